@@ -4,6 +4,7 @@ network that delays, repeats and reorders. All of it runs on one clock that the 
 from __future__ import annotations
 
 import shutil
+import time
 from collections import Counter, deque
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -145,19 +146,24 @@ def make_template(folder: Path) -> Path:
 
 
 class Plant:
-    """Everything between the yard's truth and its cranes. `now_s`: seconds since the test began."""
+    """Everything between the yard's truth and its cranes. `now_s`: seconds since the test began.
 
-    def __init__(self, template: Path, folder: Path) -> None:
+    is_drawn_time: whether all of Barsight goes by `now_s`; if not, the lifts are valid for a minute from now.
+    """
+
+    def __init__(self, template: Path, folder: Path, *, is_drawn_time: bool = True) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / "yard.db"
         shutil.copy(template, path)
         self.now_s, self.counter, self.surveys, self.handshakes = 0.0, 0, 0, 0
+        self.first_ns = FIRST_NS if is_drawn_time else time.time_ns()
         self.ends_s: dict[int, float] = {}
         self.began_s: dict[int, float] = {}
         self.answers: Counter[str] = Counter()
         self.forgotten: set[int] = set()
         clock = SimpleNamespace(time_ns=lambda: self.now_ns, monotonic=lambda: self.now_s)
-        self._patches = [patch.object(module, "time", clock) for module in (confirmation, partner, feed)]
+        modules = (confirmation, partner, feed) if is_drawn_time else ()
+        self._patches = [patch.object(module, "time", clock) for module in modules]
         for one in self._patches:
             one.start()
         self._opened = open_store(f"sqlite:///{path}")
@@ -177,7 +183,7 @@ class Plant:
 
     @property
     def now_ns(self) -> int:
-        return FIRST_NS + round(self.now_s * 1e9)
+        return self.first_ns + round(self.now_s * 1e9)
 
     def start_server(self) -> None:
         """Start it anew: all connections are lost; what they held never comes."""
@@ -204,7 +210,7 @@ class Plant:
         """
         self.surveys += 1
         offset_m = 100.0 * self.surveys if offset_m is None else offset_m
-        from_ns = self.now_ns if begun_s is None else FIRST_NS + round(begun_s * 1e9)
+        from_ns = self.now_ns if begun_s is None else self.first_ns + round(begun_s * 1e9)
         for lift_id, end_s in self.ends_s.items():
             self.ends_s[lift_id] = min(end_s, self.now_s)
         with entry(self.store, "test", "survey", self.now_ns) as opened:

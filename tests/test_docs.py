@@ -17,6 +17,7 @@ import tyro
 
 from barsight.cli import main
 from barsight.core.settings.file import read_settings
+from barsight.plant.settings import LINKS, read_plant
 from barsight.yard.magnet.description import Magnet, example_magnet
 from cli_runs import FAST
 
@@ -138,6 +139,9 @@ def test_toml_blocks_are_valid(tmp_path: Path) -> None:
     path = tmp_path / "magnet.toml"
     path.write_text(magnet)
     assert read_settings(path, Magnet, "", "magnet").safety_factor >= 2
+    (plant,) = blocks(ROOT / "docs" / "how-to" / "connect-a-plant.md", "toml")
+    path.write_text(plant)
+    assert read_plant(path).links == LINKS
 
 
 def anchors(page: Path) -> set[str]:

@@ -230,7 +230,7 @@ def test_torn_documents_of_an_archive_and_a_planted_scratch_folder_are_refused(
     archive = open_objects(str(tmp_path))
     for content in ("[" * 100_000, "{", "1" * 500):
         (tmp_path / "survey.json").write_text(content)
-        with pytest.raises(InputError, match="survey.json"):
+        with pytest.raises(InputError, match=r"survey\.json"):
             archive.read_json("survey.json")
     monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path))
     (tmp_path / "elsewhere").mkdir()

@@ -171,8 +171,10 @@ def test_a_store_that_is_gone_makes_the_state_invalid(tmp_path: Path) -> None:
     settings = PlantSettings(store=StoreSource(url=url, allow_simulated=True))
     with open_store(url) as store, StateFeed(store, settings) as feed:
         assert feed.newest(7).is_valid and feed.newest(7).life_counter == 7
-        feed._read_s -= 1.0
         feed._stop.set()
+        feed._thread.join()
+        state, read_s = feed.read()
+        feed._read = state, read_s - 1.0
         old = feed.newest(8)
         assert not old.is_valid and "state-too-old" in old.reasons[-1]
 
@@ -253,7 +255,7 @@ def test_files_of_secrets_that_cannot_be_are_told_at_the_start(tmp_path: Path) -
         {"authority": tmp_path / "none"},
         {"authority": tmp_path / "empty"},
     ):
-        with pytest.raises(InputError, match="none|empty"):
+        with pytest.raises(InputError, match=r"none|empty"):
             MqttPublisher(MqttSettings(**names))
     (tmp_path / "users.json").write_text("[" * 100_000)
     with pytest.raises(InputError, match="deep"):

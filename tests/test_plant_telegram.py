@@ -1,11 +1,18 @@
 """The telegram: bytes against offsets written by hand, and bytes that are no telegram."""
 
+import math
 import random
+import re
 import struct
 
+import numpy as np
+
 from barsight.core.errors import Failed
-from barsight.plant.state import OfferedLift, PlantState
+from barsight.plant.state import YAW_SENSE, OfferedLift, PlantState
 from barsight.plant.telegram import layout, out_values, pack, unpack
+from barsight.plant.telegram_texts import fields_at, scl_source
+from barsight.yard.magnet.footprint import Placement
+from lift_yards import judged, laid, record
 
 LIFT = OfferedLift(
     7, 1.5, -0.25, 0.7, 90.5, "ccw", 0.7, None, 2, 0.015, 0.03, 0.2, 1737.4, 522.2, 1, 3.0, 0.0, 0.1, 90.5,
@@ -34,3 +41,31 @@ def test_what_is_no_telegram_is_refused() -> None:
     for _ in range(2000):
         content = draw.randbytes(draw.randrange(2 * layout("in").size))
         assert isinstance(unpack("in", content), Failed)
+
+
+def test_the_plc_source_lays_the_bytes_out_as_the_telegram() -> None:
+    """By SCL's own widths: a value written at each field's place is read back by the telegram's code."""
+    widths = {"UInt": "H", "UDInt": "I", "DInt": "i", "LInt": "q"}
+    for side in ("out", "in"):
+        name = {"out": "BarsightOut", "in": "BarsightIn"}[side]
+        block = scl_source().split(f'TYPE "{name}"')[1].split("END_STRUCT")[0]
+        fields = re.findall(r'"(\w+)" : (\w+);   // (\d+):', block)
+        values = {field: number for number, (field, _, _) in enumerate(fields, 1)}
+        content = bytearray(layout(side).size)
+        for field, kind, at in fields:
+            struct.pack_into(f">{widths[kind]}", content, int(at), values[field])
+        assert bytes(content) == pack(side, values)
+        assert sum(struct.calcsize(widths[kind]) for _, kind, _ in fields) == len(content)
+
+
+def test_the_yaw_that_a_plc_is_told_turns_the_beam_onto_the_bundle() -> None:
+    """By the table: from +Y, counter-clockwise. From another axis the beam would lie across."""
+    stock = [laid(0.3, yaw_deg=20.0)]
+    lift = judged(stock, place=Placement(0.3, 0.0, math.radians(20.0)))
+    told = {name: text for _, name, _, text in fields_at("out")}["yaw"]
+    assert "from +Y" in told and "counter-clockwise" in told and "from +Y" in YAW_SENSE
+    yaw = math.radians(lift.place.yaw_deg)
+    beam = np.array([-math.sin(yaw), math.cos(yaw)])
+    ends = record(stock[0]).ends_m[:, :2]
+    along = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+    assert abs(beam @ along) > 0.9999

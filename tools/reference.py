@@ -46,8 +46,8 @@ class Command:
 
 
 def find(name: str) -> Any:
-    """The class or table `name` at the top of a module of the package, wherever that module lies."""
-    top = re.compile(rf"^(class )?{name}\b", re.MULTILINE)
+    """The class, function or table `name` at the top of a module of the package, wherever it lies."""
+    top = re.compile(rf"^(class |def )?{name}\b", re.MULTILINE)
     for path in sorted(PACKAGE.rglob("*.py")):
         if top.search(path.read_text(encoding="utf-8")):
             dotted = ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts)
@@ -150,6 +150,7 @@ def pages() -> dict[str, str]:
         "settings.md": HEAD + settings_page(settings_uses(all_commands)),
         "codes.md": HEAD
         + codes_page(find("BarsightError"), find("VETOES"), find("WARNINGS"), main.INTERRUPTED),
+        "telegram.md": HEAD + find("telegram_page")(),
         "schemas.md": HEAD + schemas_page(PACKAGE),
     }
 

@@ -43,8 +43,10 @@ class Acceptance:
 
     @property
     def is_passed(self) -> bool:
-        """Check that every quantity passed and no recording shows a drifted rig."""
-        sound = not any(one.state in (DriftState.RECALIBRATE, DriftState.CONTRADICTION) for one in self.rig)
+        """Check that every quantity passed, nothing wrong is named and no recording shows a drifted rig."""
+        sound = not self.causes and not any(
+            one.state in (DriftState.RECALIBRATE, DriftState.CONTRADICTION) for one in self.rig
+        )
         return sound and all(one.decision is Decision.PASSED for one in self.quantities)
 
 

@@ -30,8 +30,9 @@ THINNED = 5
 """Of so many heights one takes part in the search for a plate."""
 CORRELATED_M = 0.03
 """Cells nearer than this see the same pixels: their errors are alike."""
-MIN_SHARE = 0.5
-"""Share of the cells that must be there and fit."""
+MIN_SHARE, MIN_CAP_SHARE = 0.5, 0.35
+"""Share of a plate's cells, and of a sphere's cap, that must be there and fit: matching leaves out more of
+a cap."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,10 +74,10 @@ def fit_sphere(yard: YardMap, sphere: Sphere, search_m: float) -> FittedSphere |
             away = np.hypot(points[:, 0] - centre[0], points[:, 1] - centre[1]) < CAP_RATIO * radius
             off = np.abs(np.linalg.norm(points - centre, axis=1) - radius)
             cap = points[away & (off < near)]
-            if len(cap) < MIN_SHARE * expected:
+            if len(cap) < MIN_CAP_SHARE * expected:
                 break
             centre = _solve(cap, centre, radius)
-        if len(cap) >= MIN_SHARE * expected and (best is None or len(cap) > len(best[1])):
+        if len(cap) >= MIN_CAP_SHARE * expected and (best is None or len(cap) > len(best[1])):
             best = centre, cap
     if best is None or not _is_round(best[1], best[0], radius):
         return Failed("not-found", f"{sphere.name}: no sphere within {search_m:g} m of its place")
@@ -105,7 +106,7 @@ def _starts(points: Float64, sphere: Sphere, search_m: float, expected: float) -
             x, y = sphere.x_m + dx, sphere.y_m + dy
             square = (points[:, 0] - x) ** 2 + (points[:, 1] - y) ** 2
             near = square < (CAP_RATIO * radius) ** 2
-            if near.sum() < MIN_SHARE * expected:
+            if near.sum() < MIN_CAP_SHARE * expected:
                 continue
             z = points[near, 2] - np.sqrt(radius**2 - square[near])
             middle = float(np.median(z))

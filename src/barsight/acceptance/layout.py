@@ -129,9 +129,10 @@ def _limits(area: Area) -> ErrorLimits:
     """Set limits to shares of a pixel, as a good calibration holds them; figures as metres, then mm."""
     up, across = 1e3 * area.height_px_m, 1e3 * area.ground_px_m
     return ErrorLimits(
-        height_mm=round(0.1 * up, 1), position_mm=round(1.3 * across, 1), length_mm=round(1.3 * across, 1),
-        step_mm=round(0.08 * up, 1), flatness_mm=round(0.15 * up, 1), lift_mm=round(2.0 * across, 1),
-        yaw_deg=0.5, width_mm=round(4.5 * across, 1), bundle_length_mm=round(6.0 * across, 1),
+        height_mm=round(0.14 * up, 1), position_mm=round(1.3 * across, 1), length_mm=round(1.3 * across, 1),
+        step_mm=round(0.14 * up, 1), flatness_mm=round(0.35 * up, 1), lift_mm=round(2.0 * across, 1),
+        lift_along_mm=round(10.0 * across, 1),
+        yaw_deg=0.5, width_mm=round(4.5 * across, 1), bundle_length_mm=round(15.0 * across, 1),
         touch_mm=round(2.0 * across, 1), repeat_mm=round(0.6 * across, 1), laser_mm=round(0.1 * up, 1),
     )  # fmt: skip
 

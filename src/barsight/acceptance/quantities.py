@@ -140,7 +140,7 @@ class _Judge:
         rows = np.array([nothing if isinstance(f, Failed) else _bundle_errors(f, one) for f in found])
         own, yaw = self._own(one.sigma_m), self._own(one.yaw_sigma_deg, unit=1.0)
         for k, (what, group, part) in enumerate((
-            ("lift x", "lift_mm", own), ("lift y", "lift_mm", own), ("lift z", "lift_mm", own),
+            ("lift across", "lift_mm", own), ("lift along", "lift_along_mm", own), ("lift z", "lift_mm", own),
             ("yaw", "yaw_deg", yaw), ("width", "width_mm", own), ("length", "bundle_length_mm", own),
         )):  # fmt: skip
             yield self._judged(f"{one.name}: {what}", group, rows[:, k].tolist(), [part], _why(found))
@@ -225,12 +225,14 @@ def _why(found: Sequence[object]) -> str:
 
 
 def _bundle_errors(bundle: Bundle, dummy: DummyBundle) -> Float64:
-    """Compute errors (7,) of a bundle: x, y, z (mm), yaw (deg), width, length (mm), mass (%)."""
+    """Compute errors (7,) of a bundle: across, along, up (mm), yaw (deg), width, length (mm), mass (%)."""
     turn = (np.degrees(bundle.yaw_rad) - dummy.yaw_deg + 90) % 180 - 90
     ended = not any(bundle.ends_open)
-    kg = bundle_mass(bundle).kg
+    kg, yaw = bundle_mass(bundle).kg, np.radians(dummy.yaw_deg)
+    off = bundle.centre_m[:2] - (dummy.x_m, dummy.y_m)
     return np.array([
-        1e3 * (bundle.centre_m[0] - dummy.x_m), 1e3 * (bundle.centre_m[1] - dummy.y_m),
+        1e3 * float(off @ (np.cos(yaw), np.sin(yaw))),
+        1e3 * float(off @ (-np.sin(yaw), np.cos(yaw))) if ended else nan,
         1e3 * (bundle.top_z_m - dummy.top_z_m), turn, 1e3 * (bundle.width_m - dummy.width_m),
         1e3 * (bundle.length_m - dummy.length_m) if ended else nan,
         nan if dummy.mass_kg is None or not ended else 100 * (kg / dummy.mass_kg - 1),

@@ -157,7 +157,9 @@ class ErrorLimits:
     size_mm: float = 6.0
     """Diameter of a sphere (probing error, size)."""
     lift_mm: float = 10.0
-    """X, Y and Z of a dummy bundle as a lift would take it."""
+    """Place of a dummy bundle across its axis, and its height, as a lift would take it."""
+    lift_along_mm: float = 50.0
+    """Place of a dummy bundle along its axis: ends are seen less well than flanks."""
     yaw_deg: float = 0.5
     """Yaw of a dummy bundle."""
     width_mm: float = 20.0

@@ -36,6 +36,7 @@ COMMANDS = {
     "bench": "Compare methods: stereo, subpixel, target-size, yard",
     "paper": "Reproduce the paper: every equation, figure and table beside ours, on one page",
     "accept": "Accept a rig by artefacts, with a certificate; or make the plan for it",
+    "verify": "Verify in service that a rig still measures as it did: control charts and alarms",
     "budget": "Budget the uncertainty of a measured bundle's lift, part by part",
     "calibrate": "Calibrate two cameras from pictures of a board, or an IMU's noise, with a verdict",
     "odometry": "Estimate the trajectory and compare it with truth where there is any",
@@ -49,7 +50,7 @@ GROUPS = ("bench", "calibrate", "live", "store", "fleet", "plant")
 SECOND = {"live": ("check",)}
 """Second words of commands that do something without one too."""
 ROOMS = {"bench": ("paper",), "yard": ("lifts", "explain", "labels", "compare"), "store": ("yard", "serve"),
-         "acceptance": ("accept", "budget")}  # fmt: skip
+         "acceptance": ("accept", "budget", "verify")}  # fmt: skip
 """Commands that lie in a package of commands, without a second word."""
 INTERRUPTED = 130
 _interrupts: list[int] = []

@@ -6,6 +6,7 @@ import threading
 import time
 from dataclasses import replace
 from types import TracebackType
+from typing import Protocol
 
 from barsight.core.errors import BarsightError
 from barsight.plant.live_folder import with_live_run
@@ -18,13 +19,23 @@ MAX_AGE_S = 0.3
 READ_EVERY_S = 0.1
 
 
+class TellsState(Protocol):
+    """Tells the newest state to a link."""
+
+    def newest(self, life_counter: int) -> PlantState:
+        """Return the newest state with the link's own life counter."""
+
+    def refresh(self) -> None:
+        """Read the state now."""
+
+
 class StateFeed:
     """Hold the newest state; a thread reads it while the block runs, so that no link waits for the store."""
 
     def __init__(self, store: Store, settings: PlantSettings) -> None:
         self._store, self._settings = store, settings
-        self._read_s = time.monotonic()
-        self._state = read_state(store, settings)
+        began_s = time.monotonic()
+        self._read = read_state(store, settings), began_s
         self._stop, self._turn = threading.Event(), threading.Lock()
         self._thread = threading.Thread(target=self._follow, name="plant state", daemon=True)
 
@@ -40,22 +51,30 @@ class StateFeed:
 
     def newest(self, life_counter: int) -> PlantState:
         """Return the newest state with the link's own life counter; not valid where it is old."""
-        state, age_s = self._state, time.monotonic() - self._read_s
-        if age_s > MAX_AGE_S:
-            reason = f"state-too-old: the store was read {age_s:.1f} s ago"
-            state = replace(state, is_valid=False, reasons=(*state.reasons, reason))
-        return replace(state, life_counter=life_counter)
+        return aged(*self.read(), life_counter)
+
+    def read(self) -> tuple[PlantState, float]:
+        """Return the newest state, and when it was read (monotonic clock)."""
+        return self._read
 
     def refresh(self) -> None:
         """Read the state now, as after a step of the handshake."""
         with self._turn:
-            began = time.monotonic()
-            self._state = read_state(self._store, self._settings)
-            self._read_s = began
+            began_s = time.monotonic()
+            self._read = read_state(self._store, self._settings), began_s
 
     def _follow(self) -> None:
         while not self._stop.wait(READ_EVERY_S):
             self.refresh()
+
+
+def aged(state: PlantState, read_s: float, life_counter: int) -> PlantState:
+    """Form the state that a link tells, with its own life counter; not valid where it was read long ago."""
+    age_s = time.monotonic() - read_s
+    if age_s > MAX_AGE_S:
+        reason = f"state-too-old: the store was read {age_s:.1f} s ago"
+        state = replace(state, is_valid=False, reasons=(*state.reasons, reason))
+    return replace(state, life_counter=life_counter)
 
 
 def read_state(store: Store, settings: PlantSettings) -> PlantState:

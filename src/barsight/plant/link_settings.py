@@ -1,9 +1,10 @@
-"""Settings of the links by OPC UA, MQTT and S7: the tables of plant.toml."""
+"""Settings of the links by OPC UA, MQTT, S7 and webhooks: the tables of plant.toml."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import urlsplit
 
 from barsight.core.errors import ConfigError
 from barsight.core.settings.values import expect_ranges, expect_values
@@ -144,3 +145,28 @@ class S7Settings:
             read_start=(0, 65535), write_db=(1, 65535), write_start=(0, 65535), cycle_s=(0.01, 10),
             silent_s=(0.02, 60), max_retry_s=(0.1, 600),
         )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class WebhookSettings:
+    """Webhooks for the yard management system: each change of the state is posted, as JSON."""
+
+    urls: tuple[str, ...] = ()
+    """Addresses, http or https; each gets all changes, in order."""
+    secret_file: Path | None = None
+    """A file with a secret in its first line, by which posts are signed (HMAC-SHA-256)."""
+    timeout_s: float = 5.0
+    """Wait for an answer."""
+    max_waiting: int = 1000
+    """Changes kept for an address that doesn't answer; the oldest go."""
+    max_retry_s: float = 30.0
+    """Longest wait between attempts; the first is 0.2 s."""
+
+    def __post_init__(self) -> None:
+        expect_values(self, "webhooks.")
+        expect_ranges(
+            self, "webhooks.", timeout_s=(0.1, 600), max_waiting=(1, 100000), max_retry_s=(0.2, 3600)
+        )
+        for url in self.urls:
+            if urlsplit(url).scheme not in ("http", "https") or not urlsplit(url).hostname:
+                raise ConfigError(f"webhooks.urls: {url!r} is no address; write https://HOST/PATH")

@@ -49,7 +49,7 @@ class MqttPublisher:
 
     def __init__(self, settings: MqttSettings) -> None:
         self._settings = settings
-        self._client = mqtt_clients(settings, will=True)
+        self._client = mqtt_clients(settings, "online")
         self._state: str | None = None
         self._events: deque[dict[str, Any]] = deque()
         self._lost = 0
@@ -140,14 +140,14 @@ class MqttPublisher:
         return f"{self._settings.prefix}/{name}"
 
 
-def mqtt_clients(one: MqttSettings, *, will: bool) -> Callable[[], aiomqtt.Client]:
+def mqtt_clients(one: MqttSettings, will: str | None = None) -> Callable[[], aiomqtt.Client]:
     """Read password and authority, and return what makes clients of the broker.
 
-    will: whether the broker tells `online` false where a client is lost. Raises InputError.
+    will: topic below the prefix that tells `false` where a client is lost. Raises InputError.
     """
     password = None if one.password_file is None else read_text(one.password_file).partition("\n")[0]
     context = None if one.authority is None else _context(one.authority)
-    last = aiomqtt.Will(f"{one.prefix}/online", "false", qos=1, retain=True) if will else None
+    last = aiomqtt.Will(f"{one.prefix}/{will}", "false", qos=1, retain=True) if will else None
 
     def client() -> aiomqtt.Client:
         return aiomqtt.Client(

@@ -21,13 +21,23 @@ class PlcPartner:
         self.name, self._steps, self._silent_s = name, steps, silent_s
         self.answer: dict[str, int] = {}
         self._life: int | None = None
-        self._alive_s = 0.0
+        self._alive_s = time.monotonic()
         self._number: int | None = None
 
-    def hears(self, found: dict[str, int]) -> bool:
-        """Take a telegram; tell whether it brings a new command, which `obey` is to be called for."""
+    @property
+    def quiet_s(self) -> float:
+        """Tell how long the PLC's life counter has stood still, or didn't come."""
+        return time.monotonic() - self._alive_s
+
+    def hears(self, found: dict[str, int], *, is_busy: bool = False) -> bool:
+        """Take a telegram; tell whether it brings a new command, which `obey` is to be called for.
+
+        is_busy: whether `obey` still runs; then a command is left to the telegrams that follow.
+        """
         if found["life"] != self._life:
             self._life, self._alive_s = found["life"], time.monotonic()
+        if is_busy:
+            return False
         is_new = found["command"] != NOTHING and found["command_number"] != self._number
         if is_new or found["command"] == NOTHING:
             self._number = found["command_number"]
@@ -35,7 +45,7 @@ class PlcPartner:
 
     def seen(self, state: PlantState) -> PlantState:
         """Form the state that this PLC may act on: not valid where its life counter stands still."""
-        if self._life is not None and time.monotonic() - self._alive_s <= self._silent_s:
+        if self._life is not None and self.quiet_s <= self._silent_s:
             return state
         reason = "partner-silent: the PLC's life counter stands still"
         return replace(state, is_valid=False, reasons=(*state.reasons, reason))

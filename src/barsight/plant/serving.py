@@ -8,19 +8,26 @@ import time
 from collections.abc import Callable
 
 from barsight.core.errors import Failed
-from barsight.plant.feed import StateFeed
+from barsight.plant.feed import TellsState
 from barsight.plant.partner import PlcPartner
 from barsight.plant.settings import TelegramSettings
 from barsight.plant.steps import LiftSteps
 from barsight.plant.telegram import layout, out_values, pack, unpack
 
+MIN_GAP_RATIO = 0.8
+"""A telegram follows a late one no sooner than after so much of a cycle."""
+MAX_PARTNERS = 32
+"""Connections at once; one more is closed."""
+MAX_QUIET_S = 10.0
+"""A connection ends whose partner's life counter stands for so long."""
+
 
 class TelegramServer:
     """Serve the newest state while `run` runs. refused: telegrams that couldn't be one."""
 
-    def __init__(self, feed: StateFeed, steps: LiftSteps, settings: TelegramSettings) -> None:
+    def __init__(self, feed: TellsState, steps: LiftSteps, settings: TelegramSettings) -> None:
         self._feed, self._steps, self._settings = feed, steps, settings
-        self._counter = 0
+        self._counter = self._partners = 0
         self.refused = 0
 
     async def run(self, ready: Callable[[int], None]) -> None:
@@ -31,36 +38,57 @@ class TelegramServer:
             await server.serve_forever()
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._partners += 1
+        try:
+            if self._partners <= MAX_PARTNERS:
+                await self._exchange(reader, writer)
+        except asyncio.CancelledError:
+            return  # the server ends; asyncio's streams would log a cancelled task as an error
+        finally:
+            self._partners -= 1
+            writer.close()
+
+    async def _exchange(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         one = self._settings
         name = "plc {}".format(writer.get_extra_info("peername")[0])  # as it is after a new connection
         partner = PlcPartner(name, self._steps, one.silent_s)
+        writer.transport.set_write_buffer_limits(high=0)  # what isn't sent at once grows old
         listening = asyncio.create_task(self._listen(reader, partner))
-        due = time.monotonic()
+        due_s = time.monotonic()
         try:
-            while not listening.done():
+            while not listening.done() and partner.quiet_s < MAX_QUIET_S:
                 self._counter += 1
+                sent_s = time.monotonic()
                 state = partner.seen(self._feed.newest(self._counter))
                 writer.write(pack("out", out_values(state, partner.answer), one.byte_order))
                 await asyncio.wait_for(writer.drain(), one.silent_s)
-                due = max(due + one.cycle_s, time.monotonic())
-                await asyncio.wait({listening}, timeout=due - time.monotonic())
+                due_s = max(due_s + one.cycle_s, time.monotonic() - one.cycle_s)
+                wait_s = max(due_s, sent_s + MIN_GAP_RATIO * one.cycle_s) - time.monotonic()
+                await asyncio.wait({listening}, timeout=max(0.0, wait_s))
         except (OSError, TimeoutError):
             return
         finally:
             listening.cancel()
             with contextlib.suppress(OSError, asyncio.CancelledError):
                 await listening
-            writer.close()
 
     async def _listen(self, reader: asyncio.StreamReader, partner: PlcPartner) -> None:
-        """Take telegrams; one that can't be one ends the connection, since its length is lost."""
+        """Take telegrams; one that can't be one ends the connection, since its length is lost.
+
+        While a command is at the store the next ones are heard and left: a PLC repeats them until answered.
+        """
         size = layout("in").size
+        step: asyncio.Task[None] | None = None
         with contextlib.suppress(asyncio.IncompleteReadError, OSError):
             while True:
                 found = unpack("in", await reader.readexactly(size), self._settings.byte_order)
                 if isinstance(found, Failed):
                     self.refused += 1
                     return
-                if partner.hears(found):
-                    await asyncio.to_thread(partner.obey, found)
-                    await asyncio.to_thread(self._feed.refresh)
+                if partner.hears(found, is_busy=step is not None and not step.done()):
+                    step = asyncio.create_task(asyncio.to_thread(partner.obey, found))
+                    step.add_done_callback(self._refresh)
+
+    def _refresh(self, _: asyncio.Task[None]) -> None:
+        """Have the state read at once after a step; the telegrams don't wait for it."""
+        asyncio.get_running_loop().run_in_executor(None, self._feed.refresh)

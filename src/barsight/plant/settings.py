@@ -9,11 +9,11 @@ from typing import TypeVar
 from barsight.core.errors import ConfigError
 from barsight.core.settings.file import read_settings
 from barsight.core.settings.values import expect_choice, expect_ranges, expect_values
-from barsight.plant.link_settings import MqttSettings, OpcUaSettings, S7Settings
+from barsight.plant.link_settings import MqttSettings, OpcUaSettings, S7Settings, WebhookSettings
 
 HELP_AT = "docs/how-to/connect-a-plant.md has an example"
-LINKS = ("telegram", "opcua", "mqtt", "s7")
-Link = TypeVar("Link", OpcUaSettings, MqttSettings)
+LINKS = ("telegram", "opcua", "mqtt", "s7", "webhooks")
+Link = TypeVar("Link", OpcUaSettings, MqttSettings, WebhookSettings)
 
 
 @dataclass(frozen=True)
@@ -77,6 +77,7 @@ class PlantSettings:
     opcua: OpcUaSettings | None = None
     mqtt: MqttSettings | None = None
     s7: S7Settings | None = None
+    webhooks: WebhookSettings | None = None
 
     @property
     def links(self) -> tuple[str, ...]:
@@ -96,6 +97,7 @@ def read_plant(path: Path) -> PlantSettings:
         live=None if plant.live is None else LiveSource(at / plant.live.folder),
         opcua=None if plant.opcua is None else _beside(at, plant.opcua, "folder", "users", "nodesets"),
         mqtt=None if plant.mqtt is None else _beside(at, plant.mqtt, "password_file", "authority"),
+        webhooks=None if plant.webhooks is None else _beside(at, plant.webhooks, "secret_file"),
     )
 
 

@@ -16,7 +16,7 @@ MAX_ALARMS = 20
 """Newest alarms that are told to the plant."""
 URGENT = ("store-broken", "load-contradicts", "lift-unrecorded", "lift-failed")
 """Codes of alarms of priority 1: what the store says of the yard may not be true. All others have 2."""
-YAW_SENSE = "counter-clockwise from +x of the yard frame, seen from above"
+YAW_SENSE = "of the beam from +Y of the yard frame, counter-clockwise seen from above"
 
 
 @dataclass(frozen=True)

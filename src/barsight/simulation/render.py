@@ -303,7 +303,7 @@ def _shade_sphere(primitives: Primitives, look: Shading, p: int, x: float, y: fl
         diffuse += sun * sun_patch(lamps.sun, x, y, z)
     around, along = math.atan2(n2, n1) * radius, math.asin(min(max(n0, -1.0), 1.0)) * radius
     _, _, _, pattern = _texels(tile, (around + material[p, 2]) / ALONG_M, (along + material[p, 3]) / ALONG_M)
-    radiance: float = material[p, 0] * (1 + material[p, 7] * (pattern - 1)) * diffuse
+    radiance: float = material[p, 0] * max(1 + material[p, 7] * (pattern - 1), 0.1) * diffuse
     return radiance
 
 

@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from barsight.yard.inventory.bundle_file import bundle_of
 from barsight.yard.vetoes import VETOES
 
 with extra("store"):
-    from sqlalchemy import ColumnElement, Connection, Row, func, select
+    from sqlalchemy import ColumnElement, Connection, Row, Select, func, select
 
 OPEN = ("offered", "claimed", "executing")
 
@@ -44,8 +45,13 @@ class OpenLift:
 
 def newest_survey(connection: Connection) -> Row[Any] | None:
     """Return the row of the survey with the newest frames, None where there is none."""
+    return connection.execute(_newest_query()).first()
+
+
+@cache
+def _newest_query() -> Select[Any]:
     order = (SURVEYS.c.captured_to_ns.desc(), SURVEYS.c.id.desc())
-    return connection.execute(select(SURVEYS).where(counts()).order_by(*order).limit(1)).first()
+    return select(SURVEYS).where(counts()).order_by(*order).limit(1)
 
 
 def survey_folder(connection: Connection, map_id: str) -> Path:
@@ -76,16 +82,21 @@ def yard_clock_ns(connection: Connection, now_ns: int | None = None) -> int:
 
 def open_lifts(connection: Connection) -> tuple[OpenLift, ...]:
     """List the lifts that are offered, claimed or executing, in the order of their ids."""
-    return _lifts(connection, LIFT_STATES.c.state.in_(OPEN))
+    return _lifts(connection, _open_query())
 
 
-def _lifts(connection: Connection, which: ColumnElement[bool]) -> tuple[OpenLift, ...]:
-    """List lifts by a condition on their last state, in the order of their ids."""
+@cache
+def _open_query() -> Select[Any]:
+    return _lift_query(LIFT_STATES.c.state.in_(OPEN))
+
+
+def _lift_query(which: ColumnElement[bool]) -> Select[Any]:
+    """Build the query for lifts by a condition on their last state, in the order of their ids."""
     last = select(LIFT_STATES.c.lift_id, func.max(LIFT_STATES.c.step).label("step")).group_by(
         LIFT_STATES.c.lift_id
     )
     newest = last.subquery()
-    rows = connection.execute(
+    return (
         select(LIFTS, SURVEYS.c.map_id, SURVEYS.c.calibration_id, LIFT_STATES.c.state)
         .join(SURVEYS, SURVEYS.c.id == LIFTS.c.survey_id)
         .join(newest, newest.c.lift_id == LIFTS.c.id)
@@ -95,7 +106,11 @@ def _lifts(connection: Connection, which: ColumnElement[bool]) -> tuple[OpenLift
         )
         .where(which, counts())
         .order_by(LIFTS.c.id)
-    ).all()
+    )
+
+
+def _lifts(connection: Connection, query: Select[Any]) -> tuple[OpenLift, ...]:
+    rows = connection.execute(query).all()
     return tuple(
         OpenLift(r.id, r.survey_id, r.map_id, r.calibration_id, r.state, json.loads(r.record)) for r in rows
     )
@@ -193,7 +208,8 @@ def end_disturbed(opened: Entry, since_ns: int) -> None:
     failed = select(LIFT_STATES.c.lift_id).where(
         LIFT_STATES.c.state == "failed", LIFT_STATES.c.at_ns >= since_ns, LIFT_STATES.c.lift_id.in_(begun)
     )
-    for lift in _lifts(opened.connection, LIFTS.c.id.in_(moving) | LIFTS.c.id.in_(failed)):
+    query = _lift_query(LIFTS.c.id.in_(moving) | LIFTS.c.id.in_(failed))
+    for lift in _lifts(opened.connection, query):
         _end_beside(opened, lift)
 
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from functools import cache
+from typing import Any
+
 from barsight.core.errors import InputError
 from barsight.core.extras import extra
 from barsight.store.audit import Entry
 from barsight.store.tables import ALARM_STATES, ALARMS, LIFT_STATES
 
 with extra("store"):
-    from sqlalchemy import Connection, Table, func, select
+    from sqlalchemy import Connection, Select, Table, func, select
 
 LIFT_STEPS: dict[str | None, tuple[str, ...]] = {
     None: ("offered",),
@@ -62,16 +65,20 @@ def alarm_state(connection: Connection, alarm_id: int) -> str | None:
 
 def standing_alarms(connection: Connection) -> list[tuple[str, str, str]]:
     """List code, reason and state of the alarms that aren't cleared, the newest first."""
+    return [(row.code, row.reason, row.state) for row in connection.execute(_standing_query()).all()]
+
+
+@cache
+def _standing_query() -> Select[Any]:
     last = select(ALARM_STATES.c.alarm_id, func.max(ALARM_STATES.c.step).label("step"))
     newest = last.group_by(ALARM_STATES.c.alarm_id).subquery()
-    rows = connection.execute(
+    return (
         select(ALARMS.c.code, ALARMS.c.reason, ALARM_STATES.c.state)
         .join(ALARM_STATES, ALARM_STATES.c.alarm_id == ALARMS.c.id)
         .join(newest, (newest.c.alarm_id == ALARMS.c.id) & (newest.c.step == ALARM_STATES.c.step))
         .where(ALARM_STATES.c.state != "cleared")
         .order_by(ALARMS.c.id.desc())
-    ).all()
-    return [(row.code, row.reason, row.state) for row in rows]
+    )
 
 
 def _last(connection: Connection, table: Table, owner: str, number: int) -> tuple[int, str | None]:

@@ -16,7 +16,9 @@ from barsight.report.signing import sign_file
 def run(arguments: Sequence[str]) -> None:
     """Parse, check and print."""
 
-    def command(config: Path, protocol: Path | None = None, key: Path | None = None) -> None:
+    def command(
+        config: Path, seconds: float = 5.0, protocol: Path | None = None, key: Path | None = None
+    ) -> None:
         """Check each link that plant.toml names from its other side: what is sent, how often, and whether
         the life counter moves.
 
@@ -24,12 +26,13 @@ def run(arguments: Sequence[str]) -> None:
 
         Args:
             config: plant.toml.
+            seconds: Time for the telegram's cycle.
             protocol: A text file to write for the commissioning folder.
             key: Ed25519 key (PEM) that signs the protocol; the signature lies beside it as NAME.sig.
         """
         if key is not None and protocol is None:
             raise ConfigError("--key signs a protocol: give --protocol too")
-        checks, console = check_links(read_plant(config)), SafeConsole()
+        checks, console = check_links(read_plant(config), seconds), SafeConsole()
         for one in checks:
             console.print(f"{one.link}: {'holds' if one.is_good else 'does not hold'}", highlight=False)
             for line in one.lines:

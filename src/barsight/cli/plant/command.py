@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from barsight.cli.arguments import pass_on
 
 KINDS = {
-    "run": "Serve the state by telegram, OPC UA, MQTT and S7; Ctrl-C ends it",
+    "run": "Serve the state by telegram, OPC UA, MQTT, S7 and webhooks; Ctrl-C ends it",
     "user": "Add a user of the OPC UA server, or change role and password",
     "check": "Check each link from the other side, and write a protocol; exit code 5 where one does not hold",
+    "scl": "Write the telegram's types as a source for TIA Portal",
 }
 
 

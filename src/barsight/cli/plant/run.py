@@ -17,8 +17,8 @@ def run(arguments: Sequence[str]) -> None:
     """Parse and serve until Ctrl-C."""
 
     def command(config: Path) -> None:
-        """Serve the plant's state by the links that plant.toml names (telegram, OPC UA, MQTT, S7); Ctrl-C
-        ends it.
+        """Serve the plant's state by the links that plant.toml names (telegram, OPC UA, MQTT, S7, webhooks);
+        Ctrl-C ends it.
 
         Args:
             config: plant.toml.

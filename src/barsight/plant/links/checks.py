@@ -7,6 +7,7 @@ import platform
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 import barsight
@@ -14,6 +15,7 @@ from barsight.core.errors import Failed
 from barsight.core.files import atomic_path
 from barsight.plant.links.telegram_check import check_telegram
 from barsight.plant.settings import PlantSettings
+from barsight.plant.webhooks import post
 
 
 @dataclass(frozen=True)
@@ -25,23 +27,28 @@ class LinkCheck:
     is_good: bool
 
 
-def check_links(settings: PlantSettings) -> tuple[LinkCheck, ...]:
-    """Check each link that is configured; nothing is claimed, and no data block of the PLC is written."""
-    return tuple(_checked(name, _CHECKS[name], settings) for name in settings.links)
+Check = Callable[[PlantSettings], LinkCheck | Failed]
 
 
-def _checked(
-    name: str, check: Callable[[PlantSettings], LinkCheck | Failed], all_of: PlantSettings
-) -> LinkCheck:
+def check_links(settings: PlantSettings, seconds: float) -> tuple[LinkCheck, ...]:
+    """Check each link that is configured; nothing is claimed, and no data block of the PLC is written.
+
+    seconds: for the telegram's cycle.
+    """
+    checks: dict[str, Check] = {**_CHECKS, "telegram": partial(_telegram, seconds=seconds)}
+    return tuple(_checked(name, checks[name], settings) for name in settings.links)
+
+
+def _checked(name: str, check: Check, all_of: PlantSettings) -> LinkCheck:
     found = check(all_of)
     if isinstance(found, Failed):
         return LinkCheck(name, (f"{found.reason}; is barsight plant run running?",), False)
     return found
 
 
-def _telegram(settings: PlantSettings) -> LinkCheck | Failed:
+def _telegram(settings: PlantSettings, seconds: float) -> LinkCheck | Failed:
     assert settings.telegram is not None
-    found = check_telegram(settings.telegram)
+    found = check_telegram(settings.telegram, seconds)
     return found if isinstance(found, Failed) else LinkCheck("telegram", found.lines, found.is_good)
 
 
@@ -69,8 +76,15 @@ def _s7(settings: PlantSettings) -> LinkCheck | Failed:
     return found if isinstance(found, Failed) else LinkCheck("s7", *found)
 
 
-_CHECKS: dict[str, Callable[[PlantSettings], LinkCheck | Failed]] = {
-    "telegram": _telegram, "opcua": _opcua, "mqtt": _mqtt, "s7": _s7,
+def _webhooks(settings: PlantSettings) -> LinkCheck | Failed:
+    assert settings.webhooks is not None
+    problems = {url: post(url, settings.webhooks, {"event": "check"})[0] for url in settings.webhooks.urls}
+    lines = tuple(f"{url}: {problem or 'takes a post'}" for url, problem in problems.items())
+    return LinkCheck("webhooks", lines, not any(problems.values()))
+
+
+_CHECKS: dict[str, Check] = {
+    "opcua": _opcua, "mqtt": _mqtt, "s7": _s7, "webhooks": _webhooks,
 }  # fmt: skip
 
 

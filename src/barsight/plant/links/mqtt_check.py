@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import itertools
 import json
+import socket
 import time
 
 from barsight.core.errors import Failed
@@ -27,7 +29,7 @@ def check_mqtt(settings: MqttSettings) -> tuple[tuple[str, ...], bool] | Failed:
 
 async def _read(settings: MqttSettings) -> tuple[tuple[str, ...], bool]:
     online, stamps, lives, last, retained = "", list[float](), list[int](), "", False
-    async with asyncio.timeout(WAIT_S), mqtt_clients(settings, will=False)() as client:
+    async with asyncio.timeout(WAIT_S), mqtt_clients(settings)() as client:
         await client.subscribe(f"{settings.prefix}/#", qos=1)
         async for message in client.messages:
             text = bytes(message.payload).decode() if isinstance(message.payload, bytes | bytearray) else ""
@@ -50,4 +52,23 @@ async def _read(settings: MqttSettings) -> tuple[tuple[str, ...], bool]:
         f"interval {min(gaps_s):.3f}...{max(gaps_s):.3f} s, at least {settings.state_every_s:g} s",
         "life counter: " + ("goes up in each state" if is_alive else "stands still"),
     )
-    return lines, online == "true" and retained and is_alive
+    tells = await _tells_wills(settings)
+    will = "the broker tells the last will of a client that is lost: " + ("yes" if tells else "NO")
+    return (*lines, will), online == "true" and retained and is_alive and tells
+
+
+async def _tells_wills(settings: MqttSettings) -> bool:
+    """Lose a client of the check's own, and wait for its last will."""
+    topic = f"{settings.prefix}/check"
+    async with mqtt_clients(settings)() as client:
+        await client.subscribe(topic, qos=1)
+        with contextlib.suppress(MqttError):
+            async with mqtt_clients(settings, "check")() as lost:
+                lost._client.socket().shutdown(socket.SHUT_RDWR)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(WAIT_S):
+                async for message in client.messages:
+                    if message.payload == b"false":
+                        await client.publish(topic, b"", qos=1, retain=True)
+                        return True
+    return False

@@ -1,4 +1,4 @@
-"""Serve telegram, OPC UA, MQTT and S7 from one state, until stopped or one of them ends."""
+"""Serve telegram, OPC UA, MQTT, S7 and webhooks from one state, until stopped or one of them ends."""
 
 from __future__ import annotations
 
@@ -8,13 +8,15 @@ from collections.abc import Awaitable, Callable
 
 from barsight.core.errors import OutputError
 from barsight.plant.feed import READ_EVERY_S, StateFeed
+from barsight.plant.link_settings import WebhookSettings
 from barsight.plant.links.changes import changes_between
 from barsight.plant.links.opcua_link import serve_opcua
 from barsight.plant.links.s7_link import serve_s7
-from barsight.plant.serving import TelegramServer
+from barsight.plant.links.telegram_process import serve_telegram
 from barsight.plant.settings import PlantSettings
 from barsight.plant.state import PlantState
 from barsight.plant.steps import LiftSteps
+from barsight.plant.webhooks import Webhook
 from barsight.store.opening import Store
 
 Say = Callable[[str], None]
@@ -41,18 +43,40 @@ async def serve_plant(store: Store, settings: PlantSettings, say: Say) -> None:
 def _links(store: Store, settings: PlantSettings, feed: StateFeed, say: Say) -> dict[str, Awaitable[None]]:
     steps = LiftSteps(store, settings)
     links: dict[str, Awaitable[None]] = {}
-    if (one := settings.telegram) is not None:
-        host = one.host
-        links[f"telegram at {host}:{one.port}"] = TelegramServer(feed, steps, one).run(
-            lambda port: say(f"telegram at {host}:{port}")
-        )
+    if settings.telegram is not None:
+        at = f"telegram at {settings.telegram.host}:{settings.telegram.port}"
+        links[at] = serve_telegram(settings.telegram, feed, steps, say)
     if settings.opcua is not None:
         links[f"OPC UA at {settings.opcua.url}"] = serve_opcua(store, settings.opcua, feed, steps, say)
     if settings.mqtt is not None:
         links[f"MQTT at {settings.mqtt.host}:{settings.mqtt.port}"] = _serve_mqtt(settings, feed, say)
     if settings.s7 is not None:
         links[f"S7 at {settings.s7.host}:{settings.s7.port}"] = serve_s7(settings.s7, feed, steps, say)
+    if settings.webhooks is not None:
+        links["webhooks"] = _serve_webhooks(settings.webhooks, feed, say)
     return links
+
+
+async def _serve_webhooks(one: WebhookSettings, feed: StateFeed, say: Say) -> None:
+    hooks = [Webhook(url, one) for url in one.urls]
+    told = {hook.url: "" for hook in hooks}
+    last: PlantState | None = None
+    try:
+        while True:
+            state = feed.newest(0)
+            for change in changes_between(last, state):
+                for hook in hooks:
+                    hook.tell(change)
+            last = state
+            for hook in hooks:
+                now = hook.problem or "takes posts"
+                if now != told[hook.url]:
+                    say(f"webhook {hook.url}: {now}")
+                told[hook.url] = now
+            await asyncio.sleep(READ_EVERY_S)
+    finally:
+        for hook in hooks:
+            await asyncio.to_thread(hook.stop)
 
 
 async def _named(name: str, link: Awaitable[None]) -> None:

@@ -1,54 +1,91 @@
-"""Check the telegram's server from the PLC's side: bytes and their meaning, cycle, life counter."""
+"""Check the telegram's server from the PLC's side: bytes and their meaning, cycle, answer, life counter."""
 
 from __future__ import annotations
 
 import itertools
 import socket
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+import numpy as np
 
 from barsight.core.errors import Failed
 from barsight.plant.settings import TelegramSettings
 from barsight.plant.telegram import IN_MAGIC, VERSION, layout, pack, table_of, unpack
 
-CYCLES = 20
+TOLERANCE_RATIO = 0.2
+"""The cycle's first and last hundredth may be off by so much of it."""
+FAILED, NUMBER = 4, 0x5A5A
 
 
 @dataclass(frozen=True)
 class TelegramCheck:
-    """Record what a check saw. lines: for people. is_good: whether cycle and life counter hold."""
+    """Record what a check saw. lines: for people. is_good: whether cycle, answer and life counter hold."""
 
     lines: tuple[str, ...]
     is_good: bool
 
 
-def check_telegram(one: TelegramSettings) -> TelegramCheck | Failed:
-    """Exchange telegrams without a command, and judge them; nothing is claimed."""
-    size, stamps, lives = layout("out").size, [], []
-    content = sent = b""
+@dataclass
+class _Exchanged:
+    """Telegrams of a check. stamps_s: when each came. answered_s: from the command to its answer."""
+
+    sent: bytes = b""
+    content: bytes = b""
+    stamps_s: list[float] = field(default_factory=list)
+    lives: list[int] = field(default_factory=list)
+    answered_s: float | None = None
+
+
+def check_telegram(one: TelegramSettings, seconds: float) -> TelegramCheck | Failed:
+    """Exchange telegrams for some time, and judge them. The one command is refused: it names no lift."""
     try:
-        with socket.create_connection((one.host, one.port), timeout=2) as link:
-            for number in range(CYCLES):
-                values = {
-                    "magic": IN_MAGIC, "version": VERSION, "life": number, "clock_ns": time.time_ns()
-                }  # fmt: skip
-                sent = pack("in", values, one.byte_order)
-                link.sendall(sent)
-                content = link.recv(size, socket.MSG_WAITALL)
-                stamps.append(time.monotonic())
-                found = unpack("out", content, one.byte_order)
-                if isinstance(found, Failed):
-                    return found
-                lives.append(found["life"])
+        seen = _exchange(one, seconds)
     except OSError as error:
         return Failed("telegram-link", f"{one.host}:{one.port}: {error}")
-    gaps_s = [later - before for before, later in itertools.pairwise(stamps[1:])]
-    counts = [(later - before) & 0xFFFF for before, later in itertools.pairwise(lives)]
-    is_alive = all(0 < each < 1000 for each in counts)
-    cycle = f"cycle {min(gaps_s) * 1e3:.1f}...{max(gaps_s) * 1e3:.1f} ms, set {one.cycle_s * 1e3:g} ms"
-    lines = [*told_fields("in", sent, one.byte_order), *told_fields("out", content, one.byte_order), cycle]
-    lines.append("life counter: " + ("goes up in each telegram" if is_alive else "stands still"))
-    return TelegramCheck(tuple(lines), is_alive and max(gaps_s) < one.silent_s)
+    if isinstance(seen, Failed):
+        return seen
+    gaps_ms = 1e3 * np.diff(seen.stamps_s[1:])
+    low, middle, high = np.percentile(gaps_ms, (1, 50, 99))
+    set_ms = 1e3 * one.cycle_s
+    is_even = (1 - TOLERANCE_RATIO) * set_ms <= low and high <= (1 + TOLERANCE_RATIO) * set_ms
+    is_alive = {(later - before) & 0xFFFF for before, later in itertools.pairwise(seen.lives)} == {1}
+    answer = "NOT ANSWERED" if seen.answered_s is None else f"refused after {1e3 * seen.answered_s:.0f} ms"
+    lines = (
+        *told_fields("in", seen.sent, one.byte_order), *told_fields("out", seen.content, one.byte_order),
+        f"cycle of {len(gaps_ms) + 2} telegrams: {low:.1f}, {middle:.1f}, {high:.1f} ms (1, 50, 99 %), "
+        f"longest {gaps_ms.max():.1f} ms, set {set_ms:g} ms: {'even' if is_even else 'NOT within 20 %'}",
+        f"a command that names no lift: {answer}",
+        "life counter: " + ("goes up by one in each telegram" if is_alive else "STANDS OR LEAPS"),
+    )  # fmt: skip
+    is_in_time = float(gaps_ms.max()) < 1e3 * one.silent_s
+    return TelegramCheck(lines, is_alive and is_even and is_in_time and seen.answered_s is not None)
+
+
+def _exchange(one: TelegramSettings, seconds: float) -> _Exchanged | Failed:
+    seen, size = _Exchanged(), layout("out").size
+    asked_s: float | None = None
+    with socket.create_connection((one.host, one.port), timeout=2) as link:
+        until_s = time.monotonic() + seconds
+        while time.monotonic() < until_s or len(seen.lives) < 12:
+            values = {
+                "magic": IN_MAGIC, "version": VERSION, "life": (len(seen.lives) + 1) & 0xFFFF,
+                "clock_ns": time.time_ns(),
+            }  # fmt: skip
+            if len(seen.lives) >= 5 and seen.answered_s is None:
+                values |= {"command": FAILED, "command_number": NUMBER}
+                asked_s = asked_s or time.monotonic()
+            seen.sent = pack("in", values, one.byte_order)
+            link.sendall(seen.sent)
+            seen.content = link.recv(size, socket.MSG_WAITALL)
+            seen.stamps_s.append(time.monotonic())
+            found = unpack("out", seen.content, one.byte_order)
+            if isinstance(found, Failed):
+                return found
+            seen.lives.append(found["life"])
+            if asked_s is not None and seen.answered_s is None and found["answer_number"] == NUMBER:
+                seen.answered_s = time.monotonic() - asked_s
+    return seen
 
 
 def told_fields(side: str, content: bytes, byte_order: str) -> list[str]:

@@ -18,6 +18,8 @@ from barsight.simulation.truth import bundle_rows
 POST_M = 0.04
 """Half the side of a post that carries a sphere."""
 CELL_M = (0.1, 0.5)
+SPECKLED = 2.5
+"""Contrast of a sphere's speckles over a bare surface's texture."""
 
 
 def lay_artefacts(plan: AcceptancePlan, settings: SimulationSettings) -> LaidYard:
@@ -31,7 +33,7 @@ def lay_artefacts(plan: AcceptancePlan, settings: SimulationSettings) -> LaidYar
     boxes = [_block(one) for one in plan.plate]
     for sphere in plan.sphere:
         boxes += _on_post(sphere)
-    materials = [plain_material(0.4, 0.0, rng, weight=1.0) for _ in boxes]
+    materials = [plain_material(0.4, 0.0, rng, weight=SPECKLED if box[13] == 0 else 1.0) for box in boxes]
     shape = np.concatenate([scene.primitives.shape, np.reshape(boxes, (-1, 15))])
     material = np.concatenate([scene.primitives.material, np.reshape(materials, (-1, 10))])
     primitives = Primitives(shape, material.astype(np.float32), scene.primitives.cylinders)

@@ -1,0 +1,212 @@
+"""Watch a rig over the years: control charts (CUSUM) on what every survey shows, since the last approval."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from barsight.acceptance.observation import Observation
+from barsight.acceptance.pictures import PictureHealth
+from barsight.artefacts.plan import AcceptancePlan
+from barsight.core.errors import Failed, InputError
+from barsight.core.json_values import json_value
+from barsight.core.reading.sealed_json import read_sealed, write_sealed
+from barsight.motion.rig_check.drift_check import RigCheck
+
+SCHEMA_VERSION = 1
+REMEDY = "give the record that barsight verify wrote, or another name to begin a new one"
+LEARNED = 8
+"""Surveys after an approval that say what is normal."""
+SLACK, ALARM = 2.0, 4.0
+"""CUSUM in sigmas: what of each survey is taken off, and the sum that alarms [Page 1954]."""
+DOUBTED = 1.62
+"""A stated sigma is believed unless the learned ones scatter by more: 1 % would by chance."""
+SHARPNESS_SIGMA = 0.15
+"""Of the logarithm of a picture's sharpness: yards differ."""
+
+
+@dataclass(frozen=True)
+class WatchedFigure:
+    """A figure of one survey, with its sigma, in the unit that its name says."""
+
+    name: str
+    value: float
+    sigma: float
+
+
+@dataclass(frozen=True)
+class WatchedSurvey:
+    """A survey: digest of its recording's inputs, of its calibration, and its figures."""
+
+    recording: str
+    recording_id: str
+    calibration_id: str
+    figures: tuple[WatchedFigure, ...]
+
+
+@dataclass(frozen=True)
+class Approval:
+    """A calibration put into service: who, why, when (UTC), and how many surveys there were before."""
+
+    who: str
+    why: str
+    at: str
+    calibration_id: str
+    surveys_before: int
+
+
+@dataclass(frozen=True)
+class WatchRecord:
+    """All surveys and approvals, the oldest first."""
+
+    surveys: tuple[WatchedSurvey, ...] = ()
+    approvals: tuple[Approval, ...] = ()
+
+    @property
+    def since_approval(self) -> tuple[WatchedSurvey, ...]:
+        """Return the surveys since the last approval."""
+        return self.surveys[self.approvals[-1].surveys_before if self.approvals else 0 :]
+
+
+@dataclass(frozen=True)
+class ControlChart:
+    """A figure's chart: its last value, mean and sigma when normal (NaN while that is learned), the larger of
+    both sums, and at which survey since the approval (from 1) it first alarmed; None where it didn't.
+    """
+
+    name: str
+    value: float
+    mean: float
+    sigma: float
+    cusum: float
+    alarmed_at: int | None
+
+
+def rig_figures(check: RigCheck) -> tuple[WatchedFigure, ...]:
+    """Take what rows and travel show of the rig: baseline, pitch, roll, focal ratio, and the yaw, which both
+    see, as their weighted mean.
+    """
+    figures = [
+        WatchedFigure(f"{line.name} / {line.unit}", line.value, line.sigma)
+        for line in check.lines
+        if isfinite(line.value) and not line.name.startswith("yaw")
+    ]
+    told = []
+    if not isinstance(check.rows, Failed):
+        told.append((float(check.rows.values[3]), float(check.rows.sigmas[3])))
+    if not isinstance(check.drift, Failed):
+        told.append((check.drift.yaw_rad, check.drift.yaw_sigma_rad))
+    if told:
+        values, sigmas = np.degrees(np.array(told).T)
+        weight = sigmas**-2.0
+        yaw = float((weight * values).sum() / weight.sum())
+        figures.append(WatchedFigure("yaw / deg", yaw, float(weight.sum() ** -0.5)))
+    return tuple(figures)
+
+
+def picture_figures(health: tuple[PictureHealth, ...] | Failed) -> tuple[WatchedFigure, ...]:
+    """Take the logarithm of each camera's sharpness."""
+    if isinstance(health, Failed):
+        return ()
+    return tuple(
+        WatchedFigure(f"sharpness of {one.camera} / log", float(np.log(one.sharpness)), SHARPNESS_SIGMA)
+        for one in health
+    )
+
+
+def feature_figures(plan: AcceptancePlan, seen: Observation) -> tuple[WatchedFigure, ...]:
+    """Take the mean errors of fixed features, mm: heights of plates, places of surveyed spheres."""
+    z = [
+        1e3 * (found.z_m - one.z_m)
+        for one in plan.plate
+        if not isinstance(found := seen.plates[one.name], Failed)
+    ]
+    places = [
+        1e3 * (ball.centre_m - (one.x_m, one.y_m, one.z_m))
+        for one in plan.sphere
+        if one.place_sigma_m is not None and not isinstance(ball := seen.spheres[one.name], Failed)
+    ]
+    px_mm = 1e3 * seen.view.px_m(0.0)
+    figures = []
+    if z:
+        figures.append(WatchedFigure("height of plates / mm", float(np.mean(z)), 0.02 * px_mm))
+    if places:
+        ground_mm = 1e3 * float(seen.view.camera_m[2]) / seen.view.focal_px
+        x, y, _ = np.mean(places, axis=0)
+        figures += [
+            WatchedFigure("place of spheres along x / mm", float(x), 0.15 * ground_mm),
+            WatchedFigure("place of spheres along y / mm", float(y), 0.15 * ground_mm),
+        ]
+    return tuple(figures)
+
+
+def control_charts(surveys: Sequence[WatchedSurvey]) -> tuple[ControlChart, ...]:
+    """Compute the charts of all figures over surveys of one approval, the oldest first."""
+    names = dict.fromkeys(figure.name for survey in surveys for figure in survey.figures)
+    return tuple(_chart(name, surveys) for name in names)
+
+
+def _chart(name: str, surveys: Sequence[WatchedSurvey]) -> ControlChart:
+    rows = [
+        (number, figure)
+        for number, survey in enumerate(surveys, 1)
+        for figure in survey.figures
+        if figure.name == name
+    ]
+    learned = np.array([figure.value for _, figure in rows[:LEARNED]])
+    if len(learned) < LEARNED:
+        return ControlChart(name, rows[-1][1].value, np.nan, np.nan, 0.0, None)
+    mean = float(learned.mean())
+    scatter = float(learned.std(ddof=1))
+    up = down = 0.0
+    alarmed, sigma = None, np.nan
+    for number, figure in rows[LEARNED:]:
+        sigma = scatter if scatter > DOUBTED * figure.sigma else figure.sigma
+        off = (figure.value - mean) / sigma
+        up, down = max(up + off - SLACK, 0.0), max(down - off - SLACK, 0.0)
+        if max(up, down) > ALARM and alarmed is None:
+            alarmed = number
+    return ControlChart(name, rows[-1][1].value, mean, sigma, max(up, down), alarmed)
+
+
+def read_watch(path: Path) -> WatchRecord:
+    """Read a record; an empty one where there is no such file. Raises InputError where it was changed."""
+    if not path.exists():
+        return WatchRecord()
+    content = read_sealed(path, SCHEMA_VERSION, REMEDY)
+    try:
+        return WatchRecord(
+            tuple(_survey(one) for one in content["surveys"]),
+            tuple(Approval(**one) for one in content["approvals"]),
+        )
+    except (KeyError, TypeError) as error:
+        raise InputError(path, "is no record of surveys", REMEDY) from error
+
+
+def write_watch(record: WatchRecord, path: Path) -> None:
+    """Write a record whole or not at all."""
+    content: dict[str, Any] = json_value({"schema_version": SCHEMA_VERSION, **asdict(record)})
+    write_sealed(content, path)
+
+
+def with_survey(record: WatchRecord, survey: WatchedSurvey, path: Path) -> WatchRecord:
+    """Add a survey. Raises InputError for one that is there already, or of a calibration nobody approved."""
+    if any(one.recording_id == survey.recording_id for one in record.surveys):
+        raise InputError(survey.recording, f"is in {path.name} already", "record a new survey")
+    known = record.approvals[-1].calibration_id if record.approvals else (
+        record.surveys[0].calibration_id if record.surveys else survey.calibration_id
+    )  # fmt: skip
+    if survey.calibration_id != known:
+        problem = f"has calibration {survey.calibration_id}, but {path.name} watches {known}"
+        raise InputError(survey.recording, problem, "approve the new calibration: --approve WHO --why WHY")
+    return replace(record, surveys=(*record.surveys, survey))
+
+
+def _survey(one: dict[str, Any]) -> WatchedSurvey:
+    figures = tuple(WatchedFigure(**figure) for figure in one["figures"])
+    return WatchedSurvey(one["recording"], one["recording_id"], one["calibration_id"], figures)

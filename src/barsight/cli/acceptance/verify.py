@@ -1,0 +1,139 @@
+"""Run `barsight verify RECORDING [--record watch.json]`."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import tyro
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from barsight.acceptance.acceptance import some_frames
+from barsight.acceptance.observation import observe
+from barsight.acceptance.pictures import check_pictures
+from barsight.acceptance.watch import (
+    ALARM,
+    Approval,
+    ControlChart,
+    WatchedSurvey,
+    control_charts,
+    feature_figures,
+    picture_figures,
+    read_watch,
+    rig_figures,
+    with_survey,
+    write_watch,
+)
+from barsight.artefacts.plan import AcceptancePlan, ErrorLimits, read_plan
+from barsight.cli.arguments import call
+from barsight.cli.progress import stages
+from barsight.cli.safe_console import SafeConsole
+from barsight.core.errors import ConfigError, Failed, MeasurementError
+from barsight.core.files import expect_output
+from barsight.measure_folder import measure_into
+from barsight.measure_settings import MeasureSettings
+from barsight.motion.batch.fusion import FusionSettings
+from barsight.motion.rig_check.drift_check import CheckSettings, DriftState, RigCheck, check_rig
+from barsight.recording.base import RecordingSettings
+from barsight.recording.open import open_recording
+from barsight.yard_frame import calibration_id, in_yard, recording_id
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parse, verify and print."""
+
+    def command(
+        recording: tyro.conf.Positional[Path],
+        record: Path = Path("watch.json"),
+        plan: Path | None = None,
+        yard: Path | None = None,
+        rig: Path | None = None,
+        approve: str = "",
+        why: str = "",
+    ) -> None:
+        """Verify that a rig still measures as it did when it was accepted: an ordinary survey is enough.
+
+        Control charts (CUSUM) watch yaw, baseline, pitch, roll, focal ratio, the pictures' sharpness and,
+        with a plan, fixed features. The first eight surveys say what is normal. The exit code is 5 where a
+        chart alarms, the rig has drifted, or a lens is dirty; an alarm stands until a calibration is
+        approved.
+
+        Args:
+            recording: An ordinary survey with travel.
+            record: The record of all surveys; it is made where it isn't there.
+            plan: An acceptance plan, whose plates and surveyed spheres are fixed features.
+            yard: The file that barsight calibrate yard wrote.
+            rig: A rig file to use instead of the recording's own calibration.
+            approve: Who puts this survey's calibration into service, after a recalibration; charts begin
+                anew.
+            why: Reason of the approval; needed with it.
+        """
+        if bool(approve) != bool(why):
+            raise ConfigError("verify: --approve and --why go together")
+        expect_output(record, ".json")
+        known = read_watch(record)
+        features = None if plan is None else read_plan(plan)
+        settings = MeasureSettings(yard=yard, recording=RecordingSettings(rig=rig))
+        survey, check, dirty = _look(recording, settings, features)
+        if approve:
+            now = datetime.now(UTC).isoformat(timespec="seconds")
+            given = Approval(approve, why, now, survey.calibration_id, len(known.surveys))
+            known = replace(known, approvals=(*known.approvals, given))
+        known = with_survey(known, survey, record)
+        write_watch(known, record)
+        charts = control_charts(known.since_approval)
+        _print(charts, check, len(known.since_approval))
+        problems = _problems(charts, check) + dirty
+        if problems:
+            raise MeasurementError(f"{recording}: {'; '.join(problems)}")
+
+    call(command, "verify", arguments)
+
+
+def _look(
+    path: Path, settings: MeasureSettings, plan: AcceptancePlan | None
+) -> tuple[WatchedSurvey, RigCheck, list[str]]:
+    """Take a survey's figures; also the rig's check and what is said of dirty lenses."""
+    source = in_yard(open_recording(path, settings.recording), settings.yard)
+    check = check_rig(source, FusionSettings(), CheckSettings(), lambda: None)
+    health = check_pictures(some_frames(source))
+    figures = rig_figures(check) + picture_figures(health)
+    if plan is not None:
+        console = SafeConsole(stderr=True)
+        with tempfile.TemporaryDirectory(prefix="barsight.") as scratch, stages(console) as advance:
+            measure_into(path, Path(scratch) / "out", settings, advance=advance, report=False)
+            seen = observe(Path(scratch) / "out", plan, source.rig, str(path))
+        figures += feature_figures(plan, seen)
+    limit = (ErrorLimits() if plan is None else plan.limits).dirt_pct
+    spoiled = [] if isinstance(health, Failed) else [one for one in health if one.dirt_pct > limit]
+    survey = WatchedSurvey(str(path), recording_id(source.digests()), calibration_id(source.rig), figures)
+    return survey, check, [f"dirty lens of {one.camera}" for one in spoiled]
+
+
+def _problems(charts: Sequence[ControlChart], check: RigCheck) -> list[str]:
+    said = [
+        f"{one.name.partition(' / ')[0]} left its control limits at survey {one.alarmed_at}"
+        for one in charts
+        if one.alarmed_at is not None
+    ]
+    if check.state in (DriftState.RECALIBRATE, DriftState.CONTRADICTION):
+        bad = [line.name for line in check.lines if line.state is check.state]
+        said.append(f"{check.state}: {', '.join(bad)}")
+    return said
+
+
+def _print(charts: Sequence[ControlChart], check: RigCheck, surveys: int) -> None:
+    table = Table(box=SIMPLE_HEAD, title=f"Survey {surveys} since the last approval")
+    for head in ("figure", "now", "normal", "sigma", f"sum (alarm over {ALARM:g})", ""):
+        table.add_column(head, justify="left" if head in ("figure", "") else "right")
+    for one in charts:
+        state = "learning" if one.mean != one.mean else "good" if one.alarmed_at is None else "alarm"
+        cells = [f"{number:.4g}" for number in (one.value, one.mean, one.sigma, one.cusum)]
+        table.add_row(one.name, *(["-" if cell == "nan" else cell for cell in cells]), state)
+    console = SafeConsole()
+    console.print(table)
+    console.print(f"rig: {check.state}", highlight=False)

@@ -1,0 +1,157 @@
+"""Serve the telegram in a process of its own, so that nothing else delays its cycle.
+
+On a busy computer a thread waits for the interpreter's lock while the thread that has it waits for a core.
+So states go to the process as they are read, and commands come back. It dies with its parent, and a state
+that is no longer renewed isn't valid.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable
+from functools import partial
+from multiprocessing.connection import Connection
+from typing import Any, cast
+
+from barsight.core.errors import BarsightError, OutputError
+from barsight.plant.feed import StateFeed, aged
+from barsight.plant.serving import TelegramServer
+from barsight.plant.settings import TelegramSettings
+from barsight.plant.state import PlantState
+from barsight.plant.steps import LiftSteps
+
+SEND_EVERY_S = 0.05
+START_S = 120.0
+
+
+async def serve_telegram(
+    settings: TelegramSettings, feed: StateFeed, steps: LiftSteps, say: Callable[[str], None]
+) -> None:
+    """Serve until cancelled. Raises OutputError where the address can't be had or the process ends."""
+    context = multiprocessing.get_context("spawn")
+    states, states_there = context.Pipe()
+    calls, calls_there = context.Pipe()
+    process = context.Process(
+        target=_serve, args=(settings, states_there, calls_there), daemon=True, name="telegram"
+    )
+    await asyncio.to_thread(process.start)
+    states_there.close()
+    calls_there.close()
+    stop, at = threading.Event(), f"telegram at {settings.host}"
+    threads = [
+        threading.Thread(target=_send_states, args=(states, feed, stop), name="telegram states", daemon=True),
+        threading.Thread(target=_answer_calls, args=(calls, feed, steps), name="telegram calls", daemon=True),
+    ]
+    try:
+        begun = await asyncio.to_thread(_begun, calls)
+        if isinstance(begun, str):
+            raise OutputError(f"{at}:{settings.port}: {begun}; choose another address")
+        say(f"{at}:{begun}")
+        for thread in threads:
+            thread.start()
+        while process.is_alive():
+            await asyncio.sleep(0.1)
+        raise OutputError(f"{at}: its process ended")
+    finally:
+        stop.set()
+        process.kill()
+        await asyncio.to_thread(process.join)
+        for thread in threads:
+            if thread.ident is not None:
+                await asyncio.to_thread(thread.join, 5)
+        states.close()
+        calls.close()
+
+
+def _begun(calls: Connection) -> int | str:
+    """Wait for the process: return the port that it listens at, or why it doesn't."""
+    with contextlib.suppress(EOFError, OSError):
+        if calls.poll(START_S):
+            told: int | str = calls.recv()
+            return told
+    return "its process didn't start"
+
+
+def _send_states(states: Connection, feed: StateFeed, stop: threading.Event) -> None:
+    with contextlib.suppress(OSError):
+        while not stop.wait(SEND_EVERY_S):
+            states.send(feed.read())
+
+
+def _answer_calls(calls: Connection, feed: StateFeed, steps: LiftSteps) -> None:
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            step, arguments = calls.recv()
+            answer: Any
+            try:
+                answer = getattr(feed if step == "refresh" else steps, step)(*arguments)
+            except BarsightError as error:
+                answer = _Unreached(str(error))
+            calls.send(answer)
+
+
+class _Unreached(str):
+    """The text of an error that a step ended in."""
+
+
+class _SentFeed:
+    """The newest state that the parent sent; the process ends where no more can come."""
+
+    def __init__(self, states: Connection, calls: _Calls) -> None:
+        self._states, self._calls = states, calls
+        self._read: tuple[PlantState, float] | None = None
+        threading.Thread(target=self._receive, daemon=True).start()
+
+    def newest(self, life_counter: int) -> PlantState:
+        """Return the newest state with the telegram's life counter; not valid where it is old."""
+        if self._read is None:
+            told = ("starting: no state was read yet",)
+            return PlantState("idle", False, told, life_counter, time.time_ns(), "none")
+        return aged(*self._read, life_counter)
+
+    def refresh(self) -> None:
+        """Let the parent read the state now."""
+        self._calls.ask("refresh")
+
+    def _receive(self) -> None:
+        try:
+            while True:
+                self._read = self._states.recv()
+        except (EOFError, OSError):
+            os._exit(1)
+
+
+class _Calls:
+    """The steps of `LiftSteps` by their names, each taken by the parent, one at a time."""
+
+    def __init__(self, calls: Connection) -> None:
+        self._calls, self._turn = calls, threading.Lock()
+
+    def __getattr__(self, step: str) -> Callable[..., Any]:
+        return partial(self.ask, step)
+
+    def ask(self, step: str, *arguments: Any) -> Any:
+        """Ask the parent. Raises BarsightError where the step couldn't be judged."""
+        with self._turn:
+            self._calls.send((step, arguments))
+            answer = self._calls.recv()
+        if isinstance(answer, _Unreached):
+            raise BarsightError(answer)
+        return answer
+
+
+def _serve(settings: TelegramSettings, states: Connection, calls: Connection) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which ends this one
+    asked = _Calls(calls)
+    server = TelegramServer(_SentFeed(states, asked), cast(LiftSteps, asked), settings)
+    try:
+        asyncio.run(server.run(calls.send))
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            calls.send(str(error))

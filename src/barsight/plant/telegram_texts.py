@@ -1,0 +1,79 @@
+"""Write the telegram's table as a page of the reference and as a source for TIA Portal (SCL)."""
+
+from __future__ import annotations
+
+from barsight.plant.telegram import VERSION, layout, table_of
+
+_NAMES = {"out": "BarsightOut", "in": "BarsightIn"}
+_ABOUT = {"out": "From Barsight to the PLC", "in": "From the PLC to Barsight"}
+_SCL = {"u16": "UInt", "u32": "UDInt", "i32": "DInt", "i64": "LInt"}
+_JUDGE = """
+FUNCTION_BLOCK "BarsightJudge"
+{ S7_Optimized_Access := 'TRUE' }
+VERSION : 0.1
+   VAR_INPUT
+      silent : Time := T#300ms;   // Barsight's life counter may stand for so long
+   END_VAR
+   VAR_OUTPUT
+      isValid : Bool;   // Only then may a lift be claimed, or begun after `executing` was answered with 1
+   END_VAR
+   VAR
+      life : UInt;
+      hasLife : Bool;
+      timer : TON_TIME;
+   END_VAR
+BEGIN
+   #timer(IN := #hasLife AND ("BarsightOutDB".telegram."life" = #life), PT := #silent);
+   #life := "BarsightOutDB".telegram."life";
+   #hasLife := TRUE;
+   #isValid := NOT #timer.Q
+      AND ("BarsightOutDB".telegram."magic" = {magic})
+      AND ("BarsightOutDB".telegram."version" = {version})
+      AND (("BarsightOutDB".telegram."status" AND 1) = 1);
+END_FUNCTION_BLOCK
+"""
+
+
+def fields_at(side: str) -> list[tuple[int, str, str, str]]:
+    """List a side's fields: offset, name, type, meaning."""
+    at, found = 0, []
+    for name, kind, meaning in table_of(side):
+        found.append((at, name, kind, meaning))
+        at += int(kind[1:]) // 8
+    return found
+
+
+def telegram_page() -> str:
+    """Write the page of the reference: each side's bytes."""
+    lines = [
+        "# Telegram\n\nThe bytes of the cyclic telegram ([how to connect](../how-to/connect-a-plant.md)) and "
+        f"of the S7 exchange, version {VERSION}. Big-endian unless `byte_order` says otherwise, no gaps. "
+        "`barsight plant scl` writes them as a source for TIA Portal.\n"
+    ]
+    for side in ("out", "in"):
+        lines.append(f"\n## {_ABOUT[side]}: {layout(side).size} bytes\n\n")
+        lines.append("| byte | field | type | meaning |\n|---|---|---|---|\n")
+        lines += [f"| {at} | `{name}` | {kind} | {told} |\n" for at, name, kind, told in fields_at(side)]
+    return "".join(lines)
+
+
+def scl_source() -> str:
+    """Write a source for TIA Portal: both sides' types and data blocks, and the judgement of Barsight's life.
+
+    For S7-1500, whose 64-bit integers the stamps need.
+    """
+    lines = ["// Made by `barsight plant scl` from the telegram's table. The number after // is the byte.\n"]
+    for side in ("out", "in"):
+        lines.append(f'\nTYPE "{_NAMES[side]}"\nVERSION : 0.1\n   STRUCT\n')
+        lines += [
+            f'      "{name}" : {_SCL[kind]};   // {at}: {told}\n' for at, name, kind, told in fields_at(side)
+        ]
+        lines.append("   END_STRUCT;\nEND_TYPE\n")
+    for side in ("out", "in"):
+        lines.append(
+            f"\nDATA_BLOCK \"{_NAMES[side]}DB\"\n{{ S7_Optimized_Access := 'FALSE' }}\nVERSION : 0.1\n"
+            f'   STRUCT\n      telegram : "{_NAMES[side]}";\n   END_STRUCT;\nBEGIN\nEND_DATA_BLOCK\n'
+        )
+    magic = {name: told for name, _, told in table_of("out")}["magic"]
+    judge = _JUDGE.replace("{magic}", f"16#{magic.removeprefix('0x')}").replace("{version}", str(VERSION))
+    return "".join([*lines, judge])

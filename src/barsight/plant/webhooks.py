@@ -1,0 +1,115 @@
+"""Post each change of the state to addresses of the yard management, in order, until each is taken."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import http.client
+import json
+import threading
+import urllib.error
+import urllib.request
+from collections import deque
+from typing import Any
+
+from barsight.core.errors import BarsightError
+from barsight.core.json_values import json_value
+from barsight.core.reading.bounded_reading import read_text
+from barsight.plant.link_settings import WebhookSettings
+
+FIRST_RETRY_S = 0.2
+SIGNATURE = "X-Barsight-Signature"
+
+
+class _NoRedirect(urllib.request.HTTPRedirectHandler):
+    def redirect_request(self, req: Any, fp: Any, code: int, msg: str, headers: Any, newurl: str) -> None:
+        return None
+
+
+class Webhook:
+    """One address, with the changes that wait for it and a thread that posts them.
+
+    A change is posted until the address answers with 2xx: it may come twice, with the same `id`. What is
+    answered with 4xx is dropped, but for 408 and 429: it would be refused again. `lost` counts what was
+    dropped before a post.
+    """
+
+    def __init__(self, url: str, settings: WebhookSettings) -> None:
+        self.url = url
+        self._settings = settings
+        self._waiting: deque[tuple[int, dict[str, Any]]] = deque()
+        self._lock = threading.Lock()
+        self._numbers = 0
+        self._lost = 0
+        self._problem: str | None = None
+        self._changed, self._stop = threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=self._run, name="webhook", daemon=True)
+        self._thread.start()
+
+    @property
+    def waiting(self) -> int:
+        """Count the changes that wait."""
+        return len(self._waiting)
+
+    @property
+    def problem(self) -> str | None:
+        """Tell why the last post was not taken, None where it was."""
+        return self._problem
+
+    def tell(self, change: dict[str, Any]) -> None:
+        """Add a change; the oldest goes where too many wait."""
+        with self._lock:
+            self._numbers += 1
+            if len(self._waiting) >= self._settings.max_waiting:
+                self._waiting.popleft()
+                self._lost += 1
+            self._waiting.append((self._numbers, change))
+        self._changed.set()
+
+    def stop(self) -> None:
+        """End the thread; what waits is dropped."""
+        self._stop.set()
+        self._changed.set()
+        self._thread.join(self._settings.timeout_s + 1)
+
+    def _run(self) -> None:
+        wait_s = FIRST_RETRY_S
+        while not self._stop.is_set():
+            with self._lock:
+                first = self._waiting[0] if self._waiting else None
+                lost = self._lost
+                if first is None:
+                    self._changed.clear()
+            if first is None:
+                self._changed.wait()
+                continue
+            problem, is_final = post(self.url, self._settings, {"id": first[0], "lost": lost, **first[1]})
+            self._problem = problem
+            if problem is None or is_final:
+                wait_s = FIRST_RETRY_S
+                with self._lock:
+                    self._lost -= lost
+                    if self._waiting and self._waiting[0] is first:
+                        self._waiting.popleft()
+                continue
+            self._stop.wait(wait_s)
+            wait_s = min(2 * wait_s, self._settings.max_retry_s)
+
+
+def post(url: str, settings: WebhookSettings, body: dict[str, Any]) -> tuple[str | None, bool]:
+    """Post a body once; return the problem, None where it was taken, and whether a retry would be in vain."""
+    content = json.dumps(json_value(body), allow_nan=False).encode()
+    headers = {"Content-Type": "application/json"}
+    opener = urllib.request.build_opener(_NoRedirect)
+    try:
+        if settings.secret_file is not None:
+            secret = (read_text(settings.secret_file).splitlines() or [""])[0].encode()
+            headers[SIGNATURE] = "sha256=" + hmac.new(secret, content, hashlib.sha256).hexdigest()
+        request = urllib.request.Request(url, content, headers, method="POST")
+        with opener.open(request, timeout=settings.timeout_s):
+            return None, False
+    except urllib.error.HTTPError as error:
+        error.close()
+        return f"answered with {error.code}", 400 <= error.code < 500 and error.code not in (408, 429)
+    except (BarsightError, OSError, ValueError, http.client.HTTPException) as error:
+        return str(error), False

@@ -1,0 +1,128 @@
+"""The watch over the years: false alarms, a jump, approvals, and the command on a simulated survey."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from barsight.acceptance.watch import (
+    Approval,
+    WatchedFigure,
+    WatchedSurvey,
+    WatchRecord,
+    control_charts,
+    read_watch,
+    with_survey,
+    write_watch,
+)
+from barsight.cli.main import run
+from barsight.core.errors import InputError
+
+SIGMAS = {"yaw / deg": 0.0018, "baseline / %": 0.05, "pitch / deg": 0.0014, "sharpness of cam0 / log": 0.15}
+
+
+def survey(number: int, rng: np.random.Generator, yaw_deg: float = 0.0, id_: str = "cal") -> WatchedSurvey:
+    """Draw a healthy survey with a constant offset of its own calibration; yaw_deg: a jump."""
+    figures = tuple(
+        WatchedFigure(name, 2 * sigma + rng.normal(0, sigma) + yaw_deg * (name == "yaw / deg"), sigma)
+        for name, sigma in SIGMAS.items()
+    )
+    return WatchedSurvey(f"rec{number}", f"id{number}", id_, figures)
+
+
+def first_alarm(surveys: list[WatchedSurvey]) -> int | None:
+    alarms = [chart.alarmed_at for chart in control_charts(surveys) if chart.alarmed_at is not None]
+    return min(alarms, default=None)
+
+
+def false_alarms(runs: int, surveys: int, seed: int) -> int:
+    found = 0
+    for number in range(runs):
+        rng = np.random.default_rng((seed, number))
+        found += first_alarm([survey(k, rng) for k in range(surveys)]) is not None
+    return found
+
+
+def late_alarms(runs: int, seed: int) -> int:
+    """Jumps of 0.01 degrees after ten surveys that aren't told within three."""
+    late = 0
+    for number in range(runs):
+        rng = np.random.default_rng((seed, number))
+        drawn = [survey(k, rng) for k in range(10)]
+        drawn += [survey(k, rng, yaw_deg=0.01) for k in range(10, 13)]
+        alarm = first_alarm(drawn)
+        late += alarm is None or alarm <= 10
+    return late
+
+
+def test_healthy_surveys_are_quiet_and_a_jump_is_told_within_three() -> None:
+    assert false_alarms(4, 1000, 31) == 0
+    assert late_alarms(100, 32) <= 1
+
+
+@pytest.mark.slow
+def test_forty_thousand_healthy_surveys_alarm_at_most_forty_times() -> None:
+    assert false_alarms(40, 1000, 33) <= 40
+    assert late_alarms(200, 34) <= 4
+
+
+def test_a_slow_drift_is_told_too() -> None:
+    rng = np.random.default_rng(35)
+    drawn = [survey(k, rng, yaw_deg=4e-4 * max(k - 10, 0)) for k in range(60)]
+    chart = next(one for one in control_charts(drawn) if one.name == "yaw / deg")
+    assert chart.alarmed_at is not None and 15 < chart.alarmed_at < 40
+    assert first_alarm(drawn[:15]) is None
+
+
+def test_what_is_normal_is_learned_first() -> None:
+    rng = np.random.default_rng(36)
+    drawn = [survey(k, rng, yaw_deg=0.05 * (k == 7)) for k in range(8)]
+    assert all(np.isnan(one.mean) for one in control_charts(drawn[:7]))
+    assert first_alarm(drawn) is None
+
+
+def test_an_approval_begins_charts_anew(tmp_path: Path) -> None:
+    rng, path = np.random.default_rng(37), tmp_path / "watch.json"
+    record = WatchRecord()
+    for k in range(15):
+        record = with_survey(record, survey(k, rng, yaw_deg=0.05 * (k > 9)), path)
+    assert first_alarm(list(record.since_approval)) == 11
+    with pytest.raises(InputError, match="approve the new calibration"):
+        with_survey(record, survey(15, rng, id_="other"), path)
+    with pytest.raises(InputError, match=r"is in watch\.json already"):
+        with_survey(record, survey(3, rng), path)
+    approval = Approval("N. N.", "knocked", "2026-11-26T12:00:00+00:00", "other", len(record.surveys))
+    record = with_survey(WatchRecord(record.surveys, (approval,)), survey(15, rng, 0.0, "other"), path)
+    write_watch(record, path)
+    assert read_watch(path) == record and len(record.since_approval) == 1
+    assert first_alarm(list(record.since_approval)) is None
+    path.write_text(path.read_text().replace("knocked", "nothing"))
+    with pytest.raises(InputError, match="was changed after it was written"):
+        read_watch(path)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "reason"),
+    [
+        (["nowhere"], 3, "no such file"),
+        (["nowhere", "--approve", "N. N."], 2, "go together"),
+        (["nowhere", "--record", "watch.txt"], 4, "ends in .json"),
+        (["nowhere", "--plan", "plan.toml"], 3, "no such file"),
+    ],
+)
+def test_bad_input(
+    arguments: list[str], code: int, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    assert run(["verify", *arguments]) == code
+    assert reason in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_a_survey_is_verified_once(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    line = ["verify", str(data / "yard_dev"), "--record", str(tmp_path / "watch.json")]
+    assert run(line) == 0
+    assert "learning" in capsys.readouterr().out
+    assert run(line) == 3 and "already" in capsys.readouterr().err
+    assert len(read_watch(tmp_path / "watch.json").surveys) == 1
