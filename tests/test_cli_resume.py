@@ -1,5 +1,6 @@
 """The same files from one recording: killed at any moment and gone on with, whatever is matched early."""
 
+import contextlib
 import json
 import pickle
 from collections.abc import Callable
@@ -8,12 +9,17 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 import pytest
 
 from barsight import map_building, pipeline
 from barsight.calibration.files.rig_file import write_rig_file
-from barsight.checkpoint import checkpoint_folder, checkpointed
+from barsight.calibration.files.yaml_document import write_document
+from barsight.checkpoint import checkpoint_folder, checkpointed, read_checkpoint
 from barsight.cli.main import run
+from barsight.core.errors import BarsightError, Failed, InputError
+from barsight.map_building import inspect_recording
+from barsight.measure_settings import MeasureSettings
 from barsight.recording.base import RecordingSettings
 from barsight.recording.open import open_recording
 from barsight.yard.magnet.description import example_magnet
@@ -233,3 +239,42 @@ def test_torn_checkpoints_are_made_anew(
     for name in SAME:
         assert (out / name).read_bytes() == (one / name).read_bytes(), name
     capsys.readouterr()
+
+
+def test_a_planted_link_or_file_is_refused_and_nothing_behind_it_removed(tmp_path: Path) -> None:
+    (tmp_path / "victim" / "precious").mkdir(parents=True)
+    (tmp_path / "link").symlink_to(tmp_path / "victim")
+    (tmp_path / "file").touch()
+    for root in ("link", "file"):
+        with pytest.raises(InputError, match="no folder of this user's own"):
+            checkpoint_folder(tmp_path / root, "key")
+    own = checkpoint_folder(tmp_path / "own", "key")
+    (own.parent / "stale").symlink_to(tmp_path / "victim")
+    (own.parent / "old").touch()
+    assert checkpoint_folder(tmp_path / "own", "key") == own
+    assert [path.name for path in own.parent.iterdir()] == ["key"]
+    assert (tmp_path / "victim" / "precious").is_dir()
+
+
+@pytest.mark.parametrize("tree", ["[" * 100_000, '{"kind": "Pose", "fields": []}', "5"])
+def test_a_foreign_checkpoint_is_made_anew(tmp_path: Path, tree: str) -> None:
+    np.savez(tmp_path / "trajectory.npz", tree=np.frombuffer(tree.encode(), np.uint8))
+    assert checkpointed(tmp_path, "trajectory", lambda: Failed("made", "anew")) == Failed("made", "anew")
+    assert read_checkpoint(tmp_path / "trajectory.npz") == Failed("made", "anew")
+
+
+def test_another_yard_file_is_another_key(tmp_path: Path) -> None:
+    recording = open_recording(write_euroc(tmp_path))
+    keys = set()
+    for shift_m in (0.0, 5.0, 5.0):
+        content = {"barsight_yard": 1, "yard_from_encoders": np.eye(4).tolist()}
+        content |= {"covariance": (1e-6 * np.eye(6)).tolist()}
+        content["yard_from_encoders"][0][3] = shift_m
+        write_document(tmp_path / "yard.yaml", content)
+        settings = MeasureSettings(yard=tmp_path / "yard.yaml")
+        with contextlib.suppress(
+            BarsightError
+        ):  # the tiny recording can't be measured; its key is made first
+            inspect_recording(recording, settings, tmp_path, tmp_path / "resume")
+        keys.add(next((tmp_path / "resume").iterdir()).name)
+    assert len(keys) == 2

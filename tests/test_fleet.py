@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from sqlalchemy import select
 
-from barsight.core.errors import Failed
+from barsight.core.errors import Failed, InputError
 from barsight.fleet.archive import find_recordings, manifest_digest
 from barsight.fleet.cluster import connect
 from barsight.fleet.comparing import FigureChange, RecordingComparison
@@ -222,3 +222,26 @@ def test_the_listing_knows_its_objects(tmp_path: Path) -> None:
     objects.remove("a/b")
     objects.remove("a/b")
     assert objects.read("a/b") is None
+
+
+def test_torn_documents_of_an_archive_and_a_planted_scratch_folder_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    archive = open_objects(str(tmp_path))
+    for content in ("[" * 100_000, "{", "1" * 500):
+        (tmp_path / "survey.json").write_text(content)
+        with pytest.raises(InputError, match=r"survey\.json"):
+            archive.read_json("survey.json")
+    monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path))
+    (tmp_path / "elsewhere").mkdir()
+    planted = tmp_path / f"barsight-fleet-{os.getuid()}"
+    planted.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(InputError, match="this user alone"):
+        scratch_root()
+    planted.unlink()
+    planted.mkdir()
+    planted.chmod(0o777)
+    with pytest.raises(InputError, match="this user alone"):
+        scratch_root()
+    planted.chmod(0o700)
+    assert scratch_root() == planted

@@ -293,3 +293,24 @@ def test_bad_configurations_and_keys_are_told(tmp_path: Path, capsys: pytest.Cap
     told = read_plant(config)
     assert told.links == ("opcua", "mqtt") and told.opcua is not None and told.mqtt is not None
     assert told.opcua.folder == tmp_path / "pki" and told.mqtt.password_file == tmp_path / "secret"
+
+
+def test_files_of_secrets_that_cannot_be_are_told_at_the_start(tmp_path: Path) -> None:
+    pytest.importorskip("aiomqtt")
+    pytest.importorskip("asyncua")
+    from barsight.plant.link_settings import MqttSettings
+    from barsight.plant.mqtt import MqttPublisher
+    from barsight.plant.opcua.security.access import read_users
+
+    (tmp_path / "empty").touch()
+    MqttPublisher(MqttSettings(password_file=tmp_path / "empty"))
+    for names in (
+        {"password_file": tmp_path / "none"},
+        {"authority": tmp_path / "none"},
+        {"authority": tmp_path / "empty"},
+    ):
+        with pytest.raises(InputError, match=r"none|empty"):
+            MqttPublisher(MqttSettings(**names))
+    (tmp_path / "users.json").write_text("[" * 100_000)
+    with pytest.raises(InputError, match="deep"):
+        read_users(tmp_path / "users.json")

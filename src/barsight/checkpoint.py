@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
+import os
 import shutil
+import stat
 import zipfile
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
@@ -13,7 +16,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from barsight.core.errors import Failed
+from barsight.core.errors import Failed, InputError
 from barsight.core.files import atomic_path
 from barsight.core.motion_detail import InertialStates, MotionDetail, NormalisedResiduals, RelativePoses
 from barsight.core.pose import Pose
@@ -51,22 +54,34 @@ _RECORDS: dict[str, Any] = {
         Failed,
     )
 }
-_TORN = (OSError, EOFError, ValueError, KeyError, TypeError, NotImplementedError, zipfile.BadZipFile)
+_TORN = (
+    OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, RecursionError, NotImplementedError,
+    zipfile.BadZipFile,
+)  # fmt: skip
 """Exceptions of reading a file that is cut short or is something else."""
 
 
 def checkpoint_folder(root: Path, key: str) -> Path:
     """Make the folder of one measurement under `root`; what stands there under other keys is removed.
 
-    key: tells all that the results depend on.
+    key: tells all that the results depend on. Raises InputError where `root` or the folder is a link, a file
+    or another user's: nothing is removed there.
     """
     folder = root / key[:32]
-    root.mkdir(parents=True, exist_ok=True)
+    _make_own(root)
     for other in root.iterdir():
         if other != folder:
-            shutil.rmtree(other)
-    folder.mkdir(exist_ok=True)
+            shutil.rmtree(other) if other.is_dir() and not other.is_symlink() else other.unlink()
+    _make_own(folder)
     return folder
+
+
+def _make_own(folder: Path) -> None:
+    with contextlib.suppress(FileExistsError):
+        folder.mkdir(parents=True)
+    found = folder.lstat()
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid():
+        raise InputError(folder, "is no folder of this user's own", "remove it, or name another OUT")
 
 
 def pictures_digest(recording: Recording) -> str:
@@ -112,7 +127,10 @@ def write_checkpoint(value: Any, path: Path) -> None:
 def read_checkpoint(path: Path) -> Any:
     """Read back what `write_checkpoint` wrote."""
     with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-        return _record(json.loads(file["tree"].tobytes()), file)
+        found = _record(json.loads(file["tree"].tobytes()), file)
+    if not is_dataclass(found):
+        raise ValueError("a checkpoint holds a record")
+    return found
 
 
 def _plain(value: Any, arrays: dict[str, Any]) -> Any:

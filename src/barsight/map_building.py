@@ -167,7 +167,9 @@ def inspect_recording(
     configuration, inputs = to_json(asdict(settings)), source.digests()
     checkpoints = None
     if resume is not None:
-        checkpoints = checkpoint_folder(resume, checkpoint_key(recording, configuration, inputs))
+        frame = frame_of(source)
+        placed = inputs if frame is None else {**inputs, "yard": frame.digest}
+        checkpoints = checkpoint_folder(resume, checkpoint_key(recording, configuration, placed))
     with watch("look"):
         pairs = RectifiedPairs(source, Rectifier(source.rig), checkpoints or scratch, watch)
         first = probe_recording(pairs)

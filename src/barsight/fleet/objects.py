@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from collections.abc import Iterator
@@ -13,6 +12,7 @@ from typing import Any
 
 from barsight.core.errors import ConfigError, InputError
 from barsight.core.extras import extra
+from barsight.core.reading.bounded_reading import parse_json
 
 with extra("fleet"):
     import obstore
@@ -59,9 +59,9 @@ class Objects:
                 return None
 
     def read_json(self, path: str) -> Any:
-        """Read a JSON object; None where there is none."""
+        """Read a JSON object; None where there is none. Raises InputError for one that is torn."""
         data = self.read(path)
-        return None if data is None else json.loads(data)
+        return None if data is None else parse_json(data, f"{self.url}/{path}", "remove it, or write it anew")
 
     def write(self, path: str, data: bytes) -> None:
         """Write an object over what is there."""

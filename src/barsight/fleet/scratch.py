@@ -6,6 +6,7 @@ import contextlib
 import fcntl
 import os
 import shutil
+import stat
 import subprocess
 import sys
 import tempfile
@@ -14,6 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import barsight
+from barsight.core.errors import InputError
 from barsight.core.extras import extra
 
 with extra("fleet"):
@@ -24,9 +26,13 @@ MIN_AGE_S = 60.0
 
 
 def scratch_root() -> Path:
-    """Return this user's folder for all tasks of this machine."""
+    """Return this user's folder for all tasks of this machine. Raises InputError where others have it."""
     root = Path(tempfile.gettempdir()) / f"barsight-fleet-{os.getuid()}"
-    root.mkdir(mode=0o700, exist_ok=True)
+    with contextlib.suppress(FileExistsError):
+        root.mkdir(mode=0o700)
+    found = root.lstat()
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o022:
+        raise InputError(root, "is no folder that this user alone may write to", "remove it, or set TMPDIR")
     return root
 
 

@@ -32,7 +32,7 @@ class LiftClaim:
 
 
 def claim_lift(store: Store, lift: OfferedLift, who: str) -> LiftClaim | Failed:
-    """LiftClaim an offered lift. The same claim again returns the same token; another's is refused."""
+    """Claim an offered lift. The same claim again returns the same token; another's is refused."""
     found = claim_of(store, lift.lift_id)
     if found is None:
         try:

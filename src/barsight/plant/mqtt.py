@@ -16,10 +16,12 @@ import json
 import ssl
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from barsight.core.errors import InputError
 from barsight.core.extras import extra
 from barsight.core.json_values import json_value
 from barsight.core.reading.bounded_reading import read_text
@@ -47,6 +49,7 @@ class MqttPublisher:
 
     def __init__(self, settings: MqttSettings) -> None:
         self._settings = settings
+        self._client = mqtt_clients(settings, "online")
         self._state: str | None = None
         self._events: deque[dict[str, Any]] = deque()
         self._lost = 0
@@ -87,7 +90,7 @@ class MqttPublisher:
         while True:
             began = time.monotonic()
             with contextlib.suppress(aiomqtt.MqttError, OSError):
-                async with mqtt_client(self._settings, "online") as client:
+                async with self._client() as client:
                     self._connections += 1
                     await client.publish(self._topic("online"), "true", qos=1, retain=True)
                     latest = self._state = self._state or latest
@@ -137,15 +140,29 @@ class MqttPublisher:
         return f"{self._settings.prefix}/{name}"
 
 
-def mqtt_client(one: MqttSettings, will: str | None = None) -> aiomqtt.Client:
-    """Make a client of the broker. will: topic below the prefix that tells `false` where it is lost."""
-    password = read_text(one.password_file).splitlines()[0] if one.password_file is not None else None
-    context = ssl.create_default_context(cafile=one.authority) if one.authority is not None else None
+def mqtt_clients(one: MqttSettings, will: str | None = None) -> Callable[[], aiomqtt.Client]:
+    """Read password and authority, and return what makes clients of the broker.
+
+    will: topic below the prefix that tells `false` where a client is lost. Raises InputError.
+    """
+    password = None if one.password_file is None else read_text(one.password_file).partition("\n")[0]
+    context = None if one.authority is None else _context(one.authority)
     last = aiomqtt.Will(f"{one.prefix}/{will}", "false", qos=1, retain=True) if will else None
-    return aiomqtt.Client(
-        one.host, one.port, username=one.user, password=password, keepalive=one.keepalive_s, will=last,
-        timeout=5, tls_context=context, max_queued_outgoing_messages=20, max_inflight_messages=20,
-    )  # fmt: skip
+
+    def client() -> aiomqtt.Client:
+        return aiomqtt.Client(
+            one.host, one.port, username=one.user, password=password, keepalive=one.keepalive_s, will=last,
+            timeout=5, tls_context=context, max_queued_outgoing_messages=20, max_inflight_messages=20,
+        )  # fmt: skip
+
+    return client
+
+
+def _context(authority: Path) -> ssl.SSLContext:
+    try:
+        return ssl.create_default_context(cafile=authority)
+    except OSError as error:
+        raise InputError(authority, f"is no certificate authority ({error})", "give its PEM file") from error
 
 
 def _is_cancelled() -> bool:

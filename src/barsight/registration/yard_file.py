@@ -13,6 +13,7 @@ from barsight.calibration.files.yaml_document import Document, canonical_pose, r
 from barsight.core.arrays import Float64
 from barsight.core.errors import CalibrationError
 from barsight.core.pose import Pose, nearest_rotation
+from barsight.core.reading.bounded_reading import MAX_DOCUMENT_BYTES, read_bytes
 from barsight.registration.yard import YardCalibration
 
 FRAMES = ("world", "encoders", "body")
@@ -84,7 +85,7 @@ def read_yard_file(path: Path) -> YardFrame:
         path, pose, _covariance(document), _attitude(document), owners["calibration_id"],
         owners["mounting_id"], owners["recording_id"],
         tuple(str(one) for one in doubts) if isinstance(doubts, list) else (),
-        hashlib.sha256(path.read_bytes()).hexdigest(),
+        hashlib.sha256(read_bytes(path, MAX_DOCUMENT_BYTES)).hexdigest(),
     )  # fmt: skip
 
 

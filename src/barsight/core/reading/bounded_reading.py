@@ -120,10 +120,22 @@ def read_toml(path: Path, remedy: str = REMEDY, kind: type[InputError] = InputEr
     return content
 
 
+def parse_json(data: bytes, source: str, remedy: str = REMEDY) -> Any:
+    """Parse a JSON document that came from elsewhere than a file. Raises InputError, naming `source`."""
+    if len(data) > MAX_DOCUMENT_BYTES:
+        raise InputError(source, f"has {len(data)} bytes, at most {MAX_DOCUMENT_BYTES} are read", remedy)
+    return _told(source, "JSON", _parse_json, data.decode("utf-8-sig", "replace"), remedy, InputError)
+
+
 def _parsed(
     path: Path, form: str, parse: Callable[[str], Any], max_bytes: int, remedy: str, kind: type[InputError]
 ) -> Any:
-    text = read_text(path, max_bytes, remedy, kind)
+    return _told(path, form, parse, read_text(path, max_bytes, remedy, kind), remedy, kind)
+
+
+def _told(
+    path: Path | str, form: str, parse: Callable[[str], Any], text: str, remedy: str, kind: type[InputError]
+) -> Any:
     try:
         return parse(text)
     except RecursionError:

@@ -31,7 +31,7 @@ Check = Callable[[PlantSettings], LinkCheck | Failed]
 
 
 def check_links(settings: PlantSettings, seconds: float) -> tuple[LinkCheck, ...]:
-    """Check each link that is configured; nothing is claimed and nothing of the plant's is written.
+    """Check each link that is configured; nothing is claimed, and no data block of the PLC is written.
 
     seconds: for the telegram's cycle.
     """

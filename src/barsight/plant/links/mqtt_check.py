@@ -11,7 +11,7 @@ import time
 
 from barsight.core.errors import Failed
 from barsight.plant.link_settings import MqttSettings
-from barsight.plant.mqtt import MqttError, mqtt_client
+from barsight.plant.mqtt import MqttError, mqtt_clients
 
 STATES = 20
 WAIT_S = 5.0
@@ -29,7 +29,7 @@ def check_mqtt(settings: MqttSettings) -> tuple[tuple[str, ...], bool] | Failed:
 
 async def _read(settings: MqttSettings) -> tuple[tuple[str, ...], bool]:
     online, stamps, lives, last, retained = "", list[float](), list[int](), "", False
-    async with asyncio.timeout(WAIT_S), mqtt_client(settings) as client:
+    async with asyncio.timeout(WAIT_S), mqtt_clients(settings)() as client:
         await client.subscribe(f"{settings.prefix}/#", qos=1)
         async for message in client.messages:
             text = bytes(message.payload).decode() if isinstance(message.payload, bytes | bytearray) else ""
@@ -60,10 +60,10 @@ async def _read(settings: MqttSettings) -> tuple[tuple[str, ...], bool]:
 async def _tells_wills(settings: MqttSettings) -> bool:
     """Lose a client of the check's own, and wait for its last will."""
     topic = f"{settings.prefix}/check"
-    async with mqtt_client(settings) as client:
+    async with mqtt_clients(settings)() as client:
         await client.subscribe(topic, qos=1)
         with contextlib.suppress(MqttError):
-            async with mqtt_client(settings, "check") as lost:
+            async with mqtt_clients(settings, "check")() as lost:
                 lost._client.socket().shutdown(socket.SHUT_RDWR)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(WAIT_S):

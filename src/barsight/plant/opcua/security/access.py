@@ -16,7 +16,7 @@ from typing import Any
 from barsight.core.errors import ConfigError, InputError
 from barsight.core.extras import extra
 from barsight.core.files import atomic_path
-from barsight.core.reading.bounded_reading import read_text
+from barsight.core.reading.bounded_reading import read_json
 from barsight.plant.link_settings import OPCUA_ROLES, OpcUaSettings
 from barsight.plant.opcua.security.binding import (
     InternalServer,
@@ -72,7 +72,7 @@ def read_users(path: Path | None) -> dict[str, OpcUaUser]:
     if path is None or not path.exists():
         return {}
     try:
-        content = json.loads(read_text(path))
+        content = read_json(path, "write it anew")
         users = {str(name): OpcUaUser(**fields) for name, fields in content.items()}
         for user in users.values():
             bytes.fromhex(user.salt), bytes.fromhex(user.digest)
