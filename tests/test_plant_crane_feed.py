@@ -13,7 +13,8 @@ pytest.importorskip("sqlalchemy")
 
 from barsight.core.errors import Failed
 from barsight.plant import feed as feed_module
-from barsight.plant.feed import StateFeed, is_crane
+from barsight.plant.crane_names import is_crane
+from barsight.plant.feed import StateFeed
 from barsight.plant.handshake import LiftClaim
 from barsight.plant.partner import PlcPartner
 from barsight.plant.settings import LiveSource, PlantCrane, PlantSettings, StoreSource

@@ -9,8 +9,8 @@ import numpy as np
 
 from barsight.core.errors import Failed
 from barsight.plant.state import YAW_SENSE, OfferedLift, PlantState
-from barsight.plant.telegram import layout, out_values, pack, unpack
-from barsight.plant.telegram_texts import fields_at, scl_source
+from barsight.plant.telegram import fields_at, layout, out_values, pack, unpack
+from barsight.plant.telegram_texts import scl_source
 from barsight.yard.magnet.footprint import Placement
 from lift_yards import judged, laid, record
 

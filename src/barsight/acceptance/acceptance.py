@@ -21,7 +21,7 @@ from barsight.map_building import ProgressCallback
 from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings
 from barsight.motion.batch.fusion import FusionSettings
-from barsight.motion.rig_check.drift_check import CheckSettings, DriftState, RigCheck, check_rig
+from barsight.motion.rig_check.drift_check import CheckSettings, RigCheck, check_rig
 from barsight.recording.base import Recording
 from barsight.recording.open import open_recording
 from barsight.yard_frame import in_yard
@@ -44,9 +44,7 @@ class Acceptance:
     @property
     def is_passed(self) -> bool:
         """Check that every quantity passed, nothing wrong is named and no recording shows a drifted rig."""
-        sound = not self.causes and not any(
-            one.state in (DriftState.RECALIBRATE, DriftState.CONTRADICTION) for one in self.rig
-        )
+        sound = not self.causes and not any(one.is_bad for one in self.rig)
         return sound and all(one.decision is Decision.PASSED for one in self.quantities)
 
 
@@ -64,13 +62,20 @@ def accept(
         measure_into(path, folder, settings, advance=advance, report=False)
         source = in_yard(open_recording(path, settings.recording), settings.yard)
         seen.append(observe(folder, plan, source.rig, str(path)))
-        rig.append(check_rig(source, FusionSettings(), CheckSettings(), lambda: None))
-        pictures.append(check_pictures(some_frames(source)))
+        check, health = look_at_rig(source)
+        rig.append(check)
+        pictures.append(health)
         inputs[str(path)] = dict(source.digests())
     _expect_one_rig(seen)
     judged = judge_all(plan, seen) + tuple(_dirt(pictures, plan.limits))
     causes = name_causes(plan, seen, rig, pictures)
     return Acceptance(plan, tuple(seen), judged, tuple(rig), tuple(pictures), causes, inputs)
+
+
+def look_at_rig(source: Recording) -> tuple[RigCheck, tuple[PictureHealth, ...] | Failed]:
+    """Check what travel and rows show of the rig, and the pictures' health."""
+    check = check_rig(source, FusionSettings(), CheckSettings(), lambda: None)
+    return check, check_pictures(_some_frames(source))
 
 
 def _expect_one_rig(seen: Sequence[Observation]) -> None:
@@ -82,7 +87,7 @@ def _expect_one_rig(seen: Sequence[Observation]) -> None:
                 raise InputError(other.recording, problem, "accept one rig at a time")
 
 
-def some_frames(source: Recording) -> Iterator[StereoFrame]:
+def _some_frames(source: Recording) -> Iterator[StereoFrame]:
     """Yield frames spread evenly over a recording, as many as the check of the pictures takes."""
     stamps = list(source.index.stamps_ns)
     chosen = np.linspace(0, max(len(stamps) - 1, 0), min(FRAMES, len(stamps))).astype(int)

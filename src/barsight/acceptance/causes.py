@@ -21,7 +21,7 @@ SPHERE_PX, SPHERE_MM = 0.03, 1.5
 PLACE_PX, PLACE_MM = 0.2, 1.0
 """The same across, in pixels on the ground."""
 CLEAR = 9.0
-"""By how much chi-square must fall for a cause to be named: three sigma."""
+"""Least fall of chi-square for which a cause is named: three sigma."""
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -11,10 +9,11 @@ from pathlib import Path
 
 from barsight.acceptance.certificate import CommissioningStep
 from barsight.core.errors import InputError
-from barsight.core.json_values import json_digest
+from barsight.core.json_values import json_digest, json_value
 from barsight.core.reading.sealed_json import read_sealed, write_sealed
 from barsight.core.settings.file import read_settings
 from barsight.core.settings.values import POSITIVE, expect_ranges, expect_values
+from barsight.result_folder import file_digest
 
 RECORD, SETTINGS = "commissioning.json", "commission.toml"
 SCHEMA_VERSION = 1
@@ -123,7 +122,7 @@ def read_done(folder: Path) -> tuple[DoneStep, ...]:
 
 def _write_done(folder: Path, done: Sequence[DoneStep]) -> None:
     content = {"schema_version": SCHEMA_VERSION, "steps": [asdict(one) for one in done]}
-    write_sealed(json.loads(json.dumps(content)), folder / RECORD)
+    write_sealed(json_value(content), folder / RECORD)
 
 
 def _digest(folder: Path, names: Sequence[str]) -> str:
@@ -135,6 +134,6 @@ def _digest(folder: Path, names: Sequence[str]) -> str:
             if not file.is_file():
                 continue
             small = file.stat().st_size < 1 << 24 and file.suffix not in (".png", ".jpg", ".tif", ".ply")
-            content = hashlib.sha256(file.read_bytes()).hexdigest() if small else str(file.stat().st_size)
+            content = file_digest(file) if small else str(file.stat().st_size)
             found.append([file.relative_to(folder).as_posix(), content])
     return json_digest(found)

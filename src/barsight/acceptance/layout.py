@@ -33,7 +33,7 @@ BARS = (("bar along", "monument 3", "monument 5"), ("bar across", "monument 4", 
         ("bar aslant", "monument 1", "monument 4"))  # fmt: skip
 DUMMY = ("dummy bundle", 0.64, 0.5)
 FLOOR_M = 0.05
-"""What lies lower is floor."""
+"""Greatest height of floor."""
 
 
 @dataclass(frozen=True)

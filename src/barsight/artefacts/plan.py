@@ -192,7 +192,7 @@ class AmbientConditions:
     expansion_per_k: float = 11.5e-6
     degrees_of_freedom: float = 50.0
     search_m: float = 0.25
-    """How far from where the plan says an artefact is looked for."""
+    """Radius about its planned place in which an artefact is sought."""
 
     def __post_init__(self) -> None:
         expect_ranges(

@@ -25,7 +25,7 @@ _BELOW_M = 1.0
 
 def label_bundles(
     pairs: RectifiedPairs, poses: Mapping[int, Pose], heights: YardMap, bundles: tuple[Bundle, ...]
-) -> tuple[Bundle, ...]:  # fmt: skip
+) -> tuple[Bundle, ...]:
     """Read the codes in the pairs that have a pose, and give each bundle its label.
 
     poses: reference_from_body by stamp. A bundle has a label where one text is sure on it and no other is;

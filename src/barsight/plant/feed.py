@@ -10,6 +10,7 @@ from types import TracebackType
 from typing import Protocol
 
 from barsight.core.errors import BarsightError
+from barsight.plant.crane_names import is_crane
 from barsight.plant.live_folder import with_live_run
 from barsight.plant.settings import PlantSettings
 from barsight.plant.state import CranePose, PlantState, PlcReading, state_of_store
@@ -21,7 +22,7 @@ MAX_AGE_S = 0.3
 READ_EVERY_S = 0.1
 JUDGE_EVERY_S = 1.0
 PLC_SILENT_S = 1.0
-"""What a PLC told of the crane is told for so long."""
+"""Greatest age of a PLC's reading that is told."""
 WHO = "barsight plant"
 
 
@@ -96,11 +97,6 @@ class StateFeed:
                 with contextlib.suppress(BarsightError):  # a store that is away comes back
                     expire_stale(self._store, WHO)  # in the store, so that no clock set back revives an offer
                     expire_claims(self._store, WHO, self._settings.store.claim_s, is_crane)
-
-
-def is_crane(who: str) -> bool:
-    """Tell a crane's name in the store from a person's, whose confirmations last as long as their map."""
-    return who.startswith("plc ") or who.endswith(" by OPC UA")
 
 
 def aged(state: PlantState, read_s: float, life_counter: int) -> PlantState:

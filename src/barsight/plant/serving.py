@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 
 from barsight.core.errors import Failed
+from barsight.plant.crane_names import plc_name
 from barsight.plant.feed import TellsState
 from barsight.plant.partner import PlcPartner
 from barsight.plant.settings import TelegramSettings
@@ -50,7 +51,7 @@ class TelegramServer:
 
     async def _exchange(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         one = self._settings
-        name = "plc {}".format(writer.get_extra_info("peername")[0])  # as it is after a new connection
+        name = plc_name(writer.get_extra_info("peername")[0])  # as it is after a new connection
         partner = PlcPartner(name, self._steps, one.silent_s)
         writer.transport.set_write_buffer_limits(high=0)  # what isn't sent at once grows old
         listening = asyncio.create_task(self._listen(reader, partner))

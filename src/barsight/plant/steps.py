@@ -87,9 +87,7 @@ class LiftSteps:
         return claim
 
 
-def take_named_step(
-    steps: LiftSteps, step: str, who: str, arguments: Mapping[str, Any]
-) -> str | Failed:  # fmt: skip
+def take_named_step(steps: LiftSteps, step: str, who: str, arguments: Mapping[str, Any]) -> str | Failed:
     """Take a step by its name with the arguments that OPC UA's methods have; return the token as text.
 
     mass_kg: 0 or less where the load wasn't weighed.

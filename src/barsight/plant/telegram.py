@@ -23,6 +23,20 @@ def table_of(side: str) -> tuple[tuple[str, str, str], ...]:
     return tuple((name, kind, told) for name, kind, told in read_toml(TABLE)[side]["fields"])
 
 
+def fields_at(side: str) -> list[tuple[int, str, str, str]]:
+    """List a side's fields: offset, name, type, meaning."""
+    at, found = 0, []
+    for name, kind, meaning in table_of(side):
+        found.append((at, name, kind, meaning))
+        at += width_of(kind)
+    return found
+
+
+def width_of(kind: str) -> int:
+    """Return the bytes that a field's type takes."""
+    return int(kind[1:]) // 8
+
+
 @cache
 def layout(side: str, byte_order: str = "big") -> struct.Struct:
     """Form the layout of a side in a byte order."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from barsight.plant.telegram import VERSION, layout, table_of
+from barsight.plant.telegram import VERSION, fields_at, layout, table_of
 
 _NAMES = {"out": "BarsightOut", "in": "BarsightIn"}
 _ABOUT = {"out": "From Barsight to the PLC", "in": "From the PLC to Barsight"}
@@ -32,15 +32,6 @@ BEGIN
       AND (("BarsightOutDB".telegram."status" AND 1) = 1);
 END_FUNCTION_BLOCK
 """
-
-
-def fields_at(side: str) -> list[tuple[int, str, str, str]]:
-    """List a side's fields: offset, name, type, meaning."""
-    at, found = 0, []
-    for name, kind, meaning in table_of(side):
-        found.append((at, name, kind, meaning))
-        at += int(kind[1:]) // 8
-    return found
 
 
 def telegram_page() -> str:

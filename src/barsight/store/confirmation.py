@@ -44,14 +44,15 @@ class OpenLift:
 
 
 def newest_survey(connection: Connection) -> Row[Any] | None:
-    """Return the row of the survey with the newest frames, None where there is none."""
+    """Return the row of the survey with the newest frames, without its heights; None where there is none."""
     return connection.execute(_newest_query()).first()
 
 
 @cache
 def _newest_query() -> Select[Any]:
     order = (SURVEYS.c.captured_to_ns.desc(), SURVEYS.c.id.desc())
-    return select(SURVEYS).where(counts()).order_by(*order).limit(1)
+    columns = (column for column in SURVEYS.c if column.name != "heights")
+    return select(*columns).where(counts()).order_by(*order).limit(1)
 
 
 def survey_folder(connection: Connection, map_id: str) -> Path:

@@ -10,5 +10,5 @@ class LabelSettings:
     """The codes on bundles' labels."""
 
     read: bool = False
-    """Whether they are read in the pictures (extra `labels`; a tenth of a second a picture), attached to the
-    bundles and held against the stock list."""
+    """Read them in the pictures (extra `labels`; a tenth of a second a picture), attach them to the bundles
+    and hold them against the stock list."""

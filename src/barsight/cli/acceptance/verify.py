@@ -12,9 +12,8 @@ import tyro
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from barsight.acceptance.acceptance import some_frames
+from barsight.acceptance.acceptance import look_at_rig
 from barsight.acceptance.observation import observe
-from barsight.acceptance.pictures import check_pictures
 from barsight.acceptance.watch import (
     ALARM,
     Approval,
@@ -36,8 +35,7 @@ from barsight.core.errors import ConfigError, Failed, MeasurementError
 from barsight.core.files import expect_output
 from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings
-from barsight.motion.batch.fusion import FusionSettings
-from barsight.motion.rig_check.drift_check import CheckSettings, DriftState, RigCheck, check_rig
+from barsight.motion.rig_check.drift_check import RigCheck
 from barsight.recording.base import RecordingSettings
 from barsight.recording.open import open_recording
 from barsight.yard_frame import calibration_id, in_yard, recording_id
@@ -99,8 +97,7 @@ def _look(
 ) -> tuple[WatchedSurvey, RigCheck, list[str]]:
     """Take a survey's figures; also the rig's check and what is said of dirty lenses."""
     source = in_yard(open_recording(path, settings.recording), settings.yard)
-    check = check_rig(source, FusionSettings(), CheckSettings(), lambda: None)
-    health = check_pictures(some_frames(source))
+    check, health = look_at_rig(source)
     figures = rig_figures(check) + picture_figures(health)
     if plan is not None:
         console = SafeConsole(stderr=True)
@@ -120,7 +117,7 @@ def _problems(charts: Sequence[ControlChart], check: RigCheck) -> list[str]:
         for one in charts
         if one.alarmed_at is not None
     ]
-    if check.state in (DriftState.RECALIBRATE, DriftState.CONTRADICTION):
+    if check.is_bad:
         bad = [line.name for line in check.lines if line.state is check.state]
         said.append(f"{check.state}: {', '.join(bad)}")
     return said

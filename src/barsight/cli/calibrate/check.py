@@ -18,7 +18,7 @@ from barsight.core.errors import MeasurementError
 from barsight.core.files import expect_output
 from barsight.core.timing import count_frames
 from barsight.motion.batch.fusion import FusionSettings
-from barsight.motion.rig_check.drift_check import CheckSettings, DriftState, RigCheck, check_rig
+from barsight.motion.rig_check.drift_check import BAD_STATES, CheckSettings, DriftState, RigCheck, check_rig
 from barsight.recording.base import RecordingSettings
 from barsight.recording.open import open_recording
 from barsight.report.calibration.rig_check_page import write_rig_check_report
@@ -64,7 +64,7 @@ def run(arguments: Sequence[str]) -> None:
         if out is not None:
             write_rig_check_report(check, str(recording), out.with_suffix(".html"), out)
         _print(check, SafeConsole())
-        if check.state in (DriftState.RECALIBRATE, DriftState.CONTRADICTION):
+        if check.is_bad:
             raise MeasurementError(f"{recording}: {check.state}: " + "; ".join(bad_lines(check)))
 
     call(command, "calibrate check", arguments)
@@ -72,8 +72,7 @@ def run(arguments: Sequence[str]) -> None:
 
 def bad_lines(check: RigCheck) -> list[str]:
     """List the lines that are not good, each with its reason."""
-    bad = (DriftState.RECALIBRATE, DriftState.CONTRADICTION)
-    return [f"{line.name}: {line.reason}" for line in check.lines if line.state in bad]
+    return [f"{line.name}: {line.reason}" for line in check.lines if line.state in BAD_STATES]
 
 
 def _print(check: RigCheck, console: Console) -> None:

@@ -64,6 +64,9 @@ class CheckLine:
     reason: str
 
 
+BAD_STATES = (DriftState.RECALIBRATE, DriftState.CONTRADICTION)
+
+
 @dataclass(frozen=True, eq=False)
 class RigCheck:
     """lines: the judged drifts. rows, drift: what was seen, or why not. range_m: the working range."""
@@ -77,8 +80,13 @@ class RigCheck:
     def state(self) -> DriftState:
         """Return the worst of the lines; what one line doesn't see is no fault of the rig."""
         found = {line.state for line in self.lines}
-        order = (DriftState.RECALIBRATE, DriftState.CONTRADICTION, DriftState.GOOD)
+        order = (*BAD_STATES, DriftState.GOOD)
         return next((state for state in order if state in found), DriftState.NOT_SEEN)
+
+    @property
+    def is_bad(self) -> bool:
+        """Tell whether the rig has drifted, or rows and travel contradict each other."""
+        return self.state in BAD_STATES
 
 
 def check_rig(

@@ -1,6 +1,6 @@
 // The yard from above on a canvas: surveys' pictures faded by age, bundles, lifts, vetoes; pan, zoom, pick.
 import { shortWhy, isForbidden } from "./why.js";
-import { t } from "./dom.js";
+import { OPEN_LIFTS, t } from "./dom.js";
 
 const SELECT = "#1d4f91";
 const INK = "#26292b";
@@ -210,7 +210,7 @@ export class YardCanvas {
     const items = new Map(this.items.map((item) => [item.bundle.identity, item]));
     for (const lift of this.data.lifts) {
       const item = items.get(lift.bundles[0]);
-      if (!item || !["offered", "claimed", "executing"].includes(lift.state)) continue;
+      if (!item || !OPEN_LIFTS.includes(lift.state)) continue;
       c.strokeStyle = SELECT;
       c.lineWidth = 3.5;
       c.beginPath(); this.path(c, item);

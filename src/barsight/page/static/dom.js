@@ -45,6 +45,7 @@ export function show(place, ...children) {
   if (focused) document.getElementById(focused)?.focus({ preventScroll: true });
 }
 
+export const OPEN_LIFTS = ["offered", "claimed", "executing"];
 export const metres = (value, digits = 2) => (value === null || value === undefined ? "–" : `${value.toFixed(digits)} m`);
 export const figure = (value, sigma, factor, unit, digits = 0) => {
   if (value === null || value === undefined) return t("unknown");

@@ -1,5 +1,5 @@
 // Screens beside the yard: bundle, lifts, stock, alarms, surveys, health, administration.
-import { ask, h, known, metres, row, show, t, table, tell, timeText, ageText } from "./dom.js";
+import { OPEN_LIFTS, ask, h, known, metres, row, show, t, table, tell, timeText, ageText } from "./dom.js";
 import { change, get, logOut, may, read, session } from "./api.js";
 import { clockNow, figures, liftButtons, liftPanel } from "./yard.js";
 import { vetoText, whyNot } from "./why.js";
@@ -34,7 +34,7 @@ const stepsOf = (one) => h("div", { className: "small" }, h("strong", {}, `${t("
 
 export async function liftScreen(place) {
   const { lifts } = await read("lifts");
-  const open = lifts.filter((one) => ["offered", "claimed", "executing"].includes(one.state)).sort((a, b) => a.rank - b.rank);
+  const open = lifts.filter((one) => OPEN_LIFTS.includes(one.state)).sort((a, b) => a.rank - b.rank);
   const closed = lifts.filter((one) => !open.includes(one));
   show(place,
     h("section", {}, h("h1", {}, t("lifts.open")), open.length ? h("div", { className: "lifts" }, open.map((one) => h("div", { className: "panel", id: `lift-${one.id}` }, h("h2", {}, `${one.rank} · ${one.bundles.join(", ")}`), liftPanel(one)))) : h("p", {}, t("lifts.none"))),

@@ -1,5 +1,5 @@
 // Screen: the yard from above.
-import { ask, h, metres, figure, show, t, ageText, tell, row, table } from "./dom.js";
+import { OPEN_LIFTS, ask, h, metres, figure, show, t, ageText, tell, row, table } from "./dom.js";
 import { change, may, read, session } from "./api.js";
 import { YardCanvas } from "./canvas.js";
 import { whyNot } from "./why.js";
@@ -60,7 +60,7 @@ function sideOf(known) {
   if (!state.survey) return [h("h1", {}, t("yard.empty")), h("p", {}, t("yard.empty.help"))];
   const bundle = bundles.find((one) => one.identity === chosen);
   if (bundle) return bundlePanel(bundle, known);
-  const open = lifts.filter((lift) => ["offered", "claimed", "executing"].includes(lift.state)).sort((a, b) => a.rank - b.rank);
+  const open = lifts.filter((lift) => OPEN_LIFTS.includes(lift.state)).sort((a, b) => a.rank - b.rank);
   const vetoes = state.map_vetoes.map((veto) => h("div", { className: "why" }, h("strong", {}, t(`veto.${veto.code}`)), h("div", { className: "reason" }, `${veto.code}: ${veto.reason}`)));
   return [
     h("h1", {}, t("lifts.open")), vetoes,

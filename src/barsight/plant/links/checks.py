@@ -2,32 +2,20 @@
 
 from __future__ import annotations
 
-import hashlib
 import platform
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Iterator
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 
 import barsight
 from barsight.core.errors import Failed
 from barsight.core.files import atomic_path
+from barsight.plant.link_settings import WebhookSettings
+from barsight.plant.links.link_check import LinkCheck
 from barsight.plant.links.telegram_check import check_telegram
 from barsight.plant.settings import PlantSettings
 from barsight.plant.webhooks import post
-
-
-@dataclass(frozen=True)
-class LinkCheck:
-    """Result of a link's check. lines: for people. is_good: whether the link holds."""
-
-    link: str
-    lines: tuple[str, ...]
-    is_good: bool
-
-
-Check = Callable[[PlantSettings], LinkCheck | Failed]
+from barsight.result_folder import file_digest
 
 
 def check_links(settings: PlantSettings, seconds: float) -> tuple[LinkCheck, ...]:
@@ -35,66 +23,45 @@ def check_links(settings: PlantSettings, seconds: float) -> tuple[LinkCheck, ...
 
     seconds: for the telegram's cycle.
     """
-    checks: dict[str, Check] = {**_CHECKS, "telegram": partial(_telegram, seconds=seconds)}
-    return tuple(_checked(name, checks[name], settings) for name in settings.links)
+    return tuple(
+        LinkCheck(name, (f"{found.reason}; is barsight plant run running?",), False)
+        if isinstance(found, Failed) else found
+        for name, found in _found(settings, seconds)
+    )  # fmt: skip
 
 
-def _checked(name: str, check: Check, all_of: PlantSettings) -> LinkCheck:
-    found = check(all_of)
-    if isinstance(found, Failed):
-        return LinkCheck(name, (f"{found.reason}; is barsight plant run running?",), False)
-    return found
+def _found(settings: PlantSettings, seconds: float) -> Iterator[tuple[str, LinkCheck | Failed]]:
+    """Check link after link; what an extra installs is imported where its link is configured."""
+    if settings.telegram is not None:
+        yield "telegram", check_telegram(settings.telegram, seconds)
+    if settings.opcua is not None:
+        from barsight.plant.links.opcua_check import check_opcua
+
+        yield "opcua", check_opcua(settings.opcua)
+    if settings.mqtt is not None:
+        from barsight.plant.links.mqtt_check import check_mqtt
+
+        yield "mqtt", check_mqtt(settings.mqtt)
+    if settings.s7 is not None:
+        from barsight.plant.links.s7_check import check_s7
+
+        yield "s7", check_s7(settings.s7)
+    if settings.webhooks is not None:
+        yield "webhooks", _check_webhooks(settings.webhooks)
 
 
-def _telegram(settings: PlantSettings, seconds: float) -> LinkCheck | Failed:
-    assert settings.telegram is not None
-    found = check_telegram(settings.telegram, seconds)
-    return found if isinstance(found, Failed) else LinkCheck("telegram", found.lines, found.is_good)
-
-
-def _opcua(settings: PlantSettings) -> LinkCheck | Failed:
-    from barsight.plant.links.opcua_check import check_opcua  # an extra that other links don't need
-
-    assert settings.opcua is not None
-    found = check_opcua(settings.opcua)
-    return found if isinstance(found, Failed) else LinkCheck("opcua", *found)
-
-
-def _mqtt(settings: PlantSettings) -> LinkCheck | Failed:
-    from barsight.plant.links.mqtt_check import check_mqtt  # an extra that other links don't need
-
-    assert settings.mqtt is not None
-    found = check_mqtt(settings.mqtt)
-    return found if isinstance(found, Failed) else LinkCheck("mqtt", *found)
-
-
-def _s7(settings: PlantSettings) -> LinkCheck | Failed:
-    from barsight.plant.links.s7_check import check_s7  # an extra that other links don't need
-
-    assert settings.s7 is not None
-    found = check_s7(settings.s7)
-    return found if isinstance(found, Failed) else LinkCheck("s7", *found)
-
-
-def _webhooks(settings: PlantSettings) -> LinkCheck | Failed:
-    assert settings.webhooks is not None
-    problems = {url: post(url, settings.webhooks, {"event": "check"})[0] for url in settings.webhooks.urls}
+def _check_webhooks(settings: WebhookSettings) -> LinkCheck:
+    problems = {url: post(url, settings, {"event": "check"})[0] for url in settings.urls}
     lines = tuple(f"{url}: {problem or 'takes a post'}" for url, problem in problems.items())
     return LinkCheck("webhooks", lines, not any(problems.values()))
 
 
-_CHECKS: dict[str, Check] = {
-    "opcua": _opcua, "mqtt": _mqtt, "s7": _s7, "webhooks": _webhooks,
-}  # fmt: skip
-
-
 def write_protocol(path: Path, config: Path, checks: tuple[LinkCheck, ...]) -> None:
     """Write what was checked, when, with which plant.toml and with what result, as text."""
-    digest = hashlib.sha256(config.read_bytes()).hexdigest()
     lines = [
         "Barsight: protocol of the plant's links", f"date: {datetime.now(UTC).isoformat(timespec='seconds')}",
         f"computer: {platform.node()}", f"software: barsight {barsight.__version__}",
-        f"configuration: {config.name}, SHA-256 {digest}",
+        f"configuration: {config.name}, SHA-256 {file_digest(config)}",
     ]  # fmt: skip
     for one in checks:
         lines += [

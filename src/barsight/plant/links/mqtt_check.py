@@ -11,13 +11,14 @@ import time
 
 from barsight.core.errors import Failed
 from barsight.plant.link_settings import MqttSettings
+from barsight.plant.links.link_check import LinkCheck
 from barsight.plant.mqtt import MqttError, mqtt_clients
 
 STATES = 20
 WAIT_S = 5.0
 
 
-def check_mqtt(settings: MqttSettings) -> tuple[tuple[str, ...], bool] | Failed:
+def check_mqtt(settings: MqttSettings) -> LinkCheck | Failed:
     """Read the retained topics and some states: lines for people, and whether the link holds."""
     try:
         return asyncio.run(_read(settings))
@@ -27,7 +28,7 @@ def check_mqtt(settings: MqttSettings) -> tuple[tuple[str, ...], bool] | Failed:
         return Failed("mqtt-link", f"{settings.host}:{settings.port}: {error}")
 
 
-async def _read(settings: MqttSettings) -> tuple[tuple[str, ...], bool]:
+async def _read(settings: MqttSettings) -> LinkCheck:
     online, stamps, lives, last, retained = "", list[float](), list[int](), "", False
     async with asyncio.timeout(WAIT_S), mqtt_clients(settings)() as client:
         await client.subscribe(f"{settings.prefix}/#", qos=1)
@@ -54,7 +55,7 @@ async def _read(settings: MqttSettings) -> tuple[tuple[str, ...], bool]:
     )
     tells = await _tells_wills(settings)
     will = "the broker tells the last will of a client that is lost: " + ("yes" if tells else "NO")
-    return (*lines, will), online == "true" and retained and is_alive and tells
+    return LinkCheck("mqtt", (*lines, will), online == "true" and retained and is_alive and tells)
 
 
 async def _tells_wills(settings: MqttSettings) -> bool:

@@ -12,6 +12,7 @@ from typing import Any
 from barsight.core.errors import Failed
 from barsight.core.files import atomic_path
 from barsight.plant.link_settings import OpcUaSettings
+from barsight.plant.links.link_check import LinkCheck
 from barsight.plant.opcua.security.binding import Client, SecurityPolicyBasic256Sha256, ua
 from barsight.plant.opcua.security.certificates import make_certificate
 
@@ -20,7 +21,7 @@ LOOKS, EVERY_S = 10, 0.15
 SHOWN = ("mode", "is_valid", "reasons", "life_counter", "survey", "lift.lift_id", "lift.valid_until_ns")
 
 
-def check_opcua(settings: OpcUaSettings) -> tuple[tuple[str, ...], bool] | Failed:
+def check_opcua(settings: OpcUaSettings) -> LinkCheck | Failed:
     """Connect, read the state again and again: lines for people, and whether the link holds.
 
     With encryption the check makes a certificate, which the server trusts until the check has ended.
@@ -31,7 +32,7 @@ def check_opcua(settings: OpcUaSettings) -> tuple[tuple[str, ...], bool] | Faile
         return Failed("opcua-link", f"{settings.url}: {error or type(error).__name__}")
 
 
-async def _read(settings: OpcUaSettings) -> tuple[tuple[str, ...], bool]:
+async def _read(settings: OpcUaSettings) -> LinkCheck:
     async with _client(settings) as client:
         modes = [
             f"{point.SecurityPolicyUri.rsplit('#')[-1]}, {point.SecurityMode.name.rstrip('_')}"
@@ -57,10 +58,10 @@ async def _read(settings: OpcUaSettings) -> tuple[tuple[str, ...], bool]:
     lines.append("life counter: " + ("moves" if is_alive else "STANDS STILL"))
     if settings.allow_unsecured:
         lines.append("NOT SECURED: opcua.allow_unsecured lets clients in without a certificate")
-        return tuple(lines), is_alive
+        return LinkCheck("opcua", tuple(lines), is_alive)
     is_open = await _lets_in_unsecured(settings)
     lines.append("a client without certificate and encryption: " + ("LET IN" if is_open else "refused"))
-    return tuple(lines), is_alive and not is_open
+    return LinkCheck("opcua", tuple(lines), is_alive and not is_open)
 
 
 async def _lets_in_unsecured(settings: OpcUaSettings) -> bool:

@@ -12,6 +12,7 @@ from typing import Any
 
 from barsight.core.errors import Failed, OutputError
 from barsight.measure_settings import MeasureSettings
+from barsight.plant.crane_names import opcua_name
 from barsight.plant.feed import READ_EVERY_S, StateFeed
 from barsight.plant.link_settings import OpcUaSettings
 from barsight.plant.state import PlantState
@@ -29,7 +30,7 @@ async def serve_opcua(
     from barsight.plant.opcua.surveys import AlarmLine, Survey, Told
 
     def handshake(step: str, who: str, arguments: Mapping[str, Any]) -> str | Failed:
-        taken = take_named_step(steps, step, f"{who} by OPC UA", arguments)
+        taken = take_named_step(steps, step, opcua_name(who), arguments)
         feed.refresh()
         return taken
 

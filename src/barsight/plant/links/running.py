@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
+from typing import Any
 
 from barsight.core.errors import OutputError
 from barsight.plant.feed import READ_EVERY_S, StateFeed
-from barsight.plant.link_settings import WebhookSettings
+from barsight.plant.link_settings import MqttSettings, WebhookSettings
 from barsight.plant.links.changes import changes_between
 from barsight.plant.links.opcua_link import serve_opcua
 from barsight.plant.links.s7_link import serve_s7
@@ -49,7 +50,7 @@ def _links(store: Store, settings: PlantSettings, feed: StateFeed, say: Say) -> 
     if settings.opcua is not None:
         links[f"OPC UA at {settings.opcua.url}"] = serve_opcua(store, settings.opcua, feed, steps, say)
     if settings.mqtt is not None:
-        links[f"MQTT at {settings.mqtt.host}:{settings.mqtt.port}"] = _serve_mqtt(settings, feed, say)
+        links[f"MQTT at {settings.mqtt.host}:{settings.mqtt.port}"] = _serve_mqtt(settings.mqtt, feed, say)
     if settings.s7 is not None:
         links[f"S7 at {settings.s7.host}:{settings.s7.port}"] = serve_s7(settings.s7, feed, steps, say)
     if settings.webhooks is not None:
@@ -57,26 +58,49 @@ def _links(store: Store, settings: PlantSettings, feed: StateFeed, say: Say) -> 
     return links
 
 
+async def _followed(feed: StateFeed) -> AsyncIterator[tuple[PlantState, list[dict[str, Any]]]]:
+    """Yield the newest state again and again, and what has changed since the one before."""
+    last: PlantState | None = None
+    for counter in itertools.count(1):
+        state = feed.newest(counter)
+        yield state, changes_between(last, state)
+        last = state
+        await asyncio.sleep(READ_EVERY_S)
+
+
 async def _serve_webhooks(one: WebhookSettings, feed: StateFeed, say: Say) -> None:
     hooks = [Webhook(url, one) for url in one.urls]
     told = {hook.url: "" for hook in hooks}
-    last: PlantState | None = None
     try:
-        while True:
-            state = feed.newest(0)
-            for change in changes_between(last, state):
-                for hook in hooks:
-                    hook.tell(change)
-            last = state
+        async for _, changes in _followed(feed):
             for hook in hooks:
+                for change in changes:
+                    hook.tell(change)
                 now = hook.problem or "takes posts"
                 if now != told[hook.url]:
                     say(f"webhook {hook.url}: {now}")
                 told[hook.url] = now
-            await asyncio.sleep(READ_EVERY_S)
     finally:
         for hook in hooks:
             await asyncio.to_thread(hook.stop)
+
+
+async def _serve_mqtt(one: MqttSettings, feed: StateFeed, say: Say) -> None:
+    from barsight.plant.mqtt import MqttPublisher  # an extra that other links don't need
+
+    publisher = MqttPublisher(one)
+    running = asyncio.create_task(publisher.run())
+    say(f"MQTT to {one.host}:{one.port}, topics {one.prefix}/...")
+    try:
+        async for state, changes in _followed(feed):
+            publisher.show(state)
+            for change in changes:
+                publisher.tell(change)
+            if running.done():
+                running.result()
+    finally:
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
 
 
 async def _named(name: str, link: Awaitable[None]) -> None:
@@ -84,27 +108,3 @@ async def _named(name: str, link: Awaitable[None]) -> None:
         await link
     except OSError as error:
         raise OutputError(f"{name}: {error}; choose another address") from error
-
-
-async def _serve_mqtt(settings: PlantSettings, feed: StateFeed, say: Say) -> None:
-    from barsight.plant.mqtt import MqttPublisher  # an extra that other links don't need
-
-    one = settings.mqtt
-    assert one is not None
-    publisher = MqttPublisher(one)
-    running = asyncio.create_task(publisher.run())
-    say(f"MQTT to {one.host}:{one.port}, topics {one.prefix}/...")
-    last: PlantState | None = None
-    try:
-        for counter in itertools.count(1):
-            state = feed.newest(counter)
-            publisher.show(state)
-            for change in changes_between(last, state):
-                publisher.tell(change)
-            last = state
-            await asyncio.wait({running}, timeout=READ_EVERY_S)
-            if running.done():
-                running.result()
-    finally:
-        running.cancel()
-        await asyncio.gather(running, return_exceptions=True)

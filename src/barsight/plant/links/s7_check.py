@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from barsight.core.errors import Failed
 from barsight.plant.link_settings import S7Settings
+from barsight.plant.links.link_check import LinkCheck
 from barsight.plant.links.telegram_check import told_fields
 from barsight.plant.s7 import S7Link
 from barsight.plant.telegram import layout, unpack
@@ -14,7 +15,7 @@ from barsight.plant.telegram import layout, unpack
 LOOKS, EVERY_S = 5, 0.15
 
 
-def check_s7(settings: S7Settings) -> tuple[tuple[str, ...], bool] | Failed:
+def check_s7(settings: S7Settings) -> LinkCheck | Failed:
     """Read both data blocks again and again: lines for people, and whether both life counters move."""
     lines: list[str] = []
     is_good = True
@@ -34,7 +35,7 @@ def check_s7(settings: S7Settings) -> tuple[tuple[str, ...], bool] | Failed:
             lines.append(f"NO TELEGRAM: {wrong}")
         lines.append(f"{who} life counter: " + ("moves" if len(moved) > 1 else "STANDS STILL"))
         is_good = is_good and wrong is None and len(moved) > 1
-    return tuple(lines), is_good
+    return LinkCheck("s7", tuple(lines), is_good)
 
 
 def _look(settings: S7Settings, size: int) -> tuple[list[bytes], list[float]] | Failed:

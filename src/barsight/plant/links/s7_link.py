@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable
 
 from barsight.core.errors import Failed
+from barsight.plant.crane_names import plc_name
 from barsight.plant.feed import StateFeed
 from barsight.plant.link_settings import S7Settings
 from barsight.plant.partner import PlcPartner
@@ -23,7 +24,7 @@ async def serve_s7(
     from barsight.plant.s7 import S7Exchange, run_s7  # an extra that other links don't need
 
     at = f"{settings.host}:{settings.port}"
-    partner = PlcPartner(f"plc {at} by S7", steps, settings.silent_s)
+    partner = PlcPartner(plc_name(f"{at} by S7"), steps, settings.silent_s)
     counter, wrong, stop = 0, "not reached yet", threading.Event()
 
     def outputs() -> bytes:

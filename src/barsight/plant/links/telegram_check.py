@@ -10,20 +10,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from barsight.core.errors import Failed
+from barsight.plant.links.link_check import LinkCheck
 from barsight.plant.settings import TelegramSettings
-from barsight.plant.telegram import IN_MAGIC, VERSION, layout, pack, table_of, unpack
+from barsight.plant.telegram import IN_MAGIC, VERSION, fields_at, layout, pack, unpack, width_of
 
 TOLERANCE_RATIO = 0.2
 """The cycle's first and last hundredth may be off by so much of it."""
 FAILED, NUMBER = 4, 0x5A5A
-
-
-@dataclass(frozen=True)
-class TelegramCheck:
-    """Record what a check saw. lines: for people. is_good: whether cycle, answer and life counter hold."""
-
-    lines: tuple[str, ...]
-    is_good: bool
 
 
 @dataclass
@@ -37,7 +30,7 @@ class _Exchanged:
     answered_s: float | None = None
 
 
-def check_telegram(one: TelegramSettings, seconds: float) -> TelegramCheck | Failed:
+def check_telegram(one: TelegramSettings, seconds: float) -> LinkCheck | Failed:
     """Exchange telegrams for some time, and judge them. The one command is refused: it names no lift."""
     try:
         seen = _exchange(one, seconds)
@@ -59,7 +52,7 @@ def check_telegram(one: TelegramSettings, seconds: float) -> TelegramCheck | Fai
         "life counter: " + ("goes up by one in each telegram" if is_alive else "STANDS OR LEAPS"),
     )  # fmt: skip
     is_in_time = float(gaps_ms.max()) < 1e3 * one.silent_s
-    return TelegramCheck(lines, is_alive and is_even and is_in_time and seen.answered_s is not None)
+    return LinkCheck("telegram", lines, is_alive and is_even and is_in_time and seen.answered_s is not None)
 
 
 def _exchange(one: TelegramSettings, seconds: float) -> _Exchanged | Failed:
@@ -90,11 +83,13 @@ def _exchange(one: TelegramSettings, seconds: float) -> _Exchanged | Failed:
 
 def told_fields(side: str, content: bytes, byte_order: str) -> list[str]:
     """List the fields of a telegram with offset, bytes, value and meaning; of another its length alone."""
-    found = unpack(side, content, byte_order)
-    at, lines = 0, [f"{side}: {len(content)} bytes"]
-    for name, kind, meaning in table_of(side) if not isinstance(found, Failed) else ():
-        width = int(kind[1:]) // 8
-        value = found[name] if not isinstance(found, Failed) else 0
-        lines.append(f"{at:4} {content[at : at + width].hex():16} {name:15} {value}  ({meaning})")
-        at += width
-    return lines
+    found, head = unpack(side, content, byte_order), f"{side}: {len(content)} bytes"
+    if isinstance(found, Failed):
+        return [head]
+    return [
+        head,
+        *(
+            f"{at:4} {content[at : at + width_of(kind)].hex():16} {name:15} {found[name]}  ({meaning})"
+            for at, name, kind, meaning in fields_at(side)
+        ),
+    ]
