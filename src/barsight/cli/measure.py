@@ -96,9 +96,9 @@ def print_outcome(content: dict[str, Any], console: Console, *, verbose: bool) -
 def _agreement_table(agreements: list[dict[str, Any]]) -> Table:
     heads = {
         "bias": "bias", "median": "median", "smooth_mae": "smooth MAE",
-        "mae": "MAE", "p95": "P95", "max": "max", "equivalence": "equal within",
+        "mae": "MAE", "p95": "P95", "max": "max", "equivalence": "equal ±",
     }  # fmt: skip
-    table = Table(title="Vision minus laser, mm", box=SIMPLE_HEAD)
+    table = Table(title="Vision minus laser, mm", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for head in ("prof.", "y m", "seen %", *heads.values()):
         table.add_column(head, justify="right", no_wrap=True)
     for a in agreements:
