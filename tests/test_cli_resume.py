@@ -100,13 +100,14 @@ def counting_matches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 def test_another_key_starts_anew(tmp_path: Path) -> None:
+    made = [Failed("made", "at first"), Failed("made", "again")]
     first = checkpoint_folder(tmp_path / "kept", "a" * 64)
-    assert checkpointed(first, "x", lambda: 1) == 1
-    assert checkpointed(first, "x", lambda: 2) == 1
+    assert checkpointed(first, "x", lambda: made[0]) == made[0]
+    assert checkpointed(first, "x", lambda: made[1]) == made[0]
     second = checkpoint_folder(tmp_path / "kept", "b" * 64)
-    assert checkpointed(second, "x", lambda: 2) == 2
+    assert checkpointed(second, "x", lambda: made[1]) == made[1]
     assert not first.exists()
-    assert checkpointed(None, "x", lambda: 3) == 3
+    assert checkpointed(None, "x", lambda: made[1]) == made[1]
 
 
 def test_a_failure_leaves_nothing_to_go_on_from(tmp_path: Path) -> None:
