@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy import ndimage
 
@@ -19,6 +21,15 @@ _TOOTH = 0.6
 _PRICE, _GULLY_PRICE = 60.0, 10.0
 """Contrast that a bundle's straps must have in all, so that chance doesn't part one bundle into two; less is
 asked where the surface does."""
+_POOL_M = 0.07
+"""Length across the bars over which a faint line's gray levels are averaged."""
+_MIN_VARIANCE = 0.3
+"""Least variance that a place adds to a faint line's sum."""
+_SPOT = 3.0
+"""Contrast over noise from where a bar's own spot counts no more for a faint line."""
+_FAINT, _FAINT_PRICE, _FAINT_GULLY_PRICE = 4.0, 15.0, 5.0
+"""The same for faint lines: mean gray level of one over the noise of such means, and half the squares beyond
+that, in all."""
 GULLY_M, _GULLY_SIDE_M = 0.03, 0.08
 """Least depth of a gully that may part bundles, and the reach of its two sides."""
 CLIFF_M, _CLIFF_CELLS = 0.12, 2
@@ -30,8 +41,37 @@ FLOOR_M = 1e3
 def line_contrast(gray: Float32, cell_m: float) -> Float64:
     """Compute contrasts (rows, places) of lines across the bars over noise, beyond _NOISE.
 
-    The logarithm of a gray level less its median along the bar, over the bar's own scatter; NaN counts as
-    the bar's median. Lines may lie a cell off from bar to bar.
+    Lines may lie a cell off from bar to bar.
+    """
+    beyond = np.minimum(np.abs(_level_along(gray, cell_m)), _CLIPPED) - _NOISE
+    lines: Float64 = ndimage.maximum_filter1d(ndimage.uniform_filter1d(beyond, 3, axis=0), 3, axis=0)
+    return lines
+
+
+def faint_lines(gray: Float32, stock: Bool, cell_m: float) -> tuple[Float64, Float64]:
+    """Compute how much brighter than the steel before and behind it each place (rows, places) is, averaged
+    along the bar over a strap's width, and the variance that each place (places,) adds to a sum across.
+
+    On rough or rusty bars a strap is fainter than the bar's own spots; it stands out because it is darker, or
+    brighter, on all bars at the same place. stock: where bars lie.
+    """
+    level = np.clip(_level_along(gray, cell_m), -_SPOT, _SPOT)
+    level = ndimage.uniform_filter1d(np.where(stock, level, 0.0), 3, axis=0)
+    pool = round(_POOL_M / cell_m) | 1
+    scatter = mad_sigma(ndimage.uniform_filter1d(level, pool, axis=1), axis=0)
+    return level, np.maximum(pool * scatter**2, _MIN_VARIANCE)
+
+
+def pooled_contrast(level: Float64, variance: Float64, cell_m: float) -> Float64:
+    """Compute contrasts (rows, places) of faint lines over noise, averaged across the bars over _POOL_M."""
+    pool = round(_POOL_M / cell_m) | 1
+    mean = ndimage.uniform_filter1d(level, pool, axis=1)
+    return np.asarray(np.abs(mean) / np.sqrt(variance / pool), np.float64)
+
+
+def _level_along(gray: Float32, cell_m: float) -> Float64:
+    """Compute the logarithm of gray levels (rows, places) less their median along the bar, over the bar's own
+    scatter; NaN counts as the bar's median.
     """
     level = np.log(gray + 2.0)
     known = np.isfinite(level).sum(axis=0)
@@ -39,11 +79,8 @@ def line_contrast(gray: Float32, cell_m: float) -> Float64:
     middle = np.take_along_axis(np.sort(level, axis=0), np.maximum(known - 1, 0)[None] // 2, axis=0)
     level = np.where(np.isfinite(level), level, np.nan_to_num(middle))
     around = 2 * round(_AROUND_M / cell_m / 2) + 1
-    off = np.abs(level - running_median(level, around))
-    sigma = np.maximum(mad_sigma(off, axis=0), _MIN_SIGMA_LOG)
-    beyond = np.minimum(off / sigma, _CLIPPED) - _NOISE
-    lines: Float64 = ndimage.maximum_filter1d(ndimage.uniform_filter1d(beyond, 3, axis=0), 3, axis=0)
-    return lines
+    off = level - running_median(level, around)
+    return np.asarray(off / np.maximum(mad_sigma(np.abs(off), axis=0), _MIN_SIGMA_LOG), np.float64)
 
 
 def split_columns(
@@ -51,30 +88,74 @@ def split_columns(
 ) -> list[tuple[int, int, Int64]]:
     """Split places into stretches that share their straps: (first, one past the last, rows of its straps).
 
-    Dynamic programme over places: a stretch gains, of each row whose mean contrast is over _TOOTH, its sum,
-    and costs _PRICE, or _GULLY_PRICE where it ends in a gully; none reaches over a cliff.
-    contrast: (rows, places); gullies, cliffs: (places,).
+    A stretch gains, of each row whose mean contrast is over _TOOTH, its sum. contrast: (rows, places);
+    gullies, cliffs: (places,).
     """
-    rows, places = contrast.shape
-    sums = np.concatenate([np.zeros((rows, 1)), np.cumsum(contrast, axis=1)], axis=1)[1::2]
+    sums = _sums(contrast)[1::2]
+
+    def gain(begin: Int64, last: int) -> Float64:
+        own = sums[:, last, None] - sums[:, begin]
+        return np.where(own > _TOOTH * (last - begin), own, 0.0)
+
+    prices = _prices(gullies, _PRICE, _GULLY_PRICE)
+    return _split(gain, prices, narrowest, cliffs)
+
+
+def split_faint(
+    level: Float64, variance: Float64, narrowest: int, gullies: Bool, cliffs: Bool
+) -> list[tuple[int, int, Int64]]:
+    """Split places as `split_columns` does, by lines that stand out over a stretch's whole width only.
+
+    A stretch gains, of each row whose sum is over _FAINT standard deviations, half the squares beyond that.
+    level, variance: of `faint_lines`.
+    """
+    sums, spread = _sums(level)[1::2], _sums(variance[None])[0]
+
+    def gain(begin: Int64, last: int) -> Float64:
+        own = (sums[:, last, None] - sums[:, begin]) ** 2 / (spread[last] - spread[begin])
+        return np.asarray(np.maximum(own - _FAINT**2, 0.0) / 2, np.float64)
+
+    prices = _prices(gullies, _FAINT_PRICE, _FAINT_GULLY_PRICE)
+    return _split(gain, prices, narrowest, cliffs)
+
+
+def _sums(values: Float64) -> Float64:
+    """Sum up along rows: (rows, places + 1)."""
+    return np.concatenate([np.zeros((len(values), 1)), np.cumsum(values, axis=1)], axis=1)
+
+
+def _prices(gullies: Bool, price: float, gully_price: float) -> Float64:
+    """Return what a stretch costs by its end (places + 1,): less where that lies in a gully, or is the last."""
+    cheap = np.pad(gullies, (0, 1), constant_values=True)
+    cheap[1:] |= gullies
+    return np.where(cheap, gully_price, price)
+
+
+def _split(
+    gain: Callable[[Int64, int], Float64], prices: Float64, narrowest: int, cliffs: Bool
+) -> list[tuple[int, int, Int64]]:
+    """Choose by dynamic programming the stretches (first, one past the last, every other row that gains most
+    about it) that together gain most; none reaches over a cliff.
+
+    gain: of every other row (rows, N) in stretches by their first places and one past the last.
+    """
+    places = len(prices) - 1
     best, before = np.zeros(places + 1), np.zeros(places + 1, int)
     for last in range(1, places + 1):
         begin = int(np.flatnonzero(cliffs[: last - 1])[-1]) + 1 if cliffs[: last - 1].any() else 0
-        width = last - np.arange(begin, last)
-        own = sums[:, last : last + 1] - sums[:, begin:last]
-        gain = np.where(own > _TOOTH * width, own, 0.0).sum(axis=0)
-        price = _GULLY_PRICE if last == places or gullies[last] or gullies[last - 1] else _PRICE
-        total = best[begin:last] + np.where(width >= narrowest, gain, 0.0) - price
+        first = np.arange(begin, last)
+        gained = np.where(last - first >= narrowest, gain(first, last).sum(axis=0), 0.0)
+        total = best[begin:last] + gained - prices[last]
         before[last] = begin + int(total.argmax())
         best[last] = total.max()
     found, last = [], places
     while last > 0:
-        first = int(before[last])
-        own = sums[:, last] - sums[:, first]
-        peak = (own == ndimage.maximum_filter1d(own, 5)) & (own > _TOOTH * (last - first))
-        if last - first >= narrowest and peak.any():
-            found.append((first, last, 2 * np.flatnonzero(peak) + 1))
-        last = first
+        first_of = int(before[last])
+        own = gain(np.array([first_of]), last)[:, 0]
+        peak = (own == ndimage.maximum_filter1d(own, 5)) & (own > 0)
+        if last - first_of >= narrowest and peak.any():
+            found.append((first_of, last, 2 * np.flatnonzero(peak) + 1))
+        last = first_of
     return found[::-1]
 
 

@@ -13,11 +13,19 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
-from barsight.core.arrays import Bool, Float32, Float64, Int64
+from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8
 from barsight.core.types import HeightSource
 from barsight.yard.bundles.fitting.outline_fit import ABOVE, BELOW, MIXED, SLOPE_U, Fit, U
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
-from barsight.yard.bundles.section.strap_lines import find_cliffs, find_gullies, line_contrast, split_columns
+from barsight.yard.bundles.section.strap_lines import (
+    faint_lines,
+    find_cliffs,
+    find_gullies,
+    line_contrast,
+    pooled_contrast,
+    split_columns,
+    split_faint,
+)
 from barsight.yard.types import HeightMap
 
 REACH_M = 0.55
@@ -26,6 +34,10 @@ _NARROWEST_M = 0.07
 """Width of the narrowest place that straps may hold."""
 _EDGE = 1.0
 """Median contrast of the straps, beyond _NOISE, where a bundle's are still seen."""
+_FAINT_EDGE = 0.5
+"""Of an averaged faint line's median contrast: where it ends."""
+_MEET_M, _PART_M = 0.02, 0.04
+"""Overlap of two spans that are one; a span that is so much narrower than another is a part of it."""
 _BREAK_M = 0.08
 """A strap may be as bright as the bars over so much of its length."""
 _CLOSE_M = 0.05
@@ -64,34 +76,69 @@ def strap_spans(
 
     height_map: one with an orthophoto. level_m: mean heights over the axis at the same places.
     """
-    beside, gray, stock = _around(height_map, sheet, fit)
-    contrast = line_contrast(gray, sheet.cell_m)
+    beside, gray, tops, stock = _around(height_map, sheet, fit)
     near = 2 * round(_CLOSE_M / sheet.cell_m) + 1
     other = np.isin(fit.state[fit.first : fit.last + 1], (ABOVE, BELOW, MIXED))
-    contrast[~stock] = 0.0
-    contrast[ndimage.binary_dilation(other, np.ones(near, bool))] = 0.0
+    stock &= ~ndimage.binary_dilation(other, np.ones(near, bool))[:, None]
     narrowest = max(round(_NARROWEST_M / sheet.cell_m), 3)
-    spans = []
-    for first, last, teeth in split_columns(
-        contrast, narrowest, find_gullies(level_m, sheet.cell_m), find_cliffs(level_m)
-    ):
-        rows = _strongest(contrast[teeth, first:last].mean(axis=1), teeth, round(_APART_M / sheet.cell_m))
-        ends = _ends(contrast[rows, first:last], round(_BREAK_M / sheet.cell_m) | 1)
-        if ends is None or not MIN_STRAPS <= rows.size <= max(len(contrast) * sheet.cell_m / _DENSE_M, 2):
-            continue
-        low, high = np.median(ends, axis=0)
-        spread = float(np.median(np.abs(ends - (low, high)), axis=0).max())
-        if high - low >= narrowest:
-            across = beside[0] + sheet.cell_m * (first - 0.5 + np.array([low, high]))
-            own = contrast[:, first + round(low) : first + round(high)]
-            along = tuple(_row_at_ends(own, row, sheet.cell_m) for row in np.sort(rows).tolist())
-            spans.append(StrapSpan(float(across[0]), float(across[1]), along, sheet.cell_m * spread))
-    return tuple(spans)
+    gullies, cliffs = find_gullies(level_m, sheet.cell_m), find_cliffs(level_m)
+    contrast = line_contrast(gray, sheet.cell_m)
+    contrast[~stock] = 0.0
+    clear = [_span(contrast, one, beside, narrowest) for one in split_columns(contrast, narrowest, gullies, cliffs)]
+    level, variance = faint_lines(tops, stock, sheet.cell_m)
+    pooled = pooled_contrast(level, variance, sheet.cell_m)
+    faint = [
+        _span(pooled, one, beside, narrowest, is_faint=True)
+        for one in split_faint(level, variance, narrowest, gullies, cliffs)
+    ]
+    return _merged([span for span in clear if span], [span for span in faint if span])
 
 
-def _around(height_map: HeightMap, sheet: AlignedMap, fit: Fit) -> tuple[Float64, Float32, Bool]:
+def _merged(clear: list[StrapSpan], faint: list[StrapSpan]) -> tuple[StrapSpan, ...]:
+    """Choose among spans of both kinds, from low to high: a clear one tells better where it ends, but may be a
+    part of what a faint one spans.
+    """
+    kept = list(clear)
+    for one in faint:
+        met = [own for own in kept if min(own.high_m, one.high_m) - max(own.low_m, one.low_m) > _MEET_M]
+        parts = [own for own in met if one.low_m - _MEET_M < own.low_m and own.high_m < one.high_m + _MEET_M]
+        if not met or (len(met) == len(parts) == 1 and one.width_m - met[0].width_m > _PART_M):
+            kept = [own for own in kept if own not in met] + [one]
+    return tuple(sorted(kept, key=lambda span: span.low_m))
+
+
+def _span(
+    contrast: Float64, stretch: tuple[int, int, Int64], beside_m: Float64, narrowest: int, *,
+    is_faint: bool = False,
+) -> StrapSpan | None:  # fmt: skip
+    """Tell from where to where straps hold a stretch: (first, one past the last place, rows of lines); None
+    where they are too few, or too many, or hold less than the narrowest. Averaged faint lines end where they
+    are half as strong as in their middle.
+    """
+    first, last, teeth = stretch
+    cell_m = float(beside_m[1] - beside_m[0])
+    rows = _strongest(contrast[teeth, first:last].mean(axis=1), teeth, round(_APART_M / cell_m))
+    strong = contrast[rows, first:last]
+    least = _FAINT_EDGE * np.median(strong, axis=1) if is_faint else np.full(rows.size, _EDGE)
+    ends = _ends(strong > least[:, None], round(_BREAK_M / cell_m) | 1)
+    if ends is None or not MIN_STRAPS <= rows.size <= max(len(contrast) * cell_m / _DENSE_M, 2):
+        return None
+    low, high = np.median(ends, axis=0)
+    if high - low < narrowest:
+        return None
+    across = beside_m[0] + cell_m * (first - 0.5 + np.array([low, high]))
+    own = contrast[:, first + round(low) : first + round(high)]
+    along = tuple(_row_at_ends(own, row, cell_m) for row in np.sort(rows).tolist())
+    spread = float(np.median(np.abs(ends - (low, high)), axis=0).max())
+    return StrapSpan(float(across[0]), float(across[1]), along, cell_m * spread)
+
+
+def _around(
+    height_map: HeightMap, sheet: AlignedMap, fit: Fit
+) -> tuple[Float64, Float32, Float32, Bool]:
     """Resample gray levels (rows, places), NaN where unseen, along a bundle's axis: its rows, and places (m)
-    beside it; and which of them lie over the floor.
+    beside it; the same of the pictures at the height of the tops where there are such; and which places lie
+    over the floor.
     """
     half = round(REACH_M / sheet.cell_m)
     beside = np.asarray(sheet.cell_m * np.arange(-half, half + 1), np.float64)
@@ -109,10 +156,13 @@ def _around(height_map: HeightMap, sheet: AlignedMap, fit: Fit) -> tuple[Float64
     sources = height_map.source[low[0] : high[0], low[1] : high[1]]
     if part.size == 0:
         nothing: Float32 = np.full(u.shape, np.nan, np.float32)
-        return beside, nothing, np.zeros(u.shape, bool)
-    seen = np.where(part > 0, part, np.nan).astype(np.float32)
+        return beside, nothing, nothing, np.zeros(u.shape, bool)
     places = column - low[1], row - low[0]
-    gray = cv2.remap(seen, *places, cv2.INTER_LINEAR, borderValue=np.nan)
+    gray = _sampled(part, places)
+    tops = gray
+    if height_map.tops is not None:
+        sharper = _sampled(height_map.tops[low[0] : high[0], low[1] : high[1]], places)
+        tops = np.where(np.isfinite(sharper), sharper, gray)
     z = cv2.remap(
         np.where(HeightSource.measured(sources), heights, np.float32(np.nan)),
         *places,
@@ -120,7 +170,13 @@ def _around(height_map: HeightMap, sheet: AlignedMap, fit: Fit) -> tuple[Float64
         borderValue=np.nan,
     )
     stock: Bool = np.asarray(np.isfinite(gray) & (z > sheet.stock_over_m))
-    return beside, np.asarray(gray, np.float32), stock
+    return beside, gray, tops, stock
+
+
+def _sampled(levels: UInt8, places: tuple[Float32, Float32]) -> Float32:
+    """Resample gray levels at places, columns and rows; NaN where nothing was seen."""
+    seen = np.where(levels > 0, levels, np.nan).astype(np.float32)
+    return np.asarray(cv2.remap(seen, *places, cv2.INTER_LINEAR, borderValue=np.nan), np.float32)
 
 
 def _strongest(strength: Float64, teeth: Int64, apart: int) -> Int64:
@@ -144,14 +200,14 @@ def _row_at_ends(contrast: Float64, row: int, cell_m: float) -> tuple[float, flo
     return cell_m * (first + low), cell_m * (first + high)
 
 
-def _ends(contrast: Float64, bridged: int) -> Float64 | None:
+def _ends(lines: Bool, bridged: int) -> Float64 | None:
     """Find where each strap (rows) begins and ends (S, 2), one past the last place; None where few are seen.
 
-    A strap is its longest run over _EDGE, breaks of up to `bridged` places closed.
+    A strap is its longest run, breaks of up to `bridged` places closed. lines: (rows, places).
     """
     ends = []
-    for own in contrast:
-        seen = ndimage.binary_closing(np.pad(own > _EDGE, bridged), np.ones(bridged, bool))[bridged:-bridged]
+    for own in lines:
+        seen = ndimage.binary_closing(np.pad(own, bridged), np.ones(bridged, bool))[bridged:-bridged]
         runs, count = ndimage.label(seen)
         if count:
             longest = np.flatnonzero(runs == 1 + int(np.bincount(runs)[1:].argmax()))
