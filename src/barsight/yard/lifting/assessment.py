@@ -36,6 +36,7 @@ from barsight.yard.magnet.footprint import (
     count_gripped,
 )
 from barsight.yard.magnet.holding import WeakestPole, hold_load, share_checks, weakest_pole
+from barsight.yard.magnet.partings import without_parted
 from barsight.yard.magnet.reach import reached_strips
 from barsight.yard.stability.stability import Footing, footing_checks, nearest_cells
 from barsight.yard.thin_lines import ThinLine, find_thin_line
@@ -175,7 +176,8 @@ def _grip(
 ) -> Grip:  # fmt: skip
     """Count what the poles take by how far they reach on the map."""
     reached = reached_strips(heights, place, magnet, tolerance, contact.z_m)
-    return count_gripped(place, magnet, tolerance, near, contact.z_m, reached)
+    held = count_gripped(place, magnet, tolerance, near, contact.z_m, reached)
+    return without_parted(held, heights, place, near, reached)
 
 
 def _unseen_lift(place: Placement) -> Lift:

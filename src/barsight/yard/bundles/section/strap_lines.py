@@ -125,7 +125,7 @@ def _sums(values: Float64) -> Float64:
 
 
 def _prices(gullies: Bool, price: float, gully_price: float) -> Float64:
-    """Return what a stretch costs by its end (places + 1,): less where that lies in a gully, or is the last."""
+    """Return what a stretch costs by its end (places + 1,): less in a gully, or at the last place."""
     cheap = np.pad(gullies, (0, 1), constant_values=True)
     cheap[1:] |= gullies
     return np.where(cheap, gully_price, price)

@@ -34,8 +34,8 @@ _NARROWEST_M = 0.07
 """Width of the narrowest place that straps may hold."""
 _EDGE = 1.0
 """Median contrast of the straps, beyond _NOISE, where a bundle's are still seen."""
-_FAINT_EDGE = 0.5
-"""Of an averaged faint line's median contrast: where it ends."""
+_FAINT_EDGE = 2.0
+"""Least contrast over noise of an averaged faint line."""
 _MEET_M, _PART_M = 0.02, 0.04
 """Overlap of two spans that are one; a span that is so much narrower than another is a part of it."""
 _BREAK_M = 0.08
@@ -84,7 +84,9 @@ def strap_spans(
     gullies, cliffs = find_gullies(level_m, sheet.cell_m), find_cliffs(level_m)
     contrast = line_contrast(gray, sheet.cell_m)
     contrast[~stock] = 0.0
-    clear = [_span(contrast, one, beside, narrowest) for one in split_columns(contrast, narrowest, gullies, cliffs)]
+    clear = [
+        _span(contrast, one, beside, narrowest) for one in split_columns(contrast, narrowest, gullies, cliffs)
+    ]
     level, variance = faint_lines(tops, stock, sheet.cell_m)
     pooled = pooled_contrast(level, variance, sheet.cell_m)
     faint = [
@@ -119,7 +121,9 @@ def _span(
     cell_m = float(beside_m[1] - beside_m[0])
     rows = _strongest(contrast[teeth, first:last].mean(axis=1), teeth, round(_APART_M / cell_m))
     strong = contrast[rows, first:last]
-    least = _FAINT_EDGE * np.median(strong, axis=1) if is_faint else np.full(rows.size, _EDGE)
+    least = np.full(rows.size, _EDGE)
+    if is_faint:
+        least = np.maximum(np.percentile(strong, 75, axis=1) / 2, _FAINT_EDGE)
     ends = _ends(strong > least[:, None], round(_BREAK_M / cell_m) | 1)
     if ends is None or not MIN_STRAPS <= rows.size <= max(len(contrast) * cell_m / _DENSE_M, 2):
         return None
@@ -133,9 +137,7 @@ def _span(
     return StrapSpan(float(across[0]), float(across[1]), along, cell_m * spread)
 
 
-def _around(
-    height_map: HeightMap, sheet: AlignedMap, fit: Fit
-) -> tuple[Float64, Float32, Float32, Bool]:
+def _around(height_map: HeightMap, sheet: AlignedMap, fit: Fit) -> tuple[Float64, Float32, Float32, Bool]:
     """Resample gray levels (rows, places), NaN where unseen, along a bundle's axis: its rows, and places (m)
     beside it; the same of the pictures at the height of the tops where there are such; and which places lie
     over the floor.

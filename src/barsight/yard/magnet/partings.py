@@ -1,0 +1,100 @@
+"""Tell by the map which bundles a deep gully parts from what the poles reach."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from barsight.core.arrays import Bool, Float64
+from barsight.yard.magnet.footprint import BundleTable, Grip, Placement
+from barsight.yard.magnet.reach import PART_M
+from barsight.yard.stability.stability import lookup_heights
+from barsight.yard.types import Bundle, HeightMap
+
+_DEEP_M, _DEEP_RATIO = 0.1, 0.4
+"""Depth of a gully, and of the wider bundle's width, that parts two bundles: in 3757 packs as worlds draw them
+none is deeper than 86 mm or 0.39 of the width."""
+_STEP_M, _ALONG_M = 0.005, 0.02
+_PARALLEL = 0.05
+"""Sine of the skew up to which a gully between two bundles is looked for."""
+_ROWS = 3
+"""A bundle that lies beside fewer rows of a part along a pole lies beyond it."""
+_SEEN_RATIO = 0.5
+"""Of a part along a pole: it must have been seen for its median to count."""
+
+
+def without_parted(
+    held: Grip, heights: HeightMap, place: Placement, table: BundleTable, reached: Float64
+) -> Grip:
+    """Leave out of the count's doubts the bundles that are surely parted from all that the poles reach.
+
+    reached: (P, 4) of `reach.reached_strips`. Only what was seen parts: places out of sight count as none.
+    """
+    if len(held.gripped) != 1:
+        return held
+    load, flips = table.bundles[held.gripped[0]], held.flips.copy()
+    for number, other in enumerate(table.bundles):
+        if flips[number] > 0 and number not in held.gripped and _parted(load, other, heights, place, reached):
+            flips[number] = 0.0
+    return Grip(held.gripped, float(np.prod(1 - flips)), flips)
+
+
+def _parted(load: Bundle, other: Bundle, heights: HeightMap, place: Placement, reached: Float64) -> bool:
+    """Check that a gully runs between every pole's reach and another bundle, as far as that lies beside it."""
+    if any(abs(math.sin(bundle.yaw_rad - place.yaw_rad)) > _PARALLEL for bundle in (load, other)):
+        return False
+    deep = max(_DEEP_M, _DEEP_RATIO * max(load.width_m, other.width_m))
+    away = other.centre_m[:2] - (place.x_m, place.y_m)
+    middle, along = float(away @ place.across), float(away @ place.along)
+    half_m = math.inf if any(other.ends_open) else other.length_m / 2
+    turn = math.tan(other.yaw_rad - place.yaw_rad)
+    for pole in reached:
+        if pole[2] == 0 or pole[3] == 0:
+            continue
+        for part in _parts(pole):
+            v = part[np.abs(part - along) < half_m]
+            if v.size < _ROWS:
+                continue
+            beside = middle - turn * (float(v.mean()) - along)
+            if not _gully(_profile(heights, place, v, pole[1], beside), pole[3] / 2, deep):
+                return False
+    return True
+
+
+def _parts(pole: Float64) -> list[Float64]:
+    """Divide a pole's reach along the beam into parts of about PART_M: places along."""
+    count = max(round(pole[2] / PART_M), 1)
+    ends = pole[0] + pole[2] * (np.arange(count + 1) / count - 0.5)
+    return [np.arange(low, high + _ALONG_M / 2, _ALONG_M) for low, high in zip(ends, ends[1:], strict=False)]
+
+
+def _profile(heights: HeightMap, place: Placement, along_m: Float64, from_m: float, to_m: float) -> Float64:
+    """Take median heights along the beam, each _STEP_M from one place across it to another; NaN where too
+    little was seen.
+    """
+    across = from_m + np.sign(to_m - from_m) * np.arange(0.0, abs(to_m - from_m), _STEP_M)
+    at = (
+        np.array([place.x_m, place.y_m])
+        + along_m[:, None, None] * place.along
+        + across[None, :, None] * place.across
+    )
+    z = lookup_heights(heights, at[..., 0], at[..., 1])
+    seen: Bool = np.isfinite(z)
+    enough = seen.mean(axis=0) >= _SEEN_RATIO
+    level = np.full(across.size, np.nan)
+    if enough.any():
+        level[enough] = np.nanmedian(z[:, enough], axis=0)
+    return level
+
+
+def _gully(level: Float64, half_m: float, deep_m: float) -> bool:
+    """Check that a profile sinks by deep_m under what lies before and behind, beyond half_m from its begin."""
+    first = math.ceil(half_m / _STEP_M)
+    known = np.where(np.isfinite(level), level, -np.inf)
+    if first >= len(known) or not np.isfinite(level[:first]).any():
+        return False
+    before = np.maximum.accumulate(known)
+    behind = np.maximum.accumulate(known[::-1])[::-1]
+    sunken = np.minimum(before, behind) - level
+    return bool(np.nanmax(sunken[first:], initial=0.0) >= deep_m)
