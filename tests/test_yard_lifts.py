@@ -163,7 +163,11 @@ def test_an_edge_too_near_to_count_surely() -> None:
     unsure = tuple(
         record(one, k, sigma=replace(SIGMA, lateral_m=0.03)) for k, one in enumerate([laid(0.3), laid(0.58)])
     )
-    assert "count-uncertain" in codes(judged([laid(0.3), laid(0.58)], unsure))
+    stock = [laid(0.3), laid(0.58)]
+    heights = map_of(stock)
+    gully = np.abs(heights.x_m - 0.44) < 0.05
+    unseen = replace(heights, source=np.where(gully, HeightSource.UNKNOWN, heights.source).astype(np.uint8))
+    assert "count-uncertain" in codes(judged(stock, unsure, heights=unseen))
 
 
 def test_an_open_end_that_may_lie_under_a_pole_is_not_counted_out() -> None:

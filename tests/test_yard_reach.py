@@ -10,7 +10,8 @@ import pytest
 
 from barsight.core.types import HeightSource
 from barsight.yard.magnet.description import Tolerance
-from barsight.yard.magnet.footprint import BundleTable, Placement, count_gripped
+from barsight.yard.magnet.footprint import BundleTable, Grip, Placement, count_gripped
+from barsight.yard.magnet.partings import without_parted
 from barsight.yard.magnet.reach import reached_strips
 from barsight.yard.stability.stability import footings
 from lift_yards import MAGNET, SETTINGS, SIGMA, codes, judged, laid, map_of, record
@@ -67,6 +68,24 @@ def test_a_neighbour_that_is_hardly_known_counts_only_where_the_poles_may_reach_
     # Level ground between them within reach: nobody knows where the neighbour begins.
     filled = [*stock, laid(0.48, z=0.19)]
     assert "count-uncertain" in codes(judged(filled, (replace(bundles[0], width_m=0.12), bundles[1]), OVER))
+
+
+@pytest.mark.parametrize("way", ["seen", "shallow", "unseen", "not all along"])
+def test_a_neighbour_behind_a_deep_gully_that_is_seen_is_not_reached(way: str) -> None:
+    stock = [laid(0.3), laid(0.6)]
+    heights = map_of([*stock, laid(0.45, z=0.17)] if way == "shallow" else stock)
+    if way in ("unseen", "not all along"):
+        ends = (0.5, 1.2) if way == "not all along" else (-9.0, 9.0)
+        hidden = np.ix_((heights.y_m > ends[0]) & (heights.y_m < ends[1]), np.abs(heights.x_m - 0.45) < 0.06)
+        source = heights.source.copy()
+        source[hidden] = HeightSource.UNKNOWN
+        heights = replace(heights, source=source)
+    table = BundleTable.of(tuple(record(one, k) for k, one in enumerate(stock)))
+    held = Grip((0,), 0.5, np.array([0.0, 0.5]))
+    strips = MAGNET.pole_table * (1, 1, 1, 0.8)
+    found = without_parted(held, heights, OVER, table, strips)
+    assert found.gripped == (0,)
+    assert (found.flips[1], found.probability) == ((0.0, 1.0) if way == "seen" else (0.5, 0.5))
 
 
 def test_what_one_bundle_has_is_not_anothers_beside_it() -> None:

@@ -20,7 +20,7 @@ from barsight.yard.bundles.section.pack_sides import PackSide, _parting, _widest
 from barsight.yard.bundles.section.packs import Pack, contradicts, find_pack, strapped_pack
 from barsight.yard.bundles.section.seen_section import section_of_pack
 from barsight.yard.bundles.section.strap_lines import split_columns
-from barsight.yard.bundles.section.straps import StrapSpan
+from barsight.yard.bundles.section.straps import StrapSpan, _merged
 from barsight.yard.types import HeightMap
 from lift_yards import laid, record
 
@@ -29,21 +29,23 @@ LENGTH_M, WIDE_M = 5.0, 1.2
 
 
 def drawn(
-    packs: list[tuple[float, float, tuple[float, ...]]], rng: np.random.Generator, *, beside_m: float = 0.0
-) -> HeightMap:
-    """Draw round-topped packs (low x, high x, y of straps) on the floor, their gray levels with noise; straps
-    are darker or brighter by a third. beside_m: height of what fills the rest."""
+    packs: list[tuple[float, float, tuple[float, ...]]], rng: np.random.Generator, *, beside_m: float = 0.0,
+    rough_log: float = 0.12, shades: tuple[float, ...] = (0.5, 1.8),
+) -> HeightMap:  # fmt: skip
+    """Draw round-topped packs (low x, high x, y of straps) on the floor, their gray levels with noise of
+    rough_log; straps are darker or brighter by one of `shades` at each place. beside_m: height of what fills
+    the rest."""
     x = CELL * np.arange(round(WIDE_M / CELL)) - WIDE_M / 2
     y = CELL * np.arange(round(LENGTH_M / CELL)) - LENGTH_M / 2
     z = np.full((len(y), len(x)), beside_m)
-    gray = 60 * np.exp(rng.normal(0, 0.12, z.shape))
+    gray = 60 * np.exp(rng.normal(0, rough_log, z.shape))
     for low, high, straps in packs:
         own = (x >= low) & (x < high)
         away = (x[own] - (low + high) / 2) / (high - low)
         z[:, own] = 0.3 - 0.3 * (2 * away) ** 4 * (high - low)
         for at in straps:
             rows = np.abs(y - at) < 0.016
-            gray[np.ix_(rows, own)] *= rng.choice([0.5, 1.8], own.sum())
+            gray[np.ix_(rows, own)] *= rng.choice(shades, own.sum())
     z += rng.normal(0, 0.001, z.shape)
     shape = z.shape
     return HeightMap(
@@ -126,6 +128,41 @@ def test_what_goes_on_beside_a_strap_leaves_the_side_open() -> None:
 def test_bars_without_straps_show_none() -> None:
     found = [pack_at(drawn([(-0.12, 0.12, ())], np.random.default_rng(seed)), 0.0) for seed in range(20)]
     assert found == [None] * 20
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_straps_fainter_than_the_bars_own_spots_are_found(seed: int) -> None:
+    rows = (-1.5, 0.1, 1.6), (-1.1, 0.6, 2.0)
+    packs = [(-0.25, 0.0, rows[0]), (0.0, 0.22, rows[1])]
+    heights = drawn(packs, np.random.default_rng(seed), rough_log=0.35, shades=(0.7,))
+    found = 0
+    for u, low, high in ((-0.13, -0.25, 0.0), (0.11, 0.0, 0.22)):
+        pack = pack_at(heights, u)
+        assert pack is not None and len(pack.span.rows_m) >= 3
+        if pack.sides_seen:
+            found += 1
+            assert u + pack.low_m == pytest.approx(low, abs=2.6 * CELL)
+            assert u + pack.high_m == pytest.approx(high, abs=2.6 * CELL)
+    assert found
+
+
+def test_spots_of_rough_bars_are_no_straps() -> None:
+    drawn_ones = (
+        drawn([(-0.12, 0.12, ())], np.random.default_rng(seed), rough_log=0.35) for seed in range(20)
+    )
+    assert sum(pack_at(heights, 0.0) is not None for heights in drawn_ones) == 0
+
+
+def test_a_clear_span_is_kept_unless_it_is_a_part_of_a_faint_one() -> None:
+    faint = StrapSpan(-0.1, 0.1, straight(1.0, 2.0), 0.0)
+    edge = StrapSpan(-0.09, 0.1, straight(1.0, 2.0), 0.0)
+    part = StrapSpan(-0.1, 0.0, straight(1.0, 2.0), 0.0)
+    rest = StrapSpan(0.0, 0.1, straight(1.5, 2.5), 0.0)
+    over = StrapSpan(0.0, 0.3, straight(1.5, 2.5), 0.0)
+    for clear, kept in (((), (faint,)), ((edge,), (edge,)), ((part,), (faint,))):
+        assert _merged(list(clear), [faint]) == kept
+    for clear in ((part, rest), (over,)):
+        assert _merged(list(clear), [faint]) == clear
 
 
 def test_a_place_belongs_to_the_straps_that_it_shares() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -13,8 +14,8 @@ from barsight.yard.stability.stability import lookup_heights
 from barsight.yard.types import Bundle, HeightMap
 
 _DEEP_M, _DEEP_RATIO = 0.1, 0.4
-"""Depth of a gully, and of the wider bundle's width, that parts two bundles: in 3757 packs as worlds draw them
-none is deeper than 86 mm or 0.39 of the width."""
+"""Depth of a gully, and of the wider bundle's width, that parts two bundles: in 3757 packs as worlds draw
+them none is deeper than 86 mm or 0.39 of the width."""
 _STEP_M, _ALONG_M = 0.005, 0.02
 _PARALLEL = 0.05
 """Sine of the skew up to which a gully between two bundles is looked for."""
@@ -41,7 +42,7 @@ def without_parted(
 
 
 def _parted(load: Bundle, other: Bundle, heights: HeightMap, place: Placement, reached: Float64) -> bool:
-    """Check that a gully runs between every pole's reach and another bundle, as far as that lies beside it."""
+    """Check that a gully runs between every pole's reach and another bundle, as far as that is long."""
     if any(abs(math.sin(bundle.yaw_rad - place.yaw_rad)) > _PARALLEL for bundle in (load, other)):
         return False
     deep = max(_DEEP_M, _DEEP_RATIO * max(load.width_m, other.width_m))
@@ -66,7 +67,7 @@ def _parts(pole: Float64) -> list[Float64]:
     """Divide a pole's reach along the beam into parts of about PART_M: places along."""
     count = max(round(pole[2] / PART_M), 1)
     ends = pole[0] + pole[2] * (np.arange(count + 1) / count - 0.5)
-    return [np.arange(low, high + _ALONG_M / 2, _ALONG_M) for low, high in zip(ends, ends[1:], strict=False)]
+    return [np.arange(low, high + _ALONG_M / 2, _ALONG_M) for low, high in itertools.pairwise(ends)]
 
 
 def _profile(heights: HeightMap, place: Placement, along_m: Float64, from_m: float, to_m: float) -> Float64:
@@ -89,7 +90,7 @@ def _profile(heights: HeightMap, place: Placement, along_m: Float64, from_m: flo
 
 
 def _gully(level: Float64, half_m: float, deep_m: float) -> bool:
-    """Check that a profile sinks by deep_m under what lies before and behind, beyond half_m from its begin."""
+    """Check that a profile, beyond half_m from its begin, sinks by deep_m under both of its sides."""
     first = math.ceil(half_m / _STEP_M)
     known = np.where(np.isfinite(level), level, -np.inf)
     if first >= len(known) or not np.isfinite(level[:first]).any():

@@ -97,8 +97,8 @@ def strap_spans(
 
 
 def _merged(clear: list[StrapSpan], faint: list[StrapSpan]) -> tuple[StrapSpan, ...]:
-    """Choose among spans of both kinds, from low to high: a clear one tells better where it ends, but may be a
-    part of what a faint one spans.
+    """Choose among spans of both kinds, from low to high: a clear one tells better where it ends, but may be
+    a part of what a faint one spans.
     """
     kept = list(clear)
     for one in faint:
@@ -115,7 +115,7 @@ def _span(
 ) -> StrapSpan | None:  # fmt: skip
     """Tell from where to where straps hold a stretch: (first, one past the last place, rows of lines); None
     where they are too few, or too many, or hold less than the narrowest. Averaged faint lines end where they
-    are half as strong as in their middle.
+    are half as strong as over their strongest quarter.
     """
     first, last, teeth = stretch
     cell_m = float(beside_m[1] - beside_m[0])
