@@ -15,9 +15,14 @@ from barsight.calibration.files.rig_file import write_rig_file
 from barsight.calibration.files.yaml_document import write_document
 from barsight.cli.main import run
 from barsight.core.files import atomic_directory
+from barsight.fleet.ledger import HeldRecording, claim, park, publish
+from barsight.fleet.objects import open_objects
+from barsight.fleet.records import find_version, read_tasks
 from barsight.plant.telegram import IN_MAGIC, VERSION, pack
+from barsight.result_folder import file_digest
 from barsight.simulation.settings import CameraSettings, SimulationSettings, YardSettings
 from barsight.simulation.simulate import simulate
+from barsight.store.opening import open_store
 from barsight.yard.magnet.description import example_magnet
 from fuzz.mutators import reseal_folder
 
@@ -44,6 +49,7 @@ def make_seeds(folder: Path) -> None:
         for name, shift_m in (("out", 0.0), ("old", 0.1)):
             write_results(made / name, shift_m)
             _done(["lifts", str(made / name), "--magnet", str(made / "magnet.toml"), "--at", "end"])
+        _fleet(made)
 
 
 def _done(command: list[str]) -> None:
@@ -133,6 +139,38 @@ def _places(made: Path) -> None:
         '[store]\nurl = "sqlite:///y.db"\nmagnet_steps_kg = [1000.0, 3000.0]\n[telegram]\nport = 2000\n'
     )
     (made / "telegram.bin").write_bytes(pack("in", {"magic": IN_MAGIC, "version": VERSION, "life": 7}))
+
+
+def _fleet(made: Path) -> None:
+    """Write an archive of a recording and a survey, and results of two versions as a run leaves them: one
+    recording published under both, one parked, one under way.
+    """
+    archive, kept = made / "archive", made / "fleet"
+    for name in ("one", "survey/first", "two"):
+        (archive / name / "mav0").mkdir(parents=True)
+        (archive / name / "mav0" / "body.yaml").write_text(f"name: {name}\n")
+    (archive / "survey" / "survey.json").write_text('{"passes": ["first"]}')
+    (made / "fleet.toml").write_text(
+        'yard = "yard.yaml"\n[bundles]\nstock_list = "stock.csv"\n[map]\ncell_m = 0.05\n'
+    )
+    store = f"sqlite:///{kept}/yard.db"
+    results = open_objects(str(kept), create=True)
+    for out, flag, file in (("out", "--rig", "rig.yaml"), ("old", "--magnet", "magnet.toml")):
+        words = ["--results", str(kept), "--store", store, flag, str(made / file)]
+        _done(["fleet", "plan", str(archive), *words])
+        with open_store(store) as opened, opened.reading() as connection:
+            keys = [task.key for task in read_tasks(connection, find_version(connection, None))]
+        told = {}
+        for path in (made / out).iterdir():
+            results.upload(path, f"files/{keys[0]}/t/{path.name}")
+            told[path.name] = {"bytes": path.stat().st_size, "sha256": file_digest(path)}
+        note = {"measured_s": 1.0, "whole_s": 2.0, "peak_bytes": 1, "files": told}
+        publish(results, HeldRecording(keys[0], 1, "t"), note)
+        park(results, keys[1], "refused: exit code 3", 3)
+        if out == "old":
+            claim(results, keys[2], 60.0)
+        else:
+            park(results, keys[2], "timeout: did not end in 5 s", 3)
 
 
 def _corners(folder: Path) -> None:

@@ -130,7 +130,28 @@ def _rig(name: str) -> Target:
     return Target(f"rig {name}", (name,), (name,), call, ("made.yaml",), 1.5)
 
 
+def _compare_versions(folder: Path) -> int:
+    first, second = sorted(path.name for path in (folder / "fleet/versions").iterdir())
+    store = f"sqlite:///{folder}/fleet/yard.db"
+    words = ("--results", f"{folder}/fleet", "--store", store, "-o", f"{folder}/made")
+    return run_and_print(["fleet", "compare", first, second, *words])
+
+
+def _promote_version(folder: Path) -> int:
+    first = next(path.parent.name for path in (folder / "fleet/versions").glob("*/rig.yaml"))
+    store = f"sqlite:///{folder}/fleet/yard.db"
+    words = ("--results", f"{folder}/fleet", "--store", store, "--into", f"{folder}/made")
+    return run_and_print(["fleet", "promote", first, *words])
+
+
 RESULT = ("out/*",)
+FLEET = (
+    "fleet/results/**/*",
+    "fleet/files/**/*.json",
+    "fleet/parked/*",
+    "fleet/claims/**/*",
+    "fleet/yard.db",
+)
 TARGETS = (
     _info("euroc", 4), _info("mcap", 2), _info("sqlite", 2), _info("ros1", 2), _info("kitti", 3),
     _convert("euroc", "ros2-mcap"), _convert("kitti", "euroc"), _convert("mcap", "euroc"),
@@ -188,10 +209,20 @@ TARGETS = (
         run_words("labels", "FOLDER/euroc", "FOLDER/out"), ("out",), 0.2
     ),
     Target(
-        "fleet", ("euroc",), ("euroc/mav0/**/*",),
-        run_words("fleet", "plan", "FOLDER/euroc", "--results", "FOLDER/made", "--store", "sqlite:///FOLDER/yard.db"),
-        (), 0.2, warm=False,
+        "fleet plan", ("archive", "fleet.toml", "magnet.toml", "rig.yaml", "yard.yaml", "stock.csv"),
+        ("archive/**/*", "fleet.toml", "magnet.toml", "rig.yaml", "yard.yaml", "stock.csv"),
+        run_words(
+            "fleet", "plan", "FOLDER/archive", "--results", "FOLDER/made", "--store", "sqlite:///FOLDER/yard.db",
+            "--config", "FOLDER/fleet.toml", "--magnet", "FOLDER/magnet.toml", "--rig", "FOLDER/rig.yaml",
+        ), (), 0.6, warm=False,
     ),
+    Target(
+        "fleet status", ("fleet",), FLEET,
+        run_words("fleet", "status", "--results", "FOLDER/fleet", "--store", "sqlite:///FOLDER/fleet/yard.db"),
+        (), 0.5, warm=False,
+    ),
+    Target("fleet compare", ("fleet",), FLEET, _compare_versions, ("made",), 0.5, warm=False),
+    Target("fleet promote", ("fleet",), FLEET, _promote_version, (), 0.5, warm=False),
     Target("export", ("out",), RESULT, run_words("export", "FOLDER/out", "FOLDER/made.las"), ("made.las",)),
     Target("view", ("out",), RESULT, _view, (), 0.6, warm=False),
     Target(

@@ -20,7 +20,14 @@ from barsight.pipeline import find_lifts, map_yard
 from barsight.recording.base import Recording
 from barsight.recording.open import open_recording
 from barsight.report.page import write_report
-from barsight.report.result_files import RESULT_FILES, summary, write_results, write_summary, write_surface
+from barsight.report.result_files import (
+    RESULT_FILES,
+    summary,
+    write_results,
+    write_summary,
+    write_surface,
+    write_tables,
+)
 from barsight.result_folder import seal_map
 from barsight.yard.magnet.description import Magnet, load_magnet
 
@@ -95,6 +102,7 @@ def write_measured(
         ):
             measured = find_lifts(mapped, magnet, judged_at, notices)
         content = summary(measured)
+        write_tables(measured, staging)
         write_results(measured, seal_map(content, staging), staging)
         shutil.rmtree(scratch)
         if truth_of is not None:

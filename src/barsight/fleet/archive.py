@@ -10,6 +10,7 @@ from pathlib import Path, PurePosixPath
 
 from barsight.core.errors import InputError
 from barsight.core.json_values import json_digest
+from barsight.core.reading.bounded_reading import MAX_TABLE_BYTES
 from barsight.fleet.objects import Objects, StoredObject
 
 SURVEY = "survey.json"
@@ -113,7 +114,8 @@ def manifest_digest(
     part of it.
 
     read: told of the bytes that were read. A recording whose listing is unchanged is not read again: the
-    digest is kept in the results under `manifests/`.
+    digest is kept in the results under `manifests/`. Raises InputError for a file that is too large for what
+    it is; only bags have no bound.
     """
     listed = json_digest([archive.url, recording.name, [[f.path, f.size, f.mark] for f in recording.files]])
     kept = f"manifests/{listed}.json"
@@ -121,6 +123,8 @@ def manifest_digest(
     if known is None:
         rows = []
         for file in recording.files:
+            if not file.path.endswith(_BAGS):
+                archive.expect_size(file.path, file.size, MAX_TABLE_BYTES)
             rows.append([recording.relative(file), file.size, _digest(archive, file)])
             read(file.size)
         known = {"manifest": json_digest([list(recording.passes), rows]), "files": rows}

@@ -28,7 +28,7 @@ def package_schema(package: str, name: str) -> Any:
     return json.loads(text)
 
 
-def expect_schema(document: Any, schema: Any, path: Path, remedy: str) -> None:
+def expect_schema(document: Any, schema: Any, path: Path | str, remedy: str) -> None:
     """Raise InputError about `path` naming the first place where the document isn't as the schema says."""
     fault = _fault(document, schema, schema, "")
     if fault:
