@@ -19,6 +19,7 @@ from barsight.fleet.ledger import HeldRecording, claim, park, publish
 from barsight.fleet.objects import open_objects
 from barsight.fleet.records import find_version, read_tasks
 from barsight.plant.telegram import IN_MAGIC, VERSION, pack
+from barsight.recording.open import open_recording
 from barsight.result_folder import file_digest
 from barsight.simulation.settings import CameraSettings, SimulationSettings, YardSettings
 from barsight.simulation.simulate import simulate
@@ -48,6 +49,7 @@ def make_seeds(folder: Path) -> None:
         _files(made)
         for name, shift_m in (("out", 0.0), ("old", 0.1)):
             write_results(made / name, shift_m)
+            _measured_from(made / name, made / "euroc")
             _done(["lifts", str(made / name), "--magnet", str(made / "magnet.toml"), "--at", "end"])
         _fleet(made)
 
@@ -66,6 +68,17 @@ def write_results(folder: Path, shift_m: float) -> None:
     for name in ("cloud.ply", "contour.csv", "laser.csv", "trajectory.tum", "preview.png"):
         shutil.copyfile(more / name, folder / name)
     shutil.rmtree(more)
+    reseal_folder(folder)
+
+
+def _measured_from(folder: Path, recording: Path) -> None:
+    """Make a result one of this recording: its poses at the recording's stamps, its digests."""
+    opened = open_recording(recording)
+    poses = [f"{stamp / 1e9:.9f} {k}.0 0.15 8.0 1 0 0 0" for k, stamp in enumerate(opened.index.stamps_ns)]
+    (folder / "trajectory.tum").write_text("\n".join(poses) + "\n")
+    result = json.loads((folder / "result.json").read_text())
+    result["hashes"]["inputs"] = opened.digests()
+    (folder / "result.json").write_text(json.dumps(result))
     reseal_folder(folder)
 
 

@@ -262,9 +262,8 @@ def test_sizes_are_looked_at_before_anything_is_read(tmp_path: Path) -> None:
 def test_a_changed_document_is_not_compared(tmp_path: Path) -> None:
     write_results(tmp_path / "out", 0.0)
     (tmp_path / "magnet.toml").write_text(example_magnet())
-    assert (
-        run(["lifts", str(tmp_path / "out"), "--magnet", str(tmp_path / "magnet.toml"), "--at", "end"]) == 0
-    )
+    words = ["lifts", str(tmp_path / "out"), "--magnet", str(tmp_path / "magnet.toml")]
+    assert run([*words, "--at", "end"]) == 0
     results = open_objects(str(tmp_path / "r"), create=True)
     note = {"measured_s": 1.0, "whole_s": 1.0, "peak_bytes": 1, "files": {}}
     for key in ("a", "b"):
@@ -275,7 +274,7 @@ def test_a_changed_document_is_not_compared(tmp_path: Path) -> None:
     assert same is not None and len(same.changes) == 12 and not any(one.sigma == 0 for one in same.changes)
     assert all(change.before == change.after for change in same.changes)
     path = tmp_path / "r/files/b/t/bundles.json"
-    path.write_text(path.read_text().replace('"length_m": 2', '"length_m": 3', 1))
+    path.write_text(path.read_text().replace('"length_m": ', '"length_m": 1', 1))
     with pytest.raises(InputError, match="was changed after it was written"):
         compare_recording(results, "one", "a", "b")
     path.unlink()
