@@ -317,10 +317,10 @@ def matching(
 
 @contextmanager
 def _matched_ahead(
-    match: PairChain, pairs: Iterator[RectifiedPair | RefusedFrame], most: int
+    match: PairChain, pairs: Iterator[RectifiedPair | RefusedFrame], max_waiting: int
 ) -> Iterator[Iterator[MatchedFrame | Refusal]]:
-    """Match pairs ahead, whole chains side by side; about `most` of them may wait."""
-    chains = max(most // match.length, WORKERS)
+    """Match pairs ahead, whole chains side by side; about `max_waiting` of them may wait."""
+    chains = max(max_waiting // match.length, WORKERS)
     with prefetched_map(match.match_all, match.split(pairs), chains) as matched:
         yield chain.from_iterable(matched)
 

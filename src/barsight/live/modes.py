@@ -142,7 +142,7 @@ class JumpWatch:
     """Tells by how much the encoders have jumped, until they come back. sigma_m: of a reading."""
 
     def __init__(self, sigma_m: float) -> None:
-        self._least_m = max(MIN_JUMP_M, JUMP_SIGMAS * sigma_m)
+        self._min_jump_m = max(MIN_JUMP_M, JUMP_SIGMAS * sigma_m)
         self._off_m: Float64 = np.zeros(3)
         self._last_ns = self._jump_ns = self._from_ns = 0
         self._jump_m: Float64 = np.zeros(3)
@@ -170,7 +170,7 @@ class JumpWatch:
         place = position_m + (stamp_ns < self._jump_ns)[:, None] * self._jump_m
         off = place[-1] - place[-2] - (place[-2] - place[0]) / -t[0] * t[-1]
         speed = float(np.linalg.norm(place[-2] - place[0])) / -t[0]
-        bound_m = self._least_m + STAMP_SIGMA_S * speed + MAX_CHANGE_MPS2 * t[-1] * (t[-1] - t[0])
+        bound_m = self._min_jump_m + STAMP_SIGMA_S * speed + MAX_CHANGE_MPS2 * t[-1] * (t[-1] - t[0])
         if np.linalg.norm(off) > bound_m:
             # Back means back within the bounds of the jump there and the jump back.
             is_away = np.linalg.norm(self._off_m) > self._bound_m

@@ -30,7 +30,7 @@ PROCESSES: dict[str, Callable[[Link], None]] = {
 }  # fmt: skip
 BEAT_S = 0.1
 """Interval between judgements of the mode and looks after the processes."""
-MOST_RESTARTS, RESTARTS_WITHIN_S = 5, 30.0
+MAX_RESTARTS, RESTARTS_WITHIN_S = 5, 30.0
 """A process that ends more often than that ends the run."""
 START_S = 120.0
 """Processes may take so long to start on a busy machine."""
@@ -168,10 +168,8 @@ class Supervisor:
             self._log(f"{role} {state.reason}; starting it anew")
             now = time.monotonic()
             self._ends[role] = [at for at in self._ends[role] if now - at < RESTARTS_WITHIN_S] + [now]
-            if len(self._ends[role]) > MOST_RESTARTS:
-                self.stop(
-                    f"{role} {state.reason}, {MOST_RESTARTS + 1} times within {RESTARTS_WITHIN_S:.0f} s"
-                )
+            if len(self._ends[role]) > MAX_RESTARTS:
+                self.stop(f"{role} {state.reason}, {MAX_RESTARTS + 1} times within {RESTARTS_WITHIN_S:.0f} s")
                 return
             self._board[role, "ready"] = 0
             self._start(role)
