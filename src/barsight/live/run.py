@@ -17,7 +17,8 @@ from typing import Any, Literal
 from barsight.checkpoint import checkpoint_folder
 from barsight.core.compiling.ahead import compile_ahead
 from barsight.core.errors import ConfigError, InputError, MeasurementError, OutputError
-from barsight.core.files import atomic_path, expect_empty, lies_within, translated_os_errors
+from barsight.core.files import expect_empty, lies_within, translated_os_errors
+from barsight.core.json_values import write_json
 from barsight.core.notices import Notice
 from barsight.core.stamps import NS_PER_S
 from barsight.live.latency import latencies
@@ -168,8 +169,7 @@ def _finish(
         return content
     finally:
         state.phase = "done" if lifts_s is not None else "failed"
-        with atomic_path(out / "latency.json") as path:
-            path.write_text(json.dumps(latencies(link, board, lifts_s), indent=1) + "\n", encoding="utf-8")
+        write_json(out / "latency.json", latencies(link, board, lifts_s))
         write_state(state, board, out)
 
 
@@ -222,8 +222,7 @@ def write_keyframes(keyframes: Keyframes, target: Path) -> None:
             "lifts": keyframes.mode.lifts,
         },
     }
-    with atomic_path(target) as path:
-        path.write_text(json.dumps(content) + "\n", encoding="utf-8")
+    write_json(target, content)
 
 
 def read_keyframes(path: Path) -> Keyframes:

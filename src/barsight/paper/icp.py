@@ -13,8 +13,9 @@ from barsight.core.arrays import Float64
 from barsight.core.pose import Pose
 from barsight.core.stamps import interpolate_at
 from barsight.core.types import RectifiedPair, Trajectory
-from barsight.paper.cloud import cloud_of, truth_of
+from barsight.paper.cloud import cloud_of
 from barsight.recording.base import Recording
+from barsight.recording.formats.ground_truth import truth_of
 from barsight.recording.rectified_pairs import RectifiedPairs
 
 ROUNDS = 20

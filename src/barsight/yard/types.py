@@ -202,6 +202,11 @@ class Bundle:
         return self.on_top is True and not self.cover_doubts
 
     @property
+    def bottom_z_m(self) -> float:
+        """Return the underside's height: a hexagon is as deep below its axis as it rises above it."""
+        return float(2 * self.centre_m[2] - self.top_z_m)
+
+    @property
     def direction(self) -> Float64:
         """Return the unit vector (3,) of the axis towards +y."""
         cos_pitch = np.cos(self.pitch_rad)

@@ -47,6 +47,11 @@ VETOES = {
 """Code to what it means; a test trips each."""
 
 
+def _expect_veto(code: str) -> None:
+    if code not in VETOES:
+        raise ValueError(f"{code!r} is no veto")
+
+
 @dataclass(frozen=True)
 class Veto:
     """Reason not to lift: a code of `VETOES` and a sentence with the figures."""
@@ -55,8 +60,7 @@ class Veto:
     reason: str
 
     def __post_init__(self) -> None:
-        if self.code not in VETOES:
-            raise ValueError(f"{self.code!r} is no veto")
+        _expect_veto(self.code)
 
 
 @dataclass(frozen=True)
@@ -78,8 +82,7 @@ class Check:
     reason: str
 
     def __post_init__(self) -> None:
-        if self.code not in VETOES:
-            raise ValueError(f"{self.code!r} is no veto")
+        _expect_veto(self.code)
 
 
 def vetoes_of(checks: Iterable[Check]) -> tuple[Veto, ...]:
