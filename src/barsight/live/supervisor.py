@@ -74,7 +74,7 @@ class Supervisor:
         self._context = multiprocessing.get_context("forkserver")
         self._context.set_forkserver_preload([__name__])
         self._running: dict[str, BaseProcess] = {}
-        self._roles = [role for role in PROCESSES if role != "record" or link.crane is not None]
+        self._roles = [role for role in PROCESSES if role != "record" or link.source.crane is not None]
         self._ends: dict[str, list[float]] = {role: [] for role in self._roles}
         self._hung: dict[str, str] = {}
         self.state = RunState(processes={role: ProcessState() for role in self._roles})
@@ -84,8 +84,8 @@ class Supervisor:
         self._freeze = None if crane is None else FreezeWatch(crane)
         self._jump = None if crane is None else JumpWatch(crane.position_std_m)
         self._survey: SurveyWatch | None = None
-        if link.crane is not None:
-            self._survey = SurveyWatch(link.crane.survey, is_alone=not link.surveys)
+        if link.source.crane is not None:
+            self._survey = SurveyWatch(link.source.crane.survey, is_alone=not link.source.surveys)
         self._clock: ReplayClock | None = None
         self._health_at = 0.0
         self._signs: dict[tuple[str, str], int] = {}
@@ -137,9 +137,9 @@ class Supervisor:
                 self.stop("the processes didn't start")
         began_ns = time.monotonic_ns()
         first_ns = self._board["capture", "first_ns"]
-        if self._link.crane is not None:
-            first_ns = began_ns + self._link.epoch_ns
-        self._clock = ReplayClock(began_ns, first_ns, self._link.speed)
+        if self._link.source.crane is not None:
+            first_ns = began_ns + self._link.source.epoch_ns
+        self._clock = ReplayClock(began_ns, first_ns, self._link.source.speed)
         self._board["supervisor", "began_ns"] = began_ns
         self.state.phase = "measuring"
 
@@ -247,8 +247,8 @@ class Supervisor:
                 frozen, jumped_m = self._freeze.check(stamps, values), self._jump.check(stamps, values)
                 if frozen:
                     self._jump.begin_anew()
-        if self._link.crane is not None:
-            step_s = (time.time_ns() - time.monotonic_ns() - self._link.epoch_ns) / NS_PER_S
+        if self._link.source.crane is not None:
+            step_s = (time.time_ns() - time.monotonic_ns() - self._link.source.epoch_ns) / NS_PER_S
         return HeardSensors(last_ns, board["capture", "interval_ns"], readings, frozen, jumped_m, step_s)
 
     def _write(self, health: bool) -> None:
