@@ -11,7 +11,7 @@ import barsight
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import InputError
 from barsight.core.json_values import write_json
-from barsight.labels.attachment import Label, PlacedCode, contradictions, unite
+from barsight.labels.attachment import Label, PlacedCode, contradictions, merge_codes
 from barsight.labels.bundle_labels import placed_codes
 from barsight.labels.placing import pose_at
 from barsight.recording.base import Recording
@@ -58,7 +58,7 @@ def read_labels(
         count()
         codes += found
         pictures += 2
-    labels = unite(codes, bundles)
+    labels = merge_codes(codes, bundles)
     return ReadLabels(said["map_id"], pictures, labels, contradictions(labels, bundles, listed))
 
 

@@ -21,7 +21,7 @@ from barsight.recording.wrapper import RecordingProxy
 
 
 @dataclass(frozen=True)
-class LiveSource:
+class LiveInput:
     """A recording to replay, or a crane's own sensors.
 
     speed: recorded seconds a second; 0: as fast as possible. crane: the sensors of crane.toml; then
@@ -44,7 +44,7 @@ class Link:
     memory. keyframes: stamps of the only pairs to keep, None where the run chooses.
     """
 
-    source: LiveSource
+    source: LiveInput
     settings: MeasureSettings
     live: LiveSettings
     folder: Path

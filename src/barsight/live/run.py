@@ -22,7 +22,7 @@ from barsight.core.json_values import write_json
 from barsight.core.notices import Notice
 from barsight.core.stamps import NS_PER_S
 from barsight.live.latency import latencies
-from barsight.live.link import GrowingRecording, KeptRecording, Link, LiveSource
+from barsight.live.link import GrowingRecording, KeptRecording, Link, LiveInput
 from barsight.live.mapper import LIVE_MAP
 from barsight.live.modes import Mode
 from barsight.live.settings import LiveSettings
@@ -72,7 +72,7 @@ def replay(
     if lies_within(out, path):
         raise OutputError(f"{out}: lies in the recording itself; name a folder elsewhere")
     expect_empty(out)
-    run = LiveRun(recording, LiveSource(path.absolute(), speed), out, settings, live, tell)
+    run = LiveRun(recording, LiveInput(path.absolute(), speed), out, settings, live, tell)
     return run.measure(given, described, judged_at, advance)
 
 
@@ -82,7 +82,7 @@ class LiveRun:
     """
 
     def __init__(
-        self, recording: Recording, source: LiveSource, out: Path, settings: MeasureSettings,
+        self, recording: Recording, source: LiveInput, out: Path, settings: MeasureSettings,
         live: LiveSettings, tell: Callable[[str], None],
     ) -> None:  # fmt: skip
         self._recording, self._source, self._out, self._asked = recording, source, out, settings

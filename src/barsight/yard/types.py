@@ -76,7 +76,7 @@ class HeightMap:
         """Return a picture of the heights for a notebook."""
         from barsight.yard.map_picture import picture_html
 
-        return picture_html(self)
+        return picture_html(self.x_m, self.y_m, self.z_m)
 
     def part(self, rows: slice, columns: slice) -> HeightMap:
         """Cut a rectangle of the map, by cells from start to stop; the arrays are shared."""
