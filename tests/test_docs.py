@@ -190,6 +190,22 @@ def test_readme_leads_to_every_command() -> None:
     assert [command for command in main.COMMANDS if f"\n## {command}\n" not in made] == []
 
 
+def test_every_command_is_shown_outside_the_reference() -> None:
+    """By a shell line or in a sentence of a how-to, the tour or the paper's page."""
+    pages = [*(ROOT / "docs" / "how-to").glob("*.md"), ROOT / "docs" / "tour.md", ROOT / "docs" / "paper.md"]
+    told = " ".join(page.read_text(encoding="utf-8") for page in pages)
+    assert [command for command in main.COMMANDS if not re.search(rf"barsight {command}\b", told)] == []
+
+
+def test_index_and_menu_lead_to_every_page() -> None:
+    docs = ROOT / "docs"
+    pages = {page.relative_to(docs).as_posix() for page in docs.rglob("*.md")} - {"index.md"}
+    index = (docs / "index.md").read_text(encoding="utf-8")
+    menu = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    assert pages - set(re.findall(r"\(([\w/.-]+\.md)\)", index)) == set()
+    assert pages - set(re.findall(r"[\w/.-]+\.md", menu)) == set()
+
+
 def test_ci_runs_readmes_test_command() -> None:
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     test_command = next(line for line in readme.splitlines() if line.endswith("-m pytest"))
