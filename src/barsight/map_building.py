@@ -25,13 +25,12 @@ from barsight.core.timing import Stopwatch, count_frames
 from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame, Trajectory
 from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.fusion import fuse_view
-from barsight.mapping.scene_extent import (
+from barsight.mapping.keyframes import select_keyframes, select_keyframes_by_encoders
+from barsight.mapping.recording_probe import (
     RecordingProbe,
     choose_cell_size,
     points_per_pixel,
     probe_recording,
-    select_keyframes,
-    select_keyframes_by_encoders,
 )
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.surface.height_selection import ViewFrusta
