@@ -172,6 +172,16 @@ def test_pages_that_code_and_texts_name_exist() -> None:
     assert missing == set()
 
 
+def test_where_to_look_is_current() -> None:
+    """Each row of the table in CONTRIBUTING names what is there, and no room of the package is left out."""
+    package, text = ROOT / "src" / "barsight", (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    table = text[text.index("| you look for |") : text.index("The commands you need")]
+    named = set(re.findall(r"`([\w/]+(?:\.py)?)`", table.split("|---|---|")[1]))
+    assert [path for path in named if not (package / path).exists()] == []
+    rooms = {path.parent.name for path in package.glob("*/__init__.py")}
+    assert rooms - {path.split("/")[0] for path in named} == set()
+
+
 def test_every_veto_is_tripped_by_a_test(reference: ModuleType) -> None:
     tests = "".join(path.read_text(encoding="utf-8") for path in Path(__file__).parent.glob("test_*.py"))
     assert [code for code in reference.find("VETOES") if f'"{code}"' not in tests] == []
