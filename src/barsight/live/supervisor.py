@@ -17,7 +17,7 @@ from barsight.core.stamps import NS_PER_S
 from barsight.live.capture import capture
 from barsight.live.link import Link
 from barsight.live.mapper import build_live_map
-from barsight.live.modes import FOR_LIFTS, FreezeWatch, JumpWatch, Mode, SensorSigns, judge_mode
+from barsight.live.modes import FOR_LIFTS, FreezeWatch, JumpWatch, Mode, SensorActivity, judge_mode
 from barsight.live.record import DRAIN, record
 from barsight.live.shared.counters import Counters
 from barsight.live.source import ReplayClock
@@ -235,7 +235,7 @@ class Supervisor:
                 self._log(told.format(value))
             self._signs[key] = value
 
-    def _heard(self) -> SensorSigns:
+    def _heard(self) -> SensorActivity:
         board, frozen, jumped_m, step_s = self._board, False, 0.0, 0.0
         # First the pictures: readings that come meanwhile must not look late beside them.
         last_ns = board["capture", "last_cam0_ns"], board["capture", "last_cam1_ns"]
@@ -249,7 +249,7 @@ class Supervisor:
                     self._jump.begin_anew()
         if self._link.source.crane is not None:
             step_s = (time.time_ns() - time.monotonic_ns() - self._link.source.epoch_ns) / NS_PER_S
-        return SensorSigns(last_ns, board["capture", "interval_ns"], readings, frozen, jumped_m, step_s)
+        return SensorActivity(last_ns, board["capture", "interval_ns"], readings, frozen, jumped_m, step_s)
 
     def _write(self, health: bool) -> None:
         write_state(self.state, self._board, self._out)
