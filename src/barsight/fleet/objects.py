@@ -64,10 +64,10 @@ class Objects:
             self.expect_size(path, found.meta["size"], MAX_DOCUMENT_BYTES)
             return bytes(found.bytes())
 
-    def expect_size(self, path: str, size: int, most: int) -> None:
+    def expect_size(self, path: str, size: int, max_bytes: int) -> None:
         """Raise InputError for an object of more bytes."""
-        if size > most:
-            raise InputError(f"{self.url}/{path}", f"has {size} bytes, at most {most} are read", REMEDY)
+        if size > max_bytes:
+            raise InputError(f"{self.url}/{path}", f"has {size} bytes, at most {max_bytes} are read", REMEDY)
 
     def read_json(self, path: str, schema: Any = None) -> Any:
         """Read a JSON object; None where there is none. Raises InputError for one that is torn, or isn't as
