@@ -10,14 +10,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from barsight.acceptance.commissioning import GuidedStep, begin, walk
+from barsight.acceptance.watch import Approval, WatchedFigure, WatchedSurvey, WatchRecord, write_watch
 from barsight.calibration.files.euroc import read_rig
 from barsight.calibration.files.rig_file import write_rig_file
 from barsight.calibration.files.yaml_document import write_document
 from barsight.cli.main import run
 from barsight.core.files import atomic_directory
+from barsight.core.reading.sealed_json import write_sealed
 from barsight.fleet.ledger import HeldRecording, claim, park, publish
 from barsight.fleet.objects import open_objects
 from barsight.fleet.records import find_version, read_tasks
+from barsight.plant.opcua.security.access import add_user
 from barsight.plant.telegram import IN_MAGIC, VERSION, pack
 from barsight.recording.open import open_recording
 from barsight.result_folder import file_digest
@@ -52,6 +56,7 @@ def make_seeds(folder: Path) -> None:
             _measured_from(made / name, made / "euroc")
             _done(["lifts", str(made / name), "--magnet", str(made / "magnet.toml"), "--at", "end"])
         _fleet(made)
+        _acceptance(made)
 
 
 def _done(command: list[str]) -> None:
@@ -78,6 +83,8 @@ def _measured_from(folder: Path, recording: Path) -> None:
     (folder / "trajectory.tum").write_text("\n".join(poses) + "\n")
     result = json.loads((folder / "result.json").read_text())
     result["hashes"]["inputs"] = opened.digests()
+    result["recording"]["path"] = recording.name
+    result["configuration"] = {"stereo": {"calibration_sigma_px": 0.1}}
     (folder / "result.json").write_text(json.dumps(result))
     reseal_folder(folder)
 
@@ -151,7 +158,31 @@ def _places(made: Path) -> None:
     (made / "plant.toml").write_text(
         '[store]\nurl = "sqlite:///y.db"\nmagnet_steps_kg = [1000.0, 3000.0]\n[telegram]\nport = 2000\n'
     )
+    (made / "users.toml").write_text(
+        '[store]\nurl = "sqlite:///y.db"\nmagnet_steps_kg = [1000.0]\n[opcua]\nfolder = "opcua"\n'
+        'users = "users.json"\n'
+    )
     (made / "telegram.bin").write_bytes(pack("in", {"magic": IN_MAGIC, "version": VERSION, "life": 7}))
+
+
+def _acceptance(made: Path) -> None:
+    """Write what commissioning and service keep of a rig."""
+    row = {"group": "touch_mm", "name": "touch: x", "error": 1.5, "decision": "passed"}
+    write_sealed({"schema_version": 1, "quantities": [row], "plan": {}}, made / "certificate.json")
+    figures = tuple(WatchedFigure(name, 0.1, 0.02) for name in ("yaw / deg", "baseline / mm"))
+    surveys = tuple(WatchedSurvey(f"r{k}", f"id{k}", "c", figures) for k in range(12))
+    approval = Approval("ann", "new", "2026-01-01T00:00:00+00:00", "c", 2)
+    write_watch(WatchRecord(surveys, (approval,)), made / "watch.json")
+    (made / "plan.toml").write_text(
+        'yard = "Y"\n[[plate]]\nname = "P1"\nx_m = 1.0\ny_m = 2.0\nz_m = 0.02\nsize_m = [0.5, 0.5]\n'
+        '[[sphere]]\nname = "S1"\nx_m = 0.5\ny_m = 0.5\nz_m = 0.3\ndiameter_m = 0.2\nplace_sigma_m = 0.001\n'
+    )
+    add_user(made / "users.json", "ann", "operator", "a long password")
+    folder = made / "commission"
+    begin(folder)
+    waits = GuidedStep("cameras", ("board",), ("rig.yaml",), "pictures", lambda: "done")
+    (folder / "given").write_text("x")
+    walk(folder, (GuidedStep("first", ("given",), ("given",), "", lambda: "done"), waits))
 
 
 def _fleet(made: Path) -> None:

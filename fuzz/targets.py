@@ -130,14 +130,37 @@ def _rig(name: str) -> Target:
     return Target(f"rig {name}", (name,), (name,), call, ("made.yaml",), 1.5)
 
 
-def _compare_versions(folder: Path) -> int:
+def _watch(folder: Path) -> int:
+    from barsight.acceptance.watch import control_charts, read_watch
+
+    control_charts(read_watch(folder / "watch.json").since_approval)
+    return 0
+
+
+def _plan(folder: Path) -> int:
+    from barsight.artefacts.plan import read_plan
+
+    read_plan(folder / "plan.toml")
+    return 0
+
+
+def _users(folder: Path) -> int:
+    from barsight.plant.opcua.security.access import read_users
+
+    read_users(folder / "users.json")
+    return 0
+
+
+def compare_versions(folder: Path) -> int:
+    """Compare the two versions of the fleet's folder."""
     first, second = sorted(path.name for path in (folder / "fleet/versions").iterdir())
     store = f"sqlite:///{folder}/fleet/yard.db"
     words = ("--results", f"{folder}/fleet", "--store", store, "-o", f"{folder}/made")
     return run_and_print(["fleet", "compare", first, second, *words])
 
 
-def _promote_version(folder: Path) -> int:
+def promote_version(folder: Path) -> int:
+    """Promote the version of the fleet's folder that ran to its end."""
     first = next(path.parent.name for path in (folder / "fleet/versions").glob("*/rig.yaml"))
     store = f"sqlite:///{folder}/fleet/yard.db"
     words = ("--results", f"{folder}/fleet", "--store", store, "--into", f"{folder}/made")
@@ -221,8 +244,27 @@ TARGETS = (
         run_words("fleet", "status", "--results", "FOLDER/fleet", "--store", "sqlite:///FOLDER/fleet/yard.db"),
         (), 0.5, warm=False,
     ),
-    Target("fleet compare", ("fleet",), FLEET, _compare_versions, ("made",), 0.5, warm=False),
-    Target("fleet promote", ("fleet",), FLEET, _promote_version, (), 0.5, warm=False),
+    Target("fleet compare", ("fleet",), FLEET, compare_versions, ("made",), 0.5, warm=False),
+    Target("fleet promote", ("fleet",), FLEET, promote_version, (), 0.5, warm=False),
+    Target(
+        "budget", ("euroc", "out", "certificate.json"), (*RESULT, "certificate.json"),
+        run_words(
+            "budget", "FOLDER/out", "--certificate", "FOLDER/certificate.json", "-o", "FOLDER/made.json"
+        ),
+        ("made.json",), 0.5, warm=False,
+    ),
+    Target(
+        "accept --plan", ("euroc", "out"), RESULT,
+        run_words("accept", "--plan", "FOLDER/out", "-o", "FOLDER/made.toml"), ("made.toml",), 0.5,
+        warm=False,
+    ),
+    Target("plan of acceptance", ("plan.toml",), ("plan.toml",), _plan),
+    Target("watch", ("watch.json",), ("watch.json",), _watch),
+    Target("users", ("users.json",), ("users.json",), _users, (), 0.5),
+    Target(
+        "commission", ("commission",), ("commission/*",),
+        run_words("commission", "FOLDER/commission"), (), 0.5,
+    ),
     Target("export", ("out",), RESULT, run_words("export", "FOLDER/out", "FOLDER/made.las"), ("made.las",)),
     Target("view", ("out",), RESULT, _view, (), 0.6, warm=False),
     Target(
