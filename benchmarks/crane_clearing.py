@@ -55,7 +55,7 @@ PITCH_M, MARGIN_M = 1.1, 0.6
 
 @dataclass
 class Cleared:
-    """What came of a yard. lifts: a line each; left: bundles; refused: codes of the last survey."""
+    """A yard after it was cleared. lifts: a line each; left: bundles; refused: codes of the last survey."""
 
     bundles: int
     surveys: int = 0

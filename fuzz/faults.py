@@ -36,7 +36,7 @@ IGNORED = ("stdout", "stderr")
 
 @dataclass(frozen=True)
 class Whole:
-    """What a run leaves that nothing disturbs. content: of all files; same: names of those that two runs
+    """Output of a run that nothing disturbs. content: of all files; same: names of those that two runs
     write alike; seconds: by the clock.
     """
 

@@ -285,9 +285,9 @@ class Plant:
             return True
         found = wire.up.popleft()
         try:
-            if wire.partner.hears(found):
+            if wire.partner.receive(found):
                 self.store.fault[:] = [fault] if fault else []
-                wire.partner.obey(found)
+                wire.partner.execute(found)
         except Killed:
             self.start_server()
             return False

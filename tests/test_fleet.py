@@ -28,7 +28,7 @@ from barsight.fleet.objects import Objects, open_objects
 from barsight.fleet.planning import estimate, in_order, plan_tasks
 from barsight.fleet.records import note_plan, noted_keys
 from barsight.fleet.scratch import scratch_root, sweep
-from barsight.fleet.task import TaskSettings, run_task
+from barsight.fleet.task import TaskLimits, TaskSettings, run_task
 from barsight.fleet.versions import Version, installed_software
 from barsight.fleet.window import RunWindow
 from barsight.store.audit import AuditChain, entry, verify_chain
@@ -41,7 +41,8 @@ VERSION = Version("v1", "configuration", "", "", installed_software())
 
 
 def settings(folder: Path, archive: str, results: str, **more: float) -> TaskSettings:
-    return TaskSettings(archive, results, None, lease_s=5.0, command=stand_in(folder), **more)  # type: ignore[arg-type]
+    limits = TaskLimits(**{"lease_s": 5.0, **more})  # type: ignore[arg-type]
+    return TaskSettings(archive, results, None, limits, command=stand_in(folder))
 
 
 def no_progress(*_: int) -> None:

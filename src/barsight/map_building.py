@@ -25,13 +25,12 @@ from barsight.core.timing import Stopwatch, count_frames
 from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame, Trajectory
 from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.fusion import fuse_view
-from barsight.mapping.scene_extent import (
+from barsight.mapping.keyframes import select_keyframes, select_keyframes_by_encoders
+from barsight.mapping.recording_probe import (
     RecordingProbe,
     choose_cell_size,
     points_per_pixel,
     probe_recording,
-    select_keyframes,
-    select_keyframes_by_encoders,
 )
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.surface.height_selection import ViewFrusta
@@ -317,10 +316,10 @@ def matching(
 
 @contextmanager
 def _matched_ahead(
-    match: PairChain, pairs: Iterator[RectifiedPair | RefusedFrame], most: int
+    match: PairChain, pairs: Iterator[RectifiedPair | RefusedFrame], max_waiting: int
 ) -> Iterator[Iterator[MatchedFrame | Refusal]]:
-    """Match pairs ahead, whole chains side by side; about `most` of them may wait."""
-    chains = max(most // match.length, WORKERS)
+    """Match pairs ahead, whole chains side by side; about `max_waiting` of them may wait."""
+    chains = max(max_waiting // match.length, WORKERS)
     with prefetched_map(match.match_all, match.split(pairs), chains) as matched:
         yield chain.from_iterable(matched)
 

@@ -10,6 +10,7 @@ from typing import Any, Literal
 from barsight.core.compiling.ahead import compile_ahead
 from barsight.core.errors import ConfigError, OutputError
 from barsight.core.files import atomic_directory, lies_within
+from barsight.core.json_values import write_json
 from barsight.core.notices import Notice
 from barsight.core.parallel import in_background
 from barsight.core.settings.values import expect_choice
@@ -20,7 +21,7 @@ from barsight.pipeline import find_lifts, map_yard
 from barsight.recording.base import Recording
 from barsight.recording.open import open_recording
 from barsight.report.page import write_report
-from barsight.report.result_files import RESULT_FILES, summary, write_results, write_summary, write_surface
+from barsight.report.result_files import RESULT_FILES, summary, write_results, write_surface
 from barsight.result_folder import seal_map
 from barsight.yard.magnet.description import Magnet, load_magnet
 
@@ -99,7 +100,7 @@ def write_measured(
         shutil.rmtree(scratch)
         if truth_of is not None:
             content["truth"] = score_folder(truth_of, staging)
-        write_summary(content, staging / "result.json")
+        write_json(staging / "result.json", content)
         if report:
             write_report(staging, staging / "report.html")
     return content

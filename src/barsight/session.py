@@ -112,11 +112,16 @@ class Session:
         self._begin_pass()
 
     def snapshot(self) -> Snapshot:
-        """Return the map of what came so far of this pass; it changes nothing at the end."""
+        """Return the map of what came so far of this pass; it changes nothing at the end.
+
+        Raises MeasurementError after `finish`, whose yard has the map.
+        """
+        self._expect_open()
         return Snapshot(None, 0) if self._map is None else self._map.snapshot(self)
 
     def finish(self) -> Yard:
-        """Return the yard from all packets, as `measure` has it of the same recording or passes.
+        """Return the yard from all packets, as `measure` has it of the same recording or passes: the matched
+        pairs on disk are fused at the final poses, bundles and lifts found, once.
 
         Raises MeasurementError where it did already.
         """
@@ -139,7 +144,7 @@ class Session:
 
     def _expect_open(self) -> None:
         if self._yard.exists():
-            raise MeasurementError("the session is finished: begin another one")
+            raise MeasurementError("the session is finished: begin another one; finish returned its yard")
 
     def _is_due(self, stamp_ns: int) -> bool:
         """Check whether all readings that place a frame have come, or won't come any more."""

@@ -71,8 +71,9 @@ def main() -> None:
     _fill_closed_streams()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _interrupt)
-    if signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:  # nohup ignores it
-        signal.signal(signal.SIGHUP, _interrupt)
+    hangup = getattr(signal, "SIGHUP", None)  # Windows has none, nohup ignores it
+    if hangup is not None and signal.getsignal(hangup) == signal.SIG_DFL:
+        signal.signal(hangup, _interrupt)
     if not sys.warnoptions:
         warnings.simplefilter("ignore")  # libraries' notes to programmers would stand beside our one line
     code = run_and_print(sys.argv[1:])

@@ -1,13 +1,17 @@
-"""Convert results to values that JSON can hold."""
+"""Convert results to values that JSON can hold, and write them."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import math
+from dataclasses import asdict, is_dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from barsight.core.files import atomic_path
 
 DIGITS = 9
 """Significant digits of a result's documents: a micrometre in any yard."""
@@ -30,6 +34,14 @@ def json_value(value: Any, digits: int | None = None, decimals: int | None = Non
         shortened = value if digits is None else float(f"{value:.{digits}g}")
         return shortened if decimals is None else round(shortened, decimals)
     return value
+
+
+def write_json(target: Path, content: Any, digits: int | None = None) -> None:
+    """Write a document or a frozen record, indented, whole or not at all; NaN and infinity become null."""
+    plain = asdict(content) if is_dataclass(content) and not isinstance(content, type) else content
+    text = json.dumps(json_value(plain, digits), indent=1, allow_nan=False) + "\n"
+    with atomic_path(target) as path:
+        path.write_text(text, encoding="utf-8")
 
 
 def json_digest(value: Any) -> str:

@@ -18,7 +18,7 @@ from barsight.fleet.objects import Objects
 
 TRIES = 3
 """Failures after which a recording is parked,"""
-MOST_LOST = 12
+MAX_LOST = 12
 """and claims whose worker died without a word, which others' faults cause too."""
 Held = Literal["published", "parked", "claimed"]
 
@@ -48,7 +48,7 @@ def claim(results: Objects, key: str, lease_s: float) -> HeldRecording | Held:
         last = results.read_json(f"claims/{key}/{number:04d}.json")
         if last is not None and last["expires"] > time.time():
             return "claimed"
-    if number >= MOST_LOST:
+    if number >= MAX_LOST:
         park(results, key, f"its worker ended {number} times without a word", number)
         return "parked"
     mine = HeldRecording(key, number + 1, secrets.token_hex(8))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Mapping
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from barsight.core.files import atomic_path
+from barsight.core.json_values import write_json
 from barsight.live.drift import DRIFT_FILE, drift_figures
 from barsight.live.latency import counts
 from barsight.live.modes import MODES, Mode
@@ -60,7 +60,7 @@ class RunState:
 
 def write_state(state: RunState, board: Counters, out: Path) -> None:
     """Write state.json."""
-    _write_json(state.content(board), out / "state.json")
+    write_json(out / "state.json", state.content(board))
 
 
 def write_health(state: RunState, board: Counters, seconds: float, out: Path) -> None:
@@ -88,7 +88,7 @@ def write_health(state: RunState, board: Counters, seconds: float, out: Path) ->
         "record": board.row("record"),
         "calibration": drift_figures(out.parent / DRIFT_FILE),
     }
-    _write_json(content, out / "health.json")
+    write_json(out / "health.json", content)
     with atomic_path(out / "health.prom") as path:
         path.write_text(prometheus(content), encoding="utf-8")
 
@@ -128,11 +128,6 @@ def _disk_days(free_bytes: int, recorded_bytes: int, seconds: float) -> float | 
     if recorded_bytes <= 0 or seconds <= 0:
         return None
     return round(free_bytes / (recorded_bytes / seconds) / 86400, 2)
-
-
-def _write_json(content: dict[str, Any], target: Path) -> None:
-    with atomic_path(target) as path:
-        path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def _memory_bytes(pid: int) -> int:

@@ -34,10 +34,10 @@ class PlcPartner:
         """Tell how long the PLC's life counter has stood still, or didn't come."""
         return time.monotonic() - self._alive_s
 
-    def hears(self, found: dict[str, int], *, is_busy: bool = False) -> bool:
-        """Take a telegram; tell whether it brings a new command, which `obey` is to be called for.
+    def receive(self, found: dict[str, int], *, is_busy: bool = False) -> bool:
+        """Take a telegram; tell whether it brings a new command, which `execute` is to be called for.
 
-        is_busy: whether `obey` still runs; then a command is left to the telegrams that follow.
+        is_busy: whether `execute` still runs; then a command is left to the telegrams that follow.
         """
         if found["life"] != self._life:
             self._life, self._alive_s = found["life"], time.monotonic()
@@ -64,7 +64,7 @@ class PlcPartner:
         reason = "partner-silent: the PLC's life counter stands still"
         return replace(state, is_valid=False, reasons=(*state.reasons, reason))
 
-    def obey(self, found: dict[str, int]) -> None:
+    def execute(self, found: dict[str, int]) -> None:
         """Take a command to the store; `answer` holds what came of it.
 
         Where the store can't be reached there is none: the command is taken again with the next telegram.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import asdict, fields
 from datetime import UTC, datetime
@@ -241,12 +240,6 @@ def write_preview(preview: Preview, target: Path) -> None:
     encoded = cv2.imencode(".png", small)[1]
     with atomic_path(target) as path:
         path.write_bytes(encoded.tobytes())
-
-
-def write_summary(content: dict[str, Any], target: Path) -> None:
-    """Write result.json from what `summary` says."""
-    with atomic_path(target) as path:
-        path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def summary(measurement: Measurement) -> dict[str, Any]:

@@ -15,8 +15,7 @@ from typing import Any
 import barsight
 from barsight.benchmarks.yard.world_scores import WorldScore, score_world
 from barsight.core.errors import BarsightError, ConfigError, OutputError
-from barsight.core.files import atomic_path
-from barsight.core.json_values import json_digest, json_value
+from barsight.core.json_values import json_digest, json_value, write_json
 from barsight.simulation.settings import SimulationSettings
 from barsight.simulation.worlds.recording import GENERATOR, draw_world, simulate_world
 
@@ -110,8 +109,7 @@ def _read_note(folder: Path) -> dict[str, Any]:
 
 
 def _write_note(folder: Path, note: dict[str, Any]) -> None:
-    with atomic_path(folder / NOTE) as path:
-        path.write_text(json.dumps(note, indent=1) + "\n", encoding="utf-8")
+    write_json(folder / NOTE, note)
 
 
 def _remove(*folders: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -17,8 +16,8 @@ from barsight.acceptance.error_sources import MeasuredLoad, measured_load
 from barsight.cli.arguments import call
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError
-from barsight.core.files import atomic_path, expect_output
-from barsight.core.json_values import json_value
+from barsight.core.files import expect_output
+from barsight.core.json_values import DIGITS, write_json
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -63,8 +62,7 @@ def _write(found: MeasuredLoad, figures: Sequence[BudgetedFigure], out: Path) ->
         "figures": [asdict(one) for one in figures],
         "assumed": list(found.assumed),
     }
-    with atomic_path(out) as path:
-        path.write_text(json.dumps(json_value(content, 9), indent=1) + "\n", encoding="utf-8")
+    write_json(out, content, DIGITS)
 
 
 def _print(found: MeasuredLoad, figures: Sequence[BudgetedFigure]) -> None:

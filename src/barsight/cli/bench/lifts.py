@@ -10,7 +10,6 @@ from typing import Annotated
 import tyro
 
 from barsight.benchmarks.lift_judge.magnet import read_magnet
-from barsight.benchmarks.provenance import write_json
 from barsight.benchmarks.yard.drawn_worlds import MappedWorld, measured_world, noisy_world, render_world
 from barsight.benchmarks.yard.judged_lifts import (
     JudgedBench,
@@ -23,6 +22,7 @@ from barsight.cli.bench.seeds import over_seeds, parse_seeds
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError
+from barsight.core.json_values import write_json
 from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings
 from barsight.simulation.worlds.yards import DrawnYard, draw_yard

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from barsight.benchmarks.provenance import provenance, write_json
+from barsight.benchmarks.provenance import provenance
 from barsight.benchmarks.yard.world_runs import WorldKeys, run_world
 from barsight.benchmarks.yard.world_scores import (
     WorldBench,
@@ -20,6 +20,7 @@ from barsight.benchmarks.yard.world_scores import (
 from barsight.cli.bench.seeds import over_seeds, parse_seeds
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError
+from barsight.core.json_values import write_json
 from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings
 from barsight.simulation.settings import CameraSettings, SimulationSettings

@@ -37,6 +37,8 @@ MAX_DIGITS = 30
 MAX_MAGNITUDE = 1e15
 """Of a number in a table or a calibration: what is computed of it stays finite."""
 REMEDY = "take the original file"
+_READING = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
+"""Flags of opening a file. Windows has but the first, and no pipes among its files."""
 
 
 def in_range(values: ArrayLike) -> NDArray[np.bool_]:
@@ -55,7 +57,7 @@ def open_regular(
     try:
         _expect_regular(path, path.stat(), remedy, kind, max_bytes)
         # Another file may have taken the place meanwhile: a pipe must not block.
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        descriptor = os.open(path, _READING)
     except FileNotFoundError:
         raise kind(path, "no such file", remedy) from None
     except PermissionError:

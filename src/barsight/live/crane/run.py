@@ -13,6 +13,7 @@ from barsight.core.errors import BarsightError, ConfigError
 from barsight.core.files import expect_empty, translated_os_errors
 from barsight.live.crane.preflight import prove_sensors
 from barsight.live.drift import DRIFT_FILE, note_drift
+from barsight.live.link import LiveInput
 from barsight.live.run import INTERRUPTED, LiveRun
 from barsight.live.settings import CraneConfig, LiveSettings
 from barsight.live.survey import STOOD
@@ -104,7 +105,8 @@ def _begin(
         folder.mkdir(parents=True)
         write_descriptions(awaited, folder)
     epoch_ns = time.time_ns() - time.monotonic_ns()
-    return LiveRun(crane.awaited(folder), folder, out, settings, live, 1.0, tell, crane, epoch_ns, surveys)
+    source = LiveInput(folder, crane=crane, epoch_ns=epoch_ns, surveys=surveys)
+    return LiveRun(crane.awaited(folder), source, out, settings, live, tell)
 
 
 def _recorded(crane: CraneConfig, out: Path, name: str) -> Path:

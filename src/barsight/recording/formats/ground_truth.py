@@ -12,6 +12,7 @@ from barsight.core.errors import InputError
 from barsight.core.pose import Pose
 from barsight.core.reading.bounded_reading import in_range, read_text
 from barsight.core.stamps import expect_increasing, parse_seconds
+from barsight.recording.base import Recording
 from barsight.recording.formats.euroc_tables import read_table, require_file
 from barsight.recording.own_files import leads_outside
 
@@ -67,6 +68,13 @@ def read_ground_truth(path: Path, stamp_ns: Int64 | None = None, *, reference: s
     expect_increasing(stamps, file, 1)
     numbers = np.array([[float(field) for field in line[1:]] for line in lines])
     return _truth(file, stamps, numbers[:, :3], numbers[:, 3:], reference)
+
+
+def truth_of(recording: Recording) -> GroundTruth | None:
+    """Read the true trajectory that lies with a recording, None where there is none."""
+    if find_ground_truth(recording.path) is None:
+        return None
+    return read_ground_truth(recording.path, np.array(recording.index.stamps_ns, np.int64))
 
 
 def truth_as_euroc(path: Path, stamp_ns: Int64) -> str:
