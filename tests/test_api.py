@@ -26,7 +26,7 @@ WHEN = ("judged_at_ns", "content_sha256")
 
 
 def lifts_of(folder: Path) -> dict[str, Any]:
-    """What lifts.json says, but when it was judged, which its digest holds too."""
+    """Read lifts.json, but for when it was judged, which its digest holds too."""
     lifts = read_lifts(folder / "lifts.json")
     return {name: value for name, value in lifts.items() if name not in WHEN}
 

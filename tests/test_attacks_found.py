@@ -1,4 +1,4 @@
-"""What fuzzing found, each once: a damaged file ends soon in one line that names it."""
+"""Files of fuzzing's finds, each once: a damaged file ends soon in one line that names it."""
 
 import json
 import re

@@ -201,7 +201,7 @@ def test_readme_leads_to_every_command() -> None:
 
 
 def test_every_command_is_shown_outside_the_reference() -> None:
-    """By a shell line or in a sentence of a how-to, the tour or the paper's page."""
+    """A how-to, the tour or the paper's page shows each, in a shell line or a sentence."""
     pages = [*(ROOT / "docs" / "how-to").glob("*.md"), ROOT / "docs" / "tour.md", ROOT / "docs" / "paper.md"]
     told = " ".join(page.read_text(encoding="utf-8") for page in pages)
     assert [command for command in main.COMMANDS if not re.search(rf"barsight {command}\b", told)] == []

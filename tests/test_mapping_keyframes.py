@@ -1,4 +1,4 @@
-"""Which frames of a recording are matched."""
+"""Keyframes: the frames of a recording that are matched."""
 
 from __future__ import annotations
 

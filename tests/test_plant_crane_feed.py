@@ -1,4 +1,4 @@
-"""What a crane's PLC tells reaches the state, and a claim that isn't begun in time ends."""
+"""Readings of a crane's PLC reach the state, and a claim that isn't begun in time ends."""
 
 from __future__ import annotations
 
