@@ -18,7 +18,7 @@ from sqlalchemy import select
 from barsight.cli.arguments import load_settings
 from barsight.cli.main import run
 from barsight.core.errors import ConfigError, Failed, InputError
-from barsight.fleet.archive import find_recordings, manifest_digest
+from barsight.fleet.archive import download, find_recordings, manifest_digest
 from barsight.fleet.cluster import connect
 from barsight.fleet.comparing import FigureChange, RecordingComparison, compare_recording
 from barsight.fleet.comparison_page import comparison_page
@@ -258,6 +258,24 @@ def test_sizes_are_looked_at_before_anything_is_read(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"large\.json: has 8589934592 bytes"):
         publish_version(objects, MeasureSettings(yard=tmp_path / "a/large.json"), None, None, None)
     assert time.process_time() - began < 4
+
+
+def test_an_archive_s_links_lead_to_recordings_and_not_out_of_them(tmp_path: Path) -> None:
+    make_archive(tmp_path / "disk", {"r": "x"})
+    make_archive(tmp_path / "a", {"s": "x"})
+    (tmp_path / "a/r").symlink_to(tmp_path / "disk/r")
+    objects, results = open_objects(str(tmp_path / "a")), open_objects(str(tmp_path / "r"), create=True)
+    tasks = plan_tasks(objects, results, VERSION, None, no_progress)
+    assert sorted(task.name for task in tasks) == ["r", "s"]
+    (tmp_path / "secret").write_text("secret")
+    (tmp_path / "a/s/mav0/kind").unlink()
+    (tmp_path / "a/s/mav0/kind").symlink_to(tmp_path / "secret")
+    with pytest.raises(InputError, match=r"s/mav0/kind: is a link out of the recording"):
+        plan_tasks(objects, results, VERSION, None, no_progress)
+    (tmp_path / "work").mkdir()
+    with pytest.raises(InputError, match=r"s/mav0/kind: is a link out of the recording"):
+        list(download(objects, "s", (".",), tmp_path / "work"))
+    assert not [path for path in (tmp_path / "work").rglob("*") if path.is_file()]
 
 
 def test_a_changed_document_is_not_compared(tmp_path: Path) -> None:

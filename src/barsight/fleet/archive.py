@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -12,6 +12,7 @@ from barsight.core.errors import InputError
 from barsight.core.json_values import json_digest
 from barsight.core.reading.bounded_reading import MAX_TABLE_BYTES
 from barsight.fleet.objects import Objects, StoredObject
+from barsight.recording.own_files import leads_outside
 
 SURVEY = "survey.json"
 """File that makes one survey of the recordings in its folder: the passes, in its list `passes`."""
@@ -115,8 +116,9 @@ def manifest_digest(
 
     read: told of the bytes that were read. A recording whose listing is unchanged is not read again: the
     digest is kept in the results under `manifests/`. Raises InputError for a file that is too large for what
-    it is; only bags have no bound.
+    it is, as only bags have no bound, and for a link out of the recording.
     """
+    expect_own(archive, recording.name, recording.files)
     listed = json_digest([archive.url, recording.name, [[f.path, f.size, f.mark] for f in recording.files]])
     kept = f"manifests/{listed}.json"
     known = results.read_json(kept)
@@ -132,6 +134,18 @@ def manifest_digest(
     return str(known["manifest"])
 
 
+def expect_own(archive: Objects, name: str, files: Iterable[StoredObject]) -> None:
+    """Raise InputError for the first file of a folder's recording that a link brings in from elsewhere: a
+    copy of the recording would hold what isn't its own.
+    """
+    if "://" in archive.url:
+        return
+    for file in files:
+        path = Path(archive.url) / file.path
+        if leads_outside(path, Path(archive.url) / name):
+            raise InputError(path, "is a link out of the recording", "copy the file into the recording")
+
+
 def _digest(archive: Objects, file: StoredObject) -> str:
     found = hashlib.sha256()
     for part in archive.chunks(file.path):
@@ -143,7 +157,8 @@ def download(archive: Objects, name: str, passes: tuple[str, ...], folder: Path)
     """Copy a recording's files into a folder, and yield the path of each pass."""
     recording = ArchivedRecording(name, passes, ())
     is_file = PurePosixPath(name).suffix in _BAGS
-    listed = [StoredObject(name, 0, "")] if is_file else archive.list(name)
+    listed = [StoredObject(name, 0, "")] if is_file else list(archive.list(name))
+    expect_own(archive, name, listed)
     for file in listed:
         inner = PurePosixPath(recording.relative(file))
         if _UNREAD & set(inner.parts[:-1]) or ".." in inner.parts:
