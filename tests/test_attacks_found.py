@@ -89,6 +89,13 @@ def repeated(unit: bytes, times: int) -> Damage:
     return lambda path: path.write_bytes(unit * times)
 
 
+def profiles(path: Path) -> None:
+    """Give each row a profile of its own."""
+    rows = "1.0,0.1,0.1,0.1,1" if path.name == "contour.csv" else "1.0,0.1,0.1"
+    lines = [path.read_text().partition("\n")[0], *(f"{number},{rows}" for number in range(200_000))]
+    path.write_text("\n".join(lines) + "\n")
+
+
 def bomb(path: Path) -> None:
     path.write_bytes(png_bomb(9000, 9000))
 
@@ -132,6 +139,8 @@ FOUND: list[tuple[str, Damage, str, str]] = [
     ("euroc/mav0/cam0/data.csv", repeated(b"1,a\n", 7_000_000), "info F/euroc", "has over 500000 lines"),
     ("euroc/mav0/imu0/data.csv", repeated(b"\n", 29_000_000), "info F/euroc", "has over 4000000 lines"),
     ("euroc/mav0/imu0/data.csv", repeated(b"1", 29_000_000), "info F/euroc", "has a line of over"),
+    ("out/contour.csv", then_sealed(profiles), "report F/out", "holds 200000 profiles, at most 5000"),
+    ("euroc/mav0/laser0/data.csv", profiles, "measure F/euroc -o F/made", "has 200000 profiles, at most"),
     ("out/bundles.json", repeated(b"[],", 10_000_000), "lifts F/out", "over 4000000 values"),
     ("out/height.tif", sparse, "explain F/out 1", "is torn"),
     ("out/tops.tif", sparse, "export F/out F/made.las", "is torn"),
