@@ -119,6 +119,10 @@ FOUND: list[tuple[str, Damage, str, str]] = [
     ("euroc/mav0/imu0/sensor.yaml", number(A_NUMBER, "-1e308"), "info F/euroc", "out of range"),
     ("euroc/mav0/imu0/data.csv", number(f",{A_NUMBER}", ",1e300"), "info F/euroc", "line 2: a value is NaN"),
     ("targets.csv", number(A_NUMBER, "-1e308"), "calibrate yard F/targets.csv -o F/made.yaml", "line 2: a"),
+    (
+        "targets.csv", number(r"0\.5", "a" * 140_000), "calibrate yard F/targets.csv -o F/made.yaml",
+        "can't be read (field larger",
+    ),
     ("rig.xml", number(r"(?<=<data>)\s*\S+", "-1e308"), EXPORT, "range"),
     ("out/preview.png", bomb, "report F/out", "at most"),
     ("out/preview.png", sparse, "report F/out", "at most"),
