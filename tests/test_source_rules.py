@@ -116,6 +116,16 @@ def wide_kernels(tree: ast.AST) -> set[str]:
     }
 
 
+def wide_functions(tree: ast.AST) -> set[str]:
+    """Functions of more parameters than a kernel may have; `self` and `cls` aside."""
+    found = set()
+    for f in functions(tree):
+        own = [a.arg for a in (*f.args.posonlyargs, *f.args.args, *f.args.kwonlyargs)]
+        if len(own) - (own[:1] in (["self"], ["cls"])) > MAX_PARAMETERS:
+            found.add(f.name)
+    return found
+
+
 def names_used(trees: Iterable[ast.AST]) -> set[str]:
     """All that is imported, as `package.module.name`: by its name, or with its module and used from there."""
     used = set()
@@ -163,6 +173,12 @@ def test_kernels_have_few_parameters() -> None:
     assert {m: names for m, tree in TREES.items() if (names := wide_kernels(tree))} == {}
 
 
+def test_functions_have_few_parameters() -> None:
+    found = {m: names for m, tree in (TREES | PROGRAMS).items() if (names := wide_functions(tree))}
+    # Numba hands an intrinsic its values one by one.
+    assert found == {"stereo.direct.semiglobal.paths": {"_extend_paths"}}
+
+
 def test_every_kernel_is_tested() -> None:
     """Public ones by name: one that is only reached through others may be wrong in what they don't ask of it.
     Of private ones the module.
@@ -194,7 +210,11 @@ def test_what_breaks_a_rule_is_found() -> None:
     assert extremes(ast.parse("def f(utmost, min_m):\n    most = least_squares(at_most.x)")) == set()
     names = ", ".join(f"x{i}" for i in range(MAX_PARAMETERS))
     wide = ast.parse(f"@kernel()\ndef even({names}):\n    pass\n@kernel()\ndef more({names}, y):\n    pass\n")
-    assert wide_kernels(wide) == {"more"}
+    assert wide_kernels(wide) == {"more"} == wide_functions(wide)
+    method = ast.parse(
+        f"class A:\n    async def even(self, {names}): ...\n    def more(self, {names}, *, y): ..."
+    )
+    assert wide_functions(method) == {"more"}
     assert questions(ast.parse('"""How it works."""\nclass A:\n    """Howitzer."""')) == ["How it works."]
     assert repeated_classes([ast.parse("class A: ...\nclass B: ..."), ast.parse("class A: ...")]) == {"A"}
 

@@ -67,6 +67,20 @@ MAX_BELOW_FLOOR_RATIO = 0.3
 """Depth under the floor over the working distance, at most; depths of one pair are rough."""
 
 
+@dataclass(frozen=True)
+class LiftRequest:
+    """Lifts that are asked for.
+
+    magnet: what they are chosen for; where there is none, they are judged for the package's example and all
+    forbidden (`no-magnet`). judged_at: when they are judged: now, or at the recording's last frame, to look
+    back. notices: warnings that the caller has.
+    """
+
+    magnet: Magnet | None = None
+    judged_at: Literal["now", "end"] = "now"
+    notices: tuple[Notice, ...] = ()
+
+
 @dataclass(frozen=True, eq=False)
 class MappedYard:
     """The first half's results: trajectories, map and contours. passes: the oldest first. joined: how several
@@ -174,29 +188,19 @@ def _whole(trajectories: Sequence[Trajectory]) -> Trajectory:
     )
 
 
-def find_lifts(
-    mapped: MappedYard, magnet: Magnet | None = None, judged_at: Literal["now", "end"] = "now",
-    notices: tuple[Notice, ...] = (),
-) -> Measurement:  # fmt: skip
-    """Find the bundles of a mapped yard and choose lifts.
-
-    magnet: what lifts are chosen for; where there is none, they are judged for the package's example and all
-    forbidden (`no-magnet`). judged_at: when lifts are judged: now, or at the recording's last frame, to look
-    back. notices: warnings that the caller has.
-    """
+def find_lifts(mapped: MappedYard, request: LiftRequest) -> Measurement:
+    """Find the bundles of a mapped yard and choose lifts."""
     settings, newest, trajectory = mapped.settings, mapped.newest, mapped.trajectory
     watch, profiles = mapped.watch, mapped.profiles
     heights = surface_map(mapped.surface, mapped.free, mapped.tops, mapped.history)
     bundles = _bundles(mapped, heights)
     listed = mapped.stock if trajectory.reference == "yard" else None
     stock = None if listed is None else match_stock(listed, bundles)
-    warnings = [*_warnings(mapped), *_stock_notices(mapped.stock, stock), *notices]
+    warnings = [*_warnings(mapped), *_stock_notices(mapped.stock, stock), *request.notices]
     with watch("lifts"):
         travels = [_travel(one.probed, one.way, one.built, settings) for one in mapped.passes]
         travel = travels[0] if len(travels) == 1 else Travel.joined(travels)
-        lifts = _lifts(
-            heights, bundles, magnet, settings.lift, warnings, trajectory, travel, judged_at, stock
-        )
+        lifts = _lifts(heights, bundles, request, settings.lift, warnings, trajectory, travel, stock)
     source = newest.probed.source
     return Measurement(
         recording_path=source.path.resolve(),
@@ -381,22 +385,21 @@ def _travel(
 
 
 def _lifts(
-    heights: YardMap, bundles: tuple[Bundle, ...], magnet: Magnet | None, settings: LiftSettings,
-    warnings: list[Notice], trajectory: Trajectory, travel: Travel, judged_at: Literal["now", "end"],
-    stock: StockMatch | None,
+    heights: YardMap, bundles: tuple[Bundle, ...], request: LiftRequest, settings: LiftSettings,
+    warnings: list[Notice], trajectory: Trajectory, travel: Travel, stock: StockMatch | None,
 ) -> LiftPlan:  # fmt: skip
     """Choose lifts, judged now or at the last frame."""
     told = [(notice.code, notice.message) for notice in warnings]
     captured_to_ns = int(travel.stamp_ns[travel.measured][-1])
-    now_ns = time.time_ns() if judged_at == "now" else captured_to_ns
+    now_ns = time.time_ns() if request.judged_at == "now" else captured_to_ns
     forbidden = map_vetoes(
-        told, trajectory.reference, captured_to_ns, now_ns, settings, has_magnet=magnet is not None
+        told, trajectory.reference, captured_to_ns, now_ns, settings, has_magnet=request.magnet is not None
     )
     listed = {} if stock is None else contradicted_bundles(stock)
     return plan_lifts(
         heights,
         bundles,
-        magnet or load_magnet(None),
+        request.magnet or load_magnet(None),
         settings,
         forbidden,
         travel,

@@ -28,6 +28,7 @@ from barsight.measure_settings import MeasureSettings
 from barsight.measurement import to_json
 from barsight.motion.estimator import PoseEstimator
 from barsight.motion.settings import make_early_estimator, make_estimator
+from barsight.pipeline import LiftRequest
 from barsight.recording.packets import Packet, PacketRecording
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.recording.sensor_selection import SelectedSensors
@@ -130,8 +131,8 @@ class Session:
         several = len(self._recordings) > 1
         kept = self._checkpoints.parent
         write_measured(
-            self._recordings, self._yard, self._asked, keep=kept.parent if several else kept,
-            magnet=self._magnet, report=False,
+            self._recordings, self._yard, self._asked, LiftRequest(self._magnet),
+            keep=kept.parent if several else kept, report=False,
         )  # fmt: skip
         return Yard(self._yard, self)
 
