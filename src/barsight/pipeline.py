@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from barsight.core.errors import InputError, MeasurementError
-from barsight.core.json_values import json_digest
+from barsight.core.json_values import json_digest, json_value
 from barsight.core.memory import peak_memory_mib, trim_heap
 from barsight.core.notices import Notice
 from barsight.core.stamps import seconds_to_ns
@@ -41,7 +41,7 @@ from barsight.mapping.surface.laser_profiles import Profiles, cut_profiles
 from barsight.mapping.surface.surface import Surface
 from barsight.mapping.top_photo import TopPhoto
 from barsight.measure_settings import MeasureSettings
-from barsight.measurement import Measurement, PassRecord, StageTime, to_json
+from barsight.measurement import Measurement, PassRecord, StageTime
 from barsight.recording.base import Recording
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.inventory.stock_list import (
@@ -206,7 +206,7 @@ def find_lifts(mapped: MappedYard, request: LiftRequest) -> Measurement:
         recording_path=source.path.resolve(),
         recording_format=source.format,
         is_simulated=any(one.probed.source.is_simulated for one in mapped.passes),
-        calibration_hash=json_digest(to_json(asdict(source.rig))),
+        calibration_hash=json_digest(json_value(source.rig)),
         configuration_hash=json_digest(newest.probed.configuration),
         input_hashes=_input_hashes(mapped.passes),
         configuration=newest.probed.configuration,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +59,7 @@ def publish_version(
     if settings.recording.rig is not None or settings.recording.camchain is not None:
         raise ConfigError(f"{config}: names a calibration by its path; give it with --rig instead")
     given = {
-        "configuration": json_digest(json_value(_texts(asdict(settings)))),
+        "configuration": json_digest(json_value(settings)),
         "calibration": "" if rig is None else file_digest(rig),
         "magnet": "" if magnet is None else file_digest(magnet),
         "software": barsight.__version__,
@@ -85,11 +85,3 @@ def arguments(results: Objects, version: Version, folder: Path) -> list[str]:
             (folder / name).write_bytes(data)
             words += [flag, str(folder / name)]
     return words
-
-
-def _texts(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _texts(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_texts(item) for item in value]
-    return str(value) if isinstance(value, Path) else value

@@ -10,7 +10,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,7 +18,7 @@ from barsight.checkpoint import checkpoint_folder
 from barsight.core.compiling.ahead import compile_ahead
 from barsight.core.errors import ConfigError, InputError, MeasurementError, OutputError
 from barsight.core.files import expect_empty, lies_within, translated_os_errors
-from barsight.core.json_values import write_json
+from barsight.core.json_values import json_value, write_json
 from barsight.core.notices import Notice
 from barsight.core.stamps import NS_PER_S
 from barsight.live.latency import latencies
@@ -34,7 +34,6 @@ from barsight.live.survey import STOOD
 from barsight.map_building import ProgressCallback, checkpoint_key
 from barsight.measure_folder import ignore_progress, write_measured
 from barsight.measure_settings import MeasureSettings
-from barsight.measurement import to_json
 from barsight.pipeline import LiftRequest
 from barsight.recording.base import Recording
 from barsight.recording.open import open_recording
@@ -132,7 +131,7 @@ class LiveRun:
 
 def _key(recording: Recording, settings: MeasureSettings) -> str:
     empty = KeptRecording(recording, [])
-    return checkpoint_key(empty, to_json(asdict(settings.chosen())), empty.digests())
+    return checkpoint_key(empty, json_value(settings.chosen()), empty.digests())
 
 
 def _finish(
