@@ -3,7 +3,7 @@
 import ast
 import re
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import barsight
@@ -27,6 +27,8 @@ TESTS = {
 }
 MAX_LINES = 60
 MAX_PARAMETERS = 10
+MIN_TWIN = 18
+"""Nodes of syntax from which on a body may stand only once."""
 ARRAYS = re.compile(r"\b(?:U?Int\d+|Float\d+|Bool|NDArray)\b")
 EXTENT = r"[^(),]*\b(?:[A-Z_]+|[1-9]\d*|[a-z]+s)\b[^(),]*"
 SHAPE = re.compile(rf"\((?:{EXTENT},\s*)+(?:{EXTENT})?\)")
@@ -146,6 +148,21 @@ def repeated_classes(trees: Iterable[ast.AST]) -> set[str]:
     return {name for name, times in names.items() if times > 1}
 
 
+def twins(trees: Mapping[str, ast.AST]) -> list[set[str]]:
+    """Functions with the same body, docstring aside; short ones, as properties are, may be."""
+    places: dict[str, set[str]] = {}
+    for module, tree in trees.items():
+        for f in functions(tree):
+            body = [ast.dump(node) for node in f.body[ast.get_docstring(f) is not None :]]
+            if sum(part.count("(") for part in body) >= MIN_TWIN:
+                places.setdefault("".join(body), set()).add(f"{module}.{f.name}")
+    return [names for names in places.values() if len(names) > 1]
+
+
+def test_no_function_stands_twice() -> None:
+    assert twins(TREES | PROGRAMS) == []
+
+
 def test_every_kernel_has_a_docstring() -> None:
     assert sum(is_kernel(f) for tree in TREES.values() for f in functions(tree)) > 200
     assert {m: names for m, tree in TREES.items() if (names := undocumented_kernels(tree))} == {}
@@ -216,6 +233,9 @@ def test_what_breaks_a_rule_is_found() -> None:
     )
     assert wide_functions(method) == {"more"}
     assert questions(ast.parse('"""How it works."""\nclass A:\n    """Howitzer."""')) == ["How it works."]
+    once = "def {}(a, b):\n    {}return [x * a + b for x in range(a) if x > b and x != 7]"
+    same = {"m": ast.parse(once.format("f", "")), "n": ast.parse(once.format("g", "'told'\n    "))}
+    assert twins(same) == [{"m.f", "n.g"}] and twins({"m": same["m"]}) == []
     assert repeated_classes([ast.parse("class A: ...\nclass B: ..."), ast.parse("class A: ...")]) == {"A"}
 
 
