@@ -79,7 +79,7 @@ class CranePlc:
             0xB51B, 1, self.life, flags, time.time_ns(), 0, 0, 0, load, command, self.number,
             *(*lift, 0, 0, 0)[:3],
         ))  # fmt: skip
-        return self.link.recv(96, socket.MSG_WAITALL)
+        return self.link.recv(98, socket.MSG_WAITALL)
 
     def ask(self, command: int, flags: int, load: int, *lift: int) -> tuple[int, int, float]:
         """Return the answer, the token and the seconds that it took."""

@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 from sqlalchemy import select
 
-from barsight.core.errors import Failed, InputError
+from barsight.cli.main import run
+from barsight.core.errors import ConfigError, Failed, InputError
 from barsight.fleet.archive import find_recordings, manifest_digest
 from barsight.fleet.cluster import connect
 from barsight.fleet.comparing import FigureChange, RecordingComparison
@@ -28,7 +29,7 @@ from barsight.fleet.planning import TaskChoice, estimate, plan_tasks
 from barsight.fleet.records import note_plan, noted_keys
 from barsight.fleet.scratch import scratch_root, sweep
 from barsight.fleet.task import TaskLimits, TaskSettings, run_task
-from barsight.fleet.versions import Version
+from barsight.fleet.versions import Version, installed_software
 from barsight.fleet.window import RunWindow
 from barsight.store.audit import AuditChain, entry, verify_chain
 from barsight.store.opening import open_store
@@ -36,7 +37,7 @@ from barsight.store.promotion import counts, promoted_version
 from barsight.store.tables import FLEET_SURVEYS, PROMOTIONS, SURVEYS
 from fleet_rounds import make_archive, moto_server, stand_in
 
-VERSION = Version("v1", "configuration", "", "", "0")
+VERSION = Version("v1", "configuration", "", "", installed_software())
 
 
 def settings(folder: Path, archive: str, results: str, **more: float) -> TaskSettings:
@@ -246,3 +247,25 @@ def test_torn_documents_of_an_archive_and_a_planted_scratch_folder_are_refused(
         scratch_root()
     planted.chmod(0o700)
     assert scratch_root() == planted
+
+
+def test_a_bench_says_the_same_on_workers(tmp_path: Path) -> None:
+    tables = [tmp_path / "one.json", tmp_path / "two.json"]
+    for table, workers in zip(tables, ("1", "2"), strict=True):
+        words = ["bench", "lifts", "--seeds", "0:3", "--placements", "2", "--workers", workers]
+        assert run([*words, "--json", str(table)]) == 0
+    lifts = [json.loads(table.read_text())["lifts"] for table in tables]
+    assert lifts[0] == lifts[1] and {one["seed"] for one in lifts[0]} <= {0, 1, 2} and lifts[0]
+
+
+def test_workers_of_another_version_end_the_run(tmp_path: Path) -> None:
+    archive = open_objects(str(make_archive(tmp_path / "a", {"r": "good"})))
+    results = open_objects(str(tmp_path / "r"), create=True)
+    older = replace(VERSION, software="0.1+abc")
+    tasks = plan_tasks(archive, results, older, None, no_progress)
+    shared = settings(tmp_path, archive.url, results.url)
+    with open_store(f"sqlite:///{tmp_path}/s.db", create=True) as store:
+        note_plan(store, tasks, archive.url, "t")
+        with connect(1, None) as client, pytest.raises(ConfigError, match=r"0\.1\+abc"):
+            drive(client, tasks, shared, store, results, RunWindow(), no_progress)
+    assert not published_keys(results)

@@ -28,7 +28,7 @@ def test_bytes_lie_where_the_table_says() -> None:
     assert struct.unpack_from(">iiiii", content, 32) == (15000, -2500, 7000, 90500, -(2**31))
     assert struct.unpack_from(">HHHHII", content, 52) == (150, 300, 200, 2, 17374, 5222)
     assert struct.unpack_from(">HHHHIiiii", content, 68) == (1, 3, 1, 0, 9, 30000, 0, 1000, 90500)
-    assert len(content) == 96
+    assert len(content) == 98
 
 
 def test_a_state_that_is_not_valid_carries_no_lift() -> None:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import os
+import socket
 import sys
 import time
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
 
-from barsight.core.errors import BarsightError, Failed
+from barsight.core.errors import BarsightError, ConfigError, Failed
 from barsight.core.settings.values import NOT_NEGATIVE, POSITIVE, expect_ranges
 from barsight.fleet.archive import download
 from barsight.fleet.ledger import HeldRecording, claim, fail, held, publish
@@ -18,7 +19,7 @@ from barsight.fleet.limits import LimitedRun, run_limited
 from barsight.fleet.objects import Objects, open_objects
 from barsight.fleet.records import note_result
 from barsight.fleet.scratch import compile_once, scratch_folder
-from barsight.fleet.versions import FleetTask, arguments
+from barsight.fleet.versions import FleetTask, arguments, installed_software
 
 COMMAND = (sys.executable, "-m", "barsight", "measure")
 
@@ -59,8 +60,14 @@ class TaskSettings:
 def run_task(task: FleetTask, settings: TaskSettings) -> str:
     """Measure a recording unless another worker has it or did it, and return its key, whatever came of it.
 
-    A recording that fails is tried again at once until it is parked.
+    A recording that fails is tried again at once until it is parked. Raises ConfigError where this machine's
+    software isn't the version's.
     """
+    if task.version.software != installed_software():
+        raise ConfigError(
+            f"{socket.gethostname()}: has Barsight {installed_software()}, but the version was planned with "
+            f"{task.version.software}; install that on every worker, or plan again"
+        )
     results = open_objects(settings.results, create=True)
     while True:
         mine = claim(results, task.key, settings.limits.lease_s)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import functools
+import hashlib
 from dataclasses import dataclass
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +18,28 @@ from barsight.result_folder import file_digest
 
 FILES = ("config.toml", "rig", "magnet.toml")
 """Names under which a version's files are kept in the results."""
+LIBRARIES = ("numpy", "scipy", "numba", "opencv-contrib-python-headless")
+
+
+@functools.cache
+def installed_software() -> str:
+    """Name what measures here: Barsight's version, and a digest of its sources and of the libraries that
+    compute, as those may change a result without the version.
+    """
+    root, found = Path(barsight.__file__).parent, hashlib.sha256()
+    for path in sorted(root.rglob("*.py")):
+        found.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+    for name in LIBRARIES:
+        found.update(f"{name} {metadata.version(name)}".encode())
+    return f"{barsight.__version__}+{found.hexdigest()[:12]}"
 
 
 @dataclass(frozen=True)
 class Version:
     """A way to measure. name: 16 digits of the digest of all else; the others are digests, empty for none.
 
-    rig: name of the file of a calibration that takes the place of the recordings' own.
+    rig: name of the file of a calibration that takes the place of the recordings' own. software: as
+    `installed_software` tells it.
     """
 
     name: str
@@ -62,7 +80,7 @@ def publish_version(
         "configuration": json_digest(json_value(settings)),
         "calibration": "" if rig is None else file_digest(rig),
         "magnet": "" if magnet is None else file_digest(magnet),
-        "software": barsight.__version__,
+        "software": installed_software(),
     }
     version = Version(json_digest(given)[:16], **given, rig="" if rig is None else f"rig{rig.suffix}")
     sources = ((config, "config.toml"), (rig, version.rig), (magnet, "magnet.toml"))

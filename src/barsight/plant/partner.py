@@ -15,14 +15,19 @@ _MAGNET_ON, _WEIGHED, _SLACK, _REACHED = 1, 2, 4, 8
 
 
 class PlcPartner:
-    """A PLC that exchanges telegrams. answer: fields that go out with the next one."""
+    """A PLC that exchanges telegrams."""
 
     def __init__(self, name: str, steps: LiftSteps, silent_s: float) -> None:
         self.name, self._steps, self._silent_s = name, steps, silent_s
-        self.answer: dict[str, int] = {}
+        self._answer: dict[str, int] = {}
         self._life: int | None = None
         self._alive_s = time.monotonic()
         self._number: int | None = None
+
+    @property
+    def answer(self) -> dict[str, int]:
+        """Form the fields of the next telegram that answer the PLC: its life counter and its last command."""
+        return {"life_echo": self._life or 0, **self._answer}
 
     @property
     def quiet_s(self) -> float:
@@ -69,7 +74,7 @@ class PlcPartner:
         except BarsightError:
             self._number = None
             return
-        self.answer = {"answer_number": found["command_number"], "answer": answer, "token": token}
+        self._answer = {"answer_number": found["command_number"], "answer": answer, "token": token}
 
     def _step(self, found: dict[str, int]) -> tuple[int, int]:
         lift = (found["lift_id"], found["checksum"])

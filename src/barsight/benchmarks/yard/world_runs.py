@@ -49,14 +49,16 @@ class WorldKeys:
 
 
 def run_world(
-    folder: Path, seed: int, given: SimulationSettings, keys: WorldKeys, measure: Measure, looked_at: str
+    keep: Path, seed: int, given: SimulationSettings, keys: WorldKeys, measure: Measure, looked_at: str
 ) -> WorldScore:
-    """Score one world in `folder`, with what is kept there of it: recording, measured folder, scores.
+    """Score one world in its own folder of `keep`, by the recording, result and scores kept there.
 
     measure: measures a recording into a folder. looked_at: why the seed counts as looked at from now on;
     empty where it does not. What the product refuses to measure is a score too. Raises OutputError for a
     folder that is not of this bench.
     """
+    folder = keep / f"seed_{seed}"
+    folder.mkdir(parents=True, exist_ok=True)
     note = _read_note(folder)
     recording, out = folder / "recording", folder / "measured"
     note["looked_at"] = looked_at or note.get("looked_at", "") or looked_at_list().get(seed, "")
@@ -92,25 +94,6 @@ def looked_at_list() -> dict[int, str]:
         if entry["generator"] == GENERATOR
         for seed in range(entry["first"], entry["last"] + 1)
     }
-
-
-def run_worlds(
-    keep: Path,
-    seeds: Iterable[int],
-    given: SimulationSettings,
-    measure: Measure,
-    looked_at: str,
-    progress: Callable[[WorldScore], None],
-) -> tuple[WorldScore, ...]:
-    """Score the worlds of the seeds, each in its own folder of `keep`; progress: called after each."""
-    keys = WorldKeys.of(given)
-    scores = []
-    for seed in seeds:
-        folder = keep / f"seed_{seed}"
-        folder.mkdir(parents=True, exist_ok=True)
-        scores.append(run_world(folder, seed, given, keys, measure, looked_at))
-        progress(scores[-1])
-    return tuple(scores)
 
 
 def _read_note(folder: Path) -> dict[str, Any]:
