@@ -20,7 +20,7 @@ from barsight.pipeline import LiftRequest, find_lifts, map_yard
 from barsight.recording.base import Recording
 from barsight.recording.open import open_recording
 from barsight.report.page import write_report
-from barsight.report.result_files import RESULT_FILES, summary, write_results, write_surface
+from barsight.report.result_files import RESULT_FILES, summary, write_results, write_surface, write_tables
 from barsight.result_folder import seal_map
 from barsight.yard.magnet.description import load_magnet
 
@@ -90,6 +90,7 @@ def write_measured(
         ):
             measured = find_lifts(mapped, request)
         content = summary(measured)
+        write_tables(measured, staging)
         write_results(measured, seal_map(content, staging), staging)
         shutil.rmtree(scratch)
         if truth_of is not None:

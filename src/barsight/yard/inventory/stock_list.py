@@ -13,7 +13,7 @@ from scipy.optimize import linear_sum_assignment
 
 from barsight.core.arrays import Float64
 from barsight.core.errors import InputError
-from barsight.core.reading.bounded_reading import read_json, read_text
+from barsight.core.reading.bounded_reading import MAX_ENTRIES, read_json, read_lines
 from barsight.yard.types import Bundle
 
 _NEEDED = ("name", "x_m", "y_m")
@@ -89,7 +89,7 @@ def read_stock(path: Path) -> tuple[ListedBundle, ...]:
 
 
 def _csv_rows(path: Path) -> list[dict[str, Any]]:
-    reader = csv.DictReader(read_text(path, remedy=_REMEDY).split("\n"))
+    reader = csv.DictReader(read_lines(path, MAX_ENTRIES, _REMEDY))
     missing = [name for name in _NEEDED if name not in (reader.fieldnames or ())]
     if missing:
         raise InputError(path, f"has no column {missing[0]}", _REMEDY)
