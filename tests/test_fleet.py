@@ -27,7 +27,7 @@ from barsight.fleet.findings import holm, judge
 from barsight.fleet.ledger import HeldRecording, claim, held, publish, published_keys
 from barsight.fleet.limits import LimitedRun, run_limited
 from barsight.fleet.objects import Objects, open_objects
-from barsight.fleet.planning import estimate, in_order, plan_tasks
+from barsight.fleet.planning import TaskChoice, estimate, plan_tasks
 from barsight.fleet.records import note_plan, noted_keys
 from barsight.fleet.scratch import scratch_root, sweep
 from barsight.fleet.task import TaskLimits, TaskSettings, run_task
@@ -199,7 +199,7 @@ def test_the_estimate_is_by_what_was_measured_and_priorities_come_first(tmp_path
     tasks = [replace(t, pairs=10) for t in plan_tasks(archive, results, VERSION, None, no_progress)]
     told = estimate(tasks, [(1, 5, 20.0, 7), (1, 10, 40.0, 9)])
     assert told.seconds == pytest.approx(3 * 40.0) and told.written_bytes == 24
-    assert [task.name for task in in_order(tasks, ("c/", "b"))] == ["c/d", "b", "a"]
+    assert [task.name for task in TaskChoice(first=("c/", "b")).of(tasks)] == ["c/d", "b", "a"]
 
 
 def change(recording: str, shift: float, sigma: float, p: float) -> RecordingComparison:
