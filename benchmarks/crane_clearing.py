@@ -55,7 +55,7 @@ PITCH_M, MARGIN_M = 1.1, 0.6
 
 @dataclass
 class Cleared:
-    """What came of a yard. lifts: a line each; left: bundles; refused: codes of the last survey."""
+    """A yard after it was cleared. lifts: a line each; left: bundles; refused: codes of the last survey."""
 
     bundles: int
     surveys: int = 0
@@ -79,7 +79,7 @@ class CranePlc:
             0xB51B, 1, self.life, flags, time.time_ns(), 0, 0, 0, load, command, self.number,
             *(*lift, 0, 0, 0)[:3],
         ))  # fmt: skip
-        return self.link.recv(96, socket.MSG_WAITALL)
+        return self.link.recv(98, socket.MSG_WAITALL)
 
     def ask(self, command: int, flags: int, load: int, *lift: int) -> tuple[int, int, float]:
         """Return the answer, the token and the seconds that it took."""

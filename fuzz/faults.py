@@ -36,7 +36,7 @@ IGNORED = ("stdout", "stderr")
 
 @dataclass(frozen=True)
 class Whole:
-    """What a run leaves that nothing disturbs. content: of all files; same: names of those that two runs
+    """Output of a run that nothing disturbs. content: of all files; same: names of those that two runs
     write alike; seconds: by the clock.
     """
 
@@ -209,6 +209,7 @@ def killed(target: Target, scratch: Path, draw: random.Random, expected: Whole) 
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, 1)
         os.dup2(null, 2)
+        os.chdir(scratch)
         target.call(scratch)
         os._exit(0)
     time.sleep(draw.uniform(0.0, 1.1 * expected.seconds))
@@ -216,7 +217,8 @@ def killed(target: Target, scratch: Path, draw: random.Random, expected: Whole) 
     os.waitpid(pid, 0)
     if wrong := half_made(target, before, content(scratch), expected):
         return f"half result: {wrong}"
-    shutil.rmtree(scratch / "made", ignore_errors=True)  # a folder that is there can't be written again
+    for path in scratch.glob("made*"):  # a folder that is there can't be written again, nor a survey recorded
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
     verdict = judge(lambda: target.call(scratch), scratch)
     if verdict.fault or verdict.code:
         return f"the next run: {told(verdict)}"

@@ -15,7 +15,7 @@ SUB = 4
 
 
 def bar_view(pitch_m: float, x_m: float, contrast: float = 12.0, seed: int = 0) -> PatchPair:
-    """What a rig sees whose left camera hangs `RANGE_M` above the bars' axes at x_m.
+    """Render the view of a rig whose left camera hangs `RANGE_M` above the bars' axes at x_m.
 
     contrast: the sigma of what tells one bar from the next, gray levels; the shading swings by 100.
     """

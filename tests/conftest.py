@@ -1,4 +1,4 @@
-"""Where the real recordings lie; tests that need them skip elsewhere."""
+"""Find the real recordings; tests that need them skip elsewhere."""
 
 import os
 import shutil
@@ -47,7 +47,7 @@ def server() -> Iterator[str]:
 
 @pytest.fixture(params=["sqlite", "postgresql"])
 def store_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    """Of an empty database: a file, or one of PostgreSQL where it is installed."""
+    """URL of an empty database: a file, or one of PostgreSQL where it is installed."""
     if request.param == "sqlite":
         return f"sqlite:///{tmp_path / 'yard.db'}"
     from store_servers import add_database

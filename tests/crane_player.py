@@ -26,7 +26,7 @@ class Sensor:
         self.held: list[float] | None = None
 
     def at(self, number: int) -> float:
-        """When a reading is due, seconds from the begin."""
+        """Tell when a reading is due, seconds from the begin."""
         turns, k = divmod(number, len(self.seconds))
         return float(turns * self.period_s + self.seconds[k])
 

@@ -71,7 +71,7 @@ def drawn_crane(seed: int, jump_m: float = 0.0, frozen_s: float = 0.0) -> DrawnC
 
 @dataclass(frozen=True, eq=False)
 class DrawnSenses:
-    """What a rig that hangs from a drawn crane sees: frames' sightings, the IMU, and each frame's pose."""
+    """Sensors of a rig that hangs from a drawn crane: frames' sightings, the IMU, and each frame's pose."""
 
     rig: StereoRig
     imu: ImuSamples

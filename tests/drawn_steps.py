@@ -22,7 +22,7 @@ NOTHING = np.empty(0, np.int64)
 
 @dataclass(frozen=True, eq=False)
 class DrawnSteps:
-    """What a recording's front end and sensors tell of one way."""
+    """Steps of one way, as a recording's front end and sensors tell them."""
 
     sightings: tuple[Sighting, ...]
     imu: ImuSamples

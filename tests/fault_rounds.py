@@ -117,7 +117,7 @@ class Crane:
         self.player.stdin.flush()
 
     def is_moving(self) -> bool:
-        """Whether the crane goes at its speed for the next second."""
+        """Check that the crane goes at its speed for the next second."""
         at = ((time.time_ns() - self.begin_ns) / 1e9) % self.period_s
         return any(first < at < last - 1.0 for first, last in self.moving)
 
@@ -263,7 +263,7 @@ FAULTS = {
 
 
 def reasons_of(state: Any) -> list[str]:
-    """Why not all is well: the mode's reasons, and why a recorder that is down ended."""
+    """List why not all is well: the mode's reasons, and why a recorder that is down ended."""
     record = state["processes"]["record"]
     down = [f"record: {record['reason']}"] if record["state"] != "running" else []
     return [*state["reasons"], *down]

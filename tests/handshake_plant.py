@@ -31,6 +31,8 @@ from barsight.store.tables import BUNDLES, SURVEYS
 FIRST_NS = 1_790_000_000 * 10**9
 STAY_S = 0.3
 """What the PLC takes for too old: a life counter that stands, an answer to `executing`."""
+MAX_BEHIND = 3
+"""Telegrams that the echo of its life counter may be behind."""
 LIFTS, VALID_S = 6, 60.0
 OFFERED, CLAIMED, BEGUN = 2, 4, 32
 CLAIM, EXECUTING, EXECUTED, FAILED = 1, 2, 3, 4
@@ -75,7 +77,7 @@ class Crane:
 
     def __init__(self, host: str, plant: Plant) -> None:
         self.host, self.plant = host, plant
-        self.number = self.life = 0
+        self.number = self.life = self.resumed = 0
         self.forget()
 
     def forget(self) -> None:
@@ -83,7 +85,7 @@ class Crane:
         self.phase, self.sent_s = "idle", 0.0
         self.lift = {"lift_id": 0, "checksum": 0, "token": 0}
         self.seen: dict[str, int] = {}
-        self.seen_s = -1.0
+        self.seen_s = self.turned_s = -1.0
         self.load = 0
 
     def hear(self, told: dict[str, int]) -> None:
@@ -93,10 +95,16 @@ class Crane:
 
     @property
     def may_act(self) -> bool:
-        return self.plant.now_s - self.seen_s <= STAY_S and bool(self.seen["status"] & 1)
+        echo = self.seen.get("life_echo", 0)
+        is_fresh = self.plant.now_s - self.seen_s <= STAY_S and (self.life - echo) & 0xFFFF <= MAX_BEHIND
+        is_since = 1 <= (echo - self.resumed) & 0xFFFF < 0x8000
+        return is_fresh and is_since and bool(self.seen["status"] & 1)
 
     def turn(self) -> dict[str, int]:
         """One cycle: judge what was heard, and form the telegram that goes out."""
+        if self.plant.now_s - self.turned_s > STAY_S:
+            self.resumed = self.life
+        self.turned_s = self.plant.now_s
         seen, self.life = self.seen, self.life % 65535 + 1
         told = seen.get("answer", 0) if seen.get("answer_number") == self.number else 0
         if self.phase == "idle" and self.may_act and seen["status"] & (OFFERED | CLAIMED):
@@ -277,9 +285,9 @@ class Plant:
             return True
         found = wire.up.popleft()
         try:
-            if wire.partner.hears(found):
+            if wire.partner.receive(found):
                 self.store.fault[:] = [fault] if fault else []
-                wire.partner.obey(found)
+                wire.partner.execute(found)
         except Killed:
             self.start_server()
             return False

@@ -24,7 +24,7 @@ IN = struct.Struct(">HHHHqiiiIHHIII")
 
 
 def read_out(content: bytes) -> dict[str, int]:
-    """The fields that a PLC's program needs of 96 bytes, by the table of bytes."""
+    """The fields that a PLC's program needs of 98 bytes, by the table of bytes."""
     lift_id, checksum = struct.unpack_from(">II", content, 16)
     number, answer, _, token = struct.unpack_from(">HHHI", content, 70)
     return {
@@ -86,8 +86,8 @@ class LinkedPlc:
     def turn(self) -> dict[str, int]:
         self.life = (self.life + 1) & 0xFFFF
         self.link.sendall(IN.pack(0xB51B, 1, self.life, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0))
-        content = self.link.recv(96, socket.MSG_WAITALL)
-        if len(content) < 96:
+        content = self.link.recv(98, socket.MSG_WAITALL)
+        if len(content) < 98:
             raise ConnectionError("closed")
         return read_out(content)
 

@@ -29,7 +29,7 @@ MISSED = 0.02
 
 @dataclass(frozen=True)
 class View:
-    """What a survey sees: m along x, and up to where along y."""
+    """A survey's view: m along x, and up to where along y."""
 
     from_x_m: float
     to_x_m: float

@@ -179,7 +179,7 @@ CLEAN = (PictureHealth("cam0", 0.0, 0.03, 90.0), PictureHealth("cam1", 0.0, 0.03
 def test_a_cause_is_named_with_its_value(
     name: str, measured: Callable[[Float64], Float64], value: float, sigma: float
 ) -> None:
-    """By artefacts alone, without the crane's travel; the truth comes from triangulation."""
+    """Artefacts alone tell it, without the crane's travel; the truth comes from triangulation."""
     plan = planned()
     right = 0
     for seed in range(20):

@@ -12,10 +12,12 @@ import pytest
 import barsight as bs
 from barsight.cli.main import run
 from barsight.core.settings.values import build_settings
+from barsight.core.types import StereoFrame
 from barsight.mapping.settings import MapSettings
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.lift_file import read_lifts
 from cli_runs import FAST
+from result_folders import write_folder
 
 NOTEBOOK: dict[str, Any] = {"stereo": {"method": "sgbm"}, "map": {"cell_m": 0.05}}
 
@@ -24,7 +26,7 @@ WHEN = ("judged_at_ns", "content_sha256")
 
 
 def lifts_of(folder: Path) -> dict[str, Any]:
-    """What lifts.json says, but when it was judged, which its digest holds too."""
+    """Read lifts.json, but for when it was judged, which its digest holds too."""
     lifts = read_lifts(folder / "lifts.json")
     return {name: value for name, value in lifts.items() if name not in WHEN}
 
@@ -141,8 +143,54 @@ def test_without_xarray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> N
     assert dataset.z_m.sel(x=2.0, y=2.5).item() == 0
 
 
-def test_importing_loads_nothing_heavy_and_needs_no_unix() -> None:
-    code = "import sys; sys.modules['resource'] = None; import barsight as bs{more}; print({names})"
+ELSEWHERE = """
+import os, signal, sys
+for name in ("fcntl", "resource", "pwd", "grp", "termios"):
+    sys.modules[name] = None
+for home, names in (
+    (os, "geteuid getuid O_NONBLOCK O_CLOEXEC O_DIRECTORY O_NOFOLLOW sched_getaffinity sysconf"),
+    (signal, "SIGHUP SIGALRM SIGUSR1 setitimer"),
+):
+    for name in names.split():
+        delattr(home, name)
+from pathlib import Path
+import barsight as bs
+from barsight.cli.main import main
+recording, result = sys.argv[1:]
+opened = bs.open_recording(recording)
+pair = next(iter(opened.frames()))
+yard = bs.load(result)
+print(len(opened.index.stamps_ns), pair.left.shape, yard.height_map.z_m.shape, len(yard.contours))
+try:
+    yard.save(Path(result) / "saved")
+except bs.BarsightError as error:
+    print(error)
+sys.argv = ["barsight", "info", recording]
+main()
+"""
+"""A system without what only Unix has, as far as Linux can play it."""
+
+
+def test_recordings_and_results_are_read_without_unix(whole: Path, tmp_path: Path) -> None:
+    result = write_folder(tmp_path / "result")
+    told = subprocess.run(
+        [sys.executable, "-c", ELSEWHERE, str(whole), str(result)],
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert told.returncode == 0, told.stderr
+    read, refused, *info = told.stdout.splitlines()
+    recording, yard = bs.open_recording(whole), bs.load(result)
+    pair = next(iter(recording.frames()))
+    assert isinstance(pair, StereoFrame)
+    assert read == (
+        f"{len(recording.index.stamps_ns)} {pair.left.shape} {yard.height_map.z_m.shape} {len(yard.contours)}"
+    )
+    assert refused.endswith("can't be locked on this system; write it on Linux or macOS")
+    assert any("euroc" in line for line in info)
+
+
+def test_importing_loads_nothing_heavy() -> None:
+    code = "import sys; import barsight as bs{more}; print({names})"
     light = code.format(more="", names="[n for n in ('numpy', 'cv2', 'numba', 'scipy') if n in sys.modules]")
     assert subprocess.check_output([sys.executable, "-c", light], text=True).strip() == "[]"
     commands = ", barsight.cli.bench.command, barsight.cli.measure"

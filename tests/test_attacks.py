@@ -1,4 +1,4 @@
-"""What the attacks found, each once: one line and an exit code, no hang, nothing taken from elsewhere."""
+"""Attacks that were mended, each once: one line and an exit code, no hang, nothing taken from elsewhere."""
 
 import fcntl
 import os

@@ -56,7 +56,7 @@ def errors(calibration: CameraImuCalibration, truth: Truth) -> np.ndarray:
 
 
 def mean_square(seeds: range) -> float:
-    """Of the errors over their stated sigmas, along the covariance's own axes."""
+    """Mean square of the errors over their stated sigmas, along the covariance's own axes."""
     found = []
     for seed in seeds:
         views, imu, truth = simulated(seed)

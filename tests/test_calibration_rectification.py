@@ -48,7 +48,7 @@ def ramps(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def raw_places(rectifier: Rectifier, side: str, pixels: np.ndarray) -> np.ndarray:
-    """Where in the raw image the rectifier looks for rectified pixels (N, 2)."""
+    """Find the places in the raw image that the rectifier takes for rectified pixels (N, 2)."""
     warp = rectifier._warps[side == "right"]
     place = pixels.astype(np.float32)[None]
     maps = [cv2.remap(m, place[..., 0], place[..., 1], cv2.INTER_LINEAR)[0] for m in (warp.map_x, warp.map_y)]

@@ -1,4 +1,4 @@
-"""What `barsight measure` does with a user's mistakes: one line, an exit code, and nothing left behind."""
+"""A user's mistakes with `barsight measure`: one line, an exit code, and nothing left behind."""
 
 import contextlib
 import errno

@@ -29,7 +29,7 @@ from drawn_steps import DrawnSteps, drawn_steps
 
 
 def refusal(steps: DrawnSteps) -> str:
-    """What it is refused for; nothing where it isn't."""
+    """Return the reason of a refusal; nothing where it isn't."""
     try:
         refuse_contradictions(Path("way"), steps.sightings, steps.imu, steps.crane, steps.rectifier, 0)
     except InputError as error:

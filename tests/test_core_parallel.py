@@ -96,7 +96,7 @@ def test_what_is_begun_goes_on_before_anybody_asks() -> None:
         return k * k
 
     before = threading.active_count()
-    with prefetched_map(square, range(20), most=5, workers=3) as results:
+    with prefetched_map(square, range(20), max_waiting=5, workers=3) as results:
         assert all(done.acquire(timeout=5) for _ in range(5))
         assert not done.acquire(timeout=0.05)  # the sixth waits until a result is taken
         assert max_at_once == 1
@@ -113,7 +113,7 @@ def test_leaving_what_is_begun_drops_the_rest() -> None:
         time.sleep(0.02)
 
     before = threading.active_count()
-    with pytest.raises(KeyboardInterrupt), prefetched_map(slow, range(1000), most=8):
+    with pytest.raises(KeyboardInterrupt), prefetched_map(slow, range(1000), max_waiting=8):
         while not started:
             time.sleep(0.001)
         raise KeyboardInterrupt
@@ -126,11 +126,11 @@ def test_an_exception_of_what_is_begun_comes_at_its_turn() -> None:
         yield from (3, 2, 0, 1)
         raise KeyError("torn")
 
-    with prefetched_map(lambda k: 6 // k, items(), most=9) as results:
+    with prefetched_map(lambda k: 6 // k, items(), max_waiting=9) as results:
         assert [next(results), next(results)] == [2, 3]
         with pytest.raises(ZeroDivisionError):
             next(results)
-    with prefetched_map(lambda k: k, items(), most=2) as results, pytest.raises(KeyError):
+    with prefetched_map(lambda k: k, items(), max_waiting=2) as results, pytest.raises(KeyError):
         list(results)
 
 

@@ -172,6 +172,16 @@ def test_pages_that_code_and_texts_name_exist() -> None:
     assert missing == set()
 
 
+def test_where_to_look_is_current() -> None:
+    """Each row of the table in CONTRIBUTING names what is there, and no room of the package is left out."""
+    package, text = ROOT / "src" / "barsight", (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    table = text[text.index("| you look for |") : text.index("The commands you need")]
+    named = set(re.findall(r"`([\w/]+(?:\.py)?)`", table.split("|---|---|")[1]))
+    assert [path for path in named if not (package / path).exists()] == []
+    rooms = {path.parent.name for path in package.glob("*/__init__.py")}
+    assert rooms - {path.split("/")[0] for path in named} == set()
+
+
 def test_every_veto_is_tripped_by_a_test(reference: ModuleType) -> None:
     tests = "".join(path.read_text(encoding="utf-8") for path in Path(__file__).parent.glob("test_*.py"))
     assert [code for code in reference.find("VETOES") if f'"{code}"' not in tests] == []
@@ -188,6 +198,22 @@ def test_readme_leads_to_every_command() -> None:
     made = (ROOT / "docs" / "reference" / "commands.md").read_text(encoding="utf-8")
     assert "docs/reference/commands.md" in readme
     assert [command for command in main.COMMANDS if f"\n## {command}\n" not in made] == []
+
+
+def test_every_command_is_shown_outside_the_reference() -> None:
+    """A how-to, the tour or the paper's page shows each, in a shell line or a sentence."""
+    pages = [*(ROOT / "docs" / "how-to").glob("*.md"), ROOT / "docs" / "tour.md", ROOT / "docs" / "paper.md"]
+    told = " ".join(page.read_text(encoding="utf-8") for page in pages)
+    assert [command for command in main.COMMANDS if not re.search(rf"barsight {command}\b", told)] == []
+
+
+def test_index_and_menu_lead_to_every_page() -> None:
+    docs = ROOT / "docs"
+    pages = {page.relative_to(docs).as_posix() for page in docs.rglob("*.md")} - {"index.md"}
+    index = (docs / "index.md").read_text(encoding="utf-8")
+    menu = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    assert pages - set(re.findall(r"\(([\w/.-]+\.md)\)", index)) == set()
+    assert pages - set(re.findall(r"[\w/.-]+\.md", menu)) == set()
 
 
 def test_ci_runs_readmes_test_command() -> None:

@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
-from barsight.benchmarks.provenance import write_json
 from barsight.benchmarks.stereo.middlebury import bench_stereo, scene_table, stereo_table
 from barsight.benchmarks.stereo.middlebury_scenes import load_scene, load_scenes
 from barsight.benchmarks.stereo.scores import score_disparity
 from barsight.benchmarks.stereo.speed import bench_speed, speed_table
 from barsight.core.errors import InputError
+from barsight.core.json_values import write_json
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.disparity_files import write_disparity
 

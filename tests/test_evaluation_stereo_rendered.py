@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 
-from barsight.benchmarks.provenance import write_json
 from barsight.benchmarks.stereo.bar_edges import edge_diameter, find_outlines, tangent_planes
 from barsight.benchmarks.stereo.bar_fit import BarFit, BarGuess, fit_bar
 from barsight.benchmarks.stereo.bar_outline import _FINE_PX, _basis, _misfits
@@ -36,6 +35,7 @@ from barsight.benchmarks.stereo.subpixel import (
 )
 from barsight.benchmarks.stereo.target_size import bench_target_size, measure_bar, target_size_table
 from barsight.core.errors import Failed
+from barsight.core.json_values import write_json
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.sgbm import Sgbm, SgbmSettings
 

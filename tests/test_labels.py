@@ -12,7 +12,7 @@ import pytest
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.cli.main import run
 from barsight.core.pose import Pose
-from barsight.labels.attachment import PlacedCode, contradictions, unite
+from barsight.labels.attachment import PlacedCode, contradictions, merge_codes
 from barsight.labels.bundle_labels import bundle_label
 from barsight.labels.code_reading import read_codes
 from barsight.labels.placing import pose_at
@@ -155,7 +155,7 @@ def test_other_texts_at_the_place_and_single_pictures_are_doubted() -> None:
     place = np.array([1.0, 2.0, 0.5])
     codes = [PlacedCode("A", "QRCode", place + 0.01 * k, (k, 0)) for k in range(3)]
     codes += [PlacedCode("B", "QRCode", place, (9, 1)), PlacedCode("C", "QRCode", place + 3, (1, 0))]
-    labels = {one.text: one for one in unite(codes, ())}
+    labels = {one.text: one for one in merge_codes(codes, ())}
     assert not labels["A"].is_sure and labels["A"].agreement_ratio == 0.75
     assert "1 picture" in labels["C"].doubts[0]
 
@@ -178,7 +178,7 @@ def test_a_label_lies_on_the_highest_bundle_there_and_the_list_may_contradict() 
     at = np.array([1.06, 0.5, high.top_z_m])
     codes = [PlacedCode("N7", "QRCode", at, (k, 0)) for k in range(2)]
     codes += [PlacedCode("N9", "QRCode", at + np.array([5.0, 0, 0]), (k, 0)) for k in range(2)]
-    labels = unite(codes, (low, high))
+    labels = merge_codes(codes, (low, high))
     assert [(one.text, one.bundle) for one in labels] == [("N7", 7), ("N9", None)]
     listed = (ListedBundle("N7", 1.1, 0.2), ListedBundle("N9", 6.0, 0.0))
     assert contradictions(labels, (low, high), listed) == ()
@@ -243,7 +243,7 @@ def test_a_bundle_has_the_text_that_is_sure_or_is_illegible() -> None:
 
     def of(*readings: tuple[str, int]) -> BundleLabel | None:
         codes = [PlacedCode(text, "QRCode", at, (k, len(text))) for text, n in readings for k in range(n)]
-        return bundle_label(bundle, unite(codes, (bundle,)))
+        return bundle_label(bundle, merge_codes(codes, (bundle,)))
 
     assert of(("N7", 3)) == BundleLabel("N7", "QRCode", 3, 0.8)
     assert of(("N7", 1)) == of(("N7", 3), ("N99", 1)) == BundleLabel(None, "illegible", 0, 0.0)

@@ -14,7 +14,7 @@ import barsight as bs
 from barsight.cli.main import run
 from barsight.core.types import CraneSamples, StereoFrame
 from barsight.live.latency import counts, spread
-from barsight.live.modes import FreezeWatch, HeardSensors, JumpWatch, Mode, judge_mode
+from barsight.live.modes import FreezeWatch, JumpWatch, Mode, SensorActivity, judge_mode
 from barsight.live.pairing import PairFormer
 from barsight.live.run import Keyframes, read_keyframes, replay, write_keyframes
 from barsight.live.settings import LiveSettings
@@ -194,7 +194,7 @@ def test_pairs_form_by_stamp_and_each_lone_picture_counts() -> None:
     assert former.lost == [2, 1]
 
 
-HEARD = HeardSensors((10**9, 10**9), 30_000_000, {"imu": 10**9, "crane": 10**9})
+HEARD = SensorActivity((10**9, 10**9), 30_000_000, {"imu": 10**9, "crane": 10**9})
 
 
 @pytest.mark.parametrize(
@@ -217,7 +217,7 @@ HEARD = HeardSensors((10**9, 10**9), 30_000_000, {"imu": 10**9, "crane": 10**9})
     ],
 )  # fmt: skip
 def test_modes_have_reasons(
-    heard: HeardSensors, after_s: float, down: dict[str, str], name: str, lifts: bool, word: str | None
+    heard: SensorActivity, after_s: float, down: dict[str, str], name: str, lifts: bool, word: str | None
 ) -> None:
     mode = judge_mode(heard, 10**9 + round(after_s * 1e9), LiveSettings(), down)
     assert (mode.name, mode.lifts) == (name, lifts)

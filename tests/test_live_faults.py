@@ -120,7 +120,7 @@ def test_a_process_that_hangs_is_ended_and_comes_back(longer: Path, tmp_path: Pa
 
 
 def is_told(role: str, restarts: int, state: Any) -> bool:
-    """Whether the state names the process that was killed, and lets no lift stand."""
+    """Check that the state names the process that was killed, and lets no lift stand."""
     reasons = " ".join(state["reasons"])
     is_named = f"{role} is down: was ended by SIGKILL" in reasons
     return is_named and state["processes"][role]["restarts"] == restarts and not state["lifts"]["may_stand"]

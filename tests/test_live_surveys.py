@@ -23,7 +23,7 @@ SETTINGS = SurveySettings(way_m=0.5, stop_s=2.0, rest_s=30.0, max_s=100.0)
 def ends(
     x_m: np.ndarray, settings: SurveySettings = SETTINGS, *, is_alone: bool = False, silent_s: float = np.inf
 ) -> tuple[float, str] | None:
-    """When (s) and why a survey ends where the bridge goes so, ten readings a second; none from silent_s."""
+    """Tell when (s) and why it ends where the bridge goes so, ten readings a second; none from silent_s."""
     watch, begin_ns = SurveyWatch(settings, is_alone=is_alone), 1_700_000_000 * 10**9
     rng = np.random.default_rng(0)
     for k, x in enumerate(x_m):
@@ -60,7 +60,7 @@ def test_a_crane_that_stands_or_never_stops_ends_it_too(is_alone: bool) -> None:
 
 def test_signals_end_a_survey_or_the_run() -> None:
     class Heard:
-        """What `_stopped_by_signals` asks of a supervisor."""
+        """A supervisor as `_stopped_by_signals` takes it."""
 
         because = ""
 

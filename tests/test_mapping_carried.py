@@ -1,4 +1,4 @@
-"""What hangs from the crane is told from the yard, and leaves no ghost in the map."""
+"""Things that hang from the crane are told from the yard, and leave no ghost in the map."""
 
 import json
 from pathlib import Path

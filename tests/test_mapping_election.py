@@ -34,7 +34,7 @@ def pose_at(x_m: float) -> Pose:
 
 
 def seen_by_both(x: np.ndarray, z: np.ndarray, left_eye_m: float) -> np.ndarray:
-    """Whether no part of the wall lies between (x cells, z m) and either eye."""
+    """Check that no part of the wall lies between (x cells, z m) and either eye."""
     free = np.ones(x.shape, bool)
     at = x * CELL_M
     for eye in (left_eye_m, left_eye_m + CAMERA.baseline_m):

@@ -56,7 +56,7 @@ def laser(rng: np.random.Generator, row: int = LASER_ROW) -> LaserProfile:
 
 
 def test_right_profiles_are_believed_and_ten_millimetres_found() -> None:
-    """Of 24 right ones at most one is doubted; of those that are 10 mm off in height, or 20 mm along x, none
+    """At most one of 24 right ones is doubted; of those that are 10 mm off in height, or 20 mm along x, none
     is believed."""
     doubted, believed = 0, 0
     for seed in range(24):

@@ -26,7 +26,7 @@ def seen() -> CellObservations:
 
 
 def view(x_m: float) -> tuple[RectifiedPair, Pose]:
-    """What a pair over x_m sees of a line 0.02 m wide along X on the tops: gray 200 on 50, without the left
+    """View of a pair over x_m, of a line 0.02 m wide along X on the tops: gray 200 on 50, without the left
     picture's first columns."""
     pose = Pose("yard", "rect0", DOWN, np.array([x_m, 0.1, EYE_M]))
     v = np.arange(CAMERA.height)[:, None] + np.zeros(CAMERA.width)

@@ -48,7 +48,7 @@ def sights() -> ViewFrusta:
 
 
 def holders(point: np.ndarray) -> np.ndarray:
-    """Which views have the point in both pictures, the border left off."""
+    """List the views that have the point in both pictures, the border left off."""
     held = []
     for eye in EYES_M:
         x, y, z = point[0] - eye[0], eye[1] - point[1], eye[2] - point[2]

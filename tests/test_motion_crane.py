@@ -80,7 +80,9 @@ def oscillating(hz: float, late_s: float = 0.0) -> tuple[CraneSamples, ImuSample
 
 @pytest.mark.parametrize("hz", [0.5, 1.5, 3.0])
 def test_an_oscillation_that_the_imu_tells_isnt_smeared(hz: float) -> None:
-    """Of millimetres by a parabola; where attitude and bias are open, a parabola more than the IMU tells."""
+    """A parabola alone would be off by millimetres; where attitude and bias are open, the way is one more
+    than the IMU tells.
+    """
     crane, imu, truth = oscillating(hz)
     askew, none = NOMINAL @ Rotation.from_rotvec([2e-3, -1e-3, 0]).as_matrix(), ImuBias.none()
     for rotation, degree in ((NOMINAL, 1), (askew, 2)):

@@ -1,4 +1,4 @@
-"""Which way is up: from the accelerometer where it shows gravity, else from the picture's rows."""
+"""Up is found: from the accelerometer where it shows gravity, else from the picture's rows."""
 
 import numpy as np
 import pytest

@@ -132,7 +132,7 @@ def test_the_imu_alone_predicts_the_next_frame() -> None:
 def test_no_motion_and_even_motion(
     name: str, speed_mps: float, use: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where an IMU sees nothing of the velocity, pictures and encoders must say it."""
+    """An IMU sees nothing of the velocity: pictures and encoders must say it."""
     recording, seen, truth = steady(speed_mps, 3)
     drift = trajectory_drift(estimated(name, use, recording, seen, monkeypatch), truth, 0)
     assert drift is not None

@@ -57,7 +57,7 @@ def test_frozen_encoders_are_found_while_moving_only() -> None:
 
 @pytest.mark.parametrize("size_m", [0.09, 0.2, -0.5])
 def test_a_jump_is_taken_off_what_follows(size_m: float) -> None:
-    """By encoders alone: all readings stay, the jump's size open."""
+    """Encoders alone tell it: all readings stay, the jump's size open."""
     crane = travelling()
     step = np.where((crane.stamp_ns >= 13_000_000_000)[:, None], [size_m, 0, 0], 0)
     found = check_crane(replace(crane, position_m=crane.position_m + step)).samples
@@ -92,7 +92,7 @@ def jumps_of(seed: int, drawn: DrawnCrane, sensors: str = "stereo,imu") -> tuple
 
 
 def is_found(drawn: DrawnCrane, jumps: tuple[EncoderJump, ...], kinds: tuple[str, ...] = ("sure",)) -> bool:
-    """Whether one of them is the fault, within 0.1 s and on its axis."""
+    """Check that one of them is the fault, within 0.1 s and on its axis."""
     assert drawn.fault is not None
     at = int(drawn.readings.stamp_ns[drawn.fault])
     return any(j.axis == drawn.axis and abs(j.stamp_ns - at) < 100_000_000 and j.kind in kinds for j in jumps)
@@ -274,7 +274,7 @@ def test_an_encoder_that_lost_count_is_told(data: Path) -> None:
 
 
 def test_pictures_that_dont_follow_from_each_other_are_told() -> None:
-    """Where encoders place every frame, nothing else would say that no picture was of use."""
+    """Encoders place every frame: nothing else would say that no picture was of use."""
     none = np.empty(0, np.int64)
     seen = tuple(Sighting(k, none, np.empty((0, 3)), np.empty(0), None, 0) for k in range(4))
     assert untied_pictures(seen[:1], ()) == ((), ())

@@ -129,7 +129,7 @@ def test_the_turned_rig_takes_the_yaw_off() -> None:
 
 
 def test_the_drift_is_told_as_if_pieces_were_not_unknowns() -> None:
-    """What single pieces' disparities are off by falsifies heights whether or not the estimate knows it."""
+    """Errors of single pieces' disparities falsify heights whether or not the estimate knows it."""
     disparity = np.random.default_rng(4).uniform(60, 100, 500)
     stereo = np.column_stack([disparity, np.zeros(500), np.zeros(500)])
     seen = SimpleNamespace(stereo=stereo, camera=Rectifier(RIG).camera)

@@ -1,4 +1,4 @@
-"""What residuals say of the sightings' noise: what a fit took up of it, and what neighbours share."""
+"""Residuals tell the sightings' noise: what a fit took up of it, and what neighbours share."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ def seen_once_each(rng: np.random.Generator) -> StereoObservations:
 
 
 def spread_of_means(residual: Float64) -> float:
-    """By how much frames' mean errors scatter more than independent ones would."""
+    """Compute by how much frames' mean errors scatter more than independent ones would."""
     means = residual.reshape(FRAMES, POINTS, 3).mean(axis=1)
     return float(np.sqrt((means**2).mean() / ((residual**2).mean() / POINTS)))
 

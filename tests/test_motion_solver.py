@@ -451,7 +451,7 @@ def test_what_is_shared_costs_what_the_system_says() -> None:
 
 
 def test_the_drifts_share_is_right() -> None:
-    """How yaw and scale swing the poses, against small changes of them."""
+    """The share by which yaw and scale move the poses, against small changes of them."""
     problem, used = seen_from(6, 2, True, 0.0)
     assert problem.sightings is not None
     wide = replace(problem.sightings, sigma_px=6 * problem.sightings.sigma_px)  # none beyond Huber's length
@@ -476,7 +476,7 @@ def test_the_drifts_share_is_right() -> None:
 
 
 def test_a_sightings_rows_are_its_error_and_slopes() -> None:
-    """Of the projection as it is written down: focal 600 px, baseline 0.4 m, doffs 3 px."""
+    """Held against the projection as it is written down: focal 600 px, baseline 0.4 m, doffs 3 px."""
     lens, point, seen = np.array([600.0, 320, 240, 240, 3]), np.array([0.4, -0.3, 0.2]), [330.0, 250, 290]
     axes, lever = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix(), np.array([0.2, -0.1, 0.3])
     body, high = Rotation.from_rotvec([3.0, 0.1, 0.2]), np.array([0.5, 0.2, 6.0])

@@ -1,4 +1,4 @@
-"""What a crane's PLC tells reaches the state, and a claim that isn't begun in time ends."""
+"""Readings of a crane's PLC reach the state, and a claim that isn't begun in time ends."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_encoders_load_and_clock_of_the_plc_are_in_the_state(tmp_path: Path) -> 
     assert not isinstance(found, Failed)
     with open_store(url) as store:
         feed = StateFeed(store, settings)
-        feed.hear(PlcPartner("plc a", LiftSteps(store, settings), 0.3).reading(found))
+        feed.take_reading(PlcPartner("plc a", LiftSteps(store, settings), 0.3).reading(found))
         feed.refresh()
         state = feed.newest(1)
         assert state.plc is not None and state.pose is not None
@@ -58,7 +58,7 @@ def test_encoders_load_and_clock_of_the_plc_are_in_the_state(tmp_path: Path) -> 
             (0.002,) * 3,
         )
         with_live = StateFeed(store, replace(settings, live=LiveSource(tmp_path)))
-        with_live.hear(state.plc)
+        with_live.take_reading(state.plc)
         with_live.refresh()
         assert with_live.newest(1).pose is None  # the live run tells the pose, and tells none
         feed._plc = time.monotonic() - 2, state.plc

@@ -203,6 +203,17 @@ def test_a_lift_that_was_made_after_its_end_ends_all_offers(plant: Plant) -> Non
     assert [(one.code, one.priority) for one in state.alarms] == [("lift-unrecorded", 1)]
 
 
+def test_a_map_begun_before_an_unrecorded_lift_was_told_offers_nothing(plant: Plant) -> None:
+    claim = claimed(plant)
+    plant.survey()
+    plant.now_s = 20.0
+    assert isinstance(plant.steps.executed(claim.token, DID), Failed)
+    plant.survey(begun_s=19.0)
+    assert offered(plant).lift is None
+    plant.survey(begun_s=20.1)
+    assert offered(plant).lift is not None
+
+
 @pytest.mark.parametrize("end", ["executed", "failed"])
 def test_a_map_from_before_a_lift_offers_nothing_beside_it(plant: Plant, end: str) -> None:
     claim = claimed(plant)

@@ -43,7 +43,7 @@ class Plc:
     def __init__(self) -> None:
         snap7 = pytest.importorskip("snap7")
         self.port = free_port()
-        self.mine, self.theirs = bytearray(48), bytearray(96)
+        self.mine, self.theirs = bytearray(48), bytearray(98)
         self.mine[:4] = struct.pack(">HH", 0xB51B, 1)
         self._server = snap7.Server(log=False)
         self._server.register_area(snap7.SrvArea.DB, 100, self.mine)

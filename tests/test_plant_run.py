@@ -71,7 +71,7 @@ def test_a_plc_whose_life_counter_stands_gets_no_lift(tmp_path: Path) -> None:
     config = write_config(tmp_path, telegram={"port": (port := free_port())})
     with plant_run(config), LinkedPlc(port) as plc:
         plc.until_valid()
-        told = [read_out(plc.link.recv(96, socket.MSG_WAITALL)) for _ in range(8)]
+        told = [read_out(plc.link.recv(98, socket.MSG_WAITALL)) for _ in range(8)]
         assert [one["status"] & 1 for one in told[4:]] == [0] * 4  # 300 ms are three telegrams
         assert {one["lift_id"] for one in told[4:]} == {0}
         plc.until_valid()

@@ -24,7 +24,7 @@ WEIGHED, REACHED = 2, 8
 
 
 class Plc:
-    """Sends 48 bytes, takes 96; knows nothing of Barsight but the table."""
+    """Sends 48 bytes, takes 98; knows nothing of Barsight but the table."""
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._reader, self._writer, self._life = reader, writer, 0
@@ -39,7 +39,7 @@ class Plc:
         ))  # fmt: skip
         answer = {}
         for _ in range(30):
-            content = await asyncio.wait_for(self._reader.readexactly(96), 5)
+            content = await asyncio.wait_for(self._reader.readexactly(98), 5)
             status, lift_id, checksum, mass = (
                 *struct.unpack_from(">H", content, 6), *struct.unpack_from(">II", content, 16),
                 *struct.unpack_from(">I", content, 60),

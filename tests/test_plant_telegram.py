@@ -28,7 +28,7 @@ def test_bytes_lie_where_the_table_says() -> None:
     assert struct.unpack_from(">iiiii", content, 32) == (15000, -2500, 7000, 90500, -(2**31))
     assert struct.unpack_from(">HHHHII", content, 52) == (150, 300, 200, 2, 17374, 5222)
     assert struct.unpack_from(">HHHHIiiii", content, 68) == (1, 3, 1, 0, 9, 30000, 0, 1000, 90500)
-    assert len(content) == 96
+    assert len(content) == 98
 
 
 def test_a_state_that_is_not_valid_carries_no_lift() -> None:
@@ -44,7 +44,7 @@ def test_what_is_no_telegram_is_refused() -> None:
 
 
 def test_the_plc_source_lays_the_bytes_out_as_the_telegram() -> None:
-    """By SCL's own widths: a value written at each field's place is read back by the telegram's code."""
+    """SCL's own widths decide: a value written at each field's place is read back by the telegram's code."""
     widths = {"UInt": "H", "UDInt": "I", "DInt": "i", "LInt": "q"}
     for side in ("out", "in"):
         name = {"out": "BarsightOut", "in": "BarsightIn"}[side]
@@ -59,7 +59,7 @@ def test_the_plc_source_lays_the_bytes_out_as_the_telegram() -> None:
 
 
 def test_the_yaw_that_a_plc_is_told_turns_the_beam_onto_the_bundle() -> None:
-    """By the table: from +Y, counter-clockwise. From another axis the beam would lie across."""
+    """The table says: from +Y, counter-clockwise. From another axis the beam would lie across."""
     stock = [laid(0.3, yaw_deg=20.0)]
     lift = judged(stock, place=Placement(0.3, 0.0, math.radians(20.0)))
     told = {name: text for _, name, _, text in fields_at("out")}["yaw"]

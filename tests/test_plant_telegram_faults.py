@@ -6,6 +6,7 @@ import asyncio
 import socket
 import struct
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -63,11 +64,13 @@ def served(store: Store, settings: PlantSettings, telegrams: TelegramSettings) -
         thread = threading.Thread(target=work)
         thread.start()
         assert ready.wait(10)
-        yield told
-        loop, task = running[0]
-        assert task is not None
-        loop.call_soon_threadsafe(task.cancel)
-        thread.join(10)
+        try:
+            yield told
+        finally:
+            loop, task = running[0]
+            assert task is not None
+            loop.call_soon_threadsafe(task.cancel)
+            thread.join(10)
 
 
 @pytest.fixture
@@ -84,13 +87,13 @@ def test_no_more_partners_than_can_be_served_and_none_that_is_silent(
     monkeypatch.setattr(serving, "MAX_QUIET_S", 0.3)
     with served(plant.store, plant.settings, TelegramSettings(port=0, cycle_s=0.02)) as one:
         links = [socket.create_connection(("127.0.0.1", one.port), timeout=5) for _ in range(3)]
-        firsts = [link.recv(96, socket.MSG_WAITALL) for link in links]
-        assert [len(first) for first in firsts] == [96, 96, 0]
+        firsts = [link.recv(98, socket.MSG_WAITALL) for link in links]
+        assert [len(first) for first in firsts] == [98, 98, 0]
         for link in links[:2]:
             while link.recv(4096):
                 pass
         with socket.create_connection(("127.0.0.1", one.port), timeout=5) as late:
-            assert len(late.recv(96, socket.MSG_WAITALL)) == 96
+            assert len(late.recv(98, socket.MSG_WAITALL)) == 98
         for link in links:
             link.close()
 
@@ -105,7 +108,32 @@ def test_a_store_that_waits_stops_neither_life_counter(plant: Plant, monkeypatch
         valid = []
         for life in range(40):
             link.sendall(telegram(life, 1, 7, 1))
-            valid.append(link.recv(96, socket.MSG_WAITALL)[7] & 1)
+            valid.append(link.recv(98, socket.MSG_WAITALL)[7] & 1)
         held.set()
     assert all(valid[2:])
     assert one.wrong == []
+
+
+def test_telegrams_that_waited_for_a_late_plc_are_told_by_the_echo(plant: Plant) -> None:
+    """Those whose stamp is over 0.2 s old, by the rule that docs/how-to/connect-a-plant.md gives a PLC."""
+    ages, fresh, life, resumed = [], [], 0, 0
+    with (
+        served(plant.store, plant.settings, TelegramSettings(port=0, cycle_s=0.02)) as one,
+        socket.create_connection(("127.0.0.1", one.port), timeout=5) as link,
+    ):
+        for turn in range(80):
+            if turn == 20:
+                time.sleep(0.8)
+                resumed = life
+            life += 1
+            link.sendall(telegram(life))
+            content = link.recv(98, socket.MSG_WAITALL)
+            ages.append(time.time_ns() - struct.unpack_from(">q", content, 8)[0])
+            echo = struct.unpack_from(">H", content, 96)[0]
+            fresh.append(life - echo <= 3 and echo > resumed)
+    old = [age - min(ages) > 200_000_000 for age in ages]
+    assert sum(old) >= 20 and not any(
+        is_old and is_fresh for is_old, is_fresh in zip(old, fresh, strict=True)
+    )
+    assert all(fresh[5:20]) and all(fresh[-5:])
+    assert not one.wrong

@@ -1,4 +1,4 @@
-"""What `barsight info` says."""
+"""`barsight info` says what is in a recording."""
 
 from pathlib import Path
 

@@ -18,7 +18,7 @@ from barsight.simulation.simulate import simulate
 from barsight.stereo.settings import StereoSettings
 from cli_runs import TINY
 
-LEAST, MOST = 0.4, 1.25
+MIN_RATIO, MAX_RATIO = 0.4, 1.25
 """The sigma of matches over the planned one: plans are careful, by a factor of two on small pictures."""
 
 
@@ -53,7 +53,7 @@ def test_every_plan_holds_what_was_wished(camera: str, width_m: float, bar_m: fl
 
 def test_the_planned_sigma_is_that_of_matches(whole: Path) -> None:
     ratios = over_planned(whole)
-    assert ratios and all(LEAST < ratio < MOST for ratio in ratios), ratios
+    assert ratios and all(MIN_RATIO < ratio < MAX_RATIO for ratio in ratios), ratios
 
 
 @pytest.mark.slow
@@ -66,7 +66,7 @@ def test_the_planned_sigma_is_that_of_other_rigs(
     camera = CameraSettings(640, 512, focal_px, baseline_m, above_floor_m=above_m)
     simulate(tmp_path / "one", replace(TINY, camera=camera, seed=seed))
     ratios = over_planned(tmp_path / "one")
-    assert ratios and all(LEAST < ratio < MOST for ratio in ratios), ratios
+    assert ratios and all(MIN_RATIO < ratio < MAX_RATIO for ratio in ratios), ratios
 
 
 def over_planned(path: Path) -> list[float]:

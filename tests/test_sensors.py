@@ -246,7 +246,7 @@ def test_what_a_machine_lacks_is_named_with_a_remedy(described: Path, tmp_path: 
 def test_readings_in_other_units_are_refused_at_the_start(
     sensor: str, value: tuple[float, ...], words: str, described: Path
 ) -> None:
-    """What a moment of readings says of its units, and of the mounting, which looks down."""
+    """A moment of readings tells its units, and the mounting, which looks down."""
     described.write_text(described.read_text() + "[imu]\nport = 5601\nrate_hz = 200\n")
     crane = read_crane(described)
     awaited = crane.described(described.parent / "recording")

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 import barsight as bs
+from barsight import pipeline
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.types import StereoFrame
+from barsight.mapping.view import Matcher
 from barsight.motion.frontend.tracking import Tracker
 
 SETTINGS: dict[str, Any] = {"stereo": {"method": "sgbm"}, "map": {"cell_m": 0.05}}
@@ -19,14 +21,14 @@ SETTINGS: dict[str, Any] = {"stereo": {"method": "sgbm"}, "map": {"cell_m": 0.05
 FILES = ("height.tif", "contour.csv", "trajectory.tum", "cloud.ply")
 
 
-def counted(patch: pytest.MonkeyPatch, owner: type, name: str) -> list[str]:
-    """Count a method's calls."""
+def counted(patch: pytest.MonkeyPatch, owner: Any, name: str) -> list[str]:
+    """Count the calls of a class's method or a module's function."""
     calls: list[str] = []
     method = getattr(owner, name)
 
-    def told(*values: Any) -> Any:
+    def told(*values: Any, **named: Any) -> Any:
         calls.append(name)
-        return method(*values)
+        return method(*values, **named)
 
     patch.setattr(owner, name, told)
     return calls
@@ -42,6 +44,7 @@ def test_packets_with_snapshots_end_as_the_batch(
     recording = bs.open_recording(whole)
     session = bs.Session(recording.rig, imu_noise=recording.imu_noise(), **settings)
     rectified = counted(monkeypatch, Rectifier, "__call__")
+    matched = counted(monkeypatch, Matcher, "__call__")
     tracked = counted(monkeypatch, Tracker, "push")
     shown = []
     for packet in bs.packets(recording):
@@ -52,9 +55,12 @@ def test_packets_with_snapshots_end_as_the_batch(
     assert [one.frames for one in shown] == sorted(one.frames for one in shown)
     last = session.snapshot()
     assert last.frames >= 2
+    lifted = counted(monkeypatch, pipeline, "plan_lifts")
+    before = len(matched)
     yard = session.finish()
     pictures = len(recording.index.stamps_ns)
-    assert (len(rectified), len(tracked)) == (pictures, pictures)
+    assert (len(rectified), len(tracked), len(lifted)) == (pictures, pictures, 1)
+    assert len(matched) <= pictures and (estimator != "live" or len(matched) == before)
     batch = bs.measure(whole, **settings)
     assert len(rectified) == 2 * pictures
     for name in FILES:
@@ -108,7 +114,7 @@ def test_a_finished_session_takes_no_more(whole: Path) -> None:
     frames = list(recording.frames())
     session.push(frames[0])
     session.finish()
-    for call in (session.finish, lambda: session.push(frames[1])):
+    for call in (session.finish, session.snapshot, session.next_pass, lambda: session.push(frames[1])):
         with pytest.raises(bs.BarsightError, match="is finished"):
             call()
 

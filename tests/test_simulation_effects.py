@@ -1,4 +1,4 @@
-"""What light and faults do to a picture, held against what can be computed by hand."""
+"""Light and faults change a picture, held against what can be computed by hand."""
 
 from __future__ import annotations
 

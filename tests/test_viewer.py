@@ -58,7 +58,7 @@ UPGRADE = {
 
 
 def test_other_pages_in_the_browser_are_refused(folder: Path) -> None:
-    """By Origin, and by Host: a name of another page's that was made to lead here."""
+    """Origin and Host tell them: a name of another page's that was made to lead here."""
     with serving(folder, 0) as url:
         port = urlsplit(url).port
         assert get(url, Origin=url)[0] == get(url, Host=f"localhost:{port}")[0] == 200

@@ -107,29 +107,27 @@ def test_a_world_is_done_once_and_a_refusal_is_a_score(
     def refuse(*_: object, **__: object) -> None:
         raise MeasurementError("too dark")
 
-    folder = tmp_path / "seed_101"
-    folder.mkdir()
     keys = WorldKeys.of(GIVEN)
-    first = run_world(folder, 101, GIVEN, keys, refuse, "")
+    first = run_world(tmp_path, 101, GIVEN, keys, refuse, "")
     assert (first.seed, first.refused, first.looked_at) == (101, "too dark", "") and not first.maps
 
     def never(*_: object, **__: object) -> None:
         raise AssertionError("done again")
 
     monkeypatch.setattr(world_runs, "simulate_world", never)
-    assert run_world(folder, 101, GIVEN, keys, never, "a threshold") == replace(
+    assert run_world(tmp_path, 101, GIVEN, keys, never, "a threshold") == replace(
         first, looked_at="a threshold"
     )
-    assert run_world(folder, 101, GIVEN, keys, never, "").looked_at == "a threshold"
+    assert run_world(tmp_path, 101, GIVEN, keys, never, "").looked_at == "a threshold"
     with pytest.raises(AssertionError, match="done again"):
-        run_world(folder, 101, GIVEN, replace(keys, measured="other sources"), never, "")
+        run_world(tmp_path, 101, GIVEN, replace(keys, measured="other sources"), never, "")
     with pytest.raises(AssertionError, match="done again"):
-        run_world(folder, 101, GIVEN, replace(keys, recording="other settings"), never, "")
-    assert not (folder / "recording").exists()
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine/letter.txt").write_text("dear")
+        run_world(tmp_path, 101, GIVEN, replace(keys, recording="other settings"), never, "")
+    assert not (tmp_path / "seed_101/recording").exists()
+    (tmp_path / "seed_1").mkdir()
+    (tmp_path / "seed_1/letter.txt").write_text("dear")
     with pytest.raises(OutputError, match="other things"):
-        run_world(tmp_path / "mine", 1, GIVEN, keys, never, "")
+        run_world(tmp_path, 1, GIVEN, keys, never, "")
 
 
 def test_keys_follow_settings() -> None:

@@ -1,4 +1,4 @@
-"""What the orthophoto says of bundles whose bars the surface doesn't show."""
+"""The orthophoto tells of bundles whose bars the surface doesn't show."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a magnet may reach: by the surface under its faces, not by outlines that lie there."""
+"""A magnet's reach is judged by the surface under its faces, not by outlines that lie there."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ def in_short_stretches(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 def test_a_yard_in_stretches_has_the_same_bundles_and_lifts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What differs is what the bundles of a kind have in common, by less than half a sigma."""
+    """They differ by what the bundles of a kind have in common, by less than half a sigma."""
     heights = draw(long_yard(), x_m=(-0.5, LENGTH_M))
     whole = find_bundles(heights, BundleSettings())
     assert len(whole) == 29

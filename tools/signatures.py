@@ -66,7 +66,7 @@ def main() -> None:
 
     durations = Durations()
     event.register("numba:compile", durations)
-    ahead.MOST_PROCESSES = 1
+    ahead.MAX_PROCESSES = 1
     with tempfile.TemporaryDirectory() as folder:
         demo.run(["--out", f"{folder}/demo"])
     groups: dict[str, list[tuple[int, float, list[Any]]]] = {"simulate": [], "measure": []}

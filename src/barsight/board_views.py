@@ -71,13 +71,13 @@ def views_from_pictures(
     return views, (sizes[0], sizes[1]), left_out
 
 
-def _pairs(path: Path, most: int) -> tuple[int, Sequence[ReadPair] | map[ReadPair]]:
+def _pairs(path: Path, max_pairs: int) -> tuple[int, Sequence[ReadPair] | map[ReadPair]]:
     """Count and yield the pairs: of a bag through its reader, of a folder file by file."""
     is_bag = path.suffix in BAG_KINDS or (path / "metadata.yaml").is_file()
     if is_bag:
         recording = open_recording(path)
         total = len(recording.index.stamps_ns)
-        step = max(-(-total // most), 1)
+        step = max(-(-total // max_pairs), 1)
         frames = [frame for n, frame in enumerate(recording.frames()) if n % step == 0]
         return len(frames), [
             ReadPair(str(f.stamp_ns), None, None, (("both", f.reason),))
@@ -86,7 +86,7 @@ def _pairs(path: Path, most: int) -> tuple[int, Sequence[ReadPair] | map[ReadPai
             for f in frames
         ]
     found = find_pairs(path)
-    chosen = np.unique(np.linspace(0, len(found) - 1, min(most, len(found))).astype(int))
+    chosen = np.unique(np.linspace(0, len(found) - 1, min(max_pairs, len(found))).astype(int))
     return len(chosen), map(read_pair_files, [found[n] for n in chosen])
 
 

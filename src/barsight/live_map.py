@@ -13,12 +13,8 @@ from barsight.core.arrays import Float64
 from barsight.core.timing import Stopwatch
 from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame
 from barsight.map_building import FusedViews
-from barsight.mapping.scene_extent import (
-    choose_cell_size,
-    keyframe_spacing_m,
-    points_per_pixel,
-    probe_recording,
-)
+from barsight.mapping.keyframes import keyframe_spacing_m
+from barsight.mapping.recording_probe import choose_cell_size, points_per_pixel, probe_recording
 from barsight.mapping.surface.height_selection import ViewFrusta
 from barsight.mapping.surface.incremental import SurfaceElection
 from barsight.mapping.surface.surface import Surface

@@ -1,1 +1,1 @@
-"""Floor 7: benchmarks that compare methods in one run and print a table."""
+"""Compare methods in one run and print a table."""

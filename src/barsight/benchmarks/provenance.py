@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import os
 import platform
 import subprocess
@@ -11,16 +9,11 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from barsight.core.arrays import Float64
-from barsight.core.files import atomic_path
-from barsight.core.json_values import json_value
-
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
 
 T = TypeVar("T")
 MIN_REPEATS = 5
@@ -69,13 +62,6 @@ def summarise_times(seconds: Sequence[float] | Float64) -> Timing:
     """Summarise the seconds of `time_repeats`."""
     ms = 1e3 * np.array(seconds)
     return Timing(float(np.median(ms)), float(ms.min()), float(ms.max()), len(seconds))
-
-
-def write_json(target: Path, record: DataclassInstance) -> None:
-    """Write a frozen record as JSON, whole or not at all; NaN and infinity become null."""
-    text = json.dumps(json_value(dataclasses.asdict(record)), indent=1) + "\n"
-    with atomic_path(target) as temporary:
-        temporary.write_text(text, encoding="utf-8")
 
 
 def _commit() -> str:

@@ -1,1 +1,1 @@
-"""Floor 1: camera models, the stereo rig, rectification."""
+"""Calibrate cameras, stereo rig and IMU; rectify pictures."""

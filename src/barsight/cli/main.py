@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import logging
 import os
 import signal
 import sys
@@ -71,8 +72,9 @@ def main() -> None:
     _fill_closed_streams()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _interrupt)
-    if signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:  # nohup ignores it
-        signal.signal(signal.SIGHUP, _interrupt)
+    hangup = getattr(signal, "SIGHUP", None)  # Windows has none, nohup ignores it
+    if hangup is not None and signal.getsignal(hangup) == signal.SIG_DFL:
+        signal.signal(hangup, _interrupt)
     if not sys.warnoptions:
         warnings.simplefilter("ignore")  # libraries' notes to programmers would stand beside our one line
     code = run_and_print(sys.argv[1:])
@@ -121,8 +123,9 @@ def run(arguments: Sequence[str]) -> int:
     if name not in COMMANDS:
         return _refuse(f"there is no command {name!r}; barsight --help lists them", 2)
     _interrupts.clear()
-    # What OpenCV can't decode is told in our one line.
+    # What OpenCV and tifffile can't decode is told in our one line.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+    logging.getLogger("tifffile").addHandler(logging.NullHandler())
     try:
         importlib.import_module(home(name)).run(rest)
     except KeyboardInterrupt:

@@ -24,7 +24,7 @@ from barsight.motion.frontend.matching_example import matching_example
 from barsight.motion.settings import MotionSettings, make_estimator
 from barsight.recording.base import Recording, RecordingSettings
 from barsight.recording.formats.board_corners import CornerRecording
-from barsight.recording.formats.ground_truth import GroundTruth, find_ground_truth, read_ground_truth
+from barsight.recording.formats.ground_truth import truth_of
 from barsight.recording.open import open_recording
 from barsight.recording.sensor_selection import SelectedSensors
 from barsight.report.odometry_page import OdometryResult, write_odometry_page
@@ -62,7 +62,7 @@ def run(arguments: Sequence[str]) -> None:
         if not trajectory.frames:
             why = trajectory.refused[0].reason if trajectory.refused else "it has no frames"
             raise MeasurementError(f"{recording}: no frame could be placed: {why}")
-        truth = _truth(source)
+        truth = truth_of(source)
         drift = (
             None if truth is None else trajectory_drift(trajectory, truth, source.rig.timeshift_cam_imu_ns)
         )
@@ -98,12 +98,6 @@ def _summary(trajectory: Trajectory) -> list[str]:
     lines += [f"warning: {warning}" for warning in (*trajectory.doubts, *trajectory.warnings)]
     lines += [f"refused {frame.stamp_ns}: {frame.reason}" for frame in trajectory.refused]
     return lines
-
-
-def _truth(source: Recording) -> GroundTruth | None:
-    if find_ground_truth(source.path) is None:
-        return None
-    return read_ground_truth(source.path, np.array(source.index.stamps_ns, np.int64))
 
 
 def _board_lines(source: CornerRecording, trajectory: Trajectory) -> list[str]:

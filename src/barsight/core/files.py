@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import os
 import shutil
 from collections.abc import Iterator
+from importlib.util import find_spec
 from itertools import count
 from pathlib import Path
 
@@ -133,8 +133,11 @@ def _staging(target: Path) -> Iterator[Path]:
 
     Its name is the same each time, so that the next run finds what a killed one left and removes it. Whoever
     works in it holds a lock on it, which ends with the process, however that ends; another run meanwhile
-    takes the next name. A folder of another user, or a link, is left alone.
+    takes the next name. A folder of another user, or a link, is left alone. Where the system has no such
+    locks, as Windows, nothing is written.
     """
+    if find_spec("fcntl") is None:
+        raise OutputError(f"{target}: can't be locked on this system; write it on Linux or macOS")
     names = (target.with_name(f".{target.name[:40]}.{turn}part") for turn in _turns())
     staging, held = next((path, held) for path in names if (held := _taken(path)) is not None)
     try:
@@ -153,6 +156,8 @@ def _taken(staging: Path) -> int | None:
     """Make the folder, or empty it where a killed run left it; return its locked descriptor. None where
     another run or user has it.
     """
+    import fcntl
+
     with contextlib.suppress(FileExistsError):
         staging.mkdir()
     try:

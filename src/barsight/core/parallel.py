@@ -43,16 +43,16 @@ def ordered_map(
 
 @contextmanager
 def prefetched_map(
-    function: Callable[[Item], Result], items: Iterable[Item], most: int, workers: int = WORKERS
+    function: Callable[[Item], Result], items: Iterable[Item], max_waiting: int, workers: int = WORKERS
 ) -> Iterator[Iterator[Result]]:
     """Run `ordered_map` at once, in one thread beside whatever the caller does first; from the first result
     asked for on it has all workers.
 
-    At most `most` results are under way or wait. An exception of the function or the items comes out at its
-    turn; leaving waits for what is under way and drops the rest.
+    At most `max_waiting` results are under way or wait. An exception of the function or the items comes out
+    at its turn; leaving waits for what is under way and drops the rest.
     """
     pool, reader = ThreadPoolExecutor(workers), ThreadPoolExecutor(1)
-    at_once, room, left = Semaphore(1), Semaphore(most), Event()
+    at_once, room, left = Semaphore(1), Semaphore(max_waiting), Event()
     begun: SimpleQueue[Future[Result] | None] = SimpleQueue()
 
     def in_turn(item: Item) -> Result:

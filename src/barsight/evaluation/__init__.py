@@ -1,1 +1,1 @@
-"""Floor 6: measured results against truth."""
+"""Score measured results against truth."""

@@ -1,1 +1,1 @@
-"""Floor 2: feature points and their matching."""
+"""Detect feature points and match them."""

@@ -5,15 +5,16 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, TypeVar
 
-from barsight.core.errors import InputError
+from barsight.core.errors import ConfigError, InputError, OutputError
 from barsight.core.extras import extra
 
 with extra("fleet"):
     import dask
     from distributed import Client, LocalCluster, as_completed
 
+T = TypeVar("T")
 _LOST = 1000
 """Deaths of workers that a task may see: killed machines are no fault of it; the ledger counts them too."""
 AHEAD = 4
@@ -21,11 +22,14 @@ AHEAD = 4
 
 
 @contextmanager
-def connect(workers: int, scheduler: str | None) -> Iterator[Any]:
+def connect(workers: int, scheduler: str | None, threads: int = 0) -> Iterator[Any]:
     """Lend a client of the cluster at `scheduler`, or of one of so many processes that ends with it.
+
+    threads: of the kernels in each process of this machine; 0 leaves it alone.
 
     Raises InputError for a scheduler that doesn't answer.
     """
+    own = {name: str(threads) for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")} if threads else {}
     logging.getLogger("distributed").setLevel(logging.ERROR)
     options = {
         "distributed.scheduler.allowed-failures": _LOST, "distributed.worker.daemon": False,
@@ -44,7 +48,7 @@ def connect(workers: int, scheduler: str | None) -> Iterator[Any]:
         with (
             LocalCluster(
                 n_workers=workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0",
-                host="127.0.0.1", memory_limit=0,
+                host="127.0.0.1", memory_limit=0, env=own,
             ) as cluster,
             Client(cluster, set_as_default=False) as client,
         ):  # fmt: skip
@@ -58,10 +62,13 @@ def slots(client: Any) -> int:
 
 
 def run_all(
-    client: Any, run: Callable[..., str], tasks: Iterable[Any], settings: Any, may_go_on: Callable[[], bool]
-) -> Iterator[str | None]:
-    """Run tasks in their order, a few ahead of the workers, and yield the key of each as it ends; None for
+    client: Any, run: Callable[[Any, Any], T], tasks: Iterable[Any], settings: Any,
+    may_go_on: Callable[[], bool] = lambda: True,
+) -> Iterator[T | None]:  # fmt: skip
+    """Run tasks in their order, a few ahead of the workers, and yield what each returns as it ends; None for
     one that was lost. may_go_on: asked before each; where it refuses, what runs is waited for.
+
+    Raises what a task raised where another try would too: ConfigError and OutputError.
     """
     waiting = iter(tasks)
     running = as_completed(loop=client.loop)
@@ -81,6 +88,9 @@ def run_all(
     while count:
         future = next(running)
         count -= 1
+        error = future.exception() if future.status == "error" else None
+        if isinstance(error, ConfigError | OutputError):
+            raise error
         yield future.result() if future.status == "finished" else None
         future.release()
         count += submit_more()

@@ -7,7 +7,7 @@ from html import escape
 
 from barsight.fleet.findings import LEVEL, Findings
 
-MOST = 100
+MAX_LISTED = 100
 """Bundles and recordings that the page lists; the JSON has all."""
 _STYLE = (
     "body{font:15px/1.45 system-ui,sans-serif;margin:2rem auto;max-width:70rem;padding:0 1rem;color:#1c2733}"
@@ -38,7 +38,7 @@ def comparison_page(findings: Findings) -> str:
             [
                 (c.recording, str(c.bundle), c.figure, f"{c.before:.4f}", f"{c.after:.4f}", f"{c.sigma:.4f}",
                  f"{c.p:.2g}", pictures[c.recording])
-                for c in findings.beyond[:MOST]
+                for c in findings.beyond[:MAX_LISTED]
             ],
         ),
         "<h2>Vetoes and bundles of one version only</h2>",
@@ -49,14 +49,14 @@ def comparison_page(findings: Findings) -> str:
                  one.pictures)
                 for one in findings.recordings
                 if one.vetoes or one.only_before or one.only_after
-            ][:MOST],
+            ][:MAX_LISTED],
         ),
         "<h2>Half widths of the 95 % intervals, mean over the recordings</h2>",
         _table(("figure", "before", "after"), _intervals(findings)),
         f"<h2>Times</h2><p>Median seconds: {findings.seconds[0]:.2f} and {findings.seconds[1]:.2f}.</p>",
     ]  # fmt: skip
     if findings.untold:
-        parts.append(f"<p>Not compared: {escape(', '.join(findings.untold[:MOST]))}</p>")
+        parts.append(f"<p>Not compared: {escape(', '.join(findings.untold[:MAX_LISTED]))}</p>")
     return (
         '<!doctype html><html lang="en"><meta charset="utf-8"><title>Two versions</title>'
         f"<style>{_STYLE}</style>{''.join(parts)}</html>\n"

@@ -4,36 +4,55 @@ from __future__ import annotations
 
 import hashlib
 import os
+import socket
 import sys
 import time
 from dataclasses import dataclass
+from math import inf
 from pathlib import Path
 
-from barsight.core.errors import BarsightError, Failed
+from barsight.core.errors import BarsightError, ConfigError, Failed
+from barsight.core.settings.values import NOT_NEGATIVE, POSITIVE, expect_ranges
 from barsight.fleet.archive import download
 from barsight.fleet.ledger import HeldRecording, claim, fail, held, publish
 from barsight.fleet.limits import LimitedRun, run_limited
 from barsight.fleet.objects import Objects, open_objects
 from barsight.fleet.records import note_result
 from barsight.fleet.scratch import compile_once, scratch_folder
-from barsight.fleet.versions import FleetTask, arguments
+from barsight.fleet.versions import FleetTask, arguments, installed_software
 
 COMMAND = (sys.executable, "-m", "barsight", "measure")
 
 
 @dataclass(frozen=True)
+class TaskLimits:
+    """Limits of one measurement of an archive."""
+
+    memory_gib: float = 8.0
+    """Memory that one measurement may take."""
+    timeout_s: float = 7200.0
+    """Time that one measurement may take."""
+    lease_s: float = 60.0
+    """Time after which a dead worker's recording is taken over; more than clocks differ."""
+    threads: int = 0
+    """Threads of each measurement; all cores if 0."""
+
+    def __post_init__(self) -> None:
+        expect_ranges(
+            self, "", memory_gib=POSITIVE, timeout_s=POSITIVE, lease_s=(2, inf), threads=NOT_NEGATIVE
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
 class TaskSettings:
     """All that tasks of a run share: URLs of archive, results and store (None: the driver writes the rows),
-    and limits. lease_s: after which a silent worker's claim is free. threads: of each; 0 leaves it alone.
+    and limits.
     """
 
     archive: str
     results: str
     store: str | None
-    memory_gib: float = 8.0
-    timeout_s: float = 7200.0
-    lease_s: float = 60.0
-    threads: int = 0
+    limits: TaskLimits = TaskLimits()
     by: str = "fleet"
     command: tuple[str, ...] = COMMAND
 
@@ -41,14 +60,20 @@ class TaskSettings:
 def run_task(task: FleetTask, settings: TaskSettings) -> str:
     """Measure a recording unless another worker has it or did it, and return its key, whatever came of it.
 
-    A recording that fails is tried again at once until it is parked.
+    A recording that fails is tried again at once until it is parked. Raises ConfigError where this machine's
+    software isn't the version's.
     """
+    if task.version.software != installed_software():
+        raise ConfigError(
+            f"{socket.gethostname()}: has Barsight {installed_software()}, but the version was planned with "
+            f"{task.version.software}; install that on every worker, or plan again"
+        )
     results = open_objects(settings.results, create=True)
     while True:
-        mine = claim(results, task.key, settings.lease_s)
+        mine = claim(results, task.key, settings.limits.lease_s)
         if not isinstance(mine, HeldRecording):
             return task.key
-        with held(results, mine, settings.lease_s):
+        with held(results, mine, settings.limits.lease_s):
             ended = _try(task, mine, settings, results)
             if not isinstance(ended, Failed):
                 return task.key
@@ -71,8 +96,8 @@ def _try(task: FleetTask, mine: HeldRecording, settings: TaskSettings, results: 
             [*settings.command, *words],
             folder,
             _environment(settings),
-            settings.memory_gib,
-            settings.timeout_s,
+            settings.limits.memory_gib,
+            settings.limits.timeout_s,
         )
         if isinstance(ran, Failed):
             return ran
@@ -88,8 +113,8 @@ def _try(task: FleetTask, mine: HeldRecording, settings: TaskSettings, results: 
 
 def _environment(settings: TaskSettings) -> dict[str, str]:
     own = dict(os.environ)
-    if settings.threads:
-        own |= {name: str(settings.threads) for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")}
+    if threads := settings.limits.threads:
+        own |= {name: str(threads) for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")}
     return own
 
 

@@ -15,12 +15,12 @@ with extra("fleet"):
 
 @dataclass(frozen=True)
 class RunWindow:
-    """The times at which tasks start. between: local times HH:MM from and to, past midnight too. idle:
-    whether a core of the driver's machine must be free of other work.
-    """
+    """The times at which tasks start."""
 
     between: tuple[str, str] | None = None
+    """Start recordings only between two local times, like 22:00 06:00."""
     idle: bool = False
+    """Start a recording only while this machine has an idle core."""
 
     def __post_init__(self) -> None:
         if self.between is not None:

@@ -1,1 +1,1 @@
-"""Floor 2: what an IMU measures, its integration between two instants, and standing still."""
+"""Integrate the IMU between two instants, and detect standing still."""

@@ -47,7 +47,7 @@ class Label:
     doubts: tuple[str, ...]
 
 
-def unite(codes: Sequence[PlacedCode], bundles: Sequence[Bundle]) -> tuple[Label, ...]:
+def merge_codes(codes: Sequence[PlacedCode], bundles: Sequence[Bundle]) -> tuple[Label, ...]:
     """Unite readings of one text at one place, in the order of their places along X."""
     groups: list[list[PlacedCode]] = []
     for code in codes:

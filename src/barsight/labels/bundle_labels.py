@@ -11,7 +11,7 @@ from barsight.core.arrays import Float64
 from barsight.core.parallel import ordered_map
 from barsight.core.pose import Pose
 from barsight.core.types import RectifiedPair, RefusedFrame
-from barsight.labels.attachment import Label, PlacedCode, unite
+from barsight.labels.attachment import Label, PlacedCode, merge_codes
 from barsight.labels.code_reading import SeenCode, read_codes
 from barsight.labels.placing import PlacedCamera, first_surface
 from barsight.recording.rectified_pairs import RectifiedPairs
@@ -33,7 +33,7 @@ def label_bundles(
     Raises ConfigError without the extra `labels`.
     """
     found = [code for codes in placed_codes(pairs, poses, heights) for code in codes]
-    labels = unite(found, bundles)
+    labels = merge_codes(found, bundles)
     return tuple(replace(bundle, label=bundle_label(bundle, labels)) for bundle in bundles)
 
 
@@ -56,7 +56,7 @@ def placed_codes(
         yield [
             PlacedCode(code.text, code.kind, place, (stamp_ns, number))
             for number, (codes, camera) in enumerate(zip(seen, cameras, strict=False)) for code in codes
-            if (place := _on_the_map(heights, *camera.sight(code.middle_px))) is not None
+            if (place := _on_the_map(heights, *camera.line_of_sight(code.middle_px))) is not None
         ]  # fmt: skip
 
 

@@ -34,7 +34,7 @@ class PlacedCamera:
         principal = (camera.cx_px + camera.doffs_px, camera.cy_px)
         return left, cls(map_from_rect0 @ aside, camera.focal_px, principal)
 
-    def sight(self, pixel: Float64) -> tuple[Float64, Float64]:
+    def line_of_sight(self, pixel: Float64) -> tuple[Float64, Float64]:
         """Return the line of sight of a pixel (2,): its origin (3,) and its direction (3,) at depth 1."""
         ray = np.array([*(pixel - np.array(self.principal_px)) / self.focal_px, 1.0])
         return self.map_from_rect.translation, self.map_from_rect.rotation @ ray

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +10,8 @@ from typing import Any
 import barsight
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import InputError
-from barsight.core.files import atomic_path
-from barsight.labels.attachment import Label, PlacedCode, contradictions, unite
+from barsight.core.json_values import write_json
+from barsight.labels.attachment import Label, PlacedCode, contradictions, merge_codes
 from barsight.labels.bundle_labels import placed_codes
 from barsight.labels.placing import pose_at
 from barsight.recording.base import Recording
@@ -59,7 +58,7 @@ def read_labels(
         count()
         codes += found
         pictures += 2
-    labels = unite(codes, bundles)
+    labels = merge_codes(codes, bundles)
     return ReadLabels(said["map_id"], pictures, labels, contradictions(labels, bundles, listed))
 
 
@@ -82,6 +81,5 @@ def write_labels(found: ReadLabels, folder: Path) -> Path:
         "contradictions": list(found.contradictions),
     }  # fmt: skip
     target = folder / FILE
-    with atomic_path(target) as path:
-        path.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    write_json(target, content)
     return target

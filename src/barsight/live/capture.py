@@ -28,7 +28,7 @@ def capture(link: Link) -> None:
         board.beat("capture")
         return not board["supervisor", "stop"]
 
-    if link.crane is None:
+    if link.source.crane is None:
         recording = link.open_replayed()
         stamps = recording.camera_stamps
         first_ns = int(min(stamps.left_ns[0], stamps.right_ns[0]))
@@ -39,11 +39,13 @@ def capture(link: Link) -> None:
         if not may_go_on():
             return
         time.sleep(POLL_S)
-    if link.crane is None:
-        source: Source = ReplaySource(recording, ReplayClock(began_ns, first_ns, link.speed), may_go_on)
+    if link.source.crane is None:
+        source: Source = ReplaySource(
+            recording, ReplayClock(began_ns, first_ns, link.source.speed), may_go_on
+        )
     else:
         # Not before: what comes while nobody reads would be lost.
-        source = open_crane(link.crane, link.open_recording().rig, link.epoch_ns, may_go_on)
+        source = open_crane(link.source.crane, link.open_recording().rig, link.source.epoch_ns, may_go_on)
     board["capture", "interval_ns"] = source.interval_ns
     Capture(link, board, link.open_ring()).run(source)
     board["capture", "ended"] = 1
@@ -65,7 +67,7 @@ class Capture:
     """Takes what a source gives, and counts it."""
 
     def __init__(self, link: Link, board: Counters, ring: PairRing) -> None:
-        self._board, self._ring, self._speed = board, ring, link.speed
+        self._board, self._ring, self._speed = board, ring, link.source.speed
         self._readings = {sensor: link.readings(sensor) for sensor in ("imu", "crane")}
         self._pairs = PairFormer(seconds_to_ns(link.settings.recording.pair_tolerance_s))
         self._lost = [board["capture", f"unpaired_cam{camera}"] for camera in (0, 1)]

@@ -31,7 +31,7 @@ def latencies(link: Link, board: Counters, lifts_s: float | None) -> dict[str, A
     tiles = [done - exposed for _, exposed, done in link.tiles().read()]
     return {
         "schema_version": 1,
-        "speed": link.speed,
+        "speed": link.source.speed,
         "pose_s": spread([ns / NS_PER_S for ns in poses]),
         "tile_s": spread([ns / NS_PER_S for ns in tiles]),
         "lifts_s": spread([] if lifts_s is None else [lifts_s]),

@@ -21,36 +21,46 @@ from barsight.recording.wrapper import RecordingProxy
 
 
 @dataclass(frozen=True)
-class Link:
-    """Share a run's settings, files and memory among its processes.
+class LiveInput:
+    """A recording to replay, or a crane's own sensors.
 
-    speed: recorded seconds a second; 0: as fast as possible. checkpoints: the folder in `folder` for pictures
-    and disparities. ring, counters: names of the shared memory. keyframes: stamps of the only pairs to keep,
-    None where the run chooses. crane: the sensors of crane.toml in place of a recording; then `recording` is
-    the folder that the run records into. epoch_ns: what stamps are ahead of the monotonic clock there.
-    surveys: the run ends as the crane stops.
+    speed: recorded seconds a second; 0: as fast as possible. crane: the sensors of crane.toml; then
+    `recording` is the folder that the run records into. epoch_ns: what stamps are ahead of the monotonic
+    clock there. surveys: the run ends as the crane stops.
     """
 
     recording: Path
+    speed: float = 1.0
+    crane: CraneConfig | None = None
+    epoch_ns: int = 0
+    surveys: bool = False
+
+
+@dataclass(frozen=True)
+class Link:
+    """Share a run's settings, files and memory among its processes.
+
+    checkpoints: the folder in `folder` for pictures and disparities. ring, counters: names of the shared
+    memory. keyframes: stamps of the only pairs to keep, None where the run chooses.
+    """
+
+    source: LiveInput
     settings: MeasureSettings
     live: LiveSettings
-    speed: float
     folder: Path
     checkpoints: Path
     ring: str
     counters: str
     keyframes: tuple[int, ...] | None
-    crane: CraneConfig | None = None
-    epoch_ns: int = 0
-    surveys: bool = False
 
     def open_recording(self) -> Recording:
         """Open the recording that is replayed, or of a crane what is known beforehand."""
-        return self.open_replayed() if self.crane is None else self.crane.awaited(self.recording)
+        crane = self.source.crane
+        return self.open_replayed() if crane is None else crane.awaited(self.source.recording)
 
     def open_replayed(self) -> StoredPictures:
         """Open the recording that is replayed."""
-        return open_recording(self.recording, self.settings.recording)
+        return open_recording(self.source.recording, self.settings.recording)
 
     def sensors(self, recording: Recording) -> set[str]:
         """Tell which of `imu` and `crane` the recording has and may be used."""

@@ -37,7 +37,7 @@ STAMP_SIGMA_S = 0.02
 
 
 @dataclass(frozen=True)
-class HeardSensors:
+class SensorActivity:
     """Last signs of each sensor: stamps on the cameras' clock, 0 for never.
 
     cameras_ns: of cam0 and cam1. interval_ns: between pictures, at most. readings_ns: of `imu` and `crane`,
@@ -63,7 +63,7 @@ class Mode:
 
 
 def judge_mode(
-    heard: HeardSensors, now_ns: int, settings: LiveSettings, down: Mapping[str, str] = MappingProxyType({})
+    heard: SensorActivity, now_ns: int, settings: LiveSettings, down: Mapping[str, str] = MappingProxyType({})
 ) -> Mode:
     """Judge the mode at a stamp of the cameras' clock. down: processes that don't run, each with why."""
     reasons = [f"{process} is down: {why}" for process, why in down.items()]
@@ -88,7 +88,7 @@ def judge_mode(
     return Mode(name, tuple(reasons), name in FOR_LIFTS and not down and not is_stepped)
 
 
-def _silent_cameras(heard: HeardSensors, now_ns: int, settings: LiveSettings) -> list[str]:
+def _silent_cameras(heard: SensorActivity, now_ns: int, settings: LiveSettings) -> list[str]:
     """Tell which cameras gave no picture for too long."""
     told = []
     bound_s = max(MIN_CAMERA_SILENCE_S, settings.camera_silence_intervals * heard.interval_ns / NS_PER_S)
@@ -100,7 +100,7 @@ def _silent_cameras(heard: HeardSensors, now_ns: int, settings: LiveSettings) ->
     return told
 
 
-def _silent_sensor(sensor: str, name: str, heard: HeardSensors, now_ns: int, bound_s: float) -> str | None:
+def _silent_sensor(sensor: str, name: str, heard: SensorActivity, now_ns: int, bound_s: float) -> str | None:
     """Tell why a sensor is out, None if it isn't."""
     if sensor not in heard.readings_ns:
         return f"{name}: none in use"
@@ -142,7 +142,7 @@ class JumpWatch:
     """Tells by how much the encoders have jumped, until they come back. sigma_m: of a reading."""
 
     def __init__(self, sigma_m: float) -> None:
-        self._least_m = max(MIN_JUMP_M, JUMP_SIGMAS * sigma_m)
+        self._min_jump_m = max(MIN_JUMP_M, JUMP_SIGMAS * sigma_m)
         self._off_m: Float64 = np.zeros(3)
         self._last_ns = self._jump_ns = self._from_ns = 0
         self._jump_m: Float64 = np.zeros(3)
@@ -170,7 +170,7 @@ class JumpWatch:
         place = position_m + (stamp_ns < self._jump_ns)[:, None] * self._jump_m
         off = place[-1] - place[-2] - (place[-2] - place[0]) / -t[0] * t[-1]
         speed = float(np.linalg.norm(place[-2] - place[0])) / -t[0]
-        bound_m = self._least_m + STAMP_SIGMA_S * speed + MAX_CHANGE_MPS2 * t[-1] * (t[-1] - t[0])
+        bound_m = self._min_jump_m + STAMP_SIGMA_S * speed + MAX_CHANGE_MPS2 * t[-1] * (t[-1] - t[0])
         if np.linalg.norm(off) > bound_m:
             # Back means back within the bounds of the jump there and the jump back.
             is_away = np.linalg.norm(self._off_m) > self._bound_m

@@ -22,7 +22,7 @@ DRAIN = 2
 
 def record(link: Link) -> None:
     """Record until the supervisor says that all else has ended, and what there is then."""
-    assert link.crane is not None
+    assert link.source.crane is not None
     board = link.open_counters()
     recorder = Recorder(link, board)
     board["record", "ready"] = 1
@@ -40,15 +40,15 @@ class Recorder:
     """Moves what came since into the recording; a recorder begun anew goes on after what is written."""
 
     def __init__(self, link: Link, board: Counters) -> None:
-        assert link.crane is not None
-        settings = link.crane.recorder
+        assert link.source.crane is not None
+        settings = link.source.crane.recorder
         self._link, self._board, self._after_s = link, board, settings.alarm_after_s
         size = settings.segment_mib << 20
-        self._writer = SegmentWriter(link.recording, size)
-        self._alarms = SegmentWriter(link.recording / "alarms", size)
-        self._retention = Retention(link.recording, settings.max_used_ratio, settings.stop_used_ratio)
+        self._writer = SegmentWriter(link.source.recording, size)
+        self._alarms = SegmentWriter(link.source.recording / "alarms", size)
+        self._retention = Retention(link.source.recording, settings.max_used_ratio, settings.stop_used_ratio)
         self._frames, self._logs = link.frames(), {name: link.readings(name) for name in ("imu", "crane")}
-        self._mounted = link.crane.awaited(link.recording).crane()
+        self._mounted = link.source.crane.awaited(link.source.recording).crane()
         self._ring = link.open_ring()
         self._sync_at = self._look_at = time.monotonic()
         self._alarm_count, self._alarm_until, self._saved = board["record", "alarms"], 0.0, 0

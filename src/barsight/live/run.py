@@ -10,21 +10,22 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 from barsight.checkpoint import checkpoint_folder
 from barsight.core.compiling.ahead import compile_ahead
 from barsight.core.errors import ConfigError, InputError, MeasurementError, OutputError
-from barsight.core.files import atomic_path, expect_empty, lies_within, translated_os_errors
+from barsight.core.files import expect_empty, lies_within, translated_os_errors
+from barsight.core.json_values import json_value, write_json
 from barsight.core.notices import Notice
 from barsight.core.stamps import NS_PER_S
 from barsight.live.latency import latencies
-from barsight.live.link import GrowingRecording, KeptRecording, Link
+from barsight.live.link import GrowingRecording, KeptRecording, Link, LiveInput
 from barsight.live.mapper import LIVE_MAP
 from barsight.live.modes import Mode
-from barsight.live.settings import CraneConfig, LiveSettings
+from barsight.live.settings import LiveSettings
 from barsight.live.shared.counters import Counters
 from barsight.live.shared.ring import PairRing
 from barsight.live.state import write_state
@@ -33,11 +34,11 @@ from barsight.live.survey import STOOD
 from barsight.map_building import ProgressCallback, checkpoint_key
 from barsight.measure_folder import ignore_progress, write_measured
 from barsight.measure_settings import MeasureSettings
-from barsight.measurement import to_json
+from barsight.pipeline import LiftRequest
 from barsight.recording.base import Recording
 from barsight.recording.open import open_recording
 from barsight.yard.lifting.lift_file import read_lifts
-from barsight.yard.magnet.description import Magnet, load_magnet
+from barsight.yard.magnet.description import load_magnet
 
 MAX_SPEED = 1000.0
 INTERRUPTED = "interrupted"
@@ -66,35 +67,31 @@ def replay(
     if not (math.isfinite(speed) and 0 <= speed <= MAX_SPEED):
         raise ConfigError(f"speed must lie in 0...{MAX_SPEED:g} (0: as fast as possible), not {speed:g}")
     given = None if keyframes is None else read_keyframes(keyframes)
-    described = None if magnet is None else load_magnet(magnet)
+    request = LiftRequest(None if magnet is None else load_magnet(magnet), judged_at)
     recording = open_recording(path, settings.recording)
     if lies_within(out, path):
         raise OutputError(f"{out}: lies in the recording itself; name a folder elsewhere")
     expect_empty(out)
-    run = LiveRun(recording, path.absolute(), out, settings, live, speed, tell)
-    return run.measure(given, described, judged_at, advance)
+    run = LiveRun(recording, LiveInput(path.absolute(), speed), out, settings, live, tell)
+    return run.measure(given, request, advance)
 
 
 class LiveRun:
-    """A run into `out`. recording: what is known of it beforehand; it lies, or will lie, at `path`.
-
-    crane: where it comes from a crane; epoch_ns, surveys: see `Link`. stop_because: why it ended early.
+    """A run into `out`. recording: what is known of its source beforehand. stop_because: why it ended
+    early.
     """
 
     def __init__(
-        self, recording: Recording, path: Path, out: Path, settings: MeasureSettings, live: LiveSettings,
-        speed: float, tell: Callable[[str], None], crane: CraneConfig | None = None, epoch_ns: int = 0,
-        surveys: bool = False,
+        self, recording: Recording, source: LiveInput, out: Path, settings: MeasureSettings,
+        live: LiveSettings, tell: Callable[[str], None],
     ) -> None:  # fmt: skip
-        self._recording, self._path, self._out, self._asked = recording, path, out, settings
-        self._live, self._speed, self._tell = live, speed, tell
-        self._crane, self._epoch_ns, self._surveys = crane, epoch_ns, surveys
+        self._recording, self._source, self._out, self._asked = recording, source, out, settings
+        self._live, self._tell = live, tell
         self.stop_because = ""
 
     def measure(
-        self, given: Keyframes | None, magnet: Magnet | None, judged_at: Literal["now", "end"],
-        advance: ProgressCallback,
-    ) -> dict[str, Any]:  # fmt: skip
+        self, given: Keyframes | None, request: LiftRequest, advance: ProgressCallback
+    ) -> dict[str, Any]:
         """Run until the recording or the survey ends or a signal comes, then measure what was kept; return
         nothing where the crane only stood.
         """
@@ -106,10 +103,9 @@ class LiveRun:
         board, ring = Counters(), PairRing(self._live.ring_pairs, camera.height, camera.width)
         try:
             link = Link(
-                self._path, self._asked.chosen(), self._live, self._speed, folder,
+                self._source, self._asked.chosen(), self._live, folder,
                 checkpoint_folder(folder / "checkpoints", _key(self._recording, self._asked)), ring.name,
-                board.name, None if given is None else given.stamps_ns, self._crane, self._epoch_ns,
-                self._surveys,
+                board.name, None if given is None else given.stamps_ns,
             )  # fmt: skip
             supervisor = Supervisor(link, board, self._tell_all)
             with _stopped_by_signals(supervisor):
@@ -121,7 +117,7 @@ class LiveRun:
                 self._tell_all(f"ends early: {supervisor.stop_because}; what was kept is measured")
             if given is not None:
                 supervisor.state.mode = given.mode
-            return _finish(supervisor, link, board, self._recording, self._asked, magnet, judged_at, advance)
+            return _finish(supervisor, link, board, self._recording, self._asked, request, advance)
         finally:
             ring.remove()
             board.remove()
@@ -135,12 +131,12 @@ class LiveRun:
 
 def _key(recording: Recording, settings: MeasureSettings) -> str:
     empty = KeptRecording(recording, [])
-    return checkpoint_key(empty, to_json(asdict(settings.chosen())), empty.digests())
+    return checkpoint_key(empty, json_value(settings.chosen()), empty.digests())
 
 
 def _finish(
     supervisor: Supervisor, link: Link, board: Counters, recording: Recording, settings: MeasureSettings,
-    magnet: Magnet | None, judged_at: Literal["now", "end"], advance: ProgressCallback,
+    request: LiftRequest, advance: ProgressCallback,
 ) -> dict[str, Any]:  # fmt: skip
     """Measure what was kept, with the poses' and disparities' work that is done already."""
     state, out = supervisor.state, link.folder.parent
@@ -154,22 +150,22 @@ def _finish(
     try:
         if not kept:
             why = supervisor.stop_because or "; ".join(state.mode.reasons)
-            raise MeasurementError(f"{link.recording}: no pair was kept; {why}")
-        if link.crane is not None:
+            raise MeasurementError(f"{link.source.recording}: no pair was kept; {why}")
+        if link.source.crane is not None:
             recording, link = _recorded(link, kept, settings)
         write_keyframes(Keyframes(tuple(kept), state.mode), out / "keyframes.json")
-        forbidden = () if state.mode.lifts else (Notice("live-state", _why_no_lifts(state.mode)),)
+        if not state.mode.lifts:
+            request = replace(request, notices=(Notice("live-state", _why_no_lifts(state.mode)),))
         content = write_measured(
-            [KeptRecording(recording, kept)], out, settings, advance=advance, overwrite=True,
-            keep=link.checkpoints.parent, magnet=magnet, judged_at=judged_at, notices=forbidden,
+            [KeptRecording(recording, kept)], out, settings, request, advance=advance, overwrite=True,
+            keep=link.checkpoints.parent,
         )  # fmt: skip
         lifts_s = (time.monotonic_ns() - frames[-1][1]) / NS_PER_S
         state.phase, state.offered = "done", len(read_lifts(out / "lifts.json")["lifts"])
         return content
     finally:
         state.phase = "done" if lifts_s is not None else "failed"
-        with atomic_path(out / "latency.json") as path:
-            path.write_text(json.dumps(latencies(link, board, lifts_s), indent=1) + "\n", encoding="utf-8")
+        write_json(out / "latency.json", latencies(link, board, lifts_s))
         write_state(state, board, out)
 
 
@@ -178,7 +174,7 @@ def _recorded(link: Link, kept: list[int], settings: MeasureSettings) -> tuple[R
 
     Where the recorder had to stop, the run's own notes take the recording's place.
     """
-    recording: Recording = open_recording(link.recording, settings.recording)
+    recording: Recording = open_recording(link.source.recording, settings.recording)
     if set(kept) - set(recording.index.stamps_ns):
         growing = GrowingRecording(recording, kept, link)
         growing.grow()
@@ -222,8 +218,7 @@ def write_keyframes(keyframes: Keyframes, target: Path) -> None:
             "lifts": keyframes.mode.lifts,
         },
     }
-    with atomic_path(target) as path:
-        path.write_text(json.dumps(content) + "\n", encoding="utf-8")
+    write_json(target, content)
 
 
 def read_keyframes(path: Path) -> Keyframes:

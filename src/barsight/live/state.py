@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import os
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -11,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from barsight.core.files import atomic_path
+from barsight.core.json_values import write_json
+from barsight.core.memory import resident_bytes
 from barsight.live.drift import DRIFT_FILE, drift_figures
 from barsight.live.latency import counts
 from barsight.live.modes import MODES, Mode
 from barsight.live.shared.counters import Counters
-
-PAGE_BYTES = os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else 4096
 
 
 @dataclass
@@ -60,14 +58,14 @@ class RunState:
 
 def write_state(state: RunState, board: Counters, out: Path) -> None:
     """Write state.json."""
-    _write_json(state.content(board), out / "state.json")
+    write_json(out / "state.json", state.content(board))
 
 
 def write_health(state: RunState, board: Counters, seconds: float, out: Path) -> None:
     """Write health.json and health.prom, Prometheus' text for a file collector. seconds: since it began."""
     frames = counts(board)
     free = shutil.disk_usage(out).free
-    memory = {name: _memory_bytes(process.pid) for name, process in state.processes.items()}
+    memory = {name: resident_bytes(process.pid) for name, process in state.processes.items()}
     content = {
         "schema_version": 1,
         "seconds": round(seconds, 3),
@@ -80,7 +78,7 @@ def write_health(state: RunState, board: Counters, seconds: float, out: Path) ->
         "frames": frames,
         "queues": {"keyframes": board["map", "backlog"]},
         "restarts": {name: process.restarts for name, process in state.processes.items()},
-        "memory_bytes": memory | {"supervisor": _memory_bytes(os.getpid())},
+        "memory_bytes": memory | {"supervisor": resident_bytes()},
         "disk_free_bytes": free,
         "disk_days": _disk_days(free, board["record", "bytes"], seconds),
         "sensors": board.row("sensors")
@@ -88,7 +86,7 @@ def write_health(state: RunState, board: Counters, seconds: float, out: Path) ->
         "record": board.row("record"),
         "calibration": drift_figures(out.parent / DRIFT_FILE),
     }
-    _write_json(content, out / "health.json")
+    write_json(out / "health.json", content)
     with atomic_path(out / "health.prom") as path:
         path.write_text(prometheus(content), encoding="utf-8")
 
@@ -128,16 +126,3 @@ def _disk_days(free_bytes: int, recorded_bytes: int, seconds: float) -> float | 
     if recorded_bytes <= 0 or seconds <= 0:
         return None
     return round(free_bytes / (recorded_bytes / seconds) / 86400, 2)
-
-
-def _write_json(content: dict[str, Any], target: Path) -> None:
-    with atomic_path(target) as path:
-        path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-
-
-def _memory_bytes(pid: int) -> int:
-    """Read a process's resident memory; 0 where it is gone or the system doesn't tell."""
-    try:
-        return int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1]) * PAGE_BYTES
-    except (OSError, IndexError, ValueError):
-        return 0

@@ -17,7 +17,7 @@ from barsight.core.stamps import NS_PER_S
 from barsight.live.capture import capture
 from barsight.live.link import Link
 from barsight.live.mapper import build_live_map
-from barsight.live.modes import FOR_LIFTS, FreezeWatch, HeardSensors, JumpWatch, Mode, judge_mode
+from barsight.live.modes import FOR_LIFTS, FreezeWatch, JumpWatch, Mode, SensorActivity, judge_mode
 from barsight.live.record import DRAIN, record
 from barsight.live.shared.counters import Counters
 from barsight.live.source import ReplayClock
@@ -30,7 +30,7 @@ PROCESSES: dict[str, Callable[[Link], None]] = {
 }  # fmt: skip
 BEAT_S = 0.1
 """Interval between judgements of the mode and looks after the processes."""
-MOST_RESTARTS, RESTARTS_WITHIN_S = 5, 30.0
+MAX_RESTARTS, RESTARTS_WITHIN_S = 5, 30.0
 """A process that ends more often than that ends the run."""
 START_S = 120.0
 """Processes may take so long to start on a busy machine."""
@@ -74,7 +74,7 @@ class Supervisor:
         self._context = multiprocessing.get_context("forkserver")
         self._context.set_forkserver_preload([__name__])
         self._running: dict[str, BaseProcess] = {}
-        self._roles = [role for role in PROCESSES if role != "record" or link.crane is not None]
+        self._roles = [role for role in PROCESSES if role != "record" or link.source.crane is not None]
         self._ends: dict[str, list[float]] = {role: [] for role in self._roles}
         self._hung: dict[str, str] = {}
         self.state = RunState(processes={role: ProcessState() for role in self._roles})
@@ -84,8 +84,8 @@ class Supervisor:
         self._freeze = None if crane is None else FreezeWatch(crane)
         self._jump = None if crane is None else JumpWatch(crane.position_std_m)
         self._survey: SurveyWatch | None = None
-        if link.crane is not None:
-            self._survey = SurveyWatch(link.crane.survey, is_alone=not link.surveys)
+        if link.source.crane is not None:
+            self._survey = SurveyWatch(link.source.crane.survey, is_alone=not link.source.surveys)
         self._clock: ReplayClock | None = None
         self._health_at = 0.0
         self._signs: dict[tuple[str, str], int] = {}
@@ -137,9 +137,9 @@ class Supervisor:
                 self.stop("the processes didn't start")
         began_ns = time.monotonic_ns()
         first_ns = self._board["capture", "first_ns"]
-        if self._link.crane is not None:
-            first_ns = began_ns + self._link.epoch_ns
-        self._clock = ReplayClock(began_ns, first_ns, self._link.speed)
+        if self._link.source.crane is not None:
+            first_ns = began_ns + self._link.source.epoch_ns
+        self._clock = ReplayClock(began_ns, first_ns, self._link.source.speed)
         self._board["supervisor", "began_ns"] = began_ns
         self.state.phase = "measuring"
 
@@ -168,10 +168,8 @@ class Supervisor:
             self._log(f"{role} {state.reason}; starting it anew")
             now = time.monotonic()
             self._ends[role] = [at for at in self._ends[role] if now - at < RESTARTS_WITHIN_S] + [now]
-            if len(self._ends[role]) > MOST_RESTARTS:
-                self.stop(
-                    f"{role} {state.reason}, {MOST_RESTARTS + 1} times within {RESTARTS_WITHIN_S:.0f} s"
-                )
+            if len(self._ends[role]) > MAX_RESTARTS:
+                self.stop(f"{role} {state.reason}, {MAX_RESTARTS + 1} times within {RESTARTS_WITHIN_S:.0f} s")
                 return
             self._board[role, "ready"] = 0
             self._start(role)
@@ -237,7 +235,7 @@ class Supervisor:
                 self._log(told.format(value))
             self._signs[key] = value
 
-    def _heard(self) -> HeardSensors:
+    def _heard(self) -> SensorActivity:
         board, frozen, jumped_m, step_s = self._board, False, 0.0, 0.0
         # First the pictures: readings that come meanwhile must not look late beside them.
         last_ns = board["capture", "last_cam0_ns"], board["capture", "last_cam1_ns"]
@@ -249,9 +247,9 @@ class Supervisor:
                 frozen, jumped_m = self._freeze.check(stamps, values), self._jump.check(stamps, values)
                 if frozen:
                     self._jump.begin_anew()
-        if self._link.crane is not None:
-            step_s = (time.time_ns() - time.monotonic_ns() - self._link.epoch_ns) / NS_PER_S
-        return HeardSensors(last_ns, board["capture", "interval_ns"], readings, frozen, jumped_m, step_s)
+        if self._link.source.crane is not None:
+            step_s = (time.time_ns() - time.monotonic_ns() - self._link.source.epoch_ns) / NS_PER_S
+        return SensorActivity(last_ns, board["capture", "interval_ns"], readings, frozen, jumped_m, step_s)
 
     def _write(self, health: bool) -> None:
         write_state(self.state, self._board, self._out)

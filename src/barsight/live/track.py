@@ -131,7 +131,7 @@ class Tracking:
 
     def _keep(self, pair: RectifiedPair, frame: StereoFrame) -> None:
         self._pairs.store(pair)
-        if self._link.crane is not None:
+        if self._link.source.crane is not None:
             with atomic_path(self._link.raw_file(pair.stamp_ns)) as path, path.open("wb") as stream:
                 np.save(stream, np.stack([frame.left, frame.right]))
         self._last_kept_ns = pair.stamp_ns

@@ -1,1 +1,1 @@
-"""Floor 4: all views fused into one height surface, and contours cut from it."""
+"""Fuse all views into one height surface, and cut contours from it."""

@@ -53,9 +53,9 @@ class TileStore:
         self._versions[key] = self._versions.get(key, 0) + 1
         return tile
 
-    def hold(self, most: int) -> None:
+    def hold(self, max_tiles: int) -> None:
         """Write those that are untouched for longest to disk until so many are held."""
-        while len(self._held) > most:
+        while len(self._held) > max_tiles:
             oldest, evicted = self._held.popitem(last=False)
             np.save(self._file(oldest), evicted)
 

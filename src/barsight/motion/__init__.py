@@ -1,1 +1,1 @@
-"""Floor 3: from sensors to the trajectory of the body."""
+"""Estimate the body's trajectory from cameras, IMU and encoders."""

@@ -18,7 +18,7 @@ from barsight.mapping.surface.contours import smooth_contour
 from barsight.paper.pictures import BLUE, RED, WIDTH_PX, PaperPicture, line_picture, picture_of
 from barsight.paper.published import RELATIVE_TO_M
 from barsight.recording.base import Recording
-from barsight.recording.formats.ground_truth import GroundTruth, find_ground_truth, read_ground_truth
+from barsight.recording.formats.ground_truth import truth_of
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.report.map_images import paint_height, read_raster, robust_range
 from barsight.result_folder import read_contours, read_laser
@@ -52,13 +52,6 @@ class ContourScore:
     relative_pct: tuple[float, float]
     max_relative_pct: tuple[float, float]
     stack_m: float
-
-
-def truth_of(recording: Recording) -> GroundTruth | None:
-    """Read the true trajectory, None where there is none."""
-    if find_ground_truth(recording.path) is None:
-        return None
-    return read_ground_truth(recording.path, np.array(recording.index.stamps_ns, np.int64))
 
 
 def drift_row(what: str, trajectory: Trajectory, recording: Recording) -> DriftRow:

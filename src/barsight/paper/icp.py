@@ -13,14 +13,15 @@ from barsight.core.arrays import Float64
 from barsight.core.pose import Pose
 from barsight.core.stamps import interpolate_at
 from barsight.core.types import RectifiedPair, Trajectory
-from barsight.paper.cloud import cloud_of, truth_of
+from barsight.paper.cloud import cloud_of
 from barsight.recording.base import Recording
+from barsight.recording.formats.ground_truth import truth_of
 from barsight.recording.rectified_pairs import RectifiedPairs
 
 ROUNDS = 20
 REACH_M = 0.1
 NEIGHBOURS = 12
-MOST = 6000
+MAX_POINTS = 6000
 
 
 @dataclass(frozen=True)
@@ -54,11 +55,11 @@ def refine(source: Float64, target: Float64, start: Pose) -> Pose:
     return pose
 
 
-def icp_score(recording: Recording, trajectory: Trajectory, most_steps: int) -> IcpScore | None:
+def icp_score(recording: Recording, trajectory: Trajectory, max_steps: int) -> IcpScore | None:
     """Refine the first steps of the paper's stitching by ICP and compare their lengths with truth; None
     without truth.
     """
-    truth, frames = truth_of(recording), trajectory.frames[: most_steps + 1]
+    truth, frames = truth_of(recording), trajectory.frames[: max_steps + 1]
     if truth is None or len(frames) < 2:
         return None
     rectifier, shift = Rectifier(recording.rig), recording.rig.timeshift_cam_imu_ns
@@ -69,7 +70,7 @@ def icp_score(recording: Recording, trajectory: Trajectory, most_steps: int) -> 
     for pair in RectifiedPairs(recording, rectifier)(set(stamps.tolist())):
         if isinstance(pair, RectifiedPair):
             points = cloud_of(pair)
-            clouds[pair.stamp_ns] = points[rng.permutation(len(points))[:MOST]]
+            clouds[pair.stamp_ns] = points[rng.permutation(len(points))[:MAX_POINTS]]
     body = rectifier.body_from_rect0
     errors = []
     for k in range(1, len(frames)):

@@ -26,8 +26,8 @@ PLC_SILENT_S = 1.0
 WHO = "barsight plant"
 
 
-class TellsState(Protocol):
-    """Tells the newest state to a link."""
+class StateReader(Protocol):
+    """Reads the newest state for a link."""
 
     def newest(self, life_counter: int) -> PlantState:
         """Return the newest state with the link's own life counter."""
@@ -35,7 +35,7 @@ class TellsState(Protocol):
     def refresh(self) -> None:
         """Read the state now."""
 
-    def hear(self, reading: PlcReading) -> None:
+    def take_reading(self, reading: PlcReading) -> None:
         """Take what a PLC tells of the crane."""
 
 
@@ -62,7 +62,7 @@ class StateFeed:
 
     def newest(self, life_counter: int) -> PlantState:
         """Return the newest state with the link's own life counter; not valid where it is old."""
-        return aged(*self.read(), life_counter)
+        return with_age(*self.read(), life_counter)
 
     def read(self) -> tuple[PlantState, float]:
         """Return the newest state, and when it was read (monotonic clock)."""
@@ -74,7 +74,7 @@ class StateFeed:
             began_s = time.monotonic()
             self._read = self._with_plc(read_state(self._store, self._settings)), began_s
 
-    def hear(self, reading: PlcReading) -> None:
+    def take_reading(self, reading: PlcReading) -> None:
         """Take what a PLC tells of the crane; it is told with the states of the next second."""
         self._plc = time.monotonic(), reading
 
@@ -99,7 +99,7 @@ class StateFeed:
                     expire_claims(self._store, WHO, self._settings.store.claim_s, is_crane)
 
 
-def aged(state: PlantState, read_s: float, life_counter: int) -> PlantState:
+def with_age(state: PlantState, read_s: float, life_counter: int) -> PlantState:
     """Form the state that a link tells, with its own life counter; not valid where it was read long ago."""
     age_s = time.monotonic() - read_s
     if age_s > MAX_AGE_S:

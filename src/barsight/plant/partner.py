@@ -15,24 +15,29 @@ _MAGNET_ON, _WEIGHED, _SLACK, _REACHED = 1, 2, 4, 8
 
 
 class PlcPartner:
-    """A PLC that exchanges telegrams. answer: fields that go out with the next one."""
+    """A PLC that exchanges telegrams."""
 
     def __init__(self, name: str, steps: LiftSteps, silent_s: float) -> None:
         self.name, self._steps, self._silent_s = name, steps, silent_s
-        self.answer: dict[str, int] = {}
+        self._answer: dict[str, int] = {}
         self._life: int | None = None
         self._alive_s = time.monotonic()
         self._number: int | None = None
+
+    @property
+    def answer(self) -> dict[str, int]:
+        """Form the fields of the next telegram that answer the PLC: its life counter and its last command."""
+        return {"life_echo": self._life or 0, **self._answer}
 
     @property
     def quiet_s(self) -> float:
         """Tell how long the PLC's life counter has stood still, or didn't come."""
         return time.monotonic() - self._alive_s
 
-    def hears(self, found: dict[str, int], *, is_busy: bool = False) -> bool:
-        """Take a telegram; tell whether it brings a new command, which `obey` is to be called for.
+    def receive(self, found: dict[str, int], *, is_busy: bool = False) -> bool:
+        """Take a telegram; tell whether it brings a new command, which `execute` is to be called for.
 
-        is_busy: whether `obey` still runs; then a command is left to the telegrams that follow.
+        is_busy: whether `execute` still runs; then a command is left to the telegrams that follow.
         """
         if found["life"] != self._life:
             self._life, self._alive_s = found["life"], time.monotonic()
@@ -59,7 +64,7 @@ class PlcPartner:
         reason = "partner-silent: the PLC's life counter stands still"
         return replace(state, is_valid=False, reasons=(*state.reasons, reason))
 
-    def obey(self, found: dict[str, int]) -> None:
+    def execute(self, found: dict[str, int]) -> None:
         """Take a command to the store; `answer` holds what came of it.
 
         Where the store can't be reached there is none: the command is taken again with the next telegram.
@@ -69,7 +74,7 @@ class PlcPartner:
         except BarsightError:
             self._number = None
             return
-        self.answer = {"answer_number": found["command_number"], "answer": answer, "token": token}
+        self._answer = {"answer_number": found["command_number"], "answer": answer, "token": token}
 
     def _step(self, found: dict[str, int]) -> tuple[int, int]:
         lift = (found["lift_id"], found["checksum"])

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 from barsight.core.errors import Failed
 from barsight.plant.crane_names import plc_name
-from barsight.plant.feed import TellsState
+from barsight.plant.feed import StateReader
 from barsight.plant.partner import PlcPartner
 from barsight.plant.settings import TelegramSettings
 from barsight.plant.steps import LiftSteps
@@ -26,7 +26,7 @@ MAX_QUIET_S = 10.0
 class TelegramServer:
     """Serve the newest state while `run` runs. refused: telegrams that couldn't be one."""
 
-    def __init__(self, feed: TellsState, steps: LiftSteps, settings: TelegramSettings) -> None:
+    def __init__(self, feed: StateReader, steps: LiftSteps, settings: TelegramSettings) -> None:
         self._feed, self._steps, self._settings = feed, steps, settings
         self._counter = self._partners = 0
         self.refused = 0
@@ -86,9 +86,9 @@ class TelegramServer:
                 if isinstance(found, Failed):
                     self.refused += 1
                     return
-                self._feed.hear(partner.reading(found))
-                if partner.hears(found, is_busy=step is not None and not step.done()):
-                    step = asyncio.create_task(asyncio.to_thread(partner.obey, found))
+                self._feed.take_reading(partner.reading(found))
+                if partner.receive(found, is_busy=step is not None and not step.done()):
+                    step = asyncio.create_task(asyncio.to_thread(partner.execute, found))
                     step.add_done_callback(self._refresh)
 
     def _refresh(self, _: asyncio.Task[None]) -> None:

@@ -13,6 +13,7 @@ FUNCTION_BLOCK "BarsightJudge"
 VERSION : 0.1
    VAR_INPUT
       silent : Time := T#300ms;   // Barsight's life counter may stand for so long
+      maxBehind : DInt := 3;   // Telegrams that the echo of the PLC's own life counter may be behind
    END_VAR
    VAR_OUTPUT
       isValid : Bool;   // Only then may a lift be claimed, or begun after `executing` was answered with 1
@@ -20,13 +21,36 @@ VERSION : 0.1
    VAR
       life : UInt;
       hasLife : Bool;
+      behind : DInt;
+      sinceResumed : DInt;
+      calledAt : Time;
+      resumedLife : UInt;
+      isResuming : Bool := TRUE;
       timer : TON_TIME;
    END_VAR
 BEGIN
    #timer(IN := #hasLife AND ("BarsightOutDB".telegram."life" = #life), PT := #silent);
    #life := "BarsightOutDB".telegram."life";
+   // After a pause of this program what waits is old: the echo of a life sent since then ends it.
+   IF TIME_TCK() - #calledAt > #silent OR NOT #hasLife THEN
+      #resumedLife := "BarsightInDB".telegram."life";
+      #isResuming := TRUE;
+   END_IF;
+   #calledAt := TIME_TCK();
+   #sinceResumed := UINT_TO_DINT("BarsightOutDB".telegram."life_echo") - UINT_TO_DINT(#resumedLife);
+   IF #sinceResumed < 0 THEN
+      #sinceResumed := #sinceResumed + 65536;
+   END_IF;
+   IF #sinceResumed >= 1 AND #sinceResumed < 32768 THEN
+      #isResuming := FALSE;
+   END_IF;
+   #behind := UINT_TO_DINT("BarsightInDB".telegram."life")
+      - UINT_TO_DINT("BarsightOutDB".telegram."life_echo");
+   IF #behind < 0 THEN
+      #behind := #behind + 65536;
+   END_IF;
    #hasLife := TRUE;
-   #isValid := NOT #timer.Q
+   #isValid := NOT #timer.Q AND NOT #isResuming AND (#behind <= #maxBehind)
       AND ("BarsightOutDB".telegram."magic" = {magic})
       AND ("BarsightOutDB".telegram."version" = {version})
       AND (("BarsightOutDB".telegram."status" AND 1) = 1);

@@ -1,1 +1,1 @@
-"""Floor 2: recordings of any format behind one Protocol; frames stream, nothing loads a whole recording."""
+"""Read recordings of any format behind one Protocol; frames stream, nothing loads a whole recording."""

@@ -11,9 +11,12 @@ from barsight.core.files import lies_within
 from barsight.core.reading.bounded_reading import open_regular, read_bytes
 from barsight.recording.image_decoding import MAX_PICTURE_BYTES, TornImageError
 
+MAX_NAME_BYTES = 1000
+"""Of a file below the recording; a system takes 4096 with all folders above."""
+
 
 def expect_inner_name(name: str, path: Path, where: str) -> None:
-    """Raise InputError about `path` for a name that is absolute, climbs out of its folder or is none.
+    """Raise InputError about `path` for a name that is absolute, climbs out of its folder, too long or none.
 
     where: the place in the file, like `line 3`.
     """
@@ -22,11 +25,22 @@ def expect_inner_name(name: str, path: Path, where: str) -> None:
         raise InputError(
             path, f"{where}: {name[:80]!r} leads out of the recording", "name files by their name alone"
         )
+    if len(name.encode()) > MAX_NAME_BYTES or any(len(part.encode()) > 255 for part in parts.parts):
+        raise InputError(path, f"{where}: {name[:80]!r} is too long for a file's name", "mend the line")
 
 
 def leads_outside(path: Path, root: Path) -> bool:
     """Check whether a file lies outside the recording `root`, by a symbolic link in its way."""
     return not lies_within(path, root)
+
+
+def expect_own_files(root: Path, names: Iterable[str]) -> None:
+    """Raise InputError for the first of a recording's files that lies outside it."""
+    for name in names:
+        if leads_outside(root / name, root):
+            raise InputError(
+                root / name, "is a link out of the recording", "copy the file into the recording"
+            )
 
 
 def read_picture(path: Path, root: Path) -> bytes:

@@ -1,1 +1,1 @@
-"""Floor 2: rigid motions between matched points."""
+"""Register maps and passes by matched points: rigid motions, ties, the yard frame."""

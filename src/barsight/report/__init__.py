@@ -1,1 +1,1 @@
-"""Floor 7: result files, and the page that shows them."""
+"""Write result files, and the page that shows them."""

@@ -61,13 +61,13 @@ def _over_time(path: CameraPath, reference: str, note: str) -> Plot:
     traces: list[Trace] = []
     layout: dict[str, Any] = {"xaxis": {"title": {"text": "time / s"}, "anchor": f"y{len(rows)}"}}
     share = 1 / len(rows)
-    for row, (title, values, least) in enumerate(rows):
+    for row, (title, values, min_span) in enumerate(rows):
         axis = "y" if row == 0 else f"y{row + 1}"
         top = 1 - row * share
         layout["yaxis" if row == 0 else f"yaxis{row + 1}"] = {
             "title": {"text": title},
             "domain": [top - share * 0.84, top],
-            "range": _range(values, least),
+            "range": _range(values, min_span),
         }
         for column in range(values.shape[1]):
             single = values.shape[1] == 1
@@ -118,8 +118,8 @@ def _mark(name: str, x: float, y: float, colour: str) -> Trace:
     }
 
 
-def _range(values: Float64, least: float) -> list[float]:
+def _range(values: Float64, min_span: float) -> list[float]:
     """Choose a range that holds all values and doesn't blow noise up to the panel's height."""
     low, high = float(values.min()), float(values.max())
-    half = max((high - low) * 0.55, least / 2)
+    half = max((high - low) * 0.55, min_span / 2)
     return [(low + high) / 2 - half, (low + high) / 2 + half]

@@ -69,12 +69,12 @@ def json_numbers(values: Float64, decimals: int) -> list[float | None]:
     return [float(v) if np.isfinite(v) else None for v in np.round(values, decimals)]
 
 
-def keep_extremes(values: Float64, most: int) -> Int64:
-    """Thin to at most `most` samples that draw the same line: the lowest and the highest of each bin."""
+def keep_extremes(values: Float64, max_count: int) -> Int64:
+    """Thin to at most `max_count` samples that draw the same line: the lowest and the highest of each bin."""
     count = values.size
-    if count <= most:
+    if count <= max_count:
         return np.arange(count)
-    bins = most // 2
+    bins = max_count // 2
     edges = np.linspace(0, count, bins + 1).astype(np.int64)
     width = int(np.diff(edges).max())
     index = edges[:-1, None] + np.arange(width)

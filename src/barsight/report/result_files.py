@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import asdict, fields
 from datetime import UTC, datetime
@@ -59,16 +58,20 @@ def write_surface(
         write_passes(surface, history, folder / "passes.tif")
 
 
-def write_results(measurement: Measurement, identity: MapIdentity, folder: Path) -> None:
-    """Write all other files that a measurement fills but result.json, into an existing folder."""
+def write_tables(measurement: Measurement, folder: Path) -> None:
+    """Write trajectory, contours and the laser's profiles into an existing folder."""
     write_trajectory(measurement.trajectory, folder / "trajectory.tum")
     write_contours(measurement.contours, folder / "contour.csv")
+    if measurement.laser:
+        write_laser_csv(measurement.laser, folder / "laser.csv")
+
+
+def write_results(measurement: Measurement, identity: MapIdentity, folder: Path) -> None:
+    """Write all other files that a measurement fills but result.json, into an existing folder."""
     reference = measurement.trajectory.reference
     path = folder / "bundles.json"
     digest = write_bundles(measurement.bundles, measurement.stock, reference, identity, path)
     write_lifts(measurement.lifts, reference, identity, digest, folder / "lifts.json")
-    if measurement.laser:
-        write_laser_csv(measurement.laser, folder / "laser.csv")
     if measurement.preview is not None:
         write_preview(measurement.preview, folder / "preview.png")
 
@@ -241,12 +244,6 @@ def write_preview(preview: Preview, target: Path) -> None:
     encoded = cv2.imencode(".png", small)[1]
     with atomic_path(target) as path:
         path.write_bytes(encoded.tobytes())
-
-
-def write_summary(content: dict[str, Any], target: Path) -> None:
-    """Write result.json from what `summary` says."""
-    with atomic_path(target) as path:
-        path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def summary(measurement: Measurement) -> dict[str, Any]:

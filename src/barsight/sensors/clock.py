@@ -36,7 +36,7 @@ class DeviceClock:
         self._begin()
 
     def _begin(self) -> None:
-        self._least: deque[tuple[int, int]] = deque(maxlen=BUCKETS)
+        self._minima: deque[tuple[int, int]] = deque(maxlen=BUCKETS)
         self._delays: deque[int] = deque(maxlen=RECENT)
         self._origin: tuple[int, int] | None = None
         self._count, self._late, self._bucket = 0, 0, -1
@@ -57,14 +57,14 @@ class DeviceClock:
         since, apart = device_ns - self._origin[0], arrival_ns - device_ns - self._origin[1]
         self._count += 1
         bucket = since // BUCKET_NS
-        if bucket != self._bucket or not self._least:
+        if bucket != self._bucket or not self._minima:
             self._bucket = bucket
-            self._least.append((since, apart))
-        elif apart >= self._least[-1][1]:
+            self._minima.append((since, apart))
+        elif apart >= self._minima[-1][1]:
             self._delays.append(arrival_ns - self.host_ns(device_ns))
             return self.is_settled
         else:
-            self._least[-1] = since, apart
+            self._minima[-1] = since, apart
         self._fit()
         self._delays.append(arrival_ns - self.host_ns(device_ns))
         return self.is_settled
@@ -72,7 +72,7 @@ class DeviceClock:
     @property
     def is_settled(self) -> bool:
         """Check whether enough stamps came since the beginning or the last jump."""
-        if self._origin is None or not self._least:
+        if self._origin is None or not self._minima:
             return False
         return self._count >= SETTLE_COUNT and self._bucket * BUCKET_NS >= SETTLE_NS
 
@@ -94,7 +94,7 @@ class DeviceClock:
 
     def _fit(self) -> None:
         """Lay the line under the least delays."""
-        points = list(self._least)
+        points = list(self._minima)
         if points[-1][0] - points[0][0] < DRIFT_AFTER_NS:
             self._drift, self._offset_ns = 0.0, float(min(apart for _, apart in points))
             return

@@ -121,7 +121,7 @@ class RigPlan:
         """Return each figure: name, value, formula."""
         wish, f, near = self.wish, self.focal_px, self.wish.near_m
         far_mm, near_mm = (1e3 * depth_sigma_m(z, f, self.baseline_m) for z in (wish.range_m, near))
-        most_px, least_px = (f * self.baseline_m / z for z in (near, wish.range_m))
+        max_px, min_px = (f * self.baseline_m / z for z in (near, wish.range_m))
         overlap = 100 * (1 - wish.speed_mps / self.rate_hz / self.common_m)
         blur = f"{MAX_BLUR_PX:g} px / (f (v / z + {TURN_RADPS:g} rad/s))"
         floor = f"Z / f, bar / {MIN_BAR_PX:g} at most"
@@ -131,7 +131,7 @@ class RigPlan:
             ("pixel on the floor", f"{1e3 * wish.range_m / f:.1f} mm", floor),
             ("lanes", f"{self.passes}, {self.lane_m:.1f} m each", "H z / f, with 10 % in common"),
             ("baseline", f"{self.baseline_m:.2f} m", "B = Z^2 sigma_d / (f sigma_Z)"),
-            ("disparities", f"{least_px:.0f} to {most_px:.0f} px", "f B / Z"),
+            ("disparities", f"{min_px:.0f} to {max_px:.0f} px", "f B / Z"),
             ("sigma of a depth", f"{far_mm:.1f} mm on the floor, {near_mm:.1f} mm on top", match),
             ("exposure", f"{self.exposure_us:.0f} us at most", blur),
             ("aperture", f"f/{self.f_number:g} or more", "f^2 (Z - z) / (2 Z z pixel), sharp from z to Z"),
@@ -178,8 +178,8 @@ def plan_rig(wish: Wish, camera: CatalogueCamera) -> RigPlan:
     """
     for passes in range(1, MAX_PASSES + 1):
         lane_m = wish.width_m / passes * (1 + LANE_OVERLAP_RATIO * (passes > 1))
-        most_px = camera.height_px * wish.near_m / lane_m
-        fitting = [mm for mm in LENSES_MM if 1e3 * mm / camera.pixel_um <= most_px]
+        max_px = camera.height_px * wish.near_m / lane_m
+        fitting = [mm for mm in LENSES_MM if 1e3 * mm / camera.pixel_um <= max_px]
         if fitting and wish.range_m * MIN_BAR_PX <= 1e3 * fitting[-1] / camera.pixel_um * wish.bar_m:
             return _with_baseline(wish, camera, fitting[-1], passes)
     raise MeasurementError(
@@ -192,11 +192,11 @@ def _with_baseline(wish: Wish, camera: CatalogueCamera, focal_mm: float, passes:
     """Choose baseline, exposure, aperture and rate for a lens."""
     f, near = 1e3 * focal_mm / camera.pixel_um, wish.near_m
     baseline_m = math.ceil(20 * depth_sigma_m(wish.range_m, f, 1.0) / wish.sigma_m - 1e-9) / 20
-    most_m = MAX_DISPARITY_RATIO * camera.width_px * near / f
-    if baseline_m > most_m:
+    max_m = MAX_DISPARITY_RATIO * camera.width_px * near / f
+    if baseline_m > max_m:
         raise MeasurementError(
             f"a sigma of {1e3 * wish.sigma_m:g} mm needs a baseline of {baseline_m:.2f} m, the common view "
-            f"allows {most_m:.2f} m; allow {1e3 * depth_sigma_m(wish.range_m, f, most_m):.1f} mm, take a "
+            f"allows {max_m:.2f} m; allow {1e3 * depth_sigma_m(wish.range_m, f, max_m):.1f} mm, take a "
             "camera of more pixels or hang it lower"
         )
     exposure_us = 1e6 * MAX_BLUR_PX / (f * (wish.speed_mps / near + TURN_RADPS))

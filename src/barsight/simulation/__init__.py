@@ -1,1 +1,1 @@
-"""Floor 6: rendered recordings with exact truth."""
+"""Render recordings with exact truth."""

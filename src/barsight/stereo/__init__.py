@@ -1,1 +1,1 @@
-"""Floor 2: stereo methods behind one Protocol, their noise, triangulation and files."""
+"""Match pairs by methods behind one Protocol: noise, triangulation and files."""

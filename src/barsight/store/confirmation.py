@@ -19,7 +19,7 @@ from barsight.core.extras import extra
 from barsight.store.audit import Entry, entry
 from barsight.store.opening import Store
 from barsight.store.promotion import counts
-from barsight.store.states import has_alarm, lift_state, raise_alarm, step_lift
+from barsight.store.states import has_alarm, last_raised_ns, lift_state, raise_alarm, step_lift
 from barsight.store.tables import LIFT_BUNDLES, LIFT_STATES, LIFTS, SIGHTINGS, SURVEY_VETOES, SURVEYS
 from barsight.yard.events import corners, gap_between
 from barsight.yard.inventory.bundle_file import bundle_of
@@ -175,10 +175,7 @@ def note_unrecorded(store: Store, lift_id: int, who: str) -> str:
         )
         if not has_alarm(opened.connection, "lift-unrecorded", told):
             raise_alarm(opened, "lift-unrecorded", told)
-            for other in open_lifts(opened.connection):
-                if other.state != "executing":
-                    reason = f"disturbed: lift {lift_id} was executed and isn't recorded"
-                    step_lift(opened, other.lift_id, "expired", reason)
+            _end_offers(opened, f"disturbed: lift {lift_id} was executed and isn't recorded")
     return state
 
 
@@ -201,7 +198,12 @@ def end_lift(store: Store, lift_id: int, state: str, who: str, note: str) -> Non
 
 
 def end_disturbed(opened: Entry, since_ns: int) -> None:
-    """End offers beside lifts that moved something after `since_ns`, as a map that is being added saw it."""
+    """End offers beside lifts that moved something after `since_ns`, as a map that is being added saw it; all
+    of them after a lift that isn't recorded, as nobody knows its place.
+    """
+    unrecorded_ns = last_raised_ns(opened.connection, "lift-unrecorded")
+    if unrecorded_ns is not None and unrecorded_ns >= since_ns:
+        _end_offers(opened, "disturbed: a lift that isn't recorded was executed after this map was begun")
     moving = select(LIFT_STATES.c.lift_id).where(
         LIFT_STATES.c.state.in_(("executing", "executed")), LIFT_STATES.c.at_ns >= since_ns
     )
@@ -212,6 +214,12 @@ def end_disturbed(opened: Entry, since_ns: int) -> None:
     query = _lift_query(LIFTS.c.id.in_(moving) | LIFTS.c.id.in_(failed))
     for lift in _lifts(opened.connection, query):
         _end_beside(opened, lift)
+
+
+def _end_offers(opened: Entry, reason: str) -> None:
+    for lift in open_lifts(opened.connection):
+        if lift.state != "executing":
+            step_lift(opened, lift.lift_id, "expired", reason)
 
 
 def _end_beside(opened: Entry, lift: OpenLift) -> None:
@@ -239,9 +247,7 @@ def forbid(store: Store, code: str, reason: str, who: str) -> None:
         if newest is None:
             raise ConfigError("there is no survey to forbid lifts of")
         opened.add(SURVEY_VETOES, survey_id=newest.id, code=code, reason=reason)
-        for lift in open_lifts(opened.connection):
-            if lift.state != "executing":
-                step_lift(opened, lift.lift_id, "expired", f"{code}: {reason}")
+        _end_offers(opened, f"{code}: {reason}")
 
 
 def expire_stale(store: Store, who: str) -> int:

@@ -48,6 +48,17 @@ def has_alarm(connection: Connection, code: str, reason: str) -> bool:
     return connection.execute(query).first() is not None
 
 
+def last_raised_ns(connection: Connection, code: str) -> int | None:
+    """Tell when an alarm with this code was raised last, whatever came of it; None where none ever was."""
+    query = (
+        select(func.max(ALARM_STATES.c.at_ns))
+        .join(ALARMS, ALARMS.c.id == ALARM_STATES.c.alarm_id)
+        .where(ALARMS.c.code == code, ALARM_STATES.c.state == "raised")
+    )
+    found: int | None = connection.execute(query).scalar_one()
+    return found
+
+
 def step_alarm(opened: Entry, alarm_id: int, state: str, note: str | None = None) -> None:
     """Acknowledge or clear an alarm. Raises InputError where that may not follow the state that it is in."""
     _step(opened, ALARM_STATES, "alarm", alarm_id, ALARM_STEPS, state, note)

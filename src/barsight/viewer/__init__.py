@@ -1,1 +1,1 @@
-"""Floor 7: the measured yard in 3D, in the browser, offline."""
+"""Show the measured yard in 3D, in the browser, offline."""

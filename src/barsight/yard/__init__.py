@@ -1,1 +1,1 @@
-"""Floor 5: bars and bundles found in the map, lift targets, stability, and reasons not to lift."""
+"""Find bars and bundles in the map, choose lift targets, judge stability, and say why not to lift."""

@@ -76,7 +76,7 @@ class HeightMap:
         """Return a picture of the heights for a notebook."""
         from barsight.yard.map_picture import picture_html
 
-        return picture_html(self)
+        return picture_html(self.x_m, self.y_m, self.z_m)
 
     def part(self, rows: slice, columns: slice) -> HeightMap:
         """Cut a rectangle of the map, by cells from start to stop; the arrays are shared."""
@@ -200,6 +200,11 @@ class Bundle:
     def is_free(self) -> bool:
         """Check that nothing at all lies on it, for sure."""
         return self.on_top is True and not self.cover_doubts
+
+    @property
+    def bottom_z_m(self) -> float:
+        """Return the underside's height: a hexagon is as deep below its axis as it rises above it."""
+        return float(2 * self.centre_m[2] - self.top_z_m)
 
     @property
     def direction(self) -> Float64:

@@ -47,6 +47,11 @@ VETOES = {
 """Code to what it means; a test trips each."""
 
 
+def _expect_veto(code: str) -> None:
+    if code not in VETOES:
+        raise ValueError(f"{code!r} is no veto")
+
+
 @dataclass(frozen=True)
 class Veto:
     """Reason not to lift: a code of `VETOES` and a sentence with the figures."""
@@ -55,8 +60,7 @@ class Veto:
     reason: str
 
     def __post_init__(self) -> None:
-        if self.code not in VETOES:
-            raise ValueError(f"{self.code!r} is no veto")
+        _expect_veto(self.code)
 
 
 @dataclass(frozen=True)
@@ -78,8 +82,7 @@ class Check:
     reason: str
 
     def __post_init__(self) -> None:
-        if self.code not in VETOES:
-            raise ValueError(f"{self.code!r} is no veto")
+        _expect_veto(self.code)
 
 
 def vetoes_of(checks: Iterable[Check]) -> tuple[Veto, ...]:
@@ -92,7 +95,7 @@ def check_max(
     sigmas: float = 1.0,
 ) -> Check:  # fmt: skip
     """Check that a value and `sigmas` times its sigma above it are within an upper bound."""
-    return _checked(code, what, value, bound, unit, reason, sigma, sigmas, value, bound)
+    return _checked(code, what, value, bound, unit, reason, sigma, sigmas, 1)
 
 
 def check_min(
@@ -100,7 +103,7 @@ def check_min(
     sigmas: float = 1.0,
 ) -> Check:  # fmt: skip
     """Check that a value and `sigmas` times its sigma below it are within a lower bound."""
-    return _checked(code, what, value, bound, unit, reason, sigma, sigmas, -value, -bound)
+    return _checked(code, what, value, bound, unit, reason, sigma, sigmas, -1)
 
 
 def check_true(code: str, what: str, holds: bool | None, reason: str) -> Check:
@@ -112,19 +115,19 @@ def check_true(code: str, what: str, holds: bool | None, reason: str) -> Check:
 
 def _checked(
     code: str, what: str, value: float, bound: float, unit: str, reason: str, sigma: float, sigmas: float,
-    figure: float, most: float,
+    sign: int,
 ) -> Check:  # fmt: skip
-    """Judge `figure`, which may not be over `most`; a NaN is unknown."""
+    """Judge a value, which may not be over its bound, with the sign -1 not under it; a NaN is unknown."""
     found, spread, limit = (float(x) if math.isfinite(x) else None for x in (value, sigma, bound))
 
     def check(result: Literal["passed", "failed", "unknown"], said: str) -> Check:
         return Check(code, what, found, spread, limit, unit, result, said)
 
-    if math.isnan(figure) or math.isnan(most) or math.isnan(sigma):
+    if math.isnan(value) or math.isnan(bound) or math.isnan(sigma):
         return check("unknown", reason)
-    if figure + sigmas * sigma <= most:
+    if sign * value + sigmas * sigma <= sign * bound:
         return check("passed", "")
-    if figure <= most:
+    if sign * value <= sign * bound:
         of = f"{1.96 * sigma:.3g} {unit}".rstrip()
         reason = f"{reason}, but the figure is known to ±{of} (95 %) only"
     return check("failed", reason)

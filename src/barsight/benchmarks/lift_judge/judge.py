@@ -138,13 +138,13 @@ class Judge:
             heavy = OTHER_STEEL_N if bundle == NOTHING else PULLED_ALONG * self._weight(bundle)
             name = "pull on other steel" if bundle == NOTHING else f"pull on bundle {bundle}"
             checks.add(f"{name}, N", most, heavy, -1.0)
-        checks.least("pull over weight", min(s.pull.sum() for s in stands) / weight, magnet.factor)
+        checks.bound_below("pull over weight", min(s.pull.sum() for s in stands) / weight, magnet.factor)
         worst = min(_pole_margin(s.pull, magnet.poles[:, 0], weight, float(centre[1])) for s in stands)
-        checks.least("a pole's pull over its share", worst, 1.0)
+        checks.bound_below("a pole's pull over its share", worst, 1.0)
         slope = max(abs(math.atan(s.rest.pitch)) for s in stands)
-        checks.most("slope along the beam, deg", math.degrees(slope), math.degrees(magnet.pitch_rad))
+        checks.bound_above("slope along the beam, deg", math.degrees(slope), math.degrees(magnet.pitch_rad))
         gap = 1e3 * max(float(s.gaps.max()) for s in stands)
-        checks.most("a pole's least gap, mm", gap, 1e3 * magnet.gap_m)
+        checks.bound_above("a pole's least gap, mm", gap, 1e3 * magnet.gap_m)
         share = min(s.contact_share for s in stands)
         checks.add("share on the load", -share, -LESS * magnet.contact_share, -MORE * magnet.contact_share)
 
@@ -153,13 +153,13 @@ class Judge:
     ) -> None:
         magnet = self._magnet
         checks.add("load over what may be carried", mass_kg / magnet.carries_kg, 1.0, FULL)
-        checks.most("centre off along, mm", 1e3 * abs(centre[1]), 1e3 * magnet.offset_along_m)
-        checks.most("centre off across, mm", 1e3 * abs(centre[0]), 1e3 * magnet.offset_across_m)
+        checks.bound_above("centre off along, mm", 1e3 * abs(centre[1]), 1e3 * magnet.offset_along_m)
+        checks.bound_above("centre off across, mm", 1e3 * abs(centre[0]), 1e3 * magnet.offset_across_m)
         ends = [
             abs(bar.centre[1] + s * bar.half[0] * bar.axes[0, 1])
             for b in load for bar in yard.bars(b) for s in (-1, 1)
         ]  # fmt: skip
-        checks.most("overhang, mm", 1e3 * (max(ends) - magnet.half_span_m), 1e3 * magnet.overhang_m)
+        checks.bound_above("overhang, mm", 1e3 * (max(ends) - magnet.half_span_m), 1e3 * magnet.overhang_m)
         cover = 1e3 * max(self._covered(b, load) for b in load)
         checks.add("covered over a width of, mm", cover, *(1e3 * b for b in COVER_M))
 
@@ -189,11 +189,11 @@ class _Checks:
         elif not value <= fine_to:
             self.unclear.append(f"{text} (fine to {abs(fine_to):.3g})")
 
-    def most(self, name: str, value: float, limit: float) -> None:
+    def bound_above(self, name: str, value: float, limit: float) -> None:
         """Hold a figure against a limit of the magnet's, by a quarter to either side."""
         self.add(name, value, MORE * limit, LESS * limit)
 
-    def least(self, name: str, value: float, limit: float) -> None:
+    def bound_below(self, name: str, value: float, limit: float) -> None:
         """Hold a figure of which more is better: dangerous below the limit, fine from a quarter over it."""
         self.add(name, -value, -limit, -MORE * limit)
         self.figures[name] = float(value)

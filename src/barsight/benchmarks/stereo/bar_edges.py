@@ -146,9 +146,9 @@ def _distance(
     shift = disparity.disparity_px[rows, columns][inner] + camera.doffs_px
     sigma = disparity.sigma_px[rows, columns][inner] / shift
     # z |r_perp| = D (cos - sqrt(sine^2 - sin^2)), with the angle between the ray and the axis's direction.
-    nearness = np.sqrt(1 - aside[inner] ** 2) - np.sqrt(sine**2 - aside[inner] ** 2)
-    # In disparities: shift = f b |r_perp| / (D nearness), so that 1 / D is linear in what was measured.
-    inverse = shift * nearness / (camera.focal_px * camera.baseline_m * length[inner])
+    depth_ratio = np.sqrt(1 - aside[inner] ** 2) - np.sqrt(sine**2 - aside[inner] ** 2)
+    # In disparities: shift = f b |r_perp| / (D depth_ratio), so that 1 / D is linear in what was measured.
+    inverse = shift * depth_ratio / (camera.focal_px * camera.baseline_m * length[inner])
     weight = 1 / sigma**2
     found = float(np.median(inverse))
     for _ in range(20):

@@ -7,7 +7,7 @@ import json
 import shutil
 import tomllib
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -15,8 +15,7 @@ from typing import Any
 import barsight
 from barsight.benchmarks.yard.world_scores import WorldScore, score_world
 from barsight.core.errors import BarsightError, ConfigError, OutputError
-from barsight.core.files import atomic_path
-from barsight.core.json_values import json_digest, json_value
+from barsight.core.json_values import json_digest, json_value, write_json
 from barsight.simulation.settings import SimulationSettings
 from barsight.simulation.worlds.recording import GENERATOR, draw_world, simulate_world
 
@@ -44,20 +43,22 @@ class WorldKeys:
         """Compute them from the settings and the package's sources."""
         root = Path(barsight.__file__).parent
         measuring = [path.name for path in root.iterdir() if path.name not in (*MEASURES_NOT, "__pycache__")]
-        drawn = json_digest([GENERATOR, json_value(asdict(given)), _sources(root, DRAWS)])
+        drawn = json_digest([GENERATOR, json_value(given), _sources(root, DRAWS)])
         measured = json_digest([drawn, _sources(root, measuring)])
         return cls(drawn, measured, json_digest([measured, _sources(root, SCORES)]))
 
 
 def run_world(
-    folder: Path, seed: int, given: SimulationSettings, keys: WorldKeys, measure: Measure, looked_at: str
+    keep: Path, seed: int, given: SimulationSettings, keys: WorldKeys, measure: Measure, looked_at: str
 ) -> WorldScore:
-    """Score one world in `folder`, with what is kept there of it: recording, measured folder, scores.
+    """Score one world in its own folder of `keep`, by the recording, result and scores kept there.
 
     measure: measures a recording into a folder. looked_at: why the seed counts as looked at from now on;
     empty where it does not. What the product refuses to measure is a score too. Raises OutputError for a
     folder that is not of this bench.
     """
+    folder = keep / f"seed_{seed}"
+    folder.mkdir(parents=True, exist_ok=True)
     note = _read_note(folder)
     recording, out = folder / "recording", folder / "measured"
     note["looked_at"] = looked_at or note.get("looked_at", "") or looked_at_list().get(seed, "")
@@ -78,7 +79,7 @@ def run_world(
     done = None if note["refused"] else out
     if note.get("score") != keys.score:
         score = score_world(recording, done, note["looked_at"], note["refused"])
-        note |= {"score": keys.score, "scores": json_value(asdict(score))}
+        note |= {"score": keys.score, "scores": json_value(score)}
     note["scores"]["looked_at"] = note["looked_at"]
     _write_note(folder, note)
     return _score(note["scores"])
@@ -95,25 +96,6 @@ def looked_at_list() -> dict[int, str]:
     }
 
 
-def run_worlds(
-    keep: Path,
-    seeds: Iterable[int],
-    given: SimulationSettings,
-    measure: Measure,
-    looked_at: str,
-    progress: Callable[[WorldScore], None],
-) -> tuple[WorldScore, ...]:
-    """Score the worlds of the seeds, each in its own folder of `keep`; progress: called after each."""
-    keys = WorldKeys.of(given)
-    scores = []
-    for seed in seeds:
-        folder = keep / f"seed_{seed}"
-        folder.mkdir(parents=True, exist_ok=True)
-        scores.append(run_world(folder, seed, given, keys, measure, looked_at))
-        progress(scores[-1])
-    return tuple(scores)
-
-
 def _read_note(folder: Path) -> dict[str, Any]:
     path = folder / NOTE
     if not path.is_file():
@@ -127,8 +109,7 @@ def _read_note(folder: Path) -> dict[str, Any]:
 
 
 def _write_note(folder: Path, note: dict[str, Any]) -> None:
-    with atomic_path(folder / NOTE) as path:
-        path.write_text(json.dumps(note, indent=1) + "\n", encoding="utf-8")
+    write_json(folder / NOTE, note)
 
 
 def _remove(*folders: Path) -> None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -17,8 +15,8 @@ from barsight.acceptance.error_sources import MeasuredLoad, measured_load
 from barsight.cli.arguments import call
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError
-from barsight.core.files import atomic_path, expect_output
-from barsight.core.json_values import json_value
+from barsight.core.files import expect_output
+from barsight.core.json_values import DIGITS, write_json
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -60,11 +58,10 @@ def run(arguments: Sequence[str]) -> None:
 def _write(found: MeasuredLoad, figures: Sequence[BudgetedFigure], out: Path) -> None:
     content = {
         "bundle": found.bundle,
-        "figures": [asdict(one) for one in figures],
+        "figures": list(figures),
         "assumed": list(found.assumed),
     }
-    with atomic_path(out) as path:
-        path.write_text(json.dumps(json_value(content, 9), indent=1) + "\n", encoding="utf-8")
+    write_json(out, content, DIGITS)
 
 
 def _print(found: MeasuredLoad, figures: Sequence[BudgetedFigure]) -> None:

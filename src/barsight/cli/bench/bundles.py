@@ -11,7 +11,6 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from barsight.benchmarks.provenance import write_json
 from barsight.benchmarks.yard.bundle_detection import bench_bundles, rendered_yards
 from barsight.benchmarks.yard.bundle_scores import (
     BundleErrors,
@@ -25,6 +24,7 @@ from barsight.benchmarks.yard.bundle_scores import (
 from barsight.benchmarks.yard.yard_speed import time_yard
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError
+from barsight.core.json_values import write_json
 from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings
 from barsight.result_folder import read_heights

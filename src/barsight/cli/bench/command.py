@@ -8,7 +8,6 @@ from typing import Annotated
 
 import tyro
 
-from barsight.benchmarks.provenance import write_json
 from barsight.benchmarks.stereo.ablation import without_one_part
 from barsight.benchmarks.stereo.middlebury import bench_stereo, scene_table, stereo_table
 from barsight.benchmarks.stereo.speed import bench_speed, speed_table
@@ -25,6 +24,7 @@ from barsight.cli.bench.worlds import bench_worlds
 from barsight.cli.bench.yard import bench_yard
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError
+from barsight.core.json_values import write_json
 from barsight.stereo.direct.pipeline import BarsightSettings
 from barsight.stereo.method import StereoMethod
 from barsight.stereo.settings import METHODS, MethodName, StereoSettings, make_method

@@ -13,10 +13,11 @@ import tyro
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from barsight.benchmarks.provenance import Provenance, provenance, write_json
+from barsight.benchmarks.provenance import Provenance, provenance
 from barsight.benchmarks.yard.repeated_recording import repeat
 from barsight.cli.bench.yard import measure_apart
 from barsight.cli.safe_console import SafeConsole
+from barsight.core.json_values import write_json
 
 
 @dataclass(frozen=True)

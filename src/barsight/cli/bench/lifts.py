@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
 from barsight.benchmarks.lift_judge.magnet import read_magnet
-from barsight.benchmarks.provenance import write_json
 from barsight.benchmarks.yard.drawn_worlds import MappedWorld, measured_world, noisy_world, render_world
 from barsight.benchmarks.yard.judged_lifts import (
     JudgedBench,
@@ -18,10 +18,11 @@ from barsight.benchmarks.yard.judged_lifts import (
     dangerous_table,
     judge_yard,
 )
-from barsight.cli.bench.seeds import parse_seeds
+from barsight.cli.bench.seeds import over_seeds, parse_seeds
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError
+from barsight.core.json_values import write_json
 from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings
 from barsight.simulation.worlds.yards import DrawnYard, draw_yard
@@ -41,6 +42,8 @@ def bench_lift_targets(
     full_size: bool = False,
     keep: Path | None = None,
     magnet: Path | None = None,
+    workers: int = 1,
+    scheduler: str | None = None,
     save: Annotated[Path | None, tyro.conf.arg(name="json")] = None,
 ) -> None:
     """Judge offered lifts and random placements on drawn yards by exact geometry.
@@ -57,32 +60,59 @@ def bench_lift_targets(
             four times the computing.
         keep: Folder for the rendered yards; what is finished there is not done again.
         magnet: TOML file of the magnet; an example is assumed without it.
+        workers: Yards at a time, each in a process of its own.
+        scheduler: Address of a Dask scheduler, tcp://HOST:PORT, whose workers are used instead; they share
+            the folder of --keep.
         save: JSON file for all placements, with commit and machine.
     """
     numbers = parse_seeds(seeds, "bench lifts")
     if placements < 0:
         raise ConfigError(f"bench lifts: placements must be 0 or more, not {placements}")
-    described, settings = load_magnet(magnet), LiftSettings()
-    found: list[JudgedLift] = []
+    if scheduler is not None and keep is None:
+        raise ConfigError("bench lifts: with --scheduler the workers share a folder: name it with --keep")
+    load_magnet(magnet)
+    found: dict[int, tuple[JudgedLift, ...]] = {}
     with tempfile.TemporaryDirectory() as scratch, stages(SafeConsole(stderr=True)) as advance:
-        described_at = magnet or Path(scratch) / "magnet.toml"
-        if magnet is None:
-            described_at.write_text(example_magnet(), encoding="utf-8")
-        judged = read_magnet(described_at)
-        for done, seed in enumerate(numbers):
-            world = draw_yard(seed, 2 * judged.half_span_m + OVER_MAGNET_M, SPAN_M, min_length_ratio=1.0)
-            folder = (keep or Path(scratch)) / f"seed_{seed}"
-            mapped = (
-                _measured(world, folder, settings, full_size) if rendered else noisy_world(world, settings)
-            )
-            found += judge_yard(world, mapped, described, judged, settings, placements)
-            advance("yards", done + 1, len(numbers))
+        text = example_magnet() if magnet is None else magnet.read_text(encoding="utf-8")
+        given = _Given((keep or Path(scratch)).absolute(), text, placements, rendered, full_size)
+        for seed, judged in over_seeds(_judge_seed, numbers, given, workers, scheduler):
+            found[seed] = judged
+            advance("yards", len(found), len(numbers))
             if save is not None:
-                write_json(save, JudgedBench.of(done + 1, found))
-    bench = JudgedBench.of(len(numbers), found)
+                write_json(save, _bench(found))
+    bench = _bench(found)
     SafeConsole().print(bench_table(bench))
     if bench.dangerous:
         SafeConsole().print(dangerous_table(bench))
+
+
+@dataclass(frozen=True)
+class _Given:
+    """Settings that all seeds share. magnet: text of its TOML file."""
+
+    keep: Path
+    magnet: str
+    placements: int
+    rendered: bool
+    full_size: bool
+
+
+def _bench(found: dict[int, tuple[JudgedLift, ...]]) -> JudgedBench:
+    return JudgedBench.of(len(found), [lift for seed in sorted(found) for lift in found[seed]])
+
+
+def _judge_seed(seed: int, given: _Given) -> tuple[JudgedLift, ...]:
+    settings, folder = LiftSettings(), given.keep / f"seed_{seed}"
+    with tempfile.TemporaryDirectory() as scratch:
+        described_at = Path(scratch) / "magnet.toml"
+        described_at.write_text(given.magnet, encoding="utf-8")
+        described, judged = load_magnet(described_at), read_magnet(described_at)
+    world = draw_yard(seed, 2 * judged.half_span_m + OVER_MAGNET_M, SPAN_M, min_length_ratio=1.0)
+    if given.rendered:
+        mapped = _measured(world, folder, settings, given.full_size)
+    else:
+        mapped = noisy_world(world, settings)
+    return tuple(judge_yard(world, mapped, described, judged, settings, given.placements))
 
 
 def _measured(world: DrawnYard, folder: Path, settings: LiftSettings, full_size: bool) -> MappedWorld:

@@ -8,8 +8,8 @@ from typing import Annotated
 import tyro
 
 from barsight.benchmarks.motion.fixed_lag_speed import bench_live, live_table
-from barsight.benchmarks.provenance import write_json
 from barsight.cli.safe_console import SafeConsole
+from barsight.core.json_values import write_json
 
 
 def bench_live_estimate(

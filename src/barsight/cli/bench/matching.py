@@ -9,8 +9,8 @@ import tyro
 
 from barsight.benchmarks.motion.frontend_speed import bench_front_end, front_end_table
 from barsight.benchmarks.motion.matching import bench_features, bench_matching, feature_table, match_table
-from barsight.benchmarks.provenance import write_json
 from barsight.cli.safe_console import SafeConsole
+from barsight.core.json_values import write_json
 from barsight.features.detectors import DETECTORS, DetectorName
 
 Json = Annotated[Path | None, tyro.conf.arg(name="json")]

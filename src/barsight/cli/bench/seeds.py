@@ -1,10 +1,18 @@
-"""Parse the seeds of a benchmark."""
+"""Parse the seeds of a benchmark, and run it over them: here, or on the fleet's workers."""
 
 from __future__ import annotations
 
+import os
 import re
+from collections.abc import Callable, Iterator
+from typing import Any, TypeVar
 
-from barsight.core.errors import ConfigError
+from barsight.core.errors import ConfigError, MeasurementError
+from barsight.core.extras import extra
+
+T = TypeVar("T")
+TRIES = 3
+"""Times that a seed is given to workers before it is given up."""
 
 
 def parse_seeds(seeds: str, bench: str) -> range:
@@ -13,3 +21,36 @@ def parse_seeds(seeds: str, bench: str) -> range:
     if match is None or int(match[2]) <= int(match[1]):
         raise ConfigError(f"{bench}: seeds {seeds!r} is not like 500:560, the last not included")
     return range(int(match[1]), int(match[2]))
+
+
+def over_seeds(
+    run: Callable[[int, Any], T], seeds: range, given: Any, workers: int, scheduler: str | None
+) -> Iterator[tuple[int, T]]:
+    """Run `run(seed, given)` for each seed and yield seed and result as each ends.
+
+    workers: processes of this machine, which share its cores; 1 runs in this one. scheduler: of a Dask
+    cluster to be used instead. Raises MeasurementError for a seed whose workers die.
+    """
+    if workers < 1:
+        raise ConfigError(f"bench: workers must be 1 or more, not {workers}")
+    if workers == 1 and scheduler is None:
+        for seed in seeds:
+            yield seed, run(seed, given)
+        return
+    with extra("fleet"):
+        from barsight.fleet.cluster import connect, run_all
+    left = set(seeds)
+    with connect(workers, scheduler, threads=max(1, (os.cpu_count() or 1) // workers)) as client:
+        for _ in range(TRIES):
+            for ended in run_all(client, _one_seed, sorted(left), (run, given)):
+                if ended is not None:
+                    left.discard(ended[0])
+                    yield ended
+            if not left:
+                return
+    raise MeasurementError(f"seeds {', '.join(map(str, sorted(left)))}: their workers died {TRIES} times")
+
+
+def _one_seed(seed: int, given: tuple[Callable[[int, Any], T], Any]) -> tuple[int, T]:
+    run, shared = given
+    return seed, run(seed, shared)

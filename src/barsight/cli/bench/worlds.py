@@ -8,8 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from barsight.benchmarks.provenance import provenance, write_json
-from barsight.benchmarks.yard.world_runs import run_worlds
+from barsight.benchmarks.provenance import provenance
+from barsight.benchmarks.yard.world_runs import WorldKeys, run_world
 from barsight.benchmarks.yard.world_scores import (
     WorldBench,
     WorldScore,
@@ -17,9 +17,10 @@ from barsight.benchmarks.yard.world_scores import (
     world_rows,
     world_table,
 )
-from barsight.cli.bench.seeds import parse_seeds
+from barsight.cli.bench.seeds import over_seeds, parse_seeds
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError
+from barsight.core.json_values import write_json
 from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings
 from barsight.simulation.settings import CameraSettings, SimulationSettings
@@ -34,6 +35,8 @@ def bench_worlds(
     length_m: float = 3.5,
     frames: int = 10,
     width_px: int = 640,
+    workers: int = 1,
+    scheduler: str | None = None,
     save: Annotated[Path | None, tyro.conf.arg(name="json")] = None,
 ) -> None:
     """Draw whole worlds, render and measure them, and score map, poses and bundles against truth.
@@ -50,28 +53,41 @@ def bench_worlds(
         length_m: Length of each world, about.
         frames: Stereo pairs over that length.
         width_px: Width of the pictures; they show as much of the yard at any width.
+        workers: Worlds at a time, each in a process of its own.
+        scheduler: Address of a Dask scheduler, tcp://HOST:PORT, whose workers are used instead; they share
+            the folder of --keep.
         save: JSON file for all figures, with commit and machine.
     """
     numbers = parse_seeds(seeds, "bench worlds")
     if looked_at and keep is None:
         raise ConfigError("bench worlds: --looked-at is kept in a folder: name it with --keep")
+    if scheduler is not None and keep is None:
+        raise ConfigError("bench worlds: with --scheduler the workers share a folder: name it with --keep")
     camera = CameraSettings(
         width_px=width_px, height_px=round(ASPECT * width_px), focal_px=FOCAL_PX * width_px / WIDTH_PX
     )
     given = SimulationSettings(length_m=length_m, frames=frames, depth_views=0, camera=camera)
     console = SafeConsole()
 
-    def tell(score: WorldScore) -> None:
-        what = score.refused or f"{score.counts['found']} of {score.counts['free']} free bundles found"
-        console.print(f"seed {score.seed}, {score.kind}: {what}", highlight=False, markup=False)
-
     with tempfile.TemporaryDirectory() as scratch:
-        worlds = run_worlds(keep or Path(scratch), numbers, given, _measure, looked_at, tell)
+        folder = (keep or Path(scratch)).absolute()
+        shared = (folder, given, WorldKeys.of(given), looked_at)
+        scores: dict[int, WorldScore] = {}
+        for seed, score in over_seeds(_run, numbers, shared, workers, scheduler):
+            scores[seed] = score
+            what = score.refused or f"{score.counts['found']} of {score.counts['free']} free bundles found"
+            console.print(f"seed {seed}, {score.kind}: {what}", highlight=False, markup=False)
+    worlds = tuple(scores[seed] for seed in numbers)
     bench = WorldBench(worlds, world_rows(worlds), provenance())
     console.print(world_list(bench))
     console.print(world_table(bench))
     if save is not None:
         write_json(save, bench)
+
+
+def _run(seed: int, shared: tuple[Path, SimulationSettings, WorldKeys, str]) -> WorldScore:
+    folder, given, keys, looked_at = shared
+    return run_world(folder, seed, given, keys, _measure, looked_at)
 
 
 def _measure(recording: Path, out: Path) -> None:

@@ -10,11 +10,12 @@ from typing import Annotated, Literal, get_args
 
 import tyro
 
-from barsight.benchmarks.provenance import provenance, write_json
+from barsight.benchmarks.provenance import provenance
 from barsight.benchmarks.yard.field_test import VARIANTS, YardBench, laser_error_mm, yard_row, yard_table
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError, MeasurementError
+from barsight.core.json_values import write_json
 from barsight.recording.base import RecordingSettings
 from barsight.recording.open import open_recording
 from barsight.simulation.settings import SimulationSettings

@@ -131,17 +131,17 @@ def _noise(path: Path, noise: ImuNoise | None) -> ImuNoise:
 
 
 def _from_detections(
-    folder: Path, board: Board, most: int, gyro_unit: GyroUnit, accel_unit: AccelUnit
+    folder: Path, board: Board, max_views: int, gyro_unit: GyroUnit, accel_unit: AccelUnit
 ) -> Recorded:
     if not has_detections(folder):
         raise InputError(folder, f"lacks one of {' and '.join(NAMES)}", "detect both cameras' corners")
     views = read_detections(folder, board)
-    step = -(-len(views) // most)
+    step = -(-len(views) // max_views)
     return views[::step], read_imu_log(folder, gyro_unit, accel_unit).samples, None
 
 
 def _from_pictures(
-    path: Path, settings: RecordingSettings, board: Board, most: int,
+    path: Path, settings: RecordingSettings, board: Board, max_views: int,
     advance: Callable[[str, int, int], None],
 ) -> Recorded:  # fmt: skip
     opened = open_recording(path, settings)
@@ -149,7 +149,7 @@ def _from_pictures(
     if samples is None:
         raise InputError(path, "has no IMU", "record the IMU too; name a bag's topic with --imu-topic")
     total = len(opened.index.stamps_ns)
-    step = max(-(-total // most), 1)
+    step = max(-(-total // max_views), 1)
     chosen = (
         frame
         for number, frame in enumerate(opened.frames())

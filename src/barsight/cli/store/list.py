@@ -12,7 +12,7 @@ from rich.table import Table
 
 from barsight.cli.arguments import call
 from barsight.cli.safe_console import SafeConsole
-from barsight.cli.store.yard import bundle_table, write_json
+from barsight.cli.store.yard import bundle_table, print_json
 from barsight.store.history import SurveyRow, list_surveys, present_yard, time_text, yard_records
 from barsight.store.opening import DEFAULT_URL, open_store
 
@@ -34,7 +34,7 @@ def run(arguments: Sequence[str]) -> None:
         with open_store(url, migrate=migrate) as store, store.reading() as connection:
             surveys, present = list_surveys(connection), present_yard(connection)
         if json:
-            write_json(
+            print_json(
                 {"surveys": [asdict(each) for each in surveys], "bundles": yard_records(present, now_ns)}
             )
             return

@@ -39,14 +39,14 @@ def run(arguments: Sequence[str]) -> None:
             present = present_yard(connection, at_ns)
         now_ns = time.time_ns() if at_ns is None else at_ns
         if json:
-            write_json({"at_ns": now_ns, "bundles": yard_records(present, now_ns)})
+            print_json({"at_ns": now_ns, "bundles": yard_records(present, now_ns)})
             return
         SafeConsole().print(bundle_table(f"Yard at {time_text(now_ns)}", present, now_ns))
 
     call(command, "yard", arguments)
 
 
-def write_json(content: object) -> None:
+def print_json(content: object) -> None:
     """Print a JSON document."""
     sys.stdout.write(json.dumps(json_value(content), indent=1, allow_nan=False) + "\n")
 

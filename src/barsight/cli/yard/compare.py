@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -16,8 +15,7 @@ from rich.table import Table
 from barsight.cli.arguments import call
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import MeasurementError
-from barsight.core.files import atomic_path
-from barsight.core.json_values import json_value
+from barsight.core.json_values import write_json
 from barsight.result_folder import open_folder, read_heights
 from barsight.yard.inventory.bundle_file import read_bundles
 from barsight.yard.inventory.changes import Change, compare_yards
@@ -58,8 +56,7 @@ def run(arguments: Sequence[str]) -> None:
 
 def _write(changes: tuple[Change, ...], target: Path) -> None:
     rows = [asdict(change) | {"significant": change.significant} for change in changes]
-    with atomic_path(target) as path:
-        path.write_text(json.dumps({"changes": json_value(rows)}, indent=1, allow_nan=False) + "\n")
+    write_json(target, {"changes": rows})
 
 
 def _print(changes: tuple[Change, ...], console: Console) -> None:

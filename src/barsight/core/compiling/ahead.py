@@ -12,7 +12,7 @@ import numba
 
 from barsight.core.compiling.signatures import listed
 
-MOST_PROCESSES = 4
+MAX_PROCESSES = 4
 """Each takes half a gigabyte, and the more there are, the more compile what another is compiling."""
 FEWEST_KERNELS = 8
 """For fewer the processes take longer to start than they save."""
@@ -25,7 +25,7 @@ def compile_ahead(advance: Callable[[str, int, int], None], *groups: str) -> Non
     advance: told of progress (stage, done, total). Where processes can't be started, or can't write, each
     kernel is compiled at its first call, as it is on one core.
     """
-    cores = min(numba.config.NUMBA_NUM_THREADS, MOST_PROCESSES)
+    cores = min(numba.config.NUMBA_NUM_THREADS, MAX_PROCESSES)
     if cores < 2 or numba.config.DISABLE_JIT or not sys.executable:
         return
     missing = [place for place, one in enumerate(listed(*groups)) if one.missing()]

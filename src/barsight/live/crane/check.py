@@ -14,7 +14,7 @@ from pathlib import Path
 
 from barsight.calibration.files.rig_file import read_serials
 from barsight.core.errors import BarsightError
-from barsight.live.crane.preflight import expect_plausible, hear
+from barsight.live.crane.preflight import expect_plausible, prove_sensor
 from barsight.live.settings import CraneConfig
 
 MIN_CORES, MIN_MEMORY_GIB = 2, 2.0
@@ -204,7 +204,7 @@ def _sensors(crane: CraneConfig) -> Iterator[Finding]:
 
         def listen(name: str = name) -> None:
             nonlocal awaited
-            awaited = hear(crane, awaited, name)
+            awaited = prove_sensor(crane, awaited, name)
 
         needed = f"{sensor.rate_hz:g} readings a second at UDP port {sensor.port}"
         yield _proved(name, needed, listen)

@@ -25,12 +25,12 @@ def prove_sensors(crane: CraneConfig, folder: AwaitedRecording) -> None:
     cam0, cam1 = folder.rig.cam0, folder.rig.cam1
     prove_cameras(crane.cameras, ((cam0.width, cam0.height), (cam1.width, cam1.height)))
     for name in crane.sensors():
-        folder = hear(crane, folder, name)
+        folder = prove_sensor(crane, folder, name)
     expect_plausible(folder)
 
 
-def hear(crane: CraneConfig, folder: AwaitedRecording, name: str) -> AwaitedRecording:
-    """Hear `imu` or `crane` for a moment; return the recording with those readings.
+def prove_sensor(crane: CraneConfig, folder: AwaitedRecording, name: str) -> AwaitedRecording:
+    """Receive `imu` or `crane` for a moment; return the recording with those readings.
 
     Raises InputError where none come, or other ones than crane.toml says.
     """

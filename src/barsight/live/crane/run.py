@@ -13,12 +13,14 @@ from barsight.core.errors import BarsightError, ConfigError
 from barsight.core.files import expect_empty, translated_os_errors
 from barsight.live.crane.preflight import prove_sensors
 from barsight.live.drift import DRIFT_FILE, note_drift
+from barsight.live.link import LiveInput
 from barsight.live.run import INTERRUPTED, LiveRun
 from barsight.live.settings import CraneConfig, LiveSettings
 from barsight.live.survey import STOOD
 from barsight.map_building import ProgressCallback
 from barsight.measure_folder import ignore_progress
 from barsight.measure_settings import MeasureSettings
+from barsight.pipeline import LiftRequest
 from barsight.recording.formats.segments import PATTERN
 from barsight.recording.open import open_recording
 from barsight.recording.writers.bag import write_descriptions
@@ -42,10 +44,10 @@ def measure_crane(
     All sensors are proved first; nothing is written where one of them isn't as crane.toml says.
     Raises a BarsightError.
     """
-    described = None if magnet is None else load_magnet(magnet)
+    request = LiftRequest(None if magnet is None else load_magnet(magnet))
     expect_empty(out)
     recording = _recorded(crane, out, datetime.now(UTC).strftime(STAMP))
-    return _begin(crane, out, recording, settings, live, tell).measure(None, described, "now", advance)
+    return _begin(crane, out, recording, settings, live, tell).measure(None, request, advance)
 
 
 def measure_surveys(
@@ -60,7 +62,8 @@ def measure_surveys(
     """
     if crane.encoders is None:
         raise ConfigError("crane.toml has no [encoders], by which surveys begin and end")
-    described, proved, ended, is_first = None if magnet is None else load_magnet(magnet), False, "", True
+    request = LiftRequest(None if magnet is None else load_magnet(magnet))
+    proved, ended, is_first = False, "", True
     while ended != INTERRUPTED:
         here = out / datetime.now(UTC).strftime(STAMP)
         recording = _recorded(crane, here, here.name)
@@ -75,7 +78,7 @@ def measure_surveys(
         is_first, proved = False, True
         _point(out / RUNNING, here.name)
         try:
-            run.measure(None, described, "now", advance)
+            run.measure(None, request, advance)
             ended = run.stop_because
             if ended == STOOD:
                 _drop_standing(here, recording)
@@ -104,7 +107,8 @@ def _begin(
         folder.mkdir(parents=True)
         write_descriptions(awaited, folder)
     epoch_ns = time.time_ns() - time.monotonic_ns()
-    return LiveRun(crane.awaited(folder), folder, out, settings, live, 1.0, tell, crane, epoch_ns, surveys)
+    source = LiveInput(folder, crane=crane, epoch_ns=epoch_ns, surveys=surveys)
+    return LiveRun(crane.awaited(folder), source, out, settings, live, tell)
 
 
 def _recorded(crane: CraneConfig, out: Path, name: str) -> Path:

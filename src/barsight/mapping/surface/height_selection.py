@@ -156,7 +156,7 @@ def elect_surface(
     tile: Float32,
     key: TileKey,
     around: Float32,
-    sights: ViewFrusta,
+    frusta: ViewFrusta,
     cell_m: float,
     min_views: int,
     settings: MapSettings,
@@ -171,15 +171,15 @@ def elect_surface(
     if box is None:
         return np.full(tile.shape[:2], -1, np.int8)
     corner = np.array(key, np.float64) * TILE_CELLS
-    near = sights.touching(*box)
+    near = frusta.touching(*box)
     first_new, asked.views = int(near[: asked.views].sum()), near.size
-    sights = sights.only(near)
+    frusta = frusta.only(near)
     around = np.fmax(around, _NOTHING)
     ceiling = float(around.max())
-    planes, one_point_m = sights.planes(), cell_m / sights.spacing_rad
+    planes, one_point_m = frusta.planes(), cell_m / frusta.spacing_rad
     roof = highest_about(around)
     blocks = bound_blocks(
-        tile, corner, roof, ceiling, planes, sights.eyes, cell_m, float(min_views), one_point_m, first_new
+        tile, corner, roof, ceiling, planes, frusta.eyes, cell_m, float(min_views), one_point_m, first_new
     )
     scene = around, roof, ceiling
     share, expected = _supported(
@@ -187,7 +187,7 @@ def elect_surface(
         corner,
         scene,
         planes,
-        sights.eyes,
+        frusta.eyes,
         blocks,
         cell_m,
         float(min_views),

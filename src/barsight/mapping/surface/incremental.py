@@ -82,7 +82,7 @@ class SurfaceElection:
         self._figures: dict[TileKey, TileFigures] = {}
         self._height_m = np.inf
 
-    def snapshot(self, min_views: int, sights: ViewFrusta) -> Surface:
+    def snapshot(self, min_views: int, frusta: ViewFrusta) -> Surface:
         """Return the surface as it stands, without its cloud, of its own from now on; only tiles that changed
         are elected anew.
 
@@ -92,18 +92,18 @@ class SurfaceElection:
         keys = self._store.keys()
         states = {key: (self._store.version(key), min_views) for key in keys}
         changed = [key for key in keys if self._states.get(key) != states[key]]
-        self._elect(changed, min_views, sights, last=False)
+        self._elect(changed, min_views, frusta, last=False)
         self._states |= states
-        if not abs(sights.height_m - self._height_m) <= _KEPT_HEIGHT_M:
-            self._height_m, changed = sights.height_m, keys
-        self._finish(changed, sights)
+        if not abs(frusta.height_m - self._height_m) <= _KEPT_HEIGHT_M:
+            self._height_m, changed = frusta.height_m, keys
+        self._finish(changed, frusta)
         return self._surface(tile_file)
 
-    def finish(self, min_views: int, sights: ViewFrusta) -> Surface:
+    def finish(self, min_views: int, frusta: ViewFrusta) -> Surface:
         """Return the surface at the end, all elected from the start; the tiles in `store` are given up."""
-        keys, self._height_m = self._store.keys(), sights.height_m
-        self._elect(keys, min_views, sights, last=True)
-        self._finish(keys, sights, min_views)
+        keys, self._height_m = self._store.keys(), frusta.height_m
+        self._elect(keys, min_views, frusta, last=True)
+        self._finish(keys, frusta, min_views)
         surface = self._surface(tile_file, cloud_file)
         self._store.clear()
         shutil.rmtree(self._work)
@@ -122,7 +122,7 @@ class SurfaceElection:
         weakref.finalize(surface, shutil.rmtree, folder, ignore_errors=True)
         return surface
 
-    def _elect(self, keys: list[TileKey], min_views: int, sights: ViewFrusta, *, last: bool) -> None:
+    def _elect(self, keys: list[TileKey], min_views: int, frusta: ViewFrusta, *, last: bool) -> None:
         """Elect these tiles, at last with no regard to what was asked for snapshots."""
         known, read = frozenset(self._store.keys()), self._store.read
 
@@ -131,7 +131,7 @@ class SurfaceElection:
 
         def elect_tile(key: TileKey, tile: Float32, asked: ViewSupport) -> None:
             around = _first_around(self._first, key, known)
-            winner = elect_surface(tile, key, around, sights, self._cell_m, min_views, self._settings, asked)
+            winner = elect_surface(tile, key, around, frusta, self._cell_m, min_views, self._settings, asked)
             write_tile(self._elected, key, elected_layers(tile, winner))
             if last:
                 np.save(_winner_file(self._elected, key), winner)
@@ -150,7 +150,7 @@ class SurfaceElection:
             pass
         self._heights.hold(len(keys))
 
-    def _finish(self, keys: list[TileKey], sights: ViewFrusta, cloud_views: int | None = None) -> None:
+    def _finish(self, keys: list[TileKey], frusta: ViewFrusta, cloud_views: int | None = None) -> None:
         """Average, sharpen and fill these tiles; write the cloud of heights that cloud_views views support,
         if it is given.
         """
@@ -158,7 +158,7 @@ class SurfaceElection:
 
         def finish_tile(item: tuple[TileKey, Float32 | None]) -> tuple[TileKey, TileFigures]:
             key, tile = item
-            layers, blur = self._filled(key, known, sights)
+            layers, blur = self._filled(key, known, frusta)
             write_tile(self._finished, key, layers)
             if tile is not None and cloud_views is not None:
                 winner: Int8 = np.load(_winner_file(self._elected, key))
@@ -170,7 +170,7 @@ class SurfaceElection:
         items = ((key, None if cloud_views is None else self._store.read(key)) for key in keys)
         self._figures |= ordered_map(finish_tile, items)
 
-    def _filled(self, key: TileKey, keys: frozenset[TileKey], sights: ViewFrusta) -> tuple[Layers, Float32]:
+    def _filled(self, key: TileKey, keys: frozenset[TileKey], frusta: ViewFrusta) -> tuple[Layers, Float32]:
         """Average the tile lengthways, sharpen it, fill its narrow gaps, looking at most the halo around it;
         and what blur and gloss leave on bars, 1 sigma.
         """
@@ -186,7 +186,7 @@ class SurfaceElection:
         if along > 0:
             weight: Float32 = np.nan_to_num(1 / (around.sigma_m * around.sigma_m))
             z, direction = smooth_along_bars(around.z_m, weight, settings.min_gate_m, along)
-            pixel_m = sights.pixel_m(z, self._height_m)
+            pixel_m = frusta.pixel_m(z, self._height_m)
             sharp = deblur_across(z, direction, settings.sharpen_px * pixel_m / cell_m)
             blur = blur_sigma(sharp - z, valley_mask(sharp, _within(direction, reach)))
             pixel_cells = float(np.nanmedian(pixel_m)) / cell_m if np.isfinite(pixel_m).any() else 1.0

@@ -72,17 +72,17 @@ def may_be_occluded(
 
 
 @kernel()
-def has_enough_views(x_m: float, y_m: float, z_m: float, planes: Float64, least: float) -> bool:
+def has_enough_views(x_m: float, y_m: float, z_m: float, planes: Float64, min_views: float) -> bool:
     """Check that at least so many views have the point in both pictures.
 
     planes: (6, 4, K), see `ViewFrusta.planes`.
     """
     having = 0
     for view in range(planes.shape[2]):
-        if having >= least:
+        if having >= min_views:
             break
         having += is_pictured(x_m, y_m, z_m, planes, view)
-    return bool(having >= least)
+    return bool(having >= min_views)
 
 
 @kernel(inline=True)

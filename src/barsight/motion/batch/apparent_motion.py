@@ -85,7 +85,7 @@ def solve_with_slides(
         state = replace(state, pieces=np.zeros(2 * pieces.count))
     for left in reversed(range(rounds)):
         problem = replace(problem, pieces=pieces)
-        state, system = optimise_graph(problem, graph, state, used, most=STEPS)
+        state, system = optimise_graph(problem, graph, state, used, max_steps=STEPS)
         pieces = _learnt(problem, state, system, pieces, used)
         if left:
             del system

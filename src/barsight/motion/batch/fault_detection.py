@@ -55,7 +55,7 @@ def check_crane(crane: CraneSamples, known: KnownMotion | None = None) -> Checke
         (int(crane.stamp_ns[first]), int(crane.stamp_ns[last])) for first, last in frozen_stretches(crane)
     ]
     samples, after = without_frozen(crane, parts)
-    after = lost_counts(samples, after, known, least_way_m(crane))
+    after = lost_counts(samples, after, known, min_way_m(crane))
     found = find_jumps(replace(samples, jumps=after), known)
     warnings = freeze_sentences(parts, int(crane.stamp_ns[0])) if parts else ()
     return CheckedCrane(take_off_jumps(samples, (*after, *found)), warnings)
@@ -70,7 +70,7 @@ def freeze_sentences(parts: Sequence[tuple[int, int]], begin_ns: int) -> tuple[s
     )
 
 
-def least_way_m(crane: CraneSamples) -> float:
+def min_way_m(crane: CraneSamples) -> float:
     """Return the way from which on encoders that stand still are held to be frozen."""
     return max(MIN_HELD_M, HELD_SIGMAS * crane.position_std_m)
 
@@ -187,7 +187,7 @@ def frozen_stretches(crane: CraneSamples) -> list[tuple[int, int]]:
     place, time = crane.position_m, (crane.stamp_ns - crane.stamp_ns[:1]) / NS_PER_S
     same = np.r_[False, (np.diff(place, axis=0) == 0).all(axis=1), False]
     edges = np.flatnonzero(np.diff(same.astype(int)))
-    least = least_way_m(crane)
+    min_m = min_way_m(crane)
     found = []
     for first, last in zip(edges[::2], edges[1::2], strict=True):
         if last - first + 1 < MIN_FROZEN or first < SIDE // 2:
@@ -196,7 +196,7 @@ def frozen_stretches(crane: CraneSamples) -> list[tuple[int, int]]:
         away = float(np.linalg.norm(np.median(after, axis=0) - place[last])) if len(after) == 3 else 0.0
         speed = _speed_before(place, time, int(first))
         braked = min(float(time[last] - time[first]), speed / MAX_BRAKING_MPS2)
-        if max(away, (speed - MAX_BRAKING_MPS2 * braked / 2) * braked) > least:
+        if max(away, (speed - MAX_BRAKING_MPS2 * braked / 2) * braked) > min_m:
             found.append((int(first), int(last)))
     return found
 

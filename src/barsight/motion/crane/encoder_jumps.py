@@ -63,10 +63,10 @@ def find_jumps(
 
 @one_blas_thread()
 def lost_counts(
-    crane: CraneSamples, after: Iterable[EncoderJump], known: KnownMotion | None, least_m: float
+    crane: CraneSamples, after: Iterable[EncoderJump], known: KnownMotion | None, min_way_m: float
 ) -> tuple[EncoderJump, ...]:
     """Select of the jumps after freezes those that are seen, or that could hide: an encoder that loses count
-    misses the way since, `least_m` or more, and one that reads absolute places goes on where it should.
+    misses the way since, `min_way_m` or more, and one that reads absolute places goes on where it should.
     """
     series, lost = _thinned(crane), []
     known, sigma_m = known or KnownMotion(), _noise_m(crane, series)
@@ -85,7 +85,7 @@ def lost_counts(
         way = abs(float(np.median(read[following : following + 3]) - np.median(read[:following][-3:])) - size)
         if abs(size) > MAYBE_SIGMAS * sigma:
             lost.append(replace(jump, size_m=size))
-        elif least_m < way < MAYBE_SIGMAS * sigma:
+        elif min_way_m < way < MAYBE_SIGMAS * sigma:
             lost.append(jump)
     return tuple(lost)
 

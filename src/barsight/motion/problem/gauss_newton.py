@@ -120,7 +120,7 @@ def optimise_graph(
     graph: Any,
     state: GraphState,
     used: Bool,
-    most: int = MAX_ITERATIONS,
+    max_steps: int = MAX_ITERATIONS,
     min_gain: float = RELATIVE_GAIN,
 ) -> tuple[GraphState, System]:
     """Find the state that fits best, and its system, by Levenberg-Marquardt.
@@ -129,7 +129,7 @@ def optimise_graph(
     the cost that a step must save for another to follow. Raises LinAlgError where the measurements leave an
     unknown undetermined.
     """
-    found = minimise(_PoseIterate(problem, graph, used, state), Options(most, min_gain, 0.0, 1e-5, 1e6))
+    found = minimise(_PoseIterate(problem, graph, used, state), Options(max_steps, min_gain, 0.0, 1e-5, 1e6))
     if found.termination is Termination.SINGULAR:
         raise np.linalg.LinAlgError("the measurements leave an unknown undetermined")
     return found.best.state, found.best.system

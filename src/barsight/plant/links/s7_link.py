@@ -41,9 +41,9 @@ async def serve_s7(
         wrong = now
         if isinstance(found, Failed):
             return
-        feed.hear(partner.reading(found))
-        if partner.hears(found):
-            partner.obey(found)
+        feed.take_reading(partner.reading(found))
+        if partner.receive(found):
+            partner.execute(found)
             feed.refresh()
 
     thread = asyncio.create_task(asyncio.to_thread(run_s7, settings, layout("in").size, outputs, take, stop))

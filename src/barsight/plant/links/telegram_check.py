@@ -16,17 +16,24 @@ from barsight.plant.telegram import IN_MAGIC, VERSION, fields_at, layout, pack, 
 
 TOLERANCE_RATIO = 0.2
 """The cycle's first and last hundredth may be off by so much of it."""
+MAX_BEHIND = 3
+"""Telegrams that the echo of the PLC's life counter may be behind, as the PLC judges it."""
 FAILED, NUMBER = 4, 0x5A5A
 
 
 @dataclass
 class _Exchanged:
-    """Telegrams of a check. stamps_s: when each came. answered_s: from the command to its answer."""
+    """Telegrams of a check.
+
+    stamps_s: when each came. behind: telegrams by which each echo of the PLC's life counter was late.
+    answered_s: from the command to its answer.
+    """
 
     sent: bytes = b""
     content: bytes = b""
     stamps_s: list[float] = field(default_factory=list)
     lives: list[int] = field(default_factory=list)
+    behind: list[int] = field(default_factory=list)
     answered_s: float | None = None
 
 
@@ -43,6 +50,7 @@ def check_telegram(one: TelegramSettings, seconds: float) -> LinkCheck | Failed:
     set_ms = 1e3 * one.cycle_s
     is_even = (1 - TOLERANCE_RATIO) * set_ms <= low and high <= (1 + TOLERANCE_RATIO) * set_ms
     is_alive = {(later - before) & 0xFFFF for before, later in itertools.pairwise(seen.lives)} == {1}
+    late = max(seen.behind)
     answer = "NOT ANSWERED" if seen.answered_s is None else f"refused after {1e3 * seen.answered_s:.0f} ms"
     lines = (
         *told_fields("in", seen.sent, one.byte_order), *told_fields("out", seen.content, one.byte_order),
@@ -50,9 +58,12 @@ def check_telegram(one: TelegramSettings, seconds: float) -> LinkCheck | Failed:
         f"longest {gaps_ms.max():.1f} ms, set {set_ms:g} ms: {'even' if is_even else 'NOT within 20 %'}",
         f"a command that names no lift: {answer}",
         "life counter: " + ("goes up by one in each telegram" if is_alive else "STANDS OR LEAPS"),
+        f"echo of the PLC's life counter: {late} telegrams behind at most"
+        + ("" if late <= MAX_BEHIND else f", MORE THAN {MAX_BEHIND}"),
     )  # fmt: skip
     is_in_time = float(gaps_ms.max()) < 1e3 * one.silent_s
-    return LinkCheck("telegram", lines, is_alive and is_even and is_in_time and seen.answered_s is not None)
+    checks = (is_alive, is_even, is_in_time, late <= MAX_BEHIND, seen.answered_s is not None)
+    return LinkCheck("telegram", lines, all(checks))
 
 
 def _exchange(one: TelegramSettings, seconds: float) -> _Exchanged | Failed:
@@ -76,6 +87,8 @@ def _exchange(one: TelegramSettings, seconds: float) -> _Exchanged | Failed:
             if isinstance(found, Failed):
                 return found
             seen.lives.append(found["life"])
+            if len(seen.lives) > MAX_BEHIND:
+                seen.behind.append((len(seen.lives) - found["life_echo"]) & 0xFFFF)
             if asked_s is not None and seen.answered_s is None and found["answer_number"] == NUMBER:
                 seen.answered_s = time.monotonic() - asked_s
     return seen

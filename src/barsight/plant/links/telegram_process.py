@@ -20,7 +20,7 @@ from multiprocessing.connection import Connection
 from typing import Any, cast
 
 from barsight.core.errors import BarsightError, OutputError
-from barsight.plant.feed import StateFeed, aged
+from barsight.plant.feed import StateFeed, with_age
 from barsight.plant.serving import TelegramServer
 from barsight.plant.settings import TelegramSettings
 from barsight.plant.state import PlantState, PlcReading
@@ -83,7 +83,7 @@ def _send_states(states: Connection, feed: StateFeed, stop: threading.Event) -> 
         while not stop.wait(SEND_EVERY_S):
             states.send(feed.read())
             while states.poll():
-                feed.hear(states.recv())
+                feed.take_reading(states.recv())
 
 
 def _answer_calls(calls: Connection, feed: StateFeed, steps: LiftSteps) -> None:
@@ -115,13 +115,13 @@ class _SentFeed:
         if self._read is None:
             told = ("starting: no state was read yet",)
             return PlantState("idle", False, told, life_counter, time.time_ns(), "none")
-        return aged(*self._read, life_counter)
+        return with_age(*self._read, life_counter)
 
     def refresh(self) -> None:
         """Let the parent read the state now."""
         self._calls.ask("refresh")
 
-    def hear(self, reading: PlcReading) -> None:
+    def take_reading(self, reading: PlcReading) -> None:
         """Pass on what a PLC tells of the crane."""
         with contextlib.suppress(OSError):
             self._states.send(reading)

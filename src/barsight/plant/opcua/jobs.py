@@ -118,10 +118,10 @@ class JobMethods:
         ]  # fmt: skip
 
     async def _list(self, state: Any, *rest: Any) -> Any:
-        job, most, start = rest[7], rest[8], rest[9]
+        job, max_results, start = rest[7], rest[8], rest[9]
         asked = str(job.Id or "") if job is not None else ""
         listed = [one for one in self._results.list_newest() if asked in ("", one.job)]
-        page = [told(one) for one in listed[start : start + most if most else None]]
+        page = [told(one) for one in listed[start : start + max_results if max_results else None]]
         return [
             ua.Variant(start + len(page) >= len(listed)), ua.Variant(len(page), ua.VariantType.UInt32),
             handle(), ua.Variant(page, ua.VariantType.ExtensionObject, is_array=True), int32(0),

@@ -89,13 +89,13 @@ class RecipeMethods:
         return [_recipe(name), int32(0)]
 
     async def _list_recipes(
-        self, external: Any, product: Any, is_prepared: Any, most: int, start: int, timeout: int
+        self, external: Any, product: Any, is_prepared: Any, max_results: int, start: int, timeout: int
     ) -> Any:
         wanted = _id_of(external)
         names = [one for one in self.recipes.known if not wanted or one == wanted]
         if is_prepared is not None and int(is_prepared) in (0, 1):
             names = [one for one in names if (one == self.prepared) == bool(int(is_prepared))]
-        page = names[start : start + most if most else None]
+        page = names[start : start + max_results if max_results else None]
         listed = [ua.RecipeIdInternalDataType(Id=one) for one in page]
         return [
             ua.Variant(start + len(page) >= len(names)), ua.Variant(len(page), ua.VariantType.UInt32),
@@ -110,8 +110,8 @@ class RecipeMethods:
         told.LastModified = self.recipes.calibrated_at
         return told
 
-    async def _list_configurations(self, most: int, start: int, timeout: int) -> Any:
-        page = [self._configuration()][start : start + most if most else None]
+    async def _list_configurations(self, max_results: int, start: int, timeout: int) -> Any:
+        page = [self._configuration()][start : start + max_results if max_results else None]
         return [
             ua.Variant(True), ua.Variant(len(page), ua.VariantType.UInt32), handle(),
             ua.Variant(page, ua.VariantType.ExtensionObject, is_array=True), int32(0),

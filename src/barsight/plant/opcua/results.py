@@ -56,14 +56,14 @@ def read_result(folder: Path, survey: str, job: str, recipe: str, configuration:
 class KeptResults:
     """The last results, by id; the oldest goes as one more comes."""
 
-    def __init__(self, most: int) -> None:
-        self._most = most
+    def __init__(self, max_results: int) -> None:
+        self._max_results = max_results
         self._kept: OrderedDict[str, SurveyResult] = OrderedDict()
 
     def add(self, result: SurveyResult) -> None:
         """Keep a result."""
         self._kept[result.survey] = result
-        while len(self._kept) > self._most:
+        while len(self._kept) > self._max_results:
             self._kept.popitem(last=False)
 
     def get(self, survey: str) -> SurveyResult | None:

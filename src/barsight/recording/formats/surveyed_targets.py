@@ -11,8 +11,7 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import InputError
-from barsight.core.reading.bounded_reading import in_range, read_text
-from barsight.recording.formats.euroc_tables import require_file
+from barsight.core.reading.bounded_reading import MAX_ENTRIES, in_range, read_lines
 
 COLUMNS = ("name", "yard_x", "yard_y", "yard_z", "x", "y", "z")
 REMEDY = "give name,yard_x,yard_y,yard_z,x,y,z and, if wanted, sigma_m and check"
@@ -37,10 +36,12 @@ def read_targets(path: Path) -> Targets:
 
     Raises `InputError` naming the line.
     """
-    require_file(path)
-    first, *others = read_text(path, remedy=REMEDY).split("\n")
+    first, *others = read_lines(path, MAX_ENTRIES, REMEDY)
     lines = [first.lstrip("# "), *others]
-    rows = list(csv.DictReader(lines, skipinitialspace=True))
+    try:
+        rows = list(csv.DictReader(lines, skipinitialspace=True))
+    except csv.Error as error:
+        raise InputError(path, f"can't be read ({error})", REMEDY) from error
     header = [name.strip() for name in lines[0].split(",")]
     missing = [name for name in COLUMNS if name not in header]
     if missing:

@@ -13,7 +13,7 @@ from barsight.simulation.effects.settings import FaultSettings
 
 HAZE_GRAY = 0.45
 """Radiance of thick haze; 1 is white paper under the lamps."""
-LEAST_BLUR_PX = 0.05
+MIN_BLUR_PX = 0.05
 DROP_SIGMA_PX = 3.0
 
 
@@ -86,7 +86,7 @@ def _blot(shape: tuple[int, int], radius: float, rng: np.random.Generator, soft:
 def _motion_blur(radiance: Float32, smear_px: Float64) -> Float32:
     """Average a picture along the straight way (right, down) that it moves while the shutter is open."""
     length = float(np.hypot(*smear_px))
-    if length < LEAST_BLUR_PX:
+    if length < MIN_BLUR_PX:
         return radiance
     half = math.ceil(length / 2) + 1
     samples = max(2, math.ceil(4 * length))

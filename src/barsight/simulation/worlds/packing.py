@@ -35,10 +35,10 @@ def packed(count: int, diameter_m: float, rng: np.random.Generator) -> Float64:
 
 
 @kernel()
-def _push_apart(places: Float64, least: float, times: int) -> float:
+def _push_apart(places: Float64, min_apart: float, times: int) -> float:
     """Push discs that overlap off each other, in place; returns the deepest overlap of the last time.
 
-    places: (N, 2) centres. least: the distance at which two touch.
+    places: (N, 2) centres. min_apart: the distance at which two touch.
     """
     deepest = 0.0
     for _ in range(times):
@@ -47,7 +47,7 @@ def _push_apart(places: Float64, least: float, times: int) -> float:
             for j in range(i):
                 x, z = places[i, 0] - places[j, 0], places[i, 1] - places[j, 1]
                 distance = math.sqrt(x * x + z * z) + 1e-12
-                overlap = least - distance
+                overlap = min_apart - distance
                 if overlap > 0:
                     deepest = max(deepest, overlap)
                     x, z = 0.5 * overlap * x / distance, 0.5 * overlap * z / distance

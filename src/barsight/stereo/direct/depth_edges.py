@@ -66,7 +66,7 @@ def _falling(v: Vectors, gap: Any) -> Any:
     for factor in (1 / 2, 1.0, 1.0):
         power = v.sum(v.product(power, small), v.all(factor, v.floats))
     # Never so small that its power has no full precision any more, which is slow.
-    power = v.at_least(power, 0.05)
+    power = v.bound_below(power, 0.05)
     for _ in range(4):
         power = v.product(power, power)
     return power

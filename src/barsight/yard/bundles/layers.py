@@ -29,7 +29,7 @@ def find_layers(bundles: list[Bundle], floor_m: float | None) -> list[int]:
     The distance of the layers is the smallest step between the undersides of bundles of its width and heading
     that one bundle and its dunnage can make, else the bundle's own height and 0.1 m.
     """
-    bottoms = np.array([_bottom(b) for b in bundles])
+    bottoms = np.array([b.bottom_z_m for b in bundles])
     layers = []
     for bundle, bottom in zip(bundles, bottoms, strict=True):
         height = bundle.top_z_m - bottom
@@ -47,11 +47,6 @@ def _is_alike(one: Bundle, other: Bundle) -> bool:
     """Check for a bundle as wide, and no crossed one: these lie without dunnage."""
     parallel = abs(np.sin(one.yaw_rad - other.yaw_rad)) < _PARALLEL
     return bool(parallel and abs(other.width_m - one.width_m) < 0.15 * one.width_m)
-
-
-def _bottom(bundle: Bundle) -> float:
-    """Compute the underside's height: a hexagon is as deep below its axis as it rises above it."""
-    return float(2 * bundle.centre_m[2] - bundle.top_z_m)
 
 
 def check_uncovered(bundle: Bundle, bundles: list[Bundle]) -> tuple[bool | None, tuple[str, ...]]:

@@ -171,13 +171,13 @@ def _look(
     return rise, most, blocked
 
 
-def _filled(rise: Float32, most: Float32) -> Float32:
+def _filled(rise: Float32, max_rise: Float32) -> Float32:
     """Fill unseen cells (V, U) with the highest seen one two cells about, up to what lines of sight allow."""
     unseen = np.isnan(rise)
     if not unseen.any():
         return rise
     highest = cv2.dilate(np.where(unseen, np.float32(-1), rise), np.ones((5, 5), np.uint8))
-    return np.where(unseen, np.fmin(highest, most), rise)
+    return np.where(unseen, np.fmin(highest, max_rise), rise)
 
 
 def _over(load: tuple[Bundle, ...], region: Region) -> Bool:

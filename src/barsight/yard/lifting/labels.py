@@ -18,7 +18,7 @@ STEP_M = 0.01
 LENGTH_CELLS, WIDTH_CELLS, APART_CELLS = 5, 3, 5
 """Steps that a label fills along the bars and across, and from its middle to the bare bar on both sides: a
 label ends at once, a gleam fades."""
-BRIGHTER_RATIO, FULL_LEVEL, LEAST_LEVEL = 2.2, 215.0, 150.0
+BRIGHTER_RATIO, FULL_LEVEL, MIN_LEVEL = 2.2, 215.0, 150.0
 """Gray level of a label over the median of the load, the level from which on a picture shows no more, and the
 least of a label's steps."""
 MEAN_LOG, ODD_CELLS = 0.15, 1
@@ -78,12 +78,12 @@ def mark_labels(gray: Float32) -> Bool:
     bare = ndimage.uniform_filter1d(gray, WIDTH_CELLS, axis=0)
     brighter = np.maximum(np.roll(bare, APART_CELLS, axis=0), np.roll(bare, -APART_CELLS, axis=0)) + _DARK
     mean = ndimage.uniform_filter1d(np.log((inner + _DARK) / brighter), WIDTH_CELLS, axis=1)
-    least = ndimage.rank_filter(gray, ODD_CELLS, size=(LENGTH_CELLS, WIDTH_CELLS)) + _DARK
+    darkest = ndimage.rank_filter(gray, ODD_CELLS, size=(LENGTH_CELLS, WIDTH_CELLS)) + _DARK
     brightest = ndimage.maximum_filter1d(brighter, WIDTH_CELLS, axis=1)
     level = ndimage.uniform_filter1d(inner, WIDTH_CELLS, axis=1)
     seen = gray[gray > 0]
     needed = min(BRIGHTER_RATIO * float(np.median(seen)), FULL_LEVEL) if seen.size else np.inf
-    sure = (least > brightest) & (least > LEAST_LEVEL + _DARK)
+    sure = (darkest > brightest) & (darkest > MIN_LEVEL + _DARK)
     return np.asarray((mean > MEAN_LOG) & sure & (level > needed))
 
 

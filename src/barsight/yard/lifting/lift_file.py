@@ -142,7 +142,7 @@ def _lift(lift: Lift, rank: int | None) -> dict[str, Any]:
             {
                 "z_m": pole.z_m,
                 "mean_gap_m": pole.gap_m,
-                "least_gap_m": pole.least_gap_m,
+                "least_gap_m": pole.min_gap_m,
                 "contact_share": pole.contact_share,
                 "unknown_share": pole.unknown_share,
                 "pull_n": pole.pull_n,

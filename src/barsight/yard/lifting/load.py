@@ -9,7 +9,7 @@ import numpy as np
 
 from barsight.core.arrays import Float64
 from barsight.yard.lift_settings import UPPER
-from barsight.yard.stability.stability import mean_yaw, underside_m
+from barsight.yard.stability.stability import mean_yaw
 from barsight.yard.types import Bundle
 from barsight.yard.weight import load_centre
 
@@ -49,7 +49,7 @@ class Load:
             low = np.minimum(low, axes @ b.centre_m[:2] - half)
             high = np.maximum(high, axes @ b.centre_m[:2] + half)
         x, y = (low + high) / 2 @ axes
-        height = max(b.top_z_m for b in bundles) - min(underside_m(b) for b in bundles)
+        height = max(b.top_z_m for b in bundles) - min(b.bottom_z_m for b in bundles)
         rolls = len(bundles) == 1 and bundles[0].width_m < 1.5 * bundles[0].bar_diameter_m
         size = high - low
         ids = tuple(b.id for b in bundles)

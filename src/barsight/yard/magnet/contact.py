@@ -37,7 +37,7 @@ picture shows the steel, nothing does."""
 
 @dataclass(frozen=True, eq=False)
 class PoleContact:
-    """One pole's face. gap_m: mean air gap, least_gap_m: where it is nearest to steel; gap_map_m: (across,
+    """One pole's face. gap_m: mean air gap, min_gap_m: where it is nearest to steel; gap_map_m: (across,
     along) air gaps, NaN where unknown. contact_share: of the face that lies on steel. unknown_share: of the
     cells under it that were not seen, but for strips along it that are too narrow to hide what stands. z_m:
     height of its centre. pull_n, pull_low_n: its part of the pull, 0 until a load is known
@@ -45,7 +45,7 @@ class PoleContact:
     """
 
     gap_m: float
-    least_gap_m: float
+    min_gap_m: float
     contact_share: float
     unknown_share: float
     z_m: float
@@ -99,7 +99,7 @@ class Contact:
     @property
     def widest_gap_m(self) -> float:
         """Return the least gap of the pole that is furthest from steel; infinite where a pole knows none."""
-        return max(pole.least_gap_m for pole in self.poles)
+        return max(pole.min_gap_m for pole in self.poles)
 
 
 def rest_magnet(heights: HeightMap, place: Placement, magnet: Magnet, contact_gap_m: float) -> Contact | None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.stability.stability import Footing, leans_on, rests_against, underside_m
+from barsight.yard.stability.stability import Footing, leans_on, rests_against
 from barsight.yard.types import Bundle
 
 HIGHER_RATIO = 0.25
@@ -47,7 +47,7 @@ def find_blocked(
 def lies_on(upper: Bundle, lower: Bundle) -> bool:
     """Check whether the outlines meet, seen from above, and `upper` has its underside well over `lower`'s."""
     width = min(upper.width_m, lower.width_m)
-    if underside_m(upper) - underside_m(lower) <= HIGHER_RATIO * width:
+    if upper.bottom_z_m - lower.bottom_z_m <= HIGHER_RATIO * width:
         return False
     away = (upper.centre_m - lower.centre_m)[:2]
     both = [

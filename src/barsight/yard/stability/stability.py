@@ -291,16 +291,11 @@ def rests_against(other: Bundle, target: Bundle) -> bool:
     """
     if other.id not in target.neighbours:
         return False
-    raised = underside_m(other) - underside_m(target)
+    raised = other.bottom_z_m - target.bottom_z_m
     sideways = abs(float((other.centre_m - target.centre_m)[:2] @ high_side(target.yaw_rad)))
     reach = (other.width_m + target.width_m) / 2 + TOUCH_M
     apart = math.hypot(sideways, float(other.centre_m[2] - target.centre_m[2]))
     return raised > RAISED_RATIO * min(other.width_m, target.width_m) and apart < reach
-
-
-def underside_m(bundle: Bundle) -> float:
-    """Compute the underside's height: a hexagon is as deep below its axis as it rises above it."""
-    return float(2 * bundle.centre_m[2] - bundle.top_z_m)
 
 
 def _sure(sigma: float) -> float:

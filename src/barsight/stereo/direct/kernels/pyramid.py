@@ -42,13 +42,13 @@ def upsample_update(started: Float32, moved: Float32, disparity: Float32, same_s
 
 @kernel()
 def _carry_up(
-    started: Float32, moved: Float32, disparity: Float32, nearness: np.float32, result: Float32, first: int,
+    started: Float32, moved: Float32, disparity: Float32, inverse_px: np.float32, result: Float32, first: int,
     end: int,
 ) -> None:  # fmt: skip
     """Upsample the update by bilinear weights that fall with the difference of disparity, rows first...end.
 
     started, moved: (ceil(H / 2) + 2, ceil(W / 2) + 2), half size with a border of one, but in full px.
-    disparity: (H, W) px. nearness: one over the difference (px) at which a place no longer counts. Fills
+    disparity: (H, W) px. inverse_px: one over the difference (px) at which a place no longer counts. Fills
     result (H, W) px.
     """
     width = disparity.shape[1]
@@ -63,7 +63,7 @@ def _carry_up(
             here, total, weights = disparity[y, x], zero, tiny
             for k in range(4):
                 row, place = (near if k < 2 else far), (beside if k & 1 else column)
-                gap = (started[row, place] - here) * nearness
+                gap = (started[row, place] - here) * inverse_px
                 alike = max(one - gap * gap, zero)
                 weight = shares[k] * alike * alike
                 weights += weight

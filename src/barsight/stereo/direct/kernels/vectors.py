@@ -87,7 +87,7 @@ class Vectors:
             first, first, ir.Constant(ir.VectorType(ir.IntType(32), kind.count), [0] * kind.count)
         )
 
-    def least(self, one: Any, other: Any) -> Any:
+    def min_each(self, one: Any, other: Any) -> Any:
         """Return the lesser of both, unsigned."""
         return self.builder.select(self.builder.icmp_unsigned("<", one, other), one, other)
 
@@ -106,10 +106,10 @@ class Vectors:
         """Add vectors of floats."""
         return self.builder.fadd(one, other)
 
-    def at_least(self, vector: Any, least: float) -> Any:
-        """Floats, `least` in place of what is less."""
-        floor = self.all(least, self.floats)
-        return self.builder.select(self.builder.fcmp_ordered(">", vector, floor), vector, floor)
+    def bound_below(self, vector: Any, floor: float) -> Any:
+        """Return floats, `floor` in place of what is less."""
+        bounds = self.all(floor, self.floats)
+        return self.builder.select(self.builder.fcmp_ordered(">", vector, bounds), vector, bounds)
 
     def sum_of(self, vector: Any) -> Any:
         """Return the sum of a vector's floats, added by halves: the same on every processor."""

@@ -91,13 +91,13 @@ def match_semiglobal(
 
 @kernel()
 def _compete(
-    down: UInt16, up: UInt16, at: int, count: int, least: Int32, right: int
+    down: UInt16, up: UInt16, at: int, count: int, minima: Int32, right: int
 ) -> np.int32:  # fmt: skip
-    """Find the least key of one left pixel; its keys are written to `least` where they are less, that of
+    """Find the least key of one left pixel; its keys are written to `minima` where they are less, that of
     candidate k at `right` + k.
 
     A key is a candidate's sum and below it, in 16 bits, the candidate: the least number is the winner. down,
-    up: flat, the pixel's sums of four paths each from `at` on. least: (W,) with a margin on both sides.
+    up: flat, the pixel's sums of four paths each from `at` on. minima: (W,) with a margin on both sides.
     """
     winner = np.int32(_WORST)
     # Unsigned: no vectors are made of a loop whose index might be negative, which counts from the end.
@@ -107,29 +107,29 @@ def _compete(
         total = np.int32(np.int32(down[first + k]) + np.int32(up[first + k]))
         key = np.int32(np.int32(total << np.int32(16)) | np.int32(i))
         winner = key if key < winner else winner
-        other = least[there + k]
-        least[there + k] = key if key < other else other
+        other = minima[there + k]
+        minima[there + k] = key if key < other else other
     return winner
 
 
 @kernel()
 def _choose(
-    down: UInt16, up: UInt16, count: int, lowest: int, least: Int32, left_px: Float32, right_px: Float32
+    down: UInt16, up: UInt16, count: int, lowest: int, minima: Int32, left_px: Float32, right_px: Float32
 ) -> None:
     """Choose winners of one row for both images; the left one to a fraction with the equiangular line fit,
     which suits a cost that rises linearly [Shimizu 2002]. The right ones are kept reversed meanwhile, so that
     a left pixel's candidates meet them in memory's order. down, up: (W, places) sums of four paths each.
-    least: for use inside, with a margin on both sides that takes what falls beside the right image.
+    minima: for use inside, with a margin on both sides that takes what falls beside the right image.
 
     Fills left_px and right_px (W,).
     """
     width, places = down.shape
     downs, ups = down.reshape(-1), up.reshape(-1)
-    margin = (len(least) - width) // 2
-    least[:] = _WORST
+    margin = (len(minima) - width) // 2
+    minima[:] = _WORST
     for x in range(width):
         at = x * places
-        winner = _compete(downs, ups, at, count, least, margin + width - 1 - x + lowest)
+        winner = _compete(downs, ups, at, count, minima, margin + width - 1 - x + lowest)
         best = winner & 0xFFFF
         fraction = np.float32(0)
         if 0 < best < count - 1:
@@ -142,7 +142,7 @@ def _choose(
                 fraction = np.float32(0.5) * (below - above) / steeper
         left_px[x] = np.float32(best + lowest) + fraction
     for x in range(width):
-        found = least[margin + width - 1 - x]
+        found = minima[margin + width - 1 - x]
         right_px[x] = np.float32((found & 0xFFFF) + lowest) if found < _WORST else _FAR
 
 
@@ -165,7 +165,7 @@ def _match_stripe(
     paths = allocate_paths(width, places, penalties.small)
     leasts = np.empty((2, width, 3), dtype=np.uint8)
     up = np.empty((width, places), dtype=np.uint16)
-    least = np.empty(width + 2 * (abs(lowest) + places), dtype=np.int32)
+    minima = np.empty(width + 2 * (abs(lowest) + places), dtype=np.int32)
     above, below = max(0, start - _OVERLAP_ROWS), min(height, end + _OVERLAP_ROWS)
     for y in range(above, below):
         here = cost[y - above]
@@ -180,4 +180,4 @@ def _match_stripe(
             True, paths, leasts, up,
         )  # fmt: skip
         if y < end:
-            _choose(down[y - above], up, count, lowest, least, left_px[y], right_px[y])
+            _choose(down[y - above], up, count, lowest, minima, left_px[y], right_px[y])

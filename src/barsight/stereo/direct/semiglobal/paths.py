@@ -33,20 +33,20 @@ _PATHS = 4
 
 @intrinsic  # type: ignore[untyped-decorator]
 def _extend_paths(
-    _: Any, cost: Any, at: Any, paths: Any, before: Any, after: Any, least: Any, ceiling: Any, small: Any,
+    _: Any, cost: Any, at: Any, paths: Any, before: Any, after: Any, minima: Any, ceiling: Any, small: Any,
     sums: Any, places: Any,
 ) -> Any:  # fmt: skip
     """Step one pixel further along four paths [Hirschmueller 2008, Eq. 13]; returns the least value of each.
 
     cost: the pixel's `places` costs from `at` on; the sum of the four is written to `sums` there. before,
     after: where each path's values at the pixels before and here begin in `paths`, with one place before the
-    first. least, ceiling: each path's least value before, the same with the dearest jump. All arrays flat.
+    first. minima, ceiling: each path's least value before, the same with the dearest jump. All arrays flat.
 
     In vector instructions: plain Numba takes four times as long here, a fifth more for all of stereo. The
     four paths of a pixel are a few vectors of bytes, and checks for overlap cost more than the steps.
     """
     four = types.Tuple((types.uint8,) * _PATHS)
-    signature = four(cost, at, paths, before, after, least, ceiling, small, sums, places)
+    signature = four(cost, at, paths, before, after, minima, ceiling, small, sums, places)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         v = Vectors(context, builder, signature, arguments)
@@ -64,18 +64,18 @@ def _extend_paths(
             for k in range(_PATHS):
                 below = builder.add(starts[k], offset)
                 same, above = (builder.add(below, below.type(i)) for i in (1, 2))
-                beside = v.least(v.load(v.data(2), below, kind), v.load(v.data(2), above, kind))
-                best = v.least(v.load(v.data(2), same, kind), builder.add(beside, step))
-                value = builder.add(builder.sub(v.least(best, ceilings[k]), base[k]), own)
+                beside = v.min_each(v.load(v.data(2), below, kind), v.load(v.data(2), above, kind))
+                best = v.min_each(v.load(v.data(2), same, kind), builder.add(beside, step))
+                value = builder.add(builder.sub(v.min_each(best, ceilings[k]), base[k]), own)
                 place = builder.add(ends[k], offset)
                 v.store(value, v.data(2), builder.add(place, place.type(1)))
-                builder.store(v.least(builder.load(lowest[lanes][k]), value), lowest[lanes][k])
+                builder.store(v.min_each(builder.load(lowest[lanes][k]), value), lowest[lanes][k])
                 total = builder.add(total, builder.zext(value, total.type))
             v.store(total, v.data(8), builder.add(arguments[1], offset))
 
         v.by_chunks(arguments[9], extend)
         found = [
-            v.least(*(v.min_of(builder.load(lowest[lanes][k])) for lanes in (LANES, HALF_LANES)))
+            v.min_each(*(v.min_of(builder.load(lowest[lanes][k])) for lanes in (LANES, HALF_LANES)))
             for k in range(_PATHS)
         ]
         return context.make_tuple(builder, signature.return_type, found)
@@ -84,11 +84,11 @@ def _extend_paths(
 
 
 @kernel()
-def p2_table(large: int, least: int) -> UInt8:
+def p2_table(large: int, min_p2: int) -> UInt8:
     """Tabulate the penalty P2 (256,) by the gray levels that the image changes there."""
     jumps = np.empty(256, dtype=np.uint8)
     for contrast in range(256):
-        jumps[contrast] = max(large * _EDGE_GRAY // (_EDGE_GRAY + contrast), least)
+        jumps[contrast] = max(large * _EDGE_GRAY // (_EDGE_GRAY + contrast), min_p2)
     return jumps
 
 

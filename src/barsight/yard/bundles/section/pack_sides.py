@@ -81,8 +81,8 @@ def find_side(
         alone = shared is None or begin > round(_NEAR_M / cell_m)
         bottom = _gully(outwards[: begin + 1], top, alone)
     if bottom is None:
-        least = float(np.max((thick_m, _PARTING_M, _PARTING_RATIO * width_m)))
-        bottom = _parting(outwards, limit, top, least)
+        min_depth_m = float(np.max((thick_m, _PARTING_M, _PARTING_RATIO * width_m)))
+        bottom = _parting(outwards, limit, top, min_depth_m)
     if bottom is None:
         return last, PackSide.OPEN
     last = int(np.flatnonzero(np.isfinite(outwards[: bottom + 1]))[-1])
@@ -109,11 +109,11 @@ def flank_depth(top: float, width_m: float) -> float:
     return top - max(_FLANK_RATIO * width_m, _FLANK_DEPTH_M)
 
 
-def _parting(level: Float64, limit: int, top: float, least: float) -> int | None:
-    """Find the bottom, within `limit` places, of the first gully where it sinks by `least` under both of its
-    sides, as none does within one pack. Places out of sight count as no deeper than what is seen.
+def _parting(level: Float64, limit: int, top: float, min_depth_m: float) -> int | None:
+    """Find the bottom, within `limit` places, of the first gully where it sinks by `min_depth_m` under both
+    of its sides, as none does within one pack. Places out of sight count as no deeper than what is seen.
 
-    None where there is none, or `least` is NaN.
+    None where there is none, or `min_depth_m` is NaN.
     """
     lowest, rises = 0, False
     for k, height in enumerate(level):
@@ -121,7 +121,7 @@ def _parting(level: Float64, limit: int, top: float, least: float) -> int | None
             if rises or k > limit:
                 return None
             lowest = k
-        if min(top, height) - level[lowest] >= least:
+        if min(top, height) - level[lowest] >= min_depth_m:
             return lowest
         rises |= bool(height > level[lowest] + _RISES_M)
     return None

@@ -1,23 +1,12 @@
-"""Probe a recording: can it be matched at all, and how fine can its map be; select keyframes."""
+"""Probe a recording: can it be matched at all, and how fine can its map be."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
-from barsight.calibration.geometry.rectification import Rectifier
-from barsight.core.arrays import Float64
 from barsight.core.errors import Failed, InputError, MeasurementError
-from barsight.core.types import (
-    CraneSamples,
-    DisparityRange,
-    PosedFrame,
-    RectifiedCamera,
-    RefusedFrame,
-)
+from barsight.core.types import DisparityRange, RefusedFrame
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.stereo.search_range import find_disparity_range
 from barsight.stereo.vertical_offset import MAX_OFFSET_PX, vertical_offset
@@ -88,51 +77,6 @@ def choose_cell_size(first: RecordingProbe, *, has_crane: bool) -> float:
         return CELL_SIDES_M[0]
     wanted = 1.5 * first.pixel_on_surface_m
     return next((side for side in CELL_SIDES_M if side >= wanted), CELL_SIDES_M[-1])
-
-
-def select_keyframes(
-    frames: Sequence[PosedFrame], rectifier: Rectifier, range_m: float, min_shift: float
-) -> set[int]:
-    """Select keyframes by parallax: stamps of frames whose picture has moved, since the last one taken, by
-    min_shift of its shorter side on a surface range_m away; the first and the last always.
-    """
-    ahead = np.array([0.0, 0.0, range_m])
-    seen = [(frame.reference_from_body @ rectifier.body_from_rect0).apply(ahead) for frame in frames]
-    stamps = [frame.stamp_ns for frame in frames]
-    return set(_spread(stamps, np.array(seen), keyframe_spacing_m(rectifier.camera, range_m, min_shift)))
-
-
-def select_keyframes_by_encoders(
-    stamps_ns: Sequence[int], crane: CraneSamples, shift_ns: int, camera: RectifiedCamera, range_m: float,
-    min_shift: float,
-) -> list[int]:  # fmt: skip
-    """Select keyframes by encoders before a trajectory is known: as if the crane carried the camera without a
-    sway.
-
-    shift_ns: from the frames' clock to the encoders'.
-    """
-    start = int(crane.stamp_ns[0])
-    at, known = (np.asarray(times) - start for times in (np.array(stamps_ns) + shift_ns, crane.stamp_ns))
-    places = np.column_stack([np.interp(at, known, axis) for axis in crane.position_m.T])
-    return _spread(stamps_ns, places, keyframe_spacing_m(camera, range_m, min_shift))
-
-
-def keyframe_spacing_m(camera: RectifiedCamera, range_m: float, min_shift: float) -> float:
-    """Return the way on a surface range_m away that min_shift of a picture's shorter side spans, m."""
-    return min_shift * min(camera.width, camera.height) * range_m / camera.focal_px
-
-
-def _spread(stamps_ns: Sequence[int], places_m: Float64, min_m: float) -> list[int]:
-    """Select stamps whose place (N, 3) lies min_m from the last one taken; the first and the last
-    always.
-    """
-    taken: list[int] = []
-    last: Float64 | None = None
-    for stamp, place in zip(stamps_ns, places_m, strict=True):
-        if last is None or np.linalg.norm(place - last) >= min_m or stamp == stamps_ns[-1]:
-            taken.append(stamp)
-            last = place
-    return taken
 
 
 def points_per_pixel(first: RecordingProbe, cell_m: float) -> int:

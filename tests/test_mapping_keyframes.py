@@ -1,4 +1,4 @@
-"""Which frames of a recording are matched."""
+"""Keyframes: the frames of a recording that are matched."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from barsight.core.errors import ConfigError
 from barsight.core.pose import Pose
 from barsight.core.types import CraneSamples, PosedFrame, RectifiedCamera
-from barsight.mapping.scene_extent import select_keyframes, select_keyframes_by_encoders
+from barsight.mapping.keyframes import select_keyframes, select_keyframes_by_encoders
 from barsight.mapping.settings import MapSettings
 from barsight.measure_settings import MeasureSettings
 
