@@ -110,7 +110,9 @@ def fit_tag(image: UInt8, number: int, quad: Float64) -> Float64 | None:
     cell = max(2, int(np.ceil(side / TAG_MODULES)))
     drawn = np.kron(tag_pattern(number), np.ones((cell, cell))).astype(np.float32)
     drawn = cv2.GaussianBlur(drawn, (0, 0), BLUR_PX * cell * TAG_MODULES / side)
-    near, far = TAG_QUIET * cell - 0.5, (TAG_QUIET + TAG_MODULES) * cell - 0.5
+    edge = cell // 2  # what lies beside the paper blurs into its rim
+    drawn = np.ascontiguousarray(drawn[edge:-edge, edge:-edge])
+    near, far = TAG_QUIET * cell - edge - 0.5, (TAG_QUIET + TAG_MODULES) * cell - edge - 0.5
     corners = np.array([[near, near], [far, near], [far, far], [near, far]], np.float32)
     start = cv2.getPerspectiveTransform(corners, (quad - low).astype(np.float32)).astype(np.float32)
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-6)
