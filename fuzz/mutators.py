@@ -240,15 +240,15 @@ def _reseal(path: Path, **changes: Any) -> None:
 
 
 def reseal_folder(folder: Path) -> None:
-    """Make result.json's digests of the map's files hold again, after one of them was damaged."""
-    from barsight.result_folder import MAP_FILES, file_digest
+    """Make result.json's digests of its files hold again, after one of them was damaged."""
+    from barsight.result_folder import SEALED, file_digest
 
     path = folder / "result.json"
     if not path.is_file() or path.is_symlink() or path.stat().st_size > MAX_DAMAGED_BYTES:
         return
     try:
         tree = json.loads(path.read_text())
-        for name in MAP_FILES:
+        for name in SEALED:
             if (folder / name).is_file() and (folder / name).stat().st_size < 1 << 26:
                 tree["files"][name] = file_digest(folder / name)
     except (OSError, ValueError, TypeError, KeyError):

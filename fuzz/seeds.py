@@ -10,14 +10,24 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from barsight.acceptance.commissioning import GuidedStep, begin, walk
+from barsight.acceptance.watch import Approval, WatchedFigure, WatchedSurvey, WatchRecord, write_watch
 from barsight.calibration.files.euroc import read_rig
 from barsight.calibration.files.rig_file import write_rig_file
 from barsight.calibration.files.yaml_document import write_document
 from barsight.cli.main import run
 from barsight.core.files import atomic_directory
+from barsight.core.reading.sealed_json import write_sealed
+from barsight.fleet.ledger import HeldRecording, claim, park, publish
+from barsight.fleet.objects import open_objects
+from barsight.fleet.records import find_version, read_tasks
+from barsight.plant.opcua.security.access import add_user
 from barsight.plant.telegram import IN_MAGIC, VERSION, pack
+from barsight.recording.open import open_recording
+from barsight.result_folder import file_digest
 from barsight.simulation.settings import CameraSettings, SimulationSettings, YardSettings
 from barsight.simulation.simulate import simulate
+from barsight.store.opening import open_store
 from barsight.yard.magnet.description import example_magnet
 from fuzz.mutators import reseal_folder
 
@@ -43,7 +53,10 @@ def make_seeds(folder: Path) -> None:
         _files(made)
         for name, shift_m in (("out", 0.0), ("old", 0.1)):
             write_results(made / name, shift_m)
+            _measured_from(made / name, made / "euroc")
             _done(["lifts", str(made / name), "--magnet", str(made / "magnet.toml"), "--at", "end"])
+        _fleet(made)
+        _acceptance(made)
 
 
 def _done(command: list[str]) -> None:
@@ -60,6 +73,19 @@ def write_results(folder: Path, shift_m: float) -> None:
     for name in ("cloud.ply", "contour.csv", "laser.csv", "trajectory.tum", "preview.png"):
         shutil.copyfile(more / name, folder / name)
     shutil.rmtree(more)
+    reseal_folder(folder)
+
+
+def _measured_from(folder: Path, recording: Path) -> None:
+    """Make a result one of this recording: its poses at the recording's stamps, its digests."""
+    opened = open_recording(recording)
+    poses = [f"{stamp / 1e9:.9f} {k}.0 0.15 8.0 1 0 0 0" for k, stamp in enumerate(opened.index.stamps_ns)]
+    (folder / "trajectory.tum").write_text("\n".join(poses) + "\n")
+    result = json.loads((folder / "result.json").read_text())
+    result["hashes"]["inputs"] = opened.digests()
+    result["recording"]["path"] = recording.name
+    result["configuration"] = {"stereo": {"calibration_sigma_px": 0.1}}
+    (folder / "result.json").write_text(json.dumps(result))
     reseal_folder(folder)
 
 
@@ -132,7 +158,63 @@ def _places(made: Path) -> None:
     (made / "plant.toml").write_text(
         '[store]\nurl = "sqlite:///y.db"\nmagnet_steps_kg = [1000.0, 3000.0]\n[telegram]\nport = 2000\n'
     )
+    (made / "users.toml").write_text(
+        '[store]\nurl = "sqlite:///y.db"\nmagnet_steps_kg = [1000.0]\n[opcua]\nfolder = "opcua"\n'
+        'users = "users.json"\n'
+    )
     (made / "telegram.bin").write_bytes(pack("in", {"magic": IN_MAGIC, "version": VERSION, "life": 7}))
+
+
+def _acceptance(made: Path) -> None:
+    """Write what commissioning and service keep of a rig."""
+    row = {"group": "touch_mm", "name": "touch: x", "error": 1.5, "decision": "passed"}
+    write_sealed({"schema_version": 1, "quantities": [row], "plan": {}}, made / "certificate.json")
+    figures = tuple(WatchedFigure(name, 0.1, 0.02) for name in ("yaw / deg", "baseline / mm"))
+    surveys = tuple(WatchedSurvey(f"r{k}", f"id{k}", "c", figures) for k in range(12))
+    approval = Approval("ann", "new", "2026-01-01T00:00:00+00:00", "c", 2)
+    write_watch(WatchRecord(surveys, (approval,)), made / "watch.json")
+    (made / "plan.toml").write_text(
+        'yard = "Y"\n[[plate]]\nname = "P1"\nx_m = 1.0\ny_m = 2.0\nz_m = 0.02\nsize_m = [0.5, 0.5]\n'
+        '[[sphere]]\nname = "S1"\nx_m = 0.5\ny_m = 0.5\nz_m = 0.3\ndiameter_m = 0.2\nplace_sigma_m = 0.001\n'
+    )
+    add_user(made / "users.json", "ann", "operator", "a long password")
+    folder = made / "commission"
+    begin(folder)
+    waits = GuidedStep("cameras", ("board",), ("rig.yaml",), "pictures", lambda: "done")
+    (folder / "given").write_text("x")
+    walk(folder, (GuidedStep("first", ("given",), ("given",), "", lambda: "done"), waits))
+
+
+def _fleet(made: Path) -> None:
+    """Write an archive of a recording and a survey, and results of two versions as a run leaves them: one
+    recording published under both, one parked, one under way.
+    """
+    archive, kept = made / "archive", made / "fleet"
+    for name in ("one", "survey/first", "two"):
+        (archive / name / "mav0").mkdir(parents=True)
+        (archive / name / "mav0" / "body.yaml").write_text(f"name: {name}\n")
+    (archive / "survey" / "survey.json").write_text('{"passes": ["first"]}')
+    (made / "fleet.toml").write_text(
+        'yard = "yard.yaml"\n[bundles]\nstock_list = "stock.csv"\n[map]\ncell_m = 0.05\n'
+    )
+    store = f"sqlite:///{kept}/yard.db"
+    results = open_objects(str(kept), create=True)
+    for out, flag, file in (("out", "--rig", "rig.yaml"), ("old", "--magnet", "magnet.toml")):
+        words = ["--results", str(kept), "--store", store, flag, str(made / file)]
+        _done(["fleet", "plan", str(archive), *words])
+        with open_store(store) as opened, opened.reading() as connection:
+            keys = [task.key for task in read_tasks(connection, find_version(connection, None))]
+        told = {}
+        for path in (made / out).iterdir():
+            results.upload(path, f"files/{keys[0]}/t/{path.name}")
+            told[path.name] = {"bytes": path.stat().st_size, "sha256": file_digest(path)}
+        note = {"measured_s": 1.0, "whole_s": 2.0, "peak_bytes": 1, "files": told}
+        publish(results, HeldRecording(keys[0], 1, "t"), note)
+        park(results, keys[1], "refused: exit code 3", 3)
+        if out == "old":
+            claim(results, keys[2], 60.0)
+        else:
+            park(results, keys[2], "timeout: did not end in 5 s", 3)
 
 
 def _corners(folder: Path) -> None:

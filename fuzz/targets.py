@@ -130,7 +130,51 @@ def _rig(name: str) -> Target:
     return Target(f"rig {name}", (name,), (name,), call, ("made.yaml",), 1.5)
 
 
+def _watch(folder: Path) -> int:
+    from barsight.acceptance.watch import control_charts, read_watch
+
+    control_charts(read_watch(folder / "watch.json").since_approval)
+    return 0
+
+
+def _plan(folder: Path) -> int:
+    from barsight.artefacts.plan import read_plan
+
+    read_plan(folder / "plan.toml")
+    return 0
+
+
+def _users(folder: Path) -> int:
+    from barsight.plant.opcua.security.access import read_users
+
+    read_users(folder / "users.json")
+    return 0
+
+
+def compare_versions(folder: Path) -> int:
+    """Compare the two versions of the fleet's folder."""
+    first, second = sorted(path.name for path in (folder / "fleet/versions").iterdir())
+    store = f"sqlite:///{folder}/fleet/yard.db"
+    words = ("--results", f"{folder}/fleet", "--store", store, "-o", f"{folder}/made")
+    return run_and_print(["fleet", "compare", first, second, *words])
+
+
+def promote_version(folder: Path) -> int:
+    """Promote the version of the fleet's folder that ran to its end."""
+    first = next(path.parent.name for path in (folder / "fleet/versions").glob("*/rig.yaml"))
+    store = f"sqlite:///{folder}/fleet/yard.db"
+    words = ("--results", f"{folder}/fleet", "--store", store, "--into", f"{folder}/made")
+    return run_and_print(["fleet", "promote", first, *words])
+
+
 RESULT = ("out/*",)
+FLEET = (
+    "fleet/results/**/*",
+    "fleet/files/**/*.json",
+    "fleet/parked/*",
+    "fleet/claims/**/*",
+    "fleet/yard.db",
+)
 TARGETS = (
     _info("euroc", 4), _info("mcap", 2), _info("sqlite", 2), _info("ros1", 2), _info("kitti", 3),
     _convert("euroc", "ros2-mcap"), _convert("kitti", "euroc"), _convert("mcap", "euroc"),
@@ -188,9 +232,38 @@ TARGETS = (
         run_words("labels", "FOLDER/euroc", "FOLDER/out"), ("out",), 0.2
     ),
     Target(
-        "fleet", ("euroc",), ("euroc/mav0/**/*",),
-        run_words("fleet", "plan", "FOLDER/euroc", "--results", "FOLDER/made", "--store", "sqlite:///FOLDER/yard.db"),
-        (), 0.2, warm=False,
+        "fleet plan", ("archive", "fleet.toml", "magnet.toml", "rig.yaml", "yard.yaml", "stock.csv"),
+        ("archive/**/*", "fleet.toml", "magnet.toml", "rig.yaml", "yard.yaml", "stock.csv"),
+        run_words(
+            "fleet", "plan", "FOLDER/archive", "--results", "FOLDER/made", "--store", "sqlite:///FOLDER/yard.db",
+            "--config", "FOLDER/fleet.toml", "--magnet", "FOLDER/magnet.toml", "--rig", "FOLDER/rig.yaml",
+        ), (), 0.6, warm=False,
+    ),
+    Target(
+        "fleet status", ("fleet",), FLEET,
+        run_words("fleet", "status", "--results", "FOLDER/fleet", "--store", "sqlite:///FOLDER/fleet/yard.db"),
+        (), 0.5, warm=False,
+    ),
+    Target("fleet compare", ("fleet",), FLEET, compare_versions, ("made",), 0.5, warm=False),
+    Target("fleet promote", ("fleet",), FLEET, promote_version, (), 0.5, warm=False),
+    Target(
+        "budget", ("euroc", "out", "certificate.json"), (*RESULT, "certificate.json"),
+        run_words(
+            "budget", "FOLDER/out", "--certificate", "FOLDER/certificate.json", "-o", "FOLDER/made.json"
+        ),
+        ("made.json",), 0.5, warm=False,
+    ),
+    Target(
+        "accept --plan", ("euroc", "out"), RESULT,
+        run_words("accept", "--plan", "FOLDER/out", "-o", "FOLDER/made.toml"), ("made.toml",), 0.5,
+        warm=False,
+    ),
+    Target("plan of acceptance", ("plan.toml",), ("plan.toml",), _plan),
+    Target("watch", ("watch.json",), ("watch.json",), _watch),
+    Target("users", ("users.json",), ("users.json",), _users, (), 0.5),
+    Target(
+        "commission", ("commission",), ("commission/*",),
+        run_words("commission", "FOLDER/commission"), (), 0.5,
     ),
     Target("export", ("out",), RESULT, run_words("export", "FOLDER/out", "FOLDER/made.las"), ("made.las",)),
     Target("view", ("out",), RESULT, _view, (), 0.6, warm=False),

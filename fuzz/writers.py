@@ -6,7 +6,7 @@ import os
 import sys
 from pathlib import Path
 
-from fuzz.targets import Call, Target, run_words
+from fuzz.targets import Call, Target, compare_versions, promote_version, run_words
 
 
 def exec_words(*words: str) -> Call:
@@ -19,6 +19,21 @@ def exec_words(*words: str) -> Call:
         os.execv(sys.executable, [sys.executable, "-m", "barsight", *filled])
 
     return call
+
+
+def typed_words(text: str, *words: str) -> Call:
+    """Run a command that asks for a text on the standard input."""
+    call = run_words(*words)
+
+    def typed(folder: Path) -> int:
+        read, write = os.pipe()
+        os.write(write, text.encode())
+        os.close(write)
+        os.dup2(read, 0)
+        sys.stdin = os.fdopen(0, closefd=False)
+        return call(folder)
+
+    return typed
 
 
 TINY_YARD = (
@@ -60,7 +75,37 @@ WRITERS = (
         "compare", ("out", "old"), (),
         run_words("compare", "FOLDER/out", "FOLDER/old", "--json", "FOLDER/made.json"), ("made.json",),
     ),
+    Target(
+        "labels", ("euroc", "out"), (), run_words("labels", "FOLDER/euroc", "FOLDER/out"), ("out",),
+        warm=False,
+    ),
+    Target(
+        "budget", ("euroc", "out"), (), run_words("budget", "FOLDER/out", "-o", "FOLDER/made.json"),
+        ("made.json",), warm=False,
+    ),
     Target("store add", ("out",), (), run_words("store", "add", "sqlite:///FOLDER/yard.db", "FOLDER/out")),
+    Target(
+        "store user", ("fleet",), (),
+        typed_words(
+            "a long password\n", "store", "user", "sqlite:///FOLDER/fleet/yard.db", "ann", "--role",
+            "engineer",
+        ),
+    ),
+    Target(
+        "fleet plan", ("archive", "magnet.toml"), (),
+        run_words(
+            "fleet", "plan", "FOLDER/archive", "--results", "FOLDER/made", "--store", "sqlite:///FOLDER/yard.db",
+            "--magnet", "FOLDER/magnet.toml",
+        ), warm=False,
+    ),
+    Target("fleet compare", ("fleet",), (), compare_versions, ("made",), warm=False),
+    Target("fleet promote", ("fleet",), (), promote_version, warm=False),
+    Target("plant scl", (), (), run_words("plant", "scl", "-o", "FOLDER/made.scl"), ("made.scl",)),
+    Target(
+        "plant user", ("users.toml",), (),
+        typed_words("a long password\n", "plant", "user", "ann", "--config", "FOLDER/users.toml"),
+        ("users.json",),
+    ),
     Target(
         "calibrate board", (), (),
         run_words("calibrate", "board", "--board", BOARD, "-o", "FOLDER/made.png", "--dpi", "50"),
@@ -80,6 +125,15 @@ WRITERS = (
         "calibrate export", ("rig.yaml",), (),
         run_words("calibrate", "export", "FOLDER/rig.yaml", "-o", "FOLDER/made.yaml", "--to", "opencv"),
         ("made.yaml",),
+    ),
+    Target(
+        "calibrate check", ("euroc",), (),
+        run_words("calibrate", "check", "FOLDER/euroc", "-o", "FOLDER/made.json"), ("made.json", "made.html"),
+        warm=False,
+    ),
+    Target(
+        "verify", ("euroc",), (), run_words("verify", "FOLDER/euroc", "--record", "FOLDER/made.json"),
+        ("made.json",), warm=False,
     ),
     Target("measure", ("euroc",), (), run_words(*MEASURE), ("made",), warm=False),
     Target("measure --resume", ("euroc",), (), run_words(*MEASURE, "--resume"), ("made",), warm=False),

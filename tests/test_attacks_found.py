@@ -20,6 +20,7 @@ from barsight.calibration.files.rig_file import write_rig_file
 from barsight.cli.main import run
 from barsight.core.errors import InputError
 from barsight.recording.pairing import pair_cameras
+from barsight.result_folder import identify_map
 from barsight.yard.magnet.description import example_magnet
 
 MAX_CPU_S = 8.0
@@ -50,6 +51,23 @@ def resealed(change: Callable[[dict[str, Any]], object]) -> Damage:
     return damage
 
 
+def without_digest(path: Path) -> None:
+    """Leave out what older versions did not write; the identity holds."""
+    result = json.loads(path.read_text())
+    del result["files"]["laser.csv"]
+    path.write_text(json.dumps(result | {"map_id": identify_map(result).map_id}))
+
+
+def then_sealed(damage: Damage) -> Damage:
+    """Seal a result's folder again after one of its files was damaged."""
+
+    def damaged(path: Path) -> None:
+        damage(path)
+        reseal_folder(path.parent)
+
+    return damaged
+
+
 def link_to_itself(path: Path) -> None:
     path.unlink()
     path.symlink_to(path.name)
@@ -58,6 +76,24 @@ def link_to_itself(path: Path) -> None:
 def sparse(path: Path) -> None:
     with path.open("wb") as file:
         file.truncate(1 << 33)
+
+
+def link_out(path: Path) -> None:
+    """Put the same file elsewhere and a link in its place."""
+    recording = next(parent for parent in path.parents if parent.parent.name == "F")
+    path.symlink_to(path.rename(recording.with_name("elsewhere")))
+
+
+def repeated(unit: bytes, times: int) -> Damage:
+    """Put so many equal pieces in the file's place."""
+    return lambda path: path.write_bytes(unit * times)
+
+
+def profiles(path: Path) -> None:
+    """Give each row a profile of its own."""
+    rows = "1.0,0.1,0.1,0.1,1" if path.name == "contour.csv" else "1.0,0.1,0.1"
+    lines = [path.read_text().partition("\n")[0], *(f"{number},{rows}" for number in range(200_000))]
+    path.write_text("\n".join(lines) + "\n")
 
 
 def bomb(path: Path) -> None:
@@ -83,13 +119,33 @@ FOUND: list[tuple[str, Damage, str, str]] = [
     ("euroc/mav0/imu0/sensor.yaml", number(A_NUMBER, "-1e308"), "info F/euroc", "out of range"),
     ("euroc/mav0/imu0/data.csv", number(f",{A_NUMBER}", ",1e300"), "info F/euroc", "line 2: a value is NaN"),
     ("targets.csv", number(A_NUMBER, "-1e308"), "calibrate yard F/targets.csv -o F/made.yaml", "line 2: a"),
+    (
+        "targets.csv", number(r"0\.5", "a" * 140_000), "calibrate yard F/targets.csv -o F/made.yaml",
+        "can't be read (field larger",
+    ),
     ("rig.xml", number(r"(?<=<data>)\s*\S+", "-1e308"), EXPORT, "range"),
     ("out/preview.png", bomb, "report F/out", "at most"),
     ("out/preview.png", sparse, "report F/out", "at most"),
     ("out/ortho.png", bomb, "report F/out", "at most"),
-    ("out/trajectory.tum", number(r" \S+", " 1e999990"), "report F/out", "pose 1: its numbers are"),
-    ("out/trajectory.tum", number(r"(?m)(?<= )\S+$", "5"), "report F/out", "pose 1: its quaternion"),
-    ("out/laser.csv", number(A_NUMBER, "1e999990"), "report F/out", "out of range"),
+    ("out/trajectory.tum", then_sealed(number(r" \S+", " 1e999990")), "report F/out", "pose 1: its numbers"),
+    ("out/trajectory.tum", then_sealed(number(r"(?m)(?<= )\S+$", "5")), "report F/out", "pose 1: its quat"),
+    ("out/laser.csv", then_sealed(number(A_NUMBER, "1e999990")), "report F/out", "out of range"),
+    ("out/laser.csv", then_sealed(number(A_NUMBER, "x")), "report F/out", "laser.csv: is torn"),
+    ("out/contour.csv", number(A_NUMBER, "7"), "report F/out", "is not the one that result.json was written"),
+    ("out/trajectory.tum", number(A_NUMBER, "7"), "lifts F/out", "is not the one that result.json was wr"),
+    ("out/contour.csv", sparse, "report F/out", "at most"),
+    ("out/result.json", without_digest, "report F/out", "has no digest of laser.csv"),
+    ("euroc/mav0/crane0/sensor.yaml", link_out, "info F/euroc", "is a link out of the recording"),
+    ("euroc/mav0/cam1/data.csv", link_out, "convert F/euroc -o F/made --to ros1", "is a link out of the rec"),
+    ("kitti/times.txt", link_out, "info F/kitti", "is a link out of the recording"),
+    ("mcap/crane0.yaml", link_out, "convert F/mcap -o F/made --to euroc", "is a link out of the recording"),
+    ("mcap/camchain-imucam.yaml", link_out, "convert F/mcap -o F/made --to euroc", "is a link out of its"),
+    ("euroc/mav0/cam0/data.csv", repeated(b"1,a\n", 7_000_000), "info F/euroc", "has over 500000 lines"),
+    ("euroc/mav0/imu0/data.csv", repeated(b"\n", 29_000_000), "info F/euroc", "has over 4000000 lines"),
+    ("euroc/mav0/imu0/data.csv", repeated(b"1", 29_000_000), "info F/euroc", "has a line of over"),
+    ("out/contour.csv", then_sealed(profiles), "report F/out", "holds 200000 profiles, at most 5000"),
+    ("euroc/mav0/laser0/data.csv", profiles, "measure F/euroc -o F/made", "has 200000 profiles, at most"),
+    ("out/bundles.json", repeated(b"[],", 10_000_000), "lifts F/out", "over 4000000 values"),
     ("out/height.tif", sparse, "explain F/out 1", "is torn"),
     ("out/tops.tif", sparse, "export F/out F/made.las", "is torn"),
     ("out/cloud.ply", sparse, "store add sqlite:///F/yard.db F/out", "cloud.ply"),

@@ -12,29 +12,33 @@ from datetime import datetime
 from pathlib import Path
 
 import pytest
+from fuzz.seeds import write_results
 from sqlalchemy import select
 
+from barsight.cli.arguments import load_settings
 from barsight.cli.main import run
 from barsight.core.errors import ConfigError, Failed, InputError
-from barsight.fleet.archive import find_recordings, manifest_digest
+from barsight.fleet.archive import download, find_recordings, manifest_digest
 from barsight.fleet.cluster import connect
-from barsight.fleet.comparing import FigureChange, RecordingComparison
+from barsight.fleet.comparing import FigureChange, RecordingComparison, compare_recording
 from barsight.fleet.comparison_page import comparison_page
 from barsight.fleet.driver import count_states, drive, parked_reasons
 from barsight.fleet.findings import holm, judge
 from barsight.fleet.ledger import HeldRecording, claim, held, publish, published_keys
 from barsight.fleet.limits import LimitedRun, run_limited
 from barsight.fleet.objects import Objects, open_objects
-from barsight.fleet.planning import estimate, in_order, plan_tasks
+from barsight.fleet.planning import TaskChoice, estimate, plan_tasks
 from barsight.fleet.records import note_plan, noted_keys
 from barsight.fleet.scratch import scratch_root, sweep
 from barsight.fleet.task import TaskLimits, TaskSettings, run_task
-from barsight.fleet.versions import Version, installed_software
+from barsight.fleet.versions import Version, arguments, installed_software, publish_version
 from barsight.fleet.window import RunWindow
+from barsight.measure_settings import MeasureSettings
 from barsight.store.audit import AuditChain, entry, verify_chain
 from barsight.store.opening import open_store
 from barsight.store.promotion import counts, promoted_version
 from barsight.store.tables import FLEET_SURVEYS, PROMOTIONS, SURVEYS
+from barsight.yard.magnet.description import example_magnet
 from fleet_rounds import make_archive, moto_server, stand_in
 
 VERSION = Version("v1", "configuration", "", "", installed_software())
@@ -66,6 +70,29 @@ def test_a_key_tells_content_and_version_and_not_the_place(tmp_path: Path) -> No
     assert manifest_digest(archive, results, found[0], read.append) == first
     assert len(read) == count, "an unchanged listing is not read again"
     assert VERSION.key(first) != replace(VERSION, calibration="c").key(first) != VERSION.key(other)
+
+
+def test_files_that_a_configuration_names_count_by_their_content(tmp_path: Path) -> None:
+    results = open_objects(str(tmp_path / "r"), create=True)
+    places = {"a": "name,x_m,y_m\nA,1,1\n", "b": "name,x_m,y_m\nA,1,1\n", "c": "name,x_m,y_m\nA,2,1\n"}
+    made = {}
+    for name, text in places.items():
+        (tmp_path / f"{name}.csv").write_text(text)
+        (tmp_path / f"{name}.toml").write_text(f'[bundles]\nstock_list = "{tmp_path}/{name}.csv"\n')
+        config = tmp_path / f"{name}.toml"
+        chosen = load_settings(config, MeasureSettings)
+        made[name] = publish_version(results, chosen, config, None, None)
+    assert made["a"].configuration == made["b"].configuration != made["c"].configuration
+    (tmp_path / "work").mkdir()
+    (tmp_path / "c.csv").unlink()  # another machine does not have it
+    words = arguments(results, made["c"], tmp_path / "work")
+    taken = Path(words[words.index("--bundles.stock-list") + 1])
+    assert taken == tmp_path / "work" / "stock.csv" and taken.read_text() == places["c"]
+    (tmp_path / "c.toml").write_text('yard = "none.yaml"\n')
+    with pytest.raises(InputError, match=r"none\.yaml: no such file"):
+        publish_version(
+            results, load_settings(tmp_path / "c.toml", MeasureSettings), tmp_path / "c.toml", None, None
+        )
 
 
 def test_a_claim_has_one_owner_until_its_lease_runs_out(tmp_path: Path) -> None:
@@ -172,7 +199,7 @@ def test_the_estimate_is_by_what_was_measured_and_priorities_come_first(tmp_path
     tasks = [replace(t, pairs=10) for t in plan_tasks(archive, results, VERSION, None, no_progress)]
     told = estimate(tasks, [(1, 5, 20.0, 7), (1, 10, 40.0, 9)])
     assert told.seconds == pytest.approx(3 * 40.0) and told.written_bytes == 24
-    assert [task.name for task in in_order(tasks, ("c/", "b"))] == ["c/d", "b", "a"]
+    assert [task.name for task in TaskChoice(first=("c/", "b")).of(tasks)] == ["c/d", "b", "a"]
 
 
 def change(recording: str, shift: float, sigma: float, p: float) -> RecordingComparison:
@@ -215,6 +242,66 @@ def test_a_promoted_version_hides_the_other_survey_of_its_recording(tmp_path: Pa
         assert seen() == ["live1", "live2"]
         with store.reading() as connection:
             assert promoted_version(connection) == "" and isinstance(verify_chain(connection), AuditChain)
+
+
+def test_sizes_are_looked_at_before_anything_is_read(tmp_path: Path) -> None:
+    make_archive(tmp_path / "a", {"r": "x"})
+    objects = open_objects(str(tmp_path / "a"))
+    (tmp_path / "a/large.json").touch()
+    for path in (tmp_path / "a/large.json", tmp_path / "a/r/mav0/kind"):
+        os.truncate(path, 1 << 33)
+    began = time.process_time()
+    with pytest.raises(InputError, match=r"large\.json: has 8589934592 bytes"):
+        objects.read_json("large.json")
+    with pytest.raises(InputError, match=r"r/mav0/kind: has 8589934592 bytes"):
+        plan_tasks(objects, open_objects(str(tmp_path / "r"), create=True), VERSION, None, no_progress)
+    with pytest.raises(InputError, match=r"large\.json: has 8589934592 bytes"):
+        publish_version(objects, MeasureSettings(yard=tmp_path / "a/large.json"), None, None, None)
+    assert time.process_time() - began < 4
+
+
+def test_an_archive_s_links_lead_to_recordings_and_not_out_of_them(tmp_path: Path) -> None:
+    make_archive(tmp_path / "disk", {"r": "x"})
+    make_archive(tmp_path / "a", {"s": "x"})
+    (tmp_path / "a/r").symlink_to(tmp_path / "disk/r")
+    objects, results = open_objects(str(tmp_path / "a")), open_objects(str(tmp_path / "r"), create=True)
+    tasks = plan_tasks(objects, results, VERSION, None, no_progress)
+    assert sorted(task.name for task in tasks) == ["r", "s"]
+    (tmp_path / "secret").write_text("secret")
+    (tmp_path / "a/s/mav0/kind").unlink()
+    (tmp_path / "a/s/mav0/kind").symlink_to(tmp_path / "secret")
+    with pytest.raises(InputError, match=r"s/mav0/kind: is a link out of the recording"):
+        plan_tasks(objects, results, VERSION, None, no_progress)
+    (tmp_path / "work").mkdir()
+    with pytest.raises(InputError, match=r"s/mav0/kind: is a link out of the recording"):
+        list(download(objects, "s", (".",), tmp_path / "work"))
+    assert not [path for path in (tmp_path / "work").rglob("*") if path.is_file()]
+
+
+def test_a_changed_document_is_not_compared(tmp_path: Path) -> None:
+    write_results(tmp_path / "out", 0.0)
+    (tmp_path / "magnet.toml").write_text(example_magnet())
+    words = ["lifts", str(tmp_path / "out"), "--magnet", str(tmp_path / "magnet.toml")]
+    assert run([*words, "--at", "end"]) == 0
+    results = open_objects(str(tmp_path / "r"), create=True)
+    note = {"measured_s": 1.0, "whole_s": 1.0, "peak_bytes": 1, "files": {}}
+    for key in ("a", "b"):
+        for path in (tmp_path / "out").iterdir():
+            results.upload(path, f"files/{key}/t/{path.name}")
+        assert publish(results, HeldRecording(key, 1, "t"), note)
+    same = compare_recording(results, "one", "a", "b")
+    assert same is not None and len(same.changes) == 12 and not any(one.sigma == 0 for one in same.changes)
+    assert all(change.before == change.after for change in same.changes)
+    path = tmp_path / "r/files/b/t/bundles.json"
+    path.write_text(path.read_text().replace('"length_m": ', '"length_m": 1', 1))
+    with pytest.raises(InputError, match="was changed after it was written"):
+        compare_recording(results, "one", "a", "b")
+    path.unlink()
+    with pytest.raises(InputError, match=r"bundles\.json: is gone"):
+        compare_recording(results, "one", "a", "b")
+    (tmp_path / "r/results/b/result.json").write_text('{"key": "b", "token": 7}')
+    with pytest.raises(InputError, match="as its schema says"):
+        compare_recording(results, "one", "a", "b")
 
 
 def test_the_listing_knows_its_objects(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 import ast
 import re
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import barsight
@@ -27,6 +27,8 @@ TESTS = {
 }
 MAX_LINES = 60
 MAX_PARAMETERS = 10
+MIN_TWIN = 18
+"""Nodes of syntax from which on a body may stand only once."""
 ARRAYS = re.compile(r"\b(?:U?Int\d+|Float\d+|Bool|NDArray)\b")
 EXTENT = r"[^(),]*\b(?:[A-Z_]+|[1-9]\d*|[a-z]+s)\b[^(),]*"
 SHAPE = re.compile(rf"\((?:{EXTENT},\s*)+(?:{EXTENT})?\)")
@@ -116,6 +118,16 @@ def wide_kernels(tree: ast.AST) -> set[str]:
     }
 
 
+def wide_functions(tree: ast.AST) -> set[str]:
+    """Functions of more parameters than a kernel may have; `self` and `cls` aside."""
+    found = set()
+    for f in functions(tree):
+        own = [a.arg for a in (*f.args.posonlyargs, *f.args.args, *f.args.kwonlyargs)]
+        if len(own) - (own[:1] in (["self"], ["cls"])) > MAX_PARAMETERS:
+            found.add(f.name)
+    return found
+
+
 def names_used(trees: Iterable[ast.AST]) -> set[str]:
     """All that is imported, as `package.module.name`: by its name, or with its module and used from there."""
     used = set()
@@ -134,6 +146,21 @@ def names_used(trees: Iterable[ast.AST]) -> set[str]:
 def repeated_classes(trees: Iterable[ast.AST]) -> set[str]:
     names = Counter(n.name for tree in trees for n in documented(tree) if isinstance(n, ast.ClassDef))
     return {name for name, times in names.items() if times > 1}
+
+
+def twins(trees: Mapping[str, ast.AST]) -> list[set[str]]:
+    """Functions with the same body, docstring aside; short ones, as properties are, may be."""
+    places: dict[str, set[str]] = {}
+    for module, tree in trees.items():
+        for f in functions(tree):
+            body = [ast.dump(node) for node in f.body[ast.get_docstring(f) is not None :]]
+            if sum(part.count("(") for part in body) >= MIN_TWIN:
+                places.setdefault("".join(body), set()).add(f"{module}.{f.name}")
+    return [names for names in places.values() if len(names) > 1]
+
+
+def test_no_function_stands_twice() -> None:
+    assert twins(TREES | PROGRAMS) == []
 
 
 def test_every_kernel_has_a_docstring() -> None:
@@ -161,6 +188,12 @@ def test_bounds_are_called_min_and_max() -> None:
 
 def test_kernels_have_few_parameters() -> None:
     assert {m: names for m, tree in TREES.items() if (names := wide_kernels(tree))} == {}
+
+
+def test_functions_have_few_parameters() -> None:
+    found = {m: names for m, tree in (TREES | PROGRAMS).items() if (names := wide_functions(tree))}
+    # Numba hands an intrinsic its values one by one.
+    assert found == {"stereo.direct.semiglobal.paths": {"_extend_paths"}}
 
 
 def test_every_kernel_is_tested() -> None:
@@ -194,8 +227,15 @@ def test_what_breaks_a_rule_is_found() -> None:
     assert extremes(ast.parse("def f(utmost, min_m):\n    most = least_squares(at_most.x)")) == set()
     names = ", ".join(f"x{i}" for i in range(MAX_PARAMETERS))
     wide = ast.parse(f"@kernel()\ndef even({names}):\n    pass\n@kernel()\ndef more({names}, y):\n    pass\n")
-    assert wide_kernels(wide) == {"more"}
+    assert wide_kernels(wide) == {"more"} == wide_functions(wide)
+    method = ast.parse(
+        f"class A:\n    async def even(self, {names}): ...\n    def more(self, {names}, *, y): ..."
+    )
+    assert wide_functions(method) == {"more"}
     assert questions(ast.parse('"""How it works."""\nclass A:\n    """Howitzer."""')) == ["How it works."]
+    once = "def {}(a, b):\n    {}return [x * a + b for x in range(a) if x > b and x != 7]"
+    same = {"m": ast.parse(once.format("f", "")), "n": ast.parse(once.format("g", "'told'\n    "))}
+    assert twins(same) == [{"m.f", "n.g"}] and twins({"m": same["m"]}) == []
     assert repeated_classes([ast.parse("class A: ...\nclass B: ..."), ast.parse("class A: ...")]) == {"A"}
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import InputError
-from barsight.core.json_values import json_digest
+from barsight.core.json_values import json_digest, json_value
 from barsight.core.notices import Notice
 from barsight.core.pose import Pose, nearest_rotation, skew
 from barsight.core.types import PosedFrame, Trajectory
@@ -22,7 +22,6 @@ from barsight.mapping.passes.joined_surface import PassSurface, join_surfaces, m
 from barsight.mapping.surface.surface import Surface
 from barsight.mapping.top_photo import TopPhoto
 from barsight.measure_settings import MeasureSettings
-from barsight.measurement import to_json
 from barsight.recording.base import Recording
 from barsight.registration.pass_ties import PairTie, PassCorrection, PassPrior, PassTies, tie_passes
 from barsight.yard.types import Bundle
@@ -115,7 +114,7 @@ def _mounting(recording: Recording) -> str:
         problem = "it has no crane encoders, which place several passes in one yard"
         raise InputError(recording.path, problem, "measure it by itself")
     hung = {"lever": crane.crane_to_body_m, "attitude": crane.yard_from_body_nominal}
-    return json_digest(to_json([asdict(recording.rig), hung]))
+    return json_digest(json_value([recording.rig, hung]))
 
 
 def join_passes(passes: Sequence[MappedPass], surfaces: Sequence[Surface], folder: Path) -> JoinedPasses:

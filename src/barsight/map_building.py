@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import chain, islice, pairwise, takewhile
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.calibration.stereo.disparity_uncertainty import disparity_sigma_px
 from barsight.checkpoint import checkpoint_folder, checkpointed, pictures_digest
 from barsight.core.errors import Failed, InputError, MeasurementError
-from barsight.core.json_values import json_digest
+from barsight.core.json_values import json_digest, json_value
 from barsight.core.memory import trim_heap
 from barsight.core.notices import Notice
 from barsight.core.parallel import WORKERS, prefetched_map
@@ -38,7 +38,7 @@ from barsight.mapping.tiles import TileStore
 from barsight.mapping.top_photo import TopPhoto
 from barsight.mapping.view import MatchedFrame, Matcher, Neighbour, PointBinner, PosedView
 from barsight.measure_settings import MeasureSettings
-from barsight.measurement import Preview, Refusal, to_json
+from barsight.measurement import Preview, Refusal
 from barsight.motion.rig_check.self_calibration import self_calibrate
 from barsight.motion.settings import make_estimator
 from barsight.pair_chain import PairChain
@@ -163,7 +163,7 @@ def inspect_recording(
     source, watch = in_yard(source, settings.yard), Stopwatch()
     if faults := clock_faults(source):
         raise InputError(source.path, "; ".join(faults), "or leave the sensor out of use")
-    configuration, inputs = to_json(asdict(settings)), source.digests()
+    configuration, inputs = json_value(settings), source.digests()
     checkpoints = None
     if resume is not None:
         frame = frame_of(source)
@@ -281,7 +281,7 @@ def build_map(
 def checkpoint_key(recording: Recording, configuration: dict[str, Any], inputs: dict[str, str]) -> str:
     """Return a digest of all that trajectory and disparities depend on."""
     stages = {name: part for name, part in configuration.items() if name not in ("bundles", "lift")}
-    rig = to_json(asdict(recording.rig))
+    rig = json_value(recording.rig)
     return json_digest([barsight.__version__, stages, inputs, rig, pictures_digest(recording)])
 
 

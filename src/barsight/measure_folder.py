@@ -11,19 +11,18 @@ from barsight.core.compiling.ahead import compile_ahead
 from barsight.core.errors import ConfigError, OutputError
 from barsight.core.files import atomic_directory, lies_within
 from barsight.core.json_values import write_json
-from barsight.core.notices import Notice
 from barsight.core.parallel import in_background
 from barsight.core.settings.values import expect_choice
 from barsight.evaluation.score import score_folder
 from barsight.map_building import ProgressCallback
 from barsight.measure_settings import MeasureSettings
-from barsight.pipeline import find_lifts, map_yard
+from barsight.pipeline import LiftRequest, find_lifts, map_yard
 from barsight.recording.base import Recording
 from barsight.recording.open import open_recording
 from barsight.report.page import write_report
-from barsight.report.result_files import RESULT_FILES, summary, write_results, write_surface
+from barsight.report.result_files import RESULT_FILES, summary, write_results, write_surface, write_tables
 from barsight.result_folder import seal_map
-from barsight.yard.magnet.description import Magnet, load_magnet
+from barsight.yard.magnet.description import load_magnet
 
 
 def ignore_progress(stage: str, done: int, total: int) -> None:
@@ -48,7 +47,7 @@ def measure_into(
     paths: a recording, or several passes over one yard, which become one map.
     resume: keep what is done in `.NAME.resume` beside `out`, and go on from what is there.
     truth_of: a recording with truth to score against; only after the measuring is done. judged_at: when
-    lifts are judged, see `barsight.pipeline.find_lifts`.
+    lifts are judged, see `barsight.pipeline.LiftRequest`.
     """
     expect_choice("at", judged_at, ("now", "end"))
     chosen = [paths] if isinstance(paths, Path) else list(paths)
@@ -58,11 +57,10 @@ def measure_into(
         if lies_within(out, path):
             raise OutputError(f"{out}: lies in the recording itself; name a folder elsewhere")
     keep = out.absolute().with_name(f".{out.absolute().name}.resume") if resume else None
+    request = LiftRequest(None if magnet is None else load_magnet(magnet), judged_at)
     content = write_measured(
-        [open_recording(path, settings.recording) for path in chosen], out, settings, advance=advance,
-        overwrite=overwrite, keep=keep, truth_of=truth_of,
-        magnet=None if magnet is None else load_magnet(magnet),
-        judged_at=judged_at, report=report,
+        [open_recording(path, settings.recording) for path in chosen], out, settings, request,
+        advance=advance, overwrite=overwrite, keep=keep, truth_of=truth_of, report=report,
     )  # fmt: skip
     if keep is not None:
         shutil.rmtree(keep, ignore_errors=True)
@@ -73,19 +71,15 @@ def write_measured(
     recordings: Sequence[Recording],
     out: Path,
     settings: MeasureSettings,
+    request: LiftRequest,
     *,
     advance: ProgressCallback = ignore_progress,
     overwrite: bool = False,
     keep: Path | None = None,
     truth_of: Path | None = None,
-    magnet: Magnet | None = None,
-    judged_at: Literal["now", "end"] = "now",
     report: bool = True,
-    notices: tuple[Notice, ...] = (),
 ) -> dict[str, Any]:
-    """Measure open recordings; see `measure_into`. keep: a folder of checkpoints to go on from. notices:
-    what the caller knows besides.
-    """
+    """Measure open recordings; see `measure_into`. keep: a folder of checkpoints to go on from."""
     with atomic_directory(out, replace=overwrite, owned=RESULT_FILES) as staging:
         scratch = staging / "scratch"
         scratch.mkdir()
@@ -94,8 +88,9 @@ def write_measured(
         with in_background(
             lambda: write_surface(mapped.surface, mapped.free, mapped.tops, staging, mapped.history)
         ):
-            measured = find_lifts(mapped, magnet, judged_at, notices)
+            measured = find_lifts(mapped, request)
         content = summary(measured)
+        write_tables(measured, staging)
         write_results(measured, seal_map(content, staging), staging)
         shutil.rmtree(scratch)
         if truth_of is not None:

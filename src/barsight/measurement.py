@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from barsight.core.arrays import Float32, UInt8
 from barsight.core.notices import Notice
 from barsight.core.types import Agreement, Contour, LaserProfile, RefusedFrame, Trajectory
@@ -109,14 +107,3 @@ class Measurement:
     travel: Travel
     yard_frame_id: str | None
     passes: tuple[PassRecord, ...] = ()
-
-
-def to_json(value: Any) -> Any:
-    """Convert settings and calibrations to JSON values."""
-    if isinstance(value, dict):
-        return {key: to_json(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [to_json(item) for item in value]
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    return str(value) if isinstance(value, Path) else value

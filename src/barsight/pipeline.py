@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from barsight.core.errors import InputError, MeasurementError
-from barsight.core.json_values import json_digest
+from barsight.core.json_values import json_digest, json_value
 from barsight.core.memory import peak_memory_mib, trim_heap
 from barsight.core.notices import Notice
 from barsight.core.stamps import seconds_to_ns
@@ -41,7 +41,7 @@ from barsight.mapping.surface.laser_profiles import Profiles, cut_profiles
 from barsight.mapping.surface.surface import Surface
 from barsight.mapping.top_photo import TopPhoto
 from barsight.measure_settings import MeasureSettings
-from barsight.measurement import Measurement, PassRecord, StageTime, to_json
+from barsight.measurement import Measurement, PassRecord, StageTime
 from barsight.recording.base import Recording
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.inventory.stock_list import (
@@ -65,6 +65,20 @@ MIN_DOWN_COSINE = 0.5
 """Cosine between the optical axis and straight down; a rig over a yard looks down."""
 MAX_BELOW_FLOOR_RATIO = 0.3
 """Depth under the floor over the working distance, at most; depths of one pair are rough."""
+
+
+@dataclass(frozen=True)
+class LiftRequest:
+    """Lifts that are asked for.
+
+    magnet: what they are chosen for; where there is none, they are judged for the package's example and all
+    forbidden (`no-magnet`). judged_at: when they are judged: now, or at the recording's last frame, to look
+    back. notices: warnings that the caller has.
+    """
+
+    magnet: Magnet | None = None
+    judged_at: Literal["now", "end"] = "now"
+    notices: tuple[Notice, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,35 +188,25 @@ def _whole(trajectories: Sequence[Trajectory]) -> Trajectory:
     )
 
 
-def find_lifts(
-    mapped: MappedYard, magnet: Magnet | None = None, judged_at: Literal["now", "end"] = "now",
-    notices: tuple[Notice, ...] = (),
-) -> Measurement:  # fmt: skip
-    """Find the bundles of a mapped yard and choose lifts.
-
-    magnet: what lifts are chosen for; where there is none, they are judged for the package's example and all
-    forbidden (`no-magnet`). judged_at: when lifts are judged: now, or at the recording's last frame, to look
-    back. notices: warnings that the caller has.
-    """
+def find_lifts(mapped: MappedYard, request: LiftRequest) -> Measurement:
+    """Find the bundles of a mapped yard and choose lifts."""
     settings, newest, trajectory = mapped.settings, mapped.newest, mapped.trajectory
     watch, profiles = mapped.watch, mapped.profiles
     heights = surface_map(mapped.surface, mapped.free, mapped.tops, mapped.history)
     bundles = _bundles(mapped, heights)
     listed = mapped.stock if trajectory.reference == "yard" else None
     stock = None if listed is None else match_stock(listed, bundles)
-    warnings = [*_warnings(mapped), *_stock_notices(mapped.stock, stock), *notices]
+    warnings = [*_warnings(mapped), *_stock_notices(mapped.stock, stock), *request.notices]
     with watch("lifts"):
         travels = [_travel(one.probed, one.way, one.built, settings) for one in mapped.passes]
         travel = travels[0] if len(travels) == 1 else Travel.joined(travels)
-        lifts = _lifts(
-            heights, bundles, magnet, settings.lift, warnings, trajectory, travel, judged_at, stock
-        )
+        lifts = _lifts(heights, bundles, request, settings.lift, warnings, trajectory, travel, stock)
     source = newest.probed.source
     return Measurement(
         recording_path=source.path.resolve(),
         recording_format=source.format,
         is_simulated=any(one.probed.source.is_simulated for one in mapped.passes),
-        calibration_hash=json_digest(to_json(asdict(source.rig))),
+        calibration_hash=json_digest(json_value(source.rig)),
         configuration_hash=json_digest(newest.probed.configuration),
         input_hashes=_input_hashes(mapped.passes),
         configuration=newest.probed.configuration,
@@ -381,22 +385,21 @@ def _travel(
 
 
 def _lifts(
-    heights: YardMap, bundles: tuple[Bundle, ...], magnet: Magnet | None, settings: LiftSettings,
-    warnings: list[Notice], trajectory: Trajectory, travel: Travel, judged_at: Literal["now", "end"],
-    stock: StockMatch | None,
+    heights: YardMap, bundles: tuple[Bundle, ...], request: LiftRequest, settings: LiftSettings,
+    warnings: list[Notice], trajectory: Trajectory, travel: Travel, stock: StockMatch | None,
 ) -> LiftPlan:  # fmt: skip
     """Choose lifts, judged now or at the last frame."""
     told = [(notice.code, notice.message) for notice in warnings]
     captured_to_ns = int(travel.stamp_ns[travel.measured][-1])
-    now_ns = time.time_ns() if judged_at == "now" else captured_to_ns
+    now_ns = time.time_ns() if request.judged_at == "now" else captured_to_ns
     forbidden = map_vetoes(
-        told, trajectory.reference, captured_to_ns, now_ns, settings, has_magnet=magnet is not None
+        told, trajectory.reference, captured_to_ns, now_ns, settings, has_magnet=request.magnet is not None
     )
     listed = {} if stock is None else contradicted_bundles(stock)
     return plan_lifts(
         heights,
         bundles,
-        magnet or load_magnet(None),
+        request.magnet or load_magnet(None),
         settings,
         forbidden,
         travel,

@@ -11,10 +11,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from barsight.core.arrays import Float32, Float64, Int64
+from barsight.core.arrays import Float32, Float64, Int64, rows_by_number
 from barsight.core.errors import InputError
 from barsight.core.json_values import json_digest
-from barsight.core.reading.bounded_reading import in_range, open_regular, read_json, read_text
+from barsight.core.reading.bounded_reading import (
+    MAX_PICTURES,
+    MAX_PROFILES,
+    expect_lines,
+    in_range,
+    open_regular,
+    read_json,
+    read_lines,
+)
 from barsight.core.reading.geotiff import HEIGHT_BANDS, REMEDY, open_geotiff
 from barsight.core.reading.json_schema import expect_schema, package_schema
 from barsight.core.reading.ply import read_vertices
@@ -29,6 +37,9 @@ from barsight.yard.sections import PartedMap
 from barsight.yard.types import HeightMap
 
 MAP_FILES = ("height.tif", "free.tif", "tops.tif", "passes.tif", "cloud.ply")
+TABLES = ("contour.csv", "laser.csv", "trajectory.tum")
+SEALED = (*MAP_FILES, *TABLES)
+"""Files whose digests result.json carries."""
 MAP_FIELDS = (
     "captured_from_ns", "captured_to_ns", "is_simulated", "reference", "hashes", "calibration_id",
     "yard_frame_id", "travel", "warnings", "map", "files",
@@ -82,8 +93,8 @@ def identify_map(summary: dict[str, Any]) -> MapIdentity:
 
 
 def seal_map(summary: dict[str, Any], folder: Path) -> MapIdentity:
-    """Add to result.json's content the digests of the map's files, and the map's id."""
-    files = (folder / name for name in MAP_FILES)
+    """Add to result.json's content the digests of the SEALED files, and the map's id."""
+    files = (folder / name for name in SEALED)
     summary["files"] = {path.name: file_digest(path) for path in files if path.is_file()}
     identity = identify_map(summary)
     summary["map_id"] = identity.map_id
@@ -115,10 +126,12 @@ def open_folder(
     identity = identify_map(summary)
     if identity.map_id != summary["map_id"]:
         raise InputError(path, "was changed after it was written", REMEDY)
-    for name in MAP_FILES:
+    for name in SEALED:
         file, digest = folder / name, (summary.get("files") or {}).get(name)
         if not file.is_file() or (name == "cloud.ply" and not cloud):
             continue
+        if digest is None:
+            raise InputError(path, f"has no digest of {name}: an earlier version wrote it", REMEDY)
         _expect_form(file)
         if file_digest(file) != digest:
             raise InputError(file, "is not the one that result.json was written with", REMEDY)
@@ -134,8 +147,10 @@ def open_folder(
 
 
 def _expect_form(file: Path) -> None:
-    """Refuse by its header a file that would take long to digest and is no map or cloud."""
-    if file.suffix == ".tif":
+    """Refuse by its header a file that would take long to digest and is no map, cloud or table."""
+    if file.name in TABLES:
+        expect_lines(file, remedy=REMEDY)
+    elif file.suffix == ".tif":
         with open_geotiff(file, HEIGHT_BANDS if file.name == "height.tif" else 1):
             pass
     else:
@@ -215,7 +230,7 @@ def read_path(folder: Path) -> CameraPath | None:
         return None
     stamps: list[int] = []
     numbers: list[list[float]] = []
-    for count, line in enumerate(read_text(path, remedy=REMEDY).splitlines(), start=1):
+    for count, line in enumerate(read_lines(path, MAX_PICTURES, REMEDY), start=1):
         fields = line.split()
         if not fields or fields[0].startswith("#"):
             continue
@@ -266,7 +281,7 @@ def read_cloud(path: Path, max_points: int | None = None) -> Cloud:
 def read_contours(folder: Path) -> tuple[Contour, ...]:
     """Read contour.csv, a contour per profile; empty where there is no such file."""
     table = _read_table(folder / "contour.csv", 6)
-    parts = _by_profile(table)
+    parts = _by_profile(folder / "contour.csv", table)
     return tuple(
         Contour(number, part[:, 1], part[:, 2], part[:, 3], part[:, 4], part[:, 5].astype(np.uint8))
         for number, part in parts.items()
@@ -283,19 +298,22 @@ def read_laser(folder: Path) -> tuple[LaserProfile, ...]:
         LaserProfile(
             number, part[:, 1], part[:, 2], part[:, 3], float(part[0, 4]) if stated else float("nan")
         )
-        for number, part in _by_profile(table).items()
+        for number, part in _by_profile(folder / "laser.csv", table).items()
     )
 
 
-def _by_profile(table: Float64) -> dict[int, Float64]:
-    return {int(number): table[table[:, 0] == number] for number in np.unique(table[:, 0])}
+def _by_profile(path: Path, table: Float64) -> dict[int, Float64]:
+    found = rows_by_number(table[:, 0])
+    if len(found) > MAX_PROFILES:
+        raise InputError(path, f"holds {len(found)} profiles, at most {MAX_PROFILES} are read", REMEDY)
+    return {number: table[rows] for number, rows in found.items()}
 
 
 def _read_table(path: Path, *columns: int) -> Float64:
     """Read (N, one of `columns`) from a CSV with a header; an empty field is NaN."""
     if not path.is_file():
         return np.empty((0, columns[0]))
-    lines = read_text(path, remedy=REMEDY).splitlines()[1:]
+    lines = read_lines(path, remedy=REMEDY)[1:]
     if not lines:
         return np.empty((0, columns[0]))
     filled = (re.sub(",(?=,|$)", ",nan", line) for line in lines)

@@ -7,7 +7,6 @@ import tempfile
 import weakref
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from barsight.calibration.geometry.rig import StereoRig
 from barsight.checkpoint import checkpoint_folder, checkpointed
 from barsight.core.compiling.ahead import compile_ahead
 from barsight.core.errors import ConfigError, MeasurementError
+from barsight.core.json_values import json_value
 from barsight.core.settings.values import build_settings
 from barsight.core.stamps import NS_PER_S
 from barsight.core.timing import Stopwatch
@@ -25,9 +25,9 @@ from barsight.live_map import LiveMap, Snapshot
 from barsight.map_building import checkpoint_key, matching
 from barsight.measure_folder import ignore_progress, write_measured
 from barsight.measure_settings import MeasureSettings
-from barsight.measurement import to_json
 from barsight.motion.estimator import PoseEstimator
 from barsight.motion.settings import make_early_estimator, make_estimator
+from barsight.pipeline import LiftRequest
 from barsight.recording.packets import Packet, PacketRecording
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.recording.sensor_selection import SelectedSensors
@@ -80,7 +80,7 @@ class Session:
         self._recordings.append(self._recording)
         selected = SelectedSensors(self._recording, self._settings.use)
         self._source = in_yard(selected, self._settings.yard)
-        key = checkpoint_key(self._recording, to_json(asdict(self._settings)), {})
+        key = checkpoint_key(self._recording, json_value(self._settings), {})
         self._checkpoints = checkpoint_folder(self._folder / "checkpoints" / name, key)
         self._pairs = RectifiedPairs(self._source, Rectifier(self._rig), self._checkpoints)
         # A rig that is to be turned at the end gives other disparities then.
@@ -130,8 +130,8 @@ class Session:
         several = len(self._recordings) > 1
         kept = self._checkpoints.parent
         write_measured(
-            self._recordings, self._yard, self._asked, keep=kept.parent if several else kept,
-            magnet=self._magnet, report=False,
+            self._recordings, self._yard, self._asked, LiftRequest(self._magnet),
+            keep=kept.parent if several else kept, report=False,
         )  # fmt: skip
         return Yard(self._yard, self)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +11,9 @@ import numpy as np
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Float64
 from barsight.core.errors import InputError
-from barsight.core.json_values import json_digest
+from barsight.core.json_values import json_digest, json_value
 from barsight.core.pose import skew
 from barsight.core.types import CraneSamples, LaserProfile, Trajectory
-from barsight.measurement import to_json
 from barsight.recording.base import Recording
 from barsight.recording.sensor_samples import make_laser
 from barsight.recording.wrapper import RecordingProxy
@@ -43,7 +42,7 @@ class RecordingInYard(RecordingProxy):
             return self.whole.laser()
         return tuple(
             make_laser(
-                np.full(one.x_m.size, one.profile),
+                self.whole.path, np.full(one.x_m.size, one.profile),
                 pose.apply(np.column_stack([one.x_m, one.y_m, one.z_m])), one.range_std_m,
             )[0]
             for one in self.whole.laser()
@@ -70,13 +69,13 @@ def frame_of(recording: Recording) -> YardFrame | None:
 
 def calibration_id(rig: StereoRig) -> str:
     """Compute the digest of a rig that results carry."""
-    return json_digest(to_json(asdict(rig)))[:ID_DIGITS]
+    return json_digest(json_value(rig))[:ID_DIGITS]
 
 
 def mounting_id(crane: CraneSamples) -> str:
     """Compute the digest of how the body hangs from the crane."""
     hung = {"crane_to_body_m": crane.crane_to_body_m, "yard_from_body": crane.yard_from_body_nominal}
-    return json_digest(to_json(hung))[:ID_DIGITS]
+    return json_digest(json_value(hung))[:ID_DIGITS]
 
 
 def recording_id(inputs: Mapping[str, str]) -> str:

@@ -55,7 +55,7 @@ def certificate_content(
         "yard_frame_id": found.observations[0].yard_frame_id,
         "rule": RULE,
         "plan": asdict(found.plan),
-        "plan_sha256": json_digest(json_value(asdict(found.plan))),
+        "plan_sha256": json_digest(json_value(found.plan)),
         "recordings": [
             {"path": view.recording, "map_id": view.map_id, "inputs": found.inputs[view.recording]}
             for view in found.observations

@@ -9,7 +9,9 @@ from pathlib import Path
 
 from barsight.acceptance.certificate import CommissioningStep
 from barsight.core.errors import InputError
+from barsight.core.files import atomic_path
 from barsight.core.json_values import json_digest, json_value
+from barsight.core.reading.json_schema import expect_schema, list_schema, record_schema
 from barsight.core.reading.sealed_json import read_sealed, write_sealed
 from barsight.core.settings.file import read_settings
 from barsight.core.settings.values import POSITIVE, expect_ranges, expect_values
@@ -18,6 +20,11 @@ from barsight.result_folder import file_digest
 RECORD, SETTINGS = "commissioning.json", "commission.toml"
 SCHEMA_VERSION = 1
 REMEDY = "take the folder that barsight commission made, or begin a new one"
+_TEXT = {"type": "string"}
+_STEP = record_schema(name=_TEXT, result=_TEXT, given=_TEXT, made=_TEXT, done_at=_TEXT)
+_SCHEMA = record_schema(
+    schema_version={"const": SCHEMA_VERSION}, content_sha256=_TEXT, steps=list_schema(_STEP)
+)
 HELP = "docs/how-to/commission.md explains the steps"
 FIRST_SETTINGS = """\
 # What barsight commission needs to know of this crane.
@@ -80,7 +87,8 @@ def begin(folder: Path) -> CommissionSettings:
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise InputError(folder, f"holds no {SETTINGS}", REMEDY)
         folder.mkdir(parents=True, exist_ok=True)
-        path.write_text(FIRST_SETTINGS, encoding="utf-8")
+        with atomic_path(path) as made:
+            made.write_text(FIRST_SETTINGS, encoding="utf-8")
     return read_settings(path, CommissionSettings, HELP, "folder")
 
 
@@ -114,10 +122,8 @@ def read_done(folder: Path) -> tuple[DoneStep, ...]:
     if not path.exists():
         return ()
     content = read_sealed(path, SCHEMA_VERSION, REMEDY)
-    try:
-        return tuple(DoneStep(**one) for one in content["steps"])
-    except (KeyError, TypeError) as error:
-        raise InputError(path, "is no record of a commissioning", REMEDY) from error
+    expect_schema(content, _SCHEMA, path, REMEDY)
+    return tuple(DoneStep(**one) for one in content["steps"])
 
 
 def _write_done(folder: Path, done: Sequence[DoneStep]) -> None:

@@ -15,12 +15,15 @@ from barsight.acceptance.observation import ViewGeometry, view_geometry
 from barsight.acceptance.yard_area import measured_rig
 from barsight.core.arrays import Float64
 from barsight.core.errors import InputError, MeasurementError
+from barsight.core.reading.bounded_reading import in_range
 from barsight.registration.yard_file import read_yard_file
 from barsight.result_folder import open_folder, read_heights
 from barsight.yard.inventory.bundle_file import read_bundles
 from barsight.yard.types import Bundle, YardMap
 from barsight.yard.weight import bundle_mass
 
+REMEDY = "measure the recording again"
+MAX_SIGMA_PX = 100.0
 EXPANSION_PER_K = 23e-6
 """Of an aluminium bar that carries the cameras."""
 
@@ -52,7 +55,7 @@ def measured_load(
     view = view_geometry(folder, measured_rig(summary))
     heights = read_heights(folder)
     assumed: list[str] = []
-    yaw_rad = float(summary["configuration"]["stereo"]["calibration_sigma_px"]) / view.focal_px
+    yaw_rad = _calibration_sigma_px(summary, folder / "result.json") / view.focal_px
     change = temperature_k * EXPANSION_PER_K / 3**0.5
     sources = [
         ErrorSource(
@@ -71,6 +74,16 @@ def measured_load(
     top = np.array([bundle.centre_m[0], bundle.centre_m[1], bundle.top_z_m])
     load = BudgetedLoad(top, bundle.yaw_rad, bundle.length_m, bundle.width_m, mass.kg)
     return MeasuredLoad(bundle.id, load, view, origin, tuple(sources), tuple(assumed))
+
+
+def _calibration_sigma_px(summary: dict[str, Any], path: Path) -> float:
+    try:
+        sigma_px = float(summary["configuration"]["stereo"]["calibration_sigma_px"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(path, "doesn't say stereo.calibration_sigma_px", REMEDY) from error
+    if not 0 <= sigma_px <= MAX_SIGMA_PX:
+        raise InputError(path, f"its stereo.calibration_sigma_px can't be {sigma_px:g}", REMEDY)
+    return sigma_px
 
 
 def _chosen(folder: Path, number: int | None) -> Bundle:
@@ -122,14 +135,10 @@ def _frame_source(summary: dict[str, Any], assumed: list[str]) -> tuple[list[Err
 
 def _magnet_source(certificate: Path | None, assumed: list[str]) -> list[ErrorSource]:
     """Take the touch-downs' errors, which nothing corrects, as uncertainty: mean squares about 0."""
-    rows = [] if certificate is None else read_certificate(certificate)["quantities"]
+    touches = {} if certificate is None else _touch_errors_m(certificate)
     sources = []
     for axis in "xyz":
-        errors = [
-            1e-3 * row["error"]
-            for row in rows
-            if row["group"] == "touch_mm" and row["name"].endswith(f": {axis}") and row["error"] is not None
-        ]
+        errors = touches.get(axis, [])
         if errors:
             mean = np.array([[float(np.mean(np.square(errors)))]])
             by = f"{len(errors)} touch-downs of {Path(str(certificate)).name}"
@@ -139,3 +148,17 @@ def _magnet_source(certificate: Path | None, assumed: list[str]) -> list[ErrorSo
     if len(sources) < 3:
         assumed.append("no touch-downs along all axes: the magnet is taken to hang where the crane says")
     return sources
+
+
+def _touch_errors_m(certificate: Path) -> dict[str, list[float]]:
+    """Read the touch-downs' errors by axis."""
+    found: dict[str, list[float]] = {}
+    try:
+        for row in read_certificate(certificate)["quantities"]:
+            if row["group"] == "touch_mm" and row["error"] is not None:
+                found.setdefault(row["name"][-1:], []).append(1e-3 * float(row["error"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(certificate, f"is torn ({type(error).__name__}: {error})", REMEDY) from error
+    if not in_range([error for errors in found.values() for error in errors]).all():
+        raise InputError(certificate, "has an error that can't be", REMEDY)
+    return found

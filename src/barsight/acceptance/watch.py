@@ -15,6 +15,7 @@ from barsight.acceptance.pictures import PictureHealth
 from barsight.artefacts.plan import AcceptancePlan
 from barsight.core.errors import Failed, InputError
 from barsight.core.json_values import json_value
+from barsight.core.reading.json_schema import expect_schema, list_schema, record_schema
 from barsight.core.reading.sealed_json import read_sealed, write_sealed
 from barsight.motion.rig_check.drift_check import RigCheck
 
@@ -26,6 +27,18 @@ SLACK, ALARM = 2.0, 4.0
 """CUSUM in sigmas: what of each survey is taken off, and the sum that alarms [Page 1954]."""
 DOUBTED = 1.62
 """A stated sigma is believed unless the learned ones scatter by more: 1 % would by chance."""
+_TEXT = {"type": "string"}
+_FIGURE = record_schema(name=_TEXT, value={"type": "number"}, sigma={"type": "number", "exclusiveMinimum": 0})
+_SURVEY = record_schema(
+    recording=_TEXT, recording_id=_TEXT, calibration_id=_TEXT, figures=list_schema(_FIGURE)
+)
+_APPROVAL = record_schema(
+    who=_TEXT, why=_TEXT, at=_TEXT, calibration_id=_TEXT, surveys_before={"type": "integer", "minimum": 0}
+)
+_SCHEMA = record_schema(
+    schema_version={"const": SCHEMA_VERSION}, content_sha256=_TEXT, surveys=list_schema(_SURVEY),
+    approvals=list_schema(_APPROVAL),
+)  # fmt: skip
 SHARPNESS_SIGMA = 0.15
 """Of the logarithm of a picture's sharpness: yards differ."""
 
@@ -94,7 +107,7 @@ def rig_figures(check: RigCheck) -> tuple[WatchedFigure, ...]:
     figures = [
         WatchedFigure(f"{line.name} / {line.unit}", line.value, line.sigma)
         for line in check.lines
-        if isfinite(line.value) and not line.name.startswith("yaw")
+        if isfinite(line.value) and isfinite(line.sigma) and not line.name.startswith("yaw")
     ]
     told = []
     if not isinstance(check.rows, Failed):
@@ -179,13 +192,11 @@ def read_watch(path: Path) -> WatchRecord:
     if not path.exists():
         return WatchRecord()
     content = read_sealed(path, SCHEMA_VERSION, REMEDY)
-    try:
-        return WatchRecord(
-            tuple(_survey(one) for one in content["surveys"]),
-            tuple(Approval(**one) for one in content["approvals"]),
-        )
-    except (KeyError, TypeError) as error:
-        raise InputError(path, "is no record of surveys", REMEDY) from error
+    expect_schema(content, _SCHEMA, path, REMEDY)
+    return WatchRecord(
+        tuple(_survey(one) for one in content["surveys"]),
+        tuple(Approval(**one) for one in content["approvals"]),
+    )
 
 
 def write_watch(record: WatchRecord, path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import re
 import sys
@@ -12,6 +13,7 @@ from typing import TypeVar
 import tyro
 
 from barsight.core.errors import ConfigError, InputError
+from barsight.core.printing import printable
 from barsight.core.settings.file import read_settings
 from barsight.core.settings.renamed import refuse_old_flags
 
@@ -23,7 +25,16 @@ LISTS = ("--use", "--lifted")
 def call(command: Callable[..., None], name: str, arguments: Sequence[str]) -> None:
     """Parse `arguments` by the function's signature and call it; wrong usage exits with 2."""
     refuse_old_flags(arguments)
-    tyro.cli(command, prog=f"barsight {name}", args=_listed(arguments), compact_help=False)
+    listed = _listed(arguments)
+    shown = [printable(argument) for argument in listed]
+    if shown != listed:  # tyro prints what it refuses as it stands
+        tyro.cli(_only_parsed(command), prog=f"barsight {name}", args=shown, compact_help=False)
+    tyro.cli(command, prog=f"barsight {name}", args=listed, compact_help=False)
+
+
+def _only_parsed(command: Callable[..., None]) -> Callable[..., None]:
+    """Make a function of the same signature that does nothing."""
+    return functools.wraps(command)(lambda *_, **__: None)
 
 
 def by_own_flags(error: InputError) -> InputError:

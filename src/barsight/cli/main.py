@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import logging
 import os
 import signal
 import sys
@@ -122,8 +123,9 @@ def run(arguments: Sequence[str]) -> int:
     if name not in COMMANDS:
         return _refuse(f"there is no command {name!r}; barsight --help lists them", 2)
     _interrupts.clear()
-    # What OpenCV can't decode is told in our one line.
+    # What OpenCV and tifffile can't decode is told in our one line.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+    logging.getLogger("tifffile").addHandler(logging.NullHandler())
     try:
         importlib.import_module(home(name)).run(rest)
     except KeyboardInterrupt:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from dataclasses import asdict, is_dataclass
+from dataclasses import fields, is_dataclass
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +19,21 @@ DIGITS = 9
 
 
 def json_value(value: Any, digits: int | None = None, decimals: int | None = None) -> Any:
-    """Replace NaN and infinity by None, arrays and tuples by lists, NumPy scalars by Python's, at any depth.
+    """Replace NaN and infinity by None, arrays and tuples by lists, NumPy scalars by Python's, records by
+    mappings, members of enumerations by their values and paths by texts, at any depth.
 
     digits, decimals: significant digits or decimals that floats are rounded to; all where None.
     """
+    if is_dataclass(value) and not isinstance(value, type):
+        value = {field.name: getattr(value, field.name) for field in fields(value)}
     if isinstance(value, dict):
         return {key: json_value(item, digits, decimals) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
         return json_value(value.tolist(), digits, decimals)
     if isinstance(value, list | tuple):
         return [json_value(item, digits, decimals) for item in value]
+    if isinstance(value, Enum | Path):
+        return str(value) if isinstance(value, Path) else value.value
     if isinstance(value, float):
         if not math.isfinite(value):
             return None
@@ -37,9 +43,8 @@ def json_value(value: Any, digits: int | None = None, decimals: int | None = Non
 
 
 def write_json(target: Path, content: Any, digits: int | None = None) -> None:
-    """Write a document or a frozen record, indented, whole or not at all; NaN and infinity become null."""
-    plain = asdict(content) if is_dataclass(content) and not isinstance(content, type) else content
-    text = json.dumps(json_value(plain, digits), indent=1, allow_nan=False) + "\n"
+    """Write what `json_value` makes of it, indented, whole or not at all."""
+    text = json.dumps(json_value(content, digits), indent=1, allow_nan=False) + "\n"
     with atomic_path(target) as path:
         path.write_text(text, encoding="utf-8")
 

@@ -1,10 +1,12 @@
-"""Read this process's peak memory, and return freed memory to the system."""
+"""Read processes' memory, and return freed memory to the system."""
 
 from __future__ import annotations
 
 import ctypes
+import mmap
 from collections.abc import Callable
 from functools import cache
+from pathlib import Path
 
 
 def peak_memory_mib() -> float:
@@ -14,6 +16,17 @@ def peak_memory_mib() -> float:
     except ImportError:  # Windows
         return float("nan")
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def resident_bytes(pid: int | None = None) -> int:
+    """Read the resident memory of a process, this one by default; 0 where it is gone or the system doesn't
+    tell.
+    """
+    try:
+        pages = Path(f"/proc/{'self' if pid is None else pid}/statm").read_text(encoding="ascii").split()[1]
+    except (OSError, IndexError):
+        return 0
+    return int(pages) * mmap.PAGESIZE
 
 
 def trim_heap() -> None:

@@ -4,17 +4,17 @@ measuring.
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 import numpy as np
 
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import InputError
-from barsight.core.reading.bounded_reading import read_arrays, read_text
+from barsight.core.reading.bounded_reading import read_arrays
 from barsight.core.reading.geotiff import HEIGHT_BANDS, open_geotiff
 from barsight.core.types import HeightSource
 from barsight.mapping.agreement import smooth_places
+from barsight.result_folder import read_contours
 
 _SPACING_M = 0.01
 
@@ -44,14 +44,13 @@ def score_folder(recording: Path, out: Path) -> dict[str, Figures]:
 def _score_contours(truth: dict[str, Float64], out: Path) -> dict[str, Figures]:
     x_true = truth["profile_x"]
     heights: dict[int, Float64] = {}
-    for row in csv.DictReader(read_text(out / "contour.csv").split("\n")):
-        profile = int(row["profile"])
-        if f"profile_y{profile}" not in truth:
+    for contour in read_contours(out):
+        if f"profile_y{contour.profile}" not in truth:
             continue
-        measured = heights.setdefault(profile, np.full((2, x_true.size), np.nan))
-        k = round((float(row["x_m"]) - x_true[0]) / _SPACING_M)
-        if int(row["source"]) in (HeightSource.VISION, HeightSource.LASER) and 0 <= k < x_true.size:
-            measured[:, k] = float(row["z_m"]), float(row["sigma_m"])
+        places = np.round((contour.x_m - x_true[0]) / _SPACING_M)
+        shown = HeightSource.measured(contour.source) & (places >= 0) & (places < x_true.size)
+        measured = heights[contour.profile] = np.full((2, x_true.size), np.nan)
+        measured[:, places[shown].astype(int)] = contour.z_m[shown], contour.sigma_m[shown]
     errors, sigmas, smooth, covered = [], [], [], []
     for profile, (z, sigma) in heights.items():
         z_true = truth[f"profile_y{profile}"].astype(np.float64)

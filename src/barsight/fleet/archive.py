@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from barsight.core.errors import InputError
 from barsight.core.json_values import json_digest
+from barsight.core.reading.bounded_reading import MAX_TABLE_BYTES
 from barsight.fleet.objects import Objects, StoredObject
+from barsight.recording.own_files import leads_outside
 
 SURVEY = "survey.json"
 """File that makes one survey of the recordings in its folder: the passes, in its list `passes`."""
@@ -113,19 +115,35 @@ def manifest_digest(
     part of it.
 
     read: told of the bytes that were read. A recording whose listing is unchanged is not read again: the
-    digest is kept in the results under `manifests/`.
+    digest is kept in the results under `manifests/`. Raises InputError for a file that is too large for what
+    it is, as only bags have no bound, and for a link out of the recording.
     """
+    expect_own(archive, recording.name, recording.files)
     listed = json_digest([archive.url, recording.name, [[f.path, f.size, f.mark] for f in recording.files]])
     kept = f"manifests/{listed}.json"
     known = results.read_json(kept)
     if known is None:
         rows = []
         for file in recording.files:
+            if not file.path.endswith(_BAGS):
+                archive.expect_size(file.path, file.size, MAX_TABLE_BYTES)
             rows.append([recording.relative(file), file.size, _digest(archive, file)])
             read(file.size)
         known = {"manifest": json_digest([list(recording.passes), rows]), "files": rows}
         results.write(kept, json.dumps(known).encode())
     return str(known["manifest"])
+
+
+def expect_own(archive: Objects, name: str, files: Iterable[StoredObject]) -> None:
+    """Raise InputError for the first file of a folder's recording that a link brings in from elsewhere: a
+    copy of the recording would hold what isn't its own.
+    """
+    if "://" in archive.url:
+        return
+    for file in files:
+        path = Path(archive.url) / file.path
+        if leads_outside(path, Path(archive.url) / name):
+            raise InputError(path, "is a link out of the recording", "copy the file into the recording")
 
 
 def _digest(archive: Objects, file: StoredObject) -> str:
@@ -139,7 +157,8 @@ def download(archive: Objects, name: str, passes: tuple[str, ...], folder: Path)
     """Copy a recording's files into a folder, and yield the path of each pass."""
     recording = ArchivedRecording(name, passes, ())
     is_file = PurePosixPath(name).suffix in _BAGS
-    listed = [StoredObject(name, 0, "")] if is_file else archive.list(name)
+    listed = [StoredObject(name, 0, "")] if is_file else list(archive.list(name))
+    expect_own(archive, name, listed)
     for file in listed:
         inner = PurePosixPath(recording.relative(file))
         if _UNREAD & set(inner.parts[:-1]) or ".." in inner.parts:

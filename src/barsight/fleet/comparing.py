@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
-import json
 import math
+from collections import Counter
 from dataclasses import dataclass
 from statistics import NormalDist
 from typing import Any
 
+from barsight.core.errors import InputError
+from barsight.core.json_values import json_digest
+from barsight.core.reading.bounded_reading import in_range
+from barsight.core.reading.sealed_json import SEAL
+from barsight.fleet.ledger import result_note
 from barsight.fleet.objects import Objects
 
 FIGURES = ("x_m", "y_m", "top_z_m", "yaw_deg", "length_m", "width_m")
 """Figures of a bundle that are compared."""
+REMEDY = "promote nothing of it; measure the recording again"
+_UNREAD = (KeyError, TypeError, ValueError, AttributeError, OverflowError)
+"""Exceptions of a document that is torn."""
 MAX_APART_M = 0.5
 """Distance up to which two bundles are taken for one."""
 
@@ -52,8 +60,9 @@ class RecordingComparison:
 
 def compare_recording(results: Objects, name: str, before: str, after: str) -> RecordingComparison | None:
     """Compare the results of two keys; None where one of them isn't published."""
-    notes = [results.read_json(f"results/{key}/result.json") for key in (before, after)]
-    if None in notes:
+    found = [result_note(results, key) for key in (before, after)]
+    notes = [note for note in found if note is not None]
+    if len(notes) < len(found):
         return None
     folders = [f"files/{note['key']}/{note['token']}" for note in notes]
     bundles = [_bundles(results, folder) for folder in folders]
@@ -78,22 +87,39 @@ def compare_recording(results: Objects, name: str, before: str, after: str) -> R
 
 def _bundles(results: Objects, folder: str) -> dict[int, dict[str, float]]:
     """Read a result's bundles: each figure, and its sigma as `figure sigma`."""
-    content = results.read_json(f"{folder}/bundles.json") or {"bundles": []}
-    found = {}
-    for one in content["bundles"]:
-        sigma, (ahead_x, ahead_y, _) = one["sigma"], one["direction"]
-        along, across = sigma["along_m"] ** 2, sigma["lateral_m"] ** 2
-        x_m, y_m, _ = one["axis_centre_m"]
-        x_variance = along * ahead_x**2 + across * ahead_y**2
-        y_variance = along * ahead_y**2 + across * ahead_x**2
-        figures = {"x_m": x_m, "y_m": y_m, **{name: one[name] for name in FIGURES[2:]}}
-        figures |= {"x_m sigma": math.sqrt(x_variance), "y_m sigma": math.sqrt(y_variance)}
-        found[one["id"]] = figures | {f"{name} sigma": _or_unknown(sigma[name]) for name in FIGURES[2:]}
-    return found
+    content = _document(results, f"{folder}/bundles.json")
+    try:
+        return {int(one["id"]): _figures(one) for one in content["bundles"]}
+    except _UNREAD as error:
+        raise _torn(results, f"{folder}/bundles.json", error) from error
 
 
-def _or_unknown(sigma: float | None) -> float:
-    return math.inf if sigma is None else sigma
+def _figures(one: dict[str, Any]) -> dict[str, float]:
+    sigma, (ahead_x, ahead_y, _) = one["sigma"], one["direction"]
+    along, across = sigma["along_m"] ** 2, sigma["lateral_m"] ** 2
+    x_m, y_m, _ = one["axis_centre_m"]
+    figures = {"x_m": x_m, "y_m": y_m, **{name: one[name] for name in FIGURES[2:]}}
+    figures |= {"x_m sigma": math.sqrt(along * ahead_x**2 + across * ahead_y**2)}
+    figures |= {"y_m sigma": math.sqrt(along * ahead_y**2 + across * ahead_x**2)}
+    figures |= {f"{name} sigma": sigma[name] for name in FIGURES[2:] if sigma[name] is not None}
+    if not in_range(list(figures.values())).all():
+        raise ValueError("a figure is out of range")
+    return {f"{name} sigma": math.inf for name in FIGURES[2:]} | figures
+
+
+def _document(results: Objects, path: str) -> dict[str, Any]:
+    """Read a sealed document of a result, of whatever version. Raises InputError."""
+    content = results.read_json(path)
+    if not isinstance(content, dict):
+        problem = "is gone" if content is None else "is no object"
+        raise InputError(f"{results.url}/{path}", problem, REMEDY)
+    if content.get(SEAL) != json_digest({key: value for key, value in content.items() if key != SEAL}):
+        raise InputError(f"{results.url}/{path}", "was changed after it was written", REMEDY)
+    return content
+
+
+def _torn(results: Objects, path: str, error: Exception) -> InputError:
+    return InputError(f"{results.url}/{path}", f"is torn ({type(error).__name__}: {error})", REMEDY)
 
 
 def _partners(before: dict[int, dict[str, float]], after: dict[int, dict[str, float]]) -> dict[int, int]:
@@ -125,16 +151,13 @@ def _change(
 
 def _vetoes(results: Objects, folder: str) -> set[str]:
     """Read the codes that forbid: of the whole map, and of each refused lift with how often."""
-    data = results.read(f"{folder}/lifts.json")
-    if data is None:
-        return set()
-    content = json.loads(data)
-    codes = [_code(one) for one in content.get("vetoes", [])]
-    refused: list[Any] = content.get("refused", [])
-    counted: dict[str, int] = {}
-    for one in refused:
-        code = _code(one)
-        counted[code] = counted.get(code, 0) + 1
+    path = f"{folder}/lifts.json"
+    content = _document(results, path)
+    try:
+        codes = [_code(one) for one in content.get("vetoes", [])]
+        counted = Counter(_code(one) for one in content.get("refused", []))
+    except _UNREAD as error:
+        raise _torn(results, path, error) from error
     return {*codes, *(f"{code} x{count}" for code, count in counted.items())}
 
 

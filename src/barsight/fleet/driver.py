@@ -9,7 +9,7 @@ from typing import Any
 
 from barsight.core.errors import InputError
 from barsight.fleet.cluster import run_all
-from barsight.fleet.ledger import parked_keys, published_keys, running_keys
+from barsight.fleet.ledger import PARKED, parked_keys, published_keys, result_note, running_keys
 from barsight.fleet.objects import Objects
 from barsight.fleet.records import note_results, noted_keys
 from barsight.fleet.scratch import sweep
@@ -86,10 +86,8 @@ def note_missing(store: Store, results: Objects, by: str, wanted: set[str]) -> i
         known = noted_keys(connection)
     missing = sorted((published_keys(results) & wanted) - known)
     for first in range(0, len(missing), _ROWS):
-        contents = {
-            key: results.read_json(f"results/{key}/result.json") for key in missing[first : first + _ROWS]
-        }
-        note_results(store, contents, by)
+        notes = ((key, result_note(results, key)) for key in missing[first : first + _ROWS])
+        note_results(store, {key: note for key, note in notes if note is not None}, by)
     return len(missing)
 
 
@@ -99,7 +97,7 @@ def parked_reasons(results: Objects, tasks: list[FleetTask]) -> list[tuple[Fleet
     told = []
     for task in tasks:
         if task.key in keys:
-            note = results.read_json(f"parked/{task.key}.json")
+            note = results.read_json(f"parked/{task.key}.json", PARKED)
             if note is None:
                 raise InputError(
                     f"{results.url}/parked/{task.key}.json", "is gone", "ask for the status again"

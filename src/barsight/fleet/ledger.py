@@ -21,6 +21,19 @@ TRIES = 3
 MAX_LOST = 12
 """and claims whose worker died without a word, which others' faults cause too."""
 Held = Literal["published", "parked", "claimed"]
+_TEXT, _NUMBER = {"type": "string"}, {"type": "number"}
+_FILE = {"type": "object", "required": ["bytes", "sha256"], "properties": {"bytes": {"type": "integer"}}}
+_RESULT = {
+    "type": "object",
+    "required": ["key", "token", "measured_s", "whole_s", "peak_bytes", "files"],
+    "properties": {
+        "key": _TEXT, "token": _TEXT, "measured_s": _NUMBER, "whole_s": _NUMBER,
+        "peak_bytes": {"type": "integer"}, "files": {"type": "object", "additionalProperties": _FILE},
+    },
+}  # fmt: skip
+_CLAIM = {"type": "object", "required": ["expires"], "properties": {"expires": _NUMBER}}
+PARKED = {"type": "object", "required": ["reason"], "properties": {"reason": _TEXT}}
+"""Schemas of what is kept here."""
 
 
 @dataclass(frozen=True)
@@ -43,9 +56,10 @@ def claim(results: Objects, key: str, lease_s: float) -> HeldRecording | Held:
         return "parked"
     number = 0
     for one in results.list(f"claims/{key}/"):
-        number = max(number, int(PurePosixPath(one.path).stem))
+        stem = PurePosixPath(one.path).stem
+        number = max(number, int(stem) if stem.isdecimal() else 0)
     if number:
-        last = results.read_json(f"claims/{key}/{number:04d}.json")
+        last = results.read_json(f"claims/{key}/{number:04d}.json", _CLAIM)
         if last is not None and last["expires"] > time.time():
             return "claimed"
     if number >= MAX_LOST:
@@ -81,6 +95,12 @@ def publish(results: Objects, mine: HeldRecording, content: dict[str, Any]) -> b
     """Write the key's result.json, its last object, where there is none; tell whether it is ours."""
     text = json.dumps({"key": mine.key, "token": mine.token, **content}, indent=1)
     return results.write_new(f"results/{mine.key}/result.json", text.encode())
+
+
+def result_note(results: Objects, key: str) -> dict[str, Any] | None:
+    """Read what was published of a key; None where nothing is. Raises InputError."""
+    note: dict[str, Any] | None = results.read_json(f"results/{key}/result.json", _RESULT)
+    return note
 
 
 def fail(results: Objects, mine: HeldRecording, reason: str) -> bool:
@@ -125,7 +145,9 @@ def running_keys(results: Objects, among: set[str]) -> set[str]:
             newest[key] = max(newest.get(key, ""), one.path)
     now = time.time()
     return {
-        key for key, path in newest.items() if (results.read_json(path) or {"expires": 0})["expires"] > now
+        key
+        for key, path in newest.items()
+        if (results.read_json(path, _CLAIM) or {"expires": 0})["expires"] > now
     }
 
 

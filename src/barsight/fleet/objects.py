@@ -12,13 +12,15 @@ from typing import Any
 
 from barsight.core.errors import ConfigError, InputError
 from barsight.core.extras import extra
-from barsight.core.reading.bounded_reading import parse_json
+from barsight.core.reading.bounded_reading import MAX_DOCUMENT_BYTES, parse_json
+from barsight.core.reading.json_schema import expect_schema
 
 with extra("fleet"):
     import obstore
     from obstore.exceptions import AlreadyExistsError, BaseError
     from obstore.store import LocalStore, ObjectStore, from_url
 
+REMEDY = "remove it, or write it anew"
 RETRY_S = 180
 """Time for which a request that a server refuses or loses is tried again."""
 _LARGE = 8 << 20
@@ -51,17 +53,33 @@ class Objects:
                     yield StoredObject(one["path"], one["size"], mark)
 
     def read(self, path: str) -> bytes | None:
-        """Read an object; None where there is none."""
+        """Read a small object; None where there is none. Raises InputError for one of over
+        MAX_DOCUMENT_BYTES.
+        """
         with _told(f"{self.url}/{path}"):
             try:
-                return bytes(obstore.get(self.store, path).bytes())
+                found = obstore.get(self.store, path)
             except FileNotFoundError:
                 return None
+            self.expect_size(path, found.meta["size"], MAX_DOCUMENT_BYTES)
+            return bytes(found.bytes())
 
-    def read_json(self, path: str) -> Any:
-        """Read a JSON object; None where there is none. Raises InputError for one that is torn."""
+    def expect_size(self, path: str, size: int, max_bytes: int) -> None:
+        """Raise InputError for an object of more bytes."""
+        if size > max_bytes:
+            raise InputError(f"{self.url}/{path}", f"has {size} bytes, at most {max_bytes} are read", REMEDY)
+
+    def read_json(self, path: str, schema: Any = None) -> Any:
+        """Read a JSON object; None where there is none. Raises InputError for one that is torn, or isn't as
+        the schema says.
+        """
         data = self.read(path)
-        return None if data is None else parse_json(data, f"{self.url}/{path}", "remove it, or write it anew")
+        if data is None:
+            return None
+        content = parse_json(data, f"{self.url}/{path}", REMEDY)
+        if schema is not None:
+            expect_schema(content, schema, f"{self.url}/{path}", REMEDY)
+        return content
 
     def write(self, path: str, data: bytes) -> None:
         """Write an object over what is there."""

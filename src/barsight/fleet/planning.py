@@ -70,11 +70,26 @@ def estimate(tasks: list[FleetTask], measured: list[tuple[int, int, float, int]]
     return WorkEstimate(seconds, sum(t.size for t in tasks), round(each * len(tasks)), len(measured))
 
 
-def in_order(tasks: list[FleetTask], priorities: tuple[str, ...]) -> list[FleetTask]:
-    """Put first the recordings whose names begin with the first priority, and so on; then all others."""
+@dataclass(frozen=True)
+class TaskChoice:
+    """Tasks that are run, and their order."""
 
-    def rank(task: FleetTask) -> int:
-        hits = (place for place, start in enumerate(priorities) if task.name.startswith(start))
-        return next(hits, len(priorities))
+    version: str | None = None
+    """Version to measure, by the beginning of its name; the one planned last if not given."""
+    limit: int | None = None
+    """Most recordings to measure now."""
+    first: tuple[str, ...] = ()
+    """Beginnings of the names of recordings that come first, in this order."""
+    again: bool = False
+    """Try parked recordings again."""
 
-    return sorted(tasks, key=rank)
+    def of(self, tasks: list[FleetTask]) -> list[FleetTask]:
+        """Put first the tasks whose names begin with the first of `first`, and so on; then all others; cut to
+        the limit.
+        """
+
+        def rank(task: FleetTask) -> int:
+            hits = (place for place, start in enumerate(self.first) if task.name.startswith(start))
+            return next(hits, len(self.first))
+
+        return sorted(tasks, key=rank)[: self.limit]

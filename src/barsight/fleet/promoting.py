@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from barsight.core.errors import ConfigError, MeasurementError
+from barsight.core.errors import ConfigError, InputError, MeasurementError
 from barsight.core.extras import extra
 from barsight.core.files import atomic_directory
-from barsight.fleet.ledger import published_keys
+from barsight.fleet.ledger import published_keys, result_note
 from barsight.fleet.objects import Objects
 from barsight.fleet.versions import FleetTask, Version
 from barsight.store.adding import add_survey, read_survey
@@ -94,7 +94,9 @@ def _switch(store: Store, name: str, by: str, what: str) -> None:
 
 
 def _fetch(results: Objects, key: str, out: Path) -> None:
-    note = results.read_json(f"results/{key}/result.json")
+    note = result_note(results, key)
+    if note is None:
+        raise InputError(f"{results.url}/results/{key}/result.json", "is gone", "run the version again")
     with atomic_directory(out) as staging:
         for name in note["files"]:
             target = staging / Path(name).name

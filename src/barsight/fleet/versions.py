@@ -1,4 +1,4 @@
-"""Name a version: configuration, calibration, magnet and software; and a task's key under it."""
+"""Name a version: configuration and the files it names, calibration, magnet, software; and a task's key."""
 
 from __future__ import annotations
 
@@ -6,18 +6,22 @@ import functools
 import hashlib
 from dataclasses import asdict, dataclass
 from importlib import metadata
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import barsight
 from barsight.core.errors import ConfigError
 from barsight.core.json_values import json_digest, json_value
-from barsight.core.reading.bounded_reading import MAX_SETTINGS_BYTES, read_bytes
+from barsight.core.reading.bounded_reading import MAX_DOCUMENT_BYTES, read_bytes
 from barsight.fleet.objects import Objects
-from barsight.result_folder import file_digest
 
-FILES = ("config.toml", "rig", "magnet.toml")
-"""Names under which a version's files are kept in the results."""
+FLAGS = {
+    "config": "--config", "rig": "--recording.rig", "magnet": "--magnet", "yard": "--yard",
+    "stock": "--bundles.stock-list", "imu": "--recording.imu-yaml",
+}  # fmt: skip
+"""Names, without their suffixes, under which a version's files are kept in the results; what names them to
+`barsight measure`.
+"""
 LIBRARIES = ("numpy", "scipy", "numba", "opencv-contrib-python-headless")
 
 
@@ -71,43 +75,47 @@ def publish_version(
 ) -> Version:
     """Keep a version's files in the results, where workers read them, and return it.
 
-    settings: what `config` holds, already checked. Raises ConfigError for a configuration that names a
-    calibration by a path, which other machines may not have.
+    settings: what `config` holds, already checked. The files that it names count by their content. Raises
+    ConfigError for a configuration that names a calibration by a path.
     """
     if settings.recording.rig is not None or settings.recording.camchain is not None:
         raise ConfigError(f"{config}: names a calibration by its path; give it with --rig instead")
+    named = {
+        "yard": settings.yard, "stock": settings.bundles.stock_list, "imu": settings.recording.imu_yaml,
+    }  # fmt: skip
     given = {
-        "configuration": json_digest(json_value(_texts(asdict(settings)))),
-        "calibration": "" if rig is None else file_digest(rig),
-        "magnet": "" if magnet is None else file_digest(magnet),
+        "configuration": json_digest(json_value(_by_content(asdict(settings)))),
+        "calibration": "" if rig is None else _digest(rig),
+        "magnet": "" if magnet is None else _digest(magnet),
         "software": installed_software(),
     }
     version = Version(json_digest(given)[:16], **given, rig="" if rig is None else f"rig{rig.suffix}")
-    sources = ((config, "config.toml"), (rig, version.rig), (magnet, "magnet.toml"))
-    for path, name in sources:
+    for name, path in {"config": config, "rig": rig, "magnet": magnet, **named}.items():
         if path is not None:
-            results.write(f"versions/{version.name}/{name}", read_bytes(path, MAX_SETTINGS_BYTES))
+            data = read_bytes(path, MAX_DOCUMENT_BYTES)
+            results.write(f"versions/{version.name}/{name}{path.suffix}", data)
     return version
 
 
 def arguments(results: Objects, version: Version, folder: Path) -> list[str]:
     """Copy a version's files into a folder and return the arguments of `barsight measure` that name them."""
     words: list[str] = []
-    for name, flag in (
-        ("config.toml", "--config"),
-        (version.rig, "--recording.rig"),
-        ("magnet.toml", "--magnet"),
-    ):
-        data = results.read(f"versions/{version.name}/{name}") if name else None
-        if data is not None:
-            (folder / name).write_bytes(data)
-            words += [flag, str(folder / name)]
+    for one in results.list(f"versions/{version.name}"):
+        name = PurePosixPath(one.path)
+        data = results.read(one.path)
+        if name.stem in FLAGS and data is not None:
+            (folder / name.name).write_bytes(data)
+            words += [FLAGS[name.stem], str(folder / name.name)]
     return words
 
 
-def _texts(value: Any) -> Any:
+def _by_content(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _texts(item) for key, item in value.items()}
+        return {key: _by_content(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_texts(item) for item in value]
-    return str(value) if isinstance(value, Path) else value
+        return [_by_content(item) for item in value]
+    return _digest(value) if isinstance(value, Path) else value
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(read_bytes(path, MAX_DOCUMENT_BYTES)).hexdigest()

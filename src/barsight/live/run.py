@@ -10,7 +10,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,7 +18,7 @@ from barsight.checkpoint import checkpoint_folder
 from barsight.core.compiling.ahead import compile_ahead
 from barsight.core.errors import ConfigError, InputError, MeasurementError, OutputError
 from barsight.core.files import expect_empty, lies_within, translated_os_errors
-from barsight.core.json_values import write_json
+from barsight.core.json_values import json_value, write_json
 from barsight.core.notices import Notice
 from barsight.core.stamps import NS_PER_S
 from barsight.live.latency import latencies
@@ -34,11 +34,11 @@ from barsight.live.survey import STOOD
 from barsight.map_building import ProgressCallback, checkpoint_key
 from barsight.measure_folder import ignore_progress, write_measured
 from barsight.measure_settings import MeasureSettings
-from barsight.measurement import to_json
+from barsight.pipeline import LiftRequest
 from barsight.recording.base import Recording
 from barsight.recording.open import open_recording
 from barsight.yard.lifting.lift_file import read_lifts
-from barsight.yard.magnet.description import Magnet, load_magnet
+from barsight.yard.magnet.description import load_magnet
 
 MAX_SPEED = 1000.0
 INTERRUPTED = "interrupted"
@@ -67,13 +67,13 @@ def replay(
     if not (math.isfinite(speed) and 0 <= speed <= MAX_SPEED):
         raise ConfigError(f"speed must lie in 0...{MAX_SPEED:g} (0: as fast as possible), not {speed:g}")
     given = None if keyframes is None else read_keyframes(keyframes)
-    described = None if magnet is None else load_magnet(magnet)
+    request = LiftRequest(None if magnet is None else load_magnet(magnet), judged_at)
     recording = open_recording(path, settings.recording)
     if lies_within(out, path):
         raise OutputError(f"{out}: lies in the recording itself; name a folder elsewhere")
     expect_empty(out)
     run = LiveRun(recording, LiveInput(path.absolute(), speed), out, settings, live, tell)
-    return run.measure(given, described, judged_at, advance)
+    return run.measure(given, request, advance)
 
 
 class LiveRun:
@@ -90,9 +90,8 @@ class LiveRun:
         self.stop_because = ""
 
     def measure(
-        self, given: Keyframes | None, magnet: Magnet | None, judged_at: Literal["now", "end"],
-        advance: ProgressCallback,
-    ) -> dict[str, Any]:  # fmt: skip
+        self, given: Keyframes | None, request: LiftRequest, advance: ProgressCallback
+    ) -> dict[str, Any]:
         """Run until the recording or the survey ends or a signal comes, then measure what was kept; return
         nothing where the crane only stood.
         """
@@ -118,7 +117,7 @@ class LiveRun:
                 self._tell_all(f"ends early: {supervisor.stop_because}; what was kept is measured")
             if given is not None:
                 supervisor.state.mode = given.mode
-            return _finish(supervisor, link, board, self._recording, self._asked, magnet, judged_at, advance)
+            return _finish(supervisor, link, board, self._recording, self._asked, request, advance)
         finally:
             ring.remove()
             board.remove()
@@ -132,12 +131,12 @@ class LiveRun:
 
 def _key(recording: Recording, settings: MeasureSettings) -> str:
     empty = KeptRecording(recording, [])
-    return checkpoint_key(empty, to_json(asdict(settings.chosen())), empty.digests())
+    return checkpoint_key(empty, json_value(settings.chosen()), empty.digests())
 
 
 def _finish(
     supervisor: Supervisor, link: Link, board: Counters, recording: Recording, settings: MeasureSettings,
-    magnet: Magnet | None, judged_at: Literal["now", "end"], advance: ProgressCallback,
+    request: LiftRequest, advance: ProgressCallback,
 ) -> dict[str, Any]:  # fmt: skip
     """Measure what was kept, with the poses' and disparities' work that is done already."""
     state, out = supervisor.state, link.folder.parent
@@ -155,10 +154,11 @@ def _finish(
         if link.source.crane is not None:
             recording, link = _recorded(link, kept, settings)
         write_keyframes(Keyframes(tuple(kept), state.mode), out / "keyframes.json")
-        forbidden = () if state.mode.lifts else (Notice("live-state", _why_no_lifts(state.mode)),)
+        if not state.mode.lifts:
+            request = replace(request, notices=(Notice("live-state", _why_no_lifts(state.mode)),))
         content = write_measured(
-            [KeptRecording(recording, kept)], out, settings, advance=advance, overwrite=True,
-            keep=link.checkpoints.parent, magnet=magnet, judged_at=judged_at, notices=forbidden,
+            [KeptRecording(recording, kept)], out, settings, request, advance=advance, overwrite=True,
+            keep=link.checkpoints.parent,
         )  # fmt: skip
         lifts_s = (time.monotonic_ns() - frames[-1][1]) / NS_PER_S
         state.phase, state.offered = "done", len(read_lifts(out / "lifts.json")["lifts"])

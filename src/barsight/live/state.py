@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -11,12 +10,11 @@ from typing import Any
 
 from barsight.core.files import atomic_path
 from barsight.core.json_values import write_json
+from barsight.core.memory import resident_bytes
 from barsight.live.drift import DRIFT_FILE, drift_figures
 from barsight.live.latency import counts
 from barsight.live.modes import MODES, Mode
 from barsight.live.shared.counters import Counters
-
-PAGE_BYTES = os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else 4096
 
 
 @dataclass
@@ -67,7 +65,7 @@ def write_health(state: RunState, board: Counters, seconds: float, out: Path) ->
     """Write health.json and health.prom, Prometheus' text for a file collector. seconds: since it began."""
     frames = counts(board)
     free = shutil.disk_usage(out).free
-    memory = {name: _memory_bytes(process.pid) for name, process in state.processes.items()}
+    memory = {name: resident_bytes(process.pid) for name, process in state.processes.items()}
     content = {
         "schema_version": 1,
         "seconds": round(seconds, 3),
@@ -80,7 +78,7 @@ def write_health(state: RunState, board: Counters, seconds: float, out: Path) ->
         "frames": frames,
         "queues": {"keyframes": board["map", "backlog"]},
         "restarts": {name: process.restarts for name, process in state.processes.items()},
-        "memory_bytes": memory | {"supervisor": _memory_bytes(os.getpid())},
+        "memory_bytes": memory | {"supervisor": resident_bytes()},
         "disk_free_bytes": free,
         "disk_days": _disk_days(free, board["record", "bytes"], seconds),
         "sensors": board.row("sensors")
@@ -128,11 +126,3 @@ def _disk_days(free_bytes: int, recorded_bytes: int, seconds: float) -> float | 
     if recorded_bytes <= 0 or seconds <= 0:
         return None
     return round(free_bytes / (recorded_bytes / seconds) / 86400, 2)
-
-
-def _memory_bytes(pid: int) -> int:
-    """Read a process's resident memory; 0 where it is gone or the system doesn't tell."""
-    try:
-        return int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1]) * PAGE_BYTES
-    except (OSError, IndexError, ValueError):
-        return 0

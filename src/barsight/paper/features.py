@@ -23,10 +23,11 @@ from barsight.features.patch_alignment import PatchPair, patch_pair
 from barsight.motion.frame_to_frame.motion_trend import MotionTrend
 from barsight.motion.frame_to_frame.stitching import StitchingSettings
 from barsight.motion.settings import MotionSettings, make_estimator
-from barsight.paper.pictures import BLUE, GREEN, ORANGE, PaperPicture, canvas_of, draw_lines, picture_of
+from barsight.paper.pictures import BLUE, GREEN, ORANGE, WIDTH_PX, PaperPicture, draw_lines, picture_of
 from barsight.recording.base import Recording
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.recording.sensor_selection import SelectedSensors
+from barsight.report.match_images import canvas_of
 
 TRUE_PX = 2.0
 COUNT = 2000
@@ -182,7 +183,9 @@ def _true_pct(views: TwoViews, places: Float64, target: Float64, chosen: Bool) -
 
 def draw_features(views: TwoViews, row: FilteredMatches, where: str) -> PaperPicture:
     """Draw the features on the old picture [paper Figure 4]."""
-    canvas, scale = canvas_of(views.old.pair.left)
+    image = views.old.pair.left
+    scale = WIDTH_PX / image.shape[1]
+    canvas = canvas_of(image, scale)
     for x, y in row.places * scale:
         cv2.circle(canvas, (round(x), round(y)), 2, BLUE, 1, cv2.LINE_AA)
     return picture_of(canvas, f"{row.detector.upper()}, {where}: {len(row.places)} features")
@@ -190,7 +193,9 @@ def draw_features(views: TwoViews, row: FilteredMatches, where: str) -> PaperPic
 
 def draw_pairs(views: TwoViews, row: FilteredMatches, where: str, *, filtered: bool) -> PaperPicture:
     """Draw initial matches [paper Figure 5], or those after filtering with the trend [Figures 8, 9]."""
-    canvas, scale = canvas_of(views.new.pair.left)
+    image = views.new.pair.left
+    scale = WIDTH_PX / image.shape[1]
+    canvas = canvas_of(image, scale)
     old, new = row.places * scale, row.target * scale
     if not filtered:
         draw_lines(canvas, old, new, row.initial, ORANGE)

@@ -23,15 +23,6 @@ class PaperPicture:
     caption: str
 
 
-def canvas_of(image: UInt8) -> tuple[UInt8, float]:
-    """Stretch a gray picture (H, W) in brightness to (h, w, 3) of the page's width; also the scale."""
-    low, high = np.percentile(image, (1, 99.5))
-    light = np.clip((image - low) * (200 / max(float(high - low), 1.0)), 0, 220).astype(np.uint8)
-    scale = WIDTH_PX / image.shape[1]
-    sized = cv2.resize(light, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return np.ascontiguousarray(np.dstack([sized] * 3)), scale
-
-
 def picture_of(canvas: UInt8, caption: str) -> PaperPicture:
     """Encode a picture (H, W, 3) for the page."""
     opaque = np.full((*canvas.shape[:2], 1), 255, np.uint8)

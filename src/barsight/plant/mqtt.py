@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import dataclasses
-import enum
 import json
 import ssl
 import time
@@ -134,7 +132,7 @@ class MqttPublisher:
 
     def _event(self) -> str:
         told = {**self._events[0], "lost": self._unsaid}
-        return json.dumps(json_value(told), default=_plain, allow_nan=False)
+        return json.dumps(json_value(told), allow_nan=False)
 
     def _topic(self, name: str) -> str:
         return f"{self._settings.prefix}/{name}"
@@ -173,12 +171,4 @@ def _is_cancelled() -> bool:
 
 def state_json(snapshot: Any) -> str:
     """Write a frozen snapshot as JSON: its fields by name, what isn't known as null."""
-    return json.dumps(json_value(dataclasses.asdict(snapshot)), default=_plain, allow_nan=False)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, enum.Enum):
-        return value.value
-    if isinstance(value, Path):
-        return str(value)
-    raise TypeError(f"{type(value).__name__} has no form in JSON")
+    return json.dumps(json_value(snapshot), allow_nan=False)

@@ -29,6 +29,15 @@ def leads_outside(path: Path, root: Path) -> bool:
     return not lies_within(path, root)
 
 
+def expect_own_files(root: Path, names: Iterable[str]) -> None:
+    """Raise InputError for the first of a recording's files that lies outside it."""
+    for name in names:
+        if leads_outside(root / name, root):
+            raise InputError(
+                root / name, "is a link out of the recording", "copy the file into the recording"
+            )
+
+
 def read_picture(path: Path, root: Path) -> bytes:
     """Read a picture's bytes as stored.
 

@@ -57,7 +57,7 @@ def draw_matches(example: MatchingExample) -> tuple[Picture, ...]:
 
 
 def _features(example: MatchingExample, scale: float) -> str:
-    canvas = _canvas(example.old, scale)
+    canvas = canvas_of(example.old, scale)
     for x, y in example.features * scale:
         _circle(canvas, x, y, 2.5, BLUE)
     for x, y in example.followed * scale:
@@ -68,7 +68,7 @@ def _features(example: MatchingExample, scale: float) -> str:
 def _lines(
     image: UInt8, pairs: Float64, groups: list[tuple[Bool, tuple[int, int, int]]], scale: float
 ) -> str:
-    canvas = _canvas(image, scale)
+    canvas = canvas_of(image, scale)
     for shown, colour in groups:
         for x0, y0, x1, y1 in pairs[shown] * scale:
             cv2.line(canvas, _at(x0, y0), _at(x1, y1), colour, 1, cv2.LINE_AA, SHIFT)
@@ -78,7 +78,7 @@ def _lines(
 
 def _guided(example: MatchingExample, scale: float, corner: tuple[int, int], shape: tuple[int, ...]) -> str:
     top, left = corner
-    canvas = _canvas(example.new[top : top + shape[0], left : left + shape[1]], scale)
+    canvas = canvas_of(example.new[top : top + shape[0], left : left + shape[1]], scale)
     found = np.atleast_1d(np.isfinite(example.found).all(axis=1))
     for k in np.flatnonzero(np.isfinite(example.predicted).all(axis=1)):
         x, y = (example.predicted[k] - (left, top)) * scale
@@ -109,8 +109,8 @@ def _enlarged(example: MatchingExample) -> str:
     return _guided(example, ZOOM, best, CROP_PX)
 
 
-def _canvas(image: UInt8, scale: float) -> UInt8:
-    """Stretch the picture (H, W, 3) in brightness, a little darkened so that lines show."""
+def canvas_of(image: UInt8, scale: float) -> UInt8:
+    """Stretch a gray picture (H, W) in brightness to (h, w, 3), a little darkened so that lines show."""
     low, high = np.percentile(image, (1, 99.5))
     light = np.clip((image - low) * (215 / max(high - low, 1.0)), 0, 230).astype(np.uint8)
     way = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC

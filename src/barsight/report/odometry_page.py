@@ -86,7 +86,7 @@ def odometry_summary(result: OdometryResult) -> dict[str, Any]:
         "warnings": [*trajectory.doubts, *trajectory.warnings],
         "length_m": trajectory.length_m,
         "seconds": _seconds(trajectory.stamp_ns[-1:], trajectory)[0],
-        "drift": None if result.drift is None else json_value(dataclasses.asdict(result.drift)),
+        "drift": None if result.drift is None else json_value(result.drift),
         "rig_drift": _rig_drift(trajectory),
         "residuals_in_sigma": {
             name: {

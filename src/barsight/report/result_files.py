@@ -58,16 +58,20 @@ def write_surface(
         write_passes(surface, history, folder / "passes.tif")
 
 
-def write_results(measurement: Measurement, identity: MapIdentity, folder: Path) -> None:
-    """Write all other files that a measurement fills but result.json, into an existing folder."""
+def write_tables(measurement: Measurement, folder: Path) -> None:
+    """Write trajectory, contours and the laser's profiles into an existing folder."""
     write_trajectory(measurement.trajectory, folder / "trajectory.tum")
     write_contours(measurement.contours, folder / "contour.csv")
+    if measurement.laser:
+        write_laser_csv(measurement.laser, folder / "laser.csv")
+
+
+def write_results(measurement: Measurement, identity: MapIdentity, folder: Path) -> None:
+    """Write all other files that a measurement fills but result.json, into an existing folder."""
     reference = measurement.trajectory.reference
     path = folder / "bundles.json"
     digest = write_bundles(measurement.bundles, measurement.stock, reference, identity, path)
     write_lifts(measurement.lifts, reference, identity, digest, folder / "lifts.json")
-    if measurement.laser:
-        write_laser_csv(measurement.laser, folder / "laser.csv")
     if measurement.preview is not None:
         write_preview(measurement.preview, folder / "preview.png")
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import hmac
-import re
 import secrets
 from dataclasses import dataclass
 from typing import Literal, get_args
 
 from barsight.core.errors import ConfigError
 from barsight.core.extras import extra
+from barsight.core.passwords import expect_password, is_account_name, password_digest
 from barsight.store.audit import Entry
 from barsight.store.tables import ACCOUNTS
 
@@ -21,10 +21,6 @@ Role = Literal["viewer", "operator", "engineer", "service"]
 ROLES: tuple[Role, ...] = get_args(Role)
 NO_ROLE = "none"
 """Role of an account that was withdrawn."""
-MIN_PASSWORD = 10
-_NAME = re.compile(r"[\w.@-]{1,60}")
-_COST = {"n": 2**15, "r": 8, "p": 1, "maxmem": 2**26}
-"""scrypt's: 32 MiB and some 80 ms a password."""
 _NOBODY = f"{'0' * 32}${'0' * 128}"
 
 
@@ -50,10 +46,9 @@ def list_accounts(connection: Connection) -> dict[str, Account]:
 
 def add_person(opened: Entry, name: str, role: str, password: str) -> None:
     """Add a person, or give one that is there another role and password. Raises ConfigError."""
-    if len(password) < MIN_PASSWORD:
-        raise ConfigError(f"a password has at least {MIN_PASSWORD} characters")
+    expect_password(password)
     salt = secrets.token_bytes(16)
-    _add(opened, name, "person", role, f"{salt.hex()}${_scrypt(password, salt)}")
+    _add(opened, name, "person", role, f"{salt.hex()}${password_digest(password, salt)}")
 
 
 def add_token(opened: Entry, name: str, role: str) -> str:
@@ -81,7 +76,7 @@ def is_password(account: Account | None, password: str) -> bool:
     """Check a person's password; it takes as long for a name that there is not."""
     secret = account.secret if account is not None and account.kind == "person" else _NOBODY
     salt, _, digest = secret.partition("$")
-    return hmac.compare_digest(_scrypt(password, bytes.fromhex(salt)), digest)
+    return hmac.compare_digest(password_digest(password, bytes.fromhex(salt)), digest)
 
 
 def token_digest(token: str) -> str:
@@ -89,12 +84,8 @@ def token_digest(token: str) -> str:
     return hashlib.sha256(token.encode()).hexdigest()
 
 
-def _scrypt(password: str, salt: bytes) -> str:
-    return hashlib.scrypt(password.encode(), salt=salt, **_COST).hex()
-
-
 def _add(opened: Entry, name: str, kind: str, role: str, secret: str) -> None:
-    if not _NAME.fullmatch(name):
+    if not is_account_name(name):
         raise ConfigError(f"{name!r} is no name: letters, digits and . _ @ - are, 60 at most")
     if role not in ROLES:
         raise ConfigError(f"there is no role {role!r}; known are {', '.join(ROLES)}")

@@ -13,7 +13,7 @@ import numpy as np
 from barsight.core.arrays import Float64
 from barsight.core.errors import InputError
 from barsight.core.files import atomic_path
-from barsight.core.reading.bounded_reading import read_text
+from barsight.core.reading.bounded_reading import MAX_ENTRIES, read_lines
 from barsight.yard.types import Bundle
 
 KINDS = ("lift", "set-down", "magnet")
@@ -54,7 +54,7 @@ def read_events(path: Path) -> tuple[YardEvent, ...]:
     """Read a CSV of COLUMNS. Raises InputError where it is missing or a line is no event."""
     remedy = f"give a CSV with the columns {','.join(COLUMNS)}; a kind is one of {', '.join(KINDS)}"
     try:
-        rows = list(csv.reader(read_text(path, remedy=remedy).split("\n")))
+        rows = list(csv.reader(read_lines(path, MAX_ENTRIES, remedy)))
     except csv.Error as error:
         raise InputError(path, f"can't be read ({error})", remedy) from error
     if not rows or tuple(rows[0]) != COLUMNS:

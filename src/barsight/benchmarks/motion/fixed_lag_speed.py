@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import mmap
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -15,7 +14,7 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.errors import ConfigError
-from barsight.core.memory import peak_memory_mib
+from barsight.core.memory import peak_memory_mib, resident_bytes
 from barsight.core.pose import Pose
 from barsight.core.types import CraneSamples, ImuSamples, PosedFrame
 from barsight.features.guided_matching import project_stereo
@@ -81,7 +80,7 @@ def bench_live(keyframes: int = 1000, held: int = 8, seed: int = 1) -> LiveSpeed
         begin = time.perf_counter(), time.process_time()
         frame = estimator.take(sighting)
         clocks.append((time.perf_counter() - begin[0], time.process_time() - begin[1]))
-        memory.append(_resident_mib())
+        memory.append(resident_bytes() / 2**20)
         seen.append(len(sighting.track))
         assert isinstance(frame, PosedFrame)
         found.append((frame.reference_from_body.translation, frame.covariance[3:, 3:]))
@@ -148,9 +147,3 @@ def _rig() -> StereoRig:
     body_from_cam0 = Pose("body", "cam0", np.eye(3), np.array([0.06, -0.09, 0.04]))
     cam0_from_cam1 = Pose("cam0", "cam1", np.eye(3), np.array([0.5, 0.0, 0.0]))
     return StereoRig(lens, replace(lens), body_from_cam0, body_from_cam0 @ cam0_from_cam1, 0)
-
-
-def _resident_mib() -> float:
-    """Read the resident memory from the kernel's own count of its pages."""
-    with open("/proc/self/statm") as file:  # noqa: PTH123
-        return int(file.read().split()[1]) * mmap.PAGESIZE / 2**20

@@ -7,7 +7,7 @@ import json
 import shutil
 import tomllib
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -43,7 +43,7 @@ class WorldKeys:
         """Compute them from the settings and the package's sources."""
         root = Path(barsight.__file__).parent
         measuring = [path.name for path in root.iterdir() if path.name not in (*MEASURES_NOT, "__pycache__")]
-        drawn = json_digest([GENERATOR, json_value(asdict(given)), _sources(root, DRAWS)])
+        drawn = json_digest([GENERATOR, json_value(given), _sources(root, DRAWS)])
         measured = json_digest([drawn, _sources(root, measuring)])
         return cls(drawn, measured, json_digest([measured, _sources(root, SCORES)]))
 
@@ -79,7 +79,7 @@ def run_world(
     done = None if note["refused"] else out
     if note.get("score") != keys.score:
         score = score_world(recording, done, note["looked_at"], note["refused"])
-        note |= {"score": keys.score, "scores": json_value(asdict(score))}
+        note |= {"score": keys.score, "scores": json_value(score)}
     note["scores"]["looked_at"] = note["looked_at"]
     _write_note(folder, note)
     return _score(note["scores"])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -59,7 +58,7 @@ def run(arguments: Sequence[str]) -> None:
 def _write(found: MeasuredLoad, figures: Sequence[BudgetedFigure], out: Path) -> None:
     content = {
         "bundle": found.bundle,
-        "figures": [asdict(one) for one in figures],
+        "figures": list(figures),
         "assumed": list(found.assumed),
     }
     write_json(out, content, DIGITS)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -63,7 +62,7 @@ def run(arguments: Sequence[str]) -> None:
                 advance("compare", number + 1, len(both))
         findings = judge(versions[0].name, versions[1].name, compared, untold)
         with atomic_directory(out) as staging:
-            text = json.dumps(json_value(asdict(findings)), indent=1, allow_nan=False)
+            text = json.dumps(json_value(findings), indent=1, allow_nan=False)
             (staging / "comparison.json").write_text(text + "\n", encoding="utf-8")
             (staging / "comparison.html").write_text(comparison_page(findings), encoding="utf-8")
         shifts = ", ".join(f"{s.figure} {s.shift:+.4f}" for s in findings.shifts if s.is_found) or "none"

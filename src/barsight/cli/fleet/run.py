@@ -16,7 +16,7 @@ from barsight.fleet.cluster import connect
 from barsight.fleet.driver import count_states, drive
 from barsight.fleet.ledger import forgive
 from barsight.fleet.objects import open_objects
-from barsight.fleet.planning import in_order
+from barsight.fleet.planning import TaskChoice
 from barsight.fleet.records import find_version, read_archive, read_tasks
 from barsight.fleet.task import TaskLimits, TaskSettings
 from barsight.fleet.window import RunWindow
@@ -29,30 +29,24 @@ def run(arguments: Sequence[str]) -> None:
 
     def command(
         results: str,
+        choice: Annotated[TaskChoice, tyro.conf.arg(name="")],
         limits: Annotated[TaskLimits, tyro.conf.arg(name="")],
         window: Annotated[RunWindow, tyro.conf.arg(name="")],
         store: str = DEFAULT_URL,
-        version: str | None = None,
         workers: int = 1,
         scheduler: str | None = None,
-        limit: int | None = None,
-        first: tuple[str, ...] = (),
-        again: bool = False,
         by: str | None = None,
     ) -> None:
         """Measure what is planned; killed, it goes on where it was when it is started again.
 
         Args:
             results: Folder or URL for what is measured.
+            choice: Of what is planned.
             limits: Of each measurement.
             window: When recordings are started.
             store: SQLAlchemy's URL of the database.
-            version: Version to measure, by the beginning of its name; the one planned last if not given.
             workers: Worker processes on this machine.
             scheduler: Address of a Dask scheduler, tcp://HOST:PORT, whose workers are used instead.
-            limit: Most recordings to measure now.
-            first: Beginnings of the names of recordings that come first, in this order.
-            again: Try parked recordings again.
             by: Who runs it, for the audit log; the name of the user if not given.
         """
         if workers < 1:
@@ -60,10 +54,10 @@ def run(arguments: Sequence[str]) -> None:
         target = open_objects(results, create=True)
         with open_store(store) as opened:
             with opened.reading() as connection:
-                chosen = find_version(connection, version)
-                tasks = in_order(read_tasks(connection, chosen), first)[:limit]
+                chosen = find_version(connection, choice.version)
+                tasks = choice.of(read_tasks(connection, chosen))
                 archive = read_archive(connection, chosen)
-            if again:
+            if choice.again:
                 for task in tasks:
                     forgive(target, task.key)
             # Workers of other machines can't write into this machine's file.

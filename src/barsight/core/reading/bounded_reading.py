@@ -28,8 +28,20 @@ MAX_DOCUMENT_BYTES = 256 << 20
 """Of a result's JSON."""
 MAX_SETTINGS_BYTES = 1 << 20
 """Of a file that people write: settings, magnets, calibrations."""
-MAX_ARCHIVE_BYTES = 1 << 30
+MAX_ARCHIVE_BYTES, MAX_ARCHIVE_ARRAYS = 1 << 30, 10_000
 """Of an archive's arrays, unpacked."""
+MAX_WIDE_BYTES = 64 << 20
+"""Of a text that is not all ASCII: one letter of another alphabet makes every letter take four bytes."""
+MAX_LINES, MAX_LINE_BYTES = 4_000_000, 1 << 20
+"""Of a table: five hours of an IMU at 200 Hz. Short lines cost far more than their bytes."""
+MAX_PICTURES = 500_000
+"""Lines of a list with one for each picture or pose: four hours at 30 Hz."""
+MAX_ENTRIES = 100_000
+"""Lines of a list that people keep: stock, targets, events."""
+MAX_PROFILES = 5_000
+"""Of a laser or a map's contours."""
+MAX_VALUES = 4_000_000
+"""Of a JSON document, by its commas and opening brackets: so many take half a GiB."""
 MAX_DEPTH, MAX_NODES = 64, 1_000_000
 """Of lists and mappings in each other, and of all values of a settings file."""
 MAX_INTEGER = 2**64
@@ -100,11 +112,39 @@ def read_text(
 ) -> str:
     """Read UTF-8 text, with or without a BOM; lines end with newlines alone. Raises `kind`."""
     data = read_bytes(path, max_bytes, remedy, kind)
+    if len(data) > MAX_WIDE_BYTES and not data.isascii():
+        problem = f"has {len(data)} bytes, at most {MAX_WIDE_BYTES} are read of a text that isn't all ASCII"
+        raise kind(path, problem, remedy)
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise kind(path, f"is no UTF-8 text (byte {error.start})", remedy) from None
     return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def read_lines(
+    path: Path, max_lines: int = MAX_LINES, remedy: str = REMEDY, kind: type[InputError] = InputError
+) -> list[str]:
+    """Read a table's lines as `read_text`, after `expect_lines`. Raises `kind`."""
+    expect_lines(path, max_lines, remedy, kind)
+    return read_text(path, remedy=remedy, kind=kind).removesuffix("\n").split("\n")
+
+
+def expect_lines(
+    path: Path, max_lines: int = MAX_LINES, remedy: str = REMEDY, kind: type[InputError] = InputError
+) -> None:
+    """Raise `kind` unless the file is a regular one of at most MAX_TABLE_BYTES and so many lines, none of
+    them much longer than MAX_LINE_BYTES.
+    """
+    lines = 0
+    with open_regular(path, remedy, kind, MAX_TABLE_BYTES) as file:
+        while part := file.read(MAX_LINE_BYTES):
+            ends = max(part.count(b"\n"), part.count(b"\r"))
+            if not ends and len(part) == MAX_LINE_BYTES:
+                raise kind(path, f"has a line of over {MAX_LINE_BYTES} bytes", remedy)
+            lines += ends
+            if lines > max_lines:
+                raise kind(path, f"has over {max_lines} lines", remedy)
 
 
 def read_json(path: Path, remedy: str = REMEDY, kind: type[InputError] = InputError) -> Any:
@@ -147,6 +187,8 @@ def _told(
 
 
 def _parse_json(text: str) -> Any:
+    if text.count(",") + text.count("[") + text.count("{") > MAX_VALUES:
+        raise ValueError(f"over {MAX_VALUES} values")
     tree = json.loads(text, parse_int=_whole, parse_constant=_constant)
     _expect_shallow(tree)
     return tree
@@ -200,6 +242,8 @@ def read_arrays(
 ) -> dict[str, NDArray[Any]]:
     """Read an npz archive's arrays. Raises `kind` for one that is torn, too large, or holds objects."""
     data = read_bytes(path, MAX_ARCHIVE_BYTES, remedy, kind)
+    if (members := data.count(b"PK\x01\x02")) > MAX_ARCHIVE_ARRAYS:
+        raise kind(path, f"holds {members} arrays, at most {MAX_ARCHIVE_ARRAYS} are read", remedy)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             unpacked = sum(member.file_size for member in archive.infolist())

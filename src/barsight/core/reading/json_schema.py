@@ -28,7 +28,17 @@ def package_schema(package: str, name: str) -> Any:
     return json.loads(text)
 
 
-def expect_schema(document: Any, schema: Any, path: Path, remedy: str) -> None:
+def record_schema(**fields: Any) -> dict[str, Any]:
+    """Make the schema of an object with these fields, no other, all of them there."""
+    return {"type": "object", "required": list(fields), "properties": fields, "additionalProperties": False}
+
+
+def list_schema(items: Any) -> dict[str, Any]:
+    """Make the schema of a list."""
+    return {"type": "array", "items": items}
+
+
+def expect_schema(document: Any, schema: Any, path: Path | str, remedy: str) -> None:
     """Raise InputError about `path` naming the first place where the document isn't as the schema says."""
     fault = _fault(document, schema, schema, "")
     if fault:

@@ -20,6 +20,7 @@ from barsight.live.survey import STOOD
 from barsight.map_building import ProgressCallback
 from barsight.measure_folder import ignore_progress
 from barsight.measure_settings import MeasureSettings
+from barsight.pipeline import LiftRequest
 from barsight.recording.formats.segments import PATTERN
 from barsight.recording.open import open_recording
 from barsight.recording.writers.bag import write_descriptions
@@ -43,10 +44,10 @@ def measure_crane(
     All sensors are proved first; nothing is written where one of them isn't as crane.toml says.
     Raises a BarsightError.
     """
-    described = None if magnet is None else load_magnet(magnet)
+    request = LiftRequest(None if magnet is None else load_magnet(magnet))
     expect_empty(out)
     recording = _recorded(crane, out, datetime.now(UTC).strftime(STAMP))
-    return _begin(crane, out, recording, settings, live, tell).measure(None, described, "now", advance)
+    return _begin(crane, out, recording, settings, live, tell).measure(None, request, advance)
 
 
 def measure_surveys(
@@ -61,7 +62,8 @@ def measure_surveys(
     """
     if crane.encoders is None:
         raise ConfigError("crane.toml has no [encoders], by which surveys begin and end")
-    described, proved, ended, is_first = None if magnet is None else load_magnet(magnet), False, "", True
+    request = LiftRequest(None if magnet is None else load_magnet(magnet))
+    proved, ended, is_first = False, "", True
     while ended != INTERRUPTED:
         here = out / datetime.now(UTC).strftime(STAMP)
         recording = _recorded(crane, here, here.name)
@@ -76,7 +78,7 @@ def measure_surveys(
         is_first, proved = False, True
         _point(out / RUNNING, here.name)
         try:
-            run.measure(None, described, "now", advance)
+            run.measure(None, request, advance)
             ended = run.stop_because
             if ended == STOOD:
                 _drop_standing(here, recording)

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+from barsight.core.json_values import json_value
 from barsight.plant.opcua.security.binding import Node, Server, ua
 
 _SCALARS = {
@@ -66,7 +67,7 @@ def value_of(snapshot: Any, leaf: Leaf) -> Any:
     if isinstance(value, enum.Enum):
         value = value.value
     if leaf.is_json and value is not None:
-        return json.dumps(value, default=_plain)
+        return json.dumps(json_value(value), allow_nan=False)
     if leaf.is_array and value is not None:
         return list(value)
     return float(value) if leaf.kind is ua.VariantType.Double and value is not None else value
@@ -144,11 +145,3 @@ def _scalar(kind: Any) -> ua.VariantType | None:
 def _common(kinds: tuple[Any, ...]) -> ua.VariantType | None:
     found = {_scalar(one) for one in kinds if one is not Ellipsis}
     return found.pop() if len(found) == 1 else None
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, enum.Enum):
-        return value.value
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
-    raise TypeError(f"{type(value).__name__} has no form in JSON")

@@ -30,11 +30,13 @@ from barsight.recording.formats.bag_laser import laser_rows
 from barsight.recording.formats.bag_setup import choose_topics, find_calibration
 from barsight.recording.formats.segments import SEGMENTS, SegmentFile
 from barsight.recording.image_decoding import TornImageError
-from barsight.recording.own_files import file_digests
+from barsight.recording.own_files import expect_own_files, file_digests
 from barsight.recording.pairing import PairedStamps, pair_cameras
 from barsight.recording.sensor_samples import laser_std, make_crane, make_imu, make_laser
 from barsight.recording.stored_images import StoredImage
 
+BESIDE = ("crane0.yaml", "laser0.yaml", "body.yaml")
+"""Files that describe what a bag's messages don't."""
 WAITING_LIMIT = 64
 
 
@@ -65,6 +67,8 @@ class BagRecording:
         self.format = kind
         self._folder = path if path.is_dir() else path.parent
         self._settings = settings
+        own = self._bag_files() if path.is_dir() else []
+        expect_own_files(self._folder, [*(file.name for file in own), *BESIDE])
         self._bag = SegmentFile(bag_path) if kind == SEGMENTS else BagFile(bag_path)
         self._calibration = find_calibration(path, settings)
         self._topics = choose_topics(path, self._bag.topics, self._calibration, settings)
@@ -200,16 +204,18 @@ class BagRecording:
         path = self._folder / "laser0.yaml"
         rows = self._finite(name, 4)
         std = laser_std(read_document(path) if path.is_file() else None)
-        return make_laser(rows[:, 0].astype(np.int64), rows[:, 1:], std)
+        return make_laser(self.path, rows[:, 0].astype(np.int64), rows[:, 1:], std)
 
     def digests(self) -> dict[str, str]:
         """Compute digests; see `Recording.digests`."""
-        extra = [self._folder / name for name in ("crane0.yaml", "laser0.yaml", "body.yaml")]
-        bags = sorted(self.path.iterdir()) if self.path.is_dir() else [self.path]
-        bags = [
-            path for path in bags if path.suffix in (".bag", ".mcap", ".db3") or path.name == "metadata.yaml"
+        extra = [self._folder / name for name in BESIDE]
+        return file_digests(self._folder, [*self._bag_files(), *self._calibration.files, *extra])
+
+    def _bag_files(self) -> list[Path]:
+        files = sorted(self.path.iterdir()) if self.path.is_dir() else [self.path]
+        return [
+            file for file in files if file.suffix in (".bag", ".mcap", ".db3") or file.name == "metadata.yaml"
         ]
-        return file_digests(self._folder, [*bags, *self._calibration.files, *extra])
 
     def _pictures(self) -> Iterator[RawMessage]:
         return self._bag.messages((self._topics.cam0, self._topics.cam1))

@@ -19,6 +19,7 @@ from barsight.recording.formats.bag_file import (
     POINT_TYPE,
     Topic,
 )
+from barsight.recording.own_files import leads_outside
 
 CRANE_TOPIC = "/crane0/position"
 LASER_TOPIC = "/laser0/profiles"
@@ -112,7 +113,13 @@ def _find(folders: Sequence[Path], patterns: tuple[str, ...], without: tuple[str
                     folder, f"holds several calibrations: {names}", "name the one to use in the settings"
                 )
             if found:
-                return (exact or found)[0]
+                chosen = (exact or found)[0]
+                if leads_outside(chosen, folder):
+                    raise InputError(
+                        chosen, "is a link out of its folder",
+                        "copy the file there or name it (recording.camchain)",
+                    )  # fmt: skip
+                return chosen
     return None
 
 

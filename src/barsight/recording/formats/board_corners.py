@@ -21,11 +21,12 @@ from barsight.core.errors import InputError
 from barsight.core.types import CraneSamples, ImuSamples, LaserProfile, NamedPoints, RefusedFrame, StereoFrame
 from barsight.recording.base import RecordingSettings
 from barsight.recording.formats.imu_log import read_imu_log
-from barsight.recording.own_files import file_digests
+from barsight.recording.own_files import expect_own_files, file_digests
 from barsight.recording.pairing import PairedAtOpening, pair_cameras
 from barsight.recording.stored_images import StoredImage
 
 FIELDS = ("stamp_ns", "tag", "corner", "u", "v")
+FILES = (*NAMES, "imu0.csv")
 CORNERS_A_TAG = 4
 NO_PICTURES = "corners were recorded, no pictures"
 
@@ -44,6 +45,7 @@ class CornerRecording(PairedAtOpening):
         if settings.rig is None:
             raise InputError(path, "holds corners without a calibration", "name its rig file (rig)")
         self.path = path
+        expect_own_files(path, FILES)
         self.rig: StereoRig = read_rig_file(settings.rig)
         self._imu_yaml = settings.imu_yaml
         self._rows = [read_rows(path / name, FIELDS) for name in NAMES]
@@ -103,7 +105,7 @@ class CornerRecording(PairedAtOpening):
 
     def digests(self) -> dict[str, str]:
         """Compute digests; see `Recording.digests`."""
-        return file_digests(self.path, [self.path / name for name in (*NAMES, "imu0.csv")])
+        return file_digests(self.path, [self.path / name for name in FILES])
 
 
 def _by_stamp(rows: Any) -> dict[int, tuple[Any, Any]]:

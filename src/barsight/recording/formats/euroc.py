@@ -15,13 +15,16 @@ from barsight.core.types import CraneSamples, ImuSamples, LaserProfile
 from barsight.recording.base import RecordingSettings
 from barsight.recording.formats.euroc_tables import Table, read_image_list, read_table
 from barsight.recording.formats.image_folders import PictureFiles
-from barsight.recording.own_files import file_digests
+from barsight.recording.own_files import expect_own_files, file_digests
 from barsight.recording.pairing import pair_cameras
 from barsight.recording.sensor_samples import laser_std, make_crane, make_imu, make_laser
 
 IMU_COLUMNS = ("timestamp", "w_x", "w_y", "w_z", "a_x", "a_y", "a_z")
 CRANE_COLUMNS = ("timestamp", "bridge_x", "trolley_y", "hoist_z")
 LASER_COLUMNS = ("profile", "x", "y", "z")
+SENSORS = ("cam0", "cam1", "imu0", "crane0", "laser0")
+FILES = ("body.yaml", *(f"{sensor}/{name}" for sensor in SENSORS for name in ("data.csv", "sensor.yaml")))
+"""All that is read but pictures."""
 
 
 class EurocRecording(PictureFiles):
@@ -35,6 +38,8 @@ class EurocRecording(PictureFiles):
     def __init__(self, path: Path, settings: RecordingSettings) -> None:
         self.path = path
         self._root = path / "mav0" if (path / "mav0").is_dir() else path
+        expect_own_files(path, ["mav0"])
+        expect_own_files(self._root, FILES)
         for camera in ("cam0", "cam1"):
             if not (self._root / camera).is_dir():
                 raise InputError(
@@ -100,16 +105,11 @@ class EurocRecording(PictureFiles):
         table.expect_finite("remove the laser's dropouts from the file")
         description = folder / "sensor.yaml"
         std = laser_std(read_document(description) if description.is_file() else None)
-        return make_laser(table.first, table.rest, std)
+        return make_laser(folder / "data.csv", table.first, table.rest, std)
 
     def digests(self) -> dict[str, str]:
         """Compute digests; see `Recording.digests`."""
-        names = [
-            f"{sensor}/{name}"
-            for sensor in ("cam0", "cam1", "imu0", "crane0", "laser0")
-            for name in ("data.csv", "sensor.yaml")
-        ]
-        return file_digests(self._root, [self._root / name for name in ["body.yaml", *names]])
+        return file_digests(self._root, [self._root / name for name in FILES])
 
     def _imu_file(self, name: str) -> Path | None:
         folder = self._root / "imu0"

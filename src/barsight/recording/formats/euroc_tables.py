@@ -11,7 +11,7 @@ import numpy as np
 
 from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import InputError
-from barsight.core.reading.bounded_reading import MAX_TABLE_BYTES, in_range, open_regular
+from barsight.core.reading.bounded_reading import MAX_LINES, MAX_PICTURES, expect_lines, in_range
 from barsight.core.stamps import expect_increasing
 from barsight.recording.own_files import expect_inner_name
 
@@ -57,7 +57,7 @@ def read_table(path: Path, columns: tuple[str, ...], *, extra_allowed: bool = Fa
     Raises `InputError` naming file and line for no such file, no rows, a wrong count of columns, text
     where a number belongs, or a first column that isn't whole.
     """
-    require_file(path)
+    expect_lines(path, MAX_LINES, COPY)
     width = len(columns) - 1
     dtype = np.dtype([("first", np.int64), ("rest", np.float64, (width,))])
     header = _header_lines(path)
@@ -80,7 +80,7 @@ def read_image_list(path: Path) -> tuple[Int64, tuple[str, ...]]:
 
     Raises `InputError` as `read_table`.
     """
-    require_file(path)
+    expect_lines(path, MAX_PICTURES, COPY)
     stamps: list[int] = []
     names: list[str] = []
     lines: list[int] = []
@@ -106,11 +106,7 @@ def read_image_list(path: Path) -> tuple[Int64, tuple[str, ...]]:
     return stamp_ns, tuple(names)
 
 
-def require_file(path: Path) -> None:
-    """Raise `InputError` unless there is such a file, it may be read and is no larger than a table."""
-    open_regular(path, "copy the recording again, with all its files", max_bytes=MAX_TABLE_BYTES).close()
-
-
+COPY = "copy the recording again, with all its files"
 _REMEDY = "take the original file or mend the line"
 
 

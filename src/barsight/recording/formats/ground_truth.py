@@ -10,10 +10,10 @@ import numpy as np
 from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import InputError
 from barsight.core.pose import Pose
-from barsight.core.reading.bounded_reading import in_range, read_text
+from barsight.core.reading.bounded_reading import MAX_PICTURES, expect_lines, in_range, read_lines
 from barsight.core.stamps import expect_increasing, parse_seconds
 from barsight.recording.base import Recording
-from barsight.recording.formats.euroc_tables import read_table, require_file
+from barsight.recording.formats.euroc_tables import COPY, read_table
 from barsight.recording.own_files import leads_outside
 
 EUROC_FOLDER = "state_groundtruth_estimate0"
@@ -52,7 +52,7 @@ def read_ground_truth(path: Path, stamp_ns: Int64 | None = None, *, reference: s
     file = find_ground_truth(path) if path.is_dir() else path
     if file is None:
         raise InputError(path, "holds no true trajectory", "give a file with one")
-    require_file(file)
+    expect_lines(file, MAX_PICTURES, COPY)
     if file.suffix == ".csv":
         table = read_table(file, EUROC_COLUMNS, extra_allowed=True)
         table.expect_finite("remove the line")
@@ -113,7 +113,7 @@ def _kitti(path: Path, lines: list[list[str]], stamp_ns: Int64 | None, reference
 
 def _lines(path: Path) -> list[list[str]]:
     lines: list[list[str]] = []
-    for number, text in enumerate(read_text(path).splitlines(), 1):
+    for number, text in enumerate(read_lines(path), 1):
         fields = text.partition("#")[0].replace(",", " ").split()
         if not fields:
             continue

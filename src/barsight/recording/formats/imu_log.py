@@ -12,13 +12,15 @@ import numpy as np
 
 from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import InputError
-from barsight.core.reading.bounded_reading import in_range, read_text
+from barsight.core.reading.bounded_reading import in_range, read_lines
 from barsight.core.stamps import NS_PER_S
 from barsight.core.types import ImuSamples
 from barsight.recording.formats.bag_file import IMU_TYPE, BagFile
 
 GRAVITY_MPS2 = 9.80665
 COLUMNS = 7
+MAX_SAMPLES = 2_000_000
+"""Lines of a log: three hours at 200 Hz."""
 FORM = "seven columns: time, three of the gyroscope, three of the accelerometer (or these two exchanged)"
 NAMES_FORM = "more than seven columns need a header that names gyro and accel"
 BAGS = (".bag", ".mcap", ".db3")
@@ -112,7 +114,7 @@ def _file(path: Path) -> Path:
 
 def _rows(path: Path, unit: TimeUnit) -> tuple[str, Int64, Float64]:
     """Read header text, stamps (N,) ns in time's order and values (N, 6), by name where there are more."""
-    lines = read_text(path, remedy=f"give {FORM}").splitlines()
+    lines = read_lines(path, MAX_SAMPLES, f"give {FORM}")
     start = next((k for k, line in enumerate(lines) if re.match(r"\s*[-+.\d]", line)), len(lines))
     rows = [(k + 1, line) for k, line in enumerate(lines[start:], start) if line.strip() and line[0] != "#"]
     header = lines[start - 1].lstrip("# ") if start else ""

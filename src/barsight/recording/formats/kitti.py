@@ -19,13 +19,19 @@ from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import CalibrationError, InputError
-from barsight.core.reading.bounded_reading import in_range, read_text
+from barsight.core.reading.bounded_reading import (
+    MAX_PICTURES,
+    MAX_SETTINGS_BYTES,
+    in_range,
+    read_lines,
+    read_text,
+)
 from barsight.core.stamps import NS_PER_S, expect_increasing, seconds_in_ns
 from barsight.core.types import CraneSamples, ImuSamples, LaserProfile
 from barsight.recording.base import RecordingSettings
 from barsight.recording.formats.image_folders import PictureFiles
 from barsight.recording.image_decoding import TornImageError, decode_gray
-from barsight.recording.own_files import file_digests, read_picture
+from barsight.recording.own_files import expect_own_files, file_digests, read_picture
 from barsight.recording.pairing import pair_cameras
 
 FOLDERS = (
@@ -33,6 +39,7 @@ FOLDERS = (
     ("image_2", "image_3", "P2", "P3"),
     ("image_l", "image_r", "", ""),
 )
+TABLES = ("calib.txt", "times.txt")
 ASSUMED_RATE_HZ = 10
 ORIGINAL = "take the sequence's own calib.txt"
 PICTURE = re.compile(r"([0-9]{1,12})\.(png|jpg|jpeg)$", re.IGNORECASE)
@@ -51,6 +58,7 @@ class KittiRecording(PictureFiles):
 
     def __init__(self, path: Path, settings: RecordingSettings) -> None:
         self.path = path
+        expect_own_files(path, TABLES)
         layout = next((names for names in FOLDERS if (path / names[0]).is_dir()), None)
         if layout is None:
             raise InputError(
@@ -93,7 +101,7 @@ class KittiRecording(PictureFiles):
 
     def digests(self) -> dict[str, str]:
         """Compute digests; see `Recording.digests`."""
-        return file_digests(self.path, [self.path / "calib.txt", self.path / "times.txt"])
+        return file_digests(self.path, [self.path / name for name in TABLES])
 
 
 def _pictures(folder: Path) -> dict[int, Path]:
@@ -111,7 +119,7 @@ def _read_times(path: Path) -> Int64 | None:
     if not path.is_file():
         return None
     stamps = []
-    for number, text in enumerate(read_text(path).splitlines(), 1):
+    for number, text in enumerate(read_lines(path, MAX_PICTURES), 1):
         if text.strip():
             try:
                 stamps.append(seconds_in_ns(text.strip()))
@@ -145,7 +153,7 @@ def _read_projections(path: Path, keys: tuple[str, str]) -> tuple[Float64, Float
         raise CalibrationError(path, "no such file", "copy the sequence's calib.txt beside its pictures")
     named: dict[str, Float64] = {}
     bare: list[Float64] = []
-    for number, text in enumerate(read_text(path).splitlines(), 1):
+    for number, text in enumerate(read_text(path, MAX_SETTINGS_BYTES).split("\n"), 1):
         name, colon, rest = text.partition(":")
         name, rest = (name.strip(), rest) if colon else ("", text)
         if not rest.strip() or (name and name not in keys):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +12,7 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.errors import InputError
-from barsight.core.reading.bounded_reading import in_range, read_text
-from barsight.recording.formats.euroc_tables import require_file
+from barsight.core.reading.bounded_reading import MAX_ENTRIES, in_range, read_lines
 
 YARD = ("yard_x", "yard_y", "yard_z")
 TAGS = 587
@@ -61,7 +61,7 @@ def read_tags(path: Path) -> SurveyedTags:
     Raises `InputError` naming the line.
     """
     names, table = _read_table(path, "tag", YARD)
-    numbers = [int(name) if name.isascii() and name.isdigit() else TAGS for name in names]
+    numbers = [int(name) if re.fullmatch(r"[0-9]{1,6}", name) else TAGS for name in names]
     strange = next((name for name, number in zip(names, numbers, strict=True) if number >= TAGS), None)
     if strange is not None:
         problem = f"{strange!r} is no tag of the family 36h11"
@@ -75,10 +75,12 @@ def _read_table(path: Path, key: str, columns: tuple[str, ...]) -> tuple[tuple[s
     said), check.
     """
     remedy = f"give {','.join((key, *columns))} and, if wanted, sigma_m and check"
-    require_file(path)
-    first, *others = read_text(path, remedy=remedy).split("\n")
+    first, *others = read_lines(path, MAX_ENTRIES, remedy)
     lines = [first.lstrip("# "), *others]
-    rows = list(csv.DictReader(lines, skipinitialspace=True))
+    try:
+        rows = list(csv.DictReader(lines, skipinitialspace=True))
+    except csv.Error as error:
+        raise InputError(path, f"can't be read ({error})", remedy) from error
     header = [name.strip() for name in lines[0].split(",")]
     missing = [name for name in (key, *columns) if name not in header]
     if missing:
@@ -96,7 +98,7 @@ def _read_table(path: Path, key: str, columns: tuple[str, ...]) -> tuple[tuple[s
             )
         numbers.append(values)
     table = np.array(numbers, np.float64).reshape(-1, len(columns) + 2)
-    return tuple(row[key].strip() for row in rows), table
+    return tuple((row[key] or "").strip() for row in rows), table
 
 
 def _expect_once(path: Path, kind: str, names: tuple[str, ...]) -> None:

@@ -4,7 +4,6 @@ range.
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +30,7 @@ def rig_check_summary(check: RigCheck, source: str) -> dict[str, Any]:
         "source": source,
         "state": check.state,
         "range_m": json_value(check.range_m),
-        "lines": json_value([asdict(line) for line in check.lines]),
+        "lines": json_value(check.lines),
     }
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +30,7 @@ def write_bundles(
         **identity.header(sequence),
         "reference": reference,
         "bundles": [_record(bundle) for bundle in bundles],
-        "stock": None if stock is None else json_value(asdict(stock), DIGITS),
+        "stock": json_value(stock, DIGITS),
     }
     return write_sealed(content, target)
 
@@ -107,7 +106,7 @@ def _record(bundle: Bundle) -> dict[str, Any]:
         "known_share": bundle.known_share,
         "confidence": bundle.confidence,
         "reasons": list(bundle.reasons),
-        "label": None if bundle.label is None else asdict(bundle.label),
+        "label": bundle.label,
         "bar_axes": [
             {
                 "centre_m": bar.centre_m,

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import contextvars
-import hashlib
 import hmac
 import json
-import re
 import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,6 +14,7 @@ from typing import Any
 from barsight.core.errors import ConfigError, InputError
 from barsight.core.extras import extra
 from barsight.core.files import atomic_path
+from barsight.core.passwords import expect_password, is_account_name, password_digest
 from barsight.core.reading.bounded_reading import read_json
 from barsight.plant.link_settings import OPCUA_ROLES, OpcUaSettings
 from barsight.plant.opcua.security.binding import (
@@ -31,11 +30,6 @@ from barsight.plant.opcua.security.certificates import judge_certificate
 
 with extra("opcua"):
     from cryptography import x509
-
-MIN_PASSWORD = 10
-_NAME = re.compile(r"[\w.@-]{1,60}")
-_COST = {"n": 2**14, "r": 8, "p": 1, "maxmem": 2**25}
-"""scrypt's: 16 MiB a password."""
 
 
 @dataclass(frozen=True)
@@ -85,20 +79,15 @@ def read_users(path: Path | None) -> dict[str, OpcUaUser]:
 
 def add_user(path: Path, name: str, role: str, password: str) -> None:
     """Add a user to users.json, or give one that is there another role and password. Raises ConfigError."""
-    if len(password) < MIN_PASSWORD:
-        raise ConfigError(f"a password has at least {MIN_PASSWORD} characters")
-    if role not in OPCUA_ROLES or not _NAME.fullmatch(name):
+    expect_password(password)
+    if role not in OPCUA_ROLES or not is_account_name(name):
         raise ConfigError(f"{name!r}: a name has letters and digits, and the role is one of {OPCUA_ROLES}")
     salt = secrets.token_bytes(16)
-    user = OpcUaUser(role, salt.hex(), _scrypt(password, salt))
+    user = OpcUaUser(role, salt.hex(), password_digest(password, salt))
     users = {**read_users(path), name: user}
     with atomic_path(path) as temporary:
         temporary.touch(0o600)
         temporary.write_text(json.dumps({one: vars(fields) for one, fields in users.items()}, indent=1))
-
-
-def _scrypt(password: str, salt: bytes) -> str:
-    return hashlib.scrypt(password.encode()[:1024], salt=salt, dklen=64, **_COST).hex()
 
 
 class PasswordUsers:
@@ -116,7 +105,7 @@ class PasswordUsers:
             return RoleUser(UserRole.User, "anonymous") if self._allow_anonymous else None
         known = self._users.get(username)
         salt = bytes.fromhex(known.salt) if known else b"0" * 16
-        digest = _scrypt(password or "", salt)
+        digest = password_digest(password or "", salt)
         if known is None or not hmac.compare_digest(digest, known.digest):
             return None
         return RoleUser(UserRole.User, username, known.role)
