@@ -9,6 +9,7 @@ import importlib
 import os
 import random
 import shutil
+import signal
 import sys
 import tempfile
 import time
@@ -42,6 +43,8 @@ def main() -> int:
     parser.add_argument("--only", default="", help="targets whose names hold this")
     parser.add_argument("--show", action="store_true", help="print each finding with its last lines")
     given = parser.parse_args()
+    for number in (signal.SIGINT, signal.SIGTERM):  # a shell's background job ignores the first
+        signal.signal(number, signal.default_int_handler)
     with tempfile.TemporaryDirectory() as place:
         chosen = [target for target in TARGETS if given.only in target.name]
         seeds = prepared(given.seeds or Path(place) / "seeds", Path(place), chosen)
@@ -122,6 +125,8 @@ def attack(
                 tail = "\n    ".join(verdict.text.strip().splitlines()[-6:])
                 print(f"{number} {target.name}: {verdict.fault} ({how})\n    {tail}", flush=True)
         number += 1
+        if given.show and number % 1000 == 0:
+            print(f"{number - given.first} inputs, {len(found)} findings", flush=True)
 
 
 def one(target: Target, seeds: Path, scratch: Path, draw: random.Random) -> tuple[str, Verdict]:

@@ -30,7 +30,7 @@ def typed_words(text: str, *words: str) -> Call:
         os.write(write, text.encode())
         os.close(write)
         os.dup2(read, 0)
-        sys.stdin = os.fdopen(0)
+        sys.stdin = os.fdopen(0, closefd=False)
         return call(folder)
 
     return typed

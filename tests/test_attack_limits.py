@@ -19,6 +19,7 @@ from barsight.core.reading.bounded_reading import (
     read_lines,
     read_text,
 )
+from barsight.yard.inventory.stock_list import read_stock
 
 MAX_MIB = 400
 """Of a process that refuses: the interpreter with its libraries takes 150."""
@@ -121,3 +122,10 @@ def test_score_names_the_torn_contour(
         code = run(["score", str(whole), str(tmp_path / "out")])
         told = capsys.readouterr().err
         assert (code == 3 and "contour.csv: " in told) or damaged == ["profile,x_m"]
+
+
+def test_a_stock_list_of_too_many_is_refused_before_it_is_matched(tmp_path: Path) -> None:
+    path = tmp_path / "stock.csv"
+    path.write_text("name,x_m,y_m\n" + "".join(f"{number},1,2\n" for number in range(10_001)))
+    with pytest.raises(InputError, match="lists 10001 bundles, at most 10000"):
+        read_stock(path)

@@ -89,6 +89,13 @@ def repeated(unit: bytes, times: int) -> Damage:
     return lambda path: path.write_bytes(unit * times)
 
 
+def profiles(path: Path) -> None:
+    """Give each row a profile of its own."""
+    rows = "1.0,0.1,0.1,0.1,1" if path.name == "contour.csv" else "1.0,0.1,0.1"
+    lines = [path.read_text().partition("\n")[0], *(f"{number},{rows}" for number in range(200_000))]
+    path.write_text("\n".join(lines) + "\n")
+
+
 def bomb(path: Path) -> None:
     path.write_bytes(png_bomb(9000, 9000))
 
@@ -112,6 +119,10 @@ FOUND: list[tuple[str, Damage, str, str]] = [
     ("euroc/mav0/imu0/sensor.yaml", number(A_NUMBER, "-1e308"), "info F/euroc", "out of range"),
     ("euroc/mav0/imu0/data.csv", number(f",{A_NUMBER}", ",1e300"), "info F/euroc", "line 2: a value is NaN"),
     ("targets.csv", number(A_NUMBER, "-1e308"), "calibrate yard F/targets.csv -o F/made.yaml", "line 2: a"),
+    (
+        "targets.csv", number(r"0\.5", "a" * 140_000), "calibrate yard F/targets.csv -o F/made.yaml",
+        "can't be read (field larger",
+    ),
     ("rig.xml", number(r"(?<=<data>)\s*\S+", "-1e308"), EXPORT, "range"),
     ("out/preview.png", bomb, "report F/out", "at most"),
     ("out/preview.png", sparse, "report F/out", "at most"),
@@ -129,9 +140,16 @@ FOUND: list[tuple[str, Damage, str, str]] = [
     ("kitti/times.txt", link_out, "info F/kitti", "is a link out of the recording"),
     ("mcap/crane0.yaml", link_out, "convert F/mcap -o F/made --to euroc", "is a link out of the recording"),
     ("mcap/camchain-imucam.yaml", link_out, "convert F/mcap -o F/made --to euroc", "is a link out of its"),
+    ("euroc/mav0/cam0/data.csv", number(r"(?m)\d(?=\.png)", "<" * 3000), "info F/euroc", "is too long for a"),
+    (
+        "euroc/mav0/cam0/data.csv", number(r"(?m)\d(?=\.png)", "<" * 3000),
+        "convert F/euroc -o F/made --to ros1", "line 2: '17",
+    ),
     ("euroc/mav0/cam0/data.csv", repeated(b"1,a\n", 7_000_000), "info F/euroc", "has over 500000 lines"),
     ("euroc/mav0/imu0/data.csv", repeated(b"\n", 29_000_000), "info F/euroc", "has over 4000000 lines"),
     ("euroc/mav0/imu0/data.csv", repeated(b"1", 29_000_000), "info F/euroc", "has a line of over"),
+    ("out/contour.csv", then_sealed(profiles), "report F/out", "holds 200000 profiles, at most 5000"),
+    ("euroc/mav0/laser0/data.csv", profiles, "measure F/euroc -o F/made", "has 200000 profiles, at most"),
     ("out/bundles.json", repeated(b"[],", 10_000_000), "lifts F/out", "over 4000000 values"),
     ("out/height.tif", sparse, "explain F/out 1", "is torn"),
     ("out/tops.tif", sparse, "export F/out F/made.las", "is torn"),

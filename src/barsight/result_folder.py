@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from barsight.core.arrays import Float32, Float64, Int64
+from barsight.core.arrays import Float32, Float64, Int64, rows_by_number
 from barsight.core.errors import InputError
 from barsight.core.json_values import json_digest
 from barsight.core.reading.bounded_reading import (
     MAX_PICTURES,
+    MAX_PROFILES,
     expect_lines,
     in_range,
     open_regular,
@@ -280,7 +281,7 @@ def read_cloud(path: Path, max_points: int | None = None) -> Cloud:
 def read_contours(folder: Path) -> tuple[Contour, ...]:
     """Read contour.csv, a contour per profile; empty where there is no such file."""
     table = _read_table(folder / "contour.csv", 6)
-    parts = _by_profile(table)
+    parts = _by_profile(folder / "contour.csv", table)
     return tuple(
         Contour(number, part[:, 1], part[:, 2], part[:, 3], part[:, 4], part[:, 5].astype(np.uint8))
         for number, part in parts.items()
@@ -297,12 +298,15 @@ def read_laser(folder: Path) -> tuple[LaserProfile, ...]:
         LaserProfile(
             number, part[:, 1], part[:, 2], part[:, 3], float(part[0, 4]) if stated else float("nan")
         )
-        for number, part in _by_profile(table).items()
+        for number, part in _by_profile(folder / "laser.csv", table).items()
     )
 
 
-def _by_profile(table: Float64) -> dict[int, Float64]:
-    return {int(number): table[table[:, 0] == number] for number in np.unique(table[:, 0])}
+def _by_profile(path: Path, table: Float64) -> dict[int, Float64]:
+    found = rows_by_number(table[:, 0])
+    if len(found) > MAX_PROFILES:
+        raise InputError(path, f"holds {len(found)} profiles, at most {MAX_PROFILES} are read", REMEDY)
+    return {number: table[rows] for number, rows in found.items()}
 
 
 def _read_table(path: Path, *columns: int) -> Float64:

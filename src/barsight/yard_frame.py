@@ -42,7 +42,7 @@ class RecordingInYard(RecordingProxy):
             return self.whole.laser()
         return tuple(
             make_laser(
-                np.full(one.x_m.size, one.profile),
+                self.whole.path, np.full(one.x_m.size, one.profile),
                 pose.apply(np.column_stack([one.x_m, one.y_m, one.z_m])), one.range_std_m,
             )[0]
             for one in self.whole.laser()

@@ -78,6 +78,15 @@ def expect_shape(name: str, array: NDArray[Any], shape: tuple[int | None, ...]) 
         raise ValueError(f"{name} has shape {array.shape}, expected {wanted}")
 
 
+def rows_by_number(numbers: NDArray[Any]) -> dict[int, Int64]:
+    """List the rows that hold each number, in their order."""
+    if numbers.size == 0:
+        return {}
+    order = np.argsort(numbers, kind="stable")
+    found, first = np.unique(numbers[order], return_index=True)
+    return {int(n): rows for n, rows in zip(found, np.split(order, first[1:]), strict=True)}
+
+
 def frozen(array: NDArray[Any]) -> NDArray[Any]:
     """Return a read-only view: what a frozen dataclass hands out can't be written through."""
     view = array.view()

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from barsight.calibration.files.yaml_document import Document
-from barsight.core.arrays import Float64, Int64
+from barsight.core.arrays import Float64, Int64, rows_by_number
 from barsight.core.errors import InputError
 from barsight.core.pose import Pose
+from barsight.core.reading.bounded_reading import MAX_PROFILES
 from barsight.core.types import CraneSamples, ImuSamples, LaserProfile
 
 
@@ -51,14 +52,21 @@ def make_crane(document: Document, stamp_ns: Int64, position_m: Float64) -> Cran
     return CraneSamples(stamp_ns, position_m, np.array(document.numbers("p_crane_body", 3)), nominal, std)
 
 
-def make_laser(profile: Int64, xyz_m: Float64, range_std_m: float) -> tuple[LaserProfile, ...]:
-    """Sort profiles by number and each by x. range_std_m is NaN where nobody states it."""
+def make_laser(path: Path, profile: Int64, xyz_m: Float64, range_std_m: float) -> tuple[LaserProfile, ...]:
+    """Sort profiles by number and each by x. range_std_m is NaN where nobody states it.
+
+    Raises InputError about `path` for more than MAX_PROFILES.
+    """
+    found = rows_by_number(profile)
+    if len(found) > MAX_PROFILES:
+        problem = f"the laser has {len(found)} profiles, at most {MAX_PROFILES} are read"
+        raise InputError(path, problem, "leave profiles out")
     profiles = []
-    for number in np.unique(profile):
-        rows = xyz_m[profile == number]
+    for number, chosen in found.items():
+        rows = xyz_m[chosen]
         rows = rows[np.argsort(rows[:, 0], kind="stable")]
         x, y, z = (np.ascontiguousarray(column) for column in rows.T)
-        profiles.append(LaserProfile(int(number), x, y, z, range_std_m))
+        profiles.append(LaserProfile(number, x, y, z, range_std_m))
     return tuple(profiles)
 
 

@@ -38,6 +38,8 @@ MAX_PICTURES = 500_000
 """Lines of a list with one for each picture or pose: four hours at 30 Hz."""
 MAX_ENTRIES = 100_000
 """Lines of a list that people keep: stock, targets, events."""
+MAX_PROFILES = 5_000
+"""Of a laser or a map's contours."""
 MAX_VALUES = 4_000_000
 """Of a JSON document, by its commas and opening brackets: so many take half a GiB."""
 MAX_DEPTH, MAX_NODES = 64, 1_000_000

@@ -204,7 +204,7 @@ class BagRecording:
         path = self._folder / "laser0.yaml"
         rows = self._finite(name, 4)
         std = laser_std(read_document(path) if path.is_file() else None)
-        return make_laser(rows[:, 0].astype(np.int64), rows[:, 1:], std)
+        return make_laser(self.path, rows[:, 0].astype(np.int64), rows[:, 1:], std)
 
     def digests(self) -> dict[str, str]:
         """Compute digests; see `Recording.digests`."""

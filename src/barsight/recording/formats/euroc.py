@@ -105,7 +105,7 @@ class EurocRecording(PictureFiles):
         table.expect_finite("remove the laser's dropouts from the file")
         description = folder / "sensor.yaml"
         std = laser_std(read_document(description) if description.is_file() else None)
-        return make_laser(table.first, table.rest, std)
+        return make_laser(folder / "data.csv", table.first, table.rest, std)
 
     def digests(self) -> dict[str, str]:
         """Compute digests; see `Recording.digests`."""

@@ -38,7 +38,10 @@ def read_targets(path: Path) -> Targets:
     """
     first, *others = read_lines(path, MAX_ENTRIES, REMEDY)
     lines = [first.lstrip("# "), *others]
-    rows = list(csv.DictReader(lines, skipinitialspace=True))
+    try:
+        rows = list(csv.DictReader(lines, skipinitialspace=True))
+    except csv.Error as error:
+        raise InputError(path, f"can't be read ({error})", REMEDY) from error
     header = [name.strip() for name in lines[0].split(",")]
     missing = [name for name in COLUMNS if name not in header]
     if missing:

@@ -21,6 +21,8 @@ _OPTIONAL = ("top_z_m", "yaw_deg", "length_m", "width_m", "bar_diameter_m", "bar
 _REMEDY = (
     f"give a CSV with the columns {', '.join(_NEEDED)} (and any of {', '.join(_OPTIONAL)}), or JSON objects"
 )
+MAX_LISTED = 10_000
+"""Each is compared with each bundle of the map."""
 _REACH_M = 1.0
 _MOVED_M = 0.05
 _SIGMAS = 3.0
@@ -80,6 +82,8 @@ def read_stock(path: Path) -> tuple[ListedBundle, ...]:
         rows = _json_rows(path) if path.suffix.lower() == ".json" else _csv_rows(path)
     except (ValueError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(path, f"can't be read ({error})", _REMEDY) from error
+    if len(rows) > MAX_LISTED:
+        raise InputError(path, f"lists {len(rows)} bundles, at most {MAX_LISTED} are read", _REMEDY)
     listed = tuple(_expected(path, number, row) for number, row in enumerate(rows, start=1))
     counts = Counter(one.name for one in listed)
     twice = sorted(name for name, count in counts.items() if count > 1)
