@@ -217,7 +217,8 @@ def killed(target: Target, scratch: Path, draw: random.Random, expected: Whole) 
     os.waitpid(pid, 0)
     if wrong := half_made(target, before, content(scratch), expected):
         return f"half result: {wrong}"
-    shutil.rmtree(scratch / "made", ignore_errors=True)  # a folder that is there can't be written again
+    for path in scratch.glob("made*"):  # a folder that is there can't be written again, nor a survey recorded
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
     verdict = judge(lambda: target.call(scratch), scratch)
     if verdict.fault or verdict.code:
         return f"the next run: {told(verdict)}"

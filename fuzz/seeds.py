@@ -53,7 +53,7 @@ def make_seeds(folder: Path) -> None:
         _files(made)
         for name, shift_m in (("out", 0.0), ("old", 0.1)):
             write_results(made / name, shift_m)
-            _measured_from(made / name, made / "euroc")
+            measured_from(made / name, made / "euroc")
             _done(["lifts", str(made / name), "--magnet", str(made / "magnet.toml"), "--at", "end"])
         _fleet(made)
         _acceptance(made)
@@ -76,7 +76,7 @@ def write_results(folder: Path, shift_m: float) -> None:
     reseal_folder(folder)
 
 
-def _measured_from(folder: Path, recording: Path) -> None:
+def measured_from(folder: Path, recording: Path) -> None:
     """Make a result one of this recording: its poses at the recording's stamps, its digests."""
     opened = open_recording(recording)
     poses = [f"{stamp / 1e9:.9f} {k}.0 0.15 8.0 1 0 0 0" for k, stamp in enumerate(opened.index.stamps_ns)]

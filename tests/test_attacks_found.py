@@ -140,6 +140,11 @@ FOUND: list[tuple[str, Damage, str, str]] = [
     ("kitti/times.txt", link_out, "info F/kitti", "is a link out of the recording"),
     ("mcap/crane0.yaml", link_out, "convert F/mcap -o F/made --to euroc", "is a link out of the recording"),
     ("mcap/camchain-imucam.yaml", link_out, "convert F/mcap -o F/made --to euroc", "is a link out of its"),
+    ("euroc/mav0/cam0/data.csv", number(r"(?m)\d(?=\.png)", "<" * 3000), "info F/euroc", "is too long for a"),
+    (
+        "euroc/mav0/cam0/data.csv", number(r"(?m)\d(?=\.png)", "<" * 3000),
+        "convert F/euroc -o F/made --to ros1", "line 2: '17",
+    ),
     ("euroc/mav0/cam0/data.csv", repeated(b"1,a\n", 7_000_000), "info F/euroc", "has over 500000 lines"),
     ("euroc/mav0/imu0/data.csv", repeated(b"\n", 29_000_000), "info F/euroc", "has over 4000000 lines"),
     ("euroc/mav0/imu0/data.csv", repeated(b"1", 29_000_000), "info F/euroc", "has a line of over"),

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from barsight.acceptance.budget import BudgetedLoad, ErrorSource
+from barsight.acceptance.certificate import REMEDY as OTHER
 from barsight.acceptance.certificate import read_certificate
 from barsight.acceptance.observation import ViewGeometry, view_geometry
 from barsight.acceptance.yard_area import measured_rig
@@ -158,7 +159,7 @@ def _touch_errors_m(certificate: Path) -> dict[str, list[float]]:
             if row["group"] == "touch_mm" and row["error"] is not None:
                 found.setdefault(row["name"][-1:], []).append(1e-3 * float(row["error"]))
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(certificate, f"is torn ({type(error).__name__}: {error})", REMEDY) from error
+        raise InputError(certificate, f"is torn ({type(error).__name__}: {error})", OTHER) from error
     if not in_range([error for errors in found.values() for error in errors]).all():
-        raise InputError(certificate, "has an error that can't be", REMEDY)
+        raise InputError(certificate, "has an error that can't be", OTHER)
     return found

@@ -11,9 +11,12 @@ from barsight.core.files import lies_within
 from barsight.core.reading.bounded_reading import open_regular, read_bytes
 from barsight.recording.image_decoding import MAX_PICTURE_BYTES, TornImageError
 
+MAX_NAME_BYTES = 1000
+"""Of a file below the recording; a system takes 4096 with all folders above."""
+
 
 def expect_inner_name(name: str, path: Path, where: str) -> None:
-    """Raise InputError about `path` for a name that is absolute, climbs out of its folder or is none.
+    """Raise InputError about `path` for a name that is absolute, climbs out of its folder, too long or none.
 
     where: the place in the file, like `line 3`.
     """
@@ -22,6 +25,8 @@ def expect_inner_name(name: str, path: Path, where: str) -> None:
         raise InputError(
             path, f"{where}: {name[:80]!r} leads out of the recording", "name files by their name alone"
         )
+    if len(name.encode()) > MAX_NAME_BYTES or any(len(part.encode()) > 255 for part in parts.parts):
+        raise InputError(path, f"{where}: {name[:80]!r} is too long for a file's name", "mend the line")
 
 
 def leads_outside(path: Path, root: Path) -> bool:
