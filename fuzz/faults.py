@@ -36,11 +36,12 @@ IGNORED = ("stdout", "stderr")
 
 @dataclass(frozen=True)
 class Whole:
-    """Output of a run that nothing disturbs. content: of all files; same: names of those that two runs
-    write alike; seconds: by the clock.
+    """Output of a run that nothing disturbs. content: of all files; names: that two runs share; same: of
+    those that two runs write alike; seconds: by the clock.
     """
 
     content: Content
+    names: frozenset[str]
     same: frozenset[str]
     seconds: float
 
@@ -161,7 +162,8 @@ def whole(target: Target, seeds: Path, scratch: Path) -> Whole:
             )
         contents.append(content(scratch))
     first, second = contents
-    return Whole(second, frozenset(name for name in first if first[name] == second.get(name)), seconds)
+    names = frozenset(first.keys() & second.keys())
+    return Whole(second, names, frozenset(name for name in first if first[name] == second.get(name)), seconds)
 
 
 def content(scratch: Path) -> Content:
@@ -195,7 +197,8 @@ def told(verdict: Verdict) -> str:
 
 def unlike(found: Content, expected: Whole) -> str:
     """Name what is there too much, lacks, or has another content than an undisturbed run writes."""
-    for name in sorted(found.keys() ^ expected.content.keys()):
+    varies = len(found.keys() - expected.names) == len(expected.content.keys() - expected.names)
+    for name in sorted(expected.names - found.keys() if varies else found.keys() ^ expected.content.keys()):
         return f"{name} is {'left' if name in found else 'not there'}"
     changed = sorted(name for name in expected.same if found[name] != expected.content[name])
     return f"{changed[0]} differs" if changed else ""

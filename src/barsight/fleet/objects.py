@@ -12,6 +12,7 @@ from typing import Any
 
 from barsight.core.errors import ConfigError, InputError
 from barsight.core.extras import extra
+from barsight.core.files import translated_os_errors
 from barsight.core.reading.bounded_reading import MAX_DOCUMENT_BYTES, parse_json
 from barsight.core.reading.json_schema import expect_schema
 
@@ -139,7 +140,8 @@ def open_objects(url: str, *, create: bool = False) -> Objects:
     if not folder.is_dir():
         if not create:
             raise InputError(folder, "there is no such folder", "name the folder, or s3://BUCKET/PATH")
-        folder.mkdir(parents=True, exist_ok=True)
+        with translated_os_errors(folder):
+            folder.mkdir(parents=True, exist_ok=True)
     return Objects(str(folder), LocalStore(folder))
 
 
@@ -158,6 +160,8 @@ class _told:  # noqa: N801
 
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         """Translate."""
+        if kind is not None and kind.__name__ == "PanicException":  # of obstore, where no thread can be begun
+            raise MemoryError from error
         if isinstance(error, BaseError) or (isinstance(error, OSError) and error.errno is None):
             problem = _first_line(error)
             raise InputError(
