@@ -32,6 +32,7 @@ DONE, FAILED, UNREAD, REFUSED = 0, 1, 3, 4
 Content = dict[str, bytes | None]
 """Of the files under a folder by their names; None for a folder."""
 IGNORED = ("stdout", "stderr")
+"""Names of manifests hold when their recording was written."""
 
 
 @dataclass(frozen=True)
@@ -170,7 +171,7 @@ def content(scratch: Path) -> Content:
     """Read all that lies in the scratch folder."""
     return {
         str(path.relative_to(scratch)): path.read_bytes() if path.is_file() else None
-        for path in scratch.rglob("*") if path.name not in IGNORED
+        for path in scratch.rglob("*") if path.name not in IGNORED and path.parent.name != "manifests"
     }  # fmt: skip
 
 
