@@ -10,7 +10,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
-from barsight.core.errors import ConfigError, InputError
+from barsight.core.errors import ConfigError, InputError, OutputError
 from barsight.core.extras import extra
 from barsight.core.files import translated_os_errors
 from barsight.core.reading.bounded_reading import MAX_DOCUMENT_BYTES, parse_json
@@ -83,16 +83,17 @@ class Objects:
         return content
 
     def write(self, path: str, data: bytes) -> None:
-        """Write an object over what is there."""
-        with _told(f"{self.url}/{path}"):
+        """Write an object over what is there. Raises OutputError where it can't be."""
+        with _told(f"{self.url}/{path}", writes=True):
             obstore.put(self.store, path, data)
 
     def write_new(self, path: str, data: bytes) -> bool:
         """Write an object only where there is none; tell whether it is ours.
 
         data: tells its writer apart. A put whose answer was lost is tried again and finds itself.
+        Raises OutputError where it can't be.
         """
-        with _told(f"{self.url}/{path}"):
+        with _told(f"{self.url}/{path}", writes=True):
             try:
                 obstore.put(self.store, path, data, mode="create")
             except AlreadyExistsError:
@@ -118,8 +119,8 @@ class Objects:
                 yield bytes(part)
 
     def upload(self, file: Path, path: str) -> None:
-        """Write a file as an object."""
-        with _told(f"{self.url}/{path}"):
+        """Write a file as an object. Raises OutputError where it can't be."""
+        with _told(f"{self.url}/{path}", writes=True):
             obstore.put(self.store, path, file)
 
 
@@ -150,10 +151,10 @@ def _is_plain(endpoint: str) -> bool:
 
 
 class _told:  # noqa: N801
-    """Turn what a server or disk refuses into an InputError of one line."""
+    """Turn what a server or disk refuses into an InputError, or an OutputError where it `writes`, of a line."""
 
-    def __init__(self, name: str) -> None:
-        self.name = name
+    def __init__(self, name: str, *, writes: bool = False) -> None:
+        self.name, self.writes = name, writes
 
     def __enter__(self) -> None:
         """Begin."""
@@ -164,6 +165,9 @@ class _told:  # noqa: N801
             raise MemoryError from error
         if isinstance(error, BaseError) or (isinstance(error, OSError) and error.errno is None):
             problem = _first_line(error)
+            if self.writes:
+                told = f"{self.name}: can't be written ({problem}); free some space or set its keys"
+                raise OutputError(told) from error
             raise InputError(
                 self.name, f"can't be reached ({problem})", "see that it is there and its keys are set"
             ) from error
