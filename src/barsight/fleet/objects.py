@@ -151,7 +151,7 @@ def _is_plain(endpoint: str) -> bool:
 
 
 class _told:  # noqa: N801
-    """Turn what a server or disk refuses into an InputError, or an OutputError where it `writes`, of a line."""
+    """Turn what a server or disk refuses into one line: InputError, or OutputError where it `writes`."""
 
     def __init__(self, name: str, *, writes: bool = False) -> None:
         self.name, self.writes = name, writes
