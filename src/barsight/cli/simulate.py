@@ -14,10 +14,12 @@ from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError
 from barsight.core.settings.values import MAX_VALUE
+from barsight.recording.formats.surveyed_targets import read_tags
 from barsight.simulation.passes import simulate_passes
 from barsight.simulation.settings import SimulationSettings
-from barsight.simulation.simulate import simulate
+from barsight.simulation.simulate import laid_stock, simulate
 from barsight.simulation.worlds.artefacts import lay_artefacts
+from barsight.simulation.worlds.tags import lay_tags
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -30,6 +32,8 @@ def run(arguments: Sequence[str]) -> None:
         config: Path | None = None,
         draw: int | None = None,
         artefacts: Path | None = None,
+        tags: Path | None = None,
+        tag_m: float = 0.3,
     ) -> None:
         """Render a recording of a bar yard, with exact truth, as an EuRoC folder.
 
@@ -42,20 +46,25 @@ def run(arguments: Sequence[str]) -> None:
                 laser are taken from the settings then; truth/world.json says what was drawn.
             artefacts: Plan of an acceptance (see barsight accept): its plates, spheres and dummy bundles
                 stand there instead of a stock, exactly where it says.
+            tags: A .csv as calibrate yard --tags takes it: its AprilTags (36h11) lie there too, face up, on
+                thin plates, exactly where it says.
+            tag_m: Side of a tag's black square.
         """
         console = SafeConsole(stderr=True)
-        if artefacts is not None and (draw is not None or settings.passes.trolley_y_m):
-            raise ConfigError("simulate: --artefacts takes no drawn world and no passes")
+        if (artefacts or tags) is not None and (draw is not None or settings.passes.trolley_y_m):
+            raise ConfigError("simulate: --artefacts or --tags takes no drawn world and no passes")
+        if not 0.01 <= tag_m <= 2:
+            raise ConfigError(f"simulate: --tag-m {tag_m:g} must lie between 0.01 and 2")
+        laid = None if artefacts is None else lay_artefacts(read_plan(artefacts), settings)
+        if tags is not None:
+            laid = lay_tags(laid or laid_stock(settings), read_tags(tags), tag_m, settings)
         with stages(console) as advance:
-            if artefacts is not None:
-                laid = lay_artefacts(read_plan(artefacts), settings)
-                simulate(out, settings, lambda done, total: advance("render", done, total), laid)
-            elif draw is None and settings.passes.trolley_y_m:
-                simulate_passes(out, settings, lambda done, total: advance("render", done, total))
-            elif draw is None:
-                simulate(out, settings, lambda done, total: advance("render", done, total))
-            else:
+            if draw is not None:
                 _simulate_drawn(out, draw, settings, lambda done, total: advance("render", done, total))
+            elif settings.passes.trolley_y_m:
+                simulate_passes(out, settings, lambda done, total: advance("render", done, total))
+            else:
+                simulate(out, settings, lambda done, total: advance("render", done, total), laid)
         console.print(f"simulated recording: {out}", soft_wrap=True, highlight=False, markup=False)
 
     call(command, "simulate", arguments)

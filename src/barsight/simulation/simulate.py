@@ -67,7 +67,7 @@ class World:
     @classmethod
     def build(cls, settings: SimulationSettings) -> World:
         """Draw everything from the seed; each part has its own stream, so that one can change alone."""
-        return cls.over(lay_stock(stack_yard(settings, stream(settings, 0)), settings), settings)
+        return cls.over(laid_stock(settings), settings)
 
     @classmethod
     def over(cls, laid: LaidYard, settings: SimulationSettings, number: int = 0) -> World:
@@ -254,6 +254,11 @@ def lay_stock(stock: Stock, settings: SimulationSettings, gone: Collection[int] 
         return LaidYard(scene, {"bundles.json": rows})
     truth = {"bundles.json": rows, "labels.json": label_rows(scene, settings.seed)}
     return LaidYard(scene, truth, label_codes(settings.seed, len(stock.bundles)))
+
+
+def laid_stock(settings: SimulationSettings) -> LaidYard:
+    """Lay the stock that the seed draws."""
+    return lay_stock(stack_yard(settings, stream(settings, 0)), settings)
 
 
 def stream(settings: SimulationSettings, *number: int) -> np.random.Generator:

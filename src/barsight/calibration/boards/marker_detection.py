@@ -14,6 +14,13 @@ FEWEST_TAGS = 4
 FEWEST_CORNERS = 8
 BORDER_BITS = (2, 1)
 """Kalibr prints its tags with a black border of two cells, others with one."""
+TAG_FAMILY = "36h11"
+TAG_MODULES, TAG_QUIET = 8, 1
+"""Modules along a side of a tag 36h11, its black border counted, and of white around it."""
+MAX_FIT_PX = 2.0
+"""A fit that ends further from where it began is another minimum."""
+BLUR_PX = 0.5
+"""Blur of lens and pixel that a fitted tag is drawn with."""
 
 
 def detect_charuco(board: Board, image: UInt8) -> Corners | Failed:
@@ -62,19 +69,59 @@ def detect_aprilgrid(board: Board, image: UInt8) -> Corners | Failed:
 
 def _tags(image: UInt8, border_bits: int) -> tuple[Int64, Float64]:
     """Detect tags: numbers (N,), quads (N, 4, 2); a number seen twice is dropped."""
+    ids, quads = find_tags(image, border_bits)
+    numbers, counts = np.unique(ids, return_counts=True)
+    once = np.isin(ids, numbers[counts == 1])
+    return ids[once], quads[once]
+
+
+def find_tags(image: UInt8, border_bits: int = 1, family: str = TAG_FAMILY) -> tuple[Int64, Float64]:
+    """Detect AprilTags: numbers (N,) in order, corners (N, 4, 2) to a pixel or so, each tag's in its own
+    order.
+    """
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = border_bits
     parameters.minMarkerPerimeterRate = 0.01
     parameters.adaptiveThreshWinSizeMax = 43
-    detector = cv2.aruco.ArucoDetector(_dictionary("DICT_APRILTAG_36H11"), parameters)
+    detector = cv2.aruco.ArucoDetector(_dictionary(f"DICT_APRILTAG_{family}"), parameters)
     quads, ids, _ = detector.detectMarkers(image)
     if ids is None:
         return np.empty(0, np.int64), np.empty((0, 4, 2))
-    numbers, counts = np.unique(ids.ravel(), return_counts=True)
-    once = np.isin(ids.ravel(), numbers[counts == 1])
-    kept = np.asarray(quads, dtype=np.float64).reshape(-1, 4, 2)[once]
-    order = np.argsort(ids.ravel()[once])
-    return ids.ravel()[once][order].astype(np.int64), kept[order]
+    order = np.argsort(ids.ravel(), kind="stable")
+    return ids.ravel()[order].astype(np.int64), np.asarray(quads, np.float64).reshape(-1, 4, 2)[order]
+
+
+def tag_pattern(number: int) -> UInt8:
+    """Draw a tag 36h11 (S, S), one module a cell, 0 dark, with its quiet zone."""
+    drawn = cv2.aruco.generateImageMarker(_dictionary(f"DICT_APRILTAG_{TAG_FAMILY}"), number, TAG_MODULES)
+    return np.pad(np.asarray(drawn, np.uint8), TAG_QUIET, constant_values=255)
+
+
+def fit_tag(image: UInt8, number: int, quad: Float64) -> Float64 | None:
+    """Fit the whole pattern of a tag 36h11 to a picture [Evangelidis 2008], from corners (4, 2) known to a
+    pixel or so; the corners, or None where it doesn't fit.
+
+    Every edge counts, not the outer corners alone, and blur that is the same on all sides moves nothing.
+    """
+    low = np.maximum(np.floor(quad.min(axis=0) - 0.4 * np.ptp(quad, axis=0)).astype(int), 0)
+    high = np.ceil(quad.max(axis=0) + 0.4 * np.ptp(quad, axis=0)).astype(int) + 1
+    patch = image[low[1] : high[1], low[0] : high[0]].astype(np.float32)
+    side = float(np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1).mean())
+    cell = max(2, int(np.ceil(side / TAG_MODULES)))
+    drawn = np.kron(tag_pattern(number), np.ones((cell, cell))).astype(np.float32)
+    drawn = cv2.GaussianBlur(drawn, (0, 0), BLUR_PX * cell * TAG_MODULES / side)
+    edge = cell // 2  # what lies beside the paper blurs into its rim
+    drawn = np.ascontiguousarray(drawn[edge:-edge, edge:-edge])
+    near, far = TAG_QUIET * cell - edge - 0.5, (TAG_QUIET + TAG_MODULES) * cell - edge - 0.5
+    corners = np.array([[near, near], [far, near], [far, far], [near, far]], np.float32)
+    start = cv2.getPerspectiveTransform(corners, (quad - low).astype(np.float32)).astype(np.float32)
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-6)
+    try:
+        _, found = cv2.findTransformECC(drawn, patch, start, cv2.MOTION_HOMOGRAPHY, criteria, None, 1)
+    except cv2.error:  # it doesn't converge
+        return None
+    fitted = cv2.perspectiveTransform(corners[None].astype(np.float64), found.astype(np.float64))[0] + low
+    return fitted if np.abs(fitted - quad).max() <= max(MAX_FIT_PX, 0.1 * side) else None
 
 
 def _turn(corners: Float64, quads: Float64) -> Float64 | Failed:

@@ -54,6 +54,14 @@ class Rectifier:
 
     def __call__(self, frame: StereoFrame) -> RectifiedPair | Failed:
         """Rectify a pair; Failed `wrong-size` where the images don't have the calibration's size."""
+        wrong = self.wrong_size(frame)
+        if wrong is not None:
+            return wrong
+        right = frame.right if self._warps is None else self._warps[1](frame.right)
+        return self.pair(frame.stamp_ns, self.left(frame.left), right)
+
+    def wrong_size(self, frame: StereoFrame) -> Failed | None:
+        """Return Failed `wrong-size` where the images don't have the calibration's size."""
         for name, image, size in (
             ("left", frame.left, self._size),
             ("right", frame.right, self._right_size),
@@ -64,8 +72,7 @@ class Rectifier:
                     f"the {name} image is {image.shape[1]}x{image.shape[0]}, "
                     f"the calibration is for {size[1]}x{size[0]}",
                 )
-        right = frame.right if self._warps is None else self._warps[1](frame.right)
-        return self.pair(frame.stamp_ns, self.left(frame.left), right)
+        return None
 
     def pair(self, stamp_ns: int, left: UInt8, right: UInt8) -> RectifiedPair:
         """Name the geometry of two pictures that this rectifier has rectified."""

@@ -13,6 +13,7 @@ from rich.markup import escape
 
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.cli.arguments import call
+from barsight.cli.calibrate.yard_tags import calibrate_by_tags
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError, Failed, InputError, MeasurementError
@@ -46,21 +47,25 @@ def run(arguments: Sequence[str]) -> None:
         out: Annotated[Path, tyro.conf.arg(aliases=("-o",))],
         frame: Literal["world", "encoders", "body"] = "world",
         measured: Path | None = None,
+        tags: Path | None = None,
         sigma_m: float = 0.005,
         reading: Annotated[RecordingSettings, tyro.conf.arg(name="recording")] = RecordingSettings(),  # noqa: B008
     ) -> None:
-        """Register the measurement's world in the yard, from surveyed targets or from crane moves.
+        """Register the measurement's world in the yard, from surveyed targets or tags, or from crane moves.
 
         Args:
             source: A .csv of targets (name,yard_x,yard_y,yard_z,x,y,z in m; optionally sigma_m, and check = 1
-                for targets set apart), or a recording in which bridge and trolley move.
+                for targets set apart), a recording that shows tags, or one in which bridge and trolley move.
             out: The .yaml file to write; its report goes beside it (.html and .json).
             frame: What x, y, z of the targets are measured in: a world, the yard as the encoders have it,
                 or the body, which gives how the rig is mounted.
             measured: The folder of results in whose map the targets were measured; it says the frame, and
                 the file is then bound to its rig and crane.
-            sigma_m: One coordinate's error of a target, survey and measurement together, where no sigma_m
-                column says it.
+            tags: A .csv of AprilTags 36h11 as surveyed (tag,yard_x,yard_y,yard_z of the middle in m;
+                optionally sigma_m and check), which are found in the recording's pictures. The frame is that
+                in which measure maps this recording, and the file is bound to its rig and crane.
+            sigma_m: One coordinate's error of a target, survey and measurement together, or of a tag's survey
+                alone, where no sigma_m column says it.
             reading: How to read the recording.
         """
         expect_output(out, ".yaml", ".yml")
@@ -68,7 +73,13 @@ def run(arguments: Sequence[str]) -> None:
             raise ConfigError(f"--sigma-m {sigma_m:g} can't be; give metres")
         console = SafeConsole(stderr=True)
         hangs = None
-        if source.suffix.lower() == ".csv":
+        if tags is not None and (source.suffix.lower() == ".csv" or measured is not None or frame != "world"):
+            raise ConfigError(
+                "--tags takes a recording, and says the frame: leave out --frame and --measured"
+            )
+        if tags is not None:
+            found, owners = calibrate_by_tags(source, tags, sigma_m, reading, console)
+        elif source.suffix.lower() == ".csv":
             owners = {} if measured is None else _measured_owners(measured)
             if owners:
                 frame = "world" if owners["mounting_id"] is None else "encoders"
@@ -76,7 +87,7 @@ def run(arguments: Sequence[str]) -> None:
         else:
             moved, owners = _from_moves(source, reading, console)
             found, hangs = moved.calibration, moved.yard_from_body
-        _expect_usable(found, source)
+        _expect_usable(found, source if tags is None else tags)
         verdict = "good" if _is_good(found) else "usable with care"
         with atomic_paths(out, out.with_suffix(".html"), out.with_suffix(".json")) as (path, html, data):
             write_yard_file(path, found, hangs, owners)

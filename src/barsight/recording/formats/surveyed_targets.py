@@ -1,20 +1,22 @@
-"""Read surveyed targets: their places in the yard, and where the rig saw them."""
+"""Read surveyed targets: their places in the yard, and where the rig saw them or which tag they carry."""
 
 from __future__ import annotations
 
 import csv
+import re
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from barsight.core.arrays import Bool, Float64
+from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.errors import InputError
 from barsight.core.reading.bounded_reading import MAX_ENTRIES, in_range, read_lines
 
-COLUMNS = ("name", "yard_x", "yard_y", "yard_z", "x", "y", "z")
-REMEDY = "give name,yard_x,yard_y,yard_z,x,y,z and, if wanted, sigma_m and check"
+YARD = ("yard_x", "yard_y", "yard_z")
+TAGS = 587
+"""Tags of the family 36h11."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,37 +32,76 @@ class Targets:
     checks: Bool
 
 
+@dataclass(frozen=True, eq=False)
+class SurveyedTags:
+    """numbers (N,) of AprilTags 36h11; yard_m (N, 3) of their middles; sigma_m (N,) of each coordinate, NaN
+    where not said; checks (N,): set apart.
+    """
+
+    numbers: Int64
+    yard_m: Float64
+    sigma_m: Float64
+    checks: Bool
+
+
 def read_targets(path: Path) -> Targets:
     """Read a CSV with a header, m: `name,yard_x,yard_y,yard_z,x,y,z`, optionally `sigma_m` and `check` (1 or
     0).
 
     Raises `InputError` naming the line.
     """
-    first, *others = read_lines(path, MAX_ENTRIES, REMEDY)
+    names, table = _read_table(path, "name", (*YARD, "x", "y", "z"))
+    _expect_once(path, "target", names)
+    return Targets(names, table[:, :3], table[:, 3:6], table[:, 6], table[:, 7] == 1)
+
+
+def read_tags(path: Path) -> SurveyedTags:
+    """Read a CSV with a header, m: `tag,yard_x,yard_y,yard_z`, optionally `sigma_m` and `check` (1 or 0).
+
+    Raises `InputError` naming the line.
+    """
+    names, table = _read_table(path, "tag", YARD)
+    numbers = [int(name) if re.fullmatch(r"[0-9]{1,6}", name) else TAGS for name in names]
+    strange = next((name for name, number in zip(names, numbers, strict=True) if number >= TAGS), None)
+    if strange is not None:
+        problem = f"{strange!r} is no tag of the family 36h11"
+        raise InputError(path, problem, f"give the number on it, 0 to {TAGS - 1}")
+    _expect_once(path, "tag", tuple(map(str, numbers)))
+    return SurveyedTags(np.array(numbers, np.int64), table[:, :3], table[:, 3], table[:, 4] == 1)
+
+
+def _read_table(path: Path, key: str, columns: tuple[str, ...]) -> tuple[tuple[str, ...], Float64]:
+    """Read the texts (N,) of `key`, and the numbers (N, columns + 2): `columns`, sigma_m (NaN where not
+    said), check.
+    """
+    remedy = f"give {','.join((key, *columns))} and, if wanted, sigma_m and check"
+    first, *others = read_lines(path, MAX_ENTRIES, remedy)
     lines = [first.lstrip("# "), *others]
     try:
         rows = list(csv.DictReader(lines, skipinitialspace=True))
     except csv.Error as error:
-        raise InputError(path, f"can't be read ({error})", REMEDY) from error
+        raise InputError(path, f"can't be read ({error})", remedy) from error
     header = [name.strip() for name in lines[0].split(",")]
-    missing = [name for name in COLUMNS if name not in header]
+    missing = [name for name in (key, *columns) if name not in header]
     if missing:
-        raise InputError(path, f"has no column {missing[0]}", REMEDY)
+        raise InputError(path, f"has no column {missing[0]}", remedy)
     numbers = []
     for n, row in enumerate(rows, start=2):
         try:
-            values = [float(row[name]) for name in COLUMNS[1:]]
+            values = [float(row[name]) for name in columns]
             values += [float(row.get("sigma_m") or "nan"), float(row.get("check") or 0)]
         except (TypeError, ValueError):
-            raise InputError(path, f"line {n}: a number is missing or is none", REMEDY) from None
-        if not in_range(values[:6]).all() or values[6] <= 0 or values[7] not in (0, 1):
+            raise InputError(path, f"line {n}: a number is missing or is none", remedy) from None
+        if not in_range(values[:-2]).all() or values[-2] <= 0 or values[-1] not in (0, 1):
             raise InputError(
                 path, f"line {n}: a value can't be", "places finite, sigma_m positive, check 0 or 1"
             )
         numbers.append(values)
-    names = [row["name"].strip() for row in rows]
+    table = np.array(numbers, np.float64).reshape(-1, len(columns) + 2)
+    return tuple((row[key] or "").strip() for row in rows), table
+
+
+def _expect_once(path: Path, kind: str, names: tuple[str, ...]) -> None:
     twice = next((name for name, count in Counter(names).items() if count > 1), None)
     if twice is not None:
-        raise InputError(path, f"target {twice} is there twice", "give each target once")
-    table = np.array(numbers, np.float64).reshape(-1, 8)
-    return Targets(tuple(names), table[:, :3], table[:, 3:6], table[:, 6], table[:, 7] == 1)
+        raise InputError(path, f"{kind} {twice} is there twice", f"give each {kind} once")

@@ -1,0 +1,56 @@
+"""Lay surveyed AprilTags into a yard: thin level plates, their tops exactly where the list says."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from barsight.calibration.boards.marker_detection import TAG_MODULES, TAG_QUIET, tag_pattern
+from barsight.core.arrays import Float64
+from barsight.core.errors import ConfigError
+from barsight.recording.formats.surveyed_targets import SurveyedTags
+from barsight.simulation.scene import CODE, Primitives, Scene, build_grid, plain_material
+from barsight.simulation.settings import SimulationSettings
+from barsight.simulation.simulate import LaidYard, stream
+
+HALF_THICK_M = 0.005
+MIN_Z_M = 0.002
+"""A plate's top must lie over the floor to be seen."""
+
+
+def lay_tags(laid: LaidYard, tags: SurveyedTags, side_m: float, settings: SimulationSettings) -> LaidYard:
+    """Lay tags besides what lies there. side_m: of the black square; white paper stands out one module.
+
+    Each is turned about the vertical by an angle from the seed. Raises ConfigError for a tag under the floor,
+    and where labels are drawn.
+    """
+    if laid.codes.size:
+        raise ConfigError("simulate: --tags takes no labels; leave yard.label_m at 0 0")
+    low = np.flatnonzero(tags.yard_m[:, 2] < MIN_Z_M)
+    if low.size:
+        raise ConfigError(
+            f"simulate: tag {tags.numbers[low[0]]} must lie {MIN_Z_M:g} m or more over the floor"
+        )
+    rng, old = stream(settings, 14), laid.scene
+    plates, papers = [], []
+    for k, place in enumerate(tags.yard_m):
+        paper = plain_material(0.75, 0.0, rng, weight=0.3)
+        paper[CODE] = k + 1
+        plates.append(_plate(place, side_m, float(rng.uniform(0, 2 * np.pi))))
+        papers.append(paper)
+    shape = np.concatenate([old.primitives.shape, np.reshape(plates, (-1, 15))])
+    material = np.concatenate([old.primitives.material, np.reshape(papers, (-1, 10))]).astype(np.float32)
+    primitives = Primitives(shape, material, old.primitives.cylinders)
+    grid = build_grid(primitives, (float(old.grid.cell[0]), float(old.grid.cell[1])))
+    rows = [
+        {"tag": int(number), "center": place.tolist(), "side_m": side_m}
+        for number, place in zip(tags.numbers, tags.yard_m, strict=True)
+    ]
+    codes = np.stack([tag_pattern(int(number)) for number in tags.numbers])
+    return LaidYard(Scene(primitives, grid), {**laid.truth, "tags.json": rows}, codes)
+
+
+def _plate(place: Float64, side_m: float, yaw: float) -> Float64:
+    c, s = np.cos(yaw), np.sin(yaw)
+    half = side_m / 2 * (1 + 2 * TAG_QUIET / TAG_MODULES)
+    centre = place - [0, 0, HALF_THICK_M]
+    return np.array([*centre, c, s, 0.0, -s, c, 0.0, 0.0, 0.0, 1.0, half, half, HALF_THICK_M])
