@@ -32,15 +32,17 @@ DONE, FAILED, UNREAD, REFUSED = 0, 1, 3, 4
 Content = dict[str, bytes | None]
 """Of the files under a folder by their names; None for a folder."""
 IGNORED = ("stdout", "stderr")
+"""Names of manifests hold when their recording was written."""
 
 
 @dataclass(frozen=True)
 class Whole:
-    """Output of a run that nothing disturbs. content: of all files; same: names of those that two runs
-    write alike; seconds: by the clock.
+    """Output of a run that nothing disturbs. content: of all files; names: that two runs share; same: of
+    those that two runs write alike; seconds: by the clock.
     """
 
     content: Content
+    names: frozenset[str]
     same: frozenset[str]
     seconds: float
 
@@ -161,14 +163,15 @@ def whole(target: Target, seeds: Path, scratch: Path) -> Whole:
             )
         contents.append(content(scratch))
     first, second = contents
-    return Whole(second, frozenset(name for name in first if first[name] == second.get(name)), seconds)
+    names = frozenset(first.keys() & second.keys())
+    return Whole(second, names, frozenset(name for name in first if first[name] == second.get(name)), seconds)
 
 
 def content(scratch: Path) -> Content:
     """Read all that lies in the scratch folder."""
     return {
         str(path.relative_to(scratch)): path.read_bytes() if path.is_file() else None
-        for path in scratch.rglob("*") if path.name not in IGNORED
+        for path in scratch.rglob("*") if path.name not in IGNORED and path.parent.name != "manifests"
     }  # fmt: skip
 
 
@@ -195,7 +198,8 @@ def told(verdict: Verdict) -> str:
 
 def unlike(found: Content, expected: Whole) -> str:
     """Name what is there too much, lacks, or has another content than an undisturbed run writes."""
-    for name in sorted(found.keys() ^ expected.content.keys()):
+    varies = len(found.keys() - expected.names) == len(expected.content.keys() - expected.names)
+    for name in sorted(expected.names - found.keys() if varies else found.keys() ^ expected.content.keys()):
         return f"{name} is {'left' if name in found else 'not there'}"
     changed = sorted(name for name in expected.same if found[name] != expected.content[name])
     return f"{changed[0]} differs" if changed else ""

@@ -102,6 +102,7 @@ def bomb(path: Path) -> None:
 
 A_NUMBER = r"-?\d+\.\d+(e[-+]\d+)?"
 EXPORT = "calibrate export F/rig.xml -o F/made.yaml --to kalibr"
+OPENCV = "calibrate export F/opencv.yaml -o F/made.yaml --to kalibr"
 FOUND: list[tuple[str, Damage, str, str]] = [
     ("mcap/mcap.mcap", link_to_itself, "info F/mcap", "mcap.mcap: can't be read"),
     ("one.bag", sparse, "info F/one.bag", "is no ROS 1 bag"),
@@ -124,12 +125,17 @@ FOUND: list[tuple[str, Damage, str, str]] = [
         "can't be read (field larger",
     ),
     ("rig.xml", number(r"(?<=<data>)\s*\S+", "-1e308"), EXPORT, "range"),
+    ("opencv.yaml", number("data: ", "data: " + "[" * 100_000), OPENCV, "over 64 deep"),
+    ("opencv.yaml", number("data: ", "x: " + "- " * 100_000), OPENCV, "over 64 deep"),
+    ("rig.xml", number("<data>", "<data>" + "<a>" * 100_000), EXPORT, "over 64 deep"),
     ("out/preview.png", bomb, "report F/out", "at most"),
     ("out/preview.png", sparse, "report F/out", "at most"),
     ("out/ortho.png", bomb, "report F/out", "at most"),
     ("out/trajectory.tum", then_sealed(number(r" \S+", " 1e999990")), "report F/out", "pose 1: its numbers"),
     ("out/trajectory.tum", then_sealed(number(r"(?m)(?<= )\S+$", "5")), "report F/out", "pose 1: its quat"),
     ("out/laser.csv", then_sealed(number(A_NUMBER, "1e999990")), "report F/out", "out of range"),
+    ("out/laser.csv", then_sealed(number(A_NUMBER, "nan")), "report F/out", "laser.csv: holds a number out"),
+    ("out/contour.csv", then_sealed(number(A_NUMBER, "nan")), "report F/out", "contour.csv: holds a number"),
     ("out/laser.csv", then_sealed(number(A_NUMBER, "x")), "report F/out", "laser.csv: is torn"),
     ("out/contour.csv", number(A_NUMBER, "7"), "report F/out", "is not the one that result.json was written"),
     ("out/trajectory.tum", number(A_NUMBER, "7"), "lifts F/out", "is not the one that result.json was wr"),
@@ -164,16 +170,9 @@ def seeds(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert run(["convert", str(whole), "-o", str(folder / "mcap"), "--to", "ros2-mcap"]) == 0
     write_kitti(folder / "kitti", whole)
     write_rig_file(folder / "rig.yaml", read_rig(whole / "mav0"))
-    command = [
-        "calibrate",
-        "export",
-        str(folder / "rig.yaml"),
-        "-o",
-        str(folder / "rig.xml"),
-        "--to",
-        "opencv",
-    ]
-    assert run(command) == 0
+    for name in ("rig.xml", "opencv.yaml"):
+        words = [str(folder / "rig.yaml"), "-o", str(folder / name), "--to", "opencv"]
+        assert run(["calibrate", "export", *words]) == 0
     rows = [f"T{k},{k}.5,{k * k}.5,1.0,{k}.0,{k * k}.0,0.5" for k in range(4)]
     (folder / "targets.csv").write_text("name,yard_x,yard_y,yard_z,x,y,z\n" + "\n".join(rows) + "\n")
     (folder / "one.bag").touch()

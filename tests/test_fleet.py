@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import resource
+import signal
 import sys
 import time
 from dataclasses import replace
@@ -17,7 +19,7 @@ from sqlalchemy import select
 
 from barsight.cli.arguments import load_settings
 from barsight.cli.main import run
-from barsight.core.errors import ConfigError, Failed, InputError
+from barsight.core.errors import ConfigError, Failed, InputError, OutputError
 from barsight.fleet.archive import download, find_recordings, manifest_digest
 from barsight.fleet.cluster import connect
 from barsight.fleet.comparing import FigureChange, RecordingComparison, compare_recording
@@ -276,6 +278,26 @@ def test_an_archive_s_links_lead_to_recordings_and_not_out_of_them(tmp_path: Pat
     with pytest.raises(InputError, match=r"s/mav0/kind: is a link out of the recording"):
         list(download(objects, "s", (".",), tmp_path / "work"))
     assert not [path for path in (tmp_path / "work").rglob("*") if path.is_file()]
+
+
+def test_a_folder_that_can_t_be_made_is_an_output_that_failed(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="a part of the path is a file"):
+        open_objects(str(tmp_path / "file" / "results"), create=True)
+
+
+def test_a_full_disk_is_no_wrong_key(tmp_path: Path) -> None:
+    objects = open_objects(str(tmp_path / "o"), create=True)
+    objects.write("a", b"1")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
+    try:
+        with pytest.raises(OutputError, match=r"o/b: can't be written .*free some space"):
+            objects.write("b", bytes(100_000))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert [one.path for one in objects.list()] == ["a"]
 
 
 def test_a_changed_document_is_not_compared(tmp_path: Path) -> None:

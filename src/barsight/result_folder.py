@@ -280,7 +280,7 @@ def read_cloud(path: Path, max_points: int | None = None) -> Cloud:
 
 def read_contours(folder: Path) -> tuple[Contour, ...]:
     """Read contour.csv, a contour per profile; empty where there is no such file."""
-    table = _read_table(folder / "contour.csv", 6)
+    table = _read_table(folder / "contour.csv", 3, 6)
     parts = _by_profile(folder / "contour.csv", table)
     return tuple(
         Contour(number, part[:, 1], part[:, 2], part[:, 3], part[:, 4], part[:, 5].astype(np.uint8))
@@ -292,7 +292,7 @@ def read_laser(folder: Path) -> tuple[LaserProfile, ...]:
     """Read laser.csv; empty where there is no such file. range_std_m is NaN where nobody stated it, as in
     folders of older versions.
     """
-    table = _read_table(folder / "laser.csv", 4, 5)
+    table = _read_table(folder / "laser.csv", 4, 4, 5)
     stated = table.shape[1] == 5
     return tuple(
         LaserProfile(
@@ -309,8 +309,10 @@ def _by_profile(path: Path, table: Float64) -> dict[int, Float64]:
     return {number: table[rows] for number, rows in found.items()}
 
 
-def _read_table(path: Path, *columns: int) -> Float64:
-    """Read (N, one of `columns`) from a CSV with a header; an empty field is NaN."""
+def _read_table(path: Path, known: int, *columns: int) -> Float64:
+    """Read (N, one of `columns`) from a CSV with a header; an empty field is NaN, which none of the first
+    `known` may be.
+    """
     if not path.is_file():
         return np.empty((0, columns[0]))
     lines = read_lines(path, remedy=REMEDY)[1:]
@@ -323,6 +325,6 @@ def _read_table(path: Path, *columns: int) -> Float64:
         raise InputError(path, f"is torn ({str(error).split(';')[0]})", REMEDY) from error
     if table.shape[1] not in columns:
         raise InputError(path, f"has {table.shape[1]} columns instead of {columns[-1]}", REMEDY)
-    if (~in_range(table) & ~np.isnan(table)).any() or np.isnan(table[:, 0]).any():
+    if (~in_range(table) & ~np.isnan(table)).any() or np.isnan(table[:, :known]).any():
         raise InputError(path, "holds a number out of range", REMEDY)
     return table

@@ -52,7 +52,7 @@ def run(arguments: Sequence[str]) -> None:
         """
         console = SafeConsole(stderr=True)
         if (artefacts or tags) is not None and (draw is not None or settings.passes.trolley_y_m):
-            raise ConfigError("simulate: --artefacts and --tags take no drawn world and no passes")
+            raise ConfigError("simulate: --artefacts or --tags takes no drawn world and no passes")
         if not 0.01 <= tag_m <= 2:
             raise ConfigError(f"simulate: --tag-m {tag_m:g} must lie between 0.01 and 2")
         laid = None if artefacts is None else lay_artefacts(read_plan(artefacts), settings)

@@ -15,8 +15,11 @@ _NAME = re.compile(r"[\w.@-]{1,60}")
 
 
 def password_digest(password: str, salt: bytes) -> str:
-    """Compute scrypt's digest of 64 bytes (hex)."""
-    return hashlib.scrypt(password.encode()[:_MAX_BYTES], salt=salt, dklen=64, **_COST).hex()
+    """Compute scrypt's digest of 64 bytes (hex). Raises MemoryError where the system has no 32 MiB."""
+    try:
+        return hashlib.scrypt(password.encode()[:_MAX_BYTES], salt=salt, dklen=64, **_COST).hex()
+    except ValueError as error:  # OpenSSL's, of costs that are right
+        raise MemoryError from error
 
 
 def expect_password(password: str) -> None:

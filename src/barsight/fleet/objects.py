@@ -10,8 +10,9 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
-from barsight.core.errors import ConfigError, InputError
+from barsight.core.errors import ConfigError, InputError, OutputError
 from barsight.core.extras import extra
+from barsight.core.files import translated_os_errors
 from barsight.core.reading.bounded_reading import MAX_DOCUMENT_BYTES, parse_json
 from barsight.core.reading.json_schema import expect_schema
 
@@ -82,16 +83,17 @@ class Objects:
         return content
 
     def write(self, path: str, data: bytes) -> None:
-        """Write an object over what is there."""
-        with _told(f"{self.url}/{path}"):
+        """Write an object over what is there. Raises OutputError where it can't be."""
+        with _told(f"{self.url}/{path}", writes=True):
             obstore.put(self.store, path, data)
 
     def write_new(self, path: str, data: bytes) -> bool:
         """Write an object only where there is none; tell whether it is ours.
 
         data: tells its writer apart. A put whose answer was lost is tried again and finds itself.
+        Raises OutputError where it can't be.
         """
-        with _told(f"{self.url}/{path}"):
+        with _told(f"{self.url}/{path}", writes=True):
             try:
                 obstore.put(self.store, path, data, mode="create")
             except AlreadyExistsError:
@@ -117,8 +119,8 @@ class Objects:
                 yield bytes(part)
 
     def upload(self, file: Path, path: str) -> None:
-        """Write a file as an object."""
-        with _told(f"{self.url}/{path}"):
+        """Write a file as an object. Raises OutputError where it can't be."""
+        with _told(f"{self.url}/{path}", writes=True):
             obstore.put(self.store, path, file)
 
 
@@ -139,7 +141,8 @@ def open_objects(url: str, *, create: bool = False) -> Objects:
     if not folder.is_dir():
         if not create:
             raise InputError(folder, "there is no such folder", "name the folder, or s3://BUCKET/PATH")
-        folder.mkdir(parents=True, exist_ok=True)
+        with translated_os_errors(folder):
+            folder.mkdir(parents=True, exist_ok=True)
     return Objects(str(folder), LocalStore(folder))
 
 
@@ -148,18 +151,23 @@ def _is_plain(endpoint: str) -> bool:
 
 
 class _told:  # noqa: N801
-    """Turn what a server or disk refuses into an InputError of one line."""
+    """Turn what a server or disk refuses into one line: InputError, or OutputError where it `writes`."""
 
-    def __init__(self, name: str) -> None:
-        self.name = name
+    def __init__(self, name: str, *, writes: bool = False) -> None:
+        self.name, self.writes = name, writes
 
     def __enter__(self) -> None:
         """Begin."""
 
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         """Translate."""
+        if kind is not None and kind.__name__ == "PanicException":  # of obstore, where no thread can be begun
+            raise MemoryError from error
         if isinstance(error, BaseError) or (isinstance(error, OSError) and error.errno is None):
             problem = _first_line(error)
+            if self.writes:
+                told = f"{self.name}: can't be written ({problem}); free some space or set its keys"
+                raise OutputError(told) from error
             raise InputError(
                 self.name, f"can't be reached ({problem})", "see that it is there and its keys are set"
             ) from error

@@ -6,6 +6,7 @@ R and T are cam1_from_cam0, T in metres. OpenCV's own files don't carry the pict
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Float64
 from barsight.core.errors import CalibrationError
 from barsight.core.pose import Pose
-from barsight.core.reading.bounded_reading import MAX_SETTINGS_BYTES, in_range, read_text
+from barsight.core.reading.bounded_reading import MAX_DEPTH, MAX_SETTINGS_BYTES, in_range, read_text
 
 KEYS = {
     "M1": ("M1", "K1", "cameraMatrix1", "camera_matrix_1"), "D1": ("D1", "distCoeffs1", "dist_coeffs_1"),
@@ -86,6 +87,8 @@ def write_opencv_rig(path: Path, rig: StereoRig, *, xml: bool = False) -> None:
 def _matrices(path: Path) -> dict[str, Float64]:
     """Read the known entries as matrices; `fisheye` is there where the lenses are."""
     text = read_text(path, MAX_SETTINGS_BYTES, ORIGINAL, CalibrationError)
+    if _depth(text) > MAX_DEPTH:
+        raise CalibrationError(path, f"brackets in brackets over {MAX_DEPTH} deep", ORIGINAL)
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         root = storage.root()
@@ -110,6 +113,17 @@ def _matrices(path: Path) -> dict[str, Float64]:
     if DISTORTION_NAMES.get(model.lower()) is Distortion.EQUIDISTANT:
         found["fisheye"] = np.ones((1, 1))
     return found
+
+
+def _depth(text: str) -> int:
+    """Compute how deep brackets, tags and lists in one line stand in each other at most; OpenCV's parser goes
+    down into each and overflows its stack.
+    """
+    depth, deepest = 0, max((len(run[0]) // 2 for run in re.finditer(r"(?:- )+", text)), default=0)
+    for sign in re.finditer(r"[\[{\]}]|</|/>|<\w", text):
+        depth += -1 if sign[0] in ("]", "}", "</", "/>") else 1
+        deepest = max(deepest, depth)
+    return deepest
 
 
 def _matrix(path: Path, storage: cv2.FileStorage, name: str) -> Any:
