@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import operator
 import os
 import resource
 import signal
@@ -18,6 +19,7 @@ from fuzz.seeds import write_results
 from sqlalchemy import select
 
 from barsight.cli.arguments import load_settings
+from barsight.cli.bench.seeds import over_seeds
 from barsight.cli.main import run
 from barsight.core.errors import ConfigError, Failed, InputError, OutputError
 from barsight.fleet.archive import download, find_recordings, manifest_digest
@@ -358,6 +360,15 @@ def test_torn_documents_of_an_archive_and_a_planted_scratch_folder_are_refused(
     assert scratch_root() == planted
 
 
+def test_seeds_run_on_workers_as_here() -> None:
+    here = sorted(over_seeds(operator.add, range(3, 9), 100, 1, None))
+    assert here == [(seed, seed + 100) for seed in range(3, 9)]
+    assert sorted(over_seeds(operator.add, range(3, 9), 100, 2, None)) == here
+    with pytest.raises(ZeroDivisionError):
+        list(over_seeds(operator.floordiv, range(1), 0, 2, None))
+
+
+@pytest.mark.slow
 def test_a_bench_says_the_same_on_workers(tmp_path: Path) -> None:
     tables = [tmp_path / "one.json", tmp_path / "two.json"]
     for table, workers in zip(tables, ("1", "2"), strict=True):

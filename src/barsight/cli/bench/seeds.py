@@ -29,7 +29,7 @@ def over_seeds(
     """Run `run(seed, given)` for each seed and yield seed and result as each ends.
 
     workers: processes of this machine, which share its cores; 1 runs in this one. scheduler: of a Dask
-    cluster to be used instead. Raises MeasurementError for a seed whose workers die.
+    cluster to be used instead. Raises MeasurementError for a seed whose workers die, and what `run` raises.
     """
     if workers < 1:
         raise ConfigError(f"bench: workers must be 1 or more, not {workers}")
@@ -43,14 +43,22 @@ def over_seeds(
     with connect(workers, scheduler, threads=max(1, (os.cpu_count() or 1) // workers)) as client:
         for _ in range(TRIES):
             for ended in run_all(client, _one_seed, sorted(left), (run, given)):
-                if ended is not None:
-                    left.discard(ended[0])
-                    yield ended
+                if ended is None:
+                    continue
+                seed, result = ended
+                if isinstance(result, Exception):
+                    raise result
+                left.discard(seed)
+                yield seed, result
             if not left:
                 return
     raise MeasurementError(f"seeds {', '.join(map(str, sorted(left)))}: their workers died {TRIES} times")
 
 
-def _one_seed(seed: int, given: tuple[Callable[[int, Any], T], Any]) -> tuple[int, T]:
+def _one_seed(seed: int, given: tuple[Callable[[int, Any], T], Any]) -> tuple[int, T | Exception]:
+    """Run one seed on a worker; what it raises is returned, as a worker that died raises too."""
     run, shared = given
-    return seed, run(seed, shared)
+    try:
+        return seed, run(seed, shared)
+    except Exception as error:
+        return seed, error
