@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import operator
 import os
 import resource
@@ -24,7 +25,7 @@ from barsight.cli.main import run
 from barsight.core.errors import ConfigError, Failed, InputError, OutputError
 from barsight.fleet.archive import download, find_recordings, manifest_digest
 from barsight.fleet.cluster import connect
-from barsight.fleet.comparing import FigureChange, RecordingComparison, compare_recording
+from barsight.fleet.comparing import FigureChange, RecordingComparison, _figures, compare_recording
 from barsight.fleet.comparison_page import comparison_page
 from barsight.fleet.driver import count_states, drive, parked_reasons
 from barsight.fleet.findings import holm, judge
@@ -300,6 +301,24 @@ def test_a_full_disk_is_no_wrong_key(tmp_path: Path) -> None:
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert [one.path for one in objects.list()] == ["a"]
+
+
+def test_an_open_end_leaves_the_place_along_the_bars_unknown() -> None:
+    sigma = {
+        "along_m": None,
+        "lateral_m": 0.01,
+        "top_z_m": 0.002,
+        "yaw_deg": 0.1,
+        "length_m": None,
+        "width_m": 0.02,
+    }
+    one = {
+        "sigma": sigma, "direction": [0.0, 1.0, 0.0], "axis_centre_m": [1.0, 2.0, 0.3], "top_z_m": 0.5,
+        "yaw_deg": 90.0, "length_m": 5.0, "width_m": 0.3,
+    }  # fmt: skip
+    told = _figures(one)
+    assert (told["x_m sigma"], told["y_m sigma"], told["length_m sigma"]) == (0.01, math.inf, math.inf)
+    assert _figures(one | {"direction": [0.1, 0.995, 0.0]})["x_m sigma"] == math.inf
 
 
 def test_a_changed_document_is_not_compared(tmp_path: Path) -> None:

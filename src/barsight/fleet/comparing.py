@@ -96,15 +96,23 @@ def _bundles(results: Objects, folder: str) -> dict[int, dict[str, float]]:
 
 def _figures(one: dict[str, Any]) -> dict[str, float]:
     sigma, (ahead_x, ahead_y, _) = one["sigma"], one["direction"]
-    along, across = sigma["along_m"] ** 2, sigma["lateral_m"] ** 2
+    # An open end leaves the place along the bars unknown, and with it whatever it goes into.
+    along, across = (math.inf if sigma[name] is None else sigma[name] for name in ("along_m", "lateral_m"))
     x_m, y_m, _ = one["axis_centre_m"]
     figures = {"x_m": x_m, "y_m": y_m, **{name: one[name] for name in FIGURES[2:]}}
-    figures |= {"x_m sigma": math.sqrt(along * ahead_x**2 + across * ahead_y**2)}
-    figures |= {"y_m sigma": math.sqrt(along * ahead_y**2 + across * ahead_x**2)}
-    figures |= {f"{name} sigma": sigma[name] for name in FIGURES[2:] if sigma[name] is not None}
+    sigmas = {
+        "x_m": math.hypot(_share(along, ahead_x), _share(across, ahead_y)),
+        "y_m": math.hypot(_share(along, ahead_y), _share(across, ahead_x)),
+        **{name: sigma[name] for name in FIGURES[2:]},
+    }
+    figures |= {f"{name} sigma": one for name, one in sigmas.items() if one is not None and one < math.inf}
     if not in_range(list(figures.values())).all():
         raise ValueError("a figure is out of range")
-    return {f"{name} sigma": math.inf for name in FIGURES[2:]} | figures
+    return {f"{name} sigma": math.inf for name in FIGURES} | figures
+
+
+def _share(sigma: float, cosine: float) -> float:
+    return sigma * abs(cosine) if cosine else 0.0
 
 
 def _document(results: Objects, path: str) -> dict[str, Any]:
