@@ -39,6 +39,8 @@ TIMED = {"result.json", "report.html"}
 """Files that hold times of the clock; all others must be the same to the byte."""
 WORKER_KILLS, STOPPED_S, LEASE_S = 10, 30.0, 20.0
 SILENT_S = 600.0
+LAST = 6
+"""Recordings before whose publication all faults are due."""
 
 
 def draw(folder: Path, count: int) -> None:
@@ -116,7 +118,7 @@ class Cluster:
 
 
 def run_with_faults(
-    cluster: Cluster, server: subprocess.Popen[bytes], results: Objects, seed: int
+    cluster: Cluster, server: subprocess.Popen[bytes], results: Objects, seed: int, count: int
 ) -> dict[str, str]:
     """Drive to the end, with faults spread over the run by how much is published; the token that each key
     had when it was first seen.
@@ -125,7 +127,8 @@ def run_with_faults(
     names = [f"worker {chance.randrange(cluster.workers)}" for _ in range(WORKER_KILLS)]
     names += ["driver", "scheduler", "server"]
     chance.shuffle(names)
-    faults = list(names)
+    due = sorted(chance.uniform(0, count - LAST) for _ in names)  # published keys
+    faults = list(zip(due, names, strict=True))
     seen: dict[str, str] = {}
     at = changed = time.monotonic()
     while True:
@@ -138,8 +141,8 @@ def run_with_faults(
             return seen
         if time.monotonic() - changed > SILENT_S:
             raise SystemExit(f"nothing was published for {SILENT_S:.0f} s; {len(seen)} were")
-        if faults and time.monotonic() >= at:
-            fault = faults.pop()
+        if faults and len(seen) >= faults[0][0] and time.monotonic() >= at:
+            _, fault = faults.pop(0)
             if fault == "server":
                 server.send_signal(signal.SIGSTOP)
                 time.sleep(STOPPED_S)
@@ -148,7 +151,7 @@ def run_with_faults(
             else:
                 cluster.kill(fault)
             print(f"{len(seen):3d} published: {cluster.deaths[-1]} failed", flush=True)
-            at = time.monotonic() + chance.uniform(10, 40)
+            at = time.monotonic() + chance.uniform(5, 25)
 
 
 def token(results: Objects, key: str) -> str:
@@ -213,7 +216,7 @@ def main() -> None:
         cluster = Cluster(folder, free_port(), given.workers, url)
         started = time.monotonic()
         try:
-            seen = run_with_faults(cluster, server, results, given.seed)
+            seen = run_with_faults(cluster, server, results, given.seed, given.recordings)
         finally:
             cluster.end()
         took = time.monotonic() - started

@@ -19,6 +19,7 @@ from barsight.calibration.geometry.camera import Camera, Distortion
 from barsight.core.arrays import Float64
 from barsight.core.errors import ConfigError, OutputError
 from barsight.core.pose import Pose
+from barsight.simulation.optics import mount_rig
 from barsight.simulation.scene import build_scene
 from barsight.simulation.sensors import heights
 from barsight.simulation.settings import (
@@ -199,6 +200,16 @@ def test_same_seed_same_bytes_other_seed_other_yard(recording: Path, tmp_path: P
     assert [b.centre_m.tolist() for b in other.bundles] != [
         b.centre_m.tolist() for b in stack_yard(SMALL, np.random.default_rng((11, 0))).bundles
     ]
+
+
+def test_recordings_of_one_crane_have_its_rig() -> None:
+    def rig(seed: int, rig_seed: int | None) -> list[float]:
+        given = SimulationSettings(seed=seed, camera=CameraSettings(rig_seed=rig_seed))
+        mounted = mount_rig(given, np.random.default_rng(seed))
+        return [*mounted.rig.body_from_cam1.rotation.ravel(), mounted.rig.cam0.cx_px]
+
+    assert rig(1, 5) == rig(2, 5) != rig(1, 6)
+    assert rig(1, None) != rig(2, None)
 
 
 def test_an_interruption_leaves_nothing(tmp_path: Path) -> None:

@@ -14,4 +14,5 @@ until [ -s "$address" ]; do sleep 1; done
 srun --ntasks="$((SLURM_NTASKS - 1))" dask worker --scheduler-file "$address" --nthreads 1 --no-dashboard \
     --memory-limit 0 --death-timeout 120 &
 uri=$(python -c "import json, sys; print(json.load(open(sys.argv[1]))['address'])" "$address")
-barsight fleet run --results "$RESULTS" --store "$STORE" --scheduler "$uri" --memory-gib 10 --threads 4
+barsight fleet run --results "$RESULTS" --store "$STORE" --scheduler "$uri" --memory-gib 10 \
+    --threads "$SLURM_CPUS_PER_TASK"

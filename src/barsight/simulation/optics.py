@@ -31,9 +31,11 @@ class MountedRig:
 
 def mount_rig(settings: SimulationSettings, rng: np.random.Generator) -> MountedRig:
     """Mount cam0 looking down (but for the tilt), its rows along X (but for the heading); angles drawn by
-    chance.
+    chance: from the rig's own seed where it has one.
     """
     camera = settings.camera
+    if camera.rig_seed is not None:
+        rng = np.random.default_rng(camera.rig_seed)
     spread = np.radians(camera.misalignment_deg)
     crooked = Rotation.from_rotvec(rng.normal(0, 2 * spread, 3)).as_matrix()
     body_from_cam0 = Pose("body", "cam0", _BODY_FROM_CAM @ crooked, np.array([0.06, -0.09, 0.04]))

@@ -61,6 +61,8 @@ class CameraSettings:
     """Distance between the cameras."""
     misalignment_deg: float = 0.3
     """Standard deviation of the cameras' mounting angles, drawn from the seed."""
+    rig_seed: int | None = None
+    """Seed of the rig, the same for recordings of one crane; by default that of all else."""
     distortion: tuple[float, float, float, float] = (-0.06, 0.02, 0.0003, -0.0002)
     """Radial-tangential coefficients k1 k2 p1 p2 of both lenses; 0 0 0 0 switches them off."""
     above_floor_m: float = 8.0
