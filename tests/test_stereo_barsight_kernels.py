@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import cv2
+import numba
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
@@ -352,6 +353,24 @@ def test_rolling_sums_are_window_means() -> None:
         roll_sum(columns, reach, image[y], np.zeros(WIDTH, dtype=np.float32))
     slide_window(columns, reach, mean)
     np.testing.assert_allclose(mean, _mean(image, 2 * reach + 1)[reach], rtol=1e-4, atol=1e-4)
+
+
+def test_the_number_of_threads_changes_no_bit() -> None:
+    rng = np.random.default_rng(17)
+    left = cv2.GaussianBlur(rng.integers(0, 255, (130, 160)).astype(np.uint8), (0, 0), 1.2)
+    right = np.roll(left, -6, axis=1)
+    before, found = numba.get_num_threads(), []
+    try:
+        for threads in range(1, before + 1):
+            numba.set_num_threads(threads)
+            found.append(match_semiglobal(left, right, 0, 20, SemiGlobalSettings()))
+    finally:
+        numba.set_num_threads(before)
+    if before == 1:
+        pytest.skip("this machine has one core")
+    for one in found[1:]:
+        assert one.left_px.tobytes() == found[0].left_px.tobytes()
+        assert one.right_px.tobytes() == found[0].right_px.tobytes()
 
 
 def test_stripes_of_the_semiglobal_match_leave_no_mark() -> None:

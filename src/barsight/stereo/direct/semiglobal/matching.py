@@ -73,7 +73,8 @@ def match_semiglobal(
     left_px, right_px = np.empty((2, height, width), dtype=np.float32)
     threads, places = numba.get_num_threads(), -(-count // LANES) * LANES
     affordable = max(_STRIPE_BYTES // (3 * width * places) - 2 * _OVERLAP_ROWS, 16)
-    stripes = threads * -(-height // (threads * min(affordable, 256)))
+    # Paths end where a stripe ends, so its rows may not depend on this machine's threads: two share the work.
+    stripes = 2 * -(-height // (2 * min(affordable, 256)))
     rows = -(-height // stripes)
     volume = (min(height, rows + 2 * _OVERLAP_ROWS), width, places)
     rooms = [(np.empty(volume, dtype=np.uint8), np.empty(volume, dtype=np.uint16)) for _ in range(threads)]
