@@ -12,27 +12,19 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
 from barsight.calibration.files.rig_file import write_rig_file
 from barsight.motion.rig_check.self_calibration import turn_right_camera
 from barsight.recording.open import open_recording
+from fleet_rounds import SMALL, call
 
-CAMERA = ("--camera.width-px", "320", "--camera.height-px", "256", "--camera.focal-px", "312")
-SMALL = ("--length", "2", "--frames", "5", *CAMERA, "--camera.rig-seed", "1")
-
-
-def call(folder: Path, *words: object) -> str:
-    """Run a command of Barsight to its end and return what it printed."""
-    command = [sys.executable, "-m", "barsight", *map(str, words)]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise SystemExit(f"{' '.join(command[2:])}: {done.stderr[-500:]}")
-    return done.stdout
+RIG = ("--camera.rig-seed", "1")
 
 
 def write_rigs(folder: Path, yaw_deg: float) -> list[Path]:
@@ -58,7 +50,7 @@ def main() -> None:
     (folder / "config.toml").write_text('preset = "fast"\n')
     for number in range(1, given.recordings + 1):
         if not (out := folder / "archive" / f"r{number:02d}").exists():
-            call(folder, "simulate", out, "--seed", 100 + number, *SMALL)
+            call(folder, "simulate", out, "--seed", 100 + number, *SMALL, *RIG)
     shared = ("--results", folder / "results", "--store", f"sqlite:///{folder}/store.db")
     versions = []
     for rig in write_rigs(folder, given.yaw_deg):

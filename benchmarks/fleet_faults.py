@@ -29,12 +29,9 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from barsight.fleet.ledger import parked_keys, published_keys
 from barsight.fleet.objects import Objects, open_objects
-from fleet_rounds import moto_server
+from fleet_rounds import BARSIGHT, SMALL, call, dask_commands, moto_server
 from opcua_servers import free_port
 
-CAMERA = ("--camera.width-px", "320", "--camera.height-px", "256", "--camera.focal-px", "312")
-SMALL = ("--length", "2", "--frames", "5", *CAMERA)
-BARSIGHT = [sys.executable, "-m", "barsight"]
 TIMED = {"result.json", "report.html"}
 """Files that hold times of the clock; all others must be the same to the byte."""
 WORKER_KILLS, STOPPED_S, LEASE_S = 10, 30.0, 20.0
@@ -49,18 +46,9 @@ def draw(folder: Path, count: int) -> None:
     for number in range(1, count + 1):
         recording, out = folder / "archive" / f"r{number:02d}", folder / "local" / f"r{number:02d}"
         if not recording.exists():
-            call(["simulate", str(recording), "--seed", str(number), *SMALL], folder)
+            call(folder, "simulate", recording, "--seed", number, *SMALL)
         if not out.exists():
-            words = ["measure", str(recording), "-o", str(out), "--config", str(folder / "config.toml")]
-            call([*words, "--at", "end"], folder)
-
-
-def call(words: list[str], folder: Path) -> str:
-    """Run a command of Barsight to its end and return what it printed."""
-    done = subprocess.run([*BARSIGHT, *words], cwd=folder, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise SystemExit(f"barsight {' '.join(words)}: {done.stderr[-500:]}")
-    return done.stdout
+            call(folder, "measure", recording, "-o", out, "--config", "config.toml", "--at", "end")
 
 
 @dataclass
@@ -77,15 +65,10 @@ class Cluster:
 
     def keep_up(self) -> None:
         """Start whatever does not run; the driver unless it ended well."""
-        url = f"tcp://127.0.0.1:{self.port}"
-        dask = [sys.executable, "-m"]
-        words = ["--host", "127.0.0.1", "--port", str(self.port), "--no-dashboard"]
-        self._start("scheduler", [*dask, "distributed.cli.dask_scheduler", *words])
-        for number in range(self.workers):
-            words = [url, "--nthreads", "1", "--no-nanny", "--no-dashboard", "--memory-limit", "0"]
-            self._start(f"worker {number}", [*dask, "distributed.cli.dask_worker", *words])
+        for name, command in dask_commands(self.port, self.workers).items():
+            self._start(name, command)
         drive = ["fleet", "run", "--results", "s3://yard/results", "--store", self.store, "--threads", "1"]
-        drive += ["--scheduler", url, "--lease-s", str(LEASE_S)]
+        drive += ["--scheduler", f"tcp://127.0.0.1:{self.port}", "--lease-s", str(LEASE_S)]
         if self._start("driver", [*BARSIGHT, *drive]):
             self.driver_starts += 1
 
@@ -211,8 +194,8 @@ def main() -> None:
     with moto_server() as (endpoint, server):
         os.environ["AWS_ENDPOINT_URL"] = endpoint
         results = open_objects("s3://yard/results", create=True)
-        words = ["fleet", "plan", str(folder / "archive"), "--results", results.url, "--store", url]
-        print(call([*words, "--config", str(folder / "config.toml")], folder), flush=True)
+        words = ("fleet", "plan", "archive", "--results", results.url, "--store", url)
+        print(call(folder, *words, "--config", "config.toml"), flush=True)
         cluster = Cluster(folder, free_port(), given.workers, url)
         started = time.monotonic()
         try:

@@ -29,6 +29,7 @@ from barsight.fleet.task import TaskSettings
 from barsight.fleet.versions import FleetTask, Version
 from barsight.fleet.window import RunWindow
 from barsight.store.opening import open_store
+from fleet_rounds import dask_commands
 from opcua_servers import free_port
 
 CONTENT = {"measured_s": 0.0, "whole_s": 0.0, "fetched_s": 0.0, "peak_bytes": 0, "files": {}}
@@ -52,16 +53,13 @@ def main() -> None:
     given = parser.parse_args()
     version = Version("nothing", "", "", "", "")
     tasks = [FleetTask(f"{k:064x}", f"r{k:05d}", (".",), version) for k in range(given.tasks)]
-    url, dask = f"tcp://127.0.0.1:{free_port()}", [sys.executable, "-m"]
-    words = ["--host", "127.0.0.1", "--port", url.rsplit(":", 1)[1], "--no-dashboard"]
-    scheduler = subprocess.Popen([*dask, "distributed.cli.dask_scheduler", *words], stderr=subprocess.DEVNULL)
-    words = [url, "--nthreads", "1", "--no-nanny", "--no-dashboard", "--memory-limit", "0"]
-    workers = [
-        subprocess.Popen([*dask, "distributed.cli.dask_worker", *words], stderr=subprocess.DEVNULL)
-        for _ in range(given.workers)
-    ]
-    watched = {"driver": psutil.Process(), "scheduler": psutil.Process(scheduler.pid)}
-    watched |= {f"worker {k}": psutil.Process(one.pid) for k, one in enumerate(workers)}
+    port = free_port()
+    processes = {
+        name: subprocess.Popen(command, stderr=subprocess.DEVNULL)
+        for name, command in dask_commands(port, given.workers).items()
+    }
+    watched = {"driver": psutil.Process()}
+    watched |= {name: psutil.Process(one.pid) for name, one in processes.items()}
     started, told = time.monotonic(), -1
 
     def advance(done: int, total: int) -> None:
@@ -78,7 +76,7 @@ def main() -> None:
         ):
             results = open_objects(f"{place}/results", create=True)
             note_plan(store, tasks, "nowhere", "bench")
-            with connect(0, url) as client:
+            with connect(0, f"tcp://127.0.0.1:{port}") as client:
                 client.wait_for_workers(given.workers)
                 drive(
                     client,
@@ -92,7 +90,7 @@ def main() -> None:
                 )
             print(count_states(results, tasks))
     finally:
-        for process in (*workers, scheduler):
+        for process in processes.values():
             process.kill()
 
 

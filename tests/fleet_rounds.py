@@ -1,4 +1,4 @@
-"""Stand-ins for the fleet's tests: small files, a measurement that only digests, an S3 server."""
+"""Stand-ins for the fleet's tests and benchmarks: small files, a measurement that only digests, servers."""
 
 from __future__ import annotations
 
@@ -33,6 +33,32 @@ data = b"".join(p.read_bytes() for p in sorted(source.rglob("*")) if p.is_file()
 (out / "bundles.json").write_text(json.dumps({"sha": hashlib.sha256(data).hexdigest()}))
 (out / "result.json").write_text("{}")
 """
+
+
+CAMERA = ("--camera.width-px", "320", "--camera.height-px", "256", "--camera.focal-px", "312")
+SMALL = ("--length", "2", "--frames", "5", *CAMERA)
+"""Of `simulate`: a recording that takes some seconds to measure."""
+BARSIGHT = (sys.executable, "-m", "barsight")
+
+
+def call(folder: Path, *words: object) -> str:
+    """Run a command of Barsight in a folder to its end; what it printed."""
+    command = [*BARSIGHT, *map(str, words)]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(f"{' '.join(command[2:])}: {done.stderr[-500:]}")
+    return done.stdout
+
+
+def dask_commands(port: int, workers: int) -> dict[str, list[str]]:
+    """The commands of a scheduler at a port and of its workers without nannies, by name."""
+    dask = [sys.executable, "-m", "distributed.cli.dask_"]
+    at = ["--host", "127.0.0.1", "--port", str(port), "--no-dashboard"]
+    own = ["--nthreads", "1", "--no-nanny", "--no-dashboard", "--memory-limit", "0"]
+    worker = [*dask[:2], f"{dask[2]}worker", f"tcp://127.0.0.1:{port}", *own]
+    return {"scheduler": [*dask[:2], f"{dask[2]}scheduler", *at]} | {
+        f"worker {number}": worker for number in range(workers)
+    }
 
 
 def stand_in(folder: Path) -> tuple[str, ...]:

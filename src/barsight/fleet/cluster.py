@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 from barsight.core.errors import ConfigError, InputError, OutputError
 from barsight.core.extras import extra
+from barsight.fleet.limits import thread_variables
 
 with extra("fleet"):
     import dask
@@ -29,7 +30,6 @@ def connect(workers: int, scheduler: str | None, threads: int = 0) -> Iterator[A
 
     Raises InputError for a scheduler that doesn't answer.
     """
-    own = {name: str(threads) for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")} if threads else {}
     logging.getLogger("distributed").setLevel(logging.ERROR)
     options = {
         "distributed.scheduler.allowed-failures": _LOST, "distributed.worker.daemon": False,
@@ -48,7 +48,7 @@ def connect(workers: int, scheduler: str | None, threads: int = 0) -> Iterator[A
         with (
             LocalCluster(
                 n_workers=workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0",
-                host="127.0.0.1", memory_limit=0, env=own,
+                host="127.0.0.1", memory_limit=0, env=thread_variables(threads),
             ) as cluster,
             Client(cluster, set_as_default=False) as client,
         ):  # fmt: skip

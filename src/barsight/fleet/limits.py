@@ -30,6 +30,11 @@ class LimitedRun:
     peak_bytes: int
 
 
+def thread_variables(threads: int) -> dict[str, str]:
+    """Form the environment that bounds a process's threads; empty for 0, which leaves them alone."""
+    return {name: str(threads) for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")} if threads else {}
+
+
 def run_limited(
     command: Sequence[str], folder: Path, environment: Mapping[str, str], memory_gib: float, timeout_s: float
 ) -> LimitedRun | Failed:

@@ -15,7 +15,7 @@ from barsight.core.errors import BarsightError, ConfigError, Failed
 from barsight.core.settings.values import NOT_NEGATIVE, POSITIVE, expect_ranges
 from barsight.fleet.archive import download
 from barsight.fleet.ledger import HeldRecording, claim, fail, held, publish
-from barsight.fleet.limits import LimitedRun, run_limited
+from barsight.fleet.limits import LimitedRun, run_limited, thread_variables
 from barsight.fleet.objects import Objects, open_objects
 from barsight.fleet.records import note_result
 from barsight.fleet.scratch import compile_once, scratch_folder
@@ -95,7 +95,7 @@ def _try(task: FleetTask, mine: HeldRecording, settings: TaskSettings, results: 
         ran = run_limited(
             [*settings.command, *words],
             folder,
-            _environment(settings),
+            os.environ | thread_variables(settings.limits.threads),
             settings.limits.memory_gib,
             settings.limits.timeout_s,
         )
@@ -109,13 +109,6 @@ def _try(task: FleetTask, mine: HeldRecording, settings: TaskSettings, results: 
             except BarsightError as error:  # the driver writes what is missing
                 sys.stderr.write(f"{error}\n")
     return None
-
-
-def _environment(settings: TaskSettings) -> dict[str, str]:
-    own = dict(os.environ)
-    if threads := settings.limits.threads:
-        own |= {name: str(threads) for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")}
-    return own
 
 
 def _upload(out: Path, target: str, results: Objects) -> dict[str, dict[str, object]]:

@@ -10,6 +10,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import barsight
+from barsight.core.compiling.sources import sources_digest
 from barsight.core.errors import ConfigError
 from barsight.core.json_values import json_digest, json_value
 from barsight.core.reading.bounded_reading import MAX_DOCUMENT_BYTES, read_bytes
@@ -30,12 +31,9 @@ def installed_software() -> str:
     """Name what measures here: Barsight's version, and a digest of its sources and of the libraries that
     compute, as those may change a result without the version.
     """
-    root, found = Path(barsight.__file__).parent, hashlib.sha256()
-    for path in sorted(root.rglob("*.py")):
-        found.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
-    for name in LIBRARIES:
-        found.update(f"{name} {metadata.version(name)}".encode())
-    return f"{barsight.__version__}+{found.hexdigest()[:12]}"
+    sources = sources_digest(Path(barsight.__file__).parent)
+    found = json_digest([sources, [metadata.version(name) for name in LIBRARIES]])
+    return f"{barsight.__version__}+{found[:12]}"
 
 
 @dataclass(frozen=True)

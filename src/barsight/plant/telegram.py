@@ -14,6 +14,8 @@ from barsight.plant.state import PlantState
 TABLE = Path(__file__).parent / "telegram.toml"
 OUT_MAGIC, IN_MAGIC, VERSION = 0xB51A, 0xB51B, 1
 NOT_SET = -(2**31)
+MAX_BEHIND = 3
+"""Telegrams that the echo of the PLC's life counter may be behind before a PLC takes them for old."""
 _CODES = {"u16": "H", "u32": "I", "i32": "i", "i64": "q"}
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from barsight.plant.telegram import VERSION, fields_at, layout, table_of
+from barsight.plant.telegram import MAX_BEHIND, VERSION, fields_at, layout, table_of
 
 _NAMES = {"out": "BarsightOut", "in": "BarsightIn"}
 _ABOUT = {"out": "From Barsight to the PLC", "in": "From the PLC to Barsight"}
@@ -13,7 +13,7 @@ FUNCTION_BLOCK "BarsightJudge"
 VERSION : 0.1
    VAR_INPUT
       silent : Time := T#300ms;   // Barsight's life counter may stand for so long
-      maxBehind : DInt := 3;   // Telegrams that the echo of the PLC's own life counter may be behind
+      maxBehind : DInt := {behind};   // Telegrams that the echo of the PLC's own life counter may be behind
    END_VAR
    VAR_OUTPUT
       isValid : Bool;   // Only then may a lift be claimed, or begun after `executing` was answered with 1
@@ -90,5 +90,9 @@ def scl_source() -> str:
             f'   STRUCT\n      telegram : "{_NAMES[side]}";\n   END_STRUCT;\nBEGIN\nEND_DATA_BLOCK\n'
         )
     magic = {name: told for name, _, told in table_of("out")}["magic"]
-    judge = _JUDGE.replace("{magic}", f"16#{magic.removeprefix('0x')}").replace("{version}", str(VERSION))
+    judge = (
+        _JUDGE.replace("{magic}", f"16#{magic.removeprefix('0x')}")
+        .replace("{version}", str(VERSION))
+        .replace("{behind}", str(MAX_BEHIND))
+    )
     return "".join([*lines, judge])

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
 import tomllib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 
 import barsight
 from barsight.benchmarks.yard.world_scores import WorldScore, score_world
+from barsight.core.compiling.sources import sources_digest
 from barsight.core.errors import BarsightError, ConfigError, OutputError
 from barsight.core.json_values import json_digest, json_value, write_json
 from barsight.simulation.settings import SimulationSettings
@@ -43,9 +43,9 @@ class WorldKeys:
         """Compute them from the settings and the package's sources."""
         root = Path(barsight.__file__).parent
         measuring = [path.name for path in root.iterdir() if path.name not in (*MEASURES_NOT, "__pycache__")]
-        drawn = json_digest([GENERATOR, json_value(given), _sources(root, DRAWS)])
-        measured = json_digest([drawn, _sources(root, measuring)])
-        return cls(drawn, measured, json_digest([measured, _sources(root, SCORES)]))
+        drawn = json_digest([GENERATOR, json_value(given), sources_digest(root, DRAWS)])
+        measured = json_digest([drawn, sources_digest(root, measuring)])
+        return cls(drawn, measured, json_digest([measured, sources_digest(root, SCORES)]))
 
 
 def run_world(
@@ -130,13 +130,3 @@ def _score(content: dict[str, Any]) -> WorldScore:
         {name: numbers(values) for name, values in content["errors"].items()},
         {name: numbers(values) for name, values in content["sigmas"].items()},
     )  # fmt: skip
-
-
-def _sources(root: Path, names: Iterable[str]) -> str:
-    digest = hashlib.sha256()
-    for name in sorted(names):
-        path = root / name
-        for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
-            if file.suffix == ".py":
-                digest.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes())
-    return digest.hexdigest()

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from barsight.benchmarks.lift_judge.magnet import read_magnet
+from barsight.benchmarks.lift_judge.magnet import JudgedMagnet, read_magnet
 from barsight.benchmarks.yard.drawn_worlds import MappedWorld, measured_world, noisy_world, render_world
 from barsight.benchmarks.yard.judged_lifts import (
     JudgedBench,
@@ -27,7 +27,7 @@ from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings
 from barsight.simulation.worlds.yards import DrawnYard, draw_yard
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.magnet.description import example_magnet, load_magnet
+from barsight.yard.magnet.description import Magnet, example_magnet, load_magnet
 
 SPAN_M = 3.0
 """Of the drawn stacks, across their bars."""
@@ -70,11 +70,15 @@ def bench_lift_targets(
         raise ConfigError(f"bench lifts: placements must be 0 or more, not {placements}")
     if scheduler is not None and keep is None:
         raise ConfigError("bench lifts: with --scheduler the workers share a folder: name it with --keep")
-    load_magnet(magnet)
     found: dict[int, tuple[JudgedLift, ...]] = {}
     with tempfile.TemporaryDirectory() as scratch, stages(SafeConsole(stderr=True)) as advance:
-        text = example_magnet() if magnet is None else magnet.read_text(encoding="utf-8")
-        given = _Given((keep or Path(scratch)).absolute(), text, placements, rendered, full_size)
+        described_at = magnet or Path(scratch) / "magnet.toml"
+        if magnet is None:
+            described_at.write_text(example_magnet(), encoding="utf-8")
+        given = _Given(
+            (keep or Path(scratch)).absolute(), load_magnet(described_at), read_magnet(described_at),
+            placements, rendered, full_size,
+        )  # fmt: skip
         for seed, judged in over_seeds(_judge_seed, numbers, given, workers, scheduler):
             found[seed] = judged
             advance("yards", len(found), len(numbers))
@@ -88,10 +92,11 @@ def bench_lift_targets(
 
 @dataclass(frozen=True)
 class _Given:
-    """Settings that all seeds share. magnet: text of its TOML file."""
+    """Settings that all seeds share. magnet, judged: as the product reads its file, and as the judge does."""
 
     keep: Path
-    magnet: str
+    magnet: Magnet
+    judged: JudgedMagnet
     placements: int
     rendered: bool
     full_size: bool
@@ -103,16 +108,12 @@ def _bench(found: dict[int, tuple[JudgedLift, ...]]) -> JudgedBench:
 
 def _judge_seed(seed: int, given: _Given) -> tuple[JudgedLift, ...]:
     settings, folder = LiftSettings(), given.keep / f"seed_{seed}"
-    with tempfile.TemporaryDirectory() as scratch:
-        described_at = Path(scratch) / "magnet.toml"
-        described_at.write_text(given.magnet, encoding="utf-8")
-        described, judged = load_magnet(described_at), read_magnet(described_at)
-    world = draw_yard(seed, 2 * judged.half_span_m + OVER_MAGNET_M, SPAN_M, min_length_ratio=1.0)
+    world = draw_yard(seed, 2 * given.judged.half_span_m + OVER_MAGNET_M, SPAN_M, min_length_ratio=1.0)
     if given.rendered:
         mapped = _measured(world, folder, settings, given.full_size)
     else:
         mapped = noisy_world(world, settings)
-    return tuple(judge_yard(world, mapped, described, judged, settings, given.placements))
+    return tuple(judge_yard(world, mapped, given.magnet, given.judged, settings, given.placements))
 
 
 def _measured(world: DrawnYard, folder: Path, settings: LiftSettings, full_size: bool) -> MappedWorld:

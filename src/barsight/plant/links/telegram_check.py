@@ -12,12 +12,10 @@ import numpy as np
 from barsight.core.errors import Failed
 from barsight.plant.links.link_check import LinkCheck
 from barsight.plant.settings import TelegramSettings
-from barsight.plant.telegram import IN_MAGIC, VERSION, fields_at, layout, pack, unpack, width_of
+from barsight.plant.telegram import IN_MAGIC, MAX_BEHIND, VERSION, fields_at, layout, pack, unpack, width_of
 
 TOLERANCE_RATIO = 0.2
 """The cycle's first and last hundredth may be off by so much of it."""
-MAX_BEHIND = 3
-"""Telegrams that the echo of the PLC's life counter may be behind, as the PLC judges it."""
 FAILED, NUMBER = 4, 0x5A5A
 
 
