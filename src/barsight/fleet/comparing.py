@@ -45,7 +45,7 @@ class RecordingComparison:
 
     only_before, only_after: numbers of bundles without a partner. vetoes: codes that appeared (+) and
     vanished (-). intervals: mean half width of the 95 % interval by figure, before and after. seconds:
-    measured, before and after. pictures: URLs of the two reports' pictures.
+    measured, before and after. pictures: objects of the results, of the two reports' pictures.
     """
 
     recording: str
@@ -81,7 +81,7 @@ def compare_recording(results: Objects, name: str, before: str, after: str) -> R
         ),
         {figure: _half_widths(figure, *bundles) for figure in FIGURES} if all(bundles) else {},
         (notes[0]["measured_s"], notes[1]["measured_s"]),
-        (f"{results.url}/{folders[0]}/preview.png", f"{results.url}/{folders[1]}/preview.png"),
+        (f"{folders[0]}/preview.png", f"{folders[1]}/preview.png"),
     )  # fmt: skip
 
 

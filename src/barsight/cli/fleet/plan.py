@@ -10,6 +10,7 @@ import tyro
 from barsight.cli.arguments import call, load_settings
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
+from barsight.core.errors import ConfigError
 from barsight.core.extras import extra
 from barsight.measure_settings import MeasureSettings
 from barsight.store.audit import user_name
@@ -47,6 +48,9 @@ def run(arguments: Sequence[str]) -> None:
             from barsight.fleet.planning import estimate, plan_tasks
             from barsight.fleet.records import note_plan, seconds_by_size
             from barsight.fleet.versions import publish_version
+        for flag, value in {"workers": workers, "limit": limit}.items():
+            if value is not None and value < 1:
+                raise ConfigError(f"--{flag} {value}: give 1 or more")
         settings = load_settings(config, MeasureSettings)
         source, target = open_objects(archive), open_objects(results, create=True)
         version = publish_version(target, settings, config, rig, magnet)
@@ -54,7 +58,7 @@ def run(arguments: Sequence[str]) -> None:
         with stages(SafeConsole(stderr=True)) as advance:
             tasks = plan_tasks(source, target, version, limit, lambda n, all_: advance("read", n, all_))
         with open_store(store, create=True) as opened:
-            new = note_plan(opened, tasks, source.url, by or user_name())
+            new = note_plan(opened, tasks, by or user_name())
             with opened.reading() as connection:
                 measured = seconds_by_size(connection)
         done, parked = published_keys(target), parked_keys(target)
