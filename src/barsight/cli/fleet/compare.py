@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -42,7 +43,7 @@ def run(arguments: Sequence[str]) -> None:
             store: SQLAlchemy's URL of the database.
         """
         with extra("fleet"):
-            from barsight.fleet.comparing import compare_recording
+            from barsight.fleet.comparing import compare_tasks
             from barsight.fleet.comparison_page import comparison_page, copy_pictures
             from barsight.fleet.findings import judge
             from barsight.fleet.objects import open_objects
@@ -50,24 +51,9 @@ def run(arguments: Sequence[str]) -> None:
         target = open_objects(results)
         with open_store(store) as opened, opened.reading() as connection:
             versions = [find_version(connection, name) for name in (before, after)]
-            planned = [{t.manifest or t.key: t for t in read_tasks(connection, one)} for one in versions]
-        both = sorted(planned[0].keys() & planned[1].keys(), key=lambda manifest: planned[1][manifest].name)
-        untold = sorted(
-            f"{task.name} (of version {version.name} only)"
-            for version, tasks in zip(versions, planned, strict=True)
-            for manifest, task in tasks.items()
-            if manifest not in both
-        )
-        compared = []
+            planned = [read_tasks(connection, one) for one in versions]
         with stages(SafeConsole(stderr=True)) as advance:
-            for number, manifest in enumerate(both):
-                first, last = (tasks[manifest] for tasks in planned)
-                one = compare_recording(target, last.name or ".", first.key, last.key)
-                if one is None:
-                    untold.append(f"{last.name} (not measured under both)")
-                else:
-                    compared.append(one)
-                advance("compare", number + 1, len(both))
+            compared, untold = compare_tasks(target, planned[0], planned[1], partial(advance, "compare"))
         if not compared:
             raise MeasurementError(
                 f"versions {versions[0].name} and {versions[1].name}: no recording is measured under both; "
