@@ -11,6 +11,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from threading import Timer
 from typing import Any
 
 import pytest
@@ -36,7 +37,8 @@ from barsight.recording.formats.bag_setup import _find
 from barsight.recording.formats.segments import segments_of
 from barsight.store.audit import AuditChain, verify_chain
 from barsight.store.opening import open_store
-from fleet_rounds import AZURE, VERSION, azure_server, make_archive, no_progress, settings
+from fleet_rounds import AZURE, VERSION, azure_server, dask_commands, make_archive, no_progress, settings
+from opcua_servers import free_port
 
 
 def write(folder: Path, *names: str) -> None:
@@ -347,3 +349,29 @@ def test_an_adaptive_cluster_grows_from_no_worker_and_shrinks_again(tmp_path: Pa
         while client.nthreads() and time.monotonic() < until:
             time.sleep(0.2)
         assert not client.nthreads()
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_dies_ends_the_run_by_one_line(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    archive = open_objects(str(make_archive(tmp_path / "a", {"r": "good 30"})))
+    results = open_objects(str(tmp_path / "r"), create=True)
+    tasks = plan_tasks(archive, results, VERSION, None, no_progress)
+    shared, port = settings(tmp_path, results.url), free_port()
+    commands = dask_commands(port, 1).values()
+    cluster = [subprocess.Popen(command, stderr=subprocess.DEVNULL) for command in commands]
+    try:
+        with (
+            open_store(f"sqlite:///{tmp_path}/s.db", create=True) as store,
+            pytest.raises(InputError, match="no scheduler is there any more"),
+            connect(1, f"tcp://127.0.0.1:{port}") as client,
+        ):
+            client.wait_for_workers(1)
+            Timer(3.0, cluster[0].kill).start()
+            drive(client, tasks, shared, store, results, RunWindow(), no_progress)
+    finally:
+        for process in cluster:
+            process.kill()
+            process.wait()
+    assert capfd.readouterr().err == ""
