@@ -22,7 +22,10 @@ MAX_LOST = 12
 """and claims whose worker died without a word, which others' faults cause too."""
 Held = Literal["published", "parked", "claimed"]
 _TEXT, _NUMBER = {"type": "string"}, {"type": "number"}
-_FILE = {"type": "object", "required": ["bytes", "sha256"], "properties": {"bytes": {"type": "integer"}}}
+_FILE = {
+    "type": "object", "required": ["bytes", "sha256"],
+    "properties": {"bytes": {"type": "integer"}, "sha256": _TEXT},
+}  # fmt: skip
 _RESULT = {
     "type": "object",
     "required": ["key", "token", "measured_s", "whole_s", "peak_bytes", "files"],
