@@ -100,6 +100,14 @@ def publish(results: Objects, mine: HeldRecording, content: dict[str, Any]) -> b
     return results.write_new(f"results/{mine.key}/result.json", text.encode())
 
 
+def discard(results: Objects, mine: HeldRecording, *, is_ours: bool) -> None:
+    """Remove the files of a key's other tries once it is published by ours, or ours where it isn't."""
+    own = f"files/{mine.key}/{mine.token}/"
+    for one in list(results.list(f"files/{mine.key}/")):
+        if one.path.startswith(own) is not is_ours:
+            results.remove(one.path)
+
+
 def result_note(results: Objects, key: str) -> dict[str, Any] | None:
     """Read what was published of a key; None where nothing is. Raises InputError."""
     note: dict[str, Any] | None = results.read_json(f"results/{key}/result.json", _RESULT)

@@ -9,6 +9,7 @@ from pathlib import Path
 from barsight.core.errors import ConfigError, InputError, MeasurementError
 from barsight.core.extras import extra
 from barsight.core.files import atomic_directory
+from barsight.fleet.comparing import REMEDY
 from barsight.fleet.ledger import published_keys, result_note
 from barsight.fleet.objects import Objects
 from barsight.fleet.versions import FleetTask, Version
@@ -109,6 +110,4 @@ def _fetch(results: Objects, key: str, out: Path) -> None:
                     digest.update(part)
                     stream.write(part)
             if size != told["bytes"] or digest.hexdigest() != told["sha256"]:
-                raise InputError(
-                    f"{results.url}/{path}", "is not what was published", "run the version again"
-                )
+                raise InputError(f"{results.url}/{path}", "was changed after it was published", REMEDY)

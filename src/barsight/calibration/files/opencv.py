@@ -122,7 +122,8 @@ def _depth(text: str) -> int:
     """Compute how deep brackets, tags and lists in one line stand in each other at most; OpenCV's parser goes
     down into each and overflows its stack.
     """
-    depth, deepest = 0, max((len(run[0]) // 2 for run in re.finditer(r"(?:- )+", text)), default=0)
+    spoken = re.sub(r"#.*", "", text)
+    depth, deepest = 0, max((run[0].count("-") for run in re.finditer(r"(?:-[ \t]*)+", spoken)), default=0)
     for sign in re.finditer(r"[\[{\]}]|</|/>|<\w", text):
         depth += -1 if sign[0] in ("]", "}", "</", "/>") else 1
         deepest = max(deepest, depth)
