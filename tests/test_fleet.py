@@ -426,13 +426,23 @@ def test_seeds_run_on_workers_as_here() -> None:
 
 
 @pytest.mark.slow
-def test_a_bench_says_the_same_on_workers(tmp_path: Path) -> None:
-    tables = [tmp_path / "one.json", tmp_path / "two.json"]
-    for table, workers in zip(tables, ("1", "2"), strict=True):
-        words = ["bench", "lifts", "--seeds", "0:3", "--placements", "2", "--workers", workers]
-        assert run([*words, "--json", str(table)]) == 0
-    lifts = [json.loads(table.read_text())["lifts"] for table in tables]
-    assert lifts[0] == lifts[1] and {one["seed"] for one in lifts[0]} <= {0, 1, 2} and lifts[0]
+@pytest.mark.parametrize(
+    ("words", "kept"),
+    [
+        (("lifts", "--seeds", "0:3", "--placements", "2"), ("lifts",)),
+        (("bundles", "--yards", "4", "--length-m", "3"), ("counts", "figures")),
+    ],
+)
+def test_a_bench_says_the_same_on_workers(
+    tmp_path: Path, words: tuple[str, ...], kept: tuple[str, ...]
+) -> None:
+    told = []
+    for workers in ("1", "2"):
+        table = tmp_path / f"{workers}.json"
+        assert run(["bench", *words, "--workers", workers, "--json", str(table)]) == 0
+        content = json.loads(table.read_text())
+        told.append([content[name] for name in kept])
+    assert told[0] == told[1] and all(told[0])
 
 
 def test_workers_of_another_version_end_the_run(tmp_path: Path) -> None:
