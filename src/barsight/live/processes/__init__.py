@@ -1,0 +1,1 @@
+"""The processes of a live run, each with one task."""
