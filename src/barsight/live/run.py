@@ -23,8 +23,8 @@ from barsight.core.notices import Notice
 from barsight.core.stamps import NS_PER_S
 from barsight.live.latency import latencies
 from barsight.live.link import GrowingRecording, KeptRecording, Link, LiveInput
+from barsight.live.mapper import LIVE_MAP
 from barsight.live.modes import Mode
-from barsight.live.processes.mapper import LIVE_MAP
 from barsight.live.settings import LiveSettings
 from barsight.live.shared.counters import Counters
 from barsight.live.shared.ring import PairRing

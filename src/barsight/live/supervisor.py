@@ -14,17 +14,17 @@ from multiprocessing.process import BaseProcess
 
 from barsight.core.errors import BarsightError
 from barsight.core.stamps import NS_PER_S
+from barsight.live.capture import capture
 from barsight.live.link import Link
+from barsight.live.mapper import build_live_map
 from barsight.live.modes import FOR_LIFTS, FreezeWatch, JumpWatch, Mode, SensorActivity, judge_mode
-from barsight.live.processes.capture import capture
-from barsight.live.processes.mapper import build_live_map
-from barsight.live.processes.pose_output import output_poses
-from barsight.live.processes.record import DRAIN, record
-from barsight.live.processes.track import track
+from barsight.live.pose_output import output_poses
+from barsight.live.record import DRAIN, record
 from barsight.live.shared.counters import Counters
 from barsight.live.source import ReplayClock
 from barsight.live.state import ProcessState, RunState, write_health, write_state
 from barsight.live.survey import SurveyWatch
+from barsight.live.track import track
 
 PROCESSES: dict[str, Callable[[Link], None]] = {
     "capture": capture, "track": track, "pose": output_poses, "map": build_live_map, "record": record,

@@ -1,1 +1,0 @@
-"""The processes of a live run, each with one task."""
