@@ -279,6 +279,14 @@ def test_only_what_was_published_is_promoted(tmp_path: Path, now: bytes) -> None
             assert not (tmp_path / "again").exists()
 
 
+def test_a_pipe_among_the_results_is_not_waited_for(tmp_path: Path) -> None:
+    objects = open_objects(str(tmp_path))
+    os.mkfifo(tmp_path / "a.json")
+    for read in (objects.read, lambda path: list(objects.chunks(path))):
+        with pytest.raises(InputError, match=r"a\.json: is no regular file"):
+            read("a.json")
+
+
 def test_sizes_are_looked_at_before_anything_is_read(tmp_path: Path) -> None:
     make_archive(tmp_path / "a", {"r": "x"})
     objects = open_objects(str(tmp_path / "a"))
