@@ -1,11 +1,15 @@
-"""Write the comparison of two versions as a page that needs no other file but the pictures it links."""
+"""Write the comparison of two versions as a page, with the pictures of the worst cases beside it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from html import escape
+from pathlib import Path
+from statistics import mean
 
-from barsight.fleet.findings import LEVEL, Findings
+from barsight.fleet.comparing import FIGURES, RecordingComparison
+from barsight.fleet.findings import LEVEL, MIN_RECORDINGS, Findings
+from barsight.fleet.objects import Objects
 
 MAX_LISTED = 100
 """Bundles and recordings that the page lists; the JSON has all."""
@@ -16,9 +20,39 @@ _STYLE = (
 )
 
 
-def comparison_page(findings: Findings) -> str:
-    """Format the page: shifts of the archive, bundles beyond sigma, vetoes, bundles of one version, times."""
+def copy_pictures(results: Objects, findings: Findings, folder: Path) -> dict[str, tuple[str, str]]:
+    """Copy the pictures of the recordings that the page lists into `folder`, and return by recording where
+    they lie in it, before and after; empty for one that a result lacks.
+    """
+    worst = [c.recording for c in findings.beyond[:MAX_LISTED]]
+    worst += [one.recording for one in _other(findings)]
     pictures = {one.recording: one.pictures for one in findings.recordings}
+    (folder / "pictures").mkdir()
+    copied = {}
+    for number, recording in enumerate(dict.fromkeys(worst)):
+        names = [f"pictures/{number:03d}-{word}.png" for word in ("before", "after")]
+        for place, (name, source) in enumerate(zip(names, pictures[recording], strict=True)):
+            data = results.read(source)
+            if data is None:
+                names[place] = ""
+            else:
+                (folder / name).write_bytes(data)
+        copied[recording] = (names[0], names[1])
+    return copied
+
+
+def _other(findings: Findings) -> list[RecordingComparison]:
+    """List the recordings with other vetoes or bundles of one version only, those with most of them first."""
+    told = [one for one in findings.recordings if one.vetoes or one.only_before or one.only_after]
+    told.sort(key=lambda one: -len(one.vetoes) - len(one.only_before) - len(one.only_after))
+    return told[:MAX_LISTED]
+
+
+def comparison_page(findings: Findings, pictures: dict[str, tuple[str, str]]) -> str:
+    """Format the page: shifts of the archive, bundles beyond sigma, vetoes, bundles of one version, times.
+
+    pictures: of `copy_pictures`.
+    """
     parts = [
         f"<h1>Version {escape(findings.before)} and version {escape(findings.after)}</h1>",
         f"<p>{len(findings.recordings)} recordings, {findings.tests} figures of bundles compared. Told is "
@@ -28,7 +62,8 @@ def comparison_page(findings: Findings) -> str:
         _table(
             ("figure", "recordings", "mean shift", "chance", ""),
             [
-                (s.figure, str(s.recordings), f"{s.shift:+.5f}", f"{s.p:.2g}", "found" if s.is_found else "")
+                (s.figure, str(s.recordings), f"{s.shift:+.5f}",
+                 f"{s.p:.2g}" if s.recordings >= MIN_RECORDINGS else "too few", "found" if s.is_found else "")
                 for s in findings.shifts
             ],
         ),
@@ -45,14 +80,13 @@ def comparison_page(findings: Findings) -> str:
         _table(
             ("recording", "vetoes", "bundles gone", "bundles new", "pictures"),
             [
-                (one.recording, " ".join(one.vetoes), _numbers(one.only_before), _numbers(one.only_after),
-                 one.pictures)
-                for one in findings.recordings
-                if one.vetoes or one.only_before or one.only_after
-            ][:MAX_LISTED],
+                (one.recording, ", ".join(one.vetoes), _numbers(one.only_before), _numbers(one.only_after),
+                 pictures[one.recording])
+                for one in _other(findings)
+            ],
         ),
-        "<h2>Half widths of the 95 % intervals, mean over the recordings</h2>",
-        _table(("figure", "before", "after"), _intervals(findings)),
+        "<h2>Half widths of the 95 % intervals, mean over the recordings that have both</h2>",
+        _table(("figure", "before", "after", "recordings"), _intervals(findings)),
         f"<h2>Times</h2><p>Median seconds: {findings.seconds[0]:.2f} and {findings.seconds[1]:.2f}.</p>",
     ]  # fmt: skip
     if findings.untold:
@@ -64,13 +98,12 @@ def comparison_page(findings: Findings) -> str:
 
 
 def _intervals(findings: Findings) -> list[tuple[str, ...]]:
-    told = [one.intervals for one in findings.recordings if one.intervals]
-    if not told:
-        return []
     rows = list[tuple[str, ...]]()
-    for figure in told[0]:
-        before, after = (sum(one[figure][side] for one in told) / len(told) for side in (0, 1))
-        rows.append((figure, f"{before:.4f}", f"{after:.4f}"))
+    for figure in FIGURES:
+        told = [one.intervals[figure] for one in findings.recordings if one.intervals]
+        known = [(before, after) for before, after in told if before is not None and after is not None]
+        means = (f"{mean(one[side] for one in known):.4f}" if known else "not known" for side in (0, 1))
+        rows.append((figure, *means, str(len(known))))
     return rows
 
 
@@ -93,9 +126,5 @@ def _table(heads: tuple[str, ...], rows: Sequence[Sequence[object]]) -> str:
 def _cell(cell: object) -> str:
     if isinstance(cell, tuple):
         links = zip(("before", "after"), cell, strict=True)
-        return " ".join(f'<a href="{escape(_link(str(url)))}">{word}</a>' for word, url in links)
+        return " ".join(f'<a href="{escape(str(path))}">{word}</a>' for word, path in links if path)
     return escape(str(cell))
-
-
-def _link(url: str) -> str:
-    return url if "://" in url else f"file://{url}"

@@ -13,7 +13,7 @@ from typing import Any
 from barsight.core.errors import ConfigError, InputError, OutputError
 from barsight.core.extras import extra
 from barsight.core.files import translated_os_errors
-from barsight.core.reading.bounded_reading import MAX_DOCUMENT_BYTES, parse_json
+from barsight.core.reading.bounded_reading import MAX_DOCUMENT_BYTES, open_regular, parse_json
 from barsight.core.reading.json_schema import expect_schema
 
 with extra("fleet"):
@@ -25,6 +25,10 @@ REMEDY = "remove it, or write it anew"
 RETRY_S = 180
 """Time for which a request that a server refuses or loses is tried again."""
 _LARGE = 8 << 20
+
+
+class UnreachableError(InputError):
+    """Storage that does not answer, or refuses its keys: the fault of none of what lies in it."""
 
 
 @dataclass(frozen=True)
@@ -49,9 +53,13 @@ class Objects:
         """List what lies under a prefix, which ends at a slash."""
         with _told(self.url):
             for part in obstore.list(self.store, prefix.rstrip("/") or None):
-                for one in part:
-                    mark = one["e_tag"] or one["last_modified"].isoformat()
-                    yield StoredObject(one["path"], one["size"], mark)
+                yield from map(_listed, part)
+
+    def list_folder(self, prefix: str) -> Iterator[StoredObject]:
+        """List what lies in a folder itself."""
+        with _told(self.url):
+            for one in obstore.list_with_delimiter(self.store, prefix or None)["objects"]:
+                yield _listed(one)
 
     def read(self, path: str) -> bytes | None:
         """Read a small object; None where there is none. Raises InputError for one of over
@@ -59,7 +67,7 @@ class Objects:
         """
         with _told(f"{self.url}/{path}"):
             try:
-                found = obstore.get(self.store, path)
+                found = self._get(path)
             except FileNotFoundError:
                 return None
             self.expect_size(path, found.meta["size"], MAX_DOCUMENT_BYTES)
@@ -112,11 +120,18 @@ class Objects:
         """Read a large object in parts. Raises InputError where there is none."""
         with _told(f"{self.url}/{path}"):
             try:
-                found = obstore.get(self.store, path)
+                found = self._get(path)
             except FileNotFoundError:
                 raise InputError(f"{self.url}/{path}", "is gone", "plan the archive again") from None
             for part in found.stream(min_chunk_size=_LARGE):
                 yield bytes(part)
+
+    def _get(self, path: str) -> Any:
+        """Open an object. In a folder it must be a regular file: a pipe there would be waited for."""
+        file = Path(self.url) / path
+        if isinstance(self.store, LocalStore) and file.exists():
+            open_regular(file).close()
+        return obstore.get(self.store, path)
 
     def upload(self, file: Path, path: str) -> None:
         """Write a file as an object. Raises OutputError where it can't be."""
@@ -146,6 +161,10 @@ def open_objects(url: str, *, create: bool = False) -> Objects:
     return Objects(str(folder), LocalStore(folder))
 
 
+def _listed(one: Any) -> StoredObject:
+    return StoredObject(one["path"], one["size"], one["e_tag"] or one["last_modified"].isoformat())
+
+
 def _is_plain(endpoint: str) -> bool:
     return endpoint.startswith("http://")
 
@@ -168,7 +187,7 @@ class _told:  # noqa: N801
             if self.writes:
                 told = f"{self.name}: can't be written ({problem}); free some space or set its keys"
                 raise OutputError(told) from error
-            raise InputError(
+            raise UnreachableError(
                 self.name, f"can't be reached ({problem})", "see that it is there and its keys are set"
             ) from error
 

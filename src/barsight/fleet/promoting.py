@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from pathlib import Path
 
 from barsight.core.errors import ConfigError, InputError, MeasurementError
 from barsight.core.extras import extra
 from barsight.core.files import atomic_directory
+from barsight.fleet.comparing import REMEDY
 from barsight.fleet.ledger import published_keys, result_note
 from barsight.fleet.objects import Objects
 from barsight.fleet.versions import FleetTask, Version
@@ -98,8 +100,14 @@ def _fetch(results: Objects, key: str, out: Path) -> None:
     if note is None:
         raise InputError(f"{results.url}/results/{key}/result.json", "is gone", "run the version again")
     with atomic_directory(out) as staging:
-        for name in note["files"]:
-            target = staging / Path(name).name
-            with target.open("wb") as stream:
-                for part in results.chunks(f"files/{key}/{note['token']}/{name}"):
+        for name, told in note["files"].items():
+            path, digest, size = f"files/{key}/{note['token']}/{name}", hashlib.sha256(), 0
+            with (staging / Path(name).name).open("wb") as stream:
+                for part in results.chunks(path):
+                    size += len(part)
+                    if size > told["bytes"]:
+                        break
+                    digest.update(part)
                     stream.write(part)
+            if size != told["bytes"] or digest.hexdigest() != told["sha256"]:
+                raise InputError(f"{results.url}/{path}", "was changed after it was published", REMEDY)
