@@ -1,4 +1,4 @@
-"""The magnet's offset by touch-downs: averaged with its sigma, taken off the crane's target, bound to its rig."""
+"""The magnet's offset by touch-downs: averaged, taken off the crane's target, bound to its rig."""
 
 import json
 from dataclasses import replace
@@ -45,9 +45,7 @@ def certificate(
         for s in plan.sphere
     }
     seen = replace(seen, spheres=spheres)
-    found = Acceptance(
-        plan, (seen,), judge_all(plan, [seen], offset), (), (CLEAN,), (), {"rec": {}}, offset
-    )
+    found = Acceptance(plan, (seen,), judge_all(plan, [seen], offset), (), (CLEAN,), (), {"rec": {}}, offset)
     write_certificate(certificate_content(found, "N. N."), folder / "cert", None, pdf=False)
     return folder / "cert.json"
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import chi2 as chi_square
 
 from barsight.acceptance.observation import Observation, ViewGeometry
 from barsight.acceptance.pictures import PictureHealth
@@ -20,8 +21,8 @@ SPHERE_PX, SPHERE_MM = 0.03, 1.5
 """The same of a sphere's: pixels round its cap."""
 PLACE_PX, PLACE_MM = 0.2, 1.0
 """The same across, in pixels on the ground."""
-CLEAR = 9.0
-"""Least fall of chi-square for which a cause is named: three sigma."""
+FALSE_NAMES = 0.002
+"""Chance that a healthy rig has a cause named, over all that are tried together."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ class _Row:
 
 def _best_cause(rows: Sequence[_Row]) -> Cause | None:
     """Let each unknown go free in turn, the others as a healthy rig has them, and leave each artefact out in
-    turn; take what explains most.
+    turn; take what a healthy rig would show most rarely.
     """
     if not rows:
         return None
@@ -103,23 +104,28 @@ def _best_cause(rows: Sequence[_Row]) -> Cause | None:
     design = np.array([row.answer for row in rows]) * weight[:, None]
     error = np.array([row.error for row in rows]) * weight
     ordinary = np.array([one.ordinary for one in UNKNOWNS])
+    names = sorted({row.artefact for row in rows} - {""})
     healthy, _, _ = _solved(design, error, 1 / ordinary**2)
+    # One chance of a false name for all that are tried, whatever each leaves free.
     best: Cause | None = None
+    rarest = float(np.log(FALSE_NAMES / (len(UNKNOWNS) - 1 + len(names))))
     for k, one in enumerate(UNKNOWNS[:-1]):
         prior = 1 / ordinary**2
         prior[k] = 0.0
         chi2, value, sigma = _solved(design, error, prior)
-        gain = healthy - chi2
-        if gain > (CLEAR if best is None else best.chi2):
-            best = Cause(one.name, one.scale * float(value[k]), one.scale * float(sigma[k]), one.unit, gain)
-    for name in sorted({row.artefact for row in rows} - {""}):
+        rare = float(chi_square.logsf(healthy - chi2, 1))
+        if rare < rarest:
+            told = one.scale * float(value[k]), one.scale * float(sigma[k])
+            best, rarest = Cause(one.name, *told, one.unit, healthy - chi2), rare
+    for name in names:
         others = np.array([row.artefact != name for row in rows])
         chi2, _, _ = _solved(design[others], error[others], 1 / ordinary**2)
-        gain = healthy - chi2
-        if gain > (CLEAR + int((~others).sum()) if best is None else best.chi2):
+        rare = float(chi_square.logsf(healthy - chi2, int((~others).sum())))
+        if rare < rarest:
             off = [1e3 * row.error for row in rows if row.artefact == name]
             sigma_mm = max(1e3 * row.sigma for row in rows if row.artefact == name)
-            best = Cause(f"{name} stands elsewhere", float(max(off, key=abs)), sigma_mm, "mm", gain)
+            told = float(max(off, key=abs)), sigma_mm
+            best, rarest = Cause(f"{name} stands elsewhere", *told, "mm", healthy - chi2), rare
     return best
 
 
