@@ -15,10 +15,11 @@ from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
 from barsight.motion.rig_check.drift_check import RigCheck
 
-PLATE_PX, PLATE_MM = 0.03, 0.5
-"""Noise of a plate's height, beside what its own uncertainty is: disparity, and the map's."""
-SPHERE_PX, SPHERE_MM = 0.03, 1.5
-"""The same of a sphere's: pixels round its cap."""
+PLATE_PX, PLATE_MM = 0.008, 0.2
+"""Noise of a plate's height, beside what its own uncertainty is: disparity, and the map's. Rendered plates
+scatter by 0.4 mm where a pixel of disparity is 65 mm."""
+SPHERE_PX, SPHERE_MM = 0.012, 0.5
+"""The same of a sphere's: pixels round its cap; rendered ones scatter by 0.6 mm there."""
 PLACE_PX, PLACE_MM = 0.2, 1.0
 """The same across, in pixels on the ground."""
 FALSE_NAMES = 0.002
