@@ -52,7 +52,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     given = parser.parse_args()
     version = Version("nothing", "", "", "", "")
-    tasks = [FleetTask(f"{k:064x}", f"r{k:05d}", (".",), version) for k in range(given.tasks)]
+    tasks = [FleetTask(f"{k:064x}", f"r{k:05d}", (".",), version, "", "nowhere") for k in range(given.tasks)]
     port = free_port()
     processes = {
         name: subprocess.Popen(command, stderr=subprocess.DEVNULL)
@@ -75,13 +75,13 @@ def main() -> None:
             open_store(f"sqlite:///{place}/s.db", create=True) as store,
         ):
             results = open_objects(f"{place}/results", create=True)
-            note_plan(store, tasks, "nowhere", "bench")
+            note_plan(store, tasks, "bench")
             with connect(0, f"tcp://127.0.0.1:{port}") as client:
                 client.wait_for_workers(given.workers)
                 drive(
                     client,
                     tasks,
-                    TaskSettings("", results.url, None),
+                    TaskSettings(results.url, None),
                     store,
                     results,
                     RunWindow(),

@@ -14,6 +14,10 @@ from pathlib import Path
 
 import pytest
 
+from barsight.fleet.objects import open_objects
+from barsight.fleet.task import TaskLimits, TaskSettings
+from barsight.fleet.versions import Version, installed_software
+
 STAND_IN = """
 import hashlib, json, pathlib, sys, time
 words = sys.argv[1:]
@@ -59,6 +63,20 @@ def dask_commands(port: int, workers: int) -> dict[str, list[str]]:
     return {"scheduler": [*dask[:2], f"{dask[2]}scheduler", *at]} | {
         f"worker {number}": worker for number in range(workers)
     }
+
+
+VERSION = Version("v1", "configuration", "", "", installed_software())
+
+
+def settings(folder: Path, results: str, **more: float) -> TaskSettings:
+    """Settings of a run whose measurement is a stand-in, with results that know VERSION."""
+    limits = TaskLimits(**{"lease_s": 5.0, **more})  # type: ignore[arg-type]
+    open_objects(results, create=True).write(f"versions/{VERSION.name}/files.json", b"{}")
+    return TaskSettings(results, None, limits, command=stand_in(folder))
+
+
+def no_progress(*_: int) -> None:
+    """Take progress."""
 
 
 def stand_in(folder: Path) -> tuple[str, ...]:

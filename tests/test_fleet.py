@@ -26,7 +26,7 @@ from barsight.core.errors import ConfigError, Failed, InputError, OutputError
 from barsight.fleet.archive import download, find_recordings, manifest_digest
 from barsight.fleet.cluster import connect
 from barsight.fleet.comparing import FigureChange, RecordingComparison, _figures, compare_recording
-from barsight.fleet.comparison_page import comparison_page
+from barsight.fleet.comparison_page import comparison_page, copy_pictures
 from barsight.fleet.driver import count_states, drive, parked_reasons
 from barsight.fleet.findings import holm, judge
 from barsight.fleet.ledger import HeldRecording, claim, held, publish, published_keys
@@ -34,9 +34,9 @@ from barsight.fleet.limits import LimitedRun, run_limited
 from barsight.fleet.objects import Objects, open_objects
 from barsight.fleet.planning import TaskChoice, estimate, plan_tasks
 from barsight.fleet.records import note_plan, noted_keys
-from barsight.fleet.scratch import scratch_root, sweep
-from barsight.fleet.task import TaskLimits, TaskSettings, run_task
-from barsight.fleet.versions import Version, arguments, installed_software, publish_version
+from barsight.fleet.scratch import _machine, scratch_folder, scratch_root, sweep
+from barsight.fleet.task import run_task
+from barsight.fleet.versions import arguments, publish_version
 from barsight.fleet.window import RunWindow
 from barsight.measure_settings import MeasureSettings
 from barsight.store.audit import AuditChain, entry, verify_chain
@@ -44,18 +44,7 @@ from barsight.store.opening import open_store
 from barsight.store.promotion import counts, promoted_version
 from barsight.store.tables import FLEET_SURVEYS, PROMOTIONS, SURVEYS
 from barsight.yard.magnet.description import example_magnet
-from fleet_rounds import make_archive, moto_server, stand_in
-
-VERSION = Version("v1", "configuration", "", "", installed_software())
-
-
-def settings(folder: Path, archive: str, results: str, **more: float) -> TaskSettings:
-    limits = TaskLimits(**{"lease_s": 5.0, **more})  # type: ignore[arg-type]
-    return TaskSettings(archive, results, None, limits, command=stand_in(folder))
-
-
-def no_progress(*_: int) -> None:
-    """Take progress."""
+from fleet_rounds import VERSION, make_archive, moto_server, no_progress, settings
 
 
 def test_a_key_tells_content_and_version_and_not_the_place(tmp_path: Path) -> None:
@@ -146,9 +135,9 @@ def test_a_run_on_s3_parks_the_bad_and_publishes_the_rest_once(
             monkeypatch.setenv(name, value)
         results = open_objects("s3://yard/results", create=True)
         tasks = plan_tasks(archive, results, VERSION, None, no_progress)
-        shared = settings(tmp_path, archive.url, results.url, timeout_s=1.0)
+        shared = settings(tmp_path, results.url, timeout_s=1.0)
         with open_store(f"sqlite:///{tmp_path}/s.db", create=True) as store:
-            assert note_plan(store, tasks, archive.url, "t") == 8
+            assert note_plan(store, tasks, "t") == 8
             with connect(2, None) as client:
                 drive(client, tasks, shared, store, results, RunWindow(), no_progress)
             with store.reading() as connection:
@@ -172,7 +161,7 @@ def test_what_is_done_is_not_done_again(tmp_path: Path) -> None:
     archive = open_objects(str(make_archive(tmp_path / "a", {"r": "good"})))
     results = open_objects(str(tmp_path / "r"), create=True)
     (task,) = plan_tasks(archive, results, VERSION, None, no_progress)
-    shared = settings(tmp_path, archive.url, results.url)
+    shared = settings(tmp_path, results.url)
     assert run_task(task, shared) == task.key
     before = sorted(one.path for one in results.list())
     assert run_task(task, shared) == task.key
@@ -181,14 +170,23 @@ def test_what_is_done_is_not_done_again(tmp_path: Path) -> None:
 
 
 def test_folders_of_the_dead_are_swept_and_no_others() -> None:
-    dead = scratch_root() / "k-999999999-1.00-x"
-    alive = scratch_root() / f"k-{os.getpid()}-{time.time():.2f}-x"
+    dead = scratch_root() / f"k-{_machine()}-999999999-1.00-x"
+    others = scratch_root() / "k-12345678-999999999-1.00-x"
+    others.mkdir(exist_ok=True)
     dead.mkdir(exist_ok=True)
     sweep()
     assert dead.exists(), "it is young"
     sweep(min_age_s=0)
     assert not dead.exists()
-    assert not alive.exists()
+    assert others.exists(), "another machine's, of which this one knows nothing"
+    others.rmdir()
+    with scratch_folder("k") as alive:
+        sweep(min_age_s=0)
+        assert alive.exists()
+    dead.mkdir()
+    os.utime(dead, (1, 1))
+    with scratch_folder("k"):
+        assert not dead.exists(), "each task sweeps the machine that it runs on"
 
 
 def test_the_night_passes_midnight() -> None:
@@ -212,13 +210,21 @@ def change(recording: str, shift: float, sigma: float, p: float) -> RecordingCom
     return RecordingComparison(recording, (one,), (), (), (), {}, (1.0, 1.0), ("a", "b"))
 
 
-def test_holm_keeps_its_level_and_a_shared_shift_is_found() -> None:
+def test_holm_keeps_its_level_and_a_shared_shift_is_found(tmp_path: Path) -> None:
     assert holm([0.01, 0.04, 0.03]) == [True, False, False]
     shifted = judge("a", "b", [change(f"r{i}", 0.003 + 0.0002 * (i % 3), 0.01, 0.8) for i in range(30)], [])
     assert [s.figure for s in shifted.shifts if s.is_found] == ["top_z_m"] and not shifted.beyond
     same = judge("a", "b", [change(f"r{i}", 0.0, 0.01, 1.0) for i in range(30)], ["<lost>"])
     assert not any(s.is_found for s in same.shifts) and not same.beyond
-    page = comparison_page(judge("a", "b", [change("<r>", 1.0, 0.01, 1e-9)], ["<lost>"]))
+    worst = judge("a", "b", [change("<r>", 1.0, 0.01, 1e-9), change("<s>", 1.0, 0.01, 1e-9)], ["<lost>"])
+    results = open_objects(str(tmp_path / "r"), create=True)
+    results.write("a", b"<r> before")
+    (tmp_path / "page").mkdir()
+    copied = copy_pictures(results, worst, tmp_path / "page")
+    assert copied["<r>"] == ("pictures/000-before.png", ""), "the other result lacks its picture"
+    assert (tmp_path / "page/pictures/000-before.png").read_bytes() == b"<r> before"
+    page = comparison_page(worst, copied)
+    assert page.count('href="pictures/') == 2 and "file://" not in page and results.url not in page
     assert "&lt;r&gt;" in page and "<r>" not in page and "<lost>" not in page
 
 
@@ -402,9 +408,9 @@ def test_workers_of_another_version_end_the_run(tmp_path: Path) -> None:
     results = open_objects(str(tmp_path / "r"), create=True)
     older = replace(VERSION, software="0.1+abc")
     tasks = plan_tasks(archive, results, older, None, no_progress)
-    shared = settings(tmp_path, archive.url, results.url)
+    shared = settings(tmp_path, results.url)
     with open_store(f"sqlite:///{tmp_path}/s.db", create=True) as store:
-        note_plan(store, tasks, archive.url, "t")
+        note_plan(store, tasks, "t")
         with connect(1, None) as client, pytest.raises(ConfigError, match=r"0\.1\+abc"):
             drive(client, tasks, shared, store, results, RunWindow(), no_progress)
     assert not published_keys(results)

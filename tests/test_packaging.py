@@ -45,6 +45,7 @@ EXTRAS = {
         "store/confirmation.py",
         "store/promotion.py",
         "store/migrations/versions/v0003_fleet.py",
+        "store/migrations/versions/v0004_places.py",
         "fleet/records.py",
         "fleet/promoting.py",
         "plant/handshake.py",

@@ -33,6 +33,10 @@ class InputError(BarsightError):
         self.remedy = remedy
         super().__init__(f"{path}: {problem}" + (f"; {remedy}" if remedy else ""))
 
+    def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:
+        """Take itself apart for another process."""
+        return type(self), (str(self.path), self.problem, self.remedy)
+
 
 class CalibrationError(InputError):
     """An impossible calibration: a rotation that is none, focal lengths below zero, swapped cameras."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -12,6 +12,7 @@ from barsight.core.errors import InputError
 from barsight.core.json_values import json_digest
 from barsight.core.reading.bounded_reading import MAX_TABLE_BYTES
 from barsight.fleet.objects import Objects, StoredObject
+from barsight.recording.formats.segments import PATTERN
 from barsight.recording.own_files import leads_outside
 
 SURVEY = "survey.json"
@@ -19,7 +20,7 @@ SURVEY = "survey.json"
 _BAGS = (".bag", ".mcap", ".db3")
 _INSIDE = {"mav0", "cam0", "cam1", "image_0", "image_1"}
 _PICTURES = (".png", ".jpg", ".pgm", ".tif")
-_UNREAD = {"truth"}
+_UNREAD = {"truth", "alarms"}
 """Folders of a recording that a measurement doesn't read."""
 
 
@@ -28,6 +29,7 @@ class ArchivedRecording:
     """A recording, or a survey of several passes, as an archive holds it.
 
     name: its path in the archive. passes: paths of its recordings, relative to `name`; "." for itself.
+    files: its own, and the calibration beside a bag.
     """
 
     name: str
@@ -45,10 +47,12 @@ class ArchivedRecording:
         return sum(file.path.lower().endswith(_PICTURES) for file in self.files) // 2
 
     def relative(self, file: StoredObject) -> str:
-        """Return a file's path in the recording; its name where the recording is one file."""
-        if file.path == self.name:
-            return PurePosixPath(file.path).name
-        return file.path.removeprefix(f"{self.name}/") if self.name else file.path
+        """Return a file's path in the recording; `../` and its name for one that lies beside it."""
+        if not self.name:
+            return file.path
+        name = PurePosixPath(file.path).name
+        inner = file.path.removeprefix(f"{self.name}/")
+        return inner if inner != file.path else name if file.path == self.name else f"../{name}"
 
 
 def find_recordings(archive: Objects) -> tuple[ArchivedRecording, ...]:
@@ -57,40 +61,76 @@ def find_recordings(archive: Objects) -> tuple[ArchivedRecording, ...]:
     Raises InputError where there is none.
     """
     files = {one.path: one for one in archive.list()}
-    roots = {root for path in files if (root := _root(path)) is not None}
-    surveys = {
-        str(PurePosixPath(path).parent): _passes(archive, path)
-        for path in files
-        if PurePosixPath(path).name == SURVEY and path != SURVEY
-    }
-    roots = {r for r in roots if not any(r == s or r.startswith(f"{s}/") for s in surveys)} | surveys.keys()
+    surveys = {_above(path): _passes(archive, path) for path in files if PurePosixPath(path).name == SURVEY}
+    roots = _roots(files, surveys)
     held: dict[str, list[StoredObject]] = {root: [] for root in roots}
+    near: dict[str, list[StoredObject]] = {_above(root): [] for root in roots}
     for path, file in files.items():
-        for owner in (path, *map(str, PurePosixPath(path).parents)):
-            owner = "" if owner == "." else owner
-            if owner in held:
-                inner = PurePosixPath(path.removeprefix(owner).lstrip("/")).parts
-                if not _UNREAD & set(inner[:-1]):
-                    held[owner].append(file)
-                break
+        if (above := _above(path)) in near:
+            near[above].append(file)
+        owner = next((one for one in (path, *map(_plain, PurePosixPath(path).parents)) if one in held), None)
+        if owner is not None:
+            inner = PurePosixPath(path.removeprefix(owner).lstrip("/")).parts
+            if not _UNREAD & set(inner[:-1]):
+                held[owner].append(file)
     if not held:
         raise InputError(archive.url, "holds no recording", "name the folder above the recordings")
+    for root, own in held.items():
+        own += _beside(root, own, near[_above(root)])
     return tuple(
         ArchivedRecording(root, surveys.get(root, (".",)), tuple(sorted(held[root], key=lambda f: f.path)))
         for root in sorted(held)
     )
 
 
-def _root(path: str) -> str | None:
-    """Return the path of the recording that a file belongs to; None for any other file."""
+def _roots(files: Collection[str], surveys: Collection[str]) -> set[str]:
+    """Find the paths of recordings: folders of pictures, folders of a bag's parts, bags by themselves."""
+    parted = {
+        _above(path)
+        for path in files
+        if PurePosixPath(path).name == "metadata.yaml" or PurePosixPath(path).match(PATTERN)
+    }
+    roots = {root for path in files if (root := _root(path, parted)) is not None}
+    whole = {*surveys, *parted & roots}
+    return {r for r in roots if not any(_plain(above) in whole for above in PurePosixPath(r).parents)} | {
+        *surveys
+    }
+
+
+def _root(path: str, parted: Collection[str]) -> str | None:
+    """Return the path of the recording that a file belongs to; None for any other file. parted: folders whose
+    bags are parts of one.
+    """
     parts = PurePosixPath(path).parts
     for place, part in enumerate(parts[:-1]):
         if part in _INSIDE:
             return "/".join(parts[:place])
-    name = PurePosixPath(path)
-    if name.suffix in _BAGS:
-        return path
+    if PurePosixPath(path).suffix in _BAGS:
+        return above if (above := _above(path)) in parted else path
     return None
+
+
+def _beside(root: str, own: Collection[StoredObject], near: Iterable[StoredObject]) -> list[StoredObject]:
+    """List the calibration beside a bag, where it holds none. near: the files of the folder above it."""
+    is_bag = any(PurePosixPath(one.path).suffix in _BAGS and one.path.count("/") <= root.count("/") + 1
+                 for one in own)  # fmt: skip
+    if not root or not is_bag or any(_is_calibration(one.path, "camchain") for one in own):
+        return []
+    return [one for one in near if _is_calibration(one.path, "camchain") or _is_calibration(one.path, "imu")]
+
+
+def _is_calibration(path: str, word: str) -> bool:
+    name = PurePosixPath(path)
+    return name.suffix in (".yaml", ".yml") and word in name.stem
+
+
+def _above(path: str) -> str:
+    """Return the folder of a path; empty for the archive's own."""
+    return _plain(PurePosixPath(path).parent)
+
+
+def _plain(folder: PurePosixPath) -> str:
+    return "" if str(folder) == "." else str(folder)
 
 
 def _passes(archive: Objects, path: str) -> tuple[str, ...]:
@@ -142,7 +182,8 @@ def expect_own(archive: Objects, name: str, files: Iterable[StoredObject]) -> No
         return
     for file in files:
         path = Path(archive.url) / file.path
-        if leads_outside(path, Path(archive.url) / name):
+        is_own = not name or file.path == name or file.path.startswith(f"{name}/")
+        if leads_outside(path, Path(archive.url) / (name if is_own else _above(name))):
             raise InputError(path, "is a link out of the recording", "copy the file into the recording")
 
 
@@ -154,18 +195,26 @@ def _digest(archive: Objects, file: StoredObject) -> str:
 
 
 def download(archive: Objects, name: str, passes: tuple[str, ...], folder: Path) -> Iterator[Path]:
-    """Copy a recording's files into a folder, and yield the path of each pass."""
+    """Copy a recording's files into a folder, and yield the path of each pass.
+
+    Raises InputError for what the archive has no longer.
+    """
     recording = ArchivedRecording(name, passes, ())
     is_file = PurePosixPath(name).suffix in _BAGS
-    listed = [StoredObject(name, 0, "")] if is_file else list(archive.list(name))
-    expect_own(archive, name, listed)
-    for file in listed:
-        inner = PurePosixPath(recording.relative(file))
-        if _UNREAD & set(inner.parts[:-1]) or ".." in inner.parts:
+    own = [StoredObject(name, 0, "")] if is_file else list(archive.list(name))
+    own += _beside(name, own, archive.list_folder(_above(name)))
+    expect_own(archive, name, own)
+    if not own:
+        raise InputError(f"{archive.url}/{name}", "is gone", "plan the archive again")
+    root = folder / (PurePosixPath(name).name or "recording")
+    for file in own:
+        inner = PurePosixPath("" if file.path == name else recording.relative(file))
+        is_beside = inner.parts[:1] == ("..",)
+        if _UNREAD & set(inner.parts[:-1]) or ".." in inner.parts[is_beside:]:
             continue
-        target = folder / inner
+        target = root.parent / inner.name if is_beside else root / inner
         target.parent.mkdir(parents=True, exist_ok=True)
         with target.open("wb") as stream:
             for part in archive.chunks(file.path):
                 stream.write(part)
-    yield from (folder / PurePosixPath(name).name if is_file else folder / one for one in passes)
+    yield from (root / one for one in passes)

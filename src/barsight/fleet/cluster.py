@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
-from barsight.core.errors import ConfigError, InputError, OutputError
+from barsight.core.errors import ConfigError, InputError
 from barsight.core.extras import extra
 from barsight.fleet.limits import thread_variables
 
@@ -22,13 +23,17 @@ AHEAD = 4
 """Tasks that wait at the scheduler for each worker; no more are held there, however many are planned."""
 
 
+LOOK_S = 0.5
+"""Time after which workers that came and a window that opened are noticed."""
+
+
 @contextmanager
 def connect(workers: int, scheduler: str | None, threads: int = 0) -> Iterator[Any]:
     """Lend a client of the cluster at `scheduler`, or of one of so many processes that ends with it.
 
     threads: of the kernels in each process of this machine; 0 leaves it alone.
 
-    Raises InputError for a scheduler that doesn't answer.
+    Raises ConfigError for an address that is none, InputError for a scheduler that doesn't answer.
     """
     logging.getLogger("distributed").setLevel(logging.ERROR)
     options = {
@@ -38,6 +43,8 @@ def connect(workers: int, scheduler: str | None, threads: int = 0) -> Iterator[A
     }  # fmt: skip
     with dask.config.set(options):
         if scheduler is not None:
+            if re.fullmatch(r"(tcp|tls)://[^:/]+:\d{1,5}", scheduler) is None:
+                raise ConfigError(f"--scheduler {scheduler}: is no address; write tcp://HOST:8786")
             try:
                 client = Client(scheduler, timeout=20, set_as_default=False)
             except (OSError, ValueError) as error:
@@ -48,7 +55,8 @@ def connect(workers: int, scheduler: str | None, threads: int = 0) -> Iterator[A
         with (
             LocalCluster(
                 n_workers=workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0",
-                host="127.0.0.1", memory_limit=0, env=thread_variables(threads),
+                host="127.0.0.1", memory_limit=0,
+                env={"DASK_LOGGING__DISTRIBUTED": "critical", **thread_variables(threads)},
             ) as cluster,
             Client(cluster, set_as_default=False) as client,
         ):  # fmt: skip
@@ -63,34 +71,42 @@ def slots(client: Any) -> int:
 
 def run_all(
     client: Any, run: Callable[[Any, Any], T], tasks: Iterable[Any], settings: Any,
-    may_go_on: Callable[[], bool] = lambda: True,
+    may_go_on: Callable[[], bool] = lambda: True, ahead: int = AHEAD,
 ) -> Iterator[T | None]:  # fmt: skip
-    """Run tasks in their order, a few ahead of the workers, and yield what each returns as it ends; None for
-    one that was lost. may_go_on: asked before each; where it refuses, what runs is waited for.
+    """Run tasks in their order, `ahead` of them a worker at a time, and yield what each returns as it ends;
+    None for one that was lost. may_go_on: asked before each, and again while others run; where it refuses and
+    nothing runs, the rest is left.
 
-    Raises what a task raised where another try would too: ConfigError and OutputError.
+    Raises what a task raised.
     """
     waiting = iter(tasks)
     running = as_completed(loop=client.loop)
-    count = 0
-
-    def submit_more() -> int:
-        added = 0
-        while count + added < AHEAD * slots(client) and may_go_on():
+    is_more = True
+    while True:
+        while is_more and running.count() < ahead * slots(client) and may_go_on():
             task = next(waiting, None)
-            if task is None:
-                break
-            running.add(client.submit(run, task, settings, pure=False, retries=0))
-            added += 1
-        return added
+            is_more = task is not None
+            if is_more:
+                running.add(client.submit(_ended, run, task, settings, pure=False, retries=0))
+        if running.is_empty():
+            return
+        with running.thread_condition:
+            if not running.has_ready():
+                running.thread_condition.wait(LOOK_S)
+        while running.has_ready():
+            future = next(running)
+            ended = future.result() if future.status == "finished" else None
+            if isinstance(ended, Exception):
+                raise ended
+            yield ended
+            future.release()
 
-    count += submit_more()
-    while count:
-        future = next(running)
-        count -= 1
-        error = future.exception() if future.status == "error" else None
-        if isinstance(error, ConfigError | OutputError):
-            raise error
-        yield future.result() if future.status == "finished" else None
-        future.release()
-        count += submit_more()
+
+def _ended(run: Callable[[Any, Any], T], task: Any, settings: Any) -> T | Exception:
+    """Run a task on a worker; what it raises is returned, as a worker that died raises too, and as Dask would
+    log it.
+    """
+    try:
+        return run(task, settings)
+    except Exception as error:
+        return error

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
 from typing import Any
@@ -14,6 +15,7 @@ from barsight.core.reading.bounded_reading import in_range
 from barsight.core.reading.sealed_json import SEAL
 from barsight.fleet.ledger import result_note
 from barsight.fleet.objects import Objects
+from barsight.fleet.versions import FleetTask
 
 FIGURES = ("x_m", "y_m", "top_z_m", "yaw_deg", "length_m", "width_m")
 """Figures of a bundle that are compared."""
@@ -45,7 +47,7 @@ class RecordingComparison:
 
     only_before, only_after: numbers of bundles without a partner. vetoes: codes that appeared (+) and
     vanished (-). intervals: mean half width of the 95 % interval by figure, before and after. seconds:
-    measured, before and after. pictures: URLs of the two reports' pictures.
+    measured, before and after. pictures: objects of the results, of the two reports' pictures.
     """
 
     recording: str
@@ -56,6 +58,33 @@ class RecordingComparison:
     intervals: dict[str, tuple[float, float]]
     seconds: tuple[float, float]
     pictures: tuple[str, str]
+
+
+def compare_tasks(
+    results: Objects,
+    before: Sequence[FleetTask],
+    after: Sequence[FleetTask],
+    advance: Callable[[int, int], None],
+) -> tuple[list[RecordingComparison], list[str]]:
+    """Compare the recordings of two versions, told by their content; the others are named, with why."""
+    old, new = ({task.manifest or task.key: task for task in tasks} for tasks in (before, after))
+    untold = [
+        f"{task.name or '.'} (of version {task.version.name} only)"
+        for tasks, others in ((old, new), (new, old))
+        for manifest, task in tasks.items()
+        if manifest not in others
+    ]
+    both = [manifest for manifest in new if manifest in old]
+    compared = []
+    for number, manifest in enumerate(both):
+        name = new[manifest].name or "."
+        one = compare_recording(results, name, old[manifest].key, new[manifest].key)
+        if one is None:
+            untold.append(f"{name} (not measured under both)")
+        else:
+            compared.append(one)
+        advance(number + 1, len(both))
+    return compared, untold
 
 
 def compare_recording(results: Objects, name: str, before: str, after: str) -> RecordingComparison | None:
@@ -81,7 +110,7 @@ def compare_recording(results: Objects, name: str, before: str, after: str) -> R
         ),
         {figure: _half_widths(figure, *bundles) for figure in FIGURES} if all(bundles) else {},
         (notes[0]["measured_s"], notes[1]["measured_s"]),
-        (f"{results.url}/{folders[0]}/preview.png", f"{results.url}/{folders[1]}/preview.png"),
+        (f"{folders[0]}/preview.png", f"{folders[1]}/preview.png"),
     )  # fmt: skip
 
 

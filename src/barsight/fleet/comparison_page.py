@@ -1,11 +1,14 @@
-"""Write the comparison of two versions as a page that needs no other file but the pictures it links."""
+"""Write the comparison of two versions as a page, with the pictures of the worst cases beside it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from html import escape
+from pathlib import Path
 
+from barsight.fleet.comparing import RecordingComparison
 from barsight.fleet.findings import LEVEL, Findings
+from barsight.fleet.objects import Objects
 
 MAX_LISTED = 100
 """Bundles and recordings that the page lists; the JSON has all."""
@@ -16,9 +19,39 @@ _STYLE = (
 )
 
 
-def comparison_page(findings: Findings) -> str:
-    """Format the page: shifts of the archive, bundles beyond sigma, vetoes, bundles of one version, times."""
+def copy_pictures(results: Objects, findings: Findings, folder: Path) -> dict[str, tuple[str, str]]:
+    """Copy the pictures of the recordings that the page lists into `folder`, and return by recording where
+    they lie in it, before and after; empty for one that a result lacks.
+    """
+    worst = [c.recording for c in findings.beyond[:MAX_LISTED]]
+    worst += [one.recording for one in _other(findings)]
     pictures = {one.recording: one.pictures for one in findings.recordings}
+    (folder / "pictures").mkdir()
+    copied = {}
+    for number, recording in enumerate(dict.fromkeys(worst)):
+        names = [f"pictures/{number:03d}-{word}.png" for word in ("before", "after")]
+        for place, (name, source) in enumerate(zip(names, pictures[recording], strict=True)):
+            data = results.read(source)
+            if data is None:
+                names[place] = ""
+            else:
+                (folder / name).write_bytes(data)
+        copied[recording] = (names[0], names[1])
+    return copied
+
+
+def _other(findings: Findings) -> list[RecordingComparison]:
+    """List the recordings with other vetoes or bundles of one version only, those with most of them first."""
+    told = [one for one in findings.recordings if one.vetoes or one.only_before or one.only_after]
+    told.sort(key=lambda one: -len(one.vetoes) - len(one.only_before) - len(one.only_after))
+    return told[:MAX_LISTED]
+
+
+def comparison_page(findings: Findings, pictures: dict[str, tuple[str, str]]) -> str:
+    """Format the page: shifts of the archive, bundles beyond sigma, vetoes, bundles of one version, times.
+
+    pictures: of `copy_pictures`.
+    """
     parts = [
         f"<h1>Version {escape(findings.before)} and version {escape(findings.after)}</h1>",
         f"<p>{len(findings.recordings)} recordings, {findings.tests} figures of bundles compared. Told is "
@@ -46,10 +79,9 @@ def comparison_page(findings: Findings) -> str:
             ("recording", "vetoes", "bundles gone", "bundles new", "pictures"),
             [
                 (one.recording, " ".join(one.vetoes), _numbers(one.only_before), _numbers(one.only_after),
-                 one.pictures)
-                for one in findings.recordings
-                if one.vetoes or one.only_before or one.only_after
-            ][:MAX_LISTED],
+                 pictures[one.recording])
+                for one in _other(findings)
+            ],
         ),
         "<h2>Half widths of the 95 % intervals, mean over the recordings</h2>",
         _table(("figure", "before", "after"), _intervals(findings)),
@@ -93,9 +125,5 @@ def _table(heads: tuple[str, ...], rows: Sequence[Sequence[object]]) -> str:
 def _cell(cell: object) -> str:
     if isinstance(cell, tuple):
         links = zip(("before", "after"), cell, strict=True)
-        return " ".join(f'<a href="{escape(_link(str(url)))}">{word}</a>' for word, url in links)
+        return " ".join(f'<a href="{escape(str(path))}">{word}</a>' for word, path in links if path)
     return escape(str(cell))
-
-
-def _link(url: str) -> str:
-    return url if "://" in url else f"file://{url}"

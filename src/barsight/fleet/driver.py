@@ -8,11 +8,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from barsight.core.errors import InputError
-from barsight.fleet.cluster import run_all
+from barsight.fleet.cluster import AHEAD, run_all
 from barsight.fleet.ledger import PARKED, parked_keys, published_keys, result_note, running_keys
 from barsight.fleet.objects import Objects
 from barsight.fleet.records import note_results, noted_keys
-from barsight.fleet.scratch import sweep
 from barsight.fleet.task import TaskSettings, run_task
 from barsight.fleet.versions import FleetTask
 from barsight.fleet.window import RunWindow
@@ -57,7 +56,6 @@ def drive(
     advance: told of the tasks that are done and of all. Rows that workers could not write are written at
     the end of each round. What another driver's workers have claimed is waited for.
     """
-    sweep()
     wanted = {task.key for task in tasks}
     while True:
         ended = (published_keys(results) | parked_keys(results)) & wanted
@@ -72,12 +70,21 @@ def drive(
         busy = running_keys(results, {task.key for task in left})
         free = [task for task in left if task.key not in busy]
         done = len(ended)
-        for key in run_all(client, run, free, settings, window.is_open):
+        # What waits at the workers would start after the window has closed.
+        ahead = 1 if window.is_limited else AHEAD
+        for key in run_all(client, run, free, settings, window.is_open, ahead):
             if key is not None:
                 done += 1
                 advance(min(done, len(tasks)), len(tasks))
         if not free:
             time.sleep(POLL_S)
+
+
+def open_tasks(store: Store, results: Objects, tasks: list[FleetTask], by: str) -> list[FleetTask]:
+    """List the tasks that are neither published nor parked; rows that the others lack are written."""
+    note_missing(store, results, by, {task.key for task in tasks})
+    ended = published_keys(results) | parked_keys(results)
+    return [task for task in tasks if task.key not in ended]
 
 
 def note_missing(store: Store, results: Objects, by: str, wanted: set[str]) -> int:

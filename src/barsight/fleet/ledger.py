@@ -22,7 +22,10 @@ MAX_LOST = 12
 """and claims whose worker died without a word, which others' faults cause too."""
 Held = Literal["published", "parked", "claimed"]
 _TEXT, _NUMBER = {"type": "string"}, {"type": "number"}
-_FILE = {"type": "object", "required": ["bytes", "sha256"], "properties": {"bytes": {"type": "integer"}}}
+_FILE = {
+    "type": "object", "required": ["bytes", "sha256"],
+    "properties": {"bytes": {"type": "integer"}, "sha256": _TEXT},
+}  # fmt: skip
 _RESULT = {
     "type": "object",
     "required": ["key", "token", "measured_s", "whole_s", "peak_bytes", "files"],
@@ -95,6 +98,14 @@ def publish(results: Objects, mine: HeldRecording, content: dict[str, Any]) -> b
     """Write the key's result.json, its last object, where there is none; tell whether it is ours."""
     text = json.dumps({"key": mine.key, "token": mine.token, **content}, indent=1)
     return results.write_new(f"results/{mine.key}/result.json", text.encode())
+
+
+def discard(results: Objects, mine: HeldRecording, *, is_ours: bool) -> None:
+    """Remove the files of a key's other tries once it is published by ours, or ours where it isn't."""
+    own = f"files/{mine.key}/{mine.token}/"
+    for one in list(results.list(f"files/{mine.key}/")):
+        if one.path.startswith(own) is not is_ours:
+            results.remove(one.path)
 
 
 def result_note(results: Objects, key: str) -> dict[str, Any] | None:

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from barsight.core.errors import Failed
+from barsight.core.errors import Failed, OutputError
 from barsight.core.extras import extra
 
 with extra("fleet"):
@@ -20,6 +20,7 @@ with extra("fleet"):
 
 _LOOK_S = 0.1
 GIB = 1 << 30
+_THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class LimitedRun:
 
 def thread_variables(threads: int) -> dict[str, str]:
     """Form the environment that bounds a process's threads; empty for 0, which leaves them alone."""
-    return {name: str(threads) for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")} if threads else {}
+    return dict.fromkeys(_THREADS, str(threads)) if threads else {}
 
 
 def run_limited(
@@ -40,7 +41,8 @@ def run_limited(
 ) -> LimitedRun | Failed:
     """Run a command in `folder`; it and its children are killed once they pass a limit, or we die.
 
-    Fails with `over-memory`, `timeout`, or `refused` and the last line that it wrote.
+    Fails with `over-memory`, `timeout`, or `refused` and the last line that it wrote; `output` where that is
+    about what it could not write.
     """
     started = time.monotonic()
     peak = 0
@@ -65,7 +67,9 @@ def run_limited(
         return LimitedRun(time.monotonic() - started, peak)
     lines = (folder / "measure.log").read_bytes()[-4000:].decode(errors="replace").strip().splitlines()
     line = (lines or ["no word"])[-1]
-    return Failed("refused", f"exit code {process.returncode}: {line[:300]}")
+    code = "output" if process.returncode == OutputError.exit_code else "refused"
+    ended = f"exit code {process.returncode}" if process.returncode > 0 else f"signal {-process.returncode}"
+    return Failed(code, f"{ended}: {line[:300]}")
 
 
 def _die_with_parent() -> None:

@@ -27,6 +27,10 @@ RETRY_S = 180
 _LARGE = 8 << 20
 
 
+class UnreachableError(InputError):
+    """Storage that does not answer, or refuses its keys: the fault of none of what lies in it."""
+
+
 @dataclass(frozen=True)
 class StoredObject:
     """An object of a listing. mark: changes when its content does."""
@@ -49,9 +53,13 @@ class Objects:
         """List what lies under a prefix, which ends at a slash."""
         with _told(self.url):
             for part in obstore.list(self.store, prefix.rstrip("/") or None):
-                for one in part:
-                    mark = one["e_tag"] or one["last_modified"].isoformat()
-                    yield StoredObject(one["path"], one["size"], mark)
+                yield from map(_listed, part)
+
+    def list_folder(self, prefix: str) -> Iterator[StoredObject]:
+        """List what lies in a folder itself."""
+        with _told(self.url):
+            for one in obstore.list_with_delimiter(self.store, prefix or None)["objects"]:
+                yield _listed(one)
 
     def read(self, path: str) -> bytes | None:
         """Read a small object; None where there is none. Raises InputError for one of over
@@ -146,6 +154,10 @@ def open_objects(url: str, *, create: bool = False) -> Objects:
     return Objects(str(folder), LocalStore(folder))
 
 
+def _listed(one: Any) -> StoredObject:
+    return StoredObject(one["path"], one["size"], one["e_tag"] or one["last_modified"].isoformat())
+
+
 def _is_plain(endpoint: str) -> bool:
     return endpoint.startswith("http://")
 
@@ -168,7 +180,7 @@ class _told:  # noqa: N801
             if self.writes:
                 told = f"{self.name}: can't be written ({problem}); free some space or set its keys"
                 raise OutputError(told) from error
-            raise InputError(
+            raise UnreachableError(
                 self.name, f"can't be reached ({problem})", "see that it is there and its keys are set"
             ) from error
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import inf
 from statistics import median
 
+from barsight.core.settings.values import expect_ranges
 from barsight.fleet.archive import find_recordings, manifest_digest
 from barsight.fleet.objects import Objects
 from barsight.fleet.versions import FleetTask, Version
@@ -44,11 +46,15 @@ def plan_tasks(
             done += size
             advance(done, total)
 
-        key = version.key(manifest_digest(archive, results, recording, read))
+        manifest = manifest_digest(archive, results, recording, read)
+        key = version.key(manifest)
         tasks.setdefault(
             key,
-            FleetTask(key, recording.name, recording.passes, version, recording.size, recording.pairs),
-        )
+            FleetTask(
+                key, recording.name, recording.passes, version, manifest, archive.url, recording.size,
+                recording.pairs,
+            ),
+        )  # fmt: skip
     return list(tasks.values())
 
 
@@ -75,13 +81,17 @@ class TaskChoice:
     """Tasks that are run, and their order."""
 
     version: str | None = None
-    """Version to measure, by the beginning of its name; the one planned last if not given."""
+    """Version to measure, by the beginning of its name; the newest if not given."""
     limit: int | None = None
-    """Most recordings to measure now."""
+    """Most recordings to measure now, of those that are left."""
     first: tuple[str, ...] = ()
     """Beginnings of the names of recordings that come first, in this order."""
     again: bool = False
     """Try parked recordings again."""
+
+    def __post_init__(self) -> None:
+        if self.limit is not None:
+            expect_ranges(self, "", limit=(1, inf))
 
     def of(self, tasks: list[FleetTask]) -> list[FleetTask]:
         """Put first the tasks whose names begin with the first of `first`, and so on; then all others; cut to

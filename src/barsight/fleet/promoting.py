@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from pathlib import Path
 
 from barsight.core.errors import ConfigError, InputError, MeasurementError
 from barsight.core.extras import extra
 from barsight.core.files import atomic_directory
+from barsight.fleet.comparing import REMEDY
 from barsight.fleet.ledger import published_keys, result_note
 from barsight.fleet.objects import Objects
 from barsight.fleet.versions import FleetTask, Version
@@ -98,8 +100,11 @@ def _fetch(results: Objects, key: str, out: Path) -> None:
     if note is None:
         raise InputError(f"{results.url}/results/{key}/result.json", "is gone", "run the version again")
     with atomic_directory(out) as staging:
-        for name in note["files"]:
-            target = staging / Path(name).name
-            with target.open("wb") as stream:
-                for part in results.chunks(f"files/{key}/{note['token']}/{name}"):
+        for name, file in note["files"].items():
+            path, digest = f"files/{key}/{note['token']}/{name}", hashlib.sha256()
+            with (staging / Path(name).name).open("wb") as stream:
+                for part in results.chunks(path):
                     stream.write(part)
+                    digest.update(part)
+            if digest.hexdigest() != file["sha256"]:
+                raise InputError(f"{results.url}/{path}", "was changed after it was published", REMEDY)

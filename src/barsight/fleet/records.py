@@ -13,27 +13,35 @@ from barsight.core.extras import extra
 from barsight.fleet.versions import FleetTask, Version
 from barsight.store.audit import entry
 from barsight.store.opening import Store, open_store
-from barsight.store.tables import FLEET_RESULTS, FLEET_TASKS, FLEET_VERSIONS
+from barsight.store.tables import FLEET_PLACES, FLEET_RESULTS, FLEET_TASKS, FLEET_VERSIONS
 
 with extra("store"):
     from sqlalchemy import Connection, select
 
 
-def note_plan(store: Store, tasks: Iterable[FleetTask], archive: str, by: str) -> int:
-    """Add a version and those of its tasks that the store doesn't have; return their number."""
-    planned = list(tasks)
+def note_plan(store: Store, tasks: Iterable[FleetTask], by: str) -> int:
+    """Add a version, those of its tasks that the store doesn't have, and where they lie now.
+
+    Returns the number of new tasks.
+    """
+    planned = {task.key: task for task in tasks}
     with entry(store, by, f"fleet plan of {len(planned)} recordings") as opened:
         known = set(opened.connection.execute(select(FLEET_TASKS.c.key)).scalars())
         names = set(opened.connection.execute(select(FLEET_VERSIONS.c.name)).scalars())
-        for version in {task.version for task in planned if task.version.name not in names}:
+        for version in {task.version for task in planned.values() if task.version.name not in names}:
             opened.add(FLEET_VERSIONS, **asdict(version), at_ns=opened.at_ns)
-        fresh = {task.key: task for task in planned if task.key not in known}
-        for key, task in fresh.items():
-            opened.add(
-                FLEET_TASKS, key=key, version=task.version.name, archive=archive, recording=task.name,
-                passes=json.dumps(task.passes), bytes=task.size, pairs=task.pairs, at_ns=opened.at_ns,
-            )  # fmt: skip
-    return len(fresh)
+        places = _places(opened.connection)
+        for key, task in planned.items():
+            if key not in known:
+                opened.add(
+                    FLEET_TASKS, key=key, version=task.version.name, archive=task.archive,
+                    recording=task.name, passes=json.dumps(task.passes), bytes=task.size, pairs=task.pairs,
+                    at_ns=opened.at_ns,
+                )  # fmt: skip
+            place = {"manifest": task.manifest, "archive": task.archive, "recording": task.name}
+            if places.get(key) != tuple(place.values()):
+                opened.add(FLEET_PLACES, key=key, **place, at_ns=opened.at_ns)
+    return len(planned.keys() - known)
 
 
 def note_result(url: str, key: str, content: dict[str, Any], by: str) -> None:
@@ -67,30 +75,35 @@ def read_versions(connection: Connection) -> list[Version]:
 
 
 def find_version(connection: Connection, name: str | None) -> Version:
-    """Find a version by the beginning of its name; the one planned last where None. Raises ConfigError."""
+    """Find a version by the beginning of its name; the newest where None. Raises ConfigError."""
     versions = read_versions(connection)
+    if not versions:
+        raise ConfigError("the store knows no version of a fleet; barsight fleet plan makes one")
     found = [one for one in versions if name is None or one.name.startswith(name)]
-    if name is None and found:
+    if name is None:
         return found[-1]
     if len(found) != 1:
-        known = ", ".join(one.name for one in versions) or "none"
-        raise ConfigError(f"{name or 'the fleet'}: names no version that is planned; known: {known}")
+        problem = "names several versions" if found else "names no version that is planned"
+        raise ConfigError(f"{name}: {problem}; known are {', '.join(one.name for one in found or versions)}")
     return found[0]
 
 
 def read_tasks(connection: Connection, version: Version) -> list[FleetTask]:
-    """List a version's tasks in the order of the plan."""
+    """List a version's tasks in the order of the plan, each where it was found last."""
     chosen = select(FLEET_TASKS).where(FLEET_TASKS.c.version == version.name).order_by(FLEET_TASKS.c.id)
-    return [
-        FleetTask(r.key, r.recording, tuple(json.loads(r.passes)), version, r.bytes, r.pairs)
-        for r in connection.execute(chosen).all()
-    ]
+    places = _places(connection)
+    tasks = []
+    for row in connection.execute(chosen).all():
+        manifest, archive, name = places.get(row.key, ("", row.archive, row.recording))
+        passes = tuple(json.loads(row.passes))
+        tasks.append(FleetTask(row.key, name, passes, version, manifest, archive, row.bytes, row.pairs))
+    return tasks
 
 
-def read_archive(connection: Connection, version: Version) -> str:
-    """Return the URL of the archive that a version was planned over last."""
-    chosen = select(FLEET_TASKS.c.archive).where(FLEET_TASKS.c.version == version.name)
-    return str(connection.execute(chosen.order_by(FLEET_TASKS.c.id.desc()).limit(1)).scalar_one())
+def _places(connection: Connection) -> dict[str, tuple[str, str, str]]:
+    """Read by key the manifest of each recording, the archive where it was found last, and its name there."""
+    rows = connection.execute(select(FLEET_PLACES).order_by(FLEET_PLACES.c.id)).all()
+    return {row.key: (row.manifest, row.archive, row.recording) for row in rows}
 
 
 def seconds_by_size(connection: Connection) -> list[tuple[int, int, float, int]]:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import hashlib
 import os
 import shutil
+import socket
 import stat
 import subprocess
 import sys
@@ -17,6 +19,7 @@ from pathlib import Path
 import barsight
 from barsight.core.errors import InputError
 from barsight.core.extras import extra
+from barsight.core.files import translated_os_errors
 
 with extra("fleet"):
     import psutil
@@ -28,7 +31,7 @@ MIN_AGE_S = 60.0
 def scratch_root() -> Path:
     """Return this user's folder for all tasks of this machine. Raises InputError where others have it."""
     root = Path(tempfile.gettempdir()) / f"barsight-fleet-{os.getuid()}"
-    with contextlib.suppress(FileExistsError):
+    with translated_os_errors(root), contextlib.suppress(FileExistsError):
         root.mkdir(mode=0o700)
     found = root.lstat()
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o022:
@@ -38,9 +41,13 @@ def scratch_root() -> Path:
 
 @contextlib.contextmanager
 def scratch_folder(key: str) -> Iterator[Path]:
-    """Yield an empty folder, named after its owner's process and start, that is gone at the end."""
-    name = f"{key[:16]}-{os.getpid()}-{psutil.Process().create_time():.2f}-"
-    folder = Path(tempfile.mkdtemp(prefix=name, dir=scratch_root()))
+    """Yield an empty folder, named after its owner's machine, process and start, that is gone at the end;
+    folders that dead tasks left are swept first.
+    """
+    sweep()
+    name = f"{key[:16]}-{_machine()}-{os.getpid()}-{psutil.Process().create_time():.2f}-"
+    with translated_os_errors(scratch_root()):
+        folder = Path(tempfile.mkdtemp(prefix=name, dir=scratch_root()))
     try:
         yield folder
     finally:
@@ -48,18 +55,25 @@ def scratch_folder(key: str) -> Iterator[Path]:
 
 
 def sweep(min_age_s: float = MIN_AGE_S) -> int:
-    """Remove this user's folders whose owner no longer runs and that are old enough; count them."""
+    """Remove this user's folders whose owner ran on this machine, no longer does, and that are old enough;
+    count them.
+    """
     count = 0
     for folder in scratch_root().iterdir():
         parts = folder.name.split("-")
-        if not folder.is_dir() or folder.is_symlink() or len(parts) != 4:
+        if not folder.is_dir() or folder.is_symlink() or len(parts) != 5 or parts[1] != _machine():
             continue
         with contextlib.suppress(OSError, ValueError):
             is_old = time.time() - folder.stat().st_mtime >= min_age_s
-            if is_old and not _lives(int(parts[1]), float(parts[2])):
+            if is_old and not _lives(int(parts[2]), float(parts[3])):
                 shutil.rmtree(folder)
                 count += 1
     return count
+
+
+def _machine() -> str:
+    """Name this machine, as several may share the disk of temporary files."""
+    return hashlib.sha256(socket.gethostname().encode()).hexdigest()[:8]
 
 
 def _lives(pid: int, started: float) -> bool:
@@ -73,7 +87,7 @@ def compile_once() -> None:
     """Compile the kernels of a measurement unless this machine has done so: one compiles, others wait."""
     package = Path(barsight.__file__).parent
     stamp = max(int(path.stat().st_mtime) for path in package.rglob("*.py"))
-    mark = scratch_root() / f"kernels-{barsight.__version__}-{stamp}"
+    mark = scratch_root() / f"kernels-{_machine()}-{barsight.__version__}-{stamp}"
     with (scratch_root() / "kernels.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if mark.exists():

@@ -11,15 +11,16 @@ from dataclasses import dataclass
 from math import inf
 from pathlib import Path
 
-from barsight.core.errors import BarsightError, ConfigError, Failed
+from barsight.core.errors import BarsightError, Failed, InputError, OutputError
+from barsight.core.files import translated_os_errors
 from barsight.core.settings.values import NOT_NEGATIVE, POSITIVE, expect_ranges
 from barsight.fleet.archive import download
-from barsight.fleet.ledger import HeldRecording, claim, fail, held, publish
+from barsight.fleet.ledger import HeldRecording, claim, discard, fail, held, publish
 from barsight.fleet.limits import LimitedRun, run_limited, thread_variables
-from barsight.fleet.objects import Objects, open_objects
+from barsight.fleet.objects import Objects, UnreachableError, open_objects
 from barsight.fleet.records import note_result
 from barsight.fleet.scratch import compile_once, scratch_folder
-from barsight.fleet.versions import FleetTask, arguments, installed_software
+from barsight.fleet.versions import FleetTask, arguments, expect_software
 
 COMMAND = (sys.executable, "-m", "barsight", "measure")
 
@@ -45,11 +46,8 @@ class TaskLimits:
 
 @dataclass(frozen=True)
 class TaskSettings:
-    """All that tasks of a run share: URLs of archive, results and store (None: the driver writes the rows),
-    and limits.
-    """
+    """All that tasks of a run share: URLs of results and store (None: the driver writes the rows), limits."""
 
-    archive: str
     results: str
     store: str | None
     limits: TaskLimits = TaskLimits()
@@ -61,20 +59,20 @@ def run_task(task: FleetTask, settings: TaskSettings) -> str:
     """Measure a recording unless another worker has it or did it, and return its key, whatever came of it.
 
     A recording that fails is tried again at once until it is parked. Raises ConfigError where this machine's
-    software isn't the version's.
+    software isn't the version's, and what ends the whole run: results or archive that can't be reached, a
+    disk that takes nothing more.
     """
-    if task.version.software != installed_software():
-        raise ConfigError(
-            f"{socket.gethostname()}: has Barsight {installed_software()}, but the version was planned with "
-            f"{task.version.software}; install that on every worker, or plan again"
-        )
-    results = open_objects(settings.results, create=True)
+    expect_software(task.version.software)
+    results = open_objects(settings.results)
     while True:
         mine = claim(results, task.key, settings.limits.lease_s)
         if not isinstance(mine, HeldRecording):
             return task.key
         with held(results, mine, settings.limits.lease_s):
-            ended = _try(task, mine, settings, results)
+            try:
+                ended = _try(task, mine, settings, results)
+            except OutputError as error:
+                raise OutputError(f"on {socket.gethostname()}: {error}") from error
             if not isinstance(ended, Failed):
                 return task.key
             if fail(results, mine, f"{ended.code}: {ended.reason}"):
@@ -84,11 +82,17 @@ def run_task(task: FleetTask, settings: TaskSettings) -> str:
 def _try(task: FleetTask, mine: HeldRecording, settings: TaskSettings, results: Objects) -> Failed | None:
     """Measure once; None where it is published, by this try or another."""
     started = time.monotonic()
-    with scratch_folder(task.key) as folder:
+    with scratch_folder(task.key) as folder, translated_os_errors(folder):
+        words = arguments(results, task.version, folder)
         (folder / "in").mkdir()
-        paths = list(download(open_objects(settings.archive), task.name, task.passes, folder / "in"))
-        words = [*map(str, paths), "-o", str(folder / "out"), "--at", "end"]
-        words += arguments(results, task.version, folder)
+        archive = open_objects(task.archive)
+        try:
+            paths = list(download(archive, task.name, task.passes, folder / "in"))
+        except UnreachableError:
+            raise
+        except InputError as error:
+            return Failed("refused", str(error))
+        words = [*map(str, paths), "-o", str(folder / "out"), "--at", "end", *words]
         if settings.command == COMMAND:
             compile_once()
         fetched_s = time.monotonic() - started
@@ -100,10 +104,14 @@ def _try(task: FleetTask, mine: HeldRecording, settings: TaskSettings, results: 
             settings.limits.timeout_s,
         )
         if isinstance(ran, Failed):
+            if ran.code == "output":
+                raise OutputError(ran.reason)
             return ran
         files = _upload(folder / "out", f"files/{task.key}/{mine.token}", results)
         content = _content(task, ran, fetched_s, time.monotonic() - started, files)
-        if publish(results, mine, content) and settings.store is not None:
+        is_ours = publish(results, mine, content)
+        discard(results, mine, is_ours=is_ours)
+        if is_ours and settings.store is not None:
             try:
                 note_result(settings.store, task.key, content, settings.by)
             except BarsightError as error:  # the driver writes what is missing

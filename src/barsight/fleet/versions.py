@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import json
+import socket
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path, PurePosixPath
@@ -23,6 +25,8 @@ FLAGS = {
 """Names, without their suffixes, under which a version's files are kept in the results; what names them to
 `barsight measure`.
 """
+_FILES = "files.json"
+_FILES_SCHEMA = {"type": "object", "additionalProperties": {"type": "string"}}
 LIBRARIES = ("numpy", "scipy", "numba", "opencv-contrib-python-headless")
 
 
@@ -34,6 +38,15 @@ def installed_software() -> str:
     sources = sources_digest(Path(barsight.__file__).parent)
     found = json_digest([sources, [metadata.version(name) for name in LIBRARIES]])
     return f"{barsight.__version__}+{found[:12]}"
+
+
+def expect_software(wanted: str) -> None:
+    """Raise ConfigError where this machine would measure with other software."""
+    if installed_software() != wanted:
+        raise ConfigError(
+            f"{socket.gethostname()}: has Barsight {installed_software()}, not {wanted}; install the same on "
+            "all machines and plan or begin again"
+        )
 
 
 @dataclass(frozen=True)
@@ -58,12 +71,16 @@ class Version:
 
 @dataclass(frozen=True)
 class FleetTask:
-    """A recording to be measured under a version."""
+    """A recording to be measured under a version. manifest: digest of its files, which tells it from others
+    wherever it lies; archive: URL of where that is.
+    """
 
     key: str
     name: str
     passes: tuple[str, ...]
     version: Version
+    manifest: str
+    archive: str
     size: int = 0
     pairs: int = 0
 
@@ -88,23 +105,42 @@ def publish_version(
         "software": installed_software(),
     }
     version = Version(json_digest(given)[:16], **given, rig="" if rig is None else f"rig{rig.suffix}")
+    files = {}
     for name, path in {"config": config, "rig": rig, "magnet": magnet, **named}.items():
         if path is not None:
             data = read_bytes(path, MAX_DOCUMENT_BYTES)
+            files[f"{name}{path.suffix}"] = hashlib.sha256(data).hexdigest()
             results.write(f"versions/{version.name}/{name}{path.suffix}", data)
+    results.write(f"versions/{version.name}/{_FILES}", json.dumps(files).encode())
     return version
 
 
 def arguments(results: Objects, version: Version, folder: Path) -> list[str]:
-    """Copy a version's files into a folder and return the arguments of `barsight measure` that name them."""
+    """Copy a version's files into a folder and return the arguments of `barsight measure` that name them.
+
+    Raises ConfigError where the results don't hold them as they were planned.
+    """
     words: list[str] = []
-    for one in results.list(f"versions/{version.name}"):
-        name = PurePosixPath(one.path)
-        data = results.read(one.path)
-        if name.stem in FLAGS and data is not None:
-            (folder / name.name).write_bytes(data)
-            words += [FLAGS[name.stem], str(folder / name.name)]
+    prefix = f"versions/{version.name}"
+    for name, digest in _version_files(results, version).items():
+        data = results.read(f"{prefix}/{name}")
+        if data is None or hashlib.sha256(data).hexdigest() != digest:
+            raise ConfigError(f"{results.url}/{prefix}/{name}: is not as it was planned; plan again")
+        (folder / name).write_bytes(data)
+        words += [FLAGS[PurePosixPath(name).stem], str(folder / name)]
     return words
+
+
+def _version_files(results: Objects, version: Version) -> dict[str, str]:
+    """Read the names and digests of a version's files. Raises ConfigError where the results don't know it."""
+    files: dict[str, str] | None = results.read_json(f"versions/{version.name}/{_FILES}", _FILES_SCHEMA)
+    if files is None:
+        raise ConfigError(
+            f"{results.url}: version {version.name} was planned for other results; name those, or plan again"
+        )
+    if any(PurePosixPath(name).name != name or PurePosixPath(name).stem not in FLAGS for name in files):
+        raise ConfigError(f"{results.url}/versions/{version.name}/{_FILES}: is torn; plan again")
+    return files
 
 
 def _by_content(value: Any) -> Any:

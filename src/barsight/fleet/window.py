@@ -27,6 +27,11 @@ class RunWindow:
             for text in self.between:
                 _clock(text)
 
+    @property
+    def is_limited(self) -> bool:
+        """Tell whether it may ever be closed."""
+        return self.between is not None or self.idle
+
     def is_open(self, now: datetime | None = None, busy_ratio: float | None = None) -> bool:
         """Check the clock and the machine's load. busy_ratio: share of the cores at work, or None."""
         if self.between is not None:

@@ -127,7 +127,15 @@ FLEET_TASKS = Table(
     "fleet_tasks", METADATA, _key(), Column("key", Text, nullable=False, unique=True),
     *_texts("version", "archive", "recording", "passes"), *_stamps("bytes", "pairs", "at_ns"),
 )  # fmt: skip
-"""Recordings planned under a version. key: of `fleet.versions.Version.key`; passes: JSON."""
+"""Recordings planned under a version. key: of `fleet.versions.Version.key`; passes: JSON; archive, recording:
+where it was found first.
+"""
+
+FLEET_PLACES = Table(
+    "fleet_places", METADATA, _key(), Column("key", Text, nullable=False, index=True),
+    *_texts("manifest", "archive", "recording"), *_stamps("at_ns"),
+)  # fmt: skip
+"""Where a task's recording was found; the newest row of a key counts. manifest: digest of its files."""
 
 FLEET_RESULTS = Table(
     "fleet_results", METADATA, _key(), Column("key", Text, nullable=False, unique=True),

@@ -39,26 +39,24 @@ def over_seeds(
         return
     with extra("fleet"):
         from barsight.fleet.cluster import connect, run_all
+        from barsight.fleet.versions import installed_software
     left = set(seeds)
+    shared = (run, given, installed_software())
     with connect(workers, scheduler, threads=max(1, (os.cpu_count() or 1) // workers)) as client:
         for _ in range(TRIES):
-            for ended in run_all(client, _one_seed, sorted(left), (run, given)):
-                if ended is None:
-                    continue
-                seed, result = ended
-                if isinstance(result, Exception):
-                    raise result
-                left.discard(seed)
-                yield seed, result
+            for ended in run_all(client, _one_seed, sorted(left), shared):
+                if ended is not None:
+                    left.discard(ended[0])
+                    yield ended
             if not left:
                 return
     raise MeasurementError(f"seeds {', '.join(map(str, sorted(left)))}: their workers died {TRIES} times")
 
 
-def _one_seed(seed: int, given: tuple[Callable[[int, Any], T], Any]) -> tuple[int, T | Exception]:
-    """Run one seed on a worker; what it raises is returned, as a worker that died raises too."""
-    run, shared = given
-    try:
-        return seed, run(seed, shared)
-    except Exception as error:
-        return seed, error
+def _one_seed(seed: int, shared: tuple[Callable[[int, Any], T], Any, str]) -> tuple[int, T]:
+    """Run one seed on a worker, which must have the software that asks."""
+    from barsight.fleet.versions import expect_software
+
+    run, given, software = shared
+    expect_software(software)
+    return seed, run(seed, given)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +13,7 @@ import tyro
 from barsight.cli.arguments import call
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
+from barsight.core.errors import MeasurementError
 from barsight.core.extras import extra
 from barsight.core.files import atomic_directory
 from barsight.core.json_values import json_value
@@ -29,7 +31,7 @@ def run(arguments: Sequence[str]) -> None:
         store: str = DEFAULT_URL,
     ) -> None:
         """Compare two versions over the archive: bundles moved beyond sigma, vetoes that appeared or
-        vanished, intervals, times. Writes comparison.json and comparison.html.
+        vanished, intervals, times. Writes comparison.json, comparison.html and its pictures.
 
         Many figures are looked at together: told is what Holm's rule leaves at 5 % for any false one.
 
@@ -41,35 +43,34 @@ def run(arguments: Sequence[str]) -> None:
             store: SQLAlchemy's URL of the database.
         """
         with extra("fleet"):
-            from barsight.fleet.comparing import compare_recording
-            from barsight.fleet.comparison_page import comparison_page
+            from barsight.fleet.comparing import compare_tasks
+            from barsight.fleet.comparison_page import comparison_page, copy_pictures
             from barsight.fleet.findings import judge
             from barsight.fleet.objects import open_objects
             from barsight.fleet.records import find_version, read_tasks
         target = open_objects(results)
         with open_store(store) as opened, opened.reading() as connection:
             versions = [find_version(connection, name) for name in (before, after)]
-            keys = [{t.name: t.key for t in read_tasks(connection, one)} for one in versions]
-        compared, untold = [], sorted(keys[0].keys() ^ keys[1].keys())
-        both = sorted(keys[0].keys() & keys[1].keys())
+            planned = [read_tasks(connection, one) for one in versions]
         with stages(SafeConsole(stderr=True)) as advance:
-            for number, name in enumerate(both):
-                one = compare_recording(target, name, keys[0][name], keys[1][name])
-                if one is None:
-                    untold.append(name)
-                else:
-                    compared.append(one)
-                advance("compare", number + 1, len(both))
+            compared, untold = compare_tasks(target, planned[0], planned[1], partial(advance, "compare"))
+        if not compared:
+            raise MeasurementError(
+                f"versions {versions[0].name} and {versions[1].name}: no recording is measured under both; "
+                "run both first"
+            )
         findings = judge(versions[0].name, versions[1].name, compared, untold)
         with atomic_directory(out) as staging:
             text = json.dumps(json_value(findings), indent=1, allow_nan=False)
             (staging / "comparison.json").write_text(text + "\n", encoding="utf-8")
-            (staging / "comparison.html").write_text(comparison_page(findings), encoding="utf-8")
+            pictures = copy_pictures(target, findings, staging)
+            (staging / "comparison.html").write_text(comparison_page(findings, pictures), encoding="utf-8")
         shifts = ", ".join(f"{s.figure} {s.shift:+.4f}" for s in findings.shifts if s.is_found) or "none"
         console = SafeConsole()
         console.print(
             f"{len(compared)} recordings: {len(findings.beyond)} figures of bundles beyond sigma, shifts of "
-            f"the archive: {shifts}, {sum(bool(one.vetoes) for one in compared)} with other vetoes",
+            f"the archive: {shifts}, {sum(bool(one.vetoes) for one in compared)} with other vetoes"
+            + (f", {len(untold)} not compared" if untold else ""),
             highlight=False, soft_wrap=True,
         )  # fmt: skip
         console.print(f"page: {out / 'comparison.html'}", highlight=False, soft_wrap=True, markup=False)

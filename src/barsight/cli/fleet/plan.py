@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import tyro
 
 from barsight.cli.arguments import call, load_settings
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
+from barsight.core.errors import ConfigError
 from barsight.core.extras import extra
 from barsight.measure_settings import MeasureSettings
 from barsight.store.audit import user_name
@@ -22,8 +25,7 @@ def run(arguments: Sequence[str]) -> None:
     def command(
         archive: tyro.conf.Positional[str], results: str, store: str = DEFAULT_URL,
         config: Path | None = None, rig: Path | None = None, magnet: Path | None = None,
-        limit: int | None = None, workers: int = 1,
-        by: str | None = None,
+        limit: int | None = None, workers: int = 1, by: str | None = None,
     ) -> None:  # fmt: skip
         """Find an archive's recordings and plan their measurement; says what is new, done and parked, and
         estimates hours and gigabytes. Nothing is measured.
@@ -47,32 +49,35 @@ def run(arguments: Sequence[str]) -> None:
             from barsight.fleet.planning import estimate, plan_tasks
             from barsight.fleet.records import note_plan, seconds_by_size
             from barsight.fleet.versions import publish_version
+        for flag, value in {"workers": workers, "limit": limit}.items():
+            if value is not None and value < 1:
+                raise ConfigError(f"--{flag} {value}: give 1 or more")
         settings = load_settings(config, MeasureSettings)
         source, target = open_objects(archive), open_objects(results, create=True)
         version = publish_version(target, settings, config, rig, magnet)
-        console = SafeConsole()
         with stages(SafeConsole(stderr=True)) as advance:
-            tasks = plan_tasks(source, target, version, limit, lambda n, all_: advance("read", n, all_))
+            tasks = plan_tasks(source, target, version, limit, partial(advance, "read"))
         with open_store(store, create=True) as opened:
-            new = note_plan(opened, tasks, source.url, by or user_name())
+            new = note_plan(opened, tasks, by or user_name())
             with opened.reading() as connection:
                 measured = seconds_by_size(connection)
-        done, parked = published_keys(target), parked_keys(target)
-        left = [task for task in tasks if task.key not in done | parked]
-        told = estimate(left, measured)
-        counts = {"done": done, "parked": parked}
-        words = ", ".join(f"{sum(t.key in keys for t in tasks)} {name}" for name, keys in counts.items())
-        console.print(
-            f"version {version.name}: {len(tasks)} recordings, {new} new in the plan, {words}, "
-            f"{len(left)} to do",
-            highlight=False, soft_wrap=True,
-        )  # fmt: skip
-        basis = f"by {told.known} measured" if told.known else "roughly: none was measured yet"
-        console.print(
-            f"about {told.seconds / 3600 / workers:.2f} h with {workers} workers, "
-            f"{told.fetched_bytes / 1e9:.2f} GB to fetch, {told.written_bytes / 1e9:.2f} GB"
-            f" to write ({basis})",
-            highlight=False, soft_wrap=True,
-        )  # fmt: skip
+        ended = {"done": published_keys(target), "parked": parked_keys(target)}
+        left = [task for task in tasks if not any(task.key in keys for keys in ended.values())]
+        words = [f"{new} new in the plan", f"{len(left)} to do"]
+        words[1:1] = [f"{sum(t.key in keys for t in tasks)} {name}" for name, keys in ended.items()]
+        _tell(f"version {version.name}: {len(tasks)} recordings, {', '.join(words)}")
+        _tell_work(estimate(left, measured), workers)
 
     call(command, "fleet plan", arguments)
+
+
+def _tell_work(told: Any, workers: int) -> None:
+    basis = f"by {told.known} measured" if told.known else "roughly: none was measured yet"
+    _tell(
+        f"about {told.seconds / 3600 / workers:.2f} h with {workers} workers, "
+        f"{told.fetched_bytes / 1e9:.2f} GB to fetch, {told.written_bytes / 1e9:.2f} GB to write ({basis})"
+    )
+
+
+def _tell(line: str) -> None:
+    SafeConsole().print(line, highlight=False, soft_wrap=True, markup=False)

@@ -13,11 +13,11 @@ from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError
 from barsight.fleet.cluster import connect
-from barsight.fleet.driver import count_states, drive
-from barsight.fleet.ledger import forgive
+from barsight.fleet.driver import count_states, drive, open_tasks
+from barsight.fleet.ledger import forgive, parked_keys
 from barsight.fleet.objects import open_objects
 from barsight.fleet.planning import TaskChoice
-from barsight.fleet.records import find_version, read_archive, read_tasks
+from barsight.fleet.records import find_version, read_tasks
 from barsight.fleet.task import TaskLimits, TaskSettings
 from barsight.fleet.window import RunWindow
 from barsight.store.audit import user_name
@@ -51,27 +51,27 @@ def run(arguments: Sequence[str]) -> None:
         """
         if workers < 1:
             raise ConfigError(f"--workers {workers}: give 1 or more")
-        target = open_objects(results, create=True)
+        target = open_objects(results)
         with open_store(store) as opened:
             with opened.reading() as connection:
                 chosen = find_version(connection, choice.version)
-                tasks = choice.of(read_tasks(connection, chosen))
-                archive = read_archive(connection, chosen)
+                planned = read_tasks(connection, chosen)
             if choice.again:
-                for task in tasks:
-                    forgive(target, task.key)
+                for key in parked_keys(target) & {task.key for task in planned}:
+                    forgive(target, key)
+            who = by or user_name()
+            tasks = choice.of(open_tasks(opened, target, planned, who))
             # Workers of other machines can't write into this machine's file.
             is_reached = scheduler is None or not store.startswith("sqlite")
-            settings = TaskSettings(
-                archive, target.url, store if is_reached else None, limits, by or user_name()
-            )  # fmt: skip
+            settings = TaskSettings(target.url, store if is_reached else None, limits, who)
             with connect(workers, scheduler) as client, stages(SafeConsole(stderr=True)) as advance:
-                told = partial(advance, "measure")
-                drive(client, tasks, settings, opened, target, window, told)
-            counts = count_states(target, tasks)
+                drive(client, tasks, settings, opened, target, window, partial(advance, "measure"))
+            counts, now = count_states(target, planned), count_states(target, tasks)
         SafeConsole().print(
-            f"version {chosen.name}: {counts.published} published, {counts.parked} parked of {len(tasks)}",
-            highlight=False,
-        )
+            f"version {chosen.name}: {now.published} published and {now.parked} parked now; of "
+            f"{len(planned)} recordings {counts.published} are published, {counts.parked} parked, "
+            f"{counts.running + counts.left} left",
+            highlight=False, soft_wrap=True,
+        )  # fmt: skip
 
     call(command, "fleet run", arguments)
