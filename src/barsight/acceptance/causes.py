@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2 as chi_square
@@ -22,8 +22,10 @@ SPHERE_PX, SPHERE_MM = 0.012, 0.5
 """The same of a sphere's: pixels round its cap; rendered ones scatter by 0.6 mm there."""
 PLACE_PX, PLACE_MM = 0.2, 1.0
 """The same across, in pixels on the ground."""
-FALSE_NAMES = 0.002
+FALSE_NAMES = 0.01
 """Chance that a healthy rig has a cause named, over all that are tried together."""
+ALIKE = 4.0
+"""Another cause that explains the errors by so much less chi-square only, two sigma, isn't told from it."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,7 @@ UNKNOWNS = (
 @dataclass(frozen=True)
 class Cause:
     """A cause of errors: value and sigma in `unit`; chi2: by how much it explains them better than an
-    ordinary rig.
+    ordinary rig. alike: others that explain them nearly as well.
     """
 
     name: str
@@ -61,6 +63,12 @@ class Cause:
     sigma: float
     unit: str
     chi2: float
+    alike: tuple[str, ...] = ()
+
+    @property
+    def words(self) -> str:
+        """Name it, with those that it isn't told from."""
+        return " or ".join((self.name, *self.alike))
 
 
 def name_causes(
@@ -110,10 +118,12 @@ def _best_cause(rows: Sequence[_Row]) -> Cause | None:
     # One chance of a false name for all that are tried, whatever each leaves free.
     best: Cause | None = None
     rarest = float(np.log(FALSE_NAMES / (len(UNKNOWNS) - 1 + len(names))))
+    gains = {}
     for k, one in enumerate(UNKNOWNS[:-1]):
         prior = 1 / ordinary**2
         prior[k] = 0.0
         chi2, value, sigma = _solved(design, error, prior)
+        gains[one.name] = healthy - chi2
         rare = float(chi_square.logsf(healthy - chi2, 1))
         if rare < rarest:
             told = one.scale * float(value[k]), one.scale * float(sigma[k])
@@ -127,7 +137,10 @@ def _best_cause(rows: Sequence[_Row]) -> Cause | None:
             sigma_mm = max(1e3 * row.sigma for row in rows if row.artefact == name)
             told = float(max(off, key=abs)), sigma_mm
             best, rarest = Cause(f"{name} stands elsewhere", *told, "mm", healthy - chi2), rare
-    return best
+    if best is None or best.name not in gains:
+        return best
+    alike = (name for name, gain in gains.items() if name != best.name and gain > best.chi2 - ALIKE)
+    return replace(best, alike=tuple(alike))
 
 
 def _solved(design: Float64, error: Float64, prior: Float64) -> tuple[float, Float64, Float64]:

@@ -183,9 +183,9 @@ def touched_offset(certificate: Path) -> MagnetOffset:
         raise InputError(certificate, f"is torn ({type(error).__name__}: {error})", OTHER) from error
     told_by = [_mean_touch_m(certificate, axis, touches.get(axis, []), own_m) for axis in "xyz"]
     (x, x_sigma), (y, y_sigma), (z, z_sigma) = told_by
-    most_m = max(abs(x), abs(y), abs(z))
-    if most_m > MAX_OFFSET_M:
-        problem = f"the magnet hangs {1e3 * most_m:.0f} mm off: that is the rig's lever arm"
+    max_m = max(abs(x), abs(y), abs(z))
+    if max_m > MAX_OFFSET_M:
+        problem = f"the magnet hangs {1e3 * max_m:.0f} mm off: that is the rig's lever arm"
         raise InputError(certificate, problem, "correct p_crane_body in crane0/sensor.yaml and accept again")
     return MagnetOffset(x, y, z, x_sigma, y_sigma, z_sigma, *ids)
 

@@ -129,7 +129,7 @@ def _offset(magnet: Path | None) -> MagnetOffset | None:
 def why_refused(found: Acceptance) -> str:
     """Say in one line what is wrong: the causes, else the quantities."""
     if found.causes:
-        return ", ".join(f"{one.name} ({one.value:+.3g} {one.unit})" for one in found.causes)
+        return ", ".join(f"{one.words} ({one.value:+.3g} {one.unit})" for one in found.causes)
     bad = [q for q in found.quantities if q.decision is not Decision.PASSED]
     said = [f"{q.name} {q.decision}" for q in bad[:3]] + ([f"{len(bad) - 3} more"] if len(bad) > 3 else [])
     return ", ".join(said) or "the crane's travel contradicts the rig"
@@ -148,7 +148,7 @@ def print_acceptance(found: Acceptance) -> None:
     console = SafeConsole()
     console.print(table)
     for one in found.causes:
-        console.print(f"cause: {one.name}, {one.value:+.3g} ± {one.sigma:.2g} {one.unit}", highlight=False)
+        console.print(f"cause: {one.words}, {one.value:+.3g} ± {one.sigma:.2g} {one.unit}", highlight=False)
 
 
 def _make_plan(files: tuple[Path, ...], out: Path) -> None:

@@ -89,7 +89,7 @@ def guided_steps(folder: Path, settings: CommissionSettings) -> tuple[GuidedStep
 
 @dataclass(frozen=True)
 class _Way:
-    """What each step does in the folder; each returns its result in words."""
+    """Steps as they are done in the folder; each returns its result in words."""
 
     folder: Path
     settings: CommissionSettings

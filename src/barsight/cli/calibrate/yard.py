@@ -67,10 +67,9 @@ def run(arguments: Sequence[str]) -> None:
             tags: A .csv of AprilTags 36h11 as surveyed (tag,yard_x,yard_y,yard_z of the middle in m;
                 optionally sigma_m and check), which are found in the recording's pictures. The frame is that
                 in which measure maps this recording, and the file is bound to its rig and crane.
-            girder_y_m: With --tags: the trolley's readings at both ends of the girder, the lower first. How
-                the crane bends is then calibrated too; bridge and trolley must travel in the recording.
-            rails_x_m: With --girder-y-m: the bridge's readings at both ends of the rails, which then may lie
-                lower or higher in the middle.
+            girder_y_m: With --tags: the trolley's readings at the girder's ends, the lower first. How the crane
+                bends is calibrated too; bridge and trolley must travel in the recording.
+            rails_x_m: With --girder-y-m: the bridge's readings at the ends of rails that may bend.
             sigma_m: One coordinate's error of a target, survey and measurement together, or of a tag's survey
                 alone, where no sigma_m column says it.
             reading: How to read the recording.
@@ -78,16 +77,13 @@ def run(arguments: Sequence[str]) -> None:
         expect_output(out, ".yaml", ".yml")
         if not 0 < sigma_m < 10:
             raise ConfigError(f"--sigma-m {sigma_m:g} can't be; give metres")
-        console = SafeConsole(stderr=True)
-        hangs = None
-        if tags is not None and (source.suffix.lower() == ".csv" or measured is not None or frame != "world"):
-            raise ConfigError(
-                "--tags takes a recording, and says the frame: leave out --frame and --measured"
-            )
+        console, hangs, is_list = SafeConsole(stderr=True), None, source.suffix.lower() == ".csv"
+        if tags is not None and (is_list or measured is not None or frame != "world"):
+            raise ConfigError("--tags takes a recording and says the frame: leave out --frame, --measured")
         bend = _begun_bend(girder_y_m, rails_x_m, has_tags=tags is not None)
         if tags is not None:
             found, owners, bend = calibrate_by_tags(source, tags, sigma_m, reading, bend, console)
-        elif source.suffix.lower() == ".csv":
+        elif is_list:
             owners = {} if measured is None else _measured_owners(measured)
             if owners:
                 frame = "world" if owners["mounting_id"] is None else "encoders"
@@ -101,8 +97,7 @@ def run(arguments: Sequence[str]) -> None:
             write_yard_file(path, found, hangs, owners, bend)
             write_yard_report(found, verdict, str(source), html, data)
         _print(found, verdict, out, console)
-        if bend is not None:
-            print_bend(bend, console)
+        print_bend(bend, console)
 
     call(command, "calibrate yard", arguments)
 

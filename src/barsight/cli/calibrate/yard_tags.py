@@ -119,7 +119,7 @@ def _bent(
     for number in range(2):
         if number:  # a tag that several places of the trolley saw agrees with itself only now
             placed = places(bend.values)
-        kept = np.isfinite(_at(placed)).all(axis=1) & np.isfinite(slopes).all(axis=(1, 2))
+        kept: Bool = np.isfinite(np.column_stack([_at(placed), slopes.reshape(len(slopes), -1)])).all(axis=1)
         tags, yard_m, checks, survey = _kept(path, listed, placed, kept, sigma_m, told)
         found = calibrate_bent_yard(
             tuple(f"tag {one.number}" for one in tags), _at(tags), slopes[kept], yard_m,
@@ -202,8 +202,10 @@ def _print(
         console.print(f"[yellow]{escape(told)}[/yellow]", soft_wrap=True, highlight=False)
 
 
-def print_bend(bend: CraneBend, console: Console) -> None:
-    """Print how the crane bends."""
+def print_bend(bend: CraneBend | None, console: Console) -> None:
+    """Print how the crane bends, where it was calibrated."""
+    if bend is None:
+        return
     words = (("girder's deflection", "mm"), ("girder out of square", "mm/m"), ("rails' depth", "mm"))
     for (what, unit), value, sigma, is_fitted in zip(
         words, bend.values, bend.sigma, bend.fitted, strict=True
