@@ -10,6 +10,7 @@ import pytest
 from barsight.acceptance.certificate import read_certificate
 from barsight.acceptance.commissioning import SETTINGS, CommissionSettings, GuidedStep, begin, read_done, walk
 from barsight.acceptance.layout import Area, lay_out
+from barsight.acceptance.watch import read_watch
 from barsight.artefacts.plan import AcceptancePlan, plan_text
 from barsight.calibration.files.rig_file import write_rig_file
 from barsight.cli.acceptance.commission import guided_steps
@@ -162,5 +163,14 @@ def test_the_whole_way_from_a_drawn_crane_to_the_certificate(
         "cameras", "travel", "yard frame", "empty yard", "plan"
     ]  # fmt: skip
     assert certificate["magnet_offset"] is None and certificate["yard_frame_id"]
+    watched = ["--record", str(tmp_path / "watch.json"), "--plan", str(crane / "plan.toml")]
+    hung = ["--rig", str(crane / "rig.yaml"), "--yard", str(crane / "yard.yaml")]
+    assert run(["verify", str(crane / "artefacts" / "first"), *watched, *hung]) == 0
+    (told,) = read_watch(tmp_path / "watch.json").surveys
+    features = {one.name: abs(one.value) for one in told.figures if one.name.endswith("/ mm")}
+    assert sorted(features) == [
+        "height of plates / mm", "place of spheres along x / mm", "place of spheres along y / mm"
+    ]  # fmt: skip
+    assert max(features.values()) < 4
     before = (crane / "certificate.json").read_bytes()
     assert run(["commission", str(crane)]) == 0 and (crane / "certificate.json").read_bytes() == before

@@ -67,8 +67,8 @@ def run(arguments: Sequence[str]) -> None:
             tags: A .csv of AprilTags 36h11 as surveyed (tag,yard_x,yard_y,yard_z of the middle in m;
                 optionally sigma_m and check), which are found in the recording's pictures. The frame is that
                 in which measure maps this recording, and the file is bound to its rig and crane.
-            girder_y_m: With --tags: the trolley's readings at the girder's ends, the lower first. How the crane
-                bends is calibrated too; bridge and trolley must travel in the recording.
+            girder_y_m: With --tags: the trolley's readings at the girder's ends, the lower first. How the
+                crane bends is calibrated too; bridge and trolley must travel in the recording.
             rails_x_m: With --girder-y-m: the bridge's readings at the ends of rails that may bend.
             sigma_m: One coordinate's error of a target, survey and measurement together, or of a tag's survey
                 alone, where no sigma_m column says it.
