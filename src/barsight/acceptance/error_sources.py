@@ -74,7 +74,7 @@ def measured_load(
             "temperature of the rig", ("baseline",), np.array([[change**2]]),
             f"up to {temperature_k:g} K of aluminium", "rectangular",
         ),
-        *_fit_sources(bundle, heights),
+        *fit_sources(bundle, heights),
     ]  # fmt: skip
     frame, origin = _frame_source(summary, assumed)
     sources += frame
@@ -105,7 +105,8 @@ def _chosen(folder: Path, number: int | None) -> Bundle:
     return max(bundles, key=lambda one: (not any(one.ends_open), one.confidence))
 
 
-def _fit_sources(bundle: Bundle, heights: YardMap) -> list[ErrorSource]:
+def fit_sources(bundle: Bundle, heights: YardMap) -> list[ErrorSource]:
+    """Take what matching, travel and fit leave open of a bundle, as its file and the map say."""
     row = round((bundle.centre_m[1] - heights.y0_m) / heights.cell_m)
     column = round((bundle.centre_m[0] - heights.x0_m) / heights.cell_m)
     part = heights.part(

@@ -119,7 +119,8 @@ def _bent(
     for number in range(2):
         if number:  # a tag that several places of the trolley saw agrees with itself only now
             placed = places(bend.values)
-        kept: Bool = np.isfinite(np.column_stack([_at(placed), slopes.reshape(len(slopes), -1)])).all(axis=1)
+        known = np.column_stack([_at(placed), slopes.reshape(len(slopes), -1)])
+        kept: Bool = np.all(np.isfinite(known), axis=1)
         tags, yard_m, checks, survey = _kept(path, listed, placed, kept, sigma_m, told)
         found = calibrate_bent_yard(
             tuple(f"tag {one.number}" for one in tags), _at(tags), slopes[kept], yard_m,
