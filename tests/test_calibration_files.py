@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from barsight.calibration.files.euroc import read_imu, read_rig, write_imu_description, write_rig
 from barsight.calibration.files.kalibr import read_camchain, read_imu_file, write_camchain, write_imu_file
+from barsight.calibration.files.opencv import read_opencv_rig, write_opencv_rig
 from barsight.calibration.files.yaml_document import canonical_pose, read_document
 from barsight.calibration.geometry.camera import Camera, Distortion
 from barsight.calibration.geometry.imu_noise import ImuNoise
@@ -179,6 +180,30 @@ def test_swapped_cameras_are_named(tmp_path: Path) -> None:
     values["cam0"], values["cam1"] = values["cam1"], values["cam0"]
     with pytest.raises(CalibrationError, match="left and right are swapped"):
         read_camchain(written(tmp_path, values))
+
+
+@pytest.mark.parametrize("data", ["[ 1., !!binary ???, 3. ]", "!!binary |", '"$base64$AAAA"'])
+def test_opencv_isnt_given_base64(tmp_path: Path, data: str) -> None:
+    """Its reader of 4.14 doesn't end on the first two."""
+    path = tmp_path / "a.yaml"
+    path.write_text(
+        f"%YAML:1.0\n---\nM1: !!opencv-matrix\n   rows: 1\n   cols: 3\n   dt: d\n   data: {data}\n"
+    )
+    with pytest.raises(CalibrationError, match="base64"):
+        read_opencv_rig(path)
+
+
+@pytest.mark.parametrize("list_items", ["-" * 100_000, "- " * 100_000, "-\t" * 100_000])
+def test_opencv_isnt_given_lists_in_lists(tmp_path: Path, list_items: str) -> None:
+    """Its reader overflows the stack; a rule of dashes in a comment is none."""
+    path = tmp_path / "a.yaml"
+    camera = Camera(64, 48, 50.0, 50.0, 32.0, 24.0, Distortion.RADTAN, (-0.1, 0.0, 0.0, 0.0))
+    write_opencv_rig(path, rig(camera, [0.1, -0.2, 0.3], [0.0, -0.1, 0.2]))
+    path.write_text(path.read_text().replace("---\n", f"---\n# {'-' * 100}\n", 1))
+    read_opencv_rig(path)
+    path.write_text(path.read_text().replace("rows: 3", f"rows: {list_items}", 1))
+    with pytest.raises(CalibrationError, match="brackets"):
+        read_opencv_rig(path)
 
 
 def test_yaml_as_it_is_in_the_wild(tmp_path: Path) -> None:

@@ -81,6 +81,10 @@ def test_names_too_long(recording: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert "too long" in capsys.readouterr().err
     assert run(["measure", str(recording), "-o", str(long), *FAST]) == 4
     assert "too long" in capsys.readouterr().err
+    named = recording.parent / "long.toml"
+    named.write_text(f'recording.rig = "{"a" * 300}.yaml"\n')
+    assert run(["measure", str(recording), "-o", str(recording.parent / "out"), "--config", str(named)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
 
 
 @pytest.mark.parametrize(

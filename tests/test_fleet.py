@@ -33,6 +33,7 @@ from barsight.fleet.ledger import HeldRecording, claim, held, publish, published
 from barsight.fleet.limits import LimitedRun, run_limited
 from barsight.fleet.objects import Objects, open_objects
 from barsight.fleet.planning import TaskChoice, estimate, plan_tasks
+from barsight.fleet.promoting import _fetch
 from barsight.fleet.records import note_plan, noted_keys
 from barsight.fleet.scratch import _machine, scratch_folder, scratch_root, sweep
 from barsight.fleet.task import run_task
@@ -253,6 +254,26 @@ def test_a_promoted_version_hides_the_other_survey_of_its_recording(tmp_path: Pa
         assert seen() == ["live1", "live2"]
         with store.reading() as connection:
             assert promoted_version(connection) == "" and isinstance(verify_chain(connection), AuditChain)
+
+
+@pytest.mark.parametrize("now", [b"other", b"longer than it was", b""])
+def test_only_what_was_published_is_promoted(tmp_path: Path, now: bytes) -> None:
+    results = open_objects(str(tmp_path / "r"), create=True)
+    told = {"bytes": 5, "sha256": hashlib.sha256(b"first").hexdigest()}
+    note = {
+        "key": "k", "token": "t", "measured_s": 1, "whole_s": 1, "peak_bytes": 1, "files": {"a.json": told},
+    }  # fmt: skip
+    results.write("results/k/result.json", json.dumps(note).encode())
+    (tmp_path / "r/files/k/t").mkdir(parents=True)
+    for content in (b"first", now):
+        (tmp_path / "r/files/k/t/a.json").write_bytes(content)
+        if content == b"first":
+            _fetch(results, "k", tmp_path / "out")
+            assert (tmp_path / "out/a.json").read_bytes() == b"first"
+        else:
+            with pytest.raises(InputError, match=r"a\.json: was changed after it was published"):
+                _fetch(results, "k", tmp_path / "again")
+            assert not (tmp_path / "again").exists()
 
 
 def test_sizes_are_looked_at_before_anything_is_read(tmp_path: Path) -> None:

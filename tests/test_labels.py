@@ -13,9 +13,10 @@ from barsight.calibration.geometry.rig import StereoRig
 from barsight.cli.main import run
 from barsight.core.pose import Pose
 from barsight.labels.attachment import PlacedCode, contradictions, merge_codes
-from barsight.labels.bundle_labels import bundle_label
+from barsight.labels.bundle_labels import bundle_label, unread_label
 from barsight.labels.code_reading import read_codes
 from barsight.labels.placing import pose_at
+from barsight.labels.plates import find_plates
 from barsight.recording.open import open_recording
 from barsight.result_folder import read_heights, read_path
 from barsight.simulation.lighting import bake, hall_lamps
@@ -26,9 +27,9 @@ from barsight.simulation.simulate import simulate
 from barsight.simulation.textures import label_codes, label_text, surface_tile
 from barsight.simulation.truth import label_rows
 from barsight.yard.inventory.stock_list import ListedBundle, contradicted_bundles, match_stock
-from barsight.yard.types import BundleLabel
+from barsight.yard.types import BundleLabel, HeightMap
 from cli_runs import FAST
-from lift_yards import laid, record
+from lift_yards import laid, map_of, record
 
 zxingcpp = pytest.importorskip("zxingcpp")
 
@@ -216,7 +217,7 @@ def test_measure_reads_labels_and_holds_the_stock_list_against_them(tmp_path: Pa
     read = {
         one["label"]["text"]: one
         for one in measured_bundles(recording, tmp_path / "out")["bundles"]
-        if one["label"]
+        if one["label"] and one["label"]["text"]
     }
     assert read and set(read) <= set(truth)
     for text, one in read.items():
@@ -284,3 +285,54 @@ def test_drawn_codes_are_read_off_the_render() -> None:
     assert (found.text, found.kind) == (label_text(12, 2), "QRCode") == ("000120002", "QRCode")
     np.testing.assert_allclose(found.middle_px, [159.5, 127.5], atol=3)
     assert label_rows(scene, 12) == [{"text": "000120002", "center": [0.0, 0.0, 0.5]}]
+
+
+def shining(shape: tuple[int, int], level: float) -> np.ndarray:
+    """Bars along the first axis whose level varies across them and a little along, two dark straps."""
+    rng = np.random.default_rng(8)
+    gray = level * (0.6 + 0.4 * np.sin(0.9 * np.arange(shape[1])) ** 2) * np.exp(rng.normal(0, 0.05, shape))
+    gray[200:203] = gray[500:503] = 25.0
+    return gray
+
+
+def yard_with(gray: np.ndarray, heights: HeightMap) -> HeightMap:
+    return replace(heights, gray=np.clip(gray, 1, 255).astype(np.uint8))
+
+
+def paper(heights: HeightMap, gray: np.ndarray, half_m: tuple[float, float], is_code: bool = True) -> None:
+    """Lay white paper over x = 0.3 m, y = 0.7 m; in its middle a code's dark and white, blurred."""
+    along, across = np.abs(heights.y_m - 0.7), np.abs(heights.x_m - 0.3)
+    gray[np.ix_(along <= half_m[1], across <= half_m[0])] = 250.0
+    if is_code:
+        inner = np.ix_(along <= 0.026, across <= 0.026)
+        gray[inner] = 150.0 + np.random.default_rng(3).normal(0, 25, gray[inner].shape)
+
+
+@pytest.mark.parametrize("level", [90.0, 160.0, 300.0])
+def test_a_plate_of_a_labels_size_is_an_illegible_label(level: float) -> None:
+    """Bars from dark to shining as white as the paper."""
+    bundle, heights = record(laid(0.3)), map_of([laid(0.3)])
+    gray = shining(heights.shape, level)
+    assert unread_label(bundle, yard_with(gray, heights), (0.1, 0.06)) is None
+    paper(heights, gray, (0.03, 0.05))
+    seen = yard_with(gray, heights)
+    (first, *_) = find_plates(bundle, seen, (0.1, 0.06))
+    np.testing.assert_allclose(first, [0.3, 0.7], atol=0.02)
+    assert unread_label(bundle, seen, (0.1, 0.06)) == BundleLabel(None, "illegible", 0, 0.0)
+    assert unread_label(bundle, seen, (0.0, 0.0)) is None
+    assert not find_plates(bundle, seen, (0.3, 0.2)), "labels of another size are looked for"
+
+
+def test_what_is_longer_or_stands_up_is_no_label() -> None:
+    bundle, heights = record(laid(0.3)), map_of([laid(0.3)])
+    gray = shining(heights.shape, 90.0)
+    long, block = gray.copy(), gray.copy()
+    paper(heights, long, (0.03, 0.4), is_code=False)
+    assert not find_plates(bundle, yard_with(long, heights), (0.1, 0.06)), "a gleam along a bar"
+    paper(heights, block, (0.03, 0.05), is_code=False)
+    assert find_plates(bundle, yard_with(block, heights), (0.1, 0.06))
+    on_it = np.ix_(np.abs(heights.y_m - 0.7) <= 0.05, np.abs(heights.x_m - 0.3) <= 0.03)
+    raised = heights.z_m.copy()
+    raised[on_it] += 0.05
+    stood = replace(yard_with(block, heights), z_m=raised)
+    assert not find_plates(bundle, stood, (0.1, 0.06)), "a block of wood"

@@ -17,6 +17,7 @@ from barsight.registration.pass_ties import PassPrior, tie_passes
 from barsight.result_folder import changed_inputs, read_heights
 from barsight.simulation.passes import simulate_passes
 from barsight.simulation.settings import CameraSettings, PassesSettings, YardSettings
+from barsight.simulation.simulate import simulate
 from cli_runs import TINY
 
 CELL_M = 0.01
@@ -111,10 +112,10 @@ def history() -> PlaceHistory:
     one = PlaceHistory((0.0, 0.0), (160, 120), 0.05)
     z, sigma = np.zeros((160, 120), np.float32), np.full((160, 120), 0.005, np.float32)
     z[60:130, 40:60] = 0.3
-    one.add(0, z, sigma)
+    one.add(0, z, sigma, 0)
     later = np.zeros((160, 120), np.float32)
     later[:90] = np.nan
-    one.add(1, later, sigma)
+    one.add(1, later, sigma, 1)
     return one
 
 
@@ -125,6 +126,20 @@ def test_a_change_is_told_once_with_place_and_height() -> None:
     assert change.area_m2 == pytest.approx(2.0)
 
 
+def test_two_pairs_of_one_time_see_no_change_but_both_see_what_changed_before() -> None:
+    """The second pair of a pass finds a change where the first saw nothing; none lies between them."""
+    one, sigma = PlaceHistory((0.0, 0.0), (160, 120), 0.05), np.full((160, 120), 0.005, np.float32)
+    old, left = np.zeros((2, 160, 120), np.float32)
+    old[60:130, 40:60] = 0.3
+    left[:, 30:] = np.nan
+    left[100:120, 5:20] = 0.5  # what the other pair, which saw it at the same time, hasn't
+    for number, (z, since) in enumerate(((old, 0), (left, 1), (np.zeros((160, 120), np.float32), 1))):
+        one.add(number, z, sigma, since)
+    rises = [(change.pass_number, round(change.rise_m, 2)) for change in one.changes]
+    assert rises == [(1, 0.5), (1, -0.3)]
+    assert set(np.unique(one.changed_by)) == {-1, 1} and one.seen_by.max() == 2
+
+
 def test_noise_and_edges_are_no_change() -> None:
     rng, one = np.random.default_rng(5), PlaceHistory((0.0, 0.0), (160, 120), 0.05)
     z = np.zeros((160, 120))
@@ -133,7 +148,7 @@ def test_noise_and_edges_are_no_change() -> None:
     shifted[:, 40] = 0.0  # an edge that one view has 50 mm further in
     for number, seen in enumerate((z, shifted)):
         noisy = (seen + rng.normal(0, 0.008, z.shape)).astype(np.float32)
-        one.add(number, noisy, np.full(z.shape, 0.008, np.float32))
+        one.add(number, noisy, np.full(z.shape, 0.008, np.float32), number)
     assert not one.changes and (one.changed_by == -1).all()
 
 
@@ -264,6 +279,38 @@ def test_a_session_of_two_passes_ends_as_the_batch(passes: tuple[Path, Path], jo
         "passes.tif",
     ):
         assert (yard.folder / name).read_bytes() == (joined.folder / name).read_bytes(), name
+
+
+@pytest.fixture(scope="module")
+def two_pairs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """One pass, seen by two pairs on one body, 2.4 m apart across the travel."""
+    folder = tmp_path_factory.mktemp("pairs")
+    one = replace(PASSES, seed=710011, passes=PassesSettings())
+    for number, across_m in enumerate((-1.2, 1.2)):
+        camera = replace(one.camera, aside_m=across_m)
+        simulate(folder / f"pair_{number}", replace(one, camera=camera))
+    return folder / "pair_0", folder / "pair_1"
+
+
+def test_a_second_pair_on_the_body_sees_further_and_agrees(two_pairs: tuple[Path, Path]) -> None:
+    """Two pairs make one map, as right as one alone, and what stands in both is no change."""
+    alone, both = (bs.measure(given, at="end", map={"cell_m": 0.02}) for given in (two_pairs[:1], two_pairs))
+    assert not both.summary["passes"][1]["changes"] and not both.summary["passes"][0]["changes"]
+    assert {code for code, _ in both.warnings}.isdisjoint(
+        {"passes-contradict", "passes-untied", "yard-changed"}
+    )
+    assert np.all(np.diff(both.trajectory.stamp_ns) >= 0)
+    known, off = [], []
+    for yard in (alone, both):
+        heights = yard.height_map
+        with np.load(two_pairs[0] / "truth/height.npz") as truth:
+            i = np.abs(truth["x"][:, None] - heights.x_m).argmin(axis=0)
+            j = np.abs(truth["y"][:, None] - heights.y_m).argmin(axis=0)
+            error = heights.z_m - truth["z"][np.ix_(i, j)].T
+        known.append(np.isfinite(error).sum())
+        off.append(np.nanmedian(np.abs(error)))
+    assert known[1] > 1.3 * known[0]
+    assert off[1] < off[0] + 0.001
 
 
 def test_a_list_of_one_is_one_recording(whole: Path) -> None:

@@ -14,6 +14,8 @@ import pytest
 from barsight.cli.main import run
 from barsight.core.errors import ConfigError
 from barsight.simulation.settings import CameraSettings, SimulationSettings, TravelSettings
+from barsight.simulation.textures import label_text
+from barsight.simulation.truth import label_rows
 from barsight.simulation.worlds.conditions import draw_conditions
 from barsight.simulation.worlds.packing import packed
 from barsight.simulation.worlds.piles import Manner, Upright, pile_up
@@ -196,3 +198,18 @@ def test_simulate_draws_a_world_with_its_truth(tmp_path: Path, capsys: pytest.Ca
     assert len(list((out / "mav0/cam0/data").glob("*.png"))) == world.settings.frames
     assert run(["simulate", str(tmp_path / "no"), "--draw", "3", "--bars", "40mm:19"]) == 2
     assert "bars" in capsys.readouterr().err and not (tmp_path / "no").exists()
+
+
+def test_tags_of_a_drawn_world_bear_codes() -> None:
+    """Labels are as large as asked; nothing else of the world changes."""
+    plain, given = draw_world(21, GIVEN), replace(GIVEN, yard=replace(GIVEN.yard, label_m=(0.1, 0.06)))
+    world = draw_world(21, given)
+    tags = np.flatnonzero(
+        [s.part == "tag" for s in sorted(world.drawn.yard.solids, key=lambda s: not s.is_round)]
+    )
+    assert tags.size > 3
+    shape, old = world.scene.primitives.shape, plain.scene.primitives.shape
+    np.testing.assert_allclose(shape[tags, 12:15], [[0.03, 0.05, 0.0015]] * tags.size)
+    assert np.array_equal(np.delete(shape, tags, axis=0), np.delete(old, tags, axis=0))
+    texts = {row["text"] for row in label_rows(world.scene, 21)}
+    assert texts == {label_text(21, owners(world.drawn.yard)[k] + 1) for k in tags}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -82,7 +81,8 @@ class JoinedPasses:
 
 def in_order(recordings: Sequence[Recording], settings: MeasureSettings) -> tuple[Recording, ...]:
     """Sort passes by time. Raises InputError where they can't be joined: other cameras, mounting or crane, no
-    encoders, or two at the same time.
+    encoders, or two of one pair of cameras at the same time. Two pairs on one body may record at once; a pass
+    by itself is then taken by one of them.
     """
     if len(recordings) == 1:
         return tuple(recordings)
@@ -95,32 +95,47 @@ def in_order(recordings: Sequence[Recording], settings: MeasureSettings) -> tupl
         if not recording.index.stamps_ns:
             raise InputError(recording.path, "no stereo pair at all", "leave it out")
     ordered = sorted(recordings, key=lambda one: one.index.stamps_ns[0])
-    for before, after in pairwise(ordered):
-        if after.index.stamps_ns[0] <= before.index.stamps_ns[-1]:
-            problem = f"it and {before.path.name} were recorded at the same time"
-            raise InputError(after.path, problem, "name each pass once")
-    first = _mounting(ordered[0])
-    for other in ordered[1:]:
-        if _mounting(other) != first:
+    hung, known = _hung(ordered[0]), set[str]()
+    for group in _at_once(ordered):
+        pairs = [json_digest(json_value(one.rig)) for one in group]
+        twin = next((k for k, pair in enumerate(pairs) if pair in pairs[:k]), None)
+        if twin is not None:
+            problem = f"it and {group[pairs.index(pairs[twin])].path.name} were recorded at the same time"
+            raise InputError(group[twin].path, problem, "name each pass once")
+        if any(_hung(one) != hung for one in group) or (known and known.isdisjoint(pairs)):
             problem = f"its cameras, or how they hang from the crane, differ from those of {ordered[0].path}"
-            raise InputError(other.path, problem, "measure passes of one rig and crane together")
+            raise InputError(group[0].path, problem, "measure passes of one rig and crane together")
+        known.update(pairs)
     return tuple(ordered)
 
 
-def _mounting(recording: Recording) -> str:
-    """Return a digest of rig and mounting. Raises InputError without encoders."""
+def _at_once(ordered: Sequence[Recording]) -> list[list[Recording]]:
+    """Group recordings of the same time: two pairs on one body make one each."""
+    groups, end_ns = list[list[Recording]](), -1
+    for one in ordered:
+        if groups and one.index.stamps_ns[0] <= end_ns:
+            groups[-1].append(one)
+        else:
+            groups.append([one])
+        end_ns = max(end_ns, one.index.stamps_ns[-1])
+    return groups
+
+
+def _hung(recording: Recording) -> str:
+    """Return a digest of how the body hangs. Raises InputError without encoders."""
     crane = recording.crane()
     if crane is None:
         problem = "it has no crane encoders, which place several passes in one yard"
         raise InputError(recording.path, problem, "measure it by itself")
-    hung = {"lever": crane.crane_to_body_m, "attitude": crane.yard_from_body_nominal}
-    return json_digest(json_value([recording.rig, hung]))
+    return json_digest(json_value({"lever": crane.crane_to_body_m, "attitude": crane.yard_from_body_nominal}))
 
 
 def join_passes(passes: Sequence[MappedPass], surfaces: Sequence[Surface], folder: Path) -> JoinedPasses:
     """Tie passes by their overlaps and join their maps, the oldest first; `folder` takes the surface."""
     ties = tie_passes([_prior(one.way.trajectory) for one in passes], measure_overlaps(surfaces))
-    placed = [PassSurface(*pair) for pair in zip(surfaces, ties.corrections, strict=True)]
+    sizes = [len(group) for group in _at_once([one.probed.source for one in passes])]
+    since = np.repeat(np.cumsum([0, *sizes[:-1]]), sizes).tolist()
+    placed = [PassSurface(*parts) for parts in zip(surfaces, ties.corrections, since, strict=True)]
     joined = join_surfaces(placed, folder)
     free, tops = passes[0].built.free, passes[0].built.tops
     for number, (one, correction) in enumerate(zip(passes, ties.corrections, strict=True)):

@@ -176,12 +176,15 @@ def _remove_pictures(folder: Path) -> None:
 
 
 def _whole(trajectories: Sequence[Trajectory]) -> Trajectory:
-    """Chain the trajectories of passes, the oldest first; what only one of them knows is left to it."""
+    """Chain the trajectories of passes, the oldest first; what only one of them knows is left to it. Of two
+    pairs on one body, the first one's frame of a stamp counts.
+    """
     if len(trajectories) == 1:
         return trajectories[0]
+    frames = {frame.stamp_ns: frame for one in reversed(trajectories) for frame in one.frames}
     return Trajectory(
         trajectories[0].reference,
-        tuple(frame for one in trajectories for frame in one.frames),
+        tuple(frames[stamp_ns] for stamp_ns in sorted(frames)),
         tuple(frame for one in trajectories for frame in one.refused),
         tuple(dict.fromkeys(name for one in trajectories for name in one.sensors)),
     )
@@ -246,7 +249,7 @@ def _bundles(mapped: MappedYard, heights: YardMap) -> tuple[Bundle, ...]:
         return bundles
     with mapped.watch("labels"):
         poses = {frame.stamp_ns: frame.reference_from_body for frame in newest.way.trajectory.frames}
-        return label_bundles(newest.probed.pairs, poses, heights, bundles)
+        return label_bundles(newest.probed.pairs, poses, heights, bundles, settings.labels.size_m)
 
 
 def _input_hashes(passes: Sequence[MappedPass]) -> dict[str, str]:

@@ -14,6 +14,7 @@ from barsight.core.types import RectifiedPair, RefusedFrame
 from barsight.labels.attachment import Label, PlacedCode, merge_codes
 from barsight.labels.code_reading import SeenCode, read_codes
 from barsight.labels.placing import PlacedCamera, first_surface
+from barsight.labels.plates import find_plates
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.yard.sections import part_about
 from barsight.yard.types import Bundle, BundleLabel, YardMap
@@ -24,17 +25,26 @@ _BELOW_M = 1.0
 
 
 def label_bundles(
-    pairs: RectifiedPairs, poses: Mapping[int, Pose], heights: YardMap, bundles: tuple[Bundle, ...]
-) -> tuple[Bundle, ...]:
+    pairs: RectifiedPairs, poses: Mapping[int, Pose], heights: YardMap, bundles: tuple[Bundle, ...],
+    size_m: tuple[float, float],
+) -> tuple[Bundle, ...]:  # fmt: skip
     """Read the codes in the pairs that have a pose, and give each bundle its label.
 
     poses: reference_from_body by stamp. A bundle has a label where one text is sure on it and no other is;
-    where codes are read but aren't sure it is illegible.
+    where codes are read but aren't sure, or only a plate of a label's size (size_m) is seen, it is illegible.
     Raises ConfigError without the extra `labels`.
     """
     found = [code for codes in placed_codes(pairs, poses, heights) for code in codes]
     labels = merge_codes(found, bundles)
-    return tuple(replace(bundle, label=bundle_label(bundle, labels)) for bundle in bundles)
+    return tuple(
+        replace(bundle, label=bundle_label(bundle, labels) or unread_label(bundle, heights, size_m))
+        for bundle in bundles
+    )
+
+
+def unread_label(bundle: Bundle, heights: YardMap, size_m: tuple[float, float]) -> BundleLabel | None:
+    """Say that a bundle's label is illegible where a plate of a label's size is seen on it."""
+    return ILLEGIBLE if min(size_m) > 0 and find_plates(bundle, heights, size_m) else None
 
 
 def placed_codes(

@@ -12,7 +12,7 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import InputError
 from barsight.core.json_values import write_json
 from barsight.labels.attachment import Label, PlacedCode, contradictions, merge_codes
-from barsight.labels.bundle_labels import placed_codes
+from barsight.labels.bundle_labels import ILLEGIBLE, bundle_label, placed_codes, unread_label
 from barsight.labels.placing import pose_at
 from barsight.recording.base import Recording
 from barsight.recording.rectified_pairs import RectifiedPairs
@@ -26,20 +26,25 @@ FILE = "labels.json"
 
 @dataclass(frozen=True, eq=False)
 class ReadLabels:
-    """The labels of a yard. pictures: that were read. contradictions: with the stock list, sentences."""
+    """The labels of a yard. pictures: that were read. illegible: ids of bundles whose label is seen and not
+    read for sure. contradictions: with the stock list, sentences.
+    """
 
     map_id: str
     pictures: int
     labels: tuple[Label, ...]
+    illegible: tuple[int, ...]
     contradictions: tuple[str, ...]
 
 
 def read_labels(
-    recording: Recording, folder: Path, listed: tuple[ListedBundle, ...], count: Callable[[], None]
-) -> ReadLabels:
+    recording: Recording, folder: Path, listed: tuple[ListedBundle, ...], size_m: tuple[float, float],
+    count: Callable[[], None],
+) -> ReadLabels:  # fmt: skip
     """Read the labels in a recording's pictures onto the map that `folder` holds.
 
-    count: called after each pair. Raises InputError where the folder is not of this recording or has no
+    size_m: of a label, see `LabelSettings`. count: called after each pair.
+    Raises InputError where the folder is not of this recording or has no
     trajectory, ConfigError without the extra `labels`.
     """
     said, _ = open_folder(folder)
@@ -59,7 +64,11 @@ def read_labels(
         codes += found
         pictures += 2
     labels = merge_codes(codes, bundles)
-    return ReadLabels(said["map_id"], pictures, labels, contradictions(labels, bundles, listed))
+    illegible = tuple(
+        bundle.id for bundle in bundles
+        if (bundle_label(bundle, labels) or unread_label(bundle, heights, size_m)) == ILLEGIBLE
+    )  # fmt: skip
+    return ReadLabels(said["map_id"], pictures, labels, illegible, contradictions(labels, bundles, listed))
 
 
 def write_labels(found: ReadLabels, folder: Path) -> Path:
@@ -78,6 +87,7 @@ def write_labels(found: ReadLabels, folder: Path) -> Path:
             }
             for one in found.labels
         ],
+        "illegible": list(found.illegible),
         "contradictions": list(found.contradictions),
     }  # fmt: skip
     target = folder / FILE

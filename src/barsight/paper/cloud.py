@@ -107,8 +107,12 @@ def stitched_pair(clouds: list[tuple[Float64, Pose]]) -> tuple[PaperPicture, ...
     before = [start.apply(points) for points, _ in clouds]
     after = [pose.apply(points) for points, pose in clouds]
     return (
-        _two_colours(before, "Before: both clouds as if taken from the first place"),
-        _two_colours(after, "After: each where the paper's stitching has it; white is where both are"),
+        _two_colours(
+            before, "Before: the first view red, the second blue-green, as if both were taken from one place"
+        ),
+        _two_colours(
+            after, "After: each where the paper's stitching has it; gray to white, by height, where both are"
+        ),
     )
 
 
@@ -131,10 +135,14 @@ def _two_colours(clouds: list[Float64], caption: str) -> PaperPicture:
 def map_picture(out: Path, caption: str) -> PaperPicture:
     """Paint a measured folder's map from above [paper Figure 11]."""
     raster = read_raster(out / "height.tif")
-    painted = paint_height(raster, *robust_range(raster.z_m, 1, 99))[..., :3].copy()
+    low, high = robust_range(raster.z_m, 1, 99)
+    painted = paint_height(raster, low, high)[..., :3].copy()
     painted[~np.isfinite(raster.z_m)] = 25
     scale = 2 * WIDTH_PX / painted.shape[1]
-    return picture_of(cv2.resize(painted, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), caption)
+    small = cv2.resize(painted, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return picture_of(
+        small, f"{caption}: violet {low:.2f} m to yellow {high:.2f} m, dark where nothing was seen"
+    )
 
 
 def _filtered(laser: LaserProfile) -> Contour:

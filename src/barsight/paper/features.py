@@ -51,7 +51,8 @@ class TwoViews:
 @dataclass(frozen=True, eq=False)
 class FilteredMatches:
     """One detector on two views. places, target, expected: (N, 2) px, the last by the trend (NaN unknown);
-    initial, on_plane, kept: (N,); detect_ms, total_ms: times; true_before, true_after: % (NaN: no truth).
+    initial, on_plane, kept: (N,); detect_ms, total_ms: times; true_before, true_plane, true_after: %, true of
+    what each leaves; kept_true: % of the true ones that are left at the end (NaN: no truth).
     """
 
     detector: str
@@ -64,7 +65,9 @@ class FilteredMatches:
     detect_ms: float
     total_ms: float
     true_before: float
+    true_plane: float
     true_after: float
+    kept_true: float
 
 
 def two_views(recording: Recording) -> TwoViews:
@@ -167,18 +170,26 @@ def _match(views: TwoViews, name: DetectorName) -> FilteredMatches:
         moved = project_stereo(points @ rotation.T + translation, camera)[:, :2]
         expected = np.where(known[:, None], moved, np.nan)
     total = time.perf_counter() - begin
-    shares = [_true_pct(views, places, target, chosen) for chosen in (initial, kept)]
+    shares = _true_shares(views, places, target, (initial, plane, kept))
     return FilteredMatches(
-        name, places, target, expected, initial, plane, kept, 1e3 * detect, 1e3 * total, shares[0], shares[1]
+        name, places, target, expected, initial, plane, kept, 1e3 * detect, 1e3 * total, *shares
     )
 
 
-def _true_pct(views: TwoViews, places: Float64, target: Float64, chosen: Bool) -> float:
-    if views.reproject is None or not chosen.any():
-        return float("nan")
-    off = np.linalg.norm(target - views.reproject(places), axis=1)[chosen]
-    known = off[np.isfinite(off)]
-    return 100 * float((known < TRUE_PX).mean()) if known.size else float("nan")
+def _true_shares(
+    views: TwoViews, places: Float64, target: Float64, chosen: tuple[Bool, Bool, Bool]
+) -> tuple[float, float, float, float]:
+    """Compute the true ones' share of each choice, and that of the first one's true ones left in the last."""
+    if views.reproject is None:
+        return (np.nan,) * 4
+    off = np.linalg.norm(target - views.reproject(places), axis=1)
+    true, known = off < TRUE_PX, np.isfinite(off)
+    before, plane, after = (_pct(true[one & known]) for one in chosen)
+    return before, plane, after, _pct(chosen[2][chosen[0] & true])
+
+
+def _pct(flags: Bool) -> float:
+    return 100 * float(flags.mean()) if flags.size else float("nan")
 
 
 def draw_features(views: TwoViews, row: FilteredMatches, where: str) -> PaperPicture:

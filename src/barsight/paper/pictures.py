@@ -17,16 +17,18 @@ WIDTH_PX = 560
 
 @dataclass(frozen=True)
 class PaperPicture:
-    """A picture of a figure: its data URI and a line below it."""
+    """A picture of a figure: its data URI and a line below it. is_wide: it takes the page's whole width."""
 
     uri: str
     caption: str
+    is_wide: bool = False
 
 
 def picture_of(canvas: UInt8, caption: str) -> PaperPicture:
-    """Encode a picture (H, W, 3) for the page."""
+    """Encode a picture (H, W, 3) for the page; one broader than `WIDTH_PX` takes its whole width."""
     opaque = np.full((*canvas.shape[:2], 1), 255, np.uint8)
-    return PaperPicture(data_uri(np.dstack([canvas, opaque]), lossless=False), caption)
+    uri = data_uri(np.dstack([canvas, opaque]), lossless=False)
+    return PaperPicture(uri, caption, canvas.shape[1] > WIDTH_PX)
 
 
 def draw_lines(canvas: UInt8, old: Float64, new: Float64, kept: Bool, colour: Colour) -> None:
@@ -47,7 +49,7 @@ def heat_picture(values: Float32, caption: str, span: tuple[float, float] | None
 
 
 def line_picture(
-    lines: list[tuple[Float64, Float64, Colour]], axes: tuple[str, str], caption: str, *, dots: bool = False
+    lines: list[tuple[Float64, Float64, Colour]], axes: tuple[str, str], caption: str
 ) -> PaperPicture:
     """Plot lines (x, y, colour) over one pair of axes; their ends are written beside them."""
     width, height, edge = 2 * WIDTH_PX, 320, 46
@@ -62,14 +64,9 @@ def line_picture(
     for x, y, colour in lines:
         known = np.isfinite(y)
         u, v = edge + (x - left) * across, height - edge - (np.where(known, y, 0) - low) * up
-        for k in range(len(x)):
-            here = (round(float(u[k])), round(float(v[k])))
-            if dots and known[k]:
-                cv2.circle(canvas, here, 3, colour, -1, cv2.LINE_AA)
-            elif k and known[k] and known[k - 1]:
-                cv2.line(
-                    canvas, (round(float(u[k - 1])), round(float(v[k - 1]))), here, colour, 1, cv2.LINE_AA
-                )
+        at = np.round(16 * np.column_stack([u, v])).astype(np.int32)
+        for k in np.flatnonzero(known[1:] & known[:-1]).tolist():
+            cv2.line(canvas, at[k].tolist(), at[k + 1].tolist(), colour, 1, cv2.LINE_AA, 4)
     for text, place in (
         (f"{left:.2f}", (edge, height - 14)), (f"{right:.2f} {axes[0]}", (width - 3 * edge, height - 14)),
         (f"{low:.2f}", (2, height - edge)), (f"{high:.2f} {axes[1]}", (2, edge - 14)),

@@ -83,19 +83,19 @@ EQUATIONS = (
         "stereo.baselines.paper:iterate_bilateral stereo.baselines.bilateral_filter:bilateral_update",
         "C(x, y, d) = min(eta L, (d - D)^2), filtered bilaterally, again and again",
         "Literally there. It smooths D and adds no evidence from the pictures; ours goes back to them.",
-        "barsight disparity LEFT RIGHT --stereo.method paper",
+        "barsight disparity LEFT RIGHT --method paper",
     ),
     _equation(
         6,
         "features.matching:hamming_distances features.matching:nearest_neighbours",
         "H(A, B): the bits in which two descriptors differ",
-        "The same; --motion.stitching.hamming sets the most bits that a match may differ in.",
+        "The same; --stitching.hamming sets the most bits that a match may differ in.",
         ODOMETRY,
     ),
     _equation(
         7,
         "features.matching:homography_inliers motion.frame_to_frame.stitching:PaperStitching",
-        "one homography by RANSAC",
+        "E_s: the least sum of squared distances of x', y' from H x, y: one homography by RANSAC",
         "Literally there. It is one plane's: true matches off it are lost, so "
         "ours checks matches against a motion in 3D.",
         "barsight bench matching R",
@@ -126,16 +126,28 @@ EQUATIONS = (
         12,
         f"{_TREND}.predict features.matching:motion_inliers",
         "F(t + dt) = f(R, V, P) F(t)",
-        "A match further than --motion.stitching.trend-px from where R, V, P take it is left out; stereo "
+        "A match further than --stitching.trend-px from where R, V, P take it is left out; stereo "
         "and IMU suffice.",
         ODOMETRY,
     ),
-    _equation(13, _RIGID, "e_i = p_i - (R q_i + t)", "The same, with each point's covariance.", ODOMETRY),
+    _equation(
+        13,
+        _RIGID,
+        "e_i = p_i - (R q_i + t)",
+        "The same; each point's covariance counts where one is given, which the paper's stitching does not.",
+        ODOMETRY,
+    ),
     _equation(14, _RIGID, "E = min 1/2 sum |e_i|^2", "The same.", ODOMETRY),
-    _equation(15, _RIGID, "p' = mean of p", "The same, weighted.", ODOMETRY),
-    _equation(16, _RIGID, "q' = mean of q", "The same, weighted.", ODOMETRY),
+    _equation(15, _RIGID, "p' = mean of p", "The same; weighted where covariances are given.", ODOMETRY),
+    _equation(16, _RIGID, "q' = mean of q", "The same; weighted where covariances are given.", ODOMETRY),
     _equation(17, _RIGID, "E in three parts", "The same; the last part is zero once centred.", ODOMETRY),
-    _equation(18, _RIGID, "E_R = -tr(R sum q'' p''^T)", "The same.", ODOMETRY),
+    _equation(
+        18,
+        _RIGID,
+        "E_R = 1/2 sum |p'' - R q''|^2 = -tr(R sum q'' p''^T)",
+        "The same, but for the terms without R, which the printed equation leaves out.",
+        ODOMETRY,
+    ),
     _equation(19, _SVD, "W = sum q'' p''^T = U S V^T", "The same.", ODOMETRY),
     _equation(
         20,
@@ -166,13 +178,13 @@ FIGURES = (
         "paper.surface:loop_pictures stereo.baselines.paper:iterate_bilateral",
         "The loop: D0, cost space, bilateral filter, sub-pixel, again.",
         "D0 and the disparity after the loop; the shares of whole disparities stand under them.",
-        "barsight disparity LEFT RIGHT --stereo.method paper",
+        "barsight disparity LEFT RIGHT --method paper",
     ),
     _figure(
         3,
         "paper.surface:relief_pictures",
         "3D at whole pixels has layers; below the pixel it is smooth.",
-        "The same view's 3D from whole disparities, by the paper's loop and by our stereo.",
+        "The same view's 3D, lit aslant, from whole disparities, by the paper's loop and by our stereo.",
     ),
     _figure(
         4,
@@ -192,7 +204,7 @@ FIGURES = (
         6,
         "motion.frame_to_frame.stitching:StitchedPoses",
         "IMU and cameras hold each other.",
-        "Gyro and accelerometer predict; the pictures' pose corrects the velocity.",
+        "Gyro and accelerometer predict; the pictures' pose corrects the velocity. What each part is off by:",
         ODOMETRY,
     ),
     _figure(
@@ -278,7 +290,7 @@ CONCLUSIONS = (
         1,
         ("pipeline:map_yard",),
         "Stereo and IMU give the stack in 3D.",
-        "Confirmed: the paper's method stitches the drawn yard without encoders; its drift is below.",
+        "The paper's method runs on stereo and IMU alone; ours beside it, without encoders and with.",
         ODOMETRY,
     ),
     PaperEntry(
@@ -286,7 +298,7 @@ CONCLUSIONS = (
         2,
         ("paper.surface:relief_pictures",),
         "Sub-pixel matching smooths the surface.",
-        "Smooth it is; Figure 3 says how near to truth, which smoothness alone doesn't.",
+        "Smooth isn't yet near to truth; Figure 3 shows both.",
         "barsight bench subpixel",
     ),
     PaperEntry(
@@ -294,7 +306,7 @@ CONCLUSIONS = (
         3,
         ("motion.frame_to_frame.motion_trend:MotionTrend",),
         "The motion trend removes mismatches.",
-        "Table 3 says how many of the matches are true before and after.",
+        "The homography comes first: what is left to the trend is the step between the two.",
         "barsight bench matching R",
     ),
     PaperEntry(
@@ -302,7 +314,7 @@ CONCLUSIONS = (
         4,
         ("paper.cloud:contour_scores",),
         "Accuracy and speed meet the field's demand.",
-        "Table 4: the whole pipeline's rate, not the camera's, and errors against truth.",
+        "Table 4 has the whole pipeline's rate, not the camera's, and errors against laser and truth.",
         "barsight bench yard",
     ),
     PaperEntry(
@@ -310,7 +322,7 @@ CONCLUSIONS = (
         5,
         ("pipeline:find_lifts",),
         "It is a foundation for automatic lifting.",
-        "Ours goes on to bundles and lifts, each refused where a check isn't met.",
+        "Ours goes on to bundles and, for a magnet, to lifts; each is refused where a check isn't met.",
         "barsight lifts OUT --magnet MAGNET",
     ),
 )

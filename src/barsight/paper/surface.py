@@ -78,25 +78,41 @@ def whole_pct(disparity: Float32) -> float:
     return 100 * float((np.abs(known - np.round(known)) < 0.1).mean()) if known.size else float("nan")
 
 
-def relief_pictures(
-    pair: RectifiedPair, disparities: dict[str, Float32], true_m: Float64 | None
-) -> tuple[PaperPicture, ...]:
-    """Paint the view's relief from whole disparities, the paper's and ours [paper Figure 3].
-
-    true_m: true depth (H, W) of the rectified view where it is known: the median error stands below.
-    """
+def depth_maps(pair: RectifiedPair, disparities: dict[str, Float32]) -> dict[str, Float64]:
+    """Compute depth (H, W) from whole disparities, the paper's and ours, m; NaN where not matched."""
     shown = {"whole disparities": np.round(disparities["paper"])}
     shown |= {"paper, below the pixel": disparities["paper"], "ours": disparities["ours"]}
+    camera = pair.camera
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return {
+            label: camera.focal_px * camera.baseline_m / (disparity.astype(np.float64) + camera.doffs_px)
+            for label, disparity in shown.items()
+        }
+
+
+def depth_errors_mm(depths: dict[str, Float64], true_m: Float64 | None) -> dict[str, float]:
+    """Compute each map's median depth error, mm, where all know it; NaN without true depth (H, W)."""
+    if true_m is None:
+        return dict.fromkeys(depths, float("nan"))
+    off = {label: 1e3 * np.abs(depth - true_m) for label, depth in depths.items()}
+    known = np.logical_and.reduce([np.isfinite(one) for one in off.values()])
+    return {
+        label: float(np.median(one[known])) if known.any() else float("nan") for label, one in off.items()
+    }
+
+
+def relief_pictures(
+    pair: RectifiedPair, depths: dict[str, Float64], errors_mm: dict[str, float]
+) -> tuple[PaperPicture, ...]:
+    """Paint the view's relief from whole disparities, the paper's and ours [paper Figure 3], lit aslant; the
+    median depth error stands below where it is known.
+    """
     made = []
-    for label, disparity in shown.items():
-        camera = pair.camera
-        with np.errstate(divide="ignore", invalid="ignore"):
-            depth = camera.focal_px * camera.baseline_m / (disparity + camera.doffs_px)
-        cell = float(np.nanmedian(depth)) / camera.focal_px
+    for label, depth in depths.items():
+        cell = float(np.nanmedian(depth)) / pair.camera.focal_px
         relief = hillshade((-depth).astype(np.float32), cell)
         relief[~np.isfinite(depth)] = np.nan
-        note = ""
-        if true_m is not None:
-            note = f"; median depth error {1e3 * float(np.nanmedian(np.abs(depth - true_m))):.0f} mm"
+        error = errors_mm[label]
+        note = f"; median depth error {error:.0f} mm" if np.isfinite(error) else ""
         made.append(heat_picture(relief, label + note, (0.2, 1.4)))
     return tuple(made)

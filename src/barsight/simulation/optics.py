@@ -38,7 +38,9 @@ def mount_rig(settings: SimulationSettings, rng: np.random.Generator) -> Mounted
         rng = np.random.default_rng(camera.rig_seed)
     spread = np.radians(camera.misalignment_deg)
     crooked = Rotation.from_rotvec(rng.normal(0, 2 * spread, 3)).as_matrix()
-    body_from_cam0 = Pose("body", "cam0", _BODY_FROM_CAM @ crooked, np.array([0.06, -0.09, 0.04]))
+    body_from_cam0 = Pose(
+        "body", "cam0", _BODY_FROM_CAM @ crooked, np.array([0.06 - camera.aside_m, -0.09, 0.04])
+    )
     turned = Rotation.from_rotvec(rng.normal(0, spread, 3)).as_matrix()
     offset = np.array([0.0, *rng.normal(0, 0.001, 2)])
     offset[0] = np.sqrt(camera.baseline_m**2 - offset @ offset)

@@ -69,6 +69,9 @@ class CameraSettings:
     """Height of the body over the floor."""
     trolley_y_m: float = 0.15
     """Place of the body across the travel."""
+    aside_m: float = 0.0
+    """Place of both cameras in the body, across the travel: a second pair on the same body is a recording of
+    its own, all else alike."""
     heading_deg: float = 4.0
     """Turn of the rig about the vertical: 0 has the baseline along the travel."""
     tilt_deg: float = 0.0
@@ -89,6 +92,7 @@ class CameraSettings:
     def __post_init__(self) -> None:
         expect_ranges(
             self, "camera.", width_px=(64, 8192), height_px=(64, 8192), baseline_m=(0.01, 3),
+            aside_m=(-20, 20),
             samples_per_side=(1, 4), vignetting=(0, UNDER_1), misalignment_deg=(0, 2), tilt_deg=(-30, 30),
             shot_noise_dn=NOT_NEGATIVE, read_noise_dn=NOT_NEGATIVE, psf_sigma_px=NOT_NEGATIVE,
         )  # fmt: skip

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from barsight.core.settings.values import expect_ranges
+
 
 @dataclass(frozen=True)
 class LabelSettings:
@@ -12,3 +14,9 @@ class LabelSettings:
     read: bool = False
     """Read them in the pictures (extra `labels`; a tenth of a second a picture), attach them to the bundles
     and hold them against the stock list."""
+    size_m: tuple[float, float] = (0.1, 0.06)
+    """Length and width of a label: a bright plate of this size on a bundle that no picture reads is called
+    illegible; 0 0 looks for none."""
+
+    def __post_init__(self) -> None:
+        expect_ranges(self, "labels.", size_m=(0, 0.6))

@@ -28,6 +28,7 @@ KEYS = {
     "R": ("R",), "T": ("T",),
 }  # fmt: skip
 LONGEST_BASELINE_M = 20.0
+BASE64 = re.compile(r"!!\s*binary|type_id\s*=\s*[\"']binary|\$base64\$")
 ORIGINAL = "take the calibration's original file"
 
 
@@ -89,6 +90,8 @@ def _matrices(path: Path) -> dict[str, Float64]:
     text = read_text(path, MAX_SETTINGS_BYTES, ORIGINAL, CalibrationError)
     if _depth(text) > MAX_DEPTH:
         raise CalibrationError(path, f"brackets in brackets over {MAX_DEPTH} deep", ORIGINAL)
+    if BASE64.search(text):
+        raise CalibrationError(path, "holds base64, whose reader may not end", "write its numbers as text")
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         root = storage.root()
@@ -119,7 +122,8 @@ def _depth(text: str) -> int:
     """Compute how deep brackets, tags and lists in one line stand in each other at most; OpenCV's parser goes
     down into each and overflows its stack.
     """
-    depth, deepest = 0, max((len(run[0]) // 2 for run in re.finditer(r"(?:- )+", text)), default=0)
+    spoken = re.sub(r"#.*", "", text)
+    depth, deepest = 0, max((run[0].count("-") for run in re.finditer(r"(?:-[ \t]*)+", spoken)), default=0)
     for sign in re.finditer(r"[\[{\]}]|</|/>|<\w", text):
         depth += -1 if sign[0] in ("]", "}", "</", "/>") else 1
         deepest = max(deepest, depth)

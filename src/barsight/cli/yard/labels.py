@@ -18,6 +18,7 @@ from barsight.labels.reading import ReadLabels, read_labels, write_labels
 from barsight.recording.base import RecordingSettings
 from barsight.recording.open import open_recording
 from barsight.yard.inventory.stock_list import read_stock
+from barsight.yard.label_settings import LabelSettings
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -27,6 +28,7 @@ def run(arguments: Sequence[str]) -> None:
         recording: tyro.conf.Positional[Path],
         out: tyro.conf.Positional[Path],
         stock_list: Path | None = None,
+        label_m: tuple[float, float] = LabelSettings().size_m,
         reading: tyro.conf.OmitArgPrefixes[RecordingSettings] = RecordingSettings(),  # noqa: B008
     ) -> None:
         """Read the codes on bundles' labels in a recording's pictures, and attach them to the bundles of its
@@ -41,6 +43,8 @@ def run(arguments: Sequence[str]) -> None:
             recording: The recording that OUT was measured from.
             out: A folder written by barsight measure; labels.json goes into it.
             stock_list: CSV or JSON as bundles.stock_list takes it: labels that contradict it are named.
+            label_m: Length and width of a label: a bright plate of this size on a bundle that no picture
+                reads is called illegible; 0 0 looks for none.
             reading: How to read the recording.
         """
         listed = () if stock_list is None else read_stock(stock_list)
@@ -48,7 +52,7 @@ def run(arguments: Sequence[str]) -> None:
         total, done = len(source.index.stamps_ns), count(1)
         console = SafeConsole()
         with stages(SafeConsole(stderr=True)) as advance:
-            found = read_labels(source, out, listed, lambda: advance("labels", next(done), total))
+            found = read_labels(source, out, listed, label_m, lambda: advance("labels", next(done), total))
         target = write_labels(found, out)
         _print(found, console)
         console.print(f"labels: {target}", soft_wrap=True, highlight=False, markup=False)
@@ -64,5 +68,7 @@ def _print(found: ReadLabels, console: SafeConsole) -> None:
         x, y = (f"{value:.2f}" for value in one.place_m[:2])
         table.add_row(escape(one.text), one.kind, x, y, str(one.pictures), bundle, escape(told))
     console.print(table if found.labels else f"no label was read in {found.pictures} pictures")
+    if found.illegible:
+        console.print(f"illegible: the labels on bundles {', '.join(map(str, found.illegible))}")
     for text in found.contradictions:
         console.print(f"[yellow]{escape(text)}[/yellow]", soft_wrap=True, highlight=False)

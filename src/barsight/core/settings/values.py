@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import os
 import types
 from collections.abc import Mapping
 from dataclasses import MISSING, fields, is_dataclass
@@ -17,6 +18,8 @@ from barsight.core.settings.renamed import refuse_old_keys
 
 Settings = TypeVar("Settings")
 MAX_VALUE = 2**31 - 1
+MAX_NAME_BYTES = 255
+"""Of a file's or folder's name, as Linux, macOS and Windows have it."""
 OVER_0, UNDER_1 = math.nextafter(0, 1), math.nextafter(1, 0)
 POSITIVE, NOT_NEGATIVE, SHARE = (OVER_0, math.inf), (0.0, math.inf), (0.0, 1.0)
 """Ranges that `expect_ranges` takes, like (lowest, highest)."""
@@ -134,6 +137,8 @@ def _plain(value: Any, kind: Any, name: str) -> Any:
         raise ConfigError(f"{name} is {value!r}; give {wanted}")
     if kind is int and abs(value) > MAX_VALUE:
         raise ConfigError(f"{name} is over the most, {MAX_VALUE}")
+    if kind is Path and any(len(os.fsencode(part)) > MAX_NAME_BYTES for part in Path(value).parts):
+        raise ConfigError(f"{name} has a file name of more than {MAX_NAME_BYTES} bytes")
     try:
         made = kind(value)
     except OverflowError:

@@ -51,9 +51,12 @@ class PlaceHistory:
         self.seen_by, self.changed_by = (np.full(shape, -1, np.int8) for _ in range(2))
         self.changes: list[HeightChange] = []
 
-    def add(self, number: int, z_m: Float32, sigma_m: Float32) -> None:
-        """Add the heights (rows, columns) of the next pass with their sigma, NaN where it saw none."""
-        rise = z_m - self._z_m
+    def add(self, number: int, z_m: Float32, sigma_m: Float32, since: int) -> None:
+        """Add the heights (rows, columns) of the next pass with their sigma, NaN where it saw none.
+
+        since: number of the first pass of its time: what those saw is no older, so nothing changed between.
+        """
+        rise = np.where(self.seen_by < since, z_m - self._z_m, np.float32(np.nan))
         bound = np.maximum(MIN_CHANGE_M, CHANGE_SIGMAS * np.hypot(sigma_m, self._sigma_m))
         changed = np.zeros(self.shape, np.bool_)
         for way in (1, -1):
@@ -64,10 +67,10 @@ class PlaceHistory:
                 inside = labels[box] == label
                 if inside.sum() * self.place_m**2 >= MIN_AREA_M2:
                     changed[box] |= inside
-                    self.changes.append(self._change(number, box, inside, rise[box][inside]))
+                    self.changes.append(self._change(since, box, inside, rise[box][inside]))
         if changed.any():
             away_m = ndimage.distance_transform_edt(~changed) * self.place_m
-            self.changed_by[away_m <= MARGIN_M] = number
+            self.changed_by[away_m <= MARGIN_M] = since
         seen = np.isfinite(z_m)
         self.seen_by[seen] = number
         self._z_m[seen], self._sigma_m[seen] = z_m[seen], sigma_m[seen]

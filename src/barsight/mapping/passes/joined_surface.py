@@ -30,10 +30,13 @@ _STRIPE_CELLS = 32 * BLOCK_CELLS
 
 @dataclass(frozen=True, eq=False)
 class PassSurface:
-    """The surface of a pass, and the correction that puts it into the common map."""
+    """The surface of a pass, and the correction that puts it into the common map. since: number of the first
+    pass of its time.
+    """
 
     surface: Surface
     correction: PassCorrection
+    since: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +94,7 @@ def join_surfaces(passes: Sequence[PassSurface], folder: Path) -> JoinedSurface:
     corner = (low - 0.5) * cell_m
     history = PlaceHistory((float(corner[0]), float(corner[1])), (rows, columns), cells * cell_m)
     for number, one in enumerate(passes):
-        history.add(number, *_coarse(one, low, (rows, columns), cells))
+        history.add(number, *_coarse(one, low, (rows, columns), cells), one.since)
     figures = {key: _join_tile(passes, key, history, folder) for key in keys}
     return JoinedSurface(gather_surface(folder, cell_m, figures), history)
 

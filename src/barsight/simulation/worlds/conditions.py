@@ -24,7 +24,7 @@ ASIDE_M = 1.3
 
 
 def draw_conditions(seed: int, given: SimulationSettings, *, hides: bool) -> SimulationSettings:
-    """Draw the conditions of a seed; what `given` says of length, frames, pictures and laser stays.
+    """Draw the conditions of a seed; what `given` says of length, frames, pictures, laser and labels stays.
 
     hides: a strip of the yard is to lie out of sight. Raises ConfigError where `given` sets what is drawn.
     """
@@ -43,7 +43,9 @@ def draw_conditions(seed: int, given: SimulationSettings, *, hides: bool) -> Sim
         seed=seed,
         camera=camera,
         yard=YardSettings(
-            bar_length_m=float(rng.uniform(*BAR_LENGTH_M)), texture_ratio=float(rng.uniform(0.35, 0.85))
+            bar_length_m=float(rng.uniform(*BAR_LENGTH_M)),
+            texture_ratio=float(rng.uniform(0.35, 0.85)),
+            label_m=given.yard.label_m,
         ),
         motion=_motion(rng),
         sensors=_sensors(rng, given.sensors),
@@ -56,6 +58,7 @@ def _expect_ordinary(given: SimulationSettings) -> None:
     if given.passes.changes:
         raise ConfigError("simulate: --draw knows no passes.changes; leave one of them out")
     ordinary = SimulationSettings()
+    ordinary = replace(ordinary, yard=replace(ordinary.yard, label_m=given.yard.label_m))
     own = [name for name in DRAWN if getattr(given, name) != getattr(ordinary, name)]
     own += [
         f"camera.{name}"

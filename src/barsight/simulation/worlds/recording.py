@@ -15,6 +15,8 @@ from barsight.simulation.rays import cast_rays
 from barsight.simulation.scene import Scene
 from barsight.simulation.settings import SimulationSettings
 from barsight.simulation.simulate import LaidYard, simulate
+from barsight.simulation.textures import label_codes
+from barsight.simulation.truth import label_rows
 from barsight.simulation.worlds.conditions import draw_conditions
 from barsight.simulation.worlds.solids import SolidYard
 from barsight.simulation.worlds.surfaces import draw_finishes, owners, scene_of
@@ -54,15 +56,19 @@ def draw_world(seed: int, given: SimulationSettings) -> DrawnWorld:
     settings = replace(settings, length_m=length, frames=frames, depth_views=min(given.depth_views, frames))
     rng = np.random.default_rng((29, seed))
     finishes = draw_finishes(drawn.yard.bundles, rng)
-    return DrawnWorld(drawn, finishes, scene_of(drawn.yard, finishes, rng), settings)
+    scene = scene_of(drawn.yard, finishes, rng, settings.yard.label_m)
+    return DrawnWorld(drawn, finishes, scene, settings)
 
 
 def simulate_world(out: Path, world: DrawnWorld, progress: Callable[[int, int], None] | None = None) -> None:
     """Write the recording of a world, with its truth, to the new folder `out`; see `simulate`."""
     rows = bundle_truth(world)
-    truth = {"bundles.json": rows, "world.json": world_truth(world)}
+    laid = LaidYard(world.scene, {"bundles.json": rows, "world.json": world_truth(world)})
+    if max(world.settings.yard.label_m) > 0:
+        truth = {**laid.truth, "labels.json": label_rows(world.scene, world.drawn.seed)}
+        laid = LaidYard(world.scene, truth, label_codes(world.drawn.seed, len(rows)))
     write = simulate_passes if world.settings.passes.trolley_y_m else simulate
-    write(out, world.settings, progress, LaidYard(world.scene, truth))
+    write(out, world.settings, progress, laid)
 
 
 def bundle_truth(world: DrawnWorld) -> list[dict[str, Any]]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from barsight.core.arrays import Float64, Int64
-from barsight.simulation.scene import Primitives, Scene, build_grid
+from barsight.simulation.scene import CODE, Primitives, Scene, build_grid
 from barsight.simulation.worlds.solids import NOTHING, Solid, SolidYard
 
 CELLS_M = (0.09, 0.5)
@@ -48,12 +49,24 @@ def draw_finishes(numbers: tuple[int, ...], rng: np.random.Generator) -> dict[in
     }
 
 
-def scene_of(yard: SolidYard, finishes: dict[int, str], rng: np.random.Generator) -> Scene:
-    """Give the solids surfaces and sort them for the renderer."""
+def scene_of(
+    yard: SolidYard, finishes: dict[int, str], rng: np.random.Generator,
+    label_m: tuple[float, float] = (0.0, 0.0),
+) -> Scene:  # fmt: skip
+    """Give the solids surfaces and sort them for the renderer.
+
+    label_m: length and width of the labels that the tags then are, each with the code of its bundle's number
+    from 1; 0 0 leaves the tags plain and small.
+    """
     looks = {number: _look(FINISHES[name], rng) for number, name in finishes.items()}
     ordered = sorted(yard.solids, key=lambda s: not s.is_round)
+    labels = [k for k, s in enumerate(ordered) if s.part == "tag" and max(label_m) > 0]
+    for k in labels:
+        half = np.array([label_m[1] / 2, label_m[0] / 2, ordered[k].half[2]])
+        ordered[k] = replace(ordered[k], half=half)
     shape = np.array([_shape(s) for s in ordered])
     material = np.array([_material(s, looks, rng) for s in ordered], dtype=np.float32)
+    material[labels, CODE] = [ordered[k].bundle + 1 for k in labels]
     primitives = Primitives(shape, material, sum(s.is_round for s in ordered))
     return Scene(primitives, build_grid(primitives, CELLS_M))
 

@@ -1,0 +1,132 @@
+"""Find labels that no picture can read: bright plates of a label's size on bundles, in the orthophoto."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import chain
+
+import cv2
+import numpy as np
+
+from barsight.core.arrays import Bool, Float32, Float64
+from barsight.yard.sections import part_about
+from barsight.yard.types import Bundle, YardMap
+
+STEP_M = 0.01
+ASIDE_M = 0.05
+"""So far beside a bundle is looked: what goes on there is no label."""
+OPENING_RATIO = 1.7
+"""What is bright over this many lengths of a label along the bars is a bar."""
+CODE_CELLS = 7
+"""A code's dark modules are narrower along the bars."""
+BRIGHTER_LOGS = (0.22, 0.35, 0.5, 0.8)
+"""Logarithms of a plate's level over its bars' before and behind, at one of which it shows its shape."""
+MIDDLE_LOG, USUAL_RATIO = 0.28, 4.6
+"""The same of a plate's middle cell at least, and over what four fifths of the bundle's cells stay below."""
+MIN_SIDE_RATIO, MAX_SIDE_RATIO = (0.6, 0.75), 1.5
+"""A plate's longer and shorter side over a label's."""
+MIN_FULL_RATIO = 0.72
+"""Share of the smallest rectangle around a plate that is bright."""
+WHITE_LEVEL, CODE_LOGS = 200.0, (0.22, 0.35)
+"""Level of the paper before and behind a code, and logarithms of it over the code's level: on a bar that
+shines as the paper does only the code shows."""
+MAX_CODE_LOG, MIN_CODE_RATIO, MAX_CODE_RATIO, MIN_CODE_FULL = 0.7, (0.8, 0.6), 1.3, 0.85
+"""A code is half white: what is darker is a strap. Its sides over the label's shorter one; how full it is."""
+BESIDE_M, MAX_RISE_M = 0.1, 0.015
+"""A plate stands no more over what lies so far before and behind: blocks do."""
+_DARK = 10.0
+"""Level that is added to all: where hardly any light is, ratios tell nothing."""
+
+
+def find_plates(bundle: Bundle, heights: YardMap, size_m: tuple[float, float]) -> list[Float64]:
+    """Find the middles (2,) of bright plates of about size_m on a bundle's top, m, in either direction; none
+    without an orthophoto.
+    """
+    across = np.arange(-bundle.width_m / 2 - ASIDE_M, bundle.width_m / 2 + ASIDE_M, STEP_M)
+    along = np.arange(-bundle.length_m / 2, bundle.length_m / 2 + STEP_M / 2, STEP_M)
+    c, s = np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad)
+    x = bundle.centre_m[0] + c * across - s * along[:, None]
+    y = bundle.centre_m[1] + s * across + c * along[:, None]
+    part = part_about(heights, x.ravel(), y.ravel())
+    if part.gray is None or not part.gray.any():
+        return []
+    rows = np.rint((y - part.y0_m) / part.cell_m).astype(np.int64).clip(0, part.shape[0] - 1)
+    columns = np.rint((x - part.x0_m) / part.cell_m).astype(np.int64).clip(0, part.shape[1] - 1)
+    gray, z_m = part.gray[rows, columns], part.z_m[rows, columns]
+    found = []
+    for cells in (*_plates(gray.astype(np.float32), size_m), *_codes(gray.astype(np.float32), size_m)):
+        middle = tuple(round(float(at.mean())) for at in np.nonzero(cells))
+        if abs(across[middle[1]]) <= bundle.width_m / 2 and abs(_rise(cells, z_m)) <= MAX_RISE_M:
+            found.append(np.array([x[middle], y[middle]]))
+    return found
+
+
+def _plates(gray: Float32, size_m: tuple[float, float]) -> Iterator[Bool]:
+    """Yield the cells of what is bright and of a label's size."""
+    excess = _excess(gray, size_m)
+    limit = max(MIDDLE_LOG, USUAL_RATIO * float(np.quantile(excess, 0.8)))
+    for cells in chain.from_iterable(_blobs(excess > level) for level in BRIGHTER_LOGS):
+        ratio, full = _shape(cells, size_m)
+        fits = (ratio >= MIN_SIDE_RATIO).all() and (ratio <= MAX_SIDE_RATIO).all() and full >= MIN_FULL_RATIO
+        if fits and float(np.median(excess[cells])) >= limit:
+            yield cells
+
+
+def _codes(gray: Float32, size_m: tuple[float, float]) -> Iterator[Bool]:
+    """Yield the cells of what is darker than the white before and behind it, and of a code's size."""
+    level, side = np.log(gray + _DARK), min(size_m)
+    length = round(1.5 * side / STEP_M) | 1
+    white = cv2.morphologyEx(level, cv2.MORPH_CLOSE, np.ones((length, 1), np.uint8))
+    lack = np.where((white > np.log(WHITE_LEVEL)) & (gray > 0), white - level, 0)
+    for cells in chain.from_iterable(_blobs(lack > least) for least in CODE_LOGS):
+        ratio, full = _shape(cells, (side, side))
+        fits = (ratio >= MIN_CODE_RATIO).all() and (ratio <= MAX_CODE_RATIO).all() and full >= MIN_CODE_FULL
+        if fits and float(np.median(lack[cells])) <= MAX_CODE_LOG:
+            yield cells
+
+
+def _excess(gray: Float32, size_m: tuple[float, float]) -> Float32:
+    """Compute the logarithm of levels (V, U) over the bars' own, V along them; 0 where nothing was seen."""
+    level = np.where(gray > 0, np.log(gray + _DARK), np.float32(-1))
+    filled = cv2.morphologyEx(level, cv2.MORPH_CLOSE, np.ones((CODE_CELLS, 1), np.uint8))
+    seen = filled > 0
+    length = round(OPENING_RATIO * max(size_m) / STEP_M) | 1
+    bars = cv2.morphologyEx(
+        np.where(seen, filled, np.float32(np.log(512.0))), cv2.MORPH_OPEN, np.ones((length, 1), np.uint8)
+    )
+    excess: Float32 = np.where(seen, filled - bars, np.float32(0))
+    return excess
+
+
+def _blobs(bright: Bool) -> list[Bool]:
+    mask = bright.astype(np.uint8)
+    for way in (cv2.MORPH_CLOSE, cv2.MORPH_OPEN):
+        mask = cv2.morphologyEx(mask, way, np.ones((3, 3), np.uint8))
+    count, numbers = cv2.connectedComponents(mask)
+    return [numbers == number for number in range(1, count)]
+
+
+def _shape(cells: Bool, size_m: tuple[float, float]) -> tuple[Float64, float]:
+    """Compute the sides of the smallest rectangle around cells over those of size_m, the longer first, and
+    the share of it that they fill.
+    """
+    rows, columns = np.nonzero(cells)
+    _, sides, _ = cv2.minAreaRect(np.stack([columns, rows], axis=1).astype(np.float32))
+    sides_m = (np.sort(sides)[::-1] + 1) * STEP_M
+    full = rows.size * STEP_M**2 / float(np.prod(sides_m))
+    return sides_m / np.sort(size_m)[::-1], full
+
+
+def _rise(cells: Bool, z_m: Float32) -> float:
+    """Compute how far cells stand over the higher of what lies before and behind them; inf where unknown."""
+    i, j = np.nonzero(cells)
+    beside = []
+    for way in (-1, 1):
+        at = i + way * round(BESIDE_M / STEP_M)
+        there = (at >= 0) & (at < len(z_m))
+        level = z_m[at[there], j[there]]
+        beside += [float(np.median(level[np.isfinite(level)]))] if np.isfinite(level).any() else []
+    own = z_m[i, j]
+    if not beside or not np.isfinite(own).any():
+        return np.inf
+    return float(np.median(own[np.isfinite(own)])) - max(beside)
