@@ -8,19 +8,22 @@ import shutil
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from threading import Timer
 from typing import Any
 
 import pytest
+from distributed import LocalCluster
 
 from barsight.cli.bench.seeds import _one_seed, over_seeds
 from barsight.cli.main import run
 from barsight.core.errors import CalibrationError, ConfigError, Failed, InputError
 from barsight.fleet.archive import download, find_recordings, manifest_digest
 from barsight.fleet.cluster import connect, run_all
-from barsight.fleet.driver import drive, open_tasks, parked_reasons
-from barsight.fleet.ledger import HeldRecording, claim, discard, publish
+from barsight.fleet.driver import FleetCounts, count_states, drive, open_tasks, parked_reasons
+from barsight.fleet.ledger import HeldRecording, claim, discard, publish, published_keys
 from barsight.fleet.limits import run_limited, thread_variables
 from barsight.fleet.objects import UnreachableError, open_objects
 from barsight.fleet.planning import TaskChoice, plan_tasks
@@ -34,7 +37,8 @@ from barsight.recording.formats.bag_setup import _find
 from barsight.recording.formats.segments import segments_of
 from barsight.store.audit import AuditChain, verify_chain
 from barsight.store.opening import open_store
-from fleet_rounds import VERSION, make_archive, no_progress, settings
+from fleet_rounds import AZURE, VERSION, azure_server, dask_commands, make_archive, no_progress, settings
+from opcua_servers import free_port
 
 
 def write(folder: Path, *names: str) -> None:
@@ -295,3 +299,79 @@ def test_versions_are_named_by_their_beginning(tmp_path: Path) -> None:
         words = ["fleet", "compare", "ab", "ac", "--results", results.url, "-o", str(tmp_path / "c")]
         assert run([*words, "--store", f"sqlite:///{tmp_path}/s.db"]) == 5
         assert not (tmp_path / "c").exists()
+
+
+@pytest.mark.slow
+def test_azure_keeps_the_promises_that_a_run_rests_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "azurite").mkdir()
+    with azure_server(tmp_path / "azurite") as url:
+        for name, value in {**AZURE, "AZURITE_BLOB_STORAGE_URL": url}.items():
+            monkeypatch.setenv(name, value)
+        here = open_objects(str(make_archive(tmp_path / "a", {"r": "good", "s": "good", "bad": "poison"})))
+        archive, results = (open_objects(f"az://yard/{name}") for name in ("archive", "results"))
+        for one in here.list():
+            archive.upload(tmp_path / "a" / one.path, one.path)
+        with ThreadPoolExecutor(8) as pool:
+            put = [pool.submit(results.write_new, "x/y", bytes([k])) for k in range(8)]
+        assert sum(one.result() for one in put) == 1 and len(results.read("x/y") or b"") == 1
+        assert [one.path for one in results.list_folder("x")] == ["x/y"] and results.read("x/z") is None
+        results.remove("x/y")
+        tasks = plan_tasks(archive, results, VERSION, None, no_progress)
+        shared = settings(tmp_path, results.url)
+        with open_store(f"sqlite:///{tmp_path}/s.db", create=True) as store:
+            with connect(2, None) as client:
+                drive(client, tasks, shared, store, results, RunWindow(), no_progress)
+            with store.reading() as connection:
+                assert noted_keys(connection) == published_keys(results)
+        assert count_states(results, tasks) == FleetCounts(2, 1, 0, 0)
+        assert [task.name for task, _ in parked_reasons(results, tasks)] == ["bad"]
+
+
+@pytest.mark.slow
+def test_an_adaptive_cluster_grows_from_no_worker_and_shrinks_again(tmp_path: Path) -> None:
+    results = open_objects(str(tmp_path / "r"), create=True)
+    archive = open_objects(str(make_archive(tmp_path / "a", {str(k): "good 2" for k in range(8)})))
+    tasks = plan_tasks(archive, results, VERSION, None, no_progress)
+    shared = settings(tmp_path, results.url)
+    with (
+        LocalCluster(n_workers=0, threads_per_worker=1, host="127.0.0.1", dashboard_address=None) as cluster,
+        open_store(f"sqlite:///{tmp_path}/s.db", create=True) as store,
+        connect(1, cluster.scheduler_address) as client,
+    ):
+        cluster.adapt(minimum=0, maximum=2, interval="200ms", wait_count=2, target_duration="1s")
+        drive(client, tasks, shared, store, results, RunWindow(), no_progress)
+        claims = [results.read_json(one.path) for one in results.list("claims/")]
+        assert len(claims) == 8 and len({one["pid"] for one in claims}) >= 2
+        assert count_states(results, tasks) == FleetCounts(8, 0, 0, 0)
+        until = time.monotonic() + 20
+        while client.nthreads() and time.monotonic() < until:
+            time.sleep(0.2)
+        assert not client.nthreads()
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_dies_ends_the_run_by_one_line(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    archive = open_objects(str(make_archive(tmp_path / "a", {"r": "good 30"})))
+    results = open_objects(str(tmp_path / "r"), create=True)
+    tasks = plan_tasks(archive, results, VERSION, None, no_progress)
+    shared, port = settings(tmp_path, results.url), free_port()
+    commands = dask_commands(port, 1).values()
+    cluster = [subprocess.Popen(command, stderr=subprocess.DEVNULL) for command in commands]
+    try:
+        with (
+            open_store(f"sqlite:///{tmp_path}/s.db", create=True) as store,
+            pytest.raises(InputError, match="no scheduler is there any more"),
+            connect(1, f"tcp://127.0.0.1:{port}") as client,
+        ):
+            client.wait_for_workers(1)
+            Timer(3.0, cluster[0].kill).start()
+            drive(client, tasks, shared, store, results, RunWindow(), no_progress)
+    finally:
+        for process in cluster:
+            process.kill()
+            process.wait()
+    assert capfd.readouterr().err == ""
