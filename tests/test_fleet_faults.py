@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import pickle
 import shutil
 import subprocess
@@ -27,7 +26,6 @@ from barsight.fleet.ledger import HeldRecording, claim, discard, publish, publis
 from barsight.fleet.limits import run_limited, thread_variables
 from barsight.fleet.objects import UnreachableError, open_objects
 from barsight.fleet.planning import TaskChoice, plan_tasks
-from barsight.fleet.promoting import _fetch
 from barsight.fleet.records import find_version, note_plan, noted_keys, read_tasks
 from barsight.fleet.task import run_task
 from barsight.fleet.versions import arguments, publish_version
@@ -173,19 +171,6 @@ def test_files_of_tries_that_were_not_published_are_removed(tmp_path: Path) -> N
     assert not publish(results, late, {})
     discard(results, late, is_ours=False)
     assert [one.path for one in results.list("files/")] == ["files/k/mine/result.json"]
-
-
-def test_a_result_that_was_changed_is_not_promoted(tmp_path: Path) -> None:
-    results = open_objects(str(tmp_path / "r"), create=True)
-    results.write("files/k/t/height.tif", b"heights")
-    file = {"bytes": 7, "sha256": hashlib.sha256(b"heights").hexdigest()}
-    assert publish(results, HeldRecording("k", 1, "t"), EMPTY | {"files": {"height.tif": file}})
-    _fetch(results, "k", tmp_path / "into" / "k")
-    assert (tmp_path / "into/k/height.tif").read_bytes() == b"heights"
-    results.write("files/k/t/height.tif", b"lowered")
-    with pytest.raises(InputError, match=r"height\.tif: was changed after it was published"):
-        _fetch(results, "k", tmp_path / "into" / "again")
-    assert not (tmp_path / "into/again").exists()
 
 
 @dataclass(frozen=True)
