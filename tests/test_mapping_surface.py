@@ -191,8 +191,8 @@ def test_the_cloud_agrees_with_the_surface_on_bars(tmp_path: Path) -> None:
 
 
 def test_snapshots_change_nothing_and_stay_as_they_are(tmp_path: Path) -> None:
-    """Views along a way, settled or with a snapshot after each: the last surface has the bytes of one without,
-    tiles left behind are settled, those far behind aren't elected anew, and the first snapshot still shows what it showed."""
+    """Views on a way, settled or with a snapshot after each: the last surface has the bytes of one without:
+    what is left behind is settled and not elected anew, and the first snapshot still shows what it showed."""
     settings = MapSettings(along_m=0.1)
     rng = np.random.default_rng(5)
     views = []

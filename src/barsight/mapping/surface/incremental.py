@@ -85,10 +85,11 @@ class SurfaceElection:
         self._height_m = np.inf
 
     def settle(self, min_views: int, frusta: Callable[[], ViewFrusta]) -> None:
-        """Elect the tiles that the last view no longer touched, and finish those with none beside them that it
-        did: a snapshot then has the tiles in view left to do. Called after each view.
+        """Elect the tiles that the last view no longer touched, and finish those that lie beside none which
+        it did: a snapshot then has the tiles in view left to do. Called after each view.
         """
-        taken = {key: self._store.version(key) for key in self._store.keys()}
+        keys = self._store.keys()
+        taken = {key: self._store.version(key) for key in keys}
         in_view = {key for key, count in taken.items() if self._taken.get(key) != count}
         self._taken = taken
         if left := [key for key in self._changed(min_views) if key not in in_view]:
