@@ -29,7 +29,7 @@ def run(arguments: Sequence[str]) -> None:
     ) -> None:  # fmt: skip
         """Find an archive's recordings and plan their measurement; says what is new, done and parked, and
         estimates hours and gigabytes. Nothing is measured. Recordings that can't be read are left out by
-        name, and the command then ends with 1.
+        name, and the command then ends with 3.
 
         A folder with survey.json, {"passes": ["first", "second"]}, is one survey of several passes.
 
