@@ -98,6 +98,10 @@ def test_clients_that_stall_and_subscriptions_left_behind_cost_bounded_memory(tm
     assert after - before < 15_000, (before, after)
 
 
+CLOSING_S = 0.5
+"""A transport closes its socket in a later round of the loop."""
+
+
 async def _subscribe(url: str, seconds: float) -> None:
     class Seen:
         def datachange_notification(self, node: Any, value: Any, data: Any) -> None: ...
@@ -110,6 +114,7 @@ async def _subscribe(url: str, seconds: float) -> None:
 
 async def _many(url: str, count: int, seconds: float) -> None:
     await asyncio.gather(*(_subscribe(url, seconds) for _ in range(count)))
+    await asyncio.sleep(CLOSING_S)
 
 
 async def _leave_behind(url: str, count: int) -> int:
@@ -130,4 +135,5 @@ async def _leave_behind(url: str, count: int) -> int:
         client._closing = True
         await client.uaclient.close_session(False)
         client.disconnect_socket()
+    await asyncio.sleep(CLOSING_S)
     return made
