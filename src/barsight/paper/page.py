@@ -28,7 +28,7 @@ from barsight.paper.features import (
 )
 from barsight.paper.icp import IcpScore, icp_score
 from barsight.paper.pictures import PaperPicture
-from barsight.paper.registry import ENTRIES
+from barsight.paper.registry import ENTRIES, FURTHER
 from barsight.recording.open import open_recording
 from barsight.report.page import environment, resource
 from barsight.simulation.settings import CameraSettings
@@ -100,6 +100,7 @@ def _content(
         "equation-20": _rotations(), "conclusion-1": _drift(drift),
     }  # fmt: skip
     further = [("Environments", _environments(runs.environment_rows(scale, scratch, advance)))]
+    further.append(("What has no number", PaperTable(("what", "command"), [list(row) for row in FURTHER])))
     if icp is not None:
         further.append(("Section 4.3: ICP after the stitching", _icp(icp)))
     said = {
