@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-ON_TOP_M, MIN_PAIRS = 0.006, 2
+ON_TOP_M, MIN_PAIRS, SAME_M = 0.006, 2, 0.08
 DRAWN = ["--length", "3", "--frames", "10"]
 NEAR = [
     "--length", "1.6", "--frames", "10", "--camera.above-floor-m", "2.5", "--camera.focal-px", "2500",
@@ -59,13 +59,16 @@ def holds(bundle: dict[str, Any], place: np.ndarray) -> bool:
 def judge(recording: Path, out: Path) -> Counter[str]:
     bundles = json.loads((out / "bundles.json").read_text())["bundles"]
     labels, told, bearing = visible_labels(recording), Counter[str](), set()
+    read = json.loads((out / "labels.json").read_text())
+    places = [np.array([one["x_m"], one["y_m"]]) for one in read["illegible"] if one["bundle"] is None]
     for text, place in labels:
         here = [one for one in bundles if holds(one, place)]
         top = max(here, key=lambda one: one["top_z_m"], default=None)
         label = None if top is None else top["label"]
         bearing |= {one["id"] for one in here}
         if top is None:
-            told["on no bundle that was found"] += 1
+            said = any(np.linalg.norm(place[:2] - one) < SAME_M for one in places)
+            told["on a covered bundle, said illegible" if said else "on a covered bundle, missed"] += 1
         elif label is None:
             told["missed"] += 1
         elif label["text"] is None:
@@ -78,6 +81,9 @@ def judge(recording: Path, out: Path) -> Counter[str]:
     told += Counter(
         labels=len(labels), wrong=sum(text not in there for text in texts), blank=len(blank),
         blank_called_illegible=sum(one["label"] is not None for one in blank),
+        nothing_called_illegible=sum(
+            all(np.linalg.norm(place[:2] - one) > SAME_M for _, place in labels) for one in places
+        ),
     )  # fmt: skip
     return told
 
@@ -97,9 +103,10 @@ def main() -> None:
             how = ["--seed", str(seed), *NEAR] if given.near else ["--draw", str(seed), *DRAWN]
             label = ["--yard.label-m", "0.1", "0.06", "--depth-views", "0"]
             done = recording.exists() or barsight("simulate", str(recording), *how, *label)
-            if done and (
+            done = done and (
                 out.exists() or barsight("measure", str(recording), "-o", str(out), "--labels.read")
-            ):
+            )
+            if done and barsight("labels", str(recording), str(out)):
                 told = judge(recording, out)
                 total += told
                 print(seed, dict(told), flush=True)
