@@ -1,4 +1,4 @@
-"""Count the offers that tiny noise turns into vetoes, or back: `python benchmarks/lift_noise.py 20:61`.
+"""Count offers that tiny noise turns into vetoes, or back: `python benchmarks/lift_noise.py 20:61 [WORKERS]`.
 
 Draws a yard per seed from geometry alone, chooses its lifts, and chooses them again for maps with 0.05 mm of
 noise and bundles with 0.01 mm. A flip is told where every veto of the refused side says that its figure lies
@@ -16,6 +16,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
+from barsight.cli.bench.seeds import over_seeds, parse_seeds
 from barsight.core.types import HeightSource
 from barsight.yard.lifting.targets import LiftPlan, plan_lifts
 from barsight.yard.types import Bundle, HeightMap
@@ -29,24 +30,30 @@ TOLD = "of the limit"
 
 def main() -> None:
     """Count over the seeds and print."""
-    first, last = (int(part) for part in sys.argv[1].split(":"))
-    told, untold, offers, refusals = 0, Counter[str](), 0, Counter[str]()
-    for seed in range(first, last):
-        rng = np.random.default_rng(seed)
-        heights, bundles = draw(rng)
-        magnet = replace(MAGNET, safety_factor=float(rng.uniform(2.0, 2.8)))
-        plain = plan_lifts(heights, bundles, magnet, SETTINGS, ())
-        offers += len(plain.offered)
-        refusals.update({veto.code for lift in plain.refused for veto in lift.vetoes})
-        for _ in range(REPEATS):
-            noisy = plan_lifts(*disturbed(rng, heights, bundles), magnet, SETTINGS, ())
-            for reasons in flips(plain, noisy):
-                if all(TOLD in reason for _, reason in reasons):
-                    told += 1
-                else:
-                    untold[",".join(sorted({code for code, _ in reasons}))] += 1
+    seeds, workers = parse_seeds(sys.argv[1], "lift noise"), int(sys.argv[2]) if len(sys.argv) > 2 else 1
+    counted = [one for _, one in over_seeds(count, seeds, None, workers, None)]
+    told, offers = (sum(one[place] for one in counted) for place in (0, 2))
+    untold, refusals = (sum((one[place] for one in counted), Counter[str]()) for place in (1, 3))
     print(f"offers {offers}, refused for {dict(refusals.most_common())}")
     print(f"{REPEATS * offers} offers with noise: {told} flips told, {untold.total()} not: {dict(untold)}")
+
+
+def count(seed: int, _: object) -> tuple[int, Counter[str], int, Counter[str]]:
+    """Count of a seed the flips that are told, those that aren't by codes, offers, and which codes refuse."""
+    told, untold = 0, Counter[str]()
+    rng = np.random.default_rng(seed)
+    heights, bundles = draw(rng)
+    magnet = replace(MAGNET, safety_factor=float(rng.uniform(2.0, 2.8)))
+    plain = plan_lifts(heights, bundles, magnet, SETTINGS, ())
+    for _ in range(REPEATS):
+        noisy = plan_lifts(*disturbed(rng, heights, bundles), magnet, SETTINGS, ())
+        for reasons in flips(plain, noisy):
+            if all(TOLD in reason for _, reason in reasons):
+                told += 1
+            else:
+                untold[",".join(sorted({code for code, _ in reasons}))] += 1
+    refusals = Counter({veto.code for lift in plain.refused for veto in lift.vetoes})
+    return told, untold, len(plain.offered), refusals
 
 
 def draw(rng: np.random.Generator) -> tuple[HeightMap, tuple[Bundle, ...]]:

@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 from barsight.acceptance.certificate import read_certificate
-from barsight.acceptance.commissioning import SETTINGS, GuidedStep, begin, read_done, walk
+from barsight.acceptance.commissioning import SETTINGS, CommissionSettings, GuidedStep, begin, read_done, walk
 from barsight.acceptance.layout import Area, lay_out
+from barsight.acceptance.watch import read_watch
 from barsight.artefacts.plan import AcceptancePlan, plan_text
 from barsight.calibration.files.rig_file import write_rig_file
+from barsight.cli.acceptance.commission import guided_steps
 from barsight.cli.main import run
-from barsight.core.errors import InputError, MeasurementError
+from barsight.core.errors import ConfigError, InputError, MeasurementError
 from barsight.motion.rig_check.self_calibration import turn_right_camera
 from barsight.recording.open import open_recording
 
@@ -92,19 +94,57 @@ def test_a_new_folder_says_what_to_bring(tmp_path: Path, capsys: pytest.CaptureF
     assert "range_m must be positive" in capsys.readouterr().err
 
 
+def tags_between(plan: AcceptancePlan) -> str:
+    """Lay eight tags on the floor where no artefact stands, as far apart as they go; two are checks."""
+    spots = np.array([(x, y) for x in np.arange(0.2, 3.9, 0.1) for y in np.arange(-1.3, 1.31, 0.1)])
+    stand = np.array([(one.x_m, one.y_m) for one in plan.artefacts])
+    reach = np.array([0.85 if one in plan.dummy_bundle else 0.45 for one in plan.artefacts])
+    away = np.linalg.norm(spots[:, None] - stand, axis=2)
+    free = spots[(away > reach).all(axis=1)]
+    chosen = [int(free.sum(axis=1).argmin())]
+    while len(chosen) < 8:
+        chosen.append(int(np.linalg.norm(free[:, None] - free[chosen], axis=2).min(axis=1).argmax()))
+    rows = [
+        f"{k + 3},{free[one][0]:.2f},{free[one][1]:.2f},0.03,0.0005,{int(k in (3, 6))}"
+        for k, one in enumerate(chosen)
+    ]
+    return "\n".join(["tag,yard_x,yard_y,yard_z,sigma_m,check", *rows, ""])
+
+
+def test_tags_place_the_yard_before_it_is_measured(tmp_path: Path) -> None:
+    made = CommissionSettings(use_tags=True, girder_y_m=(-8.0, 8.0), magnet="magnet.toml")
+    listed = guided_steps(tmp_path, made)
+    assert [one.name for one in listed] == [
+        "cameras", "travel", "yard frame", "empty yard", "plan", "acceptance"
+    ]  # fmt: skip
+    by_name = {one.name: one for one in listed}
+    assert "tags.csv" in by_name["yard frame"].takes and "yard.yaml" in by_name["empty yard"].takes
+    assert {"yard.yaml", "magnet.toml"} <= set(by_name["acceptance"].takes)
+    listed = guided_steps(tmp_path, CommissionSettings(use_targets=True))
+    assert [one.name for one in listed][2:4] == ["empty yard", "yard frame"]
+    with pytest.raises(ConfigError, match="take one of them"):
+        CommissionSettings(use_tags=True, use_targets=True)
+    with pytest.raises(ConfigError, match="girder_y_m needs use_tags"):
+        CommissionSettings(girder_y_m=(-8.0, 8.0))
+
+
 @pytest.mark.slow
 def test_the_whole_way_from_a_drawn_crane_to_the_certificate(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The rig file is brought along; then a wrong one: the travel refuses it."""
+    """A wrong rig file, which the travel refuses, then the right one. Tags place the yard."""
     plan = lay_out(Area((0.2, 3.8), (-1.35, 1.35), 4.5, 625.0, 0.5), "drawn")
     assert isinstance(plan, AcceptancePlan)
     (tmp_path / "plan.toml").write_text(plan_text(plan))
     crane = tmp_path / "crane"
     assert run(["commission", str(crane)]) == 5
+    settings = crane / SETTINGS
+    settings.write_text(settings.read_text().replace("use_tags = false", "use_tags = true"))
+    (crane / "tags.csv").write_text(tags_between(plan))
     camera = ["--camera.width-px", "640", "--camera.height-px", "512", "--camera.focal-px", "625"]
     placed = ["--camera.above-floor-m", "4.5", "--camera.trolley-y-m", "0", "--depth-views", "0"]
-    drawn = ["--artefacts", str(tmp_path / "plan.toml"), "--length", "4", "--frames", "10", *camera, *placed]
+    laid = ["--artefacts", str(tmp_path / "plan.toml"), "--tags", str(crane / "tags.csv"), "--tag-m", "0.16"]
+    drawn = [*laid, "--length", "4", "--frames", "10", *camera, *placed]
     (crane / "artefacts").mkdir()
     for target, seed in ((crane / "artefacts" / "first", "23"), (crane / "artefacts" / "again", "23")):
         assert run(["simulate", str(target), "--seed", seed, *drawn]) == 0
@@ -119,6 +159,18 @@ def test_the_whole_way_from_a_drawn_crane_to_the_certificate(
     assert run(["commission", str(crane)]) == 0, capsys.readouterr().err
     certificate = read_certificate(crane / "certificate.json")
     assert certificate["passed"] and certificate["is_simulated"]
-    assert [one["name"] for one in certificate["steps"]] == ["cameras", "travel", "empty yard", "plan"]
+    assert [one["name"] for one in certificate["steps"]] == [
+        "cameras", "travel", "yard frame", "empty yard", "plan"
+    ]  # fmt: skip
+    assert certificate["magnet_offset"] is None and certificate["yard_frame_id"]
+    watched = ["--record", str(tmp_path / "watch.json"), "--plan", str(crane / "plan.toml")]
+    hung = ["--rig", str(crane / "rig.yaml"), "--yard", str(crane / "yard.yaml")]
+    assert run(["verify", str(crane / "artefacts" / "first"), *watched, *hung]) == 0
+    (told,) = read_watch(tmp_path / "watch.json").surveys
+    features = {one.name: abs(one.value) for one in told.figures if one.name.endswith("/ mm")}
+    assert sorted(features) == [
+        "height of plates / mm", "place of spheres along x / mm", "place of spheres along y / mm"
+    ]  # fmt: skip
+    assert max(features.values()) < 4
     before = (crane / "certificate.json").read_bytes()
     assert run(["commission", str(crane)]) == 0 and (crane / "certificate.json").read_bytes() == before

@@ -11,12 +11,14 @@ from barsight.acceptance.watch import (
     WatchedSurvey,
     WatchRecord,
     control_charts,
+    feature_figures,
     read_watch,
     with_survey,
     write_watch,
 )
 from barsight.cli.main import run
 from barsight.core.errors import InputError
+from test_acceptance import observed, planned
 
 SIGMAS = {"yaw / deg": 0.0018, "baseline / %": 0.05, "pitch / deg": 0.0014, "sharpness of cam0 / log": 0.15}
 
@@ -79,6 +81,28 @@ def test_what_is_normal_is_learned_first() -> None:
     drawn = [survey(k, rng, yaw_deg=0.05 * (k == 7)) for k in range(8)]
     assert all(np.isnan(one.mean) for one in control_charts(drawn[:7]))
     assert first_alarm(drawn) is None
+
+
+def test_fixed_features_watch_mounting_and_yard_frame() -> None:
+    """Ten surveys of plates and spheres as they scatter; then the rig hangs 6 mm lower, or 8 mm aside."""
+    plan = planned()
+
+    def surveys(moved: np.ndarray, seed: int) -> list[WatchedSurvey]:
+        rng = np.random.default_rng((38, seed))
+        drawn = []
+        for k in range(13):
+            off = moved * (k >= 10)
+            figures = feature_figures(plan, observed(plan, lambda place, off=off: place + off, rng))
+            drawn.append(WatchedSurvey(f"rec{k}", f"id{k}", "cal", figures))
+        return drawn
+
+    quiet = [first_alarm(surveys(np.zeros(3), seed)) for seed in range(20)]
+    assert quiet == [None] * 20
+    for moved, name in (((0, 0, -0.006), "height of plates"), ((0.008, 0, 0), "place of spheres along x")):
+        for seed in range(5):
+            charts = control_charts(surveys(np.array(moved), seed))
+            alarmed = {one.name.partition(" / ")[0]: one.alarmed_at for one in charts if one.alarmed_at}
+            assert list(alarmed) == [name] and 10 < alarmed[name] <= 13
 
 
 def test_an_approval_begins_charts_anew(tmp_path: Path) -> None:

@@ -1,5 +1,8 @@
 """Work over threads: order, bounded memory, exceptions at their turn; what the stages take; shapes."""
 
+import os
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -205,3 +208,45 @@ def test_an_exception_in_a_band_comes_out() -> None:
 
     with pytest.raises(ValueError, match="row 30"):
         parallel_bands(work, 100, 10)
+
+
+ALONE = """
+import os
+import subprocess
+import sys
+import threading
+from barsight.core.parallel import in_background, ordered_map, parallel_bands, prefetch, prefetched_map
+seen = set()
+def work(item):
+    seen.add(threading.get_ident())
+    return item + 1
+def items():
+    for item in range(4):
+        seen.add(threading.get_ident())
+        yield item
+def fails():
+    raise ValueError("torn")
+bands = []
+parallel_bands(lambda first, end: bands.append(work(first)), 8, 2)
+with prefetched_map(work, items(), 3) as mapped, in_background(lambda: work(6)) as late:
+    print(list(ordered_map(work, items())), list(prefetch(items())), list(mapped), late.result(), bands)
+try:
+    with in_background(fails):
+        print("the block runs")
+except ValueError as error:
+    print(error, len(seen))
+"""
+
+
+def test_a_process_of_one_thread_begins_no_other() -> None:
+    ended = [
+        subprocess.run(
+            [sys.executable, "-c", ALONE], env={**os.environ, "NUMBA_NUM_THREADS": threads}, check=True,
+            capture_output=True, text=True,
+        ).stdout.splitlines()
+        for threads in ("1", "2")
+    ]  # fmt: skip
+    assert ended[0] == [
+        "[1, 2, 3, 4] [0, 1, 2, 3] [1, 2, 3, 4] 7 [1, 3, 5, 7]", "the block runs", "torn 1",
+    ]  # fmt: skip
+    assert ended[0][1] == ended[1][1] and ended[1][2] != "torn 1"

@@ -23,6 +23,8 @@ from barsight.cli.arguments import load_settings
 from barsight.cli.bench.seeds import over_seeds
 from barsight.cli.main import run
 from barsight.core.errors import ConfigError, Failed, InputError, OutputError
+from barsight.core.json_values import json_digest
+from barsight.core.reading.sealed_json import SEAL
 from barsight.fleet.archive import download, find_recordings, manifest_digest
 from barsight.fleet.cluster import connect
 from barsight.fleet.comparing import FigureChange, RecordingComparison, _figures, compare_recording
@@ -225,6 +227,7 @@ def test_holm_keeps_its_level_and_a_shared_shift_is_found(tmp_path: Path) -> Non
     assert copied["<r>"] == ("pictures/000-before.png", ""), "the other result lacks its picture"
     assert (tmp_path / "page/pictures/000-before.png").read_bytes() == b"<r> before"
     page = comparison_page(worst, copied)
+    assert page.count("not known") == 12 and page.count("too few") == 6, "nothing told is no interval of 0"
     assert page.count('href="pictures/') == 2 and "file://" not in page and results.url not in page
     assert "&lt;r&gt;" in page and "<r>" not in page and "<lost>" not in page
 
@@ -274,6 +277,14 @@ def test_only_what_was_published_is_promoted(tmp_path: Path, now: bytes) -> None
             with pytest.raises(InputError, match=r"a\.json: was changed after it was published"):
                 _fetch(results, "k", tmp_path / "again")
             assert not (tmp_path / "again").exists()
+
+
+def test_a_pipe_among_the_results_is_not_waited_for(tmp_path: Path) -> None:
+    objects = open_objects(str(tmp_path))
+    os.mkfifo(tmp_path / "a.json")
+    for read in (objects.read, lambda path: list(objects.chunks(path))):
+        with pytest.raises(InputError, match=r"a\.json: is no regular file"):
+            read("a.json")
 
 
 def test_sizes_are_looked_at_before_anything_is_read(tmp_path: Path) -> None:
@@ -362,6 +373,14 @@ def test_a_changed_document_is_not_compared(tmp_path: Path) -> None:
     same = compare_recording(results, "one", "a", "b")
     assert same is not None and len(same.changes) == 12 and not any(one.sigma == 0 for one in same.changes)
     assert all(change.before == change.after for change in same.changes)
+    assert same.vetoes == ()
+    lifts = tmp_path / "r/files/b/t/lifts.json"
+    content = json.loads(lifts.read_text())
+    content["refused"].append(content["lifts"].pop() | {"vetoes": [{"code": "gap", "reason": "8 mm"}] * 2})
+    del content[SEAL]
+    lifts.write_text(json.dumps(content | {SEAL: json_digest(content)}))
+    other = compare_recording(results, "one", "a", "b")
+    assert other is not None and other.vetoes == ("gap 0 to 1", "offered 2 to 1")
     path = tmp_path / "r/files/b/t/bundles.json"
     path.write_text(path.read_text().replace('"length_m": ', '"length_m": 1', 1))
     with pytest.raises(InputError, match="was changed after it was written"):
@@ -415,13 +434,23 @@ def test_seeds_run_on_workers_as_here() -> None:
 
 
 @pytest.mark.slow
-def test_a_bench_says_the_same_on_workers(tmp_path: Path) -> None:
-    tables = [tmp_path / "one.json", tmp_path / "two.json"]
-    for table, workers in zip(tables, ("1", "2"), strict=True):
-        words = ["bench", "lifts", "--seeds", "0:3", "--placements", "2", "--workers", workers]
-        assert run([*words, "--json", str(table)]) == 0
-    lifts = [json.loads(table.read_text())["lifts"] for table in tables]
-    assert lifts[0] == lifts[1] and {one["seed"] for one in lifts[0]} <= {0, 1, 2} and lifts[0]
+@pytest.mark.parametrize(
+    ("words", "kept"),
+    [
+        (("lifts", "--seeds", "0:3", "--placements", "2"), ("lifts",)),
+        (("bundles", "--yards", "4", "--length-m", "3"), ("counts", "figures")),
+    ],
+)
+def test_a_bench_says_the_same_on_workers(
+    tmp_path: Path, words: tuple[str, ...], kept: tuple[str, ...]
+) -> None:
+    told = []
+    for workers in ("1", "2"):
+        table = tmp_path / f"{workers}.json"
+        assert run(["bench", *words, "--workers", workers, "--json", str(table)]) == 0
+        content = json.loads(table.read_text())
+        told.append([content[name] for name in kept])
+    assert told[0] == told[1] and all(told[0])
 
 
 def test_workers_of_another_version_end_the_run(tmp_path: Path) -> None:

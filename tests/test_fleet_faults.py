@@ -2,29 +2,31 @@
 
 from __future__ import annotations
 
-import hashlib
+import os
 import pickle
 import shutil
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from threading import Timer
 from typing import Any
 
 import pytest
+from distributed import LocalCluster
 
 from barsight.cli.bench.seeds import _one_seed, over_seeds
 from barsight.cli.main import run
 from barsight.core.errors import CalibrationError, ConfigError, Failed, InputError
 from barsight.fleet.archive import download, find_recordings, manifest_digest
 from barsight.fleet.cluster import connect, run_all
-from barsight.fleet.driver import drive, open_tasks, parked_reasons
-from barsight.fleet.ledger import HeldRecording, claim, discard, publish
+from barsight.fleet.driver import FleetCounts, count_states, drive, open_tasks, parked_reasons
+from barsight.fleet.ledger import HeldRecording, claim, discard, publish, published_keys
 from barsight.fleet.limits import run_limited, thread_variables
 from barsight.fleet.objects import UnreachableError, open_objects
 from barsight.fleet.planning import TaskChoice, plan_tasks
-from barsight.fleet.promoting import _fetch
 from barsight.fleet.records import find_version, note_plan, noted_keys, read_tasks
 from barsight.fleet.task import run_task
 from barsight.fleet.versions import arguments, publish_version
@@ -34,7 +36,8 @@ from barsight.recording.formats.bag_setup import _find
 from barsight.recording.formats.segments import segments_of
 from barsight.store.audit import AuditChain, verify_chain
 from barsight.store.opening import open_store
-from fleet_rounds import VERSION, make_archive, no_progress, settings
+from fleet_rounds import AZURE, VERSION, azure_server, dask_commands, make_archive, no_progress, settings
+from opcua_servers import free_port
 
 
 def write(folder: Path, *names: str) -> None:
@@ -70,6 +73,20 @@ def test_parts_of_a_bag_are_one_recording_with_the_calibration_beside_it(tmp_pat
     (tmp_path / "a/loose/imu.yaml").symlink_to(tmp_path / "a/ros/camchain.yaml")
     with pytest.raises(InputError, match=r"imu\.yaml: is a link out"):
         list(download(archive, "loose/two.bag", (".",), tmp_path / "3"))
+
+
+def test_a_recording_that_cannot_be_read_is_left_out_by_name(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    archive = make_archive(tmp_path / "a", {"good": "good", "large": "good", "linked": "good"})
+    os.truncate(archive / "large/mav0/kind", 1 << 33)
+    (archive / "linked/mav0/out").symlink_to("/etc/hostname")
+    where = ["--results", str(tmp_path / "r"), "--store", f"sqlite:///{tmp_path}/s.db"]
+    assert run(["fleet", "plan", str(archive), *where]) == 3
+    told = capsys.readouterr()
+    assert "1 recordings, 1 new in the plan" in told.out
+    lines = [line for line in told.err.splitlines() if line.startswith("left out: ")]
+    assert len(lines) == 2 and "large/mav0/kind" in lines[0] and "linked/mav0/out" in lines[1]
 
 
 def test_recordings_of_two_archives_and_of_one_that_moved(tmp_path: Path) -> None:
@@ -169,19 +186,6 @@ def test_files_of_tries_that_were_not_published_are_removed(tmp_path: Path) -> N
     assert not publish(results, late, {})
     discard(results, late, is_ours=False)
     assert [one.path for one in results.list("files/")] == ["files/k/mine/result.json"]
-
-
-def test_a_result_that_was_changed_is_not_promoted(tmp_path: Path) -> None:
-    results = open_objects(str(tmp_path / "r"), create=True)
-    results.write("files/k/t/height.tif", b"heights")
-    file = {"bytes": 7, "sha256": hashlib.sha256(b"heights").hexdigest()}
-    assert publish(results, HeldRecording("k", 1, "t"), EMPTY | {"files": {"height.tif": file}})
-    _fetch(results, "k", tmp_path / "into" / "k")
-    assert (tmp_path / "into/k/height.tif").read_bytes() == b"heights"
-    results.write("files/k/t/height.tif", b"lowered")
-    with pytest.raises(InputError, match=r"height\.tif: was changed after it was published"):
-        _fetch(results, "k", tmp_path / "into" / "again")
-    assert not (tmp_path / "into/again").exists()
 
 
 @dataclass(frozen=True)
@@ -295,3 +299,79 @@ def test_versions_are_named_by_their_beginning(tmp_path: Path) -> None:
         words = ["fleet", "compare", "ab", "ac", "--results", results.url, "-o", str(tmp_path / "c")]
         assert run([*words, "--store", f"sqlite:///{tmp_path}/s.db"]) == 5
         assert not (tmp_path / "c").exists()
+
+
+@pytest.mark.slow
+def test_azure_keeps_the_promises_that_a_run_rests_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "azurite").mkdir()
+    with azure_server(tmp_path / "azurite") as url:
+        for name, value in {**AZURE, "AZURITE_BLOB_STORAGE_URL": url}.items():
+            monkeypatch.setenv(name, value)
+        here = open_objects(str(make_archive(tmp_path / "a", {"r": "good", "s": "good", "bad": "poison"})))
+        archive, results = (open_objects(f"az://yard/{name}") for name in ("archive", "results"))
+        for one in here.list():
+            archive.upload(tmp_path / "a" / one.path, one.path)
+        with ThreadPoolExecutor(8) as pool:
+            put = [pool.submit(results.write_new, "x/y", bytes([k])) for k in range(8)]
+        assert sum(one.result() for one in put) == 1 and len(results.read("x/y") or b"") == 1
+        assert [one.path for one in results.list_folder("x")] == ["x/y"] and results.read("x/z") is None
+        results.remove("x/y")
+        tasks = plan_tasks(archive, results, VERSION, None, no_progress)
+        shared = settings(tmp_path, results.url)
+        with open_store(f"sqlite:///{tmp_path}/s.db", create=True) as store:
+            with connect(2, None) as client:
+                drive(client, tasks, shared, store, results, RunWindow(), no_progress)
+            with store.reading() as connection:
+                assert noted_keys(connection) == published_keys(results)
+        assert count_states(results, tasks) == FleetCounts(2, 1, 0, 0)
+        assert [task.name for task, _ in parked_reasons(results, tasks)] == ["bad"]
+
+
+@pytest.mark.slow
+def test_an_adaptive_cluster_grows_from_no_worker_and_shrinks_again(tmp_path: Path) -> None:
+    results = open_objects(str(tmp_path / "r"), create=True)
+    archive = open_objects(str(make_archive(tmp_path / "a", {str(k): "good 2" for k in range(8)})))
+    tasks = plan_tasks(archive, results, VERSION, None, no_progress)
+    shared = settings(tmp_path, results.url)
+    with (
+        LocalCluster(n_workers=0, threads_per_worker=1, host="127.0.0.1", dashboard_address=None) as cluster,
+        open_store(f"sqlite:///{tmp_path}/s.db", create=True) as store,
+        connect(1, cluster.scheduler_address) as client,
+    ):
+        cluster.adapt(minimum=0, maximum=2, interval="200ms", wait_count=2, target_duration="1s")
+        drive(client, tasks, shared, store, results, RunWindow(), no_progress)
+        claims = [results.read_json(one.path) for one in results.list("claims/")]
+        assert len(claims) == 8 and len({one["pid"] for one in claims}) >= 2
+        assert count_states(results, tasks) == FleetCounts(8, 0, 0, 0)
+        until = time.monotonic() + 20
+        while client.nthreads() and time.monotonic() < until:
+            time.sleep(0.2)
+        assert not client.nthreads()
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_dies_ends_the_run_by_one_line(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    archive = open_objects(str(make_archive(tmp_path / "a", {"r": "good 30"})))
+    results = open_objects(str(tmp_path / "r"), create=True)
+    tasks = plan_tasks(archive, results, VERSION, None, no_progress)
+    shared, port = settings(tmp_path, results.url), free_port()
+    commands = dask_commands(port, 1).values()
+    cluster = [subprocess.Popen(command, stderr=subprocess.DEVNULL) for command in commands]
+    try:
+        with (
+            open_store(f"sqlite:///{tmp_path}/s.db", create=True) as store,
+            pytest.raises(InputError, match="no scheduler is there any more"),
+            connect(1, f"tcp://127.0.0.1:{port}") as client,
+        ):
+            client.wait_for_workers(1)
+            Timer(3.0, cluster[0].kill).start()
+            drive(client, tasks, shared, store, results, RunWindow(), no_progress)
+    finally:
+        for process in cluster:
+            process.kill()
+            process.wait()
+    assert capfd.readouterr().err == ""

@@ -1,6 +1,8 @@
 """The live run: what it keeps gives measure's bytes, faults show by name, and lifts don't outlive them."""
 
+import contextlib
 import json
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -23,6 +25,7 @@ from barsight.live.shared.logs import NumberLog, ReadingLog
 from barsight.live.shared.ring import PairRing
 from barsight.live.source import ReplayClock, ReplaySource
 from barsight.live.state import prometheus
+from barsight.recording.formats.ground_truth import read_ground_truth
 from barsight.sensors.source import LivePicture, LostPicture, Readings
 from barsight.yard.magnet.description import example_magnet
 from cli_runs import FAST
@@ -78,10 +81,44 @@ def test_a_run_as_fast_as_possible_is_measure(whole: Path, tmp_path: Path) -> No
     frames = latency["frames"]
     assert [frames[name] for name in ("captured", "paired", "tracked", "kept")] == [4] * 4
     assert set(frames["dropped"].values()) == {0}
-    assert latency["pose_s"]["n"] == 4 and latency["lifts_s"]["n"] == 1
+    assert latency["pose_s"]["n"] == 0 and latency["pair_s"]["n"] == 4 and latency["lifts_s"]["n"] == 1
     assert (state["phase"], state["mode"], state["lifts"]["may_stand"]) == ("done", "full", True)
     assert content(out / "keyframes.json")["keyframes_ns"] == list(bs.open_recording(whole).index.stamps_ns)
     assert not {".live", "pose.json", "live_height.tif"} & {path.name for path in out.iterdir()}
+
+
+def test_poses_come_between_pictures(whole: Path, tmp_path: Path) -> None:
+    """At the recording's pace: more poses than pairs, each of its own time, carried on from the last pair."""
+    seen: dict[int, dict[str, Any]] = {}
+
+    def look() -> None:
+        while not ended.is_set():
+            with contextlib.suppress(OSError, ValueError):
+                told = content(tmp_path / "out/pose.json")
+                seen[told["stamp_ns"]] = told
+            time.sleep(0.005)
+
+    ended = threading.Event()
+    reader = threading.Thread(target=look)
+    reader.start()
+    try:
+        replay(whole, tmp_path / "out", SETTINGS, LiveSettings(max_predicted_s=5.0), tell=lambda _: None)
+    finally:
+        ended.set()
+        reader.join()
+    latency, stamps = content(tmp_path / "out/latency.json"), bs.open_recording(whole).index.stamps_ns
+    assert latency["pose_s"]["n"] > 2 * len(stamps)
+    assert 0 <= latency["pose_s"]["p50"] < 0.2
+    poses = [seen[stamp] for stamp in sorted(seen)]
+    assert {pose["frame"] for pose in poses} == {"yard"}
+    assert all(0 <= pose["predicted_s"] <= 5.0 and max(pose["sigma_m"]) < 0.1 for pose in poses)
+    truth = read_ground_truth(whole)
+    for pose in poses:
+        true = np.array([
+            np.interp(pose["stamp_ns"], truth.stamp_ns, [one.translation[axis] for one in truth.poses])
+            for axis in range(3)
+        ])  # fmt: skip
+        assert np.abs(true - pose["position_m"]).max() < 0.02
 
 
 @pytest.mark.slow

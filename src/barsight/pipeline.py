@@ -53,13 +53,12 @@ from barsight.yard.inventory.stock_list import (
     read_stock,
     stock_warnings,
 )
-from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.targets import LiftPlan, map_vetoes, plan_lifts
+from barsight.yard.lifting.targets import LiftPlan, map_vetoes, offset_vetoes, plan_lifts
 from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.magnet.description import Magnet, load_magnet
 from barsight.yard.sections import surface_map
 from barsight.yard.types import Bundle, YardMap
-from barsight.yard_frame import frame_notes, frame_of, with_shared, yard_frame_id
+from barsight.yard_frame import calibration_id, frame_notes, frame_of, with_shared, yard_frame_id
 
 MIN_DOWN_COSINE = 0.5
 """Cosine between the optical axis and straight down; a rig over a yard looks down."""
@@ -203,7 +202,7 @@ def find_lifts(mapped: MappedYard, request: LiftRequest) -> Measurement:
     with watch("lifts"):
         travels = [_travel(one.probed, one.way, one.built, settings) for one in mapped.passes]
         travel = travels[0] if len(travels) == 1 else Travel.joined(travels)
-        lifts = _lifts(heights, bundles, request, settings.lift, warnings, trajectory, travel, stock)
+        lifts = _lifts(heights, bundles, request, mapped, warnings, travel, stock)
     source = newest.probed.source
     return Measurement(
         recording_path=source.path.resolve(),
@@ -388,16 +387,20 @@ def _travel(
 
 
 def _lifts(
-    heights: YardMap, bundles: tuple[Bundle, ...], request: LiftRequest, settings: LiftSettings,
-    warnings: list[Notice], trajectory: Trajectory, travel: Travel, stock: StockMatch | None,
+    heights: YardMap, bundles: tuple[Bundle, ...], request: LiftRequest, mapped: MappedYard,
+    warnings: list[Notice], travel: Travel, stock: StockMatch | None,
 ) -> LiftPlan:  # fmt: skip
     """Choose lifts, judged now or at the last frame."""
+    settings, trajectory, source = mapped.settings.lift, mapped.trajectory, mapped.newest.probed.source
     told = [(notice.code, notice.message) for notice in warnings]
     captured_to_ns = int(travel.stamp_ns[travel.measured][-1])
     now_ns = time.time_ns() if request.judged_at == "now" else captured_to_ns
     forbidden = map_vetoes(
         told, trajectory.reference, captured_to_ns, now_ns, settings, has_magnet=request.magnet is not None
     )
+    if request.magnet is not None:
+        own = calibration_id(source.rig), yard_frame_id(source, trajectory)
+        forbidden += offset_vetoes(request.magnet, *own)
     listed = {} if stock is None else contradicted_bundles(stock)
     return plan_lifts(
         heights,

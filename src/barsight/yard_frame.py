@@ -17,6 +17,7 @@ from barsight.core.types import CraneSamples, LaserProfile, Trajectory
 from barsight.recording.base import Recording
 from barsight.recording.sensor_samples import make_laser
 from barsight.recording.wrapper import RecordingProxy
+from barsight.registration.bending import CraneBend, bend_carry, bend_heights
 from barsight.registration.yard_file import YardFrame, read_yard_file
 from barsight.yard.identity import ID_DIGITS
 
@@ -96,12 +97,22 @@ def crane_in_yard(crane: CraneSamples, frame: YardFrame) -> CraneSamples:
     """Move encoder readings into the surveyed yard, or give the body the attitude that was calibrated."""
     pose = frame.yard_from
     if pose.source == "encoders":
+        crane = crane if frame.bend is None else bent_crane(crane, frame.bend)
         return replace(
             crane, position_m=pose.apply(crane.position_m),
             crane_to_body_m=pose.rotation @ crane.crane_to_body_m,
             yard_from_body_nominal=pose.rotation @ crane.yard_from_body_nominal,
         )  # fmt: skip
     return crane if frame.attitude is None else replace(crane, yard_from_body_nominal=frame.attitude)
+
+
+def bent_crane(crane: CraneSamples, bend: CraneBend) -> CraneSamples:
+    """Move readings to where a bending crane really was, and turn the body by the mean of its tilt there."""
+    place = crane.position_m
+    return replace(
+        crane, position_m=bend.moved(place, crane.crane_to_body_m),
+        yard_from_body_nominal=bend.turn(place) @ crane.yard_from_body_nominal,
+    )  # fmt: skip
 
 
 def placed_in_yard(trajectory: Trajectory, frame: YardFrame | None) -> Trajectory:
@@ -130,7 +141,12 @@ def with_shared(trajectory: Trajectory, frame: YardFrame | None) -> Trajectory:
             carry[3:] = 0.0  # only the attitude is taken; the encoders say where the body is
         else:
             carry[3:, :3] = -skew(one.reference_from_body.translation - frame.yard_from.translation)
-        frames.append(replace(one, covariance=one.covariance + carry @ frame.covariance @ carry.T))
+        covariance = frame.covariance
+        if frame.bend is not None:
+            here = frame.yard_from.inverse().apply(one.reference_from_body.translation[None])[0]
+            carry = np.hstack([carry, bend_carry(frame.bend, frame.yard_from.rotation, here)])
+            covariance = frame.bend.covariance
+        frames.append(replace(one, covariance=one.covariance + carry @ covariance @ carry.T))
     return replace(trajectory, frames=tuple(frames))
 
 
@@ -142,7 +158,13 @@ def shared_height_sigma_m(frame: YardFrame, x_m: Float64, y_m: Float64, body_m: 
     lifted = 0.0 if frame.attitude is not None else 1.0
     row = np.zeros((x_m.size, 6))
     row[:, 0], row[:, 1], row[:, 5] = y_m - about[1], -(x_m - about[0]), lifted
-    sigma: Float64 = np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", row, frame.covariance, row), 0))
+    covariance = frame.covariance
+    if frame.bend is not None:
+        back = frame.yard_from.inverse()
+        points = back.apply(np.column_stack([x_m, y_m, np.zeros(x_m.size)]))
+        row = np.hstack([row, bend_heights(frame.bend, back.apply(body_m[None])[0], points)])
+        covariance = frame.bend.covariance
+    sigma: Float64 = np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", row, covariance, row), 0))
     return sigma
 
 

@@ -24,13 +24,14 @@ from barsight.motion.batch.fusion import FusionSettings
 from barsight.motion.rig_check.drift_check import CheckSettings, RigCheck, check_rig
 from barsight.recording.base import Recording
 from barsight.recording.open import open_recording
+from barsight.yard.magnet.description import MagnetOffset
 from barsight.yard_frame import in_yard
 
 
 @dataclass(frozen=True, eq=False)
 class Acceptance:
     """All that a certificate says. rig: check of each recording, pictures: of each; inputs: digests of each
-    recording's inputs, by its path.
+    recording's inputs, by its path; offset: of the magnet, where touch-downs were judged with one.
     """
 
     plan: AcceptancePlan
@@ -40,6 +41,7 @@ class Acceptance:
     pictures: tuple[tuple[PictureHealth, ...] | Failed, ...]
     causes: tuple[Cause, ...]
     inputs: dict[str, dict[str, str]]
+    offset: MagnetOffset | None = None
 
     @property
     def is_passed(self) -> bool:
@@ -50,11 +52,11 @@ class Acceptance:
 
 def accept(
     plan: AcceptancePlan, recordings: Sequence[Path], settings: MeasureSettings, work: Path,
-    advance: ProgressCallback,
+    advance: ProgressCallback, offset: MagnetOffset | None = None,
 ) -> Acceptance:  # fmt: skip
     """Accept or refuse by one or several recordings of the artefacts; results are kept in folders of `work`.
 
-    Raises a BarsightError where one can't be measured at all.
+    offset: of the magnet that touched down. Raises a BarsightError where one can't be measured at all.
     """
     seen, rig, pictures, inputs = [], [], [], {}
     for number, path in enumerate(recordings, 1):
@@ -67,9 +69,10 @@ def accept(
         pictures.append(health)
         inputs[str(path)] = dict(source.digests())
     _expect_one_rig(seen)
-    judged = judge_all(plan, seen) + tuple(_dirt(pictures, plan.limits))
+    _expect_own_offset(offset, seen[0])
+    judged = judge_all(plan, seen, offset) + tuple(_dirt(pictures, plan.limits))
     causes = name_causes(plan, seen, rig, pictures)
-    return Acceptance(plan, tuple(seen), judged, tuple(rig), tuple(pictures), causes, inputs)
+    return Acceptance(plan, tuple(seen), judged, tuple(rig), tuple(pictures), causes, inputs, offset)
 
 
 def look_at_rig(source: Recording) -> tuple[RigCheck, tuple[PictureHealth, ...] | Failed]:
@@ -85,6 +88,14 @@ def _expect_one_rig(seen: Sequence[Observation]) -> None:
             if getattr(other, what) != getattr(first, what):
                 problem = f"has another {what.removesuffix('_id').replace('_', ' ')} than {first.recording}"
                 raise InputError(other.recording, problem, "accept one rig at a time")
+
+
+def _expect_own_offset(offset: MagnetOffset | None, first: Observation) -> None:
+    if offset is None:
+        return
+    if (offset.calibration_id, offset.yard_frame_id) != (first.calibration_id, first.yard_frame_id):
+        problem = "has another calibration or yard frame than the magnet's offset"
+        raise InputError(first.recording, problem, "touch down with this one: accept without --magnet")
 
 
 def _some_frames(source: Recording) -> Iterator[StereoFrame]:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import chi2 as chi_square
 
 from barsight.acceptance.observation import Observation, ViewGeometry
 from barsight.acceptance.pictures import PictureHealth
@@ -14,14 +15,17 @@ from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
 from barsight.motion.rig_check.drift_check import RigCheck
 
-PLATE_PX, PLATE_MM = 0.03, 0.5
-"""Noise of a plate's height, beside what its own uncertainty is: disparity, and the map's."""
-SPHERE_PX, SPHERE_MM = 0.03, 1.5
-"""The same of a sphere's: pixels round its cap."""
+PLATE_PX, PLATE_MM = 0.008, 0.2
+"""Noise of a plate's height, beside what its own uncertainty is: disparity, and the map's. Rendered plates
+scatter by 0.4 mm where a pixel of disparity is 65 mm."""
+SPHERE_PX, SPHERE_MM = 0.012, 0.5
+"""The same of a sphere's: pixels round its cap; rendered ones scatter by 0.6 mm there."""
 PLACE_PX, PLACE_MM = 0.2, 1.0
 """The same across, in pixels on the ground."""
-CLEAR = 9.0
-"""Least fall of chi-square for which a cause is named: three sigma."""
+FALSE_NAMES = 0.01
+"""Chance that a healthy rig has a cause named, over all that are tried together."""
+ALIKE = 4.0
+"""Another cause that explains the errors by so much less chi-square only, two sigma, isn't told from it."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +55,7 @@ UNKNOWNS = (
 @dataclass(frozen=True)
 class Cause:
     """A cause of errors: value and sigma in `unit`; chi2: by how much it explains them better than an
-    ordinary rig.
+    ordinary rig. alike: others that explain them nearly as well.
     """
 
     name: str
@@ -59,6 +63,12 @@ class Cause:
     sigma: float
     unit: str
     chi2: float
+    alike: tuple[str, ...] = ()
+
+    @property
+    def words(self) -> str:
+        """Name it, with those that it isn't told from."""
+        return " or ".join((self.name, *self.alike))
 
 
 def name_causes(
@@ -95,7 +105,7 @@ class _Row:
 
 def _best_cause(rows: Sequence[_Row]) -> Cause | None:
     """Let each unknown go free in turn, the others as a healthy rig has them, and leave each artefact out in
-    turn; take what explains most.
+    turn; take what a healthy rig would show most rarely.
     """
     if not rows:
         return None
@@ -103,24 +113,34 @@ def _best_cause(rows: Sequence[_Row]) -> Cause | None:
     design = np.array([row.answer for row in rows]) * weight[:, None]
     error = np.array([row.error for row in rows]) * weight
     ordinary = np.array([one.ordinary for one in UNKNOWNS])
+    names = sorted({row.artefact for row in rows} - {""})
     healthy, _, _ = _solved(design, error, 1 / ordinary**2)
+    # One chance of a false name for all that are tried, whatever each leaves free.
     best: Cause | None = None
+    rarest = float(np.log(FALSE_NAMES / (len(UNKNOWNS) - 1 + len(names))))
+    gains = {}
     for k, one in enumerate(UNKNOWNS[:-1]):
         prior = 1 / ordinary**2
         prior[k] = 0.0
         chi2, value, sigma = _solved(design, error, prior)
-        gain = healthy - chi2
-        if gain > (CLEAR if best is None else best.chi2):
-            best = Cause(one.name, one.scale * float(value[k]), one.scale * float(sigma[k]), one.unit, gain)
-    for name in sorted({row.artefact for row in rows} - {""}):
+        gains[one.name] = healthy - chi2
+        rare = float(chi_square.logsf(healthy - chi2, 1))
+        if rare < rarest:
+            told = one.scale * float(value[k]), one.scale * float(sigma[k])
+            best, rarest = Cause(one.name, *told, one.unit, healthy - chi2), rare
+    for name in names:
         others = np.array([row.artefact != name for row in rows])
         chi2, _, _ = _solved(design[others], error[others], 1 / ordinary**2)
-        gain = healthy - chi2
-        if gain > (CLEAR + int((~others).sum()) if best is None else best.chi2):
+        rare = float(chi_square.logsf(healthy - chi2, int((~others).sum())))
+        if rare < rarest:
             off = [1e3 * row.error for row in rows if row.artefact == name]
             sigma_mm = max(1e3 * row.sigma for row in rows if row.artefact == name)
-            best = Cause(f"{name} stands elsewhere", float(max(off, key=abs)), sigma_mm, "mm", gain)
-    return best
+            told = float(max(off, key=abs)), sigma_mm
+            best, rarest = Cause(f"{name} stands elsewhere", *told, "mm", healthy - chi2), rare
+    if best is None or best.name not in gains:
+        return best
+    alike = (name for name, gain in gains.items() if name != best.name and gain > best.chi2 - ALIKE)
+    return replace(best, alike=tuple(alike))
 
 
 def _solved(design: Float64, error: Float64, prior: Float64) -> tuple[float, Float64, Float64]:

@@ -53,6 +53,7 @@ def certificate_content(
         "is_simulated": any(view.is_simulated for view in found.observations),
         "calibration_id": found.observations[0].calibration_id,
         "yard_frame_id": found.observations[0].yard_frame_id,
+        "magnet_offset": None if found.offset is None else asdict(found.offset),
         "rule": RULE,
         "plan": asdict(found.plan),
         "plan_sha256": json_digest(json_value(found.plan)),

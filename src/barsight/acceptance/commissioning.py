@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from barsight.acceptance.certificate import CommissioningStep
-from barsight.core.errors import InputError
+from barsight.core.errors import ConfigError, InputError
 from barsight.core.files import atomic_path
 from barsight.core.json_values import json_digest, json_value
 from barsight.core.reading.json_schema import expect_schema, list_schema, record_schema
@@ -32,24 +32,38 @@ yard = ""                               # which yard or crane it is
 signer = ""                             # who answers for the certificate
 board = "checkerboard:9x6:0.025"        # as barsight calibrate stereo takes it; measure the board
 range_m = 7.0                           # working distance, at which the calibration is judged
+use_tags = false                        # true: AprilTags in survey/ place the yard; tags.csv lists them
+# girder_y_m = [-10.0, 10.0]            # with use_tags: the trolley's readings at the girder's ends
+# rails_x_m = [0.0, 60.0]               # with girder_y_m: the bridge's at the rails' ends
 use_targets = false                     # true: targets.csv says where the crane's readings lie in the yard
+# magnet = "magnet.toml"                # whose [offset] is taken off what the crane gets
 """
 
 
 @dataclass(frozen=True)
 class CommissionSettings:
-    """Settings of a commissioning. key: of the signature, beside the settings' file."""
+    """Settings of a commissioning. girder_y_m, rails_x_m: as `barsight calibrate yard` takes them. magnet,
+    key: files beside the settings' own; key: of the signature.
+    """
 
     yard: str = ""
     signer: str = ""
     board: str = "checkerboard:9x6:0.025"
     range_m: float = 7.0
     use_targets: bool = False
+    use_tags: bool = False
+    girder_y_m: tuple[float, float] | None = None
+    rails_x_m: tuple[float, float] | None = None
+    magnet: str | None = None
     key: str | None = None
 
     def __post_init__(self) -> None:
         expect_values(self)
         expect_ranges(self, "commission.", range_m=POSITIVE)
+        if self.use_tags and self.use_targets:
+            raise ConfigError("commission: use_tags and use_targets both place the yard; take one of them")
+        if self.girder_y_m is not None and not self.use_tags:
+            raise ConfigError("commission: girder_y_m needs use_tags")
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import t as student
 
 from barsight.acceptance.budget import BudgetedLoad, ErrorSource
 from barsight.acceptance.certificate import REMEDY as OTHER
 from barsight.acceptance.certificate import read_certificate
 from barsight.acceptance.observation import ViewGeometry, view_geometry
+from barsight.acceptance.uncertainty import COVERAGE
 from barsight.acceptance.yard_area import measured_rig
 from barsight.core.arrays import Float64
 from barsight.core.errors import InputError, MeasurementError
@@ -20,11 +22,15 @@ from barsight.core.reading.bounded_reading import in_range
 from barsight.registration.yard_file import read_yard_file
 from barsight.result_folder import open_folder, read_heights
 from barsight.yard.inventory.bundle_file import read_bundles
+from barsight.yard.magnet.description import MAX_OFFSET_M, MagnetOffset
 from barsight.yard.types import Bundle, YardMap
 from barsight.yard.weight import bundle_mass
 
 REMEDY = "measure the recording again"
 MAX_SIGMA_PX = 100.0
+MIN_TOUCHES = 3
+MAX_APART_M = 0.1
+"""Touch-downs further apart than this along one axis aren't of one magnet at rest."""
 EXPANSION_PER_K = 23e-6
 """Of an aluminium bar that carries the cameras."""
 
@@ -42,10 +48,12 @@ class MeasuredLoad:
 
 
 def measured_load(
-    folder: Path, number: int | None, certificate: Path | None, temperature_k: float
-) -> MeasuredLoad:
+    folder: Path, number: int | None, certificate: Path | None, temperature_k: float,
+    offset: MagnetOffset | None = None,
+) -> MeasuredLoad:  # fmt: skip
     """Gather a bundle's sources. number: its id, the surest one where None. temperature_k: largest change
-    since the calibration.
+    since the calibration. offset: of the magnet, which is taken off the crane's target; without it the
+    certificate's touch-downs count whole.
 
     Raises InputError, or MeasurementError where the folder has no such bundle.
     """
@@ -66,11 +74,11 @@ def measured_load(
             "temperature of the rig", ("baseline",), np.array([[change**2]]),
             f"up to {temperature_k:g} K of aluminium", "rectangular",
         ),
-        *_fit_sources(bundle, heights),
+        *fit_sources(bundle, heights),
     ]  # fmt: skip
     frame, origin = _frame_source(summary, assumed)
     sources += frame
-    sources += _magnet_source(certificate, assumed)
+    sources += _magnet_source(certificate, assumed) if offset is None else _offset_sources(offset)
     mass = bundle_mass(bundle)
     top = np.array([bundle.centre_m[0], bundle.centre_m[1], bundle.top_z_m])
     load = BudgetedLoad(top, bundle.yaw_rad, bundle.length_m, bundle.width_m, mass.kg)
@@ -97,7 +105,8 @@ def _chosen(folder: Path, number: int | None) -> Bundle:
     return max(bundles, key=lambda one: (not any(one.ends_open), one.confidence))
 
 
-def _fit_sources(bundle: Bundle, heights: YardMap) -> list[ErrorSource]:
+def fit_sources(bundle: Bundle, heights: YardMap) -> list[ErrorSource]:
+    """Take what matching, travel and fit leave open of a bundle, as its file and the map say."""
     row = round((bundle.centre_m[1] - heights.y0_m) / heights.cell_m)
     column = round((bundle.centre_m[0] - heights.x0_m) / heights.cell_m)
     part = heights.part(
@@ -149,6 +158,65 @@ def _magnet_source(certificate: Path | None, assumed: list[str]) -> list[ErrorSo
     if len(sources) < 3:
         assumed.append("no touch-downs along all axes: the magnet is taken to hang where the crane says")
     return sources
+
+
+def _offset_sources(offset: MagnetOffset) -> list[ErrorSource]:
+    """Take the sigma of a known offset, which already covers how few touch-downs there were."""
+    return [
+        ErrorSource("camera to magnet", (f"magnet_{axis}",), np.array([[sigma**2]]), "calibrate magnet")
+        for axis, sigma in zip("xyz", offset.sigma_m, strict=True)
+    ]
+
+
+def touched_offset(certificate: Path) -> MagnetOffset:
+    """Average the touch-downs of a certificate: how far the magnet hangs from where the crane's readings say.
+
+    The sigma of a mean is the larger of the scatter and what the readings' own sigma leaves, over the root of
+    their number, and covers 95.45 % by Student's t. Raises InputError where the certificate can't carry one.
+    """
+    told, touches = read_certificate(certificate), _touch_errors_m(certificate)
+    try:
+        _expect_sound(certificate, told)
+        rows = [row for row in told["quantities"] if row["group"] == "touch_mm"]
+        own_m = 1e-3 * max((float(row["uncertainty"]["sigma"]) for row in rows), default=0.0)
+        ids = str(told["calibration_id"]), str(told["yard_frame_id"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(certificate, f"is torn ({type(error).__name__}: {error})", OTHER) from error
+    told_by = [_mean_touch_m(certificate, axis, touches.get(axis, []), own_m) for axis in "xyz"]
+    (x, x_sigma), (y, y_sigma), (z, z_sigma) = told_by
+    max_m = max(abs(x), abs(y), abs(z))
+    if max_m > MAX_OFFSET_M:
+        problem = f"the magnet hangs {1e3 * max_m:.0f} mm off: that is the rig's lever arm"
+        raise InputError(certificate, problem, "correct p_crane_body in crane0/sensor.yaml and accept again")
+    return MagnetOffset(x, y, z, x_sigma, y_sigma, z_sigma, *ids)
+
+
+def _expect_sound(certificate: Path, told: dict[str, Any]) -> None:
+    """Raise InputError where the rig wasn't accepted, but for its touch-downs, or an offset was taken off."""
+    if told.get("magnet_offset") is not None:
+        raise InputError(certificate, "was made with a magnet's offset", "accept without --magnet first")
+    wrong = [str(one["name"]) for one in told["causes"]]
+    wrong += [
+        str(row["name"])
+        for row in told["quantities"]
+        if row["group"] != "touch_mm" and row["decision"] != "passed"
+    ]
+    if wrong:
+        raise InputError(certificate, f"its rig isn't accepted ({wrong[0]})", "mend the rig, then touch down")
+
+
+def _mean_touch_m(certificate: Path, axis: str, errors_m: list[float], own_m: float) -> tuple[float, float]:
+    """Average one axis; its sigma. own_m: sigma of one reading."""
+    errors = np.array(errors_m)
+    if len(errors) < MIN_TOUCHES:
+        problem = f"has {len(errors)} touch-downs that tell {axis}, {MIN_TOUCHES} are the least"
+        raise InputError(certificate, problem, "touch spheres or dummy bundles; a plate tells z only")
+    if np.ptp(errors) > MAX_APART_M:
+        problem = f"its touch-downs lie {1e3 * np.ptp(errors):.0f} mm apart along {axis}"
+        raise InputError(certificate, problem, "touch down again, the magnet at rest")
+    few = float(student.ppf((1 + COVERAGE) / 2, len(errors) - 1)) / 2
+    sigma = few * max(float(errors.std(ddof=1)), own_m, 1e-5) / len(errors) ** 0.5
+    return float(errors.mean()), sigma
 
 
 def _touch_errors_m(certificate: Path) -> dict[str, list[float]]:

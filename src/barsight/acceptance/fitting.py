@@ -21,6 +21,9 @@ STEP_M = 0.02
 """Steps in which a place is sought; the fit goes on from the best."""
 NEAR_M = 0.02
 """A height further off isn't the artefact's."""
+LEVEL_RATIO, LEVEL_M = 5.0, 0.001
+"""Heights so many times further off than half of a plate's are no more level with it, and the least of that:
+the floor round a low plate isn't."""
 TIGHT_RATIO = 0.07
 """Share of the radius by which a sphere's heights may be off at last."""
 ROUND_RATIO = 0.75
@@ -159,7 +162,8 @@ def _plate_shift(
             inner = _inside(at, half - EDGE_M)
             if inner.sum() < MIN_SHARE * expected:
                 continue
-            level = np.abs(points[:, 2] - np.median(points[inner, 2])) < NEAR_M
+            off = np.abs(points[:, 2] - np.median(points[inner, 2]))
+            level = off < np.clip(LEVEL_RATIO * np.median(off[inner]), LEVEL_M, NEAR_M)
             beside = _inside(at, half + EDGE_M) & ~_inside(at, half)
             score = (
                 (inner & level).sum() - (beside & level).sum() - 0.01 * expected * np.hypot(dx, dy) / search_m

@@ -32,6 +32,8 @@ SPHERES = (
 BARS = (("bar along", "monument 3", "monument 5"), ("bar across", "monument 4", "monument 5"),
         ("bar aslant", "monument 1", "monument 4"))  # fmt: skip
 DUMMY = ("dummy bundle", 0.64, 0.5)
+BAR_PX = 12.5
+"""Width of a dummy bundle's bar in pixels on the floor."""
 FLOOR_M = 0.05
 """Greatest height of floor."""
 
@@ -94,7 +96,7 @@ def lay_out(area: Area, yard: str, floor: YardMap | None = None) -> AcceptancePl
             HeightStep(f"step {k}", "plate 1", name, round(tops[name] - tops["plate 1"], 3))
             for k, name in enumerate((n for n in tops if tops[n] > tops["plate 1"]), 1)
         ),
-        (_dummy(places[DUMMY[0]]),), (), _limits(area),
+        (_dummy(places[DUMMY[0]], area.ground_px_m),), (), _limits(area),
     )  # fmt: skip
 
 
@@ -116,12 +118,13 @@ def _bars(spheres: tuple[Sphere, ...]) -> tuple[SphereBar, ...]:
     )
 
 
-def _dummy(place: Float64) -> DummyBundle:
-    """Take nineteen bars of 60 mm, hexagonally packed, 1.4 m long."""
-    diameter, pitch = 0.06, 0.06 * 1.003
+def _dummy(place: Float64, ground_px_m: float) -> DummyBundle:
+    """Take seven bars, hexagonally packed, 1.4 m long, each wide enough to be told from the next."""
+    diameter = round(float(np.clip(BAR_PX * ground_px_m, 0.06, 0.15)), 2)
+    pitch = 1.003 * diameter
     return DummyBundle(
-        DUMMY[0], float(place[0]), float(place[1]), 3.0, 1.4, round(4 * pitch + diameter, 4),
-        round(2 * pitch * 3**0.5 + diameter, 4), 19, diameter,
+        DUMMY[0], float(place[0]), float(place[1]), 3.0, 1.4, round(2 * pitch + diameter, 4),
+        round(pitch * 3**0.5 + diameter, 4), 7, diameter,
     )  # fmt: skip
 
 

@@ -78,7 +78,8 @@ def findings(content: dict[str, Any]) -> list[str]:
     lines = []
     for one in content["causes"]:
         value, sigma = (_plain(one[name], 3) for name in ("value", "sigma"))
-        lines.append(f"Cause: {one['name']}, {value} ± {sigma} {one['unit']}.")
+        words = " or ".join([one["name"], *one["alike"]])
+        lines.append(f"Cause: {words}, {value} ± {sigma} {one['unit']}.")
     for number, one in enumerate(content["rig"], 1):
         lines.append(f"Rig against the crane's travel, recording {number}: {one['state']}.")
     return lines + [f"Warning of the measurement: {code}." for code in content["warnings"]]

@@ -24,6 +24,7 @@ from barsight.artefacts.plan import (
 )
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
+from barsight.yard.magnet.description import MagnetOffset
 from barsight.yard.types import Bundle
 from barsight.yard.weight import bundle_mass
 
@@ -59,9 +60,13 @@ class JudgedQuantity:
     reason: str = ""
 
 
-def judge_all(plan: AcceptancePlan, seen: Sequence[Observation]) -> tuple[JudgedQuantity, ...]:
-    """Judge every quantity that the plan names, over all recordings."""
-    judge = _Judge(plan, seen)
+def judge_all(
+    plan: AcceptancePlan, seen: Sequence[Observation], offset: MagnetOffset | None = None
+) -> tuple[JudgedQuantity, ...]:
+    """Judge every quantity that the plan names, over all recordings. offset: of the magnet, which is taken
+    off what the crane gets.
+    """
+    judge = _Judge(plan, seen, offset)
     judged = [
         *(q for one in plan.plate for q in judge.plate(one)),
         *(q for one in plan.sphere for q in judge.sphere(one)),
@@ -84,8 +89,10 @@ def decide(error: float, expanded: float, limit: float) -> Decision:
 
 
 class _Judge:
-    def __init__(self, plan: AcceptancePlan, seen: Sequence[Observation]) -> None:
-        self._plan, self._seen, self._limits = plan, seen, plan.limits
+    def __init__(
+        self, plan: AcceptancePlan, seen: Sequence[Observation], offset: MagnetOffset | None
+    ) -> None:
+        self._plan, self._seen, self._limits, self._offset = plan, seen, plan.limits, offset
 
     def plate(self, one: Plate) -> Iterator[JudgedQuantity]:
         found = [view.plates[one.name] for view in self._seen]
@@ -151,13 +158,20 @@ class _Judge:
     def touch(self, one: TouchDown) -> Iterator[JudgedQuantity]:
         tops = [_top(view, one.on, self._plan.artefacts) for view in self._seen]
         crane = np.array([one.x_m, one.y_m, one.z_m])
+        if self._offset is not None:
+            crane = crane + self._offset.place_m
         off = [np.full(3, nan) if isinstance(top, Failed) else 1e3 * (top - crane) for top in tops]
-        part = self._own(one.sigma_m, "the crane's place at the touch-down")
+        parts = [[self._own(one.sigma_m, "the crane's place at the touch-down")] for _ in range(3)]
+        if self._offset is not None:
+            for row, sigma_m in zip(parts, self._offset.sigma_m, strict=True):
+                row.append(
+                    UncertaintyPart("offset of the magnet", 1e3 * sigma_m, measured_by="calibrate magnet")
+                )
         for k, axis in enumerate("xyz"):
             errors = [o[k] for o in off]
             if all(np.isnan(errors)) and not all(isinstance(top, Failed) for top in tops):
                 continue  # a plate shows its height only
-            yield self._judged(f"{one.name}: {axis}", "touch_mm", errors, [part], _why(tops))
+            yield self._judged(f"{one.name}: {axis}", "touch_mm", errors, parts[k], _why(tops))
 
     def laser(self) -> Iterator[JudgedQuantity]:
         for profile in sorted({row.profile for view in self._seen for row in view.laser}):

@@ -1,4 +1,6 @@
-"""Spread work over threads with its order kept and its memory bounded."""
+"""Spread work over threads with its order kept and its memory bounded; where NUMBA_NUM_THREADS is 1, no other
+thread is begun.
+"""
 
 from __future__ import annotations
 
@@ -28,6 +30,9 @@ def ordered_map(
     For functions that release the interpreter (OpenCV, compiled kernels). An exception of the function comes
     out at its item's turn; leaving the loop early waits for the items under way and drops the rest.
     """
+    if _is_alone():
+        yield from map(function, items)
+        return
     pool = ThreadPoolExecutor(workers)
     waiting: deque[Future[Result]] = deque()
     try:
@@ -51,6 +56,9 @@ def prefetched_map(
     At most `max_waiting` results are under way or wait. An exception of the function or the items comes out
     at its turn; leaving waits for what is under way and drops the rest.
     """
+    if _is_alone():
+        yield map(function, items)
+        return
     pool, reader = ThreadPoolExecutor(workers), ThreadPoolExecutor(1)
     at_once, room, left = Semaphore(1), Semaphore(max_waiting), Event()
     begun: SimpleQueue[Future[Result] | None] = SimpleQueue()
@@ -93,6 +101,9 @@ def prefetch(items: Iterable[Item], count: int = 1) -> Iterator[Item]:
 
     An exception of the items comes out at its turn; leaving early waits for the item under way.
     """
+    if _is_alone():
+        yield from items
+        return
     end = object()
     pool = ThreadPoolExecutor(1)
     source = iter(items)
@@ -114,10 +125,24 @@ def in_background(work: Callable[[], Result]) -> Iterator[Future[Result]]:
     """Run `work` in a background thread while the block under it runs; what it raises comes out where its
     result is asked for, at the latest at the block's end.
     """
+    if _is_alone():
+        done = Future[Result]()
+        try:
+            done.set_result(work())
+        except Exception as error:
+            done.set_exception(error)
+        yield done
+        done.result()
+        return
     with ThreadPoolExecutor(1) as pool:
         working = pool.submit(work)
         yield working
         working.result()
+
+
+def _is_alone() -> bool:
+    """Tell whether this process was given a single thread, as each of several that share the cores is."""
+    return bool(numba.config.NUMBA_NUM_THREADS == 1)
 
 
 def parallel_bands(work: Callable[[int, int], None], rows: int, band_rows: int) -> None:

@@ -14,7 +14,7 @@ from barsight.fleet.limits import thread_variables
 
 with extra("fleet"):
     import dask
-    from distributed import Client, LocalCluster, as_completed
+    from distributed import CancelledError, Client, LocalCluster, as_completed
 
 T = TypeVar("T")
 _LOST = 1000
@@ -35,8 +35,10 @@ def connect(workers: int, scheduler: str | None, threads: int = 0) -> Iterator[A
 
     Raises ConfigError for an address that is none, InputError for a scheduler that doesn't answer.
     """
-    logging.getLogger("distributed").setLevel(logging.ERROR)
+    for name in ("distributed", "distributed.client"):  # each has a level of its own; what matters is raised
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     options = {
+        "distributed.nanny.pre-spawn-environ.DASK_LOGGING__DISTRIBUTED": "critical",
         "distributed.scheduler.allowed-failures": _LOST, "distributed.worker.daemon": False,
         "distributed.worker.memory.terminate": False, "distributed.worker.memory.pause": False,
         "distributed.worker.memory.spill": False, "distributed.worker.memory.target": False,
@@ -55,8 +57,7 @@ def connect(workers: int, scheduler: str | None, threads: int = 0) -> Iterator[A
         with (
             LocalCluster(
                 n_workers=workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0",
-                host="127.0.0.1", memory_limit=0,
-                env={"DASK_LOGGING__DISTRIBUTED": "critical", **thread_variables(threads)},
+                host="127.0.0.1", memory_limit=0, env=thread_variables(threads),
             ) as cluster,
             Client(cluster, set_as_default=False) as client,
         ):  # fmt: skip
@@ -77,17 +78,18 @@ def run_all(
     None for one that was lost. may_go_on: asked before each, and again while others run; where it refuses and
     nothing runs, the rest is left.
 
-    Raises what a task raised.
+    Raises what a task raised, InputError where the scheduler is gone.
     """
     waiting = iter(tasks)
     running = as_completed(loop=client.loop)
     is_more = True
     while True:
-        while is_more and running.count() < ahead * slots(client) and may_go_on():
-            task = next(waiting, None)
-            is_more = task is not None
-            if is_more:
-                running.add(client.submit(_ended, run, task, settings, pure=False, retries=0))
+        with _told(client):
+            while is_more and running.count() < ahead * slots(client) and may_go_on():
+                task = next(waiting, None)
+                is_more = task is not None
+                if is_more:
+                    running.add(client.submit(_ended, run, task, settings, pure=False, retries=0))
         if running.is_empty():
             return
         with running.thread_condition:
@@ -95,11 +97,22 @@ def run_all(
                 running.thread_condition.wait(LOOK_S)
         while running.has_ready():
             future = next(running)
-            ended = future.result() if future.status == "finished" else None
+            with _told(client):
+                ended = future.result() if future.status == "finished" else None
             if isinstance(ended, Exception):
                 raise ended
             yield ended
             future.release()
+
+
+@contextmanager
+def _told(client: Any) -> Iterator[None]:
+    """Turn what Dask raises where its scheduler has died into one line."""
+    address = client.scheduler.address if client.scheduler else "the scheduler"
+    try:
+        yield
+    except (OSError, CancelledError) as error:
+        raise InputError(address, "no scheduler is there any more", "start it, then the run again") from error
 
 
 def _ended(run: Callable[[Any, Any], T], task: Any, settings: Any) -> T | Exception:

@@ -15,7 +15,7 @@ from barsight.core.reading.bounded_reading import in_range
 from barsight.core.reading.sealed_json import SEAL
 from barsight.fleet.ledger import result_note
 from barsight.fleet.objects import Objects
-from barsight.fleet.versions import FleetTask
+from barsight.fleet.versions import FleetTask, places
 
 FIGURES = ("x_m", "y_m", "top_z_m", "yaw_deg", "length_m", "width_m")
 """Figures of a bundle that are compared."""
@@ -45,8 +45,10 @@ class FigureChange:
 class RecordingComparison:
     """A recording under two versions.
 
-    only_before, only_after: numbers of bundles without a partner. vetoes: codes that appeared (+) and
-    vanished (-). intervals: mean half width of the 95 % interval by figure, before and after. seconds:
+    only_before, only_after: numbers of bundles without a partner. vetoes: of the whole map, codes that
+    appeared (+) and vanished (-); of lifts, codes that forbid more or fewer of them than before, and how many
+    are offered. intervals: mean half width of the 95 % interval by figure, before and after, None where no
+    bundle has one. seconds:
     measured, before and after. pictures: objects of the results, of the two reports' pictures.
     """
 
@@ -55,7 +57,7 @@ class RecordingComparison:
     only_before: tuple[int, ...]
     only_after: tuple[int, ...]
     vetoes: tuple[str, ...]
-    intervals: dict[str, tuple[float, float]]
+    intervals: dict[str, tuple[float | None, float | None]]
     seconds: tuple[float, float]
     pictures: tuple[str, str]
 
@@ -68,8 +70,9 @@ def compare_tasks(
 ) -> tuple[list[RecordingComparison], list[str]]:
     """Compare the recordings of two versions, told by their content; the others are named, with why."""
     old, new = ({task.manifest or task.key: task for task in tasks} for tasks in (before, after))
+    names = places((*before, *after))
     untold = [
-        f"{task.name or '.'} (of version {task.version.name} only)"
+        f"{names[task.key]} (of version {task.version.name} only)"
         for tasks, others in ((old, new), (new, old))
         for manifest, task in tasks.items()
         if manifest not in others
@@ -77,7 +80,7 @@ def compare_tasks(
     both = [manifest for manifest in new if manifest in old]
     compared = []
     for number, manifest in enumerate(both):
-        name = new[manifest].name or "."
+        name = names[new[manifest].key]
         one = compare_recording(results, name, old[manifest].key, new[manifest].key)
         if one is None:
             untold.append(f"{name} (not measured under both)")
@@ -99,15 +102,10 @@ def compare_recording(results: Objects, name: str, before: str, after: str) -> R
     changes = tuple(
         _change(name, i, figure, bundles[0][i], bundles[1][j]) for i, j in pairs.items() for figure in FIGURES
     )
-    vetoes = [_vetoes(results, folder) for folder in folders]
+    vetoes = _changed_vetoes(*(_vetoes(results, folder) for folder in folders))
     return RecordingComparison(
         name, changes, tuple(sorted(bundles[0].keys() - pairs.keys())),
-        tuple(sorted(bundles[1].keys() - set(pairs.values()))),
-        tuple(
-            sign + code
-            for sign, codes in (("+", vetoes[1] - vetoes[0]), ("-", vetoes[0] - vetoes[1]))
-            for code in sorted(codes)
-        ),
+        tuple(sorted(bundles[1].keys() - set(pairs.values()))), vetoes,
         {figure: _half_widths(figure, *bundles) for figure in FIGURES} if all(bundles) else {},
         (notes[0]["measured_s"], notes[1]["measured_s"]),
         (f"{folders[0]}/preview.png", f"{folders[1]}/preview.png"),
@@ -186,27 +184,42 @@ def _change(
     )
 
 
-def _vetoes(results: Objects, folder: str) -> set[str]:
-    """Read the codes that forbid: of the whole map, and of each refused lift with how often."""
+def _vetoes(results: Objects, folder: str) -> tuple[set[str], Counter[str]]:
+    """Read the codes that forbid all lifts, and for each other one how many lifts it forbids; those that are
+    offered are counted as `offered`.
+    """
     path = f"{folder}/lifts.json"
     content = _document(results, path)
     try:
-        codes = [_code(one) for one in content.get("vetoes", [])]
-        counted = Counter(_code(one) for one in content.get("refused", []))
+        whole = {str(one["code"]) for one in content["vetoes"]}
+        counted = Counter(
+            code
+            for lift in content["refused"]
+            for code in {str(one["code"]) for one in lift["vetoes"]} - whole
+        )
+        counted["offered"] = len(content["lifts"])
     except _UNREAD as error:
         raise _torn(results, path, error) from error
-    return {*codes, *(f"{code} x{count}" for code, count in counted.items())}
+    return whole, counted
 
 
-def _code(one: Any) -> str:
-    return str(one.get("code", one.get("reason", "refused"))) if isinstance(one, dict) else str(one)
+def _changed_vetoes(
+    before: tuple[set[str], Counter[str]], after: tuple[set[str], Counter[str]]
+) -> tuple[str, ...]:
+    told = [f"+{code}" for code in sorted(after[0] - before[0])]
+    told += [f"-{code}" for code in sorted(before[0] - after[0])]
+    for code in sorted(before[1].keys() | after[1].keys()):
+        old, new = before[1][code], after[1][code]
+        if old != new and code not in before[0] | after[0]:
+            told.append(f"{code} {old} to {new}")
+    return tuple(told)
 
 
 def _half_widths(
     figure: str, before: dict[int, dict[str, float]], after: dict[int, dict[str, float]]
-) -> tuple[float, float]:
-    def mean(found: dict[int, dict[str, float]]) -> float:
+) -> tuple[float | None, float | None]:
+    def mean(found: dict[int, dict[str, float]]) -> float | None:
         known = [s for one in found.values() if math.isfinite(s := one[f"{figure} sigma"])]
-        return 1.96 * sum(known) / max(1, len(known))
+        return 1.96 * sum(known) / len(known) if known else None
 
     return mean(before), mean(after)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
+from statistics import mean
 
-from barsight.fleet.comparing import RecordingComparison
-from barsight.fleet.findings import LEVEL, Findings
+from barsight.fleet.comparing import FIGURES, RecordingComparison
+from barsight.fleet.findings import LEVEL, MIN_RECORDINGS, Findings
 from barsight.fleet.objects import Objects
 
 MAX_LISTED = 100
@@ -61,7 +62,8 @@ def comparison_page(findings: Findings, pictures: dict[str, tuple[str, str]]) ->
         _table(
             ("figure", "recordings", "mean shift", "chance", ""),
             [
-                (s.figure, str(s.recordings), f"{s.shift:+.5f}", f"{s.p:.2g}", "found" if s.is_found else "")
+                (s.figure, str(s.recordings), f"{s.shift:+.5f}",
+                 f"{s.p:.2g}" if s.recordings >= MIN_RECORDINGS else "too few", "found" if s.is_found else "")
                 for s in findings.shifts
             ],
         ),
@@ -78,13 +80,13 @@ def comparison_page(findings: Findings, pictures: dict[str, tuple[str, str]]) ->
         _table(
             ("recording", "vetoes", "bundles gone", "bundles new", "pictures"),
             [
-                (one.recording, " ".join(one.vetoes), _numbers(one.only_before), _numbers(one.only_after),
+                (one.recording, ", ".join(one.vetoes), _numbers(one.only_before), _numbers(one.only_after),
                  pictures[one.recording])
                 for one in _other(findings)
             ],
         ),
-        "<h2>Half widths of the 95 % intervals, mean over the recordings</h2>",
-        _table(("figure", "before", "after"), _intervals(findings)),
+        "<h2>Half widths of the 95 % intervals, mean over the recordings that have both</h2>",
+        _table(("figure", "before", "after", "recordings"), _intervals(findings)),
         f"<h2>Times</h2><p>Median seconds: {findings.seconds[0]:.2f} and {findings.seconds[1]:.2f}.</p>",
     ]  # fmt: skip
     if findings.untold:
@@ -96,13 +98,12 @@ def comparison_page(findings: Findings, pictures: dict[str, tuple[str, str]]) ->
 
 
 def _intervals(findings: Findings) -> list[tuple[str, ...]]:
-    told = [one.intervals for one in findings.recordings if one.intervals]
-    if not told:
-        return []
     rows = list[tuple[str, ...]]()
-    for figure in told[0]:
-        before, after = (sum(one[figure][side] for one in told) / len(told) for side in (0, 1))
-        rows.append((figure, f"{before:.4f}", f"{after:.4f}"))
+    for figure in FIGURES:
+        told = [one.intervals[figure] for one in findings.recordings if one.intervals]
+        known = [(before, after) for before, after in told if before is not None and after is not None]
+        means = (f"{mean(one[side] for one in known):.4f}" if known else "not known" for side in (0, 1))
+        rows.append((figure, *means, str(len(known))))
     return rows
 
 

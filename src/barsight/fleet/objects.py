@@ -13,7 +13,7 @@ from typing import Any
 from barsight.core.errors import ConfigError, InputError, OutputError
 from barsight.core.extras import extra
 from barsight.core.files import translated_os_errors
-from barsight.core.reading.bounded_reading import MAX_DOCUMENT_BYTES, parse_json
+from barsight.core.reading.bounded_reading import MAX_DOCUMENT_BYTES, open_regular, parse_json
 from barsight.core.reading.json_schema import expect_schema
 
 with extra("fleet"):
@@ -67,7 +67,7 @@ class Objects:
         """
         with _told(f"{self.url}/{path}"):
             try:
-                found = obstore.get(self.store, path)
+                found = self._get(path)
             except FileNotFoundError:
                 return None
             self.expect_size(path, found.meta["size"], MAX_DOCUMENT_BYTES)
@@ -120,11 +120,18 @@ class Objects:
         """Read a large object in parts. Raises InputError where there is none."""
         with _told(f"{self.url}/{path}"):
             try:
-                found = obstore.get(self.store, path)
+                found = self._get(path)
             except FileNotFoundError:
                 raise InputError(f"{self.url}/{path}", "is gone", "plan the archive again") from None
             for part in found.stream(min_chunk_size=_LARGE):
                 yield bytes(part)
+
+    def _get(self, path: str) -> Any:
+        """Open an object. In a folder it must be a regular file: a pipe there would be waited for."""
+        file = Path(self.url) / path
+        if isinstance(self.store, LocalStore) and file.exists():
+            open_regular(file).close()
+        return obstore.get(self.store, path)
 
     def upload(self, file: Path, path: str) -> None:
         """Write a file as an object. Raises OutputError where it can't be."""

@@ -6,6 +6,7 @@ import functools
 import hashlib
 import json
 import socket
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path, PurePosixPath
@@ -83,6 +84,16 @@ class FleetTask:
     archive: str
     size: int = 0
     pairs: int = 0
+
+
+def places(tasks: Iterable[FleetTask]) -> dict[str, str]:
+    """Name tasks, by key: their paths in the archive, with the archive's URL where there are several."""
+    listed = list(tasks)
+    is_one = len({task.archive for task in listed}) == 1
+    return {
+        task.key: task.name or task.archive if is_one else f"{task.archive}/{task.name}".rstrip("/")
+        for task in listed
+    }
 
 
 def publish_version(

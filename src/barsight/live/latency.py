@@ -24,15 +24,18 @@ contradicts the stamps.
 def latencies(link: Link, board: Counters, lifts_s: float | None) -> dict[str, Any]:
     """Build the content of latency.json. lifts_s: from the last frame's exposure to the lifts, if they came.
 
-    A pose counts from its exposure to where it is published, a tile from its keyframe's exposure to where the
-    keyframe is fused; keyframes that only the end fused have none.
+    A pose counts from the time that it is of to where it is written (as fast as possible none counts), a pair
+    from its exposure to its pose by pictures, a tile from its keyframe's exposure to where the keyframe is
+    fused; keyframes that only the end fused have none.
     """
-    poses = [done - exposed for _, exposed, done, _, has_pose in link.frames().read() if has_pose]
+    poses = [late for _, late in link.outputs().read()]
+    pairs = [done - exposed for _, exposed, done, _, has_pose in link.frames().read() if has_pose]
     tiles = [done - exposed for _, exposed, done in link.tiles().read()]
     return {
         "schema_version": 1,
         "speed": link.source.speed,
         "pose_s": spread([ns / NS_PER_S for ns in poses]),
+        "pair_s": spread([ns / NS_PER_S for ns in pairs]),
         "tile_s": spread([ns / NS_PER_S for ns in tiles]),
         "lifts_s": spread([] if lifts_s is None else [lifts_s]),
         "frames": counts(board),

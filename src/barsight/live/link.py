@@ -13,6 +13,7 @@ from barsight.live.shared.counters import Counters
 from barsight.live.shared.logs import NumberLog, ReadingLog
 from barsight.live.shared.ring import PairRing
 from barsight.measure_settings import MeasureSettings
+from barsight.motion.fixed_lag.propagation import ROW_NUMBERS
 from barsight.recording.base import FrameIndex, Recording
 from barsight.recording.open import open_recording
 from barsight.recording.packets import PacketRecording
@@ -79,6 +80,14 @@ class Link:
     def readings(self, sensor: str) -> ReadingLog:
         """Open the log of `imu` or `crane`."""
         return ReadingLog(self.folder / f"{sensor}.log", {"imu": 6, "crane": 3}[sensor])
+
+    def states(self) -> ReadingLog:
+        """Open the log of the states that poses are propagated from (IMU's clock)."""
+        return ReadingLog(self.folder / "states.log", ROW_NUMBERS)
+
+    def outputs(self) -> NumberLog:
+        """Open the log of the poses written: stamp, and how long after it (ns)."""
+        return NumberLog(self.folder / "outputs.log")
 
     def frames(self) -> NumberLog:
         """Open the log of tracked frames: stamp, exposure and end (ns, monotonic), is kept, has a pose."""

@@ -40,6 +40,10 @@ class LiveSettings:
     """A camera without pictures for so many of its intervals, at least 0.3 s, is out."""
     hang_s: float = 30.0
     """A process that hasn't gone round its loop for so long hangs: it is ended and started anew."""
+    pose_rate_hz: float = 30.0
+    """Poses that are written a second."""
+    max_predicted_s: float = 2.0
+    """IMU and encoders carry the last pair's pose on for so long; then no pose is written."""
     health_every_s: float = 1.0
     """Interval between writings of health.json and health.prom."""
 
@@ -49,7 +53,7 @@ class LiveSettings:
             self, "live.", ring_pairs=(2, 1000), keyframe_way_m=(0, 10), still_pairs=(0, 1000),
             passed_every_s=(0, 60), imu_silence_s=(0.02, 10), encoder_silence_s=(0.02, 10),
             camera_silence_intervals=(1.5, 100), hang_s=(1, 3600),
-            health_every_s=(0.1, 60),
+            pose_rate_hz=(0.1, 200), max_predicted_s=(0, 60), health_every_s=(0.1, 60),
         )  # fmt: skip
 
 

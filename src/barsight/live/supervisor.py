@@ -18,6 +18,7 @@ from barsight.live.capture import capture
 from barsight.live.link import Link
 from barsight.live.mapper import build_live_map
 from barsight.live.modes import FOR_LIFTS, FreezeWatch, JumpWatch, Mode, SensorActivity, judge_mode
+from barsight.live.pose_output import output_poses
 from barsight.live.record import DRAIN, record
 from barsight.live.shared.counters import Counters
 from barsight.live.source import ReplayClock
@@ -26,7 +27,7 @@ from barsight.live.survey import SurveyWatch
 from barsight.live.track import track
 
 PROCESSES: dict[str, Callable[[Link], None]] = {
-    "capture": capture, "track": track, "map": build_live_map, "record": record,
+    "capture": capture, "track": track, "pose": output_poses, "map": build_live_map, "record": record,
 }  # fmt: skip
 BEAT_S = 0.1
 """Interval between judgements of the mode and looks after the processes."""
@@ -148,6 +149,7 @@ class Supervisor:
         done = {
             "capture": self._board["capture", "ended"],
             "track": self._board["track", "done"],
+            "pose": 0,
             "map": 0,
             "record": 0,
         }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import replace
 
@@ -14,13 +13,13 @@ from barsight.core.arrays import Float64
 from barsight.core.compiling.ahead import load_kernels
 from barsight.core.errors import Failed, MeasurementError
 from barsight.core.files import atomic_path
-from barsight.core.json_values import DIGITS, json_value
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame, StereoFrame
 from barsight.live.link import GrowingRecording, Link
 from barsight.live.shared.counters import Counters
 from barsight.live.shared.ring import CapturedPair, PairRing
 from barsight.motion.estimator import PoseEstimator
+from barsight.motion.fixed_lag.estimator import FixedLagPoses
 from barsight.motion.settings import make_estimator
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.recording.sensor_selection import SelectedSensors
@@ -66,7 +65,7 @@ class Tracking:
         self._link, self._recording, self._board, self._ring = link, recording, board, ring
         self._rectifier = Rectifier(recording.rig)
         self._pairs = RectifiedPairs(recording, self._rectifier, link.checkpoints)
-        self._frames = link.frames()
+        self._frames, self._states = link.frames(), link.states()
         self._source = in_yard(SelectedSensors(recording, link.settings.use), link.settings.yard)
         motion = replace(link.settings.motion, estimator="live")
         self._estimator = make_estimator(motion)
@@ -100,7 +99,7 @@ class Tracking:
         has_pose = isinstance(posed, PosedFrame)
         self._board.add("track", "tracked" if has_pose else "not_placed")
         if isinstance(posed, PosedFrame):
-            _publish(posed, self._link)
+            self._tell_state()
         done_ns = time.monotonic_ns()
         for number in passed:
             self._keep_passed(self._ring.read(number))
@@ -112,6 +111,12 @@ class Tracking:
             with atomic_path(self._link.posed_file(stamp)) as path:
                 write_checkpoint(posed, path)
         self._frames.append((stamp, pair.exposed_ns, done_ns, is_kept, has_pose))
+
+    def _tell_state(self) -> None:
+        """Note the state for the process that writes poses."""
+        state = self._poses.navigation if isinstance(self._poses, FixedLagPoses) else None
+        if state is not None:
+            self._states.append(np.array([state.stamp_ns]), state.row[None])
 
     def _keep_passed(self, pair: CapturedPair | None) -> None:
         """Keep a pair that was passed over if it is far enough from the last one kept."""
@@ -181,17 +186,3 @@ class Tracking:
             return RefusedFrame(seen.stamp_ns, str(error))
         assert posed is not None, "the live estimator's poses are final at once"
         return posed
-
-
-def _publish(posed: PosedFrame, link: Link) -> None:
-    """Write the latest pose for readers, whole or not at all."""
-    pose = posed.reference_from_body
-    content = {
-        "stamp_ns": posed.stamp_ns,
-        "frame": pose.target,
-        "position_m": pose.translation,
-        "quaternion_xyzw": pose.quaternion_xyzw,
-        "sigma_m": np.sqrt(np.diag(posed.covariance)[3:]),
-    }
-    with atomic_path(link.folder.parent / "pose.json") as path:
-        path.write_text(json.dumps(json_value(content, DIGITS)) + "\n", encoding="utf-8")

@@ -178,7 +178,10 @@ def offered_lift(
     The magnet's class is the first step, from 1, that carries mass and two of its standard deviations.
     """
     record: dict[str, Any] = lift.record
-    target, tolerance, place = record["target"], record["tolerance"], record["set_down"] or {}
+    tolerance = record["tolerance"]
+    # An earlier version knew of no offset between the crane's readings and its magnet.
+    target = record.get("crane_target", record["target"])
+    place = record.get("crane_set_down", record["set_down"]) or {}
     heaviest_kg = record["mass_kg"] + 2 * record["mass_sigma_kg"]
     steps = [number for number, most in enumerate(magnet_steps_kg, 1) if most >= heaviest_kg]
     one = OfferedLift(

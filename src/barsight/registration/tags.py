@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -33,11 +33,14 @@ MIRRORED_RATIO = 0.2
 
 @dataclass(frozen=True, eq=False)
 class TagSighting:
-    """One tag in one pair. place_m: (3,) of its middle in the trajectory's frame. noise_m2: (3, 3) of it by
-    one pixel of noise in either picture; pose_m2: (3, 3) by the pose. rows_px: how far its rows differ
-    between the pictures; side_px: its shortest side; camera_m: (3,) where the left camera was.
+    """One tag in one pair. stamp_ns: of the pair; body_m: (3,) its middle in the body. place_m: (3,) that in
+    the trajectory's frame. noise_m2: (3, 3) of it by one pixel of noise in either picture; pose_m2: (3, 3) by
+    the pose. rows_px: how far its rows differ between the pictures; side_px: its shortest side; camera_m:
+    (3,) where the left camera was.
     """
 
+    stamp_ns: int
+    body_m: Float64
     place_m: Float64
     noise_m2: Float64
     pose_m2: Float64
@@ -74,6 +77,20 @@ class SeenTags:
         """Estimate the noise of a middle in one picture, by how rows differ between the pictures."""
         rows = [abs(one.rows_px) for seen in self.sightings.values() for one in seen]
         return max(MIN_SIGMA_PX, 1.4826 * float(np.median(rows)) / 2**0.5) if rows else MIN_SIGMA_PX
+
+    def moved(self, posed: dict[int, PosedFrame]) -> SeenTags:
+        """Place the sightings by other poses of the same pairs; those without one are left out."""
+        return SeenTags(
+            {
+                number: [
+                    replace(one, place_m=posed[one.stamp_ns].reference_from_body.apply(one.body_m[None])[0])
+                    for one in seen
+                    if one.stamp_ns in posed
+                ]
+                for number, seen in self.sightings.items()
+            },
+            self.twice, self.pairs,
+        )  # fmt: skip
 
     def place(self, number: int) -> PlacedTag | Failed:
         """Combine a tag's pairs. Failed `few-pairs`, `ambiguous`."""
@@ -144,7 +161,8 @@ def _triangulated(
     turn = body.rotation @ rectifier.body_from_rect0.rotation
     carry = np.hstack([-skew(body.rotation @ at), np.eye(3)])
     return TagSighting(
-        body.apply(at[None])[0], turn @ noise @ turn.T, carry @ frame.covariance @ carry.T,
+        frame.stamp_ns, at, body.apply(at[None])[0], turn @ noise @ turn.T,
+        carry @ frame.covariance @ carry.T,
         float(first[1] - second[1]),
         float(np.linalg.norm(flat_left - np.roll(flat_left, 1, axis=0), axis=1).min()),
         body.apply(rectifier.body_from_rect0.translation[None])[0],

@@ -79,7 +79,9 @@ def calibrate_yard(
             "too large: baseline or survey has a wrong metre (the scale is not corrected)"
         )
     off = yard - scaled.target_from_source.apply(measured)
-    sigma = _predicted(scaled, measured, covariance_m2, checks)
+    design = design_rows(measured @ scaled.target_from_source.rotation.T)
+    own = np.full(len(measured), scaled.sigma_m**2) if covariance_m2 is None else covariance_m2
+    sigma = predicted_sigma(design, scaled.covariance, own, checks)
     length = np.linalg.norm(off, axis=1)
     doubts += [
         f"check {names[k]} is {1e3 * length[k]:.1f} mm off, its sigma is {1e3 * sigma[k]:.1f} mm"
@@ -88,18 +90,16 @@ def calibrate_yard(
     return YardCalibration(scaled, inflation, names, yard, checks, off, sigma, tuple(doubts))
 
 
-def _predicted(
-    alignment: Alignment, measured: Float64, covariance_m2: Float64 | None, checks: Bool
-) -> Float64:
-    """Predict the RMS (N,) over the axes of a point's own noise and, for checks, of where the alignment puts
-    it.
+def predicted_sigma(design: Float64, covariance: Float64, own_m2: Float64, checks: Bool) -> Float64:
+    """Predict the RMS (N,) over the axes of a point's own noise and, for checks, of where the fit puts it.
+
+    design (N, 3, P): how points answer to what was fitted, covariance (P, P) of that. own_m2: variance (N,)
+    of a coordinate, or covariance (N, N) of the points or (N, 3, 3) of the axes.
     """
-    own = np.full(len(measured), alignment.sigma_m**2)
-    if covariance_m2 is not None and covariance_m2.ndim == 2:
-        own = np.diag(covariance_m2)
-    elif covariance_m2 is not None:
-        own = np.trace(covariance_m2, axis1=1, axis2=2) / 3
-    design = design_rows(measured @ alignment.target_from_source.rotation.T)
-    placed = np.einsum("nij,jk,nik->n", design, alignment.covariance, design) / 3
-    sigma: Float64 = np.sqrt(own + np.where(checks, placed, 0.0))
+    if own_m2.ndim == 2:
+        own_m2 = np.diag(own_m2)
+    elif own_m2.ndim == 3:
+        own_m2 = np.trace(own_m2, axis1=1, axis2=2) / 3
+    placed = np.einsum("nij,jk,nik->n", design, covariance, design) / 3
+    sigma: Float64 = np.sqrt(own_m2 + np.where(checks, placed, 0.0))
     return sigma

@@ -14,10 +14,14 @@ from barsight.core.arrays import Float64
 from barsight.core.errors import CalibrationError
 from barsight.core.pose import Pose, nearest_rotation
 from barsight.core.reading.bounded_reading import MAX_DOCUMENT_BYTES, read_bytes
+from barsight.registration.bending import BENDS, CraneBend
 from barsight.registration.yard import YardCalibration
 
 FRAMES = ("world", "encoders", "body")
 REMEDY = "take the file that barsight calibrate yard wrote"
+MAX_BENDS = (0.2, 0.02, 0.2)
+"""No crane in use bends more."""
+MIN_SPAN_M, MAX_SPAN_M = 1.0, 1000.0
 OWNERS = ("calibration_id", "mounting_id", "recording_id")
 
 
@@ -28,6 +32,7 @@ class YardFrame:
     yard_from_body: (3, 3) how the rig hangs, where crane moves told it. calibration_id: of the rig,
     mounting_id: of how the encoders say that it hangs, recording_id: of the inputs in whose frame the points
     were measured; None where the file doesn't say. doubts: of the calibration. digest: SHA-256 of the file.
+    bend: how the crane bends, which no encoder sees; None where it is taken to be stiff.
     """
 
     path: Path
@@ -39,6 +44,7 @@ class YardFrame:
     recording_id: str | None
     doubts: tuple[str, ...]
     digest: str
+    bend: CraneBend | None = None
 
     @property
     def attitude(self) -> Float64 | None:
@@ -47,9 +53,12 @@ class YardFrame:
 
 
 def write_yard_file(
-    path: Path, found: YardCalibration, hangs: Float64 | None, owners: dict[str, str | None]
-) -> None:
-    """Write a calibration. hangs: (3, 3) yard from body, or None. owners: values of `OWNERS`."""
+    path: Path, found: YardCalibration, hangs: Float64 | None, owners: dict[str, str | None],
+    bend: CraneBend | None = None,
+) -> None:  # fmt: skip
+    """Write a calibration. hangs: (3, 3) yard from body, or None. owners: values of `OWNERS`. bend: of the
+    crane, where it was fitted.
+    """
     pose = found.alignment.target_from_source
     content: dict[str, Any] = {
         "barsight_yard": 1,
@@ -64,6 +73,13 @@ def write_yard_file(
     }
     if hangs is not None:
         content["R_yard_body"] = hangs.tolist()
+    if bend is not None:
+        content["bend"] = {
+            "girder_y_m": list(bend.girder_y_m),
+            "rails_x_m": None if bend.rails_x_m is None else list(bend.rails_x_m),
+            **dict(zip(BENDS, bend.values.tolist(), strict=True)),
+            "covariance": bend.covariance.tolist(),
+        }
     write_document(path, content)
 
 
@@ -85,7 +101,7 @@ def read_yard_file(path: Path) -> YardFrame:
         path, pose, _covariance(document), _attitude(document), owners["calibration_id"],
         owners["mounting_id"], owners["recording_id"],
         tuple(str(one) for one in doubts) if isinstance(doubts, list) else (),
-        hashlib.sha256(read_bytes(path, MAX_DOCUMENT_BYTES)).hexdigest(),
+        hashlib.sha256(read_bytes(path, MAX_DOCUMENT_BYTES)).hexdigest(), _bend(document, frames[0]),
     )  # fmt: skip
 
 
@@ -102,8 +118,30 @@ def _rows(document: Document, key: str, size: int) -> Float64:
     return np.array(numbers, np.float64).reshape(size, size)
 
 
-def _covariance(document: Document) -> Float64:
-    covariance = _rows(document, "covariance", 6)
+def _bend(document: Document, frame: str) -> CraneBend | None:
+    if document.values.get("bend") is None:
+        return None
+    section = document.section("bend")
+    if frame != "encoders":
+        raise document.error("bend", "stands with a frame that isn't the encoders'", REMEDY)
+    has_rails = section.values.get("rails_x_m") is not None
+    girder, rails = _ends(section, "girder_y_m"), _ends(section, "rails_x_m") if has_rails else None
+    values = np.array([section.number(name) for name in BENDS])
+    for name, value, most in zip(BENDS, values, MAX_BENDS, strict=True):
+        if abs(value) > most:
+            raise section.error(name, f"can't be {value:g}", REMEDY)
+    return CraneBend(girder, rails, values, _covariance(section, 9))
+
+
+def _ends(section: Document, key: str) -> tuple[float, float]:
+    low, high = section.numbers(key, 2)
+    if not MIN_SPAN_M <= high - low <= MAX_SPAN_M:
+        raise section.error(key, f"can't be {low:g} to {high:g} m", REMEDY)
+    return low, high
+
+
+def _covariance(document: Document, size: int = 6) -> Float64:
+    covariance = _rows(document, "covariance", size)
     whole = (covariance + covariance.T) / 2
     off = np.abs(covariance - covariance.T).max()
     if off > 1e-6 * np.abs(whole).max() or np.linalg.eigvalsh(whole).min() < -1e-9 * np.abs(whole).max():

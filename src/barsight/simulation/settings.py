@@ -193,6 +193,33 @@ class TravelSettings:
 
 
 @dataclass(frozen=True)
+class GirderSettings:
+    """Bending of girder and rails, and a girder out of square: no encoder sees it."""
+
+    deflection_m: float = 0.0
+    """Deflection of the girder with the trolley in its middle: a parabola, 0 at its ends."""
+    ends_y_m: tuple[float, float] = (-10.0, 10.0)
+    """The crane point's Y with the trolley at either end of the girder."""
+    skew_mm_per_m: float = 0.0
+    """How far the crane point runs along X on a metre of the trolley's way: the girder isn't square to the
+    rails."""
+    rail_m: float = 0.0
+    """How much lower the rails lie in their middle than at their ends: a parabola."""
+    rail_ends_x_m: tuple[float, float] = (-10.0, 30.0)
+    """The crane point's X with the bridge at either end of the rails."""
+
+    def __post_init__(self) -> None:
+        expect_ranges(
+            self, "girder.", deflection_m=(-0.1, 0.1), skew_mm_per_m=(-10, 10), rail_m=(-0.1, 0.1),
+            ends_y_m=(-200, 200), rail_ends_x_m=(-1000, 1000),
+        )  # fmt: skip
+        spans = [high - low for low, high in (self.ends_y_m, self.rail_ends_x_m)]
+        _expect(
+            min(spans) >= 1, "girder.ends_y_m and rail_ends_x_m must be 1 m or more apart, the lower first"
+        )
+
+
+@dataclass(frozen=True)
 class SensorSettings:
     """IMU, encoders, laser and the clocks."""
 
@@ -304,6 +331,7 @@ class SimulationSettings:
     camera: CameraSettings = field(default_factory=CameraSettings)
     yard: YardSettings = field(default_factory=YardSettings)
     motion: TravelSettings = field(default_factory=TravelSettings)
+    girder: GirderSettings = field(default_factory=GirderSettings)
     sensors: SensorSettings = field(default_factory=SensorSettings)
     passes: PassesSettings = field(default_factory=PassesSettings)
     magnet: MagnetSettings = field(default_factory=MagnetSettings)

@@ -28,10 +28,9 @@ from barsight.simulation.sensors import EPOCH_NS, ImuRecord, record_encoders, re
 from barsight.simulation.settings import SimulationSettings
 from barsight.simulation.stock import Stock, stack_yard
 from barsight.simulation.textures import label_codes, surface_tile
-from barsight.simulation.trajectory import SimulatedTrajectory
+from barsight.simulation.trajectory import CRANE_TO_BODY_M, SimulatedTrajectory
 from barsight.simulation.truth import SurfaceTruth, bundle_rows, label_rows, true_depth, write_rig_truth
 
-CRANE_TO_BODY_M = (0.35, -0.2, -0.55)
 GROUND_TRUTH_HZ = 200
 REST_BEFORE_FRAME_S = 0.6
 STACK_M = 0.4
@@ -76,6 +75,7 @@ class World:
         trajectory = SimulatedTrajectory.plan(
             settings.length_m, settings.camera, settings.motion, mounted.nominal_yard_from_body,
             stream(settings, 3), stream(settings, 3, number) if number else None,
+            settings.girder,
         )  # fmt: skip
         return cls(settings, laid, mounted, trajectory, frame_stamps(settings, trajectory), number)
 

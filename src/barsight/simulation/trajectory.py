@@ -4,15 +4,16 @@ vibration, oscillation on springs, uneven rails.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
 
 from barsight.core.arrays import Float64
-from barsight.simulation.settings import CameraSettings, TravelSettings
+from barsight.simulation.settings import CameraSettings, GirderSettings, TravelSettings
 
 SMOOTHSTEP_PEAK_SLOPE = 1.875
+CRANE_TO_BODY_M = (0.35, -0.2, -0.55)
 RAIL_WAVE_M = (3.7, 5.3)
 """Lengths of the rails' waves, up and down and aside."""
 SKEW_WAVE_M = 6.1
@@ -99,11 +100,13 @@ class SimulatedTrajectory:
     legs: tuple[Leg, ...]
     settled_s: float
     duration_s: float
+    girder: GirderSettings = field(default_factory=GirderSettings)
 
     @classmethod
     def plan(
         cls, length_m: float, camera: CameraSettings, motion: TravelSettings,
         nominal_yard_from_body: Float64, rng: np.random.Generator, again: np.random.Generator | None = None,
+        girder: GirderSettings = GirderSettings(),  # noqa: B008
     ) -> SimulatedTrajectory:  # fmt: skip
         """Plan the travel from `overrun_m` before the stack to as far behind it.
 
@@ -122,7 +125,7 @@ class SimulatedTrajectory:
         settled = legs[-1].end_s + 1.0
         return cls(
             camera, motion, nominal_yard_from_body, phases, -motion.overrun_m, distance, tuple(legs),
-            settled, settled + motion.standstill_s,
+            settled, settled + motion.standstill_s, girder,
         )  # fmt: skip
 
     @property
@@ -133,8 +136,13 @@ class SimulatedTrajectory:
     def at(self, time_s: Float64) -> BodyMotion:
         """Evaluate the exact motion at (N,) instants."""
         t = np.asarray(time_s, dtype=np.float64)
-        x, y, z = (wheel + off for wheel, off in zip(self._wheels(t), self._springs(t), strict=True))
+        wheels = self._wheels(t)
+        bent, (tilt_x, tilt_y) = self._bent(wheels)
+        x, y, z = (
+            wheel + off + bend for wheel, off, bend in zip(wheels, self._springs(t), bent, strict=True)
+        )
         roll, pitch, yaw = self._turn(t)
+        roll, pitch = roll + tilt_x, pitch + tilt_y
         turn = _about_z(yaw.value) @ _about_y(pitch.value) @ _about_x(roll.value)
         e_x, e_y, e_z = np.eye(3)
         yawed = _about_z(yaw.value)
@@ -225,6 +233,22 @@ class SimulatedTrajectory:
         )
         return envelope * waves[0], envelope * waves[1] + aside, envelope * waves[2] + up
 
+    def _bent(self, wheels: tuple[Jet, Jet, Jet]) -> tuple[tuple[Jet, Jet, Jet], tuple[Jet, Jet]]:
+        """Bend girder and rails under the crane point: the body moves along x, y and z, and tilts about x and
+        y with the slope that it stands on.
+        """
+        girder, lever = self.girder, CRANE_TO_BODY_M
+        x, y = wheels[0].shifted(-lever[0]), wheels[1].shifted(-lever[1])
+        sag, slope_y = _parabola(y, girder.ends_y_m)
+        hollow, slope_x = _parabola(x, girder.rail_ends_x_m)
+        tilt_x, tilt_y = slope_y.scaled(-girder.deflection_m), slope_x.scaled(girder.rail_m)
+        aside = y.shifted(-sum(girder.ends_y_m) / 2).scaled(1e-3 * girder.skew_mm_per_m)
+        down = sag.scaled(-girder.deflection_m) + hollow.scaled(-girder.rail_m)
+        return (
+            aside + tilt_y.scaled(lever[2]), tilt_x.scaled(-lever[2]),
+            down + tilt_x.scaled(lever[1]) + tilt_y.scaled(-lever[0]),
+        ), (tilt_x, tilt_y)  # fmt: skip
+
     def _along(self, t: Float64, wave_m: float, number: int) -> Jet:
         """Wave over the way along X: the same at a place, whichever way the crane travels."""
         return self._way(t).scaled(2 * np.pi / wave_m).shifted(float(self.phases_rad[number])).sine()
@@ -238,6 +262,14 @@ class SimulatedTrajectory:
         yaw = self._wave(t, 0.37 * sway, 10).scaled(0.6 * swing)
         skew = self._along(t, SKEW_WAVE_M, 10).scaled(float(np.radians(self.motion.skew_deg)))
         return envelope * roll, envelope * pitch, envelope * yaw + skew
+
+
+def _parabola(place: Jet, ends_m: tuple[float, float]) -> tuple[Jet, Jet]:
+    """Evaluate the parabola that is 0 at both ends and 1 in the middle, and its slope per metre."""
+    span = ends_m[1] - ends_m[0]
+    share = place.shifted(-ends_m[0]).scaled(1 / span)
+    rest = share.scaled(-1).shifted(1)
+    return (share * rest).scaled(4), share.scaled(-2).shifted(1).scaled(4 / span)
 
 
 def _leg(start_s: float, distance_m: float, motion: TravelSettings) -> Leg:

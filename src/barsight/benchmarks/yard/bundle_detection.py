@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,7 +11,6 @@ from barsight.benchmarks.yard.bundle_scores import (
     BundleErrors,
     TrueBundle,
     bars_mass,
-    join_scores,
     score_bundles,
 )
 from barsight.benchmarks.yard.degraded_map import Defects, degraded_map
@@ -32,26 +30,12 @@ _RENDERED_KINDS = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class BundleBench:
-    """All yards' scores together; seconds: CPU time per yard, the first (which compiles) left out."""
-
-    yards: int
-    length_m: float
-    scores: BundleErrors
-    seconds: tuple[float, ...]
-
-
-def bench_bundles(yards: int, seed: int, length_m: float) -> BundleBench:
-    """Draw the yards, degrade their maps, find the bundles and score them."""
-    parts, seconds = [], []
-    for settings in drawn_yards(yards, seed, length_m):
-        height_map, true = drawn_map(settings)
-        start = time.process_time()
-        found = find_bundles(height_map, BundleSettings())
-        seconds.append(time.process_time() - start)
-        parts.append(score_bundles(found, true))
-    return BundleBench(yards, length_m, join_scores(parts), tuple(seconds[1:]))
+def score_drawn(settings: SimulationSettings) -> tuple[BundleErrors, float]:
+    """Draw a yard, degrade its map, find its bundles and score them; the CPU time that finding took, too."""
+    height_map, true = drawn_map(settings)
+    start = time.process_time()
+    found = find_bundles(height_map, BundleSettings())
+    return score_bundles(found, true), time.process_time() - start
 
 
 def drawn_yards(yards: int, seed: int, length_m: float) -> Iterator[SimulationSettings]:

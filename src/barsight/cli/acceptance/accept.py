@@ -26,12 +26,13 @@ from barsight.artefacts.plan import plan_text, read_plan
 from barsight.cli.arguments import call
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
-from barsight.core.errors import ConfigError, Failed, MeasurementError
+from barsight.core.errors import ConfigError, Failed, InputError, MeasurementError
 from barsight.core.files import atomic_path, expect_output
 from barsight.measure_settings import MeasureSettings
 from barsight.recording.base import RecordingSettings
 from barsight.report.signing import sign_file
 from barsight.result_folder import read_heights
+from barsight.yard.magnet.description import MagnetOffset, load_magnet
 
 COLOURS = {Decision.PASSED: "green", Decision.FAILED: "red"}
 
@@ -45,6 +46,7 @@ def run(arguments: Sequence[str]) -> None:
         plan: bool = False,
         yard: Path | None = None,
         rig: Path | None = None,
+        magnet: Path | None = None,
         preset: Literal["best", "fast"] = "best",
         key: Path | None = None,
         signer: str = "",
@@ -64,6 +66,8 @@ def run(arguments: Sequence[str]) -> None:
             plan: Make a plan for the yard instead: artefacts on its free floor, limits by what a pixel is.
             yard: The file that barsight calibrate yard wrote.
             rig: A rig file to use instead of the recordings' own calibration.
+            magnet: TOML file of the magnet, whose offset by earlier touch-downs (barsight calibrate magnet)
+                is taken off what the crane gets; the touch-downs of this plan prove it.
             preset: As of barsight measure.
             key: Ed25519 private key (PEM) that signs each file of the certificate; the signature lies beside
                 it as NAME.sig.
@@ -76,7 +80,8 @@ def run(arguments: Sequence[str]) -> None:
         if len(files) < 2:
             raise ConfigError("accept needs PLAN.toml and at least one recording; --plan makes a plan")
         settings = MeasureSettings(preset=preset, yard=yard, recording=RecordingSettings(rig=rig))
-        found = run_acceptance(files, out, settings, key, signer, keep)
+        offset = _offset(magnet)
+        found = run_acceptance(files, out, settings, key, signer, keep, offset=offset)
         if not found.is_passed:
             raise MeasurementError(f"{files[0]}: not accepted: {why_refused(found)}")
 
@@ -85,9 +90,11 @@ def run(arguments: Sequence[str]) -> None:
 
 def run_acceptance(
     files: tuple[Path, ...], out: Path, settings: MeasureSettings, key: Path | None, signer: str,
-    keep: Path | None, steps: Sequence[CommissioningStep] = (),
+    keep: Path | None, steps: Sequence[CommissioningStep] = (), offset: MagnetOffset | None = None,
 ) -> Acceptance:  # fmt: skip
-    """Accept by a plan and recordings of it, write the certificate and print. steps: of the commissioning."""
+    """Accept by a plan and recordings of it, write the certificate and print. steps: of the commissioning;
+    offset: of the magnet.
+    """
     console = SafeConsole(stderr=True)
     wanted = read_plan(files[0])
     page = certificate_files(out)[1]
@@ -101,7 +108,7 @@ def run_acceptance(
         work = Path(scratch) if keep is None else keep
         work.mkdir(parents=True, exist_ok=True)
         with stages(console) as advance:
-            found = accept(wanted, files[1:], settings, work, advance)
+            found = accept(wanted, files[1:], settings, work, advance, offset)
     write_certificate(certificate_content(found, signer, steps), out, key, has_pdf)
     print_acceptance(found)
     console.print(f"certificate: {page}", soft_wrap=True, highlight=False, markup=False)
@@ -110,10 +117,19 @@ def run_acceptance(
     return found
 
 
+def _offset(magnet: Path | None) -> MagnetOffset | None:
+    if magnet is None:
+        return None
+    offset = load_magnet(magnet).offset
+    if offset is None:
+        raise InputError(magnet, "has no [offset]", "make one: barsight calibrate magnet, or leave it out")
+    return offset
+
+
 def why_refused(found: Acceptance) -> str:
     """Say in one line what is wrong: the causes, else the quantities."""
     if found.causes:
-        return ", ".join(f"{one.name} ({one.value:+.3g} {one.unit})" for one in found.causes)
+        return ", ".join(f"{one.words} ({one.value:+.3g} {one.unit})" for one in found.causes)
     bad = [q for q in found.quantities if q.decision is not Decision.PASSED]
     said = [f"{q.name} {q.decision}" for q in bad[:3]] + ([f"{len(bad) - 3} more"] if len(bad) > 3 else [])
     return ", ".join(said) or "the crane's travel contradicts the rig"
@@ -132,7 +148,7 @@ def print_acceptance(found: Acceptance) -> None:
     console = SafeConsole()
     console.print(table)
     for one in found.causes:
-        console.print(f"cause: {one.name}, {one.value:+.3g} ± {one.sigma:.2g} {one.unit}", highlight=False)
+        console.print(f"cause: {one.words}, {one.value:+.3g} ± {one.sigma:.2g} {one.unit}", highlight=False)
 
 
 def _make_plan(files: tuple[Path, ...], out: Path) -> None:

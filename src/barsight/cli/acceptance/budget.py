@@ -17,6 +17,7 @@ from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError
 from barsight.core.files import expect_output
 from barsight.core.json_values import DIGITS, write_json
+from barsight.yard.magnet.description import load_magnet
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -27,6 +28,7 @@ def run(arguments: Sequence[str]) -> None:
         out: Annotated[Path | None, tyro.conf.arg(aliases=("-o",))] = None,
         bundle: int | None = None,
         certificate: Path | None = None,
+        magnet: Path | None = None,
         temperature_k: float = 10.0,
     ) -> None:
         """Budget the uncertainty of what a crane uses of a bundle, by GUM: lift x, y, z, yaw, height, width,
@@ -40,13 +42,16 @@ def run(arguments: Sequence[str]) -> None:
             out: JSON file for all parts.
             bundle: Id of the bundle; the surest with both ends seen when not given.
             certificate: That of barsight accept, whose touch-downs say how the magnet hangs.
+            magnet: TOML file of the magnet; its offset by touch-downs counts with its own sigma, instead of
+                the certificate's.
             temperature_k: How much warmer or colder than at its calibration the rig may be.
         """
         if not 0 <= temperature_k <= 100:
             raise ConfigError(f"budget: --temperature-k must lie in 0...100, not {temperature_k:g}")
         if out is not None:
             expect_output(out, ".json")
-        found = measured_load(measured, bundle, certificate, temperature_k)
+        offset = None if magnet is None else load_magnet(magnet).offset
+        found = measured_load(measured, bundle, certificate, temperature_k, offset)
         figures = budget(found.load, found.view, found.origin_m, found.sources)
         if out is not None:
             _write(found, figures, out)

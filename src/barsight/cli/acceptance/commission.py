@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
@@ -26,6 +27,7 @@ from barsight.core.errors import MeasurementError
 from barsight.core.reading.bounded_reading import read_json
 from barsight.measure_settings import MeasureSettings
 from barsight.recording.base import RecordingSettings
+from barsight.yard.magnet.description import load_magnet
 
 REMEDY = "do this step again"
 
@@ -59,64 +61,110 @@ def run(arguments: Sequence[str]) -> None:
 
 def guided_steps(folder: Path, settings: CommissionSettings) -> tuple[GuidedStep, ...]:
     """List the steps in their order."""
-    rig, survey = folder / "rig.yaml", folder / "survey"
-    with_yard = ("yard.yaml",) if settings.use_targets else ()
-    recording = RecordingSettings(rig=rig)
-    yard_file = folder / "yard.yaml" if settings.use_targets else None
+    way = _Way(folder, settings)
+    rig = ("rig.yaml",)
+    steps = [
+        GuidedStep("cameras", ("board",), rig, "pictures of the board into board/", way.cameras),
+        GuidedStep(
+            "travel", (*rig, "survey"), ("check.json",), "a recording of travel into survey/", way.travel
+        ),
+        GuidedStep("empty yard", (*rig, "survey", *way.placed), ("measured",), "", way.empty_yard),
+        GuidedStep("plan", ("measured",), ("plan_drawn.toml",), "", way.plan),
+        GuidedStep(
+            "acceptance", ("plan.toml", "artefacts", *rig, *way.framed, *way.magnet), ("certificate.json",),
+            "plan_drawn.toml with the measured values as plan.toml, recordings of the artefacts into "
+            "artefacts/, each in a folder of its own", way.acceptance,
+        ),
+    ]  # fmt: skip
+    if settings.use_tags:
+        bring = "the AprilTags that survey/ shows, as surveyed, as tags.csv"
+        steps.insert(2, GuidedStep("yard frame", ("tags.csv", *rig, "survey"), way.framed, bring, way.tags))
+    elif settings.use_targets:
+        bring = "targets as surveyed and as measured in measured/, as targets.csv"
+        steps.insert(3, GuidedStep("yard frame", ("targets.csv", "measured"), way.framed, bring, way.targets))
+    if (folder / "rig.yaml").exists() and not (folder / "board").exists():
+        steps[0] = GuidedStep("cameras", rig, (), "", lambda: "rig.yaml was brought along")
+    return tuple(steps)
 
-    def cameras() -> str:
-        words = ["--board", settings.board, "--range-m", str(settings.range_m)]
-        stereo.run([str(folder / "board"), *words, "-o", str(rig)])
-        return _verdict(folder / "rig.json")
 
-    def travel() -> str:
-        check.run([str(survey), "--recording.rig", str(rig), "-o", str(folder / "check.json")])
-        return str(read_json(folder / "check.json", REMEDY)["state"])
+@dataclass(frozen=True)
+class _Way:
+    """Steps as they are done in the folder; each returns its result in words."""
 
-    def empty_yard() -> str:
-        shutil.rmtree(folder / "measured", ignore_errors=True)
-        measure.run([str(survey), "-o", str(folder / "measured"), "--recording.rig", str(rig)])
+    folder: Path
+    settings: CommissionSettings
+
+    @property
+    def framed(self) -> tuple[str, ...]:
+        """Name the yard file, where there is one."""
+        return ("yard.yaml",) if self.settings.use_targets or self.settings.use_tags else ()
+
+    @property
+    def placed(self) -> tuple[str, ...]:
+        """Name the yard file, where the empty yard is measured with it."""
+        return ("yard.yaml",) if self.settings.use_tags else ()
+
+    @property
+    def magnet(self) -> tuple[str, ...]:
+        """Name the magnet's file, where there is one."""
+        return () if self.settings.magnet is None else (self.settings.magnet,)
+
+    def cameras(self) -> str:
+        words = ["--board", self.settings.board, "--range-m", str(self.settings.range_m)]
+        stereo.run([self._at("board"), *words, "-o", self._at("rig.yaml")])
+        return _verdict(self.folder / "rig.json")
+
+    def travel(self) -> str:
+        check.run([self._at("survey"), *self._rig, "-o", self._at("check.json")])
+        return str(read_json(self.folder / "check.json", REMEDY)["state"])
+
+    def empty_yard(self) -> str:
+        shutil.rmtree(self.folder / "measured", ignore_errors=True)
+        yard = ["--yard", self._at("yard.yaml")] if self.placed else []
+        measure.run([self._at("survey"), "-o", self._at("measured"), *self._rig, *yard])
         return "measured"
 
-    def targets() -> str:
-        words = ["--measured", str(folder / "measured"), "-o", str(folder / "yard.yaml")]
-        calibrate_yard.run([str(folder / "targets.csv"), *words])
-        return str(read_json(folder / "yard.json", REMEDY)["verdict"])
+    def tags(self) -> str:
+        words = ["--tags", self._at("tags.csv"), *self._rig, "-o", self._at("yard.yaml")]
+        for name, ends in (("girder", self.settings.girder_y_m), ("rails", self.settings.rails_x_m)):
+            axis = "y" if name == "girder" else "x"
+            words += [] if ends is None else [f"--{name}-{axis}-m", *map(str, ends)]
+        calibrate_yard.run([self._at("survey"), *words])
+        return str(read_json(self.folder / "yard.json", REMEDY)["verdict"])
 
-    def plan() -> str:
-        accept.run(["--plan", str(folder / "measured"), "-o", str(folder / "plan_drawn.toml")])
+    def targets(self) -> str:
+        words = ["--measured", self._at("measured"), "-o", self._at("yard.yaml")]
+        calibrate_yard.run([self._at("targets.csv"), *words])
+        return str(read_json(self.folder / "yard.json", REMEDY)["verdict"])
+
+    def plan(self) -> str:
+        accept.run(["--plan", self._at("measured"), "-o", self._at("plan_drawn.toml")])
         return "plan_drawn.toml: build the artefacts and have them measured"
 
-    def acceptance() -> str:
+    def acceptance(self) -> str:
+        folder, settings = self.folder, self.settings
         recordings = sorted(path for path in (folder / "artefacts").iterdir() if path.is_dir())
         if not recordings:
             raise MeasurementError(f"{folder / 'artefacts'}: holds no recordings; put one or more there")
         key = None if settings.key is None else folder / settings.key
-        chosen = MeasureSettings(yard=yard_file, recording=recording)
+        chosen = MeasureSettings(
+            yard=folder / "yard.yaml" if self.framed else None,
+            recording=RecordingSettings(rig=folder / "rig.yaml"),
+        )
         told = [one.told() for one in read_done(folder)]
+        offset = load_magnet(folder / settings.magnet).offset if settings.magnet else None
         files = (folder / "plan.toml", *recordings)
-        found = accept.run_acceptance(files, folder / "certificate", chosen, key, settings.signer, None, told)
+        found = accept.run_acceptance(
+            files, folder / "certificate", chosen, key, settings.signer, None, told, offset
+        )
         return "passed" if found.is_passed else "failed"
 
-    made: list[tuple[str, tuple[str, ...], tuple[str, ...], str, Callable[[], str]]] = [
-        ("cameras", ("board",), ("rig.yaml",), "pictures of the board into board/", cameras),
-        ("travel", ("rig.yaml", "survey"), ("check.json",), "a recording of travel into survey/", travel),
-    ]
-    made.append(("empty yard", ("rig.yaml", "survey"), ("measured",), "", empty_yard))
-    if settings.use_targets:
-        bring = "targets as surveyed and as measured in measured/, as targets.csv"
-        made.append(("yard frame", ("targets.csv", "measured"), with_yard, bring, targets))
-    made += [
-        ("plan", ("measured",), ("plan_drawn.toml",), "", plan),
-        (
-            "acceptance", ("plan.toml", "artefacts", "rig.yaml", *with_yard), ("certificate.json",),
-            "plan_drawn.toml with the measured values as plan.toml, recordings of the artefacts into "
-            "artefacts/, each in a folder of its own", acceptance,
-        ),
-    ]  # fmt: skip
-    if rig.exists() and not (folder / "board").exists():
-        made[0] = ("cameras", ("rig.yaml",), (), "", lambda: "rig.yaml was brought along")
-    return tuple(GuidedStep(*one) for one in made)
+    def _at(self, name: str) -> str:
+        return str(self.folder / name)
+
+    @property
+    def _rig(self) -> list[str]:
+        return ["--recording.rig", self._at("rig.yaml")]
 
 
 def _verdict(path: Path) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from barsight.benchmarks.yard.bundle_detection import bench_bundles, rendered_yards
+from barsight.benchmarks.yard.bundle_detection import drawn_yards, rendered_yards, score_drawn
 from barsight.benchmarks.yard.bundle_scores import (
     BundleErrors,
     bundle_report,
@@ -22,6 +22,7 @@ from barsight.benchmarks.yard.bundle_scores import (
     score_bundles,
 )
 from barsight.benchmarks.yard.yard_speed import time_yard
+from barsight.cli.bench.seeds import over_seeds
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError
 from barsight.core.json_values import write_json
@@ -46,6 +47,8 @@ def bench_found_bundles(
     seed: int = 7,
     rendered: bool = False,
     keep: Path | None = None,
+    workers: int = 1,
+    scheduler: str | None = None,
     save: Json = None,
 ) -> None:
     """Score found bundles against true ones: of drawn yards, of rendered ones, or of one measured recording.
@@ -58,6 +61,9 @@ def bench_found_bundles(
         seed: Seed of all that is drawn.
         rendered: Render the yards and measure them instead, half a minute of computing each.
         keep: Folder for the rendered yards; what is finished there is not done again.
+        workers: Yards at a time, each in a process of its own.
+        scheduler: Address of a Dask scheduler, tcp://HOST:PORT, whose workers are used instead; they share
+            the folder of --keep.
         save: JSON file for all figures, with commit and machine.
     """
     if (recording is None) != (out is None):
@@ -68,12 +74,21 @@ def bench_found_bundles(
     console = SafeConsole()
     if recording is not None and out is not None:
         scores = score_bundles(read_bundles(out / "bundles.json"), read_true_bundles(recording))
-    elif rendered:
-        with tempfile.TemporaryDirectory() as scratch:
-            scores, seconds = _bench_rendered(yards, seed, keep or Path(scratch), console)
     else:
-        bench = bench_bundles(yards, seed, length_m)
-        scores, seconds = bench.scores, bench.seconds
+        if rendered and scheduler is not None and keep is None:
+            raise ConfigError("bench bundles: workers of --scheduler share a folder: name it with --keep")
+        drawn = tuple(rendered_yards(yards, seed) if rendered else drawn_yards(yards, seed, length_m))
+        with tempfile.TemporaryDirectory() as scratch:
+            folder = (keep or Path(scratch)).absolute() / f"seed_{seed}" if rendered else None
+            found = dict[int, tuple[BundleErrors, float]]()
+            for number, one in over_seeds(_score, range(yards), (drawn, folder), workers, scheduler):
+                found[number] = one
+                if rendered:
+                    _tell(console, number, drawn[number], one[0])
+        scores = join_scores([found[number][0] for number in range(yards)])
+        seconds = tuple(
+            found[number][1] for number in range(0 if rendered else 1, yards)
+        )  # the first compiles
     console.print(bundle_table(scores))
     console.print(reliability(scores))
     if seconds:
@@ -84,27 +99,29 @@ def bench_found_bundles(
         write_json(save, bundle_report(scores, seconds))
 
 
-def _bench_rendered(
-    yards: int, seed: int, keep: Path, console: Console
-) -> tuple[BundleErrors, tuple[float, ...]]:
-    """Score rendered yards: bundles are found anew in the kept maps, so that a kept folder judges the code as
-    it is.
+def _tell(console: Console, number: int, settings: SimulationSettings, part: BundleErrors) -> None:
+    console.print(
+        f"yard {number}, {settings.bars}, up to {settings.yard.max_layers} layers: "
+        f"{part.found} of {part.free} found, {part.wrong} of {part.claimed} false",
+        highlight=False,
+    )
+
+
+def _score(
+    number: int, given: tuple[tuple[SimulationSettings, ...], Path | None]
+) -> tuple[BundleErrors, float]:
+    """Score a yard: drawn, or rendered where there is a folder for it.
+
+    Bundles are found anew in its kept map, so that a kept folder judges the code as it is.
     """
-    parts, seconds = [], []
-    for number, settings in enumerate(rendered_yards(yards, seed)):
-        recording, out = _measured(keep / f"seed_{seed}_yard_{number:02d}", settings)
-        heights = read_heights(out)
-        start = time.process_time()
-        found = find_bundles(heights, BundleSettings())
-        seconds.append(time.process_time() - start)
-        part = score_bundles(found, read_true_bundles(recording))
-        parts.append(part)
-        console.print(
-            f"yard {number}, {settings.bars}, up to {settings.yard.max_layers} layers: "
-            f"{part.found} of {part.free} found, {part.wrong} of {part.claimed} false",
-            highlight=False,
-        )
-    return join_scores(parts), tuple(seconds)
+    yards, folder = given
+    if folder is None:
+        return score_drawn(yards[number])
+    recording, out = _measured(folder.with_name(f"{folder.name}_yard_{number:02d}"), yards[number])
+    heights = read_heights(out)
+    start = time.process_time()
+    found = find_bundles(heights, BundleSettings())
+    return score_bundles(found, read_true_bundles(recording)), time.process_time() - start
 
 
 def _measured(folder: Path, settings: SimulationSettings) -> tuple[Path, Path]:

@@ -13,6 +13,7 @@ KINDS = {
     "check": "Has the rig drifted? Ordinary crane travel shows it, with sigma and cost in mm",
     "export": "Write a rig in another format: ours, Kalibr, OpenCV, EuRoC",
     "yard": "Where the world lies in the yard, from surveyed targets or crane moves in two axes",
+    "magnet": "How the magnet hangs off the crane's readings, from the touch-downs of a certificate",
     "imu-noise": "Noise densities and random walks of an IMU from a log at rest: imu.yaml",
 }
 

@@ -13,7 +13,7 @@ from rich.markup import escape
 
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.cli.arguments import call
-from barsight.cli.calibrate.yard_tags import calibrate_by_tags
+from barsight.cli.calibrate.yard_tags import calibrate_by_tags, print_bend
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError, Failed, InputError, MeasurementError
@@ -25,8 +25,9 @@ from barsight.motion.crane.encoder_trajectory import CraneSettings
 from barsight.recording.base import RecordingSettings
 from barsight.recording.formats.surveyed_targets import read_targets
 from barsight.recording.open import open_recording
+from barsight.registration.bending import CraneBend, straight
 from barsight.registration.yard import YardCalibration, calibrate_yard
-from barsight.registration.yard_file import write_yard_file
+from barsight.registration.yard_file import MAX_SPAN_M, MIN_SPAN_M, write_yard_file
 from barsight.report.calibration.yard_page import write_yard_report
 from barsight.result_folder import open_folder
 from barsight.yard_frame import MAX_PLACE_M as MAX_UNSURE_M
@@ -48,6 +49,8 @@ def run(arguments: Sequence[str]) -> None:
         frame: Literal["world", "encoders", "body"] = "world",
         measured: Path | None = None,
         tags: Path | None = None,
+        girder_y_m: tuple[float, float] | None = None,
+        rails_x_m: tuple[float, float] | None = None,
         sigma_m: float = 0.005,
         reading: Annotated[RecordingSettings, tyro.conf.arg(name="recording")] = RecordingSettings(),  # noqa: B008
     ) -> None:
@@ -64,6 +67,9 @@ def run(arguments: Sequence[str]) -> None:
             tags: A .csv of AprilTags 36h11 as surveyed (tag,yard_x,yard_y,yard_z of the middle in m;
                 optionally sigma_m and check), which are found in the recording's pictures. The frame is that
                 in which measure maps this recording, and the file is bound to its rig and crane.
+            girder_y_m: With --tags: the trolley's readings at the girder's ends, the lower first. How the
+                crane bends is calibrated too; bridge and trolley must travel in the recording.
+            rails_x_m: With --girder-y-m: the bridge's readings at the ends of rails that may bend.
             sigma_m: One coordinate's error of a target, survey and measurement together, or of a tag's survey
                 alone, where no sigma_m column says it.
             reading: How to read the recording.
@@ -71,15 +77,13 @@ def run(arguments: Sequence[str]) -> None:
         expect_output(out, ".yaml", ".yml")
         if not 0 < sigma_m < 10:
             raise ConfigError(f"--sigma-m {sigma_m:g} can't be; give metres")
-        console = SafeConsole(stderr=True)
-        hangs = None
-        if tags is not None and (source.suffix.lower() == ".csv" or measured is not None or frame != "world"):
-            raise ConfigError(
-                "--tags takes a recording, and says the frame: leave out --frame and --measured"
-            )
+        console, hangs, is_list = SafeConsole(stderr=True), None, source.suffix.lower() == ".csv"
+        if tags is not None and (is_list or measured is not None or frame != "world"):
+            raise ConfigError("--tags takes a recording and says the frame: leave out --frame, --measured")
+        bend = _begun_bend(girder_y_m, rails_x_m, has_tags=tags is not None)
         if tags is not None:
-            found, owners = calibrate_by_tags(source, tags, sigma_m, reading, console)
-        elif source.suffix.lower() == ".csv":
+            found, owners, bend = calibrate_by_tags(source, tags, sigma_m, reading, bend, console)
+        elif is_list:
             owners = {} if measured is None else _measured_owners(measured)
             if owners:
                 frame = "world" if owners["mounting_id"] is None else "encoders"
@@ -90,11 +94,31 @@ def run(arguments: Sequence[str]) -> None:
         _expect_usable(found, source if tags is None else tags)
         verdict = "good" if _is_good(found) else "usable with care"
         with atomic_paths(out, out.with_suffix(".html"), out.with_suffix(".json")) as (path, html, data):
-            write_yard_file(path, found, hangs, owners)
+            write_yard_file(path, found, hangs, owners, bend)
             write_yard_report(found, verdict, str(source), html, data)
         _print(found, verdict, out, console)
+        print_bend(bend, console)
 
     call(command, "calibrate yard", arguments)
+
+
+def _begun_bend(
+    girder_y_m: tuple[float, float] | None, rails_x_m: tuple[float, float] | None, *, has_tags: bool
+) -> CraneBend | None:
+    """Begin with a straight crane. Raises ConfigError for ends that can't be."""
+    if girder_y_m is None:
+        if rails_x_m is not None:
+            raise ConfigError("--rails-x-m needs --girder-y-m")
+        return None
+    if not has_tags:
+        raise ConfigError(
+            "--girder-y-m needs --tags: places measured by hand don't say where the trolley was"
+        )
+    for name, ends in (("--girder-y-m", girder_y_m), ("--rails-x-m", rails_x_m)):
+        if ends is not None and not MIN_SPAN_M <= ends[1] - ends[0] <= MAX_SPAN_M:
+            said = f"{name} {ends[0]:g} {ends[1]:g}"
+            raise ConfigError(f"{said}: give the lower reading first, {MIN_SPAN_M:g} m or more apart")
+    return straight(girder_y_m, rails_x_m)
 
 
 def _from_targets(path: Path, frame: str, sigma_m: float) -> YardCalibration:

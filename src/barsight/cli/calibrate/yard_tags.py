@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +13,17 @@ from rich.markup import escape
 from barsight.calibration.boards.marker_detection import TAG_FAMILY
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.cli.progress import stages
+from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import Failed, InputError, MeasurementError
 from barsight.core.timing import count_frames
+from barsight.core.types import CraneSamples, Trajectory
 from barsight.motion.settings import MotionSettings, make_estimator
 from barsight.recording.base import Recording, RecordingSettings
 from barsight.recording.formats.surveyed_targets import SurveyedTags, read_tags
 from barsight.recording.open import open_recording
 from barsight.recording.plausibility import clock_faults
+from barsight.recording.wrapper import RecordingProxy
+from barsight.registration.bending import STEPS, CraneBend, calibrate_bent_yard
 from barsight.registration.tags import (
     MIN_PAIRS,
     PlacedTag,
@@ -28,44 +34,123 @@ from barsight.registration.tags import (
     turned_covariance,
 )
 from barsight.registration.yard import YardCalibration, calibrate_yard
-from barsight.yard_frame import calibration_id, mounting_id, recording_id
+from barsight.yard_frame import bent_crane, calibration_id, mounting_id, recording_id
+
+
+@dataclass(frozen=True, eq=False)
+class _BentRecording(RecordingProxy):
+    """`whole` with its encoders' readings where a crane that bends so really was."""
+
+    bend: CraneBend
+
+    def crane(self) -> CraneSamples | None:
+        crane = self.whole.crane()
+        return None if crane is None else bent_crane(crane, self.bend)
 
 
 def calibrate_by_tags(
-    path: Path, list_path: Path, sigma_m: float, reading: RecordingSettings, console: Console
-) -> tuple[YardCalibration, dict[str, str | None]]:
+    path: Path, list_path: Path, sigma_m: float, reading: RecordingSettings, bend: CraneBend | None,
+    console: Console,
+) -> tuple[YardCalibration, dict[str, str | None], CraneBend | None]:  # fmt: skip
     """Find the listed tags in a recording, and register the frame that `measure` maps it in.
 
-    sigma_m: of a coordinate's survey, where the list doesn't say it. Returns the calibration and whose it is.
+    sigma_m: of a coordinate's survey, where the list doesn't say it. bend: what to begin with where the
+    crane's bending is calibrated too. Returns the calibration, whose it is, and the bending.
     """
     listed, recording = read_tags(list_path), open_recording(path, reading)
     if faults := clock_faults(recording):
         raise InputError(path, "; ".join(faults), "record again with one clock")
+    if bend is not None and recording.crane() is None:
+        raise InputError(path, "has no encoders", "leave --girder-y-m out")
     reference, seen = _see(recording, console)
     placed = [seen.place(int(number)) for number in listed.numbers]
     for one in placed:
         if isinstance(one, Failed) and one.code == "ambiguous":
             raise MeasurementError(f"{path}: {one.reason}")
-    frame = "encoders" if reference == "yard" else "world"
-    found = _registered(path, listed, placed, sigma_m, frame, _told(recording, seen, placed))
+    told = _told(recording, seen, placed)
+    if bend is None:
+        frame = "encoders" if reference == "yard" else "world"
+        found = _registered(path, listed, placed, sigma_m, frame, told)
+    else:
+        found, bend = _bent(path, recording, listed, seen, placed, sigma_m, bend, told, console)
     _print(listed, seen, placed, list_path, console)
-    crane = recording.crane() if frame == "encoders" else None
-    return found, {
+    crane = recording.crane() if reference == "yard" else None
+    owners = {
         "calibration_id": calibration_id(recording.rig),
         "mounting_id": None if crane is None else mounting_id(crane),
         "recording_id": recording_id(recording.digests()) if crane is None else None,
     }
+    return found, owners, bend
 
 
 def _see(recording: Recording, console: Console) -> tuple[str, SeenTags]:
     """Estimate the trajectory as `measure` does and find the tags in its pairs; its reference, and them."""
-    rectifier = Rectifier(recording.rig)
     with stages(console) as advance:
-        count = count_frames("travel", len(recording.index.stamps_ns), advance)
-        trajectory = make_estimator(MotionSettings())(recording, rectifier, count)
+        rectifier, trajectory = Rectifier(recording.rig), _trajectory(recording, advance)
         posed = {frame.stamp_ns: frame for frame in trajectory.frames}
         count = count_frames("tags", len(posed), advance)
         return trajectory.reference, see_tags(recording.frames(posed), rectifier, posed, count)
+
+
+def _trajectory(recording: Recording, advance: Callable[[str, int, int], None]) -> Trajectory:
+    count = count_frames("travel", len(recording.index.stamps_ns), advance)
+    return make_estimator(MotionSettings())(recording, Rectifier(recording.rig), count)
+
+
+def _bent(
+    path: Path, recording: Recording, listed: SurveyedTags, seen: SeenTags, placed: list[PlacedTag | Failed],
+    sigma_m: float, bend: CraneBend, told: str, console: Console,
+) -> tuple[YardCalibration, CraneBend]:  # fmt: skip
+    """Register frame and bending together. How the tags' places answer to the bending is seen by estimating
+    the travel anew with a little of each.
+    """
+
+    def places(values: Float64) -> list[PlacedTag | Failed]:
+        with stages(console) as advance:
+            way = _trajectory(_BentRecording(recording, bend.with_values(values)), advance)
+        moved = seen.moved({frame.stamp_ns: frame for frame in way.frames})
+        return [moved.place(int(number)) for number in listed.numbers]
+
+    first = _at(placed)
+    slopes = np.stack([
+        (_at(places(step * axis)) - first) / step if is_fitted else 0 * first
+        for step, axis, is_fitted in zip(STEPS, np.eye(3), bend.fitted, strict=True)
+    ], axis=2)  # fmt: skip
+    for number in range(2):
+        if number:  # a tag that several places of the trolley saw agrees with itself only now
+            placed = places(bend.values)
+        known = np.column_stack([_at(placed), slopes.reshape(len(slopes), -1)])
+        kept: Bool = np.all(np.isfinite(known), axis=1)
+        tags, yard_m, checks, survey = _kept(path, listed, placed, kept, sigma_m, told)
+        found = calibrate_bent_yard(
+            tuple(f"tag {one.number}" for one in tags), _at(tags), slopes[kept], yard_m,
+            turned_covariance(tags, yard_m, survey), checks, "encoders", bend,
+        )  # fmt: skip
+        if isinstance(found, Failed):
+            raise MeasurementError(f"{path}: {found.reason}; survey three tags or more, well apart")
+        calibration, bend = found
+    _expect_upright(path, tags, yard_m, calibration)
+    return calibration, bend
+
+
+def _at(placed: Sequence[PlacedTag | Failed]) -> Float64:
+    """Stack places (N, 3), NaN where a tag wasn't placed."""
+    return np.array([one.place_m if isinstance(one, PlacedTag) else np.full(3, np.nan) for one in placed])
+
+
+def _kept(
+    path: Path, listed: SurveyedTags, placed: list[PlacedTag | Failed], kept: Bool, sigma_m: float, told: str
+) -> tuple[tuple[PlacedTag, ...], Float64, Bool, Float64]:
+    """Select the tags that were placed, where they lie, which are checks, and their survey's sigma. told: why
+    others weren't placed, for where too few are left.
+    """
+    tags = tuple(one for one, keep in zip(placed, kept, strict=True) if keep and isinstance(one, PlacedTag))
+    checks = listed.checks[kept]
+    if (~checks).sum() < 3:
+        counted = f"{kept.sum()} of {kept.size} listed tags were placed, 3 besides checks are the least"
+        raise MeasurementError(f"{path}: {counted}: {told}")
+    survey = np.where(np.isnan(listed.sigma_m), sigma_m, listed.sigma_m)[kept]
+    return tags, listed.yard_m[kept], checks, survey
 
 
 def _registered(
@@ -73,21 +158,20 @@ def _registered(
 ) -> YardCalibration:
     """Fit the tags that were placed. told: why others weren't, for where too few are left."""
     kept = np.array([isinstance(one, PlacedTag) for one in placed], bool)
-    tags = tuple(one for one in placed if isinstance(one, PlacedTag))
-    yard_m, checks = listed.yard_m[kept], listed.checks[kept]
-    if (~checks).sum() < 3:
-        counted = f"{kept.sum()} of {kept.size} listed tags were placed, 3 besides checks are the least"
-        raise MeasurementError(f"{path}: {counted}: {told}")
-    survey = np.where(np.isnan(listed.sigma_m), sigma_m, listed.sigma_m)[kept]
+    tags, yard_m, checks, survey = _kept(path, listed, placed, kept, sigma_m, told)
     found = calibrate_yard(
         tuple(f"tag {one.number}" for one in tags), np.stack([one.place_m for one in tags]), yard_m,
         turned_covariance(tags, yard_m, survey), checks, frame,
     )  # fmt: skip
     if isinstance(found, Failed):
         raise MeasurementError(f"{path}: {found.reason}; survey three tags or more, well apart")
+    _expect_upright(path, tags, yard_m, found)
+    return found
+
+
+def _expect_upright(path: Path, tags: tuple[PlacedTag, ...], yard_m: Float64, found: YardCalibration) -> None:
     if is_mirrored(tags, yard_m, found.alignment):
         raise MeasurementError(f"{path}: the listed places are mirrored; are yard_x and yard_y swapped?")
-    return found
 
 
 def _told(recording: Recording, seen: SeenTags, placed: list[PlacedTag | Failed]) -> str:
@@ -117,3 +201,15 @@ def _print(
     if strange:
         told = f"seen, but not in {list_path}: tag {', '.join(map(str, strange))}; left out"
         console.print(f"[yellow]{escape(told)}[/yellow]", soft_wrap=True, highlight=False)
+
+
+def print_bend(bend: CraneBend | None, console: Console) -> None:
+    """Print how the crane bends, where it was calibrated."""
+    if bend is None:
+        return
+    words = (("girder's deflection", "mm"), ("girder out of square", "mm/m"), ("rails' depth", "mm"))
+    for (what, unit), value, sigma, is_fitted in zip(
+        words, bend.values, bend.sigma, bend.fitted, strict=True
+    ):
+        if is_fitted:
+            console.print(f"{what}: {1e3 * value:+.2f} ± {1e3 * sigma:.2f} {unit}", highlight=False)

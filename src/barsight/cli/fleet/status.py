@@ -26,6 +26,7 @@ def run(arguments: Sequence[str]) -> None:
             from barsight.fleet.driver import count_states, parked_reasons
             from barsight.fleet.objects import open_objects
             from barsight.fleet.records import find_version, read_tasks, read_versions
+            from barsight.fleet.versions import places
             from barsight.store.promotion import promoted_version
         target, console = open_objects(results), SafeConsole()
         with open_store(store) as opened, opened.reading() as connection:
@@ -38,7 +39,10 @@ def run(arguments: Sequence[str]) -> None:
             console.print(f"version {one.name}{star}: {words}", highlight=False, soft_wrap=True)
             for task, reason in parked_reasons(target, tasks):
                 console.print(
-                    f"  parked {task.name}: {reason}", highlight=False, soft_wrap=True, markup=False
+                    f"  parked {places(tasks)[task.key]}: {reason}",
+                    highlight=False,
+                    soft_wrap=True,
+                    markup=False,
                 )
 
     call(command, "fleet status", arguments)

@@ -36,9 +36,9 @@ from barsight.yard.inventory.stock_list import contradicted_bundles
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.lift_file import write_lifts
 from barsight.yard.lifting.order import LiftOrder, order_lifts
-from barsight.yard.lifting.targets import LiftPlan, map_vetoes, plan_lifts
+from barsight.yard.lifting.targets import LiftPlan, map_vetoes, offset_vetoes, plan_lifts
 from barsight.yard.lifting.travel_accuracy import Travel
-from barsight.yard.magnet.description import load_magnet
+from barsight.yard.magnet.description import Magnet, load_magnet
 from barsight.yard.types import Bundle, YardMap
 from barsight.yard.vetoes import Veto
 
@@ -84,8 +84,8 @@ def run(arguments: Sequence[str]) -> None:
         with in_background(lambda: draw_pictures(out)) as pictures:
             plan = plan_lifts(
                 folder.heights, folder.bundles, described, settings,
-                _vetoes(folder, settings, now_ns, has_magnet=magnet is not None), folder.travel, now_ns,
-                events=happened, contradicted=folder.contradicted,
+                _vetoes(folder, described, settings, now_ns, has_magnet=magnet is not None), folder.travel,
+                now_ns, events=happened, contradicted=folder.contradicted,
             )  # fmt: skip
             order = None if fetch is None else order_lifts(fetch, folder.heights, folder.bundles, plan)
         if isinstance(order, Failed):
@@ -142,7 +142,7 @@ def _open(out: Path) -> _MeasuredFolder:
 
 
 def _vetoes(
-    folder: _MeasuredFolder, settings: LiftSettings, now_ns: int, *, has_magnet: bool
+    folder: _MeasuredFolder, magnet: Magnet, settings: LiftSettings, now_ns: int, *, has_magnet: bool
 ) -> tuple[Veto, ...]:
     """Gather what forbids every lift of the map."""
     warnings = [(str(w.get("code")), str(w.get("message"))) for w in folder.summary.get("warnings") or []]
@@ -152,6 +152,7 @@ def _vetoes(
     if folder.travel is None:
         unknown = "result.json doesn't say how sure the trajectory is: measure again"
         vetoes = (*vetoes, Veto("trajectory-degraded", unknown))
+    vetoes += offset_vetoes(magnet, folder.identity.calibration_id, folder.identity.yard_frame_id)
     changed = changed_inputs(folder.summary)
     if changed:
         vetoes = (*vetoes, Veto("calibration-changed", f"{changed} was changed since: measure again"))
@@ -196,9 +197,19 @@ def _events(
     return merged(known, (*told, *(lift_of(by_id[number], time.time_ns()) for number in ids)))
 
 
+def _offset(magnet: Magnet) -> str:
+    """Say how far the magnet hangs from where the crane's readings say."""
+    if magnet.offset is None:
+        return "no touch-down told how the magnet hangs: its tolerance must hold that (calibrate magnet)"
+    figures = zip("xyz", magnet.offset.place_m, magnet.offset.sigma_m, strict=True)
+    told = ", ".join(f"{axis} {1e3 * off:+.1f} ± {1e3 * sigma:.1f}" for axis, off, sigma in figures)
+    return f"the magnet hangs off the crane's readings by {told} mm; crane_target has that taken off"
+
+
 def print_lifts(plan: LiftPlan, console: Console) -> None:
     """Print the offered lifts as a table, the vetoes as counts."""
     console.print(f"magnet: {escape(plan.magnet.name)}", highlight=False)
+    console.print(_offset(plan.magnet), highlight=False)
     for veto in plan.vetoes:
         console.print(f"[red]{veto.code}:[/red] {escape(veto.reason)}", highlight=False)
     if plan.offered:

@@ -19,6 +19,7 @@ ROWS: dict[str, tuple[str, ...]] = {
     "track": (
         "ready", "done", "taken", "tracked", "not_placed", "newer_pair", "kept", "kept_passed", "beat_ns",
     ),
+    "pose": ("ready", "written", "beat_ns"),
     "sensors": (
         "cam0_settled", "cam0_drift_ppb", "cam0_jitter_ns", "cam0_jumps", "cam0_lost", "cam0_connects",
         "cam1_settled", "cam1_drift_ppb", "cam1_jitter_ns", "cam1_jumps", "cam1_lost", "cam1_connects",

@@ -18,6 +18,7 @@ from barsight.motion.batch.fusion import FusionSettings
 from barsight.motion.batch.sensor_agreement import refuse_contradictions
 from barsight.motion.crane.encoder_trajectory import CraneSettings
 from barsight.motion.estimator import FrameInput, ImmediatePoses, TrajectoryEstimator, pictures_of
+from barsight.motion.fixed_lag.propagation import NavigationState
 from barsight.motion.fixed_lag.sensor_buffer import SENSOR_DELAY_S, SensorBuffer
 from barsight.motion.frontend.chains import UNTIED, untied_sentence
 from barsight.motion.frontend.tracking import Tracker
@@ -85,6 +86,12 @@ class FixedLagPoses(ImmediatePoses):
             return self._estimator.take(RefusedFrame(seen.stamp_ns, pair.reason))
         tracked = self._tracker.push(pair)
         return self._estimator.take(tracked)
+
+    @property
+    def navigation(self) -> NavigationState | None:
+        """Return the last state that was estimated; None before the first."""
+        window = self._estimator.window
+        return None if window is None or window.newest is None else window.navigation
 
     def finish(self) -> Trajectory:
         """Return all poses. Raises InputError where the pictures contradict a sensor."""

@@ -14,9 +14,11 @@ from gtsam.symbol_shorthand import B, V, X
 
 from barsight.core.arrays import Float64, Int64
 from barsight.core.pose import Pose
+from barsight.core.stamps import NS_PER_S
 from barsight.core.types import RectifiedCamera
 from barsight.inertial.model import BodyState, ImuBias
 from barsight.inertial.preintegration import Preintegrated
+from barsight.motion.fixed_lag.propagation import ACCELERATION_DENSITY, NavigationState
 from barsight.motion.fixed_lag.window_equations import NewestNode
 from barsight.motion.frontend.tracking import Sighting
 from barsight.motion.problem.gauss_newton import GraphState
@@ -83,6 +85,32 @@ class Window:
             @ turned.T
         )
         return result
+
+    @property
+    def navigation(self) -> NavigationState:
+        """Return the last node as a state to propagate; without an IMU its velocity is that since the frame
+        before.
+        """
+        assert self.newest is not None
+        last = len(self.problem.start) - 1
+        pose, stamp_ns = self.pose(last), int(self.problem.stamp_ns[-1])
+        shared = np.zeros((2, 2)) if self.drift_covariance is None else self.drift_covariance
+        jacobian = self.newest.drift_jacobian_of_pose
+        known = self.newest.covariance + jacobian @ shared @ jacobian.T
+        turned = np.eye(len(known))
+        turned[3:6, 3:6] = pose.rotation
+        covariance = np.zeros((15, 15))
+        covariance[: len(known), : len(known)] = turned @ known @ turned.T
+        if self.problem.has_imu:
+            return NavigationState(stamp_ns, pose.target, self.body, self.bias, covariance)
+        velocity = np.zeros(3)
+        if len(self.frame_nodes) > 1:
+            before = self.frame_nodes[-2]
+            seconds = (stamp_ns - int(self.problem.stamp_ns[before])) / NS_PER_S
+            velocity = (pose.translation - self.pose(before).translation) / seconds
+            covariance[6:9, 6:9] = np.eye(3) * ACCELERATION_DENSITY**2 * seconds
+        body = BodyState(pose.rotation, pose.translation, velocity)
+        return NavigationState(stamp_ns, pose.target, body, ImuBias.none(), covariance)
 
 
 def add_nodes(

@@ -165,7 +165,8 @@ def assess_placement(
         _scaled(magnet.tolerance, scale),
         safety, tuple(checks), valid,
         target_covariance(
-            place, load, contact.gap_sigma_m, _map_sigma(yard.heights, place, magnet), yard.travel
+            place, load, contact.gap_sigma_m, _map_sigma(yard.heights, place, magnet), yard.travel,
+            magnet.offset,
         ),
     )  # fmt: skip
 

@@ -20,7 +20,7 @@ from barsight.yard.lifting.assessment import Lift
 from barsight.yard.lifting.order import LiftOrder
 from barsight.yard.lifting.targets import RULE, LiftPlan
 from barsight.yard.lifting.validity import MAX_CLOCK_ERROR_NS, Validity, disturbed_checks
-from barsight.yard.magnet.description import Magnet
+from barsight.yard.magnet.description import Magnet, MagnetOffset
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.stability.stability import Footing
 from barsight.yard.types import Bundle
@@ -83,6 +83,7 @@ def lifts_content(
     """Build the content of lifts.json, without its digest. order: that digs out the bundle that was asked
     for, if one was.
     """
+    offset = plan.magnet.offset
     content: dict[str, Any] = json_value(
         {
             "schema_version": SCHEMA_VERSION,
@@ -96,8 +97,8 @@ def lifts_content(
             "magnet": asdict(plan.magnet),
             "settings": asdict(plan.settings),
             "vetoes": _vetoes(plan.vetoes),
-            "lifts": [_lift(lift, rank) for rank, lift in enumerate(plan.offered, start=1)],
-            "refused": [_lift(lift, None) for lift in plan.refused],
+            "lifts": [_lift(lift, rank, offset) for rank, lift in enumerate(plan.offered, start=1)],
+            "refused": [_lift(lift, None, offset) for lift in plan.refused],
             "footings": [_footing(footing) for footing in plan.footings],
             "sides": [asdict(side) for side in plan.sides],
             "blocked": [asdict(each) for each in plan.blocked],
@@ -108,16 +109,19 @@ def lifts_content(
     return content
 
 
-def _lift(lift: Lift, rank: int | None) -> dict[str, Any]:
+def _lift(lift: Lift, rank: int | None, offset: MagnetOffset | None) -> dict[str, Any]:
     contact, place = lift.contact, lift.place
+    height = contact.centre_z_m if contact else None
+    put = lift.set_down
     return {
         "rank": rank,
         "target": {
             "x_m": place.x_m,
             "y_m": place.y_m,
-            "z_m": contact.centre_z_m if contact else None,
+            "z_m": height,
             "yaw_deg": math.degrees(place.yaw_rad),
         },
+        "crane_target": _crane(place.x_m, place.y_m, height, math.degrees(place.yaw_rad), offset),
         "bundles": lift.bundles,
         "count": lift.count,
         "count_probability": lift.count_probability,
@@ -151,10 +155,22 @@ def _lift(lift: Lift, rank: int | None) -> dict[str, Any]:
             for pole in (contact.poles if contact else ())
         ],
         "target_covariance": None if lift.covariance is None else lift.covariance.tolist(),
-        "set_down": asdict(lift.set_down) if lift.set_down else None,
+        "set_down": asdict(put) if put else None,
+        "crane_set_down": _crane(put.x_m, put.y_m, put.z_m, put.yaw_deg, offset) if put else None,
         "checks": [asdict(check) for check in lift.checks],
         "vetoes": _vetoes(lift.vetoes),
     }
+
+
+def _crane(
+    x_m: float, y_m: float, z_m: float | None, yaw_deg: float, offset: MagnetOffset | None
+) -> dict[str, float | None]:
+    """Return what the crane's readings must say for the magnet to be at a place; the place itself where no
+    offset is known.
+    """
+    off = (0.0, 0.0, 0.0) if offset is None else offset.place_m
+    height = None if z_m is None else z_m - off[2]
+    return {"x_m": x_m - off[0], "y_m": y_m - off[1], "z_m": height, "yaw_deg": yaw_deg}
 
 
 def _vetoes(vetoes: tuple[Veto, ...]) -> list[dict[str, str]]:

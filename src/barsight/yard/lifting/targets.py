@@ -90,6 +90,21 @@ def map_vetoes(
     return (*vetoes, *vetoes_of(age_checks(captured_to_ns, now_ns, settings)))
 
 
+def offset_vetoes(magnet: Magnet, calibration_id: str, yard_frame_id: str | None) -> tuple[Veto, ...]:
+    """Forbid every lift of a map that another rig or yard frame made than the magnet's offset is of."""
+    offset = magnet.offset
+    if offset is None:
+        return ()
+    for what, own, here in (
+        ("calibration", offset.calibration_id, calibration_id),
+        ("yard frame", offset.yard_frame_id, yard_frame_id),
+    ):
+        if own != here:
+            reason = f"the magnet's offset is of another {what} ({own}; the map has {here}): touch down again"
+            return (Veto("calibration-changed", reason),)
+    return ()
+
+
 def plan_lifts(
     yard: YardMap, bundles: tuple[Bundle, ...], magnet: Magnet, settings: LiftSettings,
     vetoes: tuple[Veto, ...], travel: Travel | None = None, now_ns: int = 0,

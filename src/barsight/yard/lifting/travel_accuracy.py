@@ -17,7 +17,7 @@ from barsight.core.pose import skew
 from barsight.core.types import CraneSamples, RectifiedCamera, Trajectory
 from barsight.motion.crane.encoder_trajectory import fit_position
 from barsight.yard.lift_settings import UPPER, LiftSettings
-from barsight.yard.magnet.description import Magnet
+from barsight.yard.magnet.description import Magnet, MagnetOffset
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.types import Bundle
 from barsight.yard.vetoes import Check, check_max, check_true
@@ -218,12 +218,15 @@ def _encoder_checks(travel: Travel, place: Placement, max_m: float) -> list[Chec
 
 def _sure_enough(sigma: Float64, magnet: Magnet) -> list[Check]:
     """Check that the 95 % bound of the map's place is within the crane's tolerance, its height's within the
-    gap.
+    gap; of both with that of the magnet's offset, where it is known.
     """
+    known = "the trajectory knows"
+    if magnet.offset is not None:
+        sigma, known = np.hypot(sigma, magnet.offset.sigma_m), "trajectory and touch-downs know"
     return [
         check_max(
-            CODE, f"how well the trajectory knows {name} near it (95 %)", 1e3 * UPPER * float(one),
-            1e3 * most, "mm", f"near it the trajectory knows {name} to {1e3 * UPPER * one:.0f} mm (95 %), "
+            CODE, f"how well {known} {name} near it (95 %)", 1e3 * UPPER * float(one),
+            1e3 * most, "mm", f"near it {known} {name} to {1e3 * UPPER * one:.0f} mm (95 %), "
             f"{1e3 * most:.0f} mm are allowed",
         )
         for name, one, most in (
@@ -236,13 +239,14 @@ def _sure_enough(sigma: Float64, magnet: Magnet) -> list[Check]:
 
 def target_covariance(
     place: Placement, load: tuple[Bundle, ...], plane_sigma_m: float, map_sigma_m: float,
-    travel: Travel | None,
+    travel: Travel | None, offset: MagnetOffset | None = None,
 ) -> Float64:  # fmt: skip
     """Estimate the covariance (4, 4) of a target's x, y, z (m) and yaw (rad), in the map's frame.
 
-    The bundles' own, the plane's over its points, the trajectory's near it, and the map's: only that holds
-    the calibration's part of the heights, which moves the whole map; all of it is taken as shared. Of several
-    bundles the worst counts: their errors are common. NaN where a bundle doesn't know.
+    The bundles' own, the plane's over its points, the trajectory's near it, the magnet's offset's, and the
+    map's: only that holds the calibration's part of the heights, which moves the whole map; all of it is
+    taken as shared. Of several bundles the worst counts: their errors are common. NaN where a bundle doesn't
+    know.
     """
     if not load:
         return np.full((4, 4), np.nan)
@@ -262,4 +266,6 @@ def target_covariance(
         near = np.linalg.norm(travel.place_m - (place.x_m, place.y_m), axis=1) < travel.reach_m
         shared = np.median(travel.sigma_m[near], axis=0) if near.any() else np.full(3, np.nan)
         found[:3, :3] += np.diag(shared**2)
+    if offset is not None:
+        found[:3, :3] += np.diag(np.square(offset.sigma_m))
     return found

@@ -19,6 +19,8 @@ MIN_SAFETY_FACTOR = 3.0
 """Least safety factor of permanent and electro-permanent magnets [EN 13155], and of one of unknown type."""
 MIN_SAFETY_FACTOR_BACKED = 2.0
 """The same of an electromagnet that a battery holds when the mains fail [EN 13155]."""
+MAX_OFFSET_M = 0.2
+"""An offset larger than this is a wrong lever arm of the rig, not how the magnet hangs."""
 _EXAMPLE = resources.files("barsight.yard.magnet").joinpath("example_magnet.toml")
 
 
@@ -84,11 +86,43 @@ class Limits:
 
 
 @dataclass(frozen=True)
+class MagnetOffset:
+    """Offset of the faces' middle, as the cameras see it, from where the crane's readings say that it is: the
+    mean of touch-downs, yard axes, with the sigma of each mean. calibration_id, yard_frame_id: of the rig and
+    the frame that they were made with; another one's offset forbids every lift.
+    """
+
+    x_m: float
+    y_m: float
+    z_m: float
+    x_sigma_m: float
+    y_sigma_m: float
+    z_sigma_m: float
+    calibration_id: str
+    yard_frame_id: str
+
+    def __post_init__(self) -> None:
+        most = max(abs(value) for value in self.place_m)
+        expect(most <= MAX_OFFSET_M, f"offset x_m, y_m and z_m lie within {MAX_OFFSET_M:g} m")
+        expect(min(self.sigma_m) > 0 and max(self.sigma_m) <= 0.1, "offset's sigmas lie between 0 and 0.1 m")
+
+    @property
+    def place_m(self) -> tuple[float, float, float]:
+        """Return the offset along x, y and z."""
+        return self.x_m, self.y_m, self.z_m
+
+    @property
+    def sigma_m(self) -> tuple[float, float, float]:
+        """Return its sigma along each."""
+        return self.x_sigma_m, self.y_sigma_m, self.z_sigma_m
+
+
+@dataclass(frozen=True)
 class Magnet:
     """A magnet, or several on a beam whose faces lie in one plane. Masses in kg.
 
     type: None where the file doesn't say, which counts as the worst. battery_backup: it holds the load when
-    the mains fail.
+    the mains fail. offset: None where no touch-down told it; `tolerance` must hold it then.
     """
 
     name: str
@@ -103,6 +137,7 @@ class Magnet:
     limits: Limits
     type: MagnetType | None = None
     battery_backup: bool = False
+    offset: MagnetOffset | None = None
 
     def __post_init__(self) -> None:
         expect_values(self)

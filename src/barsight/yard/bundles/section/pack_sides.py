@@ -121,7 +121,8 @@ def _parting(level: Float64, limit: int, top: float, min_depth_m: float) -> int 
             if rises or k > limit:
                 return None
             lowest = k
-        if min(top, height) - level[lowest] >= min_depth_m:
+        # What was never seen is as low as can be: it is no depth under itself.
+        if not height <= level[lowest] and min(top, height) - level[lowest] >= min_depth_m:
             return lowest
         rises |= bool(height > level[lowest] + _RISES_M)
     return None

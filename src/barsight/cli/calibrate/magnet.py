@@ -1,0 +1,55 @@
+"""Run `barsight calibrate magnet CERTIFICATE --magnet FILE -o FILE`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from barsight.acceptance.error_sources import touched_offset
+from barsight.cli.arguments import call
+from barsight.cli.safe_console import SafeConsole
+from barsight.core.errors import InputError
+from barsight.core.files import atomic_path, expect_output
+from barsight.yard.magnet.description import load_magnet
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parse, average and write."""
+
+    def command(
+        certificate: tyro.conf.Positional[Path],
+        magnet: Path,
+        out: Annotated[Path, tyro.conf.arg(aliases=("-o",))],
+    ) -> None:
+        """Find how far the magnet hangs from where the crane's readings say, by touch-downs.
+
+        The magnet's file is written anew with the mean of the touch-downs and its sigma as [offset]. With it
+        lifts give the crane the readings at which the magnet's centre is over the target (crane_target).
+
+        Args:
+            certificate: That of barsight accept, with three touch-downs or more on spheres or dummy bundles.
+            magnet: TOML file of the magnet, without an [offset].
+            out: The .toml file to write.
+        """
+        expect_output(out, ".toml")
+        if load_magnet(magnet).offset is not None:
+            raise InputError(magnet, "has an [offset] already", "give the file without it")
+        offset = asdict(touched_offset(certificate))
+        lines = [f"{name} = {_value(value)}" for name, value in offset.items()]
+        with atomic_path(out) as path:
+            text = magnet.read_text("utf-8").rstrip("\n")
+            path.write_text("\n".join([text, "", "[offset]", *lines, ""]), encoding="utf-8")
+        console = SafeConsole()
+        for axis in "xyz":
+            off, sigma = 1e3 * offset[f"{axis}_m"], 1e3 * offset[f"{axis}_sigma_m"]
+            console.print(f"{axis}: {off:+.1f} ± {sigma:.1f} mm", highlight=False)
+
+    call(command, "calibrate magnet", arguments)
+
+
+def _value(value: object) -> str:
+    return f"{value:.5f}" if isinstance(value, float) else f'"{value}"'

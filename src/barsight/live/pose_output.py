@@ -1,0 +1,162 @@
+"""Run the pose process: write the body's pose at a steady rate, by IMU and encoders between pairs."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from barsight.core.arrays import Float64, Int64
+from barsight.core.files import atomic_path
+from barsight.core.json_values import DIGITS, json_value
+from barsight.core.stamps import NS_PER_S, seconds_to_ns
+from barsight.core.types import CraneSamples, PosedFrame
+from barsight.inertial.model import ORDINARY_NOISE
+from barsight.live.link import Link
+from barsight.live.shared.logs import ReadingLog
+from barsight.live.source import ReplayClock
+from barsight.motion.fixed_lag.propagation import NavigationState, Propagator
+from barsight.recording.sensor_selection import SelectedSensors
+from barsight.yard_frame import crane_in_yard, frame_of, in_yard
+
+WAIT_S = 0.01
+"""A pose waits so long for the readings at its stamp; what hasn't come then is extrapolated."""
+POLL_S = 0.001
+HELD_S = 5.0
+"""Readings that are held: encoders' noise is told from them, and a state that comes late begins with them."""
+
+
+def output_poses(link: Link) -> None:
+    """Write poses until the supervisor says so."""
+    board = link.open_counters()
+    output = PoseOutput(link)
+    board["pose", "ready"] = 1
+    while not board["supervisor", "began_ns"] and not board["supervisor", "stop"]:
+        board.beat("pose")
+        time.sleep(POLL_S)
+    began_ns, crane = board["supervisor", "began_ns"], link.source.crane
+    first_ns = board["capture", "first_ns"] if crane is None else began_ns + link.source.epoch_ns
+    clock, due_s = ReplayClock(began_ns, first_ns, link.source.speed), time.monotonic()
+    while not board["supervisor", "stop"]:
+        board.beat("pose")
+        due_s = max(due_s + 1 / link.live.pose_rate_hz, time.monotonic())
+        time.sleep(max(due_s - time.monotonic(), 0))
+        board.add("pose", "written", output.write(clock.stamp_now_ns()))
+
+
+class PoseOutput:
+    """Writes pose.json and notes in `link.outputs()` how late each was."""
+
+    def __init__(self, link: Link) -> None:
+        self._link, whole = link, link.open_recording()
+        source = in_yard(SelectedSensors(whole, link.settings.use), link.settings.yard)
+        self._frame, self._noise = frame_of(source), whole.imu_noise() or ORDINARY_NOISE
+        self._sensors, self._mounted = link.sensors(whole), whole.crane()
+        self._shift_ns = whole.rig.timeshift_cam_imu_ns
+        self._imu, self._crane = (HeldReadings(link.readings(name)) for name in ("imu", "crane"))
+        self._state_ns, self._taken_ns = 0, 0
+        self._propagator: Propagator | None = None
+        self._states, self._outputs = link.states(), link.outputs()
+
+    def write(self, now_ns: int | None) -> bool:
+        """Write the pose at a stamp (cameras' clock), as fast as possible that of a new state; return whether
+        there is one that isn't older than `live.max_predicted_s`.
+        """
+        began = time.monotonic_ns()
+        is_new = self._begin_anew()
+        if self._propagator is None or (now_ns is None and not is_new):
+            return False
+        if now_ns is None:
+            self._publish(self._propagator.at(self._state_ns))
+            return True
+        stamp_ns = now_ns + self._shift_ns
+        if stamp_ns - self._state_ns > seconds_to_ns(self._link.live.max_predicted_s):
+            return False
+        self._await(stamp_ns, began + int(WAIT_S * NS_PER_S))
+        self._take(stamp_ns)
+        self._publish(self._propagator.at(stamp_ns))
+        self._outputs.append((now_ns, time.monotonic_ns() - began))
+        return True
+
+    def _begin_anew(self) -> bool:
+        """Begin with the newest state of `track`, if there is a new one."""
+        stamps, rows = self._states.last(1)
+        if not len(stamps) or int(stamps[0]) == self._state_ns:
+            return False
+        self._state_ns = self._taken_ns = int(stamps[0])
+        state = NavigationState.of(self._state_ns, rows[0])
+        self._imu.grow()
+        self._crane.grow()
+        known = self._placed(*self._crane.since(0)) if "crane" in self._sensors else None
+        self._propagator = Propagator(state, self._noise, known, has_imu="imu" in self._sensors)
+        return True
+
+    def _await(self, stamp_ns: int, give_up_ns: int) -> None:
+        """Wait for the IMU's reading at a stamp, for a while."""
+        self._imu.grow()
+        while "imu" in self._sensors and self._imu.last_ns < stamp_ns and time.monotonic_ns() < give_up_ns:
+            time.sleep(POLL_S)
+            self._imu.grow()
+        self._crane.grow()
+
+    def _take(self, stamp_ns: int) -> None:
+        """Give the propagator what came since it last took any, up to a stamp."""
+        assert self._propagator is not None
+        imu, crane = (
+            held.since(self._taken_ns, stamp_ns) if name in self._sensors else held.since(0, 0)
+            for name, held in (("imu", self._imu), ("crane", self._crane))
+        )
+        places = self._placed(*crane)
+        self._propagator.take(*imu, crane[0], np.empty((0, 3)) if places is None else places.position_m)
+        last = [stamps[-1] for stamps in (imu[0], crane[0]) if len(stamps)]
+        self._taken_ns = max([self._taken_ns, *map(int, last)])
+
+    def _placed(self, stamps_ns: Int64, places_m: Float64) -> CraneSamples | None:
+        """Return encoder readings in the surveyed yard; None where there are none."""
+        if self._mounted is None or not len(stamps_ns):
+            return None
+        crane = replace(self._mounted, stamp_ns=stamps_ns, position_m=places_m)
+        return crane if self._frame is None else crane_in_yard(crane, self._frame)
+
+    def _publish(self, posed: PosedFrame) -> None:
+        """Write the pose for readers, whole or not at all. predicted_s: how long after the last pair."""
+        pose = posed.reference_from_body
+        content = {
+            "stamp_ns": posed.stamp_ns - self._shift_ns,
+            "frame": pose.target,
+            "position_m": pose.translation,
+            "quaternion_xyzw": pose.quaternion_xyzw,
+            "sigma_m": np.sqrt(np.diag(posed.covariance)[3:]),
+            "predicted_s": (posed.stamp_ns - self._state_ns) / NS_PER_S,
+        }
+        with atomic_path(self._link.folder.parent / "pose.json") as path:
+            path.write_text(json.dumps(json_value(content, DIGITS)) + "\n", encoding="utf-8")
+
+
+class HeldReadings:
+    """The readings of a log over the last `HELD_S`."""
+
+    def __init__(self, log: ReadingLog) -> None:
+        self._log = log
+        self._stamps_ns, self._values = log.last(0)
+
+    @property
+    def last_ns(self) -> int:
+        """Return the stamp of the last one, 0 before the first."""
+        return int(self._stamps_ns[-1]) if len(self._stamps_ns) else 0
+
+    def grow(self) -> None:
+        """Take in what came since the last call."""
+        stamps, values = self._log.read()
+        if len(stamps):
+            first = int(np.searchsorted(self._stamps_ns, stamps[-1] - seconds_to_ns(HELD_S)))
+            self._stamps_ns = np.concatenate([self._stamps_ns[first:], stamps])
+            self._values = np.concatenate([self._values[first:], values])
+
+    def since(self, after_ns: int, until_ns: int | None = None) -> tuple[Int64, Float64]:
+        """Return those after a stamp, up to another: (N,) stamps, (N, width) values."""
+        begin = int(np.searchsorted(self._stamps_ns, after_ns, side="right"))
+        end = None if until_ns is None else int(np.searchsorted(self._stamps_ns, until_ns, side="right"))
+        return self._stamps_ns[begin:end], self._values[begin:end]

@@ -1,0 +1,186 @@
+"""Propagate the last estimate by IMU and encoders: poses between pictures and after the last one.
+
+An error-state Kalman filter [Solà 2017, section 5] that begins anew at each estimate of the window. Without
+an IMU the body keeps its attitude and its velocity walks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from barsight.calibration.geometry.imu_noise import ImuNoise
+from barsight.core.arrays import Float64, Int64
+from barsight.core.errors import Failed
+from barsight.core.pose import Pose, skew
+from barsight.core.stamps import NS_PER_S, seconds_to_ns
+from barsight.core.types import CraneSamples, PosedFrame
+from barsight.inertial.model import GRAVITY_MPS2, BodyState, ImuBias
+from barsight.inertial.preintegration import MAX_GAP_S
+from barsight.motion.crane.encoder_trajectory import fit_position, reestimate_noise
+
+ACCELERATION_DENSITY = 0.3
+"""Noise density of the crane's acceleration where no IMU measures it, m/s²/sqrt(Hz)."""
+SWAY_DENSITY_RADPS = 6e-3
+"""Noise density of the turn rate where no IMU measures it, rad/s/sqrt(Hz)."""
+GATE_SIGMAS = 5.0
+"""An encoder reading further off is not used: it jumped, or froze."""
+REFERENCE_S = 0.25
+"""Readings so far about the estimate tell where the encoders were then."""
+_SIZE = 15
+_TURN, _PLACE, _SPEED, _ACCEL, _GYRO, _OFFSET = (slice(k, k + 3) for k in range(0, _SIZE + 3, 3))
+
+
+@dataclass(frozen=True, eq=False)
+class NavigationState:
+    """The window's last node. stamp_ns: on the IMU's clock. target: its frame, `yard` or `world`.
+
+    covariance: (15, 15) of rotation (rad, body axes), position (m) and velocity (m/s, both in the reference's
+    axes), accelerometer's and gyro's bias.
+    """
+
+    stamp_ns: int
+    target: str
+    body: BodyState
+    bias: ImuBias
+    covariance: Float64
+
+    @property
+    def row(self) -> Float64:
+        """Return its numbers, (`ROW_NUMBERS`,), but for the stamp."""
+        body, bias = self.body, self.bias
+        motion = (float(self.target == "yard"), body.rotation, body.position_m, body.velocity_mps)
+        parts = (*motion, bias.accel_mps2, bias.gyro_radps, self.covariance)
+        return np.concatenate([np.ravel(part) for part in parts])
+
+    @classmethod
+    def of(cls, stamp_ns: int, row: Float64) -> NavigationState:
+        """Build from the numbers of `row`."""
+        in_yard, turn, place, speed, accel, gyro, covariance = np.split(row, np.cumsum((1, 9, 3, 3, 3, 3)))
+        body, target = BodyState(turn.reshape(3, 3), place, speed), "yard" if in_yard[0] else "world"
+        return cls(stamp_ns, target, body, ImuBias(gyro, accel), covariance.reshape(_SIZE, _SIZE))
+
+
+ROW_NUMBERS = 1 + 9 + 4 * 3 + _SIZE**2
+
+
+class Propagator:
+    """Propagates a `NavigationState` by the readings that come after it.
+
+    crane: its readings about the state, None without encoders. has_imu: whether the IMU gives readings.
+    """
+
+    def __init__(
+        self, state: NavigationState, noise: ImuNoise, crane: CraneSamples | None, *, has_imu: bool
+    ) -> None:
+        self.stamp_ns, self._target, self._bias = state.stamp_ns, state.target, state.bias
+        body = state.body
+        self._rotation = body.rotation.copy()
+        self._position, self._velocity = body.position_m.copy(), body.velocity_mps.copy()
+        self._covariance = np.zeros((_SIZE + 3, _SIZE + 3))
+        self._covariance[:_SIZE, :_SIZE] = state.covariance
+        self._noise, self._has_imu = noise, has_imu
+        self._force, self._rate = body.rotation.T @ np.array([0.0, 0.0, GRAVITY_MPS2]), np.zeros(3)
+        self._is_measured = False
+        self._encoders: tuple[Float64, float] | None = None
+        if crane is not None:
+            crane = reestimate_noise(crane)
+            found = fit_position(crane, state.stamp_ns, seconds_to_ns(REFERENCE_S))
+            if not isinstance(found, Failed):
+                self._encoders = body.position_m - found.position_m, crane.position_std_m
+                # The offset errs by the state's place and by the encoders' there.
+                self._covariance[_OFFSET, :_SIZE] = state.covariance[_PLACE]
+                self._covariance[:_SIZE, _OFFSET] = state.covariance[:, _PLACE]
+                self._covariance[_OFFSET, _OFFSET] = state.covariance[_PLACE, _PLACE] + found.covariance
+
+    def take(self, imu_ns: Int64, imu: Float64, crane_ns: Int64, places_m: Float64) -> None:
+        """Take the readings that came since the last call, in the order of their stamps.
+
+        imu: (N, 6) turn rate and specific force. places_m: (M, 3).
+        """
+        order = np.argsort(np.concatenate([imu_ns, crane_ns]), kind="stable")
+        for k in order.tolist():
+            if k < len(imu_ns):
+                self._measure(int(imu_ns[k]), imu[k])
+            else:
+                self._correct(int(crane_ns[k - len(imu_ns)]), places_m[k - len(imu_ns)])
+
+    def at(self, stamp_ns: int) -> PosedFrame:
+        """Return the pose at a stamp (IMU's clock) after the last reading taken, without taking it."""
+        seconds = max(stamp_ns - self.stamp_ns, 0) / NS_PER_S
+        rotation, position, _ = self._moved(seconds)
+        covariance = self._spread(seconds)
+        turned = np.zeros((6, _SIZE + 3))
+        turned[:3, _TURN], turned[3:, _PLACE] = rotation, np.eye(3)
+        pose = Pose(self._target, "body", rotation, position)
+        return PosedFrame(stamp_ns, pose, turned @ covariance @ turned.T)
+
+    def _measure(self, stamp_ns: int, reading: Float64) -> None:
+        """Move to an IMU reading by its mean with the one before."""
+        rate, force = reading[:3] - self._bias.gyro_radps, reading[3:] - self._bias.accel_mps2
+        if self._is_measured and stamp_ns > self.stamp_ns:
+            self._rate, self._force = (self._rate + rate) / 2, (self._force + force) / 2
+        else:
+            self._rate, self._force = rate, force
+        self._move(stamp_ns)
+        self._rate, self._force, self._is_measured = rate, force, True
+
+    def _correct(self, stamp_ns: int, place_m: Float64) -> None:
+        """Update by an encoder reading, less that at the state begun with."""
+        if self._encoders is None:
+            return
+        self._move(stamp_ns)
+        late_s = min(stamp_ns - self.stamp_ns, 0) / NS_PER_S
+        offset, sigma = self._encoders
+        residual = place_m + offset - (self._position + late_s * self._velocity)
+        design = np.zeros((3, _SIZE + 3))
+        design[:, _PLACE], design[:, _SPEED], design[:, _OFFSET] = np.eye(3), late_s * np.eye(3), -np.eye(3)
+        noise = np.eye(3) * sigma**2
+        spread = design @ self._covariance @ design.T + noise
+        if residual @ np.linalg.solve(spread, residual) > GATE_SIGMAS**2:
+            return
+        gain = np.linalg.solve(spread, design @ self._covariance).T
+        self._apply(gain @ residual)
+        left = np.eye(_SIZE + 3) - gain @ design
+        self._covariance = left @ self._covariance @ left.T + gain @ noise @ gain.T
+
+    def _apply(self, step: Float64) -> None:
+        self._rotation = self._rotation @ Rotation.from_rotvec(step[_TURN]).as_matrix()
+        self._position, self._velocity = self._position + step[_PLACE], self._velocity + step[_SPEED]
+        self._bias = ImuBias(self._bias.gyro_radps + step[_GYRO], self._bias.accel_mps2 + step[_ACCEL])
+        if self._encoders is not None:
+            self._encoders = self._encoders[0] + step[_OFFSET], self._encoders[1]
+
+    def _move(self, stamp_ns: int) -> None:
+        """Move to a later stamp by the last turn rate and force."""
+        if stamp_ns <= self.stamp_ns:
+            return
+        seconds = (stamp_ns - self.stamp_ns) / NS_PER_S
+        covariance = self._spread(seconds)
+        self._rotation, self._position, self._velocity = self._moved(seconds)
+        self._covariance, self.stamp_ns = covariance, stamp_ns
+
+    def _moved(self, seconds: float) -> tuple[Float64, Float64, Float64]:
+        half = Rotation.from_rotvec(self._rate * seconds / 2).as_matrix()
+        acceleration = self._rotation @ half @ self._force - np.array([0.0, 0.0, GRAVITY_MPS2])
+        place = self._position + seconds * self._velocity + seconds**2 / 2 * acceleration
+        return self._rotation @ half @ half, place, self._velocity + seconds * acceleration
+
+    def _spread(self, seconds: float) -> Float64:
+        """Propagate the covariance: `F P F^T + Q` [Solà 2017, Eq. 270]."""
+        jacobian = np.eye(_SIZE + 3)
+        jacobian[_TURN, _TURN] = Rotation.from_rotvec(-self._rate * seconds).as_matrix()
+        jacobian[_TURN, _GYRO] = -seconds * np.eye(3)
+        jacobian[_PLACE, _SPEED] = seconds * np.eye(3)
+        jacobian[_SPEED, _TURN] = -seconds * self._rotation @ skew(self._force)
+        jacobian[_SPEED, _ACCEL] = -seconds * self._rotation
+        noise, measured = self._noise, self._has_imu and seconds <= MAX_GAP_S
+        turn = noise.gyro_density if measured else SWAY_DENSITY_RADPS
+        accel = noise.accel_density if measured else ACCELERATION_DENSITY
+        added = np.zeros(_SIZE + 3)
+        added[_TURN], added[_SPEED] = turn**2 * seconds, accel**2 * seconds
+        added[_PLACE] = accel**2 * seconds**3 / 3
+        added[_GYRO], added[_ACCEL] = noise.gyro_walk**2 * seconds, noise.accel_walk**2 * seconds
+        return jacobian @ self._covariance @ jacobian.T + np.diag(added)
