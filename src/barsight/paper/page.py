@@ -173,7 +173,7 @@ def _number(value: float, decimals: int = 1, unit: str = "") -> str:
 
 def _table_1(sizes: TargetSizeBench) -> PaperTable:
     heads = ("range mm", *(f"paper: {name} mm, %" for name in _OF_PAPER),
-             *(f"here: {_NAMES.get(method.method, method.method)} %" for method in sizes.methods))  # fmt: skip
+             *(f"here: {_NAMES.get(one.method, one.method)} %" for one in sizes.methods))  # fmt: skip
     rows = []
     measured = {one.range_mm: k for k, one in enumerate(sizes.methods[0].ranges)}
     for range_mm, *printed in published.TARGET_SIZE:
@@ -254,8 +254,8 @@ def _table_4(
     note = (
         "Relative errors here: against the paper's 3.77 m, and against the stack's own height. Spacing: one "
         "pixel at the floor, 8 m away. Hz: pairs a second of the whole pipeline, map included, beside what "
-        "else this machine did. Against the laser both contours are filtered and all samples count, steps and "
-        "gullies too; against truth, smooth places."
+        "else this machine did. Against the laser both contours are filtered and all samples count, steps "
+        "and gullies too; against truth, smooth places."
     )
     return PaperTable(heads, rows, note)
 
