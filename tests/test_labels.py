@@ -16,7 +16,7 @@ from barsight.labels.attachment import PlacedCode, contradictions, merge_codes
 from barsight.labels.bundle_labels import bundle_label, unread_label
 from barsight.labels.code_reading import read_codes
 from barsight.labels.placing import pose_at
-from barsight.labels.plates import find_plates, loose_plates
+from barsight.labels.plates import find_plates
 from barsight.recording.open import open_recording
 from barsight.result_folder import read_heights, read_path
 from barsight.simulation.lighting import bake, hall_lamps
@@ -322,17 +322,6 @@ def test_a_plate_of_a_labels_size_is_an_illegible_label(level: float) -> None:
     assert unread_label(bundle, seen, (0.1, 0.06)) == BundleLabel(None, "illegible", 0, 0.0)
     assert unread_label(bundle, seen, (0.0, 0.0)) is None
     assert not find_plates(bundle, seen, (0.3, 0.2)), "labels of another size are looked for"
-
-
-def test_a_label_beside_the_bundles_lies_on_none() -> None:
-    """Of two bundles only the left one was found; the label lies on the other."""
-    heights = map_of([laid(0.3), laid(0.05)])
-    gray = shining(heights.shape, 90.0)
-    paper(heights, gray, (0.03, 0.05))
-    seen = yard_with(gray, heights)
-    (place,) = loose_plates((record(laid(0.05)),), seen, (0.1, 0.06))
-    np.testing.assert_allclose(place, [0.3, 0.7], atol=0.02)
-    assert not loose_plates((record(laid(0.3)), record(laid(0.05), 1)), seen, (0.1, 0.06))
 
 
 def test_what_is_longer_or_stands_up_is_no_label() -> None:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator
 from itertools import chain
 
 import cv2
@@ -35,8 +34,6 @@ MAX_CODE_LOG, MIN_CODE_RATIO, MAX_CODE_RATIO, MIN_CODE_FULL = 0.7, (0.8, 0.6), 1
 """A code is half white: what is darker is a strap. Its sides over the label's shorter one; how full it is."""
 BESIDE_M, MAX_RISE_M = 0.1, 0.015
 """A plate stands no more over what lies so far before and behind: blocks do."""
-NEAR_M, EDGE_M = 0.25, 0.03
-"""How far beside a bundle what it covers is looked at; how far beside its outline its own label may lie."""
 _DARK = 10.0
 """Level that is added to all: where hardly any light is, ratios tell nothing."""
 
@@ -62,24 +59,6 @@ def find_plates(bundle: Bundle, heights: YardMap, size_m: tuple[float, float]) -
         if abs(across[middle[1]]) <= bundle.width_m / 2 and abs(_rise(cells, z_m)) <= MAX_RISE_M:
             found.append(np.array([x[middle], y[middle]]))
     return found
-
-
-def loose_plates(bundles: Sequence[Bundle], heights: YardMap, size_m: tuple[float, float]) -> list[Float64]:
-    """Find the middles (2,) of plates beside bundles that lie on none of them: on what they cover, m."""
-    found = list[Float64]()
-    for bundle in bundles if min(size_m) > 0 else ():
-        for place in find_plates(replace(bundle, width_m=bundle.width_m + 2 * NEAR_M), heights, size_m):
-            on_none = not any(_holds(other, place) for other in bundles)
-            if on_none and all(np.linalg.norm(place - other) > max(size_m) for other in found):
-                found.append(place)
-    return found
-
-
-def _holds(bundle: Bundle, place: Float64) -> bool:
-    """Check whether a place (2,) lies on a bundle's outline, seen from above."""
-    c, s = np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad)
-    across, along = np.abs(np.array([[c, s], [-s, c]]) @ (place - bundle.centre_m[:2]))
-    return bool(across <= bundle.width_m / 2 + EDGE_M and along <= bundle.length_m / 2)
 
 
 def _plates(gray: Float32, size_m: tuple[float, float]) -> Iterator[Bool]:

@@ -9,13 +9,11 @@ from typing import Any
 
 import barsight
 from barsight.calibration.geometry.rectification import Rectifier
-from barsight.core.arrays import Float64
 from barsight.core.errors import InputError
 from barsight.core.json_values import write_json
 from barsight.labels.attachment import Label, PlacedCode, contradictions, merge_codes
 from barsight.labels.bundle_labels import ILLEGIBLE, bundle_label, placed_codes, unread_label
 from barsight.labels.placing import pose_at
-from barsight.labels.plates import loose_plates
 from barsight.recording.base import Recording
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.result_folder import open_folder, read_heights, read_path
@@ -27,25 +25,15 @@ FILE = "labels.json"
 
 
 @dataclass(frozen=True, eq=False)
-class IllegibleLabel:
-    """A label that is seen and not read for sure. bundle: its id and place_m its middle (2,); None where it
-    lies on none that was found, and the label's own place.
-    """
-
-    bundle: int | None
-    place_m: Float64
-
-
-@dataclass(frozen=True, eq=False)
 class ReadLabels:
-    """The labels of a yard. pictures: that were read. illegible: labels that are seen and not read for sure.
-    contradictions: with the stock list, sentences.
+    """The labels of a yard. pictures: that were read. illegible: ids of bundles whose label is seen and not
+    read for sure. contradictions: with the stock list, sentences.
     """
 
     map_id: str
     pictures: int
     labels: tuple[Label, ...]
-    illegible: tuple[IllegibleLabel, ...]
+    illegible: tuple[int, ...]
     contradictions: tuple[str, ...]
 
 
@@ -76,13 +64,11 @@ def read_labels(
         codes += found
         pictures += 2
     labels = merge_codes(codes, bundles)
-    illegible = [
-        IllegibleLabel(bundle.id, bundle.centre_m[:2]) for bundle in bundles
+    illegible = tuple(
+        bundle.id for bundle in bundles
         if (bundle_label(bundle, labels) or unread_label(bundle, heights, size_m)) == ILLEGIBLE
-    ]  # fmt: skip
-    illegible += [IllegibleLabel(None, place) for place in loose_plates(bundles, heights, size_m)]
-    contradicted = contradictions(labels, bundles, listed)
-    return ReadLabels(said["map_id"], pictures, labels, tuple(illegible), contradicted)
+    )  # fmt: skip
+    return ReadLabels(said["map_id"], pictures, labels, illegible, contradictions(labels, bundles, listed))
 
 
 def write_labels(found: ReadLabels, folder: Path) -> Path:
@@ -101,13 +87,7 @@ def write_labels(found: ReadLabels, folder: Path) -> Path:
             }
             for one in found.labels
         ],
-        "illegible": [
-            {
-                "bundle": one.bundle, "x_m": round(float(one.place_m[0]), 4),
-                "y_m": round(float(one.place_m[1]), 4),
-            }
-            for one in found.illegible
-        ],
+        "illegible": list(found.illegible),
         "contradictions": list(found.contradictions),
     }  # fmt: skip
     target = folder / FILE

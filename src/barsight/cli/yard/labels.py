@@ -69,10 +69,6 @@ def _print(found: ReadLabels, console: SafeConsole) -> None:
         table.add_row(escape(one.text), one.kind, x, y, str(one.pictures), bundle, escape(told))
     console.print(table if found.labels else f"no label was read in {found.pictures} pictures")
     if found.illegible:
-        places = ", ".join(
-            f"x {one.place_m[0]:.2f} m, y {one.place_m[1]:.2f} m" if one.bundle is None
-            else f"bundle {one.bundle}" for one in found.illegible
-        )  # fmt: skip
-        console.print(f"illegible, on: {places}", soft_wrap=True, highlight=False, markup=False)
+        console.print(f"illegible: the labels on bundles {', '.join(map(str, found.illegible))}")
     for text in found.contradictions:
         console.print(f"[yellow]{escape(text)}[/yellow]", soft_wrap=True, highlight=False)
