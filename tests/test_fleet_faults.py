@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import pickle
 import shutil
 import subprocess
@@ -72,6 +73,20 @@ def test_parts_of_a_bag_are_one_recording_with_the_calibration_beside_it(tmp_pat
     (tmp_path / "a/loose/imu.yaml").symlink_to(tmp_path / "a/ros/camchain.yaml")
     with pytest.raises(InputError, match=r"imu\.yaml: is a link out"):
         list(download(archive, "loose/two.bag", (".",), tmp_path / "3"))
+
+
+def test_a_recording_that_cannot_be_read_is_left_out_by_name(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    archive = make_archive(tmp_path / "a", {"good": "good", "large": "good", "linked": "good"})
+    os.truncate(archive / "large/mav0/kind", 1 << 33)
+    (archive / "linked/mav0/out").symlink_to("/etc/hostname")
+    where = ["--results", str(tmp_path / "r"), "--store", f"sqlite:///{tmp_path}/s.db"]
+    assert run(["fleet", "plan", str(archive), *where]) == 3
+    told = capsys.readouterr()
+    assert "1 recordings, 1 new in the plan" in told.out
+    lines = [line for line in told.err.splitlines() if line.startswith("left out: ")]
+    assert len(lines) == 2 and "large/mav0/kind" in lines[0] and "linked/mav0/out" in lines[1]
 
 
 def test_recordings_of_two_archives_and_of_one_that_moved(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """The finished surface: windows over tile borders, filled gaps, the cloud."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -190,8 +191,8 @@ def test_the_cloud_agrees_with_the_surface_on_bars(tmp_path: Path) -> None:
 
 
 def test_snapshots_change_nothing_and_stay_as_they_are(tmp_path: Path) -> None:
-    """Views along a way, a snapshot after each: the last surface has the bytes of one without snapshots,
-    tiles far behind aren't elected anew, and the first snapshot still shows what it showed."""
+    """Views on a way, settled or with a snapshot after each: the last surface has the bytes of one without:
+    what is left behind is settled and not elected anew, and the first snapshot still shows what it showed."""
     settings = MapSettings(along_m=0.1)
     rng = np.random.default_rng(5)
     views = []
@@ -200,7 +201,8 @@ def test_snapshots_change_nothing_and_stay_as_they_are(tmp_path: Path) -> None:
         bars = 0.5 + np.sqrt(0.03**2 - (0.01 * x % 0.06 - 0.03) ** 2)
         views += [view(x, y, bars + rng.normal(0, 0.002, x.shape), 0.002) for _ in range(2)]
     ends = {}
-    for kind in ("once", "often"):
+    settled: list[set[str]] = []
+    for kind in ("once", "settled", "often"):
         folder = tmp_path / kind
         folder.mkdir()
         store, poses, shown = TileStore(folder, 64), [], []
@@ -208,6 +210,9 @@ def test_snapshots_change_nothing_and_stay_as_they_are(tmp_path: Path) -> None:
         for one in views:
             fuse_view(store, one, settings)
             poses.append(low_above(one))
+            if kind == "settled":
+                election.settle(2, partial(ViewFrusta.of, poses, CAMERA))
+                settled.append({path.name for path in folder.glob("election_*/finished/*")})
             if kind == "often":
                 shown.append(election.snapshot(2, ViewFrusta.of(poses, CAMERA)))
         if shown:
@@ -224,7 +229,8 @@ def test_snapshots_change_nothing_and_stay_as_they_are(tmp_path: Path) -> None:
         if shown:
             read_tile.cache_clear()
             np.testing.assert_array_equal(shown[1].window(0, 200, 300, 90).z_m, first.z_m)
-    assert ends["once"][1:] == ends["often"][1:]
+    assert ends["once"][1:] == ends["settled"][1:] == ends["often"][1:]
+    assert settled[0] == set() and "surface_0_0.npy" in settled[-1] and "surface_4_0.npy" not in settled[-1]
     assert len(ends["once"][1]) == len(surface.tiles) > 8
     assert ends["once"][0].seen == ends["often"][0].seen > 100_000
     assert replace(ends["once"][0], folder=tmp_path) == replace(ends["often"][0], folder=tmp_path)

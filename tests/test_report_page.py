@@ -144,6 +144,15 @@ def test_the_summary_alone_makes_a_page(tmp_path: Path) -> None:
     assert figures(page) == {}
 
 
+@pytest.mark.parametrize(
+    "change", [{"vetoes": 1}, {"vetoes": [1]}, {"passes": [{"number": 1}]}, {"passes": [None]}]
+)
+def test_a_summary_that_is_not_as_its_schema_says_is_refused(tmp_path: Path, change: dict[str, Any]) -> None:
+    (tmp_path / "result.json").write_text(json.dumps(summary() | change))
+    with pytest.raises(InputError, match=next(iter(change))):
+        render_page(tmp_path)
+
+
 def test_a_missing_number_is_a_dash(tmp_path: Path) -> None:
     lacking = summary()
     lacking["map"]["median_sigma_m"] = None

@@ -80,12 +80,15 @@ class LiveMap:
             return
         if not isinstance(self._views.add(self._match(pair), posed), Refusal):
             self._last = seen
+            self._election.settle(self._settings.min_views, self._frusta)
 
     def snapshot(self, owner: object) -> Snapshot:
         """Elect the surface as it stands; only tiles that changed since the last one are elected anew."""
         placed = self._views.placed
         if len(placed) < 2:
             return Snapshot(None, len(placed))
-        frusta = ViewFrusta.of(placed, self._rectifier.camera, self._per_pixel)
-        surface = self._election.snapshot(self._settings.min_views, frusta)
+        surface = self._election.snapshot(self._settings.min_views, self._frusta())
         return Snapshot(surface, len(placed), owner)
+
+    def _frusta(self) -> ViewFrusta:
+        return ViewFrusta.of(self._views.placed, self._rectifier.camera, self._per_pixel)

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from math import inf
 from statistics import median
 
+from barsight.core.errors import InputError
 from barsight.core.settings.values import expect_ranges
 from barsight.fleet.archive import find_recordings, manifest_digest
-from barsight.fleet.objects import Objects
+from barsight.fleet.objects import Objects, UnreachableError
 from barsight.fleet.versions import FleetTask, Version
 
 FIRST_S, PER_PAIR_S, PER_BYTE_S, RESULT_BYTES = 8.0, 1.5, 1e-6, 15_000_000
@@ -32,9 +33,11 @@ def plan_tasks(
     version: Version,
     limit: int | None,
     advance: Callable[[int, int], None],
+    leave_out: Callable[[InputError], None] | None = None,
 ) -> list[FleetTask]:
     """Make the tasks of an archive's recordings, in the order of their names; recordings with the same
-    content under two names are one task. advance: told of bytes read and of all.
+    content under two names are one task. advance: told of bytes read and of all. leave_out: told of a
+    recording that can't be read, which then has no task; without it the error is raised.
     """
     recordings = find_recordings(archive)[:limit]
     total, done = sum(one.size for one in recordings), 0
@@ -46,7 +49,15 @@ def plan_tasks(
             done += size
             advance(done, total)
 
-        manifest = manifest_digest(archive, results, recording, read)
+        try:
+            manifest = manifest_digest(archive, results, recording, read)
+        except UnreachableError:
+            raise
+        except InputError as error:
+            if leave_out is None:
+                raise
+            leave_out(error)
+            continue
         key = version.key(manifest)
         tasks.setdefault(
             key,

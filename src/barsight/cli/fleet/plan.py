@@ -12,7 +12,7 @@ import tyro
 from barsight.cli.arguments import call, load_settings
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
-from barsight.core.errors import ConfigError
+from barsight.core.errors import ConfigError, InputError
 from barsight.core.extras import extra
 from barsight.measure_settings import MeasureSettings
 from barsight.store.audit import user_name
@@ -28,7 +28,8 @@ def run(arguments: Sequence[str]) -> None:
         limit: int | None = None, workers: int = 1, by: str | None = None,
     ) -> None:  # fmt: skip
         """Find an archive's recordings and plan their measurement; says what is new, done and parked, and
-        estimates hours and gigabytes. Nothing is measured.
+        estimates hours and gigabytes. Nothing is measured. Recordings that can't be read are left out by
+        name, and the command then ends with 3.
 
         A folder with survey.json, {"passes": ["first", "second"]}, is one survey of several passes.
 
@@ -53,10 +54,11 @@ def run(arguments: Sequence[str]) -> None:
             if value is not None and value < 1:
                 raise ConfigError(f"--{flag} {value}: give 1 or more")
         settings = load_settings(config, MeasureSettings)
+        left_out: list[InputError] = []
         source, target = open_objects(archive), open_objects(results, create=True)
         version = publish_version(target, settings, config, rig, magnet)
         with stages(SafeConsole(stderr=True)) as advance:
-            tasks = plan_tasks(source, target, version, limit, partial(advance, "read"))
+            tasks = plan_tasks(source, target, version, limit, partial(advance, "read"), left_out.append)
         with open_store(store, create=True) as opened:
             new = note_plan(opened, tasks, by or user_name())
             with opened.reading() as connection:
@@ -67,6 +69,13 @@ def run(arguments: Sequence[str]) -> None:
         words[1:1] = [f"{sum(t.key in keys for t in tasks)} {name}" for name, keys in ended.items()]
         _tell(f"version {version.name}: {len(tasks)} recordings, {', '.join(words)}")
         _tell_work(estimate(left, measured), workers)
+        for error in left_out:
+            _tell(f"left out: {error}", stderr=True)
+        if left_out:
+            raise InputError(
+                archive, f"{len(left_out)} recordings are left out of the plan, the others are in it",
+                "mend those above and plan again",
+            )  # fmt: skip
 
     call(command, "fleet plan", arguments)
 
@@ -79,5 +88,5 @@ def _tell_work(told: Any, workers: int) -> None:
     )
 
 
-def _tell(line: str) -> None:
-    SafeConsole().print(line, highlight=False, soft_wrap=True, markup=False)
+def _tell(line: str, *, stderr: bool = False) -> None:
+    SafeConsole(stderr=stderr).print(line, highlight=False, soft_wrap=True, markup=False)

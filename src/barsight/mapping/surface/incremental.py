@@ -77,10 +77,25 @@ class SurfaceElection:
             made.mkdir()
         self._work = work
         self._states: dict[TileKey, tuple[int, int]] = {}
-        self._heights = TileStore(asked, settings.resident_tiles, fields=3, fill=np.nan)
+        self._taken: dict[TileKey, int] = {}
+        self._unfinished: set[TileKey] = set()
+        self._heights = TileStore(asked, settings.resident_tiles // 2, fields=3, fill=np.nan)
         self._views: dict[TileKey, int] = {}
         self._figures: dict[TileKey, TileFigures] = {}
         self._height_m = np.inf
+
+    def settle(self, min_views: int, frusta: Callable[[], ViewFrusta]) -> None:
+        """Elect the tiles that the last view no longer touched, and finish those that lie beside none which
+        it did: a snapshot then has the tiles in view left to do. Called after each view.
+        """
+        keys = self._store.keys()
+        taken = {key: self._store.version(key) for key in keys}
+        in_view = {key for key, count in taken.items() if self._taken.get(key) != count}
+        self._taken = taken
+        if left := [key for key in self._changed(min_views) if key not in in_view]:
+            self._elect_changed(left, min_views, frusta())
+        if ready := [key for key in sorted(self._unfinished) if in_view.isdisjoint(_around(key))]:
+            self._finish(ready, frusta())
 
     def snapshot(self, min_views: int, frusta: ViewFrusta) -> Surface:
         """Return the surface as it stands, without its cloud, of its own from now on; only tiles that changed
@@ -89,15 +104,24 @@ class SurfaceElection:
         A tile that lies beside one that changed waits for its own next change, and a view is asked once
         whether it sees a height, until that moves.
         """
-        keys = self._store.keys()
-        states = {key: (self._store.version(key), min_views) for key in keys}
-        changed = [key for key in keys if self._states.get(key) != states[key]]
-        self._elect(changed, min_views, frusta, last=False)
-        self._states |= states
-        if not abs(frusta.height_m - self._height_m) <= _KEPT_HEIGHT_M:
-            self._height_m, changed = frusta.height_m, keys
-        self._finish(changed, frusta)
+        changed = self._changed(min_views)
+        self._elect_changed(changed, min_views, frusta)
+        self._heights.hold(len(changed))
+        self._finish(sorted(self._unfinished), frusta)
         return self._surface(tile_file)
+
+    def _changed(self, min_views: int) -> list[TileKey]:
+        """List the tiles that were taken since they were last elected."""
+        keys, version = self._store.keys(), self._store.version
+        return [key for key in keys if self._states.get(key) != (version(key), min_views)]
+
+    def _elect_changed(self, keys: list[TileKey], min_views: int, frusta: ViewFrusta) -> None:
+        """Elect these tiles, whose finish is due then; that of all, once the cameras' height has changed."""
+        self._elect(keys, min_views, frusta, last=False)
+        self._states |= {key: (self._store.version(key), min_views) for key in keys}
+        if not abs(frusta.height_m - self._height_m) <= _KEPT_HEIGHT_M:
+            self._height_m, keys = frusta.height_m, list(self._states)
+        self._unfinished |= set(keys)
 
     def finish(self, min_views: int, frusta: ViewFrusta) -> Surface:
         """Return the surface at the end, all elected from the start; the tiles in `store` are given up."""
@@ -123,8 +147,12 @@ class SurfaceElection:
         return surface
 
     def _elect(self, keys: list[TileKey], min_views: int, frusta: ViewFrusta, *, last: bool) -> None:
-        """Elect these tiles, at last with no regard to what was asked for snapshots."""
+        """Elect these tiles, beside neighbours by votes alone as they are now, at last with no regard to what
+        was asked for snapshots.
+        """
         known, read = frozenset(self._store.keys()), self._store.read
+        beside = {near for key in keys for near in _around(key)}
+        voted = keys if last else [key for key in self._changed(min_views) if key in beside]
 
         def look(key: TileKey, tile: Float32) -> None:
             np.save(_first_file(self._first, key), elect_by_votes(tile, min_views, self._settings.top_ratio))
@@ -143,12 +171,11 @@ class SurfaceElection:
             )
 
         _read_first.cache_clear()
-        for _ in ordered_map(lambda item: look(*item), ((key, read(key)) for key in keys)):
+        for _ in ordered_map(lambda item: look(*item), ((key, read(key)) for key in voted)):
             pass
         items = ((key, read(key), asked_of(key)) for key in keys)
         for _ in ordered_map(lambda item: elect_tile(*item), items):
             pass
-        self._heights.hold(len(keys))
 
     def _finish(self, keys: list[TileKey], frusta: ViewFrusta, cloud_views: int | None = None) -> None:
         """Average, sharpen and fill these tiles; write the cloud of heights that cloud_views views support,
@@ -169,6 +196,7 @@ class SurfaceElection:
         read_tile.cache_clear()
         items = ((key, None if cloud_views is None else self._store.read(key)) for key in keys)
         self._figures |= ordered_map(finish_tile, items)
+        self._unfinished -= set(keys)
 
     def _filled(self, key: TileKey, keys: frozenset[TileKey], frusta: ViewFrusta) -> tuple[Layers, Float32]:
         """Average the tile lengthways, sharpen it, fill its narrow gaps, looking at most the halo around it;
