@@ -97,6 +97,7 @@ def test_labels_are_read_placed_and_held_against_the_stock(
     assert [(one["text"], one["bundle"], one["is_sure"]) for one in content["labels"]] == [
         ("B-17", None, True)
     ]
+    assert content["illegible"] == []
     label = content["labels"][0]
     assert np.linalg.norm([label["x_m"] - middle[0], label["y_m"] - middle[1]]) < 0.1
     assert label["pictures"] >= 4

@@ -113,3 +113,27 @@ def test_a_jumped_encoder_moves_no_pose_and_an_attitude_turns_with_the_gyro() ->
     assert np.abs(moved[1].reference_from_body.translation).max() < 0.01
     turned = state.body.rotation.T @ moved[0].reference_from_body.rotation
     np.testing.assert_allclose(Rotation.from_matrix(turned).as_rotvec(), [0, 0, 0.2], atol=2e-3)
+
+
+def test_encoders_lead_where_the_imu_falls_silent() -> None:
+    """At 0.5 m/s the IMU's last reading is at 0.1 s; from then on the crane brakes by 0.4 m/s2."""
+    state = NavigationState.of(0, np.zeros(ROW_NUMBERS))
+    body = replace(state.body, rotation=np.diag([1.0, -1, -1]), velocity_mps=np.array([0.5, 0.0, 0.0]))
+    state = replace(state, body=body, covariance=np.eye(15) * 1e-6)
+    stamps = np.arange(-20, 21) * 50_000_000
+    t = stamps / 1e9
+    way = 0.5 * t - 0.2 * np.clip(t - 0.1, 0, None) ** 2
+    places = np.column_stack([way, 0 * way, 0 * way]) + np.random.default_rng(1).normal(0, 0.002, (41, 3))
+    crane = simulated(47)[0].crane()
+    assert crane is not None
+    crane = replace(crane, stamp_ns=stamps, position_m=places, jumps=())
+    found = Propagator(state, ORDINARY_NOISE, crane, has_imu=True)
+    imu_ns, later = np.arange(1, 11) * 10_000_000, stamps > 0
+    # What it read last was a jerk: no turn and no push that would go on.
+    reading = np.tile([0.0, 0.02, 0, 0.3, 0, -9.80665], (10, 1))
+    found.take(imu_ns, reading, stamps[later], places[later])
+    posed = found.at(1_000_000_000)
+    pose, sigma = posed.reference_from_body, np.sqrt(np.diag(posed.covariance))
+    assert abs(pose.translation[0] - way[-1]) < 0.01
+    turned = Rotation.from_matrix(state.body.rotation.T @ pose.rotation).magnitude()
+    assert turned < 0.01 and (sigma[:2] > 0.004).all()

@@ -15,7 +15,7 @@ from barsight.motion.frame_to_frame.motion_trend import MotionTrend
 from barsight.motion.settings import MotionSettings, make_estimator
 from barsight.paper.checks import rotation_errors_deg
 from barsight.paper.published import RELATIVE_TO_M, TARGET_SIZE, recomputed
-from barsight.paper.registry import ENTRIES, PaperEntry, find_code
+from barsight.paper.registry import ENTRIES, FURTHER, PaperEntry, find_code
 from barsight.paper.runs import FULL, QUICK
 from motion_recordings import MemoryRecording, ideal_rig
 
@@ -37,7 +37,9 @@ def test_an_entry_names_code_that_exists(entry: PaperEntry) -> None:
     assert entry.command.startswith("barsight ")
 
 
-@pytest.mark.parametrize("command", sorted({entry.command for entry in ENTRIES}))
+@pytest.mark.parametrize(
+    "command", sorted({entry.command for entry in ENTRIES} | {row[1] for row in FURTHER})
+)
 def test_a_command_and_its_options_exist(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     """Names of the command up to its first argument, and each option in its help."""
     words = command.split()[1:]

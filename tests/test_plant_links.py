@@ -251,6 +251,8 @@ def test_a_live_run_gives_the_pose_and_may_forbid(tmp_path: Path) -> None:
     seen = with_live_run(QUIET, live_folder(tmp_path / "live"))
     assert seen.is_valid and seen.mode == "full" and seen.survey == "measuring"
     assert seen.pose is not None and seen.pose.yaw_deg == pytest.approx(90)
+    newer = with_live_run(QUIET, live_folder(tmp_path / "live", stamp_ns=10_090_000_000)).pose
+    assert newer is not None, "written since state.json was"
     blind = with_live_run(
         QUIET, live_folder(tmp_path / "live", may_stand=False, mode="blind", reasons=["dark"])
     )
@@ -258,7 +260,7 @@ def test_a_live_run_gives_the_pose_and_may_forbid(tmp_path: Path) -> None:
     for change in (
         {"frame": "world"},
         {"stamp_ns": 1},
-        {"stamp_ns": 10_000_000_001},
+        {"stamp_ns": 11_100_000_000},
         {"sigma_m": [float("nan")] * 3},
     ):
         assert with_live_run(QUIET, live_folder(tmp_path / "live", **change)).pose is None

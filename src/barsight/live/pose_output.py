@@ -15,6 +15,7 @@ from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.types import CraneSamples, PosedFrame
 from barsight.inertial.model import ORDINARY_NOISE
 from barsight.live.link import Link
+from barsight.live.modes import FreezeWatch
 from barsight.live.shared.logs import ReadingLog
 from barsight.live.source import ReplayClock
 from barsight.motion.fixed_lag.propagation import NavigationState, Propagator
@@ -54,9 +55,12 @@ class PoseOutput:
         source = in_yard(SelectedSensors(whole, link.settings.use), link.settings.yard)
         self._frame, self._noise = frame_of(source), whole.imu_noise() or ORDINARY_NOISE
         self._sensors, self._mounted = link.sensors(whole), whole.crane()
+        self._freeze: FreezeWatch | None = None
+        if self._mounted is not None and "crane" in self._sensors:
+            self._freeze = FreezeWatch(self._mounted)
         self._shift_ns = whole.rig.timeshift_cam_imu_ns
         self._imu, self._crane = (HeldReadings(link.readings(name)) for name in ("imu", "crane"))
-        self._state_ns, self._taken_ns = 0, 0
+        self._state_ns = 0
         self._propagator: Propagator | None = None
         self._states, self._outputs = link.states(), link.outputs()
 
@@ -85,13 +89,21 @@ class PoseOutput:
         stamps, rows = self._states.last(1)
         if not len(stamps) or int(stamps[0]) == self._state_ns:
             return False
-        self._state_ns = self._taken_ns = int(stamps[0])
+        self._state_ns = int(stamps[0])
         state = NavigationState.of(self._state_ns, rows[0])
-        self._imu.grow()
-        self._crane.grow()
-        known = self._placed(*self._crane.since(0)) if "crane" in self._sensors else None
-        self._propagator = Propagator(state, self._noise, known, has_imu="imu" in self._sensors)
+        for held in (self._imu, self._crane):
+            held.grow()
+            held.taken_ns = self._state_ns
+        has_imu, known = "imu" in self._sensors, self._trusted_encoders()
+        self._propagator = Propagator(state, self._noise, known, has_imu=has_imu)
         return True
+
+    def _trusted_encoders(self) -> CraneSamples | None:
+        """Return the encoder readings held; None where there are none in use or they are frozen."""
+        held = self._crane.since(0)
+        if self._freeze is None or self._freeze.check(*held):
+            return None
+        return self._placed(*held)
 
     def _await(self, stamp_ns: int, give_up_ns: int) -> None:
         """Wait for the IMU's reading at a stamp, for a while."""
@@ -102,16 +114,14 @@ class PoseOutput:
         self._crane.grow()
 
     def _take(self, stamp_ns: int) -> None:
-        """Give the propagator what came since it last took any, up to a stamp."""
+        """Give the propagator what each sensor gave since it last took any of it, up to a stamp."""
         assert self._propagator is not None
         imu, crane = (
-            held.since(self._taken_ns, stamp_ns) if name in self._sensors else held.since(0, 0)
+            held.take(stamp_ns) if name in self._sensors else held.since(0, 0)
             for name, held in (("imu", self._imu), ("crane", self._crane))
         )
         places = self._placed(*crane)
         self._propagator.take(*imu, crane[0], np.empty((0, 3)) if places is None else places.position_m)
-        last = [stamps[-1] for stamps in (imu[0], crane[0]) if len(stamps)]
-        self._taken_ns = max([self._taken_ns, *map(int, last)])
 
     def _placed(self, stamps_ns: Int64, places_m: Float64) -> CraneSamples | None:
         """Return encoder readings in the surveyed yard; None where there are none."""
@@ -136,10 +146,10 @@ class PoseOutput:
 
 
 class HeldReadings:
-    """The readings of a log over the last `HELD_S`."""
+    """The readings of a log over the last `HELD_S`. taken_ns: stamp of the last one taken."""
 
     def __init__(self, log: ReadingLog) -> None:
-        self._log = log
+        self._log, self.taken_ns = log, 0
         self._stamps_ns, self._values = log.last(0)
 
     @property
@@ -154,6 +164,12 @@ class HeldReadings:
             first = int(np.searchsorted(self._stamps_ns, stamps[-1] - seconds_to_ns(HELD_S)))
             self._stamps_ns = np.concatenate([self._stamps_ns[first:], stamps])
             self._values = np.concatenate([self._values[first:], values])
+
+    def take(self, until_ns: int) -> tuple[Int64, Float64]:
+        """Take those after the last one taken, up to a stamp."""
+        found = self.since(self.taken_ns, until_ns)
+        self.taken_ns = max([self.taken_ns, *found[0][-1:].tolist()])
+        return found
 
     def since(self, after_ns: int, until_ns: int | None = None) -> tuple[Int64, Float64]:
         """Return those after a stamp, up to another: (N,) stamps, (N, width) values."""

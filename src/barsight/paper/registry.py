@@ -327,3 +327,13 @@ CONCLUSIONS = (
     ),
 )
 ENTRIES = (*EQUATIONS, *FIGURES, *TABLES, *CONCLUSIONS)
+FURTHER = (
+    (
+        "labels on the bars (4.1): codes are read, or said to be illegible; plain numbers aren't read",
+        "barsight measure R -o OUT --labels.read",
+    ),
+    ("more sensors (6): the crane's laser in the map", "barsight measure R -o OUT --map.laser fuse"),
+    ("more sensors (6): a second pair on the same body", "barsight measure PAIR1 PAIR2 -o OUT"),
+    ("other environments (6)", "barsight simulate R --draw 7"),
+)
+"""What the paper names and has no number: what it is here, and the command."""

@@ -41,7 +41,7 @@ def _forbidden(state: PlantState, reason: str) -> PlantState:
 
 
 def _pose(path: Path, now_ns: int) -> CranePose | None:
-    """Read the latest pose; None where it is old, or not in the yard."""
+    """Read the latest pose; None where it is old, or not in the yard. It may be newer than now_ns."""
     try:
         told: dict[str, Any] = read_json(path)
         stamp_ns = int(told["stamp_ns"])
@@ -50,7 +50,7 @@ def _pose(path: Path, now_ns: int) -> CranePose | None:
         turn = Rotation.from_quat([float(value) for value in told["quaternion_xyzw"]]).as_matrix()
     except (BarsightError, OSError, KeyError, TypeError, ValueError):
         return None
-    if told.get("frame") != "yard" or not 0 <= now_ns - stamp_ns <= MAX_SILENCE_S * 1e9:
+    if told.get("frame") != "yard" or abs(now_ns - stamp_ns) > MAX_SILENCE_S * 1e9:
         return None
     if not all(map(math.isfinite, (x_m, y_m, z_m, sx_m, sy_m, sz_m))):
         return None

@@ -1,7 +1,7 @@
 """Propagate the last estimate by IMU and encoders: poses between pictures and after the last one.
 
 An error-state Kalman filter [Solà 2017, section 5] that begins anew at each estimate of the window. Without
-an IMU the body keeps its attitude and its velocity walks.
+an IMU, or where it is silent, the body keeps its attitude and its velocity walks.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class Propagator:
         self._covariance[:_SIZE, :_SIZE] = state.covariance
         self._noise, self._has_imu = noise, has_imu
         self._force, self._rate = body.rotation.T @ np.array([0.0, 0.0, GRAVITY_MPS2]), np.zeros(3)
-        self._is_measured = False
+        self._is_measured, self._imu_ns = False, state.stamp_ns
         self._encoders: tuple[Float64, float] | None = None
         if crane is not None:
             crane = reestimate_noise(crane)
@@ -109,9 +109,7 @@ class Propagator:
 
     def at(self, stamp_ns: int) -> PosedFrame:
         """Return the pose at a stamp (IMU's clock) after the last reading taken, without taking it."""
-        seconds = max(stamp_ns - self.stamp_ns, 0) / NS_PER_S
-        rotation, position, _ = self._moved(seconds)
-        covariance = self._spread(seconds)
+        rotation, position, _, covariance = self._moved(max(stamp_ns, self.stamp_ns))
         turned = np.zeros((6, _SIZE + 3))
         turned[:3, _TURN], turned[3:, _PLACE] = rotation, np.eye(3)
         pose = Pose(self._target, "body", rotation, position)
@@ -126,6 +124,7 @@ class Propagator:
             self._rate, self._force = rate, force
         self._move(stamp_ns)
         self._rate, self._force, self._is_measured = rate, force, True
+        self._imu_ns = max(stamp_ns, self._imu_ns)
 
     def _correct(self, stamp_ns: int, place_m: Float64) -> None:
         """Update by an encoder reading, less that at the state begun with."""
@@ -154,29 +153,36 @@ class Propagator:
             self._encoders = self._encoders[0] + step[_OFFSET], self._encoders[1]
 
     def _move(self, stamp_ns: int) -> None:
-        """Move to a later stamp by the last turn rate and force."""
-        if stamp_ns <= self.stamp_ns:
-            return
-        seconds = (stamp_ns - self.stamp_ns) / NS_PER_S
-        covariance = self._spread(seconds)
-        self._rotation, self._position, self._velocity = self._moved(seconds)
-        self._covariance, self.stamp_ns = covariance, stamp_ns
+        """Move to a later stamp."""
+        if stamp_ns > self.stamp_ns:
+            self._rotation, self._position, self._velocity, self._covariance = self._moved(stamp_ns)
+            self.stamp_ns = stamp_ns
 
-    def _moved(self, seconds: float) -> tuple[Float64, Float64, Float64]:
-        half = Rotation.from_rotvec(self._rate * seconds / 2).as_matrix()
-        acceleration = self._rotation @ half @ self._force - np.array([0.0, 0.0, GRAVITY_MPS2])
+    def _moved(self, stamp_ns: int) -> tuple[Float64, Float64, Float64, Float64]:
+        """Return rotation, position, velocity and covariance at a later stamp, by the last rate and force
+        as long as the IMU isn't silent.
+        """
+        seconds, rate, force = (stamp_ns - self.stamp_ns) / NS_PER_S, self._rate, self._force
+        gravity = np.array([0.0, 0.0, GRAVITY_MPS2])
+        measured = self._has_imu and stamp_ns - self._imu_ns <= seconds_to_ns(MAX_GAP_S)
+        if not measured:
+            rate, force = np.zeros(3), self._rotation.T @ gravity
+        half = Rotation.from_rotvec(rate * seconds / 2).as_matrix()
+        acceleration = self._rotation @ half @ force - gravity
         place = self._position + seconds * self._velocity + seconds**2 / 2 * acceleration
-        return self._rotation @ half @ half, place, self._velocity + seconds * acceleration
+        covariance = self._spread(seconds, rate, force, measured=measured)
+        return self._rotation @ half @ half, place, self._velocity + seconds * acceleration, covariance
 
-    def _spread(self, seconds: float) -> Float64:
+    def _spread(self, seconds: float, rate: Float64, force: Float64, *, measured: bool) -> Float64:
         """Propagate the covariance: `F P F^T + Q` [Solà 2017, Eq. 270]."""
         jacobian = np.eye(_SIZE + 3)
-        jacobian[_TURN, _TURN] = Rotation.from_rotvec(-self._rate * seconds).as_matrix()
-        jacobian[_TURN, _GYRO] = -seconds * np.eye(3)
+        jacobian[_TURN, _TURN] = Rotation.from_rotvec(-rate * seconds).as_matrix()
         jacobian[_PLACE, _SPEED] = seconds * np.eye(3)
-        jacobian[_SPEED, _TURN] = -seconds * self._rotation @ skew(self._force)
-        jacobian[_SPEED, _ACCEL] = -seconds * self._rotation
-        noise, measured = self._noise, self._has_imu and seconds <= MAX_GAP_S
+        if measured:
+            jacobian[_TURN, _GYRO] = -seconds * np.eye(3)
+            jacobian[_SPEED, _TURN] = -seconds * self._rotation @ skew(force)
+            jacobian[_SPEED, _ACCEL] = -seconds * self._rotation
+        noise = self._noise
         turn = noise.gyro_density if measured else SWAY_DENSITY_RADPS
         accel = noise.accel_density if measured else ACCELERATION_DENSITY
         added = np.zeros(_SIZE + 3)

@@ -1,0 +1,79 @@
+"""The pose process: what of the sensors it takes, and when."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import barsight as bs
+from barsight.core.arrays import Float64, Int64
+from barsight.live.link import Link, LiveInput
+from barsight.live.pose_output import PoseOutput
+from barsight.live.settings import LiveSettings
+from barsight.motion.fixed_lag.propagation import ROW_NUMBERS, NavigationState
+
+BEGIN_NS = 1_700_000_000_000_000_000
+STAMPS = BEGIN_NS + np.arange(-60, 13) * 50_000_000
+SPEED_MPS = 0.5
+
+
+def way(stamps: Int64) -> Float64:
+    """Readings of a crane that goes along x."""
+    noise = np.random.default_rng(3).normal(0, 5e-4, (len(stamps), 3))
+    noise[:, 0] += SPEED_MPS * (stamps - BEGIN_NS) / 1e9
+    return noise
+
+
+def linked(whole: Path, tmp_path: Path) -> Link:
+    """A run whose only state, at `BEGIN_NS`, knows the place well and the speed badly."""
+    folder = tmp_path / ".live"
+    folder.mkdir()
+    settings = bs.MeasureSettings().chosen()
+    link = Link(LiveInput(whole), settings, LiveSettings(), folder, folder, "", "", None)
+    state = NavigationState.of(BEGIN_NS, np.zeros(ROW_NUMBERS))
+    covariance = np.eye(15) * 1e-6
+    covariance[6:9, 6:9] = np.eye(3)
+    body = replace(state.body, rotation=np.eye(3), velocity_mps=np.array([SPEED_MPS, 0.0, 0.0]))
+    state = replace(state, target="yard", body=body, covariance=covariance)
+    link.states().append(np.array([state.stamp_ns]), state.row[None])
+    return link
+
+
+def give_imu(link: Link, until_s: float) -> None:
+    last, _ = link.readings("imu").last(1)
+    stamps = np.arange(last[0] if len(last) else BEGIN_NS, BEGIN_NS + round(1e9 * until_s), 10_000_000)[1:]
+    link.readings("imu").append(stamps, np.tile([0, 0, 0, 0, 0, 9.80665], (len(stamps), 1)))
+
+
+def written(output: PoseOutput, link: Link, after_s: float) -> dict[str, Any]:
+    assert output.write(BEGIN_NS + round(1e9 * after_s) - link.open_recording().rig.timeshift_cam_imu_ns)
+    told: dict[str, Any] = json.loads((link.folder.parent / "pose.json").read_text(encoding="utf-8"))
+    return told
+
+
+def test_encoders_that_come_later_than_the_imu_are_taken(whole: Path, tmp_path: Path) -> None:
+    link = linked(whole, tmp_path)
+    output, places, come = PoseOutput(link), way(STAMPS), BEGIN_NS + 50_000_000
+    link.readings("crane").append(STAMPS[come >= STAMPS], places[come >= STAMPS])
+    give_imu(link, 0.5)
+    before = written(output, link, 0.48)
+    now = (come < STAMPS) & (BEGIN_NS + 450_000_000 >= STAMPS)
+    link.readings("crane").append(STAMPS[now], places[now])
+    give_imu(link, 0.55)
+    after = written(output, link, 0.52)
+    assert after["sigma_m"][0] < before["sigma_m"][0] / 3
+    assert after["position_m"][0] == pytest.approx(SPEED_MPS * 0.52, abs=0.005)
+    assert after["predicted_s"] == pytest.approx(0.52)
+
+
+def test_frozen_encoders_hold_no_pose(whole: Path, tmp_path: Path) -> None:
+    link = linked(whole, tmp_path)
+    output, places = PoseOutput(link), way(STAMPS)
+    frozen = STAMPS > BEGIN_NS - 400_000_000
+    places[frozen] = places[np.argmax(frozen)]
+    link.readings("crane").append(STAMPS, places)
+    give_imu(link, 0.6)
+    assert written(output, link, 0.5)["position_m"][0] == pytest.approx(SPEED_MPS * 0.5, abs=0.005)
