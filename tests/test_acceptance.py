@@ -190,6 +190,20 @@ def test_a_cause_is_named_with_its_value(
     assert right >= 18
 
 
+def test_causes_that_cannot_be_told_apart_are_named_together() -> None:
+    """Two plates at one height, nothing else: each of five causes lowers both alike."""
+    plan = planned()
+    low = tuple(one for one in plan.plate if one.z_m < 0.1)
+    plan = replace(plan, plate=low, sphere=(), sphere_bar=(), step=())
+    for seed in range(5):
+        seen = observed(plan, off_by(focal=-0.004), np.random.default_rng((9, seed)))
+        (cause,) = name_causes(plan, [seen], [], [CLEAN])
+        assert {"focal length", "baseline", "mounting height"} <= {cause.name, *cause.alike}
+        assert cause.words.count(" or ") == len(cause.alike)
+    seen = observed(planned(), off_by(focal=-0.004), np.random.default_rng(9))
+    assert name_causes(planned(), [seen], [], [CLEAN])[0].words == "focal length"
+
+
 def test_an_artefact_that_was_moved_is_named_and_dirt_comes_first() -> None:
     plan = planned()
     seen = observed(plan, off_by(), np.random.default_rng(1))

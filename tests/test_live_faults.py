@@ -78,18 +78,18 @@ def expect_replays(out: Path, recording: Path, again: Path) -> None:
     assert (out / "height.tif").read_bytes() == (again / "height.tif").read_bytes()
 
 
-KILLS = 20
+KILLS = 24
 
 
 @pytest.mark.slow
 def test_a_killed_process_is_told_and_comes_back(longer: Path, tmp_path: Path) -> None:
     """At random moments: mode and reason within 1 s, all well within 10 s, and what was kept replays."""
     rng = np.random.default_rng(5)
-    told: dict[str, list[float]] = {"capture": [], "track": [], "map": []}
+    told: dict[str, list[float]] = {"capture": [], "track": [], "pose": [], "map": []}
     back: dict[str, list[float]] = {role: [] for role in told}
     live = Run(longer, tmp_path / "out", 0.07)
     for number in range(KILLS):
-        role, count = list(told)[number % 3], 1 + number // 3
+        role, count = list(told)[number % len(told)], 1 + number // len(told)
         live.running()
         time.sleep(rng.uniform(2.0, 4.0))  # one that ends six times within 30 s ends the run
         os.kill(live.state()["processes"][role]["pid"], signal.SIGKILL)
@@ -108,7 +108,7 @@ def test_a_killed_process_is_told_and_comes_back(longer: Path, tmp_path: Path) -
 @pytest.mark.slow
 def test_a_process_that_hangs_is_ended_and_comes_back(longer: Path, tmp_path: Path) -> None:
     live = Run(longer, tmp_path / "out", 0.07, "--live.hang-s", "5")
-    for role in ("capture", "track", "map"):
+    for role in ("capture", "track", "pose", "map"):
         live.running()
         os.kill(live.state()["processes"][role]["pid"], signal.SIGSTOP)
         told_s = live.until(lambda s, role=role: s["processes"][role]["restarts"] == 1, 15.0)  # type: ignore[misc]

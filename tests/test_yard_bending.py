@@ -118,6 +118,9 @@ def test_the_bend_is_taken_off_the_readings_and_its_sigma_is_shared(tmp_path: Pa
     turned = frame.yard_from.rotation @ (np.eye(3) + mean) @ hangs
     assert moved.yard_from_body_nominal == pytest.approx(turned, abs=1e-5)
 
+    none = crane_in_yard(CraneSamples(np.arange(0), np.empty((0, 3)), lever, hangs, 0.001), frame)
+    assert none.yard_from_body_nominal == pytest.approx(frame.yard_from.rotation @ hangs)
+
     body = frame.yard_from.apply(places[:1])[0]
     at = PosedFrame(1, Pose("yard", "body", hangs, body), 1e-9 * np.eye(6))
     shared = with_shared(Trajectory("yard", (at,), (), ()), frame).frames[0].covariance - at.covariance

@@ -54,7 +54,9 @@ class CraneBend:
         return np.asarray(place_m + shift @ self.values + np.cross(tilt @ self.values, lever_m), np.float64)
 
     def turn(self, place_m: Float64) -> Float64:
-        """Return the mean tilt over readings (N, 3), as a rotation (3, 3) from the left."""
+        """Return the mean tilt over readings (N, 3), as a rotation (3, 3) from the left; none without any."""
+        if not len(place_m):
+            return np.eye(3)
         _, tilt = self.slopes(place_m)
         turn: Float64 = Rotation.from_rotvec((tilt @ self.values).mean(axis=0)).as_matrix()
         return turn

@@ -36,6 +36,7 @@ from barsight.yard_frame import calibration_id, recording_id
 
 MAX_TURN_DEG = 0.05
 MAX_PLACE_M = 0.01
+ALONE = "--tags takes a recording, and says the frame: leave out --frame and --measured"
 MAX_SCALE_OFF = 0.02
 """A metre further off than this is no baseline's error: units differ, or points are mixed up."""
 
@@ -79,7 +80,7 @@ def run(arguments: Sequence[str]) -> None:
             raise ConfigError(f"--sigma-m {sigma_m:g} can't be; give metres")
         console, hangs, is_list = SafeConsole(stderr=True), None, source.suffix.lower() == ".csv"
         if tags is not None and (is_list or measured is not None or frame != "world"):
-            raise ConfigError("--tags takes a recording and says the frame: leave out --frame, --measured")
+            raise ConfigError(ALONE)
         bend = _begun_bend(girder_y_m, rails_x_m, has_tags=tags is not None)
         if tags is not None:
             found, owners, bend = calibrate_by_tags(source, tags, sigma_m, reading, bend, console)
