@@ -66,7 +66,7 @@ def main() -> None:
         if not out.exists():
             print(name, call(folder, "fleet", "compare", versions[0], after, *shared, "-o", out))
         found = json.loads((out / "comparison.json").read_text())
-        for shift in found["shifts"]:
+        for shift in (*found["shifts"], *found["lifts"]):
             print(f"  {name}: {shift}")
         print(f"  {name}: beyond {len(found['beyond'])} of {found['tests']}, vetoes",
               sorted({v for one in found["recordings"] for v in one["vetoes"]}))  # fmt: skip

@@ -208,9 +208,11 @@ def test_the_estimate_is_by_what_was_measured_and_priorities_come_first(tmp_path
     assert [task.name for task in TaskChoice(first=("c/", "b")).of(tasks)] == ["c/d", "b", "a"]
 
 
-def change(recording: str, shift: float, sigma: float, p: float) -> RecordingComparison:
+def change(
+    recording: str, shift: float, sigma: float, p: float, lifts: dict[str, tuple[int, int]] | None = None
+) -> RecordingComparison:
     one = FigureChange(recording, 1, "top_z_m", 1.0, 1.0 + shift, sigma, p)
-    return RecordingComparison(recording, (one,), (), (), (), {}, (1.0, 1.0), ("a", "b"))
+    return RecordingComparison(recording, (one,), (), (), (), lifts or {}, {}, (1.0, 1.0), ("a", "b"))
 
 
 def test_holm_keeps_its_level_and_a_shared_shift_is_found(tmp_path: Path) -> None:
@@ -359,6 +361,18 @@ def test_an_open_end_leaves_the_place_along_the_bars_unknown() -> None:
     assert _figures(one | {"direction": [0.1, 0.995, 0.0]})["x_m sigma"] == math.inf
 
 
+def test_vetoes_of_lifts_are_judged_over_the_archive() -> None:
+    """One that comes and goes by chance is none; one that forbids more in most recordings is."""
+    told = judge("a", "b", [
+        change(f"r{i}", 0.0, 0.01, 1.0, {"gap": (3, 3 + (-1) ** i), "weak-pull": (2, 3 + i % 2)})
+        for i in range(12)
+    ], [])  # fmt: skip
+    assert [(s.figure, s.recordings, s.is_found) for s in told.lifts] == [
+        ("gap", 12, False), ("weak-pull", 12, True),
+    ]  # fmt: skip
+    assert told.lifts[1].shift == pytest.approx(1.5)
+
+
 def test_a_changed_document_is_not_compared(tmp_path: Path) -> None:
     write_results(tmp_path / "out", 0.0)
     (tmp_path / "magnet.toml").write_text(example_magnet())
@@ -373,14 +387,15 @@ def test_a_changed_document_is_not_compared(tmp_path: Path) -> None:
     same = compare_recording(results, "one", "a", "b")
     assert same is not None and len(same.changes) == 12 and not any(one.sigma == 0 for one in same.changes)
     assert all(change.before == change.after for change in same.changes)
-    assert same.vetoes == ()
+    assert same.vetoes == () and all(before == after for before, after in same.lifts.values())
     lifts = tmp_path / "r/files/b/t/lifts.json"
     content = json.loads(lifts.read_text())
     content["refused"].append(content["lifts"].pop() | {"vetoes": [{"code": "gap", "reason": "8 mm"}] * 2})
     del content[SEAL]
     lifts.write_text(json.dumps(content | {SEAL: json_digest(content)}))
     other = compare_recording(results, "one", "a", "b")
-    assert other is not None and other.vetoes == ("gap 0 to 1", "offered 2 to 1")
+    assert other is not None and other.vetoes == ()
+    assert (other.lifts["gap"], other.lifts["offered"]) == ((0, 1), (2, 1))
     path = tmp_path / "r/files/b/t/bundles.json"
     path.write_text(path.read_text().replace('"length_m": ', '"length_m": 1', 1))
     with pytest.raises(InputError, match="was changed after it was written"):

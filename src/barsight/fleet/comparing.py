@@ -45,11 +45,11 @@ class FigureChange:
 class RecordingComparison:
     """A recording under two versions.
 
-    only_before, only_after: numbers of bundles without a partner. vetoes: of the whole map, codes that
-    appeared (+) and vanished (-); of lifts, codes that forbid more or fewer of them than before, and how many
-    are offered. intervals: mean half width of the 95 % interval by figure, before and after, None where no
-    bundle has one. seconds:
-    measured, before and after. pictures: objects of the results, of the two reports' pictures.
+    only_before, only_after: numbers of bundles without a partner. vetoes: codes that forbid all lifts and
+    appeared (+) or vanished (-). lifts: how many lifts each other code forbids, before and after, and how
+    many are `offered`. intervals: mean half width of the 95 % interval by figure, before and after, None
+    where no bundle has one. seconds: measured, before and after. pictures: objects of the results, of the two
+    reports' pictures.
     """
 
     recording: str
@@ -57,6 +57,7 @@ class RecordingComparison:
     only_before: tuple[int, ...]
     only_after: tuple[int, ...]
     vetoes: tuple[str, ...]
+    lifts: dict[str, tuple[int, int]]
     intervals: dict[str, tuple[float | None, float | None]]
     seconds: tuple[float, float]
     pictures: tuple[str, str]
@@ -102,10 +103,14 @@ def compare_recording(results: Objects, name: str, before: str, after: str) -> R
     changes = tuple(
         _change(name, i, figure, bundles[0][i], bundles[1][j]) for i, j in pairs.items() for figure in FIGURES
     )
-    vetoes = _changed_vetoes(*(_vetoes(results, folder) for folder in folders))
+    (whole, forbidden), (whole_after, forbidden_after) = (_vetoes(results, folder) for folder in folders)
+    told = [f"+{code}" for code in sorted(whole_after - whole)]
+    told += [f"-{code}" for code in sorted(whole - whole_after)]
+    codes = (forbidden.keys() | forbidden_after.keys()) - whole - whole_after
     return RecordingComparison(
         name, changes, tuple(sorted(bundles[0].keys() - pairs.keys())),
-        tuple(sorted(bundles[1].keys() - set(pairs.values()))), vetoes,
+        tuple(sorted(bundles[1].keys() - set(pairs.values()))), tuple(told),
+        {code: (forbidden[code], forbidden_after[code]) for code in sorted(codes)},
         {figure: _half_widths(figure, *bundles) for figure in FIGURES} if all(bundles) else {},
         (notes[0]["measured_s"], notes[1]["measured_s"]),
         (f"{folders[0]}/preview.png", f"{folders[1]}/preview.png"),
@@ -201,18 +206,6 @@ def _vetoes(results: Objects, folder: str) -> tuple[set[str], Counter[str]]:
     except _UNREAD as error:
         raise _torn(results, path, error) from error
     return whole, counted
-
-
-def _changed_vetoes(
-    before: tuple[set[str], Counter[str]], after: tuple[set[str], Counter[str]]
-) -> tuple[str, ...]:
-    told = [f"+{code}" for code in sorted(after[0] - before[0])]
-    told += [f"-{code}" for code in sorted(before[0] - after[0])]
-    for code in sorted(before[1].keys() | after[1].keys()):
-        old, new = before[1][code], after[1][code]
-        if old != new and code not in before[0] | after[0]:
-            told.append(f"{code} {old} to {new}")
-    return tuple(told)
 
 
 def _half_widths(

@@ -8,7 +8,7 @@ from pathlib import Path
 from statistics import mean
 
 from barsight.fleet.comparing import FIGURES, RecordingComparison
-from barsight.fleet.findings import LEVEL, MIN_RECORDINGS, Findings
+from barsight.fleet.findings import LEVEL, MIN_RECORDINGS, ArchiveShift, Findings
 from barsight.fleet.objects import Objects
 
 MAX_LISTED = 100
@@ -59,14 +59,9 @@ def comparison_page(findings: Findings, pictures: dict[str, tuple[str, str]]) ->
         f"what Holm's rule leaves at {100 * LEVEL:g} % for any false one among all; sigma is that of "
         "two independent measurements, which is more than two looks at the same pictures differ by.</p>",
         "<h2>Shifts of the whole archive</h2>",
-        _table(
-            ("figure", "recordings", "mean shift", "chance", ""),
-            [
-                (s.figure, str(s.recordings), f"{s.shift:+.5f}",
-                 f"{s.p:.2g}" if s.recordings >= MIN_RECORDINGS else "too few", "found" if s.is_found else "")
-                for s in findings.shifts
-            ],
-        ),
+        _table(("figure", "recordings", "mean shift", "chance", ""), _shift_rows(findings.shifts)),
+        "<h2>Lifts that a veto forbids, and lifts offered: more or fewer in each recording</h2>",
+        _table(("code", "recordings", "mean change", "chance", ""), _shift_rows(findings.lifts)),
         f"<h2>Bundles beyond sigma: {len(findings.beyond)}</h2>",
         _table(
             ("recording", "bundle", "figure", "before", "after", "sigma", "chance", "pictures"),
@@ -78,10 +73,10 @@ def comparison_page(findings: Findings, pictures: dict[str, tuple[str, str]]) ->
         ),
         "<h2>Vetoes and bundles of one version only</h2>",
         _table(
-            ("recording", "vetoes", "bundles gone", "bundles new", "pictures"),
+            ("recording", "vetoes of the map", "lifts offered", "bundles gone", "bundles new", "pictures"),
             [
-                (one.recording, ", ".join(one.vetoes), _numbers(one.only_before), _numbers(one.only_after),
-                 pictures[one.recording])
+                (one.recording, ", ".join(one.vetoes), _offered(one), _numbers(one.only_before),
+                 _numbers(one.only_after), pictures[one.recording])
                 for one in _other(findings)
             ],
         ),
@@ -95,6 +90,19 @@ def comparison_page(findings: Findings, pictures: dict[str, tuple[str, str]]) ->
         '<!doctype html><html lang="en"><meta charset="utf-8"><title>Two versions</title>'
         f"<style>{_STYLE}</style>{''.join(parts)}</html>\n"
     )
+
+
+def _shift_rows(shifts: Sequence[ArchiveShift]) -> list[tuple[str, ...]]:
+    return [
+        (s.figure, str(s.recordings), f"{s.shift:+.5f}",
+         f"{s.p:.2g}" if s.recordings >= MIN_RECORDINGS else "too few", "found" if s.is_found else "")
+        for s in shifts
+    ]  # fmt: skip
+
+
+def _offered(one: RecordingComparison) -> str:
+    before, after = one.lifts.get("offered", (0, 0))
+    return str(before) if before == after else f"{before} to {after}"
 
 
 def _intervals(findings: Findings) -> list[tuple[str, ...]]:

@@ -12,16 +12,17 @@ from scipy.stats import ttest_1samp
 from barsight.fleet.comparing import FIGURES, FigureChange, RecordingComparison
 
 LEVEL = 0.05
-"""Chance that anything at all is told of two versions that measure alike: of the bundles, and once more of
-the shifts of the whole archive."""
+"""Chance that anything at all is told of two versions that measure alike: of the bundles, once more of the
+shifts of the whole archive, and once more of what forbids lifts."""
 MIN_RECORDINGS = 5
 """Fewer don't tell a shift of the archive from chance."""
 
 
 @dataclass(frozen=True)
 class ArchiveShift:
-    """A shift that the recordings share. shift: mean over the recordings of each one's median difference;
-    p: of Student's t over the recordings. is_found: by Holm's rule over the figures.
+    """A shift that the recordings share. shift: mean over the recordings of each one's median difference, or
+    of the lifts that a code forbids more; p: of Student's t over the recordings. is_found: by Holm's rule
+    over the figures, or the codes.
     """
 
     figure: str
@@ -34,7 +35,8 @@ class ArchiveShift:
 @dataclass(frozen=True)
 class Findings:
     """All that is told of two versions. beyond: bundles beyond sigma, the least likely first. tests: how
-    many figures were looked at. untold: recordings that one of the versions lacks.
+    many figures were looked at. lifts: of the codes that forbid single lifts, and of `offered`. untold:
+    recordings that one of the versions lacks.
     """
 
     before: str
@@ -42,6 +44,7 @@ class Findings:
     tests: int
     beyond: tuple[FigureChange, ...]
     shifts: tuple[ArchiveShift, ...]
+    lifts: tuple[ArchiveShift, ...]
     recordings: tuple[RecordingComparison, ...]
     untold: tuple[str, ...]
 
@@ -64,8 +67,9 @@ def judge(
     found = holm([change.p for change in changes])
     beyond = sorted((c for c, is_found in zip(changes, found, strict=True) if is_found), key=lambda c: c.p)
     return Findings(
-        before, after, len(changes), tuple(beyond), _shifts(recordings), tuple(recordings), tuple(untold)
-    )
+        before, after, len(changes), tuple(beyond), _shifts(recordings), _lift_shifts(recordings),
+        tuple(recordings), tuple(untold),
+    )  # fmt: skip
 
 
 def holm(chances: Sequence[float]) -> list[bool]:
@@ -81,21 +85,39 @@ def holm(chances: Sequence[float]) -> list[bool]:
 
 
 def _shifts(recordings: Sequence[RecordingComparison]) -> tuple[ArchiveShift, ...]:
-    rows = []
-    for figure in FIGURES:
-        medians = [
+    """Judge the median difference of each recording, by figure."""
+    return _judged({
+        figure: [
             median(differences)
             for one in recordings
             if (differences := [c.after - c.before for c in one.changes if c.figure == figure])
         ]
-        rows.append((figure, len(medians), mean(medians) if medians else 0.0, _chance(medians)))
+        for figure in FIGURES
+    })  # fmt: skip
+
+
+def _lift_shifts(recordings: Sequence[RecordingComparison]) -> tuple[ArchiveShift, ...]:
+    """Judge how many lifts more each code forbids, by recording."""
+    codes = sorted({code for one in recordings for code in one.lifts})
+    none = (0, 0)
+    return _judged({
+        code: [float(after - before) for one in recordings for before, after in [one.lifts.get(code, none)]]
+        for code in codes
+    })  # fmt: skip
+
+
+def _judged(by_name: dict[str, list[float]]) -> tuple[ArchiveShift, ...]:
+    rows = [
+        (name, len(values), mean(values) if values else 0.0, _chance(values))
+        for name, values in by_name.items()
+    ]
     found = holm([row[3] for row in rows])
     return tuple(ArchiveShift(*row, is_found) for row, is_found in zip(rows, found, strict=True))
 
 
-def _chance(medians: list[float]) -> float:
-    if len(medians) < MIN_RECORDINGS or not any(medians):
+def _chance(values: list[float]) -> float:
+    if len(values) < MIN_RECORDINGS or not any(values):
         return 1.0
-    if np.ptp(medians) == 0:
+    if np.ptp(values) == 0:
         return 0.0
-    return float(ttest_1samp(medians, 0.0).pvalue)
+    return float(ttest_1samp(values, 0.0).pvalue)

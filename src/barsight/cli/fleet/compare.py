@@ -65,11 +65,15 @@ def run(arguments: Sequence[str]) -> None:
             (staging / "comparison.json").write_text(text + "\n", encoding="utf-8")
             pictures = copy_pictures(target, findings, staging)
             (staging / "comparison.html").write_text(comparison_page(findings, pictures), encoding="utf-8")
-        shifts = ", ".join(f"{s.figure} {s.shift:+.4f}" for s in findings.shifts if s.is_found) or "none"
+        shifts, lifts = (
+            ", ".join(f"{s.figure} {s.shift:+.4f}" for s in shifts if s.is_found) or "none"
+            for shifts in (findings.shifts, findings.lifts)
+        )
         console = SafeConsole()
         console.print(
             f"{len(compared)} recordings: {len(findings.beyond)} figures of bundles beyond sigma, shifts of "
-            f"the archive: {shifts}, {sum(bool(one.vetoes) for one in compared)} with other vetoes"
+            f"the archive: {shifts}, of its lifts' vetoes: {lifts}, "
+            f"{sum(bool(one.vetoes) for one in compared)} with other vetoes of the map"
             + (f", {len(untold)} not compared" if untold else ""),
             highlight=False, soft_wrap=True,
         )  # fmt: skip
