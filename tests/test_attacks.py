@@ -187,6 +187,24 @@ def test_several_files_appear_together_or_not_at_all(tmp_path: Path) -> None:
     assert not (folder / "kept").is_symlink() and (folder / "kept").read_text() == "old"
 
 
+def test_several_files_are_moved_one_after_the_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing comes between that a kill could meet for long; the result itself is the last."""
+    done: list[str] = []
+    real = Path.replace
+    monkeypatch.setattr(Path, "replace", lambda one, to: (done.append(Path(to).name), real(one, to))[1])
+    for name in ("unlink", "rmdir"):
+        old = getattr(Path, name)
+        monkeypatch.setattr(
+            Path, name, lambda one, *a, old=old, name=name, **k: (done.append(name), old(one, *a, **k))[1]
+        )  # fmt: skip
+    with atomic_paths(tmp_path / "a.yaml", tmp_path / "a.html", tmp_path / "a.json") as paths:
+        for path in paths:
+            path.write_text(path.name)
+        done.clear()
+    assert done[:3] == ["a.json", "a.html", "a.yaml"]
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {name: name for name in done[:3]}
+
+
 @pytest.mark.parametrize("moves", range(4))
 def test_a_kill_while_files_are_replaced_leaves_no_mixed_folder_that_looks_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moves: int

@@ -37,25 +37,38 @@ def atomic_path(target: Path) -> Iterator[Path]:
     `OutputError` where the folder isn't there, `target` is a pipe or a device, or the system refuses to
     write.
     """
-    if not target.parent.exists():
-        raise OutputError(f"{target}: there is no folder {target.parent}; make it or name another")
-    with translated_os_errors(target):
-        if target.exists() and not target.is_file() and not target.is_dir():
-            raise OutputError(f"{target}: is no regular file but a pipe or a device; name a file")
-        with _staging(target.absolute()) as folder:
-            temporary = folder / target.name
-            yield temporary
-            temporary.replace(target)
+    with _prepared(target) as (temporary,):
+        yield temporary
 
 
 @contextlib.contextmanager
 def atomic_paths(*targets: Path) -> Iterator[tuple[Path, ...]]:
-    """Yield temporary paths of files of one folder; on success all of them appear, on any failure none."""
+    """Yield temporary paths of files of one folder; on success all of them appear, on any failure none.
+
+    They are moved one right after the other, the first of `targets` last: it is the result, the others tell
+    of it.
+    """
     for target in targets:
         if target.is_dir():
             raise OutputError(f"{target}: is a folder; name a file")
-    with contextlib.ExitStack() as stack:
-        yield tuple(stack.enter_context(atomic_path(target)) for target in targets)
+    with _prepared(*targets) as temporary:
+        yield temporary
+
+
+@contextlib.contextmanager
+def _prepared(*targets: Path) -> Iterator[tuple[Path, ...]]:
+    first = targets[0]
+    if not first.parent.exists():
+        raise OutputError(f"{first}: there is no folder {first.parent}; make it or name another")
+    with translated_os_errors(first):
+        for target in targets:
+            if target.exists() and not target.is_file() and not target.is_dir():
+                raise OutputError(f"{target}: is no regular file but a pipe or a device; name a file")
+        with _staging(first.absolute()) as folder:
+            temporary = tuple(folder / target.name for target in targets)
+            yield temporary
+            for made, target in zip(reversed(temporary), reversed(targets), strict=True):
+                made.replace(target)
 
 
 @contextlib.contextmanager
