@@ -19,8 +19,10 @@ from barsight.calibration.files.euroc import read_rig
 from barsight.calibration.files.rig_file import write_rig_file
 from barsight.cli.main import run
 from barsight.core.errors import InputError
+from barsight.recording.own_files import file_digests
 from barsight.recording.pairing import pair_cameras
 from barsight.result_folder import identify_map
+from barsight.store.opening import open_store
 from barsight.yard.magnet.description import example_magnet
 
 MAX_CPU_S = 8.0
@@ -223,3 +225,24 @@ def test_a_full_disk_leaves_no_cut_opencv_file(seeds: Path, tmp_path: Path, suff
     done = subprocess.run(command, stderr=subprocess.PIPE, text=True, timeout=120)
     assert done.returncode == 4 and done.stderr.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_store_whose_schema_is_no_text_is_refused(tmp_path: Path) -> None:
+    """Python can't decode SQLite's own message about it."""
+    url = f"sqlite:///{tmp_path}/s.db"
+    with open_store(url, create=True):
+        pass
+    data = (tmp_path / "s.db").read_bytes()
+    assert data.count(b"CREATE TABLE surveys") == 1
+    (tmp_path / "s.db").write_bytes(data.replace(b"CREATE TABLE surveys", b"CREATE \xe5ABLE surveys"))
+    with pytest.raises(InputError, match=r"s\.db: is damaged"), open_store(url):
+        pass
+
+
+def test_a_file_that_grew_is_told_before_it_is_hashed(tmp_path: Path) -> None:
+    sparse(tmp_path / "body.yaml")
+    (tmp_path / "a.bag").write_bytes(b"bag")
+    began = time.process_time()
+    with pytest.raises(InputError, match=r"body\.yaml: has 8589934592 bytes"):
+        file_digests(tmp_path, [tmp_path / "body.yaml"], [tmp_path / "a.bag"])
+    assert time.process_time() - began < 1.0

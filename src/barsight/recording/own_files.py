@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 
 from barsight.core.errors import InputError
 from barsight.core.files import lies_within
-from barsight.core.reading.bounded_reading import open_regular, read_bytes
+from barsight.core.reading.bounded_reading import MAX_TABLE_BYTES, open_regular, read_bytes
 from barsight.recording.image_decoding import MAX_PICTURE_BYTES, TornImageError
 
 MAX_NAME_BYTES = 1000
@@ -59,14 +59,17 @@ def read_picture(path: Path, root: Path) -> bytes:
         raise TornImageError(error.problem) from None
 
 
-def file_digests(root: Path, paths: Iterable[Path]) -> dict[str, str]:
+def file_digests(root: Path, paths: Iterable[Path], bags: Iterable[Path] = ()) -> dict[str, str]:
     """Compute SHA-256 by the name relative to `root` (or the bare name outside it), of those paths that
-    exist.
+    exist. bags: of any size.
+
+    Raises InputError for another file that is larger than any table.
     """
     digests = {}
-    for path in paths:
+    bounded = [(path, MAX_TABLE_BYTES) for path in paths]
+    for path, max_bytes in [*((bag, None) for bag in bags), *bounded]:
         if path.is_file():
             name = path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name
-            with open_regular(path) as file:
+            with open_regular(path, max_bytes=max_bytes) as file:
                 digests[name] = hashlib.file_digest(file, "sha256").hexdigest()
     return digests

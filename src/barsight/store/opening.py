@@ -136,6 +136,8 @@ def _told(name: str) -> Iterator[None]:
     """
     try:
         yield
+    except UnicodeDecodeError as error:  # of SQLite's message about a damaged file
+        raise InputError(name, "is damaged", "take the newest backup beside it") from error
     except DatabaseError as error:
         if not isinstance(error, OperationalError) and type(error) is not DatabaseError:
             raise

@@ -209,7 +209,7 @@ class BagRecording:
     def digests(self) -> dict[str, str]:
         """Compute digests; see `Recording.digests`."""
         extra = [self._folder / name for name in BESIDE]
-        return file_digests(self._folder, [*self._bag_files(), *self._calibration.files, *extra])
+        return file_digests(self._folder, [*self._calibration.files, *extra], self._bag_files())
 
     def _bag_files(self) -> list[Path]:
         files = sorted(self.path.iterdir()) if self.path.is_dir() else [self.path]
