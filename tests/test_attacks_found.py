@@ -19,6 +19,7 @@ from barsight.calibration.files.euroc import read_rig
 from barsight.calibration.files.rig_file import write_rig_file
 from barsight.cli.main import run
 from barsight.core.errors import InputError
+from barsight.core.reading.sealed_json import read_sealed
 from barsight.recording.own_files import file_digests
 from barsight.recording.pairing import pair_cameras
 from barsight.result_folder import identify_map
@@ -246,3 +247,10 @@ def test_a_file_that_grew_is_told_before_it_is_hashed(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"body\.yaml: has 8589934592 bytes"):
         file_digests(tmp_path, [tmp_path / "body.yaml"], [tmp_path / "a.bag"])
     assert time.process_time() - began < 1.0
+
+
+def test_a_version_that_is_no_number_is_told_without_its_control_characters(tmp_path: Path) -> None:
+    (tmp_path / "watch.json").write_text(json.dumps({"schema_version": "\x1b[31mred" * 100}))
+    with pytest.raises(InputError, match=r"has schema version '\\x1b\[31m.{,40} instead of 1") as caught:
+        read_sealed(tmp_path / "watch.json", 1, "take another")
+    assert str(caught.value).isprintable() and len(caught.value.problem) < 100

@@ -38,7 +38,7 @@ def read_sealed(path: Path, version: int, remedy: str) -> dict[str, Any]:
         raise InputError(path, "has no schema_version", remedy)
     found = content["schema_version"]
     if found != version:
-        raise InputError(path, f"has schema version {found} instead of {version}", remedy)
+        raise InputError(path, f"has schema version {found!r:.40} instead of {version}", remedy)
     document: dict[str, Any] = content
     inside = {key: value for key, value in document.items() if key != SEAL}
     if document.get(SEAL) != json_digest(inside):
