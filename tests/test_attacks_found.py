@@ -24,6 +24,7 @@ from barsight.recording.own_files import file_digests
 from barsight.recording.pairing import pair_cameras
 from barsight.result_folder import identify_map
 from barsight.store.opening import open_store
+from barsight.yard.inventory.bundle_file import read_bundles
 from barsight.yard.magnet.description import example_magnet
 
 MAX_CPU_S = 8.0
@@ -254,3 +255,14 @@ def test_a_version_that_is_no_number_is_told_without_its_control_characters(tmp_
     with pytest.raises(InputError, match=r"has schema version '\\x1b\[31m.{,40} instead of 1") as caught:
         read_sealed(tmp_path / "watch.json", 1, "take another")
     assert str(caught.value).isprintable() and len(caught.value.problem) < 100
+
+
+def test_a_bundle_further_than_any_number_goes_is_refused(tmp_path: Path) -> None:
+    write_results(tmp_path / "out", 0.0)
+    path = tmp_path / "out/bundles.json"
+    content = json.loads(path.read_text())
+    content["bundles"][0]["axis_centre_m"][0] = 10**19
+    path.write_text(json.dumps(content))
+    reseal_folder(tmp_path / "out")
+    with pytest.raises(InputError, match="a number is out of range"):
+        read_bundles(path)

@@ -6,9 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from barsight.core.arrays import Float64
 from barsight.core.errors import InputError
 from barsight.core.json_values import DIGITS, json_value
+from barsight.core.reading.bounded_reading import MAX_MAGNITUDE
 from barsight.core.reading.json_schema import expect_schema, package_schema
 from barsight.core.reading.sealed_json import read_sealed, write_sealed
 from barsight.yard.identity import MapIdentity
@@ -123,25 +126,34 @@ def _record(bundle: Bundle) -> dict[str, Any]:
 
 
 def bundle_of(record: dict[str, Any]) -> Bundle:
-    """Build a bundle from its record in bundles.json; without bars where the record has no `bar_axes`."""
+    """Build a bundle from its record in bundles.json; without bars where the record has no `bar_axes`.
+
+    Raises ValueError for a number over MAX_MAGNITUDE.
+    """
 
     def figure(value: float | None) -> float:
-        return float("nan") if value is None else value
+        return float("nan") if value is None else float(figures_of(value))
+
+    def figures_of(values: ArrayLike) -> Float64:
+        found = np.array(values, np.float64)
+        if (np.abs(found) > MAX_MAGNITUDE).any():
+            raise ValueError("a number is out of range")
+        return found
 
     figures = {name: figure(value) for name, value in record["sigma"].items()}
     yaw_rad = float(np.radians(figures.pop("yaw_deg")))
     figures.pop("mass_kg", None)
     return Bundle(
         id=record["id"],
-        centre_m=np.array(record["axis_centre_m"]),
-        yaw_rad=float(np.radians(record["yaw_deg"])),
-        pitch_rad=float(np.radians(record["pitch_deg"])),
-        length_m=record["length_m"],
-        ends_m=np.array(record["ends_m"]),
+        centre_m=figures_of(record["axis_centre_m"]),
+        yaw_rad=float(np.radians(figure(record["yaw_deg"]))),
+        pitch_rad=float(np.radians(figure(record["pitch_deg"]))),
+        length_m=figure(record["length_m"]),
+        ends_m=figures_of(record["ends_m"]),
         ends_open=(record["ends_open"][0], record["ends_open"][1]),
-        width_m=record["width_m"],
-        top_z_m=record["top_z_m"],
-        bar_diameter_m=record["bar_diameter_m"],
+        width_m=figure(record["width_m"]),
+        top_z_m=figure(record["top_z_m"]),
+        bar_diameter_m=figure(record["bar_diameter_m"]),
         visible_bars=record["visible_bars"],
         bars=record["bars"] or None,
         layer=record["layer"],
@@ -149,16 +161,16 @@ def bundle_of(record: dict[str, Any]) -> Bundle:
         cover_doubts=tuple(record["cover_doubts"]),
         neighbours=tuple(record["neighbours"]),
         sigma=BundleSigma(yaw_rad=yaw_rad, **figures),
-        known_share=record["known_share"],
-        confidence=record["confidence"],
+        known_share=figure(record["known_share"]),
+        confidence=figure(record["confidence"]),
         reasons=tuple(record["reasons"]),
         section_m2=figure(record.get("section_m2")),
         label=BundleLabel(**record["label"]) if record.get("label") else None,
         ends_sigma_m=(figure(record["ends_sigma_m"][0]), figure(record["ends_sigma_m"][1])),
         bar_axes=tuple(
             Bar(
-                np.array(bar["centre_m"]), np.array(bar["direction"]), bar["diameter_m"], bar["length_m"],
-                np.array(bar["covariance"]),
+                figures_of(bar["centre_m"]), figures_of(bar["direction"]), figure(bar["diameter_m"]),
+                figure(bar["length_m"]), figures_of(bar["covariance"]),
             )
             for bar in record.get("bar_axes", ())
         ),
