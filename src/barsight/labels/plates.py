@@ -16,7 +16,7 @@ STEP_M = 0.01
 ASIDE_M = 0.05
 """So far beside a bundle is looked: what goes on there is no label."""
 OPENING_RATIO = 1.7
-"""What is bright over this many lengths of a label along the bars is a bar."""
+"""Longest bright run along the bars, in lengths of a label: a longer one is a bar."""
 CODE_CELLS = 7
 """A code's dark modules are narrower along the bars."""
 BRIGHTER_LOGS = (0.22, 0.35, 0.5, 0.8)

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import replace
 
 import numpy as np
 
 from barsight.core.arrays import Float64, Int64
-from barsight.core.files import atomic_path
-from barsight.core.json_values import DIGITS, json_value
+from barsight.core.json_values import DIGITS, write_json
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.types import CraneSamples, PosedFrame
 from barsight.inertial.model import ORDINARY_NOISE
@@ -141,8 +139,7 @@ class PoseOutput:
             "sigma_m": np.sqrt(np.diag(posed.covariance)[3:]),
             "predicted_s": (posed.stamp_ns - self._state_ns) / NS_PER_S,
         }
-        with atomic_path(self._link.folder.parent / "pose.json") as path:
-            path.write_text(json.dumps(json_value(content, DIGITS)) + "\n", encoding="utf-8")
+        write_json(self._link.folder.parent / "pose.json", content, DIGITS)
 
 
 class HeldReadings:

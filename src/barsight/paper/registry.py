@@ -336,4 +336,4 @@ FURTHER = (
     ("more sensors (6): a second pair on the same body", "barsight measure PAIR1 PAIR2 -o OUT"),
     ("other environments (6)", "barsight simulate R --draw 7"),
 )
-"""What the paper names and has no number: what it is here, and the command."""
+"""Parts of the paper without a number: each one's name, its place here, and its command."""

@@ -201,10 +201,9 @@ class GirderSettings:
     ends_y_m: tuple[float, float] = (-10.0, 10.0)
     """The crane point's Y with the trolley at either end of the girder."""
     skew_mm_per_m: float = 0.0
-    """How far the crane point runs along X on a metre of the trolley's way: the girder isn't square to the
-    rails."""
+    """Skew of the girder against square to the rails: shift along X for a metre of the trolley's way."""
     rail_m: float = 0.0
-    """How much lower the rails lie in their middle than at their ends: a parabola."""
+    """Sag of the rails in their middle against their ends: a parabola."""
     rail_ends_x_m: tuple[float, float] = (-10.0, 30.0)
     """The crane point's X with the bridge at either end of the rails."""
 

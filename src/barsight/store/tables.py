@@ -135,7 +135,7 @@ FLEET_PLACES = Table(
     "fleet_places", METADATA, _key(), Column("key", Text, nullable=False, index=True),
     *_texts("manifest", "archive", "recording"), *_stamps("at_ns"),
 )  # fmt: skip
-"""Where a task's recording was found; the newest row of a key counts. manifest: digest of its files."""
+"""Places of a task's recording; the newest row of a key counts. manifest: digest of its files."""
 
 FLEET_RESULTS = Table(
     "fleet_results", METADATA, _key(), Column("key", Text, nullable=False, unique=True),
