@@ -42,8 +42,13 @@ def copy_pictures(results: Objects, findings: Findings, folder: Path) -> dict[st
 
 
 def _other(findings: Findings) -> list[RecordingComparison]:
-    """List the recordings with other vetoes or bundles of one version only, those with most of them first."""
-    told = [one for one in findings.recordings if one.vetoes or one.only_before or one.only_after]
+    """List the recordings with other vetoes of the map, other numbers of lifts offered, or bundles of one
+    version only, those with most vetoes and bundles first.
+    """
+    told = [
+        one for one in findings.recordings
+        if one.vetoes or len(set(one.lifts.get("offered", ()))) > 1 or one.only_before or one.only_after
+    ]  # fmt: skip
     told.sort(key=lambda one: -len(one.vetoes) - len(one.only_before) - len(one.only_after))
     return told[:MAX_LISTED]
 
