@@ -146,7 +146,7 @@ class OrderBook:
 
 @dataclass
 class Cleared:
-    """What came of a yard. lines: one a lift."""
+    """Counts of what came of a yard, and a line for each lift."""
 
     counts: Counter[str] = field(default_factory=Counter)
     lines: list[str] = field(default_factory=list)

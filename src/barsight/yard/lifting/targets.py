@@ -165,7 +165,7 @@ def plan_lifts(
 
 
 def put_down(lift: Lift, load: Load, place: SetDown | None) -> Lift:
-    """Tell a lift where its load is put; the magnet keeps its place on the load, be it the middle or not."""
+    """Put a lift's load down; the magnet keeps its place on the load, be it the middle or not."""
     if place is None:
         return replace(lift, set_down=None, magnet_down=None)
     held = axes_of(load.yaw_rad) @ (lift.place.x_m - load.x_m, lift.place.y_m - load.y_m)
