@@ -14,8 +14,8 @@ from barsight.core.types import RectifiedPair, RefusedFrame
 from barsight.labels.attachment import Label, PlacedCode, merge_codes
 from barsight.labels.code_reading import SeenCode, read_codes
 from barsight.labels.placing import PlacedCamera, first_surface
-from barsight.labels.plates import find_plates
 from barsight.recording.rectified_pairs import RectifiedPairs
+from barsight.yard.plates import find_plates
 from barsight.yard.sections import part_about
 from barsight.yard.types import Bundle, BundleLabel, YardMap
 
