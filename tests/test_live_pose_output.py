@@ -67,6 +67,8 @@ def test_encoders_that_come_later_than_the_imu_are_taken(whole: Path, tmp_path: 
     assert after["sigma_m"][0] < before["sigma_m"][0] / 3
     assert after["position_m"][0] == pytest.approx(SPEED_MPS * 0.52, abs=0.005)
     assert after["predicted_s"] == pytest.approx(0.52)
+    lever = bs.open_recording(whole).crane().crane_to_body_m
+    assert np.array(after["position_m"]) - after["crane_m"] == pytest.approx(lever, abs=1e-6)
 
 
 def test_frozen_encoders_hold_no_pose(whole: Path, tmp_path: Path) -> None:

@@ -53,6 +53,8 @@ class PoseOutput:
         source = in_yard(SelectedSensors(whole, link.settings.use), link.settings.yard)
         self._frame, self._noise = frame_of(source), whole.imu_noise() or ORDINARY_NOISE
         self._sensors, self._mounted = link.sensors(whole), whole.crane()
+        placed = source.crane()
+        self._lever_m = None if placed is None else placed.crane_to_body_m
         self._freeze: FreezeWatch | None = None
         if self._mounted is not None and "crane" in self._sensors:
             self._freeze = FreezeWatch(self._mounted)
@@ -131,10 +133,12 @@ class PoseOutput:
     def _publish(self, posed: PosedFrame) -> None:
         """Write the pose for readers, whole or not at all. predicted_s: how long after the last pair."""
         pose = posed.reference_from_body
+        lever_m = self._lever_m if pose.target == "yard" else None
         content = {
             "stamp_ns": posed.stamp_ns - self._shift_ns,
             "frame": pose.target,
             "position_m": pose.translation,
+            "crane_m": None if lever_m is None else pose.translation - lever_m,
             "quaternion_xyzw": pose.quaternion_xyzw,
             "sigma_m": np.sqrt(np.diag(posed.covariance)[3:]),
             "predicted_s": (posed.stamp_ns - self._state_ns) / NS_PER_S,
