@@ -291,7 +291,9 @@ class Yard:
         weighed = round(10 * verdict.mass_kg * (1 + self.rng.normal(0, LOAD_CELL_SIGMA)))
         answer, _, _ = plc.ask(EXECUTED, 2 | 8, weighed, lift_id, token, checksum)
         counts[{DONE: "load confirmed", CONTRADICTED: "load contradicts"}.get(answer, "report refused")] += 1
-        counts["second lifts of one order offered"] += plc.next_lift() is not None
+        after = plc.next_lift()
+        is_other = after is not None and struct.unpack_from(">I", after, 16)[0] != lift_id
+        counts["second lifts of one order offered"] += is_other
         self.set_down(content, verdict.load[0])
         print(self.told.lines[-1], flush=True)
 

@@ -71,7 +71,7 @@ def plain_text(source: str) -> str:
 
 
 def test_the_plc_source_is_structured_text() -> None:
-    """By a grammar of another's; no compiler of Siemens' SCL is free."""
+    """A grammar of another's reads it; no compiler of Siemens' SCL is free."""
     tree_sitter = pytest.importorskip("tree_sitter")
     grammar = pytest.importorskip("tree_sitter_iec61131_3_st")
     parser = tree_sitter.Parser(tree_sitter.Language(grammar.language()))
