@@ -383,6 +383,14 @@ def test_files_of_a_survey_are_held_against_their_digests(local: httpx.Client, m
     assert local.get(f"{base}/bundles.json").status_code == 200
 
 
+def test_the_header_shows_the_alarm_of_the_first_priority(local: httpx.Client) -> None:
+    for code in ("bundle-moved", "calibration-changed", "survey-files"):
+        assert local.post("/api/alarms", json={"code": code, "reason": "told by hand"}).status_code == 200
+    alarms = local.get("/api/alarms").json()["alarms"]
+    assert [one["priority"] for one in alarms] == [1, 2, 3, 3]
+    assert local.get("/api/state").json()["top_alarm"]["code"] == "calibration-changed"
+
+
 def test_an_alarm_goes_through_its_states(local: httpx.Client, made: Path, tmp_path: Path) -> None:
     def alarms() -> dict[str, dict[str, object]]:
         return {one["code"]: one for one in local.get("/api/alarms").json()["alarms"]}

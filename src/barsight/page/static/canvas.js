@@ -216,10 +216,13 @@ export class YardCanvas {
     for (const change of this.data.changes || []) {
       for (const [ends_m, dash, width] of [[change.from_ends_m, [9, 6], 2.5], [change.to_ends_m, [], 4]]) {
         if (!ends_m) continue;
-        c.setLineDash(dash);
-        c.lineWidth = width;
-        c.strokeStyle = SELECT;
-        c.beginPath(); this.path(c, outline(ends_m, change.width_m)); c.stroke();
+        c.beginPath(); this.path(c, outline(ends_m, change.width_m));
+        for (const [style, wide, line] of [["#f2f2f2", width + 3, []], [SELECT, width, dash]]) {
+          c.setLineDash(line);
+          c.lineWidth = wide;
+          c.strokeStyle = style;
+          c.stroke();
+        }
       }
     }
     c.setLineDash([]);
