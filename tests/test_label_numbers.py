@@ -12,10 +12,13 @@ from barsight.core.errors import ConfigError
 from barsight.labels.attachment import NUMBER, PlacedCode, merge_codes
 from barsight.labels.number_reading import PATCH_PX, data_folder, number_reader, read_number
 from barsight.labels.placing import pose_at
+from barsight.measure_settings import MeasureSettings
+from barsight.pipeline import map_yard
 from barsight.recording.open import open_recording
 from barsight.result_folder import read_path
 from barsight.simulation.settings import CameraSettings, SimulationSettings, YardSettings
 from barsight.simulation.simulate import simulate
+from barsight.yard.label_settings import LabelSettings
 from test_labels import project, stick
 
 FONTS = (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_TRIPLEX)
@@ -119,8 +122,13 @@ def test_a_number_needs_three_pictures() -> None:
 
 def test_without_data_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("TESSDATA_PREFIX", str(tmp_path))
+    pytest.importorskip("tesserocr")
     with pytest.raises(ConfigError, match=r"eng.traineddata.*TESSDATA_PREFIX"):
-        data_folder()
+        map_yard(
+            [], MeasureSettings(labels=LabelSettings(read=True, numbers=True)), tmp_path, lambda *_: None
+        )
+    with pytest.raises(ConfigError, match=r"labels.numbers needs labels.read"):
+        LabelSettings(numbers=True)
 
 
 def write_on_bundles(recording: Path, out: Path) -> dict[str, int]:
