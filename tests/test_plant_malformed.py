@@ -215,4 +215,4 @@ def test_method_arguments_without_sense_are_refused(user: str | None, tmp_path: 
     assert not answers & {"BadUnexpectedError", "BadInternalError", "BadDecodingError", "BadEncodingError"}
     assert "Traceback" not in plant.log
     assert "BadUserAccessDenied" in answers
-    assert (steps == 0 and "Good" not in answers) if user is None else steps > 0
+    assert "BadInvalidArgument" in answers and (user is not None or steps == 0)
