@@ -28,6 +28,8 @@ from barsight.yard.weight import bundle_mass
 
 REMEDY = "measure the recording again"
 MAX_SIGMA_PX = 100.0
+SHAPE = "shape of the bundle"
+"""Source of what a bundle that isn't surely the outline leaves open; a dummy bundle's shape is known."""
 MIN_TOUCHES = 3
 MAX_APART_M = 0.1
 """Touch-downs further apart than this along one axis aren't of one magnet at rest."""
@@ -116,20 +118,27 @@ def fit_sources(bundle: Bundle, heights: YardMap) -> list[ErrorSource]:
     known = np.isfinite(part.sigma_m)
     views = float(np.median(part.views[known])) if known.any() else 1.0
     cell_m = float(np.median(part.sigma_m[known])) if known.any() else nan
-    sigma, free = bundle.sigma, max(views - 1, 1.0)
+    sigma, fit, free = bundle.sigma, bundle.fit_sigma or bundle.sigma, max(views - 1, 1.0)
     told = {
-        "fit_along": sigma.along_m, "fit_across": sigma.lateral_m, "fit_top": sigma.top_z_m,
-        "fit_yaw": sigma.yaw_rad, "fit_width": sigma.width_m, "fit_mass": bundle_mass(bundle).sigma_kg,
+        "fit_along": (sigma.along_m, fit.along_m), "fit_across": (sigma.lateral_m, fit.lateral_m),
+        "fit_top": (sigma.top_z_m, fit.top_z_m), "fit_yaw": (sigma.yaw_rad, fit.yaw_rad),
+        "fit_width": (sigma.width_m, fit.width_m),
     }  # fmt: skip
-    sources = [
-        ErrorSource(
-            "matching, travel and fit", (name,), np.array([[value**2]]), "bundles.json", "t",
-            free,
-        )
-        for name, value in told.items()
-    ]  # fmt: skip
+    mass_kg = bundle_mass(bundle).sigma_kg
+    sources = [_fit_source("fit_mass", mass_kg**2, free)]
+    for name, (whole, alone) in told.items():
+        sources.append(_fit_source(name, alone**2, free))
+        rest = whole**2 - alone**2
+        if rest > 0:
+            by = "bundles.json: sigma over fit_sigma"
+            sources.append(ErrorSource(SHAPE, (name,), np.array([[rest]]), by))
     cell = np.array([[cell_m**2]])
     return [*sources, ErrorSource("noise of a cell", ("fit_height",), cell, "height.tif", "t", free)]
+
+
+def _fit_source(name: str, variance: float, free: float) -> ErrorSource:
+    covariance = np.array([[variance]])
+    return ErrorSource("matching, travel and fit", (name,), covariance, "bundles.json", "t", free)
 
 
 def _frame_source(summary: dict[str, Any], assumed: list[str]) -> tuple[list[ErrorSource], Float64]:
