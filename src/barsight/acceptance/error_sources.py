@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from math import nan
 from pathlib import Path
 from typing import Any
@@ -62,6 +62,10 @@ def measured_load(
     summary, _ = open_folder(folder, lifts=False)
     if summary["reference"] != "yard":
         raise InputError(folder, "isn't in the yard's frame", "measure with encoders, or with --yard")
+    if certificate is not None:
+        _expect_own(certificate, read_certificate(certificate), summary)
+    if offset is not None:
+        _expect_own(folder / "result.json", summary, asdict(offset), "the magnet's offset")
     bundle = _chosen(folder, number)
     view = view_geometry(folder, measured_rig(summary))
     heights = read_heights(folder)
@@ -85,6 +89,15 @@ def measured_load(
     top = np.array([bundle.centre_m[0], bundle.centre_m[1], bundle.top_z_m])
     load = BudgetedLoad(top, bundle.yaw_rad, bundle.length_m, bundle.width_m, mass.kg)
     return MeasuredLoad(bundle.id, load, view, origin, tuple(sources), tuple(assumed))
+
+
+def _expect_own(path: Path, told: dict[str, Any], other: dict[str, Any], whose: str = "the folder") -> None:
+    """Raise InputError where a file is of another rig or yard frame than what it is used with."""
+    for name in ("calibration_id", "yard_frame_id"):
+        if told.get(name) != other.get(name):
+            what = name.removesuffix("_id").replace("_", " ")
+            problem = f"is of another {what} ({told.get(name)}; {whose} has {other.get(name)})"
+            raise InputError(path, problem, "accept this rig in this yard frame, and touch down with it")
 
 
 def _calibration_sigma_px(summary: dict[str, Any], path: Path) -> float:
