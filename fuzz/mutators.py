@@ -173,7 +173,7 @@ _TEXT_WAYS = (_number, _number, _number, _number, _insert, _word, _word, _lines,
 def _json(path: Path, draw: random.Random) -> str:
     try:
         tree = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError:
+    except (ValueError, RecursionError):
         return _bytes(path, draw)
     how = ""
     for _ in range(draw.choice((1, 1, 2, 4))):

@@ -167,8 +167,12 @@ def _places(made: Path) -> None:
 
 def _acceptance(made: Path) -> None:
     """Write what commissioning and service keep of a rig."""
-    row = {"group": "touch_mm", "name": "touch: x", "error": 1.5, "decision": "passed"}
-    write_sealed({"schema_version": 1, "quantities": [row], "plan": {}}, made / "certificate.json")
+    touch = {"group": "touch_mm", "decision": "passed", "uncertainty": {"sigma": 1.0}}
+    rows = [{**touch, "name": f"touch {k}: {axis}", "error": 1.5 + k} for k in range(3) for axis in "xyz"]
+    ids = {"calibration_id": "c", "yard_frame_id": "none"}
+    write_sealed(
+        {"schema_version": 1, "quantities": rows, "plan": {}, "causes": [], **ids}, made / "certificate.json"
+    )
     figures = tuple(WatchedFigure(name, 0.1, 0.02) for name in ("yaw / deg", "baseline / mm"))
     surveys = tuple(WatchedSurvey(f"r{k}", f"id{k}", "c", figures) for k in range(12))
     approval = Approval("ann", "new", "2026-01-01T00:00:00+00:00", "c", 2)

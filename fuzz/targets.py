@@ -258,6 +258,14 @@ TARGETS = (
         run_words("accept", "--plan", "FOLDER/out", "-o", "FOLDER/made.toml"), ("made.toml",), 0.5,
         warm=False,
     ),
+    Target(
+        "magnet offset", ("certificate.json", "magnet.toml"), ("certificate.json", "magnet.toml"),
+        run_words(
+            "calibrate", "magnet", "FOLDER/certificate.json", "--magnet", "FOLDER/magnet.toml", "-o",
+            "FOLDER/made.toml",
+        ),
+        ("made.toml",), 0.5,
+    ),
     Target("plan of acceptance", ("plan.toml",), ("plan.toml",), _plan),
     Target("watch", ("watch.json",), ("watch.json",), _watch),
     Target("users", ("users.json",), ("users.json",), _users, (), 0.5),

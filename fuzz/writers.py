@@ -117,6 +117,14 @@ WRITERS = (
         ("made.yaml", "made.html", "made.json"),
     ),
     Target(
+        "calibrate magnet", ("certificate.json", "magnet.toml"), (),
+        run_words(
+            "calibrate", "magnet", "FOLDER/certificate.json", "--magnet", "FOLDER/magnet.toml", "-o",
+            "FOLDER/made.toml",
+        ),
+        ("made.toml",),
+    ),
+    Target(
         "calibrate imu-noise", ("imu.csv",), (),
         run_words("calibrate", "imu-noise", "FOLDER/imu.csv", "-o", "FOLDER/made.yaml"),
         ("made.yaml", "made.html", "made.json"),

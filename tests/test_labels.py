@@ -16,7 +16,6 @@ from barsight.labels.attachment import PlacedCode, contradictions, merge_codes
 from barsight.labels.bundle_labels import bundle_label, unread_label
 from barsight.labels.code_reading import read_codes
 from barsight.labels.placing import pose_at
-from barsight.labels.plates import find_plates
 from barsight.recording.open import open_recording
 from barsight.result_folder import read_heights, read_path
 from barsight.simulation.lighting import bake, hall_lamps
@@ -27,6 +26,7 @@ from barsight.simulation.simulate import simulate
 from barsight.simulation.textures import label_codes, label_text, surface_tile
 from barsight.simulation.truth import label_rows
 from barsight.yard.inventory.stock_list import ListedBundle, contradicted_bundles, match_stock
+from barsight.yard.plates import find_plates
 from barsight.yard.types import BundleLabel, HeightMap
 from cli_runs import FAST
 from lift_yards import laid, map_of, record

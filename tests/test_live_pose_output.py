@@ -27,11 +27,11 @@ def way(stamps: Int64) -> Float64:
     return noise
 
 
-def linked(whole: Path, tmp_path: Path) -> Link:
+def linked(whole: Path, tmp_path: Path, yard: Path | None = None) -> Link:
     """A run whose only state, at `BEGIN_NS`, knows the place well and the speed badly."""
     folder = tmp_path / ".live"
-    folder.mkdir()
-    settings = bs.MeasureSettings().chosen()
+    folder.mkdir(parents=True)
+    settings = replace(bs.MeasureSettings(), yard=yard).chosen()
     link = Link(LiveInput(whole), settings, LiveSettings(), folder, folder, "", "", None)
     state = NavigationState.of(BEGIN_NS, np.zeros(ROW_NUMBERS))
     covariance = np.eye(15) * 1e-6
@@ -67,6 +67,8 @@ def test_encoders_that_come_later_than_the_imu_are_taken(whole: Path, tmp_path: 
     assert after["sigma_m"][0] < before["sigma_m"][0] / 3
     assert after["position_m"][0] == pytest.approx(SPEED_MPS * 0.52, abs=0.005)
     assert after["predicted_s"] == pytest.approx(0.52)
+    lever = bs.open_recording(whole).crane().crane_to_body_m
+    assert np.array(after["position_m"]) - after["crane_m"] == pytest.approx(lever, abs=1e-6)
 
 
 def test_frozen_encoders_hold_no_pose(whole: Path, tmp_path: Path) -> None:
@@ -77,3 +79,19 @@ def test_frozen_encoders_hold_no_pose(whole: Path, tmp_path: Path) -> None:
     link.readings("crane").append(STAMPS, places)
     give_imu(link, 0.6)
     assert written(output, link, 0.5)["position_m"][0] == pytest.approx(SPEED_MPS * 0.5, abs=0.005)
+
+
+def test_the_sigma_has_the_yard_frames(whole: Path, tmp_path: Path) -> None:
+    """A frame known to 20 mm and 0 rad beside none."""
+    frame = {"barsight_yard": 1, "yard_from_encoders": np.eye(4).tolist()}
+    covariance = np.diag([0.0, 0.0, 0.0, 4e-4, 4e-4, 4e-4]).tolist()
+    yard, told = tmp_path / "yard.yaml", []
+    yard.write_text(json.dumps({**frame, "covariance": covariance}))
+    for name, file in (("bare", None), ("framed", yard)):
+        link = linked(whole, tmp_path / name, file)
+        link.readings("crane").append(STAMPS, way(STAMPS))
+        give_imu(link, 0.5)
+        told.append(written(PoseOutput(link), link, 0.48))
+    assert told[1]["position_m"] == pytest.approx(told[0]["position_m"], abs=1e-6)
+    wanted = np.hypot(told[0]["sigma_m"], 0.02)
+    assert told[1]["sigma_m"] == pytest.approx(wanted, abs=1e-5)

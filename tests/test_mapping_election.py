@@ -58,10 +58,10 @@ def surface_of(views: list[CellObservations], folder: Path) -> Layers:
     store = TileStore(folder, 64)
     for one in views:
         fuse_view(store, one, MapSettings())
-    sights = ViewFrusta.of([pose_at(x) for x in EYES_X_M], CAMERA)
+    frusta = ViewFrusta.of([pose_at(x) for x in EYES_X_M], CAMERA)
     return (
         SurfaceElection(store, folder, CELL_M, MapSettings(fill_m=0.0))
-        .finish(2, sights)
+        .finish(2, frusta)
         .window(-200, 0, 400, 12)
     )
 
@@ -118,8 +118,8 @@ def test_a_hook_that_travels_along_leaves_no_ghost(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("low", "high", "held"), [(-0.5, 0.5, True), (30.0, 31.0, False), (7.0, 8.0, False)])
 def test_views_far_from_a_box_are_left_out(low: float, high: float, held: bool) -> None:
-    sights = ViewFrusta.of([pose_at(0.0)], CAMERA)
-    near = sights.only(sights.touching(np.array([low, -0.5, 0.0]), np.array([high, 0.5, 1.0])))
+    frusta = ViewFrusta.of([pose_at(0.0)], CAMERA)
+    near = frusta.only(frusta.touching(np.array([low, -0.5, 0.0]), np.array([high, 0.5, 1.0])))
     assert len(near.eyes) == held
 
 
@@ -155,10 +155,10 @@ def test_beneath_a_surface_that_the_border_cuts_off_nothing_is_known(
     store = TileStore(tmp_path, 64)
     for _ in EYES_X_M:
         fuse_view(store, view(x, y, top_m), MapSettings())
-    sights = ViewFrusta.of([pose_at(eye) for eye in EYES_X_M], camera)
+    frusta = ViewFrusta.of([pose_at(eye) for eye in EYES_X_M], camera)
     known = np.isfinite(
         SurfaceElection(store, tmp_path, CELL_M, MapSettings(fill_m=0.0))
-        .finish(2, sights)
+        .finish(2, frusta)
         .window(-30, 0, 60, 43)
         .z_m
     )
@@ -196,8 +196,8 @@ def elected(store: TileStore, poses: list[Pose], asked: ViewSupport) -> tuple[np
     first = {key: elect_by_votes(store.read(key), 2, 0.35) for key in sorted(store.keys())}
     nothing = np.full((256, 256), np.nan, np.float32)
     around = np.block([[first.get((i, j), nothing) for i in (-1, 0, 1)] for j in (-1, 0, 1)])
-    sights = ViewFrusta.of(poses, replace(CAMERA, height=60, cy_px=30.0))
-    winner = elect_surface(store.read((0, 0)), (0, 0), around, sights, CELL_M, 2, MapSettings(), asked)
+    frusta = ViewFrusta.of(poses, replace(CAMERA, height=60, cy_px=30.0))
+    winner = elect_surface(store.read((0, 0)), (0, 0), around, frusta, CELL_M, 2, MapSettings(), asked)
     return winner, asked.heights
 
 

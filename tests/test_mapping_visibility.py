@@ -42,7 +42,7 @@ EYES_M = np.array([[x, y, 6.0] for x in (1.0, 2.6, 4.2) for y in (2.0, 3.5)])
 SIDE = 3 * TILE_CELLS
 
 
-def sights() -> ViewFrusta:
+def frusta() -> ViewFrusta:
     down = np.diag([1.0, -1.0, -1.0])
     return ViewFrusta.of([Pose("yard", "rect0", down, eye) for eye in EYES_M], CAMERA)
 
@@ -100,7 +100,7 @@ def test_a_line_of_sight_is_free_where_no_cell_rises_over_it(hills: np.ndarray) 
 
 
 def test_a_point_is_held_where_both_pictures_hold_it() -> None:
-    rng, planes = np.random.default_rng(1), sights().planes()
+    rng, planes = np.random.default_rng(1), frusta().planes()
     held = []
     for point in rng.uniform((-1, -1, 0), (6, 6, 4), (300, 3)):
         held.append(holders(point))
@@ -139,7 +139,7 @@ def cut_slowly(point: np.ndarray, row: int, column: int, around: np.ndarray, lea
 
 
 def test_beneath_a_surface_that_the_pictures_cut_off_all_is_doubted(hills: np.ndarray) -> None:
-    rng, planes = np.random.default_rng(3), sights().planes()
+    rng, planes = np.random.default_rng(3), frusta().planes()
     found = []
     for _ in range(400):
         row, column = (int(n) for n in rng.integers(0, TILE_CELLS, 2))
@@ -150,7 +150,7 @@ def test_beneath_a_surface_that_the_pictures_cut_off_all_is_doubted(hills: np.nd
 
 
 def test_support_is_the_votes_over_those_that_can_be_expected(hills: np.ndarray) -> None:
-    rng, views = np.random.default_rng(4), sights()
+    rng, views = np.random.default_rng(4), frusta()
     tile = np.zeros((4, 24, SLOTS, FIELDS), np.float32)
     tile[..., VIEWS], tile[..., CENTRAL] = rng.integers(0, 7, (2, *tile.shape[:3]))
     tile[..., Z] = rng.uniform(0, 2, tile.shape[:3])

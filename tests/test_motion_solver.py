@@ -299,6 +299,15 @@ def moved_by(step: np.ndarray) -> np.ndarray:
     return matrix
 
 
+def scattered(result: ReducedSystem, poses: int, pieces: int) -> tuple[np.ndarray, ...]:
+    """Scatter a reduced system into dense arrays: matrix (lower), gradient, shared rows, corner, right."""
+    n = poses + 2 * pieces
+    dense = np.zeros((n, n)), np.zeros(n), np.zeros((2, n)), np.zeros((2, 2)), np.zeros(2)
+    at = np.arange(0, poses, 6), poses + 2 * np.arange(pieces)
+    scatter_reduced(result, *at, skyline.full(dense[0]), *dense[1:])
+    return dense
+
+
 @pytest.mark.parametrize("pieces", [0, 2])
 def test_points_are_taken_out_of_the_dense_equations(pieces: int) -> None:
     """Central differences of all errors make the dense equations. One point is used nowhere; with pieces,
@@ -323,9 +332,9 @@ def test_points_are_taken_out_of_the_dense_equations(pieces: int) -> None:
         there, common = points.copy(), shared + step[places:]
         there[:, :size] += step[poses:places].reshape(count, size)
         camera = np.array([turn @ old for turn, old in zip(turns, cameras, strict=True)])[:, :3].copy()
-        sights = Observations(first, node, used, stereo, weight, piece, tight, 1.0)
+        observations = Observations(first, node, used, stereo, weight, piece, tight, 1.0)
         off = np.zeros((len(node), 3))
-        residuals(rig, sights, LinearisationPoint(camera, there, common), off)
+        residuals(rig, observations, LinearisationPoint(camera, there, common), off)
         held = tight * (there[:, 3] - common[piece]) if pieces else np.zeros(count)
         held[3] = 0
         return np.append((-off * weight[:, None] * used[:, None]).ravel(), held)
@@ -344,23 +353,12 @@ def test_points_are_taken_out_of_the_dense_equations(pieces: int) -> None:
     reduced = normal[np.ix_(kept, kept)] - bound.T @ np.linalg.solve(own, bound)
     slope = right[kept] - bound.T @ np.linalg.solve(own, right[points_at])
 
-    sights = Observations(first, node, used, stereo, weight, piece, tight, 1.0)
+    observations = Observations(first, node, used, stereo, weight, piece, tight, 1.0)
     guess = LinearisationPoint(cameras[:, :3].copy(), points, shared)
     within = np.tile([0, nodes - 1], (pieces, 1))
     result = ReducedSystem.empty(nodes, nodes, within)
-    eliminate_points(rig, sights, guess, result)
-    n = poses + 2 * pieces
-    whole, gradient, side, corner, pull = (
-        np.zeros((n, n)),
-        np.zeros(n),
-        np.zeros((2, n)),
-        np.zeros((2, 2)),
-        np.zeros(2),
-    )
-    scatter_reduced(
-        result, np.arange(0, poses, 6), poses + 2 * np.arange(pieces), skyline.full(whole), gradient, side,
-        corner, pull,
-    )  # fmt: skip
+    eliminate_points(rig, observations, guess, result)
+    whole, gradient, side, corner, pull = scattered(result, poses, pieces)
     scale = np.sqrt(np.diag(normal)[kept])
     found = np.block([[np.tril(whole) + np.tril(whole, -1).T, side.T], [side, corner]])
     np.testing.assert_allclose(found / np.outer(scale, scale), reduced / np.outer(scale, scale), atol=1e-5)
@@ -368,7 +366,7 @@ def test_points_are_taken_out_of_the_dense_equations(pieces: int) -> None:
 
     step = rng.normal(0, 1e-3, len(none))
     moved, variance = points.copy(), np.full(count, np.nan)
-    back_substitute(rig, sights, guess, step[:poses].reshape(nodes, 6), step[places:], moved, variance)
+    back_substitute(rig, observations, guess, step[:poses].reshape(nodes, 6), step[places:], moved, variance)
     wanted = -np.linalg.solve(own, right[points_at] + bound @ step[kept])
     left = np.arange(count) != 3
     np.testing.assert_allclose((moved - points)[left, :size].ravel(), wanted, atol=5e-6)
@@ -383,7 +381,7 @@ def test_one_frames_equations_are_its_costs_slope() -> None:
     problem, used = seen_from(4, 6, False, 2.0)
     seen, values = problem.sightings, initial_values(problem)
     assert seen is not None
-    rig, sights = rig_of(seen), observations_of(problem, used)
+    rig, observations = rig_of(seen), observations_of(problem, used)
     state = GraphState(values, initial_points(problem), np.zeros(2))
 
     def moved(step: np.ndarray) -> GraphState:
@@ -393,11 +391,11 @@ def test_one_frames_equations_are_its_costs_slope() -> None:
 
     for _ in range(20):
         normal, gradient = np.zeros((6, 6)), np.zeros(6)
-        frame_equations(rig, sights, linearisation_point(problem, state), 2, normal, gradient)
+        frame_equations(rig, observations, linearisation_point(problem, state), 2, normal, gradient)
         slope = np.empty(6)
         for axis, by in enumerate(1e-7 * np.eye(6)):
             ends = [linearisation_point(problem, moved(side * by)) for side in (1, -1)]
-            high, low = (residuals(rig, sights, end, np.zeros((len(used), 3))) for end in ends)
+            high, low = (residuals(rig, observations, end, np.zeros((len(used), 3))) for end in ends)
             slope[axis] = (high - low) / 2e-7
         np.testing.assert_allclose(gradient, slope, atol=1e-5 * np.sqrt(np.diag(normal)).max())
         state = moved(-np.linalg.solve(normal, gradient))
@@ -525,9 +523,9 @@ def test_what_a_points_sightings_share_is_its_pieces() -> None:
     points, piece = np.array([[0.0, 0, 0, 0.5], [1.0, 0, 0, 0.7]]), np.array([1, 0])
     shared = np.array([0.1, 0.2, 3.0, 4.0, 0.01, 0.02])
     none = np.empty(0)
-    sights = Observations(none, none, none, none, none, piece, none, 0.0)
+    observations = Observations(none, none, none, none, none, piece, none, 0.0)
     rig = Rig(np.empty(5), np.empty((3, 4)), 2.5)
     assert [slide_offset(points, shared, piece, t) for t in (0, 1)] == pytest.approx([0.3, 0.6])
     assert [disparity_offset(shared, piece, t) for t in (0, 1)] == [4.0, 3.0]
-    assert given_of(rig, sights, shared, 1) == PointTerms(2.5, 0.0, 3.0, 0.01, 0.02)
+    assert given_of(rig, observations, shared, 1) == PointTerms(2.5, 0.0, 3.0, 0.01, 0.02)
     assert slide_offset(points, shared[4:], piece, 1) == 0.7 and disparity_offset(shared[4:], piece, 1) == 0.0

@@ -73,6 +73,7 @@ EXTRAS = {
     "signing": {"report/signing.py"},
     "mqtt": {"plant/mqtt.py"},
     "s7": {"plant/s7.py"},
+    "numbers": {"labels/number_reading.py"},
     "labels": {"labels/code_reading.py"},
     "acceptance": {"acceptance/pdf.py"},
 }

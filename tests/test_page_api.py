@@ -3,26 +3,31 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import cv2
 import httpx
+import numpy as np
 import pytest
 
 from barsight.cli.main import run
 from barsight.core.errors import ConfigError, InputError
 from barsight.core.stamps import NS_PER_S
 from barsight.page.access import Access, AccessError, Throttle
+from barsight.page.documents import unseen_lengths
 from barsight.page.layers import find_layers, paint_layer
 from barsight.page.serve import ServeOptions, serving
 from barsight.store import accounts, confirmation
 from barsight.store.adding import add_survey, read_survey
 from barsight.store.audit import AuditChain, entry, verify_chain
 from barsight.store.opening import open_store
+from live_folders import live_folder
 from page_yards import FIRST, SECOND, fill_store, survey
 
 PASSWORD = "four words that nobody guesses"
@@ -101,7 +106,59 @@ def test_what_the_page_reads(local: httpx.Client) -> None:
     picture = local.get(f"/api/layers/{layer['map_id']}.png")
     assert picture.content.startswith(b"\x89PNG")
     assert local.get("/api/bundles/B99").status_code == 404
+    shot = local.get(f"/api/bundles/B1/pictures/{layer['map_id']}.png")
+    gray = cv2.imdecode(np.frombuffer(shot.content, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert gray.shape[1] > 2 * gray.shape[0], "the bundle lies along its picture"
+    middle = gray[gray.shape[0] // 2]
+    assert middle[100:-100].mean() > middle[[20, -20]].mean() + 30, "it is higher, so lighter, than the floor"
+    assert local.get(f"/api/bundles/B4/pictures/{layer['map_id']}.png").status_code == 404
+    assert bundles["B1"]["unseen_m"] is None and bundles["B6"]["unseen_m"] is None
     assert "/api/lifts/{lift_id}/confirm" in local.get("/openapi.json").json()["paths"]
+
+
+def test_how_far_an_open_end_may_lie_is_told_by_bars_alike() -> None:
+    bar = {"bar_diameter_m": 0.05, "width_m": 0.3, "length_m": 6.0, "ends_open": [False, False]}
+    cut = bar | {"length_m": 5.2, "ends_open": [False, True]}
+    thick = cut | {"bar_diameter_m": 0.08}
+    unknown = cut | {"bar_diameter_m": None}
+    longer = cut | {"length_m": 6.5}
+    told = unseen_lengths([bar, bar | {"length_m": 6.02}, cut, thick, unknown, longer])
+    assert told == [None, None, pytest.approx(0.81), None, None, None]
+
+
+def read_events(client: httpx.Client, kind: str, act: Callable[[], object]) -> list[str]:
+    """Read events of a kind: the first one, and the one that comes when `act` was called."""
+    said: list[str] = []
+    with client.stream("GET", "/api/events", timeout=5) as answer:
+        wanted = False
+        for line in answer.iter_lines():
+            if line.startswith("event:"):
+                wanted = line == f"event: {kind}"
+            elif line.startswith("data:") and wanted:
+                said.append(line[6:])
+                if len(said) == 2:
+                    return said
+                act()
+    return said
+
+
+def test_crane_and_magnet_are_told_as_the_live_run_tells_them(url: str, tmp_path: Path) -> None:
+    """A crane's surveys have a folder each, `current` is the one that runs; a silent run has no place."""
+    (tmp_path / "live").mkdir()
+    live = live_folder(tmp_path / "live" / "one", now_ns=10_000_000_000, crane_m=[2.4, 1.1, 7.0])
+    (tmp_path / "live" / "current").symlink_to(live)
+    options = ServeOptions(port=0, live=tmp_path / "live")
+    with serving(url, options) as address, httpx.Client(base_url=address) as client:
+        old_s = time.time() - 5
+
+        def beat() -> None:
+            os.utime(live / "state.json", (old_s, old_s))
+
+        os.utime(live / "state.json")
+        moving, silent = read_events(client, "crane", beat)
+    place = {"body_m": [3.0, 1.0], "magnet_m": [2.4, 1.1]}
+    assert json.loads(moving) == {"mode": "full", "reasons": [], "place": place}
+    assert json.loads(silent) == {"mode": None, "reasons": [], "place": None}
 
 
 def test_a_lift_from_the_offer_to_the_next_survey(local: httpx.Client, url: str, tmp_path: Path) -> None:

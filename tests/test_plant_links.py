@@ -1,7 +1,6 @@
 """`barsight plant run` and `plant check`, every link at once, against mosquitto, snap7 and openssl."""
 
 import asyncio
-import json
 import shutil
 import signal
 import socket
@@ -29,6 +28,7 @@ from barsight.plant.state import PlantAlarm, PlantState, state_of_store
 from barsight.plant.steps import LiftSteps, take_named_step
 from barsight.report.signing import sign_file
 from barsight.store.opening import open_store
+from live_folders import live_folder
 from opcua_servers import free_port
 from page_yards import fill_store
 from plant_commands import Hooks, plant_run, write_config
@@ -233,20 +233,6 @@ def test_a_store_that_is_gone_makes_the_state_invalid(tmp_path: Path) -> None:
         assert not old.is_valid and "state-too-old" in old.reasons[-1]
 
 
-def live_folder(folder: Path, **changes: object) -> Path:
-    folder.mkdir(exist_ok=True)
-    lifts = {"may_stand": changes.pop("may_stand", True), "offered": None}
-    state = {"phase": "measuring", "mode": "full", "reasons": [], "now_ns": 10_000_000_000, "lifts": lifts}
-    pose = {
-        "stamp_ns": 9_800_000_000, "frame": "yard", "position_m": [3.0, 1.0, 8.0],
-        "quaternion_xyzw": [0.0, 0.0, 0.7071067811865476, 0.7071067811865476], "sigma_m": [0.001] * 3,
-    }  # fmt: skip
-    for name, content in (("state.json", state), ("pose.json", pose)):
-        content |= {key: value for key, value in changes.items() if key in content}
-        (folder / name).write_text(json.dumps(content))
-    return folder
-
-
 def test_a_live_run_gives_the_pose_and_may_forbid(tmp_path: Path) -> None:
     seen = with_live_run(QUIET, live_folder(tmp_path / "live"))
     assert seen.is_valid and seen.mode == "full" and seen.survey == "measuring"
@@ -257,8 +243,12 @@ def test_a_live_run_gives_the_pose_and_may_forbid(tmp_path: Path) -> None:
         QUIET, live_folder(tmp_path / "live", may_stand=False, mode="blind", reasons=["dark"])
     )
     assert not blind.is_valid and blind.reasons == ("live-state: blind: dark",)
+    assert newer.magnet_m is None
+    hung = with_live_run(QUIET, live_folder(tmp_path / "live", crane_m=[2.4, 1.1, 7.0])).pose
+    assert hung is not None and hung.magnet_m == (2.4, 1.1)
     for change in (
         {"frame": "world"},
+        {"crane_m": [2.4]},
         {"stamp_ns": 1},
         {"stamp_ns": 11_100_000_000},
         {"sigma_m": [float("nan")] * 3},

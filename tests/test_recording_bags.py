@@ -1,5 +1,7 @@
 """Bags as other people write them: ROS 1, ROS 2 sqlite3 and mcap, raw pictures, Kalibr's files beside."""
 
+import contextlib
+import sqlite3
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -337,6 +339,15 @@ def test_a_bag_cut_short(tmp_path: Path, kind: str, share: float) -> None:
         recording.imu()
         list(recording.frames())
     assert "\n" not in str(caught.value)
+
+
+def test_a_topic_whose_messages_are_gone_is_named(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "a", "ros2-sqlite3", messages())
+    write_kalibr(tmp_path)
+    with contextlib.closing(sqlite3.connect(path / "a.db3")) as rows, rows:
+        rows.execute("DELETE FROM messages WHERE topic_id = (SELECT id FROM topics WHERE name = '/imu0')")
+    with pytest.raises(InputError, match="/imu0 has no message, though the bag counts some"):
+        open_recording(path).imu()
 
 
 @pytest.mark.parametrize(

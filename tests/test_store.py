@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import signal
 import subprocess
@@ -253,6 +254,36 @@ def test_an_earlier_schema_is_brought_up_to_date_after_a_backup(
             assert checked(store) == before
 
 
+PAST = sorted(path.stem[1:5] for path in (opening.MIGRATIONS / "versions").glob("v*.py"))[:-1]
+
+
+@pytest.mark.parametrize("revision", PAST)
+def test_each_past_schema_is_brought_up_to_date(
+    store_url: str, tmp_path: Path, revision: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as earlier:
+        folder = tmp_path / "earlier"
+        shutil.copytree(opening.MIGRATIONS, folder, ignore=shutil.ignore_patterns("__pycache__"))
+        for path in (folder / "versions").glob("v*.py"):
+            if path.stem[1:5] > revision:
+                path.unlink()
+        earlier.setattr(opening, "MIGRATIONS", folder)
+        with open_store(store_url, create=True) as store:
+            alarm(store, "of old")
+    with open_store(store_url, migrate=True) as store:
+        with store.reading() as connection:
+            assert compare_metadata(MigrationContext.configure(connection), METADATA) == []
+            assert connection.execute(select(ALARMS.c.reason)).scalars().all() == ["of old"]
+        chain = checked(store)
+        assert isinstance(chain, AuditChain) and chain.entries == 1
+        assert alarm(store) == 2
+        if store.engine.dialect.name != "sqlite":  # its triggers fire for each row, theirs for a statement
+            for table in METADATA.tables:
+                with pytest.raises(DBAPIError, match="only adds rows"), store.writing() as connection:
+                    connection.execute(text(f"DELETE FROM {table}"))
+    assert store_url.startswith("sqlite") == (tmp_path / f"yard.db.schema-{revision}.backup").is_file()
+
+
 def test_a_migration_that_fails_changes_nothing(
     store_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -286,6 +317,11 @@ def test_the_commands_from_an_empty_folder_to_a_tampered_store(
     assert '"identity": "B2"' in capsys.readouterr().out
     assert run(["yard", "--at", "2001-01-01T00:00:00Z"]) == 0
     assert "B1" not in capsys.readouterr().out
+    assert run(["yard", "--since", "2001-01-01T00:00:00Z", "--json"]) == 0
+    changes = json.loads(capsys.readouterr().out)["changes"]
+    assert {(one["identity"], one["what"]) for one in changes} == {("B1", "came"), ("B2", "came")}
+    assert run(["yard", "--since", "2001-01-01T00:00:00Z"]) == 0
+    assert "came" in capsys.readouterr().out
     assert run(["store", "verify"]) == 0
     assert "1 rows of the audit log hold" in capsys.readouterr().out
     with open_store("sqlite:///barsight.db") as store:

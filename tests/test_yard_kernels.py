@@ -112,7 +112,7 @@ def test_the_normal_equations_are_those_of_the_outlines_derivatives() -> None:
 
 
 def drawn_heights(values: np.ndarray) -> Heights:
-    """A sheet of 40 rows about a bundle of seven bars without noise, a tenth of its cells unknown."""
+    """A grid of 40 rows about a bundle of seven bars without noise, a tenth of its cells unknown."""
     outline = make_outline(1, values[5], values[4], SMOOTHING_M)
     along = 0.01 * np.arange(40)[:, None] - 0.2
     across = (0.01 * np.arange(60) - 0.3 - values[0] - values[1] * along) / np.hypot(1, values[1])
@@ -199,16 +199,16 @@ def test_a_turned_sheet_holds_the_nearest_measured_cells() -> None:
     z = rng.normal(size=(31, 22)).astype(np.float32)
     source = rng.choice([0, 1, 1, 1, 3], z.shape).astype(np.uint8)
     heights = HeightMap(-0.4, 2.1, 0.01, z, z + 1, np.ones_like(z), source)
-    sheet = align_map(heights, 0.4)
-    row, column = np.indices(sheet.z_m.shape)
-    uv = np.column_stack([sheet.u0_m + 0.01 * column.ravel(), sheet.v0_m + 0.01 * row.ravel()])
-    x, y = sheet.to_map(uv).T
+    grid = align_map(heights, 0.4)
+    row, column = np.indices(grid.z_m.shape)
+    uv = np.column_stack([grid.u0_m + 0.01 * column.ravel(), grid.v0_m + 0.01 * row.ravel()])
+    x, y = grid.to_map(uv).T
     i, j = np.rint((y - 2.1) / 0.01).astype(int), np.rint((x + 0.4) / 0.01).astype(int)
     inside = (i >= 0) & (j >= 0) & (i < 31) & (j < 22)
     i, j = np.where(inside, i, 0), np.where(inside, j, 0)
     measured = inside & (source[i, j] == HeightSource.VISION)
-    np.testing.assert_array_equal(sheet.z_m.ravel(), np.where(measured, z[i, j], np.float32(np.nan)))
-    np.testing.assert_array_equal(sheet.sigma_m.ravel(), np.where(measured, z[i, j] + 1, np.float32(np.nan)))
+    np.testing.assert_array_equal(grid.z_m.ravel(), np.where(measured, z[i, j], np.float32(np.nan)))
+    np.testing.assert_array_equal(grid.sigma_m.ravel(), np.where(measured, z[i, j] + 1, np.float32(np.nan)))
     assert 200 < measured.sum() < inside.sum() < inside.size
 
 

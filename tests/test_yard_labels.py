@@ -45,6 +45,22 @@ def test_a_label_under_a_face_forbids(y_m: float, under: bool) -> None:
     assert codes(lift) == ({"gap"} if under else set())
 
 
+@pytest.mark.parametrize("half_m", [(0.03, 0.05), (0.05, 0.03)], ids=["along", "across"])
+def test_a_label_with_a_code_forbids(half_m: tuple[float, float]) -> None:
+    """Its dark modules keep the middle as dark as bars; a label's edge counts as its middle does."""
+    heights = map_of([laid(0.3)], x_m=(-1.5, 2.0))
+    at_m = MAGNET.poles[0].along_m
+    gray = np.clip(bars(heights.shape), 1, 255)
+    along, across = np.abs(heights.y_m - at_m), np.abs(heights.x_m - 0.3)
+    gray[np.ix_(along <= half_m[1], across <= half_m[0])] = 250.0
+    inner = np.ix_(along <= 0.026, across <= 0.026)
+    gray[inner] = 150.0 + np.random.default_rng(3).normal(0, 25, gray[inner].shape)
+    heights = replace(heights, gray=gray.astype(np.uint8))
+    assert codes(judged([laid(0.3)], (record(laid(0.3)),), PLACE, heights=heights)) == {"gap"}
+    between = (MAGNET.poles[0].along_m + MAGNET.poles[1].along_m) / 2
+    assert find_label(replace(PLACE, y_m=at_m - between), heights, MAGNET) is None
+
+
 def test_an_askew_label_on_a_bright_bar_is_found_and_a_gleam_is_not() -> None:
     """Levels as on full-size pictures of a drawn yard: a label of 230 on a bar of 175, a cell askew."""
     gray = np.full((40, 15), 120.0, np.float32)

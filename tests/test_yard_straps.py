@@ -62,12 +62,12 @@ def straight(*rows: float) -> tuple[tuple[float, float], ...]:
 
 def pack_at(heights: HeightMap, u_m: float, width_m: float = 0.2) -> Pack | None:
     """Look for straps over an outline about x = u_m that agrees with all rows."""
-    sheet = align_map(heights, 0.0, 0.05)
-    rows = sheet.z_m.shape[0]
+    grid = align_map(heights, 0.0, 0.05)
+    rows = grid.z_m.shape[0]
     values = np.array([u_m, 0.0, 0.2, 0.0, 0.0, width_m / 3])
     state, gain = np.full(rows, AGREES, np.uint8), np.ones(rows, np.float32)
-    fit = Fit(1, sheet.v0_m + CELL * rows / 2, values, np.zeros((6, 6)), 0, rows - 1, state, gain, 0.0, 0.0)
-    return strapped_pack(heights, sheet, fit)
+    fit = Fit(1, grid.v0_m + CELL * rows / 2, values, np.zeros((6, 6)), 0, rows - 1, state, gain, 0.0, 0.0)
+    return strapped_pack(heights, grid, fit)
 
 
 @pytest.mark.parametrize("seed", range(5))

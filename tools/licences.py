@@ -16,7 +16,10 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "licences.md"
-EXTRAS = ("view", "export", "bench", "store", "page", "postgres", "fleet", "acceptance")
+EXTRAS = (
+    "view", "export", "bench", "notebook", "store", "page", "postgres", "fleet", "acceptance", "cameras",
+    "labels", "numbers", "opcua", "mqtt", "s7", "signing",
+)  # fmt: skip
 _HEAD = """# Licences
 
 Barsight is under the Apache License 2.0 (`LICENSE`). Neither its repository nor its wheel holds code of

@@ -262,7 +262,7 @@ def _bundles(mapped: MappedYard, heights: YardMap) -> tuple[Bundle, ...]:
         return bundles
     with mapped.watch("labels"):
         poses = {frame.stamp_ns: frame.reference_from_body for frame in newest.way.trajectory.frames}
-        return label_bundles(newest.probed.pairs, poses, heights, bundles, settings.labels.size_m)
+        return label_bundles(newest.probed.pairs, poses, heights, bundles, settings.labels)
 
 
 def _input_hashes(passes: Sequence[MappedPass]) -> dict[str, str]:

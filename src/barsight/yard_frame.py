@@ -12,7 +12,7 @@ from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Float64
 from barsight.core.errors import InputError
 from barsight.core.json_values import json_digest, json_value
-from barsight.core.pose import skew
+from barsight.core.pose import Pose, skew
 from barsight.core.types import CraneSamples, LaserProfile, Trajectory
 from barsight.recording.base import Recording
 from barsight.recording.sensor_samples import make_laser
@@ -145,20 +145,26 @@ def with_shared(trajectory: Trajectory, frame: YardFrame | None) -> Trajectory:
     """Add what the yard frame may be off to each pose's covariance; it is common to all of them."""
     if frame is None or trajectory.reference != "yard":
         return trajectory
-    frames = []
-    for one in trajectory.frames:
-        carry = np.eye(6)
-        if frame.yard_from.source == "body" or frame.attitude is not None:
-            carry[3:] = 0.0  # only the attitude is taken; the encoders say where the body is
-        else:
-            carry[3:, :3] = -skew(one.reference_from_body.translation - frame.yard_from.translation)
-        covariance = frame.covariance
-        if frame.bend is not None:
-            here = frame.yard_from.inverse().apply(one.reference_from_body.translation[None])[0]
-            carry = np.hstack([carry, bend_carry(frame.bend, frame.yard_from.rotation, here)])
-            covariance = frame.bend.covariance
-        frames.append(replace(one, covariance=one.covariance + carry @ covariance @ carry.T))
-    return replace(trajectory, frames=tuple(frames))
+    frames = tuple(
+        replace(one, covariance=one.covariance + shared_covariance(one.reference_from_body, frame))
+        for one in trajectory.frames
+    )
+    return replace(trajectory, frames=frames)
+
+
+def shared_covariance(yard_from_body: Pose, frame: YardFrame) -> Float64:
+    """Compute the covariance (6, 6) that the yard frame adds to a pose, rotation first, in the yard."""
+    carry, covariance = np.eye(6), frame.covariance
+    if frame.yard_from.source == "body" or frame.attitude is not None:
+        carry[3:] = 0.0  # only the attitude is taken; the encoders say where the body is
+    else:
+        carry[3:, :3] = -skew(yard_from_body.translation - frame.yard_from.translation)
+    if frame.bend is not None:
+        here = frame.yard_from.inverse().apply(yard_from_body.translation[None])[0]
+        carry = np.hstack([carry, bend_carry(frame.bend, frame.yard_from.rotation, here)])
+        covariance = frame.bend.covariance
+    added: Float64 = carry @ covariance @ carry.T
+    return added
 
 
 def shared_height_sigma_m(frame: YardFrame, x_m: Float64, y_m: Float64, body_m: Float64) -> Float64:

@@ -11,8 +11,10 @@ from barsight.core.arrays import Float64
 from barsight.yard.inventory.stock_list import ListedBundle
 from barsight.yard.types import Bundle
 
-MIN_PICTURES = 2
-"""Pictures that must read a label alike before it is believed."""
+MIN_PICTURES, MIN_NUMBER_PICTURES = 2, 3
+"""Pictures that must read a code, or a plain number, alike before it is believed: a number has no check."""
+NUMBER = "number"
+"""Kind of a plain number."""
 SAME_PLACE_M = 0.15
 BESIDE_M, BELOW_TOP_M = 0.03, 0.15
 """How far beside a bundle's outline, and below its top, a label's middle may lie."""
@@ -33,7 +35,7 @@ class PlacedCode:
 @dataclass(frozen=True, eq=False)
 class Label:
     """A label. place_m: (3,) median of its pictures'. pictures: that read it so; agreement_ratio: their share
-    of all that read anything there. is_sure: read alike by `MIN_PICTURES` and contradicted by none. bundle:
+    of all that read anything there. is_sure: read alike by enough pictures and contradicted by none. bundle:
     its id, None where it lies on none that is known. doubts: sentences.
     """
 
@@ -78,8 +80,9 @@ def _label(
     ]
     others = sum(len({code.picture for code in other}) for other in there)
     doubts = [f"{len(there)} other text(s) read at the same place"] if there else []
-    if pictures < MIN_PICTURES:
-        doubts.append(f"read in {pictures} picture, {MIN_PICTURES} are needed")
+    needed = MIN_NUMBER_PICTURES if group[0].kind == NUMBER else MIN_PICTURES
+    if pictures < needed:
+        doubts.append(f"read in {pictures} picture{'s' * (pictures > 1)}, {needed} are needed")
     bundle = _bundle_at(place, bundles)
     return Label(
         group[0].text, group[0].kind, place, pictures, pictures / (pictures + others), not doubts,

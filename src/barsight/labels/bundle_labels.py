@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,11 +11,13 @@ from barsight.core.arrays import Float64
 from barsight.core.parallel import ordered_map
 from barsight.core.pose import Pose
 from barsight.core.types import RectifiedPair, RefusedFrame
-from barsight.labels.attachment import Label, PlacedCode, merge_codes
+from barsight.labels.attachment import NUMBER, Label, PlacedCode, merge_codes
 from barsight.labels.code_reading import SeenCode, read_codes
+from barsight.labels.number_reading import label_patch, number_reader, read_number
 from barsight.labels.placing import PlacedCamera, first_surface
-from barsight.labels.plates import find_plates
 from barsight.recording.rectified_pairs import RectifiedPairs
+from barsight.yard.label_settings import LabelSettings
+from barsight.yard.plates import find_plates
 from barsight.yard.sections import part_about
 from barsight.yard.types import Bundle, BundleLabel, YardMap
 
@@ -26,20 +28,40 @@ _BELOW_M = 1.0
 
 def label_bundles(
     pairs: RectifiedPairs, poses: Mapping[int, Pose], heights: YardMap, bundles: tuple[Bundle, ...],
-    size_m: tuple[float, float],
+    settings: LabelSettings,
 ) -> tuple[Bundle, ...]:  # fmt: skip
-    """Read the codes in the pairs that have a pose, and give each bundle its label.
+    """Read the labels in the pairs that have a pose, and give each bundle its own.
 
     poses: reference_from_body by stamp. A bundle has a label where one text is sure on it and no other is;
-    where codes are read but aren't sure, or only a plate of a label's size (size_m) is seen, it is illegible.
+    where something is read but isn't sure, or only a plate of a label's size is seen, it is illegible.
     Raises ConfigError without the extra `labels`.
     """
-    found = [code for codes in placed_codes(pairs, poses, heights) for code in codes]
-    labels = merge_codes(found, bundles)
+    labels = merge_codes(read_texts(pairs, poses, heights, bundles, settings), bundles)
     return tuple(
-        replace(bundle, label=bundle_label(bundle, labels) or unread_label(bundle, heights, size_m))
+        replace(bundle, label=bundle_label(bundle, labels) or unread_label(bundle, heights, settings.size_m))
         for bundle in bundles
     )
+
+
+def read_texts(
+    pairs: RectifiedPairs, poses: Mapping[int, Pose], heights: YardMap, bundles: Sequence[Bundle],
+    settings: LabelSettings, count: Callable[[], None] = lambda: None,
+) -> list[PlacedCode]:  # fmt: skip
+    """Read the codes in the pairs that have a pose, then plain numbers on bundles where no code was read.
+
+    count: called after each pair, twice where numbers are read.
+    """
+    found = list[PlacedCode]()
+    for codes in placed_codes(pairs, poses, heights):
+        found += codes
+        count()
+    if settings.numbers:
+        coded = {label.bundle for label in merge_codes(found, bundles)}
+        bare = [bundle for bundle in bundles if bundle.id not in coded]
+        for numbers in placed_numbers(pairs, poses, heights, bare, settings.size_m):
+            found += numbers
+            count()
+    return found
 
 
 def unread_label(bundle: Bundle, heights: YardMap, size_m: tuple[float, float]) -> BundleLabel | None:
@@ -68,6 +90,33 @@ def placed_codes(
             for number, (codes, camera) in enumerate(zip(seen, cameras, strict=False)) for code in codes
             if (place := _on_the_map(heights, *camera.line_of_sight(code.middle_px))) is not None
         ]  # fmt: skip
+
+
+def placed_numbers(
+    pairs: RectifiedPairs, poses: Mapping[int, Pose], heights: YardMap, bundles: Iterable[Bundle],
+    size_m: tuple[float, float],
+) -> Iterator[list[PlacedCode]]:  # fmt: skip
+    """Read plain numbers on the plates of a label's size (size_m) that lie on bundles, pair by pair.
+
+    Raises ConfigError without the extra `numbers` or Tesseract's data.
+    """
+    places = list[Float64]()
+    for bundle in bundles if min(size_m) > 0 else ():
+        for at in find_plates(bundle, heights, size_m):
+            if not any(np.hypot(*(at - other[:2])) < min(size_m) for other in places):
+                places.append(np.append(at, bundle.top_z_m))
+    rectifier, size_ratio = pairs.rectifier, min(size_m) / max(max(size_m), 1e-9)
+    with number_reader() as reader:
+        for pair in pairs(poses) if places else ():
+            pictures = () if isinstance(pair, RefusedFrame) else (pair.left, pair.right)
+            cameras = PlacedCamera.of_pair(poses[pair.stamp_ns] @ rectifier.body_from_rect0, rectifier.camera)
+            yield [
+                PlacedCode(text, NUMBER, place, (pair.stamp_ns, number))
+                for number, (picture, camera) in enumerate(zip(pictures, cameras, strict=False))
+                for place in places
+                if (patch := label_patch(picture, camera, place, size_m)) is not None
+                and (text := read_number(reader, patch, size_ratio)) is not None
+            ]  # fmt: skip
 
 
 def _on_the_map(heights: YardMap, origin: Float64, direction: Float64) -> Float64 | None:

@@ -11,14 +11,15 @@ import barsight
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import InputError
 from barsight.core.json_values import write_json
-from barsight.labels.attachment import Label, PlacedCode, contradictions, merge_codes
-from barsight.labels.bundle_labels import ILLEGIBLE, bundle_label, placed_codes, unread_label
+from barsight.labels.attachment import Label, contradictions, merge_codes
+from barsight.labels.bundle_labels import ILLEGIBLE, bundle_label, read_texts, unread_label
 from barsight.labels.placing import pose_at
 from barsight.recording.base import Recording
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.result_folder import open_folder, read_heights, read_path
 from barsight.yard.inventory.bundle_file import read_bundles
 from barsight.yard.inventory.stock_list import ListedBundle
+from barsight.yard.label_settings import LabelSettings
 
 SCHEMA_VERSION = 1
 FILE = "labels.json"
@@ -38,12 +39,12 @@ class ReadLabels:
 
 
 def read_labels(
-    recording: Recording, folder: Path, listed: tuple[ListedBundle, ...], size_m: tuple[float, float],
+    recording: Recording, folder: Path, listed: tuple[ListedBundle, ...], settings: LabelSettings,
     count: Callable[[], None],
 ) -> ReadLabels:  # fmt: skip
     """Read the labels in a recording's pictures onto the map that `folder` holds.
 
-    size_m: of a label, see `LabelSettings`. count: called after each pair.
+    count: called after each pair, twice where plain numbers are read.
     Raises InputError where the folder is not of this recording or has no
     trajectory, ConfigError without the extra `labels`.
     """
@@ -58,17 +59,14 @@ def read_labels(
     bundles, heights = read_bundles(folder / "bundles.json"), read_heights(folder)
     pairs = RectifiedPairs(recording, Rectifier(recording.rig))
     poses = {stamp: pose for stamp in recording.index.stamps_ns if (pose := pose_at(path, stamp)) is not None}
-    codes, pictures = list[PlacedCode](), 0
-    for found in placed_codes(pairs, poses, heights):
-        count()
-        codes += found
-        pictures += 2
-    labels = merge_codes(codes, bundles)
+    labels = merge_codes(read_texts(pairs, poses, heights, bundles, settings, count), bundles)
     illegible = tuple(
         bundle.id for bundle in bundles
-        if (bundle_label(bundle, labels) or unread_label(bundle, heights, size_m)) == ILLEGIBLE
+        if (bundle_label(bundle, labels) or unread_label(bundle, heights, settings.size_m)) == ILLEGIBLE
     )  # fmt: skip
-    return ReadLabels(said["map_id"], pictures, labels, illegible, contradictions(labels, bundles, listed))
+    return ReadLabels(
+        said["map_id"], 2 * len(poses), labels, illegible, contradictions(labels, bundles, listed)
+    )
 
 
 def write_labels(found: ReadLabels, folder: Path) -> Path:

@@ -18,7 +18,7 @@ from barsight.live.shared.logs import ReadingLog
 from barsight.live.source import ReplayClock
 from barsight.motion.fixed_lag.propagation import NavigationState, Propagator
 from barsight.recording.sensor_selection import SelectedSensors
-from barsight.yard_frame import crane_in_yard, frame_of, in_yard
+from barsight.yard_frame import crane_in_yard, frame_of, in_yard, shared_covariance
 
 WAIT_S = 0.01
 """A pose waits so long for the readings at its stamp; what hasn't come then is extrapolated."""
@@ -53,6 +53,8 @@ class PoseOutput:
         source = in_yard(SelectedSensors(whole, link.settings.use), link.settings.yard)
         self._frame, self._noise = frame_of(source), whole.imu_noise() or ORDINARY_NOISE
         self._sensors, self._mounted = link.sensors(whole), whole.crane()
+        placed = source.crane()
+        self._lever_m = None if placed is None else placed.crane_to_body_m
         self._freeze: FreezeWatch | None = None
         if self._mounted is not None and "crane" in self._sensors:
             self._freeze = FreezeWatch(self._mounted)
@@ -131,12 +133,19 @@ class PoseOutput:
     def _publish(self, posed: PosedFrame) -> None:
         """Write the pose for readers, whole or not at all. predicted_s: how long after the last pair."""
         pose = posed.reference_from_body
+        lever_m, covariance = None, posed.covariance
+        if pose.target == "yard":
+            lever_m = self._lever_m
+            covariance = (
+                covariance if self._frame is None else covariance + shared_covariance(pose, self._frame)
+            )
         content = {
             "stamp_ns": posed.stamp_ns - self._shift_ns,
             "frame": pose.target,
             "position_m": pose.translation,
+            "crane_m": None if lever_m is None else pose.translation - lever_m,
             "quaternion_xyzw": pose.quaternion_xyzw,
-            "sigma_m": np.sqrt(np.diag(posed.covariance)[3:]),
+            "sigma_m": np.sqrt(np.diag(covariance)[3:]),
             "predicted_s": (posed.stamp_ns - self._state_ns) / NS_PER_S,
         }
         write_json(self._link.folder.parent / "pose.json", content, DIGITS)

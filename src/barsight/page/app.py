@@ -14,13 +14,15 @@ from barsight.core.errors import BarsightError, ConfigError
 from barsight.core.extras import extra
 from barsight.core.json_values import json_value
 from barsight.page.access import COOKIE, RIGHTS, SESSION_S, Access, AccessError, Caller, Right, expect_csrf
-from barsight.page.documents import bundle_history, bundle_records, compare_yards
+from barsight.page.documents import bundle_history, bundle_records
 from barsight.page.guard import Guard
 from barsight.page.layers import Kind, PaintedLayers, find_layers
+from barsight.page.pictures import paint_bundle
 from barsight.page.survey_files import find_file
 from barsight.page.watch import StoreWatch
 from barsight.store.accounts import Role, add_person, add_token, withdraw
 from barsight.store.audit import Entry, entry
+from barsight.store.changes import yard_changes
 from barsight.store.confirmation import confirm_lift, end_lift, forbid, take_lift
 from barsight.store.states import alarm_state, raise_alarm, step_alarm
 from barsight.store.stock_decisions import Decision, decide
@@ -223,9 +225,8 @@ def _add_reading(app: FastAPI, watch: StoreWatch, access: Access) -> None:
 
     @app.get("/api/bundles/{name}")
     def bundle(name: str, _: Caller = reader) -> Any:
-        number = int(name[1:]) if name[:1] == "B" and name[1:].isdigit() and len(name) < 10 else 0
         with watch.store.reading() as connection:
-            found = bundle_history(connection, number)
+            found = bundle_history(connection, identity_number(name))
         if found is None:
             raise AccessError(404, f"there is no bundle {name}")
         return json_value(found)
@@ -241,7 +242,7 @@ def _add_reading(app: FastAPI, watch: StoreWatch, access: Access) -> None:
     @app.get("/api/compare")
     def compare(before_ns: int, after_ns: int, _: Caller = reader) -> Any:
         with watch.store.reading() as connection:
-            return json_value({"changes": compare_yards(connection, before_ns, after_ns)})
+            return json_value({"changes": yard_changes(connection, before_ns, after_ns)})
 
 
 def _add_files(app: FastAPI, watch: StoreWatch, access: Access) -> None:
@@ -258,6 +259,14 @@ def _add_files(app: FastAPI, watch: StoreWatch, access: Access) -> None:
             if one.map_id == map_id:
                 return Response(painted.paint(one, kind), media_type="image/png")
         raise AccessError(404, f"no place is known best by map {map_id}")
+
+    @app.get("/api/bundles/{name}/pictures/{map_id}.png")
+    def picture(name: str, map_id: str, _: Caller = reader) -> Response:
+        with watch.store.reading() as connection:
+            painted = paint_bundle(connection, identity_number(name), map_id)
+        if painted is None:
+            raise AccessError(404, f"survey {map_id} has no picture of {name}")
+        return Response(painted, media_type="image/png")
 
     @app.get("/api/surveys/{map_id}/files/{name}")
     def survey_file(map_id: str, name: str, _: Caller = reader) -> FileResponse:
@@ -310,6 +319,11 @@ def _add_lifts(app: FastAPI, watch: StoreWatch, access: Access) -> None:
                 decide(opened, form.map_id, form.key, form.decision, form.note)
 
         return done(add)
+
+
+def identity_number(name: str) -> int:
+    """Read a bundle's number from its name; 0, which none has, where it is no name."""
+    return int(name[1:]) if name[:1] == "B" and name[1:].isdigit() and len(name) < 10 else 0
 
 
 def signature(caller: Caller, name: str = "") -> str:

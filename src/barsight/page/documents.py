@@ -9,11 +9,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from barsight.core.errors import InputError
 from barsight.core.extras import extra
 from barsight.store.confirmation import map_vetoes, newest_survey, open_lifts, yard_clock_ns
 from barsight.store.history import PresentBundle, identity_name, list_surveys, present_yard
-from barsight.store.matching import has_moved
 from barsight.store.promotion import counts
 from barsight.store.tables import (
     ABSENCES,
@@ -27,11 +28,13 @@ from barsight.store.tables import (
     SURVEY_VETOES,
     SURVEYS,
 )  # fmt: skip
-from barsight.yard.inventory.bundle_file import bundle_of, read_match
+from barsight.yard.inventory.bundle_file import read_match
 
 with extra("store"):
     from sqlalchemy import Connection, Row, select
 
+LIKE_RATIO = 0.15
+"""Bundles whose bars' diameters and widths differ by less are of one kind."""
 MAX_LIFTS = 500
 MAX_ALARMS = 500
 _FIGURES = (
@@ -70,7 +73,33 @@ def bundle_records(connection: Connection, at_ns: int | None = None) -> list[dic
     if at_ns is None:
         of = _bundles_of_lifts(connection)
         offers = {number: lift for lift in open_lifts(connection) for number in of[lift.lift_id]}
-    return [_bundle(one, vetoes, offers) for one in present_yard(connection, at_ns)]
+    present = present_yard(connection, at_ns)
+    beyond = unseen_lengths([one.sighting.record for one in present])
+    return [
+        _bundle(one, vetoes, offers) | {"unseen_m": unseen_m}
+        for one, unseen_m in zip(present, beyond, strict=True)
+    ]
+
+
+def unseen_lengths(records: list[dict[str, Any]]) -> list[float | None]:
+    """Tell by how much each bundle with an open end is shorter than those of like bars whose ends were both
+    seen; None where it has no open end, or there are none such.
+    """
+    whole = np.array(
+        [
+            (one["bar_diameter_m"] or np.nan, one["width_m"], one["length_m"])
+            for one in records
+            if not any(one["ends_open"])
+        ]
+    ).reshape(-1, 3)
+    told: list[float | None] = []
+    for one in records:
+        own = np.array([one["bar_diameter_m"] or np.nan, one["width_m"]])
+        alike = (np.abs(whole[:, :2] - own) <= LIKE_RATIO * own).all(axis=1)
+        alike &= whole[:, 2] > one["length_m"]
+        is_told = any(one["ends_open"]) and bool(alike.any())
+        told.append(float(np.median(whole[alike, 2])) - one["length_m"] if is_told else None)
+    return told
 
 
 def _bundle(one: PresentBundle, vetoes: Any, offers: Any) -> dict[str, Any]:
@@ -225,30 +254,6 @@ def stock_record(connection: Connection) -> dict[str, Any]:
             each["decision"] = {"what": row.decision, "who": row.who, "at_ns": row.at_ns, "note": row.note}
     agree = [one.name for one in match.matched if one.name not in match.moved and not one.disagrees]
     return {"map_id": newest.map_id, "list": len(match.matched), "agree": agree, "differences": told}
-
-
-def compare_yards(connection: Connection, before_ns: int, after_ns: int) -> list[dict[str, Any]]:
-    """Tell what changed between two times: `came`, `went`, `moved`; what lies as it lay is left out."""
-    before = {one.sighting.bundle_id: one.sighting for one in present_yard(connection, before_ns)}
-    after = {one.sighting.bundle_id: one.sighting for one in present_yard(connection, after_ns)}
-    told = []
-    for number in sorted({*before, *after}):
-        old, new = before.get(number), after.get(number)
-        kind = "went" if new is None else "came" if old is None else "moved"
-        if (
-            old is not None
-            and new is not None
-            and not has_moved(bundle_of(old.record), bundle_of(new.record))
-        ):
-            continue
-        told.append(
-            {
-                "identity": identity_name(number), "what": kind,
-                "from_m": None if old is None else old.record["axis_centre_m"],
-                "to_m": None if new is None else new.record["axis_centre_m"],
-            }
-        )  # fmt: skip
-    return told
 
 
 def _survey_of(row: Row[Any]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Read the health of a live run from the files that it writes."""
+"""Read the health of a live run, and where crane and magnet are, from the files that it writes."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from barsight.core.json_values import json_value
+from barsight.core.reading.live_run import read_crane_pose, read_live_state, running_folder
 
 STOPPED_S = 10.0
 HISTORY = 720
@@ -32,7 +35,7 @@ class LiveFolder:
 
     def look(self) -> LiveHealth:
         """Read health.json; a new one is added to the history."""
-        path = self.folder / "health.json"
+        path = running_folder(self.folder) / "health.json"
         try:
             changed_s = path.stat().st_mtime
             content = json.loads(path.read_text(encoding="utf-8"))
@@ -54,3 +57,16 @@ class LiveFolder:
         elif mode not in _FOR_LIFTS:
             problem = ("live-degraded", str(mode))
         return LiveHealth(content, age_s, problem)
+
+    def crane(self) -> bytes:
+        """Tell as JSON how the run stands, and where crane and magnet are; no place where that is old."""
+        folder = running_folder(self.folder)
+        told = read_live_state(folder)
+        if told is None or not told.is_running:
+            return json.dumps({"mode": None, "reasons": [], "place": None}).encode()
+        pose = read_crane_pose(folder, told.now_ns)
+        place = None
+        if pose is not None:
+            place = {"body_m": (pose.x_m, pose.y_m), "magnet_m": pose.magnet_m}
+        content = {"mode": told.mode, "reasons": told.reasons, "place": place}
+        return json.dumps(json_value(content, decimals=3), allow_nan=False).encode()

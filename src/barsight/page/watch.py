@@ -57,13 +57,16 @@ class Published:
 
 
 class StoreWatch:
-    """Runs in a thread of its own; requests read what it published last."""
+    """Runs in a thread of its own; requests read what it published last. crane: JSON of the live run's crane,
+    empty where none is watched.
+    """
 
     def __init__(self, store: Store, live: LiveFolder | None = None) -> None:
         self.store, self.live = store, live
         self.published = Published()
         self.health: LiveHealth | None = None
         self.problem: str | None = None
+        self.crane = b""
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -105,8 +108,13 @@ class StoreWatch:
                 for name, one in content.items()
             }
             self.published = Published(int(revision), documents, accounts, layers)
-        if self._loop is not None and not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(self._tell)
+        self._wake()
+
+    def look_at_crane(self) -> None:
+        """Read where the crane of the live run is, and tell it where it moved."""
+        if self.live is not None and (crane := self.live.crane()) != self.crane:
+            self.crane = crane
+            self._wake()
 
     def judge(self, *, with_chain: bool = False) -> None:
         """Settle alarms, and let offers end whose time is over or whose calibration was changed."""
@@ -126,10 +134,10 @@ class StoreWatch:
         self.refresh()
 
     async def events(self) -> AsyncIterator[bytes]:
-        """Stream server-sent events: the newest revision, whenever there is a newer one than was sent. A
-        reader that is slow skips those in between.
+        """Stream server-sent events: the newest revision and the crane's place, whenever there is a newer one
+        than was sent. A reader that is slow skips those in between.
         """
-        sent = -1
+        sent, told = -1, b""
         while not self._stop.is_set():
             changed = self._changed
             assert changed is not None
@@ -137,10 +145,18 @@ class StoreWatch:
                 sent = self.published.revision
                 yield f"event: revision\nid: {sent}\ndata: {sent}\n\n".encode()
                 continue
+            if self.crane != told:
+                told = self.crane
+                yield b"event: crane\ndata: " + told + b"\n\n"
+                continue
             try:
                 await asyncio.wait_for(changed.wait(), HEARTBEAT_S)
             except TimeoutError:
                 yield b": still there\n\n"
+
+    def _wake(self) -> None:
+        if self._loop is not None and not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(self._tell)
 
     def _tell(self) -> None:
         changed, self._changed = self._changed, asyncio.Event()
@@ -151,6 +167,7 @@ class StoreWatch:
         judged_s = verified_s = float("-inf")
         while not self._stop.is_set():
             try:
+                self.look_at_crane()
                 now_s = time.monotonic()
                 if now_s - judged_s >= JUDGE_S:
                     with_chain = now_s - verified_s >= VERIFY_S

@@ -10,10 +10,11 @@ from types import TracebackType
 from typing import Protocol
 
 from barsight.core.errors import BarsightError
+from barsight.core.reading.live_run import CranePose
 from barsight.plant.crane_names import is_crane
 from barsight.plant.live_folder import with_live_run
 from barsight.plant.settings import PlantSettings
-from barsight.plant.state import CranePose, PlantState, PlcReading, state_of_store
+from barsight.plant.state import PlantState, PlcReading, state_of_store
 from barsight.store.confirmation import expire_claims, expire_stale
 from barsight.store.opening import Store
 

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from barsight.core.json_values import json_value
+from barsight.core.reading.live_run import CranePose
 from barsight.store.confirmation import OPEN, OpenLift, map_vetoes, newest_survey, open_lifts, yard_clock_ns
 from barsight.store.opening import Store
 from barsight.store.states import standing_alarms
@@ -17,18 +18,6 @@ MAX_ALARMS = 20
 URGENT = ("store-broken", "load-contradicts", "lift-unrecorded", "lift-failed")
 """Codes of alarms of priority 1: what the store says of the yard may not be true. All others have 2."""
 YAW_SENSE = "of the beam from +Y of the yard frame, counter-clockwise seen from above"
-
-
-@dataclass(frozen=True)
-class CranePose:
-    """The crane in the yard frame. sigma_m: standard deviations; stamp_ns: of the measurement."""
-
-    x_m: float
-    y_m: float
-    z_m: float
-    yaw_deg: float | None
-    sigma_m: tuple[float, float, float]
-    stamp_ns: int
 
 
 @dataclass(frozen=True)

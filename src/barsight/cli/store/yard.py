@@ -6,6 +6,7 @@ import json
 import sys
 import time
 from collections.abc import Sequence
+from typing import Any
 
 import tyro
 from rich.box import SIMPLE_HEAD
@@ -15,6 +16,7 @@ from barsight.cli.arguments import call
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.json_values import json_value
 from barsight.core.stamps import NS_PER_S
+from barsight.store.changes import yard_changes
 from barsight.store.history import PresentBundle, parse_time, present_yard, time_text, yard_records
 from barsight.store.opening import DEFAULT_URL, open_store
 
@@ -25,25 +27,52 @@ def run(arguments: Sequence[str]) -> None:
     """Parse, read and print."""
 
     def command(
-        url: tyro.conf.Positional[str] = DEFAULT_URL, at: str | None = None, json: bool = False
-    ) -> None:
-        """Print the yard as it was known at a time: of each bundle the newest sighting, with its age.
+        url: tyro.conf.Positional[str] = DEFAULT_URL, at: str | None = None, since: str | None = None,
+        json: bool = False,
+    ) -> None:  # fmt: skip
+        """Print the yard as it was known at a time: of each bundle the newest sighting, with its age; or what
+        came, went and moved between two times.
 
         Args:
             url: SQLAlchemy's URL of the database.
             at: ISO 8601 with its zone, like 2026-11-23T14:00:00Z, or integer ns; now if not given.
+            since: An earlier time, written likewise: print only what changed between it and --at.
             json: Write JSON, with each bundle's record as in bundles.json and its identity.
         """
         at_ns = None if at is None else parse_time(at)
+        now_ns = time.time_ns() if at_ns is None else at_ns
+        if since is not None:
+            since_ns = parse_time(since)
+            with open_store(url) as store, store.reading() as connection:
+                changes = yard_changes(connection, since_ns, now_ns)
+            if json:
+                print_json({"since_ns": since_ns, "at_ns": now_ns, "changes": changes})
+            else:
+                SafeConsole().print(_change_table(since_ns, now_ns, changes))
+            return
         with open_store(url) as store, store.reading() as connection:
             present = present_yard(connection, at_ns)
-        now_ns = time.time_ns() if at_ns is None else at_ns
         if json:
             print_json({"at_ns": now_ns, "bundles": yard_records(present, now_ns)})
             return
         SafeConsole().print(bundle_table(f"Yard at {time_text(now_ns)}", present, now_ns))
 
     call(command, "yard", arguments)
+
+
+def _change_table(since_ns: int, at_ns: int, changes: list[dict[str, Any]]) -> Table:
+    title = f"Changes from {time_text(since_ns)} to {time_text(at_ns)}"
+    table = Table(title=title, box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    for head in ("name", "what", "from x m", "y m", "to x m", "y m"):
+        table.add_column(head, justify="left" if head in ("name", "what") else "right", no_wrap=True)
+    for one in changes:
+        places = [
+            "-" if place is None else f"{place[axis]:.3f}"
+            for place in (one["from_m"], one["to_m"])
+            for axis in (0, 1)
+        ]
+        table.add_row(one["identity"], one["what"], *places)
+    return table
 
 
 def print_json(content: object) -> None:

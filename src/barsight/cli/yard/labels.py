@@ -29,6 +29,7 @@ def run(arguments: Sequence[str]) -> None:
         out: tyro.conf.Positional[Path],
         stock_list: Path | None = None,
         label_m: tuple[float, float] = LabelSettings().size_m,
+        numbers: bool = False,
         reading: tyro.conf.OmitArgPrefixes[RecordingSettings] = RecordingSettings(),  # noqa: B008
     ) -> None:
         """Read the codes on bundles' labels in a recording's pictures, and attach them to the bundles of its
@@ -45,14 +46,17 @@ def run(arguments: Sequence[str]) -> None:
             stock_list: CSV or JSON as bundles.stock_list takes it: labels that contradict it are named.
             label_m: Length and width of a label: a bright plate of this size on a bundle that no picture
                 reads is called illegible; 0 0 looks for none.
+            numbers: Read plain numbers too, where no code is read (extra `numbers`, and Tesseract's
+                English data).
             reading: How to read the recording.
         """
         listed = () if stock_list is None else read_stock(stock_list)
         source = open_recording(recording, reading)
-        total, done = len(source.index.stamps_ns), count(1)
+        settings = LabelSettings(numbers=numbers, size_m=label_m)
+        total, done = (1 + numbers) * len(source.index.stamps_ns), count(1)
         console = SafeConsole()
         with stages(SafeConsole(stderr=True)) as advance:
-            found = read_labels(source, out, listed, label_m, lambda: advance("labels", next(done), total))
+            found = read_labels(source, out, listed, settings, lambda: advance("labels", next(done), total))
         target = write_labels(found, out)
         _print(found, console)
         console.print(f"labels: {target}", soft_wrap=True, highlight=False, markup=False)

@@ -122,22 +122,33 @@ def _placed_by_points(problem: Problem, state: GraphState, used: Bool) -> GraphS
     """Place the newest frame by the known points, then its points by all frames."""
     seen, node = problem.sightings, len(problem.start) - 1
     assert seen is not None
-    rig, sights = rig_of(seen), observations_of(problem, used)
+    rig, observations = rig_of(seen), observations_of(problem, used)
     if (seen.node[used] == node).sum() >= MIN_POINTS:
         values = gtsam.Values(state.values)
         for _ in range(STEPS):
             normal, gradient = np.zeros((6, 6)), np.zeros(6)
             frame_equations(
-                rig, sights, linearisation_point(problem, state), len(problem.retained) - 1, normal, gradient
+                rig,
+                observations,
+                linearisation_point(problem, state),
+                len(problem.retained) - 1,
+                normal,
+                gradient,
             )
             values.update(X(node), values.atPose3(X(node)).retract(-dense.solve_positive(normal, gradient)))
             state = replace(state, values=values)
     points, still = state.points.copy(), np.zeros((len(problem.retained), 6))
     shown = np.zeros(len(points), np.bool_)
     shown[seen.track[seen.node == node]] = True
-    sights = sights._replace(used=used & shown[seen.track])
+    observations = observations._replace(used=used & shown[seen.track])
     back_substitute(
-        rig, sights, linearisation_point(problem, state), still, np.zeros(2), points, np.empty(len(points))
+        rig,
+        observations,
+        linearisation_point(problem, state),
+        still,
+        np.zeros(2),
+        points,
+        np.empty(len(points)),
     )
     return replace(state, points=points)
 

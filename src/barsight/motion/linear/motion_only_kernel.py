@@ -16,15 +16,25 @@ from barsight.motion.linear.reprojection_kernels import (
 
 @kernel()
 def frame_equations(
-    rig: Rig, sights: Observations, guess: LinearisationPoint, frame: int, normal: Float64, gradient: Float64
+    rig: Rig,
+    observations: Observations,
+    guess: LinearisationPoint,
+    frame: int,
+    normal: Float64,
+    gradient: Float64,
 ) -> None:
     """Add to the matrix (6, 6) and gradient (6,) of the frame's pose what its used sightings say."""
     lens, mount, camera, points, rows = rig.lens, rig.mount, guess.camera, guess.points, empty_rows()
-    stereo, weight, node, last = sights.stereo, sights.weight, sights.node, len(guess.shared) - 1
-    given = PointTerms(rig.huber, sights.scale, 0.0, guess.shared[last - 1], guess.shared[last])
-    for t in range(len(sights.first) - 1):
-        for k in range(sights.first[t], sights.first[t + 1]):
-            if not sights.used[k] or node[k] != frame:
+    stereo, weight, node, last = (
+        observations.stereo,
+        observations.weight,
+        observations.node,
+        len(guess.shared) - 1,
+    )
+    given = PointTerms(rig.huber, observations.scale, 0.0, guess.shared[last - 1], guess.shared[last])
+    for t in range(len(observations.first) - 1):
+        for k in range(observations.first[t], observations.first[t + 1]):
+            if not observations.used[k] or node[k] != frame:
                 continue
             whitened_rows(lens, mount, camera, points, stereo, weight[k], given, (frame, k, t), rows)
             for a in range(6):

@@ -139,24 +139,30 @@ def disparity_offset(shared: Float64, piece: Int64, t: int) -> float:
 
 
 @kernel(inline=True)
-def given_of(rig: Rig, sights: Observations, shared: Float64, t: int) -> PointTerms:
+def given_of(rig: Rig, observations: Observations, shared: Float64, t: int) -> PointTerms:
     """Collect the numbers that the sightings of point t have in common.
 
     shared: (2 S + 2,), see `LinearisationPoint`.
     """
     last = len(shared) - 1
-    off_px = disparity_offset(shared, sights.piece, t)
-    return PointTerms(rig.huber, sights.scale, off_px, shared[last - 1], shared[last])
+    off_px = disparity_offset(shared, observations.piece, t)
+    return PointTerms(rig.huber, observations.scale, off_px, shared[last - 1], shared[last])
 
 
 @kernel()
-def residuals(rig: Rig, sights: Observations, guess: LinearisationPoint, result: Float64) -> float:
+def residuals(rig: Rig, observations: Observations, guess: LinearisationPoint, result: Float64) -> float:
     """Compute residuals (N, 3) px, seen minus predicted, of the used sightings; returns their robust cost."""
     lens, camera, points, shared = rig.lens, guess.camera, guess.points, guess.shared
-    first, node, used, stereo, weight = sights.first, sights.node, sights.used, sights.stereo, sights.weight
+    first, node, used, stereo, weight = (
+        observations.first,
+        observations.node,
+        observations.used,
+        observations.stereo,
+        observations.weight,
+    )
     rows, cost = empty_rows(), 0.0
     for t in range(len(first) - 1):
-        seen, given = False, given_of(rig, sights, shared, t)
+        seen, given = False, given_of(rig, observations, shared, t)
         for k in range(first[t], first[t + 1]):
             if not used[k]:
                 continue
@@ -170,7 +176,7 @@ def residuals(rig: Rig, sights: Observations, guess: LinearisationPoint, result:
             size = np.sqrt(total) * weight[k]
             cost += size**2 / 2 if size < given.huber else given.huber * (size - given.huber / 2)
         if seen:
-            cost += (sights.tight[t] * slide_offset(points, shared, sights.piece, t)) ** 2 / 2
+            cost += (observations.tight[t] * slide_offset(points, shared, observations.piece, t)) ** 2 / 2
     return cost
 
 

@@ -166,18 +166,24 @@ def _take_out(
 
 @kernel()
 def eliminate_points(
-    rig: Rig, sights: Observations, guess: LinearisationPoint, result: ReducedSystem
+    rig: Rig, observations: Observations, guess: LinearisationPoint, result: ReducedSystem
 ) -> None:
     """Form the Schur complement of the points over all used sightings and add it to `result`."""
     lens, mount, camera, points, shared = rig.lens, rig.mount, guess.camera, guess.points, guess.shared
-    first, node, used, stereo, weight = sights.first, sights.node, sights.used, sights.stereo, sights.weight
+    first, node, used, stereo, weight = (
+        observations.first,
+        observations.node,
+        observations.used,
+        observations.stereo,
+        observations.weight,
+    )
     band, slope, sides = result.band, result.gradient, result.side
     rows, normal, gradient, rest = empty_rows(), np.empty((4, 4)), np.empty(4), np.empty((4, 5))
     bound = np.empty((4, band.shape[2]))
     begin, size = (0, 4) if len(shared) > 2 else (2, 3)
     for t in range(len(first) - 1):
         normal[:], gradient[:], rest[:] = 0.0, 0.0, 0.0
-        begun, end, own, given = -1, -1, sights.piece[t], given_of(rig, sights, shared, t)
+        begun, end, own, given = -1, -1, observations.piece[t], given_of(rig, observations, shared, t)
         since, corner, corner_slope = result.first[own], result.corner[own], result.corner_gradient[own]
         for k in range(first[t], first[t + 1]):
             if not used[k]:
@@ -199,8 +205,8 @@ def eliminate_points(
         if begun < 0 or normal[0, 0] == 0:
             continue
         if begin == 0:
-            held = sights.tight[t] ** 2
-            pull = held * slide_offset(points, shared, sights.piece, t)
+            held = observations.tight[t] ** 2
+            pull = held * slide_offset(points, shared, observations.piece, t)
             normal[3, 3] += held
             gradient[3] += pull
             rest[3, 0] = -held
@@ -261,7 +267,7 @@ def scatter_reduced(
 @kernel()
 def back_substitute(
     rig: Rig,
-    sights: Observations,
+    observations: Observations,
     guess: LinearisationPoint,
     pose_step: Float64,
     shared_step: Float64,
@@ -272,12 +278,18 @@ def back_substitute(
     shared; variance (T,) of each point's slide, all else taken as known.
     """
     lens, mount, camera, points, shared = rig.lens, rig.mount, guess.camera, guess.points, guess.shared
-    first, node, used, stereo, weight = sights.first, sights.node, sights.used, sights.stereo, sights.weight
+    first, node, used, stereo, weight = (
+        observations.first,
+        observations.node,
+        observations.used,
+        observations.stereo,
+        observations.weight,
+    )
     rows, normal, gradient, last = empty_rows(), np.empty((4, 4)), np.empty(4), len(shared_step) - 1
     size = 4 if last > 1 else 3
     for t in range(len(first) - 1):
-        normal[:], gradient[:], given = 0.0, 0.0, given_of(rig, sights, shared, t)
-        step = disparity_offset(shared_step, sights.piece, t)
+        normal[:], gradient[:], given = 0.0, 0.0, given_of(rig, observations, shared, t)
+        step = disparity_offset(shared_step, observations.piece, t)
         for k in range(first[t], first[t + 1]):
             if not used[k]:
                 continue
@@ -293,8 +305,8 @@ def back_substitute(
             continue
         if size == 4:
             held, off = (
-                sights.tight[t] ** 2,
-                slide_offset(points, shared, sights.piece, t) - shared_step[sights.piece[t]],
+                observations.tight[t] ** 2,
+                slide_offset(points, shared, observations.piece, t) - shared_step[observations.piece[t]],
             )
             normal[3, 3] += held
             gradient[3] += held * off

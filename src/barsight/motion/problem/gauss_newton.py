@@ -201,9 +201,15 @@ def retract(
     if problem.sightings is not None:
         points = points.copy()
         poses = np.ascontiguousarray(by_node[problem.retained, :6] if seen_step is None else seen_step)
-        rig, sights = rig_of(problem.sightings), observations_of(problem, used)
+        rig, observations = rig_of(problem.sightings), observations_of(problem, used)
         back_substitute(
-            rig, sights, linearisation_point(problem, state), poses, shared, points, np.empty(len(points))
+            rig,
+            observations,
+            linearisation_point(problem, state),
+            poses,
+            shared,
+            points,
+            np.empty(len(points)),
         )
     return replace(
         state, values=state.values.retract(vectors), points=points, drift=state.drift + border[-2:],

@@ -61,10 +61,14 @@ export function read(name) {
 
 export const may = (right) => session.rights.includes(right);
 
-// Call `onRevision` at each new revision, `onState` with whether the server is there.
-export function listen(onRevision, onState) {
+// Where crane and magnet of a live run are, and how it stands; null where none is watched.
+export const live = { crane: null };
+
+// Call `onRevision` at each new revision, `onCrane` when the crane moved, `onState` with whether the server is there.
+export function listen(onRevision, onState, onCrane) {
   const source = new EventSource("/api/events");
   source.addEventListener("revision", (event) => { onState(true); onRevision(Number(event.data)); });
+  source.addEventListener("crane", (event) => { live.crane = JSON.parse(event.data); onCrane(); });
   source.onopen = () => onState(true);
-  source.onerror = () => { onState(false); if (source.readyState === EventSource.CLOSED) setTimeout(() => listen(onRevision, onState), 1000); };
+  source.onerror = () => { live.crane = null; onState(false); if (source.readyState === EventSource.CLOSED) setTimeout(() => listen(onRevision, onState, onCrane), 1000); };
 }

@@ -4,6 +4,7 @@ import { OPEN_LIFTS, t } from "./dom.js";
 
 const SELECT = "#1d4f91";
 const INK = "#26292b";
+const WORDS_PX = 40; // room below the yard for the words of its lowest bundles
 
 export class YardCanvas {
   // onPick: is given an identity or null.
@@ -15,6 +16,7 @@ export class YardCanvas {
     this.pictures = new Map();
     this.frames = [];
     this.chosen = null;
+    this.crane = null; // place of the camera body and the magnet of a live run, m
     this.listen();
     new ResizeObserver(() => this.resize()).observe(canvas);
     this.media = matchMedia("print");
@@ -33,10 +35,8 @@ export class YardCanvas {
   item(bundle) {
     const [[ax, ay], [bx, by]] = bundle.ends_m;
     const length = Math.hypot(bx - ax, by - ay) || 1;
-    const nx = (-(by - ay) / length) * bundle.width_m / 2;
-    const ny = ((bx - ax) / length) * bundle.width_m / 2;
     return {
-      bundle, corners: [[ax + nx, ay + ny], [bx + nx, by + ny], [bx - nx, by - ny], [ax - nx, ay - ny]],
+      bundle, ...outline(bundle.ends_m, bundle.width_m),
       x: (ax + bx) / 2, y: (ay + by) / 2, reach: length / 2 + bundle.width_m, low: Math.min(ay, by), top: bundle.top_z_m,
       forbidden: isForbidden(bundle), words: shortWhy(bundle),
     };
@@ -65,8 +65,8 @@ export class YardCanvas {
     const [x0, y0, x1, y1] = this.edges();
     const width = this.canvas.clientWidth || 800;
     const height = this.canvas.clientHeight || 500;
-    const scale = Math.min(width / (x1 - x0 + 1), (height - 40) / (y1 - y0 + 1));
-    this.view = { x: (x0 + x1) / 2, y: (y0 + y1) / 2, scale };
+    const scale = Math.min(width / (x1 - x0 + 1), Math.max(height - 2 * WORDS_PX, 100) / (y1 - y0 + 1));
+    this.view = { x: (x0 + x1) / 2, y: (y0 + y1) / 2 - WORDS_PX / 2 / scale, scale };
     this.draw();
   }
 
@@ -109,7 +109,30 @@ export class YardCanvas {
     const seen = this.visible();
     this.paintBundles(c, seen);
     this.paintLifts(c);
+    this.paintChanges(c);
     this.paintWords(c, seen);
+    this.paintCrane(c);
+  }
+
+  // The bridge as two lines across the yard, the camera as a box on them, the magnet as a ring: none to scale.
+  paintCrane(c) {
+    if (!this.crane) return;
+    const [px, py] = this.place(...this.crane.body_m);
+    c.lineWidth = 1.5;
+    c.strokeStyle = INK;
+    c.beginPath();
+    for (const side of [-5, 5]) { c.moveTo(px + side, 0); c.lineTo(px + side, this.height); }
+    c.stroke();
+    c.fillStyle = INK;
+    c.fillRect(px - 10, py - 7, 20, 14);
+    if (!this.crane.magnet_m) return;
+    const [mx, my] = this.place(...this.crane.magnet_m);
+    c.lineWidth = 4;
+    c.strokeStyle = "#f2f2f2";
+    c.beginPath(); c.arc(mx, my, 11, 0, 7); c.stroke();
+    c.lineWidth = 2;
+    c.strokeStyle = INK;
+    c.beginPath(); c.arc(mx, my, 11, 0, 7); c.moveTo(mx - 17, my); c.lineTo(mx + 17, my); c.moveTo(mx, my - 17); c.lineTo(mx, my + 17); c.stroke();
   }
 
   paintLayers(c) {
@@ -191,6 +214,20 @@ export class YardCanvas {
       c.lineWidth = 2; c.strokeStyle = "#fff";
       c.beginPath(); this.path(c, chosen); c.stroke();
     }
+  }
+
+  // Between two times: where a bundle lay that went or moved is dashed, one that came or moved has a wide line.
+  paintChanges(c) {
+    for (const change of this.data.changes || []) {
+      for (const [ends_m, dash, width] of [[change.from_ends_m, [9, 6], 2.5], [change.to_ends_m, [], 4]]) {
+        if (!ends_m) continue;
+        c.setLineDash(dash);
+        c.lineWidth = width;
+        c.strokeStyle = SELECT;
+        c.beginPath(); this.path(c, outline(ends_m, change.width_m)); c.stroke();
+      }
+    }
+    c.setLineDash([]);
   }
 
   hatch(c) {
@@ -330,6 +367,13 @@ export class YardCanvas {
   }
 
   label() { return t("yard.canvas", this.data.bundles.length); }
+}
+
+function outline([[ax, ay], [bx, by]], width_m) {
+  const length = Math.hypot(bx - ax, by - ay) || 1;
+  const nx = (-(by - ay) / length) * width_m / 2;
+  const ny = ((bx - ax) / length) * width_m / 2;
+  return { corners: [[ax + nx, ay + ny], [bx + nx, by + ny], [bx - nx, by - ny], [ax - nx, ay - ny]] };
 }
 
 // How strongly a place is drawn: whole up to ten minutes, a third after a day.

@@ -1,7 +1,7 @@
 // The page: header, screens by the address's hash, the stream of revisions.
 import { ageText, h, languageName, LANGUAGES, loadWords, setLanguage, show, t, tell } from "./dom.js";
-import { enter, forget, listen, logIn, read, session } from "./api.js";
-import { clockNow, yardScreen } from "./yard.js";
+import { enter, forget, listen, live, logIn, read, session } from "./api.js";
+import { clockNow, showCrane, yardScreen } from "./yard.js";
 import { adminScreen, alarmScreen, alarmText, bundleScreen, healthScreen, liftScreen, mark, priority, stockScreen, surveyScreen } from "./screens.js";
 import { timelineScreen } from "./timeline.js";
 
@@ -25,6 +25,7 @@ async function draw() {
     if (mine !== drawn) return;
     header(state, name);
     await SCREENS[name](place, argument);
+    document.body.dataset.shown = name;
     document.title = `${t(`nav.${name}`)} · Barsight`;
   } catch (error) {
     if (error.status === 401) logInScreen();
@@ -39,18 +40,28 @@ function header(state, name) {
   show(document.getElementById("header"),
     fact("header.server", isThere ? t("server.there") : t("server.away"), { id: "server" }),
     fact("header.age", state.survey ? ageText(clockNow(state) - state.survey.captured_to_ns) : "–", { id: "age" }),
+    live.crane && fact("crane", craneText(), { id: "crane", title: live.crane.reasons.join("; ") }),
     fact("header.map", state.survey ? state.survey.map_id : "–"),
     fact("header.lifts", `${state.offered} / ${state.claimed}`),
     state.survey?.is_simulated && fact("header.kind", t("simulated")),
-    h("div", { className: "grow" }),
-    top ? h("a", { className: `alarm p${priority(top)}`, href: "#alarms", id: "top-alarm" }, mark(top), h("span", {}, `${alarmText(top)} · ${t(`alarmstate.${top.state}`)}`)) : h("span", { className: "quiet" }, t("alarms.none")),
-    h("select", { id: "language", "aria-label": t("language"), onchange: (event) => { setLanguage(event.target.value); place.replaceChildren(); draw(); } },
-      LANGUAGES.map((each) => h("option", { value: each, selected: each === languageName() }, { en: "English", de: "Deutsch", zh: "中文" }[each]))));
+    h("div", { className: "last" },
+      top ? h("a", { className: `alarm p${priority(top)}`, href: "#alarms", id: "top-alarm", title: alarmText(top) }, mark(top), h("span", {}, `${alarmText(top)} · ${t(`alarmstate.${top.state}`)}`)) : h("span", { className: "quiet" }, t("alarms.none")),
+      h("select", { id: "language", "aria-label": t("language"), onchange: (event) => { setLanguage(event.target.value); nameSkip(); place.replaceChildren(); draw(); } },
+        LANGUAGES.map((each) => h("option", { value: each, selected: each === languageName() }, { en: "English", de: "Deutsch", zh: "中文" }[each])))));
   const nav = document.getElementById("nav");
   nav.setAttribute("aria-label", t("screens"));
   show(nav, Object.keys(SCREENS).map((each) => h("a", { href: `#${each}`, id: `nav-${each}`, "aria-current": each === name ? "page" : null }, t(`nav.${each}`), each === "alarms" && state.unacknowledged > 0 && h("span", { className: "count" }, `(${state.unacknowledged})`))));
-  document.getElementById("skip").textContent = t("skip");
 }
+
+const craneText = () => (live.crane.mode ? t(`livemode.${live.crane.mode}`) : t("crane.none"));
+
+function craneMoved() {
+  const shown = document.querySelector("#crane strong");
+  if (!shown || shown.textContent !== craneText()) draw();
+  showCrane();
+}
+
+const nameSkip = () => { document.getElementById("skip").textContent = t("skip"); };
 
 function logInScreen() {
   show(document.getElementById("header"), h("strong", {}, "Barsight"));
@@ -78,7 +89,7 @@ function start() {
   draw();
   if (isListening) return;
   isListening = true;
-  listen(() => { forget(); draw(); }, (there) => { if (there !== isThere) { isThere = there; document.body.dataset.there = there; forget(); if (there) enter().catch(() => {}).then(draw); else mark_away(); } });
+  listen(() => { forget(); draw(); }, (there) => { if (there !== isThere) { isThere = there; document.body.dataset.there = there; forget(); if (there) enter().catch(() => {}).then(draw); else mark_away(); } }, craneMoved);
 }
 
 function mark_away() {
@@ -95,4 +106,5 @@ setInterval(async () => {
 }, 5000);
 window.addEventListener("hashchange", () => draw().then(() => place.focus()));
 await loadWords();
+nameSkip();
 enter().then(start, logInScreen);

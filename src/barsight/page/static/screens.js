@@ -20,10 +20,15 @@ export async function bundleScreen(place, name) {
   const bundle = bundles.find((one) => one.identity === name);
   const told = await get(`/api/bundles/${encodeURIComponent(name)}`);
   const lift = bundle?.lift && lifts.find((one) => one.id === bundle.lift.id);
+  const pictures = told.history.filter((one) => !one.reason).slice(-6).reverse().map((one) => h("figure", {},
+    h("img", { className: "shot", src: `/api/bundles/${name}/pictures/${one.map_id}.png`, alt: t("picture", one.map_id), onerror: (event) => event.target.closest("figure").remove() }),
+    h("figcaption", { className: "small quiet" }, `${t("picture", one.map_id)} · ${timeText(one.at_ns)}`)));
   show(place,
-    h("section", {}, h("h1", {}, name), bundle ? figures(bundle, clockNow(state)) : h("p", {}, t("bundle.gone")),
-      h("h2", {}, t("stock.entry")), h("p", {}, bundle?.stock_name || t("stock.none"))),
-    bundle && h("section", {}, h("h1", {}, lift ? t("lift") : t("why.not")), lift ? liftPanel(lift) : whyNot(bundle, state.map_vetoes)),
+    h("div", { className: "two" },
+      h("section", {}, h("h1", {}, name), bundle ? figures(bundle, clockNow(state)) : h("p", {}, t("bundle.gone")),
+        h("h2", {}, t("stock.entry")), h("p", {}, bundle?.stock_name || t("stock.none"))),
+      h("div", {}, bundle && h("section", {}, h("h1", {}, lift ? t("lift") : t("why.not")), lift ? liftPanel(lift) : whyNot(bundle, state.map_vetoes)),
+        h("section", { id: "pictures" }, h("h1", {}, t("pictures")), pictures))),
     h("section", {}, h("h1", {}, t("history")), table([t("time"), t("what"), "#X m", "#Y m", `#${t("top")} m`, t("map")], [...told.history].reverse().map((one) => row([
       h("td", {}, timeText(one.at_ns)), h("td", {}, t(`change.${one.what}`), one.reason && h("div", { className: "quiet small" }, one.reason)), one.x_m?.toFixed(3) ?? "–", one.y_m?.toFixed(3) ?? "–", one.top_z_m?.toFixed(3) ?? "–",
       h("td", {}, one.map_id)])), t("history")),
@@ -38,7 +43,7 @@ export async function liftScreen(place) {
   const closed = lifts.filter((one) => !open.includes(one));
   show(place,
     h("section", {}, h("h1", {}, t("lifts.open")), open.length ? h("div", { className: "lifts" }, open.map((one) => h("div", { className: "panel", id: `lift-${one.id}` }, h("h2", {}, `${one.rank} · ${one.bundles.join(", ")}`), liftPanel(one)))) : h("p", {}, t("lifts.none"))),
-    h("section", {}, h("h1", {}, t("lifts.closed")), table([t("lift"), t("bundle"), t("state"), t("time"), t("who"), t("note"), ""], closed.map((one) => {
+    h("section", {}, h("h1", {}, t("lifts.closed")), table([t("lift"), t("bundle"), t("state"), t("time"), t("who"), t("note"), t("to.do")], closed.map((one) => {
       const step = one.steps[one.steps.length - 1];
       return row([h("td", {}, String(one.id)), h("td", {}, one.bundles.map((name) => h("a", { href: `#bundle/${name}` }, name))), h("td", {}, t(`lift.${one.state}`)), h("td", {}, timeText(step.at_ns)), h("td", {}, step.who), h("td", {}, step.note || ""), h("td", {}, liftButtons(one))]);
     }), t("lifts.closed"))));
@@ -57,7 +62,7 @@ export async function stockScreen(place) {
     h("td", {}, each.decision && [h("strong", {}, t(`stock.${each.decision.what}`)), h("div", { className: "small quiet" }, `${each.decision.who} · ${timeText(each.decision.at_ns)}${each.decision.note ? ` · ${each.decision.note}` : ""}`)]),
     h("td", {}, h("div", { className: "buttons" }, h("button", { id: `accept-${k}`, disabled: !may("operate"), onclick: () => decide(each, "accepted") }, t("stock.accept")), h("button", { id: `reject-${k}`, disabled: !may("operate"), onclick: () => decide(each, "rejected") }, t("stock.reject")))),
   ]));
-  show(place, h("section", {}, h("h1", {}, t("stock")), h("p", {}, t("stock.summary", stock.agree.length, stock.differences.length, stock.map_id)), table([t("stock.kind"), t("stock.name"), t("bundle"), t("what"), t("stock.decision"), ""], rows, t("stock"))));
+  show(place, h("section", {}, h("h1", {}, t("stock")), h("p", {}, t("stock.summary", stock.agree.length, stock.differences.length, stock.map_id)), h("p", { className: "quiet small" }, t("stock.help")), table([t("stock.kind"), t("stock.name"), t("bundle"), t("what"), t("stock.decision"), t("to.do")], rows, t("stock"))));
 }
 
 const PRIORITY = { "store-broken": 1, "calibration-changed": 1, "lift-failed": 2, "live-degraded": 2, "live-stopped": 2, "bundle-gone": 2, "bundle-moved": 3, "survey-files": 3 };
@@ -78,7 +83,7 @@ export async function alarmScreen(place) {
     ]);
   };
   const sorted = [...alarms].sort((a, b) => (a.state === "cleared") - (b.state === "cleared"));
-  const heads = [t("alarm"), t("state"), t("history"), ""];
+  const heads = [t("alarm"), t("state"), t("history"), t("to.do")];
   const open = sorted.filter((one) => one.state !== "cleared");
   show(place, h("section", {}, h("h1", {}, t("alarms.active", open.length)), open.length ? table(heads, open.map(line), t("alarms")) : h("p", {}, t("alarms.none")), h("p", { className: "quiet small" }, t("alarms.veto"))),
     h("section", {}, h("h1", {}, t("alarms.past")), table(heads, sorted.filter((one) => one.state === "cleared").slice(0, 100).map(line), t("alarms.past"))));
@@ -139,7 +144,7 @@ export async function adminScreen(place) {
   };
   const remove = async (one) => (await ask(t("admin.remove"), one.name, [], t("accept"))) && act("DELETE", `/api/accounts/${encodeURIComponent(one.name)}`, {}, "told.account");
   show(place, own, h("section", {}, h("h1", {}, t("accounts")), !accounts.length && h("p", {}, t("admin.open")),
-    table([t("name"), t("kind"), t("role"), ""], accounts.map((one) => row([h("td", {}, one.name), h("td", {}, t(`kind.${one.kind}`)), h("td", {}, t(`role.${one.role}`)), h("td", {}, h("button", { id: `remove-${one.name}`, onclick: () => remove(one) }, t("admin.remove")))])), t("accounts")),
+    table([t("name"), t("kind"), t("role"), t("to.do")], accounts.map((one) => row([h("td", {}, one.name), h("td", {}, t(`kind.${one.kind}`)), h("td", {}, t(`role.${one.role}`)), h("td", {}, h("button", { id: `remove-${one.name}`, onclick: () => remove(one) }, t("admin.remove")))])), t("accounts")),
     h("div", { className: "buttons" }, h("button", { id: "add-person", onclick: () => add("person") }, t("admin.add.person")), h("button", { id: "add-token", disabled: !accounts.length, onclick: () => add("token") }, t("admin.add.token")))),
   h("section", {}, h("h1", {}, t("forbid")), h("p", {}, t("forbid.text")), h("button", { id: "forbid", onclick: async () => {
     const given = await ask(t("forbid"), t("forbid.text"), [["code", t("veto.code"), { choices: ["calibration-changed", "disturbed", "trajectory-degraded", "units-doubtful"].map((code) => [code, vetoText(code)]) }], ["reason", t("reason")]], t("forbid"));

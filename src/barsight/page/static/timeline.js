@@ -27,7 +27,8 @@ function build(place, times) {
   };
   const [[before, first], [after, second]] = [slider("before", "timeline.before"), slider("after", "timeline.after")];
   stage = { canvas, side, texts, times, sliders: [before, after], view: new YardCanvas(canvas, () => {}) };
-  stage.root = h("div", { className: "yard" }, h("div", { className: "panel stage" }, second, first, h("div", { className: "canvas" }, canvas)), side);
+  stage.root = h("div", { className: "yard" }, h("div", { className: "panel stage" }, h("div", { className: "times" }, first, second), h("div", { className: "canvas" }, canvas),
+    h("div", { className: "legend" }, h("span", {}, h("i", { className: "swatch went" }), t("legend.went")), h("span", {}, h("i", { className: "swatch offer" }), t("legend.came")))), side);
   show(place, stage.root);
 }
 
@@ -39,7 +40,7 @@ async function refresh() {
   }
   const [yard, { changes }] = await Promise.all([get(`/api/yard?at_ns=${exact(wanted.after)}`), get(`/api/compare?before_ns=${exact(wanted.before)}&after_ns=${exact(wanted.after)}`)]);
   if (wanted.after !== chosen.after || wanted.before !== chosen.before) return;
-  stage.view.show({ ...yard, at_ns: exact(wanted.after), clock_ns: wanted.after, kind: "photo", lifts: [], revision: 0 }, null);
+  stage.view.show({ ...yard, at_ns: exact(wanted.after), clock_ns: wanted.after, kind: "photo", lifts: [], revision: 0, changes }, null);
   stage.canvas.setAttribute("aria-label", stage.view.label());
   const centre = (place) => (place ? `${place[0].toFixed(2)} / ${place[1].toFixed(2)}` : "–");
   show(stage.side, h("h1", {}, t("changes")), changes.length ? table([t("bundle"), t("what"), "#X / Y m", "#X / Y m"], changes.map((one) => row([

@@ -7,11 +7,15 @@ const direction = (from, to) => {
   return Math.abs(x) > Math.abs(y) ? (x > 0 ? "+X" : "-X") : y > 0 ? "+Y" : "-Y";
 };
 
-// For an open end: towards where it lies, on which axis of the crane.
+const BEYOND_M = 0.3; // so much more than the missing length, for the end to be in view
+
+// For an open end: towards where it lies, on which axis of the crane, and how far where bars alike tell.
 export function helpOf(code, bundle) {
   if (code === "end-open" && bundle.ends_open.some(Boolean)) {
     const ways = bundle.ends_open.map((open, k) => (open ? direction(bundle.axis_centre_m, bundle.ends_m[k]) : null)).filter(Boolean);
-    return ways.map((way) => t(way.endsWith("Y") ? "help.trolley" : "help.bridge", way)).join(" ");
+    const axis = (way) => (way.endsWith("Y") ? "help.trolley" : "help.bridge");
+    if (ways.length === 1 && bundle.unseen_m !== null) return t(`${axis(ways[0])}.by`, ways[0], (bundle.unseen_m + BEYOND_M).toFixed(1));
+    return ways.map((way) => t(axis(way), way)).join(" ");
   }
   return known(`help.${code}`) ? t(`help.${code}`) : "";
 }

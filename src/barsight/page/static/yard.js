@@ -1,6 +1,6 @@
 // Screen: the yard from above.
 import { OPEN_LIFTS, ask, h, metres, figure, show, t, ageText, tell, row, table } from "./dom.js";
-import { change, may, read, session } from "./api.js";
+import { change, live, may, read, session } from "./api.js";
 import { YardCanvas } from "./canvas.js";
 import { whyNot } from "./why.js";
 
@@ -39,14 +39,22 @@ function build(place) {
 
 const legend = () => h("div", { className: "legend" }, [["offer", "legend.offer"], ["taken", "legend.claimed"], ["veto", "legend.veto"],
   ["doubt", "legend.doubt"], ["blank", "legend.blank"]].map(([name, word]) => h("span", {}, h("i", { className: `swatch ${name}` }), t(word))),
-  h("span", {}, t("legend.age")));
+  live.crane && h("span", {}, h("i", { className: "swatch crane" }), t("legend.crane")), h("span", {}, t("legend.age")));
 
 function refresh() {
   const { known, view } = stage;
+  view.crane = live.crane?.place ?? null;
   view.show({ ...known, clock_ns: clockNow(known.state), kind }, chosen);
   stage.canvas.setAttribute("aria-label", view.label());
   show(stage.tools, stage.buttons());
   show(stage.side, sideOf(known));
+}
+
+// The crane moved: only the drawing changes.
+export function showCrane() {
+  if (!stage) return;
+  stage.view.crane = live.crane?.place ?? null;
+  stage.view.draw();
 }
 
 // The yard's clock goes on between two documents.

@@ -110,6 +110,10 @@ class BagRecording:
                 point = self._decoded(message).point
                 column.values.extend((point.x, point.y, point.z))
         for name, column in columns.items():
+            if name != names.laser and not column.stamps:
+                raise InputError(
+                    self._bag.path, f"{name} has no message, though the bag counts some", "copy the bag again"
+                )
             self._expect_increasing(name, column.stamp_ns())
         return columns
 

@@ -58,11 +58,11 @@ def make_bundle(
     """Make a bundle of the chosen reading, without its number, layer and what lies on it. others: all that
     were chosen.
     """
-    sheet, fit = reading.found.sheet, reading.found.fit
-    ends = [find_end(sheet, fit, step, settings) for step in (-1, 1)]
+    grid, fit = reading.found.grid, reading.found.fit
+    ends = [find_end(grid, fit, step, settings) for step in (-1, 1)]
     outline = make_outline(fit.rings, float(fit.values[DIAMETER]), float(fit.values[ROLL]), 0.0)
-    axis = np.array([_in_map(sheet, fit, end.v_m) for end in ends])
-    yaw = sheet.heading_rad - np.arctan(fit.values[SLOPE_U])
+    axis = np.array([_in_map(grid, fit, end.v_m) for end in ends])
+    yaw = grid.heading_rad - np.arctan(fit.values[SLOPE_U])
     pitch = np.arctan(fit.values[SLOPE_Z] / np.hypot(1, fit.values[SLOPE_U]))
     if not -np.pi / 2 < yaw <= np.pi / 2:
         yaw, pitch = yaw - np.pi * np.sign(yaw), -pitch
@@ -114,9 +114,9 @@ def make_bundle(
     return bundle if bars is not None else replace(bundle, sigma=irregular)
 
 
-def _in_map(sheet: AlignedMap, fit: Fit, v_m: float) -> Float64:
+def _in_map(grid: AlignedMap, fit: Fit, v_m: float) -> Float64:
     u, z = fit.at(v_m)
-    return np.append(sheet.to_map(np.array([[u, v_m]]))[0], z)
+    return np.append(grid.to_map(np.array([[u, v_m]]))[0], z)
 
 
 def _sigma(fit: Fit, ends: list[End], top: float, settings: BundleSettings) -> BundleSigma:

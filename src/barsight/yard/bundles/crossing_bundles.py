@@ -44,8 +44,8 @@ def crossing_pieces(
     Left out is what runs as most bundles do, which is found with these, and what a kept outline follows.
     """
     over, followed = (np.zeros(height_map.z_m.shape, np.uint8) for _ in range(2))
-    for sheet, fit in kept:
-        for cells, mask in zip(_cells_over(sheet, fit, settings, height_map), (over, followed), strict=True):
+    for grid, fit in kept:
+        for cells, mask in zip(_cells_over(grid, fit, settings, height_map), (over, followed), strict=True):
             mask[cells] = 1
     read = np.zeros(height_map.z_m.shape, bool)
     for row, column in _pieces(_level(height_map), over):
@@ -61,20 +61,20 @@ def crossing_pieces(
 
 
 def _cells_over(
-    sheet: AlignedMap, fit: Fit, settings: BundleSettings, height_map: HeightMap
+    grid: AlignedMap, fit: Fit, settings: BundleSettings, height_map: HeightMap
 ) -> tuple[tuple[Int64, Int64], tuple[Int64, Int64]]:
     """Select rows and columns of the map's cells over the outline or where it may go on, and of
     those on it.
     """
-    further = round(_FURTHER_M / sheet.cell_m)
-    rows = np.arange(max(fit.first - further, 0), min(fit.last + further + 1, sheet.z_m.shape[0]))
-    v = sheet.v0_m + sheet.cell_m * rows
-    across = np.arange(-0.5 * fit.width_m, 0.5 * fit.width_m, sheet.cell_m)
+    further = round(_FURTHER_M / grid.cell_m)
+    rows = np.arange(max(fit.first - further, 0), min(fit.last + further + 1, grid.z_m.shape[0]))
+    v = grid.v0_m + grid.cell_m * rows
+    across = np.arange(-0.5 * fit.width_m, 0.5 * fit.width_m, grid.cell_m)
     u = fit.values[U] + fit.values[SLOPE_U] * (v - fit.v_m)[:, None] + across
-    rise = rise_over(sheet, fit, rows, u, settings)
+    rise = rise_over(grid, fit, rows, u, settings)
 
     def cells(chosen: Bool) -> tuple[Int64, Int64]:
-        places = sheet.to_map(np.stack([u[chosen], np.broadcast_to(v[:, None], u.shape)[chosen]], axis=1))
+        places = grid.to_map(np.stack([u[chosen], np.broadcast_to(v[:, None], u.shape)[chosen]], axis=1))
         places = np.rint((places - (height_map.x0_m, height_map.y0_m)) / height_map.cell_m).astype(np.int64)
         rows, columns = height_map.z_m.shape
         return places[:, 1].clip(0, rows - 1), places[:, 0].clip(0, columns - 1)
@@ -82,23 +82,23 @@ def _cells_over(
     return cells(rise > OVER_M), cells(np.abs(rise) <= OVER_M)
 
 
-def rise_over(sheet: AlignedMap, fit: Fit, rows: Int64, u: Float64, settings: BundleSettings) -> Float64:
+def rise_over(grid: AlignedMap, fit: Fit, rows: Int64, u: Float64, settings: BundleSettings) -> Float64:
     """Sample heights (R, N) over the outline at rows (R,) and places across u (R, N); NaN where unknown."""
     outline = make_outline(
         fit.rings, float(fit.values[DIAMETER]), float(fit.values[ROLL]), settings.smoothing_m
     )
-    along = (sheet.v0_m + sheet.cell_m * rows - fit.v_m)[:, None]
+    along = (grid.v0_m + grid.cell_m * rows - fit.v_m)[:, None]
     beside = u - fit.values[U] - fit.values[SLOPE_U] * along
     place = np.rint((beside + outline.reach_m) / STEP_M).astype(int)
-    column = np.rint((u - sheet.u0_m) / sheet.cell_m).astype(int)
-    inside = (column >= 0) & (column < sheet.z_m.shape[1]) & (place >= 0) & (place < outline.seen_m.size)
-    z = sheet.z_m[rows[:, None], np.where(inside, column, 0)]
+    column = np.rint((u - grid.u0_m) / grid.cell_m).astype(int)
+    inside = (column >= 0) & (column < grid.z_m.shape[1]) & (place >= 0) & (place < outline.seen_m.size)
+    z = grid.z_m[rows[:, None], np.where(inside, column, 0)]
     height = outline.seen_m[np.where(inside, place, 0)]
     rise: Float64 = np.where(inside, z - fit.values[Z] - fit.values[SLOPE_Z] * along - height, np.nan)
     return rise
 
 
-def is_beam(sheet: AlignedMap, fit: Fit, settings: BundleSettings) -> bool:
+def is_beam(grid: AlignedMap, fit: Fit, settings: BundleSettings) -> bool:
     """Check whether the mean section is level to where it ends, not round: a flank leaves the outline, the
     middle is nearer to level than to the outline, or only bars thinner than any would make it so level. Where
     both flanks fall off as the outline does, the middle may be level: two bars side by side are.
@@ -107,10 +107,10 @@ def is_beam(sheet: AlignedMap, fit: Fit, settings: BundleSettings) -> bool:
         return True
     rows = np.flatnonzero(fit.state == AGREES)
     rows = rows[(rows >= fit.first) & (rows <= fit.last)]
-    across = np.arange(-_FLANK[1] * fit.width_m, _FLANK[1] * fit.width_m, sheet.cell_m / 2)
-    along = sheet.v0_m + sheet.cell_m * rows - fit.v_m
+    across = np.arange(-_FLANK[1] * fit.width_m, _FLANK[1] * fit.width_m, grid.cell_m / 2)
+    along = grid.v0_m + grid.cell_m * rows - fit.v_m
     u = fit.values[U] + fit.values[SLOPE_U] * along[:, None] + across
-    rise = rise_over(sheet, fit, rows, u, settings)
+    rise = rise_over(grid, fit, rows, u, settings)
     known = np.isfinite(rise).any(axis=0)
     section = np.full(across.size, np.nan)
     section[known] = np.nanmedian(rise[:, known], axis=0)

@@ -95,11 +95,11 @@ def _search(
         found += _found(height_map, heading, floor, templates, settings)
     places = [_claims(one, settings) for one in found]
     chosen = choose_readings(_weights(found), without_slivers(places, _SLIVER_RATIO))
-    kept = [(found[k].sheet, found[k].fit) for k in chosen]
+    kept = [(found[k].grid, found[k].fit) for k in chosen]
     close = replace(settings, slice_step_m=_CROSSING_STEP_M)
     for heading, part in crossing_pieces(height_map, kept, headings, settings):
         across = _found(part, heading, floor, templates, close)
-        found += [one for one in across if not is_beam(one.sheet, one.fit, settings)]
+        found += [one for one in across if not is_beam(one.grid, one.fit, settings)]
     places += [_claims(one, settings) for one in found[len(places) :]]
     readings = _settled(found, without_slivers(places, _SLIVER_RATIO), height_map, settings)
     chosen_ones = [reading.found for reading in readings]
@@ -112,11 +112,9 @@ def _found(
     height_map: HeightMap, heading: float, floor: float | None, templates: Templates, settings: BundleSettings
 ) -> list[FittedOutline]:
     """Find every outline that runs about as `heading` does."""
-    sheet = align_map(height_map, heading, -np.inf if floor is None else floor + settings.min_rise_m)
+    grid = align_map(height_map, heading, -np.inf if floor is None else floor + settings.min_rise_m)
     return [
-        FittedOutline(sheet, fit)
-        for fit in _readings(sheet, templates, settings)
-        if _on(floor, fit, settings)
+        FittedOutline(grid, fit) for fit in _readings(grid, templates, settings) if _on(floor, fit, settings)
     ]
 
 
@@ -141,7 +139,7 @@ def _settled(
     best = (found[k] for k in chosen)
     kept = list(ordered_map(lambda one: refit_with_packing(one, height_map, settings), best))
     smoothed = replace(settings, smoothing_m=estimate_smoothing(kept, settings))
-    again = ordered_map(lambda one: refine_outline(one.sheet, one.fit, smoothed) or one.fit, kept)
+    again = ordered_map(lambda one: refine_outline(one.grid, one.fit, smoothed) or one.fit, kept)
     kept = [replace(one, fit=fit) for one, fit in zip(kept, again, strict=True)]
     resolved = 0.0 if settings.catalogue_mm else _RESOLVED_CELLS * height_map.cell_m
     readings = []
@@ -158,7 +156,7 @@ def _settled(
         packing = None if one.shades is not None else one.doubt if other is None else other
         readings.append(Reading(final, float(raised[k]), against, weight, packing))
     packs = ordered_map(
-        lambda reading: strapped_pack(height_map, reading.found.sheet, reading.found.fit), readings
+        lambda reading: strapped_pack(height_map, reading.found.grid, reading.found.fit), readings
     )
     seen = [replace(reading, pack=pack).with_flanks() for reading, pack in zip(readings, packs, strict=True)]
     return [reading for reading in seen if reading.flanks is None or not reading.flanks.are_flat]
@@ -169,7 +167,7 @@ def _finished(one: FittedOutline, kept: list[Fit], settings: BundleSettings) -> 
     fit = one.fit
     common = common_diameter(fit, kept)
     if common is not None and not settings.catalogue_mm:
-        fit = refine_outline(one.sheet, fit, settings, common=common) or fit
+        fit = refine_outline(one.grid, fit, settings, common=common) or fit
     return replace(one, fit=widen_fit(fit, settings))
 
 
@@ -185,35 +183,33 @@ def _on(floor_m: float | None, fit: Fit, settings: BundleSettings) -> bool:
     return middle - half > -min(_SUNKEN_M, _SUNKEN_RATIO * fit.width_m)
 
 
-def _readings(sheet: AlignedMap, templates: Templates, settings: BundleSettings) -> list[Fit]:
+def _readings(grid: AlignedMap, templates: Templates, settings: BundleSettings) -> list[Fit]:
     """Grow every outline that reaches at least the least length."""
     fits: list[Fit] = []
-    rows = sheet.z_m.shape[0]
-    step = max(round(settings.slice_step_m / sheet.cell_m), 1)
-    known = np.flatnonzero(np.isfinite(sheet.z_m).any(axis=1))
+    rows = grid.z_m.shape[0]
+    step = max(round(settings.slice_step_m / grid.cell_m), 1)
+    known = np.flatnonzero(np.isfinite(grid.z_m).any(axis=1))
     if known.size == 0:
         return []
     for row in range(int(known[0]) + min(step, known.size) // 2, int(known[-1]) + 1, step):
-        v = sheet.v0_m + row * sheet.cell_m
-        candidates = _worth_growing(propose_candidates(sheet, templates, v, settings))
+        v = grid.v0_m + row * grid.cell_m
+        candidates = _worth_growing(propose_candidates(grid, templates, v, settings))
         taken = _taken(fits, row, v)
         fresh = [one for one in candidates if not _is_taken(one, taken)]
-        seeds = (_seed(one, row, rows, sheet, settings) for one in fresh)
-        grown = ordered_map(lambda seed: grow_outline(sheet, seed, settings), seeds)
+        seeds = (_seed(one, row, rows, grid, settings) for one in fresh)
+        grown = ordered_map(lambda seed: grow_outline(grid, seed, settings), seeds)
         for one, fit in zip(fresh, grown, strict=True):
             if fit is None or _is_taken(one, taken):
                 continue
-            if (fit.last - fit.first + 1) * sheet.cell_m >= settings.min_length_m:
+            if (fit.last - fit.first + 1) * grid.cell_m >= settings.min_length_m:
                 fits.append(fit)
                 for rings, places in _taken([fit], row, v).items():
                     taken.setdefault(rings, []).extend(places)
     return fits
 
 
-def _seed(
-    candidate: BundleCandidate, row: int, rows: int, sheet: AlignedMap, settings: BundleSettings
-) -> Fit:
-    half = max(round(settings.slice_m / sheet.cell_m / 2), 1)
+def _seed(candidate: BundleCandidate, row: int, rows: int, grid: AlignedMap, settings: BundleSettings) -> Fit:
+    half = max(round(settings.slice_m / grid.cell_m / 2), 1)
     first, last = max(row - half, 0), min(row + half, rows - 1)
     values = np.array([candidate.u_m, 0.0, candidate.z_m, 0.0, candidate.roll_rad, candidate.diameter_m])
     state, gain = np.zeros(rows, np.uint8), np.zeros(rows, np.float32)
@@ -283,14 +279,14 @@ def _weight(fit: Fit) -> float:
 
 def _claims(reading: FittedOutline, settings: BundleSettings) -> Int64:
     """Number the map's patches of 20 mm that lie well inside the outline and near it in height."""
-    sheet, fit = reading.sheet, reading.fit
+    grid, fit = reading.grid, reading.fit
     rows = np.arange(fit.first, fit.last + 1)
     rows = rows[fit.state[rows] == AGREES]
-    v = sheet.v0_m + sheet.cell_m * rows
+    v = grid.v0_m + grid.cell_m * rows
     middle = fit.values[U] + fit.values[1] * (v - fit.v_m)
     across = np.linspace(-0.35, 0.35, max(int(fit.width_m / 0.02), 3)) * fit.width_m
     u = middle[:, None] + across
-    own = np.abs(rise_over(sheet, fit, rows, u, settings)) < OVER_M
-    xy = sheet.to_map(np.stack([u[own], np.broadcast_to(v[:, None], u.shape)[own]], axis=1))
+    own = np.abs(rise_over(grid, fit, rows, u, settings)) < OVER_M
+    xy = grid.to_map(np.stack([u[own], np.broadcast_to(v[:, None], u.shape)[own]], axis=1))
     patch = np.floor(xy / _CLAIM_M).astype(np.int64) + (1 << 20)
     return np.unique(patch[:, 0] << 32 | patch[:, 1])

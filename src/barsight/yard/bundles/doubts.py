@@ -55,7 +55,7 @@ def list_doubts(reading: Reading, rows: UInt8, ends: list[End], settings: Bundle
     if known < _SURE_KNOWN:
         out.append(f"only {100 * known:.0f} % of its length was measured")
     crossed = _runs(rows == ABOVE)
-    cell = reading.found.sheet.cell_m
+    cell = reading.found.grid.cell_m
     narrow = _places(
         [run for run in crossed if cell < (run[1] - run[0]) * cell <= _NARROW_M], reading, settings
     )
@@ -81,15 +81,15 @@ def list_doubts(reading: Reading, rows: UInt8, ends: list[End], settings: Bundle
 
 def _places(runs: list[tuple[int, int]], reading: Reading, settings: BundleSettings) -> int:
     """Count the places at which runs of rows lie over an outline; none where all are so low that noise is."""
-    sheet, fit = reading.found.sheet, reading.found.fit
+    grid, fit = reading.found.grid, reading.found.fit
     across = np.linspace(-0.35, 0.35, 15) * fit.width_m
     places, highest, last = 0, 0.0, -np.inf
     for first, end in runs:
         rows = np.arange(first, end) + fit.first
-        along = sheet.v0_m + sheet.cell_m * rows - fit.v_m
+        along = grid.v0_m + grid.cell_m * rows - fit.v_m
         u = fit.values[U] + fit.values[SLOPE_U] * along[:, None] + across
-        highest = max(highest, float(np.nanmedian(rise_over(sheet, fit, rows, u, settings))))
-        places += (first - last) * sheet.cell_m > _ONE_PLACE_M
+        highest = max(highest, float(np.nanmedian(rise_over(grid, fit, rows, u, settings))))
+        places += (first - last) * grid.cell_m > _ONE_PLACE_M
         last = end
     return places if highest > _LIES_M else 0
 
@@ -112,22 +112,22 @@ def measure_laid(reading: Reading) -> float:
     Heights are taken over the bundle's own section, the median along it at each place across. A thing is a
     patch that everywhere holds a square of _LAID_SIZE_M and rises by _LAID_M.
     """
-    sheet, fit, pack = reading.found.sheet, reading.found.fit, reading.pack
+    grid, fit, pack = reading.found.grid, reading.found.fit, reading.pack
     low, high = -fit.width_m / 2, fit.width_m / 2
     if pack is not None and pack.is_bounded:
         low, high = pack.low_m, pack.high_m
-    rim = round(_BEFORE_END_M / sheet.cell_m)
+    rim = round(_BEFORE_END_M / grid.cell_m)
     rows = np.arange(fit.first + rim, fit.last + 1 - rim)
-    along = sheet.v0_m + sheet.cell_m * rows - fit.v_m
-    beside = np.arange(low, high + sheet.cell_m / 2, sheet.cell_m)
+    along = grid.v0_m + grid.cell_m * rows - fit.v_m
+    beside = np.arange(low, high + grid.cell_m / 2, grid.cell_m)
     column = np.rint(
-        (fit.values[U] + fit.values[SLOPE_U] * along[:, None] + beside - sheet.u0_m) / sheet.cell_m
+        (fit.values[U] + fit.values[SLOPE_U] * along[:, None] + beside - grid.u0_m) / grid.cell_m
     )
-    inside = (column >= 0) & (column < sheet.z_m.shape[1])
-    z = sheet.z_m[rows[:, None], np.where(inside, column, 0).astype(np.int64)]
+    inside = (column >= 0) & (column < grid.z_m.shape[1])
+    z = grid.z_m[rows[:, None], np.where(inside, column, 0).astype(np.int64)]
     z = np.where(inside, z - fit.values[SLOPE_Z] * along[:, None], np.nan)
     rise = np.where(np.isfinite(z), z - known_median(z), -np.inf)
-    size = [max(round(side / sheet.cell_m), 1) for side in _LAID_SIZE_M]
+    size = [max(round(side / grid.cell_m), 1) for side in _LAID_SIZE_M]
     laid = ndimage.binary_opening(rise > _LAID_M, np.ones(size, bool))
     return float(rise[laid].max(initial=0.0))
 

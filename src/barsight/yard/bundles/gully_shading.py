@@ -167,7 +167,7 @@ def refit_with_packing(
     found: FittedOutline, height_map: HeightMap, settings: BundleSettings
 ) -> FittedOutline:
     """Fit again with the packing that the shades show, where they show one surely."""
-    shades = shade_profile(height_map, found.sheet, found.fit)
+    shades = shade_profile(height_map, found.grid, found.fit)
     if shades is None:
         return found
     fit = found.fit
@@ -178,11 +178,11 @@ def refit_with_packing(
     if packing.rings != fit.rings:
         values = fit.values.copy()
         values[DIAMETER], values[ROLL] = packing.diameter_m, packing.roll_rad
-        again = refine_outline(found.sheet, replace(fit, rings=packing.rings, values=values), settings)
+        again = refine_outline(found.grid, replace(fit, rings=packing.rings, values=values), settings)
         if again is None:
             return found
         fit = again
-    return FittedOutline(found.sheet, fit, shades)
+    return FittedOutline(found.grid, fit, shades)
 
 
 def _visible(rings: int, diameter_m: float, roll_rad: float) -> int:
@@ -203,7 +203,7 @@ def estimate_smoothing(found: list[FittedOutline], settings: BundleSettings) -> 
     known = known[:: 1 + len(known) // _MAX_SMOOTHED]
     misfits = []
     for one in known:
-        tried = [refine_outline(one.sheet, one.fit, replace(settings, smoothing_m=s)) for s in _SMOOTHINGS_M]
+        tried = [refine_outline(one.grid, one.fit, replace(settings, smoothing_m=s)) for s in _SMOOTHINGS_M]
         rms = np.array([np.nan if fit is None else fit.rms_m for fit in tried])
         misfits.append((rms / np.nanmin(rms)) ** 2)
     if not misfits:

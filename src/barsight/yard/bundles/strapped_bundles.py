@@ -63,7 +63,7 @@ def _as_pack(
     top_z = float(bundle.centre_m[2]) + pack.top_m + _CREST_M
     section, section_sigma = section_of_pack(pack.width_m, _over(top_z, floor_m))
     aside = pack.middle_m * np.array([np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad), 0.0])
-    if abs(bundle.yaw_rad - reading.found.sheet.heading_rad + np.arctan(fit.values[SLOPE_U])) > 1.0:
+    if abs(bundle.yaw_rad - reading.found.grid.heading_rad + np.arctan(fit.values[SLOPE_U])) > 1.0:
         aside = -aside
     down = np.array([0.0, 0.0, pack.top_m - pack.width_m / 2])
     diameter = pack.diameter_m if pack.diameter_m > 0 else bundle.bar_diameter_m

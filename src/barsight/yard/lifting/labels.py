@@ -10,11 +10,15 @@ from scipy import ndimage
 from barsight.core.arrays import Bool, Float32, Float64
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
+from barsight.yard.plates import STEP_M, plate_masks
 from barsight.yard.stability.stability import nearest_cells
 from barsight.yard.types import HeightMap
 from barsight.yard.vetoes import Check, check_true
 
-STEP_M = 0.01
+SIZE_M = (0.1, 0.06)
+"""A usual label; one with a code is too dark in its middle for `mark_labels`."""
+BESIDE_M = 0.15
+"""So far beside what lies under the faces the shape of a label may reach."""
 LENGTH_CELLS, WIDTH_CELLS, APART_CELLS = 5, 3, 5
 """Steps that a label fills along the bars and across, and from its middle to the bare bar on both sides: a
 label ends at once, a gleam fades."""
@@ -53,8 +57,13 @@ def find_label(place: Placement, heights: HeightMap, magnet: Magnet) -> tuple[fl
     long = LENGTH_CELLS * STEP_M / 2 + float(np.abs(place.along) @ slack) + turned * wide
     broad = WIDTH_CELLS * STEP_M / 2 + float(np.abs(place.across) @ slack) + turned * magnet.half_span_m
     reach_v = magnet.half_span_m + long + (APART_CELLS + LENGTH_CELLS) * STEP_M
-    v, u = _steps(reach_v), _steps(wide + broad + STEP_M)
-    bright = mark_labels(_gray(place, heights, v, u))
+    v, u = _steps(reach_v + BESIDE_M), _steps(wide + broad + STEP_M + BESIDE_M)
+    gray, z_m = _look_up(place, heights, v, u)
+    bright = np.zeros(gray.shape, np.bool_)
+    near = np.ix_(np.abs(v) < reach_v + STEP_M, np.abs(u) < wide + broad + 2 * STEP_M)
+    bright[near] = mark_labels(gray[near])
+    for mask in plate_masks(gray, z_m, SIZE_M):
+        bright |= mask
     under = np.zeros(bright.shape, np.bool_)
     for along, across, length, width in poles:
         rows = np.abs(v - along) <= length / 2 + long
@@ -87,10 +96,11 @@ def mark_labels(gray: Float32) -> Bool:
     return np.asarray((mean > MEAN_LOG) & sure & (level > needed))
 
 
-def _gray(place: Placement, heights: HeightMap, v: Float64, u: Float64) -> Float32:
-    """Look up gray levels (V, U) at places along and across; 0 where nothing was seen."""
+def _look_up(place: Placement, heights: HeightMap, v: Float64, u: Float64) -> tuple[Float32, Float32]:
+    """Look up gray levels and heights (V, U) at places along and across; 0 and NaN where nothing was seen."""
     x = place.x_m + v[:, None] * place.along[0] + u * place.across[0]
     y = place.y_m + v[:, None] * place.along[1] + u * place.across[1]
     column, row, inside = nearest_cells(heights, x, y)
     assert heights.gray is not None
-    return np.asarray(np.where(inside, heights.gray[row, column], 0), np.float32)
+    gray = np.where(inside, heights.gray[row, column], 0)
+    return gray.astype(np.float32), np.where(inside, heights.z_m[row, column], np.float32(np.nan))

@@ -41,24 +41,24 @@ def fit_bars(found: FittedOutline, settings: BundleSettings) -> tuple[Bar, ...]:
     The bundle's fit is one of all its cylinders at once: a bar's figures and their covariance follow from the
     bundle's place, slopes, roll and diameter. Fitted one by one, smoothed heights move bars by 4 mm.
     """
-    sheet, fit = found.sheet, found.fit
+    grid, fit = found.grid, found.fit
     diameter = float(fit.values[DIAMETER])
-    if diameter < _RESOLVED_CELLS * sheet.cell_m and found.shades is None:
+    if diameter < _RESOLVED_CELLS * grid.cell_m and found.shades is None:
         return ()
     rows = np.flatnonzero(fit.state == AGREES)
     rows = rows[(rows >= fit.first) & (rows <= fit.last)]
     if rows.size == 0:
         return ()
-    ends = sheet.v0_m + sheet.cell_m * rows[[0, -1]]
+    ends = grid.v0_m + grid.cell_m * rows[[0, -1]]
     middle = float(ends.mean())
     u, z = fit.at(middle)
     axes = turned_hexagon(fit.rings, diameter, float(fit.values[ROLL]))
-    flat = sheet.to_map(np.array([[fit.values[SLOPE_U], 1.0]]))[0]
+    flat = grid.to_map(np.array([[fit.values[SLOPE_U], 1.0]]))[0]
     direction = np.append(flat, fit.values[SLOPE_Z])
     direction = direction / np.linalg.norm(direction) * (1.0 if flat[1] >= 0 else -1.0)
     return tuple(
         Bar(
-            centre_m=np.append(sheet.to_map(np.array([[u + side, middle]]))[0], z + up),
+            centre_m=np.append(grid.to_map(np.array([[u + side, middle]]))[0], z + up),
             direction=direction,
             diameter_m=diameter,
             length_m=float(np.ptp(ends)),

@@ -37,7 +37,7 @@ class End:
     why: str = ""
 
 
-def find_end(sheet: AlignedMap, fit: Fit, step: int, settings: BundleSettings) -> End:
+def find_end(grid: AlignedMap, fit: Fit, step: int, settings: BundleSettings) -> End:
     """Find the end at the fit's first (step -1) or last row (step 1).
 
     It is seen where, over most of the bundle's width and for 0.1 m, the surface beyond lies lower than half
@@ -45,9 +45,9 @@ def find_end(sheet: AlignedMap, fit: Fit, step: int, settings: BundleSettings) -
     agrees to the last that lies little lower, less what a map grows over ends.
     """
     row = fit.first if step < 0 else fit.last
-    known, misfit = _beyond(sheet, fit, row, step, settings)
-    cell = sheet.cell_m
-    v = sheet.v0_m + cell * (row + step / 2)
+    known, misfit = _beyond(grid, fit, row, step, settings)
+    cell = grid.cell_m
+    v = grid.v0_m + cell * (row + step / 2)
     deep = -0.5 * fit.width_m
     ragged = lower = 0
     for k in range(known.size):
@@ -64,7 +64,7 @@ def find_end(sheet: AlignedMap, fit: Fit, step: int, settings: BundleSettings) -
             if lower * cell >= _PROOF_M:
                 spread = ragged * cell
                 end = v + step * (spread / 4 - _GROWTH_CELLS * cell)
-                uneven = _unevenness(sheet, fit, row, step, settings)
+                uneven = _unevenness(grid, fit, row, step, settings)
                 return End(
                     end,
                     float(np.linalg.norm([_SEEN_SIGMA_M, _SEEN_SIGMAS * fit.sigma_m, spread / 6, uneven])),
@@ -73,45 +73,45 @@ def find_end(sheet: AlignedMap, fit: Fit, step: int, settings: BundleSettings) -
     return End(v, float("nan"), True, "the map doesn't show what lies beyond")
 
 
-def _unevenness(sheet: AlignedMap, fit: Fit, row: int, step: int, settings: BundleSettings) -> float:
+def _unevenness(grid: AlignedMap, fit: Fit, row: int, step: int, settings: BundleSettings) -> float:
     """Estimate the sigma (m) of the middle of the visible bars' ends from how far apart they are."""
-    first, last = (round(reach / sheet.cell_m) for reach in _UNEVEN_M)
+    first, last = (round(reach / grid.cell_m) for reach in _UNEVEN_M)
     rows = row + step * np.arange(first, last + 1)
-    rows = rows[(rows >= 0) & (rows < sheet.z_m.shape[0])]
-    follows = np.abs(_over(sheet, fit, rows, settings)) < _ENDS_M
+    rows = rows[(rows >= 0) & (rows < grid.z_m.shape[0])]
+    follows = np.abs(_over(grid, fit, rows, settings)) < _ENDS_M
     ends = rows.size - 1 - follows[::-1].argmax(axis=0)[follows.any(axis=0)]
     if ends.size == 0:
         return _RAGGED_M
-    spread = sheet.cell_m * float(np.subtract(*np.percentile(ends, [84, 16]))) / 2
+    spread = grid.cell_m * float(np.subtract(*np.percentile(ends, [84, 16]))) / 2
     return float(1.25 * spread / np.sqrt(max(len(visible_bars(fit)), 1)))
 
 
 def _beyond(
-    sheet: AlignedMap, fit: Fit, row: int, step: int, settings: BundleSettings
+    grid: AlignedMap, fit: Fit, row: int, step: int, settings: BundleSettings
 ) -> tuple[Float64, Float64]:
     """Measure for each row beyond: the fraction of the outline that is known, and the median height
     over it.
     """
-    rows = row + step * np.arange(1, int(_LOOK_M / sheet.cell_m) + 1)
-    rows = rows[(rows >= 0) & (rows < sheet.z_m.shape[0])]
-    over = _over(sheet, fit, rows, settings)
+    rows = row + step * np.arange(1, int(_LOOK_M / grid.cell_m) + 1)
+    rows = rows[(rows >= 0) & (rows < grid.z_m.shape[0])]
+    over = _over(grid, fit, rows, settings)
     known = np.isfinite(over).mean(axis=1)
     misfit = np.full(rows.size, np.nan)
     misfit[known > 0] = np.nanmedian(over[known > 0], axis=1)
     return known, misfit
 
 
-def _over(sheet: AlignedMap, fit: Fit, rows: Int64, settings: BundleSettings) -> Float64:
+def _over(grid: AlignedMap, fit: Fit, rows: Int64, settings: BundleSettings) -> Float64:
     """Sample measured heights (rows, N) over the outline across most of its width; NaN where unknown."""
     outline = make_outline(
         fit.rings, float(fit.values[DIAMETER]), float(fit.values[ROLL]), settings.smoothing_m
     )
-    across = np.arange(-0.4 * fit.width_m, 0.4 * fit.width_m, sheet.cell_m)
+    across = np.arange(-0.4 * fit.width_m, 0.4 * fit.width_m, grid.cell_m)
     height = outline.seen_m[np.rint((across + outline.reach_m) / STEP_M).astype(int).clip(0, None)]
-    along = sheet.v0_m + sheet.cell_m * rows - fit.v_m
+    along = grid.v0_m + grid.cell_m * rows - fit.v_m
     u = fit.values[0] + fit.values[SLOPE_U] * along[:, None] + across
-    columns = np.rint((u - sheet.u0_m) / sheet.cell_m).astype(int)
-    inside = (columns >= 0) & (columns < sheet.z_m.shape[1])
-    z = np.where(inside, sheet.z_m[rows[:, None], columns.clip(0, sheet.z_m.shape[1] - 1)], np.nan)
+    columns = np.rint((u - grid.u0_m) / grid.cell_m).astype(int)
+    inside = (columns >= 0) & (columns < grid.z_m.shape[1])
+    z = np.where(inside, grid.z_m[rows[:, None], columns.clip(0, grid.z_m.shape[1] - 1)], np.nan)
     over: Float64 = z - (fit.values[2] + fit.values[SLOPE_Z] * along)[:, None] - height
     return over

@@ -19,7 +19,7 @@ _MIN_SCATTER = 0.04
 
 
 class Heights(NamedTuple):
-    """The sheet's heights and sigmas (rows, columns), and the rows that count: first, last, stride, the
+    """The grid's heights and sigmas (rows, columns), and the rows that count: first, last, stride, the
     middle's place.
     """
 

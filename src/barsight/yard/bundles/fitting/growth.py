@@ -31,20 +31,20 @@ _MAX_MIXED_M = 0.2
 _MAX_UNKNOWN_M = 0.6
 
 
-def extend_rows(sheet: AlignedMap, fit: Fit, settings: BundleSettings, reach_m: float) -> Fit | None:
+def extend_rows(grid: AlignedMap, fit: Fit, settings: BundleSettings, reach_m: float) -> Fit | None:
     """Find how far the outline follows the map from the fit's rows on, at most reach_m further to either
     side.
     """
     outline = make_outline(
         fit.rings, float(fit.values[DIAMETER]), float(fit.values[ROLL]), settings.smoothing_m
     )
-    more = int(reach_m / sheet.cell_m)
-    bounds = max(fit.first - more, 0), min(fit.last + more, sheet.z_m.shape[0] - 1)
-    heights = Heights(sheet.z_m, sheet.sigma_m, sheet.u0_m, sheet.v0_m, sheet.cell_m, *bounds, 1, fit.v_m)
+    more = int(reach_m / grid.cell_m)
+    bounds = max(fit.first - more, 0), min(fit.last + more, grid.z_m.shape[0] - 1)
+    heights = Heights(grid.z_m, grid.sigma_m, grid.u0_m, grid.v0_m, grid.cell_m, *bounds, 1, fit.v_m)
     state, gain = _row_states(
         heights, fit.values, outline.seen_m, outline.slope, outline.reach_m, settings.agreement_m
     )
-    runs = np.array([_MAX_UNKNOWN_M, 0.0, _MAX_ABOVE_M, _MAX_BELOW_M, _MAX_MIXED_M]) / sheet.cell_m
+    runs = np.array([_MAX_UNKNOWN_M, 0.0, _MAX_ABOVE_M, _MAX_BELOW_M, _MAX_MIXED_M]) / grid.cell_m
     agreeing = np.flatnonzero(state[fit.first : fit.last + 1] == AGREES)
     if agreeing.size < 0.5 * (fit.last + 1 - fit.first):
         return None
@@ -84,7 +84,7 @@ def _row_states(
     """Classify each row and count the cells it explains, over the parts of the outline that aren't steep.
 
     values: (6,) of the fit. seen, slope: of the outline at -reach ... reach, m. agreement: m. Returns state
-    and gain of all the sheet's rows, 0 outside of first ... last.
+    and gain of all the grid's rows, 0 outside of first ... last.
     """
     z, cell, u0 = heights.z_m, heights.cell_m, heights.u0_m
     rows, columns = z.shape
@@ -129,24 +129,24 @@ def _row_states(
     return state, gain
 
 
-def grow_outline(sheet: AlignedMap, seed: Fit, settings: BundleSettings) -> Fit | None:
+def grow_outline(grid: AlignedMap, seed: Fit, settings: BundleSettings) -> Fit | None:
     """Grow a short piece to the whole bundle: fit, follow, fit again until both ends stand still."""
-    fit = refine_outline(sheet, seed, settings, steps=8, gate_m=3 * settings.agreement_m)
+    fit = refine_outline(grid, seed, settings, steps=8, gate_m=3 * settings.agreement_m)
     if fit is None:
         return None
     reach = 0.4
     limit = np.tan(np.radians(settings.max_skew_deg) * 1.5)
     for _ in range(12):
-        longer = extend_rows(sheet, fit, settings, reach)
+        longer = extend_rows(grid, fit, settings, reach)
         if longer is None:
             return None
         settled = longer.first == fit.first and longer.last == fit.last
-        refined = refine_outline(sheet, longer, settings, steps=6 if settled else 3)
+        refined = refine_outline(grid, longer, settings, steps=6 if settled else 3)
         if refined is None or abs(refined.values[SLOPE_U]) > limit:
             return None
         fit = refined
-        if settled and reach >= sheet.z_m.shape[0] * sheet.cell_m:
-            return extend_rows(sheet, fit, settings, 0.05)
+        if settled and reach >= grid.z_m.shape[0] * grid.cell_m:
+            return extend_rows(grid, fit, settings, 0.05)
         reach = reach * 2 if not settled else np.inf if reach > 1.5 else reach * 2
-        reach = min(reach, sheet.z_m.shape[0] * sheet.cell_m)
-    return extend_rows(sheet, fit, settings, 0.05)
+        reach = min(reach, grid.z_m.shape[0] * grid.cell_m)
+    return extend_rows(grid, fit, settings, 0.05)

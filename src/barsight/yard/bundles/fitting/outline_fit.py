@@ -22,9 +22,9 @@ _ROWS_ENOUGH = 150
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """An outline that follows the map from row `first` to row `last` of its sheet.
+    """An outline that follows the map from row `first` to row `last` of its grid.
 
-    values: (6,) at v_m, see U ... DIAMETER; covariance: (6, 6). state: (rows,) of the whole sheet. gain:
+    values: (6,) at v_m, see U ... DIAMETER; covariance: (6, 6). state: (rows,) of the whole grid. gain:
     (rows,) cells explained, 0 where the row doesn't agree. rms_m: of the heights about the outline.
     """
 
@@ -65,20 +65,20 @@ class ShadeProfile:
 
 @dataclass(frozen=True, eq=False)
 class FittedOutline:
-    """A fitted outline and the sheet that its figures belong to.
+    """A fitted outline and the grid that its figures belong to.
 
     shades: what the pictures show of its bars, where they settle the packing. doubt: rings of another packing
     that the pictures would rather have, where they don't settle it.
     """
 
-    sheet: AlignedMap
+    grid: AlignedMap
     fit: Fit
     shades: ShadeProfile | None = None
     doubt: int | None = None
 
 
 def refine_outline(
-    sheet: AlignedMap,
+    grid: AlignedMap,
     start: Fit,
     settings: BundleSettings,
     steps: int = 6,
@@ -90,23 +90,23 @@ def refine_outline(
     The weight of a height falls with its sigma, with the outline's slope (it may lie beside its place) and,
     by Tukey's biweight, with its misfit over `gate_m`. common: diameter and sigma known from elsewhere.
     """
-    rows = (max(start.first, 0), min(start.last, sheet.z_m.shape[0] - 1))
-    v_m = sheet.v0_m + sheet.cell_m * (rows[0] + rows[1]) / 2
+    rows = (max(start.first, 0), min(start.last, grid.z_m.shape[0] - 1))
+    v_m = grid.v0_m + grid.cell_m * (rows[0] + rows[1]) / 2
     values = start.values.copy()
     values[U], values[Z] = start.at(v_m)
     free = np.ones(6, bool)
     free[ROLL] = start.rings > 0
     if settings.catalogue_mm:
         free[DIAMETER] = False
-    half = (rows[1] - rows[0]) * sheet.cell_m / 2
+    half = (rows[1] - rows[0]) * grid.cell_m / 2
     free[SLOPE_U] = free[SLOPE_Z] = half > 2 * settings.slice_m
     stride = 1 + (rows[1] - rows[0]) // _ROWS_ENOUGH
-    alike = settings.correlated_along_m * settings.correlated_across_m / sheet.cell_m**2 / stride
+    alike = settings.correlated_along_m * settings.correlated_across_m / grid.cell_m**2 / stride
     width_ratio = bundle_width(start.rings, 1.0)
     narrowest = settings.min_width_m if start.rings else settings.min_single_diameter_m
     held, values, normal, moments, alike = fit_outline(
         Heights(
-            sheet.z_m, sheet.sigma_m, sheet.u0_m, sheet.v0_m, sheet.cell_m, rows[0], rows[1], stride, v_m
+            grid.z_m, grid.sigma_m, grid.u0_m, grid.v0_m, grid.cell_m, rows[0], rows[1], stride, v_m
         ),
         values,
         Rules(

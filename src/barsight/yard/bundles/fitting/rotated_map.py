@@ -60,7 +60,7 @@ def align_map(height_map: HeightMap, heading_rad: float, stock_over_m: float = -
     u, v = c * x + s * y, -s * x + c * y
     width, height = (round(float(np.ptp(a)) / cell) + 1 for a in (u, v))
     z, sigma = np.full((2, height, width), np.nan, np.float32)
-    # From cell (row, column) of the sheet to that of the map, about both first cells.
+    # From cell (row, column) of the grid to that of the map, about both first cells.
     first_x, first_y = c * u.min() - s * v.min(), s * u.min() + c * v.min()
     first = np.array([(first_x - height_map.x0_m) / cell, (first_y - height_map.y0_m) / cell])
     _turned(height_map.z_m, height_map.sigma_m, height_map.source, first, float(c), float(s), z, sigma)

@@ -57,19 +57,19 @@ class Templates:
     heights: Float32
 
 
-def cross_section(sheet: AlignedMap, v_m: float, length_m: float) -> Float32:
+def cross_section(grid: AlignedMap, v_m: float, length_m: float) -> Float32:
     """Compute the median height (columns,) of each column over `length_m` about v_m; NaN where unknown, and
     on floor.
     """
-    first = round((v_m - length_m / 2 - sheet.v0_m) / sheet.cell_m)
-    rows = max(round(length_m / sheet.cell_m), 1)
-    part = sheet.z_m[max(first, 0) : first + rows]
+    first = round((v_m - length_m / 2 - grid.v0_m) / grid.cell_m)
+    rows = max(round(length_m / grid.cell_m), 1)
+    part = grid.z_m[max(first, 0) : first + rows]
     known = np.isfinite(part).sum(axis=0)
     out = np.full(part.shape[1], np.nan, np.float32)
     enough = known >= max(0.3 * rows, 1)
     if enough.any():
         out[enough] = np.nanmedian(part[:, enough], axis=0)
-    out[out <= sheet.stock_over_m] = np.nan
+    out[out <= grid.stock_over_m] = np.nan
     return out
 
 
@@ -112,12 +112,12 @@ def _diameters(rings: int, settings: BundleSettings) -> list[float]:
 
 
 def propose_candidates(
-    sheet: AlignedMap, templates: Templates, v_m: float, settings: BundleSettings
+    grid: AlignedMap, templates: Templates, v_m: float, settings: BundleSettings
 ) -> list[BundleCandidate]:
     """Propose bundles that may cross the section at v_m, the best first: local best of each number
     of rings.
     """
-    profile = cross_section(sheet, v_m, settings.slice_m)
+    profile = cross_section(grid, v_m, settings.slice_m)
     if not np.isfinite(profile).any():
         return []
     classes = np.unique(templates.kinds[:, 0]).astype(np.int64)
@@ -131,9 +131,9 @@ def propose_candidates(
         for column in _peaks(gain[k]):
             t = int(which[k, column])
             rings, diameter, roll = templates.kinds[t]
-            u = sheet.u0_m + (column + templates.phase[t]) * sheet.cell_m
+            u = grid.u0_m + (column + templates.phase[t]) * grid.cell_m
             score = float(gain[k, column])
-            if score < 0.4 * bundle_width(int(rings), diameter) / sheet.cell_m:
+            if score < 0.4 * bundle_width(int(rings), diameter) / grid.cell_m:
                 continue
             z = float(height[k, column])
             guesses.append(BundleCandidate(v_m, float(u), z, int(rings), float(diameter), float(roll), score))

@@ -21,11 +21,11 @@ _DARKER_LOG = 0.15
 """A line is so much darker, in the logarithm, than the bars on both of its sides."""
 
 
-def bar_diameter(height_map: HeightMap, sheet: AlignedMap, fit: Fit, low_m: float, high_m: float) -> float:
+def bar_diameter(height_map: HeightMap, grid: AlignedMap, fit: Fit, low_m: float, high_m: float) -> float:
     """Measure the diameter of a pack's bars by the median way between the dark lines that run along it, from
     low_m to high_m beside a fit's axis; NaN where fewer than two are seen.
     """
-    shades = shade_profile(height_map, sheet, fit, (low_m, high_m))
+    shades = shade_profile(height_map, grid, fit, (low_m, high_m))
     lines = np.empty(0) if shades is None else dark_lines(shades)
     return _DIAMETER_RATIO * float(np.median(np.diff(lines))) if lines.size > 1 else float("nan")
 

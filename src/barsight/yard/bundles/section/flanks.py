@@ -65,8 +65,8 @@ def seen_flanks(one: FittedOutline, low_m: float, high_m: float) -> Flanks | Non
     if rows.size < 3:
         return None
     width, middle = high_m - low_m, (low_m + high_m) / 2
-    half = round((width / 2 + abs(middle) + _BEYOND_M) / one.sheet.cell_m) + 1
-    beside, level = mean_section(one.sheet, one.fit, rows, half)
+    half = round((width / 2 + abs(middle) + _BEYOND_M) / one.grid.cell_m) + 1
+    beside, level = mean_section(one.grid, one.fit, rows, half)
     away = np.asarray(beside - middle, np.float64)
     crest = level[(np.abs(away) < _CREST_RATIO * width) & np.isfinite(level)].max(initial=-np.inf)
     if not np.isfinite(crest):

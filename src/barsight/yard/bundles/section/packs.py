@@ -68,22 +68,22 @@ class Pack:
         return (self.low_m + self.high_m) / 2
 
 
-def strapped_pack(height_map: HeightMap, sheet: AlignedMap, fit: Fit) -> Pack | None:
+def strapped_pack(height_map: HeightMap, grid: AlignedMap, fit: Fit) -> Pack | None:
     """Find what straps hold together over a fit's axis; None where none are seen."""
     rows = agreeing_rows(fit)
     if height_map.gray is None or rows.size < MIN_ROWS:
         return None
-    beside, level = mean_section(sheet, fit, rows, round(REACH_M / sheet.cell_m))
-    spans = strap_spans(height_map, sheet, fit, level)
+    beside, level = mean_section(grid, fit, rows, round(REACH_M / grid.cell_m))
+    spans = strap_spans(height_map, grid, fit, level)
     number = find_own(spans, fit.width_m)
     if number is None:
         return None
     own = spans[number]
-    thick = bar_diameter(height_map, sheet, fit, own.low_m, own.high_m)
+    thick = bar_diameter(height_map, grid, fit, own.low_m, own.high_m)
     pack = find_pack(spans, number, beside, level, thick * (1 + UPPER * DIAMETER_SIGMA_RATIO))
     if pack is None or not pack.is_bounded:
         return pack and replace(pack, diameter_m=thick)
-    return replace(pack, diameter_m=bar_diameter(height_map, sheet, fit, pack.low_m, pack.high_m))
+    return replace(pack, diameter_m=bar_diameter(height_map, grid, fit, pack.low_m, pack.high_m))
 
 
 def find_own(spans: tuple[StrapSpan, ...], width_m: float) -> int | None:

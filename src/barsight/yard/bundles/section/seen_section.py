@@ -69,20 +69,20 @@ class SeenSection:
 
 def seen_section(one: FittedOutline, others: list[FittedOutline], smoothing_m: float) -> SeenSection | None:
     """Measure the mean section along the rows that agree; None where there are none."""
-    sheet, fit = one.sheet, one.fit
+    grid, fit = one.grid, one.fit
     rows = agreeing_rows(fit)
     if rows.size < 3:
         return None
-    half = round(_REACH_RATIO * fit.width_m / sheet.cell_m)
-    beside, level = mean_section(sheet, fit, rows, half)
-    crest = half + round(0.3 * fit.width_m / sheet.cell_m) * np.array([-1, 1])
+    half = round(_REACH_RATIO * fit.width_m / grid.cell_m)
+    beside, level = mean_section(grid, fit, rows, half)
+    crest = half + round(0.3 * fit.width_m / grid.cell_m) * np.array([-1, 1])
     middle = int(crest[0] + np.argmax(np.nan_to_num(level[crest[0] : crest[1] + 1], nan=-np.inf)))
     deep_m = _GULLY_RATIO * float(fit.values[DIAMETER])
     others_begin = _is_neighbour(one, beside, others)
     resolved = fit.rings > 0 and fit.values[DIAMETER] > _PARTED_DIAMETER_M
     parted_m = _PARTED_RATIO * fit.width_m if resolved else np.inf
     lowest_m = float(level[middle]) - _HEIGHT_RATIOS[1] * (_MAX_PIECE_RATIO * fit.width_m + _WIDER_M)
-    limits = deep_m, parted_m, lowest_m, round(_HIDDEN_M / sheet.cell_m)
+    limits = deep_m, parted_m, lowest_m, round(_HIDDEN_M / grid.cell_m)
     ends = [_edge(level, others_begin, middle, step, *limits) for step in (-1, 1)]
     own = level[ends[0][0] : ends[1][0] + 1]
     if not np.isfinite(own).any():
@@ -95,7 +95,7 @@ def seen_section(one: FittedOutline, others: list[FittedOutline], smoothing_m: f
     misfit = np.sort(np.abs(misfit[np.isfinite(misfit)]))
     misfit = misfit[: round(_GULLIES_APART * misfit.size)]
     return SeenSection(
-        width_m=sheet.cell_m * (len(own) - 1),
+        width_m=grid.cell_m * (len(own) - 1),
         misfit_m=float(np.sqrt(np.mean(misfit**2))) if misfit.size else np.inf,
         sides_seen=all(seen for _, seen, _ in ends),
         sides_free=all(free for _, _, free in ends),
@@ -165,16 +165,16 @@ def agreeing_rows(fit: Fit) -> Int64:
     return rows[:: max(len(rows) // _ROWS_ENOUGH, 1)]
 
 
-def mean_section(sheet: AlignedMap, fit: Fit, rows: Int64, half: int) -> tuple[Float64, Float64]:
+def mean_section(grid: AlignedMap, fit: Fit, rows: Int64, half: int) -> tuple[Float64, Float64]:
     """Average the heights over the axis at places (N,) across from it; NaN where half are unknown."""
-    v = sheet.v0_m + sheet.cell_m * rows - fit.v_m
+    v = grid.v0_m + grid.cell_m * rows - fit.v_m
     axis = fit.values[U] + fit.values[SLOPE_U] * v
     up = fit.values[Z] + fit.values[SLOPE_Z] * v
-    beside = sheet.cell_m * np.arange(-half, half + 1)
-    column = np.rint((axis[:, None] + beside - sheet.u0_m) / sheet.cell_m).astype(np.int64)
-    inside = (column >= 0) & (column < sheet.z_m.shape[1])
-    z = np.where(inside, sheet.z_m[rows[:, None], np.clip(column, 0, sheet.z_m.shape[1] - 1)], np.nan)
-    z = np.where(z <= sheet.stock_over_m, -np.inf, z)
+    beside = grid.cell_m * np.arange(-half, half + 1)
+    column = np.rint((axis[:, None] + beside - grid.u0_m) / grid.cell_m).astype(np.int64)
+    inside = (column >= 0) & (column < grid.z_m.shape[1])
+    z = np.where(inside, grid.z_m[rows[:, None], np.clip(column, 0, grid.z_m.shape[1] - 1)], np.nan)
+    z = np.where(z <= grid.stock_over_m, -np.inf, z)
     known = np.isfinite(z) | (z == -np.inf)
     enough = 2 * known.sum(axis=0) >= len(rows)
     level = np.full(len(beside), np.nan)
@@ -186,13 +186,13 @@ def mean_section(sheet: AlignedMap, fit: Fit, rows: Int64, half: int) -> tuple[F
 def _is_neighbour(one: FittedOutline, beside_m: Float64, others: list[FittedOutline]) -> Bool:
     """Check which places (N,) beside a bundle's axis, at mid-length, lie in another of about its width."""
     u = one.fit.values[U] + beside_m
-    places = one.sheet.to_map(np.column_stack([u, np.full(len(u), one.fit.v_m)]))
+    places = one.grid.to_map(np.column_stack([u, np.full(len(u), one.fit.v_m)]))
     taken = np.zeros(len(u), bool)
     for other in others:
         fit = other.fit
         if other is one or abs(np.log(fit.width_m / one.fit.width_m)) > _ALIKE_LOG:
             continue
-        away = other.sheet.from_map(places) - [fit.values[U], fit.v_m]
+        away = other.grid.from_map(places) - [fit.values[U], fit.v_m]
         taken |= np.abs(away[:, 0] - fit.values[SLOPE_U] * away[:, 1]) < fit.width_m / 2
     return taken
 

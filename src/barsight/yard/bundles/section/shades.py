@@ -17,7 +17,7 @@ _INSIDE = 0.46
 
 
 def shade_profile(
-    height_map: HeightMap, sheet: AlignedMap, fit: Fit, between_m: tuple[float, float] | None = None
+    height_map: HeightMap, grid: AlignedMap, fit: Fit, between_m: tuple[float, float] | None = None
 ) -> ShadeProfile | None:
     """Sample the orthophoto's shades over the rows that agree with the fit, across its inside or between two
     places beside its axis; None where too little was seen.
@@ -28,9 +28,9 @@ def shade_profile(
     rows = rows[(rows >= fit.first) & (rows <= fit.last)]
     cell, half = height_map.cell_m, _INSIDE * fit.width_m
     first, last = between_m or (-half, half)
-    ends = sheet.v0_m + cell * np.array([fit.first, fit.last])
+    ends = grid.v0_m + cell * np.array([fit.first, fit.last])
     middle = fit.values[U] + fit.values[SLOPE_U] * (ends - fit.v_m)
-    corners = sheet.to_map(
+    corners = grid.to_map(
         np.stack([np.concatenate([middle + first, middle + last]), np.concatenate([ends, ends])], axis=1)
     )
     place = (corners - (height_map.x0_m, height_map.y0_m)) / cell
@@ -40,12 +40,12 @@ def shade_profile(
     row, column = np.nonzero(gray)
     x = height_map.x0_m + cell * (column + low[0])
     y = height_map.y0_m + cell * (row + low[1])
-    c, s = np.cos(sheet.heading_rad), np.sin(sheet.heading_rad)
+    c, s = np.cos(grid.heading_rad), np.sin(grid.heading_rad)
     v = c * y - s * x
     beside = (c * x + s * y - fit.values[U] - fit.values[SLOPE_U] * (v - fit.v_m)) / np.hypot(
         1, fit.values[SLOPE_U]
     )
-    number = np.rint((v - sheet.v0_m) / cell).astype(int).clip(0, fit.state.size - 1)
+    number = np.rint((v - grid.v0_m) / cell).astype(int).clip(0, fit.state.size - 1)
     agrees = np.zeros(fit.state.size, bool)
     agrees[rows] = True
     wanted = agrees[number] & (beside > first) & (beside < last)

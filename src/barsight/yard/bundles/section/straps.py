@@ -69,26 +69,24 @@ class StrapSpan:
         return self.high_m - self.low_m
 
 
-def strap_spans(
-    height_map: HeightMap, sheet: AlignedMap, fit: Fit, level_m: Float64
-) -> tuple[StrapSpan, ...]:
+def strap_spans(height_map: HeightMap, grid: AlignedMap, fit: Fit, level_m: Float64) -> tuple[StrapSpan, ...]:
     """Find what straps hold together within REACH_M of a bundle's axis, from low to high.
 
     height_map: one with an orthophoto. level_m: mean heights over the axis at the same places.
     """
-    beside, gray, tops, stock = _around(height_map, sheet, fit)
-    near = 2 * round(_CLOSE_M / sheet.cell_m) + 1
+    beside, gray, tops, stock = _around(height_map, grid, fit)
+    near = 2 * round(_CLOSE_M / grid.cell_m) + 1
     other = np.isin(fit.state[fit.first : fit.last + 1], (ABOVE, BELOW, MIXED))
     stock &= ~ndimage.binary_dilation(other, np.ones(near, bool))[:, None]
-    narrowest = max(round(_NARROWEST_M / sheet.cell_m), 3)
-    gullies, cliffs = find_gullies(level_m, sheet.cell_m), find_cliffs(level_m)
-    contrast = line_contrast(gray, sheet.cell_m)
+    narrowest = max(round(_NARROWEST_M / grid.cell_m), 3)
+    gullies, cliffs = find_gullies(level_m, grid.cell_m), find_cliffs(level_m)
+    contrast = line_contrast(gray, grid.cell_m)
     contrast[~stock] = 0.0
     clear = [
         _span(contrast, one, beside, narrowest) for one in split_columns(contrast, narrowest, gullies, cliffs)
     ]
-    level, variance = faint_lines(tops, stock, sheet.cell_m)
-    pooled = pooled_contrast(level, variance, sheet.cell_m)
+    level, variance = faint_lines(tops, stock, grid.cell_m)
+    pooled = pooled_contrast(level, variance, grid.cell_m)
     faint = [
         _span(pooled, one, beside, narrowest, is_faint=True)
         for one in split_faint(level, variance, narrowest, gullies, cliffs)
@@ -137,16 +135,16 @@ def _span(
     return StrapSpan(float(across[0]), float(across[1]), along, cell_m * spread)
 
 
-def _around(height_map: HeightMap, sheet: AlignedMap, fit: Fit) -> tuple[Float64, Float32, Float32, Bool]:
+def _around(height_map: HeightMap, grid: AlignedMap, fit: Fit) -> tuple[Float64, Float32, Float32, Bool]:
     """Resample gray levels (rows, places), NaN where unseen, along a bundle's axis: its rows, and places (m)
     beside it; the same of the pictures at the height of the tops where there are such; and which places lie
     over the floor.
     """
-    half = round(REACH_M / sheet.cell_m)
-    beside = np.asarray(sheet.cell_m * np.arange(-half, half + 1), np.float64)
-    v = sheet.v0_m + sheet.cell_m * np.arange(fit.first, fit.last + 1)
+    half = round(REACH_M / grid.cell_m)
+    beside = np.asarray(grid.cell_m * np.arange(-half, half + 1), np.float64)
+    v = grid.v0_m + grid.cell_m * np.arange(fit.first, fit.last + 1)
     u = fit.values[U] + fit.values[SLOPE_U] * (v - fit.v_m)[:, None] + beside
-    c, s = math.cos(sheet.heading_rad), math.sin(sheet.heading_rad)
+    c, s = math.cos(grid.heading_rad), math.sin(grid.heading_rad)
     x, y = c * u - s * v[:, None], s * u + c * v[:, None]
     column = np.asarray((x - height_map.x0_m) / height_map.cell_m, np.float32)
     row = np.asarray((y - height_map.y0_m) / height_map.cell_m, np.float32)
@@ -171,7 +169,7 @@ def _around(height_map: HeightMap, sheet: AlignedMap, fit: Fit) -> tuple[Float64
         cv2.INTER_NEAREST,
         borderValue=np.nan,
     )
-    stock: Bool = np.asarray(np.isfinite(gray) & (z > sheet.stock_over_m))
+    stock: Bool = np.asarray(np.isfinite(gray) & (z > grid.stock_over_m))
     return beside, gray, tops, stock
 
 

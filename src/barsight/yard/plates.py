@@ -1,7 +1,8 @@
-"""Find labels that no picture can read: bright plates of a label's size on bundles, in the orthophoto."""
+"""Find labels without reading them: bright plates of a label's size on bundles, in the orthophoto."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from itertools import chain
 
@@ -53,19 +54,28 @@ def find_plates(bundle: Bundle, heights: YardMap, size_m: tuple[float, float]) -
     rows = np.rint((y - part.y0_m) / part.cell_m).astype(np.int64).clip(0, part.shape[0] - 1)
     columns = np.rint((x - part.x0_m) / part.cell_m).astype(np.int64).clip(0, part.shape[1] - 1)
     gray, z_m = part.gray[rows, columns], part.z_m[rows, columns]
-    found = []
-    for cells in (*_plates(gray.astype(np.float32), size_m), *_codes(gray.astype(np.float32), size_m)):
-        middle = tuple(round(float(at.mean())) for at in np.nonzero(cells))
-        if abs(across[middle[1]]) <= bundle.width_m / 2 and abs(_rise(cells, z_m)) <= MAX_RISE_M:
-            found.append(np.array([x[middle], y[middle]]))
-    return found
+    middles = (
+        tuple(round(float(at.mean())) for at in np.nonzero(cells))
+        for cells in plate_masks(gray.astype(np.float32), z_m, size_m)
+    )
+    return [np.array([x[at], y[at]]) for at in middles if abs(across[at[1]]) <= bundle.width_m / 2]
+
+
+def plate_masks(gray: Float32, z_m: Float32, size_m: tuple[float, float]) -> Iterator[Bool]:
+    """Yield a mask (V, U) of each plate of about size_m, in either direction; one plate may come twice.
+
+    gray: levels (V, U) at places STEP_M apart, V along the bars; 0 where nothing was seen. z_m: heights.
+    """
+    for cells in (*_plates(gray, size_m), *_codes(gray, size_m)):
+        if abs(_rise(cells, z_m)) <= MAX_RISE_M:
+            yield cells
 
 
 def _plates(gray: Float32, size_m: tuple[float, float]) -> Iterator[Bool]:
     """Yield the cells of what is bright and of a label's size."""
     excess = _excess(gray, size_m)
     limit = max(MIDDLE_LOG, USUAL_RATIO * float(np.quantile(excess, 0.8)))
-    for cells in chain.from_iterable(_blobs(excess > level) for level in BRIGHTER_LOGS):
+    for cells in chain.from_iterable(_blobs(excess > level, size_m) for level in BRIGHTER_LOGS):
         ratio, full = _shape(cells, size_m)
         fits = (ratio >= MIN_SIDE_RATIO).all() and (ratio <= MAX_SIDE_RATIO).all() and full >= MIN_FULL_RATIO
         if fits and float(np.median(excess[cells])) >= limit:
@@ -78,7 +88,7 @@ def _codes(gray: Float32, size_m: tuple[float, float]) -> Iterator[Bool]:
     length = round(1.5 * side / STEP_M) | 1
     white = cv2.morphologyEx(level, cv2.MORPH_CLOSE, np.ones((length, 1), np.uint8))
     lack = np.where((white > np.log(WHITE_LEVEL)) & (gray > 0), white - level, 0)
-    for cells in chain.from_iterable(_blobs(lack > least) for least in CODE_LOGS):
+    for cells in chain.from_iterable(_blobs(lack > least, (side, side)) for least in CODE_LOGS):
         ratio, full = _shape(cells, (side, side))
         fits = (ratio >= MIN_CODE_RATIO).all() and (ratio <= MAX_CODE_RATIO).all() and full >= MIN_CODE_FULL
         if fits and float(np.median(lack[cells])) <= MAX_CODE_LOG:
@@ -98,12 +108,18 @@ def _excess(gray: Float32, size_m: tuple[float, float]) -> Float32:
     return excess
 
 
-def _blobs(bright: Bool) -> list[Bool]:
+def _blobs(bright: Bool, size_m: tuple[float, float]) -> list[Bool]:
+    """List the connected cells that may be of about size_m: neither much smaller nor longer."""
     mask = bright.astype(np.uint8)
     for way in (cv2.MORPH_CLOSE, cv2.MORPH_OPEN):
         mask = cv2.morphologyEx(mask, way, np.ones((3, 3), np.uint8))
-    count, numbers = cv2.connectedComponents(mask)
-    return [numbers == number for number in range(1, count)]
+    _, numbers, stats, _ = cv2.connectedComponentsWithStats(mask)
+    longest = MAX_SIDE_RATIO * math.hypot(*size_m) / STEP_M
+    small = MIN_FULL_RATIO * math.prod(MIN_SIDE_RATIO) * math.prod(size_m) / STEP_M**2
+    fits = (stats[1:, cv2.CC_STAT_AREA] >= small) & (
+        stats[1:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1) <= longest
+    )
+    return [numbers == number for number in 1 + np.flatnonzero(fits)]
 
 
 def _shape(cells: Bool, size_m: tuple[float, float]) -> tuple[Float64, float]:
