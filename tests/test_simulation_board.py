@@ -10,7 +10,7 @@ from barsight.calibration.boards.detection import detect
 from barsight.cli.main import run
 from barsight.core.errors import Failed
 from barsight.recording.image_decoding import decode_gray
-from barsight.simulation.board_pictures import photograph_board
+from barsight.simulation.boards.pictures import photograph_board
 from barsight.simulation.optics import mount_rig
 from barsight.simulation.settings import CameraSettings, SimulationSettings
 from barsight.simulation.simulate import stream

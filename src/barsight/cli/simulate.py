@@ -17,7 +17,7 @@ from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError
 from barsight.core.settings.values import MAX_VALUE
 from barsight.recording.formats.surveyed_targets import read_tags
-from barsight.simulation.board_pictures import photograph_board
+from barsight.simulation.boards.pictures import photograph_board
 from barsight.simulation.passes import simulate_passes
 from barsight.simulation.settings import SimulationSettings
 from barsight.simulation.simulate import laid_stock, simulate

@@ -264,9 +264,7 @@ def summary(measurement: Measurement) -> dict[str, Any]:
         "captured_from_ns": captured[0] if captured else None,
         "captured_to_ns": captured[1] if captured else None,
         "is_simulated": measurement.is_simulated,
-        "calibration_id": measurement.calibration_hash[:ID_DIGITS],
-        "yard_frame_id": measurement.yard_frame_id,
-        "frame_id": measurement.frame_id,
+        **_ids(measurement),
         "recording": {"path": str(measurement.recording_path), "format": measurement.recording_format},
         "reference": trajectory.reference,
         "hashes": {
@@ -312,6 +310,14 @@ def summary(measurement: Measurement) -> dict[str, Any]:
         content["passes"] = [_pass_content(number, one) for number, one in enumerate(measurement.passes, 1)]
     rounded: dict[str, Any] = json_value(content, decimals=6)
     return rounded
+
+
+def _ids(measurement: Measurement) -> dict[str, Any]:
+    """Name the rig, and the frame of all places."""
+    return {
+        "calibration_id": measurement.calibration_hash[:ID_DIGITS],
+        "yard_frame_id": measurement.yard_frame_id, "frame_id": measurement.frame_id,
+    }  # fmt: skip
 
 
 def _laser_content(measurement: Measurement) -> dict[str, Any]:

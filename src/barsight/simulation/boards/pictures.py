@@ -16,7 +16,7 @@ from barsight.core.arrays import Float32, Float64
 from barsight.core.errors import ConfigError
 from barsight.core.files import atomic_directory
 from barsight.core.pose import Pose
-from barsight.simulation.board import draw_board
+from barsight.simulation.boards.drawing import draw_board
 from barsight.simulation.optics import expose, mount_rig, sample_rays, vignette
 from barsight.simulation.settings import SimulationSettings
 from barsight.simulation.simulate import stream
