@@ -39,6 +39,8 @@ TEXTS = (
     "!!timestamp 2001-99-99", "!!int x", "!!binary ???", "? [1]\n: 2", "<<: 1", "~", "\ufeff",
 )  # fmt: skip
 _NUMBER = re.compile(r"[-+]?\d[\d.]*(?:[eE][-+]?\d+)?")
+UNREADABLE = (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError)
+"""What an earlier turn may have made of a file."""
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
@@ -173,7 +175,7 @@ _TEXT_WAYS = (_number, _number, _number, _number, _insert, _word, _word, _lines,
 def _json(path: Path, draw: random.Random) -> str:
     try:
         tree = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError):
+    except UNREADABLE:
         return _bytes(path, draw)
     how = ""
     for _ in range(draw.choice((1, 1, 2, 4))):
@@ -217,7 +219,7 @@ def _seal(tree: dict[str, Any], path: Path) -> None:
     if path.name == "result.json":
         try:
             tree["map_id"] = identify_map(tree).map_id
-        except (TypeError, AttributeError, KeyError, ValueError):
+        except UNREADABLE:
             return
         for name in ("bundles.json", "lifts.json"):
             _reseal(path.with_name(name), map_id=tree["map_id"])
@@ -233,7 +235,7 @@ def _reseal(path: Path, **changes: Any) -> None:
     if path.is_file() and not path.is_symlink() and path.stat().st_size < MAX_DAMAGED_BYTES:
         try:
             tree = json.loads(path.read_text()) | changes
-        except (ValueError, TypeError):
+        except UNREADABLE:
             return
         tree["content_sha256"] = json_digest({k: v for k, v in tree.items() if k != "content_sha256"})
         path.write_text(json.dumps(tree))
@@ -251,7 +253,7 @@ def reseal_folder(folder: Path) -> None:
         for name in SEALED:
             if (folder / name).is_file() and (folder / name).stat().st_size < 1 << 26:
                 tree["files"][name] = file_digest(folder / name)
-    except (OSError, ValueError, TypeError, KeyError):
+    except UNREADABLE:
         return
     _seal(tree, path)
     path.write_text(json.dumps(tree))

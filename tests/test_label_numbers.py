@@ -12,10 +12,13 @@ from barsight.core.errors import ConfigError
 from barsight.labels.attachment import NUMBER, PlacedCode, merge_codes
 from barsight.labels.number_reading import PATCH_PX, data_folder, number_reader, read_number
 from barsight.labels.placing import pose_at
+from barsight.measure_settings import MeasureSettings
+from barsight.pipeline import map_yard
 from barsight.recording.open import open_recording
 from barsight.result_folder import read_path
 from barsight.simulation.settings import CameraSettings, SimulationSettings, YardSettings
 from barsight.simulation.simulate import simulate
+from barsight.yard.label_settings import LabelSettings
 from test_labels import project, stick
 
 FONTS = (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_TRIPLEX)
@@ -88,11 +91,11 @@ def test_worn_numbers_are_read_right_or_not_at_all() -> None:
 
 @pytest.mark.slow
 @reads_numbers
-@pytest.mark.parametrize("px_mm", [0.6, 0.8, 1.0, 1.5])
+@pytest.mark.parametrize("px_mm", [0.8, 1.0, 1.5, 2.0])
 def test_two_thousand_numbers(px_mm: float) -> None:
-    share, wrong = read_share(500, px_mm, 9000 + round(10 * px_mm))
+    share, wrong = read_share(500, px_mm, 9100 + round(10 * px_mm))
     print(f"{px_mm} px a mm: {100 * share:.1f} % read, of 500 wrong: {wrong}")
-    assert len(wrong) <= 5 and share > 0.5
+    assert len(wrong) <= 3 and share > 0.7
 
 
 @reads_numbers
@@ -101,8 +104,10 @@ def test_what_reads_both_ways_or_is_no_label_is_not_sure() -> None:
         patch = np.full((PATCH_PX, PATCH_PX), 60, np.uint8)
         assert read_number(reader, patch, 0.6) is None
         patch[120:240, 80:280] = cv2.resize(plate("1689"), (200, 120), interpolation=cv2.INTER_AREA)
-        assert read_number(reader, patch, 0.6) in (None, "1689")
-        assert read_number(reader, patch[::-1, ::-1].copy(), 0.6) in (None, "1689")
+        assert read_number(reader, patch, 0.6) is None
+        patch[120:240, 80:280] = cv2.resize(plate("1682"), (200, 120), interpolation=cv2.INTER_AREA)
+        assert read_number(reader, patch, 0.6) == "1682"
+        assert read_number(reader, patch[::-1, ::-1].copy(), 0.6) == "1682"
         assert read_number(reader, patch, 0.2) is None, "a label of another shape"
 
 
@@ -117,8 +122,13 @@ def test_a_number_needs_three_pictures() -> None:
 
 def test_without_data_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("TESSDATA_PREFIX", str(tmp_path))
+    pytest.importorskip("tesserocr")
     with pytest.raises(ConfigError, match=r"eng.traineddata.*TESSDATA_PREFIX"):
-        data_folder()
+        map_yard(
+            [], MeasureSettings(labels=LabelSettings(read=True, numbers=True)), tmp_path, lambda *_: None
+        )
+    with pytest.raises(ConfigError, match=r"labels.numbers needs labels.read"):
+        LabelSettings(numbers=True)
 
 
 def write_on_bundles(recording: Path, out: Path) -> dict[str, int]:

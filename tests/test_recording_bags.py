@@ -350,6 +350,15 @@ def test_a_topic_whose_messages_are_gone_is_named(tmp_path: Path) -> None:
         open_recording(path).imu()
 
 
+def test_a_type_that_is_no_text_is_refused(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "a", "ros2-sqlite3", messages())
+    write_kalibr(tmp_path)
+    metadata = path / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace("type: sensor_msgs/msg/Imu", "type: [Imu]"))
+    with pytest.raises(InputError, match=r"\['Imu'\] is no text.*copy it again"):
+        open_recording(path)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

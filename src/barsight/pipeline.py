@@ -23,7 +23,7 @@ from barsight.core.stamps import seconds_to_ns
 from barsight.core.timing import Stopwatch
 from barsight.core.types import Trajectory
 from barsight.joined_passes import JoinedPasses, MappedPass, in_order, join_passes
-from barsight.labels.bundle_labels import label_bundles
+from barsight.labels.bundle_labels import expect_readers, label_bundles
 from barsight.map_building import (
     BuiltMap,
     ProbedRecording,
@@ -132,11 +132,12 @@ def map_yard(
     are tied and joined. resume: a folder that keeps the trajectory and each frame's disparity (about 19 MB
     for 1.3 megapixels), so that a killed run goes on where it was; the caller removes it when all is written.
 
-    Raises InputError or MeasurementError where nothing can be measured; single frames that fail are refused
-    and listed instead.
+    Raises InputError or MeasurementError where nothing can be measured, ConfigError where labels are to be
+    read without what reads them; single frames that fail are refused and listed instead.
     """
     began_s, settings = time.perf_counter(), settings.chosen()
     stock = read_stock(settings.bundles.stock_list) if settings.bundles.stock_list else None
+    expect_readers(settings.labels)
     ordered = in_order(recordings, settings)
     several = len(ordered) > 1
     passes, surfaces = [], []

@@ -26,6 +26,15 @@ _BELOW_M = 1.0
 """A line of sight is followed so far below the floor."""
 
 
+def expect_readers(settings: LabelSettings) -> None:
+    """Raise ConfigError, before anything is measured, where what is to read the labels isn't installed."""
+    if settings.read:
+        read_codes(np.zeros((16, 16), np.uint8))
+    if settings.numbers:
+        with number_reader():
+            pass
+
+
 def label_bundles(
     pairs: RectifiedPairs, poses: Mapping[int, Pose], heights: YardMap, bundles: tuple[Bundle, ...],
     settings: LabelSettings,

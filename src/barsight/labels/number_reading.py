@@ -16,13 +16,14 @@ from barsight.core.errors import ConfigError
 from barsight.core.extras import extra
 from barsight.labels.placing import PlacedCamera
 
-DIGITS, MIN_DIGITS = "0123456789", 3
-"""A shorter run of strokes is too often something else."""
-MIN_CONFIDENCE = 80
+DIGITS, TURNABLE, MIN_DIGITS = "0123456789", set("01689"), 3
+"""TURNABLE: digits upside down too; a number of these alone is unsure. A shorter run of strokes is too often
+something else."""
+MIN_CONFIDENCE = 90
 """Of the number, in percent, as Tesseract states it."""
 AROUND_RATIO = 1.8
 """Side of the patch over the label's longer side."""
-MIN_LABEL_PX = 60.0
+MIN_LABEL_PX = 80.0
 """A label is longer than this in the picture, or its digits have no shape."""
 PATCH_PX, HEIGHT_PX, MARGIN_PX = 360, 72, 14
 """Side of a patch; height of the label as Tesseract sees it, and white around it."""
@@ -65,15 +66,14 @@ def number_reader() -> Iterator[Any]:
 def read_number(reader: Any, patch: UInt8, size_ratio: float) -> str | None:
     """Read the number on the label in the middle of a patch (S, S); None where none is sure.
 
-    size_ratio: width of the label over its length. What can be read upside down too, as 1689, is unsure.
+    size_ratio: width of the label over its length. What may be upside down, as 1689, is unsure.
     """
     label = cut_label(patch, size_ratio)
     if label is None:
         return None
-    upright, turned = (_read_line(reader, image) for image in (label, label[::-1, ::-1]))
-    if upright is not None and turned is not None:
-        return None
-    return upright or turned
+    both_ways = (_read_line(reader, image) for image in (label, label[::-1, ::-1]))
+    found = [text for text in both_ways if text is not None]
+    return found[0] if len(found) == 1 and not set(found[0]) <= TURNABLE else None
 
 
 def _read_line(reader: Any, image: UInt8) -> str | None:

@@ -329,8 +329,8 @@ CONCLUSIONS = (
 ENTRIES = (*EQUATIONS, *FIGURES, *TABLES, *CONCLUSIONS)
 FURTHER = (
     (
-        "labels on the bars (4.1): codes are read, or said to be illegible; plain numbers aren't read",
-        "barsight measure R -o OUT --labels.read",
+        "labels on the bars (4.1): codes and plain numbers are read, or said to be illegible",
+        "barsight measure R -o OUT --labels.read --labels.numbers",
     ),
     ("more sensors (6): the crane's laser in the map", "barsight measure R -o OUT --map.laser fuse"),
     ("more sensors (6): a second pair on the same body", "barsight measure PAIR1 PAIR2 -o OUT"),

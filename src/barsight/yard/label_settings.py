@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from barsight.core.errors import ConfigError
 from barsight.core.settings.values import expect_ranges
 
 
@@ -23,3 +24,5 @@ class LabelSettings:
 
     def __post_init__(self) -> None:
         expect_ranges(self, "labels.", size_m=(0, 0.6))
+        if self.numbers and not (self.read and min(self.size_m) > 0):
+            raise ConfigError("labels.numbers needs labels.read and a label's size, labels.size_m")

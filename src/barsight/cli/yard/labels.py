@@ -52,7 +52,7 @@ def run(arguments: Sequence[str]) -> None:
         """
         listed = () if stock_list is None else read_stock(stock_list)
         source = open_recording(recording, reading)
-        settings = LabelSettings(numbers=numbers, size_m=label_m)
+        settings = LabelSettings(read=True, numbers=numbers, size_m=label_m)
         total, done = (1 + numbers) * len(source.index.stamps_ns), count(1)
         console = SafeConsole()
         with stages(SafeConsole(stderr=True)) as advance:

@@ -73,7 +73,7 @@ class BagFile:
             self._typestore = reader.typestore
             counts: dict[tuple[str, str], int] = {}
             for connection in reader.all_connections:
-                key = (connection.topic, connection.msgtype)
+                key = (self._text(connection.topic), self._text(connection.msgtype))
                 counts[key] = counts.get(key, 0) + self._whole(connection.msgcount)
             self.duration_s = self._whole(reader.duration) / NS_PER_S if any(counts.values()) else 0.0
         self.topics = tuple(Topic(name, kind, count) for (name, kind), count in sorted(counts.items()))
@@ -141,6 +141,12 @@ class BagFile:
         if not isinstance(number, int):
             raise self._torn(ValueError(f"{number!r} is no whole number"))
         return number
+
+    def _text(self, text: Any) -> str:
+        """Expect a text of metadata.yaml, which rosbags takes as it stands."""
+        if not isinstance(text, str):
+            raise self._torn(ValueError(f"{text!r} is no text"))
+        return text
 
     def _torn(self, error: Exception) -> InputError:
         remedy = "copy it again, or repair it with `ros2 bag reindex` or `mcap recover`"
