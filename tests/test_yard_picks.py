@@ -56,7 +56,7 @@ def test_picks_are_placed_within_their_sigma() -> None:
 
 
 def picked(way: Way, frame: StereoFrame, rng: np.random.Generator) -> dict[int, np.ndarray]:
-    """What a hand picks, 0.7 pixels off, of the papers that the left picture shows."""
+    """Pick the papers that the left picture shows, 0.7 pixels off."""
     mounting = way.posed[frame.stamp_ns].reference_from_body @ way.rig.body_from_cam0
     numbers, quads = find_tags(frame.left)
     places = [PLACES[int(number)] for number in numbers]
@@ -85,11 +85,11 @@ def test_picks_that_cannot_be_are_refused(
     (tmp_path / "list.csv").write_text(LIST + "a,0,0,0,,\n")
     (tmp_path / "picks.csv").write_text(text)
     words = ["calibrate", "yard", str(recording), "-o", str(tmp_path / "yard.yaml")]
-    listed = ["--targets", str(tmp_path / "list.csv")]
+    listed = ["--tags", str(tmp_path / "list.csv")]
     assert run([*words, *listed, "--picks", str(tmp_path / "picks.csv")]) == 3
     assert reason in " ".join(capsys.readouterr().err.split())
-    assert run([*words, *listed]) == 2
-    assert "--targets and --picks go together" in capsys.readouterr().err
+    assert run([*words, "--picks", str(tmp_path / "picks.csv")]) == 2
+    assert "--picks needs --tags" in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -108,7 +108,7 @@ def test_six_picked_targets_place_the_yard(
                 lines.append(f"post {number - 3},{frame.stamp_ns},{u:.1f},{v:.1f}\n")
     (tmp_path / "picks.csv").write_text("".join(lines))
     out = tmp_path / "yard.yaml"
-    words = ["calibrate", "yard", str(rendered / "recording"), "--targets", str(tmp_path / "list.csv")]
+    words = ["calibrate", "yard", str(rendered / "recording"), "--tags", str(tmp_path / "list.csv")]
     assert run([*words, "--picks", str(tmp_path / "picks.csv"), "-o", str(out)]) == 0
     told = capsys.readouterr().err
     assert np.linalg.norm(read_yard_file(out).yard_from.apply(LAID) - true, axis=1).max() < 0.012

@@ -229,7 +229,7 @@ def test_a_recording_without_tags_and_other_mistakes(
     )
     for more in (["--frame", "body"], ["--measured", str(tmp_path)]):
         assert run([*words, *more]) == 2
-        assert "--tags (or --targets) takes a recording, and says the frame" in capsys.readouterr().err
+        assert "--tags takes a recording, and says the frame" in capsys.readouterr().err
     assert not (tmp_path / "yard.yaml").exists()
 
 

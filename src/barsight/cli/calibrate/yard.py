@@ -38,7 +38,7 @@ from barsight.yard_frame import calibration_id, recording_id
 
 MAX_TURN_DEG = 0.05
 MAX_PLACE_M = 0.01
-ALONE = "--tags (or --targets) takes a recording, and says the frame: leave out --frame and --measured"
+ALONE = "--tags takes a recording, and says the frame: leave out --frame and --measured"
 MAX_SCALE_OFF = 0.02
 """A metre further off than this is no baseline's error: units differ, or points are mixed up."""
 
@@ -52,7 +52,6 @@ def run(arguments: Sequence[str]) -> None:
         frame: Literal["world", "encoders", "body"] = "world",
         measured: Path | None = None,
         tags: Path | None = None,
-        targets: Path | None = None,
         picks: Path | None = None,
         girder_y_m: tuple[float, float] | None = None,
         rails_x_m: tuple[float, float] | None = None,
@@ -72,12 +71,11 @@ def run(arguments: Sequence[str]) -> None:
             tags: A .csv of AprilTags 36h11 as surveyed (tag,yard_x,yard_y,yard_z of the middle in m;
                 optionally sigma_m and check), which are found in the recording's pictures. The frame is that
                 in which measure maps this recording, and the file is bound to its rig and crane.
-            targets: A .csv of targets of any kind as surveyed (name,yard_x,yard_y,yard_z in m; optionally
-                sigma_m and check), which were picked by hand in the recording's pictures; else as --tags.
-            picks: With --targets: a .csv of name,stamp_ns,u,v, a target's pixel in cam0's picture of that
-                stamp, in two pictures or more each. The spot is found again in cam1's.
-            girder_y_m: With --tags or --targets: the trolley's readings at the girder's ends, the lower
-                first. How the crane bends is calibrated too; bridge and trolley must travel in the recording.
+            picks: A .csv of targets of any kind that were picked by hand: name,stamp_ns,u,v, the pixel in
+                cam0's picture of that stamp, two pictures or more each; the spot is found again in cam1's.
+                --tags then lists them as surveyed, by name instead of tag.
+            girder_y_m: With --tags: the trolley's readings at the girder's ends, the lower first. How the
+                crane bends is calibrated too; bridge and trolley must travel in the recording.
             rails_x_m: With --girder-y-m: the bridge's readings at the ends of rails that may bend.
             sigma_m: One coordinate's error of a target, survey and measurement together, or of a tag's survey
                 alone, where no sigma_m column says it.
@@ -86,13 +84,12 @@ def run(arguments: Sequence[str]) -> None:
         expect_output(out, ".yaml", ".yml")
         if not 0 < sigma_m < 10:
             raise ConfigError(f"--sigma-m {sigma_m:g} can't be; give metres")
-        listed = tags if tags is not None else targets
-        if (targets is None) != (picks is None) or None not in (tags, targets):
-            raise ConfigError("--targets and --picks go together, without --tags")
-        bend = _begun_bend(girder_y_m, rails_x_m, has_tags=listed is not None)
-        console, way = SafeConsole(stderr=True), _Way(source, frame, measured, sigma_m, reading)
-        found, owners, hangs, bend = way.calibrated(listed, picks, bend, console)
-        _expect_usable(found, source if listed is None else listed)
+        if picks is not None and tags is None:
+            raise ConfigError("--picks needs --tags, the list of what was picked, as surveyed")
+        bend = _begun_bend(girder_y_m, rails_x_m, has_tags=tags is not None)
+        console, way = SafeConsole(stderr=True), _YardSource(source, frame, measured, sigma_m, reading)
+        found, owners, hangs, bend = way.calibrated(tags, picks, bend, console)
+        _expect_usable(found, source if tags is None else tags)
         verdict = "good" if _is_good(found) else "usable with care"
         with atomic_paths(out, out.with_suffix(".html"), out.with_suffix(".json")) as (path, html, data):
             write_yard_file(path, found, hangs, owners, bend)
@@ -104,8 +101,8 @@ def run(arguments: Sequence[str]) -> None:
 
 
 @dataclass(frozen=True)
-class _Way:
-    """What is calibrated, and what is said of it."""
+class _YardSource:
+    """A source of a calibration, with what is said of it."""
 
     source: Path
     frame: str
@@ -148,7 +145,7 @@ def _begun_bend(
         return None
     if not has_tags:
         raise ConfigError(
-            "--girder-y-m needs --tags or --targets: places measured by hand don't say where the trolley was"
+            "--girder-y-m needs --tags: places measured by hand don't say where the trolley was"
         )
     for name, ends in (("--girder-y-m", girder_y_m), ("--rails-x-m", rails_x_m)):
         if ends is not None and not MIN_SPAN_M <= ends[1] - ends[0] <= MAX_SPAN_M:
