@@ -1,8 +1,10 @@
 """Time the page's API with many readers, its canvas with many bundles: `python benchmarks/page_readers.py`.
 
 The server runs in a process of its own, `barsight serve` as a user starts it, on a store that the tests'
-drawn yard fills. Each reader asks for the six documents in turn over a connection of its own, with a pause in
-between. The canvas is timed in Chromium where Playwright is installed.
+drawn yard fills. Open pages hold a stream of events while a live run's crane moves. Each reader asks for the
+six documents in turn over a connection of its own, with a pause in between. The share of a core that the
+server uses is what it takes from a measuring process beside it. The canvas is timed in Chromium where
+Playwright is installed.
 """
 
 from __future__ import annotations
@@ -10,17 +12,20 @@ from __future__ import annotations
 import argparse
 import http.client
 import json
+import os
 import shutil
 import subprocess
 import sys
 import tempfile
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from live_folders import beating, live_folder
 from page_yards import fill_store
 
 DOCUMENTS = ("state", "bundles", "lifts", "surveys", "alarms", "stock")
@@ -86,6 +91,40 @@ def canvas(address: str, count: int) -> list[dict[str, float]] | None:
     return found
 
 
+def stream(port: int, over: threading.Event, counts: list[int]) -> None:
+    """Hold a stream of events open as a page does, and count what comes."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
+    connection.request("GET", "/api/events")
+    answer = connection.getresponse()
+    count = 0
+    while not over.is_set():
+        count += answer.readline().startswith(b"event:")
+    counts.append(count)
+    connection.close()
+
+
+def cpu_s(pid: int) -> float:
+    """Read the seconds of all cores that a process has used."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def share_of_core(pid: int, act: Callable[[], None]) -> float:
+    """Run `act` and return the share of one core that the process used meanwhile."""
+    began, began_s = cpu_s(pid), time.perf_counter()
+    act()
+    return (cpu_s(pid) - began) / (time.perf_counter() - began_s)
+
+
+def run_threads(targets: list[Callable[[], None]]) -> None:
+    """Run all at once until the last one ends."""
+    threads = [threading.Thread(target=target) for target in targets]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+
+
 def main() -> None:
     """Run and print JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -95,29 +134,46 @@ def main() -> None:
     parser.add_argument("--bundles", type=int, default=10_000)
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        url = fill_store(Path(folder))
-        command = [sys.executable, "-m", "barsight", "serve", "--store", url, "--port", "0"]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
+        url, live = fill_store(Path(folder)), live_folder(Path(folder) / "live", crane_m=[2.4, 1.1, 7.0])
+        command = [sys.executable, "-m", "barsight", "serve", "--store", url, "--port", "0", "--live", live]
+        with beating(live), subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
             assert server.stdout is not None
             address = server.stdout.readline().split()[0]
-            port = int(address.rsplit(":", 1)[1])
-            times: list[float] = []
-            threads = [
-                threading.Thread(target=read, args=(port, given.seconds, given.pause_s, times))
-                for _ in range(given.readers)
-            ]
-            for thread in threads:
-                thread.start()
-            for thread in threads:
-                thread.join()
-            ms = 1e3 * np.array(times)
-            told = {
-                "readers": given.readers, "requests": len(ms), "p50_ms": float(np.percentile(ms, 50)),
-                "p99_ms": float(np.percentile(ms, 99)), "max_ms": float(ms.max()),
-                "requests_per_s": len(ms) / given.seconds, "canvas": canvas(address, given.bundles),
-            }  # fmt: skip
-            server.terminate()
+            try:
+                told = measured(server.pid, address, live, given)
+            finally:
+                server.terminate()
     sys.stdout.write(json.dumps(told, indent=1) + "\n")
+
+
+def measured(pid: int, address: str, live: Path, given: argparse.Namespace) -> dict[str, object]:
+    """Measure the server at rest, with open pages while the crane moves and with readers, then the canvas."""
+    port, times, counts = int(address.rsplit(":", 1)[1]), list[float](), list[int]()
+    over = threading.Event()
+
+    def travel() -> None:
+        end_s, x_m = time.perf_counter() + given.seconds, 3.0
+        while time.perf_counter() < end_s:
+            x_m += 0.05
+            live_folder(live, position_m=[x_m, 1.0, 8.0])
+            time.sleep(0.05)
+        over.set()
+
+    rest = share_of_core(pid, lambda: time.sleep(given.seconds / 2))
+    pages = [lambda: stream(port, over, counts)] * given.readers
+    open_pages = share_of_core(pid, lambda: run_threads([travel, *pages]))
+    readers = [lambda: read(port, given.seconds, given.pause_s, times)] * given.readers
+    reading = share_of_core(pid, lambda: run_threads(readers))
+    ms = 1e3 * np.array(times)
+    return {
+        "load_1_min": os.getloadavg()[0], "readers": given.readers, "requests": len(ms),
+        "p50_ms": float(np.percentile(ms, 50)), "p99_ms": float(np.percentile(ms, 99)),
+        "max_ms": float(ms.max()), "requests_per_s": len(ms) / given.seconds,
+        "share_of_one_core": {"at rest": rest, "open pages": open_pages, "readers": reading},
+        "events_a_page": sum(counts) / len(counts), "canvas": [
+            {"bundles": count, "views": canvas(address, count)} for count in (10, given.bundles)
+        ],
+    }  # fmt: skip
 
 
 if __name__ == "__main__":

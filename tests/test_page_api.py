@@ -5,7 +5,10 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -380,6 +383,14 @@ def test_files_of_a_survey_are_held_against_their_digests(local: httpx.Client, m
     assert local.get(f"{base}/bundles.json").status_code == 200
 
 
+def test_the_header_shows_the_alarm_of_the_first_priority(local: httpx.Client) -> None:
+    for code in ("bundle-moved", "calibration-changed", "survey-files"):
+        assert local.post("/api/alarms", json={"code": code, "reason": "told by hand"}).status_code == 200
+    alarms = local.get("/api/alarms").json()["alarms"]
+    assert [one["priority"] for one in alarms] == [1, 2, 3, 3]
+    assert local.get("/api/state").json()["top_alarm"]["code"] == "calibration-changed"
+
+
 def test_an_alarm_goes_through_its_states(local: httpx.Client, made: Path, tmp_path: Path) -> None:
     def alarms() -> dict[str, dict[str, object]]:
         return {one["code"]: one for one in local.get("/api/alarms").json()["alarms"]}
@@ -439,6 +450,31 @@ def test_a_taken_port_is_one_line(made: Path, capsys: pytest.CaptureFixture[str]
         assert run(["serve", "--store", f"sqlite:///{made / 'yard.db'}", "--port", port]) == 4
     said = capsys.readouterr().err
     assert "is taken" in said and said.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_the_demo_ends_on_the_page_with_a_change_and_a_stock_list(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "barsight", "demo"]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True) as demo:
+        assert demo.stdout is not None
+        address = demo.stdout.readline().split()[0]
+        with httpx.Client(base_url=address) as client:
+            surveys = client.get("/api/surveys").json()["surveys"]
+            later, first = (one["captured_to_ns"] for one in surveys)
+            times = {"before_ns": first + 10**6, "after_ns": later + 10**6}
+            changes = client.get("/api/compare", params=times).json()["changes"]
+            stock = client.get("/api/stock").json()["differences"]
+            state = client.get("/api/state").json()
+        demo.send_signal(signal.SIGINT)
+        assert demo.wait(30) == 0
+    told = json.loads((tmp_path / "demo/recording_later/truth/changes.json").read_text())
+    true = {one["kind"]: one["center"][:2] for one in told}
+    found = {one["what"]: one["from_m"][:2] for one in changes if one["what"] != "came"}
+    assert set(found) == {"went", "moved"} and set(true) == {"taken", "moved"}
+    for what, kind in (("went", "taken"), ("moved", "moved")):
+        assert found[what] == pytest.approx(true[kind], abs=0.1)
+    assert "missing" in {one["kind"] for one in stock}
+    assert state["survey"]["is_simulated"] and state["alarms"] >= 2
 
 
 def test_slow_readers_skip(local: httpx.Client) -> None:

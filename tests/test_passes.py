@@ -1,19 +1,26 @@
 """Several passes over one yard: how they are tied, what changed between them, one map and one result."""
 
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 import barsight as bs
 from barsight.core.errors import ConfigError, InputError
-from barsight.joined_passes import STALE
+from barsight.core.types import HeightSource
+from barsight.joined_passes import STALE, JoinedPasses
 from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.passes.changes import PlaceHistory
+from barsight.mapping.passes.joined_surface import PassSurface
+from barsight.mapping.passes.slides import SeenBundle, find_moves
+from barsight.mapping.surface.incremental import gather_surface, tile_figures
+from barsight.mapping.surface.surface import Layers, write_tile
+from barsight.mapping.top_photo import TopPhoto
 from barsight.registration.block_shifts import BlockShifts, MatchedMap, block_shifts
-from barsight.registration.pass_ties import PassPrior, tie_passes
+from barsight.registration.pass_ties import PassCorrection, PassPrior, PassTies, tie_passes
 from barsight.result_folder import changed_inputs, read_heights
 from barsight.simulation.passes import simulate_passes
 from barsight.simulation.settings import CameraSettings, PassesSettings, YardSettings
@@ -21,6 +28,7 @@ from barsight.simulation.simulate import simulate
 from cli_runs import TINY
 
 CELL_M = 0.01
+NO_CORRECTION = PassCorrection(np.zeros(3), np.zeros(7), np.zeros((7, 7)))
 
 
 def yard(x: np.ndarray, y: np.ndarray, *, detail: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -161,6 +169,71 @@ def test_a_bundle_half_seen_beside_a_change_is_stale(
     x_m: float, y_m: float, length_m: float, stale: bool
 ) -> None:
     assert history().is_stale(np.array([x_m, y_m, 0.1]), 0.0, length_m, 0.3, 0.5) is stale
+
+
+def pictured(
+    folder: Path, rows: tuple[int, int], moved_m: dict[float, float], seed: int, since: int
+) -> PassSurface:
+    """A pass over six bundles of 6 m at x = 1, 2 ... that sees so many rows of cells; those whose x is named
+    were moved along y, by nan exchanged.
+    """
+    rng, cell_m = np.random.default_rng(1), 0.01
+    layers = Layers.unknown(256 * 4, 256 * 3)
+    y, x = np.mgrid[: 256 * 4, : 256 * 3]
+    gray = 90 + 6 * rng.standard_normal((256 * 4, 256 * 3))
+    for k in range(1, 7):
+        looks = cv2.GaussianBlur(rng.normal(0, 60, (700, 30)), (0, 0), 2) + 120
+        shift = moved_m.get(float(k), 0.0)
+        if np.isnan(shift):
+            looks, shift = np.roll(looks[::-1], 7, axis=1), 0.0
+        first = round((2.0 + shift) / cell_m)
+        gray[first : first + 600, 100 * k - 15 : 100 * k + 15] = looks[:600]
+    gray += np.random.default_rng(seed).normal(0, 3, gray.shape) + 0.03 * x
+    seen = (y >= rows[0]) & (y < rows[1])
+    whole = replace(
+        layers, z_m=np.where(seen, 0.3, np.nan).astype(np.float32),
+        sigma_m=np.full(seen.shape, 0.005, np.float32), views=seen.astype(np.float32),
+        source=np.where(seen, HeightSource.VISION, HeightSource.UNKNOWN).astype(np.uint8),
+        intensity=np.where(seen, gray, np.nan).astype(np.float32),
+    )  # fmt: skip
+    folder.mkdir()
+    figures = {}
+    for i in range(4):
+        for j in range(3):
+            part = {
+                f.name: getattr(whole, f.name)[256 * i : 256 * (i + 1), 256 * j : 256 * (j + 1)]
+                for f in fields(Layers)
+            }
+            write_tile(folder, (j, i), Layers(**part))
+            figures[j, i] = tile_figures((j, i), Layers(**part))
+    return PassSurface(gather_surface(folder, cell_m, figures), NO_CORRECTION, since)
+
+
+def test_what_was_moved_along_itself_or_exchanged_is_told_by_its_picture(tmp_path: Path) -> None:
+    """All lie as high as before; only from y = 3.5 to 6.5 m both passes see them."""
+    older = pictured(tmp_path / "older", (150, 650), {}, 5, 0)
+    newer = pictured(tmp_path / "newer", (350, 950), {2.0: 0.5, 4.0: -0.3, 5.0: float("nan")}, 6, 1)
+    twin = replace(newer, since=0)
+    bundles = [SeenBundle(np.array([[k, 2.0, 0.2], [k, 8.0, 0.2]]), 0.3) for k in range(1, 7)]
+    told = {move.ends_m[0, 0]: move.along_m for move in find_moves([older, newer], bundles)}
+    assert told == {2.0: pytest.approx(0.5, abs=0.011), 4.0: pytest.approx(-0.3, abs=0.011), 5.0: None}
+    assert find_moves([older, twin], bundles) == [], "two pairs of one time see no change"
+    history = PlaceHistory((0.0, 0.0), (200, 160), 0.05)
+    height = np.full((200, 160), 0.3, np.float32)
+    for number, rows in ((0, slice(30, 130)), (1, slice(70, 190))):
+        z = np.full_like(height, np.nan)
+        z[rows] = height[rows]
+        history.add(number, z, np.full_like(height, 0.005), number)
+    for move in find_moves([older, newer], bundles):
+        history.note(move)
+    assert not history.changes and len(history.moves) == 3
+    stale = [history.is_stale(np.array([k, 5.0]), 0.0, 6.0, 0.3, 0.1) for k in range(1, 7)]
+    assert stale == [False, True, False, True, True, False]
+    ties = PassTies((), ())
+    joined = JoinedPasses((), (), older.surface, FreeSpace(CELL_M), TopPhoto(CELL_M), ties, history)
+    said = [notice.message for notice in joined.notices()]
+    assert said[0].endswith("around x 2.00, y 5.00 m was moved 0.50 m along itself towards +Y")
+    assert said[1].endswith("was moved 0.30 m along itself towards -Y") and "exchanged" in said[2]
 
 
 def test_what_was_proven_free_is_given_up_where_it_changed() -> None:

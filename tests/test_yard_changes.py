@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from barsight.store.matching import has_moved
 from barsight.yard.inventory.changes import Change, compare_yards
 from barsight.yard.types import Bundle
 from lift_yards import SIGMA, laid, map_of, record
@@ -35,6 +36,28 @@ def test_moved_settled_taken_and_added_are_told_apart() -> None:
     kg = 7 * math.pi / 4 * 0.09**2 * 7.0 * 7850
     assert changes[2].kg == pytest.approx(-kg) and changes[3].kg == pytest.approx(kg)
     assert changes[3].sigma_kg > 0
+
+
+@pytest.mark.parametrize(
+    ("open_before", "open_after", "moved"),
+    [
+        ((False, True), (False, True), True),
+        ((False, False), (False, True), True),
+        ((True, False), (False, True), False),
+    ],
+    ids=["one-end-twice", "whole-before", "never-the-same-end"],
+)
+def test_an_end_that_was_seen_twice_tells_a_move_along(
+    open_before: tuple[bool, bool], open_after: tuple[bool, bool], moved: bool
+) -> None:
+    """The bundle lies 0.5 m further along itself, and is cut off at the same place at its high-y end."""
+    one = STOCK[0]
+    before = record(one, 0, ends_open=open_before)
+    cut = record(replace(one, y_m=one.y_m + 0.25, length_m=one.length_m - 0.5), 1, ends_open=open_after)
+    assert cut.ends_m[1, 1] == pytest.approx(before.ends_m[1, 1])
+    (change,) = compared([before], [cut])
+    assert (change.kind == "moved") is moved and has_moved(before, cut) is moved
+    assert change.along_mm == pytest.approx(500 if moved else 0)
 
 
 @pytest.mark.slow

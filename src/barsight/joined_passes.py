@@ -16,8 +16,9 @@ from barsight.core.pose import Pose, nearest_rotation, skew
 from barsight.core.types import PosedFrame, Trajectory
 from barsight.map_building import BuiltMap, ProbedRecording, TrackedRecording
 from barsight.mapping.free_space import FreeSpace
-from barsight.mapping.passes.changes import HeightChange, PlaceHistory
+from barsight.mapping.passes.changes import BundleMove, HeightChange, PlaceHistory
 from barsight.mapping.passes.joined_surface import PassSurface, join_surfaces, measure_overlaps
+from barsight.mapping.passes.slides import SeenBundle, find_moves
 from barsight.mapping.surface.surface import Surface
 from barsight.mapping.top_photo import TopPhoto
 from barsight.measure_settings import MeasureSettings
@@ -45,9 +46,12 @@ class MappedPass:
 
 @dataclass(frozen=True, eq=False)
 class JoinedPasses:
-    """Several passes in one map. ties: how they lie against each other; history: what changed between."""
+    """Several passes in one map. placed: their own surfaces. ties: how they lie against each other; history:
+    what changed between.
+    """
 
     passes: tuple[MappedPass, ...]
+    placed: tuple[PassSurface, ...]
     surface: Surface
     free: FreeSpace
     tops: TopPhoto
@@ -66,9 +70,15 @@ class JoinedPasses:
                 yield Notice("passes-contradict", _contradiction(pair))
         for change in self.history.changes:
             yield Notice("yard-changed", _changed(change))
+        for move in self.history.moves:
+            yield Notice("yard-changed", _moved_along(move))
 
     def doubted(self, bundles: Sequence[Bundle]) -> tuple[Bundle, ...]:
-        """Mark the bundles beside a change of which a part was not seen since."""
+        """Mark the bundles at or beside a change of which a part was not seen since; notes what was moved
+        along itself or exchanged.
+        """
+        for move in find_moves(self.placed, [SeenBundle(one.ends_m, one.width_m) for one in bundles]):
+            self.history.note(move)
         return tuple(
             replace(bundle, cover_doubts=(*bundle.cover_doubts, STALE), reasons=(*bundle.reasons, STALE))
             if self.history.is_stale(
@@ -152,7 +162,7 @@ def join_passes(passes: Sequence[MappedPass], surfaces: Sequence[Surface], folde
         replace(one, way=replace(one.way, trajectory=_moved(one.way.trajectory, correction)))
         for one, correction in zip(passes, ties.corrections, strict=True)
     )
-    return JoinedPasses(moved, joined.surface, free, tops, ties, joined.history)
+    return JoinedPasses(moved, tuple(placed), joined.surface, free, tops, ties, joined.history)
 
 
 def _prior(trajectory: Trajectory) -> PassPrior:
@@ -194,3 +204,14 @@ def _changed(change: HeightChange) -> str:
         f"before pass {change.pass_number + 1} {change.area_m2:.2f} m² between x {x0:.2f} and {x1:.2f} m, "
         f"y {y0:.2f} and {y1:.2f} m became {1e3 * abs(change.rise_m):.0f} mm {way}"
     )
+
+
+def _moved_along(move: BundleMove) -> str:
+    x, y = move.ends_m[:, :2].mean(axis=0)
+    what = f"before pass {move.pass_number + 1} the bundle around x {x:.2f}, y {y:.2f} m"
+    if move.along_m is None:
+        return f"{what} was exchanged: its picture is another one's"
+    way = move.ends_m[1] - move.ends_m[0] if move.along_m > 0 else move.ends_m[0] - move.ends_m[1]
+    axis = int(np.argmax(np.abs(way[:2])))
+    sign = "-" if way[axis] < 0 else "+"
+    return f"{what} was moved {abs(move.along_m):.2f} m along itself towards {sign}{'XY'[axis]}"

@@ -9,7 +9,7 @@ from typing import Any
 from barsight.core.arrays import Float32, UInt8
 from barsight.core.notices import Notice
 from barsight.core.types import Agreement, Contour, LaserProfile, RefusedFrame, Trajectory
-from barsight.mapping.passes.changes import HeightChange
+from barsight.mapping.passes.changes import BundleMove, HeightChange
 from barsight.mapping.surface.laser_check import LaserCheck
 from barsight.mapping.surface.surface import Surface
 from barsight.registration.pass_ties import PairTie, PassCorrection
@@ -52,7 +52,8 @@ class Preview:
 @dataclass(frozen=True, eq=False)
 class PassRecord:
     """One of several passes, the oldest first. captured_ns: stamps of its first and last measured frame.
-    first_ns, last_ns: of its part of the trajectory. ties: with passes before it; changes: which it saw.
+    first_ns, last_ns: of its part of the trajectory. ties: with passes before it; changes, moves: which it
+    saw.
     """
 
     recording_path: Path
@@ -67,6 +68,7 @@ class PassRecord:
     correction: PassCorrection
     ties: tuple[PairTie, ...]
     changes: tuple[HeightChange, ...]
+    moves: tuple[BundleMove, ...]
 
 
 @dataclass(frozen=True, eq=False)

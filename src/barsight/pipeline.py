@@ -300,6 +300,7 @@ def _records(mapped: MappedYard, travels: Sequence[Travel]) -> tuple[PassRecord,
             int(one.way.trajectory.stamp_ns[-1]), len(one.built.placed), _frames_total(one.probed),
             correction, tuple(pair for pair in ties.pairs if pair.second == number),
             tuple(change for change in mapped.joined.history.changes if change.pass_number == number),
+            tuple(move for move in mapped.joined.history.moves if move.pass_number == number),
         )
         for number, (one, travel, correction) in enumerate(
             zip(mapped.passes, travels, ties.corrections, strict=True)

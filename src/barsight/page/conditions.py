@@ -32,6 +32,8 @@ ALARM_CODES = {
     "live-degraded": "The live run lacks a sensor or a process that lifts need.",
 }
 """Alarms that the page's server raises itself: code to what it means."""
+PRIORITIES = {"store-broken": 1, "calibration-changed": 1, "bundle-moved": 3, "survey-files": 3}
+"""Of alarms, 1 first; all others have 2."""
 WHO = "barsight serve"
 Condition = tuple[str, str]
 """Code and reason of an alarm."""

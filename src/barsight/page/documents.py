@@ -13,6 +13,7 @@ import numpy as np
 
 from barsight.core.errors import InputError
 from barsight.core.extras import extra
+from barsight.page.conditions import PRIORITIES
 from barsight.store.confirmation import map_vetoes, newest_survey, open_lifts, yard_clock_ns
 from barsight.store.history import PresentBundle, identity_name, list_surveys, present_yard
 from barsight.store.promotion import counts
@@ -50,7 +51,7 @@ def state_document(connection: Connection) -> dict[str, Any]:
     newest = newest_survey(connection)
     alarms = alarm_records(connection)
     active = [one for one in alarms if one["state"] != "cleared"]
-    top = min(active, key=lambda one: (_ALARM_ORDER[one["state"]], -one["at_ns"]), default=None)
+    top = min(active, key=_urgency, default=None)
     return {
         "clock_ns": yard_clock_ns(connection),
         "survey": None if newest is None else _survey_of(newest),
@@ -191,10 +192,16 @@ def alarm_records(connection: Connection) -> list[dict[str, Any]]:
         {
             "id": row.id, "code": row.code, "reason": row.reason, "state": steps[row.id][-1]["state"],
             "at_ns": steps[row.id][0]["at_ns"], "steps": steps[row.id],
+            "priority": PRIORITIES.get(row.code, 2),
         }
         for row in rows
     ]  # fmt: skip
-    return sorted(told, key=lambda one: (_ALARM_ORDER[one["state"]], -one["at_ns"]))
+    return sorted(told, key=_urgency)
+
+
+def _urgency(alarm: dict[str, Any]) -> tuple[int, int, int]:
+    """Rank an alarm: the least state first, then priority, then the newest."""
+    return _ALARM_ORDER[alarm["state"]], alarm["priority"], -alarm["at_ns"]
 
 
 def survey_records(connection: Connection) -> list[dict[str, Any]]:

@@ -368,4 +368,5 @@ def _pass_content(number: int, one: PassRecord) -> dict[str, Any]:
             {"low_m": c.low_m, "high_m": c.high_m, "area_m2": c.area_m2, "rise_m": c.rise_m}
             for c in one.changes
         ],
+        "moves": [{"ends_m": m.ends_m, "width_m": m.width_m, "along_m": m.along_m} for m in one.moves],
     }  # fmt: skip

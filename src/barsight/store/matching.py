@@ -10,7 +10,13 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from barsight.core.arrays import Bool, Float64
-from barsight.yard.inventory.changes import MIN_KNOWN, SAME_WIDTH, displacement, heights_over
+from barsight.yard.inventory.changes import (
+    MIN_KNOWN,
+    SAME_WIDTH,
+    displacement,
+    displacement_along,
+    heights_over,
+)
 from barsight.yard.types import Bundle, YardMap
 
 SIGMAS = 4.0
@@ -238,14 +244,14 @@ def _is_carried(known: KnownBundle, found: FoundBundle) -> bool:
 
 def has_moved(before: Bundle, after: Bundle) -> bool:
     """Check for a move that is neither noise nor the settling of a pile."""
-    across, along, up, turned = displacement(before, after)
+    across, _, up, turned = displacement(before, after)
+    along, sigma_along = displacement_along(before, after)
     a, b = before.sigma, after.sigma
-    is_open = any(before.ends_open) or any(after.ends_open)
     return any(
         abs(value) > max(least, SIGMAS * math.hypot(_known(one), _known(two)))
         for value, one, two, least in (
             (across, a.lateral_m, b.lateral_m, MOVED_M),
-            (0.0 if is_open else along, a.along_m, b.along_m, MOVED_M),
+            (along, sigma_along, 0.0, MOVED_M),
             (up, a.top_z_m, b.top_z_m, MOVED_M),
             (turned, a.yaw_rad, b.yaw_rad, MOVED_RAD),
         )

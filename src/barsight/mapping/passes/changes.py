@@ -19,6 +19,8 @@ MIN_AREA_M2 = 0.04
 """Smaller patches are errors of matching."""
 OPENING_PLACES = 3
 """A change holds a square of so many places: at an edge two views differ over less."""
+AXIS_PLACES = 50
+"""Places along a bundle's axis at which its heights are looked up."""
 MARGIN_M = 0.15
 """So far around a change what was seen before is given up."""
 
@@ -37,12 +39,26 @@ class HeightChange:
     rise_m: float
 
 
+@dataclass(frozen=True, eq=False)
+class BundleMove:
+    """A bundle that lies as high as before, and is another one or was moved along itself.
+
+    pass_number: of the pass that saw it first, from 0. ends_m: (2, 3) of its axis as the joined map has it,
+    the low-y end first. along_m: how far it was moved towards its high-y end, None where it is another one.
+    """
+
+    pass_number: int
+    ends_m: Float64
+    width_m: float
+    along_m: float | None
+
+
 class PlaceHistory:
     """Knowledge of each place of the yard as pass after pass is added.
 
     low_m: (x, y), the corner of the first place. shape: (rows, columns). place_m: side of a place. Memory: 10
     bytes a place. seen_by: number of the newest pass that saw it, -1 for none; changed_by: of the pass that
-    saw it changed last, -1 for none. changes: all that were found.
+    saw it changed last, -1 for none. changes, moves: all that were found.
     """
 
     def __init__(self, low_m: tuple[float, float], shape: tuple[int, int], place_m: float) -> None:
@@ -50,6 +66,7 @@ class PlaceHistory:
         self._z_m, self._sigma_m = (np.full(shape, np.nan, np.float32) for _ in range(2))
         self.seen_by, self.changed_by = (np.full(shape, -1, np.int8) for _ in range(2))
         self.changes: list[HeightChange] = []
+        self.moves: list[BundleMove] = []
 
     def add(self, number: int, z_m: Float32, sigma_m: Float32, since: int) -> None:
         """Add the heights (rows, columns) of the next pass with their sigma, NaN where it saw none.
@@ -74,6 +91,23 @@ class PlaceHistory:
         seen = np.isfinite(z_m)
         self.seen_by[seen] = number
         self._z_m[seen], self._sigma_m[seen] = z_m[seen], sigma_m[seen]
+
+    def note(self, move: BundleMove) -> None:
+        """Take a bundle's place, before and after, as changed; nothing where its heights told so already."""
+        x_m, y_m = np.linspace(move.ends_m[0, :2], move.ends_m[1, :2], AXIS_PLACES).T
+        if move.along_m is None and (self._look_up(self.changed_by, x_m, y_m) >= move.pass_number).any():
+            return
+        self.moves.append(move)
+        ends = move.ends_m[:, :2]
+        length_m = float(np.hypot(*(ends[1] - ends[0])))
+        along = (ends[1] - ends[0]) / length_m
+        rows, columns = self.shape
+        x, y = np.meshgrid(*(self.place_m * (np.arange(size) + 0.5) for size in (columns, rows)))
+        away = np.stack([x + self.low_m[0], y + self.low_m[1]], axis=-1) - ends.mean(axis=0)
+        reach_m = length_m / 2 + abs(move.along_m or 0.0) + MARGIN_M
+        inside = np.abs(away @ along) <= reach_m
+        inside &= np.abs(away @ np.array([along[1], -along[0]])) <= move.width_m / 2 + MARGIN_M
+        self.changed_by[inside] = np.maximum(self.changed_by[inside], move.pass_number)
 
     def _change(self, number: int, box: tuple[slice, slice], inside: Bool, rise: Float32) -> HeightChange:
         (left, bottom), (right, top) = (

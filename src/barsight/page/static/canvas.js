@@ -4,6 +4,7 @@ import { OPEN_LIFTS, t } from "./dom.js";
 
 const SELECT = "#1d4f91";
 const INK = "#26292b";
+const PATH_ITEMS = 20;
 const WORDS_PX = 40; // room below the yard for the words of its lowest bundles
 
 export class YardCanvas {
@@ -26,7 +27,7 @@ export class YardCanvas {
   show(data, chosen) {
     this.data = data;
     this.chosen = chosen;
-    this.items = data.bundles.map((bundle) => this.item(bundle));
+    this.items = data.bundles.map((bundle) => this.item(bundle)).sort((a, b) => a.top - b.top);
     for (const layer of data.layers) this.load(layer);
     if (!this.view) this.fit();
     this.draw();
@@ -178,8 +179,7 @@ export class YardCanvas {
   visible() {
     const [x0, y0] = this.at(0, this.height);
     const [x1, y1] = this.at(this.width, 0);
-    return this.items.filter((i) => i.x + i.reach > x0 && i.x - i.reach < x1 && i.y + i.reach > y0 && i.y - i.reach < y1)
-      .sort((a, b) => a.top - b.top);
+    return this.items.filter((i) => i.x + i.reach > x0 && i.x - i.reach < x1 && i.y + i.reach > y0 && i.y - i.reach < y1);
   }
 
   path(c, item) {
@@ -194,16 +194,11 @@ export class YardCanvas {
     c.strokeStyle = INK;
     for (const [name, items] of Object.entries(groups)) {
       c.setLineDash(name === "doubt" ? [6, 4] : []);
-      c.beginPath();
-      for (const item of items) this.path(c, item);
-      c.stroke();
+      this.each(c, items, () => c.stroke());
     }
     c.setLineDash([]);
-    const hatched = seen.filter((item) => item.forbidden);
-    c.beginPath();
-    for (const item of hatched) this.path(c, item);
     c.fillStyle = this.hatch(c);
-    c.fill();
+    this.each(c, seen.filter((item) => item.forbidden), () => c.fill());
     const chosen = seen.find((item) => item.bundle.identity === this.chosen);
     if (chosen) {
       c.lineWidth = 2;
@@ -221,13 +216,25 @@ export class YardCanvas {
     for (const change of this.data.changes || []) {
       for (const [ends_m, dash, width] of [[change.from_ends_m, [9, 6], 2.5], [change.to_ends_m, [], 4]]) {
         if (!ends_m) continue;
-        c.setLineDash(dash);
-        c.lineWidth = width;
-        c.strokeStyle = SELECT;
-        c.beginPath(); this.path(c, outline(ends_m, change.width_m)); c.stroke();
+        c.beginPath(); this.path(c, outline(ends_m, change.width_m));
+        for (const [style, wide, line] of [["#f2f2f2", width + 3, []], [SELECT, width, dash]]) {
+          c.setLineDash(line);
+          c.lineWidth = wide;
+          c.strokeStyle = style;
+          c.stroke();
+        }
       }
     }
     c.setLineDash([]);
+  }
+
+  // Paths of few outlines: a path of thousands takes seconds.
+  each(c, items, act) {
+    for (let first = 0; first < items.length; first += PATH_ITEMS) {
+      c.beginPath();
+      for (const item of items.slice(first, first + PATH_ITEMS)) this.path(c, item);
+      act();
+    }
   }
 
   hatch(c) {

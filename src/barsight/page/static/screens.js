@@ -65,8 +65,7 @@ export async function stockScreen(place) {
   show(place, h("section", {}, h("h1", {}, t("stock")), h("p", {}, t("stock.summary", stock.agree.length, stock.differences.length, stock.map_id)), h("p", { className: "quiet small" }, t("stock.help")), table([t("stock.kind"), t("stock.name"), t("bundle"), t("what"), t("stock.decision"), t("to.do")], rows, t("stock"))));
 }
 
-const PRIORITY = { "store-broken": 1, "calibration-changed": 1, "lift-failed": 2, "live-degraded": 2, "live-stopped": 2, "bundle-gone": 2, "bundle-moved": 3, "survey-files": 3 };
-export const priority = (alarm) => PRIORITY[alarm.code] || 2;
+export const priority = (alarm) => alarm.priority;
 export const alarmText = (alarm) => `${known(`alarm.${alarm.code}`) ? t(`alarm.${alarm.code}`) : alarm.code}: ${alarm.reason}`;
 export const mark = (alarm) => h("span", { className: `mark ${alarm.state === "cleared" ? "done" : `p${priority(alarm)}`}`, title: t("priority", priority(alarm)) }, String(priority(alarm)));
 

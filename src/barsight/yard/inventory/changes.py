@@ -104,19 +104,38 @@ def displacement(before: Bundle, after: Bundle) -> tuple[float, float, float, fl
     return across, along, after.top_z_m - before.top_z_m, turned
 
 
+def displacement_along(before: Bundle, after: Bundle) -> tuple[float, float]:
+    """Compute the displacement along the old bundle's axis and its sigma, m: of the middle where all ends
+    were seen, else of the end that was seen both times; 0 where there is none.
+    """
+    along = displacement(before, after)[1]
+    if not (any(before.ends_open) or any(after.ends_open)):
+        return along, math.hypot(before.sigma.along_m, after.sigma.along_m)
+    axis = np.array([-math.sin(before.yaw_rad), math.cos(before.yaw_rad)])
+    for end in (0, 1):
+        if not (before.ends_open[end] or after.ends_open[end]):
+            away = after.ends_m[end, :2] - before.ends_m[end, :2]
+            return float(away @ axis), math.hypot(_end_sigma(before, end), _end_sigma(after, end))
+    return 0.0, 0.0
+
+
+def _end_sigma(bundle: Bundle, end: int) -> float:
+    own = bundle.ends_sigma_m[end]
+    if math.isfinite(own):
+        return own
+    parts = (bundle.sigma.along_m, bundle.sigma.length_m / 2)
+    return math.hypot(*(part for part in parts if math.isfinite(part)))
+
+
 def _change(before: Bundle, after: Bundle) -> Change:
-    across, along, up, turned = displacement(before, after)
+    across, _, up, turned = displacement(before, after)
+    along, sigma_along = displacement_along(before, after)
     a, b = before.sigma, after.sigma
     sigmas = (
-        math.hypot(a.lateral_m, b.lateral_m), math.hypot(a.along_m, b.along_m),
+        math.hypot(a.lateral_m, b.lateral_m), sigma_along,
         math.hypot(a.top_z_m, b.top_z_m), math.hypot(a.yaw_rad, b.yaw_rad),
     )  # fmt: skip
-    open_end = any(before.ends_open) or any(after.ends_open)
-    ratios = (
-        _ratio(across, sigmas[0]),
-        0.0 if open_end else _ratio(along, sigmas[1]),
-        _ratio(turned, sigmas[3]),
-    )
+    ratios = (_ratio(across, sigmas[0]), _ratio(along, sigmas[1]), _ratio(turned, sigmas[3]))
     lifted = _ratio(up, sigmas[2])
     kind: Kind = "same"
     if max(ratios) > SIGNIFICANT or (lifted > SIGNIFICANT and up > 0):
