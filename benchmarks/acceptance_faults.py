@@ -19,7 +19,7 @@ import numpy as np
 
 from barsight.acceptance.acceptance import Acceptance, accept
 from barsight.acceptance.budget import BudgetedLoad, ErrorSource, budget
-from barsight.acceptance.error_sources import fit_sources
+from barsight.acceptance.error_sources import SHAPE, fit_sources
 from barsight.acceptance.layout import Area, lay_out
 from barsight.artefacts.plan import AcceptancePlan
 from barsight.calibration.files.rig_file import write_rig_file
@@ -56,8 +56,8 @@ def wrong_rig(rig: StereoRig, yaw_deg: float, baseline: float, focal: float) -> 
 
 
 def lift_errors(found: Acceptance, folder: Path) -> dict[str, tuple[float, float]] | None:
-    """Compute errors and budgeted sigma of the dummy bundle's lift, mm and degrees; None where it wasn't
-    found.
+    """Compute errors and budgeted sigma of the dummy bundle's lift, mm and degrees, its shape being known;
+    None where it wasn't found.
     """
     (dummy,), view = found.plan.dummy_bundle, found.observations[0]
     bundle = view.bundles[dummy.name]
@@ -67,7 +67,8 @@ def lift_errors(found: Acceptance, folder: Path) -> dict[str, tuple[float, float
     load = BudgetedLoad(top, bundle.yaw_rad, bundle.length_m, bundle.width_m, bundle_mass(bundle).kg)
     drawn = np.diag(np.square([np.radians(ORDINARY[0]), *ORDINARY[1:]]))
     rig = ErrorSource("rig", ("yaw", "baseline", "focal"), drawn, "as drawn here")
-    sources = (rig, *fit_sources(bundle, read_heights(folder)))
+    fit = (one for one in fit_sources(bundle, read_heights(folder)) if one.name != SHAPE)
+    sources = (rig, *fit)
     figures = budget(load, view.view, np.zeros(3), sources, samples=100)
     off = [*(1e3 * (top - (dummy.x_m, dummy.y_m, dummy.top_z_m))), np.degrees(bundle.yaw_rad) - dummy.yaw_deg]
     return {one.name: (float(error), one.combined.sigma) for one, error in zip(figures[:4], off, strict=True)}

@@ -15,7 +15,7 @@ from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.pose import Pose
 from barsight.core.types import ImuSamples
-from barsight.simulation.board import draw_board
+from barsight.simulation.boards.drawing import draw_board
 
 SIZE = (752, 480)
 BOARD = parse_board("aprilgrid:6x6:0.088:0.3")

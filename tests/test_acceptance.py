@@ -22,7 +22,7 @@ from barsight.acceptance.certificate import (
 )
 from barsight.acceptance.fitting import FittedPlate, FittedSphere, fit_plate, fit_sphere
 from barsight.acceptance.layout import Area, lay_out
-from barsight.acceptance.observation import LaserAgreement, Observation, ViewGeometry
+from barsight.acceptance.observation import LaserAgreement, Observation, ViewGeometry, nearest_bundle
 from barsight.acceptance.pictures import PictureHealth, check_pictures
 from barsight.acceptance.quantities import Decision, decide, judge_all
 from barsight.acceptance.uncertainty import UncertaintyPart, combine
@@ -48,6 +48,14 @@ def planned() -> AcceptancePlan:
     plan = lay_out(AREA, "test yard")
     assert isinstance(plan, AcceptancePlan)
     return plan
+
+
+def test_a_dummy_of_bars_that_are_too_thin_is_not_measured() -> None:
+    (dummy,) = planned().dummy_bundle
+    for diameter_m, code in ((0.06, "thin-bars"), (dummy.bar_diameter_m, "not-found")):
+        found = nearest_bundle((), replace(dummy, bar_diameter_m=diameter_m), 0.2, 0.0072)
+        assert isinstance(found, Failed) and found.code == code
+        assert code == "not-found" or "8.3 pixels wide, 10 are the least" in found.reason
 
 
 def height_map(z: Callable[[Float64, Float64], Float64], noise_m: float = 1e-3) -> HeightMap:

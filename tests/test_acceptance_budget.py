@@ -8,9 +8,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from barsight.acceptance.budget import ERRORS, FIGURES, BudgetedLoad, ErrorSource, budget
+from barsight.acceptance.error_sources import SHAPE, fit_sources
 from barsight.acceptance.observation import ViewGeometry
 from barsight.cli.main import run
 from barsight.core.arrays import Float64
+from barsight.yard.types import FitSigma
+from lift_yards import laid, map_of, record
 
 VIEW = ViewGeometry(np.array([4.0, 0.2, 8.0]), 1250.0, 0.5)
 ORIGIN = np.array([0.0, -2.0, 0.0])
@@ -103,6 +106,21 @@ def test_what_is_not_known_is_not_budgeted() -> None:
     assert np.isfinite(figures["lift z"].combined.expanded)
     unweighed = BudgetedLoad(LOAD.top_m, LOAD.yaw_rad, LOAD.length_m, LOAD.width_m, np.nan)
     assert np.isnan(budget(unweighed, VIEW, ORIGIN, sources())[6].combined.expanded)
+
+
+def test_what_the_shape_leaves_open_is_a_source_of_its_own() -> None:
+    """A dummy bundle's shape is known: its budget is that of the fit alone."""
+    one, heights = laid(0.0), map_of([laid(0.0)])
+    fit = FitSigma(0.001, 0.02, 0.0006, 0.004, 0.003)
+    parts = {
+        (source.name, *source.errors): float(source.covariance[0, 0]) ** 0.5
+        for source in fit_sources(record(one, fit_sigma=fit), heights)
+    }
+    assert parts["matching, travel and fit", "fit_across"] == pytest.approx(0.001)
+    assert parts[SHAPE, "fit_across"] == pytest.approx((0.003**2 - 0.001**2) ** 0.5)
+    assert (SHAPE, "fit_along") not in parts and (SHAPE, "fit_yaw") not in parts
+    whole = {(one.name, *one.errors) for one in fit_sources(record(one), heights)}
+    assert not any(name[0] == SHAPE for name in whole) and ("matching, travel and fit", "fit_top") in whole
 
 
 @pytest.mark.parametrize(

@@ -13,11 +13,14 @@ from barsight.acceptance.watch import (
     control_charts,
     feature_figures,
     read_watch,
+    tag_figures,
     with_survey,
     write_watch,
 )
 from barsight.cli.main import run
-from barsight.core.errors import InputError
+from barsight.core.errors import Failed, InputError
+from barsight.recording.formats.surveyed_targets import SurveyedTags
+from barsight.registration.tags import PlacedTag
 from test_acceptance import observed, planned
 
 SIGMAS = {"yaw / deg": 0.0018, "baseline / %": 0.05, "pitch / deg": 0.0014, "sharpness of cam0 / log": 0.15}
@@ -103,6 +106,24 @@ def test_fixed_features_watch_mounting_and_yard_frame() -> None:
             charts = control_charts(surveys(np.array(moved), seed))
             alarmed = {one.name.partition(" / ")[0]: one.alarmed_at for one in charts if one.alarmed_at}
             assert list(alarmed) == [name] and 10 < alarmed[name] <= 13
+
+
+def test_tags_on_columns_are_fixed_features() -> None:
+    yard_m = np.array([(0.0, 0.0, 4.0), (8.0, 0.0, 4.0), (8.0, 5.0, 3.0)])
+    listed = SurveyedTags(np.array([3, 4, 5]), yard_m, np.full(3, np.nan), np.zeros(3, bool))
+    lost = Failed("few-pairs", "tag 5 is seen in no pair, 2 are the least")
+    placed = [
+        PlacedTag(k, place + off, np.diag([1e-6, 4e-6, 9e-6]), 4, 0, 30.0, place)
+        for k, place, off in ((3, yard_m[0], (0.002, 0, 0)), (4, yard_m[1], (0.004, 0, -0.001)))
+    ]
+    figures = tag_figures(listed, [*placed, lost])
+    assert not isinstance(figures, Failed)
+    assert [one.name for one in figures] == [f"place of tags along {axis} / mm" for axis in "xyz"]
+    assert [(one.value, one.sigma) for one in figures] == [
+        pytest.approx(pair) for pair in ((3.0, 1.0), (0.0, 2.0), (-0.5, 3.0))
+    ]
+    nothing = tag_figures(listed, [lost] * 3)
+    assert isinstance(nothing, Failed) and "tag 5" in nothing.reason
 
 
 def test_an_approval_begins_charts_anew(tmp_path: Path) -> None:

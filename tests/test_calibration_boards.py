@@ -8,7 +8,7 @@ from barsight.calibration.boards.board import parse_board
 from barsight.calibration.boards.board_views import Corners
 from barsight.calibration.boards.detection import detect
 from barsight.core.errors import ConfigError, Failed
-from barsight.simulation.board import draw_board
+from barsight.simulation.boards.drawing import draw_board
 
 SCALE, MARGIN_M = 2000.0, 0.05
 TILT = np.array([[0.9, 0.12, 40.0], [-0.08, 0.85, 60.0], [1e-4, 5e-5, 1.0]])

@@ -68,10 +68,10 @@ def written(out: Path, error_mm: float = 0.0, sigma_m: float = 0.005, hole: slic
         kept &= ~np.isin(x, np.round(X[hole] * 100).astype(int))
         profile[hole] = np.nan
     surface = fused([view(x[kept], y[kept], z[kept], sigma_m)], out / "s", MapSettings(min_views=1, fill_m=0))
-    write_height(surface, out / "height.tif")
+    write_height(surface, out / "height.tif", "yard:f00d")
     source = np.where(np.isfinite(profile), HeightSource.VISION, HeightSource.UNKNOWN).astype(np.uint8)
     contour = Contour(0, X, X * 0 + 0.1, profile, profile * 0 + sigma_m, source)
-    write_contours((contour,), out / "contour.csv")
+    write_contours((contour,), out / "contour.csv", "yard:f00d")
     return out
 
 

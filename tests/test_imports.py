@@ -41,7 +41,7 @@ ROOMS = {
         ".", "bundles.fitting", "bundles.section", "bundles", "stability", "magnet", "lifting", "inventory",
     ),
     "report": (".", "calibration"),
-    "simulation": ("effects", ".", "worlds"),
+    "simulation": ("effects", ".", "boards", "worlds"),
     "benchmarks": (".", "lift_judge", "stereo", "motion", "yard"),
     "live": ("shared", ".", "crane"),
     "store": (".", "migrations", "migrations.versions"),

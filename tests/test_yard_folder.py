@@ -172,7 +172,7 @@ def test_a_map_of_its_own_frame_cannot_be_compared(
 def test_the_orthophoto_lies_on_the_height_maps_grid(tmp_path: Path) -> None:
     x, y = block(40, 30, column=-7, row=5)
     surface = fused([view(x, y, 0.1 * np.ones(x.shape))], tmp_path / "tiles", MapSettings(min_views=1))
-    write_orthophoto(surface, tmp_path)
+    write_orthophoto(surface, tmp_path, "yard:f00d")
     with tifffile.TiffFile(tmp_path / "ortho.tif") as file:
         page = file.pages.first
         assert page.asarray().shape == surface.shape and page.asarray().dtype == np.uint8

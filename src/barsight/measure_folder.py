@@ -86,7 +86,9 @@ def write_measured(
         compile_ahead(advance, "measure")
         mapped = map_yard(recordings, settings, scratch, advance, keep)
         with in_background(
-            lambda: write_surface(mapped.surface, mapped.free, mapped.tops, staging, mapped.history)
+            lambda: write_surface(
+                mapped.surface, mapped.free, mapped.tops, staging, mapped.frame_id, mapped.history
+            )
         ):
             measured = find_lifts(mapped, request)
         content = summary(measured)

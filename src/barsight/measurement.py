@@ -76,9 +76,9 @@ class Measurement:
     """A measured recording; `surface` reads its tiles from a scratch folder that must still be there.
 
     seconds: by the clock on the wall; the stages' own seconds overlap. yard_frame_id: digest of how the body
-    hangs from the crane; None where the map isn't in the yard's frame. passes: of several recordings; the
-    recording is then the newest. agreements: of vision alone. laser_checks: of the laser before it was fused;
-    None where that wasn't asked for.
+    hangs from the crane; None where the map isn't in the yard's frame. frame_id: name of the frame that all
+    places are in. passes: of several recordings; the recording is then the newest. agreements: of vision
+    alone. laser_checks: of the laser before it was fused; None where that wasn't asked for.
     """
 
     recording_path: Path
@@ -108,4 +108,5 @@ class Measurement:
     stock: StockMatch | None
     travel: Travel
     yard_frame_id: str | None
+    frame_id: str
     passes: tuple[PassRecord, ...] = ()

@@ -58,7 +58,14 @@ from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.magnet.description import Magnet, load_magnet
 from barsight.yard.sections import surface_map
 from barsight.yard.types import Bundle, YardMap
-from barsight.yard_frame import calibration_id, frame_notes, frame_of, with_shared, yard_frame_id
+from barsight.yard_frame import (
+    calibration_id,
+    frame_name,
+    frame_notes,
+    frame_of,
+    with_shared,
+    yard_frame_id,
+)
 
 MIN_DOWN_COSINE = 0.5
 """Cosine between the optical axis and straight down; a rig over a yard looks down."""
@@ -103,6 +110,11 @@ class MappedYard:
     def newest(self) -> MappedPass:
         """Return the pass that was recorded last."""
         return self.passes[-1]
+
+    @property
+    def frame_id(self) -> str:
+        """Return the name of the frame that all places are in."""
+        return frame_name(self.newest.probed.source, self.trajectory, self.newest.probed.inputs)
 
     @property
     def history(self) -> PlaceHistory | None:
@@ -233,6 +245,7 @@ def find_lifts(mapped: MappedYard, request: LiftRequest) -> Measurement:
         stock=stock,
         travel=travel,
         yard_frame_id=yard_frame_id(source, trajectory),
+        frame_id=mapped.frame_id,
         passes=_records(mapped, travels),
     )
 

@@ -86,11 +86,22 @@ def recording_id(inputs: Mapping[str, str]) -> str:
 
 def yard_frame_id(recording: Recording, trajectory: Trajectory) -> str | None:
     """Compute a digest of what places the map in the yard; None where it isn't there."""
+    return placing_id(recording) if trajectory.reference == "yard" else None
+
+
+def placing_id(recording: Recording) -> str | None:
+    """Compute a digest of what can place a recording in the yard; None where nothing does."""
     crane, frame = recording.crane(), frame_of(recording)
-    if trajectory.reference != "yard":
-        return None
     mounted = None if crane is None else mounting_id(crane)
     return mounted if frame is None else json_digest([mounted, frame.digest])[:ID_DIGITS]
+
+
+def frame_name(recording: Recording, trajectory: Trajectory, inputs: Mapping[str, str]) -> str:
+    """Name the frame that a trajectory is in: `yard:` and the digest of what places it there, or `world:` and
+    that of the recording's inputs, whose world no other recording shares.
+    """
+    placed = yard_frame_id(recording, trajectory)
+    return f"world:{recording_id(inputs)}" if placed is None else f"yard:{placed}"
 
 
 def crane_in_yard(crane: CraneSamples, frame: YardFrame) -> CraneSamples:

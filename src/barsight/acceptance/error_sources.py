@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from math import nan
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,8 @@ from barsight.yard.weight import bundle_mass
 
 REMEDY = "measure the recording again"
 MAX_SIGMA_PX = 100.0
+SHAPE = "shape of the bundle"
+"""Source of what a bundle that isn't surely the outline leaves open; a dummy bundle's shape is known."""
 MIN_TOUCHES = 3
 MAX_APART_M = 0.1
 """Touch-downs further apart than this along one axis aren't of one magnet at rest."""
@@ -60,6 +62,10 @@ def measured_load(
     summary, _ = open_folder(folder, lifts=False)
     if summary["reference"] != "yard":
         raise InputError(folder, "isn't in the yard's frame", "measure with encoders, or with --yard")
+    if certificate is not None:
+        _expect_own(certificate, read_certificate(certificate), summary)
+    if offset is not None:
+        _expect_own(folder / "result.json", summary, asdict(offset), "the magnet's offset")
     bundle = _chosen(folder, number)
     view = view_geometry(folder, measured_rig(summary))
     heights = read_heights(folder)
@@ -83,6 +89,15 @@ def measured_load(
     top = np.array([bundle.centre_m[0], bundle.centre_m[1], bundle.top_z_m])
     load = BudgetedLoad(top, bundle.yaw_rad, bundle.length_m, bundle.width_m, mass.kg)
     return MeasuredLoad(bundle.id, load, view, origin, tuple(sources), tuple(assumed))
+
+
+def _expect_own(path: Path, told: dict[str, Any], other: dict[str, Any], whose: str = "the folder") -> None:
+    """Raise InputError where a file is of another rig or yard frame than what it is used with."""
+    for name in ("calibration_id", "yard_frame_id"):
+        if told.get(name) != other.get(name):
+            what = name.removesuffix("_id").replace("_", " ")
+            problem = f"is of another {what} ({told.get(name)}; {whose} has {other.get(name)})"
+            raise InputError(path, problem, "accept this rig in this yard frame, and touch down with it")
 
 
 def _calibration_sigma_px(summary: dict[str, Any], path: Path) -> float:
@@ -116,20 +131,27 @@ def fit_sources(bundle: Bundle, heights: YardMap) -> list[ErrorSource]:
     known = np.isfinite(part.sigma_m)
     views = float(np.median(part.views[known])) if known.any() else 1.0
     cell_m = float(np.median(part.sigma_m[known])) if known.any() else nan
-    sigma, free = bundle.sigma, max(views - 1, 1.0)
+    sigma, fit, free = bundle.sigma, bundle.fit_sigma or bundle.sigma, max(views - 1, 1.0)
     told = {
-        "fit_along": sigma.along_m, "fit_across": sigma.lateral_m, "fit_top": sigma.top_z_m,
-        "fit_yaw": sigma.yaw_rad, "fit_width": sigma.width_m, "fit_mass": bundle_mass(bundle).sigma_kg,
+        "fit_along": (sigma.along_m, fit.along_m), "fit_across": (sigma.lateral_m, fit.lateral_m),
+        "fit_top": (sigma.top_z_m, fit.top_z_m), "fit_yaw": (sigma.yaw_rad, fit.yaw_rad),
+        "fit_width": (sigma.width_m, fit.width_m),
     }  # fmt: skip
-    sources = [
-        ErrorSource(
-            "matching, travel and fit", (name,), np.array([[value**2]]), "bundles.json", "t",
-            free,
-        )
-        for name, value in told.items()
-    ]  # fmt: skip
+    mass_kg = bundle_mass(bundle).sigma_kg
+    sources = [_fit_source("fit_mass", mass_kg**2, free)]
+    for name, (whole, alone) in told.items():
+        sources.append(_fit_source(name, alone**2, free))
+        rest = whole**2 - alone**2
+        if rest > 0:
+            by = "bundles.json: sigma over fit_sigma"
+            sources.append(ErrorSource(SHAPE, (name,), np.array([[rest]]), by))
     cell = np.array([[cell_m**2]])
     return [*sources, ErrorSource("noise of a cell", ("fit_height",), cell, "height.tif", "t", free)]
+
+
+def _fit_source(name: str, variance: float, free: float) -> ErrorSource:
+    covariance = np.array([[variance]])
+    return ErrorSource("matching, travel and fit", (name,), covariance, "bundles.json", "t", free)
 
 
 def _frame_source(summary: dict[str, Any], assumed: list[str]) -> tuple[list[ErrorSource], Float64]:

@@ -19,6 +19,10 @@ from barsight.result_folder import open_folder, read_heights, read_path
 from barsight.yard.inventory.bundle_file import read_bundles
 from barsight.yard.types import Bundle
 
+MIN_BAR_PX = 10.0
+"""Width of a dummy bundle's bar on the floor from which its sides are found: bars of 8 pixels put them on
+another row in two of five yards."""
+
 
 @dataclass(frozen=True)
 class LaserAgreement:
@@ -69,23 +73,35 @@ def observe(folder: Path, plan: AcceptancePlan, rig: StereoRig, recording: str) 
         remedy = "give a recording with encoders, or a yard file (--yard)"
         raise InputError(recording, "was not measured in the yard's frame", remedy)
     heights, search = read_heights(folder), plan.conditions.search_m
-    bundles = read_bundles(folder / "bundles.json")
+    bundles, view = read_bundles(folder / "bundles.json"), view_geometry(folder, rig)
+    ground_px_m = float(view.camera_m[2]) / view.focal_px
     return Observation(
         recording, identity.map_id, identity.calibration_id, identity.yard_frame_id, identity.is_simulated,
         {one.name: fit_sphere(heights, one, search) for one in plan.sphere},
         {one.name: fit_plate(heights, one, search) for one in plan.plate},
-        {one.name: _nearest(bundles, one, search) for one in plan.dummy_bundle},
+        {one.name: nearest_bundle(bundles, one, search, ground_px_m) for one in plan.dummy_bundle},
         tuple(
             LaserAgreement(row["profile"], row["smooth_bias_mm"], row["equivalence_mm"])
             for row in summary["agreement"] or []
             if row.get("equivalence_mm") is not None
         ),
-        view_geometry(folder, rig),
+        view,
         tuple(str(one["code"]) for one in summary["warnings"] or []),
     )  # fmt: skip
 
 
-def _nearest(bundles: tuple[Bundle, ...], dummy: DummyBundle, search_m: float) -> Bundle | Failed:
+def nearest_bundle(
+    bundles: tuple[Bundle, ...], dummy: DummyBundle, search_m: float, ground_px_m: float
+) -> Bundle | Failed:
+    """Find the bundle nearest to a dummy's place. Failed `not-found`, or `thin-bars` where its sides can't be
+    told with pixels of this size on the floor.
+    """
+    wide_px = dummy.bar_diameter_m / ground_px_m
+    if wide_px < MIN_BAR_PX:
+        seen = f"its bars are {wide_px:.1f} pixels wide, {MIN_BAR_PX:g} are the least"
+        return Failed(
+            "thin-bars", f"{dummy.name}: {seen}: take thicker bars ({MIN_BAR_PX * ground_px_m:.3f} m)"
+        )
     place = np.array([dummy.x_m, dummy.y_m])
     near = [b for b in bundles if np.linalg.norm(b.centre_m[:2] - place) < search_m]
     if not near:

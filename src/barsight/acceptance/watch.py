@@ -18,6 +18,8 @@ from barsight.core.json_values import json_value
 from barsight.core.reading.json_schema import expect_schema, list_schema, record_schema
 from barsight.core.reading.sealed_json import read_sealed, write_sealed
 from barsight.motion.rig_check.drift_check import RigCheck
+from barsight.recording.formats.surveyed_targets import SurveyedTags
+from barsight.registration.tags import PlacedTag
 
 SCHEMA_VERSION = 1
 REMEDY = "give the record that barsight verify wrote, or another name to begin a new one"
@@ -32,6 +34,7 @@ _FIGURE = record_schema(name=_TEXT, value={"type": "number"}, sigma={"type": "nu
 _SURVEY = record_schema(
     recording=_TEXT, recording_id=_TEXT, calibration_id=_TEXT, figures=list_schema(_FIGURE)
 )
+_SURVEY["properties"]["yard_frame_id"] = {"type": ["string", "null"]}  # earlier versions didn't write it
 _APPROVAL = record_schema(
     who=_TEXT, why=_TEXT, at=_TEXT, calibration_id=_TEXT, surveys_before={"type": "integer", "minimum": 0}
 )
@@ -54,12 +57,15 @@ class WatchedFigure:
 
 @dataclass(frozen=True)
 class WatchedSurvey:
-    """A survey: digest of its recording's inputs, of its calibration, and its figures."""
+    """A survey: digest of its recording's inputs, of its calibration, its figures, and the digest of what
+    places it in the yard; None where nothing does, or nobody said.
+    """
 
     recording: str
     recording_id: str
     calibration_id: str
     figures: tuple[WatchedFigure, ...]
+    yard_frame_id: str | None = None
 
 
 @dataclass(frozen=True)
@@ -158,6 +164,26 @@ def feature_figures(plan: AcceptancePlan, seen: Observation) -> tuple[WatchedFig
     return tuple(figures)
 
 
+def tag_figures(
+    listed: SurveyedTags, placed: Sequence[PlacedTag | Failed]
+) -> tuple[WatchedFigure, ...] | Failed:
+    """Take the mean error along each axis of surveyed tags on columns and floor, mm, with the sigma that they
+    share. Failed `not-found` where none was placed.
+    """
+    found = [
+        (1e3 * (tag.place_m - place), 1e6 * np.diag(tag.covariance_m2))
+        for tag, place in zip(placed, listed.yard_m, strict=True)
+        if not isinstance(tag, Failed)
+    ]
+    if not found:
+        return Failed("not-found", "; ".join(one.reason for one in placed if isinstance(one, Failed)))
+    off, variance = (np.mean(part, axis=0) for part in zip(*found, strict=True))
+    return tuple(
+        WatchedFigure(f"place of tags along {axis} / mm", float(off[k]), float(variance[k] ** 0.5))
+        for k, axis in enumerate("xyz")
+    )
+
+
 def control_charts(surveys: Sequence[WatchedSurvey]) -> tuple[ControlChart, ...]:
     """Compute the charts of all figures over surveys of one approval, the oldest first."""
     names = dict.fromkeys(figure.name for survey in surveys for figure in survey.figures)
@@ -206,7 +232,9 @@ def write_watch(record: WatchRecord, path: Path) -> None:
 
 
 def with_survey(record: WatchRecord, survey: WatchedSurvey, path: Path) -> WatchRecord:
-    """Add a survey. Raises InputError for one that is there already, or of a calibration nobody approved."""
+    """Add a survey. Raises InputError for one that is there already, or of a calibration or yard frame that
+    nobody approved.
+    """
     if any(one.recording_id == survey.recording_id for one in record.surveys):
         raise InputError(survey.recording, f"is in {path.name} already", "record a new survey")
     known = record.approvals[-1].calibration_id if record.approvals else (
@@ -215,9 +243,14 @@ def with_survey(record: WatchRecord, survey: WatchedSurvey, path: Path) -> Watch
     if survey.calibration_id != known:
         problem = f"has calibration {survey.calibration_id}, but {path.name} watches {known}"
         raise InputError(survey.recording, problem, "approve the new calibration: --approve WHO --why WHY")
+    for before in record.since_approval[-1:]:
+        if None not in (ids := (survey.yard_frame_id, before.yard_frame_id)) and ids[0] != ids[1]:
+            problem = f"lies in yard frame {ids[0]}, but {path.name} watches {ids[1]}"
+            raise InputError(survey.recording, problem, "approve the new yard frame: --approve WHO --why WHY")
     return replace(record, surveys=(*record.surveys, survey))
 
 
 def _survey(one: dict[str, Any]) -> WatchedSurvey:
     figures = tuple(WatchedFigure(**figure) for figure in one["figures"])
-    return WatchedSurvey(one["recording"], one["recording_id"], one["calibration_id"], figures)
+    told = one["recording"], one["recording_id"], one["calibration_id"]
+    return WatchedSurvey(*told, figures, one.get("yard_frame_id"))

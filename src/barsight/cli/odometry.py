@@ -29,6 +29,7 @@ from barsight.recording.open import open_recording
 from barsight.recording.sensor_selection import SelectedSensors
 from barsight.report.odometry_page import OdometryResult, write_odometry_page
 from barsight.report.result_files import write_relative, write_trajectory
+from barsight.yard_frame import frame_name
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -75,7 +76,8 @@ def run(arguments: Sequence[str]) -> None:
             frames = len(source.index.stamps_ns)
             result = OdometryResult(recording.resolve().name, frames, trajectory, example, drift, errors)
             with atomic_directory(out, replace=True) as folder:
-                write_trajectory(trajectory, folder / "trajectory.tum")
+                frame_id = frame_name(source, trajectory, source.digests())
+                write_trajectory(trajectory, folder / "trajectory.tum", frame_id)
                 write_relative(trajectory, folder / "relative.csv")
                 write_odometry_page(result, folder / "report.html", folder / "odometry.json")
         lines = [] if truth is None else _drift_lines(drift)

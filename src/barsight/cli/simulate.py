@@ -7,19 +7,24 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+from rich.console import Console
 
 from barsight.artefacts.plan import read_plan
+from barsight.calibration.boards.board import parse_board
 from barsight.cli.arguments import call, config_path, load_settings
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError
 from barsight.core.settings.values import MAX_VALUE
 from barsight.recording.formats.surveyed_targets import read_tags
+from barsight.simulation.boards.pictures import photograph_board
 from barsight.simulation.passes import simulate_passes
 from barsight.simulation.settings import SimulationSettings
 from barsight.simulation.simulate import laid_stock, simulate
 from barsight.simulation.worlds.artefacts import lay_artefacts
 from barsight.simulation.worlds.tags import lay_tags
+
+MAX_VIEWS = 200
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -34,6 +39,8 @@ def run(arguments: Sequence[str]) -> None:
         artefacts: Path | None = None,
         tags: Path | None = None,
         tag_m: float = 0.3,
+        board: str | None = None,
+        views: int = 30,
     ) -> None:
         """Render a recording of a bar yard, with exact truth, as an EuRoC folder.
 
@@ -49,12 +56,18 @@ def run(arguments: Sequence[str]) -> None:
             tags: A .csv as calibrate yard --tags takes it: its AprilTags (36h11) lie there too, face up, on
                 thin plates, exactly where it says.
             tag_m: Side of a tag's black square.
+            board: A calibration board (see barsight calibrate stereo): pictures of it by the rig that all
+                other recordings of these settings have, instead of a recording.
+            views: Pairs of pictures of the board.
         """
         console = SafeConsole(stderr=True)
         if (artefacts or tags) is not None and (draw is not None or settings.passes.trolley_y_m):
             raise ConfigError("simulate: --artefacts or --tags takes no drawn world and no passes")
         if not 0.01 <= tag_m <= 2:
             raise ConfigError(f"simulate: --tag-m {tag_m:g} must lie between 0.01 and 2")
+        if board is not None:
+            _photograph(out, board, views, settings, console)
+            return
         laid = None if artefacts is None else lay_artefacts(read_plan(artefacts), settings)
         if tags is not None:
             laid = lay_tags(laid or laid_stock(settings), read_tags(tags), tag_m, settings)
@@ -68,6 +81,16 @@ def run(arguments: Sequence[str]) -> None:
         console.print(f"simulated recording: {out}", soft_wrap=True, highlight=False, markup=False)
 
     call(command, "simulate", arguments)
+
+
+def _photograph(out: Path, board: str, views: int, settings: SimulationSettings, console: Console) -> None:
+    if not 1 <= views <= MAX_VIEWS:
+        raise ConfigError(f"simulate: --views {views} must lie between 1 and {MAX_VIEWS}")
+    with stages(console) as advance:
+        photograph_board(
+            out, parse_board(board), views, settings, lambda done, total: advance("board", done, total)
+        )
+    console.print(f"simulated board pictures: {out}", soft_wrap=True, highlight=False, markup=False)
 
 
 def _simulate_drawn(

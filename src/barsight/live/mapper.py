@@ -18,7 +18,7 @@ from barsight.map_building import matching
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.recording.sensor_selection import SelectedSensors
 from barsight.report.result_files import write_height
-from barsight.yard_frame import in_yard
+from barsight.yard_frame import in_yard, placing_id
 
 POLL_S = 0.02
 NICENESS = 10
@@ -60,6 +60,8 @@ class Mapping:
         self._link, self._recording = link, recording
         source = in_yard(SelectedSensors(recording, link.settings.use), link.settings.yard)
         self._pairs = RectifiedPairs(source, Rectifier(recording.rig), link.checkpoints)
+        placed = placing_id(source)
+        self._frame_id = "world" if placed is None else f"yard:{placed}"
         checkpoints = link.checkpoints if link.settings.self_calibrate == "none" else None
         self._match = matching(self._pairs, link.settings, checkpoints, Stopwatch())
         self._frames, self._tiles = link.frames(), link.tiles()
@@ -103,5 +105,5 @@ class Mapping:
             return False
         if surface is None:
             return False
-        write_height(surface, self._link.folder.parent / LIVE_MAP)
+        write_height(surface, self._link.folder.parent / LIVE_MAP, self._frame_id)
         return True

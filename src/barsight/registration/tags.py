@@ -66,15 +66,25 @@ class PlacedTag:
 
 @dataclass(eq=False)
 class SeenTags:
-    """Sightings by tag number, pictures that show a tag twice, by its number, and pairs looked at."""
+    """Sightings by tag number, pictures that show a tag twice, by its number, and pairs looked at. names: of
+    targets that bear no number; known_px: noise of a middle in one picture where rows don't tell it.
+    """
 
     sightings: dict[int, list[TagSighting]] = field(default_factory=dict)
     twice: Counter[int] = field(default_factory=Counter)
     pairs: int = 0
+    names: tuple[str, ...] = ()
+    known_px: float | None = None
+
+    def name(self, number: int) -> str:
+        """Name a tag or target."""
+        return f"target {self.names[number]}" if self.names else f"tag {number}"
 
     @property
     def sigma_px(self) -> float:
         """Estimate the noise of a middle in one picture, by how rows differ between the pictures."""
+        if self.known_px is not None:
+            return self.known_px
         rows = [abs(one.rows_px) for seen in self.sightings.values() for one in seen]
         return max(MIN_SIGMA_PX, 1.4826 * float(np.median(rows)) / 2**0.5) if rows else MIN_SIGMA_PX
 
@@ -89,18 +99,19 @@ class SeenTags:
                 ]
                 for number, seen in self.sightings.items()
             },
-            self.twice, self.pairs,
+            self.twice, self.pairs, self.names, self.known_px,
         )  # fmt: skip
 
     def place(self, number: int) -> PlacedTag | Failed:
         """Combine a tag's pairs. Failed `few-pairs`, `ambiguous`."""
         seen = self.sightings.get(number, [])
         if self.twice[number] >= MIN_PAIRS:
-            return Failed("ambiguous", f"tag {number} is there twice: each number may lie in the yard once")
+            name = self.name(number)
+            return Failed("ambiguous", f"{name} is there twice: each number may lie in the yard once")
         if len(seen) < MIN_PAIRS:
             count = "no pair" if not seen else "1 pair only"
-            return Failed("few-pairs", f"tag {number} is seen in {count}, {MIN_PAIRS} are the least")
-        return _combined(number, seen, self.sigma_px)
+            return Failed("few-pairs", f"{self.name(number)} is seen in {count}, {MIN_PAIRS} are the least")
+        return _combined(number, self.name(number), seen, self.sigma_px)
 
 
 def see_tags(
@@ -193,7 +204,7 @@ def _point(
     return depth * ray, rows.T @ rows
 
 
-def _combined(number: int, seen: list[TagSighting], sigma_px: float) -> PlacedTag | Failed:
+def _combined(number: int, name: str, seen: list[TagSighting], sigma_px: float) -> PlacedTag | Failed:
     """Combine a tag's pairs, without those that stray; the poses' share stays whole, since neighbours err
     alike.
     """
@@ -209,7 +220,7 @@ def _combined(number: int, seen: list[TagSighting], sigma_px: float) -> PlacedTa
         kept = near & (chi2 <= MAX_CHI2 * max(1.0, float(np.median(chi2)) / MEDIAN_CHI2))
         if (~near).sum() >= 2 or kept.sum() < MIN_PAIRS:
             apart = float(np.linalg.norm(np.ptp(places, axis=0)))
-            reason = f"tag {number} is seen at places {apart:.2f} m apart: it is there twice, or was moved"
+            reason = f"{name} is seen at places {apart:.2f} m apart: it is there twice, or was moved"
             return Failed("ambiguous", reason)
         total = weights[kept].sum(axis=0)
         middle = np.linalg.solve(total, np.einsum("kij,kj->i", weights[kept], places[kept]))

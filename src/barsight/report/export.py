@@ -1,7 +1,7 @@
 """Export a measured cloud or map to other programs' formats, chosen by the file's name.
 
-All keep metres and the reference frame. LAS and PCD keep sigma and view count as fields of their own; E57 has
-no place for them.
+All keep metres and the reference frame, which LAS (system identifier), PCD (a comment) and E57 (the scan's
+name) say too. LAS and PCD keep sigma and view count as fields of their own; E57 has no place for them.
 """
 
 from __future__ import annotations
@@ -29,8 +29,9 @@ def export(folder: Path, target: Path) -> int:
     or has
     a file that was changed, OutputError where `target` can't be written.
     """
+    frame_id = ""
     if (folder / "result.json").is_file():
-        open_folder(folder, lifts=False, cloud=True)
+        frame_id = str(open_folder(folder, lifts=False, cloud=True)[0].get("frame_id") or "")
     kind = target.suffix.lower()
     copies = {".ply": "cloud.ply", ".tif": "height.tif", ".tiff": "height.tif"}
     if kind in copies:
@@ -46,7 +47,7 @@ def export(folder: Path, target: Path) -> int:
     cloud = read_cloud(folder / "cloud.ply")
     with atomic_path(target) as path:
         try:
-            _WRITERS[kind](cloud, path)
+            _WRITERS[kind](cloud, path, frame_id)
         except (OverflowError, ValueError) as error:
             raise InputError(folder / "cloud.ply", f"doesn't fit a {kind} file ({error})", REMEDY) from error
         except (OSError, BarsightError):
@@ -57,13 +58,14 @@ def export(folder: Path, target: Path) -> int:
     return cloud.total
 
 
-def _write_las(cloud: Cloud, path: Path, *, compress: bool) -> None:
+def _write_las(cloud: Cloud, path: Path, frame_id: str, *, compress: bool) -> None:
     with extra("export"):
         import laspy
     header = laspy.LasHeader(point_format=6, version="1.4")
     header.add_extra_dims(
         [laspy.ExtraBytesParams("sigma_z", "float32"), laspy.ExtraBytesParams("views", "uint16")]
     )
+    header.system_identifier = frame_id or "OTHER"
     header.scales = np.full(3, _LAS_STEP_M)
     header.offsets = np.floor(cloud.xyz_m.min(axis=0)).astype(np.float64)
     las = laspy.LasData(header)
@@ -76,37 +78,42 @@ def _write_las(cloud: Cloud, path: Path, *, compress: bool) -> None:
         las.write(file, do_compress=compress)
 
 
-def _write_pcd(cloud: Cloud, path: Path) -> None:
+def _write_pcd(cloud: Cloud, path: Path, frame_id: str) -> None:
     with extra("export"):
         from pypcd4 import PointCloud
     columns = np.column_stack([cloud.xyz_m, cloud.intensity, cloud.sigma_m, cloud.views])
     fields = ("x", "y", "z", "intensity", "sigma_z", "views")
     PointCloud.from_points(columns.astype(np.float32), fields, (np.float32,) * 6).save(path)
+    if frame_id:
+        path.write_bytes(f"# frame {frame_id}\n".encode() + path.read_bytes())
 
 
-def _write_e57(cloud: Cloud, path: Path) -> None:
+def _write_e57(cloud: Cloud, path: Path, frame_id: str) -> None:
     with extra("export"):
         import pye57
     x, y, z = cloud.xyz_m.T.astype(np.float64)
     file = pye57.E57(str(path), mode="w")
     try:
-        file.write_scan_raw({"cartesianX": x, "cartesianY": y, "cartesianZ": z, "intensity": cloud.intensity})
+        values = {"cartesianX": x, "cartesianY": y, "cartesianZ": z, "intensity": cloud.intensity}
+        file.write_scan_raw(values, name=frame_id or None)
         file.close()
     except BaseException:
         file.close = lambda: None  # its destructor would fail again and print it
         raise
 
 
-def _write_csv(cloud: Cloud, path: Path) -> None:
+def _write_csv(cloud: Cloud, path: Path, frame_id: str) -> None:
     columns = np.column_stack([cloud.xyz_m, cloud.intensity, cloud.sigma_m, cloud.views])
     head = "x_m,y_m,z_m,intensity,sigma_m,views"
-    form = ("%.4f", "%.4f", "%.5f", "%d", "%.5f", "%d")
-    np.savetxt(path, columns, form, delimiter=",", header=head, comments="")
+    form = "%.4f,%.4f,%.5f,%d,%.5f,%d"
+    if frame_id:
+        head, form = f"{head},frame", f"{form},{frame_id}"
+    np.savetxt(path, columns, form, header=head, comments="")
 
 
-_WRITERS: dict[str, Callable[[Cloud, Path], None]] = {
-    ".las": lambda cloud, path: _write_las(cloud, path, compress=False),
-    ".laz": lambda cloud, path: _write_las(cloud, path, compress=True),
+_WRITERS: dict[str, Callable[[Cloud, Path, str], None]] = {
+    ".las": lambda cloud, path, frame_id: _write_las(cloud, path, frame_id, compress=False),
+    ".laz": lambda cloud, path, frame_id: _write_las(cloud, path, frame_id, compress=True),
     ".pcd": _write_pcd,
     ".e57": _write_e57,
     ".csv": _write_csv,

@@ -22,17 +22,19 @@ NO_DATA = 0
 _COLUMNS = 1024
 
 
-def georeference(surface: Surface) -> list[tuple[int, str, int, Any, bool]]:
-    """Make the tags that place a raster of the surface: a projected system of its own (32767), pixels as
-    areas, m.
+def georeference(surface: Surface, frame_id: str) -> list[tuple[int, str, int, Any, bool]]:
+    """Make the tags that place a raster of the surface: a projected system of its own (32767) that is cited
+    by its frame, pixels as areas, m.
     """
-    cell = surface.cell_m
+    cell, citation = surface.cell_m, f"{frame_id}|"
     left, top = (surface.columns[0] - 0.5) * cell, (surface.rows[1] - 0.5) * cell
-    keys = (1, 1, 0, 4, 1024, 0, 1, 1, 1025, 0, 1, 1, 3072, 0, 1, 32767, 3076, 0, 1, 9001)
+    cited = (1026, 34737, len(citation), 0)
+    keys = (1, 1, 0, 5, 1024, 0, 1, 1, 1025, 0, 1, 1, *cited, 3072, 0, 1, 32767, 3076, 0, 1, 9001)
     return [
         (33550, "d", 3, (cell, cell, 0.0), True),
         (33922, "d", 6, (0.0, 0.0, 0.0, left, top, 0.0), True),
         (34735, "H", len(keys), keys, True),
+        (34737, "s", 0, citation, True),
     ]
 
 
@@ -49,30 +51,31 @@ def orthophoto(surface: Surface) -> UInt8:
     return picture
 
 
-def write_orthophoto(surface: Surface, folder: Path) -> None:
+def write_orthophoto(surface: Surface, folder: Path, frame_id: str) -> None:
     """Write ortho.tif and ortho.png, each whole or not at all."""
     picture = orthophoto(surface)
-    _write_gray(surface, picture, folder / "ortho.tif")
+    _write_gray(surface, picture, folder / "ortho.tif", frame_id)
     with atomic_path(folder / "ortho.png") as path:
         path.write_bytes(cv2.imencode(".png", picture)[1].tobytes())
 
 
-def write_top_photo(surface: Surface, tops: TopPhoto, target: Path) -> None:
+def write_top_photo(surface: Surface, tops: TopPhoto, target: Path, frame_id: str) -> None:
     """Write the pictures' mean gray level at the height of the tops, on height.tif's grid."""
     rows, columns = surface.shape
-    _write_gray(surface, tops.window(surface.columns[0], surface.rows[0], columns, rows)[::-1], target)
+    photo = tops.window(surface.columns[0], surface.rows[0], columns, rows)[::-1]
+    _write_gray(surface, photo, target, frame_id)
 
 
-def write_passes(surface: Surface, history: PlaceHistory, target: Path) -> None:
+def write_passes(surface: Surface, history: PlaceHistory, target: Path, frame_id: str) -> None:
     """Write which of several passes saw each cell last, from 1, on height.tif's grid."""
     x_m, y_m = (
         surface.cell_m * (first[0] + np.arange(count))
         for first, count in ((surface.columns, surface.shape[1]), (surface.rows, surface.shape[0]))
     )
-    _write_gray(surface, history.newest_pass(x_m, y_m)[::-1], target)
+    _write_gray(surface, history.newest_pass(x_m, y_m)[::-1], target, frame_id)
 
 
-def _write_gray(surface: Surface, picture: UInt8, target: Path) -> None:
+def _write_gray(surface: Surface, picture: UInt8, target: Path, frame_id: str) -> None:
     with atomic_path(target) as path:
         tifffile.imwrite(
             path,
@@ -82,5 +85,5 @@ def _write_gray(surface: Surface, picture: UInt8, target: Path) -> None:
             compression="zlib",
             metadata=None,
             software=f"barsight {barsight.__version__}",
-            extratags=[*georeference(surface), (42113, "s", 0, str(NO_DATA), True)],
+            extratags=[*georeference(surface, frame_id), (42113, "s", 0, str(NO_DATA), True)],
         )

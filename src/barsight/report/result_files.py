@@ -44,26 +44,28 @@ _CLOUD_POINT = np.dtype(
 
 
 def write_surface(
-    surface: Surface, free: FreeSpace, tops: TopPhoto, folder: Path, history: PlaceHistory | None = None
-) -> None:
+    surface: Surface, free: FreeSpace, tops: TopPhoto, folder: Path, frame_id: str,
+    history: PlaceHistory | None = None,
+) -> None:  # fmt: skip
     """Write what the map alone fills into an existing folder: cloud, heights, free space, photos, and of
-    several passes which saw each cell last.
+    several passes which saw each cell last; each with the frame that its places are in.
     """
-    write_height(surface, folder / "height.tif")
-    write_free(surface, free, folder / "free.tif")
-    write_orthophoto(surface, folder)
-    write_top_photo(surface, tops, folder / "tops.tif")
-    write_cloud(surface, folder / "cloud.ply")
+    write_height(surface, folder / "height.tif", frame_id)
+    write_free(surface, free, folder / "free.tif", frame_id)
+    write_orthophoto(surface, folder, frame_id)
+    write_top_photo(surface, tops, folder / "tops.tif", frame_id)
+    write_cloud(surface, folder / "cloud.ply", frame_id)
     if history is not None:
-        write_passes(surface, history, folder / "passes.tif")
+        write_passes(surface, history, folder / "passes.tif", frame_id)
 
 
 def write_tables(measurement: Measurement, folder: Path) -> None:
     """Write trajectory, contours and the laser's profiles into an existing folder."""
-    write_trajectory(measurement.trajectory, folder / "trajectory.tum")
-    write_contours(measurement.contours, folder / "contour.csv")
+    frame_id = measurement.frame_id
+    write_trajectory(measurement.trajectory, folder / "trajectory.tum", frame_id)
+    write_contours(measurement.contours, folder / "contour.csv", frame_id)
     if measurement.laser:
-        write_laser_csv(measurement.laser, folder / "laser.csv")
+        write_laser_csv(measurement.laser, folder / "laser.csv", frame_id)
 
 
 def write_results(measurement: Measurement, identity: MapIdentity, folder: Path) -> None:
@@ -76,10 +78,13 @@ def write_results(measurement: Measurement, identity: MapIdentity, folder: Path)
         write_preview(measurement.preview, folder / "preview.png")
 
 
-def write_trajectory(trajectory: Trajectory, target: Path) -> None:
-    """Write TUM: seconds with nine decimals, x y z qx qy qz qw of `yard_from_body` (or `world_from_body`)."""
+def write_trajectory(trajectory: Trajectory, target: Path, frame_id: str) -> None:
+    """Write TUM: seconds with nine decimals, x y z qx qy qz qw of `yard_from_body` (or `world_from_body`).
+    The frame stands in a comment.
+    """
     with atomic_path(target) as path, path.open("w", encoding="ascii") as file:
         file.write(f"# {trajectory.reference}_from_body: timestamp_s x y z qx qy qz qw\n")
+        file.write(f"# frame {frame_id}\n")
         for frame in trajectory.frames:
             pose = frame.reference_from_body
             numbers = (*pose.translation, *pose.quaternion_xyzw)
@@ -106,8 +111,8 @@ def write_relative(trajectory: Trajectory, target: Path) -> None:
             file.write(f"{old.stamp_ns},{new.stamp_ns},{pose},{spread}\n")
 
 
-def write_cloud(surface: Surface, target: Path) -> None:
-    """Write binary little-endian PLY of every height that enough views support."""
+def write_cloud(surface: Surface, target: Path, frame_id: str) -> None:
+    """Write binary little-endian PLY of every height that enough views support, the frame in a comment."""
     count = sum(len(part.views) for part in surface.cloud())
     fields = "".join(
         f"property {kind} {name}\n"
@@ -117,7 +122,7 @@ def write_cloud(surface: Surface, target: Path) -> None:
     )
     header = (
         f"ply\nformat binary_little_endian 1.0\ncomment barsight {barsight.__version__}\n"
-        f"element vertex {count}\n{fields}end_header\n"
+        f"comment frame {frame_id}\nelement vertex {count}\n{fields}end_header\n"
     )
     with atomic_path(target) as path, path.open("wb") as file:
         file.write(header.encode("ascii"))
@@ -130,7 +135,7 @@ def write_cloud(surface: Surface, target: Path) -> None:
             file.write(points.tobytes())
 
 
-def write_height(surface: Surface, target: Path) -> None:
+def write_height(surface: Surface, target: Path, frame_id: str) -> None:
     """Write a tiled GeoTIFF of four float32 bands; row 0 at the highest y; pixels are areas, NaN is
     no data.
     """
@@ -152,14 +157,14 @@ def write_height(surface: Surface, target: Path) -> None:
             metadata=None,
             software=f"barsight {barsight.__version__}",
             extratags=[
-                *georeference(surface),
+                *georeference(surface, frame_id),
                 (42112, "s", 0, f"<GDALMetadata>{bands}</GDALMetadata>", True),
                 (42113, "s", 0, "nan", True),
             ],
         )
 
 
-def write_free(surface: Surface, free: FreeSpace, target: Path) -> None:
+def write_free(surface: Surface, free: FreeSpace, target: Path, frame_id: str) -> None:
     """Write the upper bounds of what may stand in each cell (m) as a GeoTIFF on height.tif's grid."""
 
     def tiles() -> Iterator[Float32]:
@@ -181,7 +186,7 @@ def write_free(surface: Surface, free: FreeSpace, target: Path) -> None:
             compression="zlib",
             metadata=None,
             software=f"barsight {barsight.__version__}",
-            extratags=[*georeference(surface), (42113, "s", 0, "inf", True)],
+            extratags=[*georeference(surface, frame_id), (42113, "s", 0, "inf", True)],
         )
 
 
@@ -208,26 +213,26 @@ def _band(window: Layers, band: str) -> Float32:
     return values
 
 
-def write_contours(contours: tuple[Contour, ...], target: Path) -> None:
-    """Write `profile,x_m,y_m,z_m,sigma_m,source`; z and sigma are empty where nothing is known."""
+def write_contours(contours: tuple[Contour, ...], target: Path, frame_id: str) -> None:
+    """Write `profile,x_m,y_m,z_m,sigma_m,source,frame`; z and sigma are empty where nothing is known."""
     with atomic_path(target) as path, path.open("w", encoding="ascii") as file:
-        file.write("profile,x_m,y_m,z_m,sigma_m,source\n")
+        file.write("profile,x_m,y_m,z_m,sigma_m,source,frame\n")
         for contour in contours:
             for x, y, z, sigma, source in zip(
                 contour.x_m, contour.y_m, contour.z_m, contour.sigma_m, contour.source, strict=True
             ):
                 height = f"{z:.5f},{sigma:.5f}" if np.isfinite(z) else ","
-                file.write(f"{contour.profile},{x:.4f},{y:.4f},{height},{source}\n")
+                file.write(f"{contour.profile},{x:.4f},{y:.4f},{height},{source},{frame_id}\n")
 
 
-def write_laser_csv(laser: tuple[LaserProfile, ...], target: Path) -> None:
-    """Write the reference profiles as they were read: `profile,x_m,y_m,z_m,sigma_m`."""
+def write_laser_csv(laser: tuple[LaserProfile, ...], target: Path, frame_id: str) -> None:
+    """Write the reference profiles as they were read: `profile,x_m,y_m,z_m,sigma_m,frame`."""
     with atomic_path(target) as path, path.open("w", encoding="ascii") as file:
-        file.write("profile,x_m,y_m,z_m,sigma_m\n")
+        file.write("profile,x_m,y_m,z_m,sigma_m,frame\n")
         for profile in laser:
             sigma = f"{profile.range_std_m:.5f}" if np.isfinite(profile.range_std_m) else ""
             for x, y, z in zip(profile.x_m, profile.y_m, profile.z_m, strict=True):
-                file.write(f"{profile.profile},{x:.4f},{y:.4f},{z:.5f},{sigma}\n")
+                file.write(f"{profile.profile},{x:.4f},{y:.4f},{z:.5f},{sigma},{frame_id}\n")
 
 
 def write_preview(preview: Preview, target: Path) -> None:
@@ -259,8 +264,7 @@ def summary(measurement: Measurement) -> dict[str, Any]:
         "captured_from_ns": captured[0] if captured else None,
         "captured_to_ns": captured[1] if captured else None,
         "is_simulated": measurement.is_simulated,
-        "calibration_id": measurement.calibration_hash[:ID_DIGITS],
-        "yard_frame_id": measurement.yard_frame_id,
+        **_ids(measurement),
         "recording": {"path": str(measurement.recording_path), "format": measurement.recording_format},
         "reference": trajectory.reference,
         "hashes": {
@@ -306,6 +310,14 @@ def summary(measurement: Measurement) -> dict[str, Any]:
         content["passes"] = [_pass_content(number, one) for number, one in enumerate(measurement.passes, 1)]
     rounded: dict[str, Any] = json_value(content, decimals=6)
     return rounded
+
+
+def _ids(measurement: Measurement) -> dict[str, Any]:
+    """Name the rig, and the frame of all places."""
+    return {
+        "calibration_id": measurement.calibration_hash[:ID_DIGITS],
+        "yard_frame_id": measurement.yard_frame_id, "frame_id": measurement.frame_id,
+    }  # fmt: skip
 
 
 def _laser_content(measurement: Measurement) -> dict[str, Any]:

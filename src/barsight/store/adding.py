@@ -34,7 +34,7 @@ from barsight.store.matching import (
 )  # fmt: skip
 from barsight.store.opening import Store
 from barsight.store.tables import ABSENCES, BUNDLES, SIGHTINGS, SURVEYS
-from barsight.yard.identity import MapIdentity
+from barsight.yard.identity import MapIdentity, expect_same_frame
 from barsight.yard.inventory.bundle_file import bundle_of, bundles_content, read_match
 from barsight.yard.lifting.lift_file import read_lifts
 from barsight.yard.types import Bundle, YardMap
@@ -89,16 +89,20 @@ class MeasuredSurvey:
     lifts: dict[str, Any] | None
 
 
-def add_survey(store: Store, read: MeasuredSurvey, who: str) -> AddedSurvey:
+def add_survey(store: Store, read: MeasuredSurvey, who: str, *, same_yard: bool = False) -> AddedSurvey:
     """Add a survey in one transaction; one that is there already changes nothing.
 
     An older survey is put into its place in time: its bundles are matched to those seen before it and to
-    those seen first after it. Raises InputError where simulated and measured surveys would mix.
+    those seen first after it. same_yard: what places it in the yard may differ from the newest survey's.
+
+    Raises InputError where simulated and measured surveys would mix, or those of two yard frames.
     """
     heights = pack(read.heights)
     with entry(store, who, f"survey {read.identity.map_id}") as opened:
         if not _expect_new(opened.connection, read):
             return AddedSurvey(read.identity.map_id, False, {}, {})
+        if not same_yard:
+            _expect_same_frame(opened.connection, read)
         known, last = _known(opened.connection, read)
         matched = match_by_place(known, read.found, read.heights)
         partner = {j: i for i, j in matched.found.items()}
@@ -181,6 +185,12 @@ def _expect_new(connection: Connection, read: MeasuredSurvey) -> bool:
         )
     same = select(SURVEYS.c.id).where(SURVEYS.c.map_id == read.identity.map_id)
     return connection.execute(same).first() is None
+
+
+def _expect_same_frame(connection: Connection, read: MeasuredSurvey) -> None:
+    newest = select(SURVEYS.c.yard_frame_id).order_by(SURVEYS.c.captured_to_ns.desc()).limit(1)
+    known = connection.execute(newest).scalar()
+    expect_same_frame(read.path, read.identity.yard_frame_id, known, "the store's newest survey")
 
 
 def _shown_before(connection: Connection, read: MeasuredSurvey, new: set[int]) -> dict[int, Finding]:

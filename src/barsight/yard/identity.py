@@ -39,3 +39,13 @@ class MapIdentity:
         if content.get("map_id") != self.map_id:
             problem = f"belongs to another map ({content.get('map_id')}, this one is {self.map_id})"
             raise InputError(path, problem, remedy)
+
+
+def expect_same_frame(path: Path, found: str | None, before: str | None, whose: str) -> None:
+    """Raise InputError where two maps lie in different yard frames, by their digests; None is not known.
+    whose: of whom the other is.
+    """
+    if None not in (found, before) and found != before:
+        problem = f"lies in another yard frame ({found}) than {whose} ({before})"
+        remedy = "measure both with one yard file; --same-yard says that both frames are of one surveyed yard"
+        raise InputError(path, problem, remedy)

@@ -154,6 +154,17 @@ class BundleSigma:
     section_m2: float = float("nan")
 
 
+@dataclass(frozen=True)
+class FitSigma:
+    """One standard deviation of a fitted outline's figures, were it surely the bundle's."""
+
+    lateral_m: float
+    along_m: float
+    yaw_rad: float
+    width_m: float
+    top_z_m: float
+
+
 @dataclass(frozen=True, eq=False)
 class Bundle:
     """A bundle of round bars, or a single heavy bar.
@@ -168,7 +179,8 @@ class Bundle:
     be seen. cover_doubts: sentences on what may hold it down all the same, as dunnage or a neighbour's flank.
     neighbours: ids of the bundles it touches. known_share: share of its outline that was measured.
     confidence: probability that a bundle lies here as described. reasons: sentences for whoever doubts it.
-    label: None where none was seen, or they weren't read.
+    label: None where none was seen, or they weren't read. fit_sigma: of the outline's fit alone; None where
+    straps tell the place instead.
     """
 
     id: int
@@ -195,6 +207,7 @@ class Bundle:
     section_m2: float = float("nan")
     cover_doubts: tuple[str, ...] = ()
     label: BundleLabel | None = None
+    fit_sigma: FitSigma | None = None
 
     @property
     def is_free(self) -> bool:

@@ -24,11 +24,13 @@ from barsight.acceptance.watch import (
     picture_figures,
     read_watch,
     rig_figures,
+    tag_figures,
     with_survey,
     write_watch,
 )
 from barsight.artefacts.plan import AcceptancePlan, ErrorLimits, read_plan
 from barsight.cli.arguments import call
+from barsight.cli.calibrate.yard_tags import place_in_yard
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError, Failed, MeasurementError
@@ -37,8 +39,9 @@ from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings
 from barsight.motion.rig_check.drift_check import RigCheck
 from barsight.recording.base import RecordingSettings
+from barsight.recording.formats.surveyed_targets import SurveyedTags, read_tags
 from barsight.recording.open import open_recording
-from barsight.yard_frame import calibration_id, in_yard, recording_id
+from barsight.yard_frame import calibration_id, in_yard, placing_id, recording_id
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -48,6 +51,7 @@ def run(arguments: Sequence[str]) -> None:
         recording: tyro.conf.Positional[Path],
         record: Path = Path("watch.json"),
         plan: Path | None = None,
+        tags: Path | None = None,
         yard: Path | None = None,
         rig: Path | None = None,
         approve: str = "",
@@ -64,6 +68,8 @@ def run(arguments: Sequence[str]) -> None:
             recording: An ordinary survey with travel.
             record: The record of all surveys; it is made where it isn't there.
             plan: An acceptance plan, whose plates and surveyed spheres are fixed features.
+            tags: Surveyed AprilTags on columns or floor, as calibrate yard --tags takes them, which are
+                fixed features.
             yard: The file that barsight calibrate yard wrote.
             rig: A rig file to use instead of the recording's own calibration.
             approve: Who puts this survey's calibration into service, after a recalibration; charts begin
@@ -76,7 +82,8 @@ def run(arguments: Sequence[str]) -> None:
         known = read_watch(record)
         features = None if plan is None else read_plan(plan)
         settings = MeasureSettings(yard=yard, recording=RecordingSettings(rig=rig))
-        survey, check, dirty = _look(recording, settings, features)
+        listed = None if tags is None else read_tags(tags)
+        survey, check, dirty = _look(recording, settings, features, listed)
         if approve:
             now = datetime.now(UTC).isoformat(timespec="seconds")
             given = Approval(approve, why, now, survey.calibration_id, len(known.surveys))
@@ -93,7 +100,7 @@ def run(arguments: Sequence[str]) -> None:
 
 
 def _look(
-    path: Path, settings: MeasureSettings, plan: AcceptancePlan | None
+    path: Path, settings: MeasureSettings, plan: AcceptancePlan | None, listed: SurveyedTags | None
 ) -> tuple[WatchedSurvey, RigCheck, list[str]]:
     """Take a survey's figures; also the rig's check and what is said of dirty lenses."""
     source = in_yard(open_recording(path, settings.recording), settings.yard)
@@ -105,9 +112,15 @@ def _look(
             measure_into(path, Path(scratch) / "out", settings, advance=advance, report=False)
             seen = observe(Path(scratch) / "out", plan, source.rig, str(path))
         figures += feature_figures(plan, seen)
+    if listed is not None:
+        placed = tag_figures(listed, place_in_yard(source, listed, SafeConsole(stderr=True)))
+        if isinstance(placed, Failed):
+            raise MeasurementError(f"{path}: none of the listed tags was placed: {placed.reason}")
+        figures += placed
     limit = (ErrorLimits() if plan is None else plan.limits).dirt_pct
     spoiled = [] if isinstance(health, Failed) else [one for one in health if one.dirt_pct > limit]
-    survey = WatchedSurvey(str(path), recording_id(source.digests()), calibration_id(source.rig), figures)
+    ids = recording_id(source.digests()), calibration_id(source.rig)
+    survey = WatchedSurvey(str(path), *ids, figures, placing_id(source))
     return survey, check, [f"dirty lens of {one.camera}" for one in spoiled]
 
 

@@ -14,7 +14,7 @@ from barsight.cli.arguments import call
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError
 from barsight.core.files import atomic_path, expect_output
-from barsight.simulation.board import draw_board, draw_views
+from barsight.simulation.boards.drawing import draw_board, draw_views
 
 INCH_M = 0.0254
 MAX_PX = 30_000

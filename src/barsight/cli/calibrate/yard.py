@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -16,6 +17,7 @@ from barsight.cli.arguments import call
 from barsight.cli.calibrate.yard_tags import calibrate_by_tags, print_bend
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
+from barsight.core.arrays import Float64
 from barsight.core.errors import ConfigError, Failed, InputError, MeasurementError
 from barsight.core.files import atomic_paths, expect_output
 from barsight.core.timing import count_frames
@@ -50,6 +52,7 @@ def run(arguments: Sequence[str]) -> None:
         frame: Literal["world", "encoders", "body"] = "world",
         measured: Path | None = None,
         tags: Path | None = None,
+        picks: Path | None = None,
         girder_y_m: tuple[float, float] | None = None,
         rails_x_m: tuple[float, float] | None = None,
         sigma_m: float = 0.005,
@@ -68,6 +71,9 @@ def run(arguments: Sequence[str]) -> None:
             tags: A .csv of AprilTags 36h11 as surveyed (tag,yard_x,yard_y,yard_z of the middle in m;
                 optionally sigma_m and check), which are found in the recording's pictures. The frame is that
                 in which measure maps this recording, and the file is bound to its rig and crane.
+            picks: A .csv of targets of any kind that were picked by hand: name,stamp_ns,u,v, the pixel in
+                cam0's picture of that stamp, two pictures or more each; the spot is found again in cam1's.
+                --tags then lists them as surveyed, by name instead of tag.
             girder_y_m: With --tags: the trolley's readings at the girder's ends, the lower first. How the
                 crane bends is calibrated too; bridge and trolley must travel in the recording.
             rails_x_m: With --girder-y-m: the bridge's readings at the ends of rails that may bend.
@@ -78,20 +84,11 @@ def run(arguments: Sequence[str]) -> None:
         expect_output(out, ".yaml", ".yml")
         if not 0 < sigma_m < 10:
             raise ConfigError(f"--sigma-m {sigma_m:g} can't be; give metres")
-        console, hangs, is_list = SafeConsole(stderr=True), None, source.suffix.lower() == ".csv"
-        if tags is not None and (is_list or measured is not None or frame != "world"):
-            raise ConfigError(ALONE)
+        if picks is not None and tags is None:
+            raise ConfigError("--picks needs --tags, the list of what was picked, as surveyed")
         bend = _begun_bend(girder_y_m, rails_x_m, has_tags=tags is not None)
-        if tags is not None:
-            found, owners, bend = calibrate_by_tags(source, tags, sigma_m, reading, bend, console)
-        elif is_list:
-            owners = {} if measured is None else _measured_owners(measured)
-            if owners:
-                frame = "world" if owners["mounting_id"] is None else "encoders"
-            found = _from_targets(source, frame, sigma_m)
-        else:
-            moved, owners = _from_moves(source, reading, console)
-            found, hangs = moved.calibration, moved.yard_from_body
+        console, way = SafeConsole(stderr=True), _YardSource(source, frame, measured, sigma_m, reading)
+        found, owners, hangs, bend = way.calibrated(tags, picks, bend, console)
         _expect_usable(found, source if tags is None else tags)
         verdict = "good" if _is_good(found) else "usable with care"
         with atomic_paths(out, out.with_suffix(".html"), out.with_suffix(".json")) as (path, html, data):
@@ -101,6 +98,41 @@ def run(arguments: Sequence[str]) -> None:
         print_bend(bend, console)
 
     call(command, "calibrate yard", arguments)
+
+
+@dataclass(frozen=True)
+class _YardSource:
+    """A source of a calibration, with what is said of it."""
+
+    source: Path
+    frame: str
+    measured: Path | None
+    sigma_m: float
+    reading: RecordingSettings
+
+    def calibrated(
+        self, listed: Path | None, picks: Path | None, bend: CraneBend | None, console: Console
+    ) -> tuple[YardCalibration, dict[str, str | None], Float64 | None, CraneBend | None]:
+        """Calibrate by tags or picks of a list, by targets, or by crane moves: the calibration, whose it is,
+        how the rig hangs where moves told it, and how the crane bends.
+        """
+        is_list = self.source.suffix.lower() == ".csv"
+        if listed is not None:
+            if is_list or self.measured is not None or self.frame != "world":
+                raise ConfigError(ALONE)
+            found, owners, bend = calibrate_by_tags(
+                self.source, listed, picks, self.sigma_m, self.reading, bend, console
+            )
+            return found, owners, None, bend
+        if not is_list:
+            moved, owners = _from_moves(self.source, self.reading, console)
+            return moved.calibration, owners, moved.yard_from_body, bend
+        owners, frame = dict[str, str | None](), self.frame
+        if self.measured is not None:
+            owners = _measured_owners(self.measured)
+        if owners:
+            frame = "world" if owners["mounting_id"] is None else "encoders"
+        return _from_targets(self.source, frame, self.sigma_m), owners, None, bend
 
 
 def _begun_bend(

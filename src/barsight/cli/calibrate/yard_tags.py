@@ -1,4 +1,6 @@
-"""Register a recording's frame in the yard by surveyed AprilTags that its pictures show."""
+"""Register a recording's frame in the yard by surveyed AprilTags that its pictures show, or by targets that
+were picked in them by hand.
+"""
 
 from __future__ import annotations
 
@@ -19,11 +21,12 @@ from barsight.core.timing import count_frames
 from barsight.core.types import CraneSamples, Trajectory
 from barsight.motion.settings import MotionSettings, make_estimator
 from barsight.recording.base import Recording, RecordingSettings
-from barsight.recording.formats.surveyed_targets import SurveyedTags, read_tags
+from barsight.recording.formats.surveyed_targets import SurveyedTags, read_picks, read_places, read_tags
 from barsight.recording.open import open_recording
 from barsight.recording.plausibility import clock_faults
 from barsight.recording.wrapper import RecordingProxy
 from barsight.registration.bending import STEPS, CraneBend, calibrate_bent_yard
+from barsight.registration.picks import see_picks
 from barsight.registration.tags import (
     MIN_PAIRS,
     PlacedTag,
@@ -34,7 +37,14 @@ from barsight.registration.tags import (
     turned_covariance,
 )
 from barsight.registration.yard import YardCalibration, calibrate_yard
-from barsight.yard_frame import bent_crane, calibration_id, mounting_id, recording_id
+from barsight.yard_frame import (
+    bent_crane,
+    calibration_id,
+    frame_of,
+    mounting_id,
+    placed_in_yard,
+    recording_id,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,20 +59,26 @@ class _BentRecording(RecordingProxy):
 
 
 def calibrate_by_tags(
-    path: Path, list_path: Path, sigma_m: float, reading: RecordingSettings, bend: CraneBend | None,
-    console: Console,
+    path: Path, list_path: Path, picks_path: Path | None, sigma_m: float, reading: RecordingSettings,
+    bend: CraneBend | None, console: Console,
 ) -> tuple[YardCalibration, dict[str, str | None], CraneBend | None]:  # fmt: skip
-    """Find the listed tags in a recording, and register the frame that `measure` maps it in.
+    """Find the listed tags in a recording, or what was picked of the listed targets, and register the frame
+    that `measure` maps it in.
 
     sigma_m: of a coordinate's survey, where the list doesn't say it. bend: what to begin with where the
     crane's bending is calibrated too. Returns the calibration, whose it is, and the bending.
     """
-    listed, recording = read_tags(list_path), open_recording(path, reading)
+    is_picked = picks_path is not None
+    names, listed = read_places(list_path) if is_picked else (tuple[str, ...](), read_tags(list_path))
+    recording = open_recording(path, reading)
     if faults := clock_faults(recording):
         raise InputError(path, "; ".join(faults), "record again with one clock")
     if bend is not None and recording.crane() is None:
         raise InputError(path, "has no encoders", "leave --girder-y-m out")
-    reference, seen = _see(recording, console)
+    if picks_path is None:
+        reference, seen = _see(recording, console)
+    else:
+        reference, seen = _see_picks(recording, read_picks(picks_path, names), names, picks_path, console)
     placed = [seen.place(int(number)) for number in listed.numbers]
     for one in placed:
         if isinstance(one, Failed) and one.code == "ambiguous":
@@ -70,7 +86,7 @@ def calibrate_by_tags(
     told = _told(recording, seen, placed)
     if bend is None:
         frame = "encoders" if reference == "yard" else "world"
-        found = _registered(path, listed, placed, sigma_m, frame, told)
+        found = _registered(path, listed, seen, placed, sigma_m, frame, told)
     else:
         found, bend = _bent(path, recording, listed, seen, placed, sigma_m, bend, told, console)
     _print(listed, seen, placed, list_path, console)
@@ -83,13 +99,42 @@ def calibrate_by_tags(
     return found, owners, bend
 
 
+def place_in_yard(recording: Recording, listed: SurveyedTags, console: Console) -> list[PlacedTag | Failed]:
+    """Place listed tags by a recording that is seen in the yard, as `measure` maps it."""
+    reference, seen = _see(recording, console)
+    if reference != "yard":
+        raise InputError(recording.path, "isn't placed in the yard", "give encoders, or a yard file (--yard)")
+    return [seen.place(int(number)) for number in listed.numbers]
+
+
 def _see(recording: Recording, console: Console) -> tuple[str, SeenTags]:
     """Estimate the trajectory as `measure` does and find the tags in its pairs; its reference, and them."""
     with stages(console) as advance:
-        rectifier, trajectory = Rectifier(recording.rig), _trajectory(recording, advance)
+        rectifier = Rectifier(recording.rig)
+        trajectory = placed_in_yard(_trajectory(recording, advance), frame_of(recording))
         posed = {frame.stamp_ns: frame for frame in trajectory.frames}
         count = count_frames("tags", len(posed), advance)
         return trajectory.reference, see_tags(recording.frames(posed), rectifier, posed, count)
+
+
+def _see_picks(
+    recording: Recording, picks: dict[int, dict[int, Float64]], names: tuple[str, ...], path: Path,
+    console: Console,
+) -> tuple[str, SeenTags]:  # fmt: skip
+    """Estimate the trajectory as `measure` does and place what was picked; its reference, and the targets."""
+    with stages(console) as advance:
+        rectifier, trajectory = Rectifier(recording.rig), _trajectory(recording, advance)
+        posed = {frame.stamp_ns: frame for frame in trajectory.frames if frame.stamp_ns in picks}
+        strange = next((stamp for stamp in picks if stamp not in posed), None)
+        if strange is not None:
+            nearest = min((frame.stamp_ns for frame in trajectory.frames), key=lambda ns: abs(ns - strange))
+            problem = f"there is no pair with a pose at {strange}; the nearest is at {nearest}"
+            raise InputError(path, problem, "pick in pictures that measure uses")
+        count = count_frames("picks", len(posed), advance)
+        seen, lost = see_picks(recording.frames(posed), rectifier, posed, picks, names, count)
+    for one in lost:
+        console.print(f"[yellow]{escape(one)}: left out[/yellow]", soft_wrap=True, highlight=False)
+    return trajectory.reference, seen
 
 
 def _trajectory(recording: Recording, advance: Callable[[str, int, int], None]) -> Trajectory:
@@ -123,7 +168,7 @@ def _bent(
         kept: Bool = np.all(np.isfinite(known), axis=1)
         tags, yard_m, checks, survey = _kept(path, listed, placed, kept, sigma_m, told)
         found = calibrate_bent_yard(
-            tuple(f"tag {one.number}" for one in tags), _at(tags), slopes[kept], yard_m,
+            tuple(seen.name(one.number) for one in tags), _at(tags), slopes[kept], yard_m,
             turned_covariance(tags, yard_m, survey), checks, "encoders", bend,
         )  # fmt: skip
         if isinstance(found, Failed):
@@ -154,13 +199,14 @@ def _kept(
 
 
 def _registered(
-    path: Path, listed: SurveyedTags, placed: list[PlacedTag | Failed], sigma_m: float, frame: str, told: str
-) -> YardCalibration:
+    path: Path, listed: SurveyedTags, seen: SeenTags, placed: list[PlacedTag | Failed], sigma_m: float,
+    frame: str, told: str,
+) -> YardCalibration:  # fmt: skip
     """Fit the tags that were placed. told: why others weren't, for where too few are left."""
     kept = np.array([isinstance(one, PlacedTag) for one in placed], bool)
     tags, yard_m, checks, survey = _kept(path, listed, placed, kept, sigma_m, told)
     found = calibrate_yard(
-        tuple(f"tag {one.number}" for one in tags), np.stack([one.place_m for one in tags]), yard_m,
+        tuple(seen.name(one.number) for one in tags), np.stack([one.place_m for one in tags]), yard_m,
         turned_covariance(tags, yard_m, survey), checks, frame,
     )  # fmt: skip
     if isinstance(found, Failed):
@@ -176,7 +222,7 @@ def _expect_upright(path: Path, tags: tuple[PlacedTag, ...], yard_m: Float64, fo
 
 def _told(recording: Recording, seen: SeenTags, placed: list[PlacedTag | Failed]) -> str:
     """Say why tags weren't placed."""
-    if not seen.sightings:
+    if not seen.sightings and not seen.names:
         family = other_family(recording.frames())
         if family is not None:
             return f"the pictures show tags of the family {family}; print {TAG_FAMILY}"
@@ -191,9 +237,10 @@ def _print(
         if isinstance(one, Failed):
             console.print(f"[yellow]{escape(one.reason)}: left out[/yellow]", highlight=False)
             continue
+        wide = "" if seen.names else f", {one.side_px:.0f} pixels wide"
         strays = f", {one.left_out} that don't agree left out" if one.left_out else ""
         console.print(
-            f"tag {one.number}: {one.pairs} pairs{strays}, {one.side_px:.0f} pixels wide, sigma "
+            f"{seen.name(one.number)}: {one.pairs} pairs{strays}{wide}, sigma "
             f"{1e3 * np.sqrt(np.trace(one.covariance_m2) / 3):.1f} mm", highlight=False,
         )  # fmt: skip
     known = set(listed.numbers.tolist())

@@ -24,6 +24,7 @@ def run(arguments: Sequence[str]) -> None:
         out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")],
         by: str | None = None,
         migrate: bool = False,
+        same_yard: bool = False,
     ) -> None:
         """Add a measured folder to the store: its bundles get names that they keep.
 
@@ -34,11 +35,13 @@ def run(arguments: Sequence[str]) -> None:
             url: SQLAlchemy's URL of the database; sqlite:///barsight.db where only OUT is given.
             out: A folder written by barsight measure. It should stay where it is.
             by: Who adds it, for the audit log; the name of the user if not given.
+            same_yard: The survey lies in the store's surveyed yard, though what places it there differs, as
+                after a recalibration.
             migrate: Bring the tables of an earlier version on PostgreSQL up to date; back them up before.
         """
         survey = read_survey(out)
         with open_store(url, create=True, migrate=migrate) as store:
-            added = add_survey(store, survey, by or user_name())
+            added = add_survey(store, survey, by or user_name(), same_yard=same_yard)
         _print(added, SafeConsole())
 
     words = list(arguments)

@@ -17,6 +17,7 @@ from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import MeasurementError
 from barsight.core.json_values import write_json
 from barsight.result_folder import open_folder, read_heights
+from barsight.yard.identity import expect_same_frame
 from barsight.yard.inventory.bundle_file import read_bundles
 from barsight.yard.inventory.changes import Change, compare_yards
 
@@ -25,8 +26,9 @@ def run(arguments: Sequence[str]) -> None:
     """Parse, compare and print."""
 
     def command(
-        old: tyro.conf.Positional[Path], new: tyro.conf.Positional[Path], json: Path | None = None
-    ) -> None:
+        old: tyro.conf.Positional[Path], new: tyro.conf.Positional[Path], json: Path | None = None,
+        same_yard: bool = False,
+    ) -> None:  # fmt: skip
         """Say what changed between two measured yards: moved, settled, taken, added, in mm and kg.
 
         A change counts as significant where chance would do as much in less than one case of a hundred, by
@@ -36,13 +38,20 @@ def run(arguments: Sequence[str]) -> None:
             old: The earlier folder written by barsight measure.
             new: The later one.
             json: JSON file for all figures.
+            same_yard: Both frames are of one surveyed yard, though what places them differs, as after a
+                recalibration.
         """
+        frames = []
         for folder in (old, new):
-            reference = open_folder(folder, lifts=False)[0].get("reference")
+            summary, _ = open_folder(folder, lifts=False)
+            frames.append(summary.get("yard_frame_id"))
+            reference = summary.get("reference")
             if reference != "yard":
                 raise MeasurementError(
                     f"{folder}: is in the {reference} frame; only maps with a crane's place can be compared"
                 )
+        if not same_yard:
+            expect_same_frame(new, frames[1], frames[0], str(old))
         changes = compare_yards(
             read_bundles(old / "bundles.json"), read_heights(old),
             read_bundles(new / "bundles.json"), read_heights(new),

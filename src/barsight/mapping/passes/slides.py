@@ -16,8 +16,8 @@ from barsight.mapping.passes.joined_surface import PassSurface, moved_window
 MAX_SHIFT_M = 2.0
 STILL_M = 0.025
 """Poses and matching err by no more."""
-MIN_SHARED_M = 0.5
-"""Least length of a picture that is compared with another."""
+MIN_SHARED_M = 1.0
+"""Least length of a picture that is compared with another: of shorter ones some shift agrees by chance."""
 MIN_AGREEMENT, MIN_GAIN = 0.4, 0.25
 """Correlation of the pictures of what was moved, at its shift, and by how much more than without one."""
 MAX_OTHER, MIN_SAME = 0.3, 0.6

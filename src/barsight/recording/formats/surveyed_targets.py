@@ -70,6 +70,49 @@ def read_tags(path: Path) -> SurveyedTags:
     return SurveyedTags(np.array(numbers, np.int64), table[:, :3], table[:, 3], table[:, 4] == 1)
 
 
+def read_places(path: Path) -> tuple[tuple[str, ...], SurveyedTags]:
+    """Read a CSV with a header, m: `name,yard_x,yard_y,yard_z`, optionally `sigma_m` and `check` (1 or 0).
+    Returns the names, and targets numbered in their order.
+
+    Raises `InputError` naming the line.
+    """
+    names, table = _read_table(path, "name", YARD)
+    _expect_once(path, "target", names)
+    numbers = np.arange(len(names), dtype=np.int64)
+    return names, SurveyedTags(numbers, table[:, :3], table[:, 3], table[:, 4] == 1)
+
+
+def read_picks(path: Path, names: tuple[str, ...]) -> dict[int, dict[int, Float64]]:
+    """Read a CSV with a header: `name,stamp_ns,u,v`, where a target lies in cam0's picture of that stamp, px.
+    Returns pixels (2,) by stamp and the name's number among `names`.
+
+    Raises `InputError` naming the line.
+    """
+    remedy = "give name,stamp_ns,u,v: a target's pixel in cam0's picture of that stamp"
+    first, *lines = read_lines(path, MAX_ENTRIES, remedy)
+    header = [name.strip() for name in first.lstrip("# ").split(",")]
+    if header[:4] != ["name", "stamp_ns", "u", "v"]:
+        raise InputError(path, "doesn't begin with name,stamp_ns,u,v", remedy)
+    picks: dict[int, dict[int, Float64]] = {}
+    for n, line in enumerate(lines, start=2):
+        fields = [field.strip() for field in line.split(",")]
+        try:
+            stamp_ns, pixel = int(fields[1]), np.array([float(fields[2]), float(fields[3])])
+        except (ValueError, IndexError):
+            raise InputError(path, f"line {n}: a number is missing or is none", remedy) from None
+        if fields[0] not in names:
+            raise InputError(
+                path, f"line {n}: target {fields[0]} isn't listed", "list its surveyed place too"
+            )
+        if not in_range(pixel).all():
+            raise InputError(path, f"line {n}: a pixel can't be there", remedy)
+        number = names.index(fields[0])
+        if number in picks.setdefault(stamp_ns, {}):
+            raise InputError(path, f"line {n}: {fields[0]} is picked twice at {stamp_ns}", "pick it once")
+        picks[stamp_ns][number] = pixel
+    return picks
+
+
 def _read_table(path: Path, key: str, columns: tuple[str, ...]) -> tuple[tuple[str, ...], Float64]:
     """Read the texts (N,) of `key`, and the numbers (N, columns + 2): `columns`, sigma_m (NaN where not
     said), check.

@@ -29,7 +29,7 @@ from barsight.yard.bundles.reading import Reading
 from barsight.yard.bundles.section.seen_section import estimate_section, seen_section
 from barsight.yard.bundles.strapped_bundles import held_by_straps
 from barsight.yard.sections import MapStretch
-from barsight.yard.types import Bundle, BundleSigma
+from barsight.yard.types import Bundle, BundleSigma, FitSigma
 
 
 def describe_bundles(
@@ -77,6 +77,7 @@ def make_bundle(
     section, section_sigma = estimate_section(seen, fit, top_z, floor_m)
     if reading.flanks is not None and reading.flanks.doubt:
         reasons += (reading.flanks.doubt,)
+    own = _sigma(fit, ends, top, settings)
     bundle = Bundle(
         id=0,
         centre_m=centre,
@@ -93,7 +94,7 @@ def make_bundle(
         layer=0,
         on_top=True,
         neighbours=(),
-        sigma=replace(_sigma(fit, ends, top, settings), section_m2=section_sigma),
+        sigma=replace(own, section_m2=section_sigma),
         known_share=float((rows != 0).mean()),
         confidence=rate_confidence(reading, rows),
         reasons=reasons,
@@ -101,6 +102,7 @@ def make_bundle(
         ends_sigma_m=(ends[0].sigma_m, ends[1].sigma_m),
         section_m2=section,
         cover_doubts=list_cover_doubts(reading, reasons),
+        fit_sigma=FitSigma(own.lateral_m, own.along_m, own.yaw_rad, own.width_m, own.top_z_m),
     )
     doubtful = reading.other_packing is not None
     width_m = None if seen is None else seen.width_m

@@ -89,6 +89,7 @@ def _as_pack(
             bar_diameter_m=DIAMETER_SIGMA_RATIO * pack.diameter_m,
             section_m2=section_sigma,
         ),
+        fit_sigma=None,
     )
 
 

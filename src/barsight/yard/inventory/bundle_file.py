@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from barsight.core.reading.json_schema import expect_schema, package_schema
 from barsight.core.reading.sealed_json import read_sealed, write_sealed
 from barsight.yard.identity import MapIdentity
 from barsight.yard.inventory.stock_list import MatchedEntry, StockMatch
-from barsight.yard.types import Bar, Bundle, BundleLabel, BundleSigma
+from barsight.yard.types import Bar, Bundle, BundleLabel, BundleSigma, FitSigma
 from barsight.yard.weight import bundle_mass, bundle_section
 
 SCHEMA_VERSION = 2
@@ -106,6 +107,7 @@ def _record(bundle: Bundle) -> dict[str, Any]:
             "section_m2": section_sigma,
             "mass_kg": mass.sigma_kg,
         },
+        "fit_sigma": _fit_record(bundle.fit_sigma),
         "known_share": bundle.known_share,
         "confidence": bundle.confidence,
         "reasons": list(bundle.reasons),
@@ -123,6 +125,14 @@ def _record(bundle: Bundle) -> dict[str, Any]:
     }
     plain: dict[str, Any] = json_value(record, DIGITS)
     return plain
+
+
+def _fit_record(sigma: FitSigma | None) -> dict[str, Any] | None:
+    if sigma is None:
+        return None
+    record = asdict(sigma)
+    record["yaw_deg"] = float(np.degrees(record.pop("yaw_rad")))
+    return record
 
 
 def bundle_of(record: dict[str, Any]) -> Bundle:
@@ -143,6 +153,7 @@ def bundle_of(record: dict[str, Any]) -> Bundle:
     figures = {name: figure(value) for name, value in record["sigma"].items()}
     yaw_rad = float(np.radians(figures.pop("yaw_deg")))
     figures.pop("mass_kg", None)
+    fit = {name: figure(value) for name, value in (record.get("fit_sigma") or {}).items()}
     return Bundle(
         id=record["id"],
         centre_m=figures_of(record["axis_centre_m"]),
@@ -166,6 +177,7 @@ def bundle_of(record: dict[str, Any]) -> Bundle:
         reasons=tuple(record["reasons"]),
         section_m2=figure(record.get("section_m2")),
         label=BundleLabel(**record["label"]) if record.get("label") else None,
+        fit_sigma=FitSigma(yaw_rad=float(np.radians(fit.pop("yaw_deg"))), **fit) if fit else None,
         ends_sigma_m=(figure(record["ends_sigma_m"][0]), figure(record["ends_sigma_m"][1])),
         bar_axes=tuple(
             Bar(

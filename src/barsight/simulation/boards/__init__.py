@@ -1,0 +1,1 @@
+"""Draw calibration boards, to print and as the simulated cameras see them."""

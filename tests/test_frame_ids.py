@@ -1,0 +1,115 @@
+"""Every file of a measured folder names the frame of its places, and foreign frames aren't mixed."""
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+from barsight.acceptance.error_sources import measured_load
+from barsight.acceptance.watch import WatchedSurvey, WatchRecord, read_watch, with_survey, write_watch
+from barsight.cli.main import run
+from barsight.core.errors import InputError
+from barsight.core.reading.ply import read_vertices
+from barsight.core.reading.sealed_json import write_sealed
+from barsight.report.export import export
+from barsight.result_folder import read_contours, read_path
+from barsight.store.adding import add_survey, read_survey
+from barsight.store.opening import Store
+from cli_runs import FAST
+from yard_folders import write_folder
+
+
+def named(folder: Path, name: str) -> str:
+    """The frame that a file of any kind says."""
+    path = folder / name
+    if path.suffix == ".tif":
+        with tifffile.TiffFile(path) as file:
+            return str(file.pages.first.geotiff_tags["GTCitationGeoKey"])
+    if path.suffix == ".csv":
+        (frame,) = {row["frame"] for row in csv.DictReader(path.read_text().splitlines())}
+        return frame
+    head = path.read_bytes()[:2000].decode("latin-1").splitlines()
+    (line,) = (line for line in head if line.startswith(("comment frame", "# frame")))
+    return line.split()[-1]
+
+
+@pytest.mark.parametrize("arguments", [(), ("--use", "stereo")], ids=["yard", "world"])
+def test_every_file_names_the_frame_of_result_json(
+    whole: Path, tmp_path: Path, arguments: tuple[str, ...]
+) -> None:
+    out = tmp_path / "out"
+    assert run(["measure", str(whole), "-o", str(out), *FAST, *arguments]) == 0
+    result = json.loads((out / "result.json").read_text())
+    placed = result["yard_frame_id"]
+    assert result["frame_id"] == f"yard:{placed}" if placed else result["frame_id"].startswith("world:")
+    files = ("trajectory.tum", "cloud.ply", "height.tif", "free.tif", "tops.tif", "ortho.tif", "contour.csv")
+    assert {named(out, name) for name in files} == {result["frame_id"]}
+    path, (contour, *_) = read_path(out), read_contours(out)
+    assert path is not None and len(path.stamp_ns) == 4 and len(contour.z_m) > 20
+    assert len(read_vertices(out / "cloud.ply")) > 100
+    for kind in ("pcd", "csv"):
+        export(out, out / f"points.{kind}")
+        assert named(out, f"points.{kind}") == result["frame_id"]
+
+
+def test_a_contour_of_an_older_version_is_read(tmp_path: Path) -> None:
+    rows = "0,1.0,2.0,0.5,0.01,1\n0,1.01,2.0,,,0\n"
+    for head, end in (("", ""), (",frame", ",yard:f00d")):
+        text = f"profile,x_m,y_m,z_m,sigma_m,source{head}\n" + rows.replace("\n", f"{end}\n")
+        (tmp_path / "contour.csv").write_text(text)
+        (contour,) = read_contours(tmp_path)
+        assert contour.z_m[0] == 0.5 and np.isnan(contour.z_m[1]) and contour.source.tolist() == [1, 0]
+
+
+def moved(folder: Path, frame: str) -> Path:
+    """A folder whose result says another yard frame."""
+    return write_folder(folder, yard_frame_id=frame)
+
+
+def test_maps_of_two_yard_frames_are_not_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    old, new = moved(tmp_path / "old", "f00d"), moved(tmp_path / "new", "beef")
+    assert run(["compare", str(old), str(new)]) == 3
+    said = capsys.readouterr().err
+    assert "lies in another yard frame (beef) than" in said and "--same-yard" in said
+    assert run(["compare", str(old), str(new), "--same-yard"]) == 0
+    assert run(["compare", str(old), str(moved(tmp_path / "again", "f00d"))]) == 0
+
+
+def test_a_store_holds_one_yard_frame_unless_told(store: Store, tmp_path: Path) -> None:
+    add_survey(store, read_survey(moved(tmp_path / "old", "f00d")), "ann")
+    new = read_survey(moved(tmp_path / "new", "beef"))
+    with pytest.raises(InputError, match="than the store's newest survey"):
+        add_survey(store, new, "ann")
+    assert add_survey(store, new, "ann", same_yard=True).is_new
+
+
+def test_a_certificate_of_another_frame_budgets_nothing(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "out")
+    told = {
+        "schema_version": 1,
+        "calibration_id": "ca1b",
+        "yard_frame_id": "beef",
+        "quantities": [],
+        "plan": {},
+    }
+    write_sealed(told, tmp_path / "certificate.json")
+    with pytest.raises(InputError, match=r"another yard frame \(beef; the folder has f00d\)"):
+        measured_load(folder, None, tmp_path / "certificate.json", 5.0)
+
+
+def test_a_watch_of_another_yard_frame_wants_an_approval(tmp_path: Path) -> None:
+    path, first = tmp_path / "watch.json", WatchedSurvey("a", "1", "cal", (), "f00d")
+    record = with_survey(WatchRecord(), first, path)
+    with pytest.raises(InputError, match=r"lies in yard frame beef, but watch\.json watches f00d"):
+        with_survey(record, replace(first, recording_id="2", yard_frame_id="beef"), path)
+    older = replace(first, recording_id="2", yard_frame_id=None)
+    assert len(with_survey(record, older, path).surveys) == 2
+    write_watch(record, path)
+    content = json.loads(path.read_text())
+    del content["surveys"][0]["yard_frame_id"], content["content_sha256"]
+    write_sealed(content, path)
+    assert read_watch(path).surveys == (replace(first, yard_frame_id=None),)
