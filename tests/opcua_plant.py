@@ -2,7 +2,8 @@
 
     python opcua_plant.py SETTINGS.json
 
-`survey NAME FOLDER`, `alarm CODE LEVEL`, `quiet`, `memory` (prints resident KiB).
+`survey NAME FOLDER`, `alarm CODE LEVEL`, `quiet`, `memory` (prints resident KiB), `steps` (prints how
+many steps of the handshake were asked for).
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ class DrawnPlant:
         self.alarms: tuple[AlarmLine, ...] = ()
         self.survey: Survey | None = None
         self.is_quiet = False
-        self.looks = 0
+        self.looks = self.steps = 0
 
     async def told(self) -> Told | None:
         self.looks += 1
@@ -57,6 +58,7 @@ class DrawnPlant:
         return None if self.is_quiet else Told(state, self.alarms, self.survey)
 
     async def handshake(self, step: str, who: str, arguments: Mapping[str, Any]) -> str | Failed | None:
+        self.steps += 1
         if step == "claim":
             return f"token of {who}" if arguments["lift"] == "lift-1" else Failed("unknown", "no such lift")
         return str(arguments["token"])
@@ -69,6 +71,8 @@ class DrawnPlant:
             self.alarms = (AlarmLine(words[0], f"{words[0]} stands", words[1]),) if words[0] != "-" else ()
         elif command == "quiet":
             self.is_quiet = True
+        elif command == "steps":
+            return str(self.steps)
         elif command == "memory":
             pages = Path("/proc/self/statm").read_text().split()[1]
             return str(int(pages) * 4)

@@ -90,7 +90,7 @@ def test_an_offset_is_taken_off_what_the_crane_gets(tmp_path: Path) -> None:
         added = np.array(after["target_covariance"]) - np.array(before["target_covariance"])
         wanted = np.diag([*np.square(OFFSET.sigma_m), 0])
         assert added == pytest.approx(wanted, abs=1e-11)
-        down, crane = after["set_down"], after["crane_set_down"]
+        down, crane = before["crane_set_down"], after["crane_set_down"]
         assert [down[name] - crane[name] for name in names] == pytest.approx(HANGS_M, abs=1e-8)
     write_lifts(plan, "yard", GIVEN, "0", tmp_path / "lifts.json")
     kept = read_lifts(tmp_path / "lifts.json")

@@ -230,6 +230,20 @@ def test_a_map_from_before_a_lift_offers_nothing_beside_it(plant: Plant, end: st
     assert ranks_offered(plant) == [1, 2, 3, 4, 5, 6]
 
 
+def test_a_place_that_a_load_was_put_on_is_told_to_no_other_lift(
+    plant: Plant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain = plant._lift
+    there = {"x_m": 400.0, "y_m": 0.0, "z_m": 0.0, "yaw_deg": 0.0}
+    put = {1: there, 4: there}
+    monkeypatch.setattr(plant, "_lift", lambda rank, at_m: plain(rank, at_m) | {"set_down": put.get(rank)})
+    plant.survey()
+    claim = claimed(plant)
+    plant.steps.executing(claim.token)
+    assert plant.steps.executed(claim.token, DID) == "unweighed"
+    assert ranks_offered(plant) == [2, 3, 5, 6]
+
+
 def ranks_offered(plant: Plant) -> list[int]:
     with plant.store.reading() as connection:
         newest = max(one.survey_id for one in open_lifts(connection))

@@ -6,6 +6,7 @@ import re
 import struct
 
 import numpy as np
+import pytest
 
 from barsight.core.errors import Failed
 from barsight.plant.state import YAW_SENSE, OfferedLift, PlantState
@@ -56,6 +57,32 @@ def test_the_plc_source_lays_the_bytes_out_as_the_telegram() -> None:
             struct.pack_into(f">{widths[kind]}", content, int(at), values[field])
         assert bytes(content) == pack(side, values)
         assert sum(struct.calcsize(widths[kind]) for _, kind, _ in fields) == len(content)
+
+
+def plain_text(source: str) -> str:
+    """Structured text by IEC 61131-3, without what only Siemens has: quotes, `#`, VERSION, data blocks."""
+    rules = (
+        (r"\{[^}]*\}", ""), (r"(?m)^VERSION.*$", ""), (r"(?s)DATA_BLOCK.*?END_DATA_BLOCK", ""), ('"', ""),
+        (r"(?<!\w)#", ""), (r"(?m)^TYPE (\w+)$", r"TYPE \1 :"), (r"(?m)^BEGIN$", ""),
+    )  # fmt: skip
+    for pattern, plain in rules:
+        source = re.sub(pattern, plain, source)
+    return source
+
+
+def test_the_plc_source_is_structured_text() -> None:
+    """A grammar of another's reads it; no compiler of Siemens' SCL is free."""
+    tree_sitter = pytest.importorskip("tree_sitter")
+    grammar = pytest.importorskip("tree_sitter_iec61131_3_st")
+    parser = tree_sitter.Parser(tree_sitter.Language(grammar.language()))
+
+    def is_read(text: str) -> bool:
+        return not parser.parse(text.encode()).root_node.has_error
+
+    text = plain_text(scl_source())
+    assert text.count("END_TYPE") == 2 and "BarsightJudge" in text and is_read(text)
+    for part in (" THEN", "END_IF;", "END_VAR", ":=", "silent);"):
+        assert not is_read(text.replace(part, "", 1)), part
 
 
 def test_the_yaw_that_a_plc_is_told_turns_the_beam_onto_the_bundle() -> None:

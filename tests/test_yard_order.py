@@ -14,7 +14,7 @@ from barsight.core.types import HeightSource
 from barsight.yard.events import YardEvent
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.lift_file import lifts_content
-from barsight.yard.lifting.order import LiftOrder, order_lifts
+from barsight.yard.lifting.order import LiftOrder, begin_order, order_lifts
 from barsight.yard.lifting.targets import plan_lifts
 from barsight.yard.stability.blockers import find_blocked
 from barsight.yard.stability.stability import footing_checks, footings
@@ -71,6 +71,20 @@ def test_the_order_takes_what_is_above_first_and_offers_only_the_first() -> None
     top = STOCK[5].top_z_m
     for step in order.steps:
         assert step.travel_z_m == pytest.approx(top + SETTINGS.travel_clear_m, abs=0.02)
+
+
+def test_the_offered_lift_that_begins_an_order_is_put_where_the_order_has_it() -> None:
+    """Left alone it is put on the lowest nearest place, which may be beside what is dug out."""
+    heights, bundles = pile()
+    plan = plan_lifts(heights, bundles, MAGNET, SETTINGS, ())
+    order = order_lifts(1, heights, bundles, plan)
+    assert isinstance(order, LiftOrder)
+    (lift,) = begin_order(order, plan, bundles).offered
+    assert lift.bundles == (5,) and lift.set_down == order.steps[0].set_down
+    assert lift.magnet_down is not None
+    away = np.array([lift.magnet_down.x_m - lift.place.x_m, lift.magnet_down.y_m - lift.place.y_m])
+    moved = np.array([lift.set_down.x_m, lift.set_down.y_m]) - bundles[5].centre_m[:2]
+    assert away == pytest.approx(moved, abs=1e-6), "magnet and load go the same way"
 
 
 def test_what_cannot_be_dug_out_says_why() -> None:

@@ -13,10 +13,12 @@ from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.bearing import find_bearing
 from barsight.yard.lifting.ground import Ground
 from barsight.yard.lifting.load import Load
-from barsight.yard.lifting.set_down import find_set_down
+from barsight.yard.lifting.set_down import SetDown, find_set_down
+from barsight.yard.lifting.targets import put_down
+from barsight.yard.magnet.footprint import Placement
 from barsight.yard.types import HeightMap
 from barsight.yard.weight import load_centre
-from lift_yards import LENGTH_M, MAGNET, SETTINGS, laid, map_of, record
+from lift_yards import LENGTH_M, MAGNET, SETTINGS, judged, laid, map_of, record
 
 LOAD = Load.of((record(laid(0.3)),))
 FREE = (1.6, 0.0)
@@ -167,3 +169,28 @@ def test_a_load_settles_about_its_centre_of_mass() -> None:
     assert middle is not None and found is not None
     assert middle.margin_across_m - found.margin_across_m == pytest.approx(0.05 / 3, abs=0.01)
     assert found.z_m == pytest.approx(middle.z_m, abs=2e-3)
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 2.5, 90.0])
+@pytest.mark.parametrize("yaw_deg", [0.0, 89.0])
+def test_a_magnet_that_holds_a_load_off_its_middle_goes_as_far_beside_the_place(
+    yaw_deg: float, turn_deg: float
+) -> None:
+    """Bars and magnet are one rigid body from target to set-down: the bars' middle comes to the place."""
+    stock = laid(0.3, yaw_deg=yaw_deg)
+    load, off_m = Load.of((record(stock),)), np.array([0.03, 0.25])
+    yaw = math.radians(yaw_deg)
+    held = Placement(*(np.array([load.x_m, load.y_m]) + off_m), yaw)
+    lift = judged([stock], place=held)
+    x, y, to_deg = 3.0, -1.0, yaw_deg + turn_deg
+    wrapped_deg = to_deg - 180 * math.ceil(to_deg / 180 - 0.5)
+    moved = put_down(lift, load, SetDown(x, y, 0.0, wrapped_deg, turn_deg, 0.0, 5.0, 1.0, 0.1))
+    assert moved.magnet_down is not None
+    turned = moved.magnet_down.yaw_rad - yaw
+    cos, sin = math.cos(turned), math.sin(turned)
+    bars = np.array([[cos, -sin], [sin, cos]]) @ -off_m
+    middle = np.array([moved.magnet_down.x_m, moved.magnet_down.y_m]) + bars
+    assert middle == pytest.approx([x, y], abs=1e-9)
+    assert turned == pytest.approx(math.radians(turn_deg))
+    none = put_down(moved, load, None)
+    assert none.set_down is None and none.magnet_down is None

@@ -18,7 +18,7 @@ from barsight.core.settings.file import read_settings
 from barsight.core.settings.renamed import refuse_old_flags
 
 Settings = TypeVar("Settings")
-LISTS = ("--use", "--lifted")
+LISTS = ("--use", "--lifted", "--fetch")
 """Flags whose values may be told apart by commas."""
 
 

@@ -114,7 +114,8 @@ def state_of_store(
     """Read the state: the lift that has begun, or else the claimed one, or else the best offer.
 
     It is valid where the lift's map is the newest and not too old. A lift that has begun stays until it is
-    reported, and nothing else is offered as long.
+    reported, and nothing else is offered as long. Where a bundle is to be fetched, its order's first lift is
+    the only offer.
     approach_height_m, magnet_steps_kg, allow_simulated: see `PlantSettings`. now_ns: this computer's clock.
     """
     with store.reading() as connection:
@@ -129,6 +130,7 @@ def state_of_store(
     usable = [
         one for one in lifts
         if one.survey_id == survey.id and (one.record["valid_until_ns"] or 0) > clock_ns
+        and (one.state != "offered" or one.record.get("begins_fetch") is not False)
     ]  # fmt: skip
     begun = next((one for one in lifts if one.state == "executing"), None)
     best = begun or min(

@@ -224,13 +224,13 @@ def _end_offers(opened: Entry, reason: str) -> None:
 
 def _end_beside(opened: Entry, lift: OpenLift) -> None:
     """End offers and confirmations within reach of what a lift may have moved."""
-    moved = _outlines(opened.connection, lift, with_set_down=True)
+    moved = _outlines(opened.connection, lift)
     for other in open_lifts(opened.connection):
         reach_m = other.record.get("disturbed_reach_m")
         if other.state != "executing" and (
             reach_m is None or _gap(moved, _outlines(opened.connection, other)) < reach_m
         ):
-            note = f"disturbed: lift {lift.lift_id} came near its place"
+            note = f"disturbed: lift {lift.lift_id} came near its place, or near where its load would be put"
             step_lift(opened, other.lift_id, "expired", note)
 
 
@@ -314,7 +314,7 @@ def _stale(connection: Connection, clock_ns: int) -> dict[int, str]:
     return told
 
 
-def _outlines(connection: Connection, lift: OpenLift, *, with_set_down: bool = False) -> list[Float64]:
+def _outlines(connection: Connection, lift: OpenLift) -> list[Float64]:
     """Draw the corners (4, 2) of the load and the magnet's beam; and of both where they are set down."""
     rows = connection.execute(
         select(SIGHTINGS.c.record)
@@ -323,7 +323,7 @@ def _outlines(connection: Connection, lift: OpenLift, *, with_set_down: bool = F
     ).scalars()
     bundles = [bundle_of(json.loads(row)) for row in rows]
     places = [lift.record["target"]]
-    if with_set_down and lift.record["set_down"]:
+    if lift.record["set_down"]:
         places.append(lift.record["set_down"])
     beam = lift.record.get("beam") or {"width_m": 0.0, "length_m": 0.0}
     outlines = []

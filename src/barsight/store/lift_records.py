@@ -22,6 +22,7 @@ def add_lifts(
 
     Lifts are offered only where no later survey is known (is_newest); vetoes are kept of any.
     """
+    fetch = content.get("fetch")
     for veto in content["vetoes"]:
         opened.add(SURVEY_VETOES, survey_id=survey_id, code=veto["code"], reason=veto["reason"])
     for lift in content["refused"]:
@@ -36,6 +37,7 @@ def add_lifts(
         record |= {
             "beam": (content.get("magnet") or {}).get("beam"),
             "disturbed_reach_m": content["settings"]["disturbed_reach_m"],
+            "begins_fetch": None if fetch is None else lift["bundles"] == [fetch["steps"][0]["bundle"]],
         }
         lift_id = opened.add(
             LIFTS, survey_id=survey_id, rank=lift["rank"], record=json.dumps(record, sort_keys=True)

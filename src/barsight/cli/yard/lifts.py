@@ -35,7 +35,7 @@ from barsight.yard.inventory.bundle_file import read_bundles, read_match
 from barsight.yard.inventory.stock_list import contradicted_bundles
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.lift_file import write_lifts
-from barsight.yard.lifting.order import LiftOrder, order_lifts
+from barsight.yard.lifting.order import LiftOrder, begin_order, order_lifts
 from barsight.yard.lifting.targets import LiftPlan, map_vetoes, offset_vetoes, plan_lifts
 from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.magnet.description import Magnet, load_magnet
@@ -57,7 +57,7 @@ def run(arguments: Sequence[str]) -> None:
         settings: Annotated[LiftSettings, tyro.conf.arg(name="")] = default,
         config: Path | None = None,
         at: Literal["now", "end"] = "now",
-        fetch: int | None = None,
+        fetch: Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID[,ID...]")] = (),
         lifted: Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID[,ID...]")] = (),
         events: Path | None = None,
     ) -> None:
@@ -74,11 +74,12 @@ def run(arguments: Sequence[str]) -> None:
                 in OUT/events.csv, which counts from then on.
             events: CSV of what else was lifted, set down or passed by a magnet since; kept in the same file.
             at: When lifts are judged: now, or at the end of the recording, to look back; never for a crane.
-            fetch: Id of a bundle: also print the lifts that dig it out, in order.
+            fetch: Bundles that are wanted: the lifts that dig the first of them out that can be, in order. A
+                plant is offered that order's first lift alone.
         """
         described, folder = load_magnet(magnet), _open(out)
         _expect_bundles(out, folder, "--lifted", lifted)
-        _expect_bundles(out, folder, "--fetch", () if fetch is None else (fetch,))
+        _expect_bundles(out, folder, "--fetch", fetch)
         happened = _events(out, folder, lifted, events)
         now_ns = folder.captured_to_ns if at == "end" and folder.captured_to_ns else time.time_ns()
         with in_background(lambda: draw_pictures(out)) as pictures:
@@ -87,10 +88,8 @@ def run(arguments: Sequence[str]) -> None:
                 _vetoes(folder, described, settings, now_ns, has_magnet=magnet is not None), folder.travel,
                 now_ns, events=happened, contradicted=folder.contradicted,
             )  # fmt: skip
-            order = None if fetch is None else order_lifts(fetch, folder.heights, folder.bundles, plan)
-        if isinstance(order, Failed):
-            problem = f"bundle {fetch} can't be fetched, and nothing was written: {order.reason}"
-            raise InputError(out, problem, FETCH_REMEDY)
+            order = _first_order(out, folder, plan, fetch) if fetch else None
+            plan = plan if order is None else begin_order(order, plan, folder.bundles)
         console = SafeConsole(stderr=True)
         digest, sequence = bundles_digest(out), next_sequence(out / "lifts.json", folder.identity)
         with changed_folder(out) as staging:
@@ -157,6 +156,17 @@ def _vetoes(
     if changed:
         vetoes = (*vetoes, Veto("calibration-changed", f"{changed} was changed since: measure again"))
     return vetoes
+
+
+def _first_order(out: Path, folder: _MeasuredFolder, plan: LiftPlan, wanted: tuple[int, ...]) -> LiftOrder:
+    """Find the order of the first wanted bundle that can be dug out. Raises InputError where none can."""
+    reasons = []
+    for number in wanted:
+        order = order_lifts(number, folder.heights, folder.bundles, plan)
+        if not isinstance(order, Failed):
+            return order
+        reasons.append(f"bundle {number} can't be fetched: {order.reason}")
+    raise InputError(out, f"nothing was written, {'; '.join(reasons)}", FETCH_REMEDY)
 
 
 def print_order(order: LiftOrder, console: Console) -> None:

@@ -146,7 +146,8 @@ class Conditions:
 
     async def _refresh(self, parent: ua.NodeId, *arguments: Any) -> Any:
         subscription = arguments[0].Value if arguments else None
-        if subscription not in self._server.iserver.subscription_service.subscriptions:
+        known_ones = self._server.iserver.subscription_service.subscriptions
+        if not isinstance(subscription, int) or subscription not in known_ones:
             return ua.StatusCode(ua.StatusCodes.BadSubscriptionIdInvalid)
         await self._emitter.send(self._emitter.make("refresh start", "refresh", 1, {}), subscription)
         for known in list(self._by_code.values()):

@@ -10,8 +10,11 @@ from barsight.plant.opcua.security.binding import Node, Server, ua
 
 Handler = Callable[..., Awaitable[Any]]
 MAX_TEXT = 4096
-_PLAIN = {1: (bool,), 6: (int,), 7: (int,), 12: (str, type(None)), 15: (bytes, type(None))}
-"""Python types of the base types' numbers: Boolean, Int32, UInt32, String, ByteString."""
+_PLAIN = {
+    1: (bool,), 6: (int,), 7: (int,), 8: (int,), 9: (int,), 11: (float,), 12: (str, type(None)),
+    15: (bytes, type(None)), 17: (ua.NodeId,), 21: (ua.LocalizedText, type(None)),
+}  # fmt: skip
+"""Python types by base type: Boolean, integers, Double, String, ByteString, NodeId, LocalizedText."""
 
 
 async def answer_method(server: Server, node: Node, role: str, handler: Handler) -> None:

@@ -87,7 +87,7 @@ class Lift:
     isn't passed is a veto. validity: in time, None where no frame is known to have seen the place.
     covariance: (4, 4) of the target's x, y, z and yaw, None without a contact. map_vetoes: those that forbid
     every lift of the map. set_down: where the load can be put, None where no place is known or none was
-    looked for.
+    looked for; magnet_down: the magnet's place when the load lies there.
     """
 
     place: Placement
@@ -108,6 +108,7 @@ class Lift:
     covariance: Float64 | None = None
     map_vetoes: tuple[Veto, ...] = ()
     set_down: SetDown | None = None
+    magnet_down: Placement | None = None
 
     @property
     def vetoes(self) -> tuple[Veto, ...]:

@@ -112,7 +112,7 @@ def lifts_content(
 def _lift(lift: Lift, rank: int | None, offset: MagnetOffset | None) -> dict[str, Any]:
     contact, place = lift.contact, lift.place
     height = contact.centre_z_m if contact else None
-    put = lift.set_down
+    put, over = lift.set_down, lift.magnet_down
     return {
         "rank": rank,
         "target": {
@@ -156,7 +156,9 @@ def _lift(lift: Lift, rank: int | None, offset: MagnetOffset | None) -> dict[str
         ],
         "target_covariance": None if lift.covariance is None else lift.covariance.tolist(),
         "set_down": asdict(put) if put else None,
-        "crane_set_down": _crane(put.x_m, put.y_m, put.z_m, put.yaw_deg, offset) if put else None,
+        "crane_set_down": _crane(over.x_m, over.y_m, put.z_m, math.degrees(over.yaw_rad), offset)
+        if put and over
+        else None,
         "checks": [asdict(check) for check in lift.checks],
         "vetoes": _vetoes(lift.vetoes),
     }

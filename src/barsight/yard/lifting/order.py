@@ -7,7 +7,7 @@ until the place is measured again.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.ground import Ground
 from barsight.yard.lifting.load import Load, axes_of
 from barsight.yard.lifting.set_down import SHADOW_M, SetDown, find_set_down, sound_ground
-from barsight.yard.lifting.targets import LiftPlan
+from barsight.yard.lifting.targets import LiftPlan, put_down
 from barsight.yard.types import Bundle, YardMap
 
 
@@ -76,6 +76,17 @@ def order_lifts(
         cells = ground.inside(load, place.x_m, place.y_m, place.yaw_rad, SHADOW_M)
         ground = ground.with_load(cells, place.z_m + load.height_m)
     return LiftOrder(bundle_id, tuple(steps))
+
+
+def begin_order(order: LiftOrder, plan: LiftPlan, bundles: tuple[Bundle, ...]) -> LiftPlan:
+    """Put the load of the offered lift that begins an order where the order has it, off what is dug out."""
+    first = order.steps[0]
+    load = Load.of(tuple(bundle for bundle in bundles if bundle.id == first.bundle))
+    offered = tuple(
+        put_down(lift, load, first.set_down) if lift.bundles == load.bundles else lift
+        for lift in plan.offered
+    )
+    return replace(plan, offered=offered)
 
 
 def travel_height(ground: Ground, load: Load, place: SetDown, settings: LiftSettings) -> float | Failed:

@@ -4,6 +4,7 @@ vetoes.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -17,8 +18,8 @@ from barsight.yard.events import YardEvent, events_since
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.assessment import Lift, LiftScene, assess_placement
 from barsight.yard.lifting.ground import Ground
-from barsight.yard.lifting.load import Load
-from barsight.yard.lifting.set_down import find_set_down, sound_ground
+from barsight.yard.lifting.load import Load, axes_of
+from barsight.yard.lifting.set_down import SetDown, find_set_down, sound_ground
 from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.lifting.validity import age_checks
 from barsight.yard.magnet.description import Magnet
@@ -145,9 +146,9 @@ def plan_lifts(
     if offered:
         ground = sound_ground(Ground.of(yard), bundles, standing, settings, events_since(events, captured_ns))
         by_id = {bundle.id: bundle for bundle in bundles}
-        loads = (Load.of(tuple(by_id[k] for k in lift.bundles)) for lift in offered)
+        loads = [Load.of(tuple(by_id[k] for k in lift.bundles)) for lift in offered]
         places = ordered_map(lambda load: find_set_down(ground, load, magnet, settings), loads)
-        offered = [replace(lift, set_down=place) for lift, place in zip(offered, places, strict=True)]
+        offered = [put_down(*one) for one in zip(offered, loads, places, strict=True)]
     return LiftPlan(
         magnet,
         settings,
@@ -161,6 +162,16 @@ def plan_lifts(
         captured_ns,
         events,
     )
+
+
+def put_down(lift: Lift, load: Load, place: SetDown | None) -> Lift:
+    """Put a lift's load down; the magnet keeps its place on the load, be it the middle or not."""
+    if place is None:
+        return replace(lift, set_down=None, magnet_down=None)
+    held = axes_of(load.yaw_rad) @ (lift.place.x_m - load.x_m, lift.place.y_m - load.y_m)
+    turn = math.radians(place.turn_deg)
+    x, y = np.array([place.x_m, place.y_m]) + held @ axes_of(load.yaw_rad + turn)
+    return replace(lift, set_down=place, magnet_down=Placement(float(x), float(y), lift.place.yaw_rad + turn))
 
 
 def _groups(bundles: tuple[Bundle, ...], count: int) -> Iterator[tuple[Bundle, ...]]:
