@@ -60,7 +60,7 @@ def test_a_single_frame_says_that_nothing_confirms_it(recording: Path) -> None:
     out, result = measured(recording)
     assert result["frames"]["used"] == result["frames"]["total"] == 1
     assert "one-view" in codes(result)
-    assert len((out / "trajectory.tum").read_text().splitlines()) == 2
+    assert len((out / "trajectory.tum").read_text().splitlines()) == 3
 
 
 def test_unpaired_pictures_count_as_frames(recording: Path) -> None:

@@ -187,7 +187,7 @@ def test_too_few_samples_say_nothing_of_their_bias() -> None:
 @pytest.mark.parametrize("sigma_m", [0.001, float("nan")])
 def test_laser_csv_keeps_the_sigma(tmp_path: Path, sigma_m: float) -> None:
     profile = LaserProfile(3, X, X * 0 + 0.7, X * 0 + 1.25, sigma_m)
-    write_laser_csv((profile,), tmp_path / "laser.csv", "yard:f00d")
+    write_laser_csv((profile,), tmp_path / "laser.csv")
     (read,) = read_laser(tmp_path)
     assert read.profile == 3 and np.array_equal(read.z_m, profile.z_m)
     assert np.array_equal(read.range_std_m, sigma_m, equal_nan=True)

@@ -71,7 +71,7 @@ def written(out: Path, error_mm: float = 0.0, sigma_m: float = 0.005, hole: slic
     write_height(surface, out / "height.tif", "yard:f00d")
     source = np.where(np.isfinite(profile), HeightSource.VISION, HeightSource.UNKNOWN).astype(np.uint8)
     contour = Contour(0, X, X * 0 + 0.1, profile, profile * 0 + sigma_m, source)
-    write_contours((contour,), out / "contour.csv", "yard:f00d")
+    write_contours((contour,), out / "contour.csv")
     return out
 
 

@@ -1,11 +1,9 @@
 """Every file of a measured folder names the frame of its places, and foreign frames aren't mixed."""
 
-import csv
 import json
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import tifffile
 
@@ -29,9 +27,6 @@ def named(folder: Path, name: str) -> str:
     if path.suffix == ".tif":
         with tifffile.TiffFile(path) as file:
             return str(file.pages.first.geotiff_tags["GTCitationGeoKey"])
-    if path.suffix == ".csv":
-        (frame,) = {row["frame"] for row in csv.DictReader(path.read_text().splitlines())}
-        return frame
     head = path.read_bytes()[:2000].decode("latin-1").splitlines()
     (line,) = (line for line in head if line.startswith(("comment frame", "# frame")))
     return line.split()[-1]
@@ -46,7 +41,7 @@ def test_every_file_names_the_frame_of_result_json(
     result = json.loads((out / "result.json").read_text())
     placed = result["yard_frame_id"]
     assert result["frame_id"] == f"yard:{placed}" if placed else result["frame_id"].startswith("world:")
-    files = ("trajectory.tum", "cloud.ply", "height.tif", "free.tif", "tops.tif", "ortho.tif", "contour.csv")
+    files = ("trajectory.tum", "cloud.ply", "height.tif", "free.tif", "tops.tif", "ortho.tif")
     assert {named(out, name) for name in files} == {result["frame_id"]}
     path, (contour, *_) = read_path(out), read_contours(out)
     assert path is not None and len(path.stamp_ns) == 4 and len(contour.z_m) > 20
@@ -54,15 +49,6 @@ def test_every_file_names_the_frame_of_result_json(
     for kind in ("pcd", "csv"):
         export(out, out / f"points.{kind}")
         assert named(out, f"points.{kind}") == result["frame_id"]
-
-
-def test_a_contour_of_an_older_version_is_read(tmp_path: Path) -> None:
-    rows = "0,1.0,2.0,0.5,0.01,1\n0,1.01,2.0,,,0\n"
-    for head, end in (("", ""), (",frame", ",yard:f00d")):
-        text = f"profile,x_m,y_m,z_m,sigma_m,source{head}\n" + rows.replace("\n", f"{end}\n")
-        (tmp_path / "contour.csv").write_text(text)
-        (contour,) = read_contours(tmp_path)
-        assert contour.z_m[0] == 0.5 and np.isnan(contour.z_m[1]) and contour.source.tolist() == [1, 0]
 
 
 def moved(folder: Path, frame: str) -> Path:

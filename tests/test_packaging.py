@@ -34,6 +34,7 @@ EXTRAS = {
     "cameras": {"sensors/gige.py"},
     "store": {
         "store/tables.py",
+        "store/changes.py",
         "store/opening.py",
         "store/audit.py",
         "store/states.py",
@@ -53,6 +54,7 @@ EXTRAS = {
         "store/migrations/versions/v0002_page.py",
         "page/conditions.py",
         "page/documents.py",
+        "page/pictures.py",
         "page/layers.py",
         "page/survey_files.py",
         "page/watch.py",

@@ -311,15 +311,13 @@ def _by_profile(path: Path, table: Float64) -> dict[int, Float64]:
 
 def _read_table(path: Path, known: int, *columns: int) -> Float64:
     """Read (N, one of `columns`) from a CSV with a header; an empty field is NaN, which none of the first
-    `known` may be. A last column `frame` is left out: older versions didn't write it.
+    `known` may be.
     """
     if not path.is_file():
         return np.empty((0, columns[0]))
-    head, *lines = read_lines(path, remedy=REMEDY) or [""]
+    lines = read_lines(path, remedy=REMEDY)[1:]
     if not lines:
         return np.empty((0, columns[0]))
-    if head.rstrip().endswith(",frame"):
-        lines = [line.rpartition(",")[0] for line in lines]
     filled = (re.sub(",(?=,|$)", ",nan", line) for line in lines)
     try:
         table = np.loadtxt(filled, dtype=np.float64, delimiter=",", ndmin=2)

@@ -1,7 +1,7 @@
 """Export a measured cloud or map to other programs' formats, chosen by the file's name.
 
-All keep metres and the reference frame, which LAS (system identifier), PCD (a comment) and E57 (the scan's
-name) say too. LAS and PCD keep sigma and view count as fields of their own; E57 has no place for them.
+All keep metres and the reference frame, which LAS (system identifier), PCD and CSV (a comment) and E57 (the
+scan's name) say too. LAS and PCD keep sigma and view count as fields of their own; E57 has no place for them.
 """
 
 from __future__ import annotations
@@ -104,11 +104,8 @@ def _write_e57(cloud: Cloud, path: Path, frame_id: str) -> None:
 
 def _write_csv(cloud: Cloud, path: Path, frame_id: str) -> None:
     columns = np.column_stack([cloud.xyz_m, cloud.intensity, cloud.sigma_m, cloud.views])
-    head = "x_m,y_m,z_m,intensity,sigma_m,views"
-    form = "%.4f,%.4f,%.5f,%d,%.5f,%d"
-    if frame_id:
-        head, form = f"{head},frame", f"{form},{frame_id}"
-    np.savetxt(path, columns, form, header=head, comments="")
+    head = f"# frame {frame_id}\n" * bool(frame_id) + "x_m,y_m,z_m,intensity,sigma_m,views"
+    np.savetxt(path, columns, "%.4f,%.4f,%.5f,%d,%.5f,%d", header=head, comments="")
 
 
 _WRITERS: dict[str, Callable[[Cloud, Path, str], None]] = {

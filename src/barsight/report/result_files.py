@@ -63,9 +63,9 @@ def write_tables(measurement: Measurement, folder: Path) -> None:
     """Write trajectory, contours and the laser's profiles into an existing folder."""
     frame_id = measurement.frame_id
     write_trajectory(measurement.trajectory, folder / "trajectory.tum", frame_id)
-    write_contours(measurement.contours, folder / "contour.csv", frame_id)
+    write_contours(measurement.contours, folder / "contour.csv")
     if measurement.laser:
-        write_laser_csv(measurement.laser, folder / "laser.csv", frame_id)
+        write_laser_csv(measurement.laser, folder / "laser.csv")
 
 
 def write_results(measurement: Measurement, identity: MapIdentity, folder: Path) -> None:
@@ -213,26 +213,26 @@ def _band(window: Layers, band: str) -> Float32:
     return values
 
 
-def write_contours(contours: tuple[Contour, ...], target: Path, frame_id: str) -> None:
-    """Write `profile,x_m,y_m,z_m,sigma_m,source,frame`; z and sigma are empty where nothing is known."""
+def write_contours(contours: tuple[Contour, ...], target: Path) -> None:
+    """Write `profile,x_m,y_m,z_m,sigma_m,source`; z and sigma are empty where nothing is known."""
     with atomic_path(target) as path, path.open("w", encoding="ascii") as file:
-        file.write("profile,x_m,y_m,z_m,sigma_m,source,frame\n")
+        file.write("profile,x_m,y_m,z_m,sigma_m,source\n")
         for contour in contours:
             for x, y, z, sigma, source in zip(
                 contour.x_m, contour.y_m, contour.z_m, contour.sigma_m, contour.source, strict=True
             ):
                 height = f"{z:.5f},{sigma:.5f}" if np.isfinite(z) else ","
-                file.write(f"{contour.profile},{x:.4f},{y:.4f},{height},{source},{frame_id}\n")
+                file.write(f"{contour.profile},{x:.4f},{y:.4f},{height},{source}\n")
 
 
-def write_laser_csv(laser: tuple[LaserProfile, ...], target: Path, frame_id: str) -> None:
-    """Write the reference profiles as they were read: `profile,x_m,y_m,z_m,sigma_m,frame`."""
+def write_laser_csv(laser: tuple[LaserProfile, ...], target: Path) -> None:
+    """Write the reference profiles as they were read: `profile,x_m,y_m,z_m,sigma_m`."""
     with atomic_path(target) as path, path.open("w", encoding="ascii") as file:
-        file.write("profile,x_m,y_m,z_m,sigma_m,frame\n")
+        file.write("profile,x_m,y_m,z_m,sigma_m\n")
         for profile in laser:
             sigma = f"{profile.range_std_m:.5f}" if np.isfinite(profile.range_std_m) else ""
             for x, y, z in zip(profile.x_m, profile.y_m, profile.z_m, strict=True):
-                file.write(f"{profile.profile},{x:.4f},{y:.4f},{z:.5f},{sigma},{frame_id}\n")
+                file.write(f"{profile.profile},{x:.4f},{y:.4f},{z:.5f},{sigma}\n")
 
 
 def write_preview(preview: Preview, target: Path) -> None:
