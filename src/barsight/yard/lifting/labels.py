@@ -8,6 +8,7 @@ import numpy as np
 from scipy import ndimage
 
 from barsight.core.arrays import Bool, Float32, Float64
+from barsight.yard.label_settings import LabelSettings
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.plates import STEP_M, plate_masks
@@ -15,7 +16,7 @@ from barsight.yard.stability.stability import nearest_cells
 from barsight.yard.types import HeightMap
 from barsight.yard.vetoes import Check, check_true
 
-SIZE_M = (0.1, 0.06)
+SIZE_M = LabelSettings().size_m
 """A usual label; one with a code is too dark in its middle for `mark_labels`."""
 BESIDE_M = 0.15
 """So far beside what lies under the faces the shape of a label may reach."""
