@@ -94,7 +94,8 @@ def test_a_budget_names_the_torn_certificate(
     write_results(tmp_path / "out", 0.0)
     measured_from(tmp_path / "out", whole)
     monkeypatch.chdir(whole.parent)
-    path = tmp_path / "certificate.json"
-    write_sealed({"schema_version": 1, "quantities": [row], "plan": {}}, path)
+    path, told = tmp_path / "certificate.json", json.loads((tmp_path / "out" / "result.json").read_text())
+    ids = {name: told[name] for name in ("calibration_id", "yard_frame_id")}
+    write_sealed({"schema_version": 1, "quantities": [row], "plan": {}, **ids}, path)
     assert run(["budget", str(tmp_path / "out"), "--certificate", str(path)]) == 3
     assert "certificate.json: is torn" in capsys.readouterr().err

@@ -76,7 +76,8 @@ def test_a_run_as_fast_as_possible_is_measure(whole: Path, tmp_path: Path) -> No
     fields: dict[str, Any] = {"stereo": {"method": "sgbm"}, "map": {"cell_m": 0.05}}
     batch = bs.measure(whole, magnet=magnet, at="end", **fields)
     assert files(out) == files(batch.folder)
-    assert told == [line for line in told if "mode full" in line] and len(told) == 1
+    # Between the two cameras' first pictures a look may fall, which tells so.
+    assert ["mode full" in line for line in told if "no picture yet" not in line] == [True]
     latency, state = content(out / "latency.json"), content(out / "state.json")
     frames = latency["frames"]
     assert [frames[name] for name in ("captured", "paired", "tracked", "kept")] == [4] * 4

@@ -78,7 +78,7 @@ def test_the_command(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert "40 frames placed in world" in said
     assert "against a PnP of the board by cam0: " in said
     assert "the gyro alone, one bias fitted to those poses, is " in said
-    assert len((tmp_path / "out" / "trajectory.tum").read_text().splitlines()) == 41
+    assert len((tmp_path / "out" / "trajectory.tum").read_text().splitlines()) == 42
     assert run(["odometry", str(path)]) == 3
     assert "name its rig file" in capsys.readouterr().err
     assert run(["info", str(path), "--rig", flags(data)[1]]) == 0
