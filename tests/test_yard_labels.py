@@ -7,11 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from barsight.yard.lifting.clearance import FacePlane
 from barsight.yard.lifting.labels import find_label, mark_labels
+from barsight.yard.magnet.contact import rest_magnet
 from barsight.yard.magnet.footprint import Placement
+from barsight.yard.types import HeightMap
 from lift_yards import MAGNET, codes, judged, laid, map_of, record
 
 PLACE = Placement(0.3, 0.0, 0.0)
+
+
+def plane(place: Placement, heights: HeightMap) -> FacePlane:
+    contact = rest_magnet(heights, place, MAGNET, 0.002)
+    assert contact is not None
+    return FacePlane.of(contact)
 
 
 def bars(shape: tuple[int, int]) -> np.ndarray:
@@ -37,7 +46,7 @@ def test_a_label_under_a_face_forbids(y_m: float, under: bool) -> None:
     label = np.ix_(np.abs(heights.y_m - y_m) < 0.033, np.abs(heights.x_m - 0.3) < 0.02)
     gray[label] = 250.0
     heights = replace(heights, gray=np.clip(gray, 1, 255).astype(np.uint8))
-    found = find_label(PLACE, heights, MAGNET)
+    found = find_label(PLACE, heights, MAGNET, plane(PLACE, heights))
     assert (found is not None) == under
     if found is not None:
         assert found[0] == pytest.approx(y_m, abs=0.03) and found[1] == pytest.approx(0.0, abs=0.02)
@@ -58,7 +67,10 @@ def test_a_label_with_a_code_forbids(half_m: tuple[float, float]) -> None:
     heights = replace(heights, gray=gray.astype(np.uint8))
     assert codes(judged([laid(0.3)], (record(laid(0.3)),), PLACE, heights=heights)) == {"gap"}
     between = (MAGNET.poles[0].along_m + MAGNET.poles[1].along_m) / 2
-    assert find_label(replace(PLACE, y_m=at_m - between), heights, MAGNET) is None
+    beside = replace(PLACE, y_m=at_m - between)
+    assert find_label(beside, heights, MAGNET, plane(beside, heights)) is None
+    over = replace(plane(PLACE, heights), centre_z_m=plane(PLACE, heights).centre_z_m + 0.03)
+    assert find_label(PLACE, heights, MAGNET, over) is None, "it lies 30 mm below the faces"
 
 
 def test_an_askew_label_on_a_bright_bar_is_found_and_a_gleam_is_not() -> None:

@@ -149,7 +149,7 @@ def assess_placement(
         *(check for b in load for check in footing_checks(b, near.bundles, yard.footings, settings)),
     ]
     if not vetoes_of(checks):
-        checks += label_checks(place, yard.heights, magnet)
+        checks += label_checks(place, yard.heights, magnet, FacePlane.of(contact))
         pixel_m = yard.travel.pixel_m(contact.centre_z_m) if yard.travel else None
         checks += thin_bar_checks(yard.heights, yard.thin_line(load), load, pixel_m, settings)
     scale = 0.0
@@ -268,7 +268,7 @@ def _tolerance(
             return found, changed
         wider = replace(magnet, tolerance=box)
         clear = clearance_checks(place, yard.heights, wider, contact, load)
-        for veto in vetoes_of([*label_checks(place, yard.heights, wider), *clear]):
+        for veto in vetoes_of([*label_checks(place, yard.heights, wider, FacePlane.of(contact)), *clear]):
             return found, veto.reason
         found = scale
     return found, ""

@@ -9,6 +9,7 @@ from scipy import ndimage
 
 from barsight.core.arrays import Bool, Float32, Float64
 from barsight.yard.label_settings import LabelSettings
+from barsight.yard.lifting.clearance import FacePlane
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.plates import STEP_M, plate_masks
@@ -18,6 +19,8 @@ from barsight.yard.vetoes import Check, check_true
 
 SIZE_M = LabelSettings().size_m
 """A usual label; one with a code is too dark in its middle for `mark_labels`."""
+DEEP_M = 0.02
+"""A label so far below the faces' plane, on the flank of a bundle, holds nothing off; what is unknown may."""
 BESIDE_M = 0.15
 """So far beside what lies under the faces the shape of a label may reach."""
 LENGTH_CELLS, WIDTH_CELLS, APART_CELLS = 5, 3, 5
@@ -33,13 +36,13 @@ _DARK = 10.0
 """Level that is added to both: where hardly any light is, ratios tell nothing."""
 
 
-def label_checks(place: Placement, heights: HeightMap, magnet: Magnet) -> list[Check]:
+def label_checks(place: Placement, heights: HeightMap, magnet: Magnet, plane: FacePlane) -> list[Check]:
     """Check that no label lies under a face, wherever within its tolerance the crane sets it down; empty
     without an orthophoto.
     """
     if heights.gray is None:
         return []
-    found = find_label(place, heights, magnet)
+    found = find_label(place, heights, magnet, plane)
     reason = ""
     if found is not None:
         reason = (
@@ -49,27 +52,36 @@ def label_checks(place: Placement, heights: HeightMap, magnet: Magnet) -> list[C
     return [check_true("gap", "no label lies under a face", found is None, reason)]
 
 
-def find_label(place: Placement, heights: HeightMap, magnet: Magnet) -> tuple[float, float] | None:
-    """Find a label under the faces, m along and across the beam; None where there is none."""
+def find_label(
+    place: Placement, heights: HeightMap, magnet: Magnet, plane: FacePlane
+) -> tuple[float, float] | None:
+    """Find a label under the faces that lies nearly as high as they do, m along and across the beam; None
+    where there is none.
+    """
     poles, tolerance = magnet.pole_table, magnet.tolerance
     slack = np.array([tolerance.x_m, tolerance.y_m])
     turned = math.radians(tolerance.yaw_deg)
     wide = float((np.abs(poles[:, 1]) + poles[:, 3] / 2).max())
-    long = LENGTH_CELLS * STEP_M / 2 + float(np.abs(place.along) @ slack) + turned * wide
-    broad = WIDTH_CELLS * STEP_M / 2 + float(np.abs(place.across) @ slack) + turned * magnet.half_span_m
-    reach_v = magnet.half_span_m + long + (APART_CELLS + LENGTH_CELLS) * STEP_M
-    v, u = _steps(reach_v + BESIDE_M), _steps(wide + broad + STEP_M + BESIDE_M)
+    off = np.array([LENGTH_CELLS, WIDTH_CELLS]) * STEP_M / 2  # of a marked middle to the label's edge
+    long = float(np.abs(place.along) @ slack) + turned * wide
+    broad = float(np.abs(place.across) @ slack) + turned * magnet.half_span_m
+    reach_v = magnet.half_span_m + long + off[0] + (APART_CELLS + LENGTH_CELLS) * STEP_M
+    reach_u = wide + broad + off[1] + STEP_M
+    v, u = _steps(reach_v + BESIDE_M), _steps(reach_u + BESIDE_M)
     gray, z_m = _look_up(place, heights, v, u)
-    bright = np.zeros(gray.shape, np.bool_)
-    near = np.ix_(np.abs(v) < reach_v + STEP_M, np.abs(u) < wide + broad + 2 * STEP_M)
-    bright[near] = mark_labels(gray[near])
+    middles, plates = np.zeros((2, *gray.shape), np.bool_)
+    near = np.ix_(np.abs(v) < reach_v + STEP_M, np.abs(u) < reach_u + STEP_M)
+    middles[near] = mark_labels(gray[near])
     for mask in plate_masks(gray, z_m, SIZE_M):
-        bright |= mask
-    under = np.zeros(bright.shape, np.bool_)
-    for along, across, length, width in poles:
-        rows = np.abs(v - along) <= length / 2 + long
-        under |= rows[:, None] & (np.abs(u - across) <= width / 2 + broad)
-    cells = np.argwhere(bright & under)
+        plates |= mask
+    faces_z_m = plane.centre_z_m + math.tan(plane.pitch_rad) * v[:, None] + math.tan(plane.roll_rad) * u
+    is_near = ~(z_m < faces_z_m - DEEP_M)
+    under = np.zeros(gray.shape, np.bool_)
+    for marked, (more_v, more_u) in ((middles, off), (plates, (0.0, 0.0))):
+        for along, across, length, width in poles:
+            rows = np.abs(v - along) <= length / 2 + long + more_v
+            under |= rows[:, None] & (np.abs(u - across) <= width / 2 + broad + more_u) & marked & is_near
+    cells = np.argwhere(under)
     return (float(v[cells[0, 0]]), float(u[cells[0, 1]])) if cells.size else None
 
 
