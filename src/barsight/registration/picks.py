@@ -10,9 +10,8 @@ import numpy as np
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
-from barsight.core.pose import skew
 from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame, StereoFrame
-from barsight.registration.tags import SeenTags, TagSighting
+from barsight.registration.tags import SeenTags, TagSighting, sighting_at
 
 HALF_PX = 10
 """Half the side of the patch about a pick that is sought in the right picture."""
@@ -55,7 +54,7 @@ def _sighted(
     found = find_right(pair, flat)
     if isinstance(found, Failed):
         return found
-    camera, body = pair.camera, frame.reference_from_body
+    camera = pair.camera
     disparity, row = flat[0] - found[0] + camera.doffs_px, found[1] - flat[1]
     if disparity < MIN_DISPARITY_PX:
         return Failed("no-match", "lies out of range")
@@ -64,13 +63,7 @@ def _sighted(
     ray, aside = np.append(across, 1.0), PICKED_PX * depth / camera.focal_px
     deep = MATCHED_PX * depth / disparity * ray
     noise = np.outer(deep, deep) + np.diag([aside**2, aside**2, 0.0])
-    at = rectifier.body_from_rect0.apply(depth * ray[None])[0]
-    turn = body.rotation @ rectifier.body_from_rect0.rotation
-    carry = np.hstack([-skew(body.rotation @ at), np.eye(3)])
-    return TagSighting(
-        pair.stamp_ns, at, body.apply(at[None])[0], turn @ noise @ turn.T, carry @ frame.covariance @ carry.T,
-        float(row), 2.0 * HALF_PX, body.apply(rectifier.body_from_rect0.translation[None])[0],
-    )  # fmt: skip
+    return sighting_at(depth * ray, noise, float(row), 2.0 * HALF_PX, rectifier, frame)
 
 
 def find_right(pair: RectifiedPair, flat: Float64) -> Float64 | Failed:

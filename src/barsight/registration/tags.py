@@ -166,16 +166,22 @@ def _triangulated(
     disparity = first[0] - second[0] + camera.doffs_px
     if np.abs(flat_left[:, 1] - flat_right[:, 1]).max() > MAX_ROWS_PX or disparity <= 0:
         return None
+    side_px = float(np.linalg.norm(flat_left - np.roll(flat_left, 1, axis=0), axis=1).min())
     seen_m, noise = _point(first, second, disparity, camera)
+    return sighting_at(seen_m, noise, float(first[1] - second[1]), side_px, rectifier, frame)
+
+
+def sighting_at(
+    seen_m: Float64, noise: Float64, row_px: float, side_px: float, rectifier: Rectifier, frame: PosedFrame
+) -> TagSighting:
+    """Carry a point (3,) of `rect0` and its covariance (3, 3) into the body and the trajectory's frame."""
     body = frame.reference_from_body
     at = rectifier.body_from_rect0.apply(seen_m[None])[0]
     turn = body.rotation @ rectifier.body_from_rect0.rotation
     carry = np.hstack([-skew(body.rotation @ at), np.eye(3)])
     return TagSighting(
         frame.stamp_ns, at, body.apply(at[None])[0], turn @ noise @ turn.T,
-        carry @ frame.covariance @ carry.T,
-        float(first[1] - second[1]),
-        float(np.linalg.norm(flat_left - np.roll(flat_left, 1, axis=0), axis=1).min()),
+        carry @ frame.covariance @ carry.T, row_px, side_px,
         body.apply(rectifier.body_from_rect0.translation[None])[0],
     )  # fmt: skip
 
