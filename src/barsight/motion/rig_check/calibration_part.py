@@ -38,5 +38,5 @@ def _row_values(rig: StereoRig, left: Float64, right: Float64) -> Float64:
     a = rig.cam0.rays(left) @ rig.cam0_from_cam1.rotation @ turned
     b = rig.cam1.rays(right) @ turned
     a, b = a / a[:, 2:], b / b[:, 2:]
-    values: Float64 = np.linalg.lstsq(row_design(b[:, 0], b[:, 1]), b[:, 1] - a[:, 1], rcond=None)[0]
-    return values
+    found = np.linalg.lstsq(row_design(b[:, 0], b[:, 1]), b[:, 1] - a[:, 1], rcond=None)[0]
+    return np.asarray(found, np.float64)
