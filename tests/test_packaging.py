@@ -34,7 +34,8 @@ EXTRAS = {
     "cameras": {"sensors/gige.py"},
     "store": {
         "store/tables.py",
-        "store/changes.py",
+        "store/calibrations.py",
+        "store/recordings.py",
         "store/opening.py",
         "store/audit.py",
         "store/states.py",
@@ -47,6 +48,7 @@ EXTRAS = {
         "store/promotion.py",
         "store/migrations/versions/v0003_fleet.py",
         "store/migrations/versions/v0004_places.py",
+        "store/migrations/versions/v0005_equipment.py",
         "fleet/records.py",
         "fleet/promoting.py",
         "plant/handshake.py",
