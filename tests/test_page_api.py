@@ -554,3 +554,20 @@ def test_calibrations_and_recordings_are_told_and_an_engineer_approves(local: ht
     state = local.get("/api/state").json()
     assert [one["code"] for one in state["map_vetoes"]] == ["calibration-changed"]
     assert state["top_alarm"]["code"] == "calibration-changed"
+
+
+def test_the_model_is_read_by_those_who_may_read(local: httpx.Client, url: str) -> None:
+    survey = local.get("/api/state").json()["survey"]["map_id"]
+    answer = local.get(f"/api/surveys/{survey}/model")
+    length = int.from_bytes(answer.content[:4], "little")
+    head = json.loads(answer.content[4 : 4 + length])
+    segments = sum(count for _, count in head["lines"])
+    assert len(answer.content) == 4 + length + 15 * head["points"] + 24 * segments
+    places = np.frombuffer(answer.content, "<f4", 3 * head["points"], 4 + length).reshape(-1, 3)
+    assert head["points"] > 1000 and -2.0 < places[:, 0].min() < places[:, 0].max() < 8.0
+    assert local.get(f"/api/surveys/{survey}/model?by=smell").status_code == 404
+    assert local.get("/api/surveys/0000/model").status_code == 404
+    with open_store(url) as store, entry(store, "ann", "account") as opened:
+        accounts.add_person(opened, "ann", "engineer", PASSWORD)
+    time.sleep(0.5)
+    assert local.get(f"/api/surveys/{survey}/model").status_code == 401

@@ -17,6 +17,7 @@ from barsight.page.access import COOKIE, RIGHTS, SESSION_S, Access, AccessError,
 from barsight.page.documents import bundle_history, bundle_records
 from barsight.page.guard import Guard
 from barsight.page.layers import Kind, PaintedLayers, find_layers
+from barsight.page.model import survey_model
 from barsight.page.pictures import paint_bundle
 from barsight.page.survey_files import find_file
 from barsight.page.watch import StoreWatch
@@ -284,6 +285,11 @@ def _add_files(app: FastAPI, watch: StoreWatch, access: Access) -> None:
         if painted is None:
             raise AccessError(404, f"survey {map_id} has no picture of {name}")
         return Response(painted, media_type="image/png")
+
+    @app.get("/api/surveys/{map_id}/model")
+    def model(map_id: str, _: Caller = reader, by: str = "height") -> Response:
+        with watch.store.reading() as connection:
+            return Response(survey_model(connection, map_id, by), media_type="application/octet-stream")
 
     @app.get("/api/surveys/{map_id}/files/{name}")
     def survey_file(map_id: str, name: str, _: Caller = reader) -> FileResponse:

@@ -5,7 +5,10 @@ import { clockNow, showCrane, yardScreen } from "./yard.js";
 import { adminScreen, alarmScreen, alarmText, bundleScreen, healthScreen, liftScreen, mark, priority, stockScreen, surveyScreen } from "./screens.js";
 import { timelineScreen } from "./timeline.js";
 
-const SCREENS = { yard: yardScreen, bundle: bundleScreen, lifts: liftScreen, stock: stockScreen, alarms: alarmScreen, timeline: timelineScreen, surveys: surveyScreen, health: healthScreen, admin: adminScreen };
+// WebGL is on this screen only: it is loaded when it is opened.
+const modelScreen = async (...given) => (await import("./model.js")).modelScreen(...given);
+
+const SCREENS = { yard: yardScreen, model: modelScreen, bundle: bundleScreen, lifts: liftScreen, stock: stockScreen, alarms: alarmScreen, timeline: timelineScreen, surveys: surveyScreen, health: healthScreen, admin: adminScreen };
 const place = document.getElementById("screen");
 let isThere = true;
 let drawn = 0;
