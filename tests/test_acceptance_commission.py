@@ -132,7 +132,7 @@ def test_tags_place_the_yard_before_it_is_measured(tmp_path: Path) -> None:
 def test_the_whole_way_from_a_drawn_crane_to_the_certificate(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A wrong rig file, which the travel refuses, then the right one. Tags place the yard."""
+    """A wrong rig file, which the travel refuses, then board pictures. Tags place the yard."""
     plan = lay_out(Area((0.2, 3.8), (-1.35, 1.35), 4.5, 625.0, 0.5), "drawn")
     assert isinstance(plan, AcceptancePlan)
     (tmp_path / "plan.toml").write_text(plan_text(plan))
@@ -154,7 +154,14 @@ def test_the_whole_way_from_a_drawn_crane_to_the_certificate(
     assert run(["commission", str(crane)]) == 5
     assert "yaw" in capsys.readouterr().err
     assert [one.name for one in read_done(crane)] == ["cameras"]
-    write_rig_file(crane / "rig.yaml", rig)
+    board = "checkerboard:9x6:0.1"
+    settings.write_text(
+        settings.read_text()
+        .replace("checkerboard:9x6:0.025", board)
+        .replace("range_m = 7.0", "range_m = 4.5")
+    )
+    photographed = ["--seed", "23", "--board", board, "--views", "30", *camera, *placed[:4]]
+    assert run(["simulate", str(crane / "board"), *photographed]) == 0
     (crane / "plan.toml").write_text(plan_text(plan))
     assert run(["commission", str(crane)]) == 0, capsys.readouterr().err
     certificate = read_certificate(crane / "certificate.json")

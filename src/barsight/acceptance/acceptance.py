@@ -64,7 +64,7 @@ def accept(
         measure_into(path, folder, settings, advance=advance, report=False)
         source = in_yard(open_recording(path, settings.recording), settings.yard)
         seen.append(observe(folder, plan, source.rig, str(path)))
-        check, health = look_at_rig(source)
+        check, health = look_at_rig(source, settings.recording.rig)
         rig.append(check)
         pictures.append(health)
         inputs[str(path)] = dict(source.digests())
@@ -75,9 +75,11 @@ def accept(
     return Acceptance(plan, tuple(seen), judged, tuple(rig), tuple(pictures), causes, inputs, offset)
 
 
-def look_at_rig(source: Recording) -> tuple[RigCheck, tuple[PictureHealth, ...] | Failed]:
-    """Check what travel and rows show of the rig, and the pictures' health."""
-    check = check_rig(source, FusionSettings(), CheckSettings(), lambda: None)
+def look_at_rig(
+    source: Recording, rig_file: Path | None
+) -> tuple[RigCheck, tuple[PictureHealth, ...] | Failed]:
+    """Check what travel and rows show of the rig, which was read from rig_file, and the pictures' health."""
+    check = check_rig(source, FusionSettings(), CheckSettings(), lambda: None, rig_file)
     return check, check_pictures(_some_frames(source))
 
 

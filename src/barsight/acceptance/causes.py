@@ -216,7 +216,7 @@ def _travel_rows(check: RigCheck) -> Iterator[_Row]:
     if not isinstance(rows, Failed):
         answer = np.zeros(len(UNKNOWNS))
         answer[0] = 1.0
-        yield _Row("", float(rows.values[3]), float(rows.sigmas[3]), answer)
+        yield _Row("", float(rows.values[3]), float(check.row_sigmas[3]), answer)
     if isinstance(drift, Failed):
         return
     known = np.linalg.inv(drift.covariance)

@@ -108,10 +108,13 @@ class ControlChart:
 
 def rig_figures(check: RigCheck) -> tuple[WatchedFigure, ...]:
     """Take what rows and travel show of the rig: baseline, pitch, roll, focal ratio, and the yaw, which both
-    see, as their weighted mean.
+    see, as their weighted mean. What the calibration leaves open is alike in all surveys: sigmas are noise.
     """
+    noise = {} if isinstance(check.rows, Failed) else dict(
+        zip(("pitch", "roll", "focal ratio"), check.rows.sigmas / check.row_sigmas, strict=False)
+    )  # fmt: skip
     figures = [
-        WatchedFigure(f"{line.name} / {line.unit}", line.value, line.sigma)
+        WatchedFigure(f"{line.name} / {line.unit}", line.value, line.sigma * float(noise.get(line.name, 1)))
         for line in check.lines
         if isfinite(line.value) and isfinite(line.sigma) and not line.name.startswith("yaw")
     ]

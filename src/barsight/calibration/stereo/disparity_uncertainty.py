@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,14 +32,20 @@ def disparity_sigma_px(path: Path | None, range_m: float) -> float | None:
     _, left, right = sample_pairs(rig, [range_m])
     if len(left) == 0:
         return None
-    steps = STEP_SIGMAS * np.sqrt(np.diag(covariance))
-    columns = []
-    for number, step in enumerate(steps):
-        ends = [triangulate_depth(_moved(rig, names, number, sign * step), left, right) for sign in (1, -1)]
-        columns.append((ends[0] - ends[1]) / (2 * step))
-    by = np.column_stack(columns)
+    by = differentiate(lambda moved: triangulate_depth(moved, left, right), rig, names, covariance)
     sigma_m = float(np.median(np.sqrt(np.einsum("nc,cd,nd->n", by, covariance, by))))
     return sigma_m * rig.cam0.fx_px * rig.baseline_m / range_m**2
+
+
+def differentiate(
+    of: Callable[[StereoRig], Float64], rig: StereoRig, names: tuple[str, ...], covariance: Float64
+) -> Float64:
+    """Differentiate (N,) of a rig by the parameters that its file names: (N, C)."""
+    columns = []
+    for number, step in enumerate(STEP_SIGMAS * np.sqrt(np.diag(covariance))):
+        ends = [of(_moved(rig, names, number, sign * step)) for sign in (1, -1)]
+        columns.append((ends[0] - ends[1]) / (2 * step))
+    return np.column_stack(columns)
 
 
 def _moved(rig: StereoRig, names: tuple[str, ...], number: int, step: float) -> StereoRig:

@@ -104,7 +104,7 @@ def _look(
 ) -> tuple[WatchedSurvey, RigCheck, list[str]]:
     """Take a survey's figures; also the rig's check and what is said of dirty lenses."""
     source = in_yard(open_recording(path, settings.recording), settings.yard)
-    check, health = look_at_rig(source)
+    check, health = look_at_rig(source, settings.recording.rig)
     figures = rig_figures(check) + picture_figures(health)
     if plan is not None:
         console = SafeConsole(stderr=True)

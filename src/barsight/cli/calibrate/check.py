@@ -60,7 +60,7 @@ def run(arguments: Sequence[str]) -> None:
         source = open_recording(recording, reading)
         with stages(SafeConsole(stderr=True)) as advance:
             count = count_frames("travel", len(source.index.stamps_ns), advance)
-            check = check_rig(source, fusion, settings, count)
+            check = check_rig(source, fusion, settings, count, reading.rig)
         if out is not None:
             write_rig_check_report(check, str(recording), out.with_suffix(".html"), out)
         _print(check, SafeConsole())

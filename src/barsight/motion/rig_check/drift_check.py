@@ -5,15 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
+from pathlib import Path
 
 import numpy as np
 
 from barsight.calibration.geometry.rectification import Rectifier
+from barsight.core.arrays import Float64
 from barsight.core.errors import Failed, MeasurementError
 from barsight.core.settings.values import POSITIVE, expect_ranges
 from barsight.core.types import RectifiedCamera, RigDrift
 from barsight.motion.batch.fusion import BatchFusion, FusionSettings
 from barsight.motion.crane.encoder_trajectory import CraneSettings
+from barsight.motion.rig_check.calibration_part import calibration_covariance
 from barsight.motion.rig_check.epipolar_error import RowDrift, measure_row_drift
 from barsight.motion.rig_check.self_calibration import turn_right_camera
 from barsight.recording.base import Recording
@@ -69,12 +72,15 @@ BAD_STATES = (DriftState.RECALIBRATE, DriftState.CONTRADICTION)
 
 @dataclass(frozen=True, eq=False)
 class RigCheck:
-    """lines: the judged drifts. rows, drift: what was seen, or why not. range_m: the working range."""
+    """lines: the judged drifts. rows, drift: what was seen, or why not. range_m: the working range.
+    row_sigmas: (4,) of the rows' values, with what the calibration itself leaves open; rows' own are noise.
+    """
 
     lines: tuple[CheckLine, ...]
     rows: RowDrift | Failed
     drift: RigDrift | Failed
     range_m: float
+    row_sigmas: Float64
 
     @property
     def state(self) -> DriftState:
@@ -90,9 +96,12 @@ class RigCheck:
 
 
 def check_rig(
-    recording: Recording, fusion: FusionSettings, settings: CheckSettings, advance: Callable[[], None]
-) -> RigCheck:
-    """Check for drift. Raises MeasurementError where neither rows nor travel show anything."""
+    recording: Recording, fusion: FusionSettings, settings: CheckSettings, advance: Callable[[], None],
+    rig_file: Path | None = None,
+) -> RigCheck:  # fmt: skip
+    """Check for drift. rig_file: that the rig was read from, which may say how well it is known. Raises
+    MeasurementError where neither rows nor travel show anything.
+    """
     rig = recording.rig
     rows = measure_row_drift(recording, Rectifier(rig), settings.frames)
     if not isinstance(rows, Failed):
@@ -104,9 +113,11 @@ def check_rig(
     if isinstance(rows, Failed) and isinstance(drift, Failed):
         raise MeasurementError(f"{recording.path}: nothing to check by: {rows.reason}; {drift.reason}")
     range_m = settings.range_m or (drift.range_m if isinstance(drift, RigDrift) else np.nan)
-    lines = _row_lines(rows, rectifier.camera, range_m, settings)
-    lines += _travel_lines(drift, rows, range_m, settings)
-    return RigCheck(tuple(lines), rows, drift, range_m)
+    own = np.zeros(4) if isinstance(rows, Failed) else rows.sigmas
+    sigmas = np.sqrt(own**2 + np.diag(calibration_covariance(rig_file, range_m)))
+    lines = _row_lines(rows, sigmas, rectifier.camera, range_m, settings)
+    lines += _travel_lines(drift, rows, sigmas, range_m, settings)
+    return RigCheck(tuple(lines), rows, drift, range_m, sigmas)
 
 
 def _by_travel(
@@ -123,7 +134,7 @@ def _by_travel(
 
 
 def _row_lines(
-    rows: RowDrift | Failed, camera: RectifiedCamera, range_m: float, settings: CheckSettings
+    rows: RowDrift | Failed, sigmas: Float64, camera: RectifiedCamera, range_m: float, settings: CheckSettings
 ) -> list[CheckLine]:
     if isinstance(rows, Failed):
         return [_unseen(name, "deg", rows.reason) for name in ("pitch", "roll", "focal ratio")]
@@ -133,7 +144,7 @@ def _row_lines(
     off_row = {"pitch": f, "roll": f * x, "focal ratio": f * y}
     off_column = {"pitch": x * y, "roll": y, "focal ratio": x}
     lines = []
-    for name, value, sigma in zip(off_row, rows.values[:3], rows.sigmas[:3], strict=True):
+    for name, value, sigma in zip(off_row, rows.values[:3], sigmas[:3], strict=True):
         cost = 1e3 * abs(value) * off_column[name] * range_m**2 / baseline
         px = abs(value) * off_row[name]
         real = abs(value) > 3 * sigma
@@ -154,8 +165,9 @@ def _row_lines(
 
 
 def _travel_lines(
-    drift: RigDrift | Failed, rows: RowDrift | Failed, range_m: float, settings: CheckSettings
-) -> list[CheckLine]:
+    drift: RigDrift | Failed, rows: RowDrift | Failed, sigmas: Float64, range_m: float,
+    settings: CheckSettings,
+) -> list[CheckLine]:  # fmt: skip
     if isinstance(drift, Failed):
         return [_unseen("yaw", "deg", drift.reason), _unseen("baseline", "%", drift.reason)]
     yaw, sigma = np.degrees([drift.yaw_rad, drift.yaw_sigma_rad])
@@ -170,7 +182,7 @@ def _travel_lines(
     ]
     if not isinstance(rows, Failed):
         off = float(rows.values[3] - drift.yaw_rad)
-        spread = float(np.hypot(rows.sigmas[3], drift.yaw_sigma_rad))
+        spread = float(np.hypot(sigmas[3], drift.yaw_sigma_rad))
         agree = abs(off) <= 3 * spread
         why = (
             "rows and travel agree on the yaw" if agree

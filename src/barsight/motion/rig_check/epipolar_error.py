@@ -132,7 +132,14 @@ def _design(matches: Float64, camera: RectifiedCamera) -> Float64:
     f = camera.focal_px
     x = (matches[:, 0] - camera.cx_px - camera.doffs_px) / f
     y = (matches[:, 1] - camera.cy_px) / f
-    return f * np.column_stack([1 + y**2, -x, y, -x * y])
+    return f * row_design(x, y)
+
+
+def row_design(x: Float64, y: Float64) -> Float64:
+    """Compute how rows answer (N, 4) to pitch, roll, focal ratio and yaw at places of the right picture, all
+    in focal lengths.
+    """
+    return np.column_stack([1 + y**2, -x, y, -x * y])
 
 
 def _cells(

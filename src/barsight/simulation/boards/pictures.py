@@ -83,9 +83,14 @@ class _Sheet:
         directions = np.dstack([rays, np.ones(rays.shape[:2], np.float32)])
         depth = (pose.translation @ normal) / (directions @ normal)
         at = (directions * depth[..., None] - pose.translation) @ pose.rotation[:, :2]
-        place = ((at + self.size_m / 2) * self._px_per_m - 0.5).astype(np.float32)
+        coarser = self._px_per_m * float(np.linalg.norm(np.diff(at, axis=1), axis=2).min())
+        drawn = self._drawn
+        if coarser > 1:  # a ray sees the mean of what lies around it
+            size = np.ceil(np.array(drawn.shape[::-1]) / coarser).astype(int)
+            drawn = cv2.resize(drawn, size.tolist(), interpolation=cv2.INTER_AREA)
+        place = ((at / self.size_m + 0.5) * drawn.shape[::-1] - 0.5).astype(np.float32)
         ink = cv2.remap(
-            self._drawn, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT,
+            drawn, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT,
             borderValue=-1,
         )  # fmt: skip
         radiance = np.where(ink < 0, BEHIND, DARK + (BRIGHT - DARK) * ink).astype(np.float32)

@@ -1,0 +1,42 @@
+"""Propagate a rig file's covariance to what rows of matches show of the rig."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from barsight.calibration.files.rig_file import read_covariance
+from barsight.calibration.files.rig_formats import holds_own_rig, read_rig_file
+from barsight.calibration.geometry.rectification import right_from_rectified
+from barsight.calibration.geometry.rig import StereoRig
+from barsight.calibration.stereo.disparity_uncertainty import differentiate
+from barsight.calibration.stereo.projection_uncertainty import sample_pairs
+from barsight.core.arrays import Float64
+from barsight.motion.rig_check.epipolar_error import row_design
+
+FAR_BASELINES = 15.0
+"""Where nobody says the range: rows hardly ask for it."""
+
+
+def calibration_covariance(path: Path | None, range_m: float) -> Float64:
+    """Propagate to pitch, roll, focal ratio and yaw as rows show them (4, 4): a lens that is calibrated a
+    little wrong shifts rows as a turned camera does. 0 where no file is given or it carries no covariance.
+    """
+    if path is None or not holds_own_rig(path) or (known := read_covariance(path)) is None:
+        return np.zeros((4, 4))
+    rig, (names, covariance) = read_rig_file(path), known
+    _, left, right = sample_pairs(rig, [range_m if range_m == range_m else FAR_BASELINES * rig.baseline_m])
+    by = differentiate(lambda moved: _row_values(moved, left, right), rig, names, covariance)
+    part: Float64 = by @ covariance @ by.T
+    return part
+
+
+def _row_values(rig: StereoRig, left: Float64, right: Float64) -> Float64:
+    """Fit what raw pixels (N, 2) of both cameras show by their rows: (4,)."""
+    turned = right_from_rectified(rig)
+    a = rig.cam0.rays(left) @ rig.cam0_from_cam1.rotation @ turned
+    b = rig.cam1.rays(right) @ turned
+    a, b = a / a[:, 2:], b / b[:, 2:]
+    found = np.linalg.lstsq(row_design(b[:, 0], b[:, 1]), b[:, 1] - a[:, 1], rcond=None)[0]
+    return np.asarray(found, np.float64)
