@@ -58,6 +58,7 @@ EXTRAS = {
         "page/documents.py",
         "page/pictures.py",
         "page/layers.py",
+        "page/model.py",
         "page/survey_files.py",
         "page/watch.py",
     },
