@@ -157,7 +157,7 @@ class Model {
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     gl.useProgram(program);
     gl.uniformMatrix4fv(gl.getUniformLocation(program, "view"), false, this.matrix());
-    gl.uniform1f(gl.getUniformLocation(program, "size"), (1.3 * this.spacing * height) / (2 * Math.tan(FIELD / 2)));
+    gl.uniform1f(gl.getUniformLocation(program, "size"), (1.7 * this.spacing * height) / (2 * Math.tan(FIELD / 2)));
     gl.enableVertexAttribArray(0);
     gl.enableVertexAttribArray(1);
     gl.bindBuffer(gl.ARRAY_BUFFER, this.buffers[0]);
