@@ -47,7 +47,7 @@ PAN = """async (count) => {
     view.frames = [];
     const stamps = [];
     for (let k = 0; k < 60; k += 1) {
-      view.pan(k % 2 ? 9 : -7, 3);
+      view.pan(k < 30 ? 20 : -20, 3);
       stamps.push(await new Promise(requestAnimationFrame));
     }
     const sorted = view.frames.slice().sort((a, b) => a - b);

@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -24,12 +25,15 @@ from barsight.core.errors import ConfigError, InputError
 from barsight.core.stamps import NS_PER_S
 from barsight.page.access import Access, AccessError, Throttle
 from barsight.page.documents import unseen_lengths
-from barsight.page.layers import find_layers, paint_layer
+from barsight.page.layers import find_layers, newest_at, paint_layer
 from barsight.page.serve import ServeOptions, serving
 from barsight.store import accounts, confirmation
 from barsight.store.adding import add_survey, read_survey
 from barsight.store.audit import AuditChain, entry, verify_chain
+from barsight.store.calibrations import approve_calibration, note_calibration
+from barsight.store.history import list_surveys, present_yard
 from barsight.store.opening import open_store
+from barsight.yard.inventory.stock_list import match_stock, read_stock
 from live_folders import live_folder
 from page_yards import FIRST, SECOND, fill_store, survey
 
@@ -45,6 +49,7 @@ CHANGES = [
     ("POST", "/api/accounts", {"name": "x", "kind": "token", "role": "viewer"}, "administer"),
     ("DELETE", "/api/accounts/eve", None, "administer"),
     ("GET", "/api/accounts", None, "administer"),
+    ("POST", "/api/calibrations", {"digest": "ca1b"}, "administer"),
     ("POST", "/api/vetoes", {"code": "disturbed", "reason": "a lorry"}, "report"),
 ]
 MAY = {
@@ -159,7 +164,8 @@ def test_crane_and_magnet_are_told_as_the_live_run_tells_them(url: str, tmp_path
 
         os.utime(live / "state.json")
         moving, silent = read_events(client, "crane", beat)
-    place = {"body_m": [3.0, 1.0], "magnet_m": [2.4, 1.1]}
+        newest = client.get("/api/state").json()["survey"]["captured_to_ns"]
+    place = {"body_m": [3.0, 1.0], "magnet_m": [2.4, 1.1], "map_seen_ns": newest}
     assert json.loads(moving) == {"mode": "full", "reasons": [], "place": place}
     assert json.loads(silent) == {"mode": None, "reasons": [], "place": None}
 
@@ -492,3 +498,76 @@ def test_slow_readers_skip(local: httpx.Client) -> None:
                 if got[-1] == newest:
                     break
     assert newest == first + 20 and got == sorted(set(got))
+
+
+def test_the_map_at_a_place_is_as_old_as_the_survey_that_saw_it(url: str) -> None:
+    with open_store(url) as store, store.reading() as connection:
+        layers = find_layers(connection)
+        times = {one.map_id: one.captured_to_ns for one in list_surveys(connection)}
+    assert newest_at(layers, (2.0, 0.0)) == max(times.values())
+    assert newest_at(layers, (200.0, 0.0)) is None
+    hidden = replace(layers[-1], shown=np.zeros_like(layers[-1].shown))
+    older = replace(layers[-1], seen_ns=min(times.values()))
+    assert newest_at((older, hidden), (2.0, 0.0)) == min(times.values())
+
+
+def test_the_stock_list_that_is_written_agrees_with_the_yard(
+    local: httpx.Client, url: str, tmp_path: Path
+) -> None:
+    answer = local.get("/api/stock.csv")
+    assert answer.status_code == 200 and "attachment" in answer.headers["content-disposition"]
+    path = tmp_path / "stock.csv"
+    path.write_text(answer.text, encoding="utf-8")
+    listed = read_stock(path)
+    with open_store(url) as store, store.reading() as connection:
+        present = present_yard(connection)
+    assert [one.name for one in listed][:3] == ["A1", "A2", "A3"] and len(listed) == len(present)
+    bundles = tuple(replace(one.sighting.bundle, id=k) for k, one in enumerate(present))
+    match = match_stock(listed, bundles)
+    assert (match.moved, match.missing, match.hidden, match.extra) == ((), (), (), ())
+    assert len(match.matched) == len(present) and not any(one.disagrees for one in match.matched)
+    assert {one.name: present[one.bundle].sighting.identity for one in match.matched} == {
+        one.name: each.sighting.identity for one, each in zip(listed, present, strict=True)
+    }
+    assert run(["yard", url, "--stock-list", str(tmp_path / "again.csv")]) == 0
+    assert (tmp_path / "again.csv").read_text() == answer.text
+    assert sum(one.length_m is None for one in listed) == 1  # its end is open
+
+
+def test_calibrations_and_recordings_are_told_and_an_engineer_approves(local: httpx.Client, url: str) -> None:
+    told = local.get("/api/equipment").json()
+    (calibration,) = told["calibrations"]
+    assert (calibration["rig"], calibration["crane"], calibration["times"]) == ("1", "1", [])
+    assert {one["state"] for one in told["recordings"]} == {"measured"}
+    digest = calibration["digest"]
+    assert local.post("/api/calibrations", json={"digest": "f00d"}).status_code == 422
+    assert local.post("/api/calibrations", json={"digest": digest, "until_ns": 5}).status_code == 422
+    assert local.post("/api/calibrations", json={"digest": digest, "note": "No. 7"}).status_code == 200
+    (time_,) = local.get("/api/equipment").json()["calibrations"][0]["times"]
+    assert time_["approved_by"] == "local (engineer)" and time_["note"] == "No. 7"
+    assert offered(local) != []
+    with open_store(url) as store, entry(store, "ann", "approved") as opened:
+        note_calibration(opened, "beef", "1")
+        approve_calibration(opened, "beef", time_["from_ns"] + 1, None)
+    local.post("/api/calibrations", json={"digest": "beef"})
+    assert offered(local) == []
+    state = local.get("/api/state").json()
+    assert [one["code"] for one in state["map_vetoes"]] == ["calibration-changed"]
+    assert state["top_alarm"]["code"] == "calibration-changed"
+
+
+def test_the_model_is_read_by_those_who_may_read(local: httpx.Client, url: str) -> None:
+    survey = local.get("/api/state").json()["survey"]["map_id"]
+    answer = local.get(f"/api/surveys/{survey}/model")
+    length = int.from_bytes(answer.content[:4], "little")
+    head = json.loads(answer.content[4 : 4 + length])
+    segments = sum(count for _, count in head["lines"])
+    assert len(answer.content) == 4 + length + 15 * head["points"] + 24 * segments
+    places = np.frombuffer(answer.content, "<f4", 3 * head["points"], 4 + length).reshape(-1, 3)
+    assert head["points"] > 1000 and -2.0 < places[:, 0].min() < places[:, 0].max() < 8.0
+    assert local.get(f"/api/surveys/{survey}/model?by=smell").status_code == 404
+    assert local.get("/api/surveys/0000/model").status_code == 404
+    with open_store(url) as store, entry(store, "ann", "account") as opened:
+        accounts.add_person(opened, "ann", "engineer", PASSWORD)
+    time.sleep(0.5)
+    assert local.get(f"/api/surveys/{survey}/model").status_code == 401

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from barsight.page.serve import ServeOptions, serving
@@ -24,7 +25,9 @@ pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed (bash .ci/servers)"),
     pytest.mark.slow,
 ]
-SCREENS = ("yard", "bundle", "lifts", "stock", "alarms", "timeline", "surveys", "health", "admin")
+SCREENS = ("yard", "model", "bundle", "lifts", "stock", "alarms", "timeline", "surveys", "health", "admin")
+GRAPHICS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+"""WebGL without a graphics card."""
 PASSWORD = "four words that nobody guesses"
 WORDS = Path(__file__).parents[1] / "src" / "barsight" / "page" / "static" / "words.json"
 
@@ -32,7 +35,7 @@ WORDS = Path(__file__).parents[1] / "src" / "barsight" / "page" / "static" / "wo
 @pytest.fixture(scope="module")
 def browser() -> Iterator[object]:
     with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=list(GRAPHICS))
         yield browser
         browser.close()
 
@@ -97,7 +100,7 @@ def test_every_screen_by_mouse_and_by_keyboard(browser: object, address: str) ->
     page.wait_for_selector("#nav-admin")
     page.keyboard.press("Tab")
     reached = []
-    for _ in range(15):
+    for _ in range(16):
         page.keyboard.press("Tab")
         reached.append(page.evaluate("document.activeElement.id"))
         if reached[-1].startswith("nav-"):
@@ -153,6 +156,84 @@ def test_the_yard_by_mouse_and_on_paper(browser: object, address: str) -> None:
     assert sheet.errors == []
 
 
+PIXELS = """() => {
+  const canvas = document.querySelector("canvas");
+  const copy = document.createElement("canvas");
+  Object.assign(copy, { width: canvas.width, height: canvas.height });
+  const pen = copy.getContext("2d", { willReadFrequently: true });
+  pen.drawImage(canvas, 0, 0);
+  const { data } = pen.getImageData(0, 0, copy.width, copy.height);
+  return Array.from({ length: data.length / 4 }, (_, k) => data[4 * k + 1]);
+}"""
+
+
+def pixels(page: object) -> np.ndarray:
+    """The green of each pixel of the first canvas."""
+    return np.array(page.evaluate(PIXELS))
+
+
+def frame(page: object) -> None:
+    """Two frames on: what was asked for is drawn."""
+    page.evaluate(
+        "new Promise((go) => requestAnimationFrame(() => requestAnimationFrame(() => setTimeout(go, 50))))"
+    )
+
+
+def test_a_yard_that_is_moved_looks_as_one_that_is_drawn_there(browser: object, address: str) -> None:
+    sheet = Sheet(browser, address)
+    page = sheet.page
+    wait_for(lambda: page.evaluate("barsightYard.pictures.size > 0"))
+    frame(page)
+    before = pixels(page)
+    for _ in range(6):
+        page.evaluate("barsightYard.pan(90, 40)")
+        frame(page)
+    moved = pixels(page)
+    page.evaluate("barsightYard.moving = null; barsightYard.draw()")
+    frame(page)
+    drawn = pixels(page)
+    assert (np.abs(before - moved) > 30).mean() > 0.1
+    assert (np.abs(moved - drawn) > 30).mean() < 0.02  # lines and names at the edges
+    assert sheet.errors == []
+
+
+def test_the_yard_in_three_dimensions(browser: object, address: str) -> None:
+    sheet = Sheet(browser, address)
+    page = sheet.page
+    sheet.open("model")
+    wait_for(lambda: page.evaluate("barsightModel?.frames > 0"))
+    frame(page)
+    first = pixels(page)
+    assert (np.abs(first - 0xC8) > 20).mean() > 0.05  # of the ground's
+    assert page.evaluate("barsightModel.packed.head.points") > 10_000
+    assert [name for name, _ in page.evaluate("barsightModel.packed.head.lines")] == ["free", "axes", "poles"]
+    box = page.locator("#model").bounding_box()
+    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    turn, distance = page.evaluate("[barsightModel.looks.turn, barsightModel.looks.distance]")
+    page.mouse.move(*middle)
+    page.mouse.down()
+    page.mouse.move(middle[0] + 120, middle[1], steps=3)
+    page.mouse.up()
+    page.mouse.wheel(0, -300)
+    wait_for(lambda: page.evaluate("barsightModel.looks.distance") < 0.7 * distance)
+    assert page.evaluate("barsightModel.looks.turn") == pytest.approx(turn - 120 / 180)
+    frame(page)
+    assert (pixels(page) != first).mean() > 0.05
+    page.focus("#model")
+    page.keyboard.press("0")
+    assert page.evaluate("barsightModel.looks.turn") == pytest.approx(turn)
+    page.keyboard.press("ArrowLeft")
+    page.keyboard.press("Shift+ArrowUp")
+    page.keyboard.press("+")
+    assert page.evaluate("barsightModel.looks.distance") == pytest.approx(0.8 * distance)
+    page.select_option("#model-by", "source")
+    wait_for(lambda: "vision" in page.inner_text("#model-told"))
+    older = page.evaluate("document.querySelector('#model-survey').options[1].value")
+    page.select_option("#model-survey", older)
+    wait_for(lambda: page.evaluate("barsightModel.packed.head.lines.length") == 2)  # it has no lifts
+    assert sheet.outside == [] and sheet.errors == []
+
+
 def test_a_bundle_has_pictures_of_each_survey_and_its_history(browser: object, address: str) -> None:
     sheet = Sheet(browser, address)
     page = sheet.page
@@ -194,11 +275,16 @@ def test_the_crane_goes_over_the_yard_as_the_live_run_tells(
         with beating(live):
             sheet.page.wait_for_selector("#crane >> text=all sensors")
             wait_for(lambda: sheet.page.evaluate("barsightYard.crane?.body_m[0]") == 3.0)
+            wait_for(lambda: "Map age at the crane" in sheet.page.inner_text("#age"))
+            assert "never" not in sheet.page.inner_text("#age")
             live_folder(live, position_m=[4.0, 1.0, 8.0], mode="no-imu")
             wait_for(lambda: sheet.page.evaluate("barsightYard.crane?.body_m[0]") == 4.0, 1.0)
             sheet.page.wait_for_selector("#crane >> text=without IMU")
+            live_folder(live, position_m=[400.0, 1.0, 8.0])
+            wait_for(lambda: "never seen" in sheet.page.inner_text("#age"))
         sheet.page.wait_for_selector("#crane >> text=no word", timeout=5000)  # it writes no more
         assert sheet.page.evaluate("barsightYard.crane") is None
+        assert "Age of the newest map" in sheet.page.inner_text("#age")
         assert sheet.errors == []
 
 
@@ -334,6 +420,17 @@ def test_alarms_stock_and_accounts_by_the_page(browser: object, address: str) ->
     page.click("#accept-0")
     page.click("#ask-yes")
     page.wait_for_selector("text=accepted: the list is to be changed")
+    with page.expect_download() as told:
+        page.click("#stock-list")
+    assert Path(told.value.path()).read_text(encoding="utf-8").startswith("name,x_m,y_m,")
+    sheet.open("health")
+    page.click("[id^=approve-]")
+    page.fill("#ask-until", "2100-01-01")
+    page.click("#ask-yes")
+    page.wait_for_selector("#calibrations >> text=2100-01-01 00:00:00 UTC")
+    assert "valid" in page.inner_text("#calibrations tbody") and "local" in page.inner_text("#calibrations")
+    sheet.open("surveys")
+    page.wait_for_selector("h1 >> text=Recordings")
     sheet.open("admin")
     page.click("#add-person")
     page.fill("#ask-name", "eve")

@@ -214,8 +214,8 @@ NEXT = """
 import sqlalchemy as sa
 from alembic import op
 
-revision = "0005"
-down_revision = "0004"
+revision = "0006"
+down_revision = "0005"
 
 
 def upgrade():
@@ -227,7 +227,7 @@ def upgrade():
 def next_version(folder: Path, monkeypatch: pytest.MonkeyPatch, more: str = "pass") -> None:
     """As if a later version of the package with one more migration were installed."""
     shutil.copytree(opening.MIGRATIONS, folder, ignore=shutil.ignore_patterns("__pycache__"))
-    (folder / "versions" / "v0005_next.py").write_text(NEXT.format(more=more), encoding="utf-8")
+    (folder / "versions" / "v0006_next.py").write_text(NEXT.format(more=more), encoding="utf-8")
     monkeypatch.setattr(opening, "MIGRATIONS", folder)
 
 
@@ -249,7 +249,7 @@ def test_an_earlier_schema_is_brought_up_to_date_after_a_backup(
     assert run(["store", "verify", store_url]) == 3
     assert "newer version" in capsys.readouterr().err
     if store_url.startswith("sqlite"):
-        backup = tmp_path / "yard.db.schema-0004.backup"
+        backup = tmp_path / "yard.db.schema-0005.backup"
         with open_store(f"sqlite:///{backup}") as store:
             assert checked(store) == before
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from barsight.core.errors import ConfigError, InputError, MeasurementError
@@ -12,6 +13,7 @@ from barsight.core.files import atomic_directory
 from barsight.fleet.comparing import REMEDY
 from barsight.fleet.ledger import published_keys, result_note
 from barsight.fleet.objects import Objects
+from barsight.fleet.records import found_recording
 from barsight.fleet.versions import FleetTask, Version
 from barsight.store.adding import add_survey, read_survey
 from barsight.store.audit import entry
@@ -49,7 +51,7 @@ def promote(
         out = folder / task.key[:32]
         if not out.is_dir():
             _fetch(results, task.key, out)
-        surveys.append(read_survey(out))
+        surveys.append(replace(read_survey(out), recordings=(found_recording(task),)))
         advance(number + 1, len(chosen))
     for survey in sorted(surveys, key=lambda one: one.to_ns):
         map_id = survey.identity.map_id

@@ -13,6 +13,7 @@ from barsight.core.extras import extra
 from barsight.fleet.versions import FleetTask, Version
 from barsight.store.audit import entry
 from barsight.store.opening import Store, open_store
+from barsight.store.recordings import FoundRecording, note_recordings
 from barsight.store.tables import FLEET_PLACES, FLEET_RESULTS, FLEET_TASKS, FLEET_VERSIONS
 
 with extra("store"):
@@ -30,6 +31,7 @@ def note_plan(store: Store, tasks: Iterable[FleetTask], by: str) -> int:
         names = set(opened.connection.execute(select(FLEET_VERSIONS.c.name)).scalars())
         for version in {task.version for task in planned.values() if task.version.name not in names}:
             opened.add(FLEET_VERSIONS, **asdict(version), at_ns=opened.at_ns)
+        note_recordings(opened, tuple(found_recording(task) for task in planned.values()), "", None)
         places = _places(opened.connection)
         for key, task in planned.items():
             if key not in known:
@@ -42,6 +44,11 @@ def note_plan(store: Store, tasks: Iterable[FleetTask], by: str) -> int:
             if places.get(key) != tuple(place.values()):
                 opened.add(FLEET_PLACES, key=key, **place, at_ns=opened.at_ns)
     return len(planned.keys() - known)
+
+
+def found_recording(task: FleetTask) -> FoundRecording:
+    """Name a task's recording by its place in the archive and its manifest."""
+    return FoundRecording(f"{task.archive}/{task.name}".rstrip("/"), task.manifest)
 
 
 def note_result(url: str, key: str, content: dict[str, Any], by: str) -> None:

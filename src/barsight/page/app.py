@@ -17,15 +17,18 @@ from barsight.page.access import COOKIE, RIGHTS, SESSION_S, Access, AccessError,
 from barsight.page.documents import bundle_history, bundle_records
 from barsight.page.guard import Guard
 from barsight.page.layers import Kind, PaintedLayers, find_layers
+from barsight.page.model import survey_model
 from barsight.page.pictures import paint_bundle
 from barsight.page.survey_files import find_file
 from barsight.page.watch import StoreWatch
 from barsight.store.accounts import Role, add_person, add_token, withdraw
 from barsight.store.audit import Entry, entry
-from barsight.store.changes import yard_changes
-from barsight.store.confirmation import confirm_lift, end_lift, forbid, take_lift
+from barsight.store.calibrations import approve_calibration, find_calibration, note_calibration
+from barsight.store.confirmation import confirm_lift, end_lift, forbid, take_lift, yard_clock_ns
+from barsight.store.history import present_yard, yard_changes
 from barsight.store.states import alarm_state, raise_alarm, step_alarm
-from barsight.store.stock_decisions import Decision, decide
+from barsight.store.stock import Decision, decide, listed_bundles
+from barsight.yard.inventory.stock_list import stock_text
 
 with extra("page"):
     import asyncio
@@ -42,7 +45,7 @@ _TYPES = {
     ".json": "application/json",
     ".svg": "image/svg+xml",
 }
-DOCUMENTS = ("state", "bundles", "lifts", "surveys", "alarms", "stock", "layers")
+DOCUMENTS = ("state", "bundles", "lifts", "surveys", "alarms", "stock", "layers", "equipment")
 _SANDBOX = (
     "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
     "img-src data:"
@@ -98,6 +101,13 @@ class DecisionForm(NoteForm):
     decision: Decision
 
 
+class ApprovalForm(NoteForm):
+    """A calibration and for how long it is approved, from now on."""
+
+    digest: str = Field(max_length=64)
+    until_ns: int | None = None
+
+
 class AccountForm(BaseModel):
     """An account to add or change. password: of a person; a token is drawn for a program."""
 
@@ -129,6 +139,7 @@ def build_app(watch: StoreWatch, hosts: frozenset[str], origins: frozenset[str],
     _add_lifts(app, watch, access)
     _add_alarms(app, watch, access)
     _add_accounts(app, watch, access)
+    _add_calibrations(app, watch, access)
     return Guard(app, hosts, origins)
 
 
@@ -239,6 +250,13 @@ def _add_reading(app: FastAPI, watch: StoreWatch, access: Access) -> None:
                 {"at_ns": at_ns, "bundles": bundle_records(connection, at_ns), "layers": layers}
             )
 
+    @app.get("/api/stock.csv")
+    def stock_list(_: Caller = reader, at_ns: int | None = None) -> Response:
+        with watch.store.reading() as connection:
+            text = stock_text(listed_bundles(present_yard(connection, at_ns)))
+        headers = {"content-disposition": "attachment; filename=stock.csv"}
+        return Response(text, media_type="text/csv", headers=headers)
+
     @app.get("/api/compare")
     def compare(before_ns: int, after_ns: int, _: Caller = reader) -> Any:
         with watch.store.reading() as connection:
@@ -267,6 +285,11 @@ def _add_files(app: FastAPI, watch: StoreWatch, access: Access) -> None:
         if painted is None:
             raise AccessError(404, f"survey {map_id} has no picture of {name}")
         return Response(painted, media_type="image/png")
+
+    @app.get("/api/surveys/{map_id}/model")
+    def model(map_id: str, _: Caller = reader, by: str = "height") -> Response:
+        with watch.store.reading() as connection:
+            return Response(survey_model(connection, map_id, by), media_type="application/octet-stream")
 
     @app.get("/api/surveys/{map_id}/files/{name}")
     def survey_file(map_id: str, name: str, _: Caller = reader) -> FileResponse:
@@ -391,3 +414,17 @@ def _add_accounts(app: FastAPI, watch: StoreWatch, access: Access) -> None:
             withdraw(opened, name)
         watch.refresh()
         return {"state": "withdrawn"}
+
+
+def _add_calibrations(app: FastAPI, watch: StoreWatch, access: Access) -> None:
+    engineer = _need(access, "administer")
+
+    @app.post("/api/calibrations")
+    def approve(form: ApprovalForm, caller: Caller = engineer) -> dict[str, int]:
+        who = signature(caller)
+        with entry(watch.store, who, f"calibration {form.digest} approved") as opened:
+            note_calibration(opened, find_calibration(opened.connection, form.digest))
+            clock_ns = yard_clock_ns(opened.connection)
+            approve_calibration(opened, form.digest, clock_ns, form.until_ns, form.note)
+        watch.judge()
+        return {"revision": watch.published.revision}

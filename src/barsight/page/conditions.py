@@ -12,7 +12,8 @@ from barsight.core.extras import extra
 from barsight.page.live import LiveHealth
 from barsight.result_folder import changed_inputs, read_summary
 from barsight.store.audit import entry, verify_chain
-from barsight.store.confirmation import newest_survey
+from barsight.store.calibrations import why_invalid
+from barsight.store.confirmation import newest_survey, yard_clock_ns
 from barsight.store.history import executed_lifts, identity_name
 from barsight.store.opening import Store
 from barsight.store.states import alarm_state, raise_alarm, step_alarm
@@ -23,7 +24,7 @@ with extra("store"):
 
 ALARM_CODES = {
     "store-broken": "The audit log of the store doesn't hold: rows were changed outside Barsight.",
-    "calibration-changed": "A calibration file was changed after the newest map was measured with it.",
+    "calibration-changed": "The newest map's calibration was changed since, or isn't valid any more.",
     "survey-files": "The newest survey's folder is gone or lacks files.",
     "lift-failed": "A lift was reported as done or failed, and its bundle still lies there.",
     "bundle-gone": "A bundle is gone that no lift has taken.",
@@ -45,6 +46,8 @@ def find_conditions(connection: Connection, live: LiveHealth | None) -> set[Cond
     newest = newest_survey(connection)
     if newest is not None:
         found |= _file_conditions(newest) | _yard_conditions(connection, newest.id)
+        reason = why_invalid(connection, newest.calibration_id, yard_clock_ns(connection))
+        found |= {("calibration-changed", reason)} if reason else set()
     if live is not None and live.problem is not None:
         found.add(live.problem)
     return found

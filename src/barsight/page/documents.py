@@ -14,9 +14,11 @@ import numpy as np
 from barsight.core.errors import InputError
 from barsight.core.extras import extra
 from barsight.page.conditions import PRIORITIES
+from barsight.store.calibrations import list_calibrations
 from barsight.store.confirmation import map_vetoes, newest_survey, open_lifts, yard_clock_ns
 from barsight.store.history import PresentBundle, identity_name, list_surveys, present_yard
 from barsight.store.promotion import counts
+from barsight.store.recordings import list_recordings
 from barsight.store.tables import (
     ABSENCES,
     ALARM_STATES,
@@ -38,6 +40,7 @@ LIKE_RATIO = 0.15
 """Bundles whose bars' diameters and widths differ by less are of one kind."""
 MAX_LIFTS = 500
 MAX_ALARMS = 500
+MAX_RECORDINGS = 500
 _FIGURES = (
     "axis_centre_m", "yaw_deg", "pitch_deg", "length_m", "ends_m", "ends_open", "width_m", "top_z_m",
     "bar_diameter_m", "bars", "section_m2", "mass_kg", "layer", "on_top", "confidence", "known_share",
@@ -223,6 +226,14 @@ def survey_records(connection: Connection) -> list[dict[str, Any]]:
             }
         )  # fmt: skip
     return told
+
+
+def equipment_record(connection: Connection) -> dict[str, Any]:
+    """List the calibrations with rig, crane and the times for which they are approved, and the recordings."""
+    return {
+        "calibrations": [asdict(one) for one in list_calibrations(connection)],
+        "recordings": [asdict(one) for one in reversed(list_recordings(connection))][:MAX_RECORDINGS],
+    }
 
 
 def stock_record(connection: Connection) -> dict[str, Any]:

@@ -72,6 +72,18 @@ def find_layers(connection: Connection, at_ns: int | None = None) -> tuple[Surve
     return tuple(reversed(layers))
 
 
+def newest_at(layers: tuple[SurveyLayer, ...], at_m: tuple[float, float]) -> int | None:
+    """Tell when a place (x, y) was seen last, ns; None where no survey saw it."""
+    for layer in reversed(layers):
+        heights = layer.heights
+        column = round((at_m[0] - heights.x0_m) / heights.cell_m)
+        row = round((at_m[1] - heights.y0_m) / heights.cell_m)
+        rows, columns = heights.shape
+        if 0 <= row < rows and 0 <= column < columns and layer.shown[row, column]:
+            return layer.seen_ns
+    return None
+
+
 def _known_at(other: HeightMap, heights: HeightMap) -> Bool:
     """Tell for each cell of `heights` whether `other` knows it."""
     columns = np.round((heights.x_m - other.x0_m) / other.cell_m).astype(int)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -58,8 +59,10 @@ class LiveFolder:
             problem = ("live-degraded", str(mode))
         return LiveHealth(content, age_s, problem)
 
-    def crane(self) -> bytes:
-        """Tell as JSON how the run stands, and where crane and magnet are; no place where that is old."""
+    def crane(self, seen_at: Callable[[tuple[float, float]], int | None]) -> bytes:
+        """Tell as JSON how the run stands, where crane and magnet are, and when that place was seen last; no
+        place where that is old. seen_at: tells that by place, ns.
+        """
         folder = running_folder(self.folder)
         told = read_live_state(folder)
         if told is None or not told.is_running:
@@ -67,6 +70,8 @@ class LiveFolder:
         pose = read_crane_pose(folder, told.now_ns)
         place = None
         if pose is not None:
-            place = {"body_m": (pose.x_m, pose.y_m), "magnet_m": pose.magnet_m}
+            body_m = pose.x_m, pose.y_m
+            seen_ns = seen_at(pose.magnet_m or body_m)
+            place = {"body_m": body_m, "magnet_m": pose.magnet_m, "map_seen_ns": seen_ns}
         content = {"mode": told.mode, "reasons": told.reasons, "place": place}
         return json.dumps(json_value(content, decimals=3), allow_nan=False).encode()

@@ -23,12 +23,13 @@ from barsight.page.conditions import (
 from barsight.page.documents import (
     alarm_records,
     bundle_records,
+    equipment_record,
     lift_records,
     state_document,
     stock_record,
     survey_records,
 )  # fmt: skip
-from barsight.page.layers import SurveyLayer, find_layers
+from barsight.page.layers import SurveyLayer, find_layers, newest_at
 from barsight.page.live import LiveFolder, LiveHealth
 from barsight.store.accounts import Account, list_accounts
 from barsight.store.confirmation import expire_stale, forbid, newest_survey
@@ -99,6 +100,7 @@ class StoreWatch:
                     "surveys": {"surveys": survey_records(connection)},
                     "alarms": {"alarms": alarm_records(connection)},
                     "stock": stock_record(connection),
+                    "equipment": equipment_record(connection),
                 }
                 layers = find_layers(connection)
                 content["layers"] = {"layers": [one.content() for one in layers]}
@@ -112,7 +114,10 @@ class StoreWatch:
 
     def look_at_crane(self) -> None:
         """Read where the crane of the live run is, and tell it where it moved."""
-        if self.live is not None and (crane := self.live.crane()) != self.crane:
+        if self.live is None:
+            return
+        layers = self.published.layers
+        if (crane := self.live.crane(lambda at_m: newest_at(layers, at_m))) != self.crane:
             self.crane = crane
             self._wake()
 

@@ -12,8 +12,9 @@ from barsight.core.errors import InputError, MeasurementError
 from barsight.core.extras import extra
 from barsight.result_folder import file_digest, open_folder, read_heights
 from barsight.store.audit import Entry, entry
+from barsight.store.calibrations import note_calibration, why_invalid
 from barsight.store.coarse_map import pack, unpack
-from barsight.store.confirmation import end_disturbed
+from barsight.store.confirmation import end_disturbed, yard_clock_ns
 from barsight.store.history import (
     BundleSighting,
     executed_lifts,
@@ -33,7 +34,8 @@ from barsight.store.matching import (
     match_carried,
 )  # fmt: skip
 from barsight.store.opening import Store
-from barsight.store.tables import ABSENCES, BUNDLES, SIGHTINGS, SURVEYS
+from barsight.store.recordings import FoundRecording, note_recordings, recordings_of
+from barsight.store.tables import ABSENCES, BUNDLES, SIGHTINGS, SURVEY_VETOES, SURVEYS
 from barsight.yard.identity import MapIdentity, expect_same_frame
 from barsight.yard.inventory.bundle_file import bundle_of, bundles_content, read_match
 from barsight.yard.lifting.lift_file import read_lifts
@@ -87,13 +89,18 @@ class MeasuredSurvey:
     found: tuple[FoundBundle, ...]
     heights: YardMap
     lifts: dict[str, Any] | None
+    recordings: tuple[FoundRecording, ...]
 
 
-def add_survey(store: Store, read: MeasuredSurvey, who: str, *, same_yard: bool = False) -> AddedSurvey:
+def add_survey(
+    store: Store, read: MeasuredSurvey, who: str, *, same_yard: bool = False, rig: str | None = None,
+    crane: str | None = None,
+) -> AddedSurvey:  # fmt: skip
     """Add a survey in one transaction; one that is there already changes nothing.
 
     An older survey is put into its place in time: its bundles are matched to those seen before it and to
     those seen first after it. same_yard: what places it in the yard may differ from the newest survey's.
+    rig, crane: names of what it was surveyed with, where not given those that its calibration is of.
 
     Raises InputError where simulated and measured surveys would mix, or those of two yard frames.
     """
@@ -132,8 +139,9 @@ def add_survey(store: Store, read: MeasuredSurvey, who: str, *, same_yard: bool 
             opened.add(ABSENCES, survey_id=survey_id, bundle_id=number, kind=finding, reason=REASONS[finding])
         is_newest = not next_sightings(opened.connection, read.to_ns)
         settle_lifts(opened, changes | absences, read.from_ns, is_newest=is_newest)
+        is_valid = _note_equipment(opened, read, survey_id, (rig, crane))
         if read.lifts is not None:
-            add_lifts(opened, survey_id, read.lifts, ids, is_newest=is_newest)
+            add_lifts(opened, survey_id, read.lifts, ids, is_newest=is_newest and is_valid)
             end_disturbed(opened, read.from_ns)
     named = {identity_name(number): change for number, change in changes.items()}
     return AddedSurvey(
@@ -170,7 +178,7 @@ def read_survey(folder: Path) -> MeasuredSurvey:
     return MeasuredSurvey(
         folder.absolute(), identity, identity.captured_from_ns, identity.captured_to_ns,
         str((summary.get("software") or {}).get("version")), {**summary["files"], **own}, records, found,
-        read_heights(folder), read_lifts(chosen) if chosen.is_file() else None,
+        read_heights(folder), read_lifts(chosen) if chosen.is_file() else None, recordings_of(summary),
     )  # fmt: skip
 
 
@@ -258,6 +266,21 @@ def _change(before: Bundle | None, found: Bundle, shown: Finding | None) -> str:
     if before is not None:
         return "moved" if has_moved(before, found) else "same"
     return "added" if shown == "gone" else "found"
+
+
+def _note_equipment(
+    opened: Entry, read: MeasuredSurvey, survey_id: int, named: tuple[str | None, str | None]
+) -> bool:
+    """Add rig, calibration and recordings of a survey; tell whether the calibration is valid now, and forbid
+    the map's lifts where it isn't.
+    """
+    digest = read.identity.calibration_id
+    rig = note_calibration(opened, digest, *named)
+    note_recordings(opened, read.recordings, rig, (survey_id, read.identity.map_id))
+    reason = why_invalid(opened.connection, digest, yard_clock_ns(opened.connection))
+    if reason:
+        opened.add(SURVEY_VETOES, survey_id=survey_id, code="calibration-changed", reason=reason)
+    return not reason
 
 
 def _add_sighting(

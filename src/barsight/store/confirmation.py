@@ -17,6 +17,7 @@ from barsight.core.arrays import Float64
 from barsight.core.errors import ConfigError, InputError
 from barsight.core.extras import extra
 from barsight.store.audit import Entry, entry
+from barsight.store.calibrations import why_invalid
 from barsight.store.opening import Store
 from barsight.store.promotion import counts
 from barsight.store.states import has_alarm, last_raised_ns, lift_state, raise_alarm, step_lift
@@ -251,7 +252,9 @@ def forbid(store: Store, code: str, reason: str, who: str) -> None:
 
 
 def expire_stale(store: Store, who: str) -> int:
-    """End offers and confirmations whose map is no longer the newest, or too old. Returns their number."""
+    """End offers and confirmations whose map is no longer the newest, too old, or of a calibration that isn't
+    valid any more. Returns their number.
+    """
     with store.reading() as connection:
         clock_ns = yard_clock_ns(connection)
         if not _stale(connection, clock_ns):
@@ -303,6 +306,7 @@ def _stale(connection: Connection, clock_ns: int) -> dict[int, str]:
     """Tell why offers and confirmations may no longer be believed, by id."""
     newest = newest_survey(connection)
     told = {}
+    reason = "" if newest is None else why_invalid(connection, newest.calibration_id, clock_ns)
     for lift in open_lifts(connection):
         until_ns = lift.record["valid_until_ns"]
         if lift.state == "executing":
@@ -311,6 +315,8 @@ def _stale(connection: Connection, clock_ns: int) -> dict[int, str]:
             told[lift.lift_id] = "expired: a newer map came"
         elif until_ns is None or until_ns < clock_ns:
             told[lift.lift_id] = "expired: map-too-old: it was valid for a limited time"
+        elif reason:
+            told[lift.lift_id] = f"expired: calibration-changed: {reason}"
     return told
 
 

@@ -1,4 +1,4 @@
-"""Read from the store what was known of each bundle at a time, and what came of the lifts."""
+"""Read from the store what was known of each bundle at a time, what changed, and what came of the lifts."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ import numpy as np
 from barsight.core.errors import ConfigError
 from barsight.core.extras import extra
 from barsight.core.stamps import NS_PER_S
+from barsight.store.matching import has_moved
 from barsight.store.promotion import counts
 from barsight.store.tables import ABSENCES, LIFT_BUNDLES, LIFT_STATES, LIFTS, SIGHTINGS, SURVEYS
 from barsight.yard.inventory.bundle_file import bundle_of
@@ -152,6 +153,29 @@ def present_yard(connection: Connection, at_ns: int | None = None) -> tuple[Pres
         if doubt is None or doubt.kind != "gone":
             present.append(PresentBundle(sighting, doubt))
     return tuple(present)
+
+
+def yard_changes(connection: Connection, before_ns: int, after_ns: int) -> list[dict[str, Any]]:
+    """Tell what changed between two times: `came`, `went`, `moved`; what lies as it lay is left out."""
+    before = {one.sighting.bundle_id: one.sighting for one in present_yard(connection, before_ns)}
+    after = {one.sighting.bundle_id: one.sighting for one in present_yard(connection, after_ns)}
+    told = []
+    for number in sorted({*before, *after}):
+        old, new = before.get(number), after.get(number)
+        kind = "went" if new is None else "came" if old is None else "moved"
+        if old is not None and new is not None and not has_moved(old.bundle, new.bundle):
+            continue
+        told.append(
+            {
+                "identity": identity_name(number), "what": kind,
+                "from_m": None if old is None else old.record["axis_centre_m"],
+                "to_m": None if new is None else new.record["axis_centre_m"],
+                "from_ends_m": None if old is None else old.record["ends_m"],
+                "to_ends_m": None if new is None else new.record["ends_m"],
+                "width_m": [one.record["width_m"] for one in (old, new) if one is not None][-1],
+            }
+        )  # fmt: skip
+    return told
 
 
 def yard_records(present: tuple[PresentBundle, ...], now_ns: int) -> list[dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""Step lifts and alarms from state to state, each step a row with who and when."""
+"""Step lifts, alarms and recordings from state to state, each step a row with who and when."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 from barsight.core.errors import InputError
 from barsight.core.extras import extra
 from barsight.store.audit import Entry
-from barsight.store.tables import ALARM_STATES, ALARMS, LIFT_STATES
+from barsight.store.tables import ALARM_STATES, ALARMS, LIFT_STATES, RECORDING_STATES
 
 with extra("store"):
     from sqlalchemy import Connection, Select, Table, func, select
@@ -28,6 +28,14 @@ ALARM_STEPS: dict[str | None, tuple[str, ...]] = {
     "returned": ("cleared",),
 }
 """`returned`: the cause is gone, and nobody has acknowledged it; acknowledging it clears it (ISA-18.2)."""
+RECORDING_STEPS: dict[str | None, tuple[str, ...]] = {
+    None: ("archived", "measured"),
+    "archived": ("measured", "kept"),
+    "measured": ("kept",),
+    "kept": ("released",),
+    "released": ("kept",),
+}
+"""`archived`: a fleet's plan found it; `kept`: it is not to be deleted, its note says why."""
 
 
 def step_lift(opened: Entry, lift_id: int, state: str, note: str | None = None) -> None:
@@ -62,6 +70,16 @@ def last_raised_ns(connection: Connection, code: str) -> int | None:
 def step_alarm(opened: Entry, alarm_id: int, state: str, note: str | None = None) -> None:
     """Acknowledge or clear an alarm. Raises InputError where that may not follow the state that it is in."""
     _step(opened, ALARM_STATES, "alarm", alarm_id, ALARM_STEPS, state, note)
+
+
+def step_recording(opened: Entry, recording_id: int, state: str, note: str | None = None) -> None:
+    """Bring a recording into a state. Raises InputError where that may not follow the state that it is in."""
+    _step(opened, RECORDING_STATES, "recording", recording_id, RECORDING_STEPS, state, note)
+
+
+def recording_state(connection: Connection, recording_id: int) -> str | None:
+    """Return a recording's state, None where there is no such recording."""
+    return _last(connection, RECORDING_STATES, "recording", recording_id)[1]
 
 
 def lift_state(connection: Connection, lift_id: int) -> str | None:

@@ -151,3 +151,41 @@ FLEET_SURVEYS = Table(
 
 PROMOTIONS = Table("promotions", METADATA, _key(), *_texts("version", "who"), *_stamps("at_ns"))
 """Versions that page and plant were switched to; the newest row counts, an empty version is none."""
+
+CRANES = Table(
+    "cranes", METADATA, _key(), Column("name", Text, nullable=False, unique=True), *_stamps("at_ns")
+)
+
+RIGS = Table("rigs", METADATA, _key(), _of("cranes"), *_texts("name"), *_stamps("at_ns"))
+"""Rigs and the crane that each hangs from; of a name the newest row counts."""
+
+CALIBRATIONS = Table(
+    "calibrations", METADATA, _key(), Column("digest", Text, nullable=False, unique=True), *_texts("rig"),
+    *_stamps("at_ns"),
+)  # fmt: skip
+"""Calibrations, each of one rig, by its name. digest: surveys' `calibration_id`."""
+
+VALIDITIES = Table(
+    "validities", METADATA, _key(), _of("calibrations"), *_stamps("from_ns"),
+    Column("until_ns", BigInteger), *_texts("approved_by"), Column("note", Text), *_stamps("at_ns"),
+)  # fmt: skip
+"""Times for which a calibration was approved; of a rig the one that begins last counts, then the newest."""
+
+RECORDINGS = Table(
+    "recordings", METADATA, _key(), Column("digest", Text, nullable=False, unique=True),
+    *_texts("key", "rig"), *_stamps("at_ns"),
+)  # fmt: skip
+"""Recordings. digest: of their files' digests; key: path or URL where it was found first; rig: its name,
+empty where it isn't known.
+"""
+
+RECORDING_STATES = Table(
+    "recording_states", METADATA, _key(), _of("recordings"), Column("step", Integer, nullable=False),
+    *_texts("state"), *_stamps("at_ns"), *_texts("who"), Column("note", Text),
+    UniqueConstraint("recording_id", "step"),
+)  # fmt: skip
+
+SURVEY_RECORDINGS = Table(
+    "survey_recordings", METADATA, _key(), _of("surveys"), _of("recordings"),
+    UniqueConstraint("survey_id", "recording_id"),
+)  # fmt: skip

@@ -12,7 +12,7 @@ VETOES = {
     "map-too-old": "The place was last seen longer ago than the settings allow, or nobody knows when.",
     "disturbed": "A lift, a set-down or a magnet came near after the place was last seen.",
     "map-from-the-future": "The last frame is ahead of this computer's clock: ages can't be told.",
-    "calibration-changed": "The calibration was changed since the map, or the magnet's offset, was measured.",
+    "calibration-changed": "The calibration changed since map or magnet's offset, or isn't valid any more.",
     "calibration-drift": "The cameras' calibration doesn't fit the pictures any more.",
     "trajectory-degraded": "Trajectory or encoders aren't as sure as the magnet needs, near it or at all.",
     "live-state": "The live run ended without a sensor that lifts need.",

@@ -25,6 +25,8 @@ def run(arguments: Sequence[str]) -> None:
         by: str | None = None,
         migrate: bool = False,
         same_yard: bool = False,
+        rig: str | None = None,
+        crane: str | None = None,
     ) -> None:
         """Add a measured folder to the store: its bundles get names that they keep.
 
@@ -37,11 +39,13 @@ def run(arguments: Sequence[str]) -> None:
             by: Who adds it, for the audit log; the name of the user if not given.
             same_yard: The survey lies in the store's surveyed yard, though what places it there differs, as
                 after a recalibration.
+            rig: Name of the rig that it was surveyed with; the calibration's or the newest if not given.
+            crane: Name of the crane that the rig hangs from; the one that it hung from, if not given.
             migrate: Bring the tables of an earlier version on PostgreSQL up to date; back them up before.
         """
         survey = read_survey(out)
         with open_store(url, create=True, migrate=migrate) as store:
-            added = add_survey(store, survey, by or user_name(), same_yard=same_yard)
+            added = add_survey(store, survey, by or user_name(), same_yard=same_yard, rig=rig, crane=crane)
         _print(added, SafeConsole())
 
     words = list(arguments)

@@ -8,7 +8,9 @@ from barsight.cli.arguments import pass_on
 
 KINDS = {
     "add": "Add a measured folder: its bundles get names that they keep",
-    "list": "List the surveys, and the bundles of the present yard",
+    "approve": "Approve a calibration for a time; the rig's older ones end",
+    "keep": "Say why a recording is not to be deleted",
+    "list": "List the surveys, calibrations and recordings, and the bundles of the present yard",
     "user": "Add or withdraw who may log in to the page",
     "verify": "Check the audit chain and the rows that it covers; exit code 5 where they don't hold",
 }

@@ -6,6 +6,7 @@ import json
 import sys
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import tyro
@@ -14,11 +15,20 @@ from rich.table import Table
 
 from barsight.cli.arguments import call
 from barsight.cli.safe_console import SafeConsole
+from barsight.core.files import atomic_path
 from barsight.core.json_values import json_value
 from barsight.core.stamps import NS_PER_S
-from barsight.store.changes import yard_changes
-from barsight.store.history import PresentBundle, parse_time, present_yard, time_text, yard_records
+from barsight.store.history import (
+    PresentBundle,
+    parse_time,
+    present_yard,
+    time_text,
+    yard_changes,
+    yard_records,
+)
 from barsight.store.opening import DEFAULT_URL, open_store
+from barsight.store.stock import listed_bundles
+from barsight.yard.inventory.stock_list import stock_text
 
 _UNITS = ((86400, "d"), (3600, "h"), (60, "min"), (1, "s"))
 
@@ -28,7 +38,7 @@ def run(arguments: Sequence[str]) -> None:
 
     def command(
         url: tyro.conf.Positional[str] = DEFAULT_URL, at: str | None = None, since: str | None = None,
-        json: bool = False,
+        json: bool = False, stock_list: Path | None = None,
     ) -> None:  # fmt: skip
         """Print the yard as it was known at a time: of each bundle the newest sighting, with its age; or what
         came, went and moved between two times.
@@ -37,6 +47,7 @@ def run(arguments: Sequence[str]) -> None:
             url: SQLAlchemy's URL of the database.
             at: ISO 8601 with its zone, like 2026-11-23T14:00:00Z, or integer ns; now if not given.
             since: An earlier time, written likewise: print only what changed between it and --at.
+            stock_list: CSV file to write the yard to, as `--bundles.stock-list` reads it.
             json: Write JSON, with each bundle's record as in bundles.json and its identity.
         """
         at_ns = None if at is None else parse_time(at)
@@ -52,6 +63,11 @@ def run(arguments: Sequence[str]) -> None:
             return
         with open_store(url) as store, store.reading() as connection:
             present = present_yard(connection, at_ns)
+        if stock_list is not None:
+            with atomic_path(stock_list) as path:
+                path.write_text(stock_text(listed_bundles(present)), encoding="utf-8")
+            SafeConsole().print(f"{stock_list}: {len(present)} bundles", highlight=False, soft_wrap=True)
+            return
         if json:
             print_json({"at_ns": now_ns, "bundles": yard_records(present, now_ns)})
             return

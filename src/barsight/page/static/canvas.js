@@ -5,6 +5,7 @@ import { OPEN_LIFTS, t } from "./dom.js";
 const SELECT = "#1d4f91";
 const INK = "#26292b";
 const PATH_ITEMS = 20;
+const AROUND = 0.25; // share of the view that is drawn beyond each of its edges while it is moved
 const WORDS_PX = 40; // room below the yard for the words of its lowest bundles
 
 export class YardCanvas {
@@ -17,6 +18,7 @@ export class YardCanvas {
     this.pictures = new Map();
     this.frames = [];
     this.chosen = null;
+    this.moving = null; // the drawing and more around it, while the view is moved
     this.crane = null; // place of the camera body and the magnet of a live run, m
     this.listen();
     new ResizeObserver(() => this.resize()).observe(canvas);
@@ -27,6 +29,7 @@ export class YardCanvas {
   show(data, chosen) {
     this.data = data;
     this.chosen = chosen;
+    this.moving = null;
     this.items = data.bundles.map((bundle) => this.item(bundle)).sort((a, b) => a.top - b.top);
     for (const layer of data.layers) this.load(layer);
     if (!this.view) this.fit();
@@ -48,7 +51,7 @@ export class YardCanvas {
     layer.url = url;
     if (this.pictures.has(url)) return;
     const picture = new Image();
-    picture.onload = () => this.draw();
+    picture.onload = () => { this.moving = null; this.draw(); };
     picture.src = url;
     this.pictures.set(url, picture);
     if (this.pictures.size > 24) this.pictures.delete(this.pictures.keys().next().value);
@@ -67,11 +70,13 @@ export class YardCanvas {
     const width = this.canvas.clientWidth || 800;
     const height = this.canvas.clientHeight || 500;
     const scale = Math.min(width / (x1 - x0 + 1), Math.max(height - 2 * WORDS_PX, 100) / (y1 - y0 + 1));
+    this.moving = null;
     this.view = { x: (x0 + x1) / 2, y: (y0 + y1) / 2 - WORDS_PX / 2 / scale, scale };
     this.draw();
   }
 
   resize() {
+    this.moving = null;
     if (this.view) this.fit();
   }
 
@@ -103,6 +108,13 @@ export class YardCanvas {
     if (this.canvas.height !== Math.round(this.height * ratio)) this.canvas.height = Math.round(this.height * ratio);
     const c = this.canvas.getContext("2d");
     c.setTransform(ratio, 0, 0, ratio, 0, 0);
+    if (this.moving) this.paintMoved(c, ratio);
+    else this.paintYard(c);
+    this.paintScale(c);
+    this.paintCrane(c);
+  }
+
+  paintYard(c) {
     c.fillStyle = "#c6c8ca";
     c.fillRect(0, 0, this.width, this.height);
     this.paintLayers(c);
@@ -112,7 +124,39 @@ export class YardCanvas {
     this.paintLifts(c);
     this.paintChanges(c);
     this.paintWords(c, seen);
-    this.paintCrane(c);
+  }
+
+  // While the view is moved its drawing is moved, which was made once with more around it.
+  paintMoved(c, ratio) {
+    if (!this.moving.drawing || !this.covers()) this.drawAround(ratio);
+    const { drawing, wide, high } = this.moving;
+    const [left, top] = this.offset().map((px) => Math.round(px * ratio) / ratio);
+    c.drawImage(drawing, left, top, wide, high);
+  }
+
+  offset() {
+    const { view, wide, high } = this.moving;
+    return [(this.width - wide) / 2 + (view.x - this.view.x) * view.scale, (this.height - high) / 2 + (this.view.y - view.y) * view.scale];
+  }
+
+  covers() {
+    const { view, wide, high } = this.moving;
+    const [left, top] = this.offset();
+    return view.scale === this.view.scale && left <= 0 && top <= 0 && left + wide >= this.width && top + high >= this.height;
+  }
+
+  drawAround(ratio) {
+    const [width, height] = [this.width, this.height];
+    const drawing = this.moving.drawing || document.createElement("canvas");
+    this.width = Math.round(width * (1 + 2 * AROUND));
+    this.height = Math.round(height * (1 + 2 * AROUND));
+    drawing.width = Math.round(this.width * ratio);
+    drawing.height = Math.round(this.height * ratio);
+    const c = drawing.getContext("2d");
+    c.setTransform(ratio, 0, 0, ratio, 0, 0);
+    this.paintYard(c);
+    this.moving = { drawing, view: { ...this.view }, wide: this.width, high: this.height };
+    Object.assign(this, { width, height });
   }
 
   // The bridge as two lines across the yard, the camera as a box on them, the magnet as a ring: none to scale.
@@ -150,30 +194,39 @@ export class YardCanvas {
     c.globalAlpha = 1;
   }
 
-  paintGrid(c) {
+  // Round metres in view, along X and along Y.
+  marks() {
     const step = [1, 2, 5, 10, 20, 50].find((each) => each * this.view.scale > 70) || 100;
-    c.font = "12px sans-serif";
-    c.fillStyle = "#3c4043";
+    const [x0, y0] = this.at(0, this.height);
+    const [x1, y1] = this.at(this.width, 0);
+    const between = (low, high) => Array.from({ length: Math.max(0, Math.ceil(high / step) - Math.ceil(low / step)) }, (_, k) => (Math.ceil(low / step) + k) * step);
+    return [between(x0, x1), between(y0, y1)];
+  }
+
+  paintGrid(c) {
+    const [xs, ys] = this.marks();
     c.strokeStyle = "#00000022";
     c.lineWidth = 1;
     c.beginPath();
-    const [x0, y0] = this.at(0, this.height);
-    const [x1, y1] = this.at(this.width, 0);
+    for (const x of xs) { const [px] = this.place(x, 0); c.moveTo(px, 0); c.lineTo(px, this.height); }
+    for (const y of ys) { const [, py] = this.place(0, y); c.moveTo(0, py); c.lineTo(this.width, py); }
+    c.stroke();
+  }
+
+  // Along the edges, over everything: how many metres.
+  paintScale(c) {
+    const [xs, ys] = this.marks();
+    c.font = "12px sans-serif";
+    c.fillStyle = "#3c4043";
     c.textAlign = "center";
     c.textBaseline = "bottom";
-    for (let x = Math.ceil(x0 / step) * step; x < x1; x += step) {
-      const [px] = this.place(x, 0);
-      c.moveTo(px, 0); c.lineTo(px, this.height);
-      c.fillText(`X ${x}`, px, this.height - 3);
-    }
+    for (const x of xs) c.fillText(`X ${x}`, this.place(x, 0)[0], this.height - 3);
     c.textAlign = "left";
     c.textBaseline = "middle";
-    for (let y = Math.ceil(y0 / step) * step; y < y1; y += step) {
+    for (const y of ys) {
       const [, py] = this.place(0, y);
-      c.moveTo(0, py); c.lineTo(this.width, py);
       if (py < this.height - 24) c.fillText(`Y ${y}`, 4, py);
     }
-    c.stroke();
   }
 
   visible() {
@@ -304,6 +357,7 @@ export class YardCanvas {
   }
 
   zoom(factor, px = this.width / 2, py = this.height / 2) {
+    this.moving = null;
     const [x, y] = this.at(px, py);
     this.view.scale = Math.min(2000, Math.max(1, this.view.scale * factor));
     const [nx, ny] = this.at(px, py);
@@ -313,6 +367,7 @@ export class YardCanvas {
   }
 
   pan(px, py) {
+    this.moving ||= {};
     this.view.x -= px / this.view.scale;
     this.view.y += py / this.view.scale;
     this.draw();

@@ -5,7 +5,10 @@ import { clockNow, showCrane, yardScreen } from "./yard.js";
 import { adminScreen, alarmScreen, alarmText, bundleScreen, healthScreen, liftScreen, mark, priority, stockScreen, surveyScreen } from "./screens.js";
 import { timelineScreen } from "./timeline.js";
 
-const SCREENS = { yard: yardScreen, bundle: bundleScreen, lifts: liftScreen, stock: stockScreen, alarms: alarmScreen, timeline: timelineScreen, surveys: surveyScreen, health: healthScreen, admin: adminScreen };
+// WebGL is on this screen only: it is loaded when it is opened.
+const modelScreen = async (...given) => (await import("./model.js")).modelScreen(...given);
+
+const SCREENS = { yard: yardScreen, model: modelScreen, bundle: bundleScreen, lifts: liftScreen, stock: stockScreen, alarms: alarmScreen, timeline: timelineScreen, surveys: surveyScreen, health: healthScreen, admin: adminScreen };
 const place = document.getElementById("screen");
 let isThere = true;
 let drawn = 0;
@@ -39,7 +42,7 @@ function header(state, name) {
   const top = state.top_alarm;
   show(document.getElementById("header"),
     fact("header.server", isThere ? t("server.there") : t("server.away"), { id: "server" }),
-    fact("header.age", state.survey ? ageText(clockNow(state) - state.survey.captured_to_ns) : "–", { id: "age" }),
+    fact(...mapAge(state), { id: "age" }),
     live.crane && fact("crane", craneText(), { id: "crane", title: live.crane.reasons.join("; ") }),
     fact("header.map", state.survey ? state.survey.map_id : "–"),
     fact("header.lifts", `${state.offered} / ${state.claimed}`),
@@ -53,11 +56,28 @@ function header(state, name) {
   show(nav, Object.keys(SCREENS).map((each) => h("a", { href: `#${each}`, id: `nav-${each}`, "aria-current": each === name ? "page" : null }, t(`nav.${each}`), each === "alarms" && state.unacknowledged > 0 && h("span", { className: "count" }, `(${state.unacknowledged})`))));
 }
 
+// The age of the map where the live crane is, else that of the newest map.
+function mapAge(state) {
+  const place = live.crane?.place;
+  if (place) return ["header.age.here", place.map_seen_ns === null ? t("header.age.unseen") : ageText(clockNow(state) - place.map_seen_ns)];
+  return ["header.age", state.survey ? ageText(clockNow(state) - state.survey.captured_to_ns) : "–"];
+}
+
+async function showAge() {
+  const state = await read("state").catch(() => null);
+  const fact = document.getElementById("age");
+  if (!state || !fact) return;
+  const [word, value] = mapAge(state);
+  fact.firstChild.textContent = t(word);
+  fact.lastChild.textContent = value;
+}
+
 const craneText = () => (live.crane.mode ? t(`livemode.${live.crane.mode}`) : t("crane.none"));
 
 function craneMoved() {
   const shown = document.querySelector("#crane strong");
   if (!shown || shown.textContent !== craneText()) draw();
+  showAge();
   showCrane();
 }
 
@@ -99,9 +119,7 @@ function mark_away() {
 
 setInterval(async () => {
   if (!session.isKnown || !isThere) return;
-  const state = await read("state").catch(() => null);
-  const age = document.querySelector("#age strong");
-  if (state?.survey && age) age.textContent = ageText(clockNow(state) - state.survey.captured_to_ns);
+  await showAge();
   if (where()[0] === "health") draw();
 }, 5000);
 window.addEventListener("hashchange", () => draw().then(() => place.focus()));

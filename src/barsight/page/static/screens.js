@@ -51,7 +51,8 @@ export async function liftScreen(place) {
 
 export async function stockScreen(place) {
   const stock = await read("stock");
-  if (stock.list === null) return show(place, h("section", {}, h("h1", {}, t("stock")), h("p", {}, t(stock.map_id ? "stock.no.list" : "yard.empty"))));
+  const written = h("p", {}, h("a", { href: "/api/stock.csv", download: "stock.csv", id: "stock-list" }, t("stock.write")));
+  if (stock.list === null) return show(place, h("section", {}, h("h1", {}, t("stock")), h("p", {}, t(stock.map_id ? "stock.no.list" : "yard.empty")), stock.map_id && written));
   const decide = async (each, decision) => {
     const given = await ask(t(`stock.${decision}`), each.key, [["note", t("reason"), { required: false }]], t("accept"));
     if (given) act("POST", "/api/stock", { map_id: stock.map_id, key: each.key, decision, note: given.note }, "told.decided");
@@ -62,7 +63,7 @@ export async function stockScreen(place) {
     h("td", {}, each.decision && [h("strong", {}, t(`stock.${each.decision.what}`)), h("div", { className: "small quiet" }, `${each.decision.who} · ${timeText(each.decision.at_ns)}${each.decision.note ? ` · ${each.decision.note}` : ""}`)]),
     h("td", {}, h("div", { className: "buttons" }, h("button", { id: `accept-${k}`, disabled: !may("operate"), onclick: () => decide(each, "accepted") }, t("stock.accept")), h("button", { id: `reject-${k}`, disabled: !may("operate"), onclick: () => decide(each, "rejected") }, t("stock.reject")))),
   ]));
-  show(place, h("section", {}, h("h1", {}, t("stock")), h("p", {}, t("stock.summary", stock.agree.length, stock.differences.length, stock.map_id)), h("p", { className: "quiet small" }, t("stock.help")), table([t("stock.kind"), t("stock.name"), t("bundle"), t("what"), t("stock.decision"), t("to.do")], rows, t("stock"))));
+  show(place, h("section", {}, h("h1", {}, t("stock")), h("p", {}, t("stock.summary", stock.agree.length, stock.differences.length, stock.map_id)), h("p", { className: "quiet small" }, t("stock.help")), written, table([t("stock.kind"), t("stock.name"), t("bundle"), t("what"), t("stock.decision"), t("to.do")], rows, t("stock"))));
 }
 
 export const priority = (alarm) => alarm.priority;
@@ -89,7 +90,7 @@ export async function alarmScreen(place) {
 }
 
 export async function surveyScreen(place) {
-  const { surveys } = await read("surveys");
+  const [{ surveys }, { recordings }] = await Promise.all([read("surveys"), read("equipment")]);
   const kinds = ["same", "moved", "added", "found", "gone", "covered", "not-found"];
   const rows = surveys.map((one) => row([
     h("td", {}, one.map_id, one.is_simulated && h("div", { className: "small" }, t("simulated"))), h("td", {}, timeText(one.captured_to_ns)),
@@ -97,7 +98,27 @@ export async function surveyScreen(place) {
     h("td", {}, one.files.includes("report.html") ? h("a", { href: `/api/surveys/${one.map_id}/files/report.html`, target: "_blank", rel: "noopener", id: `report-${one.map_id}` }, t("report")) : "–"),
     h("td", {}, h("details", {}, h("summary", {}, t("files", one.files.length)), h("ul", { className: "plain small" }, one.files.map((name) => h("li", {}, h("a", { href: `/api/surveys/${one.map_id}/files/${name}`, download: name }, name)))), one.missing.length > 0 && h("p", { className: "small" }, t("files.missing", one.missing.join(", "))), h("p", { className: "small quiet" }, one.folder))),
   ]));
-  show(place, h("section", {}, h("h1", {}, t("surveys")), table([t("map"), t("last.frame"), ...kinds.map((kind) => `#${t(`change.${kind}`)}`), t("report"), t("files.head")], rows, t("surveys"))));
+  show(place, h("section", {}, h("h1", {}, t("surveys")), table([t("map"), t("last.frame"), ...kinds.map((kind) => `#${t(`change.${kind}`)}`), t("report"), t("files.head")], rows, t("surveys"))),
+    h("section", {}, h("h1", {}, t("recordings")), table([t("recording"), "SHA-256", t("rig"), t("state"), t("recording.why"), t("map")], recordings.map((one) => row([
+      h("td", { className: "long" }, one.key), h("td", {}, h("code", { title: one.digest }, one.digest.slice(0, 12))), h("td", {}, one.rig || "–"), h("td", {}, t(`recording.${one.state}`)),
+      h("td", {}, one.state === "kept" ? one.note : "–", h("div", { className: "small quiet" }, `${one.who} · ${timeText(one.at_ns)}`)), h("td", {}, one.surveys.join(", ") || "–")])), t("recordings"))));
+}
+
+function calibrationSection(calibrations, clock_ns) {
+  const approve = async (digest) => {
+    const fields = [["until", t("calibration.until.date"), { type: "date", required: false }], ["note", t("note"), { required: false }]];
+    const given = await ask(t("calibration.approve"), h("p", {}, t("calibration.approve.text", digest)), fields, t("calibration.approve"));
+    const until_ns = given?.until ? Date.parse(`${given.until}T00:00:00Z`) * 1e6 : null;
+    if (given) act("POST", "/api/calibrations", { digest, until_ns, note: given.note }, "told.approved");
+  };
+  const standing = (time) => (clock_ns < time.from_ns ? "to.come" : time.until_ns !== null && clock_ns >= time.until_ns ? "ended" : "valid");
+  const rows = calibrations.flatMap((one) => (one.times.length ? one.times : [null]).map((time, k) => row([
+    h("td", {}, one.crane), h("td", {}, one.rig), h("td", {}, one.digest), h("td", {}, t(time ? `calibration.${standing(time)}` : "calibration.never")),
+    h("td", {}, time ? timeText(time.from_ns) : "–"), h("td", {}, time?.until_ns ? timeText(time.until_ns) : "–"),
+    h("td", {}, time ? time.approved_by : "–", time?.note && h("div", { className: "small quiet" }, time.note)),
+    h("td", {}, k === 0 && h("button", { id: `approve-${one.digest}`, disabled: !may("administer"), onclick: () => approve(one.digest) }, t("calibration.approve")))])));
+  const heads = ["crane", "rig", "calibration", "state", "calibration.from", "calibration.until", "calibration.by", "to.do"].map((word) => t(word));
+  return h("section", { id: "calibrations" }, h("h1", {}, t("calibrations")), h("p", { className: "quiet small" }, t("calibrations.help")), table(heads, rows, t("calibrations")));
 }
 
 const curve = (values, label) => {
@@ -116,10 +137,11 @@ const curve = (values, label) => {
 };
 
 export async function healthScreen(place) {
-  const health = await get("/api/health");
+  const [health, { calibrations }, state] = await Promise.all([get("/api/health"), read("equipment"), read("state")]);
   const pairs = [[t("store"), health.store], [t("revision"), String(health.revision)], [t("problem"), health.problem || t("none")]];
   const live = health.live;
   show(place, h("section", {}, h("h1", {}, t("health")), h("dl", {}, pairs.map(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]))),
+    calibrationSection(calibrations, clockNow(state)),
     h("section", {}, h("h1", {}, t("live")), !live ? h("p", {}, t("live.none")) : !live.content ? h("p", {}, t("alarm.live-stopped")) : [
       h("dl", {}, [[t("mode"), live.content.mode], [t("age"), ageText(live.age_s * 1e9)],
         ...Object.entries(live.content.rates_hz).map(([name, value]) => [name, `${value} Hz`]),

@@ -1,10 +1,11 @@
-"""Compare the stock list, what should lie in the yard, with what was found."""
+"""Read and write the stock list, what should lie in the yard, and compare it with what was found."""
 
 from __future__ import annotations
 
 import csv
+import io
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -90,6 +91,27 @@ def read_stock(path: Path) -> tuple[ListedBundle, ...]:
     if twice:
         raise InputError(path, f"lists {twice[0]!r} {counts[twice[0]]} times", "give each its own name")
     return listed
+
+
+def stock_text(listed: tuple[ListedBundle, ...]) -> str:
+    """Write a list as `read_stock` reads it from CSV; lengths to 0.1 mm, angles to 0.001 deg."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    names = ("name", *_NEEDED[1:], *_OPTIONAL)
+    writer.writerow(names)
+    for one in listed:
+        figures = asdict(one)
+        digits = {"yaw_deg": 3, "bars": 0}
+        row = [figures[name] for name in names[1:]]
+        finite = [value if value is not None and np.isfinite(value) else None for value in row]
+        writer.writerow(
+            [one.name]
+            + [
+                "" if value is None else f"{value:.{digits.get(name, 4)}f}"
+                for name, value in zip(names[1:], finite, strict=True)
+            ]
+        )
+    return out.getvalue()
 
 
 def _csv_rows(path: Path) -> list[dict[str, Any]]:

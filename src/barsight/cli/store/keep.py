@@ -1,0 +1,39 @@
+"""Run `barsight store keep URL RECORDING WHY`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import tyro
+
+from barsight.cli.arguments import call
+from barsight.cli.safe_console import SafeConsole
+from barsight.store.audit import entry, user_name
+from barsight.store.opening import open_store
+from barsight.store.recordings import keep_recording, release_recording
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parse, change and print."""
+
+    def command(
+        url: tyro.conf.Positional[str], recording: tyro.conf.Positional[str],
+        why: tyro.conf.Positional[str], release: bool = False, by: str | None = None,
+    ) -> None:  # fmt: skip
+        """Say why a recording is not to be deleted. A folder that is on this computer gets a file PROTECTED,
+        which a crane's recorder leaves alone when the disk fills.
+
+        Args:
+            url: SQLAlchemy's URL of the database.
+            recording: Its path as `store list` tells it, or the beginning of its SHA-256.
+            why: The reason.
+            release: Take the protection back, for this reason.
+            by: Who says so, for the audit log; the name of the user if not given.
+        """
+        change = release_recording if release else keep_recording
+        with open_store(url) as store, entry(store, by or user_name(), f"recording {recording}") as opened:
+            key = change(opened, recording, why)
+        told = f"{key} is {'released' if release else 'kept'}: {why}"
+        SafeConsole().print(told, highlight=False, soft_wrap=True)
+
+    call(command, "store keep", arguments)
