@@ -48,13 +48,14 @@ def false_alarms(runs: int, surveys: int, seed: int) -> int:
     return found
 
 
-def late_alarms(runs: int, seed: int) -> int:
+def late_alarms(runs: int, seed: int, sigma_deg: float = 0.0018) -> int:
     """Jumps of 0.01 degrees after ten surveys that aren't told within three."""
     late = 0
     for number in range(runs):
         rng = np.random.default_rng((seed, number))
+        jump = 0.01 * SIGMAS["yaw / deg"] / sigma_deg
         drawn = [survey(k, rng) for k in range(10)]
-        drawn += [survey(k, rng, yaw_deg=0.01) for k in range(10, 13)]
+        drawn += [survey(k, rng, yaw_deg=jump) for k in range(10, 13)]
         alarm = first_alarm(drawn)
         late += alarm is None or alarm <= 10
     return late
@@ -69,6 +70,7 @@ def test_healthy_surveys_are_quiet_and_a_jump_is_told_within_three() -> None:
 def test_forty_thousand_healthy_surveys_alarm_at_most_forty_times() -> None:
     assert false_alarms(40, 1000, 33) <= 40
     assert late_alarms(200, 34) <= 4
+    assert late_alarms(400, 39, sigma_deg=0.0024) <= 20
 
 
 def test_a_slow_drift_is_told_too() -> None:

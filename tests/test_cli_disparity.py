@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 
 from barsight.calibration.files.rig_file import write_rig_file
+from barsight.calibration.geometry.camera import Camera, Distortion
+from barsight.calibration.geometry.rig import StereoRig
 from barsight.cli.main import run
+from barsight.core.pose import Pose
 from barsight.stereo.disparity_files import read_disparity
 from motion_recordings import ideal_rig
 
@@ -43,6 +46,20 @@ def test_a_wall_has_one_disparity(pair: tuple[Path, Path], tmp_path: Path, name:
     assert known[:, SHIFT_PX + 8 :].mean() > 0.95
     assert abs(np.median(found[known]) - SHIFT_PX) < 0.05
     assert cv2.imread(str(preview)).shape == (150, 520, 3)
+
+
+def test_a_rig_gives_what_makes_depth_of_it(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    camera = Camera(260, 150, 300.0, 300.0, 129.5, 74.5, Distortion.RADTAN, (-0.01, 0.0, 0.0, 0.0))
+    aside = Pose("cam0", "cam1", np.eye(3), np.array([0.4, 0, 0]))
+    body = Pose("body", "cam0", np.eye(3), np.zeros(3))
+    write_rig_file(tmp_path / "rig.yaml", StereoRig(camera, camera, body, body @ aside))
+    out = tmp_path / "d.pfm"
+    assert run(["disparity", *map(str, pair), "--rig", str(tmp_path / "rig.yaml"), "-o", str(out)]) == 0
+    said = dict(line.split("=") for line in (tmp_path / "d_calib.txt").read_text().splitlines())
+    focal = float(said["cam0"].strip("[]").split()[0])
+    disparity = read_disparity(out).disparity_px
+    depth = float(said["baseline"]) * focal / (disparity + float(said["doffs"]))
+    assert np.nanmedian(depth) == pytest.approx(400 * 300 / SHIFT_PX, rel=0.02)
 
 
 def test_colour_and_16_bits_are_turned_to_gray(pair: tuple[Path, Path], tmp_path: Path) -> None:

@@ -5,10 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from barsight.calibration.files.kalibr import read_camchain
 from barsight.calibration.files.kalibr_lens import MAX_OFF_PX, fit_four
+from barsight.calibration.files.rig_file import write_rig_file
 from barsight.calibration.geometry.camera import Camera, Distortion
+from barsight.calibration.geometry.rig import StereoRig
 from barsight.cli.main import run
 from barsight.core.errors import InputError
+from barsight.core.pose import Pose
 from barsight.core.types import RectifiedCamera
 from barsight.recording.formats.bag_setup import side_by_side
 from barsight.recording.formats.image_pairs import find_pairs
@@ -81,6 +85,29 @@ def test_kalibr_gets_four_coefficients_or_a_reason() -> None:
     assert len(fitted.coefficients) == 4 and off_px < MAX_OFF_PX
     strong = (-0.1, 0.02, 0, 0, -0.1, 0.2, 0.05, -0.08)
     assert fit_four(Camera(640, 480, 300, 300, 320, 240, Distortion.RADTAN, strong))[1] > MAX_OFF_PX
+
+
+@pytest.mark.parametrize(
+    "lens", [(-0.1, 0.02, 1e-3, -1e-3, -0.002), (-0.1, 0.02, 0, 0, -0.1, 0.2, 0.05, -0.08)]
+)
+def test_kalibr_is_written_through_the_command_or_refused(
+    tmp_path: Path, lens: tuple[float, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    wide = len(lens) == 8
+    focal = 300.0 if wide else 660.0
+    camera = Camera(640, 480, focal, focal, 320, 240, Distortion.RADTAN, lens)
+    aside = Pose("cam0", "cam1", np.eye(3), np.array([0.2, 0, 0]))
+    body = Pose("body", "cam0", np.eye(3), np.zeros(3))
+    write_rig_file(tmp_path / "rig.yaml", StereoRig(camera, camera, body, body @ aside))
+    out = tmp_path / "camchain.yaml"
+    words = ["calibrate", "export", str(tmp_path / "rig.yaml"), "-o", str(out), "--to", "kalibr"]
+    assert (run(words) == 0) is not wide
+    told = " ".join(capsys.readouterr().err.split())
+    assert out.exists() is not wide
+    if wide:
+        assert "calibrate with --lens radtan4" in told
+    else:
+        assert len(read_camchain(out).rig.cam0.coefficients) == 4 and "four coefficients, up to" in told
 
 
 def test_disparities_can_be_made_into_depth(tmp_path: Path) -> None:

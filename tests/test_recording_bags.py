@@ -18,6 +18,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from barsight.calibration.files.rig_file import write_rig_file
 from barsight.calibration.files.rig_formats import read_rig_file
+from barsight.cli.main import run
 from barsight.core.errors import CalibrationError, InputError
 from barsight.core.types import RefusedFrame, StereoFrame
 from barsight.recording.base import RecordingSettings
@@ -196,13 +197,19 @@ def test_torn_and_odd_messages_are_refused(tmp_path: Path) -> None:
     assert "is 64x9, the calibration is for 64x48" in reasons[4]
 
 
-def test_raw_pictures_that_are_too_short_or_unknown_are_refused(tmp_path: Path) -> None:
+def test_raw_pictures_that_are_too_short_or_unknown_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     sent = [Sent(f"/cam{k}/image_raw", IMAGE, START_NS, ("yuv422", picture(0))) for k in (0, 1)]
     path = write_bag(tmp_path / "a", "ros2-sqlite3", sent)
     write_kalibr(tmp_path)
     (frame,) = open_recording(path).frames()
     assert isinstance(frame, RefusedFrame)
     assert "has the encoding 'yuv422'" in frame.reason
+    assert run(["convert", str(path), "-o", str(tmp_path / "whole"), "--to", "euroc"]) == 3
+    told = " ".join(capsys.readouterr().err.split())
+    assert "none of its pictures can be read" in told and "yuv422" in told
+    assert not (tmp_path / "whole").exists()
     sent = [replace(message, content=("mono16", picture(0))) for message in sent]
     (frame,) = open_recording_of(tmp_path / "b", sent)
     assert isinstance(frame, RefusedFrame)

@@ -138,6 +138,8 @@ def test_the_file_fits_its_schema_and_comes_back_whole(bundles: tuple[Bundle, ..
         assert np.allclose(one.ends_m, back.ends_m, atol=1e-6)
         assert back.yaw_rad == pytest.approx(one.yaw_rad, abs=1e-8)
         assert np.isclose(back.sigma.length_m, one.sigma.length_m, equal_nan=True)
+        assert 0 < one.map_sigma_z_m < 0.1
+        assert back.map_sigma_z_m == pytest.approx(one.map_sigma_z_m, rel=1e-6)
         assert back.fit_sigma is not None and one.fit_sigma is not None
         assert back.fit_sigma.yaw_rad == pytest.approx(one.fit_sigma.yaw_rad, rel=1e-6)
         assert back.reasons == one.reasons and back.neighbours == one.neighbours

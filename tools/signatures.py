@@ -68,7 +68,7 @@ def main() -> None:
     event.register("numba:compile", durations)
     ahead.MAX_PROCESSES = 1
     with tempfile.TemporaryDirectory() as folder:
-        demo.run(["--out", f"{folder}/demo"])
+        demo.run(["--out", f"{folder}/demo", "--no-serve"])
     groups: dict[str, list[tuple[int, float, list[Any]]]] = {"simulate": [], "measure": []}
     for module, name, function, arguments in compiled():
         group = "simulate" if module.startswith("barsight.simulation.") else "measure"

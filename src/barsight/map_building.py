@@ -47,7 +47,7 @@ from barsight.recording.plausibility import clock_faults, doubts
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.recording.sensor_selection import SelectedSensors
 from barsight.registration.yard_file import YardFrame
-from barsight.stereo.settings import StereoSettings, make_method
+from barsight.stereo.settings import StereoSettings, make_map_method
 from barsight.yard_frame import frame_of, in_yard, placed_in_yard, shared_height_sigma_m
 
 ProgressCallback = Callable[[str, int, int], None]
@@ -310,7 +310,7 @@ def matching(
     """Make what matches the pairs of a recording for its map."""
     stereo, every = settings.stereo, settings.map.min_shift == 0
     chained = every and stereo.method == "barsight" and stereo.barsight.preset == "best"
-    matcher = Matcher(stereo, make_method(stereo.for_map()), watch)
+    matcher = Matcher(stereo, make_map_method(stereo), watch)
     return PairChain(pairs, matcher, stereo.confirmed_pairs + 1 if chained else 1, checkpoints)
 
 

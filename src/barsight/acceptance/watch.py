@@ -25,8 +25,11 @@ SCHEMA_VERSION = 1
 REMEDY = "give the record that barsight verify wrote, or another name to begin a new one"
 LEARNED = 8
 """Surveys after an approval that say what is normal."""
-SLACK, ALARM = 2.0, 4.0
-"""CUSUM in sigmas: what of each survey is taken off, and the sum that alarms [Page 1954]."""
+SLACK, ALARM = 1.8, 2.8
+"""CUSUM in sigmas of a survey against the learned mean: what of each is taken off, and the sum that alarms
+[Page 1954]. A jump of four sigma is told within three surveys, and a dozen charts of healthy ones alarm less
+than once in a thousand surveys.
+"""
 DOUBTED = 1.62
 """A stated sigma is believed unless the learned ones scatter by more: 1 % would by chance."""
 _TEXT = {"type": "string"}
@@ -205,11 +208,12 @@ def _chart(name: str, surveys: Sequence[WatchedSurvey]) -> ControlChart:
         return ControlChart(name, rows[-1][1].value, np.nan, np.nan, 0.0, None)
     mean = float(learned.mean())
     scatter = float(learned.std(ddof=1))
+    spread = (1 + 1 / LEARNED) ** 0.5  # the learned mean errs too
     up = down = 0.0
     alarmed, sigma = None, np.nan
     for number, figure in rows[LEARNED:]:
         sigma = scatter if scatter > DOUBTED * figure.sigma else figure.sigma
-        off = (figure.value - mean) / sigma
+        off = (figure.value - mean) / (spread * sigma)
         up, down = max(up + off - SLACK, 0.0), max(down - off - SLACK, 0.0)
         if max(up, down) > ALARM and alarmed is None:
             alarmed = number

@@ -40,6 +40,10 @@ class StereoSettings:
     """So many pairs after one that is matched from nothing are started from the disparity of the pair before,
     moved as encoders and pictures say, where their own pictures confirm it; 0 matches each from nothing. Only
     with method `barsight`, preset `best`, encoders and map.min_shift 0."""
+    binned_row_m: float = 0.016
+    """For a map, pairs of rows are averaged where the picture is alike along its columns, as bars across the
+    baseline are, and two rows are no wider than this on the surface: half the work; 0 never. Only with method
+    `barsight`."""
     gap_darkness: float = 0.55
     """Places darker than this share of their surroundings are gaps between bars: unknown; 0 keeps them."""
     sgbm: SgbmSettings = field(default_factory=SgbmSettings)
@@ -56,17 +60,21 @@ class StereoSettings:
             raise ConfigError(f"the disparity range {low}:{high} is empty")
         expect_ranges(
             self, "stereo.", calibration_sigma_px=NOT_NEGATIVE, max_depth_m=POSITIVE, max_sigma_px=POSITIVE,
-            confirmed_pairs=NOT_NEGATIVE,
+            confirmed_pairs=NOT_NEGATIVE, binned_row_m=NOT_NEGATIVE,
             gap_darkness=(0, UNDER_1),
         )  # fmt: skip
 
-    def for_map(self) -> StereoSettings:
-        """Drop guesses, which no map takes, and be as sure of a pixel's side as if there were no edge: a map
-        holds the views' sides against each other.
-        """
-        return replace(
-            self, barsight=replace(self.barsight, fill_occlusions=False, other_side_error_ratio=0.0)
-        )
+
+def make_map_method(settings: StereoSettings) -> StereoMethod:
+    """Make the method that the settings name, for a map.
+
+    It makes no guesses, which no map takes, and is as sure of a pixel's side as if there were no edge: a map
+    holds the views' sides against each other. Rows may be binned.
+    """
+    if settings.method != "barsight":
+        return make_method(settings)
+    own = replace(settings.barsight, fill_occlusions=False, other_side_error_ratio=0.0)
+    return BarsightStereo(own, settings.binned_row_m)
 
 
 def make_method(settings: StereoSettings) -> StereoMethod:

@@ -180,7 +180,8 @@ class Bundle:
     neighbours: ids of the bundles it touches. known_share: share of its outline that was measured.
     confidence: probability that a bundle lies here as described. reasons: sentences for whoever doubts it.
     label: None where none was seen, or they weren't read. fit_sigma: of the outline's fit alone; None where
-    straps tell the place instead.
+    straps tell the place instead. map_sigma_z_m: of heights there, which holds the calibration's part, shared
+    by the whole map and not in `sigma`; NaN where it isn't known.
     """
 
     id: int
@@ -208,6 +209,7 @@ class Bundle:
     cover_doubts: tuple[str, ...] = ()
     label: BundleLabel | None = None
     fit_sigma: FitSigma | None = None
+    map_sigma_z_m: float = float("nan")
 
     @property
     def is_free(self) -> bool:

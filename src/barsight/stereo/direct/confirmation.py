@@ -23,19 +23,21 @@ from barsight.stereo.direct.semiglobal.cost import (
 _SAME_PX = np.float32(1.0)
 _CONSISTENT_PX = 2.0
 _COST_WINDOW_PX = 7
-_EDGE_WINDOW_PX = 9
+EDGE_WINDOW_PX = 9
 _BAND_ROWS = 64
 _NAN = np.float32(np.nan)
 _FAR = -1e6
 
 
 def confirmed_start(
-    left: UInt8, right: UInt8, predicted: Float32, matched: Float32, matched_right: Float32
-) -> Float32:
+    left: UInt8, right: UInt8, predicted: Float32, matched: Float32, matched_right: Float32,
+    edge_rows: int = EDGE_WINDOW_PX,
+) -> Float32:  # fmt: skip
     """Merge a prediction and the pair's own match at half the size into a start (H, W), NaN where unknown.
 
     predicted, matched: (H, W) px of the left picture, NaN where unknown; matched_right: (H, W) of the right
     one. Where the match has nothing, the prediction stays if the right picture's match agrees within 2 px.
+    edge_rows: rows of the window in which an edge is looked for.
     """
     differ = np.abs(predicted - matched)
     disputed = differ >= _SAME_PX
@@ -44,13 +46,13 @@ def confirmed_start(
     confirmed = (differ < _SAME_PX) | disputed
     alone = np.isfinite(predicted) & ~np.isfinite(matched)
     alone &= is_consistent(np.nan_to_num(predicted, nan=_FAR), matched_right, _CONSISTENT_PX)
-    return np.where(confirmed | alone, predicted, np.where(_is_edge(matched), _NAN, matched))
+    return np.where(confirmed | alone, predicted, np.where(_is_edge(matched, edge_rows), _NAN, matched))
 
 
-def _is_edge(disparity: Float32) -> Bool:
-    """Check (H, W) for a jump of more than 1 px, or a hole's border, within 4 px."""
+def _is_edge(disparity: Float32, rows: int) -> Bool:
+    """Check (H, W) for a jump of more than 1 px, or a hole's border, within 4 px and so many rows."""
     filled = np.nan_to_num(disparity, nan=_FAR)
-    window = np.ones((_EDGE_WINDOW_PX, _EDGE_WINDOW_PX), dtype=np.uint8)
+    window = np.ones((rows, EDGE_WINDOW_PX), dtype=np.uint8)
     edge: Bool = cv2.dilate(filled, window) - cv2.erode(filled, window) > _SAME_PX
     return edge
 

@@ -15,7 +15,7 @@ from barsight.core.arrays import Float32, UInt8
 from barsight.core.settings.values import NOT_NEGATIVE, POSITIVE, expect_ranges
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.direct.confidence import disparity_bend, edge_risk, start_disagreement, vertical_error_px
-from barsight.stereo.direct.confirmation import confirmed_start
+from barsight.stereo.direct.confirmation import EDGE_WINDOW_PX, confirmed_start
 from barsight.stereo.direct.consistency import hits_valid, is_consistent, remove_islands
 from barsight.stereo.direct.depth_edges import sharpen_edges
 from barsight.stereo.direct.kernels.pyramid import halve
@@ -25,6 +25,13 @@ from barsight.stereo.direct.refinement import (
     RefinementSettings,
     refine_at_half_size,
     refine_disparity,
+)
+from barsight.stereo.direct.row_binning import (
+    BINNED_ROWS,
+    are_rows_alike,
+    bin_disparity,
+    bin_rows,
+    spread_rows,
 )
 from barsight.stereo.direct.semiglobal.matching import SemiGlobalSettings, match_semiglobal
 
@@ -90,46 +97,99 @@ class _Start:
 
 @dataclass(frozen=True)
 class BarsightStereo:
-    """`StereoMethod` of Barsight: direct refinement of a semi-global start."""
+    """`StereoMethod` of Barsight: direct refinement of a semi-global start.
+
+    binned_row_m: pairs of rows no wider than this are averaged where rows are alike, 0 averages none.
+    """
 
     settings: BarsightSettings
+    binned_row_m: float = 0.0
 
     def __call__(self, pair: RectifiedPair, candidates: DisparityRange) -> Disparity:
         """Match; see `StereoMethod`. Candidates beyond the image's width are left out.
 
         Memory: the semi-global stripes (about 130 MB per thread) and some thirty float32 images.
         """
-        settings = self.settings
-        candidates = _inside(candidates, pair.camera.width)
-        if min(_contrast(pair.left), _contrast(pair.right)) < _MIN_CONTRAST_GRAY:
-            nothing = np.full(pair.left.shape, _NAN, dtype=np.float32)
-            return Disparity(nothing, nothing.copy())
-        refinement = settings.refinement
-        if settings.preset == "fast":
-            steps = min(refinement.steps, _FAST_STEPS)
-            refinement = replace(refinement, steps=steps, short_px=0.0, first_at_half_size=True)
-        start = self._start(pair, candidates)
-        return self._finish(pair, candidates, start, _refined(pair, start.left_px, refinement))
+        return self._in_rows(pair, candidates, None)
 
     def confirm(self, pair: RectifiedPair, candidates: DisparityRange, predicted: Float32) -> Disparity:
         """Match a pair whose disparity is predicted, (H, W) px, NaN where not: in one step of refinement,
         where the pair's own pictures confirm it. In all steps, where that one goes far in many places.
         """
+        return self._in_rows(pair, candidates, predicted)
+
+    def _in_rows(
+        self, pair: RectifiedPair, candidates: DisparityRange, predicted: Float32 | None
+    ) -> Disparity:
+        """Match at the pictures' own size, or by pairs of rows."""
         candidates = _inside(candidates, pair.camera.width)
-        flat = min(_contrast(pair.left), _contrast(pair.right)) < _MIN_CONTRAST_GRAY
-        if flat or min(pair.left.shape) < _MIN_HALVED_PX:
-            return self(pair, candidates)
+        if not (self.binned_row_m > 0 and are_rows_alike(pair, candidates, self.binned_row_m)):
+            return _Matching(self.settings).match(pair, candidates, predicted)
+        found = _Matching(_in_binned_rows(self.settings), halves_rows=False).match(
+            bin_rows(pair), candidates, None if predicted is None else bin_disparity(predicted)
+        )
+        return spread_rows(found, len(pair.left))
+
+
+def _in_binned_rows(settings: BarsightSettings) -> BarsightSettings:
+    """Convert lengths along the columns to binned rows; a window keeps its area."""
+    refinement = settings.refinement
+    return replace(
+        settings,
+        island_px=settings.island_px // BINNED_ROWS,
+        vertical_error_ratio=settings.vertical_error_ratio * BINNED_ROWS,
+        refinement=replace(
+            refinement,
+            along_px=refinement.along_px / BINNED_ROWS,
+            short_px=refinement.short_px / BINNED_ROWS,
+            gloss_px=refinement.gloss_px / BINNED_ROWS,
+            window_px=max(int(refinement.window_px / BINNED_ROWS**0.5) | 1, 3),
+        ),
+    )
+
+
+@dataclass(frozen=True)
+class _Matching:
+    """The matching of one pair. halves_rows: half the size has half the rows; not where these are binned."""
+
+    settings: BarsightSettings
+    halves_rows: bool = True
+
+    def match(self, pair: RectifiedPair, candidates: DisparityRange, predicted: Float32 | None) -> Disparity:
+        """Match a pair, from a predicted disparity where there is one."""
+        if min(_contrast(pair.left), _contrast(pair.right)) < _MIN_CONTRAST_GRAY:
+            nothing = np.full(pair.left.shape, _NAN, dtype=np.float32)
+            return Disparity(nothing, nothing.copy())
+        if predicted is not None and min(pair.left.shape) >= _MIN_HALVED_PX:
+            return self._confirm(pair, candidates, predicted)
+        settings, refinement = self.settings, self.settings.refinement
+        if settings.preset == "fast":
+            steps = min(refinement.steps, _FAST_STEPS)
+            refinement = replace(refinement, steps=steps, short_px=0.0, first_at_half_size=True)
+        start = self._start(pair, candidates)
+        return self._finish(pair, candidates, start, self._refined(pair, start.left_px, refinement))
+
+    def _confirm(self, pair: RectifiedPair, candidates: DisparityRange, predicted: Float32) -> Disparity:
         own, refinement = self._start_at_half_size(pair, candidates), self.settings.refinement
         matched = np.isfinite(own.left_px)
-        own_px = refine_at_half_size(pair.left, pair.right, fill_row_holes(own.left_px), matched, refinement)
+        own_px = refine_at_half_size(
+            pair.left, pair.right, fill_row_holes(own.left_px), matched, refinement, self.halves_rows
+        )
         own_px = np.where(matched, own_px, _NAN)
-        started = confirmed_start(pair.left, pair.right, predicted, own_px, own.right_px)
+        rows = EDGE_WINDOW_PX if self.halves_rows else EDGE_WINDOW_PX // BINNED_ROWS | 1
+        started = confirmed_start(pair.left, pair.right, predicted, own_px, own.right_px, rows)
         started = np.where(pair.left_valid, started, _NAN)
-        refined = _refined(pair, started, replace(refinement, steps=1))
+        refined = self._refined(pair, started, replace(refinement, steps=1))
         moved = np.abs(refined.disparity_px - started)[np.isfinite(started)] > _FAR_STEP_PX
         if moved.size and moved.mean() > _MAX_FAR_RATIO:
-            refined = _refined(pair, started, refinement)
+            refined = self._refined(pair, started, refinement)
         return self._finish(pair, candidates, _Start(started, own.right_px), refined)
+
+    def _refined(
+        self, pair: RectifiedPair, start_px: Float32, settings: RefinementSettings
+    ) -> RefinedDisparity:
+        filled, matched = fill_row_holes(start_px), np.isfinite(start_px)
+        return refine_disparity(pair.left, pair.right, filled, matched, settings, self.halves_rows)
 
     def _finish(
         self, pair: RectifiedPair, candidates: DisparityRange, start: _Start, refined: RefinedDisparity
@@ -184,7 +244,7 @@ class BarsightStereo:
     def _start_at_half_size(self, pair: RectifiedPair, candidates: DisparityRange) -> _Start:
         """Match the start at half size, an eighth of the work: refinement makes up for the coarser steps."""
         settings, shape = self.settings, pair.left.shape
-        left, right = (halve(image) for image in (pair.left, pair.right))
+        left, right = (halve(image, rows=self.halves_rows) for image in (pair.left, pair.right))
         lowest = candidates.lowest_px // 2
         found = match_semiglobal(
             left, right, lowest, -(-candidates.highest_px // 2) - lowest, settings.semiglobal
@@ -197,14 +257,10 @@ class BarsightStereo:
         return _Start(np.where(believed, left_px, _NAN), _doubled(found.right_px, shape))
 
 
-def _refined(pair: RectifiedPair, start_px: Float32, settings: RefinementSettings) -> RefinedDisparity:
-    return refine_disparity(
-        pair.left, pair.right, fill_row_holes(start_px), np.isfinite(start_px), settings
-    )  # fmt: skip
-
-
 def _doubled(disparity: Float32, shape: tuple[int, ...]) -> Float32:
-    doubled: Float32 = 2 * disparity.repeat(2, axis=0).repeat(2, axis=1)[: shape[0], : shape[1]]
+    """Repeat each column, and each row where there are half as many."""
+    taller = disparity if len(disparity) == shape[0] else disparity.repeat(2, axis=0)
+    doubled: Float32 = 2 * taller.repeat(2, axis=1)[: shape[0], : shape[1]]
     return np.ascontiguousarray(doubled)
 
 

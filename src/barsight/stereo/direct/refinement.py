@@ -109,12 +109,16 @@ class RefinedDisparity:
 
 
 def refine_disparity(
-    left: UInt8, right: UInt8, start: Float32, matched: Bool, settings: RefinementSettings
-) -> RefinedDisparity:
-    """Refine `start` (H, W; no NaN) from the pixels that are `matched`; the others only follow."""
+    left: UInt8, right: UInt8, start: Float32, matched: Bool, settings: RefinementSettings,
+    halves_rows: bool = True,
+) -> RefinedDisparity:  # fmt: skip
+    """Refine `start` (H, W; no NaN) from the pixels that are `matched`; the others only follow.
+
+    halves_rows: half the size has half the rows too.
+    """
     at_half_size = settings.first_at_half_size and min(left.shape) >= _MIN_HALVED_PX and settings.steps > 1
     if at_half_size:
-        start = refine_at_half_size(left, right, start, matched, settings)
+        start = refine_at_half_size(left, right, start, matched, settings, halves_rows)
     work = _Work.of(left.astype(np.float32), start, matched.astype(np.float32), settings)
     noise = _noise(left, right)
     variance = np.full_like(start, np.inf)
@@ -126,22 +130,26 @@ def refine_disparity(
 
 
 def refine_at_half_size(
-    left: UInt8, right: UInt8, start: Float32, matched: Bool, settings: RefinementSettings
-) -> Float32:
-    """Run one step at half the size with the long support: a quarter of the work, and softer images carry
-    further.
+    left: UInt8, right: UInt8, start: Float32, matched: Bool, settings: RefinementSettings,
+    halves_rows: bool = True,
+) -> Float32:  # fmt: skip
+    """Run one step at half the size with the long support: a fraction of the work, and softer images carry
+    further. halves_rows: that has half the rows too.
     """
+    rows = 2 if halves_rows else 1
     half = replace(
         settings,
-        along_px=settings.along_px / 2,
+        along_px=settings.along_px / rows,
         across_px=settings.across_px * _HALF_ACROSS,
-        gloss_px=settings.gloss_px / 2,
+        gloss_px=settings.gloss_px / rows,
         same_surface_px=settings.same_surface_px / 2,
-        window_px=max(settings.window_px // 4 * 2 + 1, 3),
+        window_px=max(int(settings.window_px / (2 * rows) ** 0.5) | 1, 3),
     )
-    small_left, small_right = (halve(image.astype(np.float32)) for image in (left, right))
-    started = np.float32(0.5) * halve(start)
-    work = _Work.of(small_left, started, halve(matched.astype(np.float32)), half, _HALF_HOLD * _HOLD)
+    small_left, small_right, small_start, small_matched = (
+        halve(image.astype(np.float32), rows=halves_rows) for image in (left, right, start, matched)
+    )
+    started = np.float32(0.5) * small_start
+    work = _Work.of(small_left, started, small_matched, half, _HALF_HOLD * _HOLD)
     slope_noise = _noise(small_left, small_right) * _slope_gain(_BLUR_PX)
     work.pulls(small_left, small_right, _BLUR_PX, slope_noise, is_last=False)
     fitted, _ = work.planes(SupportShape(half.along_px, half.across_px, _HALF_STEP_PX))

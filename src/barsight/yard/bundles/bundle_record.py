@@ -29,7 +29,7 @@ from barsight.yard.bundles.reading import Reading
 from barsight.yard.bundles.section.seen_section import estimate_section, seen_section
 from barsight.yard.bundles.strapped_bundles import held_by_straps
 from barsight.yard.sections import MapStretch
-from barsight.yard.types import Bundle, BundleSigma, FitSigma
+from barsight.yard.types import Bundle, BundleSigma, FitSigma, YardMap
 
 
 def describe_bundles(
@@ -112,6 +112,28 @@ def make_bundle(
     if reading.pack is not None:
         return held_by_straps(bundle, irregular, reading, reading.pack, floor_m)
     return bundle if bars is not None else replace(bundle, sigma=irregular)
+
+
+def map_sigma(yard: YardMap, bundle: Bundle) -> float:
+    """Return the median of the map's own sigma of heights over a bundle; NaN where nothing was seen."""
+    low = np.minimum(*bundle.ends_m[:, :2]) - bundle.width_m / 2
+    high = np.maximum(*bundle.ends_m[:, :2]) + bundle.width_m / 2
+    origin = np.array([yard.x0_m, yard.y0_m])
+    first, last = ((np.rint((place - origin) / yard.cell_m).astype(int)) for place in (low, high))
+    height, width = yard.shape
+    rows = slice(*np.clip([first[1], last[1] + 1], 0, height).tolist())
+    columns = slice(*np.clip([first[0], last[0] + 1], 0, width).tolist())
+    part = yard.part(rows, columns)
+    y, x = np.meshgrid(
+        part.y0_m + part.cell_m * np.arange(part.shape[0]),
+        part.x0_m + part.cell_m * np.arange(part.shape[1]), indexing="ij",
+    )  # fmt: skip
+    way = bundle.direction[:2] / np.linalg.norm(bundle.direction[:2])
+    aside = way[1] * (x - bundle.centre_m[0]) - way[0] * (y - bundle.centre_m[1])
+    along = way[0] * (x - bundle.centre_m[0]) + way[1] * (y - bundle.centre_m[1])
+    over = (np.abs(aside) <= bundle.width_m / 2) & (np.abs(along) <= bundle.length_m / 2)
+    seen = part.sigma_m[over & np.isfinite(part.sigma_m)]
+    return float(np.median(seen)) if seen.size else float("nan")
 
 
 def _in_map(grid: AlignedMap, fit: Fit, v_m: float) -> Float64:

@@ -108,6 +108,7 @@ def _record(bundle: Bundle) -> dict[str, Any]:
             "mass_kg": mass.sigma_kg,
         },
         "fit_sigma": _fit_record(bundle.fit_sigma),
+        "map_sigma_z_m": bundle.map_sigma_z_m,
         "known_share": bundle.known_share,
         "confidence": bundle.confidence,
         "reasons": list(bundle.reasons),
@@ -178,6 +179,7 @@ def bundle_of(record: dict[str, Any]) -> Bundle:
         section_m2=figure(record.get("section_m2")),
         label=BundleLabel(**record["label"]) if record.get("label") else None,
         fit_sigma=FitSigma(yaw_rad=float(np.radians(fit.pop("yaw_deg"))), **fit) if fit else None,
+        map_sigma_z_m=figure(record.get("map_sigma_z_m")),
         ends_sigma_m=(figure(record["ends_sigma_m"][0]), figure(record["ends_sigma_m"][1])),
         bar_axes=tuple(
             Bar(

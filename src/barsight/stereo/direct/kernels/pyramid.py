@@ -16,25 +16,28 @@ _BAND_ROWS = 64
 Image = TypeVar("Image", UInt8, Float32)
 
 
-def halve(image: Image) -> Image:
-    """Average 2 x 2 pixels; odd images go on with their last row and column."""
+def halve(image: Image, *, rows: bool = True, columns: bool = True) -> Image:
+    """Average 2 x 2 pixels, or two along one axis; odd images go on with their last row and column."""
+    down, right = 2 if rows else 1, 2 if columns else 1
     height, width = image.shape
-    framed = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
-    size = framed.shape[1] // 2, framed.shape[0] // 2
+    framed = cv2.copyMakeBorder(image, 0, height % down, 0, width % right, cv2.BORDER_REPLICATE)
+    size = framed.shape[1] // right, framed.shape[0] // down
     return cast(Image, cv2.resize(framed, size, interpolation=cv2.INTER_AREA))
 
 
 def upsample_update(started: Float32, moved: Float32, disparity: Float32, same_surface_px: float) -> Float32:
     """Upsample what was found at half size onto `disparity` (H, W): by the bilinear mean of the four nearest
-    places, where those on another surface don't count. started, moved: (H / 2, W / 2), in half pixels.
+    places, where those on another surface don't count. started, moved: (H / 2, W / 2), or (H, W / 2) where
+    the rows are all there, in half pixels.
     """
+    rows = 1 if len(started) == len(disparity) else 2
     result = np.empty_like(disparity)
     seen, pulled = (
         cv2.copyMakeBorder(2 * image, 1, 1, 1, 1, cv2.BORDER_REPLICATE) for image in (started, moved)
     )
 
     def work(first: int, end: int) -> None:
-        _carry_up(seen, pulled, disparity, np.float32(1 / same_surface_px), result, first, end)
+        _carry_up(seen, pulled, disparity, np.float32(1 / same_surface_px), rows, result, first, end)
 
     parallel_bands(work, len(disparity), _BAND_ROWS)
     return result
@@ -42,12 +45,12 @@ def upsample_update(started: Float32, moved: Float32, disparity: Float32, same_s
 
 @kernel()
 def _carry_up(
-    started: Float32, moved: Float32, disparity: Float32, inverse_px: np.float32, result: Float32, first: int,
-    end: int,
+    started: Float32, moved: Float32, disparity: Float32, inverse_px: np.float32, rows: int, result: Float32,
+    first: int, end: int,
 ) -> None:  # fmt: skip
     """Upsample the update by bilinear weights that fall with the difference of disparity, rows first...end.
 
-    started, moved: (ceil(H / 2) + 2, ceil(W / 2) + 2), half size with a border of one, but in full px.
+    started, moved: (ceil(H / rows) + 2, ceil(W / 2) + 2), half size with a border of one, but in full px.
     disparity: (H, W) px. inverse_px: one over the difference (px) at which a place no longer counts. Fills
     result (H, W) px.
     """
@@ -55,8 +58,8 @@ def _carry_up(
     zero, one, tiny = np.float32(0), np.float32(1), np.float32(1e-6)
     shares = np.array([9, 3, 3, 1], dtype=np.float32)
     for y in range(first, end):
-        near = y // 2 + 1
-        far = near - 1 + 2 * (y & 1)
+        near = y // rows + 1
+        far = near - 1 + 2 * (y & 1) if rows == 2 else near
         for x in range(width):
             column = x // 2 + 1
             beside = column - 1 + 2 * (x & 1)
