@@ -304,7 +304,7 @@ def test_passes_whose_trolley_travels_meanwhile_lie_together(tmp_path: Path) -> 
 
 
 def heights_off_m(yard: bs.Yard, path: Path) -> np.ndarray:
-    """How far a map's heights are off a recording's truth, where both know one."""
+    """Errors of a map's heights against a recording's truth."""
     heights = yard.height_map
     with np.load(path / "truth/height.npz") as truth:
         i = np.abs(truth["x"][:, None] - heights.x_m).argmin(axis=0)
@@ -314,7 +314,7 @@ def heights_off_m(yard: bs.Yard, path: Path) -> np.ndarray:
 
 
 def places_off_m(joined: bs.Yard, one: dict[str, Any], path: Path) -> np.ndarray:
-    """(3, N) how far a pass's poses are off the truth."""
+    """(3, N) errors of a pass's poses, m."""
     truth = np.loadtxt(path / "mav0/state_groundtruth_estimate0/data.csv", delimiter=",", usecols=range(4))
     stamps = joined.trajectory.stamp_ns
     own = (stamps >= one["trajectory"]["first_ns"]) & (stamps <= one["trajectory"]["last_ns"])
