@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 from barsight.calibration.boards.ring_detection import PAPER, find_rings, ring_codes, ring_pattern
+from barsight.cli.main import run
 from barsight.core.errors import InputError
 from barsight.recording.formats.surveyed_targets import SurveyedTags, read_tags
 from barsight.registration.tags import PlacedTag, see_tags
+from barsight.registration.yard_file import read_yard_file
 from barsight.simulation.simulate import laid_stock
 from barsight.simulation.worlds.tags import lay_tags
-from test_yard_tags import SETTINGS, Way, stick
+from test_yard_tags import LAID, SETTINGS, SHIFT, SURVEY_M, TURN, Way, stick
 
 PLACES = {
     3: (0.4, -0.9, 0.1),
@@ -91,3 +93,24 @@ def test_circles_are_laid_where_the_list_says() -> None:
     assert [*plate[:2], plate[2] + plate[14]] == pytest.approx([1.0, 0.2, 1.5])
     assert plate[12:14] == pytest.approx(0.2)
     assert (laid.codes[0] == ring_pattern(5)).all()
+
+
+@pytest.mark.slow
+def test_six_rendered_circles_place_the_yard(tmp_path: Path) -> None:
+    def write(name: str, yard: np.ndarray) -> str:
+        rows = (
+            f"{k + 3},{x:.5f},{y:.5f},{z:.5f},{SURVEY_M},{int(k > 3)}" for k, (x, y, z) in enumerate(yard)
+        )
+        (tmp_path / name).write_text("\n".join(["ring,yard_x,yard_y,yard_z,sigma_m,check", *rows, ""]))
+        return str(tmp_path / name)
+
+    camera = ("--camera.width-px", "640", "--camera.height-px", "512", "--camera.focal-px", "625")
+    yard = ("--camera.above-floor-m", "6", "--yard.max-layers", "2", "--yard.bar-length-m", "5")
+    words = ("--length", "3.6", "--frames", "12", "--seed", "8201", "--depth-views", "0", *camera, *yard)
+    recording, out = str(tmp_path / "recording"), tmp_path / "yard.yaml"
+    laid = write("laid.csv", LAID)
+    assert run(["simulate", recording, *words, "--tags", laid, "--tag-m", "0.1"]) == 0
+    true = LAID @ TURN.T + SHIFT
+    listed = write("rings.csv", true + np.random.default_rng(8201).normal(0, SURVEY_M, (6, 3)))
+    assert run(["calibrate", "yard", recording, "-o", str(out), "--tags", listed]) == 0
+    assert np.linalg.norm(read_yard_file(out).yard_from.apply(LAID) - true, axis=1).max() < 0.004
