@@ -3,6 +3,7 @@
 import json
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -280,16 +281,47 @@ def test_passes_lie_together_as_well_as_their_sigmas_say(passes: tuple[Path, Pat
     assert first["ties"] == [] and tie["blocks"] > 5 and not tie["contradicts"]
     for one, path in zip((first, second), passes, strict=True):
         assert Path(one["recording"]["path"]) == path
-        truth = np.loadtxt(
-            path / "mav0/state_groundtruth_estimate0/data.csv", delimiter=",", usecols=range(4)
-        )
-        stamps = joined.trajectory.stamp_ns
-        own = (stamps >= one["trajectory"]["first_ns"]) & (stamps <= one["trajectory"]["last_ns"])
-        shift_s = open_recording_shift(path)
-        at = (stamps[own] - truth[0, 0]) / 1e9 + shift_s
-        true = np.stack([np.interp(at, (truth[:, 0] - truth[0, 0]) / 1e9, axis) for axis in truth[:, 1:].T])
-        off = joined.trajectory.position_m[own].T - true
-        assert np.abs(np.median(off, axis=1)).max() < 0.008
+        assert np.abs(np.median(places_off_m(joined, one, path), axis=1)).max() < 0.008
+
+
+@pytest.mark.slow
+def test_passes_whose_trolley_travels_meanwhile_lie_together(tmp_path: Path) -> None:
+    """The way back is driven obliquely too: the trolley goes 0.8 m within each pass."""
+    oblique = replace(PASSES, seed=720021, motion=replace(PASSES.motion, trolley_m=0.8))
+    simulate_passes(tmp_path / "yard", oblique)
+    recordings = [tmp_path / "yard" / f"pass_{number}" for number in (1, 2)]
+    yard = bs.measure(recordings, at="end", **COARSE)
+    (tie,) = yard.summary["passes"][1]["ties"]
+    assert tie["blocks"] > 5 and not tie["contradicts"]
+    ways = []
+    for one, path in zip(yard.summary["passes"], recordings, strict=True):
+        assert np.abs(np.median(places_off_m(yard, one, path), axis=1)).max() < 0.008
+        ways.append(np.ptp(bs.open_recording(path).crane().position_m[:, 1]))
+    assert min(ways) > 0.7
+    alone = bs.measure(recordings[0], at="end", **COARSE)
+    one, both = (np.nanmedian(np.abs(heights_off_m(each, recordings[0]))) for each in (alone, yard))
+    assert both < one + 0.002
+
+
+def heights_off_m(yard: bs.Yard, path: Path) -> np.ndarray:
+    """Errors of a map's heights against a recording's truth."""
+    heights = yard.height_map
+    with np.load(path / "truth/height.npz") as truth:
+        i = np.abs(truth["x"][:, None] - heights.x_m).argmin(axis=0)
+        j = np.abs(truth["y"][:, None] - heights.y_m).argmin(axis=0)
+        off: np.ndarray = heights.z_m - truth["z"][np.ix_(i, j)].T
+    return off
+
+
+def places_off_m(joined: bs.Yard, one: dict[str, Any], path: Path) -> np.ndarray:
+    """(3, N) errors of a pass's poses, m."""
+    truth = np.loadtxt(path / "mav0/state_groundtruth_estimate0/data.csv", delimiter=",", usecols=range(4))
+    stamps = joined.trajectory.stamp_ns
+    own = (stamps >= one["trajectory"]["first_ns"]) & (stamps <= one["trajectory"]["last_ns"])
+    at = (stamps[own] - truth[0, 0]) / 1e9 + open_recording_shift(path)
+    true = np.stack([np.interp(at, (truth[:, 0] - truth[0, 0]) / 1e9, axis) for axis in truth[:, 1:].T])
+    off: np.ndarray = joined.trajectory.position_m[own].T - true
+    return off
 
 
 def open_recording_shift(path: Path) -> float:
@@ -375,11 +407,7 @@ def test_a_second_pair_on_the_body_sees_further_and_agrees(two_pairs: tuple[Path
     assert np.all(np.diff(both.trajectory.stamp_ns) >= 0)
     known, off = [], []
     for yard in (alone, both):
-        heights = yard.height_map
-        with np.load(two_pairs[0] / "truth/height.npz") as truth:
-            i = np.abs(truth["x"][:, None] - heights.x_m).argmin(axis=0)
-            j = np.abs(truth["y"][:, None] - heights.y_m).argmin(axis=0)
-            error = heights.z_m - truth["z"][np.ix_(i, j)].T
+        error = heights_off_m(yard, two_pairs[0])
         known.append(np.isfinite(error).sum())
         off.append(np.nanmedian(np.abs(error)))
     assert known[1] > 1.3 * known[0]

@@ -46,7 +46,8 @@ def stick(image: np.ndarray, pattern: np.ndarray, corners_px: np.ndarray) -> Non
         np.ceil(corners_px.max(axis=0)).astype(int) + 4,
     )
     size = tuple(int(v) for v in fine * (high - low))
-    cell, n = 16, len(pattern)
+    n = len(pattern)
+    cell = 16 if n < 20 else 4
     large = np.kron(pattern, np.ones((cell, cell), np.uint8))
     source = np.array([[0, 0], [n, 0], [n, n], [0, n]], np.float32) * cell - 0.5
     target = (fine * (corners_px - low + 0.5) - 0.5).astype(np.float32)
@@ -67,13 +68,16 @@ def drawn_frame(
     for camera, mounting in ((rig.cam0, rig.body_from_cam0), (rig.cam1, rig.body_from_cam1)):
         image = np.full((camera.height, camera.width), 90.0)
         for pattern, middle in tags:
-            half = SIDE_M / 16 * len(pattern)
+            half = SIDE_M / 16 * min(len(pattern), 10)
             c, s = half * np.cos(middle[0]), half * np.sin(middle[0])
             corners = middle + np.array(
                 [[-c - s, c - s, 0], [c - s, c + s, 0], [c + s, s - c, 0], [s - c, -c - s, 0]]
             )
-            here = (posed.reference_from_body @ mounting).inverse().apply(corners)
-            pixels = camera.project(here)
+            here = (posed.reference_from_body @ mounting).inverse().apply(np.vstack([corners, middle]))
+            projected = camera.project(here)
+            pixels, exact = projected[:4], projected[4]
+            if len(pattern) > 10:  # a circle is known by its middle, which the lens moves against the corners
+                pixels = pixels + exact - np.mean(pixels, axis=0)
             if (pixels > 8).all() and (pixels < np.array([camera.width, camera.height]) - 9).all():
                 stick(image, pattern, pixels)
         pictures.append(np.clip(image + rng.normal(0, 2, image.shape), 0, 255).astype(np.uint8))

@@ -55,7 +55,7 @@ def run(arguments: Sequence[str]) -> None:
                 stand there instead of a stock, exactly where it says.
             tags: A .csv as calibrate yard --tags takes it: its AprilTags (36h11) lie there too, face up, on
                 thin plates, exactly where it says.
-            tag_m: Side of a tag's black square.
+            tag_m: Side of a tag's black square; diameter of a coded circle's disc.
             board: A calibration board (see barsight calibrate stereo): pictures of it by the rig that all
                 other recordings of these settings have, instead of a recording.
             views: Pairs of pictures of the board.

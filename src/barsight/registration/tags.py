@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from barsight.calibration.boards.marker_detection import find_tags, fit_tag
+from barsight.calibration.boards.ring_detection import find_rings
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Float64, UInt8
 from barsight.core.errors import Failed
@@ -68,6 +69,7 @@ class PlacedTag:
 class SeenTags:
     """Sightings by tag number, pictures that show a tag twice, by its number, and pairs looked at. names: of
     targets that bear no number; known_px: noise of a middle in one picture where rows don't tell it.
+    are_rings: they are coded circles.
     """
 
     sightings: dict[int, list[TagSighting]] = field(default_factory=dict)
@@ -75,10 +77,12 @@ class SeenTags:
     pairs: int = 0
     names: tuple[str, ...] = ()
     known_px: float | None = None
+    are_rings: bool = False
 
     def name(self, number: int) -> str:
-        """Name a tag or target."""
-        return f"target {self.names[number]}" if self.names else f"tag {number}"
+        """Name a tag, coded circle or target."""
+        kind = "ring" if self.are_rings else "tag"
+        return f"target {self.names[number]}" if self.names else f"{kind} {number}"
 
     @property
     def sigma_px(self) -> float:
@@ -99,7 +103,7 @@ class SeenTags:
                 ]
                 for number, seen in self.sightings.items()
             },
-            self.twice, self.pairs, self.names, self.known_px,
+            self.twice, self.pairs, self.names, self.known_px, self.are_rings,
         )  # fmt: skip
 
     def place(self, number: int) -> PlacedTag | Failed:
@@ -116,14 +120,14 @@ class SeenTags:
 
 def see_tags(
     frames: Iterable[StereoFrame | RefusedFrame], rectifier: Rectifier, posed: dict[int, PosedFrame],
-    count: Callable[[], None],
+    count: Callable[[], None], *, are_rings: bool = False,
 ) -> SeenTags:  # fmt: skip
-    """Find tags in the raw pairs whose pose is known. count: called after each pair."""
-    seen = SeenTags()
+    """Find tags, or coded circles, in the raw pairs whose pose is known. count: called after each pair."""
+    seen = SeenTags(are_rings=are_rings)
     for frame in frames:
         if isinstance(frame, StereoFrame) and rectifier.wrong_size(frame) is None:
             seen.pairs += 1
-            left, right = _corners(frame.left, seen.twice), _corners(frame.right, seen.twice)
+            left, right = (_corners(one, seen.twice, are_rings) for one in (frame.left, frame.right))
             for number in left.keys() & right.keys():
                 one = _triangulated(left[number], right[number], rectifier, posed[frame.stamp_ns])
                 if one is not None:
@@ -144,13 +148,13 @@ def other_family(frames: Iterable[StereoFrame | RefusedFrame]) -> str | None:
     return next((family for (family, _), count in shown.most_common(1) if count >= MIN_PAIRS), None)
 
 
-def _corners(image: UInt8, twice: Counter[int]) -> dict[int, Float64]:
+def _corners(image: UInt8, twice: Counter[int], are_rings: bool) -> dict[int, Float64]:
     """Find the fitted corners (4, 2) of the tags that a picture shows once; count the others."""
-    numbers, quads = find_tags(image)
+    numbers, quads = find_rings(image) if are_rings else find_tags(image)
     repeated = {int(n) for n, times in Counter(numbers.tolist()).items() if times > 1}
     twice.update(repeated)
     found = {
-        int(number): fit_tag(image, int(number), quad)
+        int(number): quad if are_rings else fit_tag(image, int(number), quad)
         for number, quad in zip(numbers, quads, strict=True)
         if int(number) not in repeated
     }

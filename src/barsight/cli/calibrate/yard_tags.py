@@ -76,7 +76,7 @@ def calibrate_by_tags(
     if bend is not None and recording.crane() is None:
         raise InputError(path, "has no encoders", "leave --girder-y-m out")
     if picks_path is None:
-        reference, seen = _see(recording, console)
+        reference, seen = _see(recording, console, are_rings=listed.are_rings)
     else:
         reference, seen = _see_picks(recording, read_picks(picks_path, names), names, picks_path, console)
     placed = [seen.place(int(number)) for number in listed.numbers]
@@ -101,20 +101,21 @@ def calibrate_by_tags(
 
 def place_in_yard(recording: Recording, listed: SurveyedTags, console: Console) -> list[PlacedTag | Failed]:
     """Place listed tags by a recording that is seen in the yard, as `measure` maps it."""
-    reference, seen = _see(recording, console)
+    reference, seen = _see(recording, console, are_rings=listed.are_rings)
     if reference != "yard":
         raise InputError(recording.path, "isn't placed in the yard", "give encoders, or a yard file (--yard)")
     return [seen.place(int(number)) for number in listed.numbers]
 
 
-def _see(recording: Recording, console: Console) -> tuple[str, SeenTags]:
+def _see(recording: Recording, console: Console, *, are_rings: bool) -> tuple[str, SeenTags]:
     """Estimate the trajectory as `measure` does and find the tags in its pairs; its reference, and them."""
     with stages(console) as advance:
         rectifier = Rectifier(recording.rig)
         trajectory = placed_in_yard(_trajectory(recording, advance), frame_of(recording))
         posed = {frame.stamp_ns: frame for frame in trajectory.frames}
         count = count_frames("tags", len(posed), advance)
-        return trajectory.reference, see_tags(recording.frames(posed), rectifier, posed, count)
+        frames = recording.frames(posed)
+        return trajectory.reference, see_tags(frames, rectifier, posed, count, are_rings=are_rings)
 
 
 def _see_picks(
@@ -222,6 +223,8 @@ def _expect_upright(path: Path, tags: tuple[PlacedTag, ...], yard_m: Float64, fo
 
 def _told(recording: Recording, seen: SeenTags, placed: list[PlacedTag | Failed]) -> str:
     """Say why tags weren't placed."""
+    if not seen.sightings and seen.are_rings:
+        return f"no coded circle is seen in both pictures of any of {seen.pairs} pairs"
     if not seen.sightings and not seen.names:
         family = other_family(recording.frames())
         if family is not None:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from barsight.calibration.boards.ring_detection import ring_codes
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.errors import InputError
 from barsight.core.reading.bounded_reading import MAX_ENTRIES, in_range, read_lines
@@ -34,14 +35,15 @@ class Targets:
 
 @dataclass(frozen=True, eq=False)
 class SurveyedTags:
-    """numbers (N,) of AprilTags 36h11; yard_m (N, 3) of their middles; sigma_m (N,) of each coordinate, NaN
-    where not said; checks (N,): set apart.
+    """numbers (N,) of AprilTags 36h11, or of coded circles where `are_rings`; yard_m (N, 3) of their middles;
+    sigma_m (N,) of each coordinate, NaN where not said; checks (N,): set apart.
     """
 
     numbers: Int64
     yard_m: Float64
     sigma_m: Float64
     checks: Bool
+    are_rings: bool = False
 
 
 def read_targets(path: Path) -> Targets:
@@ -56,18 +58,23 @@ def read_targets(path: Path) -> Targets:
 
 
 def read_tags(path: Path) -> SurveyedTags:
-    """Read a CSV with a header, m: `tag,yard_x,yard_y,yard_z`, optionally `sigma_m` and `check` (1 or 0).
+    """Read a CSV with a header, m: `tag,yard_x,yard_y,yard_z` (`ring` for coded circles), optionally
+    `sigma_m` and `check` (1 or 0).
 
     Raises `InputError` naming the line.
     """
-    names, table = _read_table(path, "tag", YARD)
-    numbers = [int(name) if re.fullmatch(r"[0-9]{1,6}", name) else TAGS for name in names]
-    strange = next((name for name, number in zip(names, numbers, strict=True) if number >= TAGS), None)
+    are_rings = read_lines(path, MAX_ENTRIES, f"give tag,{','.join(YARD)}")[0].lstrip("# ").startswith("ring")
+    kind, family, count = ("ring", "circle coded in 12", len(ring_codes())) if are_rings else (
+        "tag", "tag of the family 36h11", TAGS
+    )  # fmt: skip
+    names, table = _read_table(path, kind, YARD)
+    numbers = [int(name) if re.fullmatch(r"[0-9]{1,6}", name) else count for name in names]
+    strange = next((name for name, number in zip(names, numbers, strict=True) if number >= count), None)
     if strange is not None:
-        problem = f"{strange!r} is no tag of the family 36h11"
-        raise InputError(path, problem, f"give the number on it, 0 to {TAGS - 1}")
-    _expect_once(path, "tag", tuple(map(str, numbers)))
-    return SurveyedTags(np.array(numbers, np.int64), table[:, :3], table[:, 3], table[:, 4] == 1)
+        raise InputError(path, f"{strange!r} is no {family}", f"give the number on it, 0 to {count - 1}")
+    _expect_once(path, kind, tuple(map(str, numbers)))
+    found = np.array(numbers, np.int64), table[:, :3], table[:, 3], table[:, 4] == 1
+    return SurveyedTags(*found, are_rings)
 
 
 def read_places(path: Path) -> tuple[tuple[str, ...], SurveyedTags]:

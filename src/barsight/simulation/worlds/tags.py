@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from barsight.calibration.boards.marker_detection import TAG_MODULES, TAG_QUIET, tag_pattern
+from barsight.calibration.boards.ring_detection import PAPER, ring_pattern
 from barsight.core.arrays import Float64
 from barsight.core.errors import ConfigError
 from barsight.recording.formats.surveyed_targets import SurveyedTags
@@ -18,7 +19,8 @@ MIN_Z_M = 0.002
 
 
 def lay_tags(laid: LaidYard, tags: SurveyedTags, side_m: float, settings: SimulationSettings) -> LaidYard:
-    """Lay tags besides what lies there. side_m: of the black square; white paper stands out one module.
+    """Lay tags besides what lies there. side_m: of the black square; white paper stands out one module. Of
+    coded circles it is the disc's diameter.
 
     Each is turned about the vertical by an angle from the seed. Raises ConfigError for a tag under the floor,
     and where labels are drawn.
@@ -35,7 +37,8 @@ def lay_tags(laid: LaidYard, tags: SurveyedTags, side_m: float, settings: Simula
     for k, place in enumerate(tags.yard_m):
         paper = plain_material(0.75, 0.0, rng, weight=0.3)
         paper[CODE] = k + 1
-        plates.append(_plate(place, side_m, float(rng.uniform(0, 2 * np.pi))))
+        half_m = side_m * PAPER / 2 if tags.are_rings else side_m / 2 * (1 + 2 * TAG_QUIET / TAG_MODULES)
+        plates.append(_plate(place, half_m, float(rng.uniform(0, 2 * np.pi))))
         papers.append(paper)
     shape = np.concatenate([old.primitives.shape, np.reshape(plates, (-1, 15))])
     material = np.concatenate([old.primitives.material, np.reshape(papers, (-1, 10))]).astype(np.float32)
@@ -45,12 +48,12 @@ def lay_tags(laid: LaidYard, tags: SurveyedTags, side_m: float, settings: Simula
         {"tag": int(number), "center": place.tolist(), "side_m": side_m}
         for number, place in zip(tags.numbers, tags.yard_m, strict=True)
     ]
-    codes = np.stack([tag_pattern(int(number)) for number in tags.numbers])
+    pattern = ring_pattern if tags.are_rings else tag_pattern
+    codes = np.stack([pattern(int(number)) for number in tags.numbers])
     return LaidYard(Scene(primitives, grid), {**laid.truth, "tags.json": rows}, codes)
 
 
-def _plate(place: Float64, side_m: float, yaw: float) -> Float64:
+def _plate(place: Float64, half: float, yaw: float) -> Float64:
     c, s = np.cos(yaw), np.sin(yaw)
-    half = side_m / 2 * (1 + 2 * TAG_QUIET / TAG_MODULES)
     centre = place - [0, 0, HALF_THICK_M]
     return np.array([*centre, c, s, 0.0, -s, c, 0.0, 0.0, 0.0, 1.0, half, half, HALF_THICK_M])
