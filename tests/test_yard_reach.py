@@ -15,6 +15,7 @@ from barsight.yard.magnet.partings import without_parted
 from barsight.yard.magnet.reach import reached_strips
 from barsight.yard.stability.stability import footings
 from lift_yards import MAGNET, SETTINGS, SIGMA, codes, judged, laid, map_of, record
+from yard_maps import Laid
 
 EXACT = Tolerance(0.0, 0.0, 0.0)
 OVER = Placement(0.3, 0.0, 0.0)
@@ -116,3 +117,17 @@ def test_edges_that_show_alike_on_both_sides_tell_no_shift(aside_m: float, side:
     top = record(stock[1], 0, layer=1)
     (footing,) = footings(map_of(stock), (top,), SETTINGS)
     assert footing.overhang_side == side
+
+
+def test_what_stands_on_nothing_that_shows_is_not_lifted() -> None:
+    """A wall looks like a bundle from above, but falls sheer on both sides."""
+
+    def over_floor(z: float, beside: list[Laid]) -> bool:
+        stock = [laid(0.3, z=z), *beside]
+        lift = judged(stock, tuple(record(one, k) for k, one in enumerate(stock)))
+        return any("neither side" in veto.reason for veto in lift.vetoes if veto.code == "unstable-side")
+
+    high = record(laid(0.3)).width_m * 2.5 + 0.3 - laid(0.3).top_z_m + laid(0.3).z_m
+    assert not over_floor(high - 0.08, [])
+    assert over_floor(high + 0.02, []) and over_floor(1.4, [])
+    assert not over_floor(1.4, [laid(0.5, z=1.1)])

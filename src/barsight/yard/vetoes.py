@@ -40,7 +40,7 @@ VETOES = {
     "overhang": "The bars reach too far beyond the outermost pole and would sag.",
     "end-open": "An end of the bundle was not seen: length, mass and balance are not known.",
     "overhanging": "The bundle lies over the edge of what carries it.",
-    "unstable-side": "A neighbour leans over or rests on this bundle and may follow it.",
+    "unstable-side": "A neighbour may follow this bundle, or what carries it shows on neither side.",
     "no-support": "What should carry the bundle isn't there, as far as can be seen.",
     "over-stanchion": "The bundle stands higher than the stanchions allow.",
 }

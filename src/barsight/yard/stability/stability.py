@@ -26,6 +26,9 @@ DUNNAGE_M = 0.3
 """The thickest dunnage that may lie between two layers."""
 MIN_LEDGE_M = 0.03
 MIN_KNOWN = 0.3
+SHEER_M = 0.15
+MAX_COLUMN_RATIO = 2.5
+"""Of its width: the most that two bundles, one on the other, are high."""
 BESIDE_M = 0.3
 TOUCH_M = 0.02
 RAISED_RATIO = 0.25
@@ -37,7 +40,8 @@ _UNKNOWN, _FILLED = HeightSource.UNKNOWN, HeightSource.FILLED
 class Side:
     """Surface beside a bundle. drop_m: from its top to the lowest place within 1.5 m; run_m: from its edge to
     that place's beginning; slope_deg: of the line between (90 is sheer); ledge_m: how far what lies below the
-    bundle shows beyond its edge; known_share: of the places looked at. NaN where unknown.
+    bundle shows beyond its edge; known_share: of the places looked at; sheer_m: from its top to the lowest
+    place within SHEER_M of its edge. NaN where unknown.
     """
 
     drop_m: float
@@ -45,6 +49,7 @@ class Side:
     slope_deg: float
     ledge_m: float
     known_share: float
+    sheer_m: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -199,7 +204,9 @@ def _side(profile: Float64, bundle: Bundle) -> Side:
     floor_of_layer = base - DUNNAGE_M / 2 - 0.5 * bundle.width_m
     shows = np.flatnonzero(~(np.nan_to_num(z, nan=-np.inf) > max(floor_of_layer, 0.05)))
     ledge = float(shows[0] if shows.size else len(z)) * STEP_M
-    return Side(drop, run, slope, ledge, share)
+    near = z[: round(SHEER_M / STEP_M) + 1]
+    sheer = bundle.top_z_m - float(np.nanmin(near)) if np.isfinite(near).any() else math.nan
+    return Side(drop, run, slope, ledge, share, sheer)
 
 
 def _distance(bundle: Bundle, x: float, y: float) -> float:
@@ -240,6 +247,7 @@ def footing_checks(
             f"{settings.max_lean_deg:g} are allowed",
         )
     )  # fmt: skip
+    checks += _column_checks(target, own)
     if not math.isnan(own.freeboard_m):
         checks.append(
             check_min(
@@ -269,6 +277,25 @@ def footing_checks(
                 )
             )  # fmt: skip
     return checks
+
+
+def _column_checks(target: Bundle, own: Footing) -> list[Check]:
+    """Check that what carries a bundle shows on a side of it: a wall falls sheer on both, and so does a pile
+    no wider than its highest bundle. Nothing where a side is unknown.
+    """
+    sheer = min(own.sides[0].sheer_m, own.sides[1].sheer_m)
+    if math.isnan(own.sides[0].sheer_m + own.sides[1].sheer_m):
+        return []
+    most, mm = MAX_COLUMN_RATIO * target.width_m + DUNNAGE_M, 1e3
+    sigma = math.hypot(MAX_COLUMN_RATIO * _sure(target.sigma.width_m), _sure(target.sigma.top_z_m))
+    return [
+        check_max(
+            "unstable-side", "how far both its sides fall sheer", mm * sheer, mm * most, "mm",
+            f"both its sides fall {mm * sheer:.0f} mm sheer, {mm * most:.0f} mm are as much as two bundles "
+            "on dunnage have: what carries it shows on neither side, as under a wall", sigma=mm * sigma,
+            sigmas=UPPER,
+        )
+    ]  # fmt: skip
 
 
 def leans_on(other: Bundle, target: Bundle, footing: Footing, settings: LiftSettings) -> bool:
