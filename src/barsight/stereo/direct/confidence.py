@@ -37,14 +37,13 @@ _UNSURE_SIDE_PX = 2.5
 def vertical_error_px(left: UInt8, right: UInt8, disparity: Float32, matched: Bool) -> float:
     """Estimate the robust sigma (px) of vertical shifts between the matched images, less what noise explains.
 
-    disparity: (H, W), no NaN. 0 where fewer than 30 windows of 21 px tell anything. Of a large image up to
-    four stripes are asked, at most half of it: one number for the whole needs no more.
+    disparity: (H, W), no NaN. 0 where fewer than 30 windows of 21 px tell anything. Of a large image four
+    stripes are asked: one number for the whole needs no more.
     """
     height, usable = len(left), matched.astype(np.float32)
     stripes = [slice(0, height)]
-    count = min(_STRIPES, height // (2 * _STRIPE_ROWS))
-    if count > 1:
-        firsts = np.linspace(0, height - _STRIPE_ROWS, count).astype(int)
+    if height >= 2 * _STRIPES * _STRIPE_ROWS:
+        firsts = np.linspace(0, height - _STRIPE_ROWS, _STRIPES).astype(int)
         stripes = [slice(first, first + _STRIPE_ROWS) for first in firsts]
     found = [_vertical_shifts(left[rows], right[rows], disparity[rows], usable[rows]) for rows in stripes]
     shift, variance = (np.concatenate(parts) for parts in zip(*found, strict=True))
