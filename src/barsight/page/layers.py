@@ -18,6 +18,7 @@ from barsight.report.map_images import hillshade
 from barsight.store.coarse_map import unpack
 from barsight.store.promotion import counts
 from barsight.store.tables import SURVEYS
+from barsight.yard.stability.stability import nearest_cells
 from barsight.yard.types import HeightMap
 
 with extra("store"):
@@ -75,11 +76,8 @@ def find_layers(connection: Connection, at_ns: int | None = None) -> tuple[Surve
 def newest_at(layers: tuple[SurveyLayer, ...], at_m: tuple[float, float]) -> int | None:
     """Tell when a place (x, y) was seen last, ns; None where no survey saw it."""
     for layer in reversed(layers):
-        heights = layer.heights
-        column = round((at_m[0] - heights.x0_m) / heights.cell_m)
-        row = round((at_m[1] - heights.y0_m) / heights.cell_m)
-        rows, columns = heights.shape
-        if 0 <= row < rows and 0 <= column < columns and layer.shown[row, column]:
+        column, row, inside = nearest_cells(layer.heights, *np.array(at_m).reshape(2, 1))
+        if inside[0] and layer.shown[row[0], column[0]]:
             return layer.seen_ns
     return None
 

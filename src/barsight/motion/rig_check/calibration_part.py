@@ -16,7 +16,7 @@ from barsight.core.arrays import Float64
 from barsight.motion.rig_check.epipolar_error import row_design
 
 FAR_BASELINES = 15.0
-"""Where nobody says the range: rows hardly ask for it."""
+"""Range that is assumed where none is known, in baselines: rows hardly depend on it."""
 
 
 def calibration_covariance(path: Path | None, range_m: float) -> Float64:

@@ -28,7 +28,7 @@ from barsight.yard.bundles.layers import check_uncovered, find_layers, list_neig
 from barsight.yard.bundles.reading import Reading
 from barsight.yard.bundles.section.seen_section import estimate_section, seen_section
 from barsight.yard.bundles.strapped_bundles import held_by_straps
-from barsight.yard.sections import MapStretch
+from barsight.yard.sections import MapStretch, part_about
 from barsight.yard.types import Bundle, BundleSigma, FitSigma, YardMap
 
 
@@ -118,12 +118,7 @@ def map_sigma(yard: YardMap, bundle: Bundle) -> float:
     """Return the median of the map's own sigma of heights over a bundle; NaN where nothing was seen."""
     low = np.minimum(*bundle.ends_m[:, :2]) - bundle.width_m / 2
     high = np.maximum(*bundle.ends_m[:, :2]) + bundle.width_m / 2
-    origin = np.array([yard.x0_m, yard.y0_m])
-    first, last = ((np.rint((place - origin) / yard.cell_m).astype(int)) for place in (low, high))
-    height, width = yard.shape
-    rows = slice(*np.clip([first[1], last[1] + 1], 0, height).tolist())
-    columns = slice(*np.clip([first[0], last[0] + 1], 0, width).tolist())
-    part = yard.part(rows, columns)
+    part = part_about(yard, np.array([low[0], high[0]]), np.array([low[1], high[1]]))
     y, x = np.meshgrid(
         part.y0_m + part.cell_m * np.arange(part.shape[0]),
         part.x0_m + part.cell_m * np.arange(part.shape[1]), indexing="ij",
