@@ -116,11 +116,11 @@ def test_what_the_shape_leaves_open_is_a_source_of_its_own() -> None:
         (source.name, *source.errors): float(source.covariance[0, 0]) ** 0.5
         for source in fit_sources(record(one, fit_sigma=fit), heights)
     }
-    assert parts["matching, travel and fit", "fit_across"] == pytest.approx(0.001)
+    assert parts["matching and fit", "fit_across"] == pytest.approx(0.001)
     assert parts[SHAPE, "fit_across"] == pytest.approx((0.003**2 - 0.001**2) ** 0.5)
     assert (SHAPE, "fit_along") not in parts and (SHAPE, "fit_yaw") not in parts
     whole = {(one.name, *one.errors) for one in fit_sources(record(one), heights)}
-    assert not any(name[0] == SHAPE for name in whole) and ("matching, travel and fit", "fit_top") in whole
+    assert not any(name[0] == SHAPE for name in whole) and ("matching and fit", "fit_top") in whole
 
 
 @pytest.mark.parametrize(
