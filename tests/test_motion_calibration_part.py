@@ -64,8 +64,8 @@ def test_a_rig_without_a_covariance_adds_nothing(tmp_path: Path) -> None:
         assert not calibration_covariance(path, float("nan")).any()
 
 
-def test_a_wrong_rig_shifts_depths_as_much_as_yaw_baseline_and_focal_length_say(tmp_path: Path) -> None:
-    """Rigs drawn by the file's covariance; depths of what they see, near and far, against its three figures."""
+def test_a_wrong_rig_shifts_depths_as_its_three_figures_say(tmp_path: Path) -> None:
+    """Rigs drawn by the file's covariance: depths of what they see, near and far."""
     settings = SimulationSettings(seed=3)
     rig = mount_rig(settings, stream(settings, 2)).rig
     sigmas = (0.4, 0.4, 4e-5, 1.2e-4)
@@ -82,7 +82,7 @@ def test_a_wrong_rig_shifts_depths_as_much_as_yaw_baseline_and_focal_length_say(
         camera = replace(rig.cam0, fx_px=rig.cam0.fx_px + off[0], fy_px=rig.cam0.fy_px + off[1])
         cam1 = rig.cam0_from_cam1.inverse()
         turned = Rotation.from_rotvec([0, off[2], 0]).as_matrix() @ cam1.rotation
-        moved = Pose("cam1", "cam0", turned, cam1.translation + [off[3], 0, 0])
+        moved = Pose("cam1", "cam0", turned, cam1.translation + np.array([off[3], 0, 0]))
         drawn = StereoRig(camera, rig.cam1, rig.body_from_cam0, rig.body_from_cam0 @ moved.inverse())
         depths.append(triangulate_depth(drawn, left, right))
     scatter = np.std(depths, axis=0)

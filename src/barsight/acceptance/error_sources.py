@@ -96,9 +96,10 @@ def measured_load(
     top = np.array([bundle.centre_m[0], bundle.centre_m[1], bundle.top_z_m])
     load = BudgetedLoad(top, bundle.yaw_rad, bundle.length_m, bundle.width_m, mass.kg)
     origin = np.zeros(3) if frame is None else frame.yard_from.translation.copy()
-    same = frame is not None and frame.attitude is None and frame.calibration_id is not None
-    found_by = frame.targets_m if frame is not None and same else None
-    return MeasuredLoad(bundle.id, load, view, origin, tuple(sources), tuple(assumed), found_by)
+    targets = None
+    if frame is not None and frame.attitude is None and frame.calibration_id is not None:
+        targets = frame.targets_m
+    return MeasuredLoad(bundle.id, load, view, origin, tuple(sources), tuple(assumed), targets)
 
 
 def _expect_own(path: Path, told: dict[str, Any], other: dict[str, Any], whose: str = "the folder") -> None:

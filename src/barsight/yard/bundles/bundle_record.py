@@ -82,7 +82,6 @@ def make_bundle(
     if reading.flanks is not None and reading.flanks.doubt:
         reasons += (reading.flanks.doubt,)
     own = _sigma(fit, ends, top, settings)
-    flush_m, _ = middle_and_length_sigma((ends[0].flush_sigma_m, ends[1].flush_sigma_m))
     bundle = Bundle(
         id=0,
         centre_m=centre,
@@ -107,7 +106,7 @@ def make_bundle(
         ends_sigma_m=(ends[0].sigma_m, ends[1].sigma_m),
         section_m2=section,
         cover_doubts=list_cover_doubts(reading, reasons),
-        fit_sigma=FitSigma(own.lateral_m, flush_m, own.yaw_rad, own.width_m, own.top_z_m),
+        fit_sigma=_fit_sigma(own, ends),
     )
     doubtful = reading.other_packing is not None
     width_m = None if seen is None else seen.width_m
@@ -165,6 +164,12 @@ def _sigma(fit: Fit, ends: list[End], top: float, settings: BundleSettings) -> B
         top_z_m=float(np.hypot(height, settings.shared_height_m)),
         bar_diameter_m=diameter,
     )
+
+
+def _fit_sigma(own: BundleSigma, ends: list[End]) -> FitSigma:
+    """Take the fit's own sigmas, and along the axis that of bars that end alike."""
+    along, _ = middle_and_length_sigma((ends[0].flush_sigma_m, ends[1].flush_sigma_m))
+    return FitSigma(own.lateral_m, along, own.yaw_rad, own.width_m, own.top_z_m)
 
 
 def _top_changes(fit: Fit, top: float) -> tuple[float, float]:

@@ -36,8 +36,8 @@ _ALIKE = 0.6
 
 @dataclass(frozen=True)
 class End:
-    """An end of a bundle at v_m. sigma_m, and flush_sigma_m for bars that are known to end alike, are NaN where
-    the end is open, and `why` says why it is.
+    """An end of a bundle at v_m. sigma_m, and flush_sigma_m for bars that surely end alike, are NaN where the
+    end is open, and `why` says why it is.
     """
 
     v_m: float
