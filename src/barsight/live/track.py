@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from barsight.calibration.geometry.rectification import Rectifier
-from barsight.checkpoint import write_checkpoint
 from barsight.core.arrays import Float64
 from barsight.core.compiling.ahead import load_kernels
 from barsight.core.errors import Failed, MeasurementError
@@ -108,8 +107,6 @@ class Tracking:
             self._keep(rectified, pair.frame)
         if isinstance(posed, PosedFrame) and is_kept:
             self._last_kept = posed.reference_from_body.translation
-            with atomic_path(self._link.posed_file(stamp)) as path:
-                write_checkpoint(posed, path)
         self._frames.append((stamp, pair.exposed_ns, done_ns, is_kept, has_pose))
 
     def _tell_state(self) -> None:
