@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from barsight.checkpoint import checkpointed, sensor_readings, trajectory_name
+from barsight.checkpoint import checkpointed
 from barsight.core.arrays import Float64
 from barsight.core.errors import MeasurementError
 from barsight.core.timing import Stopwatch
@@ -21,7 +21,8 @@ from barsight.mapping.surface.surface import Surface
 from barsight.mapping.view import MatchedFrame, PointBinner
 from barsight.measure_settings import MeasureSettings
 from barsight.measurement import Refusal
-from barsight.motion.settings import make_early_estimator, make_estimator
+from barsight.motion.settings import make_estimator
+from barsight.pair_placing import PairPlacer
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.yard.sections import surface_map
 from barsight.yard.types import HeightMap
@@ -51,22 +52,18 @@ class Snapshot:
 class LiveMap:
     """Places pairs as they come and fuses them; `folder` takes its tiles and surfaces.
 
-    With an estimator whose poses are final at once, `end` leaves the trajectory and the map in `checkpoints`,
-    as measuring the same pairs makes them. Raises MeasurementError where nothing places the body.
+    With settings that make poses final at once (`is_final`), `end` leaves the trajectory and the map in
+    `checkpoints`, as measuring the same pairs makes them.
     """
 
     def __init__(
         self, pairs: RectifiedPairs, settings: MeasureSettings, folder: Path, checkpoints: Path | None,
-        match: Callable[[RectifiedPair], MatchedFrame | Refusal],
+        placer: PairPlacer, match: Callable[[RectifiedPair], MatchedFrame | Refusal],
     ) -> None:  # fmt: skip
         self._pairs, self._settings, self._folder, self._match = pairs, settings, folder, match
-        has_crane = pairs.recording.crane() is not None
-        self._reference = "yard" if has_crane else "world"
-        estimator = make_early_estimator(settings.motion, has_crane=has_crane)
-        self._poses = estimator.begin(pairs.recording, pairs.rectifier)
-        named = make_estimator(settings.motion).begins_early and settings.self_calibrate == "none"
-        self._checkpoints = checkpoints if named else None
-        self._readings: list[tuple[int, tuple[int, ...]]] = []
+        self._reference = "world" if pairs.recording.crane() is None else "yard"
+        self._placer = placer
+        self._checkpoints = checkpoints if is_final(settings) else None
         self._waiting: list[tuple[RectifiedPair, PosedFrame]] = []
         self._passed: tuple[RectifiedPair, PosedFrame] | None = None
         self._taken: list[PosedFrame] = []
@@ -77,7 +74,7 @@ class LiveMap:
     @property
     def delay_ns(self) -> int:
         """Return how much later than itself the readings come that a frame needs."""
-        return self._poses.delay_ns or 0
+        return self._placer.poses.delay_ns or 0
 
     @property
     def stamps_ns(self) -> list[int]:
@@ -88,8 +85,7 @@ class LiveMap:
         """Place the next pair, and fuse the one before; pairs wait as long as none of them can be matched,
         and one whose picture has hardly moved is left out.
         """
-        posed = self._poses.push(pair)
-        self._readings.append((pair.stamp_ns, self._known(pair.stamp_ns)))
+        posed = self._placer.push(pair)
         if not isinstance(posed, PosedFrame) or not isinstance(pair, RectifiedPair):
             return
         way = Trajectory(self._reference, (posed,), (), ())
@@ -116,10 +112,8 @@ class LiveMap:
 
         Raises InputError where the pictures contradict a sensor.
         """
-        if self._checkpoints is None or self._map is None or not self._is_whole():
+        if self._checkpoints is None or self._map is None or self._placer.finish() is None:
             return
-        name = trajectory_name(self._pairs.recording, self.delay_ns)
-        checkpointed(self._checkpoints, name, self._poses.finish)
         (builder, binner), last = self._map, self._passed
         if last is not None:
             builder.add(self._match(last[0]), last[1])
@@ -151,14 +145,7 @@ class LiveMap:
         self._taken.append(posed)
         builder.settle()
 
-    def _is_whole(self) -> bool:
-        """Check that all frames were placed by all the readings that measuring them now would use."""
-        stamps = [stamp_ns for stamp_ns, _ in self._readings]
-        whole = stamps == list(self._pairs.recording.index.stamps_ns)
-        return whole and all(self._known(stamp_ns) == known for stamp_ns, known in self._readings)
 
-    def _known(self, stamp_ns: int) -> tuple[int, ...]:
-        """Count the readings of each sensor that have come of those that a frame needs."""
-        due_ns = stamp_ns + self._pairs.recording.rig.timeshift_cam_imu_ns + self.delay_ns
-        readings = sensor_readings(self._pairs.recording)
-        return tuple(int(np.searchsorted(stamps, due_ns, side="right")) for stamps, *_ in readings)
+def is_final(settings: MeasureSettings) -> bool:
+    """Tell whether each pair's pose and disparity are final at once, as measured at the end."""
+    return make_estimator(settings.motion).begins_early and settings.self_calibrate == "none"

@@ -21,11 +21,12 @@ from barsight.core.settings.values import build_settings
 from barsight.core.stamps import NS_PER_S
 from barsight.core.timing import Stopwatch
 from barsight.core.types import RectifiedPair, RefusedFrame, StereoFrame
-from barsight.live_map import LiveMap, Snapshot
+from barsight.live_map import LiveMap, Snapshot, is_final
 from barsight.map_building import checkpoint_key, matching
 from barsight.measure_folder import ignore_progress, write_measured
 from barsight.measure_settings import MeasureSettings
-from barsight.motion.settings import make_estimator
+from barsight.motion.settings import make_early_estimator
+from barsight.pair_placing import PairPlacer
 from barsight.pipeline import LiftRequest
 from barsight.recording.packets import Packet, PacketRecording
 from barsight.recording.rectified_pairs import RectifiedPairs
@@ -134,7 +135,7 @@ class Session:
         return Yard(self._yard, self)
 
     def _end_pass(self) -> None:
-        if make_estimator(self._settings.motion).begins_early:
+        if is_final(self._settings):
             while self._waiting:
                 self._place(self._waiting.popleft())
             if self._map is not None:
@@ -157,5 +158,9 @@ class Session:
 
     def _place(self, pair: RectifiedPair | RefusedFrame) -> None:
         if self._map is None:
-            self._map = LiveMap(self._pairs, self._settings, self._here, self._checkpoints, self._match)
+            has_crane = self._source.crane() is not None
+            estimator = make_early_estimator(self._settings.motion, has_crane=has_crane)
+            kept = self._checkpoints if is_final(self._settings) else None
+            placer = PairPlacer(self._pairs, estimator, kept)
+            self._map = LiveMap(self._pairs, self._settings, self._here, kept, placer, self._match)
         self._map.add(pair)

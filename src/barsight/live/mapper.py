@@ -6,30 +6,35 @@ import contextlib
 import os
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.compiling.ahead import load_kernels
 from barsight.core.errors import BarsightError, MeasurementError
 from barsight.core.memory import trim_heap
+from barsight.core.parallel import WORKERS
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.timing import Stopwatch
 from barsight.core.types import RectifiedPair
 from barsight.live.link import GrowingRecording, Link
 from barsight.live.shared.counters import DRAIN
-from barsight.live_map import LiveMap
+from barsight.live_map import LiveMap, is_final
 from barsight.map_building import matching
 from barsight.mapping.view import MatchedFrame
 from barsight.measurement import Refusal
 from barsight.motion.fixed_lag.sensor_buffer import SENSOR_DELAY_S
 from barsight.motion.settings import make_estimator
+from barsight.pair_placing import PairPlacer
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.recording.sensor_selection import SelectedSensors
 from barsight.report.result_files import write_height
 from barsight.yard_frame import in_yard, placing_id
 
 POLL_S = 0.02
-AHEAD = 3
-"""Keyframes that are matched beside what else is done, the one whose turn it is among them."""
+AHEAD = 12
+"""Keyframes that are matched beside what else is done, the one whose turn it is among them: two chains."""
+TIDIED_EVERY = 8
+"""Keyframes between which freed memory may pile up."""
 GRACE_NS = NS_PER_S
 """A keyframe waits for readings until one so much later is there."""
 DELAY_NS = seconds_to_ns(SENSOR_DELAY_S)
@@ -77,10 +82,10 @@ class Mapping:
         self._pairs = RectifiedPairs(source, Rectifier(recording.rig), link.checkpoints)
         placed = placing_id(source)
         self._frame_id = "world" if placed is None else f"yard:{placed}"
-        self.is_final = make_estimator(settings.motion).begins_early and settings.self_calibrate == "none"
+        self.is_final = is_final(settings)
         checkpoints = link.checkpoints if settings.self_calibrate == "none" else None
         self._match = matching(self._pairs, settings, checkpoints, Stopwatch())
-        self._ahead = ThreadPoolExecutor(1)
+        self._ahead = [ThreadPoolExecutor(1) for _ in range(WORKERS)]
         self._matched: dict[int, Future[MatchedFrame | Refusal]] = {}
         self._frames, self._tiles = link.frames(), link.tiles()
         self._told = {stamp for stamp, _, _ in self._tiles.read()}
@@ -117,19 +122,19 @@ class Mapping:
         """
         for stamp in self.queue[:AHEAD]:
             if stamp not in self._matched:
-                self._matched[stamp] = self._ahead.submit(self._match_stamp, stamp)
+                worker = self._ahead[self._match.chain(stamp) % WORKERS]
+                self._matched[stamp] = worker.submit(self._match_stamp, stamp)
         stamp = self.queue.pop(0)
         (pair,) = self._pairs(frozenset((stamp,)))
         try:
             if self._map is None:
-                self._map = LiveMap(
-                    self._pairs, self._link.settings, self._link.folder, self._link.checkpoints, self._take
-                )
+                self._map = self._begun()
             self._map.add(pair)
         except MeasurementError:
             return 0
         self._tell_fused()
-        trim_heap()
+        if len(self._told) % TIDIED_EVERY == 0:
+            trim_heap()
         return len(self._map.stamps_ns)
 
     def show(self) -> bool:
@@ -146,11 +151,19 @@ class Mapping:
 
     def end(self) -> None:
         """Leave trajectory and map for what measures what was kept; where that can't be, it says why."""
-        self._ahead.shutdown(cancel_futures=True)
+        for worker in self._ahead:
+            worker.shutdown(cancel_futures=True)
         if self._map is not None and self.is_final:
             with contextlib.suppress(BarsightError):
                 self._map.end()
             self._tell_fused()
+
+    def _begun(self) -> LiveMap:
+        """Begin with the poses that track has found, as far as it had the same pairs and readings."""
+        link = self._link
+        estimator = make_estimator(replace(link.settings.motion, estimator="live"))
+        placer = PairPlacer(self._pairs, estimator, link.checkpoints)
+        return LiveMap(self._pairs, link.settings, link.folder, link.checkpoints, placer, self._take)
 
     def _match_stamp(self, stamp_ns: int) -> MatchedFrame | Refusal:
         (pair,) = self._pairs(frozenset((stamp_ns,)))
