@@ -21,12 +21,11 @@ from barsight.core.settings.values import build_settings
 from barsight.core.stamps import NS_PER_S
 from barsight.core.timing import Stopwatch
 from barsight.core.types import RectifiedPair, RefusedFrame, StereoFrame
-from barsight.live_map import LiveMap, Snapshot, is_final
+from barsight.live_map import LiveMap, PairPlacer, Snapshot, is_final
 from barsight.map_building import checkpoint_key, matching
 from barsight.measure_folder import ignore_progress, write_measured
 from barsight.measure_settings import MeasureSettings
 from barsight.motion.settings import make_early_estimator
-from barsight.pair_placing import PairPlacer
 from barsight.pipeline import LiftRequest
 from barsight.recording.packets import Packet, PacketRecording
 from barsight.recording.rectified_pairs import RectifiedPairs

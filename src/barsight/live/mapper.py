@@ -18,13 +18,12 @@ from barsight.core.timing import Stopwatch
 from barsight.core.types import RectifiedPair
 from barsight.live.link import GrowingRecording, Link
 from barsight.live.shared.counters import DRAIN
-from barsight.live_map import LiveMap, is_final
+from barsight.live_map import LiveMap, PairPlacer, is_final
 from barsight.map_building import matching
 from barsight.mapping.view import MatchedFrame
 from barsight.measurement import Refusal
 from barsight.motion.fixed_lag.sensor_buffer import SENSOR_DELAY_S
 from barsight.motion.settings import make_estimator
-from barsight.pair_placing import PairPlacer
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.recording.sensor_selection import SelectedSensors
 from barsight.report.result_files import write_height
