@@ -119,7 +119,8 @@ class Mapping:
         """Place and fuse the keyframe that waits longest, while those after it are matched; return how many
         are in the map.
         """
-        for stamp in self.queue[:AHEAD]:
+        # Where not all pairs are matched, only the place of each tells which are.
+        for stamp in self.queue[:AHEAD] if self._link.settings.map.min_shift == 0 else ():
             if stamp not in self._matched:
                 worker = self._ahead[self._match.chain(stamp) % WORKERS]
                 self._matched[stamp] = worker.submit(self._match_stamp, stamp)
@@ -150,12 +151,12 @@ class Mapping:
 
     def end(self) -> None:
         """Leave trajectory and map for what measures what was kept; where that can't be, it says why."""
-        for worker in self._ahead:
-            worker.shutdown(cancel_futures=True)
         if self._map is not None and self.is_final:
             with contextlib.suppress(BarsightError):
                 self._map.end()
             self._tell_fused()
+        for worker in self._ahead:
+            worker.shutdown(cancel_futures=True)
 
     def _begun(self) -> LiveMap:
         """Begin with the poses that track has found, as far as it had the same pairs and readings."""
