@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -32,6 +33,8 @@ from barsight.yard_frame import in_yard, placing_id
 POLL_S = 0.02
 AHEAD = 12
 """Keyframes that are matched beside what else is done, the one whose turn it is among them: two chains."""
+SHOW_EVERY_S = 5.0
+"""The heights so far are written at most this often: keyframes go first."""
 TIDIED_EVERY = 8
 """Keyframes between which freed memory may pile up."""
 GRACE_NS = NS_PER_S
@@ -51,7 +54,7 @@ def build_live_map(link: Link) -> None:
     board["map", "mapped"] = board["map", "refused"] = 0
     board.beat("map")
     board["map", "ready"] = 1
-    shown = 0
+    shown, shown_s = 0, -math.inf
     while True:
         board.beat("map")
         is_last = board["supervisor", "stop"] == DRAIN
@@ -60,8 +63,11 @@ def build_live_map(link: Link) -> None:
             break
         if mapping.is_due(ended=is_last or bool(board["capture", "ended"])):
             board["map", "mapped"] = mapping.add_next()
-        elif board["map", "mapped"] > max(shown, 1) and not mapping.queue:
-            shown = board["map", "mapped"]
+        elif (
+            board["map", "mapped"] > max(shown, 1) and not mapping.queue
+            and time.monotonic() - shown_s >= SHOW_EVERY_S
+        ):  # fmt: skip
+            shown, shown_s = board["map", "mapped"], time.monotonic()
             if mapping.show():
                 board.add("map", "snapshots")
         else:

@@ -38,6 +38,7 @@ from barsight.measure_settings import MeasureSettings
 from barsight.pipeline import LiftRequest
 from barsight.recording.base import Recording
 from barsight.recording.open import open_recording
+from barsight.report.page import write_report
 from barsight.yard.lifting.lift_file import read_lifts
 from barsight.yard.magnet.description import load_magnet
 
@@ -163,10 +164,12 @@ def _finish(
             request = replace(request, notices=(Notice("live-state", _why_no_lifts(state.mode)),))
         content = write_measured(
             [KeptRecording(recording, kept)], out, settings, request, advance=advance, overwrite=True,
-            keep=link.checkpoints.parent,
+            keep=link.checkpoints.parent, report=False,
         )  # fmt: skip
         lifts_s = (time.monotonic_ns() - frames[-1][1]) / NS_PER_S
         state.phase, state.offered = "done", len(read_lifts(out / "lifts.json")["lifts"])
+        write_state(state, board, out)
+        write_report(out, out / "report.html")
         return content
     finally:
         state.phase = "done" if lifts_s is not None else "failed"
