@@ -1,8 +1,12 @@
 """Scatter and level of values with gross errors."""
 
-import numpy as np
+import warnings
+from typing import Any
 
-from barsight.core.linalg.robust import running_median
+import numpy as np
+import pytest
+
+from barsight.core.linalg.robust import nan_medians, running_median
 
 
 def test_a_running_median_is_that_of_the_rows_about_each() -> None:
