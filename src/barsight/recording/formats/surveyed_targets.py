@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import re
 from collections import Counter
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from barsight.core.errors import InputError
 from barsight.core.reading.bounded_reading import MAX_ENTRIES, in_range, read_lines
 
 YARD = ("yard_x", "yard_y", "yard_z")
+PLACE = ("x", "y", "z")
 TAGS = 587
 """Tags of the family 36h11."""
 
@@ -52,7 +54,7 @@ def read_targets(path: Path) -> Targets:
 
     Raises `InputError` naming the line.
     """
-    names, table = _read_table(path, "name", (*YARD, "x", "y", "z"))
+    names, table = _read_table(path, "name", (*YARD, *PLACE))
     _expect_once(path, "target", names)
     return Targets(names, table[:, :3], table[:, 3:6], table[:, 6], table[:, 7] == 1)
 
@@ -77,13 +79,13 @@ def read_tags(path: Path) -> SurveyedTags:
     return SurveyedTags(*found, are_rings)
 
 
-def read_places(path: Path) -> tuple[tuple[str, ...], SurveyedTags]:
+def read_places(path: Path, text: str | None = None) -> tuple[tuple[str, ...], SurveyedTags]:
     """Read a CSV with a header, m: `name,yard_x,yard_y,yard_z`, optionally `sigma_m` and `check` (1 or 0).
     Returns the names, and targets numbered in their order.
 
-    Raises `InputError` naming the line.
+    text: its content where it is no file yet. Raises `InputError` naming the line.
     """
-    names, table = _read_table(path, "name", YARD)
+    names, table = _read_table(path, "name", YARD, text)
     _expect_once(path, "target", names)
     numbers = np.arange(len(names), dtype=np.int64)
     return names, SurveyedTags(numbers, table[:, :3], table[:, 3], table[:, 4] == 1)
@@ -120,12 +122,25 @@ def read_picks(path: Path, names: tuple[str, ...]) -> dict[int, dict[int, Float6
     return picks
 
 
-def _read_table(path: Path, key: str, columns: tuple[str, ...]) -> tuple[tuple[str, ...], Float64]:
+def write_targets(targets: Targets) -> str:
+    """Write the text that `read_targets` reads."""
+    file = io.StringIO()
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow(("name", *YARD, *PLACE, "sigma_m", "check"))
+    for k, name in enumerate(targets.names):
+        numbers = [*targets.yard_m[k], *targets.measured_m[k], targets.sigma_m[k]]
+        writer.writerow([name, *(f"{value:.5f}" for value in numbers), int(targets.checks[k])])
+    return file.getvalue()
+
+
+def _read_table(
+    path: Path, key: str, columns: tuple[str, ...], text: str | None = None
+) -> tuple[tuple[str, ...], Float64]:
     """Read the texts (N,) of `key`, and the numbers (N, columns + 2): `columns`, sigma_m (NaN where not
     said), check.
     """
     remedy = f"give {','.join((key, *columns))} and, if wanted, sigma_m and check"
-    first, *others = read_lines(path, MAX_ENTRIES, remedy)
+    first, *others = read_lines(path, MAX_ENTRIES, remedy) if text is None else text.strip().split("\n")
     lines = [first.lstrip("# "), *others]
     try:
         rows = list(csv.DictReader(lines, skipinitialspace=True))

@@ -1,0 +1,242 @@
+"""Place targets picked on a survey's orthophoto, and register its map by them, for `calibrate yard`."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+
+from barsight.calibration.boards.ring_detection import nearest_disc
+from barsight.core.arrays import Float64
+from barsight.core.errors import ConfigError, Failed, InputError
+from barsight.core.extras import extra
+from barsight.core.reading.geotiff import open_geotiff
+from barsight.core.types import HeightSource
+from barsight.page.layers import MAX_PIXELS
+from barsight.page.survey_files import expect_map, survey_folder
+from barsight.recording.formats.surveyed_targets import Targets, read_places, write_targets
+from barsight.registration.yard import calibrate_yard
+from barsight.result_folder import read_heights
+from barsight.yard.types import HeightMap, YardMap
+from barsight.yard_frame import measured_owners
+
+with extra("store"):
+    from sqlalchemy import Connection
+
+Found = Literal["disc", "hand"]
+CLOSE_M = 0.08
+"""A disc whose middle lies no further from a pick is what was meant."""
+AROUND_M = 0.5
+"""Half the side of the photo that is searched for it."""
+SIDE: dict[Found, tuple[float, float]] = {"disc": (0.12, 0.1), "hand": (0.7, 0.5)}
+"""Sigma of a pick's x and y, in cells of the map and as a share of its height's sigma; the larger counts:
+pixels may be coarser than cells.
+"""
+LEVEL_M, DISC_RATIO = 0.03, 2.0
+"""Heights so near to a pick tell its own, or within so many radii of a disc: a black one itself has none."""
+JUMP_M = 0.02
+"""A height further off than this, and than twice its sigma, isn't that of the same face."""
+MIN_SHARE, MIN_LEVEL = 0.3, 0.8
+"""Least share of the cells about a pick that are measured, and of these that lie on one face."""
+SAME_M = 0.02
+"""No two targets lie so near to each other: it was clicked twice."""
+MIN_TARGETS = 3
+LISTED = Path("list of places")
+
+
+@dataclass(frozen=True)
+class Pick:
+    """A target's pick in the map, m. is_exact: take the place itself, even where a disc lies beside it."""
+
+    name: str
+    x_m: float
+    y_m: float
+    is_exact: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class PickedPlace:
+    """place_m (3,) in the map's frame, sigma_m (3,) of each coordinate; found: what told x and y."""
+
+    place_m: Float64
+    sigma_m: Float64
+    found: Found
+
+
+@dataclass(frozen=True, eq=False)
+class _PickedSurvey:
+    """A survey whose map targets can be picked in. frame: that of its places."""
+
+    folder: Path
+    frame: str
+    heights: YardMap
+
+
+def picking_record(connection: Connection, map_id: str) -> dict[str, Any]:
+    """Tell a survey's grid, its folder, and what `calibrate yard --measured` needs of it.
+
+    Raises AccessError where there is no such survey, InputError where its map can't be registered.
+    """
+    survey = _opened(survey_folder(connection, map_id), map_id)
+    rows, columns = survey.heights.shape
+    cell_m = survey.heights.cell_m
+    left_m, low_m = survey.heights.x0_m - cell_m / 2, survey.heights.y0_m - cell_m / 2
+    return {
+        "map_id": map_id, "folder": str(survey.folder), "frame": survey.frame, "cell_m": cell_m,
+        "left_m": left_m, "low_m": low_m, "columns": columns, "rows": rows,
+    }  # fmt: skip
+
+
+def paint_photo(
+    connection: Connection, map_id: str, columns: tuple[int, int], rows: tuple[int, int]
+) -> bytes:
+    """Paint cells from first to last of the orthophoto as PNG, gray with alpha, row 0 at the highest y,
+    coarser where they are many.
+    """
+    survey = _opened(survey_folder(connection, map_id), map_id)
+    high, wide = survey.heights.shape
+    if not (0 <= columns[0] < columns[1] <= wide and 0 <= rows[0] < rows[1] <= high):
+        raise ConfigError(f"the map has {wide} columns and {high} rows")
+    with open_geotiff(survey.folder / "ortho.tif") as file:
+        gray = file.rectangle(1, slice(*rows), slice(*columns))[0][::-1]
+    step = max(1, math.ceil(math.sqrt(gray.size / MAX_PIXELS)))
+    size = math.ceil(gray.shape[1] / step), math.ceil(gray.shape[0] / step)
+    gray = cv2.resize(gray, size, interpolation=cv2.INTER_NEAREST)
+    picture = np.dstack([gray, gray, gray, np.where(gray > 0, 255, 0).astype(np.uint8)])
+    return bytes(cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 3])[1].tobytes())
+
+
+def fit_targets(
+    connection: Connection, map_id: str, listed: str, sigma_m: float, picks: Sequence[Pick]
+) -> dict[str, Any]:
+    """Place all picks of a list's targets; how the yard lies by them, once there are three besides checks,
+    and the list for `calibrate yard`.
+
+    listed: CSV as `read_places` takes it. sigma_m: of a coordinate's survey where it doesn't say. Raises
+    InputError naming the line of the list, or the target whose pick can't be placed.
+    """
+    survey = _opened(survey_folder(connection, map_id), map_id)
+    names, places = read_places(LISTED, listed)
+    if not names:
+        raise InputError(LISTED, "has no target", "give one a line")
+    if not 0 < sigma_m < 1:
+        raise ConfigError(f"a survey's sigma of {sigma_m:g} m can't be")
+    numbers = list[int]()
+    for pick in picks:
+        if pick.name not in names:
+            raise InputError(pick.name, "is picked but isn't in the list", "choose one that is")
+        if (number := names.index(pick.name)) in numbers:
+            raise InputError(pick.name, "is picked twice", "pick it once")
+        numbers.append(number)
+    found = [place_pick(survey.heights, pick) for pick in picks]
+    _expect_apart(picks, found)
+    surveyed = np.where(np.isnan(places.sigma_m), sigma_m, places.sigma_m)[numbers]
+    own = np.array([one.sigma_m for one in found]).reshape(-1, 3)
+    targets = Targets(
+        tuple(names[number] for number in numbers), places.yard_m[numbers],
+        np.array([one.place_m for one in found]).reshape(-1, 3),
+        np.sqrt(surveyed**2 + (own**2).mean(axis=1)), places.checks[numbers],
+    )  # fmt: skip
+    fit, off_m = _fitted(targets, survey.frame)
+    rows = [
+        {
+            "name": name, "found": one.found, "place_m": one.place_m.tolist(),
+            "sigma_m": one.sigma_m.tolist(), "off_m": None if off_m is None else off_m[k].tolist(),
+        }
+        for k, (name, one) in enumerate(zip(targets.names, found, strict=True))
+    ]  # fmt: skip
+    checks = places.checks.tolist()
+    return {
+        "names": [{"name": name, "check": check} for name, check in zip(names, checks, strict=True)],
+        "targets": rows, "fit": fit, "csv": write_targets(targets) if off_m is not None else None,
+    }  # fmt: skip
+
+
+def place_pick(heights: YardMap, pick: Pick) -> PickedPlace:
+    """Place a pick: x and y of the disc beside it, or its own, and the height of the face that it lies on.
+
+    Raises InputError naming the target where that wasn't measured, or where the height jumps.
+    """
+    part = _around(heights, pick)
+    cell_m, middle = part.cell_m, np.array([pick.x_m, pick.y_m])
+    pixel = (middle - (part.x0_m, part.y0_m)) / cell_m
+    disc = None
+    if part.gray is not None and not pick.is_exact:
+        disc = nearest_disc(part.gray, pixel, CLOSE_M / cell_m)
+    if disc is not None:
+        pixel, middle = disc[:2], disc[:2] * cell_m + (part.x0_m, part.y0_m)
+    found: Found = "hand" if disc is None else "disc"
+    reach_m = LEVEL_M if disc is None else DISC_RATIO * float(disc[2]) * cell_m
+    columns, rows = np.meshgrid(part.x_m - middle[0], part.y_m - middle[1])
+    near = np.hypot(columns, rows) < reach_m
+    is_measured = np.isfinite(part.z_m) & np.isin(part.source, (HeightSource.VISION, HeightSource.LASER))
+    column, row = np.rint(pixel).astype(int)
+    if disc is None and not is_measured[row, column]:
+        raise InputError(pick.name, "its pick lies where no height was measured", "pick a place that was")
+    known = near & is_measured
+    if known.sum() < MIN_SHARE * near.sum():
+        raise InputError(pick.name, "about its pick too few heights were measured", "pick a place that was")
+    z = float(np.median(part.z_m[known]))
+    level = known & (np.abs(part.z_m - z) < np.maximum(JUMP_M, 2 * part.sigma_m))
+    if level.sum() < MIN_LEVEL * known.sum():
+        jump_m = float(np.ptp(np.percentile(part.z_m[known], (5, 95))))
+        said = f"about its pick the height jumps by {jump_m:.2f} m"
+        raise InputError(pick.name, said, "pick a face's middle, not its edge")
+    sigma_m = float(np.median(part.sigma_m[level]))
+    side_m = max(SIDE[found][0] * cell_m, SIDE[found][1] * sigma_m)
+    return PickedPlace(np.append(middle, z), np.array([side_m, side_m, sigma_m]), found)
+
+
+def _expect_apart(picks: Sequence[Pick], found: Sequence[PickedPlace]) -> None:
+    for k, one in enumerate(found):
+        for other, before in zip(picks[:k], found, strict=False):
+            if np.linalg.norm(one.place_m - before.place_m) < SAME_M:
+                raise InputError(picks[k].name, f"is picked where {other.name} is", "pick each where it is")
+
+
+def _around(heights: YardMap, pick: Pick) -> HeightMap:
+    """Read the map about a pick. Raises InputError where it lies outside."""
+    cell_m, (high, wide) = heights.cell_m, heights.shape
+    x, y = (pick.x_m - heights.x0_m) / cell_m, (pick.y_m - heights.y0_m) / cell_m
+    if not (-0.5 < x < wide - 0.5 and -0.5 < y < high - 0.5):
+        raise InputError(pick.name, "its pick lies outside the map", "pick a place in it")
+    column, row = round(x), round(y)
+    reach = math.ceil(AROUND_M / cell_m)
+    return heights.part(
+        slice(max(row - reach, 0), min(row + reach + 1, high)),
+        slice(max(column - reach, 0), min(column + reach + 1, wide)),
+    )
+
+
+def _fitted(targets: Targets, frame: str) -> tuple[dict[str, Any] | None, Float64 | None]:
+    """Register the frame as `calibrate yard` does: what it tells, and off_m (N, 3), None while it can't."""
+    if (~targets.checks).sum() < MIN_TARGETS:
+        return None, None
+    covariance = targets.sigma_m[:, None, None] ** 2 * np.eye(3)
+    found = calibrate_yard(
+        targets.names, targets.measured_m, targets.yard_m, covariance, targets.checks, frame
+    )
+    if isinstance(found, Failed):
+        return {"problem": found.reason}, None
+    told = {
+        "turn_sigma_deg": found.turn_sigma_deg, "place_sigma_m": found.place_sigma_m,
+        "scale": found.alignment.scale, "scale_sigma": found.alignment.scale_sigma,
+        "doubts": list(found.doubts),
+    }  # fmt: skip
+    return told, found.off_m
+
+
+@functools.lru_cache(maxsize=4)
+def _opened(folder: Path, map_id: str) -> _PickedSurvey:
+    expect_map(folder, map_id)
+    owners = measured_owners(folder)
+    if not (folder / "ortho.tif").is_file():
+        raise InputError(folder, "has no ortho.tif", "measure the recording again")
+    frame = "world" if owners["mounting_id"] is None else "encoders"
+    return _PickedSurvey(folder, frame, read_heights(folder))

@@ -1,0 +1,185 @@
+"""Targets picked on a survey's photo: placed or refused by name, fitted, written for `calibrate yard`."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import httpx
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from barsight.cli.main import run
+from barsight.page.serve import ServeOptions, serving
+from barsight.recording.formats.surveyed_targets import read_targets
+from barsight.registration.yard_file import read_yard_file
+from barsight.store.accounts import add_person
+from barsight.store.audit import entry
+from barsight.store.opening import open_store
+from page_yards import DISCS, SECOND, fill_store
+
+PASSWORD = "four words that nobody guesses"
+TURN, SHIFT = Rotation.from_euler("z", 40, degrees=True).as_matrix(), np.array([100.0, 20.0, 0.5])
+PLACES = np.array([(x, y, 0.0) for x, y in DISCS])
+HEADER = "name,yard_x,yard_y,yard_z,sigma_m,check\n"
+TRUE = PLACES @ TURN.T + SHIFT
+LISTED = HEADER + "".join(
+    f'"post, {k}",{x:.5f},{y:.5f},{z:.5f},,{int(k == 3)}\n' for k, (x, y, z) in enumerate(TRUE)
+)
+
+
+def clicks(numbers: range, aside_m: float = 0.02) -> list[dict[str, object]]:
+    return [
+        {"name": f"post, {k}", "x_m": DISCS[k][0] + aside_m, "y_m": DISCS[k][1] - aside_m} for k in numbers
+    ]
+
+
+TWICE = [*clicks(range(1)), clicks(range(1))[0] | {"name": "post, 1"}]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("made")
+    fill_store(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def local(made: Path) -> Iterator[httpx.Client]:
+    """An engineer at this computer."""
+    url = f"sqlite:///{made / 'yard.db'}"
+    with serving(url, ServeOptions(port=0)) as address, httpx.Client(base_url=address) as client:
+        client.headers["X-Barsight-Token"] = client.get("/api/session").json()["token"]
+        yield client
+
+
+@pytest.fixture(scope="module")
+def path(local: httpx.Client) -> str:
+    return f"/api/surveys/{local.get('/api/surveys').json()['surveys'][0]['map_id']}"
+
+
+def asked(
+    client: httpx.Client, path: str, picks: list[dict[str, object]], listed: str = LISTED
+) -> httpx.Response:
+    return client.post(f"{path}/targets", json={"listed": listed, "sigma_m": 0.001, "picks": picks})
+
+
+def test_clicks_beside_discs_place_the_yard(
+    local: httpx.Client, path: str, made: Path, tmp_path: Path
+) -> None:
+    told = asked(local, path, clicks(range(4))).json()
+    assert [one["name"] for one in told["names"] if one["check"]] == ["post, 3"]
+    for one, place in zip(told["targets"], PLACES, strict=True):
+        assert one["found"] == "disc"
+        off = np.array(one["place_m"]) - place
+        assert np.hypot(*off[:2]) < 0.0008 and abs(off[2]) < 0.002
+        assert np.linalg.norm(one["off_m"]) < 0.006
+    assert told["fit"]["scale"] == pytest.approx(1, abs=0.001) and told["fit"]["doubts"] == []
+    listed = tmp_path / "targets.csv"
+    listed.write_text(told["csv"], encoding="utf-8")
+    assert read_targets(listed).names == tuple(f"post, {k}" for k in range(4))
+    out = tmp_path / "yard.yaml"
+    assert run(["calibrate", "yard", str(listed), "--measured", str(made / "second"), "-o", str(out)]) == 0
+    frame = read_yard_file(out)
+    assert np.linalg.norm(frame.yard_from.apply(PLACES) - TRUE, axis=1).max() < 0.003
+    assert told["fit"]["turn_sigma_deg"] == pytest.approx(
+        np.degrees(np.sqrt(np.linalg.eigvalsh(frame.covariance[:3, :3])[-1])), rel=1e-2
+    )
+
+
+def test_few_picks_are_placed_but_not_fitted(local: httpx.Client, path: str) -> None:
+    for picks in ([], clicks(range(2)), clicks(range(1, 4))):
+        told = asked(local, path, picks).json()
+        assert len(told["names"]) == 4 and len(told["targets"]) == len(picks)
+        assert told["fit"] is None and told["csv"] is None
+
+
+def test_a_pick_by_hand_stays_where_it_is_and_is_less_sure(local: httpx.Client, path: str) -> None:
+    by_hand = clicks(range(1))[0] | {"is_exact": True}
+    (one,) = asked(local, path, [by_hand]).json()["targets"]
+    (other,) = asked(local, path, clicks(range(1))).json()["targets"]
+    assert one["found"] == "hand" and one["place_m"][:2] == [by_hand["x_m"], by_hand["y_m"]]
+    assert one["sigma_m"][0] > 2 * other["sigma_m"][0] and one["sigma_m"][2] == pytest.approx(0.002, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("place", "reason"),
+    [
+        ((-9.0, 0.0), "post, 0: its pick lies outside the map; pick a place in it"),
+        ((-1.2, 0.0), "post, 0: its pick lies where no height was measured; pick a place that was"),
+        ((SECOND[0].x_m - SECOND[0].width_m / 2, 0.0), "post, 0: about its pick the height jumps by 0."),
+    ],
+)
+def test_a_place_that_no_target_can_have_is_refused_by_name(
+    local: httpx.Client, path: str, place: tuple[float, float], reason: str
+) -> None:
+    answer = asked(local, path, [{"name": "post, 0", "x_m": place[0], "y_m": place[1]}])
+    assert answer.status_code == 409 and reason in answer.json()["problem"]
+
+
+@pytest.mark.parametrize(
+    ("listed", "picks", "reason"),
+    [
+        ("where,x\n", [], "list of places: has no column name; give name,yard_x,yard_y,yard_z"),
+        (HEADER + "a,1,2,x\n", [], "list of places: line 2: a number is missing or is none"),
+        (HEADER + "a,1,2,3\na,1,2,3\n", [], "list of places: target a is there twice; give each target once"),
+        (HEADER, [], "list of places: has no target"),
+        (LISTED, [{"name": "b", "x_m": 0, "y_m": 0}], "b: is picked but isn't in the list"),
+        (LISTED, clicks(range(1)) * 2, "post, 0: is picked twice; pick it once"),
+        (LISTED, TWICE, "post, 1: is picked where post, 0 is; pick each where it is"),
+    ],
+)
+def test_a_list_that_cannot_be_is_refused(
+    local: httpx.Client, path: str, listed: str, picks: list[dict[str, object]], reason: str
+) -> None:
+    answer = asked(local, path, picks, listed)
+    assert answer.status_code == 409 and reason in answer.json()["problem"]
+
+
+def test_forms_and_surveys_that_cannot_be_are_refused(local: httpx.Client, path: str) -> None:
+    for body in ({"listed": LISTED, "sigma_m": 0, "picks": []}, {"listed": "", "sigma_m": 1e-3, "picks": []}):
+        assert local.post(f"{path}/targets", json=body).status_code == 422
+    body = json.dumps({"listed": LISTED, "sigma_m": 0.001, "picks": clicks(range(1))})
+    for number, status in (("-0.98", 409), ("0.001", 422)):
+        no_number = body.replace(number, "NaN")
+        assert no_number.count("NaN") == 1
+        kind = {"content-type": "application/json"}
+        answer = local.post(f"{path}/targets", content=no_number, headers=kind)
+        assert answer.status_code == status and answer.json()["problem"]
+    assert asked(local, "/api/surveys/none", []).status_code == 404
+    assert local.get("/api/surveys/none/targets").status_code == 404
+
+
+def test_the_photo_is_shown_cell_by_cell(local: httpx.Client, path: str) -> None:
+    grid = local.get(f"{path}/targets").json()
+    column = round((DISCS[0][0] - grid["left_m"]) / grid["cell_m"] - 0.5)
+    row = round((DISCS[0][1] - grid["low_m"]) / grid["cell_m"] - 0.5)
+    box = {"left": column - 20, "right": column + 30, "low": row - 20, "high": row + 25}
+    shown = cv2.imdecode(
+        np.frombuffer(local.get(f"{path}/photo.png", params=box).content, np.uint8), cv2.IMREAD_UNCHANGED
+    )
+    assert shown.shape == (45, 50, 4) and (shown[..., 3] == 255).all()
+    assert shown[24, 20, 0] == 30 and shown[24, 32, 0] == 220 and shown[12, 20, 0] == 220
+    for wrong in ({"right": grid["columns"] + 1}, {"left": -1}, {"high": row - 20}):
+        answer = local.get(f"{path}/photo.png", params=box | wrong)
+        assert answer.status_code == 422 and "the map has" in answer.json()["problem"]
+
+
+def test_only_engineers_pick_and_a_folder_that_was_changed_is_refused(made: Path, tmp_path: Path) -> None:
+    shutil.copy(made / "yard.db", tmp_path / "yard.db")
+    url = f"sqlite:///{tmp_path / 'yard.db'}"
+    with open_store(url) as store, entry(store, "ann", "accounts") as opened:
+        add_person(opened, "ann", "engineer", PASSWORD)
+        add_person(opened, "oli", "operator", PASSWORD)
+    for name, status in (("oli", 403), ("ann", 200)):
+        with serving(url, ServeOptions(port=0)) as address, httpx.Client(base_url=address) as client:
+            known = client.post("/api/session", json={"name": name, "password": PASSWORD}).json()
+            path = f"/api/surveys/{client.get('/api/surveys').json()['surveys'][0]['map_id']}"
+            assert asked(client, path, clicks(range(4))).status_code == 403, "no token"
+            client.headers["X-Barsight-Token"] = known["token"]
+            assert asked(client, path, clicks(range(4))).status_code == status
+            assert client.get(f"{path}/targets").status_code == status
