@@ -92,7 +92,9 @@ def frame_off(folder: Path, places: Float64, found: list, rng: np.random.Generat
     design = design_rows(places @ frame.yard_from.rotation.T)
     told = np.sqrt(3) * predicted_sigma(design, frame.covariance, np.zeros(6), np.ones(6, bool))
     k = int(off.argmax())
-    return f"{folder.name} frame worst {1e3 * off[k]:.2f} mm of {1e3 * told[k]:.2f}, doubts {len(frame.doubts)}"
+    return (
+        f"{folder.name} frame worst {1e3 * off[k]:.2f} mm of {1e3 * told[k]:.2f}, doubts {len(frame.doubts)}"
+    )
 
 
 if __name__ == "__main__":

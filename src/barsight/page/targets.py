@@ -5,15 +5,16 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import cv2
 import numpy as np
+from scipy import ndimage
 
 from barsight.calibration.boards.ring_detection import nearest_disc
-from barsight.core.arrays import Float64
+from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import ConfigError, Failed, InputError
 from barsight.core.extras import extra
 from barsight.core.reading.geotiff import open_geotiff
@@ -29,17 +30,22 @@ from barsight.yard_frame import measured_owners
 with extra("store"):
     from sqlalchemy import Connection
 
-Found = Literal["disc", "hand"]
+Found = Literal["disc", "column", "hand"]
 CLOSE_M = 0.08
 """A disc whose middle lies no further from a pick is what was meant."""
 AROUND_M = 0.5
 """Half the side of the photo that is searched for it."""
-SIDE: dict[Found, tuple[float, float]] = {"disc": (0.12, 0.1), "hand": (0.7, 0.5)}
+SIDE: dict[Found, tuple[float, float]] = {"disc": (0.12, 0.1), "column": (0.4, 0.25), "hand": (0.7, 0.5)}
 """Sigma of a pick's x and y, in cells of the map and as a share of its height's sigma; the larger counts:
 pixels may be coarser than cells.
 """
 LEVEL_M, DISC_RATIO = 0.03, 2.0
 """Heights so near to a pick tell its own, or within so many radii of a disc: a black one itself has none."""
+TOP_M = 0.03
+"""Cells of a column's top lie no further from the height at the pick."""
+NARROWER_RATIO, WIDER_M = 0.8, 0.05
+"""A top may be so much narrower than the column (a round one of as much area is 0.89), and wider: matching
+makes it 20 mm wider."""
 JUMP_M = 0.02
 """A height further off than this, and than twice its sigma, isn't that of the same face."""
 MIN_SHARE, MIN_LEVEL = 0.3, 0.8
@@ -52,12 +58,15 @@ LISTED = Path("list of places")
 
 @dataclass(frozen=True)
 class Pick:
-    """A target's pick in the map, m. is_exact: take the place itself, even where a disc lies beside it."""
+    """A target's pick in the map, m. is_exact: take the place itself, even where a disc lies beside it.
+    width_m: of a column whose top is meant; None of another target.
+    """
 
     name: str
     x_m: float
     y_m: float
     is_exact: bool = False
+    width_m: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +143,10 @@ def fit_targets(
         if (number := names.index(pick.name)) in numbers:
             raise InputError(pick.name, "is picked twice", "pick it once")
         numbers.append(number)
-    found = [place_pick(survey.heights, pick) for pick in picks]
+    assert places.width_m is not None
+    widths = [None if np.isnan(width) else float(width) for width in places.width_m[numbers]]
+    meant = [replace(pick, width_m=width) for pick, width in zip(picks, widths, strict=True)]
+    found = [place_pick(survey.heights, pick) for pick in meant]
     _expect_apart(picks, found)
     surveyed = np.where(np.isnan(places.sigma_m), sigma_m, places.sigma_m)[numbers]
     own = np.array([one.sigma_m for one in found]).reshape(-1, 3)
@@ -159,38 +171,73 @@ def fit_targets(
 
 
 def place_pick(heights: YardMap, pick: Pick) -> PickedPlace:
-    """Place a pick: x and y of the disc beside it, or its own, and the height of the face that it lies on.
+    """Place a pick: x and y of the column or the disc beside it, or its own, and the height of the face that
+    it lies on.
 
-    Raises InputError naming the target where that wasn't measured, or where the height jumps.
+    Raises InputError naming the target where that wasn't measured, where the height jumps, or where no such
+    column stands.
     """
     part = _around(heights, pick)
-    cell_m, middle = part.cell_m, np.array([pick.x_m, pick.y_m])
-    pixel = (middle - (part.x0_m, part.y0_m)) / cell_m
-    disc = None
-    if part.gray is not None and not pick.is_exact:
-        disc = nearest_disc(part.gray, pixel, CLOSE_M / cell_m)
-    if disc is not None:
-        pixel, middle = disc[:2], disc[:2] * cell_m + (part.x0_m, part.y0_m)
-    found: Found = "hand" if disc is None else "disc"
-    reach_m = LEVEL_M if disc is None else DISC_RATIO * float(disc[2]) * cell_m
-    columns, rows = np.meshgrid(part.x_m - middle[0], part.y_m - middle[1])
-    near = np.hypot(columns, rows) < reach_m
+    cell_m, corner = part.cell_m, (part.x0_m, part.y0_m)
+    pixel = (np.array([pick.x_m, pick.y_m]) - corner) / cell_m
     is_measured = np.isfinite(part.z_m) & np.isin(part.source, (HeightSource.VISION, HeightSource.LASER))
+    found: Found = "hand"
+    reach = LEVEL_M / cell_m
+    if pick.width_m is not None and not pick.is_exact:
+        found = "column"
+        pixel, reach = _column_top(part, pixel, pick), pick.width_m / 3 / cell_m
+    elif part.gray is not None and not pick.is_exact:
+        disc = nearest_disc(part.gray, pixel, CLOSE_M / cell_m)
+        if disc is not None:
+            found, pixel, reach = "disc", disc[:2], DISC_RATIO * float(disc[2])
     column, row = np.rint(pixel).astype(int)
-    if disc is None and not is_measured[row, column]:
+    if found == "hand" and not is_measured[row, column]:
         raise InputError(pick.name, "its pick lies where no height was measured", "pick a place that was")
-    known = near & is_measured
+    rows, columns = np.indices(part.shape)
+    near = np.hypot(columns - pixel[0], rows - pixel[1]) < reach
+    z, sigma_m = _face_height(part, near, near & is_measured, pick.name)
+    side_m = max(SIDE[found][0] * cell_m, SIDE[found][1] * sigma_m[0])
+    place = np.append(pixel * cell_m + corner, z)
+    return PickedPlace(place, np.array([side_m, side_m, np.hypot(*sigma_m)]), found)
+
+
+def _face_height(part: HeightMap, near: Bool, known: Bool, name: str) -> tuple[float, tuple[float, float]]:
+    """Take the median height of the face that the known cells (rows, columns) near a pick show: height, the
+    map's sigma of it, and the heights' scatter.
+    """
     if known.sum() < MIN_SHARE * near.sum():
-        raise InputError(pick.name, "about its pick too few heights were measured", "pick a place that was")
+        raise InputError(name, "about its pick too few heights were measured", "pick a place that was")
     z = float(np.median(part.z_m[known]))
     level = known & (np.abs(part.z_m - z) < np.maximum(JUMP_M, 2 * part.sigma_m))
     if level.sum() < MIN_LEVEL * known.sum():
         jump_m = float(np.ptp(np.percentile(part.z_m[known], (5, 95))))
         said = f"about its pick the height jumps by {jump_m:.2f} m"
-        raise InputError(pick.name, said, "pick a face's middle, not its edge")
-    sigma_m = float(np.median(part.sigma_m[level]))
-    side_m = max(SIDE[found][0] * cell_m, SIDE[found][1] * sigma_m)
-    return PickedPlace(np.append(middle, z), np.array([side_m, side_m, sigma_m]), found)
+        raise InputError(name, said, "pick a face's middle, not its edge")
+    return z, (float(np.median(part.sigma_m[level])), float(part.z_m[level].std()))
+
+
+def _column_top(part: HeightMap, pixel: Float64, pick: Pick) -> Float64:
+    """Find the middle (2,), column and row, of the level top that a pick lies on; holes in it are its own.
+
+    Raises InputError where none as wide as the column ends on all sides.
+    """
+    column, row = np.rint(pixel).astype(int)
+    wide_m = 0.0
+    about = part.z_m[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3]
+    if np.isfinite(about).any():
+        level = np.abs(part.z_m - np.nanmedian(about)) < TOP_M
+        labels, _ = ndimage.label(level)
+        own = np.bincount(labels[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3].ravel())
+        own[0] = 0
+        top = ndimage.binary_fill_holes(labels == own.argmax()) if own.any() else level
+        rows, columns = np.nonzero(top)
+        wide_m = math.sqrt(rows.size) * part.cell_m
+    assert pick.width_m is not None
+    if not NARROWER_RATIO * pick.width_m <= wide_m <= pick.width_m + WIDER_M:
+        shown = f"the level place is {wide_m:.2f} m wide" if wide_m else "no height was measured"
+        said = f"where it is picked no column of {pick.width_m:g} m ends: {shown}"
+        raise InputError(pick.name, said, "pick the column's top, and list its width")
+    return np.array([columns.mean(), rows.mean()])
 
 
 def _expect_apart(picks: Sequence[Pick], found: Sequence[PickedPlace]) -> None:

@@ -27,6 +27,8 @@ SAMPLES = 10
 MIN_AGREE = 0.85
 """Least share of a sector's places that agree, the outer ones left out."""
 RAYS = 64
+MAX_OVAL = 1.15
+"""Most by which a round disc's axes differ: what isn't known beside it makes it longer."""
 
 
 @cache
@@ -72,14 +74,14 @@ def find_rings(image: UInt8) -> tuple[Int64, Float64]:
 
 
 def nearest_disc(image: UInt8, pixel: Float64, reach_px: float) -> Float64 | None:
-    """Find the dark disc on bright, or bright on dark, whose middle lies nearest to a pixel (2,): middle and
-    radius (3,), or None where none lies within reach.
+    """Find the round disc, dark on bright or bright on dark, whose middle lies nearest to a pixel (2,):
+    middle and radius (3,), or None where none lies within reach.
     """
     best, nearest = None, reach_px
     for gray in (image, 255 - image):
         for ellipse in _dark_discs(gray):
             away = float(np.linalg.norm(ellipse[:2] - pixel))
-            if away < nearest:
+            if away < nearest and max(ellipse[2:4]) < MAX_OVAL * min(ellipse[2:4]):
                 best, nearest = np.append(ellipse[:2], np.sqrt(ellipse[2] * ellipse[3])), away
     return best
 

@@ -5,7 +5,7 @@ import { YardCanvas } from "./canvas.js";
 
 const LOUPE = 1500; // pixels a metre
 const MAX_PIXELS = 4e6; // of a picture that the server paints cell by cell
-const COLUMNS = "name,yard_x,yard_y,yard_z,sigma_m,check\n";
+const COLUMNS = "name,yard_x,yard_y,yard_z,sigma_m,check,width_m\n";
 const PICKED = "#b30059";
 const NUDGES = { ArrowLeft: [-0.001, 0], ArrowRight: [0.001, 0], ArrowUp: [0, 0.001], ArrowDown: [0, -0.001] };
 
