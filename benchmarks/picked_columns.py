@@ -14,10 +14,11 @@ from barsight.cli.main import run
 from barsight.core.arrays import Float64
 from barsight.core.errors import InputError
 from barsight.page.targets import Pick, place_pick
-from barsight.result_folder import read_heights
+from barsight.result_folder import read_heights, read_summary
 from barsight.simulation.scene import Primitives, Scene, build_grid, plain_material
 from barsight.simulation.settings import CameraSettings, SimulationSettings, YardSettings
 from barsight.simulation.simulate import LaidYard, laid_stock, simulate, stream
+from barsight.yard.lifting.travel_accuracy import Travel
 
 ASIDE_M, APART_M = 0.06, 0.9
 """How far a click lies beside the axis at most, along each axis; columns keep so far apart."""
@@ -61,10 +62,11 @@ def picked(folder: Path, seed: int, above_m: float) -> list[str]:
         simulate(folder / "recording", settings, laid=lay_columns(columns, settings))
         assert run(["measure", str(folder / "recording"), "-o", str(folder / "out")]) == 0
     heights, told = read_heights(folder / "out"), []
+    travel = Travel.read(read_summary(folder / "out"))
     for k, (x, y, z, wide) in enumerate(columns):
         aside = rng.uniform(-ASIDE_M, ASIDE_M, 2)
         try:
-            one = place_pick(heights, Pick(f"column {k}", x + aside[0], y + aside[1], width_m=wide))
+            one = place_pick(heights, travel, Pick(f"column {k}", x + aside[0], y + aside[1], width_m=wide))
         except InputError as error:
             told.append(f"{seed} {error}")
             continue

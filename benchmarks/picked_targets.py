@@ -19,7 +19,8 @@ from barsight.recording.formats.surveyed_targets import Targets, write_targets
 from barsight.registration.rigid import design_rows
 from barsight.registration.yard import predicted_sigma
 from barsight.registration.yard_file import read_yard_file
-from barsight.result_folder import read_heights
+from barsight.result_folder import read_heights, read_summary
+from barsight.yard.lifting.travel_accuracy import Travel
 
 TURN, SHIFT = Rotation.from_rotvec([0.002, -0.001, 0.4]).as_matrix(), np.array([100.0, 20.0, 0.05])
 CAMERA = ("--camera.width-px", "640", "--camera.height-px", "512", "--camera.focal-px", "625")
@@ -57,13 +58,14 @@ def picked(folder: Path, seed: int, above_m: str) -> list[str]:
     places = laid(rng)
     measured(folder, seed, places, above_m)
     heights, told, found = read_heights(folder / "out"), [], []
+    travel = Travel.read(read_summary(folder / "out"))
     for k, place in enumerate(places):
         turn = rng.uniform(0, 2 * np.pi)
         click = place[:2] + ASIDE_M * np.array([np.cos(turn), np.sin(turn)])
         paper = place[:2] + 0.075 * np.array([np.cos(k), np.sin(k)])
         for pick in (Pick(f"post {k}", *click), Pick(f"post {k}", *paper, is_exact=True)):
             try:
-                one = place_pick(heights, pick)
+                one = place_pick(heights, travel, pick)
             except InputError as error:
                 told.append(f"{seed} {error}")
                 continue

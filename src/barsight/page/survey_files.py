@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 from barsight.core.errors import InputError
 from barsight.core.extras import extra
@@ -26,11 +27,12 @@ def survey_folder(connection: Connection, map_id: str) -> Path:
     return Path(folder)
 
 
-def expect_map(folder: Path, map_id: str) -> None:
-    """Raise InputError where a folder isn't as it was added."""
-    _, identity = open_folder(folder)
+def expect_map(folder: Path, map_id: str) -> dict[str, Any]:
+    """Return a folder's result.json. Raises InputError where the folder isn't as it was added."""
+    summary, identity = open_folder(folder)
     if identity is None or identity.map_id != map_id:
         raise InputError(folder, f"holds another map than {map_id}", "measure into a folder of its own")
+    return summary
 
 
 def find_file(connection: Connection, map_id: str, name: str) -> Path:

@@ -24,6 +24,7 @@ from barsight.page.survey_files import expect_map, survey_folder
 from barsight.recording.formats.surveyed_targets import Targets, read_places, write_targets
 from barsight.registration.yard import calibrate_yard
 from barsight.result_folder import read_heights
+from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.types import HeightMap, YardMap
 from barsight.yard_frame import measured_owners
 
@@ -35,17 +36,14 @@ CLOSE_M = 0.08
 """A disc whose middle lies no further from a pick is what was meant."""
 AROUND_M = 0.5
 """Half the side of the photo that is searched for it."""
-SIDE: dict[Found, tuple[float, float]] = {"disc": (0.12, 0.1), "column": (0.4, 0.25), "hand": (0.7, 0.5)}
-"""Sigma of a pick's x and y, in cells of the map and as a share of its height's sigma; the larger counts:
-pixels may be coarser than cells.
-"""
+SIDE: dict[Found, float] = {"disc": 0.12, "column": 0.35, "hand": 0.7}
+"""Sigma of a pick's x and y, in cells of the map, or in pixels there where these are coarser."""
 LEVEL_M, DISC_RATIO = 0.03, 2.0
 """Heights so near to a pick tell its own, or within so many radii of a disc: a black one itself has none."""
 TOP_M = 0.03
 """Cells of a column's top lie no further from the height at the pick."""
-NARROWER_RATIO, WIDER_M = 0.8, 0.05
-"""A top may be so much narrower than the column (a round one of as much area is 0.89), and wider: matching
-makes it 20 mm wider."""
+WIDER_PX, MAX_OFF_RATIO = 2.0, 0.25
+"""By how much matching widens a top, and the most by which its width may then be off the column's."""
 JUMP_M = 0.02
 """A height further off than this, and than twice its sigma, isn't that of the same face."""
 MIN_SHARE, MIN_LEVEL = 0.3, 0.8
@@ -85,6 +83,7 @@ class _PickedSurvey:
     folder: Path
     frame: str
     heights: YardMap
+    travel: Travel | None
 
 
 def picking_record(connection: Connection, map_id: str) -> dict[str, Any]:
@@ -146,7 +145,7 @@ def fit_targets(
     assert places.width_m is not None
     widths = [None if np.isnan(width) else float(width) for width in places.width_m[numbers]]
     meant = [replace(pick, width_m=width) for pick, width in zip(picks, widths, strict=True)]
-    found = [place_pick(survey.heights, pick) for pick in meant]
+    found = [place_pick(survey.heights, survey.travel, pick) for pick in meant]
     _expect_apart(picks, found)
     surveyed = np.where(np.isnan(places.sigma_m), sigma_m, places.sigma_m)[numbers]
     own = np.array([one.sigma_m for one in found]).reshape(-1, 3)
@@ -170,7 +169,7 @@ def fit_targets(
     }  # fmt: skip
 
 
-def place_pick(heights: YardMap, pick: Pick) -> PickedPlace:
+def place_pick(heights: YardMap, travel: Travel | None, pick: Pick) -> PickedPlace:
     """Place a pick: x and y of the column or the disc beside it, or its own, and the height of the face that
     it lies on.
 
@@ -182,10 +181,10 @@ def place_pick(heights: YardMap, pick: Pick) -> PickedPlace:
     pixel = (np.array([pick.x_m, pick.y_m]) - corner) / cell_m
     is_measured = np.isfinite(part.z_m) & np.isin(part.source, (HeightSource.VISION, HeightSource.LASER))
     found: Found = "hand"
-    reach = LEVEL_M / cell_m
+    reach, off_m = LEVEL_M / cell_m, 0.0
     if pick.width_m is not None and not pick.is_exact:
-        found = "column"
-        pixel, reach = _column_top(part, pixel, pick), pick.width_m / 3 / cell_m
+        found, reach = "column", pick.width_m / 3 / cell_m
+        pixel, off_m = _column_top(part, travel, pixel, pick)
     elif part.gray is not None and not pick.is_exact:
         disc = nearest_disc(part.gray, pixel, CLOSE_M / cell_m)
         if disc is not None:
@@ -196,7 +195,7 @@ def place_pick(heights: YardMap, pick: Pick) -> PickedPlace:
     rows, columns = np.indices(part.shape)
     near = np.hypot(columns - pixel[0], rows - pixel[1]) < reach
     z, sigma_m = _face_height(part, near, near & is_measured, pick.name)
-    side_m = max(SIDE[found][0] * cell_m, SIDE[found][1] * sigma_m[0])
+    side_m = math.hypot(SIDE[found] * max(cell_m, _pixel_m(travel, z, cell_m)), off_m / 2)
     place = np.append(pixel * cell_m + corner, z)
     return PickedPlace(place, np.array([side_m, side_m, np.hypot(*sigma_m)]), found)
 
@@ -216,28 +215,34 @@ def _face_height(part: HeightMap, near: Bool, known: Bool, name: str) -> tuple[f
     return z, (float(np.median(part.sigma_m[level])), float(part.z_m[level].std()))
 
 
-def _column_top(part: HeightMap, pixel: Float64, pick: Pick) -> Float64:
-    """Find the middle (2,), column and row, of the level top that a pick lies on; holes in it are its own.
+def _column_top(part: HeightMap, travel: Travel | None, pixel: Float64, pick: Pick) -> tuple[Float64, float]:
+    """Find the level top that a pick lies on, holes in it too: its middle (2,), column and row, and by how
+    much its width is off the column's.
 
-    Raises InputError where none as wide as the column ends on all sides.
+    Raises InputError where none as wide ends on all sides.
     """
-    column, row = np.rint(pixel).astype(int)
-    wide_m = 0.0
-    about = part.z_m[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3]
-    if np.isfinite(about).any():
-        level = np.abs(part.z_m - np.nanmedian(about)) < TOP_M
-        labels, _ = ndimage.label(level)
-        own = np.bincount(labels[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3].ravel())
-        own[0] = 0
-        top = ndimage.binary_fill_holes(labels == own.argmax()) if own.any() else level
-        rows, columns = np.nonzero(top)
-        wide_m = math.sqrt(rows.size) * part.cell_m
     assert pick.width_m is not None
-    if not NARROWER_RATIO * pick.width_m <= wide_m <= pick.width_m + WIDER_M:
-        shown = f"the level place is {wide_m:.2f} m wide" if wide_m else "no height was measured"
-        said = f"where it is picked no column of {pick.width_m:g} m ends: {shown}"
-        raise InputError(pick.name, said, "pick the column's top, and list its width")
-    return np.array([columns.mean(), rows.mean()])
+    remedy = "pick the column's top, and list its width"
+    column, row = np.rint(pixel).astype(int)
+    about = slice(max(row - 2, 0), row + 3), slice(max(column - 2, 0), column + 3)
+    if not np.isfinite(part.z_m[about]).any():
+        raise InputError(pick.name, "where its column is picked no height was measured", remedy)
+    z = float(np.nanmedian(part.z_m[about]))
+    labels, _ = ndimage.label(np.abs(part.z_m - z) < TOP_M)
+    counts = np.bincount(labels[about].ravel(), minlength=2)
+    rows, columns = np.nonzero(ndimage.binary_fill_holes(labels == 1 + counts[1:].argmax()))
+    wide_m = math.sqrt(rows.size) * part.cell_m
+    off_m = wide_m - WIDER_PX * _pixel_m(travel, z, part.cell_m) - pick.width_m
+    if abs(off_m) > MAX_OFF_RATIO * pick.width_m:
+        said = f"where it is picked no column of {pick.width_m:g} m ends"
+        raise InputError(pick.name, f"{said}: the level place is {wide_m:.2f} m wide", remedy)
+    return np.array([columns.mean(), rows.mean()]), off_m
+
+
+def _pixel_m(travel: Travel | None, z_m: float, cell_m: float) -> float:
+    """Return a pixel's size at a height; a cell's where it isn't known."""
+    pixel_m = float("nan") if travel is None else travel.pixel_m(z_m)
+    return pixel_m if math.isfinite(pixel_m) else cell_m
 
 
 def _expect_apart(picks: Sequence[Pick], found: Sequence[PickedPlace]) -> None:
@@ -281,9 +286,8 @@ def _fitted(targets: Targets, frame: str) -> tuple[dict[str, Any] | None, Float6
 
 @functools.lru_cache(maxsize=4)
 def _opened(folder: Path, map_id: str) -> _PickedSurvey:
-    expect_map(folder, map_id)
-    owners = measured_owners(folder)
+    summary, owners = expect_map(folder, map_id), measured_owners(folder)
     if not (folder / "ortho.tif").is_file():
         raise InputError(folder, "has no ortho.tif", "measure the recording again")
     frame = "world" if owners["mounting_id"] is None else "encoders"
-    return _PickedSurvey(folder, frame, read_heights(folder))
+    return _PickedSurvey(folder, frame, read_heights(folder), Travel.read(summary))
