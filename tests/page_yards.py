@@ -26,7 +26,7 @@ FIRST = [laid(0.3), laid(1.4), laid(2.5), laid(3.6), laid(4.7, y_m=0.4)]
 SECOND = [laid(0.3), laid(1.4), laid(2.5), laid(4.7, y_m=0.4), laid(5.8)]
 """Between the two the fourth went and a sixth came. The second yard's last bundle has an open end."""
 DISCS = ((-1.0, -3.0), (0.85, 2.0), (2.0, -1.0), (3.05, 2.5))
-"""Middles of dark discs on white paper, painted on the floor."""
+"""Middles of dark discs on white paper, painted on the floor where the map has it."""
 HOLE = (-1.2, 0.0)
 """Nothing was measured 50 mm about it."""
 STOCK = (
@@ -77,7 +77,8 @@ def paint_disc(gray: np.ndarray, heights: HeightMap, x_m: float, y_m: float) -> 
     at = (np.arange(-15 * fine, 16 * fine) + 0.5 - fine / 2) / fine
     away = np.hypot(at[None, :] - (x - column), at[:, None] - (len(gray) - 1 - y - row))
     drawn = np.where(away < 6, 30.0, 220.0).reshape(31, fine, 31, fine).mean(axis=(1, 3))
-    gray[row - 15 : row + 16, column - 15 : column + 16] = drawn.round().astype(np.uint8)
+    if 15 <= row < len(gray) - 15 and 15 <= column < gray.shape[1] - 15:
+        gray[row - 15 : row + 16, column - 15 : column + 16] = drawn.round().astype(np.uint8)
 
 
 def fill_store(folder: Path, *, surveys: int = 2) -> str:

@@ -195,7 +195,7 @@ def test_only_engineers_pick_and_a_folder_that_was_changed_is_refused(made: Path
 
 
 def test_coarser_pixels_than_cells_make_a_pick_less_sure() -> None:
-    """Of 12.8 mm on the floor where the page's yard has 6.4 mm; the cells are 10 mm."""
+    """Pixels of 6.4 and 12.8 mm on the floor; the cells are 10 mm."""
     heights, stamps = draw([], sigma_m=0.002), np.arange(2, dtype=np.int64)
     travel = sure_travel(np.zeros((2, 2)), stamps)
     for eye_z_m, sigma_m in ((8.0, 0.007), (16.0, 0.7 * 0.0128)):
