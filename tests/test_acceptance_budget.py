@@ -116,11 +116,11 @@ def test_what_the_shape_leaves_open_is_a_source_of_its_own() -> None:
         (source.name, *source.errors): float(source.covariance[0, 0]) ** 0.5
         for source in fit_sources(record(one, fit_sigma=fit), heights)
     }
-    assert parts["matching, travel and fit", "fit_across"] == pytest.approx(0.001)
+    assert parts["matching and fit", "fit_across"] == pytest.approx(0.001)
     assert parts[SHAPE, "fit_across"] == pytest.approx((0.003**2 - 0.001**2) ** 0.5)
     assert (SHAPE, "fit_along") not in parts and (SHAPE, "fit_yaw") not in parts
     whole = {(one.name, *one.errors) for one in fit_sources(record(one), heights)}
-    assert not any(name[0] == SHAPE for name in whole) and ("matching, travel and fit", "fit_top") in whole
+    assert not any(name[0] == SHAPE for name in whole) and ("matching and fit", "fit_top") in whole
 
 
 @pytest.mark.parametrize(
@@ -148,3 +148,17 @@ def test_a_measured_bundle_is_budgeted(
     figures = {one["name"]: one for one in told["figures"]}
     assert 1 < figures["lift z"]["combined"]["expanded"] < 40
     assert 0 < figures["yaw"]["combined"]["expanded"] < 1
+
+
+def test_a_frame_that_the_same_rig_found_takes_up_its_errors() -> None:
+    """Targets at the load's height, all about it, move as it does: only what is left of the way counts."""
+    rig = ErrorSource("rig", ("yaw", "baseline", "focal"), np.diag(np.square([YAW, BASE, FOCAL])), "a test")
+    x, y = np.meshgrid([2.0, 6.0], [-1.0, 3.0])
+    level = np.column_stack([x.ravel(), y.ravel(), np.full(4, LOAD.top_m[2])])
+    z = [
+        budget(LOAD, VIEW, ORIGIN, (rig,), 1000, targets_m=targets)[2].combined.sigma
+        for targets in (None, level, level - [0, 0, 0.6])
+    ]
+    assert z[1] < 0.05 * z[0]
+    low = np.array([YAW, BASE, FOCAL]) @ np.diag([(8.0**2 - 7.4**2) / 0.5, 0.6, 0.6])
+    assert z[2] == pytest.approx(1e3 * float(np.linalg.norm(low)), rel=0.1)

@@ -12,6 +12,7 @@ from barsight.core.errors import ConfigError
 from barsight.core.types import HeightSource
 from barsight.yard.bundles.collinear_pieces import join_pieces
 from barsight.yard.bundles.detection import _on, find_bundles
+from barsight.yard.bundles.fitting.ends import middle_and_length_sigma
 from barsight.yard.bundles.fitting.outline import bundle_width
 from barsight.yard.bundles.fitting.outline_fit import Fit
 from barsight.yard.bundles.fitting.settings import BundleSettings
@@ -310,3 +311,13 @@ def test_what_shows_behind_a_steep_flank_may_be_a_bundles_own_lower_bars(
     another = np.arange(18) >= (9 if begins else 18)
     last, is_seen, is_free = _edge(level, another, 0, 1, 0.1, np.inf, -0.2, 12)
     assert (last, is_seen, is_free) == (5, seen, behind == -np.inf)
+
+
+def test_both_ends_err_outwards_alike() -> None:
+    """The middle is surer, the length less sure than of ends that err each for itself."""
+    rng = np.random.default_rng(7)
+    outwards = rng.multivariate_normal([0, 0], [[1, 0.6 * 2], [0.6 * 2, 4]], 20_000)
+    middle, length = middle_and_length_sigma((1.0, 2.0))
+    assert np.std(outwards[:, 1] - outwards[:, 0]) / 2 == pytest.approx(middle, rel=0.03)
+    assert np.std(outwards.sum(axis=1)) == pytest.approx(length, rel=0.03)
+    assert np.isnan(middle_and_length_sigma((np.nan, 1.0))).all()

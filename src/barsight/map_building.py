@@ -13,8 +13,9 @@ import numpy as np
 
 import barsight
 from barsight.calibration.geometry.rectification import Rectifier
-from barsight.calibration.stereo.disparity_uncertainty import disparity_sigma_px
+from barsight.calibration.stereo.disparity_uncertainty import disparity_sigma_px, rig_covariance
 from barsight.checkpoint import checkpoint_folder, checkpointed, pictures_digest
+from barsight.core.arrays import Float64
 from barsight.core.errors import Failed, InputError, MeasurementError
 from barsight.core.json_values import json_digest, json_value
 from barsight.core.memory import trim_heap
@@ -39,7 +40,7 @@ from barsight.mapping.top_photo import TopPhoto
 from barsight.mapping.view import MatchedFrame, Matcher, Neighbour, PointBinner, PosedView
 from barsight.measure_settings import MeasureSettings
 from barsight.measurement import Preview, Refusal
-from barsight.motion.rig_check.self_calibration import self_calibrate
+from barsight.motion.rig_check.self_calibration import residual_covariance, self_calibrate
 from barsight.motion.settings import make_estimator
 from barsight.pair_chain import PairChain
 from barsight.recording.base import Recording
@@ -86,12 +87,14 @@ class ProbedRecording:
 @dataclass(frozen=True, eq=False)
 class TrackedRecording:
     """The trajectory, and the pairs that the map is made of. rectifier: as corrected in service. stereo: with
-    the disparity's calibration sigma. poses: of the frames taken, by stamp. matched: those frames, in order.
+    the disparity's calibration sigma. rig_covariance: of yaw, baseline and focal length (3, 3), None where no
+    rig file says it. poses: of the frames taken, by stamp. matched: those frames, in order.
     """
 
     trajectory: Trajectory
     rectifier: Rectifier
     stereo: StereoSettings
+    rig_covariance: Float64 | None
     drift_warnings: tuple[str, ...]
     poses: dict[int, PosedFrame]
     matched: Iterator[MatchedFrame | Refusal]
@@ -219,7 +222,11 @@ def estimate_trajectory(
             rest = pairs({stamp for stamp in poses if stamp >= late})
             after = pools.enter_context(_matched_ahead(match, rest, _MATCHED_AFTER))
             matched = chain(takewhile(lambda frame: frame.stamp_ns < late, ahead), after)
-        yield TrackedRecording(trajectory, rectifier, stereo, calibrated.warnings, poses, matched)
+        rig = rig_covariance(settings.recording.rig, probed.first.range_m)
+        if rig is not None:
+            corrected = settings.self_calibrate == "yaw"
+            rig = residual_covariance(rig, trajectory.drift, corrected=corrected)
+        yield TrackedRecording(trajectory, rectifier, stereo, rig, calibrated.warnings, poses, matched)
 
 
 @contextmanager

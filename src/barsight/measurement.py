@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from barsight.core.arrays import Float32, UInt8
+from barsight.core.arrays import Float32, Float64, UInt8
 from barsight.core.notices import Notice
 from barsight.core.types import Agreement, Contour, LaserProfile, RefusedFrame, Trajectory
 from barsight.mapping.passes.changes import BundleMove, HeightChange
@@ -75,10 +75,12 @@ class PassRecord:
 class Measurement:
     """A measured recording; `surface` reads its tiles from a scratch folder that must still be there.
 
-    seconds: by the clock on the wall; the stages' own seconds overlap. yard_frame_id: digest of how the body
-    hangs from the crane; None where the map isn't in the yard's frame. frame_id: name of the frame that all
-    places are in. passes: of several recordings; the recording is then the newest. agreements: of vision
-    alone. laser_checks: of the laser before it was fused; None where that wasn't asked for.
+    rig_covariance: of yaw (rad), baseline and focal length (ratios) after the travel, (3, 3); None where no
+    rig file says it. seconds: by the clock on the wall; the stages' own seconds overlap. yard_frame_id:
+    digest of how the body hangs from the crane; None where the map isn't in the yard's frame. frame_id: name
+    of the frame that all places are in. passes: of several recordings; the recording is then the newest.
+    agreements: of vision alone. laser_checks: of the laser before it was fused; None where that wasn't asked
+    for.
     """
 
     recording_path: Path
@@ -107,6 +109,7 @@ class Measurement:
     lifts: LiftPlan
     stock: StockMatch | None
     travel: Travel
+    rig_covariance: Float64 | None
     yard_frame_id: str | None
     frame_id: str
     passes: tuple[PassRecord, ...] = ()

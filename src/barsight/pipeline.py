@@ -244,6 +244,7 @@ def find_lifts(mapped: MappedYard, request: LiftRequest) -> Measurement:
         lifts=lifts,
         stock=stock,
         travel=travel,
+        rig_covariance=newest.way.rig_covariance,
         yard_frame_id=yard_frame_id(source, trajectory),
         frame_id=mapped.frame_id,
         passes=_records(mapped, travels),

@@ -11,6 +11,7 @@ import numpy as np
 from barsight.acceptance.observation import ViewGeometry
 from barsight.acceptance.uncertainty import COVERAGE, CombinedUncertainty, UncertaintyPart, combine
 from barsight.core.arrays import Float64
+from barsight.core.pose import skew
 
 FIGURES = (
     ("lift x", "mm", 1e3), ("lift y", "mm", 1e3), ("lift z", "mm", 1e3), ("yaw", "deg", 180 / np.pi),
@@ -24,6 +25,7 @@ ERRORS = (
 )  # fmt: skip
 """Errors that the model takes: of the rig, the yard frame, the bundle's fit (fit_height: of a single cell),
 and from camera to magnet."""
+RIG, FRAME = ERRORS[:3], ERRORS[3:9]
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,13 +68,19 @@ class BudgetedFigure:
     agree: bool
 
 
-def measured(load: BudgetedLoad, view: ViewGeometry, frame_origin_m: Float64, errors: Float64) -> Float64:
+def measured(
+    load: BudgetedLoad, view: ViewGeometry, frame_origin_m: Float64, errors: Float64,
+    targets_m: Float64 | None = None,
+) -> Float64:  # fmt: skip
     """Compute what is measured of a load under errors (N, 19), in the order of `ERRORS`: FIGURES (N, 7), SI.
 
     The bundle's ends are seen from the cameras' mean place over it, triangulated with a wrong rig, and moved
-    by a wrong yard frame about its origin; then the errors of the fit and of the magnet are added.
+    by a wrong yard frame about its origin; then the errors of the fit and of the magnet are added. targets_m:
+    (T, 3) by which the same rig found the frame, which so takes up most of what the rig does to them.
     """
     e = dict(zip(ERRORS, errors.T, strict=True))
+    if targets_m is not None:
+        e |= _with_frame_found(targets_m, view, frame_origin_m, e)
     way = np.array([-np.sin(load.yaw_rad), np.cos(load.yaw_rad), 0.0])
     ends = [
         _placed(load.top_m + share * load.length_m * way, load.top_m, view, frame_origin_m, e)
@@ -90,6 +98,20 @@ def measured(load: BudgetedLoad, view: ViewGeometry, frame_origin_m: Float64, er
         place + magnet, yaw, middle[:, 2] + e["fit_height"], load.width_m * scale + e["fit_width"],
         load.mass_kg * scale**3 + e["fit_mass"],
     ])  # fmt: skip
+
+
+def _with_frame_found(
+    targets: Float64, view: ViewGeometry, origin: Float64, e: dict[str, Float64]
+) -> dict[str, Float64]:
+    """Take off the frame's errors what best moves targets (T, 3), as the wrong rig sees them, to their places
+    (least squares): errors of the frame (N,), by name.
+    """
+    rig_alone = {name: e[name] if name in RIG else np.zeros_like(e[name]) for name in e}
+    off = np.stack([_placed(one, one, view, origin, rig_alone) - one for one in targets], axis=1)
+    arm = targets - origin
+    design = np.concatenate([np.concatenate([-skew(one), np.eye(3)], axis=1) for one in arm])
+    found = off.reshape(len(off), -1) @ np.linalg.pinv(design).T
+    return {name: e[name] - found[:, k] for k, name in enumerate(FRAME)}
 
 
 def _placed(
@@ -115,15 +137,17 @@ def _placed(
 
 def budget(
     load: BudgetedLoad, view: ViewGeometry, frame_origin_m: Float64, sources: Sequence[ErrorSource],
-    samples: int = 20_000, seed: int = 0,
+    samples: int = 20_000, seed: int = 0, targets_m: Float64 | None = None,
 ) -> tuple[BudgetedFigure, ...]:  # fmt: skip
-    """Budget every figure: parts by the model's derivatives, combined by GUM, and by sampling."""
+    """Budget every figure: parts by the model's derivatives, combined by GUM, and by sampling. targets_m: as
+    `measured` takes them.
+    """
     scale = np.array([one[2] for one in FIGURES])
     steps = 1e-6 * np.eye(len(ERRORS))
-    both = measured(load, view, frame_origin_m, np.concatenate([steps, -steps]))
+    both = measured(load, view, frame_origin_m, np.concatenate([steps, -steps]), targets_m)
     slopes = (both[: len(ERRORS)] - both[len(ERRORS) :]) / 2e-6 * scale  # (errors, figures)
     drawn = _drawn(sources, samples, np.random.default_rng(seed))
-    values = measured(load, view, frame_origin_m, drawn) * scale
+    values = measured(load, view, frame_origin_m, drawn, targets_m) * scale
     figures = []
     for k, (name, unit, _) in enumerate(FIGURES):
         parts = tuple(part for source in sources if (part := _part(source, slopes[:, k])) is not None)

@@ -18,16 +18,20 @@ from barsight.acceptance.uncertainty import COVERAGE
 from barsight.acceptance.yard_area import measured_rig
 from barsight.core.arrays import Float64
 from barsight.core.errors import InputError, MeasurementError
+from barsight.core.pose import Pose
 from barsight.core.reading.bounded_reading import in_range
-from barsight.registration.yard_file import read_yard_file
+from barsight.registration.yard_file import YardFrame, read_yard_file
 from barsight.result_folder import open_folder, read_heights
 from barsight.yard.inventory.bundle_file import read_bundles
+from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.magnet.description import MAX_OFFSET_M, MagnetOffset
 from barsight.yard.types import Bundle, YardMap
 from barsight.yard.weight import bundle_mass
+from barsight.yard_frame import shared_covariance
 
 REMEDY = "measure the recording again"
-MAX_SIGMA_PX = 100.0
+MAX_SIGMA_RATIO = 0.1
+"""Largest sigma of yaw (rad), baseline and focal length (ratios) of a rig that measures anything."""
 SHAPE = "shape of the bundle"
 """Source of what a bundle that isn't surely the outline leaves open; a dummy bundle's shape is known."""
 MIN_TOUCHES = 3
@@ -39,7 +43,9 @@ EXPANSION_PER_K = 23e-6
 
 @dataclass(frozen=True, eq=False)
 class MeasuredLoad:
-    """A bundle of a folder with all that its budget takes. assumed: sentences on what nobody measured."""
+    """A bundle of a folder with all that its budget takes. assumed: sentences on what nobody measured.
+    targets_m: (T, 3) by which this rig found the yard frame; None where it didn't.
+    """
 
     bundle: int
     load: BudgetedLoad
@@ -47,6 +53,7 @@ class MeasuredLoad:
     origin_m: Float64
     sources: tuple[ErrorSource, ...]
     assumed: tuple[str, ...]
+    targets_m: Float64 | None
 
 
 def measured_load(
@@ -70,25 +77,29 @@ def measured_load(
     view = view_geometry(folder, measured_rig(summary))
     heights = read_heights(folder)
     assumed: list[str] = []
-    yaw_rad = _calibration_sigma_px(summary, folder / "result.json") / view.focal_px
     change = temperature_k * EXPANSION_PER_K / 3**0.5
     sources = [
-        ErrorSource(
-            "calibration of the cameras", ("yaw",), np.array([[yaw_rad**2]]), "stereo.calibration_sigma_px"
-        ),
+        _rig_source(summary, folder / "result.json", view.focal_px, assumed),
         ErrorSource(
             "temperature of the rig", ("baseline",), np.array([[change**2]]),
             f"up to {temperature_k:g} K of aluminium", "rectangular",
         ),
-        *fit_sources(bundle, heights),
+        *fit_sources(bundle, heights, _shared_m(summary, folder / "result.json")),
     ]  # fmt: skip
-    frame, origin = _frame_source(summary, assumed)
-    sources += frame
+    frame = _yard_frame(summary)
+    sources += [
+        *_frame_source(frame, assumed),
+        _travel_source(summary, folder / "result.json", bundle, frame),
+    ]
     sources += _magnet_source(certificate, assumed) if offset is None else _offset_sources(offset)
     mass = bundle_mass(bundle)
     top = np.array([bundle.centre_m[0], bundle.centre_m[1], bundle.top_z_m])
     load = BudgetedLoad(top, bundle.yaw_rad, bundle.length_m, bundle.width_m, mass.kg)
-    return MeasuredLoad(bundle.id, load, view, origin, tuple(sources), tuple(assumed))
+    origin = np.zeros(3) if frame is None else frame.yard_from.translation.copy()
+    targets = None
+    if frame is not None and frame.attitude is None and frame.calibration_id is not None:
+        targets = frame.targets_m
+    return MeasuredLoad(bundle.id, load, view, origin, tuple(sources), tuple(assumed), targets)
 
 
 def _expect_own(path: Path, told: dict[str, Any], other: dict[str, Any], whose: str = "the folder") -> None:
@@ -100,14 +111,27 @@ def _expect_own(path: Path, told: dict[str, Any], other: dict[str, Any], whose: 
             raise InputError(path, problem, "accept this rig in this yard frame, and touch down with it")
 
 
-def _calibration_sigma_px(summary: dict[str, Any], path: Path) -> float:
+def _rig_source(summary: dict[str, Any], path: Path, focal_px: float, assumed: list[str]) -> ErrorSource:
+    """Take what the rig file and the travel leave open of the rig, else what the settings assume."""
+    name, told = "calibration of the cameras", summary.get("rig_uncertainty")
     try:
-        sigma_px = float(summary["configuration"]["stereo"]["calibration_sigma_px"])
+        if told is not None:
+            sigma = np.array(
+                [np.radians(told["yaw_deg"]), told["baseline_ratio"], told["focal_ratio"]], float
+            )
+            covariance = np.outer(sigma, sigma) * np.array(told["correlation"], float).reshape(3, 3)
+        else:
+            sigma_px = float(summary["configuration"]["stereo"]["calibration_sigma_px"])
+            covariance = np.array([[(sigma_px / focal_px) ** 2]])
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(path, "doesn't say stereo.calibration_sigma_px", REMEDY) from error
-    if not 0 <= sigma_px <= MAX_SIGMA_PX:
-        raise InputError(path, f"its stereo.calibration_sigma_px can't be {sigma_px:g}", REMEDY)
-    return sigma_px
+        raise InputError(path, "doesn't say how sure the rig's calibration is", REMEDY) from error
+    if not (np.isfinite(covariance).all() and (np.diag(covariance) <= MAX_SIGMA_RATIO**2).all()):
+        raise InputError(path, "what it says of the rig's calibration can't be", REMEDY)
+    if told is not None:
+        by = "the rig file's covariance, and the travel"
+        return ErrorSource(name, ("yaw", "baseline", "focal"), covariance, by)
+    assumed.append("no rig file with a covariance was used: baseline and focal length are taken as right")
+    return ErrorSource(name, ("yaw",), covariance, "stereo.calibration_sigma_px")
 
 
 def _chosen(folder: Path, number: int | None) -> Bundle:
@@ -120,8 +144,12 @@ def _chosen(folder: Path, number: int | None) -> Bundle:
     return max(bundles, key=lambda one: (not any(one.ends_open), one.confidence))
 
 
-def fit_sources(bundle: Bundle, heights: YardMap) -> list[ErrorSource]:
-    """Take what matching, travel and fit leave open of a bundle, as its file and the map say."""
+def fit_sources(
+    bundle: Bundle, heights: YardMap, shared_m: tuple[float, float] = (0.0, 0.0)
+) -> list[ErrorSource]:
+    """Take what matching and fit leave open of a bundle, as its file and the map say. shared_m: what its
+    sigmas across and of the top hold of errors that all its heights share, which is taken off.
+    """
     row = round((bundle.centre_m[1] - heights.y0_m) / heights.cell_m)
     column = round((bundle.centre_m[0] - heights.x0_m) / heights.cell_m)
     part = heights.part(
@@ -133,14 +161,16 @@ def fit_sources(bundle: Bundle, heights: YardMap) -> list[ErrorSource]:
     cell_m = float(np.median(part.sigma_m[known])) if known.any() else nan
     sigma, fit, free = bundle.sigma, bundle.fit_sigma or bundle.sigma, max(views - 1, 1.0)
     told = {
-        "fit_along": (sigma.along_m, fit.along_m), "fit_across": (sigma.lateral_m, fit.lateral_m),
-        "fit_top": (sigma.top_z_m, fit.top_z_m), "fit_yaw": (sigma.yaw_rad, fit.yaw_rad),
-        "fit_width": (sigma.width_m, fit.width_m),
+        "fit_along": (sigma.along_m, fit.along_m, 0.0),
+        "fit_across": (sigma.lateral_m, fit.lateral_m, shared_m[0]),
+        "fit_top": (sigma.top_z_m, fit.top_z_m, shared_m[1]),
+        "fit_yaw": (sigma.yaw_rad, fit.yaw_rad, 0.0), "fit_width": (sigma.width_m, fit.width_m, 0.0),
     }  # fmt: skip
     mass_kg = bundle_mass(bundle).sigma_kg
     sources = [_fit_source("fit_mass", mass_kg**2, free)]
-    for name, (whole, alone) in told.items():
-        sources.append(_fit_source(name, alone**2, free))
+    for name, (whole, alone, shared) in told.items():
+        own = alone**2 if np.isnan(alone) else max(alone**2 - shared**2, 0.0)
+        sources.append(_fit_source(name, own, free))
         rest = whole**2 - alone**2
         if rest > 0:
             by = "bundles.json: sigma over fit_sigma"
@@ -151,18 +181,49 @@ def fit_sources(bundle: Bundle, heights: YardMap) -> list[ErrorSource]:
 
 def _fit_source(name: str, variance: float, free: float) -> ErrorSource:
     covariance = np.array([[variance]])
-    return ErrorSource("matching, travel and fit", (name,), covariance, "bundles.json", "t", free)
+    return ErrorSource("matching and fit", (name,), covariance, "bundles.json", "t", free)
 
 
-def _frame_source(summary: dict[str, Any], assumed: list[str]) -> tuple[list[ErrorSource], Float64]:
+def _shared_m(summary: dict[str, Any], path: Path) -> tuple[float, float]:
+    """Read what bundles take for errors that all of one's heights share, across and up."""
+    try:
+        told = summary["configuration"]["bundles"]
+        return float(told["shared_lateral_m"]), float(told["shared_height_m"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(path, "doesn't say bundles.shared_lateral_m and shared_height_m", REMEDY) from error
+
+
+def _travel_source(
+    summary: dict[str, Any], path: Path, bundle: Bundle, frame: YardFrame | None
+) -> ErrorSource:
+    """Take the trajectory's covariance where the bundle was seen from, the yard frame's part left out."""
+    travel = Travel.read(summary)
+    if travel is None:
+        raise InputError(path, "doesn't say how sure the travel is", REMEDY)
+    near = np.linalg.norm(travel.place_m - bundle.centre_m[:2], axis=1) < travel.reach_m
+    variance = np.full(3, nan)
+    if near.any():
+        variance = np.median(travel.sigma_m[near] ** 2, axis=0)
+        if frame is not None:
+            body = np.append(travel.place_m[near].mean(axis=0), travel.eye_z_m)
+            shared = shared_covariance(Pose("yard", "body", np.eye(3), body), frame)
+            variance = np.maximum(variance - np.diag(shared)[3:], 0.0)
+    names = ("move_x", "move_y", "move_z")
+    return ErrorSource("travel", names, np.diag(variance), "the trajectory's covariance")
+
+
+def _yard_frame(summary: dict[str, Any]) -> YardFrame | None:
     file = summary["configuration"].get("yard")
-    if not file:
+    return read_yard_file(Path(str(file))) if file else None
+
+
+def _frame_source(frame: YardFrame | None, assumed: list[str]) -> list[ErrorSource]:
+    if frame is None:
         assumed.append("no yard file was used: how the rig hangs is taken as the recording says it")
-        return [], np.zeros(3)
-    frame = read_yard_file(Path(str(file)))
+        return []
     names = ("turn_x", "turn_y", "turn_z", "move_x", "move_y", "move_z")
     source = ErrorSource("yard frame", names, frame.covariance, f"calibrate yard, {frame.path.name}")
-    return [source], frame.yard_from.translation.copy()
+    return [source]
 
 
 def _magnet_source(certificate: Path | None, assumed: list[str]) -> list[ErrorSource]:

@@ -32,7 +32,8 @@ class YardFrame:
     yard_from_body: (3, 3) how the rig hangs, where crane moves told it. calibration_id: of the rig,
     mounting_id: of how the encoders say that it hangs, recording_id: of the inputs in whose frame the points
     were measured; None where the file doesn't say. doubts: of the calibration. digest: SHA-256 of the file.
-    bend: how the crane bends, which no encoder sees; None where it is taken to be stiff.
+    bend: how the crane bends, which no encoder sees; None where it is taken to be stiff. targets_m: (N, 3) in
+    the yard, which the frame was found by; None where the file doesn't say.
     """
 
     path: Path
@@ -45,6 +46,7 @@ class YardFrame:
     doubts: tuple[str, ...]
     digest: str
     bend: CraneBend | None = None
+    targets_m: Float64 | None = None
 
     @property
     def attitude(self) -> Float64 | None:
@@ -68,6 +70,7 @@ def write_yard_file(
         "scale_sigma": found.alignment.scale_sigma,
         "points": int((~found.checks).sum()),
         "rms_m": float(np.sqrt((found.off_m[~found.checks] ** 2).sum(axis=1).mean())),
+        "targets_m": found.yard_m[~found.checks].tolist(),
         "doubts": list(found.doubts),
         **{name: value for name, value in owners.items() if value is not None},
     }
@@ -102,6 +105,7 @@ def read_yard_file(path: Path) -> YardFrame:
         owners["mounting_id"], owners["recording_id"],
         tuple(str(one) for one in doubts) if isinstance(doubts, list) else (),
         hashlib.sha256(read_bytes(path, MAX_DOCUMENT_BYTES)).hexdigest(), _bend(document, frames[0]),
+        _targets(document),
     )  # fmt: skip
 
 
@@ -116,6 +120,16 @@ def _rows(document: Document, key: str, size: int) -> Float64:
         raise document.error(key, f"is not a {size}x{size} matrix", REMEDY)
     numbers = document.numbers_in(key, [number for row in value for number in row])
     return np.array(numbers, np.float64).reshape(size, size)
+
+
+def _targets(document: Document) -> Float64 | None:
+    rows = document.values.get("targets_m")
+    if rows is None:
+        return None
+    if not isinstance(rows, list) or any(not isinstance(row, list) or len(row) != 3 for row in rows):
+        raise document.error("targets_m", "is no list of x, y, z", REMEDY)
+    numbers = document.numbers_in("targets_m", [number for row in rows for number in row])
+    return np.array(numbers, np.float64).reshape(-1, 3)
 
 
 def _bend(document: Document, frame: str) -> CraneBend | None:

@@ -13,7 +13,7 @@ import numpy as np
 import tifffile
 
 import barsight
-from barsight.core.arrays import Float32
+from barsight.core.arrays import Float32, Float64
 from barsight.core.files import atomic_path
 from barsight.core.json_values import json_value
 from barsight.core.stamps import NS_PER_S, format_seconds
@@ -287,6 +287,7 @@ def summary(measurement: Measurement) -> dict[str, Any]:
             "duration_s": float(stamps[-1] - stamps[0]) / NS_PER_S if stamps.size else 0.0,
         },
         "travel": measurement.travel.content(),
+        "rig_uncertainty": _rig_content(measurement.rig_covariance),
         "stages": [asdict(stage) for stage in measurement.stages],
         "seconds": measurement.seconds,
         "peak_memory_mib": measurement.peak_memory_mib,
@@ -318,6 +319,19 @@ def _ids(measurement: Measurement) -> dict[str, Any]:
         "calibration_id": measurement.calibration_hash[:ID_DIGITS],
         "yard_frame_id": measurement.yard_frame_id, "frame_id": measurement.frame_id,
     }  # fmt: skip
+
+
+def _rig_content(covariance: Float64 | None) -> dict[str, Any] | None:
+    """Describe what the cameras' calibration and the travel leave open of the rig."""
+    if covariance is None:
+        return None
+    sigma = np.sqrt(np.diag(covariance))
+    return {
+        "yaw_deg": float(np.degrees(sigma[0])),
+        "baseline_ratio": float(sigma[1]),
+        "focal_ratio": float(sigma[2]),
+        "correlation": (covariance / np.outer(sigma, sigma)).tolist(),
+    }
 
 
 def _laser_content(measurement: Measurement) -> dict[str, Any]:

@@ -19,6 +19,8 @@ from barsight.core.pose import Pose
 
 STEP_SIGMAS = 0.05
 INTRINSICS = 4
+NEAR_RATIO = 0.6
+"""Of the range: the nearer of two distances at which depths tell a wrong yaw from a wrong scale."""
 
 
 def disparity_sigma_px(path: Path | None, range_m: float) -> float | None:
@@ -35,6 +37,39 @@ def disparity_sigma_px(path: Path | None, range_m: float) -> float | None:
     by = differentiate(lambda moved: triangulate_depth(moved, left, right), rig, names, covariance)
     sigma_m = float(np.median(np.sqrt(np.einsum("nc,cd,nd->n", by, covariance, by))))
     return sigma_m * rig.cam0.fx_px * rig.baseline_m / range_m**2
+
+
+def rig_covariance(path: Path | None, range_m: float) -> Float64 | None:
+    """Propagate a rig file's covariance to yaw (rad), baseline and focal length (ratios), (3, 3), as depths
+    up to `range_m` show them; None where no file is given or it carries no covariance.
+
+    Signs: a right camera that is turned by more, and depths that are seen larger, than the file has it. What
+    lenses do otherwise to depths there counts as yaw. Raises `CalibrationError` for one that can't be.
+    """
+    if path is None or not holds_own_rig(path) or (known := read_covariance(path)) is None:
+        return None
+    rig = read_rig_file(path)
+    names, covariance = known
+    at, left, right = sample_pairs(rig, [NEAR_RATIO * range_m, range_m])
+    if np.unique(at).size < 2:
+        return None
+    near = triangulate_depth(rig, left, right)
+    design = np.column_stack([np.ones(near.size), rig.baseline_m / near])
+
+    def errors(moved: StereoRig) -> Float64:
+        """Fit yaw and scale of depths to b / z; the baseline's part of the scale is known."""
+        parallax = rig.baseline_m / triangulate_depth(moved, left, right)
+        yaw, shorter = np.linalg.lstsq(design, parallax, rcond=None)[0]
+        longer = moved.baseline_m / rig.baseline_m
+        return np.array([yaw, longer, -shorter - longer])
+
+    by = differentiate(errors, rig, names, covariance)
+    found: Float64 = by @ covariance @ by.T
+    arm = np.array([1.0, -rig.baseline_m / range_m, -rig.baseline_m / range_m])
+    whole = disparity_sigma_px(path, range_m)
+    assert whole is not None
+    found[0, 0] += max((whole / rig.cam0.fx_px) ** 2 - float(arm @ found @ arm), 0.0)
+    return found
 
 
 def differentiate(

@@ -52,7 +52,7 @@ def run(arguments: Sequence[str]) -> None:
             expect_output(out, ".json")
         offset = None if magnet is None else load_magnet(magnet).offset
         found = measured_load(measured, bundle, certificate, temperature_k, offset)
-        figures = budget(found.load, found.view, found.origin_m, found.sources)
+        figures = budget(found.load, found.view, found.origin_m, found.sources, targets_m=found.targets_m)
         if out is not None:
             _write(found, figures, out)
         _print(found, figures)

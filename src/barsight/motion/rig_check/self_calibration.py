@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from barsight.calibration.geometry.rectification import Rectifier, right_from_rectified
 from barsight.calibration.geometry.rig import StereoRig
+from barsight.core.arrays import Float64
 from barsight.core.pose import Pose
 from barsight.core.types import RigDrift
 
@@ -29,6 +30,29 @@ class SelfCalibration:
     rectifier: Rectifier
     warnings: tuple[str, ...]
     sigma_px: float
+
+
+def residual_covariance(prior: Float64, drift: RigDrift | None, *, corrected: bool) -> Float64:
+    """Update a calibration's covariance of yaw, baseline and focal length (3, 3) by what the travel shows.
+
+    What both together find counts as error, for nothing corrects it but the yaw where that is `corrected`.
+    Where the travel contradicts the calibration, it alone is believed. Only encoders show either.
+    """
+    if drift is None or not drift.by_encoders:
+        return prior
+    found = np.array([drift.yaw_rad, -drift.scale])  # a baseline that is longer makes depths too small
+    covariance = drift.covariance * [[1, -1], [-1, 1]]
+    joint = prior[:2, :2] + covariance
+    if corrected or found @ np.linalg.solve(joint, found) > AGREEING_SIGMAS**2:
+        left = found * [not corrected, True]
+        updated = prior.copy()
+        updated[:2, :] = updated[:, :2] = 0.0
+        updated[:2, :2] = covariance + np.outer(left, left)
+        return updated
+    gain = prior[:, :2] @ np.linalg.inv(joint)
+    mean = gain @ found
+    posterior: Float64 = prior - gain @ prior[:2] + np.outer(mean, mean)
+    return posterior
 
 
 def self_calibrate(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 
@@ -23,13 +23,15 @@ SPECKLED = 2.5
 
 
 def lay_artefacts(plan: AcceptancePlan, settings: SimulationSettings) -> LaidYard:
-    """Lay what a plan names exactly where it says, each on a block or post down to the floor.
+    """Lay what a plan names exactly where it says, each on a block or post down to the floor. Bars of a dummy
+    bundle end flush.
 
     Raises ConfigError for a dummy bundle whose bars no hexagonal packing has, or whose figures contradict it.
     """
     rng = stream(settings, 13)
     bundles = tuple(_bundle(one) for one in plan.dummy_bundle)
-    scene = build_scene(Stock(bundles, ()), settings, stream(settings, 1))
+    flush = replace(settings, yard=replace(settings.yard, uneven_ends_m=0.0))
+    scene = build_scene(Stock(bundles, ()), flush, stream(settings, 1))
     boxes = [_block(one) for one in plan.plate]
     for sphere in plan.sphere:
         boxes += _on_post(sphere)

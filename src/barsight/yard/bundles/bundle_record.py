@@ -9,7 +9,7 @@ import numpy as np
 from barsight.core.arrays import Float64
 from barsight.yard.bundles.doubts import count_bars, list_cover_doubts, list_doubts, rate_confidence
 from barsight.yard.bundles.fitting.bars import fit_bars, visible_bars
-from barsight.yard.bundles.fitting.ends import End, find_end
+from barsight.yard.bundles.fitting.ends import End, find_end, middle_and_length_sigma
 from barsight.yard.bundles.fitting.outline import LOOSENESS, make_outline
 from barsight.yard.bundles.fitting.outline_fit import (
     DIAMETER,
@@ -30,6 +30,10 @@ from barsight.yard.bundles.section.seen_section import estimate_section, seen_se
 from barsight.yard.bundles.strapped_bundles import held_by_straps
 from barsight.yard.sections import MapStretch, part_about
 from barsight.yard.types import Bundle, BundleSigma, FitSigma, YardMap
+
+_SLOPE_RATIO = 0.6
+"""Of the slope's sigma that errors alike over `correlated_along_m` would give: what is alike over so long a
+way moves the bundle aside and turns it little."""
 
 
 def describe_bundles(
@@ -102,7 +106,7 @@ def make_bundle(
         ends_sigma_m=(ends[0].sigma_m, ends[1].sigma_m),
         section_m2=section,
         cover_doubts=list_cover_doubts(reading, reasons),
-        fit_sigma=FitSigma(own.lateral_m, own.along_m, own.yaw_rad, own.width_m, own.top_z_m),
+        fit_sigma=_fit_sigma(own, ends),
     )
     doubtful = reading.other_packing is not None
     width_m = None if seen is None else seen.width_m
@@ -146,16 +150,26 @@ def _sigma(fit: Fit, ends: list[End], top: float, settings: BundleSettings) -> B
     at_middle[1, ROLL], at_middle[1, DIAMETER] = _top_changes(fit, top)
     lateral, height = np.sqrt(np.maximum(np.diag(at_middle @ covariance @ at_middle.T), 0))
     diameter = float(np.sqrt(covariance[DIAMETER, DIAMETER]))
-    sigmas = np.array([end.sigma_m for end in ends])
+    middle, length = middle_and_length_sigma((ends[0].sigma_m, ends[1].sigma_m))
     return BundleSigma(
         lateral_m=float(np.hypot(lateral, settings.shared_lateral_m)),
-        along_m=float(np.linalg.norm(sigmas) / 2),
-        yaw_rad=float(np.hypot(np.sqrt(covariance[SLOPE_U, SLOPE_U]), np.radians(settings.shared_yaw_deg))),
-        length_m=float(np.linalg.norm(sigmas)),
+        along_m=middle,
+        yaw_rad=float(
+            np.hypot(
+                _SLOPE_RATIO * np.sqrt(covariance[SLOPE_U, SLOPE_U]), np.radians(settings.shared_yaw_deg)
+            )
+        ),
+        length_m=length,
         width_m=(2 * LOOSENESS * fit.rings + 1) * diameter,
         top_z_m=float(np.hypot(height, settings.shared_height_m)),
         bar_diameter_m=diameter,
     )
+
+
+def _fit_sigma(own: BundleSigma, ends: list[End]) -> FitSigma:
+    """Take the fit's own sigmas, and along the axis that of bars that end alike."""
+    along, _ = middle_and_length_sigma((ends[0].flush_sigma_m, ends[1].flush_sigma_m))
+    return FitSigma(own.lateral_m, along, own.yaw_rad, own.width_m, own.top_z_m)
 
 
 def _top_changes(fit: Fit, top: float) -> tuple[float, float]:

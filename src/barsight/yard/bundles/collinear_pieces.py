@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from barsight.yard.bundles.fitting.ends import middle_and_length_sigma
 from barsight.yard.types import Bundle
 
 _SKEW, _ASIDE_RATIO, _LEVEL_M = 0.05, 0.3, 0.04
@@ -62,13 +63,14 @@ def _joined(whole: Bundle, piece: Bundle) -> Bundle | None:
     far = order[side]
     is_open, sigmas = list(whole.ends_open), list(whole.ends_sigma_m)
     is_open[side], sigmas[side] = piece.ends_open[far], piece.ends_sigma_m[far]
+    middle, length = middle_and_length_sigma((sigmas[0], sigmas[1]))
     sigma = replace(
         whole.sigma,
         lateral_m=float(np.hypot(whole.sigma.lateral_m, aside)),
         width_m=float(np.hypot(whole.sigma.width_m, piece.width_m - whole.width_m)),
         top_z_m=float(np.hypot(whole.sigma.top_z_m, piece.top_z_m - whole.top_z_m)),
-        along_m=float(np.linalg.norm(sigmas) / 2),
-        length_m=float(np.linalg.norm(sigmas)),
+        along_m=middle,
+        length_m=length,
     )
     name = ("low-y", "high-y")[side]
     kept = tuple(r for r in whole.reasons if f"the {name} end is open" not in r)

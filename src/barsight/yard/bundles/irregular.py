@@ -14,7 +14,7 @@ _WIDTH_RATIOS, _WIDTH_SIGMAS = (0.03, 0.12), (1.5, 2.0)
 not. A map's sigma rises with the size of its pixels, by which its edges grow."""
 _SECTION_RATIO = 0.5
 """Of what the width of the section that is seen differs from the outline's."""
-_TOP_SIGMAS, _YAW_SIGMAS, _DIAMETER_RATIO = 0.8, 0.8, 0.5
+_TOP_SIGMAS, _YAW_SIGMAS, _DIAMETER_RATIO = 0.8, 0.4, 0.5
 """Of a height's sigma: error of the top, and of the ends' places sideways; of a diameter, where another
 fits as well."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,22 +20,31 @@ _RAGGED_M = 0.2
 _SOME, _MAX_VALUE = 0.3, 0.6
 _GROWTH_CELLS = 1.5
 """A map grows over ends by about one and a half cells."""
-_SEEN_SIGMA_M = 0.012
-"""What is left where all bars end alike: a cell of growth, straps and shadows."""
-_SEEN_SIGMAS = 4.0
-"""Of a height's sigma, which rises with the size of the pixels: what they leave of an end's place."""
+_SEEN_SIGMA_M, _SEEN_SIGMAS = 0.006, 1.0
+"""What is left of an end's place where all bars end alike, and of a height's sigma, which rises with the size
+of the pixels."""
+_UNEVEN_SIGMAS, _RAGGED_RATIO = 2.0, 0.35
+"""Of the sigma by how far apart the visible bars end, since others may end elsewhere; of the way over which
+the surface goes on a little lower."""
 _UNEVEN_M = (-0.15, 0.2)
 _ENDS_M = 0.03
+_QUARTILES = 1.349
+"""Standard deviations between the quartiles of a normal distribution."""
+_ALIKE = 0.6
+"""Correlation of how far both ends of a bundle are put outwards: what moves one moves the other."""
 
 
 @dataclass(frozen=True)
 class End:
-    """An end of a bundle at v_m; sigma_m is NaN where the end is open, and `why` says why it is."""
+    """An end of a bundle at v_m. sigma_m, and flush_sigma_m for bars that surely end alike, are NaN where the
+    end is open, and `why` says why it is.
+    """
 
     v_m: float
     sigma_m: float
     is_open: bool
     why: str = ""
+    flush_sigma_m: float = np.nan
 
 
 def find_end(grid: AlignedMap, fit: Fit, step: int, settings: BundleSettings) -> End:
@@ -65,12 +75,19 @@ def find_end(grid: AlignedMap, fit: Fit, step: int, settings: BundleSettings) ->
                 spread = ragged * cell
                 end = v + step * (spread / 4 - _GROWTH_CELLS * cell)
                 uneven = _unevenness(grid, fit, row, step, settings)
-                return End(
-                    end,
-                    float(np.linalg.norm([_SEEN_SIGMA_M, _SEEN_SIGMAS * fit.sigma_m, spread / 6, uneven])),
-                    False,
-                )
+                flush = math.hypot(_SEEN_SIGMA_M, _SEEN_SIGMAS * fit.sigma_m)
+                sigma = math.hypot(flush, _RAGGED_RATIO * spread, _UNEVEN_SIGMAS * uneven)
+                return End(end, sigma, is_open=False, flush_sigma_m=flush)
     return End(v, float("nan"), True, "the map doesn't show what lies beyond")
+
+
+def middle_and_length_sigma(ends_sigma_m: tuple[float, float]) -> tuple[float, float]:
+    """Propagate the sigmas of both ends, whose errors outwards are alike, to the middle and to the length."""
+    squares, alike = (
+        ends_sigma_m[0] ** 2 + ends_sigma_m[1] ** 2,
+        2 * _ALIKE * ends_sigma_m[0] * ends_sigma_m[1],
+    )
+    return float(np.sqrt(squares - alike)) / 2, float(np.sqrt(squares + alike))
 
 
 def _unevenness(grid: AlignedMap, fit: Fit, row: int, step: int, settings: BundleSettings) -> float:
@@ -82,7 +99,7 @@ def _unevenness(grid: AlignedMap, fit: Fit, row: int, step: int, settings: Bundl
     ends = rows.size - 1 - follows[::-1].argmax(axis=0)[follows.any(axis=0)]
     if ends.size == 0:
         return _RAGGED_M
-    spread = grid.cell_m * float(np.subtract(*np.percentile(ends, [84, 16]))) / 2
+    spread = grid.cell_m * float(np.subtract(*np.percentile(ends, [75, 25]))) / _QUARTILES
     return float(1.25 * spread / np.sqrt(max(len(visible_bars(fit)), 1)))
 
 

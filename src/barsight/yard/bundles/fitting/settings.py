@@ -45,7 +45,7 @@ class BundleSettings:
     """Errors of heights across the bars are alike over this distance."""
     shared_lateral_m: float = 0.0018
     """Error of place that all heights of a bundle share, mostly the trajectory's (one standard deviation)."""
-    shared_yaw_deg: float = 0.03
+    shared_yaw_deg: float = 0.01
     """Error of direction that all of the map shares (one standard deviation)."""
     shared_height_m: float = 0.001
     """The same of height, but for the calibration's part, which moves the whole map."""
