@@ -7,12 +7,13 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
 
 import barsight as bs
+from barsight import map_building
 from barsight.cli.main import run
 from barsight.core.types import CraneSamples, StereoFrame
 from barsight.live.latency import counts, spread
@@ -25,6 +26,7 @@ from barsight.live.shared.logs import NumberLog, ReadingLog
 from barsight.live.shared.ring import PairRing
 from barsight.live.source import ReplayClock, ReplaySource
 from barsight.live.state import prometheus
+from barsight.mapping.fusion import fuse_view
 from barsight.recording.formats.ground_truth import read_ground_truth
 from barsight.sensors.source import LivePicture, LostPicture, Readings
 from barsight.yard.magnet.description import example_magnet
@@ -65,15 +67,25 @@ def frame(number: int) -> StereoFrame:
     return StereoFrame(number, np.full((4, 6), number, np.uint8), np.full((4, 6), 100 + number, np.uint8))
 
 
-def test_a_run_as_fast_as_possible_is_measure(whole: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("estimator", ["fused", "live"])
+def test_a_run_as_fast_as_possible_is_measure(
+    estimator: Literal["fused", "live"], whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Poses that are final at once leave nothing to be fused at the end."""
+    fused: list[int] = []
+    monkeypatch.setattr(map_building, "fuse_view", lambda *one: fused.append(1) or fuse_view(*one))
+    settings = replace(SETTINGS, motion=replace(SETTINGS.motion, estimator=estimator))
     magnet = tmp_path / "magnet.toml"
     magnet.write_text(example_magnet(), encoding="utf-8")
     told: list[str] = []
     out = tmp_path / "out"
     replay(
-        whole, out, SETTINGS, LiveSettings(), speed=0, magnet=magnet, judged_at="end", tell=told.append
+        whole, out, settings, LiveSettings(), speed=0, magnet=magnet, judged_at="end", tell=told.append
     )  # fmt: skip
-    fields: dict[str, Any] = {"stereo": {"method": "sgbm"}, "map": {"cell_m": 0.05}}
+    assert len(fused) == {"fused": 4, "live": 0}[estimator]
+    fields: dict[str, Any] = {
+        "stereo": {"method": "sgbm"}, "map": {"cell_m": 0.05}, "motion": {"estimator": estimator},
+    }  # fmt: skip
     batch = bs.measure(whole, magnet=magnet, at="end", **fields)
     assert files(out) == files(batch.folder)
     # Between the two cameras' first pictures a look may fall, which tells so.

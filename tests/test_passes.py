@@ -239,8 +239,8 @@ def test_what_was_moved_along_itself_or_exchanged_is_told_by_its_picture(tmp_pat
 
 def test_what_was_proven_free_is_given_up_where_it_changed() -> None:
     old, new = FreeSpace(CELL_M), FreeSpace(CELL_M)
-    old._tiles[0, 0] = np.full((2, 256, 256), 0.1, np.float32)
-    new._tiles[0, 0] = np.full((2, 256, 256), 0.4, np.float32)
+    old.tiles[0, 0] = np.full((2, 256, 256), 0.1, np.float32)
+    new.tiles[0, 0] = np.full((2, 256, 256), 0.4, np.float32)
     old.join(new, 0.01, lambda x, y: np.broadcast_to(x < 1.0, (len(y), len(x))))
     window = old.window(0, 0, 200, 10)
     assert (window[:, :98] == np.float32(0.41)).all() and (window[:, 104:] == np.float32(0.1)).all()

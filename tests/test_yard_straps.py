@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from barsight.core.types import HeightSource
 from barsight.simulation.worlds.packing import packed
@@ -19,8 +20,8 @@ from barsight.yard.bundles.section.bar_pitch import dark_lines
 from barsight.yard.bundles.section.pack_sides import PackSide, _parting, _widest
 from barsight.yard.bundles.section.packs import Pack, contradicts, find_pack, strapped_pack
 from barsight.yard.bundles.section.seen_section import section_of_pack
-from barsight.yard.bundles.section.strap_lines import split_columns
-from barsight.yard.bundles.section.straps import StrapSpan, _merged
+from barsight.yard.bundles.section.strap_lines import _best_stretches, row_gains, split_columns
+from barsight.yard.bundles.section.straps import StrapSpan, _merged, longest_runs
 from barsight.yard.types import HeightMap
 from lift_yards import laid, record
 
@@ -347,3 +348,55 @@ def test_an_outline_that_reaches_into_a_pack_is_cut_and_doubtful() -> None:
     assert cut.centre_m[0] - cut.width_m / 2 == pytest.approx(pack.width_m / 2)
     higher = record(laid(0.22, 0.2 + pack.width_m), 1)
     assert hold_off([pack, higher], [True, False])[1] is higher
+
+
+@pytest.mark.parametrize("bridged", [1, 3, 9])
+def test_longest_runs_are_those_of_a_closing(bridged: int) -> None:
+    rng = np.random.default_rng(bridged)
+    lines = rng.random((200, 60)) < rng.random((200, 1))
+    lines[:5] = False
+    for own, found in zip(lines, longest_runs(lines, bridged), strict=True):
+        closed = ndimage.binary_closing(np.pad(own, bridged), np.ones(bridged, bool))[bridged:-bridged]
+        runs, count = ndimage.label(closed)
+        if not count:
+            assert found.tolist() == [0, 0]
+            continue
+        longest = np.flatnonzero(runs == 1 + int(np.bincount(runs)[1:].argmax()))
+        assert found.tolist() == [longest[0], longest[-1] + 1]
+
+
+@pytest.mark.parametrize("is_faint", [False, True])
+def test_the_best_stretches_are_those_of_plain_sums(is_faint: bool) -> None:
+    """Stretches over rows with lines that lie elsewhere left and right, a gully and a cliff."""
+    rng = np.random.default_rng(7)
+    rows, places, narrowest = 40, 50, 5
+    values = rng.normal(0, 0.3, (rows, places))
+    values[5, :30] += 2.0
+    values[25, :30] += 2.0
+    values[15, 32:] += 2.0
+    sums = np.concatenate([np.zeros((1, rows)), np.cumsum(values, axis=1).T])
+    spread = np.concatenate([[0.0], np.cumsum(rng.uniform(0.3, 0.5, places))])
+    spread = spread if is_faint else np.arange(places + 1.0)
+    prices = np.where(np.arange(places + 1) % 10 == 0, 5.0, 15.0)
+    cliffs = np.arange(places) == 41
+
+    def gained(first: int, last: int) -> float:
+        own, wide = sums[last] - sums[first], spread[last] - spread[first]
+        np.testing.assert_allclose(
+            row_gains(sums[first], sums[last], wide, is_faint),
+            np.maximum(own**2 / wide - 16, 0) / 2 if is_faint else np.where(own > 0.6 * wide, own, 0),
+        )
+        return float(row_gains(sums[first], sums[last], wide, is_faint).sum())
+
+    best, before = [0.0], [0]
+    for last in range(1, places + 1):
+        begin = max([k + 1 for k in np.flatnonzero(cliffs) if k < last - 1], default=0)
+        totals = [
+            best[first] + (gained(first, last) if last - first >= narrowest else 0.0) - prices[last]
+            for first in range(begin, last)
+        ]
+        before.append(begin + int(np.argmax(totals)))
+        best.append(max(totals))
+    found = _best_stretches(sums, spread, prices, narrowest, cliffs, is_faint)
+    assert found.tolist() == before
+    assert found[30] == 0 and found[places] in (30, 32, 42)

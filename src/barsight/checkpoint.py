@@ -8,6 +8,7 @@ import json
 import os
 import shutil
 import stat
+import tempfile
 import zipfile
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from barsight.core.errors import Failed, InputError
 from barsight.core.files import atomic_path
@@ -22,6 +24,7 @@ from barsight.core.motion_detail import InertialStates, MotionDetail, Normalised
 from barsight.core.pose import Pose
 from barsight.core.types import (
     Disparity,
+    DisparityRange,
     PosedFrame,
     RectifiedCamera,
     RectifiedPair,
@@ -29,7 +32,12 @@ from barsight.core.types import (
     RigDrift,
     Trajectory,
 )
+from barsight.mapping.free_space import FreeSpace
+from barsight.mapping.recording_probe import RecordingProbe
+from barsight.mapping.surface.surface import Surface
+from barsight.mapping.top_photo import TopPhoto
 from barsight.mapping.view import MatchedFrame
+from barsight.measurement import BuiltMap, Preview, Refusal
 from barsight.recording.base import Recording
 from barsight.recording.formats.image_folders import PictureFiles
 
@@ -52,6 +60,14 @@ _RECORDS: dict[str, Any] = {
         RectifiedCamera,
         Disparity,
         Failed,
+        RecordingProbe,
+        DisparityRange,
+        BuiltMap,
+        Surface,
+        FreeSpace,
+        TopPhoto,
+        Refusal,
+        Preview,
     )
 }
 _TORN = (
@@ -112,47 +128,96 @@ def checkpointed(folder: Path | None, name: str, make: Callable[[], T]) -> T:
             return kept
     made = make()
     with atomic_path(file) as path:
-        write_checkpoint(made, path)
+        _write(made, path, folder)
     return made
 
 
-def write_checkpoint(value: Any, path: Path) -> None:
-    """Write frozen records as an npz file: the arrays, and a tree of all else as JSON."""
+def trajectory_name(recording: Recording, delay_ns: int | None) -> str:
+    """Name the checkpoint of a trajectory by the frames and readings that it rests on: readings up to
+    delay_ns after the last frame, all of them if that is None.
+    """
+    stamps = np.array(recording.index.stamps_ns, np.int64)
+    found = hashlib.sha256(stamps.tobytes())
+    for readings in sensor_readings(recording):
+        count = readings[0].size
+        if delay_ns is not None and stamps.size:
+            until_ns = int(stamps[-1]) + recording.rig.timeshift_cam_imu_ns + delay_ns
+            count = int(np.searchsorted(readings[0], until_ns, side="right"))
+        for values in readings:
+            found.update(np.ascontiguousarray(values[:count]).tobytes())
+    return f"trajectory_{found.hexdigest()[:32]}"
+
+
+def sensor_readings(recording: Recording) -> list[tuple[NDArray[Any], ...]]:
+    """List what encoders and IMU have read, their stamps first."""
+    crane, imu = recording.crane(), recording.imu()
+    found: list[tuple[NDArray[Any], ...]] = []
+    if crane is not None:
+        found.append((crane.stamp_ns, crane.position_m))
+    if imu is not None:
+        found.append((imu.stamp_ns, imu.gyro_radps, imu.accel_mps2))
+    return found
+
+
+def _write(value: Any, path: Path, beside: Path) -> None:
+    """Write frozen records as an npz file: the arrays, and a tree of all else as JSON; the files of a folder
+    that they name are linked into one in `beside`.
+    """
     arrays: dict[str, Any] = {}
-    tree = json.dumps(_plain(value, arrays)).encode()
+    tree = json.dumps(_plain(value, arrays, beside)).encode()
     with path.open("wb") as stream:
         np.savez(stream, tree=np.frombuffer(tree, np.uint8), **arrays)
 
 
 def read_checkpoint(path: Path) -> Any:
-    """Read back what `write_checkpoint` wrote."""
+    """Read back what `checkpointed` wrote."""
     with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-        found = _record(json.loads(file["tree"].tobytes()), file)
+        found = _record(json.loads(file["tree"].tobytes()), file, path.parent)
     if not is_dataclass(found):
         raise ValueError("a checkpoint holds a record")
     return found
 
 
-def _plain(value: Any, arrays: dict[str, Any]) -> Any:
+def _plain(value: Any, arrays: dict[str, Any], beside: Path) -> Any:
     if isinstance(value, np.ndarray):
         name = f"a{len(arrays)}"
         arrays[name] = value
         return {"array": name}
     if is_dataclass(value):
         kind = type(value).__name__
-        content = {field.name: _plain(getattr(value, field.name), arrays) for field in fields(value)}
+        content = {field.name: _plain(getattr(value, field.name), arrays, beside) for field in fields(value)}
         assert kind in _RECORDS, f"{kind} is kept nowhere"
         return {"kind": kind, "fields": content}
+    if isinstance(value, dict):
+        return {"pairs": [[_plain(item, arrays, beside) for item in pair] for pair in value.items()]}
+    if isinstance(value, frozenset):
+        return {"members": [_plain(item, arrays, beside) for item in sorted(value)]}
+    if isinstance(value, Path):
+        return {"folder": _linked(value, beside).name}
     if isinstance(value, tuple):
-        return [_plain(item, arrays) for item in value]
+        return [_plain(item, arrays, beside) for item in value]
     return value.item() if isinstance(value, np.generic) else value
 
 
-def _record(tree: Any, arrays: Any) -> Any:
+def _linked(folder: Path, beside: Path) -> Path:
+    made = Path(tempfile.mkdtemp(prefix="files_", dir=beside))
+    for file in folder.iterdir():
+        os.link(file, made / file.name)
+    return made
+
+
+def _record(tree: Any, arrays: Any, beside: Path) -> Any:
     if isinstance(tree, list):
-        return tuple(_record(item, arrays) for item in tree)
+        return tuple(_record(item, arrays, beside) for item in tree)
     if not isinstance(tree, dict):
         return tree
     if "array" in tree:
         return arrays[tree["array"]]
-    return _RECORDS[tree["kind"]](**{name: _record(item, arrays) for name, item in tree["fields"].items()})
+    if "pairs" in tree:
+        return {_record(key, arrays, beside): _record(item, arrays, beside) for key, item in tree["pairs"]}
+    if "members" in tree:
+        return frozenset(_record(tree["members"], arrays, beside))
+    if "folder" in tree:
+        return beside / Path(tree["folder"]).name
+    content = {name: _record(item, arrays, beside) for name, item in tree["fields"].items()}
+    return _RECORDS[tree["kind"]](**content)

@@ -1,31 +1,33 @@
-"""Build the map while packets still come: each view is fused once its pose is known."""
+"""Build the map while packets still come: each pair is placed, and fused as the one after it is."""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
+from barsight.checkpoint import checkpointed, sensor_readings, trajectory_name
 from barsight.core.arrays import Float64
+from barsight.core.errors import MeasurementError
 from barsight.core.timing import Stopwatch
-from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame
-from barsight.map_building import FusedViews
+from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame, Trajectory
+from barsight.map_building import MapBuilder, look_at, map_name
 from barsight.mapping.keyframes import keyframe_spacing_m
-from barsight.mapping.recording_probe import choose_cell_size, points_per_pixel, probe_recording
-from barsight.mapping.surface.height_selection import ViewFrusta
-from barsight.mapping.surface.incremental import SurfaceElection
+from barsight.mapping.recording_probe import points_per_pixel
 from barsight.mapping.surface.surface import Surface
-from barsight.mapping.tiles import TileStore
 from barsight.mapping.view import MatchedFrame, PointBinner
 from barsight.measure_settings import MeasureSettings
 from barsight.measurement import Refusal
+from barsight.motion.estimator import PoseEstimator, TrajectoryEstimator
+from barsight.motion.settings import make_estimator
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.yard.sections import surface_map
 from barsight.yard.types import HeightMap
-from barsight.yard_frame import frame_of
+from barsight.yard_frame import frame_of, placed_in_yard
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,47 +50,176 @@ class Snapshot:
         return surface_map(self.surface).part(slice(0, rows), slice(0, columns))
 
 
-class LiveMap:
-    """Fuses posed pairs; `folder` takes its tiles and surfaces.
+class PairPlacer:
+    """Places pairs with an estimator whose poses are final at once.
 
-    Raises InputError or MeasurementError where none of the pairs so far can be matched.
+    A pose lies in `checkpoints` by the frames and readings that it rests on. One that lies there needs no
+    pictures, unless `reads` is False or a later one is missing: then those before it are followed again.
+    poses: the estimator, as far as it came. Raises MeasurementError where nothing places the body.
     """
 
     def __init__(
-        self, pairs: RectifiedPairs, settings: MeasureSettings, folder: Path,
-        match: Callable[[RectifiedPair | RefusedFrame], MatchedFrame | Refusal],
+        self, pairs: RectifiedPairs, estimator: TrajectoryEstimator, checkpoints: Path | None, *,
+        reads: bool = True,
     ) -> None:  # fmt: skip
-        first, self._rectifier, self._match = probe_recording(pairs), pairs.rectifier, match
-        has_crane = pairs.recording.crane() is not None
-        cell_m = settings.map.cell_m or choose_cell_size(first, has_crane=has_crane)
-        self._settings, self._per_pixel = settings.map, points_per_pixel(first, cell_m)
-        binner = PointBinner(
-            settings.stereo, self._rectifier.body_from_rect0, cell_m, self._per_pixel,
-            settings.map.max_sigma_m, Stopwatch(),
-        )  # fmt: skip
-        store = TileStore(folder, settings.map.resident_tiles)
-        self._views = FusedViews(binner, store, settings.map, frame_of(pairs.recording))
-        self._election = SurfaceElection(store, folder, cell_m, settings.map)
-        self._min_way_m = keyframe_spacing_m(self._rectifier.camera, first.range_m, settings.map.min_shift)
-        self._ahead = np.array([0.0, 0.0, first.range_m])
+        self._pairs, self._checkpoints, self._reads = pairs, checkpoints, reads
+        self.poses: PoseEstimator = estimator.begin(pairs.recording, pairs.rectifier)
+        self._known: list[tuple[int, tuple[int, ...]]] = []
+        self._unfollowed: list[int | RefusedFrame] = []
+        self._key = hashlib.sha256()
+
+    def push(self, pair: RectifiedPair | RefusedFrame) -> PosedFrame | RefusedFrame | None:
+        """Return the next pair's pose, or why it has none; None where only the end can tell."""
+        before = self._known[-1][1] if self._known else None
+        now = self._counts(pair.stamp_ns)
+        self._known.append((pair.stamp_ns, now))
+        if self._checkpoints is None:
+            return self.poses.push(pair)
+        self._key.update(f"{pair.stamp_ns} {isinstance(pair, RefusedFrame)} {now}".encode())
+        readings = sensor_readings(self._pairs.recording)
+        for number, (values, count) in enumerate(zip(readings, now, strict=True)):
+            first = 0 if before is None or len(before) != len(now) else before[number]
+            for one in values:
+                self._key.update(np.ascontiguousarray(one[first:count]).tobytes())
+        name = f"placed_{pair.stamp_ns}_{self._key.hexdigest()[:32]}"
+        if not self._reads:
+            posed = self.poses.push(pair)
+            return checkpointed(self._checkpoints, name, lambda: posed)
+        self._unfollowed.append(pair if isinstance(pair, RefusedFrame) else pair.stamp_ns)
+        return checkpointed(self._checkpoints, name, self._follow)
+
+    def finish(self) -> Trajectory | None:
+        """Return all poses, which then lie in the checkpoints; None where measuring the recording now would
+        use other frames or readings than those that came in time.
+
+        Raises InputError where the pictures contradict a sensor.
+        """
+        recording = self._pairs.recording
+        stamps = [stamp_ns for stamp_ns, _ in self._known]
+        if stamps != list(recording.index.stamps_ns):
+            return None
+        if any(self._counts(stamp_ns) != known for stamp_ns, known in self._known):
+            return None
+
+        def finish() -> Trajectory:
+            self._follow()
+            return self.poses.finish()
+
+        return checkpointed(self._checkpoints, trajectory_name(recording, self.poses.delay_ns), finish)
+
+    def _follow(self) -> PosedFrame | RefusedFrame | None:
+        """Estimate the poses that weren't yet; return the last one."""
+        posed = None
+        for seen in self._unfollowed:
+            (pair,) = (seen,) if isinstance(seen, RefusedFrame) else self._pairs(frozenset((seen,)))
+            posed = self.poses.push(pair)
+        self._unfollowed.clear()
+        return posed
+
+    def _counts(self, stamp_ns: int) -> tuple[int, ...]:
+        """Count the readings of each sensor that have come of those that a frame needs."""
+        due_ns = stamp_ns + self._pairs.recording.rig.timeshift_cam_imu_ns + (self.poses.delay_ns or 0)
+        readings = sensor_readings(self._pairs.recording)
+        return tuple(int(np.searchsorted(stamps, due_ns, side="right")) for stamps, *_ in readings)
+
+
+class LiveMap:
+    """Places pairs as they come and fuses them; `folder` takes its tiles and surfaces.
+
+    With settings that make poses final at once (`is_final`), `end` leaves the trajectory and the map in
+    `checkpoints`, as measuring the same pairs makes them.
+    """
+
+    def __init__(
+        self, pairs: RectifiedPairs, settings: MeasureSettings, folder: Path, checkpoints: Path | None,
+        placer: PairPlacer, match: Callable[[RectifiedPair], MatchedFrame | Refusal],
+    ) -> None:  # fmt: skip
+        self._pairs, self._settings, self._folder, self._match = pairs, settings, folder, match
+        self._reference = "world" if pairs.recording.crane() is None else "yard"
+        self._placer = placer
+        self._checkpoints = checkpoints if is_final(settings) else None
+        self._waiting: list[tuple[RectifiedPair, PosedFrame]] = []
+        self._passed: tuple[RectifiedPair, PosedFrame] | None = None
+        self._taken: list[PosedFrame] = []
+        self._map: tuple[MapBuilder, PointBinner] | None = None
+        self._min_way_m, self._ahead = 0.0, np.zeros(3)
         self._last: Float64 | None = None
 
-    def add(self, pair: RectifiedPair, posed: PosedFrame) -> None:
-        """Match a pair and fuse it, unless its picture has hardly moved."""
-        seen = (posed.reference_from_body @ self._rectifier.body_from_rect0).apply(self._ahead)
-        if self._last is not None and np.linalg.norm(seen - self._last) < self._min_way_m:
+    @property
+    def delay_ns(self) -> int:
+        """Return how much later than itself the readings come that a frame needs."""
+        return self._placer.poses.delay_ns or 0
+
+    @property
+    def stamps_ns(self) -> list[int]:
+        """Return the stamps of the frames fused so far."""
+        return [] if self._map is None else self._map[0].stamps_ns
+
+    def add(self, pair: RectifiedPair | RefusedFrame) -> None:
+        """Place the next pair, and fuse the one before; pairs wait as long as none of them can be matched,
+        and one whose picture has hardly moved is left out.
+        """
+        posed = self._placer.push(pair)
+        if not isinstance(posed, PosedFrame) or not isinstance(pair, RectifiedPair):
             return
-        if not isinstance(self._views.add(self._match(pair), posed), Refusal):
-            self._last = seen
-            self._election.settle(self._settings.min_views, self._frusta)
+        way = Trajectory(self._reference, (posed,), (), ())
+        (placed,) = placed_in_yard(way, frame_of(self._pairs.recording)).frames
+        self._waiting.append((pair, placed))
+        if self._map is None:
+            try:
+                self._map = self._begun()
+            except MeasurementError:
+                return
+        for waiting in self._waiting:
+            self._take(self._map[0], *waiting)
+        self._waiting.clear()
 
     def snapshot(self, owner: object) -> Snapshot:
         """Elect the surface as it stands; only tiles that changed since the last one are elected anew."""
-        placed = self._views.placed
-        if len(placed) < 2:
-            return Snapshot(None, len(placed))
-        surface = self._election.snapshot(self._settings.min_views, self._frusta())
-        return Snapshot(surface, len(placed), owner)
+        frames = len(self.stamps_ns)
+        if self._map is None or frames < 2:
+            return Snapshot(None, frames)
+        return Snapshot(self._map[0].snapshot(), frames, owner)
 
-    def _frusta(self) -> ViewFrusta:
-        return ViewFrusta.of(self._views.placed, self._rectifier.camera, self._per_pixel)
+    def end(self) -> None:
+        """Leave trajectory and map in the checkpoints, if all readings were there when they were needed.
+
+        Raises InputError where the pictures contradict a sensor.
+        """
+        if self._checkpoints is None or self._map is None or self._placer.finish() is None:
+            return
+        (builder, binner), last = self._map, self._passed
+        if last is not None:
+            builder.add(self._match(last[0]), last[1])
+            self._taken.append(last[1])
+        builder.fuse_last()
+        if builder.placed:
+            checkpointed(self._checkpoints, map_name(tuple(self._taken), binner), builder.finish)
+
+    def _begun(self) -> tuple[MapBuilder, PointBinner]:
+        settings, rectifier = self._settings, self._pairs.rectifier
+        first, cell_m, sigma_px = look_at(self._pairs, settings, self._checkpoints)
+        self._min_way_m = keyframe_spacing_m(rectifier.camera, first.range_m, settings.map.min_shift)
+        self._ahead = np.array([0.0, 0.0, first.range_m])
+        binner = PointBinner(
+            replace(settings.stereo, calibration_sigma_px=sigma_px), rectifier.body_from_rect0, cell_m,
+            points_per_pixel(first, cell_m), settings.map.max_sigma_m, Stopwatch(),
+        )  # fmt: skip
+        yard = frame_of(self._pairs.recording)
+        return MapBuilder(binner, rectifier.camera, self._folder, settings.map, yard), binner
+
+    def _take(self, builder: MapBuilder, pair: RectifiedPair, posed: PosedFrame) -> None:
+        """Match a pair and add it to the map, unless its picture has hardly moved."""
+        seen = (posed.reference_from_body @ self._pairs.rectifier.body_from_rect0).apply(self._ahead)
+        if self._last is not None and np.linalg.norm(seen - self._last) < self._min_way_m:
+            self._passed = pair, posed
+            return
+        self._last, self._passed = seen, None
+        builder.add(self._match(pair), posed)
+        self._taken.append(posed)
+        builder.settle()
+
+
+def is_final(settings: MeasureSettings) -> bool:
+    """Tell whether each pair's pose and disparity are final at once, as measured at the end."""
+    return make_estimator(settings.motion).begins_early and settings.self_calibrate == "none"

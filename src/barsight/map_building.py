@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
-from itertools import chain, islice, pairwise, takewhile
+from itertools import chain, islice, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ import numpy as np
 import barsight
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.calibration.stereo.disparity_uncertainty import disparity_sigma_px, rig_covariance
-from barsight.checkpoint import checkpoint_folder, checkpointed, pictures_digest
+from barsight.checkpoint import checkpoint_folder, checkpointed, pictures_digest, trajectory_name
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed, InputError, MeasurementError
 from barsight.core.json_values import json_digest, json_value
@@ -23,7 +23,7 @@ from barsight.core.notices import Notice
 from barsight.core.parallel import WORKERS, prefetched_map
 from barsight.core.pose import Pose
 from barsight.core.timing import Stopwatch, count_frames
-from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame, Trajectory
+from barsight.core.types import PosedFrame, RectifiedCamera, RectifiedPair, RefusedFrame, Trajectory
 from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.fusion import fuse_view
 from barsight.mapping.keyframes import select_keyframes, select_keyframes_by_encoders
@@ -35,11 +35,13 @@ from barsight.mapping.recording_probe import (
 )
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.surface.height_selection import ViewFrusta
+from barsight.mapping.surface.incremental import SurfaceElection
+from barsight.mapping.surface.surface import Surface
 from barsight.mapping.tiles import TileStore
 from barsight.mapping.top_photo import TopPhoto
-from barsight.mapping.view import MatchedFrame, Matcher, Neighbour, PointBinner, PosedView
+from barsight.mapping.view import MatchedFrame, Matcher, PointBinner, PosedView
 from barsight.measure_settings import MeasureSettings
-from barsight.measurement import Preview, Refusal
+from barsight.measurement import BuiltMap, Preview, Refusal
 from barsight.motion.rig_check.self_calibration import residual_covariance, self_calibrate
 from barsight.motion.settings import make_estimator
 from barsight.pair_chain import PairChain
@@ -100,48 +102,93 @@ class TrackedRecording:
     matched: Iterator[MatchedFrame | Refusal]
 
 
-@dataclass(frozen=True, eq=False)
-class BuiltMap:
-    """All views' votes. placed: reference_from_rect0 of the views used, stamps_ns theirs. preview: of a view
-    in the middle.
-    """
-
-    store: TileStore
-    free: FreeSpace
-    tops: TopPhoto
-    placed: tuple[Pose, ...]
-    stamps_ns: tuple[int, ...]
-    refusals: tuple[Refusal, ...]
-    preview: Preview | None
+PlacedFrame = tuple[MatchedFrame | Refusal, PosedFrame]
 
 
-class FusedViews:
-    """Fuses posed views, one after the other, into the tiles of `store`.
+class MapBuilder:
+    """Fuses posed frames, one after the other, into the tiles of `folder`, and carves their lines of sight.
 
-    placed: reference_from_rect0 of the views used, stamps_ns theirs.
+    A frame waits for the one after it: against both its neighbours the crane's own parts stand still. placed:
+    reference_from_rect0 of the views used, stamps_ns theirs.
     """
 
     def __init__(
-        self, binner: PointBinner, store: TileStore, settings: MapSettings, yard: YardFrame | None = None
-    ) -> None:
-        self._binner, self.store, self._settings, self._yard = binner, store, settings, yard
+        self, binner: PointBinner, camera: RectifiedCamera, folder: Path, settings: MapSettings,
+        yard: YardFrame | None = None,
+    ) -> None:  # fmt: skip
+        self._binner, self._camera, self._settings, self._yard = binner, camera, settings, yard
+        self._store = TileStore(folder, settings.resident_tiles)
+        self._election = SurfaceElection(self._store, folder, binner.cell_m, settings)
+        self._free, self._tops = FreeSpace(binner.cell_m), TopPhoto(binner.cell_m)
+        self._before: PlacedFrame | None = None
+        self._waiting: PlacedFrame | None = None
+        self._previews: list[tuple[int, Preview]] = []
         self.placed: list[Pose] = []
         self.stamps_ns: list[int] = []
+        self.refusals: list[Refusal] = []
 
-    def add(
-        self, frame: MatchedFrame | Refusal, posed: PosedFrame, beside: Sequence[Neighbour] = ()
-    ) -> PosedView | Refusal:
-        """Bin a matched frame's points at its pose and fuse them. beside: see `PointBinner`."""
+    def add(self, frame: MatchedFrame | Refusal, posed: PosedFrame) -> None:
+        """Take the next frame, and fuse the one before."""
+        self._fuse_waiting((frame, posed))
+        self._before, self._waiting = self._waiting, (frame, posed)
+
+    def settle(self) -> None:
+        """Elect the tiles that the views have left; called after each view, it leaves less for the end."""
+        self._election.settle(self._min_views, self._frusta)
+
+    def snapshot(self) -> Surface:
+        """Elect the surface as it stands; only tiles that changed since the last one are elected anew."""
+        return self._election.snapshot(self._min_views, self._frusta())
+
+    def fuse_last(self) -> None:
+        """Fuse the frame that waits: none comes after it."""
+        self._fuse_waiting(None)
+        self._before = self._waiting = None
+
+    def finish(self) -> BuiltMap:
+        """Elect the surface of all views, of which there is one at least; the tiles are given up."""
+        with self._binner.watch("surface"):
+            surface = self._election.finish(self._min_views, self._frusta())
+        trim_heap()
+        middle = len(self.placed) / 2
+        _, preview = min(self._previews, key=lambda one: abs(one[0] - middle))
+        return BuiltMap(
+            surface, self._free, self._tops, tuple(self.placed), tuple(self.stamps_ns), tuple(self.refusals),
+            preview,
+        )  # fmt: skip
+
+    @property
+    def _min_views(self) -> int:
+        return self._settings.min_views if len(self.placed) > 1 else 1
+
+    def _frusta(self) -> ViewFrusta:
+        return ViewFrusta.of(self.placed, self._camera, self._binner.per_pixel)
+
+    def _fuse_waiting(self, after: PlacedFrame | None) -> None:
+        """Bin the points of the frame that waits and fuse them."""
+        if self._waiting is None:
+            return
+        frame, posed = self._waiting
+        both = (other for other in (self._before, after) if other is not None)
+        beside = [(other, pose) for other, pose in both if not isinstance(other, Refusal)]
         view = frame if isinstance(frame, Refusal) else self._binner(frame, posed, beside)
         if isinstance(view, Failed):
-            return Refusal("stereo", RefusedFrame(posed.stamp_ns, view.reason))
-        if isinstance(view, PosedView):
-            view = self._with_shared(view, posed)
-            with self._binner.watch("fuse", 1):
-                fuse_view(self.store, view.cells, self._settings)
-            self.placed.append(posed.reference_from_body @ self._binner.body_from_rect0)
-            self.stamps_ns.append(posed.stamp_ns)
-        return view
+            view = Refusal("stereo", RefusedFrame(posed.stamp_ns, view.reason))
+        if isinstance(view, Refusal):
+            self.refusals.append(view)
+            return
+        view, watch = self._with_shared(view, posed), self._binner.watch
+        with watch("fuse", 1):
+            fuse_view(self._store, view.cells, self._settings)
+        self.placed.append(posed.reference_from_body @ self._binner.body_from_rect0)
+        self.stamps_ns.append(posed.stamp_ns)
+        with watch("free space", 1):
+            self._free.carve(view.cells, ViewFrusta.of(self.placed[-1:], self._camera).eyes[0])
+        with watch("top photo", 1):
+            self._tops.add(view.cells, view.pair, self.placed[-1])
+        count = len(self.placed)
+        if count & (count - 1) == 0:
+            self._previews = [*self._previews[-1:], (count, Preview(view.pair.left, view.disparity_px))]
 
     def _with_shared(self, view: PosedView, posed: PosedFrame) -> PosedView:
         """Add what the yard frame may be off to what the heights' errors share."""
@@ -174,14 +221,24 @@ def inspect_recording(
         checkpoints = checkpoint_folder(resume, checkpoint_key(recording, configuration, placed))
     with watch("look"):
         pairs = RectifiedPairs(source, Rectifier(source.rig), checkpoints or scratch, watch)
-        first = probe_recording(pairs)
-        cell_m = settings.map.cell_m or choose_cell_size(first, has_crane=source.crane() is not None)
-    known_px = disparity_sigma_px(settings.recording.rig, first.range_m)
-    calibration_px = settings.stereo.calibration_sigma_px if known_px is None else known_px
+        first, cell_m, calibration_px = look_at(pairs, settings, checkpoints)
     return ProbedRecording(
         source, pairs, first, cell_m, calibration_px, doubts(source), configuration, inputs, checkpoints,
         watch,
     )  # fmt: skip
+
+
+def look_at(
+    pairs: RectifiedPairs, settings: MeasureSettings, checkpoints: Path | None
+) -> tuple[RecordingProbe, float, float]:
+    """Look at the first usable pair; return what it shows, the side of the map's cells (m) and the sigma of
+    the disparity by the calibration (px).
+    """
+    first = checkpointed(checkpoints, "look", lambda: probe_recording(pairs))
+    has_crane = pairs.recording.crane() is not None
+    cell_m = settings.map.cell_m or choose_cell_size(first, has_crane=has_crane)
+    known_px = disparity_sigma_px(settings.recording.rig, first.range_m)
+    return first, cell_m, settings.stereo.calibration_sigma_px if known_px is None else known_px
 
 
 @contextmanager
@@ -200,8 +257,9 @@ def estimate_trajectory(
             estimate = make_estimator(settings.motion)
             count = count_frames("trajectory", total, advance)
             with _naming(probed):
+                name = trajectory_name(source, estimate.delay_ns)
                 trajectory = checkpointed(
-                    probed.checkpoints, "trajectory", lambda: estimate(source, rectifier, count, pairs)
+                    probed.checkpoints, name, lambda: estimate(source, rectifier, count, pairs)
                 )
             trajectory = placed_in_yard(trajectory, frame_of(source))
             trim_heap()
@@ -248,41 +306,44 @@ def build_map(
     scratch: Path,
     advance: ProgressCallback,
 ) -> BuiltMap:
-    """Fuse each matched pair into the map's tiles, and carve its lines of sight.
+    """Build the map of all matched pairs, or take the one that is kept of just these at these poses.
 
-    Raises MeasurementError where no frame could be measured.
+    Raises MeasurementError where no frame could be measured, or no place was seen often enough.
     """
-    source, watch = probed.source, probed.watch
-    camera = way.rectifier.camera
+    source, path = probed.source, probed.source.path
     refusals = [Refusal("recording", frame) for frame in source.index.unpaired]
     refusals += [Refusal("trajectory", frame) for frame in way.trajectory.refused]
     binner = PointBinner(
         way.stereo, way.rectifier.body_from_rect0, probed.cell_m, probed.per_pixel, settings.map.max_sigma_m,
-        watch,
+        probed.watch,
     )  # fmt: skip
-    views = FusedViews(
-        binner, TileStore(scratch, settings.map.resident_tiles), settings.map, frame_of(source)
-    )
-    free, tops, preview = FreeSpace(probed.cell_m), TopPhoto(probed.cell_m), None
-    for done, (frame, posed, neighbours) in enumerate(_placed(way.matched, way.poses), start=1):
-        view = views.add(frame, posed, neighbours)
-        if isinstance(view, Refusal):
-            refusals.append(view)
-        else:
-            with watch("free space", 1):
-                free.carve(view.cells, ViewFrusta.of(views.placed[-1:], camera).eyes[0])
-            with watch("top photo", 1):
-                tops.add(view.cells, view.pair, views.placed[-1])
-            if preview is None or abs(done - len(way.poses) / 2) < 1:
-                preview = Preview(view.pair.left, view.disparity_px)
-        if done % _TIDIED_EVERY == 1:
-            trim_heap()
-        advance("map", done, len(way.poses))
-    if not views.placed:
-        raise MeasurementError(f"{source.path}: no frame could be measured; {_first_reason(refusals)}")
-    return BuiltMap(
-        views.store, free, tops, tuple(views.placed), tuple(views.stamps_ns), tuple(refusals), preview
-    )  # fmt: skip
+
+    def build() -> BuiltMap:
+        builder = MapBuilder(binner, way.rectifier.camera, scratch, settings.map, frame_of(source))
+        known = (frame for frame in way.matched if frame.stamp_ns in way.poses)
+        for done, frame in enumerate(known, start=1):
+            builder.add(frame, way.poses[frame.stamp_ns])
+            if done % _TIDIED_EVERY == 1:
+                trim_heap()
+            advance("map", done, len(way.poses))
+        builder.fuse_last()
+        if not builder.placed:
+            reason = _first_reason([*refusals, *builder.refusals])
+            raise MeasurementError(f"{path}: no frame could be measured; {reason}")
+        return builder.finish()
+
+    name = map_name(tuple(way.poses.values()), binner)
+    built = checkpointed(probed.checkpoints, name, build)
+    if built.surface.seen == 0:
+        least = settings.map.min_views if len(built.placed) > 1 else 1
+        raise MeasurementError(f"{path}: no place was seen by {least} frames; lower map.min_views")
+    return replace(built, refusals=(*refusals, *built.refusals))
+
+
+def map_name(poses: tuple[PosedFrame, ...], binner: PointBinner) -> str:
+    """Name the checkpoint of the map of frames at these poses by what it rests on beside `checkpoint_key`."""
+    asked = [binner.stereo.calibration_sigma_px, binner.cell_m, binner.per_pixel]
+    return f"map_{json_digest([json_value(poses), asked])[:32]}"
 
 
 def checkpoint_key(recording: Recording, configuration: dict[str, Any], inputs: dict[str, str]) -> str:
@@ -329,19 +390,6 @@ def _matched_ahead(
     chains = max(max_waiting // match.length, WORKERS)
     with prefetched_map(match.match_all, match.split(pairs), chains) as matched:
         yield chain.from_iterable(matched)
-
-
-def _placed(
-    matched: Iterator[MatchedFrame | Refusal], poses: dict[int, PosedFrame]
-) -> Iterator[tuple[MatchedFrame | Refusal, PosedFrame, list[Neighbour]]]:
-    """Yield the posed frames, each with those before and after it."""
-    known = ((frame, poses[frame.stamp_ns]) for frame in matched if frame.stamp_ns in poses)
-    before = None
-    for here, after in pairwise(chain(known, (None,))):
-        assert here is not None
-        both = (other for other in (before, after) if other is not None)
-        yield *here, [(frame, pose) for frame, pose in both if not isinstance(frame, Refusal)]
-        before = here
 
 
 def _first_reason(refusals: list[Refusal]) -> str:

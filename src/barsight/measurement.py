@@ -8,10 +8,13 @@ from typing import Any
 
 from barsight.core.arrays import Float32, Float64, UInt8
 from barsight.core.notices import Notice
+from barsight.core.pose import Pose
 from barsight.core.types import Agreement, Contour, LaserProfile, RefusedFrame, Trajectory
+from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.passes.changes import BundleMove, HeightChange
 from barsight.mapping.surface.laser_check import LaserCheck
 from barsight.mapping.surface.surface import Surface
+from barsight.mapping.top_photo import TopPhoto
 from barsight.registration.pass_ties import PairTie, PassCorrection
 from barsight.yard.inventory.stock_list import StockMatch
 from barsight.yard.lifting.targets import LiftPlan
@@ -47,6 +50,21 @@ class Preview:
 
     left: UInt8
     disparity_px: Float32
+
+
+@dataclass(frozen=True, eq=False)
+class BuiltMap:
+    """All views' map. placed: reference_from_rect0 of the views used, stamps_ns theirs. preview: of a view
+    about the middle.
+    """
+
+    surface: Surface
+    free: FreeSpace
+    tops: TopPhoto
+    placed: tuple[Pose, ...]
+    stamps_ns: tuple[int, ...]
+    refusals: tuple[Refusal, ...]
+    preview: Preview | None
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,7 +41,7 @@ class PairChain:
         """Match a pair of the recording."""
         if self.length == 1:
             return self._matched(pair, None)
-        place = self._place(pair)
+        place = self._place(pair.stamp_ns)
         chain = place // self.length
         with self._turns.setdefault(chain, Lock()):
             frame = self._at(pair, place)
@@ -58,11 +58,15 @@ class PairChain:
         self, pairs: Iterable[RectifiedPair | RefusedFrame]
     ) -> Iterator[list[RectifiedPair | RefusedFrame]]:
         """Split pairs in time's order into those of each chain, which can be matched side by side."""
-        for _, together in groupby(pairs, lambda pair: self._place(pair) // self.length):
+        for _, together in groupby(pairs, lambda pair: self.chain(pair.stamp_ns)):
             yield list(together)
 
-    def _place(self, pair: RectifiedPair | RefusedFrame) -> int:
-        return bisect_left(self._pairs.recording.index.stamps_ns, pair.stamp_ns)
+    def chain(self, stamp_ns: int) -> int:
+        """Number the chain that a pair is of: chains can be matched side by side."""
+        return self._place(stamp_ns) // self.length
+
+    def _place(self, stamp_ns: int) -> int:
+        return bisect_left(self._pairs.recording.index.stamps_ns, stamp_ns)
 
     def _at(self, pair: RectifiedPair | RefusedFrame, place: int) -> MatchedFrame | Refusal:
         chain = place // self.length

@@ -15,9 +15,9 @@ from typing import Literal
 
 import numpy as np
 
-from barsight.core.errors import InputError, MeasurementError
+from barsight.core.errors import InputError
 from barsight.core.json_values import json_digest, json_value
-from barsight.core.memory import peak_memory_mib, trim_heap
+from barsight.core.memory import peak_memory_mib
 from barsight.core.notices import Notice
 from barsight.core.stamps import seconds_to_ns
 from barsight.core.timing import Stopwatch
@@ -25,7 +25,6 @@ from barsight.core.types import Trajectory
 from barsight.joined_passes import JoinedPasses, MappedPass, in_order, join_passes
 from barsight.labels.bundle_labels import expect_readers, label_bundles
 from barsight.map_building import (
-    BuiltMap,
     ProbedRecording,
     ProgressCallback,
     TrackedRecording,
@@ -35,13 +34,11 @@ from barsight.map_building import (
 )
 from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.passes.changes import PlaceHistory
-from barsight.mapping.surface.height_selection import ViewFrusta
-from barsight.mapping.surface.incremental import SurfaceElection
 from barsight.mapping.surface.laser_profiles import Profiles, cut_profiles
 from barsight.mapping.surface.surface import Surface
 from barsight.mapping.top_photo import TopPhoto
 from barsight.measure_settings import MeasureSettings
-from barsight.measurement import Measurement, PassRecord, StageTime
+from barsight.measurement import BuiltMap, Measurement, PassRecord, StageTime
 from barsight.recording.base import Recording
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.inventory.stock_list import (
@@ -150,8 +147,7 @@ def map_yard(
         probed = inspect_recording(recording, settings, own, kept)
         with estimate_trajectory(probed, settings, advance) as way:
             built = build_map(probed, way, settings, own, advance)
-        with probed.watch("surface"):
-            surfaces.append(_elect(probed, way, built, settings, own))
+        surfaces.append(built.surface)
         passes.append(MappedPass(probed, way, built))
         if several:
             _expect_same_cells(passes)
@@ -307,22 +303,6 @@ def _records(mapped: MappedYard, travels: Sequence[Travel]) -> tuple[PassRecord,
             zip(mapped.passes, travels, ties.corrections, strict=True)
         )
     )  # fmt: skip
-
-
-def _elect(
-    probed: ProbedRecording, way: TrackedRecording, built: BuiltMap, settings: MeasureSettings, scratch: Path
-) -> Surface:
-    """Elect the surface of all views. Raises MeasurementError where no place was seen often enough."""
-    min_views = settings.map.min_views if len(built.placed) > 1 else 1
-    frusta = ViewFrusta.of(built.placed, way.rectifier.camera, probed.per_pixel)
-    election = SurfaceElection(built.store, scratch, probed.cell_m, settings.map)
-    surface = election.finish(min_views, frusta)
-    trim_heap()
-    if surface.seen == 0:
-        raise MeasurementError(
-            f"{probed.source.path}: no place was seen by {min_views} frames; lower map.min_views"
-        )
-    return surface
 
 
 def _warnings(mapped: MappedYard) -> list[Notice]:

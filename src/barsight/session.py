@@ -13,20 +13,19 @@ from typing import Any
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.calibration.geometry.rig import StereoRig
-from barsight.checkpoint import checkpoint_folder, checkpointed
+from barsight.checkpoint import checkpoint_folder
 from barsight.core.compiling.ahead import compile_ahead
 from barsight.core.errors import ConfigError, MeasurementError
 from barsight.core.json_values import json_value
 from barsight.core.settings.values import build_settings
 from barsight.core.stamps import NS_PER_S
 from barsight.core.timing import Stopwatch
-from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame, StereoFrame
-from barsight.live_map import LiveMap, Snapshot
+from barsight.core.types import RectifiedPair, RefusedFrame, StereoFrame
+from barsight.live_map import LiveMap, PairPlacer, Snapshot, is_final
 from barsight.map_building import checkpoint_key, matching
 from barsight.measure_folder import ignore_progress, write_measured
 from barsight.measure_settings import MeasureSettings
-from barsight.motion.estimator import PoseEstimator
-from barsight.motion.settings import make_early_estimator, make_estimator
+from barsight.motion.settings import make_early_estimator
 from barsight.pipeline import LiftRequest
 from barsight.recording.packets import Packet, PacketRecording
 from barsight.recording.rectified_pairs import RectifiedPairs
@@ -87,7 +86,6 @@ class Session:
         checkpoints = self._checkpoints if self._settings.self_calibrate == "none" else None
         self._match = matching(self._pairs, self._settings, checkpoints, Stopwatch())
         self._waiting: deque[RectifiedPair | RefusedFrame] = deque()
-        self._poses: PoseEstimator | None = None
         self._map: LiveMap | None = None
 
     def push(self, packet: Packet) -> None:
@@ -136,11 +134,11 @@ class Session:
         return Yard(self._yard, self)
 
     def _end_pass(self) -> None:
-        if make_estimator(self._settings.motion).begins_early:
+        if is_final(self._settings):
             while self._waiting:
                 self._place(self._waiting.popleft())
-            if self._poses is not None:
-                checkpointed(self._checkpoints, "trajectory", self._poses.finish)
+            if self._map is not None:
+                self._map.end()
 
     def _expect_open(self) -> None:
         if self._yard.exists():
@@ -152,22 +150,16 @@ class Session:
         last_ns = self._recording.last_frame_ns
         if last_ns is not None and last_ns >= stamp_ns + GRACE_NS:
             return True
-        if self._poses is None:
+        if self._map is None:
             return False
-        due_ns = stamp_ns + shift_ns + (self._poses.delay_ns or 0)
+        due_ns = stamp_ns + shift_ns + self._map.delay_ns
         return all(last >= due_ns for last in self._recording.last_readings_ns(self._settings.use))
 
     def _place(self, pair: RectifiedPair | RefusedFrame) -> None:
-        if self._poses is None:
+        if self._map is None:
             has_crane = self._source.crane() is not None
             estimator = make_early_estimator(self._settings.motion, has_crane=has_crane)
-            self._poses = estimator.begin(self._source, self._pairs.rectifier)
-        posed = self._poses.push(pair)
-        if not isinstance(posed, PosedFrame) or not isinstance(pair, RectifiedPair):
-            return
-        if self._map is None:
-            try:
-                self._map = LiveMap(self._pairs, self._settings, self._here, self._match)
-            except MeasurementError:
-                return
-        self._map.add(pair, posed)
+            kept = self._checkpoints if is_final(self._settings) else None
+            placer = PairPlacer(self._pairs, estimator, kept)
+            self._map = LiveMap(self._pairs, self._settings, self._here, kept, placer, self._match)
+        self._map.add(pair)

@@ -101,10 +101,6 @@ class Link:
         """Return the file of a kept pair's pictures as they came, until they are recorded."""
         return self.folder / f"raw_{stamp_ns}.npy"
 
-    def posed_file(self, stamp_ns: int) -> Path:
-        """Return the file of a kept frame's pose."""
-        return self.checkpoints / f"posed_{stamp_ns}.npz"
-
 
 @dataclass(frozen=True, eq=False)
 class KeptRecording(RecordingProxy):

@@ -2,32 +2,51 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
 import os
 import time
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 
 from barsight.calibration.geometry.rectification import Rectifier
-from barsight.checkpoint import read_checkpoint
 from barsight.core.compiling.ahead import load_kernels
 from barsight.core.errors import BarsightError, MeasurementError
 from barsight.core.memory import trim_heap
+from barsight.core.parallel import WORKERS
+from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.timing import Stopwatch
 from barsight.core.types import RectifiedPair
 from barsight.live.link import GrowingRecording, Link
-from barsight.live_map import LiveMap
+from barsight.live.shared.counters import DRAIN
+from barsight.live_map import LiveMap, PairPlacer, is_final
 from barsight.map_building import matching
+from barsight.mapping.view import MatchedFrame
+from barsight.measurement import Refusal
+from barsight.motion.fixed_lag.sensor_buffer import SENSOR_DELAY_S
+from barsight.motion.settings import make_estimator
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.recording.sensor_selection import SelectedSensors
 from barsight.report.result_files import write_height
 from barsight.yard_frame import in_yard, placing_id
 
 POLL_S = 0.02
+AHEAD = 12
+"""Keyframes that are matched beside what else is done, the one whose turn it is among them: two chains."""
+SHOW_EVERY_S = 5.0
+"""The heights so far are written at most this often: keyframes go first."""
+TIDIED_EVERY = 8
+"""Keyframes between which freed memory may pile up."""
+GRACE_NS = NS_PER_S
+"""A keyframe waits for readings until one so much later is there."""
+DELAY_NS = seconds_to_ns(SENSOR_DELAY_S)
 NICENESS = 10
 """Poses go before maps, where cores are few."""
 LIVE_MAP = "live_height.tif"
 
 
 def build_live_map(link: Link) -> None:
-    """Map keyframes until the supervisor says so."""
+    """Map keyframes until the supervisor says so, then those that are left where the map is final."""
     os.nice(NICENESS)
     board = link.open_counters()
     load_kernels("measure")
@@ -35,66 +54,94 @@ def build_live_map(link: Link) -> None:
     board["map", "mapped"] = board["map", "refused"] = 0
     board.beat("map")
     board["map", "ready"] = 1
-    shown = 0
-    while not board["supervisor", "stop"]:
+    shown, shown_s = 0, -math.inf
+    while True:
         board.beat("map")
+        is_last = board["supervisor", "stop"] == DRAIN
         board["map", "backlog"] = mapping.read_queue()
-        if mapping.queue:
-            board.add("map", "mapped" if mapping.add_next() else "refused")
-            continue
-        if board["map", "mapped"] > max(shown, 1):
-            shown = board["map", "mapped"]
+        if is_last and not (mapping.is_final and mapping.queue):
+            break
+        if mapping.is_due(ended=is_last or bool(board["capture", "ended"])):
+            board["map", "mapped"] = mapping.add_next()
+        elif (
+            board["map", "mapped"] > max(shown, 1) and not mapping.queue
+            and time.monotonic() - shown_s >= SHOW_EVERY_S
+        ):  # fmt: skip
+            shown, shown_s = board["map", "mapped"], time.monotonic()
             if mapping.show():
                 board.add("map", "snapshots")
-            continue
-        time.sleep(POLL_S)
+        else:
+            time.sleep(POLL_S)
+    mapping.end()
 
 
 class Mapping:
-    """A `LiveMap` of the keyframes so far. queue: those that wait, each as stamp and exposure.
+    """A `LiveMap` of the keyframes so far. queue: stamps of those that wait.
 
     A process begun anew fuses all again: their disparities are there.
     """
 
     def __init__(self, link: Link, recording: GrowingRecording) -> None:
-        self._link, self._recording = link, recording
-        source = in_yard(SelectedSensors(recording, link.settings.use), link.settings.yard)
+        self._link, self._recording, settings = link, recording, link.settings
+        source = in_yard(SelectedSensors(recording, settings.use), settings.yard)
         self._pairs = RectifiedPairs(source, Rectifier(recording.rig), link.checkpoints)
         placed = placing_id(source)
         self._frame_id = "world" if placed is None else f"yard:{placed}"
-        checkpoints = link.checkpoints if link.settings.self_calibrate == "none" else None
-        self._match = matching(self._pairs, link.settings, checkpoints, Stopwatch())
+        self.is_final = is_final(settings)
+        checkpoints = link.checkpoints if settings.self_calibrate == "none" else None
+        self._match = matching(self._pairs, settings, checkpoints, Stopwatch())
+        self._ahead = [ThreadPoolExecutor(1) for _ in range(WORKERS)]
+        self._matched: dict[int, Future[MatchedFrame | Refusal]] = {}
         self._frames, self._tiles = link.frames(), link.tiles()
-        self._done = {stamp for stamp, _, _ in self._tiles.read()}
-        self.queue: list[tuple[int, int]] = []
+        self._told = {stamp for stamp, _, _ in self._tiles.read()}
+        self._exposed: dict[int, int] = {}
+        self.queue: list[int] = []
         self._map: LiveMap | None = None
 
     def read_queue(self) -> int:
-        """Read what was kept since; return how many keyframes with a pose wait."""
+        """Read what was kept since; return how many keyframes wait."""
         self._recording.grow()
-        for stamp, exposed_ns, _, is_kept, has_pose in self._frames.read():
+        for stamp, exposed_ns, _, is_kept, _ in self._frames.read():
             if is_kept:
                 self._recording.stamps_ns.append(stamp)
-            if is_kept and has_pose:
-                self.queue.append((stamp, exposed_ns))
+                self._exposed[stamp] = exposed_ns
+                self.queue.append(stamp)
         return len(self.queue)
 
-    def add_next(self) -> bool:
-        """Match and fuse the keyframe that waits longest; return whether it is in the map."""
-        stamp, exposed_ns = self.queue.pop(0)
-        (pair,) = self._pairs(frozenset((stamp,)))
-        if not isinstance(pair, RectifiedPair):
+    def is_due(self, *, ended: bool) -> bool:
+        """Tell whether the keyframe that waits longest has all the readings that place it, or won't get more:
+        later frames are there, or capture has ended.
+        """
+        if not self.queue:
             return False
+        if ended or self._recording.stamps_ns[-1] >= self.queue[0] + GRACE_NS:
+            return True
+        delay_ns = DELAY_NS if self._map is None else self._map.delay_ns
+        due_ns = self.queue[0] + self._recording.rig.timeshift_cam_imu_ns + delay_ns
+        last, sensors = self._recording.last_readings_ns(), self._link.sensors(self._recording.whole)
+        return all(last.get(sensor, 0) >= due_ns for sensor in sensors)
+
+    def add_next(self) -> int:
+        """Place and fuse the keyframe that waits longest, while those after it are matched; return how many
+        are in the map.
+        """
+        # Where not all pairs are matched, only the place of each tells which are.
+        for stamp in self.queue[:AHEAD] if self._link.settings.map.min_shift == 0 else ():
+            if stamp not in self._matched:
+                worker = self._ahead[self._match.chain(stamp) % WORKERS]
+                self._matched[stamp] = worker.submit(self._match_stamp, stamp)
+        stamp = self.queue.pop(0)
+        (pair,) = self._pairs(frozenset((stamp,)))
         try:
             if self._map is None:
-                self._map = LiveMap(self._pairs, self._link.settings, self._link.folder, self._match)
-            self._map.add(pair, read_checkpoint(self._link.posed_file(stamp)))
+                self._map = self._begun()
+            self._map.add(pair)
         except MeasurementError:
-            return False
-        if stamp not in self._done:
-            self._tiles.append((stamp, exposed_ns, time.monotonic_ns()))
-        trim_heap()
-        return True
+            return 0
+        self._tell_fused()
+        if len(self._told) % TIDIED_EVERY == 0:
+            trim_heap()
+        return len(self._map.stamps_ns)
 
     def show(self) -> bool:
         """Write the heights so far for readers; return whether there are any."""
@@ -107,3 +154,36 @@ class Mapping:
             return False
         write_height(surface, self._link.folder.parent / LIVE_MAP, self._frame_id)
         return True
+
+    def end(self) -> None:
+        """Leave trajectory and map for what measures what was kept; where that can't be, it says why."""
+        if self._map is not None and self.is_final:
+            with contextlib.suppress(BarsightError):
+                self._map.end()
+            self._tell_fused()
+        for worker in self._ahead:
+            worker.shutdown(cancel_futures=True)
+
+    def _begun(self) -> LiveMap:
+        """Begin with the poses that track has found, as far as it had the same pairs and readings."""
+        link = self._link
+        estimator = make_estimator(replace(link.settings.motion, estimator="live"))
+        placer = PairPlacer(self._pairs, estimator, link.checkpoints)
+        return LiveMap(self._pairs, link.settings, link.folder, link.checkpoints, placer, self._take)
+
+    def _match_stamp(self, stamp_ns: int) -> MatchedFrame | Refusal:
+        (pair,) = self._pairs(frozenset((stamp_ns,)))
+        return self._match(pair)
+
+    def _take(self, pair: RectifiedPair) -> MatchedFrame | Refusal:
+        matched = self._matched.pop(pair.stamp_ns, None)
+        return self._match(pair) if matched is None else matched.result()
+
+    def _tell_fused(self) -> None:
+        """Note when each keyframe came into the map."""
+        assert self._map is not None
+        for stamp in self._map.stamps_ns[::-1]:
+            if stamp in self._told:
+                break
+            self._told.add(stamp)
+            self._tiles.append((stamp, self._exposed[stamp], time.monotonic_ns()))

@@ -9,15 +9,13 @@ import numpy as np
 
 from barsight.core.types import ImuSamples
 from barsight.live.link import Link
-from barsight.live.shared.counters import Counters
+from barsight.live.shared.counters import DRAIN, Counters
 from barsight.recording.writers.retention import Retention
 from barsight.recording.writers.segments import SegmentWriter
 
 POLL_S = 0.05
 SYNC_EVERY_S = 1.0
 LOOK_EVERY_S = 0.5
-DRAIN = 2
-"""What `stop` says once the other processes have ended."""
 
 
 def record(link: Link) -> None:

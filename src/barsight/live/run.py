@@ -15,11 +15,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 from barsight.checkpoint import checkpoint_folder
-from barsight.core.compiling.ahead import compile_ahead
+from barsight.core.compiling.ahead import compile_ahead, load_kernels
 from barsight.core.errors import ConfigError, InputError, MeasurementError, OutputError
 from barsight.core.files import expect_empty, lies_within, translated_os_errors
 from barsight.core.json_values import json_value, write_json
 from barsight.core.notices import Notice
+from barsight.core.parallel import in_background
 from barsight.core.stamps import NS_PER_S
 from barsight.live.latency import latencies
 from barsight.live.link import GrowingRecording, KeptRecording, Link, LiveInput
@@ -37,6 +38,7 @@ from barsight.measure_settings import MeasureSettings
 from barsight.pipeline import LiftRequest
 from barsight.recording.base import Recording
 from barsight.recording.open import open_recording
+from barsight.report.page import write_report
 from barsight.yard.lifting.lift_file import read_lifts
 from barsight.yard.magnet.description import load_magnet
 
@@ -101,6 +103,7 @@ class LiveRun:
             folder.mkdir(parents=True, exist_ok=True)
         camera = self._recording.rig.cam0
         board, ring = Counters(), PairRing(self._live.ring_pairs, camera.height, camera.width)
+        supervisor: Supervisor | None = None
         try:
             link = Link(
                 self._source, self._asked.chosen(), self._live, folder,
@@ -108,17 +111,20 @@ class LiveRun:
                 board.name, None if given is None else given.stamps_ns,
             )  # fmt: skip
             supervisor = Supervisor(link, board, self._tell_all)
-            with _stopped_by_signals(supervisor):
+            with in_background(lambda: load_kernels("measure")), _stopped_by_signals(supervisor):
                 supervisor.run()
             self.stop_because = supervisor.stop_because
             if self.stop_because == STOOD:
                 return {}
+            supervisor.end_map()
             if supervisor.stop_because:
                 self._tell_all(f"ends early: {supervisor.stop_because}; what was kept is measured")
             if given is not None:
                 supervisor.state.mode = given.mode
             return _finish(supervisor, link, board, self._recording, self._asked, request, advance)
         finally:
+            if supervisor is not None:
+                supervisor.end_map(at_once=True)
             ring.remove()
             board.remove()
             shutil.rmtree(folder, ignore_errors=True)
@@ -158,10 +164,12 @@ def _finish(
             request = replace(request, notices=(Notice("live-state", _why_no_lifts(state.mode)),))
         content = write_measured(
             [KeptRecording(recording, kept)], out, settings, request, advance=advance, overwrite=True,
-            keep=link.checkpoints.parent,
+            keep=link.checkpoints.parent, report=False,
         )  # fmt: skip
         lifts_s = (time.monotonic_ns() - frames[-1][1]) / NS_PER_S
         state.phase, state.offered = "done", len(read_lifts(out / "lifts.json")["lifts"])
+        write_state(state, board, out)
+        write_report(out, out / "report.html")
         return content
     finally:
         state.phase = "done" if lifts_s is not None else "failed"

@@ -19,8 +19,8 @@ from barsight.live.link import Link
 from barsight.live.mapper import build_live_map
 from barsight.live.modes import FOR_LIFTS, FreezeWatch, JumpWatch, Mode, SensorActivity, judge_mode
 from barsight.live.pose_output import output_poses
-from barsight.live.record import DRAIN, record
-from barsight.live.shared.counters import Counters
+from barsight.live.record import record
+from barsight.live.shared.counters import DRAIN, Counters
 from barsight.live.source import ReplayClock
 from barsight.live.state import ProcessState, RunState, write_health, write_state
 from barsight.live.survey import SurveyWatch
@@ -35,6 +35,8 @@ MAX_RESTARTS, RESTARTS_WITHIN_S = 5, 30.0
 """A process that ends more often than that ends the run."""
 START_S = 120.0
 """Processes may take so long to start on a busy machine."""
+FINISH_S = 60.0
+"""The map process may be silent so long while it elects the last of the surface."""
 FREEZE_READINGS = 100
 DRAIN_S = 60.0
 """The recorder may take so long to write what is left."""
@@ -266,14 +268,29 @@ class Supervisor:
             seconds = (time.monotonic_ns() - self._clock.began_ns) / NS_PER_S
         self._tell(f"{seconds:8.2f} s  {text}")
 
-    def _end_all(self) -> None:
-        """End the processes: those that are at a frame finish it only if that takes no time."""
-        self._board["supervisor", "stop"] = 1
-        for role, process in self._running.items():
-            if role == "record":
-                self._board["supervisor", "stop"] = DRAIN
-            process.join({"map": 1.0, "record": DRAIN_S}.get(role, 5.0))
-            if process.is_alive():
+    def end_map(self, *, at_once: bool = False) -> None:
+        """Wait until what was kept is in the map, where the map process can finish it; `at_once` ends it."""
+        process = self._running.get("map")
+        while process is not None and process.is_alive():
+            silent_s = (time.monotonic_ns() - self._board["map", "beat_ns"]) / NS_PER_S
+            if at_once or silent_s > max(self._link.live.hang_s, FINISH_S):
                 process.kill()
-                process.join()
-            self.state.processes[role].state = "done"
+            process.join(BEAT_S)
+        if process is not None:
+            self.state.processes["map"].state = "done"
+
+    def _end_all(self) -> None:
+        """End the processes but for the map's, which goes on until `end_map`."""
+        self._board["supervisor", "stop"] = 1
+        for role in self._running.keys() - {"map", "record"}:
+            self._end(role, self._running[role], 5.0)
+        self._board["supervisor", "stop"] = DRAIN
+        if "record" in self._running:
+            self._end("record", self._running["record"], DRAIN_S)
+
+    def _end(self, role: str, process: BaseProcess, within_s: float) -> None:
+        process.join(within_s)
+        if process.is_alive():
+            process.kill()
+            process.join()
+        self.state.processes[role].state = "done"

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from dataclasses import replace
 
 import numpy as np
 
 from barsight.calibration.geometry.rectification import Rectifier
-from barsight.checkpoint import write_checkpoint
 from barsight.core.arrays import Float64
 from barsight.core.compiling.ahead import load_kernels
-from barsight.core.errors import Failed, MeasurementError
+from barsight.core.errors import BarsightError, Failed, MeasurementError
 from barsight.core.files import atomic_path
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame, StereoFrame
 from barsight.live.link import GrowingRecording, Link
 from barsight.live.shared.counters import Counters
 from barsight.live.shared.ring import CapturedPair, PairRing
-from barsight.motion.estimator import PoseEstimator
+from barsight.live_map import PairPlacer
 from barsight.motion.fixed_lag.estimator import FixedLagPoses
 from barsight.motion.settings import make_estimator
 from barsight.recording.rectified_pairs import RectifiedPairs
@@ -55,6 +55,7 @@ def track(link: Link) -> None:
             continue
         board["track", "taken"] = newest
         tracking.take(pair, range(taken + 1, newest))
+    tracking.end()
     board["track", "done"] = 1
 
 
@@ -69,7 +70,7 @@ class Tracking:
         self._source = in_yard(SelectedSensors(recording, link.settings.use), link.settings.yard)
         motion = replace(link.settings.motion, estimator="live")
         self._estimator = make_estimator(motion)
-        self._poses: PoseEstimator | None = None
+        self._placer: PairPlacer | None = None
         self._last_kept: Float64 | None = None
         self._last_kept_ns, self._still = 0, 0
 
@@ -84,6 +85,12 @@ class Tracking:
             self._last_kept_ns = seen.stamp_ns
             if isinstance(posed, PosedFrame):
                 self._last_kept = posed.reference_from_body.translation
+
+    def end(self) -> None:
+        """Leave the trajectory, if it is of just the pairs kept."""
+        if self._placer is not None:
+            with contextlib.suppress(BarsightError):
+                self._placer.finish()
 
     def take(self, pair: CapturedPair, passed: range) -> None:
         """Track a pair from the ring and keep it if it is a keyframe. passed: numbers of the pairs before it
@@ -108,13 +115,12 @@ class Tracking:
             self._keep(rectified, pair.frame)
         if isinstance(posed, PosedFrame) and is_kept:
             self._last_kept = posed.reference_from_body.translation
-            with atomic_path(self._link.posed_file(stamp)) as path:
-                write_checkpoint(posed, path)
         self._frames.append((stamp, pair.exposed_ns, done_ns, is_kept, has_pose))
 
     def _tell_state(self) -> None:
         """Note the state for the process that writes poses."""
-        state = self._poses.navigation if isinstance(self._poses, FixedLagPoses) else None
+        poses = None if self._placer is None else self._placer.poses
+        state = poses.navigation if isinstance(poses, FixedLagPoses) else None
         if state is not None:
             self._states.append(np.array([state.stamp_ns]), state.row[None])
 
@@ -136,6 +142,7 @@ class Tracking:
 
     def _keep(self, pair: RectifiedPair, frame: StereoFrame) -> None:
         self._pairs.store(pair)
+        self._recording.stamps_ns.append(pair.stamp_ns)
         if self._link.source.crane is not None:
             with atomic_path(self._link.raw_file(pair.stamp_ns)) as path, path.open("wb") as stream:
                 np.save(stream, np.stack([frame.left, frame.right]))
@@ -159,7 +166,7 @@ class Tracking:
 
     def _wait_for_readings(self, stamp_ns: int) -> None:
         """Wait for the readings that the pose needs, `GRACE_S` at most."""
-        delay_ns = 0 if self._poses is None else self._poses.delay_ns or 0
+        delay_ns = 0 if self._placer is None else self._placer.poses.delay_ns or 0
         due_ns = stamp_ns + self._recording.rig.timeshift_cam_imu_ns + delay_ns
         give_up_ns = time.monotonic_ns() + int(GRACE_S * NS_PER_S)
         while True:
@@ -177,11 +184,12 @@ class Tracking:
 
     def _placed(self, seen: RectifiedPair | RefusedFrame) -> PosedFrame | RefusedFrame:
         try:
-            if self._poses is None and "crane" in self._expected and self._source.crane() is None:
+            if self._placer is None and "crane" in self._expected and self._source.crane() is None:
                 return RefusedFrame(seen.stamp_ns, "the encoders have given no reading yet")
-            if self._poses is None:
-                self._poses = self._estimator.begin(self._source, self._rectifier)
-            posed = self._poses.push(seen)
+            if self._placer is None:
+                pairs = RectifiedPairs(self._source, self._rectifier, self._link.checkpoints)
+                self._placer = PairPlacer(pairs, self._estimator, self._link.checkpoints, reads=False)
+            posed = self._placer.push(seen)
         except MeasurementError as error:
             return RefusedFrame(seen.stamp_ns, str(error))
         assert posed is not None, "the live estimator's poses are final at once"

@@ -7,6 +7,7 @@ higher, whether or not the cell itself was seen.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any
 
 import cv2
@@ -30,16 +31,20 @@ end: at edges, matches mix what is in front with what is behind."""
 UNPROVEN = np.float32(np.inf)
 
 
+@dataclass(eq=False)
 class FreeSpace:
     """Upper bounds (m) of what may stand in each cell, by the two views that bound it best.
 
-    cell_m: side of the map's cells; those of free space are COARSE_CELLS as wide. Memory: 0.5 MiB per 5 m
-    square at cells of 10 mm.
+    cell_m: side of the map's cells; those of free space are COARSE_CELLS as wide. tiles: (2, TILE, TILE)
+    each, the best bound and the second. Memory: 0.5 MiB per 5 m square at cells of 10 mm.
     """
 
-    def __init__(self, cell_m: float) -> None:
-        self._cell_m = cell_m * COARSE_CELLS
-        self._tiles: dict[TileKey, Float32] = {}
+    cell_m: float
+    tiles: dict[TileKey, Float32] = field(default_factory=dict)
+
+    @property
+    def _cell_m(self) -> float:
+        return self.cell_m * COARSE_CELLS
 
     def carve(self, cells: CellObservations, eyes_m: Float64) -> None:
         """Carve what one view has seen. eyes_m: (E, 3) places of its cameras, reference frame."""
@@ -76,7 +81,7 @@ class FreeSpace:
         )
         out = np.full(shape, UNPROVEN)
         for key in covering_tiles(low_x, low_y, shape):
-            tile = self._tiles.get(key)
+            tile = self.tiles.get(key)
             if tile is not None:
                 ours, theirs = tile_overlap(key, low_x, low_y, shape)
                 out[theirs] = tile[1][ours]
@@ -91,19 +96,19 @@ class FreeSpace:
         a grid, have changed since, so that only the newer pass tells of them.
         """
         cells = np.arange(TILE) * self._cell_m
-        for key in {*self._tiles, *newer._tiles}:
+        for key in {*self.tiles, *newer.tiles}:
             x, y = (cells + at * TILE * self._cell_m for at in key)
-            mine = self._tiles.setdefault(key, np.full((2, TILE, TILE), UNPROVEN))
+            mine = self.tiles.setdefault(key, np.full((2, TILE, TILE), UNPROVEN))
             mine[:, forgotten(x, y)] = UNPROVEN
-            if key in newer._tiles:
-                np.minimum(mine, newer._tiles[key] + np.float32(rise_m), out=mine)
+            if key in newer.tiles:
+                np.minimum(mine, newer.tiles[key] + np.float32(rise_m), out=mine)
 
     def _merge(self, key: TileKey, column: int, row: int, bound: Float32) -> None:
         ours, theirs = tile_overlap(key, column, row, bound.shape)
         new = bound[theirs]
         if not np.isfinite(new).any():
             return
-        tile = self._tiles.setdefault(key, np.full((2, TILE, TILE), UNPROVEN))
+        tile = self.tiles.setdefault(key, np.full((2, TILE, TILE), UNPROVEN))
         first, second = tile[0][ours], tile[1][ours]
         tile[1][ours] = np.minimum(second, np.maximum(first, new))
         tile[0][ours] = np.minimum(first, new)

@@ -7,6 +7,7 @@ thinner than matching can measure; what lies deeper is blurred, since each view 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any
 
 import cv2
@@ -30,28 +31,29 @@ MAX_VIEWS = 250
 """Views of a cell beyond these are not counted, so that their sum fits 16 bits."""
 
 
+@dataclass(eq=False)
 class TopPhoto:
     """Sums of gray levels and how many views made them, per cell of the map.
 
-    cell_m: side of the cells. Memory: 0.75 MiB per 5 m square at cells of 10 mm.
+    cell_m: side of the cells. tiles: sums and numbers of views, (TILE, TILE) each. Memory: 0.75 MiB per 5 m
+    square at cells of 10 mm.
     """
 
-    def __init__(self, cell_m: float) -> None:
-        self._cell_m = cell_m
-        self._tiles: dict[TileKey, tuple[UInt16, UInt8]] = {}
+    cell_m: float
+    tiles: dict[TileKey, tuple[UInt16, UInt8]] = field(default_factory=dict)
 
     def add(self, cells: CellObservations, pair: RectifiedPair, reference_from_rect0: Pose) -> None:
         """Add both pictures of a view at the height of the tops that the view itself has measured."""
         if cells.x.size == 0:
             return
         column, row = int(cells.x.min()), int(cells.y.min())
-        tops, held = _tops(cells, column, row, self._cell_m)
-        step = COARSE_CELLS * self._cell_m
-        offset = (COARSE_CELLS - 1) / 2 * self._cell_m
+        tops, held = _tops(cells, column, row, self.cell_m)
+        step = COARSE_CELLS * self.cell_m
+        offset = (COARSE_CELLS - 1) / 2 * self.cell_m
         rows, columns = tops.shape
         x, y = np.meshgrid(
-            column * self._cell_m + offset + step * np.arange(columns),
-            row * self._cell_m + offset + step * np.arange(rows),
+            column * self.cell_m + offset + step * np.arange(columns),
+            row * self.cell_m + offset + step * np.arange(rows),
         )
         seen = reference_from_rect0.inverse().apply(np.stack([x, y, tops], axis=-1).reshape(-1, 3))
         camera, depth = pair.camera, np.maximum(seen[:, 2], 1e-3)
@@ -78,24 +80,24 @@ class TopPhoto:
         """
         out = np.zeros((rows, columns), np.uint8)
         for key in covering_tiles(column, row, out.shape):
-            if key in self._tiles:
+            if key in self.tiles:
                 ours, theirs = tile_overlap(key, column, row, out.shape)
-                total, count = (part[ours] for part in self._tiles[key])
+                total, count = (part[ours] for part in self.tiles[key])
                 mean = np.rint(total / np.maximum(count, 1)).clip(1, 255)
                 out[theirs] = np.where(count > 0, mean, 0).astype(np.uint8)
         return out
 
     def join(self, newer: TopPhoto, forgotten: Callable[[NDArray[Any], NDArray[Any]], Bool]) -> None:
         """Add a newer pass's pictures. forgotten: see `FreeSpace.join`."""
-        cells = np.arange(TILE) * self._cell_m
-        for key, (sums, views) in self._tiles.items():
-            gone = forgotten(*(cells + at * TILE * self._cell_m for at in key))
+        cells = np.arange(TILE) * self.cell_m
+        for key, (sums, views) in self.tiles.items():
+            gone = forgotten(*(cells + at * TILE * self.cell_m for at in key))
             sums[gone], views[gone] = 0, 0
-        for key, (total, count) in newer._tiles.items():
-            if key not in self._tiles:
-                self._tiles[key] = total.copy(), count.copy()
+        for key, (total, count) in newer.tiles.items():
+            if key not in self.tiles:
+                self.tiles[key] = total.copy(), count.copy()
                 continue
-            sums, views = self._tiles[key]
+            sums, views = self.tiles[key]
             full = views.astype(np.uint16) + count > MAX_VIEWS
             sums[full], views[full] = 0, 0
             sums += total
@@ -105,7 +107,7 @@ class TopPhoto:
         ours, theirs = tile_overlap(key, column, row, count.shape)
         if not count[theirs].any():
             return
-        sums, views = self._tiles.setdefault(
+        sums, views = self.tiles.setdefault(
             key, (np.zeros((TILE, TILE), np.uint16), np.zeros((TILE, TILE), np.uint8))
         )
         open_ = views[ours] < MAX_VIEWS

@@ -87,10 +87,11 @@ class TrajectoryEstimator(ABC):
     """Settings of an estimator; `begin` makes one for a recording.
 
     begins_early: whether each pose depends on no reading beyond the estimator's `delay_ns`, so that a
-    recording that still grows ends with the same poses.
+    recording that still grows ends with the same poses. delay_ns: see `PoseEstimator`.
     """
 
     begins_early: ClassVar[bool] = False
+    delay_ns: ClassVar[int | None] = None
 
     @abstractmethod
     def begin(self, recording: Recording, rectifier: Rectifier) -> PoseEstimator:

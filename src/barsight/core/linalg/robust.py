@@ -28,6 +28,18 @@ def known_median(values: NDArray[Any]) -> NDArray[Any]:
     return np.take_along_axis(np.sort(values, axis=0), middle, axis=0)
 
 
+def nan_medians(values: NDArray[Any]) -> NDArray[Any]:
+    """Compute the median (U,) of each column (V, U) without its NaN, as `np.nanmedian` does, which takes ten
+    times as long for a few hundred values each.
+    """
+    known = (~np.isnan(values)).sum(axis=0)[None]
+    ordered = np.sort(values, axis=0)  # NaN last
+    low, high = (
+        np.take_along_axis(ordered, np.maximum(at, 0), axis=0)[0] for at in ((known - 1) // 2, known // 2)
+    )
+    return np.asarray(np.where(known[0] > 0, (low + high) / 2, np.nan), values.dtype)
+
+
 def running_median(values: NDArray[Any], count: int) -> NDArray[Any]:
     """Compute the median of `count` (odd) rows about each, (N, M); the first and last row are repeated.
 

@@ -31,6 +31,8 @@ ROWS: dict[str, tuple[str, ...]] = {
 }  # fmt: skip
 """Counters of each process; those of `sensors` are capture's too. Those in _ns are stamps or spans; began_ns
 and beat_ns, when a process last went round its loop, are of the monotonic clock."""
+DRAIN = 2
+"""Value of `stop` once nothing more comes from capture and track, and what is left is to be done."""
 _WIDTH = max(len(names) for names in ROWS.values())
 
 

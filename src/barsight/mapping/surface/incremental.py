@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from barsight.core.arrays import Bool, Float32, Int8
+from barsight.core.arrays import Bool, Float32, Float64, Int8
 from barsight.core.parallel import ordered_map
 from barsight.core.types import HeightSource
 from barsight.mapping.settings import MapSettings
@@ -28,7 +28,13 @@ from barsight.mapping.surface.directional_filter import (
     valley_mask,
     vote_directions,
 )
-from barsight.mapping.surface.height_selection import ViewFrusta, ViewSupport, elect_by_votes, elect_surface
+from barsight.mapping.surface.height_selection import (
+    ViewFrusta,
+    ViewSupport,
+    elect_by_votes,
+    elect_surface,
+    supported_box,
+)
 from barsight.mapping.surface.picture_stripes import NODE_CELLS, find_stripes
 from barsight.mapping.surface.surface import (
     Layers,
@@ -45,8 +51,8 @@ from barsight.mapping.tiles import TILE_CELLS, TileKey, TileStore
 _HALO = 13 + VOTE_CELLS // 2 + REACH_CELLS
 """Cells around a tile that it depends on: along a bar, and what is read beside it. Even, so that stripes are
 sought at the same cells in a tile and in its neighbours' halos."""
-_KEPT_HEIGHT_M = 0.05
-"""A snapshot sharpens tiles anew once the cameras' median height has changed by so much."""
+_MIDDLE = 4
+"""A tile among `_around` it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +64,21 @@ class TileFigures:
     sigmas_m: Float32
     columns: tuple[int, int] | None
     rows: tuple[int, int] | None
+
+
+@dataclass(frozen=True, eq=False)
+class TileElection:
+    """Tell what a tile's election rests on: its own version and its neighbours' (see `TileStore`), and the
+    `near` views that may see something of what it holds, from box[0] to box[1] (m), None where it holds
+    nothing. height_m: of their cameras. is_last: elected as at the end, not as for a snapshot.
+    """
+
+    versions: tuple[int, ...]
+    min_views: int
+    is_last: bool
+    box: Float64 | None
+    near: int
+    height_m: float
 
 
 class SurfaceElection:
@@ -76,25 +97,30 @@ class SurfaceElection:
         for made in (self._first, self._elected, self._finished, asked):
             made.mkdir()
         self._work = work
-        self._states: dict[TileKey, tuple[int, int]] = {}
         self._taken: dict[TileKey, int] = {}
-        self._unfinished: set[TileKey] = set()
+        self._voted: dict[TileKey, tuple[int, int]] = {}
+        self._elections: dict[TileKey, TileElection] = {}
+        self._finishes: dict[TileKey, tuple[TileElection | None, ...]] = {}
         self._heights = TileStore(asked, settings.resident_tiles // 2, fields=3, fill=np.nan)
         self._views: dict[TileKey, int] = {}
         self._figures: dict[TileKey, TileFigures] = {}
-        self._height_m = np.inf
 
     def settle(self, min_views: int, frusta: Callable[[], ViewFrusta]) -> None:
-        """Elect the tiles that the last view no longer touched, and finish those that lie beside none which
-        it did: a snapshot then has the tiles in view left to do. Called after each view.
+        """Elect as at the end the tiles that lie beside none which the last view touched, and finish those
+        among elected ones: a snapshot and `finish` then have the tiles about the view left to do. Called
+        after each view.
         """
         keys = self._store.keys()
         taken = {key: self._store.version(key) for key in keys}
         in_view = {key for key, count in taken.items() if self._taken.get(key) != count}
         self._taken = taken
-        if left := [key for key in self._changed(min_views) if key not in in_view]:
-            self._elect_changed(left, min_views, frusta())
-        if ready := [key for key in sorted(self._unfinished) if in_view.isdisjoint(_around(key))]:
+        left = [key for key in keys if in_view.isdisjoint(_around(key))]
+        if stale := [key for key in left if not self._stands(key, min_views)]:
+            self._elect(stale, min_views, frusta(), last=True)
+        whole = {key for key in left if self._stands(key, min_views)}
+        known = frozenset(keys)
+        ready = [key for key in left if whole.issuperset(known.intersection(_around(key)))]
+        if ready := [key for key in ready if self._is_unfinished(key)]:
             self._finish(ready, frusta())
 
     def snapshot(self, min_views: int, frusta: ViewFrusta) -> Surface:
@@ -104,34 +130,58 @@ class SurfaceElection:
         A tile that lies beside one that changed waits for its own next change, and a view is asked once
         whether it sees a height, until that moves.
         """
-        changed = self._changed(min_views)
-        self._elect_changed(changed, min_views, frusta)
+        keys = self._store.keys()
+        changed = [key for key in keys if not self._is_current(key, min_views)]
+        self._elect(changed, min_views, frusta, last=False)
         self._heights.hold(len(changed))
-        self._finish(sorted(self._unfinished), frusta)
+        self._finish([key for key in keys if self._is_unfinished(key)], frusta)
         return self._surface(tile_file)
 
-    def _changed(self, min_views: int) -> list[TileKey]:
-        """List the tiles that were taken since they were last elected."""
-        keys, version = self._store.keys(), self._store.version
-        return [key for key in keys if self._states.get(key) != (version(key), min_views)]
-
-    def _elect_changed(self, keys: list[TileKey], min_views: int, frusta: ViewFrusta) -> None:
-        """Elect these tiles, whose finish is due then; that of all, once the cameras' height has changed."""
-        self._elect(keys, min_views, frusta, last=False)
-        self._states |= {key: (self._store.version(key), min_views) for key in keys}
-        if not abs(frusta.height_m - self._height_m) <= _KEPT_HEIGHT_M:
-            self._height_m, keys = frusta.height_m, list(self._states)
-        self._unfinished |= set(keys)
-
     def finish(self, min_views: int, frusta: ViewFrusta) -> Surface:
-        """Return the surface at the end, all elected from the start; the tiles in `store` are given up."""
-        keys, self._height_m = self._store.keys(), frusta.height_m
-        self._elect(keys, min_views, frusta, last=True)
-        self._finish(keys, frusta, min_views)
+        """Return the surface at the end, of which nothing depends on what was asked for meanwhile; the tiles
+        in `store` are given up.
+        """
+        keys = self._store.keys()
+        stale = [key for key in keys if not self._stands(key, min_views, frusta)]
+        self._elect(stale, min_views, frusta, last=True)
+        self._finish([key for key in keys if self._is_unfinished(key)], frusta)
         surface = self._surface(tile_file, cloud_file)
         self._store.clear()
         shutil.rmtree(self._work)
         return surface
+
+    def _is_current(self, key: TileKey, min_views: int) -> bool:
+        """Check whether a tile was elected since it was taken."""
+        one = self._elections.get(key)
+        return one is not None and (one.versions[_MIDDLE], one.min_views) == (
+            self._store.version(key), min_views
+        )  # fmt: skip
+
+    def _stands(self, key: TileKey, min_views: int, frusta: ViewFrusta | None = None) -> bool:
+        """Check whether a tile was elected as at the end and would be elected so again, by all views of
+        `frusta` if they are given.
+        """
+        one = self._elections.get(key)
+        if (
+            one is None
+            or not one.is_last
+            or (one.versions, one.min_views) != (self._versions(key), min_views)
+        ):
+            return False
+        return (
+            frusta is None
+            or one.box is None
+            or int(frusta.touching(one.box[0], one.box[1]).sum()) == one.near
+        )
+
+    def _is_unfinished(self, key: TileKey) -> bool:
+        return self._finishes.get(key) != self._around_elected(key)
+
+    def _versions(self, key: TileKey) -> tuple[int, ...]:
+        return tuple(self._store.version(near) for near in _around(key))
+
+    def _around_elected(self, key: TileKey) -> tuple[TileElection | None, ...]:
+        return tuple(self._elections.get(near) for near in _around(key))
 
     def _surface(self, *names: Callable[[Path, TileKey], Path]) -> Surface:
         """Gather the finished tiles in a folder of its own, by links to their files of these names, which are
@@ -151,19 +201,27 @@ class SurfaceElection:
         was asked for snapshots.
         """
         known, read = frozenset(self._store.keys()), self._store.read
-        beside = {near for key in keys for near in _around(key)}
-        voted = keys if last else [key for key in self._changed(min_views) if key in beside]
+        states = {key: (self._store.version(key), min_views) for key in known}
+        beside = known.intersection(near for key in keys for near in _around(key))
+        voted = [key for key in sorted(beside) if self._voted.get(key) != states[key]]
 
         def look(key: TileKey, tile: Float32) -> None:
             np.save(_first_file(self._first, key), elect_by_votes(tile, min_views, self._settings.top_ratio))
 
-        def elect_tile(key: TileKey, tile: Float32, asked: ViewSupport) -> None:
+        def elect_tile(key: TileKey, tile: Float32, asked: ViewSupport) -> TileElection:
             around = _first_around(self._first, key, known)
+            box = supported_box(tile, key, self._cell_m, min_views)
             winner = elect_surface(tile, key, around, frusta, self._cell_m, min_views, self._settings, asked)
             write_tile(self._elected, key, elected_layers(tile, winner))
             if last:
                 np.save(_winner_file(self._elected, key), winner)
-            self._views[key] = asked.views
+            else:
+                self._views[key] = asked.views
+            near = None if box is None else frusta.touching(box[0], box[1])
+            height_m = np.nan if near is None else frusta.only(near).height_m
+            return TileElection(
+                self._versions(key), min_views, last, box, 0 if near is None else int(near.sum()), height_m
+            )
 
         def asked_of(key: TileKey) -> ViewSupport:
             return (
@@ -173,30 +231,36 @@ class SurfaceElection:
         _read_first.cache_clear()
         for _ in ordered_map(lambda item: look(*item), ((key, read(key)) for key in voted)):
             pass
+        self._voted |= {key: states[key] for key in voted}
         items = ((key, read(key), asked_of(key)) for key in keys)
-        for _ in ordered_map(lambda item: elect_tile(*item), items):
-            pass
+        elections = ordered_map(lambda item: elect_tile(*item), items)
+        self._elections |= dict(zip(keys, elections, strict=True))
 
-    def _finish(self, keys: list[TileKey], frusta: ViewFrusta, cloud_views: int | None = None) -> None:
-        """Average, sharpen and fill these tiles; write the cloud of heights that cloud_views views support,
-        if it is given.
-        """
+    def _finish(self, keys: list[TileKey], frusta: ViewFrusta) -> None:
+        """Average, sharpen and fill these tiles; write the cloud of those that are elected as at the end."""
         known = frozenset(self._store.keys())
 
         def finish_tile(item: tuple[TileKey, Float32 | None]) -> tuple[TileKey, TileFigures]:
             key, tile = item
             layers, blur = self._filled(key, known, frusta)
             write_tile(self._finished, key, layers)
-            if tile is not None and cloud_views is not None:
+            if tile is not None:
                 winner: Int8 = np.load(_winner_file(self._elected, key))
-                part = CloudPart.of(tile, winner, key, self._cell_m, cloud_views)
+                part = CloudPart.of(tile, winner, key, self._cell_m, self._elections[key].min_views)
                 part.finished(layers.z_m, layers.sigma_m, blur).write(self._finished, key)
             return key, tile_figures(key, layers)
 
         read_tile.cache_clear()
-        items = ((key, None if cloud_views is None else self._store.read(key)) for key in keys)
+        items = ((key, self._store.read(key) if self._elections[key].is_last else None) for key in keys)
         self._figures |= ordered_map(finish_tile, items)
-        self._unfinished -= set(keys)
+        self._finishes |= {key: self._around_elected(key) for key in keys}
+
+    def _seen_from_m(self, key: TileKey) -> float:
+        """Return the height of the cameras that see a tile, or of those that see its neighbours."""
+        around = [one.height_m for one in self._around_elected(key) if one is not None]
+        own = self._elections[key].height_m
+        known = [height_m for height_m in around if np.isfinite(height_m)]
+        return own if np.isfinite(own) else float(np.median(known)) if known else 0.0
 
     def _filled(self, key: TileKey, keys: frozenset[TileKey], frusta: ViewFrusta) -> tuple[Layers, Float32]:
         """Average the tile lengthways, sharpen it, fill its narrow gaps, looking at most the halo around it;
@@ -214,7 +278,7 @@ class SurfaceElection:
         if along > 0:
             weight: Float32 = np.nan_to_num(1 / (around.sigma_m * around.sigma_m))
             z, direction = smooth_along_bars(around.z_m, weight, settings.min_gate_m, along)
-            pixel_m = frusta.pixel_m(z, self._height_m)
+            pixel_m = frusta.pixel_m(z, self._seen_from_m(key))
             sharp = deblur_across(z, direction, settings.sharpen_px * pixel_m / cell_m)
             blur = blur_sigma(sharp - z, valley_mask(sharp, _within(direction, reach)))
             pixel_cells = float(np.nanmedian(pixel_m)) / cell_m if np.isfinite(pixel_m).any() else 1.0
@@ -244,7 +308,7 @@ def _within(direction: Int8, margin: int) -> Int8:
 
 
 def _around(key: TileKey) -> list[TileKey]:
-    """Return a tile and its eight neighbours."""
+    """Return a tile and its eight neighbours, itself in the middle."""
     return [(key[0] + i, key[1] + j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
 
 

@@ -44,6 +44,7 @@ class FixedLagFusion(TrajectoryEstimator):
     """
 
     begins_early = True
+    delay_ns = seconds_to_ns(SENSOR_DELAY_S)
     settings: FusionSettings
     live: FixedLagSettings
     crane: CraneSettings
@@ -58,7 +59,7 @@ class FixedLagFusion(TrajectoryEstimator):
 class FixedLagPoses(ImmediatePoses):
     """`PoseEstimator` over a window of the last frames."""
 
-    delay_ns = seconds_to_ns(SENSOR_DELAY_S)
+    delay_ns = FixedLagFusion.delay_ns
 
     def __init__(self, estimator: FixedLagFusion, recording: Recording, rectifier: Rectifier) -> None:
         from barsight.motion.fixed_lag.smoother import FixedLagEstimator

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8
+from barsight.core.linalg.robust import nan_medians
 from barsight.core.types import HeightSource
 from barsight.yard.bundles.fitting.outline import STEP_M, make_outline
 from barsight.yard.bundles.fitting.outline_fit import AGREES, DIAMETER, ROLL, SLOPE_U, SLOPE_Z, Fit, U, Z
@@ -113,7 +114,7 @@ def is_beam(grid: AlignedMap, fit: Fit, settings: BundleSettings) -> bool:
     rise = rise_over(grid, fit, rows, u, settings)
     known = np.isfinite(rise).any(axis=0)
     section = np.full(across.size, np.nan)
-    section[known] = np.nanmedian(rise[:, known], axis=0)
+    section[known] = nan_medians(rise[:, known])
     flanks = [section[known & (side * across > _FLANK[0] * fit.width_m)] for side in (-1, 1)]
     seen = [float(np.median(flank)) for flank in flanks if flank.size]
     if max((abs(one) for one in seen), default=0.0) > _FOLLOWS_M:

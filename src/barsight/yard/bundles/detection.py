@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from barsight.core.arrays import Float64, Int64
-from barsight.core.parallel import ordered_map
+from barsight.core.parallel import ordered_map, prefetch
 from barsight.core.types import HeightSource
 from barsight.yard.bundles.bundle_kinds import common_diameter, other_packings, reinforce_kinds
 from barsight.yard.bundles.bundle_record import describe_bundles, make_bundle, map_sigma
@@ -192,9 +192,14 @@ def _readings(grid: AlignedMap, templates: Templates, settings: BundleSettings) 
     known = np.flatnonzero(np.isfinite(grid.z_m).any(axis=1))
     if known.size == 0:
         return []
-    for row in range(int(known[0]) + min(step, known.size) // 2, int(known[-1]) + 1, step):
+    sections = range(int(known[0]) + min(step, known.size) // 2, int(known[-1]) + 1, step)
+    proposed = (
+        _worth_growing(propose_candidates(grid, templates, grid.v0_m + row * grid.cell_m, settings))
+        for row in sections
+    )
+    # The next sections are matched while one's outlines grow.
+    for row, candidates in zip(sections, prefetch(proposed, 2), strict=True):
         v = grid.v0_m + row * grid.cell_m
-        candidates = _worth_growing(propose_candidates(grid, templates, v, settings))
         taken = _taken(fits, row, v)
         fresh = [one for one in candidates if not _is_taken(one, taken)]
         seeds = (_seed(one, row, rows, grid, settings) for one in fresh)

@@ -8,6 +8,7 @@ import math
 import numpy as np
 
 from barsight.core.arrays import Bool, Float64
+from barsight.core.linalg.robust import nan_medians
 from barsight.yard.magnet.footprint import BundleTable, Grip, Placement
 from barsight.yard.magnet.reach import PART_M
 from barsight.yard.stability.stability import lookup_heights
@@ -85,7 +86,7 @@ def _profile(heights: HeightMap, place: Placement, along_m: Float64, from_m: flo
     enough = seen.mean(axis=0) >= _SEEN_RATIO
     level = np.full(across.size, np.nan)
     if enough.any():
-        level[enough] = np.nanmedian(z[:, enough], axis=0)
+        level[enough] = nan_medians(z[:, enough])
     return level
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.core.arrays import Float64, Int64
+from barsight.core.linalg.robust import nan_medians
 from barsight.yard.bundles.fitting.bars import visible_bars
 from barsight.yard.bundles.fitting.outline import STEP_M, make_outline
 from barsight.yard.bundles.fitting.outline_fit import DIAMETER, ROLL, SLOPE_U, SLOPE_Z, Fit
@@ -114,7 +115,7 @@ def _beyond(
     over = _over(grid, fit, rows, settings)
     known = np.isfinite(over).mean(axis=1)
     misfit = np.full(rows.size, np.nan)
-    misfit[known > 0] = np.nanmedian(over[known > 0], axis=1)
+    misfit[known > 0] = nan_medians(over[known > 0].T)
     return known, misfit
 
 

@@ -8,6 +8,7 @@ import numba
 import numpy as np
 
 from barsight.core.arrays import Float32, Float64, Int64, kernel
+from barsight.core.linalg.robust import nan_medians
 from barsight.yard.bundles.fitting.outline import (
     BARS_OF_RINGS,
     LOOSENESS,
@@ -68,7 +69,7 @@ def cross_section(grid: AlignedMap, v_m: float, length_m: float) -> Float32:
     out = np.full(part.shape[1], np.nan, np.float32)
     enough = known >= max(0.3 * rows, 1)
     if enough.any():
-        out[enough] = np.nanmedian(part[:, enough], axis=0)
+        out[enough] = nan_medians(part[:, enough])
     out[out <= grid.stock_over_m] = np.nan
     return out
 

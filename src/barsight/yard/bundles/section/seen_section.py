@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.core.arrays import Bool, Float64, Int64
+from barsight.core.linalg.robust import nan_medians
 from barsight.yard.bundles.fitting.outline import STEP_M, make_outline, turned_hexagon
 from barsight.yard.bundles.fitting.outline_fit import (
     AGREES,
@@ -179,7 +180,7 @@ def mean_section(grid: AlignedMap, fit: Fit, rows: Int64, half: int) -> tuple[Fl
     enough = 2 * known.sum(axis=0) >= len(rows)
     level = np.full(len(beside), np.nan)
     with np.errstate(invalid="ignore"):
-        level[enough] = np.nanmedian(np.where(known, z, np.nan)[:, enough] - up[:, None], axis=0)
+        level[enough] = nan_medians(np.where(known, z, np.nan)[:, enough] - up[:, None])
     return np.asarray(beside, np.float64), np.asarray(level, np.float64)
 
 

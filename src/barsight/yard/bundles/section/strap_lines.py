@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from scipy import ndimage
 
-from barsight.core.arrays import Bool, Float32, Float64, Int64
+from barsight.core.arrays import Bool, Float32, Float64, Int64, kernel
 from barsight.core.linalg.robust import mad_sigma, running_median
 
 _AROUND_M = 0.2
@@ -91,14 +89,9 @@ def split_columns(
     A stretch gains, of each row whose mean contrast is over _TOOTH, its sum. contrast: (rows, places);
     gullies, cliffs: (places,).
     """
-    sums = _sums(contrast)[1::2]
-
-    def gain(begin: Int64, last: int) -> Float64:
-        own = sums[:, last, None] - sums[:, begin]
-        return np.where(own > _TOOTH * (last - begin), own, 0.0)
-
+    spread = np.arange(contrast.shape[1] + 1, dtype=np.float64)
     prices = _prices(gullies, _PRICE, _GULLY_PRICE)
-    return _split(gain, prices, narrowest, cliffs)
+    return _split(_sums(contrast[1::2]), spread, prices, narrowest, cliffs, is_faint=False)
 
 
 def split_faint(
@@ -109,19 +102,14 @@ def split_faint(
     A stretch gains, of each row whose sum is over _FAINT standard deviations, half the squares beyond that.
     level, variance: of `faint_lines`.
     """
-    sums, spread = _sums(level)[1::2], _sums(variance[None])[0]
-
-    def gain(begin: Int64, last: int) -> Float64:
-        own = (sums[:, last, None] - sums[:, begin]) ** 2 / (spread[last] - spread[begin])
-        return np.asarray(np.maximum(own - _FAINT**2, 0.0) / 2, np.float64)
-
     prices = _prices(gullies, _FAINT_PRICE, _FAINT_GULLY_PRICE)
-    return _split(gain, prices, narrowest, cliffs)
+    spread = _sums(variance[None])[:, 0].copy()
+    return _split(_sums(level[1::2]), spread, prices, narrowest, cliffs, is_faint=True)
 
 
 def _sums(values: Float64) -> Float64:
-    """Sum up along rows: (rows, places + 1)."""
-    return np.concatenate([np.zeros((len(values), 1)), np.cumsum(values, axis=1)], axis=1)
+    """Sum up along rows: (places + 1, rows)."""
+    return np.concatenate([np.zeros((1, len(values))), np.cumsum(values, axis=1).T])
 
 
 def _prices(gullies: Bool, price: float, gully_price: float) -> Float64:
@@ -132,31 +120,64 @@ def _prices(gullies: Bool, price: float, gully_price: float) -> Float64:
 
 
 def _split(
-    gain: Callable[[Int64, int], Float64], prices: Float64, narrowest: int, cliffs: Bool
+    sums: Float64, spread: Float64, prices: Float64, narrowest: int, cliffs: Bool, *, is_faint: bool
 ) -> list[tuple[int, int, Int64]]:
     """Choose by dynamic programming the stretches (first, one past the last, every other row that gains most
     about it) that together gain most; none reaches over a cliff.
 
-    gain: of every other row (rows, N) in stretches by their first places and one past the last.
+    sums: (places + 1, rows) of every other row; spread: (places + 1,) sums of what a place is wide.
+    """
+    before = _best_stretches(sums, spread, prices, narrowest, cliffs, is_faint)
+    found, last = [], len(prices) - 1
+    while last > 0:
+        first = int(before[last])
+        own = row_gains(sums[first], sums[last], spread[last] - spread[first], is_faint)
+        peak = (own == ndimage.maximum_filter1d(own, 5)) & (own > 0)
+        if last - first >= narrowest and peak.any():
+            found.append((first, last, 2 * np.flatnonzero(peak) + 1))
+        last = first
+    return found[::-1]
+
+
+@kernel()
+def _best_stretches(
+    sums: Float64, spread: Float64, prices: Float64, narrowest: int, cliffs: Bool, is_faint: bool
+) -> Int64:
+    """Find the first place of the best stretch that ends at each place, (places + 1,).
+
+    sums: (places + 1, rows), spread, prices: (places + 1,), cliffs: (places,), see `_split`.
     """
     places = len(prices) - 1
-    best, before = np.zeros(places + 1), np.zeros(places + 1, int)
+    best, before = np.zeros(places + 1), np.zeros(places + 1, np.int64)
+    begin = 0
     for last in range(1, places + 1):
-        begin = int(np.flatnonzero(cliffs[: last - 1])[-1]) + 1 if cliffs[: last - 1].any() else 0
-        first = np.arange(begin, last)
-        gained = np.where(last - first >= narrowest, gain(first, last).sum(axis=0), 0.0)
-        total = best[begin:last] + gained - prices[last]
-        before[last] = begin + int(total.argmax())
-        best[last] = total.max()
-    found, last = [], places
-    while last > 0:
-        first_of = int(before[last])
-        own = gain(np.array([first_of]), last)[:, 0]
-        peak = (own == ndimage.maximum_filter1d(own, 5)) & (own > 0)
-        if last - first_of >= narrowest and peak.any():
-            found.append((first_of, last, 2 * np.flatnonzero(peak) + 1))
-        last = first_of
-    return found[::-1]
+        if last > 1 and cliffs[last - 2]:
+            begin = last - 1
+        best[last] = -np.inf
+        for first in range(begin, last):
+            total = best[first] - prices[last]
+            if last - first >= narrowest:
+                gains = row_gains(sums[first], sums[last], spread[last] - spread[first], is_faint)
+                total = best[first] + gains.sum() - prices[last]
+            if total > best[last]:
+                best[last], before[last] = total, first
+    return before
+
+
+@kernel()
+def row_gains(begin: Float64, end: Float64, wide: float, is_faint: bool) -> Float64:
+    """Compute what a stretch gains of each row (rows,): see `split_columns`, and `split_faint` if is_faint.
+
+    begin, end: (rows,) sums up to its first and last place. wide: how many places, or their variance.
+    """
+    gains = np.empty(begin.size)
+    for k in range(begin.size):
+        own = end[k] - begin[k]
+        if is_faint:
+            gains[k] = max(own * own / wide - _FAINT**2, 0.0) / 2
+        else:
+            gains[k] = own if own > _TOOTH * wide else 0.0
+    return gains
 
 
 def find_gullies(level_m: Float64, cell_m: float) -> Bool:

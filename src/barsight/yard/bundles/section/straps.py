@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
-from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8
+from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8, kernel
 from barsight.core.types import HeightSource
 from barsight.yard.bundles.fitting.outline_fit import ABOVE, BELOW, MIXED, SLOPE_U, Fit, U
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
@@ -203,13 +203,29 @@ def _row_at_ends(contrast: Float64, row: int, cell_m: float) -> tuple[float, flo
 def _ends(lines: Bool, bridged: int) -> Float64 | None:
     """Find where each strap (rows) begins and ends (S, 2), one past the last place; None where few are seen.
 
-    A strap is its longest run, breaks of up to `bridged` places closed. lines: (rows, places).
+    A strap is its longest run, breaks of less than `bridged` places closed. lines: (rows, places).
     """
-    ends = []
-    for own in lines:
-        seen = ndimage.binary_closing(np.pad(own, bridged), np.ones(bridged, bool))[bridged:-bridged]
-        runs, count = ndimage.label(seen)
-        if count:
-            longest = np.flatnonzero(runs == 1 + int(np.bincount(runs)[1:].argmax()))
-            ends.append((longest[0], longest[-1] + 1))
-    return np.array(ends, np.float64) if len(ends) >= MIN_STRAPS else None
+    ends = longest_runs(lines, bridged)
+    ends = ends[ends[:, 1] > 0]
+    return ends.astype(np.float64) if len(ends) >= MIN_STRAPS else None
+
+
+@kernel()
+def longest_runs(lines: Bool, bridged: int) -> Int64:
+    """Find the longest run of each row (rows, 2), its first place and one past its last, 0 where nothing is
+    set; runs less than `bridged` places apart are one, of equal ones the first counts.
+
+    lines: (rows, places).
+    """
+    found = np.zeros((lines.shape[0], 2), np.int64)
+    for k in range(lines.shape[0]):
+        first, last = -1, -1
+        for place in range(lines.shape[1]):
+            if not lines[k, place]:
+                continue
+            if first < 0 or place - last > bridged:
+                first = place
+            last = place
+            if last + 1 - first > found[k, 1] - found[k, 0]:
+                found[k, 0], found[k, 1] = first, last + 1
+    return found
