@@ -25,7 +25,10 @@ pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed (bash .ci/servers)"),
     pytest.mark.slow,
 ]
-SCREENS = ("yard", "model", "bundle", "lifts", "stock", "alarms", "timeline", "surveys", "health", "admin")
+SCREENS = (
+    "yard", "model", "bundle", "lifts", "stock", "alarms", "timeline", "surveys", "targets", "health",
+    "admin",
+)  # fmt: skip
 GRAPHICS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 """WebGL without a graphics card."""
 PASSWORD = "four words that nobody guesses"
@@ -100,7 +103,7 @@ def test_every_screen_by_mouse_and_by_keyboard(browser: object, address: str) ->
     page.wait_for_selector("#nav-admin")
     page.keyboard.press("Tab")
     reached = []
-    for _ in range(16):
+    for _ in range(17):
         page.keyboard.press("Tab")
         reached.append(page.evaluate("document.activeElement.id"))
         if reached[-1].startswith("nav-"):

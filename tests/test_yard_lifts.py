@@ -12,8 +12,11 @@ from typing import Any
 import jsonschema
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.optimize import linprog
 
+from barsight.core.errors import ConfigError
 from barsight.core.notices import FORBIDS, WARNINGS
 from barsight.core.stamps import NS_PER_S
 from barsight.core.types import HeightSource
@@ -21,6 +24,7 @@ from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.lift_file import lifts_content, read_lifts, write_lifts
+from barsight.yard.lifting.load import reaches_area
 from barsight.yard.lifting.targets import map_vetoes, plan_lifts
 from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.magnet.contact import rest_magnet
@@ -299,6 +303,37 @@ def test_a_bundle_beside_one_that_leans_over_it() -> None:
     lift = judged(stock, bundles, Placement(0.5, 0.0, 0.0))
     assert "unstable-side" in codes(lift)
     assert "bundle 1" in next(v.reason for v in lift.vetoes if v.code == "unstable-side")
+
+
+def test_nothing_is_lifted_in_a_no_lift_area() -> None:
+    """The bundle lies at x 0.3, 7 m long and known to some millimetres."""
+    for area, free in (
+        ((0.25, -1.0, 0.35, 1.0), False), ((-9.0, 3.51, 9.0, 4.0), False), ((-9.0, 3.7, 9.0, 4.0), True),
+        ((1.2, -9.0, 1.3, 9.0), True),
+    ):  # fmt: skip
+        lift = judged([laid(0.3)], settings=LiftSettings(no_lift_areas=(area,)))
+        assert codes(lift) == (set() if free else {"no-lift-area"}), area
+    with pytest.raises(ConfigError, match=r"give x_min, y_min, x_max, y_max, not 2, 0, 1, 1"):
+        LiftSettings(no_lift_areas=((2.0, 0.0, 1.0, 1.0),))
+
+
+@given(
+    st.floats(-np.pi, np.pi), st.tuples(st.floats(-3, 3), st.floats(-3, 3)),
+    st.tuples(st.floats(0.2, 2), st.floats(0.2, 4)),
+)  # fmt: skip
+def test_a_turned_outline_meets_an_area_where_they_overlap(
+    yaw_rad: float, middle: tuple[float, float], size: tuple[float, float]
+) -> None:
+    area = (-1.0, -0.5, 1.0, 0.5)
+    axes = np.array([[np.cos(yaw_rad), np.sin(yaw_rad)], [-np.sin(yaw_rad), np.cos(yaw_rad)]])
+    u, v = np.meshgrid(*(np.linspace(-0.5, 0.5, 41) * one for one in size))
+    points = middle + np.column_stack([u.ravel(), v.ravel()]) @ axes
+    inside = ((np.abs(points) <= (1.0, 0.5)).all(axis=1)).any()
+    told = reaches_area(np.array(middle), yaw_rad, size, area)
+    # Points are 0.05 and 0.1 m apart: they may miss a corner that overlaps by less.
+    grown = reaches_area(np.array(middle), yaw_rad, (size[0] - 0.25, size[1] - 0.25), area)
+    assert told or not inside
+    assert inside or not grown or min(size) < 0.3
 
 
 def test_a_bundle_above_its_stanchion() -> None:

@@ -7,7 +7,13 @@ import cv2
 import numpy as np
 import pytest
 
-from barsight.calibration.boards.ring_detection import PAPER, find_rings, ring_codes, ring_pattern
+from barsight.calibration.boards.ring_detection import (
+    PAPER,
+    find_rings,
+    nearest_disc,
+    ring_codes,
+    ring_pattern,
+)
 from barsight.cli.main import run
 from barsight.core.errors import InputError
 from barsight.recording.formats.surveyed_targets import SurveyedTags, read_tags
@@ -58,6 +64,20 @@ def test_nothing_else_is_taken_for_one() -> None:
     for x, y in rng.uniform(20, 480, (60, 2)).astype(int).tolist():
         cv2.circle(image, (x, y), 7, 20, -1)
     assert find_rings(image)[0].size == 0
+
+
+def test_the_disc_beside_a_place_is_found_dark_or_bright_and_one_that_is_not_round_is_none() -> None:
+    y, x = (np.indices((80 * 8, 80 * 8)) + 0.5) / 8 - 0.5
+    for dark, bright in ((30, 200), (210, 60)):
+        drawn = np.where(np.hypot(x - 38.3, y - 41.6) < 5, dark, bright)
+        blotted = np.where((np.abs(x - 32) < 2) & (np.abs(y - 41) < 2), dark, drawn)
+        round_one, other = (
+            one.reshape(80, 8, 80, 8).mean(axis=(1, 3)).astype(np.uint8) for one in (drawn, blotted)
+        )
+        found = nearest_disc(round_one, np.array([42.0, 40.0]), 8.0)
+        assert found is not None and found == pytest.approx([38.3, 41.6, 5], abs=0.1)
+        assert nearest_disc(round_one, np.array([48.0, 40.0]), 8.0) is None
+        assert nearest_disc(other, np.array([42.0, 40.0]), 8.0) is None
 
 
 def test_circles_in_pairs_are_placed_within_their_sigma() -> None:

@@ -12,8 +12,8 @@ from barsight.core.types import HeightSource
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.bearing import find_bearing
 from barsight.yard.lifting.ground import Ground
-from barsight.yard.lifting.load import Load
-from barsight.yard.lifting.set_down import SetDown, find_set_down
+from barsight.yard.lifting.load import Load, reaches_area
+from barsight.yard.lifting.set_down import SetDown, find_set_down, sound_ground
 from barsight.yard.lifting.targets import put_down
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.types import HeightMap
@@ -117,6 +117,22 @@ def test_a_stanchion_is_not_touched_and_stands_over_what_it_holds() -> None:
         settings = LiftSettings(stanchions=((x, 1.0, top),))
         found = find_bearing(yard(), LOAD, *FREE, 0.0, MAGNET, settings)
         assert (found is not None) is fits, (x, top)
+
+
+def test_nothing_is_put_down_in_a_no_lift_area() -> None:
+    """The nearest place is taken; with that barred another one, and with all barred none."""
+    heights = yard()
+    place = find_set_down(Ground.of(heights), LOAD, MAGNET, SETTINGS)
+    assert place is not None
+    for reach_m, found in ((0.3, True), (50.0, False)):
+        area = (place.x_m - reach_m, place.y_m - reach_m, place.x_m + reach_m, place.y_m + reach_m)
+        settings = LiftSettings(no_lift_areas=(area,))
+        other = find_set_down(sound_ground(Ground.of(heights), (), (), settings), LOAD, MAGNET, settings)
+        assert (other is not None) is found
+        if other is not None:
+            middle = np.array([other.x_m, other.y_m])
+            yaw_rad = np.radians(other.yaw_deg)
+            assert not reaches_area(middle, yaw_rad, (LOAD.width_m, LOAD.length_m), area)
 
 
 def test_the_place_is_the_bundles_own_kind_of_place() -> None:

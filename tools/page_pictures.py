@@ -6,24 +6,28 @@ import importlib
 import shutil
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
-from playwright.sync_api import sync_playwright
+import numpy as np
+from playwright.sync_api import Page, sync_playwright
 
 from barsight.page.serve import ServeOptions, serving
 
 ROOT = Path(__file__).parents[1]
-SCREENS = ("yard", "lifts", "alarms", "timeline")
+SCREENS = ("yard", "lifts", "alarms", "timeline", "targets")
+TURN, SHIFT_M = np.array([[0.8, -0.6], [0.6, 0.8]]), (100.0, 20.0)
+"""Of the surveyed targets' yard."""
 
 
 def main() -> None:
     """Serve a store of two surveys and write a picture of each screen."""
     sys.path.insert(0, str(ROOT / "tests"))
-    fill_store = importlib.import_module("page_yards").fill_store
+    yards = importlib.import_module("page_yards")
 
     with (
         tempfile.TemporaryDirectory() as folder,
-        serving(fill_store(Path(folder)), ServeOptions(port=0)) as address,
+        serving(yards.fill_store(Path(folder)), ServeOptions(port=0)) as address,
         sync_playwright() as playwright,
     ):
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
@@ -36,8 +40,22 @@ def main() -> None:
                 for _ in range(5):
                     page.keyboard.press("n")
                 page.wait_for_timeout(300)
+            if name == "targets":
+                pick(page, yards.DISCS)
             page.screenshot(path=ROOT / "docs" / "pictures" / f"page_{name}.jpg", type="jpeg", quality=70)
         browser.close()
+
+
+def pick(page: Page, discs: Sequence[tuple[float, float]]) -> None:
+    """List the discs as surveyed, and click beside each."""
+    rows = [f"post {k},{x:.4f},{y:.4f},0.0010,0.001," for k, (x, y) in enumerate(discs @ TURN.T + SHIFT_M)]
+    page.fill("#listed", "\n".join(["name,yard_x,yard_y,yard_z,sigma_m,check", *rows]))
+    page.click("#take-list .main")
+    page.wait_for_selector("#target-0")
+    for k, (x_m, y_m) in enumerate(discs):
+        x, y = page.evaluate(f"barsightTargets.place({x_m}, {y_m})")
+        page.click("#photo", position={"x": x + 1, "y": y})
+        page.wait_for_selector(f"#remove-{k}")
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from barsight.recording.sensor_samples import make_laser
 from barsight.recording.wrapper import RecordingProxy
 from barsight.registration.bending import CraneBend, bend_carry, bend_heights
 from barsight.registration.yard_file import YardFrame, read_yard_file
+from barsight.result_folder import open_folder
 from barsight.yard.identity import ID_DIGITS
 
 MAX_TURN_DEG, MAX_PLACE_M = 1.0, 0.5
@@ -82,6 +83,23 @@ def mounting_id(crane: CraneSamples) -> str:
 def recording_id(inputs: Mapping[str, str]) -> str:
     """Compute the digest of a recording's inputs."""
     return json_digest(dict(inputs))[:ID_DIGITS]
+
+
+def measured_owners(folder: Path) -> dict[str, str | None]:
+    """Read which rig, crane and recording a folder of results is of. Raises InputError for one whose map says
+    nothing of a frame of one recording.
+    """
+    said, path = open_folder(folder)[0], folder / "result.json"
+    if said["configuration"].get("yard") is not None:
+        raise InputError(path, "was measured with --yard", "measure the targets in a map without it")
+    if said.get("passes"):
+        raise InputError(path, "is of several passes", "measure the targets in a map of one pass")
+    by_encoders = said["reference"] == "yard"
+    return {
+        "calibration_id": said["calibration_id"],
+        "mounting_id": said["yard_frame_id"] if by_encoders else None,
+        "recording_id": None if by_encoders else recording_id(said["hashes"]["inputs"]),
+    }
 
 
 def yard_frame_id(recording: Recording, trajectory: Trajectory) -> str | None:

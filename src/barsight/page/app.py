@@ -20,6 +20,7 @@ from barsight.page.layers import Kind, PaintedLayers, find_layers
 from barsight.page.model import survey_model
 from barsight.page.pictures import paint_bundle
 from barsight.page.survey_files import find_file
+from barsight.page.targets import Pick, fit_targets, paint_photo, picking_record
 from barsight.page.watch import StoreWatch
 from barsight.store.accounts import Role, add_person, add_token, withdraw
 from barsight.store.audit import Entry, entry
@@ -108,6 +109,23 @@ class ApprovalForm(NoteForm):
     until_ns: int | None = None
 
 
+class PickForm(BaseModel):
+    """A target's pick in a survey's map, m. is_exact: take the place itself, no disc beside it."""
+
+    name: str = Field(max_length=200)
+    x_m: float
+    y_m: float
+    is_exact: bool = False
+
+
+class TargetsForm(BaseModel):
+    """A list of surveyed places (CSV), the sigma of a coordinate where it says none, and the picks."""
+
+    listed: str = Field(min_length=1, max_length=200_000)
+    sigma_m: float
+    picks: list[PickForm] = Field(max_length=1000)
+
+
 class AccountForm(BaseModel):
     """An account to add or change. password: of a person; a token is drawn for a program."""
 
@@ -140,6 +158,7 @@ def build_app(watch: StoreWatch, hosts: frozenset[str], origins: frozenset[str],
     _add_alarms(app, watch, access)
     _add_accounts(app, watch, access)
     _add_calibrations(app, watch, access)
+    _add_targets(app, watch, access)
     return Guard(app, hosts, origins)
 
 
@@ -428,3 +447,24 @@ def _add_calibrations(app: FastAPI, watch: StoreWatch, access: Access) -> None:
             approve_calibration(opened, form.digest, clock_ns, form.until_ns, form.note)
         watch.judge()
         return {"revision": watch.published.revision}
+
+
+def _add_targets(app: FastAPI, watch: StoreWatch, access: Access) -> None:
+    reader, engineer = _need(access, "read"), _need(access, "administer")
+
+    @app.get("/api/surveys/{map_id}/targets")
+    def grid(map_id: str, _: Caller = engineer) -> Any:
+        with watch.store.reading() as connection:
+            return json_value(picking_record(connection, map_id))
+
+    @app.get("/api/surveys/{map_id}/photo.png")
+    def photo(map_id: str, left: int, right: int, low: int, high: int, _: Caller = reader) -> Response:
+        with watch.store.reading() as connection:
+            painted = paint_photo(connection, map_id, (left, right), (low, high))
+        return Response(painted, media_type="image/png")
+
+    @app.post("/api/surveys/{map_id}/targets")
+    def fit(map_id: str, form: TargetsForm, _: Caller = engineer) -> Any:
+        picks = [Pick(one.name, one.x_m, one.y_m, one.is_exact) for one in form.picks]
+        with watch.store.reading() as connection:
+            return json_value(fit_targets(connection, map_id, form.listed, form.sigma_m, picks))

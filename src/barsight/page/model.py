@@ -9,16 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
-from barsight.core.errors import InputError
 from barsight.core.extras import extra
 from barsight.page.access import AccessError
-from barsight.result_folder import open_folder, read_heights
-from barsight.store.tables import SURVEYS
+from barsight.page.survey_files import expect_map, survey_folder
+from barsight.result_folder import read_heights
 from barsight.viewer.cloud import colour_layer, surface_layer
 from barsight.viewer.yard_lines import yard_lines
 
 with extra("store"):
-    from sqlalchemy import Connection, select
+    from sqlalchemy import Connection
 
 COLOURS = ("height", "sigma", "views", "source")
 MAX_POINTS = 400_000
@@ -32,17 +31,14 @@ def survey_model(connection: Connection, map_id: str, by: str) -> bytes:
     lines, (N, 3) uint8 colours. Raises AccessError where there is no such survey, InputError where its folder
     isn't as it was added.
     """
-    folder = connection.execute(select(SURVEYS.c.folder).where(SURVEYS.c.map_id == map_id)).scalar()
-    if folder is None or by not in COLOURS:
+    if by not in COLOURS:
         raise AccessError(404, f"there is no survey {map_id} with {by}")
-    return _packed(Path(folder), map_id, by)
+    return _packed(survey_folder(connection, map_id), map_id, by)
 
 
 @functools.lru_cache(maxsize=_KEPT)
 def _packed(folder: Path, map_id: str, by: str) -> bytes:
-    _, identity = open_folder(folder)
-    if identity is None or identity.map_id != map_id:
-        raise InputError(folder, f"holds another map than {map_id}", "measure into a folder of its own")
+    expect_map(folder, map_id)
     layer = surface_layer(read_heights(folder), MAX_POINTS)
     coloured, lines = colour_layer(layer, by), yard_lines(folder)
     head = {

@@ -1,13 +1,15 @@
-"""Find a survey's files for whoever asks for one by name."""
+"""Find a survey's folder, and its files for whoever asks for one by name."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 from barsight.core.errors import InputError
 from barsight.core.extras import extra
-from barsight.result_folder import file_digest
+from barsight.page.access import AccessError
+from barsight.result_folder import file_digest, open_folder
 from barsight.store.tables import SURVEYS
 
 with extra("store"):
@@ -15,6 +17,22 @@ with extra("store"):
 
 UNSEALED = ("report.html", "ortho.png")
 """Files that the store keeps no digest of."""
+
+
+def survey_folder(connection: Connection, map_id: str) -> Path:
+    """Return a survey's folder. Raises AccessError where there is no such survey."""
+    folder = connection.execute(select(SURVEYS.c.folder).where(SURVEYS.c.map_id == map_id)).scalar()
+    if folder is None:
+        raise AccessError(404, f"there is no survey {map_id}")
+    return Path(folder)
+
+
+def expect_map(folder: Path, map_id: str) -> dict[str, Any]:
+    """Return a folder's result.json. Raises InputError where the folder isn't as it was added."""
+    summary, identity = open_folder(folder)
+    if identity is None or identity.map_id != map_id:
+        raise InputError(folder, f"holds another map than {map_id}", "measure into a folder of its own")
+    return summary
 
 
 def find_file(connection: Connection, map_id: str, name: str) -> Path:

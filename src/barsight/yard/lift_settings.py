@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from barsight.core.errors import ConfigError
 from barsight.core.settings.values import OVER_0, POSITIVE, SHARE, expect_ranges
 
 
@@ -51,6 +52,9 @@ class LiftSettings:
     """The most that may stand where nothing was seen; without it no load travels over such a place."""
     stanchions: tuple[tuple[float, float, float], ...] = ()
     """x, y and height (m) of the stanchions, where there are any."""
+    no_lift_areas: tuple[tuple[float, float, float, float], ...] = ()
+    """x_min, y_min, x_max, y_max (m) of rectangles where nothing is lifted or put down: walls, walkways, what
+    stands there for good."""
     min_freeboard_m: float = 0.05
     """How far a stanchion must stand above the bundles beside it."""
     beside_stanchion_m: float = 1.0
@@ -66,6 +70,10 @@ class LiftSettings:
             swing_m=POSITIVE, dunnage_m=(0, 0.5), max_turn_deg=(0, 180), max_stack_m=(OVER_0, 50),
             max_lean_deg=(OVER_0, 45),
         )  # fmt: skip
+        for area in self.no_lift_areas:
+            if not (area[0] < area[2] and area[1] < area[3]):
+                told = ", ".join(f"{value:g}" for value in area)
+                raise ConfigError(f"lift.no_lift_areas: give x_min, y_min, x_max, y_max, not {told}")
 
 
 UPPER = 1.645

@@ -21,6 +21,7 @@ VETOES = {
     "stock-list": "The stock list says another bundle than the one that was found.",
     "one-view": "One frame made the map: no height is confirmed by another.",
     "no-yard-frame": "The map isn't in the crane's yard frame, so the crane can't go there.",
+    "no-lift-area": "The magnet or the load reaches into a place where the settings allow no lift.",
     "no-bundle": "No bundle lies under the footprint within the magnet's reach.",
     "unknown-under-footprint": "Under or beside the magnet a place is neither seen nor proven free by sight.",
     "unexplained-surface": "Something under the poles, within reach, belongs to no known bundle.",

@@ -6,6 +6,7 @@ target's number is that of its sectors among all that are no turn of each other.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import cache
 
 import cv2
@@ -26,6 +27,8 @@ SAMPLES = 10
 MIN_AGREE = 0.85
 """Least share of a sector's places that agree, the outer ones left out."""
 RAYS = 64
+MAX_OVAL = 1.15
+"""Most by which a round disc's axes differ: what isn't known beside it makes it longer."""
 
 
 @cache
@@ -59,20 +62,41 @@ def find_rings(image: UInt8) -> tuple[Int64, Float64]:
     """
     found: dict[tuple[int, int], tuple[int, Float64]] = {}
     smooth = image.astype(np.float32)
+    for seen in _dark_discs(image):
+        number = _number(smooth, seen)
+        if number is not None:
+            middle, radius = seen[:2], float(np.sqrt(seen[2] * seen[3]))
+            square = middle + radius * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+            found.setdefault((round(middle[0] / 4), round(middle[1] / 4)), (number, square))
+    ones = _without_doubles(sorted(found.values(), key=lambda one: one[0]))
+    numbers = np.array([number for number, _ in ones], np.int64)
+    return numbers, np.array([square for _, square in ones], np.float64).reshape(-1, 4, 2)
+
+
+def nearest_disc(image: UInt8, pixel: Float64, reach_px: float) -> Float64 | None:
+    """Find the round disc, dark on bright or bright on dark, whose middle lies nearest to a pixel (2,):
+    middle and radius (3,), or None where none lies within reach.
+    """
+    best, nearest = None, reach_px
+    for gray in (image, 255 - image):
+        for ellipse in _dark_discs(gray):
+            away = float(np.linalg.norm(ellipse[:2] - pixel))
+            if away < nearest and max(ellipse[2:4]) < MAX_OVAL * min(ellipse[2:4]):
+                best, nearest = np.append(ellipse[:2], np.sqrt(ellipse[2] * ellipse[3])), away
+    return best
+
+
+def _dark_discs(image: UInt8) -> Iterator[Float64]:
+    """Yield ellipses (5,) through the edges of dark discs, some more than once."""
+    smooth = image.astype(np.float32)
     for window in WINDOWS:
         dark = cv2.adaptiveThreshold(
             image, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, window, MIN_CONTRAST / 5
         )
         for ellipse in _discs(dark):
             seen = _fitted(smooth, ellipse)
-            number = None if seen is None else _number(smooth, seen)
-            if seen is not None and number is not None:
-                middle, radius = seen[:2], float(np.sqrt(seen[2] * seen[3]))
-                square = middle + radius * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-                found.setdefault((round(middle[0] / 4), round(middle[1] / 4)), (number, square))
-    ones = _without_doubles(sorted(found.values(), key=lambda one: one[0]))
-    numbers = np.array([number for number, _ in ones], np.int64)
-    return numbers, np.array([square for _, square in ones], np.float64).reshape(-1, 4, 2)
+            if seen is not None:
+                yield seen
 
 
 def _without_doubles(ones: list[tuple[int, Float64]]) -> list[tuple[int, Float64]]:

@@ -18,7 +18,7 @@ from barsight.cli.calibrate.yard_tags import calibrate_by_tags, print_bend
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.arrays import Float64
-from barsight.core.errors import ConfigError, Failed, InputError, MeasurementError
+from barsight.core.errors import ConfigError, Failed, MeasurementError
 from barsight.core.files import atomic_paths, expect_output
 from barsight.core.timing import count_frames
 from barsight.motion.batch.fusion import BatchFusion, FusionSettings
@@ -31,10 +31,9 @@ from barsight.registration.bending import CraneBend, straight
 from barsight.registration.yard import YardCalibration, calibrate_yard
 from barsight.registration.yard_file import MAX_SPAN_M, MIN_SPAN_M, write_yard_file
 from barsight.report.calibration.yard_page import write_yard_report
-from barsight.result_folder import open_folder
 from barsight.yard_frame import MAX_PLACE_M as MAX_UNSURE_M
 from barsight.yard_frame import MAX_TURN_DEG as MAX_UNSURE_DEG
-from barsight.yard_frame import calibration_id, recording_id
+from barsight.yard_frame import calibration_id, measured_owners, recording_id
 
 MAX_TURN_DEG = 0.05
 MAX_PLACE_M = 0.01
@@ -129,7 +128,7 @@ class _YardSource:
             return moved.calibration, owners, moved.yard_from_body, bend
         owners, frame = dict[str, str | None](), self.frame
         if self.measured is not None:
-            owners = _measured_owners(self.measured)
+            owners = measured_owners(self.measured)
         if owners:
             frame = "world" if owners["mounting_id"] is None else "encoders"
         return _from_targets(self.source, frame, self.sigma_m), owners, None, bend
@@ -185,21 +184,6 @@ def _from_moves(
         "recording_id": recording_id(recording.digests()),
     }  # fmt: skip
     return moved, owners
-
-
-def _measured_owners(folder: Path) -> dict[str, str | None]:
-    """Read which rig, crane and recording a folder of results is of."""
-    said, path = open_folder(folder)[0], folder / "result.json"
-    if said["configuration"].get("yard") is not None:
-        raise InputError(path, "was measured with --yard", "measure the targets in a map without it")
-    if said.get("passes"):
-        raise InputError(path, "is of several passes", "measure the targets in a map of one pass")
-    by_encoders = said["reference"] == "yard"
-    return {
-        "calibration_id": said["calibration_id"],
-        "mounting_id": said["yard_frame_id"] if by_encoders else None,
-        "recording_id": None if by_encoders else recording_id(said["hashes"]["inputs"]),
-    }
 
 
 def _expect_usable(found: YardCalibration, source: Path) -> None:

@@ -220,12 +220,15 @@ export class YardCanvas {
     c.fillStyle = "#3c4043";
     c.textAlign = "center";
     c.textBaseline = "bottom";
-    for (const x of xs) c.fillText(`X ${x}`, this.place(x, 0)[0], this.height - 3);
+    c.strokeStyle = "#dcdddfd8";
+    c.lineWidth = 4;
+    const write = (text, px, py) => { c.strokeText(text, px, py); c.fillText(text, px, py); };
+    for (const x of xs) write(`X ${x}`, this.place(x, 0)[0], this.height - 3);
     c.textAlign = "left";
     c.textBaseline = "middle";
     for (const y of ys) {
       const [, py] = this.place(0, y);
-      if (py < this.height - 24) c.fillText(`Y ${y}`, 4, py);
+      if (py < this.height - 24) write(`Y ${y}`, 4, py);
     }
   }
 

@@ -3,12 +3,13 @@ import { ageText, h, languageName, LANGUAGES, loadWords, setLanguage, show, t, t
 import { enter, forget, listen, live, logIn, read, session } from "./api.js";
 import { clockNow, showCrane, yardScreen } from "./yard.js";
 import { adminScreen, alarmScreen, alarmText, bundleScreen, healthScreen, liftScreen, mark, priority, stockScreen, surveyScreen } from "./screens.js";
+import { targetScreen } from "./targets.js";
 import { timelineScreen } from "./timeline.js";
 
 // WebGL is on this screen only: it is loaded when it is opened.
 const modelScreen = async (...given) => (await import("./model.js")).modelScreen(...given);
 
-const SCREENS = { yard: yardScreen, model: modelScreen, bundle: bundleScreen, lifts: liftScreen, stock: stockScreen, alarms: alarmScreen, timeline: timelineScreen, surveys: surveyScreen, health: healthScreen, admin: adminScreen };
+const SCREENS = { yard: yardScreen, model: modelScreen, bundle: bundleScreen, lifts: liftScreen, stock: stockScreen, alarms: alarmScreen, timeline: timelineScreen, surveys: surveyScreen, targets: targetScreen, health: healthScreen, admin: adminScreen };
 const place = document.getElementById("screen");
 let isThere = true;
 let drawn = 0;

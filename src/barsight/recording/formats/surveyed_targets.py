@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import re
 from collections import Counter
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from barsight.core.errors import InputError
 from barsight.core.reading.bounded_reading import MAX_ENTRIES, in_range, read_lines
 
 YARD = ("yard_x", "yard_y", "yard_z")
+PLACE = ("x", "y", "z")
 TAGS = 587
 """Tags of the family 36h11."""
 
@@ -36,7 +38,8 @@ class Targets:
 @dataclass(frozen=True, eq=False)
 class SurveyedTags:
     """numbers (N,) of AprilTags 36h11, or of coded circles where `are_rings`; yard_m (N, 3) of their middles;
-    sigma_m (N,) of each coordinate, NaN where not said; checks (N,): set apart.
+    sigma_m (N,) of each coordinate, NaN where not said; checks (N,): set apart. width_m (N,) of columns that
+    are meant by the middle of their tops, NaN of other targets.
     """
 
     numbers: Int64
@@ -44,6 +47,7 @@ class SurveyedTags:
     sigma_m: Float64
     checks: Bool
     are_rings: bool = False
+    width_m: Float64 | None = None
 
 
 def read_targets(path: Path) -> Targets:
@@ -52,7 +56,7 @@ def read_targets(path: Path) -> Targets:
 
     Raises `InputError` naming the line.
     """
-    names, table = _read_table(path, "name", (*YARD, "x", "y", "z"))
+    names, table = _read_table(path, "name", (*YARD, *PLACE))
     _expect_once(path, "target", names)
     return Targets(names, table[:, :3], table[:, 3:6], table[:, 6], table[:, 7] == 1)
 
@@ -77,16 +81,16 @@ def read_tags(path: Path) -> SurveyedTags:
     return SurveyedTags(*found, are_rings)
 
 
-def read_places(path: Path) -> tuple[tuple[str, ...], SurveyedTags]:
-    """Read a CSV with a header, m: `name,yard_x,yard_y,yard_z`, optionally `sigma_m` and `check` (1 or 0).
-    Returns the names, and targets numbered in their order.
+def read_places(path: Path, text: str | None = None) -> tuple[tuple[str, ...], SurveyedTags]:
+    """Read a CSV with a header, m: `name,yard_x,yard_y,yard_z`, optionally `sigma_m`, `check` (1 or 0) and,
+    of columns, `width_m`. Returns the names, and targets numbered in their order.
 
-    Raises `InputError` naming the line.
+    text: its content where it is no file yet. Raises `InputError` naming the line.
     """
-    names, table = _read_table(path, "name", YARD)
+    names, table = _read_table(path, "name", YARD, text)
     _expect_once(path, "target", names)
     numbers = np.arange(len(names), dtype=np.int64)
-    return names, SurveyedTags(numbers, table[:, :3], table[:, 3], table[:, 4] == 1)
+    return names, SurveyedTags(numbers, table[:, :3], table[:, 3], table[:, 4] == 1, width_m=table[:, 5])
 
 
 def read_picks(path: Path, names: tuple[str, ...]) -> dict[int, dict[int, Float64]]:
@@ -120,12 +124,25 @@ def read_picks(path: Path, names: tuple[str, ...]) -> dict[int, dict[int, Float6
     return picks
 
 
-def _read_table(path: Path, key: str, columns: tuple[str, ...]) -> tuple[tuple[str, ...], Float64]:
-    """Read the texts (N,) of `key`, and the numbers (N, columns + 2): `columns`, sigma_m (NaN where not
-    said), check.
+def write_targets(targets: Targets) -> str:
+    """Write the text that `read_targets` reads."""
+    file = io.StringIO()
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow(("name", *YARD, *PLACE, "sigma_m", "check"))
+    for k, name in enumerate(targets.names):
+        numbers = [*targets.yard_m[k], *targets.measured_m[k], targets.sigma_m[k]]
+        writer.writerow([name, *(f"{value:.5f}" for value in numbers), int(targets.checks[k])])
+    return file.getvalue()
+
+
+def _read_table(
+    path: Path, key: str, columns: tuple[str, ...], text: str | None = None
+) -> tuple[tuple[str, ...], Float64]:
+    """Read the texts (N,) of `key`, and the numbers (N, columns + 3): `columns`, sigma_m (NaN where not
+    said), check, width_m (NaN where not said).
     """
     remedy = f"give {','.join((key, *columns))} and, if wanted, sigma_m and check"
-    first, *others = read_lines(path, MAX_ENTRIES, remedy)
+    first, *others = read_lines(path, MAX_ENTRIES, remedy) if text is None else text.strip().split("\n")
     lines = [first.lstrip("# "), *others]
     try:
         rows = list(csv.DictReader(lines, skipinitialspace=True))
@@ -140,14 +157,15 @@ def _read_table(path: Path, key: str, columns: tuple[str, ...]) -> tuple[tuple[s
         try:
             values = [float(row[name]) for name in columns]
             values += [float(row.get("sigma_m") or "nan"), float(row.get("check") or 0)]
+            values.append(float(row.get("width_m") or "nan"))
         except (TypeError, ValueError):
             raise InputError(path, f"line {n}: a number is missing or is none", remedy) from None
-        if not in_range(values[:-2]).all() or values[-2] <= 0 or values[-1] not in (0, 1):
-            raise InputError(
-                path, f"line {n}: a value can't be", "places finite, sigma_m positive, check 0 or 1"
-            )
+        sigma_m, check, width_m = values[-3:]
+        if not in_range(values[:-3]).all() or sigma_m <= 0 or check not in (0, 1) or width_m <= 0:
+            help_ = "places finite, sigma_m and width_m positive, check 0 or 1"
+            raise InputError(path, f"line {n}: a value can't be", help_)
         numbers.append(values)
-    table = np.array(numbers, np.float64).reshape(-1, len(columns) + 2)
+    table = np.array(numbers, np.float64).reshape(-1, len(columns) + 3)
     return tuple((row[key] or "").strip() for row in rows), table
 
 

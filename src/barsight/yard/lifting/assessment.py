@@ -13,6 +13,7 @@ from barsight.core.arrays import Float64
 from barsight.yard.events import YardEvent
 from barsight.yard.lift_settings import UPPER, LiftSettings
 from barsight.yard.lifting.checks import (
+    area_checks,
     count_checks,
     face_checks,
     load_checks,
@@ -139,6 +140,7 @@ def assess_placement(
     checks = [
         *(travel_checks(yard.travel, place, magnet, settings) if yard.travel else ()),
         *(age_checks(valid.from_ns if valid else None, yard.now_ns, settings) if yard.travel else ()),
+        *area_checks(place, magnet, load, settings),
         *disturbed_checks(yard.events, place, magnet, load, valid, settings),
         *count_checks(place, yard.heights, magnet, near, contact, held, settings),
         *face_checks(contact, needed, magnet, settings),

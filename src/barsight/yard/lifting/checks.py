@@ -10,6 +10,7 @@ import numpy as np
 
 from barsight.core.arrays import Float32, Float64, UInt8, frozen, kernel
 from barsight.yard.lift_settings import UPPER, LiftSettings
+from barsight.yard.lifting.load import Load, reaches_area
 from barsight.yard.magnet.contact import Contact
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import BEYOND_OPEN_END_M, BundleTable, Grip, Placement
@@ -85,6 +86,30 @@ def probability_check(probability: float, count: int, settings: LiftSettings, wh
     return check_min(
         "count-uncertain", "how sure the count is", sure, bound, "sigma", reason, sigma=SURE_OF_SIGMA * bound
     )
+
+
+def area_checks(
+    place: Placement, magnet: Magnet, load: tuple[Bundle, ...], settings: LiftSettings
+) -> list[Check]:
+    """Check that magnet and load keep out of the places where nothing is lifted, the crane's tolerance and
+    the bundles' sigmas counted.
+    """
+    reach = 2 * max(magnet.tolerance.x_m, magnet.tolerance.y_m)
+    centre = np.array([place.x_m, place.y_m])
+    hung = [Load.of((bundle,)) for bundle in load]
+    outlines = [
+        (centre, place.yaw_rad, (magnet.beam.width_m + reach, magnet.beam.length_m + reach)),
+        *((np.array([one.x_m, one.y_m]), one.yaw_rad, (one.width_m, one.length_m)) for one in hung),
+    ]
+    what = "magnet and load keep out of no-lift areas"
+    return [
+        check_true(
+            "no-lift-area", what, not any(reaches_area(*outline, area) for outline in outlines),
+            f"magnet or load reaches into the no-lift area from {area[0]:g}, {area[1]:g} to {area[2]:g}, "
+            f"{area[3]:g} m",
+        )
+        for area in settings.no_lift_areas
+    ]  # fmt: skip
 
 
 def face_checks(contact: Contact, needed_n: float, magnet: Magnet, settings: LiftSettings) -> list[Check]:

@@ -89,6 +89,14 @@ class Ground:
         to_side, to_end = (np.abs(xx * axis[0] + yy * axis[1]) for axis in (across, along))
         return np.asarray((to_side < size.width_m / 2 + margin_m) & (to_end < size.length_m / 2 + margin_m))
 
+    def within(self, x_min: float, y_min: float, x_max: float, y_max: float) -> Bool:
+        """Mark the cells that a rectangle along X and Y (m) touches."""
+        rows, columns = self.top_m.shape
+        x, y = self.x0_m + self.cell_m * np.arange(columns), self.y0_m + self.cell_m * np.arange(rows)
+        half = self.cell_m / 2
+        across = (x > x_min - half) & (x < x_max + half)
+        return np.asarray(across & ((y > y_min - half) & (y < y_max + half))[:, None])
+
     def barring(self, cells: Bool) -> Ground:
         """Return the same with nothing to be put down on these cells."""
         return replace(self, barred=self.barred | cells)

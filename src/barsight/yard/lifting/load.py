@@ -60,6 +60,20 @@ class Load:
         )  # fmt: skip
 
 
+def reaches_area(
+    middle_m: Float64, yaw_rad: float, size_m: tuple[float, float], area: tuple[float, float, float, float]
+) -> bool:
+    """Check whether a rectangle of this width and length, turned by yaw, meets one along X and Y (x_min,
+    y_min, x_max, y_max): no axis of either parts them.
+    """
+    axes, half = axes_of(yaw_rad), np.array(size_m) / 2
+    low, high = np.array(area[:2]), np.array(area[2:])
+    off, side = (low + high) / 2 - middle_m, (high - low) / 2
+    own = np.abs(axes @ off) <= half + np.abs(axes) @ side
+    others = np.abs(off) <= side + np.abs(axes.T) @ half
+    return bool(own.all() and others.all())
+
+
 def axes_of(yaw_rad: float) -> Float64:
     """Return unit vectors (2, 2): across an axis and along it."""
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)

@@ -74,8 +74,8 @@ def sound_ground(
     ground: Ground, bundles: tuple[Bundle, ...], standing: tuple[Footing, ...], settings: LiftSettings,
     events: tuple[YardEvent, ...] = (),
 ) -> Ground:  # fmt: skip
-    """Bar what should not be loaded: bundles that lean or stand over an edge, and doubtful ones. What lies
-    within reach of an event in the yard isn't known any more.
+    """Bar what should not be loaded: bundles that lean or stand over an edge, doubtful ones, and places where
+    nothing is put down. What lies within reach of an event in the yard isn't known any more.
     """
     footings = {footing.bundle: footing for footing in standing}
     for bundle in bundles:
@@ -84,6 +84,8 @@ def sound_ground(
         if leans or bundle.confidence < settings.min_confidence:
             own = Load.of((bundle,))
             ground = ground.barring(ground.inside(own, own.x_m, own.y_m, own.yaw_rad, SHADOW_M))
+    for x_min, y_min, x_max, y_max in settings.no_lift_areas:
+        ground = ground.barring(ground.within(x_min, y_min, x_max, y_max))
     for event in events:
         yaw_rad, reach_m = math.radians(event.yaw_deg), settings.disturbed_reach_m
         ground = ground.forgetting(ground.inside(event, event.x_m, event.y_m, yaw_rad, reach_m))

@@ -1,0 +1,293 @@
+"""Place targets picked on a survey's orthophoto, and register its map by them, for `calibrate yard`."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from scipy import ndimage
+
+from barsight.calibration.boards.ring_detection import nearest_disc
+from barsight.core.arrays import Bool, Float64
+from barsight.core.errors import ConfigError, Failed, InputError
+from barsight.core.extras import extra
+from barsight.core.reading.geotiff import open_geotiff
+from barsight.core.types import HeightSource
+from barsight.page.layers import MAX_PIXELS
+from barsight.page.survey_files import expect_map, survey_folder
+from barsight.recording.formats.surveyed_targets import Targets, read_places, write_targets
+from barsight.registration.yard import calibrate_yard
+from barsight.result_folder import read_heights
+from barsight.yard.lifting.travel_accuracy import Travel
+from barsight.yard.types import HeightMap, YardMap
+from barsight.yard_frame import measured_owners
+
+with extra("store"):
+    from sqlalchemy import Connection
+
+Found = Literal["disc", "column", "hand"]
+CLOSE_M = 0.08
+"""A disc whose middle lies no further from a pick is what was meant."""
+AROUND_M = 0.5
+"""Half the side of the photo that is searched for it."""
+SIDE: dict[Found, float] = {"disc": 0.12, "column": 0.35, "hand": 0.7}
+"""Sigma of a pick's x and y, in cells of the map, or in pixels there where these are coarser."""
+LEVEL_M, DISC_RATIO = 0.03, 2.0
+"""Heights so near to a pick tell its own, or within so many radii of a disc: a black one itself has none."""
+TOP_M = 0.03
+"""Cells of a column's top lie no further from the height at the pick."""
+WIDER_PX, MAX_OFF_RATIO = 2.0, 0.25
+"""By how much matching widens a top, and the most by which its width may then be off the column's."""
+JUMP_M = 0.02
+"""A height further off than this, and than twice its sigma, isn't that of the same face."""
+MIN_SHARE, MIN_LEVEL = 0.3, 0.8
+"""Least share of the cells about a pick that are measured, and of these that lie on one face."""
+SAME_M = 0.02
+"""No two targets lie so near to each other: it was clicked twice."""
+MIN_TARGETS = 3
+LISTED = Path("list of places")
+
+
+@dataclass(frozen=True)
+class Pick:
+    """A target's pick in the map, m. is_exact: take the place itself, even where a disc lies beside it.
+    width_m: of a column whose top is meant; None of another target.
+    """
+
+    name: str
+    x_m: float
+    y_m: float
+    is_exact: bool = False
+    width_m: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class PickedPlace:
+    """place_m (3,) in the map's frame, sigma_m (3,) of each coordinate; found: what told x and y."""
+
+    place_m: Float64
+    sigma_m: Float64
+    found: Found
+
+
+@dataclass(frozen=True, eq=False)
+class _PickedSurvey:
+    """A survey whose map targets can be picked in. frame: that of its places."""
+
+    folder: Path
+    frame: str
+    heights: YardMap
+    travel: Travel | None
+
+
+def picking_record(connection: Connection, map_id: str) -> dict[str, Any]:
+    """Tell a survey's grid, its folder, and what `calibrate yard --measured` needs of it.
+
+    Raises AccessError where there is no such survey, InputError where its map can't be registered.
+    """
+    survey = _opened(survey_folder(connection, map_id), map_id)
+    rows, columns = survey.heights.shape
+    cell_m = survey.heights.cell_m
+    left_m, low_m = survey.heights.x0_m - cell_m / 2, survey.heights.y0_m - cell_m / 2
+    return {
+        "map_id": map_id, "folder": str(survey.folder), "frame": survey.frame, "cell_m": cell_m,
+        "left_m": left_m, "low_m": low_m, "columns": columns, "rows": rows,
+    }  # fmt: skip
+
+
+def paint_photo(
+    connection: Connection, map_id: str, columns: tuple[int, int], rows: tuple[int, int]
+) -> bytes:
+    """Paint cells from first to last of the orthophoto as PNG, gray with alpha, row 0 at the highest y,
+    coarser where they are many.
+    """
+    survey = _opened(survey_folder(connection, map_id), map_id)
+    high, wide = survey.heights.shape
+    if not (0 <= columns[0] < columns[1] <= wide and 0 <= rows[0] < rows[1] <= high):
+        raise ConfigError(f"the map has {wide} columns and {high} rows")
+    with open_geotiff(survey.folder / "ortho.tif") as file:
+        gray = file.rectangle(1, slice(*rows), slice(*columns))[0][::-1]
+    step = max(1, math.ceil(math.sqrt(gray.size / MAX_PIXELS)))
+    size = math.ceil(gray.shape[1] / step), math.ceil(gray.shape[0] / step)
+    gray = cv2.resize(gray, size, interpolation=cv2.INTER_NEAREST)
+    picture = np.dstack([gray, gray, gray, np.where(gray > 0, 255, 0).astype(np.uint8)])
+    return bytes(cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 3])[1].tobytes())
+
+
+def fit_targets(
+    connection: Connection, map_id: str, listed: str, sigma_m: float, picks: Sequence[Pick]
+) -> dict[str, Any]:
+    """Place all picks of a list's targets; how the yard lies by them, once there are three besides checks,
+    and the list for `calibrate yard`.
+
+    listed: CSV as `read_places` takes it. sigma_m: of a coordinate's survey where it doesn't say. Raises
+    InputError naming the line of the list, or the target whose pick can't be placed.
+    """
+    survey = _opened(survey_folder(connection, map_id), map_id)
+    names, places = read_places(LISTED, listed)
+    if not names:
+        raise InputError(LISTED, "has no target", "give one a line")
+    if not 0 < sigma_m < 1:
+        raise ConfigError(f"a survey's sigma of {sigma_m:g} m can't be")
+    numbers = list[int]()
+    for pick in picks:
+        if pick.name not in names:
+            raise InputError(pick.name, "is picked but isn't in the list", "choose one that is")
+        if (number := names.index(pick.name)) in numbers:
+            raise InputError(pick.name, "is picked twice", "pick it once")
+        numbers.append(number)
+    assert places.width_m is not None
+    widths = [None if np.isnan(width) else float(width) for width in places.width_m[numbers]]
+    meant = [replace(pick, width_m=width) for pick, width in zip(picks, widths, strict=True)]
+    found = [place_pick(survey.heights, survey.travel, pick) for pick in meant]
+    _expect_apart(picks, found)
+    surveyed = np.where(np.isnan(places.sigma_m), sigma_m, places.sigma_m)[numbers]
+    own = np.array([one.sigma_m for one in found]).reshape(-1, 3)
+    targets = Targets(
+        tuple(names[number] for number in numbers), places.yard_m[numbers],
+        np.array([one.place_m for one in found]).reshape(-1, 3),
+        np.sqrt(surveyed**2 + (own**2).mean(axis=1)), places.checks[numbers],
+    )  # fmt: skip
+    fit, off_m = _fitted(targets, survey.frame)
+    rows = [
+        {
+            "name": name, "found": one.found, "place_m": one.place_m.tolist(),
+            "sigma_m": one.sigma_m.tolist(), "off_m": None if off_m is None else off_m[k].tolist(),
+        }
+        for k, (name, one) in enumerate(zip(targets.names, found, strict=True))
+    ]  # fmt: skip
+    checks = places.checks.tolist()
+    return {
+        "names": [{"name": name, "check": check} for name, check in zip(names, checks, strict=True)],
+        "targets": rows, "fit": fit, "csv": write_targets(targets) if off_m is not None else None,
+    }  # fmt: skip
+
+
+def place_pick(heights: YardMap, travel: Travel | None, pick: Pick) -> PickedPlace:
+    """Place a pick: x and y of the column or the disc beside it, or its own, and the height of the face that
+    it lies on.
+
+    Raises InputError naming the target where that wasn't measured, where the height jumps, or where no such
+    column stands.
+    """
+    part = _around(heights, pick)
+    cell_m, corner = part.cell_m, (part.x0_m, part.y0_m)
+    pixel = (np.array([pick.x_m, pick.y_m]) - corner) / cell_m
+    is_measured = np.isfinite(part.z_m) & np.isin(part.source, (HeightSource.VISION, HeightSource.LASER))
+    found: Found = "hand"
+    reach, off_m = LEVEL_M / cell_m, 0.0
+    if pick.width_m is not None and not pick.is_exact:
+        found, reach = "column", pick.width_m / 3 / cell_m
+        pixel, off_m = _column_top(part, travel, pixel, pick)
+    elif part.gray is not None and not pick.is_exact:
+        disc = nearest_disc(part.gray, pixel, CLOSE_M / cell_m)
+        if disc is not None:
+            found, pixel, reach = "disc", disc[:2], DISC_RATIO * float(disc[2])
+    column, row = np.rint(pixel).astype(int)
+    if found == "hand" and not is_measured[row, column]:
+        raise InputError(pick.name, "its pick lies where no height was measured", "pick a place that was")
+    rows, columns = np.indices(part.shape)
+    near = np.hypot(columns - pixel[0], rows - pixel[1]) < reach
+    z, sigma_m = _face_height(part, near, near & is_measured, pick.name)
+    side_m = math.hypot(SIDE[found] * max(cell_m, _pixel_m(travel, z, cell_m)), off_m / 2)
+    place = np.append(pixel * cell_m + corner, z)
+    return PickedPlace(place, np.array([side_m, side_m, np.hypot(*sigma_m)]), found)
+
+
+def _face_height(part: HeightMap, near: Bool, known: Bool, name: str) -> tuple[float, tuple[float, float]]:
+    """Take the median height of the face that the known cells (rows, columns) near a pick show: height, the
+    map's sigma of it, and the heights' scatter.
+    """
+    if known.sum() < MIN_SHARE * near.sum():
+        raise InputError(name, "about its pick too few heights were measured", "pick a place that was")
+    z = float(np.median(part.z_m[known]))
+    level = known & (np.abs(part.z_m - z) < np.maximum(JUMP_M, 2 * part.sigma_m))
+    if level.sum() < MIN_LEVEL * known.sum():
+        jump_m = float(np.ptp(np.percentile(part.z_m[known], (5, 95))))
+        said = f"about its pick the height jumps by {jump_m:.2f} m"
+        raise InputError(name, said, "pick a face's middle, not its edge")
+    return z, (float(np.median(part.sigma_m[level])), float(part.z_m[level].std()))
+
+
+def _column_top(part: HeightMap, travel: Travel | None, pixel: Float64, pick: Pick) -> tuple[Float64, float]:
+    """Find the level top that a pick lies on, holes in it too: its middle (2,), column and row, and by how
+    much its width is off the column's.
+
+    Raises InputError where none as wide ends on all sides.
+    """
+    assert pick.width_m is not None
+    remedy = "pick the column's top, and list its width"
+    column, row = np.rint(pixel).astype(int)
+    about = slice(max(row - 2, 0), row + 3), slice(max(column - 2, 0), column + 3)
+    if not np.isfinite(part.z_m[about]).any():
+        raise InputError(pick.name, "where its column is picked no height was measured", remedy)
+    z = float(np.nanmedian(part.z_m[about]))
+    labels, _ = ndimage.label(np.abs(part.z_m - z) < TOP_M)
+    counts = np.bincount(labels[about].ravel(), minlength=2)
+    rows, columns = np.nonzero(ndimage.binary_fill_holes(labels == 1 + counts[1:].argmax()))
+    wide_m = math.sqrt(rows.size) * part.cell_m
+    off_m = wide_m - WIDER_PX * _pixel_m(travel, z, part.cell_m) - pick.width_m
+    if abs(off_m) > MAX_OFF_RATIO * pick.width_m:
+        said = f"where it is picked no column of {pick.width_m:g} m ends"
+        raise InputError(pick.name, f"{said}: the level place is {wide_m:.2f} m wide", remedy)
+    return np.array([columns.mean(), rows.mean()]), off_m
+
+
+def _pixel_m(travel: Travel | None, z_m: float, cell_m: float) -> float:
+    """Return a pixel's size at a height; a cell's where it isn't known."""
+    pixel_m = float("nan") if travel is None else travel.pixel_m(z_m)
+    return pixel_m if math.isfinite(pixel_m) else cell_m
+
+
+def _expect_apart(picks: Sequence[Pick], found: Sequence[PickedPlace]) -> None:
+    for k, one in enumerate(found):
+        for other, before in zip(picks[:k], found, strict=False):
+            if np.linalg.norm(one.place_m - before.place_m) < SAME_M:
+                raise InputError(picks[k].name, f"is picked where {other.name} is", "pick each where it is")
+
+
+def _around(heights: YardMap, pick: Pick) -> HeightMap:
+    """Read the map about a pick. Raises InputError where it lies outside."""
+    cell_m, (high, wide) = heights.cell_m, heights.shape
+    x, y = (pick.x_m - heights.x0_m) / cell_m, (pick.y_m - heights.y0_m) / cell_m
+    if not (-0.5 < x < wide - 0.5 and -0.5 < y < high - 0.5):
+        raise InputError(pick.name, "its pick lies outside the map", "pick a place in it")
+    column, row = round(x), round(y)
+    reach = math.ceil(AROUND_M / cell_m)
+    return heights.part(
+        slice(max(row - reach, 0), min(row + reach + 1, high)),
+        slice(max(column - reach, 0), min(column + reach + 1, wide)),
+    )
+
+
+def _fitted(targets: Targets, frame: str) -> tuple[dict[str, Any] | None, Float64 | None]:
+    """Register the frame as `calibrate yard` does: what it tells, and off_m (N, 3), None while it can't."""
+    if (~targets.checks).sum() < MIN_TARGETS:
+        return None, None
+    covariance = targets.sigma_m[:, None, None] ** 2 * np.eye(3)
+    found = calibrate_yard(
+        targets.names, targets.measured_m, targets.yard_m, covariance, targets.checks, frame
+    )
+    if isinstance(found, Failed):
+        return {"problem": found.reason}, None
+    told = {
+        "turn_sigma_deg": found.turn_sigma_deg, "place_sigma_m": found.place_sigma_m,
+        "scale": found.alignment.scale, "scale_sigma": found.alignment.scale_sigma,
+        "doubts": list(found.doubts),
+    }  # fmt: skip
+    return told, found.off_m
+
+
+@functools.lru_cache(maxsize=4)
+def _opened(folder: Path, map_id: str) -> _PickedSurvey:
+    summary, owners = expect_map(folder, map_id), measured_owners(folder)
+    if not (folder / "ortho.tif").is_file():
+        raise InputError(folder, "has no ortho.tif", "measure the recording again")
+    frame = "world" if owners["mounting_id"] is None else "encoders"
+    return _PickedSurvey(folder, frame, read_heights(folder), Travel.read(summary))
