@@ -140,6 +140,7 @@ class LiveMap:
         self._checkpoints = checkpoints if is_final(settings) else None
         self._waiting: list[tuple[RectifiedPair, PosedFrame]] = []
         self._passed: tuple[RectifiedPair, PosedFrame] | None = None
+        self._held: tuple[RectifiedPair, PosedFrame] | None = None
         self._taken: list[PosedFrame] = []
         self._map: tuple[MapBuilder, PointBinner] | None = None
         self._min_way_m, self._ahead = 0.0, np.zeros(3)
@@ -188,11 +189,10 @@ class LiveMap:
         """
         if self._checkpoints is None or self._map is None or self._placer.finish() is None:
             return
-        (builder, binner), last = self._map, self._passed
-        if last is not None:
-            builder.add(self._match(last[0]), last[1])
-            self._taken.append(last[1])
-        builder.fuse_last()
+        builder, binner = self._map
+        if self._passed is not None:
+            self._fuse_held(builder, self._passed)
+        self._fuse_held(builder, None)
         if builder.placed:
             checkpointed(self._checkpoints, map_name(tuple(self._taken), binner), builder.finish)
 
@@ -209,15 +209,22 @@ class LiveMap:
         return MapBuilder(binner, rectifier.camera, self._folder, settings.map, yard), binner
 
     def _take(self, builder: MapBuilder, pair: RectifiedPair, posed: PosedFrame) -> None:
-        """Match a pair and add it to the map, unless its picture has hardly moved."""
+        """Take a pair for the map, unless its picture has hardly moved."""
         seen = (posed.reference_from_body @ self._pairs.rectifier.body_from_rect0).apply(self._ahead)
         if self._last is not None and np.linalg.norm(seen - self._last) < self._min_way_m:
             self._passed = pair, posed
             return
         self._last, self._passed = seen, None
-        builder.add(self._match(pair), posed)
-        self._taken.append(posed)
+        self._fuse_held(builder, (pair, posed))
         builder.settle()
+
+    def _fuse_held(self, builder: MapBuilder, after: tuple[RectifiedPair, PosedFrame] | None) -> None:
+        """Match and fuse the pair that is held, as the one after it is known, which is held then."""
+        if self._held is not None:
+            pair, posed = self._held
+            builder.add(self._match(pair), posed, after)
+            self._taken.append(posed)
+        self._held = after
 
 
 def is_final(settings: MeasureSettings) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
-from itertools import chain, islice, takewhile
+from itertools import chain, islice, pairwise, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,7 @@ from barsight.mapping.surface.incremental import SurfaceElection
 from barsight.mapping.surface.surface import Surface
 from barsight.mapping.tiles import TileStore
 from barsight.mapping.top_photo import TopPhoto
-from barsight.mapping.view import MatchedFrame, Matcher, PointBinner, PosedView
+from barsight.mapping.view import MatchedFrame, Matcher, Neighbour, PointBinner, PosedView
 from barsight.measure_settings import MeasureSettings
 from barsight.measurement import BuiltMap, Preview, Refusal
 from barsight.motion.rig_check.self_calibration import residual_covariance, self_calibrate
@@ -102,14 +102,10 @@ class TrackedRecording:
     matched: Iterator[MatchedFrame | Refusal]
 
 
-PlacedFrame = tuple[MatchedFrame | Refusal, PosedFrame]
-
-
 class MapBuilder:
     """Fuses posed frames, one after the other, into the tiles of `folder`, and carves their lines of sight.
 
-    A frame waits for the one after it: against both its neighbours the crane's own parts stand still. placed:
-    reference_from_rect0 of the views used, stamps_ns theirs.
+    placed: reference_from_rect0 of the views used, stamps_ns theirs.
     """
 
     def __init__(
@@ -120,17 +116,36 @@ class MapBuilder:
         self._store = TileStore(folder, settings.resident_tiles)
         self._election = SurfaceElection(self._store, folder, binner.cell_m, settings)
         self._free, self._tops = FreeSpace(binner.cell_m), TopPhoto(binner.cell_m)
-        self._before: PlacedFrame | None = None
-        self._waiting: PlacedFrame | None = None
+        self._before: Neighbour | None = None
         self._previews: list[tuple[int, Preview]] = []
         self.placed: list[Pose] = []
         self.stamps_ns: list[int] = []
         self.refusals: list[Refusal] = []
 
-    def add(self, frame: MatchedFrame | Refusal, posed: PosedFrame) -> None:
-        """Take the next frame, and fuse the one before."""
-        self._fuse_waiting((frame, posed))
-        self._before, self._waiting = self._waiting, (frame, posed)
+    def add(self, frame: MatchedFrame | Refusal, posed: PosedFrame, after: Neighbour | None) -> None:
+        """Bin a frame's points and fuse them. after: the next frame; against it and the one before the
+        crane's own parts stand still.
+        """
+        beside = [other for other in (self._before, after) if other is not None]
+        self._before = None if isinstance(frame, Refusal) else (frame.pair, posed)
+        view = frame if isinstance(frame, Refusal) else self._binner(frame, posed, beside)
+        if isinstance(view, Failed):
+            view = Refusal("stereo", RefusedFrame(posed.stamp_ns, view.reason))
+        if isinstance(view, Refusal):
+            self.refusals.append(view)
+            return
+        view, watch = self._with_shared(view, posed), self._binner.watch
+        with watch("fuse", 1):
+            fuse_view(self._store, view.cells, self._settings)
+        self.placed.append(posed.reference_from_body @ self._binner.body_from_rect0)
+        self.stamps_ns.append(posed.stamp_ns)
+        with watch("free space", 1):
+            self._free.carve(view.cells, ViewFrusta.of(self.placed[-1:], self._camera).eyes[0])
+        with watch("top photo", 1):
+            self._tops.add(view.cells, view.pair, self.placed[-1])
+        count = len(self.placed)
+        if count & (count - 1) == 0:
+            self._previews = [*self._previews[-1:], (count, Preview(view.pair.left, view.disparity_px))]
 
     def settle(self) -> None:
         """Elect the tiles that the views have left; called after each view, it leaves less for the end."""
@@ -139,11 +154,6 @@ class MapBuilder:
     def snapshot(self) -> Surface:
         """Elect the surface as it stands; only tiles that changed since the last one are elected anew."""
         return self._election.snapshot(self._min_views, self._frusta())
-
-    def fuse_last(self) -> None:
-        """Fuse the frame that waits: none comes after it."""
-        self._fuse_waiting(None)
-        self._before = self._waiting = None
 
     def finish(self) -> BuiltMap:
         """Elect the surface of all views, of which there is one at least; the tiles are given up."""
@@ -163,32 +173,6 @@ class MapBuilder:
 
     def _frusta(self) -> ViewFrusta:
         return ViewFrusta.of(self.placed, self._camera, self._binner.per_pixel)
-
-    def _fuse_waiting(self, after: PlacedFrame | None) -> None:
-        """Bin the points of the frame that waits and fuse them."""
-        if self._waiting is None:
-            return
-        frame, posed = self._waiting
-        both = (other for other in (self._before, after) if other is not None)
-        beside = [(other, pose) for other, pose in both if not isinstance(other, Refusal)]
-        view = frame if isinstance(frame, Refusal) else self._binner(frame, posed, beside)
-        if isinstance(view, Failed):
-            view = Refusal("stereo", RefusedFrame(posed.stamp_ns, view.reason))
-        if isinstance(view, Refusal):
-            self.refusals.append(view)
-            return
-        view, watch = self._with_shared(view, posed), self._binner.watch
-        with watch("fuse", 1):
-            fuse_view(self._store, view.cells, self._settings)
-        self.placed.append(posed.reference_from_body @ self._binner.body_from_rect0)
-        self.stamps_ns.append(posed.stamp_ns)
-        with watch("free space", 1):
-            self._free.carve(view.cells, ViewFrusta.of(self.placed[-1:], self._camera).eyes[0])
-        with watch("top photo", 1):
-            self._tops.add(view.cells, view.pair, self.placed[-1])
-        count = len(self.placed)
-        if count & (count - 1) == 0:
-            self._previews = [*self._previews[-1:], (count, Preview(view.pair.left, view.disparity_px))]
 
     def _with_shared(self, view: PosedView, posed: PosedFrame) -> PosedView:
         """Add what the yard frame may be off to what the heights' errors share."""
@@ -321,12 +305,15 @@ def build_map(
     def build() -> BuiltMap:
         builder = MapBuilder(binner, way.rectifier.camera, scratch, settings.map, frame_of(source))
         known = (frame for frame in way.matched if frame.stamp_ns in way.poses)
-        for done, frame in enumerate(known, start=1):
-            builder.add(frame, way.poses[frame.stamp_ns])
+        for done, (frame, after) in enumerate(pairwise(chain(known, (None,))), start=1):
+            assert frame is not None
+            beside = None
+            if isinstance(after, MatchedFrame):
+                beside = after.pair, way.poses[after.stamp_ns]
+            builder.add(frame, way.poses[frame.stamp_ns], beside)
             if done % _TIDIED_EVERY == 1:
                 trim_heap()
             advance("map", done, len(way.poses))
-        builder.fuse_last()
         if not builder.placed:
             reason = _first_reason([*refusals, *builder.refusals])
             raise MeasurementError(f"{path}: no frame could be measured; {reason}")

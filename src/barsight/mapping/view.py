@@ -55,7 +55,7 @@ class PosedView:
     disparity_px: Float32
 
 
-Neighbour = tuple[MatchedFrame, PosedFrame]
+Neighbour = tuple[RectifiedPair, PosedFrame]
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +134,7 @@ class PointBinner:
             for other, pose in beside:
                 there_from_here = (pose.reference_from_body @ self.body_from_rect0).inverse()
                 still = mask_carried(
-                    pair.left, disparity.disparity_px, pair.camera, other.pair.left,
+                    pair.left, disparity.disparity_px, pair.camera, other.left,
                     there_from_here @ reference_from_rect0,
                 )  # fmt: skip
                 disparity = mask_disparity(disparity, ~still)
