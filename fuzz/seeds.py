@@ -84,7 +84,18 @@ def measured_from(folder: Path, recording: Path) -> None:
     result = json.loads((folder / "result.json").read_text())
     result["hashes"]["inputs"] = opened.digests()
     result["recording"]["path"] = recording.name
-    result["configuration"] = {"stereo": {"calibration_sigma_px": 0.1}}
+    result["configuration"] = {
+        "stereo": {"calibration_sigma_px": 0.1},
+        "bundles": {"shared_lateral_m": 0.002, "shared_height_m": 0.001},
+    }
+    stamps = [int(stamp) for stamp in opened.index.stamps_ns]
+    count = len(stamps)
+    result["travel"] = {
+        "place_m": [[float(k), 0.15] for k in range(count)], "sigma_m": [[1e-3, 2e-3, 1e-3]] * count,
+        "off_m": [1e-3] * count, "refused_m": [], "reach_m": 5.0, "stamp_ns": stamps,
+        "measured": [True] * count, "sure_reach_m": 3.0, "eye_z_m": 8.0, "pixel_rad": 8e-4,
+        "pass_number": [],
+    }  # fmt: skip
     (folder / "result.json").write_text(json.dumps(result))
     reseal_folder(folder)
 

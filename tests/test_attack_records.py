@@ -63,16 +63,26 @@ def _no_space(path: Path, text: str, **_: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("configuration", "says"),
+    ("changed", "says"),
     [
-        ({}, "doesn't say stereo.calibration_sigma_px"),
-        ({"stereo": {"calibration_sigma_px": []}}, "doesn't say stereo.calibration_sigma_px"),
-        ({"stereo": {"calibration_sigma_px": 1e300}}, "can't be 1e+300"),
+        ({"configuration": {}}, "doesn't say how sure the rig's calibration is"),
+        (
+            {"configuration": {"stereo": {"calibration_sigma_px": []}}},
+            "doesn't say how sure the rig's calibration is",
+        ),
+        ({"configuration": {"stereo": {"calibration_sigma_px": 1e100}}}, "rig's calibration can't be"),
+        ({"rig_uncertainty": {"yaw_deg": 0.01}}, "doesn't say how sure the rig's calibration is"),
+        ({"rig_uncertainty": [3]}, "doesn't say how sure the rig's calibration is"),
+        (
+            {"configuration": {"stereo": {"calibration_sigma_px": 0.1}}},
+            "doesn't say bundles.shared_lateral_m",
+        ),
+        ({"travel": None}, "doesn't say how sure the travel is"),
     ],
 )
 def test_a_budget_says_what_a_result_lacks(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-    configuration: dict[str, Any], says: str,
+    changed: dict[str, Any], says: str,
 ) -> None:  # fmt: skip
     out = tmp_path / "out"
     write_results(out, 0.0)
@@ -80,7 +90,7 @@ def test_a_budget_says_what_a_result_lacks(
     monkeypatch.chdir(whole.parent)
     assert run(["budget", str(out)]) == 0
     result = json.loads((out / "result.json").read_text())
-    (out / "result.json").write_text(json.dumps(result | {"configuration": configuration}))
+    (out / "result.json").write_text(json.dumps(result | changed))
     reseal_folder(out)
     capsys.readouterr()
     assert run(["budget", str(out)]) == 3

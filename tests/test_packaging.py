@@ -60,6 +60,7 @@ EXTRAS = {
         "page/layers.py",
         "page/model.py",
         "page/survey_files.py",
+        "page/targets.py",
         "page/watch.py",
     },
     "fleet": {

@@ -123,7 +123,7 @@ def _rig_source(summary: dict[str, Any], path: Path, focal_px: float, assumed: l
         else:
             sigma_px = float(summary["configuration"]["stereo"]["calibration_sigma_px"])
             covariance = np.array([[(sigma_px / focal_px) ** 2]])
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(path, "doesn't say how sure the rig's calibration is", REMEDY) from error
     if not (np.isfinite(covariance).all() and (np.diag(covariance) <= MAX_SIGMA_RATIO**2).all()):
         raise InputError(path, "what it says of the rig's calibration can't be", REMEDY)
@@ -189,7 +189,7 @@ def _shared_m(summary: dict[str, Any], path: Path) -> tuple[float, float]:
     try:
         told = summary["configuration"]["bundles"]
         return float(told["shared_lateral_m"]), float(told["shared_height_m"])
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(path, "doesn't say bundles.shared_lateral_m and shared_height_m", REMEDY) from error
 
 
