@@ -205,8 +205,8 @@ def _travel_source(
     if near.any():
         variance = np.median(travel.sigma_m[near] ** 2, axis=0)
         if frame is not None:
-            body = np.append(travel.place_m[near].mean(axis=0), travel.eye_z_m)
-            shared = shared_covariance(Pose("yard", "body", np.eye(3), body), frame)
+            seen = np.append(travel.place_m[near].mean(axis=0), bundle.centre_m[2])
+            shared = shared_covariance(Pose("yard", "body", np.eye(3), seen), frame)
             variance = np.maximum(variance - np.diag(shared)[3:], 0.0)
     names = ("move_x", "move_y", "move_z")
     return ErrorSource("travel", names, np.diag(variance), "the trajectory's covariance")

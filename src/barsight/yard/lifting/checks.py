@@ -10,7 +10,7 @@ import numpy as np
 
 from barsight.core.arrays import Float32, Float64, UInt8, frozen, kernel
 from barsight.yard.lift_settings import UPPER, LiftSettings
-from barsight.yard.lifting.load import Load, reaches_area
+from barsight.yard.lifting.load import Load, reached_areas
 from barsight.yard.magnet.contact import Contact
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import BEYOND_OPEN_END_M, BundleTable, Grip, Placement
@@ -94,19 +94,18 @@ def area_checks(
     """Check that magnet and load keep out of the places where nothing is lifted, the crane's tolerance and
     the bundles' sigmas counted.
     """
-    reach = 2 * max(magnet.tolerance.x_m, magnet.tolerance.y_m)
-    centre = np.array([place.x_m, place.y_m])
-    hung = [Load.of((bundle,)) for bundle in load]
-    outlines = [
-        (centre, place.yaw_rad, (magnet.beam.width_m + reach, magnet.beam.length_m + reach)),
-        *((np.array([one.x_m, one.y_m]), one.yaw_rad, (one.width_m, one.length_m)) for one in hung),
-    ]
+    outlines = [(np.array([place.x_m, place.y_m]), place.yaw_rad, magnet.size_m)]
+    for bundle in load:
+        one, own = Load.of((bundle,)), bundle.sigma
+        wide, long = (2 * UPPER * float(np.nan_to_num(part)) for part in (own.lateral_m, own.along_m))
+        size = one.width_m + wide, one.length_m + long
+        outlines.append((np.array([one.x_m, one.y_m]), one.yaw_rad, size))
+    reached = [area for one in outlines for area in reached_areas(*one, magnet.tolerance, settings)]
     what = "magnet and load keep out of no-lift areas"
     return [
         check_true(
-            "no-lift-area", what, not any(reaches_area(*outline, area) for outline in outlines),
-            f"magnet or load reaches into the no-lift area from {area[0]:g}, {area[1]:g} to {area[2]:g}, "
-            f"{area[3]:g} m",
+            "no-lift-area", what, area not in reached, "magnet or load reaches into the no-lift area from "
+            f"{area[0]:g}, {area[1]:g} to {area[2]:g}, {area[3]:g} m",
         )
         for area in settings.no_lift_areas
     ]  # fmt: skip

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.core.arrays import Float64
-from barsight.yard.lift_settings import UPPER
+from barsight.yard.lift_settings import UPPER, LiftSettings
+from barsight.yard.magnet.description import Tolerance
 from barsight.yard.stability.stability import mean_yaw
 from barsight.yard.types import Bundle
 from barsight.yard.weight import load_centre
@@ -72,6 +73,20 @@ def reaches_area(
     own = np.abs(axes @ off) <= half + np.abs(axes) @ side
     others = np.abs(off) <= side + np.abs(axes.T) @ half
     return bool(own.all() and others.all())
+
+
+def reached_areas(
+    middle_m: Float64,
+    yaw_rad: float,
+    size_m: tuple[float, float],
+    tolerance: Tolerance,
+    settings: LiftSettings,
+) -> list[tuple[float, float, float, float]]:
+    """List the no-lift areas that an outline (width, length) may reach within the crane's tolerance."""
+    turned_m = math.sin(math.radians(tolerance.yaw_deg)) * max(size_m) / 2
+    slack_m = 2 * (max(tolerance.x_m, tolerance.y_m) + turned_m)
+    grown = size_m[0] + slack_m, size_m[1] + slack_m
+    return [area for area in settings.no_lift_areas if reaches_area(middle_m, yaw_rad, grown, area)]
 
 
 def axes_of(yaw_rad: float) -> Float64:

@@ -14,7 +14,7 @@ from barsight.yard.events import YardEvent
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.bearing import HOLE_DEPTH_M, MAX_RISE_M, Bearing, find_bearing
 from barsight.yard.lifting.ground import Ground
-from barsight.yard.lifting.load import Load
+from barsight.yard.lifting.load import Load, axes_of, reached_areas
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.stability.stability import Footing
 from barsight.yard.types import Bundle
@@ -65,9 +65,19 @@ def find_set_down(ground: Ground, load: Load, magnet: Magnet, settings: LiftSett
         yaw -= math.pi * math.ceil(yaw / math.pi - 0.5)
         for x, y in _candidates(free, load, yaw, settings):
             bearing = find_bearing(ground.yard, load, x, y, yaw, magnet, settings)
-            if bearing is not None:
+            if bearing is not None and not _reaches_area(load, x, y, yaw, magnet, settings):
                 return _place(bearing, x, y, yaw, turn)
     return None
+
+
+def _reaches_area(
+    load: Load, x_m: float, y_m: float, yaw_rad: float, magnet: Magnet, settings: LiftSettings
+) -> bool:
+    """Check whether a load put down, or the magnet over its centre of mass, may reach a no-lift area."""
+    middle = np.array([x_m, y_m])
+    over = middle + np.array([load.off_across_m, load.off_along_m]) @ axes_of(yaw_rad)
+    outlines = (middle, (load.width_m, load.length_m)), (over, magnet.size_m)
+    return any(reached_areas(at, yaw_rad, size, magnet.tolerance, settings) for at, size in outlines)
 
 
 def sound_ground(

@@ -178,6 +178,12 @@ class Magnet:
         return np.array([(p.along_m, p.across_m, p.length_m, p.width_m) for p in self.poles])
 
     @property
+    def size_m(self) -> tuple[float, float]:
+        """Return width and length of beam and poles together, about the centre."""
+        wide = max(abs(p.across_m) + p.width_m / 2 for p in self.poles)
+        return max(self.beam.width_m, 2 * wide), max(self.beam.length_m, 2 * self.half_span_m)
+
+    @property
     def half_span_m(self) -> float:
         """Return the way from the centre to the outermost pole's outer edge, along the beam."""
         return max(abs(p.along_m) + p.length_m / 2 for p in self.poles)
