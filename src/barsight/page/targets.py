@@ -43,7 +43,7 @@ LEVEL_M, DISC_RATIO = 0.03, 2.0
 TOP_M = 0.03
 """Cells of a column's top lie no further from the height at the pick."""
 WIDER_PX, MAX_OFF_RATIO = 2.0, 0.25
-"""By how much matching widens a top, and the most by which its width may then be off the column's."""
+"""Widening of a top by matching, and the most by which its width may then be off the column's."""
 JUMP_M = 0.02
 """A height further off than this, and than twice its sigma, isn't that of the same face."""
 MIN_SHARE, MIN_LEVEL = 0.3, 0.8

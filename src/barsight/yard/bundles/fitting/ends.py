@@ -22,8 +22,8 @@ _SOME, _MAX_VALUE = 0.3, 0.6
 _GROWTH_CELLS = 1.5
 """A map grows over ends by about one and a half cells."""
 _SEEN_SIGMA_M, _SEEN_SIGMAS = 0.006, 1.0
-"""What is left of an end's place where all bars end alike, and of a height's sigma, which rises with the size
-of the pixels."""
+"""Standard deviation of an end's place where all bars end alike: a constant part, and one in sigmas of a
+height, which rise with the size of the pixels."""
 _UNEVEN_SIGMAS, _RAGGED_RATIO = 2.0, 0.35
 """Of the sigma by how far apart the visible bars end, since others may end elsewhere; of the way over which
 the surface goes on a little lower."""
