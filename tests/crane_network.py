@@ -122,6 +122,8 @@ def end(process: subprocess.Popen[str]) -> None:
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
+    if process.stdin is not None:
+        process.stdin.close()
 
 
 def play(plant: Plant, recording: Recording, folder: Path, in_s: float) -> int:
