@@ -200,9 +200,7 @@ def inspect_recording(
     configuration, inputs = json_value(settings), source.digests()
     checkpoints = None
     if resume is not None:
-        frame = frame_of(source)
-        placed = inputs if frame is None else {**inputs, "yard": frame.digest}
-        checkpoints = checkpoint_folder(resume, checkpoint_key(recording, configuration, placed))
+        checkpoints = checkpoint_folder(resume, checkpoint_key(recording, source, settings, inputs))
     with watch("look"):
         pairs = RectifiedPairs(source, Rectifier(source.rig), checkpoints or scratch, watch)
         first, cell_m, calibration_px = look_at(pairs, settings, checkpoints)
@@ -333,11 +331,18 @@ def map_name(poses: tuple[PosedFrame, ...], binner: PointBinner) -> str:
     return f"map_{json_digest([json_value(poses), asked])[:32]}"
 
 
-def checkpoint_key(recording: Recording, configuration: dict[str, Any], inputs: dict[str, str]) -> str:
-    """Return a digest of all that trajectory and disparities depend on."""
+def checkpoint_key(
+    recording: Recording, source: Recording, settings: MeasureSettings, inputs: dict[str, str]
+) -> str:
+    """Return a digest of all that trajectory and disparities depend on.
+
+    source: the recording with the sensors in use, in the yard. inputs: SHA-256 of its files.
+    """
+    configuration, frame = json_value(settings), frame_of(source)
     stages = {name: part for name, part in configuration.items() if name not in ("bundles", "lift")}
+    placed = inputs if frame is None else {**inputs, "yard": frame.digest}
     rig = json_value(recording.rig)
-    return json_digest([barsight.__version__, stages, inputs, rig, pictures_digest(recording)])
+    return json_digest([barsight.__version__, stages, placed, rig, pictures_digest(recording)])
 
 
 def _known_early(

@@ -26,9 +26,8 @@ from barsight.measurement import Refusal
 from barsight.motion.fixed_lag.sensor_buffer import SENSOR_DELAY_S
 from barsight.motion.settings import make_estimator
 from barsight.recording.rectified_pairs import RectifiedPairs
-from barsight.recording.sensor_selection import SelectedSensors
 from barsight.report.result_files import write_height
-from barsight.yard_frame import in_yard, placing_id
+from barsight.yard_frame import placing_id
 
 POLL_S = 0.02
 AHEAD = 12
@@ -83,10 +82,7 @@ class Mapping:
 
     def __init__(self, link: Link, recording: GrowingRecording) -> None:
         self._link, self._recording, settings = link, recording, link.settings
-        source = in_yard(SelectedSensors(recording, settings.use), settings.yard)
-        self._pairs = RectifiedPairs(source, Rectifier(recording.rig), link.checkpoints)
-        placed = placing_id(source)
-        self._frame_id = "world" if placed is None else f"yard:{placed}"
+        self._pairs = RectifiedPairs(recording.in_use(), Rectifier(recording.rig), link.checkpoints)
         self.is_final = is_final(settings)
         checkpoints = link.checkpoints if settings.self_calibrate == "none" else None
         self._match = matching(self._pairs, settings, checkpoints, Stopwatch())
@@ -152,7 +148,9 @@ class Mapping:
             return False
         if surface is None:
             return False
-        write_height(surface, self._link.folder.parent / LIVE_MAP, self._frame_id)
+        placed = placing_id(self._pairs.recording)
+        frame_id = "world" if placed is None else f"yard:{placed}"
+        write_height(surface, self._link.folder.parent / LIVE_MAP, frame_id)
         return True
 
     def end(self) -> None:

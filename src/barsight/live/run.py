@@ -18,7 +18,7 @@ from barsight.checkpoint import checkpoint_folder
 from barsight.core.compiling.ahead import compile_ahead, load_kernels
 from barsight.core.errors import ConfigError, InputError, MeasurementError, OutputError
 from barsight.core.files import expect_empty, lies_within, translated_os_errors
-from barsight.core.json_values import json_value, write_json
+from barsight.core.json_values import write_json
 from barsight.core.notices import Notice
 from barsight.core.parallel import in_background
 from barsight.core.stamps import NS_PER_S
@@ -38,9 +38,11 @@ from barsight.measure_settings import MeasureSettings
 from barsight.pipeline import LiftRequest
 from barsight.recording.base import Recording
 from barsight.recording.open import open_recording
+from barsight.recording.sensor_selection import SelectedSensors
 from barsight.report.page import write_report
 from barsight.yard.lifting.lift_file import read_lifts
 from barsight.yard.magnet.description import load_magnet
+from barsight.yard_frame import in_yard
 
 MAX_SPEED = 1000.0
 INTERRUPTED = "interrupted"
@@ -136,8 +138,10 @@ class LiveRun:
 
 
 def _key(recording: Recording, settings: MeasureSettings) -> str:
-    empty = KeptRecording(recording, [])
-    return checkpoint_key(empty, json_value(settings.chosen()), empty.digests())
+    """Name the checkpoints as measuring what is kept of the recording will."""
+    empty, chosen = KeptRecording(recording, []), settings.chosen()
+    source = in_yard(SelectedSensors(empty, chosen.use), chosen.yard)
+    return checkpoint_key(empty, source, chosen, source.digests())
 
 
 def _finish(
