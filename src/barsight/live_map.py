@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -19,11 +18,11 @@ from barsight.map_building import MapBuilder, look_at, map_name
 from barsight.mapping.keyframes import keyframe_spacing_m
 from barsight.mapping.recording_probe import points_per_pixel
 from barsight.mapping.surface.surface import Surface
-from barsight.mapping.view import MatchedFrame, PointBinner
+from barsight.mapping.view import PointBinner
 from barsight.measure_settings import MeasureSettings
-from barsight.measurement import Refusal
 from barsight.motion.estimator import PoseEstimator, TrajectoryEstimator
 from barsight.motion.settings import make_estimator
+from barsight.pair_chain import MatchedAhead, PairChain
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.yard.sections import surface_map
 from barsight.yard.types import HeightMap
@@ -132,7 +131,7 @@ class LiveMap:
 
     def __init__(
         self, pairs: RectifiedPairs, settings: MeasureSettings, folder: Path, checkpoints: Path | None,
-        placer: PairPlacer, match: Callable[[RectifiedPair], MatchedFrame | Refusal],
+        placer: PairPlacer, match: PairChain | MatchedAhead,
     ) -> None:  # fmt: skip
         self._pairs, self._settings, self._folder, self._match = pairs, settings, folder, match
         self._reference = "world" if pairs.recording.crane() is None else "yard"
@@ -193,7 +192,7 @@ class LiveMap:
         if self._passed is not None:
             self._fuse_held(builder, self._passed)
         self._fuse_held(builder, None)
-        if builder.placed:
+        if builder.placed and all(self._match.holds(one.stamp_ns) for one in self._taken):
             checkpointed(self._checkpoints, map_name(tuple(self._taken), binner), builder.finish)
 
     def _begun(self) -> tuple[MapBuilder, PointBinner]:

@@ -6,25 +6,21 @@ import contextlib
 import math
 import os
 import time
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.compiling.ahead import load_kernels
 from barsight.core.errors import BarsightError, MeasurementError
 from barsight.core.memory import trim_heap
-from barsight.core.parallel import WORKERS
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.timing import Stopwatch
-from barsight.core.types import RectifiedPair
 from barsight.live.link import GrowingRecording, Link
 from barsight.live.shared.counters import DRAIN
 from barsight.live_map import LiveMap, PairPlacer, is_final
 from barsight.map_building import matching
-from barsight.mapping.view import MatchedFrame
-from barsight.measurement import Refusal
 from barsight.motion.fixed_lag.sensor_buffer import SENSOR_DELAY_S
 from barsight.motion.settings import make_estimator
+from barsight.pair_chain import MatchedAhead
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.report.result_files import write_height
 from barsight.yard_frame import placing_id
@@ -57,10 +53,11 @@ def build_live_map(link: Link) -> None:
     while True:
         board.beat("map")
         is_last = board["supervisor", "stop"] == DRAIN
+        ended = is_last or bool(board["capture", "ended"])
         board["map", "backlog"] = mapping.read_queue()
         if is_last and not (mapping.is_final and mapping.queue):
             break
-        if mapping.is_due(ended=is_last or bool(board["capture", "ended"])):
+        if mapping.is_due(ended=ended):
             board["map", "mapped"] = mapping.add_next()
         elif (
             board["map", "mapped"] > max(shown, 1) and not mapping.queue
@@ -85,9 +82,7 @@ class Mapping:
         self._pairs = RectifiedPairs(recording.in_use(), Rectifier(recording.rig), link.checkpoints)
         self.is_final = is_final(settings)
         checkpoints = link.checkpoints if settings.self_calibrate == "none" else None
-        self._match = matching(self._pairs, settings, checkpoints, Stopwatch())
-        self._ahead = [ThreadPoolExecutor(1) for _ in range(WORKERS)]
-        self._matched: dict[int, Future[MatchedFrame | Refusal]] = {}
+        self._match = MatchedAhead(matching(self._pairs, settings, checkpoints, Stopwatch()), self._pairs)
         self._frames, self._tiles = link.frames(), link.tiles()
         self._told = {stamp for stamp, _, _ in self._tiles.read()}
         self._exposed: dict[int, int] = {}
@@ -96,8 +91,9 @@ class Mapping:
 
     def read_queue(self) -> int:
         """Read what was kept since; return how many keyframes wait."""
-        self._recording.grow()
-        for stamp, exposed_ns, _, is_kept, _ in self._frames.read():
+        frames = self._frames.read()
+        self._recording.grow()  # after the frames: what was there for them is here too
+        for stamp, exposed_ns, _, is_kept, _ in frames:
             if is_kept:
                 self._recording.stamps_ns.append(stamp)
                 self._exposed[stamp] = exposed_ns
@@ -122,10 +118,8 @@ class Mapping:
         are in the map.
         """
         # Where not all pairs are matched, only the place of each tells which are.
-        for stamp in self.queue[:AHEAD] if self._link.settings.map.min_shift == 0 else ():
-            if stamp not in self._matched:
-                worker = self._ahead[self._match.chain(stamp) % WORKERS]
-                self._matched[stamp] = worker.submit(self._match_stamp, stamp)
+        if self._link.settings.map.min_shift == 0:
+            self._match.begin(self.queue[:AHEAD])
         stamp = self.queue.pop(0)
         (pair,) = self._pairs(frozenset((stamp,)))
         try:
@@ -159,23 +153,14 @@ class Mapping:
             with contextlib.suppress(BarsightError):
                 self._map.end()
             self._tell_fused()
-        for worker in self._ahead:
-            worker.shutdown(cancel_futures=True)
+        self._match.close()
 
     def _begun(self) -> LiveMap:
         """Begin with the poses that track has found, as far as it had the same pairs and readings."""
         link = self._link
         estimator = make_estimator(replace(link.settings.motion, estimator="live"))
         placer = PairPlacer(self._pairs, estimator, link.checkpoints)
-        return LiveMap(self._pairs, link.settings, link.folder, link.checkpoints, placer, self._take)
-
-    def _match_stamp(self, stamp_ns: int) -> MatchedFrame | Refusal:
-        (pair,) = self._pairs(frozenset((stamp_ns,)))
-        return self._match(pair)
-
-    def _take(self, pair: RectifiedPair) -> MatchedFrame | Refusal:
-        matched = self._matched.pop(pair.stamp_ns, None)
-        return self._match(pair) if matched is None else matched.result()
+        return LiveMap(self._pairs, link.settings, link.folder, link.checkpoints, placer, self._match)
 
     def _tell_fused(self) -> None:
         """Note when each keyframe came into the map."""
