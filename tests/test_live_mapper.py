@@ -38,7 +38,7 @@ def board() -> Iterator[Counters]:
 
 
 class Come:
-    """What comes to a map process: keyframes and the encoders' readings, each when it is told."""
+    """Feeds a map process: keyframes and the encoders' readings, each when it is told."""
 
     def __init__(self, recording: Recording, link: Link) -> None:
         self.stamps, self._link, self._given = list(recording.index.stamps_ns), link, 0
