@@ -1,4 +1,4 @@
-"""What the tests at a crane's cameras need of the machine is found alike by all workers."""
+"""Workers that look at once for what the tests at a crane's cameras need find it alike."""
 
 import subprocess
 import sys
