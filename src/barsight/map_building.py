@@ -22,7 +22,7 @@ from barsight.core.memory import trim_heap
 from barsight.core.notices import Notice
 from barsight.core.parallel import WORKERS, prefetched_map
 from barsight.core.pose import Pose
-from barsight.core.timing import Stopwatch, count_frames
+from barsight.core.timing import Stopwatch, count_frames, unwatched
 from barsight.core.types import PosedFrame, RectifiedCamera, RectifiedPair, RefusedFrame, Trajectory
 from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.fusion import fuse_view
@@ -105,16 +105,16 @@ class TrackedRecording:
 class MapBuilder:
     """Fuses posed frames, one after the other, into the tiles of `folder`, and carves their lines of sight.
 
-    placed: reference_from_rect0 of the views used, stamps_ns theirs.
+    placed: reference_from_rect0 of the views used, stamps_ns theirs. beat: called for each tile that is done.
     """
 
     def __init__(
         self, binner: PointBinner, camera: RectifiedCamera, folder: Path, settings: MapSettings,
-        yard: YardFrame | None = None,
+        yard: YardFrame | None = None, beat: Callable[[], None] = unwatched,
     ) -> None:  # fmt: skip
         self._binner, self._camera, self._settings, self._yard = binner, camera, settings, yard
         self._store = TileStore(folder, settings.resident_tiles)
-        self._election = SurfaceElection(self._store, folder, binner.cell_m, settings)
+        self._election = SurfaceElection(self._store, folder, binner.cell_m, settings, beat)
         self._free, self._tops = FreeSpace(binner.cell_m), TopPhoto(binner.cell_m)
         self._before: Neighbour | None = None
         self._previews: list[tuple[int, Preview]] = []

@@ -6,6 +6,7 @@ import contextlib
 import math
 import os
 import time
+from collections.abc import Callable
 from dataclasses import replace
 
 from barsight.calibration.geometry.rectification import Rectifier
@@ -45,7 +46,8 @@ def build_live_map(link: Link) -> None:
     os.nice(NICENESS)
     board = link.open_counters()
     load_kernels("measure")
-    mapping = Mapping(link, GrowingRecording(link.open_recording(), [], link))
+    recording = GrowingRecording(link.open_recording(), [], link)
+    mapping = Mapping(link, recording, lambda: board.beat("map"))
     board["map", "mapped"] = board["map", "refused"] = 0
     board.beat("map")
     board["map", "ready"] = 1
@@ -72,12 +74,13 @@ def build_live_map(link: Link) -> None:
 
 
 class Mapping:
-    """A `LiveMap` of the keyframes so far. queue: stamps of those that wait.
+    """A `LiveMap` of the keyframes so far. queue: stamps of those that wait. beat: called as work goes on.
 
     A process begun anew fuses all again: their disparities are there.
     """
 
-    def __init__(self, link: Link, recording: GrowingRecording) -> None:
+    def __init__(self, link: Link, recording: GrowingRecording, beat: Callable[[], None]) -> None:
+        self._beat = beat
         self._link, self._recording, settings = link, recording, link.settings
         self._pairs = RectifiedPairs(recording.in_use(), Rectifier(recording.rig), link.checkpoints)
         self.is_final = is_final(settings)
@@ -159,8 +162,10 @@ class Mapping:
         """Begin with the poses that track has found, as far as it had the same pairs and readings."""
         link = self._link
         estimator = make_estimator(replace(link.settings.motion, estimator="live"))
-        placer = PairPlacer(self._pairs, estimator, link.checkpoints)
-        return LiveMap(self._pairs, link.settings, link.folder, link.checkpoints, placer, self._match)
+        placer = PairPlacer(self._pairs, estimator, link.checkpoints, beat=self._beat)
+        return LiveMap(
+            self._pairs, link.settings, link.folder, link.checkpoints, placer, self._match, self._beat
+        )  # fmt: skip
 
     def _tell_fused(self) -> None:
         """Note when each keyframe came into the map."""
