@@ -68,16 +68,23 @@ def replay(
     speed: recorded seconds a second; 0: as fast as possible, where nothing is lost. keyframes: keyframes.json
     of an earlier run, to keep just what it kept. tell: takes each line of the log. Raises a BarsightError.
     """
-    if not (math.isfinite(speed) and 0 <= speed <= MAX_SPEED):
-        raise ConfigError(f"speed must lie in 0...{MAX_SPEED:g} (0: as fast as possible), not {speed:g}")
     given = None if keyframes is None else read_keyframes(keyframes)
     request = LiftRequest(None if magnet is None else load_magnet(magnet), judged_at)
+    return begin_replay(path, out, settings, live, speed, tell).measure(given, request, advance)
+
+
+def begin_replay(
+    path: Path, out: Path, settings: MeasureSettings, live: LiveSettings, speed: float,
+    tell: Callable[[str], None],
+) -> LiveRun:  # fmt: skip
+    """Begin the run of a replay into `out`; see `replay`."""
+    if not (math.isfinite(speed) and 0 <= speed <= MAX_SPEED):
+        raise ConfigError(f"speed must lie in 0...{MAX_SPEED:g} (0: as fast as possible), not {speed:g}")
     recording = open_recording(path, settings.recording)
     if lies_within(out, path):
         raise OutputError(f"{out}: lies in the recording itself; name a folder elsewhere")
     expect_empty(out)
-    run = LiveRun(recording, LiveInput(path.absolute(), speed), out, settings, live, tell)
-    return run.measure(given, request, advance)
+    return LiveRun(recording, LiveInput(path.absolute(), speed), out, settings, live, tell)
 
 
 class LiveRun:
