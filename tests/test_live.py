@@ -27,6 +27,7 @@ from barsight.live.shared.ring import PairRing
 from barsight.live.source import ReplayClock, ReplaySource
 from barsight.live.state import prometheus
 from barsight.mapping.fusion import fuse_view
+from barsight.mapping.surface.surface import read_tile
 from barsight.recording.formats.ground_truth import read_ground_truth
 from barsight.sensors.source import LivePicture, LostPicture, Readings
 from barsight.yard.magnet.description import example_magnet
@@ -90,6 +91,7 @@ def test_a_run_as_fast_as_possible_is_measure(
         whole, out, settings, LiveSettings(), speed=0, magnet=magnet, judged_at="end", tell=told.append
     )  # fmt: skip
     assert (len(fused), len(matched)) == (fused_again, 0)
+    assert read_tile.cache_info().currsize == 0, "of a survey that is over nothing stays in memory"
     fields: dict[str, Any] = {
         "stereo": {"method": "sgbm"}, "map": {"cell_m": 0.05}, "motion": {"estimator": estimator},
         "yard": yard,
