@@ -131,9 +131,12 @@ class Told:
         self._thread = threading.Thread(target=self._supervise)
         self._thread.start()
 
-    def end(self) -> None:
+    def pause(self) -> None:
         self._over.set()
         self._thread.join()
+
+    def end(self) -> None:
+        self.pause()
         self.process.kill()
         self.process.wait()
 
@@ -162,6 +165,7 @@ def test_a_killing_is_timed_by_what_the_run_tells(
     tells: bool, revokes: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(faults, "GIVE_UP_S", 2.0)
+    monkeypatch.setattr(RunWatch, "owns", lambda _, pid: True)
     watch, one = RunWatch(tmp_path), Told(tmp_path, tells, revokes)
     try:
         kills = RandomKills(watch, 0, time.sleep)
@@ -183,6 +187,22 @@ def test_a_killing_is_timed_by_what_the_run_tells(
         assert watch.restarts == {"map": 1}
     table = soak_table(soak_content(watch, kills.killed, 0.0, SoakBounds()))
     assert ("1 times never" in table) == (any(missed))
+
+
+def test_processes_of_others_are_neither_watched_nor_killed(tmp_path: Path) -> None:
+    """state.json of a run that is over names numbers that others have now."""
+    one = Told(tmp_path, tells=False, revokes=False)
+    try:
+        one.pause()
+        told = content(tmp_path / "state.json") | {"pid": one.process.pid}
+        (tmp_path / "state.json").write_text(json.dumps(told))
+        watch = RunWatch(tmp_path)
+        assert not watch.sample() and not watch.processes
+        kills = RandomKills(watch, 0, time.sleep)
+        kills.step()
+        assert one.process.poll() is None and kills.killed["map"].times == 0
+    finally:
+        one.end()
 
 
 @pytest.mark.parametrize(

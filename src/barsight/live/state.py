@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -46,6 +47,7 @@ class RunState:
         return {
             "schema_version": 1,
             "phase": self.phase,
+            "pid": os.getpid(),
             "now_ns": self.now_ns,
             "mode": self.mode.name,
             "reasons": list(self.mode.reasons),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import time
@@ -59,10 +60,10 @@ class RandomKills:
     def _kill(self, role: str, before: dict[str, Any]) -> None:
         one, survey = self.killed.setdefault(role, Killed()), self._watch.survey
         pid, restarts = before["processes"][role]["pid"], before["processes"][role]["restarts"]
-        try:
-            os.kill(pid, signal.SIGKILL)
-        except ProcessLookupError:
+        if not self._watch.owns(pid):
             return
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
         began, told_s, revoked_s = time.monotonic(), None, None
         one.times += 1
         while (now_s := time.monotonic() - began) < GIVE_UP_S:

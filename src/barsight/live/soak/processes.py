@@ -9,8 +9,9 @@ from pathlib import Path
 from barsight.core.errors import ConfigError
 
 PROC = Path("/proc")
+SERVER = "forkserver"
 HELPERS = {
-    b"multiprocessing.forkserver": "forkserver",
+    b"multiprocessing.forkserver": SERVER,
     b"multiprocessing.resource_tracker": "resource tracker",
 }
 """Processes that the command keeps beside its run's own, by a word of their command line."""

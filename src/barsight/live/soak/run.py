@@ -114,9 +114,12 @@ def _soak(
 ) -> dict[str, Any]:  # fmt: skip
     """Sample, kill and write until it is over."""
     sample_at = write_at = 0.0
+    told: list[int] = []
 
     def rest(seconds: float) -> None:
         nonlocal sample_at
+        if told:
+            raise _ToldError
         if watch.seconds >= sample_at:
             sample_at = watch.seconds + SAMPLE_S
             watch.sample()
@@ -129,7 +132,7 @@ def _soak(
         write_soak(content, out)
         return content
 
-    with _sigterm_as_ctrl_c(), contextlib.suppress(KeyboardInterrupt):
+    with _told_by_signals(told), contextlib.suppress(_ToldError):
         tell(f"soaking; {out / 'soak.md'} has the table, each minute anew; Ctrl-C ends it")
         while watch.seconds < plan.hours * S_PER_H and is_there():
             rest(POLL_S)
@@ -141,16 +144,20 @@ def _soak(
     return write()
 
 
-@contextlib.contextmanager
-def _sigterm_as_ctrl_c() -> Iterator[None]:
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
+class _ToldError(Exception):
+    """The soak was told to end."""
 
-    before = signal.signal(signal.SIGTERM, interrupt)
+
+@contextlib.contextmanager
+def _told_by_signals(told: list[int]) -> Iterator[None]:
+    """Let Ctrl-C and SIGTERM end the soak as its time does, so that all is written; `told` takes them."""
+    numbers = signal.SIGINT, signal.SIGTERM
+    before = [signal.signal(number, lambda number, _: told.append(number)) for number in numbers]
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
 
 
 def _end(run: subprocess.Popen[bytes]) -> None:

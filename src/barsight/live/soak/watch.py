@@ -10,7 +10,7 @@ from typing import Any
 from barsight.core.errors import BarsightError
 from barsight.core.reading.bounded_reading import read_json
 from barsight.core.reading.live_run import running_folder
-from barsight.live.soak.processes import COMMAND, HELPERS, command_of, family, read_usage
+from barsight.live.soak.processes import COMMAND, HELPERS, SERVER, command_of, family, read_usage
 from barsight.live.soak.trend import Windows
 
 LASTING = (COMMAND, *HELPERS.values())
@@ -96,6 +96,10 @@ class RunWatch:
         """Check that the command was there at the last sample."""
         return self._command is not None
 
+    def owns(self, pid: int) -> bool:
+        """Check that a process is one of the run's now."""
+        return self._command is not None and command_of(pid) == self._command
+
     @property
     def survey(self) -> Path | None:
         """Return the folder of the survey that was seen last."""
@@ -106,11 +110,13 @@ class RunWatch:
         state = self.state()
         roles = {} if state is None else {one["pid"]: role for role, one in state["processes"].items()}
         there = {} if self._command is None else family(self._command, roles)
+        if not there and state is not None:
+            # A process of that number may be another by now: the run's has a fork server.
+            told = family(state.get("pid", 0), roles)
+            there = told if SERVER in told.values() else {}
+            self._command = state["pid"] if there else None
         if not there:
-            known = (command_of(pid) for pid in roles)
-            self._command = next((pid for pid in known if pid is not None), None)
-            there = {} if self._command is None else family(self._command, roles)
-        if not there:
+            self._command = None
             return False
         at_s, total = self.seconds, 0.0
         for pid, role in there.items():
