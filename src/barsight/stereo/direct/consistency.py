@@ -47,7 +47,8 @@ def _agree(left_px: Float32, right_px: Float32, tolerance: np.float32, same: Boo
 def agrees_with(right_px: Float32, x: int, disparity: np.float32, tolerance: np.float32) -> bool:
     """Check that the right picture's disparity (W,) px at the match of column x is the same."""
     column = np.int32(np.rint(np.float32(x) - disparity))
-    return column >= 0 and column < len(right_px) and abs(right_px[column] - disparity) <= tolerance
+    is_inside = column >= 0 and column < len(right_px)
+    return bool(is_inside and abs(right_px[column] - disparity) <= tolerance)
 
 
 @kernel()

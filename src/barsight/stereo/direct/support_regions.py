@@ -20,7 +20,7 @@ TILE_COLUMNS = 32
 MARGIN = 48
 _LINE_FLOATS = 16
 BAND_TILES = 16
-"""Rows of tiles that a thread works through row by row: what lies along a row is fetched before it is read."""
+"""Rows of tiles that a thread works through row by row: what lies along a row comes in before it is read."""
 _MIN_COHERENCE = 0.35
 FITTED_EVERY = 4
 """Where a tile's axis is a column's, supports are worked out for one row of so many, a divisor of TILE_ROWS,
