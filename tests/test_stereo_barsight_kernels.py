@@ -17,7 +17,13 @@ from barsight.stereo.direct.confidence import (
     judge_matches,
     start_disagreement,
 )
-from barsight.stereo.direct.consistency import drop_invalid, hits_valid, is_consistent, remove_islands
+from barsight.stereo.direct.consistency import (
+    agrees_with,
+    drop_invalid,
+    hits_valid,
+    is_consistent,
+    remove_islands,
+)
 from barsight.stereo.direct.curvature import curvature_row
 from barsight.stereo.direct.depth_edges import (
     _BESIDE_PX,
@@ -568,6 +574,13 @@ def test_doubled_disparity_repeats_its_pixels(shape: tuple[int, int], rows: int)
     small = _with_holes(51)[:20, :35]
     wanted = 2 * small.repeat(rows, axis=0).repeat(2, axis=1)[: shape[0], : shape[1]]
     np.testing.assert_array_equal(double_disparity(small, shape), wanted)
+
+
+def test_a_match_agrees_within_the_tolerance_inside_the_picture() -> None:
+    right = np.array([2, 3, np.nan, 5], dtype=np.float32)
+    asked = [(3, 2.0), (3, 2.5), (3, 3.0), (3, 4.0), (1, -1.0), (3, np.nan)]
+    found = [agrees_with(right, x, np.float32(px), np.float32(1)) for x, px in asked]
+    assert found == [True, True, True, False, False, False]
 
 
 def test_matches_of_invalid_pixels_are_dropped() -> None:

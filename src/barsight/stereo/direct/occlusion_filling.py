@@ -100,8 +100,9 @@ def _median(disparity: Float32) -> np.float32:
 def _take_between(
     disparity: Float32, low: np.float32, high: np.float32, found: Float32
 ) -> tuple[int, int, int]:
-    """Count what lies below, between and above two disparities, NaN aside. Fills the first of found with
-    what lies between.
+    """Count what lies below, between and above two disparities, NaN aside.
+
+    disparity: (H, W) px. Fills the first of found (H W,) px with what lies between.
     """
     below = count = above = 0
     for row in disparity:
