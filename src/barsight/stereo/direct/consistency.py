@@ -47,8 +47,10 @@ def _agree(left_px: Float32, right_px: Float32, tolerance: np.float32, same: Boo
 def agrees_with(right_px: Float32, x: int, disparity: np.float32, tolerance: np.float32) -> bool:
     """Check that the right picture's disparity (W,) px at the match of column x is the same."""
     column = np.int32(np.rint(np.float32(x) - disparity))
-    is_inside = column >= 0 and column < len(right_px)
-    return bool(is_inside and abs(right_px[column] - disparity) <= tolerance)
+    is_inside = (column >= 0) & (column < len(right_px))
+    # Without a branch, which would be guessed wrong as often as pictures disagree.
+    seen = right_px[np.uint64(column if is_inside else 0)]
+    return bool(is_inside & (abs(seen - disparity) <= tolerance))
 
 
 @kernel()
