@@ -37,9 +37,20 @@ def missing() -> str:
         return "libaravis-0.8 is not installed (.ci/servers installs it)"
     if os.geteuid() != 0 or shutil.which("ip") is None:
         return "network namespaces need root and iproute2"
-    made = subprocess.run(["ip", "netns", "add", "bs-try"], capture_output=True, text=True, check=False)
-    subprocess.run(["ip", "netns", "del", "bs-try"], capture_output=True, check=False)
-    return "" if made.returncode == 0 else f"no network namespaces here: {made.stderr.strip()}"
+    told = try_namespace()
+    return f"no network namespaces here: {told}" if told else ""
+
+
+def try_namespace() -> str:
+    """Make a namespace of this process's own and remove it, even if the process is killed meanwhile; tell why
+    it can't be made.
+    """
+    name = f"bs-try{os.getpid()}"
+    tried = subprocess.run(
+        ["sh", "-c", f"ip netns add {name} && ip netns del {name}"],
+        start_new_session=True, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    return tried.stderr.strip()
 
 
 def ip(*words: str) -> None:

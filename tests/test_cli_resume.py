@@ -155,9 +155,9 @@ def test_checkpoints_hold_only_for_what_made_them(
     capsys.readouterr()
 
 
-def key_of(recording: Path) -> str:
+def key_of(recording: Path, settings: MeasureSettings | None = None) -> str:
     source = open_recording(recording)
-    return map_building.checkpoint_key(source, {"stereo": {"p1": 1.0}, "lift": {"a": 1}}, source.digests())
+    return map_building.checkpoint_key(source, source, settings or MeasureSettings(), source.digests())
 
 
 def edit_imu(recording: Path) -> None:
@@ -190,9 +190,9 @@ def test_the_key_tells_each_input(tmp_path: Path, change: Callable[[Path], None]
 def test_the_key_tells_version_and_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Magnet and lift settings are judged anew each time: nothing that is kept depends on them."""
     recording = write_euroc(tmp_path)
-    source, before = open_recording(recording), key_of(recording)
-    assert map_building.checkpoint_key(source, {"stereo": {"p1": 2.0}}, source.digests()) != before
-    assert map_building.checkpoint_key(source, {"stereo": {"p1": 1.0}}, source.digests()) == before
+    before, settings = key_of(recording), MeasureSettings()
+    assert key_of(recording, replace(settings, stereo=replace(settings.stereo, max_sigma_px=0.1))) != before
+    assert key_of(recording, replace(settings, lift=replace(settings.lift, max_age_s=1.0))) == before
     monkeypatch.setattr("barsight.__version__", "0.0.9")
     assert key_of(recording) != before
 

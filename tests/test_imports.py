@@ -41,7 +41,7 @@ ROOMS = {
     "report": (".", "calibration"),
     "simulation": ("effects", ".", "boards", "worlds"),
     "benchmarks": (".", "lift_judge", "stereo", "motion", "yard"),
-    "live": ("shared", ".", "crane"),
+    "live": ("shared", ".", "crane", "soak"),
     "store": (".", "migrations", "migrations.versions"),
     "plant": (".", "opcua.security", "opcua", "links"),
     "cli": (".", "calibrate", "bench", "live", "yard", "store", "fleet", "plant", "acceptance"),

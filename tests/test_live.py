@@ -31,6 +31,8 @@ from barsight.recording.formats.ground_truth import read_ground_truth
 from barsight.sensors.source import LivePicture, LostPicture, Readings
 from barsight.yard.magnet.description import example_magnet
 from cli_runs import FAST
+from test_cli_resume import counting_matches
+from test_yard_frame import calibrated
 
 SETTINGS = bs.MeasureSettings(
     stereo=replace(bs.MeasureSettings().stereo, method="sgbm"),
@@ -67,14 +69,19 @@ def frame(number: int) -> StereoFrame:
     return StereoFrame(number, np.full((4, 6), number, np.uint8), np.full((4, 6), 100 + number, np.uint8))
 
 
-@pytest.mark.parametrize("estimator", ["fused", "live"])
+@pytest.mark.parametrize(
+    ("estimator", "in_yard", "fused_again"), [("fused", False, 4), ("live", False, 0), ("live", True, 0)]
+)
 def test_a_run_as_fast_as_possible_is_measure(
-    estimator: Literal["fused", "live"], whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Poses that are final at once leave nothing to be fused at the end."""
+    estimator: Literal["fused", "live"], in_yard: bool, fused_again: int, whole: Path, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """Poses that are final at once leave nothing to be fused at the end, and no pair is matched again."""
     fused: list[int] = []
     monkeypatch.setattr(map_building, "fuse_view", lambda *one: fused.append(1) or fuse_view(*one))
-    settings = replace(SETTINGS, motion=replace(SETTINGS.motion, estimator=estimator))
+    matched = counting_matches(monkeypatch)
+    yard = calibrated(tmp_path, 3, "encoders")[0].path if in_yard else None
+    settings = replace(SETTINGS, motion=replace(SETTINGS.motion, estimator=estimator), yard=yard)
     magnet = tmp_path / "magnet.toml"
     magnet.write_text(example_magnet(), encoding="utf-8")
     told: list[str] = []
@@ -82,9 +89,10 @@ def test_a_run_as_fast_as_possible_is_measure(
     replay(
         whole, out, settings, LiveSettings(), speed=0, magnet=magnet, judged_at="end", tell=told.append
     )  # fmt: skip
-    assert len(fused) == {"fused": 4, "live": 0}[estimator]
+    assert (len(fused), len(matched)) == (fused_again, 0)
     fields: dict[str, Any] = {
         "stereo": {"method": "sgbm"}, "map": {"cell_m": 0.05}, "motion": {"estimator": estimator},
+        "yard": yard,
     }  # fmt: skip
     batch = bs.measure(whole, magnet=magnet, at="end", **fields)
     assert files(out) == files(batch.folder)

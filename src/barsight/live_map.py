@@ -13,17 +13,17 @@ import numpy as np
 from barsight.checkpoint import checkpointed, sensor_readings, trajectory_name
 from barsight.core.arrays import Float64
 from barsight.core.errors import MeasurementError
-from barsight.core.timing import Stopwatch
+from barsight.core.timing import Stopwatch, unwatched
 from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame, Trajectory
 from barsight.map_building import MapBuilder, look_at, map_name
 from barsight.mapping.keyframes import keyframe_spacing_m
 from barsight.mapping.recording_probe import points_per_pixel
 from barsight.mapping.surface.surface import Surface
-from barsight.mapping.view import MatchedFrame, PointBinner
+from barsight.mapping.view import PointBinner
 from barsight.measure_settings import MeasureSettings
-from barsight.measurement import Refusal
 from barsight.motion.estimator import PoseEstimator, TrajectoryEstimator
 from barsight.motion.settings import make_estimator
+from barsight.pair_chain import MatchedAhead, PairChain
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.yard.sections import surface_map
 from barsight.yard.types import HeightMap
@@ -55,14 +55,17 @@ class PairPlacer:
 
     A pose lies in `checkpoints` by the frames and readings that it rests on. One that lies there needs no
     pictures, unless `reads` is False or a later one is missing: then those before it are followed again.
-    poses: the estimator, as far as it came. Raises MeasurementError where nothing places the body.
+    poses: the estimator, as far as it came. beat: called for each pair that is followed.
+
+    Raises MeasurementError where nothing places the body.
     """
 
     def __init__(
         self, pairs: RectifiedPairs, estimator: TrajectoryEstimator, checkpoints: Path | None, *,
-        reads: bool = True,
+        reads: bool = True, beat: Callable[[], None] = unwatched,
     ) -> None:  # fmt: skip
         self._pairs, self._checkpoints, self._reads = pairs, checkpoints, reads
+        self._beat = beat
         self.poses: PoseEstimator = estimator.begin(pairs.recording, pairs.rectifier)
         self._known: list[tuple[int, tuple[int, ...]]] = []
         self._unfollowed: list[int | RefusedFrame] = []
@@ -113,6 +116,7 @@ class PairPlacer:
         for seen in self._unfollowed:
             (pair,) = (seen,) if isinstance(seen, RefusedFrame) else self._pairs(frozenset((seen,)))
             posed = self.poses.push(pair)
+            self._beat()
         self._unfollowed.clear()
         return posed
 
@@ -127,13 +131,15 @@ class LiveMap:
     """Places pairs as they come and fuses them; `folder` takes its tiles and surfaces.
 
     With settings that make poses final at once (`is_final`), `end` leaves the trajectory and the map in
-    `checkpoints`, as measuring the same pairs makes them.
+    `checkpoints`, as measuring the same pairs makes them. beat: called for each pair and each tile that is
+    done.
     """
 
     def __init__(
         self, pairs: RectifiedPairs, settings: MeasureSettings, folder: Path, checkpoints: Path | None,
-        placer: PairPlacer, match: Callable[[RectifiedPair], MatchedFrame | Refusal],
+        placer: PairPlacer, match: PairChain | MatchedAhead, beat: Callable[[], None] = unwatched,
     ) -> None:  # fmt: skip
+        self._beat = beat
         self._pairs, self._settings, self._folder, self._match = pairs, settings, folder, match
         self._reference = "world" if pairs.recording.crane() is None else "yard"
         self._placer = placer
@@ -193,7 +199,7 @@ class LiveMap:
         if self._passed is not None:
             self._fuse_held(builder, self._passed)
         self._fuse_held(builder, None)
-        if builder.placed:
+        if builder.placed and all(self._match.holds(one.stamp_ns) for one in self._taken):
             checkpointed(self._checkpoints, map_name(tuple(self._taken), binner), builder.finish)
 
     def _begun(self) -> tuple[MapBuilder, PointBinner]:
@@ -206,7 +212,7 @@ class LiveMap:
             points_per_pixel(first, cell_m), settings.map.max_sigma_m, Stopwatch(),
         )  # fmt: skip
         yard = frame_of(self._pairs.recording)
-        return MapBuilder(binner, rectifier.camera, self._folder, settings.map, yard), binner
+        return MapBuilder(binner, rectifier.camera, self._folder, settings.map, yard, self._beat), binner
 
     def _take(self, builder: MapBuilder, pair: RectifiedPair, posed: PosedFrame) -> None:
         """Take a pair for the map, unless its picture has hardly moved."""
@@ -224,6 +230,7 @@ class LiveMap:
             pair, posed = self._held
             builder.add(self._match(pair), posed, after)
             self._taken.append(posed)
+            self._beat()
         self._held = after
 
 

@@ -22,7 +22,7 @@ from barsight.core.memory import trim_heap
 from barsight.core.notices import Notice
 from barsight.core.parallel import WORKERS, prefetched_map
 from barsight.core.pose import Pose
-from barsight.core.timing import Stopwatch, count_frames
+from barsight.core.timing import Stopwatch, count_frames, unwatched
 from barsight.core.types import PosedFrame, RectifiedCamera, RectifiedPair, RefusedFrame, Trajectory
 from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.fusion import fuse_view
@@ -105,16 +105,16 @@ class TrackedRecording:
 class MapBuilder:
     """Fuses posed frames, one after the other, into the tiles of `folder`, and carves their lines of sight.
 
-    placed: reference_from_rect0 of the views used, stamps_ns theirs.
+    placed: reference_from_rect0 of the views used, stamps_ns theirs. beat: called for each tile that is done.
     """
 
     def __init__(
         self, binner: PointBinner, camera: RectifiedCamera, folder: Path, settings: MapSettings,
-        yard: YardFrame | None = None,
+        yard: YardFrame | None = None, beat: Callable[[], None] = unwatched,
     ) -> None:  # fmt: skip
         self._binner, self._camera, self._settings, self._yard = binner, camera, settings, yard
         self._store = TileStore(folder, settings.resident_tiles)
-        self._election = SurfaceElection(self._store, folder, binner.cell_m, settings)
+        self._election = SurfaceElection(self._store, folder, binner.cell_m, settings, beat)
         self._free, self._tops = FreeSpace(binner.cell_m), TopPhoto(binner.cell_m)
         self._before: Neighbour | None = None
         self._previews: list[tuple[int, Preview]] = []
@@ -200,9 +200,7 @@ def inspect_recording(
     configuration, inputs = json_value(settings), source.digests()
     checkpoints = None
     if resume is not None:
-        frame = frame_of(source)
-        placed = inputs if frame is None else {**inputs, "yard": frame.digest}
-        checkpoints = checkpoint_folder(resume, checkpoint_key(recording, configuration, placed))
+        checkpoints = checkpoint_folder(resume, checkpoint_key(recording, source, settings, inputs))
     with watch("look"):
         pairs = RectifiedPairs(source, Rectifier(source.rig), checkpoints or scratch, watch)
         first, cell_m, calibration_px = look_at(pairs, settings, checkpoints)
@@ -333,11 +331,18 @@ def map_name(poses: tuple[PosedFrame, ...], binner: PointBinner) -> str:
     return f"map_{json_digest([json_value(poses), asked])[:32]}"
 
 
-def checkpoint_key(recording: Recording, configuration: dict[str, Any], inputs: dict[str, str]) -> str:
-    """Return a digest of all that trajectory and disparities depend on."""
+def checkpoint_key(
+    recording: Recording, source: Recording, settings: MeasureSettings, inputs: dict[str, str]
+) -> str:
+    """Return a digest of all that trajectory and disparities depend on.
+
+    source: the recording with the sensors in use, in the yard. inputs: SHA-256 of its files.
+    """
+    configuration, frame = json_value(settings), frame_of(source)
     stages = {name: part for name, part in configuration.items() if name not in ("bundles", "lift")}
+    placed = inputs if frame is None else {**inputs, "yard": frame.digest}
     rig = json_value(recording.rig)
-    return json_digest([barsight.__version__, stages, inputs, rig, pictures_digest(recording)])
+    return json_digest([barsight.__version__, stages, placed, rig, pictures_digest(recording)])
 
 
 def _known_early(

@@ -16,7 +16,6 @@ from barsight.calibration.geometry.rig import StereoRig
 from barsight.checkpoint import checkpoint_folder
 from barsight.core.compiling.ahead import compile_ahead
 from barsight.core.errors import ConfigError, MeasurementError
-from barsight.core.json_values import json_value
 from barsight.core.settings.values import build_settings
 from barsight.core.stamps import NS_PER_S
 from barsight.core.timing import Stopwatch
@@ -79,7 +78,7 @@ class Session:
         self._recordings.append(self._recording)
         selected = SelectedSensors(self._recording, self._settings.use)
         self._source = in_yard(selected, self._settings.yard)
-        key = checkpoint_key(self._recording, json_value(self._settings), {})
+        key = checkpoint_key(self._recording, self._source, self._settings, {})
         self._checkpoints = checkpoint_folder(self._folder / "checkpoints" / name, key)
         self._pairs = RectifiedPairs(self._source, Rectifier(self._rig), self._checkpoints)
         # A rig that is to be turned at the end gives other disparities then.

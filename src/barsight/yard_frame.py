@@ -51,8 +51,10 @@ class RecordingInYard(RecordingProxy):
         )  # fmt: skip
 
 
-def in_yard(recording: Recording, yard: Path | None) -> Recording:
+def in_yard(recording: Recording, yard: Path | None, known: Recording | None = None) -> Recording:
     """View a recording through the yard file, the recording itself where there is none.
+
+    known: what the file must fit, where the recording's own readings are yet to come.
 
     Raises CalibrationError for a file that can't be, InputError for one of another rig, crane or recording.
     """
@@ -60,7 +62,7 @@ def in_yard(recording: Recording, yard: Path | None) -> Recording:
         return recording
     frame = read_yard_file(yard)
     _expect_sure(frame)
-    _expect_fits(frame, recording)
+    _expect_fits(frame, known or recording)
     return RecordingInYard(recording, frame)
 
 

@@ -49,7 +49,7 @@ COMMANDS = {
 }
 GROUPS = ("bench", "calibrate", "live", "store", "fleet", "plant")
 """Commands that are packages: `command.py` in them finds the second word."""
-SECOND = {"live": ("check",)}
+SECOND = {"live": ("check", "soak")}
 """Second words of commands that do something without one too."""
 ROOMS = {"bench": ("paper",), "yard": ("lifts", "explain", "labels", "compare"), "store": ("yard", "serve"),
          "acceptance": ("accept", "budget", "verify", "commission")}  # fmt: skip

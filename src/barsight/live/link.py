@@ -17,8 +17,10 @@ from barsight.motion.fixed_lag.propagation import ROW_NUMBERS
 from barsight.recording.base import FrameIndex, Recording
 from barsight.recording.open import open_recording
 from barsight.recording.packets import PacketRecording
+from barsight.recording.sensor_selection import SelectedSensors
 from barsight.recording.stored_images import StoredPictures
 from barsight.recording.wrapper import RecordingProxy
+from barsight.yard_frame import in_yard
 
 
 @dataclass(frozen=True)
@@ -136,6 +138,11 @@ class GrowingRecording(KeptRecording):
         stamps, values = self._logs["crane"].read()
         if self._mounted is not None:
             self._held.add(replace(self._mounted, stamp_ns=stamps, position_m=values))
+
+    def in_use(self) -> Recording:
+        """View it with the sensors in use, in the yard."""
+        use, yard = self.link.settings.use, self.link.settings.yard
+        return in_yard(SelectedSensors(self, use), yard, SelectedSensors(self.whole, use))
 
     def last_readings_ns(self) -> dict[str, int]:
         """Return the stamp of the last reading of each sensor that gave any."""

@@ -6,29 +6,25 @@ import contextlib
 import math
 import os
 import time
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable
 from dataclasses import replace
 
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.compiling.ahead import load_kernels
 from barsight.core.errors import BarsightError, MeasurementError
 from barsight.core.memory import trim_heap
-from barsight.core.parallel import WORKERS
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.timing import Stopwatch
-from barsight.core.types import RectifiedPair
 from barsight.live.link import GrowingRecording, Link
 from barsight.live.shared.counters import DRAIN
 from barsight.live_map import LiveMap, PairPlacer, is_final
 from barsight.map_building import matching
-from barsight.mapping.view import MatchedFrame
-from barsight.measurement import Refusal
 from barsight.motion.fixed_lag.sensor_buffer import SENSOR_DELAY_S
 from barsight.motion.settings import make_estimator
+from barsight.pair_chain import MatchedAhead
 from barsight.recording.rectified_pairs import RectifiedPairs
-from barsight.recording.sensor_selection import SelectedSensors
 from barsight.report.result_files import write_height
-from barsight.yard_frame import in_yard, placing_id
+from barsight.yard_frame import placing_id
 
 POLL_S = 0.02
 AHEAD = 12
@@ -50,7 +46,8 @@ def build_live_map(link: Link) -> None:
     os.nice(NICENESS)
     board = link.open_counters()
     load_kernels("measure")
-    mapping = Mapping(link, GrowingRecording(link.open_recording(), [], link))
+    recording = GrowingRecording(link.open_recording(), [], link)
+    mapping = Mapping(link, recording, lambda: board.beat("map"))
     board["map", "mapped"] = board["map", "refused"] = 0
     board.beat("map")
     board["map", "ready"] = 1
@@ -58,10 +55,11 @@ def build_live_map(link: Link) -> None:
     while True:
         board.beat("map")
         is_last = board["supervisor", "stop"] == DRAIN
+        ended = is_last or bool(board["capture", "ended"])
         board["map", "backlog"] = mapping.read_queue()
         if is_last and not (mapping.is_final and mapping.queue):
             break
-        if mapping.is_due(ended=is_last or bool(board["capture", "ended"])):
+        if mapping.is_due(ended=ended):
             board["map", "mapped"] = mapping.add_next()
         elif (
             board["map", "mapped"] > max(shown, 1) and not mapping.queue
@@ -76,22 +74,18 @@ def build_live_map(link: Link) -> None:
 
 
 class Mapping:
-    """A `LiveMap` of the keyframes so far. queue: stamps of those that wait.
+    """A `LiveMap` of the keyframes so far. queue: stamps of those that wait. beat: called as work goes on.
 
     A process begun anew fuses all again: their disparities are there.
     """
 
-    def __init__(self, link: Link, recording: GrowingRecording) -> None:
+    def __init__(self, link: Link, recording: GrowingRecording, beat: Callable[[], None]) -> None:
+        self._beat = beat
         self._link, self._recording, settings = link, recording, link.settings
-        source = in_yard(SelectedSensors(recording, settings.use), settings.yard)
-        self._pairs = RectifiedPairs(source, Rectifier(recording.rig), link.checkpoints)
-        placed = placing_id(source)
-        self._frame_id = "world" if placed is None else f"yard:{placed}"
+        self._pairs = RectifiedPairs(recording.in_use(), Rectifier(recording.rig), link.checkpoints)
         self.is_final = is_final(settings)
         checkpoints = link.checkpoints if settings.self_calibrate == "none" else None
-        self._match = matching(self._pairs, settings, checkpoints, Stopwatch())
-        self._ahead = [ThreadPoolExecutor(1) for _ in range(WORKERS)]
-        self._matched: dict[int, Future[MatchedFrame | Refusal]] = {}
+        self._match = MatchedAhead(matching(self._pairs, settings, checkpoints, Stopwatch()), self._pairs)
         self._frames, self._tiles = link.frames(), link.tiles()
         self._told = {stamp for stamp, _, _ in self._tiles.read()}
         self._exposed: dict[int, int] = {}
@@ -100,8 +94,9 @@ class Mapping:
 
     def read_queue(self) -> int:
         """Read what was kept since; return how many keyframes wait."""
-        self._recording.grow()
-        for stamp, exposed_ns, _, is_kept, _ in self._frames.read():
+        frames = self._frames.read()
+        self._recording.grow()  # after the frames: what was there for them is here too
+        for stamp, exposed_ns, _, is_kept, _ in frames:
             if is_kept:
                 self._recording.stamps_ns.append(stamp)
                 self._exposed[stamp] = exposed_ns
@@ -126,10 +121,8 @@ class Mapping:
         are in the map.
         """
         # Where not all pairs are matched, only the place of each tells which are.
-        for stamp in self.queue[:AHEAD] if self._link.settings.map.min_shift == 0 else ():
-            if stamp not in self._matched:
-                worker = self._ahead[self._match.chain(stamp) % WORKERS]
-                self._matched[stamp] = worker.submit(self._match_stamp, stamp)
+        if self._link.settings.map.min_shift == 0:
+            self._match.begin(self.queue[:AHEAD])
         stamp = self.queue.pop(0)
         (pair,) = self._pairs(frozenset((stamp,)))
         try:
@@ -152,7 +145,9 @@ class Mapping:
             return False
         if surface is None:
             return False
-        write_height(surface, self._link.folder.parent / LIVE_MAP, self._frame_id)
+        placed = placing_id(self._pairs.recording)
+        frame_id = "world" if placed is None else f"yard:{placed}"
+        write_height(surface, self._link.folder.parent / LIVE_MAP, frame_id)
         return True
 
     def end(self) -> None:
@@ -161,23 +156,16 @@ class Mapping:
             with contextlib.suppress(BarsightError):
                 self._map.end()
             self._tell_fused()
-        for worker in self._ahead:
-            worker.shutdown(cancel_futures=True)
+        self._match.close()
 
     def _begun(self) -> LiveMap:
         """Begin with the poses that track has found, as far as it had the same pairs and readings."""
         link = self._link
         estimator = make_estimator(replace(link.settings.motion, estimator="live"))
-        placer = PairPlacer(self._pairs, estimator, link.checkpoints)
-        return LiveMap(self._pairs, link.settings, link.folder, link.checkpoints, placer, self._take)
-
-    def _match_stamp(self, stamp_ns: int) -> MatchedFrame | Refusal:
-        (pair,) = self._pairs(frozenset((stamp_ns,)))
-        return self._match(pair)
-
-    def _take(self, pair: RectifiedPair) -> MatchedFrame | Refusal:
-        matched = self._matched.pop(pair.stamp_ns, None)
-        return self._match(pair) if matched is None else matched.result()
+        placer = PairPlacer(self._pairs, estimator, link.checkpoints, beat=self._beat)
+        return LiveMap(
+            self._pairs, link.settings, link.folder, link.checkpoints, placer, self._match, self._beat
+        )  # fmt: skip
 
     def _tell_fused(self) -> None:
         """Note when each keyframe came into the map."""

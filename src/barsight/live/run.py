@@ -18,7 +18,7 @@ from barsight.checkpoint import checkpoint_folder
 from barsight.core.compiling.ahead import compile_ahead, load_kernels
 from barsight.core.errors import ConfigError, InputError, MeasurementError, OutputError
 from barsight.core.files import expect_empty, lies_within, translated_os_errors
-from barsight.core.json_values import json_value, write_json
+from barsight.core.json_values import write_json
 from barsight.core.notices import Notice
 from barsight.core.parallel import in_background
 from barsight.core.stamps import NS_PER_S
@@ -38,9 +38,11 @@ from barsight.measure_settings import MeasureSettings
 from barsight.pipeline import LiftRequest
 from barsight.recording.base import Recording
 from barsight.recording.open import open_recording
+from barsight.recording.sensor_selection import SelectedSensors
 from barsight.report.page import write_report
 from barsight.yard.lifting.lift_file import read_lifts
 from barsight.yard.magnet.description import load_magnet
+from barsight.yard_frame import in_yard
 
 MAX_SPEED = 1000.0
 INTERRUPTED = "interrupted"
@@ -66,16 +68,23 @@ def replay(
     speed: recorded seconds a second; 0: as fast as possible, where nothing is lost. keyframes: keyframes.json
     of an earlier run, to keep just what it kept. tell: takes each line of the log. Raises a BarsightError.
     """
-    if not (math.isfinite(speed) and 0 <= speed <= MAX_SPEED):
-        raise ConfigError(f"speed must lie in 0...{MAX_SPEED:g} (0: as fast as possible), not {speed:g}")
     given = None if keyframes is None else read_keyframes(keyframes)
     request = LiftRequest(None if magnet is None else load_magnet(magnet), judged_at)
+    return begin_replay(path, out, settings, live, speed, tell).measure(given, request, advance)
+
+
+def begin_replay(
+    path: Path, out: Path, settings: MeasureSettings, live: LiveSettings, speed: float,
+    tell: Callable[[str], None],
+) -> LiveRun:  # fmt: skip
+    """Begin the run of a replay into `out`; see `replay`."""
+    if not (math.isfinite(speed) and 0 <= speed <= MAX_SPEED):
+        raise ConfigError(f"speed must lie in 0...{MAX_SPEED:g} (0: as fast as possible), not {speed:g}")
     recording = open_recording(path, settings.recording)
     if lies_within(out, path):
         raise OutputError(f"{out}: lies in the recording itself; name a folder elsewhere")
     expect_empty(out)
-    run = LiveRun(recording, LiveInput(path.absolute(), speed), out, settings, live, tell)
-    return run.measure(given, request, advance)
+    return LiveRun(recording, LiveInput(path.absolute(), speed), out, settings, live, tell)
 
 
 class LiveRun:
@@ -136,8 +145,10 @@ class LiveRun:
 
 
 def _key(recording: Recording, settings: MeasureSettings) -> str:
-    empty = KeptRecording(recording, [])
-    return checkpoint_key(empty, json_value(settings.chosen()), empty.digests())
+    """Name the checkpoints as measuring what is kept of the recording will."""
+    empty, chosen = KeptRecording(recording, []), settings.chosen()
+    source = in_yard(SelectedSensors(empty, chosen.use), chosen.yard)
+    return checkpoint_key(empty, source, chosen, source.digests())
 
 
 def _finish(

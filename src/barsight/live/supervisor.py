@@ -36,7 +36,7 @@ MAX_RESTARTS, RESTARTS_WITHIN_S = 5, 30.0
 START_S = 120.0
 """Processes may take so long to start on a busy machine."""
 FINISH_S = 60.0
-"""The map process may be silent so long while it elects the last of the surface."""
+"""At the end the map process may be silent so long, between one pair or tile and the next."""
 FREEZE_READINGS = 100
 DRAIN_S = 60.0
 """The recorder may take so long to write what is left."""

@@ -22,8 +22,6 @@ from barsight.live_map import PairPlacer
 from barsight.motion.fixed_lag.estimator import FixedLagPoses
 from barsight.motion.settings import make_estimator
 from barsight.recording.rectified_pairs import RectifiedPairs
-from barsight.recording.sensor_selection import SelectedSensors
-from barsight.yard_frame import in_yard
 
 POLL_S = 0.002
 GRACE_S = 0.3
@@ -67,7 +65,7 @@ class Tracking:
         self._rectifier = Rectifier(recording.rig)
         self._pairs = RectifiedPairs(recording, self._rectifier, link.checkpoints)
         self._frames, self._states = link.frames(), link.states()
-        self._source = in_yard(SelectedSensors(recording, link.settings.use), link.settings.yard)
+        self._source = recording.in_use()
         motion = replace(link.settings.motion, estimator="live")
         self._estimator = make_estimator(motion)
         self._placer: PairPlacer | None = None

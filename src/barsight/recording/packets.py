@@ -166,9 +166,10 @@ class _Grown(Generic[Samples]):
 
     @property
     def samples(self) -> Samples | None:
+        count = self._count  # once: another thread may add meanwhile
         if self._first is None:
             return None
-        return replace(self._first, **{name: held[: self._count] for name, held in self._arrays.items()})
+        return replace(self._first, **{name: held[:count] for name, held in self._arrays.items()})
 
 
 def _between(

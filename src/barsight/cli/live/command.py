@@ -1,4 +1,4 @@
-"""Run `barsight live --replay RECORDING -o OUT`, `live --config crane.toml -o OUT`, `live check`."""
+"""Run `barsight live --replay RECORDING -o OUT`, `live --config crane.toml -o OUT`, `live check`, `soak`."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from barsight.cli.arguments import call, config_path, load_settings
-from barsight.cli.live import check
+from barsight.cli.live import check, soak
 from barsight.cli.measure import print_outcome
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError
-from barsight.live.crane.run import measure_crane, measure_surveys
+from barsight.live.crane.run import measure_crane, measure_surveys, replay_surveys
 from barsight.live.run import replay as replay_recording
 from barsight.live.settings import LiveSettings, read_crane
 from barsight.measure_settings import MeasureSettings
@@ -23,8 +23,8 @@ from barsight.measure_settings import MeasureSettings
 
 def run(arguments: Sequence[str]) -> None:
     """Parse and run."""
-    if arguments[:1] == ["check"]:
-        check.run(arguments[1:])
+    if arguments[:1] in (["check"], ["soak"]):
+        {"check": check, "soak": soak}[arguments[0]].run(arguments[1:])
         return
     at_config, is_replay = config_path(arguments), any(a.split("=")[0] == "--replay" for a in arguments)
     crane = None if is_replay or at_config is None else read_crane(at_config)
@@ -59,18 +59,17 @@ def run(arguments: Sequence[str]) -> None:
             magnet: TOML file of the magnet that lifts are chosen for; without it nothing is offered.
             at: When lifts are judged: now, or at the end of the recording, to look back; never for a crane.
             keyframes: keyframes.json of an earlier run: keep just the pairs that it kept.
-            surveys: One survey after the other, each in a folder of OUT, as the crane moves and stops.
+            surveys: Survey after survey, each in a folder of OUT: as the crane moves and stops, or replays.
         """
         console = SafeConsole(stderr=True)
-
         tell = partial(console.print, soft_wrap=True, highlight=False, markup=False)
-        _expect_fitting(replay, surveys, for_replays=speed != 1 or at != "now" or keyframes is not None)
+        for_replays = speed != 1 or at != "now" or keyframes is not None
+        _expect_fitting(replay, for_replays=for_replays, surveys_of=keyframes if surveys else None)
         with stages(console) as advance:
             common: dict[str, Any] = {"magnet": magnet, "tell": tell, "advance": advance}
             if replay is not None:
-                measured = replay_recording(
-                    replay, out, settings, live, speed=speed, judged_at=at, keyframes=keyframes, **common
-                )
+                run_replay = replay_surveys if surveys else partial(replay_recording, keyframes=keyframes)
+                measured = run_replay(replay, out, settings, live, speed=speed, judged_at=at, **common)
             elif crane is None:
                 raise ConfigError("live needs --replay RECORDING or --config crane.toml")
             else:
@@ -83,9 +82,9 @@ def run(arguments: Sequence[str]) -> None:
     call(command, "live", arguments)
 
 
-def _expect_fitting(replay: Path | None, surveys: bool, *, for_replays: bool) -> None:
-    """Raise ConfigError for flags that are another source's."""
-    if surveys and replay is not None:
-        raise ConfigError("--surveys is for --config crane.toml: a recording is one survey")
+def _expect_fitting(replay: Path | None, *, for_replays: bool, surveys_of: Path | None) -> None:
+    """Raise ConfigError for flags of another source. surveys_of: keyframes for survey after survey."""
+    if surveys_of is not None:
+        raise ConfigError("--keyframes is for one replay, without --surveys")
     if replay is None and for_replays:
         raise ConfigError("--speed, --at and --keyframes are for --replay; a crane has its own pace")

@@ -1,4 +1,4 @@
-"""Run `barsight live --config crane.toml`: one survey by the crane's own sensors, or one after the other."""
+"""Run `barsight live`: one survey by the crane's own sensors, or survey after survey, of a replay too."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import time
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from barsight.core.errors import BarsightError, ConfigError
 from barsight.core.files import expect_empty, translated_os_errors
 from barsight.live.crane.preflight import prove_sensors
 from barsight.live.drift import DRIFT_FILE, note_drift
 from barsight.live.link import LiveInput
-from barsight.live.run import INTERRUPTED, LiveRun
+from barsight.live.run import INTERRUPTED, LiveRun, begin_replay
 from barsight.live.settings import CraneConfig, LiveSettings
 from barsight.live.survey import STOOD
 from barsight.map_building import ProgressCallback
@@ -30,6 +30,8 @@ from barsight.yard.magnet.description import load_magnet
 STAMP = "%Y%m%dT%H%M%S"
 AGAIN_S = 5.0
 """After a survey that failed the sensors are proved this often until they answer."""
+REPLAYS_KEPT = 5
+"""Of a recording that is replayed over and over so many surveys' folders are kept."""
 RUNNING, LATEST = "current", "latest"
 """Links to the survey that runs, and to the last that was measured."""
 
@@ -91,6 +93,38 @@ def measure_surveys(
             ended, proved = run.stop_because, False
             tell(f"{here.name} offers no lifts: {error}")
         _keep(out, crane.survey.keep)
+    return {}
+
+
+def replay_surveys(
+    path: Path, out: Path, settings: MeasureSettings, live: LiveSettings, *, speed: float = 1.0,
+    magnet: Path | None = None, judged_at: Literal["now", "end"] = "now", tell: Callable[[str], None] = print,
+    advance: ProgressCallback = ignore_progress,
+) -> dict[str, Any]:  # fmt: skip
+    """Measure a recording over and over, each time into a folder in `out`, until Ctrl-C or SIGTERM; the
+    newest few are kept. Raises a BarsightError where the first time fails.
+    """
+    request, ended, is_first = (
+        LiftRequest(None if magnet is None else load_magnet(magnet), judged_at),
+        "",
+        True,
+    )
+    while ended != INTERRUPTED:
+        here = out / datetime.now(UTC).strftime(STAMP)
+        run = begin_replay(path, here, settings, live, speed, tell)
+        with translated_os_errors(here):
+            here.mkdir(parents=True, exist_ok=True)
+        _point(out / RUNNING, here.name)
+        try:
+            run.measure(None, request, advance)
+            _point(out / LATEST, here.name)
+            tell(f"{here.name} is measured")
+        except BarsightError as error:
+            if is_first:
+                raise
+            tell(f"{here.name} offers no lifts: {error}")
+        ended, is_first = run.stop_because, False
+        _keep(out, REPLAYS_KEPT)
     return {}
 
 

@@ -6,15 +6,17 @@ import os
 import shutil
 import tempfile
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, Int8
 from barsight.core.parallel import ordered_map
+from barsight.core.timing import unwatched
 from barsight.core.types import HeightSource
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.surface.bar_profiles import REACH_CELLS, draw_bars
@@ -47,6 +49,8 @@ from barsight.mapping.surface.surface import (
     write_tile,
 )
 from barsight.mapping.tiles import TILE_CELLS, TileKey, TileStore
+
+Result = TypeVar("Result")
 
 _HALO = 13 + VOTE_CELLS // 2 + REACH_CELLS
 """Cells around a tile that it depends on: along a bar, and what is read beside it. Even, so that stripes are
@@ -85,10 +89,14 @@ class SurfaceElection:
     """Elects the surface of the tiles in `store`; `folder` takes its files and those of the surfaces.
 
     Poses that were given once stay: the next `ViewFrusta` begin with the same views. Nothing in `store`
-    changes but by `finish`.
+    changes but by `finish`. beat: called for each tile that is done.
     """
 
-    def __init__(self, store: TileStore, folder: Path, cell_m: float, settings: MapSettings) -> None:
+    def __init__(
+        self, store: TileStore, folder: Path, cell_m: float, settings: MapSettings,
+        beat: Callable[[], None] = unwatched,
+    ) -> None:  # fmt: skip
+        self._beat = beat
         self._store, self._folder, self._cell_m, self._settings = store, folder, cell_m, settings
         work = Path(tempfile.mkdtemp(prefix="election_", dir=folder))
         self._first, self._elected, self._finished, asked = (
@@ -229,11 +237,11 @@ class SurfaceElection:
             )
 
         _read_first.cache_clear()
-        for _ in ordered_map(lambda item: look(*item), ((key, read(key)) for key in voted)):
+        for _ in self._counted(ordered_map(lambda item: look(*item), ((key, read(key)) for key in voted))):
             pass
         self._voted |= {key: states[key] for key in voted}
         items = ((key, read(key), asked_of(key)) for key in keys)
-        elections = ordered_map(lambda item: elect_tile(*item), items)
+        elections = self._counted(ordered_map(lambda item: elect_tile(*item), items))
         self._elections |= dict(zip(keys, elections, strict=True))
 
     def _finish(self, keys: list[TileKey], frusta: ViewFrusta) -> None:
@@ -252,8 +260,13 @@ class SurfaceElection:
 
         read_tile.cache_clear()
         items = ((key, self._store.read(key) if self._elections[key].is_last else None) for key in keys)
-        self._figures |= ordered_map(finish_tile, items)
+        self._figures |= self._counted(ordered_map(finish_tile, items))
         self._finishes |= {key: self._around_elected(key) for key in keys}
+
+    def _counted(self, tiles: Iterator[Result]) -> Iterator[Result]:
+        for tile in tiles:
+            self._beat()
+            yield tile
 
     def _seen_from_m(self, key: TileKey) -> float:
         """Return the height of the cameras that see a tile, or of those that see its neighbours."""

@@ -1,0 +1,74 @@
+"""Run `barsight live soak OUT -o SOAK`, `live soak --replay RECORDING -o SOAK [-- FLAGS OF LIVE]`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from barsight.cli.arguments import call
+from barsight.cli.safe_console import SafeConsole
+from barsight.core.errors import ConfigError, MeasurementError
+from barsight.live.soak.report import UNSURE, SoakBounds, soak_table
+from barsight.live.soak.run import SoakPlan, soak_replays, soak_run
+
+BOUNDS = SoakBounds()
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Parse, soak and print."""
+    cut = arguments.index("--") if "--" in arguments else len(arguments)
+    own, flags = arguments[:cut], arguments[cut + 1 :]
+
+    def command(
+        out: Annotated[Path, tyro.conf.arg(aliases=("-o",))],
+        run: Annotated[Path | None, tyro.conf.Positional] = None,
+        replay: Path | None = None,
+        hours: float | None = None,
+        warm_up_h: float = 0.5,
+        faults_after_h: float | None = None,
+        seed: int = 0,
+        bounds: SoakBounds = BOUNDS,
+    ) -> None:  # fmt: skip
+        """Soak a live run for hours or weeks: its memory, open descriptors, how it comes back from faults.
+
+        Writes soak.json and soak.md each minute and at the end, which comes after --hours, at Ctrl-C, or when
+        the run is gone. Exit code 5 where a bound is broken, or where it can't be told yet whether it is.
+
+        Args:
+            out: An empty or new folder for the two files.
+            run: OUT of a run of barsight live that goes on, as its service has it.
+            replay: Instead, a recording, which a run of its own replays over and over; flags of live for it
+                stand at the end, after --.
+            hours: How long, from the beginning; without it until Ctrl-C.
+            warm_up_h: For so long memory may grow.
+            faults_after_h: From then on kill one of the run's processes after the other, at random moments.
+            seed: Of these moments.
+            bounds: What the run must stay within.
+        """
+        if (run is None) == (replay is None):
+            raise ConfigError("live soak needs OUT of a run that goes on, or --replay RECORDING")
+        if run is not None and flags:
+            raise ConfigError("flags after -- are for --replay: a run that goes on has its own")
+        plan = SoakPlan(
+            hours or math.inf, warm_up_h, math.inf if faults_after_h is None else faults_after_h, seed
+        )
+        console = SafeConsole(stderr=True)
+
+        def tell(line: str) -> None:
+            console.print(line, soft_wrap=True, highlight=False, markup=False)
+
+        if replay is not None:
+            found = soak_replays(replay, out, plan, bounds, flags, tell)
+        else:
+            assert run is not None
+            found = soak_run(run, out, plan, bounds, tell)
+        SafeConsole().print(soak_table(found), soft_wrap=True, highlight=False, markup=False)
+        if wrong := [*found["broken"], *found[UNSURE]]:
+            name = "bounds are broken" if found["broken"] else "not sure yet, soak longer"
+            raise MeasurementError(f"{name}: {'; '.join(wrong)}")
+
+    call(command, "live soak", own)

@@ -1,0 +1,95 @@
+"""Kill a run's processes at random, and time how soon it tells, revokes lifts and is well again."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from barsight.live.soak.watch import RunWatch
+
+PAUSE_S = (5.0, 30.0)
+GIVE_UP_S = 60.0
+LOOK_S = 0.01
+WITHOUT_LIFTS = ("record",)
+"""Processes without which lifts may stand."""
+
+
+@dataclass
+class Killed:
+    """Killings of a role's process, in seconds: to where state.json told it, to where lifts were revoked, to
+    where all was well again. over: the survey ended meanwhile; not_told, not_revoked, not_back: not before
+    all was well again, or within `GIVE_UP_S`.
+    """
+
+    told_s: list[float] = field(default_factory=list)
+    revoked_s: list[float] = field(default_factory=list)
+    back_s: list[float] = field(default_factory=list)
+    times: int = 0
+    over: int = 0
+    not_told: int = 0
+    not_revoked: int = 0
+    not_back: int = 0
+
+
+class RandomKills:
+    """Kills one process after another, by `seed`, as long as the run is well. rest: called while it waits."""
+
+    def __init__(self, watch: RunWatch, seed: int, rest: Callable[[float], None]) -> None:
+        self._watch, self._rest, self._rng = watch, rest, np.random.default_rng(seed)
+        self.killed: dict[str, Killed] = {}
+        self._due_s = 0.0
+
+    def step(self) -> None:
+        """Kill a process where one is due and the run is well."""
+        state = self._watch.state()
+        if state is None or not _is_well(state):
+            self._due_s = max(self._due_s, self._watch.seconds + PAUSE_S[0])
+            return
+        if self._watch.seconds < self._due_s:
+            return
+        self._kill(str(self._rng.choice(sorted(state["processes"]))), state)
+        self._due_s = self._watch.seconds + float(self._rng.uniform(*PAUSE_S))
+
+    def _kill(self, role: str, before: dict[str, Any]) -> None:
+        one, survey = self.killed.setdefault(role, Killed()), self._watch.survey
+        pid, restarts = before["processes"][role]["pid"], before["processes"][role]["restarts"]
+        try:
+            os.kill(pid, signal.SIGKILL)
+        except ProcessLookupError:
+            return
+        began, told_s, revoked_s = time.monotonic(), None, None
+        one.times += 1
+        while (now_s := time.monotonic() - began) < GIVE_UP_S:
+            state = self._watch.state()
+            if self._watch.survey != survey or (state is not None and state["phase"] != "measuring"):
+                one.over += 1
+                break
+            if state is not None:
+                if told_s is None and state["processes"][role]["restarts"] > restarts:
+                    told_s = now_s
+                if revoked_s is None and not state["lifts"]["may_stand"]:
+                    revoked_s = now_s
+                if told_s is not None and _is_well(state):
+                    one.back_s.append(now_s)
+                    one.not_revoked += revoked_s is None and role not in WITHOUT_LIFTS
+                    break
+            self._rest(LOOK_S)
+        else:
+            one.not_told += told_s is None
+            one.not_back += 1
+        one.told_s += [] if told_s is None else [told_s]
+        one.revoked_s += [] if revoked_s is None or role in WITHOUT_LIFTS else [revoked_s]
+
+
+def _is_well(state: dict[str, Any]) -> bool:
+    return (
+        state["phase"] == "measuring"
+        and bool(state["lifts"]["may_stand"])
+        and all(one["state"] == "running" for one in state["processes"].values())
+    )
