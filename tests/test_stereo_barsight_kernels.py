@@ -9,11 +9,37 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from barsight.core.errors import ConfigError
-from barsight.stereo.direct.confidence import disparity_bend, edge_risk, start_disagreement
-from barsight.stereo.direct.consistency import hits_valid, is_consistent, remove_islands
+from barsight.stereo.direct.confidence import (
+    Doubts,
+    add_edge_sigma,
+    disparity_bend,
+    edge_risk,
+    judge_matches,
+    start_disagreement,
+)
+from barsight.stereo.direct.consistency import (
+    agrees_with,
+    drop_invalid,
+    hits_valid,
+    is_consistent,
+    remove_islands,
+)
 from barsight.stereo.direct.curvature import curvature_row
-from barsight.stereo.direct.depth_edges import _BESIDE_PX, _DISTANCE_PX, _GRAY, _RADIUS_PX, sharpen_edges
-from barsight.stereo.direct.disparity_update import blend_fits, fit_variance, update_disparity
+from barsight.stereo.direct.depth_edges import (
+    _BESIDE_PX,
+    _DISTANCE_PX,
+    _GRAY,
+    _RADIUS_PX,
+    mark_jumps,
+    sharpen_edges,
+)
+from barsight.stereo.direct.disparity_update import (
+    blend_fits,
+    complete_step,
+    fit_variance,
+    raise_noise,
+    update_disparity,
+)
 from barsight.stereo.direct.kernels.box_sums import (
     allocate_columns,
     mirror_index,
@@ -24,8 +50,8 @@ from barsight.stereo.direct.kernels.box_sums import (
     window_means,
 )
 from barsight.stereo.direct.kernels.cubic_spline import row_coefficients, row_slope, value_and_slope
-from barsight.stereo.direct.kernels.pyramid import halve, upsample_update
-from barsight.stereo.direct.occlusion_filling import fill_occlusions_by_planes
+from barsight.stereo.direct.kernels.pyramid import double_disparity, halve, upsample_update
+from barsight.stereo.direct.occlusion_filling import fill_occlusions_by_planes, fill_row_holes
 from barsight.stereo.direct.photometric_residuals import (
     noise_power,
     photometric_residual,
@@ -496,6 +522,97 @@ def test_disagreement_of_start_and_refinement_forgets_noise_and_holes() -> None:
     assert not start_disagreement(np.full_like(refined, np.nan), refined).any()
 
 
+def _with_holes(seed: int, ratio: float = 0.2) -> np.ndarray:
+    disparity = 20 + _noise(seed, 3.0)
+    disparity[np.random.default_rng(seed).random(disparity.shape) < ratio] = np.nan
+    return disparity
+
+
+def test_bends_at_the_border_are_of_the_mirrored_picture() -> None:
+    disparity = 20 + _noise(40, 0.3)
+    framed = np.pad(disparity, 3, mode="reflect")
+    inner = slice(3, -3)
+    along = np.abs(disparity - np.float32(0.5) * (framed[inner, :-6] + framed[inner, 6:]))
+    down = np.abs(disparity - np.float32(0.5) * (framed[:-6, inner] + framed[6:, inner]))
+    np.testing.assert_array_equal(disparity_bend(disparity, 0.5), np.maximum(along, down).clip(max=0.5))
+
+
+def test_jumps_are_what_the_greatest_and_least_of_nine_say() -> None:
+    disparity = _with_holes(41)
+    framed = np.pad(disparity, 1, constant_values=np.nan)
+    marked = mark_jumps(disparity, 4.0)
+    for y, x in np.ndindex(disparity.shape):
+        around = framed[y : y + 3, x : x + 3]
+        known = around[np.isfinite(around)]
+        assert marked[y, x] == (known.size > 0 and np.ptp(known) > 4)
+
+
+def test_sigma_sums_the_squares_of_all_doubts_and_far_or_unsure_matches_are_none() -> None:
+    start, refined = _with_holes(42), 20 + _noise(43, 3.0)
+    variance, bend, moved = (np.abs(_noise(seed, 0.3)) for seed in (44, 45, 46))
+    doubts = Doubts(*(np.float32(x) for x in (0.01, 0.3, 0.09, 2.0, 0.7)))
+    found, sigma = judge_matches(start, refined, variance, bend, moved, doubts)
+    wanted = np.sqrt(variance + 0.01 + 0.3 * np.maximum(bend**2 - variance, 0) + (0.09 * moved) ** 2)
+    kept = np.isfinite(start) & (np.abs(refined - start) < 2) & (wanted <= 0.7)
+    assert 0.05 < kept.mean() < 0.9
+    np.testing.assert_array_equal(found, np.where(kept, refined, np.nan))
+    np.testing.assert_allclose(sigma, np.where(kept, wanted, np.nan), rtol=1e-5)
+
+
+def test_edges_add_to_sigma_and_invalid_pixels_have_none() -> None:
+    before, beside, valid = _with_holes(47), np.abs(_noise(48, 0.3)), _noise(49) > -1
+    sharp, sigma = before + _noise(50, 0.1), np.where(np.isfinite(before), np.float32(0.1), np.nan)
+    wanted = np.where(valid, np.sqrt(sigma**2 + (sharp - before) ** 2 + (0.3 * beside) ** 2), np.nan)
+    kept = np.where(valid, sharp, np.nan)
+    add_edge_sigma(before, sharp, beside, 0.3, valid, sigma)
+    np.testing.assert_allclose(sigma, wanted, rtol=1e-5)
+    np.testing.assert_array_equal(sharp, kept)
+
+
+@pytest.mark.parametrize(("shape", "rows"), [((40, 70), 2), ((39, 69), 2), ((20, 69), 1)])
+def test_doubled_disparity_repeats_its_pixels(shape: tuple[int, int], rows: int) -> None:
+    small = _with_holes(51)[:20, :35]
+    wanted = 2 * small.repeat(rows, axis=0).repeat(2, axis=1)[: shape[0], : shape[1]]
+    np.testing.assert_array_equal(double_disparity(small, shape), wanted)
+
+
+def test_a_match_agrees_within_the_tolerance_inside_the_picture() -> None:
+    right = np.array([2, 3, np.nan, 5], dtype=np.float32)
+    asked = [(3, 2.0), (3, 2.5), (3, 3.0), (3, 4.0), (1, -1.0), (3, np.nan)]
+    found = [agrees_with(right, x, np.float32(px), np.float32(1)) for x, px in asked]
+    assert found == [True, True, True, False, False, False]
+
+
+def test_matches_of_invalid_pixels_are_dropped() -> None:
+    left_valid, right_valid, disparity = _noise(52) > -1, _noise(53) > -1, _with_holes(54)
+    kept = disparity.copy()
+    drop_invalid(left_valid, right_valid, kept)
+    for y, x in np.argwhere(np.isfinite(disparity)):
+        column = min(max(round(float(np.float32(x) - disparity[y, x])), 0), WIDTH - 1)
+        assert np.isfinite(kept[y, x]) == (left_valid[y, x] and right_valid[y, column])
+    assert np.isnan(kept[np.isnan(disparity)]).all()
+
+
+def test_a_step_that_falls_short_is_completed_and_noisier() -> None:
+    short_of, usable, moved = 1 + np.abs(_noise(55)), np.abs(_noise(56)), _noise(57, 0.1)
+    power, disparity = np.abs(_noise(58)), _frame(20 + _noise(59))
+    before = inside(disparity, power.shape).copy()
+    noisier = power * np.minimum(short_of, 1.5 - (short_of - 1.5) / 6)
+    raise_noise(short_of, power)
+    np.testing.assert_allclose(power, noisier, rtol=1e-5)
+    complete_step(moved, usable, short_of, disparity)
+    wanted = before + (short_of - 1) * moved / (usable + 1e-6)
+    np.testing.assert_allclose(inside(disparity, power.shape), wanted, rtol=1e-4)
+
+
+@pytest.mark.parametrize("ratio", [0.0, 0.3, 0.31, 0.995, 1.0])
+def test_rows_without_any_disparity_take_the_median_of_all(ratio: float) -> None:
+    disparity = _with_holes(60, ratio)
+    disparity[7] = np.nan
+    known = disparity[np.isfinite(disparity)]
+    assert (fill_row_holes(disparity)[7] == (np.median(known) if known.size else 0)).all()
+
+
 def test_only_jumps_between_known_neighbours_are_edges() -> None:
     disparity = np.full((HEIGHT, WIDTH), 5, dtype=np.float32)
     disparity[:, 40:] = 9
@@ -504,6 +621,7 @@ def test_only_jumps_between_known_neighbours_are_edges() -> None:
     assert (beside[:, 39:41] == 1).all() and (beside[:, 18:23] < 0.01).all()
     assert (other_side[:, 38:42] == 4).all() and not other_side[:, :37].any() and not other_side[:, 43:].any()
     np.testing.assert_allclose(beside[20, 43], np.exp(-1.0), rtol=0.05)
+    assert edge_risk(disparity, 1.0, other_side=False)[1] is None
 
 
 def test_windows_are_what_box_filters_say() -> None:

@@ -27,7 +27,7 @@ from barsight.recording.sensor_selection import SelectedSensors
 from barsight.stereo.direct.confirmation import confirmed_start
 from barsight.stereo.direct.pipeline import BarsightSettings, BarsightStereo
 from barsight.stereo.direct.semiglobal.cost import describe_pixels, descriptor_cost, reverse_rows, row_costs
-from barsight.stereo.prediction import predict_disparity
+from barsight.stereo.prediction import _without_gaps, predict_disparity
 from synthetic_scenes import Texture, quantised
 
 WIDTH, HEIGHT, FOCAL, BASELINE = 480, 352, 500.0, 0.5
@@ -195,6 +195,39 @@ def test_what_the_pictures_like_better_stays() -> None:
     for predicted, matched in ((right, wrong), (wrong, right)):
         start = confirmed_start(now.left, now.right, predicted, matched, nothing)
         assert np.mean(np.abs(start - right)[8:-8, 60:-8] < 0.5) > 0.95
+
+
+def test_start_is_the_prediction_where_nothing_speaks_against_it() -> None:
+    rng, shape, gray = np.random.default_rng(5), (40, 70), np.full((40, 70), 90, dtype=np.uint8)
+    matched = (30 + 0.2 * rng.standard_normal(shape)).astype(np.float32)
+    predicted = (matched + rng.uniform(-0.9, 0.9, shape)).astype(np.float32)
+    matched_right = (30 + 2 * rng.standard_normal(shape)).astype(np.float32)
+    matched[:, 50:][rng.random((40, 20)) < 0.3] = np.nan
+    predicted[rng.random(shape) < 0.2] = np.nan
+    start = confirmed_start(gray, gray, predicted, matched, matched_right)
+    for y, x in np.ndindex(shape):
+        one, other = predicted[y, x], matched[y, x]
+        around = matched[max(y - 4, 0) : y + 5, max(x - 4, 0) : x + 5]
+        wanted = other if np.ptp(around) <= 1 else np.nan  # a hole near by makes the span NaN
+        if np.isfinite(one) and np.isfinite(other):
+            wanted = one
+        elif np.isfinite(one):
+            column = round(float(np.float32(x) - one))
+            seen = 0 <= column < shape[1] and abs(matched_right[y, column] - one) <= 2
+            wanted = one if seen else np.nan
+        np.testing.assert_equal(start[y, x], np.float32(wanted))
+
+
+def test_gaps_between_moved_places_take_the_nearest_to_the_camera() -> None:
+    rng = np.random.default_rng(6)
+    first = (30 + rng.standard_normal((20, 30))).astype(np.float32)
+    first[rng.random(first.shape) < 0.7] = np.nan
+    framed, filled = np.pad(first, 1, constant_values=np.nan), _without_gaps(first)
+    for y, x in np.ndindex(first.shape):
+        around = framed[y : y + 3, x : x + 3]
+        known = around[np.isfinite(around)]
+        largest = known.max() if known.size else np.float32(np.nan)
+        np.testing.assert_equal(filled[y, x], first[y, x] if np.isfinite(first[y, x]) else largest)
 
 
 def test_a_pixel_costs_what_its_row_does() -> None:

@@ -15,6 +15,7 @@ from barsight.core.parallel import in_background
 from barsight.core.settings.values import expect_choice
 from barsight.evaluation.score import score_folder
 from barsight.map_building import ProgressCallback
+from barsight.mapping.surface.surface import read_tile
 from barsight.measure_settings import MeasureSettings
 from barsight.pipeline import LiftRequest, find_lifts, map_yard
 from barsight.recording.base import Recording
@@ -95,6 +96,7 @@ def write_measured(
         write_tables(measured, staging)
         write_results(measured, seal_map(content, staging), staging)
         shutil.rmtree(scratch)
+        read_tile.cache_clear()  # 60 MB of tiles that are gone
         if truth_of is not None:
             content["truth"] = score_folder(truth_of, staging)
         write_json(staging / "result.json", content)

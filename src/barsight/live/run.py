@@ -19,6 +19,7 @@ from barsight.core.compiling.ahead import compile_ahead, load_kernels
 from barsight.core.errors import ConfigError, InputError, MeasurementError, OutputError
 from barsight.core.files import expect_empty, lies_within, translated_os_errors
 from barsight.core.json_values import write_json
+from barsight.core.memory import trim_heap
 from barsight.core.notices import Notice
 from barsight.core.parallel import in_background
 from barsight.core.stamps import NS_PER_S
@@ -137,6 +138,7 @@ class LiveRun:
             ring.remove()
             board.remove()
             shutil.rmtree(folder, ignore_errors=True)
+            trim_heap()  # the command lives on, survey after survey
 
     def _tell_all(self, line: str) -> None:
         with (self._out / "live.log").open("a", encoding="utf-8") as file:

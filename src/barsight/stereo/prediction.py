@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from barsight.core.arrays import Float32, kernel
@@ -21,7 +20,6 @@ _MAX_SIGMA_PX = 0.5
 _SAME_SURFACE_PX = np.float32(1.0)
 _MAX_OFF_PX = np.float32(1.5)
 _BAND_ROWS = 64
-_NOWHERE = -1e6
 _NAN = np.float32(np.nan)
 
 
@@ -49,8 +47,7 @@ def predict_disparity(before: Disparity, camera: RectifiedCamera, now_from_befor
     there, back = _transfer(camera, now_from_before), _transfer(camera, now_from_before.inverse())
     first = np.full(known.shape, _NAN, dtype=np.float32)
     _splat(known, there, first)
-    spread = cv2.dilate(np.nan_to_num(first, nan=_NOWHERE), np.ones((3, 3), dtype=np.uint8))
-    first = np.where(np.isfinite(first), first, np.where(spread > _NOWHERE, spread, _NAN))
+    first = _without_gaps(first)
     predicted = np.empty_like(first)
 
     def work(start: int, end: int) -> None:
@@ -92,6 +89,28 @@ def _move_row(known: Float32, v: int, motion: _Transfer, moved: Float32) -> None
         along[u] = (r00 * x + x0 + s0 * q) * scale + motion.cx
         down[u] = (r10 * x + y0 + s1 * q) * scale + motion.cy
         near[u] = q * scale
+
+
+@kernel()
+def _without_gaps(first: Float32) -> Float32:
+    """Fill pixels (H, W) where nothing landed with the largest disparity of the eight around them."""
+    height, width = first.shape
+    filled = np.empty_like(first)
+    largest = np.full(width + 2, -np.inf, dtype=np.float32)
+    inner, none = largest[1:], np.float32(-np.inf)
+    for y in range(height):
+        above, here, below, found = first[max(y - 1, 0)], first[y], first[min(y + 1, height - 1)], filled[y]
+        # A NaN fails each comparison.
+        for x in range(width):
+            most = above[x] if above[x] > none else none
+            most = here[x] if here[x] > most else most
+            inner[x] = below[x] if below[x] > most else most
+        for x in range(width):
+            most = largest[x] if largest[x] > largest[x + 1] else largest[x + 1]
+            most = largest[x + 2] if largest[x + 2] > most else most
+            most = most if most > none else _NAN
+            found[x] = here[x] if here[x] == here[x] else most
+    return filled
 
 
 @kernel()

@@ -7,12 +7,16 @@ blur that differs) moves the match; what moves it up and down moves it left and 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 
-from barsight.core.arrays import Bool, Float32, UInt8
+from barsight.core.arrays import Bool, Float32, UInt8, kernel
 from barsight.core.linalg.robust import mad_sigma
-from barsight.stereo.direct.kernels.box_sums import window_means
+from barsight.core.parallel import parallel_bands
+from barsight.stereo.direct.depth_edges import mark_jumps
+from barsight.stereo.direct.kernels.box_sums import mirror_index, window_means
 from barsight.stereo.direct.kernels.cubic_spline import row_coefficients, value_and_slope
 
 _BLUR_PX = 0.7
@@ -32,6 +36,8 @@ _EDGE_REACH_PX = 3.0
 _FAR_PX = 1e4
 _OTHER_SIDE_PX = 4
 _UNSURE_SIDE_PX = 2.5
+_BAND_ROWS = 64
+_NAN = np.float32(np.nan)
 
 
 def vertical_error_px(left: UInt8, right: UInt8, disparity: Float32, matched: Bool) -> float:
@@ -59,12 +65,35 @@ def disparity_bend(disparity: Float32, widest_px: float) -> Float32:
 
     Zero on a plane. On a bend or an edge a match that sits one pixel beside its place errs by as much.
     """
-    framed = cv2.copyMakeBorder(disparity, _BEND_PX, _BEND_PX, _BEND_PX, _BEND_PX, cv2.BORDER_REFLECT_101)
-    side, inner = 2 * _BEND_PX, slice(_BEND_PX, -_BEND_PX)
-    along_row = np.abs(disparity - np.float32(0.5) * (framed[inner, :-side] + framed[inner, side:]))
-    along_column = np.abs(disparity - np.float32(0.5) * (framed[:-side, inner] + framed[side:, inner]))
-    bend: Float32 = np.minimum(np.maximum(along_row, along_column), np.float32(widest_px))
+    bend = np.empty_like(disparity)
+
+    def work(first: int, end: int) -> None:
+        _bends(disparity, np.float32(widest_px), bend, first, end)
+
+    parallel_bands(work, len(disparity), _BAND_ROWS)
     return bend
+
+
+@kernel()
+def _bends(disparity: Float32, widest: np.float32, bend: Float32, first: int, end: int) -> None:
+    """Compute bends (H, W) px of rows first...end, see `disparity_bend`, mirrored at the border."""
+    height, width = disparity.shape
+    half = np.float32(0.5)
+    framed = np.empty(width + 2 * _BEND_PX, dtype=np.float32)
+    for y in range(first, end):
+        here, found = disparity[y], bend[y]
+        above = disparity[mirror_index(y - _BEND_PX, height)]
+        below = disparity[mirror_index(y + _BEND_PX, height)]
+        framed[_BEND_PX : _BEND_PX + width] = here
+        for step in range(1, _BEND_PX + 1):
+            framed[_BEND_PX - step] = here[mirror_index(-step, width)]
+            framed[_BEND_PX + width - 1 + step] = here[mirror_index(width - 1 + step, width)]
+        before, after = framed[:width], framed[2 * _BEND_PX :]
+        for x in range(width):
+            along_row = abs(here[x] - half * (before[x] + after[x]))
+            along_column = abs(here[x] - half * (above[x] + below[x]))
+            larger = along_row if along_row > along_column else along_column
+            found[x] = larger if larger < widest else widest
 
 
 def start_disagreement(start: Float32, refined: Float32) -> Float32:
@@ -75,32 +104,128 @@ def start_disagreement(start: Float32, refined: Float32) -> Float32:
     over a whole window, noise isn't why, and either may be wrong.
     """
     side = (_START_WINDOW_PX, _START_WINDOW_PX)
-    known = np.isfinite(start)
-    moved = np.where(known, refined - start, np.float32(0))
-    share = cv2.boxFilter(known.astype(np.float32), -1, side)
-    disagreement: Float32 = np.abs(cv2.boxFilter(moved, -1, side)) / np.maximum(share, np.float32(1e-3))
-    return disagreement
+    moved, known = np.empty_like(refined), np.empty_like(refined)
+    _note_moves(start, refined, moved, known)
+    cv2.boxFilter(moved, -1, side, moved)
+    share = cv2.boxFilter(known, -1, side, known)
+    np.maximum(share, np.float32(1e-3), out=share)
+    np.abs(moved, out=moved)
+    np.divide(moved, share, out=moved)
+    return moved
 
 
-def edge_risk(disparity: Float32, jump_px: float, other_side: bool = True) -> tuple[Float32, Float32]:
+@kernel()
+def _note_moves(start: Float32, refined: Float32, moved: Float32, known: Float32) -> None:
+    """Note by how much (H, W) px refinement moved the start, and where it did: 1, or 0 for both."""
+    height, width = start.shape
+    zero, one = np.float32(0), np.float32(1)
+    for y in range(height):
+        begun, found, step, is_known = start[y], refined[y], moved[y], known[y]
+        for x in range(width):
+            step[x] = found[x] - begun[x] if begun[x] == begun[x] else zero
+        for x in range(width):
+            is_known[x] = one if begun[x] == begun[x] else zero
+
+
+class Doubts(NamedTuple):
+    """unexplained: px^2, of each pixel. edge, start: variance per squared bend and disagreement. furthest: px
+    from the start, sigma: px, from which on a match is none.
+    """
+
+    unexplained: np.float32
+    edge: np.float32
+    start: np.float32
+    furthest: np.float32
+    sigma: np.float32
+
+
+def judge_matches(
+    start: Float32, refined: Float32, variance: Float32, bend: Float32, disagreement: Float32, doubts: Doubts
+) -> tuple[Float32, Float32]:
+    """Combine noise, what noise doesn't explain, and what bends and two opinions cost: the disparity and its
+    sigma (H, W) px, NaN where the start is, and where the match is none. start: NaN where unmatched.
+    """
+    disparity, sigma = np.empty_like(refined), np.empty_like(refined)
+
+    def work(first: int, end: int) -> None:
+        _judge(start, refined, variance, (bend, disagreement), doubts, disparity, sigma, first, end)
+
+    parallel_bands(work, len(refined), _BAND_ROWS)
+    return disparity, sigma
+
+
+@kernel()
+def _judge(
+    start: Float32, refined: Float32, variance: Float32, opinions: tuple[Float32, Float32], doubts: Doubts,
+    disparity: Float32, sigma: Float32, first: int, end: int,
+) -> None:  # fmt: skip
+    """Judge rows first...end, see `judge_matches`; opinions: bend and disagreement (H, W) px. Fills disparity
+    and sigma (H, W) px.
+    """
+    zero = np.float32(0)
+    for y in range(first, end):
+        begun, found, noise, bent, moved = start[y], refined[y], variance[y], opinions[0][y], opinions[1][y]
+        kept, error = disparity[y], sigma[y]
+        for x in range(len(found)):
+            off = bent[x] * bent[x] - noise[x]
+            off = off if off > zero else zero
+            apart = doubts.start * moved[x]
+            error[x] = np.sqrt(noise[x] + doubts.unexplained + doubts.edge * off + apart * apart)
+        for x in range(len(found)):
+            # A NaN of the start fails the comparison.
+            is_match = (abs(found[x] - begun[x]) < doubts.furthest) & (error[x] <= doubts.sigma)
+            kept[x] = found[x] if is_match else _NAN
+            error[x] = error[x] if is_match else _NAN
+
+
+def edge_risk(disparity: Float32, jump_px: float, other_side: bool = True) -> tuple[Float32, Float32 | None]:
     """Estimate the risk at depth edges: two arrays (H, W) for pixels that may have been given to the wrong
     side of a jump of more than jump_px between neighbours: 1 on the jump, falling to 1 / e within 3 px; and
-    how far away (px) the other side lies within 4 px, zero further than 2.5 px from the jump, or everywhere
-    where that isn't asked for. NaN in `disparity` is no jump.
+    how far away (px) the other side lies within 4 px, zero further than 2.5 px from the jump, None where
+    that isn't asked for. NaN in `disparity` is no jump.
     """
+    distance = cv2.distanceTransform(mark_jumps(disparity, jump_px) ^ 1, cv2.DIST_L2, 5)
+    beside: Float32 = np.divide(distance, np.float32(-_EDGE_REACH_PX))
+    np.exp(beside, out=beside)
+    if not other_side:
+        return beside, None
     known = np.isfinite(disparity)
     for_highest = np.where(known, disparity, np.float32(-_FAR_PX))
     for_lowest = np.where(known, disparity, np.float32(_FAR_PX))
-    three = np.ones((3, 3), dtype=np.uint8)
-    level = (cv2.dilate(for_highest, three) - cv2.erode(for_lowest, three) <= jump_px).astype(np.uint8)
-    distance = cv2.distanceTransform(level, cv2.DIST_L2, 5)
-    beside: Float32 = np.exp(-distance / np.float32(_EDGE_REACH_PX))
-    if not other_side:
-        return beside, np.zeros_like(beside)
     window = np.ones((2 * _OTHER_SIDE_PX + 1,) * 2, dtype=np.uint8)
     away = np.maximum(cv2.dilate(for_highest, window) - disparity, disparity - cv2.erode(for_lowest, window))
     other: Float32 = np.where(known & (distance < _UNSURE_SIDE_PX) & (away > jump_px), away, np.float32(0))
     return beside, other
+
+
+def add_edge_sigma(
+    disparity: Float32, sharp: Float32, beside: Float32, wrong_side_px: float, valid: Bool, sigma: Float32
+) -> None:
+    """Add to sigma (H, W) px, in quadrature, what sharpening moved the disparity by, and wrong_side_px times
+    what lies `beside` an edge. Where it isn't valid, `sharp` and sigma become NaN.
+    """
+
+    def work(first: int, end: int) -> None:
+        _add_edge_sigma(disparity, sharp, beside, np.float32(wrong_side_px), valid, sigma, first, end)
+
+    parallel_bands(work, len(sharp), _BAND_ROWS)
+
+
+@kernel()
+def _add_edge_sigma(
+    disparity: Float32, sharp: Float32, beside: Float32, wrong_side: np.float32, valid: Bool, sigma: Float32,
+    first: int, end: int,
+) -> None:  # fmt: skip
+    """Add to sigma (H, W) px in rows first...end, see `add_edge_sigma`."""
+    for y in range(first, end):
+        blurred, moved, near, usable, error = disparity[y], sharp[y], beside[y], valid[y], sigma[y]
+        for x in range(len(error)):
+            step, risk = moved[x] - blurred[x], wrong_side * near[x]
+            both = np.sqrt(error[x] * error[x] + step * step)
+            both = np.sqrt(both * both + risk * risk)
+            error[x] = both if usable[x] else _NAN
+        for x in range(len(error)):
+            moved[x] = moved[x] if usable[x] else _NAN
 
 
 def _vertical_shifts(

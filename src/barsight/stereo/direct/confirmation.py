@@ -12,7 +12,7 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float32, UInt8, kernel
 from barsight.core.parallel import parallel_bands
-from barsight.stereo.direct.consistency import is_consistent
+from barsight.stereo.direct.consistency import agrees_with
 from barsight.stereo.direct.semiglobal.cost import (
     UNKNOWN_COST,
     PixelDescriptors,
@@ -39,22 +39,61 @@ def confirmed_start(
     one. Where the match has nothing, the prediction stays if the right picture's match agrees within 2 px.
     edge_rows: rows of the window in which an edge is looked for.
     """
-    differ = np.abs(predicted - matched)
-    disputed = differ >= _SAME_PX
+    disputed, known = np.empty(matched.shape, dtype=np.bool_), np.empty_like(matched)
+    _find_disputes(predicted, matched, disputed, known)
+    better = disputed
     if disputed.any():
-        disputed &= _fits_better(describe_pixels(left), describe_pixels(right), predicted, matched, disputed)
-    confirmed = (differ < _SAME_PX) | disputed
-    alone = np.isfinite(predicted) & ~np.isfinite(matched)
-    alone &= is_consistent(np.nan_to_num(predicted, nan=_FAR), matched_right, _CONSISTENT_PX)
-    return np.where(confirmed | alone, predicted, np.where(_is_edge(matched, edge_rows), _NAN, matched))
+        better = _fits_better(describe_pixels(left), describe_pixels(right), predicted, matched, disputed)
+    window = np.ones((edge_rows, EDGE_WINDOW_PX), dtype=np.uint8)
+    around, start = (cv2.dilate(known, window), cv2.erode(known, window)), np.empty_like(matched)
+
+    def merge(first: int, end: int) -> None:
+        _merge((predicted, matched, matched_right), better, around, start, first, end)
+
+    parallel_bands(merge, len(start), _BAND_ROWS)
+    return start
 
 
-def _is_edge(disparity: Float32, rows: int) -> Bool:
-    """Check (H, W) for a jump of more than 1 px, or a hole's border, within 4 px and so many rows."""
-    filled = np.nan_to_num(disparity, nan=_FAR)
-    window = np.ones((rows, EDGE_WINDOW_PX), dtype=np.uint8)
-    edge: Bool = cv2.dilate(filled, window) - cv2.erode(filled, window) > _SAME_PX
-    return edge
+@kernel()
+def _find_disputes(predicted: Float32, matched: Float32, disputed: Bool, known: Float32) -> None:
+    """Find the pixels (H, W) where both are known and differ by 1 px or more. Fills known (H, W) px: what is
+    matched, _FAR elsewhere.
+    """
+    height, width = matched.shape
+    far = np.float32(_FAR)
+    for y in range(height):
+        one, other, differ, filled = predicted[y], matched[y], disputed[y], known[y]
+        for x in range(width):
+            differ[x] = abs(one[x] - other[x]) >= _SAME_PX
+        for x in range(width):
+            filled[x] = other[x] if other[x] == other[x] else far
+
+
+@kernel()
+def _merge(
+    px: tuple[Float32, Float32, Float32], better: Bool, around: tuple[Float32, Float32], start: Float32,
+    first: int, end: int,
+) -> None:  # fmt: skip
+    """Merge prediction and match in rows first...end, see `confirmed_start`.
+
+    px: predicted, matched, and matched of the right picture. better: where the prediction costs less, if they
+    differ. around: the greatest and the least match near by, holes far off. Fills start (H, W) px.
+    """
+    predicted, matched, matched_right = px
+    highest, lowest = around
+    tolerance = np.float32(_CONSISTENT_PX)
+    for y in range(first, end):
+        seen = matched_right[y]
+        for x in range(start.shape[1]):
+            one, other = predicted[y, x], matched[y, x]
+            if np.isnan(other):
+                stays = agrees_with(seen, x, one, tolerance)
+            else:
+                stays = abs(one - other) < _SAME_PX or (abs(one - other) >= _SAME_PX and better[y, x])
+            if stays:
+                start[y, x] = one
+            else:
+                start[y, x] = _NAN if highest[y, x] - lowest[y, x] > _SAME_PX else other
 
 
 def _fits_better(

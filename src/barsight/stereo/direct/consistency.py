@@ -38,10 +38,19 @@ def _agree(left_px: Float32, right_px: Float32, tolerance: np.float32, same: Boo
     """
     height, width = left_px.shape
     for y in range(height):
+        seen = right_px[y]
         for x in range(width):
-            column = np.int32(np.rint(np.float32(x) - left_px[y, x]))
-            is_inside = column >= 0 and column < width
-            same[y, x] = is_inside and abs(right_px[y, column] - left_px[y, x]) <= tolerance
+            same[y, x] = agrees_with(seen, x, left_px[y, x], tolerance)
+
+
+@kernel(inline=True)
+def agrees_with(right_px: Float32, x: int, disparity: np.float32, tolerance: np.float32) -> bool:
+    """Check that the right picture's disparity (W,) px at the match of column x is the same."""
+    column = np.int32(np.rint(np.float32(x) - disparity))
+    is_inside = (column >= 0) & (column < len(right_px))
+    # Without a branch, which would be guessed wrong as often as pictures disagree.
+    seen = right_px[np.uint64(column if is_inside else 0)]
+    return bool(is_inside & (abs(seen - disparity) <= tolerance))
 
 
 @kernel()
@@ -55,6 +64,20 @@ def _land(valid: Bool, disparity: Float32, landed: Bool) -> None:
         for x in range(width):
             column = np.int32(np.rint(np.float32(x) - disparity[y, x]))
             landed[y, x] = valid[y, min(max(column, 0), width - 1)]
+
+
+@kernel()
+def drop_invalid(left_valid: Bool, right_valid: Bool, disparity: Float32) -> None:
+    """Drop disparities (H, W) px, to NaN, at invalid pixels and where the match isn't valid, in place."""
+    height, width = disparity.shape
+    for y in range(height):
+        for x in range(width):
+            here = disparity[y, x]
+            if np.isnan(here):
+                continue
+            column = np.int32(np.rint(np.float32(x) - here))
+            if not (left_valid[y, x] and right_valid[y, min(max(column, 0), width - 1)]):
+                disparity[y, x] = np.float32(np.nan)
 
 
 def remove_islands(disparity: Float32, min_size_px: int, step_px: float) -> Float32:

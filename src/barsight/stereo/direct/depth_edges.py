@@ -20,7 +20,7 @@ _UNKNOWN = 1e30
 _GRAY = 10.0
 _DISTANCE_PX = 4.0
 _BESIDE_PX = 3
-_LOWEST = -1e4
+_FAR = 1e4
 _EXACT_PX = 0.02
 _BAND_ROWS = 32
 
@@ -47,14 +47,51 @@ def sharpen_edges(disparity: Float32, gray: UInt8, jump_px: float) -> Float32:
 
 
 def _beside_jumps(disparity: Float32, jump_px: float) -> Bool:
-    three = np.ones((3, 3), dtype=np.uint8)
-    known = np.isfinite(disparity)
-    highest = cv2.dilate(np.where(known, disparity, np.float32(_LOWEST)), three)
-    lowest = cv2.erode(np.where(known, disparity, np.float32(-_LOWEST)), three)
     side = 2 * _BESIDE_PX + 1
-    jumps = (highest - lowest > jump_px).astype(np.uint8)
-    beside: Bool = known & (cv2.dilate(jumps, np.ones((side, side), dtype=np.uint8)) > 0)
+    near = cv2.dilate(mark_jumps(disparity, jump_px), np.ones((side, side), dtype=np.uint8))
+    beside: Bool = np.isfinite(disparity) & near.view(np.bool_)
     return beside
+
+
+def mark_jumps(disparity: Float32, jump_px: float) -> UInt8:
+    """Mark (1, else 0) the pixels (H, W) around which, within 1 px, known disparities differ by more than
+    jump_px. NaN is no jump.
+    """
+    jumps = np.empty(disparity.shape, dtype=np.uint8)
+
+    def work(first: int, end: int) -> None:
+        _mark_jumps(disparity, np.float32(jump_px), jumps, first, end)
+
+    parallel_bands(work, len(disparity), _BAND_ROWS)
+    return jumps
+
+
+@kernel()
+def _mark_jumps(disparity: Float32, jump: np.float32, jumps: UInt8, first: int, end: int) -> None:
+    """Mark jumps (H, W) of rows first...end, see `mark_jumps`."""
+    height, width = disparity.shape
+    highest, lowest = np.empty((2, width + 2), dtype=np.float32)
+    low, high = np.float32(-_FAR), np.float32(_FAR)
+    highest[:], lowest[:] = low, high
+    inner_highest, inner_lowest = highest[1:], lowest[1:]
+    for y in range(first, end):
+        one, two, three = disparity[max(y - 1, 0)], disparity[y], disparity[min(y + 1, height - 1)]
+        marked = jumps[y]
+        # A NaN fails each comparison.
+        for x in range(width):
+            most = one[x] if one[x] > low else low
+            most = two[x] if two[x] > most else most
+            inner_highest[x] = three[x] if three[x] > most else most
+        for x in range(width):
+            least = one[x] if one[x] < high else high
+            least = two[x] if two[x] < least else least
+            inner_lowest[x] = three[x] if three[x] < least else least
+        for x in range(width):
+            most = highest[x] if highest[x] > highest[x + 1] else highest[x + 1]
+            most = highest[x + 2] if highest[x + 2] > most else most
+            least = lowest[x] if lowest[x] < lowest[x + 1] else lowest[x + 1]
+            least = lowest[x + 2] if lowest[x + 2] < least else least
+            marked[x] = np.uint8(most - least > jump)
 
 
 def _falling(v: Vectors, gap: Any) -> Any:

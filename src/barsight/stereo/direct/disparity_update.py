@@ -28,6 +28,10 @@ _SUPPORT = np.float32(0.5 * 1.87)
 cost: measured on rendered planes. What noise in the slopes costs grows with what a step falls short of."""
 _MIN_INFORMATION = np.float32(0.5)
 
+_MAX_NOISIER, _DAMPED = np.float32(1.5), np.float32(6)
+"""What steps fall short of counts as noise up to here, measured on rendered planes. Beyond, a sixth of it is
+taken off again, measured on rendered bars: a step that is short by half damps its own noise."""
+
 Fit = tuple[Float32, Float32]
 """A fitted disparity and its information, (H, W)."""
 
@@ -109,6 +113,32 @@ def _blend(
             other = _SUPPORT * noise[x] / max(long_certain[x], _MIN_INFORMATION)
             gap, share = near[x] - far[x], one - mean[x]
             unsure[x] = other + share * (own - other) + share * mean[x] * gap * gap
+
+
+@kernel()
+def raise_noise(short_of: Float32, power: Float32) -> None:
+    """Raise the noise power (H, W) by what steps fall short of (H, W), 1 or more, in place."""
+    height, width = power.shape
+    for y in range(height):
+        short, noise = short_of[y], power[y]
+        for x in range(width):
+            damped = _MAX_NOISIER - (short[x] - _MAX_NOISIER) / _DAMPED
+            noise[x] *= short[x] if short[x] < damped else damped
+
+
+@kernel()
+def complete_step(moved: Float32, usable: Float32, short_of: Float32, disparity: Float32) -> None:
+    """Complete a step that fell short: the disparity (a frame, px, in place) by what it moved in the mean.
+
+    moved, usable: (H, W) means over windows, of what is usable. short_of: (H, W), 1 or more.
+    """
+    height, width = moved.shape
+    one, tiny = np.float32(1), np.float32(1e-6)
+    for y in range(height):
+        mean, share, short = moved[y], usable[y], short_of[y]
+        here = disparity[y + MARGIN, MARGIN : MARGIN + width]
+        for x in range(width):
+            here[x] += (short[x] - one) * mean[x] / (share[x] + tiny)
 
 
 def update_disparity(fitted: Float32, axes: Float32, disparity: Float32, variance: Float32) -> None:

@@ -14,11 +14,19 @@ import numpy as np
 from barsight.core.arrays import Float32, UInt8
 from barsight.core.settings.values import NOT_NEGATIVE, POSITIVE, expect_ranges
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
-from barsight.stereo.direct.confidence import disparity_bend, edge_risk, start_disagreement, vertical_error_px
+from barsight.stereo.direct.confidence import (
+    Doubts,
+    add_edge_sigma,
+    disparity_bend,
+    edge_risk,
+    judge_matches,
+    start_disagreement,
+    vertical_error_px,
+)
 from barsight.stereo.direct.confirmation import EDGE_WINDOW_PX, confirmed_start
-from barsight.stereo.direct.consistency import hits_valid, is_consistent, remove_islands
+from barsight.stereo.direct.consistency import drop_invalid, hits_valid, is_consistent, remove_islands
 from barsight.stereo.direct.depth_edges import sharpen_edges
-from barsight.stereo.direct.kernels.pyramid import halve
+from barsight.stereo.direct.kernels.pyramid import double_disparity, halve
 from barsight.stereo.direct.occlusion_filling import fill_occlusions_by_planes, fill_row_holes
 from barsight.stereo.direct.refinement import (
     RefinedDisparity,
@@ -180,8 +188,9 @@ class _Matching:
         started = confirmed_start(pair.left, pair.right, predicted, own_px, own.right_px, rows)
         started = np.where(pair.left_valid, started, _NAN)
         refined = self._refined(pair, started, replace(refinement, steps=1))
-        moved = np.abs(refined.disparity_px - started)[np.isfinite(started)] > _FAR_STEP_PX
-        if moved.size and moved.mean() > _MAX_FAR_RATIO:
+        moved = np.subtract(refined.disparity_px, started)
+        far = np.count_nonzero(np.abs(moved, out=moved) > _FAR_STEP_PX)
+        if far > _MAX_FAR_RATIO * np.count_nonzero(np.isfinite(started)):
             refined = self._refined(pair, started, refinement)
         return self._finish(pair, candidates, _Start(started, own.right_px), refined)
 
@@ -195,39 +204,37 @@ class _Matching:
         self, pair: RectifiedPair, candidates: DisparityRange, start: _Start, refined: RefinedDisparity
     ) -> Disparity:
         """Judge a refined start: its sigma, occlusions, edges."""
-        settings, matched = self.settings, np.isfinite(start.left_px)
-        sigma = self._sigma(pair, refined, start.left_px)
-        kept = matched & (np.abs(refined.disparity_px - start.left_px) < _FURTHEST_FROM_START_PX)
-        if not settings.fill_occlusions:
-            kept &= sigma <= settings.max_sigma_px
-        disparity, sigma = np.where(kept, refined.disparity_px, _NAN), np.where(kept, sigma, _NAN)
+        settings = self.settings
+        disparity, sigma = self._judged(pair, refined, start.left_px)
         if settings.fill_occlusions:
             limits = float(candidates.lowest_px), float(candidates.highest_px)
             disparity, guessed = fill_occlusions_by_planes(disparity, pair.left, start.right_px, *limits)
             sigma = np.where(np.isfinite(guessed), guessed, sigma)
+        sharp = disparity
         if settings.preset == "best":
-            disparity, sigma = _with_sharp_edges(disparity, sigma, pair)
-        beside, other_side = edge_risk(disparity, _JUMP_PX, settings.other_side_error_ratio > 0)
-        sigma = _both(sigma, np.float32(settings.wrong_side_px) * beside)
-        sigma = _both(sigma, np.float32(settings.other_side_error_ratio) * other_side)
-        disparity, sigma = np.where(pair.left_valid, disparity, _NAN), np.where(pair.left_valid, sigma, _NAN)
-        return Disparity(disparity.astype(np.float32), sigma.astype(np.float32))
+            sharp = sharpen_edges(disparity, pair.left, _JUMP_PX)
+        beside, other_side = edge_risk(sharp, _JUMP_PX, settings.other_side_error_ratio > 0)
+        # What a pixel was moved by counts as one sigma more.
+        add_edge_sigma(disparity, sharp, beside, settings.wrong_side_px, pair.left_valid, sigma)
+        if other_side is not None:
+            sigma = _both(sigma, np.float32(settings.other_side_error_ratio) * other_side)
+        return Disparity(sharp, sigma)
 
-    def _sigma(self, pair: RectifiedPair, refined: RefinedDisparity, start_px: Float32) -> Float32:
-        """Combine noise, what noise doesn't explain, and what a bend costs. start_px: NaN where unmatched."""
-        settings = self.settings
-        matched = np.isfinite(start_px)
-        vertical_px = vertical_error_px(pair.left, pair.right, refined.disparity_px, matched)
-        unexplained = settings.model_sigma_px**2 + (settings.vertical_error_ratio * vertical_px) ** 2
-        bend = disparity_bend(refined.disparity_px, settings.max_edge_px)
-        bent = np.maximum(bend * bend - refined.variance_px2, 0)
-        variance = (
-            refined.variance_px2 + np.float32(unexplained) + np.float32(settings.edge_error_ratio**2) * bent
+    def _judged(
+        self, pair: RectifiedPair, refined: RefinedDisparity, start_px: Float32
+    ) -> tuple[Float32, Float32]:
+        """Judge what was refined from a start, NaN where unmatched: the disparity and its sigma."""
+        settings, found = self.settings, refined.disparity_px
+        vertical_px = vertical_error_px(pair.left, pair.right, found, np.isfinite(start_px))
+        doubts = Doubts(
+            np.float32(settings.model_sigma_px**2 + (settings.vertical_error_ratio * vertical_px) ** 2),
+            np.float32(settings.edge_error_ratio**2),
+            np.float32(settings.start_error_ratio),
+            np.float32(_FURTHEST_FROM_START_PX),
+            np.float32(np.inf if settings.fill_occlusions else settings.max_sigma_px),
         )
-        moved = settings.start_error_ratio * start_disagreement(start_px, refined.disparity_px)
-        variance += np.square(moved, dtype=np.float32)
-        sigma: Float32 = np.sqrt(variance, dtype=np.float32)
-        return sigma
+        bend, disagreement = disparity_bend(found, settings.max_edge_px), start_disagreement(start_px, found)
+        return judge_matches(start_px, found, refined.variance_px2, bend, disagreement, doubts)
 
     def _start(self, pair: RectifiedPair, candidates: DisparityRange) -> _Start:
         settings = self.settings
@@ -251,17 +258,10 @@ class _Matching:
         )
         believed = is_consistent(found.left_px, found.right_px, settings.consistency_px)
         left_px = np.where(believed, found.left_px, _NAN)
-        left_px = _doubled(remove_islands(left_px, settings.island_px // 4, 1.0), shape)
-        believed = pair.left_valid & np.isfinite(left_px)
-        believed &= hits_valid(pair.right_valid, np.where(believed, left_px, np.float32(0)))
-        return _Start(np.where(believed, left_px, _NAN), _doubled(found.right_px, shape))
-
-
-def _doubled(disparity: Float32, shape: tuple[int, ...]) -> Float32:
-    """Repeat each column, and each row where there are half as many."""
-    taller = disparity if len(disparity) == shape[0] else disparity.repeat(2, axis=0)
-    doubled: Float32 = 2 * taller.repeat(2, axis=1)[: shape[0], : shape[1]]
-    return np.ascontiguousarray(doubled)
+        small = remove_islands(left_px, settings.island_px // 4, 1.0)
+        left_px, right_px = double_disparity(small, shape), double_disparity(found.right_px, shape)
+        drop_invalid(pair.left_valid, pair.right_valid, left_px)
+        return _Start(left_px, right_px)
 
 
 def _contrast(image: UInt8) -> float:
@@ -278,9 +278,3 @@ def _both(one: Float32, other: Float32) -> Float32:
     """Add two sigmas in quadrature. NumPy's hypot, which minds overflow, takes several times as long."""
     together: Float32 = np.sqrt(one * one + other * other)
     return together
-
-
-def _with_sharp_edges(disparity: Float32, sigma: Float32, pair: RectifiedPair) -> tuple[Float32, Float32]:
-    """Sharpen edges; what a pixel was moved by counts as one sigma more."""
-    sharp = sharpen_edges(disparity, pair.left, _JUMP_PX)
-    return sharp, _both(sigma, sharp - disparity)

@@ -96,7 +96,7 @@ def fit_planes(
     for only_between in (False, True):
 
         def gather(first: int, end: int, between: bool = only_between) -> None:
-            _gather(heard, axes, pairs, step, between, fitted, information, first, end)
+            _gather(heard, axes, pairs, between, fitted, information, first, end)
 
         parallel_bands(gather, len(axes), BAND_TILES)
     if unit != 1:
@@ -222,19 +222,20 @@ def _sum_near(
     height, width = shape
     framed_width = evidence.disparity.shape[1]
     flat = _flat(evidence)
-    offsets = np.empty(len(near), dtype=np.int64)
+    offsets = np.empty((axes.shape[1], len(near)), dtype=np.int64)
     weight_sums, pull_sums = sums[0].reshape(-1), sums[1].reshape(-1)
     found = np.empty(2 * _LANES, dtype=np.float32)
-    for tile_x in range(axes.shape[1]):
-        for tile_y in range(first_tile, end_tile):
+    for tile_y in range(first_tile, end_tile):
+        for tile_x in range(axes.shape[1]):
             axis_x, axis_y = axes[tile_y, tile_x, 0], axes[tile_y, tile_x, 1]
             for j in range(len(near)):
-                offsets[j] = round(near[j] * axis_y) * framed_width + round(near[j] * axis_x)
-            x0 = tile_x * TILE_COLUMNS
-            count = min(TILE_COLUMNS, width - x0)
-            for y in range(tile_y * TILE_ROWS, min(height, tile_y * TILE_ROWS + TILE_ROWS)):
+                offsets[tile_x, j] = round(near[j] * axis_y) * framed_width + round(near[j] * axis_x)
+        for y in range(tile_y * TILE_ROWS, min(height, tile_y * TILE_ROWS + TILE_ROWS)):
+            for tile_x in range(axes.shape[1]):
+                x0 = tile_x * TILE_COLUMNS
+                count = min(TILE_COLUMNS, width - x0)
                 middle = (y + MARGIN) * framed_width + x0 + MARGIN
-                _add_near(flat, middle, offsets, found)
+                _add_near(flat, middle, offsets[tile_x], found)
                 for i in range(count, _LANES):
                     found[i] = found[_LANES + i] = 0
                 at = np.uint64(middle)
@@ -272,46 +273,36 @@ def _fit_lanes(
 
 @kernel()
 def _gather(
-    evidence: Evidence, axes: Float32, pairs: _Pairs, step: int, only_between: bool, fitted: Float32,
+    evidence: Evidence, axes: Float32, pairs: _Pairs, only_between: bool, fitted: Float32,
     information: Float32, first_tile: int, end_tile: int,
 ) -> None:  # fmt: skip
     """Fit each pixel's plane in tile rows first_tile...end_tile, see `fit_planes`: where the axis is a
     column's one row of FITTED_EVERY, or the rows between these.
 
     evidence: frames, disparity and pull in units of same_surface_px. axes: (tile rows, tile columns, 2).
-    step: the support's, in which rows are taken too. Fills fitted (in the same units) and information, both
-    (H, W).
+    Fills fitted (in the same units) and information, both (H, W).
     """
     height, width = fitted.shape
     framed_width = evidence.disparity.shape[1]
     flat = _flat(evidence)
     sums, part = np.empty(11 * _LANES, dtype=np.float32), np.empty(_LANES, dtype=np.float32)
-    offsets = np.empty(len(pairs.along), dtype=np.int64)
-    for tile_x in range(axes.shape[1]):
-        x0 = tile_x * TILE_COLUMNS
-        lanes = slice(x0, min(width, x0 + TILE_COLUMNS))
-        for tile_y in range(first_tile, end_tile):
-            axis = axes[tile_y, tile_x]
-            is_column = is_along_column(axis)
-            if only_between and not is_column:
-                continue
-            for j in range(len(offsets)):
-                a, c = pairs.along[j], pairs.across[j]
-                down, right = a * axis[1] + c * axis[0], a * axis[0] - c * axis[1]
-                offsets[j] = round(down) * framed_width + round(right)
-            # Rows a step apart have most of their supports' rows in common: those stay in the nearest cache.
-            first_row, end_row = tile_y * TILE_ROWS, min(height, tile_y * TILE_ROWS + TILE_ROWS)
-            for turn in range(step):
-                for y in range(first_row + turn, end_row, step):
-                    above, below = fitted_rows(y, height)
-                    is_between = is_column and above != y and below != y
-                    if only_between != is_between:
-                        continue
-                    row, row_information = fitted[y, lanes], information[y, lanes]
-                    if is_between and share_rows(evidence.disparity, y, x0, height, _SAME_PLANE, part):
-                        blend_rows(fitted[above, lanes], fitted[below, lanes], part, row)
-                        certain = information[above, lanes], information[below, lanes]
-                        blend_rows(certain[0], certain[1], part, row_information)
-                        continue
-                    middle = (y + MARGIN) * framed_width + x0 + MARGIN
-                    _fit_lanes(flat, middle, offsets, pairs.factors, sums, row, row_information)
+    offsets = np.empty((axes.shape[1], len(pairs.along)), dtype=np.int64)
+    for tile_y in range(first_tile, end_tile):
+        for tile_x in range(axes.shape[1]):
+            _place_pairs(axes[tile_y, tile_x], pairs, framed_width, offsets[tile_x])
+        for y in range(tile_y * TILE_ROWS, min(height, tile_y * TILE_ROWS + TILE_ROWS)):
+            above, below = fitted_rows(y, height)
+            for tile_x in range(axes.shape[1]):
+                is_between = above != y and below != y and is_along_column(axes[tile_y, tile_x])
+                if only_between != is_between:
+                    continue
+                x0 = tile_x * TILE_COLUMNS
+                lanes = slice(x0, min(width, x0 + TILE_COLUMNS))
+                row, row_information = fitted[y, lanes], information[y, lanes]
+                if is_between and share_rows(evidence.disparity, y, x0, height, _SAME_PLANE, part):
+                    blend_rows(fitted[above, lanes], fitted[below, lanes], part, row)
+                    certain = information[above, lanes], information[below, lanes]
+                    blend_rows(certain[0], certain[1], part, row_information)
+                    continue
+                middle = (y + MARGIN) * framed_width + x0 + MARGIN
+                _fit_lanes(flat, middle, offsets[tile_x], pairs.factors, sums, row, row_information)

@@ -24,7 +24,14 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float32, UInt8
 from barsight.core.errors import ConfigError
-from barsight.stereo.direct.disparity_update import Fit, blend_fits, fit_variance, update_disparity
+from barsight.stereo.direct.disparity_update import (
+    Fit,
+    blend_fits,
+    complete_step,
+    fit_variance,
+    raise_noise,
+    update_disparity,
+)
 from barsight.stereo.direct.kernels.cubic_spline import row_coefficients, row_slope, value_and_slope
 from barsight.stereo.direct.kernels.pyramid import halve, upsample_update
 from barsight.stereo.direct.photometric_residuals import (
@@ -53,9 +60,6 @@ _MIN_HALVED_PX = 128
 _ALIKE_BLUR_PX = 1.5
 _HOLD = 0.1
 _HOLD_UNMATCHED = 0.02
-_MAX_NOISIER, _DAMPED = np.float32(1.5), np.float32(6)
-"""What steps fall short of counts as noise up to here, measured on rendered planes. Beyond, a sixth of it is
-taken off again, measured on rendered bars: a step that is short by half damps its own noise."""
 
 
 @dataclass(frozen=True)
@@ -189,7 +193,7 @@ class _Work:
         shape, side = self.usable.shape, self.settings.window_px
         short_of, mean_weight = self.pulls(left, right, blur_px, slope_noise, is_last)
         power = noise_power(self.pull, self.usable, self.mean_usable, mean_weight, _HOLD, side)
-        power *= np.minimum(short_of, _MAX_NOISIER - (short_of - _MAX_NOISIER) / _DAMPED)
+        raise_noise(short_of, power)
         fitted, variance = self._fit(power)
         before = inside(self.disparity, shape).copy()
         update_disparity(fitted, self.axes, self.disparity, variance)
@@ -208,10 +212,12 @@ class _Work:
         left_gray = cv2.GaussianBlur(left.astype(np.float32), (0, 0), blur_px)
         warped, right_slope = value_and_slope(row_coefficients(right, blur_px), self.disparity, MARGIN)
         slope = inside(self.slope, shape)
-        slope[:] = row_slope(left, blur_px)
-        if not is_last:
-            slope += right_slope
-            slope *= np.float32(0.5)
+        left_slope = row_slope(left, blur_px)
+        if is_last:
+            slope[:] = left_slope
+        else:
+            left_slope += right_slope
+            np.multiply(left_slope, np.float32(0.5), out=slope)
             slope_noise *= 0.5
         side = settings.window_px
         photometric_residual(
@@ -231,18 +237,20 @@ class _Work:
         whole, while each pixel's own rest is mostly noise.
         """
         now, side = inside(self.disparity, before.shape), self.settings.window_px
-        moved = cv2.boxFilter(self.usable * (now - before), -1, (side, side))
-        now += (short_of - 1) * moved / (self.mean_usable + np.float32(1e-6))
+        np.subtract(now, before, out=before)
+        before *= self.usable
+        complete_step(cv2.boxFilter(before, -1, (side, side)), self.mean_usable, short_of, self.disparity)
 
     def _along(self, gray: Float32) -> tuple[Float32, Float32]:
         """Average residual and slope along the axis, (H, W)."""
         settings, shape = self.settings, gray.shape
-        means = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
-        if settings.gloss_px > 0:
-            blurred = cv2.GaussianBlur(gray, (0, 0), _ALIKE_BLUR_PX)
-            np.multiply(blurred, np.float32(1 / settings.alike_gray), out=inside(self.alike, shape))
-            images = self.residual, self.slope, self.trust, self.alike
-            axis_means(*images, self.axes, settings.gloss_px, means)
+        if settings.gloss_px == 0:
+            return np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
+        means = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
+        blurred = cv2.GaussianBlur(gray, (0, 0), _ALIKE_BLUR_PX)
+        np.multiply(blurred, np.float32(1 / settings.alike_gray), out=inside(self.alike, shape))
+        images = self.residual, self.slope, self.trust, self.alike
+        axis_means(*images, self.axes, settings.gloss_px, means)
         return means
 
     def _fit(self, power: Float32) -> tuple[Float32, Float32]:

@@ -20,7 +20,7 @@ TILE_COLUMNS = 32
 MARGIN = 48
 _LINE_FLOATS = 16
 BAND_TILES = 16
-"""Rows of tiles that are worked through column by column: what their supports read fits into the cache."""
+"""Rows of tiles that a thread works through row by row: what lies along a row comes in before it is read."""
 _MIN_COHERENCE = 0.35
 FITTED_EVERY = 4
 """Where a tile's axis is a column's, supports are worked out for one row of so many, a divisor of TILE_ROWS,
@@ -205,16 +205,18 @@ def _axis_means(
         images.alike.reshape(-1),
     )
     sums = np.empty(3 * TILE_COLUMNS, dtype=np.float32)
-    offsets = np.empty(len(steps), dtype=np.int64)
-    for tile_x in range(axes.shape[1]):
-        for tile_y in range(first_tile, end_tile):
+    offsets = np.empty((axes.shape[1], len(steps)), dtype=np.int64)
+    for tile_y in range(first_tile, end_tile):
+        for tile_x in range(axes.shape[1]):
             axis_x, axis_y = axes[tile_y, tile_x, 0], axes[tile_y, tile_x, 1]
             for j in range(len(steps)):
-                offsets[j] = round(steps[j] * axis_y) * framed_width + round(steps[j] * axis_x)
-            x0 = tile_x * TILE_COLUMNS
-            count = min(TILE_COLUMNS, width - x0)
-            for y in range(tile_y * TILE_ROWS, min(height, tile_y * TILE_ROWS + TILE_ROWS)):
-                _take_means(flat, (y + MARGIN) * framed_width + x0 + MARGIN, offsets, shares, sums)
+                offsets[tile_x, j] = round(steps[j] * axis_y) * framed_width + round(steps[j] * axis_x)
+        for y in range(tile_y * TILE_ROWS, min(height, tile_y * TILE_ROWS + TILE_ROWS)):
+            for tile_x in range(axes.shape[1]):
+                x0 = tile_x * TILE_COLUMNS
+                count = min(TILE_COLUMNS, width - x0)
+                middle = (y + MARGIN) * framed_width + x0 + MARGIN
+                _take_means(flat, middle, offsets[tile_x], shares, sums)
                 for i in range(count):
                     first_mean[y, x0 + i] = sums[TILE_COLUMNS + i]
                 for i in range(count):

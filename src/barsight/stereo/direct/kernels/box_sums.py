@@ -51,8 +51,9 @@ def roll_sum(column: Float64, reach: int, ahead: Float32, behind: Float32) -> No
     column: (W + 2 reach + 2,), a row of `allocate_columns`, of which column[reach : reach + W] changes.
     ahead, behind: (W,).
     """
+    inner = column[reach : reach + ahead.shape[0]]
     for x in range(ahead.shape[0]):
-        column[reach + x] += np.float64(ahead[x]) - np.float64(behind[x])
+        inner[x] += np.float64(ahead[x]) - np.float64(behind[x])
 
 
 @kernel()
@@ -60,8 +61,9 @@ def roll_product(
     column: Float64, reach: int, ahead: Float32, ahead_other: Float32, behind: Float32, behind_other: Float32
 ) -> None:
     """Roll the sum of products: a row of each comes in, one of each goes. All as in `roll_sum`, rows (W,)."""
+    inner = column[reach : reach + ahead.shape[0]]
     for x in range(ahead.shape[0]):
-        column[reach + x] += np.float64(ahead[x] * ahead_other[x]) - np.float64(behind[x] * behind_other[x])
+        inner[x] += np.float64(ahead[x] * ahead_other[x]) - np.float64(behind[x] * behind_other[x])
 
 
 @kernel()
@@ -69,9 +71,10 @@ def roll_square(
     column: Float64, reach: int, ahead: Float32, ahead_other: Float32, behind: Float32, behind_other: Float32
 ) -> None:
     """Roll the sum of the first times the square of the other. All as in `roll_sum`, rows (W,)."""
+    inner = column[reach : reach + ahead.shape[0]]
     for x in range(ahead.shape[0]):
         coming = ahead[x] * ahead_other[x] * ahead_other[x]
-        column[reach + x] += np.float64(coming) - np.float64(behind[x] * behind_other[x] * behind_other[x])
+        inner[x] += np.float64(coming) - np.float64(behind[x] * behind_other[x] * behind_other[x])
 
 
 @kernel()
@@ -85,7 +88,14 @@ def _add_columns(column: Float64, threes: Float32, side: int, mean: Float32) -> 
     for x in range(threes.shape[0]):
         threes[x] = np.float32(one[x] + two[x] + three[x])
     mean[:] = 0
-    for step in range(0, 3 * count, 3):
+    done = 0
+    for _ in range(count // 3):
+        # Three at once, in the same order: the mean is written a third as often.
+        ahead = threes[done : done + width + 6]
+        for x in range(width):
+            mean[x] = mean[x] + ahead[x] + ahead[x + 3] + ahead[x + 6]
+        done += 9
+    for step in range(done, 3 * count, 3):
         ahead = threes[step : step + width]
         for x in range(width):
             mean[x] += ahead[x]

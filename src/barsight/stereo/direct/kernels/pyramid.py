@@ -25,6 +25,31 @@ def halve(image: Image, *, rows: bool = True, columns: bool = True) -> Image:
     return cast(Image, cv2.resize(framed, size, interpolation=cv2.INTER_AREA))
 
 
+def double_disparity(small: Float32, shape: tuple[int, ...]) -> Float32:
+    """Repeat each column, and each row where there are half as many, up to a shape (H, W); disparities then
+    count twice as many pixels.
+    """
+    doubled = np.empty(shape, dtype=np.float32)
+    _double(small, 1 if len(small) == shape[0] else 2, doubled)
+    return doubled
+
+
+@kernel()
+def _double(small: Float32, rows: int, doubled: Float32) -> None:
+    """Repeat columns, and each row `rows` times, with twice the disparity. Fills doubled (H, W) px."""
+    height, width = doubled.shape
+    for y in range(0, height, rows):
+        own, row = small[y // rows], doubled[y]
+        for x in range(width // 2):
+            twice = np.float32(2) * own[x]
+            row[2 * x] = twice
+            row[2 * x + 1] = twice
+        if width % 2:
+            row[width - 1] = np.float32(2) * own[width // 2]
+        if y + 1 < height and rows == 2:
+            doubled[y + 1] = row
+
+
 def upsample_update(started: Float32, moved: Float32, disparity: Float32, same_surface_px: float) -> Float32:
     """Upsample what was found at half size onto `disparity` (H, W): by the bilinear mean of the four nearest
     places, where those on another surface don't count. started, moved: (H / 2, W / 2), or (H, W / 2) where
