@@ -251,7 +251,8 @@ def test_a_beams_end_on_a_flank_holds_the_bundle_down(
 def test_outlines_that_overlap_leave_open_which_bundle_lies_over_the_other() -> None:
     (one,) = find_bundles(draw([Laid(0.0, 0.0, 0.2, 0.0)]), SETTINGS)
     for overlap_m, up_ratio, top_ratio, is_free in (
-        (0.03, -0.1, -0.1, False), (0.005, -0.1, -0.1, True), (0.03, -0.2, -0.2, True), (0.03, -0.2, 0.0, False)
+        (0.03, -0.1, -0.1, False), (0.005, -0.1, -0.1, True), (0.03, -0.2, -0.2, True),
+        (0.03, -0.2, 0.0, False),
     ):  # fmt: skip
         away_m = np.array([one.width_m - overlap_m, 0.0, up_ratio * one.width_m])
         top_z_m = one.top_z_m + top_ratio * one.width_m

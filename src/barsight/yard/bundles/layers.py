@@ -68,7 +68,8 @@ def _lies_on(upper: Bundle, lower: Bundle) -> bool:
 
 def list_overlaps(bundle: Bundle, bundles: list[Bundle]) -> tuple[str, ...]:
     """List other bundles whose outlines overlap this one's and whose middles or tops lie no lower: they may
-    lie over its flank. In plan view two convex sections overlap where one's widest place is above the other's.
+    lie over its flank. In plan view two convex sections overlap where one's widest place is above the
+    other's.
     """
     ids = [str(other.id) for other in bundles if other.id != bundle.id and _overlaps(other, bundle)]
     return (
