@@ -58,8 +58,9 @@ def main() -> None:
         took_s = time.monotonic() - begun_s
         found = {
             "seconds": round(took_s, 1), "pairs": pairs, "mispaired": mispaired,
-            "due": ticks[-1] - ticks[0] + 1, "lost": lost, "unpaired": former.lost,
-            "contradicted": former.contradicted, "max_skew_ms": former.max_skew_ns / 1e6,
+            "ticks": [ticks[0], ticks[-1]], "due": ticks[-1] - ticks[0] + 1,
+            "lost": lost, "unpaired": former.lost, "contradicted": former.contradicted,
+            "max_skew_ms": former.max_skew_ns / 1e6,
             "cores": round((time.process_time() - cpu_s) / took_s, 4), "signs": signs,
         }  # fmt: skip
         sys.stdout.write(json.dumps(found) + "\n")

@@ -2,12 +2,13 @@
 
 Usage: gige_camera.py INTERFACE SERIAL PICTURES.npy TIMES OFFSET_NS DRIFT_PPM. PICTURES is (N, H, W). TIMES
 is either a period in ns: the camera runs free, its block numbers and the first eight bytes of each picture
-are its tick, a whole number of periods of the host's time; or a file (N,) of the host's times in ns, at each
-of which one picture is triggered.
+are its tick, a whole number of periods of the host's time, and PICTURES.SERIAL has the ticks of all that it
+made (uint64); or a file (N,) of the host's times in ns, at each of which one picture is triggered.
 The camera's clock is OFFSET_NS off and runs DRIFT_PPM fast.
 """
 
 import ctypes as c
+import os
 import sys
 import time
 from typing import Any
@@ -45,6 +46,7 @@ def main() -> None:
     period_ns = int(times) if is_free else POLL_NS
     due: list[int] = [] if is_free else np.load(times).tolist()
     shown = [0]
+    made = os.open(f"{path}.{serial}", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
 
     def fill(buffer: Any, *_: Any) -> None:
         tick = time.time_ns() // period_ns
@@ -55,6 +57,7 @@ def main() -> None:
         if is_free:
             c.memmove(place, c.byref(c.c_uint64(tick)), 8)
             lib.arv_buffer_set_frame_id(buffer, tick % WRAP + 1)
+            os.write(made, c.c_uint64(tick))
         drift_ns = round((at_ns - begun_ns) * float(drift_ppm) * 1e-6)
         lib.arv_buffer_set_timestamp(buffer, at_ns + int(offset_ns) + drift_ns)
 

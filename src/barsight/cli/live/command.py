@@ -15,6 +15,7 @@ from barsight.cli.measure import print_outcome
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError
+from barsight.core.printing import printed_aside
 from barsight.live.crane.run import measure_crane, measure_surveys, replay_surveys
 from barsight.live.run import replay as replay_recording
 from barsight.live.settings import LiveSettings, read_crane
@@ -62,10 +63,10 @@ def run(arguments: Sequence[str]) -> None:
             surveys: Survey after survey, each in a folder of OUT: as the crane moves and stops, or replays.
         """
         console = SafeConsole(stderr=True)
-        tell = partial(console.print, soft_wrap=True, highlight=False, markup=False)
+        prints = partial(console.print, soft_wrap=True, highlight=False, markup=False)
         for_replays = speed != 1 or at != "now" or keyframes is not None
         _expect_fitting(replay, for_replays=for_replays, surveys_of=keyframes if surveys else None)
-        with stages(console) as advance:
+        with printed_aside(prints) as tell, stages(console) as advance:
             common: dict[str, Any] = {"magnet": magnet, "tell": tell, "advance": advance}
             if replay is not None:
                 run_replay = replay_surveys if surveys else partial(replay_recording, keyframes=keyframes)
@@ -77,7 +78,7 @@ def run(arguments: Sequence[str]) -> None:
                 measured = measure(crane, out, settings, live, **common)
         if measured:
             print_outcome(measured, console, verbose=False)
-            tell(f"report: {out / 'report.html'}")
+            prints(f"report: {out / 'report.html'}")
 
     call(command, "live", arguments)
 

@@ -67,8 +67,9 @@ def _lies_on(upper: Bundle, lower: Bundle) -> bool:
 
 
 def list_overlaps(bundle: Bundle, bundles: list[Bundle]) -> tuple[str, ...]:
-    """List other bundles whose outlines overlap this one's and whose middles lie no lower: they may lie over
-    its flank. In plan view two convex sections overlap where one's widest place is above the other's.
+    """List other bundles whose outlines overlap this one's and whose middles or tops lie no lower: they may
+    lie over its flank. In plan view two convex sections overlap where one's widest place is above the
+    other's.
     """
     ids = [str(other.id) for other in bundles if other.id != bundle.id and _overlaps(other, bundle)]
     return (
@@ -79,8 +80,9 @@ def list_overlaps(bundle: Bundle, bundles: list[Bundle]) -> tuple[str, ...]:
 
 
 def _overlaps(other: Bundle, bundle: Bundle) -> bool:
-    higher = other.centre_m[2] - bundle.centre_m[2] > -_LOWER_RATIO * (other.width_m + bundle.width_m) / 2
-    return bool(higher) and _common_length(bundle, other, -_MEET_M) > _MEET_LENGTH_M
+    lower_m = _LOWER_RATIO * (other.width_m + bundle.width_m) / 2
+    rises_m = max(other.centre_m[2] - bundle.centre_m[2], other.top_z_m - bundle.top_z_m)
+    return rises_m > -lower_m and _common_length(bundle, other, -_MEET_M) > _MEET_LENGTH_M
 
 
 def list_neighbours(bundle: Bundle, bundles: list[Bundle]) -> tuple[int, ...]:
