@@ -12,9 +12,11 @@ import pytest
 import barsight as bs
 from barsight import pipeline
 from barsight.calibration.geometry.rectification import Rectifier
-from barsight.core.types import StereoFrame
+from barsight.core.errors import InputError
+from barsight.core.types import CraneSamples, StereoFrame
 from barsight.mapping.view import Matcher
 from barsight.motion.frontend.tracking import Tracker
+from test_yard_frame import calibrated
 
 SETTINGS: dict[str, Any] = {"stereo": {"method": "sgbm"}, "map": {"cell_m": 0.05}}
 
@@ -32,6 +34,23 @@ def counted(patch: pytest.MonkeyPatch, owner: Any, name: str) -> list[str]:
 
     patch.setattr(owner, name, told)
     return calls
+
+
+def test_packets_are_measured_in_the_surveyed_yard(whole: Path, tmp_path: Path) -> None:
+    """No encoder reading has come when the session begins; a yard file of encoders is refused without any."""
+    recording = bs.open_recording(whole)
+    settings = {**SETTINGS, "yard": calibrated(tmp_path, 3, "encoders")[0].path}
+    session = bs.Session(recording.rig, imu_noise=recording.imu_noise(), **settings)
+    for packet in bs.packets(recording):
+        session.push(packet)
+    yard, batch = session.finish(), bs.measure(whole, **settings)
+    for name in FILES:
+        assert (yard.folder / name).read_bytes() == (batch.folder / name).read_bytes(), name
+    other = bs.Session(recording.rig, imu_noise=recording.imu_noise(), **settings)
+    with pytest.raises(InputError, match="has no encoders that are used"):
+        for packet in bs.packets(recording):
+            if not isinstance(packet, CraneSamples):
+                other.push(packet)
 
 
 @pytest.mark.parametrize(

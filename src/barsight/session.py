@@ -31,7 +31,7 @@ from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.recording.sensor_selection import SelectedSensors
 from barsight.result import Yard
 from barsight.yard.magnet.description import load_magnet
-from barsight.yard_frame import in_yard
+from barsight.yard_frame import expect_fits, in_yard
 
 GRACE_NS = NS_PER_S
 """A frame waits so long for a sensor's readings, the first one for signs of every sensor."""
@@ -77,7 +77,7 @@ class Session:
         )  # fmt: skip
         self._recordings.append(self._recording)
         selected = SelectedSensors(self._recording, self._settings.use)
-        self._source = in_yard(selected, self._settings.yard)
+        self._source = in_yard(selected, self._settings.yard, is_awaited=True)
         key = checkpoint_key(self._recording, self._source, self._settings, {})
         self._checkpoints = checkpoint_folder(self._folder / "checkpoints" / name, key)
         self._pairs = RectifiedPairs(self._source, Rectifier(self._rig), self._checkpoints)
@@ -89,7 +89,8 @@ class Session:
 
     def push(self, packet: Packet) -> None:
         """Take the next packet, a pair after all readings before it; it enters the map once those are there
-        that place it. Raises MeasurementError after `finish`.
+        that place it. Raises MeasurementError after `finish`, InputError where the yard file isn't of this
+        rig and crane.
         """
         self._expect_open()
         self._recording.add(packet)
@@ -156,6 +157,7 @@ class Session:
 
     def _place(self, pair: RectifiedPair | RefusedFrame) -> None:
         if self._map is None:
+            expect_fits(self._source)
             has_crane = self._source.crane() is not None
             estimator = make_early_estimator(self._settings.motion, has_crane=has_crane)
             kept = self._checkpoints if is_final(self._settings) else None

@@ -51,10 +51,13 @@ class RecordingInYard(RecordingProxy):
         )  # fmt: skip
 
 
-def in_yard(recording: Recording, yard: Path | None, known: Recording | None = None) -> Recording:
+def in_yard(
+    recording: Recording, yard: Path | None, known: Recording | None = None, *, is_awaited: bool = False
+) -> Recording:
     """View a recording through the yard file, the recording itself where there is none.
 
-    known: what the file must fit, where the recording's own readings are yet to come.
+    Where the recording's own readings are yet to come, the file must fit `known`, or, if it is_awaited,
+    `expect_fits` is to be asked once they are there.
 
     Raises CalibrationError for a file that can't be, InputError for one of another rig, crane or recording.
     """
@@ -62,8 +65,18 @@ def in_yard(recording: Recording, yard: Path | None, known: Recording | None = N
         return recording
     frame = read_yard_file(yard)
     _expect_sure(frame)
-    _expect_fits(frame, known or recording)
-    return RecordingInYard(recording, frame)
+    placed = RecordingInYard(recording, frame)
+    if not is_awaited:
+        expect_fits(placed, known)
+    return placed
+
+
+def expect_fits(recording: Recording, known: Recording | None = None) -> None:
+    """Raise InputError where the yard file that a recording is seen through is of another rig, crane or
+    recording. known: what it must fit, the recording itself if None.
+    """
+    if isinstance(recording, RecordingInYard):
+        _expect_fits(recording.frame, known or recording.whole)
 
 
 def frame_of(recording: Recording) -> YardFrame | None:
