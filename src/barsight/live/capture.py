@@ -14,7 +14,7 @@ from barsight.live.shared.counters import Counters
 from barsight.live.shared.ring import PairRing
 from barsight.live.source import ReplayClock, ReplaySource
 from barsight.sensors.crane import CraneSource
-from barsight.sensors.datagrams import ReadingReceiver
+from barsight.sensors.receiver import ReadingReceiver
 from barsight.sensors.source import LivePicture, LostPicture, Readings, SensorSigns, Source
 
 POLL_S = 0.002
@@ -59,7 +59,7 @@ def open_crane(
 
     sizes = rig.cam0.width, rig.cam0.height
     cameras = GigeCamera(0, crane.cameras, sizes), GigeCamera(1, crane.cameras, sizes)
-    receivers = {name: ReadingReceiver(name, one.port) for name, one in crane.sensors().items()}
+    receivers = {name: ReadingReceiver(name, one) for name, one in crane.sensors().items()}
     return CraneSource(cameras, receivers, crane.cameras.rate_hz, epoch_ns, may_go_on)
 
 
