@@ -24,7 +24,7 @@ MARK = b"BSI1"
 
 
 def stamp(number: int) -> int:
-    """Of a clock that is far from any here."""
+    """Tell the time of a clock that is far from any here."""
     return 7 * 10**17 + number * 5_000_000
 
 
