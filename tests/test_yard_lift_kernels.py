@@ -87,9 +87,9 @@ def plain_obstacle(heights: HeightMap, place: Placement, load: Laid) -> tuple[st
             return "obstructed", 1e3 * (smooth + spare).ravel()[highest], xy[large]
     label, _ = ndimage.label(~blocked)
     unproven = blocked | (np.bincount(label.ravel()) < 4)[label]
-    hidden = ndimage.binary_opening(unproven, np.ones((8, 8))) & under
+    hidden = ndimage.binary_opening(unproven, np.ones((6, 6))) & under
     if hidden.any():
-        return "unknown-under-footprint", 1e3 * max(0.08, 0.01 * math.sqrt(hidden.sum())), xy[hidden]
+        return "unknown-under-footprint", 1e3 * max(0.06, 0.01 * math.sqrt(hidden.sum())), xy[hidden]
     return None
 
 

@@ -38,7 +38,7 @@ MIN_PATCH_CELLS = 4
 """Cells of STEP_M of the smallest patch that counts."""
 EDGE_SIGMA_M = 0.003
 """How well a cell of STEP_M tells the edge of what it shows."""
-MAX_HOLE_M = 0.08
+MAX_HOLE_M = 0.06
 """An unseen place narrower than this is taken to hide nothing that stands."""
 _HOLE_CELLS = round(MAX_HOLE_M / STEP_M)
 _UNKNOWN, _FILLED = HeightSource.UNKNOWN, HeightSource.FILLED
