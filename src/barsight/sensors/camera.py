@@ -65,7 +65,7 @@ class Blocks:
             yield RawLoss("missed", gap)
 
 
-class Camera(ABC):
+class CameraDriver(ABC):
     """A camera of one serial number, connected when pictures are asked for and anew after it was lost.
 
     size: width and height that the calibration has. connects: how often it was connected.

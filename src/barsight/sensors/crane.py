@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from barsight.core.stamps import NS_PER_S
-from barsight.sensors.camera import Camera, RawLoss, RawPicture
+from barsight.sensors.camera import CameraDriver, RawLoss, RawPicture
 from barsight.sensors.clock import DeviceClock
 from barsight.sensors.datagrams import RawReading, ReadingReceiver
 from barsight.sensors.source import LivePicture, LostPicture, Packet, Readings, SensorSigns
@@ -43,8 +43,8 @@ class CraneSource:
     """
 
     def __init__(
-        self, cameras: tuple[Camera, Camera], receivers: dict[str, ReadingReceiver], rate_hz: float,
-        epoch_ns: int, may_go_on: Callable[[], bool],
+        self, cameras: tuple[CameraDriver, CameraDriver], receivers: dict[str, ReadingReceiver],
+        rate_hz: float, epoch_ns: int, may_go_on: Callable[[], bool],
     ) -> None:  # fmt: skip
         self._cameras, self._receivers, self._epoch_ns = cameras, receivers, epoch_ns
         self._ask, self._going = may_go_on, True
@@ -83,7 +83,7 @@ class CraneSource:
             for receiver in self._receivers.values():
                 receiver.close()
 
-    def _take_pictures(self, name: str, camera: Camera) -> None:
+    def _take_pictures(self, name: str, camera: CameraDriver) -> None:
         for item in camera.pictures(lambda: self._going):
             self._put(name, item)
 

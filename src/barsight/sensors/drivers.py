@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from barsight.core.errors import InputError
-from barsight.sensors.camera import Camera
+from barsight.sensors.camera import CameraDriver
 from barsight.sensors.settings import CamerasSettings
 
 
-def both_cameras(settings: CamerasSettings, size: tuple[int, int]) -> tuple[Camera, Camera]:
+def both_cameras(settings: CamerasSettings, size: tuple[int, int]) -> tuple[CameraDriver, CameraDriver]:
     """Make cam0 and cam1, not connected yet. size: width and height that the calibration has.
 
     Raises ConfigError where the driver isn't installed.
@@ -35,7 +35,7 @@ def prove_cameras(settings: CamerasSettings, size: tuple[int, int]) -> None:
         camera.close()
 
 
-def _driver(settings: CamerasSettings) -> type[Camera]:
+def _driver(settings: CamerasSettings) -> type[CameraDriver]:
     """Import the driver, an extra, which replays do without."""
     if settings.driver == "pylon":
         from barsight.sensors.pylon import PylonCamera

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from barsight.core.extras import extra
-from barsight.sensors.camera import WAIT_MS, Blocks, Camera, RawLoss, RawPicture
+from barsight.sensors.camera import WAIT_MS, Blocks, CameraDriver, RawLoss, RawPicture
 from barsight.sensors.settings import CamerasSettings
 
 with extra("cameras"):
@@ -23,7 +23,7 @@ SERIALS = ("DeviceSerialNumber", "DeviceID")
 CAUSES = {"frames_incomplete": "incomplete", "frames_missed": "missed", "frames_backpressure": "backpressure"}
 
 
-class GigeCamera(Camera):
+class GigeCamera(CameraDriver):
     """A GigE Vision camera of any make."""
 
     errors = vg.GenicamError

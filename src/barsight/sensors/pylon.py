@@ -9,7 +9,7 @@ from typing import Any
 from barsight.core.errors import InputError
 from barsight.core.extras import extra
 from barsight.core.stamps import NS_PER_S
-from barsight.sensors.camera import WAIT_MS, Blocks, Camera, RawLoss, RawPicture
+from barsight.sensors.camera import WAIT_MS, Blocks, CameraDriver, RawLoss, RawPicture
 from barsight.sensors.settings import CamerasSettings
 
 with extra("basler"):
@@ -24,7 +24,7 @@ HEADERS_BYTES = 28
 """Of IPv4 and UDP, which the camera counts as part of a packet."""
 
 
-class PylonCamera(Camera):
+class PylonCamera(CameraDriver):
     """A Basler camera, by GigE or USB."""
 
     errors = genicam.GenericException
