@@ -12,7 +12,7 @@ import time
 
 import numpy as np
 
-from barsight.sensors.datagrams import pack
+from barsight.sensors.forms import pack
 from crane_network import PORTS
 
 

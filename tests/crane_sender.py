@@ -10,7 +10,7 @@ import time
 
 import numpy as np
 
-from barsight.sensors.datagrams import pack
+from barsight.sensors.forms import pack
 
 OFF_NS = 3_000_000_000
 

@@ -19,7 +19,9 @@ from barsight.live.pairing import PairFormer
 from barsight.live.settings import read_crane
 from barsight.recording.writers.retention import PROTECTED, Retention
 from barsight.sensors.clock import DeviceClock
-from barsight.sensors.datagrams import RawReading, ReadingReceiver, pack
+from barsight.sensors.forms import pack
+from barsight.sensors.receiver import RawReading, ReadingReceiver
+from barsight.sensors.settings import ReadingsSettings
 from barsight.sensors.source import LivePicture
 
 SECOND = 10**9
@@ -72,7 +74,8 @@ def test_datagrams_are_read_and_what_is_lost_or_torn_counts() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
         one.bind(("127.0.0.1", 0))
         port = one.getsockname()[1]
-    receiver, out = ReadingReceiver("crane", port), socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    settings = ReadingsSettings(port=port, rate_hz=20)
+    receiver, out = ReadingReceiver("crane", settings), socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     place = (1.5, -2.0, 8.0)
     whole = [pack("crane", number, 100 + number, place) for number in (7, 8, 8, 11)]
     sent = [whole[0] + whole[1], whole[2], b"BSC1", pack("imu", 1, 5, (0.0,) * 6), whole[3]]
@@ -86,7 +89,7 @@ def test_datagrams_are_read_and_what_is_lost_or_torn_counts() -> None:
     ]  # fmt: skip
     assert receiver.torn == 3 and found[0].arrival_ns == 42
     with pytest.raises(bs.BarsightError, match=rf"crane: UDP port {port} can't be opened"):
-        ReadingReceiver("crane", port)
+        ReadingReceiver("crane", settings)
     receiver.close()
     out.close()
 

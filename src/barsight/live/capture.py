@@ -14,8 +14,8 @@ from barsight.live.shared.counters import Counters
 from barsight.live.shared.ring import PairRing
 from barsight.live.source import ReplayClock, ReplaySource
 from barsight.sensors.crane import CraneSource
-from barsight.sensors.datagrams import ReadingReceiver
 from barsight.sensors.drivers import both_cameras
+from barsight.sensors.receiver import ReadingReceiver
 from barsight.sensors.source import LivePicture, LostPicture, Readings, SensorSigns, Source
 
 POLL_S = 0.002
@@ -57,7 +57,7 @@ def open_crane(
 ) -> CraneSource:
     """Open the sensors of crane.toml. Raises ConfigError where a port or a library is missing."""
     cameras = both_cameras(crane.cameras, (rig.cam0.width, rig.cam0.height))
-    receivers = {name: ReadingReceiver(name, one.port) for name, one in crane.sensors().items()}
+    receivers = {name: ReadingReceiver(name, one) for name, one in crane.sensors().items()}
     return CraneSource(cameras, receivers, crane.cameras.rate_hz, epoch_ns, may_go_on)
 
 

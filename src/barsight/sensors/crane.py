@@ -14,7 +14,7 @@ import numpy as np
 from barsight.core.stamps import NS_PER_S
 from barsight.sensors.camera import CameraDriver, RawLoss, RawPicture
 from barsight.sensors.clock import DeviceClock
-from barsight.sensors.datagrams import RawReading, ReadingReceiver
+from barsight.sensors.receiver import RawReading, ReadingReceiver
 from barsight.sensors.source import LivePicture, LostPicture, Packet, Readings, SensorSigns
 
 WAIT_S = 0.01

@@ -10,9 +10,16 @@ import numpy as np
 
 from barsight.core.errors import ConfigError
 from barsight.core.pose import Pose
-from barsight.core.settings.values import expect_ranges, expect_values
+from barsight.core.settings.values import expect_choice, expect_ranges, expect_values
+from barsight.sensors.forms import CRC_BYTES, FORMS
 
 PORTS = (1, 65535)
+BAUDS = (
+    9600, 19200, 38400, 57600, 115200, 230400, 460800, 500000, 576000, 921600, 1000000, 1152000, 1500000,
+    2000000, 2500000, 3000000, 3500000, 4000000,
+)  # fmt: skip
+BITS_PER_BYTE = 10
+"""On a serial line, start and stop bit among them."""
 MAX_LEVER_M = 30.0
 
 
@@ -47,30 +54,61 @@ class CamerasSettings:
             raise ConfigError(f"cameras.serials names {self.serials[0]} twice; give cam0's and cam1's")
 
 
-@dataclass(frozen=True)
-class ImuSettings:
-    """The IMU, by UDP; its axes are the body's."""
+@dataclass(frozen=True, kw_only=True)
+class ReadingsSettings:
+    """Tells how a sensor's readings come: to a UDP port, or by a serial line."""
 
-    port: int
-    """UDP port that its datagrams come to."""
+    port: int | None = None
+    """UDP port that the datagrams come to; this or `device`."""
+    device: str | None = None
+    """Serial line that the readings come by, like /dev/serial/by-id/usb-...; this or `port`. Linux only."""
+    baud: int | None = None
+    """Speed of the serial line, bits a second, like 921600."""
     rate_hz: float
     """Readings a second."""
+
+    @property
+    def way(self) -> str:
+        """Tell the way in words."""
+        return f"UDP port {self.port}" if self.device is None else f"{self.device} at {self.baud} baud"
+
+    def _expect_way(self, section: str, sensor: str) -> None:
+        """Raise ConfigError where no way is named or two are, or where the line is too slow."""
+        expect_ranges(self, section, port=PORTS)
+        if (self.port is None) == (self.device is None):
+            told = "neither is" if self.port is None else "both are"
+            raise ConfigError(
+                f"{section}port and {section}device: {told} given; give the UDP port or the serial line"
+            )
+        if (self.device is None) != (self.baud is None):
+            raise ConfigError(f"{section}device and {section}baud belong together; give both or none")
+        if self.baud is not None:
+            expect_choice(f"{section}baud", self.baud, BAUDS)
+            needed = BITS_PER_BYTE * (FORMS[sensor][1].size + CRC_BYTES) * self.rate_hz
+            if self.baud < needed:
+                raise ConfigError(
+                    f"{section}baud is {self.baud}, too slow for {self.rate_hz:g} readings a second; "
+                    f"give over {needed:.0f}, or a lower {section}rate_hz"
+                )
+
+
+@dataclass(frozen=True)
+class ImuSettings(ReadingsSettings):
+    """The IMU, by UDP or a serial line; its axes are the body's."""
+
     noise: Path | None = None
     """Kalibr's imu.yaml with its noise densities."""
 
     def __post_init__(self) -> None:
         expect_values(self, "imu.")
-        expect_ranges(self, "imu.", port=PORTS, rate_hz=(10, 5000))
+        expect_ranges(self, "imu.", rate_hz=(10, 5000))
+        self._expect_way("imu.", "imu")
 
 
 @dataclass(frozen=True)
-class EncodersSettings:
-    """The crane's encoders, by UDP, and how the body hangs on the crane."""
+class EncodersSettings(ReadingsSettings):
+    """The crane's encoders, by UDP or a serial line, and how the body hangs on the crane."""
 
-    port: int
-    """UDP port that their datagrams come to."""
-    rate_hz: float
-    """Readings a second."""
     p_crane_body_m: tuple[float, float, float]
     """The body's origin minus the crane point, yard axes, in metres."""
     R_yard_body: tuple[float, ...]
@@ -81,9 +119,10 @@ class EncodersSettings:
     def __post_init__(self) -> None:
         expect_values(self, "encoders.")
         expect_ranges(
-            self, "encoders.", port=PORTS, rate_hz=(1, 1000), p_crane_body_m=(-MAX_LEVER_M, MAX_LEVER_M),
+            self, "encoders.", rate_hz=(1, 1000), p_crane_body_m=(-MAX_LEVER_M, MAX_LEVER_M),
             position_std_m=(1e-5, 0.2),
         )  # fmt: skip
+        self._expect_way("encoders.", "crane")
         if len(self.R_yard_body) != 9:
             raise ConfigError(f"encoders.R_yard_body has {len(self.R_yard_body)} values; give 9")
         try:

@@ -201,7 +201,7 @@ def _sensors(crane: CraneConfig) -> Iterator[Finding]:
             nonlocal awaited
             awaited = prove_sensor(crane, awaited, name)
 
-        needed = f"{sensor.rate_hz:g} readings a second at UDP port {sensor.port}"
+        needed = f"{sensor.rate_hz:g} readings a second at {sensor.way}"
         yield _proved(name, needed, listen)
     heard = (awaited.imu_samples, awaited.crane_samples)
     if any(one is not None and len(one.stamp_ns) for one in heard):

@@ -11,8 +11,9 @@ from barsight.core.errors import InputError
 from barsight.live.settings import CraneConfig
 from barsight.recording.awaited import AwaitedRecording
 from barsight.recording.plausibility import doubts
-from barsight.sensors.datagrams import RawReading, ReadingReceiver
 from barsight.sensors.drivers import prove_cameras
+from barsight.sensors.receiver import RawReading, ReadingReceiver
+from barsight.sensors.settings import ReadingsSettings
 
 LISTEN_S = 3.0
 ENOUGH_S = 0.5
@@ -33,7 +34,7 @@ def prove_sensor(crane: CraneConfig, folder: AwaitedRecording, name: str) -> Awa
     Raises InputError where none come, or other ones than crane.toml says.
     """
     sensor = crane.sensors()[name]
-    found = _listen(name, sensor.port, sensor.rate_hz)
+    found = _listen(name, sensor)
     stamps = np.array([one.device_ns for one in found], np.int64)
     if (np.diff(stamps) <= 0).any():
         raise InputError(name, "its stamps do not increase", "send the time of each measurement in ns")
@@ -66,10 +67,10 @@ def expect_plausible(folder: AwaitedRecording) -> None:
         raise InputError("crane.toml", notice.message)
 
 
-def _listen(name: str, port: int, rate_hz: float) -> list[RawReading]:
+def _listen(name: str, sensor: ReadingsSettings) -> list[RawReading]:
     """Receive a few readings."""
-    receiver = ReadingReceiver(name, port)
-    wanted, give_up = max(round(ENOUGH_S * rate_hz), 5), time.monotonic() + LISTEN_S
+    receiver = ReadingReceiver(name, sensor)
+    wanted, give_up = max(round(ENOUGH_S * sensor.rate_hz), 5), time.monotonic() + LISTEN_S
     found: list[RawReading] = []
     try:
         for reading in receiver.readings(lambda: time.monotonic() < give_up, time.monotonic_ns):
@@ -78,8 +79,10 @@ def _listen(name: str, port: int, rate_hz: float) -> list[RawReading]:
                 return found
     finally:
         receiver.close()
-    torn = f", and {receiver.torn} datagrams of another form" if receiver.torn else ""
+    told = f", and {receiver.torn} of another form" if receiver.torn else ""
+    told += f" ({receiver.trouble})" if receiver.trouble else ""
+    means = "the port and the firewall" if sensor.device is None else "the cable, the baud and the rights"
     raise InputError(
-        name, f"{len(found)} readings came to UDP port {port} within {LISTEN_S:g} s{torn}",
-        "check the sender and its form (docs/how-to/run-a-crane.md), the port and the firewall",
+        name, f"{len(found)} readings came to {sensor.way} within {LISTEN_S:g} s{told}",
+        f"check the sender and its form (docs/how-to/run-a-crane.md), {means}",
     )  # fmt: skip

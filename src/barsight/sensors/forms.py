@@ -1,0 +1,20 @@
+"""Lay out readings of IMU and encoders as their senders do.
+
+A reading is little-endian: four bytes of kind (`BSI1` for the IMU, `BSC1` for the crane), a sequence number
+(uint32), the stamp of the measurement on the sender's clock (int64, ns), and float64 values: gyro x, y, z
+(rad/s) and accelerometer x, y, z (m/s2), or bridge x, trolley y and hoist z (m). A datagram holds one or more
+of them. On a serial line, which has no checksum of its own, each is followed by its CRC-32.
+"""
+
+from __future__ import annotations
+
+import struct
+
+FORMS = {"imu": (b"BSI1", struct.Struct("<4sIq6d")), "crane": (b"BSC1", struct.Struct("<4sIq3d"))}
+CRC_BYTES = 4
+
+
+def pack(sensor: str, number: int, stamp_ns: int, values: tuple[float, ...]) -> bytes:
+    """Pack a reading as a sender does."""
+    mark, form = FORMS[sensor]
+    return form.pack(mark, number % (1 << 32), stamp_ns, *values)
