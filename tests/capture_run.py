@@ -11,7 +11,7 @@ import time
 from barsight.live.pairing import PairFormer
 from barsight.live.shared.ring import PairRing
 from barsight.sensors.crane import CraneSource
-from barsight.sensors.gige import GigeCamera
+from barsight.sensors.drivers import both_cameras
 from barsight.sensors.settings import CamerasSettings
 from barsight.sensors.source import LivePicture, LostPicture, SensorSigns
 
@@ -23,7 +23,7 @@ def main() -> None:
     seconds, width, height, rate_hz, *serials = sys.argv[1:]
     settings = CamerasSettings((serials[0], serials[1]), float(rate_hz))
     size = int(width), int(height)
-    cameras = GigeCamera(0, settings, size), GigeCamera(1, settings, size)
+    cameras = both_cameras(settings, size)
     end_s = [float("inf")]
     source = CraneSource(cameras, {}, float(rate_hz), 0, lambda: time.monotonic() < end_s[0])
     former, ring = PairFormer(TOLERANCE_NS), PairRing(8, size[1], size[0])

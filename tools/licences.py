@@ -31,6 +31,9 @@ Some wheels bundle libraries: NumPy's and SciPy's for Linux OpenBLAS (BSD-3-Clau
 with the GCC Runtime Library Exception), OpenCV's FFmpeg (LGPL-2.1). Whoever passes these wheels on passes
 the libraries on too; their licences lie in the wheels' `.dist-info` folders.
 
+The extra `basler` is not listed: it installs pypylon, whose wheel holds Basler's pylon under Basler's own
+licence (in its `.dist-info` folder); read it before you use it or pass it on.
+
 GTSAM's wheel declares that it needs pytest, so pytest's packages are listed under Run time;
 `requirements.lock` leaves them out.
 """

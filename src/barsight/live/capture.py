@@ -14,6 +14,7 @@ from barsight.live.shared.counters import Counters
 from barsight.live.shared.ring import PairRing
 from barsight.live.source import ReplayClock, ReplaySource
 from barsight.sensors.crane import CraneSource
+from barsight.sensors.drivers import both_cameras
 from barsight.sensors.receiver import ReadingReceiver
 from barsight.sensors.source import LivePicture, LostPicture, Readings, SensorSigns, Source
 
@@ -55,10 +56,7 @@ def open_crane(
     crane: CraneConfig, rig: StereoRig, epoch_ns: int, may_go_on: Callable[[], bool]
 ) -> CraneSource:
     """Open the sensors of crane.toml. Raises ConfigError where a port or a library is missing."""
-    from barsight.sensors.gige import GigeCamera  # an extra, which replays do without
-
-    sizes = rig.cam0.width, rig.cam0.height
-    cameras = GigeCamera(0, crane.cameras, sizes), GigeCamera(1, crane.cameras, sizes)
+    cameras = both_cameras(crane.cameras, (rig.cam0.width, rig.cam0.height))
     receivers = {name: ReadingReceiver(name, one) for name, one in crane.sensors().items()}
     return CraneSource(cameras, receivers, crane.cameras.rate_hz, epoch_ns, may_go_on)
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from barsight.core.stamps import NS_PER_S
+from barsight.sensors.camera import CameraDriver, RawLoss, RawPicture
 from barsight.sensors.clock import DeviceClock
-from barsight.sensors.gige import GigeCamera, RawLoss, RawPicture
 from barsight.sensors.receiver import RawReading, ReadingReceiver
 from barsight.sensors.source import LivePicture, LostPicture, Packet, Readings, SensorSigns
 
@@ -36,15 +36,15 @@ class _Stream:
 
 
 class CraneSource:
-    """`Source` of two GigE Vision cameras, an IMU and encoders.
+    """`Source` of two cameras, an IMU and encoders.
 
     Every stamp is the device's own, mapped to the host's monotonic clock by its `DeviceClock`; `epoch_ns`
     added to that gives the run's stamps, which a step of the host's wall clock can't move.
     """
 
     def __init__(
-        self, cameras: tuple[GigeCamera, GigeCamera], receivers: dict[str, ReadingReceiver], rate_hz: float,
-        epoch_ns: int, may_go_on: Callable[[], bool],
+        self, cameras: tuple[CameraDriver, CameraDriver], receivers: dict[str, ReadingReceiver],
+        rate_hz: float, epoch_ns: int, may_go_on: Callable[[], bool],
     ) -> None:  # fmt: skip
         self._cameras, self._receivers, self._epoch_ns = cameras, receivers, epoch_ns
         self._ask, self._going = may_go_on, True
@@ -83,7 +83,7 @@ class CraneSource:
             for receiver in self._receivers.values():
                 receiver.close()
 
-    def _take_pictures(self, name: str, camera: GigeCamera) -> None:
+    def _take_pictures(self, name: str, camera: CameraDriver) -> None:
         for item in camera.pictures(lambda: self._going):
             self._put(name, item)
 

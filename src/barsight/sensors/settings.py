@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -24,7 +25,7 @@ MAX_LEVER_M = 30.0
 
 @dataclass(frozen=True)
 class CamerasSettings:
-    """The two cameras: GigE Vision, triggered together, Mono8."""
+    """The two cameras, triggered together, Mono8."""
 
     serials: tuple[str, str]
     """Serial numbers (DeviceSerialNumber, else DeviceID) of cam0 and cam1."""
@@ -37,7 +38,12 @@ class CamerasSettings:
     packet_size_bytes: int = 8000
     """Payload of a packet; over 1500 the network must carry jumbo frames (MTU 9000)."""
     interface: str | None = None
-    """Name or IPv4 address of the host's interface to the cameras; all are searched where it isn't given."""
+    """Name or IPv4 address of the host's interface to the cameras; all are searched where it isn't given.
+
+    The driver `pylon` searches all.
+    """
+    driver: Literal["gige", "pylon"] = "gige"
+    """`gige`: GigE Vision of any make, extra `cameras`. `pylon`: Basler's, by GigE or USB, extra `basler`."""
 
     def __post_init__(self) -> None:
         expect_values(self, "cameras.")

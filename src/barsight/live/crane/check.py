@@ -16,6 +16,7 @@ from barsight.calibration.files.rig_file import read_serials
 from barsight.core.errors import BarsightError
 from barsight.live.crane.preflight import expect_plausible, prove_sensor
 from barsight.live.settings import CraneConfig
+from barsight.sensors.drivers import prove_cameras
 
 MIN_CORES, MIN_MEMORY_GIB = 2, 2.0
 KEYFRAME_BYTES_PER_PIXEL = 16
@@ -191,15 +192,9 @@ def _number(path: Path) -> int | None:
 def _sensors(crane: CraneConfig) -> Iterator[Finding]:
     """Prove both cameras, then IMU and encoders."""
     awaited = crane.described(Path("recording"))
-    sizes = tuple((camera.width, camera.height) for camera in (awaited.rig.cam0, awaited.rig.cam1))
-
-    def prove_both() -> None:
-        from barsight.sensors.gige import prove_cameras  # an extra, which replays do without
-
-        prove_cameras(crane.cameras, (sizes[0], sizes[1]))
-
-    told = f"{' and '.join(crane.cameras.serials)}, {sizes[0][0]}x{sizes[0][1]}, Mono8"
-    yield _proved("cameras", told, prove_both)
+    size = awaited.rig.cam0.width, awaited.rig.cam0.height
+    told = f"{' and '.join(crane.cameras.serials)}, {size[0]}x{size[1]}, Mono8"
+    yield _proved("cameras", told, lambda: prove_cameras(crane.cameras, size))
     for name, sensor in crane.sensors().items():
 
         def listen(name: str = name) -> None:

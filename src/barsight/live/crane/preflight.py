@@ -11,6 +11,7 @@ from barsight.core.errors import InputError
 from barsight.live.settings import CraneConfig
 from barsight.recording.awaited import AwaitedRecording
 from barsight.recording.plausibility import doubts
+from barsight.sensors.drivers import prove_cameras
 from barsight.sensors.receiver import RawReading, ReadingReceiver
 from barsight.sensors.settings import ReadingsSettings
 
@@ -21,10 +22,7 @@ ENOUGH_S = 0.5
 
 def prove_sensors(crane: CraneConfig, folder: AwaitedRecording) -> None:
     """Prove that all sensors of crane.toml answer. Raises InputError naming the one that doesn't."""
-    from barsight.sensors.gige import prove_cameras  # an extra, which replays do without
-
-    cam0, cam1 = folder.rig.cam0, folder.rig.cam1
-    prove_cameras(crane.cameras, ((cam0.width, cam0.height), (cam1.width, cam1.height)))
+    prove_cameras(crane.cameras, (folder.rig.cam0.width, folder.rig.cam0.height))
     for name in crane.sensors():
         folder = prove_sensor(crane, folder, name)
     expect_plausible(folder)

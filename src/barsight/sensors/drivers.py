@@ -1,0 +1,46 @@
+"""Choose the cameras' driver that crane.toml names, and prove cameras by it."""
+
+from __future__ import annotations
+
+from barsight.core.errors import InputError
+from barsight.sensors.camera import CameraDriver
+from barsight.sensors.settings import CamerasSettings
+
+
+def both_cameras(settings: CamerasSettings, size: tuple[int, int]) -> tuple[CameraDriver, CameraDriver]:
+    """Make cam0 and cam1, not connected yet. size: width and height that the calibration has.
+
+    Raises ConfigError where the driver isn't installed.
+    """
+    driver = _driver(settings)
+    return driver(0, settings, size), driver(1, settings, size)
+
+
+def prove_cameras(settings: CamerasSettings, size: tuple[int, int]) -> None:
+    """Prove that cam0 and cam1 are there and can be set. size: width and height that the calibration has.
+
+    Raises InputError for one that isn't there, is in use, or does not fit its calibration.
+    """
+    cameras = both_cameras(settings, size)
+    found = cameras[0].find(settings)
+    for camera in cameras:
+        if camera.serial not in found:
+            there = ", ".join(sorted(found)) or "none"
+            raise InputError(
+                camera.name, f"no camera of serial number {camera.serial} answers (there: {there})",
+                "check its power and cable, and cameras.serials in crane.toml",
+            )  # fmt: skip
+    for camera in cameras:
+        camera.open(found[camera.serial])
+        camera.close()
+
+
+def _driver(settings: CamerasSettings) -> type[CameraDriver]:
+    """Import the driver, an extra, which replays do without."""
+    if settings.driver == "pylon":
+        from barsight.sensors.pylon import PylonCamera
+
+        return PylonCamera
+    from barsight.sensors.gige import GigeCamera
+
+    return GigeCamera
