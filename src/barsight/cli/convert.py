@@ -42,7 +42,7 @@ def run(arguments: Sequence[str]) -> None:
         with stages(console) as advance:
             done = convert(source, out, to, lambda n, total: advance("pictures", n, total))
         text = f"{done.images} pictures written to {done.out}"
-        console.print(text, soft_wrap=True, highlight=False, markup=False)
+        console.print_line(text)
         if done.left_out:
             console.print(f"[yellow]{done.left_out} pictures were missing or torn and are left out[/yellow]")
 

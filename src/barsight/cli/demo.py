@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from rich.console import Console
 
 from barsight.cli.arguments import call
 from barsight.cli.measure import print_outcome
@@ -57,7 +56,7 @@ def run(arguments: Sequence[str]) -> None:
         print_outcome(_measure(out, console, 0), console, verbose=False)
         _measure(out, console, 1)
         for what in (f"report: {out / 'result' / 'report.html'}", f"in 3D:  barsight view {out / 'result'}"):
-            console.print(what, soft_wrap=True, highlight=False, markup=False)
+            console.print_line(what)
         _show_page(out, console, serve=serve)
 
     call(command, "demo", arguments)
@@ -81,7 +80,7 @@ def _simulate(out: Path, advance: Any) -> None:
             )
 
 
-def _measure(out: Path, console: Console, number: int) -> dict[str, Any]:
+def _measure(out: Path, console: SafeConsole, number: int) -> dict[str, Any]:
     """Measure one of the recordings, the first against its truth too."""
     settings = MeasureSettings()
     settings = replace(settings, bundles=replace(settings.bundles, stock_list=out / "stock.csv"))
@@ -93,7 +92,7 @@ def _measure(out: Path, console: Console, number: int) -> dict[str, Any]:
         )  # fmt: skip
 
 
-def _show_page(out: Path, console: Console, *, serve: bool) -> None:
+def _show_page(out: Path, console: SafeConsole, *, serve: bool) -> None:
     """Put both results into a store and serve its page, or say what it lacks."""
     url = f"sqlite:///{out / 'yard.db'}"
     try:
@@ -108,7 +107,7 @@ def _show_page(out: Path, console: Console, *, serve: bool) -> None:
             f"page:   pip install 'barsight[store,page]', then {added}",
             f"        and barsight serve --store {url}",
         ):
-            console.print(line, soft_wrap=True, highlight=False, markup=False)
+            console.print_line(line)
         return
     with open_store(url, create=True) as store:
         for name in RESULTS:
@@ -117,4 +116,4 @@ def _show_page(out: Path, console: Console, *, serve: bool) -> None:
         console.print("page:", end="   ", highlight=False)
         page.serve(url, page.ServeOptions(port=0))
     else:
-        console.print(f"page:   barsight serve --store {url}", soft_wrap=True, highlight=False, markup=False)
+        console.print_line(f"page:   barsight serve --store {url}")

@@ -24,8 +24,6 @@ def run(arguments: Sequence[str]) -> None:
         """
         points = export(out, file)
         told = f" ({points} points)" if points else ""
-        SafeConsole(stderr=True).print(
-            f"written: {file}{told}", soft_wrap=True, highlight=False, markup=False
-        )
+        SafeConsole(stderr=True).print_line(f"written: {file}{told}")
 
     call(command, "export", arguments)

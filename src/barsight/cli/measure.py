@@ -63,7 +63,7 @@ def run(arguments: Sequence[str]) -> None:
                 judged_at=at,
             )  # fmt: skip
         print_outcome(measured, console, verbose=verbose)
-        console.print(f"report: {out / 'report.html'}", soft_wrap=True, highlight=False, markup=False)
+        console.print_line(f"report: {out / 'report.html'}")
 
     call(command, "measure", arguments)
 

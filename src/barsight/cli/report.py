@@ -23,6 +23,6 @@ def run(arguments: Sequence[str]) -> None:
         """
         path = out / "report.html"
         write_report(out, path)
-        SafeConsole(stderr=True).print(f"report: {path}", soft_wrap=True, highlight=False, markup=False)
+        SafeConsole(stderr=True).print_line(f"report: {path}")
 
     call(command, "report", arguments)

@@ -16,3 +16,7 @@ class SafeConsole(Console):
     def render_str(self, text: str, **given: Any) -> Text:
         """Render text that is printable."""
         return super().render_str(printable(text), **given)
+
+    def print_line(self, text: str) -> None:
+        """Print text as it stands, however long: paths can be copied, and nothing in it is markup."""
+        self.print(text, soft_wrap=True, highlight=False, markup=False)

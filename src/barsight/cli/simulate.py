@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 
 from barsight.artefacts.plan import read_plan
 from barsight.calibration.boards.board import parse_board
@@ -78,19 +77,21 @@ def run(arguments: Sequence[str]) -> None:
                 simulate_passes(out, settings, lambda done, total: advance("render", done, total))
             else:
                 simulate(out, settings, lambda done, total: advance("render", done, total), laid)
-        console.print(f"simulated recording: {out}", soft_wrap=True, highlight=False, markup=False)
+        console.print_line(f"simulated recording: {out}")
 
     call(command, "simulate", arguments)
 
 
-def _photograph(out: Path, board: str, views: int, settings: SimulationSettings, console: Console) -> None:
+def _photograph(
+    out: Path, board: str, views: int, settings: SimulationSettings, console: SafeConsole
+) -> None:
     if not 1 <= views <= MAX_VIEWS:
         raise ConfigError(f"simulate: --views {views} must lie between 1 and {MAX_VIEWS}")
     with stages(console) as advance:
         photograph_board(
             out, parse_board(board), views, settings, lambda done, total: advance("board", done, total)
         )
-    console.print(f"simulated board pictures: {out}", soft_wrap=True, highlight=False, markup=False)
+    console.print_line(f"simulated board pictures: {out}")
 
 
 def _simulate_drawn(

@@ -9,7 +9,7 @@ import shutil
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -208,18 +208,22 @@ def _why_no_lifts(mode: Mode) -> str:
     return f"the run ended in mode {mode.name}: {'; '.join(mode.reasons)}"
 
 
-@contextlib.contextmanager
-def _stopped_by_signals(supervisor: Supervisor) -> Iterator[None]:
+def _stopped_by_signals(supervisor: Supervisor) -> contextlib.AbstractContextManager[None]:
     """Let Ctrl-C and SIGTERM end the run, so that what was kept is measured; a second one ends that too.
     SIGUSR1 ends the survey.
     """
+    told = {signal.SIGINT: INTERRUPTED, signal.SIGTERM: INTERRUPTED, signal.SIGUSR1: "told to end the survey"}
+    return handled_signals(told, supervisor.stop)
+
+
+@contextlib.contextmanager
+def handled_signals(told: Mapping[signal.Signals, str], take: Callable[[str], object]) -> Iterator[None]:
+    """Let `take` have what is told by each signal; other threads than the main one leave signals alone."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    told = {signal.SIGINT: INTERRUPTED, signal.SIGTERM: INTERRUPTED, signal.SIGUSR1: "told to end the survey"}
     before = {
-        number: signal.signal(number, lambda *_, because=because: supervisor.stop(because))
-        for number, because in told.items()
+        number: signal.signal(number, lambda *_, what=what: take(what)) for number, what in told.items()
     }
     try:
         yield

@@ -111,7 +111,7 @@ def run_acceptance(
             found = accept(wanted, files[1:], settings, work, advance, offset)
     write_certificate(certificate_content(found, signer, steps), out, key, has_pdf)
     print_acceptance(found)
-    console.print(f"certificate: {page}", soft_wrap=True, highlight=False, markup=False)
+    console.print_line(f"certificate: {page}")
     if not has_pdf:
         console.print("no PDF: run pip install 'barsight[acceptance]'", highlight=False, markup=False)
     return found
@@ -161,4 +161,4 @@ def _make_plan(files: tuple[Path, ...], out: Path) -> None:
         raise MeasurementError(f"{files[0]}: {made.reason}; clear more floor, or write the plan by hand")
     with atomic_path(out) as path:
         path.write_text(plan_text(made), encoding="utf-8")
-    SafeConsole(stderr=True).print(f"plan: {out}", soft_wrap=True, highlight=False, markup=False)
+    SafeConsole(stderr=True).print_line(f"plan: {out}")

@@ -35,6 +35,6 @@ def run(arguments: Sequence[str]) -> None:
         console = SafeConsole(stderr=True)
         with stages(console) as advance:
             write_paper(out, advance, quick=quick, recording=recording)
-        console.print(f"page: {out / 'paper.html'}", soft_wrap=True, highlight=False, markup=False)
+        console.print_line(f"page: {out / 'paper.html'}")
 
     call(command, "paper", arguments)

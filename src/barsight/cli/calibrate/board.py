@@ -49,6 +49,6 @@ def run(arguments: Sequence[str]) -> None:
             Image.fromarray(drawn).save(path, format=out.suffix[1:].upper(), dpi=(dpi, dpi), resolution=dpi)
         size = " x ".join(f"{side * INCH_M / dpi:.3f} m" for side in drawn.shape[::-1])
         text = f"{out}: {'how to hold it' if views else f'{size} with its margin, at {dpi} dpi'}"
-        SafeConsole(stderr=True).print(text, soft_wrap=True, highlight=False, markup=False)
+        SafeConsole(stderr=True).print_line(text)
 
     call(command, "calibrate board", arguments)

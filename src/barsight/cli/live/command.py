@@ -63,10 +63,11 @@ def run(arguments: Sequence[str]) -> None:
             surveys: Survey after survey, each in a folder of OUT: as the crane moves and stops, or replays.
         """
         console = SafeConsole(stderr=True)
-        prints = partial(console.print, soft_wrap=True, highlight=False, markup=False)
-        for_replays = speed != 1 or at != "now" or keyframes is not None
-        _expect_fitting(replay, for_replays=for_replays, surveys_of=keyframes if surveys else None)
-        with printed_aside(prints) as tell, stages(console) as advance:
+        if surveys and keyframes is not None:
+            raise ConfigError("--keyframes is for one replay, without --surveys")
+        if replay is None and (speed != 1 or at != "now" or keyframes is not None):
+            raise ConfigError("--speed, --at and --keyframes are for --replay; a crane has its own pace")
+        with printed_aside(console.print_line) as tell, stages(console) as advance:
             common: dict[str, Any] = {"magnet": magnet, "tell": tell, "advance": advance}
             if replay is not None:
                 run_replay = replay_surveys if surveys else partial(replay_recording, keyframes=keyframes)
@@ -78,14 +79,6 @@ def run(arguments: Sequence[str]) -> None:
                 measured = measure(crane, out, settings, live, **common)
         if measured:
             print_outcome(measured, console, verbose=False)
-            prints(f"report: {out / 'report.html'}")
+            console.print_line(f"report: {out / 'report.html'}")
 
     call(command, "live", arguments)
-
-
-def _expect_fitting(replay: Path | None, *, for_replays: bool, surveys_of: Path | None) -> None:
-    """Raise ConfigError for flags of another source. surveys_of: keyframes for survey after survey."""
-    if surveys_of is not None:
-        raise ConfigError("--keyframes is for one replay, without --surveys")
-    if replay is None and for_replays:
-        raise ConfigError("--speed, --at and --keyframes are for --replay; a crane has its own pace")

@@ -57,16 +57,13 @@ def run(arguments: Sequence[str]) -> None:
             hours or math.inf, warm_up_h, math.inf if faults_after_h is None else faults_after_h, seed
         )
         console = SafeConsole(stderr=True)
-
-        def tell(line: str) -> None:
-            console.print(line, soft_wrap=True, highlight=False, markup=False)
-
+        tell = console.print_line
         if replay is not None:
             found = soak_replays(replay, out, plan, bounds, flags, tell)
         else:
             assert run is not None
             found = soak_run(run, out, plan, bounds, tell)
-        SafeConsole().print(soak_table(found), soft_wrap=True, highlight=False, markup=False)
+        SafeConsole().print_line(soak_table(found))
         if wrong := [*found["broken"], *found[UNSURE]]:
             name = "bounds are broken" if found["broken"] else "not sure yet, soak longer"
             raise MeasurementError(f"{name}: {'; '.join(wrong)}")

@@ -39,7 +39,7 @@ def run(arguments: Sequence[str]) -> None:
         write_explanation(told, target)
         console = SafeConsole()
         _print(told, console)
-        console.print(f"page: {target}", soft_wrap=True, highlight=False, markup=False)
+        console.print_line(f"page: {target}")
 
     call(command, "explain", arguments)
 

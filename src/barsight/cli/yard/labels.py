@@ -59,7 +59,7 @@ def run(arguments: Sequence[str]) -> None:
             found = read_labels(source, out, listed, settings, lambda: advance("labels", next(done), total))
         target = write_labels(found, out)
         _print(found, console)
-        console.print(f"labels: {target}", soft_wrap=True, highlight=False, markup=False)
+        console.print_line(f"labels: {target}")
 
     call(command, "labels", arguments)
 

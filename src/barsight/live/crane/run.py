@@ -104,11 +104,8 @@ def replay_surveys(
     """Measure a recording over and over, each time into a folder in `out`, until Ctrl-C or SIGTERM; the
     newest few are kept. Raises a BarsightError where the first time fails.
     """
-    request, ended, is_first = (
-        LiftRequest(None if magnet is None else load_magnet(magnet), judged_at),
-        "",
-        True,
-    )
+    request = LiftRequest(None if magnet is None else load_magnet(magnet), judged_at)
+    ended, is_first = "", True
     while ended != INTERRUPTED:
         here = out / datetime.now(UTC).strftime(STAMP)
         run = begin_replay(path, here, settings, live, speed, tell)

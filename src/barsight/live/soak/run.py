@@ -8,13 +8,14 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from barsight.core.errors import ConfigError, InputError, MeasurementError
 from barsight.core.files import expect_empty, translated_os_errors
+from barsight.live.run import INTERRUPTED, handled_signals
 from barsight.live.soak.faults import RandomKills
 from barsight.live.soak.processes import PROC
 from barsight.live.soak.report import SoakBounds, soak_content, write_soak
@@ -56,21 +57,13 @@ def soak_replays(
     surveys = out / "surveys"
     with translated_os_errors(out):
         out.mkdir(parents=True, exist_ok=True)
-    command = [
-        sys.executable,
-        "-m",
-        "barsight",
-        "live",
-        "--replay",
-        str(replay),
-        "--surveys",
-        "-o",
-        str(surveys),
-    ]
+    command = [sys.executable, "-m", "barsight", "live", "--replay", str(replay), "--surveys"]
     log = out / "run.log"
     with log.open("wb") as stream:
         # A session of its own: Ctrl-C is the soak's, which then ends the run.
-        run = subprocess.Popen([*command, *flags], stdout=stream, stderr=stream, start_new_session=True)
+        run = subprocess.Popen(
+            [*command, "-o", str(surveys), *flags], stdout=stream, stderr=stream, start_new_session=True
+        )
     try:
         content = _soak(RunWatch(surveys, run.pid), out, plan, bounds, tell, lambda: run.poll() is None)
         if run.poll() is not None:
@@ -114,7 +107,7 @@ def _soak(
 ) -> dict[str, Any]:  # fmt: skip
     """Sample, kill and write until it is over."""
     sample_at = write_at = 0.0
-    told: list[int] = []
+    told: list[str] = []
 
     def rest(seconds: float) -> None:
         nonlocal sample_at
@@ -132,7 +125,9 @@ def _soak(
         write_soak(content, out)
         return content
 
-    with _told_by_signals(told), contextlib.suppress(_ToldError):
+    # Ctrl-C and SIGTERM end the soak as its time does, so that all is written.
+    ends = dict.fromkeys((signal.SIGINT, signal.SIGTERM), INTERRUPTED)
+    with handled_signals(ends, told.append), contextlib.suppress(_ToldError):
         tell(f"soaking; {out / 'soak.md'} has the table, each minute anew; Ctrl-C ends it")
         while watch.seconds < plan.hours * S_PER_H and is_there():
             rest(POLL_S)
@@ -146,18 +141,6 @@ def _soak(
 
 class _ToldError(Exception):
     """The soak was told to end."""
-
-
-@contextlib.contextmanager
-def _told_by_signals(told: list[int]) -> Iterator[None]:
-    """Let Ctrl-C and SIGTERM end the soak as its time does, so that all is written; `told` takes them."""
-    numbers = signal.SIGINT, signal.SIGTERM
-    before = [signal.signal(number, lambda number, _: told.append(number)) for number in numbers]
-    try:
-        yield
-    finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)
 
 
 def _end(run: subprocess.Popen[bytes]) -> None:
