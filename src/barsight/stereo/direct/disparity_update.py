@@ -29,8 +29,8 @@ cost: measured on rendered planes. What noise in the slopes costs grows with wha
 _MIN_INFORMATION = np.float32(0.5)
 
 _MAX_NOISIER, _DAMPED = np.float32(1.5), np.float32(6)
-"""What steps fall short of counts as noise up to here, measured on rendered planes. Beyond, a sixth of it is
-taken off again, measured on rendered bars: a step that is short by half damps its own noise."""
+"""Gain of a step up to which its shortfall counts as noise, by rendered planes. Beyond, a sixth of it is
+taken off again, by rendered bars: a step that is short by half damps its own noise."""
 
 Fit = tuple[Float32, Float32]
 """A fitted disparity and its information, (H, W)."""
