@@ -94,6 +94,16 @@ def test_a_strip_between_bars_hides_nothing_but_a_wide_one_does(wide_m: float, v
     assert ("unknown-under-footprint" in found(heights)) == vetoed
 
 
+@pytest.mark.parametrize(("cells", "vetoed"), [(3, False), (4, True)])
+def test_beside_the_load_what_wrong_lines_of_sight_leave_of_a_post_forbids(cells: int, vetoed: bool) -> None:
+    post = with_block((0.46, 0.53), (1.0, 1.07), None, TOP_M - 0.1)
+    assert found(post) == set()
+    assert post.free_m is not None
+    row, column = (int(abs(axis - at).argmin()) for axis, at in ((post.y_m, 1.02), (post.x_m, 0.48)))
+    post.free_m[row : row + cells, column : column + cells] = np.inf
+    assert found(post) == ({"unknown-under-footprint"} if vetoed else set())
+
+
 def test_a_map_that_ends_beside_the_magnet_is_unseen_there() -> None:
     heights = map_of([laid(0.3)], x_m=(-1.5, 0.4))
     assert "unknown-under-footprint" in found(heights)

@@ -87,9 +87,14 @@ def plain_obstacle(heights: HeightMap, place: Placement, load: Laid) -> tuple[st
             return "obstructed", 1e3 * (smooth + spare).ravel()[highest], xy[large]
     label, _ = ndimage.label(~blocked)
     unproven = blocked | (np.bincount(label.ravel()) < 4)[label]
-    hidden = ndimage.binary_opening(unproven, np.ones((6, 6))) & under
+    over, beside = (ndimage.binary_opening(unproven, np.ones((side, side))) for side in (6, 4))
+    hidden = (over | beside & ~over_load) & under
     if hidden.any():
-        return "unknown-under-footprint", 1e3 * max(0.06, 0.01 * math.sqrt(hidden.sum())), xy[hidden]
+        patch, _ = ndimage.label(hidden, EIGHT)
+        largest = patch == 1 + np.argmax(np.bincount(patch.ravel())[1:])
+        bound_m = 0.06 if over_load[largest].any() else 0.04
+        width_m = max(bound_m, 0.01 * math.sqrt(largest.sum()))
+        return "unknown-under-footprint", 1e3 * width_m, xy[hidden]
     return None
 
 

@@ -12,10 +12,11 @@ from scipy import ndimage
 
 from barsight.core.errors import ConfigError
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.thin_bars import thin_bar_checks
-from barsight.yard.thin_lines import BESIDE_RATIO, MAX_STRENGTH, _line_strengths, find_thin_line
-from barsight.yard.types import HeightMap
-from lift_yards import SETTINGS, codes, judged, laid, map_of, record
+from barsight.yard.lifting.thin_bars import beside_checks, thin_bar_checks
+from barsight.yard.magnet.footprint import Placement
+from barsight.yard.thin_lines import BESIDE_RATIO, MAX_STRENGTH, ThinLine, _line_strengths, find_thin_lines
+from barsight.yard.types import Bundle, HeightMap
+from lift_yards import MAGNET, SETTINGS, codes, judged, laid, map_of, record
 
 STOCK = [laid(0.0), laid(0.45)]
 HALF_M = STOCK[0].width_m / 2
@@ -57,10 +58,15 @@ def photo(
     return replace(heights, tops=noisy)
 
 
+def strongest(heights: HeightMap, bundle: Bundle) -> ThinLine | None:
+    lines = find_thin_lines(heights, bundle)
+    return None if lines is None else lines[0]
+
+
 @pytest.mark.parametrize(("bar_m", "slope"), [(0.016, 0.0), (0.016, 0.3), (0.02, -0.8), (0.025, 0.05)])
 def test_a_thin_bar_across_the_load_is_found_where_it_lies(bar_m: float, slope: float) -> None:
     for seed in range(2):
-        line = find_thin_line(photo(seed, bar_m, slope), LOAD[0])
+        line = strongest(photo(seed, bar_m, slope), LOAD[0])
         assert line is not None and line.strength > MAX_STRENGTH
         assert abs(line.along_m + 0.6) < 0.025
         assert line.askew_deg == pytest.approx(math.degrees(math.atan(slope)), abs=4.0)
@@ -70,12 +76,12 @@ def test_straps_dunnage_and_a_bar_that_lies_along_are_no_bar_across() -> None:
     for seed in range(2):
         for heights in (photo(seed), photo(seed, 0.02, along=True)):
             for bundle in (LOAD[0], record(STOCK[1], 1)):
-                line = find_thin_line(heights, bundle)
+                line = strongest(heights, bundle)
                 assert line is not None and line.strength < MAX_STRENGTH
 
 
 def test_a_bar_that_ends_on_the_load_is_found() -> None:
-    line = find_thin_line(photo(5, 0.02, to_m=0.1), LOAD[0])
+    line = strongest(photo(5, 0.02, to_m=0.1), LOAD[0])
     assert line is not None and line.strength > MAX_STRENGTH
 
 
@@ -83,15 +89,52 @@ def test_a_lift_onto_a_thin_bar_is_vetoed_and_one_onto_straps_is_not() -> None:
     assert codes(judged(STOCK, heights=photo(0))) == set()
     lift = judged(STOCK, heights=photo(0, 0.02, 0.1))
     assert codes(lift) == {"thin-bar"}
-    (failed,) = [check for check in lift.checks if check.result == "failed"]
-    assert (
-        failed.value is not None and failed.bound == MAX_STRENGTH and "across the load -0.6" in failed.reason
-    )
+    failed, beside = (check for check in lift.checks if check.result == "failed")
+    assert failed.value is not None and failed.bound == MAX_STRENGTH
+    assert "across the load -0.6" in failed.reason and "across bundle 1 -0.56" in beside.reason
+
+
+def test_all_lines_across_are_found_the_strongest_first() -> None:
+    one, other = photo(0, 0.02), photo(0, 0.016, at_m=1.9)
+    assert one.tops is not None and other.tops is not None
+    rows = one.y_m > 0.6
+    one.tops[rows] = other.tops[rows]
+    lines = find_thin_lines(one, LOAD[0])
+    assert lines is not None
+    over = [line for line in lines if line.strength > MAX_STRENGTH]
+    assert sorted(round(line.along_m, 1) for line in over) == [-0.6, 1.9]
+    strengths = [line.strength for line in lines]
+    assert strengths == sorted(strengths, reverse=True)
+
+
+@pytest.mark.parametrize(("gap_m", "vetoed"), [(0.2, True), (0.5, False)])
+def test_a_bar_across_a_neighbour_that_may_reach_under_the_magnet_forbids(gap_m: float, vetoed: bool) -> None:
+    place, half = Placement(0.0, 0.0, 0.0), MAGNET.size_m[0] / 2
+    neighbour = record(laid(half + gap_m + HALF_M + 0.05), 7)
+    line = ThinLine(12.0, -0.6, 0.0)
+    (check,) = beside_checks(place, MAGNET, ((neighbour, (line,)),))
+    assert (check.result == "failed") == vetoed
+    if vetoed:
+        assert "bundle 7 -0.60 m along it" in check.reason
+    # Beyond the magnet's end it does no harm, nor does what isn't sure to be a line.
+    for harmless in (replace(line, along_m=3.4), replace(line, strength=MAX_STRENGTH - 0.1)):
+        (check,) = beside_checks(place, MAGNET, ((neighbour, (harmless,)),))
+        assert check.result == "passed"
+
+
+def test_a_lift_beside_a_neighbour_with_a_bar_over_its_flank_is_vetoed() -> None:
+    heights = photo(0, 0.02, to_m=0.7)
+    assert heights.tops is not None
+    clear = photo(0)
+    assert clear.tops is not None
+    on_load = abs(heights.x_m) < HALF_M + 0.02
+    heights.tops[:, on_load] = clear.tops[:, on_load]
+    assert codes(judged(STOCK, heights=heights)) == {"thin-bar"}
 
 
 def test_without_a_photo_nobody_knows() -> None:
     heights = map_of(STOCK)
-    assert find_thin_line(heights, LOAD[0]) is None
+    assert find_thin_lines(heights, LOAD[0]) is None
     (unknown,) = thin_bar_checks(heights, None, LOAD, PIXEL_M, SETTINGS)
     assert (unknown.code, unknown.result) == ("thin-bar", "unknown")
     # A map that no pictures made is taken as it is.
@@ -99,12 +142,12 @@ def test_without_a_photo_nobody_knows() -> None:
     seen = photo(0)
     assert seen.tops is not None
     seen.tops[np.abs(seen.y_m) < 1.0] = 0
-    assert find_thin_line(seen, LOAD[0]) is None
+    assert strongest(seen, LOAD[0]) is None
 
 
 def test_pictures_too_coarse_to_show_a_bar_forbid() -> None:
     heights = photo(0)
-    line = find_thin_line(heights, LOAD[0])
+    line = strongest(heights, LOAD[0])
     results = {
         pixel_m: thin_bar_checks(heights, line, LOAD, pixel_m, SETTINGS)[1].result
         for pixel_m in (0.005, PIXEL_M, 0.014, math.nan)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from scipy.ndimage import maximum_filter1d
 
 from barsight.core.arrays import Float32, Float64, Int64, kernel
 from barsight.core.linalg.robust import known_median, mad_sigma, running_median
@@ -39,6 +40,8 @@ HIGHLIGHT_LOG, FADE_LOG = 0.3, 0.4
 BESIDE_END_M = 0.12
 """Rows nearer to an end tell nothing: what lies before it shows there."""
 MIN_SEEN_RATIO = 0.8
+APART_M = 0.1
+"""Lines nearer to each other along a bundle are one."""
 _SLOPES = np.r_[np.arange(-1.2, -0.5, 0.05), np.arange(-0.5, 0.501, 0.02), np.arange(0.55, 1.21, 0.05)]
 _ROW_SIGMAS = np.float32(math.sqrt(3.0))
 """Neighbouring columns of the photo share their pixels: a row's sum scatters more by this."""
@@ -46,7 +49,7 @@ _ROW_SIGMAS = np.float32(math.sqrt(3.0))
 
 @dataclass(frozen=True)
 class ThinLine:
-    """The strongest line across a bundle. strength: its contrast in sigmas. along_m: where it crosses the
+    """A line across a bundle. strength: its contrast in sigmas. along_m: where it crosses the
     axis, from the middle. askew_deg: its angle from square to the axis.
     """
 
@@ -55,25 +58,32 @@ class ThinLine:
     askew_deg: float
 
 
-def find_thin_line(heights: HeightMap, bundle: Bundle) -> ThinLine | None:
-    """Find the strongest line across a bundle in the top photo; None where too little of it is seen."""
+def find_thin_lines(heights: HeightMap, bundle: Bundle) -> tuple[ThinLine, ...] | None:
+    """Find the strongest line across a bundle in the top photo, then all others over MAX_STRENGTH; None where
+    too little of it is seen.
+    """
     found = line_strengths(heights, bundle)
     if found is None:
         return None
     along, strength = found
-    number, row = np.unravel_index(int(strength.argmax()), strength.shape)
-    askew_deg = math.degrees(math.atan(_SLOPES[number]))
-    return ThinLine(float(strength[number, row]), float(along[row]), askew_deg)
+    number, best = strength.argmax(axis=0), strength.max(axis=0)
+    peaks = best == maximum_filter1d(best, 2 * round(APART_M / STEP_M) + 1)
+    peaks &= best >= min(MAX_STRENGTH, best.max())
+    rows = np.flatnonzero(peaks)
+    return tuple(
+        ThinLine(float(best[row]), float(along[row]), math.degrees(math.atan(_SLOPES[number[row]])))
+        for row in rows[np.argsort(-best[rows], kind="stable")]
+    )
 
 
 def with_thin_lines(bundle: Bundle, heights: HeightMap) -> Bundle:
     """Return a bundle that says so where a line runs across it; dunnage that heights show is left out."""
     if heights.tops is None or any(KNOWN_ACROSS in reason for reason in bundle.reasons):
         return bundle
-    line = find_thin_line(heights, bundle)
-    if line is None or line.strength < MAX_STRENGTH:
+    lines = find_thin_lines(heights, bundle)
+    if lines is None or lines[0].strength < MAX_STRENGTH:
         return bundle
-    reason = f"a line runs across it {line.along_m:+.2f} m from its middle: a thin bar may lie over it"
+    reason = f"a line runs across it {lines[0].along_m:+.2f} m from its middle: a thin bar may lie over it"
     return replace(bundle, reasons=(*bundle.reasons, reason))
 
 

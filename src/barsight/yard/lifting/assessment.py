@@ -23,7 +23,7 @@ from barsight.yard.lifting.checks import (
 from barsight.yard.lifting.clearance import FacePlane, clearance_checks, find_obstacle, resting_checks
 from barsight.yard.lifting.labels import label_checks
 from barsight.yard.lifting.set_down import SetDown
-from barsight.yard.lifting.thin_bars import thin_bar_checks
+from barsight.yard.lifting.thin_bars import beside_checks, thin_bar_checks
 from barsight.yard.lifting.travel_accuracy import Travel, target_covariance, travel_checks
 from barsight.yard.lifting.validity import Validity, age_checks, disturbed_checks, validity
 from barsight.yard.magnet.contact import NEWTON_PER_KG, Contact, rest_magnet
@@ -40,7 +40,7 @@ from barsight.yard.magnet.holding import WeakestPole, hold_load, share_checks, w
 from barsight.yard.magnet.partings import without_parted
 from barsight.yard.magnet.reach import reached_strips
 from barsight.yard.stability.stability import Footing, footing_checks, nearest_cells
-from barsight.yard.thin_lines import ThinLine, find_thin_line
+from barsight.yard.thin_lines import ThinLine, find_thin_lines
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Check, Veto, check_min, check_true, vetoes_of
 from barsight.yard.weight import Mass, bundle_mass, load_centre
@@ -63,15 +63,18 @@ class LiftScene:
     events: tuple[YardEvent, ...] = ()
 
     @cached_property
-    def _thin_lines(self) -> dict[int, ThinLine | None]:
+    def _thin_lines(self) -> dict[int, tuple[ThinLine, ...] | None]:
         return {}
 
+    def thin_lines(self, bundle: Bundle) -> tuple[ThinLine, ...] | None:
+        """Return the lines across a bundle, the strongest first; None where too little of it is seen."""
+        if bundle.id not in self._thin_lines:
+            self._thin_lines[bundle.id] = find_thin_lines(self.heights, bundle)
+        return self._thin_lines[bundle.id]
+
     def thin_line(self, load: tuple[Bundle, ...]) -> ThinLine | None:
-        """Return the strongest line across a load, looked for once a bundle; None where one isn't seen."""
-        for bundle in load:
-            if bundle.id not in self._thin_lines:
-                self._thin_lines[bundle.id] = find_thin_line(self.heights, bundle)
-        lines = [line for bundle in load if (line := self._thin_lines[bundle.id]) is not None]
+        """Return the strongest line across a load; None where one of its bundles isn't seen."""
+        lines = [found[0] for bundle in load if (found := self.thin_lines(bundle)) is not None]
         return max(lines, key=lambda line: line.strength) if lines and len(lines) == len(load) else None
 
 
@@ -154,6 +157,8 @@ def assess_placement(
         checks += label_checks(place, yard.heights, magnet, FacePlane.of(contact))
         pixel_m = yard.travel.pixel_m(contact.centre_z_m) if yard.travel else None
         checks += thin_bar_checks(yard.heights, yard.thin_line(load), load, pixel_m, settings)
+        beside = tuple((b, yard.thin_lines(b) or ()) for b in near.bundles if b not in load)
+        checks += beside_checks(place, magnet, beside)
     scale = 0.0
     if search and not vetoes_of(checks):
         scale, end = _tolerance(place, yard, magnet, near, held, needed, contact, settings)

@@ -37,7 +37,7 @@ MAX_ALONG_DEG, MAX_ACROSS_DEG = 2.0, 3.0
 MAX_HOLE_M, HOLE_DEPTH_M = 0.14, 0.15
 """Gullies narrower than this between bars are no holes, and dunnage bridges them; nor are shallow ones."""
 _HOLE_STEPS = round(MAX_HOLE_M / STEP_M) | 1
-MAX_UNSEEN_CELLS = 4
+MAX_UNSEEN_CELLS = 3
 """An unseen place narrower than so many steps hides nothing that stands."""
 UNSEEN_REACH_CELLS = 9
 MAX_RISE_M = 0.03

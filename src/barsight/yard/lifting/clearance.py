@@ -39,8 +39,10 @@ MIN_PATCH_CELLS = 4
 EDGE_SIGMA_M = 0.003
 """How well a cell of STEP_M tells the edge of what it shows."""
 MAX_HOLE_M = 0.06
-"""An unseen place narrower than this is taken to hide nothing that stands."""
-_HOLE_CELLS = round(MAX_HOLE_M / STEP_M)
+"""An unseen place narrower than this, over the load, is taken to hide nothing that stands."""
+MAX_HOLE_BESIDE_M = 0.04
+"""The same beside the load: about a post, wrong matches prove its rim free."""
+_HOLE_CELLS, _HOLE_BESIDE_CELLS = round(MAX_HOLE_M / STEP_M), round(MAX_HOLE_BESIDE_M / STEP_M)
 _UNKNOWN, _FILLED = HeightSource.UNKNOWN, HeightSource.FILLED
 _BEAM_ONLY = 2
 _NO_BOUNDS = np.empty((0, 0), np.float32)
@@ -122,10 +124,11 @@ def find_obstacle(
         np.array([heights.x0_m, heights.y0_m, heights.cell_m]), region.x_m, region.y_m, region.frame, plane,
         region.parts, region.under,
     )  # fmt: skip
-    beside = (region.under == _BEAM_ONLY) & ~_over(load, region)
+    beside = ~_over(load, region)
+    spare = region.parts[-1, 4] - MAX_RISE_M
+    spares = np.where(beside & (region.under == _BEAM_ONLY), np.float32(spare), np.float32(0))
     np.minimum(region.under, 1, out=region.under)
-    spare = np.where(beside, np.float32(region.parts[-1, 4] - MAX_RISE_M), np.float32(0))
-    return _obstructed(_filled(rise, most) - spare, spare, region) or _unseen(blocked, region)
+    return _obstructed(_filled(rise, most) - spares, spares, region) or _unseen(blocked, beside, region)
 
 
 @kernel()
@@ -242,28 +245,33 @@ def _obstructed(rise: Float32, spare: Float32, region: Region) -> Obstacle | Non
     return None
 
 
-def _unseen(blocked: UInt8, region: Region) -> Obstacle | None:
+def _unseen(blocked: UInt8, beside: Bool, region: Region) -> Obstacle | None:
     """Find places, unproven or standing, that are wide enough to hide what stands. blocked: (V, U); a few
-    cells free among them, as wrong matches are, prove nothing.
+    cells free among them, as wrong matches are, prove nothing. beside: (V, U), that no load lies there.
     """
     # Three to either side prove something: with what is narrower closed over, the most is hidden.
-    most = wide_parts(cv2.morphologyEx(blocked, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)), _HOLE_CELLS)
-    if not (most & region.under).any():
+    closed = cv2.morphologyEx(blocked, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    if not (wide_parts(closed, _HOLE_BESIDE_CELLS) & region.under).any():
         return None
     _, patch, boxes, _ = cv2.connectedComponentsWithStats(1 - blocked, connectivity=4)
     unproven = blocked.astype(np.bool_) | (boxes[:, cv2.CC_STAT_AREA] < MIN_PATCH_CELLS)[patch]
-    hidden = wide_parts(unproven, _HOLE_CELLS) & region.under
+    hidden = wide_parts(unproven, _HOLE_CELLS) | (wide_parts(unproven, _HOLE_BESIDE_CELLS) & beside)
+    hidden &= region.under
     if not hidden.any():
         return None
-    xy, grid = region.places(np.nonzero(hidden))
+    _, patch, boxes, _ = cv2.connectedComponentsWithStats(hidden, connectivity=8)
+    largest = patch == 1 + int(np.argmax(boxes[1:, cv2.CC_STAT_AREA]))
+    _, grid = region.places(np.nonzero(largest))
     along, across = grid.mean(axis=0)
-    area_m2 = STEP_M**2 * len(xy)
+    area_m2 = STEP_M**2 * len(grid)
+    bound_m = MAX_HOLE_BESIDE_M if beside[largest].all() else MAX_HOLE_M
     reason = (
         f"{1e4 * area_m2:.0f} cm2 under the magnet or beside it were not seen, around "
         f"{along:+.2f} m along and {across:+.2f} m across the beam: what is not known counts as an obstacle"
     )
-    width_mm = 1e3 * max(MAX_HOLE_M, math.sqrt(area_m2))
-    return Obstacle("unknown-under-footprint", reason, width_mm, 1e3 * MAX_HOLE_M, xy)
+    width_mm = 1e3 * max(bound_m, math.sqrt(area_m2))
+    places = region.places(np.nonzero(hidden))[0]
+    return Obstacle("unknown-under-footprint", reason, width_mm, 1e3 * bound_m, places)
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
+from barsight.core.arrays import Float64
 from barsight.yard.lift_settings import LiftSettings
+from barsight.yard.lifting.clearance import STRAY_FIELD_M
+from barsight.yard.magnet.description import Magnet
+from barsight.yard.magnet.footprint import Placement
 from barsight.yard.thin_lines import MAX_STRENGTH, ThinLine
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Check, check_max, check_true
@@ -12,6 +18,9 @@ from barsight.yard.vetoes import Check, check_max, check_true
 CODE = "thin-bar"
 FOUND_PX = 1.8
 """Diameter of a bar, in the photo's pixels, from which on nine of ten are found."""
+BEYOND_M = 0.4
+"""So far beyond a bundle's flank a bar that lies across it may stick out."""
+WAY_STEP_M = 0.02
 
 
 def thin_bar_checks(
@@ -50,3 +59,44 @@ def thin_bar_checks(
             )
         )  # fmt: skip
     return checks
+
+
+def beside_checks(
+    place: Placement, magnet: Magnet, near: tuple[tuple[Bundle, tuple[ThinLine, ...]], ...]
+) -> list[Check]:
+    """Check that no thin bar that lies across a neighbour reaches under the magnet.
+
+    In the air beyond its bundle's flank nothing shows such a bar: the map has what lies below it. near: the
+    bundles about the load, and the lines across each.
+    """
+    if not near:
+        return []
+    slack = abs(np.stack([place.along, place.across])) @ (magnet.tolerance.x_m, magnet.tolerance.y_m)
+    half = np.array([magnet.size_m[1], magnet.size_m[0]]) / 2 + slack + STRAY_FIELD_M
+    half += math.radians(magnet.tolerance.yaw_deg) * half[::-1]
+    strongest, where = 0.0, ""
+    for bundle, line in ((bundle, line) for bundle, lines in near for line in lines):
+        if line.strength <= strongest:
+            continue
+        way = _beyond_flanks(bundle, line) - (place.x_m, place.y_m)
+        under = (np.abs(way @ place.along) <= half[0]) & (np.abs(way @ place.across) <= half[1])
+        if under.any():
+            strongest = line.strength
+            where = f"a line runs across bundle {bundle.id} {line.along_m:+.2f} m along it from its middle"
+    return [
+        check_max(
+            CODE, "strength of the strongest line across a neighbour that runs on to under the magnet",
+            strongest, MAX_STRENGTH, "sigma", f"{where}: a thin bar may reach from there under the magnet",
+        )
+    ]  # fmt: skip
+
+
+def _beyond_flanks(bundle: Bundle, line: ThinLine) -> Float64:
+    """Return places (N, 2) on a line across a bundle, up to BEYOND_M beyond either flank, yard axes."""
+    along = np.array([-math.sin(bundle.yaw_rad), math.cos(bundle.yaw_rad)])
+    across = np.array([along[1], -along[0]])
+    askew = math.radians(line.askew_deg)
+    way = math.cos(askew) * across + math.sin(askew) * along
+    reach = (bundle.width_m / 2 + BEYOND_M) / math.cos(askew)
+    steps = np.linspace(-reach, reach, math.ceil(2 * reach / WAY_STEP_M) + 1)
+    return np.asarray(bundle.centre_m[:2] + line.along_m * along + steps[:, None] * way)
