@@ -66,10 +66,9 @@ def soak_content(
 
 
 def _figures(role: str, one: Watched, watch: RunWatch, warm_s: float) -> dict[str, Any]:
-    of_peaks = role not in LASTING
-    memory, descriptors = (
-        figure.trend(warm_s, watch.survey_s, of_peaks=of_peaks) for figure in (one.rss_mib, one.descriptors)
-    )
+    memory = one.rss_mib.trend(warm_s, watch.survey_s, of_peaks=role not in LASTING)
+    # Between two surveys the command has fewer for an instant, which a sample meets by chance.
+    descriptors = one.descriptors.trend(warm_s, watch.survey_s, of_peaks=True)
     return {
         "memory_mib": {"first": one.rss_mib.first, "last": one.rss_mib.last, "max": one.rss_mib.peak},
         "slope_mib_per_h": None if memory is None else memory.per_h,
