@@ -69,7 +69,9 @@ def plain_obstacle(heights: HeightMap, place: Placement, load: Laid) -> tuple[st
     near = tuple(slice(at.min() - 20, at.max() + 21) for at in np.nonzero(under))
     cut = z, free, xy, level, over_faces, under
     z, free, xy, level, over_faces, under = (a[near] for a in cut)
-    over_load = (abs(xy[..., 0] - load.x_m) <= load.width_m / 2) & (abs(xy[..., 1]) <= load.length_m / 2)
+    half = np.array([load.width_m, load.length_m]) / 2
+    off_load = abs(xy - (load.x_m, 0.0)) - half
+    over_load, at_load = ((off_load <= margin).all(axis=-1) for margin in (0.0, 0.03))
     rise, most = (z - level).astype(np.float32), (free - level).astype(np.float32)
     above_m = MAGNET.beam.above_faces_m - BEAM_CLEAR_M
     allowed = np.where(over_faces, MAX_RISE_M, above_m)
@@ -88,11 +90,11 @@ def plain_obstacle(heights: HeightMap, place: Placement, load: Laid) -> tuple[st
     label, _ = ndimage.label(~blocked)
     unproven = blocked | (np.bincount(label.ravel()) < 4)[label]
     over, beside = (ndimage.binary_opening(unproven, np.ones((side, side))) for side in (6, 4))
-    hidden = (over | beside & ~over_load) & under
+    hidden = (over | beside & ~at_load) & under
     if hidden.any():
         patch, _ = ndimage.label(hidden, EIGHT)
         largest = patch == 1 + np.argmax(np.bincount(patch.ravel())[1:])
-        bound_m = 0.06 if over_load[largest].any() else 0.04
+        bound_m = 0.06 if at_load[largest].any() else 0.04
         width_m = max(bound_m, 0.01 * math.sqrt(largest.sum()))
         return "unknown-under-footprint", 1e3 * width_m, xy[hidden]
     return None

@@ -42,6 +42,8 @@ MAX_HOLE_M = 0.06
 """An unseen place narrower than this, over the load, is taken to hide nothing that stands."""
 MAX_HOLE_BESIDE_M = 0.04
 """The same beside the load: about a post, wrong matches prove its rim free."""
+FLANK_M = 0.03
+"""So near to the load its own flank is what isn't seen."""
 _HOLE_CELLS, _HOLE_BESIDE_CELLS = round(MAX_HOLE_M / STEP_M), round(MAX_HOLE_BESIDE_M / STEP_M)
 _UNKNOWN, _FILLED = HeightSource.UNKNOWN, HeightSource.FILLED
 _BEAM_ONLY = 2
@@ -124,10 +126,11 @@ def find_obstacle(
         np.array([heights.x0_m, heights.y0_m, heights.cell_m]), region.x_m, region.y_m, region.frame, plane,
         region.parts, region.under,
     )  # fmt: skip
-    beside = ~_over(load, region)
     spare = region.parts[-1, 4] - MAX_RISE_M
-    spares = np.where(beside & (region.under == _BEAM_ONLY), np.float32(spare), np.float32(0))
+    passed_over = (region.under == _BEAM_ONLY) & ~_over(load, region)
+    spares = np.where(passed_over, np.float32(spare), np.float32(0))
     np.minimum(region.under, 1, out=region.under)
+    beside = ~_over(load, region, FLANK_M)
     return _obstructed(_filled(rise, most) - spares, spares, region) or _unseen(blocked, beside, region)
 
 
@@ -183,14 +186,14 @@ def _filled(rise: Float32, max_rise: Float32) -> Float32:
     return np.where(unseen, np.fmin(highest, max_rise), rise)
 
 
-def _over(load: tuple[Bundle, ...], region: Region) -> Bool:
-    """Mark the cells (V, U) over the load's outline; all where no load is known."""
+def _over(load: tuple[Bundle, ...], region: Region, margin_m: float = 0.0) -> Bool:
+    """Mark the cells (V, U) over the load's outline and in a margin; all where no load is known."""
     over = np.full(region.under.shape, not load)
     for bundle in load:
         dx, dy = region.x_m - bundle.centre_m[0], region.y_m[:, None] - bundle.centre_m[1]
         sin, cos = math.sin(bundle.yaw_rad), math.cos(bundle.yaw_rad)
-        inside = np.abs(cos * dx + sin * dy) <= bundle.width_m / 2
-        over |= inside & (np.abs(cos * dy - sin * dx) <= bundle.length_m / 2)
+        inside = np.abs(cos * dx + sin * dy) <= bundle.width_m / 2 + margin_m
+        over |= inside & (np.abs(cos * dy - sin * dx) <= bundle.length_m / 2 + margin_m)
     return over
 
 
