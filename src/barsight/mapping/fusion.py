@@ -52,7 +52,7 @@ def fuse_view(store: TileStore, view: CellObservations, settings: MapSettings) -
     store.hold(edges.size)
 
 
-@kernel()
+@kernel(borrows=True)
 def _vote(
     tile: Float32,
     members: Int64,
@@ -101,7 +101,7 @@ def _vote(
         slots[target, CENTRAL] = central[m]
 
 
-@kernel()
+@kernel(borrows=True)
 def _choose_slots(
     slots: Float32, z: float, variance: float, shared: float, gate_sigma: float, min_gate: float
 ) -> tuple[int, int]:
