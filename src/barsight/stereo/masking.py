@@ -39,15 +39,23 @@ def mask_unsure(disparity: Disparity, max_sigma_px: float) -> Disparity:
 
 def mask_disparity(disparity: Disparity, kept: Bool) -> Disparity:
     """Mask all that is not `kept` (H, W)."""
-    masked = np.empty((2, *kept.shape), np.float32)
-    _mask(np.ascontiguousarray(disparity.disparity_px), kept, masked[0])
-    _mask(np.ascontiguousarray(disparity.sigma_px), kept, masked[1])
-    return replace(disparity, disparity_px=masked[0], sigma_px=masked[1])
+    return replace(
+        disparity,
+        disparity_px=mask_values(disparity.disparity_px, kept),
+        sigma_px=mask_values(disparity.sigma_px, kept),
+    )
+
+
+def mask_values(values: Float32, kept: Bool) -> Float32:
+    """Mask by NaN all values (H, W) that aren't `kept`, as `np.where` does in three times the time."""
+    masked = np.empty(values.shape, np.float32)
+    _mask(np.ascontiguousarray(values), kept, masked)
+    return masked
 
 
 @kernel()
 def _mask(values: Float32, kept: Bool, masked: Float32) -> None:
-    """Fill masked (H, W) with values, NaN where not kept, as `np.where` does in three times the time."""
+    """Fill masked (H, W) with values, NaN where not kept."""
     for i in range(values.shape[0]):
         row, held, out = values[i], kept[i], masked[i]
         for j in range(len(row)):
