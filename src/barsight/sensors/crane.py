@@ -171,7 +171,11 @@ class CraneSource:
                 f"{name}_jitter_ns": clock.jitter_ns, f"{name}_jumps": clock.jumps,
                 f"{name}_lost": stream.lost,
             }  # fmt: skip
-        signs |= {f"{name}_torn": receiver.torn for name, receiver in self._receivers.items()}
+        for name, receiver in self._receivers.items():
+            signs |= {
+                f"{name}_torn": receiver.torn, f"{name}_overtaken": receiver.sequence.overtaken,
+                f"{name}_restarts": receiver.sequence.restarts,
+            }  # fmt: skip
         for number, camera in enumerate(self._cameras):
             signs[f"cam{number}_connects"] = camera.connects
         return signs
