@@ -218,7 +218,7 @@ def _ptp(told: list[str]) -> Finding:
     return Finding(
         "PTP of the cameras", " and ".join(one or "none told" for one in told),
         "none, offset and drift are estimated from the stamps; Slave and Slave: one clock",
-        "" if is_one else "to have one clock, enable PTP in both cameras and keep them on one master's network",
+        "" if is_one else "to have one clock, enable PTP in both cameras and give their network one master",
         is_one or None,
     )  # fmt: skip
 
