@@ -147,7 +147,8 @@ def prepare(
 ) -> tuple[float, list[tuple[float, float]]]:
     """Write what cameras and player play: the recording there and back, standing at both ends.
 
-    Turned back in time, places and accelerations stay what they are and turn rates change their sign.
+    Turned back in time, places and accelerations stay what they are and turn rates change their sign, but for
+    the gyro's bias: one that turned round too would, by gravity, be an acceleration that no encoder follows.
     Returns the period (s) and when the crane goes at speed.
     """
     crane, imu = recording.crane(), recording.imu()
@@ -160,13 +161,16 @@ def prepare(
     half_s = (last_ns - zero_ns) / 1e9
     held = {"period_s": np.array(2 * half_s)}
     values = {"imu": np.hstack([imu.gyro_radps, imu.accel_mps2]), "crane": crane.position_m}
+    begins = imu.stamp_ns < imu.stamp_ns[0] + round(1e9 * (WALK.motion.standstill_s - 0.5))
+    bias = np.hstack([imu.gyro_radps[begins].mean(axis=0), np.zeros(3)])
     turned = {"imu": np.array([-1.0] * 3 + [1.0] * 3), "crane": np.ones(3)}
+    off = {"imu": 2 * bias, "crane": np.zeros(3)}
     for name, samples in (("imu", imu), ("crane", crane)):
         s = (samples.stamp_ns - shift_ns - zero_ns) / 1e9
-        inside = (s >= 0) & (s < half_s)
+        inside = (s > 0) & (s < half_s)
         s, there = s[inside], values[name][inside]
         held[f"{name}_s"] = np.concatenate([s, 2 * half_s - s[::-1]]) + shift_ns / 1e9
-        held[f"{name}_values"] = np.vstack([there, there[::-1] * turned[name]])
+        held[f"{name}_values"] = np.vstack([there, off[name] + there[::-1] * turned[name]])
     np.savez(folder / "readings.npz", **held)
     at = (np.array(recording.index.stamps_ns) - zero_ns) / 1e9
     still = [np.arange(low + STILL_S, high - STILL_S / 2, STILL_S) for low, high in (

@@ -3,18 +3,43 @@
 How soon is measured by `python tests/fault_rounds.py` on a machine without other work; here bounds are wide.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+import barsight as bs
+from barsight.core.types import ImuSamples
+from barsight.motion.crane.encoder_jumps import find_jumps
+from barsight.motion.crane.known_motion import KnownMotion
+from barsight.simulation.simulate import simulate
 from crane_network import missing
-from fault_rounds import FAULTS, GIVE_UP_S, run_rounds
+from fault_rounds import FAULTS, GIVE_UP_S, WALK, prepare, run_rounds
 
 WHY_NOT = missing()
-pytestmark = pytest.mark.skipif(bool(WHY_NOT), reason=WHY_NOT or "cameras are here")
 
 
 @pytest.mark.slow
+def test_the_crane_that_is_played_has_no_jump_of_its_own(tmp_path: Path) -> None:
+    """Nor where it turns: what the player sends of two rounds is what a crane could send."""
+    simulate(tmp_path / "recording", WALK)
+    recording = bs.open_recording(tmp_path / "recording")
+    crane = recording.crane()
+    assert crane is not None
+    period_s, _ = prepare(recording, tmp_path, 0, 0.1)
+    held, sent = np.load(tmp_path / "readings.npz"), {}
+    for name in ("imu", "crane"):
+        seconds = np.concatenate([held[f"{name}_s"] + k * period_s for k in range(2)])
+        sent[name] = np.round(1e9 * seconds).astype(np.int64), np.vstack([held[f"{name}_values"]] * 2)
+        assert (np.diff(sent[name][0]) > 0).all()
+    stamps, values = sent["imu"]
+    known = KnownMotion(None, ImuSamples(stamps, values[:, :3].copy(), values[:, 3:].copy()))
+    assert find_jumps(replace(crane, stamp_ns=sent["crane"][0], position_m=sent["crane"][1]), known) == ()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(bool(WHY_NOT), reason=WHY_NOT or "cameras are here")
 def test_each_fault_is_told_revokes_lifts_and_is_over_when_it_is_over(tmp_path: Path) -> None:
     table, ended = run_rounds(1, 6, list(FAULTS), tmp_path)
     assert set(table) == set(FAULTS)
