@@ -70,9 +70,9 @@ def _by_tile(x: Int32, y: Int32, first: tuple[int, int], shape: tuple[int, int])
         starts[k + 1] += starts[k]
     cursor = starts[:-1].copy()
     for i in range(x.size):
-        k = np.uint64(tile[i])
-        order[np.uint64(cursor[k])] = i
-        cursor[k] += 1
+        own = np.uint64(tile[i])
+        order[np.uint64(cursor[own])] = i
+        cursor[own] += 1
     return order, starts
 
 

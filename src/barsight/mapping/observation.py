@@ -117,8 +117,8 @@ def _by_cell(
     width = np.uint64(shape[1])
     low_x, low_y, half = np.int32(corner[0]), np.int32(corner[1]), np.float32(half_rad)
     starts = np.zeros(shape[0] * shape[1] + 1, np.int64)
-    for i in range(x.size):
-        starts[np.uint64(y[i] - low_y) * width + np.uint64(x[i] - low_x) + np.uint64(1)] += 1
+    for n in range(x.size):
+        starts[np.uint64(y[n] - low_y) * width + np.uint64(x[n] - low_x) + np.uint64(1)] += 1
     for k in range(starts.size - 1):
         starts[k + 1] += starts[k]
     cursor = starts[:-1].copy()
@@ -169,7 +169,7 @@ def _gather(
             top = first
             for i in range(first + np.uint64(1), last):
                 if said[i, _HEIGHT] > said[top, _HEIGHT]:
-                    top = i
+                    top = np.uint64(i)
             floor = said[top, _HEIGHT] - max(4 * np.sqrt(said[top, _NOISE]), 2 * cell_m)
             weights = heights = variances = extra = gray = 0.0
             left = first
