@@ -15,7 +15,7 @@ from barsight.motion.crane.encoder_jumps import find_jumps
 from barsight.motion.crane.known_motion import KnownMotion
 from barsight.simulation.simulate import simulate
 from crane_network import missing
-from fault_rounds import FAULTS, GIVE_UP_S, WALK, prepare, run_rounds
+from fault_rounds import FAULTS, GIVE_UP_S, LINE_FAULTS, WALK, prepare, run_rounds
 
 WHY_NOT = missing()
 
@@ -41,10 +41,21 @@ def test_the_crane_that_is_played_has_no_jump_of_its_own(tmp_path: Path) -> None
 @pytest.mark.slow
 @pytest.mark.skipif(bool(WHY_NOT), reason=WHY_NOT or "cameras are here")
 def test_each_fault_is_told_revokes_lifts_and_is_over_when_it_is_over(tmp_path: Path) -> None:
-    table, ended = run_rounds(1, 6, list(FAULTS), tmp_path)
+    table, ended = run_rounds(1, 6, FAULTS, tmp_path)
     assert set(table) == set(FAULTS)
     for name, found in table.items():
         assert len(found.told_s) == (1 if FAULTS[name].reason else 0), name
         assert found.missed == 0 and max(found.back_s) < GIVE_UP_S, name
         assert all(stood < 5.0 for stood in found.revoked_s), name
+    assert int(ended.split(";")[1].split()[0]) > 0, ended
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(bool(WHY_NOT), reason=WHY_NOT or "cameras are here")
+def test_a_serial_line_that_is_unplugged_is_told_and_all_is_well_when_it_is_back(tmp_path: Path) -> None:
+    table, ended = run_rounds(2, 7, LINE_FAULTS, tmp_path)
+    for name, found in table.items():
+        assert len(found.told_s) == 2 and found.missed == found.invalid == 0, (name, found)
+        assert max(found.told_s) < 1.0 and max(found.back_s) < 10.0, (name, found)
+    assert len(table["encoders unplugged 2 s"].revoked_s) == 2
     assert int(ended.split(";")[1].split()[0]) > 0, ended
