@@ -60,7 +60,7 @@ def main() -> None:
             "seconds": round(took_s, 1), "pairs": pairs, "mispaired": mispaired,
             "ticks": [ticks[0], ticks[-1]], "due": ticks[-1] - ticks[0] + 1,
             "lost": lost, "unpaired": former.lost, "contradicted": former.contradicted,
-            "max_skew_ms": former.max_skew_ns / 1e6,
+            "skew_ms": former.skew_ns / 1e6, "max_skew_ms": former.max_skew_ns / 1e6,
             "cores": round((time.process_time() - cpu_s) / took_s, 4), "signs": signs,
         }  # fmt: skip
         sys.stdout.write(json.dumps(found) + "\n")

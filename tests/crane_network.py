@@ -100,12 +100,12 @@ class Plant:
 
     def camera(
         self, number: int, pictures: Path, times: str, offset_ns: int = 0, drift_ppm: float = 0.0,
-        serial: str = "",
+        serial: str = "", ptp: tuple[str, ...] = (),
     ) -> subprocess.Popen[str]:  # fmt: skip
         """Start a camera, see `gige_camera`."""
         return self.start(
             number + 1, str(TESTS / "gige_camera.py"), "e0", serial or SERIALS[number], str(pictures), times,
-            str(offset_ns), str(drift_ppm),
+            str(offset_ns), str(drift_ppm), *ptp,
         )  # fmt: skip
 
     def cable(self, number: int, state: str) -> None:

@@ -1,7 +1,8 @@
 """Spoil a live run at a crane of Aravis cameras at random moments, and tell how soon it told and came back.
 
-Usage: python tests/fault_rounds.py [ROUNDS] [SEED] (root, libaravis, network namespaces). Every fault of
-`FAULTS` comes once a round, in random order. The table has, of each fault: how often; from the fault to mode
+Usage: python tests/fault_rounds.py [ROUNDS] [SEED] [lines] (root, libaravis, network namespaces). Every fault
+of `FAULTS`, or with `lines`, readings coming by serial lines, of `LINE_FAULTS`, comes once a round, in random
+order. The table has, of each fault: how often; from the fault to mode
 and reason in state.json, and to lifts revoked; from its end to mode full with lifts and all processes
 running; seconds, median and most.
 """
@@ -28,7 +29,7 @@ from barsight.core.types import StereoFrame
 from barsight.recording.base import Recording
 from barsight.simulation.simulate import simulate
 from cli_runs import FAST, TINY
-from crane_network import TESTS, Plant, describe, end, plant
+from crane_network import PORTS, TESTS, Plant, describe, end, plant
 
 PAUSE_S = (0.3, 2.5)
 GIVE_UP_S = 45.0
@@ -69,7 +70,9 @@ class Found:
 class Crane:
     """The plant, a player of readings, and the run; `run` begins it."""
 
-    def __init__(self, here: Plant, folder: Path, rng: np.random.Generator, minutes: float) -> None:
+    def __init__(
+        self, here: Plant, folder: Path, rng: np.random.Generator, minutes: float, *, by_lines: bool
+    ) -> None:
         self.plant, self.folder, self.rng, self.out = here, folder, rng, folder / "out"
         self.disk, self.step = folder / "disk", folder / "step"
         recording = folder / "recording"
@@ -79,13 +82,17 @@ class Crane:
         self.cameras = [self.camera(0), self.camera(1)]
         self.player = subprocess.Popen(
             ["ip", "netns", "exec", here.spaces[0], sys.executable, str(TESTS / "crane_player.py"),
-             str(folder / "readings.npz"), str(self.begin_ns)],
+             str(folder / "readings.npz"), str(self.begin_ns), *([str(folder)] if by_lines else [])],
             stdin=subprocess.PIPE, text=True,
         )  # fmt: skip
         self.changes = {
             "rate_hz = 3.0": "rate_hz = 8.4",
             "[measure": f'[recorder]\nfolder = "{self.disk}"\nsegment_mib = 16\n[measure',
         }
+        if by_lines:
+            self.changes |= {
+                f"port = {port}": f'device = "{folder / name}"\nbaud = 921600' for name, port in PORTS.items()
+            }
         self.config = describe(recording, folder, changes=self.changes)
 
     def camera(self, number: int) -> subprocess.Popen[str]:
@@ -147,7 +154,8 @@ def prepare(
 ) -> tuple[float, list[tuple[float, float]]]:
     """Write what cameras and player play: the recording there and back, standing at both ends.
 
-    Turned back in time, places and accelerations stay what they are and turn rates change their sign.
+    Turned back in time, places and accelerations stay what they are and turn rates change their sign, but for
+    the gyro's bias: one that turned round too would, by gravity, be an acceleration that no encoder follows.
     Returns the period (s) and when the crane goes at speed.
     """
     crane, imu = recording.crane(), recording.imu()
@@ -160,13 +168,16 @@ def prepare(
     half_s = (last_ns - zero_ns) / 1e9
     held = {"period_s": np.array(2 * half_s)}
     values = {"imu": np.hstack([imu.gyro_radps, imu.accel_mps2]), "crane": crane.position_m}
+    begins = imu.stamp_ns < imu.stamp_ns[0] + round(1e9 * (WALK.motion.standstill_s - 0.5))
+    bias = np.hstack([imu.gyro_radps[begins].mean(axis=0), np.zeros(3)])
     turned = {"imu": np.array([-1.0] * 3 + [1.0] * 3), "crane": np.ones(3)}
+    off = {"imu": 2 * bias, "crane": np.zeros(3)}
     for name, samples in (("imu", imu), ("crane", crane)):
         s = (samples.stamp_ns - shift_ns - zero_ns) / 1e9
-        inside = (s >= 0) & (s < half_s)
+        inside = (s > 0) & (s < half_s)
         s, there = s[inside], values[name][inside]
         held[f"{name}_s"] = np.concatenate([s, 2 * half_s - s[::-1]]) + shift_ns / 1e9
-        held[f"{name}_values"] = np.vstack([there, there[::-1] * turned[name]])
+        held[f"{name}_values"] = np.vstack([there, off[name] + there[::-1] * turned[name]])
     np.savez(folder / "readings.npz", **held)
     at = (np.array(recording.index.stamps_ns) - zero_ns) / 1e9
     still = [np.arange(low + STILL_S, high - STILL_S / 2, STILL_S) for low, high in (
@@ -260,6 +271,10 @@ FAULTS = {
     ),
     "disk full 2 s": Fault(fill, "recording is stopped", 2.0, empty, forbids=False),
 }
+LINE_FAULTS = {
+    "encoders unplugged 2 s": Fault(partial(spoil, "crane unplug 2"), "the encoders: silent", 2.0),
+    "IMU unplugged 2 s": Fault(partial(spoil, "imu unplug 2"), "the IMU: silent", 2.0, forbids=False),
+}
 
 
 def reasons_of(state: Any) -> list[str]:
@@ -315,17 +330,20 @@ def small_disk(folder: Path) -> Iterator[None]:
         subprocess.run(["umount", "-l", str(folder)], check=True)
 
 
-def run_rounds(rounds: int, seed: int, names: list[str], folder: Path) -> tuple[dict[str, Found], str]:
+def run_rounds(
+    rounds: int, seed: int, faults: dict[str, Fault], folder: Path
+) -> tuple[dict[str, Found], str]:
     """Run rounds of faults; return what was found, and how the run ended."""
-    rng, table = np.random.default_rng(seed), {name: Found() for name in names}
+    rng, table, names = np.random.default_rng(seed), {name: Found() for name in faults}, list(faults)
     with plant() as here, small_disk(folder / "disk"):
-        crane = Crane(here, folder, rng, 10 + rounds * len(names) * 0.35)
+        minutes = 10 + rounds * len(names) * 0.35
+        crane = Crane(here, folder, rng, minutes, by_lines=faults is LINE_FAULTS)
         try:
             time.sleep(max(crane.begin_ns - time.time_ns(), 0) / 1e9 + 1.0)
             process = crane.run()
             with suppress(KeyboardInterrupt):  # Ctrl-C ends the rounds, not the table
                 for number, name in ((k, n) for k in range(rounds) for n in rng.permutation(names).tolist()):
-                    try_fault(crane, FAULTS[name], table[name])
+                    try_fault(crane, faults[name], table[name])
                     sys.stderr.write(f"{number} {row(name, table[name])}\n")
             frames = crane.state()["frames"]
             process.send_signal(2)
@@ -349,10 +367,11 @@ def row(name: str, found: Found) -> str:
 
 def main() -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background has it ignored
-    words = [int(word) for word in sys.argv[1:]]
+    faults = LINE_FAULTS if "lines" in sys.argv else FAULTS
+    words = [int(word) for word in sys.argv[1:] if word != "lines"]
     rounds, seed = [*words, *(20, 1)[len(words) :]]
     with tempfile.TemporaryDirectory() as folder:
-        table, ended = run_rounds(rounds, seed, list(FAULTS), Path(folder))
+        table, ended = run_rounds(rounds, seed, faults, Path(folder))
     head = "| fault | times | told, s | lifts revoked, s | well again, s | not told | lifts stood over 1 s |"
     lines = [head, "|---|---|---|---|---|---|---|", *(row(name, found) for name, found in table.items())]
     sys.stdout.write("\n".join(lines) + f"\n\n{ended}\n")

@@ -165,3 +165,55 @@ def test_pairs_are_whole_and_none_is_mispaired(crane: Plant, tmp_path: Path) -> 
     assert found["pairs"] >= 0.999 * sent
     assert found["mispaired"] == 0 and found["contradicted"] == 0
     assert found["pairs"] > 0 and missing_pairs <= told_lost + 1
+
+
+@pytest.mark.parametrize(
+    ("features", "states", "offset_ns", "is_one"),
+    [
+        (("PtpStatus", "GevIEEE1588Status"), ("Slave", "Slave"), 0, True),
+        (("PtpStatus", "PtpStatus"), ("Master", "Slave"), 0, True),
+        (("PtpStatus", "PtpStatus"), ("Slave", "Uncalibrated"), 0, False),
+        (("PtpStatus", "PtpStatus"), ("Slave", "Slave"), 3 * 10**7, False),
+    ],
+)
+@pytest.mark.slow
+def test_clocks_that_ptp_keeps_are_one(
+    features: tuple[str, str], states: tuple[str, str], offset_ns: int, is_one: bool, crane: Plant,
+    tmp_path: Path,
+) -> None:  # fmt: skip
+    """Not where a camera isn't there yet, nor where stamps contradict what the cameras say of them."""
+    pictures = tmp_path / "pictures.npy"
+    np.save(pictures, np.random.default_rng(0).integers(0, 255, (4, 256, 320), np.uint8))
+    for number in (0, 1):
+        (tmp_path / f"ptp{number}").write_text("Listening")
+        ptp = features[number], str(tmp_path / f"ptp{number}")
+        crane.camera(number, pictures, "100000000", number * offset_ns, 0.0, ptp=ptp)
+    script = str(Path(__file__).parent / "capture_run.py")
+    process = crane.start(0, script, "12", "320", "256", "10", *SERIALS, quiet=False)
+    time.sleep(6.0)
+    for number in (0, 1):
+        (tmp_path / f"ptp{number}").write_text(states[number])
+    told, errors = process.communicate(timeout=120)
+    assert process.returncode == 0, errors
+    found = json.loads(told)
+    signs, roles = found["signs"], {"Master": 1, "Slave": 2}
+    assert [signs[f"cam{k}_ptp"] for k in (0, 1)] == [roles.get(state, 0) for state in states]
+    assert signs["one_clock"] == is_one
+    if not offset_ns:
+        assert found["pairs"] > 80 and found["mispaired"] == found["contradicted"] == 0
+    assert found["skew_ms"] == 0 if is_one else found["skew_ms"] != 0
+
+
+@pytest.mark.slow
+def test_the_check_tells_of_the_cameras_ptp(crane: Plant, whole: Path, tmp_path: Path) -> None:
+    np.save(tmp_path / "dark.npy", np.zeros((1, 256, 320), np.uint8))
+    (tmp_path / "slave").write_text("Slave")
+    for number in (0, 1):
+        ptp = ("PtpStatus", str(tmp_path / "slave"))
+        crane.camera(number, tmp_path / "dark.npy", "100000000", ptp=ptp)
+    config = describe(whole, tmp_path)
+    time.sleep(1.5)
+    command = ("-m", "barsight", "live", "check", "--config", str(config), "-o", str(tmp_path / "out"))
+    told, _ = crane.start(0, *command, quiet=False).communicate(timeout=120)
+    (line,) = [line for line in told.splitlines() if "PTP of the cameras" in line]
+    assert line.startswith("ok") and "Slave and Slave" in line, told

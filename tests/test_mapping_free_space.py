@@ -9,9 +9,12 @@ import pytest
 
 from barsight.mapping.free_space import (
     COARSE_CELLS,
+    LEVEL_CELLS,
+    LEVEL_M,
     OVER_END_M,
     REACH_M,
     FreeSpace,
+    _level,
     bound_heights,
     carve_rays,
 )
@@ -119,8 +122,24 @@ def test_heights_of_a_cell_are_bounded_by_its_highest_and_its_lowest() -> None:
     row, column = rng.integers(0, 9, (2, 200)).astype(np.int32)
     z = rng.normal(0, 1, 200).astype(np.float32)
     highest, lowest = np.full((9, 9), -np.inf, np.float32), np.full((9, 9), np.inf, np.float32)
-    bound_heights(row, column, z, highest, lowest)
+    bound_heights(column, row, z, (0, 0), highest, lowest)
     for i, j in np.ndindex(9, 9):
         of_cell = z[(row == i) & (column == j)]
         assert highest[i, j] == max(of_cell, default=-np.inf)
         assert lowest[i, j] == min(of_cell, default=np.inf)
+
+
+def test_one_height_in_four_is_level_as_a_slow_reference_has_it() -> None:
+    rng, side = np.random.default_rng(6), 30
+    x, y = rng.integers(-side, side, (2, 900)).astype(np.int32)
+    z = (0.2 * (x // 6 % 2) + rng.uniform(0, 0.04, x.size)).astype(np.float32)
+    none = np.zeros(x.size, np.float32)
+    level_x, level_y, level_z = _level(CellObservations(x, y, none > 0, z, none, none, none))
+    slow = []
+    for k in range(x.size):
+        near = (abs(x - x[k]) <= LEVEL_CELLS // 2) & (abs(y - y[k]) <= LEVEL_CELLS // 2)
+        if x[k] % COARSE_CELLS == y[k] % COARSE_CELLS == 0 and abs(z[near] - z[k]).max() < LEVEL_M:
+            slow.append((x[k] // COARSE_CELLS, y[k] // COARSE_CELLS, z[k]))
+    assert slow == list(zip(level_x, level_y, level_z, strict=True))
+    even = (x % COARSE_CELLS == 0) & (y % COARSE_CELLS == 0)
+    assert 20 < len(slow) < even.sum() - 20

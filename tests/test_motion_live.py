@@ -103,6 +103,53 @@ def test_what_is_held_doesnt_grow() -> None:
     assert max(count for _, count in held) <= 4 * most
 
 
+def spoiled_encoders(recording: Recording, frozen_s: float = 0.0) -> Recording:
+    """Each encoder jumps to and fro, every 2.5 s one of them, and freezes at 3 s."""
+    crane = recording.crane()
+    assert crane is not None
+    place, since = crane.position_m.copy(), (crane.stamp_ns - crane.stamp_ns[0]) / 1e9
+    for k, at in enumerate(np.arange(5.0, since[-1] - 4.0, 2.5)):
+        place[since >= at, k % 3] += 0.3 * (-1) ** (k // 3)
+    held = (since >= 3.0) & (since < 3.0 + frozen_s)
+    place[held] = place[held][:1]
+    return replace(recording, crane_samples=replace(crane, position_m=place))
+
+
+def test_jumps_that_are_past_are_one_unknown_of_each_encoder(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The poses are those that all of them kept apart give."""
+    recording, seen, truth = steady(0.05, 2, frames=100)
+    recording = spoiled_encoders(recording)
+    found, unknowns = {}, {}
+    for name in ("kept apart", "put together"):
+        estimator = estimator_of(recording, "stereo,imu,crane", 4)
+        if name == "kept apart":
+            monkeypatch.setattr(estimator.watch, "put_together", lambda _: {})
+        found[name] = [estimator.take(sighting) for sighting in seen]
+        assert estimator.window is not None
+        unknowns[name] = estimator.window.problem.encoder_unknowns
+    assert unknowns["kept apart"] == 1 + len(estimator.watch.told) >= 14
+    assert unknowns["put together"] <= 1 + 3 + 3
+    for one, other in zip(*found.values(), strict=True):
+        assert isinstance(one, PosedFrame) and isinstance(other, PosedFrame)
+        off = one.reference_from_body.translation - other.reference_from_body.translation
+        sigma = np.sqrt(np.diag(one.covariance))
+        assert np.abs(off).max() < 0.01 * sigma[3:].min()
+        np.testing.assert_allclose(np.sqrt(np.diag(other.covariance)), sigma, rtol=0.01)
+    off = found["put together"][-1].reference_from_body.translation - truth.poses[-1].translation
+    assert np.linalg.norm(off) < 0.05
+
+
+def test_a_freeze_that_is_long_past_is_told_once() -> None:
+    recording, seen, _ = steady(0.4, 2, frames=60)
+    crane = recording.crane()
+    assert crane is not None
+    estimator = estimator_of(spoiled_encoders(recording, 1.0), "stereo,imu,crane", 4)
+    for sighting in seen:
+        estimator.take(sighting)
+    told = [jump for jump in estimator.watch.told if jump.kind == "freeze"]
+    assert len(told) == 3 and len(estimator.watch.frozen) == 1
+
+
 def test_the_imu_alone_predicts_the_next_frame() -> None:
     """Without encoders: as near the true motion as it says, and near enough to guide the matching."""
     off = []
@@ -168,6 +215,16 @@ def test_frames_that_show_nothing_are_bridged(monkeypatch: pytest.MonkeyPatch) -
     assert drift is not None
     assert drift.frames == len(seen)
     assert drift.reference_rmse_mm < 3
+
+
+def test_pictures_that_show_nothing_for_longer_than_the_window() -> None:
+    recording, seen, truth = steady(0.1, 0, frames=20)
+    estimator = estimator_of(recording, "stereo,imu,crane", 4)
+    for k, sighting in enumerate(seen):
+        frame = estimator.take(RefusedFrame(sighting.stamp_ns, "dark") if 6 <= k < 14 else sighting)
+        assert isinstance(frame, PosedFrame)
+    off = frame.reference_from_body.translation - truth.poses[-1].translation
+    assert np.linalg.norm(off) < 0.01
 
 
 def turned(seen: tuple, angle: float) -> tuple:

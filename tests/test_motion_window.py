@@ -1,7 +1,9 @@
 """The live window's algebra against NumPy's."""
 
+import gtsam
 import numpy as np
 
+from barsight.motion.fixed_lag.encoder_watch import sum_unknowns
 from barsight.motion.fixed_lag.window_equations import (
     SLIDE_SIGMA_RAD,
     SLIDE_WAY_M,
@@ -9,6 +11,7 @@ from barsight.motion.fixed_lag.window_equations import (
     marginal_prior,
     propagate_slide,
 )
+from barsight.motion.problem.problem import MarginalPrior
 
 
 def positive(seed: int, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -48,3 +51,17 @@ def test_a_slide_is_forgotten() -> None:
     far, slope = propagate_slide(matrix, gradient, slide, 1e3)
     np.testing.assert_allclose(np.linalg.inv(far)[4, 4], SLIDE_SIGMA_RAD**2)
     np.testing.assert_allclose(np.linalg.solve(far, slope)[4], slide)
+
+
+def test_a_sum_is_known_as_well_as_its_parts_tell() -> None:
+    """As the whole's inverse says of the sum; what else is known stays."""
+    matrix, gradient = positive(4, 9)
+    at = np.array([1, 3, 4])
+    prior = MarginalPrior(np.zeros(0, np.int64), gtsam.Values(), np.arange(6.0), matrix, gradient)
+    found = sum_unknowns(prior, at)
+    summing = np.delete(np.eye(9), 3 + at[1:], axis=0)
+    summing[4, 3 + at] = 1.0
+    np.testing.assert_allclose(found.border, [0, 8, 2, 5])
+    np.testing.assert_allclose(np.linalg.inv(found.matrix), summing @ np.linalg.inv(matrix) @ summing.T)
+    best = np.linalg.solve(matrix, gradient)
+    np.testing.assert_allclose(np.linalg.solve(found.matrix, found.gradient), summing @ best)

@@ -20,7 +20,7 @@ from barsight.live.settings import read_crane
 from barsight.recording.writers.retention import PROTECTED, Retention
 from barsight.sensors.clock import DeviceClock
 from barsight.sensors.forms import pack
-from barsight.sensors.receiver import RawReading, ReadingReceiver
+from barsight.sensors.receiver import RawReading, ReadingReceiver, Sequence
 from barsight.sensors.settings import ReadingsSettings
 from barsight.sensors.source import LivePicture
 
@@ -88,10 +88,52 @@ def test_datagrams_are_read_and_what_is_lost_or_torn_counts() -> None:
         (107, place, 0), (108, place, 0), (111, place, 2),
     ]  # fmt: skip
     assert receiver.torn == 3 and found[0].arrival_ns == 42
+    assert (receiver.sequence.overtaken, receiver.sequence.restarts) == (1, 0)
     with pytest.raises(bs.BarsightError, match=rf"crane: UDP port {port} can't be opened"):
         ReadingReceiver("crane", settings)
     receiver.close()
     out.close()
+
+
+STEP_NS = 50_000_000
+
+
+@pytest.mark.parametrize("keeps_order", [True, False])
+@pytest.mark.parametrize("clock_ns", [0, -(10**18)], ids=["its clock goes on", "its clock begins anew too"])
+@pytest.mark.parametrize("first", [0, 40, 5_000, 9_990, 1 << 30, 3 << 30])
+def test_a_sender_that_begins_anew_is_told(first: int, clock_ns: int, keeps_order: bool) -> None:
+    """Whatever number the first reading has that comes of it; silent for half a minute before."""
+    sequence, restart = Sequence(20, keeps_order=keeps_order), 10_000 + 600
+    for k in range(10_001):
+        assert sequence.lost_before(k, k * STEP_NS, k * STEP_NS + 7) == 0
+    taken = []
+    for k in range(40):
+        stamp = (restart + k) * STEP_NS
+        lost = sequence.lost_before(first + k, clock_ns + stamp, stamp + 7)
+        taken += [] if lost is None else [(k, lost)]
+    late = 2 if clock_ns and not keeps_order else 0
+    assert taken == [(k, 0) for k in range(late, 40)]
+    assert (sequence.restarts, sequence.overtaken) == (1, late)
+
+
+@pytest.mark.parametrize("rate_hz", [20, 1000])
+def test_readings_that_are_overtaken_or_doubled_begin_nothing_anew(rate_hz: int) -> None:
+    """Each up to 0.2 s late; one in ten lost, one in ten doubled; the numbers wrap, and all stops for 2 s."""
+    rng, step = np.random.default_rng(5), SECOND // rate_hz
+    count, first = 3 * rate_hz, (1 << 32) - rate_hz
+    due = np.arange(count) * step + np.where(np.arange(count) > 2 * rate_hz, 2 * SECOND, 0)
+    lost = rng.uniform(size=count) < 0.1
+    sent = np.concatenate([np.flatnonzero(~lost), np.flatnonzero(rng.uniform(size=count) < 0.1)])
+    arrival = due[sent] + rng.integers(0, SECOND // 5, len(sent))
+    sequence, taken, missing = Sequence(rate_hz, keeps_order=False), [], 0
+    for k in np.argsort(arrival).tolist():
+        number = int(sent[k])
+        found = sequence.lost_before((first + number) % (1 << 32), int(due[number]), int(arrival[k]))
+        if found is not None:
+            taken.append(number)
+            missing += found
+    assert (np.diff(taken) > 0).all() and len(taken) + missing == taken[-1] - taken[0] + 1
+    assert sequence.restarts == 0 and sequence.overtaken == len(sent) - len(taken) > 0
 
 
 def test_the_oldest_unprotected_segments_go_first(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from barsight.core.types import Disparity
-from barsight.stereo.masking import gap_mask, mask_gaps
+from barsight.stereo.masking import gap_mask, mask_disparity, mask_gaps
 
 
 def steel(level: float, seed: int = 0) -> np.ndarray:
@@ -37,3 +37,14 @@ def test_gaps_lose_disparity_and_sigma() -> None:
     assert np.isnan(masked.disparity_px[:, 92:96]).all() and np.isnan(masked.sigma_px[:, 92:96]).all()
     assert np.isfinite(masked.disparity_px[:, :80]).all() and masked.bias_sigma_px == 0.05
     assert mask_gaps(masked, image, 0.0) is masked
+
+
+def test_what_is_kept_keeps_its_bits() -> None:
+    rng = np.random.default_rng(5)
+    known, sigma = rng.normal(0, 9, (2, 7, 33)).astype(np.float32)
+    known[rng.random(known.shape) < 0.2] = np.nan
+    kept = rng.random(known.shape) < 0.7
+    masked = mask_disparity(Disparity(known, sigma, 0.05), kept)
+    np.testing.assert_array_equal(masked.disparity_px, np.where(kept, known, np.nan))
+    np.testing.assert_array_equal(masked.sigma_px, np.where(kept, sigma, np.nan))
+    assert masked.bias_sigma_px == 0.05

@@ -381,7 +381,14 @@ def _matched_ahead(
     """Match pairs ahead, whole chains side by side; about `max_waiting` of them may wait."""
     chains = max(max_waiting // match.length, WORKERS)
     with prefetched_map(match.match_all, match.split(pairs), chains) as matched:
-        yield chain.from_iterable(matched)
+        yield chain.from_iterable(map(_emptied, matched))
+
+
+def _emptied(frames: list[MatchedFrame | Refusal]) -> Iterator[MatchedFrame | Refusal]:
+    """Empty a list from its beginning: a frame that is fused needn't wait for the last of its chain."""
+    frames.reverse()
+    while frames:
+        yield frames.pop()
 
 
 def _first_reason(refusals: list[Refusal]) -> str:

@@ -19,6 +19,7 @@ from barsight.core.errors import InputError
 from barsight.core.json_values import json_digest, json_value
 from barsight.core.memory import peak_memory_mib
 from barsight.core.notices import Notice
+from barsight.core.parallel import single_opencv_thread
 from barsight.core.stamps import seconds_to_ns
 from barsight.core.timing import Stopwatch
 from barsight.core.types import Trajectory
@@ -119,6 +120,7 @@ class MappedYard:
         return None if self.joined is None else self.joined.history
 
 
+@single_opencv_thread()
 def map_yard(
     recordings: Sequence[Recording], settings: MeasureSettings, scratch: Path, advance: ProgressCallback,
     resume: Path | None = None,

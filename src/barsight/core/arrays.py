@@ -31,7 +31,7 @@ _ALL_CORES = threading.Lock()
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
-def kernel(*, parallel: bool = False, inline: bool = False) -> Callable[[F], F]:
+def kernel(*, parallel: bool = False, inline: bool = False, borrows: bool = False) -> Callable[[F], F]:
     """Compile a function with Numba, cached on disk so that a second run starts at once.
 
     The cache holds until the kernel or anything that it calls changes (`core.compiling.cache`).
@@ -44,11 +44,15 @@ def kernel(*, parallel: bool = False, inline: bool = False) -> Callable[[F], F]:
     one, which `core.parallel.in_bands` spreads over the cores as well.
     `inline` copies a short function into the kernels that call it: a call hands over each array as nine
     numbers and hides from the compiler which of them overlap, which can cost more than the sums inside.
+    `borrows` counts no references to the arrays that it is given nor to parts of them, for a kernel that
+    makes and returns none: threads that share an array wait for each other at each count.
     """
-    options = {
+    options: dict[str, Any] = {
         "parallel": parallel, "nogil": True, "error_model": "numpy",
         "inline": "always" if inline else "never",
     }  # fmt: skip
+    if borrows:
+        options["_nrt"] = False
 
     def decorate(function: F) -> F:
         compiled: Any = numba.njit(**options)(function)

@@ -13,6 +13,7 @@ from queue import SimpleQueue
 from threading import Event, Semaphore
 from typing import TypeVar, cast
 
+import cv2
 import numba
 
 Item = TypeVar("Item")
@@ -138,6 +139,19 @@ def in_background(work: Callable[[], Result]) -> Iterator[Future[Result]]:
         working = pool.submit(work)
         yield working
         working.result()
+
+
+@contextmanager
+def single_opencv_thread() -> Iterator[None]:
+    """Keep OpenCV to the thread that calls it: where frames go side by side, its own threads only wait for
+    each other, and spin meanwhile.
+    """
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
 
 
 def _is_alone() -> bool:

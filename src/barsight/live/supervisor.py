@@ -49,6 +49,9 @@ SIGNS = {
         for sign, told in (("settled", "its clock is settled: {}"), ("jumps", "its stamps jumped {} times"))
     },
     **{("sensors", f"cam{k}_connects"): f"cam{k}: connected {{}} times" for k in (0, 1)},
+    **{
+        ("sensors", f"{one}_restarts"): f"{one}: its sender began anew {{}} times" for one in ("imu", "crane")
+    },
 }
 """Counters whose changes go to the log, each with its line."""
 

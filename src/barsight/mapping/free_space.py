@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from barsight.core.arrays import Bool, Float32, Float64, Int32, kernel
+from barsight.core.arrays import Bool, Float32, Float64, Int32, Int64, kernel
 from barsight.mapping.observation import CellObservations
 from barsight.mapping.tiles import TileKey
 
@@ -29,6 +29,8 @@ LEVEL_CELLS, LEVEL_M = 5, 0.05
 """A line of sight counts if its view sees only heights so close within a square of so many cells about its
 end: at edges, matches mix what is in front with what is behind."""
 UNPROVEN = np.float32(np.inf)
+_STEPS = 64
+"""Steps of a ray that are worked out at once, as vectors."""
 
 
 @dataclass(eq=False)
@@ -50,11 +52,9 @@ class FreeSpace:
         """Carve what one view has seen. eyes_m: (E, 3) places of its cameras, reference frame."""
         if cells.x.size == 0:
             return
-        chosen = (cells.x % COARSE_CELLS == 0) & (cells.y % COARSE_CELLS == 0) & _level(cells)
-        x, y, z = (np.ascontiguousarray(part[chosen]) for part in (cells.x, cells.y, cells.z_m))
+        x, y, z = _level(cells)
         if x.size == 0:
             return
-        x, y = x // COARSE_CELLS, y // COARSE_CELLS
         margin = int(np.ceil(2 * REACH_M / self._cell_m))
         column, row = int(x.min()) - margin, int(y.min()) - margin
         bound = np.full((int(y.max()) - row + margin + 1, int(x.max()) - column + margin + 1), UNPROVEN)
@@ -114,16 +114,18 @@ class FreeSpace:
         tile[0][ours] = np.minimum(first, new)
 
 
-def _level(cells: CellObservations) -> Bool:
-    """Find the heights (N,) that differ little from all that the view sees about them."""
-    column, row = cells.x - cells.x.min(), cells.y - cells.y.min()
-    shape = int(row.max()) + 1, int(column.max()) + 1
+def _level(cells: CellObservations) -> tuple[Int32, Int32, Float32]:
+    """Choose of one cell in COARSE_CELLS to a side the heights that differ little from all that the view sees
+    about them: cells of free space along x and y (N,), and the heights (N,).
+    """
+    corner = int(cells.x.min()), int(cells.y.min())
+    shape = int(cells.y.max()) - corner[1] + 1, int(cells.x.max()) - corner[0] + 1
     highest, lowest = np.full(shape, -np.inf, np.float32), np.full(shape, np.inf, np.float32)
-    bound_heights(row, column, cells.z_m, highest, lowest)
+    bound_heights(cells.x, cells.y, cells.z_m, corner, highest, lowest)
     about = np.ones((LEVEL_CELLS, LEVEL_CELLS), np.uint8)
     highest, lowest = cv2.dilate(highest, about), cv2.erode(lowest, about)
-    over, under = highest[row, column] - cells.z_m, cells.z_m - lowest[row, column]
-    return np.asarray(np.maximum(over, under) < LEVEL_M)
+    chosen = _choose_level(cells.x, cells.y, cells.z_m, corner, highest, lowest)
+    return cells.x[chosen] // COARSE_CELLS, cells.y[chosen] // COARSE_CELLS, cells.z_m[chosen]
 
 
 def covering_tiles(column: int, row: int, shape: tuple[int, int]) -> list[TileKey]:
@@ -150,14 +152,36 @@ def tile_overlap(
 
 
 @kernel()
-def bound_heights(row: Int32, column: Int32, z: Float32, highest: Float32, lowest: Float32) -> None:
-    """Bound the heights z (N,) of each cell: raise `highest` and lower `lowest` (H, W), in place, at row,
-    column (N,).
+def bound_heights(
+    x: Int32, y: Int32, z: Float32, corner: tuple[int, int], highest: Float32, lowest: Float32
+) -> None:
+    """Bound the heights z (N,) of each cell x, y (N,): raise `highest` and lower `lowest` (H, W), in place,
+    whose first cell is `corner` (x, y).
     """
+    low_x, low_y = np.int32(corner[0]), np.int32(corner[1])
     for k in range(z.size):
-        i, j = row[k], column[k]
+        i, j = np.uint32(y[k] - low_y), np.uint32(x[k] - low_x)
         highest[i, j] = max(highest[i, j], z[k])
         lowest[i, j] = min(lowest[i, j], z[k])
+
+
+@kernel()
+def _choose_level(
+    x: Int32, y: Int32, z: Float32, corner: tuple[int, int], highest: Float32, lowest: Float32
+) -> Int64:
+    """Choose those (M,) of the heights at x, y, z (N,) that lie in one cell of COARSE_CELLS to a side, and
+    within LEVEL_M of the highest and the lowest about them, (H, W) from `corner` on.
+    """
+    low_x, low_y = np.int32(corner[0]), np.int32(corner[1])
+    chosen, n = np.empty(z.size, np.int64), 0
+    for k in range(z.size):
+        if x[k] % COARSE_CELLS or y[k] % COARSE_CELLS:
+            continue
+        i, j = np.uint32(y[k] - low_y), np.uint32(x[k] - low_x)
+        if max(highest[i, j] - z[k], z[k] - lowest[i, j]) < np.float32(LEVEL_M):
+            chosen[n] = k
+            n += 1
+    return chosen[:n]
 
 
 @kernel()
@@ -167,6 +191,7 @@ def carve_rays(x: Int32, y: Int32, z: Float32, eye: Float64, cell_m: float, boun
     x, y: (N,) the heights' cells. A cell's bound is the ray's height where it leaves the cell, plus
     OVER_END_M. All places count from the middle of the bounds' first cell.
     """
+    over, column, row = np.empty(_STEPS, np.float32), np.empty(_STEPS, np.int32), np.empty(_STEPS, np.int32)
     for k in range(x.size):
         rise = eye[2] - z[k]
         if rise <= 0:
@@ -176,15 +201,22 @@ def carve_rays(x: Int32, y: Int32, z: Float32, eye: Float64, cell_m: float, boun
         if run < 1e-6:
             continue
         step = cell_m / run
-        count = int(REACH_M / step)
-        for i in range(1, count):
-            height = i * step
-            if height >= rise:
-                break
-            column = int(np.floor(x[k] + height * run_x / cell_m + 0.5))
-            row = int(np.floor(y[k] + height * run_y / cell_m + 0.5))
-            if row < 0 or column < 0 or row >= bound.shape[0] or column >= bound.shape[1]:
-                break
-            over = np.float32(z[k] + height + step + OVER_END_M)
-            if over < bound[row, column]:
-                bound[row, column] = over
+        count, first = int(REACH_M / step), 1
+        begin_x, begin_y, begin_z = np.float64(x[k]), np.float64(y[k]), np.float64(z[k])
+        while first < count and first * step < rise:
+            many = min(_STEPS, count - first)
+            for i in range(many):
+                height = (first + i) * step
+                column[i] = np.int32(np.floor(begin_x + height * run_x / cell_m + 0.5))
+                row[i] = np.int32(np.floor(begin_y + height * run_y / cell_m + 0.5))
+                over[i] = np.float32(begin_z + height + step + OVER_END_M)
+            for i in range(many):
+                at_x, at_y = column[i], row[i]
+                if at_y < 0 or at_x < 0 or at_y >= bound.shape[0] or at_x >= bound.shape[1]:
+                    count = 0
+                    break
+                if (first + i) * step >= rise:
+                    break
+                if over[i] < bound[np.uint32(at_y), np.uint32(at_x)]:
+                    bound[np.uint32(at_y), np.uint32(at_x)] = over[i]
+            first += many

@@ -30,13 +30,15 @@ PRIOR_VIEWS = 4.0
 
 def fuse_view(store: TileStore, view: CellObservations, settings: MapSettings) -> None:
     """Add one view to the tiles in `store`, of which as many stay in memory as the view has touched."""
-    columns, rows = view.x // TILE_CELLS, view.y // TILE_CELLS
-    numbers = rows.astype(np.int64) * (1 << 31) + columns
-    order = np.argsort(numbers, kind="stable")
-    edges = np.flatnonzero(np.diff(numbers[order], prepend=numbers[order[:1]] - 1))
-    for first, last in zip(edges, [*edges[1:], order.size], strict=True):
-        members = order[first:last]
-        key = (int(columns[members[0]]), int(rows[members[0]]))
+    first = int(view.x.min()) // TILE_CELLS, int(view.y.min()) // TILE_CELLS
+    columns, rows = (
+        int(at.max()) // TILE_CELLS - low + 1 for at, low in zip((view.x, view.y), first, strict=True)
+    )
+    order, starts = _by_tile(view.x, view.y, first, (rows, columns))
+    touched = np.flatnonzero(np.diff(starts))
+    for number in touched.tolist():
+        members = order[starts[number] : starts[number + 1]]
+        key = first[0] + number % columns, first[1] + number // columns
         _vote(
             store.take(key),
             members,
@@ -49,10 +51,32 @@ def fuse_view(store: TileStore, view: CellObservations, settings: MapSettings) -
             view.central,
             (settings.gate_sigma, settings.min_gate_m),
         )
-    store.hold(edges.size)
+    store.hold(touched.size)
 
 
 @kernel()
+def _by_tile(x: Int32, y: Int32, first: tuple[int, int], shape: tuple[int, int]) -> tuple[Int64, Int64]:
+    """Sort cells x, y (N,) by counting: their numbers (N,), tile by tile and row by row, and where each tile
+    starts (tiles + 1,).
+
+    shape: rows and columns of tiles from the tile `first` (x, y) on.
+    """
+    starts, order = np.zeros(shape[0] * shape[1] + 1, np.int64), np.empty(x.size, np.int64)
+    tile = np.empty(x.size, np.int64)
+    for i in range(x.size):
+        tile[i] = (y[i] // TILE_CELLS - first[1]) * shape[1] + x[i] // TILE_CELLS - first[0]
+        starts[np.uint64(tile[i] + 1)] += 1
+    for k in range(starts.size - 1):
+        starts[k + 1] += starts[k]
+    cursor = starts[:-1].copy()
+    for i in range(x.size):
+        own = np.uint64(tile[i])
+        order[np.uint64(cursor[own])] = i
+        cursor[own] += 1
+    return order, starts
+
+
+@kernel(borrows=True)
 def _vote(
     tile: Float32,
     members: Int64,
@@ -101,7 +125,7 @@ def _vote(
         slots[target, CENTRAL] = central[m]
 
 
-@kernel()
+@kernel(borrows=True)
 def _choose_slots(
     slots: Float32, z: float, variance: float, shared: float, gate_sigma: float, min_gate: float
 ) -> tuple[int, int]:

@@ -53,19 +53,15 @@ def bin_points(
     if len(points.xyz_m) == 0:
         return _no_observations()
     about = covariance[np.ix_((0, 1, 5), (0, 1, 5))]
-    x, y, said = _in_reference(
-        points.xyz_m, points.range_sigma_m, points.shared_sigma_m, points.intensity,
-        reference_from_rect0.rotation, reference_from_rect0.translation, body_origin_m, about,
-        cell_m, 0.5 * spacing_rad,
+    rotation, translation = reference_from_rect0.rotation, reference_from_rect0.translation
+    x, y = _cell_numbers(points.xyz_m, rotation, translation, cell_m)
+    corner = int(x.min()), int(y.min())
+    shape = int(y.max()) - corner[1] + 1, int(x.max()) - corner[0] + 1
+    by_cell, starts = _by_cell(
+        points.xyz_m, (points.range_sigma_m, points.shared_sigma_m), points.intensity,
+        (rotation, translation, body_origin_m, about), cell_m, 0.5 * spacing_rad, (x, y), corner, shape,
     )  # fmt: skip
-    low_x, low_y = int(x.min()), int(y.min())
-    width, height = int(x.max()) - low_x + 1, int(y.max()) - low_y + 1
-    by_cell, starts = _by_cell(x, y, said, low_x, low_y, width, height)
-    cell, central, *heights = _gather(by_cell, starts, cell_m)
-    rows, columns = np.divmod(cell, width)
-    return CellObservations(
-        (columns + low_x).astype(np.int32), (rows + low_y).astype(np.int32), central, *heights
-    )
+    return CellObservations(*_gather(by_cell, starts, cell_m, corner, shape))
 
 
 def _no_observations() -> CellObservations:
@@ -75,92 +71,105 @@ def _no_observations() -> CellObservations:
 
 
 @kernel()
-def _in_reference(
-    xyz: Float32, range_sigma: Float32, shared_sigma: Float32, intensity: UInt8, rotation: Float64,
-    translation: Float64, origin: Float64, about: Float64, cell_m: float, half_rad: float,
-) -> tuple[Int32, Int32, Float32]:  # fmt: skip
-    """Transform and pack: cell numbers (N,) and, side by side in memory, what each point says (N, _SAID): its
-    height, matching variance, pose variance and shared sigma of the height, its gray level and whether it
-    lies within half_rad (half a pixel) of the cell's middle, along x and along y.
+def _cell_numbers(
+    xyz: Float32, rotation: Float64, translation: Float64, cell_m: float
+) -> tuple[Int32, Int32]:
+    """Number the cells (N,) along x and y that points xyz (N, 3) lie in."""
+    x, y = np.empty(len(xyz), np.int32), np.empty(len(xyz), np.int32)
+    for i in range(len(xyz)):
+        px, py, _ = _turned(xyz, np.uint64(i), rotation)
+        x[i] = np.int32(np.floor((px + translation[0]) / cell_m + 0.5))
+        y[i] = np.int32(np.floor((py + translation[1]) / cell_m + 0.5))
+    return x, y
 
-    The height's error is the range error along the ray times the ray's slope, plus that of the pose:
-    dz = dt_z + theta_x * q_y - theta_y * q_x for a point q as seen from the body.
+
+@kernel(inline=True)
+def _turned(xyz: Float32, i: np.uint64, rotation: Float64) -> tuple[float, float, float]:
+    """Turn point i of xyz (N, 3)."""
+    a, b, c = np.float64(xyz[i, 0]), np.float64(xyz[i, 1]), np.float64(xyz[i, 2])
+    return (
+        rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2] * c,
+        rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2] * c,
+        rotation[2, 0] * a + rotation[2, 1] * b + rotation[2, 2] * c,
+    )
+
+
+@kernel()
+def _by_cell(
+    xyz: Float32, sigmas: tuple[Float32, Float32], intensity: UInt8,
+    pose: tuple[Float64, Float64, Float64, Float64], cell_m: float, half_rad: float,
+    numbers: tuple[Int32, Int32], corner: tuple[int, int], shape: tuple[int, int],
+) -> tuple[Float32, Int64]:  # fmt: skip
+    """Tell what each point says, sorted by counting, cell by cell and row by row (N, _SAID), and where each
+    cell starts (cells + 1,).
+
+    A point says its height, matching variance, pose variance and shared sigma of the height, its gray level
+    and whether it lies within half_rad (half a pixel) of the cell's middle, along x and along y. The height's
+    error is the range error along the ray times the ray's slope, plus that of the pose: dz = dt_z + theta_x *
+    q_y - theta_y * q_x for a point q as seen from the body.
+
+    sigmas: along the ray, matching and shared, (N,) each. pose: rotation, translation, the body's origin and
+    the covariance (3, 3) about it. numbers: the points' cells (N,), within shape (rows, columns) from corner
+    (column, row) on.
     """
-    count = xyz.shape[0]
-    x, y = np.empty(count, np.int32), np.empty(count, np.int32)
-    said = np.empty((count, _SAID), np.float32)
-    half = np.float32(half_rad)
-    for i in range(count):
+    (x, y), (range_sigma, shared_sigma) = numbers, sigmas
+    rotation, translation, origin, about = pose
+    width = np.uint64(shape[1])
+    low_x, low_y, half = np.int32(corner[0]), np.int32(corner[1]), np.float32(half_rad)
+    starts = np.zeros(shape[0] * shape[1] + 1, np.int64)
+    for n in range(x.size):
+        starts[np.uint64(y[n] - low_y) * width + np.uint64(x[n] - low_x) + np.uint64(1)] += 1
+    for k in range(starts.size - 1):
+        starts[k + 1] += starts[k]
+    cursor = starts[:-1].copy()
+    by_cell = np.empty((x.size, _SAID), np.float32)
+    for n in range(x.size):
+        i = np.uint64(n)
+        rx, ry, rz = _turned(xyz, i, rotation)
         a, b, c = np.float64(xyz[i, 0]), np.float64(xyz[i, 1]), np.float64(xyz[i, 2])
-        rx = rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2] * c
-        ry = rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2] * c
-        rz = rotation[2, 0] * a + rotation[2, 1] * b + rotation[2, 2] * c
         slope = rz / np.sqrt(a * a + b * b + c * c)
         px, py = rx + translation[0], ry + translation[1]
-        column, row = np.floor(px / cell_m + 0.5), np.floor(py / cell_m + 0.5)
-        x[i], y[i] = np.int32(column), np.int32(row)
-        said[i, _HEIGHT] = rz + translation[2]
-        said[i, _NOISE] = (range_sigma[i] * slope) ** 2
         jx, jy = py - origin[1], -(px - origin[0])
-        said[i, _POSE] = (
+        off = np.float32(max(abs(px - x[i] * cell_m), abs(py - y[i] * cell_m)))
+        cell = np.uint64(y[i] - low_y) * width + np.uint64(x[i] - low_x)
+        at = np.uint64(cursor[cell])
+        by_cell[at, _HEIGHT] = rz + translation[2]
+        by_cell[at, _NOISE] = (range_sigma[i] * slope) ** 2
+        by_cell[at, _POSE] = (
             about[0, 0] * jx * jx
             + about[1, 1] * jy * jy
             + about[2, 2]
             + 2 * (about[0, 1] * jx * jy + about[0, 2] * jx + about[1, 2] * jy)
         )
-        said[i, _SHARED] = np.abs(shared_sigma[i] * slope)
-        said[i, _GRAY] = np.float32(intensity[i])
-        off = np.float32(max(abs(px - column * cell_m), abs(py - row * cell_m)))
-        said[i, _MIDDLE] = np.float32(off <= half * xyz[i, 2])
-    return x, y, said
-
-
-@kernel()
-def _by_cell(
-    x: Int32, y: Int32, said: Float32, low_x: int, low_y: int, width: int, height: int
-) -> tuple[Float32, Int64]:
-    """Sort by counting: what is said (N, _SAID), cell by cell and row by row, and where each cell starts
-    (cells + 1,).
-
-    x, y: (N,) cell numbers, within width columns from low_x and height rows from low_y on; said: (N, _SAID).
-    """
-    starts = np.zeros(width * height + 1, np.int64)
-    for i in range(x.size):
-        starts[(y[i] - low_y) * width + x[i] - low_x + 1] += 1
-    for k in range(width * height):
-        starts[k + 1] += starts[k]
-    cursor = starts[:-1].copy()
-    by_cell = np.empty_like(said)
-    for i in range(x.size):
-        k = (y[i] - low_y) * width + x[i] - low_x
-        for field in range(_SAID):  # a row at once takes Numba ten seconds more to compile
-            by_cell[cursor[k], field] = said[i, field]
-        cursor[k] += 1
+        by_cell[at, _SHARED] = np.abs(shared_sigma[i] * slope)
+        by_cell[at, _GRAY] = np.float32(intensity[i])
+        by_cell[at, _MIDDLE] = np.float32(off <= half * xyz[i, 2])
+        cursor[cell] += 1
     return by_cell, starts
 
 
 @kernel()
 def _gather(
-    said: Float32, starts: Int64, cell_m: float
-) -> tuple[Int64, Bool, Float32, Float32, Float32, Float32]:
+    said: Float32, starts: Int64, cell_m: float, corner: tuple[int, int], shape: tuple[int, int]
+) -> tuple[Int32, Int32, Bool, Float32, Float32, Float32, Float32]:
     """Merge within each cell, from the top: points no deeper than 4 sigma below the highest are one surface;
     those below wait at the cell's front.
 
-    said: (N, _SAID) and starts: (cells + 1,), of `_by_cell`; said's order changes. Returns (M,) each: a
-    surface's cell, whether a point lies at the cell's middle, height (m), its variance (m^2), shared sigma
-    (m), gray level.
+    said: (N, _SAID) and starts: (cells + 1,), of `_by_cell`, as corner and shape; said's order changes.
+    Returns (M,) each: a surface's cell along x and along y, whether a point lies at the cell's middle, height
+    (m), its variance (m^2), shared sigma (m), gray level.
     """
     count = said.shape[0]
-    cell, middle = np.empty(count, np.int64), np.zeros(count, np.bool_)
+    x, y, middle = np.empty(count, np.int32), np.empty(count, np.int32), np.zeros(count, np.bool_)
     out = np.empty((4, count), np.float32)
-    n = 0
+    n = np.uint64(0)
     for k in range(starts.size - 1):
-        first, last = starts[k], starts[k + 1]
+        first, last = np.uint64(starts[k]), np.uint64(starts[k + 1])
         while first < last:
             top = first
-            for i in range(first + 1, last):
+            for i in range(first + np.uint64(1), last):
                 if said[i, _HEIGHT] > said[top, _HEIGHT]:
-                    top = i
+                    top = np.uint64(i)
             floor = said[top, _HEIGHT] - max(4 * np.sqrt(said[top, _NOISE]), 2 * cell_m)
             weights = heights = variances = extra = gray = 0.0
             left = first
@@ -168,7 +177,7 @@ def _gather(
                 if said[i, _HEIGHT] < floor:
                     for field in range(_SAID):
                         said[left, field] = said[i, field]
-                    left += 1
+                    left += np.uint64(1)
                     continue
                 w = 1.0 / max(said[i, _NOISE], 1e-10)
                 weights += w
@@ -177,12 +186,12 @@ def _gather(
                 extra += said[i, _SHARED]
                 gray += said[i, _GRAY]
                 middle[n] |= said[i, _MIDDLE] > 0
-            held = last - left
-            cell[n] = k
+            held = np.int64(last - left)
+            x[n], y[n] = corner[0] + k % shape[1], corner[1] + k // shape[1]
             out[0, n] = heights / weights
             out[1, n] = variances / held
             out[2, n] = extra / held
             out[3, n] = gray / held
-            n += 1
+            n += np.uint64(1)
             last = left
-    return cell[:n], middle[:n], out[0, :n], out[1, :n], out[2, :n], out[3, :n]
+    return x[:n], y[:n], middle[:n], out[0, :n], out[1, :n], out[2, :n], out[3, :n]

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from barsight.core.arrays import Bool, Float32, Float64, UInt8, UInt16
+from barsight.core.arrays import Bool, Float32, Float64, Int32, UInt8, UInt16, kernel
 from barsight.core.pose import Pose
 from barsight.core.types import RectifiedPair
 from barsight.mapping.free_space import TILE, covering_tiles, tile_overlap
@@ -124,16 +124,28 @@ def _tops(cells: CellObservations, column: int, row: int, cell_m: float) -> tupl
     lowest = np.float32(cells.z_m.min())
     heights = np.full(tuple(COARSE_CELLS * n for n in shape), lowest, np.float32)
     seen = np.zeros(heights.shape, np.uint8)
-    # A cell's highest comes first, and the last that is assigned stays.
-    heights[cells.y[::-1] - row, cells.x[::-1] - column] = cells.z_m[::-1]
-    seen[cells.y - row, cells.x - column] = 1
+    _note_highest(cells.x, cells.y, cells.z_m, column, row, heights, seen)
     # A single wrong match raises nothing.
     smooth = cv2.medianBlur(heights, 3).reshape(shape[0], COARSE_CELLS, shape[1], COARSE_CELLS)
     span = round(SPAN_M / (COARSE_CELLS * cell_m)) | 1
-    tops = cv2.morphologyEx(smooth.max(axis=(1, 3)), cv2.MORPH_CLOSE, np.ones((span, span), np.uint8))
+    tops = cv2.morphologyEx(smooth.max(axis=1).max(axis=2), cv2.MORPH_CLOSE, np.ones((span, span), np.uint8))
     wide = round(SPAN_M / cell_m) | 1
     held = cv2.morphologyEx(seen, cv2.MORPH_CLOSE, np.ones((wide, wide), np.uint8)) > 0
     return np.asarray(cv2.blur(tops, (3, 3)) + np.float32(OVER_TOPS_M), np.float32), held
+
+
+@kernel()
+def _note_highest(
+    x: Int32, y: Int32, z: Float32, column: int, row: int, heights: Float32, seen: UInt8
+) -> None:
+    """Raise heights (H, W) to the highest z (N,) of each cell x, y (N,), and note it as seen (H, W), which
+    begin at (column, row).
+    """
+    first_column, first_row = np.int32(column), np.int32(row)
+    for k in range(z.size):
+        i, j = np.uint32(y[k] - first_row), np.uint32(x[k] - first_column)
+        heights[i, j] = max(heights[i, j], z[k])
+        seen[i, j] = 1
 
 
 def _finer(at: Float64, coarse: Float32, size: tuple[int, ...]) -> Float32:

@@ -137,7 +137,8 @@ class PointBinner:
                     pair.left, disparity.disparity_px, pair.camera, other.left,
                     there_from_here @ reference_from_rect0,
                 )  # fmt: skip
-                disparity = mask_disparity(disparity, ~still)
+                if still.any():
+                    disparity = mask_disparity(disparity, ~still)
         with self.watch("points", 1):
             points = triangulate_disparity(
                 pair,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -39,6 +39,17 @@ class RawLoss:
     count: int
 
 
+PTP_ROLES = {"Master": 1, "Slave": 2}
+"""What a camera does whose clock PTP keeps, or that others follow; all else it may tell counts as 0."""
+
+
+def are_one_clock(ptp: Iterable[str]) -> bool:
+    """Check by the cameras' PTP states whether their clocks are one: both follow a master, or one follows the
+    other.
+    """
+    return sorted(ptp) in (["Master", "Slave"], ["Slave", "Slave"])
+
+
 class Blocks:
     """Counts the blocks of one stream. trigger: the last one's number, those that didn't come counted too."""
 
@@ -68,7 +79,8 @@ class Blocks:
 class CameraDriver(ABC):
     """A camera of one serial number, connected when pictures are asked for and anew after it was lost.
 
-    size: width and height that the calibration has. connects: how often it was connected.
+    size: width and height that the calibration has. connects: how often it was connected. ptp: the state that
+    it tells of its clock's PTP, "" where it is not connected or tells none.
     """
 
     errors: ClassVar[type[Exception]]
@@ -78,7 +90,7 @@ class CameraDriver(ABC):
         self.name, self.serial = f"cam{number}", settings.serials[number]
         self._settings, self._size = settings, size
         self._camera: Any = None
-        self.connects = 0
+        self.connects, self.ptp = 0, ""
 
     @staticmethod
     @abstractmethod
@@ -113,6 +125,7 @@ class CameraDriver(ABC):
 
     def close(self) -> None:
         """Give the camera back, if it is held."""
+        self.ptp = ""
         if self._camera is not None:
             self._release()
             self._camera = None

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from barsight.core.stamps import NS_PER_S
-from barsight.sensors.camera import CameraDriver, RawLoss, RawPicture
+from barsight.sensors.camera import PTP_ROLES, CameraDriver, RawLoss, RawPicture, are_one_clock
 from barsight.sensors.clock import DeviceClock
 from barsight.sensors.receiver import RawReading, ReadingReceiver
 from barsight.sensors.source import LivePicture, LostPicture, Packet, Readings, SensorSigns
@@ -22,6 +22,8 @@ SIGNS_EVERY_S = 1.0
 HOLD_INTERVALS = 3
 """A picture waits so many intervals for an older one of the other camera."""
 RAW_QUEUE = 256
+ONE_CLOCK_NS = 5_000_000
+"""The least delays of two cameras on one network are no further apart."""
 
 Item = tuple[str, RawPicture | RawLoss | RawReading]
 
@@ -39,7 +41,8 @@ class CraneSource:
     """`Source` of two cameras, an IMU and encoders.
 
     Every stamp is the device's own, mapped to the host's monotonic clock by its `DeviceClock`; `epoch_ns`
-    added to that gives the run's stamps, which a step of the host's wall clock can't move.
+    added to that gives the run's stamps, which a step of the host's wall clock can't move. Cameras whose
+    clocks PTP makes one are mapped by one, cam0's, so that no delay tells them apart.
     """
 
     def __init__(
@@ -52,7 +55,7 @@ class CraneSource:
         self._streams = {name: _Stream() for name in ("cam0", "cam1", *receivers)}
         self._items: queue.Queue[Item] = queue.Queue(RAW_QUEUE)
         self._held: list[tuple[int, int, int, LivePicture]] = []
-        self._overflow = 0
+        self._overflow = self._device_ns = 0
 
     def packets(self, after: dict[str, int]) -> Iterator[Packet]:
         """Yield what comes, pictures in time's order; see `Source.packets`."""
@@ -141,7 +144,8 @@ class CraneSource:
         if not stream.clock.add(item.device_ns, item.arrival_ns):
             yield LostPicture(camera, 0, "clock")
             return
-        exposed_ns = stream.clock.host_ns(item.device_ns)
+        self._device_ns, first = item.device_ns, self._streams["cam0"].clock
+        exposed_ns = (first if self._are_one(item.device_ns) else stream.clock).host_ns(item.device_ns)
         stamp_ns = exposed_ns + self._epoch_ns
         if stamp_ns <= stream.last_ns:
             yield LostPicture(camera, stamp_ns, "late")
@@ -149,6 +153,15 @@ class CraneSource:
         stream.last_ns = stamp_ns
         picture = LivePicture(camera, stamp_ns, exposed_ns, item.image, item.trigger)
         heapq.heappush(self._held, (stamp_ns, camera, item.arrival_ns, picture))
+
+    def _are_one(self, device_ns: int) -> bool:
+        """Check whether both cameras' clocks are one: they say so, and a stamp is as old on both."""
+        clocks = [self._streams[f"cam{k}"].clock for k in (0, 1)]
+        if not are_one_clock(camera.ptp for camera in self._cameras):
+            return False
+        if not all(clock.is_settled for clock in clocks):
+            return False
+        return abs(clocks[0].host_ns(device_ns) - clocks[1].host_ns(device_ns)) < ONE_CLOCK_NS
 
     def _ordered(self, until_ns: int | None) -> Iterator[Packet]:
         """Yield held pictures that no older one can follow: both cameras are past them, or they came before
@@ -171,7 +184,13 @@ class CraneSource:
                 f"{name}_jitter_ns": clock.jitter_ns, f"{name}_jumps": clock.jumps,
                 f"{name}_lost": stream.lost,
             }  # fmt: skip
-        signs |= {f"{name}_torn": receiver.torn for name, receiver in self._receivers.items()}
+        for name, receiver in self._receivers.items():
+            signs |= {
+                f"{name}_torn": receiver.torn, f"{name}_overtaken": receiver.sequence.overtaken,
+                f"{name}_restarts": receiver.sequence.restarts,
+            }  # fmt: skip
         for number, camera in enumerate(self._cameras):
             signs[f"cam{number}_connects"] = camera.connects
+            signs[f"cam{number}_ptp"] = PTP_ROLES.get(camera.ptp, 0)
+        signs["one_clock"] = int(self._are_one(self._device_ns))
         return signs

@@ -16,8 +16,9 @@ def both_cameras(settings: CamerasSettings, size: tuple[int, int]) -> tuple[Came
     return driver(0, settings, size), driver(1, settings, size)
 
 
-def prove_cameras(settings: CamerasSettings, size: tuple[int, int]) -> None:
-    """Prove that cam0 and cam1 are there and can be set. size: width and height that the calibration has.
+def prove_cameras(settings: CamerasSettings, size: tuple[int, int]) -> tuple[str, str]:
+    """Prove that cam0 and cam1 are there and can be set; return what they tell of their clocks' PTP. size:
+    width and height that the calibration has.
 
     Raises InputError for one that isn't there, is in use, or does not fit its calibration.
     """
@@ -30,9 +31,12 @@ def prove_cameras(settings: CamerasSettings, size: tuple[int, int]) -> None:
                 camera.name, f"no camera of serial number {camera.serial} answers (there: {there})",
                 "check its power and cable, and cameras.serials in crane.toml",
             )  # fmt: skip
+    told = []
     for camera in cameras:
         camera.open(found[camera.serial])
+        told.append(camera.ptp)
         camera.close()
+    return told[0], told[1]
 
 
 def _driver(settings: CamerasSettings) -> type[CameraDriver]:

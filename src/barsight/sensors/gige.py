@@ -20,6 +20,9 @@ SILENT_S = 2.0
 STOPPED_S = 0.1
 """A camera needs so long to end its stream."""
 SERIALS = ("DeviceSerialNumber", "DeviceID")
+PTP_STATES = {"PtpStatus": "PtpDataSetLatch", "GevIEEE1588Status": "GevIEEE1588DataSetLatch"}
+"""The feature that tells PTP's state, by its newer and its older name, and the command that latches it."""
+PTP_EVERY_S = 2.0
 CAUSES = {"frames_incomplete": "incomplete", "frames_missed": "missed", "frames_backpressure": "backpressure"}
 
 
@@ -53,6 +56,18 @@ class GigeCamera(CameraDriver):
             camera.set_frame_rate(self._settings.rate_hz)
         else:
             camera.enable_trigger("FrameStart", self._settings.trigger)
+        self.ptp = self._read_ptp()
+
+    def _read_ptp(self) -> str:
+        for state, latch in PTP_STATES.items():
+            try:
+                with contextlib.suppress(vg.GenicamError):  # not every camera has it
+                    self._camera.execute(latch, wait=False)
+                self._camera.invalidate(state)
+                return str(self._camera.get(state))
+            except vg.GenicamError:
+                continue
+        return ""
 
     def _release(self) -> None:
         self._camera.close()
@@ -61,8 +76,10 @@ class GigeCamera(CameraDriver):
         """Yield from one stream until the camera has been silent for `SILENT_S`."""
         blocks = Blocks()
         with self._camera.stream(packet_size=self._settings.packet_size_bytes) as stream:
-            heard = time.monotonic()
+            heard = asked = time.monotonic()
             while may_go_on():
+                if self.ptp and time.monotonic() - asked > PTP_EVERY_S:
+                    self.ptp, asked = self._read_ptp() or "lost", time.monotonic()
                 try:
                     frame = stream.next_frame(WAIT_MS)
                 except vg.GenicamError:

@@ -10,11 +10,14 @@ from typing import Protocol
 import numpy as np
 
 from barsight.core.errors import ConfigError
+from barsight.core.stamps import NS_PER_S
 from barsight.sensors.forms import FORMS
 from barsight.sensors.settings import ReadingsSettings
 
 MAX_BYTES = 65536
-GAP_LIMIT = 1 << 31
+NUMBERS = 1 << 32
+ANEW_AFTER_NS, ANEW_COUNT = NS_PER_S // 2, 3
+"""No network holds a reading back for so long, nor so many, one after another, with none newer between."""
 
 
 @dataclass(frozen=True)
@@ -73,13 +76,47 @@ class UdpPort:
         self._socket.close()
 
 
+class Sequence:
+    """Judges the numbers that a sender counts its readings by.
+
+    A number that isn't ahead is doubled or was overtaken on its way, or its sender began anew: then its stamp
+    is later than the last one's, or, where the sender's clock began anew too, nothing newer comes any more.
+    So did one that is further ahead than the sensor could have counted meanwhile. overtaken: readings left
+    out; restarts: how often a sender began anew.
+    """
+
+    def __init__(self, rate_hz: float, *, keeps_order: bool) -> None:
+        self._rate_hz, self._keeps_order = rate_hz, keeps_order
+        self._last: tuple[int, int, int] | None = None
+        self._behind = self.overtaken = self.restarts = 0
+
+    def lost_before(self, number: int, stamp_ns: int, arrival_ns: int) -> int | None:
+        """Take a reading; return how many are missing before it, None where it is to be left out."""
+        before, self._last = self._last, (number, stamp_ns, arrival_ns)
+        if before is None:
+            return 0
+        last, last_stamp_ns, last_arrival_ns = before
+        step = (number - last) % NUMBERS
+        since_ns = max(stamp_ns - last_stamp_ns, arrival_ns - last_arrival_ns, 0) + NS_PER_S
+        if 0 < step <= 1 + 2 * self._rate_hz * since_ns / NS_PER_S:
+            self._behind = 0
+            return step - 1
+        is_doubled = step == 0 and stamp_ns == last_stamp_ns
+        self._behind += 1
+        is_last = arrival_ns - last_arrival_ns > ANEW_AFTER_NS and self._behind >= ANEW_COUNT
+        if not is_doubled and (self._keeps_order or stamp_ns > last_stamp_ns or is_last):
+            self._behind, self.restarts = 0, self.restarts + 1
+            return 0
+        self._last, self.overtaken = before, self.overtaken + 1
+        return None
+
+
 class ReadingReceiver:
     """Receives readings of `imu` or `crane`. torn: datagrams or pieces of a stream that aren't ours."""
 
     def __init__(self, sensor: str, settings: ReadingsSettings) -> None:
         """Raises ConfigError where a UDP port is taken; a serial device may come later."""
         self._mark, self._form = FORMS[sensor]
-        self._last: int | None = None
         self.torn = 0
         self._way: Way
         if settings.port is not None:
@@ -89,6 +126,7 @@ class ReadingReceiver:
 
             assert settings.device is not None and settings.baud is not None
             self._way = SerialLine(self._mark, self._form.size, settings.device, settings.baud)
+        self.sequence = Sequence(settings.rate_hz, keeps_order=self._way.keeps_order)
 
     @property
     def trouble(self) -> str:
@@ -111,13 +149,6 @@ class ReadingReceiver:
             if mark != self._mark or not np.isfinite(values).all():
                 self.torn += 1
                 continue
-            step = 1 if self._last is None else (number - self._last) % (1 << 32)
-            if step >= GAP_LIMIT and self._way.keeps_order:
-                step = 1  # a sender that began anew
-            if step == 0 or step >= GAP_LIMIT:
-                # Doubled, overtaken, or a sender that began anew.
-                if self._last is not None and number < self._last and number < 16:
-                    self._last = number
-                continue
-            self._last = number
-            yield RawReading(stamp, arrival_ns, tuple(values), step - 1)
+            lost = self.sequence.lost_before(number, stamp, arrival_ns)
+            if lost is not None:
+                yield RawReading(stamp, arrival_ns, tuple(values), lost)

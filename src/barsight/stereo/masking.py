@@ -11,7 +11,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from barsight.core.arrays import Bool, UInt8
+from barsight.core.arrays import Bool, Float32, UInt8, kernel
 from barsight.core.types import Disparity
 
 _AROUND_PX = 41
@@ -39,9 +39,24 @@ def mask_unsure(disparity: Disparity, max_sigma_px: float) -> Disparity:
 
 def mask_disparity(disparity: Disparity, kept: Bool) -> Disparity:
     """Mask all that is not `kept` (H, W)."""
-    nan = np.float32(np.nan)
     return replace(
         disparity,
-        disparity_px=np.where(kept, disparity.disparity_px, nan),
-        sigma_px=np.where(kept, disparity.sigma_px, nan),
+        disparity_px=mask_values(disparity.disparity_px, kept),
+        sigma_px=mask_values(disparity.sigma_px, kept),
     )
+
+
+def mask_values(values: Float32, kept: Bool) -> Float32:
+    """Mask by NaN all values (H, W) that aren't `kept`, as `np.where` does in three times the time."""
+    masked = np.empty(values.shape, np.float32)
+    _mask(np.ascontiguousarray(values), kept, masked)
+    return masked
+
+
+@kernel()
+def _mask(values: Float32, kept: Bool, masked: Float32) -> None:
+    """Fill masked (H, W) with values, NaN where not kept."""
+    for i in range(values.shape[0]):
+        row, held, out = values[i], kept[i], masked[i]
+        for j in range(len(row)):
+            out[j] = row[j] if held[j] else np.float32(np.nan)

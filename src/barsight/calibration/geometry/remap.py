@@ -56,6 +56,7 @@ def _warp(image: UInt8, crossing: Float32, map_x: Float32, warped: UInt8) -> Non
     """
     height, width = image.shape
     row = np.empty(width + 4, np.float32)  # two more on each side
+    column, furthest = np.empty(warped.shape[1], np.float32), np.float32(width)
     for i in range(warped.shape[0]):
         curve, begin = crossing[i], 0
         while begin < width:
@@ -78,13 +79,24 @@ def _warp(image: UInt8, crossing: Float32, map_x: Float32, warped: UInt8) -> Non
             begin = end
         row[0] = row[1] = row[2]
         row[width + 2] = row[width + 3] = row[width + 1]
-        places, line = map_x[i], warped[i]
-        for j in range(line.size):
-            x = min(max(places[j], -_ONE), np.float32(width)) + _ONE
-            k = min(int(x), width)
-            a, b, c, d = _weights(x - np.float32(k))
-            value = a * row[k] + b * row[k + 1] + c * row[k + 2] + d * row[k + 3] + _HALF
-            line[j] = np.uint8(min(max(value, _ZERO), _MAX_VALUE))
+        for j in range(column.size):
+            place = map_x[i, j] if map_x[i, j] > -_ONE else -_ONE
+            column[j] = (place if place < furthest else furthest) + _ONE
+        begin = 0
+        while begin < column.size:
+            first = min(int(column[begin]), width)
+            end = begin + 1
+            while end < column.size and min(int(column[end]), width) == first + end - begin:
+                end += 1
+            places, line, count = column[begin:end], warped[i, begin:end], end - begin
+            before, left = row[first : first + count], row[first + 1 : first + 1 + count]
+            right, after = row[first + 2 : first + 2 + count], row[first + 3 : first + 3 + count]
+            for k in range(count):
+                a, b, c, d = _weights(places[k] - np.float32(first + k))
+                value = a * before[k] + b * left[k] + c * right[k] + d * after[k] + _HALF
+                value = value if value > _ZERO else _ZERO
+                line[k] = np.uint8(np.int32(value if value < _MAX_VALUE else _MAX_VALUE))
+            begin = end
 
 
 @kernel()

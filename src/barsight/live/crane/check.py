@@ -16,6 +16,7 @@ from barsight.calibration.files.rig_file import read_serials
 from barsight.core.errors import BarsightError
 from barsight.live.crane.preflight import expect_plausible, prove_sensor
 from barsight.live.settings import CraneConfig
+from barsight.sensors.camera import are_one_clock
 from barsight.sensors.drivers import prove_cameras
 
 MIN_CORES, MIN_MEMORY_GIB = 2, 2.0
@@ -194,7 +195,10 @@ def _sensors(crane: CraneConfig) -> Iterator[Finding]:
     awaited = crane.described(Path("recording"))
     size = awaited.rig.cam0.width, awaited.rig.cam0.height
     told = f"{' and '.join(crane.cameras.serials)}, {size[0]}x{size[1]}, Mono8"
-    yield _proved("cameras", told, lambda: prove_cameras(crane.cameras, size))
+    ptp: list[str] = []
+    yield _proved("cameras", told, lambda: ptp.extend(prove_cameras(crane.cameras, size)))
+    if ptp:
+        yield _ptp(ptp)
     for name, sensor in crane.sensors().items():
 
         def listen(name: str = name) -> None:
@@ -206,6 +210,17 @@ def _sensors(crane: CraneConfig) -> Iterator[Finding]:
     heard = (awaited.imu_samples, awaited.crane_samples)
     if any(one is not None and len(one.stamp_ns) for one in heard):
         yield _proved("readings", "those of a crane, in SI units", lambda: expect_plausible(awaited))
+
+
+def _ptp(told: list[str]) -> Finding:
+    """Tell whether PTP makes the cameras' clocks one."""
+    is_one = are_one_clock(told)
+    return Finding(
+        "PTP of the cameras", " and ".join(one or "none told" for one in told),
+        "none, offset and drift are estimated from the stamps; Slave and Slave: one clock",
+        "" if is_one else "to have one clock, enable PTP in both cameras and give their network one master",
+        is_one or None,
+    )  # fmt: skip
 
 
 def _proved(what: str, needed: str, prove: Callable[[], None]) -> Finding:

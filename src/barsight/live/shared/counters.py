@@ -23,8 +23,11 @@ ROWS: dict[str, tuple[str, ...]] = {
     "sensors": (
         "cam0_settled", "cam0_drift_ppb", "cam0_jitter_ns", "cam0_jumps", "cam0_lost", "cam0_connects",
         "cam1_settled", "cam1_drift_ppb", "cam1_jitter_ns", "cam1_jumps", "cam1_lost", "cam1_connects",
+        "cam0_ptp", "cam1_ptp",
         "imu_settled", "imu_drift_ppb", "imu_jitter_ns", "imu_jumps", "imu_lost", "imu_torn",
+        "imu_overtaken", "imu_restarts",
         "crane_settled", "crane_drift_ppb", "crane_jitter_ns", "crane_jumps", "crane_lost", "crane_torn",
+        "crane_overtaken", "crane_restarts", "one_clock",
     ),
     "record": ("ready", "pairs", "readings", "deleted", "paused", "alarms", "backlog", "bytes", "beat_ns"),
     "map": ("ready", "mapped", "refused", "backlog", "snapshots", "beat_ns"),

@@ -182,7 +182,8 @@ def elect_surface(
         tile, corner, roof, ceiling, planes, frusta.eyes, cell_m, float(min_views), one_point_m, first_new
     )
     scene = around, roof, ceiling
-    share, expected = _supported(
+    share, expected = np.full((2, *tile.shape[:3]), -1, np.float32)
+    _support(
         tile,
         corner,
         scene,
@@ -192,7 +193,7 @@ def elect_surface(
         cell_m,
         float(min_views),
         one_point_m,
-        (first_new, asked.heights),
+        (first_new, asked.heights, share, expected),
     )
     return _elected(tile, share, expected, cell_m, float(min_views), settings.own_ratio, settings.along_ratio)
 
@@ -209,27 +210,24 @@ def supported_box(tile: Float32, key: TileKey, cell_m: float, min_views: int) ->
     return box
 
 
-@kernel()
-def _supported(
+@kernel(borrows=True)
+def _support(
     tile: Float32, corner: Float64, scene: tuple[Float32, Float32, float], planes: Float64, eyes: Float64,
     blocks: tuple[Int8, Bool, Float64, Bool], cell_m: float, min_views: float, one_point_m: float,
-    asked: tuple[int, Float32],
-) -> tuple[Float32, Float32]:  # fmt: skip
-    """Compute support, two arrays (rows, columns, SLOTS): the ratio of votes to those a height can expect, -1
-    where fewer than min_views see or can see it or something may lie above; and how many it can expect.
+    asked: tuple[int, Float32, Float32, Float32],
+) -> None:  # fmt: skip
+    """Fill support, two arrays (rows, columns, SLOTS) of -1: the ratio of votes to those a height can expect,
+    and how many it can expect; left where fewer than min_views see or can see it or something may lie above.
 
     A view that can see a height is expected to vote for it in the cell's middle, or less where its points lie
     further apart than cells: at ranges over one_point_m, and where it looks along the ground. scene: around,
     roof and ceiling of `is_unoccluded`. blocks: what `bound_blocks` tells. asked: the first view that wasn't
     yet, and what those before it see, of `ViewSupport`; it holds for a height that has hardly moved, and is
-    brought up to date.
+    brought up to date; then the arrays to fill.
     """
     rows, columns = tile.shape[:2]
-    share = np.full((rows, columns, SLOTS), -1, np.float32)
-    expected = np.zeros((rows, columns, SLOTS), np.float32)
-    point = np.empty(3)
     (around, _, ceiling), (within, dense, clear, is_open) = scene, blocks
-    first_new, known = asked
+    first_new, known, share, expected = asked
     for i in range(rows):
         for j in range(columns):
             a, b = i // BLOCK, j // BLOCK
@@ -238,7 +236,7 @@ def _supported(
                     continue
                 z = float(tile[i, j, s, Z])
                 x, y = (corner[0] + j) * cell_m, (corner[1] + i) * cell_m
-                point[0], point[1], point[2] = x, y, z
+                point = x, y, np.float64(z)
                 able, votes, first = 0.0, 0.0, 0
                 if abs(known[i, j, s, 0] - z) <= _MOVED_CELLS * cell_m:
                     able, votes, first = known[i, j, s, 1], known[i, j, s, 2], first_new
@@ -264,17 +262,16 @@ def _supported(
                     continue
                 share[i, j, s] = min(tile[i, j, s, CENTRAL] / max(votes, 1e-6), 1.0)
                 expected[i, j, s] = votes
-    return share, expected
 
 
 @kernel(inline=True)
 def _is_seen(
-    point: Float64, row: int, column: int, eyes: Float64, view: int, clear: Float64,
+    point: tuple[float, float, float], row: int, column: int, eyes: Float64, view: int, clear: Float64,
     scene: tuple[Float32, Float32, float], cell_m: float,
 ) -> bool:  # fmt: skip
     """Check that both cameras of a view have a free line of sight to a point, in a cell of the middle tile.
 
-    point: (3,) m. eyes: (K, 2, 3) m. view: its number among the K. clear: (B, B, K, 2) m, heights from which
+    point: m. eyes: (K, 2, 3) m. view: its number among the K. clear: (B, B, K, 2) m, heights from which
     the lines of a block are known to be free. scene: around, roof and ceiling of `is_unoccluded`.
     """
     (around, roof, ceiling), z = scene, point[2]
@@ -298,7 +295,7 @@ def _elected(
 ) -> Int8:
     """Select the highest supported height of each cell: its slot (rows, columns), -1 where there is none.
 
-    tile: (rows, columns, SLOTS, FIELDS). share, expected: (rows, columns, SLOTS) of `_supported`, share -1
+    tile: (rows, columns, SLOTS, FIELDS). share, expected: (rows, columns, SLOTS) of `_support`, share -1
     where a height can't be the surface. It needs own_ratio of its votes (along_ratio where fewer than
     min_views are expected), or along_ratio averaged along a bar or an edge.
     """
@@ -329,7 +326,7 @@ def _share_along(heights: Float32, share: Float32, row: int, column: int, z: flo
     """Average the support of a height and its like within `_ALONG` cells (every third is read), along that of
     four directions in which most of the tile's cells have one: the bar's own, or the edge's.
 
-    heights, share: (rows, columns, SLOTS) of `_supported`, heights NaN where share is -1. z: the height, m.
+    heights, share: (rows, columns, SLOTS) of `_support`, heights NaN where share is -1. z: the height, m.
     """
     most, result = -1, 0.0
     for direction in range(4):

@@ -14,7 +14,7 @@ STRIDE = 4
 """Cells that a line of sight passes at once where all around lies below it."""
 
 
-@kernel()
+@kernel(borrows=True)
 def point_density(way: tuple[float, float, float], one_point_m: float) -> float:
     """Compute points that a view has in a level cell, at most 1.
 
@@ -25,7 +25,7 @@ def point_density(way: tuple[float, float, float], one_point_m: float) -> float:
     return float(min(one_point_m * one_point_m * abs(z) / (squared * np.sqrt(squared)), 1.0))
 
 
-@kernel()
+@kernel(borrows=True)
 def is_pictured(x_m: float, y_m: float, z_m: float, planes: Float64, view: int) -> bool:
     """Check that a point lies inside both pictures of a view.
 
@@ -38,9 +38,9 @@ def is_pictured(x_m: float, y_m: float, z_m: float, planes: Float64, view: int) 
     return True
 
 
-@kernel()
+@kernel(borrows=True)
 def may_be_occluded(
-    point: Float64,
+    point: tuple[float, float, float],
     row: int,
     column: int,
     around: Float32,
@@ -52,7 +52,7 @@ def may_be_occluded(
     """Check for possible occlusion: within `_CUT_CELLS` along x or y, a much higher surface ends where fewer
     than min_views views could see it go on towards the point: their pictures end there.
 
-    point: (3,), m. around: (rows, columns) the tile's heights with a tile around it, m; row, column: the
+    point: m. around: (rows, columns) the tile's heights with a tile around it, m; row, column: the
     point's, in the tile. planes: of all views, as `has_enough_views` takes them.
     """
     x_m, y_m = point[0], point[1]
@@ -71,7 +71,7 @@ def may_be_occluded(
     return False
 
 
-@kernel()
+@kernel(borrows=True)
 def has_enough_views(x_m: float, y_m: float, z_m: float, planes: Float64, min_views: float) -> bool:
     """Check that at least so many views have the point in both pictures.
 

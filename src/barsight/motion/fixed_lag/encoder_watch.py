@@ -1,15 +1,21 @@
-"""Watch the encoders while the crane travels: jumps and freezes as soon as they show."""
+"""Watch the encoders while the crane travels: jumps and freezes as soon as they show.
+
+Once all readings held lie beyond several jumps of one encoder, only the sum of these shows, and it is held
+in their place, so that neither the unknowns nor the time grow with what is past.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import E
 
-from barsight.core.arrays import Float64
+from barsight.core.arrays import Float64, Int64
+from barsight.core.linalg import dense
 from barsight.core.stamps import seconds_to_ns
 from barsight.core.types import CraneSamples, EncoderJump
 from barsight.motion.batch.fault_detection import frozen_stretches, without_frozen
@@ -23,10 +29,13 @@ NEWEST_S = 2.5
 
 
 class EncoderWatch:
-    """Encoder faults so far. jumps: in time's order; frozen: stamps of the first and last frozen readings."""
+    """Encoder faults so far. jumps: those that the readings held need, in time's order; told: every one that
+    was found; frozen: stamps of the first and last frozen readings.
+    """
 
     def __init__(self) -> None:
         self.jumps: tuple[EncoderJump, ...] = ()
+        self.told: list[EncoderJump] = []
         self.frozen: list[tuple[int, int]] = []
 
     def check(self, crane: CraneSamples, known: KnownMotion) -> None:
@@ -35,7 +44,7 @@ class EncoderWatch:
             return
         stamps, place = crane.stamp_ns, crane.position_m
         parts = [(int(stamps[first]), int(stamps[last])) for first, last in frozen_stretches(crane)]
-        if self.frozen:  # one that began before what is left of the readings goes on
+        if self.frozen and self.frozen[-1][1] >= stamps[0]:  # one that began before these readings may go on
             begin, end = self.frozen[-1]
             k = int(np.searchsorted(stamps, end))
             while k + 1 < len(stamps) and stamps[k] >= end and (place[k + 1] == place[k]).all():
@@ -43,17 +52,37 @@ class EncoderWatch:
             self.frozen[-1] = begin, max(end, int(stamps[min(k, len(stamps) - 1)]))
         seen = {first for first, _ in self.frozen}
         self.frozen += [part for part in parts if part[0] not in seen]
-        usable, after = without_frozen(crane, self.frozen)
+        usable, after = without_frozen(crane, self._frozen_since(int(stamps[0])))
         told = {jump.stamp_ns for jump in self.jumps}
-        self._add(jump for jump in after if jump.stamp_ns not in told)
+        self._add([jump for jump in after if jump.stamp_ns not in told])
         newest_ns = int(stamps[-1]) - seconds_to_ns(NEWEST_S)
         self._add(find_jumps(replace(usable, jumps=self.jumps), known, newest_ns))
 
+    def put_together(self, begin_ns: int) -> dict[EncoderJump, tuple[EncoderJump, ...]]:
+        """Put the jumps of each encoder together that no reading held, from `begin_ns` on, is before; return
+        which, by what they became.
+        """
+        found: dict[EncoderJump, tuple[EncoderJump, ...]] = {}
+        for axis in range(3):
+            past = tuple(jump for jump in self.jumps if jump.axis == axis and jump.stamp_ns <= begin_ns)
+            if len(past) > 1:
+                size, sigma = sum(jump.size_m for jump in past), math.hypot(*(jump.sigma_m for jump in past))
+                found[EncoderJump(past[-1].stamp_ns, axis, size, sigma)] = past
+        gone = {jump for past in found.values() for jump in past}
+        left = (*found, *(jump for jump in self.jumps if jump not in gone))
+        self.jumps = tuple(sorted(left, key=lambda jump: jump.stamp_ns))
+        return found
+
     def usable(self, crane: CraneSamples) -> CraneSamples:
         """Return readings without the frozen ones, jumps taken off."""
-        return take_off_jumps(without_frozen(crane, self.frozen)[0], self.jumps)
+        since = int(crane.stamp_ns[0]) if len(crane.stamp_ns) else 0
+        return take_off_jumps(without_frozen(crane, self._frozen_since(since))[0], self.jumps)
 
-    def _add(self, jumps: Iterable[EncoderJump]) -> None:
+    def _frozen_since(self, begin_ns: int) -> list[tuple[int, int]]:
+        return [part for part in self.frozen if part[1] >= begin_ns]
+
+    def _add(self, jumps: Sequence[EncoderJump]) -> None:
+        self.told += jumps
         self.jumps = tuple(sorted((*self.jumps, *jumps), key=lambda jump: jump.stamp_ns))
 
 
@@ -71,6 +100,51 @@ def with_jumps(window: Window, jumps: tuple[EncoderJump, ...]) -> Window:
         prior = _widened(prior, old, np.array([jump.sigma_m for jump in added]))
     problem = replace(problem, jumps=(*problem.jumps, *added), prior=prior)
     return replace(window, problem=problem, state=replace(window.state, values=values))
+
+
+def with_sums(window: Window, sums: dict[EncoderJump, tuple[EncoderJump, ...]]) -> Window:
+    """Make jumps that all nodes held and to come lie beyond one unknown of a window: their sum.
+
+    What the window knows of the sum is what it knew before, since no residual is moved by anything else of
+    them.
+    """
+    problem, values = window.problem, gtsam.Values(window.state.values)
+    if not problem.has_latency:
+        return window
+    for whole, past in sums.items():
+        at = [problem.jumps.index(jump) for jump in past]
+        kept = np.delete(np.arange(len(problem.jumps)), at[1:])
+        known = encoder_unknowns_of(values)
+        known[1 + at[0]] = known[1:][at].sum()
+        values.erase(E(0))
+        values.insert(E(0), known[np.r_[0, 1 + kept]])
+        prior = problem.prior
+        if prior is not None:
+            prior = sum_unknowns(prior, 1 + np.array(at))
+        jumps = [whole if k == at[0] else problem.jumps[k] for k in kept.tolist()]
+        problem = replace(problem, jumps=tuple(jumps), prior=prior)
+    return replace(window, problem=problem, state=replace(window.state, values=values))
+
+
+def sum_unknowns(prior: MarginalPrior, at: Int64) -> MarginalPrior:
+    """Put a sum of unknowns in the first one's place and marginalise the others. at: (J,) their places in
+    the border.
+    """
+    first = len(prior.matrix) - len(prior.border)
+    others = first + at[1:]
+    kept = np.delete(np.arange(len(prior.matrix)), others)
+    # The first is the sum less the others.
+    matrix, gradient, border = prior.matrix.copy(), prior.gradient.copy(), prior.border.copy()
+    gradient[others] -= gradient[first + at[0]]
+    matrix[others] -= matrix[first + at[0]]
+    matrix[:, others] -= matrix[:, [first + at[0]]]
+    border[at[0]] = border[at].sum()
+    share = dense.solve_positive(matrix[np.ix_(others, others)], matrix[np.ix_(others, kept)]).T
+    own = matrix[np.ix_(kept, kept)] - share @ matrix[np.ix_(others, kept)]
+    return replace(
+        prior, border=np.delete(border, at[1:]), matrix=(own + own.T) / 2,
+        gradient=gradient[kept] - share @ gradient[others],
+    )  # fmt: skip
 
 
 def _widened(prior: MarginalPrior, old: int, sigmas_m: Float64) -> MarginalPrior:

@@ -22,7 +22,7 @@ from barsight.motion.batch.fault_detection import freeze_sentences
 from barsight.motion.batch.fusion import PLACE_SPACING_S, FusionSettings
 from barsight.motion.crane.encoder_trajectory import CraneSettings, fit_position, reestimate_noise
 from barsight.motion.crane.known_motion import way_around
-from barsight.motion.fixed_lag.encoder_watch import EncoderWatch, with_jumps
+from barsight.motion.fixed_lag.encoder_watch import EncoderWatch, with_jumps, with_sums
 from barsight.motion.fixed_lag.sensor_buffer import SENSOR_DELAY_S, SensorBuffer
 from barsight.motion.fixed_lag.sliding_window import Window, add_frame, add_nodes
 from barsight.motion.fixed_lag.window_update import marginalise, solve_window
@@ -148,13 +148,17 @@ class FixedLagEstimator:
 
     def _check_encoders(self, stamp_ns: int) -> None:
         """Look for faults in the encoders' newest readings; places that were taken beyond a jump leave."""
-        now, before = self._come(stamp_ns), self.watch.jumps
-        if now.crane is None:
+        now = self._come(stamp_ns)
+        if now.crane is None or not len(now.crane.stamp_ns):
             return
+        sums = self.watch.put_together(int(now.crane.stamp_ns[0]))
+        if sums and self.window is not None:
+            self.window = with_sums(self.window, sums)
+        told = len(self.watch.told)
         recent = self.motions[-RECENT_FRAMES:]
         known = known_motion(recent, now.imu, self._rectifier, self._shift_ns)
         self.watch.check(reestimate_noise(now.crane), known)
-        new, window = [jump for jump in self.watch.jumps if jump not in before], self.window
+        new, window = self.watch.told[told:], self.window
         if not new or window is None:
             return
         window = with_jumps(window, self.watch.jumps)
@@ -170,7 +174,7 @@ class FixedLagEstimator:
         if crane is None or not len(crane.stamp_ns):
             return (), ()
         begin_ns = int(crane.stamp_ns[0])
-        sure, maybe = jump_sentences(self.watch.jumps, begin_ns, None)
+        sure, maybe = jump_sentences(sorted(self.watch.told, key=lambda jump: jump.stamp_ns), begin_ns, None)
         return (*freeze_sentences(self.watch.frozen, begin_ns), *sure), maybe
 
     def _now(self, stamp_ns: int) -> SensorBuffer:

@@ -117,7 +117,7 @@ def _add_pose(
             bound[b, first + a] = x * rows[0, PLACE + b] + y * rows[1, PLACE + b] + z * rows[2, PLACE + b]
 
 
-@kernel()
+@kernel(borrows=True)
 def _take_out(
     bound: Float64, width: int, rest: Float64, factor: Float64, span: Span, result: ReducedSystem
 ) -> None:

@@ -58,7 +58,7 @@ class StereoObservations:
     @cached_property
     def first(self) -> Int64:
         """Return the start of each point's sightings (T + 1,), and the end."""
-        return np.searchsorted(self.track, np.arange(self.track[-1] + 2)).astype(np.int64)
+        return np.searchsorted(self.track, np.arange(self.track.max(initial=-1) + 2)).astype(np.int64)
 
     @cached_property
     def reach(self) -> Int64:

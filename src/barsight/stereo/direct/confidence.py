@@ -237,12 +237,10 @@ def _vertical_shifts(
     )
     warped, right_x = value_and_slope(row_coefficients(right_gray), disparity)
     right_y, _ = value_and_slope(row_coefficients(_derivative(right_gray, (0, 1))), disparity)
-    x = (_derivative(left_gray, (1, 0)) + right_x) * np.float32(0.5)
-    y = (_derivative(left_gray, (0, 1)) + right_y) * np.float32(0.5)
-    share = _mean(usable) + np.float32(1e-6)
-    residual = (left_gray - _mean(usable * left_gray) / share) - (warped - _mean(usable * warped) / share)
-    trust = usable / (1 + np.square(residual / _OUTLIER_GRAY))
-    products = np.stack([x * x, x * y, y * y, x * residual, y * residual, trust * np.square(y * residual)])
+    left_x, left_y = _derivative(left_gray, (1, 0)), _derivative(left_gray, (0, 1))
+    means = _mean(usable), _mean(usable * left_gray), _mean(usable * warped)
+    products, trust = np.empty((6, *usable.shape), np.float32), np.empty_like(usable)
+    _multiply_out(usable, (left_gray, warped), means, (left_x, right_x), (left_y, right_y), products, trust)
     xx, xy, yy, xr, yr, power = window_means(products, trust, _WINDOW_PX, _EVERY_PX)
     chosen = (slice(None, None, _EVERY_PX), slice(None, None, _EVERY_PX))
     determinant = xx * yy - xy * xy
@@ -254,6 +252,34 @@ def _vertical_shifts(
     sure = variance < _LARGEST_VARIANCE_PX2
     shift = (xx * yr - xy * xr) / determinant
     return np.asarray(shift[sure], dtype=np.float32), np.asarray(variance[sure], dtype=np.float32)
+
+
+@kernel()
+def _multiply_out(
+    usable: Float32, grays: tuple[Float32, Float32], means: tuple[Float32, Float32, Float32],
+    x_slopes: tuple[Float32, Float32], y_slopes: tuple[Float32, Float32], products: Float32, trust: Float32,
+) -> None:  # fmt: skip
+    """Multiply out, pixel by pixel (H, W), what the vertical shifts are solved from.
+
+    grays, x_slopes, y_slopes: left and right; means over windows: of usable, and of it times each gray. The
+    mean slopes x, y and the residual r of the grays about their means fill products (6, H, W): x x, x y, y y,
+    x r, y r and trust (y r)^2, and trust (H, W), Cauchy's weight of r.
+    """
+    half, least, one, outlier = np.float32(0.5), np.float32(1e-6), np.float32(1), np.float32(_OUTLIER_GRAY)
+    for i in range(usable.shape[0]):
+        known, left, right, mean = usable[i], grays[0][i], grays[1][i], means[0][i]
+        left_mean, right_mean = means[1][i], means[2][i]
+        left_x, right_x, left_y, right_y = x_slopes[0][i], x_slopes[1][i], y_slopes[0][i], y_slopes[1][i]
+        xx, xy, yy = products[0, i], products[1, i], products[2, i]
+        xr, yr, power, sure = products[3, i], products[4, i], products[5, i], trust[i]
+        for j in range(len(known)):
+            x, y, share = (left_x[j] + right_x[j]) * half, (left_y[j] + right_y[j]) * half, mean[j] + least
+            residual = (left[j] - left_mean[j] / share) - (right[j] - right_mean[j] / share)
+            off = residual / outlier
+            sure[j] = known[j] / (one + off * off)
+            xx[j], xy[j], yy[j] = x * x, x * y, y * y
+            xr[j], yr[j] = x * residual, y * residual
+            power[j] = sure[j] * ((y * residual) * (y * residual))
 
 
 def _derivative(image: Float32, order: tuple[int, int]) -> Float32:

@@ -42,6 +42,7 @@ from barsight.stereo.direct.row_binning import (
     spread_rows,
 )
 from barsight.stereo.direct.semiglobal.matching import SemiGlobalSettings, match_semiglobal
+from barsight.stereo.masking import mask_values
 
 _NAN = np.float32(np.nan)
 _FAST_STEPS = 2
@@ -183,10 +184,10 @@ class _Matching:
         own_px = refine_at_half_size(
             pair.left, pair.right, fill_row_holes(own.left_px), matched, refinement, self.halves_rows
         )
-        own_px = np.where(matched, own_px, _NAN)
+        own_px = mask_values(own_px, matched)
         rows = EDGE_WINDOW_PX if self.halves_rows else EDGE_WINDOW_PX // BINNED_ROWS | 1
         started = confirmed_start(pair.left, pair.right, predicted, own_px, own.right_px, rows)
-        started = np.where(pair.left_valid, started, _NAN)
+        started = mask_values(started, pair.left_valid)
         refined = self._refined(pair, started, replace(refinement, steps=1))
         moved = np.subtract(refined.disparity_px, started)
         far = np.count_nonzero(np.abs(moved, out=moved) > _FAR_STEP_PX)
@@ -245,7 +246,7 @@ class _Matching:
         )
         believed = is_consistent(found.left_px, found.right_px, settings.consistency_px) & pair.left_valid
         believed &= hits_valid(pair.right_valid, found.left_px)
-        left_px = np.where(believed, found.left_px, _NAN)
+        left_px = mask_values(found.left_px, believed)
         return _Start(remove_islands(left_px, settings.island_px, 1.0), found.right_px)
 
     def _start_at_half_size(self, pair: RectifiedPair, candidates: DisparityRange) -> _Start:
@@ -257,7 +258,7 @@ class _Matching:
             left, right, lowest, -(-candidates.highest_px // 2) - lowest, settings.semiglobal
         )
         believed = is_consistent(found.left_px, found.right_px, settings.consistency_px)
-        left_px = np.where(believed, found.left_px, _NAN)
+        left_px = mask_values(found.left_px, believed)
         small = remove_islands(left_px, settings.island_px // 4, 1.0)
         left_px, right_px = double_disparity(small, shape), double_disparity(found.right_px, shape)
         drop_invalid(pair.left_valid, pair.right_valid, left_px)

@@ -115,7 +115,7 @@ def _pairs(shape: SupportShape) -> _Pairs:
     return _Pairs(a, c, factors.astype(np.float32))
 
 
-@kernel()
+@kernel(borrows=True)
 def _sum_pairs(evidence: Evidence, middle: int, offsets: Int64, factors: Float32, sums: Float32) -> None:
     """Sum the nine terms of a plane's normal equations for TILE_COLUMNS pixels from `middle` on: the weights
     times 1, a, c, a a, a c, c c and the pulls times 1, a, c; a along, c across the axis.
@@ -158,7 +158,7 @@ def _sum_pairs(evidence: Evidence, middle: int, offsets: Int64, factors: Float32
             sums[8 * _LANES + i] += lean_pull * fc
 
 
-@kernel()
+@kernel(borrows=True)
 def _solve_planes(sums: Float32, steps: Float32, information: Float32) -> None:
     """Solve each plane's height at its pixel and that height's information out of the sums of `_sum_pairs`.
 
@@ -179,7 +179,7 @@ def _solve_planes(sums: Float32, steps: Float32, information: Float32) -> None:
         information[i] = certain
 
 
-@kernel()
+@kernel(borrows=True)
 def _add_near(evidence: Evidence, middle: int, offsets: Int64, sums: Float32) -> None:
     """Add the weights and the pulls of a few points for TILE_COLUMNS pixels from `middle` on.
 
@@ -245,7 +245,7 @@ def _sum_near(
                     pull_sums[at + np.uint64(i)] = found[_LANES + i]
 
 
-@kernel()
+@kernel(borrows=True)
 def _place_pairs(axis: Float32, pairs: _Pairs, framed_width: int, offsets: Int64) -> None:
     """Turn the pairs' points to a tile's axis (x, y). Fills offsets (K,) in flat frames."""
     for j in range(len(offsets)):
@@ -253,7 +253,7 @@ def _place_pairs(axis: Float32, pairs: _Pairs, framed_width: int, offsets: Int64
         offsets[j] = round(a * axis[1] + c * axis[0]) * framed_width + round(a * axis[0] - c * axis[1])
 
 
-@kernel()
+@kernel(borrows=True)
 def _fit_lanes(
     flat: Evidence, middle: int, offsets: Int64, factors: Float32, sums: Float32, row: Float32,
     row_information: Float32,

@@ -125,7 +125,7 @@ def fitted_rows(y: int, height: int) -> tuple[int, int]:
     return above, min(above + FITTED_EVERY, height - 1)
 
 
-@kernel()
+@kernel(borrows=True)
 def share_rows(frame: Float32, y: int, x0: int, height: int, alike: np.float32, shares: Float32) -> bool:
     """Share TILE_COLUMNS pixels of row y between the fitted rows above and below, by distance, where both are
     alike there; else the one that is has all.
@@ -147,14 +147,14 @@ def share_rows(frame: Float32, y: int, x0: int, height: int, alike: np.float32, 
     return bool(alone == 0)
 
 
-@kernel()
+@kernel(borrows=True)
 def blend_rows(above: Float32, below: Float32, shares: Float32, row: Float32) -> None:
     """Blend two rows (N,) by the shares of the one below. Fills row (N,)."""
     for i in range(len(row)):
         row[i] = above[i] + shares[i] * (below[i] - above[i])
 
 
-@kernel()
+@kernel(borrows=True)
 def _take_means(images: AxisImages, middle: int, offsets: Int64, shares: Float32, sums: Float32) -> None:
     """Average the first and the second image for TILE_COLUMNS pixels from `middle` on.
 
