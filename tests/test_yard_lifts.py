@@ -203,6 +203,23 @@ def test_a_pole_over_a_hollow_is_a_gap() -> None:
     assert "gap" in codes(judged(stock, heights=heights))
 
 
+@pytest.mark.parametrize(
+    ("diameter_m", "bars", "ratio"), [(0.09, None, 1.0), (0.03, 7, 1.0), (0.06, None, 0.3), (0.03, None, 0.3)]
+)
+def test_less_of_the_faces_surely_lies_on_thin_bars_that_nobody_could_count(
+    diameter_m: float, bars: int | None, ratio: float
+) -> None:
+    sigma = replace(SIGMA, bar_diameter_m=0.008)
+    lift = judged(
+        [laid(0.3)],
+        (record(laid(0.3), bar_diameter_m=diameter_m, bars=bars, sigma=sigma),),
+        Placement(0.3, 0.0, 0.0),
+    )
+    assert lift.contact is not None
+    (share,) = [check for check in lift.checks if check.what == "part of the faces that lies on steel"]
+    assert share.value == pytest.approx(ratio * lift.contact.contact_share, rel=0.1)
+
+
 def weak(**changes: object) -> Magnet:
     return replace(MAGNET, **changes)  # type: ignore[arg-type]
 

@@ -146,7 +146,7 @@ def assess_placement(
         *area_checks(place, magnet, load, settings),
         *disturbed_checks(yard.events, place, magnet, load, valid, settings),
         *count_checks(place, yard.heights, magnet, near, contact, held, settings),
-        *face_checks(contact, needed, magnet, settings),
+        *face_checks(contact, needed, magnet, load, settings),
         *share_checks(weakest),
         *clearance_checks(place, yard.heights, magnet, contact, load),
         *resting_checks(place, magnet, contact, load),
@@ -305,7 +305,7 @@ def _change(
             return "nothing is known under the magnet"
         contact = hold_load(contact, magnet, load, settings.strap_m)
         checks = [
-            unknown_check(contact, settings), *face_checks(contact, needed_n, magnet, settings),
+            unknown_check(contact, settings), *face_checks(contact, needed_n, magnet, load, settings),
             *share_checks(weakest_pole(contact, needed_n, magnet, moved, load)),
             *resting_checks(moved, magnet, contact, load),
         ]  # fmt: skip

@@ -14,6 +14,7 @@ from barsight.yard.lifting.load import Load, reached_areas
 from barsight.yard.magnet.contact import Contact
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import BEYOND_OPEN_END_M, BundleTable, Grip, Placement
+from barsight.yard.magnet.holding import min_diameter_m
 from barsight.yard.stability.stability import interpolate_height
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Check, check_max, check_min, check_true
@@ -28,6 +29,10 @@ UNKNOWN_SIGMA = 0.01
 """How well cells tell the part of a face that was seen."""
 MAX_ASIDE_RATIO = 1 / 3
 """Of a face's width: so far beside its middle the faces may rest where the suspension's stop holds them."""
+MIN_SHOWN_BAR_M = 0.05
+"""A map shows the crests of bars from this diameter on."""
+THIN_CONTACT_RATIO = 0.3
+"""Of what seems to lie on thinner bars, in a packing that isn't settled: so little may, by drawn yards."""
 SURE_OF_SIGMA = 0.1
 """How well sigmas themselves are known, of them."""
 
@@ -111,13 +116,16 @@ def area_checks(
     ]  # fmt: skip
 
 
-def face_checks(contact: Contact, needed_n: float, magnet: Magnet, settings: LiftSettings) -> list[Check]:
-    """Check how the faces lie and pull."""
+def face_checks(
+    contact: Contact, needed_n: float, magnet: Magnet, load: tuple[Bundle, ...], settings: LiftSettings
+) -> list[Check]:
+    """Check how the faces lie on the load and pull."""
     limits, sigma = magnet.limits, contact.gap_sigma_m
     pitch, roll = (abs(math.degrees(angle)) for angle in (contact.pitch_rad, contact.roll_rad))
     narrowest = min(pole.width_m for pole in magnet.poles)
-    gap, share = contact.widest_gap_m, contact.contact_share
-    low, high = _contact_shares(contact, (settings.contact_gap_m, settings.contact_gap_m + sigma))
+    gap, shown = contact.widest_gap_m, _shown_ratio(load)
+    low, high = _contact_shares(contact, (settings.contact_gap_m, settings.contact_gap_m + sigma)) * shown
+    share = shown * contact.contact_share
     held = roll >= (1 - 1e-3) * limits.roll_deg
     aside = (
         f"the faces rest {1e3 * contact.rests_off_m:.0f} mm beside their middle and "
@@ -148,8 +156,8 @@ def face_checks(contact: Contact, needed_n: float, magnet: Magnet, settings: Lif
         ),
         check_min(
             "gap", "part of the faces that lies on steel", high, limits.contact_share, "",
-            f"only {100 * share:.0f} % of the faces lie on steel, {100 * limits.contact_share:.0f} % are "
-            "needed", sigma=high - low,
+            f"only {100 * share:.0f} % of the faces surely lie on steel, "
+            f"{100 * limits.contact_share:.0f} % are needed", sigma=high - low,
         ),
         check_min(
             "weak-pull", "pull on the load", contact.pull_n, needed_n, "N",
@@ -232,7 +240,15 @@ def _known(sigma: float) -> float:
     return sigma if math.isfinite(sigma) else 0.05
 
 
-def _contact_shares(contact: Contact, near_m: tuple[float, float]) -> tuple[float, float]:
+def _shown_ratio(load: tuple[Bundle, ...]) -> float:
+    """Return the least part of what seems to lie on steel that does: crests of thin bars don't show, and one
+    that lies higher than the others carries the faces alone.
+    """
+    hidden = (bundle.bars is None and min_diameter_m(bundle) < MIN_SHOWN_BAR_M for bundle in load)
+    return THIN_CONTACT_RATIO if any(hidden) else 1.0
+
+
+def _contact_shares(contact: Contact, near_m: tuple[float, float]) -> Float64:
     """Compute the part of all faces nearer to steel than each of `near_m`, by gaps blurred by half a
     millimetre; poles count alike.
     """
@@ -240,8 +256,7 @@ def _contact_shares(contact: Contact, near_m: tuple[float, float]) -> tuple[floa
     gaps = np.concatenate([pole.gap_map_m.ravel() for pole in contact.poles])
     weights = np.concatenate([np.full(p.gap_map_m.size, 1 / p.gap_map_m.size) for p in contact.poles])
     near = np.clip((np.array(near_m)[:, None] - gaps) / blur + 0.5, 0, 1)
-    low, high = np.where(np.isnan(gaps), 0, near) @ weights / len(contact.poles)
-    return float(low), float(high)
+    return np.asarray(np.where(np.isnan(gaps), 0, near) @ weights / len(contact.poles))
 
 
 @lru_cache(maxsize=64)

@@ -35,7 +35,7 @@ def hold_load(contact: Contact, magnet: Magnet, load: tuple[Bundle, ...], strap_
     """
     if not load:
         return contact
-    diameter = min(_min_diameter_m(bundle) for bundle in load)
+    diameter = min(min_diameter_m(bundle) for bundle in load)
     cut = min(SMOOTHING_M**2 / diameter, MAX_CUT_RATIO * diameter)
     higher = cut + strap_m + UPPER * contact.gap_sigma_m
     return replace(
@@ -94,7 +94,7 @@ def _between(gap: float, gap_m: Float64, curve: Float64) -> float:
     return 0.0
 
 
-def _min_diameter_m(bundle: Bundle) -> float:
+def min_diameter_m(bundle: Bundle) -> float:
     """Compute the lower bound of a bundle's bars; with a packing that isn't settled they may be thinner."""
     sigma = float(np.nan_to_num(bundle.sigma.bar_diameter_m, nan=0.25 * bundle.bar_diameter_m))
     return max(bundle.bar_diameter_m - UPPER * sigma, 0.25 * bundle.bar_diameter_m)
