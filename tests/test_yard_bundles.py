@@ -104,6 +104,34 @@ def test_bars_are_counted_only_where_nothing_may_hide_below() -> None:
         assert mass < 1.01 * told.upper_kg
 
 
+class Triangle(Laid):
+    """One bar on two, as thick bars are strapped."""
+
+    @property
+    def axes_m(self) -> NDArray[np.float64]:
+        rise = 0.75**0.5 / 2
+        return self.diameter_m * np.array([[-0.5, -rise], [0.5, -rise], [0.0, rise]])
+
+    @property
+    def width_m(self) -> float:
+        return 2 * self.diameter_m
+
+
+def test_three_thick_bars_are_one_bundle_as_wide_as_two() -> None:
+    """The upper bar alone was read, as a bundle of thin bars, half as wide and a third as heavy."""
+    laid = [Triangle(0.2, 0.0, 0.3, 0.5, 0.1), Triangle(0.7, 0.1, 0.093, -0.3, 0.1), Laid(1.3, 0.0, 0.3, 0.0)]
+    bundles = find_bundles(draw(laid), SETTINGS)
+    assert len(bundles) == 3
+    for one in laid:
+        expect(nearest(bundles, one), one)
+    raised, stands = (nearest(bundles, one) for one in laid[:2])
+    assert raised.bars is None and stands.bars in (None, 3)
+    for bundle in (raised, stands):
+        assert bundle.bar_diameter_m == pytest.approx(0.1, abs=0.006)
+        mass = bundle_mass(bundle)
+        assert np.isnan(mass.kg) or 3 * np.pi / 4 * 0.1**2 * 3.0 * 7850 < 1.01 * mass.upper_kg
+
+
 def test_a_pack_that_was_read_as_one_thin_bar_does_not_weigh_as_little() -> None:
     """A single bar's outline laid on a wide section is no single bar."""
     values = np.array([0.0, 0.0, 0.18, 0.0, 0.0, 0.111])

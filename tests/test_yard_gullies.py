@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from barsight.yard.bundles.detection import find_bundles
-from barsight.yard.bundles.fitting.outline import STEP_M, hexagon, turned_hexagon
+from barsight.yard.bundles.fitting.outline import STEP_M, packing_axes, turned_packing
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.gully_shading import _rests, _shading
 from yard_maps import Laid, draw, photographed
@@ -51,9 +51,9 @@ def test_a_picture_without_lines_counts_nothing() -> None:
 
 def test_shading_is_that_of_the_highest_bar_blurred() -> None:
     diameter, roll, blur = 0.04, 0.2, 0.004
-    above, aside = _shading(hexagon(2), diameter, roll, blur)
+    above, aside = _shading(packing_axes(2), diameter, roll, blur)
     u = STEP_M * (np.arange(above.size) - above.size // 2)
-    axes = turned_hexagon(2, diameter, roll)
+    axes = turned_packing(2, diameter, roll)
     turned = 2 * (u[:, None] - axes[:, 0]) / diameter
     rise = np.sqrt(np.maximum(1 - turned**2, 0))
     height = np.where(np.abs(turned) <= 1, axes[:, 1] + rise * diameter / 2, -np.inf)
@@ -68,10 +68,10 @@ def test_shading_is_that_of_the_highest_bar_blurred() -> None:
 def test_the_rest_is_that_of_a_plain_least_squares() -> None:
     rng = np.random.default_rng(4)
     places, levels = np.sort(rng.uniform(-0.08, 0.08, 60)), rng.normal(0, 1, 60)
-    rest = _rests(places, levels, hexagon(2), np.array([0.04]), np.array([0.1]), np.array([0.002]), 0.004)[
-        0, 0
-    ]
-    above, aside = _shading(hexagon(2), 0.04, 0.1, 0.004)
+    rest = _rests(
+        places, levels, packing_axes(2), np.array([0.04]), np.array([0.1]), np.array([0.002]), 0.004
+    )[0, 0]
+    above, aside = _shading(packing_axes(2), 0.04, 0.1, 0.004)
     u = STEP_M * (np.arange(above.size) - above.size // 2)
     up, side = np.interp(places - 0.002, u, above), np.interp(places - 0.002, u, aside)
     q = places / np.abs(places).max()

@@ -8,7 +8,7 @@ import pytest
 from barsight.core.types import HeightSource
 from barsight.yard.bundles.fitting.gauss_newton import Heights, Rules, _normal_equations, fit_outline
 from barsight.yard.bundles.fitting.growth import _row_states, _walk
-from barsight.yard.bundles.fitting.outline import STEP_M, hexagon, make_outline, trace_with_changes
+from barsight.yard.bundles.fitting.outline import STEP_M, make_outline, packing_axes, trace_with_changes
 from barsight.yard.bundles.fitting.outline_fit import ABOVE, AGREES, BELOW, MIXED, UNKNOWN
 from barsight.yard.bundles.fitting.rotated_map import align_map
 from barsight.yard.bundles.fitting.settings import BundleSettings
@@ -22,7 +22,7 @@ SMOOTHING_M = 0.006
 def test_an_outline_is_the_smoothed_upper_edge_of_its_bars() -> None:
     outline = make_outline(1, 0.09, 0.2, SMOOTHING_M)
     c, s = np.cos(0.2), np.sin(0.2)
-    axes = 0.09 * hexagon(1) @ np.array([[c, s], [-s, c]])
+    axes = 0.09 * packing_axes(1) @ np.array([[c, s], [-s, c]])
     u = STEP_M * (np.arange(outline.exact_m.size) - outline.exact_m.size // 2)
     inside = 0.045**2 - (u[:, None] - axes[:, 0]) ** 2
     exact = np.where(inside >= 0, axes[:, 1] + np.sqrt(inside.clip(0)), -np.inf).max(axis=1)
@@ -83,7 +83,7 @@ def plain_gain(profile: np.ndarray, template: np.ndarray) -> float:
 def test_the_normal_equations_are_those_of_the_outlines_derivatives() -> None:
     rng = np.random.default_rng(5)
     values = np.array([0.013, 0.02, 0.3, -0.01, 0.1, 0.09])
-    tables = trace_with_changes(hexagon(1), 0.09, 0.1, SMOOTHING_M)
+    tables = trace_with_changes(packing_axes(1), 0.09, 0.1, SMOOTHING_M)
     z = (0.4 + rng.normal(0, 0.005, (40, 60))).astype(np.float32)
     z[rng.random(z.shape) < 0.1] = np.nan
     heights = Heights(z, np.full_like(z, 0.004), -0.3, 1.0, 0.01, 0, 39, 3, 1.2)
@@ -124,7 +124,16 @@ def drawn_heights(values: np.ndarray) -> Heights:
 
 def rules(max_m: float) -> Rules:
     return Rules(
-        hexagon(1), 3.006, np.ones(6, bool), 12, 0.05, 0.004, SMOOTHING_M, 1.0, (0.0, np.inf), (0.1, max_m)
+        packing_axes(1),
+        3.006,
+        np.ones(6, bool),
+        12,
+        0.05,
+        0.004,
+        SMOOTHING_M,
+        1.0,
+        (0.0, np.inf),
+        (0.1, max_m),
     )
 
 

@@ -10,7 +10,7 @@ from barsight.core.arrays import Float64
 from barsight.yard.bundles.doubts import count_bars, list_cover_doubts, list_doubts, rate_confidence
 from barsight.yard.bundles.fitting.bars import fit_bars, visible_bars
 from barsight.yard.bundles.fitting.ends import End, find_end, middle_and_length_sigma
-from barsight.yard.bundles.fitting.outline import LOOSENESS, make_outline
+from barsight.yard.bundles.fitting.outline import bundle_width, make_outline
 from barsight.yard.bundles.fitting.outline_fit import (
     DIAMETER,
     ROLL,
@@ -160,7 +160,7 @@ def _sigma(fit: Fit, ends: list[End], top: float, settings: BundleSettings) -> B
             )
         ),
         length_m=length,
-        width_m=(2 * LOOSENESS * fit.rings + 1) * diameter,
+        width_m=bundle_width(fit.rings, diameter),
         top_z_m=float(np.hypot(height, settings.shared_height_m)),
         bar_diameter_m=diameter,
     )

@@ -9,7 +9,7 @@ from barsight.core.arrays import Bool, UInt8
 from barsight.core.linalg.robust import known_median
 from barsight.yard.bundles.crossing_bundles import rise_over
 from barsight.yard.bundles.fitting.ends import End
-from barsight.yard.bundles.fitting.outline import BARS_OF_RINGS, LOOSENESS
+from barsight.yard.bundles.fitting.outline import BARS_OF_RINGS, bundle_width
 from barsight.yard.bundles.fitting.outline_fit import ABOVE, AGREES, BELOW, DIAMETER, SLOPE_U, SLOPE_Z, U
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.reading import Reading
@@ -41,7 +41,7 @@ def count_bars(
         if not why_not and fit.rings == 0 and reading.found.shades is None:
             why_not = "many thin bars may look like one"
         return (None, (f"its bars can't be counted: {why_not}",)) if why_not else (fit.bars, ())
-    diameter = fit.width_m / (2 * LOOSENESS * other + 1)
+    diameter = fit.width_m / bundle_width(other, 1.0)
     return None, (
         f"{fit.bars} bars of {1e3 * fit.values[DIAMETER]:.0f} mm or {BARS_OF_RINGS[other]} of "
         f"{1e3 * diameter:.0f} mm: the outline fits both",

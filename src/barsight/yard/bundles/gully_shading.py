@@ -14,10 +14,12 @@ from barsight.core.arrays import Float64, kernel
 from barsight.yard.bundles.fitting.outline import (
     BARS_OF_RINGS,
     STEP_M,
+    TRIANGLE,
+    TRIANGLE_BARS_M,
     bundle_width,
-    hexagon,
     highest_bars,
-    turned_hexagon,
+    packing_axes,
+    turned_packing,
 )
 from barsight.yard.bundles.fitting.outline_fit import (
     DIAMETER,
@@ -67,6 +69,8 @@ def packing_by_shades(shades: ShadeProfile, fit: Fit, cell_m: float, settings: B
     tried: list[tuple[float, int, float, float]] = []
     for rings in range(len(BARS_OF_RINGS)):
         diameter = fit.width_m / bundle_width(rings, 1.0)
+        if rings == TRIANGLE and not TRIANGLE_BARS_M[0] <= diameter <= TRIANGLE_BARS_M[1]:
+            continue
         if settings.catalogue_mm:
             known = 1e-3 * np.array(settings.catalogue_mm)
             diameters = known[np.abs(known / diameter - 1) < -2 * _WIDER[0]]
@@ -75,7 +79,9 @@ def packing_by_shades(shades: ShadeProfile, fit: Fit, cell_m: float, settings: B
         rolls = fit.values[ROLL] + (_ROLLS_RAD if rings else np.zeros(1))
         blur = float(np.hypot(cell_m / np.sqrt(12), _PIXEL_M))
         if diameters.size:
-            rests = _rests(shades.places_m, shades.levels, hexagon(rings), diameters, rolls, _SHIFTS_M, blur)
+            rests = _rests(
+                shades.places_m, shades.levels, packing_axes(rings), diameters, rolls, _SHIFTS_M, blur
+            )
             k = np.unravel_index(int(rests.argmin()), rests.shape)
             tried.append((float(rests.min()), rings, float(diameters[k[0]]), float(rolls[k[1]])))
     tried.sort()
@@ -187,7 +193,7 @@ def refit_with_packing(
 
 def _visible(rings: int, diameter_m: float, roll_rad: float) -> int:
     """Count the bars that show from above."""
-    axes = turned_hexagon(rings, diameter_m, roll_rad)
+    axes = turned_packing(rings, diameter_m, roll_rad)
     reach = bundle_width(rings, diameter_m) / 2
     highest, _ = highest_bars(axes, diameter_m / 2, np.arange(-reach, reach, STEP_M))
     return int(np.unique(highest[highest >= 0]).size)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from barsight.core.arrays import Float64, Int64
-from barsight.yard.bundles.fitting.outline import STEP_M, highest_bars, turned_hexagon
+from barsight.yard.bundles.fitting.outline import STEP_M, highest_bars, turned_packing
 from barsight.yard.bundles.fitting.outline_fit import (
     AGREES,
     DIAMETER,
@@ -29,7 +29,7 @@ _LOOSE_M = 0.001
 def visible_bars(fit: Fit) -> Int64:
     """Select the packing's bars of which at least 30 % of the diameter is seen from straight above."""
     diameter = float(fit.values[DIAMETER])
-    axes = turned_hexagon(fit.rings, diameter, float(fit.values[ROLL]))
+    axes = turned_packing(fit.rings, diameter, float(fit.values[ROLL]))
     highest, _ = highest_bars(axes, diameter / 2, np.arange(-fit.width_m / 2, fit.width_m / 2, STEP_M))
     counts = np.bincount(highest[highest >= 0], minlength=len(axes))
     return np.flatnonzero(counts * STEP_M >= _SEEN_RATIO * diameter)
@@ -52,7 +52,7 @@ def fit_bars(found: FittedOutline, settings: BundleSettings) -> tuple[Bar, ...]:
     ends = grid.v0_m + grid.cell_m * rows[[0, -1]]
     middle = float(ends.mean())
     u, z = fit.at(middle)
-    axes = turned_hexagon(fit.rings, diameter, float(fit.values[ROLL]))
+    axes = turned_packing(fit.rings, diameter, float(fit.values[ROLL]))
     flat = grid.to_map(np.array([[fit.values[SLOPE_U], 1.0]]))[0]
     direction = np.append(flat, fit.values[SLOPE_Z])
     direction = direction / np.linalg.norm(direction) * (1.0 if flat[1] >= 0 else -1.0)

@@ -35,7 +35,8 @@ class Heights(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """packing: (bars, 2), see `hexagon`. free: (6,) figures that are sought. widths_m: least, most allowed.
+    """packing: (bars, 2), see `packing_axes`. free: (6,) figures that are sought. widths_m: least, most
+    allowed.
 
     alike: heights that err as one. common_m: diameter known from elsewhere and its sigma, which
     is infinite where none is known.

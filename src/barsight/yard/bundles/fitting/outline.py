@@ -1,4 +1,4 @@
-"""Compute a bundle's outline from above: the upper outline of round bars in hexagonal packing."""
+"""Compute a bundle's outline from above: the upper outline of round bars in a full hexagon or a triangle."""
 
 from __future__ import annotations
 
@@ -9,20 +9,26 @@ import numpy as np
 
 from barsight.core.arrays import Float64, Int64, kernel
 
-BARS_OF_RINGS = (1, 7, 19, 37, 61)
-"""Bars of a full hexagon of 0, 1, 2, ... rings around the middle bar."""
+BARS_OF_RINGS = (1, 7, 19, 37, 61, 3)
+"""Bars of each packing: a full hexagon of 0, 1, 2, ... rings around the middle bar, then the triangle."""
+TRIANGLE = 5
+"""In place of a number of rings: one bar on two, as thick bars are strapped."""
+TRIANGLE_BARS_M = (0.06, 0.12)
+"""Diameters of its bars: thinner ones' shoulders are lost in a map's smoothing, thicker ones are bundles of
+their own, piled up."""
 LOOSENESS = 1.003
 """Distance of neighbouring axes over the diameter: bars are never quite straight."""
-PERIOD_RAD = np.pi / 3
-"""A hexagon looks the same after this turn."""
 STEP_M = 0.001
 _ROLL_STEP_RAD = float(np.radians(1.0))
 _DIAMETER_STEP = 0.01
 
 
 @lru_cache(maxsize=8)
-def hexagon(rings: int) -> Float64:
+def packing_axes(rings: int) -> Float64:
     """Compute axes of the packing (bars, 2), sideways and up, in diameters, a row lying level."""
+    if rings == TRIANGLE:
+        rise = np.sqrt(0.75) / 2
+        return LOOSENESS * np.array([(-0.5, -rise), (0.5, -rise), (0.0, rise)])
     cells = [
         (q + r / 2, r * np.sqrt(0.75))
         for q in range(-rings, rings + 1)
@@ -32,14 +38,19 @@ def hexagon(rings: int) -> Float64:
     return LOOSENESS * np.array(cells, dtype=np.float64).reshape(-1, 2)
 
 
-def turned_hexagon(rings: int, diameter_m: float, roll_rad: float) -> Float64:
+def turned_packing(rings: int, diameter_m: float, roll_rad: float) -> Float64:
     """Compute axes (bars, 2) in m, the packing rolled clockwise by roll_rad as seen along the bundle."""
-    return _turned(hexagon(rings), diameter_m, roll_rad)
+    return _turned(packing_axes(rings), diameter_m, roll_rad)
 
 
 def bundle_width(rings: int, diameter_m: float) -> float:
     """Compute the diameter of the circle around all bars."""
-    return diameter_m * (2 * LOOSENESS * rings + 1)
+    return diameter_m * (1 + LOOSENESS * (1 if rings == TRIANGLE else 2 * rings))
+
+
+def period_rad(rings: int) -> float:
+    """Return the turn after which the packing looks the same."""
+    return 2 * np.pi / 3 if rings == TRIANGLE else np.pi / 3
 
 
 def highest_bars(axes_m: Float64, radius_m: float, u_m: Float64) -> tuple[Int64, Float64]:
@@ -67,7 +78,7 @@ class Outline:
 
 def make_outline(rings: int, diameter_m: float, roll_rad: float, smoothing_m: float) -> Outline:
     """Compute the upper outline of a bundle."""
-    axes = turned_hexagon(rings, diameter_m, roll_rad)
+    axes = turned_packing(rings, diameter_m, roll_rad)
     exact, seen, slope = _trace(axes, diameter_m / 2, smoothing_m)
     return Outline(exact.size // 2 * STEP_M, exact, seen, slope)
 
@@ -110,7 +121,7 @@ def _trace(axes: Float64, radius: float, sigma: float) -> tuple[Float64, Float64
 
 @kernel()
 def trace_with_changes(packing: Float64, diameter: float, roll: float, sigma: float) -> Float64:
-    """Trace `packing`'s seen outline (4, N) (see `hexagon`), its slope, its change by roll and by
+    """Trace `packing`'s seen outline (4, N) (see `packing_axes`), its slope, its change by roll and by
     diameter.
     """
     _, seen, slope = _trace(_turned(packing, diameter, roll), diameter / 2, sigma)

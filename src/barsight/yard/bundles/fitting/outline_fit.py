@@ -8,7 +8,14 @@ import numpy as np
 
 from barsight.core.arrays import Float32, Float64, UInt8
 from barsight.yard.bundles.fitting.gauss_newton import Heights, Rules, fit_outline
-from barsight.yard.bundles.fitting.outline import BARS_OF_RINGS, bundle_width, hexagon, make_outline
+from barsight.yard.bundles.fitting.outline import (
+    BARS_OF_RINGS,
+    TRIANGLE,
+    TRIANGLE_BARS_M,
+    bundle_width,
+    make_outline,
+    packing_axes,
+)
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.fitting.settings import BundleSettings
 
@@ -104,13 +111,15 @@ def refine_outline(
     alike = settings.correlated_along_m * settings.correlated_across_m / grid.cell_m**2 / stride
     width_ratio = bundle_width(start.rings, 1.0)
     narrowest = settings.min_width_m if start.rings else settings.min_single_diameter_m
+    if start.rings == TRIANGLE:
+        narrowest = max(narrowest, bundle_width(TRIANGLE, TRIANGLE_BARS_M[0]))
     held, values, normal, moments, alike = fit_outline(
         Heights(
             grid.z_m, grid.sigma_m, grid.u0_m, grid.v0_m, grid.cell_m, rows[0], rows[1], stride, v_m
         ),
         values,
         Rules(
-            hexagon(start.rings), width_ratio, free, steps, float(gate_m or 2 * settings.agreement_m),
+            packing_axes(start.rings), width_ratio, free, steps, float(gate_m or 2 * settings.agreement_m),
             settings.placing_m, settings.smoothing_m, alike, common or (0.0, np.inf),
             (0.8 * narrowest, 1.2 * settings.max_width_m),
         ),

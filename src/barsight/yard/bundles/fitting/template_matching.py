@@ -11,11 +11,12 @@ from barsight.core.arrays import Float32, Float64, Int64, kernel
 from barsight.core.linalg.robust import nan_medians
 from barsight.yard.bundles.fitting.outline import (
     BARS_OF_RINGS,
-    LOOSENESS,
-    PERIOD_RAD,
     STEP_M,
+    TRIANGLE,
+    TRIANGLE_BARS_M,
     bundle_width,
     make_outline,
+    period_rad,
 )
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.fitting.settings import BundleSettings
@@ -78,7 +79,7 @@ def make_templates(settings: BundleSettings, cell_m: float) -> Templates:
     """Make all kinds of bundles that the settings allow, diameters 6 % apart (or the catalogue's)."""
     kinds, phases, samples = [], [], []
     for rings in range(len(BARS_OF_RINGS)):
-        rolls = PERIOD_RAD * np.arange(_ROLLS) / _ROLLS if rings else np.zeros(1)
+        rolls = period_rad(rings) * np.arange(_ROLLS) / _ROLLS if rings else np.zeros(1)
         for diameter in _diameters(rings, settings):
             for roll in rolls:
                 outline = make_outline(rings, diameter, roll, settings.smoothing_m)
@@ -105,8 +106,10 @@ def make_templates(settings: BundleSettings, cell_m: float) -> Templates:
 
 def _diameters(rings: int, settings: BundleSettings) -> list[float]:
     narrowest = settings.min_single_diameter_m if rings == 0 else settings.min_width_m
-    low = max(narrowest / (2 * LOOSENESS * rings + 1), settings.min_bar_diameter_m)
-    high = settings.max_width_m / (2 * LOOSENESS * rings + 1)
+    low = max(narrowest / bundle_width(rings, 1.0), settings.min_bar_diameter_m)
+    high = settings.max_width_m / bundle_width(rings, 1.0)
+    if rings == TRIANGLE:
+        low, high = max(low, TRIANGLE_BARS_M[0]), min(high, TRIANGLE_BARS_M[1])
     if settings.catalogue_mm:
         return [d / 1000 for d in settings.catalogue_mm if low <= d / 1000 <= high]
     return list(np.geomspace(low, high, int(np.log(high / low) / np.log(_RATIO)) + 2))

@@ -8,7 +8,7 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.linalg.robust import nan_medians
-from barsight.yard.bundles.fitting.outline import STEP_M, make_outline, turned_hexagon
+from barsight.yard.bundles.fitting.outline import STEP_M, make_outline, turned_packing
 from barsight.yard.bundles.fitting.outline_fit import (
     AGREES,
     DIAMETER,
@@ -113,7 +113,7 @@ def is_no_hexagon(seen: SeenSection | None, fit: Fit, top_m: float, floor_m: flo
     if floor_m is None:
         return "no floor was seen to measure its height from"
     diameter = float(fit.values[DIAMETER])
-    axes = turned_hexagon(fit.rings, diameter, float(fit.values[ROLL]))
+    axes = turned_packing(fit.rings, diameter, float(fit.values[ROLL]))
     width, height = (float(size) + diameter for size in np.ptp(axes, axis=0))
     higher = top_m - floor_m - height
     if abs(higher) > _HEIGHT_RATIO * diameter:
