@@ -122,6 +122,18 @@ def test_a_bar_across_a_neighbour_that_may_reach_under_the_magnet_forbids(gap_m:
         assert check.result == "passed"
 
 
+def test_a_neighbour_that_no_photo_shows_leaves_open_what_sticks_out_of_it() -> None:
+    heights = photo(0)
+    assert heights.tops is not None
+    heights.tops[:, abs(heights.x_m - STOCK[1].x_m) < HALF_M] = 0
+    lift = judged(STOCK, heights=heights)
+    assert codes(lift) == {"thin-bar"}
+    assert any("bundle 1 beside the load" in veto.reason for veto in lift.vetoes)
+    far = replace(STOCK[1], x_m=MAGNET.size_m[0] + HALF_M + 0.8)
+    (check,) = beside_checks(Placement(0.0, 0.0, 0.0), MAGNET, ((record(far, 1), None),))
+    assert check.result == "passed"
+
+
 def test_a_lift_beside_a_neighbour_with_a_bar_over_its_flank_is_vetoed() -> None:
     heights = photo(0, 0.02, to_m=0.7)
     assert heights.tops is not None

@@ -115,8 +115,8 @@ class FreeSpace:
 
 
 def _level(cells: CellObservations) -> tuple[Int32, Int32, Float32]:
-    """Choose of one cell in COARSE_CELLS to a side the heights that differ little from all that the view sees
-    about them: cells of free space along x and y (N,), and the heights (N,).
+    """Choose the level heights of every COARSE_CELLSth cell along x and y, those that differ little from all
+    that the view sees about them: cells of free space along x and y (N,), and the heights (N,).
     """
     corner = int(cells.x.min()), int(cells.y.min())
     shape = int(cells.y.max()) - corner[1] + 1, int(cells.x.max()) - corner[0] + 1

@@ -97,7 +97,7 @@ class Sequence:
             return 0
         last, last_stamp_ns, last_arrival_ns = before
         step = (number - last) % NUMBERS
-        since_ns = max(stamp_ns - last_stamp_ns, arrival_ns - last_arrival_ns, 0) + NS_PER_S
+        since_ns = max(arrival_ns - last_arrival_ns, 0) + NS_PER_S
         if 0 < step <= 1 + 2 * self._rate_hz * since_ns / NS_PER_S:
             self._behind = 0
             return step - 1

@@ -157,8 +157,9 @@ def assess_placement(
         checks += label_checks(place, yard.heights, magnet, FacePlane.of(contact))
         pixel_m = yard.travel.pixel_m(contact.centre_z_m) if yard.travel else None
         checks += thin_bar_checks(yard.heights, yard.thin_line(load), load, pixel_m, settings)
-        beside = tuple((b, yard.thin_lines(b) or ()) for b in near.bundles if b not in load)
-        checks += beside_checks(place, magnet, beside)
+        if pixel_m is not None or yard.heights.tops is not None:
+            beside = tuple((b, yard.thin_lines(b)) for b in near.bundles if b not in load)
+            checks += beside_checks(place, magnet, beside)
     scale = 0.0
     if search and not vetoes_of(checks):
         scale, end = _tolerance(place, yard, magnet, near, held, needed, contact, settings)

@@ -32,7 +32,8 @@ MAX_ASIDE_RATIO = 1 / 3
 MIN_SHOWN_BAR_M = 0.05
 """A map shows the crests of bars from this diameter on."""
 THIN_CONTACT_RATIO = 0.3
-"""Of what seems to lie on thinner bars, in a packing that isn't settled: so little may, by drawn yards."""
+"""Of what seems to lie on thinner bars, in a packing that isn't settled, so much counts. That is no bound: as
+little as a tenth was seen on drawn yards."""
 SURE_OF_SIGMA = 0.1
 """How well sigmas themselves are known, of them."""
 
@@ -156,7 +157,7 @@ def face_checks(
         ),
         check_min(
             "gap", "part of the faces that lies on steel", high, limits.contact_share, "",
-            f"only {100 * share:.0f} % of the faces surely lie on steel, "
+            f"only {100 * share:.0f} % of the faces count as lying on steel, "
             f"{100 * limits.contact_share:.0f} % are needed", sigma=high - low,
         ),
         check_min(
@@ -241,7 +242,7 @@ def _known(sigma: float) -> float:
 
 
 def _shown_ratio(load: tuple[Bundle, ...]) -> float:
-    """Return the least part of what seems to lie on steel that does: crests of thin bars don't show, and one
+    """Return the part of what seems to lie on steel that counts: crests of thin bars don't show, and one
     that lies higher than the others carries the faces alone.
     """
     hidden = (bundle.bars is None and min_diameter_m(bundle) < MIN_SHOWN_BAR_M for bundle in load)

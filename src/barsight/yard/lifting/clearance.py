@@ -93,7 +93,7 @@ def clearance_checks(
         ("obstructed", "what stands highest above the faces' plane, under the magnet or beside it",
          1e3 * MAX_RISE_M),
         ("unknown-under-footprint", "the widest place under the magnet or beside it that was neither seen "
-         "nor proven free", 1e3 * MAX_HOLE_M),
+         f"nor proven free; beside the load {1e3 * MAX_HOLE_BESIDE_M:.0f} mm are allowed", 1e3 * MAX_HOLE_M),
     ):  # fmt: skip
         if obstacle is None or obstacle.code != code:
             unknown = obstacle is not None and code == "unknown-under-footprint"
@@ -187,7 +187,9 @@ def _filled(rise: Float32, max_rise: Float32) -> Float32:
 
 
 def _over(load: tuple[Bundle, ...], region: Region, margin_m: float = 0.0) -> Bool:
-    """Mark the cells (V, U) over the load's outline and in a margin; all where no load is known."""
+    """Mark the cells (V, U) over the load's outline and in a margin; all where no load is known, which no
+    lift is offered without.
+    """
     over = np.full(region.under.shape, not load)
     for bundle in load:
         dx, dy = region.x_m - bundle.centre_m[0], region.y_m[:, None] - bundle.centre_m[1]

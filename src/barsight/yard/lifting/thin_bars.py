@@ -20,7 +20,7 @@ FOUND_PX = 1.8
 """Diameter of a bar, in the photo's pixels, from which on nine of ten are found."""
 BEYOND_M = 0.4
 """So far beyond a bundle's flank a bar that lies across it may stick out."""
-WAY_STEP_M = 0.02
+WAY_STEP_M, UNSEEN_STEP_M = 0.02, 0.1
 
 
 def thin_bar_checks(
@@ -62,33 +62,41 @@ def thin_bar_checks(
 
 
 def beside_checks(
-    place: Placement, magnet: Magnet, near: tuple[tuple[Bundle, tuple[ThinLine, ...]], ...]
+    place: Placement, magnet: Magnet, near: tuple[tuple[Bundle, tuple[ThinLine, ...] | None], ...]
 ) -> list[Check]:
     """Check that no thin bar that lies across a neighbour reaches under the magnet.
 
     In the air beyond its bundle's flank nothing shows such a bar: the map has what lies below it. near: the
-    bundles about the load, and the lines across each.
+    bundles about the load, and the lines across each, None where the photo doesn't show enough of it.
     """
     if not near:
         return []
     slack = abs(np.stack([place.along, place.across])) @ (magnet.tolerance.x_m, magnet.tolerance.y_m)
     half = np.array([magnet.size_m[1], magnet.size_m[0]]) / 2 + slack + STRAY_FIELD_M
     half += math.radians(magnet.tolerance.yaw_deg) * half[::-1]
-    strongest, where = 0.0, ""
-    for bundle, line in ((bundle, line) for bundle, lines in near for line in lines):
-        if line.strength <= strongest:
-            continue
+
+    def reaches(bundle: Bundle, line: ThinLine) -> bool:
         way = _beyond_flanks(bundle, line) - (place.x_m, place.y_m)
         under = (np.abs(way @ place.along) <= half[0]) & (np.abs(way @ place.across) <= half[1])
-        if under.any():
-            strongest = line.strength
-            where = f"a line runs across bundle {bundle.id} {line.along_m:+.2f} m along it from its middle"
-    return [
-        check_max(
-            CODE, "strength of the strongest line across a neighbour that runs on to under the magnet",
-            strongest, MAX_STRENGTH, "sigma", f"{where}: a thin bar may reach from there under the magnet",
-        )
-    ]  # fmt: skip
+        return bool(under.any())
+
+    what = "strength of the strongest line across a neighbour that runs on to under the magnet"
+    checks, strongest, where = [], 0.0, ""
+    for bundle, lines in near:
+        if lines is None:
+            ends = np.linspace(-0.5, 0.5, math.ceil(bundle.length_m / UNSEEN_STEP_M) + 1) * bundle.length_m
+            if any(reaches(bundle, ThinLine(0.0, float(along), 0.0)) for along in ends):
+                reason = f"no photo shows whether a thin bar lies across bundle {bundle.id} beside the load"
+                checks.append(check_true(CODE, what, None, reason))
+            continue
+        for line in lines:
+            if line.strength > strongest and reaches(bundle, line):
+                strongest = line.strength
+                where = (
+                    f"a line runs across bundle {bundle.id} {line.along_m:+.2f} m along it from its middle"
+                )
+    reason = f"{where}: a thin bar may reach from there under the magnet"
+    return [*checks, check_max(CODE, what, strongest, MAX_STRENGTH, "sigma", reason)]
 
 
 def _beyond_flanks(bundle: Bundle, line: ThinLine) -> Float64:

@@ -111,8 +111,10 @@ def refine_outline(
     alike = settings.correlated_along_m * settings.correlated_across_m / grid.cell_m**2 / stride
     width_ratio = bundle_width(start.rings, 1.0)
     narrowest = settings.min_width_m if start.rings else settings.min_single_diameter_m
+    widths_m = 0.8 * narrowest, 1.2 * settings.max_width_m
     if start.rings == TRIANGLE:
-        narrowest = max(narrowest, bundle_width(TRIANGLE, TRIANGLE_BARS_M[0]))
+        least, most = (bundle_width(TRIANGLE, diameter_m) for diameter_m in TRIANGLE_BARS_M)
+        widths_m = max(widths_m[0], 0.8 * least), min(widths_m[1], 1.2 * most)
     held, values, normal, moments, alike = fit_outline(
         Heights(
             grid.z_m, grid.sigma_m, grid.u0_m, grid.v0_m, grid.cell_m, rows[0], rows[1], stride, v_m
@@ -121,7 +123,7 @@ def refine_outline(
         Rules(
             packing_axes(start.rings), width_ratio, free, steps, float(gate_m or 2 * settings.agreement_m),
             settings.placing_m, settings.smoothing_m, alike, common or (0.0, np.inf),
-            (0.8 * narrowest, 1.2 * settings.max_width_m),
+            widths_m,
         ),
     )  # fmt: skip
     if not held:

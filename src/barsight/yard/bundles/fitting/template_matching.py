@@ -112,6 +112,8 @@ def _diameters(rings: int, settings: BundleSettings) -> list[float]:
         low, high = max(low, TRIANGLE_BARS_M[0]), min(high, TRIANGLE_BARS_M[1])
     if settings.catalogue_mm:
         return [d / 1000 for d in settings.catalogue_mm if low <= d / 1000 <= high]
+    if low > high:
+        return []
     return list(np.geomspace(low, high, int(np.log(high / low) / np.log(_RATIO)) + 2))
 
 
