@@ -47,11 +47,11 @@ def test_a_crane_is_measured_and_its_recording_gives_the_same(
     crane: Plant, longer: Path, tmp_path: Path
 ) -> None:
     wanted = bs.open_recording(longer)
-    begin_ns = play(crane, wanted, tmp_path, 45.0)
+    begin_ns = play(crane, wanted, tmp_path, 60.0)
     out = tmp_path / "out"
     process = run(crane, describe(longer, tmp_path), out, "--live.camera-silence-intervals", "12")
     end_s = (begin_ns - time.time_ns()) / 1e9 + (wanted.index.stamps_ns[-1] - wanted.index.stamps_ns[0]) / 1e9
-    time.sleep(max(end_s + 1.0, 0.0))
+    time.sleep(max(end_s + 2.0, 0.0))
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=120)
     assert process.returncode == 0, errors
