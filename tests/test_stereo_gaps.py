@@ -46,5 +46,8 @@ def test_what_is_kept_keeps_its_bits() -> None:
     kept = rng.random(known.shape) < 0.7
     masked = mask_disparity(Disparity(known, sigma, 0.05), kept)
     np.testing.assert_array_equal(masked.disparity_px, np.where(kept, known, np.nan))
+    assert (
+        masked.disparity_px.view(np.uint32) == np.where(kept, known, np.float32(np.nan)).view(np.uint32)
+    ).all()
     np.testing.assert_array_equal(masked.sigma_px, np.where(kept, sigma, np.nan))
     assert masked.bias_sigma_px == 0.05

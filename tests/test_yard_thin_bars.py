@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from barsight.core.errors import ConfigError
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.thin_bars import beside_checks, thin_bar_checks
+from barsight.yard.lifting.thin_bars import beside_checks, may_reach, thin_bar_checks
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.thin_lines import BESIDE_RATIO, MAX_STRENGTH, ThinLine, _line_strengths, find_thin_lines
 from barsight.yard.types import Bundle, HeightMap
@@ -120,6 +120,26 @@ def test_a_bar_across_a_neighbour_that_may_reach_under_the_magnet_forbids(gap_m:
     for harmless in (replace(line, along_m=3.4), replace(line, strength=MAX_STRENGTH - 0.1)):
         (check,) = beside_checks(place, MAGNET, ((neighbour, (harmless,)),))
         assert check.result == "passed"
+
+
+def test_a_neighbour_is_left_out_only_where_no_line_across_it_comes_under_the_magnet() -> None:
+    rng, place, found = np.random.default_rng(4), Placement(0.1, -0.2, 0.02), []
+    for _ in range(400):
+        one = record(
+            laid(
+                float(rng.uniform(-1.5, 1.5)),
+                y_m=float(rng.uniform(-8, 8)),
+                yaw_deg=float(rng.uniform(-90, 90)),
+            )
+        )
+        lines = [
+            ThinLine(12.0, float(along), float(askew))
+            for along in np.linspace(-0.5, 0.5, 29) * one.length_m
+            for askew in (-50.0, -20.0, 0.0, 20.0, 50.0)
+        ]
+        (check,) = beside_checks(place, MAGNET, ((one, tuple(lines)),))
+        found.append((check.result == "failed", may_reach(one, place, MAGNET)))
+    assert (True, False) not in found and {(True, True), (False, False)} <= set(found)
 
 
 def test_a_neighbour_that_no_photo_shows_leaves_open_what_sticks_out_of_it() -> None:

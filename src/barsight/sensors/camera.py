@@ -40,7 +40,7 @@ class RawLoss:
 
 
 PTP_ROLES = {"Master": 1, "Slave": 2}
-"""What a camera does whose clock PTP keeps, or that others follow; all else it may tell counts as 0."""
+"""PTP states by number, for health: a clock that others follow, and one that follows; all others are 0."""
 
 
 def are_one_clock(ptp: Iterable[str]) -> bool:

@@ -43,6 +43,8 @@ MIN_SEEN_RATIO = 0.8
 APART_M = 0.1
 """Lines nearer to each other along a bundle are one."""
 _SLOPES = np.r_[np.arange(-1.2, -0.5, 0.05), np.arange(-0.5, 0.501, 0.02), np.arange(0.55, 1.21, 0.05)]
+MAX_SLOPE = float(_SLOPES.max())
+"""Of a line, from square to the bundle's axis."""
 _ROW_SIGMAS = np.float32(math.sqrt(3.0))
 """Neighbouring columns of the photo share their pixels: a row's sum scatters more by this."""
 
@@ -108,7 +110,7 @@ def line_strengths(heights: HeightMap, bundle: Bundle) -> tuple[Float64, Float32
     left = [first - n for n in reaches if n <= first]
     right = [last + n for n in reaches if last + n <= level.shape[1]]
     ends = np.array([*left[::-1], *right])
-    reach = math.ceil(float(np.abs(_SLOPES).max()) * level.shape[1]) + 1
+    reach = math.ceil(MAX_SLOPE * level.shape[1]) + 1
     columns, power = (
         np.pad(np.ascontiguousarray(part.T), ((0, 0), (reach, reach))) for part in (contrast, weight**2)
     )

@@ -23,7 +23,7 @@ from barsight.yard.lifting.checks import (
 from barsight.yard.lifting.clearance import FacePlane, clearance_checks, find_obstacle, resting_checks
 from barsight.yard.lifting.labels import label_checks
 from barsight.yard.lifting.set_down import SetDown
-from barsight.yard.lifting.thin_bars import beside_checks, thin_bar_checks
+from barsight.yard.lifting.thin_bars import beside_checks, has_pictures, may_reach, thin_bar_checks
 from barsight.yard.lifting.travel_accuracy import Travel, target_covariance, travel_checks
 from barsight.yard.lifting.validity import Validity, age_checks, disturbed_checks, validity
 from barsight.yard.magnet.contact import NEWTON_PER_KG, Contact, rest_magnet
@@ -157,9 +157,10 @@ def assess_placement(
         checks += label_checks(place, yard.heights, magnet, FacePlane.of(contact))
         pixel_m = yard.travel.pixel_m(contact.centre_z_m) if yard.travel else None
         checks += thin_bar_checks(yard.heights, yard.thin_line(load), load, pixel_m, settings)
-        if pixel_m is not None or yard.heights.tops is not None:
-            beside = tuple((b, yard.thin_lines(b)) for b in near.bundles if b not in load)
-            checks += beside_checks(place, magnet, beside)
+        if has_pictures(yard.heights, pixel_m):
+            others = [b for b in near.bundles if b not in load]
+            beside = ((b, yard.thin_lines(b) if may_reach(b, place, magnet) else ()) for b in others)
+            checks += beside_checks(place, magnet, tuple(beside))
     scale = 0.0
     if search and not vetoes_of(checks):
         scale, end = _tolerance(place, yard, magnet, near, held, needed, contact, settings)

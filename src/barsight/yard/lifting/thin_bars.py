@@ -11,7 +11,7 @@ from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.clearance import STRAY_FIELD_M
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
-from barsight.yard.thin_lines import MAX_STRENGTH, ThinLine
+from barsight.yard.thin_lines import MAX_SLOPE, MAX_STRENGTH, ThinLine
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Check, check_max, check_true
 
@@ -33,7 +33,7 @@ def thin_bar_checks(
     load, NaN where it isn't known; None for a map that no pictures made: then nothing is checked where
     there is no photo either.
     """
-    if not load or (pixel_m is None and heights.tops is None):
+    if not load or not has_pictures(heights, pixel_m):
         return []
     what = "strength of the strongest line across the load that is no strap"
     if line is None:
@@ -61,6 +61,11 @@ def thin_bar_checks(
     return checks
 
 
+def has_pictures(heights: HeightMap, pixel_m: float | None) -> bool:
+    """Check that pictures made a map, or that it has their photo: see `thin_bar_checks`."""
+    return pixel_m is not None or heights.tops is not None
+
+
 def beside_checks(
     place: Placement, magnet: Magnet, near: tuple[tuple[Bundle, tuple[ThinLine, ...] | None], ...]
 ) -> list[Check]:
@@ -71,9 +76,7 @@ def beside_checks(
     """
     if not near:
         return []
-    slack = abs(np.stack([place.along, place.across])) @ (magnet.tolerance.x_m, magnet.tolerance.y_m)
-    half = np.array([magnet.size_m[1], magnet.size_m[0]]) / 2 + slack + STRAY_FIELD_M
-    half += math.radians(magnet.tolerance.yaw_deg) * half[::-1]
+    half = _under_m(place, magnet)
 
     def reaches(bundle: Bundle, line: ThinLine) -> bool:
         way = _beyond_flanks(bundle, line) - (place.x_m, place.y_m)
@@ -99,10 +102,37 @@ def beside_checks(
     return [*checks, check_max(CODE, what, strongest, MAX_STRENGTH, "sigma", reason)]
 
 
+def may_reach(bundle: Bundle, place: Placement, magnet: Magnet) -> bool:
+    """Check whether a line of any slope across a bundle could come under the magnet, by the rectangle about
+    all of them along each of the magnet's axes: where it can't, the bundle's photo need not be searched.
+    """
+    along, across = _axes(bundle)
+    wide = bundle.width_m / 2 + BEYOND_M
+    long = bundle.length_m / 2 + MAX_SLOPE * wide
+    away = bundle.centre_m[:2] - (place.x_m, place.y_m)
+    axes = np.stack([place.along, place.across])
+    spread = np.abs(axes @ along) * long + np.abs(axes @ across) * wide
+    return bool((np.abs(axes @ away) <= _under_m(place, magnet) + spread).all())
+
+
+def _under_m(place: Placement, magnet: Magnet) -> Float64:
+    """Compute half the length and half the width (2,) under the magnet, within the crane's tolerance and the
+    stray field.
+    """
+    slack = abs(np.stack([place.along, place.across])) @ (magnet.tolerance.x_m, magnet.tolerance.y_m)
+    half = np.array([magnet.size_m[1], magnet.size_m[0]]) / 2 + slack + STRAY_FIELD_M
+    return np.asarray(half + math.radians(magnet.tolerance.yaw_deg) * half[::-1])
+
+
+def _axes(bundle: Bundle) -> tuple[Float64, Float64]:
+    """Return a bundle's unit vectors along and across, yard axes."""
+    along = np.array([-math.sin(bundle.yaw_rad), math.cos(bundle.yaw_rad)])
+    return along, np.array([along[1], -along[0]])
+
+
 def _beyond_flanks(bundle: Bundle, line: ThinLine) -> Float64:
     """Return places (N, 2) on a line across a bundle, up to BEYOND_M beyond either flank, yard axes."""
-    along = np.array([-math.sin(bundle.yaw_rad), math.cos(bundle.yaw_rad)])
-    across = np.array([along[1], -along[0]])
+    along, across = _axes(bundle)
     askew = math.radians(line.askew_deg)
     way = math.cos(askew) * across + math.sin(askew) * along
     reach = (bundle.width_m / 2 + BEYOND_M) / math.cos(askew)
