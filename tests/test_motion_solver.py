@@ -46,6 +46,7 @@ from barsight.motion.linear.schur_complement import (
     eliminate_points,
     scatter_reduced,
 )
+from barsight.motion.problem.encoder_factors import with_unevenness
 from barsight.motion.problem.gauss_newton import (
     GraphState,
     cost_of,
@@ -69,6 +70,8 @@ from barsight.motion.problem.stereo_factors import initial_points, well_observed
 
 CAMERA = RectifiedCamera(600.0, 320.0, 240.0, 0.3, 4.0, 640, 480)
 MOUNT = Pose("body", "rect0", Rotation.from_rotvec([0.1, -0.3, 1.5]).as_matrix(), np.array([0.1, -0.2, 0.3]))
+
+UNEVEN_M = np.array([0.0005, 0.001, 0.002])
 
 
 def banded(rng: np.random.Generator, n: int, width: int) -> tuple[np.ndarray, np.ndarray]:
@@ -220,7 +223,7 @@ def seen_from(count: int, seed: int, with_crane: bool, wrong_px: float) -> tuple
         attitudes = tuple(AttitudePrior(k, poses[k].rotation, np.full(3, 0.003)) for k in range(count))
     problem = Problem(
         tuple(poses), stamps, not with_crane, seen, (None,) * (count - 1), placed, attitudes, (),
-        ImuBias.none(), has_latency=with_crane, jumps=jumps,
+        ImuBias.none(), has_latency=with_crane, jumps=jumps, uneven_m=UNEVEN_M,
     )  # fmt: skip
     return problem, well_observed(seen, np.ones(len(seen.node), np.bool_))
 
@@ -255,7 +258,9 @@ def by_gtsam(problem: Problem, used: np.ndarray) -> tuple[gtsam.Values, gtsam.Ma
     huber = gtsam.noiseModel.mEstimator.Huber.Create(HUBER_SIGMAS)
     points = initial_points(problem)
     for place in problem.placed:
-        model = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Isotropic.Sigma(3, place.sigma_m))
+        near = [np.linalg.norm(place.position_m - other.position_m) < 0.5 for other in problem.placed]
+        sigma = np.sqrt(place.sigma_m**2 + sum(near) * UNEVEN_M**2)
+        model = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Diagonal.Sigmas(sigma))
         share = np.array([float(place.node >= 5), float(place.node >= 3)])
         graph.add(gtsam.CustomFactor(model, [X(place.node), E(0)], encoder_error(place, share)))
     for k in np.flatnonzero(used):
@@ -290,6 +295,25 @@ def test_points_taken_out_give_what_gtsam_gives(with_crane: bool) -> None:
         sigma = np.sqrt(np.diag(covariance.marginalCovariance(E(0))))
         assert (np.abs(expected.atVector(E(0)) - state.values.atVector(E(0))) < 0.01 * sigma).all()
         np.testing.assert_allclose(found.encoder_sigmas, sigma, rtol=0.01)
+
+
+def test_rails_that_wave_are_seen_in_the_places_and_noise_alone_is_not() -> None:
+    problem, _ = seen_from(40, 1, True, 0.0)
+    values, rng = initial_values(problem), np.random.default_rng(3)
+    way = np.linspace(0, 12, 40)
+    wave = 0.004 * np.sin(2 * np.pi * way / 4)
+    off = rng.normal(0, 0.001, (40, 3)) + wave[:, None] * [0, 0, 1]
+    start = np.column_stack([way, np.zeros((40, 2))])
+    for k, place in enumerate(start):
+        values.update(X(k), gtsam.Pose3(gtsam.Rot3(), place))
+    still = np.zeros(3)
+    placed = tuple(EncoderPosition(k, place, still, still, 0.001) for k, place in enumerate(start + off))
+    uneven = with_unevenness(replace(problem, placed=placed, jumps=()), values).uneven_m
+    assert (uneven[:2] < 0.0008).all()
+    assert uneven[2] == pytest.approx(0.004 / 2**0.5, rel=0.2)
+    leap = np.array([0, 0, 0.5])
+    wild = tuple(replace(p, position_m=p.position_m + leap * (p.node % 2)) for p in placed)
+    assert with_unevenness(replace(problem, placed=wild, jumps=()), values).uneven_m[2] < 0.006
 
 
 def moved_by(step: np.ndarray) -> np.ndarray:

@@ -20,8 +20,10 @@ from barsight.motion.problem.encoder_factors import (
     EncoderState,
     encoder_inliers,
     encoder_residuals,
+    encoder_sigmas,
     encoder_state,
     with_known_way,
+    with_unevenness,
 )
 from barsight.motion.problem.gauss_newton import GraphState, optimise_graph, sighting_residuals
 from barsight.motion.problem.gtsam_factors import build_graph, initial_values
@@ -53,7 +55,8 @@ class Estimate:
     (F - 1, 6, 6) of a frame's pose in the frame before, in its own axes. velocity_mps: (M, 3) or
     None without IMU. biases: (M,). pixel_sigma_px: what the residuals show; used: (N,) sightings kept.
     drift: of the rig, None where no picture was used or the calibration is taken as exact. encoders: None
-    without. placed: P of them; encoder_off_m: (P, 3) of each, encoder_used: (P,) those that agree.
+    without. placed: P of them; encoder_off_m, encoder_sigma_m: (P, 3) of each, encoder_used: (P,) those that
+    agree.
     inertial, pictures, imu: of the nodes, their stamps by the nodes' clock; points: (M,) sightings used at
     each.
     """
@@ -69,6 +72,7 @@ class Estimate:
     encoders: EncoderState | None
     placed: tuple[EncoderPosition, ...]
     encoder_off_m: Float64
+    encoder_sigma_m: Float64
     encoder_used: Bool
     inertial: InertialStates | None
     pictures: NormalisedResiduals | None
@@ -81,10 +85,10 @@ def solve_batch(problem: Problem, frames: Int64) -> Estimate:
     the next.
 
     After a first solution, drift of the rig included, encoders' places are taken anew with the accelerations
-    it shows, sightings beyond 3.5 sigma leave and all sigmas grow or shrink to what was seen; then the drift
-    is sought on and weighed against its prior, and encoder places beyond 5 sigma leave. (A cut before the
-    drift is known would take the very sightings that show it best.) Raises LinAlgError where the
-    measurements leave an unknown undetermined.
+    and the unevenness it shows, sightings beyond 3.5 sigma leave and all sigmas grow or shrink to what was
+    seen; then the drift is sought on and weighed against its prior, and encoder places beyond 5 sigma leave.
+    (A cut before the drift is known would take the very sightings that show it best.) Raises LinAlgError
+    where the measurements leave an unknown undetermined.
     """
     problem = replace(problem, asked=frames)
     used = np.ones(0 if problem.sightings is None else len(problem.sightings.node), np.bool_)
@@ -98,6 +102,7 @@ def solve_batch(problem: Problem, frames: Int64) -> Estimate:
             state, system, _ = optimise_with_drift(problem, state, system, used, START_GAIN)
         del system
         seen, problem = problem.sightings, with_known_way(problem, state.values)
+        problem = with_unevenness(problem, state.values)
         problem, state, system, used = _with_seen_noise(problem, seen, state, used)
     drift: RigDrift | None = None
     everywhere, agreed = problem, np.ones(len(problem.placed), np.bool_)
@@ -143,6 +148,7 @@ def _estimate(
         encoder_state(state.values, problem.jumps, found.encoder_sigmas) if problem.has_latency else None,
         everywhere.placed,
         encoder_residuals(state.values, everywhere),
+        encoder_sigmas(everywhere),
         encoder_inliers(state.values, everywhere),
         inertial_states(problem, state, everything),
         pictures,

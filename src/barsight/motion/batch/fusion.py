@@ -313,7 +313,8 @@ class BatchPoses:
         begin_ns = 0 if inputs.crane is None else int(inputs.crane.stamp_ns[0])
         sure, maybe = jump_sentences(jumps, begin_ns, estimate.encoders)
         warnings += maybe
-        encoders = normalised_encoders(nodes.stamp_ns, estimate.placed, estimate.encoder_off_m)
+        in_sigmas = estimate.encoder_off_m / estimate.encoder_sigma_m
+        encoders = normalised_encoders(nodes.stamp_ns, estimate.placed, in_sigmas)
         return estimate, warnings, sure, encoders
 
     def _attitude_sigmas_deg(self, chosen: list[int], still: Container[int]) -> dict[int, float]:

@@ -3,6 +3,11 @@
 A reading stamped t says where the crane was at t minus the latency. That shows wherever the speed changes,
 since pictures and IMU know the way by themselves. Their scale against the baseline is the rig's drift; a
 constant offset is seen by nothing in the recording: it stays what the yard's origin is.
+
+Encoders tell where wheels and drum are, not the body: rails that wave and a girder that swings move it by
+millimetres, alike over a stretch of the way. Taken as noise of single readings, which averages out, that
+would tilt the whole yard surely. So a place's variance is the readings' own plus this unevenness's, as often
+as it counts among its neighbours; its size on each axis is learnt from the recording.
 """
 
 from __future__ import annotations
@@ -22,7 +27,13 @@ from barsight.inertial.model import ImuBias
 from barsight.motion.crane.encoder_trajectory import fit_position
 from barsight.motion.crane.known_motion import ImuWay, way_around
 from barsight.motion.linear.chain_elimination import Chain
-from barsight.motion.problem.problem import EncoderPosition, Problem, encoder_unknowns_of, poses_of
+from barsight.motion.problem.problem import (
+    FIRST_UNEVEN_M,
+    EncoderPosition,
+    Problem,
+    encoder_unknowns_of,
+    poses_of,
+)
 from barsight.motion.problem.rig_drift import HUBER_SIGMAS
 
 FARTHEST_SIGMAS = 5.0
@@ -31,6 +42,10 @@ WINDOW_S = 0.21
 MIN_SIGMA_M = 0.0003
 MIN_AGREEING_SIGMA_M = 0.001
 """What a parabola through the readings may be off by while the crane jerks, which isn't a disagreement."""
+PRIOR_STRETCHES = 3.0
+"""How many stretches' worth the first unevenness counts in what a recording shows."""
+MAX_UNEVEN_M = 0.006
+"""What is further off says no more than this: it is a fault."""
 NOTED_LATENCY_SIGMAS = 5.0
 NOTED_LATENCY_S = 0.005
 AXES = ("bridge", "trolley", "hoist")
@@ -99,21 +114,20 @@ def add_encoders(chain: Chain, problem: Problem, poses: Float64, unknowns: Float
     node = _nodes(problem.placed)
     reading, by_unknowns = _readings(problem, unknowns)
     turn, error = poses[node, :3, :3], poses[node, :3, 3] - reading
-    sigma = _sigmas(problem.placed, MIN_SIGMA_M)
-    distance = np.linalg.norm(error, axis=1) / sigma
-    weight = HUBER_SIGMAS / np.maximum(distance, HUBER_SIGMAS) / sigma**2
+    sigma = encoder_sigmas(problem)
+    distance = np.linalg.norm(error / sigma, axis=1)
+    weight = (HUBER_SIGMAS / np.maximum(distance, HUBER_SIGMAS))[:, None] / sigma**2
     shift = np.arange(3, 6)  # GTSAM's, in body axes
-    chain.own[node[:, None], shift, shift] += weight[:, None]
-    chain.gradient[node, 3:6] += np.einsum("p,pij,pi->pj", weight, turn, error)
-    chain.side[node, 3:6] -= np.einsum("p,pij,pis->pjs", weight, turn, by_unknowns)
-    chain.corner[:] += np.einsum("p,pis,pit->st", weight, by_unknowns, by_unknowns)
-    chain.corner_gradient[:] -= np.einsum("p,pis,pi->s", weight, by_unknowns, error)
+    chain.own[node[:, None, None], shift[:, None], shift] += np.einsum("pij,pi,pik->pjk", turn, weight, turn)
+    chain.gradient[node, 3:6] += np.einsum("pi,pij,pi->pj", weight, turn, error)
+    chain.side[node, 3:6] -= np.einsum("pi,pij,pis->pjs", weight, turn, by_unknowns)
+    chain.corner[:] += np.einsum("pi,pis,pit->st", weight, by_unknowns, by_unknowns)
+    chain.corner_gradient[:] -= np.einsum("pi,pis,pi->s", weight, by_unknowns, error)
 
 
 def encoders_cost(values: Any, problem: Problem) -> float:
     """Compute the Huber cost of the places."""
-    sigma = _sigmas(problem.placed, MIN_SIGMA_M)
-    distance = np.linalg.norm(encoder_residuals(values, problem), axis=1) / sigma
+    distance = np.linalg.norm(encoder_residuals(values, problem) / encoder_sigmas(problem), axis=1)
     near = np.minimum(distance, HUBER_SIGMAS)
     return float((near * (distance - near / 2)).sum())
 
@@ -129,9 +143,27 @@ def encoder_residuals(values: Any, problem: Problem) -> Float64:
 
 def encoder_inliers(values: Any, problem: Problem) -> Bool:
     """Select places (P,) within 5 sigma of the poses."""
-    sigma = _sigmas(problem.placed, MIN_AGREEING_SIGMA_M)
-    kept: Bool = np.linalg.norm(encoder_residuals(values, problem), axis=1) < FARTHEST_SIGMAS * sigma
+    sigma = encoder_sigmas(problem, MIN_AGREEING_SIGMA_M)
+    kept: Bool = np.linalg.norm(encoder_residuals(values, problem) / sigma, axis=1) < FARTHEST_SIGMAS
     return kept
+
+
+def with_unevenness(problem: Problem, values: Any) -> Problem:
+    """Estimate the unevenness of each axis by the places' residuals beyond the readings' own."""
+    if not problem.placed:
+        return problem
+    square = np.minimum(encoder_residuals(values, problem) ** 2, MAX_UNEVEN_M**2)
+    own = encoder_sigmas(replace(problem, uneven_m=np.zeros(3))) ** 2
+    share = 1 / problem.alike
+    seen = np.maximum(share @ (square - own), 0.0)
+    variance = (PRIOR_STRETCHES * FIRST_UNEVEN_M**2 + seen) / (PRIOR_STRETCHES + share.sum())
+    return replace(problem, uneven_m=np.sqrt(variance))
+
+
+def encoder_sigmas(problem: Problem, min_m: float = MIN_SIGMA_M) -> Float64:
+    """Compute the places' sigmas (P, 3) m, with the unevenness that neighbours share. min_m: of readings."""
+    own = np.array([max(p.sigma_m, min_m) for p in problem.placed], np.float64)
+    return np.hypot(own[:, None], problem.uneven_m * np.sqrt(problem.alike)[:, None])
 
 
 def encoder_state(values: Any, jumps: Sequence[EncoderJump], sigmas: Float64) -> EncoderState:
@@ -216,7 +248,3 @@ def _readings(problem: Problem, unknowns: Float64) -> tuple[Float64, Float64]:
 
 def _nodes(placed: tuple[EncoderPosition, ...]) -> Int64:
     return np.array([p.node for p in placed], np.int64)
-
-
-def _sigmas(placed: tuple[EncoderPosition, ...], min_m: float) -> Float64:
-    return np.array([max(p.sigma_m, min_m) for p in placed], np.float64)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, E, V, X
+from scipy.spatial import KDTree
 
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.pose import Pose
@@ -19,6 +20,9 @@ from barsight.inertial.preintegration import Preintegrated
 from barsight.motion.frontend.tracking import Sighting
 from barsight.motion.linear.ordering import Ordering, order_unknowns
 
+FIRST_UNEVEN_M = 0.0005
+ALIKE_M = 0.5
+"""Rails put places so near to each other off alike: a quarter of their waves, which are a few metres long."""
 MAX_SIGHTINGS = 40
 MIN_SIGMA_PX = 0.03
 """What no patch is better than, however well it fits: rectification, splines and aliasing."""
@@ -220,6 +224,16 @@ class Problem:
     """Of the encoders' readings, each an unknown."""
     has_imu: bool = False
     """Whether velocities and biases are unknowns."""
+    uneven_m: Float64 = field(default_factory=lambda: np.full(3, FIRST_UNEVEN_M))
+    """By how much rails and springs move the body along x, y and z where no encoder sees it (1 sigma)."""
+
+    @cached_property
+    def alike(self) -> Int64:
+        """Count the encoders' places (P,) that rails and springs put off as one, itself among them."""
+        place = np.array([p.position_m for p in self.placed]).reshape(-1, 3)
+        if not len(place):
+            return np.empty(0, np.int64)
+        return np.asarray(KDTree(place).query_ball_point(place, ALIKE_M, return_length=True), np.int64)
 
     @cached_property
     def retained(self) -> Int64:

@@ -71,12 +71,9 @@ def normalised_imu(problem: Problem, state: GraphState) -> NormalisedResiduals |
 
 
 def normalised_encoders(
-    node_ns: Int64, placed: tuple[EncoderPosition, ...], off_m: Float64
+    node_ns: Int64, placed: tuple[EncoderPosition, ...], in_sigmas: Float64
 ) -> NormalisedResiduals | None:
-    """Normalise the encoders' residuals. off_m: (P, 3) as `encoders.disagreement` has it."""
+    """List the encoders' residuals (P, 3), in sigmas, by the stamps of their nodes."""
     if not placed:
         return None
-    sigma = np.array([place.sigma_m for place in placed])
-    return NormalisedResiduals(
-        ("x", "y", "z"), node_ns[[place.node for place in placed]], off_m / sigma[:, None]
-    )
+    return NormalisedResiduals(("x", "y", "z"), node_ns[[place.node for place in placed]], in_sigmas)
