@@ -48,6 +48,24 @@ def test_the_bench_tells_what_was_judged(tmp_path: Path) -> None:
     assert table.row_count == 10
 
 
+def test_placements_for_danger_say_nothing_of_what_is_refused(tmp_path: Path) -> None:
+    described = tmp_path / "magnet.toml"
+    described.write_text(example_magnet(), encoding="utf-8")
+    magnet, settings = read_magnet(described), LiftSettings()
+    world = draw_yard(9, 2 * magnet.half_span_m + 0.3, 1.2)
+    given = world, noisy_world(world, settings), load_magnet(described), magnet, settings
+    offered = len(tuple(judge_yard(*given, 0)))
+    judged = tuple(judge_yard(*given, 1, 5))
+    more = judged[offered + 1 :]
+    assert more and all(one.for_danger and not one.vetoes for one in more)
+    assert not any(one.for_danger for one in judged[: offered + 1])
+    both, first = (
+        [str(cell) for cell in bench_table(JudgedBench.of(1, lifts)).columns[1].cells]
+        for lifts in (judged, judged[: offered + 1])
+    )
+    assert both[0] != first[0] and both[5:8] == first[5:8]
+
+
 def test_the_judge_reads_the_magnet_as_the_product_does(tmp_path: Path) -> None:
     described = tmp_path / "magnet.toml"
     described.write_text(example_magnet(), encoding="utf-8")

@@ -2,7 +2,8 @@
 
 The lifts that are offered, and random placements, are assessed on a measured map of a drawn world; each that
 is not vetoed is judged by the world's solids at the stated tolerance, and so are the vetoed ones over a
-bundle on which nothing lies, for what is refused although it is fine.
+bundle on which nothing lies, for what is refused although it is fine. Of more placements only those without
+a veto are judged: they bound the danger.
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ class JudgedLift:
     """One placement and what the judge says. offered: it is in the plan's list; vetoes: the product's codes.
 
     dangerous: of what is vetoed and dangerous at the target already, the reasons there. stated_*: by the
-    product; true_*: by the judge, NaN where there is no load.
+    product; true_*: by the judge, NaN where there is no load. for_danger: it is listed as it has no veto, and
+    tells nothing of what is refused.
     """
 
     seed: int
@@ -54,6 +56,7 @@ class JudgedLift:
     stated_pull_low_n: float
     true_mass_kg: float
     true_pull_n: float
+    for_danger: bool = False
 
     @property
     def is_fine(self) -> bool:
@@ -87,9 +90,11 @@ class JudgedBench:
 
 def judge_yard(
     world: DrawnYard, mapped: MappedWorld, magnet: Magnet, judged: JudgedMagnet, settings: LiftSettings,
-    placements: int,
+    placements: int, for_danger: int = 0,
 ) -> Iterator[JudgedLift]:  # fmt: skip
-    """Assess and judge the offered lifts and so many placements of one world."""
+    """Assess and judge the offered lifts and so many placements of one world, and what isn't vetoed of
+    `for_danger` more.
+    """
     rng, judge = np.random.default_rng((37, world.seed)), Judge(world.yard, judged, settings.bundles)
     scene = mapped.scene
     plan = plan_lifts(
@@ -98,13 +103,15 @@ def judge_yard(
     for lift in plan.offered:
         yield _judged(world, lift, judge, judged, offered=True)
     offered = [lift.place for lift in plan.offered]
-    for number in range(placements):
+    for number in range(placements + for_danger):
         middles = offered if number % 2 and offered else [_over(world, b) for b in world.free]
         if not middles:
             return
         place = _beside(middles[int(rng.integers(len(middles)))], rng)
         lift = replace(assess_placement(place, scene, magnet, settings), map_vetoes=mapped.vetoes)
-        yield _judged(world, lift, judge, judged, offered=False)
+        more = number >= placements
+        if not more or not lift.vetoes:
+            yield replace(_judged(world, lift, judge, judged, offered=False), for_danger=more)
 
 
 def _over(world: DrawnYard, bundle: int) -> Placement:
@@ -151,7 +158,7 @@ def bench_table(bench: JudgedBench) -> Table:
     """Tabulate the bench for people."""
     table = Table("figure", "value", title=f"{len(bench.lifts)} placements on {bench.yards} yards")
     free, bad = bench.unvetoed, bench.dangerous
-    fine = [one for one in bench.lifts if one.is_fine]
+    fine = [one for one in bench.lifts if one.is_fine and not one.for_danger]
     refused = [one for one in fine if one.vetoes]
     codes = Counter(code for one in refused for code in one.vetoes)
     reasons = Counter(reason.split(":")[0] for one in bad for reason in one.dangerous)

@@ -38,6 +38,7 @@ OVER_MAGNET_M = 0.3
 def bench_lift_targets(
     seeds: str = "0:8",
     placements: int = 40,
+    danger_placements: int = 0,
     rendered: bool = False,
     full_size: bool = False,
     keep: Path | None = None,
@@ -55,6 +56,8 @@ def bench_lift_targets(
     Args:
         seeds: Seeds of the yards, first:last, the last not included; the kind of yard is the seed modulo 10.
         placements: Random placements on each yard, beside the lifts that are offered there.
+        danger_placements: Placements on each yard besides, of which only those without a veto are judged, so
+            that they bound the danger in less time.
         rendered: Render and measure each yard, a minute of computing; without it the exact map gets noise.
         full_size: Render pictures of 1280x1024 instead of 640x512: half the size of a pixel on the surface,
             four times the computing.
@@ -66,8 +69,9 @@ def bench_lift_targets(
         save: JSON file for all placements, with commit and machine.
     """
     numbers = parse_seeds(seeds, "bench lifts")
-    if placements < 0:
-        raise ConfigError(f"bench lifts: placements must be 0 or more, not {placements}")
+    for name, count in (("placements", placements), ("danger-placements", danger_placements)):
+        if count < 0:
+            raise ConfigError(f"bench lifts: {name} must be 0 or more, not {count}")
     if scheduler is not None and keep is None:
         raise ConfigError("bench lifts: with --scheduler the workers share a folder: name it with --keep")
     found: dict[int, tuple[JudgedLift, ...]] = {}
@@ -77,7 +81,7 @@ def bench_lift_targets(
             described_at.write_text(example_magnet(), encoding="utf-8")
         given = _Given(
             (keep or Path(scratch)).absolute(), load_magnet(described_at), read_magnet(described_at),
-            placements, rendered, full_size,
+            placements, danger_placements, rendered, full_size,
         )  # fmt: skip
         for seed, judged in over_seeds(_judge_seed, numbers, given, workers, scheduler):
             found[seed] = judged
@@ -98,6 +102,7 @@ class _Given:
     magnet: Magnet
     judged: JudgedMagnet
     placements: int
+    danger_placements: int
     rendered: bool
     full_size: bool
 
@@ -113,7 +118,8 @@ def _judge_seed(seed: int, given: _Given) -> tuple[JudgedLift, ...]:
         mapped = _measured(world, folder, settings, given.full_size)
     else:
         mapped = noisy_world(world, settings)
-    return tuple(judge_yard(world, mapped, given.magnet, given.judged, settings, given.placements))
+    counts = given.placements, given.danger_placements
+    return tuple(judge_yard(world, mapped, given.magnet, given.judged, settings, *counts))
 
 
 def _measured(world: DrawnYard, folder: Path, settings: LiftSettings, full_size: bool) -> MappedWorld:

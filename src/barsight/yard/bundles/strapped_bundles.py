@@ -61,7 +61,8 @@ def _as_pack(
     """Replace place, width, top and section of a fitted outline by those of the pack that straps hold."""
     fit = reading.found.fit
     top_z = float(bundle.centre_m[2]) + pack.top_m + _CREST_M
-    section, section_sigma = section_of_pack(pack.width_m, _over(top_z, floor_m))
+    width_sigma = _pack_sigma(reading)
+    section, section_sigma = section_of_pack(pack.width_m, width_sigma, _over(top_z, floor_m))
     aside = pack.middle_m * np.array([np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad), 0.0])
     if abs(bundle.yaw_rad - reading.found.grid.heading_rad + np.arctan(fit.values[SLOPE_U])) > 1.0:
         aside = -aside
@@ -84,7 +85,7 @@ def _as_pack(
             bundle.sigma,
             lateral_m=float(np.hypot(bundle.sigma.lateral_m, _PACK_MIDDLE_M)),
             yaw_rad=irregular.yaw_rad,
-            width_m=_pack_sigma(reading),
+            width_m=width_sigma,
             top_z_m=float(np.hypot(bundle.sigma.top_z_m, _PACK_TOP_M)),
             bar_diameter_m=DIAMETER_SIGMA_RATIO * pack.diameter_m,
             section_m2=section_sigma,
@@ -142,20 +143,20 @@ def _confirmed(bundle: Bundle, pack: Pack, floor_m: float | None, pack_sigma_m: 
     """Keep a fitted outline that ends where the pack does. Its width is the mean of both by their sigmas;
     they are as sure as they agree.
     """
-    section, section_sigma = section_of_pack(pack.width_m, _over(bundle.top_z_m, floor_m))
     diameter, spread = bundle.bar_diameter_m, bundle.sigma.bar_diameter_m
     if abs(pack.diameter_m - diameter) > DIAMETER_SIGMA_RATIO * diameter:
         diameter, spread = pack.diameter_m, DIAMETER_SIGMA_RATIO * pack.diameter_m
     own, packs = bundle.sigma.width_m**-2, pack_sigma_m**-2
-    scatter_m = (bundle.width_m - pack.width_m) / 2
+    width = (own * bundle.width_m + packs * pack.width_m) / (own + packs)
+    width_sigma = float(np.hypot((own + packs) ** -0.5, (bundle.width_m - pack.width_m) / 2))
+    section, section_sigma = section_of_pack(width, width_sigma, _over(bundle.top_z_m, floor_m))
     sigma = replace(
         bundle.sigma,
         bar_diameter_m=spread,
         lateral_m=float(np.hypot(bundle.sigma.lateral_m, pack.middle_m)),
-        width_m=float(np.hypot((own + packs) ** -0.5, scatter_m)),
+        width_m=width_sigma,
         section_m2=section_sigma,
     )
-    width = (own * bundle.width_m + packs * pack.width_m) / (own + packs)
     return replace(bundle, width_m=width, section_m2=section, bar_diameter_m=diameter, sigma=sigma)
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from barsight.core.arrays import Float64
-from barsight.yard.bundles.fitting.outline_fit import Fit
+from barsight.yard.bundles.fitting.outline_fit import DIAMETER, Fit
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.section.bar_pitch import DIAMETER_SIGMA_RATIO, bar_diameter
 from barsight.yard.bundles.section.pack_sides import PackSide, find_side, flank_depth
@@ -27,6 +27,8 @@ _SPREAD_M = 0.03
 _IN_LINE_M, _BESIDE_M = 0.018, 0.09
 """Along the bars: largest distance between the two halves of one strap where they meet; a strap that is
 nearer than the second, but not in line, makes it doubtful that any are of one bundle."""
+_MIN_WIDTH_BARS = 1.5
+"""Least width of what straps hold, in its bars."""
 _BEYOND_M = 0.03
 """Distance of straps beyond an outline, or of others' into it, from which they speak against it."""
 
@@ -83,7 +85,12 @@ def strapped_pack(height_map: HeightMap, grid: AlignedMap, fit: Fit) -> Pack | N
     pack = find_pack(spans, number, beside, level, thick * (1 + UPPER * DIAMETER_SIGMA_RATIO))
     if pack is None or not pack.is_bounded:
         return pack and replace(pack, diameter_m=thick)
-    return replace(pack, diameter_m=bar_diameter(height_map, grid, fit, pack.low_m, pack.high_m))
+    pack = replace(pack, diameter_m=bar_diameter(height_map, grid, fit, pack.low_m, pack.high_m))
+    # Straps hold several bars: where no line parts any, what is in sight may be the topmost of thick ones.
+    one_bar = fit.rings == 0 and math.isnan(pack.diameter_m)
+    if one_bar and pack.width_m < _MIN_WIDTH_BARS * float(fit.values[DIAMETER]):
+        return replace(pack, sides=(PackSide.OPEN, PackSide.OPEN))
+    return pack
 
 
 def find_own(spans: tuple[StrapSpan, ...], width_m: float) -> int | None:

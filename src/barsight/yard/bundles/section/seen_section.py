@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import numpy as np
 
@@ -23,6 +25,7 @@ from barsight.yard.bundles.fitting.outline_fit import (
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.lift_settings import UPPER
 
+_UNIT = NormalDist()
 _ROWS_ENOUGH = 120
 _GULLY_RATIO = 0.95
 """Of a bar's diameter: a dip this deep between two crests parts two bundles."""
@@ -44,15 +47,18 @@ _ALIKE_LOG = 0.35
 _PARTED_RATIO, _PARTED_DIAMETER_M = 0.3, 0.04
 """Two bundles lie side by side where the surface sinks so far, of the outline's width, between them and their
 bars are this thick; else they may be pieces of one pack."""
-_HEIGHT_RATIOS = 0.45, 1.25
-"""Least and greatest height of a bundle over its width."""
-_FILLED_RATIOS, _BAR_FILLED_RATIO = (0.54, 0.73), 0.79
-"""Least and greatest share of steel in the box round a bundle, and the greatest in that round what looks like
-one bar. Heights and shares are by packs drawn with seeds 0 to 99."""
-_WIDTH_ERRORS_M = 0.02, 0.01
-"""Largest errors of a bundle's width in a map, too wide and too narrow."""
-_STRAPPED_RATIOS, _STRAPPED_ERROR_M = (0.42, 0.90), 0.02
-"""Least and greatest section of steel over the width squared of bars that straps hold; error of the width."""
+_MAX_HEIGHT_RATIO, _MAX_FILL_RATIO = 1.25, 0.79
+"""Greatest height of a bundle over its width, and share of steel in the box round it."""
+_HEIGHT_RATIO_PRIOR = NormalDist(0.92, 0.14)
+"""Height of a bundle over its width. Its mean and deviation, and those of the fill, are by 1500 settled packs
+drawn with seeds 0 to 1499; full hexagons of any turn lie within two deviations of both."""
+_FILL_RATIO, _BAR_FILL_RATIO = (0.65, 0.045), (0.70, 0.055)
+"""Mean and deviation of the share of steel in the box round a bundle, and in that round what looks like one
+bar: it is one, or a round pack of thin ones."""
+_MAX_DEVIATIONS = 4.0
+"""From this many deviations of the prior on, a floor cuts nothing off; below as many it cuts off no more."""
+_SEEN_WIDTH_SIGMA_M, _OUTLINE_RATIO = 0.012, 0.5
+"""Of the width between the sides that a map shows, and of what it differs from the outline's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +88,7 @@ def seen_section(one: FittedOutline, others: list[FittedOutline], smoothing_m: f
     others_begin = _is_neighbour(one, beside, others)
     resolved = fit.rings > 0 and fit.values[DIAMETER] > _PARTED_DIAMETER_M
     parted_m = _PARTED_RATIO * fit.width_m if resolved else np.inf
-    lowest_m = float(level[middle]) - _HEIGHT_RATIOS[1] * (_MAX_PIECE_RATIO * fit.width_m + _WIDER_M)
+    lowest_m = float(level[middle]) - _MAX_HEIGHT_RATIO * (_MAX_PIECE_RATIO * fit.width_m + _WIDER_M)
     limits = deep_m, parted_m, lowest_m, round(_HIDDEN_M / grid.cell_m)
     ends = [_edge(level, others_begin, middle, step, *limits) for step in (-1, 1)]
     own = level[ends[0][0] : ends[1][0] + 1]
@@ -133,31 +139,40 @@ def estimate_section(
 ) -> tuple[float, float]:
     """Estimate steel's section and its sigma, m2, of a bundle whose bars can't be counted; NaN where its
     sides were not seen, or where what is seen is not the outline's section.
-
-    What lies under the widest place isn't seen. The estimate is the middle between the least that may be
-    there and the most, down to the floor, and its upper 95 % bound is the most.
     """
     if seen is None or not seen.sides_seen:
         return np.nan, np.nan
     if not _MIN_PIECE_RATIO * fit.width_m < seen.width_m < _MAX_PIECE_RATIO * fit.width_m + _WIDER_M:
         return np.nan, np.nan
     over_m = np.inf if floor_m is None else max(top_m - floor_m, 0.0)
-    heights = [min(ratio * seen.width_m, over_m) for ratio in _HEIGHT_RATIOS]
-    narrow, wide = max(seen.width_m - _WIDTH_ERRORS_M[0], 0.0), seen.width_m + _WIDTH_ERRORS_M[1]
-    least = _FILLED_RATIOS[0] * narrow * heights[0]
-    most = (_FILLED_RATIOS[1] if fit.rings else _BAR_FILLED_RATIO) * wide * heights[1]
-    return (least + most) / 2, (most - least) / 2 / UPPER
+    fill = _FILL_RATIO if fit.rings else _BAR_FILL_RATIO
+    sigma_m = math.hypot(_SEEN_WIDTH_SIGMA_M, _OUTLINE_RATIO * (seen.width_m - fit.width_m))
+    return section_of_pack(seen.width_m, sigma_m, over_m, fill)
 
 
-def section_of_pack(width_m: float, over_floor_m: float) -> tuple[float, float]:
-    """Estimate steel's section and its sigma, m2, of bars that straps hold, by the width between the flanks.
+def section_of_pack(
+    width_m: float, width_sigma_m: float, over_floor_m: float, fill: tuple[float, float] = _FILL_RATIO
+) -> tuple[float, float]:
+    """Estimate steel's section and its sigma, m2, of bars by the width between the flanks.
 
-    over_floor_m: height of the top over the floor, inf where none was seen: bars reach no further down.
+    section = fill x height x width. What lies under the widest place isn't seen: the height is the prior's,
+    cut off where the floor is [Johnson 1994, truncated normal]. over_floor_m: height of the top over the
+    floor, inf where none was seen. fill: share of steel in the box round the bars, and its deviation.
     """
-    narrow, wide = max(width_m - _STRAPPED_ERROR_M, 0.0), width_m + _STRAPPED_ERROR_M
-    least = min(_STRAPPED_RATIOS[0] * narrow, _FILLED_RATIOS[0] * over_floor_m) * narrow
-    most = min(_STRAPPED_RATIOS[1] * wide, _FILLED_RATIOS[1] * over_floor_m) * wide
-    return (least + most) / 2, (most - least) / 2 / UPPER
+    if not width_m > 0 or not over_floor_m > 0:
+        return np.nan, np.nan
+    prior, cut = _HEIGHT_RATIO_PRIOR, over_floor_m / width_m
+    height, height_sigma = prior.mean, prior.stdev
+    at = max(prior.zscore(cut), -_MAX_DEVIATIONS)
+    if at < _MAX_DEVIATIONS:
+        slope = _UNIT.pdf(at) / _UNIT.cdf(at)
+        height = cut - min(prior.stdev * (slope + at), cut / 2)
+        height_sigma = prior.stdev * math.sqrt(1 - at * slope - slope**2)
+    section = fill[0] * height * width_m**2
+    share = np.linalg.norm([fill[1] / fill[0], height_sigma / height, 2 * width_sigma_m / width_m])
+    widest = width_m + UPPER * width_sigma_m
+    most = _MAX_FILL_RATIO * min(over_floor_m, _MAX_HEIGHT_RATIO * width_m) * widest
+    return section, min(section * float(share), (most - section) / UPPER)
 
 
 def agreeing_rows(fit: Fit) -> Int64:
