@@ -1,9 +1,11 @@
-"""Gaps between bars are unknown; bars of another brightness are not gaps."""
+"""Gaps between bars are unknown; bars of another brightness are not gaps. Bars along the rows that are
+matched in pieces are unknown, too.
+"""
 
 import numpy as np
 
 from barsight.core.types import Disparity
-from barsight.stereo.masking import gap_mask, mask_disparity, mask_gaps
+from barsight.stereo.masking import gap_mask, mask_disparity, mask_gaps, mask_pieces, streak_mask
 
 
 def steel(level: float, seed: int = 0) -> np.ndarray:
@@ -37,6 +39,44 @@ def test_gaps_lose_disparity_and_sigma() -> None:
     assert np.isnan(masked.disparity_px[:, 92:96]).all() and np.isnan(masked.sigma_px[:, 92:96]).all()
     assert np.isfinite(masked.disparity_px[:, :80]).all() and masked.bias_sigma_px == 0.05
     assert mask_gaps(masked, image, 0.0) is masked
+
+
+def streaked(along_rows: bool) -> np.ndarray:
+    """A picture (240, 400) of bare ground with a bundle of thin bars in its middle."""
+    rng = np.random.default_rng(2)
+    image = 100 + rng.normal(0, 8, (240, 400))
+    bars = 60 * np.sin(np.arange(300) * 2 * np.pi / 5)
+    if along_rows:
+        image[70:170, 50:350] += bars[:100, None]
+    else:
+        image[20:220, 50:350] += bars
+    return image.clip(0, 255).astype(np.uint8)
+
+
+def test_bars_along_the_rows_alone_are_streaks() -> None:
+    marked = streak_mask(streaked(along_rows=True))
+    assert marked[80:160, 70:330].all()
+    assert not marked[:55].any() and not marked[185:].any()
+    assert not streak_mask(streaked(along_rows=False)).any()
+
+
+def test_an_edge_along_the_rows_is_no_streak() -> None:
+    image = streaked(along_rows=False)
+    image[212:222, 40:360] = 20
+    image[222:230, 40:360] = 200
+    assert not streak_mask(image).any()
+
+
+def test_bars_along_the_rows_in_pieces_are_unknown_and_whole_ones_stay() -> None:
+    image = streaked(along_rows=True)
+    known = np.full(image.shape, 20, np.float32)
+    known[120:150, 100:300:8], known[120:150, 101:300:8] = np.nan, np.nan
+    pieces = Disparity(known, known * 0 + 0.1, 0.05)
+    kept = np.isfinite(mask_pieces(pieces, image).disparity_px)
+    assert not kept[122:148, 150:250].any()
+    assert kept[80:118, 70:330].all()
+    across = mask_pieces(pieces, streaked(along_rows=False))
+    assert (np.isfinite(across.disparity_px) == np.isfinite(known)).all()
 
 
 def test_what_is_kept_keeps_its_bits() -> None:

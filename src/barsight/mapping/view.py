@@ -14,7 +14,7 @@ from barsight.mapping.ego_mask import mask_carried
 from barsight.mapping.observation import CellObservations, bin_points
 from barsight.motion.frontend.direct_alignment import align_views
 from barsight.stereo.direct.pipeline import BarsightStereo
-from barsight.stereo.masking import mask_disparity, mask_gaps, mask_unsure
+from barsight.stereo.masking import mask_disparity, mask_gaps, mask_pieces, mask_unsure
 from barsight.stereo.method import StereoMethod
 from barsight.stereo.prediction import predict_disparity
 from barsight.stereo.search_range import find_disparity_range, follow_disparity_range
@@ -90,9 +90,8 @@ class Matcher:
                 found = self.method.confirm(pair, candidates, predicted)
             else:
                 found = self.method(pair, candidates)
-            return mask_gaps(
-                mask_unsure(found, self.stereo.max_sigma_px), pair.left, self.stereo.gap_darkness
-            )
+            sure = mask_unsure(found, self.stereo.max_sigma_px)
+            return mask_pieces(mask_gaps(sure, pair.left, self.stereo.gap_darkness), pair.left)
 
 
 def _predicted(pair: RectifiedPair, preceding: Preceding) -> Float32 | None:

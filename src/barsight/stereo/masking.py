@@ -1,7 +1,13 @@
-"""Mask what no map takes: guesses, and gaps between bars, so dark that nothing in them is matched itself.
+"""Mask what no map takes: guesses; gaps between bars, so dark that nothing in them is matched itself; bars
+along the rows that are matched in pieces.
 
 A gully whose floor neither camera sees is a black stripe between two edges of the same surface. It matches
 perfectly at that surface's disparity, since both edges do, but nothing lies there.
+
+Where bars lie along the rows, as the baseline does, little tells one place of a bar from the next. On steel
+that shines it is mostly a lamp's highlight, which lies in no one place: it matches half a metre off in one
+piece, and not at all in the next, and no view contradicts since the highlight moves on with the crane. The
+sigma of such a match is no guide, but the holes beside it are: true surface is matched all along its bars.
 """
 
 from __future__ import annotations
@@ -15,6 +21,17 @@ from barsight.core.arrays import Bool, Float32, UInt8, kernel
 from barsight.core.types import Disparity
 
 _AROUND_PX = 41
+_BLUR_PX = 0.7
+_COARSE_PX = 4
+_STREAKS = 11, 3
+_BUNDLE = 41, 9
+"""In coarse pixels, along the rows and across: the window in which streaks are looked for, and the patch of
+streaks that no edge, beam or row of bars' ends fills, but a bundle does."""
+_ALONG_PX = 81, 3
+"""Window in which holes are looked for."""
+_MAX_SLOPE_RATIO = 0.35
+"""Power of the gray values' slopes along the rows over that across, below which there are streaks alone."""
+_MIN_MATCHED_RATIO = 0.85
 
 
 def gap_mask(image: UInt8, darkness: float) -> Bool:
@@ -30,6 +47,52 @@ def mask_gaps(disparity: Disparity, image: UInt8, darkness: float) -> Disparity:
     if darkness <= 0:
         return disparity
     return mask_disparity(disparity, ~gap_mask(image, darkness))
+
+
+def mask_pieces(disparity: Disparity, image: UInt8) -> Disparity:
+    """Mask bars along the rows where less than 85 % of the pixels along them are matched."""
+    streaks = streak_mask(image)
+    if not streaks.any():
+        return disparity
+    known = np.isfinite(disparity.disparity_px)
+    matched = cv2.boxFilter(known.view(np.uint8), cv2.CV_32F, _ALONG_PX)
+    return mask_disparity(disparity, ~(streaks & (matched < _MIN_MATCHED_RATIO)))
+
+
+def streak_mask(image: UInt8) -> Bool:
+    """Mark bars along the rows (H, W): gray values change across them and hardly along them, in one piece
+    with a patch as large as a bundle.
+    """
+    height, width = image.shape
+    small = height // _COARSE_PX, width // _COARSE_PX
+    marked = np.zeros(image.shape, np.bool_)
+    if min(small) == 0:
+        return marked
+    excess = np.empty(image.shape, np.float32)
+    _note_slopes(cv2.GaussianBlur(image.astype(np.float32), (0, 0), _BLUR_PX), excess)
+    whole = tuple(slice(count * _COARSE_PX) for count in small)
+    coarse = cv2.resize(excess[whole], small[::-1], interpolation=cv2.INTER_AREA)
+    streaks = (cv2.boxFilter(coarse, -1, _STREAKS) < 0).view(np.uint8)
+    patches = cv2.morphologyEx(streaks, cv2.MORPH_OPEN, np.ones(_BUNDLE[::-1], np.uint8))
+    count, piece = cv2.connectedComponents(streaks, connectivity=4)
+    kept = np.zeros(count, np.bool_)
+    kept[piece[patches > 0]] = True
+    marked[whole] = kept[piece].repeat(_COARSE_PX, axis=0).repeat(_COARSE_PX, axis=1)
+    return marked
+
+
+@kernel()
+def _note_slopes(gray: Float32, excess: Float32) -> None:
+    """Fill excess (H, W): the squared slope along the row less its least share of that across; 0 at the
+    border.
+    """
+    ratio = np.float32(_MAX_SLOPE_RATIO)
+    excess[:] = 0
+    for y in range(1, gray.shape[0] - 1):
+        above, here, below, out = gray[y - 1], gray[y], gray[y + 1], excess[y]
+        for x in range(1, gray.shape[1] - 1):
+            along, across = here[x + 1] - here[x - 1], below[x] - above[x]
+            out[x] = along * along - ratio * across * across
 
 
 def mask_unsure(disparity: Disparity, max_sigma_px: float) -> Disparity:
