@@ -9,6 +9,7 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
+from numba import types
 
 import barsight
 from barsight.core.arrays import kernel
@@ -77,6 +78,22 @@ def test_a_change_in_a_called_file_is_compiled_anew(tmp_path: Path) -> None:
 @kernel()
 def doubled(value: float) -> float:
     return 2 * value
+
+
+def test_code_of_another_signature_is_not_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two processes that begin with an empty cache may both write to its first file."""
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+    whole, broken = (types.int64,), (types.float64,)
+    written = kernel()(doubled.py_func)  # type: ignore[attr-defined]
+    for one in (whole, broken):
+        written.compile(one)
+    first, second = sorted(tmp_path.rglob("*.nbc"))
+    second.write_bytes(first.read_bytes())
+    found = [written._cache.load_overload(one, written.targetctx) for one in (whole, broken)]
+    assert [one is not None for one in found] == [True, False]
+    again = kernel()(doubled.py_func)  # type: ignore[attr-defined]
+    assert (again(3), again(1.5)) == (6, 3.0)
+    assert set(again.overloads) == {whole, broken}
 
 
 def test_the_list_names_kernels_with_all_their_arguments() -> None:

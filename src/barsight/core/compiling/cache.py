@@ -34,13 +34,17 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
         _digest(function.__code__.co_filename)  # of what is imported now, not of what may replace it later
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return the code for a signature, None if there is none or something in it has changed."""
+        """Return the code for a signature, None if there is none or something in it has changed.
+
+        Processes that begin with an empty cache may write the code of two signatures to one file.
+        """
         self._stamp()
         try:
-            return super().load_overload(sig, target_context)
+            found = super().load_overload(sig, target_context)
         except Exception:  # it names a class that is no more, or was torn
             self.flush()
             return None
+        return found if found is not None and tuple(found.signature.args) == tuple(sig) else None
 
     def holds(self, sig: Any, target_context: Any) -> bool:
         """Return whether the code for a signature is there."""
