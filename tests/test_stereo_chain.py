@@ -20,7 +20,7 @@ from barsight.map_building import matching
 from barsight.mapping.view import MatchedFrame
 from barsight.measure_settings import MeasureSettings
 from barsight.measurement import Refusal
-from barsight.motion.frontend.direct_alignment import align_views
+from barsight.motion.frontend.direct_alignment import _add_equations, _compare, align_views
 from barsight.recording.base import Recording
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.recording.sensor_selection import SelectedSensors
@@ -106,6 +106,51 @@ def test_views_of_other_places_are_not_aligned() -> None:
     assert isinstance(align_views(before.left, exact(disparity), other, CAMERA, MOVED), Failed)
     unknown = exact(np.full(disparity.shape, np.nan))
     assert isinstance(align_views(before.left, unknown, before.left, CAMERA, MOVED), Failed)
+
+
+def test_places_are_compared_as_one_by_one() -> None:
+    rng = np.random.default_rng(3)
+    image = rng.uniform(0, 255, (30, 40)).astype(np.float32)
+    rays = np.column_stack([rng.uniform(-40, 40, 300), rng.uniform(-30, 30, 300), np.full(300, 50.0)])
+    q, gray, tone = rng.uniform(5, 9, 300), rng.uniform(0, 255, 300), np.array([0.9, 4.0])
+    principal, turn = np.array([19.0, 14.0]), Rotation.from_rotvec([0.02, -0.05, 0.1]).as_matrix()
+    shift = np.array([0.3, -0.2, 0.1])
+    found = np.empty(300), np.empty((300, 8)), np.empty(300)
+    seen = _compare((rays, q, gray), image, (turn, shift), tone, principal, *found)
+
+    def shown(ray: np.ndarray, near: float, motion: np.ndarray) -> tuple[float, float, float]:
+        """Gray value, column and row of a place, after a turn and a shift beside those above."""
+        x, y, z = Rotation.from_rotvec(motion[:3]).apply(turn @ ray + near * shift) + near * motion[3:]
+        u, v = 50 * x / z + principal[0], 50 * y / z + principal[1]
+        if not (1 <= u < 38 and 1 <= v < 28):
+            return np.nan, u, v
+        a, b = int(u), int(v)
+        row = [float(image[b + k, a] * (1 - u + a) + image[b + k, a + 1] * (u - a)) for k in (0, 1)]
+        return row[0] * (1 - v + b) + row[1] * (v - b), u, v
+
+    inside = [k for k in range(300) if np.isfinite(shown(rays[k], q[k], np.zeros(6))[0])]
+    assert 40 < seen == len(inside) < 300
+    for n, k in enumerate(inside):
+        level, u, v = shown(rays[k], q[k], np.zeros(6))
+        assert found[0][n] == pytest.approx(level - tone[0] * gray[k] - tone[1], abs=1e-4)
+        assert (found[2][n], *found[1][n, 6:]) == (gray[k], -gray[k], -1)
+        if min(u % 1, v % 1) < 0.01 or max(u % 1, v % 1) > 0.99:
+            continue  # the slope changes here
+        for j in range(6):
+            way = 1e-6 * np.eye(6)[j]
+            slope = (shown(rays[k], q[k], way)[0] - shown(rays[k], q[k], -way)[0]) / 2e-6
+            assert found[1][n, j] == pytest.approx(slope, rel=1e-3, abs=0.05)
+
+
+def test_equations_are_weighted_sums() -> None:
+    rng = np.random.default_rng(4)
+    residual, rows = rng.normal(0, 2, 50), rng.normal(0, 1, (50, 8))
+    normal, pull = np.zeros((8, 8)), np.zeros(8)
+    _add_equations(residual, rows, 3.0, normal, pull)
+    weight = np.clip(1 - (residual / 3) ** 2, 0, None) ** 2
+    assert 0 < np.count_nonzero(weight) < 50
+    np.testing.assert_allclose(normal, rows.T @ (weight[:, None] * rows), rtol=1e-9)
+    np.testing.assert_allclose(pull, rows.T @ (weight * residual), rtol=1e-9)
 
 
 def errors_of(found: Disparity, truth: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from barsight.core.arrays import Float32, Float64, UInt8
+from barsight.core.arrays import Float32, Float64, UInt8, kernel
 from barsight.core.errors import Failed
 from barsight.core.linalg.robust import mad_sigma
 from barsight.core.pose import Pose
@@ -62,11 +62,10 @@ def align_views(
         places = _places(old, disparity, camera, shrink)
         principal = _principal(camera, shrink)
         for _ in range(_STEPS):
-            residual, rows = _residuals(places, image, motion, tone, principal)
-            seen = np.isfinite(residual)
-            if seen.sum() < max(_MIN_INSIDE_RATIO * len(residual), _MIN_POINTS):
+            seen = _compared(places, image, motion, tone, principal)
+            if len(seen.gray) < max(_MIN_INSIDE_RATIO * len(places.gray), _MIN_POINTS):
                 return Failed("not-alike", "the views have too little in common")
-            step = _solve(residual[seen], rows[seen], guess, motion)
+            step = _solve(seen.residual, seen.rows, guess, motion)
             turned = Rotation.from_rotvec(step[:3]).as_matrix()
             motion = Pose(
                 motion.target, motion.source, turned @ motion.rotation,
@@ -75,8 +74,8 @@ def align_views(
             tone = tone + step[6:]
             if np.abs(step[:3]).max() < _CLOSE_RAD and np.abs(step[3:6]).max() < _CLOSE_M:
                 break
-    explained = mad_sigma(tone[0] * places.gray[seen])
-    alike = 1 - (mad_sigma(residual[seen]) / max(explained, 1e-6)) ** 2
+    explained = mad_sigma(tone[0] * seen.gray)
+    alike = 1 - (mad_sigma(seen.residual) / max(explained, 1e-6)) ** 2
     if alike < _MIN_CORRELATION**2:
         return Failed("not-alike", f"the views don't look alike, correlation {max(alike, 0) ** 0.5:.2f}")
     return motion
@@ -112,53 +111,103 @@ def _places(small: Float32, disparity: Disparity, camera: RectifiedCamera, shrin
     return _Places(rays, q.astype(np.float64) / (shrink * camera.baseline_m), small[v, u].astype(np.float64))
 
 
-def _residuals(
-    places: _Places, image: Float32, motion: Pose, tone: Float64, principal: Float64
-) -> tuple[Float64, Float64]:
-    """Compute residuals (N,) and their derivatives (N, 8) by a turn, a shift, gain and offset; NaN outside.
+@dataclass(frozen=True, eq=False)
+class _Compared:
+    """Places that the view now shows. residual: (N,); rows: (N, 8), its derivatives by a turn, a shift, gain
+    and offset; gray: (N,), of the view before.
+    """
+
+    residual: Float64
+    rows: Float64
+    gray: Float64
+
+
+def _compared(places: _Places, image: Float32, motion: Pose, tone: Float64, principal: Float64) -> _Compared:
+    """Compare the places with the picture now, those that lie in it."""
+    count = len(places.q)
+    found = np.empty(count), np.empty((count, 8)), np.empty(count)
+    seen = _compare(
+        (places.rays, places.q, places.gray), image, (motion.rotation, motion.translation), tone, principal,
+        *found,
+    )  # fmt: skip
+    return _Compared(*(values[:seen] for values in found))
+
+
+@kernel()
+def _compare(
+    places: tuple[Float64, Float64, Float64], image: Float32, motion: tuple[Float64, Float64], tone: Float64,
+    principal: Float64, residual: Float64, rows: Float64, grays: Float64,
+) -> int:  # fmt: skip
+    """Compute residuals and their derivatives of the places that lie in the picture, and count these.
 
     Scaled by q / b a place moves to X = R ray + t q / b; a turn w and a shift s after that move it by
-    w x X + s q / b.
+    w x X + s q / b. Gray values and slopes are read between pixels, bilinearly.
+
+    places: rays (N, 3), q (N,), gray (N,). motion: rotation (3, 3), translation (3,). principal: (2,) px.
+    Fills the first of residual (N,), rows (N, 8) and grays (N,).
     """
-    focal = places.rays[0, 2]
-    moved = places.rays @ motion.rotation.T + places.q[:, None] * motion.translation
-    x, y, z = moved.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u, v = focal * x / z + principal[0], focal * y / z + principal[1]
+    (rays, q, gray), (r, t) = places, motion
     height, width = image.shape
-    inside = (z > 0) & (u >= 1) & (v >= 1) & (u < width - 2) & (v < height - 2)
-    u, v = np.where(inside, u, 1.0), np.where(inside, v, 1.0)
-    gray, along, down = _read(image, u, v)
-    over = focal / np.where(inside, z, 1.0)
-    toward = -(along * x + down * y) * over / np.where(inside, z, 1.0)
-    slope = np.column_stack([along * over, down * over, toward])
-    rows = np.column_stack(
-        [np.cross(moved, slope), places.q[:, None] * slope, -places.gray, -np.ones(len(gray))]
-    )
-    residual = np.where(inside, gray - tone[0] * places.gray - tone[1], np.nan)
-    return residual, rows
-
-
-def _read(image: Float32, u: Float64, v: Float64) -> tuple[Float64, Float64, Float64]:
-    """Read gray values (N,) and slopes along both axes between pixels, bilinearly."""
-    column, row = u.astype(np.int64), v.astype(np.int64)
-    right, below = u - column, v - row
-    one, two = image[row, column].astype(np.float64), image[row, column + 1]
-    three, four = image[row + 1, column], image[row + 1, column + 1]
-    upper, lower = one + right * (two - one), three + right * (four - three)
-    along = (two - one) * (1 - below) + (four - three) * below
-    return upper + below * (lower - upper), along, lower - upper
+    n = 0
+    for i in range(len(q)):
+        a, b, focal = rays[i, 0], rays[i, 1], rays[i, 2]
+        x = r[0, 0] * a + r[0, 1] * b + r[0, 2] * focal + q[i] * t[0]
+        y = r[1, 0] * a + r[1, 1] * b + r[1, 2] * focal + q[i] * t[1]
+        z = r[2, 0] * a + r[2, 1] * b + r[2, 2] * focal + q[i] * t[2]
+        u, v = focal * x / z + principal[0], focal * y / z + principal[1]
+        if not (z > 0 and 1 <= u < width - 2 and 1 <= v < height - 2):
+            continue
+        column, row = np.uint64(u), np.uint64(v)
+        right, below = u - np.float64(column), v - np.float64(row)
+        beside, under = column + np.uint64(1), row + np.uint64(1)
+        one, two = np.float64(image[row, column]), np.float64(image[row, beside])
+        three, four = np.float64(image[under, column]), np.float64(image[under, beside])
+        upper, lower = one + right * (two - one), three + right * (four - three)
+        over = focal / z
+        along = ((two - one) * (1 - below) + (four - three) * below) * over
+        down = (lower - upper) * over
+        toward = -(along * x + down * y) / z
+        residual[n] = upper + below * (lower - upper) - tone[0] * gray[i] - tone[1]
+        rows[n, 0] = y * toward - z * down
+        rows[n, 1] = z * along - x * toward
+        rows[n, 2] = x * down - y * along
+        rows[n, 3], rows[n, 4], rows[n, 5] = q[i] * along, q[i] * down, q[i] * toward
+        rows[n, 6], rows[n, 7] = -gray[i], -1.0
+        grays[n] = gray[i]
+        n += 1
+    return n
 
 
 def _solve(residual: Float64, rows: Float64, guess: Pose, motion: Pose) -> Float64:
     """Solve one step (8,) by Tukey's weights, with the guess as prior of turn and shift."""
     sigma = max(mad_sigma(residual), 0.5)
-    rest = 1 - (residual / (_OUTLIER_SIGMAS * sigma)) ** 2
-    weight = np.square(np.maximum(rest, 0)) / sigma**2
+    normal, pull = np.zeros((8, 8)), np.zeros(8)
+    _add_equations(residual, rows, _OUTLIER_SIGMAS * sigma, normal, pull)
     off = (motion @ guess.inverse()).rotation
     turned = Rotation.from_matrix(off).as_rotvec()
     prior = np.array([_PRIOR_RAD**-2] * 3 + [_PRIOR_M**-2] * 3 + [1e-6] * 2)
     so_far = np.concatenate([turned, motion.translation - guess.translation, [0.0, 0.0]])
-    normal = rows.T @ (weight[:, None] * rows) + np.diag(prior)
-    step: Float64 = -np.linalg.solve(normal, rows.T @ (weight * residual) + prior * so_far)
+    step: Float64 = -np.linalg.solve(normal / sigma**2 + np.diag(prior), pull / sigma**2 + prior * so_far)
     return step
+
+
+@kernel()
+def _add_equations(residual: Float64, rows: Float64, end: float, normal: Float64, pull: Float64) -> None:
+    """Add up the normal equations of residuals (N,) and rows (N, 8) by Tukey's biweight that ends at `end`.
+
+    Fills normal (8, 8) and pull (8,), zeros before.
+    """
+    for i in range(len(residual)):
+        off = residual[i] / end
+        rest = 1 - off * off
+        if rest <= 0:
+            continue
+        weight = rest * rest
+        for j in range(8):
+            heavy = weight * rows[i, j]
+            pull[j] += heavy * residual[i]
+            for k in range(j + 1):
+                normal[j, k] += heavy * rows[i, k]
+    for j in range(8):
+        for k in range(j):
+            normal[k, j] = normal[j, k]
