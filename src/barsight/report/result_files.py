@@ -38,6 +38,8 @@ RESULT_FILES = (
 """Everything that a run may leave in its folder."""
 BANDS = ("z_m", "sigma_m", "views", "source")
 _TILE = 256
+_DEFLATE_LEVEL = 1
+"""Of heights, which hardly compress: at the usual 6 they take 3 % less room and twice the time."""
 _CLOUD_POINT = np.dtype(
     [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "u1"), ("sigma_z", "<f4"), ("views", "<u2")]
 )
@@ -154,6 +156,7 @@ def write_height(surface: Surface, target: Path, frame_id: str) -> None:
             planarconfig="separate",
             tile=(_TILE, _TILE),
             compression="zlib",
+            compressionargs={"level": _DEFLATE_LEVEL},
             metadata=None,
             software=f"barsight {barsight.__version__}",
             extratags=[

@@ -44,12 +44,12 @@ def image_noise(image: UInt8 | Float32) -> float:
     """Estimate the image's noise, one sigma in gray levels: robust, from a Laplacian that planes don't excite
     [Immerkaer 1996], with the median instead of the mean so that texture counts less.
     """
-    response = _bends(_bends(image.astype(np.float32)).T)
+    response = _bends(_bends(image).T)
     spread = float(np.median(np.abs(response))) / 0.6745
     return max(spread / 6.0, 0.5)
 
 
-def _bends(image: Float32) -> Float32:
+def _bends(image: UInt8 | Float32) -> Float32:
     """Compute second differences down the columns at every third row."""
-    bends: Float32 = image[:-2:3] - 2 * image[1:-1:3] + image[2::3]
+    bends: Float32 = np.asarray(image[:-2:3] - np.float32(2) * image[1:-1:3] + image[2::3], np.float32)
     return bends
