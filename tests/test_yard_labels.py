@@ -85,3 +85,12 @@ def test_an_askew_label_on_a_bright_bar_is_found_and_a_gleam_is_not() -> None:
     rows = np.arange(40)[:, None]
     gleam[:, 6:11] += 60 * np.exp(-(((rows - 20) / 8.0) ** 2))
     assert not mark_labels(gleam).any()
+
+
+@pytest.mark.parametrize("ratio", [1.1, 1.4])
+def test_a_dull_label_between_dark_straps_is_marked_on_bright_bars(ratio: float) -> None:
+    """Take levels as a rendered tag had that held the faces off: a third brighter than its load."""
+    gray = np.full((60, 20), 120.0, np.float32)
+    gray[24:27, 6:12] = gray[33:36, 6:12] = 60.0
+    gray[27:33, 7:11] = 120.0 * ratio
+    assert mark_labels(gray).any() == (ratio > 1.3)

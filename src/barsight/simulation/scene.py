@@ -74,7 +74,7 @@ def build_scene(stock: Stock, settings: SimulationSettings, rng: np.random.Gener
             paper = plain_material(0.75, 0.0, rng, weight=0.3)
             if max(settings.yard.label_m) > 0:
                 paper[CODE] = number
-            if max(settings.yard.label_m) == 0 or k == len(straps) // 2:
+            if k == len(straps) // 2:
                 boxes.append(label)
                 box_materials.append(paper)
     for beam in stock.beams:

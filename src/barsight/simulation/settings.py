@@ -123,7 +123,7 @@ class YardSettings:
     """Distance between a bundle's straps; 0 leaves them out."""
     label_m: tuple[float, float] = (0.0, 0.0)
     """Length and width of a label with a QR code of its own on each strapped bundle, over the middle strap;
-    0 0 leaves the straps' small plain ones."""
+    0 0 leaves a small plain one there."""
     ribbed_ratio: float = 0.25
     """Share of sections that hold ribbed bars."""
     gloss: float = 1.0

@@ -26,7 +26,7 @@ BESIDE_M = 0.15
 LENGTH_CELLS, WIDTH_CELLS, APART_CELLS = 5, 3, 5
 """Steps that a label fills along the bars and across, and from its middle to the bare bar on both sides: a
 label ends at once, a gleam fades."""
-BRIGHTER_RATIO, FULL_LEVEL, MIN_LEVEL = 2.2, 215.0, 150.0
+BRIGHTER_RATIO, FULL_LEVEL, MIN_LEVEL = 1.3, 215.0, 140.0
 """Gray level of a label over the median of the load, the level from which on a picture shows no more, and the
 least of a label's steps."""
 MEAN_LOG, ODD_CELLS = 0.15, 1
