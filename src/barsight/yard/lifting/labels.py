@@ -21,6 +21,8 @@ SIZE_M = LabelSettings().size_m
 """A usual label; one with a code is too dark in its middle for `mark_labels`."""
 DEEP_M = 0.02
 """A label so far below the faces' plane, on the flank of a bundle, holds nothing off; what is unknown may."""
+EDGE_M = 0.01
+"""How far a label may reach beyond what the orthophoto shows of it: a cell."""
 BESIDE_M = 0.15
 """So far beside what lies under the faces the shape of a label may reach."""
 LENGTH_CELLS, WIDTH_CELLS, APART_CELLS = 5, 3, 5
@@ -62,7 +64,8 @@ def find_label(
     slack = np.array([tolerance.x_m, tolerance.y_m])
     turned = math.radians(tolerance.yaw_deg)
     wide = float((np.abs(poles[:, 1]) + poles[:, 3] / 2).max())
-    off = np.array([LENGTH_CELLS, WIDTH_CELLS]) * STEP_M / 2  # of a marked middle to the label's edge
+    edge = np.full(2, EDGE_M)
+    off = edge + np.array([LENGTH_CELLS, WIDTH_CELLS]) * STEP_M / 2  # of a marked middle to the label's edge
     long = float(np.abs(place.along) @ slack) + turned * wide
     broad = float(np.abs(place.across) @ slack) + turned * magnet.half_span_m
     reach_v = magnet.half_span_m + long + off[0] + (APART_CELLS + LENGTH_CELLS) * STEP_M
@@ -77,7 +80,7 @@ def find_label(
     faces_z_m = plane.centre_z_m + math.tan(plane.pitch_rad) * v[:, None] + math.tan(plane.roll_rad) * u
     is_near = ~(z_m < faces_z_m - DEEP_M)
     under = np.zeros(gray.shape, np.bool_)
-    for marked, (more_v, more_u) in ((middles, off), (plates, (0.0, 0.0))):
+    for marked, (more_v, more_u) in ((middles, off), (plates, edge)):
         for along, across, length, width in poles:
             rows = np.abs(v - along) <= length / 2 + long + more_v
             under |= rows[:, None] & (np.abs(u - across) <= width / 2 + broad + more_u) & marked & is_near
