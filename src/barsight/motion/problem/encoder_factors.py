@@ -43,9 +43,9 @@ MIN_SIGMA_M = 0.0003
 MIN_AGREEING_SIGMA_M = 0.001
 """What a parabola through the readings may be off by while the crane jerks, which isn't a disagreement."""
 PRIOR_STRETCHES = 3.0
-"""How many stretches' worth the first unevenness counts in what a recording shows."""
+"""Weight of the first unevenness as a prior, in stretches of a recording."""
 MAX_UNEVEN_M = 0.006
-"""What is further off says no more than this: it is a fault."""
+"""Largest residual that counts towards the unevenness: more is a fault."""
 NOTED_LATENCY_SIGMAS = 5.0
 NOTED_LATENCY_S = 0.005
 AXES = ("bridge", "trolley", "hoist")

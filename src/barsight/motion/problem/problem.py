@@ -225,7 +225,7 @@ class Problem:
     has_imu: bool = False
     """Whether velocities and biases are unknowns."""
     uneven_m: Float64 = field(default_factory=lambda: np.full(3, FIRST_UNEVEN_M))
-    """By how much rails and springs move the body along x, y and z where no encoder sees it (1 sigma)."""
+    """Standard deviation (3,) of the way that rails and springs move the body by, unseen by encoders."""
 
     @cached_property
     def alike(self) -> Int64:

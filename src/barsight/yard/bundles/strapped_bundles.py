@@ -13,7 +13,7 @@ from barsight.yard.bundles.reading import Reading
 from barsight.yard.bundles.section.bar_pitch import DIAMETER_SIGMA_RATIO
 from barsight.yard.bundles.section.pack_sides import PackSide
 from barsight.yard.bundles.section.packs import Pack, contradicts
-from barsight.yard.bundles.section.seen_section import section_of_pack
+from barsight.yard.bundles.section.seen_section import over_floor, section_of_pack
 from barsight.yard.types import Bundle, BundleSigma
 
 _PACK_MIDDLE_M, _PACK_WIDTH_M, _PACK_TOP_M, _PACK_WIDTH_SIGMAS = 0.012, 0.016, 0.006, 3.0
@@ -62,7 +62,7 @@ def _as_pack(
     fit = reading.found.fit
     top_z = float(bundle.centre_m[2]) + pack.top_m + _CREST_M
     width_sigma = _pack_sigma(reading)
-    section, section_sigma = section_of_pack(pack.width_m, width_sigma, _over(top_z, floor_m))
+    section, section_sigma = section_of_pack(pack.width_m, width_sigma, over_floor(top_z, floor_m))
     aside = pack.middle_m * np.array([np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad), 0.0])
     if abs(bundle.yaw_rad - reading.found.grid.heading_rad + np.arctan(fit.values[SLOPE_U])) > 1.0:
         aside = -aside
@@ -149,7 +149,7 @@ def _confirmed(bundle: Bundle, pack: Pack, floor_m: float | None, pack_sigma_m: 
     own, packs = bundle.sigma.width_m**-2, pack_sigma_m**-2
     width = (own * bundle.width_m + packs * pack.width_m) / (own + packs)
     width_sigma = float(np.hypot((own + packs) ** -0.5, (bundle.width_m - pack.width_m) / 2))
-    section, section_sigma = section_of_pack(width, width_sigma, _over(bundle.top_z_m, floor_m))
+    section, section_sigma = section_of_pack(width, width_sigma, over_floor(bundle.top_z_m, floor_m))
     sigma = replace(
         bundle.sigma,
         bar_diameter_m=spread,
@@ -163,10 +163,6 @@ def _confirmed(bundle: Bundle, pack: Pack, floor_m: float | None, pack_sigma_m: 
 def _pack_sigma(reading: Reading) -> float:
     """Compute the standard deviation of a pack's width."""
     return float(np.hypot(_PACK_WIDTH_M, _PACK_WIDTH_SIGMAS * reading.found.fit.sigma_m))
-
-
-def _over(top_z_m: float, floor_m: float | None) -> float:
-    return np.inf if floor_m is None else max(top_z_m - floor_m, 0.0)
 
 
 def without_pieces(bundles: list[Bundle], readings: list[Reading]) -> list[Bundle]:

@@ -22,7 +22,7 @@ SIZE_M = LabelSettings().size_m
 DEEP_M = 0.02
 """A label so far below the faces' plane, on the flank of a bundle, holds nothing off; what is unknown may."""
 EDGE_M = 0.01
-"""How far a label may reach beyond what the orthophoto shows of it: a cell."""
+"""Margin of a label around what the orthophoto shows of it: a cell."""
 BESIDE_M = 0.15
 """So far beside what lies under the faces the shape of a label may reach."""
 LENGTH_CELLS, WIDTH_CELLS, APART_CELLS = 5, 3, 5

@@ -144,10 +144,9 @@ def estimate_section(
         return np.nan, np.nan
     if not _MIN_PIECE_RATIO * fit.width_m < seen.width_m < _MAX_PIECE_RATIO * fit.width_m + _WIDER_M:
         return np.nan, np.nan
-    over_m = np.inf if floor_m is None else max(top_m - floor_m, 0.0)
     fill = _FILL_RATIO if fit.rings else _BAR_FILL_RATIO
     sigma_m = math.hypot(_SEEN_WIDTH_SIGMA_M, _OUTLINE_RATIO * (seen.width_m - fit.width_m))
-    return section_of_pack(seen.width_m, sigma_m, over_m, fill)
+    return section_of_pack(seen.width_m, sigma_m, over_floor(top_m, floor_m), fill)
 
 
 def section_of_pack(
@@ -173,6 +172,11 @@ def section_of_pack(
     widest = width_m + UPPER * width_sigma_m
     most = _MAX_FILL_RATIO * min(over_floor_m, _MAX_HEIGHT_RATIO * width_m) * widest
     return section, min(section * float(share), (most - section) / UPPER)
+
+
+def over_floor(top_m: float, floor_m: float | None) -> float:
+    """Compute the height of a top over the floor; infinite where no floor was seen."""
+    return np.inf if floor_m is None else max(top_m - floor_m, 0.0)
 
 
 def agreeing_rows(fit: Fit) -> Int64:
