@@ -94,3 +94,20 @@ def test_a_dull_label_between_dark_straps_is_marked_on_bright_bars(ratio: float)
     gray[24:27, 6:12] = gray[33:36, 6:12] = 60.0
     gray[27:33, 7:11] = 120.0 * ratio
     assert mark_labels(gray).any() == (ratio > 1.3)
+
+
+@pytest.mark.parametrize(
+    ("levels", "is_label"),
+    [
+        ([110, 119, 109, 96, 77, 68, 87, 188, 254, 255, 233, 142, 81, 73, 70, 72, 82], True),
+        ([150, 148, 156, 164, 163, 161, 185, 211, 215, 214, 201, 176, 155, 157, 153, 144, 147], False),
+        ([179, 182, 184, 178, 184, 204, 216, 236, 230, 239, 239, 213, 186, 180, 177, 173, 176], False),
+        ([135, 132, 122, 116, 122, 138, 153, 165, 172, 181, 181, 163, 141, 113, 0, 0, 0], False),
+    ],
+    ids=["label", "gleam", "bright gleam", "gleam at an end"],
+)
+def test_a_short_label_ends_at_once_and_a_gleam_fades(levels: list[int], is_label: bool) -> None:
+    """Take levels along a bar from a demo's orthophoto, with a label of 36 mm."""
+    gray = np.full((57, 20), 90.0, np.float32)
+    gray[20:37, 8:12] = np.array(levels, np.float32)[:, None]
+    assert mark_labels(gray).any() == is_label

@@ -25,15 +25,16 @@ EDGE_M = 0.01
 """Margin of a label around what the orthophoto shows of it: a cell."""
 BESIDE_M = 0.15
 """So far beside what lies under the faces the shape of a label may reach."""
-LENGTH_CELLS, WIDTH_CELLS, APART_CELLS = 5, 3, 5
-"""Steps that a label fills along the bars and across, and from its middle to the bare bar on both sides: a
-label ends at once, a gleam fades."""
+LENGTH_CELLS, WIDTH_CELLS = range(3, 11), 3
+"""Steps that a label fills along the bars, and at least across."""
+MIN_EDGE_LOG, MIN_COLUMN_LOG = 0.25, 0.12
+"""Logarithm of the darkest of a label's steps over the bare bar's two and three steps before and behind it,
+as a mean across the label and of each of its columns: a label ends at once, a gleam fades."""
+STRAP_CELLS, MAX_ACROSS_CELLS = 4, 13
+"""What is no longer than the one and wider than the other is a bright strap."""
 BRIGHTER_RATIO, FULL_LEVEL, MIN_LEVEL = 1.3, 215.0, 140.0
 """Gray level of a label over the median of the load, the level from which on a picture shows no more, and the
-least of a label's steps."""
-MEAN_LOG, ODD_CELLS = 0.15, 1
-"""Logarithm of a label's level over that of the brighter end of the bare bar, on average; each step but so
-many is brighter than that."""
+least of a label."""
 _DARK = 10.0
 """Level that is added to both: where hardly any light is, ratios tell nothing."""
 
@@ -64,26 +65,20 @@ def find_label(
     slack = np.array([tolerance.x_m, tolerance.y_m])
     turned = math.radians(tolerance.yaw_deg)
     wide = float((np.abs(poles[:, 1]) + poles[:, 3] / 2).max())
-    edge = np.full(2, EDGE_M)
-    off = edge + np.array([LENGTH_CELLS, WIDTH_CELLS]) * STEP_M / 2  # of a marked middle to the label's edge
-    long = float(np.abs(place.along) @ slack) + turned * wide
-    broad = float(np.abs(place.across) @ slack) + turned * magnet.half_span_m
-    reach_v = magnet.half_span_m + long + off[0] + (APART_CELLS + LENGTH_CELLS) * STEP_M
-    reach_u = wide + broad + off[1] + STEP_M
-    v, u = _steps(reach_v + BESIDE_M), _steps(reach_u + BESIDE_M)
+    long = float(np.abs(place.along) @ slack) + turned * wide + EDGE_M
+    broad = float(np.abs(place.across) @ slack) + turned * magnet.half_span_m + EDGE_M
+    v, u = _steps(magnet.half_span_m + long + BESIDE_M), _steps(wide + broad + BESIDE_M)
     gray, z_m = _look_up(place, heights, v, u)
-    middles, plates = np.zeros((2, *gray.shape), np.bool_)
-    near = np.ix_(np.abs(v) < reach_v + STEP_M, np.abs(u) < reach_u + STEP_M)
-    middles[near] = mark_labels(gray[near])
+    labels = mark_labels(gray)
     for mask in plate_masks(gray, z_m, SIZE_M):
-        plates |= mask
+        labels |= mask
     faces_z_m = plane.centre_z_m + math.tan(plane.pitch_rad) * v[:, None] + math.tan(plane.roll_rad) * u
-    is_near = ~(z_m < faces_z_m - DEEP_M)
+    labels &= ~(z_m < faces_z_m - DEEP_M)
     under = np.zeros(gray.shape, np.bool_)
-    for marked, (more_v, more_u) in ((middles, off), (plates, edge)):
-        for along, across, length, width in poles:
-            rows = np.abs(v - along) <= length / 2 + long + more_v
-            under |= rows[:, None] & (np.abs(u - across) <= width / 2 + broad + more_u) & marked & is_near
+    for along, across, length, width in poles:
+        rows = np.abs(v - along) <= length / 2 + long
+        under |= rows[:, None] & (np.abs(u - across) <= width / 2 + broad)
+    under &= labels
     cells = np.argwhere(under)
     return (float(v[cells[0, 0]]), float(u[cells[0, 1]])) if cells.size else None
 
@@ -95,21 +90,45 @@ def _steps(reach_m: float) -> Float64:
 
 
 def mark_labels(gray: Float32) -> Bool:
-    """Mark the middles (V, U) of labels: bright all over, and darker before and behind along the bars.
+    """Mark the cells (V, U) of labels: bright, and at once darker before and behind along the bars.
 
     gray: levels, 0 where nothing was seen.
     """
-    inner = ndimage.uniform_filter1d(gray, LENGTH_CELLS, axis=0)
-    bare = ndimage.uniform_filter1d(gray, WIDTH_CELLS, axis=0)
-    brighter = np.maximum(np.roll(bare, APART_CELLS, axis=0), np.roll(bare, -APART_CELLS, axis=0)) + _DARK
-    mean = ndimage.uniform_filter1d(np.log((inner + _DARK) / brighter), WIDTH_CELLS, axis=1)
-    darkest = ndimage.rank_filter(gray, ODD_CELLS, size=(LENGTH_CELLS, WIDTH_CELLS)) + _DARK
-    brightest = ndimage.maximum_filter1d(brighter, WIDTH_CELLS, axis=1)
-    level = ndimage.uniform_filter1d(inner, WIDTH_CELLS, axis=1)
+    level = np.log(gray + _DARK)
+    mean = ndimage.uniform_filter1d(level, WIDTH_CELLS, axis=1)
     seen = gray[gray > 0]
     needed = min(BRIGHTER_RATIO * float(np.median(seen)), FULL_LEVEL) if seen.size else np.inf
-    sure = (darkest > brightest) & (darkest > MIN_LEVEL + _DARK)
-    return np.asarray((mean > MEAN_LOG) & sure & (level > needed))
+    bright = mean > np.log(max(needed, MIN_LEVEL) + _DARK)
+    short, long = np.zeros((2, *gray.shape), np.bool_)
+    for length in LENGTH_CELLS:
+        if length + 6 > len(gray):
+            break
+        columns = _edge_logs(level, length) > MIN_COLUMN_LOG
+        wide = ndimage.binary_erosion(columns, np.ones((1, WIDTH_CELLS), np.bool_))
+        found = wide & (_edge_logs(mean, length) > MIN_EDGE_LOG)
+        found = ndimage.binary_dilation(found, np.ones((1, WIDTH_CELLS), np.bool_))
+        marked = short if length <= STRAP_CELLS else long
+        for row in range(length):
+            marked[3 + row : 3 + row + len(found)] |= found
+    return np.asarray(long & bright | _without_straps(short & bright), np.bool_)
+
+
+def _edge_logs(level: Float32, length: int) -> Float32:
+    """Compute how far the lowest of `length` steps stands over the highest of the two beyond the next, before
+    and behind: (V - length - 5, U), for runs from the fourth step on.
+    """
+    count = len(level) - length - 5
+    rows = [level[k : k + count] for k in range(length + 6)]
+    return np.asarray(np.min(rows[3:-3], axis=0) - np.max([*rows[:2], *rows[-2:]], axis=0))
+
+
+def _without_straps(marked: Bool) -> Bool:
+    """Unmark what goes on across the bars for longer than a label."""
+    numbers, _ = ndimage.label(marked, np.ones((3, 3)))
+    for number, place in enumerate(ndimage.find_objects(numbers), start=1):
+        if place[1].stop - place[1].start > MAX_ACROSS_CELLS:
+            marked[numbers == number] = False
+    return marked
 
 
 def _look_up(place: Placement, heights: HeightMap, v: Float64, u: Float64) -> tuple[Float32, Float32]:
