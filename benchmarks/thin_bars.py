@@ -14,13 +14,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from barsight.benchmarks.lift_judge.solids import Solid, SolidYard, cylinder, envelope
-from barsight.benchmarks.lift_judge.worlds import DrawnWorld, draw_world
 
+from barsight.benchmarks.lift_judge.envelopes import envelope
 from barsight.benchmarks.yard.drawn_worlds import render_world
 from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings
 from barsight.result_folder import read_heights
+from barsight.simulation.worlds.solids import Solid, SolidYard, cylinder
+from barsight.simulation.worlds.yards import LOOSE, DrawnYard, draw_yard
 from barsight.yard.inventory.bundle_file import read_bundles
 from barsight.yard.thin_lines import MAX_STRENGTH, line_strengths
 from barsight.yard.types import Bundle
@@ -28,17 +29,15 @@ from barsight.yard.types import Bundle
 DIAMETERS_M = (0.008, 0.012, 0.016, 0.020, 0.025, 0.030, 0.036)
 FIRST_NUMBER = 2000
 """Owner of the first bar that is laid; none of a drawn world's own is as high."""
-LOOSE_NUMBER = 1000
-"""The same of the single bars that a drawn world has itself."""
 BAR_LENGTH_M, SPAN_M = 5.4, 3.0
 SLOT_M = 0.6
 STANDS_OUT_M = 0.06
 """A bar is not laid where it would rest higher than this over the load's own top."""
 
 
-def lay_thin_bars(seed: int) -> DrawnWorld:
+def lay_thin_bars(seed: int) -> DrawnYard:
     """Draw the yard of a seed and lay a thin bar across it every SLOT_M along its bars."""
-    world = draw_world(seed, BAR_LENGTH_M, SPAN_M)
+    world = draw_yard(seed, BAR_LENGTH_M, SPAN_M, min_length_ratio=1.0)
     if not world.free:
         raise SystemExit(f"seed {seed} draws a yard on which every bundle is covered")
     rng = np.random.default_rng((41, seed))
@@ -53,13 +52,13 @@ def lay_thin_bars(seed: int) -> DrawnWorld:
     return world
 
 
-def _bar(world: DrawnWorld, slot: float, number: int, rng: np.random.Generator) -> Solid | None:
-    """Lay a bar over a free bundle, two of three nearly across, else at any angle up to 50 degrees from that;
-    None where something stands in its way."""
+def _bar(world: DrawnYard, slot: float, number: int, rng: np.random.Generator) -> Solid | None:
+    """Lay a bar over a free bundle, one of three square to it as straps are, one nearly so, one at any angle
+    up to 50 degrees from that; None where something stands in its way."""
     load = world.yard.bars(int(rng.choice(world.free)))
     radius = float(rng.choice(DIAMETERS_M)) / 2
     length = float(rng.uniform(0.5, 1.8))
-    askew = rng.normal(0, 0.1) if rng.random() < 2 / 3 else rng.uniform(-0.87, 0.87)
+    askew = (rng.normal(0, 0.01), rng.normal(0, 0.1), rng.uniform(-0.87, 0.87))[int(rng.integers(3))]
     along = load[0].axes[0]
     middle = np.mean([b.centre for b in load], axis=0) + slot * along
     angle = math.atan2(along[1], along[0]) - math.pi / 2 + float(askew)
@@ -76,12 +75,12 @@ def _bar(world: DrawnWorld, slot: float, number: int, rng: np.random.Generator) 
     return cylinder("bar", np.array([*middle[:2], top + 0.0005 + radius]), direction, radius, length, number)
 
 
-def crossings(world: DrawnWorld, bundle: Bundle) -> list[tuple[float, float, float, float]]:
+def crossings(world: DrawnYard, bundle: Bundle) -> list[tuple[float, float, float, float]]:
     """List the single bars across a found bundle: place along its axis from its middle, slope, the share of
     its width that they cover, and diameter: NaN of one more than 0.05 m under or 0.15 m over its top."""
     axis = np.array([-math.sin(bundle.yaw_rad), math.cos(bundle.yaw_rad)])
     frame, found = np.array([[axis[1], -axis[0]], axis]), []
-    for bar in (s for s in world.yard.solids if s.part == "bar" and s.bundle >= LOOSE_NUMBER):
+    for bar in (s for s in world.yard.solids if s.part == "bar" and s.bundle >= LOOSE):
         ends = [bar.centre + side * bar.half[0] * bar.axes[0] - bundle.centre_m for side in (-1, 1)]
         (u0, v0), (u1, v1) = sorted((frame @ end[:2]).tolist() for end in ends)
         low, high = max(u0, -bundle.width_m / 2), min(u1, bundle.width_m / 2)
@@ -94,7 +93,7 @@ def crossings(world: DrawnWorld, bundle: Bundle) -> list[tuple[float, float, flo
     return found
 
 
-def score(world: DrawnWorld, out: Path, found: dict[float, list[bool]], alarms: list[float]) -> None:
+def score(world: DrawnYard, out: Path, found: dict[float, list[bool]], alarms: list[float]) -> None:
     """Score a measured yard's uncovered bundles of 2 m and more: whether each bar that covers 0.9 of one's
     width is found, by diameter; the strongest line on each that nothing lies on."""
     yard = read_heights(out)
@@ -121,7 +120,7 @@ def main(arguments: list[str]) -> None:
             plain = True
             continue
         seed = int(argument)
-        world = draw_world(seed, BAR_LENGTH_M, SPAN_M) if plain else lay_thin_bars(seed)
+        world = draw_yard(seed, BAR_LENGTH_M, SPAN_M, min_length_ratio=1.0) if plain else lay_thin_bars(seed)
         folder = Path(arguments[0]) / f"seed_{seed}"
         folder.mkdir(parents=True, exist_ok=True)
         if not (folder / "recording").is_dir():

@@ -357,7 +357,7 @@ def test_the_last_place_of_a_flank_that_falls_away(falls: tuple[float, ...], las
 
 
 def test_what_lies_over_a_pack_leaves_its_section_open() -> None:
-    """The low pack goes on under the high one, whose flank rises beside it: one is free, one unknown."""
+    """The low pack goes on under the high one, whose flank rises beside it: one is free, one in doubt."""
     rng = np.random.default_rng(4)
     heights = drawn([(-0.25, 0.0, (-1.5, 0.1, 1.6)), (0.0, 0.26, (-1.1, 0.6, 2.0))], rng)
     x = heights.x0_m + CELL * np.arange(heights.shape[1])
@@ -367,7 +367,8 @@ def test_what_lies_over_a_pack_leaves_its_section_open() -> None:
     (lower,) = (b for b in found if abs(b.centre_m[0] + 0.125) < 0.05)
     (upper,) = (b for b in found if abs(b.centre_m[0] - 0.13) < 0.05)
     assert upper.on_top and upper.width_m == pytest.approx(0.26, abs=0.04)
-    assert lower.on_top is None and lower.bars is None and not np.isfinite(lower.section_m2)
+    assert lower.looks_free and not lower.is_free and any("flank" in doubt for doubt in lower.cover_doubts)
+    assert lower.bars is None and not np.isfinite(lower.section_m2)
     assert lower.sigma.width_m > 0.4 * lower.width_m
 
 

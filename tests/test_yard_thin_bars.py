@@ -11,10 +11,19 @@ import pytest
 from scipy import ndimage
 
 from barsight.core.errors import ConfigError
+from barsight.yard.bundles.layers import check_uncovered
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.thin_bars import beside_checks, may_reach, thin_bar_checks
 from barsight.yard.magnet.footprint import Placement
-from barsight.yard.thin_lines import BESIDE_RATIO, MAX_STRENGTH, ThinLine, _line_strengths, find_thin_lines
+from barsight.yard.thin_lines import (
+    BESIDE_RATIO,
+    MAX_STRENGTH,
+    SURE_STRENGTH,
+    ThinLine,
+    _line_strengths,
+    find_thin_lines,
+    with_thin_lines,
+)
 from barsight.yard.types import Bundle, HeightMap
 from lift_yards import MAGNET, SETTINGS, codes, judged, laid, map_of, record
 
@@ -215,3 +224,24 @@ def test_a_lines_strength_is_its_sum_along_it() -> None:
     found = _line_strengths(*padded, 40, slopes, ends, 2, 15)
     wanted = [[strength_slowly(contrast, power, slope, ends, v) for v in range(40)] for slope in slopes]
     np.testing.assert_allclose(found, wanted, atol=2e-5)
+
+
+@pytest.mark.parametrize(("bar_m", "sure"), [(0.0, None), (0.008, False), (0.025, True)])
+def test_a_strong_line_covers_a_bundle_and_a_faint_one_is_a_doubt(bar_m: float, sure: bool | None) -> None:
+    """Lifts are forbidden for both: only what `on_top` says differs."""
+    heights = photo(1, bar_m, 0.05)
+    line, bundle = strongest(heights, LOAD[0]), with_thin_lines(LOAD[0], heights)
+    assert line is not None and (line.strength > SURE_STRENGTH) == bool(sure)
+    assert (line.strength > MAX_STRENGTH) == (sure is not None) == bool(bundle.cover_doubts)
+    on_top, _ = check_uncovered(bundle, [bundle], layer=0)
+    assert on_top is (None if sure else True) and bundle.is_free == (sure is None)
+
+
+@pytest.mark.parametrize(("layer", "on_top"), [(0, True), (1, None)])
+def test_a_hidden_flank_leaves_open_what_lies_on_a_bundle_of_an_upper_layer(
+    layer: int, on_top: bool | None
+) -> None:
+    doubt = "what stands 40 mm higher beside it may lie over its high flank"
+    bundle = replace(LOAD[0], reasons=(doubt,), cover_doubts=(doubt,))
+    assert check_uncovered(bundle, [bundle], layer)[0] is on_top
+    assert bundle.looks_free and not bundle.is_free

@@ -21,6 +21,8 @@ KNOWN_ACROSS = "crosses over it"
 """In the reason of a bundle that heights show to be crossed at several places, as by dunnage."""
 MAX_STRENGTH = 8.0
 """Of a line that texture, dunnage or a strap with a bright middle makes on a load, in sigmas of its row."""
+SURE_STRENGTH = 14.0
+"""From this strength on no strap makes a line."""
 STEP_M = 0.01
 REACH_M = 0.6
 """How far beside a bundle's axis a line may add to what is seen of it on the bundle."""
@@ -85,8 +87,9 @@ def with_thin_lines(bundle: Bundle, heights: HeightMap) -> Bundle:
     lines = find_thin_lines(heights, bundle)
     if lines is None or lines[0].strength < MAX_STRENGTH:
         return bundle
-    reason = f"a line runs across it {lines[0].along_m:+.2f} m from its middle: a thin bar may lie over it"
-    return replace(bundle, reasons=(*bundle.reasons, reason))
+    lies = "lies" if lines[0].strength >= SURE_STRENGTH else "may lie"
+    reason = f"a line runs across it {lines[0].along_m:+.2f} m from its middle: a thin bar {lies} over it"
+    return replace(bundle, reasons=(*bundle.reasons, reason), cover_doubts=(*bundle.cover_doubts, reason))
 
 
 def line_strengths(heights: HeightMap, bundle: Bundle) -> tuple[Float64, Float32] | None:

@@ -165,6 +165,10 @@ class FitSigma:
     top_z_m: float
 
 
+_UNSEEN = "flank", "overlap", "a thin bar may"
+"""In doubts about what isn't seen; the others are about what is seen to lie there."""
+
+
 @dataclass(frozen=True, eq=False)
 class Bundle:
     """A bundle of round bars, or a single heavy bar.
@@ -175,8 +179,9 @@ class Bundle:
     NaN where open. top_z_m: the highest line at mid-length.
     visible_bars: bars seen from above. bars: bars in the bundle by its outline, None where that isn't
     certain; section_m2: steel's section by what was seen, NaN where that isn't known either.
-    layer: 0 lies on the floor or on dunnage. on_top: no other bundle or bar lies on it; None where that can't
-    be seen. cover_doubts: sentences on what may hold it down all the same, as dunnage or a neighbour's flank.
+    layer: 0 lies on the floor or on dunnage. on_top: no other bundle or bar is known to lie on it; None where
+    something lies there that isn't known. cover_doubts: sentences on what may hold it down all the same, as
+    dunnage or a hidden flank.
     neighbours: ids of the bundles it touches. known_share: share of its outline that was measured.
     confidence: probability that a bundle lies here as described. reasons: sentences for whoever doubts it.
     label: None where none was seen, or they weren't read. fit_sigma: of the outline's fit alone; None where
@@ -215,6 +220,12 @@ class Bundle:
     def is_free(self) -> bool:
         """Check that nothing at all lies on it, for sure."""
         return self.on_top is True and not self.cover_doubts
+
+    @property
+    def looks_free(self) -> bool:
+        """Check that nothing is seen to lie on it, though a flank may be hidden: it is most likely free."""
+        seen = (doubt for doubt in self.cover_doubts if not any(word in doubt for word in _UNSEEN))
+        return self.on_top is True and not any(seen)
 
     @property
     def bottom_z_m(self) -> float:

@@ -93,7 +93,7 @@ def score_world(recording: Path, out: Path | None, looked_at: str, refused: str)
     shown = _shown(recording, true)
     bundles = tuple(t for t, alone, seen in zip(true, loose, shown, strict=True) if seen and not alone)
     bars = tuple(t for t, alone, seen in zip(true, loose, shown, strict=True) if seen and alone)
-    found = tuple(replace(b, on_top=b.is_free) for b in read_bundles(out / "bundles.json"))
+    found = tuple(replace(b, on_top=b.looks_free) for b in read_bundles(out / "bundles.json"))
     lying = tuple(replace(t, on_top=True) for t in true)
     scores, single, every, anywhere = (score_bundles(found, part) for part in (bundles, bars, true, lying))
     counts = {

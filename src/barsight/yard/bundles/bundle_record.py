@@ -47,7 +47,7 @@ def describe_bundles(
         near = [bundle for bundle in ordered if part.reaches(bundle.centre_m)]
         for bundle, layer in zip(near, find_layers(near, floor_m), strict=True):
             if part.owns(bundle.centre_m):
-                on_top, why = check_uncovered(bundle, near)
+                on_top, why = check_uncovered(bundle, near, layer)
                 out[bundle.id] = replace(
                     bundle, layer=layer, on_top=on_top, neighbours=list_neighbours(bundle, near),
                     reasons=bundle.reasons + why,

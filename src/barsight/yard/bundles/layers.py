@@ -16,8 +16,12 @@ _LOWER_RATIO = 0.15
 _PARALLEL = 0.08
 _INSIDE = 0.35
 """Share of a bundle's width, to either side of its axis, within which no other bundle lies."""
-_DOUBTS = "covers a part", "something higher", "lies across it", "may lie over"
-"""In reasons that leave open whether something lies on a bundle."""
+_DOUBTS = "covers a part", "something higher", "lies across it", "a thin bar lies over it"
+"""In reasons that leave open whether something lies on a bundle. A faint line across it is most often a
+strap: a doubt, which forbids its lift."""
+_HEAPED = "flank"
+"""The same from the second layer on, where bundles rest on each other's flanks. On the floor a higher
+neighbour that hides a flank most often stands beside it: a doubt."""
 _MEET_M, _MEET_LENGTH_M = 0.02, 0.3
 """Two outlines that overlap by more, over this length, are not both right: one may lie over the other."""
 
@@ -49,12 +53,13 @@ def _is_alike(one: Bundle, other: Bundle) -> bool:
     return bool(parallel and abs(other.width_m - one.width_m) < 0.15 * one.width_m)
 
 
-def check_uncovered(bundle: Bundle, bundles: list[Bundle]) -> tuple[bool | None, tuple[str, ...]]:
+def check_uncovered(bundle: Bundle, bundles: list[Bundle], layer: int) -> tuple[bool | None, tuple[str, ...]]:
     """Check whether no other lies on the bundle, and why not; None where what covers it isn't known."""
     covers = [other.id for other in bundles if other.id != bundle.id and _lies_on(other, bundle)]
     if covers:
         return False, (f"bundle {', '.join(map(str, covers))} lies on it",)
-    if any(doubt in reason for reason in bundle.reasons for doubt in _DOUBTS):
+    doubts = (*_DOUBTS, _HEAPED) if layer > 0 else _DOUBTS
+    if any(doubt in reason for reason in bundle.reasons for doubt in doubts):
         return None, ()
     return True, ()
 

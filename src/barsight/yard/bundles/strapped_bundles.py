@@ -100,13 +100,14 @@ def _covered(bundle: Bundle, pack: Pack) -> Bundle:
     if not sides:
         return bundle
     hidden_m = _HIDDEN_RATIO * bundle.width_m
-    doubts = (f"what stands higher beside it may lie over its {name} flank" for name in sides)
+    doubts = tuple(f"what stands higher beside it may lie over its {name} flank" for name in sides)
     return replace(
         bundle,
         bars=None,
         section_m2=np.nan,
         confidence=min(bundle.confidence, DOUBTFUL),
-        reasons=(*bundle.reasons, *doubts),
+        reasons=bundle.reasons + doubts,
+        cover_doubts=bundle.cover_doubts + doubts,
         sigma=replace(
             bundle.sigma,
             lateral_m=float(np.hypot(bundle.sigma.lateral_m, hidden_m / 2)),
