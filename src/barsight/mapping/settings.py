@@ -29,7 +29,7 @@ class MapSettings:
     """Heights nearer than this many sigma are one surface."""
     min_gate_m: float = 0.015
     """Heights nearer than this are one surface however small their sigma."""
-    along_m: float = 0.12
+    along_m: float = 0.26
     """Heights are averaged so far to either side, along the direction in which they are most alike (a bar's
     own); 0 leaves each cell as it is."""
     sharpen_px: float = 1.25

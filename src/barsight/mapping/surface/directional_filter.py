@@ -9,10 +9,15 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, Int8, Int64, kernel
+from barsight.mapping.surface.bar_directions import (
+    DIRECTIONS,
+    FINE_RATIO,
+    choose_directions,
+    elect_directions,
+    line_cells,
+)
 
 VOTE_CELLS = 9
-_SAMPLE_CELLS = 2
-_DIRECTIONS = 16
 _STEP_M = 0.03
 _WIDEST_CELLS = np.float32(1.5)
 _BLUR_CELLS, _BLUR_RATIO, _VALLEY_RATIO = 11, 2.0, 4.5
@@ -22,19 +27,18 @@ _FAR_M = np.float32(1e4)
 
 
 def smooth_along_bars(z: Float32, weight: Float32, gate_m: float, reach: int) -> tuple[Float32, Int8]:
-    """Average heights (H, W) along that of 16 directions in which each is most alike, and the number of that
-    direction, -1 where there is no height.
+    """Average heights (H, W) along the bar, and return the number of that of 16 directions in which each is
+    most alike over a short way, -1 where there is no height.
 
     weight: (H, W), 0 where there is no height (NaN). Heights further than gate_m from a cell's own are
-    another surface: they don't count in its mean, and against the direction. Every other cell up to `reach`
-    on either side is read; those that are missing or outside count against the direction too.
+    another surface: they don't count. Every other cell up to `reach` on either side is read, in the direction
+    that `elect_directions` gives.
     """
-    turn = np.arange(_DIRECTIONS)[:, None] * np.pi / _DIRECTIONS
-    onward = np.arange(_SAMPLE_CELLS, reach + 1, _SAMPLE_CELLS)
-    along = np.r_[-onward[::-1], 0, onward]
-    rows, columns = (np.rint(f(turn) * along).astype(np.int64) for f in (np.sin, np.cos))
-    z, weight = np.pad(z, reach, constant_values=np.nan), np.pad(weight, reach)
-    return _lengthways(z, weight, gate_m, rows, columns, reach)
+    direction = choose_directions(z, weight > 0, gate_m, reach)
+    elected = elect_directions(z, direction, gate_m, reach)
+    rows, columns = line_cells(FINE_RATIO * DIRECTIONS, reach)
+    padded, weights = np.pad(z, reach, constant_values=np.nan), np.pad(weight, reach)
+    return _average_along(padded, weights, elected, gate_m, rows, columns, reach), direction
 
 
 def vote_directions(direction: Int8) -> Int8:
@@ -42,72 +46,41 @@ def vote_directions(direction: Int8) -> Int8:
     are alike, in 9 x 9 cells; -1 stays. On bars that the heights hardly show, noise turns single ones.
     """
     most = np.zeros(direction.shape, np.uint16)
-    for number in range(_DIRECTIONS):
+    for number in range(DIRECTIONS):
         own = (direction == number).view(np.uint8)
         votes = cv2.boxFilter(own, -1, (VOTE_CELLS,) * 2, normalize=False, borderType=cv2.BORDER_CONSTANT)
-        np.maximum(most, votes * np.uint16(_DIRECTIONS) + np.uint16(_DIRECTIONS - 1 - number), out=most)
-    voted = (_DIRECTIONS - 1 - most % _DIRECTIONS).astype(np.int8)
+        np.maximum(most, votes * np.uint16(DIRECTIONS) + np.uint16(DIRECTIONS - 1 - number), out=most)
+    voted = (DIRECTIONS - 1 - most % DIRECTIONS).astype(np.int8)
     voted[direction < 0] = -1
     return voted
 
 
 @kernel()
-def _lengthways(
-    z: Float32, weight: Float32, gate_m: float, rows: Int64, columns: Int64, reach: int
-) -> tuple[Float32, Int8]:
-    """Average along the best direction, the first of those that are alike.
+def _average_along(
+    z: Float32, weight: Float32, elected: Int8, gate_m: float, rows: Int64, columns: Int64, reach: int
+) -> Float32:  # fmt: skip
+    """Average heights along each cell's direction; NaN and what has no direction stay.
 
-    z, weight: with `reach` cells more on each side. The squares of a whole row of cells are summed at once,
-    direction by direction, which vector instructions do. z, weight: (rows + 2 reach, columns + 2 reach).
-    rows, columns: (16, N) cells from the middle to each point of a direction. Returns the heights and the
-    directions, (rows, columns), -1 where there is none.
+    z, weight: (H + 2 reach, W + 2 reach). elected: (H, W). rows, columns: (directions, N) cells from the
+    middle.
     """
-    height, width = z.shape[0] - 2 * reach, z.shape[1] - 2 * reach
-    out, chosen = np.empty((height, width), np.float32), np.full((height, width), -1, np.int8)
-    least, squares = np.empty(width, np.float32), np.empty(width, np.float32)
-    gate, best = np.float32(gate_m), np.empty(width, np.int32)
+    height, width = elected.shape
+    out = z[reach : reach + height, reach : reach + width].copy()
     flat, weights, ways = z.ravel(), weight.ravel(), rows * z.shape[1] + columns
     for i in range(height):
-        out[i] = z[i + reach, reach : reach + width]
-        known = np.flatnonzero(weight[i + reach, reach : reach + width] > 0)
-        if known.size == 0:
-            continue
-        first, size = reach + known[0], known[-1] + 1 - known[0]
-        own = z[i + reach, first : first + size]
-        least[:size] = np.inf
-        for d in range(rows.shape[0]):
-            squares[:size] = 0
-            for k in range(rows.shape[1]):
-                b = first + columns[d, k]
-                if rows[d, k] == 0 and columns[d, k] == 0:
-                    continue
-                _add_squares(squares[:size], z[i + reach + rows[d, k], b : b + size], own, gate)
-            for j in range(size):
-                best[j] = d if squares[j] < least[j] else best[j]
-                least[j] = min(squares[j], least[j])
-        for column in known:
-            chosen[i, column] = best[column - known[0]]
-            middle = (i + reach) * z.shape[1] + reach + column
-            own_m = flat[middle]
-            off, total = 0.0, 0.0
+        for j in range(width):
+            if elected[i, j] < 0:
+                continue
+            middle = (i + reach) * z.shape[1] + reach + j
+            own_m, off, total = flat[middle], 0.0, 0.0
             for k in range(ways.shape[1]):
-                at = middle + ways[chosen[i, column], k]
+                at = middle + ways[elected[i, j], k]
                 gap = flat[at] - own_m
                 if abs(gap) <= gate_m:
                     off += weights[at] * gap
                     total += weights[at]
-            out[i, column] = own_m + off / total
-    return out, chosen
-
-
-@kernel()
-def _add_squares(squares: Float32, beside: Float32, own: Float32, gate_m: np.float32) -> None:
-    """Add the squared differences of two rows of heights (W,), each no more than the gate; as much where one
-    is missing.
-    """
-    for j in range(squares.size):
-        gap = abs(beside[j] - own[j])
-        squares[j] += gap * gap if gap <= gate_m else gate_m * gate_m
+            out[i, j] = own_m + off / total
+    return out
 
 
 def deblur_across(z: Float32, direction: Int8, blur_cells: Float32) -> Float32:
@@ -176,7 +149,7 @@ def step_sigma(z: Float32, pixel_cells: float) -> Float32:
 
 def _across() -> Float64:
     """Compute one cell across the bar of each direction (2, 16), as a step in rows and in columns."""
-    turn = np.arange(_DIRECTIONS) * np.pi / _DIRECTIONS
+    turn = np.arange(DIRECTIONS) * np.pi / DIRECTIONS
     return np.array([np.cos(turn), -np.sin(turn)])
 
 

@@ -52,9 +52,9 @@ from barsight.mapping.tiles import TILE_CELLS, TileKey, TileStore
 
 Result = TypeVar("Result")
 
-_HALO = 13 + VOTE_CELLS // 2 + REACH_CELLS
-"""Cells around a tile that it depends on: along a bar, and what is read beside it. Even, so that stripes are
-sought at the same cells in a tile and in its neighbours' halos."""
+_HALO = 29 + VOTE_CELLS // 2 + REACH_CELLS
+"""Cells around a tile that it depends on: along a bar, and what is read beside it. A multiple of 8, so that
+stripes and directions are sought at the same cells in a tile and in its neighbours' halos."""
 _MIDDLE = 4
 """A tile among `_around` it."""
 

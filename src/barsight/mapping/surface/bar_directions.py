@@ -1,0 +1,154 @@
+"""Find the direction in which a bar runs through each cell: a bar is straight, so along it heights are alike.
+
+One cell alone can tell it only roughly, and where noise is as high as the bars not even so. So each cell
+chooses one of 16 directions over a short way, and blocks of cells elect one of 80 near that.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from barsight.core.arrays import Bool, Float32, Int8, Int64, kernel
+
+DIRECTIONS = 16
+FINE_RATIO = 5
+"""Elected directions per chosen one: 26 cells away the nearest lies half a cell beside a bar at most."""
+SAMPLE_CELLS = 2
+CHOICE_CELLS, ELECTION_CELLS = 12, 16
+"""Longest way to either side over which a cell's own direction is chosen, and the elected one."""
+BLOCK_CELLS = 8
+"""A block of cells elects its direction with the blocks around it."""
+_NEAR = 8
+"""Elected directions by which a block's may differ from a cell's own one, as noise turns it: what lies across
+bars keeps its own."""
+
+
+def choose_directions(z: Float32, known: Bool, gate_m: float, reach: int) -> Int8:
+    """Choose that of 16 directions in which heights (H, W) are most alike, -1 where none is known.
+
+    Every other cell up to `reach` on either side is read, and no more than CHOICE_CELLS; heights further than
+    gate_m from a cell's own, and those that are missing or outside, count as so far.
+    """
+    reach = min(reach, CHOICE_CELLS)
+    rows, columns = line_cells(DIRECTIONS, reach)
+    padded = np.pad(z, reach, constant_values=np.nan)
+    return _most_alike(padded, known, np.float32(gate_m), rows, columns, reach)
+
+
+def elect_directions(z: Float32, direction: Int8, gate_m: float, reach: int) -> Int8:
+    """Elect one of 80 directions (H, W) for the cells of a block that have chosen one near that.
+
+    In every other row and column a cell votes for the best of five about its own (`choose_directions`).
+    """
+    reach = min(reach, ELECTION_CELLS)
+    rows, columns = line_cells(FINE_RATIO * DIRECTIONS, reach)
+    padded = np.pad(z, reach, constant_values=np.nan)
+    elected = _elect(padded, direction, np.float32(gate_m), rows, columns, reach)
+    return _near_own(direction, elected)
+
+
+def line_cells(directions: int, reach: int) -> tuple[Int64, Int64]:
+    """Compute rows and columns (directions, N) from a cell to every other one along each direction, itself in
+    the middle.
+    """
+    turn = np.arange(directions)[:, None] * np.pi / directions
+    onward = np.arange(SAMPLE_CELLS, reach + 1, SAMPLE_CELLS)
+    along = np.r_[-onward[::-1], 0, onward]
+    rows, columns = (np.rint(f(turn) * along).astype(np.int64) for f in (np.sin, np.cos))
+    return rows, columns
+
+
+@kernel()
+def _most_alike(z: Float32, known: Bool, gate_m: np.float32, rows: Int64, columns: Int64, reach: int) -> Int8:
+    """Choose the direction with the least sum of squares, the first of those that are alike.
+
+    z: (H + 2 reach, W + 2 reach). The squares of a whole row of cells are summed at once, direction by
+    direction, which vector instructions do.
+    """
+    height, width = known.shape
+    chosen = np.full((height, width), -1, np.int8)
+    least, squares, best = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.int32)
+    for i in range(height):
+        there = np.flatnonzero(known[i])
+        if there.size == 0:
+            continue
+        first, size = reach + there[0], there[-1] + 1 - there[0]
+        own = z[i + reach, first : first + size]
+        least[:size] = np.inf
+        for d in range(rows.shape[0]):
+            squares[:size] = 0
+            for k in range(rows.shape[1]):
+                b = first + columns[d, k]
+                if rows[d, k] == 0 and columns[d, k] == 0:
+                    continue
+                _add_squares(squares[:size], z[i + reach + rows[d, k], b : b + size], own, gate_m)
+            for j in range(size):
+                best[j] = d if squares[j] < least[j] else best[j]
+                least[j] = min(squares[j], least[j])
+        for column in there:
+            chosen[i, column] = best[column - there[0]]
+    return chosen
+
+
+@kernel()
+def _add_squares(squares: Float32, beside: Float32, own: Float32, gate_m: np.float32) -> None:
+    """Add the squared differences of two rows of heights (W,), each no more than the gate; as much where one
+    is missing.
+    """
+    for j in range(squares.size):
+        gap = abs(beside[j] - own[j])
+        squares[j] += gap * gap if gap <= gate_m else gate_m * gate_m
+
+
+@kernel()
+def _elect(z: Float32, direction: Int8, gate_m: np.float32, rows: Int64, columns: Int64, reach: int) -> Int8:
+    """Elect the direction (blocks, blocks) with the most votes of a block and its eight neighbours, the first
+    of those that are alike; -1 where nobody votes.
+
+    z: (H + 2 reach, W + 2 reach). direction: (H, W).
+    """
+    height, width = direction.shape
+    votes = np.zeros(
+        ((height - 1) // BLOCK_CELLS + 1, (width - 1) // BLOCK_CELLS + 1, rows.shape[0]), np.int32
+    )
+    for i in range(0, height, 2):
+        for j in range(0, width, 2):
+            if direction[i, j] < 0:
+                continue
+            own, best, least = z[i + reach, j + reach], 0, np.float32(np.inf)
+            for turn in (0, -1, 1, -2, 2):
+                way = (direction[i, j] * FINE_RATIO + turn) % rows.shape[0]
+                squares = np.float32(0)
+                for k in range(rows.shape[1]):
+                    gap = abs(z[i + reach + rows[way, k], j + reach + columns[way, k]] - own)
+                    squares += gap * gap if gap <= gate_m else gate_m * gate_m
+                if squares < least:
+                    best, least = way, squares
+            votes[i // BLOCK_CELLS, j // BLOCK_CELLS, best] += 1
+    elected = np.full(votes.shape[:2], -1, np.int8)
+    for i in range(votes.shape[0]):
+        for j in range(votes.shape[1]):
+            around = votes[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2]
+            most = 0
+            for way in range(rows.shape[0]):
+                count = around[:, :, way].sum()
+                if count > most:
+                    most, elected[i, j] = count, way
+    return elected
+
+
+@kernel()
+def _near_own(direction: Int8, elected: Int8) -> Int8:
+    """Take the block's direction where it is near a cell's own, else that one, in the finer steps (H, W); -1
+    stays. direction: (H, W); elected: (blocks, blocks).
+    """
+    out = np.full(direction.shape, -1, np.int8)
+    for i in range(direction.shape[0]):
+        for j in range(direction.shape[1]):
+            if direction[i, j] < 0:
+                continue
+            own, block = direction[i, j] * FINE_RATIO, elected[i // BLOCK_CELLS, j // BLOCK_CELLS]
+            apart = abs(block - own)
+            is_near = block >= 0 and min(apart, FINE_RATIO * DIRECTIONS - apart) <= _NEAR
+            out[i, j] = block if is_near else own
+    return out
