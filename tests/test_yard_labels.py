@@ -6,10 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
+from barsight.yard.lifting import labels
 from barsight.yard.lifting.clearance import FacePlane
-from barsight.yard.lifting.labels import find_label, mark_labels
+from barsight.yard.lifting.labels import find_label
 from barsight.yard.magnet.contact import rest_magnet
+from barsight.yard.magnet.description import Tolerance
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.types import HeightMap
 from lift_yards import MAGNET, codes, judged, laid, map_of, record
@@ -26,6 +29,11 @@ def plane(place: Placement, heights: HeightMap) -> FacePlane:
 def bars(shape: tuple[int, int]) -> np.ndarray:
     rng = np.random.default_rng(4)
     return 100 * np.exp(rng.normal(0, 0.12, shape)) * (0.7 + 0.5 * np.sin(np.arange(shape[1])) ** 2)
+
+
+def mark_labels(gray: np.ndarray) -> np.ndarray:
+    """Mark labels on a load that fills the picture."""
+    return labels.mark_labels(gray, gray > 0, gray.shape[1])
 
 
 def test_a_label_is_marked_and_a_strap_is_not() -> None:
@@ -107,7 +115,56 @@ def test_a_dull_label_between_dark_straps_is_marked_on_bright_bars(ratio: float)
     ids=["label", "gleam", "bright gleam", "gleam at an end"],
 )
 def test_a_short_label_ends_at_once_and_a_gleam_fades(levels: list[int], is_label: bool) -> None:
-    """Take levels along a bar from a demo's orthophoto, with a label of 36 mm."""
-    gray = np.full((57, 20), 90.0, np.float32)
+    """Take levels along a bar from a demo's orthophoto, with a label of 36 mm, on bars as mottled."""
+    gray = 90 * np.exp(np.random.default_rng(2).normal(0, 0.1, (57, 20))).astype(np.float32)
     gray[20:37, 8:12] = np.array(levels, np.float32)[:, None]
     assert mark_labels(gray).any() == is_label
+
+
+@pytest.mark.parametrize("width", [8, 12, 27])
+@pytest.mark.parametrize("on_crests", [True, False])
+def test_a_bright_strap_is_no_label(width: int, on_crests: bool) -> None:
+    """One of 32 mm, across a whole load or on its bars' crests only."""
+    gray = bars((60, width))
+    shown = np.arange(width) % 9 < 5 if on_crests and width > 12 else np.ones(width, bool)
+    gray[28:31, shown] = 240.0
+    assert not mark_labels(gray.astype(np.float32)).any()
+
+
+@pytest.mark.parametrize("blur_cells", [0.5, 1.0, 1.2])
+@pytest.mark.parametrize(("bar", "paper"), [(90, 170), (120, 200), (175, 250), (200, 255)])
+@pytest.mark.parametrize("size", [(4, 7), (6, 4), (10, 6)], ids=["36 mm", "64 mm", "100 mm"])
+def test_labels_are_found_however_a_picture_blurs_them(
+    size: tuple[int, int], bar: int, paper: int, blur_cells: float
+) -> None:
+    if bar == 200 and (blur_cells > 1 or min(size) < 6):
+        pytest.skip("a small white label on a bar that shines as much can't be told")
+    rng, found = np.random.default_rng(7), 0
+    for _ in range(10):
+        gray = bar * np.exp(rng.normal(0, 0.04, (60, 27)))
+        gray[28 : 28 + size[0], 10 : 10 + size[1]] = paper
+        blurred = ndimage.gaussian_filter(gray, blur_cells).clip(1, 255).astype(np.float32)
+        found += mark_labels(blurred)[28 : 28 + size[0], 10 : 10 + size[1]].any()
+    assert found >= 9
+
+
+def test_a_bright_floor_beside_a_narrow_load_hides_no_label() -> None:
+    heights = map_of([laid(0.3, bars=1, diameter_m=0.16)], x_m=(-1.5, 2.0))
+    gray = np.where(np.abs(heights.x_m - 0.3) < 0.08, 90.0, 170.0) * np.ones(heights.shape)
+    at_m = MAGNET.poles[0].along_m
+    gray[np.ix_(np.abs(heights.y_m - at_m) < 0.025, np.abs(heights.x_m - 0.3) < 0.02)] = 160.0
+    heights = replace(heights, gray=gray.astype(np.uint8))
+    assert find_label(PLACE, heights, MAGNET, plane(PLACE, heights)) is not None
+
+
+@pytest.mark.parametrize(("beside_m", "found"), [(0.015, True), (0.06, False)])
+def test_a_label_that_ends_beside_a_face_counts_two_cells_further(beside_m: float, found: bool) -> None:
+    heights = map_of([laid(0.3)], x_m=(-1.5, 2.0))
+    exact = replace(MAGNET, tolerance=Tolerance(0.0, 0.0, 0.0))
+    pole = exact.poles[0]
+    far = pole.along_m - pole.length_m / 2 - beside_m
+    gray = np.full(heights.shape, 90.0)
+    rows = (heights.y_m <= far + 1e-6) & (heights.y_m > far - 0.06)
+    gray[np.ix_(rows, np.abs(heights.x_m - 0.3) < 0.03)] = 250.0
+    heights = replace(heights, gray=gray.astype(np.uint8))
+    assert (find_label(PLACE, heights, exact, plane(PLACE, heights)) is not None) == found

@@ -30,8 +30,8 @@ class MapSettings:
     min_gate_m: float = 0.015
     """Heights nearer than this are one surface however small their sigma."""
     along_m: float = 0.26
-    """Heights are averaged so far to either side, along the direction in which they are most alike (a bar's
-    own); 0 leaves each cell as it is."""
+    """Heights are averaged so far to either side, 28 cells at most, along the direction in which they are
+    most alike (a bar's own); 0 leaves each cell as it is."""
     sharpen_px: float = 1.25
     """Matching's window lowers crests and lifts valleys across the bars as a blur of so many pixels (sigma)
     does: heights averaged along a bar are moved back by as much, and sigma grows with it; 0 leaves both."""

@@ -18,9 +18,9 @@ CHOICE_CELLS, ELECTION_CELLS = 12, 16
 """Longest way to either side over which a cell's own direction is chosen, and the elected one."""
 BLOCK_CELLS = 8
 """A block of cells elects its direction with the blocks around it."""
-_NEAR = 8
-"""Elected directions by which a block's may differ from a cell's own one, as noise turns it: what lies across
-bars keeps its own."""
+_NEAR, _MAX_SQUARES_RATIO = 8, np.float32(2.0)
+"""Elected directions by which a block's may differ from a cell's own one, as noise turns it, and its squares
+over those along the cell's own: what lies over the bars at an angle keeps its direction."""
 
 
 def choose_directions(z: Float32, known: Bool, gate_m: float, reach: int) -> Int8:
@@ -43,8 +43,9 @@ def elect_directions(z: Float32, direction: Int8, gate_m: float, reach: int) -> 
     reach = min(reach, ELECTION_CELLS)
     rows, columns = line_cells(FINE_RATIO * DIRECTIONS, reach)
     padded = np.pad(z, reach, constant_values=np.nan)
-    elected = _elect(padded, direction, np.float32(gate_m), rows, columns, reach)
-    return _near_own(direction, elected)
+    gate = np.float32(gate_m)
+    elected = _elect(padded, direction, gate, rows, columns, reach)
+    return _near_own(padded, direction, elected, gate, rows, columns, reach)
 
 
 def line_cells(directions: int, reach: int) -> tuple[Int64, Int64]:
@@ -115,13 +116,10 @@ def _elect(z: Float32, direction: Int8, gate_m: np.float32, rows: Int64, columns
         for j in range(0, width, 2):
             if direction[i, j] < 0:
                 continue
-            own, best, least = z[i + reach, j + reach], 0, np.float32(np.inf)
+            best, least = 0, np.float32(np.inf)
             for turn in (0, -1, 1, -2, 2):
                 way = (direction[i, j] * FINE_RATIO + turn) % rows.shape[0]
-                squares = np.float32(0)
-                for k in range(rows.shape[1]):
-                    gap = abs(z[i + reach + rows[way, k], j + reach + columns[way, k]] - own)
-                    squares += gap * gap if gap <= gate_m else gate_m * gate_m
+                squares = _squares(z, i + reach, j + reach, rows[way], columns[way], gate_m)
                 if squares < least:
                     best, least = way, squares
             votes[i // BLOCK_CELLS, j // BLOCK_CELLS, best] += 1
@@ -138,9 +136,13 @@ def _elect(z: Float32, direction: Int8, gate_m: np.float32, rows: Int64, columns
 
 
 @kernel()
-def _near_own(direction: Int8, elected: Int8) -> Int8:
-    """Take the block's direction where it is near a cell's own, else that one, in the finer steps (H, W); -1
-    stays. direction: (H, W); elected: (blocks, blocks).
+def _near_own(
+    z: Float32, direction: Int8, elected: Int8, gate_m: np.float32, rows: Int64, columns: Int64, reach: int
+) -> Int8:
+    """Take the block's direction where it is near a cell's own and nearly as good there, else that one, in
+    the finer steps (H, W); -1 stays.
+
+    z: (H + 2 reach, W + 2 reach). direction: (H, W); elected: (blocks, blocks).
     """
     out = np.full(direction.shape, -1, np.int8)
     for i in range(direction.shape[0]):
@@ -149,6 +151,23 @@ def _near_own(direction: Int8, elected: Int8) -> Int8:
                 continue
             own, block = direction[i, j] * FINE_RATIO, elected[i // BLOCK_CELLS, j // BLOCK_CELLS]
             apart = abs(block - own)
-            is_near = block >= 0 and min(apart, FINE_RATIO * DIRECTIONS - apart) <= _NEAR
-            out[i, j] = block if is_near else own
+            apart = min(apart, FINE_RATIO * DIRECTIONS - apart)
+            out[i, j] = own
+            if block < 0 or apart > _NEAR:
+                continue
+            most = np.float32(np.inf)
+            if apart > FINE_RATIO // 2:
+                most = _MAX_SQUARES_RATIO * _squares(z, i + reach, j + reach, rows[own], columns[own], gate_m)
+            if _squares(z, i + reach, j + reach, rows[block], columns[block], gate_m) <= most:
+                out[i, j] = block
     return out
+
+
+@kernel()
+def _squares(z: Float32, i: int, j: int, rows: Int64, columns: Int64, gate_m: np.float32) -> np.float32:
+    """Sum the squared differences from cell (i, j) along one direction, each no more than the gate."""
+    squares = np.float32(0)
+    for k in range(rows.size):
+        gap = abs(z[i + rows[k], j + columns[k]] - z[i, j])
+        squares += gap * gap if gap <= gate_m else gate_m * gate_m
+    return squares

@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from barsight.core.arrays import Float32, Int8, kernel
-from barsight.mapping.surface.picture_stripes import DIRECTIONS, NODE_CELLS, STEP_CELLS, Stripes
+from barsight.mapping.surface.bar_directions import DIRECTIONS
+from barsight.mapping.surface.picture_stripes import NODE_CELLS, STEP_CELLS, Stripes
 
 REACH_CELLS = 15
 """Cells around a cell that its bars depend on: two of the widest pitches, or a stripe window's corner."""

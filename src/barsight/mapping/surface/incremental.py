@@ -19,6 +19,7 @@ from barsight.core.parallel import ordered_map
 from barsight.core.timing import unwatched
 from barsight.core.types import HeightSource
 from barsight.mapping.settings import MapSettings
+from barsight.mapping.surface.bar_directions import BLOCK_CELLS
 from barsight.mapping.surface.bar_profiles import REACH_CELLS, draw_bars
 from barsight.mapping.surface.cloud import CloudPart, cloud_file
 from barsight.mapping.surface.directional_filter import (
@@ -52,8 +53,10 @@ from barsight.mapping.tiles import TILE_CELLS, TileKey, TileStore
 
 Result = TypeVar("Result")
 
-_HALO = 29 + VOTE_CELLS // 2 + REACH_CELLS
-"""Cells around a tile that it depends on: along a bar, and what is read beside it. A multiple of 8, so that
+_ALONG_CELLS = 28
+"""The longest way along a bar, to either side."""
+_HALO = -(-(_ALONG_CELLS + 1 + VOTE_CELLS // 2 + REACH_CELLS) // BLOCK_CELLS) * BLOCK_CELLS
+"""Cells around a tile that it depends on: along a bar, and what is read beside it. Whole blocks, so that
 stripes and directions are sought at the same cells in a tile and in its neighbours' halos."""
 _MIDDLE = 4
 """A tile among `_around` it."""
@@ -280,7 +283,8 @@ class SurfaceElection:
         and what blur and gloss leave on bars, 1 sigma.
         """
         settings, cell_m = self._settings, self._cell_m
-        along, reach = (min(round(way_m / cell_m), _HALO) for way_m in (settings.along_m, settings.fill_m))
+        along = min(round(settings.along_m / cell_m), _ALONG_CELLS)
+        reach = min(round(settings.fill_m / cell_m), _HALO)
         side = TILE_CELLS + 2 * _HALO
         around = Layers.unknown(side, side)
         column, row = key[0] * TILE_CELLS - _HALO, key[1] * TILE_CELLS - _HALO

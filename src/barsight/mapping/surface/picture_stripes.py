@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from barsight.core.arrays import Float32, Int8, Int64, kernel
+from barsight.mapping.surface.bar_directions import DIRECTIONS
 
-DIRECTIONS = 16
 NODE_CELLS = 2
 STEP_CELLS = 1.4
 """A surface ends where heights change by more from one cell to the next."""

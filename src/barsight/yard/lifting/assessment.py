@@ -159,7 +159,10 @@ def assess_placement(
         checks += thin_bar_checks(yard.heights, yard.thin_line(load), load, pixel_m, settings)
         if has_pictures(yard.heights, pixel_m):
             others = [b for b in near.bundles if b not in load]
-            beside = ((b, yard.thin_lines(b) if may_reach(b, place, magnet) else ()) for b in others)
+            faces_z_m = contact.centre_z_m
+            beside = (
+                (b, yard.thin_lines(b) if may_reach(b, place, magnet, faces_z_m) else ()) for b in others
+            )
             checks += beside_checks(place, magnet, tuple(beside))
     scale = 0.0
     if search and not vetoes_of(checks):

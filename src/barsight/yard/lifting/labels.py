@@ -8,6 +8,7 @@ import numpy as np
 from scipy import ndimage
 
 from barsight.core.arrays import Bool, Float32, Float64
+from barsight.core.linalg.robust import mad_sigma
 from barsight.yard.label_settings import LabelSettings
 from barsight.yard.lifting.clearance import FacePlane
 from barsight.yard.magnet.description import Magnet
@@ -21,20 +22,28 @@ SIZE_M = LabelSettings().size_m
 """A usual label; one with a code is too dark in its middle for `mark_labels`."""
 DEEP_M = 0.02
 """A label so far below the faces' plane, on the flank of a bundle, holds nothing off; what is unknown may."""
-EDGE_M = 0.01
-"""Margin of a label around what the orthophoto shows of it: a cell."""
+EDGE_M = 0.02
+"""Margin of a label around what the orthophoto shows of it: two cells."""
 BESIDE_M = 0.15
 """So far beside what lies under the faces the shape of a label may reach."""
 LENGTH_CELLS, WIDTH_CELLS = range(3, 11), 3
 """Steps that a label fills along the bars, and at least across."""
-MIN_EDGE_LOG, MIN_COLUMN_LOG = 0.25, 0.12
-"""Logarithm of the darkest of a label's steps over the bare bar's two and three steps before and behind it,
-as a mean across the label and of each of its columns: a label ends at once, a gleam fades."""
-STRAP_CELLS, MAX_ACROSS_CELLS = 4, 13
-"""What is no longer than the one and wider than the other is a bright strap."""
-BRIGHTER_RATIO, FULL_LEVEL, MIN_LEVEL = 1.3, 215.0, 140.0
+EDGE_SIGMAS, MIN_EDGE_LOG, MIN_COLUMN_LOG = 6.0, (0.2, 0.42), 0.06
+"""Logarithm of the darkest of a label's steps over the bare bar's before and behind it, as a mean across the
+label: in scatters of the bars' own, and its least and its largest bound; and of each column. A label ends at
+once, a gleam fades."""
+AROUND_CELLS = 9
+"""Steps along a bar over which its scatter is taken."""
+WHITE_LEVEL, MIN_WHITE_LOG = 245.0, 0.1
+"""Level from which on a picture tells no more, and the least such mean of what is as bright."""
+STRAP_CELLS, STRAP_RATIO, GAP_CELLS = 4, 0.7, 7
+"""What is no longer than the first, and wider than the second of the load, is a bright strap: one that shows
+on the bars' crests only has gaps of so many cells."""
+BRIGHTER_RATIO, FULL_LEVEL, MIN_LEVEL = 1.2, 215.0, 140.0
 """Gray level of a label over the median of the load, the level from which on a picture shows no more, and the
 least of a label."""
+_BESIDE = 4
+"""Steps before and behind a label that are read."""
 _DARK = 10.0
 """Level that is added to both: where hardly any light is, ratios tell nothing."""
 
@@ -69,11 +78,13 @@ def find_label(
     broad = float(np.abs(place.across) @ slack) + turned * magnet.half_span_m + EDGE_M
     v, u = _steps(magnet.half_span_m + long + BESIDE_M), _steps(wide + broad + BESIDE_M)
     gray, z_m = _look_up(place, heights, v, u)
-    labels = mark_labels(gray)
+    faces_z_m = plane.centre_z_m + math.tan(plane.pitch_rad) * v[:, None] + math.tan(plane.roll_rad) * u
+    is_low = z_m < faces_z_m - DEEP_M
+    load = (gray > 0) & ~is_low
+    labels = mark_labels(gray, load & (np.abs(u) <= wide + broad), float(np.median(load.sum(axis=1))))
     for mask in plate_masks(gray, z_m, SIZE_M):
         labels |= mask
-    faces_z_m = plane.centre_z_m + math.tan(plane.pitch_rad) * v[:, None] + math.tan(plane.roll_rad) * u
-    labels &= ~(z_m < faces_z_m - DEEP_M)
+    labels &= ~is_low
     under = np.zeros(gray.shape, np.bool_)
     for along, across, length, width in poles:
         rows = np.abs(v - along) <= length / 2 + long
@@ -89,46 +100,62 @@ def _steps(reach_m: float) -> Float64:
     return np.asarray(STEP_M * np.arange(-count, count + 1), np.float64)
 
 
-def mark_labels(gray: Float32) -> Bool:
+def mark_labels(gray: Float32, load: Bool, load_cells: float) -> Bool:
     """Mark the cells (V, U) of labels: bright, and at once darker before and behind along the bars.
 
-    gray: levels, 0 where nothing was seen.
+    gray: levels, 0 where nothing was seen, which counts as dark. load: cells that tell the load's usual level
+    and its scatter. load_cells: the load's width.
     """
+    if not load.any():
+        return np.zeros(gray.shape, np.bool_)
     level = np.log(gray + _DARK)
     mean = ndimage.uniform_filter1d(level, WIDTH_CELLS, axis=1)
-    seen = gray[gray > 0]
-    needed = min(BRIGHTER_RATIO * float(np.median(seen)), FULL_LEVEL) if seen.size else np.inf
-    bright = mean > np.log(max(needed, MIN_LEVEL) + _DARK)
+    scatter = mad_sigma((mean - ndimage.uniform_filter1d(mean, AROUND_CELLS, axis=0))[load])
+    edge = float(np.clip(EDGE_SIGMAS * scatter, *MIN_EDGE_LOG))
+    needed = max(min(BRIGHTER_RATIO * float(np.median(gray[load])), FULL_LEVEL), MIN_LEVEL)
+    bright = mean > np.log(needed + _DARK)
     short, long = np.zeros((2, *gray.shape), np.bool_)
     for length in LENGTH_CELLS:
-        if length + 6 > len(gray):
+        if length + 2 * _BESIDE > len(gray):
             break
-        columns = _edge_logs(level, length) > MIN_COLUMN_LOG
+        columns = _edge_logs(level, length)[0] > MIN_COLUMN_LOG
         wide = ndimage.binary_erosion(columns, np.ones((1, WIDTH_CELLS), np.bool_))
-        found = wide & (_edge_logs(mean, length) > MIN_EDGE_LOG)
+        edges, lowest = _edge_logs(mean, length)
+        is_white = lowest > np.log(WHITE_LEVEL + _DARK)
+        found = wide & (edges > np.where(is_white, MIN_WHITE_LOG, edge))
         found = ndimage.binary_dilation(found, np.ones((1, WIDTH_CELLS), np.bool_))
         marked = short if length <= STRAP_CELLS else long
-        for row in range(length):
-            marked[3 + row : 3 + row + len(found)] |= found
-    return np.asarray(long & bright | _without_straps(short & bright), np.bool_)
+        for row in range(_BESIDE, _BESIDE + length):
+            marked[row : row + len(found)] |= found
+    return np.asarray(bright & (long | _without_straps(short, STRAP_RATIO * load_cells)), np.bool_)
 
 
-def _edge_logs(level: Float32, length: int) -> Float32:
-    """Compute how far the lowest of `length` steps stands over the highest of the two beyond the next, before
-    and behind: (V - length - 5, U), for runs from the fourth step on.
+def _edge_logs(level: Float32, length: int) -> tuple[Float32, Float32]:
+    """Compute how far the lowest of `length` steps stands over the bare bar's before and behind it, and the
+    lowest: (V - length - 2 _BESIDE + 1, U), for runs from step _BESIDE on.
+
+    The bare bar's are the two next steps but one, or but two: a picture blurs an end over one or two.
     """
-    count = len(level) - length - 5
-    rows = [level[k : k + count] for k in range(length + 6)]
-    return np.asarray(np.min(rows[3:-3], axis=0) - np.max([*rows[:2], *rows[-2:]], axis=0))
+    count = len(level) - length - 2 * _BESIDE + 1
+    rows = [level[k : k + count] for k in range(length + 2 * _BESIDE)]
+    lowest = np.min(rows[_BESIDE:-_BESIDE], axis=0)
+    bare = [
+        np.minimum(np.maximum(near, middle), np.maximum(middle, far))
+        for far, middle, near in (rows[:3], rows[:-4:-1])
+    ]
+    return np.asarray(lowest - np.maximum(*bare)), np.asarray(lowest)
 
 
-def _without_straps(marked: Bool) -> Bool:
-    """Unmark what goes on across the bars for longer than a label."""
-    numbers, _ = ndimage.label(marked, np.ones((3, 3)))
-    for number, place in enumerate(ndimage.find_objects(numbers), start=1):
-        if place[1].stop - place[1].start > MAX_ACROSS_CELLS:
-            marked[numbers == number] = False
-    return marked
+def _without_straps(marked: Bool, widest: float) -> Bool:
+    """Unmark what goes on across the bars for longer than `widest` cells, gaps of a few closed."""
+    padded = np.pad(marked, ((0, 0), (GAP_CELLS, GAP_CELLS)))
+    closed = ndimage.binary_closing(padded, np.ones((1, GAP_CELLS), np.bool_))[:, GAP_CELLS:-GAP_CELLS]
+    numbers, _ = ndimage.label(closed, np.ones((3, 3)))
+    wide = [
+        number for number, place in enumerate(ndimage.find_objects(numbers), start=1)
+        if place[1].stop - place[1].start > widest
+    ]  # fmt: skip
+    return marked & ~np.isin(numbers, wide)
 
 
 def _look_up(place: Placement, heights: HeightMap, v: Float64, u: Float64) -> tuple[Float32, Float32]:
