@@ -238,11 +238,17 @@ def test_a_strong_line_covers_a_bundle_and_a_faint_one_is_a_doubt(bar_m: float, 
     assert on_top is (None if sure else True) and bundle.is_free == (sure is None)
 
 
-@pytest.mark.parametrize(("layer", "on_top"), [(0, True), (1, None)])
-def test_a_hidden_flank_leaves_open_what_lies_on_a_bundle_of_an_upper_layer(
-    layer: int, on_top: bool | None
+@pytest.mark.parametrize(
+    ("doubt", "layer", "on_top"),
+    [
+        ("what stands 40 mm higher beside it may lie over its high flank", 0, True),
+        ("what stands 40 mm higher beside it may lie over its high flank", 1, None),
+        ("its low flank was not seen: something may lie over it", 0, None),
+    ],
+)
+def test_a_hidden_flank_leaves_open_what_lies_on_a_bundle_but_on_the_floor(
+    doubt: str, layer: int, on_top: bool | None
 ) -> None:
-    doubt = "what stands 40 mm higher beside it may lie over its high flank"
     bundle = replace(LOAD[0], reasons=(doubt,), cover_doubts=(doubt,))
     assert check_uncovered(bundle, [bundle], layer)[0] is on_top
     assert bundle.looks_free and not bundle.is_free

@@ -16,12 +16,14 @@ _LOWER_RATIO = 0.15
 _PARALLEL = 0.08
 _INSIDE = 0.35
 """Share of a bundle's width, to either side of its axis, within which no other bundle lies."""
-_DOUBTS = "covers a part", "something higher", "lies across it", "a thin bar lies over it"
+_DOUBTS = (
+    "covers a part", "something higher", "lies across it", "a thin bar lies over it", "flank was not seen",
+)  # fmt: skip
 """In reasons that leave open whether something lies on a bundle. A faint line across it is most often a
 strap: a doubt, which forbids its lift."""
-_HEAPED = "flank"
+_HEAPED = " may lie over its "
 """The same from the second layer on, where bundles rest on each other's flanks. On the floor a higher
-neighbour that hides a flank most often stands beside it: a doubt."""
+neighbour that hides the lower part of a flank most often stands beside it: a doubt."""
 _MEET_M, _MEET_LENGTH_M = 0.02, 0.3
 """Two outlines that overlap by more, over this length, are not both right: one may lie over the other."""
 
