@@ -2,7 +2,7 @@
 
 Each step warps the right image with the current disparity and asks every pixel how far it should move
 (Gauss-Newton [Lucas 1981]), then fits planes to the answers along supports that follow the bars. Gain and
-offset of the images are taken off in a window. The first step may see the images at half the size. All but
+offset of the images are taken off in a window. The first steps may see the images at half the size. All but
 the last see them softer and use the mean gradient of both [Malis 2004], which carries them further; the last
 one uses the left gradient alone: an interpolated image's noise falls with the fraction of the disparity, and
 its own gradient turns that into pixel locking.
@@ -68,8 +68,9 @@ class RefinementSettings:
 
     steps: int = 3
     """Gauss-Newton steps."""
-    first_at_half_size: bool = False
-    """Whether the first step goes at half the size: a quarter of its work, errors a little larger."""
+    half_size_steps: int = 0
+    """So many of the steps, the first ones, go at half the size: a quarter of their work, errors a little
+    larger. The last step never does."""
     along_px: float = 16.0
     """The long support along the axis, one sigma."""
     across_px: float = 1.5
@@ -92,8 +93,8 @@ class RefinementSettings:
     """Window in which gain and offset are taken off, odd."""
 
     def __post_init__(self) -> None:
-        if self.steps < 0:
-            raise ConfigError(f"refinement steps can't be negative, {self.steps} is")
+        if min(self.steps, self.half_size_steps) < 0:
+            raise ConfigError("refinement steps can't be negative, nor those at half the size")
         if min(self.along_px, self.across_px, self.outlier_gray, self.same_surface_px, self.alike_gray) <= 0:
             raise ConfigError(
                 "the long support, outlier_gray, same_surface_px and alike_gray must be positive"
@@ -120,13 +121,15 @@ def refine_disparity(
 
     halves_rows: half the size has half the rows too.
     """
-    at_half_size = settings.first_at_half_size and min(left.shape) >= _MIN_HALVED_PX and settings.steps > 1
-    if at_half_size:
+    halved = max(min(settings.half_size_steps, settings.steps - 1), 0)
+    if min(left.shape) < _MIN_HALVED_PX:
+        halved = 0
+    for _ in range(halved):
         start = refine_at_half_size(left, right, start, matched, settings, halves_rows)
     work = _Work.of(left.astype(np.float32), start, matched.astype(np.float32), settings)
     noise = _noise(left, right)
     variance = np.full_like(start, np.inf)
-    for step in range(int(at_half_size), settings.steps):
+    for step in range(halved, settings.steps):
         remaining = (settings.steps - 1 - step) / max(settings.steps - 1, 1)
         blur_px = _BLUR_PX * (_FIRST_BLUR_PX / _BLUR_PX) ** remaining
         variance = work.step(left, right, blur_px, noise * _slope_gain(blur_px), remaining == 0)
