@@ -124,8 +124,8 @@ def refine_disparity(
     halved = max(min(settings.half_size_steps, settings.steps - 1), 0)
     if min(left.shape) < _MIN_HALVED_PX:
         halved = 0
-    for _ in range(halved):
-        start = refine_at_half_size(left, right, start, matched, settings, halves_rows)
+    if halved:
+        start = refine_at_half_size(left, right, start, matched, settings, halves_rows, halved)
     work = _Work.of(left.astype(np.float32), start, matched.astype(np.float32), settings)
     noise = _noise(left, right)
     variance = np.full_like(start, np.inf)
@@ -138,9 +138,9 @@ def refine_disparity(
 
 def refine_at_half_size(
     left: UInt8, right: UInt8, start: Float32, matched: Bool, settings: RefinementSettings,
-    halves_rows: bool = True,
+    halves_rows: bool = True, steps: int = 1,
 ) -> Float32:  # fmt: skip
-    """Run one step at half the size with the long support: a fraction of the work, and softer images carry
+    """Run steps at half the size with the long support: a fraction of the work, and softer images carry
     further. halves_rows: that has half the rows too.
     """
     rows = 2 if halves_rows else 1
@@ -158,9 +158,13 @@ def refine_at_half_size(
     started = np.float32(0.5) * small_start
     work = _Work.of(small_left, started, small_matched, half, _HALF_HOLD * _HOLD)
     slope_noise = _noise(small_left, small_right) * _slope_gain(_BLUR_PX)
-    work.pulls(small_left, small_right, _BLUR_PX, slope_noise, is_last=False)
-    fitted, _ = work.planes(SupportShape(half.along_px, half.across_px, _HALF_STEP_PX))
-    moved = np.clip(fitted - started, -_LONGEST_HALF_STEP_PX, _LONGEST_HALF_STEP_PX)
+    now, moved = inside(work.disparity, started.shape), np.zeros_like(started)
+    for _ in range(steps):
+        work.pulls(small_left, small_right, _BLUR_PX, slope_noise, is_last=False)
+        fitted, _ = work.planes(SupportShape(half.along_px, half.across_px, _HALF_STEP_PX))
+        step = np.clip(fitted - now, -_LONGEST_HALF_STEP_PX, _LONGEST_HALF_STEP_PX)
+        now += step
+        moved += step
     return upsample_update(started, moved, start, settings.same_surface_px)
 
 
