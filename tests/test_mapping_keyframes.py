@@ -55,7 +55,7 @@ def test_encoders_choose_as_the_trajectory_does() -> None:
 def test_preset_fast_says_what_it_changes() -> None:
     best, fast = MeasureSettings().chosen(), MeasureSettings(preset="fast").chosen()
     assert (best.stereo.barsight.preset, best.map.min_shift) == ("best", 0.0)
-    assert (fast.stereo.barsight.preset, fast.map.min_shift) == ("fast", 0.1)
+    assert (fast.stereo.barsight.preset, fast.map.min_shift) == ("fast", 0.15)
     wider = MeasureSettings(preset="fast", map=MapSettings(min_shift=0.2)).chosen()
     assert wider.map.min_shift == 0.2
     with pytest.raises(ConfigError, match="min_shift"):

@@ -16,7 +16,7 @@ from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.label_settings import LabelSettings
 from barsight.yard.lift_settings import LiftSettings
 
-_FAST_SHIFT = 0.1
+_FAST_SHIFT = 0.15
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class MeasureSettings:
     """Settings of `barsight measure`; each stage gets its own part only."""
 
     preset: Literal["best", "fast"] = "best"
-    """fast: the stereo preset `fast`, and no more pictures matched than lie a tenth apart."""
+    """fast: the stereo preset `fast`, and pictures matched 0.15 of their shorter side apart, or further."""
     use: tuple[Literal["stereo", "imu", "crane"], ...] = ("stereo", "imu", "crane")
     """Sensors that may be used, where the recording has them."""
     self_calibrate: Literal["none", "yaw"] = "none"

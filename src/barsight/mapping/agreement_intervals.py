@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from barsight.core.arrays import Bool, Float64
 
@@ -84,13 +84,13 @@ def agreement_intervals(
     bias, spread = float(d.mean()), float(d.std(ddof=1))
     free = max(alone - 1, 1.0)
     standard = spread / np.sqrt(alone)
-    half, one_sided = (float(student.ppf(share, free)) * standard for share in (0.975, 0.95))
+    half, one_sided = (float(stdtrit(free, share)) * standard for share in (0.975, 0.95))
     slope, slope_half = _slope(series, reference_m + difference_m / 2, used)
     laser = 0.0 if np.isnan(reference_sigma_m) else reference_sigma_m
     stated = 1e3 * np.hypot(sigma_m[used], laser)
     return AgreementIntervals(
         count, alone, bias, bias - half, bias + half, bias - Z_95 * spread, bias + Z_95 * spread,
-        float(student.ppf(0.975, free)) * spread * float(np.sqrt(1 / alone + Z_95**2 / (2 * free))),
+        float(stdtrit(free, 0.975)) * spread * float(np.sqrt(1 / alone + Z_95**2 / (2 * free))),
         slope, slope - slope_half, slope + slope_half, abs(bias) + one_sided,
         float(np.sqrt(max(spread**2 - (1e3 * laser) ** 2, 0.0))),
         100 * float(np.mean(np.abs(d) <= Z_95 * stated)),
@@ -113,4 +113,4 @@ def _slope(series: Float64, mean_m: Float64, used: Bool) -> tuple[float, float]:
     alone = effective_samples(rest)
     free = max(alone - 2, 1.0)
     variance = float(rest[used] @ rest[used]) / max(d.size - 2, 1) / square * d.size / alone
-    return slope, float(student.ppf(0.975, free)) * float(np.sqrt(variance))
+    return slope, float(stdtrit(free, 0.975)) * float(np.sqrt(variance))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import Failed
@@ -63,7 +63,7 @@ def calibrate_yard(
     doubts: list[str] = []
     inflation = 1.0
     free = found.degrees_of_freedom
-    if covariance is not None and free > 0 and chi2.sf(found.chi2, free) < DOUBTFUL:
+    if covariance is not None and free > 0 and chdtrc(free, found.chi2) < DOUBTFUL:
         inflation = found.chi2 / free
         doubts.append(
             f"the points disagree {(found.chi2 / free) ** 0.5:.1f} times as much as their sigmas say: "

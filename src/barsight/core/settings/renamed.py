@@ -15,6 +15,7 @@ RENAMED = {
     "edge_share": "edge_error_ratio",
     "farthest_baselines": "max_range_baselines",
     "fewest_votes": "min_votes",
+    "first_at_half_size": "half_size_steps",
     "first_share": "first_ratio",
     "fusion.calibration_sigma_px": "offset_prior_px",
     "gray_share": "gray_weight",

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import wilcoxon
 
 from barsight.core.arrays import Bool, Float64
 from barsight.core.linalg.robust import mad_sigma
@@ -96,6 +95,8 @@ def _sideways(contour: Contour, laser: LaserProfile, off_m: float) -> str:
     Mean differences of stretches of a quarter of a metre, each difference 30 mm at most, compared with those
     of the profile moved: signed ranks [Wilcoxon 1945], 1 %.
     """
+    from scipy.stats import wilcoxon  # half a second to import, and only a map with the laser needs it
+
     for move in (off_m, -off_m):
         gain = _costs(contour, replace(laser, x_m=laser.x_m + move)) - _costs(contour, laser)
         gain = gain[np.isfinite(gain)]

@@ -45,7 +45,7 @@ from barsight.stereo.direct.semiglobal.matching import SemiGlobalSettings, match
 from barsight.stereo.masking import mask_values
 
 _NAN = np.float32(np.nan)
-_FAST_STEPS = 2
+_FAST_HALF_SIZE_STEPS = 2
 _JUMP_PX = 1.0
 _FURTHEST_FROM_START_PX = 2.0
 _MIN_CONTRAST_GRAY = 0.5
@@ -59,7 +59,8 @@ class BarsightSettings:
     """Settings of Barsight's own stereo."""
 
     preset: Literal["best", "fast"] = "best"
-    """`fast` starts at half the size, refines in two steps with the long support alone, leaves the edges."""
+    """`fast` starts at half the size, refines there in all steps but the last, with the long support alone,
+    and leaves the edges."""
     fill_occlusions: bool = True
     """Guess what only one image sees (sigma of 1 px or more, which no map takes) instead of leaving NaN."""
     consistency_px: float = 1.0
@@ -173,8 +174,9 @@ class _Matching:
             return self._confirm(pair, candidates, predicted)
         settings, refinement = self.settings, self.settings.refinement
         if settings.preset == "fast":
-            steps = min(refinement.steps, _FAST_STEPS)
-            refinement = replace(refinement, steps=steps, short_px=0.0, first_at_half_size=True)
+            halved = _FAST_HALF_SIZE_STEPS
+            steps = min(refinement.steps, halved + 1)
+            refinement = replace(refinement, steps=steps, short_px=0.0, half_size_steps=halved)
         start = self._start(pair, candidates)
         return self._finish(pair, candidates, start, self._refined(pair, start.left_px, refinement))
 

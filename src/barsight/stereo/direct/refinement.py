@@ -2,7 +2,7 @@
 
 Each step warps the right image with the current disparity and asks every pixel how far it should move
 (Gauss-Newton [Lucas 1981]), then fits planes to the answers along supports that follow the bars. Gain and
-offset of the images are taken off in a window. The first step may see the images at half the size. All but
+offset of the images are taken off in a window. The first steps may see the images at half the size. All but
 the last see them softer and use the mean gradient of both [Malis 2004], which carries them further; the last
 one uses the left gradient alone: an interpolated image's noise falls with the fraction of the disparity, and
 its own gradient turns that into pixel locking.
@@ -68,8 +68,9 @@ class RefinementSettings:
 
     steps: int = 3
     """Gauss-Newton steps."""
-    first_at_half_size: bool = False
-    """Whether the first step goes at half the size: a quarter of its work, errors a little larger."""
+    half_size_steps: int = 0
+    """So many of the steps, the first ones, go at half the size: a quarter of their work, errors a little
+    larger. The last step never does."""
     along_px: float = 16.0
     """The long support along the axis, one sigma."""
     across_px: float = 1.5
@@ -92,8 +93,8 @@ class RefinementSettings:
     """Window in which gain and offset are taken off, odd."""
 
     def __post_init__(self) -> None:
-        if self.steps < 0:
-            raise ConfigError(f"refinement steps can't be negative, {self.steps} is")
+        if min(self.steps, self.half_size_steps) < 0:
+            raise ConfigError("refinement steps can't be negative, nor those at half the size")
         if min(self.along_px, self.across_px, self.outlier_gray, self.same_surface_px, self.alike_gray) <= 0:
             raise ConfigError(
                 "the long support, outlier_gray, same_surface_px and alike_gray must be positive"
@@ -120,13 +121,15 @@ def refine_disparity(
 
     halves_rows: half the size has half the rows too.
     """
-    at_half_size = settings.first_at_half_size and min(left.shape) >= _MIN_HALVED_PX and settings.steps > 1
-    if at_half_size:
-        start = refine_at_half_size(left, right, start, matched, settings, halves_rows)
+    halved = max(min(settings.half_size_steps, settings.steps - 1), 0)
+    if min(left.shape) < _MIN_HALVED_PX:
+        halved = 0
+    if halved:
+        start = refine_at_half_size(left, right, start, matched, settings, halves_rows, halved)
     work = _Work.of(left.astype(np.float32), start, matched.astype(np.float32), settings)
     noise = _noise(left, right)
     variance = np.full_like(start, np.inf)
-    for step in range(int(at_half_size), settings.steps):
+    for step in range(halved, settings.steps):
         remaining = (settings.steps - 1 - step) / max(settings.steps - 1, 1)
         blur_px = _BLUR_PX * (_FIRST_BLUR_PX / _BLUR_PX) ** remaining
         variance = work.step(left, right, blur_px, noise * _slope_gain(blur_px), remaining == 0)
@@ -135,9 +138,9 @@ def refine_disparity(
 
 def refine_at_half_size(
     left: UInt8, right: UInt8, start: Float32, matched: Bool, settings: RefinementSettings,
-    halves_rows: bool = True,
+    halves_rows: bool = True, steps: int = 1,
 ) -> Float32:  # fmt: skip
-    """Run one step at half the size with the long support: a fraction of the work, and softer images carry
+    """Run steps at half the size with the long support: a fraction of the work, and softer images carry
     further. halves_rows: that has half the rows too.
     """
     rows = 2 if halves_rows else 1
@@ -155,9 +158,13 @@ def refine_at_half_size(
     started = np.float32(0.5) * small_start
     work = _Work.of(small_left, started, small_matched, half, _HALF_HOLD * _HOLD)
     slope_noise = _noise(small_left, small_right) * _slope_gain(_BLUR_PX)
-    work.pulls(small_left, small_right, _BLUR_PX, slope_noise, is_last=False)
-    fitted, _ = work.planes(SupportShape(half.along_px, half.across_px, _HALF_STEP_PX))
-    moved = np.clip(fitted - started, -_LONGEST_HALF_STEP_PX, _LONGEST_HALF_STEP_PX)
+    now, moved = inside(work.disparity, started.shape), np.zeros_like(started)
+    for _ in range(steps):
+        work.pulls(small_left, small_right, _BLUR_PX, slope_noise, is_last=False)
+        fitted, _ = work.planes(SupportShape(half.along_px, half.across_px, _HALF_STEP_PX))
+        step = np.clip(fitted - now, -_LONGEST_HALF_STEP_PX, _LONGEST_HALF_STEP_PX)
+        now += step
+        moved += step
     return upsample_update(started, moved, start, settings.same_surface_px)
 
 
