@@ -132,13 +132,11 @@ def test_a_bright_strap_is_no_label(width: int, on_crests: bool) -> None:
 
 
 @pytest.mark.parametrize("blur_cells", [0.5, 1.0, 1.2])
-@pytest.mark.parametrize(("bar", "paper"), [(90, 170), (120, 200), (175, 250), (200, 255)])
+@pytest.mark.parametrize(("bar", "paper"), [(90, 170), (120, 200), (175, 250)])
 @pytest.mark.parametrize("size", [(4, 7), (6, 4), (10, 6)], ids=["36 mm", "64 mm", "100 mm"])
 def test_labels_are_found_however_a_picture_blurs_them(
     size: tuple[int, int], bar: int, paper: int, blur_cells: float
 ) -> None:
-    if bar == 200 and (blur_cells > 1 or min(size) < 6):
-        pytest.skip("a small white label on a bar that shines as much can't be told")
     rng, found = np.random.default_rng(7), 0
     for _ in range(10):
         gray = bar * np.exp(rng.normal(0, 0.04, (60, 27)))

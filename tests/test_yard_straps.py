@@ -23,6 +23,7 @@ from barsight.yard.bundles.section.packs import Pack, contradicts, find_pack, st
 from barsight.yard.bundles.section.seen_section import section_of_pack
 from barsight.yard.bundles.section.strap_lines import _best_stretches, row_gains, split_columns
 from barsight.yard.bundles.section.straps import StrapSpan, _merged, longest_runs
+from barsight.yard.bundles.strapped_bundles import _covered
 from barsight.yard.types import HeightMap
 from lift_yards import laid, record
 
@@ -367,9 +368,17 @@ def test_what_lies_over_a_pack_leaves_its_section_open() -> None:
     (lower,) = (b for b in found if abs(b.centre_m[0] + 0.125) < 0.05)
     (upper,) = (b for b in found if abs(b.centre_m[0] - 0.13) < 0.05)
     assert upper.on_top and upper.width_m == pytest.approx(0.26, abs=0.04)
-    assert lower.looks_free and not lower.is_free and any("flank" in doubt for doubt in lower.cover_doubts)
+    assert not lower.is_free and any("flank" in doubt for doubt in lower.cover_doubts)
     assert lower.bars is None and not np.isfinite(lower.section_m2)
     assert lower.sigma.width_m > 0.4 * lower.width_m
+
+
+@pytest.mark.parametrize("side", [PackSide.COVERED, PackSide.SEEN])
+def test_a_covered_side_is_a_doubt_that_forbids_the_lift(side: PackSide) -> None:
+    span = StrapSpan(-0.1, 0.1, straight(1.0, 2.0), 0.0)
+    pack = Pack(-0.12, 0.12, span, (-np.inf, np.inf), 0.1, (side, PackSide.SEEN))
+    bundle = _covered(record(laid(0.0)), pack)
+    assert bundle.is_free == (side == PackSide.SEEN) and (bundle.bars is None) == bool(bundle.cover_doubts)
 
 
 def test_the_way_between_dark_lines_is_a_bar_s_diameter() -> None:

@@ -165,10 +165,6 @@ class FitSigma:
     top_z_m: float
 
 
-_UNSEEN = "flank", "overlap", "a thin bar may"
-"""In doubts about what isn't seen; the others are about what is seen to lie there."""
-
-
 @dataclass(frozen=True, eq=False)
 class Bundle:
     """A bundle of round bars, or a single heavy bar.
@@ -220,12 +216,6 @@ class Bundle:
     def is_free(self) -> bool:
         """Check that nothing at all lies on it, for sure."""
         return self.on_top is True and not self.cover_doubts
-
-    @property
-    def looks_free(self) -> bool:
-        """Check that nothing is seen to lie on it, though a flank may be hidden: it is most likely free."""
-        seen = (doubt for doubt in self.cover_doubts if not any(word in doubt for word in _UNSEEN))
-        return self.on_top is True and not any(seen)
 
     @property
     def bottom_z_m(self) -> float:

@@ -24,8 +24,12 @@ from barsight.evaluation.trajectory_error import frame_errors
 from barsight.recording.formats.ground_truth import read_ground_truth
 from barsight.result_folder import read_summary
 from barsight.yard.inventory.bundle_file import read_bundles
+from barsight.yard.types import Bundle
 
 TWO_SIDED = 1.959964
+UNSEEN = "flank", "overlap", "a thin bar may"
+"""In `cover_doubts` on what isn't seen to lie there: a bundle with no others is said to be free. A beam or bar
+that is seen across it covers it, in a world's truth."""
 SEEN_FRAMES, SEEN_RATIO = 2, 0.5
 """A bundle is asked for where so many frames see at least this share of its axis in both cameras."""
 MAP_ROWS = ("contour, smooth places", "contour, everywhere", "height, smooth stack", "height, seen by two")
@@ -93,7 +97,7 @@ def score_world(recording: Path, out: Path | None, looked_at: str, refused: str)
     shown = _shown(recording, true)
     bundles = tuple(t for t, alone, seen in zip(true, loose, shown, strict=True) if seen and not alone)
     bars = tuple(t for t, alone, seen in zip(true, loose, shown, strict=True) if seen and alone)
-    found = tuple(replace(b, on_top=b.looks_free) for b in read_bundles(out / "bundles.json"))
+    found = tuple(replace(b, on_top=_said_free(b)) for b in read_bundles(out / "bundles.json"))
     lying = tuple(replace(t, on_top=True) for t in true)
     scores, single, every, anywhere = (score_bundles(found, part) for part in (bundles, bars, true, lying))
     counts = {
@@ -104,6 +108,11 @@ def score_world(recording: Path, out: Path | None, looked_at: str, refused: str)
     errors = {name: [float(v) for v in values] for name, values in scores.errors.items()}
     sigmas = {name: [float(v) for v in values] for name, values in scores.sigmas.items()}
     return WorldScore(*known, maps, _poses(recording, out), counts, errors, sigmas)
+
+
+def _said_free(bundle: Bundle) -> bool:
+    """Check that a bundle is on top, and that nothing is seen to lie on it."""
+    return bundle.on_top is True and all(any(word in d for word in UNSEEN) for d in bundle.cover_doubts)
 
 
 def world_rows(worlds: Sequence[WorldScore]) -> tuple[WorldRow, ...]:
