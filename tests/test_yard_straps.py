@@ -20,10 +20,10 @@ from barsight.yard.bundles.pack_edges import hold_off
 from barsight.yard.bundles.section.bar_pitch import dark_lines
 from barsight.yard.bundles.section.pack_sides import PackSide, _parting, _widest
 from barsight.yard.bundles.section.packs import Pack, contradicts, find_pack, strapped_pack
-from barsight.yard.bundles.section.seen_section import section_of_pack
+from barsight.yard.bundles.section.seen_section import SeenSection, section_of_pack
 from barsight.yard.bundles.section.strap_lines import _best_stretches, row_gains, split_columns
 from barsight.yard.bundles.section.straps import StrapSpan, _merged, longest_runs
-from barsight.yard.bundles.strapped_bundles import _covered
+from barsight.yard.bundles.strapped_bundles import _covered, _may_go_on
 from barsight.yard.types import HeightMap
 from lift_yards import laid, record
 
@@ -379,6 +379,25 @@ def test_a_covered_side_is_a_doubt_that_forbids_the_lift(side: PackSide) -> None
     pack = Pack(-0.12, 0.12, span, (-np.inf, np.inf), 0.1, (side, PackSide.SEEN))
     bundle = _covered(record(laid(0.0)), pack)
     assert bundle.is_free == (side == PackSide.SEEN) and (bundle.bars is None) == bool(bundle.cover_doubts)
+
+
+@pytest.mark.parametrize(
+    ("straps_m", "seen", "may"),
+    [
+        (0.16, None, False),
+        (0.07, None, True),
+        (0.07, SeenSection(0.16, 0.0, sides_seen=True, sides_free=False), False),
+        (0.07, SeenSection(0.21, 0.0, sides_seen=True, sides_free=False), True),
+        (0.07, SeenSection(0.16, 0.0, sides_seen=False, sides_free=False), True),
+    ],
+)
+def test_straps_on_the_crest_alone_bound_no_section(
+    straps_m: float, seen: SeenSection | None, may: bool
+) -> None:
+    """Six bars of 80 mm, three on the ground, were told as half their mass by straps on the top bar."""
+    span = StrapSpan(-straps_m / 2, straps_m / 2, straight(1.0, 2.0), 0.0)
+    pack = Pack(-0.08, 0.08, span, (-np.inf, np.inf), 0.1, (PackSide.SEEN, PackSide.SEEN))
+    assert _may_go_on(pack, seen) == may
 
 
 def test_the_way_between_dark_lines_is_a_bar_s_diameter() -> None:

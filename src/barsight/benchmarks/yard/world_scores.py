@@ -28,8 +28,8 @@ from barsight.yard.types import Bundle
 
 TWO_SIDED = 1.959964
 UNSEEN = "flank", "overlap", "a thin bar may"
-"""In `cover_doubts` on what isn't seen to lie there: a bundle with no others is said to be free. A beam or bar
-that is seen across it covers it, in a world's truth."""
+"""In `cover_doubts` on what isn't seen to lie there: a bundle with no others is said to be free. A beam or
+bar that is seen across it covers it, in a world's truth."""
 SEEN_FRAMES, SEEN_RATIO = 2, 0.5
 """A bundle is asked for where so many frames see at least this share of its axis in both cameras."""
 MAP_ROWS = ("contour, smooth places", "contour, everywhere", "height, smooth stack", "height, seen by two")

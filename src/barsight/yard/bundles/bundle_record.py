@@ -114,7 +114,7 @@ def make_bundle(
         width_m = reading.pack.width_m
     irregular = widen_sigma(bundle.sigma, reading.found, width_m, bundle.length_m, is_one_of_two=doubtful)
     if reading.pack is not None:
-        return held_by_straps(bundle, irregular, reading, reading.pack, floor_m)
+        return held_by_straps(bundle, irregular, reading, seen, floor_m)
     return bundle if bars is not None else replace(bundle, sigma=irregular)
 
 

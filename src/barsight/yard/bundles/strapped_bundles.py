@@ -13,11 +13,14 @@ from barsight.yard.bundles.reading import Reading
 from barsight.yard.bundles.section.bar_pitch import DIAMETER_SIGMA_RATIO
 from barsight.yard.bundles.section.pack_sides import PackSide
 from barsight.yard.bundles.section.packs import Pack, contradicts
-from barsight.yard.bundles.section.seen_section import over_floor, section_of_pack
+from barsight.yard.bundles.section.seen_section import SeenSection, over_floor, section_of_pack
 from barsight.yard.types import Bundle, BundleSigma
 
 _PACK_MIDDLE_M, _PACK_WIDTH_M, _PACK_TOP_M, _PACK_WIDTH_SIGMAS = 0.012, 0.016, 0.006, 3.0
 """Standard deviations of a pack's middle, width and top, and its width's in those of a height."""
+_CREST_RATIO, _SMEARED_M = 0.6, 0.03
+"""Share of a pack's width over which straps must show to bound what it holds: heaps of three rows fall off
+under straps that show on the top bar. So much wider the map smears two flanks."""
 _SAME_MIDDLE_M = 0.009
 """Largest distance between the middles of a pack and of the outline that is fitted to it."""
 _CREST_M = 0.006
@@ -35,14 +38,37 @@ _ASIDE_M = 0.02
 
 
 def held_by_straps(
-    bundle: Bundle, irregular: BundleSigma, reading: Reading, pack: Pack, floor_m: float | None
+    bundle: Bundle, irregular: BundleSigma, reading: Reading, seen: SeenSection | None, floor_m: float | None
 ) -> Bundle:
     """Hold a bundle to what straps show: place, width and section where the fitted outline misses the pack,
     the section alone where both agree, a doubt where a neighbour may lie over the pack or it goes on beyond
     what is in sight.
 
-    irregular: its sigma where it is not surely the hexagon that was fitted.
+    irregular: its sigma where it is not surely the hexagon that was fitted. reading: one with a pack. seen:
+    what the surface shows of its section.
     """
+    pack = reading.pack
+    assert pack is not None
+    held = _held(bundle, irregular, reading, pack, floor_m)
+    if held.bars is not None or not _may_go_on(pack, seen):
+        return held
+    reason = "its straps show on its crest alone, and its surface doesn't end there: it may be wider"
+    return replace(
+        held, section_m2=np.nan, sigma=replace(held.sigma, section_m2=np.nan), reasons=(*held.reasons, reason)
+    )
+
+
+def _may_go_on(pack: Pack, seen: SeenSection | None) -> bool:
+    """Check for straps that show on a pack's crest alone, where its surface doesn't end with its flanks."""
+    if pack.span.width_m >= _CREST_RATIO * pack.width_m:
+        return False
+    return seen is None or not seen.sides_seen or seen.width_m >= pack.width_m + _SMEARED_M
+
+
+def _held(
+    bundle: Bundle, irregular: BundleSigma, reading: Reading, pack: Pack, floor_m: float | None
+) -> Bundle:
+    """Hold a bundle to its straps as if they showed all across it; see `held_by_straps`."""
     if not pack.is_bounded:
         return _partly_seen(bundle, irregular, pack)
     if reading.outlines_pack:
