@@ -1,8 +1,8 @@
 """Score what is found of drawn yards' labels, and what is taken for one.
 
 `python benchmarks/labels.py KEEP SEED...`: KEEP is a folder of `bench lifts --rendered --full-size --keep`.
-Labels are the drawn solids; bundles are those that were measured, and only what lies no lower than 40 mm under
-a bundle's top is looked at.
+Labels are the drawn solids; bundles are those that were measured, and only what lies no lower than 40 mm
+under a bundle's top is looked at.
 """
 
 from __future__ import annotations
