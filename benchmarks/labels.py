@@ -97,7 +97,7 @@ def main(arguments: list[str]) -> None:
             gray, z_m, u = strip_of(bundle, heights)
             top = (z_m > bundle.top_z_m - DEEP_M) & (np.abs(u) <= bundle.width_m / 2) & (gray > 0)
             load = top & (np.abs(u) <= POLE_M)
-            marked = mark_labels(gray, load, float(np.median(top.sum(axis=1))))
+            marked = mark_labels(gray, load)
             in_sight = [
                 (r, c) for r, c, z in places_of(labels, bundle, gray.shape) if abs(z - z_m[r, c]) < SAME_M
             ]

@@ -7,20 +7,14 @@ import pytest
 
 from barsight.core.errors import Failed
 from barsight.core.types import DisparityRange, RectifiedPair
-from barsight.stereo.search_range import (
-    COARSE_SCALE,
-    coarse_disparity,
-    find_disparity_range,
-    follow_disparity_range,
-)
+from barsight.stereo.search_range import coarse_disparity, find_disparity_range, follow_disparity_range
 from synthetic_scenes import camera, slanted_pair
 
 
-@pytest.mark.parametrize("shrink", [4, COARSE_SCALE])
 @pytest.mark.parametrize(("start_px", "slope"), [(12.4, (0.02, 0.01)), (60.2, (0.05, -0.03)), (90.0, (0, 0))])
-def test_the_range_holds_the_truth(start_px: float, slope: tuple[float, float], shrink: int) -> None:
+def test_the_range_holds_the_truth(start_px: float, slope: tuple[float, float]) -> None:
     pair, truth = slanted_pair(480, 320, start_px, slope)
-    found = find_disparity_range(pair, shrink)
+    found = find_disparity_range(pair)
     assert isinstance(found, DisparityRange)
     assert found.lowest_px <= truth.min()
     assert truth.max() < found.highest_px

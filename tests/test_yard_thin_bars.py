@@ -148,7 +148,8 @@ def test_a_neighbour_is_left_out_only_where_no_line_across_it_comes_under_the_ma
         ]
         (check,) = beside_checks(place, MAGNET, ((one, tuple(lines)),))
         found.append((check.result == "failed", may_reach(one, place, MAGNET, one.top_z_m)))
-        assert not may_reach(one, place, MAGNET, one.top_z_m + 0.2)
+        assert not may_reach(one, place, MAGNET, one.top_z_m + 0.31)
+        assert may_reach(one, place, MAGNET, one.top_z_m + 0.29) == found[-1][1]
     assert (True, False) not in found and {(True, True), (False, False)} <= set(found)
 
 

@@ -17,7 +17,7 @@ from barsight.stereo.direct.pipeline import BarsightStereo
 from barsight.stereo.masking import mask_disparity, mask_gaps, mask_pieces, mask_unsure
 from barsight.stereo.method import StereoMethod
 from barsight.stereo.prediction import predict_disparity
-from barsight.stereo.search_range import COARSE_SCALE, find_disparity_range, follow_disparity_range
+from barsight.stereo.search_range import find_disparity_range, follow_disparity_range
 from barsight.stereo.settings import StereoSettings
 from barsight.stereo.triangulation import triangulate_disparity
 
@@ -163,11 +163,7 @@ def disparity_range(
     """Complete the settings' disparity range, its open ends found from the images and what is predicted."""
     low, high = stereo.min_disparity_px, stereo.max_disparity_px
     if low is None or high is None:
-        is_fast = stereo.method == "barsight" and stereo.barsight.preset == "fast"
-        if predicted is not None:
-            found = follow_disparity_range(pair, predicted)
-        else:
-            found = find_disparity_range(pair, COARSE_SCALE) if is_fast else find_disparity_range(pair)
+        found = find_disparity_range(pair) if predicted is None else follow_disparity_range(pair, predicted)
         if isinstance(found, Failed):
             return found
         low = found.lowest_px if low is None else low

@@ -15,7 +15,6 @@ from barsight.core.errors import Failed
 from barsight.core.types import DisparityRange, RectifiedCamera, RectifiedPair
 
 _SCALE = 4
-COARSE_SCALE = 8
 _USUAL_RATIO = 0.4
 _WIDEST_RATIO = 0.8
 _TOP_PX = 16
@@ -27,9 +26,8 @@ _MIN_CONSISTENT = 0.03
 _SPAN_PERCENT = (0.1, 99.9)
 
 
-def find_disparity_range(pair: RectifiedPair, shrink: int = _SCALE) -> DisparityRange | Failed:
-    """Find the range of disparities that a pair shows, widened by a margin. shrink: the match's scale, where
-    that says enough.
+def find_disparity_range(pair: RectifiedPair) -> DisparityRange | Failed:
+    """Find the range of disparities that a pair shows, widened by a margin.
 
     Failed `no-texture` where too little matches either way, `swapped` where left and right are exchanged; see
     also `check_matchable`.
@@ -38,10 +36,8 @@ def find_disparity_range(pair: RectifiedPair, shrink: int = _SCALE) -> Disparity
     if nothing is not None:
         return nothing
     doffs = pair.camera.doffs_px
-    disparity = coarse_disparity(pair.left, pair.right, doffs, shrink=shrink)
+    disparity = coarse_disparity(pair.left, pair.right, doffs)
     share = _finite_ratio(disparity)
-    if shrink > _SCALE and share < _POOR:
-        return find_disparity_range(pair)
     top = _USUAL_RATIO * pair.camera.width - doffs - _TOP_PX
     ends_at_top = share > 0 and np.nanpercentile(disparity, 99) > top
     if ends_at_top or share < _POOR:
@@ -71,7 +67,7 @@ def follow_disparity_range(pair: RectifiedPair, predicted: Float32) -> Disparity
     nothing = check_matchable(pair)
     if nothing is not None:
         return nothing
-    coarse = coarse_disparity(pair.left, pair.right, pair.camera.doffs_px, shrink=COARSE_SCALE)
+    coarse = coarse_disparity(pair.left, pair.right, pair.camera.doffs_px, shrink=2 * _SCALE)
     known = predicted[::_SCALE, ::_SCALE]
     if min(_finite_ratio(coarse), _finite_ratio(known)) < _POOR:
         return find_disparity_range(pair)

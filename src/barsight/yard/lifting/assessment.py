@@ -159,7 +159,7 @@ def assess_placement(
         checks += thin_bar_checks(yard.heights, yard.thin_line(load), load, pixel_m, settings)
         if has_pictures(yard.heights, pixel_m):
             others = [b for b in near.bundles if b not in load]
-            faces_z_m = contact.centre_z_m
+            faces_z_m = contact.centre_z_m - magnet.half_span_m * abs(math.tan(contact.pitch_rad))
             beside = (
                 (b, yard.thin_lines(b) if may_reach(b, place, magnet, faces_z_m) else ()) for b in others
             )

@@ -36,9 +36,6 @@ AROUND_CELLS = 9
 """Steps along a bar over which its scatter is taken."""
 WHITE_LEVEL, MIN_WHITE_LOG = 245.0, 0.1
 """Level from which on a picture tells no more, and the least such mean of what is as bright."""
-STRAP_CELLS, STRAP_RATIO, GAP_CELLS = 4, 0.7, 7
-"""What is no longer than the first, and wider than the second of the load, is a bright strap: one that shows
-on the bars' crests only has gaps of so many cells."""
 BRIGHTER_RATIO, FULL_LEVEL, MIN_LEVEL = 1.2, 215.0, 140.0
 """Gray level of a label over the median of the load, the level from which on a picture shows no more, and the
 least of a label."""
@@ -81,7 +78,7 @@ def find_label(
     faces_z_m = plane.centre_z_m + math.tan(plane.pitch_rad) * v[:, None] + math.tan(plane.roll_rad) * u
     is_low = z_m < faces_z_m - DEEP_M
     load = (gray > 0) & ~is_low
-    labels = mark_labels(gray, load & (np.abs(u) <= wide + broad), float(np.median(load.sum(axis=1))))
+    labels = mark_labels(gray, load & (np.abs(u) <= wide + broad))
     for mask in plate_masks(gray, z_m, SIZE_M):
         labels |= mask
     labels &= ~is_low
@@ -100,11 +97,12 @@ def _steps(reach_m: float) -> Float64:
     return np.asarray(STEP_M * np.arange(-count, count + 1), np.float64)
 
 
-def mark_labels(gray: Float32, load: Bool, load_cells: float) -> Bool:
-    """Mark the cells (V, U) of labels: bright, and at once darker before and behind along the bars.
+def mark_labels(gray: Float32, load: Bool) -> Bool:
+    """Mark the cells (V, U) of labels: bright, and at once darker before and behind along the bars. A bright
+    strap is marked as well.
 
     gray: levels, 0 where nothing was seen, which counts as dark. load: cells that tell the load's usual level
-    and its scatter. load_cells: the load's width.
+    and its scatter.
     """
     if not load.any():
         return np.zeros(gray.shape, np.bool_)
@@ -114,7 +112,7 @@ def mark_labels(gray: Float32, load: Bool, load_cells: float) -> Bool:
     edge = float(np.clip(EDGE_SIGMAS * scatter, *MIN_EDGE_LOG))
     needed = max(min(BRIGHTER_RATIO * float(np.median(gray[load])), FULL_LEVEL), MIN_LEVEL)
     bright = mean > np.log(needed + _DARK)
-    short, long = np.zeros((2, *gray.shape), np.bool_)
+    marked = np.zeros(gray.shape, np.bool_)
     for length in LENGTH_CELLS:
         if length + 2 * _BESIDE > len(gray):
             break
@@ -124,10 +122,9 @@ def mark_labels(gray: Float32, load: Bool, load_cells: float) -> Bool:
         is_white = lowest > np.log(WHITE_LEVEL + _DARK)
         found = wide & (edges > np.where(is_white, MIN_WHITE_LOG, edge))
         found = ndimage.binary_dilation(found, np.ones((1, WIDTH_CELLS), np.bool_))
-        marked = short if length <= STRAP_CELLS else long
         for row in range(_BESIDE, _BESIDE + length):
             marked[row : row + len(found)] |= found
-    return np.asarray(bright & (long | _without_straps(short, STRAP_RATIO * load_cells)), np.bool_)
+    return np.asarray(bright & marked, np.bool_)
 
 
 def _edge_logs(level: Float32, length: int) -> tuple[Float32, Float32]:
@@ -144,18 +141,6 @@ def _edge_logs(level: Float32, length: int) -> tuple[Float32, Float32]:
         for far, middle, near in (rows[:3], rows[:-4:-1])
     ]
     return np.asarray(lowest - np.maximum(*bare)), np.asarray(lowest)
-
-
-def _without_straps(marked: Bool, widest: float) -> Bool:
-    """Unmark what goes on across the bars for longer than `widest` cells, gaps of a few closed."""
-    padded = np.pad(marked, ((0, 0), (GAP_CELLS, GAP_CELLS)))
-    closed = ndimage.binary_closing(padded, np.ones((1, GAP_CELLS), np.bool_))[:, GAP_CELLS:-GAP_CELLS]
-    numbers, _ = ndimage.label(closed, np.ones((3, 3)))
-    wide = [
-        number for number, place in enumerate(ndimage.find_objects(numbers), start=1)
-        if place[1].stop - place[1].start > widest
-    ]  # fmt: skip
-    return marked & ~np.isin(numbers, wide)
 
 
 def _look_up(place: Placement, heights: HeightMap, v: Float64, u: Float64) -> tuple[Float32, Float32]:

@@ -20,9 +20,9 @@ FOUND_PX = 1.8
 """Diameter of a bar, in the photo's pixels, from which on nine of ten are found."""
 BEYOND_M = 0.4
 """So far beyond a bundle's flank a bar that lies across it may stick out."""
-BELOW_M = 0.15
-"""A bar that lies on a bundle so far below the faces doesn't rise to them: it would rest on the load, and
-show there."""
+BELOW_M = 0.3
+"""A bar that lies on a bundle so far below the faces doesn't rise to them, though it may lean by a slope of a
+half where it sticks out."""
 WAY_STEP_M, UNSEEN_STEP_M = 0.02, 0.1
 
 
@@ -108,9 +108,10 @@ def beside_checks(
 def may_reach(bundle: Bundle, place: Placement, magnet: Magnet, faces_z_m: float) -> bool:
     """Check whether a line of any slope across a bundle could come under the magnet, by the rectangle about
     all of them along each of the magnet's axes, and by its height: where it can't, the bundle's photo need
-    not be searched.
+    not be searched. faces_z_m: of the lowest face.
     """
-    if bundle.top_z_m < faces_z_m - BELOW_M:
+    highest_m = bundle.top_z_m + bundle.length_m / 2 * abs(math.tan(bundle.pitch_rad))
+    if highest_m < faces_z_m - BELOW_M:
         return False
     along, across = _axes(bundle)
     wide = bundle.width_m / 2 + BEYOND_M

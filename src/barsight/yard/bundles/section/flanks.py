@@ -47,11 +47,11 @@ class Flanks:
         return self._doubt(_SURE_RATIO)
 
     def _doubt(self, shallow_ratio: float) -> str:
-        for name, fall, rise, ended in zip(
-            ("low", "high"), self.falls_m, self.rises_m, self.ended, strict=True
-        ):
+        sides = list(zip(("low", "high"), self.falls_m, self.rises_m, self.ended, strict=True))
+        for name, fall, rise, ended in sides:
             if fall < _FLAT_RATIO * self.width_m and not (ended and rise <= _HIGHER_M):
                 return f"its {name} flank was not seen: something may lie over it"
+        for name, fall, rise, _ in sides:
             if fall < shallow_ratio * self.width_m and _HIGHER_M < rise < self.width_m:
                 return f"what stands {1e3 * rise:.0f} mm higher beside it may lie over its {name} flank"
         return ""
