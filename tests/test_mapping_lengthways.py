@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from barsight.mapping.surface.bar_directions import choose_directions, elect_directions
 from barsight.mapping.surface.directional_filter import (
     blur_sigma,
     deblur_across,
@@ -102,6 +103,22 @@ def test_a_rod_that_lies_nearly_along_the_bars_stays_nearly_as_high(askew_deg: f
     noisy = (truth + rng.normal(0, 0.002, truth.shape)).astype(np.float32)
     error = (smooth_along_bars(noisy, np.ones_like(noisy), GATE_M, REACH)[0] - truth)[30:-30]
     assert abs(error[rod[30:-30]].mean()) < most_m
+
+
+@pytest.mark.parametrize("turn_deg", [7.0, 62.0])
+def test_blocks_elect_a_finer_direction_than_cells_choose(turn_deg: float) -> None:
+    z = (bars(turn_deg) + np.random.default_rng(3).normal(0, 0.002, (120, 120))).astype(np.float32)
+    z[:, :8] = np.nan
+    chosen = choose_directions(z, np.isfinite(z), GATE_M, REACH)
+    elected = elect_directions(z, chosen, GATE_M, REACH)
+    assert (elected[:, :8] == -1).all() and (chosen[:, :8] == -1).all()
+    inner = slice(30, -30), slice(30, -30)
+    # Bars turned from the y axis run at 90 degrees and more from the rows.
+    off = [
+        np.abs((part[inner] * step - 90 - turn_deg + 90) % 180 - 90)
+        for part, step in ((chosen, 180 / 16), (elected, 180 / 80))
+    ]
+    assert np.median(off[1]) < 1.2 < np.median(off[0])
 
 
 def test_a_step_stays_a_step() -> None:

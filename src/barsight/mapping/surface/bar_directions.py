@@ -32,7 +32,7 @@ def choose_directions(z: Float32, known: Bool, gate_m: float, reach: int) -> Int
     reach = min(reach, CHOICE_CELLS)
     rows, columns = line_cells(DIRECTIONS, reach)
     padded = np.pad(z, reach, constant_values=np.nan)
-    return _most_alike(padded, known, np.float32(gate_m), rows, columns, reach)
+    return _choose(padded, known, np.float32(gate_m), rows, columns, reach)
 
 
 def elect_directions(z: Float32, direction: Int8, gate_m: float, reach: int) -> Int8:
@@ -60,7 +60,7 @@ def line_cells(directions: int, reach: int) -> tuple[Int64, Int64]:
 
 
 @kernel()
-def _most_alike(z: Float32, known: Bool, gate_m: np.float32, rows: Int64, columns: Int64, reach: int) -> Int8:
+def _choose(z: Float32, known: Bool, gate_m: np.float32, rows: Int64, columns: Int64, reach: int) -> Int8:
     """Choose the direction with the least sum of squares, the first of those that are alike.
 
     z: (H + 2 reach, W + 2 reach). The squares of a whole row of cells are summed at once, direction by
@@ -165,7 +165,10 @@ def _near_own(
 
 @kernel()
 def _squares(z: Float32, i: int, j: int, rows: Int64, columns: Int64, gate_m: np.float32) -> np.float32:
-    """Sum the squared differences from cell (i, j) along one direction, each no more than the gate."""
+    """Sum the squared differences from cell (i, j) along one direction, each no more than the gate.
+
+    z: (H, W). rows, columns: (N,) cells from there.
+    """
     squares = np.float32(0)
     for k in range(rows.size):
         gap = abs(z[i + rows[k], j + columns[k]] - z[i, j])
