@@ -15,6 +15,7 @@ import numpy as np
 from scipy import ndimage
 
 from barsight.benchmarks.lift_judge.magnet import read_magnet
+from barsight.cli.bench.lifts import OVER_MAGNET_M, SPAN_M
 from barsight.core.arrays import Bool, Float32, Float64
 from barsight.result_folder import read_heights
 from barsight.simulation.worlds.solids import Solid
@@ -22,10 +23,9 @@ from barsight.simulation.worlds.yards import draw_yard
 from barsight.yard.inventory.bundle_file import read_bundles
 from barsight.yard.lifting.labels import mark_labels
 from barsight.yard.magnet.description import example_magnet
+from barsight.yard.stability.stability import nearest_cells
 from barsight.yard.types import Bundle, HeightMap
 
-OVER_MAGNET_M, SPAN_M = 0.3, 3.0
-"""Of drawn yards: as `bench lifts` draws them."""
 STEP_M, ASIDE_M, DEEP_M, POLE_M = 0.01, 0.12, 0.04, 0.09
 """Cells, margin beside a bundle, depth under its top, and half the width that tells its usual level."""
 SAME_M, NEAR_CELLS, FAR_CELLS = 0.02, (3, 2), (10, 6)
@@ -40,12 +40,7 @@ def strip_of(bundle: Bundle, heights: HeightMap) -> tuple[Float32, Float64, Floa
     c, s = np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad)
     x = bundle.centre_m[0] + c * u - s * v[:, None]
     y = bundle.centre_m[1] + s * u + c * v[:, None]
-    row, column = (
-        np.rint((at - first) / heights.cell_m).astype(int)
-        for at, first in ((y, heights.y0_m), (x, heights.x0_m))
-    )
-    inside = (row >= 0) & (column >= 0) & (row < heights.shape[0]) & (column < heights.shape[1])
-    row, column = row.clip(0, heights.shape[0] - 1), column.clip(0, heights.shape[1] - 1)
+    column, row, inside = nearest_cells(heights, x, y)
     assert heights.gray is not None
     gray = np.where(inside, heights.gray[row, column], 0).astype(np.float32)
     return gray, np.where(inside, heights.z_m[row, column], np.nan), u
