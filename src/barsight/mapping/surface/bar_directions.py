@@ -152,14 +152,12 @@ def _near_own(
             own, block = direction[i, j] * FINE_RATIO, elected[i // BLOCK_CELLS, j // BLOCK_CELLS]
             apart = abs(block - own)
             apart = min(apart, FINE_RATIO * DIRECTIONS - apart)
-            out[i, j] = own
-            if block < 0 or apart > _NEAR:
-                continue
-            most = np.float32(np.inf)
-            if apart > FINE_RATIO // 2:
-                most = _MAX_SQUARES_RATIO * _squares(z, i + reach, j + reach, rows[own], columns[own], gate_m)
-            if _squares(z, i + reach, j + reach, rows[block], columns[block], gate_m) <= most:
-                out[i, j] = block
+            is_near = block >= 0 and apart <= _NEAR
+            if is_near and apart > FINE_RATIO // 2:
+                ours = _squares(z, i + reach, j + reach, rows[own], columns[own], gate_m)
+                theirs = _squares(z, i + reach, j + reach, rows[block], columns[block], gate_m)
+                is_near = theirs <= _MAX_SQUARES_RATIO * ours
+            out[i, j] = block if is_near else own
     return out
 
 
