@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -12,12 +14,15 @@ from barsight.core.errors import ConfigError
 from barsight.core.types import HeightSource
 from barsight.yard.bundles.collinear_pieces import join_pieces
 from barsight.yard.bundles.detection import _on, find_bundles
+from barsight.yard.bundles.doubts import measure_laid
 from barsight.yard.bundles.fitting.ends import middle_and_length_sigma
 from barsight.yard.bundles.fitting.outline import bundle_width
 from barsight.yard.bundles.fitting.outline_fit import Fit
+from barsight.yard.bundles.fitting.outline_fit import Z as OUTLINE_Z
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.headings import find_headings
 from barsight.yard.bundles.layers import list_overlaps
+from barsight.yard.bundles.reading import Reading
 from barsight.yard.bundles.section.flanks import Flanks
 from barsight.yard.bundles.section.seen_section import SeenSection, _edge, estimate_section, is_no_hexagon
 from barsight.yard.types import Bundle, HeightMap
@@ -250,6 +255,22 @@ def test_a_beams_end_on_a_flank_holds_the_bundle_down(
     heights.z_m[(np.abs(y - 0.6) < width_m / 2)[:, None] & (x > from_axis_m)[None]] += rise_m
     (bundle,) = [b for b in find_bundles(heights, SETTINGS) if abs(b.centre_m[0]) < 0.05]
     assert bundle.is_free is is_free
+
+
+@pytest.mark.parametrize(("top_m", "own_m", "laid_m"), [(0.1, 0.0, 0.0), (0.2, 0.0, 0.2), (0.1, 0.07, 0.03)])
+def test_dunnage_that_shows_in_a_gully_lies_beside_the_bundle(
+    top_m: float, own_m: float, laid_m: float
+) -> None:
+    """The outline is 0.25 m wide, 40 mm too much: there own_m shows, and at one place what is top_m high."""
+    v, u = 0.01 * np.arange(200) - 1, 0.01 * np.arange(25) - 0.12
+    z = np.where(u < 0.085, 0.24, own_m) + np.zeros((200, 1))
+    z[(np.abs(v) < 0.05)[:, None] & (u > 0.085)[None]] = top_m
+    values = np.zeros(6)
+    values[OUTLINE_Z] = 0.125
+    fit = SimpleNamespace(width_m=0.24, first=0, last=199, v_m=0.0, values=values)
+    grid = SimpleNamespace(z_m=z, cell_m=0.01, u0_m=u[0], v0_m=v[0])
+    reading = SimpleNamespace(found=SimpleNamespace(grid=grid, fit=fit), pack=None)
+    assert measure_laid(cast(Reading, reading)) == pytest.approx(laid_m)
 
 
 def test_outlines_that_overlap_leave_open_which_bundle_lies_over_the_other() -> None:

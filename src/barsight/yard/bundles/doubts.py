@@ -10,7 +10,7 @@ from barsight.core.linalg.robust import known_median
 from barsight.yard.bundles.crossing_bundles import rise_over
 from barsight.yard.bundles.fitting.ends import End
 from barsight.yard.bundles.fitting.outline import BARS_OF_RINGS, bundle_width
-from barsight.yard.bundles.fitting.outline_fit import ABOVE, AGREES, BELOW, DIAMETER, SLOPE_U, SLOPE_Z, U
+from barsight.yard.bundles.fitting.outline_fit import ABOVE, AGREES, BELOW, DIAMETER, SLOPE_U, SLOPE_Z, U, Z
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.reading import Reading
 from barsight.yard.bundles.section.seen_section import SeenSection, is_no_hexagon
@@ -23,6 +23,8 @@ _LIES_M, _ONE_PLACE_M = 0.02, 0.3
 thing. Dunnage comes in twos and more."""
 _LAID_M, _LAID_SIZE_M = 0.02, (0.04, 0.03)
 """Least rise of a thing that lies over a part of a bundle's width, and its size along and across."""
+_GULLY_RATIO = 0.25
+"""Of a bundle's width under its axis: where its surface lies lower in the median, it is another's."""
 _BEFORE_END_M = 0.05
 """Rows nearer to an end tell nothing of that: bars end unevenly."""
 _SURE_KNOWN = 0.7
@@ -110,7 +112,8 @@ def measure_laid(reading: Reading) -> float:
     does; 0 where nothing does.
 
     Heights are taken over the bundle's own section, the median along it at each place across. A thing is a
-    patch that everywhere holds a square of _LAID_SIZE_M and rises by _LAID_M.
+    patch that everywhere holds a square of _LAID_SIZE_M and rises by _LAID_M. What stands no higher than the
+    axis where nothing of the section shows lies beside the bundle: dunnage, that is, which shows in a gully.
     """
     grid, fit, pack = reading.found.grid, reading.found.fit, reading.pack
     low, high = -fit.width_m / 2, fit.width_m / 2
@@ -126,7 +129,9 @@ def measure_laid(reading: Reading) -> float:
     inside = (column >= 0) & (column < grid.z_m.shape[1])
     z = grid.z_m[rows[:, None], np.where(inside, column, 0).astype(np.int64)]
     z = np.where(inside, z - fit.values[SLOPE_Z] * along[:, None], np.nan)
-    rise = np.where(np.isfinite(z), z - known_median(z), -np.inf)
+    own = known_median(z)
+    in_gully = (own < fit.values[Z] - _GULLY_RATIO * fit.width_m) & (z < fit.values[Z])
+    rise = np.where(np.isfinite(z) & ~in_gully, z - own, -np.inf)
     size = [max(round(side / grid.cell_m), 1) for side in _LAID_SIZE_M]
     laid = ndimage.binary_opening(rise > _LAID_M, np.ones(size, bool))
     return float(rise[laid].max(initial=0.0))
