@@ -20,7 +20,7 @@ from barsight.core.pose import Pose
 from barsight.core.stamps import seconds_to_ns
 from barsight.core.types import PosedFrame, Trajectory
 from barsight.evaluation.score import score_folder
-from barsight.evaluation.trajectory_error import frame_errors
+from barsight.evaluation.trajectory_error import frame_errors, trajectory_drift
 from barsight.recording.formats.ground_truth import read_ground_truth
 from barsight.result_folder import read_summary
 from barsight.yard.inventory.bundle_file import read_bundles
@@ -33,6 +33,12 @@ bar that is seen across it covers it, in a world's truth."""
 SEEN_FRAMES, SEEN_RATIO = 2, 0.5
 """A bundle is asked for where so many frames see at least this share of its axis in both cameras."""
 MAP_ROWS = ("contour, smooth places", "contour, everywhere", "height, smooth stack", "height, seen by two")
+POSE_ROWS = {
+    "ground below the frames: RMSE, mm": "rmse_mm",
+    "poses: attitude, RMSE, deg": "attitude_rmse_deg",
+    "poses but for one rigid motion: place, RMSE, mm": "aligned_rmse_mm",
+    "poses but for one rigid motion: attitude, RMSE, deg": "aligned_rmse_deg",
+}
 BUNDLE_ROWS = {
     "lateral": "mm", "yaw": "deg", "top": "mm", "width": "mm", "diameter": "mm", "low end": "mm",
     "high end": "mm", "mass": "kg",
@@ -43,11 +49,11 @@ BUNDLE_ROWS = {
 class WorldScore:
     """Scores of one world. refused: why it could not be measured, empty where it was.
 
-    maps: as `score_folder` has them, mm. poses: of the ground below the frames. counts: free bundles in
-    sight, how many were found, bundles said to be free, how many of those are wrong, at how many of those no
-    bundle lies whether free or not, how often a number of bars was said and right, single bars in sight and
-    found. errors, sigmas: by figure of the bundles that
-    were found, m (yaw rad, mass t).
+    maps: as `score_folder` has them, mm. poses: of the ground below the frames, and of the poses themselves,
+    as they stand and after the best rigid motion. counts: free bundles in sight, how many were found, bundles
+    said to be free, how many of those are wrong, at how many of those no bundle lies whether free or not, how
+    often a number of bars was said and right, single bars in sight and found. errors, sigmas: by figure of
+    the bundles that were found, m (yaw rad, mass t).
     """
 
     seed: int
@@ -166,13 +172,9 @@ def _map_rows(kind: str, worlds: Sequence[WorldScore]) -> Iterable[WorldRow]:
             yield from _over_worlds(
                 kind, "cells seen by two that are measured, %", figures, "coverage_pct", min
             )
-    yield from _over_worlds(
-        kind,
-        "ground below the frames: RMSE, mm",
-        [(w.poses, w.seed) for w in worlds if w.poses],
-        "rmse_mm",
-        max,
-    )
+    poses = [(w.poses, w.seed) for w in worlds if w.poses]
+    for name, key in POSE_ROWS.items():
+        yield from _over_worlds(kind, name, poses, key, max)
 
 
 def _over_worlds(
@@ -185,7 +187,8 @@ def _over_worlds(
         return
     samples = np.array([one["samples"] for one, _ in figures])
     inside = np.array([one["within_95_pct"] for one, _ in figures])
-    share = float((samples * inside).sum() / samples.sum()) if key != "coverage_pct" else math.nan
+    has_sigma = key in ("p95_mm", "rmse_mm")
+    share = float((samples * inside).sum() / samples.sum()) if has_sigma else math.nan
     bad, seed = worst(values)
     n = round(samples.sum())
     yield WorldRow(kind, name, n, float(np.median([v for v, _ in values])), bad, seed, share)
@@ -256,15 +259,13 @@ def _poses(recording: Path, out: Path) -> dict[str, float]:
         return {}
     path = read_ground_truth(out / "trajectory.tum", reference="yard")
     frames = tuple(
-        PosedFrame(int(stamp), pose, np.zeros((6, 6)))
-        for stamp, pose in zip(path.stamp_ns, path.poses, strict=True)
+        PosedFrame(int(stamp), pose, np.eye(6)) for stamp, pose in zip(path.stamp_ns, path.poses, strict=True)
     )
     rig = json.loads((recording / "truth" / "rig.json").read_text(encoding="utf-8"))
     shift = seconds_to_ns(rig["time_offset_s"])
-    found = frame_errors(
-        Trajectory("yard", frames, (), ()), read_ground_truth(recording, reference="yard"), shift
-    )
-    if found is None:
+    trajectory, truth = Trajectory("yard", frames, (), ()), read_ground_truth(recording, reference="yard")
+    found, drift = frame_errors(trajectory, truth, shift), trajectory_drift(trajectory, truth, shift)
+    if found is None or drift is None:
         return {}
     poses: dict[int, Pose] = {frame.stamp_ns: frame.reference_from_body for frame in frames}
     sigma_of = dict(zip(travel["stamp_ns"], travel["sigma_m"], strict=True))
@@ -283,4 +284,7 @@ def _poses(recording: Path, out: Path) -> dict[str, float]:
         "rmse_mm": 1e3 * float(np.sqrt((error**2).sum(axis=1).mean())),
         "max_mm": 1e3 * float(np.linalg.norm(error, axis=1).max()),
         "within_95_pct": 100 * float(inside.mean()),
+        "attitude_rmse_deg": drift.reference_rmse_deg,
+        "aligned_rmse_mm": drift.aligned_rmse_mm,
+        "aligned_rmse_deg": drift.aligned_rmse_deg,
     }
