@@ -89,11 +89,12 @@ def time_chain(path: Path, repeats: int = MIN_REPEATS) -> tuple[SpeedResult, ...
     recording, settings = open_recording(path), MeasureSettings()
     if recording.crane() is None:
         raise InputError(path, "has no encoders, by which pairs are predicted", "give one with crane0")
-    reader, length = RectifiedPairs(recording, Rectifier(recording.rig)), settings.stereo.confirmed_pairs + 1
-    pairs = [pair for pair in islice(reader(), length) if isinstance(pair, RectifiedPair)]
-    candidates = find_disparity_range(pairs[0]) if len(pairs) == length else None
+    reader = RectifiedPairs(recording, Rectifier(recording.rig))
+    chain = list(islice(reader(), settings.stereo.confirmed_pairs + 1))
+    pairs = [pair for pair in chain if isinstance(pair, RectifiedPair)]
+    candidates = find_disparity_range(pairs[0]) if 1 < len(pairs) == len(chain) else None
     if not isinstance(candidates, DisparityRange):
-        raise MeasurementError(f"{path}: its first {length} pairs can't all be matched")
+        raise MeasurementError(f"{path}: its first pairs, six or at least two, can't all be matched")
     usual = DisparityRange(candidates.lowest_px, candidates.lowest_px + CANDIDATES)
     matchers, rounds = [_five_path_sgbm(one) for one in (usual, candidates)], []
     for _ in range(repeats + 1):
@@ -101,7 +102,7 @@ def time_chain(path: Path, repeats: int = MIN_REPEATS) -> tuple[SpeedResult, ...
         for pair in pairs:
             rounds += [_seconds(partial(matcher.compute, pair.left, pair.right)) for matcher in matchers]
             rounds.append(_seconds(partial(match, pair)))
-    reference, narrow, own = np.array(rounds).reshape(-1, length, 3, 2)[1:].transpose(2, 0, 1, 3)
+    reference, narrow, own = np.array(rounds).reshape(-1, len(pairs), 3, 2)[1:].transpose(2, 0, 1, 3)
     place, unknown = path.resolve().name, float("nan")
     return (
         _result(f"SGBM on {place}", reference, reference, unknown),

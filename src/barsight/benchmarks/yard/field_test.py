@@ -18,6 +18,7 @@ from barsight.recording.base import Recording
 VARIANTS: dict[str, tuple[str, ...]] = {
     "paper": ("--stereo.method", "paper", "--motion.estimator", "paper", "--map.contours", "paper"),
     "sgbm": ("--stereo.method", "sgbm"),
+    "sgbm 5path": ("--stereo.method", "sgbm", "--stereo.sgbm.mode", "5path"),
     "ours": (),
     "ours fast": ("--preset", "fast"),
     "ours crane-only": ("--motion.estimator", "crane"),
@@ -25,8 +26,9 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "ours self-calibrated": ("--self-calibrate", "yaw"),
     "ours paper-contours": ("--map.contours", "paper"),
 }
-"""What `barsight measure` is told. sgbm has our trajectory and fusion. The last rows are the ablation:
-trajectory, fusion (any height that enough views see, each cell for itself), self-calibration, contours."""
+"""What `barsight measure` is told. sgbm has our trajectory and fusion; it sums costs along four paths,
+`sgbm 5path` along five. The last rows are the ablation: trajectory, fusion (any height that
+enough views see, each cell for itself), self-calibration, contours."""
 
 _HEADS = ("bias_mm", "mae_mm", "p95_mm", "coverage_pct", "within_95_pct")
 

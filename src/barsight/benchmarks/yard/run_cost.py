@@ -50,10 +50,12 @@ def measure_apart(recording: Path, out: Path, flags: tuple[str, ...]) -> RunCost
 def cost_table(title: str, costs: Mapping[str, RunCost], reference: str) -> Table:
     """Tabulate runs side by side, over `reference` where it is one of them, then their stages in s."""
     caption = "Stages: s by the clock; those that run side by side count each in full."
-    table = Table(title=title, caption=caption, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    table.add_column("")
+    if reference in costs:
+        caption = f"times: over {reference}. {caption}"
+    table = Table(title=title, caption=caption, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table.add_column("", no_wrap=True)
     for name in costs:
-        table.add_column(name, justify="right")
+        table.add_column(name, justify="right", overflow="fold")
     runs = tuple(costs.values())
     heads = {
         "wall s": [run.wall_s for run in runs],
@@ -67,7 +69,7 @@ def cost_table(title: str, costs: Mapping[str, RunCost], reference: str) -> Tabl
         place = list(costs).index(reference)
         for head, values in heads.items():
             ratios = (f"{value / values[place]:.2f}" for value in values)
-            table.add_row(f"{head.split()[0]} over {reference}", *ratios)
+            table.add_row(f"{head.split()[0]}, times", *ratios)
     table.add_section()
     for stage in dict.fromkeys(stage for run in runs for stage in run.stage_s):
         cells = (f"{run.stage_s[stage]:.1f}" if stage in run.stage_s else "-" for run in runs)
