@@ -111,9 +111,9 @@ def _stereo_speed(
             "barsight fast, no guesses": BarsightSettings(preset="fast", fill_occlusions=False),
         }.items():
             made[name] = make_method(StereoSettings(barsight=settings))
+    in_chain = () if recording is None else time_chain(recording, repeats)
     bench = bench_speed(made, repeats)
-    if recording is not None:
-        bench = replace(bench, methods=(*bench.methods, *time_chain(recording, repeats)))
+    bench = replace(bench, methods=(*bench.methods, *in_chain))
     SafeConsole().print(speed_table(bench))
     if save is not None:
         write_json(save, bench)
