@@ -69,6 +69,20 @@ def test_the_live_estimate_is_timed(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert bench["grown_mib"][-1] - bench["grown_mib"][2] < 20
 
 
+def test_a_live_step_is_timed_whole_and_by_parts(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    saved = tmp_path / "step.json"
+    assert run(["bench", "live-step", str(recording), "--json", str(saved)]) == 0
+    assert "3 in the map" in capsys.readouterr().out
+    bench = json.loads(saved.read_text())
+    assert (bench["pairs"], bench["fused"]) == (4, 3), "the last pair waits for the one after it"
+    parts = {part["part"].strip(): part for part in bench["parts"]}
+    step, added = parts["step"], parts["placed, matched, fused"]
+    assert 0 < parts["of that stereo"]["wall_ms"] < added["wall_ms"] < step["wall_ms"]
+    assert step["cpu_p95_ms"] >= step["cpu_ms"] > parts["rectified"]["cpu_ms"] > 0
+
+
 def test_the_front_end_is_timed(data: Path, tmp_path: Path) -> None:
     saved = tmp_path / "front_end.json"
     still = str(data / "euroc_v101_still")

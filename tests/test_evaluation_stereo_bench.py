@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -12,10 +13,11 @@ import pytest
 from barsight.benchmarks.stereo.middlebury import bench_stereo, scene_table, stereo_table
 from barsight.benchmarks.stereo.middlebury_scenes import load_scene, load_scenes
 from barsight.benchmarks.stereo.scores import score_disparity
-from barsight.benchmarks.stereo.speed import bench_speed, speed_table
+from barsight.benchmarks.stereo.speed import bench_speed, speed_table, time_chain
 from barsight.core.errors import InputError
 from barsight.core.json_values import write_json
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
+from barsight.stereo.direct.pipeline import BarsightStereo
 from barsight.stereo.disparity_files import write_disparity
 
 
@@ -129,3 +131,25 @@ def test_bench_speed_times_methods_against_sgbm(tmp_path: Path) -> None:
     assert speed_table(bench).row_count == 2
     write_json(tmp_path / "out.json", bench)
     assert json.loads((tmp_path / "out.json").read_text())["methods"][0]["method"] == "instant"
+
+
+def test_all_pairs_of_a_chain_but_the_first_are_timed_as_predicted(
+    recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    confirmed: list[int] = []
+    confirm = BarsightStereo.confirm
+
+    def counted(
+        self: BarsightStereo, pair: RectifiedPair, candidates: DisparityRange, predicted: np.ndarray
+    ) -> Disparity:
+        confirmed.append(pair.stamp_ns)
+        return confirm(self, pair, candidates, predicted)
+
+    monkeypatch.setattr(BarsightStereo, "confirm", counted)
+    sgbm, narrow, first, predicted = time_chain(recording, repeats=2)
+    assert len(set(confirmed)) == 3 and len(confirmed) == 3 * (1 + 2), "four pairs, three rounds"
+    assert (first.time.repeats, predicted.time.repeats, sgbm.time.repeats) == (2, 6, 8)
+    assert sgbm.ratio == sgbm.cpu_ratio == 1 and narrow.ratio < 1 < first.ratio
+    shutil.rmtree(recording / "mav0" / "crane0")
+    with pytest.raises(InputError, match="no encoders"):
+        time_chain(recording)

@@ -1,20 +1,35 @@
-"""Time every method on 1280x1024 with 96 candidates (`bench stereo-speed`), against OpenCV's 5-path SGBM."""
+"""Time every method on 1280x1024 with 96 candidates, and pairs of a recording as a map matches them
+(`bench stereo-speed`), against OpenCV's 5-path SGBM.
+"""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
+from itertools import islice
+from pathlib import Path
 
 import cv2
 import numpy as np
+from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from barsight.benchmarks.provenance import MIN_REPEATS, Provenance, Timing, provenance, summarise_times
 from barsight.benchmarks.stereo.middlebury_scenes import pair_from_images
-from barsight.core.arrays import Float32, UInt8
+from barsight.calibration.geometry.rectification import Rectifier
+from barsight.core.arrays import Float32, Float64, UInt8
+from barsight.core.errors import InputError, MeasurementError
+from barsight.core.timing import Stopwatch
 from barsight.core.types import DisparityRange, RectifiedPair
+from barsight.map_building import matching
+from barsight.measure_settings import MeasureSettings
+from barsight.recording.open import open_recording
+from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.stereo.method import StereoMethod
+from barsight.stereo.search_range import find_disparity_range
 
 WIDTH_PX, HEIGHT_PX, CANDIDATES = 1280, 1024, 96
 
@@ -23,7 +38,7 @@ WIDTH_PX, HEIGHT_PX, CANDIDATES = 1280, 1024, 96
 class SpeedResult:
     """One method. ratio: its wall time over OpenCV's 5-path SGBM's, median of the rounds. cpu_ratio: the same
     of the processor time of all cores: what other programs on the machine take doesn't count there.
-    median_error_px: of the absolute error where there is a disparity.
+    median_error_px: of the absolute error where there is a disparity; NaN on a recording.
     """
 
     method: str
@@ -50,9 +65,7 @@ def bench_speed(methods: Mapping[str, StereoMethod], repeats: int = MIN_REPEATS)
     `repeats` rounds SGBM and all methods in turn, after one round that gives the errors.
     """
     pair, candidates, truth_px = speed_pair()
-    matcher = cv2.StereoSGBM.create(
-        minDisparity=0, numDisparities=CANDIDATES, blockSize=5, P1=200, P2=800, mode=cv2.STEREO_SGBM_MODE_SGBM
-    )
+    matcher = _five_path_sgbm(candidates)
     works: list[Callable[[], object]] = [lambda: matcher.compute(pair.left, pair.right)]
     works += [lambda method=method: method(pair, candidates) for method in methods.values()]  # type: ignore[misc]
     fixed = matcher.compute(pair.left, pair.right)
@@ -60,14 +73,43 @@ def bench_speed(methods: Mapping[str, StereoMethod], repeats: int = MIN_REPEATS)
     found += [method(pair, candidates).disparity_px for method in methods.values()]
     errors = [float(np.nanmedian(np.abs(one - truth_px))) for one in found]
     rounds = np.array([[_seconds(work) for work in works] for _ in range(repeats)])
-    ratios = np.median(rounds / rounds[:, :1], axis=0)
     results = tuple(
-        SpeedResult(
-            name, summarise_times(rounds[:, i, 0]), float(ratios[i, 0]), float(ratios[i, 1]), errors[i]
-        )
-        for i, name in enumerate(methods, start=1)
+        _result(name, rounds[:, i], rounds[:, 0], errors[i]) for i, name in enumerate(methods, start=1)
     )
     return SpeedBench(provenance(), summarise_times(rounds[:, 0, 0]), errors[0], results)
+
+
+def time_chain(path: Path, repeats: int = MIN_REPEATS) -> tuple[SpeedResult, ...]:
+    """Time the first chain of pairs of a recording as `measure` matches them for its map, range and masks
+    included: the first from nothing, each other from the one before. SGBM has its turns on each of them, with
+    96 candidates and with those that the first pair shows. A round before isn't counted.
+
+    Raises InputError or MeasurementError where the recording has no such chain.
+    """
+    recording, settings = open_recording(path), MeasureSettings()
+    if recording.crane() is None:
+        raise InputError(path, "has no encoders, by which pairs are predicted", "give one with crane0")
+    reader = RectifiedPairs(recording, Rectifier(recording.rig))
+    chain = list(islice(reader(), settings.stereo.confirmed_pairs + 1))
+    pairs = [pair for pair in chain if isinstance(pair, RectifiedPair)]
+    candidates = find_disparity_range(pairs[0]) if 1 < len(pairs) == len(chain) else None
+    if not isinstance(candidates, DisparityRange):
+        raise MeasurementError(f"{path}: its first pairs, six or at least two, can't all be matched")
+    usual = DisparityRange(candidates.lowest_px, candidates.lowest_px + CANDIDATES)
+    matchers, rounds = [_five_path_sgbm(one) for one in (usual, candidates)], []
+    for _ in range(repeats + 1):
+        match = matching(reader, settings, None, Stopwatch())
+        for pair in pairs:
+            rounds += [_seconds(partial(matcher.compute, pair.left, pair.right)) for matcher in matchers]
+            rounds.append(_seconds(partial(match, pair)))
+    reference, narrow, own = np.array(rounds).reshape(-1, len(pairs), 3, 2)[1:].transpose(2, 0, 1, 3)
+    place, unknown = path.resolve().name, float("nan")
+    return (
+        _result(f"SGBM on {place}", reference, reference, unknown),
+        _result(f"SGBM, the {candidates.count} of its range", narrow, reference, unknown),
+        _result(f"first pair of {place}", own[:, :1], reference[:, :1], unknown),
+        _result(f"predicted pair of {place}", own[:, 1:], reference[:, 1:], unknown),
+    )
 
 
 def speed_pair() -> tuple[RectifiedPair, DisparityRange, Float32]:
@@ -93,18 +135,34 @@ def speed_table(bench: SpeedBench) -> Table:
     table = Table(
         title=f"{WIDTH_PX}x{HEIGHT_PX}, {CANDIDATES} candidates, {bench.provenance.cores} cores",
         caption=f"Median (range) of {bench.reference.repeats} rounds, all in turn. times SGBM: wall time "
-        "over OpenCV's 5-path SGBM's of the same round; processor time: the same of all cores' together.",
+        "over OpenCV's 5-path SGBM's of the same round, 96 candidates; CPU: the same of all cores together.",
+        box=SIMPLE_HEAD,
     )
     table.add_column("method")
-    for heading in ("ms", "times SGBM", "processor time", "median error px"):
+    for heading in ("ms", "times SGBM", "CPU", "error px"):
         table.add_column(heading, justify="right")
     table.add_row(
         "OpenCV's 5-path SGBM", _cell(bench.reference), "1.0", "1.0", f"{bench.reference_error_px:.3f}"
     )
     for result in bench.methods:
         ratios = f"{result.ratio:.1f}", f"{result.cpu_ratio:.1f}"
-        table.add_row(result.method, _cell(result.time), *ratios, f"{result.median_error_px:.3f}")
+        error = "-" if math.isnan(result.median_error_px) else f"{result.median_error_px:.3f}"
+        table.add_row(result.method, _cell(result.time), *ratios, error)
     return table
+
+
+def _five_path_sgbm(candidates: DisparityRange) -> cv2.StereoSGBM:
+    """Make OpenCV's SGBM for no fewer candidates, a multiple of 16, blocks of 5."""
+    return cv2.StereoSGBM.create(
+        minDisparity=candidates.lowest_px, numDisparities=-(-candidates.count // 16) * 16, blockSize=5,
+        P1=200, P2=800, mode=cv2.STEREO_SGBM_MODE_SGBM,
+    )  # fmt: skip
+
+
+def _result(method: str, times: Float64, reference: Float64, error_px: float) -> SpeedResult:
+    """Summarise times (..., 2) of a method, wall and CPU s, against SGBM's of the same turns."""
+    wall, cpu = np.median((times / reference).reshape(-1, 2), axis=0)
+    return SpeedResult(method, summarise_times(times[..., 0].ravel()), float(wall), float(cpu), error_px)
 
 
 def _seconds(work: Callable[[], object]) -> tuple[float, float]:

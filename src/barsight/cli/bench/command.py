@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -10,7 +11,7 @@ import tyro
 
 from barsight.benchmarks.stereo.ablation import without_one_part
 from barsight.benchmarks.stereo.middlebury import bench_stereo, scene_table, stereo_table
-from barsight.benchmarks.stereo.speed import bench_speed, speed_table
+from barsight.benchmarks.stereo.speed import bench_speed, speed_table, time_chain
 from barsight.benchmarks.stereo.steps import write_steps
 from barsight.benchmarks.stereo.subpixel import bench_subpixel, subpixel_table
 from barsight.benchmarks.stereo.target_size import bench_target_size, target_size_table
@@ -19,7 +20,7 @@ from barsight.cli.bench import matching
 from barsight.cli.bench.bundles import bench_found_bundles
 from barsight.cli.bench.length import bench_length
 from barsight.cli.bench.lifts import bench_lift_targets
-from barsight.cli.bench.live import bench_live_estimate
+from barsight.cli.bench.live import bench_live_estimate, bench_step
 from barsight.cli.bench.worlds import bench_worlds
 from barsight.cli.bench.yard import bench_yard
 from barsight.cli.safe_console import SafeConsole
@@ -49,6 +50,7 @@ def run(arguments: Sequence[str]) -> None:
         "matching": matching.matching,
         "front-end": matching.front_end,
         "live": bench_live_estimate,
+        "live-step": bench_step,
         "length": bench_length,
     }
     names = " | ".join(benches)
@@ -84,13 +86,20 @@ def _stereo(
         write_json(save, bench)
 
 
-def _stereo_speed(methods: tuple[MethodName, ...] = METHODS, repeats: int = 5, save: Json = None) -> None:
+def _stereo_speed(
+    methods: tuple[MethodName, ...] = METHODS,
+    recording: Path | None = None,
+    repeats: int = 5,
+    save: Json = None,
+) -> None:
     """Time stereo methods on a pair of 1280x1024 with 96 candidates, against OpenCV's 5-path SGBM.
 
     Our own is timed in both presets, with guesses as `disparity` wants them and without as a map does.
 
     Args:
         methods: The methods to compare.
+        recording: A recording with crane encoders, of which the first pairs are timed too as its map has
+            them: the first matched from nothing, the five after it predicted from the one before.
         repeats: Rounds, in each of which every method has its turn.
         save: JSON file for all figures, with commit and machine.
     """
@@ -102,7 +111,9 @@ def _stereo_speed(methods: tuple[MethodName, ...] = METHODS, repeats: int = 5, s
             "barsight fast, no guesses": BarsightSettings(preset="fast", fill_occlusions=False),
         }.items():
             made[name] = make_method(StereoSettings(barsight=settings))
+    in_chain = () if recording is None else time_chain(recording, repeats)
     bench = bench_speed(made, repeats)
+    bench = replace(bench, methods=(*bench.methods, *in_chain))
     SafeConsole().print(speed_table(bench))
     if save is not None:
         write_json(save, bench)

@@ -1,15 +1,18 @@
-"""Run `barsight bench live`."""
+"""Run `barsight bench live|live-step`."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
 from barsight.benchmarks.motion.fixed_lag_speed import bench_live, live_table
+from barsight.benchmarks.yard.live_step import bench_live_step, live_step_table
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.json_values import write_json
+from barsight.measure_settings import MeasureSettings
+from barsight.motion.settings import MotionSettings
 
 
 def bench_live_estimate(
@@ -26,5 +29,23 @@ def bench_live_estimate(
     """
     bench = bench_live(keyframes, held)
     SafeConsole().print(live_table(bench))
+    if save is not None:
+        write_json(save, bench)
+
+
+def bench_step(
+    recording: tyro.conf.Positional[Path],
+    preset: Literal["best", "fast"] = "best",
+    save: Annotated[Path | None, tyro.conf.arg(name="json")] = None,
+) -> None:
+    """Time a whole live step: a pair comes in, is rectified and placed, and the one before is in the map.
+
+    Args:
+        recording: Any recording that `live --replay` takes.
+        preset: That of `measure`.
+        save: JSON file for all figures, with commit and machine.
+    """
+    bench = bench_live_step(recording, MeasureSettings(preset=preset, motion=MotionSettings("live")))
+    SafeConsole().print(live_step_table(bench))
     if save is not None:
         write_json(save, bench)

@@ -1,0 +1,142 @@
+"""Time a live step (`bench live-step`): a pair comes in, the map has it."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from barsight.benchmarks.provenance import Provenance, provenance
+from barsight.calibration.geometry.rectification import Rectifier
+from barsight.core.arrays import Float64
+from barsight.core.compiling.ahead import compile_ahead
+from barsight.core.errors import MeasurementError
+from barsight.core.memory import peak_memory_mib
+from barsight.core.timing import Stopwatch
+from barsight.core.types import RefusedFrame
+from barsight.live_map import LiveMap, PairPlacer
+from barsight.map_building import matching
+from barsight.measure_settings import MeasureSettings
+from barsight.motion.settings import make_estimator
+from barsight.recording.base import Recording
+from barsight.recording.open import open_recording
+from barsight.recording.rectified_pairs import RectifiedPairs
+
+_WARMING_PAIRS = 3
+
+
+@dataclass(frozen=True)
+class StepTime:
+    """A step or a part of it: ms a pair by the clock and of all threads' CPU, median and 95th percentile."""
+
+    part: str
+    wall_ms: float
+    wall_p95_ms: float
+    cpu_ms: float
+    cpu_p95_ms: float
+
+
+@dataclass(frozen=True)
+class LiveStepBench:
+    """A recording's steps but the first, which also looks what there is: that one took first_s.
+
+    fused: pairs in the map. parts: CPU of stereo is NaN, it isn't told apart.
+    """
+
+    recording: str
+    size: tuple[int, int]
+    preset: str
+    pairs: int
+    fused: int
+    first_s: float
+    parts: tuple[StepTime, ...]
+    peak_memory_mib: float
+    provenance: Provenance
+
+
+def bench_live_step(path: Path, settings: MeasureSettings) -> LiveStepBench:
+    """Time each pair of a recording, one after the other and none matched ahead, after a few that load all
+    kernels. settings: with the estimator `live`.
+    """
+    compile_ahead(lambda stage, done, total: None, "measure")
+    recording, chosen = open_recording(path, settings.recording), settings.chosen()
+    with tempfile.TemporaryDirectory() as scratch:
+        _steps(recording, chosen, Path(scratch) / "warming", _WARMING_PAIRS)
+        times, fused = _steps(recording, chosen, Path(scratch) / "timed", None)
+    if len(times) < 2 or fused == 0:
+        raise MeasurementError(f"{path}: no pair comes into the map")
+    rectified, added, elected = times[1:].transpose(1, 0, 2)
+    step = rectified + added
+    stereo = np.column_stack([step[:, 2], np.full(len(step), np.nan)])
+    parts = (
+        _part("step", step[:, :2]),
+        _part("rectified", rectified[:, :2]),
+        _part("placed, matched, fused", added[:, :2]),
+        _part("  of that stereo", stereo),
+        _part("surface elected, besides", elected[:, :2]),
+    )
+    camera = Rectifier(recording.rig).camera
+    return LiveStepBench(
+        path.resolve().name, (camera.width, camera.height), settings.preset, len(times), fused,
+        float(times[0, :2, 0].sum()), parts, peak_memory_mib(), provenance(),
+    )  # fmt: skip
+
+
+def live_step_table(bench: LiveStepBench) -> Table:
+    """Tabulate for the terminal."""
+    width, height = bench.size
+    table = Table(
+        title=f"{bench.recording}: {bench.pairs} pairs of {width}x{height}, {bench.fused} in the map, preset "
+        f"{bench.preset}; {bench.provenance.cores} cores",
+        caption=f"A pair in, the one before fused; the first step took {bench.first_s:.1f} s and isn't "
+        f"counted. `live` elects the surface every 5 s. Peak {bench.peak_memory_mib:.0f} MiB",
+        box=SIMPLE_HEAD,
+    )
+    table.add_column("")
+    for head in ("ms", "P95", "CPU ms", "P95"):
+        table.add_column(head, justify="right")
+    for part in bench.parts:
+        values = (part.wall_ms, part.wall_p95_ms, part.cpu_ms, part.cpu_p95_ms)
+        table.add_row(part.part, *("" if np.isnan(value) else f"{value:.0f}" for value in values))
+    return table
+
+
+def _steps(
+    recording: Recording, settings: MeasureSettings, folder: Path, count: int | None
+) -> tuple[Float64, int]:
+    """Map the first `count` pairs in `folder`. Returns (n, 3, 3): s by the clock, of CPU and by the clock in
+    stereo of rectifying, adding and electing; and how many pairs are in the map.
+    """
+    folder.mkdir()
+    watch = Stopwatch()
+    pairs = RectifiedPairs(recording, Rectifier(recording.rig), folder)
+    placer = PairPlacer(pairs, make_estimator(settings.motion), None)
+    live = LiveMap(pairs, settings, folder, None, placer, matching(pairs, settings, None, watch))
+    times = []
+    for frame in islice(recording.frames(), count):
+        marks = [_now(watch)]
+        pair = frame if isinstance(frame, RefusedFrame) else pairs.rectify(frame)
+        marks.append(_now(watch))
+        live.add(pair)
+        marks.append(_now(watch))
+        live.snapshot(live)
+        marks.append(_now(watch))
+        times.append(np.diff(marks, axis=0))
+    return np.array(times), len(live.stamps_ns)
+
+
+def _now(watch: Stopwatch) -> tuple[float, float, float]:
+    stereo_s = sum(seconds for stage, seconds, _ in watch.entries() if stage == "stereo")
+    return time.perf_counter(), time.process_time(), stereo_s
+
+
+def _part(name: str, seconds: Float64) -> StepTime:
+    """Summarise seconds (n, 2) by the clock and of CPU."""
+    (wall, cpu), (wall_p95, cpu_p95) = 1e3 * np.percentile(seconds, (50, 95), axis=0)
+    return StepTime(name, float(wall), float(wall_p95), float(cpu), float(cpu_p95))
