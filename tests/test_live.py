@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 import barsight as bs
-from barsight import map_building
 from barsight.cli.main import run
 from barsight.core.types import CraneSamples, StereoFrame
 from barsight.live.latency import counts, spread
@@ -28,6 +27,7 @@ from barsight.live.source import ReplayClock, ReplaySource
 from barsight.live.state import prometheus
 from barsight.mapping.fusion import fuse_view
 from barsight.mapping.surface.surface import read_tile
+from barsight.reconstruction import map_building
 from barsight.recording.formats.ground_truth import read_ground_truth
 from barsight.sensors.source import LivePicture, LostPicture, Readings
 from barsight.yard.magnet.description import example_magnet
