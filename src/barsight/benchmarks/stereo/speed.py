@@ -11,9 +11,9 @@ import numpy as np
 from rich.table import Table
 
 from barsight.benchmarks.provenance import MIN_REPEATS, Provenance, Timing, provenance, summarise_times
-from barsight.benchmarks.stereo.middlebury_scenes import pair_from_images
 from barsight.core.arrays import Float32, UInt8
 from barsight.core.types import DisparityRange, RectifiedPair
+from barsight.stereo.image_pair import pair_from_images
 from barsight.stereo.method import StereoMethod
 
 WIDTH_PX, HEIGHT_PX, CANDIDATES = 1280, 1024, 96
