@@ -26,7 +26,7 @@ from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Bool, Float32, Float64, UInt8
 from barsight.core.pose import Pose
 from barsight.core.types import StereoFrame
-from barsight.pair_matching import disparity_range
+from barsight.reconstruction.pair_matching import disparity_range
 from barsight.recording.formats.ground_truth import read_ground_truth
 from barsight.simulation.effects.settings import LightSettings
 from barsight.simulation.lighting import bake, hall_lamps

@@ -22,8 +22,8 @@ from barsight.artefacts.plan import AcceptancePlan, DummyBundle
 from barsight.calibration.files.rig_file import write_rig_file
 from barsight.cli.main import run
 from barsight.core.arrays import Float64
-from barsight.recording.formats.surveyed_targets import read_tags
 from barsight.recording.open import open_recording
+from barsight.registration.surveyed_targets import read_tags
 from barsight.simulation.settings import SimulationSettings
 from barsight.simulation.simulate import simulate
 from barsight.simulation.worlds.artefacts import lay_artefacts

@@ -15,8 +15,8 @@ from barsight.cli.main import run
 from barsight.core.arrays import Float64
 from barsight.core.errors import InputError
 from barsight.page.targets import Pick, place_pick
-from barsight.recording.formats.surveyed_targets import Targets, write_targets
 from barsight.registration.rigid import design_rows
+from barsight.registration.surveyed_targets import Targets, write_targets
 from barsight.registration.yard import predicted_sigma
 from barsight.registration.yard_file import read_yard_file
 from barsight.result_folder import read_heights, read_summary

@@ -15,8 +15,8 @@ import numpy as np
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Float64
 from barsight.core.types import PosedFrame
-from barsight.recording.formats.surveyed_targets import SurveyedTags
 from barsight.recording.open import open_recording
+from barsight.registration.surveyed_targets import SurveyedTags
 from barsight.registration.tags import MAX_CHI2, SeenTags, see_tags
 from barsight.simulation.settings import CameraSettings, SimulationSettings, YardSettings
 from barsight.simulation.simulate import World, laid_stock, simulate

@@ -8,10 +8,10 @@ import json
 import sys
 import time
 
-from barsight.live.pairing import PairFormer
 from barsight.live.shared.ring import PairRing
 from barsight.sensors.crane import CraneSource
 from barsight.sensors.drivers import both_cameras
+from barsight.sensors.pairing import PairFormer
 from barsight.sensors.settings import CamerasSettings
 from barsight.sensors.source import LivePicture, LostPicture, SensorSigns
 

@@ -19,7 +19,7 @@ from barsight.acceptance.watch import (
 )
 from barsight.cli.main import run
 from barsight.core.errors import Failed, InputError
-from barsight.recording.formats.surveyed_targets import SurveyedTags
+from barsight.registration.surveyed_targets import SurveyedTags
 from barsight.registration.tags import PlacedTag
 from test_acceptance import observed, planned
 

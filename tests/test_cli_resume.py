@@ -12,14 +12,15 @@ import cv2
 import numpy as np
 import pytest
 
-from barsight import map_building, pipeline
+from barsight import pipeline
 from barsight.calibration.files.rig_file import write_rig_file
 from barsight.calibration.files.yaml_document import write_document
-from barsight.checkpoint import checkpoint_folder, checkpointed, read_checkpoint
 from barsight.cli.main import run
 from barsight.core.errors import BarsightError, Failed, InputError
-from barsight.map_building import inspect_recording
 from barsight.measure_settings import MeasureSettings
+from barsight.reconstruction import map_building
+from barsight.reconstruction.checkpoint import checkpoint_folder, checkpointed, read_checkpoint
+from barsight.reconstruction.map_building import inspect_recording
 from barsight.recording.base import RecordingSettings
 from barsight.recording.open import open_recording
 from barsight.yard.magnet.description import example_magnet

@@ -24,7 +24,6 @@ from barsight.benchmarks.stereo.bar_renderer import (
 )
 from barsight.benchmarks.stereo.bar_scenes import PosedScene, bar_over_floor, tilted_floor
 from barsight.benchmarks.stereo.cramer_rao_bound import noise_limit_px
-from barsight.benchmarks.stereo.middlebury_scenes import pair_from_images
 from barsight.benchmarks.stereo.steps import steps_picture
 from barsight.benchmarks.stereo.subpixel import (
     bench_subpixel,
@@ -37,6 +36,7 @@ from barsight.benchmarks.stereo.target_size import bench_target_size, measure_ba
 from barsight.core.errors import Failed
 from barsight.core.json_values import write_json
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
+from barsight.stereo.image_pair import pair_from_images
 from barsight.stereo.sgbm import Sgbm, SgbmSettings
 
 

@@ -27,10 +27,10 @@ from barsight.core.json_values import json_digest
 from barsight.core.reading.sealed_json import SEAL
 from barsight.fleet.archive import download, find_recordings, manifest_digest
 from barsight.fleet.cluster import connect
-from barsight.fleet.comparing import FigureChange, RecordingComparison, _figures, compare_recording
-from barsight.fleet.comparison_page import comparison_page, copy_pictures
+from barsight.fleet.comparison.comparing import FigureChange, RecordingComparison, _figures, compare_recording
+from barsight.fleet.comparison.comparison_page import comparison_page, copy_pictures
+from barsight.fleet.comparison.findings import holm, judge
 from barsight.fleet.driver import count_states, drive, parked_reasons
-from barsight.fleet.findings import holm, judge
 from barsight.fleet.ledger import HeldRecording, claim, held, publish, published_keys
 from barsight.fleet.limits import LimitedRun, run_limited
 from barsight.fleet.objects import Objects, open_objects

@@ -13,12 +13,10 @@ import numpy as np
 import pytest
 
 import barsight as bs
-from barsight import map_building
 from barsight.cli.main import run
 from barsight.core.types import CraneSamples, StereoFrame
 from barsight.live.latency import counts, spread
 from barsight.live.modes import FreezeWatch, JumpWatch, Mode, SensorActivity, judge_mode
-from barsight.live.pairing import PairFormer
 from barsight.live.run import Keyframes, read_keyframes, replay, write_keyframes
 from barsight.live.settings import LiveSettings
 from barsight.live.shared.counters import Counters
@@ -28,7 +26,9 @@ from barsight.live.source import ReplayClock, ReplaySource
 from barsight.live.state import prometheus
 from barsight.mapping.fusion import fuse_view
 from barsight.mapping.surface.surface import read_tile
+from barsight.reconstruction import map_building
 from barsight.recording.formats.ground_truth import read_ground_truth
+from barsight.sensors.pairing import PairFormer
 from barsight.sensors.source import LivePicture, LostPicture, Readings
 from barsight.yard.magnet.description import example_magnet
 from cli_runs import FAST

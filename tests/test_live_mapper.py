@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 
 import barsight as bs
-from barsight import map_building
-from barsight.checkpoint import checkpoint_folder
 from barsight.core.types import CraneSamples
 from barsight.live.link import GrowingRecording, KeptRecording, Link, LiveInput
 from barsight.live.mapper import LIVE_MAP, Mapping
 from barsight.live.settings import LiveSettings
 from barsight.live.shared.counters import Counters
-from barsight.map_building import checkpoint_key
 from barsight.mapping.fusion import fuse_view
 from barsight.measure_folder import write_measured
 from barsight.pipeline import LiftRequest
+from barsight.reconstruction import map_building
+from barsight.reconstruction.checkpoint import checkpoint_folder
+from barsight.reconstruction.map_building import checkpoint_key
 from barsight.recording.base import Recording
 
 FIELDS = {"map": {"cell_m": 0.05}, "motion": {"estimator": "live"}}

@@ -18,8 +18,8 @@ from barsight.cli.main import run
 from barsight.core.errors import InputError
 from barsight.page.serve import ServeOptions, serving
 from barsight.page.targets import Pick, place_pick
-from barsight.recording.formats.surveyed_targets import read_targets
 from barsight.registration.rigid import design_rows
+from barsight.registration.surveyed_targets import read_targets
 from barsight.registration.yard import predicted_sigma
 from barsight.registration.yard_file import read_yard_file
 from barsight.store.accounts import add_person

@@ -12,7 +12,6 @@ import pytest
 import barsight as bs
 from barsight.core.errors import ConfigError, InputError
 from barsight.core.types import HeightSource
-from barsight.joined_passes import STALE, JoinedPasses
 from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.passes.changes import PlaceHistory
 from barsight.mapping.passes.joined_surface import PassSurface
@@ -20,6 +19,7 @@ from barsight.mapping.passes.slides import SeenBundle, find_moves
 from barsight.mapping.surface.incremental import gather_surface, tile_figures
 from barsight.mapping.surface.surface import Layers, write_tile
 from barsight.mapping.top_photo import TopPhoto
+from barsight.reconstruction.joined_passes import STALE, JoinedPasses
 from barsight.registration.block_shifts import BlockShifts, MatchedMap, block_shifts
 from barsight.registration.pass_ties import PassCorrection, PassPrior, PassTies, tie_passes
 from barsight.result_folder import changed_inputs, read_heights

@@ -11,7 +11,7 @@ import barsight as bs
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.cli.main import run
 from barsight.core.types import StereoFrame
-from barsight.pair_matching import match_pictures
+from barsight.reconstruction.pair_matching import match_pictures
 from barsight.sensors.rig_plan import CAMERAS, Wish, depth_sigma_m, plan_rig
 from barsight.simulation.settings import CameraSettings
 from barsight.simulation.simulate import simulate

@@ -15,11 +15,11 @@ import barsight as bs
 from barsight.cli.main import run as cli
 from barsight.live.crane.check import check_machine
 from barsight.live.crane.preflight import expect_plausible, held
-from barsight.live.pairing import PairFormer
 from barsight.live.settings import read_crane
 from barsight.recording.writers.retention import PROTECTED, Retention
 from barsight.sensors.clock import DeviceClock
 from barsight.sensors.forms import pack
+from barsight.sensors.pairing import PairFormer
 from barsight.sensors.receiver import RawReading, ReadingReceiver, Sequence
 from barsight.sensors.settings import ReadingsSettings
 from barsight.sensors.source import LivePicture

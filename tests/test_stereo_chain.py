@@ -16,11 +16,11 @@ from barsight.core.errors import Failed
 from barsight.core.pose import Pose
 from barsight.core.timing import Stopwatch
 from barsight.core.types import Disparity, DisparityRange, RectifiedCamera, RectifiedPair
-from barsight.map_building import matching
 from barsight.mapping.view import MatchedFrame
 from barsight.measure_settings import MeasureSettings
 from barsight.measurement import Refusal
 from barsight.motion.frontend.direct_alignment import _add_equations, _compare, align_views
+from barsight.reconstruction.map_building import matching
 from barsight.recording.base import Recording
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.recording.sensor_selection import SelectedSensors

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from barsight.benchmarks.stereo.middlebury_scenes import load_scenes, pair_from_images
+from barsight.benchmarks.stereo.middlebury_scenes import load_scenes
 from barsight.benchmarks.stereo.scores import StereoScore, score_disparity
 from barsight.core.errors import ConfigError
 from barsight.core.types import DisparityRange, RectifiedPair
@@ -19,6 +19,7 @@ from barsight.stereo.baselines.csca import Csca, CscaSettings
 from barsight.stereo.baselines.nonlocal_aggregation import Nonlocal, NonlocalSettings
 from barsight.stereo.baselines.paper import Paper, PaperSettings
 from barsight.stereo.baselines.postprocessing import OutputSettings
+from barsight.stereo.image_pair import pair_from_images
 from barsight.stereo.method import StereoMethod
 from barsight.stereo.settings import StereoSettings, make_method
 from barsight.stereo.sgbm import Sgbm, SgbmSettings

@@ -16,7 +16,7 @@ from barsight.calibration.boards.ring_detection import (
 )
 from barsight.cli.main import run
 from barsight.core.errors import InputError
-from barsight.recording.formats.surveyed_targets import SurveyedTags, read_tags
+from barsight.registration.surveyed_targets import SurveyedTags, read_tags
 from barsight.registration.tags import PlacedTag, see_tags
 from barsight.registration.yard_file import read_yard_file
 from barsight.simulation.simulate import laid_stock

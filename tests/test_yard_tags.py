@@ -15,9 +15,9 @@ from barsight.cli.main import run
 from barsight.core.errors import ConfigError, Failed
 from barsight.core.pose import Pose
 from barsight.core.types import PosedFrame, StereoFrame
-from barsight.recording.formats.surveyed_targets import SurveyedTags
 from barsight.recording.open import open_recording
 from barsight.registration.rigid import align_rigid
+from barsight.registration.surveyed_targets import SurveyedTags
 from barsight.registration.tags import (
     PlacedTag,
     SeenTags,

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from barsight.calibration.stereo.calibration import StereoCalibration
     from barsight.core.errors import BarsightError
     from barsight.core.types import Contour, Disparity
-    from barsight.live_map import Snapshot
     from barsight.measure_settings import MeasureSettings
+    from barsight.reconstruction.live_map import Snapshot
     from barsight.result import Lifts, LiftTarget, Yard
     from barsight.result_folder import CameraPath
     from barsight.session import Session
@@ -38,7 +38,7 @@ _HOMES = {
     "barsight.calibration.stereo.calibration": ("StereoCalibration",),
     "barsight.core.errors": ("BarsightError",),
     "barsight.core.types": ("Contour", "Disparity"),
-    "barsight.live_map": ("Snapshot",),
+    "barsight.reconstruction.live_map": ("Snapshot",),
     "barsight.measure_settings": ("MeasureSettings",),
     "barsight.result": ("LiftTarget", "Lifts", "Yard"),
     "barsight.result_folder": ("CameraPath",),

@@ -18,10 +18,10 @@ from barsight.calibration.stereo.calibration import calibrate_stereo as solve_st
 from barsight.core.arrays import UInt8
 from barsight.core.settings.values import build_settings, expect_choice
 from barsight.core.types import Disparity
-from barsight.map_building import ProgressCallback
 from barsight.measure_folder import ignore_progress, measure_into
 from barsight.measure_settings import MeasureSettings
-from barsight.pair_matching import match_pictures
+from barsight.reconstruction.map_building import ProgressCallback
+from barsight.reconstruction.pair_matching import match_pictures
 from barsight.recording.open import open_recording as open_path
 from barsight.recording.packets import packets as packets
 from barsight.recording.stored_images import StoredPictures

@@ -23,16 +23,7 @@ from barsight.core.parallel import single_opencv_thread
 from barsight.core.stamps import seconds_to_ns
 from barsight.core.timing import Stopwatch
 from barsight.core.types import Trajectory
-from barsight.joined_passes import JoinedPasses, MappedPass, in_order, join_passes
 from barsight.labels.bundle_labels import expect_readers, label_bundles
-from barsight.map_building import (
-    ProbedRecording,
-    ProgressCallback,
-    TrackedRecording,
-    build_map,
-    estimate_trajectory,
-    inspect_recording,
-)
 from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.passes.changes import PlaceHistory
 from barsight.mapping.surface.laser_profiles import Profiles, cut_profiles
@@ -40,6 +31,15 @@ from barsight.mapping.surface.surface import Surface
 from barsight.mapping.top_photo import TopPhoto
 from barsight.measure_settings import MeasureSettings
 from barsight.measurement import BuiltMap, Measurement, PassRecord, StageTime
+from barsight.reconstruction.joined_passes import JoinedPasses, MappedPass, in_order, join_passes
+from barsight.reconstruction.map_building import (
+    ProbedRecording,
+    ProgressCallback,
+    TrackedRecording,
+    build_map,
+    estimate_trajectory,
+    inspect_recording,
+)
 from barsight.recording.base import Recording
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.inventory.stock_list import (

@@ -13,19 +13,19 @@ from typing import Any
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.calibration.geometry.rig import StereoRig
-from barsight.checkpoint import checkpoint_folder
 from barsight.core.compiling.ahead import compile_ahead
 from barsight.core.errors import ConfigError, MeasurementError
 from barsight.core.settings.values import build_settings
 from barsight.core.stamps import NS_PER_S
 from barsight.core.timing import Stopwatch
 from barsight.core.types import RectifiedPair, RefusedFrame, StereoFrame
-from barsight.live_map import LiveMap, PairPlacer, Snapshot, is_final
-from barsight.map_building import checkpoint_key, matching
 from barsight.measure_folder import ignore_progress, write_measured
 from barsight.measure_settings import MeasureSettings
 from barsight.motion.settings import make_early_estimator
 from barsight.pipeline import LiftRequest
+from barsight.reconstruction.checkpoint import checkpoint_folder
+from barsight.reconstruction.live_map import LiveMap, PairPlacer, Snapshot, is_final
+from barsight.reconstruction.map_building import checkpoint_key, matching
 from barsight.recording.packets import Packet, PacketRecording
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.recording.sensor_selection import SelectedSensors

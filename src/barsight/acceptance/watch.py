@@ -18,7 +18,7 @@ from barsight.core.json_values import json_value
 from barsight.core.reading.json_schema import expect_schema, list_schema, record_schema
 from barsight.core.reading.sealed_json import read_sealed, write_sealed
 from barsight.motion.rig_check.drift_check import RigCheck
-from barsight.recording.formats.surveyed_targets import SurveyedTags
+from barsight.registration.surveyed_targets import SurveyedTags
 from barsight.registration.tags import PlacedTag
 
 SCHEMA_VERSION = 1

@@ -51,8 +51,12 @@ GROUPS = ("bench", "calibrate", "live", "store", "fleet", "plant")
 """Commands that are packages: `command.py` in them finds the second word."""
 SECOND = {"live": ("check", "soak")}
 """Second words of commands that do something without one too."""
-ROOMS = {"bench": ("paper",), "yard": ("lifts", "explain", "labels", "compare"), "store": ("yard", "serve"),
-         "acceptance": ("accept", "budget", "verify", "commission")}  # fmt: skip
+ROOMS = {
+    "bench": ("paper",),
+    "yard": ("lifts", "explain", "labels", "compare", "view", "report", "export"),
+    "store": ("yard", "serve"),
+    "acceptance": ("accept", "budget", "verify", "commission"),
+}
 """Commands that lie in a package of commands, without a second word."""
 INTERRUPTED = 130
 _interrupts: list[int] = []

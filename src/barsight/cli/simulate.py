@@ -15,7 +15,7 @@ from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError
 from barsight.core.settings.values import MAX_VALUE
-from barsight.recording.formats.surveyed_targets import read_tags
+from barsight.registration.surveyed_targets import read_tags
 from barsight.simulation.boards.pictures import photograph_board
 from barsight.simulation.passes import simulate_passes
 from barsight.simulation.settings import SimulationSettings

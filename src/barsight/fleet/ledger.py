@@ -20,6 +20,8 @@ TRIES = 3
 """Failures after which a recording is parked,"""
 MAX_LOST = 12
 """and claims whose worker died without a word, which others' faults cause too."""
+REMEDY = "promote nothing of it; measure the recording again"
+"""Remedy for a published result that isn't what was written."""
 Held = Literal["published", "parked", "claimed"]
 _TEXT, _NUMBER = {"type": "string"}, {"type": "number"}
 _FILE = {

@@ -10,8 +10,7 @@ from pathlib import Path
 from barsight.core.errors import ConfigError, InputError, MeasurementError
 from barsight.core.extras import extra
 from barsight.core.files import atomic_directory
-from barsight.fleet.comparing import REMEDY
-from barsight.fleet.ledger import published_keys, result_note
+from barsight.fleet.ledger import REMEDY, published_keys, result_note
 from barsight.fleet.objects import Objects
 from barsight.fleet.records import found_recording
 from barsight.fleet.versions import FleetTask, Version

@@ -8,13 +8,13 @@ from collections.abc import Callable
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.stamps import seconds_to_ns
 from barsight.live.link import Link
-from barsight.live.pairing import PairFormer
 from barsight.live.settings import CraneConfig
 from barsight.live.shared.counters import Counters
 from barsight.live.shared.ring import PairRing
 from barsight.live.source import ReplayClock, ReplaySource
 from barsight.sensors.crane import CraneSource
 from barsight.sensors.drivers import both_cameras
+from barsight.sensors.pairing import PairFormer
 from barsight.sensors.receiver import ReadingReceiver
 from barsight.sensors.source import LivePicture, LostPicture, Readings, SensorSigns, Source
 

@@ -17,11 +17,11 @@ from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.timing import Stopwatch
 from barsight.live.link import GrowingRecording, Link
 from barsight.live.shared.counters import DRAIN
-from barsight.live_map import LiveMap, PairPlacer, is_final
-from barsight.map_building import matching
 from barsight.motion.fixed_lag.sensor_buffer import SENSOR_DELAY_S
 from barsight.motion.settings import make_estimator
-from barsight.pair_chain import MatchedAhead
+from barsight.reconstruction.live_map import LiveMap, PairPlacer, is_final
+from barsight.reconstruction.map_building import matching
+from barsight.reconstruction.pair_chain import MatchedAhead
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.report.result_files import write_height
 from barsight.yard_frame import placing_id

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from barsight.checkpoint import checkpoint_folder
 from barsight.core.compiling.ahead import compile_ahead, load_kernels
 from barsight.core.errors import ConfigError, InputError, MeasurementError, OutputError
 from barsight.core.files import expect_empty, lies_within, translated_os_errors
@@ -33,10 +32,11 @@ from barsight.live.shared.ring import PairRing
 from barsight.live.state import write_state
 from barsight.live.supervisor import Supervisor
 from barsight.live.survey import STOOD
-from barsight.map_building import ProgressCallback, checkpoint_key
 from barsight.measure_folder import ignore_progress, write_measured
 from barsight.measure_settings import MeasureSettings
 from barsight.pipeline import LiftRequest
+from barsight.reconstruction.checkpoint import checkpoint_folder
+from barsight.reconstruction.map_building import ProgressCallback, checkpoint_key
 from barsight.recording.base import Recording
 from barsight.recording.open import open_recording
 from barsight.recording.sensor_selection import SelectedSensors

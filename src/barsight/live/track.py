@@ -18,9 +18,9 @@ from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame, StereoF
 from barsight.live.link import GrowingRecording, Link
 from barsight.live.shared.counters import Counters
 from barsight.live.shared.ring import CapturedPair, PairRing
-from barsight.live_map import PairPlacer
 from barsight.motion.fixed_lag.estimator import FixedLagPoses
 from barsight.motion.settings import make_estimator
+from barsight.reconstruction.live_map import PairPlacer
 from barsight.recording.rectified_pairs import RectifiedPairs
 
 POLL_S = 0.002

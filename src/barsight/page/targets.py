@@ -21,7 +21,7 @@ from barsight.core.reading.geotiff import open_geotiff
 from barsight.core.types import HeightSource
 from barsight.page.layers import MAX_PIXELS
 from barsight.page.survey_files import expect_map, survey_folder
-from barsight.recording.formats.surveyed_targets import Targets, read_places, write_targets
+from barsight.registration.surveyed_targets import Targets, read_places, write_targets
 from barsight.registration.yard import calibrate_yard
 from barsight.result_folder import read_heights
 from barsight.yard.lifting.travel_accuracy import Travel

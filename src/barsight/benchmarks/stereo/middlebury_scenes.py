@@ -10,9 +10,10 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float32, UInt8
 from barsight.core.errors import InputError
-from barsight.core.types import DisparityRange, RectifiedCamera, RectifiedPair
+from barsight.core.types import DisparityRange, RectifiedPair
 from barsight.recording.image_decoding import TornImageError, decode_with_colour
 from barsight.stereo.disparity_files import read_disparity
+from barsight.stereo.image_pair import pair_from_images
 
 _BRIGHTEST_16_BIT = 257
 
@@ -83,16 +84,6 @@ def load_scene(folder: Path) -> StereoScene:
         mask=mask_path.name if mask_path.is_file() else "known",
         candidates=DisparityRange(lowest, lowest + -(-count // 16) * 16),
     )
-
-
-def pair_from_images(
-    left: UInt8, right: UInt8, left_colour: UInt8 | None = None, right_colour: UInt8 | None = None
-) -> RectifiedPair:
-    """Build a pair without a known rig: unit focal length and baseline, everything valid."""
-    height, width = left.shape
-    everywhere = np.ones((height, width), dtype=np.bool_)
-    camera = RectifiedCamera(float(width), (width - 1) / 2, (height - 1) / 2, 1.0, 0.0, width, height)
-    return RectifiedPair(0, left, right, everywhere, everywhere, camera, left_colour, right_colour)
 
 
 def _read_colour(path: Path) -> UInt8 | None:

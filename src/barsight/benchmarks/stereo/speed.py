@@ -18,16 +18,16 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from barsight.benchmarks.provenance import MIN_REPEATS, Provenance, Timing, provenance, summarise_times
-from barsight.benchmarks.stereo.middlebury_scenes import pair_from_images
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Float32, Float64, UInt8
 from barsight.core.errors import InputError, MeasurementError
 from barsight.core.timing import Stopwatch
 from barsight.core.types import DisparityRange, RectifiedPair
-from barsight.map_building import matching
 from barsight.measure_settings import MeasureSettings
+from barsight.reconstruction.map_building import matching
 from barsight.recording.open import open_recording
 from barsight.recording.rectified_pairs import RectifiedPairs
+from barsight.stereo.image_pair import pair_from_images
 from barsight.stereo.method import StereoMethod
 from barsight.stereo.search_range import find_disparity_range
 

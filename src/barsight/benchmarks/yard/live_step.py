@@ -20,10 +20,10 @@ from barsight.core.errors import MeasurementError
 from barsight.core.memory import peak_memory_mib
 from barsight.core.timing import Stopwatch
 from barsight.core.types import RefusedFrame
-from barsight.live_map import LiveMap, PairPlacer
-from barsight.map_building import matching
 from barsight.measure_settings import MeasureSettings
 from barsight.motion.settings import make_estimator
+from barsight.reconstruction.live_map import LiveMap, PairPlacer
+from barsight.reconstruction.map_building import matching
 from barsight.recording.base import Recording
 from barsight.recording.open import open_recording
 from barsight.recording.rectified_pairs import RectifiedPairs

@@ -39,8 +39,8 @@ from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings
 from barsight.motion.rig_check.drift_check import RigCheck
 from barsight.recording.base import RecordingSettings
-from barsight.recording.formats.surveyed_targets import SurveyedTags, read_tags
 from barsight.recording.open import open_recording
+from barsight.registration.surveyed_targets import SurveyedTags, read_tags
 from barsight.yard_frame import calibration_id, in_yard, placing_id, recording_id
 
 

@@ -25,9 +25,9 @@ from barsight.motion.batch.fusion import BatchFusion, FusionSettings
 from barsight.motion.crane.crane_moves import MovedYard, yard_from_moves
 from barsight.motion.crane.encoder_trajectory import CraneSettings
 from barsight.recording.base import RecordingSettings
-from barsight.recording.formats.surveyed_targets import read_targets
 from barsight.recording.open import open_recording
 from barsight.registration.bending import CraneBend, straight
+from barsight.registration.surveyed_targets import read_targets
 from barsight.registration.yard import YardCalibration, calibrate_yard
 from barsight.registration.yard_file import MAX_SPAN_M, MIN_SPAN_M, write_yard_file
 from barsight.report.calibration.yard_page import write_yard_report

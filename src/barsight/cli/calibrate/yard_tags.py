@@ -21,12 +21,12 @@ from barsight.core.timing import count_frames
 from barsight.core.types import CraneSamples, Trajectory
 from barsight.motion.settings import MotionSettings, make_estimator
 from barsight.recording.base import Recording, RecordingSettings
-from barsight.recording.formats.surveyed_targets import SurveyedTags, read_picks, read_places, read_tags
 from barsight.recording.open import open_recording
 from barsight.recording.plausibility import clock_faults
 from barsight.recording.wrapper import RecordingProxy
 from barsight.registration.bending import STEPS, CraneBend, calibrate_bent_yard
 from barsight.registration.picks import see_picks
+from barsight.registration.surveyed_targets import SurveyedTags, read_picks, read_places, read_tags
 from barsight.registration.tags import (
     MIN_PAIRS,
     PlacedTag,

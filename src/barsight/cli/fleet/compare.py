@@ -43,9 +43,9 @@ def run(arguments: Sequence[str]) -> None:
             store: SQLAlchemy's URL of the database.
         """
         with extra("fleet"):
-            from barsight.fleet.comparing import compare_tasks
-            from barsight.fleet.comparison_page import comparison_page, copy_pictures
-            from barsight.fleet.findings import judge
+            from barsight.fleet.comparison.comparing import compare_tasks
+            from barsight.fleet.comparison.comparison_page import comparison_page, copy_pictures
+            from barsight.fleet.comparison.findings import judge
             from barsight.fleet.objects import open_objects
             from barsight.fleet.records import find_version, read_tasks
         target = open_objects(results)

@@ -17,10 +17,10 @@ from barsight.live.link import LiveInput
 from barsight.live.run import INTERRUPTED, LiveRun, begin_replay
 from barsight.live.settings import CraneConfig, LiveSettings
 from barsight.live.survey import STOOD
-from barsight.map_building import ProgressCallback
 from barsight.measure_folder import ignore_progress
 from barsight.measure_settings import MeasureSettings
 from barsight.pipeline import LiftRequest
+from barsight.reconstruction.map_building import ProgressCallback
 from barsight.recording.formats.segments import PATTERN
 from barsight.recording.open import open_recording
 from barsight.recording.writers.bag import write_descriptions

@@ -18,9 +18,9 @@ from barsight.motion.batch.fusion import BatchFusion, FusionSettings
 from barsight.motion.crane.encoder_trajectory import CraneSettings
 from barsight.motion.rig_check.calibration_part import calibration_covariance
 from barsight.motion.rig_check.epipolar_error import RowDrift, measure_row_drift
+from barsight.motion.rig_check.rig_override import RecordingWithRig
 from barsight.motion.rig_check.self_calibration import turn_right_camera
 from barsight.recording.base import Recording
-from barsight.recording.rig_override import RecordingWithRig
 
 
 class DriftState(StrEnum):

@@ -8,7 +8,7 @@ from barsight.calibration.boards.marker_detection import TAG_MODULES, TAG_QUIET,
 from barsight.calibration.boards.ring_detection import PAPER, ring_pattern
 from barsight.core.arrays import Float64
 from barsight.core.errors import ConfigError
-from barsight.recording.formats.surveyed_targets import SurveyedTags
+from barsight.registration.surveyed_targets import SurveyedTags
 from barsight.simulation.scene import CODE, Primitives, Scene, build_grid, plain_material
 from barsight.simulation.settings import SimulationSettings
 from barsight.simulation.simulate import LaidYard, stream

@@ -14,7 +14,6 @@ import numpy as np
 import barsight
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.calibration.stereo.disparity_uncertainty import disparity_sigma_px, rig_covariance
-from barsight.checkpoint import checkpoint_folder, checkpointed, pictures_digest, trajectory_name
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed, InputError, MeasurementError
 from barsight.core.json_values import json_digest, json_value
@@ -44,7 +43,13 @@ from barsight.measure_settings import MeasureSettings
 from barsight.measurement import BuiltMap, Preview, Refusal
 from barsight.motion.rig_check.self_calibration import residual_covariance, self_calibrate
 from barsight.motion.settings import make_estimator
-from barsight.pair_chain import PairChain
+from barsight.reconstruction.checkpoint import (
+    checkpoint_folder,
+    checkpointed,
+    pictures_digest,
+    trajectory_name,
+)
+from barsight.reconstruction.pair_chain import PairChain
 from barsight.recording.base import Recording
 from barsight.recording.plausibility import clock_faults, doubts
 from barsight.recording.rectified_pairs import RectifiedPairs

@@ -10,12 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from barsight.checkpoint import checkpointed, sensor_readings, trajectory_name
 from barsight.core.arrays import Float64
 from barsight.core.errors import MeasurementError
 from barsight.core.timing import Stopwatch, unwatched
 from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame, Trajectory
-from barsight.map_building import MapBuilder, look_at, map_name
 from barsight.mapping.keyframes import keyframe_spacing_m
 from barsight.mapping.recording_probe import points_per_pixel
 from barsight.mapping.surface.surface import Surface
@@ -23,7 +21,9 @@ from barsight.mapping.view import PointBinner
 from barsight.measure_settings import MeasureSettings
 from barsight.motion.estimator import PoseEstimator, TrajectoryEstimator
 from barsight.motion.settings import make_estimator
-from barsight.pair_chain import MatchedAhead, PairChain
+from barsight.reconstruction.checkpoint import checkpointed, sensor_readings, trajectory_name
+from barsight.reconstruction.map_building import MapBuilder, look_at, map_name
+from barsight.reconstruction.pair_chain import MatchedAhead, PairChain
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.yard.sections import surface_map
 from barsight.yard.types import HeightMap

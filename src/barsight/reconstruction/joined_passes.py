@@ -14,7 +14,6 @@ from barsight.core.json_values import json_digest, json_value
 from barsight.core.notices import Notice
 from barsight.core.pose import Pose, nearest_rotation, skew
 from barsight.core.types import PosedFrame, Trajectory
-from barsight.map_building import ProbedRecording, TrackedRecording
 from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.passes.changes import BundleMove, HeightChange, PlaceHistory
 from barsight.mapping.passes.joined_surface import PassSurface, join_surfaces, measure_overlaps
@@ -23,6 +22,7 @@ from barsight.mapping.surface.surface import Surface
 from barsight.mapping.top_photo import TopPhoto
 from barsight.measure_settings import MeasureSettings
 from barsight.measurement import BuiltMap
+from barsight.reconstruction.map_building import ProbedRecording, TrackedRecording
 from barsight.recording.base import Recording
 from barsight.registration.pass_ties import PairTie, PassCorrection, PassPrior, PassTies, tie_passes
 from barsight.yard.types import Bundle

@@ -13,13 +13,12 @@ from barsight.core.errors import InputError
 from barsight.core.json_values import json_digest
 from barsight.core.reading.bounded_reading import in_range
 from barsight.core.reading.sealed_json import SEAL
-from barsight.fleet.ledger import result_note
+from barsight.fleet.ledger import REMEDY, result_note
 from barsight.fleet.objects import Objects
 from barsight.fleet.versions import FleetTask, places
 
 FIGURES = ("x_m", "y_m", "top_z_m", "yaw_deg", "length_m", "width_m")
 """Figures of a bundle that are compared."""
-REMEDY = "promote nothing of it; measure the recording again"
 _UNREAD = (KeyError, TypeError, ValueError, AttributeError, OverflowError)
 """Exceptions of a document that is torn."""
 MAX_APART_M = 0.5

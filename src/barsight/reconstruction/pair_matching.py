@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from barsight.benchmarks.stereo.middlebury_scenes import pair_from_images
 from barsight.calibration.files.rig_formats import read_rig_file
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.calibration.geometry.rig import StereoRig
@@ -17,6 +16,7 @@ from barsight.core.reading.bounded_reading import read_bytes
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair, StereoFrame
 from barsight.mapping.view import disparity_range
 from barsight.recording.image_decoding import MAX_PICTURE_BYTES, TornImageError, decode_with_colour
+from barsight.stereo.image_pair import pair_from_images
 from barsight.stereo.search_range import check_matchable
 from barsight.stereo.settings import MethodName, StereoSettings, make_method
 from barsight.stereo.vertical_offset import MAX_OFFSET_PX, vertical_offset

@@ -7,8 +7,8 @@ from html import escape
 from pathlib import Path
 from statistics import mean
 
-from barsight.fleet.comparing import FIGURES, RecordingComparison
-from barsight.fleet.findings import LEVEL, MIN_RECORDINGS, ArchiveShift, Findings
+from barsight.fleet.comparison.comparing import FIGURES, RecordingComparison
+from barsight.fleet.comparison.findings import LEVEL, MIN_RECORDINGS, ArchiveShift, Findings
 from barsight.fleet.objects import Objects
 
 MAX_LISTED = 100

@@ -9,7 +9,7 @@ from statistics import mean, median
 import numpy as np
 from scipy.stats import ttest_1samp
 
-from barsight.fleet.comparing import FIGURES, FigureChange, RecordingComparison
+from barsight.fleet.comparison.comparing import FIGURES, FigureChange, RecordingComparison
 
 LEVEL = 0.05
 """Chance that anything at all is told of two versions that measure alike: of the bundles, once more of the

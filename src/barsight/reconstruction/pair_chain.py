@@ -13,13 +13,13 @@ from threading import Lock
 
 import numpy as np
 
-from barsight.checkpoint import checkpointed
 from barsight.core.parallel import WORKERS
 from barsight.core.pose import Pose
 from barsight.core.stamps import NS_PER_S, interpolate_at
 from barsight.core.types import CraneSamples, RectifiedPair, RefusedFrame
 from barsight.mapping.view import MatchedFrame, Matcher, Preceding
 from barsight.measurement import Refusal
+from barsight.reconstruction.checkpoint import checkpointed
 from barsight.recording.rectified_pairs import RectifiedPairs
 
 _MAX_READING_AGE_NS = NS_PER_S // 2
