@@ -76,7 +76,7 @@ def measured_world(out: Path, settings: LiftSettings) -> MappedWorld:
     whole = read_heights(out)
     rows, columns = whole.shape
     heights = whole.part(slice(0, rows), slice(0, columns))
-    return _mapped(heights, read_bundles(out / "bundles.json"), vetoes, travel, now_ns, settings)
+    return map_world(heights, read_bundles(out / "bundles.json"), vetoes, travel, now_ns, settings)
 
 
 def noisy_world(world: DrawnYard, settings: LiftSettings) -> MappedWorld:
@@ -92,12 +92,13 @@ def noisy_world(world: DrawnYard, settings: LiftSettings) -> MappedWorld:
     sigma = np.full_like(z, np.hypot(WHITE_M, ALIKE_M))
     vision = np.full(z.shape, HeightSource.VISION, np.uint8)
     heights = HeightMap(drawn.x0, drawn.y0, CELL_M, z, sigma, np.full_like(z, 6.0), vision)
-    return _mapped(heights, find_bundles(heights, BundleSettings()), (), None, 0, settings)
+    return map_world(heights, find_bundles(heights, BundleSettings()), (), None, 0, settings)
 
 
-def _mapped(
+def map_world(
     heights: HeightMap, bundles: tuple[Bundle, ...], vetoes: tuple[Veto, ...], travel: Travel | None,
     now_ns: int, settings: LiftSettings,
 ) -> MappedWorld:  # fmt: skip
+    """Gather what lifts are chosen from."""
     stands = footings(heights, bundles, settings)
     return MappedWorld(LiftScene(heights, BundleTable.of(bundles), stands, travel, now_ns), vetoes)

@@ -104,23 +104,25 @@ def judge_yard(
         yield _judged(world, lift, judge, judged, offered=True)
     offered = [lift.place for lift in plan.offered]
     for number in range(placements + for_danger):
-        middles = offered if number % 2 and offered else [_over(world, b) for b in world.free]
+        middles = offered if number % 2 and offered else [over_bundle(world, b) for b in world.free]
         if not middles:
             return
-        place = _beside(middles[int(rng.integers(len(middles)))], rng)
+        place = draw_beside(middles[int(rng.integers(len(middles)))], rng)
         lift = replace(assess_placement(place, scene, magnet, settings), map_vetoes=mapped.vetoes)
         more = number >= placements
         if not more or not lift.vetoes:
             yield replace(_judged(world, lift, judge, judged, offered=False), for_danger=more)
 
 
-def _over(world: DrawnYard, bundle: int) -> Placement:
+def over_bundle(world: DrawnYard, bundle: int) -> Placement:
+    """Place the magnet over a bundle's centre of mass, along its bars."""
     _, centre = world.yard.load(bundle)
     along = world.yard.bars(bundle)[0].axes[0]
     return Placement(float(centre[0]), float(centre[1]), math.atan2(-along[0], along[1]))
 
 
-def _beside(middle: Placement, rng: np.random.Generator) -> Placement:
+def draw_beside(middle: Placement, rng: np.random.Generator) -> Placement:
+    """Draw a placement that misses the middle by SPREAD."""
     along, across, turn = rng.normal(0, SPREAD)
     x, y = (middle.x_m, middle.y_m) + along * middle.along + across * middle.across
     return Placement(float(x), float(y), middle.yaw_rad + float(turn))
