@@ -256,6 +256,10 @@ def test_a_slope_towards_the_lamp_is_bright() -> None:
     assert hillshade(rising, 0.01)[10, 10] > 1.1
     assert hillshade(-rising, 0.01)[10, 10] < 0.9
     assert hillshade(-rising.T.copy(), 0.01)[10, 10] < hillshade(rising.T.copy(), 0.01)[10, 10]
+    # A slope that the heights' noise may make is hardly shaded, one of bars as ever.
+    for slope, sigma_m, ratio in ((0.05, 0.008, 0.1), (0.5, 0.008, 0.85), (0.05, 0.0005, 0.9)):
+        plain, unsure = (hillshade(rising * slope / 0.3, 0.01, s)[10, 10] - 1 for s in (0.0, sigma_m))
+        assert unsure / plain == pytest.approx(ratio, abs=0.1)
 
 
 def test_the_difference_is_the_bias(folder: Path) -> None:

@@ -136,7 +136,7 @@ def _shaded(heights: HeightMap) -> UInt8:
     low, high = np.percentile(heights.z_m[known], (1, 99)) if known.any() else (0.0, 1.0)
     level = (heights.z_m - low) / max(float(high - low), 0.2)
     gray = (_DARK + (_LIGHT - _DARK) * level.clip(0, 1)) * (
-        0.8 + 0.2 * hillshade(heights.z_m, heights.cell_m)
+        0.8 + 0.2 * hillshade(heights.z_m, heights.cell_m, heights.sigma_m)
     )
     return np.asarray(np.where(known, gray.clip(1, 255), 0)).astype(np.uint8)
 

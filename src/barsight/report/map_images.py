@@ -30,6 +30,8 @@ SOURCE_RGB: Codes = {
     HeightSource.FILLED: (238, 119, 51),
 }
 FILLED_TINT_RGB = (255, 90, 160)
+_SLOPE_NOISE = 0.25
+"""Noise of the difference of two pixels' heights, of their sigma: most of that is alike nearby."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,8 +138,11 @@ def gradient_stops(scale: int, count: int = 9) -> tuple[str, ...]:
     return tuple(f"rgb({r},{g},{b})" for r, g, b in ramp.tolist())
 
 
-def hillshade(z_m: Float32, cell_m: float) -> Float32:
-    """Shade (H, W) by a lamp in the north-west at 45 degrees, 1 on a flat floor [Horn 1981]; NaN is flat."""
+def hillshade(z_m: Float32, cell_m: float, sigma_m: Float32 | float = 0.0) -> Float32:
+    """Shade (H, W) by a lamp in the north-west at 45 degrees, 1 on a flat floor [Horn 1981]; NaN is flat.
+
+    Of a slope s that noise of n = _SLOPE_NOISE sigma_m / cell_m makes s^2 / (s^2 + n^2) counts [Wiener 1949].
+    """
     known = np.isfinite(z_m)
     weight = cv2.GaussianBlur(known.astype(np.float32), (0, 0), 1.0)
     smooth = cv2.GaussianBlur(np.where(known, z_m, 0).astype(np.float32), (0, 0), 1.0)
@@ -145,6 +150,9 @@ def hillshade(z_m: Float32, cell_m: float) -> Float32:
     with np.errstate(invalid="ignore"):
         east = np.gradient(surface, cell_m, axis=1) if surface.shape[1] > 1 else np.zeros_like(surface)
         north = -np.gradient(surface, cell_m, axis=0) if surface.shape[0] > 1 else np.zeros_like(surface)
+        squares, noise = east**2 + north**2, (_SLOPE_NOISE / cell_m * sigma_m) ** 2
+        share = squares / np.maximum(squares + noise, 1e-12)
+        east, north = share * east, share * north
     facing: Float64 = (1 + (east - north) / np.sqrt(2)) / np.sqrt(1 + east**2 + north**2)
     return np.nan_to_num(facing, nan=1.0).astype(np.float32)
 
@@ -154,7 +162,7 @@ def paint_height(raster: Raster, low_m: float, high_m: float) -> UInt8:
     tinted pink.
     """
     base = colours(raster.z_m, low_m, high_m, cv2.COLORMAP_VIRIDIS).astype(np.float32)
-    light = np.clip(hillshade(raster.z_m, raster.cell_m), 0.0, 1.4)[..., None]
+    light = np.clip(hillshade(raster.z_m, raster.cell_m, raster.sigma_m), 0.0, 1.4)[..., None]
     shaded = np.where(light < 1, base * (0.35 + 0.65 * light), base + (255 - base) * (light - 1) * 0.9)
     filled = raster.source == HeightSource.FILLED
     shaded[filled] = 0.3 * shaded[filled] + 0.7 * np.array(FILLED_TINT_RGB)
