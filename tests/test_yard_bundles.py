@@ -257,19 +257,28 @@ def test_a_beams_end_on_a_flank_holds_the_bundle_down(
     assert bundle.is_free is is_free
 
 
-@pytest.mark.parametrize(("top_m", "own_m", "laid_m"), [(0.1, 0.0, 0.0), (0.2, 0.0, 0.2), (0.1, 0.07, 0.03)])
+@pytest.mark.parametrize(
+    ("sunk_from_m", "own_m", "top_m", "laid_m"),
+    [(0.085, 0.0, 0.1, 0.0), (0.085, 0.0, 0.2, 0.2), (0.085, 0.06, 0.1, 0.04), (0.0, 0.0, 0.1, 0.1)],
+)
+@pytest.mark.parametrize("pack_only", [False, True])
 def test_dunnage_that_shows_in_a_gully_lies_beside_the_bundle(
-    top_m: float, own_m: float, laid_m: float
+    sunk_from_m: float, own_m: float, top_m: float, laid_m: float, *, pack_only: bool
 ) -> None:
-    """The outline is 0.25 m wide, 40 mm too much: there own_m shows, and at one place what is top_m high."""
+    """A bundle is read 0.24 m wide, up to 0.24 m high. From one place on, to its rim or over 30 mm inside it,
+    own_m shows, and at one place along it what is top_m high. pack_only: the fit has the topmost bar alone.
+    """
     v, u = 0.01 * np.arange(200) - 1, 0.01 * np.arange(25) - 0.12
-    z = np.where(u < 0.085, 0.24, own_m) + np.zeros((200, 1))
-    z[(np.abs(v) < 0.05)[:, None] & (u > 0.085)[None]] = top_m
+    sunken = (u > sunk_from_m) & (u < sunk_from_m + 0.045)
+    z = np.where(sunken, own_m, 0.24) + np.zeros((200, 1))
+    z[(np.abs(v) < 0.05)[:, None] & sunken[None]] = top_m
+    width_m = 0.06 if pack_only else 0.24
     values = np.zeros(6)
-    values[OUTLINE_Z] = 0.125
-    fit = SimpleNamespace(width_m=0.24, first=0, last=199, v_m=0.0, values=values)
+    values[OUTLINE_Z] = 0.24 - width_m / 2
+    fit = SimpleNamespace(width_m=width_m, first=0, last=199, v_m=0.0, values=values)
+    pack = SimpleNamespace(is_bounded=True, low_m=-0.12, high_m=0.12, width_m=0.24, top_m=width_m / 2)
     grid = SimpleNamespace(z_m=z, cell_m=0.01, u0_m=u[0], v0_m=v[0])
-    reading = SimpleNamespace(found=SimpleNamespace(grid=grid, fit=fit), pack=None)
+    reading = SimpleNamespace(found=SimpleNamespace(grid=grid, fit=fit), pack=pack if pack_only else None)
     assert measure_laid(cast(Reading, reading)) == pytest.approx(laid_m)
 
 

@@ -20,7 +20,7 @@ from barsight.core.pose import Pose
 from barsight.core.stamps import seconds_to_ns
 from barsight.core.types import PosedFrame, Trajectory
 from barsight.evaluation.score import score_folder
-from barsight.evaluation.trajectory_error import frame_errors, trajectory_drift
+from barsight.evaluation.trajectory_error import frame_errors
 from barsight.recording.formats.ground_truth import read_ground_truth
 from barsight.result_folder import read_summary
 from barsight.yard.inventory.bundle_file import read_bundles
@@ -35,9 +35,9 @@ SEEN_FRAMES, SEEN_RATIO = 2, 0.5
 MAP_ROWS = ("contour, smooth places", "contour, everywhere", "height, smooth stack", "height, seen by two")
 POSE_ROWS = {
     "ground below the frames: RMSE, mm": "rmse_mm",
-    "poses: attitude, RMSE, deg": "attitude_rmse_deg",
-    "poses but for one rigid motion: place, RMSE, mm": "aligned_rmse_mm",
-    "poses but for one rigid motion: attitude, RMSE, deg": "aligned_rmse_deg",
+    "frames' attitude: RMSE, deg": "turn_rmse_deg",
+    "ground below the frames but for one rigid motion: RMSE, mm": "aligned_rmse_mm",
+    "frames' attitude but for the same motion: RMSE, deg": "aligned_turn_rmse_deg",
 }
 BUNDLE_ROWS = {
     "lateral": "mm", "yaw": "deg", "top": "mm", "width": "mm", "diameter": "mm", "low end": "mm",
@@ -49,11 +49,11 @@ BUNDLE_ROWS = {
 class WorldScore:
     """Scores of one world. refused: why it could not be measured, empty where it was.
 
-    maps: as `score_folder` has them, mm. poses: of the ground below the frames, and of the poses themselves,
-    as they stand and after the best rigid motion. counts: free bundles in sight, how many were found, bundles
-    said to be free, how many of those are wrong, at how many of those no bundle lies whether free or not, how
-    often a number of bars was said and right, single bars in sight and found. errors, sigmas: by figure of
-    the bundles that were found, m (yaw rad, mass t).
+    maps: as `score_folder` has them, mm. poses: of the ground below the frames and of their attitude, as they
+    stand and but for one rigid motion that all share. counts: free bundles in sight, how many were found,
+    bundles said to be free, how many of those are wrong, at how many of those no bundle lies whether free or
+    not, how often a number of bars was said and right, single bars in sight and found. errors, sigmas: by
+    figure of the bundles that were found, m (yaw rad, mass t).
     """
 
     seed: int
@@ -252,39 +252,50 @@ def _shown(recording: Path, true: tuple[TrueBundle, ...]) -> list[bool]:
 
 
 def _poses(recording: Path, out: Path) -> dict[str, float]:
-    """Compare the ground below each frame, as its pose places it, with truth; empty in `world`."""
+    """Compare the ground below each frame, as its pose places it, and its attitude with truth; empty in
+    `world`.
+    """
     summary = read_summary(out)
     travel = summary.get("travel")
     if summary["reference"] != "yard" or not travel:
         return {}
     path = read_ground_truth(out / "trajectory.tum", reference="yard")
     frames = tuple(
-        PosedFrame(int(stamp), pose, np.eye(6)) for stamp, pose in zip(path.stamp_ns, path.poses, strict=True)
+        PosedFrame(int(stamp), pose, np.zeros((6, 6)))
+        for stamp, pose in zip(path.stamp_ns, path.poses, strict=True)
     )
     rig = json.loads((recording / "truth" / "rig.json").read_text(encoding="utf-8"))
     shift = seconds_to_ns(rig["time_offset_s"])
-    trajectory, truth = Trajectory("yard", frames, (), ()), read_ground_truth(recording, reference="yard")
-    found, drift = frame_errors(trajectory, truth, shift), trajectory_drift(trajectory, truth, shift)
-    if found is None or drift is None:
+    found = frame_errors(
+        Trajectory("yard", frames, (), ()), read_ground_truth(recording, reference="yard"), shift
+    )
+    if found is None:
         return {}
     poses: dict[int, Pose] = {frame.stamp_ns: frame.reference_from_body for frame in frames}
     sigma_of = dict(zip(travel["stamp_ns"], travel["sigma_m"], strict=True))
-    errors, sigmas = [], []
-    for stamp, place, turn in zip(found.stamp_ns.tolist(), found.place_m, found.turn_rad, strict=True):
-        if stamp in sigma_of:
-            down = np.array([0.0, 0.0, -poses[stamp].translation[2]])
-            errors.append(place + np.cross(turn, down))
-            sigmas.append(sigma_of[stamp])
-    if not errors:
+    known = np.array([stamp in sigma_of for stamp in found.stamp_ns.tolist()])
+    if not known.any():
         return {}
-    error: Float64 = np.array(errors)
+    turn = found.turn_rad[known]
+    stamps = found.stamp_ns[known].tolist()
+    ground = np.array([poses[stamp].translation for stamp in stamps])
+    down = np.array([0.0, 0.0, -1.0]) * ground[:, 2:]
+    ground = ground + down
+    error = found.place_m[known] + np.cross(turn, down)
+    sigmas = [sigma_of[stamp] for stamp in stamps]
+    # One rigid motion: the mean turn, and the mean shift that is left.
+    aligned = error - error.mean(axis=0) - np.cross(turn.mean(axis=0), ground - ground.mean(axis=0))
     inside = np.abs(error) <= TWO_SIDED * np.array(sigmas, np.float64)
     return {
         "samples": float(error.size),
-        "rmse_mm": 1e3 * float(np.sqrt((error**2).sum(axis=1).mean())),
+        "rmse_mm": 1e3 * _rms(error),
         "max_mm": 1e3 * float(np.linalg.norm(error, axis=1).max()),
         "within_95_pct": 100 * float(inside.mean()),
-        "attitude_rmse_deg": drift.reference_rmse_deg,
-        "aligned_rmse_mm": drift.aligned_rmse_mm,
-        "aligned_rmse_deg": drift.aligned_rmse_deg,
+        "turn_rmse_deg": math.degrees(_rms(turn)),
+        "aligned_rmse_mm": 1e3 * _rms(aligned),
+        "aligned_turn_rmse_deg": math.degrees(_rms(turn - turn.mean(axis=0))),
     }
+
+
+def _rms(vectors: Float64) -> float:
+    return float(np.sqrt((vectors**2).sum(axis=1).mean()))
