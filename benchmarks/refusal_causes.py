@@ -1,15 +1,16 @@
 """Tell what the refusals of truly fine lifts rest on: the map, the bundles found in it, or the limits.
 
 `python benchmarks/refusal_causes.py KEEP FIRST:LAST [PLACEMENTS]`: KEEP has yards that `barsight bench lifts
---rendered --full-size --keep KEEP` measured. Placements over free bundles that the independent judge finds
-fine are assessed on the measured map and on the exact one with noise, with the bundles found in each and with
-the true ones.
+--rendered --full-size --keep KEEP` measured, with the example magnet. Placements over free bundles that the
+independent judge finds fine are assessed on the measured map and on the exact one with noise, with the
+bundles found in each, anew, and with the true ones.
 """
 
 from __future__ import annotations
 
 import math
 import sys
+import tempfile
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -101,9 +102,10 @@ def four_maps(world: DrawnYard, out: Path) -> dict[str, MappedWorld]:
 
 def main(keep: Path, seeds: range, placements: int) -> None:
     """Print, of all yards together, how many fine placements each map refuses and why."""
-    described_at = keep / "magnet.toml"
-    described_at.write_text(example_magnet(), encoding="utf-8")
-    magnet, judged = load_magnet(described_at), read_magnet(described_at)
+    with tempfile.NamedTemporaryFile("w", suffix=".toml") as described:
+        described.write(example_magnet())
+        described.flush()
+        magnet, judged = load_magnet(Path(described.name)), read_magnet(Path(described.name))
     refused, codes, alone, fine = Counter[str](), Counter[tuple[str, str]](), Counter[tuple[str, str]](), 0
     for seed in seeds:
         out = keep / f"seed_{seed}" / "measured"
@@ -128,6 +130,8 @@ def main(keep: Path, seeds: range, placements: int) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) < 3:
+        sys.exit(__doc__)
     main(
         Path(sys.argv[1]),
         parse_seeds(sys.argv[2], "refusal_causes"),

@@ -31,7 +31,7 @@ SOURCE_RGB: Codes = {
 }
 FILLED_TINT_RGB = (255, 90, 160)
 _SLOPE_NOISE = 0.25
-"""Noise of the difference of two pixels' heights, of their sigma: most of that is alike nearby."""
+"""RMS slope of floors over sigma by pixel: 0.17 to 0.25 on four maps. Most of sigma is alike nearby."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +141,8 @@ def gradient_stops(scale: int, count: int = 9) -> tuple[str, ...]:
 def hillshade(z_m: Float32, cell_m: float, sigma_m: Float32 | float = 0.0) -> Float32:
     """Shade (H, W) by a lamp in the north-west at 45 degrees, 1 on a flat floor [Horn 1981]; NaN is flat.
 
-    Of a slope s that noise of n = _SLOPE_NOISE sigma_m / cell_m makes s^2 / (s^2 + n^2) counts [Wiener 1949].
+    Of a slope s with noise n = _SLOPE_NOISE sigma_m / cell_m, s^2 / (s^2 + n^2) of it counts [Wiener 1949];
+    all of it where sigma isn't known.
     """
     known = np.isfinite(z_m)
     weight = cv2.GaussianBlur(known.astype(np.float32), (0, 0), 1.0)
@@ -150,7 +151,8 @@ def hillshade(z_m: Float32, cell_m: float, sigma_m: Float32 | float = 0.0) -> Fl
     with np.errstate(invalid="ignore"):
         east = np.gradient(surface, cell_m, axis=1) if surface.shape[1] > 1 else np.zeros_like(surface)
         north = -np.gradient(surface, cell_m, axis=0) if surface.shape[0] > 1 else np.zeros_like(surface)
-        squares, noise = east**2 + north**2, (_SLOPE_NOISE / cell_m * sigma_m) ** 2
+        noise = (_SLOPE_NOISE / cell_m * np.nan_to_num(sigma_m, nan=0, posinf=0)) ** 2
+        squares = east**2 + north**2
         share = squares / np.maximum(squares + noise, 1e-12)
         east, north = share * east, share * north
     facing: Float64 = (1 + (east - north) / np.sqrt(2)) / np.sqrt(1 + east**2 + north**2)
