@@ -10,6 +10,7 @@ import pytest
 from barsight.cli.main import run
 from barsight.core.types import Disparity
 from barsight.stereo.disparity_files import write_disparity
+from cli_runs import cut_short, pictures
 
 
 @pytest.fixture
@@ -54,6 +55,9 @@ def test_ablation_leaves_out_one_part_at_a_time(
 def test_mistakes_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["bench", "everything"]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+    for flags in (["stereo-speed", "--repeats", "0"], ["length", str(tmp_path), "--times", "1"]):
+        assert run(["bench", *flags]) == 2
+        assert capsys.readouterr().err.count("\n") == 1
     assert run(["bench", "stereo", str(tmp_path)]) == 3
     text = capsys.readouterr().err
     assert text.count("\n") == 1 and str(tmp_path) in text
@@ -73,10 +77,12 @@ def test_a_live_step_is_timed_whole_and_by_parts(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     saved = tmp_path / "step.json"
+    cut_short(pictures(recording, "cam1")[1])
     assert run(["bench", "live-step", str(recording), "--json", str(saved)]) == 0
-    assert "3 in the map" in capsys.readouterr().out
+    assert "2 in the map" in capsys.readouterr().out
     bench = json.loads(saved.read_text())
-    assert (bench["pairs"], bench["fused"]) == (4, 3), "the last pair waits for the one after it"
+    assert (bench["pairs"], bench["fused"]) == (4, 2), "one is torn, the last waits for the one after it"
+    assert bench["others"] == 1, "the torn one's step isn't counted"
     parts = {part["part"].strip(): part for part in bench["parts"]}
     step, added = parts["step"], parts["placed, matched, fused"]
     assert 0 < parts["of that stereo"]["wall_ms"] < added["wall_ms"] < step["wall_ms"]

@@ -19,6 +19,7 @@ from barsight.core.json_values import write_json
 from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.direct.pipeline import BarsightStereo
 from barsight.stereo.disparity_files import write_disparity
+from cli_runs import edit
 
 
 def _disparity(values: np.ndarray, sigma: float = 1.0) -> Disparity:
@@ -149,7 +150,17 @@ def test_all_pairs_of_a_chain_but_the_first_are_timed_as_predicted(
     sgbm, narrow, first, predicted = time_chain(recording, repeats=2)
     assert len(set(confirmed)) == 3 and len(confirmed) == 3 * (1 + 2), "four pairs, three rounds"
     assert (first.time.repeats, predicted.time.repeats, sgbm.time.repeats) == (2, 6, 8)
-    assert sgbm.ratio == sgbm.cpu_ratio == 1 and narrow.ratio < 1 < first.ratio
-    shutil.rmtree(recording / "mav0" / "crane0")
-    with pytest.raises(InputError, match="no encoders"):
+    assert sgbm.ratio == sgbm.cpu_ratio == 1
+    assert all(result.ratio > 0 and result.cpu_ratio > 0 for result in (narrow, first, predicted))
+    assert "320x256: SGBM, 96 candidates" in sgbm.method and "320x256: SGBM" in narrow.method
+
+
+@pytest.mark.parametrize("left", ["none", "late"])
+def test_a_chain_that_encoders_do_not_predict_is_refused(recording: Path, left: str) -> None:
+    crane = recording / "mav0" / "crane0"
+    if left == "none":
+        shutil.rmtree(crane)
+    else:
+        edit(crane / "data.csv", lambda lines: [lines[0], *lines[len(lines) // 2 :]])
+    with pytest.raises(InputError, match="lacks encoders"):
         time_chain(recording)

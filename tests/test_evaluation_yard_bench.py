@@ -47,7 +47,7 @@ def test_costs_stand_beside_each_other_over_one_of_them() -> None:
 def test_a_run_costs_what_its_process_and_its_stages_took(recording: Path, tmp_path: Path) -> None:
     cost = measure_apart(recording, tmp_path / "out", FAST)
     content = json.loads((tmp_path / "out" / "result.json").read_text(encoding="utf-8"))
-    assert cost.wall_s > content["seconds"] > 0.5 < cost.cpu_s
+    assert cost.cpu_s > 0 and cost.wall_s > content["seconds"], "its start is included"
     assert cost.peak_memory_mib == content["peak_memory_mib"]
     assert content["seconds"] / 2 < sum(cost.stage_s.values()) < 4 * content["seconds"]
 

@@ -73,6 +73,10 @@ class PairChain:
         """Tell whether a pair was matched as it would be with the readings that there are now."""
         return self._names.get(stamp_ns) == self._steps(stamp_ns)[-1].name
 
+    def follows(self, stamp_ns: int) -> bool:
+        """Tell whether a pair is held against the one before: it begins no chain, encoders say the way."""
+        return self._steps(stamp_ns)[-1].now_from_before is not None
+
     def match_all(self, pairs: Sequence[RectifiedPair | RefusedFrame]) -> list[MatchedFrame | Refusal]:
         """Match pairs one after the other."""
         return [self(pair) for pair in pairs]

@@ -87,14 +87,16 @@ def time_chain(path: Path, repeats: int = MIN_REPEATS) -> tuple[SpeedResult, ...
     Raises InputError or MeasurementError where the recording has no such chain.
     """
     recording, settings = open_recording(path), MeasureSettings()
-    if recording.crane() is None:
-        raise InputError(path, "has no encoders, by which pairs are predicted", "give one with crane0")
     reader = RectifiedPairs(recording, Rectifier(recording.rig))
-    chain = list(islice(reader(), settings.stereo.confirmed_pairs + 1))
+    match = matching(reader, settings, None, Stopwatch())
+    chain = list(islice(reader(), max(match.length, 2)))
+    if not all(match.follows(pair.stamp_ns) for pair in chain[1:]):
+        lacks = "lacks encoders that say the way between its first pairs, by which they are predicted"
+        raise InputError(path, lacks, "give one with crane0")
     pairs = [pair for pair in chain if isinstance(pair, RectifiedPair)]
     candidates = find_disparity_range(pairs[0]) if 1 < len(pairs) == len(chain) else None
     if not isinstance(candidates, DisparityRange):
-        raise MeasurementError(f"{path}: its first pairs, six or at least two, can't all be matched")
+        raise MeasurementError(f"{path}: needs two pairs or more at its beginning, all of them matched")
     usual = DisparityRange(candidates.lowest_px, candidates.lowest_px + CANDIDATES)
     matchers, rounds = [_five_path_sgbm(one) for one in (usual, candidates)], []
     for _ in range(repeats + 1):
@@ -103,12 +105,14 @@ def time_chain(path: Path, repeats: int = MIN_REPEATS) -> tuple[SpeedResult, ...
             rounds += [_seconds(partial(matcher.compute, pair.left, pair.right)) for matcher in matchers]
             rounds.append(_seconds(partial(match, pair)))
     reference, narrow, own = np.array(rounds).reshape(-1, len(pairs), 3, 2)[1:].transpose(2, 0, 1, 3)
-    place, unknown = path.resolve().name, float("nan")
+    camera, unknown = pairs[0].camera, float("nan")
+    place = f"{path.resolve().name}, {camera.width}x{camera.height}"
+    usual_count, narrow_count = (matcher.getNumDisparities() for matcher in matchers)
     return (
-        _result(f"SGBM on {place}", reference, reference, unknown),
-        _result(f"SGBM, the {candidates.count} of its range", narrow, reference, unknown),
-        _result(f"first pair of {place}", own[:, :1], reference[:, :1], unknown),
-        _result(f"predicted pair of {place}", own[:, 1:], reference[:, 1:], unknown),
+        _result(f"{place}: SGBM, {usual_count} candidates", reference, reference, unknown),
+        _result(f"{place}: SGBM, {narrow_count} candidates", narrow, reference, unknown),
+        _result(f"{place}: first pair", own[:, :1], reference[:, :1], unknown),
+        _result(f"{place}: predicted pairs", own[:, 1:], reference[:, 1:], unknown),
     )
 
 
@@ -133,21 +137,23 @@ def speed_pair() -> tuple[RectifiedPair, DisparityRange, Float32]:
 def speed_table(bench: SpeedBench) -> Table:
     """Tabulate one row per method."""
     table = Table(
-        title=f"{WIDTH_PX}x{HEIGHT_PX}, {CANDIDATES} candidates, {bench.provenance.cores} cores",
-        caption=f"Median (range) of {bench.reference.repeats} rounds, all in turn. times SGBM: wall time "
-        "over OpenCV's 5-path SGBM's of the same round, 96 candidates; CPU: the same of all cores together.",
+        title=f"{WIDTH_PX}x{HEIGHT_PX}, {CANDIDATES} candidates where a row says no other; "
+        f"{bench.provenance.cores} cores",
+        caption="Median (range) of the runs: one a round, all in turn; on a recording one a pair and round. "
+        f"wall, times: over OpenCV's 5-path SGBM's of the same turn, {CANDIDATES} candidates; CPU, times: "
+        "the same of the processor time of all cores.",
         box=SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
     )
     table.add_column("method")
-    for heading in ("ms", "times SGBM", "CPU", "error px"):
+    for heading in ("ms", "runs", "wall, times", "CPU, times", "error px"):
         table.add_column(heading, justify="right")
-    table.add_row(
-        "OpenCV's 5-path SGBM", _cell(bench.reference), "1.0", "1.0", f"{bench.reference_error_px:.3f}"
-    )
+    error = f"{bench.reference_error_px:.3f}"
+    table.add_row("OpenCV's 5-path SGBM", *_cells(bench.reference), "1.0", "1.0", error)
     for result in bench.methods:
         ratios = f"{result.ratio:.1f}", f"{result.cpu_ratio:.1f}"
         error = "-" if math.isnan(result.median_error_px) else f"{result.median_error_px:.3f}"
-        table.add_row(result.method, _cell(result.time), *ratios, error)
+        table.add_row(result.method, *_cells(result.time), *ratios, error)
     return table
 
 
@@ -172,5 +178,5 @@ def _seconds(work: Callable[[], object]) -> tuple[float, float]:
     return time.perf_counter() - wall, time.process_time() - processor
 
 
-def _cell(time: Timing) -> str:
-    return f"{time.median_ms:.0f} ({time.fastest_ms:.0f}-{time.slowest_ms:.0f})"
+def _cells(time: Timing) -> tuple[str, str]:
+    return f"{time.median_ms:.0f} ({time.fastest_ms:.0f}-{time.slowest_ms:.0f})", str(time.repeats)

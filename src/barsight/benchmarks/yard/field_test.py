@@ -70,9 +70,7 @@ def laser_error_mm(recording: Recording, folder: Path) -> tuple[float, float]:
     return float(error.mean()), float(np.abs(error).mean())
 
 
-def yard_row(
-    method: str, flags: tuple[str, ...], recording: Path, out: Path, cost: RunCost
-) -> YardRow:  # fmt: skip
+def yard_row(method: str, flags: tuple[str, ...], recording: Path, out: Path, cost: RunCost) -> YardRow:
     """Score a measured folder."""
     content = json.loads((out / "result.json").read_text(encoding="utf-8"))
     figures = score_folder(recording, out)

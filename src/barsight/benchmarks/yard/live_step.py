@@ -14,7 +14,7 @@ from rich.table import Table
 
 from barsight.benchmarks.provenance import Provenance, provenance
 from barsight.calibration.geometry.rectification import Rectifier
-from barsight.core.arrays import Float64
+from barsight.core.arrays import Float64, Int64
 from barsight.core.compiling.ahead import compile_ahead
 from barsight.core.errors import MeasurementError
 from barsight.core.memory import peak_memory_mib
@@ -29,6 +29,7 @@ from barsight.recording.open import open_recording
 from barsight.recording.rectified_pairs import RectifiedPairs
 
 _WARMING_PAIRS = 3
+"""Pairs mapped before and not timed: with the third, a pair is matched by the one before it."""
 
 
 @dataclass(frozen=True)
@@ -44,9 +45,11 @@ class StepTime:
 
 @dataclass(frozen=True)
 class LiveStepBench:
-    """A recording's steps but the first, which also looks what there is: that one took first_s.
+    """A recording's steps in which a pair came into the map. The first step, which also looks what there is,
+    took first_s.
 
-    fused: pairs in the map. parts: CPU of stereo is NaN, it isn't told apart.
+    fused: pairs in the map. others: steps besides the first in which none came into it, not counted. parts:
+    CPU of stereo is NaN, it isn't told apart.
     """
 
     recording: str
@@ -54,6 +57,7 @@ class LiveStepBench:
     preset: str
     pairs: int
     fused: int
+    others: int
     first_s: float
     parts: tuple[StepTime, ...]
     peak_memory_mib: float
@@ -69,9 +73,10 @@ def bench_live_step(path: Path, settings: MeasureSettings) -> LiveStepBench:
     with tempfile.TemporaryDirectory() as scratch:
         _steps(recording, chosen, Path(scratch) / "warming", _WARMING_PAIRS)
         times, fused = _steps(recording, chosen, Path(scratch) / "timed", None)
-    if len(times) < 2 or fused == 0:
+    grown = np.diff(fused, prepend=0) > 0
+    if not grown[1:].any():
         raise MeasurementError(f"{path}: no pair comes into the map")
-    rectified, added, elected = times[1:].transpose(1, 0, 2)
+    rectified, added, elected = times[1:][grown[1:]].transpose(1, 0, 2)
     step = rectified + added
     stereo = np.column_stack([step[:, 2], np.full(len(step), np.nan)])
     parts = (
@@ -83,8 +88,8 @@ def bench_live_step(path: Path, settings: MeasureSettings) -> LiveStepBench:
     )
     camera = Rectifier(recording.rig).camera
     return LiveStepBench(
-        path.resolve().name, (camera.width, camera.height), settings.preset, len(times), fused,
-        float(times[0, :2, 0].sum()), parts, peak_memory_mib(), provenance(),
+        path.resolve().name, (camera.width, camera.height), settings.preset, len(times), int(fused[-1]),
+        int((~grown[1:]).sum()), float(times[0, :2, 0].sum()), parts, peak_memory_mib(), provenance(),
     )  # fmt: skip
 
 
@@ -94,8 +99,10 @@ def live_step_table(bench: LiveStepBench) -> Table:
     table = Table(
         title=f"{bench.recording}: {bench.pairs} pairs of {width}x{height}, {bench.fused} in the map, preset "
         f"{bench.preset}; {bench.provenance.cores} cores",
-        caption=f"A pair in, the one before fused; the first step took {bench.first_s:.1f} s and isn't "
-        f"counted. `live` elects the surface every 5 s. Peak {bench.peak_memory_mib:.0f} MiB",
+        caption=f"A pair in, the one before fused, one after the other. Not counted: the first step, which "
+        f"took {bench.first_s:.1f} s, and {bench.others} others in which no pair came into the map. The "
+        "surface is elected after each pair; `live` does so every 5 s. "
+        f"Peak {bench.peak_memory_mib:.0f} MiB",
         box=SIMPLE_HEAD,
     )
     table.add_column("")
@@ -109,16 +116,16 @@ def live_step_table(bench: LiveStepBench) -> Table:
 
 def _steps(
     recording: Recording, settings: MeasureSettings, folder: Path, count: int | None
-) -> tuple[Float64, int]:
+) -> tuple[Float64, Int64]:
     """Map the first `count` pairs in `folder`. Returns (n, 3, 3): s by the clock, of CPU and by the clock in
-    stereo of rectifying, adding and electing; and how many pairs are in the map.
+    stereo of rectifying, adding and electing; and how many pairs are in the map after each.
     """
     folder.mkdir()
     watch = Stopwatch()
     pairs = RectifiedPairs(recording, Rectifier(recording.rig), folder)
     placer = PairPlacer(pairs, make_estimator(settings.motion), None)
     live = LiveMap(pairs, settings, folder, None, placer, matching(pairs, settings, None, watch))
-    times = []
+    times, fused = [], []
     for frame in islice(recording.frames(), count):
         marks = [_now(watch)]
         pair = frame if isinstance(frame, RefusedFrame) else pairs.rectify(frame)
@@ -128,7 +135,8 @@ def _steps(
         live.snapshot(live)
         marks.append(_now(watch))
         times.append(np.diff(marks, axis=0))
-    return np.array(times), len(live.stamps_ns)
+        fused.append(len(live.stamps_ns))
+    return np.array(times), np.array(fused, dtype=np.int64)
 
 
 def _now(watch: Stopwatch) -> tuple[float, float, float]:

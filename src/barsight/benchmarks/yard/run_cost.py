@@ -49,7 +49,7 @@ def measure_apart(recording: Path, out: Path, flags: tuple[str, ...]) -> RunCost
 
 def cost_table(title: str, costs: Mapping[str, RunCost], reference: str) -> Table:
     """Tabulate runs side by side, over `reference` where it is one of them, then their stages in s."""
-    caption = "Stages: s by the clock; those that run side by side count each in full."
+    caption = "One run each. Stages: s by the clock; those that run side by side count each in full."
     if reference in costs:
         caption = f"times: over {reference}. {caption}"
     table = Table(title=title, caption=caption, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)

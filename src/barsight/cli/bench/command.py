@@ -103,6 +103,8 @@ def _stereo_speed(
         repeats: Rounds, in each of which every method has its turn.
         save: JSON file for all figures, with commit and machine.
     """
+    if repeats < 1:
+        raise ConfigError(f"--repeats {repeats}: one round at least")
     made = _made(methods)
     if "barsight" in methods:
         for name, settings in {

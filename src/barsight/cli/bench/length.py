@@ -14,6 +14,7 @@ from barsight.benchmarks.provenance import Provenance, provenance
 from barsight.benchmarks.yard.repeated_recording import repeat
 from barsight.benchmarks.yard.run_cost import RunCost, cost_table, measure_apart
 from barsight.cli.safe_console import SafeConsole
+from barsight.core.errors import ConfigError
 from barsight.core.json_values import write_json
 
 
@@ -43,9 +44,11 @@ def bench_length(
 
     Args:
         recording: A recording with crane encoders, as barsight simulate writes it.
-        times: How many laps the long way has.
+        times: How many laps the long way has, two at least.
         save: JSON file for all figures, with commit and machine.
     """
+    if times < 2:
+        raise ConfigError(f"--times {times}: the long way has two laps at least")
     with tempfile.TemporaryDirectory() as scratch:
         once, long = Path(scratch) / "once", Path(scratch) / "long"
         repeat(recording, once, 1)

@@ -60,7 +60,7 @@ def bench_yard(
         if not (place / "truth" / "height.npz").is_file():
             raise ConfigError(f"{place}: has no truth; give a recording of barsight simulate")
         rows = []
-        for method in methods:
+        for method in dict.fromkeys(methods):
             console.print(f"measuring: {method} ...")
             out = Path(scratch) / method.replace(" ", "-")
             cost = measure_apart(place, out, VARIANTS[method])
