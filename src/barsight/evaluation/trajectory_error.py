@@ -108,10 +108,10 @@ def trajectory_drift(
     covariance = np.array([frame.covariance for frame in frames])
     return Drift(
         len(frames),
-        _rms(aligned - true_place) * 1e3,
+        rms(aligned - true_place) * 1e3,
         float(np.degrees(np.sqrt((spread**2).mean()))),
-        _rms(error) * 1e3 if in_yard else nan,
-        float(np.degrees(_rms(angle))) if in_yard else nan,
+        rms(error) * 1e3 if in_yard else nan,
+        float(np.degrees(rms(angle))) if in_yard else nan,
         _drift(place, turn, true_place, true_turn, min_length_m),
         min_length_m,
         _nees(error, covariance[:, 3:, 3:]) if in_yard else nan,
@@ -126,7 +126,8 @@ def align_umeyama(place: Float64, target: Float64) -> Float64:
     return aligned
 
 
-def _rms(vectors: Float64) -> float:
+def rms(vectors: Float64) -> float:
+    """Compute the root mean square of vectors' lengths (N, 3)."""
     return float(np.sqrt((vectors**2).sum(axis=1).mean()))
 
 

@@ -20,7 +20,7 @@ from barsight.core.pose import Pose
 from barsight.core.stamps import seconds_to_ns
 from barsight.core.types import PosedFrame, Trajectory
 from barsight.evaluation.score import score_folder
-from barsight.evaluation.trajectory_error import frame_errors
+from barsight.evaluation.trajectory_error import frame_errors, rms
 from barsight.recording.formats.ground_truth import read_ground_truth
 from barsight.result_folder import read_summary
 from barsight.yard.inventory.bundle_file import read_bundles
@@ -288,14 +288,10 @@ def _poses(recording: Path, out: Path) -> dict[str, float]:
     inside = np.abs(error) <= TWO_SIDED * np.array(sigmas, np.float64)
     return {
         "samples": float(error.size),
-        "rmse_mm": 1e3 * _rms(error),
+        "rmse_mm": 1e3 * rms(error),
         "max_mm": 1e3 * float(np.linalg.norm(error, axis=1).max()),
         "within_95_pct": 100 * float(inside.mean()),
-        "turn_rmse_deg": math.degrees(_rms(turn)),
-        "aligned_rmse_mm": 1e3 * _rms(aligned),
-        "aligned_turn_rmse_deg": math.degrees(_rms(turn - turn.mean(axis=0))),
+        "turn_rmse_deg": math.degrees(rms(turn)),
+        "aligned_rmse_mm": 1e3 * rms(aligned),
+        "aligned_turn_rmse_deg": math.degrees(rms(turn - turn.mean(axis=0))),
     }
-
-
-def _rms(vectors: Float64) -> float:
-    return float(np.sqrt((vectors**2).sum(axis=1).mean()))
