@@ -15,7 +15,6 @@ from rich.table import Table
 
 from barsight.benchmarks.provenance import Provenance
 from barsight.benchmarks.yard.bundle_scores import TrueBundle, read_true_bundles, score_bundles
-from barsight.core.arrays import Float64
 from barsight.core.pose import Pose
 from barsight.core.stamps import seconds_to_ns
 from barsight.core.types import PosedFrame, Trajectory
