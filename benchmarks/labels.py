@@ -15,11 +15,10 @@ import numpy as np
 from scipy import ndimage
 
 from barsight.benchmarks.lift_judge.magnet import read_magnet
-from barsight.cli.bench.lifts import OVER_MAGNET_M, SPAN_M
+from barsight.benchmarks.yard.drawn_worlds import judged_yard
 from barsight.core.arrays import Bool, Float32, Float64
 from barsight.result_folder import read_heights
 from barsight.simulation.worlds.solids import Solid
-from barsight.simulation.worlds.yards import draw_yard
 from barsight.yard.inventory.bundle_file import read_bundles
 from barsight.yard.lifting.labels import mark_labels
 from barsight.yard.magnet.description import example_magnet
@@ -79,12 +78,12 @@ def main(arguments: list[str]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "magnet.toml"
         path.write_text(example_magnet(), encoding="utf-8")
-        length_m = 2 * read_magnet(path).half_span_m + OVER_MAGNET_M
+        magnet = read_magnet(path)
     seen = hits = patches = 0
     free_m = 0.0
     for seed in map(int, arguments[1:]):
         out = Path(arguments[0]) / f"seed_{seed}" / "measured"
-        solids = draw_yard(seed, length_m, SPAN_M, min_length_ratio=1.0).yard.solids
+        solids = judged_yard(seed, magnet).yard.solids
         labels = [solid for solid in solids if solid.part == "tag"]
         yard = read_heights(out)
         heights = yard.part(slice(0, yard.shape[0]), slice(0, yard.shape[1]))

@@ -22,16 +22,16 @@ from barsight.benchmarks.lift_judge.magnet import JudgedMagnet, read_magnet
 from barsight.benchmarks.yard.drawn_worlds import (
     MappedWorld,
     drawn_scene,
+    judged_yard,
     map_world,
     measured_world,
     noisy_world,
 )
 from barsight.benchmarks.yard.judged_lifts import draw_beside, over_bundle
-from barsight.cli.bench.lifts import OVER_MAGNET_M, SPAN_M
 from barsight.cli.bench.seeds import parse_seeds
-from barsight.simulation.worlds.recording import COVERED_RATIO, CROSSED_RATIO, cover
+from barsight.simulation.worlds.recording import cover, is_uncovered
 from barsight.simulation.worlds.surfaces import owners
-from barsight.simulation.worlds.yards import DrawnBundle, DrawnYard, draw_yard
+from barsight.simulation.worlds.yards import DrawnBundle, DrawnYard
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.layers import list_neighbours
@@ -53,8 +53,7 @@ def true_bundles(world: DrawnYard) -> tuple[Bundle, ...]:
     scene, owner = drawn_scene(world), owners(world.yard)
     known = []
     for number, drawn in enumerate(world.bundles):
-        covered, crossed = cover(scene, owner, drawn)
-        known.append(_bundle(number, drawn, is_free=covered < COVERED_RATIO and crossed < CROSSED_RATIO))
+        known.append(_bundle(number, drawn, is_free=is_uncovered(*cover(scene, owner, drawn))))
     return tuple(replace(one, neighbours=list_neighbours(one, known)) for one in known)
 
 
@@ -111,7 +110,7 @@ def main(keep: Path, seeds: range, placements: int) -> None:
         out = keep / f"seed_{seed}" / "measured"
         if not (out / "bundles.json").is_file():
             continue
-        world = draw_yard(seed, 2 * judged.half_span_m + OVER_MAGNET_M, SPAN_M, min_length_ratio=1.0)
+        world = judged_yard(seed, judged)
         places = fine_placements(world, judged, placements)
         fine += len(places)
         for name, mapped in four_maps(world, out).items() if places else ():

@@ -9,6 +9,7 @@ import numpy as np
 from scipy import ndimage
 
 from barsight.benchmarks.lift_judge.envelopes import envelope
+from barsight.benchmarks.lift_judge.magnet import JudgedMagnet
 from barsight.core.types import HeightSource
 from barsight.result_folder import read_heights, read_summary
 from barsight.simulation.scene import Scene
@@ -16,7 +17,7 @@ from barsight.simulation.settings import CameraSettings, SimulationSettings
 from barsight.simulation.simulate import LaidYard, simulate
 from barsight.simulation.worlds.conditions import ASIDE_M
 from barsight.simulation.worlds.surfaces import draw_finishes, scene_of
-from barsight.simulation.worlds.yards import DrawnYard
+from barsight.simulation.worlds.yards import DrawnYard, draw_yard
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.inventory.bundle_file import read_bundles
@@ -29,9 +30,18 @@ from barsight.yard.stability.stability import footings
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Veto
 
+SPAN_M = 3.0
+"""Of the stacks that lifts are judged on, across their bars."""
+OVER_MAGNET_M = 0.3
+"""Length of their bars beyond the magnet's."""
 CELL_M, MARGIN_M = 0.01, 0.6
 WHITE_M, ALIKE_M, ALIKE_CELLS = 0.001, 0.0015, 3.0
 """Noise of `noisy_world`: of each cell, and alike over cells."""
+
+
+def judged_yard(seed: int, magnet: JudgedMagnet) -> DrawnYard:
+    """Draw the yard of a seed on which lifts of a magnet are judged: full bars a little longer than it."""
+    return draw_yard(seed, 2 * magnet.half_span_m + OVER_MAGNET_M, SPAN_M, min_length_ratio=1.0)
 
 
 def drawn_scene(world: DrawnYard) -> Scene:

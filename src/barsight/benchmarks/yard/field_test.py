@@ -26,7 +26,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "ours self-calibrated": ("--self-calibrate", "yaw"),
     "ours paper-contours": ("--map.contours", "paper"),
 }
-"""What `barsight measure` is told. sgbm has our trajectory and fusion; it sums costs along four paths,
+"""Flags of `barsight measure`, by method. sgbm has our trajectory and fusion; it sums costs along four paths,
 `sgbm 5path` along five. The last rows are the ablation: trajectory, fusion (any height that
 enough views see, each cell for itself), self-calibration, contours."""
 

@@ -10,7 +10,13 @@ from typing import Annotated
 import tyro
 
 from barsight.benchmarks.lift_judge.magnet import JudgedMagnet, read_magnet
-from barsight.benchmarks.yard.drawn_worlds import MappedWorld, measured_world, noisy_world, render_world
+from barsight.benchmarks.yard.drawn_worlds import (
+    MappedWorld,
+    judged_yard,
+    measured_world,
+    noisy_world,
+    render_world,
+)
 from barsight.benchmarks.yard.judged_lifts import (
     JudgedBench,
     JudgedLift,
@@ -25,14 +31,9 @@ from barsight.core.errors import ConfigError
 from barsight.core.json_values import write_json
 from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings
-from barsight.simulation.worlds.yards import DrawnYard, draw_yard
+from barsight.simulation.worlds.yards import DrawnYard
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.magnet.description import Magnet, example_magnet, load_magnet
-
-SPAN_M = 3.0
-"""Of the drawn stacks, across their bars."""
-OVER_MAGNET_M = 0.3
-"""Length of the drawn bars beyond the magnet's."""
 
 
 def bench_lift_targets(
@@ -113,7 +114,7 @@ def _bench(found: dict[int, tuple[JudgedLift, ...]]) -> JudgedBench:
 
 def _judge_seed(seed: int, given: _Given) -> tuple[JudgedLift, ...]:
     settings, folder = LiftSettings(), given.keep / f"seed_{seed}"
-    world = draw_yard(seed, 2 * given.judged.half_span_m + OVER_MAGNET_M, SPAN_M, min_length_ratio=1.0)
+    world = judged_yard(seed, given.judged)
     if given.rendered:
         mapped = _measured(world, folder, settings, given.full_size)
     else:

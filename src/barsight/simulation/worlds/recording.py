@@ -87,10 +87,15 @@ def _row(bundle: DrawnBundle, world: DrawnWorld, owner: Int64) -> dict[str, Any]
         "bundle_radius": float(np.hypot(*cross.T).max()) + radius, "width": float(high[0] - low[0]),
         "bar_diameter": bundle.diameter_m, "bars": len(cross), "length": bundle.length_m,
         "top_z": float(bundle.centre_m[2] + high[1]), "mass_kg": world.drawn.yard.load(bundle.number)[0],
-        "covered": round(covered, 4), "on_top": covered < COVERED_RATIO and crossed < CROSSED_RATIO,
+        "covered": round(covered, 4), "on_top": is_uncovered(covered, crossed),
         "is_loose": bundle.number >= LOOSE, "manner": bundle.manner, "bow": bundle.bow_m,
         "finish": world.finishes[bundle.number], "cross": np.round(cross, 5).tolist(),
     }  # fmt: skip
+
+
+def is_uncovered(covered: float, crossed: float) -> bool:
+    """Tell whether nothing lies on a bundle, by its `cover`."""
+    return covered < COVERED_RATIO and crossed < CROSSED_RATIO
 
 
 def cover(scene: Scene, owner: Int64, bundle: DrawnBundle) -> tuple[float, float]:
