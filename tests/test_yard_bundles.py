@@ -165,7 +165,7 @@ def test_a_bundle_across_others_lies_on_them() -> None:
     for lower in laid[:2]:
         bundle = nearest(bundles, lower)
         assert bundle.on_top is False
-        assert any("lies on it" in reason for reason in bundle.reasons)
+        assert any("lies on it" in doubt.sentence for doubt in bundle.reasons)
 
 
 def test_a_stack_turned_by_30_degrees_is_found_whole() -> None:
@@ -181,7 +181,7 @@ def test_an_end_out_of_view_is_open() -> None:
     assert len(bundles) == 1
     assert bundles[0].ends_open == (False, True)
     assert np.isnan(bundles[0].sigma.length_m)
-    assert any("high-y end is open" in reason for reason in bundles[0].reasons)
+    assert [doubt.end for doubt in bundles[0].reasons if doubt.end is not None] == [1]
 
 
 def test_an_empty_floor_and_an_unknown_map_hold_no_bundle() -> None:
@@ -236,7 +236,7 @@ def test_a_beam_over_bundles_is_no_bundle() -> None:
         heights.z_m[beam] = (lower[0].top_z_m + 0.1 + noise[beam]).astype(np.float32)
         bundles = find_bundles(heights, SETTINGS)
         assert len(bundles) == 4 and all(b.on_top is on_top for b in bundles)
-        assert all(any(said in reason for reason in b.reasons) for b in bundles)
+        assert all(any(said in doubt.sentence for doubt in b.reasons) for b in bundles)
         assert not any(b.is_free for b in bundles)
 
 

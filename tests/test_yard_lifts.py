@@ -32,6 +32,7 @@ from barsight.yard.magnet.description import Beam, Magnet, Tolerance
 from barsight.yard.magnet.footprint import BundleTable, Placement, count_gripped
 from barsight.yard.magnet.holding import hold_load, pole_shares, share_checks, weakest_pole
 from barsight.yard.magnet.resting_plane import rest_plane
+from barsight.yard.types import Doubt, DoubtKind
 from barsight.yard.vetoes import VETOES, Veto
 from barsight.yard.weight import bundle_mass
 from lift_yards import GIVEN, MAGNET, SETTINGS, SIGMA, bare, codes, judged, laid, map_of, record, sure_travel
@@ -138,7 +139,9 @@ def test_a_thin_bar_beside_a_thick_one_is_in_no_bundle(beside_m: float, *, is_ta
 
 
 def test_a_doubtful_bundle() -> None:
-    lift = judged([laid(0.3)], (record(laid(0.3), confidence=0.3, reasons=("it may be two",)),))
+    lift = judged(
+        [laid(0.3)], (record(laid(0.3), confidence=0.3, reasons=(Doubt(DoubtKind.OTHER, "it may be two"),)),)
+    )
     assert codes(lift) == {"bundle-doubtful"}
     assert "it may be two" in lift.vetoes[0].reason
 
@@ -149,7 +152,9 @@ def test_a_covered_bundle(on_top: bool | None) -> None:
 
 
 def test_a_bundle_that_dunnage_may_hold_down() -> None:
-    lift = judged([laid(0.3)], (record(laid(0.3), cover_doubts=("a beam lies over it",)),))
+    lift = judged(
+        [laid(0.3)], (record(laid(0.3), cover_doubts=(Doubt(DoubtKind.OTHER, "a beam lies over it"),)),)
+    )
     assert codes(lift) == {"covered"}
     assert "a beam lies over it" in lift.vetoes[0].reason
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import jsonschema
@@ -21,7 +22,7 @@ from barsight.yard.inventory.stock_list import (
     read_stock,
     stock_warnings,
 )
-from barsight.yard.types import Bundle
+from barsight.yard.types import Bundle, Doubt, DoubtKind
 from lift_yards import GIVEN
 from yard_folders import schema
 from yard_maps import Laid, draw
@@ -142,8 +143,18 @@ def test_the_file_fits_its_schema_and_comes_back_whole(bundles: tuple[Bundle, ..
         assert back.map_sigma_z_m == pytest.approx(one.map_sigma_z_m, rel=1e-6)
         assert back.fit_sigma is not None and one.fit_sigma is not None
         assert back.fit_sigma.yaw_rad == pytest.approx(one.fit_sigma.yaw_rad, rel=1e-6)
-        assert back.reasons == one.reasons and back.neighbours == one.neighbours
+        assert back.reasons == one.reasons and back.cover_doubts == one.cover_doubts
+        assert back.neighbours == one.neighbours
         assert len(back.bar_axes) == len(one.bar_axes)
+
+
+def test_doubts_come_back_with_their_kind(bundles: tuple[Bundle, ...], tmp_path: Path) -> None:
+    path, told = tmp_path / "bundles.json", tuple(Doubt(kind, f"it: {kind.value} 1") for kind in DoubtKind)
+    write_bundles((replace(bundles[0], reasons=told, cover_doubts=told[::-1]),), None, "yard", GIVEN, path)
+    (back,) = read_bundles(path)
+    assert back.reasons == told and back.cover_doubts == told[::-1]
+    with pytest.raises(ValueError, match="OVERLAP"):
+        Doubt(DoubtKind.OVERLAP, "it may be two")
 
 
 def test_no_bundles_make_a_valid_file(tmp_path: Path) -> None:

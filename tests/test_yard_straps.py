@@ -24,7 +24,7 @@ from barsight.yard.bundles.section.seen_section import SeenSection, section_of_p
 from barsight.yard.bundles.section.strap_lines import _best_stretches, row_gains, split_columns
 from barsight.yard.bundles.section.straps import StrapSpan, _merged, longest_runs
 from barsight.yard.bundles.strapped_bundles import _covered, _may_go_on
-from barsight.yard.types import HeightMap
+from barsight.yard.types import DoubtKind, HeightMap
 from lift_yards import laid, record
 
 CELL = 0.01
@@ -368,7 +368,7 @@ def test_what_lies_over_a_pack_leaves_its_section_open() -> None:
     (lower,) = (b for b in found if abs(b.centre_m[0] + 0.125) < 0.05)
     (upper,) = (b for b in found if abs(b.centre_m[0] - 0.13) < 0.05)
     assert upper.on_top and upper.width_m == pytest.approx(0.26, abs=0.04)
-    assert not lower.is_free and any("flank" in doubt for doubt in lower.cover_doubts)
+    assert not lower.is_free and DoubtKind.HIDDEN_FLANK in {doubt.kind for doubt in lower.cover_doubts}
     assert lower.bars is None and not np.isfinite(lower.section_m2)
     assert lower.sigma.width_m > 0.4 * lower.width_m
 

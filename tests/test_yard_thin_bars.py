@@ -24,7 +24,7 @@ from barsight.yard.thin_lines import (
     find_thin_lines,
     with_thin_lines,
 )
-from barsight.yard.types import Bundle, HeightMap
+from barsight.yard.types import Bundle, Doubt, DoubtKind, HeightMap
 from lift_yards import MAGNET, SETTINGS, codes, judged, laid, map_of, record
 
 STOCK = [laid(0.0), laid(0.45)]
@@ -240,16 +240,13 @@ def test_a_strong_line_covers_a_bundle_and_a_faint_one_is_a_doubt(bar_m: float, 
 
 
 @pytest.mark.parametrize(
-    ("doubt", "layer", "on_top"),
-    [
-        ("what stands 40 mm higher beside it may lie over its high flank", 0, True),
-        ("what stands 40 mm higher beside it may lie over its high flank", 1, None),
-        ("its low flank was not seen: something may lie over it", 0, None),
-    ],
+    ("kind", "layer", "on_top"),
+    [(DoubtKind.HIDDEN_FLANK, 0, True), (DoubtKind.HIDDEN_FLANK, 1, None), (DoubtKind.UNSEEN_FLANK, 0, None)],
 )
 def test_a_hidden_flank_leaves_open_what_lies_on_a_bundle_but_on_the_floor(
-    doubt: str, layer: int, on_top: bool | None
+    kind: DoubtKind, layer: int, on_top: bool | None
 ) -> None:
+    doubt = Doubt(kind, kind.value)
     bundle = replace(LOAD[0], reasons=(doubt,), cover_doubts=(doubt,))
     assert check_uncovered(bundle, [bundle], layer)[0] is on_top
     assert not bundle.is_free

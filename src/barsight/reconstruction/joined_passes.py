@@ -25,7 +25,7 @@ from barsight.measurement import BuiltMap
 from barsight.reconstruction.map_building import ProbedRecording, TrackedRecording
 from barsight.recording.base import Recording
 from barsight.registration.pass_ties import PairTie, PassCorrection, PassPrior, PassTies, tie_passes
-from barsight.yard.types import Bundle
+from barsight.yard.types import Bundle, Doubt, DoubtKind
 
 MIN_SIGMA = np.array([2e-4, 2e-4, 2e-4, 0.002, 0.002, 0.002])
 """Turn (rad) and shift (m) that no pass is taken to know better: springs and rails that no encoder sees."""
@@ -33,7 +33,9 @@ SCALE_SIGMA = 2e-4
 """By which share two passes' ways along X may differ."""
 CHANGE_REACH_M = 0.5
 """A change so near to a bundle that was not seen whole since may have been one of it."""
-STALE = "the yard changed beside it between two passes, and a part of it was not seen since"
+STALE = Doubt(
+    DoubtKind.OTHER, "the yard changed beside it between two passes, and a part of it was not seen since"
+)
 
 
 @dataclass(frozen=True, eq=False)

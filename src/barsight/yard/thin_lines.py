@@ -15,10 +15,8 @@ from scipy.ndimage import maximum_filter1d
 
 from barsight.core.arrays import Float32, Float64, Int64, kernel
 from barsight.core.linalg.robust import known_median, mad_sigma, running_median
-from barsight.yard.types import Bundle, HeightMap
+from barsight.yard.types import Bundle, Doubt, DoubtKind, HeightMap
 
-KNOWN_ACROSS = "crosses over it"
-"""In the reason of a bundle that heights show to be crossed at several places, as by dunnage."""
 MAX_STRENGTH = 8.0
 """Of a line that texture, dunnage or a strap with a bright middle makes on a load, in sigmas of its row."""
 SURE_STRENGTH = 14.0
@@ -82,14 +80,14 @@ def find_thin_lines(heights: HeightMap, bundle: Bundle) -> tuple[ThinLine, ...] 
 
 def with_thin_lines(bundle: Bundle, heights: HeightMap) -> Bundle:
     """Return a bundle that says so where a line runs across it; dunnage that heights show is left out."""
-    if heights.tops is None or any(KNOWN_ACROSS in reason for reason in bundle.reasons):
+    if heights.tops is None or any(doubt.kind is DoubtKind.CROSSED for doubt in bundle.reasons):
         return bundle
     lines = find_thin_lines(heights, bundle)
     if lines is None or lines[0].strength < MAX_STRENGTH:
         return bundle
-    lies = "lies" if lines[0].strength >= SURE_STRENGTH else "may lie"
-    reason = f"a line runs across it {lines[0].along_m:+.2f} m from its middle: a thin bar {lies} over it"
-    return replace(bundle, reasons=(*bundle.reasons, reason), cover_doubts=(*bundle.cover_doubts, reason))
+    kind = DoubtKind.THIN_BAR if lines[0].strength >= SURE_STRENGTH else DoubtKind.FAINT_LINE
+    doubt = Doubt(kind, f"a line runs across it {lines[0].along_m:+.2f} m from its middle: {kind.value}")
+    return replace(bundle, reasons=(*bundle.reasons, doubt), cover_doubts=(*bundle.cover_doubts, doubt))
 
 
 def line_strengths(heights: HeightMap, bundle: Bundle) -> tuple[Float64, Float32] | None:

@@ -7,12 +7,16 @@ All in the yard frame, m and rad. Yaw is the axis's angle from +Y about Z, count
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 from typing import Any, Protocol
 
 import numpy as np
 
 from barsight.core.arrays import Float32, Float64, UInt8
 from barsight.core.extras import extra
+
+ENDS = "low-y", "high-y"
+"""Names of a bundle's ends."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,6 +169,43 @@ class FitSigma:
     top_z_m: float
 
 
+class DoubtKind(Enum):
+    """Tell apart the doubts that something is decided by. A value is the words in every sentence of the kind,
+    and in no other: files hold sentences alone.
+    """
+
+    COVERED_END = "end is open: something higher"
+    LIES_ACROSS = "lies across it"
+    COVERS_PART = "covers a part of it"
+    CROSSED = "crosses over it"
+    THIN_BAR = "a thin bar lies over it"
+    FAINT_LINE = "a thin bar may lie over it"
+    UNSEEN_FLANK = "flank was not seen"
+    HIDDEN_FLANK = "beside it may lie over its"
+    OVERLAP = "overlap: one may lie over the other"
+    RIVAL = "explains the surface nearly as well"
+    OTHER = ""
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """Say what speaks against a bundle as described. end: number, in ENDS, of the open end it tells of."""
+
+    kind: DoubtKind
+    sentence: str
+    end: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.kind.value not in self.sentence:
+            raise ValueError(f"no doubt of kind {self.kind.name}: {self.sentence}")
+
+    @classmethod
+    def read(cls, sentence: str) -> Doubt:
+        """Read a sentence of a file back."""
+        end = next((k for k, name in enumerate(ENDS) if f"the {name} end is open" in sentence), None)
+        return cls(next(kind for kind in DoubtKind if kind.value in sentence), sentence, end)
+
+
 @dataclass(frozen=True, eq=False)
 class Bundle:
     """A bundle of round bars, or a single heavy bar.
@@ -176,10 +217,10 @@ class Bundle:
     visible_bars: bars seen from above. bars: bars in the bundle by its outline, None where that isn't
     certain; section_m2: steel's section by what was seen, NaN where that isn't known either.
     layer: 0 lies on the floor or on dunnage. on_top: no other bundle or bar is known to lie on it; None where
-    something lies there that isn't known. cover_doubts: sentences on what may hold it down all the same, as
-    dunnage or a hidden flank.
+    something lies there that isn't known. cover_doubts: what may hold it down all the same, as dunnage or a
+    hidden flank.
     neighbours: ids of the bundles it touches. known_share: share of its outline that was measured.
-    confidence: probability that a bundle lies here as described. reasons: sentences for whoever doubts it.
+    confidence: probability that a bundle lies here as described. reasons: all that speaks against it.
     label: None where none was seen, or they weren't read. fit_sigma: of the outline's fit alone; None where
     straps tell the place instead. map_sigma_z_m: of heights there, which holds the calibration's part, shared
     by the whole map and not in `sigma`; NaN where it isn't known.
@@ -203,11 +244,11 @@ class Bundle:
     sigma: BundleSigma
     known_share: float
     confidence: float
-    reasons: tuple[str, ...]
+    reasons: tuple[Doubt, ...]
     bar_axes: tuple[Bar, ...] = ()
     ends_sigma_m: tuple[float, float] = (float("nan"), float("nan"))
     section_m2: float = float("nan")
-    cover_doubts: tuple[str, ...] = ()
+    cover_doubts: tuple[Doubt, ...] = ()
     label: BundleLabel | None = None
     fit_sigma: FitSigma | None = None
     map_sigma_z_m: float = float("nan")

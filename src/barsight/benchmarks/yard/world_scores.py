@@ -23,10 +23,10 @@ from barsight.evaluation.trajectory_error import frame_errors, rms
 from barsight.recording.formats.ground_truth import read_ground_truth
 from barsight.result_folder import read_summary
 from barsight.yard.inventory.bundle_file import read_bundles
-from barsight.yard.types import Bundle
+from barsight.yard.types import Bundle, DoubtKind
 
 TWO_SIDED = 1.959964
-UNSEEN = "flank", "overlap", "a thin bar may"
+UNSEEN = frozenset({DoubtKind.UNSEEN_FLANK, DoubtKind.HIDDEN_FLANK, DoubtKind.OVERLAP, DoubtKind.FAINT_LINE})
 """In `cover_doubts` on what isn't seen to lie there: a bundle with no others is said to be free. A beam or
 bar that is seen across it covers it, in a world's truth."""
 SEEN_FRAMES, SEEN_RATIO = 2, 0.5
@@ -117,7 +117,7 @@ def score_world(recording: Path, out: Path | None, looked_at: str, refused: str)
 
 def _said_free(bundle: Bundle) -> bool:
     """Check that a bundle is on top, and that nothing is seen to lie on it."""
-    return bundle.on_top is True and all(any(word in d for word in UNSEEN) for d in bundle.cover_doubts)
+    return bundle.on_top is True and all(doubt.kind in UNSEEN for doubt in bundle.cover_doubts)
 
 
 def world_rows(worlds: Sequence[WorldScore]) -> tuple[WorldRow, ...]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from barsight.yard.bundles.fitting.ends import middle_and_length_sigma
-from barsight.yard.types import Bundle
+from barsight.yard.types import ENDS, Bundle, Doubt
 
 _SKEW, _ASIDE_RATIO, _LEVEL_M = 0.05, 0.3, 0.04
 """Most that two pieces of one bundle differ by: sine of the skew, way between their axes over the narrower
@@ -72,14 +72,20 @@ def _joined(whole: Bundle, piece: Bundle) -> Bundle | None:
         along_m=middle,
         length_m=length,
     )
-    name = ("low-y", "high-y")[side]
-    kept = tuple(r for r in whole.reasons if f"the {name} end is open" not in r)
-    doubts = tuple(r for r in piece.reasons if "is open" not in r or ("low-y", "high-y")[far] in r)
-    doubts = tuple(r.replace(("low-y", "high-y")[far], name) for r in doubts if r not in kept)
+    kept = tuple(doubt for doubt in whole.reasons if doubt.end != side)
+    added = (doubt for doubt in piece.reasons if doubt.end in (None, far) and doubt not in kept)
+    reasons = (*kept, *(_at_end(doubt, side) for doubt in added))
     return replace(
         whole, centre_m=ends.mean(axis=0), ends_m=ends, ends_open=(is_open[0], is_open[1]),
         ends_sigma_m=(sigmas[0], sigmas[1]), length_m=float(np.linalg.norm(ends[1] - ends[0])), sigma=sigma,
         bars=whole.bars if whole.bars == piece.bars else None,
-        confidence=min(whole.confidence, piece.confidence), reasons=kept + doubts,
+        confidence=min(whole.confidence, piece.confidence), reasons=reasons,
         cover_doubts=tuple(dict.fromkeys(whole.cover_doubts + piece.cover_doubts)),
     )  # fmt: skip
+
+
+def _at_end(doubt: Doubt, end: int) -> Doubt:
+    """Tell of an end of the whole what is told of a piece's; other doubts stay as they are."""
+    if doubt.end is None:
+        return doubt
+    return replace(doubt, sentence=doubt.sentence.replace(ENDS[doubt.end], ENDS[end]), end=end)

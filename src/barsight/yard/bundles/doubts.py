@@ -14,7 +14,7 @@ from barsight.yard.bundles.fitting.outline_fit import ABOVE, AGREES, BELOW, DIAM
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.reading import Reading
 from barsight.yard.bundles.section.seen_section import SeenSection, is_no_hexagon
-from barsight.yard.thin_lines import KNOWN_ACROSS
+from barsight.yard.types import ENDS, Doubt, DoubtKind
 
 _NARROW_M = 0.3
 """Longest place along a bundle over which a thing that lies across it counts as narrow."""
@@ -34,8 +34,8 @@ _SURE_KNOWN = 0.7
 
 def count_bars(
     reading: Reading, seen: SeenSection | None, top_m: float, floor_m: float | None
-) -> tuple[int | None, tuple[str, ...]]:
-    """Count bars by the outline; None and a sentence where it is not surely a full hexagon, where another
+) -> tuple[int | None, tuple[Doubt, ...]]:
+    """Count bars by the outline; None and a doubt where it is not surely a full hexagon, where another
     packing explains its kind as well, or where one bar may as well be many thin ones.
     """
     fit, other = reading.found.fit, reading.other_packing
@@ -43,20 +43,25 @@ def count_bars(
         why_not = is_no_hexagon(seen, fit, top_m, floor_m)
         if not why_not and fit.rings == 0 and reading.found.shades is None:
             why_not = "many thin bars may look like one"
-        return (None, (f"its bars can't be counted: {why_not}",)) if why_not else (fit.bars, ())
+        if not why_not:
+            return fit.bars, ()
+        return None, (Doubt(DoubtKind.OTHER, f"its bars can't be counted: {why_not}"),)
     diameter = fit.width_m / bundle_width(other, 1.0)
-    return None, (
+    both = (
         f"{fit.bars} bars of {1e3 * fit.values[DIAMETER]:.0f} mm or {BARS_OF_RINGS[other]} of "
-        f"{1e3 * diameter:.0f} mm: the outline fits both",
+        f"{1e3 * diameter:.0f} mm: the outline fits both"
     )
+    return None, (Doubt(DoubtKind.OTHER, both),)
 
 
-def list_doubts(reading: Reading, rows: UInt8, ends: list[End], settings: BundleSettings) -> tuple[str, ...]:
+def list_doubts(
+    reading: Reading, rows: UInt8, ends: list[End], settings: BundleSettings
+) -> tuple[Doubt, ...]:
     """List what speaks against the bundle as described."""
     out = []
     known = (rows != 0).mean()
     if known < _SURE_KNOWN:
-        out.append(f"only {100 * known:.0f} % of its length was measured")
+        out.append(Doubt(DoubtKind.OTHER, f"only {100 * known:.0f} % of its length was measured"))
     crossed = _runs(rows == ABOVE)
     cell = reading.found.grid.cell_m
     narrow = _places(
@@ -64,21 +69,26 @@ def list_doubts(reading: Reading, rows: UInt8, ends: list[End], settings: Bundle
     )
     wide = [b - a for a, b in crossed if (b - a) * cell > _NARROW_M]
     if narrow == 1:
-        out.append("something narrow lies across it at one place")
+        out.append(Doubt(DoubtKind.LIES_ACROSS, "something narrow lies across it at one place"))
     elif narrow:
-        out.append(f"something narrow {KNOWN_ACROSS} at {narrow} places, such as dunnage")
-    out += [f"something {n * cell:.2f} m long covers a part of it" for n in wide]
+        said = f"something narrow crosses over it at {narrow} places, such as dunnage"
+        out.append(Doubt(DoubtKind.CROSSED, said))
+    out += [
+        Doubt(DoubtKind.COVERS_PART, f"something {n * cell:.2f} m long covers a part of it") for n in wide
+    ]
     sunken = (rows == BELOW).sum() * cell
     if sunken > 0.1:
-        out.append(f"over {sunken:.2f} m the surface lies lower than the outline")
-    out += [f"the {name} end is open: {end.why}" for name, end in zip(("low-y", "high-y"), ends, strict=True)
-            if end.is_open]  # fmt: skip
+        out.append(Doubt(DoubtKind.OTHER, f"over {sunken:.2f} m the surface lies lower than the outline"))
+    for number, (name, end) in enumerate(zip(ENDS, ends, strict=True)):
+        if end.is_open:
+            kind = DoubtKind.COVERED_END if end.is_covered else DoubtKind.OTHER
+            out.append(Doubt(kind, f"the {name} end is open: {end.why}", number))
     if reading.rival is not None and reading.rival_weight > 0.9 * reading.weight:
         gap = abs(reading.rival.fit.width_m - reading.found.fit.width_m)
         if gap > 0.15 * reading.found.fit.width_m:
-            out.append(
-                f"a bundle {1e3 * reading.rival.fit.width_m:.0f} mm wide explains the surface nearly as well"
-            )
+            width_mm = 1e3 * reading.rival.fit.width_m
+            said = f"a bundle {width_mm:.0f} mm wide explains the surface nearly as well"
+            out.append(Doubt(DoubtKind.RIVAL, said))
     return tuple(out)
 
 
@@ -97,12 +107,13 @@ def _places(runs: list[tuple[int, int]], reading: Reading, settings: BundleSetti
     return places if highest > _LIES_M else 0
 
 
-def list_cover_doubts(reading: Reading, reasons: tuple[str, ...]) -> tuple[str, ...]:
+def list_cover_doubts(reading: Reading, reasons: tuple[Doubt, ...]) -> tuple[Doubt, ...]:
     """List what may hold the bundle down though no other bundle is known to lie on it."""
-    out = [reason for reason in reasons if KNOWN_ACROSS in reason]
+    out = [doubt for doubt in reasons if doubt.kind is DoubtKind.CROSSED]
     laid = measure_laid(reading)
     if laid > 0:
-        out.append(f"something {1e3 * laid:.0f} mm high lies over a part of its width")
+        said = f"something {1e3 * laid:.0f} mm high lies over a part of its width"
+        out.append(Doubt(DoubtKind.OTHER, said))
     if reading.flanks is not None and reading.flanks.cover_doubt:
         out.append(reading.flanks.cover_doubt)
     return tuple(out)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from barsight.core.arrays import Float64
-from barsight.yard.types import Bundle
+from barsight.yard.types import Bundle, Doubt, DoubtKind
 
 _OVERLAP_M = 0.05
 _TOUCH_M = 0.03
@@ -16,14 +16,15 @@ _LOWER_RATIO = 0.15
 _PARALLEL = 0.08
 _INSIDE = 0.35
 """Share of a bundle's width, to either side of its axis, within which no other bundle lies."""
-_DOUBTS = (
-    "covers a part", "something higher", "lies across it", "a thin bar lies over it", "flank was not seen",
-)  # fmt: skip
-"""In reasons that leave open whether something lies on a bundle. A faint line across it is most often a
-strap: a doubt, which forbids its lift."""
-_HEAPED = " may lie over its "
-"""The same from the second layer on, where bundles rest on each other's flanks. On the floor a higher
-neighbour that hides the lower part of a flank most often stands beside it: a doubt."""
+_LEAVE_OPEN = frozenset({
+    DoubtKind.COVERS_PART, DoubtKind.COVERED_END, DoubtKind.LIES_ACROSS, DoubtKind.THIN_BAR,
+    DoubtKind.UNSEEN_FLANK,
+})  # fmt: skip
+"""Doubts that leave open whether something lies on a bundle. A faint line across it, most often a strap,
+only forbids its lift.
+
+A hidden flank does so from the second layer on, where bundles rest on each other's flanks. On the floor a
+higher neighbour that hides the lower part of a flank most often stands beside it."""
 _MEET_M, _MEET_LENGTH_M = 0.02, 0.3
 """Two outlines that overlap by more, over this length, are not both right: one may lie over the other."""
 
@@ -55,13 +56,15 @@ def _is_alike(one: Bundle, other: Bundle) -> bool:
     return bool(parallel and abs(other.width_m - one.width_m) < 0.15 * one.width_m)
 
 
-def check_uncovered(bundle: Bundle, bundles: list[Bundle], layer: int) -> tuple[bool | None, tuple[str, ...]]:
+def check_uncovered(
+    bundle: Bundle, bundles: list[Bundle], layer: int
+) -> tuple[bool | None, tuple[Doubt, ...]]:
     """Check whether no other lies on the bundle, and why not; None where what covers it isn't known."""
     covers = [other.id for other in bundles if other.id != bundle.id and _lies_on(other, bundle)]
     if covers:
-        return False, (f"bundle {', '.join(map(str, covers))} lies on it",)
-    doubts = (*_DOUBTS, _HEAPED) if layer > 0 else _DOUBTS
-    if any(doubt in reason for reason in bundle.reasons for doubt in doubts):
+        return False, (Doubt(DoubtKind.OTHER, f"bundle {', '.join(map(str, covers))} lies on it"),)
+    kinds = {doubt.kind for doubt in bundle.reasons}
+    if kinds & _LEAVE_OPEN or (layer > 0 and DoubtKind.HIDDEN_FLANK in kinds):
         return None, ()
     return True, ()
 
@@ -73,17 +76,16 @@ def _lies_on(upper: Bundle, lower: Bundle) -> bool:
     return _common_length(lower, upper, -0.2 * lower.width_m) > _OVERLAP_M
 
 
-def list_overlaps(bundle: Bundle, bundles: list[Bundle]) -> tuple[str, ...]:
+def list_overlaps(bundle: Bundle, bundles: list[Bundle]) -> tuple[Doubt, ...]:
     """List other bundles whose outlines overlap this one's and whose middles or tops lie no lower: they may
     lie over its flank. In plan view two convex sections overlap where one's widest place is above the
     other's.
     """
     ids = [str(other.id) for other in bundles if other.id != bundle.id and _overlaps(other, bundle)]
-    return (
-        (f"its outline and that of bundle {', '.join(ids)} overlap: one may lie over the other",)
-        if ids
-        else ()
-    )
+    if not ids:
+        return ()
+    outlines = f"its outline and that of bundle {', '.join(ids)}"
+    return (Doubt(DoubtKind.OVERLAP, f"{outlines} overlap: one may lie over the other"),)
 
 
 def _overlaps(other: Bundle, bundle: Bundle) -> bool:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from barsight.yard.types import Bundle
+from barsight.yard.types import Bundle, Doubt, DoubtKind
 
 DOUBTFUL = 0.4
 """The most confidence in an outline that straps speak against."""
@@ -36,10 +36,11 @@ def _cut_at(bundle: Bundle, packs: list[Bundle]) -> Bundle:
         if reach <= 0 or left < _NARROWEST_M or not _side_by_side(bundle, pack):
             continue
         if reach > _SLIGHT_M:
-            doubt = f"its outline reaches {1e3 * reach:.0f} mm into a bundle that straps hold"
+            said = f"its outline reaches {1e3 * reach:.0f} mm into a bundle that straps hold"
             bundle = replace(
                 bundle, bars=None, section_m2=np.nan, confidence=min(bundle.confidence, DOUBTFUL),
-                reasons=(*bundle.reasons, doubt), sigma=replace(bundle.sigma, section_m2=np.nan),
+                reasons=(*bundle.reasons, Doubt(DoubtKind.OTHER, said)),
+                sigma=replace(bundle.sigma, section_m2=np.nan),
             )  # fmt: skip
         aside = -np.sign(beside) * reach / 2 * across
         sigma = replace(

@@ -14,7 +14,7 @@ from barsight.yard.bundles.section.bar_pitch import DIAMETER_SIGMA_RATIO
 from barsight.yard.bundles.section.pack_sides import PackSide
 from barsight.yard.bundles.section.packs import Pack, contradicts
 from barsight.yard.bundles.section.seen_section import SeenSection, over_floor, section_of_pack
-from barsight.yard.types import Bundle, BundleSigma
+from barsight.yard.types import Bundle, BundleSigma, Doubt, DoubtKind
 
 _PACK_MIDDLE_M, _PACK_WIDTH_M, _PACK_TOP_M, _PACK_WIDTH_SIGMAS = 0.012, 0.016, 0.006, 3.0
 """Standard deviations of a pack's middle, width and top, and its width's in those of a height."""
@@ -52,10 +52,11 @@ def held_by_straps(
     held = _held(bundle, irregular, reading, pack, floor_m)
     if held.bars is not None or not _may_go_on(pack, seen):
         return held
-    reason = "its straps show on its crest alone, and its surface doesn't end there: it may be wider"
+    said = "its straps show on its crest alone, and its surface doesn't end there: it may be wider"
     return replace(
-        held, section_m2=np.nan, sigma=replace(held.sigma, section_m2=np.nan), reasons=(*held.reasons, reason)
-    )
+        held, section_m2=np.nan, sigma=replace(held.sigma, section_m2=np.nan),
+        reasons=(*held.reasons, Doubt(DoubtKind.OTHER, said)),
+    )  # fmt: skip
 
 
 def _may_go_on(pack: Pack, seen: SeenSection | None) -> bool:
@@ -94,7 +95,8 @@ def _as_pack(
         aside = -aside
     down = np.array([0.0, 0.0, pack.top_m - pack.width_m / 2])
     diameter = pack.diameter_m if pack.diameter_m > 0 else bundle.bar_diameter_m
-    packing = f"straps at {len(pack.span.rows_m)} places hold it together, not the packing that was fitted"
+    said = f"straps at {len(pack.span.rows_m)} places hold it together, not the packing that was fitted"
+    kept = (doubt for doubt in bundle.reasons if doubt.kind is not DoubtKind.RIVAL)
     return replace(
         bundle,
         centre_m=bundle.centre_m + aside + down,
@@ -106,7 +108,7 @@ def _as_pack(
         bar_axes=(),
         section_m2=section,
         confidence=_STRAPPED * rate_agreement(fit.state[fit.first : fit.last + 1]),
-        reasons=(*(reason for reason in bundle.reasons if "explains the surface" not in reason), packing),
+        reasons=(*kept, Doubt(DoubtKind.OTHER, said)),
         sigma=replace(
             bundle.sigma,
             lateral_m=float(np.hypot(bundle.sigma.lateral_m, _PACK_MIDDLE_M)),
@@ -126,7 +128,10 @@ def _covered(bundle: Bundle, pack: Pack) -> Bundle:
     if not sides:
         return bundle
     hidden_m = _HIDDEN_RATIO * bundle.width_m
-    doubts = tuple(f"what stands higher beside it may lie over its {name} flank" for name in sides)
+    doubts = tuple(
+        Doubt(DoubtKind.HIDDEN_FLANK, f"what stands higher beside it may lie over its {name} flank")
+        for name in sides
+    )
     return replace(
         bundle,
         bars=None,
@@ -145,10 +150,10 @@ def _covered(bundle: Bundle, pack: Pack) -> Bundle:
 
 def _partly_seen(bundle: Bundle, irregular: BundleSigma, pack: Pack) -> Bundle:
     """Doubt a bundle whose pack goes on beyond it or lies aside, and whose flanks are not both seen."""
-    beyond_m, doubt = contradicts(pack, bundle.width_m)
-    if doubt:
-        sure = min(bundle.confidence, DOUBTFUL)
-        bundle = replace(bundle, confidence=sure, reasons=(*bundle.reasons, doubt), bars=None)
+    beyond_m, said = contradicts(pack, bundle.width_m)
+    if said:
+        sure, reasons = min(bundle.confidence, DOUBTFUL), (*bundle.reasons, Doubt(DoubtKind.OTHER, said))
+        bundle = replace(bundle, confidence=sure, reasons=reasons, bars=None)
         irregular = replace(
             irregular,
             width_m=float(np.hypot(irregular.width_m, beyond_m)),

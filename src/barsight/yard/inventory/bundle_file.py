@@ -17,7 +17,7 @@ from barsight.core.reading.json_schema import expect_schema, package_schema
 from barsight.core.reading.sealed_json import read_sealed, write_sealed
 from barsight.yard.identity import MapIdentity
 from barsight.yard.inventory.stock_list import MatchedEntry, StockMatch
-from barsight.yard.types import Bar, Bundle, BundleLabel, BundleSigma, FitSigma
+from barsight.yard.types import Bar, Bundle, BundleLabel, BundleSigma, Doubt, FitSigma
 from barsight.yard.weight import bundle_mass, bundle_section
 
 SCHEMA_VERSION = 2
@@ -94,7 +94,7 @@ def _record(bundle: Bundle) -> dict[str, Any]:
         "mass_kg": mass.kg,
         "layer": bundle.layer,
         "on_top": bundle.on_top,
-        "cover_doubts": list(bundle.cover_doubts),
+        "cover_doubts": [doubt.sentence for doubt in bundle.cover_doubts],
         "neighbours": list(bundle.neighbours),
         "sigma": {
             "lateral_m": sigma.lateral_m,
@@ -111,7 +111,7 @@ def _record(bundle: Bundle) -> dict[str, Any]:
         "map_sigma_z_m": bundle.map_sigma_z_m,
         "known_share": bundle.known_share,
         "confidence": bundle.confidence,
-        "reasons": list(bundle.reasons),
+        "reasons": [doubt.sentence for doubt in bundle.reasons],
         "label": bundle.label,
         "bar_axes": [
             {
@@ -170,12 +170,12 @@ def bundle_of(record: dict[str, Any]) -> Bundle:
         bars=record["bars"] or None,
         layer=record["layer"],
         on_top=record["on_top"],
-        cover_doubts=tuple(record["cover_doubts"]),
+        cover_doubts=tuple(map(Doubt.read, record["cover_doubts"])),
         neighbours=tuple(record["neighbours"]),
         sigma=BundleSigma(yaw_rad=yaw_rad, **figures),
         known_share=figure(record["known_share"]),
         confidence=figure(record["confidence"]),
-        reasons=tuple(record["reasons"]),
+        reasons=tuple(map(Doubt.read, record["reasons"])),
         section_m2=figure(record.get("section_m2")),
         label=BundleLabel(**record["label"]) if record.get("label") else None,
         fit_sigma=FitSigma(yaw_rad=float(np.radians(fit.pop("yaw_deg"))), **fit) if fit else None,

@@ -16,7 +16,7 @@ from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import BEYOND_OPEN_END_M, BundleTable, Grip, Placement
 from barsight.yard.magnet.holding import min_diameter_m
 from barsight.yard.stability.stability import interpolate_height
-from barsight.yard.types import Bundle, HeightMap
+from barsight.yard.types import ENDS, Bundle, HeightMap
 from barsight.yard.vetoes import Check, check_max, check_min, check_true
 from barsight.yard.weight import Mass
 
@@ -218,8 +218,8 @@ def _bundle_checks(bundle: Bundle, settings: LiftSettings) -> list[Check]:
     covered = bundle.on_top is False
     what = f"{'something lies' if covered else 'it is not known what lies'} on bundle {bundle.id}"
     if bundle.on_top and bundle.cover_doubts:
-        what += f": {bundle.cover_doubts[0]}"
-    ends = " and ".join(e for e, o in zip(("low-y", "high-y"), bundle.ends_open, strict=True) if o)
+        what += f": {bundle.cover_doubts[0].sentence}"
+    ends = " and ".join(e for e, o in zip(ENDS, bundle.ends_open, strict=True) if o)
     return [
         check_true(
             "covered", f"nothing lies on bundle {bundle.id}",
@@ -228,7 +228,7 @@ def _bundle_checks(bundle: Bundle, settings: LiftSettings) -> list[Check]:
         check_min(
             "bundle-doubtful", f"how sure bundle {bundle.id} is", bundle.confidence, settings.min_confidence,
             "", f"bundle {bundle.id} is {100 * bundle.confidence:.0f} % sure: "
-            + ("; ".join(bundle.reasons) or "no reason is given"),
+            + ("; ".join(doubt.sentence for doubt in bundle.reasons) or "no reason is given"),
         ),
         check_true(
             "end-open", f"both ends of bundle {bundle.id} were seen", None if ends else True,

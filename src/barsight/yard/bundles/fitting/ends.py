@@ -38,7 +38,7 @@ _ALIKE = 0.6
 @dataclass(frozen=True)
 class End:
     """An end of a bundle at v_m. sigma_m, and flush_sigma_m for bars that surely end alike, are NaN where the
-    end is open, and `why` says why it is.
+    end is open, and `why` says why it is. is_covered: something higher lies there.
     """
 
     v_m: float
@@ -46,6 +46,7 @@ class End:
     is_open: bool
     why: str = ""
     flush_sigma_m: float = np.nan
+    is_covered: bool = False
 
 
 def find_end(grid: AlignedMap, fit: Fit, step: int, settings: BundleSettings) -> End:
@@ -65,7 +66,7 @@ def find_end(grid: AlignedMap, fit: Fit, step: int, settings: BundleSettings) ->
         if known[k] < _SOME:
             continue
         if misfit[k] > 2 * settings.agreement_m:
-            return End(v, float("nan"), True, "something higher lies there")
+            return End(v, float("nan"), True, "something higher lies there", is_covered=True)
         if misfit[k] > deep:
             ragged = k + 1
             if ragged * cell > _RAGGED_M:

@@ -9,6 +9,7 @@ import numpy as np
 from barsight.core.arrays import Float64
 from barsight.yard.bundles.fitting.outline_fit import FittedOutline
 from barsight.yard.bundles.section.seen_section import agreeing_rows, mean_section
+from barsight.yard.types import Doubt, DoubtKind
 
 _CREST_RATIO = 0.35
 """Of the width, to either side of its middle: where a bundle is highest."""
@@ -37,24 +38,26 @@ class Flanks:
     ended: tuple[bool, bool] = (False, False)
 
     @property
-    def doubt(self) -> str:
-        """Say that something may lie over a flank; empty where both are seen."""
+    def doubt(self) -> Doubt | None:
+        """Say that something may lie over a flank; None where both are seen."""
         return self._doubt(_SHALLOW_RATIO)
 
     @property
-    def cover_doubt(self) -> str:
+    def cover_doubt(self) -> Doubt | None:
         """Say the same of a flank that isn't seen for sure."""
         return self._doubt(_SURE_RATIO)
 
-    def _doubt(self, shallow_ratio: float) -> str:
+    def _doubt(self, shallow_ratio: float) -> Doubt | None:
         sides = list(zip(("low", "high"), self.falls_m, self.rises_m, self.ended, strict=True))
         for name, fall, rise, ended in sides:
             if fall < _FLAT_RATIO * self.width_m and not (ended and rise <= _HIGHER_M):
-                return f"its {name} flank was not seen: something may lie over it"
+                said = f"its {name} flank was not seen: something may lie over it"
+                return Doubt(DoubtKind.UNSEEN_FLANK, said)
         for name, fall, rise, _ in sides:
             if fall < shallow_ratio * self.width_m and _HIGHER_M < rise < self.width_m:
-                return f"what stands {1e3 * rise:.0f} mm higher beside it may lie over its {name} flank"
-        return ""
+                said = f"what stands {1e3 * rise:.0f} mm higher beside it may lie over its {name} flank"
+                return Doubt(DoubtKind.HIDDEN_FLANK, said)
+        return None
 
 
 def seen_flanks(one: FittedOutline, low_m: float, high_m: float) -> Flanks | None:
