@@ -183,6 +183,7 @@ class DoubtKind(Enum):
     UNSEEN_FLANK = "flank was not seen"
     HIDDEN_FLANK = "beside it may lie over its"
     OVERLAP = "overlap: one may lie over the other"
+    WALL = "it may be a wall"
     RIVAL = "explains the surface nearly as well"
     OTHER = ""
 

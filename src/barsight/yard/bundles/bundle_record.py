@@ -7,7 +7,13 @@ from dataclasses import replace
 import numpy as np
 
 from barsight.core.arrays import Float64
-from barsight.yard.bundles.doubts import count_bars, list_cover_doubts, list_doubts, rate_confidence
+from barsight.yard.bundles.doubts import (
+    count_bars,
+    list_carrier_doubts,
+    list_cover_doubts,
+    list_doubts,
+    rate_confidence,
+)
 from barsight.yard.bundles.fitting.bars import fit_bars, visible_bars
 from barsight.yard.bundles.fitting.ends import End, find_end, middle_and_length_sigma
 from barsight.yard.bundles.fitting.outline import bundle_width, make_outline
@@ -25,6 +31,7 @@ from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.irregular import widen_sigma
 from barsight.yard.bundles.layers import check_uncovered, find_layers, list_neighbours, list_overlaps
+from barsight.yard.bundles.pack_edges import DOUBTFUL
 from barsight.yard.bundles.reading import Reading
 from barsight.yard.bundles.section.seen_section import estimate_section, seen_section
 from barsight.yard.bundles.strapped_bundles import held_by_straps
@@ -77,7 +84,9 @@ def make_bundle(
     top = float(np.nanmax(outline.exact_m))
     top_z = float(centre[2]) + top
     bars, doubt = count_bars(reading, seen, top_z, floor_m)
-    reasons = doubt + list_doubts(reading, rows, ends, settings)
+    walls = list_carrier_doubts(reading, seen, top_z, floor_m)
+    reasons = doubt + walls + list_doubts(reading, rows, ends, settings)
+    confidence = rate_confidence(reading, rows)
     section, section_sigma = estimate_section(seen, fit, top_z, floor_m)
     if reading.flanks is not None and reading.flanks.doubt:
         reasons += (reading.flanks.doubt,)
@@ -100,7 +109,7 @@ def make_bundle(
         neighbours=(),
         sigma=replace(own, section_m2=section_sigma),
         known_share=float((rows != 0).mean()),
-        confidence=rate_confidence(reading, rows),
+        confidence=min(confidence, DOUBTFUL) if walls else confidence,
         reasons=reasons,
         bar_axes=fit_bars(reading.found, settings),
         ends_sigma_m=(ends[0].sigma_m, ends[1].sigma_m),

@@ -50,6 +50,9 @@ _CLAIM_M = 0.02
 _RIVAL_RATIO = 0.8
 _SUNKEN_M, _SUNKEN_RATIO = 0.04, 0.2
 """How deep an outline may reach under the floor: errors of the map, at most, and of its width."""
+_FLAT_RATIO, _FLAT_WEIGHT = 0.4, 0.5
+"""Of its width: how deep a circle over the flat top of an irregular pack may reach under the floor; what such
+an outline weighs beside one that stands on it."""
 _LOWER_M = 0.005
 """Largest error, downwards, of a single bar's measured top."""
 _RESOLVED_CELLS = 4.0
@@ -95,14 +98,15 @@ def _search(
     for heading in headings:
         found += _found(height_map, heading, floor, templates, settings)
     places = [_claims(one, settings) for one in found]
-    chosen = choose_readings(_weights(found), without_slivers(places, _SLIVER_RATIO))
+    chosen = choose_readings(_weights(found, floor), without_slivers(places, _SLIVER_RATIO))
     kept = [(found[k].grid, found[k].fit) for k in chosen]
     close = replace(settings, slice_step_m=_CROSSING_STEP_M)
     for heading, part in crossing_pieces(height_map, kept, headings, settings):
         across = _found(part, heading, floor, templates, close)
         found += [one for one in across if not is_beam(one.grid, one.fit, settings)]
     places += [_claims(one, settings) for one in found[len(places) :]]
-    readings = _settled(found, without_slivers(places, _SLIVER_RATIO), height_map, settings)
+    claims = without_slivers(places, _SLIVER_RATIO)
+    readings = _settled(found, _weights(found, floor), claims, height_map, settings)
     chosen_ones = [reading.found for reading in readings]
     bundles = [make_bundle(reading, chosen_ones, settings, floor) for reading in readings]
     joined = join_pieces(without_pieces(bundles, readings))
@@ -119,20 +123,23 @@ def _found(
     ]
 
 
-def _weights(found: list[FittedOutline]) -> Float64:
-    """Compute the number of cells that each explains."""
-    return np.array([_weight(one.fit) for one in found])
+def _weights(found: list[FittedOutline], floor_m: float | None) -> Float64:
+    """Compute the number of cells that each explains, less of those that reach under the floor."""
+    return np.array([
+        _weight(one.fit) * (_FLAT_WEIGHT if _is_sunken(floor_m, one.fit) else 1.0) for one in found
+    ])  # fmt: skip
 
 
 def _settled(
-    found: list[FittedOutline], claims: list[Int64], height_map: HeightMap, settings: BundleSettings
-) -> list[Reading]:
+    found: list[FittedOutline], weights: Float64, claims: list[Int64], height_map: HeightMap,
+    settings: BundleSettings,
+) -> list[Reading]:  # fmt: skip
     """Select the best set of readings, once by itself and once more with regard to the kinds of bundles in
     it.
 
     Which bars an outline holds is settled by the pictures where they show it, else by its neighbours.
     """
-    fits, weights = [one.fit for one in found], _weights(found)
+    fits = [one.fit for one in found]
     first = choose_readings(weights, claims)
     raised = reinforce_kinds(fits, weights, first, overlaps(first, claims))
     chosen = choose_readings(raised, claims)
@@ -160,7 +167,7 @@ def _settled(
         lambda reading: strapped_pack(height_map, reading.found.grid, reading.found.fit), readings
     )
     seen = [replace(reading, pack=pack).with_flanks() for reading, pack in zip(readings, packs, strict=True)]
-    return [reading for reading in seen if reading.flanks is None or not reading.flanks.are_flat]
+    return [one for one in seen if one.flanks is None or one.pack is not None or not one.flanks.are_flat]
 
 
 def _finished(one: FittedOutline, kept: list[Fit], settings: BundleSettings) -> FittedOutline:
@@ -173,15 +180,27 @@ def _finished(one: FittedOutline, kept: list[Fit], settings: BundleSettings) -> 
 
 
 def _on(floor_m: float | None, fit: Fit, settings: BundleSettings) -> bool:
-    """Check that the whole packing lies over the floor: its top rises from it by about its own height, and a
-    single bar's by the least diameter of one, however wide the map shows it.
+    """Check that a packing lies over the floor, but for what its circle is wider than a flat pack is high; a
+    single bar's top rises from it by the least diameter of one, however wide the map shows it.
     """
     if floor_m is None:
         return True
-    middle, half = float(fit.values[Z]) - floor_m, fit.width_m / 2
-    if fit.rings == 0 and middle + half < settings.min_single_diameter_m - _LOWER_M:
+    top = float(fit.values[Z]) + fit.width_m / 2
+    if fit.rings == 0 and top - floor_m < settings.min_single_diameter_m - _LOWER_M:
         return False
-    return middle - half > -min(_SUNKEN_M, _SUNKEN_RATIO * fit.width_m)
+    return _sunken_m(floor_m, fit) < _FLAT_RATIO * fit.width_m
+
+
+def _is_sunken(floor_m: float | None, fit: Fit) -> bool:
+    """Check whether an outline reaches further under the floor than a map's errors may have it."""
+    if floor_m is None:
+        return False
+    return _sunken_m(floor_m, fit) >= min(_SUNKEN_M, _SUNKEN_RATIO * fit.width_m)
+
+
+def _sunken_m(floor_m: float, fit: Fit) -> float:
+    """Compute how deep an outline's lowest point lies under the floor."""
+    return floor_m - float(fit.values[Z]) + fit.width_m / 2
 
 
 def _readings(grid: AlignedMap, templates: Templates, settings: BundleSettings) -> list[Fit]:

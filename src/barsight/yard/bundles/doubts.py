@@ -26,6 +26,8 @@ _LAID_M, _LAID_SIZE_M = 0.02, (0.04, 0.03)
 _GULLY_RATIO = 0.3
 """Of a bundle's width: where the surface at its rim lies so far under its axis or further, it is no bundle's.
 The rim of an upright triangle of bars lies 0.22 under it, turned by 25 degrees 0.24."""
+_MAX_HEIGHT_RATIO, _MAX_DUNNAGE_M = 1.25, 0.15
+"""Height of a bundle, of its width, and of the dunnage under it, at most."""
 _BEFORE_END_M = 0.05
 """Rows nearer to an end tell nothing of that: bars end unevenly."""
 _SURE_KNOWN = 0.7
@@ -105,6 +107,20 @@ def _places(runs: list[tuple[int, int]], reading: Reading, settings: BundleSetti
         places += (first - last) * grid.cell_m > _ONE_PLACE_M
         last = end
     return places if highest > _LIES_M else 0
+
+
+def list_carrier_doubts(
+    reading: Reading, seen: SeenSection | None, top_m: float, floor_m: float | None
+) -> tuple[Doubt, ...]:
+    """List the doubt about what no straps hold and stands too high for a bundle, alone on the floor, as a
+    wall does.
+    """
+    if reading.pack is not None or seen is None or floor_m is None or not seen.sides_free:
+        return ()
+    if top_m - floor_m <= _MAX_HEIGHT_RATIO * reading.found.fit.width_m + _MAX_DUNNAGE_M:
+        return ()
+    said = f"nothing carries it {1e3 * (top_m - floor_m):.0f} mm over the floor: it may be a wall"
+    return (Doubt(DoubtKind.WALL, said),)
 
 
 def list_cover_doubts(reading: Reading, reasons: tuple[Doubt, ...]) -> tuple[Doubt, ...]:

@@ -18,7 +18,7 @@ _INSIDE = 0.35
 """Share of a bundle's width, to either side of its axis, within which no other bundle lies."""
 _LEAVE_OPEN = frozenset({
     DoubtKind.COVERS_PART, DoubtKind.COVERED_END, DoubtKind.LIES_ACROSS, DoubtKind.THIN_BAR,
-    DoubtKind.UNSEEN_FLANK,
+    DoubtKind.UNSEEN_FLANK, DoubtKind.WALL,
 })  # fmt: skip
 """Doubts that leave open whether something lies on a bundle. A faint line across it, most often a strap,
 only forbids its lift.
