@@ -13,7 +13,12 @@ from barsight.yard.bundles.fitting.outline import BARS_OF_RINGS, bundle_width
 from barsight.yard.bundles.fitting.outline_fit import ABOVE, AGREES, BELOW, DIAMETER, SLOPE_U, SLOPE_Z, U, Z
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.reading import Reading
-from barsight.yard.bundles.section.seen_section import SeenSection, is_no_hexagon
+from barsight.yard.bundles.section.seen_section import (
+    SeenSection,
+    agreeing_rows,
+    is_no_hexagon,
+    sections,
+)
 from barsight.yard.types import ENDS, Doubt, DoubtKind
 
 _NARROW_M = 0.3
@@ -28,6 +33,8 @@ _GULLY_RATIO = 0.3
 The rim of an upright triangle of bars lies 0.22 under it, turned by 25 degrees 0.24."""
 _MAX_HEIGHT_RATIO, _MAX_DUNNAGE_M = 1.25, 0.15
 """Height of a bundle, of its width, and of the dunnage under it, at most."""
+_CARRIER_M, _CARRIED_RATIO = 0.15, 0.03
+"""What lies so near to both flanks may carry a bundle, over this share of its length."""
 _BEFORE_END_M = 0.05
 """Rows nearer to an end tell nothing of that: bars end unevenly."""
 _SURE_KNOWN = 0.7
@@ -119,8 +126,21 @@ def list_carrier_doubts(
         return ()
     if top_m - floor_m <= _MAX_HEIGHT_RATIO * reading.found.fit.width_m + _MAX_DUNNAGE_M:
         return ()
+    if _shows_carrier(reading):
+        return ()
     said = f"nothing carries it {1e3 * (top_m - floor_m):.0f} mm over the floor: it may be a wall"
     return (Doubt(DoubtKind.WALL, said),)
+
+
+def _shows_carrier(reading: Reading) -> bool:
+    """Check whether something stands over the floor on both sides: what lies across under it does."""
+    grid, fit = reading.found.grid, reading.found.fit
+    edge = fit.width_m / 2
+    half = round((edge + _CARRIER_M) / grid.cell_m)
+    beside, heights = sections(grid, fit, agreeing_rows(fit), half)
+    stands = np.isfinite(heights)
+    low, high = (stands[:, side * beside > edge].any(axis=1) for side in (-1, 1))
+    return bool((low & high).mean() > _CARRIED_RATIO)
 
 
 def list_cover_doubts(reading: Reading, reasons: tuple[Doubt, ...]) -> tuple[Doubt, ...]:

@@ -14,9 +14,13 @@ _WIDTH_RATIOS, _WIDTH_SIGMAS = (0.03, 0.12), (1.5, 2.0)
 not. A map's sigma rises with the size of its pixels, by which its edges grow."""
 _SECTION_RATIO = 0.5
 """Of what the width of the section that is seen differs from the outline's."""
-_TOP_SIGMAS, _YAW_SIGMAS, _DIAMETER_RATIO = 0.8, 0.4, 0.5
-"""Of a height's sigma: error of the top, and of the ends' places sideways; of a diameter, where another
-fits as well."""
+_TOP_SIGMAS, _YAW_SIGMAS = 0.8, 0.4
+"""Of a height's sigma: error of the top, and of the ends' places sideways."""
+_RESOLVED_M = 0.07
+"""Bars from this diameter on show their shape in a map."""
+_DIAMETER_RATIOS = 0.35, 0.5
+"""Of a diameter: its error where bars are thinner than that, and where another packing fits as well or many
+bars may look like one."""
 
 
 def widen_sigma(
@@ -37,12 +41,13 @@ def widen_sigma(
     section = 0.0 if seen_width_m is None else _SECTION_RATIO * abs(seen_width_m - fit.width_m)
     wide = float(np.linalg.norm([ratio * fit.width_m, sigmas * fit.sigma_m, section]))
     turned = 0.0 if shown else _YAW_SIGMAS * fit.sigma_m / max(length_m, fit.width_m)
-    diameter = _DIAMETER_RATIO * float(fit.values[DIAMETER]) if is_one_of_two else 0.0
+    diameter, (thin, unsettled) = float(fit.values[DIAMETER]), _DIAMETER_RATIOS
+    spread = unsettled if is_one_of_two or fit.rings == 0 else thin if diameter < _RESOLVED_M else 0.0
     return replace(
         sigma,
         width_m=float(np.hypot(sigma.width_m, wide)),
         lateral_m=float(np.hypot(sigma.lateral_m, wide / 2)),
         top_z_m=float(np.hypot(sigma.top_z_m, _TOP_SIGMAS * fit.sigma_m)),
         yaw_rad=float(np.hypot(sigma.yaw_rad, turned)),
-        bar_diameter_m=max(sigma.bar_diameter_m, diameter),
+        bar_diameter_m=max(sigma.bar_diameter_m, spread * diameter),
     )

@@ -16,6 +16,9 @@ from barsight.yard.bundles.section.packs import Pack, contradicts
 from barsight.yard.bundles.section.seen_section import SeenSection, over_floor, section_of_pack
 from barsight.yard.types import Bundle, BundleSigma, Doubt, DoubtKind
 
+_LINES_SIGMA_RATIO = 0.35
+"""Of a diameter by dark lines: one standard deviation. Where lines between thin bars don't all show, it is
+that of two bars or three."""
 _PACK_MIDDLE_M, _PACK_WIDTH_M, _PACK_TOP_M, _PACK_WIDTH_SIGMAS = 0.012, 0.016, 0.006, 3.0
 """Standard deviations of a pack's middle, width and top, and its width's in those of a height."""
 _CREST_RATIO, _SMEARED_M = 0.6, 0.03
@@ -115,7 +118,7 @@ def _as_pack(
             yaw_rad=irregular.yaw_rad,
             width_m=width_sigma,
             top_z_m=float(np.hypot(bundle.sigma.top_z_m, _PACK_TOP_M)),
-            bar_diameter_m=DIAMETER_SIGMA_RATIO * pack.diameter_m,
+            bar_diameter_m=_LINES_SIGMA_RATIO * pack.diameter_m,
             section_m2=section_sigma,
         ),
         fit_sigma=None,
@@ -165,7 +168,7 @@ def _partly_seen(bundle: Bundle, irregular: BundleSigma, pack: Pack) -> Bundle:
         lateral = float(np.hypot(bundle.sigma.lateral_m, pack.middle_m))
         bundle = replace(bundle, sigma=replace(bundle.sigma, lateral_m=lateral))
     if bundle.bars is None and pack.diameter_m > 0:
-        spread = DIAMETER_SIGMA_RATIO * pack.diameter_m
+        spread = _LINES_SIGMA_RATIO * pack.diameter_m
         sigma = replace(bundle.sigma, bar_diameter_m=spread)
         bundle = replace(bundle, bar_diameter_m=pack.diameter_m, sigma=sigma)
     return bundle
@@ -177,7 +180,7 @@ def _confirmed(bundle: Bundle, pack: Pack, floor_m: float | None, pack_sigma_m: 
     """
     diameter, spread = bundle.bar_diameter_m, bundle.sigma.bar_diameter_m
     if abs(pack.diameter_m - diameter) > DIAMETER_SIGMA_RATIO * diameter:
-        diameter, spread = pack.diameter_m, DIAMETER_SIGMA_RATIO * pack.diameter_m
+        diameter, spread = pack.diameter_m, _LINES_SIGMA_RATIO * pack.diameter_m
     own, packs = bundle.sigma.width_m**-2, pack_sigma_m**-2
     width = (own * bundle.width_m + packs * pack.width_m) / (own + packs)
     width_sigma = float(np.hypot((own + packs) ** -0.5, (bundle.width_m - pack.width_m) / 2))

@@ -185,8 +185,8 @@ def agreeing_rows(fit: Fit) -> Int64:
     return rows[:: max(len(rows) // _ROWS_ENOUGH, 1)]
 
 
-def mean_section(grid: AlignedMap, fit: Fit, rows: Int64, half: int) -> tuple[Float64, Float64]:
-    """Average the heights over the axis at places (N,) across from it; NaN where half are unknown."""
+def sections(grid: AlignedMap, fit: Fit, rows: Int64, half: int) -> tuple[Float64, Float64]:
+    """Read the heights over the axis (rows, N) at places (N,) across from it; NaN unknown, -inf floor."""
     v = grid.v0_m + grid.cell_m * rows - fit.v_m
     axis = fit.values[U] + fit.values[SLOPE_U] * v
     up = fit.values[Z] + fit.values[SLOPE_Z] * v
@@ -195,12 +195,17 @@ def mean_section(grid: AlignedMap, fit: Fit, rows: Int64, half: int) -> tuple[Fl
     inside = (column >= 0) & (column < grid.z_m.shape[1])
     z = np.where(inside, grid.z_m[rows[:, None], np.clip(column, 0, grid.z_m.shape[1] - 1)], np.nan)
     z = np.where(z <= grid.stock_over_m, -np.inf, z)
-    known = np.isfinite(z) | (z == -np.inf)
-    enough = 2 * known.sum(axis=0) >= len(rows)
+    return np.asarray(beside, np.float64), np.asarray(z - up[:, None], np.float64)
+
+
+def mean_section(grid: AlignedMap, fit: Fit, rows: Int64, half: int) -> tuple[Float64, Float64]:
+    """Average the heights over the axis at places (N,) across from it; NaN where half are unknown."""
+    beside, heights = sections(grid, fit, rows, half)
+    enough = 2 * (~np.isnan(heights)).sum(axis=0) >= len(rows)
     level = np.full(len(beside), np.nan)
     with np.errstate(invalid="ignore"):
-        level[enough] = nan_medians(np.where(known, z, np.nan)[:, enough] - up[:, None])
-    return np.asarray(beside, np.float64), np.asarray(level, np.float64)
+        level[enough] = nan_medians(heights[:, enough])
+    return beside, level
 
 
 def _is_neighbour(one: FittedOutline, beside_m: Float64, others: list[FittedOutline]) -> Bool:
