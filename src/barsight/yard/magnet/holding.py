@@ -27,6 +27,13 @@ SMOOTHING_M = 0.016
 MAX_CUT_RATIO = 0.12
 """Of a bar's diameter: how far its crest may stand over the mean of it and its neighbours."""
 
+UNSETTLED_RATIO, MAX_THINNER_RATIO = 0.5, 0.21
+"""Sigma of a diameter, of it, from which another packing fits as well; how much thinner than told bars count
+otherwise, at most. There are thinner ones, as sigma says: the pull's lower bound, which has the faces as high
+as they may lie, held with this figure wherever it was judged."""
+LEAST_RATIO = 0.25
+"""Of a diameter: what bars count as where another packing fits as well."""
+
 
 def hold_load(contact: Contact, magnet: Magnet, load: tuple[Bundle, ...], strap_m: float) -> Contact:
     """Add the pull on the load's bars; nothing pulls on no load.
@@ -95,9 +102,11 @@ def _between(gap: float, gap_m: Float64, curve: Float64) -> float:
 
 
 def min_diameter_m(bundle: Bundle) -> float:
-    """Compute the lower bound of a bundle's bars; with a packing that isn't settled they may be thinner."""
-    sigma = float(np.nan_to_num(bundle.sigma.bar_diameter_m, nan=0.25 * bundle.bar_diameter_m))
-    return max(bundle.bar_diameter_m - UPPER * sigma, 0.25 * bundle.bar_diameter_m)
+    """Choose the diameter that pull and contact count with: a bundle's own, less what it may be over."""
+    diameter, sigma = bundle.bar_diameter_m, bundle.sigma.bar_diameter_m
+    if not sigma < UNSETTLED_RATIO * diameter:
+        return LEAST_RATIO * diameter
+    return diameter - min(UPPER * sigma, MAX_THINNER_RATIO * diameter)
 
 
 def pole_shares(contact: Contact, magnet: Magnet, place: Placement, load: tuple[Bundle, ...]) -> Float64:
