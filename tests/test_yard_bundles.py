@@ -295,6 +295,20 @@ def test_outlines_that_overlap_leave_open_which_bundle_lies_over_the_other() -> 
         assert (not list_overlaps(other, [one, other])) is (overlap_m < 0.02)
 
 
+@pytest.mark.parametrize(
+    ("bars", "diameter_m", "roll_deg"),
+    [(61, 0.016, 25.0), (61, 0.02, 10.0), (37, 0.02, 10.0), (19, 0.03, 25.0)],
+)
+def test_bars_that_cannot_be_counted_have_a_diameter_as_unsure_as_that(
+    bars: int, diameter_m: float, roll_deg: float
+) -> None:
+    """A map of 10 mm reads thin bars as one, or as others of two and three times their diameter."""
+    one = Laid(0.0, 0.0, 0.3, 0.0, diameter_m, bars, 3.0, roll_deg)
+    (bundle,) = find_bundles(draw([one]), SETTINGS)
+    assert bundle.bars is None
+    assert abs(bundle.bar_diameter_m - diameter_m) < 2 * bundle.sigma.bar_diameter_m
+
+
 def test_what_has_no_flanks_is_no_bundle() -> None:
     """A plate of 0.4 by 1.2 m at the bundle's height, as a cart's top is."""
     heights = draw([Laid(0.0, 0.0, 0.2, 0.0)])

@@ -168,6 +168,40 @@ def test_what_goes_on_beside_a_strap_leaves_the_side_open() -> None:
     assert pack is not None and not pack.sides_seen
 
 
+STRAPS = (-1.5, 0.2, 1.6)
+
+
+@pytest.mark.parametrize(("width_m", "top_m"), [(0.2, 0.28), (0.3, 0.28), (0.3, 0.35)])
+def test_straps_make_a_bundle_of_a_level_top(width_m: float, top_m: float) -> None:
+    """With upright sides it looks like a plate or a wall; a circle over it would reach under the floor."""
+    for straps in ((), STRAPS):
+        heights = drawn([(0.3 - width_m / 2, 0.3 + width_m / 2, straps)], np.random.default_rng(3))
+        level = heights.z_m > 0.1
+        heights.z_m[level] = top_m + np.random.default_rng(4).normal(0, 0.001, int(level.sum()))
+        bundles = find_bundles(heights, BundleSettings())
+        assert len(bundles) == len(straps) / 3
+        for one in bundles:
+            assert one.width_m == pytest.approx(width_m, abs=0.01)
+            assert one.centre_m[0] == pytest.approx(0.3, abs=0.02)
+            assert one.top_z_m == pytest.approx(top_m, abs=0.02) and one.on_top is True
+
+
+@pytest.mark.parametrize(("straps", "carried"), [((), False), ((), True), (STRAPS, False)])
+def test_what_nothing_carries_may_be_a_wall(straps: tuple[float, ...], carried: bool) -> None:
+    """Something round 0.6 m over the floor: alone, on beams across, or with straps."""
+    heights = drawn([(0.2, 0.4, straps)], np.random.default_rng(3))
+    heights.z_m[heights.z_m > 0.1] += 0.3
+    if carried:
+        y = heights.y0_m + CELL * np.arange(heights.z_m.shape[0])
+        beams = (np.abs(np.abs(y) - 1.5) < 0.06)[:, None] & (heights.z_m < 0.1)
+        heights.z_m[beams] = 0.28
+    (one,) = find_bundles(heights, BundleSettings())
+    is_wall = DoubtKind.WALL in {doubt.kind for doubt in one.reasons}
+    assert is_wall is (not straps and not carried)
+    assert one.on_top is (None if is_wall else True)
+    assert (one.confidence < 0.5) is is_wall
+
+
 def test_bars_without_straps_show_none() -> None:
     found = [pack_at(drawn([(-0.12, 0.12, ())], np.random.default_rng(seed)), 0.0) for seed in range(20)]
     assert found == [None] * 20
