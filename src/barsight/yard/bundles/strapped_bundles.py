@@ -16,7 +16,7 @@ from barsight.yard.bundles.section.packs import Pack, contradicts
 from barsight.yard.bundles.section.seen_section import SeenSection, over_floor, section_of_pack
 from barsight.yard.types import Bundle, BundleSigma, Doubt, DoubtKind
 
-_LINES_SIGMA_RATIO = 0.45
+_LINES_SIGMA_RATIO = 0.5
 """Of a diameter by dark lines: one standard deviation. Where lines between thin bars don't all show, it is
 that of two bars, of three or of more."""
 _PACK_MIDDLE_M, _PACK_WIDTH_M, _PACK_TOP_M, _PACK_WIDTH_SIGMAS = 0.012, 0.016, 0.006, 3.0

@@ -8,6 +8,7 @@ strap, and the noise on top.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -27,12 +28,8 @@ SMOOTHING_M = 0.016
 MAX_CUT_RATIO = 0.12
 """Of a bar's diameter: how far its crest may stand over the mean of it and its neighbours."""
 
-UNSETTLED_RATIO, MAX_THINNER_RATIO = 0.5, 0.21
-"""Sigma of a diameter, of it, from which another packing fits as well; how much thinner than told bars count
-otherwise, at most. There are thinner ones, as sigma says: the pull's lower bound, which has the faces as high
-as they may lie, held with this figure wherever it was judged."""
-LEAST_RATIO = 0.25
-"""Of a diameter: what bars count as where another packing fits as well."""
+MIN_DIAMETER_RATIO = 0.1
+"""Of a diameter: its least lower bound. Bars were told as thick as twenty of them."""
 
 
 def hold_load(contact: Contact, magnet: Magnet, load: tuple[Bundle, ...], strap_m: float) -> Contact:
@@ -102,11 +99,10 @@ def _between(gap: float, gap_m: Float64, curve: Float64) -> float:
 
 
 def min_diameter_m(bundle: Bundle) -> float:
-    """Choose the diameter that pull and contact count with: a bundle's own, less what it may be over."""
+    """Compute the lower bound of the diameter of a bundle's bars."""
     diameter, sigma = bundle.bar_diameter_m, bundle.sigma.bar_diameter_m
-    if not sigma < UNSETTLED_RATIO * diameter:
-        return LEAST_RATIO * diameter
-    return diameter - min(UPPER * sigma, MAX_THINNER_RATIO * diameter)
+    least = MIN_DIAMETER_RATIO * diameter
+    return max(diameter - UPPER * sigma, least) if math.isfinite(sigma) else least
 
 
 def pole_shares(contact: Contact, magnet: Magnet, place: Placement, load: tuple[Bundle, ...]) -> Float64:
