@@ -31,7 +31,6 @@ from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.irregular import widen_sigma
 from barsight.yard.bundles.layers import check_uncovered, find_layers, list_neighbours, list_overlaps
-from barsight.yard.bundles.pack_edges import DOUBTFUL
 from barsight.yard.bundles.reading import Reading
 from barsight.yard.bundles.section.seen_section import estimate_section, seen_section
 from barsight.yard.bundles.strapped_bundles import held_by_straps
@@ -84,9 +83,8 @@ def make_bundle(
     top = float(np.nanmax(outline.exact_m))
     top_z = float(centre[2]) + top
     bars, doubt = count_bars(reading, seen, top_z, floor_m)
-    walls = list_carrier_doubts(reading, seen, top_z, floor_m)
-    reasons = doubt + walls + list_doubts(reading, rows, ends, settings)
-    confidence = rate_confidence(reading, rows)
+    reasons = doubt + list_carrier_doubts(reading, seen, top_z, floor_m)
+    reasons += list_doubts(reading, rows, ends, settings)
     section, section_sigma = estimate_section(seen, fit, top_z, floor_m)
     if reading.flanks is not None and reading.flanks.doubt:
         reasons += (reading.flanks.doubt,)
@@ -109,7 +107,7 @@ def make_bundle(
         neighbours=(),
         sigma=replace(own, section_m2=section_sigma),
         known_share=float((rows != 0).mean()),
-        confidence=min(confidence, DOUBTFUL) if walls else confidence,
+        confidence=rate_confidence(reading, rows, reasons),
         reasons=reasons,
         bar_axes=fit_bars(reading.found, settings),
         ends_sigma_m=(ends[0].sigma_m, ends[1].sigma_m),

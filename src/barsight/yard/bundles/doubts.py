@@ -12,6 +12,7 @@ from barsight.yard.bundles.fitting.ends import End
 from barsight.yard.bundles.fitting.outline import BARS_OF_RINGS, bundle_width
 from barsight.yard.bundles.fitting.outline_fit import ABOVE, AGREES, BELOW, DIAMETER, SLOPE_U, SLOPE_Z, U, Z
 from barsight.yard.bundles.fitting.settings import BundleSettings
+from barsight.yard.bundles.pack_edges import DOUBTFUL
 from barsight.yard.bundles.reading import Reading
 from barsight.yard.bundles.section.seen_section import (
     SeenSection,
@@ -186,16 +187,17 @@ def measure_laid(reading: Reading) -> float:
     return float(rise[laid].max(initial=0.0))
 
 
-def rate_confidence(reading: Reading, rows: UInt8) -> float:
+def rate_confidence(reading: Reading, rows: UInt8, reasons: tuple[Doubt, ...]) -> float:
     """Estimate the probability from how much of the length agrees and how far the next other reading is
-    behind.
+    behind; what may be a wall is doubtful.
     """
     fit, rival = reading.found.fit, reading.rival
     lead = 1.0
     if rival is not None and abs(rival.fit.width_m - fit.width_m) > 0.15 * fit.width_m:
         lead = 1 - reading.rival_weight / max(reading.weight, 1e-9)
     sure = 1 - 0.5 * np.exp(-max(lead, 0.0) / 0.05)
-    return float(np.clip(sure * rate_agreement(rows), 0.01, 0.99))
+    most = DOUBTFUL if any(doubt.kind is DoubtKind.WALL for doubt in reasons) else 0.99
+    return float(np.clip(sure * rate_agreement(rows), 0.01, most))
 
 
 def rate_agreement(rows: UInt8) -> float:
