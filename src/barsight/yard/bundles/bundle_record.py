@@ -86,8 +86,6 @@ def make_bundle(
     reasons = doubt + list_carrier_doubts(reading, seen, top_z, floor_m)
     reasons += list_doubts(reading, rows, ends, settings)
     section, section_sigma = estimate_section(seen, fit, top_z, floor_m)
-    if reading.flanks is not None and reading.flanks.doubt:
-        reasons += (reading.flanks.doubt,)
     own = _sigma(fit, ends, top, settings)
     bundle = Bundle(
         id=0,

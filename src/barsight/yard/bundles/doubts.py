@@ -99,6 +99,8 @@ def list_doubts(
             width_mm = 1e3 * reading.rival.fit.width_m
             said = f"a bundle {width_mm:.0f} mm wide explains the surface nearly as well"
             out.append(Doubt(DoubtKind.RIVAL, said))
+    if reading.flanks is not None and reading.flanks.doubt:
+        out.append(reading.flanks.doubt)
     return tuple(out)
 
 
