@@ -9,9 +9,9 @@ import numpy as np
 from barsight.core.arrays import Float64
 from barsight.yard.bundles.doubts import (
     count_bars,
-    list_carrier_doubts,
     list_cover_doubts,
     list_doubts,
+    list_wall_doubts,
     rate_confidence,
 )
 from barsight.yard.bundles.fitting.bars import fit_bars, visible_bars
@@ -29,8 +29,10 @@ from barsight.yard.bundles.fitting.outline_fit import (
 )
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.fitting.settings import BundleSettings
+from barsight.yard.bundles.floor import is_sunken
 from barsight.yard.bundles.irregular import widen_sigma
 from barsight.yard.bundles.layers import check_uncovered, find_layers, list_neighbours, list_overlaps
+from barsight.yard.bundles.pack_edges import DOUBTFUL
 from barsight.yard.bundles.reading import Reading
 from barsight.yard.bundles.section.seen_section import estimate_section, seen_section
 from barsight.yard.bundles.strapped_bundles import held_by_straps
@@ -45,7 +47,9 @@ way moves the bundle aside and turns it little."""
 def describe_bundles(
     bundles: list[Bundle], floor_m: float | None, parts: list[MapStretch]
 ) -> tuple[Bundle, ...]:
-    """Number the bundles by rising x of their centres and relate each to its neighbours."""
+    """Number the bundles by rising x of their centres and relate each to its neighbours. One that reaches
+    under the floor isn't as high as it is told, and so is doubtful.
+    """
     ordered = sorted(bundles, key=lambda b: tuple(b.centre_m))
     ordered = [replace(bundle, id=k) for k, bundle in enumerate(ordered)]
     out = list(ordered)
@@ -54,10 +58,12 @@ def describe_bundles(
         for bundle, layer in zip(near, find_layers(near, floor_m), strict=True):
             if part.owns(bundle.centre_m):
                 on_top, why = check_uncovered(bundle, near, layer)
+                flat = is_sunken(floor_m, bundle.bottom_z_m, bundle.width_m)
                 out[bundle.id] = replace(
                     bundle, layer=layer, on_top=on_top, neighbours=list_neighbours(bundle, near),
                     reasons=bundle.reasons + why,
                     cover_doubts=bundle.cover_doubts + list_overlaps(bundle, near),
+                    confidence=min(bundle.confidence, DOUBTFUL) if flat else bundle.confidence,
                 )  # fmt: skip
     return tuple(out)
 
@@ -83,7 +89,7 @@ def make_bundle(
     top = float(np.nanmax(outline.exact_m))
     top_z = float(centre[2]) + top
     bars, doubt = count_bars(reading, seen, top_z, floor_m)
-    reasons = doubt + list_carrier_doubts(reading, seen, top_z, floor_m)
+    reasons = doubt + list_wall_doubts(reading, seen, top_z, floor_m)
     reasons += list_doubts(reading, rows, ends, settings)
     section, section_sigma = estimate_section(seen, fit, top_z, floor_m)
     own = _sigma(fit, ends, top, settings)

@@ -32,7 +32,7 @@ from barsight.yard.bundles.fitting.template_matching import (
     make_templates,
     propose_candidates,
 )
-from barsight.yard.bundles.floor import find_floor
+from barsight.yard.bundles.floor import find_floor, is_sunken
 from barsight.yard.bundles.gully_shading import estimate_smoothing, refit_with_packing
 from barsight.yard.bundles.headings import find_headings
 from barsight.yard.bundles.layers import same_place
@@ -48,8 +48,6 @@ _EDGE_CELLS = 3.0
 """What a bundle costs per row: its edges explain nothing."""
 _CLAIM_M = 0.02
 _RIVAL_RATIO = 0.8
-_SUNKEN_M, _SUNKEN_RATIO = 0.04, 0.2
-"""How deep an outline may reach under the floor: errors of the map, at most, and of its width."""
 _FLAT_RATIO, _FLAT_WEIGHT = 0.4, 0.5
 """Of its width: how deep a circle over the flat top of an irregular pack may reach under the floor; what such
 an outline weighs beside one that stands on it."""
@@ -124,9 +122,10 @@ def _found(
 
 
 def _weights(found: list[FittedOutline], floor_m: float | None) -> Float64:
-    """Compute the number of cells that each explains, less of those that reach under the floor."""
+    """Compute the number of cells that each explains, half for those that reach under the floor."""
     return np.array([
-        _weight(one.fit) * (_FLAT_WEIGHT if _is_sunken(floor_m, one.fit) else 1.0) for one in found
+        _weight(fit) * (_FLAT_WEIGHT if is_sunken(floor_m, _bottom_m(fit), fit.width_m) else 1.0)
+        for fit in (one.fit for one in found)
     ])  # fmt: skip
 
 
@@ -167,7 +166,7 @@ def _settled(
         lambda reading: strapped_pack(height_map, reading.found.grid, reading.found.fit), readings
     )
     seen = [replace(reading, pack=pack).with_flanks() for reading, pack in zip(readings, packs, strict=True)]
-    return [one for one in seen if one.flanks is None or one.pack is not None or not one.flanks.are_flat]
+    return [one for one in seen if one.pack is not None or not one.is_flat]
 
 
 def _finished(one: FittedOutline, kept: list[Fit], settings: BundleSettings) -> FittedOutline:
@@ -188,19 +187,12 @@ def _on(floor_m: float | None, fit: Fit, settings: BundleSettings) -> bool:
     top = float(fit.values[Z]) + fit.width_m / 2
     if fit.rings == 0 and top - floor_m < settings.min_single_diameter_m - _LOWER_M:
         return False
-    return _sunken_m(floor_m, fit) < _FLAT_RATIO * fit.width_m
+    return floor_m - _bottom_m(fit) < _FLAT_RATIO * fit.width_m
 
 
-def _is_sunken(floor_m: float | None, fit: Fit) -> bool:
-    """Check whether an outline reaches further under the floor than a map's errors may have it."""
-    if floor_m is None:
-        return False
-    return _sunken_m(floor_m, fit) >= min(_SUNKEN_M, _SUNKEN_RATIO * fit.width_m)
-
-
-def _sunken_m(floor_m: float, fit: Fit) -> float:
-    """Compute how deep an outline's lowest point lies under the floor."""
-    return floor_m - float(fit.values[Z]) + fit.width_m / 2
+def _bottom_m(fit: Fit) -> float:
+    """Return the height of an outline's lowest point."""
+    return float(fit.values[Z]) - fit.width_m / 2
 
 
 def _readings(grid: AlignedMap, templates: Templates, settings: BundleSettings) -> list[Fit]:

@@ -119,26 +119,26 @@ def _places(runs: list[tuple[int, int]], reading: Reading, settings: BundleSetti
     return places if highest > _LIES_M else 0
 
 
-def list_carrier_doubts(
+def list_wall_doubts(
     reading: Reading, seen: SeenSection | None, top_m: float, floor_m: float | None
 ) -> tuple[Doubt, ...]:
-    """List the doubt about what no straps hold and stands too high for a bundle, alone on the floor, as a
-    wall does.
-    """
-    if reading.pack is not None or seen is None or floor_m is None or not seen.sides_free:
+    """List the doubt about what may be a wall: no flank falls off, or nothing carries it so high."""
+    if reading.is_flat:
+        return (Doubt(DoubtKind.WALL, "neither flank falls off: it may be a wall"),)
+    if seen is None or floor_m is None or not seen.sides_free:
         return ()
     if top_m - floor_m <= _MAX_HEIGHT_RATIO * reading.found.fit.width_m + _MAX_DUNNAGE_M:
         return ()
-    if _shows_carrier(reading):
+    if _shows_carrier(reading, seen.width_m):
         return ()
     said = f"nothing carries it {1e3 * (top_m - floor_m):.0f} mm over the floor: it may be a wall"
     return (Doubt(DoubtKind.WALL, said),)
 
 
-def _shows_carrier(reading: Reading) -> bool:
+def _shows_carrier(reading: Reading, width_m: float) -> bool:
     """Check whether something stands over the floor on both sides: what lies across under it does."""
     grid, fit = reading.found.grid, reading.found.fit
-    edge = fit.width_m / 2
+    edge = max(fit.width_m, width_m) / 2 + grid.cell_m
     half = round((edge + _CARRIER_M) / grid.cell_m)
     beside, heights = sections(grid, fit, agreeing_rows(fit), half)
     stands = np.isfinite(heights)

@@ -15,6 +15,9 @@ _LEVEL_M = 0.03
 _KNOWN_RATIO = 0.6
 _PATCH_BLOCKS = 64
 
+_SUNKEN_M, _SUNKEN_RATIO = 0.04, 0.2
+"""How deep an outline may reach under the floor: errors of the map, at most, and of its width."""
+
 
 def find_floor(yard: YardMap) -> float | None:
     """Find the height (m) of the lowest level ground in the map; None where no block of 0.3 m is level.
@@ -42,3 +45,8 @@ def _levels(height_map: HeightMap, block: int) -> Float32:
     low, middle, high = (ordered[np.arange(at.size), np.rint(q * at).astype(int)] for q in (0.1, 0.5, 0.9))
     level: Float32 = middle[high - low < 2 * _FLAT_M]
     return level
+
+
+def is_sunken(floor_m: float | None, bottom_m: float, width_m: float) -> bool:
+    """Check whether an outline reaches further under the floor than a map's errors may have it."""
+    return floor_m is not None and floor_m - bottom_m >= min(_SUNKEN_M, _SUNKEN_RATIO * width_m)

@@ -18,7 +18,7 @@ _TOP_SIGMAS, _YAW_SIGMAS = 0.8, 0.4
 """Of a height's sigma: error of the top, and of the ends' places sideways."""
 _RESOLVED_M = 0.07
 """Bars from this diameter on show their shape in a map."""
-_DIAMETER_RATIOS = 0.35, 0.5
+_DIAMETER_RATIOS = 0.45, 0.6
 """Of a diameter: its error where bars are thinner than that, and where another packing fits as well or many
 bars may look like one."""
 

@@ -39,6 +39,12 @@ class Reading:
         off = max(abs(pack.low_m + width / 2), abs(pack.high_m - width / 2))
         return off < _SAME_RATIO * width + _SAME_M
 
+    @property
+    def is_flat(self) -> bool:
+        """Check that neither flank falls off, as a plate's or a wall's doesn't, and no straps bound it."""
+        bounded = self.pack is not None and self.pack.is_bounded
+        return self.flanks is not None and self.flanks.are_flat and not bounded
+
     def with_flanks(self) -> Reading:
         """Return the same with its flanks."""
         half, pack = self.found.fit.width_m / 2, self.pack

@@ -10,13 +10,13 @@ from barsight.yard.bundles.doubts import rate_agreement
 from barsight.yard.bundles.fitting.outline_fit import SLOPE_U
 from barsight.yard.bundles.pack_edges import DOUBTFUL, hold_off
 from barsight.yard.bundles.reading import Reading
-from barsight.yard.bundles.section.bar_pitch import DIAMETER_SIGMA_RATIO
+from barsight.yard.bundles.section.bar_pitch import SAME_DIAMETER_RATIO
 from barsight.yard.bundles.section.pack_sides import PackSide
 from barsight.yard.bundles.section.packs import Pack, contradicts
 from barsight.yard.bundles.section.seen_section import SeenSection, over_floor, section_of_pack
 from barsight.yard.types import Bundle, BundleSigma, Doubt, DoubtKind
 
-_LINES_SIGMA_RATIO = 0.5
+_LINES_SIGMA_RATIO = 0.6
 """Of a diameter by dark lines: one standard deviation. Where lines between thin bars don't all show, it is
 that of two bars, of three or of more."""
 _PACK_MIDDLE_M, _PACK_WIDTH_M, _PACK_TOP_M, _PACK_WIDTH_SIGMAS = 0.012, 0.016, 0.006, 3.0
@@ -99,6 +99,9 @@ def _as_pack(
     down = np.array([0.0, 0.0, pack.top_m - pack.width_m / 2])
     diameter = pack.diameter_m if pack.diameter_m > 0 else bundle.bar_diameter_m
     said = f"straps at {len(pack.span.rows_m)} places hold it together, not the packing that was fitted"
+    sure = _STRAPPED * rate_agreement(fit.state[fit.first : fit.last + 1])
+    if any(doubt.kind is DoubtKind.WALL for doubt in bundle.reasons):
+        sure = min(sure, DOUBTFUL)
     kept = (doubt for doubt in bundle.reasons if doubt.kind is not DoubtKind.RIVAL)
     return replace(
         bundle,
@@ -110,7 +113,7 @@ def _as_pack(
         bar_diameter_m=diameter,
         bar_axes=(),
         section_m2=section,
-        confidence=_STRAPPED * rate_agreement(fit.state[fit.first : fit.last + 1]),
+        confidence=sure,
         reasons=(*kept, Doubt(DoubtKind.OTHER, said)),
         sigma=replace(
             bundle.sigma,
@@ -118,7 +121,7 @@ def _as_pack(
             yaw_rad=irregular.yaw_rad,
             width_m=width_sigma,
             top_z_m=float(np.hypot(bundle.sigma.top_z_m, _PACK_TOP_M)),
-            bar_diameter_m=_LINES_SIGMA_RATIO * pack.diameter_m,
+            bar_diameter_m=_LINES_SIGMA_RATIO * diameter,
             section_m2=section_sigma,
         ),
         fit_sigma=None,
@@ -179,7 +182,7 @@ def _confirmed(bundle: Bundle, pack: Pack, floor_m: float | None, pack_sigma_m: 
     they are as sure as they agree.
     """
     diameter, spread = bundle.bar_diameter_m, bundle.sigma.bar_diameter_m
-    if abs(pack.diameter_m - diameter) > DIAMETER_SIGMA_RATIO * diameter:
+    if abs(pack.diameter_m - diameter) > SAME_DIAMETER_RATIO * diameter:
         diameter, spread = pack.diameter_m, _LINES_SIGMA_RATIO * pack.diameter_m
     own, packs = bundle.sigma.width_m**-2, pack_sigma_m**-2
     width = (own * bundle.width_m + packs * pack.width_m) / (own + packs)

@@ -10,7 +10,7 @@ import numpy as np
 from barsight.core.arrays import Float64
 from barsight.yard.bundles.fitting.outline_fit import DIAMETER, Fit
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
-from barsight.yard.bundles.section.bar_pitch import DIAMETER_SIGMA_RATIO, bar_diameter
+from barsight.yard.bundles.section.bar_pitch import SAME_DIAMETER_RATIO, bar_diameter
 from barsight.yard.bundles.section.pack_sides import PackSide, find_side, flank_depth
 from barsight.yard.bundles.section.seen_section import agreeing_rows, mean_section
 from barsight.yard.bundles.section.strap_lines import FLOOR_M
@@ -82,7 +82,7 @@ def strapped_pack(height_map: HeightMap, grid: AlignedMap, fit: Fit) -> Pack | N
         return None
     own = spans[number]
     thick = bar_diameter(height_map, grid, fit, own.low_m, own.high_m)
-    pack = find_pack(spans, number, beside, level, thick * (1 + UPPER * DIAMETER_SIGMA_RATIO))
+    pack = find_pack(spans, number, beside, level, thick * (1 + UPPER * SAME_DIAMETER_RATIO))
     if pack is None or not pack.is_bounded:
         return pack and replace(pack, diameter_m=thick)
     pack = replace(pack, diameter_m=bar_diameter(height_map, grid, fit, pack.low_m, pack.high_m))
