@@ -52,7 +52,7 @@ def test_placements_for_danger_say_nothing_of_what_is_refused(tmp_path: Path) ->
     described = tmp_path / "magnet.toml"
     described.write_text(example_magnet(), encoding="utf-8")
     magnet, settings = read_magnet(described), LiftSettings()
-    world = draw_yard(9, 2 * magnet.half_span_m + 0.3, 1.2)
+    world = draw_yard(45, 2 * magnet.half_span_m + 0.3, 1.2)
     given = world, noisy_world(world, settings), load_magnet(described), magnet, settings
     offered = len(tuple(judge_yard(*given, 0)))
     judged = tuple(judge_yard(*given, 1, 5))
