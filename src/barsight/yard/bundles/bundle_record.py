@@ -37,7 +37,7 @@ from barsight.yard.bundles.reading import Reading
 from barsight.yard.bundles.section.seen_section import estimate_section, seen_section
 from barsight.yard.bundles.strapped_bundles import held_by_straps
 from barsight.yard.sections import MapStretch, part_about
-from barsight.yard.types import Bundle, BundleSigma, FitSigma, YardMap
+from barsight.yard.types import Bundle, BundleSigma, DoubtKind, FitSigma, YardMap
 
 _SLOPE_RATIO = 0.6
 """Of the slope's sigma that errors alike over `correlated_along_m` would give: what is alike over so long a
@@ -47,8 +47,8 @@ way moves the bundle aside and turns it little."""
 def describe_bundles(
     bundles: list[Bundle], floor_m: float | None, parts: list[MapStretch]
 ) -> tuple[Bundle, ...]:
-    """Number the bundles by rising x of their centres and relate each to its neighbours. One that reaches
-    under the floor isn't as high as it is told, and so is doubtful.
+    """Number the bundles by rising x of their centres and relate each to its neighbours. What may be a
+    wall is doubtful, and what reaches under the floor, as it isn't as high as told.
     """
     ordered = sorted(bundles, key=lambda b: tuple(b.centre_m))
     ordered = [replace(bundle, id=k) for k, bundle in enumerate(ordered)]
@@ -58,12 +58,14 @@ def describe_bundles(
         for bundle, layer in zip(near, find_layers(near, floor_m), strict=True):
             if part.owns(bundle.centre_m):
                 on_top, why = check_uncovered(bundle, near, layer)
-                flat = is_sunken(floor_m, bundle.bottom_z_m, bundle.width_m)
+                doubtful = is_sunken(floor_m, bundle.bottom_z_m, bundle.width_m) or any(
+                    doubt.kind is DoubtKind.WALL for doubt in bundle.reasons
+                )
                 out[bundle.id] = replace(
                     bundle, layer=layer, on_top=on_top, neighbours=list_neighbours(bundle, near),
                     reasons=bundle.reasons + why,
                     cover_doubts=bundle.cover_doubts + list_overlaps(bundle, near),
-                    confidence=min(bundle.confidence, DOUBTFUL) if flat else bundle.confidence,
+                    confidence=min(bundle.confidence, DOUBTFUL) if doubtful else bundle.confidence,
                 )  # fmt: skip
     return tuple(out)
 
@@ -111,7 +113,7 @@ def make_bundle(
         neighbours=(),
         sigma=replace(own, section_m2=section_sigma),
         known_share=float((rows != 0).mean()),
-        confidence=rate_confidence(reading, rows, reasons),
+        confidence=rate_confidence(reading, rows),
         reasons=reasons,
         bar_axes=fit_bars(reading.found, settings),
         ends_sigma_m=(ends[0].sigma_m, ends[1].sigma_m),

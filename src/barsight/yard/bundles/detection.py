@@ -49,8 +49,8 @@ _EDGE_CELLS = 3.0
 _CLAIM_M = 0.02
 _RIVAL_RATIO = 0.8
 _FLAT_RATIO, _FLAT_WEIGHT = 0.4, 0.5
-"""Of its width: how deep a circle over the flat top of an irregular pack may reach under the floor; what such
-an outline weighs beside one that stands on it."""
+"""Largest depth under the floor, in widths, of a circle over the flat top of an irregular pack; weight of
+such an outline beside one that stands on the floor."""
 _LOWER_M = 0.005
 """Largest error, downwards, of a single bar's measured top."""
 _RESOLVED_CELLS = 4.0

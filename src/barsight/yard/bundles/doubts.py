@@ -12,9 +12,9 @@ from barsight.yard.bundles.fitting.ends import End
 from barsight.yard.bundles.fitting.outline import BARS_OF_RINGS, bundle_width
 from barsight.yard.bundles.fitting.outline_fit import ABOVE, AGREES, BELOW, DIAMETER, SLOPE_U, SLOPE_Z, U, Z
 from barsight.yard.bundles.fitting.settings import BundleSettings
-from barsight.yard.bundles.pack_edges import DOUBTFUL
 from barsight.yard.bundles.reading import Reading
 from barsight.yard.bundles.section.seen_section import (
+    MAX_HEIGHT_RATIO,
     SeenSection,
     agreeing_rows,
     is_no_hexagon,
@@ -32,10 +32,10 @@ _LAID_M, _LAID_SIZE_M = 0.02, (0.04, 0.03)
 _GULLY_RATIO = 0.3
 """Of a bundle's width: where the surface at its rim lies so far under its axis or further, it is no bundle's.
 The rim of an upright triangle of bars lies 0.22 under it, turned by 25 degrees 0.24."""
-_MAX_HEIGHT_RATIO, _MAX_DUNNAGE_M = 1.25, 0.15
-"""Height of a bundle, of its width, and of the dunnage under it, at most."""
+_MAX_DUNNAGE_M = 0.15
+"""Largest height of the dunnage under a bundle."""
 _CARRIER_M, _CARRIED_RATIO = 0.15, 0.03
-"""What lies so near to both flanks may carry a bundle, over this share of its length."""
+"""Largest distance of a carrier from both flanks; least share of a bundle's length over which it shows."""
 _BEFORE_END_M = 0.05
 """Rows nearer to an end tell nothing of that: bars end unevenly."""
 _SURE_KNOWN = 0.7
@@ -127,7 +127,7 @@ def list_wall_doubts(
         return (Doubt(DoubtKind.WALL, "neither flank falls off: it may be a wall"),)
     if seen is None or floor_m is None or not seen.sides_free:
         return ()
-    if top_m - floor_m <= _MAX_HEIGHT_RATIO * reading.found.fit.width_m + _MAX_DUNNAGE_M:
+    if top_m - floor_m <= MAX_HEIGHT_RATIO * reading.found.fit.width_m + _MAX_DUNNAGE_M:
         return ()
     if _shows_carrier(reading, seen.width_m):
         return ()
@@ -189,17 +189,16 @@ def measure_laid(reading: Reading) -> float:
     return float(rise[laid].max(initial=0.0))
 
 
-def rate_confidence(reading: Reading, rows: UInt8, reasons: tuple[Doubt, ...]) -> float:
+def rate_confidence(reading: Reading, rows: UInt8) -> float:
     """Estimate the probability from how much of the length agrees and how far the next other reading is
-    behind; what may be a wall is doubtful.
+    behind.
     """
     fit, rival = reading.found.fit, reading.rival
     lead = 1.0
     if rival is not None and abs(rival.fit.width_m - fit.width_m) > 0.15 * fit.width_m:
         lead = 1 - reading.rival_weight / max(reading.weight, 1e-9)
     sure = 1 - 0.5 * np.exp(-max(lead, 0.0) / 0.05)
-    most = DOUBTFUL if any(doubt.kind is DoubtKind.WALL for doubt in reasons) else 0.99
-    return float(np.clip(sure * rate_agreement(rows), 0.01, most))
+    return float(np.clip(sure * rate_agreement(rows), 0.01, 0.99))
 
 
 def rate_agreement(rows: UInt8) -> float:

@@ -14,9 +14,8 @@ _FLAT_M = 0.012
 _LEVEL_M = 0.03
 _KNOWN_RATIO = 0.6
 _PATCH_BLOCKS = 64
-
 _SUNKEN_M, _SUNKEN_RATIO = 0.04, 0.2
-"""How deep an outline may reach under the floor: errors of the map, at most, and of its width."""
+"""Largest depth of an outline under the floor by a map's errors: the lesser of both, the second in widths."""
 
 
 def find_floor(yard: YardMap) -> float | None:

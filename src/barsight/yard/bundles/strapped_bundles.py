@@ -99,9 +99,6 @@ def _as_pack(
     down = np.array([0.0, 0.0, pack.top_m - pack.width_m / 2])
     diameter = pack.diameter_m if pack.diameter_m > 0 else bundle.bar_diameter_m
     said = f"straps at {len(pack.span.rows_m)} places hold it together, not the packing that was fitted"
-    sure = _STRAPPED * rate_agreement(fit.state[fit.first : fit.last + 1])
-    if any(doubt.kind is DoubtKind.WALL for doubt in bundle.reasons):
-        sure = min(sure, DOUBTFUL)
     kept = (doubt for doubt in bundle.reasons if doubt.kind is not DoubtKind.RIVAL)
     return replace(
         bundle,
@@ -113,7 +110,7 @@ def _as_pack(
         bar_diameter_m=diameter,
         bar_axes=(),
         section_m2=section,
-        confidence=sure,
+        confidence=_STRAPPED * rate_agreement(fit.state[fit.first : fit.last + 1]),
         reasons=(*kept, Doubt(DoubtKind.OTHER, said)),
         sigma=replace(
             bundle.sigma,

@@ -8,7 +8,6 @@ strap, and the noise on top.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -100,9 +99,8 @@ def _between(gap: float, gap_m: Float64, curve: Float64) -> float:
 
 def min_diameter_m(bundle: Bundle) -> float:
     """Compute the lower bound of the diameter of a bundle's bars."""
-    diameter, sigma = bundle.bar_diameter_m, bundle.sigma.bar_diameter_m
-    least = MIN_DIAMETER_RATIO * diameter
-    return max(diameter - UPPER * sigma, least) if math.isfinite(sigma) else least
+    diameter = bundle.bar_diameter_m
+    return float(np.fmax(diameter - UPPER * bundle.sigma.bar_diameter_m, MIN_DIAMETER_RATIO * diameter))
 
 
 def pole_shares(contact: Contact, magnet: Magnet, place: Placement, load: tuple[Bundle, ...]) -> Float64:

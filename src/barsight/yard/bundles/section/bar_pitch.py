@@ -12,7 +12,7 @@ from barsight.yard.bundles.section.shades import shade_profile
 from barsight.yard.types import HeightMap
 
 SAME_DIAMETER_RATIO = 0.13
-"""Of a diameter: how far one by the dark lines may lie off it. Where all lines show, bars of drawn packs have
+"""Largest error of a diameter by the dark lines, in diameters. Where all lines show, bars of drawn packs have
 0.78 (P5) to 1.4 (P95) of it."""
 _DIAMETER_RATIO = 1.06
 """Bars' diameter over the median way between dark lines: some bars are hidden in part."""

@@ -47,7 +47,7 @@ _ALIKE_LOG = 0.35
 _PARTED_RATIO, _PARTED_DIAMETER_M = 0.3, 0.04
 """Two bundles lie side by side where the surface sinks so far, of the outline's width, between them and their
 bars are this thick; else they may be pieces of one pack."""
-_MAX_HEIGHT_RATIO, _MAX_FILL_RATIO = 1.25, 0.79
+MAX_HEIGHT_RATIO, _MAX_FILL_RATIO = 1.25, 0.79
 """Greatest height of a bundle over its width, and share of steel in the box round it."""
 _HEIGHT_RATIO_PRIOR = NormalDist(0.92, 0.14)
 """Height of a bundle over its width. Its mean and deviation, and those of the fill, are by 1500 settled packs
@@ -88,7 +88,7 @@ def seen_section(one: FittedOutline, others: list[FittedOutline], smoothing_m: f
     others_begin = _is_neighbour(one, beside, others)
     resolved = fit.rings > 0 and fit.values[DIAMETER] > _PARTED_DIAMETER_M
     parted_m = _PARTED_RATIO * fit.width_m if resolved else np.inf
-    lowest_m = float(level[middle]) - _MAX_HEIGHT_RATIO * (_MAX_PIECE_RATIO * fit.width_m + _WIDER_M)
+    lowest_m = float(level[middle]) - MAX_HEIGHT_RATIO * (_MAX_PIECE_RATIO * fit.width_m + _WIDER_M)
     limits = deep_m, parted_m, lowest_m, round(_HIDDEN_M / grid.cell_m)
     ends = [_edge(level, others_begin, middle, step, *limits) for step in (-1, 1)]
     own = level[ends[0][0] : ends[1][0] + 1]
@@ -170,7 +170,7 @@ def section_of_pack(
     section = fill[0] * height * width_m**2
     share = np.linalg.norm([fill[1] / fill[0], height_sigma / height, 2 * width_sigma_m / width_m])
     widest = width_m + UPPER * width_sigma_m
-    most = _MAX_FILL_RATIO * min(over_floor_m, _MAX_HEIGHT_RATIO * width_m) * widest
+    most = _MAX_FILL_RATIO * min(over_floor_m, MAX_HEIGHT_RATIO * width_m) * widest
     return section, min(section * float(share), (most - section) / UPPER)
 
 
