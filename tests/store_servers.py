@@ -31,13 +31,12 @@ def postgres() -> Iterator[str]:
     if initdb is None or control is None:
         pytest.skip("PostgreSQL is not installed (Debian: apt-get install postgresql-15)")
     folder = Path(tempfile.mkdtemp(prefix="barsight-pg-"))
-    user: list[str] = []
-    if os.geteuid() == 0:
-        user = ["runuser", "-u", "postgres", "--"]
-        shutil.chown(folder, "postgres")
+    user = "postgres" if os.geteuid() == 0 else None
+    if user is not None:
+        shutil.chown(folder, user)
 
     def call(*command: str) -> None:
-        subprocess.run([*user, *command], check=True, stdout=subprocess.DEVNULL, cwd=folder)
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=folder, user=user, group=user)
 
     data = str(folder / "data")
     options = f"-k {folder} -c listen_addresses= -c fsync=off -c shared_buffers=16MB"
