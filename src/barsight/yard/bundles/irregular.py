@@ -18,9 +18,9 @@ _TOP_SIGMAS, _YAW_SIGMAS = 0.8, 0.4
 """Of a height's sigma: error of the top, and of the ends' places sideways."""
 _RESOLVED_M = 0.07
 """Bars from this diameter on show their shape in a map."""
-_DIAMETER_RATIOS = 0.45, 0.6
-"""Of a diameter: its error where bars are thinner than that, and where another packing fits as well or many
-bars may look like one."""
+_DIAMETER_RATIOS = 0.06, 0.45, 0.6
+"""Of a diameter: its error where bars show their shape, where they are thinner, and where another packing
+fits as well or many bars may look like one."""
 
 
 def widen_sigma(
@@ -41,8 +41,10 @@ def widen_sigma(
     section = 0.0 if seen_width_m is None else _SECTION_RATIO * abs(seen_width_m - fit.width_m)
     wide = float(np.linalg.norm([ratio * fit.width_m, sigmas * fit.sigma_m, section]))
     turned = 0.0 if shown else _YAW_SIGMAS * fit.sigma_m / max(length_m, fit.width_m)
-    diameter, (thin, unsettled) = float(fit.values[DIAMETER]), _DIAMETER_RATIOS
-    spread = unsettled if is_one_of_two or fit.rings == 0 else thin if diameter < _RESOLVED_M else 0.0
+    diameter, (shown_ratio, thin, unsettled) = float(fit.values[DIAMETER]), _DIAMETER_RATIOS
+    spread = shown_ratio if diameter >= _RESOLVED_M else thin
+    if is_one_of_two or fit.rings == 0:
+        spread = unsettled
     return replace(
         sigma,
         width_m=float(np.hypot(sigma.width_m, wide)),
