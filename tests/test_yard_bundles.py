@@ -16,15 +16,22 @@ from barsight.yard.bundles.collinear_pieces import join_pieces
 from barsight.yard.bundles.detection import _on, find_bundles
 from barsight.yard.bundles.doubts import measure_laid
 from barsight.yard.bundles.fitting.ends import middle_and_length_sigma
-from barsight.yard.bundles.fitting.outline import bundle_width
-from barsight.yard.bundles.fitting.outline_fit import Fit
+from barsight.yard.bundles.fitting.outline import TRIANGLE, bundle_width
+from barsight.yard.bundles.fitting.outline_fit import AGREES, Fit, FittedOutline
 from barsight.yard.bundles.fitting.outline_fit import Z as OUTLINE_Z
+from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.headings import find_headings
 from barsight.yard.bundles.layers import list_overlaps
 from barsight.yard.bundles.reading import Reading
 from barsight.yard.bundles.section.flanks import Flanks
-from barsight.yard.bundles.section.seen_section import SeenSection, _edge, estimate_section, is_no_hexagon
+from barsight.yard.bundles.section.seen_section import (
+    SeenSection,
+    _edge,
+    estimate_section,
+    is_no_hexagon,
+    seen_section,
+)
 from barsight.yard.magnet.holding import min_diameter_m
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.weight import bundle_mass
@@ -392,6 +399,28 @@ def test_what_shows_behind_a_steep_flank_may_be_a_bundles_own_lower_bars(
     another = np.arange(18) >= (9 if begins else 18)
     last, is_seen, is_free = _edge(level, another, 0, 1, 0.1, np.inf, -0.2, 12)
     assert (last, is_seen, is_free) == (5, seen, behind == -np.inf)
+
+
+@pytest.mark.parametrize(("deep_m", "seen"), [(0.09, False), (0.13, True)])
+def test_a_gully_parts_two_bundles_of_thick_bars_if_no_bar_one_layer_down_leaves_it(
+    deep_m: float, seen: bool
+) -> None:
+    """Six bars of 80 mm were told as the three that show highest, half their mass."""
+    cell, diameter = 0.01, 0.085
+    u = cell * np.arange(-30, 31)
+    level = np.where(np.abs(u) > 0.08, 0.43, 0.5 - deep_m * (u / 0.08) ** 2)
+    z = np.tile(level.astype(np.float32), (40, 1))
+    grid = AlignedMap(0.0, float(u[0]), 0.0, cell, z, np.full_like(z, 0.003), 0.05)
+    fits = [
+        Fit(
+            TRIANGLE, 0.2, np.array([at, 0.0, 0.42, 0.0, 0.0, diameter]), np.zeros((6, 6)), 0, 39,
+            np.full(40, AGREES, np.uint8), np.ones(40, np.float32), 0.0, 0.0,
+        )
+        for at in (-0.17, 0.0, 0.17)
+    ]  # fmt: skip
+    left, one, right = (FittedOutline(grid, fit) for fit in fits)
+    section = seen_section(one, [left, right], 0.01)
+    assert section is not None and section.sides_seen == seen
 
 
 def test_both_ends_err_outwards_alike() -> None:

@@ -13,17 +13,18 @@ from barsight.core.types import HeightSource
 from barsight.simulation.worlds.packing import packed
 from barsight.simulation.worlds.settling import BarPack, settle
 from barsight.yard.bundles.detection import find_bundles
-from barsight.yard.bundles.fitting.outline_fit import AGREES, Fit, ShadeProfile
+from barsight.yard.bundles.fitting.outline_fit import AGREES, Fit, FittedOutline, ShadeProfile
 from barsight.yard.bundles.fitting.rotated_map import align_map
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.pack_edges import hold_off
+from barsight.yard.bundles.reading import Reading
 from barsight.yard.bundles.section.bar_pitch import dark_lines
 from barsight.yard.bundles.section.pack_sides import PackSide, _parting, _widest
 from barsight.yard.bundles.section.packs import Pack, contradicts, find_pack, strapped_pack
 from barsight.yard.bundles.section.seen_section import SeenSection, section_of_pack
 from barsight.yard.bundles.section.strap_lines import _best_stretches, row_gains, split_columns
 from barsight.yard.bundles.section.straps import StrapSpan, _merged, longest_runs
-from barsight.yard.bundles.strapped_bundles import _covered, _may_go_on
+from barsight.yard.bundles.strapped_bundles import _covered, _may_go_on, _pack_sigma
 from barsight.yard.types import DoubtKind, HeightMap
 from lift_yards import laid, record
 
@@ -104,6 +105,22 @@ def test_a_flank_out_of_sight_is_not_seen() -> None:
         part = replace(heights, z_m=np.where(hidden, np.float32(np.nan), heights.z_m))
         pack = pack_at(part, -0.05, 0.3)
         assert pack is None or not pack.sides_seen
+
+
+@pytest.mark.parametrize("hidden_m", [0.0, 0.08])
+def test_what_is_out_of_sight_behind_a_flank_makes_the_width_unsure(hidden_m: float) -> None:
+    """Packs whose bars bulge out of sight were told as half their mass."""
+    level = level_of(*LEFT, (0.09, -0.05), (0.1, -0.06), (0.101, -1.0), (0.4, -1.0))
+    level[(BESIDE > 0.102) & (0.102 + hidden_m > BESIDE)] = np.nan
+    pack = pack_beside(level, ROWS, 0.35)
+    assert pack.sides_seen and pack.high_m == pytest.approx(0.1, abs=CELL)
+    assert pack.hidden_m == pytest.approx((0.0, hidden_m))
+    fit = Fit(
+        1, 0.0, np.zeros(6), np.zeros((6, 6)), 0, 0, np.zeros(1, np.uint8), np.zeros(1, np.float32), 0, 0
+    )
+    grid = align_map(drawn([], np.random.default_rng(0)), 0.0, 0.05)
+    sigma_m = _pack_sigma(Reading(FittedOutline(grid, fit), 0.0, None, 0.0, None, pack))
+    assert (hidden_m / 2 < 1.96 * sigma_m) and (sigma_m > 0.025) == (hidden_m > 0)
 
 
 def test_straps_that_go_on_contradict_an_outline() -> None:
@@ -358,13 +375,15 @@ def test_a_low_bar_at_the_flank_is_still_the_bundle_s() -> None:
         (((0.09, -0.04), (0.11, -0.05), (0.15, 0.0), (0.4, 0.0)), ROWS, PackSide.OPEN),
         (((0.09, -0.04), (0.11, -0.07), (0.15, 0.0), (0.4, 0.0)), straight(0.53, 2.03, 3.53), PackSide.SEEN),
         (((0.09, -0.04), (0.11, -0.05), (0.15, 0.0), (0.4, 0.0)), straight(0.5, 2.3, 3.9), PackSide.OPEN),
+        (((0.09, -0.04), (0.11, -0.07), (0.15, 0.0), (0.4, 0.0)), straight(0.5, 2.05, 3.5), PackSide.OPEN),
         (((0.09, -0.04), (0.11, -0.05), (0.15, 0.06), (0.4, 0.06)), OTHER_ROWS, PackSide.COVERED),
         (((0.09, -0.06), (0.11, -0.12), (0.15, 0.06), (0.4, 0.06)), OTHER_ROWS, PackSide.SEEN),
         (((0.09, -0.04), (0.11, -0.05), (0.4, -0.12)), OTHER_ROWS, PackSide.OPEN),
         (((0.09, -0.04), (0.1, -0.09), (0.13, -0.06), (0.14, 0.3), (0.4, 0.3)), OTHER_ROWS, PackSide.SEEN),
     ],
     ids=[
-        "straps in line", "straps beside each other", "one of three in line", "a higher neighbour",
+        "straps in line", "straps beside each other", "one of three in line", "two of three in line",
+        "a higher neighbour",
         "a higher neighbour beside a deep flank", "one round surface", "a wall beyond something lower",
     ],
 )  # fmt: skip

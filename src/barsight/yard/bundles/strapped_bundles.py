@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -31,6 +32,8 @@ _CREST_M = 0.006
 _HIDDEN_RATIO = 0.5
 """Of the width in sight: one standard deviation of what a neighbour hides of a pack. In the pile that was
 looked at, as much as what was in sight was hidden at most."""
+_BULGE_RATIO = 0.4
+"""Of what wasn't seen behind a flank: one standard deviation of how far bars bulge there."""
 _STRAPPED = 0.95
 """Confidence in a bundle whose straps and flanks were seen."""
 _PIECE_M, _PIECE_HIGHER_M, _PIECE_BEYOND_M, _PIECE_SKEW = 0.02, 0.012, 0.1, 0.05
@@ -197,7 +200,9 @@ def _confirmed(bundle: Bundle, pack: Pack, floor_m: float | None, pack_sigma_m: 
 
 def _pack_sigma(reading: Reading) -> float:
     """Compute the standard deviation of a pack's width."""
-    return float(np.hypot(_PACK_WIDTH_M, _PACK_WIDTH_SIGMAS * reading.found.fit.sigma_m))
+    assert reading.pack is not None
+    hidden = (_BULGE_RATIO * hidden_m for hidden_m in reading.pack.hidden_m)
+    return math.hypot(_PACK_WIDTH_M, _PACK_WIDTH_SIGMAS * reading.found.fit.sigma_m, *hidden)
 
 
 def without_pieces(bundles: list[Bundle], readings: list[Reading]) -> list[Bundle]:

@@ -24,9 +24,8 @@ _DIP_RATIO = 0.12
 """Depth of a dip in a span, of its width, from which it may part two bundles whose straps lie in line."""
 _SPREAD_M = 0.03
 """Median distance between the straps' ends from which the pack's is open."""
-_IN_LINE_M, _BESIDE_M = 0.018, 0.09
-"""Along the bars: largest distance between the two halves of one strap where they meet; a strap that is
-nearer than the second, but not in line, makes it doubtful that any are of one bundle."""
+_IN_LINE_M = 0.018
+"""Along the bars: largest distance between the two halves of one strap where they meet."""
 _MIN_WIDTH_BARS = 1.5
 """Least width of what straps hold, in its bars."""
 _BEYOND_M = 0.03
@@ -38,7 +37,8 @@ class Pack:
     """Bars that straps hold, with their flanks: from low_m to high_m beside a fit's axis. span: of the straps
     themselves; others_m: where other bundles' begin on either side, infinite where none do. top_m: highest
     place over the axis; sides: the low and the high one. diameter_m: of its bars by the dark lines along it,
-    NaN where they aren't seen.
+    NaN where they aren't seen. hidden_m: how far nothing was seen behind the low and the high flank: bars may
+    bulge there.
     """
 
     low_m: float
@@ -48,6 +48,7 @@ class Pack:
     top_m: float
     sides: tuple[PackSide, PackSide]
     diameter_m: float = math.nan
+    hidden_m: tuple[float, float] = (0.0, 0.0)
 
     @property
     def sides_seen(self) -> bool:
@@ -119,7 +120,7 @@ def find_pack(
     cell = float(beside_m[1] - beside_m[0])
     level_inside = level_m[inside[0] : inside[-1] + 1]
     is_one = own.spread_m <= _SPREAD_M and _dip(level_inside) < _DIP_RATIO * own.width_m
-    ends, others, sides = [], [], []
+    ends, others, sides, hidden = [], [], [], []
     for step, at, beyond in ((-1, inside[0], spans[:number][::-1]), (1, inside[-1], spans[number + 1 :])):
         near, begin, shared = np.inf, None, None
         for other in beyond:
@@ -135,7 +136,16 @@ def find_pack(
         )
         ends.append(float(beside_m[at]) + step * cell * (last + 0.5))
         sides.append(side if is_one else PackSide.OPEN)
-    return Pack(ends[0], ends[1], own, (others[0], others[1]), top, (sides[0], sides[1]))
+        hidden.append(cell * _unseen_places(level_m[at::step][last + 1 :]))
+    return Pack(
+        ends[0], ends[1], own, (others[0], others[1]), top, (sides[0], sides[1]), math.nan,
+        (hidden[0], hidden[1]),
+    )  # fmt: skip
+
+
+def _unseen_places(level: Float64) -> int:
+    """Count the places before the first that was seen."""
+    return int(np.argmin(np.append(np.isnan(level), False)))
 
 
 def _lies_below(span: StrapSpan, beside_m: Float64, level_m: Float64, deep_m: float) -> bool:
@@ -166,11 +176,11 @@ def _dip(level: Float64) -> float:
 
 def _shared(lower: StrapSpan, upper: StrapSpan) -> bool | None:
     """Check whether most straps of either lie in line with the other's where they meet, as those of one
-    bundle do; False where none does. None where no more than half do, or some lie just beside one.
+    bundle do; False where none does. None where no more than half do.
     """
     apart = np.abs(np.subtract.outer([rows[1] for rows in lower.rows_m], [rows[0] for rows in upper.rows_m]))
     nearest = apart.min(axis=1 if len(lower.rows_m) <= len(upper.rows_m) else 0)
     in_line = nearest < _IN_LINE_M
     if not in_line.any():
         return False
-    return None if 2 * in_line.sum() <= nearest.size or (~in_line & (nearest < _BESIDE_M)).any() else True
+    return None if 2 * in_line.sum() <= nearest.size else True

@@ -44,9 +44,10 @@ _MIN_PIECE_RATIO, _MAX_PIECE_RATIO = 0.7, 1.5
 """Of the outline's width: what is seen narrower, or (by _WIDER_M besides) wider, is not its section."""
 _ALIKE_LOG = 0.35
 """Neighbours whose widths differ by a larger factor's logarithm may be pieces of one irregular pack."""
-_PARTED_RATIO, _PARTED_DIAMETER_M = 0.3, 0.04
-"""Two bundles lie side by side where the surface sinks so far, of the outline's width, between them and their
-bars are this thick; else they may be pieces of one pack."""
+_PARTED_RATIO, _PARTED_BARS, _PARTED_DIAMETER_M = 0.3, 1.4, 0.04
+"""Two bundles lie side by side where the surface sinks so far, of the outline's width and in bars, between
+them and their bars are this thick; else they may be pieces of one pack: a bar one layer down beside the
+highest shows a gully 0.87 + 0.5 bars under its top."""
 MAX_HEIGHT_RATIO, _MAX_FILL_RATIO = 1.25, 0.79
 """Greatest height of a bundle over its width, and share of steel in the box round it."""
 _HEIGHT_RATIO_PRIOR = NormalDist(0.92, 0.14)
@@ -87,7 +88,9 @@ def seen_section(one: FittedOutline, others: list[FittedOutline], smoothing_m: f
     deep_m = _GULLY_RATIO * float(fit.values[DIAMETER])
     others_begin = _is_neighbour(one, beside, others)
     resolved = fit.rings > 0 and fit.values[DIAMETER] > _PARTED_DIAMETER_M
-    parted_m = _PARTED_RATIO * fit.width_m if resolved else np.inf
+    parted_m = np.inf
+    if resolved:
+        parted_m = max(_PARTED_RATIO * fit.width_m, _PARTED_BARS * float(fit.values[DIAMETER]))
     lowest_m = float(level[middle]) - MAX_HEIGHT_RATIO * (_MAX_PIECE_RATIO * fit.width_m + _WIDER_M)
     limits = deep_m, parted_m, lowest_m, round(_HIDDEN_M / grid.cell_m)
     ends = [_edge(level, others_begin, middle, step, *limits) for step in (-1, 1)]
