@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from barsight.core.errors import ConfigError
 from barsight.core.types import HeightSource
+from barsight.yard.bundles.bundle_kinds import listed_diameter
 from barsight.yard.bundles.collinear_pieces import join_pieces
 from barsight.yard.bundles.detection import _on, find_bundles
 from barsight.yard.bundles.doubts import measure_laid
@@ -421,6 +422,29 @@ def test_a_gully_parts_two_bundles_of_thick_bars_if_no_bar_one_layer_down_leaves
     left, one, right = (FittedOutline(grid, fit) for fit in fits)
     section = seen_section(one, [left, right], 0.01)
     assert section is not None and section.sides_seen == seen
+
+
+@pytest.mark.parametrize(
+    ("told_mm", "sigma_mm", "listed_mm", "mean_mm", "least_mm"),
+    [
+        (110.0, 66.0, (), 110.0, 11.0),
+        (110.0, 66.0, (100.0, 120.0), 110.0, 93.0),
+        (110.0, 66.0, (20.0, 110.0), 85.0, 18.0),
+        (84.0, 5.0, (40.0, 90.0), 90.0, 88.0),
+        (90.0, 5.0, (40.0,), 90.0, 81.0),
+    ],
+    ids=["no list", "thick bars alone", "thin bars too", "one of them", "none of them"],
+)
+def test_a_catalogue_narrows_the_diameters_that_it_leaves(
+    told_mm: float, sigma_mm: float, listed_mm: tuple[float, ...], mean_mm: float, least_mm: float
+) -> None:
+    (bundle,) = find_bundles(draw([Laid(0.0, 0.0, 0.2, 0.0)]), SETTINGS)
+    sigma = replace(bundle.sigma, bar_diameter_m=sigma_mm / 1e3)
+    told = replace(bundle, bars=None, bar_diameter_m=told_mm / 1e3, sigma=sigma, confidence=0.95)
+    listed = listed_diameter(told, listed_mm)
+    assert 1e3 * listed.bar_diameter_m == pytest.approx(mean_mm, abs=2)
+    assert 1e3 * min_diameter_m(listed) == pytest.approx(least_mm, abs=2)
+    assert (listed.confidence < 0.5) == (listed_mm == (40.0,))
 
 
 def test_both_ends_err_outwards_alike() -> None:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from barsight.core.arrays import Float64, Int64
 from barsight.yard.bundles.fitting.outline_fit import DIAMETER, Fit
+from barsight.yard.bundles.pack_edges import DOUBTFUL
+from barsight.yard.types import Bundle, Doubt, DoubtKind
 
 _ALIKE_LOG = 0.08
 """Standard deviation of the logarithm of diameters read for one kind of bar."""
@@ -15,6 +19,10 @@ _PRIOR_RATIO = 0.015
 """How much bars of one kind differ, as a share of the diameter."""
 _MIN_MEMBERS = 3
 _SAME_WIDTH = 0.2
+_UNLISTED_SIGMAS = 3.0
+"""A diameter so far from all that are listed is none of them."""
+_ROLLED_RATIO = 0.01
+"""Of a listed diameter: how far bars are off it, as rolled (EN 10060)."""
 _AS_WELL, _AS_WELL_SINGLE, _AS_WELL_THIN = 0.95, 0.85, 0.6
 
 
@@ -80,3 +88,25 @@ def common_diameter(fit: Fit, others: list[Fit]) -> tuple[float, float] | None:
     spread = 1.25 * np.std(alike) / np.sqrt(len(alike))
     middle = float(np.median(alike))
     return middle, float(np.hypot(_PRIOR_RATIO * middle, spread))
+
+
+def listed_diameter(bundle: Bundle, catalogue_mm: tuple[float, ...]) -> Bundle:
+    """Replace a diameter that isn't counted by the mean and deviation of the listed ones c, as likely as it
+    tells: w = exp(-(c - d)^2 / 2 sigma^2). A bundle of none of them is doubtful.
+    """
+    diameter, sigma = bundle.bar_diameter_m, bundle.sigma.bar_diameter_m
+    if not catalogue_mm or bundle.bars is not None or not sigma > 0:
+        return bundle
+    listed = 1e-3 * np.array(catalogue_mm)
+    away = (listed - diameter) / sigma
+    if np.abs(away).min() > _UNLISTED_SIGMAS:
+        said = f"its bars look {1e3 * diameter:.0f} mm thick: the catalogue has none like them"
+        return replace(
+            bundle, confidence=min(bundle.confidence, DOUBTFUL),
+            reasons=(*bundle.reasons, Doubt(DoubtKind.OTHER, said)),
+        )  # fmt: skip
+    likely = np.exp(-0.5 * away**2)
+    likely /= likely.sum()
+    mean = float(likely @ listed)
+    spread = float(np.hypot(np.sqrt(likely @ (listed - mean) ** 2), _ROLLED_RATIO * mean))
+    return replace(bundle, bar_diameter_m=mean, sigma=replace(bundle.sigma, bar_diameter_m=spread))

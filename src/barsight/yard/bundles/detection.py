@@ -9,7 +9,12 @@ import numpy as np
 from barsight.core.arrays import Float64, Int64
 from barsight.core.parallel import ordered_map, prefetch
 from barsight.core.types import HeightSource
-from barsight.yard.bundles.bundle_kinds import common_diameter, other_packings, reinforce_kinds
+from barsight.yard.bundles.bundle_kinds import (
+    common_diameter,
+    listed_diameter,
+    other_packings,
+    reinforce_kinds,
+)
 from barsight.yard.bundles.bundle_record import describe_bundles, make_bundle, map_sigma
 from barsight.yard.bundles.collinear_pieces import join_pieces
 from barsight.yard.bundles.crossing_bundles import OVER_M, crossing_pieces, is_beam, rise_over
@@ -80,7 +85,8 @@ def find_bundles(yard: YardMap, settings: BundleSettings) -> tuple[Bundle, ...]:
         own = [bundle for bundle in read if part.owns(bundle.centre_m, _SEAM_M)]
         before = [bundle for bundle in found if part.reaches(bundle.centre_m)]
         found += [bundle for bundle in own if not any(same_place(bundle, one) for one in before)]
-    described = describe_bundles(found, floor, parts)
+    listed = [listed_diameter(bundle, settings.catalogue_mm) for bundle in found]
+    described = describe_bundles(listed, floor, parts)
     return tuple(replace(one, map_sigma_z_m=map_sigma(yard, one)) for one in described)
 
 

@@ -14,7 +14,7 @@ class BundleSettings:
     """Settings of finding bundles of round bars, or single heavy bars, in the height map."""
 
     catalogue_mm: tuple[float, ...] = ()
-    """Diameters of bars that may lie here; any diameter when not given."""
+    """All diameters of bars that may lie here; any diameter when not given. Lifts count on that."""
     stock_list: Path | None = None
     """CSV or JSON of the bundles that should lie here, to be held against those found."""
     min_length_m: float = 0.5
