@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from barsight.core.arrays import Float64
 from barsight.core.errors import ConfigError
 from barsight.core.types import HeightSource
 from barsight.yard.bundles.bundle_kinds import listed_diameter
@@ -266,6 +267,20 @@ def test_a_beams_end_on_a_flank_holds_the_bundle_down(
     assert bundle.is_free is is_free
 
 
+def _reading_of(z_m: Float64, width_m: float, *, pack_only: bool = False) -> Reading:
+    """Describe a bundle by its heights, its top at 0.24 m. pack_only: the fit has the topmost bar alone."""
+    fitted_m = width_m / 4 if pack_only else width_m
+    values = np.zeros(6)
+    values[OUTLINE_Z] = 0.24 - fitted_m / 2
+    fit = SimpleNamespace(width_m=fitted_m, first=0, last=len(z_m) - 1, v_m=0.0, values=values)
+    pack = SimpleNamespace(
+        is_bounded=True, low_m=-width_m / 2, high_m=width_m / 2, width_m=width_m, top_m=fitted_m / 2
+    )
+    grid = SimpleNamespace(z_m=z_m, cell_m=0.01, u0_m=-width_m / 2, v0_m=-1.0)
+    reading = SimpleNamespace(found=SimpleNamespace(grid=grid, fit=fit), pack=pack if pack_only else None)
+    return cast(Reading, reading)
+
+
 @pytest.mark.parametrize(
     ("sunk_from_m", "own_m", "top_m", "laid_m"),
     [(0.085, 0.0, 0.1, 0.0), (0.085, 0.0, 0.2, 0.2), (0.085, 0.06, 0.1, 0.04), (0.0, 0.0, 0.1, 0.1)],
@@ -275,20 +290,25 @@ def test_dunnage_that_shows_in_a_gully_lies_beside_the_bundle(
     sunk_from_m: float, own_m: float, top_m: float, laid_m: float, *, pack_only: bool
 ) -> None:
     """A bundle is read 0.24 m wide, up to 0.24 m high. From one place on, to its rim or over 30 mm inside it,
-    own_m shows, and at one place along it what is top_m high. pack_only: the fit has the topmost bar alone.
+    own_m shows, and at one place along it what is top_m high.
     """
     v, u = 0.01 * np.arange(200) - 1, 0.01 * np.arange(25) - 0.12
     sunken = (u > sunk_from_m) & (u < sunk_from_m + 0.045)
     z = np.where(sunken, own_m, 0.24) + np.zeros((200, 1))
     z[(np.abs(v) < 0.05)[:, None] & sunken[None]] = top_m
-    width_m = 0.06 if pack_only else 0.24
-    values = np.zeros(6)
-    values[OUTLINE_Z] = 0.24 - width_m / 2
-    fit = SimpleNamespace(width_m=width_m, first=0, last=199, v_m=0.0, values=values)
-    pack = SimpleNamespace(is_bounded=True, low_m=-0.12, high_m=0.12, width_m=0.24, top_m=width_m / 2)
-    grid = SimpleNamespace(z_m=z, cell_m=0.01, u0_m=u[0], v0_m=v[0])
-    reading = SimpleNamespace(found=SimpleNamespace(grid=grid, fit=fit), pack=pack if pack_only else None)
-    assert measure_laid(cast(Reading, reading)) == pytest.approx(laid_m)
+    laid = measure_laid(_reading_of(z, 0.24, pack_only=pack_only))
+    assert laid == (pytest.approx(laid_m), laid_m > 0)
+
+
+@pytest.mark.parametrize(("cells", "over_m", "is_clear"), [(1, 0.0, False), (2, 0.0, True), (1, 0.03, True)])
+def test_a_steep_flank_that_is_a_cell_off_is_not_clearly_another_thing(
+    cells: int, over_m: float, *, is_clear: bool
+) -> None:
+    """Flanks fall by 25 mm a cell. Over 0.4 m the bundle lies so many cells aside, and over_m higher."""
+    u = 0.01 * np.arange(25) - 0.12
+    z = np.tile(0.24 - 2.5 * np.maximum(np.abs(u) - 0.06, 0.0), (200, 1))
+    z[80:120] = np.roll(z[80:120], cells, axis=1) + over_m
+    assert measure_laid(_reading_of(z, 0.24)) == (pytest.approx(0.025 * cells + over_m), is_clear)
 
 
 def test_outlines_that_overlap_leave_open_which_bundle_lies_over_the_other() -> None:

@@ -149,22 +149,26 @@ def _shows_carrier(reading: Reading, width_m: float) -> bool:
 def list_cover_doubts(reading: Reading, reasons: tuple[Doubt, ...]) -> tuple[Doubt, ...]:
     """List what may hold the bundle down though no other bundle is known to lie on it."""
     out = [doubt for doubt in reasons if doubt.kind is DoubtKind.CROSSED]
-    laid = measure_laid(reading)
-    if laid > 0:
+    laid, is_clear = measure_laid(reading)
+    if is_clear:
         said = f"something {1e3 * laid:.0f} mm high lies over a part of its width"
         out.append(Doubt(DoubtKind.OTHER, said))
+    elif laid > 0:
+        said = f"something {1e3 * laid:.0f} mm high beside it may lie over its flank"
+        out.append(Doubt(DoubtKind.HIDDEN_FLANK, said))
     if reading.flanks is not None and reading.flanks.cover_doubt:
         out.append(reading.flanks.cover_doubt)
     return tuple(out)
 
 
-def measure_laid(reading: Reading) -> float:
+def measure_laid(reading: Reading) -> tuple[float, bool]:
     """Measure how high the highest thing rises that lies over a part of a bundle's width, as a beam's end
-    does; 0 where nothing does.
+    does, 0 where nothing does; and whether one rises so, anywhere, over the section a cell to the side too.
 
     Heights are taken over the bundle's own section, the median along it at each place across. A thing is a
     patch that everywhere holds a square of _LAID_SIZE_M and rises by _LAID_M. What stands no higher than the
-    axis where a gully shows at the rim lies beside the bundle, as dunnage does.
+    axis where a gully shows at the rim lies beside the bundle, as dunnage does. A steep flank that is a cell
+    off rises as much; what lies on a bundle rests on its crest, and rises over that too.
     """
     grid, fit, pack = reading.found.grid, reading.found.fit, reading.pack
     low, high, axis_z_m = -fit.width_m / 2, fit.width_m / 2, float(fit.values[Z])
@@ -183,10 +187,11 @@ def measure_laid(reading: Reading) -> float:
     own = known_median(z)
     sunken = (own < axis_z_m - _GULLY_RATIO * (high - low))[0]
     gully = np.logical_and.accumulate(sunken) | np.logical_and.accumulate(sunken[::-1])[::-1]
-    rise = np.where(np.isfinite(z) & ~(gully & (z < axis_z_m)), z - own, -np.inf)
+    may_lie = np.isfinite(z) & ~(gully & (z < axis_z_m))
     size = [max(round(side / grid.cell_m), 1) for side in _LAID_SIZE_M]
-    laid = ndimage.binary_opening(rise > _LAID_M, np.ones(size, bool))
-    return float(rise[laid].max(initial=0.0))
+    laid = ndimage.binary_opening(may_lie & (z - own > _LAID_M), np.ones(size, bool))
+    highest = ndimage.maximum_filter(np.where(np.isfinite(own), own, -np.inf), (1, 3))
+    return float((z - own)[laid].max(initial=0.0)), bool((z - highest > _LAID_M)[laid].any())
 
 
 def rate_confidence(reading: Reading, rows: UInt8) -> float:
