@@ -8,7 +8,13 @@ import pytest
 from barsight.core.types import HeightSource
 from barsight.yard.bundles.fitting.gauss_newton import Heights, Rules, _normal_equations, fit_outline
 from barsight.yard.bundles.fitting.growth import _row_states, _walk
-from barsight.yard.bundles.fitting.outline import STEP_M, make_outline, packing_axes, trace_with_changes
+from barsight.yard.bundles.fitting.outline import (
+    STEP_M,
+    add_weighted,
+    make_outline,
+    packing_axes,
+    trace_with_changes,
+)
 from barsight.yard.bundles.fitting.outline_fit import ABOVE, AGREES, BELOW, MIXED, UNKNOWN
 from barsight.yard.bundles.fitting.rotated_map import align_map
 from barsight.yard.bundles.fitting.settings import BundleSettings
@@ -17,6 +23,12 @@ from barsight.yard.bundles.set_packing import choose_readings
 from barsight.yard.types import HeightMap
 
 SMOOTHING_M = 0.006
+
+
+def test_weighted_values_are_added_to_a_part_of_the_sums() -> None:
+    sums = np.arange(5.0)
+    add_weighted(sums[1:4], np.array([2.0, np.pi, -1.0]), 0.5)
+    np.testing.assert_array_equal(sums, [0.0, 2.0, 2.0 + 0.5 * np.pi, 2.5, 4.0])
 
 
 def test_an_outline_is_the_smoothed_upper_edge_of_its_bars() -> None:

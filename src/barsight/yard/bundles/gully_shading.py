@@ -16,6 +16,7 @@ from barsight.yard.bundles.fitting.outline import (
     STEP_M,
     TRIANGLE,
     TRIANGLE_BARS_M,
+    add_weighted,
     bundle_width,
     highest_bars,
     packing_axes,
@@ -163,9 +164,9 @@ def _shading(packing: Float64, diameter: float, roll: float, blur: float) -> tup
     for k in range(-reach, reach + 1):
         weight = np.exp(-0.5 * (STEP_M * k / blur) ** 2)
         total += weight
-        for i in range(max(-k, 0), min(size - k, size)):
-            above[i] += weight * up[i + k]
-            aside[i] += weight * side[i + k]
+        first, end = max(-k, 0), min(size - k, size)
+        add_weighted(above[first:end], up[first + k : end + k], weight)
+        add_weighted(aside[first:end], side[first + k : end + k], weight)
     return above / total, aside / total
 
 

@@ -9,6 +9,8 @@ import numpy as np
 from barsight.core.arrays import Bool, Float32, Float64, kernel
 from barsight.yard.bundles.fitting.outline import STEP_M, trace_with_changes
 
+Four = tuple[float, float, float, float]
+
 _ROLL, _DIAMETER = 4, 5
 _RIM_M = 0.008
 _STEEPEST = 4.0
@@ -130,8 +132,8 @@ def _normal_equations(
 
     Along one row the two slopes' columns are the places' times the way along: four sums per row make six.
     """
-    normal, right, moments = np.zeros((6, 6)), np.zeros(6), np.zeros(3)
-    part, side = np.zeros((4, 4)), np.zeros(4)
+    normal, right = np.zeros((6, 6)), np.zeros(6)
+    count = weight = chi2 = 0.0
     cell, columns, size = heights.cell_m, heights.z_m.shape[1], tables.shape[1]
     cosine = 1.0 / np.sqrt(1.0 + values[1] * values[1])
     reach = size // 2 * STEP_M
@@ -139,7 +141,9 @@ def _normal_equations(
     for j in range(heights.first, heights.last + 1, heights.stride):
         along = heights.v0_m + cell * j - heights.v_m
         u = values[0] + values[1] * along - heights.u0_m
-        part[:], side[:] = 0.0, 0.0
+        # Plain numbers stay in registers; an array's would be stored and loaded for each height.
+        uu = uz = ur = ud = zz = zr = zd = rr = rd = dd = 0.0
+        side_u = side_z = side_r = side_d = 0.0
         for i in range(
             max(int(np.ceil((u - inner) / cell)), 0), min(int((u + inner) / cell), columns - 1) + 1
         ):
@@ -157,29 +161,33 @@ def _normal_equations(
                 continue
             tukey = (1 - (r / gate) ** 2) ** 2
             w = tukey / (heights.sigma_m[j, i] ** 2 + (slope * placing) ** 2)
-            row = (-slope * cosine, 1.0, roll, diameter)
-            for a in range(4):
-                side[a] += w * row[a] * r
-                for b in range(a, 4):
-                    part[a, b] += w * row[a] * row[b]
-            moments[0] += tukey
-            moments[1] += w
-            moments[2] += w * r * r
-        _add_row(normal, right, part, side, along)
-    return normal, right, moments
+            sideways = -slope * cosine
+            w_u, w_r, w_d = w * sideways, w * roll, w * diameter
+            side_u, side_z = side_u + w_u * r, side_z + w * r
+            side_r, side_d = side_r + w_r * r, side_d + w_d * r
+            uu, uz, ur, ud = uu + w_u * sideways, uz + w_u, ur + w_u * roll, ud + w_u * diameter
+            zz, zr, zd = zz + w, zr + w_r, zd + w_d
+            rr, rd, dd = rr + w_r * roll, rd + w_r * diameter, dd + w_d * diameter
+            count += tukey
+            weight += w
+            chi2 += w * r * r
+        part = ((uu, uz, ur, ud), (uz, zz, zr, zd), (ur, zr, rr, rd), (ud, zd, rd, dd))
+        _add_row(normal, right, part, (side_u, side_z, side_r, side_d), along)
+    return normal, right, np.array([count, weight, chi2])
 
 
 @kernel()
-def _add_row(normal: Float64, right: Float64, part: Float64, side: Float64, along: float) -> None:
+def _add_row(
+    normal: Float64, right: Float64, part: tuple[Four, Four, Four, Four], side: Four, along: float
+) -> None:
     """Spread a row's sums over place, height, roll and diameter to the figures U ... DIAMETER.
 
-    part: (4, 4), its upper half, and side: (4,), the row's sums. along: the row's way from the middle, m.
-    Added to: normal (6, 6), right (6,).
+    part: (4, 4) and side: (4,), the row's sums. along: the row's way from the middle, m. Added to: normal
+    (6, 6), right (6,).
     """
     source = (0, 0, 1, 1, 2, 3)
     times = (1.0, along, 1.0, along, 1.0, 1.0)
     for a in range(6):
         right[a] += times[a] * side[source[a]]
         for b in range(6):
-            p, q = min(source[a], source[b]), max(source[a], source[b])
-            normal[a, b] += times[a] * times[b] * part[p, q]
+            normal[a, b] += times[a] * times[b] * part[source[a]][source[b]]

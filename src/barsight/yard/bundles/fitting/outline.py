@@ -108,15 +108,24 @@ def _trace(axes: Float64, radius: float, sigma: float) -> tuple[Float64, Float64
             there[i], height[i] = 1.0, exact[i]
     for k in range(-reach, reach + 1):
         weight = np.exp(-0.5 * (STEP_M * k / sigma) ** 2) if k != 0 else 1.0
-        for i in range(max(-k, 0), min(size - k, size)):
-            total[i] += weight * height[i + k]
-            share[i] += weight * there[i + k]
+        first, end = max(-k, 0), min(size - k, size)
+        add_weighted(total[first:end], height[first + k : end + k], weight)
+        add_weighted(share[first:end], there[first + k : end + k], weight)
     for i in range(size):
         if there[i] > 0:
             seen[i] = total[i] / share[i]
     for i in range(1, size - 1):
         slope[i] = (seen[i + 1] - seen[i - 1]) / (2 * STEP_M)
     return exact, seen, slope
+
+
+@kernel(inline=True)
+def add_weighted(sums: Float64, values: Float64, weight: float) -> None:
+    """Add weighted values (N,) to sums (N,): pieces of arrays from 0 on, or else the compiler must check for
+    places before the first and adds one at a time.
+    """
+    for i in range(sums.size):
+        sums[i] += weight * values[i]
 
 
 @kernel()
