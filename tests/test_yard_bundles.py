@@ -34,6 +34,7 @@ from barsight.yard.bundles.section.seen_section import (
     is_no_hexagon,
     seen_section,
 )
+from barsight.yard.lifting.load import Load
 from barsight.yard.magnet.holding import min_diameter_m
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.weight import bundle_mass
@@ -422,7 +423,7 @@ def test_what_shows_behind_a_steep_flank_may_be_a_bundles_own_lower_bars(
     assert (last, is_seen, is_free) == (5, seen, behind == -np.inf)
 
 
-@pytest.mark.parametrize(("deep_m", "seen"), [(0.09, False), (0.13, True)])
+@pytest.mark.parametrize(("deep_m", "seen"), [(0.09, False), (0.12, False), (0.14, True)])
 def test_a_gully_parts_two_bundles_of_thick_bars_if_no_bar_one_layer_down_leaves_it(
     deep_m: float, seen: bool
 ) -> None:
@@ -444,17 +445,30 @@ def test_a_gully_parts_two_bundles_of_thick_bars_if_no_bar_one_layer_down_leaves
     assert section is not None and section.sides_seen == seen
 
 
+def test_a_single_bar_may_roll_whatever_is_listed() -> None:
+    heights = draw([Laid(0.3, 0.0, 0.13, 0.5, 0.2, 1)])
+    for listed_mm, least_m in (((), 0.02), ((150.0, 200.0), 0.15), ((20.0, 60.0, 120.0, 160.0, 200.0), 0.02)):
+        (bundle,) = find_bundles(heights, replace(SETTINGS, catalogue_mm=listed_mm))
+        assert bundle.bars is None and min_diameter_m(bundle) == pytest.approx(least_m, rel=0.05)
+        assert Load.of((bundle,)).rolls
+
+
 @pytest.mark.parametrize(
     ("told_mm", "sigma_mm", "listed_mm", "mean_mm", "least_mm"),
     [
         (110.0, 66.0, (), 110.0, 11.0),
-        (110.0, 66.0, (100.0, 120.0), 110.0, 93.0),
-        (110.0, 66.0, (20.0, 110.0), 85.0, 18.0),
+        (110.0, 66.0, (100.0, 120.0), 110.0, 100.0),
+        (110.0, 66.0, (20.0, 110.0), 85.0, 20.0),
+        (110.0, 66.0, (20.0, 80.0, 90.0, 100.0, 110.0, 120.0, 130.0), 100.0, 20.0),
+        (110.0, 40.0, (20.0, 50.0, 110.0), 93.0, 50.0),
         (84.0, 5.0, (40.0, 90.0), 90.0, 88.0),
         (90.0, 5.0, (40.0,), 90.0, 81.0),
     ],
-    ids=["no list", "thick bars alone", "thin bars too", "one of them", "none of them"],
-)
+    ids=[
+        "no list", "thick bars alone", "thin bars too", "many thick bars", "thin bars that it can't be",
+        "one of them", "none of them",
+    ],
+)  # fmt: skip
 def test_a_catalogue_narrows_the_diameters_that_it_leaves(
     told_mm: float, sigma_mm: float, listed_mm: tuple[float, ...], mean_mm: float, least_mm: float
 ) -> None:

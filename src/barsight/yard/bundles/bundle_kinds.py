@@ -9,6 +9,7 @@ import numpy as np
 from barsight.core.arrays import Float64, Int64
 from barsight.yard.bundles.fitting.outline_fit import DIAMETER, Fit
 from barsight.yard.bundles.pack_edges import DOUBTFUL
+from barsight.yard.lift_settings import UPPER
 from barsight.yard.types import Bundle, Doubt, DoubtKind
 
 _ALIKE_LOG = 0.08
@@ -91,8 +92,9 @@ def common_diameter(fit: Fit, others: list[Fit]) -> tuple[float, float] | None:
 
 
 def listed_diameter(bundle: Bundle, catalogue_mm: tuple[float, ...]) -> Bundle:
-    """Replace a diameter that isn't counted by the mean and deviation of the listed ones c, as likely as it
-    tells: w = exp(-(c - d)^2 / 2 sigma^2). A bundle of none of them is doubtful.
+    """Replace a diameter d that isn't counted by the mean of the listed ones c, weighed by
+    exp(-(c - d)^2 / 2 sigma^2). Its lower bound is the thinnest one over that of d, however many thick ones
+    are listed. A bundle of none of them is doubtful.
     """
     diameter, sigma = bundle.bar_diameter_m, bundle.sigma.bar_diameter_m
     if not catalogue_mm or bundle.bars is not None or not sigma > 0:
@@ -106,7 +108,7 @@ def listed_diameter(bundle: Bundle, catalogue_mm: tuple[float, ...]) -> Bundle:
             reasons=(*bundle.reasons, Doubt(DoubtKind.OTHER, said)),
         )  # fmt: skip
     likely = np.exp(-0.5 * away**2)
-    likely /= likely.sum()
-    mean = float(likely @ listed)
-    spread = float(np.hypot(np.sqrt(likely @ (listed - mean) ** 2), _ROLLED_RATIO * mean))
+    mean = float(likely @ listed / likely.sum())
+    thin = min(listed[away >= -UPPER], default=listed[np.abs(away).argmin()])
+    spread = max((mean - float(thin)) / UPPER, _ROLLED_RATIO * mean)
     return replace(bundle, bar_diameter_m=mean, sigma=replace(bundle.sigma, bar_diameter_m=spread))

@@ -69,6 +69,9 @@ def _joined(whole: Bundle, piece: Bundle) -> Bundle | None:
         lateral_m=float(np.hypot(whole.sigma.lateral_m, aside)),
         width_m=float(np.hypot(whole.sigma.width_m, piece.width_m - whole.width_m)),
         top_z_m=float(np.hypot(whole.sigma.top_z_m, piece.top_z_m - whole.top_z_m)),
+        bar_diameter_m=float(
+            np.hypot(whole.sigma.bar_diameter_m, piece.bar_diameter_m - whole.bar_diameter_m)
+        ),
         along_m=middle,
         length_m=length,
     )

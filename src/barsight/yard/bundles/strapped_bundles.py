@@ -14,7 +14,7 @@ from barsight.yard.bundles.reading import Reading
 from barsight.yard.bundles.section.bar_pitch import SAME_DIAMETER_RATIO
 from barsight.yard.bundles.section.pack_sides import PackSide
 from barsight.yard.bundles.section.packs import Pack, contradicts
-from barsight.yard.bundles.section.seen_section import SeenSection, over_floor, section_of_pack
+from barsight.yard.bundles.section.seen_section import BULGE_RATIO, SeenSection, over_floor, section_of_pack
 from barsight.yard.types import Bundle, BundleSigma, Doubt, DoubtKind
 
 _LINES_SIGMA_RATIO = 0.6
@@ -32,8 +32,6 @@ _CREST_M = 0.006
 _HIDDEN_RATIO = 0.5
 """Of the width in sight: one standard deviation of what a neighbour hides of a pack. In the pile that was
 looked at, as much as what was in sight was hidden at most."""
-_BULGE_RATIO = 0.4
-"""Of what wasn't seen behind a flank: one standard deviation of how far bars bulge there."""
 _STRAPPED = 0.95
 """Confidence in a bundle whose straps and flanks were seen."""
 _PIECE_M, _PIECE_HIGHER_M, _PIECE_BEYOND_M, _PIECE_SKEW = 0.02, 0.012, 0.1, 0.05
@@ -94,7 +92,8 @@ def _as_pack(
     """Replace place, width, top and section of a fitted outline by those of the pack that straps hold."""
     fit = reading.found.fit
     top_z = float(bundle.centre_m[2]) + pack.top_m + _CREST_M
-    width_sigma = _pack_sigma(reading)
+    bulge_m = _bulge(pack)
+    width_sigma = math.hypot(_pack_sigma(reading), bulge_m)
     section, section_sigma = section_of_pack(pack.width_m, width_sigma, over_floor(top_z, floor_m))
     aside = pack.middle_m * np.array([np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad), 0.0])
     if abs(bundle.yaw_rad - reading.found.grid.heading_rad + np.arctan(fit.values[SLOPE_U])) > 1.0:
@@ -117,7 +116,7 @@ def _as_pack(
         reasons=(*kept, Doubt(DoubtKind.OTHER, said)),
         sigma=replace(
             bundle.sigma,
-            lateral_m=float(np.hypot(bundle.sigma.lateral_m, _PACK_MIDDLE_M)),
+            lateral_m=math.hypot(bundle.sigma.lateral_m, _PACK_MIDDLE_M, bulge_m / 2),
             yaw_rad=irregular.yaw_rad,
             width_m=width_sigma,
             top_z_m=float(np.hypot(bundle.sigma.top_z_m, _PACK_TOP_M)),
@@ -179,19 +178,20 @@ def _partly_seen(bundle: Bundle, irregular: BundleSigma, pack: Pack) -> Bundle:
 
 def _confirmed(bundle: Bundle, pack: Pack, floor_m: float | None, pack_sigma_m: float) -> Bundle:
     """Keep a fitted outline that ends where the pack does. Its width is the mean of both by their sigmas;
-    they are as sure as they agree.
+    they are as sure as they agree. Neither knows how far bars bulge out of sight.
     """
+    bulge_m = _bulge(pack)
     diameter, spread = bundle.bar_diameter_m, bundle.sigma.bar_diameter_m
     if abs(pack.diameter_m - diameter) > SAME_DIAMETER_RATIO * diameter:
         diameter, spread = pack.diameter_m, _LINES_SIGMA_RATIO * pack.diameter_m
     own, packs = bundle.sigma.width_m**-2, pack_sigma_m**-2
     width = (own * bundle.width_m + packs * pack.width_m) / (own + packs)
-    width_sigma = float(np.hypot((own + packs) ** -0.5, (bundle.width_m - pack.width_m) / 2))
+    width_sigma = math.hypot((own + packs) ** -0.5, (bundle.width_m - pack.width_m) / 2, bulge_m)
     section, section_sigma = section_of_pack(width, width_sigma, over_floor(bundle.top_z_m, floor_m))
     sigma = replace(
         bundle.sigma,
         bar_diameter_m=spread,
-        lateral_m=float(np.hypot(bundle.sigma.lateral_m, pack.middle_m)),
+        lateral_m=math.hypot(bundle.sigma.lateral_m, pack.middle_m, bulge_m / 2),
         width_m=width_sigma,
         section_m2=section_sigma,
     )
@@ -199,10 +199,13 @@ def _confirmed(bundle: Bundle, pack: Pack, floor_m: float | None, pack_sigma_m: 
 
 
 def _pack_sigma(reading: Reading) -> float:
-    """Compute the standard deviation of a pack's width."""
-    assert reading.pack is not None
-    hidden = (_BULGE_RATIO * hidden_m for hidden_m in reading.pack.hidden_m)
-    return math.hypot(_PACK_WIDTH_M, _PACK_WIDTH_SIGMAS * reading.found.fit.sigma_m, *hidden)
+    """Compute the standard deviation of the width of a pack in sight."""
+    return math.hypot(_PACK_WIDTH_M, _PACK_WIDTH_SIGMAS * reading.found.fit.sigma_m)
+
+
+def _bulge(pack: Pack) -> float:
+    """Compute the standard deviation of how much wider a pack is where nothing was seen behind its flanks."""
+    return BULGE_RATIO * math.hypot(*pack.hidden_m)
 
 
 def without_pieces(bundles: list[Bundle], readings: list[Reading]) -> list[Bundle]:

@@ -51,7 +51,7 @@ class Load:
             high = np.maximum(high, axes @ b.centre_m[:2] + half)
         x, y = (low + high) / 2 @ axes
         height = max(b.top_z_m for b in bundles) - min(b.bottom_z_m for b in bundles)
-        rolls = len(bundles) == 1 and bundles[0].width_m < 1.5 * bundles[0].bar_diameter_m
+        rolls = len(bundles) == 1 and _is_one_bar(bundles[0])
         size = high - low
         ids = tuple(b.id for b in bundles)
         off = axes @ (load_centre(bundles) - (x, y))
@@ -59,6 +59,11 @@ class Load:
             ids, float(x), float(y), yaw, float(size[0]), float(size[1]), height, rolls, float(off[0]),
             float(off[1]),
         )  # fmt: skip
+
+
+def _is_one_bar(bundle: Bundle) -> bool:
+    """Check whether a bundle may be a single bar: one shows, or it is hardly wider than one."""
+    return bundle.visible_bars == 1 or bundle.width_m < 1.5 * bundle.bar_diameter_m
 
 
 def reaches_area(

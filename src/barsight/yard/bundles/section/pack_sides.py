@@ -16,7 +16,7 @@ _FLANK_RATIO, _FLANK_DEPTH_M, _FLANK_M = 0.6, 0.15, 0.15
 """Depth of a flank under the top, of the straps' width and at least; how far from them it is looked for."""
 _WIDEST_RATIO, _WIDEST_M = 0.6, 0.1
 """Depth under the top, of the straps' width and at least, under which no pack is wider."""
-_LEDGE_SLOPE = 0.5
+_LEDGE_SLOPE = 1.0
 """A bar low at the side shows as a ledge: two steps in a row that fall by less than this slope."""
 _PARTING_M, _PARTING_RATIO = 0.06, 0.3
 """Least depth of a gully that parts two packs, whatever their straps, and of the straps' width; it is as deep
@@ -101,6 +101,14 @@ def find_side(
     if steep or not (higher or is_overhung(before, beside)):
         return last, PackSide.SEEN
     return last, PackSide.OPEN if rise > width_m else PackSide.COVERED
+
+
+def hidden_places(outwards: Float64, last: int) -> int:
+    """Count the places out of sight behind a flank that ends at `last`, or as high a little further out."""
+    behind = outwards[last + 1 :]
+    level = np.append(np.abs(behind - outwards[last]) <= _RISES_M, False)
+    first = int(np.argmin(level))
+    return int(np.argmin(np.append(np.isnan(behind[first:]), False)))
 
 
 def flank_depth(top: float, width_m: float) -> float:

@@ -11,7 +11,7 @@ from barsight.core.arrays import Float64
 from barsight.yard.bundles.fitting.outline_fit import DIAMETER, Fit
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.section.bar_pitch import SAME_DIAMETER_RATIO, bar_diameter
-from barsight.yard.bundles.section.pack_sides import PackSide, find_side, flank_depth
+from barsight.yard.bundles.section.pack_sides import PackSide, find_side, flank_depth, hidden_places
 from barsight.yard.bundles.section.seen_section import agreeing_rows, mean_section
 from barsight.yard.bundles.section.strap_lines import FLOOR_M
 from barsight.yard.bundles.section.straps import MIN_ROWS, REACH_M, StrapSpan, strap_spans
@@ -110,7 +110,8 @@ def find_pack(
     level_m: (N,) mean heights over the axis at beside_m: NaN unknown, -inf floor. thick_m: upper bound of the
     bars' diameter, NaN where it isn't known. A flank is seen where the surface falls to the floor, or far
     under the top, where a gully is deeper than one pack's bars leave, or where a neighbour begins that is no
-    higher and whose straps lie elsewhere. What may be a bar of the same bundle leaves it open.
+    higher and whose straps lie elsewhere. What may be a bar of the same bundle leaves it open, as does a
+    neighbour most of whose straps are in line, but one that stands higher: it may lie over the flank.
     """
     own = spans[number]
     inside = np.flatnonzero((beside_m >= own.low_m) & (beside_m <= own.high_m) & np.isfinite(level_m))
@@ -131,21 +132,17 @@ def find_pack(
             begin = max(round((abs(near - float(beside_m[at])) - cell / 2) / cell), 0)
             break
         others.append(float(near) if begin is not None and shared is False else step * np.inf)
-        last, side = find_side(
-            level_m[at::step], level_m[at::-step], begin, shared, top, own.width_m, cell, thick_m
-        )
+        around = level_m[at::step], level_m[at::-step]
+        last, side = find_side(*around, begin, None if shared else shared, top, own.width_m, cell, thick_m)
+        if shared and side is PackSide.SEEN:
+            last, side = find_side(*around, begin, True, top, own.width_m, cell, thick_m)
         ends.append(float(beside_m[at]) + step * cell * (last + 0.5))
         sides.append(side if is_one else PackSide.OPEN)
-        hidden.append(cell * _unseen_places(level_m[at::step][last + 1 :]))
+        hidden.append(cell * hidden_places(around[0], last))
     return Pack(
         ends[0], ends[1], own, (others[0], others[1]), top, (sides[0], sides[1]), math.nan,
         (hidden[0], hidden[1]),
     )  # fmt: skip
-
-
-def _unseen_places(level: Float64) -> int:
-    """Count the places before the first that was seen."""
-    return int(np.argmin(np.append(np.isnan(level), False)))
 
 
 def _lies_below(span: StrapSpan, beside_m: Float64, level_m: Float64, deep_m: float) -> bool:
@@ -176,7 +173,7 @@ def _dip(level: Float64) -> float:
 
 def _shared(lower: StrapSpan, upper: StrapSpan) -> bool | None:
     """Check whether most straps of either lie in line with the other's where they meet, as those of one
-    bundle do; False where none does. None where no more than half do.
+    bundle do; False where none does, None where no more than half do.
     """
     apart = np.abs(np.subtract.outer([rows[1] for rows in lower.rows_m], [rows[0] for rows in upper.rows_m]))
     nearest = apart.min(axis=1 if len(lower.rows_m) <= len(upper.rows_m) else 0)

@@ -44,10 +44,10 @@ _MIN_PIECE_RATIO, _MAX_PIECE_RATIO = 0.7, 1.5
 """Of the outline's width: what is seen narrower, or (by _WIDER_M besides) wider, is not its section."""
 _ALIKE_LOG = 0.35
 """Neighbours whose widths differ by a larger factor's logarithm may be pieces of one irregular pack."""
-_PARTED_RATIO, _PARTED_BARS, _PARTED_DIAMETER_M = 0.3, 1.4, 0.04
+_PARTED_RATIO, _PARTED_BARS, _PARTED_DIAMETER_M = 0.3, 1.5, 0.04
 """Two bundles lie side by side where the surface sinks so far, of the outline's width and in bars, between
 them and their bars are this thick; else they may be pieces of one pack: a bar one layer down beside the
-highest shows a gully 0.87 + 0.5 bars under its top."""
+highest shows a gully 0.87 + 0.5 bars under its top, and a diameter is told with a sigma of 6 %."""
 MAX_HEIGHT_RATIO, _MAX_FILL_RATIO = 1.25, 0.79
 """Greatest height of a bundle over its width, and share of steel in the box round it."""
 _HEIGHT_RATIO_PRIOR = NormalDist(0.92, 0.14)
@@ -58,6 +58,8 @@ _FILL_RATIO, _BAR_FILL_RATIO = (0.65, 0.045), (0.70, 0.055)
 bar: it is one, or a round pack of thin ones."""
 _MAX_DEVIATIONS = 4.0
 """From this many deviations of the prior on, a floor cuts nothing off; below as many it cuts off no more."""
+BULGE_RATIO = 0.4
+"""Of what wasn't seen behind a flank: one standard deviation of how far bars bulge there."""
 _SEEN_WIDTH_SIGMA_M, _OUTLINE_RATIO = 0.012, 0.5
 """Of the width between the sides that a map shows, and of what it differs from the outline's."""
 
@@ -66,13 +68,15 @@ _SEEN_WIDTH_SIGMA_M, _OUTLINE_RATIO = 0.012, 0.5
 class SeenSection:
     """Seen section of a bundle. width_m: from side to side. misfit_m: root mean square of the mean section
     over the outline of a full hexagon. sides_seen: both sides fall to the floor, or sink deep before a bundle
-    of about its width begins. sides_free: both fall to the floor.
+    of about its width begins. sides_free: both fall to the floor. hidden_m: how far nothing was seen behind
+    the low and the high side.
     """
 
     width_m: float
     misfit_m: float
     sides_seen: bool
     sides_free: bool
+    hidden_m: tuple[float, float] = (0.0, 0.0)
 
 
 def seen_section(one: FittedOutline, others: list[FittedOutline], smoothing_m: float) -> SeenSection | None:
@@ -109,6 +113,10 @@ def seen_section(one: FittedOutline, others: list[FittedOutline], smoothing_m: f
         misfit_m=float(np.sqrt(np.mean(misfit**2))) if misfit.size else np.inf,
         sides_seen=all(seen for _, seen, _ in ends),
         sides_free=all(free for _, _, free in ends),
+        hidden_m=(
+            grid.cell_m * _unseen_places(level[: ends[0][0]][::-1]),
+            grid.cell_m * _unseen_places(level[ends[1][0] + 1 :]),
+        ),
     )
 
 
@@ -148,7 +156,8 @@ def estimate_section(
     if not _MIN_PIECE_RATIO * fit.width_m < seen.width_m < _MAX_PIECE_RATIO * fit.width_m + _WIDER_M:
         return np.nan, np.nan
     fill = _FILL_RATIO if fit.rings else _BAR_FILL_RATIO
-    sigma_m = math.hypot(_SEEN_WIDTH_SIGMA_M, _OUTLINE_RATIO * (seen.width_m - fit.width_m))
+    off_m = _OUTLINE_RATIO * (seen.width_m - fit.width_m)
+    sigma_m = math.hypot(_SEEN_WIDTH_SIGMA_M, off_m, BULGE_RATIO * math.hypot(*seen.hidden_m))
     return section_of_pack(seen.width_m, sigma_m, over_floor(top_m, floor_m), fill)
 
 
@@ -209,6 +218,11 @@ def mean_section(grid: AlignedMap, fit: Fit, rows: Int64, half: int) -> tuple[Fl
     with np.errstate(invalid="ignore"):
         level[enough] = nan_medians(heights[:, enough])
     return beside, level
+
+
+def _unseen_places(level: Float64) -> int:
+    """Count the places before the first that was seen."""
+    return int(np.argmin(np.append(np.isnan(level), False)))
 
 
 def _is_neighbour(one: FittedOutline, beside_m: Float64, others: list[FittedOutline]) -> Bool:
