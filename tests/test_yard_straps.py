@@ -13,17 +13,18 @@ from barsight.core.types import HeightSource
 from barsight.simulation.worlds.packing import packed
 from barsight.simulation.worlds.settling import BarPack, settle
 from barsight.yard.bundles.detection import find_bundles
-from barsight.yard.bundles.fitting.outline_fit import AGREES, Fit, ShadeProfile
+from barsight.yard.bundles.fitting.outline_fit import AGREES, Fit, FittedOutline, ShadeProfile
 from barsight.yard.bundles.fitting.rotated_map import align_map
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.pack_edges import hold_off
+from barsight.yard.bundles.reading import Reading
 from barsight.yard.bundles.section.bar_pitch import dark_lines
 from barsight.yard.bundles.section.pack_sides import PackSide, _parting, _widest
 from barsight.yard.bundles.section.packs import Pack, contradicts, find_pack, strapped_pack
 from barsight.yard.bundles.section.seen_section import SeenSection, section_of_pack
 from barsight.yard.bundles.section.strap_lines import _best_stretches, row_gains, split_columns
 from barsight.yard.bundles.section.straps import StrapSpan, _merged, longest_runs
-from barsight.yard.bundles.strapped_bundles import _confirmed, _covered, _may_go_on
+from barsight.yard.bundles.strapped_bundles import _as_pack, _covered, _may_go_on
 from barsight.yard.types import DoubtKind, HeightMap
 from lift_yards import laid, record
 
@@ -114,9 +115,14 @@ def test_what_is_out_of_sight_behind_a_flank_makes_the_width_unsure(hidden_m: fl
     pack = pack_beside(level, ROWS, 0.35)
     assert pack.sides_seen and pack.high_m == pytest.approx(0.1, abs=1.1 * CELL)
     assert pack.hidden_m == pytest.approx((0.0, hidden_m))
-    bundle = record(laid(0.0))
-    in_sight = replace(pack, hidden_m=(0.0, 0.0))
-    sure, unsure = (_confirmed(bundle, one, 0.0, 0.02) for one in (in_sight, pack))
+    state, gain = np.zeros(1, np.uint8), np.zeros(1, np.float32)
+    fit = Fit(1, 0.0, np.zeros(6), np.zeros((6, 6)), 0, 0, state, gain, 0.0, 0.0)
+    grid = align_map(drawn([], np.random.default_rng(0)), 0.0, 0.05)
+    reading, bundle = Reading(FittedOutline(grid, fit), 0.0, None, 0.0, None), record(laid(0.0))
+    sure, unsure = (
+        _as_pack(bundle, bundle.sigma, reading, one, 0.0)
+        for one in (replace(pack, hidden_m=(0.0, 0.0)), pack)
+    )
     assert unsure.sigma.width_m == pytest.approx(np.hypot(sure.sigma.width_m, 0.4 * hidden_m))
     assert unsure.sigma.lateral_m == pytest.approx(np.hypot(sure.sigma.lateral_m, 0.2 * hidden_m))
     assert (unsure.sigma.section_m2 > sure.sigma.section_m2) == (hidden_m > 0)

@@ -82,7 +82,7 @@ def _held(
         shown = reading.found.shades is not None
         if shown or abs(pack.middle_m) < _SAME_MIDDLE_M:
             own = replace(bundle, sigma=irregular)
-            return _covered(_confirmed(own, pack, floor_m, _pack_sigma(reading)), pack)
+            return _covered(_confirmed(own, pack, floor_m, _pack_sigma(reading, pack)), pack)
     return _covered(_as_pack(bundle, irregular, reading, pack, floor_m), pack)
 
 
@@ -92,8 +92,7 @@ def _as_pack(
     """Replace place, width, top and section of a fitted outline by those of the pack that straps hold."""
     fit = reading.found.fit
     top_z = float(bundle.centre_m[2]) + pack.top_m + _CREST_M
-    bulge_m = _bulge(pack)
-    width_sigma = math.hypot(_pack_sigma(reading), bulge_m)
+    width_sigma = _pack_sigma(reading, pack)
     section, section_sigma = section_of_pack(pack.width_m, width_sigma, over_floor(top_z, floor_m))
     aside = pack.middle_m * np.array([np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad), 0.0])
     if abs(bundle.yaw_rad - reading.found.grid.heading_rad + np.arctan(fit.values[SLOPE_U])) > 1.0:
@@ -116,7 +115,7 @@ def _as_pack(
         reasons=(*kept, Doubt(DoubtKind.OTHER, said)),
         sigma=replace(
             bundle.sigma,
-            lateral_m=math.hypot(bundle.sigma.lateral_m, _PACK_MIDDLE_M, bulge_m / 2),
+            lateral_m=math.hypot(bundle.sigma.lateral_m, _PACK_MIDDLE_M, _bulge(pack) / 2),
             yaw_rad=irregular.yaw_rad,
             width_m=width_sigma,
             top_z_m=float(np.hypot(bundle.sigma.top_z_m, _PACK_TOP_M)),
@@ -178,29 +177,28 @@ def _partly_seen(bundle: Bundle, irregular: BundleSigma, pack: Pack) -> Bundle:
 
 def _confirmed(bundle: Bundle, pack: Pack, floor_m: float | None, pack_sigma_m: float) -> Bundle:
     """Keep a fitted outline that ends where the pack does. Its width is the mean of both by their sigmas;
-    they are as sure as they agree. Neither knows how far bars bulge out of sight.
+    they are as sure as they agree. Where the pack's flanks are out of sight, the outline tells more.
     """
-    bulge_m = _bulge(pack)
     diameter, spread = bundle.bar_diameter_m, bundle.sigma.bar_diameter_m
     if abs(pack.diameter_m - diameter) > SAME_DIAMETER_RATIO * diameter:
         diameter, spread = pack.diameter_m, _LINES_SIGMA_RATIO * pack.diameter_m
     own, packs = bundle.sigma.width_m**-2, pack_sigma_m**-2
     width = (own * bundle.width_m + packs * pack.width_m) / (own + packs)
-    width_sigma = math.hypot((own + packs) ** -0.5, (bundle.width_m - pack.width_m) / 2, bulge_m)
+    width_sigma = math.hypot((own + packs) ** -0.5, (bundle.width_m - pack.width_m) / 2)
     section, section_sigma = section_of_pack(width, width_sigma, over_floor(bundle.top_z_m, floor_m))
     sigma = replace(
         bundle.sigma,
         bar_diameter_m=spread,
-        lateral_m=math.hypot(bundle.sigma.lateral_m, pack.middle_m, bulge_m / 2),
+        lateral_m=math.hypot(bundle.sigma.lateral_m, pack.middle_m),
         width_m=width_sigma,
         section_m2=section_sigma,
     )
     return replace(bundle, width_m=width, section_m2=section, bar_diameter_m=diameter, sigma=sigma)
 
 
-def _pack_sigma(reading: Reading) -> float:
-    """Compute the standard deviation of the width of a pack in sight."""
-    return math.hypot(_PACK_WIDTH_M, _PACK_WIDTH_SIGMAS * reading.found.fit.sigma_m)
+def _pack_sigma(reading: Reading, pack: Pack) -> float:
+    """Compute the standard deviation of a pack's width."""
+    return math.hypot(_PACK_WIDTH_M, _PACK_WIDTH_SIGMAS * reading.found.fit.sigma_m, _bulge(pack))
 
 
 def _bulge(pack: Pack) -> float:
