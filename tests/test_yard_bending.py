@@ -245,7 +245,7 @@ def test_tags_calibrate_a_girder_that_bends_and_measure_straightens_it(tmp_path:
     frame = read_yard_file(tmp_path / "yard.yaml")
     assert frame.bend is not None
     off = (frame.bend.values - (0.012, 0.0005, 0)) / np.maximum(frame.bend.sigma, 1e-9)
-    assert np.abs(off[:2]).max() < 3 and frame.bend.sigma[0] < 0.012, "an ordinary crane: 0.02"
+    assert np.abs(off[:2]).max() < 3 and frame.bend.sigma[0] < 0.016, "an ordinary crane: 0.02"
     rows = json.loads((tmp_path / "yard.json").read_text())["table"]
     for row in (row for row in rows if row["kind"] == "check"):
         length = np.linalg.norm(row["off_mm"])
