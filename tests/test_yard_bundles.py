@@ -445,6 +445,25 @@ def test_a_gully_parts_two_bundles_of_thick_bars_if_no_bar_one_layer_down_leaves
     assert section is not None and section.sides_seen == seen
 
 
+def test_what_is_out_of_sight_beside_a_section_makes_it_unsure() -> None:
+    """Four places behind the low side and seven behind the high one are out of sight, then floor."""
+    u = 0.01 * np.arange(-30, 31)
+    level = np.where(np.abs(u) < 0.085, 0.5 - 4 * u**2, 0.0)
+    sights = []
+    for hidden in (np.zeros(61, bool), ((u < -0.085) & (u > -0.125)) | ((u > 0.085) & (u < 0.155))):
+        z = np.tile(np.where(hidden, np.nan, level).astype(np.float32), (40, 1))
+        grid = AlignedMap(0.0, float(u[0]), 0.0, 0.01, z, np.full_like(z, 0.003), 0.05)
+        values = np.array([0.0, 0.0, 0.42, 0.0, 0.0, 0.17 / bundle_width(1, 1.0)])
+        state, gain = np.full(40, AGREES, np.uint8), np.ones(40, np.float32)
+        fit = Fit(1, 0.2, values, np.zeros((6, 6)), 0, 39, state, gain, 0.0, 0.0)
+        seen = seen_section(FittedOutline(grid, fit), [], 0.01)
+        assert seen is not None and seen.sides_seen
+        sights.append((seen.hidden_m, estimate_section(seen, fit, 0.5, 0.0)))
+    (none_m, (section, sigma)), (hidden_m, (same, wider)) = sights
+    assert none_m == (0.0, 0.0) and hidden_m == pytest.approx((0.04, 0.07))
+    assert same == pytest.approx(section, rel=0.01) and wider > 1.2 * sigma
+
+
 def test_a_single_bar_may_roll_whatever_is_listed() -> None:
     heights = draw([Laid(0.3, 0.0, 0.13, 0.5, 0.2, 1)])
     for listed_mm, least_m in (((), 0.02), ((150.0, 200.0), 0.15), ((20.0, 60.0, 120.0, 160.0, 200.0), 0.02)):
@@ -462,11 +481,13 @@ def test_a_single_bar_may_roll_whatever_is_listed() -> None:
         (110.0, 66.0, (20.0, 80.0, 90.0, 100.0, 110.0, 120.0, 130.0), 100.0, 20.0),
         (110.0, 40.0, (20.0, 50.0, 110.0), 93.0, 50.0),
         (84.0, 5.0, (40.0, 90.0), 90.0, 88.0),
+        (100.0, 6.0, (85.0, 117.0), 94.3, 85.0),
+        (100.0, 6.0, (88.0, 111.4), 100.8, 88.0),
         (90.0, 5.0, (40.0,), 90.0, 81.0),
     ],
     ids=[
         "no list", "thick bars alone", "thin bars too", "many thick bars", "thin bars that it can't be",
-        "one of them", "none of them",
+        "one of them", "a thin one is the likeliest", "a thin one is nearly as likely", "none of them",
     ],
 )  # fmt: skip
 def test_a_catalogue_narrows_the_diameters_that_it_leaves(

@@ -93,8 +93,8 @@ def common_diameter(fit: Fit, others: list[Fit]) -> tuple[float, float] | None:
 
 def listed_diameter(bundle: Bundle, catalogue_mm: tuple[float, ...]) -> Bundle:
     """Replace a diameter d that isn't counted by the mean of the listed ones c, weighed by
-    exp(-(c - d)^2 / 2 sigma^2). Its lower bound is the thinnest one over that of d, however many thick ones
-    are listed. A bundle of none of them is doubtful.
+    exp(-(c - d)^2 / 2 sigma^2). Its lower bound is the thinnest one whose weight is that of a one-sided 95 %
+    bound or more, of the largest, however many thick ones are listed. A bundle of none is doubtful.
     """
     diameter, sigma = bundle.bar_diameter_m, bundle.sigma.bar_diameter_m
     if not catalogue_mm or bundle.bars is not None or not sigma > 0:
@@ -109,6 +109,6 @@ def listed_diameter(bundle: Bundle, catalogue_mm: tuple[float, ...]) -> Bundle:
         )  # fmt: skip
     likely = np.exp(-0.5 * away**2)
     mean = float(likely @ listed / likely.sum())
-    thin = min(listed[away >= -UPPER], default=listed[np.abs(away).argmin()])
-    spread = max((mean - float(thin)) / UPPER, _ROLLED_RATIO * mean)
+    thinnest = float(listed[likely >= np.exp(-0.5 * UPPER**2) * likely.max()].min())
+    spread = max((mean - thinnest) / UPPER, _ROLLED_RATIO * mean)
     return replace(bundle, bar_diameter_m=mean, sigma=replace(bundle.sigma, bar_diameter_m=spread))
