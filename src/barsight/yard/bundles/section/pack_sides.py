@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from barsight.core.arrays import Float64
 from barsight.yard.bundles.section.bar_pitch import find_minima
-from barsight.yard.bundles.section.seen_section import is_overhung
+from barsight.yard.bundles.section.seen_section import is_overhung, unseen_places
 from barsight.yard.bundles.section.strap_lines import FLOOR_M, GULLY_M
 
 _FLANK_RATIO, _FLANK_DEPTH_M, _FLANK_M = 0.6, 0.15, 0.15
@@ -108,7 +108,7 @@ def hidden_places(outwards: Float64, last: int) -> int:
     behind = outwards[last + 1 :]
     level = np.append(np.abs(behind - outwards[last]) <= _RISES_M, False)
     first = int(np.argmin(level))
-    return int(np.argmin(np.append(np.isnan(behind[first:]), False)))
+    return unseen_places(behind[first:])
 
 
 def flank_depth(top: float, width_m: float) -> float:

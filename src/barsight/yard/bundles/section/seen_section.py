@@ -114,8 +114,8 @@ def seen_section(one: FittedOutline, others: list[FittedOutline], smoothing_m: f
         sides_seen=all(seen for _, seen, _ in ends),
         sides_free=all(free for _, _, free in ends),
         hidden_m=(
-            grid.cell_m * _unseen_places(level[: ends[0][0]][::-1]),
-            grid.cell_m * _unseen_places(level[ends[1][0] + 1 :]),
+            grid.cell_m * unseen_places(level[: ends[0][0]][::-1]),
+            grid.cell_m * unseen_places(level[ends[1][0] + 1 :]),
         ),
     )
 
@@ -220,7 +220,7 @@ def mean_section(grid: AlignedMap, fit: Fit, rows: Int64, half: int) -> tuple[Fl
     return beside, level
 
 
-def _unseen_places(level: Float64) -> int:
+def unseen_places(level: Float64) -> int:
     """Count the places before the first that was seen."""
     return int(np.argmin(np.append(np.isnan(level), False)))
 
