@@ -15,6 +15,7 @@ from typing import Literal
 
 import numpy as np
 
+from barsight.bar_pitch.diameters import measure_diameters
 from barsight.core.errors import InputError
 from barsight.core.json_values import json_digest, json_value
 from barsight.core.memory import peak_memory_mib
@@ -41,6 +42,7 @@ from barsight.reconstruction.map_building import (
     inspect_recording,
 )
 from barsight.recording.base import Recording
+from barsight.yard.bundles.bundle_kinds import listed_diameter
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.inventory.stock_list import (
     ListedBundle,
@@ -250,18 +252,21 @@ def find_lifts(mapped: MappedYard, request: LiftRequest) -> Measurement:
 
 
 def _bundles(mapped: MappedYard, heights: YardMap) -> tuple[Bundle, ...]:
-    """Find the bundles, and read their labels in the newest pass's pictures: what lay there before may be
-    gone.
+    """Find the bundles, and look at their bars and labels in the newest pass's pictures: what lay there
+    before may be gone.
     """
     settings, newest = mapped.settings, mapped.newest
+    poses = {frame.stamp_ns: frame.reference_from_body for frame in newest.way.trajectory.frames}
     with mapped.watch("bundles"):
         bundles = find_bundles(heights, settings.bundles)
         if mapped.joined is not None:
             bundles = mapped.joined.doubted(bundles)
+    with mapped.watch("pitch"):
+        measured = measure_diameters(newest.probed.pairs, poses, heights, bundles)
+        bundles = tuple(listed_diameter(bundle, settings.bundles.catalogue_mm) for bundle in measured)
     if not settings.labels.read:
         return bundles
     with mapped.watch("labels"):
-        poses = {frame.stamp_ns: frame.reference_from_body for frame in newest.way.trajectory.frames}
         return label_bundles(newest.probed.pairs, poses, heights, bundles, settings.labels)
 
 

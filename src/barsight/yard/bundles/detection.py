@@ -11,7 +11,6 @@ from barsight.core.parallel import ordered_map, prefetch
 from barsight.core.types import HeightSource
 from barsight.yard.bundles.bundle_kinds import (
     common_diameter,
-    listed_diameter,
     other_packings,
     reinforce_kinds,
 )
@@ -85,8 +84,7 @@ def find_bundles(yard: YardMap, settings: BundleSettings) -> tuple[Bundle, ...]:
         own = [bundle for bundle in read if part.owns(bundle.centre_m, _SEAM_M)]
         before = [bundle for bundle in found if part.reaches(bundle.centre_m)]
         found += [bundle for bundle in own if not any(same_place(bundle, one) for one in before)]
-    listed = [listed_diameter(bundle, settings.catalogue_mm) for bundle in found]
-    described = describe_bundles(listed, floor, parts)
+    described = describe_bundles(found, floor, parts)
     return tuple(replace(one, map_sigma_z_m=map_sigma(yard, one)) for one in described)
 
 

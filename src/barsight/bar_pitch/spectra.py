@@ -1,0 +1,119 @@
+"""Estimate a diameter from the power spectrum of a bundle's shades.
+
+Bars that lie beside each other are as far apart as they are thick, or nearer where some are hidden in part:
+the spectrum S of the shades, over the frequency f, rises towards f d = 1 and falls steeply beyond. What it is
+in the mean, over f d, was learnt from drawn packs (benchmarks/pitch_spectra.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import ndimage
+
+from barsight.bar_pitch.profiles import STEP_M, PitchProfile
+from barsight.core.arrays import Float64
+
+FREQUENCIES = np.arange(6.0, 141.0)
+"""Frequencies (F,), per m, of a spectrum."""
+DIAMETERS_M = np.exp(np.arange(np.log(0.008), np.log(0.14), 0.02))
+"""Diameters (D,) that are compared."""
+CLASSES = 0.13, 0.26
+"""Diameter over width: bounds of the classes for which a mean spectrum is known. The fewer bars a profile
+crosses, the wider are its peaks."""
+LOG_RATIOS = np.log(0.08) + 0.12 * np.arange(36)
+"""Logarithms (R,) of f d at which mean spectra are known."""
+_HIGH_PASS_M = 0.04
+_FLOOR = 2e-5
+"""Power that is added to a spectrum before its logarithm."""
+_HIGHEST = 0.5
+"""Highest frequency that is used, per pixel."""
+_DEGREES = 4.0
+"""Degrees of freedom of Student's t distribution of a spectrum's logarithm."""
+_APART, _TEMPERATURE = 1.5, 0.5
+"""Frequencies that lie so far apart, over the profile's length, are independent but for errors that all
+frequencies share; those make them worth half."""
+_MAX_WIDTHS = 1.2
+"""No bar is thicker than so many lengths of a profile."""
+
+
+def power_spectrum(profiles: Sequence[PitchProfile]) -> Float64:
+    """Compute the mean power spectrum (F,) of profiles (N,) of one length, h a Hann window:
+    S(f) = |sum_k h_k l_k exp(-2 pi i f u_k)|^2 / sum_k h_k^2.
+    """
+    levels = np.array([profile.levels for profile in profiles])
+    levels = levels - ndimage.gaussian_filter1d(levels, _HIGH_PASS_M / STEP_M, axis=1, mode="nearest")
+    window = np.hanning(levels.shape[1])
+    levels = window * (levels - (levels @ window / window.sum())[:, None])
+    turns = np.exp(-2j * np.pi * FREQUENCIES[:, None] * STEP_M * np.arange(levels.shape[1]))
+    power = np.abs(levels @ turns.T) ** 2 / (window**2).sum()
+    return np.asarray(power.mean(axis=0), np.float64)
+
+
+def log_spectrum(profiles: Sequence[PitchProfile]) -> tuple[Float64, float]:
+    """Compute the logarithm of the power spectrum before pixels of a size p averaged it, S / sinc(f p)^4,
+    NaN beyond what they show; and the profiles' length, m.
+    """
+    pixel_m = float(np.median([profile.pixel_m for profile in profiles]))
+    shown = np.maximum(np.sinc(FREQUENCIES * pixel_m) ** 4, 0.02)
+    level = np.log((power_spectrum(profiles) + _FLOOR) / shown)
+    return np.where(FREQUENCIES < _HIGHEST / pixel_m, level, np.nan), STEP_M * profiles[0].levels.size
+
+
+def log_likelihood(level: Float64, length_m: float) -> Float64:
+    """Compute the logarithm of the likelihood of each diameter (D,): with m and s the mean and the scale of
+    the class of d, log S = a + m(f d) + s(f d) t, where t has Student's distribution and a is free.
+    """
+    known = np.isfinite(level)
+    level, at = level[known], np.log(FREQUENCIES[known])
+    out = np.full(DIAMETERS_M.size, -np.inf)
+    for k, diameter in enumerate(DIAMETERS_M):
+        if diameter > _MAX_WIDTHS * length_m:
+            break
+        mean, scale = mean_spectrum(at + np.log(diameter), diameter / length_m)
+        apart, weight = level - mean, scale**-2
+        apart = (apart - apart @ weight / weight.sum()) / scale
+        terms = (_DEGREES + 1) / 2 * np.log1p(apart**2 / _DEGREES) + np.log(scale)
+        out[k] = -float(terms.sum()) * length_m / _APART * _TEMPERATURE
+    return out
+
+
+def mean_spectrum(log_ratio: Float64, width_ratio: float) -> tuple[Float64, Float64]:
+    """Interpolate the mean and the scale of a spectrum's logarithm at logarithms of f d (N,)."""
+    mean, scale = MEAN_SPECTRA[int(np.searchsorted(CLASSES, width_ratio, side="right"))]
+    return np.interp(log_ratio, LOG_RATIOS, mean), np.interp(log_ratio, LOG_RATIOS, scale)
+
+
+MEAN_SPECTRA = tuple(
+    (np.array(mean), np.array(scale)) for mean, scale in (
+        ((
+            -0.72, -0.72, -0.71, -0.69, -0.79, -0.83, -0.76, -0.64, -0.56, -0.54, -0.52, -0.52,
+            -0.52, -0.52, -0.52, -0.49, -0.44, -0.44, -0.32, -0.03, 0.29, 0.74, 0.66, -0.60,
+            -1.62, -2.12, -2.33, -2.03, -2.48, -2.62, -2.62, -2.62, -2.62, -2.62, -2.62, -2.62,
+        ), (
+            0.55, 0.55, 0.56, 0.57, 0.55, 0.52, 0.48, 0.43, 0.40, 0.44, 0.49, 0.51,
+            0.49, 0.45, 0.47, 0.56, 0.63, 0.68, 0.81, 1.00, 1.12, 1.18, 1.24, 1.10,
+            0.84, 0.78, 0.89, 1.04, 1.17, 1.22, 1.22, 1.22, 1.22, 1.22, 1.22, 1.22,
+        )),
+        ((
+            -1.59, -1.59, -1.59, -1.59, -1.56, -1.44, -1.39, -1.31, -1.26, -1.18, -1.13, -1.04,
+            -0.96, -0.90, -0.85, -0.80, -0.74, -0.64, -0.43, -0.09, 0.30, 0.78, 0.84, 0.10,
+            -1.21, -1.99, -2.10, -1.90, -2.59, -3.10, -2.77, -2.94, -3.55, -3.46, -4.05, -4.22,
+        ), (
+            0.40, 0.40, 0.40, 0.40, 0.40, 0.40, 0.40, 0.42, 0.49, 0.49, 0.44, 0.40,
+            0.40, 0.41, 0.48, 0.56, 0.60, 0.70, 0.89, 1.08, 1.16, 1.08, 1.01, 0.90,
+            0.86, 0.79, 0.85, 1.01, 0.91, 0.82, 0.86, 0.74, 0.60, 0.49, 0.53, 0.58,
+        )),
+        ((
+            -1.81, -1.81, -1.81, -1.81, -1.81, -1.81, -1.81, -1.81, -1.79, -1.71, -1.76, -1.69,
+            -1.74, -1.58, -1.33, -1.11, -0.83, -0.52, -0.21, 0.06, 0.27, 0.39, 0.38, 0.16,
+            -0.34, -1.05, -1.57, -1.74, -2.01, -2.39, -2.35, -2.38, -2.93, -3.19, -3.71, -3.79,
+        ), (
+            0.58, 0.58, 0.58, 0.58, 0.58, 0.58, 0.58, 0.58, 0.57, 0.56, 0.54, 0.51,
+            0.54, 0.52, 0.44, 0.40, 0.40, 0.40, 0.40, 0.40, 0.40, 0.40, 0.40, 0.40,
+            0.55, 0.73, 0.78, 0.77, 0.69, 0.60, 0.54, 0.49, 0.49, 0.46, 0.44, 0.40,
+        )),
+    )
+)  # fmt: skip
+"""Mean (R,) and scale (R,) of a spectrum's logarithm at LOG_RATIOS, by class."""
