@@ -18,7 +18,7 @@ from barsight.yard.bundles.fitting.rotated_map import align_map
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.pack_edges import hold_off
 from barsight.yard.bundles.reading import Reading
-from barsight.yard.bundles.section.bar_pitch import dark_lines
+from barsight.yard.bundles.section.dark_lines import dark_lines
 from barsight.yard.bundles.section.pack_sides import PackSide, _parting, _widest
 from barsight.yard.bundles.section.packs import Pack, contradicts, find_pack, strapped_pack
 from barsight.yard.bundles.section.seen_section import SeenSection, section_of_pack

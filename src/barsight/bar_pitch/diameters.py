@@ -51,16 +51,14 @@ def with_pitch(bundle: Bundle, profiles: Sequence[PitchProfile]) -> Bundle:
     below = np.cumsum(share) / share.sum()
     median, lower = np.exp(np.interp([_MEDIAN, _LOWER], below, np.log(DIAMETERS_M)))
     spread = float(median - lower) / UPPER
-    return replace(
-        bundle, bar_diameter_m=float(median), sigma=replace(bundle.sigma, bar_diameter_m=spread)
-    )
+    return replace(bundle, bar_diameter_m=float(median), sigma=replace(bundle.sigma, bar_diameter_m=spread))
 
 
 def _by_shape(bundle: Bundle) -> Float64:
-    """Compute the prior (D,) of the diameters by the bars' shape in the map; flat where they don't show it."""
+    """Compute the prior (D,) of the diameters by the bars' shape in the map; flat where it doesn't show."""
     diameter, sigma = bundle.bar_diameter_m, bundle.sigma.bar_diameter_m
     flat = np.full(DIAMETERS_M.size, 1 / DIAMETERS_M.size)
     if not 0 < sigma <= _MAX_SHAPE_SIGMA * diameter:
         return flat
     shape = np.exp(-0.5 * (np.log(DIAMETERS_M / diameter) / _SHAPE_SIGMA) ** 2)
-    return _SHAPE_SHARE * shape / max(float(shape.sum()), 1e-12) + (1 - _SHAPE_SHARE) * flat
+    return np.asarray(_SHAPE_SHARE * shape / max(float(shape.sum()), 1e-12) + (1 - _SHAPE_SHARE) * flat)

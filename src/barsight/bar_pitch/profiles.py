@@ -15,15 +15,16 @@ from barsight.core.types import RefusedFrame
 from barsight.labels.placing import PlacedCamera
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.yard.sections import part_about
-from barsight.yard.types import Bundle, YardMap
+from barsight.yard.types import Bundle, HeightMap, YardMap
 
 STEP_M = 0.0015
 """Way between two places across a bundle: a fifth of a pixel."""
-_ROW_M, _WINDOW_M = 0.01, 0.3
+_ROW_M, _WINDOW_M = 0.02, 0.3
 """Way between two rows along a bundle, and length of the rows whose median is a profile: bars turn by less
 than a pixel over it."""
-_MAX_WINDOWS, _VIEWS = 16, 2
-"""Windows along a bundle, and frames that each is sampled in."""
+_MAX_WINDOWS = 5
+"""Windows along a bundle, each sampled in both pictures of one frame: the same bars lie all along it, so that
+sixteen in two frames tell no more."""
 _BESIDE_ENDS_M, _TRIM_M = 0.1, 0.01
 _SMOOTH_M = 0.015
 _DARKEST = 8.0
@@ -62,7 +63,8 @@ def pitch_profiles(
     wanted = dict[int, list[_Window]]()
     for number, bundle in enumerate(bundles):
         for window in _windows(number, bundle, heights):
-            for stamp in _nearest(window, views, (rectifier.camera.width, rectifier.camera.height)):
+            stamp = _nearest(window, views, (rectifier.camera.width, rectifier.camera.height))
+            if stamp is not None:
                 wanted.setdefault(stamp, []).append(window)
     for pair in pairs(wanted) if wanted else ():
         if isinstance(pair, RefusedFrame):
@@ -86,18 +88,19 @@ def _windows(number: int, bundle: Bundle, heights: YardMap) -> Iterator[_Window]
     along = bundle.direction / np.linalg.norm(bundle.direction[:2])
     across = np.array([along[1], -along[0], 0.0])
     beside = np.arange(-half, half, STEP_M)
-    rows = np.arange(-_WINDOW_M / 2, _WINDOW_M / 2, _ROW_M)
+    rows = np.arange(-_WINDOW_M / 2, _WINDOW_M / 2 + _ROW_M / 2, _ROW_M)
     middle = bundle.centre_m + (bundle.top_z_m - bundle.centre_m[2]) * np.array([0.0, 0.0, 1.0])
     edges = np.linspace(-reach, reach, count + 1)
+    corners = middle + edges[[0, 0, -1, -1], None] * along + beside[[0, -1, 0, -1], None] * across
+    part = part_about(heights, corners[:, 0], corners[:, 1])
     for at in (edges[1:] + edges[:-1]) / 2:
         places = middle + (at + rows)[:, None, None] * along + beside[:, None] * across
-        places[..., 2] = _surface(heights, places)
+        places[..., 2] = _surface(part, places)
         yield _Window(number, places)
 
 
-def _surface(heights: YardMap, places: Float64) -> Float64:
+def _surface(part: HeightMap, places: Float64) -> Float64:
     """Take the median height along each line of places (R, N, 3), smoothed across; theirs where unknown."""
-    part = part_about(heights, places[..., 0].ravel(), places[..., 1].ravel())
     rows, columns = part.shape
     row = np.rint((places[..., 1] - part.y0_m) / part.cell_m).astype(np.int64).clip(0, rows - 1)
     column = np.rint((places[..., 0] - part.x0_m) / part.cell_m).astype(np.int64).clip(0, columns - 1)
@@ -108,20 +111,18 @@ def _surface(heights: YardMap, places: Float64) -> Float64:
 
 def _nearest(
     window: _Window, views: Mapping[int, tuple[PlacedCamera, PlacedCamera]], size_px: tuple[int, int]
-) -> list[int]:
-    """Select the frames over a window that see it whole, the nearest first."""
+) -> int | None:
+    """Find the frame nearest over a window whose left picture has it whole; None where none has."""
     middle = window.places_m[len(window.places_m) // 2, window.places_m.shape[1] // 2, :2]
     corners = window.places_m[[0, 0, -1, -1], [0, -1, 0, -1]]
-    away = {stamp: float(np.hypot(*(cameras[0].map_from_rect.translation[:2] - middle)))
-            for stamp, cameras in views.items()}  # fmt: skip
-    chosen = list[int]()
-    for stamp in sorted(away, key=away.__getitem__):
+    stamps = list(views)
+    eyes = np.array([views[stamp][0].map_from_rect.translation[:2] for stamp in stamps]).reshape(-1, 2)
+    for k in np.argsort(np.hypot(*(eyes - middle).T), kind="stable"):
+        stamp = stamps[int(k)]
         at, _ = _project(views[stamp][0], corners)
         if bool(((at >= 1) & (at <= np.array(size_px) - 2)).all()):
-            chosen.append(stamp)
-        if len(chosen) == _VIEWS:
-            break
-    return chosen
+            return stamp
+    return None
 
 
 def _project(camera: PlacedCamera, places_m: Float64) -> tuple[Float64, Float64]:
@@ -139,5 +140,5 @@ def _profile(picture: UInt8, valid: Bool, camera: PlacedCamera, places_m: Float6
     if not inside.all():
         return None
     gray = cv2.remap(picture, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    levels = np.median(np.log(gray.astype(np.float64) + _DARKEST), axis=0)
+    levels = np.log(np.median(gray, axis=0) + _DARKEST)
     return PitchProfile(levels, float(np.median(depth)) / camera.focal_px)

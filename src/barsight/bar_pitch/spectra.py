@@ -8,12 +8,13 @@ in the mean, over f d, was learnt from drawn packs (benchmarks/pitch_spectra.py)
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
 from scipy import ndimage
 
 from barsight.bar_pitch.profiles import STEP_M, PitchProfile
-from barsight.core.arrays import Float64
+from barsight.core.arrays import Float64, frozen
 
 FREQUENCIES = np.arange(6.0, 141.0)
 """Frequencies (F,), per m, of a spectrum."""
@@ -58,7 +59,7 @@ def log_spectrum(profiles: Sequence[PitchProfile]) -> tuple[Float64, float]:
     pixel_m = float(np.median([profile.pixel_m for profile in profiles]))
     shown = np.maximum(np.sinc(FREQUENCIES * pixel_m) ** 4, 0.02)
     level = np.log((power_spectrum(profiles) + _FLOOR) / shown)
-    return np.where(FREQUENCIES < _HIGHEST / pixel_m, level, np.nan), STEP_M * profiles[0].levels.size
+    return np.where(_HIGHEST / pixel_m > FREQUENCIES, level, np.nan), STEP_M * profiles[0].levels.size
 
 
 def log_likelihood(level: Float64, length_m: float) -> Float64:
@@ -66,23 +67,23 @@ def log_likelihood(level: Float64, length_m: float) -> Float64:
     the class of d, log S = a + m(f d) + s(f d) t, where t has Student's distribution and a is free.
     """
     known = np.isfinite(level)
-    level, at = level[known], np.log(FREQUENCIES[known])
-    out = np.full(DIAMETERS_M.size, -np.inf)
-    for k, diameter in enumerate(DIAMETERS_M):
-        if diameter > _MAX_WIDTHS * length_m:
-            break
-        mean, scale = mean_spectrum(at + np.log(diameter), diameter / length_m)
-        apart, weight = level - mean, scale**-2
-        apart = (apart - apart @ weight / weight.sum()) / scale
-        terms = (_DEGREES + 1) / 2 * np.log1p(apart**2 / _DEGREES) + np.log(scale)
-        out[k] = -float(terms.sum()) * length_m / _APART * _TEMPERATURE
-    return out
+    classes = np.searchsorted(CLASSES, DIAMETERS_M / length_m, side="right")
+    mean, scale = (table[classes, np.arange(DIAMETERS_M.size)][:, known] for table in _tables())
+    apart, weight = level[known] - mean, scale**-2
+    apart = (apart - (apart * weight).sum(axis=1, keepdims=True) / weight.sum(axis=1, keepdims=True)) / scale
+    terms = (_DEGREES + 1) / 2 * np.log1p(apart**2 / _DEGREES) + np.log(scale)
+    out = -terms.sum(axis=1) * length_m / _APART * _TEMPERATURE
+    return np.where(_MAX_WIDTHS * length_m < DIAMETERS_M, -np.inf, out)
 
 
-def mean_spectrum(log_ratio: Float64, width_ratio: float) -> tuple[Float64, Float64]:
-    """Interpolate the mean and the scale of a spectrum's logarithm at logarithms of f d (N,)."""
-    mean, scale = MEAN_SPECTRA[int(np.searchsorted(CLASSES, width_ratio, side="right"))]
-    return np.interp(log_ratio, LOG_RATIOS, mean), np.interp(log_ratio, LOG_RATIOS, scale)
+@cache
+def _tables() -> tuple[Float64, Float64]:
+    """Interpolate mean and scale (C, D, F) of a spectrum's logarithm, by class, diameter and frequency."""
+    at = np.log(DIAMETERS_M[:, None] * FREQUENCIES)
+    mean, scale = (
+        np.array([np.interp(at, LOG_RATIOS, one[k]) for one in MEAN_SPECTRA]) for k in range(2)
+    )  # fmt: skip
+    return frozen(mean), frozen(scale)
 
 
 MEAN_SPECTRA = tuple(

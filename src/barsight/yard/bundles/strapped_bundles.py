@@ -11,7 +11,7 @@ from barsight.yard.bundles.doubts import rate_agreement
 from barsight.yard.bundles.fitting.outline_fit import SLOPE_U
 from barsight.yard.bundles.pack_edges import DOUBTFUL, hold_off
 from barsight.yard.bundles.reading import Reading
-from barsight.yard.bundles.section.bar_pitch import SAME_DIAMETER_RATIO
+from barsight.yard.bundles.section.dark_lines import SAME_DIAMETER_RATIO
 from barsight.yard.bundles.section.pack_sides import PackSide
 from barsight.yard.bundles.section.packs import Pack, contradicts
 from barsight.yard.bundles.section.seen_section import BULGE_RATIO, SeenSection, over_floor, section_of_pack

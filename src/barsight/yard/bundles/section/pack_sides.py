@@ -8,7 +8,7 @@ import numpy as np
 from scipy import ndimage
 
 from barsight.core.arrays import Float64
-from barsight.yard.bundles.section.bar_pitch import find_minima
+from barsight.yard.bundles.section.dark_lines import find_minima
 from barsight.yard.bundles.section.seen_section import is_overhung, unseen_places
 from barsight.yard.bundles.section.strap_lines import FLOOR_M, GULLY_M
 

@@ -10,7 +10,7 @@ import numpy as np
 from barsight.core.arrays import Float64
 from barsight.yard.bundles.fitting.outline_fit import DIAMETER, Fit
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
-from barsight.yard.bundles.section.bar_pitch import SAME_DIAMETER_RATIO, bar_diameter
+from barsight.yard.bundles.section.dark_lines import SAME_DIAMETER_RATIO, bar_diameter
 from barsight.yard.bundles.section.pack_sides import PackSide, find_side, flank_depth, hidden_places
 from barsight.yard.bundles.section.seen_section import agreeing_rows, mean_section
 from barsight.yard.bundles.section.strap_lines import FLOOR_M
