@@ -3,7 +3,7 @@
 `python benchmarks/refusal_causes.py KEEP FIRST:LAST [PLACEMENTS]`: KEEP has yards that `barsight bench lifts
 --rendered --full-size --keep KEEP` measured, with the example magnet. Placements over free bundles that the
 independent judge finds fine are assessed on the measured map and on the exact one with noise, with the
-bundles found in each, anew, and with the true ones.
+bundles found in each and with the true ones.
 """
 
 from __future__ import annotations
@@ -32,8 +32,6 @@ from barsight.cli.bench.seeds import parse_seeds
 from barsight.simulation.worlds.recording import cover, is_uncovered
 from barsight.simulation.worlds.surfaces import owners
 from barsight.simulation.worlds.yards import DrawnBundle, DrawnYard
-from barsight.yard.bundles.detection import find_bundles
-from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.layers import list_neighbours
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.assessment import assess_placement
@@ -88,11 +86,10 @@ def fine_placements(world: DrawnYard, magnet: JudgedMagnet, count: int) -> list[
 def four_maps(world: DrawnYard, out: Path) -> dict[str, MappedWorld]:
     """Map a yard as measured and exactly, with found and with true bundles."""
     measured, exact, known = measured_world(out, SETTINGS), noisy_world(world, SETTINGS), true_bundles(world)
-    found = find_bundles(measured.scene.heights, BundleSettings())
     maps = {}
-    for name, one, of_map in (("measured", measured, found), ("exact", exact, exact.scene.table.bundles)):
+    for name, one in (("measured", measured), ("exact", exact)):
         scene = one.scene
-        for told, bundles in (("found", of_map), ("true", known)):
+        for told, bundles in (("found", scene.table.bundles), ("true", known)):
             maps[f"{name} map, {told} bundles"] = map_world(
                 scene.heights, bundles, one.vetoes, scene.travel, scene.now_ns, SETTINGS
             )

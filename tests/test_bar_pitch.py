@@ -1,0 +1,138 @@
+"""Pitch of bars: drawn stripes of bars are measured in pictures that a map's cells would blur."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Iterator
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from barsight.bar_pitch.diameters import measure_diameters, with_pitch
+from barsight.bar_pitch.profiles import STEP_M, PitchProfile, pitch_profiles
+from barsight.core.pose import Pose
+from barsight.core.types import HeightSource, RectifiedCamera, RectifiedPair
+from barsight.labels.placing import PlacedCamera
+from barsight.yard.magnet.holding import min_diameter_m
+from barsight.yard.types import Bundle, HeightMap
+from lift_yards import record
+from yard_maps import Laid
+
+CAMERA = RectifiedCamera(1250.0, 320.0, 255.0, 0.6, 0.0, 640, 512)
+BODY = Pose.identity("body", "rect0")
+TOP_M, ABOVE_M = 0.4, 7.5
+WIDTH_M, LENGTH_M = 0.26, 2.0
+
+
+@dataclass
+class Pictures:
+    """Pairs drawn by a function of the places (N, 2) on the plane at TOP_M, as gray levels."""
+
+    poses: dict[int, Pose]
+    gray: object
+
+    def __post_init__(self) -> None:
+        self.rectifier = SimpleNamespace(camera=CAMERA, body_from_rect0=BODY)
+
+    def __call__(self, wanted: Container[int]) -> Iterator[RectifiedPair]:
+        seen = np.ones((CAMERA.height, CAMERA.width), bool)
+        for stamp, pose in self.poses.items():
+            if stamp in wanted:
+                left, right = (self.draw(one) for one in PlacedCamera.of_pair(pose @ BODY, CAMERA))
+                yield RectifiedPair(stamp, left, right, seen, seen, CAMERA)
+
+    def draw(self, camera: PlacedCamera) -> np.ndarray:
+        """Average three by three rays per pixel."""
+        fine = (np.arange(3 * CAMERA.width) - 1) / 3, (np.arange(3 * CAMERA.height) - 1) / 3
+        x, y = np.meshgrid(*fine)
+        ray = np.stack([x, y, np.full_like(x, camera.focal_px)], -1) - [*camera.principal_px, 0.0]
+        ray = ray @ camera.map_from_rect.rotation.T
+        eye = camera.map_from_rect.translation
+        reach = (TOP_M - eye[2]) / ray[..., 2]
+        gray = self.gray(eye[:2] + reach[..., None] * ray[..., :2])
+        mean = gray.reshape(CAMERA.height, 3, CAMERA.width, 3).mean(axis=(1, 3))
+        noise = np.random.default_rng(3).normal(0, 1.5, mean.shape)
+        return (mean + noise).round().clip(0, 255).astype(np.uint8)
+
+
+def looking_down(x_m: float, stamp: int) -> dict[int, Pose]:
+    tilt = Rotation.from_euler("xyz", [180.0, 2.0, 93.0], degrees=True).as_matrix()
+    return {stamp: Pose("yard", "body", tilt, np.array([x_m, 0.2, TOP_M + ABOVE_M]))}
+
+
+def striped(bundle: Bundle, diameter_m: float) -> object:
+    """Shade bars side by side, with gaps of up to a quarter of one between them, on a dull floor."""
+    rng = np.random.default_rng(round(1e4 * diameter_m))
+    steps = diameter_m * (1 + rng.uniform(0, 0.25, 60) ** 2)
+    axes = np.cumsum(steps) - bundle.width_m / 2
+    across = np.array([np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad)])
+
+    def gray(places: np.ndarray) -> np.ndarray:
+        beside = (places - bundle.centre_m[:2]) @ across
+        near = axes[np.searchsorted((axes[1:] + axes[:-1]) / 2, beside)]
+        rise = np.sqrt(np.clip(1 - ((beside - near) / (diameter_m / 2)) ** 2, 0, 1))
+        return np.where(np.abs(beside) < bundle.width_m / 2, 30 + 150 * rise, 60.0)
+
+    return gray
+
+
+def flat_map() -> HeightMap:
+    shape = 300, 200
+    z = np.full(shape, TOP_M, np.float32)
+    source = np.full(shape, HeightSource.VISION, np.uint8)
+    return HeightMap(-1.0, -1.5, 0.01, z, np.full_like(z, 0.003), np.full_like(z, 6.0), source)
+
+
+def told(diameter_m: float, sigma_m: float, yaw_deg: float = 7.0) -> Bundle:
+    bundle = record(Laid(0.0, 0.0, TOP_M - WIDTH_M / 2, yaw_deg, length_m=LENGTH_M))
+    sigma = replace(bundle.sigma, bar_diameter_m=sigma_m)
+    return replace(
+        bundle, bars=None, bar_diameter_m=diameter_m, width_m=WIDTH_M, top_z_m=TOP_M, sigma=sigma
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("diameter_mm", [16, 20, 25, 32, 40])
+def test_a_diameter_is_measured_finer_than_a_cell(diameter_mm: int) -> None:
+    bundle = told(0.11, 0.066)
+    poses = looking_down(-2.0, 1) | looking_down(0.3, 2)
+    pairs = Pictures(poses, striped(bundle, diameter_mm / 1e3))
+    (measured,) = measure_diameters(pairs, poses, flat_map(), (bundle,))
+    assert 1e3 * measured.bar_diameter_m == pytest.approx(diameter_mm, rel=0.15)
+    assert 0.4 * diameter_mm < 1e3 * min_diameter_m(measured) < 1.02 * diameter_mm
+    assert measured.width_m == bundle.width_m and measured.section_m2 is bundle.section_m2
+
+
+def test_profiles_lie_where_the_bars_do() -> None:
+    """The darkest place of a profile is the only dark line, in both pictures of the nearest frame."""
+    bundle = told(0.11, 0.066, yaw_deg=-20.0)
+    across = np.array([np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad)])
+    poses = looking_down(-0.4, 1) | looking_down(0.2, 2) | looking_down(9.0, 3)
+    pairs = Pictures(
+        poses, lambda at: np.where(np.abs((at - bundle.centre_m[:2]) @ across - 0.04) < 0.004, 20, 150)
+    )
+    (profiles,) = pitch_profiles(pairs, poses, flat_map(), [bundle])
+    assert len(profiles) == 10
+    for profile in profiles:
+        beside = STEP_M * (profile.levels.argmin() - (profile.levels.size - 1) / 2)
+        assert beside == pytest.approx(0.04, abs=0.003)
+        assert profile.pixel_m == pytest.approx(ABOVE_M / CAMERA.focal_px, rel=0.02)
+
+
+def test_a_diameter_by_shape_holds_unless_the_pictures_contradict_it() -> None:
+    poses = looking_down(0.3, 2)
+    for bars_mm, told_mm in ((90, 92.0), (20, 92.0)):
+        bundle = told(told_mm / 1e3, 0.06 * told_mm / 1e3)
+        pairs = Pictures(poses, striped(bundle, bars_mm / 1e3))
+        (measured,) = measure_diameters(pairs, poses, flat_map(), (bundle,))
+        assert 1e3 * measured.bar_diameter_m == pytest.approx(bars_mm, rel=0.15)
+
+
+def test_what_no_picture_shows_is_left_as_told() -> None:
+    bundle = told(0.11, 0.066)
+    counted = replace(bundle, bars=7)
+    for one, poses in ((bundle, looking_down(9.0, 1)), (counted, looking_down(0.0, 1))):
+        (same,) = measure_diameters(Pictures(poses, striped(one, 0.02)), poses, flat_map(), (one,))
+        assert same is one
+    assert with_pitch(bundle, [PitchProfile(np.zeros(30), 0.006)] * 4) is bundle
