@@ -21,7 +21,9 @@ _MAX_SHAPE_SIGMA = 0.1
 """Of a diameter: one that is said to be surer is told by the bars' shape."""
 _MIN_PLACES = 40
 """A profile needs so many places."""
-_LOWER, _MEDIAN = 0.05, 0.5
+_LOWER, _MIN_RATIO = 0.05, 0.02
+"""Quantile of the lower bound, and the least that it lies under the mean, of that: diameters are compared
+2 % apart."""
 
 
 def measure_diameters(
@@ -40,18 +42,19 @@ def measure_diameters(
 
 
 def with_pitch(bundle: Bundle, profiles: Sequence[PitchProfile]) -> Bundle:
-    """Replace a diameter by the median of what the pitch tells, with what the bars' shape tells where they
-    show it. One sigma is what the 5 % quantile lies under it, over 1.645. The same bundle where no picture
-    shows enough of it.
+    """Replace a diameter by the mean of its distribution given the pitch, and the bars' shape where they show
+    it. One sigma is what the 5 % quantile lies under the mean, over 1.645: lifts count with that quantile.
+    The same bundle where no picture shows enough of it.
     """
     if not profiles or profiles[0].levels.size < _MIN_PLACES:
         return bundle
     likely = log_likelihood(*log_spectrum(profiles))
     share = np.exp(likely - likely.max()) * _by_shape(bundle)
-    below = np.cumsum(share) / share.sum()
-    median, lower = np.exp(np.interp([_MEDIAN, _LOWER], below, np.log(DIAMETERS_M)))
-    spread = float(median - lower) / UPPER
-    return replace(bundle, bar_diameter_m=float(median), sigma=replace(bundle.sigma, bar_diameter_m=spread))
+    share /= share.sum()
+    mean = float(share @ DIAMETERS_M)
+    lower = float(np.exp(np.interp(_LOWER, np.cumsum(share), np.log(DIAMETERS_M))))
+    sigma = replace(bundle.sigma, bar_diameter_m=max(mean - lower, _MIN_RATIO * mean) / UPPER)
+    return replace(bundle, bar_diameter_m=mean, sigma=sigma)
 
 
 def _by_shape(bundle: Bundle) -> Float64:

@@ -43,7 +43,7 @@ class PitchProfile:
 
 
 @dataclass(frozen=True, eq=False)
-class _Window:
+class _BundleWindow:
     """Places (R, N, 3) on a bundle. number: the bundle's place in its list."""
 
     number: int
@@ -60,7 +60,7 @@ def pitch_profiles(
     rectifier, out = pairs.rectifier, [list[PitchProfile]() for _ in bundles]
     views = {stamp: PlacedCamera.of_pair(pose @ rectifier.body_from_rect0, rectifier.camera)
              for stamp, pose in poses.items()}  # fmt: skip
-    wanted = dict[int, list[_Window]]()
+    wanted = dict[int, list[_BundleWindow]]()
     for number, bundle in enumerate(bundles):
         for window in _windows(number, bundle, heights):
             stamp = _nearest(window, views, (rectifier.camera.width, rectifier.camera.height))
@@ -79,7 +79,7 @@ def pitch_profiles(
     return out
 
 
-def _windows(number: int, bundle: Bundle, heights: YardMap) -> Iterator[_Window]:
+def _windows(number: int, bundle: Bundle, heights: YardMap) -> Iterator[_BundleWindow]:
     """Divide what is inside a bundle's ends and flanks into windows, at the map's heights."""
     half, reach = bundle.width_m / 2 - _TRIM_M, bundle.length_m / 2 - _BESIDE_ENDS_M
     count = min(int(2 * reach / _WINDOW_M), _MAX_WINDOWS)
@@ -96,7 +96,7 @@ def _windows(number: int, bundle: Bundle, heights: YardMap) -> Iterator[_Window]
     for at in (edges[1:] + edges[:-1]) / 2:
         places = middle + (at + rows)[:, None, None] * along + beside[:, None] * across
         places[..., 2] = _surface(part, places)
-        yield _Window(number, places)
+        yield _BundleWindow(number, places)
 
 
 def _surface(part: HeightMap, places: Float64) -> Float64:
@@ -110,7 +110,7 @@ def _surface(part: HeightMap, places: Float64) -> Float64:
 
 
 def _nearest(
-    window: _Window, views: Mapping[int, tuple[PlacedCamera, PlacedCamera]], size_px: tuple[int, int]
+    window: _BundleWindow, views: Mapping[int, tuple[PlacedCamera, PlacedCamera]], size_px: tuple[int, int]
 ) -> int | None:
     """Find the frame nearest over a window whose left picture has it whole; None where none has."""
     middle = window.places_m[len(window.places_m) // 2, window.places_m.shape[1] // 2, :2]
