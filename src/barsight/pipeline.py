@@ -262,7 +262,9 @@ def _bundles(mapped: MappedYard, heights: YardMap) -> tuple[Bundle, ...]:
         if mapped.joined is not None:
             bundles = mapped.joined.doubted(bundles)
     with mapped.watch("pitch"):
-        measured = measure_diameters(newest.probed.pairs, poses, heights, bundles)
+        used = set(newest.built.stamps_ns)
+        seen = {stamp: pose for stamp, pose in poses.items() if stamp in used}
+        measured = measure_diameters(newest.probed.pairs, seen, heights, bundles)
         bundles = tuple(listed_diameter(bundle, settings.bundles.catalogue_mm) for bundle in measured)
     if not settings.labels.read:
         return bundles

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from barsight.bar_pitch.profiles import PitchProfile, pitch_profiles
-from barsight.bar_pitch.spectra import DIAMETERS_M, log_likelihood, log_spectrum
+from barsight.bar_pitch.profiles import WINDOW_M, PitchProfile, pitch_profiles
+from barsight.bar_pitch.spectra import DIAMETERS_M, log_likelihood, log_spectrum, misfit
 from barsight.core.arrays import Float64
 from barsight.core.pose import Pose
 from barsight.recording.rectified_pairs import RectifiedPairs
@@ -21,9 +21,14 @@ _MAX_SHAPE_SIGMA = 0.1
 """Of a diameter: one that is said to be surer is told by the bars' shape."""
 _MIN_PLACES = 40
 """A profile needs so many places."""
-_LOWER, _MIN_RATIO = 0.05, 0.02
-"""Quantile of the lower bound, and the least that it lies under the mean, of that: diameters are compared
-2 % apart."""
+_LOWER, _MAX_LOWER_RATIO = 0.05, 0.75
+"""Quantile of the lower bound, and the largest that it may be of the mean where the pitch alone tells: packs,
+finishes and light differ from those that were learnt from."""
+_ONE_BAR_WIDTHS, _ONE_BAR_SIGMA, _FINER_RATIO = 1.5, 0.6, 0.5
+"""A bundle that is no wider, in diameters, is told as one bar. Its sigma, of it, where the pitch is finer: a
+bar's gloss and scratches are. Where the 95 % quantile is under half of it, they are many thin bars."""
+_MAX_MISFIT = 1.5
+"""No diameter explains a spectrum with a larger one: 1 % of drawn packs have it."""
 
 
 def measure_diameters(
@@ -44,24 +49,46 @@ def measure_diameters(
 def with_pitch(bundle: Bundle, profiles: Sequence[PitchProfile]) -> Bundle:
     """Replace a diameter by the mean of its distribution given the pitch, and the bars' shape where they show
     it. One sigma is what the 5 % quantile lies under the mean, over 1.645: lifts count with that quantile.
-    The same bundle where no picture shows enough of it.
+
+    What is told as one bar keeps its diameter, unless the pitch is far finer. The same bundle where no
+    picture shows enough of it, its axis is too unsure, or no diameter explains what is seen.
     """
     if not profiles or profiles[0].levels.size < _MIN_PLACES:
         return bundle
-    likely = log_likelihood(*log_spectrum(profiles))
+    if bundle.sigma.yaw_rad * WINDOW_M > profiles[0].pixel_m:
+        return bundle
+    level, length_m = log_spectrum(profiles)
+    likely = log_likelihood(level, length_m)
+    if misfit(level, length_m, int(likely.argmax())) > _MAX_MISFIT:
+        return bundle
     share = np.exp(likely - likely.max()) * _by_shape(bundle)
     share /= share.sum()
     mean = float(share @ DIAMETERS_M)
-    lower = float(np.exp(np.interp(_LOWER, np.cumsum(share), np.log(DIAMETERS_M))))
-    sigma = replace(bundle.sigma, bar_diameter_m=max(mean - lower, _MIN_RATIO * mean) / UPPER)
-    return replace(bundle, bar_diameter_m=mean, sigma=sigma)
+    lower, upper = np.exp(np.interp([_LOWER, 1 - _LOWER], np.cumsum(share), np.log(DIAMETERS_M)))
+    told = bundle.bar_diameter_m
+    one_bar = bundle.visible_bars == 1 or bundle.width_m < _ONE_BAR_WIDTHS * told
+    if one_bar and upper > _FINER_RATIO * told:
+        spread = bundle.sigma.bar_diameter_m
+        return _told(bundle, told, spread if upper >= told else max(spread, _ONE_BAR_SIGMA * told))
+    most = 1 - UPPER * _SHAPE_SIGMA if _shows_shape(bundle) else _MAX_LOWER_RATIO
+    return _told(bundle, mean, (mean - min(float(lower), most * mean)) / UPPER)
+
+
+def _told(bundle: Bundle, diameter_m: float, sigma_m: float) -> Bundle:
+    return replace(
+        bundle, bar_diameter_m=diameter_m, sigma=replace(bundle.sigma, bar_diameter_m=sigma_m)
+    )  # fmt: skip
+
+
+def _shows_shape(bundle: Bundle) -> bool:
+    """Check whether the bars' shape in the map tells their diameter."""
+    return 0 < bundle.sigma.bar_diameter_m <= _MAX_SHAPE_SIGMA * bundle.bar_diameter_m
 
 
 def _by_shape(bundle: Bundle) -> Float64:
     """Compute the prior (D,) of the diameters by the bars' shape in the map; flat where it doesn't show."""
-    diameter, sigma = bundle.bar_diameter_m, bundle.sigma.bar_diameter_m
     flat = np.full(DIAMETERS_M.size, 1 / DIAMETERS_M.size)
-    if not 0 < sigma <= _MAX_SHAPE_SIGMA * diameter:
+    if not _shows_shape(bundle):
         return flat
-    shape = np.exp(-0.5 * (np.log(DIAMETERS_M / diameter) / _SHAPE_SIGMA) ** 2)
+    shape = np.exp(-0.5 * (np.log(DIAMETERS_M / bundle.bar_diameter_m) / _SHAPE_SIGMA) ** 2)
     return np.asarray(_SHAPE_SHARE * shape / max(float(shape.sum()), 1e-12) + (1 - _SHAPE_SHARE) * flat)

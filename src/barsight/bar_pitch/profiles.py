@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
+from barsight.bar_pitch.sharpness import is_sharp
 from barsight.core.arrays import Bool, Float64, UInt8
 from barsight.core.pose import Pose
 from barsight.core.types import RefusedFrame
@@ -19,7 +20,7 @@ from barsight.yard.types import Bundle, HeightMap, YardMap
 
 STEP_M = 0.0015
 """Way between two places across a bundle: a fifth of a pixel."""
-_ROW_M, _WINDOW_M = 0.02, 0.3
+_ROW_M, WINDOW_M = 0.02, 0.3
 """Way between two rows along a bundle, and length of the rows whose median is a profile: bars turn by less
 than a pixel over it."""
 _MAX_WINDOWS = 5
@@ -27,6 +28,13 @@ _MAX_WINDOWS = 5
 sixteen in two frames tell no more."""
 _BESIDE_ENDS_M, _TRIM_M = 0.1, 0.01
 _SMOOTH_M = 0.015
+_AROUND_M = 0.4
+"""The map is read so far beside a bundle's flanks: what stands there may hide it."""
+_OVER_M, _MAX_RISE_M, _HIDDEN_RATIO = 0.05, 1.0, 0.05
+"""A line of sight is followed up to so high, in such steps; the share of a window's middle line that may be
+hidden."""
+_TRIED = 10
+"""Frames, the nearest ones, that are tried for a window."""
 _DARKEST = 8.0
 """Gray levels that are added before the logarithm: noise of dark ones counts less."""
 
@@ -44,84 +52,103 @@ class PitchProfile:
 
 @dataclass(frozen=True, eq=False)
 class _BundleWindow:
-    """Places (R, N, 3) on a bundle. number: the bundle's place in its list."""
+    """Lines across a bundle: places (N, 3) of the middle one and the others' ways from it (R, 3). number: the
+    bundle's place in its list.
+    """
 
     number: int
-    places_m: Float64
+    middle_m: Float64
+    rows_m: Float64
+
+    @property
+    def corners_m(self) -> Float64:
+        """Return its corners (4, 3)."""
+        return (self.middle_m[[0, -1]] + self.rows_m[[0, -1], None]).reshape(4, 3)
 
 
 def pitch_profiles(
     pairs: RectifiedPairs, poses: Mapping[int, Pose], heights: YardMap, bundles: Sequence[Bundle]
 ) -> list[list[PitchProfile]]:
-    """Sample profiles across each bundle in the frames nearest to windows along it.
+    """Sample profiles across each bundle in the frames nearest over windows along it.
 
-    poses: reference_from_body by stamp. A frame that can't be decoded gives none.
+    poses: reference_from_body by stamp. What stands higher may hide a window; it gives no profile then, nor
+    does a frame that can't be decoded or isn't sharp.
     """
     rectifier, out = pairs.rectifier, [list[PitchProfile]() for _ in bundles]
-    views = {stamp: PlacedCamera.of_pair(pose @ rectifier.body_from_rect0, rectifier.camera)
-             for stamp, pose in poses.items()}  # fmt: skip
+    size_px = rectifier.camera.width, rectifier.camera.height
+    stamps = list(poses)
+    views = [PlacedCamera.of_pair(poses[s] @ rectifier.body_from_rect0, rectifier.camera) for s in stamps]
+    eyes = np.array([left.map_from_rect.translation for left, _ in views]).reshape(-1, 3)
     wanted = dict[int, list[_BundleWindow]]()
     for number, bundle in enumerate(bundles):
-        for window in _windows(number, bundle, heights):
-            stamp = _nearest(window, views, (rectifier.camera.width, rectifier.camera.height))
-            if stamp is not None:
-                wanted.setdefault(stamp, []).append(window)
+        for part, window in _windows(number, bundle, heights):
+            k = _nearest(window, views, eyes, size_px)
+            if k is not None and not _is_hidden(part, window.middle_m, eyes[k]):
+                wanted.setdefault(stamps[k], []).append(window)
     for pair in pairs(wanted) if wanted else ():
         if isinstance(pair, RefusedFrame):
             continue
-        pictures = zip((pair.left, pair.right), (pair.left_valid, pair.right_valid), views[pair.stamp_ns],
-                       strict=True)  # fmt: skip
-        for picture, valid, camera in pictures:
-            for window in wanted[pair.stamp_ns]:
-                profile = _profile(picture, valid, camera, window.places_m)
+        cameras = views[stamps.index(pair.stamp_ns)]
+        for picture, valid, camera in zip(
+            (pair.left, pair.right), (pair.left_valid, pair.right_valid), cameras, strict=True
+        ):
+            for window in wanted[pair.stamp_ns] if is_sharp(picture) else ():
+                profile = _profile(picture, valid, camera, window)
                 if profile is not None:
                     out[window.number].append(profile)
     return out
 
 
-def _windows(number: int, bundle: Bundle, heights: YardMap) -> Iterator[_BundleWindow]:
-    """Divide what is inside a bundle's ends and flanks into windows, at the map's heights."""
+def _windows(number: int, bundle: Bundle, heights: YardMap) -> Iterator[tuple[HeightMap, _BundleWindow]]:
+    """Divide what is inside a bundle's ends and flanks into windows, at the heights of the map around."""
     half, reach = bundle.width_m / 2 - _TRIM_M, bundle.length_m / 2 - _BESIDE_ENDS_M
-    count = min(int(2 * reach / _WINDOW_M), _MAX_WINDOWS)
-    if half <= 0 or count < 1:
+    if not (half > STEP_M and 2 * reach >= WINDOW_M and np.isfinite(bundle.centre_m).all()):
         return
+    count = min(int(2 * reach / WINDOW_M), _MAX_WINDOWS)
     along = bundle.direction / np.linalg.norm(bundle.direction[:2])
     across = np.array([along[1], -along[0], 0.0])
     beside = np.arange(-half, half, STEP_M)
-    rows = np.arange(-_WINDOW_M / 2, _WINDOW_M / 2 + _ROW_M / 2, _ROW_M)
+    rows = np.arange(-WINDOW_M / 2, WINDOW_M / 2 + _ROW_M / 2, _ROW_M)[:, None] * along
     middle = bundle.centre_m + (bundle.top_z_m - bundle.centre_m[2]) * np.array([0.0, 0.0, 1.0])
     edges = np.linspace(-reach, reach, count + 1)
-    corners = middle + edges[[0, 0, -1, -1], None] * along + beside[[0, -1, 0, -1], None] * across
+    wide = np.array([-half - _AROUND_M, half + _AROUND_M])
+    corners = middle + np.repeat(edges[[0, -1]], 2)[:, None] * along + np.tile(wide, 2)[:, None] * across
     part = part_about(heights, corners[:, 0], corners[:, 1])
     for at in (edges[1:] + edges[:-1]) / 2:
-        places = middle + (at + rows)[:, None, None] * along + beside[:, None] * across
-        places[..., 2] = _surface(part, places)
-        yield _BundleWindow(number, places)
+        line = middle + at * along + beside[:, None] * across
+        z = _heights(part, rows[:, None] + line)
+        z = np.where(np.isfinite(z), z, line[:, 2])
+        line[:, 2] = ndimage.gaussian_filter1d(np.median(z, axis=0), _SMOOTH_M / STEP_M, mode="nearest")
+        yield part, _BundleWindow(number, line, rows - rows[:, 2:] * np.array([0.0, 0.0, 1.0]))
 
 
-def _surface(part: HeightMap, places: Float64) -> Float64:
-    """Take the median height along each line of places (R, N, 3), smoothed across; theirs where unknown."""
+def _heights(part: HeightMap, places: Float64) -> Float64:
+    """Look up the height at places (..., 2 or 3), the nearest cell's beyond the map."""
     rows, columns = part.shape
     row = np.rint((places[..., 1] - part.y0_m) / part.cell_m).astype(np.int64).clip(0, rows - 1)
     column = np.rint((places[..., 0] - part.x0_m) / part.cell_m).astype(np.int64).clip(0, columns - 1)
-    z = np.where(np.isfinite(part.z_m[row, column]), part.z_m[row, column], places[..., 2])
-    line = ndimage.gaussian_filter1d(np.median(z, axis=0), _SMOOTH_M / STEP_M, mode="nearest")
-    return np.broadcast_to(line, z.shape)
+    return np.asarray(part.z_m[row, column], np.float64)
+
+
+def _is_hidden(part: HeightMap, line_m: Float64, eye_m: Float64) -> bool:
+    """Check whether the map stands in the way from an eye to a line of places (N, 3)."""
+    rise = np.arange(_OVER_M, _MAX_RISE_M, _OVER_M)[:, None]
+    way = (eye_m - line_m)[:, :2] / np.maximum(eye_m[2] - line_m[:, 2:], _OVER_M)
+    there = line_m[:, :2] + rise[..., None] * way
+    blocked = _heights(part, there) > line_m[:, 2] + rise + _OVER_M / 2
+    return bool(blocked.any(axis=0).mean() > _HIDDEN_RATIO)
 
 
 def _nearest(
-    window: _BundleWindow, views: Mapping[int, tuple[PlacedCamera, PlacedCamera]], size_px: tuple[int, int]
-) -> int | None:
+    window: _BundleWindow, views: Sequence[tuple[PlacedCamera, PlacedCamera]], eyes_m: Float64,
+    size_px: tuple[int, int],
+) -> int | None:  # fmt: skip
     """Find the frame nearest over a window whose left picture has it whole; None where none has."""
-    middle = window.places_m[len(window.places_m) // 2, window.places_m.shape[1] // 2, :2]
-    corners = window.places_m[[0, 0, -1, -1], [0, -1, 0, -1]]
-    stamps = list(views)
-    eyes = np.array([views[stamp][0].map_from_rect.translation[:2] for stamp in stamps]).reshape(-1, 2)
-    for k in np.argsort(np.hypot(*(eyes - middle).T), kind="stable"):
-        stamp = stamps[int(k)]
-        at, _ = _project(views[stamp][0], corners)
+    away = np.hypot(*(eyes_m - window.middle_m[len(window.middle_m) // 2])[:, :2].T)
+    for k in np.argsort(away, kind="stable")[:_TRIED].tolist():
+        at, _ = _project(views[k][0], window.corners_m)
         if bool(((at >= 1) & (at <= np.array(size_px) - 2)).all()):
-            return stamp
+            return int(k)
     return None
 
 
@@ -132,9 +159,11 @@ def _project(camera: PlacedCamera, places_m: Float64) -> tuple[Float64, Float64]
     return camera.focal_px * seen[..., :2] / depth[..., None] + np.array(camera.principal_px), depth
 
 
-def _profile(picture: UInt8, valid: Bool, camera: PlacedCamera, places_m: Float64) -> PitchProfile | None:
+def _profile(
+    picture: UInt8, valid: Bool, camera: PlacedCamera, window: _BundleWindow
+) -> PitchProfile | None:  # fmt: skip
     """Sample one picture; None where it doesn't see all of the places."""
-    at, depth = _project(camera, places_m)
+    at, depth = _project(camera, window.rows_m[:, None] + window.middle_m)
     x, y = at[..., 0].astype(np.float32), at[..., 1].astype(np.float32)
     inside = cv2.remap(valid.astype(np.uint8), x, y, cv2.INTER_NEAREST, borderValue=0)
     if not inside.all():
