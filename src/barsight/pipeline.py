@@ -2,7 +2,7 @@
 
 recording -> rectified pair -> disparity -> points --+
 crane or matched features -> trajectory -------------+-> map -> height surface -> contours -> agreement
-                                                              +-> bundles -> lifts
+                                                              +-> bundles -> pitch of their bars -> lifts
 """
 
 from __future__ import annotations
