@@ -172,7 +172,9 @@ def test_one_bar_keeps_its_diameter_unless_the_pitch_is_far_finer() -> None:
 def test_what_no_picture_shows_is_left_as_told() -> None:
     bundle = told(0.11, 0.066)
     counted = replace(bundle, bars=7)
-    for one, poses in ((bundle, looking_down(9.0, 1)), (counted, looking_down(0.0, 1))):
-        (same,) = measure_diameters(Pictures(poses, striped(one, 0.02)), poses, flat_map(), (one,))
+    bars, smooth = striped(bundle, 0.02), lambda places: np.full(places.shape[:-1], 120.0)
+    near, far = looking_down(0.0, 1), looking_down(9.0, 1)
+    for one, gray, poses in ((bundle, bars, far), (counted, bars, near), (bundle, smooth, near)):
+        (same,) = measure_diameters(Pictures(poses, gray), poses, flat_map(), (one,))
         assert same is one
     assert with_pitch(bundle, [PitchProfile(np.zeros(30), 0.006)] * 4) is bundle

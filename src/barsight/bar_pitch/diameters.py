@@ -29,6 +29,8 @@ _ONE_BAR_WIDTHS, _ONE_BAR_SIGMA, _FINER_RATIO = 1.5, 0.6, 0.5
 bar's gloss and scratches are. Where the 95 % quantile is under half of it, they are many thin bars."""
 _MAX_MISFIT = 1.5
 """No diameter explains a spectrum with a larger one: 1 % of drawn packs have it."""
+_MIN_POWER_LOG = -6.0
+"""Logarithm of a spectrum's highest power: drawn packs have -4.3 and more, the noise of a smooth face -8.5."""
 
 
 def measure_diameters(
@@ -59,7 +61,7 @@ def with_pitch(bundle: Bundle, profiles: Sequence[PitchProfile]) -> Bundle:
         return bundle
     level, length_m = log_spectrum(profiles)
     likely = log_likelihood(level, length_m)
-    if misfit(level, length_m, int(likely.argmax())) > _MAX_MISFIT:
+    if np.nanmax(level) < _MIN_POWER_LOG or misfit(level, length_m, int(likely.argmax())) > _MAX_MISFIT:
         return bundle
     share = np.exp(likely - likely.max()) * _by_shape(bundle)
     share /= share.sum()
