@@ -30,7 +30,7 @@ bar's gloss and scratches are. Where the 95 % quantile is under half of it, they
 _MAX_MISFIT = 1.5
 """No diameter explains a spectrum with a larger one: 1 % of drawn packs have it."""
 _MIN_POWER_LOG = -6.0
-"""Logarithm of a spectrum's highest power: drawn packs have -4.3 and more, the noise of a smooth face -8.5."""
+"""Logarithm of the highest power: drawn packs have -4.3 and more, noise on a smooth face -8.5."""
 
 
 def measure_diameters(
