@@ -9,7 +9,7 @@ by the map alone and by the pictures.
 from __future__ import annotations
 
 import sys
-import tempfile
+import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +20,7 @@ from scipy import ndimage
 from barsight.bar_pitch.diameters import with_pitch
 from barsight.bar_pitch.profiles import PitchProfile, pitch_profiles
 from barsight.bar_pitch.spectra import CLASSES, FREQUENCIES, LOG_RATIOS, log_spectrum
-from barsight.benchmarks.lift_judge.magnet import JudgedMagnet, read_magnet
+from barsight.benchmarks.lift_judge.magnet import JudgedMagnet, magnet_of
 from barsight.benchmarks.yard.drawn_worlds import drawn_scene, judged_yard
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.cli.bench.seeds import parse_seeds
@@ -35,6 +35,7 @@ from barsight.simulation.worlds.yards import LOOSE, DrawnBundle
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.magnet.description import example_magnet
+from barsight.yard.magnet.holding import min_diameter_m
 from barsight.yard.types import Bundle
 
 MIN_SCALE, MIN_BUNDLES = 0.4, 15
@@ -128,7 +129,7 @@ def judge(seen: list[SeenBundle]) -> str:
     pictures = [with_pitch(one.bundle, one.profiles) for one in seen]
     for name, bundles in (("map", [one.bundle for one in seen]), ("pictures", pictures)):
         told, sigma = np.array([(b.bar_diameter_m, b.sigma.bar_diameter_m) for b in bundles]).T
-        lower = np.maximum(told - 1.645 * sigma, 0.1 * told)
+        lower = np.array([min_diameter_m(bundle) for bundle in bundles])
         for diameter in (*np.unique(drawn), None):
             own = drawn == diameter if diameter else np.ones(len(drawn), bool)
             ratio = np.quantile(told[own] / drawn[own], [0.05, 0.25, 0.5, 0.75, 0.95])
@@ -144,10 +145,7 @@ def judge(seen: list[SeenBundle]) -> str:
 
 def main(task: str, keep: Path, seeds: range) -> None:
     """Sample the yards, and learn or judge."""
-    with tempfile.NamedTemporaryFile("w", suffix=".toml") as described:
-        described.write(example_magnet())
-        described.flush()
-        magnet = read_magnet(Path(described.name))
+    magnet = magnet_of(tomllib.loads(example_magnet()))
     seen = list[SeenBundle]()
     for seed in seeds:
         if (keep / f"seed_{seed}" / "measured" / "result.json").is_file():

@@ -139,14 +139,14 @@ def test_results_that_don_t_hold_a_version_measure_nothing_by_it(tmp_path: Path)
     (task,) = plan_tasks(archive, others, version, None, no_progress)
     with pytest.raises(ConfigError, match="was planned for other results"):
         run_task(task, settings(tmp_path, others.url))
-    (tmp_path / "work").mkdir()
-    assert arguments(planned, version, tmp_path / "work") == ["--config", f"{tmp_path}/work/config.toml"]
+    (tmp_path / "task").mkdir()
+    assert arguments(planned, version, tmp_path / "task") == ["--config", f"{tmp_path}/task/config.toml"]
     planned.write(f"versions/{version.name}/config.toml", b'preset = "accurate"\n')
     with pytest.raises(ConfigError, match=r"config\.toml: is not as it was planned"):
-        arguments(planned, version, tmp_path / "work")
+        arguments(planned, version, tmp_path / "task")
     planned.write(f"versions/{version.name}/files.json", b'{"../config.toml": "0"}')
     with pytest.raises(ConfigError, match="is torn"):
-        arguments(planned, version, tmp_path / "work")
+        arguments(planned, version, tmp_path / "task")
 
 
 def test_a_recording_that_is_gone_is_parked_by_its_reason(tmp_path: Path) -> None:

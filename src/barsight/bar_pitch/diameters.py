@@ -8,15 +8,18 @@ from dataclasses import replace
 import numpy as np
 
 from barsight.bar_pitch.profiles import WINDOW_M, PitchProfile, pitch_profiles
-from barsight.bar_pitch.spectra import DIAMETERS_M, log_likelihood, log_spectrum, misfit
+from barsight.bar_pitch.spectra import DIAMETERS_M, fit_diameters, log_spectrum
 from barsight.core.arrays import Float64
 from barsight.core.pose import Pose
 from barsight.recording.rectified_pairs import RectifiedPairs
+from barsight.yard.bundles.irregular import DIAMETER_RATIOS
 from barsight.yard.lift_settings import UPPER
+from barsight.yard.lifting.load import is_one_bar
 from barsight.yard.types import Bundle, YardMap
 
-_SHAPE_SIGMA, _SHAPE_SHARE = 0.06, 0.9
-"""Sigma of a diameter's logarithm where bars show their shape in the map, and how often that holds."""
+_SHAPE_SIGMA, _, _ONE_BAR_SIGMA = DIAMETER_RATIOS
+_SHAPE_SHARE = 0.9
+"""How often a diameter by the bars' shape in the map is right within its sigma."""
 _MAX_SHAPE_SIGMA = 0.1
 """Of a diameter: one that is said to be surer is told by the bars' shape."""
 _MIN_PLACES = 40
@@ -24,9 +27,9 @@ _MIN_PLACES = 40
 _LOWER, _MAX_LOWER_RATIO = 0.05, 0.75
 """Quantile of the lower bound, and the largest that it may be of the mean where the pitch alone tells: packs,
 finishes and light differ from those that were learnt from."""
-_ONE_BAR_WIDTHS, _ONE_BAR_SIGMA, _FINER_RATIO = 1.5, 0.6, 0.5
-"""A bundle that is no wider, in diameters, is told as one bar. Its sigma, of it, where the pitch is finer: a
-bar's gloss and scratches are. Where the 95 % quantile is under half of it, they are many thin bars."""
+_FINER_RATIO = 0.5
+"""What is told as one bar is unsure where the pitch is finer: a bar's gloss and scratches are. Where the 95 %
+quantile is under half of it, they are many thin bars."""
 _MAX_MISFIT = 1.5
 """No diameter explains a spectrum with a larger one: 1 % of drawn packs have it."""
 _MIN_POWER_LOG = -6.0
@@ -60,16 +63,15 @@ def with_pitch(bundle: Bundle, profiles: Sequence[PitchProfile]) -> Bundle:
     if bundle.sigma.yaw_rad * WINDOW_M > profiles[0].pixel_m:
         return bundle
     level, length_m = log_spectrum(profiles)
-    likely = log_likelihood(level, length_m)
-    if np.nanmax(level) < _MIN_POWER_LOG or misfit(level, length_m, int(likely.argmax())) > _MAX_MISFIT:
+    likely, misfit = fit_diameters(level, length_m)
+    if np.nanmax(level) < _MIN_POWER_LOG or misfit[likely.argmax()] > _MAX_MISFIT:
         return bundle
     share = np.exp(likely - likely.max()) * _by_shape(bundle)
     share /= share.sum()
     mean = float(share @ DIAMETERS_M)
     lower, upper = np.exp(np.interp([_LOWER, 1 - _LOWER], np.cumsum(share), np.log(DIAMETERS_M)))
     told = bundle.bar_diameter_m
-    one_bar = bundle.visible_bars == 1 or bundle.width_m < _ONE_BAR_WIDTHS * told
-    if one_bar and upper > _FINER_RATIO * told:
+    if is_one_bar(bundle) and upper > _FINER_RATIO * told:
         spread = bundle.sigma.bar_diameter_m
         return _told(bundle, told, spread if upper >= told else max(spread, _ONE_BAR_SIGMA * told))
     most = 1 - UPPER * _SHAPE_SIGMA if _shows_shape(bundle) else _MAX_LOWER_RATIO

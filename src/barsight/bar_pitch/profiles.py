@@ -13,7 +13,7 @@ from barsight.bar_pitch.sharpness import is_sharp
 from barsight.core.arrays import Bool, Float64, UInt8
 from barsight.core.pose import Pose
 from barsight.core.types import RefusedFrame
-from barsight.labels.placing import PlacedCamera
+from barsight.labels.placing import PlacedCamera, heights_at
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.yard.sections import part_about
 from barsight.yard.types import Bundle, HeightMap, YardMap
@@ -108,26 +108,19 @@ def _windows(number: int, bundle: Bundle, heights: YardMap) -> Iterator[tuple[He
     along = bundle.direction / np.linalg.norm(bundle.direction[:2])
     across = np.array([along[1], -along[0], 0.0])
     beside = np.arange(-half, half, STEP_M)
-    rows = np.arange(-WINDOW_M / 2, WINDOW_M / 2 + _ROW_M / 2, _ROW_M)[:, None] * along
-    middle = bundle.centre_m + (bundle.top_z_m - bundle.centre_m[2]) * np.array([0.0, 0.0, 1.0])
+    level = np.append(along[:2], 0.0)
+    rows = np.arange(-WINDOW_M / 2, WINDOW_M / 2 + _ROW_M / 2, _ROW_M)[:, None] * level
+    middle = np.append(bundle.centre_m[:2], bundle.top_z_m)
     edges = np.linspace(-reach, reach, count + 1)
     wide = np.array([-half - _AROUND_M, half + _AROUND_M])
     corners = middle + np.repeat(edges[[0, -1]], 2)[:, None] * along + np.tile(wide, 2)[:, None] * across
     part = part_about(heights, corners[:, 0], corners[:, 1])
     for at in (edges[1:] + edges[:-1]) / 2:
         line = middle + at * along + beside[:, None] * across
-        z = _heights(part, rows[:, None] + line)
+        z = heights_at(part, rows[:, None] + line)
         z = np.where(np.isfinite(z), z, line[:, 2])
         line[:, 2] = ndimage.gaussian_filter1d(np.median(z, axis=0), _SMOOTH_M / STEP_M, mode="nearest")
-        yield part, _BundleWindow(number, line, rows - rows[:, 2:] * np.array([0.0, 0.0, 1.0]))
-
-
-def _heights(part: HeightMap, places: Float64) -> Float64:
-    """Look up the height at places (..., 2 or 3), the nearest cell's beyond the map."""
-    rows, columns = part.shape
-    row = np.rint((places[..., 1] - part.y0_m) / part.cell_m).astype(np.int64).clip(0, rows - 1)
-    column = np.rint((places[..., 0] - part.x0_m) / part.cell_m).astype(np.int64).clip(0, columns - 1)
-    return np.asarray(part.z_m[row, column], np.float64)
+        yield part, _BundleWindow(number, line, rows)
 
 
 def _is_hidden(part: HeightMap, line_m: Float64, eye_m: Float64) -> bool:
@@ -135,7 +128,7 @@ def _is_hidden(part: HeightMap, line_m: Float64, eye_m: Float64) -> bool:
     rise = np.arange(_OVER_M, _MAX_RISE_M, _OVER_M)[:, None]
     way = (eye_m - line_m)[:, :2] / np.maximum(eye_m[2] - line_m[:, 2:], _OVER_M)
     there = line_m[:, :2] + rise[..., None] * way
-    blocked = _heights(part, there) > line_m[:, 2] + rise + _OVER_M / 2
+    blocked = heights_at(part, there) > line_m[:, 2] + rise + _OVER_M / 2
     return bool(blocked.any(axis=0).mean() > _HIDDEN_RATIO)
 
 
@@ -146,24 +139,17 @@ def _nearest(
     """Find the frame nearest over a window whose left picture has it whole; None where none has."""
     away = np.hypot(*(eyes_m - window.middle_m[len(window.middle_m) // 2])[:, :2].T)
     for k in np.argsort(away, kind="stable")[:_TRIED].tolist():
-        at, _ = _project(views[k][0], window.corners_m)
+        at, _ = views[k][0].project(window.corners_m)
         if bool(((at >= 1) & (at <= np.array(size_px) - 2)).all()):
             return int(k)
     return None
-
-
-def _project(camera: PlacedCamera, places_m: Float64) -> tuple[Float64, Float64]:
-    """Project places (..., 3) into a rectified picture: px (..., 2) and depth (...) m."""
-    seen = (places_m - camera.map_from_rect.translation) @ camera.map_from_rect.rotation
-    depth = np.maximum(seen[..., 2], 1e-3)
-    return camera.focal_px * seen[..., :2] / depth[..., None] + np.array(camera.principal_px), depth
 
 
 def _profile(
     picture: UInt8, valid: Bool, camera: PlacedCamera, window: _BundleWindow
 ) -> PitchProfile | None:  # fmt: skip
     """Sample one picture; None where it doesn't see all of the places."""
-    at, depth = _project(camera, window.rows_m[:, None] + window.middle_m)
+    at, depth = camera.project(window.rows_m[:, None] + window.middle_m)
     x, y = at[..., 0].astype(np.float32), at[..., 1].astype(np.float32)
     inside = cv2.remap(valid.astype(np.uint8), x, y, cv2.INTER_NEAREST, borderValue=0)
     if not inside.all():

@@ -62,28 +62,19 @@ def log_spectrum(profiles: Sequence[PitchProfile]) -> tuple[Float64, float]:
     return np.where(_HIGHEST / pixel_m > FREQUENCIES, level, np.nan), STEP_M * profiles[0].levels.size
 
 
-def log_likelihood(level: Float64, length_m: float) -> Float64:
+def fit_diameters(level: Float64, length_m: float) -> tuple[Float64, Float64]:
     """Compute the logarithm of the likelihood of each diameter (D,): with m and s the mean and the scale of
-    the class of d, log S = a + m(f d) + s(f d) t, where t has Student's distribution and a is free.
+    the class of d, log S = a + m(f d) + s(f d) t, where t has Student's distribution and a is free. And each
+    one's misfit (D,), the mean of the distribution's negative logarithms: 0.5 is usual.
     """
-    terms, scale = _terms(level, length_m)
-    out = -(terms + np.log(scale)).sum(axis=1) * length_m / _APART * _TEMPERATURE
-    return np.where(_MAX_WIDTHS * length_m < DIAMETERS_M, -np.inf, out)
-
-
-def misfit(level: Float64, length_m: float, number: int) -> float:
-    """Compute the mean of the terms of a diameter's likelihood, by its number: 0.5 is usual."""
-    return float(_terms(level, length_m)[0][number].mean())
-
-
-def _terms(level: Float64, length_m: float) -> tuple[Float64, Float64]:
-    """Compute the negative logarithms of Student's distribution (D, N) at known frequencies; the scales."""
     known = np.isfinite(level)
     classes = np.searchsorted(CLASSES, DIAMETERS_M / length_m, side="right")
     mean, scale = (table[classes, np.arange(DIAMETERS_M.size)][:, known] for table in _tables())
     apart, weight = level[known] - mean, scale**-2
     apart = (apart - (apart * weight).sum(axis=1, keepdims=True) / weight.sum(axis=1, keepdims=True)) / scale
-    return (_DEGREES + 1) / 2 * np.log1p(apart**2 / _DEGREES), scale
+    terms = (_DEGREES + 1) / 2 * np.log1p(apart**2 / _DEGREES)
+    likely = -(terms + np.log(scale)).sum(axis=1) * length_m / _APART * _TEMPERATURE
+    return np.where(_MAX_WIDTHS * length_m < DIAMETERS_M, -np.inf, likely), terms.mean(axis=1)
 
 
 @cache

@@ -136,11 +136,10 @@ def label_patch(
     """Cut a square patch around a place (3,) of the map out of a rectified picture; None where it isn't in
     view or a label is too small there.
     """
-    seen = camera.map_from_rect.inverse().apply(place_m)
-    if seen[2] <= 0:
+    middle, depth = camera.project(place_m)
+    if depth <= 0:
         return None
-    length_px = camera.focal_px * max(size_m) / seen[2]
-    middle = camera.focal_px * seen[:2] / seen[2] + camera.principal_px
+    length_px = camera.focal_px * max(size_m) / depth
     half = AROUND_RATIO * length_px / 2
     height, width = image.shape
     if (

@@ -39,6 +39,13 @@ class PlacedCamera:
         ray = np.array([*(pixel - np.array(self.principal_px)) / self.focal_px, 1.0])
         return self.map_from_rect.translation, self.map_from_rect.rotation @ ray
 
+    def project(self, places_m: Float64) -> tuple[Float64, Float64]:
+        """Project places (..., 3) to pixels (..., 2), NaN behind the camera; depth (...), m."""
+        seen = self.map_from_rect.inverse().apply(places_m.reshape(-1, 3)).reshape(places_m.shape)
+        depth = seen[..., 2]
+        ahead = np.where(depth > 0, depth, np.nan)[..., None]
+        return self.focal_px * seen[..., :2] / ahead + np.array(self.principal_px), depth
+
 
 def pose_at(path: CameraPath, stamp_ns: int) -> Pose | None:
     """Interpolate the body's pose between the poses around a stamp; None beyond `MAX_GAP_S` of them."""
@@ -73,7 +80,7 @@ def first_surface(heights: HeightMap, origin: Float64, direction: Float64) -> Fl
     step = 0.5 * heights.cell_m / max(level, drop)
     depth = np.arange(max(near, 0.0), far + 2 * step, step)
     places = origin + depth[:, None] * direction
-    z = _heights_at(heights, places)
+    z = heights_at(heights, places)
     hit = np.flatnonzero(np.isfinite(z) & (places[:, 2] <= z))
     if not hit.size:
         return None
@@ -81,12 +88,14 @@ def first_surface(heights: HeightMap, origin: Float64, direction: Float64) -> Fl
     return found
 
 
-def _heights_at(heights: HeightMap, places: Float64) -> Float64:
-    """Look up the height (N,) of the cell at each place (N, 3); NaN outside the map and where unknown."""
-    columns = np.round((places[:, 0] - heights.x0_m) / heights.cell_m).astype(np.int64)
-    rows = np.round((places[:, 1] - heights.y0_m) / heights.cell_m).astype(np.int64)
+def heights_at(heights: HeightMap, places: Float64) -> Float64:
+    """Look up the height (...) of the cell at each place (..., 2 or 3); NaN outside the map and where
+    unknown.
+    """
+    columns = np.round((places[..., 0] - heights.x0_m) / heights.cell_m).astype(np.int64)
+    rows = np.round((places[..., 1] - heights.y0_m) / heights.cell_m).astype(np.int64)
     height, width = heights.z_m.shape
     inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-    z = np.full(len(places), np.nan)
+    z = np.full(columns.shape, np.nan)
     z[inside] = heights.z_m[rows[inside], columns[inside]]
     return z

@@ -18,7 +18,7 @@ _TOP_SIGMAS, _YAW_SIGMAS = 0.8, 0.4
 """Of a height's sigma: error of the top, and of the ends' places sideways."""
 _RESOLVED_M = 0.07
 """Bars from this diameter on show their shape in a map."""
-_DIAMETER_RATIOS = 0.06, 0.45, 0.6
+DIAMETER_RATIOS = 0.06, 0.45, 0.6
 """Of a diameter: its error where bars show their shape, where they are thinner, and where another packing
 fits as well or many bars may look like one."""
 
@@ -41,7 +41,7 @@ def widen_sigma(
     section = 0.0 if seen_width_m is None else _SECTION_RATIO * abs(seen_width_m - fit.width_m)
     wide = float(np.linalg.norm([ratio * fit.width_m, sigmas * fit.sigma_m, section]))
     turned = 0.0 if shown else _YAW_SIGMAS * fit.sigma_m / max(length_m, fit.width_m)
-    diameter, (shown_ratio, thin, unsettled) = float(fit.values[DIAMETER]), _DIAMETER_RATIOS
+    diameter, (shown_ratio, thin, unsettled) = float(fit.values[DIAMETER]), DIAMETER_RATIOS
     spread = shown_ratio if diameter >= _RESOLVED_M else thin
     if is_one_of_two or fit.rings == 0:
         spread = unsettled

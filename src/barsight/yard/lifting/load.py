@@ -51,7 +51,7 @@ class Load:
             high = np.maximum(high, axes @ b.centre_m[:2] + half)
         x, y = (low + high) / 2 @ axes
         height = max(b.top_z_m for b in bundles) - min(b.bottom_z_m for b in bundles)
-        rolls = len(bundles) == 1 and _is_one_bar(bundles[0])
+        rolls = len(bundles) == 1 and is_one_bar(bundles[0])
         size = high - low
         ids = tuple(b.id for b in bundles)
         off = axes @ (load_centre(bundles) - (x, y))
@@ -61,7 +61,7 @@ class Load:
         )  # fmt: skip
 
 
-def _is_one_bar(bundle: Bundle) -> bool:
+def is_one_bar(bundle: Bundle) -> bool:
     """Check whether a bundle may be a single bar: one shows, or it is hardly wider than one."""
     return bundle.visible_bars == 1 or bundle.width_m < 1.5 * bundle.bar_diameter_m
 
