@@ -1,4 +1,4 @@
-"""Learn the mean spectra of bundles' shades, `barsight.bar_pitch.spectra.MEAN_SPECTRA`, or judge them.
+"""Learn the mean spectra of bundles' shades, `barsight.bundle_pictures.spectra.MEAN_SPECTRA`, or judge them.
 
 `python benchmarks/pitch_spectra.py learn|judge KEEP FIRST:LAST`: KEEP has yards that `barsight bench lifts
 --rendered --full-size --keep KEEP` measured with the example magnet; their bundles are found anew. `learn`
@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
-from barsight.bar_pitch.diameters import with_pitch
-from barsight.bar_pitch.profiles import PitchProfile, pitch_profiles
-from barsight.bar_pitch.spectra import CLASSES, FREQUENCIES, LOG_RATIOS, log_spectrum
+from barsight.bundle_pictures.diameters import with_pitch
+from barsight.bundle_pictures.profiles import PitchProfile, pitch_profiles
+from barsight.bundle_pictures.spectra import CLASSES, FREQUENCIES, LOG_RATIOS, log_spectrum
 from barsight.benchmarks.lift_judge.magnet import JudgedMagnet, magnet_of
 from barsight.benchmarks.yard.drawn_worlds import drawn_scene, judged_yard
 from barsight.calibration.geometry.rectification import Rectifier

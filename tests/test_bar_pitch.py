@@ -11,8 +11,8 @@ import pytest
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from barsight.bar_pitch.diameters import measure_diameters, with_pitch
-from barsight.bar_pitch.profiles import STEP_M, PitchProfile, pitch_profiles
+from barsight.bundle_pictures.diameters import measure_diameters, with_pitch
+from barsight.bundle_pictures.profiles import STEP_M, PitchProfile, pitch_profiles
 from barsight.core.pose import Pose
 from barsight.core.types import HeightSource, RectifiedCamera, RectifiedPair
 from barsight.labels.placing import PlacedCamera

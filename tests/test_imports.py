@@ -18,7 +18,7 @@ FLOORS = {
     "measurement": 6, "result_folder": 6, "simulation": 6, "board_views": 6, "measure_settings": 6,
     "store": 7, "evaluation": 7, "yard_frame": 7,
     "labels": 8,
-    "reconstruction": 9, "bar_pitch": 9,
+    "reconstruction": 9, "bundle_pictures": 9,
     "report": 10, "pipeline": 10, "benchmarks": 10, "viewer": 10,
     "result": 11, "page": 11, "measure_folder": 11,
     "api": 12, "session": 12, "live": 12, "plant": 12, "paper": 12, "acceptance": 12,

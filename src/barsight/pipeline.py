@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from barsight.bar_pitch.diameters import measure_diameters
+from barsight.bundle_pictures.diameters import measure_diameters
 from barsight.core.errors import InputError
 from barsight.core.json_values import json_digest, json_value
 from barsight.core.memory import peak_memory_mib

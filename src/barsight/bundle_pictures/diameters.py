@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from barsight.bar_pitch.profiles import WINDOW_M, PitchProfile, pitch_profiles
-from barsight.bar_pitch.spectra import DIAMETERS_M, fit_diameters, log_spectrum
+from barsight.bundle_pictures.profiles import WINDOW_M, PitchProfile, pitch_profiles
+from barsight.bundle_pictures.spectra import DIAMETERS_M, fit_diameters, log_spectrum
 from barsight.core.arrays import Float64
 from barsight.core.pose import Pose
 from barsight.recording.rectified_pairs import RectifiedPairs

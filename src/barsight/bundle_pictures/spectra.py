@@ -13,7 +13,7 @@ from functools import cache
 import numpy as np
 from scipy import ndimage
 
-from barsight.bar_pitch.profiles import STEP_M, PitchProfile
+from barsight.bundle_pictures.profiles import STEP_M, PitchProfile
 from barsight.core.arrays import Float64, frozen
 
 FREQUENCIES = np.arange(6.0, 141.0)

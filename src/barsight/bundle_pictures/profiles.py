@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
-from barsight.bar_pitch.sharpness import is_sharp
+from barsight.bundle_pictures.sharpness import is_sharp
 from barsight.core.arrays import Bool, Float64, UInt8
 from barsight.core.pose import Pose
 from barsight.core.types import RefusedFrame
