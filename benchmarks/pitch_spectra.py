@@ -17,11 +17,12 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
-from barsight.bundle_pictures.diameters import with_pitch
-from barsight.bundle_pictures.profiles import PitchProfile, pitch_profiles
-from barsight.bundle_pictures.spectra import CLASSES, FREQUENCIES, LOG_RATIOS, log_spectrum
 from barsight.benchmarks.lift_judge.magnet import JudgedMagnet, magnet_of
 from barsight.benchmarks.yard.drawn_worlds import drawn_scene, judged_yard
+from barsight.bundle_pictures.diameters import with_pitch
+from barsight.bundle_pictures.measuring import pitch_profiles
+from barsight.bundle_pictures.profiles import PitchProfile
+from barsight.bundle_pictures.spectra import CLASSES, FREQUENCIES, LOG_RATIOS, log_spectrum
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.cli.bench.seeds import parse_seeds
 from barsight.core.arrays import Float64

@@ -11,8 +11,9 @@ import pytest
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from barsight.bundle_pictures.diameters import measure_diameters, with_pitch
-from barsight.bundle_pictures.profiles import STEP_M, PitchProfile, pitch_profiles
+from barsight.bundle_pictures.diameters import with_pitch
+from barsight.bundle_pictures.measuring import measure_from_pictures, pitch_profiles
+from barsight.bundle_pictures.profiles import STEP_M, PitchProfile
 from barsight.core.pose import Pose
 from barsight.core.types import HeightSource, RectifiedCamera, RectifiedPair
 from barsight.labels.placing import PlacedCamera
@@ -108,7 +109,7 @@ def test_a_diameter_is_measured_finer_than_a_cell(diameter_mm: int) -> None:
     bundle = told(0.11, 0.066)
     poses = looking_down(-2.0, 1) | looking_down(0.3, 2)
     pairs = Pictures(poses, striped(bundle, diameter_mm / 1e3))
-    (measured,) = measure_diameters(pairs, poses, flat_map(), (bundle,))
+    (measured,) = measure_from_pictures(pairs, poses, flat_map(), (bundle,))
     assert 1e3 * measured.bar_diameter_m == pytest.approx(diameter_mm, rel=0.2)
     assert 0.4 * diameter_mm < 1e3 * min_diameter_m(measured) < 1.02 * diameter_mm
     assert measured.width_m == bundle.width_m and measured.section_m2 is bundle.section_m2
@@ -135,7 +136,7 @@ def test_a_diameter_by_shape_holds_unless_the_pictures_contradict_it() -> None:
     for bars_mm, told_mm in ((90, 92.0), (20, 92.0)):
         bundle = told(told_mm / 1e3, 0.06 * told_mm / 1e3)
         pairs = Pictures(poses, striped(bundle, bars_mm / 1e3))
-        (measured,) = measure_diameters(pairs, poses, flat_map(), (bundle,))
+        (measured,) = measure_from_pictures(pairs, poses, flat_map(), (bundle,))
         assert 1e3 * measured.bar_diameter_m == pytest.approx(bars_mm, rel=0.2)
 
 
@@ -144,7 +145,7 @@ def test_blurred_pictures_tell_nothing(diameter_mm: int) -> None:
     """Blur takes the thin bars' pitch away and would leave what looks like thick ones'."""
     bundle, poses = told(0.11, 0.066), looking_down(0.0, 1)
     pairs = Pictures(poses, striped(bundle, diameter_mm / 1e3), blur_px=1.0)
-    (same,) = measure_diameters(pairs, poses, flat_map(), (bundle,))
+    (same,) = measure_from_pictures(pairs, poses, flat_map(), (bundle,))
     assert same is bundle
 
 
@@ -164,7 +165,7 @@ def test_one_bar_keeps_its_diameter_unless_the_pitch_is_far_finer() -> None:
     single = replace(told(0.2, 0.012), visible_bars=1)
     for bars_mm, kept in ((150, True), (20, False)):
         pairs = Pictures(poses, striped(single, bars_mm / 1e3))
-        (measured,) = measure_diameters(pairs, poses, flat_map(), (single,))
+        (measured,) = measure_from_pictures(pairs, poses, flat_map(), (single,))
         assert (measured.bar_diameter_m == 0.2) == kept
         assert kept or 1e3 * measured.bar_diameter_m == pytest.approx(bars_mm, rel=0.3)
 
@@ -175,6 +176,6 @@ def test_what_no_picture_shows_is_left_as_told() -> None:
     bars, smooth = striped(bundle, 0.02), lambda places: np.full(places.shape[:-1], 120.0)
     near, far = looking_down(0.0, 1), looking_down(9.0, 1)
     for one, gray, poses in ((bundle, bars, far), (counted, bars, near), (bundle, smooth, near)):
-        (same,) = measure_diameters(Pictures(poses, gray), poses, flat_map(), (one,))
+        (same,) = measure_from_pictures(Pictures(poses, gray), poses, flat_map(), (one,))
         assert same is one
     assert with_pitch(bundle, [PitchProfile(np.zeros(30), 0.006)] * 4) is bundle

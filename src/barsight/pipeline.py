@@ -2,7 +2,7 @@
 
 recording -> rectified pair -> disparity -> points --+
 crane or matched features -> trajectory -------------+-> map -> height surface -> contours -> agreement
-                                                              +-> bundles -> pitch of their bars -> lifts
+                                                              +-> bundles -> a closer look -> lifts
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from barsight.bundle_pictures.diameters import measure_diameters
+from barsight.bundle_pictures.measuring import measure_from_pictures
 from barsight.core.errors import InputError
 from barsight.core.json_values import json_digest, json_value
 from barsight.core.memory import peak_memory_mib
@@ -252,8 +252,8 @@ def find_lifts(mapped: MappedYard, request: LiftRequest) -> Measurement:
 
 
 def _bundles(mapped: MappedYard, heights: YardMap) -> tuple[Bundle, ...]:
-    """Find the bundles, and look at their bars and labels in the newest pass's pictures: what lay there
-    before may be gone.
+    """Find the bundles, and look at their bars, straps and labels in the newest pass's pictures: what lay
+    there before may be gone.
     """
     settings, newest = mapped.settings, mapped.newest
     poses = {frame.stamp_ns: frame.reference_from_body for frame in newest.way.trajectory.frames}
@@ -261,10 +261,10 @@ def _bundles(mapped: MappedYard, heights: YardMap) -> tuple[Bundle, ...]:
         bundles = find_bundles(heights, settings.bundles)
         if mapped.joined is not None:
             bundles = mapped.joined.doubted(bundles)
-    with mapped.watch("pitch"):
+    with mapped.watch("pictures"):
         used = set(newest.built.stamps_ns)
         seen = {stamp: pose for stamp, pose in poses.items() if stamp in used}
-        measured = measure_diameters(newest.probed.pairs, seen, heights, bundles)
+        measured = measure_from_pictures(newest.probed.pairs, seen, heights, bundles)
         bundles = tuple(listed_diameter(bundle, settings.bundles.catalogue_mm) for bundle in measured)
     if not settings.labels.read:
         return bundles

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from barsight.bundle_pictures.profiles import WINDOW_M, PitchProfile, pitch_profiles
+from barsight.bundle_pictures.profiles import WINDOW_M, PitchProfile
 from barsight.bundle_pictures.spectra import DIAMETERS_M, fit_diameters, log_spectrum
 from barsight.core.arrays import Float64
-from barsight.core.pose import Pose
-from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.yard.bundles.irregular import DIAMETER_RATIOS
 from barsight.yard.lift_settings import UPPER
 from barsight.yard.lifting.load import is_one_bar
-from barsight.yard.types import Bundle, YardMap
+from barsight.yard.types import Bundle
 
 _SHAPE_SIGMA, _, _ONE_BAR_SIGMA = DIAMETER_RATIOS
 _SHAPE_SHARE = 0.9
@@ -34,21 +32,6 @@ _MAX_MISFIT = 1.5
 """No diameter explains a spectrum with a larger one: 1 % of drawn packs have it."""
 _MIN_POWER_LOG = -6.0
 """Logarithm of the highest power: drawn packs have -4.3 and more, noise on a smooth face -8.5."""
-
-
-def measure_diameters(
-    pairs: RectifiedPairs, poses: Mapping[int, Pose], heights: YardMap, bundles: Sequence[Bundle]
-) -> tuple[Bundle, ...]:
-    """Measure the bars' diameters of bundles whose bars aren't counted; see `with_pitch`.
-
-    poses: reference_from_body by stamp of the frames that may be looked at.
-    """
-    open_ones = [k for k, bundle in enumerate(bundles) if bundle.bars is None]
-    profiles = pitch_profiles(pairs, poses, heights, [bundles[k] for k in open_ones])
-    out = list(bundles)
-    for k, seen in zip(open_ones, profiles, strict=True):
-        out[k] = with_pitch(bundles[k], seen)
-    return tuple(out)
 
 
 def with_pitch(bundle: Bundle, profiles: Sequence[PitchProfile]) -> Bundle:

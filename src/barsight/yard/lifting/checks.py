@@ -29,11 +29,10 @@ UNKNOWN_SIGMA = 0.01
 """How well cells tell the part of a face that was seen."""
 MAX_ASIDE_RATIO = 1 / 3
 """Of a face's width: so far beside its middle the faces may rest where the suspension's stop holds them."""
-MIN_SHOWN_BAR_M = 0.05
-"""A map shows the crests of bars from this diameter on."""
-THIN_CONTACT_RATIO = 0.3
-"""Of what seems to lie on thinner bars, in a packing that isn't settled, so much counts. That is no bound: as
-little as a tenth was seen on drawn yards."""
+SHOWN_BAR_M, MIN_SHOWN_RATIO = 0.08, 0.3
+"""A map shows the crests of bars from this diameter on. Of what seems to lie on thinner ones whose packing
+isn't settled as much less counts as they are thinner, down to the ratio. That is no bound: as little as a
+tenth was seen on drawn yards."""
 SURE_OF_SIGMA = 0.1
 """How well sigmas themselves are known, of them."""
 
@@ -245,8 +244,8 @@ def _shown_ratio(load: tuple[Bundle, ...]) -> float:
     """Return the part of what seems to lie on steel that counts: crests of thin bars don't show, and one
     that lies higher than the others carries the faces alone.
     """
-    hidden = (bundle.bars is None and min_diameter_m(bundle) < MIN_SHOWN_BAR_M for bundle in load)
-    return THIN_CONTACT_RATIO if any(hidden) else 1.0
+    bars_m = [min_diameter_m(bundle) for bundle in load if bundle.bars is None]
+    return float(np.clip(np.min([SHOWN_BAR_M, *bars_m]) / SHOWN_BAR_M, MIN_SHOWN_RATIO, 1.0))
 
 
 def _contact_shares(contact: Contact, near_m: tuple[float, float]) -> Float64:

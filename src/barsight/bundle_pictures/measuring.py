@@ -1,0 +1,64 @@
+"""Measure what pictures show of bundles finer than the map: diameters by the pitch, flanks by the straps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from barsight.bundle_pictures.diameters import with_pitch
+from barsight.bundle_pictures.flanks import MeanSection, with_flanks
+from barsight.bundle_pictures.profiles import PitchProfile, pitch_windows
+from barsight.bundle_pictures.samples import PlacedFrames, sample_windows
+from barsight.bundle_pictures.strap_ends import StrapEnds, find_straps, strap_windows, view_tilt
+from barsight.core.pose import Pose
+from barsight.recording.rectified_pairs import RectifiedPairs
+from barsight.yard.bundles.floor import find_floor
+from barsight.yard.lifting.load import is_one_bar
+from barsight.yard.types import Bundle, YardMap
+
+
+def measure_from_pictures(
+    pairs: RectifiedPairs, poses: Mapping[int, Pose], heights: YardMap, bundles: Sequence[Bundle]
+) -> tuple[Bundle, ...]:
+    """Measure the flanks and the bars' diameters of bundles whose bars aren't counted; see `with_flanks` and
+    `with_pitch`.
+
+    poses: reference_from_body by stamp of the frames that may be looked at.
+    """
+    frames = PlacedFrames.of(pairs.rectifier, poses)
+    numbers = [k for k, bundle in enumerate(bundles) if bundle.bars is None]
+    unsure = [bundles[k] for k in numbers]
+    windows = list(pitch_windows(frames, heights, unsure))
+    first_strap = len(windows)
+    windows += strap_windows(frames, heights, unsure)
+    profiles, straps = [list[PitchProfile]() for _ in unsure], [list[StrapEnds]() for _ in unsure]
+    for place, picture in sample_windows(pairs, frames, windows):
+        _, window = windows[place]
+        if not picture.is_sharp:
+            continue
+        if place >= first_strap:
+            straps[window.number] += find_straps(picture, window, unsure[window.number])
+        else:
+            profiles[window.number].append(PitchProfile.of(picture))
+    tilts = [0.0] * len(unsure)
+    for k, window in windows[first_strap:]:
+        tilts[window.number] = max(tilts[window.number], abs(view_tilt(frames, k, window)))
+    floor, out = find_floor(heights), list(bundles)
+    for k, bundle, seen, ends, tilt in zip(numbers, unsure, profiles, straps, tilts, strict=True):
+        told = with_pitch(bundle, seen)
+        if ends and not is_one_bar(told):
+            told = with_flanks(told, ends, MeanSection.of(bundle, heights), floor, tilt)
+        out[k] = told
+    return tuple(out)
+
+
+def pitch_profiles(
+    pairs: RectifiedPairs, poses: Mapping[int, Pose], heights: YardMap, bundles: Sequence[Bundle]
+) -> list[list[PitchProfile]]:
+    """Sample the profiles across each bundle alone; poses as for `measure_from_pictures`."""
+    frames = PlacedFrames.of(pairs.rectifier, poses)
+    windows = list(pitch_windows(frames, heights, bundles))
+    profiles = [list[PitchProfile]() for _ in bundles]
+    for place, picture in sample_windows(pairs, frames, windows):
+        if picture.is_sharp:
+            profiles[windows[place][1].number].append(PitchProfile.of(picture))
+    return profiles

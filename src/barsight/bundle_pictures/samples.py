@@ -1,0 +1,126 @@
+"""Sample the pictures over bundles, each window in both pictures of the frame nearest over it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from barsight.bundle_pictures.sharpness import is_sharp
+from barsight.calibration.geometry.rectification import Rectifier
+from barsight.core.arrays import Float64, UInt8
+from barsight.core.pose import Pose
+from barsight.core.types import RefusedFrame
+from barsight.labels.placing import PlacedCamera, heights_at
+from barsight.recording.rectified_pairs import RectifiedPairs
+from barsight.yard.types import HeightMap
+
+_OVER_M, _MAX_RISE_M, _HIDDEN_RATIO = 0.05, 1.0, 0.05
+"""A line of sight is followed up to so high, in such steps; the share of a line of places that may be
+hidden."""
+_TRIED = 10
+"""Frames, the nearest ones, that are tried for a window."""
+
+
+@dataclass(frozen=True, eq=False)
+class BundleWindow:
+    """Lines across a bundle: places (N, 3) of the middle one and the others' ways from it (R, 3). number: the
+    bundle's place in its list.
+    """
+
+    number: int
+    middle_m: Float64
+    rows_m: Float64
+
+    @property
+    def corners_m(self) -> Float64:
+        """Return its corners (4, 3)."""
+        return (self.middle_m[[0, -1]] + self.rows_m[[0, -1], None]).reshape(4, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class WindowPicture:
+    """Gray levels (R, N) of a window in one picture. pixel_m: size of its pixels there; is_sharp: whether the
+    picture is.
+    """
+
+    gray: UInt8
+    pixel_m: float
+    is_sharp: bool
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedFrames:
+    """Frames by their stamps, with both cameras and the left one's place (K, 3) in the map."""
+
+    stamps_ns: tuple[int, ...]
+    cameras: tuple[tuple[PlacedCamera, PlacedCamera], ...]
+    eyes_m: Float64
+    size_px: tuple[int, int]
+
+    @classmethod
+    def of(cls, rectifier: Rectifier, poses: Mapping[int, Pose]) -> PlacedFrames:
+        """Place frames by their reference_from_body."""
+        camera = rectifier.camera
+        cameras = tuple(
+            PlacedCamera.of_pair(pose @ rectifier.body_from_rect0, camera) for pose in poses.values()
+        )
+        eyes = np.array([left.map_from_rect.translation for left, _ in cameras]).reshape(-1, 3)
+        return cls(tuple(poses), cameras, eyes, (camera.width, camera.height))
+
+    def nearest(self, window: BundleWindow) -> int | None:
+        """Find the number of the frame nearest over a window whose left picture has it whole; None where none
+        has.
+        """
+        away = np.hypot(*(self.eyes_m - window.middle_m[len(window.middle_m) // 2])[:, :2].T)
+        for k in np.argsort(away, kind="stable")[:_TRIED].tolist():
+            at, _ = self.cameras[k][0].project(window.corners_m)
+            if bool(((at >= 1) & (at <= np.array(self.size_px) - 2)).all()):
+                return int(k)
+        return None
+
+
+def sample_windows(
+    pairs: RectifiedPairs, frames: PlacedFrames, windows: Sequence[tuple[int, BundleWindow]]
+) -> Iterator[tuple[int, WindowPicture]]:
+    """Sample windows in the frames of these numbers; tell each picture by the window's place in the list.
+
+    A picture that doesn't show all of a window gives nothing, nor does a frame that can't be decoded.
+    """
+    wanted = dict[int, list[int]]()
+    for place, (k, _) in enumerate(windows):
+        wanted.setdefault(frames.stamps_ns[k], []).append(place)
+    for pair in pairs(wanted) if wanted else ():
+        if isinstance(pair, RefusedFrame):
+            continue
+        cameras = frames.cameras[frames.stamps_ns.index(pair.stamp_ns)]
+        for picture, valid, camera in zip(
+            (pair.left, pair.right), (pair.left_valid, pair.right_valid), cameras, strict=True
+        ):
+            sharp, seen = is_sharp(picture), valid.astype(np.uint8)
+            for place in wanted[pair.stamp_ns]:
+                sampled = _sample(picture, seen, camera, windows[place][1])
+                if sampled is not None:
+                    yield place, WindowPicture(*sampled, sharp)
+
+
+def _sample(
+    picture: UInt8, seen: UInt8, camera: PlacedCamera, window: BundleWindow
+) -> tuple[UInt8, float] | None:  # fmt: skip
+    at, depth = camera.project(window.rows_m[:, None] + window.middle_m)
+    x, y = at[..., 0].astype(np.float32), at[..., 1].astype(np.float32)
+    if not cv2.remap(seen, x, y, cv2.INTER_NEAREST, borderValue=0).all():
+        return None
+    gray = cv2.remap(picture, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(gray, np.uint8), float(np.median(depth)) / camera.focal_px
+
+
+def is_hidden(part: HeightMap, line_m: Float64, eye_m: Float64) -> bool:
+    """Check whether the map stands in the way from an eye to a line of places (N, 3)."""
+    rise = np.arange(_OVER_M, _MAX_RISE_M, _OVER_M)[:, None]
+    way = (eye_m - line_m)[:, :2] / np.maximum(eye_m[2] - line_m[:, 2:], _OVER_M)
+    there = line_m[:, :2] + rise[..., None] * way
+    blocked = heights_at(part, there) > line_m[:, 2] + rise + _OVER_M / 2
+    return bool(blocked.any(axis=0).mean() > _HIDDEN_RATIO)

@@ -1,0 +1,170 @@
+"""Find where the straps of a bundle end in the pictures: at its flanks, where they turn out of sight.
+
+A strap is a line across the bars, darker or brighter than the steel before and after it. It is followed from
+the middle of the bundle to either side, on the level plane at half its height: there a round bundle is as
+wide as its outline in the picture, whatever the view.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from scipy import ndimage
+
+from barsight.bundle_pictures.samples import BundleWindow, PlacedFrames, WindowPicture, is_hidden
+from barsight.core.arrays import Bool, Float64, UInt8
+from barsight.yard.sections import part_about
+from barsight.yard.types import Bundle, YardMap
+
+STEP_M, _ROW_M = 0.004, 0.008
+"""Way between two places across a bundle, and along it."""
+REACH_M = 0.22
+"""Search reach beyond the flanks of a bundle as the map tells it."""
+_OUTSIDE_M = 0.01
+"""Way from a flank to the line beside it that must be in sight."""
+_OVERHEAD = 0.05
+"""Way aside over height: a line of sight that leads less far aside passes what stands beside a bundle."""
+_WINDOW_M = 3.0
+"""Greatest length of a window: one picture shows it whole."""
+_AROUND_M, _STRAP_ROWS = 0.4, 3
+"""Length along the bars over which the steel's own gray level is taken, and rows that a strap covers."""
+_DARKEST = 8.0
+_SCATTER_LOG, _MIN_SCATTER_LOG, _SCATTER_M = 0.3, 0.03, 0.06
+"""Of the logarithm of gray levels along a bar: the most that counts for its scatter, the least scatter, and
+over how far across it is averaged."""
+_CLIPPED, _STRAP, _SEEN = 6.0, 1.5, 1.2
+"""Contrasts over noise: from where more counts no more; the least mean of a strap's over the middle, and the
+least by which a place of it is seen."""
+_MIDDLE_RATIO, _MIN_MIDDLE_M = 0.3, 0.03
+"""Of the width, to either side, and at least: the middle, where straps are looked for."""
+_SMOOTH_M, _END_RATIO = 0.02, 0.5
+"""A strap ends where its contrast, averaged so far across, is less than this share of the middle's."""
+_GULLY_BARS, _MIN_GULLY_M = 0.45, 0.016
+"""A gully between two bars, of their diameter and at least, doesn't end a strap."""
+APART_M, _DENSE_M = 0.3, 0.45
+"""Straps are no nearer to each other than the first, and on average over a bundle than the second."""
+LINE_M = 0.0015
+"""A strap shows so far beyond the bundle: it is this thick, and blurred."""
+
+
+class StrapEnds(NamedTuple):
+    """Ends of one strap in one picture: m along the bundle from its middle, m beside its axis, NaN where the
+    strap goes on to the window's side. contrast: of its middle over noise. pixel_m: size of the picture's
+    pixels there.
+    """
+
+    along_m: float
+    low_m: float
+    high_m: float
+    contrast: float
+    pixel_m: float
+
+
+def strap_windows(
+    frames: PlacedFrames, heights: YardMap, bundles: Sequence[Bundle]
+) -> Iterator[tuple[int, BundleWindow]]:
+    """List windows along each bundle with the frames nearest over them; none where what stands higher beside
+    it may hide the flank on the camera's side.
+    """
+    for number, bundle in enumerate(bundles):
+        for window in _windows(number, bundle):
+            k = frames.nearest(window)
+            if k is not None and not _hides_flank(frames, k, window, heights):
+                yield k, window
+
+
+def _hides_flank(frames: PlacedFrames, k: int, window: BundleWindow, heights: YardMap) -> bool:
+    """Check whether what stands higher beside a bundle hides its flank from a frame's camera."""
+    tilt = view_tilt(frames, k, window)
+    if abs(tilt) < _OVERHEAD:
+        return False
+    inwards = window.middle_m[-1] - window.middle_m[0]
+    inwards *= -np.sign(tilt) * (REACH_M - _OUTSIDE_M) / np.linalg.norm(inwards)
+    flank = window.middle_m[0 if tilt < 0 else -1] + inwards
+    part = part_about(heights, window.corners_m[:, 0], window.corners_m[:, 1])
+    return is_hidden(part, flank + window.rows_m, frames.eyes_m[k])
+
+
+def view_tilt(frames: PlacedFrames, k: int, window: BundleWindow) -> float:
+    """Compute how far across a bundle a frame's line of sight leads, over its height."""
+    middle = window.middle_m[len(window.middle_m) // 2]
+    across = window.middle_m[-1] - window.middle_m[0]
+    away = frames.eyes_m[k] - middle
+    return float(away @ across / np.linalg.norm(across) / away[2])
+
+
+def _windows(number: int, bundle: Bundle) -> Iterator[BundleWindow]:
+    """Divide a bundle's length into windows that reach beyond its flanks."""
+    if not (np.isfinite(bundle.centre_m).all() and bundle.width_m > 0 and bundle.length_m > 2 * APART_M):
+        return
+    along = bundle.direction / np.linalg.norm(bundle.direction[:2])
+    across = np.array([along[1], -along[0], 0.0])
+    half = bundle.width_m / 2 + REACH_M
+    beside = np.arange(-half, half, STEP_M)
+    middle = np.append(bundle.centre_m[:2], bundle.top_z_m - bundle.width_m / 2)
+    edges = np.linspace(-0.5, 0.5, int(bundle.length_m / _WINDOW_M) + 2) * bundle.length_m
+    for low, high in pairwise(edges.tolist()):
+        rows = np.arange(low, high, _ROW_M)[:, None] * along
+        yield BundleWindow(number, middle + beside[:, None] * across, rows)
+
+
+def find_straps(picture: WindowPicture, window: BundleWindow, bundle: Bundle) -> list[StrapEnds]:
+    """Find the straps in a window of a bundle, and where each ends."""
+    contrast = _contrast(picture.gray)
+    beside = STEP_M * (np.arange(contrast.shape[1]) - (contrast.shape[1] - 1) / 2)
+    middle = np.abs(beside) < max(_MIDDLE_RATIO * bundle.width_m, _MIN_MIDDLE_M)
+    strength = contrast[:, middle].mean(axis=1)
+    bridged = round(max(_MIN_GULLY_M, _GULLY_BARS * np.nan_to_num(bundle.bar_diameter_m)) / STEP_M)
+    found = []
+    for row in _strap_rows(strength):
+        near = contrast[max(row - 2, 0) : row + 3] * np.sign(strength[row])
+        line = ndimage.uniform_filter1d(near, round(_SMOOTH_M / STEP_M), axis=1).max(axis=0)
+        level = float(np.median(line[middle]))
+        seen = line > max(_END_RATIO * level, _SEEN)
+        half = seen.size // 2
+        ends = (_end(part, bridged) for part in (seen[half::-1], seen[half:]))
+        low, high = (np.nan if k is None else STEP_M * (k + 0.5) - LINE_M for k in ends)
+        along = float(np.linalg.norm(window.rows_m[row]) * np.sign(window.rows_m[row] @ bundle.direction))
+        sides = float(beside[half] - low), float(beside[half] + high)
+        found.append(StrapEnds(along, *sides, level, picture.pixel_m))
+    return found
+
+
+def _contrast(gray: UInt8) -> Float64:
+    """Compute how much each place (R, N) differs from the steel before and after it, over a bar's own
+    scatter: the logarithm of gray levels less its mean along the bar, averaged over a strap's rows.
+    """
+    level = np.log(gray + _DARKEST)
+    around = 2 * round(_AROUND_M / _ROW_M / 2) + 1
+    off = level - ndimage.uniform_filter1d(level, around, axis=0, mode="nearest")
+    off = ndimage.uniform_filter1d(off, _STRAP_ROWS, axis=0)
+    scatter = np.sqrt(np.pi / 2) * np.minimum(np.abs(off), _SCATTER_LOG).mean(axis=0)
+    scatter = ndimage.uniform_filter1d(np.maximum(scatter, _MIN_SCATTER_LOG), round(_SCATTER_M / STEP_M))
+    return np.asarray(np.clip(off / scatter, -_CLIPPED, _CLIPPED))
+
+
+def _strap_rows(strength: Float64) -> list[int]:
+    """Choose the rows (R,) with the strongest lines, APART_M from each other."""
+    rows = list[int]()
+    most = max(int(strength.size * _ROW_M / _DENSE_M), 2)
+    for row in np.argsort(-np.abs(strength), kind="stable").tolist():
+        if abs(strength[row]) < _STRAP or len(rows) == most:
+            break
+        if all(abs(row - other) * _ROW_M > APART_M for other in rows):
+            rows.append(row)
+    return rows
+
+
+def _end(seen: Bool, bridged: int) -> int | None:
+    """Follow a strap outwards to the last place that is seen before more than `bridged` aren't; None where it
+    is seen up to the last.
+    """
+    last = 0
+    for k in np.flatnonzero(seen).tolist():
+        if k - last > bridged + 1:
+            return last
+        last = k
+    return last if seen.size - 1 - last > bridged else None
