@@ -70,11 +70,11 @@ class MeanSection:
         mean[known] = nan_medians(z[:, known])
         return cls(beside, mean)
 
-    def ends_at(self, flank_m: float, width_m: float, diameter_m: float) -> bool:
-        """Check whether the surface ends about a flank: it falls far, isn't seen, or rises again behind a gully
-        that is deeper or wider than one between the bundle's bars.
+    def ends_at(self, flank_m: float, side: int, width_m: float, diameter_m: float) -> bool:
+        """Check whether the surface ends about a flank: it falls far, isn't seen, or rises again behind a
+        gully that is deeper or wider than one between the bundle's bars. side: -1 for the low flank, else 1.
         """
-        outwards = self.beside_m * np.sign(flank_m) - abs(flank_m)
+        outwards = side * (self.beside_m - flank_m)
         order = np.argsort(outwards)
         outwards, level = outwards[order], self.level_m[order]
         crest = self.level_m[np.abs(self.beside_m) < _CREST_RATIO * width_m]
@@ -126,8 +126,11 @@ def with_flanks(
         return bundle
     low, high = flanks
     diameter = float(np.nan_to_num(bundle.bar_diameter_m))
-    sides_end = all(section.ends_at(flank, bundle.width_m, diameter) for flank in flanks)
-    if not sides_end or section.is_parted(low, high, diameter):
+    ended = (
+        section.ends_at(flank, side, bundle.width_m, diameter)
+        for flank, side in zip(flanks, (-1, 1), strict=True)
+    )
+    if not all(ended) or section.is_parted(low, high, diameter):
         return bundle
     plane_m = tilt * _PLANE_RATIO * (high - low)
     width, middle = high - low, (low + high) / 2

@@ -1,0 +1,136 @@
+"""Flanks by straps: drawn straps end where they were drawn; what they can't tell stays as told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from barsight.bundle_pictures.flanks import MeanSection, with_flanks
+from barsight.bundle_pictures.measuring import measure_from_pictures
+from barsight.bundle_pictures.strap_ends import StrapEnds
+from barsight.yard.types import Bundle, Doubt, DoubtKind, HeightMap
+from drawn_pictures import TOP_M, Pictures, flat_map, looking_down
+from lift_yards import record
+from yard_maps import Laid
+
+WIDTH_M, LENGTH_M = 0.26, 2.0
+PLACES_M = -0.6, 0.05, 0.7
+"""Where along a bundle its straps lie."""
+
+
+def told(yaw_deg: float, width_m: float = WIDTH_M, aside_m: float = 0.0) -> Bundle:
+    """Describe a bundle that isn't counted, its flanks as unsure as a map may tell them."""
+    bundle = record(Laid(aside_m, 0.0, TOP_M - width_m / 2, yaw_deg, length_m=LENGTH_M))
+    sigma = replace(bundle.sigma, lateral_m=0.04, width_m=0.08, bar_diameter_m=0.01)
+    return replace(
+        bundle, bars=None, bar_diameter_m=0.03, visible_bars=7, width_m=width_m, top_z_m=TOP_M, sigma=sigma,
+        section_m2=np.nan,
+    )  # fmt: skip
+
+
+def strapped(
+    yaw_deg: float, spans_m: Sequence[tuple[float, float]], gray: float = 25.0
+) -> Callable[[np.ndarray], np.ndarray]:
+    """Shade bars along the heading, with straps from and to these places beside the axis."""
+    yaw = np.radians(yaw_deg)
+    across, along = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
+
+    def shade(places: np.ndarray) -> np.ndarray:
+        u, v = places @ across, places @ along
+        level = 110 + 40 * np.abs(np.sin(np.pi * u / 0.03))
+        for at, (low, high) in zip(PLACES_M, spans_m, strict=True):
+            level = np.where((np.abs(v - at) < 0.012) & (u > low) & (u < high), gray, level)
+        return level
+
+    return shade
+
+
+def ridge(yaw_deg: float, low_m: float, high_m: float, beside_z_m: float = 0.0) -> HeightMap:
+    """Map a flat bundle between two flanks, and what is beside it."""
+    heights, yaw = flat_map(), np.radians(yaw_deg)
+    u = np.cos(yaw) * heights.x_m + np.sin(yaw) * heights.y_m[:, None]
+    heights.z_m[(u < low_m) | (u > high_m)] = beside_z_m
+    return heights
+
+
+def measured(bundle: Bundle, gray: Callable[[np.ndarray], np.ndarray], heights: HeightMap) -> Bundle:
+    poses = looking_down(0.03, 1)
+    (one,) = measure_from_pictures(Pictures(poses, gray), poses, heights, (bundle,))
+    return one
+
+
+def middle_m(bundle: Bundle) -> float:
+    """Return how far beside the drawn axis, through the origin, a bundle lies."""
+    across = np.array([np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad)])
+    return float(bundle.centre_m[:2] @ across)
+
+
+@pytest.mark.parametrize("gray", [25.0, 240.0])
+@pytest.mark.parametrize("yaw_deg", [7.0, -15.0])
+def test_flanks_stand_where_straps_end(yaw_deg: float, gray: float) -> None:
+    """The map told a bundle 80 mm too wide and 30 mm aside; its ends move with its middle."""
+    low, high = -0.10, 0.08
+    across = np.array([np.cos(np.radians(yaw_deg)), np.sin(np.radians(yaw_deg)), 0.0])
+    bundle = told(yaw_deg)
+    bundle = replace(bundle, centre_m=bundle.centre_m + 0.02 * across, ends_m=bundle.ends_m + 0.02 * across)
+    one = measured(bundle, strapped(yaw_deg, [(low, high)] * 3, gray), ridge(yaw_deg, low, high))
+    assert one.width_m == pytest.approx(high - low, abs=0.008)
+    assert middle_m(one) == pytest.approx((low + high) / 2, abs=0.006)
+    np.testing.assert_allclose(one.ends_m.mean(axis=0), one.centre_m, atol=1e-9)
+    assert 0.008 < one.sigma.width_m < 0.012 and one.sigma.lateral_m < 0.01
+    assert 0.4 < one.section_m2 / (high - low) ** 2 < 0.8 and one.sigma.section_m2 > 0
+
+
+def test_what_straps_cannot_tell_stays() -> None:
+    """Straps that end differently, a surface that goes on where they end, a gully that parts them."""
+    low, high = -0.10, 0.08
+    same = [(low, high)] * 3
+    differ = [(-0.10, 0.02), (-0.04, 0.08), (-0.07, 0.05)]
+    parted = ridge(7.0, low, high)
+    u = np.cos(np.radians(7.0)) * parted.x_m + np.sin(np.radians(7.0)) * parted.y_m[:, None]
+    parted.z_m[np.abs(u) < 0.025] = 0.2
+    for spans, heights in (
+        (differ, ridge(7.0, low, high)), (same, flat_map()), (same, ridge(7.0, low, 0.13)), (same, parted),
+    ):  # fmt: skip
+        bundle = told(7.0)
+        one = measured(bundle, strapped(7.0, spans), heights)
+        assert one.width_m == bundle.width_m and one.sigma.width_m == bundle.sigma.width_m
+        assert one.centre_m is bundle.centre_m and np.isnan(one.section_m2)
+
+
+def ends(low_m: float, high_m: float, count: int = 3) -> list[StrapEnds]:
+    return [StrapEnds(0.6 * k, low_m, high_m, 5.0, 0.006) for k in range(count)]
+
+
+def section(low_m: float, high_m: float) -> MeanSection:
+    beside = np.arange(-0.35, 0.35, 0.01)
+    return MeanSection(beside, np.where((beside >= low_m) & (beside <= high_m), TOP_M, 0.0))
+
+
+def test_straps_far_off_the_map_make_a_bundle_unsure() -> None:
+    bundle = told(7.0)
+    sure = replace(bundle, sigma=replace(bundle.sigma, lateral_m=0.005, width_m=0.01), section_m2=0.03)
+    one = with_flanks(sure, ends(-0.08, 0.03), section(-0.08, 0.03), 0.0, 0.0)
+    assert one.width_m == sure.width_m and one.centre_m is sure.centre_m
+    assert one.sigma.lateral_m > 0.025 and one.sigma.width_m > 0.1 and np.isnan(one.section_m2)
+
+
+def test_a_covered_bundle_is_left_and_a_doubtful_one_has_no_mass() -> None:
+    bundle, seen = told(7.0), section(-0.1, 0.1)
+    covered = replace(bundle, on_top=False)
+    assert with_flanks(covered, ends(-0.1, 0.1), seen, 0.0, 0.0) is covered
+    doubt = Doubt(DoubtKind.HIDDEN_FLANK, "what stands higher beside it may lie over its low flank")
+    one = with_flanks(replace(bundle, cover_doubts=(doubt,)), ends(-0.1, 0.1), seen, 0.0, 0.0)
+    assert one.width_m == pytest.approx(0.2) and np.isnan(one.section_m2)
+
+
+def test_sigma_grows_with_the_pixel_and_the_slope_of_the_view() -> None:
+    bundle, seen = told(7.0), section(-0.1, 0.1)
+    near = with_flanks(bundle, ends(-0.1, 0.1), seen, 0.0, 0.0)
+    coarse = [end._replace(pixel_m=0.015) for end in ends(-0.1, 0.1)]
+    assert with_flanks(bundle, coarse, seen, 0.0, 0.0).sigma.width_m > 2 * near.sigma.width_m
+    assert with_flanks(bundle, ends(-0.1, 0.1), seen, 0.0, 0.4).sigma.width_m > 2 * near.sigma.width_m
+    assert with_flanks(bundle, ends(-0.1, 0.1, count=1), seen, 0.0, 0.0) is bundle
