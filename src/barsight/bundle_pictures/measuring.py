@@ -29,7 +29,7 @@ def measure_from_pictures(
     unsure = [bundles[k] for k in numbers]
     windows = list(pitch_windows(frames, heights, unsure))
     first_strap = len(windows)
-    windows += strap_windows(frames, heights, unsure)
+    windows += strap_windows(frames, {k for k, _ in windows}, heights, unsure)
     profiles, straps = [list[PitchProfile]() for _ in unsure], [list[StrapEnds]() for _ in unsure]
     for place, picture in sample_windows(pairs, frames, windows):
         _, window = windows[place]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -70,12 +70,13 @@ class PlacedFrames:
         eyes = np.array([left.map_from_rect.translation for left, _ in cameras]).reshape(-1, 3)
         return cls(tuple(poses), cameras, eyes, (camera.width, camera.height))
 
-    def nearest(self, window: BundleWindow) -> int | None:
-        """Find the number of the frame nearest over a window whose left picture has it whole; None where none
-        has.
+    def nearest(self, window: BundleWindow, among: Collection[int] | None = None) -> int | None:
+        """Find the number of the frame nearest over a window whose left picture has it whole, of those in
+        `among`; None where none has.
         """
         away = np.hypot(*(self.eyes_m - window.middle_m[len(window.middle_m) // 2])[:, :2].T)
-        for k in np.argsort(away, kind="stable")[:_TRIED].tolist():
+        numbers = np.argsort(away, kind="stable").tolist()
+        for k in [k for k in numbers if among is None or k in among][:_TRIED]:
             at, _ = self.cameras[k][0].project(window.corners_m)
             if bool(((at >= 1) & (at <= np.array(self.size_px) - 2)).all()):
                 return int(k)
@@ -109,8 +110,14 @@ def sample_windows(
 def _sample(
     picture: UInt8, seen: UInt8, camera: PlacedCamera, window: BundleWindow
 ) -> tuple[UInt8, float] | None:  # fmt: skip
-    at, depth = camera.project(window.rows_m[:, None] + window.middle_m)
-    x, y = at[..., 0].astype(np.float32), at[..., 1].astype(np.float32)
+    into = camera.map_from_rect.inverse()
+    # Projection is linear before the division: the sum of a row and a place of the middle line.
+    rows, middle = window.rows_m @ into.rotation.T, into.apply(window.middle_m)
+    right, down, depth = (rows[:, k, None] + middle[:, k] for k in range(3))
+    if depth.min() <= 0:
+        return None
+    x = (camera.focal_px * right / depth + camera.principal_px[0]).astype(np.float32)
+    y = (camera.focal_px * down / depth + camera.principal_px[1]).astype(np.float32)
     if not cv2.remap(seen, x, y, cv2.INTER_NEAREST, borderValue=0).all():
         return None
     gray = cv2.remap(picture, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)

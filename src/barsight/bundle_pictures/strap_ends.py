@@ -7,7 +7,7 @@ wide as its outline in the picture, whatever the view.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -16,6 +16,7 @@ from scipy import ndimage
 
 from barsight.bundle_pictures.samples import BundleWindow, PlacedFrames, WindowPicture, is_hidden
 from barsight.core.arrays import Bool, Float64, UInt8
+from barsight.yard.lifting.load import is_one_bar
 from barsight.yard.sections import part_about
 from barsight.yard.types import Bundle, YardMap
 
@@ -64,14 +65,15 @@ class StrapEnds(NamedTuple):
 
 
 def strap_windows(
-    frames: PlacedFrames, heights: YardMap, bundles: Sequence[Bundle]
+    frames: PlacedFrames, among: Collection[int], heights: YardMap, bundles: Sequence[Bundle]
 ) -> Iterator[tuple[int, BundleWindow]]:
-    """List windows along each bundle with the frames nearest over them; none where what stands higher beside
-    it may hide the flank on the camera's side.
+    """List windows along each bundle that straps may hold, with the frames nearest over them, of those in
+    `among` where one has it; none where what stands higher may hide the flank on the camera's side.
     """
     for number, bundle in enumerate(bundles):
-        for window in _windows(number, bundle):
-            k = frames.nearest(window)
+        for window in _windows(number, bundle) if bundle.on_top and not is_one_bar(bundle) else ():
+            k = frames.nearest(window, among)
+            k = frames.nearest(window) if k is None else k
             if k is not None and not _hides_flank(frames, k, window, heights):
                 yield k, window
 
