@@ -107,7 +107,7 @@ def ends(low_m: float, high_m: float, count: int = 3) -> list[StrapEnds]:
 
 def section(low_m: float, high_m: float) -> MeanSection:
     beside = np.arange(-0.35, 0.35, 0.01)
-    return MeanSection(beside, np.where((beside >= low_m) & (beside <= high_m), TOP_M, 0.0))
+    return MeanSection(beside, np.where((beside >= low_m) & (beside <= high_m), TOP_M, 0.0), WIDTH_M)
 
 
 def test_straps_far_off_the_map_make_a_bundle_unsure() -> None:
@@ -118,13 +118,37 @@ def test_straps_far_off_the_map_make_a_bundle_unsure() -> None:
     assert one.sigma.lateral_m > 0.025 and one.sigma.width_m > 0.1 and np.isnan(one.section_m2)
 
 
-def test_a_covered_bundle_is_left_and_a_doubtful_one_has_no_mass() -> None:
+def test_a_bundle_that_may_be_covered_is_left() -> None:
     bundle, seen = told(7.0), section(-0.1, 0.1)
-    covered = replace(bundle, on_top=False)
-    assert with_flanks(covered, ends(-0.1, 0.1), seen, 0.0, 0.0) is covered
     doubt = Doubt(DoubtKind.HIDDEN_FLANK, "what stands higher beside it may lie over its low flank")
-    one = with_flanks(replace(bundle, cover_doubts=(doubt,)), ends(-0.1, 0.1), seen, 0.0, 0.0)
+    for one in (replace(bundle, on_top=False), replace(bundle, cover_doubts=(doubt,))):
+        assert with_flanks(one, ends(-0.1, 0.1), seen, 0.0, 0.0) is one
+    may_go_on = Doubt(DoubtKind.MAY_GO_ON, "it may be wider")
+    one = with_flanks(replace(bundle, reasons=(may_go_on,)), ends(-0.1, 0.1), seen, 0.0, 0.0)
     assert one.width_m == pytest.approx(0.2) and np.isnan(one.section_m2)
+
+
+def test_a_strip_out_of_sight_is_no_flank_nor_the_maps_border() -> None:
+    """Straps that end within a pack, where one column of the map isn't seen, or where the map ends."""
+    beside = np.arange(-0.35, 0.35, 0.01)
+    bundle, level = told(7.0), np.where(np.abs(beside) < 0.131, TOP_M, 0.0)
+    for hole, value in ((np.abs(beside - 0.06) < 0.006, np.nan), (beside > 0.06, np.inf)):
+        seen = MeanSection(beside, np.where(hole, value, level), WIDTH_M)
+        assert with_flanks(bundle, ends(-0.13, 0.06), seen, 0.0, 0.0) is bundle
+
+
+def test_straps_in_line_with_a_neighbours_are_not_one_bundle() -> None:
+    """A neighbour touches: straps go on over it, and the map smooths the gully between."""
+    beside = np.arange(-0.35, 0.35, 0.01)
+    level = np.where((beside > -0.13) & (beside < 0.31), TOP_M, 0.0)
+    level[np.abs(beside - 0.13) < 0.011] = TOP_M - 0.085
+    bundle = told(7.0)
+    seen = MeanSection(beside, level, WIDTH_M)
+    assert with_flanks(bundle, ends(-0.13, 0.31), seen, 0.0, 0.0) is bundle
+    shallow = np.where(level == TOP_M - 0.085, TOP_M - 0.05, level)
+    one = with_flanks(bundle, ends(-0.13, 0.31), MeanSection(beside, shallow, WIDTH_M), 0.0, 0.0)
+    assert one.centre_m is bundle.centre_m and one.sigma.lateral_m > 0.09 and np.isnan(one.section_m2)
+    assert one.reasons[-1].sentence.startswith("in the pictures its straps end")
 
 
 def test_sigma_grows_with_the_pixel_and_the_slope_of_the_view() -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
@@ -12,9 +14,10 @@ from barsight.bundle_pictures.strap_ends import APART_M, REACH_M, StrapEnds
 from barsight.core.arrays import Float64
 from barsight.core.linalg.robust import nan_medians
 from barsight.labels.placing import heights_at
-from barsight.yard.bundles.section.seen_section import over_floor, section_of_pack
+from barsight.yard.bundles.section.seen_section import is_overhung, over_floor, section_of_pack
+from barsight.yard.lift_settings import UPPER
 from barsight.yard.sections import part_about
-from barsight.yard.types import Bundle, YardMap
+from barsight.yard.types import Bundle, Doubt, DoubtKind, YardMap
 
 _WEAK_RATIO, _STRONG = 0.5, 4
 """Lines with less than this share of the fourth strongest's contrast are no straps."""
@@ -31,7 +34,7 @@ _CELL_M, _ROW_M, _TRIM_M = 0.01, 0.03, 0.1
 """Places of a mean section across and along, and what is left out at either end."""
 _CREST_RATIO, _BESIDE_M = 0.35, 0.02
 """Of the width, to either side: where a bundle is highest; what a map smears of a gully."""
-_INSIDE_M, _OUTSIDE_M, _RIM_M = 0.015, 0.025, 0.045
+_INSIDE_M, _OUTSIDE_M, _RIM_M = 0.015, 0.015, 0.045
 """How far within and beyond a flank the surface must end; reach of a gully's two sides."""
 _DEEP_RATIO, _DEEP_M = 0.6, 0.15
 """Depth under the crest, of the width and at least, that no pack's surface has."""
@@ -40,18 +43,23 @@ _FALL_RATIO, _MIN_FALL_M, _FALL_BARS, _DENT_M = 0.15, 0.02, 0.5, 0.006
 side of it."""
 _PARTING_M, _PARTING_RATIO, _PARTING_BARS = 0.06, 0.3, 1.2
 """A gully that is as deep, of the width and in bars, parts two bundles."""
-_HIDDEN_M, _HIDDEN_BARS = 0.04, 0.6
-"""So does one that is so wide where its ground isn't seen."""
-_CONTRADICTED = 4.0
-"""Sigmas of the map's flanks from which straps that end elsewhere make the bundle unsure, no more."""
+_HIDDEN_M, _MIN_HIDDEN_M, _HIDDEN_BARS = 0.04, 0.02, 0.6
+"""So does one that is so wide where its ground isn't seen; a flank may be out of sight over the second, and
+over as many bars."""
+_CONTRADICTED, _MAX_ASIDE_M = 4.0, 0.05
+"""Sigmas of the map's flanks, and way of the middle, from which straps that end elsewhere make the bundle
+unsure, no more."""
 
 
 @dataclass(frozen=True, eq=False)
 class MeanSection:
-    """Mean heights (N,) across a bundle at places beside_m; NaN where half of the length isn't known."""
+    """Mean heights (N,) across a bundle at places beside_m; NaN where half of the length isn't known, inf
+    beyond the map's border. width_m: of the bundle as the map tells it.
+    """
 
     beside_m: Float64
     level_m: Float64
+    width_m: float
 
     @classmethod
     def of(cls, bundle: Bundle, heights: YardMap) -> MeanSection:
@@ -68,30 +76,35 @@ class MeanSection:
         mean = np.full(beside.size, np.nan)
         known = 2 * np.isfinite(z).sum(axis=0) > len(z)
         mean[known] = nan_medians(z[:, known])
-        return cls(beside, mean)
+        cells = (places[..., :2] - (heights.x0_m, heights.y0_m)) / heights.cell_m
+        outside = (cells < -0.5) | (cells > np.array(heights.shape[::-1]) - 0.5)
+        mean[2 * outside.any(axis=-1).sum(axis=0) > len(z)] = np.inf
+        return cls(beside, mean, bundle.width_m)
 
-    def ends_at(self, flank_m: float, side: int, width_m: float, diameter_m: float) -> bool:
+    def ends_at(self, flank_m: float, side: int, diameter_m: float) -> bool:
         """Check whether the surface ends about a flank: it falls far, isn't seen, or rises again behind a
         gully that is deeper or wider than one between the bundle's bars. side: -1 for the low flank, else 1.
         """
         outwards = side * (self.beside_m - flank_m)
         order = np.argsort(outwards)
         outwards, level = outwards[order], self.level_m[order]
-        crest = self.level_m[np.abs(self.beside_m) < _CREST_RATIO * width_m]
+        crest = self.level_m[np.abs(self.beside_m) < _CREST_RATIO * self.width_m]
         near = np.flatnonzero((outwards > -_INSIDE_M) & (outwards < _OUTSIDE_M))
         if not (np.isfinite(crest).any() and near.size):
             return False
-        depth = np.nanmax(crest) - level
-        if bool((depth[near] > max(_DEEP_RATIO * width_m, _DEEP_M)).any()):
+        depth = crest[np.isfinite(crest)].max() - level
+        if bool((depth[near] > max(_DEEP_RATIO * self.width_m, _DEEP_M)).any()):
             return True
         rims = round(_RIM_M / _CELL_M)
-        min_depth = max(_FALL_RATIO * width_m, _MIN_FALL_M, _FALL_BARS * diameter_m)
-        run = np.ones(max(round(_HIDDEN_BARS * diameter_m / _CELL_M), 1), bool)
+        min_depth = max(_FALL_RATIO * self.width_m, _MIN_FALL_M, _FALL_BARS * diameter_m)
+        run = np.ones(round(max(_HIDDEN_BARS * diameter_m, _MIN_HIDDEN_M) / _CELL_M), bool)
         hidden = ndimage.binary_opening(np.isnan(level), run)
         for k in near.tolist():
+            before, behind = level[max(k - rims, 0) : k], level[k + 1 : k + 1 + rims]
+            if is_overhung(before[::-1], behind):
+                return False
             if hidden[k]:
                 return True
-            before, behind = level[max(k - rims, 0) : k], level[k + 1 : k + 1 + rims]
             rises = [part[np.isfinite(part)].max(initial=-np.inf) - level[k] for part in (before, behind)]
             if depth[k] >= min_depth and min(rises) >= _DENT_M:
                 return True
@@ -107,76 +120,102 @@ class MeanSection:
         apart_m = _CELL_M * (np.diff(np.concatenate([[-1], seen, [level.size]])).max() - 1)
         known = level[seen]
         rims = np.minimum(np.maximum.accumulate(known), np.maximum.accumulate(known[::-1])[::-1])
-        deep_m = max(_PARTING_BARS * diameter_m, _PARTING_M, _PARTING_RATIO * (high_m - low_m))
+        width_m = min(high_m - low_m, self.width_m)
+        deep_m = max(_PARTING_BARS * diameter_m, _PARTING_M, _PARTING_RATIO * width_m)
         return bool((rims - known).max() > deep_m or apart_m > max(_HIDDEN_BARS * diameter_m, _HIDDEN_M))
 
 
 def with_flanks(
     bundle: Bundle, straps: Sequence[StrapEnds], section: MeanSection, floor_m: float | None, tilt: float
 ) -> Bundle:
-    """Place a bundle's flanks where most of its straps end; the same bundle where they don't agree, or the
-    map's section speaks against it.
+    """Place a bundle's flanks where most of its straps end; the same bundle where they don't agree, the map's
+    section speaks against it, or something lies on the bundle or may lie over it.
 
     floor_m: height of the floor. tilt: way aside of the lines of sight over their height. The section is
-    estimated anew, unless something may lie over a flank. Where straps end far off the flanks that the map
-    told, the bundle is only made unsure.
+    estimated anew. Where straps end far off the flanks that the map told, the bundle is only made unsure.
     """
-    flanks = _agreed_flanks(straps) if bundle.on_top else None
+    flanks = _agreed_flanks(straps) if bundle.is_free else None
     if flanks is None:
         return bundle
-    low, high = flanks
-    diameter = float(np.nan_to_num(bundle.bar_diameter_m))
-    ended = (
-        section.ends_at(flank, side, bundle.width_m, diameter)
-        for flank, side in zip(flanks, (-1, 1), strict=True)
-    )
+    (low, high), own = (flank.beside_m for flank in flanks), bundle.sigma
+    diameter = float(np.nan_to_num(bundle.bar_diameter_m + UPPER * np.nan_to_num(own.bar_diameter_m)))
+    ended = (section.ends_at(flank, side, diameter) for flank, side in ((low, -1), (high, 1)))
     if not all(ended) or section.is_parted(low, high, diameter):
         return bundle
-    plane_m = tilt * _PLANE_RATIO * (high - low)
     width, middle = high - low, (low + high) / 2
-    own = bundle.sigma
     off = abs(np.array([middle, width - bundle.width_m])) / np.fmax([own.lateral_m, own.width_m], 1e-6)
-    if off.max() > _CONTRADICTED:
-        unsure = replace(
-            own, lateral_m=float(np.hypot(own.lateral_m, middle)),
-            width_m=float(np.hypot(own.width_m, width - bundle.width_m)), section_m2=np.nan,
-        )  # fmt: skip
-        return replace(bundle, section_m2=np.nan, sigma=unsure)
-    flank_m = max(_FLANK_SIGMA_M, *(strap.pixel_m for strap in straps))
-    spread = float(np.hypot(2**0.5 * flank_m, plane_m))
-    found, found_sigma = section_of_pack(width, spread, over_floor(bundle.top_z_m, floor_m))
-    if bundle.cover_doubts:
-        found = found_sigma = np.nan
+    if off.max() > _CONTRADICTED or abs(middle) > _MAX_ASIDE_M:
+        return _contradicted(bundle, middle, width)
+    plane_m = tilt * _PLANE_RATIO * width
+    spread = math.hypot(*(flank.sigma_m for flank in flanks), plane_m)
+    turned = own.yaw_rad * max(abs(flank.along_m) for flank in flanks)
+    sigma = replace(own, width_m=spread, lateral_m=math.hypot(spread / 2, _MIDDLE_SIGMA_M, plane_m, turned))
+    if not any(doubt.kind is DoubtKind.MAY_GO_ON for doubt in bundle.reasons):
+        found, found_sigma = section_of_pack(width, spread, over_floor(bundle.top_z_m, floor_m))
+        bundle, sigma = replace(bundle, section_m2=found), replace(sigma, section_m2=found_sigma)
     along = bundle.direction / np.linalg.norm(bundle.direction[:2])
-    aside = middle * np.array([along[1], -along[0], 0.0])
-    sigma = replace(
-        own, width_m=spread, lateral_m=float(np.hypot(spread / 2, np.hypot(_MIDDLE_SIGMA_M, plane_m))),
-        section_m2=found_sigma,
-    )  # fmt: skip
+    # The axis of what is as high as wide lies half its width under its top.
+    aside = middle * np.array([along[1], -along[0], 0.0]) + [0, 0, (bundle.width_m - width) / 2]
     return replace(
-        bundle, centre_m=bundle.centre_m + aside, ends_m=bundle.ends_m + aside, width_m=width,
-        section_m2=found, sigma=sigma, fit_sigma=None,
+        bundle, centre_m=bundle.centre_m + aside, ends_m=bundle.ends_m + aside, width_m=width, sigma=sigma,
+        fit_sigma=None,
     )  # fmt: skip
 
 
-def _agreed_flanks(straps: Sequence[StrapEnds]) -> tuple[float, float] | None:
+def _contradicted(bundle: Bundle, middle_m: float, width_m: float) -> Bundle:
+    """Make a bundle unsure whose straps end elsewhere than the map tells its flanks."""
+    own, wider = bundle.sigma, width_m - bundle.width_m
+    said = (
+        f"in the pictures its straps end {1e3 * abs(middle_m) + 1e3 * abs(wider) / 2:.0f} mm off its flanks"
+    )
+    unsure = replace(
+        own, lateral_m=math.hypot(own.lateral_m, middle_m), width_m=math.hypot(own.width_m, wider),
+        section_m2=math.nan,
+    )  # fmt: skip
+    reasons = (*bundle.reasons, Doubt(DoubtKind.OTHER, said))
+    return replace(bundle, section_m2=math.nan, sigma=unsure, reasons=reasons)
+
+
+class _Flank(NamedTuple):
+    """Place of a flank beside the axis with its sigma, and mean place along of the straps that tell it."""
+
+    beside_m: float
+    sigma_m: float
+    along_m: float
+
+
+def _agreed_flanks(straps: Sequence[StrapEnds]) -> tuple[_Flank, _Flank] | None:
     """Find where most straps end on either side, of those that stand out; None where they don't agree."""
     contrasts = sorted((strap.contrast for strap in straps), reverse=True)
     if len(contrasts) < _MIN_STRAPS:
         return None
     least = _WEAK_RATIO * contrasts[min(_STRONG, len(contrasts)) - 1]
-    kept = np.array([strap for strap in straps if strap.contrast >= least])
-    low, high = (_agreed(kept[:, k], kept[:, 0]) for k in (1, 2))
-    return None if low is None or high is None or low >= high else (low, high)
+    kept = [strap for strap in straps if strap.contrast >= least]
+    along, pixel_m = np.array([strap.along_m for strap in kept]), max(strap.pixel_m for strap in kept)
+    low = _agreed(np.array([strap.low_m for strap in kept]), along, pixel_m)
+    high = _agreed(np.array([strap.high_m for strap in kept]), along, pixel_m)
+    return None if low is None or high is None or low.beside_m >= high.beside_m else (low, high)
 
 
-def _agreed(ends_m: Float64, along_m: Float64) -> float | None:
+def _agreed(ends_m: Float64, along_m: Float64, pixel_m: float) -> _Flank | None:
     """Compute the median of the ends (S,) that agree, of straps at along_m; None where they are too few."""
-    best = np.zeros(0)
+    best = np.zeros(ends_m.size, bool)
     for end in ends_m[np.isfinite(ends_m)]:
         same = np.abs(ends_m - end) <= _SAME_M
-        rows = np.sort(along_m[same])
-        straps = 1 + int((np.diff(rows) > APART_M / 2).sum())
-        if straps >= _MIN_STRAPS and same.sum() > best.size:
-            best = ends_m[same]
-    return float(np.median(best)) if best.size > _AGREE_RATIO * ends_m.size else None
+        straps = 1 + int((np.diff(np.sort(along_m[same])) > APART_M / 2).sum())
+        if straps >= _MIN_STRAPS and same.sum() > best.sum():
+            best = same
+    if best.sum() <= _AGREE_RATIO * ends_m.size:
+        return None
+    spread = math.hypot(max(_FLANK_SIGMA_M, pixel_m), float(np.std(ends_m[best])))
+    return _Flank(float(np.median(ends_m[best])), spread, float(along_m[best].mean()))
+
+
+def takes_another(bundle: Bundle, others: Sequence[Bundle]) -> bool:
+    """Check whether another bundle's middle lies within a bundle's flanks, at about its height."""
+    centres = np.array([other.centre_m for other in others]) - bundle.centre_m
+    along = bundle.direction[:2] / np.linalg.norm(bundle.direction[:2])
+    beside, beyond = centres @ [along[1], -along[0], 0.0], centres[:, :2] @ along
+    lower = np.abs([other.top_z_m - bundle.top_z_m for other in others])
+    inside = (np.abs(beside) < bundle.width_m / 2) & (np.abs(beyond) < bundle.length_m / 2)
+    return bool((inside & (lower < bundle.width_m / 2)).sum() > 1)

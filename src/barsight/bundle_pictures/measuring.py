@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from barsight.bundle_pictures.diameters import with_pitch
-from barsight.bundle_pictures.flanks import MeanSection, with_flanks
+from barsight.bundle_pictures.flanks import MeanSection, takes_another, with_flanks
 from barsight.bundle_pictures.profiles import PitchProfile, pitch_windows
 from barsight.bundle_pictures.samples import PlacedFrames, sample_windows
 from barsight.bundle_pictures.strap_ends import StrapEnds, find_straps, strap_windows, view_tilt
@@ -44,10 +44,10 @@ def measure_from_pictures(
         tilts[window.number] = max(tilts[window.number], abs(view_tilt(frames, k, window)))
     floor, out = find_floor(heights), list(bundles)
     for k, bundle, seen, ends, tilt in zip(numbers, unsure, profiles, straps, tilts, strict=True):
-        told = with_pitch(bundle, seen)
+        told = out[k] = with_pitch(bundle, seen)
         if ends and not is_one_bar(told):
-            told = with_flanks(told, ends, MeanSection.of(bundle, heights), floor, tilt)
-        out[k] = told
+            placed = with_flanks(told, ends, MeanSection.of(bundle, heights), floor, tilt)
+            out[k] = told if takes_another(placed, bundles) else placed
     return tuple(out)
 
 

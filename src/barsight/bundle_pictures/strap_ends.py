@@ -87,15 +87,19 @@ def _hides_flank(frames: PlacedFrames, k: int, window: BundleWindow, heights: Ya
     inwards *= -np.sign(tilt) * (REACH_M - _OUTSIDE_M) / np.linalg.norm(inwards)
     flank = window.middle_m[0 if tilt < 0 else -1] + inwards
     part = part_about(heights, window.corners_m[:, 0], window.corners_m[:, 1])
-    return is_hidden(part, flank + window.rows_m, frames.eyes_m[k])
+    eyes = (camera.map_from_rect.translation for camera in frames.cameras[k])
+    return any(is_hidden(part, flank + window.rows_m, eye) for eye in eyes)
 
 
 def view_tilt(frames: PlacedFrames, k: int, window: BundleWindow) -> float:
-    """Compute how far across a bundle a frame's line of sight leads, over its height."""
+    """Compute how far across a bundle a frame's lines of sight lead, over their height: of the camera that
+    looks from further aside.
+    """
     middle = window.middle_m[len(window.middle_m) // 2]
     across = window.middle_m[-1] - window.middle_m[0]
-    away = frames.eyes_m[k] - middle
-    return float(away @ across / np.linalg.norm(across) / away[2])
+    away = [camera.map_from_rect.translation - middle for camera in frames.cameras[k]]
+    tilts = [float(one @ across / np.linalg.norm(across) / one[2]) for one in away]
+    return max(tilts, key=abs)
 
 
 def _windows(number: int, bundle: Bundle) -> Iterator[BundleWindow]:

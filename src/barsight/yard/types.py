@@ -184,6 +184,7 @@ class DoubtKind(Enum):
     HIDDEN_FLANK = "beside it may lie over its"
     OVERLAP = "overlap: one may lie over the other"
     WALL = "it may be a wall"
+    MAY_GO_ON = "it may be wider"
     RIVAL = "explains the surface nearly as well"
     OTHER = ""
 

@@ -59,7 +59,7 @@ def held_by_straps(
     said = "its straps show on its crest alone, and its surface doesn't end there: it may be wider"
     return replace(
         held, section_m2=np.nan, sigma=replace(held.sigma, section_m2=np.nan),
-        reasons=(*held.reasons, Doubt(DoubtKind.OTHER, said)),
+        reasons=(*held.reasons, Doubt(DoubtKind.MAY_GO_ON, said)),
     )  # fmt: skip
 
 
