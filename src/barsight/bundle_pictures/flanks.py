@@ -25,7 +25,7 @@ _SAME_M = 0.01
 """Ends of straps this near to their median agree."""
 _AGREE_RATIO, _MIN_STRAPS = 0.5, 2
 """Share of the lines' ends of which more must agree, and of how many straps at least."""
-_FLANK_SIGMA_M, _MIDDLE_SIGMA_M = 0.006, 0.004
+_FLANK_SIGMA_M, _MIDDLE_SIGMA_M = 0.008, 0.004
 """Of a flank that straps tell, and at least a pixel; of the centre of mass, from the middle between the
 flanks."""
 _PLANE_RATIO = 0.25
@@ -34,7 +34,7 @@ _CELL_M, _ROW_M, _TRIM_M = 0.01, 0.03, 0.1
 """Places of a mean section across and along, and what is left out at either end."""
 _CREST_RATIO, _BESIDE_M = 0.35, 0.02
 """Of the width, to either side: where a bundle is highest; what a map smears of a gully."""
-_INSIDE_M, _OUTSIDE_M, _RIM_M = 0.015, 0.015, 0.045
+_INSIDE_M, _OUTSIDE_M, _RIM_M = 0.015, 0.02, 0.045
 """How far within and beyond a flank the surface must end; reach of a gully's two sides."""
 _DEEP_RATIO, _DEEP_M = 0.6, 0.15
 """Depth under the crest, of the width and at least, that no pack's surface has."""
