@@ -26,18 +26,19 @@ from barsight.bundle_pictures.spectra import CLASSES, FREQUENCIES, LOG_RATIOS, l
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.cli.bench.seeds import parse_seeds
 from barsight.core.arrays import Float64
+from barsight.core.pose import Pose
 from barsight.labels.placing import pose_at
 from barsight.recording.open import open_recording
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.result_folder import read_heights, read_path
 from barsight.simulation.worlds.recording import cover, is_uncovered
 from barsight.simulation.worlds.surfaces import owners
-from barsight.simulation.worlds.yards import LOOSE, DrawnBundle
+from barsight.simulation.worlds.yards import LOOSE, DrawnBundle, DrawnYard
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.magnet.description import example_magnet
 from barsight.yard.magnet.holding import min_diameter_m
-from barsight.yard.types import Bundle
+from barsight.yard.types import Bundle, YardMap
 
 MIN_SCALE, MIN_BUNDLES = 0.4, 15
 """Least scale of a spectrum's logarithm, and bundles that a place of a table needs."""
@@ -56,28 +57,53 @@ class SeenBundle:
     profiles: list[PitchProfile]
 
 
+@dataclass(frozen=True, eq=False)
+class KeptYard:
+    """A yard that was measured, its bundles found anew. poses: of its frames by stamp."""
+
+    world: DrawnYard
+    pairs: RectifiedPairs
+    poses: dict[int, Pose]
+    heights: YardMap
+    bundles: tuple[Bundle, ...]
+
+    @classmethod
+    def of(cls, keep: Path, seed: int, magnet: JudgedMagnet) -> KeptYard:
+        """Read a yard's folders."""
+        folder = keep / f"seed_{seed}"
+        heights, path = read_heights(folder / "measured"), read_path(folder / "measured")
+        recording = open_recording(folder / "recording")
+        stamps = recording.index.stamps_ns if path is not None else ()
+        return cls(
+            judged_yard(seed, magnet), RectifiedPairs(recording, Rectifier(recording.rig)),
+            {stamp: pose for stamp in stamps if path and (pose := pose_at(path, stamp)) is not None},
+            heights, find_bundles(heights, BundleSettings()),
+        )  # fmt: skip
+
+    def drawn_ones(self) -> list[tuple[DrawnBundle, bool] | None]:
+        """Find for each bundle the drawn one about whose axis it lies, and whether that one is free."""
+        scene, owner = drawn_scene(self.world), owners(self.world.yard)
+        packs, found = [drawn for drawn in self.world.bundles if drawn.number < LOOSE], []
+        for bundle in self.bundles:
+            asides = [(abs(aside_m(bundle, drawn)), k) for k, drawn in enumerate(packs)]
+            aside, k = min(asides, default=(np.inf, -1))
+            found.append(
+                (packs[k], is_uncovered(*cover(scene, owner, packs[k]))) if np.isfinite(aside) else None
+            )
+        return found
+
+
 def seen_bundles(keep: Path, seed: int, magnet: JudgedMagnet) -> Iterator[SeenBundle]:
     """Sample the profiles of a yard's found bundles of more than one bar."""
-    folder, world = keep / f"seed_{seed}", judged_yard(seed, magnet)
-    heights, path = read_heights(folder / "measured"), read_path(folder / "measured")
-    recording = open_recording(folder / "recording")
-    pairs = RectifiedPairs(recording, Rectifier(recording.rig))
-    stamps = recording.index.stamps_ns if path is not None else ()
-    poses = {stamp: pose for stamp in stamps if path and (pose := pose_at(path, stamp)) is not None}
-    bundles = find_bundles(heights, BundleSettings())
-    scene, owner = drawn_scene(world), owners(world.yard)
-    packs = [drawn for drawn in world.bundles if drawn.number < LOOSE]
-    for bundle, profiles in zip(bundles, pitch_profiles(pairs, poses, heights, bundles), strict=True):
-        near = [
-            (abs(aside), k) for k, drawn in enumerate(packs) if (aside := _aside(bundle, drawn)) is not None
-        ]
-        if near and profiles:
-            drawn = packs[min(near)[1]]
-            yield SeenBundle(bundle, drawn, is_uncovered(*cover(scene, owner, drawn)), profiles)
+    yard = KeptYard.of(keep, seed, magnet)
+    sampled = pitch_profiles(yard.pairs, yard.poses, yard.heights, yard.bundles)
+    for bundle, drawn, profiles in zip(yard.bundles, yard.drawn_ones(), sampled, strict=True):
+        if drawn is not None and profiles:
+            yield SeenBundle(bundle, *drawn, profiles)
 
 
-def _aside(bundle: Bundle, drawn: DrawnBundle) -> float | None:
-    """Compute how far a found bundle lies beside a drawn one's middle; None where it lies outside of it."""
+def aside_m(bundle: Bundle, drawn: DrawnBundle) -> float:
+    """Compute how far a found bundle lies beside a drawn one's middle; inf where it lies outside of it."""
     c, s, radius = np.cos(drawn.yaw_rad), np.sin(drawn.yaw_rad), drawn.diameter_m / 2
     low, high = drawn.cross_m.min(axis=0) - radius, drawn.cross_m.max(axis=0) + radius
     step = bundle.centre_m[:2] - drawn.centre_m[:2]
@@ -85,7 +111,7 @@ def _aside(bundle: Bundle, drawn: DrawnBundle) -> float | None:
     half = float(high[0] - low[0]) / 2
     turn = abs((bundle.yaw_rad - drawn.yaw_rad + np.pi / 2) % np.pi - np.pi / 2)
     lies = abs(aside) < half and abs(step @ (-s, c)) < drawn.length_m / 2 and turn < MAX_TURN_RAD
-    return aside if lies and abs(bundle.top_z_m - drawn.centre_m[2] - high[1]) < half else None
+    return aside if lies and abs(bundle.top_z_m - drawn.centre_m[2] - high[1]) < half else np.inf
 
 
 def learn(seen: list[SeenBundle]) -> str:
