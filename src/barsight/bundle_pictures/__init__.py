@@ -1,1 +1,1 @@
-"""Diameters of bars by their pitch in the pictures, which show it finer than the map's cells do."""
+"""What pictures show of bundles finer than the map's cells do: the bars' pitch, and where straps end."""

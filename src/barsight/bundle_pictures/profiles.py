@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from barsight.bundle_pictures.samples import BundleWindow, PlacedFrames, WindowPicture, is_hidden
+from barsight.bundle_pictures.samples import DARKEST, BundleWindow, PlacedFrames, WindowPicture, is_hidden
 from barsight.core.arrays import Float64
 from barsight.labels.placing import heights_at
 from barsight.yard.sections import part_about
@@ -26,8 +26,6 @@ _BESIDE_ENDS_M, _TRIM_M = 0.1, 0.01
 _SMOOTH_M = 0.015
 _AROUND_M = 0.4
 """The map is read so far beside a bundle's flanks: what stands there may hide it."""
-_DARKEST = 8.0
-"""Gray levels that are added before the logarithm: noise of dark ones counts less."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +41,7 @@ class PitchProfile:
     @classmethod
     def of(cls, picture: WindowPicture) -> PitchProfile:
         """Take the median of a window's rows."""
-        return cls(np.log(np.median(picture.gray, axis=0) + _DARKEST), picture.pixel_m)
+        return cls(np.log(np.median(picture.gray, axis=0) + DARKEST), picture.pixel_m)
 
 
 def pitch_windows(

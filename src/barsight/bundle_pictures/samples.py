@@ -20,6 +20,8 @@ from barsight.yard.types import HeightMap
 _OVER_M, _MAX_RISE_M, _HIDDEN_RATIO = 0.05, 1.0, 0.05
 """A line of sight is followed up to so high, in such steps; the share of a line of places that may be
 hidden."""
+DARKEST = 8.0
+"""Gray levels that are added before their logarithm: noise of dark ones counts less."""
 _TRIED = 10
 """Frames, the nearest ones, that are tried for a window."""
 

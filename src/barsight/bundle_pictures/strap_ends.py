@@ -14,13 +14,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage
 
-from barsight.bundle_pictures.samples import BundleWindow, PlacedFrames, WindowPicture, is_hidden
+from barsight.bundle_pictures.samples import DARKEST, BundleWindow, PlacedFrames, WindowPicture, is_hidden
 from barsight.core.arrays import Bool, Float64, UInt8
 from barsight.yard.lifting.load import is_one_bar
 from barsight.yard.sections import part_about
 from barsight.yard.types import Bundle, YardMap
 
-STEP_M, _ROW_M = 0.004, 0.008
+_STEP_M, _ROW_M = 0.004, 0.008
 """Way between two places across a bundle, and along it."""
 REACH_M = 0.22
 """Search reach beyond the flanks of a bundle as the map tells it."""
@@ -32,7 +32,6 @@ _WINDOW_M = 3.0
 """Greatest length of a window: one picture shows it whole."""
 _AROUND_M, _STRAP_ROWS = 0.4, 3
 """Length along the bars over which the steel's own gray level is taken, and rows that a strap covers."""
-_DARKEST = 8.0
 _SCATTER_LOG, _MIN_SCATTER_LOG, _SCATTER_M = 0.3, 0.03, 0.06
 """Of the logarithm of gray levels along a bar: the most that counts for its scatter, the least scatter, and
 over how far across it is averaged."""
@@ -47,7 +46,7 @@ _GULLY_BARS, _MIN_GULLY_M = 0.45, 0.016
 """A gully between two bars, of their diameter and at least, doesn't end a strap."""
 APART_M, _DENSE_M = 0.3, 0.45
 """Straps are no nearer to each other than the first, and on average over a bundle than the second."""
-LINE_M = 0.0015
+_LINE_M = 0.0015
 """A strap shows so far beyond the bundle: it is this thick, and blurred."""
 
 
@@ -67,11 +66,11 @@ class StrapEnds(NamedTuple):
 def strap_windows(
     frames: PlacedFrames, among: Collection[int], heights: YardMap, bundles: Sequence[Bundle]
 ) -> Iterator[tuple[int, BundleWindow]]:
-    """List windows along each bundle that straps may hold, with the frames nearest over them, of those in
+    """List windows along each free bundle that straps may hold, with the frames nearest over them, of those in
     `among` where one has it; none where what stands higher may hide the flank on the camera's side.
     """
     for number, bundle in enumerate(bundles):
-        for window in _windows(number, bundle) if bundle.on_top and not is_one_bar(bundle) else ():
+        for window in _windows(number, bundle) if bundle.is_free and not is_one_bar(bundle) else ():
             k = frames.nearest(window, among)
             k = frames.nearest(window) if k is None else k
             if k is not None and not _hides_flank(frames, k, window, heights):
@@ -109,7 +108,7 @@ def _windows(number: int, bundle: Bundle) -> Iterator[BundleWindow]:
     along = bundle.direction / np.linalg.norm(bundle.direction[:2])
     across = np.array([along[1], -along[0], 0.0])
     half = bundle.width_m / 2 + REACH_M
-    beside = np.arange(-half, half, STEP_M)
+    beside = np.arange(-half, half, _STEP_M)
     middle = np.append(bundle.centre_m[:2], bundle.top_z_m - bundle.width_m / 2)
     edges = np.linspace(-0.5, 0.5, int(bundle.length_m / _WINDOW_M) + 2) * bundle.length_m
     for low, high in pairwise(edges.tolist()):
@@ -120,19 +119,19 @@ def _windows(number: int, bundle: Bundle) -> Iterator[BundleWindow]:
 def find_straps(picture: WindowPicture, window: BundleWindow, bundle: Bundle) -> list[StrapEnds]:
     """Find the straps in a window of a bundle, and where each ends."""
     contrast = _contrast(picture.gray)
-    beside = STEP_M * (np.arange(contrast.shape[1]) - (contrast.shape[1] - 1) / 2)
+    beside = _STEP_M * (np.arange(contrast.shape[1]) - (contrast.shape[1] - 1) / 2)
     middle = np.abs(beside) < max(_MIDDLE_RATIO * bundle.width_m, _MIN_MIDDLE_M)
     strength = contrast[:, middle].mean(axis=1)
-    bridged = round(max(_MIN_GULLY_M, _GULLY_BARS * np.nan_to_num(bundle.bar_diameter_m)) / STEP_M)
+    bridged = round(max(_MIN_GULLY_M, _GULLY_BARS * np.nan_to_num(bundle.bar_diameter_m)) / _STEP_M)
     found = []
     for row in _strap_rows(strength):
         near = contrast[max(row - 2, 0) : row + 3] * np.sign(strength[row])
-        line = ndimage.uniform_filter1d(near, round(_SMOOTH_M / STEP_M), axis=1).max(axis=0)
+        line = ndimage.uniform_filter1d(near, round(_SMOOTH_M / _STEP_M), axis=1).max(axis=0)
         level = float(np.median(line[middle]))
         seen = line > max(_END_RATIO * level, _SEEN)
         half = seen.size // 2
         ends = (_end(part, bridged) for part in (seen[half::-1], seen[half:]))
-        low, high = (np.nan if k is None else STEP_M * (k + 0.5) - LINE_M for k in ends)
+        low, high = (np.nan if k is None else _STEP_M * (k + 0.5) - _LINE_M for k in ends)
         along = float(np.linalg.norm(window.rows_m[row]) * np.sign(window.rows_m[row] @ bundle.direction))
         sides = float(beside[half] - low), float(beside[half] + high)
         found.append(StrapEnds(along, *sides, level, picture.pixel_m))
@@ -143,12 +142,12 @@ def _contrast(gray: UInt8) -> Float64:
     """Compute how much each place (R, N) differs from the steel before and after it, over a bar's own
     scatter: the logarithm of gray levels less its mean along the bar, averaged over a strap's rows.
     """
-    level = np.log(gray + _DARKEST)
+    level = np.log(gray + DARKEST)
     around = 2 * round(_AROUND_M / _ROW_M / 2) + 1
     off = level - ndimage.uniform_filter1d(level, around, axis=0, mode="nearest")
     off = ndimage.uniform_filter1d(off, _STRAP_ROWS, axis=0)
     scatter = np.sqrt(np.pi / 2) * np.minimum(np.abs(off), _SCATTER_LOG).mean(axis=0)
-    scatter = ndimage.uniform_filter1d(np.maximum(scatter, _MIN_SCATTER_LOG), round(_SCATTER_M / STEP_M))
+    scatter = ndimage.uniform_filter1d(np.maximum(scatter, _MIN_SCATTER_LOG), round(_SCATTER_M / _STEP_M))
     return np.asarray(np.clip(off / scatter, -_CLIPPED, _CLIPPED))
 
 
