@@ -1,1 +1,1 @@
-"""What pictures show of bundles finer than the map's cells do: the bars' pitch, and where straps end."""
+"""Pictures tell of bundles what the map's cells blur: the bars' pitch, and where straps end."""

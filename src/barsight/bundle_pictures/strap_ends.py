@@ -66,8 +66,8 @@ class StrapEnds(NamedTuple):
 def strap_windows(
     frames: PlacedFrames, among: Collection[int], heights: YardMap, bundles: Sequence[Bundle]
 ) -> Iterator[tuple[int, BundleWindow]]:
-    """List windows along each free bundle that straps may hold, with the frames nearest over them, of those in
-    `among` where one has it; none where what stands higher may hide the flank on the camera's side.
+    """List windows along each free bundle that straps may hold, with the frames nearest over them, of those
+    in `among` where one has it; none where what stands higher may hide the flank on the camera's side.
     """
     for number, bundle in enumerate(bundles):
         for window in _windows(number, bundle) if bundle.is_free and not is_one_bar(bundle) else ():
