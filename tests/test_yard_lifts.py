@@ -209,7 +209,8 @@ def test_a_pole_over_a_hollow_is_a_gap() -> None:
 
 
 @pytest.mark.parametrize(
-    ("diameter_m", "bars", "ratio"), [(0.09, None, 1.0), (0.03, 7, 1.0), (0.06, None, 0.3), (0.03, None, 0.3)]
+    ("diameter_m", "bars", "ratio"),
+    [(0.09, None, 1.0), (0.03, 7, 1.0), (0.06, None, 0.585), (0.03, None, 0.3)],
 )
 def test_less_of_the_faces_surely_lies_on_thin_bars_that_nobody_could_count(
     diameter_m: float, bars: int | None, ratio: float
