@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from barsight.bundle_pictures.flanks import MeanSection, with_flanks
+from barsight.bundle_pictures.flanks import MeanSection, takes_another, with_flanks
 from barsight.bundle_pictures.measuring import measure_from_pictures
 from barsight.bundle_pictures.strap_ends import StrapEnds
 from barsight.yard.types import Bundle, Doubt, DoubtKind, HeightMap
@@ -149,6 +149,15 @@ def test_straps_in_line_with_a_neighbours_are_not_one_bundle() -> None:
     one = with_flanks(bundle, ends(-0.13, 0.31), MeanSection(beside, shallow, WIDTH_M), 0.0, 0.0)
     assert one.centre_m is bundle.centre_m and one.sigma.lateral_m > 0.09 and np.isnan(one.section_m2)
     assert one.reasons[-1].sentence.startswith("in the pictures its straps end")
+
+
+def test_flanks_take_no_other_bundle_in() -> None:
+    bundle = told(7.0)
+    across = np.array([np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad), 0.0])
+    near, beside = (replace(bundle, centre_m=bundle.centre_m + d * across) for d in (0.1, 0.2))
+    lower = replace(near, top_z_m=TOP_M - 0.2)
+    assert takes_another(bundle, [beside, near]) and not takes_another(bundle, [beside, lower])
+    assert not takes_another(bundle, [])
 
 
 def test_sigma_grows_with_the_pixel_and_the_slope_of_the_view() -> None:

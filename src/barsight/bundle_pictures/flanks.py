@@ -213,9 +213,9 @@ def _agreed(ends_m: Float64, along_m: Float64, pixel_m: float) -> _Flank | None:
 
 def takes_another(bundle: Bundle, others: Sequence[Bundle]) -> bool:
     """Check whether another bundle's middle lies within a bundle's flanks, at about its height."""
-    centres = np.array([other.centre_m for other in others]) - bundle.centre_m
+    centres = np.array([other.centre_m for other in others]).reshape(-1, 3) - bundle.centre_m
     along = bundle.direction[:2] / np.linalg.norm(bundle.direction[:2])
     beside, beyond = centres @ [along[1], -along[0], 0.0], centres[:, :2] @ along
     lower = np.abs([other.top_z_m - bundle.top_z_m for other in others])
     inside = (np.abs(beside) < bundle.width_m / 2) & (np.abs(beyond) < bundle.length_m / 2)
-    return bool((inside & (lower < bundle.width_m / 2)).sum() > 1)
+    return bool((inside & (lower < bundle.width_m / 2)).any())
