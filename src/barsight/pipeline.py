@@ -2,7 +2,7 @@
 
 recording -> rectified pair -> disparity -> points --+
 crane or matched features -> trajectory -------------+-> map -> height surface -> contours -> agreement
-                                                              +-> bundles -> a closer look -> lifts
+                                                              +-> bundles -> their flanks, bars -> lifts
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from barsight.yard.types import Bundle
 
 _SHAPE_SIGMA, _, _ONE_BAR_SIGMA = DIAMETER_RATIOS
 _SHAPE_SHARE = 0.9
-"""How often a diameter by the bars' shape in the map is right within its sigma."""
+"""Share of the diameters by the bars' shape in the map that are right within their sigma."""
 _MAX_SHAPE_SIGMA = 0.1
 """Of a diameter: one that is said to be surer is told by the bars' shape."""
 _MIN_PLACES = 40
@@ -26,8 +26,8 @@ _LOWER, _MAX_LOWER_RATIO = 0.05, 0.75
 """Quantile of the lower bound, and the largest that it may be of the mean where the pitch alone tells: packs,
 finishes and light differ from those that were learnt from."""
 _FINER_RATIO = 0.5
-"""What is told as one bar is unsure where the pitch is finer: a bar's gloss and scratches are. Where the 95 %
-quantile is under half of it, they are many thin bars."""
+"""Ratio of the 95 % quantile to what is told as one bar under which it is many thin ones. Where the pitch is
+less fine, the bar is unsure: its gloss and scratches have one too."""
 _MAX_MISFIT = 1.5
 """No diameter explains a spectrum with a larger one: 1 % of drawn packs have it."""
 _MIN_POWER_LOG = -6.0

@@ -10,11 +10,14 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage
 
-from barsight.bundle_pictures.strap_ends import APART_M, REACH_M, StrapEnds
+from barsight.bundle_pictures.samples import bundle_axes
+from barsight.bundle_pictures.strap_ends import REACH_M, StrapEnds
 from barsight.core.arrays import Float64
 from barsight.core.linalg.robust import nan_medians
 from barsight.labels.placing import heights_at
+from barsight.yard.bundles.section.packs import dip_depth
 from barsight.yard.bundles.section.seen_section import is_overhung, over_floor, section_of_pack
+from barsight.yard.bundles.section.straps import APART_M, MIN_STRAPS
 from barsight.yard.lift_settings import UPPER
 from barsight.yard.sections import part_about
 from barsight.yard.types import Bundle, Doubt, DoubtKind, YardMap
@@ -23,8 +26,8 @@ _WEAK_RATIO, _STRONG = 0.5, 4
 """Lines with less than this share of the fourth strongest's contrast are no straps."""
 _SAME_M = 0.01
 """Ends of straps this near to their median agree."""
-_AGREE_RATIO, _MIN_STRAPS = 0.5, 2
-"""Share of the lines' ends of which more must agree, and of how many straps at least."""
+_AGREE_RATIO = 0.5
+"""Share of the lines' ends of which more must agree."""
 _FLANK_SIGMA_M, _MIDDLE_SIGMA_M = 0.008, 0.004
 """Of a flank that straps tell, and at least a pixel; of the centre of mass, from the middle between the
 flanks."""
@@ -35,7 +38,7 @@ _CELL_M, _ROW_M, _TRIM_M = 0.01, 0.03, 0.1
 _CREST_RATIO, _BESIDE_M = 0.35, 0.02
 """Of the width, to either side: where a bundle is highest; what a map smears of a gully."""
 _INSIDE_M, _OUTSIDE_M, _RIM_M = 0.015, 0.02, 0.045
-"""How far within and beyond a flank the surface must end; reach of a gully's two sides."""
+"""Distances within and beyond a flank up to which the surface must end; reach of a gully's two sides."""
 _DEEP_RATIO, _DEEP_M = 0.6, 0.15
 """Depth under the crest, of the width and at least, that no pack's surface has."""
 _FALL_RATIO, _MIN_FALL_M, _FALL_BARS, _DENT_M = 0.15, 0.02, 0.5, 0.006
@@ -64,8 +67,7 @@ class MeanSection:
     @classmethod
     def of(cls, bundle: Bundle, heights: YardMap) -> MeanSection:
         """Average the map along a bundle."""
-        along = bundle.direction / np.linalg.norm(bundle.direction[:2])
-        across = np.array([along[1], -along[0], 0.0])
+        along, across = bundle_axes(bundle)
         half = bundle.width_m / 2 + REACH_M
         beside = np.arange(-half, half, _CELL_M)
         rows = np.arange(-bundle.length_m / 2 + _TRIM_M, bundle.length_m / 2 - _TRIM_M, _ROW_M)[:, None]
@@ -118,11 +120,9 @@ class MeanSection:
         if not seen.size:
             return True
         apart_m = _CELL_M * (np.diff(np.concatenate([[-1], seen, [level.size]])).max() - 1)
-        known = level[seen]
-        rims = np.minimum(np.maximum.accumulate(known), np.maximum.accumulate(known[::-1])[::-1])
         width_m = min(high_m - low_m, self.width_m)
         deep_m = max(_PARTING_BARS * diameter_m, _PARTING_M, _PARTING_RATIO * width_m)
-        return bool((rims - known).max() > deep_m or apart_m > max(_HIDDEN_BARS * diameter_m, _HIDDEN_M))
+        return bool(dip_depth(level[seen]) > deep_m or apart_m > max(_HIDDEN_BARS * diameter_m, _HIDDEN_M))
 
 
 def with_flanks(
@@ -153,9 +153,9 @@ def with_flanks(
     if not any(doubt.kind is DoubtKind.MAY_GO_ON for doubt in bundle.reasons):
         found, found_sigma = section_of_pack(width, spread, over_floor(bundle.top_z_m, floor_m))
         bundle, sigma = replace(bundle, section_m2=found), replace(sigma, section_m2=found_sigma)
-    along = bundle.direction / np.linalg.norm(bundle.direction[:2])
+    _, across = bundle_axes(bundle)
     # The axis of what is as high as wide lies half its width under its top.
-    aside = middle * np.array([along[1], -along[0], 0.0]) + [0, 0, (bundle.width_m - width) / 2]
+    aside = middle * across + [0, 0, (bundle.width_m - width) / 2]
     return replace(
         bundle, centre_m=bundle.centre_m + aside, ends_m=bundle.ends_m + aside, width_m=width, sigma=sigma,
         fit_sigma=None,
@@ -187,7 +187,7 @@ class _Flank(NamedTuple):
 def _agreed_flanks(straps: Sequence[StrapEnds]) -> tuple[_Flank, _Flank] | None:
     """Find where most straps end on either side, of those that stand out; None where they don't agree."""
     contrasts = sorted((strap.contrast for strap in straps), reverse=True)
-    if len(contrasts) < _MIN_STRAPS:
+    if len(contrasts) < MIN_STRAPS:
         return None
     least = _WEAK_RATIO * contrasts[min(_STRONG, len(contrasts)) - 1]
     kept = [strap for strap in straps if strap.contrast >= least]
@@ -203,7 +203,7 @@ def _agreed(ends_m: Float64, along_m: Float64, pixel_m: float) -> _Flank | None:
     for end in ends_m[np.isfinite(ends_m)]:
         same = np.abs(ends_m - end) <= _SAME_M
         straps = 1 + int((np.diff(np.sort(along_m[same])) > APART_M / 2).sum())
-        if straps >= _MIN_STRAPS and same.sum() > best.sum():
+        if straps >= MIN_STRAPS and same.sum() > best.sum():
             best = same
     if best.sum() <= _AGREE_RATIO * ends_m.size:
         return None
@@ -214,8 +214,8 @@ def _agreed(ends_m: Float64, along_m: Float64, pixel_m: float) -> _Flank | None:
 def takes_another(bundle: Bundle, others: Sequence[Bundle]) -> bool:
     """Check whether another bundle's middle lies within a bundle's flanks, at about its height."""
     centres = np.array([other.centre_m for other in others]).reshape(-1, 3) - bundle.centre_m
-    along = bundle.direction[:2] / np.linalg.norm(bundle.direction[:2])
-    beside, beyond = centres @ [along[1], -along[0], 0.0], centres[:, :2] @ along
+    along, across = bundle_axes(bundle)
+    beside, beyond = centres @ across, centres[:, :2] @ along[:2]
     lower = np.abs([other.top_z_m - bundle.top_z_m for other in others])
     inside = (np.abs(beside) < bundle.width_m / 2) & (np.abs(beyond) < bundle.length_m / 2)
     return bool((inside & (lower < bundle.width_m / 2)).any())

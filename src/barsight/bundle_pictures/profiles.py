@@ -8,7 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from barsight.bundle_pictures.samples import DARKEST, BundleWindow, PlacedFrames, WindowPicture, is_hidden
+from barsight.bundle_pictures.samples import (
+    DARKEST,
+    BundleWindow,
+    PlacedFrames,
+    WindowPicture,
+    bundle_axes,
+    is_hidden,
+)
 from barsight.core.arrays import Float64
 from barsight.labels.placing import heights_at
 from barsight.yard.sections import part_about
@@ -63,8 +70,7 @@ def _windows(number: int, bundle: Bundle, heights: YardMap) -> Iterator[tuple[He
     if not (half > STEP_M and 2 * reach >= WINDOW_M and np.isfinite(bundle.centre_m).all()):
         return
     count = min(int(2 * reach / WINDOW_M), _MAX_WINDOWS)
-    along = bundle.direction / np.linalg.norm(bundle.direction[:2])
-    across = np.array([along[1], -along[0], 0.0])
+    along, across = bundle_axes(bundle)
     beside = np.arange(-half, half, STEP_M)
     level = np.append(along[:2], 0.0)
     rows = np.arange(-WINDOW_M / 2, WINDOW_M / 2 + _ROW_M / 2, _ROW_M)[:, None] * level

@@ -15,7 +15,7 @@ from barsight.core.pose import Pose
 from barsight.core.types import RefusedFrame
 from barsight.labels.placing import PlacedCamera, heights_at
 from barsight.recording.rectified_pairs import RectifiedPairs
-from barsight.yard.types import HeightMap
+from barsight.yard.types import Bundle, HeightMap
 
 _OVER_M, _MAX_RISE_M, _HIDDEN_RATIO = 0.05, 1.0, 0.05
 """A line of sight is followed up to so high, in such steps; the share of a line of places that may be
@@ -24,6 +24,12 @@ DARKEST = 8.0
 """Gray levels that are added before their logarithm: noise of dark ones counts less."""
 _TRIED = 10
 """Frames, the nearest ones, that are tried for a window."""
+
+
+def bundle_axes(bundle: Bundle) -> tuple[Float64, Float64]:
+    """Compute a bundle's way (3,) per level metre along it, and the level unit vector (3,) across."""
+    along = bundle.direction / np.linalg.norm(bundle.direction[:2])
+    return along, np.array([along[1], -along[0], 0.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,15 +118,8 @@ def sample_windows(
 def _sample(
     picture: UInt8, seen: UInt8, camera: PlacedCamera, window: BundleWindow
 ) -> tuple[UInt8, float] | None:  # fmt: skip
-    into = camera.map_from_rect.inverse()
-    # Projection is linear before the division: the sum of a row and a place of the middle line.
-    rows, middle = window.rows_m @ into.rotation.T, into.apply(window.middle_m)
-    right, down, depth = (rows[:, k, None] + middle[:, k] for k in range(3))
-    if depth.min() <= 0:
-        return None
-    x = (camera.focal_px * right / depth + camera.principal_px[0]).astype(np.float32)
-    y = (camera.focal_px * down / depth + camera.principal_px[1]).astype(np.float32)
-    if not cv2.remap(seen, x, y, cv2.INTER_NEAREST, borderValue=0).all():
+    x, y, depth = camera.project_sums(window.rows_m, window.middle_m)
+    if depth.min() <= 0 or not cv2.remap(seen, x, y, cv2.INTER_NEAREST, borderValue=0).all():
         return None
     gray = cv2.remap(picture, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(gray, np.uint8), float(np.median(depth)) / camera.focal_px

@@ -7,6 +7,7 @@ wide as its outline in the picture, whatever the view.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterator, Sequence
 from itertools import pairwise
 from typing import NamedTuple
@@ -14,8 +15,16 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage
 
-from barsight.bundle_pictures.samples import DARKEST, BundleWindow, PlacedFrames, WindowPicture, is_hidden
+from barsight.bundle_pictures.samples import (
+    DARKEST,
+    BundleWindow,
+    PlacedFrames,
+    WindowPicture,
+    bundle_axes,
+    is_hidden,
+)
 from barsight.core.arrays import Bool, Float64, UInt8
+from barsight.yard.bundles.section.straps import APART_M, DENSE_M, strongest_lines
 from barsight.yard.lifting.load import is_one_bar
 from barsight.yard.sections import part_about
 from barsight.yard.types import Bundle, YardMap
@@ -44,8 +53,6 @@ _SMOOTH_M, _END_RATIO = 0.02, 0.5
 """A strap ends where its contrast, averaged so far across, is less than this share of the middle's."""
 _GULLY_BARS, _MIN_GULLY_M = 0.45, 0.016
 """A gully between two bars, of their diameter and at least, doesn't end a strap."""
-APART_M, _DENSE_M = 0.3, 0.45
-"""Straps are no nearer to each other than the first, and on average over a bundle than the second."""
 _LINE_M = 0.0015
 """A strap shows so far beyond the bundle: it is this thick, and blurred."""
 
@@ -105,8 +112,7 @@ def _windows(number: int, bundle: Bundle) -> Iterator[BundleWindow]:
     """Divide a bundle's length into windows that reach beyond its flanks."""
     if not (np.isfinite(bundle.centre_m).all() and bundle.width_m > 0 and bundle.length_m > 2 * APART_M):
         return
-    along = bundle.direction / np.linalg.norm(bundle.direction[:2])
-    across = np.array([along[1], -along[0], 0.0])
+    along, across = bundle_axes(bundle)
     half = bundle.width_m / 2 + REACH_M
     beside = np.arange(-half, half, _STEP_M)
     middle = np.append(bundle.centre_m[:2], bundle.top_z_m - bundle.width_m / 2)
@@ -153,14 +159,9 @@ def _contrast(gray: UInt8) -> Float64:
 
 def _strap_rows(strength: Float64) -> list[int]:
     """Choose the rows (R,) with the strongest lines, APART_M from each other."""
-    rows = list[int]()
-    most = max(int(strength.size * _ROW_M / _DENSE_M), 2)
-    for row in np.argsort(-np.abs(strength), kind="stable").tolist():
-        if abs(strength[row]) < _STRAP or len(rows) == most:
-            break
-        if all(abs(row - other) * _ROW_M > APART_M for other in rows):
-            rows.append(row)
-    return rows
+    lines = np.flatnonzero(np.abs(strength) >= _STRAP)
+    rows = strongest_lines(np.abs(strength[lines]), lines, math.ceil(APART_M / _ROW_M))
+    return [int(row) for row in rows[: max(int(strength.size * _ROW_M / DENSE_M), 2)]]
 
 
 def _end(seen: Bool, bridged: int) -> int | None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from barsight.core.arrays import Float64
+from barsight.core.arrays import Float32, Float64
 from barsight.core.pose import Pose
 from barsight.core.stamps import NS_PER_S
 from barsight.core.types import RectifiedCamera
@@ -45,6 +45,19 @@ class PlacedCamera:
         depth = seen[..., 2]
         ahead = np.where(depth > 0, depth, np.nan)[..., None]
         return self.focal_px * seen[..., :2] / ahead + np.array(self.principal_px), depth
+
+    def project_sums(self, ways_m: Float64, places_m: Float64) -> tuple[Float32, Float32, Float64]:
+        """Project the sums of ways (R, 3) and places (N, 3), which is linear before the division: pixels x, y
+        and depth, m, (R, N) each. Pixels are none where the depth isn't over 0.
+        """
+        into = self.map_from_rect.inverse()
+        ways, places = ways_m @ into.rotation.T, into.apply(places_m)
+        right, down, depth = (ways[:, k, None] + places[:, k] for k in range(3))
+        x, y = (
+            (self.focal_px * way / depth + middle).astype(np.float32)
+            for way, middle in zip((right, down), self.principal_px, strict=True)
+        )
+        return x, y, depth
 
 
 def pose_at(path: CameraPath, stamp_ns: int) -> Pose | None:

@@ -120,7 +120,7 @@ def find_pack(
     top = float(level_m[inside].max())
     cell = float(beside_m[1] - beside_m[0])
     level_inside = level_m[inside[0] : inside[-1] + 1]
-    is_one = own.spread_m <= _SPREAD_M and _dip(level_inside) < _DIP_RATIO * own.width_m
+    is_one = own.spread_m <= _SPREAD_M and dip_depth(level_inside) < _DIP_RATIO * own.width_m
     ends, others, sides, hidden = [], [], [], []
     for step, at, beyond in ((-1, inside[0], spans[:number][::-1]), (1, inside[-1], spans[number + 1 :])):
         near, begin, shared = np.inf, None, None
@@ -164,7 +164,7 @@ def contradicts(pack: Pack, width_m: float) -> tuple[float, str]:
     return 0.0, ""
 
 
-def _dip(level: Float64) -> float:
+def dip_depth(level: Float64) -> float:
     """Compute how deep the surface sinks between two higher places; what isn't seen lies on the floor."""
     seen = np.nan_to_num(level, nan=-FLOOR_M, neginf=-FLOOR_M)
     between = np.minimum(np.maximum.accumulate(seen), np.maximum.accumulate(seen[::-1])[::-1])

@@ -42,13 +42,13 @@ _BREAK_M = 0.08
 """A strap may be as bright as the bars over so much of its length."""
 _CLOSE_M = 0.05
 """Rows nearer to what lies over the outline tell nothing: it throws shade."""
-_DENSE_M = 0.45
+DENSE_M = 0.45
 """Straps are no nearer to each other than this, on average over a bundle's length."""
 MIN_STRAPS, MIN_ROWS = 2, 20
 """Fewest straps that hold a bundle, and rows of the map that tell its mean section."""
 _LINE_M, _END_M = 0.05, 0.08
 """Half the length along the bars over which a strap's place is averaged, and the width of either end."""
-_APART_M = 0.3
+APART_M = 0.3
 """Lines nearer to each other along the bars are one strap."""
 
 
@@ -117,13 +117,13 @@ def _span(
     """
     first, last, teeth = stretch
     cell_m = float(beside_m[1] - beside_m[0])
-    rows = _strongest(contrast[teeth, first:last].mean(axis=1), teeth, round(_APART_M / cell_m))
+    rows = strongest_lines(contrast[teeth, first:last].mean(axis=1), teeth, round(APART_M / cell_m))
     strong = contrast[rows, first:last]
     least = np.full(rows.size, _EDGE)
     if is_faint:
         least = np.maximum(np.percentile(strong, 75, axis=1) / 2, _FAINT_EDGE)
     ends = _ends(strong > least[:, None], round(_BREAK_M / cell_m) | 1)
-    if ends is None or not MIN_STRAPS <= rows.size <= max(len(contrast) * cell_m / _DENSE_M, 2):
+    if ends is None or not MIN_STRAPS <= rows.size <= max(len(contrast) * cell_m / DENSE_M, 2):
         return None
     low, high = np.median(ends, axis=0)
     if high - low < narrowest:
@@ -179,10 +179,10 @@ def _sampled(levels: UInt8, places: tuple[Float32, Float32]) -> Float32:
     return np.asarray(cv2.remap(seen, *places, cv2.INTER_LINEAR, borderValue=np.nan), np.float32)
 
 
-def _strongest(strength: Float64, teeth: Int64, apart: int) -> Int64:
+def strongest_lines(strength: Float64, teeth: Int64, apart: int) -> Int64:
     """Keep of lines nearer to each other than `apart` rows the strongest: (S,) rows of straps."""
     kept: list[int] = []
-    for k in np.argsort(-strength):
+    for k in np.argsort(-strength, kind="stable"):
         if all(abs(teeth[k] - row) >= apart for row in kept):
             kept.append(int(teeth[k]))
     return np.array(kept, np.int64)
