@@ -47,7 +47,8 @@ def measure_from_pictures(
         told = out[k] = with_pitch(bundle, seen)
         if ends and not is_one_bar(told):
             placed = with_flanks(told, ends, MeanSection.of(bundle, heights), floor, tilt)
-            others = [other for other in bundles if other is not bundle]
+            moved = placed.centre_m is not told.centre_m
+            others = [other for other in bundles if moved and other is not bundle]
             out[k] = told if takes_another(placed, others) else placed
     return tuple(out)
 
