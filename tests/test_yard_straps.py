@@ -208,18 +208,26 @@ def test_straps_make_a_bundle_of_a_level_top(width_m: float, top_m: float) -> No
             assert one.top_z_m == pytest.approx(top_m, abs=0.02) and one.on_top is True
 
 
+@pytest.mark.parametrize("at_border", [False, True])
 @pytest.mark.parametrize(("straps", "carried"), [((), False), ((), True), (STRAPS, False), (STRAPS, True)])
-def test_what_nothing_carries_may_be_a_wall(straps: tuple[float, ...], carried: bool) -> None:
-    """Something round 0.6 m over the floor: alone or on beams across."""
+def test_what_nothing_carries_may_be_a_wall(
+    straps: tuple[float, ...], carried: bool, at_border: bool
+) -> None:
+    """Something round 0.6 m over the floor: alone or on beams across; one of its sides may be out of view,
+    where beams tell nothing.
+    """
     heights = drawn([(0.2, 0.4, straps)], np.random.default_rng(3))
     heights.z_m[heights.z_m > 0.1] += 0.3
     if carried:
         y = heights.y0_m + CELL * np.arange(heights.z_m.shape[0])
         beams = (np.abs(np.abs(y) - 1.5) < 0.06)[:, None] & (heights.z_m < 0.1)
         heights.z_m[beams] = 0.28
+    if at_border:
+        beyond = heights.x_m > 0.405
+        heights.z_m[:, beyond], heights.source[:, beyond] = np.nan, HeightSource.UNKNOWN
     (one,) = find_bundles(heights, BundleSettings())
     is_wall = DoubtKind.WALL in {doubt.kind for doubt in one.reasons}
-    assert is_wall is not carried
+    assert is_wall is (at_border or not carried)
     assert one.on_top is (None if is_wall else True)
     assert (one.confidence < 0.5) is is_wall
 

@@ -125,7 +125,7 @@ def list_wall_doubts(
     """List the doubt about what may be a wall: no flank falls off, or nothing carries it so high."""
     if reading.is_flat:
         return (Doubt(DoubtKind.WALL, "neither flank falls off: it may be a wall"),)
-    if seen is None or floor_m is None or not seen.sides_free:
+    if seen is None or floor_m is None:
         return ()
     if top_m - floor_m <= MAX_HEIGHT_RATIO * reading.found.fit.width_m + _MAX_DUNNAGE_M:
         return ()
