@@ -223,7 +223,7 @@ def test_what_nothing_carries_may_be_a_wall(
         beams = (np.abs(np.abs(y) - 1.5) < 0.06)[:, None] & (heights.z_m < 0.1)
         heights.z_m[beams] = 0.28
     if at_border:
-        beyond = heights.x_m > 0.405
+        beyond = heights.x_m > 0.395
         heights.z_m[:, beyond], heights.source[:, beyond] = np.nan, HeightSource.UNKNOWN
     (one,) = find_bundles(heights, BundleSettings())
     is_wall = DoubtKind.WALL in {doubt.kind for doubt in one.reasons}

@@ -1,4 +1,4 @@
-"""Place a bundle's flanks where its straps end in the pictures, each side by itself."""
+"""Place a bundle's flanks where its straps end in the pictures."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from scipy import ndimage
 
 from barsight.bundle_pictures.samples import bundle_axes
-from barsight.bundle_pictures.strap_ends import REACH_M, STEP_M, Strap
+from barsight.bundle_pictures.strap_ends import REACH_M, StrapEnds
 from barsight.core.arrays import Float64
 from barsight.core.linalg.robust import nan_medians
 from barsight.labels.placing import heights_at
@@ -22,19 +22,12 @@ from barsight.yard.lift_settings import UPPER
 from barsight.yard.sections import part_about
 from barsight.yard.types import Bundle, Doubt, DoubtKind, YardMap
 
-_LINE_M = 0.0015
-"""A strap shows so far beyond the bundle: it is this thick, and blurred."""
-_NEVER = 6.0
-"""Log-likelihood ratio by which one strap may speak against a flank, at most."""
-_VOTE, _VOTE_STEPS = 1.5, 2
-"""A strap speaks for a flank where the place that it ends at best, or one so many steps off, is no more
-likely than this."""
+_WEAK_RATIO, _STRONG = 0.5, 4
+"""Lines with less than this share of the fourth strongest's contrast are no straps."""
+_SAME_M = 0.01
+"""Ends of straps this near to their median agree."""
 _AGREE_RATIO = 0.5
-"""Share of the straps of which more must speak for a flank."""
-_APART_M, _LESS_LIKELY = 0.012, 6.0
-"""Other places for a flank, so far off, must be less likely by this."""
-_WIDER_M = 0.03
-"""A flank that straps tell where the map has it, or so far beyond, needs no edge of the surface."""
+"""Share of the lines' ends of which more must agree."""
 _FLANK_SIGMA_M, _MIDDLE_SIGMA_M = 0.008, 0.004
 """Of a flank that straps tell, and at least a pixel; of the centre of mass, from the middle between the
 flanks."""
@@ -46,8 +39,9 @@ _CREST_RATIO, _BESIDE_M = 0.35, 0.02
 """Of the width, to either side: where a bundle is highest; what a map smears of a gully."""
 _INSIDE_M, _OUTSIDE_M, _RIM_M = 0.015, 0.02, 0.045
 """Distances within and beyond a flank up to which the surface must end; reach of a gully's two sides."""
-_DEEP_RATIO, _DEEP_M = 0.6, 0.15
-"""Depth under the crest, of the width and at least, that no pack's surface has."""
+_DEEP_RATIO, _DEEP_M, _BEFORE = 0.6, 0.15, 3
+"""Depth under the crest, of the width and at least, that no pack's surface has; of so many places before a
+flank one must not lie so deep."""
 _FALL_RATIO, _MIN_FALL_M, _FALL_BARS, _DENT_M = 0.15, 0.02, 0.5, 0.006
 """Least depth of a gully that parts a bundle from the next, of the width, and in bars; least rise on either
 side of it."""
@@ -91,9 +85,8 @@ class MeanSection:
         return cls(beside, mean, bundle.width_m)
 
     def ends_at(self, flank_m: float, side: int, diameter_m: float) -> bool:
-        """Check whether the surface ends about a flank: the map tells it there, or it falls far, isn't seen,
-        or rises again behind a gully that is deeper or wider than one between the bundle's bars; and nothing
-        higher follows it. side: -1 for the low flank, else 1.
+        """Check whether the surface ends about a flank: it falls far, isn't seen, or rises again behind a
+        gully that is deeper or wider than one between the bundle's bars. side: -1 for the low flank, else 1.
         """
         outwards = side * (self.beside_m - flank_m)
         order = np.argsort(outwards)
@@ -103,8 +96,9 @@ class MeanSection:
         if not (np.isfinite(crest).any() and near.size):
             return False
         depth = crest[np.isfinite(crest)].max() - level
-        if bool((depth[near] > max(_DEEP_RATIO * self.width_m, _DEEP_M)).any()):
-            return True
+        deep = depth > max(_DEEP_RATIO * self.width_m, _DEEP_M)
+        if bool(deep[near].any()):
+            return not bool(deep[max(near[0] - _BEFORE, 0) : near[0]].all())
         rims = round(_RIM_M / _CELL_M)
         min_depth = max(_FALL_RATIO * self.width_m, _MIN_FALL_M, _FALL_BARS * diameter_m)
         run = np.ones(round(max(_HIDDEN_BARS * diameter_m, _MIN_HIDDEN_M) / _CELL_M), bool)
@@ -118,7 +112,7 @@ class MeanSection:
             rises = [part[np.isfinite(part)].max(initial=-np.inf) - level[k] for part in (before, behind)]
             if depth[k] >= min_depth and min(rises) >= _DENT_M:
                 return True
-        return 0 <= side * flank_m - self.width_m / 2 <= _WIDER_M
+        return False
 
     def is_parted(self, low_m: float, high_m: float, diameter_m: float) -> bool:
         """Check whether a gully between two flanks is as deep, or as wide, as one between two bundles."""
@@ -134,58 +128,39 @@ class MeanSection:
 
 
 def with_flanks(
-    bundle: Bundle, straps: Sequence[Strap], section: MeanSection, floor_m: float | None, tilt: float
+    bundle: Bundle, straps: Sequence[StrapEnds], section: MeanSection, floor_m: float | None, tilt: float
 ) -> Bundle:
-    """Place a bundle's flanks where most of its straps end; the same bundle where straps tell neither flank,
-    the map's section speaks against them, or something lies on the bundle or may lie over it.
+    """Place a bundle's flanks where most of its straps end; the same bundle where they don't agree, the map's
+    section speaks against it, or something lies on the bundle or may lie over it.
 
     floor_m: height of the floor. tilt: way aside of the lines of sight over their height. The section is
     estimated anew. Where straps end far off the flanks that the map told, the bundle is only made unsure.
     """
-    if not bundle.is_free:
+    flanks = _agreed_flanks(straps) if bundle.is_free else None
+    if flanks is None:
         return bundle
-    own, plane_m = bundle.sigma, tilt * _PLANE_RATIO * bundle.width_m
+    (low, high), own = (flank.beside_m for flank in flanks), bundle.sigma
     diameter = float(np.nan_to_num(bundle.bar_diameter_m + UPPER * np.nan_to_num(own.bar_diameter_m)))
-    straps_tell = [told_flank(straps, side) for side in (-1, 1)]
-    ended = [
-        flank if flank and section.ends_at(flank.beside_m, side, diameter) else None
-        for flank, side in zip(straps_tell, (-1, 1), strict=True)
-    ]
-    if not any(ended) or (None not in straps_tell and None in ended):
+    ended = (section.ends_at(flank, side, diameter) for flank, side in ((low, -1), (high, 1)))
+    if not all(ended) or section.is_parted(low, high, diameter):
         return bundle
-    map_m = math.hypot(own.lateral_m, own.width_m / 2)
-    (low, low_m, _), (high, high_m, _) = (
-        flank or Flank(side * bundle.width_m / 2, map_m, 0.0)
-        for flank, side in zip(ended, (-1, 1), strict=True)
-    )
-    if low >= high or section.is_parted(low, high, diameter):
-        return bundle
-    width, middle, spread = high - low, (low + high) / 2, math.hypot(low_m, high_m, plane_m)
+    width, middle = high - low, (low + high) / 2
     off = abs(np.array([middle, width - bundle.width_m])) / np.fmax([own.lateral_m, own.width_m], 1e-6)
     if off.max() > _CONTRADICTED or abs(middle) > _MAX_ASIDE_M:
         return _contradicted(bundle, middle, width)
-    if spread >= own.width_m:
-        return bundle
-    turned = own.yaw_rad * max(abs(flank.along_m) for flank in ended if flank)
+    plane_m = tilt * _PLANE_RATIO * width
+    moved = abs(low + bundle.width_m / 2) / 2, abs(high - bundle.width_m / 2) / 2
+    spread = math.hypot(*(flank.sigma_m for flank in flanks), *moved, plane_m)
+    turned = own.yaw_rad * max(abs(flank.along_m) for flank in flanks)
     sigma = replace(own, width_m=spread, lateral_m=math.hypot(spread / 2, _MIDDLE_SIGMA_M, plane_m, turned))
-    may_go_on = any(doubt.kind is DoubtKind.MAY_GO_ON for doubt in bundle.reasons)
-    told = not may_go_on and (None not in ended or bool(np.isfinite(bundle.section_m2)))
-    return _placed(replace(bundle, sigma=sigma), middle, width, floor_m, is_section_told=told)
-
-
-def _placed(
-    bundle: Bundle, middle_m: float, width_m: float, floor_m: float | None, *, is_section_told: bool
-) -> Bundle:
-    """Move a bundle's middle aside and give it a width, whose sigma it has, and the section by that."""
-    if is_section_told:
-        over_m = over_floor(bundle.top_z_m, floor_m)
-        found, found_sigma = section_of_pack(width_m, bundle.sigma.width_m, over_m)
-        bundle = replace(bundle, section_m2=found, sigma=replace(bundle.sigma, section_m2=found_sigma))
+    if not any(doubt.kind is DoubtKind.MAY_GO_ON for doubt in bundle.reasons):
+        found, found_sigma = section_of_pack(width, spread, over_floor(bundle.top_z_m, floor_m))
+        bundle, sigma = replace(bundle, section_m2=found), replace(sigma, section_m2=found_sigma)
     _, across = bundle_axes(bundle)
     # The axis of what is as high as wide lies half its width under its top.
-    aside = middle_m * across + [0, 0, (bundle.width_m - width_m) / 2]
+    aside = middle * across + [0, 0, (bundle.width_m - width) / 2]
     return replace(
-        bundle, centre_m=bundle.centre_m + aside, ends_m=bundle.ends_m + aside, width_m=width_m,
+        bundle, centre_m=bundle.centre_m + aside, ends_m=bundle.ends_m + aside, width_m=width, sigma=sigma,
         fit_sigma=None,
     )  # fmt: skip
 
@@ -204,7 +179,7 @@ def _contradicted(bundle: Bundle, middle_m: float, width_m: float) -> Bundle:
     return replace(bundle, section_m2=math.nan, sigma=unsure, reasons=reasons)
 
 
-class Flank(NamedTuple):
+class _Flank(NamedTuple):
     """Place of a flank beside the axis with its sigma, and mean place along of the straps that tell it."""
 
     beside_m: float
@@ -212,30 +187,31 @@ class Flank(NamedTuple):
     along_m: float
 
 
-def told_flank(straps: Sequence[Strap], side: int) -> Flank | None:
-    """Find where all straps together end on one side; None where too few do, or elsewhere nearly as likely.
+def _agreed_flanks(straps: Sequence[StrapEnds]) -> tuple[_Flank, _Flank] | None:
+    """Find where most straps end on either side, of those that stand out; None where they don't agree."""
+    contrasts = sorted((strap.contrast for strap in straps), reverse=True)
+    if len(contrasts) < MIN_STRAPS:
+        return None
+    least = _WEAK_RATIO * contrasts[min(_STRONG, len(contrasts)) - 1]
+    kept = [strap for strap in straps if strap.contrast >= least]
+    along, pixel_m = np.array([strap.along_m for strap in kept]), max(strap.pixel_m for strap in kept)
+    low = _agreed(np.array([strap.low_m for strap in kept]), along, pixel_m)
+    high = _agreed(np.array([strap.high_m for strap in kept]), along, pixel_m)
+    return None if low is None or high is None or low.beside_m >= high.beside_m else (low, high)
 
-    Of each strap the log-likelihood ratios over its own best place are summed, down to -_NEVER, so that one
-    that a neighbour's goes on from, or that fades, is outvoted. side: -1 for the low flank, else 1.
-    """
-    if len(straps) < MIN_STRAPS:
+
+def _agreed(ends_m: Float64, along_m: Float64, pixel_m: float) -> _Flank | None:
+    """Compute the median of the ends (S,) that agree, of straps at along_m; None where they are too few."""
+    best = np.zeros(ends_m.size, bool)
+    for end in ends_m[np.isfinite(ends_m)]:
+        same = np.abs(ends_m - end) <= _SAME_M
+        straps = 1 + int((np.diff(np.sort(along_m[same])) > APART_M / 2).sum())
+        if straps >= MIN_STRAPS and same.sum() > best.sum():
+            best = same
+    if best.sum() <= _AGREE_RATIO * ends_m.size:
         return None
-    sums = [strap.low if side < 0 else strap.high for strap in straps]
-    reach = min(one.size for one in sums)
-    ratios = np.array([np.maximum(one[:reach] - one[:reach].max(), -_NEVER) for one in sums])
-    total = ratios.sum(axis=0)
-    best = int(np.argmax(total))
-    near = slice(max(best - _VOTE_STEPS, 0), best + _VOTE_STEPS + 1)
-    votes = ratios[:, near].max(axis=1) > -_VOTE
-    along = np.array([strap.along_m for strap in straps])[votes]
-    places = 1 + int((np.diff(np.sort(along)) > APART_M / 2).sum())
-    if not votes.any() or places < MIN_STRAPS or votes.mean() <= _AGREE_RATIO:
-        return None
-    away = np.abs(np.arange(reach) - best) * STEP_M > _APART_M
-    if best >= reach - 1 - _VOTE_STEPS or total[away].max() > total[best] - _LESS_LIKELY:
-        return None
-    sigma = max(_FLANK_SIGMA_M, *(strap.pixel_m for strap in straps))
-    return Flank(side * (STEP_M * (best + 0.5) - _LINE_M), sigma, float(along.mean()))
+    spread = math.hypot(max(_FLANK_SIGMA_M, pixel_m), float(np.std(ends_m[best])))
+    return _Flank(float(np.median(ends_m[best])), spread, float(along_m[best].mean()))
 
 
 def takes_another(bundle: Bundle, others: Sequence[Bundle]) -> bool:

@@ -8,7 +8,7 @@ from barsight.bundle_pictures.diameters import with_pitch
 from barsight.bundle_pictures.flanks import MeanSection, takes_another, with_flanks
 from barsight.bundle_pictures.profiles import PitchProfile, pitch_windows
 from barsight.bundle_pictures.samples import PlacedFrames, sample_windows
-from barsight.bundle_pictures.strap_ends import Strap, find_straps, strap_windows, view_tilt
+from barsight.bundle_pictures.strap_ends import StrapEnds, find_straps, strap_windows, view_tilt
 from barsight.core.pose import Pose
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.yard.bundles.floor import find_floor
@@ -30,7 +30,7 @@ def measure_from_pictures(
     windows = list(pitch_windows(frames, heights, unsure))
     first_strap = len(windows)
     windows += strap_windows(frames, {k for k, _ in windows}, heights, unsure)
-    profiles, straps = [list[PitchProfile]() for _ in unsure], [list[Strap]() for _ in unsure]
+    profiles, straps = [list[PitchProfile]() for _ in unsure], [list[StrapEnds]() for _ in unsure]
     for place, picture in sample_windows(pairs, frames, windows):
         _, window = windows[place]
         if not picture.is_sharp:

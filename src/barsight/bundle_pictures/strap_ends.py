@@ -1,8 +1,8 @@
-"""Find how far the straps of a bundle go on in the pictures: to its flanks, where they turn out of sight.
+"""Find where the straps of a bundle end in the pictures: at its flanks, where they turn out of sight.
 
 A strap is a line across the bars, darker or brighter than the steel before and after it. It is followed from
-the middle of the bundle to either side over a round section, and beside it on the level plane at half its
-height: there a round bundle is as wide as its outline in the picture, whatever the view.
+the middle of the bundle to either side, on the level plane at half its height: there a round bundle is as
+wide as its outline in the picture, whatever the view.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from barsight.bundle_pictures.samples import (
     bundle_axes,
     is_hidden,
 )
-from barsight.core.arrays import Float64, UInt8
+from barsight.core.arrays import Bool, Float64, UInt8
 from barsight.yard.bundles.section.straps import APART_M, DENSE_M, strongest_lines
 from barsight.yard.lifting.load import is_one_bar
 from barsight.yard.sections import part_about
 from barsight.yard.types import Bundle, YardMap
 
-STEP_M, _ROW_M = 0.004, 0.008
+_STEP_M, _ROW_M = 0.004, 0.008
 """Way between two places across a bundle, and along it."""
 REACH_M = 0.22
 """Search reach beyond the flanks of a bundle as the map tells it."""
@@ -44,26 +44,29 @@ _AROUND_M, _STRAP_ROWS = 0.4, 3
 _SCATTER_LOG, _MIN_SCATTER_LOG, _SCATTER_M = 0.3, 0.03, 0.06
 """Of the logarithm of gray levels along a bar: the most that counts for its scatter, the least scatter, and
 over how far across it is averaged."""
-_CLIPPED, _STRAP = 6.0, 1.5
-"""Contrasts over noise, and log-likelihood ratios: from where more counts no more. Least mean of a strap's
-contrast over the middle."""
+_CLIPPED, _STRAP, _SEEN = 6.0, 1.5, 1.2
+"""Contrasts over noise: from where more counts no more; the least mean of a strap's over the middle, and the
+least by which a place of it is seen."""
 _MIDDLE_RATIO, _MIN_MIDDLE_M = 0.3, 0.03
 """Of the width, to either side, and at least: the middle, where straps are looked for."""
-_ALIKE = 5
-"""Places across that share their pixels, and so their evidence."""
-_SLOPES = np.arange(-4, 5) * 0.025
-"""Of a strap, from square to the bundle's axis."""
+_SMOOTH_M, _END_RATIO = 0.02, 0.5
+"""A strap ends where its contrast, averaged so far across, is less than this share of the middle's."""
+_GULLY_BARS, _MIN_GULLY_M = 0.45, 0.016
+"""A gully between two bars, of their diameter and at least, doesn't end a strap."""
+_LINE_M = 0.0015
+"""A strap shows so far beyond the bundle: it is this thick, and blurred."""
 
 
-class Strap(NamedTuple):
-    """One strap in one picture: m along the bundle from its middle; log-likelihood ratios (N,), summed from
-    the axis outwards at places STEP_M apart on the low and on the high side, that the strap shows up to there
-    rather than steel alone; size of the picture's pixels there.
+class StrapEnds(NamedTuple):
+    """Ends of one strap in one picture: m along the bundle from its middle, m beside its axis, NaN where the
+    strap goes on to the window's side. contrast: of its middle over noise. pixel_m: size of the picture's
+    pixels there.
     """
 
     along_m: float
-    low: Float64
-    high: Float64
+    low_m: float
+    high_m: float
+    contrast: float
     pixel_m: float
 
 
@@ -110,38 +113,35 @@ def _windows(number: int, bundle: Bundle) -> Iterator[BundleWindow]:
     if not (np.isfinite(bundle.centre_m).all() and bundle.width_m > 0 and bundle.length_m > 2 * APART_M):
         return
     along, across = bundle_axes(bundle)
-    half = round((bundle.width_m / 2 + REACH_M) / STEP_M)
-    beside = STEP_M * np.arange(-half, half + 1)
-    inner = np.minimum(np.abs(beside) / (bundle.width_m / 2), 1)
-    fall = bundle.width_m / 2 * (1 - np.sqrt(1 - inner**2))
-    middle = np.append(bundle.centre_m[:2], bundle.top_z_m) - fall[:, None] * [0.0, 0.0, 1.0]
+    half = bundle.width_m / 2 + REACH_M
+    beside = np.arange(-half, half, _STEP_M)
+    middle = np.append(bundle.centre_m[:2], bundle.top_z_m - bundle.width_m / 2)
     edges = np.linspace(-0.5, 0.5, int(bundle.length_m / _WINDOW_M) + 2) * bundle.length_m
     for low, high in pairwise(edges.tolist()):
         rows = np.arange(low, high, _ROW_M)[:, None] * along
         yield BundleWindow(number, middle + beside[:, None] * across, rows)
 
 
-def find_straps(picture: WindowPicture, window: BundleWindow, bundle: Bundle) -> list[Strap]:
-    """Find the straps in a window of a bundle, and how far each goes on."""
+def find_straps(picture: WindowPicture, window: BundleWindow, bundle: Bundle) -> list[StrapEnds]:
+    """Find the straps in a window of a bundle, and where each ends."""
     contrast = _contrast(picture.gray)
-    half = contrast.shape[1] // 2
-    beside = STEP_M * np.arange(-half, half + 1)
+    beside = _STEP_M * (np.arange(contrast.shape[1]) - (contrast.shape[1] - 1) / 2)
     middle = np.abs(beside) < max(_MIDDLE_RATIO * bundle.width_m, _MIN_MIDDLE_M)
+    strength = contrast[:, middle].mean(axis=1)
+    bridged = round(max(_MIN_GULLY_M, _GULLY_BARS * np.nan_to_num(bundle.bar_diameter_m)) / _STEP_M)
     found = []
-    for row in _strap_rows(contrast[:, middle].mean(axis=1)):
-        rows = np.rint(row + _SLOPES[:, None] * beside / _ROW_M).astype(np.int64)
-        lines = contrast[np.clip(rows, 0, len(contrast) - 1), np.arange(beside.size)]
-        ratios = [_strap_ratios(line, float(np.median(line[middle]))) for line in lines]
-        ratio = max(ratios, key=lambda one: float(one[middle].sum()))
+    for row in _strap_rows(strength):
+        near = contrast[max(row - 2, 0) : row + 3] * np.sign(strength[row])
+        line = ndimage.uniform_filter1d(near, round(_SMOOTH_M / _STEP_M), axis=1).max(axis=0)
+        level = float(np.median(line[middle]))
+        seen = line > max(_END_RATIO * level, _SEEN)
+        half = seen.size // 2
+        ends = (_end(part, bridged) for part in (seen[half::-1], seen[half:]))
+        low, high = (np.nan if k is None else _STEP_M * (k + 0.5) - _LINE_M for k in ends)
         along = float(np.linalg.norm(window.rows_m[row]) * np.sign(window.rows_m[row] @ bundle.direction))
-        low, high = (np.cumsum(part) for part in (ratio[half::-1], ratio[half:]))
-        found.append(Strap(along, low, high, picture.pixel_m))
+        sides = float(beside[half] - low), float(beside[half] + high)
+        found.append(StrapEnds(along, *sides, level, picture.pixel_m))
     return found
-
-
-def _strap_ratios(contrast: Float64, level: float) -> Float64:
-    """Compute log-likelihood ratios (N,) of contrasts c, a strap's to steel's: c level - level^2 / 2."""
-    return np.asarray(np.clip(contrast * level - level**2 / 2, -_CLIPPED, _CLIPPED) / _ALIKE)
 
 
 def _contrast(gray: UInt8) -> Float64:
@@ -153,7 +153,7 @@ def _contrast(gray: UInt8) -> Float64:
     off = level - ndimage.uniform_filter1d(level, around, axis=0, mode="nearest")
     off = ndimage.uniform_filter1d(off, _STRAP_ROWS, axis=0)
     scatter = np.sqrt(np.pi / 2) * np.minimum(np.abs(off), _SCATTER_LOG).mean(axis=0)
-    scatter = ndimage.uniform_filter1d(np.maximum(scatter, _MIN_SCATTER_LOG), round(_SCATTER_M / STEP_M))
+    scatter = ndimage.uniform_filter1d(np.maximum(scatter, _MIN_SCATTER_LOG), round(_SCATTER_M / _STEP_M))
     return np.asarray(np.clip(off / scatter, -_CLIPPED, _CLIPPED))
 
 
@@ -162,3 +162,15 @@ def _strap_rows(strength: Float64) -> list[int]:
     lines = np.flatnonzero(np.abs(strength) >= _STRAP)
     rows = strongest_lines(np.abs(strength[lines]), lines, math.ceil(APART_M / _ROW_M))
     return [int(row) for row in rows[: max(int(strength.size * _ROW_M / DENSE_M), 2)]]
+
+
+def _end(seen: Bool, bridged: int) -> int | None:
+    """Follow a strap outwards to the last place that is seen before more than `bridged` aren't; None where it
+    is seen up to the last.
+    """
+    last = 0
+    for k in np.flatnonzero(seen).tolist():
+        if k - last > bridged + 1:
+            return last
+        last = k
+    return last if seen.size - 1 - last > bridged else None
