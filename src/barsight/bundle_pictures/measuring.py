@@ -1,9 +1,12 @@
-"""Measure what pictures show of bundles finer than the map: diameters by the pitch, flanks by the straps."""
+"""Measure what pictures show of bundles finer than the map: diameters by the pitch, flanks by the straps, and
+what lies across them by its edges.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from barsight.bundle_pictures.crossing_edges import edge_windows, find_edge, with_edge
 from barsight.bundle_pictures.diameters import with_pitch
 from barsight.bundle_pictures.flanks import MeanSection, takes_another, with_flanks
 from barsight.bundle_pictures.profiles import PitchProfile, pitch_windows
@@ -19,8 +22,8 @@ from barsight.yard.types import Bundle, YardMap
 def measure_from_pictures(
     pairs: RectifiedPairs, poses: Mapping[int, Pose], heights: YardMap, bundles: Sequence[Bundle]
 ) -> tuple[Bundle, ...]:
-    """Measure the flanks and the bars' diameters of bundles whose bars aren't counted; see `with_flanks` and
-    `with_pitch`.
+    """Measure the flanks and the bars' diameters of bundles whose bars aren't counted, see `with_flanks` and
+    `with_pitch`, and doubt free bundles across which an edge runs.
 
     poses: reference_from_body by stamp of the frames that may be looked at.
     """
@@ -30,9 +33,19 @@ def measure_from_pictures(
     windows = list(pitch_windows(frames, heights, unsure))
     first_strap = len(windows)
     windows += strap_windows(frames, {k for k, _ in windows}, heights, unsure)
+    first_edge = len(windows)
+    windows += edge_windows(frames, {k for k, _ in windows}, bundles)
+    looked_at, edges = set[int](), dict[int, float]()
     profiles, straps = [list[PitchProfile]() for _ in unsure], [list[StrapEnds]() for _ in unsure]
     for place, picture in sample_windows(pairs, frames, windows):
         _, window = windows[place]
+        if place >= first_edge:
+            # One picture of a frame tells: the other shows the same.
+            if place not in looked_at and window.number not in edges:
+                looked_at.add(place)
+                edge = find_edge(picture.gray, window, bundles[window.number])
+                edges |= {} if edge is None else {window.number: edge}
+            continue
         if not picture.is_sharp:
             continue
         if place >= first_strap:
@@ -40,7 +53,7 @@ def measure_from_pictures(
         else:
             profiles[window.number].append(PitchProfile.of(picture))
     tilts = [0.0] * len(unsure)
-    for k, window in windows[first_strap:]:
+    for k, window in windows[first_strap:first_edge]:
         tilts[window.number] = max(tilts[window.number], abs(view_tilt(frames, k, window)))
     floor, out = find_floor(heights), list(bundles)
     for k, bundle, seen, ends, tilt in zip(numbers, unsure, profiles, straps, tilts, strict=True):
@@ -50,6 +63,8 @@ def measure_from_pictures(
             moved = placed.centre_m is not told.centre_m
             others = [other for other in bundles if moved and other is not bundle]
             out[k] = told if takes_another(placed, others) else placed
+    for k, along_m in edges.items():
+        out[k] = with_edge(out[k], along_m)
     return tuple(out)
 
 

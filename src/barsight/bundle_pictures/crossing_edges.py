@@ -1,0 +1,128 @@
+"""Find what lies across bundles in the pictures: its straight edges run on over a flank.
+
+A strap ends at the flanks, and the bundle hides dunnage under it. Edges are found as line segments [Grompone
+von Gioi 2010, LSD], dark or bright; those in line with each other may be broken by gaps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from barsight.bundle_pictures.samples import DARKEST, BundleWindow, PlacedFrames, bundle_axes
+from barsight.core.arrays import Bool, Float64, UInt8
+from barsight.yard.types import Bundle, Doubt, DoubtKind
+
+_STEP_M, _BESIDE_M, _WINDOW_M = 0.005, 0.3, 3.0
+"""Way between two places along and across; reach beside the flanks; greatest length of a window."""
+_DENSITY = 0.5
+"""Least share of a segment's rectangle that its points fill."""
+_DARK_LOG, _LOG_RANGE = 2.0, 3.6
+"""Least logarithm of gray levels, and their range: 8 to 255, with DARKEST added."""
+_MAX_SLOPE, _MIN_ACROSS_M, _MIN_FIRST_M = 0.6, 0.03, 0.06
+"""Of a segment, from square to the axis; its least extent across, and that of the first one of an edge."""
+_SAME_SLOPE, _SAME_M = 0.06, 0.008
+"""Segments this much alike, and this near to one's line, are in line with it."""
+_REACH_M, _MIN_COVERED_RATIO, _MAX_GAP_M = 0.1, 0.6, 0.06
+"""An edge runs over a flank where it shows on this share of so much to either side, without a longer gap."""
+
+
+class _Segments(NamedTuple):
+    """Line segments (S,): from and to beside the axis and their middles, m; the middles along, m from the
+    bundle's middle; slopes; which side is the darker one, 1 or -1.
+    """
+
+    low: Float64
+    high: Float64
+    beside: Float64
+    along: Float64
+    slope: Float64
+    side: Float64
+
+    def chosen(self, those: Bool) -> _Segments:
+        """Return some of them."""
+        return _Segments(*(part[those] for part in self))
+
+
+def edge_windows(
+    frames: PlacedFrames, among: Collection[int], bundles: Sequence[Bundle]
+) -> Iterator[tuple[int, BundleWindow]]:
+    """List windows along each free bundle, level at its top, with the frames nearest over them, of those in
+    `among` where one has it.
+    """
+    for number, bundle in enumerate(bundles):
+        for window in _windows(number, bundle) if bundle.is_free else ():
+            k = frames.nearest(window, among)
+            k = frames.nearest(window) if k is None else k
+            if k is not None:
+                yield k, window
+
+
+def _windows(number: int, bundle: Bundle) -> Iterator[BundleWindow]:
+    if not (np.isfinite(bundle.centre_m).all() and bundle.width_m > 0 and bundle.length_m > 0):
+        return
+    along, across = bundle_axes(bundle)
+    half = round((bundle.width_m / 2 + _BESIDE_M) / _STEP_M)
+    beside = _STEP_M * np.arange(-half, half + 1)[:, None]
+    middle = np.append(bundle.centre_m[:2], bundle.top_z_m)
+    edges = np.linspace(-0.5, 0.5, int(bundle.length_m / _WINDOW_M) + 2) * bundle.length_m
+    for low, high in pairwise(edges.tolist()):
+        rows = np.arange(low, high, _STEP_M)[:, None] * along
+        yield BundleWindow(number, middle + beside * across, rows)
+
+
+def find_edge(gray: UInt8, window: BundleWindow, bundle: Bundle) -> float | None:
+    """Find where an edge runs over a flank, m along the bundle from its middle; None where none does."""
+    along, _ = bundle_axes(bundle)
+    segments = _find_segments(gray, float(window.rows_m[0] @ along / (along @ along)))
+    for flank in (-bundle.width_m / 2, bundle.width_m / 2):
+        first, last = flank - _REACH_M, flank + _REACH_M
+        near = segments.chosen((segments.high > first) & (segments.low < last))
+        for k in np.flatnonzero(near.high - near.low >= _MIN_FIRST_M).tolist():
+            off = near.along - near.along[k] - near.slope[k] * (near.beside - near.beside[k])
+            alike = np.abs(near.slope - near.slope[k]) < _SAME_SLOPE
+            line = near.chosen((np.abs(off) < _SAME_M) & alike & (near.side == near.side[k]))
+            if _is_covered(np.maximum(line.low, first), np.minimum(line.high, last), first, last):
+                return float(near.along[k] + near.slope[k] * (flank - near.beside[k]))
+    return None
+
+
+def _find_segments(gray: UInt8, first_m: float) -> _Segments:
+    """Find line segments across the bars; first_m: of the first row along."""
+    level = (np.log(gray + DARKEST) - _DARK_LOG) * (255 / _LOG_RANGE)
+    detector = cv2.createLineSegmentDetector(scale=1.0, density_th=_DENSITY)
+    found = detector.detect(np.clip(level, 0, 255).astype(np.uint8))[0]
+    ends = np.zeros((0, 4)) if found is None else found[:, 0, :].astype(np.float64)
+    middle = (gray.shape[1] - 1) / 2
+    beside, along = _STEP_M * (ends[:, [0, 2]] - middle), first_m + _STEP_M * ends[:, [1, 3]]
+    across = beside[:, 1] - beside[:, 0]
+    kept = np.abs(across) > np.maximum(_MIN_ACROSS_M, np.abs(along[:, 1] - along[:, 0]) / _MAX_SLOPE)
+    beside, along, across = beside[kept], along[kept], across[kept]
+    return _Segments(
+        beside.min(axis=1), beside.max(axis=1), beside.mean(axis=1), along.mean(axis=1),
+        (along[:, 1] - along[:, 0]) / across, np.sign(across),
+    )  # fmt: skip
+
+
+def _is_covered(low: Float64, high: Float64, first: float, last: float) -> bool:
+    """Check whether spans (N,) cover enough of a way, without too long a gap."""
+    covered, gap, at = 0.0, 0.0, first
+    for k in np.argsort(low, kind="stable").tolist():
+        gap = max(gap, low[k] - at)
+        covered += max(high[k] - max(low[k], at), 0.0)
+        at = max(at, high[k])
+    return covered >= _MIN_COVERED_RATIO * (last - first) and max(gap, last - at) <= _MAX_GAP_M
+
+
+def with_edge(bundle: Bundle, along_m: float) -> Bundle:
+    """Return a bundle that says that an edge runs across it."""
+    doubt = Doubt(
+        DoubtKind.FAINT_LINE,
+        f"an edge runs over its flank {along_m:+.2f} m from its middle: {DoubtKind.FAINT_LINE.value}",
+    )
+    return replace(bundle, reasons=(*bundle.reasons, doubt), cover_doubts=(*bundle.cover_doubts, doubt))
