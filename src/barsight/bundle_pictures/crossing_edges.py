@@ -18,7 +18,7 @@ from barsight.bundle_pictures.samples import DARKEST, BundleWindow, PlacedFrames
 from barsight.core.arrays import Bool, Float64, UInt8
 from barsight.yard.types import Bundle, Doubt, DoubtKind
 
-_STEP_M, _BESIDE_M, _WINDOW_M = 0.005, 0.3, 3.0
+_STEP_M, _BESIDE_M, _WINDOW_M = 0.005, 0.15, 3.0
 """Way between two places along and across; reach beside the flanks; greatest length of a window."""
 _DENSITY = 0.5
 """Least share of a segment's rectangle that its points fill."""
