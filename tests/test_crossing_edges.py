@@ -1,4 +1,4 @@
-"""What lies across a bundle is told by edges that run over its flanks; straps and dunnage are not."""
+"""Things across a bundle are told by edges that run over its flanks; straps and dunnage are not."""
 
 from __future__ import annotations
 

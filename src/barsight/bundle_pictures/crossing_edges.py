@@ -77,7 +77,7 @@ def _windows(number: int, bundle: Bundle) -> Iterator[BundleWindow]:
 
 
 def find_edge(gray: UInt8, window: BundleWindow, bundle: Bundle) -> float | None:
-    """Find where an edge runs over a flank, m along the bundle from its middle; None where none does."""
+    """Find an edge that runs over a flank: its place there, m along from the middle; None without one."""
     along, _ = bundle_axes(bundle)
     segments = _find_segments(gray, float(window.rows_m[0] @ along / (along @ along)))
     for flank in (-bundle.width_m / 2, bundle.width_m / 2):
