@@ -7,19 +7,24 @@ von Gioi 2010, LSD], dark or bright; those in line with each other may be broken
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import replace
-from itertools import pairwise
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from barsight.bundle_pictures.samples import DARKEST, BundleWindow, PlacedFrames, bundle_axes
+from barsight.bundle_pictures.samples import (
+    DARKEST,
+    BundleWindow,
+    PlacedFrames,
+    bundle_axes,
+    is_placed,
+    windows_along,
+)
 from barsight.core.arrays import Bool, Float64, UInt8
 from barsight.yard.types import Bundle, Doubt, DoubtKind
 
-_STEP_M, _BESIDE_M, _WINDOW_M = 0.005, 0.15, 3.0
-"""Way between two places along and across; reach beside the flanks; greatest length of a window."""
+_STEP_M, _BESIDE_M = 0.005, 0.15
+"""Way between two places along and across; reach beside the flanks."""
 _DENSITY = 0.5
 """Least share of a segment's rectangle that its points fill."""
 _DARK_LOG, _LOG_RANGE = 2.0, 3.6
@@ -50,30 +55,20 @@ class _Segments(NamedTuple):
 
 
 def edge_windows(
-    frames: PlacedFrames, among: Collection[int], bundles: Sequence[Bundle]
+    frames: PlacedFrames, preferred: Collection[int], bundles: Sequence[Bundle]
 ) -> Iterator[tuple[int, BundleWindow]]:
     """List windows along each free bundle, level at its top, with the frames nearest over them, of those in
-    `among` where one has it.
+    `preferred` where one has it.
     """
     for number, bundle in enumerate(bundles):
-        for window in _windows(number, bundle) if bundle.is_free else ():
-            k = frames.nearest(window, among)
-            k = frames.nearest(window) if k is None else k
+        if not (bundle.is_free and is_placed(bundle)):
+            continue
+        half = round((bundle.width_m / 2 + _BESIDE_M) / _STEP_M)
+        beside = _STEP_M * np.arange(-half, half + 1.0)
+        for window in windows_along(number, bundle, beside, bundle.top_z_m, _STEP_M):
+            k = frames.nearest(window, preferred)
             if k is not None:
                 yield k, window
-
-
-def _windows(number: int, bundle: Bundle) -> Iterator[BundleWindow]:
-    if not (np.isfinite(bundle.centre_m).all() and bundle.width_m > 0 and bundle.length_m > 0):
-        return
-    along, across = bundle_axes(bundle)
-    half = round((bundle.width_m / 2 + _BESIDE_M) / _STEP_M)
-    beside = _STEP_M * np.arange(-half, half + 1)[:, None]
-    middle = np.append(bundle.centre_m[:2], bundle.top_z_m)
-    edges = np.linspace(-0.5, 0.5, int(bundle.length_m / _WINDOW_M) + 2) * bundle.length_m
-    for low, high in pairwise(edges.tolist()):
-        rows = np.arange(low, high, _STEP_M)[:, None] * along
-        yield BundleWindow(number, middle + beside * across, rows)
 
 
 def find_edge(gray: UInt8, window: BundleWindow, bundle: Bundle) -> float | None:
@@ -125,4 +120,4 @@ def with_edge(bundle: Bundle, along_m: float) -> Bundle:
         DoubtKind.FAINT_LINE,
         f"an edge runs over its flank {along_m:+.2f} m from its middle: {DoubtKind.FAINT_LINE.value}",
     )
-    return replace(bundle, reasons=(*bundle.reasons, doubt), cover_doubts=(*bundle.cover_doubts, doubt))
+    return bundle.with_cover_doubt(doubt)

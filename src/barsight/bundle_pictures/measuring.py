@@ -44,7 +44,8 @@ def measure_from_pictures(
             if place not in looked_at and window.number not in edges:
                 looked_at.add(place)
                 edge = find_edge(picture.gray, window, bundles[window.number])
-                edges |= {} if edge is None else {window.number: edge}
+                if edge is not None:
+                    edges[window.number] = edge
             continue
         if not picture.is_sharp:
             continue

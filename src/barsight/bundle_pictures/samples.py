@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -22,6 +23,8 @@ _OVER_M, _MAX_RISE_M, _HIDDEN_RATIO = 0.05, 1.0, 0.05
 hidden."""
 DARKEST = 8.0
 """Gray levels that are added before their logarithm: noise of dark ones counts less."""
+_MAX_LENGTH_M = 3.0
+"""Length of a window along a bundle that one picture shows whole."""
 _TRIED = 10
 """Frames, the nearest ones, that are tried for a window."""
 
@@ -78,17 +81,35 @@ class PlacedFrames:
         eyes = np.array([left.map_from_rect.translation for left, _ in cameras]).reshape(-1, 3)
         return cls(tuple(poses), cameras, eyes, (camera.width, camera.height))
 
-    def nearest(self, window: BundleWindow, among: Collection[int] | None = None) -> int | None:
+    def nearest(self, window: BundleWindow, preferred: Collection[int] = ()) -> int | None:
         """Find the number of the frame nearest over a window whose left picture has it whole, of those in
-        `among`; None where none has.
+        `preferred` where one has it; None where none has.
         """
         away = np.hypot(*(self.eyes_m - window.middle_m[len(window.middle_m) // 2])[:, :2].T)
         numbers = np.argsort(away, kind="stable").tolist()
-        for k in [k for k in numbers if among is None or k in among][:_TRIED]:
+        for k in [k for k in numbers if k in preferred][:_TRIED] + numbers[:_TRIED]:
             at, _ = self.cameras[k][0].project(window.corners_m)
             if bool(((at >= 1) & (at <= np.array(self.size_px) - 2)).all()):
                 return int(k)
         return None
+
+
+def is_placed(bundle: Bundle) -> bool:
+    """Check that a bundle's place, width and length are known."""
+    return bool(np.isfinite(bundle.centre_m).all() and bundle.width_m > 0 and bundle.length_m > 0)
+
+
+def windows_along(
+    number: int, bundle: Bundle, beside_m: Float64, z_m: float, row_m: float
+) -> Iterator[BundleWindow]:
+    """Divide a bundle's length into windows no longer than _MAX_LENGTH_M, with lines across at height z_m of
+    places beside_m (N,) from its axis, each row_m along.
+    """
+    along, across = bundle_axes(bundle)
+    middle = np.append(bundle.centre_m[:2], z_m) + beside_m[:, None] * across
+    edges = np.linspace(-0.5, 0.5, int(bundle.length_m / _MAX_LENGTH_M) + 2) * bundle.length_m
+    for low, high in pairwise(edges.tolist()):
+        yield BundleWindow(number, middle, np.arange(low, high, row_m)[:, None] * along)
 
 
 def sample_windows(

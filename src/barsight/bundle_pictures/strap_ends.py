@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Sequence
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -20,8 +19,9 @@ from barsight.bundle_pictures.samples import (
     BundleWindow,
     PlacedFrames,
     WindowPicture,
-    bundle_axes,
     is_hidden,
+    is_placed,
+    windows_along,
 )
 from barsight.core.arrays import Bool, Float64, UInt8
 from barsight.yard.bundles.section.straps import APART_M, DENSE_M, strongest_lines
@@ -37,8 +37,6 @@ _OUTSIDE_M = 0.01
 """Way from a flank to the line beside it that must be in sight."""
 _OVERHEAD = 0.05
 """Way aside over height: a line of sight that leads less far aside passes what stands beside a bundle."""
-_WINDOW_M = 3.0
-"""Greatest length of a window: one picture shows it whole."""
 _AROUND_M, _STRAP_ROWS = 0.4, 3
 """Length along the bars over which the steel's own gray level is taken, and rows that a strap covers."""
 _SCATTER_LOG, _MIN_SCATTER_LOG, _SCATTER_M = 0.3, 0.03, 0.06
@@ -71,15 +69,19 @@ class StrapEnds(NamedTuple):
 
 
 def strap_windows(
-    frames: PlacedFrames, among: Collection[int], heights: YardMap, bundles: Sequence[Bundle]
+    frames: PlacedFrames, preferred: Collection[int], heights: YardMap, bundles: Sequence[Bundle]
 ) -> Iterator[tuple[int, BundleWindow]]:
     """List windows along each free bundle that straps may hold, with the frames nearest over them, of those
-    in `among` where one has it; none where what stands higher may hide the flank on the camera's side.
+    in `preferred` where one has it; none where what stands higher may hide the flank on the camera's side.
     """
     for number, bundle in enumerate(bundles):
-        for window in _windows(number, bundle) if bundle.is_free and not is_one_bar(bundle) else ():
-            k = frames.nearest(window, among)
-            k = frames.nearest(window) if k is None else k
+        is_long = is_placed(bundle) and bundle.length_m > 2 * APART_M
+        if not (bundle.is_free and is_long) or is_one_bar(bundle):
+            continue
+        half = bundle.width_m / 2 + REACH_M
+        beside, axis_z_m = np.arange(-half, half, _STEP_M), bundle.top_z_m - bundle.width_m / 2
+        for window in windows_along(number, bundle, beside, axis_z_m, _ROW_M):
+            k = frames.nearest(window, preferred)
             if k is not None and not _hides_flank(frames, k, window, heights):
                 yield k, window
 
@@ -106,20 +108,6 @@ def view_tilt(frames: PlacedFrames, k: int, window: BundleWindow) -> float:
     away = [camera.map_from_rect.translation - middle for camera in frames.cameras[k]]
     tilts = [float(one @ across / np.linalg.norm(across) / one[2]) for one in away]
     return max(tilts, key=abs)
-
-
-def _windows(number: int, bundle: Bundle) -> Iterator[BundleWindow]:
-    """Divide a bundle's length into windows that reach beyond its flanks."""
-    if not (np.isfinite(bundle.centre_m).all() and bundle.width_m > 0 and bundle.length_m > 2 * APART_M):
-        return
-    along, across = bundle_axes(bundle)
-    half = bundle.width_m / 2 + REACH_M
-    beside = np.arange(-half, half, _STEP_M)
-    middle = np.append(bundle.centre_m[:2], bundle.top_z_m - bundle.width_m / 2)
-    edges = np.linspace(-0.5, 0.5, int(bundle.length_m / _WINDOW_M) + 2) * bundle.length_m
-    for low, high in pairwise(edges.tolist()):
-        rows = np.arange(low, high, _ROW_M)[:, None] * along
-        yield BundleWindow(number, middle + beside[:, None] * across, rows)
 
 
 def find_straps(picture: WindowPicture, window: BundleWindow, bundle: Bundle) -> list[StrapEnds]:

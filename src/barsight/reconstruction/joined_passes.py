@@ -83,7 +83,7 @@ class JoinedPasses:
         for move in find_moves(self.placed, [SeenBundle(one.ends_m, one.width_m) for one in bundles]):
             self.history.note(move)
         return tuple(
-            replace(bundle, cover_doubts=(*bundle.cover_doubts, STALE), reasons=(*bundle.reasons, STALE))
+            bundle.with_cover_doubt(STALE)
             if self.history.is_stale(
                 bundle.centre_m, bundle.yaw_rad, bundle.length_m, bundle.width_m, CHANGE_REACH_M
             )

@@ -7,7 +7,7 @@ dark, and ends where its bundle does; dunnage shows beside the load, not on it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -87,7 +87,7 @@ def with_thin_lines(bundle: Bundle, heights: HeightMap) -> Bundle:
         return bundle
     kind = DoubtKind.THIN_BAR if lines[0].strength >= SURE_STRENGTH else DoubtKind.FAINT_LINE
     doubt = Doubt(kind, f"a line runs across it {lines[0].along_m:+.2f} m from its middle: {kind.value}")
-    return replace(bundle, reasons=(*bundle.reasons, doubt), cover_doubts=(*bundle.cover_doubts, doubt))
+    return bundle.with_cover_doubt(doubt)
 
 
 def line_strengths(heights: HeightMap, bundle: Bundle) -> tuple[Float64, Float32] | None:

@@ -6,7 +6,7 @@ All in the yard frame, m and rad. Yaw is the axis's angle from +Y about Z, count
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any, Protocol
 
@@ -259,6 +259,11 @@ class Bundle:
     def is_free(self) -> bool:
         """Check that nothing at all lies on it, for sure."""
         return self.on_top is True and not self.cover_doubts
+
+    def with_cover_doubt(self, doubt: Doubt) -> Bundle:
+        """Return it with a doubt whether something lies on it, which speaks against it too."""
+        both = (*self.reasons, doubt), (*self.cover_doubts, doubt)
+        return replace(self, reasons=both[0], cover_doubts=both[1])
 
     @property
     def bottom_z_m(self) -> float:
