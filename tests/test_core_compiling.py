@@ -96,6 +96,21 @@ def test_code_of_another_signature_is_not_taken(tmp_path: Path, monkeypatch: pyt
     assert set(again.overloads) == {whole, broken}
 
 
+@kernel()
+def four_times(value: float) -> float:
+    return doubled(doubled(value))
+
+
+def test_a_loaded_kernel_is_compiled_into_a_new_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+    kernel()(doubled.py_func).compile((types.float64,))  # type: ignore[attr-defined]
+    loaded = kernel()(doubled.py_func)  # type: ignore[attr-defined]
+    loaded.compile((types.float64,))
+    assert loaded.stats.cache_hits and not loaded.stats.cache_misses
+    monkeypatch.setitem(four_times.py_func.__globals__, "doubled", loaded)  # type: ignore[attr-defined]
+    assert kernel()(four_times.py_func)(1.5) == 6.0  # type: ignore[attr-defined]
+
+
 def test_the_list_names_kernels_with_all_their_arguments() -> None:
     found = listed("simulate", "measure")
     assert len(found) > 100 and len(listed("simulate")) > 5

@@ -5,13 +5,13 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
 
 from barsight.core.arrays import expect_shape, kernel
-from barsight.core.parallel import in_background, ordered_map, parallel_bands, prefetch, prefetched_map
+from barsight.core.parallel import in_background, ordered_map, parallel_bands, prefetch, prefetched_chain
 from barsight.core.timing import Stopwatch
 
 
@@ -83,6 +83,39 @@ def test_items_are_made_while_others_are_used() -> None:
     assert threading.active_count() == before
 
 
+def each(function: Callable[[int], object]) -> Callable[[int], Iterator[object]]:
+    """What a function makes of an item, as all that comes of it."""
+    return lambda item: iter([function(item)])
+
+
+def test_results_of_an_item_are_there_before_its_last() -> None:
+    taken = threading.Event()
+
+    def two(k: int) -> Iterator[int]:
+        yield k
+        assert taken.wait(timeout=5)
+        yield -k
+
+    with prefetched_chain(two, range(4), max_waiting=2) as results:
+        assert next(results) == 0
+        taken.set()
+        assert list(results) == [0, 1, -1, 2, -2, 3, -3]
+
+
+def test_leaving_in_the_middle_of_an_item_drops_its_rest() -> None:
+    made: list[int] = []
+
+    def many(k: int) -> Iterator[int]:
+        for number in range(1000):
+            made.append(number)
+            time.sleep(0.001)
+            yield k
+
+    with prefetched_chain(many, range(3), max_waiting=2) as results:
+        next(results)
+    assert len(made) < 500
+
+
 def test_what_is_begun_goes_on_before_anybody_asks() -> None:
     running, max_at_once, done = 0, 0, threading.Semaphore(0)
     lock = threading.Lock()
@@ -99,7 +132,7 @@ def test_what_is_begun_goes_on_before_anybody_asks() -> None:
         return k * k
 
     before = threading.active_count()
-    with prefetched_map(square, range(20), max_waiting=5, workers=3) as results:
+    with prefetched_chain(each(square), range(20), max_waiting=5, workers=3) as results:
         assert all(done.acquire(timeout=5) for _ in range(5))
         assert not done.acquire(timeout=0.05)  # the sixth waits until a result is taken
         assert max_at_once == 1
@@ -116,7 +149,7 @@ def test_leaving_what_is_begun_drops_the_rest() -> None:
         time.sleep(0.02)
 
     before = threading.active_count()
-    with pytest.raises(KeyboardInterrupt), prefetched_map(slow, range(1000), max_waiting=8):
+    with pytest.raises(KeyboardInterrupt), prefetched_chain(each(slow), range(1000), max_waiting=8):
         while not started:
             time.sleep(0.001)
         raise KeyboardInterrupt
@@ -129,11 +162,11 @@ def test_an_exception_of_what_is_begun_comes_at_its_turn() -> None:
         yield from (3, 2, 0, 1)
         raise KeyError("torn")
 
-    with prefetched_map(lambda k: 6 // k, items(), max_waiting=9) as results:
+    with prefetched_chain(each(lambda k: 6 // k), items(), max_waiting=9) as results:
         assert [next(results), next(results)] == [2, 3]
         with pytest.raises(ZeroDivisionError):
             next(results)
-    with prefetched_map(lambda k: k, items(), max_waiting=2) as results, pytest.raises(KeyError):
+    with prefetched_chain(each(lambda k: k), items(), max_waiting=2) as results, pytest.raises(KeyError):
         list(results)
 
 
@@ -215,7 +248,7 @@ import os
 import subprocess
 import sys
 import threading
-from barsight.core.parallel import in_background, ordered_map, parallel_bands, prefetch, prefetched_map
+from barsight.core.parallel import in_background, ordered_map, parallel_bands, prefetch, prefetched_chain
 seen = set()
 def work(item):
     seen.add(threading.get_ident())
@@ -228,7 +261,9 @@ def fails():
     raise ValueError("torn")
 bands = []
 parallel_bands(lambda first, end: bands.append(work(first)), 8, 2)
-with prefetched_map(work, items(), 3) as mapped, in_background(lambda: work(6)) as late:
+def each(item):
+    yield work(item)
+with prefetched_chain(each, items(), 3) as mapped, in_background(lambda: work(6)) as late:
     print(list(ordered_map(work, items())), list(prefetch(items())), list(mapped), late.result(), bands)
 try:
     with in_background(fails):

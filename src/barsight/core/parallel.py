@@ -6,12 +6,13 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
+from itertools import chain
 from queue import SimpleQueue
 from threading import Event, Semaphore
-from typing import TypeVar, cast
+from typing import Generic, NamedTuple, TypeVar, cast
 
 import cv2
 import numba
@@ -48,27 +49,33 @@ def ordered_map(
 
 
 @contextmanager
-def prefetched_map(
-    function: Callable[[Item], Result], items: Iterable[Item], max_waiting: int, workers: int = WORKERS
-) -> Iterator[Iterator[Result]]:
-    """Run `ordered_map` at once, in one thread beside whatever the caller does first; from the first result
-    asked for on it has all workers.
+def prefetched_chain(
+    function: Callable[[Item], Iterable[Result]], items: Iterable[Item], max_waiting: int,
+    workers: int = WORKERS,
+) -> Iterator[Iterator[Result]]:  # fmt: skip
+    """Chain what a function yields of each item, in the items' order: one thread begins at once, beside
+    whatever the caller does first; from the first result asked for on there are all workers.
 
-    At most `max_waiting` results are under way or wait. An exception of the function or the items comes out
-    at its turn; leaving waits for what is under way and drops the rest.
+    At most `max_waiting` items are under way or wait, beside the one whose results are being taken, each as
+    soon as it is there. An exception of the function or the items comes out at its turn; leaving waits for
+    the results under way and drops the rest.
     """
     if _is_alone():
-        yield map(function, items)
+        yield chain.from_iterable(map(function, items))
         return
     pool, reader = ThreadPoolExecutor(workers), ThreadPoolExecutor(1)
     at_once, room, left = Semaphore(1), Semaphore(max_waiting), Event()
-    begun: SimpleQueue[Future[Result] | None] = SimpleQueue()
+    begun: SimpleQueue[_Stream[Result] | None] = SimpleQueue()
 
-    def in_turn(item: Item) -> Result:
-        with at_once:
-            if left.is_set():
-                raise CancelledError
-            return function(item)
+    def in_turn(item: Item, found: SimpleQueue[tuple[Result] | None]) -> None:
+        try:
+            with at_once:
+                for result in () if left.is_set() else function(item):
+                    found.put((result,))
+                    if left.is_set():
+                        return
+        finally:
+            found.put(None)
 
     def read() -> None:
         try:
@@ -76,15 +83,18 @@ def prefetched_map(
                 room.acquire()
                 if left.is_set():
                     return
-                begun.put(pool.submit(in_turn, item))
+                found: SimpleQueue[tuple[Result] | None] = SimpleQueue()
+                begun.put(_Stream(pool.submit(in_turn, item, found), found))
         finally:
             begun.put(None)
 
     def results() -> Iterator[Result]:
         at_once.release(workers)
-        while (future := begun.get()) is not None:
+        while (stream := begun.get()) is not None:
             room.release()
-            yield future.result()
+            while (result := stream.found.get()) is not None:
+                yield result[0]
+            stream.done.result()
         reading.result()
 
     reading = reader.submit(read)
@@ -95,6 +105,13 @@ def prefetched_map(
         room.release()
         reader.shutdown(wait=True, cancel_futures=True)
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+class _Stream(NamedTuple, Generic[Result]):
+    """Results of an item so far, None after the last, and what raises the exception that ended them."""
+
+    done: Future[None]
+    found: SimpleQueue[tuple[Result] | None]
 
 
 def prefetch(items: Iterable[Item], count: int = 1) -> Iterator[Item]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import chain, islice, pairwise, takewhile
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from barsight.core.errors import Failed, InputError, MeasurementError
 from barsight.core.json_values import json_digest, json_value
 from barsight.core.memory import trim_heap
 from barsight.core.notices import Notice
-from barsight.core.parallel import WORKERS, prefetched_map
+from barsight.core.parallel import WORKERS, prefetched_chain
 from barsight.core.pose import Pose
 from barsight.core.timing import Stopwatch, count_frames, unwatched
 from barsight.core.types import PosedFrame, RectifiedCamera, RectifiedPair, RefusedFrame, Trajectory
@@ -379,21 +380,12 @@ def matching(
     return PairChain(pairs, matcher, stereo.confirmed_pairs + 1 if chained else 1, checkpoints)
 
 
-@contextmanager
 def _matched_ahead(
     match: PairChain, pairs: Iterator[RectifiedPair | RefusedFrame], max_waiting: int
-) -> Iterator[Iterator[MatchedFrame | Refusal]]:
+) -> AbstractContextManager[Iterator[MatchedFrame | Refusal]]:
     """Match pairs ahead, whole chains side by side; about `max_waiting` of them may wait."""
     chains = max(max_waiting // match.length, WORKERS)
-    with prefetched_map(match.match_all, match.split(pairs), chains) as matched:
-        yield chain.from_iterable(map(_emptied, matched))
-
-
-def _emptied(frames: list[MatchedFrame | Refusal]) -> Iterator[MatchedFrame | Refusal]:
-    """Empty a list from its beginning: a frame that is fused needn't wait for the last of its chain."""
-    frames.reverse()
-    while frames:
-        yield frames.pop()
+    return prefetched_chain(partial(map, match), match.split(pairs), chains)
 
 
 def _first_reason(refusals: list[Refusal]) -> str:

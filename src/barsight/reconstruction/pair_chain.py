@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from bisect import bisect_left
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import groupby, pairwise
@@ -76,10 +76,6 @@ class PairChain:
     def follows(self, stamp_ns: int) -> bool:
         """Tell whether a pair is held against the one before: it begins no chain, encoders say the way."""
         return self._steps(stamp_ns)[-1].now_from_before is not None
-
-    def match_all(self, pairs: Sequence[RectifiedPair | RefusedFrame]) -> list[MatchedFrame | Refusal]:
-        """Match pairs one after the other."""
-        return [self(pair) for pair in pairs]
 
     def split(
         self, pairs: Iterable[RectifiedPair | RefusedFrame]

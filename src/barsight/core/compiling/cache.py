@@ -13,7 +13,9 @@ from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
+from llvmlite import binding
 from numba.core.caching import FunctionCache
+from numba.core.codegen import JITCodeLibrary
 
 _LIBRARIES = ("numba", "numpy", "llvmlite")
 """Not followed: the compiler's version is part of every cache already."""
@@ -44,7 +46,10 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
         except Exception:  # it names a class that is no more, or was torn
             self.flush()
             return None
-        return found if found is not None and tuple(found.signature.args) == tuple(sig) else None
+        if found is None or tuple(found.signature.args) != tuple(sig):
+            return None
+        _PackedLibrary.pack(found.library)
+        return found
 
     def holds(self, sig: Any, target_context: Any) -> bool:
         """Return whether the code for a signature is there."""
@@ -58,6 +63,23 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
     def _stamp(self) -> None:
         """Stamp the index, only now: what the kernel calls may be defined after it."""
         self._cache_file._source_stamp = (*self._own, sources_digest(self._py_func))
+
+
+class _PackedLibrary(JITCodeLibrary):  # type: ignore[misc]
+    """Machine code whose LLVM module is kept as bitcode, an eighth of its size.
+
+    Only a kernel that is compiled anew and calls this one needs the module.
+    """
+
+    @classmethod
+    def pack(cls, library: JITCodeLibrary) -> None:
+        """Pack a library that was loaded from the cache."""
+        library._bitcode = library._shared_module.as_bitcode()
+        library._shared_module = None
+        library.__class__ = cls
+
+    def _get_module_for_linking(self) -> binding.ModuleRef:
+        return binding.parse_bitcode(self._bitcode)
 
 
 def sources_digest(function: Any) -> str:
