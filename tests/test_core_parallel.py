@@ -84,7 +84,7 @@ def test_items_are_made_while_others_are_used() -> None:
 
 
 def each(function: Callable[[int], object]) -> Callable[[int], Iterator[object]]:
-    """What a function makes of an item, as all that comes of it."""
+    """Yield the only result of an item."""
     return lambda item: iter([function(item)])
 
 

@@ -65,7 +65,7 @@ def prefetched_chain(
         return
     pool, reader = ThreadPoolExecutor(workers), ThreadPoolExecutor(1)
     at_once, room, left = Semaphore(1), Semaphore(max_waiting), Event()
-    begun: SimpleQueue[_Stream[Result] | None] = SimpleQueue()
+    begun: SimpleQueue[_Queued[Result] | None] = SimpleQueue()
 
     def in_turn(item: Item, found: SimpleQueue[tuple[Result] | None]) -> None:
         try:
@@ -84,7 +84,7 @@ def prefetched_chain(
                 if left.is_set():
                     return
                 found: SimpleQueue[tuple[Result] | None] = SimpleQueue()
-                begun.put(_Stream(pool.submit(in_turn, item, found), found))
+                begun.put(_Queued(pool.submit(in_turn, item, found), found))
         finally:
             begun.put(None)
 
@@ -107,7 +107,7 @@ def prefetched_chain(
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-class _Stream(NamedTuple, Generic[Result]):
+class _Queued(NamedTuple, Generic[Result]):
     """Results of an item so far, None after the last, and what raises the exception that ended them."""
 
     done: Future[None]
