@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from barsight.core.pose import Pose
 from barsight.core.types import StereoPoints
-from barsight.mapping.observation import bin_points
+from barsight.mapping.observation import sort_points
 
 CELL_M = 0.02
 SPACING_RAD = 1e-3
@@ -74,7 +74,7 @@ def observed_slowly(
 
 def test_the_kernels_agree_with_the_slow_reference() -> None:
     seen, pose = points(), BODY @ BODY_FROM_RECT0
-    found = bin_points(seen, pose, BODY.translation, covariance(), CELL_M, SPACING_RAD)
+    found = sort_points(seen, pose, BODY.translation, covariance(), CELL_M, SPACING_RAD).merged()
     expected = np.array(observed_slowly(seen, pose, BODY.translation, covariance()))
     assert len(expected) > 1500
     np.testing.assert_array_equal(found.x, expected[:, 0])
@@ -92,8 +92,8 @@ def test_many_points_of_one_view_say_it_once() -> None:
     one = StereoPoints(1, *(np.array(v) for v in _flat(1)))
     many = StereoPoints(1, *(np.array(v) for v in _flat(100)))
     nothing = np.zeros((6, 6))
-    single = bin_points(one, BODY, BODY.translation, nothing, CELL_M, SPACING_RAD)
-    crowd = bin_points(many, BODY, BODY.translation, nothing, CELL_M, SPACING_RAD)
+    single = sort_points(one, BODY, BODY.translation, nothing, CELL_M, SPACING_RAD).merged()
+    crowd = sort_points(many, BODY, BODY.translation, nothing, CELL_M, SPACING_RAD).merged()
     assert len(single.z_m) == len(crowd.z_m) == 1
     np.testing.assert_allclose(crowd.variance_m2, single.variance_m2)
 
@@ -106,7 +106,7 @@ def _flat(count: int) -> tuple[np.ndarray, ...]:
 def test_the_variance_is_that_of_noisy_rays_and_poses() -> None:
     rng = np.random.default_rng(3)
     seen, cov = points(1, seed=5), covariance()
-    found = bin_points(seen, BODY @ BODY_FROM_RECT0, BODY.translation, cov, CELL_M, SPACING_RAD)
+    found = sort_points(seen, BODY @ BODY_FROM_RECT0, BODY.translation, cov, CELL_M, SPACING_RAD).merged()
     point = seen.xyz_m[0].astype(np.float64)
     heights = []
     for error in rng.multivariate_normal(np.zeros(6), cov, 4000):
@@ -123,5 +123,5 @@ def test_the_variance_is_that_of_noisy_rays_and_poses() -> None:
 
 def test_no_points() -> None:
     none = points(0)
-    found = bin_points(none, BODY, BODY.translation, covariance(), CELL_M, SPACING_RAD)
+    found = sort_points(none, BODY, BODY.translation, covariance(), CELL_M, SPACING_RAD).merged()
     assert found.x.shape == found.z_m.shape == (0,)

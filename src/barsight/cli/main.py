@@ -14,6 +14,7 @@ from types import FrameType
 
 import barsight
 from barsight.core.errors import BarsightError
+from barsight.core.memory import bound_heap
 from barsight.core.printing import printable
 
 COMMANDS = {
@@ -74,6 +75,7 @@ def home(name: str) -> str:
 def main() -> None:
     """Run the console script: signals end a run as Ctrl-C does."""
     _fill_closed_streams()
+    bound_heap()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _interrupt)
     hangup = getattr(signal, "SIGHUP", None)  # Windows has none, nohup ignores it

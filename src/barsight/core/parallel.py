@@ -64,7 +64,7 @@ def prefetched_chain(
         yield chain.from_iterable(map(function, items))
         return
     pool, reader = ThreadPoolExecutor(workers), ThreadPoolExecutor(1)
-    at_once, room, left = Semaphore(1), Semaphore(max_waiting), Event()
+    at_once, room, left = Semaphore(1), Semaphore(max_waiting - 1), Event()
     begun: SimpleQueue[_Queued[Result] | None] = SimpleQueue()
 
     def in_turn(item: Item, found: SimpleQueue[tuple[Result] | None]) -> None:
@@ -80,11 +80,11 @@ def prefetched_chain(
     def read() -> None:
         try:
             for item in items:
-                room.acquire()
-                if left.is_set():
-                    return
                 found: SimpleQueue[tuple[Result] | None] = SimpleQueue()
                 begun.put(_Queued(pool.submit(in_turn, item, found), found))
+                room.acquire()  # before the next item takes memory
+                if left.is_set():
+                    return
         finally:
             begun.put(None)
 

@@ -37,37 +37,48 @@ class CellObservations:
     intensity: Float32
 
 
-def bin_points(
+@dataclass(frozen=True, eq=False)
+class SortedPoints:
+    """A view's points, sorted by cell. said: (N, _SAID) what each says of its cell, starts: (cells + 1,), of
+    `_by_cell`, within shape (rows, columns) from corner (column, row) on.
+    """
+
+    said: Float32
+    starts: Int64
+    cell_m: float
+    corner: tuple[int, int]
+    shape: tuple[int, int]
+
+    def merged(self) -> CellObservations:
+        """Merge the points of each cell and surface, once: it changes their order."""
+        return CellObservations(*_gather(self.said, self.starts, self.cell_m, self.corner, self.shape))
+
+
+def sort_points(
     points: StereoPoints,
     reference_from_rect0: Pose,
     body_origin_m: Float64,
     covariance: Float64,
     cell_m: float,
     spacing_rad: float,
-) -> CellObservations:
-    """Transform a view's points to the reference frame and bin them by cell.
+) -> SortedPoints:
+    """Transform a view's points to the reference frame and sort them by cell.
 
     body_origin_m: (3,) about which the attitude's error turns. covariance: (6, 6) of the body's pose,
     rotation then translation, reference axes. spacing_rad: angle between neighbouring points.
     """
     if len(points.xyz_m) == 0:
-        return _no_observations()
+        return SortedPoints(np.empty((0, _SAID), np.float32), np.zeros(1, np.int64), cell_m, (0, 0), (0, 0))
     about = covariance[np.ix_((0, 1, 5), (0, 1, 5))]
     rotation, translation = reference_from_rect0.rotation, reference_from_rect0.translation
     x, y = _cell_numbers(points.xyz_m, rotation, translation, cell_m)
     corner = int(x.min()), int(y.min())
     shape = int(y.max()) - corner[1] + 1, int(x.max()) - corner[0] + 1
-    by_cell, starts = _by_cell(
+    said, starts = _by_cell(
         points.xyz_m, (points.range_sigma_m, points.shared_sigma_m), points.intensity,
         (rotation, translation, body_origin_m, about), cell_m, 0.5 * spacing_rad, (x, y), corner, shape,
     )  # fmt: skip
-    return CellObservations(*_gather(by_cell, starts, cell_m, corner, shape))
-
-
-def _no_observations() -> CellObservations:
-    none = np.empty(0, np.float32)
-    whole = np.empty(0, np.int32)
-    return CellObservations(whole, whole, np.empty(0, np.bool_), none, none, none, none)
+    return SortedPoints(said, starts, cell_m, corner, shape)
 
 
 @kernel()

@@ -181,21 +181,26 @@ class _Matching:
         return self._finish(pair, candidates, start, self._refined(pair, start.left_px, refinement))
 
     def _confirm(self, pair: RectifiedPair, candidates: DisparityRange, predicted: Float32) -> Disparity:
-        own, refinement = self._start_at_half_size(pair, candidates), self.settings.refinement
-        matched = np.isfinite(own.left_px)
-        own_px = refine_at_half_size(
-            pair.left, pair.right, fill_row_holes(own.left_px), matched, refinement, self.halves_rows
-        )
-        own_px = mask_values(own_px, matched)
-        rows = EDGE_WINDOW_PX if self.halves_rows else EDGE_WINDOW_PX // BINNED_ROWS | 1
-        started = confirmed_start(pair.left, pair.right, predicted, own_px, own.right_px, rows)
-        started = mask_values(started, pair.left_valid)
+        start, refinement = self._confirmed_start(pair, candidates, predicted), self.settings.refinement
+        started = start.left_px
         refined = self._refined(pair, started, replace(refinement, steps=1))
         moved = np.subtract(refined.disparity_px, started)
         far = np.count_nonzero(np.abs(moved, out=moved) > _FAR_STEP_PX)
         if far > _MAX_FAR_RATIO * np.count_nonzero(np.isfinite(started)):
             refined = self._refined(pair, started, refinement)
-        return self._finish(pair, candidates, _Start(started, own.right_px), refined)
+        return self._finish(pair, candidates, start, refined)
+
+    def _confirmed_start(self, pair: RectifiedPair, candidates: DisparityRange, predicted: Float32) -> _Start:
+        own = self._start_at_half_size(pair, candidates)
+        matched = np.isfinite(own.left_px)
+        own_px = refine_at_half_size(
+            pair.left, pair.right, fill_row_holes(own.left_px), matched, self.settings.refinement,
+            self.halves_rows,
+        )  # fmt: skip
+        own_px = mask_values(own_px, matched)
+        rows = EDGE_WINDOW_PX if self.halves_rows else EDGE_WINDOW_PX // BINNED_ROWS | 1
+        started = confirmed_start(pair.left, pair.right, predicted, own_px, own.right_px, rows)
+        return _Start(mask_values(started, pair.left_valid), own.right_px)
 
     def _refined(
         self, pair: RectifiedPair, start_px: Float32, settings: RefinementSettings

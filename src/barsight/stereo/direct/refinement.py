@@ -181,7 +181,6 @@ class _Work:
     residual: Float32
     slope: Float32
     trust: Float32
-    alike: Float32
     weight: Float32
     pull: Float32
 
@@ -190,7 +189,7 @@ class _Work:
         cls, left: Float32, start: Float32, usable: Float32, settings: RefinementSettings, hold: float = _HOLD
     ) -> _Work:
         mean_usable = cv2.boxFilter(usable, -1, (settings.window_px, settings.window_px))
-        frames = [allocate_frame(start.shape) for _ in range(7)]
+        frames = [allocate_frame(start.shape) for _ in range(6)]
         inside(frames[0], start.shape)[:] = start
         hold_each = np.float32(hold) * (usable + np.float32(_HOLD_UNMATCHED))
         return cls(settings, tile_axes(left), usable, mean_usable, hold_each, *frames)
@@ -255,8 +254,9 @@ class _Work:
             return np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
         means = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
         blurred = cv2.GaussianBlur(gray, (0, 0), _ALIKE_BLUR_PX)
-        np.multiply(blurred, np.float32(1 / settings.alike_gray), out=inside(self.alike, shape))
-        images = self.residual, self.slope, self.trust, self.alike
+        alike = self.pull  # whose values of this step come later
+        np.multiply(blurred, np.float32(1 / settings.alike_gray), out=inside(alike, shape))
+        images = self.residual, self.slope, self.trust, alike
         axis_means(*images, self.axes, settings.gloss_px, means)
         return means
 
