@@ -50,7 +50,7 @@ def shaded(*things: tuple[float, float, float, float, float, float]) -> Shade:
 def edges_of(gray: Shade, one: Bundle) -> list[str]:
     poses = looking_down(0.03, 1)
     (seen,) = measure_from_pictures(Pictures(poses, gray), poses, flat_map(), (one,))  # type: ignore[arg-type]
-    return [doubt.sentence for doubt in seen.cover_doubts if doubt.kind is DoubtKind.FAINT_LINE]
+    return [doubt.sentence for doubt in seen.cover_doubts if doubt.kind is DoubtKind.CROSSING_EDGE]
 
 
 @pytest.mark.parametrize("gray", [60.0, 200.0])
@@ -78,4 +78,4 @@ def test_only_free_bundles_are_looked_at_and_the_doubt_forbids() -> None:
     assert edges_of(shaded((0.0, 0.35, 0.25, 0.0125, 0.0, 200.0)), covered) == []
     one = with_edge(bundle(), 0.3)
     assert not one.is_free and one.cover_doubts == one.reasons[-1:]
-    assert Doubt.read(one.reasons[-1].sentence).kind is DoubtKind.FAINT_LINE
+    assert Doubt.read(one.reasons[-1].sentence).kind is DoubtKind.CROSSING_EDGE

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from barsight.bundle_pictures.crossing_edges import with_edge
 from barsight.core.errors import ConfigError
 from barsight.yard.bundles.layers import check_uncovered
 from barsight.yard.lift_settings import LiftSettings
@@ -173,6 +174,16 @@ def test_a_lift_beside_a_neighbour_with_a_bar_over_its_flank_is_vetoed() -> None
     on_load = abs(heights.x_m) < HALF_M + 0.02
     heights.tops[:, on_load] = clear.tops[:, on_load]
     assert codes(judged(STOCK, heights=heights)) == {"thin-bar"}
+
+
+@pytest.mark.parametrize(("away_m", "vetoed"), [(0.45, True), (2.0, False)])
+def test_a_lift_beside_a_neighbour_with_an_edge_over_its_flank_is_vetoed(away_m: float, vetoed: bool) -> None:
+    """What has the edge may be too dark or too level for lines in the photo."""
+    stock = [STOCK[0], replace(STOCK[1], x_m=away_m)]
+    neighbour = with_edge(record(stock[1], 1), 0.4)
+    lift = judged(stock, (record(stock[0]), neighbour), heights=photo(0))
+    assert codes(lift) == ({"thin-bar"} if vetoed else set())
+    assert not vetoed or "on bundle 1, an edge runs over its flank +0.40 m" in lift.vetoes[0].reason
 
 
 def test_without_a_photo_nobody_knows() -> None:

@@ -117,7 +117,7 @@ def _is_covered(low: Float64, high: Float64, first: float, last: float) -> bool:
 def with_edge(bundle: Bundle, along_m: float) -> Bundle:
     """Return a bundle that says that an edge runs across it."""
     doubt = Doubt(
-        DoubtKind.FAINT_LINE,
-        f"an edge runs over its flank {along_m:+.2f} m from its middle: {DoubtKind.FAINT_LINE.value}",
+        DoubtKind.CROSSING_EDGE,
+        f"{DoubtKind.CROSSING_EDGE.value} {along_m:+.2f} m from its middle: something may lie over it",
     )
     return bundle.with_cover_doubt(doubt)

@@ -180,6 +180,7 @@ class DoubtKind(Enum):
     CROSSED = "crosses over it"
     THIN_BAR = "a thin bar lies over it"
     FAINT_LINE = "a thin bar may lie over it"
+    CROSSING_EDGE = "an edge runs over its flank"
     UNSEEN_FLANK = "flank was not seen"
     HIDDEN_FLANK = "beside it may lie over its"
     OVERLAP = "overlap: one may lie over the other"

@@ -26,7 +26,10 @@ from barsight.yard.inventory.bundle_file import read_bundles
 from barsight.yard.types import Bundle, DoubtKind
 
 TWO_SIDED = 1.959964
-UNSEEN = frozenset({DoubtKind.UNSEEN_FLANK, DoubtKind.HIDDEN_FLANK, DoubtKind.OVERLAP, DoubtKind.FAINT_LINE})
+UNSEEN = frozenset({
+    DoubtKind.UNSEEN_FLANK, DoubtKind.HIDDEN_FLANK, DoubtKind.OVERLAP, DoubtKind.FAINT_LINE,
+    DoubtKind.CROSSING_EDGE,
+})  # fmt: skip
 """In `cover_doubts` on what isn't seen to lie there: a bundle with no others is said to be free. A beam or
 bar that is seen across it covers it, in a world's truth."""
 SEEN_FRAMES, SEEN_RATIO = 2, 0.5

@@ -23,7 +23,13 @@ from barsight.yard.lifting.checks import (
 from barsight.yard.lifting.clearance import FacePlane, clearance_checks, find_obstacle, resting_checks
 from barsight.yard.lifting.labels import label_checks
 from barsight.yard.lifting.set_down import SetDown
-from barsight.yard.lifting.thin_bars import beside_checks, has_pictures, may_reach, thin_bar_checks
+from barsight.yard.lifting.thin_bars import (
+    beside_checks,
+    edge_checks,
+    has_pictures,
+    may_reach,
+    thin_bar_checks,
+)
 from barsight.yard.lifting.travel_accuracy import Travel, target_covariance, travel_checks
 from barsight.yard.lifting.validity import Validity, age_checks, disturbed_checks, validity
 from barsight.yard.magnet.contact import NEWTON_PER_KG, Contact, rest_magnet
@@ -158,12 +164,10 @@ def assess_placement(
         pixel_m = yard.travel.pixel_m(contact.centre_z_m) if yard.travel else None
         checks += thin_bar_checks(yard.heights, yard.thin_line(load), load, pixel_m, settings)
         if has_pictures(yard.heights, pixel_m):
-            others = [b for b in near.bundles if b not in load]
             faces_z_m = contact.centre_z_m - magnet.half_span_m * abs(math.tan(contact.pitch_rad))
-            beside = (
-                (b, yard.thin_lines(b) if may_reach(b, place, magnet, faces_z_m) else ()) for b in others
-            )
-            checks += beside_checks(place, magnet, tuple(beside))
+            others = [b for b in near.bundles if b not in load and may_reach(b, place, magnet, faces_z_m)]
+            checks += edge_checks(others)
+            checks += beside_checks(place, magnet, tuple((b, yard.thin_lines(b)) for b in others))
     scale = 0.0
     if search and not vetoes_of(checks):
         scale, end = _tolerance(place, yard, magnet, near, held, needed, contact, settings)

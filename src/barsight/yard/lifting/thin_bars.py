@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from barsight.yard.lifting.clearance import STRAY_FIELD_M
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.thin_lines import MAX_SLOPE, MAX_STRENGTH, ThinLine
-from barsight.yard.types import Bundle, HeightMap
+from barsight.yard.types import Bundle, DoubtKind, HeightMap
 from barsight.yard.vetoes import Check, check_max, check_true
 
 CODE = "thin-bar"
@@ -69,13 +70,24 @@ def has_pictures(heights: HeightMap, pixel_m: float | None) -> bool:
     return pixel_m is not None or heights.tops is not None
 
 
+def edge_checks(beside: Iterable[Bundle]) -> list[Check]:
+    """Check that no edge runs over a flank of a neighbour from which a bar may come under the magnet: how far
+    what has that edge reaches beyond the flank isn't known.
+    """
+    what = "nothing that has an edge over a neighbour's flank reaches under the magnet"
+    return [
+        check_true(CODE, what, None, f"beside the load, on bundle {bundle.id}, {doubt.sentence}")
+        for bundle in beside for doubt in bundle.cover_doubts if doubt.kind is DoubtKind.CROSSING_EDGE
+    ]  # fmt: skip
+
+
 def beside_checks(
     place: Placement, magnet: Magnet, near: tuple[tuple[Bundle, tuple[ThinLine, ...] | None], ...]
 ) -> list[Check]:
     """Check that no thin bar that lies across a neighbour reaches under the magnet.
 
     In the air beyond its bundle's flank nothing shows such a bar: the map has what lies below it. near: the
-    bundles about the load, and the lines across each, None where the photo doesn't show enough of it.
+    bundles that `may_reach`, and the lines across each, None where the photo doesn't show enough of it.
     """
     if not near:
         return []
