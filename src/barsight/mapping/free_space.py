@@ -6,7 +6,7 @@ higher, whether or not the cell itself was seen.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, MutableMapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -38,11 +38,11 @@ class FreeSpace:
     """Upper bounds (m) of what may stand in each cell, by the two views that bound it best.
 
     cell_m: side of the map's cells; those of free space are COARSE_CELLS as wide. tiles: (2, TILE, TILE)
-    each, the best bound and the second. Memory: 0.5 MiB per 5 m square at cells of 10 mm.
+    each, the best bound and the second; 0.5 MiB per 5 m square at cells of 10 mm.
     """
 
     cell_m: float
-    tiles: dict[TileKey, Float32] = field(default_factory=dict)
+    tiles: MutableMapping[TileKey, Float32] = field(default_factory=dict)
 
     @property
     def _cell_m(self) -> float:
@@ -96,7 +96,7 @@ class FreeSpace:
         a grid, have changed since, so that only the newer pass tells of them.
         """
         cells = np.arange(TILE) * self._cell_m
-        for key in {*self.tiles, *newer.tiles}:
+        for key in sorted({*self.tiles, *newer.tiles}):
             x, y = (cells + at * TILE * self._cell_m for at in key)
             mine = self.tiles.setdefault(key, np.full((2, TILE, TILE), UNPROVEN))
             mine[:, forgotten(x, y)] = UNPROVEN

@@ -10,7 +10,7 @@ import shutil
 import stat
 import tempfile
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -188,7 +188,7 @@ def _plain(value: Any, arrays: dict[str, Any], beside: Path) -> Any:
         content = {field.name: _plain(getattr(value, field.name), arrays, beside) for field in fields(value)}
         assert kind in _RECORDS, f"{kind} is kept nowhere"
         return {"kind": kind, "fields": content}
-    if isinstance(value, dict):
+    if isinstance(value, Mapping):
         return {"pairs": [[_plain(item, arrays, beside) for item in pair] for pair in value.items()]}
     if isinstance(value, frozenset):
         return {"members": [_plain(item, arrays, beside) for item in sorted(value)]}

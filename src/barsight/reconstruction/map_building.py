@@ -34,6 +34,7 @@ from barsight.mapping.recording_probe import (
     probe_recording,
 )
 from barsight.mapping.settings import MapSettings
+from barsight.mapping.spilled_tiles import SpilledTiles
 from barsight.mapping.surface.height_selection import ViewFrusta
 from barsight.mapping.surface.incremental import SurfaceElection
 from barsight.mapping.surface.surface import Surface
@@ -121,7 +122,8 @@ class MapBuilder:
         self._binner, self._camera, self._settings, self._yard = binner, camera, settings, yard
         self._store = TileStore(folder, settings.resident_tiles)
         self._election = SurfaceElection(self._store, folder, binner.cell_m, settings, beat)
-        self._free, self._tops = FreeSpace(binner.cell_m), TopPhoto(binner.cell_m)
+        self._free = FreeSpace(binner.cell_m, SpilledTiles(folder))
+        self._tops = TopPhoto(binner.cell_m, SpilledTiles(folder))
         self._before: Neighbour | None = None
         self._previews: list[tuple[int, Preview]] = []
         self.placed: list[Pose] = []
