@@ -27,7 +27,8 @@ VETOES = {
     "unexplained-surface": "Something under the poles, within reach, belongs to no known bundle.",
     "bundle-doubtful": "The bundle is less sure than the settings ask.",
     "covered": "Something lies on the bundle, or whether something does isn't known.",
-    "thin-bar": "The pictures show a line across the load that may be a thin bar, or can't show one.",
+    "thin-bar": "The pictures show a line across the load, or a line or an edge across a neighbour that may "
+    "reach under the magnet, or can't show one.",
     "straddles-neighbour": "The footprint reaches over more bundles than are to be lifted.",
     "count-uncertain": "How many bundles the magnet would take isn't sure enough.",
     "narrow-tolerance": "Within the crane's own tolerance the lift would not stay as checked.",
