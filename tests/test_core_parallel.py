@@ -6,6 +6,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import CancelledError
 
 import numpy as np
 import pytest
@@ -114,6 +115,8 @@ def test_leaving_in_the_middle_of_an_item_drops_its_rest() -> None:
     with prefetched_chain(many, range(3), max_waiting=2) as results:
         next(results)
     assert len(made) < 500
+    with pytest.raises(CancelledError):
+        next(results)
 
 
 def test_what_is_begun_goes_on_before_anybody_asks() -> None:

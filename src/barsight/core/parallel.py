@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
 from itertools import chain
@@ -19,6 +19,7 @@ import numba
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+Taken = TypeVar("Taken")
 
 WORKERS = 2
 """Items under way side by side: as many as a user's cores."""
@@ -88,11 +89,16 @@ def prefetched_chain(
         finally:
             begun.put(None)
 
+    def taken(queue: SimpleQueue[Taken]) -> Taken:
+        if left.is_set():
+            raise CancelledError
+        return queue.get()
+
     def results() -> Iterator[Result]:
         at_once.release(workers)
-        while (stream := begun.get()) is not None:
+        while (stream := taken(begun)) is not None:
             room.release()
-            while (result := stream.found.get()) is not None:
+            while (result := taken(stream.found)) is not None:
                 yield result[0]
             stream.done.result()
         reading.result()

@@ -16,6 +16,7 @@ import barsight
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.calibration.stereo.disparity_uncertainty import disparity_sigma_px, rig_covariance
 from barsight.core.arrays import Float64
+from barsight.core.compiling.sources import sources_digest
 from barsight.core.errors import Failed, InputError, MeasurementError
 from barsight.core.json_values import json_digest, json_value
 from barsight.core.memory import trim_heap
@@ -342,15 +343,16 @@ def map_name(poses: tuple[PosedFrame, ...], binner: PointBinner) -> str:
 def checkpoint_key(
     recording: Recording, source: Recording, settings: MeasureSettings, inputs: dict[str, str]
 ) -> str:
-    """Return a digest of all that trajectory and disparities depend on.
+    """Return a digest of all that trajectory, disparities and map depend on, the package's sources among it.
 
     source: the recording with the sensors in use, in the yard. inputs: SHA-256 of its files.
     """
+    sources = sources_digest(Path(barsight.__file__).parent)
     configuration, frame = json_value(settings), frame_of(source)
     stages = {name: part for name, part in configuration.items() if name not in ("bundles", "lift")}
     placed = inputs if frame is None else {**inputs, "yard": frame.digest}
     rig = json_value(recording.rig)
-    return json_digest([barsight.__version__, stages, placed, rig, pictures_digest(recording)])
+    return json_digest([sources, stages, placed, rig, pictures_digest(recording)])
 
 
 def _known_early(
