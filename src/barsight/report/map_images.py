@@ -30,6 +30,8 @@ SOURCE_RGB: Codes = {
     HeightSource.FILLED: (238, 119, 51),
 }
 FILLED_TINT_RGB = (255, 90, 160)
+_BAND_ROWS, _SHADE_REACH_PX = 128, 8
+"""Rows that are painted at once; the hillshade of a pixel rests on none further off."""
 _SLOPE_NOISE = 0.25
 """RMS slope of floors over sigma by pixel: 0.17 to 0.25 on four maps. Most of sigma is alike nearby."""
 
@@ -163,12 +165,25 @@ def paint_height(raster: Raster, low_m: float, high_m: float) -> UInt8:
     """Paint (H, W, 4): colour by height, darkened and lightened by the hillshade; filled cells
     tinted pink.
     """
-    base = colours(raster.z_m, low_m, high_m, cv2.COLORMAP_VIRIDIS).astype(np.float32)
-    light = np.clip(hillshade(raster.z_m, raster.cell_m, raster.sigma_m), 0.0, 1.4)[..., None]
+    height, width = raster.z_m.shape
+    painted = np.empty((height, width, 4), np.uint8)
+    for first in range(0, height, _BAND_ROWS):
+        end, above = min(first + _BAND_ROWS, height), min(first, _SHADE_REACH_PX)
+        band = slice(first - above, min(end + _SHADE_REACH_PX, height))
+        light = hillshade(raster.z_m[band], raster.cell_m, raster.sigma_m[band])[above:][: end - first]
+        z_m, source = raster.z_m[first:end], raster.source[first:end]
+        painted[first:end] = _paint_shaded(z_m, light, source, low_m, high_m)
+    return painted
+
+
+def _paint_shaded(z_m: Float32, light: Float32, source: UInt8, low_m: float, high_m: float) -> UInt8:
+    """Paint (H, W, 4) in the light of the hillshade (H, W)."""
+    base = colours(z_m, low_m, high_m, cv2.COLORMAP_VIRIDIS).astype(np.float32)
+    light = np.clip(light, 0.0, 1.4)[..., None]
     shaded = np.where(light < 1, base * (0.35 + 0.65 * light), base + (255 - base) * (light - 1) * 0.9)
-    filled = raster.source == HeightSource.FILLED
+    filled = source == HeightSource.FILLED
     shaded[filled] = 0.3 * shaded[filled] + 0.7 * np.array(FILLED_TINT_RGB)
-    return _with_alpha(shaded, np.isfinite(raster.z_m))
+    return _with_alpha(shaded, np.isfinite(z_m))
 
 
 def paint_scale(values: Float32, low: float, high: float, scale: int) -> UInt8:
