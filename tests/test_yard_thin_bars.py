@@ -178,7 +178,7 @@ def test_a_lift_beside_a_neighbour_with_a_bar_over_its_flank_is_vetoed() -> None
 
 @pytest.mark.parametrize(("away_m", "vetoed"), [(0.45, True), (2.0, False)])
 def test_a_lift_beside_a_neighbour_with_an_edge_over_its_flank_is_vetoed(away_m: float, vetoed: bool) -> None:
-    """What has the edge may be too dark or too level for lines in the photo."""
+    """A dark bar has edges, and no bright line in the photo."""
     stock = [STOCK[0], replace(STOCK[1], x_m=away_m)]
     neighbour = with_edge(record(stock[1], 1), 0.4)
     lift = judged(stock, (record(stock[0]), neighbour), heights=photo(0))

@@ -64,53 +64,11 @@ def prefetched_chain(
     if _is_alone():
         yield chain.from_iterable(map(function, items))
         return
-    pool, reader = ThreadPoolExecutor(workers), ThreadPoolExecutor(1)
-    at_once, room, left = Semaphore(1), Semaphore(max_waiting - 1), Event()
-    begun: SimpleQueue[_Queued[Result] | None] = SimpleQueue()
-
-    def in_turn(item: Item, found: SimpleQueue[tuple[Result] | None]) -> None:
-        try:
-            with at_once:
-                for result in () if left.is_set() else function(item):
-                    found.put((result,))
-                    if left.is_set():
-                        return
-        finally:
-            found.put(None)
-
-    def read() -> None:
-        try:
-            for item in items:
-                found: SimpleQueue[tuple[Result] | None] = SimpleQueue()
-                begun.put(_Queued(pool.submit(in_turn, item, found), found))
-                room.acquire()  # before the next item takes memory
-                if left.is_set():
-                    return
-        finally:
-            begun.put(None)
-
-    def taken(queue: SimpleQueue[Taken]) -> Taken:
-        if left.is_set():
-            raise CancelledError
-        return queue.get()
-
-    def results() -> Iterator[Result]:
-        at_once.release(workers)
-        while (stream := taken(begun)) is not None:
-            room.release()
-            while (result := taken(stream.found)) is not None:
-                yield result[0]
-            stream.done.result()
-        reading.result()
-
-    reading = reader.submit(read)
+    work = _ChainWork(function, items, max_waiting, workers)
     try:
-        yield results()
+        yield work.results()
     finally:
-        left.set()
-        room.release()
-        reader.shutdown(wait=True, cancel_futures=True)
-        pool.shutdown(wait=True, cancel_futures=True)
+        work.leave()
 
 
 class _Queued(NamedTuple, Generic[Result]):
@@ -118,6 +76,63 @@ class _Queued(NamedTuple, Generic[Result]):
 
     done: Future[None]
     found: SimpleQueue[tuple[Result] | None]
+
+
+class _ChainWork(Generic[Item, Result]):
+    """Threads of a `prefetched_chain`: one reads the items, the others work on them."""
+
+    def __init__(
+        self, function: Callable[[Item], Iterable[Result]], items: Iterable[Item], max_waiting: int,
+        workers: int,
+    ) -> None:  # fmt: skip
+        self._function, self._items, self._workers = function, items, workers
+        self._at_once, self._room, self._left = Semaphore(1), Semaphore(max_waiting - 1), Event()
+        self._begun: SimpleQueue[_Queued[Result] | None] = SimpleQueue()
+        self._pool, self._reader = ThreadPoolExecutor(workers), ThreadPoolExecutor(1)
+        self._reading = self._reader.submit(self._read)
+
+    def results(self) -> Iterator[Result]:
+        """Yield the results; from now on all workers work."""
+        self._at_once.release(self._workers)
+        while (item := self._taken(self._begun)) is not None:
+            self._room.release()
+            while (result := self._taken(item.found)) is not None:
+                yield result[0]
+            item.done.result()
+        self._reading.result()
+
+    def leave(self) -> None:
+        """Wait for the results under way and drop the rest."""
+        self._left.set()
+        self._room.release()
+        self._reader.shutdown(wait=True, cancel_futures=True)
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def _read(self) -> None:
+        try:
+            for item in self._items:
+                found: SimpleQueue[tuple[Result] | None] = SimpleQueue()
+                self._begun.put(_Queued(self._pool.submit(self._work, item, found), found))
+                self._room.acquire()  # before the next item takes memory
+                if self._left.is_set():
+                    return
+        finally:
+            self._begun.put(None)
+
+    def _work(self, item: Item, found: SimpleQueue[tuple[Result] | None]) -> None:
+        try:
+            with self._at_once:
+                for result in () if self._left.is_set() else self._function(item):
+                    found.put((result,))
+                    if self._left.is_set():
+                        return
+        finally:
+            found.put(None)
+
+    def _taken(self, queue: SimpleQueue[Taken]) -> Taken:
+        if self._left.is_set():
+            raise CancelledError
+        return queue.get()
 
 
 def prefetch(items: Iterable[Item], count: int = 1) -> Iterator[Item]:
