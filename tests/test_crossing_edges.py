@@ -72,9 +72,36 @@ def test_straps_and_dunnage_are_no_bars() -> None:
     assert edges_of(shaded((0.3, 0.35, 0.15, 0.0125, 8.0, 60.0)), bundle()) == []
 
 
-def test_only_free_bundles_are_looked_at_and_the_doubt_forbids() -> None:
-    doubt = Doubt(DoubtKind.HIDDEN_FLANK, "what stands higher beside it may lie over its low flank")
-    covered = replace(bundle(), cover_doubts=(doubt,))
+HIDDEN = Doubt(DoubtKind.HIDDEN_FLANK, "what stands higher beside it may lie over its low flank")
+
+
+@pytest.mark.parametrize(
+    ("away_m", "lower_m", "on_top", "expected"),
+    [
+        (0.4, 0.0, True, True), (0.4, 0.0, None, True), (0.4, 0.0, False, False), (1.2, 0.0, True, False),
+        (0.4, 0.35, True, False),
+    ],
+)  # fmt: skip
+def test_bundles_beside_a_free_one_are_looked_at_too(
+    away_m: float, lower_m: float, on_top: bool | None, expected: bool
+) -> None:
+    """A bar lies across the neighbour alone; what is told to be covered forbids as it is."""
+    low, free = TOP_M - lower_m, replace(bundle(), id=1)
+    free = replace(free, centre_m=free.centre_m + np.array([away_m, 0.0, 0.0]))
+    unsure = replace(bundle(), on_top=on_top, cover_doubts=(HIDDEN,), top_z_m=low)
+    poses = looking_down(0.03, 1)
+    seen, other = measure_from_pictures(
+        Pictures(poses, shaded((0.0, 0.35, 0.25, 0.0125, 0.0, 200.0))),
+        poses,
+        flat_map(),
+        (unsure, free),  # type: ignore[arg-type]
+    )
+    assert (seen.cover_doubts[-1].kind is DoubtKind.CROSSING_EDGE) == expected
+    assert other.is_free
+
+
+def test_covered_bundles_alone_are_not_looked_at_and_the_doubt_forbids() -> None:
+    covered = replace(bundle(), cover_doubts=(HIDDEN,))
     assert edges_of(shaded((0.0, 0.35, 0.25, 0.0125, 0.0, 200.0)), covered) == []
     one = with_edge(bundle(), 0.3)
     assert not one.is_free and one.cover_doubts == one.reasons[-1:]

@@ -33,6 +33,8 @@ _MAX_SLOPE, _MIN_ACROSS_M, _MIN_FIRST_M = 0.6, 0.03, 0.06
 """Of a segment, from square to the axis; its least extent across, and that of the first one of an edge."""
 _SAME_SLOPE, _SAME_M = 0.06, 0.008
 """Segments this much alike, and this near to one's line, are in line with it."""
+_BESIDE_FREE_M, _BELOW_FREE_M = 0.8, 0.3
+"""What lies on a bundle so far from a free one, or so far below its top, is in no magnet's way there."""
 _REACH_M, _MIN_COVERED_RATIO, _MAX_GAP_M = 0.1, 0.6, 0.06
 """An edge runs over a flank where it shows on this share of so much to either side, without a longer gap."""
 
@@ -57,11 +59,13 @@ class _Segments(NamedTuple):
 def edge_windows(
     frames: PlacedFrames, preferred: Collection[int], bundles: Sequence[Bundle]
 ) -> Iterator[tuple[int, BundleWindow]]:
-    """List windows along each free bundle, level at its top, with the frames nearest over them, of those in
-    `preferred` where one has it.
+    """List windows along each free bundle and those beside one, level at their tops, with the frames nearest
+    over them, of those in `preferred` where one has it.
     """
+    free = [bundle for bundle in bundles if bundle.is_free and is_placed(bundle)]
     for number, bundle in enumerate(bundles):
-        if not (bundle.is_free and is_placed(bundle)):
+        unsure = bundle.on_top is not False and not bundle.is_free and is_placed(bundle)
+        if not (bundle in free or (unsure and any(_is_beside(bundle, one) for one in free))):
             continue
         half = round((bundle.width_m / 2 + _BESIDE_M) / _STEP_M)
         beside = _STEP_M * np.arange(-half, half + 1.0)
@@ -69,6 +73,18 @@ def edge_windows(
             k = frames.nearest(window, preferred)
             if k is not None:
                 yield k, window
+
+
+def _is_beside(bundle: Bundle, free: Bundle) -> bool:
+    """Check whether something on a bundle may reach over a free one or beside it, by the rectangle about the
+    bundle along the free one's axes, and by its height.
+    """
+    axes = np.array([axis[:2] for axis in bundle_axes(free)])
+    own = np.array([axis[:2] for axis in bundle_axes(bundle)])
+    spread = np.abs(axes @ own.T) @ (bundle.length_m / 2, bundle.width_m / 2)
+    near = spread + np.array([free.length_m, free.width_m]) / 2 + _BESIDE_FREE_M
+    away = np.abs(axes @ (bundle.centre_m - free.centre_m)[:2])
+    return bool((away <= near).all()) and bundle.top_z_m > free.top_z_m - _BELOW_FREE_M
 
 
 def find_edge(gray: UInt8, window: BundleWindow, bundle: Bundle) -> float | None:
