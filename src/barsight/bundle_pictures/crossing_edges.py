@@ -34,7 +34,7 @@ _MAX_SLOPE, _MIN_ACROSS_M, _MIN_FIRST_M = 0.6, 0.03, 0.06
 _SAME_SLOPE, _SAME_M = 0.06, 0.008
 """Segments this much alike, and this near to one's line, are in line with it."""
 _BESIDE_FREE_M, _BELOW_FREE_M = 0.8, 0.3
-"""What lies on a bundle so far from a free one, or so far below its top, is in no magnet's way there."""
+"""Reach of what may lie on a bundle towards a free one, and how far its top may be below that one's."""
 _REACH_M, _MIN_COVERED_RATIO, _MAX_GAP_M = 0.1, 0.6, 0.06
 """An edge runs over a flank where it shows on this share of so much to either side, without a longer gap."""
 
@@ -56,16 +56,52 @@ class _Segments(NamedTuple):
         return _Segments(*(part[those] for part in self))
 
 
+class _FreeBundles(NamedTuple):
+    """Bundles (F,) that lie free: middles (F, 2) and tops (F,), m; level axes (F, 2, 2), along and across;
+    half their lengths and widths (F, 2).
+    """
+
+    middle_m: Float64
+    top_z_m: Float64
+    axes: Float64
+    half_m: Float64
+
+    @classmethod
+    def of(cls, bundles: Sequence[Bundle]) -> _FreeBundles:
+        """Gather bundles."""
+        return cls(
+            np.array([one.centre_m[:2] for one in bundles]).reshape(-1, 2),
+            np.array([one.top_z_m for one in bundles]),
+            np.array([_level_axes(one) for one in bundles]).reshape(-1, 2, 2),
+            np.array([(one.length_m / 2, one.width_m / 2) for one in bundles]).reshape(-1, 2),
+        )
+
+    def reached_from(self, bundle: Bundle) -> bool:
+        """Check whether what lies on a bundle, one of these or another, may reach over one or beside it, by
+        the rectangle about the bundle along that one's axes, and by its height.
+        """
+        half = np.array([bundle.length_m, bundle.width_m]) / 2
+        near = np.abs(self.axes @ _level_axes(bundle).T) @ half + self.half_m + _BESIDE_FREE_M
+        away = np.abs(np.einsum("fij,fj->fi", self.axes, bundle.centre_m[:2] - self.middle_m))
+        beside = (away <= near).all(axis=1) & (bundle.top_z_m > self.top_z_m - _BELOW_FREE_M)
+        return bool(beside.any())
+
+
+def _level_axes(bundle: Bundle) -> Float64:
+    """Stack the level axes (2, 2), along and across."""
+    return np.array([axis[:2] for axis in bundle_axes(bundle)])
+
+
 def edge_windows(
     frames: PlacedFrames, preferred: Collection[int], bundles: Sequence[Bundle]
 ) -> Iterator[tuple[int, BundleWindow]]:
     """List windows along each free bundle and those beside one, level at their tops, with the frames nearest
     over them, of those in `preferred` where one has it.
     """
-    free = [bundle for bundle in bundles if bundle.is_free and is_placed(bundle)]
-    for number, bundle in enumerate(bundles):
-        unsure = bundle.on_top is not False and not bundle.is_free and is_placed(bundle)
-        if not (bundle in free or (unsure and any(_is_beside(bundle, one) for one in free))):
+    placed = [(k, one) for k, one in enumerate(bundles) if one.on_top is not False and is_placed(one)]
+    free = _FreeBundles.of([one for _, one in placed if one.is_free])
+    for number, bundle in placed:
+        if not free.reached_from(bundle):
             continue
         half = round((bundle.width_m / 2 + _BESIDE_M) / _STEP_M)
         beside = _STEP_M * np.arange(-half, half + 1.0)
@@ -73,18 +109,6 @@ def edge_windows(
             k = frames.nearest(window, preferred)
             if k is not None:
                 yield k, window
-
-
-def _is_beside(bundle: Bundle, free: Bundle) -> bool:
-    """Check whether something on a bundle may reach over a free one or beside it, by the rectangle about the
-    bundle along the free one's axes, and by its height.
-    """
-    axes = np.array([axis[:2] for axis in bundle_axes(free)])
-    own = np.array([axis[:2] for axis in bundle_axes(bundle)])
-    spread = np.abs(axes @ own.T) @ (bundle.length_m / 2, bundle.width_m / 2)
-    near = spread + np.array([free.length_m, free.width_m]) / 2 + _BESIDE_FREE_M
-    away = np.abs(axes @ (bundle.centre_m - free.centre_m)[:2])
-    return bool((away <= near).all()) and bundle.top_z_m > free.top_z_m - _BELOW_FREE_M
 
 
 def find_edge(gray: UInt8, window: BundleWindow, bundle: Bundle) -> float | None:
