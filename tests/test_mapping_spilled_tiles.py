@@ -24,10 +24,15 @@ def test_spilled_tiles_are_those_of_a_dictionary(tmp_path: Path) -> None:
     assert len(list(tmp_path.rglob("*.npy"))) >= 9
     for key, tile in tiles.items():
         np.testing.assert_array_equal(tile, kept[key])
+        np.testing.assert_array_equal(tiles.peek(key), kept[key])
     del tiles[0, 0]
     assert (0, 0) not in tiles and len(tiles) == 11
     with pytest.raises(KeyError):
         tiles[0, 0]
+    tiles.hold(0)
+    assert len(list(tmp_path.rglob("*.npy"))) == 11
+    tiles.clear()
+    assert not tiles and not list(tmp_path.rglob("*.npy"))
 
 
 def test_two_stores_in_one_folder_are_apart(tmp_path: Path) -> None:

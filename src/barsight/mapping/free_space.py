@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from barsight.core.arrays import Bool, Float32, Float64, Int32, Int64, kernel
 from barsight.mapping.observation import CellObservations
-from barsight.mapping.tiles import TileKey
+from barsight.mapping.spilled_tiles import TileKey
 
 COARSE_CELLS = 2
 """Cells of the map per cell of free space, to a side."""

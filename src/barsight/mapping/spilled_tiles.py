@@ -1,4 +1,4 @@
-"""Hold tiles of what is known of free space and tops: a few in memory, the others on disk."""
+"""Hold the tiles of a map: a few in memory, the others on disk."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from collections import OrderedDict
 from collections.abc import Iterator, MutableMapping
 from pathlib import Path
 from threading import Lock
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from barsight.mapping.tiles import TileKey
-
 Tile = NDArray[Any]
+TileKey = tuple[int, int]
+"""Column and row number."""
 
 
 class SpilledTiles(MutableMapping[TileKey, Tile]):
@@ -36,18 +36,29 @@ class SpilledTiles(MutableMapping[TileKey, Tile]):
         with self._lock:
             tile = self._held.pop(key, None)
             if tile is None:
-                if key not in self._known:
-                    raise KeyError(key)
-                tile = np.load(self._file(key))
-            self._hold(key, tile)
+                self._write_oldest(self._resident - 1)
+                tile = self._load(key)
+            self._held[key] = tile
             return tile
 
     def __setitem__(self, key: TileKey, tile: Tile) -> None:
         """Take a tile in."""
         with self._lock:
             self._held.pop(key, None)
+            self._write_oldest(self._resident - 1)
             self._known.add(key)
-            self._hold(key, tile)
+            self._held[key] = tile
+
+    def peek(self, key: TileKey) -> Tile:
+        """Return a tile, not to be written to: it isn't kept if it lay on disk."""
+        with self._lock:
+            tile = self._held.get(key)
+            return self._load(key) if tile is None else tile
+
+    def hold(self, max_tiles: int) -> None:
+        """Write those that are unused for longest to disk until so many are held."""
+        with self._lock:
+            self._write_oldest(max_tiles)
 
     def __delitem__(self, key: TileKey) -> None:
         """Forget a tile."""
@@ -55,6 +66,14 @@ class SpilledTiles(MutableMapping[TileKey, Tile]):
             self._known.remove(key)
             self._held.pop(key, None)
             self._file(key).unlink(missing_ok=True)
+
+    def clear(self) -> None:
+        """Forget all tiles."""
+        with self._lock:
+            for key in self._known:
+                self._file(key).unlink(missing_ok=True)
+            self._known.clear()
+            self._held.clear()
 
     def __iter__(self) -> Iterator[TileKey]:
         """Iterate over the keys in a fixed order."""
@@ -68,11 +87,15 @@ class SpilledTiles(MutableMapping[TileKey, Tile]):
         """Check for a tile without taking it."""
         return key in self._known
 
-    def _hold(self, key: TileKey, tile: Tile) -> None:
-        self._held[key] = tile
-        while len(self._held) > self._resident:
+    def _write_oldest(self, max_tiles: int) -> None:
+        while len(self._held) > max_tiles:
             oldest, evicted = self._held.popitem(last=False)
             np.save(self._file(oldest), evicted)
+
+    def _load(self, key: TileKey) -> Tile:
+        if key not in self._known:
+            raise KeyError(key)
+        return cast(Tile, np.load(self._file(key)))
 
     def _file(self, key: TileKey) -> Path:
         return self._folder / f"{key[0]}_{key[1]}.npy"

@@ -19,7 +19,7 @@ from barsight.core.pose import Pose
 from barsight.core.types import RectifiedPair
 from barsight.mapping.free_space import TILE, covering_tiles, tile_overlap
 from barsight.mapping.observation import CellObservations
-from barsight.mapping.tiles import TileKey
+from barsight.mapping.spilled_tiles import TileKey
 
 COARSE_CELLS = 5
 """Cells of the map per cell, to a side, in which the height of the tops is kept."""

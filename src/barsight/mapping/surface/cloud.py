@@ -11,7 +11,8 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Int8, Int32, UInt8
 from barsight.mapping.fusion import height_sigma
-from barsight.mapping.tiles import GRAY, TILE_CELLS, VIEWS, TileKey, Z
+from barsight.mapping.spilled_tiles import TileKey
+from barsight.mapping.tiles import GRAY, TILE_CELLS, VIEWS, Z
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,6 +21,7 @@ from barsight.core.arrays import Bool, Float32, Float64, Int8, kernel
 from barsight.core.pose import Pose
 from barsight.core.types import RectifiedCamera
 from barsight.mapping.settings import MapSettings
+from barsight.mapping.spilled_tiles import TileKey
 from barsight.mapping.surface.block_visibility import (
     BLOCK,
     NOWHERE,
@@ -35,7 +36,7 @@ from barsight.mapping.surface.visibility import (
     may_be_occluded,
     point_density,
 )
-from barsight.mapping.tiles import CENTRAL, SLOTS, TILE_CELLS, VIEWS, TileKey, Z
+from barsight.mapping.tiles import CENTRAL, SLOTS, TILE_CELLS, VIEWS, Z
 
 _ALONG = 30
 _ALIKE_CELLS = 3.0

@@ -19,6 +19,7 @@ from barsight.core.parallel import ordered_map
 from barsight.core.timing import unwatched
 from barsight.core.types import HeightSource
 from barsight.mapping.settings import MapSettings
+from barsight.mapping.spilled_tiles import TileKey
 from barsight.mapping.surface.bar_directions import BLOCK_CELLS
 from barsight.mapping.surface.bar_profiles import REACH_CELLS, draw_bars
 from barsight.mapping.surface.cloud import CloudPart, cloud_file
@@ -49,7 +50,7 @@ from barsight.mapping.surface.surface import (
     tile_file,
     write_tile,
 )
-from barsight.mapping.tiles import TILE_CELLS, TileKey, TileStore
+from barsight.mapping.tiles import TILE_CELLS, TileStore
 
 Result = TypeVar("Result")
 

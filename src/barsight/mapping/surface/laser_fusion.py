@@ -12,10 +12,11 @@ import numpy as np
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.types import HeightSource, LaserProfile
 from barsight.mapping.settings import MapSettings
+from barsight.mapping.spilled_tiles import TileKey
 from barsight.mapping.surface.cloud import cloud_file
 from barsight.mapping.surface.incremental import gather_surface, tile_figures
 from barsight.mapping.surface.surface import Layers, Surface, read_tile, tile_file, write_tile
-from barsight.mapping.tiles import TILE_CELLS, TileKey
+from barsight.mapping.tiles import TILE_CELLS
 
 CARRIED_M = 0.12
 """Distance along Y over which the share of vision's error that is the same falls to 1/e: it averages so far

@@ -12,9 +12,10 @@ import numpy as np
 from barsight.core.arrays import Float32, Int8, UInt8, kernel
 from barsight.core.types import HeightSource
 from barsight.mapping.fusion import height_sigma
+from barsight.mapping.spilled_tiles import TileKey
 from barsight.mapping.surface.cloud import CloudPart, read_part
 from barsight.mapping.surface.hole_filling import bridge_gaps
-from barsight.mapping.tiles import FIELDS, GRAY, TILE_CELLS, VIEWS, TileKey, Z
+from barsight.mapping.tiles import FIELDS, GRAY, TILE_CELLS, VIEWS, Z
 
 
 @dataclass(frozen=True, eq=False)
