@@ -362,6 +362,18 @@ def test_a_neighbour_that_may_lie_over_a_flank_leaves_open_what_lies_on_it() -> 
         assert not flanks.doubt and (not flanks.cover_doubt) is is_sure
 
 
+@pytest.mark.parametrize(("rise_m", "is_free"), [(-0.05, True), (0.15, False), (0.4, False)])
+def test_a_flank_out_of_sight_may_lie_under_what_stands_higher(rise_m: float, *, is_free: bool) -> None:
+    lower = Laid(0.0, 0.0, 0.15, 0.0)
+    heights = draw([lower])
+    x = heights.x0_m + heights.cell_m * np.arange(heights.z_m.shape[1])
+    unseen, beside = (x > 0.04) & (x < 0.17), (x >= 0.17) & (x < 0.4)
+    heights.z_m[:, unseen], heights.source[:, unseen] = np.nan, HeightSource.UNKNOWN
+    heights.z_m[:, beside] = lower.top_z_m + rise_m
+    found = min(find_bundles(heights, SETTINGS), key=lambda one: abs(one.centre_m[0]))
+    assert found.is_free is is_free and (found.on_top is True) is is_free
+
+
 def test_two_readings_of_one_bundle_are_joined() -> None:
     (one,) = find_bundles(draw([Laid(0.0, 0.0, 0.2, 0.0)]), SETTINGS)
     step = np.array([0.004, 1.0, 0.0])

@@ -26,9 +26,10 @@ stack on feet of its own."""
 @dataclass(frozen=True)
 class Flanks:
     """Flanks on the low and the high side. falls_m: from the crest to the lowest place of each, inf where it
-    falls to the floor or out of sight; rises_m: from the crest to the highest place beside it, -inf where
-    nothing is seen. are_flat: neither falls off before its edge, as a plate, a cart or a wall does not.
-    ended: on which sides straps show where the bundle ends, however little it falls there.
+    falls to the floor or out of sight, 0 where what hides all of it stands higher; rises_m: from the crest to
+    the highest place beside it, -inf where nothing is seen. are_flat: neither falls off before its edge, as a
+    plate, a cart or a wall does not. ended: on which sides straps show where the bundle ends, however little
+    it falls there.
     """
 
     width_m: float
@@ -81,12 +82,14 @@ def seen_flanks(one: FittedOutline, low_m: float, high_m: float) -> Flanks | Non
 
 def _flank(outwards: Float64, level: Float64, crest: float, width: float) -> tuple[float, float, float]:
     """Compute how far one side falls before its edge; how far with what a map grows over that, inf where to
-    the floor or out of sight; and how far what lies beyond rises.
+    the floor or out of sight, 0 where what hides it all stands higher; and how far what lies beyond rises.
     """
     first, edge, last = (ratio * width for ratio in _FLANK_RATIOS)
     inner = level[(outwards > first) & (outwards < edge)]
     own = level[(outwards > first) & (outwards < last)]
     beyond = level[(outwards >= edge) & (outwards < edge + _BEYOND_M)]
     before = crest - inner[np.isfinite(inner)].min(initial=crest)
-    seen = own[~np.isnan(own)].min(initial=-np.inf if np.isnan(own).all() else np.inf)
-    return float(before), float(crest - seen), float(beyond[np.isfinite(beyond)].max(initial=-np.inf) - crest)
+    rise = beyond[np.isfinite(beyond)].max(initial=-np.inf) - crest
+    seen = own[~np.isnan(own)]
+    lowest = seen.min() if seen.size else crest if rise > _HIGHER_M else -np.inf
+    return float(before), float(crest - lowest), float(rise)
