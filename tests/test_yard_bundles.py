@@ -38,7 +38,7 @@ from barsight.yard.lifting.load import Load
 from barsight.yard.magnet.holding import min_diameter_m
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.weight import bundle_mass
-from yard_maps import Laid, draw
+from yard_maps import Laid, draw, photographed
 
 SETTINGS = BundleSettings()
 
@@ -372,6 +372,27 @@ def test_a_flank_out_of_sight_may_lie_under_what_stands_higher(rise_m: float, *,
     heights.z_m[:, beside] = lower.top_z_m + rise_m
     found = min(find_bundles(heights, SETTINGS), key=lambda one: abs(one.centre_m[0]))
     assert found.is_free is is_free and (found.on_top is True) is is_free
+
+
+@pytest.mark.parametrize(("z_m", "straps_m", "is_sure"), [
+    (0.3, (), False), (0.3, (-1.0, 0.1, 1.0), True), (0.134, (), True),
+])  # fmt: skip
+def test_bars_that_no_straps_hold_may_lie_loose_unless_they_are_counted(
+    z_m: float, straps_m: tuple[float, ...], *, is_sure: bool
+) -> None:
+    """At 0.3 m it stands too high for the full bundle that it is, and can't be counted."""
+    laid = Laid(0.5, 0.0, z_m, 0.0)
+    heights = draw([laid])
+    (bundle,) = find_bundles(heights, SETTINGS)
+    assert bundle.confidence > 0.9
+    heights = photographed(heights, [laid])
+    assert heights.gray is not None
+    y = heights.y0_m + heights.cell_m * np.arange(heights.z_m.shape[0])
+    for at in straps_m:
+        heights.gray[np.abs(y - at) < 0.02] = 10
+    (bundle,) = find_bundles(heights, SETTINGS)
+    assert (bundle.confidence > 0.9) is is_sure
+    assert any("no straps" in doubt.sentence for doubt in bundle.reasons) is not is_sure
 
 
 def test_two_readings_of_one_bundle_are_joined() -> None:

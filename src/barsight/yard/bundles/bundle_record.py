@@ -126,9 +126,7 @@ def make_bundle(
     if reading.pack is not None and reading.pack.is_bounded:
         width_m = reading.pack.width_m
     irregular = widen_sigma(bundle.sigma, reading.found, width_m, bundle.length_m, is_one_of_two=doubtful)
-    if reading.pack is not None:
-        return held_by_straps(bundle, irregular, reading, seen, floor_m)
-    return bundle if bars is not None else replace(bundle, sigma=irregular)
+    return held_by_straps(bundle, irregular, reading, seen, floor_m)
 
 
 def map_sigma(yard: YardMap, bundle: Bundle) -> float:

@@ -169,7 +169,11 @@ def _settled(
     packs = ordered_map(
         lambda reading: strapped_pack(height_map, reading.found.grid, reading.found.fit), readings
     )
-    seen = [replace(reading, pack=pack).with_flanks() for reading, pack in zip(readings, packs, strict=True)]
+    has_photo = height_map.gray is not None
+    seen = [
+        replace(reading, pack=pack, has_photo=has_photo).with_flanks()
+        for reading, pack in zip(readings, packs, strict=True)
+    ]
     return [one for one in seen if one.pack is not None or not one.is_flat]
 
 

@@ -18,8 +18,9 @@ class Reading:
     """A chosen outline with its weight (cells explained) and the strongest other reading of its place.
 
     other_packing: rings of another packing that explains the bundles of this kind as well, if any does. pack:
-    the bars that straps hold together there, None where no straps are seen. flanks: of the pack where its
-    bounds are known, else of the outline; None where too little of them is seen.
+    the bars that straps hold together there, None where no straps are seen; has_photo: whether they were
+    looked for. flanks: of the pack where its bounds are known, else of the outline; None where too little of
+    them is seen.
     """
 
     found: FittedOutline
@@ -28,6 +29,7 @@ class Reading:
     rival_weight: float
     other_packing: int | None
     pack: Pack | None = None
+    has_photo: bool = False
     flanks: Flanks | None = None
 
     @property

@@ -46,13 +46,14 @@ def held_by_straps(
 ) -> Bundle:
     """Hold a bundle to what straps show: place, width and section where the fitted outline misses the pack,
     the section alone where both agree, a doubt where a neighbour may lie over the pack or it goes on beyond
-    what is in sight.
+    what is in sight, and where no straps show.
 
-    irregular: its sigma where it is not surely the hexagon that was fitted. reading: one with a pack. seen:
-    what the surface shows of its section.
+    irregular: its sigma where it is not surely the hexagon that was fitted. seen: what the surface shows of
+    its section.
     """
     pack = reading.pack
-    assert pack is not None
+    if pack is None:
+        return _without_straps(bundle, irregular, reading)
     held = _held(bundle, irregular, reading, pack, floor_m)
     if held.bars is not None or not _may_go_on(pack, seen):
         return held
@@ -61,6 +62,20 @@ def held_by_straps(
         held, section_m2=np.nan, sigma=replace(held.sigma, section_m2=np.nan),
         reasons=(*held.reasons, Doubt(DoubtKind.MAY_GO_ON, said)),
     )  # fmt: skip
+
+
+def _without_straps(bundle: Bundle, irregular: BundleSigma, reading: Reading) -> Bundle:
+    """Doubt several bars that can't be counted where the photo shows no straps: they may lie loose, and the
+    outline may be that of some bars of a pack.
+    """
+    if bundle.bars is not None:
+        return bundle
+    bundle = replace(bundle, sigma=irregular)
+    if not reading.has_photo or reading.found.fit.rings == 0:
+        return bundle
+    said = "the photo shows no straps on it: its bars may lie loose, or be some of a wider bundle's"
+    reasons = (*bundle.reasons, Doubt(DoubtKind.OTHER, said))
+    return replace(bundle, confidence=min(bundle.confidence, DOUBTFUL), reasons=reasons)
 
 
 def _may_go_on(pack: Pack, seen: SeenSection | None) -> bool:
