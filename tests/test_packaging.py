@@ -72,7 +72,14 @@ EXTRAS = {
         "fleet/window.py",
         "fleet/cluster.py",
     },
-    "page": {"page/app.py", "page/serve.py"},
+    "page": {
+        "page/api/app.py",
+        "page/api/callers.py",
+        "page/api/changing.py",
+        "page/api/forms.py",
+        "page/api/reading.py",
+        "page/api/serve.py",
+    },
     "opcua": {
         "plant/opcua/security/binding.py",
         "plant/opcua/security/access.py",

@@ -24,9 +24,9 @@ from barsight.cli.main import run
 from barsight.core.errors import ConfigError, InputError
 from barsight.core.stamps import NS_PER_S
 from barsight.page.access import Access, AccessError, Throttle
+from barsight.page.api.serve import ServeOptions, serving
 from barsight.page.documents import unseen_lengths
 from barsight.page.layers import find_layers, newest_at, paint_layer
-from barsight.page.serve import ServeOptions, serving
 from barsight.store import accounts, confirmation
 from barsight.store.adding import add_survey, read_survey
 from barsight.store.audit import AuditChain, entry, verify_chain

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barsight.page.serve import ServeOptions, serving
+from barsight.page.api.serve import ServeOptions, serving
 from barsight.store.accounts import add_person
 from barsight.store.audit import entry
 from barsight.store.opening import open_store

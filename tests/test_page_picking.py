@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from barsight.cli.main import run
-from barsight.page.serve import ServeOptions, serving
+from barsight.page.api.serve import ServeOptions, serving
 from barsight.registration.yard_file import read_yard_file
 from page_yards import DISCS
 from test_page_browser import Sheet, address, browser, frame, made, pytestmark, url, violations, wait_for

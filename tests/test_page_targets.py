@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from barsight.cli.main import run
 from barsight.core.errors import InputError
-from barsight.page.serve import ServeOptions, serving
+from barsight.page.api.serve import ServeOptions, serving
 from barsight.page.targets import Pick, place_pick
 from barsight.registration.rigid import design_rows
 from barsight.registration.surveyed_targets import read_targets

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from playwright.sync_api import Page, sync_playwright
 
-from barsight.page.serve import ServeOptions, serving
+from barsight.page.api.serve import ServeOptions, serving
 
 ROOT = Path(__file__).parents[1]
 SCREENS = ("yard", "lifts", "alarms", "timeline", "targets")

@@ -97,7 +97,7 @@ def _show_page(out: Path, console: SafeConsole, *, serve: bool) -> None:
     url = f"sqlite:///{out / 'yard.db'}"
     try:
         with extra("store,page"):
-            from barsight.page import serve as page
+            from barsight.page.api import serve as page
             from barsight.store.adding import add_survey, read_survey
             from barsight.store.audit import user_name
             from barsight.store.opening import open_store

@@ -32,7 +32,7 @@ def run(arguments: Sequence[str]) -> None:
             live: Folder that a live run writes, for its health.
         """
         with extra("page"):
-            from barsight.page.serve import ServeOptions, serve
+            from barsight.page.api.serve import ServeOptions, serve
         serve(store, ServeOptions(host, port, public_url, certificate, key, live))
 
     call(command, "serve", arguments)

@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 
 from barsight.core.errors import ConfigError, InputError, OutputError
 from barsight.core.extras import extra
-from barsight.page.app import build_app
+from barsight.page.api.app import build_app
 from barsight.page.live import LiveFolder
 from barsight.page.watch import StoreWatch
 from barsight.store.accounts import list_accounts
