@@ -17,10 +17,11 @@ from barsight.calibration.files.rig_file import write_rig_file
 from barsight.calibration.files.yaml_document import write_document
 from barsight.cli.main import run
 from barsight.core.errors import BarsightError, Failed, InputError
+from barsight.mapping.view import Matcher
 from barsight.measure_settings import MeasureSettings
-from barsight.reconstruction import map_building
+from barsight.reconstruction import checkpoint, map_building, tracked_recording
 from barsight.reconstruction.checkpoint import checkpoint_folder, checkpointed, read_checkpoint
-from barsight.reconstruction.map_building import inspect_recording
+from barsight.reconstruction.probed_recording import inspect_recording
 from barsight.recording.base import RecordingSettings
 from barsight.recording.open import open_recording
 from barsight.yard.magnet.description import example_magnet
@@ -32,7 +33,7 @@ SAME = ("height.tif", "contour.csv", "trajectory.tum", "cloud.ply")
 
 def killed_at(monkeypatch: pytest.MonkeyPatch, name: str, call: int) -> list[int]:
     """Let the pipeline's function `name` be interrupted at its call-th call (0: never); the calls made."""
-    room = pipeline if hasattr(pipeline, name) else map_building
+    room = next(one for one in (pipeline, tracked_recording, map_building) if hasattr(one, name))
     whole, calls = getattr(room, name), []
 
     def counted(*arguments: Any, **named: Any) -> Any:
@@ -78,7 +79,7 @@ def test_what_is_matched_early_changes_nothing(
         with monkeypatch.context() as patch:
             if early is not None:
                 guess = frozenset(stamps[k] for k in early)
-                patch.setattr(map_building, "_known_early", lambda *_, guess=guess: guess)
+                patch.setattr(tracked_recording, "_known_early", lambda *_, guess=guess: guess)
             matched = counting_matches(patch)
             assert run(["measure", str(recording), "-o", str(out), *FAST, "--map.min-shift", "0.2"]) == 0
         written[early] = [(out / name).read_bytes() for name in SAME]
@@ -90,13 +91,13 @@ def test_what_is_matched_early_changes_nothing(
 
 
 def counting_matches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    whole, calls = map_building.Matcher.__call__, []
+    whole, calls = Matcher.__call__, []
 
     def counted(self: Any, *arguments: Any) -> Any:
         calls.append(1)
         return whole(self, *arguments)
 
-    monkeypatch.setattr(map_building.Matcher, "__call__", counted)
+    monkeypatch.setattr(Matcher, "__call__", counted)
     return calls
 
 
@@ -158,7 +159,7 @@ def test_checkpoints_hold_only_for_what_made_them(
 
 def key_of(recording: Path, settings: MeasureSettings | None = None) -> str:
     source = open_recording(recording)
-    return map_building.checkpoint_key(source, source, settings or MeasureSettings(), source.digests())
+    return checkpoint.checkpoint_key(source, source, settings or MeasureSettings(), source.digests())
 
 
 def edit_imu(recording: Path) -> None:
@@ -194,7 +195,7 @@ def test_the_key_tells_sources_and_settings(tmp_path: Path, monkeypatch: pytest.
     before, settings = key_of(recording), MeasureSettings()
     assert key_of(recording, replace(settings, stereo=replace(settings.stereo, max_sigma_px=0.1))) != before
     assert key_of(recording, replace(settings, lift=replace(settings.lift, max_age_s=1.0))) == before
-    monkeypatch.setattr(map_building, "sources_digest", lambda _: "of another version")
+    monkeypatch.setattr(checkpoint, "sources_digest", lambda _: "of another version")
     assert key_of(recording) != before
 
 

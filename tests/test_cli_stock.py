@@ -26,7 +26,7 @@ def test_a_bad_list_fails_before_anything_is_measured(
     def never(*_: object) -> None:
         raise AssertionError("a frame was looked at")
 
-    monkeypatch.setattr("barsight.reconstruction.map_building.probe_recording", never)
+    monkeypatch.setattr("barsight.reconstruction.probed_recording.probe_recording", never)
     listed = tmp_path / "stock.csv"
     if content is not None:
         listed.write_text(content)

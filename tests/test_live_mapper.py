@@ -18,8 +18,7 @@ from barsight.mapping.fusion import fuse_view
 from barsight.measure_folder import write_measured
 from barsight.pipeline import LiftRequest
 from barsight.reconstruction import map_building
-from barsight.reconstruction.checkpoint import checkpoint_folder
-from barsight.reconstruction.map_building import checkpoint_key
+from barsight.reconstruction.checkpoint import checkpoint_folder, checkpoint_key
 from barsight.recording.base import Recording
 
 FIELDS = {"map": {"cell_m": 0.05}, "motion": {"estimator": "live"}}

@@ -20,7 +20,7 @@ from barsight.mapping.view import MatchedFrame
 from barsight.measure_settings import MeasureSettings
 from barsight.measurement import Refusal
 from barsight.motion.frontend.direct_alignment import _add_equations, _compare, align_views
-from barsight.reconstruction.map_building import matching
+from barsight.reconstruction.tracked_recording import matching
 from barsight.recording.base import Recording
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.recording.sensor_selection import SelectedSensors

@@ -13,11 +13,11 @@ from barsight.core.files import atomic_directory, lies_within
 from barsight.core.json_values import write_json
 from barsight.core.parallel import in_background
 from barsight.core.settings.values import expect_choice
+from barsight.core.timing import ProgressCallback
 from barsight.evaluation.score import score_folder
 from barsight.mapping.surface.surface import read_tile
 from barsight.measure_settings import MeasureSettings
 from barsight.pipeline import LiftRequest, find_lifts, map_yard
-from barsight.reconstruction.map_building import ProgressCallback
 from barsight.recording.base import Recording
 from barsight.recording.open import open_recording
 from barsight.report.page import write_report

@@ -22,7 +22,7 @@ from barsight.core.memory import peak_memory_mib
 from barsight.core.notices import Notice
 from barsight.core.parallel import single_opencv_thread
 from barsight.core.stamps import seconds_to_ns
-from barsight.core.timing import Stopwatch
+from barsight.core.timing import ProgressCallback, Stopwatch
 from barsight.core.types import Trajectory
 from barsight.labels.bundle_labels import expect_readers, label_bundles
 from barsight.mapping.free_space import FreeSpace
@@ -33,14 +33,9 @@ from barsight.mapping.top_photo import TopPhoto
 from barsight.measure_settings import MeasureSettings
 from barsight.measurement import BuiltMap, Measurement, PassRecord, StageTime
 from barsight.reconstruction.joined_passes import JoinedPasses, MappedPass, in_order, join_passes
-from barsight.reconstruction.map_building import (
-    ProbedRecording,
-    ProgressCallback,
-    TrackedRecording,
-    build_map,
-    estimate_trajectory,
-    inspect_recording,
-)
+from barsight.reconstruction.map_building import build_map
+from barsight.reconstruction.probed_recording import ProbedRecording, inspect_recording
+from barsight.reconstruction.tracked_recording import TrackedRecording, estimate_trajectory
 from barsight.recording.base import Recording
 from barsight.yard.bundles.bundle_kinds import listed_diameter
 from barsight.yard.bundles.detection import find_bundles

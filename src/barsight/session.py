@@ -23,9 +23,9 @@ from barsight.measure_folder import ignore_progress, write_measured
 from barsight.measure_settings import MeasureSettings
 from barsight.motion.settings import make_early_estimator
 from barsight.pipeline import LiftRequest
-from barsight.reconstruction.checkpoint import checkpoint_folder
+from barsight.reconstruction.checkpoint import checkpoint_folder, checkpoint_key
 from barsight.reconstruction.live_map import LiveMap, PairPlacer, Snapshot, is_final
-from barsight.reconstruction.map_building import checkpoint_key, matching
+from barsight.reconstruction.tracked_recording import matching
 from barsight.recording.packets import Packet, PacketRecording
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.recording.sensor_selection import SelectedSensors

@@ -16,12 +16,12 @@ from barsight.acceptance.quantities import Decision, JudgedQuantity, decide, jud
 from barsight.acceptance.uncertainty import combine
 from barsight.artefacts.plan import AcceptancePlan, ErrorLimits
 from barsight.core.errors import Failed, InputError
+from barsight.core.timing import ProgressCallback
 from barsight.core.types import StereoFrame
 from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings
 from barsight.motion.batch.fusion import FusionSettings
 from barsight.motion.rig_check.drift_check import CheckSettings, RigCheck, check_rig
-from barsight.reconstruction.map_building import ProgressCallback
 from barsight.recording.base import Recording
 from barsight.recording.open import open_recording
 from barsight.yard.magnet.description import MagnetOffset

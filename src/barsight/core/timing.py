@@ -7,6 +7,9 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 
+ProgressCallback = Callable[[str, int, int], None]
+"""Told of progress: stage, frames done, frames in all."""
+
 
 class Stopwatch:
     """Adds up seconds and frames by stage, from any thread; stages that overlap count each in full."""
@@ -32,7 +35,7 @@ class Stopwatch:
         return tuple((stage, seconds, self._frames[stage]) for stage, seconds in self._seconds.items())
 
 
-def count_frames(stage: str, total: int, advance: Callable[[str, int, int], None]) -> Callable[[], None]:
+def count_frames(stage: str, total: int, advance: ProgressCallback) -> Callable[[], None]:
     """Count a stage's frames: each call reports one more of `total` to `advance(stage, done, total)`."""
     done = 0
 

@@ -20,8 +20,8 @@ from barsight.live.shared.counters import DRAIN
 from barsight.motion.fixed_lag.sensor_buffer import SENSOR_DELAY_S
 from barsight.motion.settings import make_estimator
 from barsight.reconstruction.live_map import LiveMap, PairPlacer, is_final
-from barsight.reconstruction.map_building import matching
 from barsight.reconstruction.pair_chain import MatchedAhead
+from barsight.reconstruction.tracked_recording import matching
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.report.result_files import write_height
 from barsight.yard_frame import placing_id

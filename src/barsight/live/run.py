@@ -22,6 +22,7 @@ from barsight.core.memory import trim_heap
 from barsight.core.notices import Notice
 from barsight.core.parallel import in_background
 from barsight.core.stamps import NS_PER_S
+from barsight.core.timing import ProgressCallback
 from barsight.live.latency import latencies
 from barsight.live.link import GrowingRecording, KeptRecording, Link, LiveInput
 from barsight.live.mapper import LIVE_MAP
@@ -35,8 +36,7 @@ from barsight.live.survey import STOOD
 from barsight.measure_folder import ignore_progress, write_measured
 from barsight.measure_settings import MeasureSettings
 from barsight.pipeline import LiftRequest
-from barsight.reconstruction.checkpoint import checkpoint_folder
-from barsight.reconstruction.map_building import ProgressCallback, checkpoint_key
+from barsight.reconstruction.checkpoint import checkpoint_folder, checkpoint_key
 from barsight.recording.base import Recording
 from barsight.recording.open import open_recording
 from barsight.recording.sensor_selection import SelectedSensors

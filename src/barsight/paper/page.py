@@ -14,6 +14,7 @@ from barsight.benchmarks.provenance import provenance
 from barsight.benchmarks.stereo.target_size import TargetSizeBench
 from barsight.core.errors import BarsightError, InputError
 from barsight.core.files import atomic_directory
+from barsight.core.timing import ProgressCallback
 from barsight.paper import cloud, findings, published, runs, surface
 from barsight.paper.architecture import Architecture, measure_architecture
 from barsight.paper.checks import rotation_errors_deg
@@ -28,7 +29,6 @@ from barsight.paper.features import (
 from barsight.paper.icp import IcpScore, icp_score
 from barsight.paper.pictures import PaperPicture
 from barsight.paper.registry import ENTRIES, FURTHER
-from barsight.reconstruction.map_building import ProgressCallback
 from barsight.recording.open import open_recording
 from barsight.report.page import environment, resource
 from barsight.simulation.settings import CameraSettings

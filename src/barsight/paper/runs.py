@@ -9,6 +9,7 @@ from typing import Any
 from barsight.benchmarks.stereo.target_size import RANGES_MM, TargetSizeBench, bench_target_size
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import BarsightError
+from barsight.core.timing import ProgressCallback
 from barsight.core.types import Trajectory
 from barsight.mapping.settings import MapSettings
 from barsight.measure_folder import measure_into
@@ -16,7 +17,6 @@ from barsight.measure_settings import MeasureSettings
 from barsight.motion.batch.fusion import FusionSettings
 from barsight.motion.settings import MotionSettings, make_estimator
 from barsight.paper.cloud import DriftRow, drift_row
-from barsight.reconstruction.map_building import ProgressCallback
 from barsight.recording.base import Recording
 from barsight.recording.sensor_selection import SelectedSensors
 from barsight.simulation.effects.settings import FaultSettings, LightSettings

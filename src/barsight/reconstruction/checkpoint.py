@@ -18,8 +18,11 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+import barsight
+from barsight.core.compiling.sources import sources_digest
 from barsight.core.errors import Failed, InputError
 from barsight.core.files import atomic_path
+from barsight.core.json_values import json_digest, json_value
 from barsight.core.motion_detail import InertialStates, MotionDetail, NormalisedResiduals, RelativePoses
 from barsight.core.pose import Pose
 from barsight.core.types import (
@@ -37,9 +40,11 @@ from barsight.mapping.recording_probe import RecordingProbe
 from barsight.mapping.surface.surface import Surface
 from barsight.mapping.top_photo import TopPhoto
 from barsight.mapping.view import MatchedFrame
+from barsight.measure_settings import MeasureSettings
 from barsight.measurement import BuiltMap, Preview, Refusal
 from barsight.recording.base import Recording
 from barsight.recording.formats.image_folders import PictureFiles
+from barsight.yard_frame import frame_of
 
 T = TypeVar("T")
 
@@ -98,6 +103,21 @@ def _make_own(folder: Path) -> None:
     found = folder.lstat()
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid():
         raise InputError(folder, "is no folder of this user's own", "remove it, or name another OUT")
+
+
+def checkpoint_key(
+    recording: Recording, source: Recording, settings: MeasureSettings, inputs: dict[str, str]
+) -> str:
+    """Return a digest of all that trajectory, disparities and map depend on, the package's sources among it.
+
+    source: the recording with the sensors in use, in the yard. inputs: SHA-256 of its files.
+    """
+    sources = sources_digest(Path(barsight.__file__).parent)
+    configuration, frame = json_value(settings), frame_of(source)
+    stages = {name: part for name, part in configuration.items() if name not in ("bundles", "lift")}
+    placed = inputs if frame is None else {**inputs, "yard": frame.digest}
+    rig = json_value(recording.rig)
+    return json_digest([sources, stages, placed, rig, pictures_digest(recording)])
 
 
 def pictures_digest(recording: Recording) -> str:

@@ -22,7 +22,8 @@ from barsight.mapping.surface.surface import Surface
 from barsight.mapping.top_photo import TopPhoto
 from barsight.measure_settings import MeasureSettings
 from barsight.measurement import BuiltMap
-from barsight.reconstruction.map_building import ProbedRecording, TrackedRecording
+from barsight.reconstruction.probed_recording import ProbedRecording
+from barsight.reconstruction.tracked_recording import TrackedRecording
 from barsight.recording.base import Recording
 from barsight.registration.pass_ties import PairTie, PassCorrection, PassPrior, PassTies, tie_passes
 from barsight.yard.types import Bundle, Doubt, DoubtKind

@@ -22,8 +22,9 @@ from barsight.measure_settings import MeasureSettings
 from barsight.motion.estimator import PoseEstimator, TrajectoryEstimator
 from barsight.motion.settings import make_estimator
 from barsight.reconstruction.checkpoint import checkpointed, sensor_readings, trajectory_name
-from barsight.reconstruction.map_building import MapBuilder, look_at, map_name
+from barsight.reconstruction.map_building import MapBuilder, map_name
 from barsight.reconstruction.pair_chain import MatchedAhead, PairChain
+from barsight.reconstruction.probed_recording import look_at
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.yard.sections import surface_map
 from barsight.yard.types import HeightMap

@@ -1,39 +1,22 @@
-"""Build the map: recording -> trajectory and matched pairs -> votes in the map's cells."""
+"""Build the map: posed, matched pairs -> votes in the map's cells -> height surface."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import dataclass, replace
-from functools import partial
-from itertools import chain, islice, pairwise, takewhile
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import chain, pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-import barsight
-from barsight.calibration.geometry.rectification import Rectifier
-from barsight.calibration.stereo.disparity_uncertainty import disparity_sigma_px, rig_covariance
-from barsight.core.arrays import Float64
-from barsight.core.compiling.sources import sources_digest
-from barsight.core.errors import Failed, InputError, MeasurementError
+from barsight.core.errors import Failed, MeasurementError
 from barsight.core.json_values import json_digest, json_value
 from barsight.core.memory import trim_heap
-from barsight.core.notices import Notice
-from barsight.core.parallel import WORKERS, prefetched_chain
 from barsight.core.pose import Pose
-from barsight.core.timing import Stopwatch, count_frames, unwatched
-from barsight.core.types import PosedFrame, RectifiedCamera, RectifiedPair, RefusedFrame, Trajectory
+from barsight.core.timing import ProgressCallback, unwatched
+from barsight.core.types import PosedFrame, RectifiedCamera, RefusedFrame
 from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.fusion import fuse_view
-from barsight.mapping.keyframes import select_keyframes, select_keyframes_by_encoders
-from barsight.mapping.recording_probe import (
-    RecordingProbe,
-    choose_cell_size,
-    points_per_pixel,
-    probe_recording,
-)
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.spilled_tiles import SpilledTiles
 from barsight.mapping.surface.height_selection import ViewFrusta
@@ -41,73 +24,17 @@ from barsight.mapping.surface.incremental import SurfaceElection
 from barsight.mapping.surface.surface import Surface
 from barsight.mapping.tiles import TileStore
 from barsight.mapping.top_photo import TopPhoto
-from barsight.mapping.view import MatchedFrame, Matcher, Neighbour, PointBinner, PosedView
+from barsight.mapping.view import MatchedFrame, Neighbour, PointBinner, PosedView
 from barsight.measure_settings import MeasureSettings
 from barsight.measurement import BuiltMap, Preview, Refusal
-from barsight.motion.rig_check.self_calibration import residual_covariance, self_calibrate
-from barsight.motion.settings import make_estimator
-from barsight.reconstruction.checkpoint import (
-    checkpoint_folder,
-    checkpointed,
-    pictures_digest,
-    trajectory_name,
-)
-from barsight.reconstruction.pair_chain import PairChain
-from barsight.recording.base import Recording
-from barsight.recording.plausibility import clock_faults, doubts
-from barsight.recording.rectified_pairs import RectifiedPairs
-from barsight.recording.sensor_selection import SelectedSensors
+from barsight.reconstruction.checkpoint import checkpointed
+from barsight.reconstruction.probed_recording import ProbedRecording
+from barsight.reconstruction.tracked_recording import TrackedRecording
 from barsight.registration.yard_file import YardFrame
-from barsight.stereo.settings import StereoSettings, make_map_method
-from barsight.yard_frame import frame_of, in_yard, placed_in_yard, shared_height_sigma_m
+from barsight.yard_frame import frame_of, shared_height_sigma_m
 
-ProgressCallback = Callable[[str, int, int], None]
-"""Told of progress: stage, frames done, frames in all."""
-
-_MATCHED_AHEAD, _MATCHED_AFTER = 16, 4
-"""Pairs that may wait, matched, beside the trajectory and after it: 13 MB each at 1280x1024."""
 _TIDIED_EVERY = 8
 """Frames between which freed memory may pile up."""
-
-
-@dataclass(frozen=True, eq=False)
-class ProbedRecording:
-    """A recording as it was first looked at. calibration_px: sigma of the disparity by the calibration.
-    doubts: what can't be right in the samples. inputs: SHA-256 of the files. checkpoints: their folder, if
-    any. watch: times the stages.
-    """
-
-    source: Recording
-    pairs: RectifiedPairs
-    first: RecordingProbe
-    cell_m: float
-    calibration_px: float
-    doubts: tuple[Notice, ...]
-    configuration: dict[str, Any]
-    inputs: dict[str, str]
-    checkpoints: Path | None
-    watch: Stopwatch
-
-    @property
-    def per_pixel(self) -> int:
-        """Return the points per pixel and side that the cells need."""
-        return points_per_pixel(self.first, self.cell_m)
-
-
-@dataclass(frozen=True, eq=False)
-class TrackedRecording:
-    """The trajectory, and the pairs that the map is made of. rectifier: as corrected in service. stereo: with
-    the disparity's calibration sigma. rig_covariance: of yaw, baseline and focal length (3, 3), None where no
-    rig file says it. poses: of the frames taken, by stamp. matched: those frames, in order.
-    """
-
-    trajectory: Trajectory
-    rectifier: Rectifier
-    stereo: StereoSettings
-    rig_covariance: Float64 | None
-    drift_warnings: tuple[str, ...]
-    poses: dict[int, PosedFrame]
-    matched: Iterator[MatchedFrame | Refusal]
 
 
 class MapBuilder:
@@ -195,101 +122,6 @@ class MapBuilder:
         return replace(view, cells=replace(cells, shared_m=shared))
 
 
-def inspect_recording(
-    recording: Recording, settings: MeasureSettings, scratch: Path, resume: Path | None
-) -> ProbedRecording:
-    """Look at a recording: how far the scene is, how large the cells, how sure the calibration.
-
-    Raises InputError where the sensors' clocks differ.
-    """
-    source: Recording = SelectedSensors(recording, settings.use)
-    source, watch = in_yard(source, settings.yard), Stopwatch()
-    if faults := clock_faults(source):
-        raise InputError(source.path, "; ".join(faults), "or leave the sensor out of use")
-    configuration, inputs = json_value(settings), source.digests()
-    checkpoints = None
-    if resume is not None:
-        checkpoints = checkpoint_folder(resume, checkpoint_key(recording, source, settings, inputs))
-    with watch("look"):
-        pairs = RectifiedPairs(source, Rectifier(source.rig), checkpoints or scratch, watch)
-        first, cell_m, calibration_px = look_at(pairs, settings, checkpoints)
-    return ProbedRecording(
-        source, pairs, first, cell_m, calibration_px, doubts(source), configuration, inputs, checkpoints,
-        watch,
-    )  # fmt: skip
-
-
-def look_at(
-    pairs: RectifiedPairs, settings: MeasureSettings, checkpoints: Path | None
-) -> tuple[RecordingProbe, float, float]:
-    """Look at the first usable pair; return what it shows, the side of the map's cells (m) and the sigma of
-    the disparity by the calibration (px).
-    """
-    first = checkpointed(checkpoints, "look", lambda: probe_recording(pairs))
-    has_crane = pairs.recording.crane() is not None
-    cell_m = settings.map.cell_m or choose_cell_size(first, has_crane=has_crane)
-    known_px = disparity_sigma_px(settings.recording.rig, first.range_m)
-    return first, cell_m, settings.stereo.calibration_sigma_px if known_px is None else known_px
-
-
-@contextmanager
-def estimate_trajectory(
-    probed: ProbedRecording, settings: MeasureSettings, advance: ProgressCallback
-) -> Iterator[TrackedRecording]:
-    """Estimate the trajectory while the first pairs are matched on the core that it leaves idle."""
-    source, pairs, watch = probed.source, probed.pairs, probed.watch
-    rectifier, total = pairs.rectifier, len(source.index.stamps_ns)
-    match = matching(pairs, settings, probed.checkpoints, watch)
-    early = _known_early(source, settings, rectifier, probed.first.range_m)
-    begun = islice(pairs(early), len(early))
-    with ExitStack() as pools:
-        ahead = pools.enter_context(_matched_ahead(match, begun, _MATCHED_AHEAD))
-        with watch("trajectory", total):
-            estimate = make_estimator(settings.motion)
-            count = count_frames("trajectory", total, advance)
-            with _naming(probed):
-                name = trajectory_name(source, estimate.delay_ns)
-                trajectory = checkpointed(
-                    probed.checkpoints, name, lambda: estimate(source, rectifier, count, pairs)
-                )
-            trajectory = placed_in_yard(trajectory, frame_of(source))
-            trim_heap()
-            calibrated = self_calibrate(
-                source.rig, rectifier, trajectory.drift, probed.calibration_px,
-                correct=settings.self_calibrate == "yaw",
-            )  # fmt: skip
-        if calibrated.rectifier is not rectifier:
-            rectifier = calibrated.rectifier
-            pairs = RectifiedPairs(source, rectifier, watch=watch)
-            match = matching(pairs, settings, probed.checkpoints, watch)
-        stereo = replace(settings.stereo, calibration_sigma_px=calibrated.sigma_px)
-        taken = select_keyframes(trajectory.frames, rectifier, probed.first.range_m, settings.map.min_shift)
-        poses = {frame.stamp_ns: frame for frame in trajectory.frames if frame.stamp_ns in taken}
-        late = min((stamp for stamp in poses if stamp not in early), default=None)
-        matched: Iterator[MatchedFrame | Refusal] = ahead
-        if late is not None:
-            rest = pairs({stamp for stamp in poses if stamp >= late})
-            after = pools.enter_context(_matched_ahead(match, rest, _MATCHED_AFTER))
-            matched = chain(takewhile(lambda frame: frame.stamp_ns < late, ahead), after)
-        rig = rig_covariance(settings.recording.rig, probed.first.range_m)
-        if rig is not None:
-            corrected = settings.self_calibrate == "yaw"
-            rig = residual_covariance(rig, trajectory.drift, corrected=corrected)
-        yield TrackedRecording(trajectory, rectifier, stereo, rig, calibrated.warnings, poses, matched)
-
-
-@contextmanager
-def _naming(probed: ProbedRecording) -> Iterator[None]:
-    """Name what can't be right in the samples as the cause, where nothing can be estimated from them."""
-    try:
-        yield
-    except (InputError, MeasurementError) as error:
-        if not probed.doubts:
-            raise
-        told = "; ".join(doubt.message for doubt in probed.doubts)
-        raise InputError(probed.source.path, told, str(error)) from error
-
-
 def build_map(
     probed: ProbedRecording,
     way: TrackedRecording,
@@ -338,58 +170,6 @@ def map_name(poses: tuple[PosedFrame, ...], binner: PointBinner) -> str:
     """Name the checkpoint of the map of frames at these poses by what it rests on beside `checkpoint_key`."""
     asked = [binner.stereo.calibration_sigma_px, binner.cell_m, binner.per_pixel]
     return f"map_{json_digest([json_value(poses), asked])[:32]}"
-
-
-def checkpoint_key(
-    recording: Recording, source: Recording, settings: MeasureSettings, inputs: dict[str, str]
-) -> str:
-    """Return a digest of all that trajectory, disparities and map depend on, the package's sources among it.
-
-    source: the recording with the sensors in use, in the yard. inputs: SHA-256 of its files.
-    """
-    sources = sources_digest(Path(barsight.__file__).parent)
-    configuration, frame = json_value(settings), frame_of(source)
-    stages = {name: part for name, part in configuration.items() if name not in ("bundles", "lift")}
-    placed = inputs if frame is None else {**inputs, "yard": frame.digest}
-    rig = json_value(recording.rig)
-    return json_digest([sources, stages, placed, rig, pictures_digest(recording)])
-
-
-def _known_early(
-    source: Recording, settings: MeasureSettings, rectifier: Rectifier, range_m: float
-) -> frozenset[int]:
-    """Select stamps of frames that may be matched before the trajectory is known: all, or the first few that
-    lie apart by the encoders. Where the trajectory says otherwise, it decides.
-    """
-    stamps, min_shift = source.index.stamps_ns, settings.map.min_shift
-    if settings.self_calibrate != "none":
-        return frozenset()
-    if min_shift == 0:
-        return frozenset(stamps)
-    crane = source.crane()
-    if crane is None or crane.stamp_ns.size == 0:
-        return frozenset()
-    shift_ns = source.rig.timeshift_cam_imu_ns
-    chosen = select_keyframes_by_encoders(stamps, crane, shift_ns, rectifier.camera, range_m, min_shift)
-    return frozenset(chosen[:_MATCHED_AHEAD])
-
-
-def matching(
-    pairs: RectifiedPairs, settings: MeasureSettings, checkpoints: Path | None, watch: Stopwatch
-) -> PairChain:
-    """Make what matches the pairs of a recording for its map."""
-    stereo, every = settings.stereo, settings.map.min_shift == 0
-    chained = every and stereo.method == "barsight" and stereo.barsight.preset == "best"
-    matcher = Matcher(stereo, make_map_method(stereo), watch)
-    return PairChain(pairs, matcher, stereo.confirmed_pairs + 1 if chained else 1, checkpoints)
-
-
-def _matched_ahead(
-    match: PairChain, pairs: Iterator[RectifiedPair | RefusedFrame], max_waiting: int
-) -> AbstractContextManager[Iterator[MatchedFrame | Refusal]]:
-    """Match pairs ahead, whole chains side by side; about `max_waiting` of them may wait."""
-    chains = max(max_waiting // match.length, WORKERS)
-    return prefetched_chain(partial(map, match), match.split(pairs), chains)
 
 
 def _first_reason(refusals: list[Refusal]) -> str:

@@ -24,7 +24,7 @@ from barsight.core.errors import InputError, MeasurementError
 from barsight.core.timing import Stopwatch
 from barsight.core.types import DisparityRange, RectifiedPair
 from barsight.measure_settings import MeasureSettings
-from barsight.reconstruction.map_building import matching
+from barsight.reconstruction.tracked_recording import matching
 from barsight.recording.open import open_recording
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.stereo.image_pair import pair_from_images

@@ -23,7 +23,7 @@ from barsight.core.types import RefusedFrame
 from barsight.measure_settings import MeasureSettings
 from barsight.motion.settings import make_estimator
 from barsight.reconstruction.live_map import LiveMap, PairPlacer
-from barsight.reconstruction.map_building import matching
+from barsight.reconstruction.tracked_recording import matching
 from barsight.recording.base import Recording
 from barsight.recording.open import open_recording
 from barsight.recording.rectified_pairs import RectifiedPairs

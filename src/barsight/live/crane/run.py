@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 from barsight.core.errors import BarsightError, ConfigError
 from barsight.core.files import expect_empty, translated_os_errors
+from barsight.core.timing import ProgressCallback
 from barsight.live.crane.preflight import prove_sensors
 from barsight.live.drift import DRIFT_FILE, note_drift
 from barsight.live.link import LiveInput
@@ -20,7 +21,6 @@ from barsight.live.survey import STOOD
 from barsight.measure_folder import ignore_progress
 from barsight.measure_settings import MeasureSettings
 from barsight.pipeline import LiftRequest
-from barsight.reconstruction.map_building import ProgressCallback
 from barsight.recording.formats.segments import PATTERN
 from barsight.recording.open import open_recording
 from barsight.recording.writers.bag import write_descriptions
