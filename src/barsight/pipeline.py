@@ -221,7 +221,7 @@ def find_lifts(mapped: MappedYard, request: LiftRequest) -> Measurement:
         input_hashes=_input_hashes(mapped.passes),
         configuration=newest.probed.configuration,
         trajectory=trajectory,
-        frames_total=sum(_frames_total(one.probed) for one in mapped.passes),
+        frames_total=sum(one.probed.frames_total for one in mapped.passes),
         frames_used=sum(len(one.built.placed) for one in mapped.passes),
         refusals=tuple(refusal for one in mapped.passes for refusal in one.built.refusals),
         sensors_used=tuple(dict.fromkeys(("stereo", *trajectory.sensors, *profiles.sensors))),
@@ -298,7 +298,7 @@ def _records(mapped: MappedYard, travels: Sequence[Travel]) -> tuple[PassRecord,
         PassRecord(
             one.probed.source.path.resolve(), one.probed.source.format, one.probed.inputs,
             one.way.trajectory.length_m, travel.captured_ns, int(one.way.trajectory.stamp_ns[0]),
-            int(one.way.trajectory.stamp_ns[-1]), len(one.built.placed), _frames_total(one.probed),
+            int(one.way.trajectory.stamp_ns[-1]), len(one.built.placed), one.probed.frames_total,
             correction, tuple(pair for pair in ties.pairs if pair.second == number),
             tuple(change for change in mapped.joined.history.changes if change.pass_number == number),
             tuple(move for move in mapped.joined.history.moves if move.pass_number == number),
@@ -324,7 +324,7 @@ def _warnings(mapped: MappedYard) -> list[Notice]:
             reason = "one frame made the map: no height is confirmed by another"
             warnings.append(Notice("one-view", reason))
         if one.built.refusals:
-            reason = f"{len(one.built.refusals)} of {_frames_total(one.probed)} frames were refused"
+            reason = f"{len(one.built.refusals)} of {one.probed.frames_total} frames were refused"
             warnings.append(Notice("frames-refused", reason))
     return warnings
 
@@ -368,10 +368,6 @@ def _floor_doubts(probed: ProbedRecording, built: BuiltMap, trajectory: Trajecto
         return []
     remedy = "check the hoist's sign and unit, p_crane_body, R_yard_body and the cameras' T_BS"
     return [Notice("mounting-doubtful", f"what the cameras see lies {where}: {remedy}")]
-
-
-def _frames_total(probed: ProbedRecording) -> int:
-    return len(probed.source.index.stamps_ns) + len(probed.source.index.unpaired)
 
 
 def _travel(

@@ -50,6 +50,11 @@ class ProbedRecording:
         """Return the points per pixel and side that the cells need."""
         return points_per_pixel(self.first, self.cell_m)
 
+    @property
+    def frames_total(self) -> int:
+        """Return the number of frames recorded, those without a partner among them."""
+        return len(self.source.index.stamps_ns) + len(self.source.index.unpaired)
+
 
 def inspect_recording(
     recording: Recording, settings: MeasureSettings, scratch: Path, resume: Path | None
