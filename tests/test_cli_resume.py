@@ -12,13 +12,13 @@ import cv2
 import numpy as np
 import pytest
 
-from barsight import pipeline
 from barsight.calibration.files.rig_file import write_rig_file
 from barsight.calibration.files.yaml_document import write_document
 from barsight.cli.main import run
 from barsight.core.errors import BarsightError, Failed, InputError
 from barsight.mapping.view import Matcher
 from barsight.measure_settings import MeasureSettings
+from barsight.pipeline import mapped_yard
 from barsight.reconstruction import checkpoint, map_building, tracked_recording
 from barsight.reconstruction.checkpoint import checkpoint_folder, checkpointed, read_checkpoint
 from barsight.reconstruction.probed_recording import inspect_recording
@@ -33,7 +33,7 @@ SAME = ("height.tif", "contour.csv", "trajectory.tum", "cloud.ply")
 
 def killed_at(monkeypatch: pytest.MonkeyPatch, name: str, call: int) -> list[int]:
     """Let the pipeline's function `name` be interrupted at its call-th call (0: never); the calls made."""
-    room = next(one for one in (pipeline, tracked_recording, map_building) if hasattr(one, name))
+    room = next(one for one in (mapped_yard, tracked_recording, map_building) if hasattr(one, name))
     whole, calls = getattr(room, name), []
 
     def counted(*arguments: Any, **named: Any) -> Any:

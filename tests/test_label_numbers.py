@@ -13,7 +13,7 @@ from barsight.labels.attachment import NUMBER, PlacedCode, merge_codes
 from barsight.labels.number_reading import PATCH_PX, data_folder, number_reader, read_number
 from barsight.labels.placing import pose_at
 from barsight.measure_settings import MeasureSettings
-from barsight.pipeline import map_yard
+from barsight.pipeline.mapped_yard import map_yard
 from barsight.recording.open import open_recording
 from barsight.result_folder import read_path
 from barsight.simulation.settings import CameraSettings, SimulationSettings, YardSettings

@@ -16,7 +16,7 @@ from barsight.live.settings import LiveSettings
 from barsight.live.shared.counters import Counters
 from barsight.mapping.fusion import fuse_view
 from barsight.measure_folder import write_measured
-from barsight.pipeline import LiftRequest
+from barsight.pipeline.lift_choice import LiftRequest
 from barsight.reconstruction import map_building
 from barsight.reconstruction.checkpoint import checkpoint_folder, checkpoint_key
 from barsight.recording.base import Recording

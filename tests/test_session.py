@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 import barsight as bs
-from barsight import pipeline
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import InputError
 from barsight.core.types import CraneSamples, StereoFrame
 from barsight.mapping.view import Matcher
 from barsight.motion.frontend.tracking import Tracker
+from barsight.pipeline import lift_choice
 from test_yard_frame import calibrated
 
 SETTINGS: dict[str, Any] = {"stereo": {"method": "sgbm"}, "map": {"cell_m": 0.05}}
@@ -74,7 +74,7 @@ def test_packets_with_snapshots_end_as_the_batch(
     assert [one.frames for one in shown] == sorted(one.frames for one in shown)
     last = session.snapshot()
     assert last.frames >= 2
-    lifted = counted(monkeypatch, pipeline, "plan_lifts")
+    lifted = counted(monkeypatch, lift_choice, "plan_lifts")
     before = len(matched)
     yard = session.finish()
     pictures = len(recording.index.stamps_ns)

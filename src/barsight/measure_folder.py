@@ -17,7 +17,8 @@ from barsight.core.timing import ProgressCallback
 from barsight.evaluation.score import score_folder
 from barsight.mapping.surface.surface import read_tile
 from barsight.measure_settings import MeasureSettings
-from barsight.pipeline import LiftRequest, find_lifts, map_yard
+from barsight.pipeline.lift_choice import LiftRequest, find_lifts
+from barsight.pipeline.mapped_yard import map_yard
 from barsight.recording.base import Recording
 from barsight.recording.open import open_recording
 from barsight.report.page import write_report
@@ -48,7 +49,7 @@ def measure_into(
     paths: a recording, or several passes over one yard, which become one map.
     resume: keep what is done in `.NAME.resume` beside `out`, and go on from what is there.
     truth_of: a recording with truth to score against; only after the measuring is done. judged_at: when
-    lifts are judged, see `barsight.pipeline.LiftRequest`.
+    lifts are judged, see `barsight.pipeline.lift_choice.LiftRequest`.
     """
     expect_choice("at", judged_at, ("now", "end"))
     chosen = [paths] if isinstance(paths, Path) else list(paths)

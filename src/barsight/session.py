@@ -22,7 +22,7 @@ from barsight.core.types import RectifiedPair, RefusedFrame, StereoFrame
 from barsight.measure_folder import ignore_progress, write_measured
 from barsight.measure_settings import MeasureSettings
 from barsight.motion.settings import make_early_estimator
-from barsight.pipeline import LiftRequest
+from barsight.pipeline.lift_choice import LiftRequest
 from barsight.reconstruction.checkpoint import checkpoint_folder, checkpoint_key
 from barsight.reconstruction.live_map import LiveMap, PairPlacer, Snapshot, is_final
 from barsight.reconstruction.tracked_recording import matching

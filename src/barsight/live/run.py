@@ -35,7 +35,7 @@ from barsight.live.supervisor import Supervisor
 from barsight.live.survey import STOOD
 from barsight.measure_folder import ignore_progress, write_measured
 from barsight.measure_settings import MeasureSettings
-from barsight.pipeline import LiftRequest
+from barsight.pipeline.lift_choice import LiftRequest
 from barsight.reconstruction.checkpoint import checkpoint_folder, checkpoint_key
 from barsight.recording.base import Recording
 from barsight.recording.open import open_recording

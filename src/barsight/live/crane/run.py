@@ -20,7 +20,7 @@ from barsight.live.settings import CraneConfig, LiveSettings
 from barsight.live.survey import STOOD
 from barsight.measure_folder import ignore_progress
 from barsight.measure_settings import MeasureSettings
-from barsight.pipeline import LiftRequest
+from barsight.pipeline.lift_choice import LiftRequest
 from barsight.recording.formats.segments import PATTERN
 from barsight.recording.open import open_recording
 from barsight.recording.writers.bag import write_descriptions
