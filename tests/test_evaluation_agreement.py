@@ -12,7 +12,7 @@ from barsight.core.errors import Failed
 from barsight.core.types import Agreement, Contour, HeightSource, LaserProfile
 from barsight.mapping.agreement import compute_agreement, profile_difference, smooth_places
 from barsight.mapping.agreement_intervals import AgreementIntervals, agreement_intervals
-from barsight.report.result_files import write_laser_csv
+from barsight.report.files.tables import write_laser_csv
 from barsight.result_folder import read_laser
 
 X = np.round(5 + 0.01 * np.arange(8), 4)

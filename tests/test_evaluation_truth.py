@@ -9,7 +9,8 @@ from barsight.core.errors import InputError
 from barsight.core.types import Contour, HeightSource
 from barsight.evaluation.score import score_folder
 from barsight.mapping.settings import MapSettings
-from barsight.report.result_files import write_contours, write_height
+from barsight.report.files.height_rasters import write_height
+from barsight.report.files.tables import write_contours
 from mapping_views import block, fused, view
 
 X = np.round(1 + 0.01 * np.arange(120), 4)

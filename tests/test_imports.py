@@ -38,7 +38,7 @@ ROOMS = {
     "yard": (
         ".", "bundles.fitting", "bundles.section", "bundles", "stability", "magnet", "lifting", "inventory",
     ),
-    "report": (".", "calibration"),
+    "report": (".", "calibration", "files"),
     "page": (".", "api"),
     "simulation": ("effects", ".", "boards", "worlds"),
     "benchmarks": (".", "lift_judge", "stereo", "motion", "yard"),

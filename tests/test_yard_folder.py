@@ -14,7 +14,7 @@ import tifffile
 from barsight.cli.main import run
 from barsight.core.stamps import NS_PER_S
 from barsight.mapping.settings import MapSettings
-from barsight.report.orthophoto import orthophoto, write_orthophoto
+from barsight.report.files.orthophoto import orthophoto, write_orthophoto
 from barsight.result_folder import open_folder, read_heights
 from barsight.viewer.yard_lines import yard_lines
 from barsight.yard.inventory.bundle_file import write_bundles

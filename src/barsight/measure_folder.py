@@ -21,8 +21,9 @@ from barsight.pipeline.lift_choice import LiftRequest, find_lifts
 from barsight.pipeline.mapped_yard import map_yard
 from barsight.recording.base import Recording
 from barsight.recording.open import open_recording
+from barsight.report.files.result_files import RESULT_FILES, write_results, write_surface, write_tables
+from barsight.report.files.summary import summary
 from barsight.report.page import write_report
-from barsight.report.result_files import RESULT_FILES, summary, write_results, write_surface, write_tables
 from barsight.result_folder import seal_map
 from barsight.yard.magnet.description import load_magnet
 

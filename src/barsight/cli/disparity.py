@@ -17,7 +17,7 @@ from barsight.core.errors import ConfigError, OutputError
 from barsight.core.types import Disparity
 from barsight.measurement import Preview
 from barsight.reconstruction.pair_matching import match_pictures
-from barsight.report.result_files import write_preview
+from barsight.report.files.result_files import write_preview
 from barsight.stereo.disparity_files import write_calib, write_disparity
 from barsight.stereo.settings import StereoSettings
 

@@ -27,8 +27,8 @@ from barsight.recording.formats.board_corners import CornerRecording
 from barsight.recording.formats.ground_truth import truth_of
 from barsight.recording.open import open_recording
 from barsight.recording.sensor_selection import SelectedSensors
+from barsight.report.files.tables import write_relative, write_trajectory
 from barsight.report.odometry_page import OdometryResult, write_odometry_page
-from barsight.report.result_files import write_relative, write_trajectory
 from barsight.yard_frame import frame_name
 
 

@@ -23,7 +23,7 @@ from barsight.reconstruction.live_map import LiveMap, PairPlacer, is_final
 from barsight.reconstruction.pair_chain import MatchedAhead
 from barsight.reconstruction.tracked_recording import matching
 from barsight.recording.rectified_pairs import RectifiedPairs
-from barsight.report.result_files import write_height
+from barsight.report.files.height_rasters import write_height
 from barsight.yard_frame import placing_id
 
 POLL_S = 0.02

@@ -1,0 +1,100 @@
+"""Write heights and free space as tiled GeoTIFFs; tiles stream, memory stays bounded."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import tifffile
+
+import barsight
+from barsight.core.arrays import Float32
+from barsight.core.files import atomic_path
+from barsight.mapping.free_space import UNPROVEN, FreeSpace
+from barsight.mapping.surface.surface import Layers, Surface
+from barsight.report.files.orthophoto import georeference
+
+BANDS = ("z_m", "sigma_m", "views", "source")
+_TILE = 256
+_DEFLATE_LEVEL = 1
+"""Of heights, which hardly compress: at the usual 6 they take 3 % less room and twice the time."""
+
+
+def write_height(surface: Surface, target: Path, frame_id: str) -> None:
+    """Write a tiled GeoTIFF of four float32 bands; row 0 at the highest y; pixels are areas, NaN is
+    no data.
+    """
+    rows, columns = surface.shape
+    bands = "".join(
+        f'<Item name="DESCRIPTION" sample="{i}" role="description">{name}</Item>'
+        for i, name in enumerate(BANDS)
+    )
+    with atomic_path(target) as path:
+        tifffile.imwrite(
+            path,
+            _height_tiles(surface),
+            shape=(len(BANDS), rows, columns),
+            dtype=np.float32,
+            photometric="minisblack",
+            planarconfig="separate",
+            tile=(_TILE, _TILE),
+            compression="zlib",
+            compressionargs={"level": _DEFLATE_LEVEL},
+            metadata=None,
+            software=f"barsight {barsight.__version__}",
+            extratags=[
+                *georeference(surface, frame_id),
+                (42112, "s", 0, f"<GDALMetadata>{bands}</GDALMetadata>", True),
+                (42113, "s", 0, "nan", True),
+            ],
+        )
+
+
+def write_free(surface: Surface, free: FreeSpace, target: Path, frame_id: str) -> None:
+    """Write the upper bounds of what may stand in each cell (m) as a GeoTIFF on height.tif's grid."""
+
+    def tiles() -> Iterator[Float32]:
+        for row, column, height, width in _tiles_of(surface):
+            tile = np.full((_TILE, _TILE), UNPROVEN)
+            lowest = surface.rows[1] - row - height
+            part = free.window(surface.columns[0] + column, lowest, width, height)
+            tile[:height, :width] = np.round(part, 3)[::-1]
+            yield tile
+
+    with atomic_path(target) as path:
+        tifffile.imwrite(
+            path,
+            tiles(),
+            shape=surface.shape,
+            dtype=np.float32,
+            photometric="minisblack",
+            tile=(_TILE, _TILE),
+            compression="zlib",
+            metadata=None,
+            software=f"barsight {barsight.__version__}",
+            extratags=[*georeference(surface, frame_id), (42113, "s", 0, "inf", True)],
+        )
+
+
+def _tiles_of(surface: Surface) -> Iterator[tuple[int, int, int, int]]:
+    """First row from the highest y, first column, height and width of each tile of a raster."""
+    rows, columns = surface.shape
+    for row in range(0, rows, _TILE):
+        for column in range(0, columns, _TILE):
+            yield row, column, min(_TILE, rows - row), min(_TILE, columns - column)
+
+
+def _height_tiles(surface: Surface) -> Iterator[Float32]:
+    for band in BANDS:
+        for row, column, height, width in _tiles_of(surface):
+            lowest = surface.rows[1] - row - height
+            window = surface.window(surface.columns[0] + column, lowest, width, height)
+            tile = np.full((_TILE, _TILE), np.nan, np.float32)
+            tile[:height, :width] = _band(window, band)[::-1]
+            yield tile
+
+
+def _band(window: Layers, band: str) -> Float32:
+    values: Float32 = getattr(window, band).astype(np.float32)
+    return values
