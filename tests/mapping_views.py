@@ -10,11 +10,11 @@ import numpy as np
 
 from barsight.core.pose import Pose
 from barsight.core.types import RectifiedCamera
+from barsight.mapping.election.surface_election import SurfaceElection
 from barsight.mapping.fusion import fuse_view
 from barsight.mapping.observation import CellObservations
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.surface.height_selection import ViewFrusta
-from barsight.mapping.surface.incremental import SurfaceElection
 from barsight.mapping.surface.surface import Surface
 from barsight.mapping.tiles import TileStore
 

@@ -34,7 +34,7 @@ ROOMS = {
         "settings",
     ),
     "core": ("compiling", ".", "reading", "linalg", "settings"),
-    "mapping": (".", "surface", "passes"),
+    "mapping": (".", "surface", "election", "passes"),
     "yard": (
         ".", "bundles.fitting", "bundles.section", "bundles", "stability", "magnet", "lifting", "inventory",
     ),

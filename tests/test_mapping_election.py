@@ -8,13 +8,13 @@ import pytest
 
 from barsight.core.pose import Pose
 from barsight.core.types import HeightSource, RectifiedCamera
+from barsight.mapping.election.surface_election import SurfaceElection
 from barsight.mapping.fusion import fuse_view
 from barsight.mapping.observation import CellObservations
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.surface import height_selection
 from barsight.mapping.surface.block_visibility import EVERYWHERE, SOMEWHERE, bound_blocks
 from barsight.mapping.surface.height_selection import ViewFrusta, ViewSupport, elect_by_votes, elect_surface
-from barsight.mapping.surface.incremental import SurfaceElection
 from barsight.mapping.surface.surface import Layers
 from barsight.mapping.tiles import FIELDS, SLOTS, VIEWS, TileStore, Z
 from mapping_views import FAR_CAMERA, block, high_above, view

@@ -9,12 +9,12 @@ import pytest
 
 from barsight.core.pose import Pose
 from barsight.core.types import HeightSource
+from barsight.mapping.election.surface_election import SurfaceElection
 from barsight.mapping.fusion import fuse_view
 from barsight.mapping.observation import CellObservations
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.surface.height_selection import ViewFrusta
 from barsight.mapping.surface.hole_filling import bridge_gaps
-from barsight.mapping.surface.incremental import SurfaceElection
 from barsight.mapping.surface.surface import Layers, fill_gaps, read_tile
 from barsight.mapping.tiles import TileStore
 from mapping_views import FAR_CAMERA, block, fused, high_above, view

@@ -16,8 +16,8 @@ from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.passes.changes import PlaceHistory
 from barsight.mapping.passes.joined_surface import PassSurface
 from barsight.mapping.passes.slides import SeenBundle, find_moves
-from barsight.mapping.surface.incremental import gather_surface, tile_figures
 from barsight.mapping.surface.surface import Layers, write_tile
+from barsight.mapping.surface.tile_figures import gather_surface, tile_figures
 from barsight.mapping.top_photo import TopPhoto
 from barsight.reconstruction.joined_passes import STALE, JoinedPasses
 from barsight.registration.block_shifts import BlockShifts, MatchedMap, block_shifts

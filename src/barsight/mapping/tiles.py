@@ -61,3 +61,8 @@ class TileStore:
         """Forget all tiles."""
         self._tiles.clear()
         self._versions.clear()
+
+
+def tiles_around(key: TileKey) -> list[TileKey]:
+    """Return a tile and its eight neighbours, itself in the middle."""
+    return [(key[0] + i, key[1] + j) for i in (-1, 0, 1) for j in (-1, 0, 1)]

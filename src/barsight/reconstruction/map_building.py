@@ -15,12 +15,12 @@ from barsight.core.memory import trim_heap
 from barsight.core.pose import Pose
 from barsight.core.timing import ProgressCallback, unwatched
 from barsight.core.types import PosedFrame, RectifiedCamera, RefusedFrame
+from barsight.mapping.election.surface_election import SurfaceElection
 from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.fusion import fuse_view
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.spilled_tiles import SpilledTiles
 from barsight.mapping.surface.height_selection import ViewFrusta
-from barsight.mapping.surface.incremental import SurfaceElection
 from barsight.mapping.surface.surface import Surface
 from barsight.mapping.tiles import TileStore
 from barsight.mapping.top_photo import TopPhoto

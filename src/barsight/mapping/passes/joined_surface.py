@@ -15,8 +15,8 @@ from barsight.core.arrays import Bool, Float32, Float64
 from barsight.core.types import HeightSource
 from barsight.mapping.passes.changes import PLACE_M, PlaceHistory
 from barsight.mapping.spilled_tiles import TileKey
-from barsight.mapping.surface.incremental import TileFigures, gather_surface, tile_figures
 from barsight.mapping.surface.surface import Layers, Surface, write_tile
+from barsight.mapping.surface.tile_figures import TileFigures, gather_surface, tile_figures
 from barsight.mapping.tiles import TILE_CELLS
 from barsight.registration.block_shifts import BLOCK_CELLS, BlockShifts, MatchedMap, block_shifts
 from barsight.registration.pass_ties import PassCorrection

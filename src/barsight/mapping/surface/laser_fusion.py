@@ -14,8 +14,8 @@ from barsight.core.types import HeightSource, LaserProfile
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.spilled_tiles import TileKey
 from barsight.mapping.surface.cloud import cloud_file
-from barsight.mapping.surface.incremental import gather_surface, tile_figures
 from barsight.mapping.surface.surface import Layers, Surface, read_tile, tile_file, write_tile
+from barsight.mapping.surface.tile_figures import gather_surface, tile_figures
 from barsight.mapping.tiles import TILE_CELLS
 
 CARRIED_M = 0.12

@@ -8,16 +8,15 @@ import tempfile
 import weakref
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
-from barsight.core.arrays import Bool, Float32, Float64, Int8
+from barsight.core.arrays import Float32, Float64, Int8
 from barsight.core.parallel import ordered_map
 from barsight.core.timing import unwatched
-from barsight.core.types import HeightSource
+from barsight.mapping.election.first_heights import first_around, first_file, read_first
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.spilled_tiles import TileKey
 from barsight.mapping.surface.bar_directions import BLOCK_CELLS
@@ -50,7 +49,8 @@ from barsight.mapping.surface.surface import (
     tile_file,
     write_tile,
 )
-from barsight.mapping.tiles import TILE_CELLS, TileStore
+from barsight.mapping.surface.tile_figures import TileFigures, gather_surface, tile_figures
+from barsight.mapping.tiles import TILE_CELLS, TileStore, tiles_around
 
 Result = TypeVar("Result")
 
@@ -60,18 +60,7 @@ _HALO = -(-(_ALONG_CELLS + 1 + VOTE_CELLS // 2 + REACH_CELLS) // BLOCK_CELLS) * 
 """Cells around a tile that it depends on: along a bar, and what is read beside it. Whole blocks, so that
 stripes and directions are sought at the same cells in a tile and in its neighbours' halos."""
 _MIDDLE = 4
-"""A tile among `_around` it."""
-
-
-@dataclass(frozen=True, eq=False)
-class TileFigures:
-    """A finished tile in figures. columns, rows: first and last known cell of the map, None without any."""
-
-    seen: int
-    filled: int
-    sigmas_m: Float32
-    columns: tuple[int, int] | None
-    rows: tuple[int, int] | None
+"""A tile among `tiles_around` it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,12 +115,12 @@ class SurfaceElection:
         taken = {key: self._store.version(key) for key in keys}
         in_view = {key for key, count in taken.items() if self._taken.get(key) != count}
         self._taken = taken
-        left = [key for key in keys if in_view.isdisjoint(_around(key))]
+        left = [key for key in keys if in_view.isdisjoint(tiles_around(key))]
         if stale := [key for key in left if not self._stands(key, min_views)]:
             self._elect(stale, min_views, frusta(), last=True)
         whole = {key for key in left if self._stands(key, min_views)}
         known = frozenset(keys)
-        ready = [key for key in left if whole.issuperset(known.intersection(_around(key)))]
+        ready = [key for key in left if whole.issuperset(known.intersection(tiles_around(key)))]
         if ready := [key for key in ready if self._is_unfinished(key)]:
             self._finish(ready, frusta())
 
@@ -190,10 +179,10 @@ class SurfaceElection:
         return self._finishes.get(key) != self._around_elected(key)
 
     def _versions(self, key: TileKey) -> tuple[int, ...]:
-        return tuple(self._store.version(near) for near in _around(key))
+        return tuple(self._store.version(near) for near in tiles_around(key))
 
     def _around_elected(self, key: TileKey) -> tuple[TileElection | None, ...]:
-        return tuple(self._elections.get(near) for near in _around(key))
+        return tuple(self._elections.get(near) for near in tiles_around(key))
 
     def _surface(self, *names: Callable[[Path, TileKey], Path]) -> Surface:
         """Gather the finished tiles in a folder of its own, by links to their files of these names, which are
@@ -214,14 +203,14 @@ class SurfaceElection:
         """
         known, read = frozenset(self._store.keys()), self._store.read
         states = {key: (self._store.version(key), min_views) for key in known}
-        beside = known.intersection(near for key in keys for near in _around(key))
+        beside = known.intersection(near for key in keys for near in tiles_around(key))
         voted = [key for key in sorted(beside) if self._voted.get(key) != states[key]]
 
         def look(key: TileKey, tile: Float32) -> None:
-            np.save(_first_file(self._first, key), elect_by_votes(tile, min_views, self._settings.top_ratio))
+            np.save(first_file(self._first, key), elect_by_votes(tile, min_views, self._settings.top_ratio))
 
         def elect_tile(key: TileKey, tile: Float32, asked: ViewSupport) -> TileElection:
-            around = _first_around(self._first, key, known)
+            around = first_around(self._first, key, known)
             box = supported_box(tile, key, self._cell_m, min_views)
             winner = elect_surface(tile, key, around, frusta, self._cell_m, min_views, self._settings, asked)
             write_tile(self._elected, key, elected_layers(tile, winner))
@@ -240,7 +229,7 @@ class SurfaceElection:
                 ViewSupport.none() if last else ViewSupport(self._views.get(key, 0), self._heights.take(key))
             )
 
-        _read_first.cache_clear()
+        read_first.cache_clear()
         for _ in self._counted(ordered_map(lambda item: look(*item), ((key, read(key)) for key in voted))):
             pass
         self._voted |= {key: states[key] for key in voted}
@@ -289,7 +278,7 @@ class SurfaceElection:
         side = TILE_CELLS + 2 * _HALO
         around = Layers.unknown(side, side)
         column, row = key[0] * TILE_CELLS - _HALO, key[1] * TILE_CELLS - _HALO
-        for neighbour in _around(key):
+        for neighbour in tiles_around(key):
             if neighbour in keys:
                 paste(read_tile(self._elected, neighbour), neighbour, around, column, row)
         blur = np.zeros((side, side), np.float32)
@@ -325,63 +314,5 @@ def _within(direction: Int8, margin: int) -> Int8:
     return kept
 
 
-def _around(key: TileKey) -> list[TileKey]:
-    """Return a tile and its eight neighbours, itself in the middle."""
-    return [(key[0] + i, key[1] + j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
-
-
-def _first_around(folder: Path, key: TileKey, keys: frozenset[TileKey]) -> Float32:
-    """Assemble the first heights of a tile and its eight neighbours, (3 * TILE_CELLS, 3 * TILE_CELLS)."""
-    around = np.full((3 * TILE_CELLS, 3 * TILE_CELLS), np.nan, np.float32)
-    for neighbour in _around(key):
-        if neighbour in keys:
-            row, column = ((neighbour[i] - key[i] + 1) * TILE_CELLS for i in (1, 0))
-            around[row : row + TILE_CELLS, column : column + TILE_CELLS] = _read_first(folder, neighbour)
-    return around
-
-
-@lru_cache(maxsize=64)
-def _read_first(folder: Path, key: TileKey) -> Float32:
-    heights: Float32 = np.load(_first_file(folder, key))
-    return heights
-
-
-def _first_file(folder: Path, key: TileKey) -> Path:
-    return folder / f"first_{key[0]}_{key[1]}.npy"
-
-
 def _winner_file(folder: Path, key: TileKey) -> Path:
     return folder / f"winner_{key[0]}_{key[1]}.npy"
-
-
-def gather_surface(folder: Path, cell_m: float, tiles: dict[TileKey, TileFigures]) -> Surface:
-    """Describe the surface whose finished tiles lie in `folder`."""
-    figures = list(tiles.values())
-    columns = [column for one in figures if one.columns for column in one.columns]
-    rows = [row for one in figures if one.rows for row in one.rows]
-    sigmas = np.concatenate([one.sigmas_m for one in figures]) if figures else np.empty(0)
-    return Surface(
-        folder=folder,
-        cell_m=cell_m,
-        columns=(min(columns), max(columns) + 1) if columns else (0, 0),
-        rows=(min(rows), max(rows) + 1) if rows else (0, 0),
-        seen=sum(one.seen for one in figures),
-        filled=sum(one.filled for one in figures),
-        median_sigma_m=float(np.median(sigmas)) if sigmas.size else float("nan"),
-        tiles=frozenset(tiles),
-    )
-
-
-def tile_figures(key: TileKey, layers: Layers) -> TileFigures:
-    """Count what a finished tile knows."""
-    there = layers.source != HeightSource.UNKNOWN
-    measured = HeightSource.measured(layers.source)
-    seen, filled = measured.sum(), (layers.source == HeightSource.FILLED).sum()
-    sigmas = layers.sigma_m[measured][::17] if there.any() else np.empty(0, np.float32)
-    spans = [_span(there.any(axis=axis), key[axis] * TILE_CELLS) for axis in (0, 1)]
-    return TileFigures(int(seen), int(filled), sigmas, *spans)
-
-
-def _span(occupied: Bool, first: int) -> tuple[int, int] | None:
-    index = np.flatnonzero(occupied)
-    return (first + int(index[0]), first + int(index[-1])) if index.size else None
