@@ -7,7 +7,7 @@ import shutil
 import tempfile
 import weakref
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
@@ -17,20 +17,10 @@ from barsight.core.arrays import Float32, Float64, Int8
 from barsight.core.parallel import ordered_map
 from barsight.core.timing import unwatched
 from barsight.mapping.election.first_heights import first_around, first_file, read_first
+from barsight.mapping.election.tile_finishing import finished_layers
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.spilled_tiles import TileKey
-from barsight.mapping.surface.bar_directions import BLOCK_CELLS
-from barsight.mapping.surface.bar_profiles import REACH_CELLS, draw_bars
 from barsight.mapping.surface.cloud import CloudPart, cloud_file
-from barsight.mapping.surface.directional_filter import (
-    VOTE_CELLS,
-    blur_sigma,
-    deblur_across,
-    smooth_along_bars,
-    step_sigma,
-    valley_mask,
-    vote_directions,
-)
 from barsight.mapping.surface.height_selection import (
     ViewFrusta,
     ViewSupport,
@@ -38,27 +28,12 @@ from barsight.mapping.surface.height_selection import (
     elect_surface,
     supported_box,
 )
-from barsight.mapping.surface.picture_stripes import NODE_CELLS, find_stripes
-from barsight.mapping.surface.surface import (
-    Layers,
-    Surface,
-    elected_layers,
-    fill_gaps,
-    paste,
-    read_tile,
-    tile_file,
-    write_tile,
-)
+from barsight.mapping.surface.surface import Surface, elected_layers, read_tile, tile_file, write_tile
 from barsight.mapping.surface.tile_figures import TileFigures, gather_surface, tile_figures
-from barsight.mapping.tiles import TILE_CELLS, TileStore, tiles_around
+from barsight.mapping.tiles import TileStore, tiles_around
 
 Result = TypeVar("Result")
 
-_ALONG_CELLS = 28
-"""The longest way along a bar, to either side."""
-_HALO = -(-(_ALONG_CELLS + 1 + VOTE_CELLS // 2 + REACH_CELLS) // BLOCK_CELLS) * BLOCK_CELLS
-"""Cells around a tile that it depends on: along a bar, and what is read beside it. Whole blocks, so that
-stripes and directions are sought at the same cells in a tile and in its neighbours' halos."""
 _MIDDLE = 4
 """A tile among `tiles_around` it."""
 
@@ -243,7 +218,9 @@ class SurfaceElection:
 
         def finish_tile(item: tuple[TileKey, Float32 | None]) -> tuple[TileKey, TileFigures]:
             key, tile = item
-            layers, blur = self._filled(key, known, frusta)
+            layers, blur = finished_layers(
+                self._elected, key, known, frusta, self._seen_from_m(key), self._cell_m, self._settings
+            )
             write_tile(self._finished, key, layers)
             if tile is not None:
                 winner: Int8 = np.load(_winner_file(self._elected, key))
@@ -267,51 +244,6 @@ class SurfaceElection:
         own = self._elections[key].height_m
         known = [height_m for height_m in around if np.isfinite(height_m)]
         return own if np.isfinite(own) else float(np.median(known)) if known else 0.0
-
-    def _filled(self, key: TileKey, keys: frozenset[TileKey], frusta: ViewFrusta) -> tuple[Layers, Float32]:
-        """Average the tile lengthways, sharpen it, fill its narrow gaps, looking at most the halo around it;
-        and what blur and gloss leave on bars, 1 sigma.
-        """
-        settings, cell_m = self._settings, self._cell_m
-        along = min(round(settings.along_m / cell_m), _ALONG_CELLS)
-        reach = min(round(settings.fill_m / cell_m), _HALO)
-        side = TILE_CELLS + 2 * _HALO
-        around = Layers.unknown(side, side)
-        column, row = key[0] * TILE_CELLS - _HALO, key[1] * TILE_CELLS - _HALO
-        for neighbour in tiles_around(key):
-            if neighbour in keys:
-                paste(read_tile(self._elected, neighbour), neighbour, around, column, row)
-        blur = np.zeros((side, side), np.float32)
-        if along > 0:
-            weight: Float32 = np.nan_to_num(1 / (around.sigma_m * around.sigma_m))
-            z, direction = smooth_along_bars(around.z_m, weight, settings.min_gate_m, along)
-            pixel_m = frusta.pixel_m(z, self._seen_from_m(key))
-            sharp = deblur_across(z, direction, settings.sharpen_px * pixel_m / cell_m)
-            blur = blur_sigma(sharp - z, valley_mask(sharp, _within(direction, reach)))
-            pixel_cells = float(np.nanmedian(pixel_m)) / cell_m if np.isfinite(pixel_m).any() else 1.0
-            steps = step_sigma(sharp, pixel_cells)
-            bar = _within(vote_directions(direction), reach + NODE_CELLS)
-            stripes = find_stripes(z, around.intensity, bar, cell_m)
-            draws, pixel = settings.thin_bars == "drawn", pixel_m / np.float32(cell_m)
-            bars, unsure, hidden = draw_bars(z, bar, stripes, pixel, cell_m, draws)
-            drawn = np.isfinite(bars)
-            sharp = np.where(drawn, bars, sharp)
-            blur = np.where(drawn, unsure, np.maximum(blur, hidden))
-            around = replace(around, z_m=sharp, sigma_m=np.sqrt(around.sigma_m**2 + blur**2 + steps**2))
-        if reach > 0:
-            fill_gaps(around, reach)
-        inner = slice(_HALO, _HALO + TILE_CELLS)
-        layers = Layers(*(getattr(around, field.name)[inner, inner] for field in fields(Layers)))
-        return layers, blur[inner, inner]
-
-
-def _within(direction: Int8, margin: int) -> Int8:
-    """Keep directions of the tile and of so many cells about it, -1 further out: nothing is read there."""
-    out = max(_HALO - margin, 0)
-    inner = slice(out, direction.shape[0] - out)
-    kept = np.full_like(direction, -1)
-    kept[inner, inner] = direction[inner, inner]
-    return kept
 
 
 def _winner_file(folder: Path, key: TileKey) -> Path:
