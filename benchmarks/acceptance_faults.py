@@ -34,7 +34,8 @@ from barsight.recording.base import RecordingSettings
 from barsight.recording.open import open_recording
 from barsight.result_folder import read_heights
 from barsight.simulation.effects.settings import FaultSettings
-from barsight.simulation.settings import CameraSettings, SimulationSettings
+from barsight.simulation.settings.recording import SimulationSettings
+from barsight.simulation.settings.rig import CameraSettings
 from barsight.simulation.simulate import simulate
 from barsight.simulation.worlds.artefacts import lay_artefacts
 from barsight.yard.weight import bundle_mass

@@ -33,7 +33,9 @@ from barsight.simulation.lighting import bake, hall_lamps
 from barsight.simulation.optics import expose, sample_rays, vignette
 from barsight.simulation.render import Shading, render_view
 from barsight.simulation.scene import Scene, build_scene
-from barsight.simulation.settings import BarKind, CameraSettings, SimulationSettings, YardSettings
+from barsight.simulation.settings.recording import SimulationSettings
+from barsight.simulation.settings.rig import CameraSettings
+from barsight.simulation.settings.yard import BarKind, YardSettings
 from barsight.simulation.stock import DunnageBeam, StackedBundle, Stock, hexagonal_packing
 from barsight.simulation.textures import surface_tile
 from barsight.simulation.truth import true_depth

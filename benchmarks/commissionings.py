@@ -24,7 +24,7 @@ from barsight.cli.main import run
 from barsight.core.arrays import Float64
 from barsight.recording.open import open_recording
 from barsight.registration.surveyed_targets import read_tags
-from barsight.simulation.settings import SimulationSettings
+from barsight.simulation.settings.recording import SimulationSettings
 from barsight.simulation.simulate import simulate
 from barsight.simulation.worlds.artefacts import lay_artefacts
 from barsight.simulation.worlds.tags import lay_tags

@@ -18,7 +18,8 @@ from digging_judge import CELL_M, Bars, Beam, World, judge_set_down, judge_way, 
 from drawn_errors import SIGMA, seen_heights
 
 from barsight.core.errors import Failed
-from barsight.simulation.settings import SimulationSettings, YardSettings
+from barsight.simulation.settings.recording import SimulationSettings
+from barsight.simulation.settings.yard import YardSettings
 from barsight.simulation.stock import stack_yard
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.order import order_lifts

@@ -16,7 +16,9 @@ from barsight.core.errors import InputError
 from barsight.page.targets import Pick, place_pick
 from barsight.result_folder import read_heights, read_summary
 from barsight.simulation.scene import Primitives, Scene, build_grid, plain_material
-from barsight.simulation.settings import CameraSettings, SimulationSettings, YardSettings
+from barsight.simulation.settings.recording import SimulationSettings
+from barsight.simulation.settings.rig import CameraSettings
+from barsight.simulation.settings.yard import YardSettings
 from barsight.simulation.simulate import LaidYard, laid_stock, simulate, stream
 from barsight.yard.lifting.travel_accuracy import Travel
 

@@ -18,7 +18,9 @@ from barsight.core.types import PosedFrame
 from barsight.recording.open import open_recording
 from barsight.registration.surveyed_targets import SurveyedTags
 from barsight.registration.tags import MAX_CHI2, SeenTags, see_tags
-from barsight.simulation.settings import CameraSettings, SimulationSettings, YardSettings
+from barsight.simulation.settings.recording import SimulationSettings
+from barsight.simulation.settings.rig import CameraSettings
+from barsight.simulation.settings.yard import YardSettings
 from barsight.simulation.simulate import World, laid_stock, simulate
 from barsight.simulation.worlds.tags import lay_tags
 

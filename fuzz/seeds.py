@@ -25,7 +25,9 @@ from barsight.plant.opcua.security.access import add_user
 from barsight.plant.telegram import IN_MAGIC, VERSION, pack
 from barsight.recording.open import open_recording
 from barsight.result_folder import file_digest
-from barsight.simulation.settings import CameraSettings, SimulationSettings, YardSettings
+from barsight.simulation.settings.recording import SimulationSettings
+from barsight.simulation.settings.rig import CameraSettings
+from barsight.simulation.settings.yard import YardSettings
 from barsight.simulation.simulate import simulate
 from barsight.store.opening import open_store
 from barsight.yard.magnet.description import example_magnet

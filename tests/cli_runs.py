@@ -6,7 +6,9 @@ from pathlib import Path
 import pytest
 
 from barsight.cli.main import run
-from barsight.simulation.settings import CameraSettings, SimulationSettings, YardSettings
+from barsight.simulation.settings.recording import SimulationSettings
+from barsight.simulation.settings.rig import CameraSettings
+from barsight.simulation.settings.yard import YardSettings
 
 TINY = SimulationSettings(
     length_m=1.5,

@@ -34,7 +34,7 @@ from barsight.core.types import StereoFrame
 from barsight.simulation.effects.faults import SpoiledLens
 from barsight.simulation.effects.settings import FaultSettings
 from barsight.simulation.rays import cast_rays
-from barsight.simulation.settings import SimulationSettings
+from barsight.simulation.settings.recording import SimulationSettings
 from barsight.simulation.worlds.artefacts import lay_artefacts
 from barsight.yard.types import HeightMap
 

@@ -20,7 +20,7 @@ from barsight.measure_settings import MeasureSettings
 from barsight.motion.batch.sensor_agreement import refuse_contradictions
 from barsight.recording.open import open_recording
 from barsight.recording.plausibility import clock_faults, doubts
-from barsight.simulation.settings import SimulationSettings
+from barsight.simulation.settings.recording import SimulationSettings
 from barsight.simulation.simulate import simulate
 from barsight.yard.magnet.description import example_magnet
 from barsight.yard.vetoes import VETOES

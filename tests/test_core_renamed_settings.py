@@ -9,7 +9,7 @@ from barsight.cli.main import run
 from barsight.core.errors import ConfigError
 from barsight.core.settings.renamed import RENAMED, refuse_old_keys
 from barsight.measure_settings import MeasureSettings
-from barsight.simulation.settings import SimulationSettings
+from barsight.simulation.settings.recording import SimulationSettings
 
 
 def names(settings: object) -> set[str]:

@@ -40,7 +40,7 @@ ROOMS = {
     ),
     "report": (".", "calibration", "files"),
     "page": (".", "api"),
-    "simulation": ("effects", ".", "boards", "worlds"),
+    "simulation": ("effects", "settings", ".", "boards", "worlds"),
     "benchmarks": (".", "lift_judge", "stereo", "motion", "yard"),
     "live": ("shared", ".", "crane", "soak"),
     "store": (".", "migrations", "migrations.versions"),

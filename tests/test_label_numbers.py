@@ -16,7 +16,9 @@ from barsight.measure_settings import MeasureSettings
 from barsight.pipeline.mapped_yard import map_yard
 from barsight.recording.open import open_recording
 from barsight.result_folder import read_path
-from barsight.simulation.settings import CameraSettings, SimulationSettings, YardSettings
+from barsight.simulation.settings.recording import SimulationSettings
+from barsight.simulation.settings.rig import CameraSettings
+from barsight.simulation.settings.yard import YardSettings
 from barsight.simulation.simulate import simulate
 from barsight.yard.label_settings import LabelSettings
 from test_labels import project, stick

@@ -21,7 +21,9 @@ from barsight.result_folder import read_heights, read_path
 from barsight.simulation.lighting import bake, hall_lamps
 from barsight.simulation.render import Shading, render_view
 from barsight.simulation.scene import Primitives, Scene, build_grid
-from barsight.simulation.settings import CameraSettings, SimulationSettings, YardSettings
+from barsight.simulation.settings.recording import SimulationSettings
+from barsight.simulation.settings.rig import CameraSettings
+from barsight.simulation.settings.yard import YardSettings
 from barsight.simulation.simulate import simulate
 from barsight.simulation.textures import label_codes, label_text, surface_tile
 from barsight.simulation.truth import label_rows

@@ -18,7 +18,7 @@ from barsight.motion.rig_check.calibration_part import calibration_covariance
 from barsight.motion.rig_check.epipolar_error import row_design
 from barsight.motion.rig_check.self_calibration import residual_covariance
 from barsight.simulation.optics import mount_rig
-from barsight.simulation.settings import SimulationSettings
+from barsight.simulation.settings.recording import SimulationSettings
 from barsight.simulation.simulate import stream
 
 NAMES = ("cam0.fx_px", "cam0.fy_px", "cam0.cx_px", "cam0.cy_px", "cam0.k1", "cam0.k2", "cam0.p1", "cam0.p2")

@@ -22,7 +22,8 @@ from barsight.recording.base import Recording
 from barsight.recording.formats.ground_truth import GroundTruth, read_ground_truth
 from barsight.recording.open import open_recording
 from barsight.simulation.sensors import EPOCH_NS, record_encoders, record_imu
-from barsight.simulation.settings import CameraSettings, SensorSettings, TravelSettings
+from barsight.simulation.settings.rig import CameraSettings, SensorSettings
+from barsight.simulation.settings.travel import TravelSettings
 from barsight.simulation.trajectory import SimulatedTrajectory
 from motion_recordings import MemoryRecording, ideal_rig, tell_sightings
 

@@ -24,7 +24,9 @@ from barsight.registration.block_shifts import BlockShifts, MatchedMap, block_sh
 from barsight.registration.pass_ties import PassCorrection, PassPrior, PassTies, tie_passes
 from barsight.result_folder import changed_inputs, read_heights
 from barsight.simulation.passes import simulate_passes
-from barsight.simulation.settings import CameraSettings, PassesSettings, YardSettings
+from barsight.simulation.settings.rig import CameraSettings
+from barsight.simulation.settings.travel import PassesSettings
+from barsight.simulation.settings.yard import YardSettings
 from barsight.simulation.simulate import simulate
 from cli_runs import TINY
 

@@ -13,7 +13,7 @@ from barsight.cli.main import run
 from barsight.core.types import StereoFrame
 from barsight.reconstruction.pair_matching import match_pictures
 from barsight.sensors.rig_plan import CAMERAS, Wish, depth_sigma_m, plan_rig
-from barsight.simulation.settings import CameraSettings
+from barsight.simulation.settings.rig import CameraSettings
 from barsight.simulation.simulate import simulate
 from barsight.stereo.settings import StereoSettings
 from cli_runs import TINY

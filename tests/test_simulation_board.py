@@ -13,7 +13,8 @@ from barsight.core.errors import Failed
 from barsight.recording.image_decoding import decode_gray
 from barsight.simulation.boards.pictures import photograph_board
 from barsight.simulation.optics import mount_rig
-from barsight.simulation.settings import CameraSettings, SimulationSettings
+from barsight.simulation.settings.recording import SimulationSettings
+from barsight.simulation.settings.rig import CameraSettings
 from barsight.simulation.simulate import stream
 
 BOARD = "checkerboard:9x6:0.1"

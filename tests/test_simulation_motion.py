@@ -10,7 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from barsight.simulation.sensors import GRAVITY_MPS2, exact_imu, record_encoders, record_imu, seconds, stamps
-from barsight.simulation.settings import CameraSettings, SensorSettings, TravelSettings
+from barsight.simulation.settings.rig import CameraSettings, SensorSettings
+from barsight.simulation.settings.travel import TravelSettings
 from barsight.simulation.trajectory import SimulatedTrajectory
 
 NOMINAL = Rotation.from_euler("zyx", [86, 2, 179], degrees=True).as_matrix()

@@ -35,7 +35,8 @@ from barsight.simulation.render import (
     shade,
 )
 from barsight.simulation.scene import Primitives, Scene, build_grid, build_scene
-from barsight.simulation.settings import SimulationSettings, YardSettings
+from barsight.simulation.settings.recording import SimulationSettings
+from barsight.simulation.settings.yard import YardSettings
 from barsight.simulation.stock import stack_yard
 from barsight.simulation.textures import TILE, surface_tile
 

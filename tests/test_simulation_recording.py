@@ -22,15 +22,10 @@ from barsight.core.pose import Pose
 from barsight.simulation.optics import mount_rig
 from barsight.simulation.scene import build_scene
 from barsight.simulation.sensors import heights
-from barsight.simulation.settings import (
-    BarKind,
-    CameraSettings,
-    SensorSettings,
-    SimulationSettings,
-    TravelSettings,
-    YardSettings,
-    parse_bars,
-)
+from barsight.simulation.settings.recording import SimulationSettings
+from barsight.simulation.settings.rig import CameraSettings, SensorSettings
+from barsight.simulation.settings.travel import TravelSettings
+from barsight.simulation.settings.yard import BarKind, YardSettings, parse_bars
 from barsight.simulation.simulate import World, simulate
 from barsight.simulation.stock import StackedBundle, stack_yard
 

@@ -13,7 +13,9 @@ import pytest
 
 from barsight.cli.main import run
 from barsight.core.errors import ConfigError
-from barsight.simulation.settings import CameraSettings, SimulationSettings, TravelSettings
+from barsight.simulation.settings.recording import SimulationSettings
+from barsight.simulation.settings.rig import CameraSettings
+from barsight.simulation.settings.travel import TravelSettings
 from barsight.simulation.textures import label_text
 from barsight.simulation.truth import label_rows
 from barsight.simulation.worlds.conditions import draw_conditions

@@ -15,7 +15,8 @@ from barsight.benchmarks.yard.world_runs import WorldKeys, looked_at_list, run_w
 from barsight.benchmarks.yard.world_scores import WorldScore, world_rows
 from barsight.cli.main import run
 from barsight.core.errors import MeasurementError, OutputError
-from barsight.simulation.settings import CameraSettings, SimulationSettings
+from barsight.simulation.settings.recording import SimulationSettings
+from barsight.simulation.settings.rig import CameraSettings
 from lift_yards import laid, record
 
 GIVEN = SimulationSettings(

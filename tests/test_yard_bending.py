@@ -19,7 +19,8 @@ from barsight.motion.settings import MotionSettings, make_estimator
 from barsight.recording.open import open_recording
 from barsight.registration.bending import ORDINARY, CraneBend, calibrate_bent_yard, straight
 from barsight.registration.yard_file import YardFrame, read_yard_file, write_yard_file
-from barsight.simulation.settings import CameraSettings, GirderSettings, TravelSettings
+from barsight.simulation.settings.rig import CameraSettings
+from barsight.simulation.settings.travel import GirderSettings, TravelSettings
 from barsight.simulation.trajectory import CRANE_TO_BODY_M, SimulatedTrajectory
 from barsight.yard_frame import crane_in_yard, in_yard, shared_height_sigma_m, with_shared
 

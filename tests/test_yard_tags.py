@@ -28,7 +28,8 @@ from barsight.registration.tags import (
 )
 from barsight.registration.yard_file import read_yard_file
 from barsight.simulation.optics import mount_rig
-from barsight.simulation.settings import CameraSettings, SimulationSettings
+from barsight.simulation.settings.recording import SimulationSettings
+from barsight.simulation.settings.rig import CameraSettings
 from barsight.simulation.simulate import laid_stock
 from barsight.simulation.worlds.tags import lay_tags
 from barsight.yard_frame import calibration_id, in_yard

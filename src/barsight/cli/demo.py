@@ -21,7 +21,8 @@ from barsight.core.files import atomic_path, expect_empty
 from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings
 from barsight.simulation.passes import simulate_passes
-from barsight.simulation.settings import PassesSettings, SimulationSettings
+from barsight.simulation.settings.recording import SimulationSettings
+from barsight.simulation.settings.travel import PassesSettings
 from barsight.simulation.simulate import stream
 from barsight.simulation.stock import stack_yard
 from barsight.yard.magnet.description import example_magnet

@@ -18,7 +18,7 @@ from barsight.core.settings.values import MAX_VALUE
 from barsight.registration.surveyed_targets import read_tags
 from barsight.simulation.boards.pictures import photograph_board
 from barsight.simulation.passes import simulate_passes
-from barsight.simulation.settings import SimulationSettings
+from barsight.simulation.settings.recording import SimulationSettings
 from barsight.simulation.simulate import laid_stock, simulate
 from barsight.simulation.worlds.artefacts import lay_artefacts
 from barsight.simulation.worlds.tags import lay_tags

@@ -31,7 +31,7 @@ from barsight.paper.pictures import PaperPicture
 from barsight.paper.registry import ENTRIES, FURTHER
 from barsight.recording.open import open_recording
 from barsight.report.page import environment, resource
-from barsight.simulation.settings import CameraSettings
+from barsight.simulation.settings.rig import CameraSettings
 
 Cells = list[list[str]]
 _OF_PAPER = ("SGBM", "CSCA", "its own")

@@ -20,7 +20,9 @@ from barsight.paper.cloud import DriftRow, drift_row
 from barsight.recording.base import Recording
 from barsight.recording.sensor_selection import SelectedSensors
 from barsight.simulation.effects.settings import FaultSettings, LightSettings
-from barsight.simulation.settings import CameraSettings, SimulationSettings, YardSettings
+from barsight.simulation.settings.recording import SimulationSettings
+from barsight.simulation.settings.rig import CameraSettings
+from barsight.simulation.settings.yard import YardSettings
 from barsight.simulation.simulate import simulate
 from barsight.stereo.method import StereoMethod
 from barsight.stereo.settings import MethodName, StereoSettings, make_method

@@ -18,7 +18,7 @@ from barsight.core.types import CraneSamples, LaserProfile
 from barsight.recording.formats.ground_truth import EUROC_HEADER
 from barsight.recording.writers import euroc
 from barsight.simulation.sensors import ImuRecord
-from barsight.simulation.settings import SensorSettings
+from barsight.simulation.settings.rig import SensorSettings
 
 
 def write_png(path: Path, image: UInt8) -> None:

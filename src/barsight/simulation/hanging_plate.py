@@ -10,7 +10,7 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64
 from barsight.core.pose import Pose
-from barsight.simulation.settings import MagnetSettings
+from barsight.simulation.settings.travel import MagnetSettings
 from barsight.simulation.textures import ALONG_M, TILE
 
 ALBEDO = 0.3

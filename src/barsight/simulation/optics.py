@@ -14,7 +14,8 @@ from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Float32, Float64, UInt8
 from barsight.core.pose import Pose
 from barsight.core.stamps import seconds_to_ns
-from barsight.simulation.settings import CameraSettings, SimulationSettings
+from barsight.simulation.settings.recording import SimulationSettings
+from barsight.simulation.settings.rig import CameraSettings
 
 LATTICE_PX = 8
 WHITE_DN = 215.0

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from barsight.core.files import atomic_directory
-from barsight.simulation.settings import PassesSettings, SimulationSettings
+from barsight.simulation.settings.recording import SimulationSettings
+from barsight.simulation.settings.travel import PassesSettings
 from barsight.simulation.simulate import LaidYard, World, lay_stock, simulate, stream
 from barsight.simulation.stock import StackedBundle, Stock, stack_yard
 

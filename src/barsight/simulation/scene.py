@@ -16,7 +16,8 @@ from typing import NamedTuple
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, Int32, Int64, kernel
-from barsight.simulation.settings import SimulationSettings, YardSettings
+from barsight.simulation.settings.recording import SimulationSettings
+from barsight.simulation.settings.yard import YardSettings
 from barsight.simulation.stock import DunnageBeam, StackedBundle, Stock
 
 STRAP_WIDTH_M = 0.032

@@ -10,7 +10,7 @@ from barsight.core.arrays import Float64, Int64
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.simulation.rays import cast_rays
 from barsight.simulation.scene import Scene
-from barsight.simulation.settings import SensorSettings
+from barsight.simulation.settings.rig import SensorSettings
 from barsight.simulation.trajectory import SimulatedTrajectory
 
 GRAVITY_MPS2 = 9.80665

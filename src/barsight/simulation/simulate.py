@@ -25,7 +25,7 @@ from barsight.simulation.optics import MountedRig, expose, mount_rig, sample_ray
 from barsight.simulation.render import NO_CODES, Shading, render_view
 from barsight.simulation.scene import Scene, build_scene, select_primitives
 from barsight.simulation.sensors import EPOCH_NS, ImuRecord, record_encoders, record_imu, seconds, stamps
-from barsight.simulation.settings import SimulationSettings
+from barsight.simulation.settings.recording import SimulationSettings
 from barsight.simulation.stock import Stock, stack_yard
 from barsight.simulation.textures import label_codes, surface_tile
 from barsight.simulation.trajectory import CRANE_TO_BODY_M, SimulatedTrajectory

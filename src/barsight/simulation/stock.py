@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from barsight.core.arrays import Float64
-from barsight.simulation.settings import BarKind, SimulationSettings
+from barsight.simulation.settings.recording import SimulationSettings
+from barsight.simulation.settings.yard import BarKind
 
 PACKING = 1.003
 """Distance of neighbouring bars' axes over their diameter."""

@@ -10,7 +10,8 @@ from itertools import pairwise
 import numpy as np
 
 from barsight.core.arrays import Float64
-from barsight.simulation.settings import CameraSettings, GirderSettings, TravelSettings
+from barsight.simulation.settings.rig import CameraSettings
+from barsight.simulation.settings.travel import GirderSettings, TravelSettings
 
 SMOOTHSTEP_PEAK_SLOPE = 1.875
 CRANE_TO_BODY_M = (0.35, -0.2, -0.55)

@@ -20,7 +20,7 @@ from barsight.simulation.optics import sample_rays
 from barsight.simulation.rays import cast_rays
 from barsight.simulation.scene import CODE, Scene
 from barsight.simulation.sensors import heights
-from barsight.simulation.settings import SimulationSettings
+from barsight.simulation.settings.recording import SimulationSettings
 from barsight.simulation.stock import StackedBundle
 from barsight.simulation.textures import label_text
 

@@ -25,7 +25,8 @@ from barsight.motion.fixed_lag.sensor_buffer import SensorBuffer
 from barsight.motion.fixed_lag.smoother import FixedLagEstimator
 from barsight.motion.frontend.tracking import Sighting
 from barsight.simulation.sensors import EPOCH_NS, record_encoders, record_imu
-from barsight.simulation.settings import CameraSettings, SensorSettings, TravelSettings
+from barsight.simulation.settings.rig import CameraSettings, SensorSettings
+from barsight.simulation.settings.travel import TravelSettings
 from barsight.simulation.trajectory import SimulatedTrajectory
 
 STEP_S = 0.4

@@ -15,7 +15,9 @@ from barsight.benchmarks.yard.bundle_scores import (
 )
 from barsight.benchmarks.yard.degraded_map import Defects, degraded_map
 from barsight.simulation.scene import build_scene
-from barsight.simulation.settings import CameraSettings, SimulationSettings, YardSettings
+from barsight.simulation.settings.recording import SimulationSettings
+from barsight.simulation.settings.rig import CameraSettings
+from barsight.simulation.settings.yard import YardSettings
 from barsight.simulation.stock import StackedBundle, stack_yard
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings

@@ -16,7 +16,7 @@ from barsight.core.arrays import Bool, Float64, kernel
 from barsight.core.types import HeightSource
 from barsight.simulation.scene import Scene
 from barsight.simulation.sensors import heights
-from barsight.simulation.settings import CameraSettings
+from barsight.simulation.settings.rig import CameraSettings
 from barsight.yard.types import HeightMap
 
 CELL_M = 0.01

@@ -13,7 +13,8 @@ from barsight.benchmarks.lift_judge.magnet import JudgedMagnet
 from barsight.core.types import HeightSource
 from barsight.result_folder import read_heights, read_summary
 from barsight.simulation.scene import Scene
-from barsight.simulation.settings import CameraSettings, SimulationSettings
+from barsight.simulation.settings.recording import SimulationSettings
+from barsight.simulation.settings.rig import CameraSettings
 from barsight.simulation.simulate import LaidYard, simulate
 from barsight.simulation.worlds.conditions import ASIDE_M
 from barsight.simulation.worlds.surfaces import draw_finishes, scene_of

@@ -16,7 +16,7 @@ from barsight.benchmarks.yard.world_scores import WorldScore, score_world
 from barsight.core.compiling.sources import sources_digest
 from barsight.core.errors import BarsightError, ConfigError, OutputError
 from barsight.core.json_values import json_digest, json_value, write_json
-from barsight.simulation.settings import SimulationSettings
+from barsight.simulation.settings.recording import SimulationSettings
 from barsight.simulation.worlds.recording import GENERATOR, draw_world, simulate_world
 
 NOTE = "world.json"

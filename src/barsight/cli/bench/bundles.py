@@ -29,7 +29,7 @@ from barsight.core.json_values import write_json
 from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings
 from barsight.result_folder import read_heights
-from barsight.simulation.settings import SimulationSettings
+from barsight.simulation.settings.recording import SimulationSettings
 from barsight.simulation.simulate import simulate
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings

@@ -23,7 +23,8 @@ from barsight.core.errors import ConfigError
 from barsight.core.json_values import write_json
 from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings
-from barsight.simulation.settings import CameraSettings, SimulationSettings
+from barsight.simulation.settings.recording import SimulationSettings
+from barsight.simulation.settings.rig import CameraSettings
 
 WIDTH_PX, FOCAL_PX, ASPECT = 1280, 1250.0, 0.8
 

@@ -17,7 +17,7 @@ from barsight.core.errors import ConfigError
 from barsight.core.json_values import write_json
 from barsight.recording.base import RecordingSettings
 from barsight.recording.open import open_recording
-from barsight.simulation.settings import SimulationSettings
+from barsight.simulation.settings.recording import SimulationSettings
 from barsight.simulation.simulate import simulate
 
 Method = Literal[

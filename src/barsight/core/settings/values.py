@@ -70,6 +70,12 @@ def expect_ranges(settings: Any, section: str, **ranges: tuple[float, float]) ->
             raise ConfigError(f"{section}{name} must {_told(low, high)}, not {value}")
 
 
+def expect(holds: bool, sentence: str) -> None:
+    """Raise ConfigError with the sentence unless it holds."""
+    if not holds:
+        raise ConfigError(sentence)
+
+
 def _told(low: float, high: float) -> str:
     if math.isinf(high):
         return "be positive" if low == OVER_0 else f"be at least {low:g}"

@@ -18,7 +18,7 @@ from barsight.core.files import atomic_directory
 from barsight.core.pose import Pose
 from barsight.simulation.boards.drawing import draw_board
 from barsight.simulation.optics import expose, mount_rig, sample_rays, vignette
-from barsight.simulation.settings import SimulationSettings
+from barsight.simulation.settings.recording import SimulationSettings
 from barsight.simulation.simulate import stream
 
 SHARES = 0.2, 0.75

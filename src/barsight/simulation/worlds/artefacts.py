@@ -10,7 +10,8 @@ from barsight.artefacts.plan import AcceptancePlan, DummyBundle, Plate, Sphere
 from barsight.core.arrays import Float64
 from barsight.core.errors import ConfigError
 from barsight.simulation.scene import Primitives, Scene, build_grid, build_scene, plain_material
-from barsight.simulation.settings import BARS_OF_RINGS, BarKind, SimulationSettings
+from barsight.simulation.settings.recording import SimulationSettings
+from barsight.simulation.settings.yard import BARS_OF_RINGS, BarKind
 from barsight.simulation.simulate import LaidYard, stream
 from barsight.simulation.stock import StackedBundle, Stock, hexagonal_packing
 from barsight.simulation.truth import bundle_rows

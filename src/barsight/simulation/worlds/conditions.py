@@ -8,13 +8,10 @@ import numpy as np
 
 from barsight.core.errors import ConfigError
 from barsight.simulation.effects.settings import FaultSettings, LightSettings
-from barsight.simulation.settings import (
-    CameraSettings,
-    SensorSettings,
-    SimulationSettings,
-    TravelSettings,
-    YardSettings,
-)
+from barsight.simulation.settings.recording import SimulationSettings
+from barsight.simulation.settings.rig import CameraSettings, SensorSettings
+from barsight.simulation.settings.travel import TravelSettings
+from barsight.simulation.settings.yard import YardSettings
 
 DRAWN = ("seed", "bars", "yard", "motion", "magnet", "light", "faults")
 MOUNTING = ("above_floor_m", "trolley_y_m", "heading_deg", "tilt_deg", "misalignment_deg")

@@ -13,7 +13,7 @@ from barsight.core.arrays import Int64
 from barsight.simulation.passes import simulate_passes
 from barsight.simulation.rays import cast_rays
 from barsight.simulation.scene import Scene
-from barsight.simulation.settings import SimulationSettings
+from barsight.simulation.settings.recording import SimulationSettings
 from barsight.simulation.simulate import LaidYard, simulate
 from barsight.simulation.textures import label_codes
 from barsight.simulation.truth import label_rows

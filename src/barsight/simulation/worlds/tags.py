@@ -10,7 +10,7 @@ from barsight.core.arrays import Float64
 from barsight.core.errors import ConfigError
 from barsight.registration.surveyed_targets import SurveyedTags
 from barsight.simulation.scene import CODE, Primitives, Scene, build_grid, plain_material
-from barsight.simulation.settings import SimulationSettings
+from barsight.simulation.settings.recording import SimulationSettings
 from barsight.simulation.simulate import LaidYard, stream
 
 HALF_THICK_M = 0.005

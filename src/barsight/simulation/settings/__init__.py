@@ -1,0 +1,1 @@
+"""The settings of a simulated recording: frozen dataclasses, checked once, units in the names."""

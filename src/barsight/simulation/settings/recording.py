@@ -1,0 +1,64 @@
+"""Define the settings of a whole simulated recording."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import tyro
+
+from barsight.core.settings.values import NOT_NEGATIVE, expect, expect_ranges, expect_values
+from barsight.simulation.effects.settings import FaultSettings, LightSettings
+from barsight.simulation.settings.rig import CameraSettings, SensorSettings
+from barsight.simulation.settings.travel import GirderSettings, MagnetSettings, PassesSettings, TravelSettings
+from barsight.simulation.settings.yard import BarKind, YardSettings, parse_bars
+
+
+@dataclass(frozen=True)
+class SimulationSettings:
+    """A simulated recording of a bar yard. The same settings give the same bytes."""
+
+    length_m: Annotated[float, tyro.conf.arg(aliases=("--length",))] = 7.0
+    """Length of the stack along the travel."""
+    frames: int = 20
+    """Stereo pairs, spread evenly over the travel."""
+    seed: int = 0
+    """Random seed."""
+    bars: str = "90mm:7"
+    """Kinds of bundles, diameter and bars: 90mm:7,40mm:37; each section of the stack takes one."""
+    depth_views: int = 2
+    """Pairs whose true depth is stored."""
+    camera: CameraSettings = field(default_factory=CameraSettings)
+    yard: YardSettings = field(default_factory=YardSettings)
+    motion: TravelSettings = field(default_factory=TravelSettings)
+    girder: GirderSettings = field(default_factory=GirderSettings)
+    sensors: SensorSettings = field(default_factory=SensorSettings)
+    passes: PassesSettings = field(default_factory=PassesSettings)
+    magnet: MagnetSettings = field(default_factory=MagnetSettings)
+    light: LightSettings = field(default_factory=LightSettings)
+    faults: FaultSettings = field(default_factory=FaultSettings)
+
+    def __post_init__(self) -> None:
+        expect_values(self)
+        expect_ranges(
+            self, "", length_m=(1, 500), frames=(2, 100_000), seed=NOT_NEGATIVE, depth_views=(0, self.frames)
+        )
+        layers = self.yard.max_layers + (self.yard.crossed_ratio > 0)
+        tallest = max(2 * k.diameter_m * (k.rings + 0.5) for k in self.kinds) + self.yard.dunnage_m
+        expect(
+            self.camera.above_floor_m > layers * tallest + 1,
+            "camera.above_floor_m must be at least 1 m over the highest possible stack",
+        )
+
+    @property
+    def kinds(self) -> tuple[BarKind, ...]:
+        """Parse the kinds of bundles that `bars` names."""
+        return parse_bars(self.bars)
+
+    @classmethod
+    def demo(cls) -> SimulationSettings:
+        """Make a small yard for `barsight demo`: 3 m of stack, 10 pairs of 640x512."""
+        camera = CameraSettings(width_px=640, height_px=512, focal_px=625.0)
+        return cls(
+            length_m=3.0, frames=10, seed=1, camera=camera, yard=YardSettings(max_layers=3, bar_length_m=5.0)
+        )
