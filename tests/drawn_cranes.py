@@ -16,7 +16,7 @@ from barsight.core.pose import Pose
 from barsight.core.types import CraneSamples, ImuSamples
 from barsight.features.guided_matching import PredictedMotion, project_stereo
 from barsight.inertial.model import GRAVITY_MPS2
-from barsight.motion.frontend.tracking import Sighting
+from barsight.motion.frontend.sightings import Sighting
 from motion_recordings import ideal_rig
 
 UP = np.array([0, 0, GRAVITY_MPS2])

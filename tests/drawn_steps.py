@@ -11,7 +11,7 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.pose import Pose
 from barsight.core.types import CraneSamples, ImuSamples
 from barsight.features.guided_matching import PredictedMotion
-from barsight.motion.frontend.tracking import Sighting
+from barsight.motion.frontend.sightings import Sighting
 from drawn_cranes import drawn_crane
 from motion_recordings import ideal_rig
 from simulated_ways import DOWN

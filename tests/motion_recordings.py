@@ -24,7 +24,7 @@ from barsight.core.types import (
     StereoFrame,
 )
 from barsight.motion import estimator
-from barsight.motion.frontend.tracking import Sighting
+from barsight.motion.frontend.sightings import Sighting
 from barsight.recording.base import FrameIndex
 
 BODY_FROM_CAM0 = Pose("body", "cam0", np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]]), np.array([0.2, -0.1, 0.3]))

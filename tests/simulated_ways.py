@@ -12,7 +12,7 @@ from barsight.core.pose import Pose
 from barsight.core.types import CraneSamples, ImuSamples
 from barsight.features.guided_matching import project_stereo
 from barsight.inertial.model import GRAVITY_MPS2
-from barsight.motion.frontend.tracking import Sighting
+from barsight.motion.frontend.sightings import Sighting
 from barsight.recording.formats.ground_truth import GroundTruth
 from motion_recordings import MemoryRecording, ideal_rig
 

@@ -13,7 +13,8 @@ from barsight.core.pose import Pose
 from barsight.features.guided_matching import PredictedMotion, triangulate_stereo
 from barsight.features.self_similarity import texture_period_px
 from barsight.features.tracks import Tracks, TrackSettings, detect_corners
-from barsight.motion.frontend.tracking import FrontEndSettings, motion_consensus
+from barsight.motion.frontend.motion_consensus import motion_consensus
+from barsight.motion.frontend.settings import FrontEndSettings
 
 PLACES = np.array([[60.0, 50], [250, 200], [600, 470]])
 

@@ -17,7 +17,7 @@ from barsight.features.guided_matching import project_stereo, triangulate_stereo
 from barsight.motion.batch import fusion
 from barsight.motion.batch.fusion import BatchFusion, FusionSettings
 from barsight.motion.crane.encoder_trajectory import CraneSettings
-from barsight.motion.frontend.tracking import Sighting
+from barsight.motion.frontend.sightings import Sighting
 from barsight.recording.base import Recording
 from barsight.recording.formats.ground_truth import GroundTruth, read_ground_truth
 from barsight.recording.open import open_recording

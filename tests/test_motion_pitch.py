@@ -11,9 +11,11 @@ from barsight.core.errors import Failed
 from barsight.features.guided_matching import GuidedMatches, PredictedMotion
 from barsight.features.patch_alignment import PatchPair, patch_pair
 from barsight.features.tracks import Tracks, TrackSettings, update_tracks
+from barsight.motion.frontend.motion_consensus import motion_consensus
 from barsight.motion.frontend.relative_pose import estimate_step
+from barsight.motion.frontend.settings import FrontEndSettings
 from barsight.motion.frontend.stereo_features import FeatureView
-from barsight.motion.frontend.tracking import FrontEndSettings, describe_corners, motion_consensus
+from barsight.motion.frontend.tracking import describe_corners
 from barsight.stereo.search_range import coarse_disparity
 
 WAY_M = 0.5

@@ -20,7 +20,7 @@ from barsight.motion.crane.encoder_jumps import find_jumps
 from barsight.motion.crane.encoder_trajectory import CraneSettings, fit_position, reestimate_noise
 from barsight.motion.fixed_lag.estimator import FixedLagFusion, FixedLagSettings
 from barsight.motion.frontend.seen_steps import known_motion
-from barsight.motion.frontend.tracking import Sighting
+from barsight.motion.frontend.sightings import Sighting
 from barsight.recording.formats.ground_truth import GroundTruth, read_ground_truth
 from barsight.recording.open import open_recording
 from drawn_cranes import DrawnCrane, drawn_crane, drawn_senses

@@ -15,8 +15,11 @@ from barsight.core.types import RefusedFrame
 from barsight.evaluation.trajectory_error import trajectory_drift
 from barsight.features.guided_matching import PredictedMotion
 from barsight.motion.frontend.chains import UNTIED, chained_poses, tied_parts
+from barsight.motion.frontend.motion_consensus import wide_consensus
 from barsight.motion.frontend.relative_pose import RelativePose
-from barsight.motion.frontend.tracking import FrontEndSettings, SeenAgain, Sighting, Tracker, wide_consensus
+from barsight.motion.frontend.settings import FrontEndSettings
+from barsight.motion.frontend.sightings import SeenAgain, Sighting
+from barsight.motion.frontend.tracking import Tracker
 from barsight.motion.frontend.wide_steps import (
     BARS_OFF,
     DescribedMotion,

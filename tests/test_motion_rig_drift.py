@@ -14,7 +14,7 @@ from barsight.features.guided_matching import project_stereo
 from barsight.motion.batch import fusion
 from barsight.motion.batch.fusion import BatchFusion, FusionSettings
 from barsight.motion.crane.encoder_trajectory import CraneSettings
-from barsight.motion.frontend.tracking import Sighting
+from barsight.motion.frontend.sightings import Sighting
 from barsight.motion.problem.problem import Problem
 from barsight.motion.problem.rig_drift import MATCHING_BIAS_PX, combine_with_prior, with_matching_bias
 from barsight.motion.rig_check.self_calibration import (

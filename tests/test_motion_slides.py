@@ -11,7 +11,7 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.evaluation.trajectory_error import trajectory_drift
 from barsight.features.guided_matching import triangulate_stereo
 from barsight.motion.batch import apparent_motion as slides
-from barsight.motion.frontend.tracking import Sighting
+from barsight.motion.frontend.sightings import Sighting
 from barsight.recording.formats.ground_truth import GroundTruth
 from test_motion_fusion import NoisyRecording, fused, simulated
 

@@ -15,7 +15,7 @@ from barsight.core.pose import Pose
 from barsight.core.types import EncoderJump, RectifiedCamera
 from barsight.features.guided_matching import project_stereo
 from barsight.inertial.model import ImuBias
-from barsight.motion.frontend.tracking import Sighting
+from barsight.motion.frontend.sightings import Sighting
 from barsight.motion.linear.chain_elimination import (
     Chain,
     add_chain,

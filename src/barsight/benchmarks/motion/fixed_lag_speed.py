@@ -23,7 +23,7 @@ from barsight.motion.batch.fusion import FusionSettings
 from barsight.motion.crane.encoder_trajectory import CraneSettings
 from barsight.motion.fixed_lag.sensor_buffer import SensorBuffer
 from barsight.motion.fixed_lag.smoother import FixedLagEstimator
-from barsight.motion.frontend.tracking import Sighting
+from barsight.motion.frontend.sightings import Sighting
 from barsight.simulation.sensors import EPOCH_NS, record_encoders, record_imu
 from barsight.simulation.settings.rig import CameraSettings, SensorSettings
 from barsight.simulation.settings.travel import TravelSettings

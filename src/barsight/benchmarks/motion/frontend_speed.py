@@ -13,7 +13,9 @@ from barsight.benchmarks.provenance import Provenance, Timing, provenance, summa
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.types import RefusedFrame
 from barsight.motion.frontend.motion_prediction import CranePredictor
-from barsight.motion.frontend.tracking import FrontEndSettings, Predictor, Sighting, Tracker
+from barsight.motion.frontend.settings import FrontEndSettings
+from barsight.motion.frontend.sightings import Sighting
+from barsight.motion.frontend.tracking import Predictor, Tracker
 from barsight.recording.base import Recording
 from barsight.recording.open import open_recording
 from barsight.recording.rectified_pairs import RectifiedPairs

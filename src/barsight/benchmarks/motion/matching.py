@@ -42,8 +42,9 @@ from barsight.features.tracks import Tracks
 from barsight.inertial.model import GRAVITY_MPS2, ORDINARY_NOISE, BodyState, ImuBias
 from barsight.inertial.preintegration import Preintegrator
 from barsight.motion.crane.encoder_trajectory import fit_position
+from barsight.motion.frontend.motion_consensus import motion_consensus
 from barsight.motion.frontend.motion_prediction import CranePredictor
-from barsight.motion.frontend.tracking import FrontEndSettings, motion_consensus
+from barsight.motion.frontend.settings import FrontEndSettings
 from barsight.stereo.search_range import coarse_disparity
 
 TRUE_PX = 2.0

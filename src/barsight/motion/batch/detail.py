@@ -11,7 +11,7 @@ from barsight.core.arrays import Float64
 from barsight.core.motion_detail import InertialStates, MotionDetail, NormalisedResiduals, RelativePoses
 from barsight.core.types import CraneSamples, RefusedFrame
 from barsight.motion.frontend.chains import chain_begins, seconds_after
-from barsight.motion.frontend.tracking import Sighting, innovations
+from barsight.motion.frontend.sightings import Sighting, innovations
 from barsight.motion.problem.nodes import Nodes
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from barsight.motion.crane.jump_window import WIDE_M
 from barsight.motion.crane.known_motion import KnownMotion
 from barsight.motion.crane.sway import turned_angle
 from barsight.motion.frontend.seen_steps import seen_steps
-from barsight.motion.frontend.tracking import Sighting
+from barsight.motion.frontend.sightings import Sighting
 
 MIN_FROZEN = 5
 SIDE, SPEED_WINDOW_S = 8, 0.3

@@ -44,7 +44,9 @@ from barsight.motion.frontend.chains import (
 )
 from barsight.motion.frontend.motion_prediction import CranePredictor
 from barsight.motion.frontend.seen_steps import known_motion
-from barsight.motion.frontend.tracking import FrontEndSettings, Predictor, Sighting, Tracker
+from barsight.motion.frontend.settings import FrontEndSettings
+from barsight.motion.frontend.sightings import Sighting
+from barsight.motion.frontend.tracking import Predictor, Tracker
 from barsight.motion.gravity import GravityAlignment, align_with_gravity
 from barsight.motion.problem.nodes import Nodes, constrain_by_imu, initial_poses, make_nodes
 from barsight.recording.base import Recording

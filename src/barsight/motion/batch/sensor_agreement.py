@@ -25,7 +25,7 @@ from barsight.motion.batch.fault_detection import (
 from barsight.motion.crane.known_motion import SeenSteps
 from barsight.motion.crane.sway import turned_angle
 from barsight.motion.frontend.seen_steps import seen_steps
-from barsight.motion.frontend.tracking import Sighting
+from barsight.motion.frontend.sightings import Sighting
 
 MIN_STEPS, MAX_STEPS = 3, 200
 MIN_WAY_M = 0.1

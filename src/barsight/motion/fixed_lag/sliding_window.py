@@ -20,7 +20,7 @@ from barsight.inertial.model import BodyState, ImuBias
 from barsight.inertial.preintegration import Preintegrated
 from barsight.motion.fixed_lag.propagation import ACCELERATION_DENSITY, NavigationState
 from barsight.motion.fixed_lag.window_equations import NewestNode
-from barsight.motion.frontend.tracking import Sighting
+from barsight.motion.frontend.sightings import Sighting
 from barsight.motion.problem.gauss_newton import GraphState
 from barsight.motion.problem.problem import MIN_SIGMA_PX, Problem, StereoObservations
 from barsight.motion.problem.stereo_factors import initial_points

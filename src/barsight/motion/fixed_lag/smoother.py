@@ -29,7 +29,7 @@ from barsight.motion.fixed_lag.window_update import marginalise, solve_window
 from barsight.motion.frontend.chains import UNTIED, imu_bridges
 from barsight.motion.frontend.motion_prediction import CranePredictor, predict_by_imu
 from barsight.motion.frontend.seen_steps import known_motion
-from barsight.motion.frontend.tracking import Sighting
+from barsight.motion.frontend.sightings import Sighting
 from barsight.motion.gravity import GravityAlignment
 from barsight.motion.problem.encoder_factors import encoder_position, jump_sentences
 from barsight.motion.problem.gauss_newton import GraphState

@@ -15,8 +15,8 @@ from barsight.core.errors import Failed
 from barsight.core.types import NamedPoints, RectifiedCamera, RefusedFrame
 from barsight.features.guided_matching import PredictedMotion, triangulate_stereo
 from barsight.motion.frontend.relative_pose import ransac, refine_pose
+from barsight.motion.frontend.sightings import Sighting
 from barsight.motion.frontend.stereo_features import OdometrySettings
-from barsight.motion.frontend.tracking import Sighting
 
 TURN = 7
 SIGMA_PX = 0.3

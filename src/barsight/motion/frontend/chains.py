@@ -12,7 +12,7 @@ from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.core.types import ImuSamples
 from barsight.features.guided_matching import PredictedMotion
 from barsight.motion.crane.sway import MAX_GAP_S
-from barsight.motion.frontend.tracking import Sighting
+from barsight.motion.frontend.sightings import Sighting
 
 UNTIED = "the pictures begin anew, and nothing ties them to the part that is placed"
 """Reason of frames that show enough, but not where they are."""

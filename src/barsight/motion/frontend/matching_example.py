@@ -20,9 +20,11 @@ from barsight.features.guided_matching import (
 from barsight.features.matching import homography_inliers, is_mutual, nearest_neighbours
 from barsight.features.patch_alignment import PatchPair, patch_pair
 from barsight.features.tracks import Tracks, update_tracks
+from barsight.motion.frontend.motion_consensus import motion_consensus
 from barsight.motion.frontend.motion_prediction import CranePredictor
 from barsight.motion.frontend.relative_pose import estimate_step
-from barsight.motion.frontend.tracking import FrontEndSettings, describe_corners, motion_consensus
+from barsight.motion.frontend.settings import FrontEndSettings
+from barsight.motion.frontend.tracking import describe_corners
 from barsight.recording.base import Recording
 from barsight.stereo.search_range import coarse_disparity
 

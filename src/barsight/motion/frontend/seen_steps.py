@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.types import ImuSamples
 from barsight.motion.crane.known_motion import KnownMotion, SeenSteps
-from barsight.motion.frontend.tracking import Sighting
+from barsight.motion.frontend.sightings import Sighting
 
 
 def seen_steps(

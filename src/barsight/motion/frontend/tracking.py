@@ -3,42 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from barsight.core.arrays import Bool, Float64, Int64
+from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
-from barsight.core.motion_detail import NormalisedResiduals
 from barsight.core.types import RectifiedCamera, RectifiedPair, RefusedFrame
-from barsight.features.guided_matching import (
-    GuidedMatches,
-    PredictedMotion,
-    predict_projections,
-    triangulate_stereo,
-)
+from barsight.features.guided_matching import GuidedMatches, PredictedMotion
 from barsight.features.orb import describe_upright
 from barsight.features.patch_alignment import PatchPair, patch_pair
-from barsight.features.self_similarity import texture_period_px
-from barsight.features.tracks import Tracks, TrackSettings, detect_corners, match_tracks, update_tracks
-from barsight.motion.frontend.relative_pose import RelativePose, estimate_step, ransac, refine_pose
-from barsight.motion.frontend.stereo_features import FeatureView, OdometrySettings, match_coarsely
-from barsight.motion.frontend.wide_steps import (
-    MIN_WIDE_RATIO,
-    REPEATING,
-    DescribedMotion,
-    Repeats,
-    check_next_bars,
-    check_overlap,
-    wide_motion,
-    wide_view,
-)
+from barsight.features.tracks import Tracks, detect_corners, update_tracks
+from barsight.motion.frontend.motion_consensus import Consensus, motion_consensus, wide_consensus
+from barsight.motion.frontend.relative_pose import RelativePose, estimate_step
+from barsight.motion.frontend.settings import FrontEndSettings
+from barsight.motion.frontend.sightings import SeenAgain, Sighting, normalised_innovation
+from barsight.motion.frontend.stereo_features import FeatureView, match_coarsely
+from barsight.motion.frontend.wide_steps import DescribedMotion, check_overlap, wide_motion, wide_view
 from barsight.stereo.search_range import coarse_disparity
 
-MIN_RATIO = 0.45
-"""One bar off, a twentieth of the points find one alike and agree, on dull bars a third; at the true place
-most do (six in ten from a car, eight over a yard)."""
 MIN_KNOWN = 200
 SPAN = 1.6
 """New points are sought up to this much nearer and further than the known ones."""
@@ -46,49 +29,8 @@ SPAN = 1.6
 MAX_LOST = 3
 """Ends of chains that are held."""
 
-Consensus = tuple[Bool, GuidedMatches, PredictedMotion]
-"""Which tracked points (N,) agree, all their matches, and the motion on which they do."""
-
 Predictor = Callable[[int, int], PredictedMotion | None]
 """From two frames' stamps to the motion of `rect0` between them as the other sensors know it, or None."""
-
-
-@dataclass(frozen=True, eq=False)
-class Sighting:
-    """Tracked points of one frame. track: (N,) names of points; stereo: (N, 3) u, v and right u, px;
-    sigma_px: (N,) of each as the patches show it.
-
-    motion: of `rect0` since the sighting before; None for the first of a chain, which nothing ties to the
-    one before. again: another one that it is tied to, by points that both name. ambiguous: how many points
-    were refused since the prediction was too coarse for the bars. innovation: (6,) turn and way of `motion`
-    minus the predicted ones in sigma, None without a prediction.
-    """
-
-    stamp_ns: int
-    track: Int64
-    stereo: Float64
-    sigma_px: Float64
-    motion: PredictedMotion | None
-    ambiguous: int
-    innovation: Float64 | None = None
-    again: SeenAgain | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class SeenAgain:
-    """A place seen again: the stamp of the sighting before a loss, and the motion of `rect0` since it."""
-
-    stamp_ns: int
-    motion: PredictedMotion
-
-
-@dataclass(frozen=True)
-class FrontEndSettings:
-    """Settings of the front end."""
-
-    tracks: TrackSettings = field(default_factory=TrackSettings)
-    rough: OdometrySettings = field(default_factory=lambda: OdometrySettings(features=900))
-    """The motion from corners' descriptors where no other sensor predicts it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,7 +136,7 @@ def _see(
             if isinstance(found, Failed):
                 return found
         kept, matches, motion = found
-        innovation = None if prediction is None else _innovation(prediction, motion)
+        innovation = None if prediction is None else normalised_innovation(prediction, motion)
     camera = pair.pair.camera
     if view is None:
         span = _span(matches.stereo[kept], camera)
@@ -210,24 +152,6 @@ def _see(
         pair.pair.stamp_ns, tracks.track, tracks.stereo, tracks.sigma_px, motion, ambiguous, innovation
     )
     return _State(tracks, tracks.next_track, pair.pair.stamp_ns, view), sighting
-
-
-def _innovation(predicted: PredictedMotion, found: PredictedMotion) -> Float64:
-    """Compute the innovation (6,): turn and way found minus predicted, each over its sigma."""
-    turn = Rotation.from_matrix(found.rotation @ predicted.rotation.T)
-    way = found.translation - turn.as_matrix() @ predicted.translation
-    sigma = np.sqrt(np.diag(predicted.covariance + found.covariance))
-    return np.asarray(np.concatenate([turn.as_rotvec(), way]) / sigma, np.float64)
-
-
-def innovations(sightings: tuple[Sighting, ...]) -> NormalisedResiduals | None:
-    """Collect the innovations of all frames whose motion was predicted, None if there are none."""
-    told = [(s.stamp_ns, s.innovation) for s in sightings if s.innovation is not None]
-    if not told:
-        return None
-    names = tuple(f"{part} {axis}" for part in ("turn", "way") for axis in "xyz")
-    stamps = np.array([stamp for stamp, _ in told], np.int64)
-    return NormalisedResiduals(names, stamps, np.array([values for _, values in told]))
 
 
 def _span(known: Float64, camera: RectifiedCamera) -> tuple[float, float] | None:
@@ -282,75 +206,3 @@ def _by_wide_step(tracks: Tracks, pair: PatchPair, settings: FrontEndSettings) -
     views = [wide_view(one, settings.rough) for one in (patch_pair(tracks.last), pair)]
     motion = wide_motion(views[0], views[1], settings.rough)
     return motion if isinstance(motion, Failed) else wide_consensus(tracks, pair, motion, settings)
-
-
-def wide_consensus(
-    tracks: Tracks, pair: PatchPair, wide: DescribedMotion, settings: FrontEndSettings
-) -> Consensus | Failed:
-    """Select points that agree on a motion which `wide_motion` found, unless the next bars agree too."""
-    if failed := check_overlap(tracks, pair, wide, settings.tracks):
-        return failed
-    repeats = Repeats.of(tracks)
-    min_ratio = MIN_RATIO if repeats.share >= REPEATING else MIN_WIDE_RATIO
-    found = motion_consensus(tracks, pair, wide.motion, settings, min_ratio)
-    if isinstance(found, Failed):
-        return found
-    kept, _, motion = found
-    return check_next_bars(tracks, pair, motion, repeats, int(kept.sum()), settings.tracks) or found
-
-
-def motion_consensus(
-    tracks: Tracks, pair: PatchPair, prediction: PredictedMotion, settings: FrontEndSettings,
-    min_ratio: float = MIN_RATIO,
-) -> Consensus | Failed:  # fmt: skip
-    """Select points found again in their ellipses that agree on one motion in 3D, and that motion."""
-    assert tracks.last is not None
-    repeats = texture_period_px(tracks.last.left, tracks.stereo[:, :2])
-    camera = pair.pair.camera
-    predicted = predict_projections(
-        triangulate_stereo(tracks.stereo, camera), settings.tracks.sigma_px, prediction, camera
-    )
-    matches = match_tracks(tracks, pair, predicted, settings.tracks, repeats)
-    index = np.flatnonzero(matches.found)
-    least = settings.rough.min_inliers
-    if index.size < least:
-        alike = int(matches.ambiguous.sum())
-        why = f", {alike} can't be told from the next bar's" if alike else ""
-        return Failed("no-matches", f"only {index.size} of {len(tracks.track)} points are found again{why}")
-    points, target = triangulate_stereo(tracks.stereo[index], camera), matches.stereo[index]
-    start = ransac(points, target[:, :2], camera, settings.rough)
-    if isinstance(start, Failed):
-        return start
-    step = refine_pose(points, target, *start, camera, settings.rough)
-    if isinstance(step, Failed):
-        return step
-    kept = np.zeros(len(tracks.track), np.bool_)
-    kept[index[step.kept]] = True
-    share = kept.sum() / max(1, int((predicted.inside & ~matches.ambiguous).sum()))
-    if share < min_ratio:
-        return Failed(
-            "ambiguous",
-            f"only {100 * share:.0f} % of the points are found where they are expected: another bar may be",
-        )
-    motion = PredictedMotion(step.rotation, step.translation, step.covariance)
-    return *_with_ambiguous(tracks, pair, motion, matches, kept, repeats, settings), motion
-
-
-def _with_ambiguous(
-    tracks: Tracks, pair: PatchPair, motion: PredictedMotion, matches: GuidedMatches, kept: Bool,
-    repeats: Float64, settings: FrontEndSettings,
-) -> tuple[Bool, GuidedMatches]:  # fmt: skip
-    """Match points too ambiguous for the prediction anew by the motion on which the others agree."""
-    left = np.flatnonzero(matches.ambiguous)
-    if left.size == 0:
-        return kept, matches
-    some, camera = tracks.chosen(matches.ambiguous), pair.pair.camera
-    places = predict_projections(
-        triangulate_stereo(some.stereo, camera), settings.tracks.sigma_px, motion, camera
-    )
-    again = match_tracks(some, pair, places, settings.tracks, repeats[left])
-    stereo, sigma = matches.stereo.copy(), matches.sigma_px.copy()
-    kept, ambiguous = kept.copy(), matches.ambiguous.copy()
-    stereo[left], sigma[left], kept[left] = again.stereo, again.sigma_px, again.found
-    ambiguous[left] = again.ambiguous
-    return kept, GuidedMatches(stereo, sigma, matches.found | kept, ambiguous)

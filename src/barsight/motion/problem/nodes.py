@@ -20,7 +20,7 @@ from barsight.inertial.model import ImuBias
 from barsight.inertial.standstill import estimate_at_rest, stands_still
 from barsight.motion.crane.encoder_trajectory import fit_position
 from barsight.motion.frontend.chains import chained_poses
-from barsight.motion.frontend.tracking import Sighting
+from barsight.motion.frontend.sightings import Sighting
 from barsight.motion.gravity import GravityAlignment
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from barsight.core.pose import Pose
 from barsight.core.types import CraneSamples, EncoderJump, ImuSamples, RectifiedCamera
 from barsight.inertial.model import ImuBias
 from barsight.inertial.preintegration import Preintegrated
-from barsight.motion.frontend.tracking import Sighting
+from barsight.motion.frontend.sightings import Sighting
 from barsight.motion.linear.ordering import Ordering, order_unknowns
 
 FIRST_UNEVEN_M = 0.0005
