@@ -27,7 +27,7 @@ from barsight.artefacts.plan import AcceptancePlan
 from barsight.calibration.files.rig_file import write_rig_file
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.errors import Failed
-from barsight.core.types import StereoFrame
+from barsight.core.records.pairs import StereoFrame
 from barsight.measure_settings import MeasureSettings
 from barsight.motion.rig_check.self_calibration import turn_right_camera
 from barsight.recording.base import RecordingSettings

@@ -25,7 +25,7 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Bool, Float32, Float64, UInt8
 from barsight.core.pose import Pose
-from barsight.core.types import StereoFrame
+from barsight.core.records.pairs import StereoFrame
 from barsight.reconstruction.pair_matching import disparity_range
 from barsight.recording.formats.ground_truth import read_ground_truth
 from barsight.simulation.effects.settings import LightSettings

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Float32, Float64
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.yard.types import BundleSigma, HeightMap
 
 CELL_SIGMA_M, CORRELATION_CELLS = 0.005, 2.0

@@ -17,7 +17,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from barsight.cli.bench.seeds import over_seeds, parse_seeds
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.yard.lifting.targets import LiftPlan, plan_lifts
 from barsight.yard.types import Bundle, HeightMap
 from lift_yards import MAGNET, SETTINGS, SIGMA, map_of, record

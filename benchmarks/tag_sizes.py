@@ -14,7 +14,7 @@ import numpy as np
 
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Float64
-from barsight.core.types import PosedFrame
+from barsight.core.records.trajectory import PosedFrame
 from barsight.recording.open import open_recording
 from barsight.registration.surveyed_targets import SurveyedTags
 from barsight.registration.tags import MAX_CHI2, SeenTags, see_tags

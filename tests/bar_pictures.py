@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from barsight.core.types import RectifiedCamera, RectifiedPair
+from barsight.core.records.pairs import RectifiedCamera, RectifiedPair
 from barsight.features.patch_alignment import PatchPair, patch_pair
 from synthetic_scenes import Texture, quantised
 

@@ -14,7 +14,7 @@ from barsight.calibration.geometry.camera import Camera, Distortion
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.pose import Pose
-from barsight.core.types import ImuSamples
+from barsight.core.records.sensor_samples import ImuSamples
 from barsight.simulation.boards.drawing import draw_board
 
 SIZE = (752, 480)

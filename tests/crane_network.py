@@ -16,7 +16,7 @@ import numpy as np
 import barsight as bs
 from barsight.calibration.files.kalibr import write_imu_file
 from barsight.calibration.files.rig_file import write_rig_file
-from barsight.core.types import StereoFrame
+from barsight.core.records.pairs import StereoFrame
 from barsight.recording.base import Recording
 from gige_camera import library
 

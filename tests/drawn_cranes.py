@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.pose import Pose
-from barsight.core.types import CraneSamples, ImuSamples
+from barsight.core.records.sensor_samples import CraneSamples, ImuSamples
 from barsight.features.guided_matching import PredictedMotion, project_stereo
 from barsight.inertial.model import GRAVITY_MPS2
 from barsight.motion.frontend.sightings import Sighting

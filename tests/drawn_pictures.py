@@ -11,7 +11,8 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from barsight.core.pose import Pose
-from barsight.core.types import HeightSource, RectifiedCamera, RectifiedPair
+from barsight.core.records.heights import HeightSource
+from barsight.core.records.pairs import RectifiedCamera, RectifiedPair
 from barsight.labels.placing import PlacedCamera
 from barsight.yard.types import HeightMap
 

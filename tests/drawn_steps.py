@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.pose import Pose
-from barsight.core.types import CraneSamples, ImuSamples
+from barsight.core.records.sensor_samples import CraneSamples, ImuSamples
 from barsight.features.guided_matching import PredictedMotion
 from barsight.motion.frontend.sightings import Sighting
 from drawn_cranes import drawn_crane

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 import barsight as bs
-from barsight.core.types import StereoFrame
+from barsight.core.records.pairs import StereoFrame
 from barsight.recording.base import Recording
 from barsight.simulation.simulate import simulate
 from cli_runs import FAST, TINY

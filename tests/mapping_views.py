@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from barsight.core.pose import Pose
-from barsight.core.types import RectifiedCamera
+from barsight.core.records.pairs import RectifiedCamera
 from barsight.mapping.election.surface_election import SurfaceElection
 from barsight.mapping.fusion import fuse_view
 from barsight.mapping.observation import CellObservations

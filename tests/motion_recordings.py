@@ -14,15 +14,8 @@ from barsight.calibration.geometry.camera import Camera
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.pose import Pose
-from barsight.core.types import (
-    CraneSamples,
-    ImuSamples,
-    LaserProfile,
-    RectifiedCamera,
-    RectifiedPair,
-    RefusedFrame,
-    StereoFrame,
-)
+from barsight.core.records.pairs import RectifiedCamera, RectifiedPair, RefusedFrame, StereoFrame
+from barsight.core.records.sensor_samples import CraneSamples, ImuSamples, LaserProfile
 from barsight.motion import estimator
 from barsight.motion.frontend.sightings import Sighting
 from barsight.recording.base import FrameIndex

@@ -9,7 +9,7 @@ import numpy as np
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.pose import Pose
-from barsight.core.types import CraneSamples, ImuSamples
+from barsight.core.records.sensor_samples import CraneSamples, ImuSamples
 from barsight.features.guided_matching import project_stereo
 from barsight.inertial.model import GRAVITY_MPS2
 from barsight.motion.frontend.sightings import Sighting

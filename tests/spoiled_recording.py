@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from barsight.core.arrays import Float64
-from barsight.core.types import CraneSamples, ImuSamples, RefusedFrame, StereoFrame
+from barsight.core.records.pairs import RefusedFrame, StereoFrame
+from barsight.core.records.sensor_samples import CraneSamples, ImuSamples
 from barsight.recording.base import FrameIndex, Recording
 
 

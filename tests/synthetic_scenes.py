@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from barsight.core.types import RectifiedCamera, RectifiedPair
+from barsight.core.records.pairs import RectifiedCamera, RectifiedPair
 
 WAVES = 100
 

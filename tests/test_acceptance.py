@@ -30,7 +30,7 @@ from barsight.artefacts.plan import AcceptancePlan, Plate, Sphere, TouchDown, pl
 from barsight.cli.main import run
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed, InputError
-from barsight.core.types import StereoFrame
+from barsight.core.records.pairs import StereoFrame
 from barsight.simulation.effects.faults import SpoiledLens
 from barsight.simulation.effects.settings import FaultSettings
 from barsight.simulation.rays import cast_rays

@@ -11,8 +11,8 @@ import pytest
 
 import barsight as bs
 from barsight.cli.main import run
+from barsight.core.records.pairs import StereoFrame
 from barsight.core.settings.values import build_settings
-from barsight.core.types import StereoFrame
 from barsight.mapping.settings import MapSettings
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.lift_file import read_lifts

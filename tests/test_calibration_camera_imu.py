@@ -25,7 +25,7 @@ from barsight.calibration.camera_imu.problem import (
 from barsight.calibration.camera_imu.setup import prepare
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.errors import CalibrationError
-from barsight.core.types import ImuSamples
+from barsight.core.records.sensor_samples import ImuSamples
 from camera_imu_recordings import BOARD, NOISE, Truth, simulated, true_rig, without_extrinsics
 
 SOURCE = Path("recording")

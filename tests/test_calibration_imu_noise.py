@@ -13,7 +13,7 @@ from barsight.calibration.camera_imu.allan_deviation import (
 from barsight.calibration.files.kalibr import read_imu_file
 from barsight.cli.main import run
 from barsight.core.errors import Failed
-from barsight.core.types import ImuSamples
+from barsight.core.records.sensor_samples import ImuSamples
 from barsight.recording.formats.imu_log import read_imu_log
 
 RATE_HZ, DENSITY, WALK = 100.0, np.array([1.5e-3, 2e-2]), np.array([8e-4, 1e-2])

@@ -11,7 +11,7 @@ from barsight.calibration.geometry.remap import Warp
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.errors import Failed
 from barsight.core.pose import Pose
-from barsight.core.types import StereoFrame
+from barsight.core.records.pairs import StereoFrame
 
 RADTAN = (-0.28, 0.07, 0.0002, 1.8e-05)
 EQUIDISTANT = (-0.013, 0.021, -0.011, 0.002)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from barsight.cli.main import run
-from barsight.core.types import Disparity
+from barsight.core.records.disparity import Disparity
 from barsight.stereo.disparity_files import write_disparity
 from cli_runs import cut_short, pictures
 

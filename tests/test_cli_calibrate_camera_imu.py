@@ -12,7 +12,7 @@ from barsight.calibration.files.kalibr import read_camchain, write_imu_file
 from barsight.calibration.files.rig_file import read_covariance, write_rig_file
 from barsight.calibration.files.rig_formats import read_rig_file
 from barsight.cli.main import run
-from barsight.core.types import ImuSamples
+from barsight.core.records.sensor_samples import ImuSamples
 from camera_imu_recordings import BOARD, NOISE, draw_recording, simulated, true_rig, without_extrinsics
 
 TEXT = str(BOARD)

@@ -16,7 +16,8 @@ from barsight.benchmarks.stereo.scores import score_disparity
 from barsight.benchmarks.stereo.speed import bench_speed, speed_table, time_chain
 from barsight.core.errors import InputError
 from barsight.core.json_values import write_json
-from barsight.core.types import Disparity, DisparityRange, RectifiedPair
+from barsight.core.records.disparity import Disparity, DisparityRange
+from barsight.core.records.pairs import RectifiedPair
 from barsight.stereo.direct.pipeline import BarsightStereo
 from barsight.stereo.disparity_files import write_disparity
 from cli_runs import edit

@@ -35,7 +35,8 @@ from barsight.benchmarks.stereo.subpixel import (
 from barsight.benchmarks.stereo.target_size import bench_target_size, measure_bar, target_size_table
 from barsight.core.errors import Failed
 from barsight.core.json_values import write_json
-from barsight.core.types import Disparity, DisparityRange, RectifiedPair
+from barsight.core.records.disparity import Disparity, DisparityRange
+from barsight.core.records.pairs import RectifiedPair
 from barsight.stereo.image_pair import pair_from_images
 from barsight.stereo.sgbm import Sgbm, SgbmSettings
 

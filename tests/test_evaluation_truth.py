@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from barsight.core.errors import InputError
-from barsight.core.types import Contour, HeightSource
+from barsight.core.records.heights import Contour, HeightSource
 from barsight.evaluation.score import score_folder
 from barsight.mapping.settings import MapSettings
 from barsight.report.files.height_rasters import write_height

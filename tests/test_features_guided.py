@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from barsight.core.types import RectifiedCamera, RectifiedPair
+from barsight.core.records.pairs import RectifiedCamera, RectifiedPair
 from barsight.features.guided_matching import (
     PredictedMotion,
     match_guided,

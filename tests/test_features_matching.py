@@ -8,7 +8,7 @@ import pytest
 from barsight.benchmarks.motion.matching import bench_features, bench_matching
 from barsight.core.arrays import UInt8
 from barsight.core.errors import InputError
-from barsight.core.types import RectifiedCamera
+from barsight.core.records.pairs import RectifiedCamera
 from barsight.features.detectors import DETECTORS, DetectorName, make_detector
 from barsight.features.guided_matching import project_stereo
 from barsight.features.matching import (

@@ -13,7 +13,7 @@ from barsight.calibration.geometry.rig import StereoRig
 from barsight.cli.main import run
 from barsight.core.errors import InputError
 from barsight.core.pose import Pose
-from barsight.core.types import RectifiedCamera
+from barsight.core.records.pairs import RectifiedCamera
 from barsight.recording.formats.bag_setup import side_by_side
 from barsight.recording.formats.image_pairs import find_pairs
 from barsight.recording.formats.imu_log import read_imu_log

@@ -33,7 +33,7 @@ ROOMS = {
         ".", "crane", "frontend", "frame_to_frame", "linear", "problem", "batch", "fixed_lag", "rig_check",
         "settings",
     ),
-    "core": ("compiling", ".", "reading", "linalg", "settings"),
+    "core": ("compiling", ".", "records", "reading", "linalg", "settings"),
     "mapping": (".", "surface", "election", "passes"),
     "yard": (
         ".", "bundles.fitting", "bundles.section", "bundles", "stability", "magnet", "lifting", "inventory",

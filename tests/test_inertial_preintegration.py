@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.core.errors import Failed
+from barsight.core.records.sensor_samples import ImuSamples
 from barsight.core.stamps import NS_PER_S, interpolate_at
-from barsight.core.types import ImuSamples
 from barsight.inertial.model import GRAVITY_MPS2, BodyState, ImuBias
 from barsight.inertial.preintegration import Preintegrated, Preintegrator
 from barsight.recording.formats.ground_truth import read_ground_truth

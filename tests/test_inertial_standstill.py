@@ -4,7 +4,7 @@ import numpy as np
 
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.core.errors import Failed
-from barsight.core.types import ImuSamples
+from barsight.core.records.sensor_samples import ImuSamples
 from barsight.inertial.standstill import RestEstimate, estimate_at_rest, stands_still
 
 NOISE = ImuNoise(2.4e-4, 2e-5, 1.9e-3, 4e-4, 200.0)

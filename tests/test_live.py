@@ -14,7 +14,8 @@ import pytest
 
 import barsight as bs
 from barsight.cli.main import run
-from barsight.core.types import CraneSamples, StereoFrame
+from barsight.core.records.pairs import StereoFrame
+from barsight.core.records.sensor_samples import CraneSamples
 from barsight.live.latency import counts, spread
 from barsight.live.modes import FreezeWatch, JumpWatch, Mode, SensorActivity, judge_mode
 from barsight.live.run import Keyframes, read_keyframes, replay, write_keyframes

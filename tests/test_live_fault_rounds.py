@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import barsight as bs
-from barsight.core.types import ImuSamples
+from barsight.core.records.sensor_samples import ImuSamples
 from barsight.motion.crane.encoder_jumps import find_jumps
 from barsight.motion.crane.known_motion import KnownMotion
 from barsight.simulation.simulate import simulate

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import barsight as bs
-from barsight.core.types import CraneSamples
+from barsight.core.records.sensor_samples import CraneSamples
 from barsight.live.link import GrowingRecording, KeptRecording, Link, LiveInput
 from barsight.live.mapper import LIVE_MAP, Mapping
 from barsight.live.settings import LiveSettings

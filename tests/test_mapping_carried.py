@@ -10,7 +10,7 @@ import tifffile
 
 from barsight.cli.main import run
 from barsight.core.pose import Pose
-from barsight.core.types import RectifiedCamera
+from barsight.core.records.pairs import RectifiedCamera
 from barsight.mapping.ego_mask import mask_carried
 
 CAMERA = RectifiedCamera(600.0, 320.0, 240.0, 0.5, 0.0, 640, 480)

@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barsight.core.types import Contour, HeightSource, LaserProfile
+from barsight.core.records.heights import Contour, HeightSource
+from barsight.core.records.sensor_samples import LaserProfile
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.surface.contours import cut_contour, cut_contours, smooth_contour
 from barsight.mapping.surface.surface import Surface

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from barsight.core.errors import ConfigError
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.mapping.fusion import PRIOR_VIEWS
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.tiles import SLOTS, TILE_CELLS, VIEWS, TileStore, Z

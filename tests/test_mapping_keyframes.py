@@ -10,7 +10,9 @@ import pytest
 
 from barsight.core.errors import ConfigError
 from barsight.core.pose import Pose
-from barsight.core.types import CraneSamples, PosedFrame, RectifiedCamera
+from barsight.core.records.pairs import RectifiedCamera
+from barsight.core.records.sensor_samples import CraneSamples
+from barsight.core.records.trajectory import PosedFrame
 from barsight.mapping.keyframes import select_keyframes, select_keyframes_by_encoders
 from barsight.mapping.settings import MapSettings
 from barsight.measure_settings import MeasureSettings

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from barsight.core.pose import Pose
-from barsight.core.types import Contour, HeightSource, LaserProfile, PosedFrame, Trajectory
+from barsight.core.records.heights import Contour, HeightSource
+from barsight.core.records.sensor_samples import LaserProfile
+from barsight.core.records.trajectory import PosedFrame, Trajectory
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.surface.laser_check import check_laser
 from barsight.mapping.surface.laser_fusion import fuse_laser

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from barsight.core.pose import Pose
-from barsight.core.types import StereoPoints
+from barsight.core.records.disparity import StereoPoints
 from barsight.mapping.observation import sort_points
 
 CELL_M = 0.02

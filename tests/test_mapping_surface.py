@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from barsight.core.pose import Pose
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.mapping.election.surface_election import SurfaceElection
 from barsight.mapping.fusion import fuse_view
 from barsight.mapping.observation import CellObservations

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from barsight.core.pose import Pose
-from barsight.core.types import RectifiedCamera, RectifiedPair
+from barsight.core.records.pairs import RectifiedCamera, RectifiedPair
 from barsight.mapping.observation import CellObservations
 from barsight.mapping.top_photo import OVER_TOPS_M, TopPhoto
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from barsight.core.pose import Pose
-from barsight.core.types import RectifiedCamera
+from barsight.core.records.pairs import RectifiedCamera
 from barsight.mapping.surface.block_visibility import (
     BLOCK,
     SOMEWHERE,

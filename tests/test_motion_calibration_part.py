@@ -13,7 +13,7 @@ from barsight.calibration.geometry.rig import StereoRig
 from barsight.calibration.stereo.disparity_uncertainty import rig_covariance
 from barsight.calibration.stereo.projection_uncertainty import sample_pairs, triangulate_depth
 from barsight.core.pose import Pose
-from barsight.core.types import RigDrift
+from barsight.core.records.trajectory import RigDrift
 from barsight.motion.rig_check.calibration_part import calibration_covariance
 from barsight.motion.rig_check.epipolar_error import row_design
 from barsight.motion.rig_check.self_calibration import residual_covariance

@@ -11,7 +11,7 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.cli.main import run
 from barsight.core.errors import InputError
 from barsight.core.pose import Pose
-from barsight.core.types import RefusedFrame
+from barsight.core.records.pairs import RefusedFrame
 from barsight.evaluation.board_poses import board_poses, gyro_only_rmse_deg
 from barsight.evaluation.trajectory_error import Drift, trajectory_drift
 from barsight.motion.batch.fusion import BatchFusion, FusionSettings

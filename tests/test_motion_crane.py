@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import ConfigError, Failed, MeasurementError
-from barsight.core.types import CraneSamples, ImuSamples
+from barsight.core.records.sensor_samples import CraneSamples, ImuSamples
 from barsight.inertial.model import GRAVITY_MPS2, ImuBias
 from barsight.motion.crane.encoder_trajectory import CraneSettings, EncoderOdometry, fit_position
 from barsight.motion.crane.known_motion import ImuWay, way_around

@@ -11,7 +11,8 @@ from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import ConfigError, MeasurementError
 from barsight.core.pose import Pose
-from barsight.core.types import CraneSamples, ImuSamples, Trajectory
+from barsight.core.records.sensor_samples import CraneSamples, ImuSamples
+from barsight.core.records.trajectory import Trajectory
 from barsight.evaluation.trajectory_error import Drift, trajectory_drift
 from barsight.features.guided_matching import project_stereo, triangulate_stereo
 from barsight.motion.batch import fusion

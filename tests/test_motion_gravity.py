@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from barsight.core.types import ImuSamples
+from barsight.core.records.sensor_samples import ImuSamples
 from barsight.motion.gravity import align_with_gravity
 from motion_recordings import BODY_FROM_CAM0, MemoryRecording, ideal_rig
 

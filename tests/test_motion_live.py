@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import ConfigError
 from barsight.core.pose import Pose
-from barsight.core.types import PosedFrame, RefusedFrame, StereoFrame, Trajectory
+from barsight.core.records.pairs import RefusedFrame, StereoFrame
+from barsight.core.records.trajectory import PosedFrame, Trajectory
 from barsight.evaluation.trajectory_error import trajectory_drift
 from barsight.inertial.model import ORDINARY_NOISE
 from barsight.motion.batch import fusion

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import ConfigError, Failed
 from barsight.core.pose import Pose, skew
-from barsight.core.types import RectifiedCamera, RefusedFrame, StereoFrame, Trajectory
+from barsight.core.records.pairs import RectifiedCamera, RefusedFrame, StereoFrame
+from barsight.core.records.trajectory import Trajectory
 from barsight.features.guided_matching import (
     project_stereo,
     stereo_jacobian,

@@ -9,7 +9,8 @@ import pytest
 
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import Failed
-from barsight.core.types import CraneSamples, EncoderJump, ImuSamples, RefusedFrame
+from barsight.core.records.pairs import RefusedFrame
+from barsight.core.records.sensor_samples import CraneSamples, EncoderJump, ImuSamples
 from barsight.evaluation.trajectory_error import trajectory_drift
 from barsight.inertial.model import without_saturation
 from barsight.motion.batch import fusion

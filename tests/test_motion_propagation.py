@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from barsight.core.arrays import Float64
-from barsight.core.types import PosedFrame
+from barsight.core.records.trajectory import PosedFrame
 from barsight.inertial.model import ORDINARY_NOISE
 from barsight.motion.fixed_lag.propagation import ROW_NUMBERS, NavigationState, Propagator
 from barsight.recording.base import Recording

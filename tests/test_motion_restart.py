@@ -11,7 +11,7 @@ from bar_pictures import bar_view
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import Failed
 from barsight.core.pose import Pose
-from barsight.core.types import RefusedFrame
+from barsight.core.records.pairs import RefusedFrame
 from barsight.evaluation.trajectory_error import trajectory_drift
 from barsight.features.guided_matching import PredictedMotion
 from barsight.motion.frontend.chains import UNTIED, chained_poses, tied_parts

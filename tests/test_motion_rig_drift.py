@@ -9,7 +9,8 @@ import pytest
 
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.pose import Pose
-from barsight.core.types import CraneSamples, RigDrift
+from barsight.core.records.sensor_samples import CraneSamples
+from barsight.core.records.trajectory import RigDrift
 from barsight.features.guided_matching import project_stereo
 from barsight.motion.batch import fusion
 from barsight.motion.batch.fusion import BatchFusion, FusionSettings

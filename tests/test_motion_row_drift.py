@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from barsight.core.errors import Failed
-from barsight.core.types import RectifiedCamera
+from barsight.core.records.pairs import RectifiedCamera
 from barsight.motion.rig_check.epipolar_error import RowDrift, fit_rows
 
 CAMERA = RectifiedCamera(1250.0, 640.0, 512.0, 0.5, 3.0, 1280, 1024)

@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from barsight.core.linalg import skyline
 from barsight.core.pose import Pose
-from barsight.core.types import EncoderJump, RectifiedCamera
+from barsight.core.records.pairs import RectifiedCamera
+from barsight.core.records.sensor_samples import EncoderJump
 from barsight.features.guided_matching import project_stereo
 from barsight.inertial.model import ImuBias
 from barsight.motion.frontend.sightings import Sighting

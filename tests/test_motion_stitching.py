@@ -5,7 +5,7 @@ import pytest
 
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import ConfigError
-from barsight.core.types import RefusedFrame, StereoFrame
+from barsight.core.records.pairs import RefusedFrame, StereoFrame
 from barsight.motion.crane.encoder_trajectory import CraneSettings
 from barsight.motion.frame_to_frame.stitching import PaperStitching, StitchingSettings
 from barsight.motion.frontend.stereo_features import OdometrySettings

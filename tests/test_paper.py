@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.cli.main import run
 from barsight.core.pose import Pose
-from barsight.core.types import ImuSamples, StereoFrame
+from barsight.core.records.pairs import StereoFrame
+from barsight.core.records.sensor_samples import ImuSamples
 from barsight.features.matching import hamming_distances
 from barsight.motion.frame_to_frame.motion_trend import MotionTrend
 from barsight.motion.settings import MotionSettings, make_estimator

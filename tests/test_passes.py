@@ -11,7 +11,7 @@ import pytest
 
 import barsight as bs
 from barsight.core.errors import ConfigError, InputError
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.passes.changes import PlaceHistory
 from barsight.mapping.passes.joined_surface import PassSurface

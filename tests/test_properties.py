@@ -11,7 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from barsight.core.linalg.robust import mad_sigma
 from barsight.core.pose import Pose
-from barsight.core.types import Disparity, HeightSource, RectifiedPair, StereoPoints
+from barsight.core.records.disparity import Disparity, StereoPoints
+from barsight.core.records.heights import HeightSource
+from barsight.core.records.pairs import RectifiedPair
 from barsight.mapping.observation import CellObservations
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.surface.surface import Layers

@@ -20,7 +20,7 @@ from barsight.calibration.files.rig_file import write_rig_file
 from barsight.calibration.files.rig_formats import read_rig_file
 from barsight.cli.main import run
 from barsight.core.errors import CalibrationError, InputError
-from barsight.core.types import RefusedFrame, StereoFrame
+from barsight.core.records.pairs import RefusedFrame, StereoFrame
 from barsight.recording.base import RecordingSettings
 from barsight.recording.formats import bag
 from barsight.recording.open import open_recording

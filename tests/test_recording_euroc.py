@@ -9,7 +9,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from barsight.core.errors import CalibrationError, InputError
-from barsight.core.types import RefusedFrame, StereoFrame
+from barsight.core.records.pairs import RefusedFrame, StereoFrame
 from barsight.recording.base import RecordingSettings
 from barsight.recording.open import open_recording
 from recording_samples import (

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from barsight.core.errors import CalibrationError, InputError
-from barsight.core.types import RefusedFrame, StereoFrame
+from barsight.core.records.pairs import RefusedFrame, StereoFrame
 from barsight.recording.open import open_recording
 from recording_samples import HEIGHT, WIDTH, picture, png, real
 

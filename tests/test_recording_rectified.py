@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from barsight.calibration.geometry.rectification import Rectifier
-from barsight.core.types import RectifiedPair, RefusedFrame, StereoFrame
+from barsight.core.records.pairs import RectifiedPair, RefusedFrame, StereoFrame
 from barsight.recording import rectified_pairs
 from barsight.recording.rectified_pairs import RectifiedPairs
 from motion_recordings import MemoryRecording, ideal_rig

@@ -7,7 +7,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 import barsight as bs
-from barsight.core.types import StereoFrame
+from barsight.core.records.pairs import StereoFrame
 from barsight.recording.base import Recording
 from barsight.recording.formats.segments import segments_of
 from barsight.recording.writers.bag import write_descriptions

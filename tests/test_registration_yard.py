@@ -6,7 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from barsight.core.errors import Failed
 from barsight.core.pose import Pose
-from barsight.core.types import CraneSamples, PosedFrame, Trajectory
+from barsight.core.records.sensor_samples import CraneSamples
+from barsight.core.records.trajectory import PosedFrame, Trajectory
 from barsight.motion.crane.crane_moves import MovedYard, yard_from_moves
 from barsight.registration.yard import YardCalibration, calibrate_yard
 

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from barsight.core.errors import InputError, OutputError
-from barsight.core.types import Contour, HeightSource, LaserProfile
+from barsight.core.records.heights import Contour, HeightSource
+from barsight.core.records.sensor_samples import LaserProfile
 from barsight.report.map_images import cut_strips, hillshade, paint_height, read_raster
 from barsight.report.page import format_number, render_page, write_report
 from barsight.report.page_trajectory import turned_since_start_deg

@@ -10,7 +10,7 @@ from scipy.ndimage import map_coordinates
 import barsight as bs
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.cli.main import run
-from barsight.core.types import StereoFrame
+from barsight.core.records.pairs import StereoFrame
 from barsight.reconstruction.pair_matching import match_pictures
 from barsight.sensors.rig_plan import CAMERAS, Wish, depth_sigma_m, plan_rig
 from barsight.simulation.settings.rig import CameraSettings

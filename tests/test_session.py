@@ -12,7 +12,8 @@ import pytest
 import barsight as bs
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import InputError
-from barsight.core.types import CraneSamples, StereoFrame
+from barsight.core.records.pairs import StereoFrame
+from barsight.core.records.sensor_samples import CraneSamples
 from barsight.mapping.view import Matcher
 from barsight.motion.frontend.tracking import Tracker
 from barsight.pipeline import lift_choice

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from barsight.core.errors import ConfigError
-from barsight.core.types import DisparityRange, RectifiedCamera, RectifiedPair
+from barsight.core.records.disparity import DisparityRange
+from barsight.core.records.pairs import RectifiedCamera, RectifiedPair
 from barsight.stereo.direct.confidence import vertical_error_px
 from barsight.stereo.direct.kernels.cubic_spline import row_coefficients, value_and_slope
 from barsight.stereo.direct.pipeline import BarsightSettings, BarsightStereo

@@ -14,8 +14,9 @@ import barsight as bs
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import Failed
 from barsight.core.pose import Pose
+from barsight.core.records.disparity import Disparity, DisparityRange
+from barsight.core.records.pairs import RectifiedCamera, RectifiedPair
 from barsight.core.timing import Stopwatch
-from barsight.core.types import Disparity, DisparityRange, RectifiedCamera, RectifiedPair
 from barsight.mapping.view import MatchedFrame
 from barsight.measure_settings import MeasureSettings
 from barsight.measurement import Refusal

@@ -4,7 +4,7 @@ matched in pieces are unknown, too.
 
 import numpy as np
 
-from barsight.core.types import Disparity
+from barsight.core.records.disparity import Disparity
 from barsight.stereo.masking import gap_mask, mask_disparity, mask_gaps, mask_pieces, streak_mask
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from barsight.core.errors import InputError, OutputError
-from barsight.core.types import Disparity
+from barsight.core.records.disparity import Disparity
 from barsight.stereo.disparity_files import read_disparity, write_disparity
 
 

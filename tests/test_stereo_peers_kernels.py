@@ -7,7 +7,7 @@ import pytest
 import scipy.sparse
 import scipy.sparse.csgraph
 
-from barsight.core.types import DisparityRange
+from barsight.core.records.disparity import DisparityRange
 from barsight.stereo.baselines.bilateral_filter import bilateral_update
 from barsight.stereo.baselines.census_transform import HEIGHT_PX, WIDTH_PX, WORST, census_codes, census_cost
 from barsight.stereo.baselines.cross_aggregation import cross_filter, cross_regions

@@ -13,7 +13,8 @@ import pytest
 from barsight.benchmarks.stereo.middlebury_scenes import load_scenes
 from barsight.benchmarks.stereo.scores import StereoScore, score_disparity
 from barsight.core.errors import ConfigError
-from barsight.core.types import DisparityRange, RectifiedPair
+from barsight.core.records.disparity import DisparityRange
+from barsight.core.records.pairs import RectifiedPair
 from barsight.stereo.baselines.census import Census, CensusSettings
 from barsight.stereo.baselines.csca import Csca, CscaSettings
 from barsight.stereo.baselines.nonlocal_aggregation import Nonlocal, NonlocalSettings

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from barsight.core.types import Disparity, RectifiedPair
+from barsight.core.records.disparity import Disparity
+from barsight.core.records.pairs import RectifiedPair
 from barsight.stereo.triangulation import refine_grid, triangulate_disparity
 from synthetic_scenes import slanted_pair
 

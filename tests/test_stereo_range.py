@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from barsight.core.errors import Failed
-from barsight.core.types import DisparityRange, RectifiedPair
+from barsight.core.records.disparity import DisparityRange
+from barsight.core.records.pairs import RectifiedPair
 from barsight.stereo.search_range import coarse_disparity, find_disparity_range, follow_disparity_range
 from synthetic_scenes import camera, slanted_pair
 

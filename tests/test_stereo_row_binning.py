@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from barsight.core.types import Disparity, DisparityRange, RectifiedCamera, RectifiedPair
+from barsight.core.records.disparity import Disparity, DisparityRange
+from barsight.core.records.pairs import RectifiedCamera, RectifiedPair
 from barsight.stereo.direct.kernels.pyramid import halve, upsample_update
 from barsight.stereo.direct.pipeline import BarsightSettings, BarsightStereo
 from barsight.stereo.direct.row_binning import are_rows_alike, bin_disparity, bin_rows, spread_rows

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from barsight.core.errors import ConfigError
-from barsight.core.types import DisparityRange, RectifiedPair
+from barsight.core.records.disparity import DisparityRange
+from barsight.core.records.pairs import RectifiedPair
 from barsight.stereo.noise import image_noise
 from barsight.stereo.sgbm import Sgbm, SgbmSettings
 from synthetic_scenes import camera, slanted_pair

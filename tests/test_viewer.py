@@ -13,7 +13,7 @@ import pytest
 
 from barsight.cli.main import run
 from barsight.core.errors import InputError, OutputError
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.result_folder import read_cloud, read_heights
 from barsight.viewer.cloud import SOURCE_RGB, colour_layer, seen_layer, surface_layer
 from barsight.viewer.view import line_segments, serving, view

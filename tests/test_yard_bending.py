@@ -14,7 +14,8 @@ from barsight.cli.main import run
 from barsight.core.arrays import Float64
 from barsight.core.errors import CalibrationError, Failed
 from barsight.core.pose import Pose
-from barsight.core.types import CraneSamples, PosedFrame, Trajectory
+from barsight.core.records.sensor_samples import CraneSamples
+from barsight.core.records.trajectory import PosedFrame, Trajectory
 from barsight.motion.settings import MotionSettings, make_estimator
 from barsight.recording.open import open_recording
 from barsight.registration.bending import ORDINARY, CraneBend, calibrate_bent_yard, straight

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from barsight.core.arrays import Float64
 from barsight.core.errors import ConfigError
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.yard.bundles.bundle_kinds import listed_diameter
 from barsight.yard.bundles.collinear_pieces import join_pieces
 from barsight.yard.bundles.detection import _on, find_bundles

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.yard.lifting.clearance import BEAM_CLEAR_M
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.types import HeightMap

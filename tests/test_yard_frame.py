@@ -11,7 +11,8 @@ from barsight.calibration.files.yaml_document import read_document, write_docume
 from barsight.cli.main import run
 from barsight.core.errors import CalibrationError, InputError
 from barsight.core.pose import Pose
-from barsight.core.types import CraneSamples, PosedFrame, Trajectory
+from barsight.core.records.sensor_samples import CraneSamples
+from barsight.core.records.trajectory import PosedFrame, Trajectory
 from barsight.mapping.surface.laser_profiles import runs_along_x
 from barsight.recording.open import open_recording
 from barsight.recording.sensor_selection import SelectedSensors

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.yard.bundles.fitting.gauss_newton import Heights, Rules, _normal_equations, fit_outline
 from barsight.yard.bundles.fitting.growth import _row_states, _walk
 from barsight.yard.bundles.fitting.outline import (

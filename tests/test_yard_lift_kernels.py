@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.yard.lifting.checks import _stray_shares
 from barsight.yard.lifting.clearance import (
     BEAM_CLEAR_M,

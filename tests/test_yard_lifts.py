@@ -18,8 +18,8 @@ from scipy.optimize import linprog
 
 from barsight.core.errors import ConfigError
 from barsight.core.notices import FORBIDS, WARNINGS
+from barsight.core.records.heights import HeightSource
 from barsight.core.stamps import NS_PER_S
-from barsight.core.types import HeightSource
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.lift_settings import LiftSettings

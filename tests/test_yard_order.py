@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from barsight.core.errors import Failed
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.yard.events import YardEvent
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.lift_file import lifts_content

@@ -9,7 +9,7 @@ import pytest
 from barsight.calibration.boards.marker_detection import find_tags
 from barsight.cli.main import run
 from barsight.core.errors import Failed
-from barsight.core.types import RectifiedPair, StereoFrame
+from barsight.core.records.pairs import RectifiedPair, StereoFrame
 from barsight.recording.open import open_recording
 from barsight.registration.picks import find_right, see_picks
 from barsight.registration.tags import PlacedTag

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.yard.magnet.description import Tolerance
 from barsight.yard.magnet.footprint import BundleTable, Grip, Placement, count_gripped
 from barsight.yard.magnet.partings import without_parted

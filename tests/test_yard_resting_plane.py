@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.yard.magnet.footprint import Placement, overlap
 from barsight.yard.magnet.resting_plane import (
     ALL,

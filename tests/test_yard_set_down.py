@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.bearing import find_bearing
 from barsight.yard.lifting.ground import Ground

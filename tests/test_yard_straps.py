@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.simulation.worlds.packing import packed
 from barsight.simulation.worlds.settling import BarPack, settle
 from barsight.yard.bundles.detection import find_bundles

@@ -14,7 +14,8 @@ from barsight.calibration.geometry.rig import StereoRig
 from barsight.cli.main import run
 from barsight.core.errors import ConfigError, Failed
 from barsight.core.pose import Pose
-from barsight.core.types import PosedFrame, StereoFrame
+from barsight.core.records.pairs import StereoFrame
+from barsight.core.records.trajectory import PosedFrame
 from barsight.recording.open import open_recording
 from barsight.registration.rigid import align_rigid
 from barsight.registration.surveyed_targets import SurveyedTags

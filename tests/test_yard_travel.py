@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from barsight.core.pose import Pose
-from barsight.core.types import CraneSamples, PosedFrame, RectifiedCamera, RefusedFrame, Trajectory
+from barsight.core.records.pairs import RectifiedCamera, RefusedFrame
+from barsight.core.records.sensor_samples import CraneSamples
+from barsight.core.records.trajectory import PosedFrame, Trajectory
 from barsight.yard.lifting.travel_accuracy import Travel, travel_checks
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.vetoes import vetoes_of

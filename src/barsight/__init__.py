@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from barsight.calibration.geometry.rig import StereoRig
     from barsight.calibration.stereo.calibration import StereoCalibration
     from barsight.core.errors import BarsightError
-    from barsight.core.types import Contour, Disparity
+    from barsight.core.records.disparity import Disparity
+    from barsight.core.records.heights import Contour
     from barsight.measure_settings import MeasureSettings
     from barsight.reconstruction.live_map import Snapshot
     from barsight.result import Lifts, LiftTarget, Yard
@@ -37,7 +38,8 @@ _HOMES = {
     "barsight.calibration.geometry.rig": ("StereoRig",),
     "barsight.calibration.stereo.calibration": ("StereoCalibration",),
     "barsight.core.errors": ("BarsightError",),
-    "barsight.core.types": ("Contour", "Disparity"),
+    "barsight.core.records.disparity": ("Disparity",),
+    "barsight.core.records.heights": ("Contour",),
     "barsight.reconstruction.live_map": ("Snapshot",),
     "barsight.measure_settings": ("MeasureSettings",),
     "barsight.result": ("LiftTarget", "Lifts", "Yard"),

@@ -16,9 +16,9 @@ from barsight.calibration.geometry.rig import StereoRig
 from barsight.calibration.stereo.calibration import StereoCalibration
 from barsight.calibration.stereo.calibration import calibrate_stereo as solve_stereo
 from barsight.core.arrays import UInt8
+from barsight.core.records.disparity import Disparity
 from barsight.core.settings.values import build_settings, expect_choice
 from barsight.core.timing import ProgressCallback
-from barsight.core.types import Disparity
 from barsight.measure_folder import ignore_progress, measure_into
 from barsight.measure_settings import MeasureSettings
 from barsight.reconstruction.pair_matching import match_pictures

@@ -13,7 +13,7 @@ from barsight.calibration.boards.detection import detect
 from barsight.calibration.boards.detection_files import read_detections
 from barsight.core.errors import ConfigError, Failed, InputError
 from barsight.core.parallel import ordered_map
-from barsight.core.types import RefusedFrame
+from barsight.core.records.pairs import RefusedFrame
 from barsight.recording.formats.image_pairs import ReadPair, find_pairs, read_pair_files
 from barsight.recording.open import BAG_KINDS, open_recording
 

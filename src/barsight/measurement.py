@@ -9,7 +9,10 @@ from typing import Any
 from barsight.core.arrays import Float32, Float64, UInt8
 from barsight.core.notices import Notice
 from barsight.core.pose import Pose
-from barsight.core.types import Agreement, Contour, LaserProfile, RefusedFrame, Trajectory
+from barsight.core.records.heights import Agreement, Contour
+from barsight.core.records.pairs import RefusedFrame
+from barsight.core.records.sensor_samples import LaserProfile
+from barsight.core.records.trajectory import Trajectory
 from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.passes.changes import BundleMove, HeightChange
 from barsight.mapping.surface.laser_check import LaserCheck

@@ -13,7 +13,7 @@ from typing import Any
 
 from barsight.core.errors import InputError, OutputError
 from barsight.core.files import atomic_directory
-from barsight.core.types import Contour
+from barsight.core.records.heights import Contour
 from barsight.report.files.result_files import RESULT_FILES
 from barsight.report.page import write_report
 from barsight.result_folder import (

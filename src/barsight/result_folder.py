@@ -27,8 +27,9 @@ from barsight.core.reading.geotiff import HEIGHT_BANDS, REMEDY, open_geotiff
 from barsight.core.reading.json_schema import expect_schema, package_schema
 from barsight.core.reading.ply import read_vertices
 from barsight.core.reading.sealed_json import SEAL
+from barsight.core.records.heights import Contour
+from barsight.core.records.sensor_samples import LaserProfile
 from barsight.core.stamps import parse_seconds
-from barsight.core.types import Contour, LaserProfile
 from barsight.yard.identity import ID_DIGITS, MapIdentity
 from barsight.yard.inventory import bundle_file
 from barsight.yard.lifting import lift_file

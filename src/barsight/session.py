@@ -15,10 +15,10 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.compiling.ahead import compile_ahead
 from barsight.core.errors import ConfigError, MeasurementError
+from barsight.core.records.pairs import RectifiedPair, RefusedFrame, StereoFrame
 from barsight.core.settings.values import build_settings
 from barsight.core.stamps import NS_PER_S
 from barsight.core.timing import Stopwatch
-from barsight.core.types import RectifiedPair, RefusedFrame, StereoFrame
 from barsight.measure_folder import ignore_progress, write_measured
 from barsight.measure_settings import MeasureSettings
 from barsight.motion.settings import make_early_estimator

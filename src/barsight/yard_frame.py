@@ -13,7 +13,8 @@ from barsight.core.arrays import Float64
 from barsight.core.errors import InputError
 from barsight.core.json_values import json_digest, json_value
 from barsight.core.pose import Pose, skew
-from barsight.core.types import CraneSamples, LaserProfile, Trajectory
+from barsight.core.records.sensor_samples import CraneSamples, LaserProfile
+from barsight.core.records.trajectory import Trajectory
 from barsight.recording.base import Recording
 from barsight.recording.sensor_samples import make_laser
 from barsight.recording.wrapper import RecordingProxy

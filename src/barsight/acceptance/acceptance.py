@@ -16,8 +16,8 @@ from barsight.acceptance.quantities import Decision, JudgedQuantity, decide, jud
 from barsight.acceptance.uncertainty import combine
 from barsight.artefacts.plan import AcceptancePlan, ErrorLimits
 from barsight.core.errors import Failed, InputError
+from barsight.core.records.pairs import StereoFrame
 from barsight.core.timing import ProgressCallback
-from barsight.core.types import StereoFrame
 from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings
 from barsight.motion.batch.fusion import FusionSettings

@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 from barsight.artefacts.plan import Plate, Sphere
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import Failed
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.yard.types import YardMap
 
 CAP_RATIO = 0.7

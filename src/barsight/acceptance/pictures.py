@@ -11,7 +11,7 @@ from scipy.ndimage import median_filter
 
 from barsight.core.arrays import Float32, UInt8
 from barsight.core.errors import Failed
-from barsight.core.types import StereoFrame
+from barsight.core.records.pairs import StereoFrame
 
 BLOCKS = 80
 """Blocks across a picture."""

@@ -11,7 +11,7 @@ from barsight.acceptance.layout import Area
 from barsight.acceptance.observation import view_geometry
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.errors import InputError
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.recording.base import RecordingSettings
 from barsight.recording.open import open_recording
 from barsight.result_folder import open_folder, read_heights

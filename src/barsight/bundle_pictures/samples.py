@@ -13,7 +13,7 @@ from barsight.bundle_pictures.sharpness import is_sharp
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Float64, UInt8
 from barsight.core.pose import Pose
-from barsight.core.types import RefusedFrame
+from barsight.core.records.pairs import RefusedFrame
 from barsight.labels.placing import PlacedCamera, heights_at
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.yard.types import Bundle, HeightMap

@@ -14,7 +14,7 @@ from rich.markup import escape
 from barsight.cli.arguments import call
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError, OutputError
-from barsight.core.types import Disparity
+from barsight.core.records.disparity import Disparity
 from barsight.measurement import Preview
 from barsight.reconstruction.pair_matching import match_pictures
 from barsight.report.files.result_files import write_preview

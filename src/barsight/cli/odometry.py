@@ -17,7 +17,7 @@ from barsight.cli.arguments import call
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import MeasurementError
 from barsight.core.files import atomic_directory
-from barsight.core.types import Trajectory
+from barsight.core.records.trajectory import Trajectory
 from barsight.evaluation.board_poses import board_poses, gyro_only_rmse_deg
 from barsight.evaluation.trajectory_error import Drift, frame_errors, trajectory_drift
 from barsight.motion.frontend.matching_example import matching_example

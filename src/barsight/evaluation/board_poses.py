@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from barsight.calibration.boards.detection_files import NAMES, read_rows
 from barsight.core.arrays import Float64
 from barsight.core.pose import Pose
+from barsight.core.records.sensor_samples import ImuSamples
 from barsight.core.stamps import NS_PER_S
-from barsight.core.types import ImuSamples
 from barsight.motion.frontend.board_corners import MIN_POINTS
 from barsight.recording.formats.board_corners import CornerRecording
 from barsight.recording.formats.ground_truth import GroundTruth

@@ -12,7 +12,7 @@ from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import InputError
 from barsight.core.reading.bounded_reading import read_arrays
 from barsight.core.reading.geotiff import HEIGHT_BANDS, open_geotiff
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.mapping.agreement import smooth_places
 from barsight.result_folder import read_contours
 

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from barsight.core.arrays import Float64, Int64
 from barsight.core.pose import nearest_rotation
+from barsight.core.records.trajectory import PosedFrame, Trajectory
 from barsight.core.stamps import NS_PER_S, interpolate_at
-from barsight.core.types import PosedFrame, Trajectory
 from barsight.recording.formats.ground_truth import GroundTruth
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float64
 from barsight.core.pose import skew
-from barsight.core.types import RectifiedCamera
+from barsight.core.records.pairs import RectifiedCamera
 from barsight.features.patch_alignment import (
     FINE_REACH_PX,
     AlignedPatches,

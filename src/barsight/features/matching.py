@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8
-from barsight.core.types import RectifiedCamera
+from barsight.core.records.pairs import RectifiedCamera
 from barsight.features.guided_matching import project_stereo
 from barsight.features.orb import Features
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, UInt8, kernel
 from barsight.core.linalg.bspline import sixfold_weights
-from barsight.core.types import RectifiedPair
+from barsight.core.records.pairs import RectifiedPair
 
 HALF_PX = 5
 """A patch is 2 * HALF_PX + 1 wide."""

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8
+from barsight.core.records.pairs import RectifiedPair
 from barsight.core.settings.values import POSITIVE, expect_ranges
-from barsight.core.types import RectifiedPair
 from barsight.features.guided_matching import (
     GuidedMatches,
     PredictedProjections,

@@ -14,7 +14,7 @@ from scipy.ndimage import binary_opening
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.core.arrays import Float64
 from barsight.core.linalg.robust import mad_sigma
-from barsight.core.types import ImuSamples
+from barsight.core.records.sensor_samples import ImuSamples
 
 GRAVITY_MPS2 = 9.80665
 SATURATED_SIGMAS = 6.0

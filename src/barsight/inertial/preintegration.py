@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
+from barsight.core.records.sensor_samples import ImuSamples
 from barsight.core.stamps import NS_PER_S, interpolate_at, seconds_to_ns
-from barsight.core.types import ImuSamples
 from barsight.inertial.model import GRAVITY_MPS2, BodyState, ImuBias
 
 MAX_GAP_S = 0.1

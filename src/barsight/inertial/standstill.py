@@ -10,8 +10,8 @@ from scipy.ndimage import binary_opening, uniform_filter1d
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import Failed
+from barsight.core.records.sensor_samples import ImuSamples
 from barsight.core.stamps import NS_PER_S
-from barsight.core.types import ImuSamples
 from barsight.inertial.model import GRAVITY_MPS2, ImuBias
 
 WINDOW_S = 0.6

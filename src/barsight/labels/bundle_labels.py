@@ -10,7 +10,7 @@ import numpy as np
 from barsight.core.arrays import Float64
 from barsight.core.parallel import ordered_map
 from barsight.core.pose import Pose
-from barsight.core.types import RectifiedPair, RefusedFrame
+from barsight.core.records.pairs import RectifiedPair, RefusedFrame
 from barsight.labels.attachment import NUMBER, Label, PlacedCode, merge_codes
 from barsight.labels.code_reading import SeenCode, read_codes
 from barsight.labels.number_reading import label_patch, number_reader, read_number

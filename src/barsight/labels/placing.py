@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from barsight.core.arrays import Float32, Float64
 from barsight.core.pose import Pose
+from barsight.core.records.pairs import RectifiedCamera
 from barsight.core.stamps import NS_PER_S
-from barsight.core.types import RectifiedCamera
 from barsight.result_folder import CameraPath
 from barsight.yard.types import HeightMap
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-from barsight.core.types import CraneSamples, ImuSamples, RefusedFrame, StereoFrame
+from barsight.core.records.pairs import RefusedFrame, StereoFrame
+from barsight.core.records.sensor_samples import CraneSamples, ImuSamples
 from barsight.live.settings import CraneConfig, LiveSettings
 from barsight.live.shared.counters import Counters
 from barsight.live.shared.logs import NumberLog, ReadingLog

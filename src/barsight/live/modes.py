@@ -10,8 +10,8 @@ from typing import Literal
 import numpy as np
 
 from barsight.core.arrays import Float64, Int64
+from barsight.core.records.sensor_samples import CraneSamples
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
-from barsight.core.types import CraneSamples
 from barsight.live.settings import LiveSettings
 from barsight.motion.batch.fault_detection import frozen_stretches
 

@@ -9,8 +9,9 @@ import numpy as np
 
 from barsight.core.arrays import Float64, Int64
 from barsight.core.json_values import DIGITS, write_json
+from barsight.core.records.sensor_samples import CraneSamples
+from barsight.core.records.trajectory import PosedFrame
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
-from barsight.core.types import CraneSamples, PosedFrame
 from barsight.inertial.model import ORDINARY_NOISE
 from barsight.live.link import Link
 from barsight.live.modes import FreezeWatch

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from barsight.core.types import ImuSamples
+from barsight.core.records.sensor_samples import ImuSamples
 from barsight.live.link import Link
 from barsight.live.shared.counters import DRAIN, Counters
 from barsight.recording.writers.retention import Retention

@@ -12,9 +12,9 @@ from barsight.calibration.files.rig_file import read_serials
 from barsight.calibration.files.rig_formats import read_rig_file
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.errors import CalibrationError, ConfigError
+from barsight.core.records.sensor_samples import CraneSamples, ImuSamples
 from barsight.core.settings.file import read_settings
 from barsight.core.settings.values import expect_ranges, expect_values
-from barsight.core.types import CraneSamples, ImuSamples
 from barsight.measure_settings import MeasureSettings
 from barsight.recording.awaited import AwaitedRecording
 from barsight.sensors.settings import CamerasSettings, EncodersSettings, ImuSettings

@@ -13,8 +13,9 @@ from barsight.core.arrays import Float64
 from barsight.core.compiling.ahead import load_kernels
 from barsight.core.errors import BarsightError, Failed, MeasurementError
 from barsight.core.files import atomic_path
+from barsight.core.records.pairs import RectifiedPair, RefusedFrame, StereoFrame
+from barsight.core.records.trajectory import PosedFrame
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
-from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame, StereoFrame
 from barsight.live.link import GrowingRecording, Link
 from barsight.live.shared.counters import Counters
 from barsight.live.shared.ring import CapturedPair, PairRing

@@ -8,7 +8,8 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import Failed
-from barsight.core.types import Agreement, Contour, HeightSource, LaserProfile
+from barsight.core.records.heights import Agreement, Contour, HeightSource
+from barsight.core.records.sensor_samples import LaserProfile
 from barsight.mapping.agreement_intervals import agreement_intervals
 
 JUMP_M = 0.03

@@ -11,7 +11,7 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float32, UInt8
 from barsight.core.pose import Pose
-from barsight.core.types import RectifiedCamera
+from barsight.core.records.pairs import RectifiedCamera
 
 _SHRINK = 4
 _SWING = 2

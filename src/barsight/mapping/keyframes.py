@@ -8,7 +8,9 @@ import numpy as np
 
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Float64
-from barsight.core.types import CraneSamples, PosedFrame, RectifiedCamera
+from barsight.core.records.pairs import RectifiedCamera
+from barsight.core.records.sensor_samples import CraneSamples
+from barsight.core.records.trajectory import PosedFrame
 
 
 def select_keyframes(

@@ -12,7 +12,7 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, Int32, Int64, UInt8, kernel
 from barsight.core.pose import Pose
-from barsight.core.types import StereoPoints
+from barsight.core.records.disparity import StereoPoints
 
 _SAID = 6
 _HEIGHT, _NOISE, _POSE, _SHARED, _GRAY, _MIDDLE = range(_SAID)

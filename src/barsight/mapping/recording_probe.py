@@ -6,7 +6,8 @@ import math
 from dataclasses import dataclass
 
 from barsight.core.errors import Failed, InputError, MeasurementError
-from barsight.core.types import DisparityRange, RefusedFrame
+from barsight.core.records.disparity import DisparityRange
+from barsight.core.records.pairs import RefusedFrame
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.stereo.search_range import find_disparity_range
 from barsight.stereo.vertical_offset import MAX_OFFSET_PX, vertical_offset

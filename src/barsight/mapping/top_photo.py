@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from barsight.core.arrays import Bool, Float32, Float64, Int32, UInt8, UInt16, kernel
 from barsight.core.pose import Pose
-from barsight.core.types import RectifiedPair
+from barsight.core.records.pairs import RectifiedPair
 from barsight.mapping.free_space import TILE, covering_tiles, tile_overlap
 from barsight.mapping.observation import CellObservations
 from barsight.mapping.spilled_tiles import TileKey

@@ -8,8 +8,10 @@ from dataclasses import dataclass
 from barsight.core.arrays import Float32
 from barsight.core.errors import Failed
 from barsight.core.pose import Pose
+from barsight.core.records.disparity import Disparity, DisparityRange
+from barsight.core.records.pairs import RectifiedPair
+from barsight.core.records.trajectory import PosedFrame
 from barsight.core.timing import Stopwatch
-from barsight.core.types import Disparity, DisparityRange, PosedFrame, RectifiedPair
 from barsight.mapping.ego_mask import mask_carried
 from barsight.mapping.observation import CellObservations, sort_points
 from barsight.motion.frontend.direct_alignment import align_views

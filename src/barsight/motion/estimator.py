@@ -9,7 +9,8 @@ from typing import ClassVar, Protocol
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import Failed
 from barsight.core.parallel import prefetch
-from barsight.core.types import NamedPoints, PosedFrame, RectifiedPair, RefusedFrame, Trajectory
+from barsight.core.records.pairs import NamedPoints, RectifiedPair, RefusedFrame
+from barsight.core.records.trajectory import PosedFrame, Trajectory
 from barsight.recording.base import Recording
 from barsight.recording.formats.board_corners import CornerRecording
 from barsight.recording.rectified_pairs import RectifiedPairs

@@ -18,7 +18,7 @@ from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import ConfigError, Failed, InputError
 from barsight.core.extras import extra
 from barsight.core.reading.geotiff import open_geotiff
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.page.layers import MAX_PIXELS
 from barsight.page.survey_files import expect_map, survey_folder
 from barsight.registration.surveyed_targets import Targets, read_places, write_targets

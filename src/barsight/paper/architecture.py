@@ -9,8 +9,8 @@ import numpy as np
 
 from barsight.core.arrays import Float64
 from barsight.core.pose import Pose
+from barsight.core.records.trajectory import Trajectory
 from barsight.core.stamps import NS_PER_S, interpolate_at
-from barsight.core.types import Trajectory
 from barsight.motion.frame_to_frame.motion_trend import MotionTrend
 from barsight.recording.base import Recording
 from barsight.recording.formats.ground_truth import truth_of

@@ -12,7 +12,10 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
 from barsight.core.pose import Pose
-from barsight.core.types import Contour, LaserProfile, RectifiedPair, Trajectory
+from barsight.core.records.heights import Contour
+from barsight.core.records.pairs import RectifiedPair
+from barsight.core.records.sensor_samples import LaserProfile
+from barsight.core.records.trajectory import Trajectory
 from barsight.evaluation.trajectory_error import trajectory_drift
 from barsight.mapping.surface.contours import smooth_contour
 from barsight.paper.pictures import BLUE, RED, WIDTH_PX, PaperPicture, line_picture, picture_of

@@ -15,7 +15,8 @@ from barsight.benchmarks.motion.matching_truth import TrueStep, reproject, true_
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import InputError
-from barsight.core.types import PosedFrame, RectifiedPair
+from barsight.core.records.pairs import RectifiedPair
+from barsight.core.records.trajectory import PosedFrame
 from barsight.features.detectors import DETECTORS, DetectorName, make_detector
 from barsight.features.guided_matching import project_stereo, triangulate_stereo
 from barsight.features.matching import homography_inliers, is_mutual, motion_inliers, nearest_neighbours

@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Float64
 from barsight.core.pose import Pose
+from barsight.core.records.pairs import RectifiedPair
+from barsight.core.records.trajectory import Trajectory
 from barsight.core.stamps import interpolate_at
-from barsight.core.types import RectifiedPair, Trajectory
 from barsight.paper.cloud import cloud_of
 from barsight.recording.base import Recording
 from barsight.recording.formats.ground_truth import truth_of

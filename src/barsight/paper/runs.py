@@ -9,8 +9,8 @@ from typing import Any
 from barsight.benchmarks.stereo.target_size import RANGES_MM, TargetSizeBench, bench_target_size
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import BarsightError
+from barsight.core.records.trajectory import Trajectory
 from barsight.core.timing import ProgressCallback
-from barsight.core.types import Trajectory
 from barsight.mapping.settings import MapSettings
 from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings

@@ -7,7 +7,7 @@ import numpy as np
 
 from barsight.core.arrays import Float32, Float64
 from barsight.core.errors import Failed
-from barsight.core.types import RectifiedPair
+from barsight.core.records.pairs import RectifiedPair
 from barsight.paper.pictures import BLUE, RED, PaperPicture, heat_picture, line_picture
 from barsight.report.map_images import hillshade
 from barsight.stereo.search_range import find_disparity_range

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from barsight.core.errors import InputError
 from barsight.core.parallel import single_opencv_thread
+from barsight.core.records.trajectory import Trajectory
 from barsight.core.timing import ProgressCallback, Stopwatch
-from barsight.core.types import Trajectory
 from barsight.labels.bundle_labels import expect_readers
 from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.passes.changes import PlaceHistory

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from barsight.core.notices import Notice
-from barsight.core.types import Trajectory
+from barsight.core.records.trajectory import Trajectory
 from barsight.measurement import BuiltMap
 from barsight.pipeline.mapped_yard import MappedYard
 from barsight.reconstruction.probed_recording import ProbedRecording

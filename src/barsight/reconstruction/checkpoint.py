@@ -25,16 +25,9 @@ from barsight.core.files import atomic_path
 from barsight.core.json_values import json_digest, json_value
 from barsight.core.motion_detail import InertialStates, MotionDetail, NormalisedResiduals, RelativePoses
 from barsight.core.pose import Pose
-from barsight.core.types import (
-    Disparity,
-    DisparityRange,
-    PosedFrame,
-    RectifiedCamera,
-    RectifiedPair,
-    RefusedFrame,
-    RigDrift,
-    Trajectory,
-)
+from barsight.core.records.disparity import Disparity, DisparityRange
+from barsight.core.records.pairs import RectifiedCamera, RectifiedPair, RefusedFrame
+from barsight.core.records.trajectory import PosedFrame, RigDrift, Trajectory
 from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.recording_probe import RecordingProbe
 from barsight.mapping.surface.surface import Surface

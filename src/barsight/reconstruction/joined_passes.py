@@ -13,7 +13,7 @@ from barsight.core.errors import InputError
 from barsight.core.json_values import json_digest, json_value
 from barsight.core.notices import Notice
 from barsight.core.pose import Pose, nearest_rotation, skew
-from barsight.core.types import PosedFrame, Trajectory
+from barsight.core.records.trajectory import PosedFrame, Trajectory
 from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.passes.changes import BundleMove, HeightChange, PlaceHistory
 from barsight.mapping.passes.joined_surface import PassSurface, join_surfaces, measure_overlaps

@@ -12,8 +12,9 @@ import numpy as np
 
 from barsight.core.arrays import Float64
 from barsight.core.errors import MeasurementError
+from barsight.core.records.pairs import RectifiedPair, RefusedFrame
+from barsight.core.records.trajectory import PosedFrame, Trajectory
 from barsight.core.timing import Stopwatch, unwatched
-from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame, Trajectory
 from barsight.mapping.keyframes import keyframe_spacing_m
 from barsight.mapping.recording_probe import points_per_pixel
 from barsight.mapping.surface.surface import Surface

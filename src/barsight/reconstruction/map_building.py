@@ -13,8 +13,9 @@ from barsight.core.errors import Failed, MeasurementError
 from barsight.core.json_values import json_digest, json_value
 from barsight.core.memory import trim_heap
 from barsight.core.pose import Pose
+from barsight.core.records.pairs import RectifiedCamera, RefusedFrame
+from barsight.core.records.trajectory import PosedFrame
 from barsight.core.timing import ProgressCallback, unwatched
-from barsight.core.types import PosedFrame, RectifiedCamera, RefusedFrame
 from barsight.mapping.election.surface_election import SurfaceElection
 from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.fusion import fuse_view

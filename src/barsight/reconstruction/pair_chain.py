@@ -15,8 +15,9 @@ import numpy as np
 
 from barsight.core.parallel import WORKERS
 from barsight.core.pose import Pose
+from barsight.core.records.pairs import RectifiedPair, RefusedFrame
+from barsight.core.records.sensor_samples import CraneSamples
 from barsight.core.stamps import NS_PER_S, interpolate_at
-from barsight.core.types import CraneSamples, RectifiedPair, RefusedFrame
 from barsight.mapping.view import MatchedFrame, Matcher, Preceding
 from barsight.measurement import Refusal
 from barsight.reconstruction.checkpoint import checkpointed

@@ -13,7 +13,8 @@ from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import UInt8
 from barsight.core.errors import CalibrationError, ConfigError, Failed, InputError, MeasurementError
 from barsight.core.reading.bounded_reading import read_bytes
-from barsight.core.types import Disparity, DisparityRange, RectifiedPair, StereoFrame
+from barsight.core.records.disparity import Disparity, DisparityRange
+from barsight.core.records.pairs import RectifiedPair, StereoFrame
 from barsight.mapping.view import disparity_range
 from barsight.recording.image_decoding import MAX_PICTURE_BYTES, TornImageError, decode_with_colour
 from barsight.stereo.image_pair import pair_from_images

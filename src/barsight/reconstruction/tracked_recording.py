@@ -15,8 +15,9 @@ from barsight.core.arrays import Float64
 from barsight.core.errors import InputError, MeasurementError
 from barsight.core.memory import trim_heap
 from barsight.core.parallel import WORKERS, prefetched_chain
+from barsight.core.records.pairs import RectifiedPair, RefusedFrame
+from barsight.core.records.trajectory import PosedFrame, Trajectory
 from barsight.core.timing import ProgressCallback, Stopwatch, count_frames
-from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame, Trajectory
 from barsight.mapping.keyframes import select_keyframes, select_keyframes_by_encoders
 from barsight.mapping.view import MatchedFrame, Matcher
 from barsight.measure_settings import MeasureSettings

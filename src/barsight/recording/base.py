@@ -9,8 +9,9 @@ from typing import Protocol
 
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig
+from barsight.core.records.pairs import RefusedFrame, StereoFrame
+from barsight.core.records.sensor_samples import CraneSamples, ImuSamples, LaserProfile
 from barsight.core.settings.values import UNDER_1, expect_ranges
-from barsight.core.types import CraneSamples, ImuSamples, LaserProfile, RefusedFrame, StereoFrame
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,9 @@ import numpy as np
 from barsight.calibration.geometry.camera import Camera
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Int64
+from barsight.core.records.pairs import RefusedFrame
+from barsight.core.records.sensor_samples import CraneSamples, LaserProfile
 from barsight.core.stamps import NS_PER_S
-from barsight.core.types import CraneSamples, LaserProfile, RefusedFrame
 from barsight.recording.plausibility import clock_faults, doubts
 from barsight.recording.stored_images import StoredPictures
 

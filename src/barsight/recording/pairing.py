@@ -10,8 +10,8 @@ import numpy as np
 from barsight.calibration.geometry.camera import Camera
 from barsight.core.arrays import Int64, UInt8
 from barsight.core.errors import InputError
+from barsight.core.records.pairs import RefusedFrame
 from barsight.core.stamps import Pairing, pair_stamps, seconds_to_ns
-from barsight.core.types import RefusedFrame
 from barsight.recording.base import FrameIndex
 from barsight.recording.image_decoding import decode_gray
 

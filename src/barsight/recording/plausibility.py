@@ -8,8 +8,8 @@ import numpy as np
 
 from barsight.core.arrays import Int64
 from barsight.core.notices import Notice
+from barsight.core.records.sensor_samples import CraneSamples, ImuSamples
 from barsight.core.stamps import NS_PER_S
-from barsight.core.types import CraneSamples, ImuSamples
 from barsight.recording.base import Recording
 
 GRAVITY_MPS2 = (8.0, 12.0)

@@ -12,8 +12,8 @@ import numpy as np
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import Failed
 from barsight.core.files import atomic_path
+from barsight.core.records.pairs import RectifiedPair, RefusedFrame, StereoFrame
 from barsight.core.timing import Stopwatch
-from barsight.core.types import RectifiedPair, RefusedFrame, StereoFrame
 from barsight.recording.base import Recording
 
 MAX_STORED_BYTES = 8 << 30

@@ -11,7 +11,7 @@ from barsight.core.arrays import Float64, Int64, rows_by_number
 from barsight.core.errors import InputError
 from barsight.core.pose import Pose
 from barsight.core.reading.bounded_reading import MAX_PROFILES
-from barsight.core.types import CraneSamples, ImuSamples, LaserProfile
+from barsight.core.records.sensor_samples import CraneSamples, ImuSamples, LaserProfile
 
 
 def make_imu(path: Path, stamp_ns: Int64, gyro: Float64, accel: Float64, body_from_imu: Pose) -> ImuSamples:

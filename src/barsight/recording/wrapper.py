@@ -8,7 +8,8 @@ from pathlib import Path
 
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig
-from barsight.core.types import CraneSamples, ImuSamples, LaserProfile, RefusedFrame, StereoFrame
+from barsight.core.records.pairs import RefusedFrame, StereoFrame
+from barsight.core.records.sensor_samples import CraneSamples, ImuSamples, LaserProfile
 from barsight.recording.base import FrameIndex, Recording
 
 

@@ -10,7 +10,8 @@ import numpy as np
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
-from barsight.core.types import PosedFrame, RectifiedPair, RefusedFrame, StereoFrame
+from barsight.core.records.pairs import RectifiedPair, RefusedFrame, StereoFrame
+from barsight.core.records.trajectory import PosedFrame
 from barsight.registration.tags import SeenTags, TagSighting, sighting_at
 
 HALF_PX = 10

@@ -14,7 +14,8 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Float64, UInt8
 from barsight.core.errors import Failed
 from barsight.core.pose import skew
-from barsight.core.types import PosedFrame, RectifiedCamera, RefusedFrame, StereoFrame
+from barsight.core.records.pairs import RectifiedCamera, RefusedFrame, StereoFrame
+from barsight.core.records.trajectory import PosedFrame
 from barsight.registration.rigid import Alignment, align_rigid
 
 MIN_PAIRS = 2

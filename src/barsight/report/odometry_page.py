@@ -14,8 +14,8 @@ from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import Failed
 from barsight.core.json_values import json_value
 from barsight.core.motion_detail import NormalisedResiduals
+from barsight.core.records.trajectory import Trajectory
 from barsight.core.stamps import NS_PER_S
-from barsight.core.types import Trajectory
 from barsight.evaluation.trajectory_error import Drift, FrameErrors
 from barsight.motion.frontend.matching_example import MatchingExample
 from barsight.report.match_images import draw_matches

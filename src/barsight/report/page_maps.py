@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import UInt8
-from barsight.core.types import HeightSource, LaserProfile
+from barsight.core.records.heights import HeightSource
+from barsight.core.records.sensor_samples import LaserProfile
 from barsight.report.map_images import (
     FILLED_TINT_RGB,
     SOURCE_RGB,

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from barsight.core.arrays import Float64, Int64
-from barsight.core.types import Contour, HeightSource, LaserProfile
+from barsight.core.records.heights import Contour, HeightSource
+from barsight.core.records.sensor_samples import LaserProfile
 from barsight.mapping.agreement import profile_difference
 
 MAX_POINTS = 20_000

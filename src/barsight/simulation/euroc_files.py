@@ -13,8 +13,8 @@ from barsight.calibration.files.yaml_document import write_document
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Float64, Int64, UInt8
+from barsight.core.records.sensor_samples import CraneSamples, LaserProfile
 from barsight.core.stamps import NS_PER_S
-from barsight.core.types import CraneSamples, LaserProfile
 from barsight.recording.formats.ground_truth import EUROC_HEADER
 from barsight.recording.writers import euroc
 from barsight.simulation.sensors import ImuRecord

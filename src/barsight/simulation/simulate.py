@@ -15,8 +15,8 @@ from barsight.calibration.geometry.camera import Camera
 from barsight.core.arrays import Float64, Int64, UInt8
 from barsight.core.files import atomic_directory
 from barsight.core.pose import Pose
+from barsight.core.records.sensor_samples import CraneSamples, LaserProfile
 from barsight.core.stamps import seconds_to_ns
-from barsight.core.types import CraneSamples, LaserProfile
 from barsight.simulation import euroc_files
 from barsight.simulation.effects.faults import SpoiledLens, exposure_gain
 from barsight.simulation.hanging_plate import paint_plate, plate_at

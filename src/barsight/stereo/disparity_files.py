@@ -16,7 +16,8 @@ from barsight.core.arrays import Float32
 from barsight.core.errors import InputError, OutputError
 from barsight.core.files import atomic_path
 from barsight.core.reading.bounded_reading import read_bytes
-from barsight.core.types import Disparity, RectifiedCamera
+from barsight.core.records.disparity import Disparity
+from barsight.core.records.pairs import RectifiedCamera
 
 _KITTI_STEPS = 256
 _MAX_BYTES = 1 << 30

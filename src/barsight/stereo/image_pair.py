@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from barsight.core.arrays import UInt8
-from barsight.core.types import RectifiedCamera, RectifiedPair
+from barsight.core.records.pairs import RectifiedCamera, RectifiedPair
 
 
 def pair_from_images(

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, UInt8, kernel
-from barsight.core.types import Disparity
+from barsight.core.records.disparity import Disparity
 
 _AROUND_PX = 41
 _BLUR_PX = 0.7

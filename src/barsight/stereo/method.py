@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from barsight.core.types import Disparity, DisparityRange, RectifiedPair
+from barsight.core.records.disparity import Disparity, DisparityRange
+from barsight.core.records.pairs import RectifiedPair
 
 
 class StereoMethod(Protocol):

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, UInt8
-from barsight.core.types import RectifiedPair
+from barsight.core.records.pairs import RectifiedPair
 
 _VISIBLE_STEP = 4
 _MIN_RATIO = 1e-3

@@ -14,7 +14,8 @@ import numpy as np
 from barsight.core.arrays import Float32, kernel
 from barsight.core.parallel import parallel_bands
 from barsight.core.pose import Pose
-from barsight.core.types import Disparity, RectifiedCamera
+from barsight.core.records.disparity import Disparity
+from barsight.core.records.pairs import RectifiedCamera
 
 _MAX_SIGMA_PX = 0.5
 _SAME_SURFACE_PX = np.float32(1.0)

@@ -12,7 +12,8 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float32, UInt8
 from barsight.core.errors import Failed
-from barsight.core.types import DisparityRange, RectifiedCamera, RectifiedPair
+from barsight.core.records.disparity import DisparityRange
+from barsight.core.records.pairs import RectifiedCamera, RectifiedPair
 
 _SCALE = 4
 _USUAL_RATIO = 0.4

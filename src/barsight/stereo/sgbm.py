@@ -10,8 +10,9 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float32, UInt8
 from barsight.core.errors import ConfigError
+from barsight.core.records.disparity import Disparity, DisparityRange
+from barsight.core.records.pairs import RectifiedPair
 from barsight.core.settings.values import NOT_NEGATIVE, POSITIVE, expect_ranges
-from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.noise import image_noise
 
 _MODES = {

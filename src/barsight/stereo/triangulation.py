@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from barsight.core.arrays import Bool, Float32, Float64, UInt8, kernel
-from barsight.core.types import Disparity, RectifiedPair, StereoPoints
+from barsight.core.records.disparity import Disparity, StereoPoints
+from barsight.core.records.pairs import RectifiedPair
 
 _MIN_NOISE_PX = 0.02
 _JUMP_PX = 1.0

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Float32, UInt8
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.result_folder import Cloud
 from barsight.yard.sections import patches
 from barsight.yard.types import YardMap

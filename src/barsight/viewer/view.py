@@ -19,7 +19,8 @@ from viser.infra import _infra
 
 from barsight.core.arrays import Float32, Float64, UInt8
 from barsight.core.errors import OutputError
-from barsight.core.types import Contour, LaserProfile
+from barsight.core.records.heights import Contour
+from barsight.core.records.sensor_samples import LaserProfile
 from barsight.result_folder import (
     CameraPath,
     Cloud,

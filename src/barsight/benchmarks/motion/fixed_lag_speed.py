@@ -16,7 +16,8 @@ from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.errors import ConfigError
 from barsight.core.memory import peak_memory_mib, resident_bytes
 from barsight.core.pose import Pose
-from barsight.core.types import CraneSamples, ImuSamples, PosedFrame
+from barsight.core.records.sensor_samples import CraneSamples, ImuSamples
+from barsight.core.records.trajectory import PosedFrame
 from barsight.features.guided_matching import project_stereo
 from barsight.inertial.model import ORDINARY_NOISE
 from barsight.motion.batch.fusion import FusionSettings

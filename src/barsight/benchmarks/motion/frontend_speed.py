@@ -11,7 +11,7 @@ from rich.table import Table
 
 from barsight.benchmarks.provenance import Provenance, Timing, provenance, summarise_times
 from barsight.calibration.geometry.rectification import Rectifier
-from barsight.core.types import RefusedFrame
+from barsight.core.records.pairs import RefusedFrame
 from barsight.motion.frontend.motion_prediction import CranePredictor
 from barsight.motion.frontend.settings import FrontEndSettings
 from barsight.motion.frontend.sightings import Sighting

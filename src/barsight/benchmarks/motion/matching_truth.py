@@ -13,8 +13,8 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed, InputError
 from barsight.core.pose import Pose
+from barsight.core.records.pairs import RefusedFrame
 from barsight.core.stamps import NS_PER_S
-from barsight.core.types import RefusedFrame
 from barsight.features.guided_matching import project_stereo
 from barsight.features.patch_alignment import PatchPair, patch_pair
 from barsight.recording.base import Recording

@@ -16,7 +16,8 @@ from barsight.benchmarks.stereo.bar_outline import OutlineSearch, find_outline
 from barsight.core.arrays import Float64, UInt8
 from barsight.core.errors import Failed
 from barsight.core.linalg.robust import mad_sigma
-from barsight.core.types import Disparity, RectifiedCamera, RectifiedPair
+from barsight.core.records.disparity import Disparity
+from barsight.core.records.pairs import RectifiedCamera, RectifiedPair
 
 _MIN_REACH_PX = 4.0
 _REACH_RADII = 0.4

@@ -19,7 +19,8 @@ from scipy.optimize import fmin
 from barsight.core.arrays import Bool, Float64, kernel
 from barsight.core.errors import Failed
 from barsight.core.linalg.robust import mad_sigma
-from barsight.core.types import Disparity, RectifiedCamera
+from barsight.core.records.disparity import Disparity
+from barsight.core.records.pairs import RectifiedCamera
 
 _ROUNDS = 3
 _FEWEST_PIXELS = 200

@@ -16,7 +16,7 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, UInt8, kernel
 from barsight.core.linalg.bspline import sixfold_weights
-from barsight.core.types import RectifiedCamera, RectifiedPair
+from barsight.core.records.pairs import RectifiedCamera, RectifiedPair
 
 FLOOR, BAR = 1, 2
 _SAMPLES = 5

@@ -14,7 +14,8 @@ import numpy as np
 
 from barsight.benchmarks.stereo.bar_renderer import BarScene, Material, RenderedBar
 from barsight.core.arrays import Float64
-from barsight.core.types import DisparityRange, RectifiedCamera
+from barsight.core.records.disparity import DisparityRange
+from barsight.core.records.pairs import RectifiedCamera
 
 FOCAL_PX, BASELINE_M = 1250.0, 0.5
 WIDTH_PX, HEIGHT_PX = 416, 384

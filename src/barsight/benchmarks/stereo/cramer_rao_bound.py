@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Bool
-from barsight.core.types import RectifiedPair
+from barsight.core.records.pairs import RectifiedPair
 from barsight.stereo.direct.refinement import RefinementSettings
 from barsight.stereo.noise import image_noise
 

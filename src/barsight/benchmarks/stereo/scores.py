@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32
-from barsight.core.types import Disparity
+from barsight.core.records.disparity import Disparity
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,9 @@ from barsight.benchmarks.provenance import MIN_REPEATS, Provenance, Timing, prov
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Float32, Float64, UInt8
 from barsight.core.errors import InputError, MeasurementError
+from barsight.core.records.disparity import DisparityRange
+from barsight.core.records.pairs import RectifiedPair
 from barsight.core.timing import Stopwatch
-from barsight.core.types import DisparityRange, RectifiedPair
 from barsight.measure_settings import MeasureSettings
 from barsight.reconstruction.tracked_recording import matching
 from barsight.recording.open import open_recording

@@ -14,7 +14,7 @@ from barsight.benchmarks.stereo.bar_scenes import bar_over_floor
 from barsight.core.arrays import Float32, UInt8
 from barsight.core.errors import OutputError
 from barsight.core.files import atomic_path
-from barsight.core.types import Disparity
+from barsight.core.records.disparity import Disparity
 from barsight.stereo.direct.pipeline import BarsightSettings, BarsightStereo
 
 _RANGE_M, _GLOSS = 2.8, 30.0

@@ -22,7 +22,7 @@ from barsight.benchmarks.stereo.bar_scenes import PosedScene, bar_over_floor, ti
 from barsight.benchmarks.stereo.cramer_rao_bound import noise_limit_px
 from barsight.benchmarks.stereo.middlebury_scenes import load_scene
 from barsight.core.arrays import Bool, Float64, UInt8
-from barsight.core.types import Disparity
+from barsight.core.records.disparity import Disparity
 from barsight.stereo.method import StereoMethod
 
 BINS = 10

@@ -27,7 +27,8 @@ from barsight.benchmarks.stereo.bar_scenes import BAR_DIAMETER_M, bar_over_floor
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
 from barsight.core.parallel import ordered_map
-from barsight.core.types import Disparity, RectifiedPair
+from barsight.core.records.disparity import Disparity
+from barsight.core.records.pairs import RectifiedPair
 from barsight.stereo.method import StereoMethod
 
 RANGES_MM = (1800, 2500, 3000, 3600, 4500, 5000, 5600, 8500)

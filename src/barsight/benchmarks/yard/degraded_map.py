@@ -13,7 +13,7 @@ import numpy as np
 from scipy import ndimage
 
 from barsight.core.arrays import Bool, Float64, kernel
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.simulation.scene import Scene
 from barsight.simulation.sensors import heights
 from barsight.simulation.settings.rig import CameraSettings

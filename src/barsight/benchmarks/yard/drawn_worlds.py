@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from barsight.benchmarks.lift_judge.envelopes import envelope
 from barsight.benchmarks.lift_judge.magnet import JudgedMagnet
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.result_folder import read_heights, read_summary
 from barsight.simulation.scene import Scene
 from barsight.simulation.settings.recording import SimulationSettings

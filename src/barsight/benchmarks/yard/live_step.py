@@ -18,8 +18,8 @@ from barsight.core.arrays import Float64, Int64
 from barsight.core.compiling.ahead import compile_ahead
 from barsight.core.errors import MeasurementError
 from barsight.core.memory import peak_memory_mib
+from barsight.core.records.pairs import RefusedFrame
 from barsight.core.timing import Stopwatch
-from barsight.core.types import RefusedFrame
 from barsight.measure_settings import MeasureSettings
 from barsight.motion.settings import make_estimator
 from barsight.reconstruction.live_map import LiveMap, PairPlacer

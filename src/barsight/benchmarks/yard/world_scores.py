@@ -16,8 +16,8 @@ from rich.table import Table
 from barsight.benchmarks.provenance import Provenance
 from barsight.benchmarks.yard.bundle_scores import TrueBundle, read_true_bundles, score_bundles
 from barsight.core.pose import Pose
+from barsight.core.records.trajectory import PosedFrame, Trajectory
 from barsight.core.stamps import seconds_to_ns
-from barsight.core.types import PosedFrame, Trajectory
 from barsight.evaluation.score import score_folder
 from barsight.evaluation.trajectory_error import frame_errors, rms
 from barsight.recording.formats.ground_truth import read_ground_truth

@@ -16,8 +16,8 @@ from scipy.optimize import nnls
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import Failed
+from barsight.core.records.sensor_samples import ImuSamples
 from barsight.core.stamps import NS_PER_S
-from barsight.core.types import ImuSamples
 
 FLICKER = 2 * np.log(2) / np.pi
 GAP_STEPS = 1.5

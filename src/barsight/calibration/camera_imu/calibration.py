@@ -29,8 +29,8 @@ from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Float64
 from barsight.core.errors import CalibrationError
 from barsight.core.pose import Pose
+from barsight.core.records.sensor_samples import ImuSamples
 from barsight.core.stamps import seconds_to_ns
-from barsight.core.types import ImuSamples
 
 HUBER = 3.0
 CORNER_SIGMAS = 4.5

@@ -33,8 +33,8 @@ from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import CalibrationError, Failed
+from barsight.core.records.sensor_samples import ImuSamples
 from barsight.core.stamps import NS_PER_S
-from barsight.core.types import ImuSamples
 
 GRAVITY_MPS2 = 9.80665
 MARGIN_S = 0.1

@@ -21,7 +21,7 @@ from barsight.calibration.geometry.rig import StereoRig
 from barsight.calibration.stereo.verdict import Line, Verdict, judge
 from barsight.core.arrays import Float64
 from barsight.core.errors import CalibrationError, Failed
-from barsight.core.types import ImuSamples
+from barsight.core.records.sensor_samples import ImuSamples
 
 MIN_HALF_S = 6.0
 MIN_RATE_RADPS, MIN_FORCE_MPS2 = 0.3, 1.0

@@ -15,7 +15,7 @@ from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Float64, UInt8
 from barsight.core.errors import Failed
 from barsight.core.pose import Pose
-from barsight.core.types import RectifiedCamera, RectifiedPair, StereoFrame
+from barsight.core.records.pairs import RectifiedCamera, RectifiedPair, StereoFrame
 
 
 class Rectifier:

@@ -32,7 +32,8 @@ from barsight.core.arrays import Float64
 from barsight.core.errors import ConfigError, InputError
 from barsight.core.files import atomic_paths, expect_output
 from barsight.core.parallel import ordered_map
-from barsight.core.types import ImuSamples, RefusedFrame, StereoFrame
+from barsight.core.records.pairs import RefusedFrame, StereoFrame
+from barsight.core.records.sensor_samples import ImuSamples
 from barsight.recording.base import RecordingSettings
 from barsight.recording.formats.imu_log import AccelUnit, GyroUnit, read_imu_log
 from barsight.recording.open import open_recording

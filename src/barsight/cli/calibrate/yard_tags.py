@@ -17,8 +17,9 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.cli.progress import stages
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import Failed, InputError, MeasurementError
+from barsight.core.records.sensor_samples import CraneSamples
+from barsight.core.records.trajectory import Trajectory
 from barsight.core.timing import count_frames
-from barsight.core.types import CraneSamples, Trajectory
 from barsight.motion.settings import MotionSettings, make_estimator
 from barsight.recording.base import Recording, RecordingSettings
 from barsight.recording.open import open_recording

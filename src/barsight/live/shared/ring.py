@@ -8,7 +8,7 @@ from multiprocessing.shared_memory import SharedMemory
 import numpy as np
 
 from barsight.core.arrays import Int64, UInt8
-from barsight.core.types import StereoFrame
+from barsight.core.records.pairs import StereoFrame
 
 _VERSION, _STAMP, _EXPOSED = range(3)
 

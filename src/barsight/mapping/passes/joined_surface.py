@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.mapping.passes.changes import PLACE_M, PlaceHistory
 from barsight.mapping.spilled_tiles import TileKey
 from barsight.mapping.surface.surface import Layers, Surface, write_tile

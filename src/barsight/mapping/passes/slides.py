@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Float32, Float64
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.mapping.passes.changes import BundleMove
 from barsight.mapping.passes.joined_surface import PassSurface, moved_window
 

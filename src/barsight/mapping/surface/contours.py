@@ -9,7 +9,8 @@ from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import median_filter
 
 from barsight.core.arrays import Float64, UInt8
-from barsight.core.types import Contour, HeightSource, LaserProfile
+from barsight.core.records.heights import Contour, HeightSource
+from barsight.core.records.sensor_samples import LaserProfile
 from barsight.mapping.surface.surface import Surface
 
 SPACING_M = 0.01

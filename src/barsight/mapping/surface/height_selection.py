@@ -19,7 +19,7 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, Int8, kernel
 from barsight.core.pose import Pose
-from barsight.core.types import RectifiedCamera
+from barsight.core.records.pairs import RectifiedCamera
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.spilled_tiles import TileKey
 from barsight.mapping.surface.block_visibility import (

@@ -8,7 +8,8 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float64
 from barsight.core.linalg.robust import mad_sigma
-from barsight.core.types import Contour, HeightSource, LaserProfile
+from barsight.core.records.heights import Contour, HeightSource
+from barsight.core.records.sensor_samples import LaserProfile
 from barsight.mapping.agreement import profile_difference, smooth_places
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.surface.contours import SPACING_M

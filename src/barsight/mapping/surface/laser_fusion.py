@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from barsight.core.arrays import Bool, Float64, Int64
-from barsight.core.types import HeightSource, LaserProfile
+from barsight.core.records.heights import HeightSource
+from barsight.core.records.sensor_samples import LaserProfile
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.spilled_tiles import TileKey
 from barsight.mapping.surface.cloud import cloud_file

@@ -10,8 +10,10 @@ import numpy as np
 
 from barsight.core.errors import Failed
 from barsight.core.notices import Notice
+from barsight.core.records.heights import Agreement, Contour
+from barsight.core.records.sensor_samples import LaserProfile
+from barsight.core.records.trajectory import Trajectory
 from barsight.core.stamps import NS_PER_S
-from barsight.core.types import Agreement, Contour, LaserProfile, Trajectory
 from barsight.mapping.agreement import compute_agreement
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.surface.contours import cut_contours

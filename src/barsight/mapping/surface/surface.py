@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from barsight.core.arrays import Float32, Int8, UInt8, kernel
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.mapping.fusion import height_sigma
 from barsight.mapping.spilled_tiles import TileKey
 from barsight.mapping.surface.cloud import CloudPart, read_part

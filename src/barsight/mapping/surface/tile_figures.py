@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.mapping.spilled_tiles import TileKey
 from barsight.mapping.surface.surface import Layers, Surface
 from barsight.mapping.tiles import TILE_CELLS

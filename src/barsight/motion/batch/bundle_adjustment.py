@@ -12,7 +12,7 @@ from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.linalg.robust import mad_sigma
 from barsight.core.motion_detail import InertialStates, NormalisedResiduals
 from barsight.core.pose import Pose, skew
-from barsight.core.types import RigDrift
+from barsight.core.records.trajectory import RigDrift
 from barsight.inertial.model import ImuBias
 from barsight.motion.batch.apparent_motion import solve_with_slides
 from barsight.motion.batch.rig_drift_search import optimise_with_drift

@@ -9,7 +9,8 @@ import numpy as np
 
 from barsight.core.arrays import Float64
 from barsight.core.motion_detail import InertialStates, MotionDetail, NormalisedResiduals, RelativePoses
-from barsight.core.types import CraneSamples, RefusedFrame
+from barsight.core.records.pairs import RefusedFrame
+from barsight.core.records.sensor_samples import CraneSamples
 from barsight.motion.frontend.chains import chain_begins, seconds_after
 from barsight.motion.frontend.sightings import Sighting, innovations
 from barsight.motion.problem.nodes import Nodes

@@ -10,8 +10,8 @@ import numpy as np
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import Failed
+from barsight.core.records.sensor_samples import CraneSamples, EncoderJump, ImuSamples
 from barsight.core.stamps import NS_PER_S, interpolate_at, seconds_to_ns
-from barsight.core.types import CraneSamples, EncoderJump, ImuSamples
 from barsight.motion.crane.encoder_jumps import find_jumps, lost_counts, take_off_jumps
 from barsight.motion.crane.encoder_trajectory import fit_position
 from barsight.motion.crane.jump_window import WIDE_M

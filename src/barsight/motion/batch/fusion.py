@@ -12,16 +12,11 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Int64
 from barsight.core.errors import ConfigError, Failed, InputError, MeasurementError
 from barsight.core.motion_detail import NormalisedResiduals
+from barsight.core.records.pairs import NamedPoints, RefusedFrame
+from barsight.core.records.sensor_samples import CraneSamples, ImuSamples
+from barsight.core.records.trajectory import PosedFrame, Trajectory
 from barsight.core.settings.values import NOT_NEGATIVE, OVER_0, expect_ranges
 from barsight.core.stamps import seconds_to_ns
-from barsight.core.types import (
-    CraneSamples,
-    ImuSamples,
-    NamedPoints,
-    PosedFrame,
-    RefusedFrame,
-    Trajectory,
-)
 from barsight.inertial.model import ORDINARY_NOISE, without_saturation
 from barsight.motion.batch.detail import joint_sentences, jumps_alone, select_detail, untied_pictures
 from barsight.motion.batch.fault_detection import check_crane, frames_off

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from barsight.core.arrays import Bool
-from barsight.core.types import RigDrift
+from barsight.core.records.trajectory import RigDrift
 from barsight.motion.problem.gauss_newton import RELATIVE_GAIN, GraphState, optimise_graph, retract
 from barsight.motion.problem.gtsam_factors import build_graph
 from barsight.motion.problem.normal_equations import System

@@ -15,8 +15,8 @@ from scipy.ndimage import median_filter
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import InputError
+from barsight.core.records.sensor_samples import CraneSamples, ImuSamples
 from barsight.core.stamps import interpolate_at, seconds_to_ns
-from barsight.core.types import CraneSamples, ImuSamples
 from barsight.motion.batch.fault_detection import (
     CLEARLY_BETTER,
     TURN_SIGMA_RAD,

@@ -10,8 +10,9 @@ from scipy.linalg import solve_triangular
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
 from barsight.core.pose import nearest_rotation
+from barsight.core.records.sensor_samples import CraneSamples
+from barsight.core.records.trajectory import Trajectory
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
-from barsight.core.types import CraneSamples, Trajectory
 from barsight.motion.crane.encoder_trajectory import fit_position
 from barsight.registration.rigid import design_rows
 from barsight.registration.yard import YardCalibration, calibrate_yard

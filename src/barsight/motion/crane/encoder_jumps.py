@@ -9,8 +9,8 @@ import numpy as np
 
 from barsight.core.linalg.dense import one_blas_thread
 from barsight.core.linalg.robust import mad_sigma
+from barsight.core.records.sensor_samples import CraneSamples, EncoderJump
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
-from barsight.core.types import CraneSamples, EncoderJump
 from barsight.motion.crane.jump_window import (
     HALF_S,
     MAX_RATE_HZ,

@@ -12,9 +12,10 @@ from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import Failed, MeasurementError
 from barsight.core.linalg.robust import mad_sigma
 from barsight.core.pose import Pose
+from barsight.core.records.sensor_samples import CraneSamples
+from barsight.core.records.trajectory import PosedFrame, Trajectory
 from barsight.core.settings.values import NOT_NEGATIVE, POSITIVE, expect_ranges
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
-from barsight.core.types import CraneSamples, PosedFrame, Trajectory
 from barsight.inertial.model import ImuBias
 from barsight.motion.crane.known_motion import ImuWay, way_around
 from barsight.motion.crane.robust_parabola import fit_parabola

@@ -22,8 +22,8 @@ from scipy.linalg import block_diag
 
 from barsight.core.arrays import Float64, Int64
 from barsight.core.linalg.dense import cholesky, solve_lower
+from barsight.core.records.sensor_samples import CraneSamples, EncoderJump
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
-from barsight.core.types import CraneSamples, EncoderJump
 from barsight.motion.crane.known_motion import KnownMotion, SeenSteps
 
 HALF_S, STRIDE_S = 2.0, 0.5

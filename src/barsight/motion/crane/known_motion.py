@@ -9,8 +9,8 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 
 from barsight.core.arrays import Float64, Int64
+from barsight.core.records.sensor_samples import CraneSamples, ImuSamples
 from barsight.core.stamps import NS_PER_S, interpolate_at, seconds_to_ns
-from barsight.core.types import CraneSamples, ImuSamples
 from barsight.inertial.model import GRAVITY_MPS2, ImuBias
 from barsight.motion.crane.sway import MAX_GAP_S, turned_angle
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import Failed
+from barsight.core.records.sensor_samples import ImuSamples
 from barsight.core.stamps import NS_PER_S, interpolate_at, seconds_to_ns
-from barsight.core.types import ImuSamples
 
 MIN_SPAN_S = 4.0
 MAX_GAP_S = 0.2

@@ -16,8 +16,8 @@ from gtsam.symbol_shorthand import E
 
 from barsight.core.arrays import Float64, Int64
 from barsight.core.linalg import dense
+from barsight.core.records.sensor_samples import CraneSamples, EncoderJump
 from barsight.core.stamps import seconds_to_ns
-from barsight.core.types import CraneSamples, EncoderJump
 from barsight.motion.batch.fault_detection import frozen_stretches, without_frozen
 from barsight.motion.crane.encoder_jumps import find_jumps, take_off_jumps
 from barsight.motion.crane.known_motion import KnownMotion

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import Failed, MeasurementError
+from barsight.core.records.pairs import RefusedFrame
+from barsight.core.records.trajectory import PosedFrame, Trajectory
 from barsight.core.settings.values import expect_ranges
 from barsight.core.stamps import seconds_to_ns
-from barsight.core.types import PosedFrame, RefusedFrame, Trajectory
 from barsight.inertial.model import ORDINARY_NOISE
 from barsight.motion.batch.fusion import FusionSettings
 from barsight.motion.batch.sensor_agreement import refuse_contradictions

@@ -15,8 +15,9 @@ from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import Failed
 from barsight.core.pose import Pose, skew
+from barsight.core.records.sensor_samples import CraneSamples
+from barsight.core.records.trajectory import PosedFrame
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
-from barsight.core.types import CraneSamples, PosedFrame
 from barsight.inertial.model import GRAVITY_MPS2, BodyState, ImuBias
 from barsight.inertial.preintegration import MAX_GAP_S
 from barsight.motion.crane.encoder_trajectory import fit_position, reestimate_noise

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from barsight.calibration.geometry.imu_noise import ImuNoise
-from barsight.core.types import CraneSamples, ImuSamples
+from barsight.core.records.sensor_samples import CraneSamples, ImuSamples
 
 SENSOR_DELAY_S = 0.06
 """A frame is computed once readings this much later are there."""

@@ -14,8 +14,8 @@ from gtsam.symbol_shorthand import B, V, X
 
 from barsight.core.arrays import Float64, Int64
 from barsight.core.pose import Pose
+from barsight.core.records.pairs import RectifiedCamera
 from barsight.core.stamps import NS_PER_S
-from barsight.core.types import RectifiedCamera
 from barsight.inertial.model import BodyState, ImuBias
 from barsight.inertial.preintegration import Preintegrated
 from barsight.motion.fixed_lag.propagation import ACCELERATION_DENSITY, NavigationState

@@ -14,8 +14,9 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
 from barsight.core.pose import Pose
+from barsight.core.records.pairs import RefusedFrame
+from barsight.core.records.trajectory import PosedFrame
 from barsight.core.stamps import seconds_to_ns
-from barsight.core.types import PosedFrame, RefusedFrame
 from barsight.features.guided_matching import PredictedMotion
 from barsight.inertial.preintegration import Preintegrated
 from barsight.motion.batch.fault_detection import freeze_sentences

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
 from barsight.core.pose import Pose
+from barsight.core.records.sensor_samples import ImuSamples
 from barsight.core.stamps import NS_PER_S
-from barsight.core.types import ImuSamples
 from barsight.inertial.model import ORDINARY_NOISE, BodyState, ImuBias
 from barsight.inertial.preintegration import Preintegrator
 from barsight.inertial.standstill import estimate_at_rest

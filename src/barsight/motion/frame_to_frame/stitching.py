@@ -18,8 +18,9 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Bool, Float32, Float64, Int64
 from barsight.core.errors import Failed
 from barsight.core.pose import Pose
+from barsight.core.records.pairs import RectifiedCamera
+from barsight.core.records.trajectory import PosedFrame, Trajectory
 from barsight.core.settings.values import POSITIVE, expect_ranges
-from barsight.core.types import PosedFrame, RectifiedCamera, Trajectory
 from barsight.features.guided_matching import project_stereo
 from barsight.features.matching import hamming_distances, match_mutual
 from barsight.motion.crane.encoder_trajectory import CraneSettings, EncoderOdometry

@@ -11,7 +11,7 @@ import numpy as np
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import Failed
 from barsight.core.pose import Pose
-from barsight.core.types import PosedFrame, Trajectory
+from barsight.core.records.trajectory import PosedFrame, Trajectory
 from barsight.motion.estimator import FrameInput, ImmediatePoses, TrajectoryEstimator, pictures_of
 from barsight.motion.frontend.relative_pose import estimate_step, rotate_covariance, transport_covariance
 from barsight.motion.frontend.stereo_features import FeatureView, OdometrySettings, feature_view

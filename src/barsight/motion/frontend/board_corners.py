@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
-from barsight.core.types import NamedPoints, RectifiedCamera, RefusedFrame
+from barsight.core.records.pairs import NamedPoints, RectifiedCamera, RefusedFrame
 from barsight.features.guided_matching import PredictedMotion, triangulate_stereo
 from barsight.motion.frontend.relative_pose import ransac, refine_pose
 from barsight.motion.frontend.sightings import Sighting

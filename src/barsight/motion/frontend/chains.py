@@ -8,8 +8,8 @@ import numpy as np
 
 from barsight.core.arrays import Int64
 from barsight.core.pose import Pose
+from barsight.core.records.sensor_samples import ImuSamples
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
-from barsight.core.types import ImuSamples
 from barsight.features.guided_matching import PredictedMotion
 from barsight.motion.crane.sway import MAX_GAP_S
 from barsight.motion.frontend.sightings import Sighting

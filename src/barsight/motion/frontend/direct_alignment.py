@@ -17,7 +17,8 @@ from barsight.core.arrays import Float32, Float64, UInt8, kernel
 from barsight.core.errors import Failed
 from barsight.core.linalg.robust import mad_sigma
 from barsight.core.pose import Pose
-from barsight.core.types import Disparity, RectifiedCamera
+from barsight.core.records.disparity import Disparity
+from barsight.core.records.pairs import RectifiedCamera
 
 _SHRINKS = (16, 8, 4)
 """Sizes that the pictures are shrunk to, one after the other: the first ones see past the next bar."""

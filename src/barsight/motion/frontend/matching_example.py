@@ -9,7 +9,7 @@ import numpy as np
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8
 from barsight.core.errors import Failed
-from barsight.core.types import RefusedFrame
+from barsight.core.records.pairs import RefusedFrame
 from barsight.features.detectors import make_detector
 from barsight.features.guided_matching import (
     GuidedMatches,

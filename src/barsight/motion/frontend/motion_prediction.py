@@ -11,8 +11,8 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
 from barsight.core.pose import Pose, skew
+from barsight.core.records.sensor_samples import CraneSamples, ImuSamples
 from barsight.core.stamps import interpolate_at, seconds_to_ns
-from barsight.core.types import CraneSamples, ImuSamples
 from barsight.features.guided_matching import PredictedMotion
 from barsight.inertial.model import GRAVITY_MPS2, BodyState, ImuBias
 from barsight.motion.crane.encoder_trajectory import fit_position

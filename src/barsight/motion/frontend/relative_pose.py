@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import Failed
 from barsight.core.pose import skew
-from barsight.core.types import RectifiedCamera
+from barsight.core.records.pairs import RectifiedCamera
 from barsight.features.guided_matching import match_across, triangulation_jacobian
 from barsight.features.matching import match_mutual
 from barsight.features.patch_alignment import align_patches

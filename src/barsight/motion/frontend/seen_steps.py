@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from barsight.calibration.geometry.rectification import Rectifier
-from barsight.core.types import ImuSamples
+from barsight.core.records.sensor_samples import ImuSamples
 from barsight.motion.crane.known_motion import KnownMotion, SeenSteps
 from barsight.motion.frontend.sightings import Sighting
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from barsight.core.arrays import Float32, Float64, Int64
 from barsight.core.errors import Failed
+from barsight.core.records.pairs import RectifiedPair
 from barsight.core.settings.values import POSITIVE, expect_ranges
-from barsight.core.types import RectifiedPair
 from barsight.features.guided_matching import match_across, triangulate_stereo
 from barsight.features.orb import Features, detect_orb
 from barsight.features.patch_alignment import PatchPair, patch_pair

@@ -9,7 +9,7 @@ import numpy as np
 
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
-from barsight.core.types import RectifiedCamera, RectifiedPair, RefusedFrame
+from barsight.core.records.pairs import RectifiedCamera, RectifiedPair, RefusedFrame
 from barsight.features.guided_matching import GuidedMatches, PredictedMotion
 from barsight.features.orb import describe_upright
 from barsight.features.patch_alignment import PatchPair, patch_pair

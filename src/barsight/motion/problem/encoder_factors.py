@@ -21,8 +21,8 @@ from gtsam.symbol_shorthand import B, X
 
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.errors import Failed
+from barsight.core.records.sensor_samples import CraneSamples, EncoderJump, ImuSamples
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
-from barsight.core.types import CraneSamples, EncoderJump, ImuSamples
 from barsight.inertial.model import ImuBias
 from barsight.motion.crane.encoder_trajectory import fit_position
 from barsight.motion.crane.known_motion import ImuWay, way_around

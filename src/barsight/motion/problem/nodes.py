@@ -14,8 +14,8 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.errors import Failed
 from barsight.core.pose import Pose
+from barsight.core.records.sensor_samples import CraneSamples, ImuSamples
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
-from barsight.core.types import CraneSamples, ImuSamples
 from barsight.inertial.model import ImuBias
 from barsight.inertial.standstill import estimate_at_rest, stands_still
 from barsight.motion.crane.encoder_trajectory import fit_position

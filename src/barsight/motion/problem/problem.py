@@ -14,7 +14,8 @@ from scipy.spatial import KDTree
 
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.pose import Pose
-from barsight.core.types import CraneSamples, EncoderJump, ImuSamples, RectifiedCamera
+from barsight.core.records.pairs import RectifiedCamera
+from barsight.core.records.sensor_samples import CraneSamples, EncoderJump, ImuSamples
 from barsight.inertial.model import ImuBias
 from barsight.inertial.preintegration import Preintegrated
 from barsight.motion.frontend.sightings import Sighting

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from barsight.core.arrays import Float64
-from barsight.core.types import RigDrift
+from barsight.core.records.trajectory import RigDrift
 from barsight.motion.problem.problem import Problem, StereoObservations
 
 HUBER_SIGMAS = 2.2

@@ -12,8 +12,9 @@ import numpy as np
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed, MeasurementError
+from barsight.core.records.pairs import RectifiedCamera
+from barsight.core.records.trajectory import RigDrift
 from barsight.core.settings.values import POSITIVE, expect_ranges
-from barsight.core.types import RectifiedCamera, RigDrift
 from barsight.motion.batch.fusion import BatchFusion, FusionSettings
 from barsight.motion.crane.encoder_trajectory import CraneSettings
 from barsight.motion.rig_check.calibration_part import calibration_covariance

@@ -15,7 +15,7 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
 from barsight.core.linalg.robust import mad_sigma
-from barsight.core.types import RectifiedCamera, RectifiedPair, RefusedFrame
+from barsight.core.records.pairs import RectifiedCamera, RectifiedPair, RefusedFrame
 from barsight.features.patch_alignment import align_patches, patch_image
 from barsight.features.tracks import TrackSettings, detect_corners
 from barsight.recording.base import Recording

@@ -13,7 +13,7 @@ from barsight.calibration.geometry.rectification import Rectifier, right_from_re
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Float64
 from barsight.core.pose import Pose
-from barsight.core.types import RigDrift
+from barsight.core.records.trajectory import RigDrift
 
 SIGNIFICANT_SIGMAS = 3.0
 WORTH_MM = 3.0

@@ -22,7 +22,8 @@ from barsight.core.arrays import Float64, Int64, UInt8
 from barsight.core.errors import InputError
 from barsight.core.pose import Pose
 from barsight.core.reading.bounded_reading import in_range
-from barsight.core.types import CraneSamples, ImuSamples, LaserProfile, RefusedFrame, StereoFrame
+from barsight.core.records.pairs import RefusedFrame, StereoFrame
+from barsight.core.records.sensor_samples import CraneSamples, ImuSamples, LaserProfile
 from barsight.recording.base import FrameIndex, RecordingSettings
 from barsight.recording.formats.bag_file import BagFile, RawMessage
 from barsight.recording.formats.bag_images import file_of, gray_of

@@ -18,7 +18,8 @@ from barsight.calibration.files.rig_formats import read_rig_file
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.errors import InputError
-from barsight.core.types import CraneSamples, ImuSamples, LaserProfile, NamedPoints, RefusedFrame, StereoFrame
+from barsight.core.records.pairs import NamedPoints, RefusedFrame, StereoFrame
+from barsight.core.records.sensor_samples import CraneSamples, ImuSamples, LaserProfile
 from barsight.recording.base import RecordingSettings
 from barsight.recording.formats.imu_log import read_imu_log
 from barsight.recording.own_files import expect_own_files, file_digests

@@ -11,7 +11,7 @@ from barsight.calibration.files.yaml_document import read_document
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.errors import InputError
-from barsight.core.types import CraneSamples, ImuSamples, LaserProfile
+from barsight.core.records.sensor_samples import CraneSamples, ImuSamples, LaserProfile
 from barsight.recording.base import RecordingSettings
 from barsight.recording.formats.euroc_tables import Table, read_image_list, read_table
 from barsight.recording.formats.image_folders import PictureFiles

@@ -6,7 +6,7 @@ from collections.abc import Container, Iterator, Sequence
 from pathlib import Path
 
 from barsight.calibration.geometry.rig import StereoRig
-from barsight.core.types import RefusedFrame, StereoFrame
+from barsight.core.records.pairs import RefusedFrame, StereoFrame
 from barsight.recording.image_decoding import TornImageError
 from barsight.recording.own_files import read_picture
 from barsight.recording.pairing import PairedAtOpening, decode_for

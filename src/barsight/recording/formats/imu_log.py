@@ -13,8 +13,8 @@ import numpy as np
 from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import InputError
 from barsight.core.reading.bounded_reading import in_range, read_lines
+from barsight.core.records.sensor_samples import ImuSamples
 from barsight.core.stamps import NS_PER_S
-from barsight.core.types import ImuSamples
 from barsight.recording.formats.bag_file import IMU_TYPE, BagFile
 
 GRAVITY_MPS2 = 9.80665

@@ -26,8 +26,8 @@ from barsight.core.reading.bounded_reading import (
     read_lines,
     read_text,
 )
+from barsight.core.records.sensor_samples import CraneSamples, ImuSamples, LaserProfile
 from barsight.core.stamps import NS_PER_S, expect_increasing, seconds_in_ns
-from barsight.core.types import CraneSamples, ImuSamples, LaserProfile
 from barsight.recording.base import RecordingSettings
 from barsight.recording.formats.image_folders import PictureFiles
 from barsight.recording.image_decoding import TornImageError, decode_gray

@@ -19,8 +19,8 @@ from barsight.calibration.files.kalibr import write_camchain, write_imu_file
 from barsight.calibration.files.yaml_document import write_document
 from barsight.core.arrays import Int64, UInt8
 from barsight.core.errors import InputError, OutputError
+from barsight.core.records.sensor_samples import CraneSamples, ImuSamples, LaserProfile
 from barsight.core.stamps import NS_PER_S
-from barsight.core.types import CraneSamples, ImuSamples, LaserProfile
 from barsight.recording.base import Recording
 from barsight.recording.formats.bag_file import (
     CLOUD_TYPE,

@@ -14,7 +14,7 @@ from typing import Literal
 
 from barsight.core.errors import InputError, OutputError
 from barsight.core.files import atomic_directory, lies_within
-from barsight.core.types import RefusedFrame
+from barsight.core.records.pairs import RefusedFrame
 from barsight.recording.stored_images import StoredPictures
 from barsight.recording.writers.bag import BAG_FLAVOURS, write_bag
 from barsight.recording.writers.euroc import write_euroc

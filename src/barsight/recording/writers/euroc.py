@@ -12,7 +12,7 @@ import numpy as np
 from barsight.calibration.files.euroc import write_imu_description, write_rig
 from barsight.calibration.files.yaml_document import write_document
 from barsight.core.arrays import Float64, Int64
-from barsight.core.types import CraneSamples, LaserProfile
+from barsight.core.records.sensor_samples import CraneSamples, LaserProfile
 from barsight.recording.formats.ground_truth import EUROC_FOLDER, find_ground_truth, truth_as_euroc
 from barsight.recording.stored_images import StoredPictures
 

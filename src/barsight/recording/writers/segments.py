@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from barsight.core.arrays import UInt8
-from barsight.core.types import CraneSamples, ImuSamples
+from barsight.core.records.sensor_samples import CraneSamples, ImuSamples
 from barsight.recording.formats.bag_file import IMAGE_TYPE, IMU_TYPE, POINT_TYPE
 from barsight.recording.formats.bag_setup import CRANE_TOPIC
 from barsight.recording.formats.segments import (

@@ -12,7 +12,7 @@ import numpy as np
 import barsight
 from barsight.core.errors import Failed
 from barsight.core.json_values import json_value
-from barsight.core.types import RigDrift
+from barsight.core.records.trajectory import RigDrift
 from barsight.motion.rig_check.drift_check import RigCheck
 from barsight.motion.rig_check.epipolar_error import COLUMNS, ROWS, RowDrift
 from barsight.report.page import KeyFigure, format_number, write_summary_page

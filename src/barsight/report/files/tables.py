@@ -7,8 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from barsight.core.files import atomic_path
+from barsight.core.records.heights import Contour
+from barsight.core.records.sensor_samples import LaserProfile
+from barsight.core.records.trajectory import Trajectory
 from barsight.core.stamps import format_seconds
-from barsight.core.types import Contour, LaserProfile, Trajectory
 
 
 def write_trajectory(trajectory: Trajectory, target: Path, frame_id: str) -> None:

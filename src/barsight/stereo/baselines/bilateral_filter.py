@@ -16,7 +16,7 @@ import numba
 import numpy as np
 
 from barsight.core.arrays import Float32, Float64, UInt8, kernel
-from barsight.core.types import DisparityRange
+from barsight.core.records.disparity import DisparityRange
 
 _FAR = np.float32(1e9)
 

@@ -14,8 +14,9 @@ import numpy as np
 
 from barsight.core.arrays import Float32
 from barsight.core.errors import ConfigError
+from barsight.core.records.disparity import Disparity, DisparityRange
+from barsight.core.records.pairs import RectifiedPair
 from barsight.core.settings.values import NOT_NEGATIVE, SHARE, expect_ranges
-from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.baselines.census_transform import census_codes, census_cost
 from barsight.stereo.baselines.cross_aggregation import CrossRegions, cross_filter, cross_regions
 from barsight.stereo.baselines.left_right_check import (

@@ -22,8 +22,9 @@ import numba
 import numpy as np
 
 from barsight.core.arrays import Float32, Float64, UInt8, kernel
+from barsight.core.records.disparity import Disparity, DisparityRange
+from barsight.core.records.pairs import RectifiedPair
 from barsight.core.settings.values import NOT_NEGATIVE, POSITIVE, expect_ranges
-from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.baselines.gradient_cost import (
     CostImages,
     GradientCostSettings,

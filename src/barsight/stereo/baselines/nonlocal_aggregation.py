@@ -15,8 +15,9 @@ import numba
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Int32, kernel
+from barsight.core.records.disparity import Disparity, DisparityRange
+from barsight.core.records.pairs import RectifiedPair
 from barsight.core.settings.values import OVER_0, expect_ranges
-from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.baselines.gradient_cost import GradientCostSettings, cost_images, gradient_cost
 from barsight.stereo.baselines.left_right_check import left_right_agreement
 from barsight.stereo.baselines.postprocessing import (

@@ -15,8 +15,9 @@ from typing import Literal
 import numpy as np
 
 from barsight.core.arrays import Float32
+from barsight.core.records.disparity import Disparity, DisparityRange
+from barsight.core.records.pairs import RectifiedPair
 from barsight.core.settings.values import POSITIVE, expect_ranges
-from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.baselines.bilateral_filter import bilateral_update
 from barsight.stereo.baselines.census import Census, CensusSettings
 from barsight.stereo.baselines.postprocessing import OutputSettings, is_matchable, no_match, with_sigma

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Int32, UInt8
+from barsight.core.records.disparity import Disparity, DisparityRange
+from barsight.core.records.pairs import RectifiedPair
 from barsight.core.settings.values import NOT_NEGATIVE, expect_ranges
-from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.baselines.winner_takes_all import Winners, subpixel_winners
 from barsight.stereo.noise import has_texture, noise_sigma
 

@@ -13,7 +13,7 @@ import numba
 import numpy as np
 
 from barsight.core.arrays import Float32, Int32, kernel
-from barsight.core.types import DisparityRange
+from barsight.core.records.disparity import DisparityRange
 
 _BLOCK = 16
 

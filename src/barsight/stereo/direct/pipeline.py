@@ -12,8 +12,9 @@ from typing import Literal
 import numpy as np
 
 from barsight.core.arrays import Float32, UInt8
+from barsight.core.records.disparity import Disparity, DisparityRange
+from barsight.core.records.pairs import RectifiedPair
 from barsight.core.settings.values import NOT_NEGATIVE, POSITIVE, expect_ranges
-from barsight.core.types import Disparity, DisparityRange, RectifiedPair
 from barsight.stereo.direct.confidence import (
     Doubts,
     add_edge_sigma,

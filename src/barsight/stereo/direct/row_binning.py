@@ -14,7 +14,8 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float32, kernel
 from barsight.core.parallel import parallel_bands
-from barsight.core.types import Disparity, DisparityRange, RectifiedPair
+from barsight.core.records.disparity import Disparity, DisparityRange
+from barsight.core.records.pairs import RectifiedPair
 from barsight.stereo.direct.kernels.pyramid import halve
 from barsight.stereo.direct.support_regions import tile_axes
 

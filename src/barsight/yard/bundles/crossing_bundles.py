@@ -9,7 +9,7 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8
 from barsight.core.linalg.robust import nan_medians
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.yard.bundles.fitting.outline import STEP_M, make_outline
 from barsight.yard.bundles.fitting.outline_fit import AGREES, DIAMETER, ROLL, SLOPE_U, SLOPE_Z, Fit, U, Z
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap

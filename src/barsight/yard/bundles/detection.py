@@ -8,7 +8,7 @@ import numpy as np
 
 from barsight.core.arrays import Float64, Int64
 from barsight.core.parallel import ordered_map, prefetch
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.yard.bundles.bundle_kinds import (
     common_diameter,
     other_packings,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from barsight.core.arrays import Float32
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.yard.sections import patches
 from barsight.yard.types import HeightMap, YardMap
 

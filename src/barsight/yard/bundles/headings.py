@@ -6,7 +6,7 @@ import numpy as np
 from scipy import ndimage
 
 from barsight.core.arrays import Float64
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.yard.types import HeightMap
 
 _BLOCK_M = 0.3

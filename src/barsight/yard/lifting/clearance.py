@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, UInt8, kernel
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.yard.lift_settings import UPPER
 from barsight.yard.lifting.unseen import wide_parts
 from barsight.yard.magnet.contact import Contact

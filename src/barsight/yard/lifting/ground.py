@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.yard.events import YardEvent
 from barsight.yard.lifting.load import Load, axes_of
 from barsight.yard.lifting.unseen import wide_parts

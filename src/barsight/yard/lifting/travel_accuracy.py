@@ -14,7 +14,9 @@ from scipy.interpolate import interp1d
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.errors import Failed
 from barsight.core.pose import skew
-from barsight.core.types import CraneSamples, RectifiedCamera, Trajectory
+from barsight.core.records.pairs import RectifiedCamera
+from barsight.core.records.sensor_samples import CraneSamples
+from barsight.core.records.trajectory import Trajectory
 from barsight.motion.crane.encoder_trajectory import fit_position
 from barsight.yard.lift_settings import UPPER, LiftSettings
 from barsight.yard.magnet.description import Magnet, MagnetOffset

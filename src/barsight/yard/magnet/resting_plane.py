@@ -9,7 +9,7 @@ import numpy as np
 
 from barsight.core.arrays import Float32, Float64, Int64, UInt8, kernel
 from barsight.core.linalg.robust import SIGMA_PER_MAD
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.types import HeightMap
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8, kernel
 from barsight.core.parallel import ordered_map
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.yard.lift_settings import UPPER, LiftSettings
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Check, check_max, check_min, check_true

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.core.arrays import Float32, Float64, UInt8, kernel
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.yard.types import HeightMap
 
 _VISION, _LASER = HeightSource.VISION, HeightSource.LASER

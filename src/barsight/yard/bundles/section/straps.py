@@ -14,7 +14,7 @@ import numpy as np
 from scipy import ndimage
 
 from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8, kernel
-from barsight.core.types import HeightSource
+from barsight.core.records.heights import HeightSource
 from barsight.yard.bundles.fitting.outline_fit import ABOVE, BELOW, MIXED, SLOPE_U, Fit, U
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.section.strap_lines import (

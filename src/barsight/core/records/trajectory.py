@@ -1,0 +1,94 @@
+"""Define the records of the body's way, and of the rig's drift that it shows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from barsight.core.arrays import Float64, Int64, expect_shape
+from barsight.core.motion_detail import MotionDetail
+from barsight.core.pose import Pose
+from barsight.core.records.pairs import RefusedFrame
+
+
+@dataclass(frozen=True, eq=False)
+class PosedFrame:
+    """Pose of one frame. reference_from_body: target is `yard` or `world`.
+
+    covariance: (6, 6), rotation (rad) then translation (m), both in the reference frame's axes.
+    """
+
+    stamp_ns: int
+    reference_from_body: Pose
+    covariance: Float64
+
+    def __post_init__(self) -> None:
+        expect_shape("covariance", self.covariance, (6, 6))
+
+
+@dataclass(frozen=True, eq=False)
+class RigDrift:
+    """Rig drift against its calibration as the motion shows it.
+
+    yaw_rad: how far cam1 has turned about `rect0`'s y axis. scale: by which share the baseline is longer than
+    calibrated, if the encoders' metre is right. covariance: (2, 2) of both. prior_sigma: (2,) what was held
+    possible before. range_m: the points' median depth. by_encoders: whether a known way was there.
+    """
+
+    yaw_rad: float
+    scale: float
+    covariance: Float64
+    prior_sigma: Float64
+    baseline_m: float
+    range_m: float
+    by_encoders: bool
+
+    @property
+    def yaw_sigma_rad(self) -> float:
+        """One standard deviation of the yaw."""
+        return float(self.covariance[0, 0] ** 0.5)
+
+    @property
+    def scale_sigma(self) -> float:
+        """One standard deviation of the scale."""
+        return float(self.covariance[1, 1] ** 0.5)
+
+    def depth_error_m(self, range_m: float) -> float:
+        """Return the depth error by the uncorrected yaw at `range_m` straight ahead."""
+        return -self.yaw_rad * range_m**2 / self.baseline_m
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses of the frames that could be placed, in time's order, and the refused ones.
+
+    reference: `yard` or `world`. sensors: which were used. warnings: sentences for the result.
+    drift: of the rig, where the estimate sees it. detail: what else it knows, where it is one of all sensors.
+    doubts: sentences on what makes all of it doubtful, so that no lift may be chosen by it.
+    """
+
+    reference: str
+    frames: tuple[PosedFrame, ...]
+    refused: tuple[RefusedFrame, ...]
+    sensors: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
+    drift: RigDrift | None = None
+    detail: MotionDetail | None = None
+    doubts: tuple[str, ...] = ()
+
+    @property
+    def stamp_ns(self) -> Int64:
+        """Return the frames' stamps (N,)."""
+        return np.array([frame.stamp_ns for frame in self.frames], dtype=np.int64)
+
+    @property
+    def positions_m(self) -> Float64:
+        """Return the body's positions (N, 3) in the reference frame."""
+        places = [frame.reference_from_body.translation for frame in self.frames]
+        return np.array(places, dtype=np.float64).reshape(-1, 3)
+
+    @property
+    def length_m(self) -> float:
+        """Return the path length along the frames."""
+        return float(np.linalg.norm(np.diff(self.positions_m, axis=0), axis=1).sum())
