@@ -20,7 +20,7 @@ from scipy import ndimage
 from barsight.benchmarks.lift_judge.magnet import JudgedMagnet, magnet_of
 from barsight.benchmarks.yard.drawn_worlds import drawn_scene, judged_yard
 from barsight.bundle_pictures.diameters import with_pitch
-from barsight.bundle_pictures.measuring import pitch_profiles
+from barsight.bundle_pictures.measuring import look_at_bundles
 from barsight.bundle_pictures.profiles import PitchProfile
 from barsight.bundle_pictures.spectra import CLASSES, FREQUENCIES, LOG_RATIOS, log_spectrum
 from barsight.calibration.geometry.rectification import Rectifier
@@ -96,8 +96,8 @@ class KeptYard:
 def seen_bundles(keep: Path, seed: int, magnet: JudgedMagnet) -> Iterator[SeenBundle]:
     """Sample the profiles of a yard's found bundles of more than one bar."""
     yard = KeptYard.of(keep, seed, magnet)
-    sampled = pitch_profiles(yard.pairs, yard.poses, yard.heights, yard.bundles)
-    for bundle, drawn, profiles in zip(yard.bundles, yard.drawn_ones(), sampled, strict=True):
+    shown = look_at_bundles(yard.pairs, yard.poses, yard.heights, yard.bundles, ())
+    for bundle, drawn, profiles in zip(yard.bundles, yard.drawn_ones(), shown.profiles, strict=True):
         if drawn is not None and profiles:
             yield SeenBundle(bundle, *drawn, profiles)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from barsight.bundle_pictures.diameters import with_pitch
-from barsight.bundle_pictures.measuring import measure_from_pictures, pitch_profiles
+from barsight.bundle_pictures.measuring import look_at_bundles, measure_from_pictures
 from barsight.bundle_pictures.profiles import STEP_M, PitchProfile
 from barsight.yard.magnet.holding import min_diameter_m
 from barsight.yard.types import Bundle
@@ -65,7 +65,7 @@ def test_profiles_lie_where_the_bars_do() -> None:
     pairs = Pictures(
         poses, lambda at: np.where(np.abs((at - bundle.centre_m[:2]) @ across - 0.04) < 0.004, 20, 150)
     )
-    (profiles,) = pitch_profiles(pairs, poses, flat_map(), [bundle])
+    (profiles,) = look_at_bundles(pairs, poses, flat_map(), [bundle], ()).profiles
     assert len(profiles) == 10
     for profile in profiles:
         beside = STEP_M * (profile.levels.argmin() - (profile.levels.size - 1) / 2)
@@ -94,11 +94,9 @@ def test_blurred_pictures_tell_nothing(diameter_mm: int) -> None:
 def test_what_stands_in_the_way_hides_a_bundle() -> None:
     bundle, poses = told(0.11, 0.066, yaw_deg=0.0), looking_down(-0.9, 1)
     heights, wall = flat_map(), flat_map()
+    pairs = Pictures(poses, striped(bundle, 0.02))
     wall.z_m[:, np.abs(wall.x_m + 0.18) < 0.04] = TOP_M + 0.9
-    counts = [
-        len(pitch_profiles(Pictures(poses, striped(bundle, 0.02)), poses, one, [bundle])[0])
-        for one in (heights, wall)
-    ]
+    counts = [len(look_at_bundles(pairs, poses, one, [bundle], ()).profiles[0]) for one in (heights, wall)]
     assert counts[0] > 0 and counts[1] == 0
 
 

@@ -5,6 +5,7 @@ what lies across them by its edges.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 from barsight.bundle_pictures.crossing_edges import edge_windows, find_edge, with_edge
 from barsight.bundle_pictures.diameters import with_pitch
@@ -19,6 +20,19 @@ from barsight.yard.lifting.load import is_one_bar
 from barsight.yard.types import Bundle, YardMap
 
 
+@dataclass(frozen=True, eq=False)
+class ShownBundles:
+    """Samples of bundles in pictures. profiles, straps: of each bundle whose bars and flanks are looked for;
+    tilts: how far aside the lines of sight to its straps lead, over their height. edges: m along from its
+    middle, by the number of the bundle that one runs across.
+    """
+
+    profiles: list[list[PitchProfile]]
+    straps: list[list[StrapEnds]]
+    tilts: list[float]
+    edges: dict[int, float]
+
+
 def measure_from_pictures(
     pairs: RectifiedPairs, poses: Mapping[int, Pose], heights: YardMap, bundles: Sequence[Bundle]
 ) -> tuple[Bundle, ...]:
@@ -27,14 +41,36 @@ def measure_from_pictures(
 
     poses: reference_from_body by stamp of the frames that may be looked at.
     """
-    frames = PlacedFrames.of(pairs.rectifier, poses)
     numbers = [k for k, bundle in enumerate(bundles) if bundle.bars is None]
     unsure = [bundles[k] for k in numbers]
+    shown = look_at_bundles(pairs, poses, heights, unsure, bundles)
+    floor, out = find_floor(heights), list(bundles)
+    seen = zip(numbers, unsure, shown.profiles, shown.straps, shown.tilts, strict=True)
+    for k, bundle, profiles, ends, tilt in seen:
+        told = out[k] = with_pitch(bundle, profiles)
+        if ends and not is_one_bar(told):
+            placed = with_flanks(told, ends, MeanSection.of(bundle, heights), floor, tilt)
+            moved = placed.centre_m is not told.centre_m
+            others = [other for other in bundles if moved and other is not bundle]
+            out[k] = told if takes_another(placed, others) else placed
+    for k, along_m in shown.edges.items():
+        out[k] = with_edge(out[k], along_m)
+    return tuple(out)
+
+
+def look_at_bundles(
+    pairs: RectifiedPairs, poses: Mapping[int, Pose], heights: YardMap, unsure: Sequence[Bundle],
+    crossed: Sequence[Bundle],
+) -> ShownBundles:  # fmt: skip
+    """Sample profiles and straps of `unsure` bundles, and edges across those that may be `crossed`; poses as
+    for `measure_from_pictures`.
+    """
+    frames = PlacedFrames.of(pairs.rectifier, poses)
     windows = list(pitch_windows(frames, heights, unsure))
     first_strap = len(windows)
     windows += strap_windows(frames, {k for k, _ in windows}, heights, unsure)
     first_edge = len(windows)
-    windows += edge_windows(frames, {k for k, _ in windows}, bundles)
+    windows += edge_windows(frames, {k for k, _ in windows}, crossed)
     looked_at, edges = set[int](), dict[int, float]()
     profiles, straps = [list[PitchProfile]() for _ in unsure], [list[StrapEnds]() for _ in unsure]
     for place, picture in sample_windows(pairs, frames, windows):
@@ -43,7 +79,7 @@ def measure_from_pictures(
             # One picture of a frame tells: the other shows the same.
             if place not in looked_at and window.number not in edges:
                 looked_at.add(place)
-                edge = find_edge(picture.gray, window, bundles[window.number])
+                edge = find_edge(picture.gray, window, crossed[window.number])
                 if edge is not None:
                     edges[window.number] = edge
             continue
@@ -56,27 +92,4 @@ def measure_from_pictures(
     tilts = [0.0] * len(unsure)
     for k, window in windows[first_strap:first_edge]:
         tilts[window.number] = max(tilts[window.number], abs(view_tilt(frames, k, window)))
-    floor, out = find_floor(heights), list(bundles)
-    for k, bundle, seen, ends, tilt in zip(numbers, unsure, profiles, straps, tilts, strict=True):
-        told = out[k] = with_pitch(bundle, seen)
-        if ends and not is_one_bar(told):
-            placed = with_flanks(told, ends, MeanSection.of(bundle, heights), floor, tilt)
-            moved = placed.centre_m is not told.centre_m
-            others = [other for other in bundles if moved and other is not bundle]
-            out[k] = told if takes_another(placed, others) else placed
-    for k, along_m in edges.items():
-        out[k] = with_edge(out[k], along_m)
-    return tuple(out)
-
-
-def pitch_profiles(
-    pairs: RectifiedPairs, poses: Mapping[int, Pose], heights: YardMap, bundles: Sequence[Bundle]
-) -> list[list[PitchProfile]]:
-    """Sample the profiles across each bundle alone; poses as for `measure_from_pictures`."""
-    frames = PlacedFrames.of(pairs.rectifier, poses)
-    windows = list(pitch_windows(frames, heights, bundles))
-    profiles = [list[PitchProfile]() for _ in bundles]
-    for place, picture in sample_windows(pairs, frames, windows):
-        if picture.is_sharp:
-            profiles[windows[place][1].number].append(PitchProfile.of(picture))
-    return profiles
+    return ShownBundles(profiles, straps, tilts, edges)
