@@ -21,10 +21,10 @@ makes them 1.68 or more, of 0.7 px mostly, motion of 4 px 1.7 or more along it."
 def is_sharp(picture: UInt8) -> bool:
     """Check that the edges of a picture (H, W) are narrow along its rows and its columns."""
     rows, columns = picture[::_STRIDE], np.ascontiguousarray(picture[:, ::_STRIDE].T)
-    return all(edge_width(lines) <= _MAX_EDGE_PX for lines in (rows, columns))
+    return all(sharpest_edge_width(lines) <= _MAX_EDGE_PX for lines in (rows, columns))
 
 
-def edge_width(lines: UInt8) -> float:
+def sharpest_edge_width(lines: UInt8) -> float:
     """Compute the width of the sharpest edges along lines (N, W), contrast over slope, px; NaN where too few
     are seen.
     """
