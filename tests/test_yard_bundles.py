@@ -34,6 +34,7 @@ from barsight.yard.bundles.section.seen_section import (
     is_no_hexagon,
     seen_section,
 )
+from barsight.yard.lift_settings import UPPER
 from barsight.yard.lifting.load import Load
 from barsight.yard.magnet.holding import min_diameter_m
 from barsight.yard.types import Bundle, HeightMap
@@ -491,10 +492,29 @@ def test_what_is_out_of_sight_beside_a_section_makes_it_unsure() -> None:
         fit = Fit(1, 0.2, values, np.zeros((6, 6)), 0, 39, state, gain, 0.0, 0.0)
         seen = seen_section(FittedOutline(grid, fit), [], 0.01)
         assert seen is not None and seen.sides_seen
-        sights.append((seen.hidden_m, estimate_section(seen, fit, 0.5, 0.0)))
-    (none_m, (section, sigma)), (hidden_m, (same, wider)) = sights
-    assert none_m == (0.0, 0.0) and hidden_m == pytest.approx((0.04, 0.07))
+        own, along = (
+            estimate_section(seen, fit, 0.5, 0.0, is_along_baseline=is_along) for is_along in (False, True)
+        )
+        sights.append((seen.hidden_m, own, along))
+    (none_m, (section, sigma), along), (hidden_m, (same, wider), all_hidden) = sights
+    assert none_m == (0.0, 0.0) and hidden_m == pytest.approx((0.04, 0.07)) and along == (section, sigma)
     assert same == pytest.approx(section, rel=0.01) and wider > 1.2 * sigma
+    # Along the baseline bars may fill all of what wasn't seen: (0.17 + 0.11)^2 / 0.17^2 is 2.7.
+    assert 2.7 * section < all_hidden[0] + UPPER * all_hidden[1] < 3.2 * section
+    assert same + UPPER * wider < 1.9 * section
+
+
+def test_bars_along_the_baseline_may_go_on_where_nothing_was_seen() -> None:
+    heights = draw([Laid(0.3, 0.0, 0.35, 0.0, bars=19, diameter_m=0.04)])
+    x = heights.x0_m + heights.cell_m * np.arange(heights.z_m.shape[1])
+    unseen = (x > 0.38) & (x < 0.45)
+    heights.z_m[:, unseen], heights.source[:, unseen] = np.nan, HeightSource.UNKNOWN
+    yaw = np.radians([0.0, 20.0, 40.0, 90.0])
+    upper = []
+    for baseline in (None, *np.column_stack([-np.sin(yaw), np.cos(yaw)])):
+        (found,) = find_bundles(heights, SETTINGS, baseline)
+        upper.append(found.section_m2 + UPPER * found.sigma.section_m2)
+    assert upper[1] > 1.1 * upper[0] and upper[1:3] == [upper[1]] * 2 and upper[3:] == [upper[0]] * 2
 
 
 def test_a_single_bar_may_roll_whatever_is_listed() -> None:

@@ -7,7 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 from barsight.bundle_pictures.measuring import measure_from_pictures
+from barsight.core.arrays import Float64
 from barsight.core.json_values import json_digest, json_value
 from barsight.core.memory import peak_memory_mib
 from barsight.core.notices import Notice
@@ -100,7 +103,7 @@ def _bundles(mapped: MappedYard, heights: YardMap) -> tuple[Bundle, ...]:
     settings, newest = mapped.settings, mapped.newest
     poses = {frame.stamp_ns: frame.reference_from_body for frame in newest.way.trajectory.frames}
     with mapped.watch("bundles"):
-        bundles = find_bundles(heights, settings.bundles)
+        bundles = find_bundles(heights, settings.bundles, _baseline(newest))
         if mapped.joined is not None:
             bundles = mapped.joined.doubted(bundles)
     with mapped.watch("pictures"):
@@ -112,6 +115,14 @@ def _bundles(mapped: MappedYard, heights: YardMap) -> tuple[Bundle, ...]:
         return bundles
     with mapped.watch("labels"):
         return label_bundles(newest.probed.pairs, poses, heights, bundles, settings.labels)
+
+
+def _baseline(one: MappedPass) -> Float64:
+    """Average the level unit vector (2,) from the left camera to the right one."""
+    right = one.way.rectifier.body_from_rect0.rotation[:, 0]
+    poses = (frame.reference_from_body for frame in one.way.trajectory.frames)
+    mean = np.mean([pose.rotation @ right for pose in poses], axis=0)[:2]
+    return np.asarray(mean / np.linalg.norm(mean))
 
 
 def _input_hashes(passes: Sequence[MappedPass]) -> dict[str, str]:

@@ -93,7 +93,9 @@ def make_bundle(
     bars, doubt = count_bars(reading, seen, top_z, floor_m)
     reasons = doubt + list_wall_doubts(reading, seen, top_z, floor_m)
     reasons += list_doubts(reading, rows, ends, settings)
-    section, section_sigma = estimate_section(seen, fit, top_z, floor_m)
+    section, section_sigma = estimate_section(
+        seen, fit, top_z, floor_m, is_along_baseline=reading.is_along_baseline
+    )
     own = _sigma(fit, ends, top, settings)
     bundle = Bundle(
         id=0,

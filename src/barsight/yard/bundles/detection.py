@@ -61,13 +61,17 @@ _RESOLVED_CELLS = 4.0
 _SLIVER_RATIO = 0.03
 _CROSSING_STEP_M = 0.4
 """What lies across may be short: cross-sections this far apart meet it."""
+_ALONG_COS = 0.87
+"""Cosine of the angle, 30 degrees, within which bars lie along the baseline: single ones aren't matched."""
 _SEAM_M = 0.1
 """Two stretches of a yard put a bundle's middle no further apart than this."""
 
 
-def find_bundles(yard: YardMap, settings: BundleSettings) -> tuple[Bundle, ...]:
+def find_bundles(
+    yard: YardMap, settings: BundleSettings, baseline: Float64 | None = None
+) -> tuple[Bundle, ...]:
     """Find all bundles that the map shows, in the map's frame, from low to high x; empty where there are
-    none.
+    none. baseline: (2,) level unit vector along which the cameras stand, None where it isn't known.
 
     A bundle is an outline of round bars in hexagonal packing (or one bar) that the measured heights follow.
     Outlines are guessed in cross-sections, grown along the bars by least squares, and of those that want the
@@ -80,7 +84,7 @@ def find_bundles(yard: YardMap, settings: BundleSettings) -> tuple[Bundle, ...]:
     templates = make_templates(settings, yard.cell_m)
     parts, found = split_map(yard), list[Bundle]()
     for part in parts:
-        read = _search(yard.part(part.rows, part.columns), floor, templates, settings)
+        read = _search(yard.part(part.rows, part.columns), floor, templates, settings, baseline)
         own = [bundle for bundle in read if part.owns(bundle.centre_m, _SEAM_M)]
         before = [bundle for bundle in found if part.reaches(bundle.centre_m)]
         found += [bundle for bundle in own if not any(same_place(bundle, one) for one in before)]
@@ -89,8 +93,9 @@ def find_bundles(yard: YardMap, settings: BundleSettings) -> tuple[Bundle, ...]:
 
 
 def _search(
-    height_map: HeightMap, floor: float | None, templates: Templates, settings: BundleSettings
-) -> list[Bundle]:
+    height_map: HeightMap, floor: float | None, templates: Templates, settings: BundleSettings,
+    baseline: Float64 | None,
+) -> list[Bundle]:  # fmt: skip
     """Search a map that is short enough to be held."""
     if not HeightSource.measured(height_map.source).any():
         return []
@@ -108,11 +113,22 @@ def _search(
         found += [one for one in across if not is_beam(one.grid, one.fit, settings)]
     places += [_claims(one, settings) for one in found[len(places) :]]
     claims = without_slivers(places, _SLIVER_RATIO)
-    readings = _settled(found, _weights(found, floor), claims, height_map, settings)
+    readings = [
+        replace(one, is_along_baseline=_runs_along(one.found.grid, baseline))
+        for one in _settled(found, _weights(found, floor), claims, height_map, settings)
+    ]
     chosen_ones = [reading.found for reading in readings]
     bundles = [make_bundle(reading, chosen_ones, settings, floor) for reading in readings]
     joined = join_pieces(without_pieces(bundles, readings))
     return list(ordered_map(lambda bundle: with_thin_lines(bundle, height_map), joined))
+
+
+def _runs_along(grid: AlignedMap, baseline: Float64 | None) -> bool:
+    """Check whether a heading runs about along the baseline."""
+    if baseline is None:
+        return False
+    axis = np.array([-np.sin(grid.heading_rad), np.cos(grid.heading_rad)])
+    return bool(abs(axis @ baseline) > _ALONG_COS)
 
 
 def _found(

@@ -19,8 +19,8 @@ class Reading:
 
     other_packing: rings of another packing that explains the bundles of this kind as well, if any does. pack:
     the bars that straps hold together there, None where no straps are seen; has_photo: whether they were
-    looked for. flanks: of the pack where its bounds are known, else of the outline; None where too little of
-    them is seen.
+    looked for. is_along_baseline: whether the cameras stand about in line with its bars. flanks: of the pack
+    where its bounds are known, else of the outline; None where too little of them is seen.
     """
 
     found: FittedOutline
@@ -30,6 +30,7 @@ class Reading:
     other_packing: int | None
     pack: Pack | None = None
     has_photo: bool = False
+    is_along_baseline: bool = False
     flanks: Flanks | None = None
 
     @property

@@ -14,7 +14,7 @@ from barsight.yard.bundles.reading import Reading
 from barsight.yard.bundles.section.dark_lines import SAME_DIAMETER_RATIO
 from barsight.yard.bundles.section.pack_sides import PackSide
 from barsight.yard.bundles.section.packs import Pack, contradicts
-from barsight.yard.bundles.section.seen_section import BULGE_RATIO, SeenSection, over_floor, section_of_pack
+from barsight.yard.bundles.section.seen_section import SeenSection, bulge_sigma, over_floor, section_of_pack
 from barsight.yard.types import Bundle, BundleSigma, Doubt, DoubtKind
 
 _LINES_SIGMA_RATIO = 0.6
@@ -130,7 +130,7 @@ def _as_pack(
         reasons=(*kept, Doubt(DoubtKind.OTHER, said)),
         sigma=replace(
             bundle.sigma,
-            lateral_m=math.hypot(bundle.sigma.lateral_m, _PACK_MIDDLE_M, _bulge(pack) / 2),
+            lateral_m=math.hypot(bundle.sigma.lateral_m, _PACK_MIDDLE_M, _bulge(reading, pack) / 2),
             yaw_rad=irregular.yaw_rad,
             width_m=width_sigma,
             top_z_m=float(np.hypot(bundle.sigma.top_z_m, _PACK_TOP_M)),
@@ -213,12 +213,12 @@ def _confirmed(bundle: Bundle, pack: Pack, floor_m: float | None, pack_sigma_m: 
 
 def _pack_sigma(reading: Reading, pack: Pack) -> float:
     """Compute the standard deviation of a pack's width."""
-    return math.hypot(_PACK_WIDTH_M, _PACK_WIDTH_SIGMAS * reading.found.fit.sigma_m, _bulge(pack))
+    return math.hypot(_PACK_WIDTH_M, _PACK_WIDTH_SIGMAS * reading.found.fit.sigma_m, _bulge(reading, pack))
 
 
-def _bulge(pack: Pack) -> float:
+def _bulge(reading: Reading, pack: Pack) -> float:
     """Compute the standard deviation of how much wider a pack is where nothing was seen behind its flanks."""
-    return BULGE_RATIO * math.hypot(*pack.hidden_m)
+    return bulge_sigma(pack.hidden_m, is_along_baseline=reading.is_along_baseline)
 
 
 def without_pieces(bundles: list[Bundle], readings: list[Reading]) -> list[Bundle]:

@@ -58,7 +58,7 @@ _FILL_RATIO, _BAR_FILL_RATIO = (0.65, 0.045), (0.70, 0.055)
 bar: it is one, or a round pack of thin ones."""
 _MAX_DEVIATIONS = 4.0
 """From this many deviations of the prior on, a floor cuts nothing off; below as many it cuts off no more."""
-BULGE_RATIO = 0.4
+_BULGE_RATIO = 0.4
 """Of what wasn't seen behind a flank: one standard deviation of how far bars bulge there."""
 _SEEN_WIDTH_SIGMA_M, _OUTLINE_RATIO = 0.012, 0.5
 """Of the width between the sides that a map shows, and of what it differs from the outline's."""
@@ -145,8 +145,21 @@ def is_no_hexagon(seen: SeenSection | None, fit: Fit, top_m: float, floor_m: flo
     return ""
 
 
+def bulge_sigma(hidden_m: tuple[float, float], *, is_along_baseline: bool) -> float:
+    """Estimate the standard deviation, m, of how much wider a bundle is where nothing was seen behind its
+    flanks. Of bars along the cameras' baseline single ones aren't matched at all: there all of what wasn't
+    seen may be bars.
+    """
+    return sum(hidden_m) / UPPER if is_along_baseline else _BULGE_RATIO * math.hypot(*hidden_m)
+
+
 def estimate_section(
-    seen: SeenSection | None, fit: Fit, top_m: float, floor_m: float | None
+    seen: SeenSection | None,
+    fit: Fit,
+    top_m: float,
+    floor_m: float | None,
+    *,
+    is_along_baseline: bool = False,
 ) -> tuple[float, float]:
     """Estimate steel's section and its sigma, m2, of a bundle whose bars can't be counted; NaN where its
     sides were not seen, or where what is seen is not the outline's section.
@@ -157,7 +170,8 @@ def estimate_section(
         return np.nan, np.nan
     fill = _FILL_RATIO if fit.rings else _BAR_FILL_RATIO
     off_m = _OUTLINE_RATIO * (seen.width_m - fit.width_m)
-    sigma_m = math.hypot(_SEEN_WIDTH_SIGMA_M, off_m, BULGE_RATIO * math.hypot(*seen.hidden_m))
+    bulge_m = bulge_sigma(seen.hidden_m, is_along_baseline=is_along_baseline)
+    sigma_m = math.hypot(_SEEN_WIDTH_SIGMA_M, off_m, bulge_m)
     return section_of_pack(seen.width_m, sigma_m, over_floor(top_m, floor_m), fill)
 
 
@@ -180,9 +194,11 @@ def section_of_pack(
         height = cut - min(prior.stdev * (slope + at), cut / 2)
         height_sigma = prior.stdev * math.sqrt(1 - at * slope - slope**2)
     section = fill[0] * height * width_m**2
-    share = np.linalg.norm([fill[1] / fill[0], height_sigma / height, 2 * width_sigma_m / width_m])
+    wider = width_sigma_m / width_m
+    # The upper bound of the width squared, (1 + UPPER wider)^2, is what counts, not its slope alone.
+    share = np.linalg.norm([fill[1] / fill[0], height_sigma / height, wider * (2 + UPPER * wider)])
     widest = width_m + UPPER * width_sigma_m
-    most = _MAX_FILL_RATIO * min(over_floor_m, MAX_HEIGHT_RATIO * width_m) * widest
+    most = _MAX_FILL_RATIO * min(over_floor_m, MAX_HEIGHT_RATIO * widest) * widest
     return section, min(section * float(share), (most - section) / UPPER)
 
 
