@@ -25,6 +25,8 @@ def test_spilled_tiles_are_those_of_a_dictionary(tmp_path: Path) -> None:
     for key, tile in tiles.items():
         np.testing.assert_array_equal(tile, kept[key])
         np.testing.assert_array_equal(tiles.peek(key), kept[key])
+    files = len(list(tmp_path.rglob("*.npy")))
+    assert tiles.get((9, 9)) is None and len(list(tmp_path.rglob("*.npy"))) == files
     del tiles[0, 0]
     assert (0, 0) not in tiles and len(tiles) == 11
     with pytest.raises(KeyError):

@@ -78,6 +78,7 @@ EXTRAS = {
         "page/api/changing.py",
         "page/api/forms.py",
         "page/api/reading.py",
+        "page/api/sessions.py",
         "page/api/serve.py",
     },
     "opcua": {

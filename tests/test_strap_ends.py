@@ -127,6 +127,9 @@ def test_a_bundle_that_may_be_covered_is_left() -> None:
     may_go_on = Doubt(DoubtKind.MAY_GO_ON, "it may be wider")
     one = with_flanks(replace(bundle, reasons=(may_go_on,)), ends(-0.1, 0.1), seen, 0.0, 0.0)
     assert one.width_m == pytest.approx(0.2) and np.isnan(one.section_m2)
+    no_straps = Doubt(DoubtKind.NO_STRAPS, "the photo shows no straps that hold it")
+    one = with_flanks(replace(bundle, reasons=(no_straps,)), ends(-0.1, 0.1), seen, 0.0, 0.0)
+    assert one.width_m == pytest.approx(0.2) and not one.reasons
 
 
 def test_a_strip_out_of_sight_is_no_flank_nor_the_maps_border() -> None:

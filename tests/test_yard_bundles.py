@@ -34,10 +34,11 @@ from barsight.yard.bundles.section.seen_section import (
     is_no_hexagon,
     seen_section,
 )
+from barsight.yard.bundles.strapped_bundles import doubted_without_straps
 from barsight.yard.lift_settings import UPPER
 from barsight.yard.lifting.load import Load
 from barsight.yard.magnet.holding import min_diameter_m
-from barsight.yard.types import Bundle, HeightMap
+from barsight.yard.types import Bundle, Doubt, DoubtKind, HeightMap
 from barsight.yard.weight import bundle_mass
 from yard_maps import Laid, draw, photographed
 
@@ -375,25 +376,29 @@ def test_a_flank_out_of_sight_may_lie_under_what_stands_higher(rise_m: float, *,
     assert found.is_free is is_free and (found.on_top is True) is is_free
 
 
-@pytest.mark.parametrize(("z_m", "straps_m", "is_sure"), [
-    (0.3, (), False), (0.3, (-1.0, 0.1, 1.0), True), (0.134, (), True),
+@pytest.mark.parametrize(("z_m", "straps_m", "photo_to_m", "is_sure"), [
+    (0.3, (), 2.0, False), (0.3, (-1.0, 0.1, 1.0), 2.0, True), (0.3, (-1.0, 0.1, 1.0), 0.0, True),
+    (0.3, (), 0.0, True), (0.134, (), 2.0, True),
 ])  # fmt: skip
 def test_bars_that_no_straps_hold_may_lie_loose_unless_they_are_counted(
-    z_m: float, straps_m: tuple[float, ...], *, is_sure: bool
+    z_m: float, straps_m: tuple[float, ...], photo_to_m: float, *, is_sure: bool
 ) -> None:
-    """At 0.3 m it stands too high for the full bundle that it is, and can't be counted."""
+    """At 0.3 m it stands too high for the full bundle that it is, and can't be counted. A photo that ends at
+    its middle tells nothing.
+    """
     laid = Laid(0.5, 0.0, z_m, 0.0)
     heights = draw([laid])
     (bundle,) = find_bundles(heights, SETTINGS)
-    assert bundle.confidence > 0.9
+    assert doubted_without_straps(bundle) is bundle and bundle.confidence > 0.9
     heights = photographed(heights, [laid])
     assert heights.gray is not None
     y = heights.y0_m + heights.cell_m * np.arange(heights.z_m.shape[0])
     for at in straps_m:
         heights.gray[np.abs(y - at) < 0.02] = 10
+    heights.gray[y > photo_to_m] = 0
     (bundle,) = find_bundles(heights, SETTINGS)
-    assert (bundle.confidence > 0.9) is is_sure
-    assert any("no straps" in doubt.sentence for doubt in bundle.reasons) is not is_sure
+    assert (doubted_without_straps(bundle).confidence > 0.9) is is_sure
+    assert any(doubt.kind is DoubtKind.NO_STRAPS for doubt in bundle.reasons) is not is_sure
 
 
 def test_two_readings_of_one_bundle_are_joined() -> None:
@@ -412,6 +417,14 @@ def test_two_readings_of_one_bundle_are_joined() -> None:
         False,
     )
     assert whole.sigma.lateral_m > one.sigma.lateral_m
+    doubt = Doubt(DoubtKind.NO_STRAPS, "the photo shows no straps that hold it")
+    for strapped in ((True, False), (False, True), (False, False)):
+        told = [
+            replace(piece, reasons=() if has_straps else (doubt,))
+            for piece, has_straps in zip(pieces, strapped, strict=True)
+        ]
+        (whole,) = join_pieces(told)
+        assert (doubt in whole.reasons) is not any(strapped)
     assert len(join_pieces([replace(piece, ends_open=(False, False)) for piece in pieces])) == 2
 
 

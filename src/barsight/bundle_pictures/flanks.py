@@ -161,6 +161,7 @@ def with_flanks(
     aside = middle * across + [0, 0, (bundle.width_m - width) / 2]
     return replace(
         bundle, centre_m=bundle.centre_m + aside, ends_m=bundle.ends_m + aside, width_m=width, sigma=sigma,
+        reasons=tuple(doubt for doubt in bundle.reasons if doubt.kind is not DoubtKind.NO_STRAPS),
         fit_sigma=None,
     )  # fmt: skip
 

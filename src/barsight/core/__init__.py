@@ -1,1 +1,1 @@
-"""Errors, frozen types, poses that know their frames, time stamps, uncertainty, atomic files."""
+"""Errors, records, poses that know their frames, time stamps, uncertainty, atomic files."""

@@ -34,6 +34,8 @@ class SpilledTiles(MutableMapping[TileKey, Tile]):
     def __getitem__(self, key: TileKey) -> Tile:
         """Return a tile, from its file where it isn't held."""
         with self._lock:
+            if key not in self._known:
+                raise KeyError(key)
             tile = self._held.pop(key, None)
             if tile is None:
                 self._write_oldest(self._resident - 1)
@@ -50,7 +52,7 @@ class SpilledTiles(MutableMapping[TileKey, Tile]):
             self._held[key] = tile
 
     def peek(self, key: TileKey) -> Tile:
-        """Return a tile, not to be written to: it isn't kept if it lay on disk."""
+        """Return a known tile, not to be written to: it isn't kept if it lay on disk."""
         with self._lock:
             tile = self._held.get(key)
             return self._load(key) if tile is None else tile
@@ -93,8 +95,6 @@ class SpilledTiles(MutableMapping[TileKey, Tile]):
             np.save(self._file(oldest), evicted)
 
     def _load(self, key: TileKey) -> Tile:
-        if key not in self._known:
-            raise KeyError(key)
         return cast(Tile, np.load(self._file(key)))
 
     def _file(self, key: TileKey) -> Path:

@@ -7,24 +7,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-
-from barsight.bundle_pictures.measuring import measure_from_pictures
-from barsight.core.arrays import Float64
 from barsight.core.json_values import json_digest, json_value
 from barsight.core.memory import peak_memory_mib
 from barsight.core.notices import Notice
 from barsight.core.stamps import seconds_to_ns
-from barsight.labels.bundle_labels import label_bundles
 from barsight.measure_settings import MeasureSettings
 from barsight.measurement import BuiltMap, Measurement, PassRecord, StageTime
+from barsight.pipeline.bundle_search import find_yard_bundles
 from barsight.pipeline.mapped_yard import MappedYard
 from barsight.pipeline.notices import stage_notices, stock_notices
 from barsight.reconstruction.joined_passes import MappedPass
 from barsight.reconstruction.probed_recording import ProbedRecording
 from barsight.reconstruction.tracked_recording import TrackedRecording
-from barsight.yard.bundles.bundle_kinds import listed_diameter
-from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.inventory.stock_list import StockMatch, contradicted_bundles, match_stock
 from barsight.yard.lifting.targets import LiftPlan, map_vetoes, offset_vetoes, plan_lifts
 from barsight.yard.lifting.travel_accuracy import Travel
@@ -53,7 +47,7 @@ def find_lifts(mapped: MappedYard, request: LiftRequest) -> Measurement:
     settings, newest, trajectory = mapped.settings, mapped.newest, mapped.trajectory
     watch, profiles = mapped.watch, mapped.profiles
     heights = surface_map(mapped.surface, mapped.free, mapped.tops, mapped.history)
-    bundles = _bundles(mapped, heights)
+    bundles = find_yard_bundles(mapped, heights)
     listed = mapped.stock if trajectory.reference == "yard" else None
     stock = None if listed is None else match_stock(listed, bundles)
     warnings = [*stage_notices(mapped), *stock_notices(mapped.stock, stock), *request.notices]
@@ -94,35 +88,6 @@ def find_lifts(mapped: MappedYard, request: LiftRequest) -> Measurement:
         frame_id=mapped.frame_id,
         passes=_records(mapped, travels),
     )
-
-
-def _bundles(mapped: MappedYard, heights: YardMap) -> tuple[Bundle, ...]:
-    """Find the bundles, and look at their bars, straps and labels in the newest pass's pictures: what lay
-    there before may be gone.
-    """
-    settings, newest = mapped.settings, mapped.newest
-    poses = {frame.stamp_ns: frame.reference_from_body for frame in newest.way.trajectory.frames}
-    with mapped.watch("bundles"):
-        bundles = find_bundles(heights, settings.bundles, _baseline(newest))
-        if mapped.joined is not None:
-            bundles = mapped.joined.doubted(bundles)
-    with mapped.watch("pictures"):
-        used = set(newest.built.stamps_ns)
-        seen = {stamp: pose for stamp, pose in poses.items() if stamp in used}
-        measured = measure_from_pictures(newest.probed.pairs, seen, heights, bundles)
-        bundles = tuple(listed_diameter(bundle, settings.bundles.catalogue_mm) for bundle in measured)
-    if not settings.labels.read:
-        return bundles
-    with mapped.watch("labels"):
-        return label_bundles(newest.probed.pairs, poses, heights, bundles, settings.labels)
-
-
-def _baseline(one: MappedPass) -> Float64:
-    """Average the level unit vector (2,) from the left camera to the right one."""
-    right = one.way.rectifier.body_from_rect0.rotation[:, 0]
-    poses = (frame.reference_from_body for frame in one.way.trajectory.frames)
-    mean = np.mean([pose.rotation @ right for pose in poses], axis=0)[:2]
-    return np.asarray(mean / np.linalg.norm(mean))
 
 
 def _input_hashes(passes: Sequence[MappedPass]) -> dict[str, str]:

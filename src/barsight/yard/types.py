@@ -23,13 +23,13 @@ ENDS = "low-y", "high-y"
 class HeightMap:
     """The map that the yard's stages read: arrays [y, x] with y rising.
 
-    Cell (row, column) has its centre at (x0_m + column * cell_m, y0_m + row * cell_m). z_m, sigma_m: float32,
-    NaN where unknown. views: float32. source: `Source`. gray: the orthophoto, levels from 1, 0 where nothing
-    was seen; None where there is none. free_m: float32, upper bound of what may stand in the cell by lines
-    of sight that passed over it, inf where none did; None where no lines of sight are known. tops: gray
-    levels from 1 of the pictures at the height of the tops around (`TopPhoto`), 0 where nothing was seen;
-    None where there is no such photo. passes: number of the newest pass that saw the place, from 1, 0 where
-    none did; None where one pass made the map.
+    Cell (row, column) has its centre at (x0_m + column * cell_m, y0_m + row * cell_m). z_m, sigma_m:
+    float32, NaN where unknown. views: float32. source: `HeightSource`. gray: the orthophoto, levels from
+    1, 0 where nothing was seen; None where there is none. free_m: float32, upper bound of what may stand
+    in the cell by lines of sight that passed over it, inf where none did; None where no lines of sight
+    are known. tops: gray levels from 1 of the pictures at the height of the tops around (`TopPhoto`), 0
+    where nothing was seen; None where there is no such photo. passes: number of the newest pass that saw
+    the place, from 1, 0 where none did; None where one pass made the map.
     """
 
     x0_m: float
@@ -186,6 +186,7 @@ class DoubtKind(Enum):
     OVERLAP = "overlap: one may lie over the other"
     WALL = "it may be a wall"
     MAY_GO_ON = "it may be wider"
+    NO_STRAPS = "no straps that hold it"
     RIVAL = "explains the surface nearly as well"
     OTHER = ""
 

@@ -1,4 +1,4 @@
-"""Build the page's application: its errors, its static files, sessions, and all other routes."""
+"""Build the page's application: its errors, its static files, and all routes."""
 
 from __future__ import annotations
 
@@ -11,11 +11,10 @@ from typing import Any
 import barsight
 from barsight.core.errors import BarsightError, ConfigError
 from barsight.core.extras import extra
-from barsight.page.access import COOKIE, RIGHTS, SESSION_S, Access, AccessError, Caller
-from barsight.page.api.callers import need
+from barsight.page.access import Access, AccessError
 from barsight.page.api.changing import add_accounts, add_alarms, add_calibrations, add_lifts
-from barsight.page.api.forms import LogInForm
 from barsight.page.api.reading import add_files, add_reading, add_targets
+from barsight.page.api.sessions import add_sessions
 from barsight.page.guard import Guard
 from barsight.page.watch import StoreWatch
 
@@ -51,7 +50,7 @@ def build_app(watch: StoreWatch, hosts: frozenset[str], origins: frozenset[str],
     access = Access(lambda: watch.published.accounts)
     _add_errors(app)
     _add_page(app)
-    _add_session(app, access, is_secure=is_secure)
+    add_sessions(app, access, is_secure=is_secure)
     add_reading(app, watch, access)
     add_files(app, watch, access)
     add_lifts(app, watch, access)
@@ -86,32 +85,3 @@ def _add_page(app: FastAPI) -> None:
         if name not in contents:
             raise AccessError(404, "there is no such file")
         return Response(contents[name], media_type=_TYPES[Path(name).suffix])
-
-
-def _add_session(app: FastAPI, access: Access, *, is_secure: bool) -> None:
-    reader = need(access, "read")
-
-    def told(caller: Caller) -> dict[str, Any]:
-        return {
-            "name": caller.name, "role": caller.role, "token": caller.csrf, "rights": RIGHTS[caller.role],
-            "version": barsight.__version__,
-        }  # fmt: skip
-
-    @app.get("/api/session")
-    async def session(caller: Caller = reader) -> dict[str, Any]:
-        return told(caller)
-
-    @app.post("/api/session")
-    def log_in(form: LogInForm, request: Request, response: Response) -> dict[str, Any]:
-        client = request.client.host if request.client else ""
-        cookie, caller = access.log_in(form.name, form.password, client)
-        response.set_cookie(
-            COOKIE, cookie, max_age=int(SESSION_S), httponly=True, samesite="strict", secure=is_secure
-        )
-        return told(caller)
-
-    @app.delete("/api/session")
-    async def log_out(request: Request, response: Response, _: Caller = reader) -> dict[str, str]:
-        access.log_out(request.headers.get("cookie", ""))
-        response.delete_cookie(COOKIE)
-        return {"state": "logged out"}

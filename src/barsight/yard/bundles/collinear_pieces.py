@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from barsight.yard.bundles.fitting.ends import middle_and_length_sigma
-from barsight.yard.types import ENDS, Bundle, Doubt
+from barsight.yard.types import ENDS, Bundle, Doubt, DoubtKind
 
 _SKEW, _ASIDE_RATIO, _LEVEL_M = 0.05, 0.3, 0.04
 """Most that two pieces of one bundle differ by: sine of the skew, way between their axes over the narrower
@@ -75,8 +75,15 @@ def _joined(whole: Bundle, piece: Bundle) -> Bundle | None:
         along_m=middle,
         length_m=length,
     )
-    kept = tuple(doubt for doubt in whole.reasons if doubt.end != side)
-    added = (doubt for doubt in piece.reasons if doubt.end in (None, far) and doubt not in kept)
+    # Straps on one of them hold both.
+    kept, others = (
+        tuple(
+            doubt for doubt in one.reasons if doubt.kind is not DoubtKind.NO_STRAPS or doubt in other.reasons
+        )
+        for one, other in ((whole, piece), (piece, whole))
+    )
+    kept = tuple(doubt for doubt in kept if doubt.end != side)
+    added = (doubt for doubt in others if doubt.end in (None, far) and doubt not in kept)
     reasons = (*kept, *(_at_end(doubt, side) for doubt in added))
     return replace(
         whole, centre_m=ends.mean(axis=0), ends_m=ends, ends_open=(is_open[0], is_open[1]),

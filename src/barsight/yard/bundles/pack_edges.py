@@ -9,7 +9,7 @@ import numpy as np
 from barsight.yard.types import Bundle, Doubt, DoubtKind
 
 DOUBTFUL = 0.4
-"""The most confidence in an outline that straps speak against."""
+"""The most confidence in an outline that straps, or their absence, or the floor speak against."""
 _SKEW, _BESIDE_M, _LEVEL_RATIO = 0.05, 0.3, 0.3
 """Sine of the skew, length beside each other, and height between axes over the mean width: within these two
 bundles lie side by side."""

@@ -18,8 +18,8 @@ class Reading:
     """A chosen outline with its weight (cells explained) and the strongest other reading of its place.
 
     other_packing: rings of another packing that explains the bundles of this kind as well, if any does. pack:
-    the bars that straps hold together there, None where no straps are seen; has_photo: whether they were
-    looked for. is_along_baseline: whether the cameras stand about in line with its bars. flanks: of the pack
+    the bars that straps hold together there, None where no straps are seen; has_photo: whether they would
+    show. is_along_baseline: whether the cameras stand about in line with its bars. flanks: of the pack
     where its bounds are known, else of the outline; None where too little of them is seen.
     """
 

@@ -65,17 +65,23 @@ def held_by_straps(
 
 
 def _without_straps(bundle: Bundle, irregular: BundleSigma, reading: Reading) -> Bundle:
-    """Doubt several bars that can't be counted where the photo shows no straps: they may lie loose, and the
-    outline may be that of some bars of a pack.
-    """
+    """Say of several bars that can't be counted that no straps show where they would."""
     if bundle.bars is not None:
         return bundle
     bundle = replace(bundle, sigma=irregular)
     if not reading.has_photo or reading.found.fit.rings == 0:
         return bundle
-    said = "the photo shows no straps on it: its bars may lie loose, or be some of a wider bundle's"
-    reasons = (*bundle.reasons, Doubt(DoubtKind.OTHER, said))
-    return replace(bundle, confidence=min(bundle.confidence, DOUBTFUL), reasons=reasons)
+    said = "the photo shows no straps that hold it: its bars may lie loose, or be some of a wider bundle's"
+    return replace(bundle, reasons=(*bundle.reasons, Doubt(DoubtKind.NO_STRAPS, said)))
+
+
+def doubted_without_straps(bundle: Bundle) -> Bundle:
+    """Doubt several bars that can't be counted, and on which neither the photo nor the pictures show straps:
+    they may lie loose, and the outline may be that of some bars of a pack.
+    """
+    if not any(doubt.kind is DoubtKind.NO_STRAPS for doubt in bundle.reasons):
+        return bundle
+    return replace(bundle, confidence=min(bundle.confidence, DOUBTFUL))
 
 
 def _may_go_on(pack: Pack, seen: SeenSection | None) -> bool:
@@ -218,7 +224,7 @@ def _pack_sigma(reading: Reading, pack: Pack) -> float:
 
 def _bulge(reading: Reading, pack: Pack) -> float:
     """Compute the standard deviation of how much wider a pack is where nothing was seen behind its flanks."""
-    return bulge_sigma(pack.hidden_m, is_along_baseline=reading.is_along_baseline)
+    return bulge_sigma(pack.hidden_m, pack.width_m, is_along_baseline=reading.is_along_baseline)
 
 
 def without_pieces(bundles: list[Bundle], readings: list[Reading]) -> list[Bundle]:

@@ -91,5 +91,5 @@ def _flank(outwards: Float64, level: Float64, crest: float, width: float) -> tup
     before = crest - inner[np.isfinite(inner)].min(initial=crest)
     rise = beyond[np.isfinite(beyond)].max(initial=-np.inf) - crest
     seen = own[~np.isnan(own)]
-    lowest = seen.min() if seen.size else crest if rise > _HIGHER_M else -np.inf
+    lowest = seen.min() if seen.size else crest if own.size and rise > _HIGHER_M else -np.inf
     return float(before), float(crest - lowest), float(rise)

@@ -145,12 +145,17 @@ def is_no_hexagon(seen: SeenSection | None, fit: Fit, top_m: float, floor_m: flo
     return ""
 
 
-def bulge_sigma(hidden_m: tuple[float, float], *, is_along_baseline: bool) -> float:
+def bulge_sigma(hidden_m: tuple[float, float], width_m: float, *, is_along_baseline: bool) -> float:
     """Estimate the standard deviation, m, of how much wider a bundle is where nothing was seen behind its
-    flanks. Of bars along the cameras' baseline single ones aren't matched at all: there all of what wasn't
-    seen may be bars.
+    flanks.
+
+    Of bars along the cameras' baseline single ones aren't matched at all: there all of what wasn't seen, h,
+    may be bars, and the section's bound, which 2 h / w raises, holds with (1 + h / w)^2 = 1 + 2 h' / w.
     """
-    return sum(hidden_m) / UPPER if is_along_baseline else _BULGE_RATIO * math.hypot(*hidden_m)
+    if not is_along_baseline:
+        return _BULGE_RATIO * math.hypot(*hidden_m)
+    h = sum(hidden_m)
+    return h * (1 + h / (2 * width_m)) / UPPER
 
 
 def estimate_section(
@@ -170,7 +175,7 @@ def estimate_section(
         return np.nan, np.nan
     fill = _FILL_RATIO if fit.rings else _BAR_FILL_RATIO
     off_m = _OUTLINE_RATIO * (seen.width_m - fit.width_m)
-    bulge_m = bulge_sigma(seen.hidden_m, is_along_baseline=is_along_baseline)
+    bulge_m = bulge_sigma(seen.hidden_m, seen.width_m, is_along_baseline=is_along_baseline)
     sigma_m = math.hypot(_SEEN_WIDTH_SIGMA_M, off_m, bulge_m)
     return section_of_pack(seen.width_m, sigma_m, over_floor(top_m, floor_m), fill)
 
@@ -194,9 +199,7 @@ def section_of_pack(
         height = cut - min(prior.stdev * (slope + at), cut / 2)
         height_sigma = prior.stdev * math.sqrt(1 - at * slope - slope**2)
     section = fill[0] * height * width_m**2
-    wider = width_sigma_m / width_m
-    # The upper bound of the width squared, (1 + UPPER wider)^2, is what counts, not its slope alone.
-    share = np.linalg.norm([fill[1] / fill[0], height_sigma / height, wider * (2 + UPPER * wider)])
+    share = np.linalg.norm([fill[1] / fill[0], height_sigma / height, 2 * width_sigma_m / width_m])
     widest = width_m + UPPER * width_sigma_m
     most = _MAX_FILL_RATIO * min(over_floor_m, MAX_HEIGHT_RATIO * widest) * widest
     return section, min(section * float(share), (most - section) / UPPER)

@@ -48,6 +48,8 @@ MIN_STRAPS, MIN_ROWS = 2, 20
 """Fewest straps that hold a bundle, and rows of the map that tell its mean section."""
 _LINE_M, _END_M = 0.05, 0.08
 """Half the length along the bars over which a strap's place is averaged, and the width of either end."""
+_SHOWN_RATIO = 0.9
+"""Least share of a bundle in the photo for straps that don't show to tell anything."""
 APART_M = 0.3
 """Lines nearer to each other along the bars are one strap."""
 
@@ -133,6 +135,14 @@ def _span(
     along = tuple(_row_at_ends(own, row, cell_m) for row in np.sort(rows).tolist())
     spread = float(np.median(np.abs(ends - (low, high)), axis=0).max())
     return StrapSpan(float(across[0]), float(across[1]), along, cell_m * spread)
+
+
+def is_photographed(height_map: HeightMap, grid: AlignedMap, fit: Fit) -> bool:
+    """Check whether the orthophoto has nearly all of a bundle's middle, where straps would show."""
+    if height_map.gray is None:
+        return False
+    beside, gray, _, _ = _around(height_map, grid, fit)
+    return bool(np.isfinite(gray[:, np.abs(beside) < fit.width_m / 4]).mean() > _SHOWN_RATIO)
 
 
 def _around(height_map: HeightMap, grid: AlignedMap, fit: Fit) -> tuple[Float64, Float32, Float32, Bool]:

@@ -1,0 +1,45 @@
+"""Find the bundles of a mapped yard: in its map, then in its pictures."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from barsight.bundle_pictures.measuring import measure_from_pictures
+from barsight.core.arrays import Float64
+from barsight.labels.bundle_labels import label_bundles
+from barsight.pipeline.mapped_yard import MappedYard
+from barsight.reconstruction.joined_passes import MappedPass
+from barsight.yard.bundles.bundle_kinds import listed_diameter
+from barsight.yard.bundles.detection import find_bundles
+from barsight.yard.bundles.strapped_bundles import doubted_without_straps
+from barsight.yard.types import Bundle, YardMap
+
+
+def find_yard_bundles(mapped: MappedYard, heights: YardMap) -> tuple[Bundle, ...]:
+    """Find the bundles, and look at their bars, straps and labels in the newest pass's pictures: what lay
+    there before may be gone.
+    """
+    settings, newest = mapped.settings, mapped.newest
+    poses = {frame.stamp_ns: frame.reference_from_body for frame in newest.way.trajectory.frames}
+    with mapped.watch("bundles"):
+        bundles = find_bundles(heights, settings.bundles, _baseline(newest))
+        if mapped.joined is not None:
+            bundles = mapped.joined.doubted(bundles)
+    with mapped.watch("pictures"):
+        used = set(newest.built.stamps_ns)
+        seen = {stamp: pose for stamp, pose in poses.items() if stamp in used}
+        measured = measure_from_pictures(newest.probed.pairs, seen, heights, bundles)
+        listed = (listed_diameter(bundle, settings.bundles.catalogue_mm) for bundle in measured)
+        bundles = tuple(doubted_without_straps(bundle) for bundle in listed)
+    if not settings.labels.read:
+        return bundles
+    with mapped.watch("labels"):
+        return label_bundles(newest.probed.pairs, poses, heights, bundles, settings.labels)
+
+
+def _baseline(one: MappedPass) -> Float64:
+    """Average the level unit vector (2,) from the left camera to the right one."""
+    right = one.way.rectifier.body_from_rect0.rotation[:, 0]
+    poses = (frame.reference_from_body for frame in one.way.trajectory.frames)
+    mean = np.mean([pose.rotation @ right for pose in poses], axis=0)[:2]
+    return np.asarray(mean / np.linalg.norm(mean))
