@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 
 from barsight.core.records.heights import HeightSource
-from barsight.yard.lifting.clearance import BEAM_CLEAR_M
+from barsight.yard.lifting.clearance import BEAM_CLEAR_M, leaning_checks
+from barsight.yard.magnet.contact import Contact
+from barsight.yard.magnet.description import Tolerance
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.types import HeightMap
+from barsight.yard.vetoes import vetoes_of
 from lift_yards import MAGNET, SIGMA, codes, judged, laid, map_of, record
 
 TOP_M = laid(0.3).top_z_m
@@ -153,3 +156,20 @@ def test_faces_must_rest_on_the_load_itself() -> None:
     assert found(heights) == {"obstructed"}
     unsure = record(laid(0.3), sigma=replace(SIGMA, top_z_m=float("nan")))
     assert "obstructed" in codes(judged([laid(0.3)], (unsure,), Placement(0.3, 0.0, 0.0), heights=heights))
+
+
+@pytest.mark.parametrize(("roll_deg", "down_m", "passes"), [
+    (0.0, 0.012, True), (0.0, 0.016, False), (-6.0, 0.001, True), (6.0, 0.007, False), (-6.0, 0.007, False),
+])  # fmt: skip
+def test_the_loads_top_does_not_stand_above_leaning_faces(
+    roll_deg: float, down_m: float, *, passes: bool
+) -> None:
+    """A map cuts crests off: the faces may lie lower than the fitted top, and lean down from there."""
+    bundle, place = record(laid(0.3)), Placement(0.3, 0.0, 0.0)
+    heights = np.full(len(MAGNET.poles), bundle.top_z_m - down_m)
+    contact = Contact(bundle.top_z_m - down_m, heights, 0.0, np.radians(roll_deg), 0.0, 0.004, 0.0005, ())
+    narrow = replace(MAGNET, tolerance=Tolerance(0.02, 0.02, 0.2))
+    (check,) = leaning_checks(place, narrow, contact, (bundle,))
+    half_m = MAGNET.pole_table[0, 3] / 2 + 0.02
+    assert check.value == pytest.approx(1e3 * (down_m + half_m * np.tan(np.radians(abs(roll_deg)))), abs=0.01)
+    assert (not vetoes_of([check])) is passes

@@ -20,7 +20,13 @@ from barsight.yard.lifting.checks import (
     probability_check,
     unknown_check,
 )
-from barsight.yard.lifting.clearance import FacePlane, clearance_checks, find_obstacle, resting_checks
+from barsight.yard.lifting.clearance import (
+    FacePlane,
+    clearance_checks,
+    find_obstacle,
+    leaning_checks,
+    resting_checks,
+)
 from barsight.yard.lifting.labels import label_checks
 from barsight.yard.lifting.set_down import SetDown
 from barsight.yard.lifting.thin_bars import (
@@ -156,6 +162,7 @@ def assess_placement(
         *share_checks(weakest),
         *clearance_checks(place, yard.heights, magnet, contact, load),
         *resting_checks(place, magnet, contact, load),
+        *leaning_checks(place, magnet, contact, load),
         *load_checks(load, mass, offset, overhang, magnet, settings),
         *(check for b in load for check in footing_checks(b, near.bundles, yard.footings, settings)),
     ]

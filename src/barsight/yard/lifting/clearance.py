@@ -28,6 +28,9 @@ STRAY_FIELD_M = 0.03
 """Steel this near to a face or the beam is drawn to it."""
 MAX_RISE_M = 0.012
 """A patch that the map shows this much above the faces' plane obstructs, by medians over 50 mm squares."""
+MAX_TOP_RISE_M = 0.014
+"""So far the load's own top, as its outline was fitted, may stand above the plane where that lies lowest: a
+map cuts crests of thick bars off by some 6 mm."""
 MAX_NARROW_RISE_M = 0.020
 """The same for what is too narrow for those: by medians over 30 mm squares."""
 MAX_THIN_RISE_M, MIN_THIN_CELLS = 0.05, 8
@@ -205,14 +208,10 @@ def resting_checks(
     """Check that nothing lies between the faces and the load: that no face rests above its top."""
     if not load:
         return []
-    poles = magnet.pole_table[:, :2] @ np.stack([place.along, place.across]) + (place.x_m, place.y_m)
-    above, sigmas = [], []
-    for bundle in load:
-        axis = np.array([-math.sin(bundle.yaw_rad), math.cos(bundle.yaw_rad)])
-        top = bundle.top_z_m + (poles - bundle.centre_m[:2]) @ axis * math.tan(bundle.pitch_rad)
-        sigmas.append(float(np.nan_to_num(bundle.sigma.top_z_m)))
-        above.append(contact.z_m - top - UPPER * sigmas[-1])
-    highest, sigma = 1e3 * float(np.min(above, axis=0).max()), 1e3 * max(sigmas)
+    above = contact.z_m - _tops(place, magnet, load)
+    sigmas = np.array([float(np.nan_to_num(bundle.sigma.top_z_m)) for bundle in load])
+    highest = 1e3 * float((above - UPPER * sigmas[:, None]).min(axis=0).max())
+    sigma = 1e3 * float(sigmas.max())
     return [
         check_max(
             "obstructed", "how far a face surely rests above the load's top", highest - sigma,
@@ -220,6 +219,37 @@ def resting_checks(
             f"{1e3 * MAX_RISE_M:.0f} mm are allowed: something lies between", sigma=sigma,
         )
     ]  # fmt: skip
+
+
+def leaning_checks(
+    place: Placement, magnet: Magnet, contact: Contact, load: tuple[Bundle, ...]
+) -> list[Check]:
+    """Check that the load's top doesn't stand above the faces where they lean lowest within the crane's
+    tolerance.
+    """
+    if not load:
+        return []
+    slack = float(np.abs(place.across) @ (magnet.tolerance.x_m, magnet.tolerance.y_m))
+    down = (magnet.pole_table[:, 3] / 2 + slack) * math.tan(abs(contact.roll_rad))
+    rise = 1e3 * float((_tops(place, magnet, load) - contact.z_m + down).max())
+    return [
+        check_max(
+            "obstructed", "how far the load's top stands above the faces where they lean lowest", rise,
+            1e3 * MAX_TOP_RISE_M, "mm", f"the load's top stands {rise:.0f} mm above the faces where they "
+            f"lean lowest within the crane's tolerance, {1e3 * MAX_TOP_RISE_M:.0f} mm are allowed",
+            sigma=1e3 * contact.gap_sigma_m,
+        )
+    ]  # fmt: skip
+
+
+def _tops(place: Placement, magnet: Magnet, load: tuple[Bundle, ...]) -> Float64:
+    """Compute the heights (bundles, poles) of the load's tops where the poles are."""
+    poles = magnet.pole_table[:, :2] @ np.stack([place.along, place.across]) + (place.x_m, place.y_m)
+    tops = []
+    for bundle in load:
+        axis = np.array([-math.sin(bundle.yaw_rad), math.cos(bundle.yaw_rad)])
+        tops.append(bundle.top_z_m + (poles - bundle.centre_m[:2]) @ axis * math.tan(bundle.pitch_rad))
+    return np.array(tops)
 
 
 def _obstructed(rise: Float32, spare: Float32, region: Region) -> Obstacle | None:
