@@ -288,7 +288,7 @@ CONCLUSIONS = (
     PaperEntry(
         "conclusion",
         1,
-        ("pipeline:map_yard",),
+        ("pipeline.mapped_yard:map_yard",),
         "Stereo and IMU give the stack in 3D.",
         "The paper's method runs on stereo and IMU alone; ours beside it, without encoders and with.",
         ODOMETRY,
@@ -320,7 +320,7 @@ CONCLUSIONS = (
     PaperEntry(
         "conclusion",
         5,
-        ("pipeline:find_lifts",),
+        ("pipeline.lift_choice:find_lifts",),
         "It is a foundation for automatic lifting.",
         "Ours goes on to bundles and, for a magnet, to lifts; each is refused where a check isn't met.",
         "barsight lifts OUT --magnet MAGNET",
