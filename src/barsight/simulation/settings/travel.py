@@ -36,7 +36,7 @@ class TravelSettings:
     trolley_m: float = 0.0
     """Travel of the trolley during the pass."""
     backward: bool = False
-    """Whether the bridge travels from high X to low X."""
+    """The bridge travels from high X to low X."""
     begin_s: float = 0.0
     """Time after the simulation's epoch at which the recording begins."""
     oscillation_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -94,8 +94,8 @@ class PassesSettings:
     pause_s: float = 120.0
     """Time from one pass's end to the next one's begin."""
     changes: tuple[Literal["taken", "added", "moved"], ...] = ()
-    """What happens before the last pass to bundles on top, to one each: it is taken away, only comes then, or
-    is moved half a metre along itself."""
+    """Changes to bundles on top before the last pass, to one each: it is taken away, only comes then, or is
+    moved half a metre along itself."""
 
     def __post_init__(self) -> None:
         expect_ranges(self, "passes.", trolley_y_m=(-50, 50), pause_s=(0, 1e6))

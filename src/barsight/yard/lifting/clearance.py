@@ -16,6 +16,7 @@ import numpy as np
 from barsight.core.arrays import Bool, Float32, Float64, UInt8, kernel
 from barsight.core.records.heights import HeightSource
 from barsight.yard.lift_settings import UPPER
+from barsight.yard.lifting.load import tops_at
 from barsight.yard.lifting.unseen import wide_parts
 from barsight.yard.magnet.contact import Contact
 from barsight.yard.magnet.description import Magnet
@@ -244,12 +245,8 @@ def leaning_checks(
 
 def _tops(place: Placement, magnet: Magnet, load: tuple[Bundle, ...]) -> Float64:
     """Compute the heights (bundles, poles) of the load's tops where the poles are."""
-    poles = magnet.pole_table[:, :2] @ np.stack([place.along, place.across]) + (place.x_m, place.y_m)
-    tops = []
-    for bundle in load:
-        axis = np.array([-math.sin(bundle.yaw_rad), math.cos(bundle.yaw_rad)])
-        tops.append(bundle.top_z_m + (poles - bundle.centre_m[:2]) @ axis * math.tan(bundle.pitch_rad))
-    return np.array(tops)
+    axes = np.stack([place.along, place.across])
+    return tops_at(load, magnet.pole_table[:, :2] @ axes + (place.x_m, place.y_m))
 
 
 def _obstructed(rise: Float32, spare: Float32, region: Region) -> Obstacle | None:

@@ -98,3 +98,12 @@ def axes_of(yaw_rad: float) -> Float64:
     """Return unit vectors (2, 2): across an axis and along it."""
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     return np.array([[cos, sin], [-sin, cos]])
+
+
+def tops_at(bundles: tuple[Bundle, ...], places_m: Float64) -> Float64:
+    """Compute the heights (bundles, N) of bundles' tops at level places (N, 2) along them."""
+    along = [(places_m - bundle.centre_m[:2]) @ axes_of(bundle.yaw_rad)[1] for bundle in bundles]
+    return np.array([
+        bundle.top_z_m + away * math.tan(bundle.pitch_rad)
+        for bundle, away in zip(bundles, along, strict=True)
+    ])  # fmt: skip
