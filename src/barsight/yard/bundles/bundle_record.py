@@ -26,6 +26,7 @@ from barsight.yard.bundles.fitting.outline_fit import (
     FittedOutline,
     U,
     Z,
+    find_bow,
 )
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.fitting.settings import BundleSettings
@@ -42,6 +43,8 @@ from barsight.yard.types import Bundle, BundleSigma, DoubtKind, FitSigma, YardMa
 _SLOPE_RATIO = 0.6
 """Of the slope's sigma that errors alike over `correlated_along_m` would give: what is alike over so long a
 way moves the bundle aside and turns it little."""
+_BOW_RATIO = 0.15
+"""Of the angle between the two halves of bars that bow: error of the heading that is fitted to both."""
 
 
 def describe_bundles(
@@ -96,7 +99,7 @@ def make_bundle(
     section, section_sigma = estimate_section(
         seen, fit, top_z, floor_m, is_along_baseline=reading.is_along_baseline
     )
-    own = _sigma(fit, ends, top, settings)
+    own = _sigma(reading.found, ends, top, settings)
     bundle = Bundle(
         id=0,
         centre_m=centre,
@@ -153,8 +156,9 @@ def _in_map(grid: AlignedMap, fit: Fit, v_m: float) -> Float64:
     return np.append(grid.to_map(np.array([[u, v_m]]))[0], z)
 
 
-def _sigma(fit: Fit, ends: list[End], top: float, settings: BundleSettings) -> BundleSigma:
+def _sigma(one: FittedOutline, ends: list[End], top: float, settings: BundleSettings) -> BundleSigma:
     """Propagate the fit's covariance to each figure, with the parts that the whole map shares."""
+    fit = one.fit
     along = (ends[0].v_m + ends[1].v_m) / 2 - fit.v_m
     covariance = fit.covariance
     at_middle = np.zeros((2, 6))
@@ -164,14 +168,12 @@ def _sigma(fit: Fit, ends: list[End], top: float, settings: BundleSettings) -> B
     lateral, height = np.sqrt(np.maximum(np.diag(at_middle @ covariance @ at_middle.T), 0))
     diameter = float(np.sqrt(covariance[DIAMETER, DIAMETER]))
     middle, length = middle_and_length_sigma((ends[0].sigma_m, ends[1].sigma_m))
+    slope = _SLOPE_RATIO * np.sqrt(covariance[SLOPE_U, SLOPE_U])
+    turned = slope, _BOW_RATIO * find_bow(one, settings), np.radians(settings.shared_yaw_deg)
     return BundleSigma(
         lateral_m=float(np.hypot(lateral, settings.shared_lateral_m)),
         along_m=middle,
-        yaw_rad=float(
-            np.hypot(
-                _SLOPE_RATIO * np.sqrt(covariance[SLOPE_U, SLOPE_U]), np.radians(settings.shared_yaw_deg)
-            )
-        ),
+        yaw_rad=float(np.linalg.norm(turned)),
         length_m=length,
         width_m=bundle_width(fit.rings, diameter),
         top_z_m=float(np.hypot(height, settings.shared_height_m)),

@@ -25,6 +25,8 @@ UNKNOWN, AGREES, ABOVE, BELOW, MIXED = range(5)
 """What a row of the map says of a bundle's outline."""
 _ROWS_ENOUGH = 150
 """Neighbouring rows err alike, so more of them than this only cost time."""
+_HALF_STEPS = 3
+"""Gauss-Newton steps from the whole bundle's outline to that of a half."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,6 +137,19 @@ def refine_outline(
         start, v_m=v_m, values=values, covariance=covariance, first=rows[0], last=rows[1], rms_m=rms,
         sigma_m=sigma,
     )  # fmt: skip
+
+
+def find_bow(one: FittedOutline, settings: BundleSettings) -> float:
+    """Compute by how much a bundle's second half runs on another heading than its first, rad: 4 b / L of bars
+    of length L that bow by b. 0 where a half alone holds no outline.
+    """
+    fit, middle = one.fit, (one.fit.first + one.fit.last) // 2
+    halves = [
+        refine_outline(one.grid, replace(fit, first=first, last=last), settings, _HALF_STEPS)
+        for first, last in ((fit.first, middle), (middle + 1, fit.last))
+    ]
+    slopes = [half.values[SLOPE_U] for half in halves if half is not None]
+    return float(abs(slopes[1] - slopes[0])) if len(slopes) == 2 else 0.0
 
 
 def widen_fit(fit: Fit, settings: BundleSettings) -> Fit:
