@@ -82,7 +82,7 @@ def find_bearing(
     something may stand in its way.
     """
     axes = axes_of(yaw_rad)
-    slack = np.abs(axes) @ (magnet.tolerance.x_m, magnet.tolerance.y_m)
+    slack = magnet.tolerance.along(axes)
     slack[0] += load.length_m / 2 * math.radians(magnet.tolerance.yaw_deg)
     around = _surroundings(yard, load, (x_m, y_m), yaw_rad, slack + settings.set_down_clear_m, magnet)
     clear = _within(around, load, slack + settings.set_down_clear_m)

@@ -280,7 +280,7 @@ def _unexplained(
 
     What lies in the wider margin of the load may be another's: as far beyond, the surface is looked at too.
     """
-    across = abs(place.across) @ (magnet.tolerance.x_m, magnet.tolerance.y_m)
+    across = magnet.tolerance.along(place.across)
     outlines = np.empty((len(near.bundles), 8))
     rectangles = near.rectangles
     outlines[:, :2], outlines[:, 2:4] = rectangles.centre, rectangles.along

@@ -230,7 +230,7 @@ def leaning_checks(
     """
     if not load:
         return []
-    slack = float(np.abs(place.across) @ (magnet.tolerance.x_m, magnet.tolerance.y_m))
+    slack = float(magnet.tolerance.along(place.across))
     down = (magnet.pole_table[:, 3] / 2 + slack) * math.tan(abs(contact.roll_rad))
     rise = 1e3 * float((_tops(place, magnet, load) - contact.z_m + down).max())
     return [
@@ -328,9 +328,9 @@ def _region(place: Placement, heights: HeightMap, magnet: Magnet, wider_m: float
     """Lay the grid, a hole's width wider than the region, for a crane that may miss by its tolerance and
     `wider_m`. It lies on the map's cells: none comes or goes as the place moves, but at the region's edge.
     """
-    beam, slack = magnet.beam, np.array([magnet.tolerance.x_m, magnet.tolerance.y_m])
+    beam = magnet.beam
     frame = np.array([[place.x_m, place.y_m], place.along, place.across])
-    more = np.abs(frame[1:]) @ slack
+    more = magnet.tolerance.along(frame[1:])
     parts = np.empty((len(magnet.poles) + 1, 5))
     parts[:-1, :4] = magnet.pole_table * (1, 1, 0.5, 0.5)
     parts[:-1, 4] = MAX_RISE_M

@@ -68,11 +68,10 @@ def find_label(
     where there is none.
     """
     poles, tolerance = magnet.pole_table, magnet.tolerance
-    slack = np.array([tolerance.x_m, tolerance.y_m])
     turned = math.radians(tolerance.yaw_deg)
     wide = float((np.abs(poles[:, 1]) + poles[:, 3] / 2).max())
-    long = float(np.abs(place.along) @ slack) + turned * wide + EDGE_M
-    broad = float(np.abs(place.across) @ slack) + turned * magnet.half_span_m + EDGE_M
+    long = float(tolerance.along(place.along)) + turned * wide + EDGE_M
+    broad = float(tolerance.along(place.across)) + turned * magnet.half_span_m + EDGE_M
     v, u = _steps(magnet.half_span_m + long + BESIDE_M), _steps(wide + broad + BESIDE_M)
     gray, z_m = _look_up(place, heights, v, u)
     faces_z_m = plane.centre_z_m + math.tan(plane.pitch_rad) * v[:, None] + math.tan(plane.roll_rad) * u

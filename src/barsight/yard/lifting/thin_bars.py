@@ -138,7 +138,7 @@ def _under_m(place: Placement, magnet: Magnet) -> Float64:
     """Compute half the length and half the width (2,) under the magnet, within the crane's tolerance and the
     stray field.
     """
-    slack = abs(np.stack([place.along, place.across])) @ (magnet.tolerance.x_m, magnet.tolerance.y_m)
+    slack = magnet.tolerance.along(np.stack([place.along, place.across]))
     half = np.array([magnet.size_m[1], magnet.size_m[0]]) / 2 + slack + STRAY_FIELD_M
     return np.asarray(half + math.radians(magnet.tolerance.yaw_deg) * half[::-1])
 

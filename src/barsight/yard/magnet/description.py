@@ -64,6 +64,10 @@ class Tolerance:
         within = min(self.x_m, self.y_m) >= 0 and max(self.x_m, self.y_m) <= 1 and 0 <= self.yaw_deg <= 20
         expect(within, "tolerance x_m and y_m lie between 0 and 1, yaw_deg between 0 and 20")
 
+    def along(self, axes: Float64) -> Float64:
+        """Return the largest miss (...), m, along level unit vectors (..., 2), but for the turn's."""
+        return np.asarray(np.abs(axes) @ (self.x_m, self.y_m), np.float64)
+
 
 @dataclass(frozen=True)
 class Limits:
