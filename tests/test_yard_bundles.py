@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from barsight.core.arrays import Float64
 from barsight.core.errors import ConfigError
 from barsight.core.records.heights import HeightSource
-from barsight.pipeline import bundle_search
-from barsight.reconstruction.joined_passes import MappedPass
 from barsight.yard.bundles import detection
 from barsight.yard.bundles.bundle_kinds import listed_diameter
 from barsight.yard.bundles.collinear_pieces import join_pieces
@@ -22,7 +20,7 @@ from barsight.yard.bundles.detection import _on, find_bundles
 from barsight.yard.bundles.doubts import measure_laid
 from barsight.yard.bundles.fitting.ends import middle_and_length_sigma
 from barsight.yard.bundles.fitting.outline import TRIANGLE, bundle_width
-from barsight.yard.bundles.fitting.outline_fit import AGREES, Fit, FittedOutline, find_bow
+from barsight.yard.bundles.fitting.outline_fit import AGREES, Fit, FittedOutline, compare_halves
 from barsight.yard.bundles.fitting.outline_fit import Z as OUTLINE_Z
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.fitting.settings import BundleSettings
@@ -103,36 +101,44 @@ def test_single_heavy_bars_are_bundles_of_one() -> None:
 
 @dataclass(frozen=True)
 class Bowed(Laid):
-    """Bars whose middle lies this far beside the line through their ends."""
+    """Bars whose middle lies this far beside the line through their ends; is_s: their quarters, to both
+    sides.
+    """
 
     bow_m: float = 0.012
+    is_s: bool = False
 
     def over(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        aside = self.bow_m * (1 - (2 * (y - self.y_m) / self.length_m) ** 2)
+        v = 2 * (y - self.y_m) / self.length_m
+        aside = self.bow_m * (np.sin(np.pi * v) if self.is_s else 1 - v**2)
         return super().over(x - aside, y)
 
 
-@pytest.mark.parametrize("bow_m", [0.012, 0.006, 0.0])
-def test_bars_that_bow_widen_the_heading(bow_m: float) -> None:
-    laid, found = Bowed(0.6, 0.0, 0.225, 0.0, length_m=3.6, bow_m=bow_m), []
-    keep = detection.make_bundle
+def bowed(laid: Laid) -> tuple[Bundle, tuple[float, float]]:
+    """Find the one bundle, and compare its halves."""
+    found, make = [], detection.make_bundle
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(detection, "make_bundle", lambda *args: found.append(args[0]) or keep(*args))
-        bundle = nearest(find_bundles(draw([laid]), SETTINGS), laid)
-    bow = find_bow(found[0].found, SETTINGS)
-    assert bow == pytest.approx(4 * bow_m / laid.length_m, abs=1.5e-3)
-    assert abs(bundle.yaw_rad) < 2 * bundle.sigma.yaw_rad
-    assert (bundle.sigma.yaw_rad > np.radians(0.05)) == (bow_m > 0)
+        patch.setattr(detection, "make_bundle", lambda *args: found.append(args[0].found) or make(*args))
+        (bundle,) = find_bundles(draw([laid]), SETTINGS)
+    return bundle, compare_halves(found[0], SETTINGS)
 
 
-def test_what_the_trajectory_does_not_know_of_its_heading_turns_the_bundles() -> None:
-    found = find_bundles(draw([Laid(0.6, 0.0, 0.225, 0.0)]), SETTINGS)[0]
-    covariance = np.diag(np.radians([0.5, 0.5, 0.3, 0, 0, 0]) ** 2)
-    way = SimpleNamespace(trajectory=SimpleNamespace(frames=[SimpleNamespace(covariance=covariance)] * 3))
-    heading = bundle_search._heading_sigma(cast(MappedPass, SimpleNamespace(way=way)))
-    turned = bundle_search._turned(found, heading)
-    assert turned.sigma.yaw_rad == pytest.approx(np.hypot(found.sigma.yaw_rad, np.radians(0.3)))
-    assert turned.sigma.lateral_m == found.sigma.lateral_m
+@pytest.mark.parametrize("length_m", [3.6, 1.5])
+@pytest.mark.parametrize("bow_m", [0.012, 0.006])
+def test_bars_that_bow_widen_the_heading(bow_m: float, length_m: float) -> None:
+    laid = Bowed(0.6, 0.0, 0.225, 0.0, length_m=length_m, bow_m=bow_m)
+    bundle, (bow, _) = bowed(laid)
+    straight, (none, turn) = bowed(replace(laid, bow_m=0.0))
+    assert bow == pytest.approx(4 * bow_m / length_m, rel=0.25)
+    assert none < 2e-3 and turn < 1e-3
+    assert bundle.sigma.yaw_rad**2 - straight.sigma.yaw_rad**2 > (0.1 * bow) ** 2
+    assert np.radians(0.03) < straight.sigma.yaw_rad < np.radians(0.06) * 3.6 / length_m
+
+
+def test_halves_that_run_on_another_heading_than_the_whole_widen_it() -> None:
+    bundle, (_, turn) = bowed(Bowed(0.6, 0.0, 0.225, 0.0, length_m=3.6, is_s=True))
+    assert turn > 0.5 * abs(bundle.yaw_rad) > np.radians(0.1)
+    assert abs(bundle.yaw_rad) < 4 * bundle.sigma.yaw_rad
 
 
 class HungBelow(Laid):

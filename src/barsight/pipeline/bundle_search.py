@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from barsight.bundle_pictures.measuring import measure_from_pictures
@@ -32,24 +30,11 @@ def find_yard_bundles(mapped: MappedYard, heights: YardMap) -> tuple[Bundle, ...
         seen = {stamp: pose for stamp, pose in poses.items() if stamp in used}
         measured = measure_from_pictures(newest.probed.pairs, seen, heights, bundles)
         listed = (listed_diameter(bundle, settings.bundles.catalogue_mm) for bundle in measured)
-        heading = _heading_sigma(newest)
-        bundles = tuple(_turned(doubted_without_straps(bundle), heading) for bundle in listed)
+        bundles = tuple(doubted_without_straps(bundle) for bundle in listed)
     if not settings.labels.read:
         return bundles
     with mapped.watch("labels"):
         return label_bundles(newest.probed.pairs, poses, heights, bundles, settings.labels)
-
-
-def _heading_sigma(one: MappedPass) -> float:
-    """Return the median standard deviation of the body's heading, rad: it turns the whole map."""
-    variances = [frame.covariance[2, 2] for frame in one.way.trajectory.frames]
-    return float(np.sqrt(np.median(variances)))
-
-
-def _turned(bundle: Bundle, heading_rad: float) -> Bundle:
-    """Add the trajectory's standard deviation of heading to a bundle's yaw."""
-    yaw = float(np.hypot(bundle.sigma.yaw_rad, heading_rad))
-    return replace(bundle, sigma=replace(bundle.sigma, yaw_rad=yaw))
 
 
 def _baseline(one: MappedPass) -> Float64:

@@ -26,7 +26,7 @@ from barsight.yard.bundles.fitting.outline_fit import (
     FittedOutline,
     U,
     Z,
-    find_bow,
+    compare_halves,
 )
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.fitting.settings import BundleSettings
@@ -43,8 +43,9 @@ from barsight.yard.types import Bundle, BundleSigma, DoubtKind, FitSigma, YardMa
 _SLOPE_RATIO = 0.6
 """Of the slope's sigma that errors alike over `correlated_along_m` would give: what is alike over so long a
 way moves the bundle aside and turns it little."""
-_BOW_RATIO = 0.15
-"""Of the angle between the two halves of bars that bow: error of the heading that is fitted to both."""
+_BOW_RATIO, _TURN_RATIO = 0.15, 0.5
+"""Of the angle between the two halves of bars that bow, and between their mean and the whole: error of the
+heading that is fitted to both."""
 
 
 def describe_bundles(
@@ -169,7 +170,8 @@ def _sigma(one: FittedOutline, ends: list[End], top: float, settings: BundleSett
     diameter = float(np.sqrt(covariance[DIAMETER, DIAMETER]))
     middle, length = middle_and_length_sigma((ends[0].sigma_m, ends[1].sigma_m))
     slope = _SLOPE_RATIO * np.sqrt(covariance[SLOPE_U, SLOPE_U])
-    turned = slope, _BOW_RATIO * find_bow(one, settings), np.radians(settings.shared_yaw_deg)
+    bow, turn = compare_halves(one, settings)
+    turned = slope, _BOW_RATIO * bow, _TURN_RATIO * turn, np.radians(settings.shared_yaw_deg)
     return BundleSigma(
         lateral_m=float(np.hypot(lateral, settings.shared_lateral_m)),
         along_m=middle,

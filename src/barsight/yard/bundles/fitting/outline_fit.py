@@ -139,17 +139,22 @@ def refine_outline(
     )  # fmt: skip
 
 
-def find_bow(one: FittedOutline, settings: BundleSettings) -> float:
-    """Compute by how much a bundle's second half runs on another heading than its first, rad: 4 b / L of bars
-    of length L that bow by b. 0 where a half alone holds no outline.
+def compare_halves(one: FittedOutline, settings: BundleSettings) -> tuple[float, float]:
+    """Fit both halves of a bundle alone: how far apart their slopes are, 4 b / L of bars of length L that bow
+    by b, and how far the mean of both is off the whole's.
+
+    A half that holds no outline alone may bow by all that agrees with the whole's.
     """
     fit, middle = one.fit, (one.fit.first + one.fit.last) // 2
-    halves = [
-        refine_outline(one.grid, replace(fit, first=first, last=last), settings, _HALF_STEPS)
+    finer = replace(settings, slice_m=settings.slice_m / 2)
+    slopes = [
+        float(half.values[SLOPE_U])
         for first, last in ((fit.first, middle), (middle + 1, fit.last))
+        if (half := refine_outline(one.grid, replace(fit, first=first, last=last), finer, _HALF_STEPS))
     ]
-    slopes = [half.values[SLOPE_U] for half in halves if half is not None]
-    return float(abs(slopes[1] - slopes[0])) if len(slopes) == 2 else 0.0
+    if len(slopes) < 2:
+        return 4 * settings.agreement_m / (one.grid.cell_m * (fit.last - fit.first + 1)), 0.0
+    return abs(slopes[1] - slopes[0]), abs(sum(slopes) / 2 - float(fit.values[SLOPE_U]))
 
 
 def widen_fit(fit: Fit, settings: BundleSettings) -> Fit:

@@ -45,9 +45,9 @@ class BundleSettings:
     """Errors of heights across the bars are alike over this distance."""
     shared_lateral_m: float = 0.0018
     """Error of place that all heights of a bundle share, mostly the trajectory's (one standard deviation)."""
-    shared_yaw_deg: float = 0.025
-    """Error of direction that all of the map shares beside what the trajectory knows of its own (one standard
-    deviation): over a short way the encoders can't tell a rail's wave from a turn."""
+    shared_yaw_deg: float = 0.03
+    """Error of direction that all of the map shares (one standard deviation): over a short way encoders can't
+    tell a rail's wave from a turn."""
     shared_height_m: float = 0.001
     """The same of height, but for the calibration's part, which moves the whole map."""
     packing_error_ratio: float = 0.025
