@@ -35,7 +35,7 @@ from barsight.yard.bundles.section.seen_section import (
     is_no_hexagon,
     seen_section,
 )
-from barsight.yard.bundles.strapped_bundles import doubted_without_straps
+from barsight.yard.bundles.strapped_bundles import doubted_if_narrow, doubted_without_straps
 from barsight.yard.lift_settings import UPPER
 from barsight.yard.lifting.load import Load
 from barsight.yard.magnet.holding import min_diameter_m
@@ -139,6 +139,19 @@ def test_halves_that_run_on_another_heading_than_the_whole_widen_it() -> None:
     bundle, (_, turn) = bowed(Bowed(0.6, 0.0, 0.225, 0.0, length_m=3.6, is_s=True))
     assert turn > 0.5 * abs(bundle.yaw_rad) > np.radians(0.1)
     assert abs(bundle.yaw_rad) < 4 * bundle.sigma.yaw_rad
+
+
+@pytest.mark.parametrize(("width_m", "bars", "is_doubted"), [
+    (0.080, None, False), (0.110, None, True), (0.139, None, True), (0.145, None, False), (0.110, 2, False),
+])  # fmt: skip
+def test_less_than_two_bars_side_by_side_are_no_whole_bundle(
+    width_m: float, bars: int | None, *, is_doubted: bool
+) -> None:
+    found = find_bundles(draw([Laid(0.6, 0.0, 0.225, 0.0)]), SETTINGS)[0]
+    known = replace(found, width_m=width_m, bar_diameter_m=0.08, bars=bars, section_m2=0.02, confidence=0.95)
+    told = doubted_if_narrow(known)
+    assert (told is not known) == is_doubted == bool(np.isnan(bundle_mass(told).kg))
+    assert (told.confidence < 0.5) == is_doubted
 
 
 class HungBelow(Laid):

@@ -11,7 +11,7 @@ from barsight.pipeline.mapped_yard import MappedYard
 from barsight.reconstruction.joined_passes import MappedPass
 from barsight.yard.bundles.bundle_kinds import listed_diameter
 from barsight.yard.bundles.detection import find_bundles
-from barsight.yard.bundles.strapped_bundles import doubted_without_straps
+from barsight.yard.bundles.strapped_bundles import doubted_if_narrow, doubted_without_straps
 from barsight.yard.types import Bundle, YardMap
 
 
@@ -30,7 +30,7 @@ def find_yard_bundles(mapped: MappedYard, heights: YardMap) -> tuple[Bundle, ...
         seen = {stamp: pose for stamp, pose in poses.items() if stamp in used}
         measured = measure_from_pictures(newest.probed.pairs, seen, heights, bundles)
         listed = (listed_diameter(bundle, settings.bundles.catalogue_mm) for bundle in measured)
-        bundles = tuple(doubted_without_straps(bundle) for bundle in listed)
+        bundles = tuple(doubted_if_narrow(doubted_without_straps(bundle)) for bundle in listed)
     if not settings.labels.read:
         return bundles
     with mapped.watch("labels"):

@@ -37,6 +37,9 @@ _STRAPPED = 0.95
 _PIECE_M, _PIECE_HIGHER_M, _PIECE_BEYOND_M, _PIECE_SKEW = 0.02, 0.012, 0.1, 0.05
 """Bounds of a piece: way of its axis within the flanks, most by which its top is higher and its ends lie
 beyond the pack's, sine of its skew."""
+_ONE_BAR, _TWO_BARS = 1.05, 1.75
+"""Of the diameter: an outline up to the first is one bar's, and one narrower than the second is not a whole
+bundle's, of which two lie side by side at least."""
 _ASIDE_M = 0.02
 """Straps whose middle lies so far beside an outline's make its place that unsure."""
 
@@ -82,6 +85,24 @@ def doubted_without_straps(bundle: Bundle) -> Bundle:
     if not any(doubt.kind is DoubtKind.NO_STRAPS for doubt in bundle.reasons):
         return bundle
     return replace(bundle, confidence=min(bundle.confidence, DOUBTFUL))
+
+
+def doubted_if_narrow(bundle: Bundle) -> Bundle:
+    """Doubt what is wider than one of its bars and narrower than two: it is some of a wider bundle's, or one
+    bar whose diameter is wrong. Its section isn't known.
+    """
+    ratio = bundle.width_m / bundle.bar_diameter_m
+    if bundle.bars is not None or not _ONE_BAR < ratio < _TWO_BARS:
+        return bundle
+    said = (
+        f"it is {1e3 * bundle.width_m:.0f} mm wide, less than two of its bars of "
+        f"{1e3 * bundle.bar_diameter_m:.0f} mm: it may be wider, or one bar"
+    )
+    return replace(
+        bundle, section_m2=np.nan, confidence=min(bundle.confidence, DOUBTFUL),
+        reasons=(*bundle.reasons, Doubt(DoubtKind.MAY_GO_ON, said)),
+        sigma=replace(bundle.sigma, section_m2=np.nan),
+    )  # fmt: skip
 
 
 def _may_go_on(pack: Pack, seen: SeenSection | None) -> bool:
