@@ -25,7 +25,7 @@ from barsight.simulation.worlds.recording import cover, draw_world
 from barsight.simulation.worlds.settling import SKIN_M, BarPack, settle
 from barsight.simulation.worlds.solids import SolidYard, cylinder
 from barsight.simulation.worlds.surfaces import owners, scene_of
-from barsight.simulation.worlds.yards import KINDS, DrawnBundle, draw_yard
+from barsight.simulation.worlds.yards import KINDS, LOOSE, ORDERLY, DrawnBundle, draw_yard, kind_of
 
 GIVEN = SimulationSettings(
     length_m=1.6, frames=4, depth_views=0,
@@ -78,7 +78,8 @@ def deepest_overlap(packs: Sequence[BarPack]) -> float:
 
 
 @pytest.mark.parametrize(
-    ("manner", "upright"), [("layered", "wedges"), ("nested", "stanchions"), ("loose", "walls")]
+    ("manner", "upright"),
+    [("layered", "wedges"), ("nested", "stanchions"), ("loose", "walls"), ("orderly", "wedges")],
 )
 def test_piles_cut_into_nothing(manner: Manner, upright: Upright) -> None:
     for seed in range(3):
@@ -102,6 +103,23 @@ def test_yards_are_piled_without_cutting_into_each_other(seed: int) -> None:
     for y in (-0.6, 0.0, 0.5):
         for section in {b.section for b in world.bundles}:
             _expect_apart([b for b in world.bundles if b.section == section and b.layer < 3], y)
+
+
+def test_orderly_yards_hold_whole_bundles_of_one_sort() -> None:
+    """Full hexagons in even layers: six bars at one diameter's distance about the middle one."""
+    for seed in range(6):
+        world = draw_yard(seed, 2.0, 2.4, kind=ORDERLY)
+        strapped = [b for b in world.bundles if b.number < LOOSE]
+        assert world.kind == ORDERLY and {b.manner for b in strapped} == {"orderly"}
+        for section in {b.section for b in strapped}:
+            own = [b for b in strapped if b.section == section]
+            assert len({(len(b.cross_m), b.diameter_m) for b in own}) == 1
+            for one in own:
+                away = np.sort(np.hypot(*one.cross_m.T)) / one.diameter_m
+                assert len(away) in (7, 19, 37, 61)
+                assert away[0] < 1e-6 and away[1:7] == pytest.approx(1.001, abs=1e-6)
+                assert one.length_m >= 0.97 * max(o.length_m for o in own)
+    assert kind_of(seed) != ORDERLY and draw_yard(5, 2.0, 2.4).kind == KINDS[5]
 
 
 def _expect_apart(bundles: list[DrawnBundle], y: float) -> None:

@@ -40,9 +40,9 @@ WHITE_M, ALIKE_M, ALIKE_CELLS = 0.001, 0.0015, 3.0
 """Noise of `noisy_world`: of each cell, and alike over cells."""
 
 
-def judged_yard(seed: int, magnet: JudgedMagnet) -> DrawnYard:
+def judged_yard(seed: int, magnet: JudgedMagnet, kind: str | None = None) -> DrawnYard:
     """Draw the yard of a seed on which lifts of a magnet are judged: full bars a little longer than it."""
-    return draw_yard(seed, 2 * magnet.half_span_m + OVER_MAGNET_M, SPAN_M, min_length_ratio=1.0)
+    return draw_yard(seed, 2 * magnet.half_span_m + OVER_MAGNET_M, SPAN_M, min_length_ratio=1.0, kind=kind)
 
 
 def drawn_scene(world: DrawnYard) -> Scene:

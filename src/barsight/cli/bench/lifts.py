@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -38,6 +38,7 @@ from barsight.yard.magnet.description import Magnet, example_magnet, load_magnet
 
 def bench_lift_targets(
     seeds: str = "0:8",
+    kind: Literal["by-seed", "orderly"] = "by-seed",
     placements: int = 40,
     danger_placements: int = 0,
     rendered: bool = False,
@@ -51,11 +52,13 @@ def bench_lift_targets(
     """Judge offered lifts and random placements on drawn yards by exact geometry.
 
     The yards are irregular bundles and heaps of bars, settled by physics among beams, walls and stanchions,
-    askew and along X, partly out of sight. Counts what is dangerous and not vetoed, and what is fine and
-    vetoed.
+    askew and along X, partly out of sight; or orderly ones. Counts what is dangerous and not vetoed, and what
+    is fine and vetoed.
 
     Args:
-        seeds: Seeds of the yards, first:last, the last not included; the kind of yard is the seed modulo 10.
+        seeds: Seeds of the yards, first:last, the last not included.
+        kind: Kind of the yards: by-seed is the seed modulo 10; orderly yards hold whole bundles of one sort
+            in even layers.
         placements: Random placements on each yard, beside the lifts that are offered there.
         danger_placements: Placements on each yard besides, of which only those without a veto are judged, so
             that they bound the danger in less time.
@@ -82,7 +85,7 @@ def bench_lift_targets(
             described_at.write_text(example_magnet(), encoding="utf-8")
         given = _Given(
             (keep or Path(scratch)).absolute(), load_magnet(described_at), read_magnet(described_at),
-            placements, danger_placements, rendered, full_size,
+            placements, danger_placements, rendered, full_size, None if kind == "by-seed" else kind,
         )  # fmt: skip
         for seed, judged in over_seeds(_judge_seed, numbers, given, workers, scheduler):
             found[seed] = judged
@@ -106,6 +109,7 @@ class _Given:
     danger_placements: int
     rendered: bool
     full_size: bool
+    kind: str | None
 
 
 def _bench(found: dict[int, tuple[JudgedLift, ...]]) -> JudgedBench:
@@ -113,8 +117,8 @@ def _bench(found: dict[int, tuple[JudgedLift, ...]]) -> JudgedBench:
 
 
 def _judge_seed(seed: int, given: _Given) -> tuple[JudgedLift, ...]:
-    settings, folder = LiftSettings(), given.keep / f"seed_{seed}"
-    world = judged_yard(seed, given.judged)
+    settings, folder = LiftSettings(), given.keep / f"{given.kind or 'seed'}_{seed}"
+    world = judged_yard(seed, given.judged, given.kind)
     if given.rendered:
         mapped = _measured(world, folder, settings, given.full_size)
     else:

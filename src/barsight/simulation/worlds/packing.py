@@ -34,6 +34,15 @@ def packed(count: int, diameter_m: float, rng: np.random.Generator) -> Float64:
     return np.asarray(places - places.mean(axis=0), np.float64)
 
 
+def hexagon(rings: int, diameter_m: float) -> Float64:
+    """Lay discs (3 rings (rings + 1) + 1, 2) in a full hexagon around the first, a side down."""
+    cells = np.arange(-rings, rings + 1)
+    row, place = (index.ravel() for index in np.meshgrid(cells, cells, indexing="ij"))
+    within = np.abs(row + place) <= rings
+    x, z = place[within] + row[within] / 2, row[within] * math.sqrt(3) / 2
+    return np.asarray(1.001 * diameter_m * np.stack([x, z], axis=1), np.float64)
+
+
 @kernel()
 def _push_apart(places: Float64, min_apart: float, times: int) -> float:
     """Push discs that overlap off each other, in place; returns the deepest overlap of the last time.

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from barsight.simulation.worlds.packing import packed
+from barsight.simulation.worlds.packing import hexagon, packed
 from barsight.simulation.worlds.settling import BarPack, Rectangle, settle
 from barsight.simulation.worlds.solids import Solid, box, cylinder
 
@@ -23,13 +23,16 @@ BARS = (3, 200)
 BEAMS_M = (0.05, 0.09, 0.14)
 BOW = 0.002
 """Standard deviation of the bow over the length, where there is room."""
-SHORTEST = 0.8
+SHORTEST, SHORTEST_ORDERLY = 0.8, 0.98
 """Least length of a bundle over the longest of its pile."""
-
+RINGS = (1, 2, 3, 4)
+"""Of the full hexagons of an orderly pile."""
+GAPS_M = (0.002, 0.006, 0.02, 0.05, 0.12, 0.25)
+"""Between neighbours of a layer; those of an orderly pile are all alike, between the third and the fifth."""
 ROLLED_M = 0.8
 """Largest distance of a bundle from its pile."""
 
-Manner = Literal["layered", "nested", "loose"]
+Manner = Literal["layered", "nested", "loose", "orderly"]
 Upright = Literal["wedges", "stanchions", "walls"]
 
 
@@ -85,9 +88,24 @@ def pile_up(manner: Manner, upright: Upright, span: float, length: float, rng: n
         settled = settle(_over(packs, (0.02, span - 0.02), base + 0.02, rng), boxes=[*sides, *boxes])
         laid = [_laid(pack, 0, length, rng) for pack in _within(settled, span)]
         pile.lying += _slackened(laid, (0.0, span), rng)
+    elif manner == "orderly":
+        whole = _whole_bundle(rng)
+        gap = float(rng.uniform(GAPS_M[2], GAPS_M[4]))
+        _layers(pile, span, length, sides, lambda: whole, (gap,), rng)
     else:
-        _layers(pile, span, length, sides, lambda: _bundle(sorts, rng), rng)
+        _layers(pile, span, length, sides, lambda: _bundle(sorts, rng), GAPS_M, rng)
     return pile
+
+
+def _whole_bundle(rng: np.random.Generator) -> BarPack:
+    """Lay out a bundle that is a full hexagon, of a usual section."""
+    area = {
+        (rings, diameter): (3 * rings * (rings + 1) + 1) * math.pi / 4 * diameter**2
+        for rings in RINGS for diameter in DIAMETERS_M
+    }  # fmt: skip
+    usual = [one for one, section in area.items() if SECTION_M2[0] <= section <= SECTION_M2[1]]
+    rings, diameter = usual[int(rng.integers(len(usual)))]
+    return BarPack(hexagon(rings, diameter), diameter / 2)
 
 
 def _bundle(sorts: Sequence[float], rng: np.random.Generator) -> BarPack:
@@ -120,7 +138,7 @@ def _over(
 
 def _layers(
     pile: Pile, span: float, length: float, sides: list[Rectangle], bundle: Callable[[], BarPack],
-    rng: np.random.Generator,
+    gaps: Sequence[float], rng: np.random.Generator,
 ) -> None:  # fmt: skip
     """Lay one to three layers on beams, each settled on those below."""
     reach = (0.0, span)
@@ -136,18 +154,21 @@ def _layers(
             place = np.array([x + pack.reach, level + pack.reach + 0.003])
             if rng.random() > 0.1 or not hanging:
                 hanging.append(BarPack(pack.cross - pack.cross.mean(axis=0) + place, pack.radius))
-            x += 2 * pack.reach + float(rng.choice([0.002, 0.006, 0.02, 0.05, 0.12, 0.25]))
+            x += 2 * pack.reach + float(rng.choice(gaps))
         if not hanging:
             return
         settled = settle(hanging, [one.pack for one in pile.lying], [*sides, *boxes])
-        laid = [_laid(pack, layer, length, rng) for pack in settled]
+        shortest = SHORTEST_ORDERLY if pile.manner == "orderly" else SHORTEST
+        laid = [_laid(pack, layer, length, rng, shortest) for pack in settled]
         pile.lying += _slackened(laid, reach, rng)
         extents = np.array([pack.extent for pack in settled])
         reach = (float(extents[:, 0].min()), float(extents[:, 1].max()) - float(rng.uniform(0, 0.6)))
 
 
-def _laid(pack: BarPack, layer: int, length: float, rng: np.random.Generator) -> Lying:
-    own = float(rng.uniform(SHORTEST, 1.0)) * length
+def _laid(
+    pack: BarPack, layer: int, length: float, rng: np.random.Generator, shortest: float = SHORTEST
+) -> Lying:
+    own = float(rng.uniform(shortest, 1.0)) * length
     uneven = float(rng.choice([0.005, 0.02, 0.2], p=[0.3, 0.55, 0.15]))
     return Lying(pack, layer, own, float(rng.normal(0, 0.03)), uneven=uneven)
 
@@ -233,7 +254,7 @@ def _stand_sides(pile: Pile, span: float, length: float, rng: np.random.Generato
             centre = np.array([edge + sign * (gap + thick / 2), y, high / 2])
             pile.others.append(box("wall", centre, np.array([thick, long, high])))
             sides.append(_beside(edge + sign * gap, sign, thick, high))
-        elif pile.manner != "layered":
+        elif pile.manner not in ("layered", "orderly"):
             for y in (-0.3, 0.3):
                 centre = np.array([edge + sign * 0.06, y * length, 0.06])
                 pile.others.append(box("beam", centre, np.array([0.12, 0.25, 0.12])))

@@ -1,4 +1,4 @@
-"""Draw yards from more than any model of them knows: `draw_yard(seed)` makes one of KINDS.
+"""Draw yards from more than any model of them knows: `draw_yard(seed)` makes one of KINDS, or an orderly one.
 
 Piles (`piles`) stand one after the other along X; what yards have besides stands and lies around them.
 No code of the simulated stock or of the yard's stages is used.
@@ -20,6 +20,8 @@ from barsight.simulation.worlds.solids import Solid, SolidYard, box, cylinder, t
 KINDS = (
     "layered", "beams", "walls", "along-x", "nested", "askew", "stanchions", "unseen", "loose", "mixed",
 )  # fmt: skip
+ORDERLY = "orderly"
+"""Kind of yard that is drawn where it is named, not by a seed: layers of whole bundles of one sort."""
 LOOSE = 1000
 """Number of the first bar that is in no bundle."""
 SEGMENT_M = 1.2
@@ -55,7 +57,7 @@ class DrawnBundle:
 
 @dataclass(frozen=True, eq=False)
 class DrawnYard:
-    """A yard of one of KINDS. size_m: along X and Y; it begins at x = 0, its middle is at y = 0.
+    """A yard of one of KINDS or ORDERLY. size_m: along X and Y; it begins at x = 0, its middle is at y = 0.
 
     free: see there.
     """
@@ -84,14 +86,16 @@ def kind_of(seed: int) -> str:
     return KINDS[seed % len(KINDS)]
 
 
-def draw_yard(seed: int, bar_length_m: float, length_m: float, min_length_ratio: float = 0.75) -> DrawnYard:
-    """Draw the yard of a seed: see `kind_of`.
+def draw_yard(
+    seed: int, bar_length_m: float, length_m: float, min_length_ratio: float = 0.75, kind: str | None = None
+) -> DrawnYard:
+    """Draw the yard of a seed, of its own kind (see `kind_of`) where none is given.
 
     length_m: along X, about. bar_length_m: of the longest bars; min_length_ratio: those of a pile have at
     least this share of it.
     """
     rng = np.random.default_rng((23, seed))
-    kind = kind_of(seed)
+    kind = kind or kind_of(seed)
     solids: list[Solid] = []
     bundles: list[DrawnBundle] = []
     x, section = 0.0, 0
@@ -124,8 +128,8 @@ def _sort(kind: str, section: int, rng: np.random.Generator) -> tuple[Manner, Up
     """Choose how a pile lies and what holds it."""
     manner: Manner = "nested" if rng.random() < 0.3 else "layered"
     upright: Upright = "wedges"
-    if kind == "nested":
-        manner = "nested"
+    if kind in ("nested", ORDERLY):
+        manner = "nested" if kind == "nested" else "orderly"
     if kind == "loose" and section % 2 == 0:
         return "loose", "stanchions" if rng.random() < 0.5 else "wedges"
     if kind == "mixed":
