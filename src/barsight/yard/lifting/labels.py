@@ -143,10 +143,27 @@ def _edge_logs(level: Float32, length: int) -> tuple[Float32, Float32]:
 
 
 def _look_up(place: Placement, heights: HeightMap, v: Float64, u: Float64) -> tuple[Float32, Float32]:
-    """Look up gray levels and heights (V, U) at places along and across; 0 and NaN where nothing was seen."""
+    """Look up gray levels and heights (V, U) at places along and across; 0 and NaN where nothing was seen.
+
+    Levels are interpolated between the four cells about: along bars that lie a little askew the nearest cell
+    jumps aside from step to step, and a bar's bright crest then seems to begin there.
+    """
     x = place.x_m + v[:, None] * place.along[0] + u * place.across[0]
     y = place.y_m + v[:, None] * place.along[1] + u * place.across[1]
     column, row, inside = nearest_cells(heights, x, y)
     assert heights.gray is not None
-    gray = np.where(inside, heights.gray[row, column], 0)
-    return gray.astype(np.float32), np.where(inside, heights.z_m[row, column], np.float32(np.nan))
+    gray = np.where(inside, heights.gray[row, column], 0).astype(np.float32)
+    right, down = ((at - first) / heights.cell_m for at, first in ((x, heights.x0_m), (y, heights.y0_m)))
+    left, above = np.floor(right).astype(np.int64), np.floor(down).astype(np.int64)
+    within = (left >= 0) & (above >= 0) & (left + 1 < heights.shape[1]) & (above + 1 < heights.shape[0])
+    left, above = np.where(within, left, 0), np.where(within, above, 0)
+    right, down = right - left, down - above
+    level, seen = np.zeros(gray.shape), within
+    for i, j, share in ((0, 0, (1 - down) * (1 - right)), (0, 1, (1 - down) * right),
+                        (1, 0, down * (1 - right)), (1, 1, down * right)):  # fmt: skip
+        cell = heights.gray[above + i, left + j]
+        level, seen = level + share * cell, seen & (cell > 0)
+    return (
+        np.where(seen, level, gray).astype(np.float32),
+        np.where(inside, heights.z_m[row, column], np.float32(np.nan)),
+    )
