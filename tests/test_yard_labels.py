@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from barsight.yard.lifting.labels import find_label
 from barsight.yard.magnet.contact import rest_magnet
 from barsight.yard.magnet.description import Tolerance
 from barsight.yard.magnet.footprint import Placement
+from barsight.yard.plates import plate_masks
 from barsight.yard.types import HeightMap
 from lift_yards import MAGNET, codes, judged, laid, map_of, record
 
@@ -142,6 +144,33 @@ def test_a_bright_floor_beside_a_narrow_load_hides_no_label() -> None:
     gray[np.ix_(np.abs(heights.y_m - at_m) < 0.025, np.abs(heights.x_m - 0.3) < 0.02)] = 160.0
     heights = replace(heights, gray=gray.astype(np.uint8))
     assert find_label(PLACE, heights, MAGNET, plane(PLACE, heights)) is not None
+
+
+@pytest.mark.parametrize("askew_deg", [0.6, 1.1])
+def test_bars_a_little_askew_bear_no_label(askew_deg: float) -> None:
+    """Bright crests of 80 mm bars jump by a cell to the side, and straps end them, as on drawn yards."""
+    heights = map_of([laid(0.3)], x_m=(-1.5, 2.0))
+    yaw = math.radians(askew_deg)
+    u = math.cos(yaw) * (heights.x_m - 0.3) + math.sin(yaw) * heights.y_m[:, None]
+    v = math.cos(yaw) * heights.y_m[:, None] - math.sin(yaw) * (heights.x_m - 0.3)
+    gray = 60 + 175 * np.abs(np.cos(np.pi * (u - 0.04) / 0.08))
+    gray[np.abs(np.mod(v, 0.5) - 0.25) < 0.02] = 60.0
+    heights = replace(heights, gray=gray.astype(np.uint8))
+    place = replace(PLACE, yaw_rad=yaw)
+    assert find_label(place, heights, MAGNET, plane(place, heights)) is None
+
+
+def test_a_strap_is_no_code() -> None:
+    """Take levels as on a drawn yard: across crests as white as paper a strap, partly too dark to see."""
+    gray = np.full((60, 27), 232.0, np.float32)
+    gray[28:32, 10:16] = [
+        (117, 137, 135, 114, 106, 120), (58, 0, 63, 62, 0, 60), (0, 71, 0, 0, 74, 66),
+        (107, 121, 134, 111, 97, 115),
+    ]  # fmt: skip
+    flat = np.zeros(gray.shape, np.float32)
+    assert not list(plate_masks(gray, flat, (0.1, 0.06)))
+    gray[28:33, 10:16] = 145.0
+    assert list(plate_masks(gray, flat, (0.1, 0.06))), "a code's dark and white, mixed"
 
 
 @pytest.mark.parametrize(("beside_m", "found"), [(0.015, True), (0.06, False)])

@@ -31,8 +31,11 @@ MIN_FULL_RATIO = 0.72
 WHITE_LEVEL, CODE_LOGS = 200.0, (0.22, 0.35)
 """Level of the paper before and behind a code, and logarithms of it over the code's level: on a bar that
 shines as the paper does only the code shows."""
-MAX_CODE_LOG, MIN_CODE_RATIO, MAX_CODE_RATIO, MIN_CODE_FULL = 0.7, (0.8, 0.6), 1.3, 0.85
-"""A code is half white: what is darker is a strap. Its sides over the label's shorter one; how full it is."""
+MAX_CODE_LOG, DARK_QUANTILE = 0.7, 0.75
+"""A code is half white: this share of its cells lacks no more of the white's level. What is darker, or so
+dark that no picture shows it, is a strap."""
+MIN_CODE_RATIO, MAX_CODE_RATIO, MIN_CODE_FULL = (0.8, 0.6), 1.3, 0.85
+"""Sides of a code over the label's shorter one, and how full it is."""
 BESIDE_M, MAX_RISE_M = 0.1, 0.015
 """A plate stands no more over what lies so far before and behind: blocks do."""
 _DARK = 10.0
@@ -88,10 +91,11 @@ def _codes(gray: Float32, size_m: tuple[float, float]) -> Iterator[Bool]:
     length = round(1.5 * side / STEP_M) | 1
     white = cv2.morphologyEx(level, cv2.MORPH_CLOSE, np.ones((length, 1), np.uint8))
     lack = np.where((white > np.log(WHITE_LEVEL)) & (gray > 0), white - level, 0)
+    dark = np.where(gray > 0, white - level, np.float32(np.inf))
     for cells in chain.from_iterable(_blobs(lack > least, (side, side)) for least in CODE_LOGS):
         ratio, full = _shape(cells, (side, side))
         fits = (ratio >= MIN_CODE_RATIO).all() and (ratio <= MAX_CODE_RATIO).all() and full >= MIN_CODE_FULL
-        if fits and float(np.median(lack[cells])) <= MAX_CODE_LOG:
+        if fits and float(np.quantile(dark[cells], DARK_QUANTILE, method="higher")) <= MAX_CODE_LOG:
             yield cells
 
 
