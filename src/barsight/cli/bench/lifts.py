@@ -36,13 +36,25 @@ from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.magnet.description import Magnet, example_magnet, load_magnet
 
 
+@dataclass(frozen=True)
+class YardChoice:
+    """Yards that are drawn, and how each becomes a map."""
+
+    kind: Literal["by-seed", "orderly"] = "by-seed"
+    """Kind of the yards: by-seed is the seed modulo 10; orderly yards hold whole bundles of one sort in even
+    layers."""
+    rendered: bool = False
+    """Render and measure each yard, a minute of computing; without it the exact map gets noise."""
+    full_size: bool = False
+    """Render pictures of 1280x1024 instead of 640x512: half the size of a pixel on the surface, four times
+    the computing."""
+
+
 def bench_lift_targets(
     seeds: str = "0:8",
-    kind: Literal["by-seed", "orderly"] = "by-seed",
+    choice: Annotated[YardChoice, tyro.conf.arg(name="")] = YardChoice(),
     placements: int = 40,
     danger_placements: int = 0,
-    rendered: bool = False,
-    full_size: bool = False,
     keep: Path | None = None,
     magnet: Path | None = None,
     workers: int = 1,
@@ -57,14 +69,10 @@ def bench_lift_targets(
 
     Args:
         seeds: Seeds of the yards, first:last, the last not included.
-        kind: Kind of the yards: by-seed is the seed modulo 10; orderly yards hold whole bundles of one sort
-            in even layers.
+        choice: What is drawn.
         placements: Random placements on each yard, beside the lifts that are offered there.
         danger_placements: Placements on each yard besides, of which only those without a veto are judged, so
             that they bound the danger in less time.
-        rendered: Render and measure each yard, a minute of computing; without it the exact map gets noise.
-        full_size: Render pictures of 1280x1024 instead of 640x512: half the size of a pixel on the surface,
-            four times the computing.
         keep: Folder for the rendered yards; what is finished there is not done again.
         magnet: TOML file of the magnet; an example is assumed without it.
         workers: Yards at a time, each in a process of its own.
@@ -85,7 +93,7 @@ def bench_lift_targets(
             described_at.write_text(example_magnet(), encoding="utf-8")
         given = _Given(
             (keep or Path(scratch)).absolute(), load_magnet(described_at), read_magnet(described_at),
-            placements, danger_placements, rendered, full_size, None if kind == "by-seed" else kind,
+            placements, danger_placements, choice,
         )  # fmt: skip
         for seed, judged in over_seeds(_judge_seed, numbers, given, workers, scheduler):
             found[seed] = judged
@@ -107,9 +115,7 @@ class _Given:
     judged: JudgedMagnet
     placements: int
     danger_placements: int
-    rendered: bool
-    full_size: bool
-    kind: str | None
+    choice: YardChoice
 
 
 def _bench(found: dict[int, tuple[JudgedLift, ...]]) -> JudgedBench:
@@ -117,10 +123,11 @@ def _bench(found: dict[int, tuple[JudgedLift, ...]]) -> JudgedBench:
 
 
 def _judge_seed(seed: int, given: _Given) -> tuple[JudgedLift, ...]:
-    settings, folder = LiftSettings(), given.keep / f"{given.kind or 'seed'}_{seed}"
-    world = judged_yard(seed, given.judged, given.kind)
-    if given.rendered:
-        mapped = _measured(world, folder, settings, given.full_size)
+    kind = None if given.choice.kind == "by-seed" else given.choice.kind
+    settings, folder = LiftSettings(), given.keep / f"{kind or 'seed'}_{seed}"
+    world = judged_yard(seed, given.judged, kind)
+    if given.choice.rendered:
+        mapped = _measured(world, folder, settings, given.choice.full_size)
     else:
         mapped = noisy_world(world, settings)
     counts = given.placements, given.danger_placements

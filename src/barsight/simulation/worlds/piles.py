@@ -90,10 +90,9 @@ def pile_up(manner: Manner, upright: Upright, span: float, length: float, rng: n
         pile.lying += _slackened(laid, (0.0, span), rng)
     elif manner == "orderly":
         whole = _whole_bundle(rng)
-        gap = float(rng.uniform(GAPS_M[2], GAPS_M[4]))
-        _layers(pile, span, length, sides, lambda: whole, (gap,), rng)
+        _layers(pile, span, length, sides, lambda: whole, rng)
     else:
-        _layers(pile, span, length, sides, lambda: _bundle(sorts, rng), GAPS_M, rng)
+        _layers(pile, span, length, sides, lambda: _bundle(sorts, rng), rng)
     return pile
 
 
@@ -138,9 +137,11 @@ def _over(
 
 def _layers(
     pile: Pile, span: float, length: float, sides: list[Rectangle], bundle: Callable[[], BarPack],
-    gaps: Sequence[float], rng: np.random.Generator,
+    rng: np.random.Generator,
 ) -> None:  # fmt: skip
     """Lay one to three layers on beams, each settled on those below."""
+    is_orderly = pile.manner == "orderly"
+    gaps = (float(rng.uniform(GAPS_M[2], GAPS_M[4])),) if is_orderly else GAPS_M
     reach = (0.0, span)
     for layer in range(int(rng.integers(1, 4))):
         base = pile.top if pile.lying else 0.0
@@ -158,7 +159,7 @@ def _layers(
         if not hanging:
             return
         settled = settle(hanging, [one.pack for one in pile.lying], [*sides, *boxes])
-        shortest = SHORTEST_ORDERLY if pile.manner == "orderly" else SHORTEST
+        shortest = SHORTEST_ORDERLY if is_orderly else SHORTEST
         laid = [_laid(pack, layer, length, rng, shortest) for pack in settled]
         pile.lying += _slackened(laid, reach, rng)
         extents = np.array([pack.extent for pack in settled])
