@@ -90,8 +90,8 @@ def _codes(gray: Float32, size_m: tuple[float, float]) -> Iterator[Bool]:
     level, side = np.log(gray + _DARK), min(size_m)
     length = round(1.5 * side / STEP_M) | 1
     white = cv2.morphologyEx(level, cv2.MORPH_CLOSE, np.ones((length, 1), np.uint8))
-    lack = np.where((white > np.log(WHITE_LEVEL)) & (gray > 0), white - level, 0)
     dark = np.where(gray > 0, white - level, np.float32(np.inf))
+    lack = np.where((white > np.log(WHITE_LEVEL)) & (gray > 0), dark, 0)
     for cells in chain.from_iterable(_blobs(lack > least, (side, side)) for least in CODE_LOGS):
         ratio, full = _shape(cells, (side, side))
         fits = (ratio >= MIN_CODE_RATIO).all() and (ratio <= MAX_CODE_RATIO).all() and full >= MIN_CODE_FULL

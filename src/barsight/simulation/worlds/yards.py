@@ -128,8 +128,10 @@ def _sort(kind: str, section: int, rng: np.random.Generator) -> tuple[Manner, Up
     """Choose how a pile lies and what holds it."""
     manner: Manner = "nested" if rng.random() < 0.3 else "layered"
     upright: Upright = "wedges"
-    if kind in ("nested", ORDERLY):
-        manner = "nested" if kind == "nested" else "orderly"
+    if kind == "nested":
+        manner = "nested"
+    if kind == ORDERLY:
+        manner = "orderly"
     if kind == "loose" and section % 2 == 0:
         return "loose", "stanchions" if rng.random() < 0.5 else "wedges"
     if kind == "mixed":
