@@ -10,6 +10,7 @@ import pytest
 
 import barsight as bs
 from barsight.core.arrays import Float64, Int64
+from barsight.core.stamps import NS_PER_S
 from barsight.live.link import Link, LiveInput
 from barsight.live.pose_output import PoseOutput
 from barsight.live.settings import LiveSettings
@@ -27,12 +28,13 @@ def way(stamps: Int64) -> Float64:
     return noise
 
 
-def linked(whole: Path, tmp_path: Path, yard: Path | None = None) -> Link:
+def linked(whole: Path, tmp_path: Path, yard: Path | None = None, max_predicted_s: float = 2.0) -> Link:
     """A run whose only state, at `BEGIN_NS`, knows the place well and the speed badly."""
     folder = tmp_path / ".live"
     folder.mkdir(parents=True)
     settings = replace(bs.MeasureSettings(), yard=yard).chosen()
-    link = Link(LiveInput(whole), settings, LiveSettings(), folder, folder, "", "", None)
+    live = LiveSettings(max_predicted_s=max_predicted_s)
+    link = Link(LiveInput(whole), settings, live, folder, folder, "", "", None)
     state = NavigationState.of(BEGIN_NS, np.zeros(ROW_NUMBERS))
     covariance = np.eye(15) * 1e-6
     covariance[6:9, 6:9] = np.eye(3)
@@ -79,6 +81,27 @@ def test_frozen_encoders_hold_no_pose(whole: Path, tmp_path: Path) -> None:
     link.readings("crane").append(STAMPS, places)
     give_imu(link, 0.6)
     assert written(output, link, 0.5)["position_m"][0] == pytest.approx(SPEED_MPS * 0.5, abs=0.005)
+
+
+def test_a_state_that_comes_late_still_begins_with_its_readings(whole: Path, tmp_path: Path) -> None:
+    """As late as `max_predicted_s` lets it: the encoders about it hold the pose then too."""
+    link = linked(whole, tmp_path, max_predicted_s=15.0)
+    output, last_ns, speed_mps = PoseOutput(link), 0, np.array([SPEED_MPS, 0.0, 0.0])
+    stamps = BEGIN_NS + np.arange(-60, 301) * 50_000_000
+    for second in range(1, 14):
+        now = (stamps > last_ns) & (stamps <= BEGIN_NS + second * NS_PER_S)
+        link.readings("crane").append(stamps[now], way(stamps)[now])
+        give_imu(link, second)
+        last_ns = BEGIN_NS + second * NS_PER_S
+        written(output, link, second)
+    late_ns = BEGIN_NS + NS_PER_S
+    state = NavigationState.of(late_ns, link.states().last(1)[1][0])
+    body = replace(state.body, position_m=speed_mps)
+    link.states().append(np.array([late_ns]), replace(state, stamp_ns=late_ns, body=body).row[None])
+    told = written(output, link, 13)
+    assert told["predicted_s"] == pytest.approx(12)
+    assert told["position_m"][0] == pytest.approx(SPEED_MPS * 13, abs=0.005)
+    assert max(told["sigma_m"]) < 0.005
 
 
 def test_the_sigma_has_the_yard_frames(whole: Path, tmp_path: Path) -> None:

@@ -24,8 +24,8 @@ from barsight.yard_frame import crane_in_yard, frame_of, in_yard, shared_covaria
 WAIT_S = 0.01
 """A pose waits so long for the readings at its stamp; what hasn't come then is extrapolated."""
 POLL_S = 0.001
-HELD_S = 5.0
-"""Readings that are held: encoders' noise is told from them, and a state that comes late begins with them."""
+BEFORE_STATE_S = 5.0
+"""Readings held from before the oldest state that a pose carries on: they tell the noise of the encoders."""
 
 
 def output_poses(link: Link) -> None:
@@ -60,7 +60,8 @@ class PoseOutput:
         if self._mounted is not None and "crane" in self._sensors:
             self._freeze = FreezeWatch(self._mounted)
         self._shift_ns = whole.rig.timeshift_cam_imu_ns
-        self._imu, self._crane = (HeldReadings(link.readings(name)) for name in ("imu", "crane"))
+        held_s = BEFORE_STATE_S + link.live.max_predicted_s
+        self._imu, self._crane = (HeldReadings(link.readings(name), held_s) for name in ("imu", "crane"))
         self._state_ns = 0
         self._propagator: Propagator | None = None
         self._states, self._outputs = link.states(), link.outputs()
@@ -153,10 +154,10 @@ class PoseOutput:
 
 
 class HeldReadings:
-    """The readings of a log over the last `HELD_S`. taken_ns: stamp of the last one taken."""
+    """The readings of a log over the last `held_s`. taken_ns: stamp of the last one taken."""
 
-    def __init__(self, log: ReadingLog) -> None:
-        self._log, self.taken_ns = log, 0
+    def __init__(self, log: ReadingLog, held_s: float) -> None:
+        self._log, self._held_ns, self.taken_ns = log, seconds_to_ns(held_s), 0
         self._stamps_ns, self._values = log.last(0)
 
     @property
@@ -168,7 +169,7 @@ class HeldReadings:
         """Take in what came since the last call."""
         stamps, values = self._log.read()
         if len(stamps):
-            first = int(np.searchsorted(self._stamps_ns, stamps[-1] - seconds_to_ns(HELD_S)))
+            first = int(np.searchsorted(self._stamps_ns, stamps[-1] - self._held_ns))
             self._stamps_ns = np.concatenate([self._stamps_ns[first:], stamps])
             self._values = np.concatenate([self._values[first:], values])
 
