@@ -22,7 +22,7 @@ from barsight.yard.lifting.clearance import (
 from barsight.yard.lifting.unseen import wide_parts
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.magnet.holding import _sum_pull
-from barsight.yard.stability.stability import interpolate_height
+from barsight.yard.map_lookup import interpolate_height
 from barsight.yard.types import HeightMap
 from lift_yards import MAGNET, Laid, laid, map_of, record
 

@@ -31,7 +31,7 @@ from barsight.yard.magnet.resting_plane import (
     rest_faces,
     straighten_heights,
 )
-from barsight.yard.stability.stability import interpolate_height, lookup_heights
+from barsight.yard.map_lookup import interpolate_height, lookup_heights
 from barsight.yard.types import HeightMap
 
 POLES = np.array([[-0.3, 0.02, 0.9, 0.1], [0.7, -0.02, 0.5, 0.12]])

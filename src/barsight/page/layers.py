@@ -18,7 +18,7 @@ from barsight.report.map_images import hillshade
 from barsight.store.coarse_map import unpack
 from barsight.store.promotion import counts
 from barsight.store.tables import SURVEYS
-from barsight.yard.stability.stability import nearest_cells
+from barsight.yard.map_lookup import nearest_cells
 from barsight.yard.types import HeightMap
 
 with extra("store"):

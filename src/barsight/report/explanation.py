@@ -25,7 +25,7 @@ from barsight.yard.lifting.clearance import FacePlane, find_obstacle
 from barsight.yard.lifting.lift_file import forbidden_since, read_lifts
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
-from barsight.yard.stability.stability import lookup_heights
+from barsight.yard.map_lookup import lookup_heights
 from barsight.yard.types import Bundle, HeightMap, YardMap
 from barsight.yard.vetoes import Veto
 

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from barsight.core.arrays import Float64
+from barsight.yard.map_lookup import lookup_heights
 from barsight.yard.sections import part_about
-from barsight.yard.stability.stability import lookup_heights
 from barsight.yard.types import Bundle, YardMap
 from barsight.yard.weight import Mass, bundle_mass
 

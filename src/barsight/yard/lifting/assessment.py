@@ -51,7 +51,8 @@ from barsight.yard.magnet.footprint import (
 from barsight.yard.magnet.holding import WeakestPole, hold_load, share_checks, weakest_pole
 from barsight.yard.magnet.partings import without_parted
 from barsight.yard.magnet.reach import reached_strips
-from barsight.yard.stability.stability import Footing, footing_checks, nearest_cells
+from barsight.yard.map_lookup import nearest_cells
+from barsight.yard.stability.stability import Footing, footing_checks
 from barsight.yard.thin_lines import ThinLine, find_thin_lines
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Check, Veto, check_min, check_true, vetoes_of

@@ -16,8 +16,8 @@ from barsight.yard.lifting.load import Load, axes_of
 from barsight.yard.lifting.unseen import wide_parts
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.resting_plane import rest_plane
+from barsight.yard.map_lookup import nearest_cells
 from barsight.yard.sections import part_about
-from barsight.yard.stability.stability import nearest_cells
 from barsight.yard.types import YardMap
 
 STEP_M = 0.02

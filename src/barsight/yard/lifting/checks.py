@@ -15,7 +15,7 @@ from barsight.yard.magnet.contact import Contact
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import BEYOND_OPEN_END_M, BundleTable, Grip, Placement
 from barsight.yard.magnet.holding import min_diameter_m
-from barsight.yard.stability.stability import interpolate_height
+from barsight.yard.map_lookup import interpolate_height
 from barsight.yard.types import ENDS, Bundle, HeightMap
 from barsight.yard.vetoes import Check, check_max, check_min, check_true
 from barsight.yard.weight import Mass

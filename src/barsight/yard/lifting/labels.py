@@ -13,8 +13,8 @@ from barsight.yard.label_settings import LabelSettings
 from barsight.yard.lifting.clearance import FacePlane
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
+from barsight.yard.map_lookup import nearest_cells
 from barsight.yard.plates import STEP_M, plate_masks
-from barsight.yard.stability.stability import nearest_cells
 from barsight.yard.types import HeightMap
 from barsight.yard.vetoes import Check, check_true
 

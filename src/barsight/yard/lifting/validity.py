@@ -18,7 +18,7 @@ from barsight.yard.lifting.load import axes_of
 from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
-from barsight.yard.stability.stability import nearest_cells
+from barsight.yard.map_lookup import nearest_cells
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Check, check_max, check_min, check_true
 

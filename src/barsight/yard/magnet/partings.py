@@ -11,7 +11,7 @@ from barsight.core.arrays import Bool, Float64
 from barsight.core.linalg.robust import nan_medians
 from barsight.yard.magnet.footprint import BundleTable, Grip, Placement
 from barsight.yard.magnet.reach import PART_M
-from barsight.yard.stability.stability import lookup_heights
+from barsight.yard.map_lookup import lookup_heights
 from barsight.yard.types import Bundle, HeightMap
 
 _DEEP_M, _DEEP_RATIO = 0.1, 0.4

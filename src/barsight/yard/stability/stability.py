@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8, kernel
+from barsight.core.arrays import Float64
 from barsight.core.parallel import ordered_map
-from barsight.core.records.heights import HeightSource
 from barsight.yard.lift_settings import UPPER, LiftSettings
+from barsight.yard.map_lookup import lookup_heights
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Check, check_max, check_min, check_true
 
@@ -33,7 +33,6 @@ BESIDE_M = 0.3
 TOUCH_M = 0.02
 RAISED_RATIO = 0.25
 """Of the width by which a neighbour's underside lies higher where it rests against a bundle."""
-_UNKNOWN, _FILLED = HeightSource.UNKNOWN, HeightSource.FILLED
 
 
 @dataclass(frozen=True)
@@ -136,57 +135,6 @@ def _profile(heights: HeightMap, bundle: Bundle, sign: int) -> Float64:
     count = known.sum(axis=1)
     middle = ordered[np.arange(len(out)), np.maximum(count - 1, 0) // 2]
     return np.stack([np.where(count > 0, middle, np.nan), count / STATIONS], axis=1)
-
-
-def nearest_cells(heights: HeightMap, x: Float64, y: Float64) -> tuple[Int64, Int64, Bool]:
-    """Columns and rows of the nearest cells, and whether they lie in the map; (0, 0) where not."""
-    column = np.floor((x - heights.x0_m) / heights.cell_m + 0.5).astype(np.int64)
-    row = np.floor((y - heights.y0_m) / heights.cell_m + 0.5).astype(np.int64)
-    rows, columns = heights.z_m.shape
-    inside = (row >= 0) & (column >= 0) & (row < rows) & (column < columns)
-    return np.where(inside, column, 0), np.where(inside, row, 0), inside
-
-
-def lookup_heights(heights: HeightMap, x: Float64, y: Float64) -> Float64:
-    """Look up heights of the nearest cells; NaN where they were not seen."""
-    x, y = np.broadcast_arrays(x, y)
-    z = _lookup(
-        heights.z_m, heights.source, heights.x0_m, heights.y0_m, heights.cell_m,
-        np.ravel(x).astype(np.float64), np.ravel(y).astype(np.float64),
-    )  # fmt: skip
-    return z.reshape(x.shape)
-
-
-@kernel()
-def _lookup(z: Float32, source: UInt8, x0: float, y0: float, cell: float, x: Float64, y: Float64) -> Float64:
-    """Look up the heights (N,) of the cells nearest to places x and y (N,), m; NaN where none was seen."""
-    found = np.full(x.size, np.nan)
-    for k in range(x.size):
-        column = int(np.floor((x[k] - x0) / cell + 0.5))
-        row = int(np.floor((y[k] - y0) / cell + 0.5))
-        if row < 0 or column < 0 or row >= z.shape[0] or column >= z.shape[1]:
-            continue
-        if source[row, column] != _UNKNOWN and source[row, column] != _FILLED:
-            found[k] = z[row, column]
-    return found
-
-
-@kernel()
-def interpolate_height(z: Float32, source: UInt8, column: float, row: float) -> float:
-    """Interpolate the height between the four cells about a place in cells; NaN where less than half of it
-    was seen. z, source: maps (rows, columns).
-    """
-    left, low = int(np.floor(column)), int(np.floor(row))
-    total, weight = 0.0, 0.0
-    for c, share_c in ((left, 1 - (column - left)), (left + 1, column - left)):
-        for r, share_r in ((low, 1 - (row - low)), (low + 1, row - low)):
-            if r < 0 or c < 0 or r >= z.shape[0] or c >= z.shape[1]:
-                continue
-            if source[r, c] == _UNKNOWN or source[r, c] == _FILLED or np.isnan(z[r, c]):
-                continue
-            total += share_c * share_r * z[r, c]
-            weight += share_c * share_r
-    return total / weight if weight >= 0.5 else np.nan
 
 
 def _side(profile: Float64, bundle: Bundle) -> Side:
