@@ -31,7 +31,7 @@ from barsight.yard.magnet.resting_plane import (
     rest_faces,
     straighten_heights,
 )
-from barsight.yard.map_lookup import interpolate_height, lookup_heights
+from barsight.yard.map_lookup import interpolate_height
 from barsight.yard.types import HeightMap
 
 POLES = np.array([[-0.3, 0.02, 0.9, 0.1], [0.7, -0.02, 0.5, 0.12]])
@@ -90,20 +90,6 @@ def test_profiles_are_medians_of_what_was_seen() -> None:
             assert own[[Z, SCATTER, SIGMA]] == pytest.approx((np.median(z), spread, sigma.mean()), abs=1e-6)
         first += columns * parts
     assert 0 < np.isnan(points[:, Z]).sum() < 16
-
-
-def test_heights_are_looked_up_in_the_nearest_seen_cell() -> None:
-    heights = some_map()
-    rng = np.random.default_rng(3)
-    x, y = rng.uniform(-0.4, 0.4, 500), rng.uniform(-0.9, 0.9, 500)
-    column, row = (np.floor((a - a0) / 0.01 + 0.5).astype(int) for a, a0 in ((x, -0.3), (y, -0.75)))
-    inside = (column >= 0) & (row >= 0) & (column < 60) & (row < 150)
-    column, row = np.where(inside, column, 0), np.where(inside, row, 0)
-    seen = inside & was_seen(heights)[row, column]
-    np.testing.assert_array_equal(
-        lookup_heights(heights, x, y), np.where(seen, heights.z_m[row, column].astype(float), np.nan)
-    )
-    assert 0.2 < seen.mean() < 0.8
 
 
 def test_a_departure_counts_by_how_far_it_is_from_straight() -> None:

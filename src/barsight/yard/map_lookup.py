@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+
+import cv2
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8, kernel
@@ -18,6 +21,25 @@ def nearest_cells(heights: HeightMap, x: Float64, y: Float64) -> tuple[Int64, In
     rows, columns = heights.z_m.shape
     inside = (row >= 0) & (column >= 0) & (row < rows) & (column < columns)
     return np.where(inside, column, 0), np.where(inside, row, 0), inside
+
+
+def sample_levels(heights: HeightMap, levels: UInt8, x: Float64, y: Float64) -> Float32:
+    """Interpolate gray levels (V, U) between the four cells about places x and y, m; NaN where one of them
+    wasn't seen. levels: (rows, columns) of the map, 0 where unseen.
+    """
+    column, row = (
+        np.asarray((at - first) / heights.cell_m, np.float32)
+        for at, first in ((x, heights.x0_m), (y, heights.y0_m))
+    )
+    top, left = (max(math.floor(float(at.min())), 0) for at in (row, column))
+    end, right = (max(math.ceil(float(at.max())) + 1, 0) for at in (row, column))
+    part = levels[top:end, left:right]
+    if part.size == 0:
+        return np.full(column.shape, np.nan, np.float32)
+    seen = np.where(part > 0, part, np.nan).astype(np.float32)
+    return np.asarray(
+        cv2.remap(seen, column - left, row - top, cv2.INTER_LINEAR, borderValue=np.nan), np.float32
+    )
 
 
 def lookup_heights(heights: HeightMap, x: Float64, y: Float64) -> Float64:

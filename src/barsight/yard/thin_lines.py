@@ -9,12 +9,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
 from barsight.core.arrays import Float32, Float64, Int64, kernel
 from barsight.core.linalg.robust import known_median, mad_sigma, running_median
+from barsight.yard.map_lookup import sample_levels
 from barsight.yard.types import Bundle, Doubt, DoubtKind, HeightMap
 
 MAX_STRENGTH = 8.0
@@ -180,18 +180,7 @@ def _strip(heights: HeightMap, bundle: Bundle) -> tuple[Float64, Float32]:
     along, beside = (STEP_M * np.arange(-half, half + 1.0) for half in (half_v, half_u))
     x = bundle.centre_m[0] + along[:, None] * axis[0] + beside * axis[1]
     y = bundle.centre_m[1] + along[:, None] * axis[1] - beside * axis[0]
-    column, row = (
-        np.asarray((at - first) / heights.cell_m, np.float32)
-        for at, first in ((x, heights.x0_m), (y, heights.y0_m))
-    )
-    low = [max(math.floor(float(at.min())), 0) for at in (row, column)]
-    high = [max(math.ceil(float(at.max())) + 1, 0) for at in (row, column)]
-    part = heights.tops[low[0] : high[0], low[1] : high[1]]
-    if part.size == 0:
-        return along, np.full(x.shape, np.nan, np.float32)
-    seen = np.where(part > 0, np.log(part + 2.0), np.nan).astype(np.float32)
-    level = cv2.remap(seen, column - low[1], row - low[0], cv2.INTER_LINEAR, borderValue=np.nan)
-    return along, np.asarray(level, np.float32)
+    return along, np.log(sample_levels(heights, heights.tops, x, y) + 2)
 
 
 def _contrast(level: Float32, middle: int, half: int) -> tuple[Float32, Float32]:

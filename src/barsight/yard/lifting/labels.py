@@ -13,7 +13,7 @@ from barsight.yard.label_settings import LabelSettings
 from barsight.yard.lifting.clearance import FacePlane
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
-from barsight.yard.map_lookup import nearest_cells
+from barsight.yard.map_lookup import nearest_cells, sample_levels
 from barsight.yard.plates import STEP_M, plate_masks
 from barsight.yard.types import HeightMap
 from barsight.yard.vetoes import Check, check_true
@@ -152,18 +152,9 @@ def _look_up(place: Placement, heights: HeightMap, v: Float64, u: Float64) -> tu
     y = place.y_m + v[:, None] * place.along[1] + u * place.across[1]
     column, row, inside = nearest_cells(heights, x, y)
     assert heights.gray is not None
-    gray = np.where(inside, heights.gray[row, column], 0).astype(np.float32)
-    right, down = ((at - first) / heights.cell_m for at, first in ((x, heights.x0_m), (y, heights.y0_m)))
-    left, above = np.floor(right).astype(np.int64), np.floor(down).astype(np.int64)
-    within = (left >= 0) & (above >= 0) & (left + 1 < heights.shape[1]) & (above + 1 < heights.shape[0])
-    left, above = np.where(within, left, 0), np.where(within, above, 0)
-    right, down = right - left, down - above
-    level, seen = np.zeros(gray.shape), within
-    for i, j, share in ((0, 0, (1 - down) * (1 - right)), (0, 1, (1 - down) * right),
-                        (1, 0, down * (1 - right)), (1, 1, down * right)):  # fmt: skip
-        cell = heights.gray[above + i, left + j]
-        level, seen = level + share * cell, seen & (cell > 0)
+    nearest = np.where(inside, heights.gray[row, column], 0).astype(np.float32)
+    between = sample_levels(heights, heights.gray, x, y)
     return (
-        np.where(seen, level, gray).astype(np.float32),
+        np.where(np.isfinite(between), between, nearest),
         np.where(inside, heights.z_m[row, column], np.float32(np.nan)),
     )

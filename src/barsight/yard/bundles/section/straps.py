@@ -9,12 +9,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from scipy import ndimage
 
-from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8, kernel
-from barsight.core.records.heights import HeightSource
+from barsight.core.arrays import Bool, Float32, Float64, Int64, kernel
 from barsight.yard.bundles.fitting.outline_fit import ABOVE, BELOW, MIXED, SLOPE_U, Fit, U
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.section.strap_lines import (
@@ -26,6 +24,7 @@ from barsight.yard.bundles.section.strap_lines import (
     split_columns,
     split_faint,
 )
+from barsight.yard.map_lookup import lookup_heights, sample_levels
 from barsight.yard.types import HeightMap
 
 REACH_M = 0.55
@@ -156,37 +155,13 @@ def _around(height_map: HeightMap, grid: AlignedMap, fit: Fit) -> tuple[Float64,
     u = fit.values[U] + fit.values[SLOPE_U] * (v - fit.v_m)[:, None] + beside
     c, s = math.cos(grid.heading_rad), math.sin(grid.heading_rad)
     x, y = c * u - s * v[:, None], s * u + c * v[:, None]
-    column = np.asarray((x - height_map.x0_m) / height_map.cell_m, np.float32)
-    row = np.asarray((y - height_map.y0_m) / height_map.cell_m, np.float32)
     assert height_map.gray is not None
-    low = [max(int(a.min()) - 1, 0) for a in (row, column)]
-    high = [int(a.max()) + 2 for a in (row, column)]
-    part = height_map.gray[low[0] : high[0], low[1] : high[1]]
-    heights = height_map.z_m[low[0] : high[0], low[1] : high[1]]
-    sources = height_map.source[low[0] : high[0], low[1] : high[1]]
-    if part.size == 0:
-        nothing: Float32 = np.full(u.shape, np.nan, np.float32)
-        return beside, nothing, nothing, np.zeros(u.shape, bool)
-    places = column - low[1], row - low[0]
-    gray = _sampled(part, places)
-    tops = gray
+    gray = tops = sample_levels(height_map, height_map.gray, x, y)
     if height_map.tops is not None:
-        sharper = _sampled(height_map.tops[low[0] : high[0], low[1] : high[1]], places)
+        sharper = sample_levels(height_map, height_map.tops, x, y)
         tops = np.where(np.isfinite(sharper), sharper, gray)
-    z = cv2.remap(
-        np.where(HeightSource.measured(sources), heights, np.float32(np.nan)),
-        *places,
-        cv2.INTER_NEAREST,
-        borderValue=np.nan,
-    )
-    stock: Bool = np.asarray(np.isfinite(gray) & (z > grid.stock_over_m))
+    stock: Bool = np.isfinite(gray) & (lookup_heights(height_map, x, y) > grid.stock_over_m)
     return beside, gray, tops, stock
-
-
-def _sampled(levels: UInt8, places: tuple[Float32, Float32]) -> Float32:
-    """Resample gray levels at places, columns and rows; NaN where nothing was seen."""
-    seen = np.where(levels > 0, levels, np.nan).astype(np.float32)
-    return np.asarray(cv2.remap(seen, *places, cv2.INTER_LINEAR, borderValue=np.nan), np.float32)
 
 
 def strongest_lines(strength: Float64, teeth: Int64, apart: int) -> Int64:

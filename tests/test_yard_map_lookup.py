@@ -1,0 +1,40 @@
+"""Looking up the map at places of the yard, beside plain references."""
+
+import numpy as np
+from scipy.ndimage import map_coordinates
+
+from barsight.yard.map_lookup import lookup_heights, sample_levels
+from test_yard_resting_plane import some_map, was_seen
+
+
+def test_heights_are_looked_up_in_the_nearest_seen_cell() -> None:
+    heights = some_map()
+    rng = np.random.default_rng(3)
+    x, y = rng.uniform(-0.4, 0.4, 500), rng.uniform(-0.9, 0.9, 500)
+    column, row = (np.floor((a - a0) / 0.01 + 0.5).astype(int) for a, a0 in ((x, -0.3), (y, -0.75)))
+    inside = (column >= 0) & (row >= 0) & (column < 60) & (row < 150)
+    column, row = np.where(inside, column, 0), np.where(inside, row, 0)
+    seen = inside & was_seen(heights)[row, column]
+    np.testing.assert_array_equal(
+        lookup_heights(heights, x, y), np.where(seen, heights.z_m[row, column].astype(float), np.nan)
+    )
+    assert 0.2 < seen.mean() < 0.8
+
+
+def test_levels_are_interpolated_between_four_seen_cells() -> None:
+    """As SciPy does it, to OpenCV's 1/32 of a cell; unknown beside what wasn't seen and off the map."""
+    heights = some_map()
+    rng = np.random.default_rng(4)
+    levels = rng.integers(1, 256, heights.shape).astype(np.uint8)
+    levels[rng.random(heights.shape) < 0.05] = 0
+    x, y = rng.uniform(-0.4, 0.4, (20, 25)), rng.uniform(-0.9, 0.9, (20, 25))
+    column, row = (x - heights.x0_m) / heights.cell_m, (y - heights.y0_m) / heights.cell_m
+    plain = map_coordinates(
+        np.where(levels > 0, levels, np.nan).astype(float), (row, column), order=1, cval=np.nan
+    )
+    found = sample_levels(heights, levels, x, y)
+    within = np.minimum(abs(column - np.rint(column)), abs(row - np.rint(row))) > 1 / 32
+    np.testing.assert_array_equal(np.isfinite(found[within]), np.isfinite(plain[within]))
+    np.testing.assert_allclose(found[within], plain[within], atol=255 / 32)
+    assert np.isnan(sample_levels(heights, levels, x + 5, y)).all()
+    assert 0.2 < np.isfinite(found).mean() < 0.8
