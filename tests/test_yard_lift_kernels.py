@@ -154,7 +154,7 @@ def test_what_lies_outside_all_outlines_is_the_share_that_arrays_give() -> None:
         [rng.uniform(-1, 1, (4, 2)), -np.sin(turn), np.cos(turn), rng.uniform(0.1, 0.8, (4, 4))]
     )
     reach_z = np.array([0.12, 0.14])
-    frame = np.array([(place.x_m, place.y_m), place.along, place.across])
+    frame = place.frame
     points = frame[0] + grid[:, :2] @ frame[1:]
     at = np.array([heights.x0_m, heights.y0_m, heights.cell_m])
     columns, rows = ((points - at[:2]) / at[2]).T

@@ -293,7 +293,7 @@ def _unexplained(
         outlines[:, first + 1] += open_m
     return _stray_shares(
         heights.z_m, heights.source, np.array([heights.x0_m, heights.y0_m, heights.cell_m]),
-        np.array([(place.x_m, place.y_m), place.along, place.across]),
+        place.frame,
         _face_grid(magnet, math.ceil(1e3 * (float(across) + margin))), contact.z_m - magnet.reach_m, outlines,
     )  # fmt: skip
 

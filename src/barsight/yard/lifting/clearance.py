@@ -245,8 +245,7 @@ def leaning_checks(
 
 def _tops(place: Placement, magnet: Magnet, load: tuple[Bundle, ...]) -> Float64:
     """Compute the heights (bundles, poles) of the load's tops where the poles are."""
-    axes = np.stack([place.along, place.across])
-    return tops_at(load, magnet.pole_table[:, :2] @ axes + (place.x_m, place.y_m))
+    return tops_at(load, magnet.pole_table[:, :2] @ place.axes + (place.x_m, place.y_m))
 
 
 def _obstructed(rise: Float32, spare: Float32, region: Region) -> Obstacle | None:
@@ -329,7 +328,7 @@ def _region(place: Placement, heights: HeightMap, magnet: Magnet, wider_m: float
     `wider_m`. It lies on the map's cells: none comes or goes as the place moves, but at the region's edge.
     """
     beam = magnet.beam
-    frame = np.array([[place.x_m, place.y_m], place.along, place.across])
+    frame = place.frame
     more = magnet.tolerance.along(frame[1:])
     parts = np.empty((len(magnet.poles) + 1, 5))
     parts[:-1, :4] = magnet.pole_table * (1, 1, 0.5, 0.5)

@@ -129,16 +129,15 @@ def may_reach(bundle: Bundle, place: Placement, magnet: Magnet, faces_z_m: float
     wide = bundle.width_m / 2 + BEYOND_M
     long = bundle.length_m / 2 + MAX_SLOPE * wide
     away = bundle.centre_m[:2] - (place.x_m, place.y_m)
-    axes = np.stack([place.along, place.across])
-    spread = np.abs(axes @ along) * long + np.abs(axes @ across) * wide
-    return bool((np.abs(axes @ away) <= _under_m(place, magnet) + spread).all())
+    spread = np.abs(place.axes @ along) * long + np.abs(place.axes @ across) * wide
+    return bool((np.abs(place.axes @ away) <= _under_m(place, magnet) + spread).all())
 
 
 def _under_m(place: Placement, magnet: Magnet) -> Float64:
     """Compute half the length and half the width (2,) under the magnet, within the crane's tolerance and the
     stray field.
     """
-    slack = magnet.tolerance.along(np.stack([place.along, place.across]))
+    slack = magnet.tolerance.along(place.axes)
     half = np.array([magnet.size_m[1], magnet.size_m[0]]) / 2 + slack + STRAY_FIELD_M
     return np.asarray(half + math.radians(magnet.tolerance.yaw_deg) * half[::-1])
 

@@ -50,6 +50,16 @@ class Placement:
         """Return the unit vector (2,) across the beam."""
         return np.array([np.cos(self.yaw_rad), np.sin(self.yaw_rad)])
 
+    @property
+    def axes(self) -> Float64:
+        """Return the rows (2, 2) `along` and `across`."""
+        return np.stack([self.along, self.across])
+
+    @property
+    def frame(self) -> Float64:
+        """Return the rows (3, 2): the place, and `axes`."""
+        return np.vstack([(self.x_m, self.y_m), self.axes])
+
 
 class Rectangles(NamedTuple):
     """Bundles from above with their tops, for all at once. Lengths in m.

@@ -115,7 +115,7 @@ def pole_shares(contact: Contact, magnet: Magnet, place: Placement, load: tuple[
     slack = UPPER * np.max([
         np.nan_to_num((bundle.sigma.along_m, bundle.sigma.lateral_m), nan=0.05) for bundle in load
     ], axis=0)  # fmt: skip
-    offset = np.array([away @ place.along, away @ place.across])
+    offset = place.axes @ away
     middle, slope, in_row = _levers(magnet.poles)
     offset = offset - middle
     share = 1 / len(slope) + slope @ offset + np.abs(slope) @ slack

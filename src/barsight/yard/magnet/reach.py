@@ -34,7 +34,7 @@ def reached_strips(
     face_z_m: (P,) height of each pole's face.
     """
     poles = magnet.pole_table
-    more = tolerance.along(np.stack([place.along, place.across]))
+    more = tolerance.along(place.axes)
     turned = math.radians(tolerance.yaw_deg)
     wide, long = ((np.abs(poles[:, k]) + poles[:, m] / 2).max() for k, m in ((1, 3), (0, 2)))
     grown = poles.copy()

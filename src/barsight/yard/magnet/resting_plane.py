@@ -47,7 +47,7 @@ def profiles(heights: HeightMap, place: Placement, poles: Float64) -> tuple[list
     _sample(
         heights.z_m, heights.sigma_m, heights.source,
         np.array([heights.x0_m, heights.y0_m, heights.cell_m]),
-        np.array([(place.x_m, place.y_m), place.along, place.across]), poles, np.array(shape), points,
+        place.frame, poles, np.array(shape), points,
     )  # fmt: skip
     return shape, points
 
