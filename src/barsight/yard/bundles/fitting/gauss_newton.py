@@ -13,7 +13,7 @@ Four = tuple[float, float, float, float]
 
 _ROLL, _DIAMETER = 4, 5
 _RIM_M = 0.008
-_STEEPEST = 4.0
+_STEEPEST = 4.5
 _MIN_HEIGHTS = 30
 _STILL_M = 1e-5
 _MIN_SCATTER = 0.04
@@ -68,6 +68,7 @@ def fit_outline(
     values, alike = start.copy(), rules.alike
     normal, moments = np.eye(6), np.zeros(3)
     half = (heights.last - heights.first) * heights.cell_m / 2
+    before, damping = np.zeros(6), 1.0
     for _ in range(rules.steps):
         tables = trace_with_changes(rules.packing, values[_DIAMETER], values[_ROLL], rules.smoothing_m)
         normal, right, moments = _normal_equations(heights, values, tables, rules.gate_m, rules.placing_m)
@@ -84,6 +85,10 @@ def fit_outline(
         if rules.free[_DIAMETER]:
             most = 0.05 * values[_DIAMETER]
             change[_DIAMETER] = min(max(change[_DIAMETER], -most), most + 1e-3)
+        # A step that turns back is too long: without damping many fits swing by millimetres for ever.
+        if before @ normal @ change < 0:
+            damping /= 2
+        before, change = change, damping * change
         values += change
         width = values[_DIAMETER] * rules.width_ratio
         if not rules.widths_m[0] < width < rules.widths_m[1]:
@@ -144,9 +149,8 @@ def _normal_equations(
         # Plain numbers stay in registers; an array's would be stored and loaded for each height.
         uu = uz = ur = ud = zz = zr = zd = rr = rd = dd = 0.0
         side_u = side_z = side_r = side_d = 0.0
-        for i in range(
-            max(int(np.ceil((u - inner) / cell)), 0), min(int((u + inner) / cell), columns - 1) + 1
-        ):
+        first = max(int(np.ceil((u - inner) / cell - 0.5)), 0)
+        for i in range(first, min(int(np.floor((u + inner) / cell + 0.5)), columns - 1) + 1):
             z = heights.z_m[j, i]
             place = ((cell * i - u) * cosine + reach) / STEP_M
             k = int(place)
@@ -155,11 +159,14 @@ def _normal_equations(
             share = place - k
             h = tables[0, k] * (1 - share) + tables[0, k + 1] * share
             slope = tables[1, k] * (1 - share) + tables[1, k + 1] * share
-            roll, diameter = tables[2, k], tables[3, k]
+            roll = tables[2, k] * (1 - share) + tables[2, k + 1] * share
+            diameter = tables[3, k] * (1 - share) + tables[3, k + 1] * share
             r = z - values[2] - values[3] * along - h
-            if not (abs(r) < gate and abs(slope) <= _STEEPEST and roll == roll and diameter == diameter):
+            if not (abs(r) < gate and abs(slope) < _STEEPEST and roll == roll and diameter == diameter):
                 continue
-            tukey = (1 - (r / gate) ** 2) ** 2
+            # Weights that jump as a cell comes in or goes would let the steps swing about the jump.
+            within = min((inner - abs(cell * i - u)) / cell + 0.5, 1.0) * min(_STEEPEST - abs(slope), 1.0)
+            tukey = within * (1 - (r / gate) ** 2) ** 2
             w = tukey / (heights.sigma_m[j, i] ** 2 + (slope * placing) ** 2)
             sideways = -slope * cosine
             w_u, w_r, w_d = w * sideways, w * roll, w * diameter

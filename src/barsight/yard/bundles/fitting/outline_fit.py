@@ -90,7 +90,7 @@ def refine_outline(
     grid: AlignedMap,
     start: Fit,
     settings: BundleSettings,
-    steps: int = 6,
+    steps: int = 20,
     gate_m: float | None = None,
     common: tuple[float, float] | None = None,
 ) -> Fit | None:
