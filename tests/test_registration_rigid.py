@@ -55,6 +55,20 @@ def test_the_covariance_is_right(stated: bool) -> None:
     assert 0.75 < np.mean(np.square(scales)) < 1.3
 
 
+def test_sigmas_that_differ_by_direction_are_believed() -> None:
+    squares = []
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        source = rng.uniform((-20, -6, 0), (20, 6, 2.5), (12, 3))
+        ray = np.column_stack([rng.normal(0, 0.3, (12, 2)), np.ones(12)])
+        ray /= np.linalg.norm(ray, axis=1)[:, None]
+        covariance = 1e-6 * np.eye(3) + 99e-6 * ray[:, :, None] * ray[:, None, :]
+        noise = np.einsum("nij,nj->ni", np.linalg.cholesky(covariance), rng.normal(0, 1, (12, 3)))
+        result = found(source, TRUTH.apply(source) + noise, covariance)
+        squares.append(result.chi2 / result.degrees_of_freedom)
+    assert 0.9 < np.mean(squares) < 1.1
+
+
 def test_what_cant_be_aligned_is_refused_with_the_reason() -> None:
     line = np.column_stack([np.linspace(0, 7, 20), np.zeros(20), np.zeros(20)])
     for source, code in ((line, "collinear"), (np.zeros((5, 3)), "collinear"), (line[:2], "few-points")):

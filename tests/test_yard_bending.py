@@ -104,6 +104,30 @@ def test_check_points_lie_within_5_mm_and_inside_sigma_under_a_girder_that_bends
     assert 0.8 < np.std(off_sigma) < 1.2
 
 
+def test_frame_and_bend_err_as_they_say_where_depths_are_less_sure() -> None:
+    squares = []
+    for seed in range(60):
+        rng = np.random.default_rng((26, seed))
+        points, cranes = drawn(rng, 14)
+        bend, values = straight(GIRDER, RAILS), rng.normal(0, ORDINARY)
+        shift, tilt = bend.slopes(cranes)
+        slopes = shift + np.cross(tilt, (points - cranes)[:, :, None], axis=1)
+        ray = np.column_stack([rng.normal(0, 0.3, (14, 2)), np.ones(14)])
+        ray /= np.linalg.norm(ray, axis=1)[:, None]
+        covariance = 1e-6 * np.eye(3) + 24e-6 * ray[:, :, None] * ray[:, None, :]
+        noise = np.einsum("nij,nj->ni", np.linalg.cholesky(covariance), rng.normal(0, 1, (14, 3)))
+        yard = (points + slopes @ values) @ TURN.T + SHIFT + noise
+        found = calibrate_bent_yard(
+            tuple("abcdefghijklmn"), points, slopes, yard, covariance, np.zeros(14, bool), "encoders", bend
+        )
+        assert not isinstance(found, Failed)
+        pose = found[0].alignment.target_from_source
+        turned = Rotation.from_matrix(TURN @ pose.rotation.T).as_rotvec()
+        off = np.concatenate([turned, SHIFT - pose.translation, values - found[1].values])
+        squares.append(off @ np.linalg.solve(found[1].covariance, off) / 9)
+    assert 0.8 < np.mean(squares) < 1.25
+
+
 def test_the_bend_is_taken_off_the_readings_and_its_sigma_is_shared(tmp_path: Path) -> None:
     _, bend, frame = calibrated(tmp_path, 3)
     lever, hangs = np.array([0.3, 0.1, -0.5]), DOWN

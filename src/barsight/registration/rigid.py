@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from barsight.core.arrays import Float64, expect_shape
 from barsight.core.errors import Failed
@@ -13,6 +14,8 @@ from barsight.core.pose import Pose, nearest_rotation, skew
 MIN_POINTS = 3
 MIN_WIDTH = 0.01
 """Points that stray less than this share of their length from a line leave the turn about it open."""
+ROUNDS = 3
+"""Gauss-Newton steps from the closed form."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,9 +47,10 @@ def align_rigid(
 ) -> Alignment | Failed:
     """Align `source` (N, 3) rigidly with `target` (N, 3), m [paper Eq. 13-20, see below].
 
-    frames: (target, source). covariance_m2: (N, 3, 3) of each pair's difference, target axes; points count
-    by its trace, and the stated covariance follows from it whole. Without it all count alike and one sigma
-    for all is taken from the residuals.
+    frames: (target, source). covariance_m2: (N, 3, 3) of each pair's difference, target axes, or (N, N) of
+    the points on each axis alike. Points count by its trace at first, then by all of it (`_refined`), so that
+    chi2 has its degrees of freedom. Without it all count alike and one sigma for all is taken from the
+    residuals.
     The rotation is the one nearest to sum p'' q''^T; the paper prints its transpose.
     Failed `few-points`, `collinear`.
     """
@@ -66,24 +70,25 @@ def align_rigid(
         return line
     moment = p.T @ (weight[:, None] * q)
     rotation = nearest_rotation(moment)
-    centre = np.average(target, 0, weight)
-    translation = centre - rotation @ np.average(source, 0, weight)
-    residuals = target - source @ rotation.T - translation
+    shift = np.average(target, 0, weight) - rotation @ np.average(source, 0, weight)
+    pose = Pose(*frames, rotation, shift)
+    if covariance_m2 is not None:
+        pose = _refined(source, target, pose, covariance_m2)
+    rotation = pose.rotation
+    residuals = target - pose.apply(source)
     extent = float((weight * (q**2).sum(1)).sum())
-    turned = q @ rotation.T
 
     free = max(residuals.size - 6, 0)
     sigma = float(np.sqrt((weight[:, None] * residuals**2).sum() / free / weight.mean())) if free else np.nan
-    spread, chi2 = np.broadcast_to(np.eye(3) * sigma**2, (len(source), 3, 3)), np.nan
+    spread, known, chi2 = np.broadcast_to(np.eye(3), (len(source), 3, 3)), sigma**2, np.nan
     if covariance_m2 is not None:
-        spread = covariance_m2
-        solved = np.linalg.solve(spread, residuals if together else residuals[..., None])
-        chi2 = float((residuals * solved.reshape(residuals.shape)).sum())
-    weighted = weight[:, None] * turned
-    along = (weighted * _times(spread, weighted)).sum()
+        spread, known = covariance_m2, 1.0
+        chi2 = float((residuals * _divided(residuals, spread)).sum())
+    weighted = weight[:, None] * (q @ rotation.T)
+    along = known * float((weighted * _times(spread, weighted)).sum())
     return Alignment(
-        Pose(*frames, rotation, translation),
-        _covariance(turned, centre - translation, weight, spread),
+        pose,
+        known * _covariance(source @ rotation.T, spread),
         residuals,
         float((rotation * moment).sum()) / extent,
         float(np.sqrt(along)) / extent,
@@ -118,18 +123,40 @@ def _times(spread: Float64, values: Float64) -> Float64:
     return product
 
 
-def _covariance(turned: Float64, centre: Float64, weight: Float64, spread: Float64) -> Float64:
-    """Compute A^-1 B A^-1 (6, 6) of weighted least squares.
+def _divided(values: Float64, spread: Float64) -> Float64:
+    """Multiply values (N, 3, ...) by the inverse of a covariance, (N, 3, 3) or (N, N)."""
+    rows = values.reshape(len(values), -1) if spread.ndim == 2 else values.reshape(len(values), 3, -1)
+    solved = np.linalg.solve(spread, rows)
+    return np.asarray(solved, np.float64).reshape(values.shape)
 
-    centre: (3,) from the source's origin, target axes.
+
+def _refined(source: Float64, target: Float64, pose: Pose, spread: Float64) -> Pose:
+    """Refine a pose by least squares under the points' covariance S: it makes r^T S^-1 r least, r being the
+    residuals [Aitken 1936].
     """
-    design = design_rows(turned)
-    weighted = weight[:, None, None] * design
-    normal = np.einsum("nki,nkj->ij", weighted, design)
-    noise = np.einsum("nki,nkj->ij", weighted, _times(spread, weighted))
-    bread = np.linalg.inv(normal)
+    for _ in range(ROUNDS):
+        turned = source @ pose.rotation.T
+        centre = turned.mean(axis=0)
+        design = design_rows(turned - centre)
+        weighted = _divided(design, spread)
+        normal = np.einsum("nki,nkj->ij", design, weighted)
+        step = np.linalg.solve(normal, np.einsum("nki,nk->i", weighted, target - pose.apply(source)))
+        turn = Rotation.from_rotvec(step[:3]).as_matrix()
+        shift = pose.translation + centre - turn @ centre + step[3:]
+        pose = Pose(pose.target, pose.source, turn @ pose.rotation, shift)
+    return pose
+
+
+def _covariance(turned: Float64, spread: Float64) -> Float64:
+    """Compute (J^T S^-1 J)^-1 (6, 6) of least squares under a covariance S, (N, 3, 3) or (N, N).
+
+    turned: (N, 3) points from the source's origin, target axes.
+    """
+    centre = turned.mean(axis=0)
+    design = design_rows(turned - centre)
+    bread = np.linalg.inv(np.einsum("nki,nkj->ij", design, _divided(design, spread)))
     move = np.eye(6)
     # A turn about the points' centre carries the source's origin along.
     move[3:, :3] = skew(centre)
-    covariance: Float64 = move @ bread @ noise @ bread @ move.T
+    covariance: Float64 = move @ bread @ move.T
     return covariance
