@@ -7,12 +7,20 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from barsight.acceptance import error_sources
 from barsight.acceptance.budget import ERRORS, FIGURES, BudgetedLoad, ErrorSource, budget
-from barsight.acceptance.error_sources import SHAPE, fit_sources
+from barsight.acceptance.error_sources import SHAPE, fit_sources, measured_load
 from barsight.acceptance.observation import ViewGeometry
 from barsight.cli.main import run
 from barsight.core.arrays import Float64
+from barsight.core.pose import Pose
+from barsight.core.records.pairs import RectifiedCamera
+from barsight.core.records.trajectory import PosedFrame, Trajectory
+from barsight.registration.bending import CraneBend
+from barsight.registration.yard_file import YardFrame
+from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.types import FitSigma
+from barsight.yard_frame import with_shared
 from lift_yards import laid, map_of, record
 
 VIEW = ViewGeometry(np.array([4.0, 0.2, 8.0]), 1250.0, 0.5)
@@ -121,6 +129,66 @@ def test_what_the_shape_leaves_open_is_a_source_of_its_own() -> None:
     assert (SHAPE, "fit_along") not in parts and (SHAPE, "fit_yaw") not in parts
     whole = {(one.name, *one.errors) for one in fit_sources(record(one), heights)}
     assert not any(name[0] == SHAPE for name in whole) and ("matching and fit", "fit_top") in whole
+
+
+BODY = np.array([20.0, 0.4, 8.0])
+OWN = np.diag([1e-12] * 3 + [1e-6] * 3)
+
+
+def frame_parts(frame: YardFrame, monkeypatch: pytest.MonkeyPatch) -> Float64:
+    """Budget a bundle below BODY: sigma (3,) of lift x, y and z, mm, that the frame and the travel cause."""
+    one, camera = laid(20.0), RectifiedCamera(1250.0, 800.0, 600.0, 0.5, 0.0, 1600, 1200)
+    posed = tuple(PosedFrame(k, Pose("yard", "body", np.eye(3), BODY), OWN) for k in (1, 2))
+    way = with_shared(Trajectory("yard", posed, (), ("crane",)), frame)
+    travel = Travel.of(way, None, 0, 0, BODY[2] - one.top_z_m, camera, {1, 2}).content()
+    told = {
+        "reference": "yard", "travel": travel,
+        "configuration": {
+            "stereo": {"calibration_sigma_px": 0.01},
+            "bundles": {"shared_lateral_m": 0.0, "shared_height_m": 0.0},
+        },
+    }  # fmt: skip
+    for name, answer in (
+        ("open_folder", (told, None)), ("measured_rig", None), ("_yard_frame", frame),
+        ("view_geometry", ViewGeometry(BODY, 1250.0, 0.5)), ("read_heights", map_of([one])),
+        ("_chosen", record(one)),
+    ):  # fmt: skip
+        monkeypatch.setattr(error_sources, name, lambda *_, said=answer, **__: said)
+    found = measured_load(Path("folder"), None, None, 0.0)
+    figures = budget(found.load, found.view, found.origin_m, found.sources, 1000)[:3]
+    named = [[p.sigma for p in one.parts if p.source in ("yard frame", "travel")] for one in figures]
+    return np.array([float(np.linalg.norm(parts)) for parts in named])
+
+
+def frame_of(pose: Pose, covariance: Float64, hangs: Float64 | None, bend: CraneBend | None) -> YardFrame:
+    return YardFrame(Path("yard.yaml"), pose, covariance, hangs, None, None, None, (), "", bend)
+
+
+def test_what_a_bent_cranes_frame_leaves_open_is_budgeted(monkeypatch: pytest.MonkeyPatch) -> None:
+    sigma = np.diag([1e-4, 1e-4, 1e-4, 1e-3, 1e-3, 1e-3, 6e-3, 2e-4, 4e-3])
+    alike = np.eye(9)
+    alike[5, 6] = alike[6, 5] = 0.6
+    covariance = sigma @ alike @ sigma
+    bend = CraneBend((-8.0, 8.0), (0.0, 40.0), np.zeros(3), covariance)
+    pose = Pose("yard", "encoders", np.eye(3), np.zeros(3))
+    told = frame_parts(frame_of(pose, covariance[:6, :6], None, bend), monkeypatch)
+    errors = np.random.default_rng(0).multivariate_normal(np.zeros(9), covariance, 20_000)
+    top = np.array([20.0, 0.0, laid(20.0).top_z_m])
+    shift, tilt = (part[0] for part in bend.slopes(BODY[None]))
+    values = errors[:, 6:]
+    moved = np.cross(errors[:, :3], top) + errors[:, 3:6]
+    moved += values @ shift.T + np.cross(values @ tilt.T, top - BODY)
+    assert told == pytest.approx(1e3 * np.hypot(moved.std(axis=0), 1e-3), rel=0.05)
+
+
+def test_a_frame_that_gives_the_attitude_alone_counts_about_the_body(monkeypatch: pytest.MonkeyPatch) -> None:
+    covariance = np.diag(np.square([2e-4, 2e-4, 2e-4, 5e-3, 5e-3, 5e-3]))
+    away = np.array([0.0, 0.0, laid(20.0).top_z_m]) - BODY * [0, 1, 1]
+    moved = 2e-4 * np.array([np.hypot(away[1], away[2]), abs(away[2]), abs(away[1])])
+    for origin in (np.zeros(3), np.array([80.0, -30.0, 1.0])):
+        pose = Pose("yard", "world", np.eye(3), origin)
+        told = frame_parts(frame_of(pose, covariance, np.eye(3), None), monkeypatch)
+        assert told == pytest.approx(1e3 * np.hypot(moved, 1e-3), rel=0.05)
 
 
 @pytest.mark.parametrize(

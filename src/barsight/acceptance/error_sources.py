@@ -18,7 +18,7 @@ from barsight.acceptance.uncertainty import COVERAGE
 from barsight.acceptance.yard_area import measured_rig
 from barsight.core.arrays import Float64
 from barsight.core.errors import InputError, MeasurementError
-from barsight.core.pose import Pose
+from barsight.core.pose import Pose, skew
 from barsight.core.reading.bounded_reading import in_range
 from barsight.registration.yard_file import YardFrame, read_yard_file
 from barsight.result_folder import open_folder, read_heights
@@ -43,8 +43,9 @@ EXPANSION_PER_K = 23e-6
 
 @dataclass(frozen=True, eq=False)
 class MeasuredLoad:
-    """A bundle of a folder with all that its budget takes. assumed: sentences on what nobody measured.
-    targets_m: (T, 3) by which this rig found the yard frame; None where it didn't.
+    """A bundle of a folder with all that its budget takes. origin_m: about which the yard frame's errors
+    turn. assumed: sentences on what nobody measured. targets_m: (T, 3) by which this rig found the yard
+    frame; None where it didn't.
     """
 
     bundle: int
@@ -86,20 +87,24 @@ def measured_load(
         ),
         *fit_sources(bundle, heights, _shared_m(summary, folder / "result.json")),
     ]  # fmt: skip
-    frame = _yard_frame(summary)
-    sources += [
-        *_frame_source(frame, assumed),
-        _travel_source(summary, folder / "result.json", bundle, frame),
-    ]
+    frame, travel = _yard_frame(summary), Travel.read(summary)
+    if travel is None:
+        raise InputError(folder / "result.json", "doesn't say how sure the travel is", REMEDY)
+    near = np.linalg.norm(travel.place_m - bundle.centre_m[:2], axis=1) < travel.reach_m
+    seen_from = np.append(
+        travel.place_m[near].mean(axis=0) if near.any() else bundle.centre_m[:2], view.camera_m[2]
+    )
+    below = np.append(seen_from[:2], bundle.top_z_m)
+    shared = np.zeros((6, 6)) if frame is None else frame_covariance(frame, seen_from, below)
+    sources += [*_frame_source(frame, shared, assumed), _travel_source(travel.sigma_m[near], shared)]
     sources += _magnet_source(certificate, assumed) if offset is None else _offset_sources(offset)
     mass = bundle_mass(bundle)
     top = np.array([bundle.centre_m[0], bundle.centre_m[1], bundle.top_z_m])
     load = BudgetedLoad(top, bundle.yaw_rad, bundle.length_m, bundle.width_m, mass.kg)
-    origin = np.zeros(3) if frame is None else frame.yard_from.translation.copy()
     targets = None
     if frame is not None and frame.attitude is None and frame.calibration_id is not None:
         targets = frame.targets_m
-    return MeasuredLoad(bundle.id, load, view, origin, tuple(sources), tuple(assumed), targets)
+    return MeasuredLoad(bundle.id, load, view, below, tuple(sources), tuple(assumed), targets)
 
 
 def _expect_own(path: Path, told: dict[str, Any], other: dict[str, Any], whose: str = "the folder") -> None:
@@ -193,21 +198,26 @@ def _shared_m(summary: dict[str, Any], path: Path) -> tuple[float, float]:
         raise InputError(path, "doesn't say bundles.shared_lateral_m and shared_height_m", REMEDY) from error
 
 
-def _travel_source(
-    summary: dict[str, Any], path: Path, bundle: Bundle, frame: YardFrame | None
-) -> ErrorSource:
-    """Take the trajectory's covariance where the bundle was seen from, the yard frame's part left out."""
-    travel = Travel.read(summary)
-    if travel is None:
-        raise InputError(path, "doesn't say how sure the travel is", REMEDY)
-    near = np.linalg.norm(travel.place_m - bundle.centre_m[:2], axis=1) < travel.reach_m
+def frame_covariance(frame: YardFrame, seen_from: Float64, below: Float64) -> Float64:
+    """Compute the covariance (6, 6) of how the yard frame turns and moves what is about a place (3,), seen
+    from the body at `seen_from` (3,), both in the yard: with a bend's part, and without the frame's own place
+    where only the attitude is taken.
+    """
+    carry = np.eye(6)
+    carry[3:, :3] = -skew(below - seen_from)
+    shared = shared_covariance(Pose("yard", "body", np.eye(3), seen_from), frame)
+    covariance: Float64 = carry @ shared @ carry.T
+    return covariance
+
+
+def _travel_source(sigma_m: Float64, shared: Float64) -> ErrorSource:
+    """Take the trajectory's covariance where the bundle was seen from, the yard frame's part left out.
+
+    sigma_m: (N, 3) there; shared: (6, 6) of `frame_covariance`.
+    """
     variance = np.full(3, nan)
-    if near.any():
-        variance = np.median(travel.sigma_m[near] ** 2, axis=0)
-        if frame is not None:
-            seen = np.append(travel.place_m[near].mean(axis=0), bundle.centre_m[2])
-            shared = shared_covariance(Pose("yard", "body", np.eye(3), seen), frame)
-            variance = np.maximum(variance - np.diag(shared)[3:], 0.0)
+    if len(sigma_m):
+        variance = np.maximum(np.median(sigma_m**2, axis=0) - np.diag(shared)[3:], 0.0)
     names = ("move_x", "move_y", "move_z")
     return ErrorSource("travel", names, np.diag(variance), "the trajectory's covariance")
 
@@ -217,13 +227,12 @@ def _yard_frame(summary: dict[str, Any]) -> YardFrame | None:
     return read_yard_file(Path(str(file))) if file else None
 
 
-def _frame_source(frame: YardFrame | None, assumed: list[str]) -> list[ErrorSource]:
+def _frame_source(frame: YardFrame | None, shared: Float64, assumed: list[str]) -> list[ErrorSource]:
     if frame is None:
         assumed.append("no yard file was used: how the rig hangs is taken as the recording says it")
         return []
     names = ("turn_x", "turn_y", "turn_z", "move_x", "move_y", "move_z")
-    source = ErrorSource("yard frame", names, frame.covariance, f"calibrate yard, {frame.path.name}")
-    return [source]
+    return [ErrorSource("yard frame", names, shared, f"calibrate yard, {frame.path.name}")]
 
 
 def _magnet_source(certificate: Path | None, assumed: list[str]) -> list[ErrorSource]:
