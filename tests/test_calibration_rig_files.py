@@ -13,11 +13,12 @@ from barsight.calibration.geometry.camera import Camera, Distortion
 from barsight.calibration.geometry.projection import Lens
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.calibration.stereo.calibration import calibrate_stereo, rig_file_section
-from barsight.calibration.stereo.disparity_uncertainty import disparity_sigma_px
+from barsight.calibration.stereo.disparity_uncertainty import disparity_sigma_px, rig_covariance
 from barsight.calibration.stereo.projection_uncertainty import depth_sigma
 from barsight.cli.main import run
 from barsight.core.errors import CalibrationError
 from barsight.core.pose import Pose
+from barsight.motion.rig_check.calibration_part import calibration_covariance
 from calibration_views import BOARD, CAM0, CAM1, ROTATION, SIZE, TRANSLATION_M, simulated
 
 
@@ -127,6 +128,29 @@ def test_a_covariance_gives_the_shared_disparity_error(tmp_path: Path) -> None:
     assert found == pytest.approx(expected, rel=0.02)
     assert disparity_sigma_px(tmp_path / "bare.yaml", 2.0) is None
     assert disparity_sigma_px(None, 2.0) is None
+
+
+def test_a_mounting_on_an_imu_changes_no_disparity_error(tmp_path: Path) -> None:
+    """A file of `calibrate camera-imu` tells of the mountings and clocks too."""
+    calibration = calibrate_stereo(simulated(3), BOARD, Lens.RADTAN4, (SIZE, SIZE), Path("views"), [])
+    section = rig_file_section(calibration)
+    write_rig_file(tmp_path / "rig.yaml", calibration.rig, section)
+    count = 2 * len(Lens.RADTAN4.parameter_names)
+    parts = ("rx_rad", "ry_rad", "rz_rad", "tx_m", "ty_m", "tz_m", "timeshift_s")
+    mounts = [f"body_from_cam{camera}.{part}" for camera in (0, 1) for part in parts]
+    names = calibration.parameter_names
+    section["parameters"] = [*names[:count], *mounts, *names[count:]]
+    whole = np.eye(len(names) + len(mounts)) * 1e-6
+    own = np.r_[:count, count + len(mounts) : len(whole)]
+    whole[np.ix_(own, own)] = calibration.covariance
+    section["covariance"] = whole.tolist()
+    write_rig_file(tmp_path / "imu.yaml", calibration.rig, section)
+    for found in (disparity_sigma_px, rig_covariance, calibration_covariance):
+        without, with_imu = (np.array(found(tmp_path / f"{name}.yaml", 2.0)) for name in ("rig", "imu"))
+        np.testing.assert_allclose(with_imu, without, rtol=1e-9)
+    section["parameters"], section["covariance"] = [*mounts, *names[count:]], whole[count:, count:].tolist()
+    write_rig_file(tmp_path / "exact.yaml", calibration.rig, section)
+    assert disparity_sigma_px(tmp_path / "exact.yaml", 2.0) is None
 
 
 def test_a_rig_of_two_cameras_keeps_the_recordings_mounting(tmp_path: Path) -> None:

@@ -23,11 +23,21 @@ NEAR_RATIO = 0.6
 """Of the range: the nearer of two distances at which depths tell a wrong yaw from a wrong scale."""
 
 
+def calibrated_covariance(path: Path) -> tuple[tuple[str, ...], Float64] | None:
+    """Read what a rig file's covariance is of (C,) and that, (C, C); None where it carries none, or none of
+    the lenses: then they were taken as exact and may be off by anything. Raises `CalibrationError`.
+    """
+    if not holds_own_rig(path) or (known := read_covariance(path)) is None:
+        return None
+    return known if any(name.startswith("cam0.") for name in known[0]) else None
+
+
 def disparity_sigma_px(path: Path | None, range_m: float) -> float | None:
     """Compute the standard deviation (px, median over the picture) that the calibration causes at `range_m`;
-    None where no file is given or it carries no covariance. Raises `CalibrationError` for one that can't be.
+    None where no file is given or it carries no covariance of lenses. Raises `CalibrationError` for one that
+    can't be.
     """
-    if path is None or not holds_own_rig(path) or (known := read_covariance(path)) is None:
+    if path is None or (known := calibrated_covariance(path)) is None:
         return None
     rig = read_rig_file(path)
     names, covariance = known
@@ -46,7 +56,7 @@ def rig_covariance(path: Path | None, range_m: float) -> Float64 | None:
     Signs: a right camera that is turned by more, and depths that are seen larger, than the file has it. What
     lenses do otherwise to depths there counts as yaw. Raises `CalibrationError` for one that can't be.
     """
-    if path is None or not holds_own_rig(path) or (known := read_covariance(path)) is None:
+    if path is None or (known := calibrated_covariance(path)) is None:
         return None
     rig = read_rig_file(path)
     names, covariance = known
@@ -84,7 +94,7 @@ def differentiate(
 
 
 def _moved(rig: StereoRig, names: tuple[str, ...], number: int, step: float) -> StereoRig:
-    """Perturb one named parameter of the rig."""
+    """Perturb one named parameter of the rig; where it sits on its body, and its clock, move no depth."""
     owner, _, name = names[number].partition(".")
     if owner in ("cam0", "cam1"):
         first = names.index(next(other for other in names if other.startswith(f"{owner}.")))
@@ -97,6 +107,8 @@ def _moved(rig: StereoRig, names: tuple[str, ...], number: int, step: float) -> 
             camera, fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy, coefficients=tuple(values[INTRINSICS:].tolist())
         )
         return replace(rig, cam0=changed) if owner == "cam0" else replace(rig, cam1=changed)
+    if owner != "cam1_from_cam0":
+        return rig
     change = np.zeros(6)
     change[("rx_rad", "ry_rad", "rz_rad", "tx_m", "ty_m", "tz_m").index(name)] = step
     old = rig.cam0_from_cam1.inverse()

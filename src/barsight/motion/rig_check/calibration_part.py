@@ -6,11 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from barsight.calibration.files.rig_file import read_covariance
-from barsight.calibration.files.rig_formats import holds_own_rig, read_rig_file
+from barsight.calibration.files.rig_formats import read_rig_file
 from barsight.calibration.geometry.rectification import right_from_rectified
 from barsight.calibration.geometry.rig import StereoRig
-from barsight.calibration.stereo.disparity_uncertainty import differentiate
+from barsight.calibration.stereo.disparity_uncertainty import calibrated_covariance, differentiate
 from barsight.calibration.stereo.projection_uncertainty import sample_pairs
 from barsight.core.arrays import Float64
 from barsight.motion.rig_check.epipolar_error import row_design
@@ -23,7 +22,7 @@ def calibration_covariance(path: Path | None, range_m: float) -> Float64:
     """Propagate to pitch, roll, focal ratio and yaw as rows show them (4, 4): a lens that is calibrated a
     little wrong shifts rows as a turned camera does. 0 where no file is given or it carries no covariance.
     """
-    if path is None or not holds_own_rig(path) or (known := read_covariance(path)) is None:
+    if path is None or (known := calibrated_covariance(path)) is None:
         return np.zeros((4, 4))
     rig, (names, covariance) = read_rig_file(path), known
     _, left, right = sample_pairs(rig, [range_m if range_m == range_m else FAR_BASELINES * rig.baseline_m])
