@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from barsight.calibration.boards.board import Board
 from barsight.calibration.boards.board_views import BoardView, Corners
@@ -22,8 +23,12 @@ from barsight.calibration.camera_imu.problem import (
     linearise_camera_imu,
     retract_state,
 )
+from barsight.calibration.camera_imu.result_files import write_camera_imu
 from barsight.calibration.camera_imu.setup import prepare
+from barsight.calibration.files.rig_file import read_covariance
+from barsight.calibration.geometry.projection import Lens
 from barsight.calibration.geometry.rig import StereoRig
+from barsight.calibration.stereo.disparity_uncertainty import disparity_sigma_px
 from barsight.core.errors import CalibrationError
 from barsight.core.records.sensor_samples import ImuSamples
 from camera_imu_recordings import BOARD, NOISE, Truth, simulated, true_rig, without_extrinsics
@@ -125,6 +130,32 @@ def test_a_minute_of_swinging_is_not_needed_for_a_good_mounting(recorded: Record
         assert spread.factor == pytest.approx(1, abs=0.06)
         assert np.abs(spread.after - spread.after_expected).max() < 0.08
     assert calibration.corner_px == pytest.approx(0.25, rel=0.05)
+
+
+def test_the_cameras_lie_as_their_lenses_have_it_and_the_file_says_so(
+    recorded: Recorded, tmp_path: Path
+) -> None:
+    """A middle that is 0.4 px off turns the camera by as much, so that hardly any depth changes."""
+    views, imu, _ = recorded
+    found, off_px = calibrated(views, imu), 0.4
+    wrong = replace(RIG, cam1=replace(RIG.cam1, cx_px=RIG.cam1.cx_px + off_px))
+    other = calibrated(views, imu, wrong)
+    names = tuple(f"cam{camera}.{name}" for camera in (0, 1) for name in Lens.RADTAN4.parameter_names)
+    at, covariance = names.index("cam1.cx_px"), 1e-12 * np.eye(len(names))
+    covariance[at, at] = off_px**2
+    write_camera_imu(found, tmp_path / "rig.yaml", tmp_path / "chain.yaml", (names, covariance))
+    told = read_covariance(tmp_path / "rig.yaml")
+    assert told is not None
+    known, whole = told
+    first, second = (one.rig.cam0_from_cam1.inverse() for one in (found, other))
+    turn = Rotation.from_matrix(second.rotation @ first.rotation.T).as_rotvec()
+    change = np.concatenate([turn, second.translation - first.translation])
+    pair = [n for n, name in enumerate(known) if name.startswith("cam1_from_cam0.")]
+    assert abs(turn[1]) > 0.5 * off_px / RIG.cam1.fx_px
+    np.testing.assert_allclose(whole[known.index("cam1.cx_px"), pair] / off_px, change, atol=3e-5)
+    assert np.linalg.eigvalsh(whole).min() > -1e-12
+    sigma_px = disparity_sigma_px(tmp_path / "rig.yaml", 2.0)
+    assert sigma_px is not None and sigma_px < 0.3 * off_px
 
 
 def test_a_large_time_shift_is_found() -> None:

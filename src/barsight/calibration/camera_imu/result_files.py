@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from barsight.calibration.camera_imu.calibration import CameraImuCalibration
 from barsight.calibration.camera_imu.problem import MOUNT
@@ -25,21 +26,14 @@ def write_camera_imu(
 ) -> None:  # fmt: skip
     """Write both files, each whole or not at all.
 
-    lenses: names and covariance of the lenses' parameters from the stereo calibration; they were held fixed,
-    so their rows are carried over as they are.
+    lenses: names and covariance of the lenses' parameters from the stereo calibration. They were held fixed,
+    so the mountings err with them.
     """
-    names, covariance = mounting_covariance(calibration)
-    if lenses is not None:
-        kept = [n for n, name in enumerate(lenses[0]) if "_from_" not in name]
-        own = lenses[1][np.ix_(kept, kept)]
-        size = len(kept) + len(names)
-        joined = np.zeros((size, size))
-        joined[: len(kept), : len(kept)], joined[len(kept) :, len(kept) :] = own, covariance
-        names, covariance = (*(lenses[0][n] for n in kept), *names), joined
+    names, covariance = joint_covariance(calibration, lenses)
     section: dict[str, object] = {
         "board": str(calibration.board),
         "corner_sigma_px": calibration.corner_px,
-        "baseline_sigma_m": calibration.baseline_sigma_m,
+        "baseline_sigma_m": _baseline_sigma_m(calibration, covariance),
         "timeshift_cam1_s": float(calibration.solution.state.mounts[1].shift_s),
         "parameters": list(names),
         "sigmas": [float(value) for value in np.sqrt(np.diag(covariance))],
@@ -49,18 +43,45 @@ def write_camera_imu(
     write_camchain(camchain_path, calibration.rig, TOPICS)
 
 
-def mounting_covariance(calibration: CameraImuCalibration) -> tuple[tuple[str, ...], Float64]:
-    """Compute names and covariance of both mountings, time shifts and the resulting cam1_from_cam0.
+def joint_covariance(
+    calibration: CameraImuCalibration, lenses: tuple[tuple[str, ...], Float64] | None
+) -> tuple[tuple[str, ...], Float64]:
+    """Compute names and covariance of the lenses, where it is known, mountings, time shifts and the resulting
+    cam1_from_cam0: what lenses are off by, the mountings take up as far as they can.
 
     Turns are small, from the left: of body_from_cam in body axes, of cam1_from_cam0 in cam1's.
     """
+    names, whole = _by_mounts(calibration)
+    known, mounts = calibration.uncertainty, slice(2 * MOUNT)
+    kept = [n for n, name in enumerate(lenses[0]) if name in known.lens_names] if lenses else []
+    if lenses is None or len(kept) < len(known.lens_names):
+        return names, whole @ known.covariance[mounts, mounts] @ whole.T
+    lens_names = tuple(lenses[0][n] for n in kept)
+    by_lens = known.by_lens[mounts, [known.lens_names.index(name) for name in lens_names]]
+    carry = np.zeros((len(kept) + len(names), len(kept) + 2 * MOUNT))
+    carry[: len(kept), : len(kept)] = np.eye(len(kept))
+    carry[len(kept) :] = whole @ np.hstack([by_lens, np.eye(2 * MOUNT)])
+    apart = block_diag(lenses[1][np.ix_(kept, kept)], known.covariance[mounts, mounts])
+    return (*lens_names, *names), carry @ apart @ carry.T
+
+
+def _baseline_sigma_m(calibration: CameraImuCalibration, covariance: Float64) -> float:
+    """Compute one standard deviation of the distance between the cameras, whose place ends the covariance."""
+    first, second = calibration.solution.state.mounts
+    place = second.rotation.T @ (first.place_m - second.place_m)
+    direction = place / np.linalg.norm(place)
+    return float(np.sqrt(direction @ covariance[-3:, -3:] @ direction))
+
+
+def _by_mounts(calibration: CameraImuCalibration) -> tuple[tuple[str, ...], Float64]:
+    """Differentiate both mountings, time shifts and cam1_from_cam0 by the mountings and shifts: names (20,)
+    and Jacobian (20, 14).
+    """
     names = calibration.problem.parameter_names[: 2 * MOUNT]
-    own = calibration.uncertainty.covariance[: 2 * MOUNT, : 2 * MOUNT]
     first, second = calibration.solution.state.mounts
     back = second.rotation.T
     pair = np.zeros((6, 2 * MOUNT))
     pair[:3, :3], pair[:3, MOUNT : MOUNT + 3] = back, -back
     pair[3:, 3:6], pair[3:, MOUNT + 3 : MOUNT + 6] = back, -back
     pair[3:, MOUNT : MOUNT + 3] = back @ skew(first.place_m - second.place_m)
-    whole = np.vstack([np.eye(2 * MOUNT), pair])
-    return (*names, *PAIR_NAMES), whole @ own @ whole.T
+    return (*names, *PAIR_NAMES), np.vstack([np.eye(2 * MOUNT), pair])

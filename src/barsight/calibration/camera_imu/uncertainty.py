@@ -43,7 +43,8 @@ class Uncertainty:
     """covariance: (P, P) of the common parameters, all causes together; noise_sigma: (P,) the corners'
     and IMU's independent noise alone. correlation: the factor on the variances by which seconds disagree more
     than that. singular_values: (P,) of the information in units of what is needed, falling; undetermined: the
-    directions known worse than ten times the need, in words. fixed: what was held fixed."""
+    directions known worse than ten times the need, in words. fixed: what was held fixed. lens_names: (L,) of
+    the lenses' parameters; by_lens: (P, L) how the common ones answer to them."""
 
     covariance: Float64
     noise_sigma: Float64
@@ -51,6 +52,8 @@ class Uncertainty:
     singular_values: Float64
     undetermined: tuple[str, ...]
     fixed: tuple[HeldFixed, ...]
+    lens_names: tuple[str, ...]
+    by_lens: Float64
 
 
 def uncertainty(problem: CameraImuProblem, solution: Solution) -> Uncertainty:
@@ -68,14 +71,17 @@ def uncertainty(problem: CameraImuProblem, solution: Solution) -> Uncertainty:
     solid = np.maximum(values, FLOOR)
     inverse = (vectors / solid) @ vectors.T * unit[:, None] * unit
     covariance, correlation = inflate_covariance(inverse, 1.0, *_blocks(problem, solution))
+    free = _freed_system(problem, solution)
     fixed = []
-    for group, shift in _freed(problem, solution, inverse, correlation):
+    for group, shift in _freed(problem, free, inverse, correlation):
         fixed.append(group)
         if group.matters:
             covariance = covariance + np.outer(shift, shift)
+    by_lens = -inverse @ free.information[np.ix_(free.own, free.lenses)]
     return Uncertainty(
-        covariance, np.sqrt(np.diag(inverse)), correlation, values[::-1], undetermined, tuple(fixed)
-    )
+        covariance, np.sqrt(np.diag(inverse)), correlation, values[::-1], undetermined, tuple(fixed),
+        tuple(free.names[k] for k in free.lenses), by_lens,
+    )  # fmt: skip
 
 
 def needed_units(names: Sequence[str]) -> Float64:
@@ -96,27 +102,48 @@ def _blocks(problem: CameraImuProblem, solution: Solution) -> tuple[Float64, Flo
     return block_scores(samples, by_common, block, int(block.max()) + 1)
 
 
-def _freed(
-    problem: CameraImuProblem, solution: Solution, inverse: Float64, correlation: float
-) -> list[tuple[HeldFixed, Float64]]:
-    """Estimate the effect of freeing lenses and IMU scales: one Newton step from the solution."""
+@dataclass(frozen=True, eq=False)
+class _FreedSystem:
+    """Information (Q, Q) and gradient (Q,) of the common parameters at the solution, were lenses and IMU
+    scales free too. own: (P,) those that were solved for; lenses, scales: the others, the latter where they
+    were held fixed.
+    """
+
+    names: tuple[str, ...]
+    information: Float64
+    gradient: Float64
+    own: list[int]
+    lenses: list[int]
+    scales: list[int]
+
+
+def _freed_system(problem: CameraImuProblem, solution: Solution) -> _FreedSystem:
     freed = replace(problem, scales=True, lenses=True)
     here = linearise_camera_imu(freed, solution.state, None)
     system = assemble(here.samples, here.walks, len(solution.state.spline.places_m))
     whole: EliminatedChain = eliminate(system)
     gradient = system.common_gradient - np.einsum("np,n->p", whole.through, system.chain_gradient)
-    names = list(freed.parameter_names)
+    names = freed.parameter_names
     own = [names.index(name) for name in problem.parameter_names]
-    groups = {"lenses": range(freed.lens_at[0], len(names))}
+    scales = range(MOUNT * len(problem.sightings) + 2, freed.lens_at[0])
+    return _FreedSystem(
+        names, whole.information, gradient, own, list(range(freed.lens_at[0], len(names))),
+        [] if problem.scales else list(scales),
+    )  # fmt: skip
+
+
+def _freed(
+    problem: CameraImuProblem, free: _FreedSystem, inverse: Float64, correlation: float
+) -> list[tuple[HeldFixed, Float64]]:
+    """Estimate the effect of freeing lenses and IMU scales: one Newton step from the solution."""
+    names, own, gradient = free.names, free.own, free.gradient
+    groups = {"lenses": free.lenses}
     if not problem.scales:
-        groups["IMU scales and misalignments"] = range(
-            own[MOUNT * len(problem.sightings)] + 2, freed.lens_at[0]
-        )
+        groups["IMU scales and misalignments"] = free.scales
     out = []
-    for name, columns in groups.items():
-        extra = list(columns)
-        mixed = whole.information[np.ix_(own, extra)]
-        left = whole.information[np.ix_(extra, extra)] - mixed.T @ inverse @ mixed
+    for name, extra in groups.items():
+        mixed = free.information[np.ix_(own, extra)]
+        left = free.information[np.ix_(extra, extra)] - mixed.T @ inverse @ mixed
         scale = 1 / np.sqrt(np.maximum(np.diag(left), 1e-300))
         values, vectors = np.linalg.eigh(left * scale[:, None] * scale)
         values = np.maximum(values, 1e-9 * values[-1])
