@@ -106,3 +106,17 @@ def test_what_travel_leaves_open_of_a_rig_is_as_large_as_stated() -> None:
     assert np.mean(squares, axis=0) == pytest.approx(1, abs=0.12)
     unseen = residual_covariance(half @ half.T, None, corrected=False)
     np.testing.assert_array_equal(unseen, half @ half.T)
+
+
+def test_what_was_held_of_the_drift_before_is_not_told_by_the_travel() -> None:
+    calibrated = np.diag(np.square([4e-5, 1e-3, 5e-4]))
+    held = np.array([3.5e-3, 5e-4])
+    nothing = RigDrift(0.0, 0.0, np.diag(held**2), held, 0.4, 7.0, True)
+    np.testing.assert_allclose(residual_covariance(calibrated, nothing, corrected=False), calibrated)
+    told = np.array([[1.0, 0.06], [0.0, 1.0]]) @ np.diag([1e-5, 4e-4])
+    known, seen = np.linalg.inv(told @ told.T), np.array([3e-5, 2e-4])
+    both = np.linalg.inv(known + np.diag(held**-2))
+    alone = RigDrift(*seen, told @ told.T, np.full(2, 1e3), 0.4, 7.0, True)
+    combined = RigDrift(*(both @ known @ seen), both, held, 0.4, 7.0, True)
+    left = [residual_covariance(calibrated, drift, corrected=False) for drift in (alone, combined)]
+    np.testing.assert_allclose(left[1], left[0], rtol=1e-6, atol=1e-16)

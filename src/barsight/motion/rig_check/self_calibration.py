@@ -17,6 +17,8 @@ from barsight.core.records.trajectory import RigDrift
 
 SIGNIFICANT_SIGMAS = 3.0
 WORTH_MM = 3.0
+MIN_TOLD = 1e-3
+"""What travel tells of a direction counts from this share of what was held before (information)."""
 AGREEING_SIGMAS = 1.96
 """Travel that shows yaw and scale within this agrees with the calibration. Over rigs that are off as far as
 they admit, 95 % of the heights then lie inside (tests/test_motion_rig_drift.py)."""
@@ -36,23 +38,36 @@ def residual_covariance(prior: Float64, drift: RigDrift | None, *, corrected: bo
     """Update a calibration's covariance of yaw, baseline and focal length (3, 3) by what the travel shows.
 
     What both together find counts as error, for nothing corrects it but the yaw where that is `corrected`.
-    Where the travel contradicts the calibration, it alone is believed. Only encoders show either.
+    Where the travel contradicts the calibration, it alone is believed. Only encoders show either. What was
+    held of the drift before is no word of the travel's: where that shows nothing, the calibration's stays.
     """
     if drift is None or not drift.by_encoders:
         return prior
-    found = np.array([drift.yaw_rad, -drift.scale])  # a baseline that is longer makes depths too small
-    covariance = drift.covariance * [[1, -1], [-1, 1]]
-    joint = prior[:2, :2] + covariance
-    if corrected or found @ np.linalg.solve(joint, found) > AGREEING_SIGMAS**2:
-        left = found * [not corrected, True]
+    rows, seen, variance = _travel_alone(drift)
+    joint = rows @ prior[:2, :2] @ rows.T + np.diag(variance)
+    if corrected or seen @ np.linalg.solve(joint, seen) > AGREEING_SIGMAS**2:
+        # A baseline that is longer makes depths too small.
+        left = np.array([drift.yaw_rad, -drift.scale]) * [not corrected, True]
         updated = prior.copy()
         updated[:2, :] = updated[:, :2] = 0.0
-        updated[:2, :2] = covariance + np.outer(left, left)
+        updated[:2, :2] = drift.covariance * [[1, -1], [-1, 1]] + np.outer(left, left)
         return updated
-    gain = prior[:, :2] @ np.linalg.inv(joint)
-    mean = gain @ found
-    posterior: Float64 = prior - gain @ prior[:2] + np.outer(mean, mean)
+    gain = prior[:, :2] @ rows.T @ np.linalg.inv(joint)
+    mean = gain @ seen
+    posterior: Float64 = prior - gain @ rows @ prior[:2] + np.outer(mean, mean)
     return posterior
+
+
+def _travel_alone(drift: RigDrift) -> tuple[Float64, Float64, Float64]:
+    """Take off the drift's prior: rows (K, 2) of yaw and depths' scale that the travel itself tells, values
+    (K,) and variances (K,) of these; K is 2 or less.
+    """
+    unit, known = drift.prior_sigma, np.linalg.inv(drift.covariance)
+    weight, axes = np.linalg.eigh(known * np.outer(unit, unit) - np.eye(2))
+    told = weight > MIN_TOLD
+    weight, axes = weight[told], axes[:, told]
+    seen = (unit[:, None] * axes).T @ known @ np.array([drift.yaw_rad, drift.scale]) / weight
+    return axes.T / unit * [1, -1], seen, 1 / weight
 
 
 def self_calibrate(
