@@ -212,6 +212,16 @@ def test_causes_that_cannot_be_told_apart_are_named_together() -> None:
     assert name_causes(planned(), [seen], [], [CLEAN])[0].words == "focal length"
 
 
+def test_bars_that_are_short_of_cold_are_no_cause() -> None:
+    plan = planned()
+    free = tuple(replace(one, place_sigma_m=None) for one in plan.sphere)
+    cold = replace(plan.conditions, temperature_c=-30.0, expansion_per_k=23e-6)
+    longer = tuple(replace(one, length_m=one.length_m / cold.expansion) for one in plan.sphere_bar)
+    plan = replace(plan, plate=(), step=(), sphere=free, sphere_bar=longer, conditions=cold)
+    seen = [observed(plan, off_by(), np.random.default_rng((3, seed))) for seed in range(20)]
+    assert name_causes(plan, seen, [], [CLEAN]) == ()
+
+
 def test_an_artefact_that_was_moved_is_named_and_dirt_comes_first() -> None:
     plan = planned()
     seen = observed(plan, off_by(), np.random.default_rng(1))

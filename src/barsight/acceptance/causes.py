@@ -183,7 +183,7 @@ def _artefact_rows(plan: AcceptancePlan, view: Observation) -> Iterator[_Row]:
         assert not isinstance(a, Failed) and not isinstance(b, Failed)
         way = (second - first) / np.linalg.norm(second - first)
         answer = way @ (_moves(view.view, second) - _moves(view.view, first))
-        error = float(np.linalg.norm(b.centre_m - a.centre_m)) - bar.length_m
+        error = float(np.linalg.norm(b.centre_m - a.centre_m)) - bar.length_m * plan.conditions.expansion
         yield _Row(bar.name, error, float(np.hypot(2e-3 * PLACE_MM, bar.sigma_m)), answer)
 
 

@@ -230,8 +230,7 @@ class _Judge:
 
     @property
     def _expansion(self) -> float:
-        about = self._plan.conditions
-        return 1 + about.expansion_per_k * (about.temperature_c - 20)
+        return self._plan.conditions.expansion
 
 
 def _why(found: Sequence[object]) -> str:

@@ -200,6 +200,11 @@ class AmbientConditions:
             expansion_per_k=(0, 1e-3), degrees_of_freedom=(1, inf), search_m=(0.02, 2),
         )  # fmt: skip
 
+    @property
+    def expansion(self) -> float:
+        """Return an artefact's length over its calibrated one: 1 + expansion_per_k (T - 20)."""
+        return 1 + self.expansion_per_k * (self.temperature_c - 20)
+
 
 Artefact = Plate | Sphere | DummyBundle
 
