@@ -69,6 +69,19 @@ def test_sigmas_that_differ_by_direction_are_believed() -> None:
     assert 0.9 < np.mean(squares) < 1.1
 
 
+def test_mistaken_points_are_fitted_no_worse_than_by_the_closed_form(monkeypatch: pytest.MonkeyPatch) -> None:
+    for seed in range(100):
+        rng = np.random.default_rng((4, seed))
+        source = rng.uniform((-20, -6, 0), (20, 6, 2.5), (4, 3))
+        target = source + rng.normal(0, 5, 3) * [[1], [0], [0], [0]]
+        ray = np.column_stack([rng.normal(0, 0.3, (4, 2)), np.ones(4)])
+        covariance = 1e-6 * np.eye(3) + 99e-6 * ray[:, :, None] * ray[:, None, :]
+        refined = found(source, target, covariance)
+        with monkeypatch.context() as patch:
+            patch.setattr("barsight.registration.rigid.ROUNDS", 0)
+            assert refined.chi2 <= found(source, target, covariance).chi2
+
+
 def test_what_cant_be_aligned_is_refused_with_the_reason() -> None:
     line = np.column_stack([np.linspace(0, 7, 20), np.zeros(20), np.zeros(20)])
     for source, code in ((line, "collinear"), (np.zeros((5, 3)), "collinear"), (line[:2], "few-points")):

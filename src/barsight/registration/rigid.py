@@ -132,18 +132,23 @@ def _divided(values: Float64, spread: Float64) -> Float64:
 
 def _refined(source: Float64, target: Float64, pose: Pose, spread: Float64) -> Pose:
     """Refine a pose by least squares under the points' covariance S: it makes r^T S^-1 r least, r being the
-    residuals [Aitken 1936].
+    residuals [Aitken 1936]. A step that doesn't, as a mistaken point may ask for, isn't taken.
     """
+    off = target - pose.apply(source)
     for _ in range(ROUNDS):
         turned = source @ pose.rotation.T
         centre = turned.mean(axis=0)
         design = design_rows(turned - centre)
         weighted = _divided(design, spread)
         normal = np.einsum("nki,nkj->ij", design, weighted)
-        step = np.linalg.solve(normal, np.einsum("nki,nk->i", weighted, target - pose.apply(source)))
+        step = np.linalg.solve(normal, np.einsum("nki,nk->i", weighted, off))
         turn = Rotation.from_rotvec(step[:3]).as_matrix()
         shift = pose.translation + centre - turn @ centre + step[3:]
-        pose = Pose(pose.target, pose.source, turn @ pose.rotation, shift)
+        trial = Pose(pose.target, pose.source, turn @ pose.rotation, shift)
+        left = target - trial.apply(source)
+        if not (left * _divided(left, spread)).sum() < (off * _divided(off, spread)).sum():
+            break
+        pose, off = trial, left
     return pose
 
 
