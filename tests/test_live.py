@@ -17,6 +17,7 @@ from barsight.cli.main import run
 from barsight.core.records.pairs import StereoFrame
 from barsight.core.records.sensor_samples import CraneSamples
 from barsight.live.latency import counts, spread
+from barsight.live.link import Link, LiveInput
 from barsight.live.modes import FreezeWatch, JumpWatch, Mode, SensorActivity, judge_mode
 from barsight.live.run import Keyframes, read_keyframes, replay, write_keyframes
 from barsight.live.settings import LiveSettings
@@ -25,6 +26,7 @@ from barsight.live.shared.logs import NumberLog, ReadingLog
 from barsight.live.shared.ring import PairRing
 from barsight.live.source import ReplayClock, ReplaySource
 from barsight.live.state import prometheus
+from barsight.live.supervisor import Supervisor
 from barsight.mapping.fusion import fuse_view
 from barsight.mapping.surface.surface import read_tile
 from barsight.reconstruction import map_building
@@ -392,3 +394,27 @@ def test_encoders_that_come_back_from_a_freeze_have_not_jumped() -> None:
             jump.begin_anew()
         out.append(frozen or jumped_m > 0)
     assert any(out) and not any(out[int(5.2 / 0.1) :])
+
+
+@pytest.mark.parametrize("rate_hz", [20, 200, 1000])
+@pytest.mark.parametrize("fault", ["frozen", "jumped"])
+def test_faults_of_encoders_show_at_every_rate_and_after_a_pause(
+    fault: str, rate_hz: int, whole: Path, board: Counters, tmp_path: Path
+) -> None:
+    """0.4 m/s; the fault comes while the supervisor, which looks every 0.11 s, is held up for 0.9 s."""
+    link = Link(LiveInput(whole), SETTINGS.chosen(), LiveSettings(), tmp_path, tmp_path, "", board.name, None)
+    supervisor, log = Supervisor(link, board, print), link.readings("crane")
+    t, begin_s, taken, out = np.arange(0, 8, 1 / rate_hz), 3.0, 0, []
+    place, stamps = np.zeros((t.size, 3)), BEGIN_NS + (1e9 * t).astype(np.int64)
+    place[:, 0] = np.round(0.4 * t + np.random.default_rng(5).normal(0, 5e-4, t.size), 4)
+    late = t >= begin_s
+    place[late, 0] = place[np.argmax(late), 0] if fault == "frozen" else place[late, 0] + 0.2
+    for now_s in np.arange(0.5, 6, 0.11):
+        if begin_s - 0.3 < now_s < begin_s + 0.6:
+            continue
+        come = int(np.searchsorted(t, now_s))
+        log.append(stamps[taken:come], place[taken:come])
+        taken, heard = come, supervisor._heard()
+        out.append((now_s > begin_s, heard.frozen if fault == "frozen" else heard.jumped_m > 0.15))
+    assert not any(is_out for is_late, is_out in out if not is_late)
+    assert all([is_out for is_late, is_out in out if is_late][2:])

@@ -34,6 +34,10 @@ JUMP_HELD_S = 1.0
 AFTER_FREEZE_S = 0.3
 STAMP_SIGMA_S = 0.02
 """A device's clock is known no better while it is estimated anew."""
+HELD_NS, HELD_READINGS = 5 * NS_PER_S, 100
+"""Faults are sought in readings of so much time, and in so many at least."""
+LOOK_NS = NS_PER_S // 10
+"""Faults are looked for this often by the readings' stamps."""
 
 
 @dataclass(frozen=True)
@@ -133,10 +137,6 @@ class FreezeWatch:
             self._since = position_m[-1]
         return self._since is not None
 
-    def forget(self) -> None:
-        """Begin anew."""
-        self._since = None
-
 
 class JumpWatch:
     """Tells by how much the encoders have jumped, until they come back. sigma_m: of a reading."""
@@ -178,3 +178,35 @@ class JumpWatch:
                 (self._off_m + off, self._bound_m + bound_m) if is_away else (off, bound_m)
             )
             self._jump_ns, self._jump_m = int(stamp_ns[-1]), off
+
+
+class EncoderFaults:
+    """Finds freezes and jumps of the encoders, whatever their rate and however late they are looked at.
+
+    mounted: gives all but the readings.
+    """
+
+    def __init__(self, mounted: CraneSamples) -> None:
+        self._freeze, self._jump = FreezeWatch(mounted), JumpWatch(mounted.position_std_m)
+        self._stamp_ns, self._position_m = mounted.stamp_ns[:0], mounted.position_m[:0]
+        self._frozen, self._jumped_m = False, 0.0
+
+    def take(self, stamp_ns: Int64, position_m: Float64) -> tuple[bool, float]:
+        """Take the readings that came since the last call, (N,) and (N, 3); return whether the encoders are
+        frozen, and by how much (m) they have jumped.
+        """
+        if not len(stamp_ns):
+            return self._frozen, self._jumped_m
+        stamps = self._stamp_ns = np.concatenate([self._stamp_ns, stamp_ns])
+        places = self._position_m = np.concatenate([self._position_m, position_m])
+        steps = 1 + np.flatnonzero(np.diff(stamps // LOOK_NS))
+        begin = 0
+        for end in (*steps[steps > len(stamps) - len(stamp_ns)].tolist(), len(stamps)):
+            held = int(np.searchsorted(stamps, stamps[end - 1] - HELD_NS))
+            begin = max(min(held, end - HELD_READINGS), 0)
+            now = stamps[begin:end], places[begin:end]
+            self._frozen, self._jumped_m = self._freeze.check(*now), self._jump.check(*now)
+            if self._frozen:
+                self._jump.begin_anew()
+        self._stamp_ns, self._position_m = stamps[begin:].copy(), places[begin:].copy()
+        return self._frozen, self._jumped_m

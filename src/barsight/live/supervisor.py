@@ -17,7 +17,7 @@ from barsight.core.stamps import NS_PER_S
 from barsight.live.capture import capture
 from barsight.live.link import Link
 from barsight.live.mapper import build_live_map
-from barsight.live.modes import FOR_LIFTS, FreezeWatch, JumpWatch, Mode, SensorActivity, judge_mode
+from barsight.live.modes import FOR_LIFTS, EncoderFaults, FreezeWatch, Mode, SensorActivity, judge_mode
 from barsight.live.pose_output import output_poses
 from barsight.live.record import record
 from barsight.live.shared.counters import DRAIN, Counters
@@ -37,7 +37,6 @@ START_S = 120.0
 """Processes may take so long to start on a busy machine."""
 FINISH_S = 60.0
 """At the end the map process may be silent so long, between one pair or tile and the next."""
-FREEZE_READINGS = 100
 DRAIN_S = 60.0
 """The recorder may take so long to write what is left."""
 SIGNS = {
@@ -86,9 +85,9 @@ class Supervisor:
         self.state = RunState(processes={role: ProcessState() for role in self._roles})
         recording = link.open_recording()
         self._sensors, self._shift_ns = link.sensors(recording), recording.rig.timeshift_cam_imu_ns
-        crane = recording.crane() if "crane" in self._sensors else None
-        self._freeze = None if crane is None else FreezeWatch(crane)
-        self._jump = None if crane is None else JumpWatch(crane.position_std_m)
+        self._crane = recording.crane() if "crane" in self._sensors else None
+        self._encoders = link.readings("crane")
+        self._faults = None if self._crane is None else EncoderFaults(self._crane)
         self._survey: SurveyWatch | None = None
         if link.source.crane is not None:
             self._survey = SurveyWatch(link.source.crane.survey, is_alone=not link.source.surveys)
@@ -119,9 +118,9 @@ class Supervisor:
     def final_mode(self) -> Mode:
         """Judge the mode at the last picture, whatever the processes' pace was."""
         heard = self._heard()
-        if self._freeze is not None:
-            self._freeze.forget()
-            heard = replace(heard, frozen=self._freeze.check(*self._link.readings("crane").read()))
+        if self._crane is not None:
+            freeze = FreezeWatch(self._crane)
+            heard = replace(heard, frozen=freeze.check(*self._link.readings("crane").read()))
         return judge_mode(heard, max(heard.cameras_ns), self._link.live)
 
     def _start(self, role: str) -> None:
@@ -248,12 +247,10 @@ class Supervisor:
         last_ns = board["capture", "last_cam0_ns"], board["capture", "last_cam1_ns"]
         readings: dict[str, int] = {}
         for sensor in sorted(self._sensors):
-            stamps, values = self._link.readings(sensor).last(FREEZE_READINGS)
+            stamps, _ = self._link.readings(sensor).last(1)
             readings[sensor] = int(stamps[-1]) - self._shift_ns if len(stamps) else 0
-            if sensor == "crane" and self._freeze is not None and self._jump is not None:
-                frozen, jumped_m = self._freeze.check(stamps, values), self._jump.check(stamps, values)
-                if frozen:
-                    self._jump.begin_anew()
+        if self._faults is not None:
+            frozen, jumped_m = self._faults.take(*self._encoders.read())
         if self._link.source.crane is not None:
             step_s = (time.time_ns() - time.monotonic_ns() - self._link.source.epoch_ns) / NS_PER_S
         return SensorActivity(last_ns, board["capture", "interval_ns"], readings, frozen, jumped_m, step_s)
