@@ -83,6 +83,24 @@ def test_frozen_encoders_hold_no_pose(whole: Path, tmp_path: Path) -> None:
     assert written(output, link, 0.5)["position_m"][0] == pytest.approx(SPEED_MPS * 0.5, abs=0.005)
 
 
+def test_encoders_that_freeze_after_the_state_hold_no_pose(whole: Path, tmp_path: Path) -> None:
+    """Without an IMU nothing but the encoders tells whether the crane stopped."""
+    link = linked(whole, tmp_path)
+    state = NavigationState.of(BEGIN_NS, link.states().last(1)[1][0])
+    known = replace(state, covariance=np.eye(15) * 1e-6)
+    link.states().append(np.array([BEGIN_NS]), known.row[None])
+    output, places, last_ns = PoseOutput(link), way(STAMPS), 0
+    frozen = STAMPS > BEGIN_NS + 100_000_000
+    places[frozen] = places[np.argmax(frozen)]
+    for tenth in range(1, 7):
+        now_ns = BEGIN_NS + tenth * 100_000_000
+        now = (last_ns < STAMPS) & (now_ns >= STAMPS)
+        link.readings("crane").append(STAMPS[now], places[now])
+        last_ns, told = now_ns, written(output, link, tenth / 10)
+    error_m = abs(told["position_m"][0] - SPEED_MPS * 0.6)
+    assert error_m < 3 * told["sigma_m"][0]
+
+
 def test_a_state_that_comes_late_still_begins_with_its_readings(whole: Path, tmp_path: Path) -> None:
     """As late as `max_predicted_s` lets it: the encoders about it hold the pose then too."""
     link = linked(whole, tmp_path, max_predicted_s=15.0)

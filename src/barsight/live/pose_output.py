@@ -62,7 +62,7 @@ class PoseOutput:
         self._shift_ns = whole.rig.timeshift_cam_imu_ns
         held_s = BEFORE_STATE_S + link.live.max_predicted_s
         self._imu, self._crane = (HeldReadings(link.readings(name), held_s) for name in ("imu", "crane"))
-        self._state_ns = 0
+        self._state_ns, self._has_encoders = 0, False
         self._propagator: Propagator | None = None
         self._states, self._outputs = link.states(), link.outputs()
 
@@ -81,6 +81,8 @@ class PoseOutput:
         if stamp_ns - self._state_ns > seconds_to_ns(self._link.live.max_predicted_s):
             return False
         self._await(stamp_ns, began + int(WAIT_S * NS_PER_S))
+        if self._has_encoders and self._trusted_encoders() is None:
+            self._begin()  # they froze since, and their last readings must not hold the pose
         self._take(stamp_ns)
         self._publish(self._propagator.at(stamp_ns))
         self._outputs.append((now_ns, time.monotonic_ns() - began))
@@ -92,13 +94,19 @@ class PoseOutput:
         if not len(stamps) or int(stamps[0]) == self._state_ns:
             return False
         self._state_ns = int(stamps[0])
-        state = NavigationState.of(self._state_ns, rows[0])
+        self._state = NavigationState.of(self._state_ns, rows[0])
         for held in (self._imu, self._crane):
             held.grow()
+        self._begin()
+        return True
+
+    def _begin(self) -> None:
+        """Begin with the last state, by the encoders where they can be trusted now."""
+        for held in (self._imu, self._crane):
             held.taken_ns = self._state_ns
         has_imu, known = "imu" in self._sensors, self._trusted_encoders()
-        self._propagator = Propagator(state, self._noise, known, has_imu=has_imu)
-        return True
+        self._has_encoders = known is not None
+        self._propagator = Propagator(self._state, self._noise, known, has_imu=has_imu)
 
     def _trusted_encoders(self) -> CraneSamples | None:
         """Return the encoder readings held; None where there are none in use or they are frozen."""
