@@ -14,10 +14,10 @@ import pytest
 
 import barsight as bs
 from barsight.cli.main import run
-from barsight.core.records.pairs import StereoFrame
+from barsight.core.records.pairs import RefusedFrame, StereoFrame
 from barsight.core.records.sensor_samples import CraneSamples
 from barsight.live.latency import counts, spread
-from barsight.live.link import Link, LiveInput
+from barsight.live.link import GrowingRecording, Link, LiveInput
 from barsight.live.modes import FreezeWatch, JumpWatch, Mode, SensorActivity, judge_mode
 from barsight.live.run import Keyframes, read_keyframes, replay, write_keyframes
 from barsight.live.settings import LiveSettings
@@ -27,6 +27,7 @@ from barsight.live.shared.ring import PairRing
 from barsight.live.source import ReplayClock, ReplaySource
 from barsight.live.state import prometheus
 from barsight.live.supervisor import Supervisor
+from barsight.live.track import Tracking
 from barsight.mapping.fusion import fuse_view
 from barsight.mapping.surface.surface import read_tile
 from barsight.reconstruction import map_building
@@ -418,3 +419,23 @@ def test_faults_of_encoders_show_at_every_rate_and_after_a_pause(
         out.append((now_s > begin_s, heard.frozen if fault == "frozen" else heard.jumped_m > 0.15))
     assert not any(is_out for is_late, is_out in out if not is_late)
     assert all([is_out for is_late, is_out in out if is_late][2:])
+
+
+def test_tracking_begun_anew_beats_as_it_follows_all_keyframes(
+    whole: Path, board: Counters, ring: PairRing, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without encoders it follows every one of them, in an hour's run for longer than a start may take."""
+    link = Link(LiveInput(whole), SETTINGS.chosen(), LiveSettings(), tmp_path, tmp_path, "", board.name, None)
+    recording, beats = bs.open_recording(whole), []
+    for stamp in recording.index.stamps_ns[:3]:
+        link.frames().append((stamp, 0, 0, True, True))
+    tracking = Tracking(link, GrowingRecording(recording, [], link), board, ring)
+
+    def placed(seen: Any) -> RefusedFrame:
+        beats.append(board["track", "beat_ns"])
+        board["track", "beat_ns"] = 0
+        return RefusedFrame(seen.stamp_ns, "dark")
+
+    monkeypatch.setattr(tracking, "_placed", placed)
+    tracking.follow_again()
+    assert len(beats) == 3 and all(beats)

@@ -80,6 +80,7 @@ class Tracking:
         again = kept if self._source.crane() is None else kept[-AGAIN_FRAMES:]
         self._recording.stamps_ns[:] = kept
         for seen in self._pairs(frozenset(again)) if again else ():
+            self._board.beat("track")  # without encoders they are all of them, which may take minutes
             posed = self._placed(seen)
             self._last_kept_ns = seen.stamp_ns
             if isinstance(posed, PosedFrame):
