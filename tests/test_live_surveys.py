@@ -12,9 +12,12 @@ import pytest
 import barsight as bs
 from barsight.live.crane.run import _drop_standing, _keep
 from barsight.live.drift import DAY_NS, HEAD, NAMES, drift_figures, note_drift
-from barsight.live.run import INTERRUPTED, _stopped_by_signals
-from barsight.live.settings import SurveySettings
-from barsight.live.survey import STOOD, SurveyWatch
+from barsight.live.link import Link, LiveInput
+from barsight.live.run import _stopped_by_signals
+from barsight.live.settings import LiveSettings, SurveySettings
+from barsight.live.shared.counters import Counters
+from barsight.live.supervisor import Supervisor
+from barsight.live.survey import INTERRUPTED, STOOD, SurveyWatch
 from barsight.recording.writers.retention import PROTECTED
 
 SETTINGS = SurveySettings(way_m=0.5, stop_s=2.0, rest_s=30.0, max_s=100.0)
@@ -75,6 +78,24 @@ def test_signals_end_a_survey_or_the_run() -> None:
             time.sleep(0.01)
         assert heard.because == told
     assert signal.getsignal(signal.SIGUSR1) == before
+
+
+@pytest.mark.parametrize("ended", ["the crane stopped", STOOD])
+def test_an_interruption_counts_though_the_survey_was_ending(ended: str, whole: Path, tmp_path: Path) -> None:
+    """While processes end and the recorder writes what is left: else the next survey would begin."""
+    board, settings = Counters(), bs.MeasureSettings().chosen()
+    try:
+        link = Link(LiveInput(whole), settings, LiveSettings(), tmp_path, tmp_path, "", board.name, None)
+        supervisor = Supervisor(link, board, print)
+        supervisor.stop(ended)
+        supervisor.stop("told to end the survey")
+        assert supervisor.stop_because == ended
+        with _stopped_by_signals(supervisor):
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(0.01)
+        assert supervisor.stop_because == INTERRUPTED
+    finally:
+        board.remove()
 
 
 def test_the_oldest_surveys_go_but_for_protected_ones(tmp_path: Path) -> None:

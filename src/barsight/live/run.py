@@ -32,7 +32,7 @@ from barsight.live.shared.counters import Counters
 from barsight.live.shared.ring import PairRing
 from barsight.live.state import write_state
 from barsight.live.supervisor import Supervisor
-from barsight.live.survey import STOOD
+from barsight.live.survey import INTERRUPTED, STOOD
 from barsight.measure_folder import ignore_progress, write_measured
 from barsight.measure_settings import MeasureSettings
 from barsight.pipeline.lift_choice import LiftRequest
@@ -46,7 +46,6 @@ from barsight.yard.magnet.description import load_magnet
 from barsight.yard_frame import in_yard
 
 MAX_SPEED = 1000.0
-INTERRUPTED = "interrupted"
 LATEST = ("pose.json", LIVE_MAP)
 """Files that hold the latest value while the run lasts."""
 

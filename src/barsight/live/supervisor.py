@@ -23,7 +23,7 @@ from barsight.live.record import record
 from barsight.live.shared.counters import DRAIN, Counters
 from barsight.live.source import ReplayClock
 from barsight.live.state import ProcessState, RunState, write_health, write_state
-from barsight.live.survey import SurveyWatch
+from barsight.live.survey import INTERRUPTED, SurveyWatch
 from barsight.live.track import track
 
 PROCESSES: dict[str, Callable[[Link], None]] = {
@@ -112,8 +112,9 @@ class Supervisor:
         self._write(health=True)
 
     def stop(self, because: str) -> None:
-        """Ask the run to end."""
-        self.stop_because = self.stop_because or because
+        """Ask the run to end. An interruption counts though it was ending already: no other run follows."""
+        if not self.stop_because or because == INTERRUPTED:
+            self.stop_because = because
 
     def final_mode(self) -> Mode:
         """Judge the mode at the last picture, whatever the processes' pace was."""

@@ -11,6 +11,7 @@ from barsight.live.settings import SurveySettings
 STILL_M = 0.05
 """A crane that stays so near to a place stands."""
 STOOD = "the crane stood, there is nothing to measure"
+INTERRUPTED = "interrupted"
 
 
 class SurveyWatch:

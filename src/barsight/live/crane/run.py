@@ -15,9 +15,9 @@ from barsight.core.timing import ProgressCallback
 from barsight.live.crane.preflight import prove_sensors
 from barsight.live.drift import DRIFT_FILE, note_drift
 from barsight.live.link import LiveInput
-from barsight.live.run import INTERRUPTED, LiveRun, begin_replay
+from barsight.live.run import LiveRun, begin_replay
 from barsight.live.settings import CraneConfig, LiveSettings
-from barsight.live.survey import STOOD
+from barsight.live.survey import INTERRUPTED, STOOD
 from barsight.measure_folder import ignore_progress
 from barsight.measure_settings import MeasureSettings
 from barsight.pipeline.lift_choice import LiftRequest

@@ -15,12 +15,13 @@ from typing import Any
 
 from barsight.core.errors import ConfigError, InputError, MeasurementError
 from barsight.core.files import expect_empty, translated_os_errors
-from barsight.live.run import INTERRUPTED, handled_signals
+from barsight.live.run import handled_signals
 from barsight.live.soak.faults import RandomKills
 from barsight.live.soak.processes import PROC
 from barsight.live.soak.report import SoakBounds, soak_content, write_soak
 from barsight.live.soak.trend import S_PER_H
 from barsight.live.soak.watch import RunWatch
+from barsight.live.survey import INTERRUPTED
 
 SAMPLE_S = 10.0
 WRITE_S = 60.0
