@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import barsight as bs
-from barsight.live.crane.run import _drop_standing, _keep
+from barsight.live.crane import run as crane_run
+from barsight.live.crane.run import _drop_standing, _keep, replay_surveys
 from barsight.live.drift import DAY_NS, HEAD, NAMES, drift_figures, note_drift
 from barsight.live.link import Link, LiveInput
 from barsight.live.run import _stopped_by_signals
@@ -78,6 +79,23 @@ def test_signals_end_a_survey_or_the_run() -> None:
             time.sleep(0.01)
         assert heard.because == told
     assert signal.getsignal(signal.SIGUSR1) == before
+
+
+def test_a_signal_that_ends_surveys_ends_no_command_that_measures_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Measuring:
+        """A run whose survey is over."""
+
+        stop_because = INTERRUPTED
+
+        def measure(self, *_: object) -> None:
+            held.append(signal.getsignal(signal.SIGUSR1))
+
+    held: list[object] = []
+    monkeypatch.setattr(crane_run, "begin_replay", lambda *_: Measuring())
+    replay_surveys(tmp_path, tmp_path / "out", bs.MeasureSettings(), LiveSettings(), tell=lambda _: None)
+    assert callable(held[0]) and signal.getsignal(signal.SIGUSR1) == signal.SIG_DFL
 
 
 @pytest.mark.parametrize("ended", ["the crane stopped", STOOD])

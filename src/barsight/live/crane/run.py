@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import signal
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -15,7 +16,7 @@ from barsight.core.timing import ProgressCallback
 from barsight.live.crane.preflight import prove_sensors
 from barsight.live.drift import DRIFT_FILE, note_drift
 from barsight.live.link import LiveInput
-from barsight.live.run import LiveRun, begin_replay
+from barsight.live.run import LiveRun, begin_replay, handled_signals
 from barsight.live.settings import CraneConfig, LiveSettings
 from barsight.live.survey import INTERRUPTED, STOOD
 from barsight.measure_folder import ignore_progress
@@ -34,8 +35,13 @@ REPLAYS_KEPT = 5
 """Of a recording that is replayed over and over so many surveys' folders are kept."""
 RUNNING, LATEST = "current", "latest"
 """Links to the survey that runs, and to the last that was measured."""
+_NO_SURVEY_RUNS = {one: "no survey runs" for one in signal.Signals if one.name == "SIGUSR1"}
+"""While one is measured, or none can begin, the signal that ends a survey must not end the command. (Windows
+has none.)
+"""
 
 
+@handled_signals(_NO_SURVEY_RUNS, lambda _: None)
 def measure_crane(
     crane: CraneConfig, out: Path, settings: MeasureSettings, live: LiveSettings, *,
     magnet: Path | None = None, tell: Callable[[str], None] = print,
@@ -52,6 +58,7 @@ def measure_crane(
     return _begin(crane, out, recording, settings, live, tell).measure(None, request, advance)
 
 
+@handled_signals(_NO_SURVEY_RUNS, lambda _: None)
 def measure_surveys(
     crane: CraneConfig, out: Path, settings: MeasureSettings, live: LiveSettings, *,
     magnet: Path | None = None, tell: Callable[[str], None] = print,
@@ -96,6 +103,7 @@ def measure_surveys(
     return {}
 
 
+@handled_signals(_NO_SURVEY_RUNS, lambda _: None)
 def replay_surveys(
     path: Path, out: Path, settings: MeasureSettings, live: LiveSettings, *, speed: float = 1.0,
     magnet: Path | None = None, judged_at: Literal["now", "end"] = "now", tell: Callable[[str], None] = print,
