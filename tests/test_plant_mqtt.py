@@ -177,6 +177,35 @@ def test_a_broker_that_is_away_costs_bounded_memory_and_the_newest_survives(brok
     assert [event["number"] for event in told] == sorted({event["number"] for event in told})
 
 
+def test_what_is_dropped_while_an_event_goes_out_is_told() -> None:
+    """Ten events come during one publishing, with room for two: the newest two follow."""
+
+    class SlowClient:
+        def __init__(self) -> None:
+            self.told: list[dict[str, Any]] = []
+
+        async def publish(self, topic: str, text: str, **_: Any) -> None:
+            if topic.endswith("events"):
+                self.told.append(json.loads(text))
+                if len(self.told) == 1:
+                    for number in range(1, 11):
+                        publisher.tell({"number": number})
+
+    client = SlowClient()
+
+    async def body() -> None:
+        nonlocal publisher
+        publisher = MqttPublisher(MqttSettings(max_waiting=2, state_every_s=0.01))
+        publisher.tell({"number": 0})
+        await publisher._publish(client)  # type: ignore[arg-type]
+
+    publisher: MqttPublisher
+    asyncio.run(body())
+    numbers = [(one["number"], one["lost"]) for one in client.told]
+    assert numbers == [(0, 0), (9, 8), (10, 0)]
+    assert publisher.counts.lost == 8 and publisher.counts.events == 3 and publisher.waiting == 0
+
+
 def test_a_publisher_ends_though_its_broker_is_gone(broker: Broker, monkeypatch: pytest.MonkeyPatch) -> None:
     """The farewell fails as the broker is away: that must not stand in the place of the cancellation."""
     publisher = MqttPublisher(MqttSettings(port=broker.port, state_every_s=0.02))

@@ -120,10 +120,14 @@ class MqttPublisher:
                 await client.publish(self._topic("state"), state, qos=0, retain=True)
                 self._states_sent += 1
             while self._events:
+                first, lost = self._events[0], self._unsaid
                 await client.publish(self._topic("events"), self._event(), qos=1)
-                self._events.popleft()
                 self._events_sent += 1
-                self._unsaid = 0
+                self._unsaid -= lost
+                if self._events and self._events[0] is first:
+                    self._events.popleft()
+                else:  # it was dropped while it went out, and isn't lost
+                    self._lost, self._unsaid = self._lost - 1, self._unsaid - 1
         except BaseException:
             self._state = self._state or state
             raise
