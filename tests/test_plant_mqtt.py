@@ -206,6 +206,39 @@ def test_what_is_dropped_while_an_event_goes_out_is_told() -> None:
     assert publisher.counts.lost == 8 and publisher.counts.events == 3 and publisher.waiting == 0
 
 
+def test_a_newer_state_does_not_wait_for_the_events(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A hundred events that waited for the broker take 5 s; the state becomes another after 0.3 s."""
+    sent: list[str] = []
+
+    class SlowClient:
+        async def __aenter__(self) -> SlowClient:
+            return self
+
+        async def __aexit__(self, *_: object) -> None:
+            return
+
+        async def publish(self, topic: str, text: str, **_: Any) -> None:
+            sent.append(text if topic.endswith("state") else topic)
+            await asyncio.sleep(0.05 if topic.endswith("events") else 0)
+
+    async def body() -> float:
+        publisher = MqttPublisher(MqttSettings(state_every_s=0.02))
+        monkeypatch.setattr(publisher, "_client", SlowClient)
+        for number in range(100):
+            publisher.tell({"number": number})
+        running = asyncio.create_task(publisher.run())
+        await asyncio.sleep(0.3)
+        began_s = time.monotonic()
+        publisher.show(DrawnMode("blind", 2))
+        await until(lambda: any('"blind"' in text for text in sent))
+        took_s = time.monotonic() - began_s
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+        return took_s
+
+    assert asyncio.run(body()) < 0.5
+
+
 def test_a_publisher_ends_though_its_broker_is_gone(broker: Broker, monkeypatch: pytest.MonkeyPatch) -> None:
     """The farewell fails as the broker is away: that must not stand in the place of the cancellation."""
     publisher = MqttPublisher(MqttSettings(port=broker.port, state_every_s=0.02))

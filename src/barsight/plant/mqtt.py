@@ -115,11 +115,14 @@ class MqttPublisher:
             return None
         self._changed.clear()
         state, self._state = self._state, None
+        began_s = time.monotonic()
         try:
             if state is not None:
                 await client.publish(self._topic("state"), state, qos=0, retain=True)
                 self._states_sent += 1
             while self._events:
+                if self._has_newer(began_s):
+                    return state
                 first, lost = self._events[0], self._unsaid
                 await client.publish(self._topic("events"), self._event(), qos=1)
                 self._events_sent += 1
@@ -133,6 +136,10 @@ class MqttPublisher:
             raise
         await asyncio.sleep(self._settings.state_every_s)
         return state
+
+    def _has_newer(self, since_s: float) -> bool:
+        """Check whether another state is to be published, which doesn't wait for all events."""
+        return self._state is not None and time.monotonic() - since_s > self._settings.state_every_s
 
     def _event(self) -> str:
         told = {**self._events[0], "lost": self._unsaid}
