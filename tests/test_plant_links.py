@@ -1,6 +1,7 @@
 """`barsight plant run` and `plant check`, every link at once, against mosquitto, snap7 and openssl."""
 
 import asyncio
+import os
 import shutil
 import signal
 import socket
@@ -258,6 +259,15 @@ def test_a_live_run_gives_the_pose_and_may_forbid(tmp_path: Path) -> None:
         assert not with_live_run(QUIET, live_folder(tmp_path / "live", phase=phase)).is_valid
     (tmp_path / "live/state.json").write_text("{")
     assert "live-stopped" in with_live_run(QUIET, tmp_path / "live").reasons[0]
+
+
+@pytest.mark.parametrize("ago_s", [2.0, -3600.0])
+def test_a_run_that_ended_stays_so_though_the_clock_is_set_back(ago_s: float, tmp_path: Path) -> None:
+    folder = live_folder(tmp_path / "live")
+    assert with_live_run(QUIET, folder).is_valid
+    written_s = time.time() - ago_s
+    os.utime(folder / "state.json", (written_s, written_s))
+    assert "live-stopped" in with_live_run(QUIET, folder).reasons[0]
 
 
 def test_changes_are_told_once() -> None:

@@ -53,7 +53,7 @@ class LiveFolder:
             self.history.append(kept)
         age_s = time.time() - changed_s
         problem = None
-        if age_s > STOPPED_S:
+        if abs(age_s) > STOPPED_S:  # under 0: the clock was set back since
             problem = ("live-stopped", str(path))
         elif mode not in _FOR_LIFTS:
             problem = ("live-degraded", str(mode))

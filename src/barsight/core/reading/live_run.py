@@ -35,7 +35,9 @@ class CranePose:
 
 @dataclass(frozen=True)
 class LiveState:
-    """A run's last state.json, written silent_s ago. now_ns: its clock; may_stand: whether lifts may."""
+    """A run's last state.json, written silent_s ago, which is under 0 where the system's clock was set back
+    since. now_ns: its clock; may_stand: whether lifts may.
+    """
 
     phase: str
     mode: str
@@ -47,7 +49,7 @@ class LiveState:
     @property
     def is_running(self) -> bool:
         """Check that it was written a moment ago by a run that goes on."""
-        return self.silent_s <= MAX_SILENCE_S and self.phase not in ("done", "failed")
+        return abs(self.silent_s) <= MAX_SILENCE_S and self.phase not in ("done", "failed")
 
 
 def running_folder(folder: Path) -> Path:
