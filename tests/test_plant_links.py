@@ -278,6 +278,29 @@ def test_changes_are_told_once() -> None:
     assert [one["event"] for one in changes_between(raised, QUIET)] == ["validity", "alarm-ended"]
 
 
+def test_each_alarm_is_told_though_others_of_its_code_stand() -> None:
+    first, second = (PlantAlarm("load-contradicts", 1, f"lift {k}", True, False) for k in (3, 5))
+    one, both = replace(QUIET, alarms=(first,)), replace(QUIET, alarms=(second, first))
+    (told,) = changes_between(one, both)
+    assert (told["event"], told["text"]) == ("alarm-raised", "lift 5")
+    acknowledged = replace(QUIET, alarms=(second, replace(first, is_acknowledged=True)))
+    assert changes_between(both, acknowledged) == []
+    (told,) = changes_between(acknowledged, one)
+    assert (told["event"], told["text"]) == ("alarm-ended", "lift 5")
+    again = replace(QUIET, alarms=(first, replace(first, is_active=False)))
+    assert [one["event"] for one in changes_between(one, again)] == ["alarm-raised"]
+
+
+def test_alarms_that_no_longer_fit_have_not_ended() -> None:
+    alarms = tuple(PlantAlarm("bundle-gone", 2, f"B{k}", True, False) for k in range(25, 0, -1))
+    full, more = replace(QUIET, alarms=alarms[1:21]), replace(QUIET, alarms=alarms[:20])
+    assert [(one["event"], one["text"]) for one in changes_between(full, more)] == [("alarm-raised", "B25")]
+    cleared = replace(QUIET, alarms=alarms[:3] + alarms[4:21])
+    assert [(one["event"], one["text"]) for one in changes_between(more, cleared)] == [
+        ("alarm-raised", "B5"), ("alarm-ended", "B22"),
+    ]  # fmt: skip
+
+
 def test_bad_configurations_and_keys_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = tmp_path / "plant.toml"
     config.write_text("[store]\n")

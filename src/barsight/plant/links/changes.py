@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
-from barsight.plant.state import PlantState
+from barsight.plant.state import MAX_ALARMS, PlantAlarm, PlantState
 
 
 def changes_between(old: PlantState | None, new: PlantState) -> list[dict[str, Any]]:
@@ -19,13 +22,25 @@ def changes_between(old: PlantState | None, new: PlantState) -> list[dict[str, A
     before, after = _lift(old), _lift(new)
     if before != after:
         told.append({"event": "lift", "was": before, "is": after})
-    standing, stood = ({alarm.code: alarm for alarm in state.alarms} for state in (new, old))
-    for code, alarm in standing.items():
-        if code not in stood:
-            text = {"code": code, "text": alarm.text, "priority": alarm.priority}
-            told.append({"event": "alarm-raised", **text})
-    told += [{"event": "alarm-ended", "code": code} for code in stood if code not in standing]
+    for alarm in (Counter(_alarms(new)) - Counter(_alarms(old))).elements():
+        text = {"code": alarm.code, "text": alarm.text, "priority": alarm.priority}
+        told.append({"event": "alarm-raised", **text})
+    told += [{"event": "alarm-ended", "code": one.code, "text": one.text} for one in _ended(old, new)]
     return [{**one, "stamp_ns": new.stamp_ns} for one in told]
+
+
+def _alarms(state: PlantState) -> list[PlantAlarm]:
+    """List a state's alarms, the newest first, whatever came of each."""
+    return [replace(alarm, is_active=True, is_acknowledged=False) for alarm in state.alarms]
+
+
+def _ended(old: PlantState, new: PlantState) -> Iterator[PlantAlarm]:
+    """Yield the alarms that don't stand any more; where more stand than are told the oldest may stand on."""
+    stood, standing = _alarms(old), _alarms(new)
+    if len(standing) >= MAX_ALARMS:
+        last = max((k for k, alarm in enumerate(stood) if alarm in standing), default=0)
+        stood = stood[:last]
+    yield from (Counter(stood) - Counter(standing)).elements()
 
 
 def _lift(state: PlantState) -> dict[str, Any] | None:
