@@ -13,6 +13,8 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
@@ -299,6 +301,40 @@ def test_alarms_that_no_longer_fit_have_not_ended() -> None:
     assert [(one["event"], one["text"]) for one in changes_between(more, cleared)] == [
         ("alarm-raised", "B5"), ("alarm-ended", "B22"),
     ]  # fmt: skip
+
+
+def test_another_alarm_of_a_code_is_raised_though_the_first_was_acknowledged() -> None:
+    pytest.importorskip("asyncua")
+    from barsight.plant.opcua.alarms import Conditions
+    from barsight.plant.opcua.surveys import AlarmLine
+
+    class Sent:
+        """An emitter that keeps what it is to send, and the parent of all conditions."""
+
+        def __init__(self) -> None:
+            self.events: list[tuple[str, bool]] = []
+
+        def make(self, _: str, text: str, severity: int, fields: dict[str, Any]) -> SimpleNamespace:
+            return SimpleNamespace(EventId=b"1", said=(text, fields["AckedState/Id"].Value))
+
+        async def send(self, event: SimpleNamespace) -> None:
+            self.events.append(event.said)
+
+        async def add_object(self, *_: object) -> SimpleNamespace:
+            return SimpleNamespace(nodeid=None)
+
+    async def shown() -> list[tuple[str, bool]]:
+        sent: Any = Sent()
+        conditions = Conditions(cast(Any, None), sent, sent, None, 2)
+        first, second = (AlarmLine("load-contradicts", f"lift {k}", "error") for k in (3, 5))
+        await conditions.show((first,))
+        known = conditions._by_code["load-contradicts"]
+        conditions._by_code["load-contradicts"] = replace(known, is_acknowledged=True)
+        for alarms in ((first,), (second, first), (second, first)):
+            await conditions.show(alarms)
+        return list(sent.events)
+
+    assert asyncio.run(shown()) == [("lift 3", False), ("lift 5", False)]
 
 
 def test_bad_configurations_and_keys_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -56,13 +56,16 @@ class Conditions:
             self._server.iserver.isession.add_method_callback(ua.NodeId(number), method)
 
     async def show(self, alarms: tuple[AlarmLine, ...]) -> None:
-        """Raise what stands now and wasn't active, end what was and doesn't stand any more."""
-        standing = {alarm.code: alarm for alarm in alarms}
+        """Raise what stands now and wasn't active, end what was and doesn't stand any more.
+
+        alarms: the newest first. Of each code that one is shown, raised anew where another was.
+        """
+        standing = {alarm.code: alarm for alarm in reversed(alarms)}
         for code, alarm in standing.items():
             known = self._by_code.get(code)
             if known is None and len(self._by_code) < MAX_CONDITIONS:
                 await self._change(_Condition(await self._add_node(code), alarm))
-            elif known is not None and not known.is_active:
+            elif known is not None and not (known.is_active and known.alarm == alarm):
                 await self._change(replace(known, alarm=alarm, is_active=True, is_acknowledged=False))
         for code, known in list(self._by_code.items()):
             if known.is_active and code not in standing:
