@@ -7,6 +7,7 @@ import threading
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,12 +18,15 @@ from barsight.live.crane.check import check_machine
 from barsight.live.crane.preflight import expect_plausible, held
 from barsight.live.settings import read_crane
 from barsight.recording.writers.retention import PROTECTED, Retention
+from barsight.sensors import crane as crane_module
+from barsight.sensors.camera import RawPicture
 from barsight.sensors.clock import DeviceClock
+from barsight.sensors.crane import CraneSource
 from barsight.sensors.forms import pack
 from barsight.sensors.pairing import PairFormer
 from barsight.sensors.receiver import RawReading, ReadingReceiver, Sequence
 from barsight.sensors.settings import ReadingsSettings
-from barsight.sensors.source import LivePicture
+from barsight.sensors.source import LivePicture, LostPicture, Readings
 
 SECOND = 10**9
 DARK = np.zeros((4, 6), np.uint8)
@@ -138,6 +142,28 @@ def test_readings_that_are_overtaken_or_doubled_begin_nothing_anew(rate_hz: int)
             missing += found
     assert (np.diff(taken) > 0).all() and len(taken) + missing == taken[-1] - taken[0] + 1
     assert sequence.restarts == 0 and sequence.overtaken == len(sent) - len(taken) > 0
+
+
+def test_readings_wait_while_all_is_held_up_and_pictures_that_find_no_room_count(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """An IMU of 1 kHz for 1.5 s, its clock settled before; with room for four pictures."""
+    monkeypatch.setattr(crane_module, "RAW_PICTURES", 4, raising=False)
+    source = CraneSource((), {"imu": None}, 30.0, 0, lambda: True)  # type: ignore[arg-type, dict-item]
+    given: list[Any] = []
+    for k in range(3000):
+        source._put("imu", RawReading(k * 1_000_000, k * 1_000_000 + 5, (0.0,) * 6, 0))
+        if k < 1500:
+            given += source._next()
+    for k in range(6):
+        source._put("cam0", RawPicture(k, k, k, np.zeros((2, 2), np.uint8)))
+    late = list(source._next())
+    (readings,) = (one for one in late if isinstance(one, Readings))
+    assert len(readings.stamp_ns) == 1500
+    lost = [one for one in (*given, *late) if isinstance(one, LostPicture)]
+    assert sum(one.count for one in lost if one.cause == "backpressure") == 2
+    source._put("cam0", RawPicture(9, 9, 9, np.zeros((2, 2), np.uint8)))
+    assert not any(one.cause == "backpressure" for one in source._next() if isinstance(one, LostPicture))
 
 
 def test_the_oldest_unprotected_segments_go_first(tmp_path: Path) -> None:

@@ -21,7 +21,8 @@ WAIT_S = 0.01
 SIGNS_EVERY_S = 1.0
 HOLD_INTERVALS = 3
 """A picture waits so many intervals for an older one of the other camera."""
-RAW_QUEUE = 256
+RAW_PICTURES, RAW_READINGS = 256, 1 << 16
+"""So many wait at most while all is held up: the fastest IMU's readings of ten seconds."""
 ONE_CLOCK_NS = 5_000_000
 """The least delays of two cameras on one network are no further apart."""
 
@@ -30,11 +31,12 @@ Item = tuple[str, RawPicture | RawLoss | RawReading]
 
 @dataclass
 class _Stream:
-    """A sensor's clock, its last stamp given on, and what it lost."""
+    """A sensor's clock, its last stamp given on, and what it lost. dropped: readings that found no room."""
 
     clock: DeviceClock = field(default_factory=DeviceClock)
     last_ns: int = 0
     lost: int = 0
+    dropped: int = 0
 
 
 class CraneSource:
@@ -53,7 +55,8 @@ class CraneSource:
         self._ask, self._going = may_go_on, True
         self.interval_ns = round(NS_PER_S / rate_hz)
         self._streams = {name: _Stream() for name in ("cam0", "cam1", *receivers)}
-        self._items: queue.Queue[Item] = queue.Queue(RAW_QUEUE)
+        self._items: queue.Queue[Item] = queue.Queue()
+        self._room = threading.Semaphore(RAW_PICTURES)
         self._held: list[tuple[int, int, int, LivePicture]] = []
         self._overflow = self._device_ns = 0
 
@@ -95,10 +98,12 @@ class CraneSource:
             self._put(name, item)
 
     def _put(self, name: str, item: RawPicture | RawLoss | RawReading) -> None:
-        try:
-            self._items.put_nowait((name, item))
-        except queue.Full:
+        if isinstance(item, RawPicture) and not self._room.acquire(blocking=False):
             self._overflow += 1
+        elif isinstance(item, RawReading) and self._items.qsize() >= RAW_READINGS:
+            self._streams[name].dropped += 1
+        else:
+            self._items.put((name, item))
 
     def _next(self) -> Iterator[Packet]:
         """Yield what one wait gives; readings that came together make one packet."""
@@ -109,6 +114,8 @@ class CraneSource:
                 if isinstance(item, RawReading):
                     self._read(name, item, readings)
                 else:
+                    if isinstance(item, RawPicture):
+                        self._room.release()
                     yield from self._picture(name, item)
                 name, item = self._items.get_nowait()
         except queue.Empty:
@@ -182,7 +189,7 @@ class CraneSource:
             signs |= {
                 f"{name}_settled": int(clock.is_settled), f"{name}_drift_ppb": clock.drift_ppb,
                 f"{name}_jitter_ns": clock.jitter_ns, f"{name}_jumps": clock.jumps,
-                f"{name}_lost": stream.lost,
+                f"{name}_lost": stream.lost + stream.dropped,
             }  # fmt: skip
         for name, receiver in self._receivers.items():
             signs |= {
