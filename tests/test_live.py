@@ -16,6 +16,7 @@ import barsight as bs
 from barsight.cli.main import run
 from barsight.core.records.pairs import RefusedFrame, StereoFrame
 from barsight.core.records.sensor_samples import CraneSamples
+from barsight.live.capture import Capture
 from barsight.live.latency import counts, spread
 from barsight.live.link import GrowingRecording, Link, LiveInput
 from barsight.live.modes import FreezeWatch, JumpWatch, Mode, SensorActivity, judge_mode
@@ -257,6 +258,23 @@ def test_pairs_form_by_stamp_and_each_lone_picture_counts() -> None:
     list(former.push(LivePicture(0, 50, 0, DARK)))
     former.end()
     assert former.lost == [2, 1]
+
+
+def test_a_wide_tolerance_pairs_no_neighbours(
+    whole: Path, board: Counters, ring: PairRing, tmp_path: Path
+) -> None:
+    """At 30 Hz, with a tolerance over an interval, the pictures after one that was lost."""
+    settings = replace(SETTINGS, recording=replace(SETTINGS.recording, pair_tolerance_s=0.05)).chosen()
+    link = Link(LiveInput(whole), settings, LiveSettings(), tmp_path, tmp_path, "", board.name, None)
+    board["capture", "interval_ns"] = 33_333_333
+    capture = Capture(link, board, ring)
+    for k in range(8):
+        for camera in (0, 1):
+            if (k, camera) != (2, 0):
+                stamp_ns = BEGIN_NS + k * 33_333_333 + camera * 100_000
+                capture._take(LivePicture(camera, stamp_ns, stamp_ns, DARK, k))
+    assert board["capture", "max_skew_ns"] == 100_000
+    assert (board["capture", "paired"], board["capture", "unpaired_cam1"]) == (7, 1)
 
 
 HEARD = SensorActivity((10**9, 10**9), 30_000_000, {"imu": 10**9, "crane": 10**9})

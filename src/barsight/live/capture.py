@@ -67,7 +67,10 @@ class Capture:
     def __init__(self, link: Link, board: Counters, ring: PairRing) -> None:
         self._board, self._ring, self._speed = board, ring, link.source.speed
         self._readings = {sensor: link.readings(sensor) for sensor in ("imu", "crane")}
-        self._pairs = PairFormer(seconds_to_ns(link.settings.recording.pair_tolerance_s))
+        tolerance_ns = seconds_to_ns(link.settings.recording.pair_tolerance_s)
+        if half_ns := board["capture", "interval_ns"] // 2:  # further apart they can be neighbours'
+            tolerance_ns = min(tolerance_ns, half_ns)
+        self._pairs = PairFormer(tolerance_ns)
         self._lost = [board["capture", f"unpaired_cam{camera}"] for camera in (0, 1)]
         self._contradicted = board["capture", "trigger"]
 
