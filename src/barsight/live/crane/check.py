@@ -89,7 +89,7 @@ def _disk(name: str, folder: Path, crane: CraneConfig, *, is_run: bool) -> Itera
     there = next(path for path in (folder, *folder.parents) if path.is_dir())
     camera = crane.rig().cam0
     kept = camera.width * camera.height * (KEYFRAME_BYTES_PER_PIXEL if is_run else 2)
-    way_m = crane.live.keyframe_way_m
+    way_m = crane.live.keyframe_way_m or TRAVEL_MPS / crane.cameras.rate_hz  # 0: each pair is one
     free, needed = shutil.disk_usage(there).free, kept * SURVEY_M / way_m
     remedy = "free some, or name a folder on a larger disk"
     yield Finding(
