@@ -1,6 +1,7 @@
 """`barsight plant run` and `plant check`, every link at once, against mosquitto, snap7 and openssl."""
 
 import asyncio
+import multiprocessing
 import os
 import shutil
 import signal
@@ -335,6 +336,28 @@ def test_another_alarm_of_a_code_is_raised_though_the_first_was_acknowledged() -
         return list(sent.events)
 
     assert asyncio.run(shown()) == [("lift 3", False), ("lift 5", False)]
+
+
+def test_a_handshake_that_waits_for_the_store_makes_the_state_unknown() -> None:
+    """Three steps that nobody answers for a second each: the state is unknown within 0.3 s, not after 3 s."""
+    pytest.importorskip("asyncua")
+    from barsight.plant.opcua.process import _AskedPlant
+
+    here, there = multiprocessing.Pipe()
+
+    async def ask() -> float:
+        source = _AskedPlant(there, 0.3)
+        steps = [asyncio.create_task(source.handshake("claim", "crane", {})) for _ in range(3)]
+        await asyncio.sleep(0.05)
+        began_s = time.monotonic()
+        assert await source.told() is None
+        took_s = time.monotonic() - began_s
+        assert await asyncio.gather(*steps) == [None] * 3
+        return took_s
+
+    assert asyncio.run(ask()) < 0.6
+    here.close()
+    there.close()
 
 
 def test_bad_configurations_and_keys_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -100,8 +100,12 @@ class _AskedPlant:
         self._turn = asyncio.Lock()
 
     async def told(self) -> Told | None:
-        """Ask for what is true now."""
-        answer = await self._ask(None, self._max_age_s)
+        """Ask for what is true now; what is shown doesn't outlive a step of the handshake that waits."""
+        try:
+            async with asyncio.timeout(self._max_age_s):
+                answer = await self._ask(None, self._max_age_s)
+        except TimeoutError:
+            return None
         return answer if isinstance(answer, Told) else None
 
     async def handshake(self, step: str, who: str, arguments: Mapping[str, Any]) -> str | Failed | None:
