@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -25,6 +26,7 @@ from barsight.cli.main import run
 from barsight.core.errors import ConfigError, Failed, InputError
 from barsight.plant.feed import StateFeed
 from barsight.plant.link_settings import OpcUaSettings
+from barsight.plant.links import opcua_link
 from barsight.plant.links.changes import changes_between
 from barsight.plant.live_folder import with_live_run
 from barsight.plant.settings import PlantSettings, StoreSource, read_plant
@@ -336,6 +338,46 @@ def test_another_alarm_of_a_code_is_raised_though_the_first_was_acknowledged() -
         return list(sent.events)
 
     assert asyncio.run(shown()) == [("lift 3", False), ("lift 5", False)]
+
+
+def test_a_store_that_goes_away_as_a_survey_came_ends_no_link(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The state was read, the survey's folder can't be: that is told once the store is back."""
+    pytest.importorskip("asyncua")
+    from barsight.plant.links.opcua_link import serve_opcua
+    from barsight.plant.opcua import process
+
+    shown: list[Any] = []
+    shower = SimpleNamespace(is_alive=True, show=shown.append, stop=lambda: None)
+    monkeypatch.setattr(process, "OpcUaProcess", lambda *_: shower)
+
+    class Store:
+        """Away for two looks."""
+
+        def reading(self) -> Any:
+            if len(shown) < 2:
+                raise InputError("store", "is away", "wait")
+            return nullcontext()
+
+    monkeypatch.setattr(opcua_link, "survey_folder", lambda _, name: tmp_path / name)
+    feed: Any = SimpleNamespace(newest=lambda _: replace(QUIET, map_id="m"))
+
+    async def serve() -> None:
+        store, steps = cast(Any, Store()), cast(Any, None)
+        serving = asyncio.create_task(
+            serve_opcua(store, OpcUaSettings(folder=tmp_path), feed, steps, lambda _: None)
+        )
+        while len(shown) < 3 and not serving.done():
+            await asyncio.sleep(0.05)
+        serving.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await serving
+
+    asyncio.run(serve())
+    assert [None if one.survey is None else one.survey.folder for one in shown[:3]] == [
+        None, None, tmp_path / "m",
+    ]  # fmt: skip
 
 
 def test_a_handshake_that_waits_for_the_store_makes_the_state_unknown() -> None:

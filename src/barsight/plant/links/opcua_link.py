@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import datetime
 import itertools
 import typing
@@ -10,7 +11,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from barsight.core.errors import Failed, OutputError
+from barsight.core.errors import BarsightError, Failed, OutputError
 from barsight.measure_settings import MeasureSettings
 from barsight.plant.crane_names import opcua_name
 from barsight.plant.feed import READ_EVERY_S, StateFeed
@@ -43,10 +44,13 @@ async def serve_opcua(
         )  # fmt: skip
         if state.map_id is not None and state.map_id not in folders:
             folders.clear()
-            with store.reading() as connection:
+            with (
+                contextlib.suppress(BarsightError),
+                store.reading() as connection,
+            ):  # one that is away comes back
                 folders[state.map_id] = survey_folder(connection, state.map_id)
-        survey = None if state.map_id is None else Survey(state.map_id, folders[state.map_id])
-        return Told(state, alarms, survey)
+        surveys = [Survey(name, folder) for name, folder in folders.items() if name == state.map_id]
+        return Told(state, alarms, surveys[0] if surveys else None)
 
     presets = typing.get_args(typing.get_type_hints(MeasureSettings)["preset"])
     state = feed.newest(0)
