@@ -1,6 +1,8 @@
 """The pose process: what of the sensors it takes, and when."""
 
 import json
+import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,8 +14,9 @@ import barsight as bs
 from barsight.core.arrays import Float64, Int64
 from barsight.core.stamps import NS_PER_S
 from barsight.live.link import Link, LiveInput
-from barsight.live.pose_output import PoseOutput
+from barsight.live.pose_output import PoseOutput, output_poses
 from barsight.live.settings import LiveSettings
+from barsight.live.shared.counters import Counters
 from barsight.motion.fixed_lag.propagation import ROW_NUMBERS, NavigationState
 
 BEGIN_NS = 1_700_000_000_000_000_000
@@ -120,6 +123,25 @@ def test_a_state_that_comes_late_still_begins_with_its_readings(whole: Path, tmp
     assert told["predicted_s"] == pytest.approx(12)
     assert told["position_m"][0] == pytest.approx(SPEED_MPS * 13, abs=0.005)
     assert max(told["sigma_m"]) < 0.005
+
+
+def test_a_process_that_writes_seldom_goes_on_and_ends_at_once(whole: Path, tmp_path: Path) -> None:
+    """A pose every ten seconds: one that beat no more often would be ended for hanging."""
+    board = Counters()
+    link = linked(whole, tmp_path)
+    link = replace(link, live=replace(link.live, pose_rate_hz=0.1), counters=board.name)
+    board["supervisor", "began_ns"] = time.monotonic_ns()
+    thread = threading.Thread(target=output_poses, args=(link,))
+    try:
+        thread.start()
+        time.sleep(1.5)
+        silent_s = (time.monotonic_ns() - board["pose", "beat_ns"]) / 1e9
+        board["supervisor", "stop"] = 1
+        thread.join(2.0)
+        assert silent_s < 1.0 and not thread.is_alive()
+    finally:
+        thread.join(20.0)
+        board.remove()
 
 
 def test_the_sigma_has_the_yard_frames(whole: Path, tmp_path: Path) -> None:

@@ -24,6 +24,8 @@ from barsight.yard_frame import crane_in_yard, frame_of, in_yard, shared_covaria
 WAIT_S = 0.01
 """A pose waits so long for the readings at its stamp; what hasn't come then is extrapolated."""
 POLL_S = 0.001
+BEAT_S = 0.2
+"""While no pose is due the process tells this often that it goes on."""
 BEFORE_STATE_S = 5.0
 """Readings held from before the oldest state that a pose carries on: they tell the noise of the encoders."""
 
@@ -40,9 +42,11 @@ def output_poses(link: Link) -> None:
     first_ns = board["capture", "first_ns"] if crane is None else began_ns + link.source.epoch_ns
     clock, due_s = ReplayClock(began_ns, first_ns, link.source.speed), time.monotonic()
     while not board["supervisor", "stop"]:
-        board.beat("pose")
         due_s = max(due_s + 1 / link.live.pose_rate_hz, time.monotonic())
-        time.sleep(max(due_s - time.monotonic(), 0))
+        board.beat("pose")
+        while (left_s := due_s - time.monotonic()) > 0 and not board["supervisor", "stop"]:
+            time.sleep(min(left_s, BEAT_S))
+            board.beat("pose")
         board.add("pose", "written", output.write(clock.stamp_now_ns()))
 
 
