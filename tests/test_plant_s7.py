@@ -50,12 +50,31 @@ def test_an_exchange_reads_inputs_and_writes_outputs(plc: DrawnPlc) -> None:
     outputs = bytes(i * 7 % 256 for i in range(OUTPUT_BYTES))
     link = S7Link(S7Settings(port=plc.port), INPUT_BYTES)
     try:
-        exchanged = link.exchange(outputs)
+        exchanged = link.exchange(lambda: outputs)
     finally:
         link.close()
     assert isinstance(exchanged, S7Exchange), exchanged
     assert exchanged.inputs == bytes(plc.blocks[100])
     assert bytes(plc.blocks[101]) == outputs
+
+
+def test_what_is_written_is_as_it_is_then(plc: DrawnPlc, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The state ages while the PLC takes half a second for what it is asked for before."""
+    read, began_s, asked_s = snap7.Client.db_read, time.monotonic(), []
+
+    def slow(client: snap7.Client, *arguments: int) -> bytearray:
+        time.sleep(0.5)
+        return read(client, *arguments)
+
+    def outputs() -> bytes:
+        asked_s.append(time.monotonic() - began_s)
+        stop.set()
+        return bytes(8)
+
+    monkeypatch.setattr(snap7.Client, "db_read", slow)
+    stop = threading.Event()
+    run_s7(S7Settings(port=plc.port), INPUT_BYTES, outputs, lambda _: None, stop)
+    assert asked_s[0] > 0.5
 
 
 def test_nodes7_sees_the_same_numbers(plc: DrawnPlc) -> None:
@@ -68,7 +87,7 @@ def test_nodes7_sees_the_same_numbers(plc: DrawnPlc) -> None:
     assert process.returncode == 0, errors
     link = S7Link(S7Settings(port=plc.port), INPUT_BYTES)
     try:
-        exchanged = link.exchange(struct.pack(">Iif?", 4000000000, -42, 2.5, True))
+        exchanged = link.exchange(lambda: struct.pack(">Iif?", 4000000000, -42, 2.5, True))
     finally:
         link.close()
     assert isinstance(exchanged, S7Exchange), exchanged

@@ -43,8 +43,10 @@ class S7Link:
         """Read the inputs; return Failed where the PLC can't be reached."""
         return self.exchange(None)
 
-    def exchange(self, outputs: bytes | None) -> S7Exchange | Failed:
-        """Read the inputs, then write the outputs, if any; return Failed where the PLC can't be reached."""
+    def exchange(self, outputs: Callable[[], bytes] | None) -> S7Exchange | Failed:
+        """Read the inputs, then write the outputs, if any, as they are by then; return Failed where the PLC
+        can't be reached.
+        """
         one = self._settings
         try:
             client = self._connected()
@@ -52,7 +54,7 @@ class S7Link:
             inputs = bytes(client.db_read(one.read_db, one.read_start, self._input_bytes))
             read = time.monotonic()
             if outputs is not None:
-                client.db_write(one.write_db, one.write_start, bytearray(outputs))
+                client.db_write(one.write_db, one.write_start, bytearray(outputs()))
             written = time.monotonic()
         except (S7Error, RuntimeError, OSError, ValueError) as error:
             self.close()
@@ -85,15 +87,15 @@ def run_s7(
 ) -> None:  # fmt: skip
     """Exchange at each cycle until `stop` is set.
 
-    outputs: the bytes to write, asked for at each exchange, so that none is older than a cycle. take: told of
-    each exchange, and of each that failed.
+    outputs: the bytes to write, asked for as they are written: to connect and to read may take seconds.
+    take: told of each exchange, and of each that failed.
     """
     link = S7Link(settings, input_bytes)
     wait_s = settings.cycle_s
     due = time.monotonic()
     try:
         while not stop.is_set():
-            exchanged = link.exchange(outputs())
+            exchanged = link.exchange(outputs)
             take(exchanged)
             failed = isinstance(exchanged, Failed)
             wait_s = min(2 * wait_s, settings.max_retry_s) if failed else settings.cycle_s
