@@ -104,6 +104,29 @@ def test_encoders_that_freeze_after_the_state_hold_no_pose(whole: Path, tmp_path
     assert error_m < 3 * told["sigma_m"][0]
 
 
+@pytest.mark.parametrize("has_imu", [False, True])
+@pytest.mark.parametrize("jump_m", [0.06, 0.2])
+def test_encoders_that_jump_after_the_state_hold_no_pose(
+    jump_m: float, has_imu: bool, whole: Path, tmp_path: Path
+) -> None:
+    """Not at once, nor once its sigma has grown so far that the place they tell could be one."""
+    link = linked(whole, tmp_path)
+    state = NavigationState.of(BEGIN_NS, link.states().last(1)[1][0])
+    known = replace(state, covariance=np.eye(15) * 1e-6)
+    link.states().append(np.array([BEGIN_NS]), known.row[None])
+    stamps = BEGIN_NS + np.arange(-60, 41) * 50_000_000
+    output, places, last_ns = PoseOutput(link), way(stamps), 0
+    places[stamps > BEGIN_NS + 200_000_000, 0] += jump_m
+    for tenth in range(1, 19):
+        now_ns = BEGIN_NS + tenth * 100_000_000
+        now = (last_ns < stamps) & (stamps <= now_ns)
+        link.readings("crane").append(stamps[now], places[now])
+        if has_imu:
+            give_imu(link, tenth / 10 + 0.05)
+        last_ns, told = now_ns, written(output, link, tenth / 10)
+        assert abs(told["position_m"][0] - SPEED_MPS * tenth / 10) < 3 * told["sigma_m"][0]
+
+
 def test_a_state_that_comes_late_still_begins_with_its_readings(whole: Path, tmp_path: Path) -> None:
     """As late as `max_predicted_s` lets it: the encoders about it hold the pose then too."""
     link = linked(whole, tmp_path, max_predicted_s=15.0)

@@ -139,12 +139,14 @@ class FreezeWatch:
 
 
 class JumpWatch:
-    """Tells by how much the encoders have jumped, until they come back. sigma_m: of a reading."""
+    """Tells by how much the encoders have jumped, until they come back. sigma_m: of a reading. after_ns:
+    readings up to this stamp aren't judged.
+    """
 
-    def __init__(self, sigma_m: float) -> None:
+    def __init__(self, sigma_m: float, after_ns: int = 0) -> None:
         self._min_jump_m = max(MIN_JUMP_M, JUMP_SIGMAS * sigma_m)
         self._off_m: Float64 = np.zeros(3)
-        self._last_ns = self._jump_ns = self._from_ns = 0
+        self._last_ns, self._jump_ns, self._from_ns = after_ns, 0, 0
         self._jump_m: Float64 = np.zeros(3)
         self._bound_m = 0.0
 

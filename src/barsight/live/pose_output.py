@@ -14,10 +14,10 @@ from barsight.core.records.trajectory import PosedFrame
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.inertial.model import ORDINARY_NOISE
 from barsight.live.link import Link
-from barsight.live.modes import FreezeWatch
+from barsight.live.modes import FreezeWatch, JumpWatch
 from barsight.live.shared.logs import ReadingLog
 from barsight.live.source import ReplayClock
-from barsight.motion.fixed_lag.propagation import NavigationState, Propagator
+from barsight.motion.fixed_lag.propagation import REFERENCE_S, NavigationState, Propagator
 from barsight.recording.sensor_selection import SelectedSensors
 from barsight.yard_frame import crane_in_yard, frame_of, in_yard, shared_covariance
 
@@ -61,6 +61,7 @@ class PoseOutput:
         placed = source.crane()
         self._lever_m = None if placed is None else placed.crane_to_body_m
         self._freeze: FreezeWatch | None = None
+        self._jump: JumpWatch | None = None
         if self._mounted is not None and "crane" in self._sensors:
             self._freeze = FreezeWatch(self._mounted)
         self._shift_ns = whole.rig.timeshift_cam_imu_ns
@@ -86,7 +87,7 @@ class PoseOutput:
             return False
         self._await(stamp_ns, began + int(WAIT_S * NS_PER_S))
         if self._has_encoders and self._trusted_encoders() is None:
-            self._begin()  # they froze since, and their last readings must not hold the pose
+            self._begin()  # they froze or jumped since, and must not hold the pose where it isn't
         self._take(stamp_ns)
         self._publish(self._propagator.at(stamp_ns))
         self._outputs.append((now_ns, time.monotonic_ns() - began))
@@ -101,6 +102,9 @@ class PoseOutput:
         self._state = NavigationState.of(self._state_ns, rows[0])
         for held in (self._imu, self._crane):
             held.grow()
+        if self._mounted is not None:
+            about_ns = self._state_ns - seconds_to_ns(REFERENCE_S)
+            self._jump = JumpWatch(self._mounted.position_std_m, about_ns)
         self._begin()
         return True
 
@@ -113,9 +117,13 @@ class PoseOutput:
         self._propagator = Propagator(self._state, self._noise, known, has_imu=has_imu)
 
     def _trusted_encoders(self) -> CraneSamples | None:
-        """Return the encoder readings held; None where there are none in use or they are frozen."""
+        """Return the encoder readings held; None where there are none in use, they are frozen or they have
+        jumped since the last state or about it.
+        """
         held = self._crane.since(0)
         if self._freeze is None or self._freeze.check(*held):
+            return None
+        if self._jump is None or self._jump.check(*held):
             return None
         return self._placed(*held)
 
