@@ -24,6 +24,7 @@ pytest.importorskip("sqlalchemy")
 
 from barsight.cli.main import run
 from barsight.core.errors import ConfigError, Failed, InputError
+from barsight.plant import feed as feed_module
 from barsight.plant.feed import StateFeed
 from barsight.plant.link_settings import OpcUaSettings
 from barsight.plant.links import opcua_link
@@ -237,6 +238,26 @@ def test_a_store_that_is_gone_makes_the_state_invalid(tmp_path: Path) -> None:
         feed._read = state, read_s - 1.0
         old = feed.newest(8)
         assert not old.is_valid and "state-too-old" in old.reasons[-1]
+
+
+def test_a_store_that_is_away_for_a_moment_ends_no_alarm_and_brings_no_survey(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    alarm = PlantAlarm("load-contradicts", 1, "lift 3", True, False)
+    known, looks = replace(QUIET, alarms=(alarm,), map_id="m"), iter((True, True, False, False, True))
+
+    def read(*_: object, **__: object) -> PlantState:
+        if next(looks):
+            return known
+        raise InputError("store", "is locked", "wait")
+
+    monkeypatch.setattr(feed_module, "state_of_store", read)
+    feed, told = StateFeed(cast(Any, None), PlantSettings()), []
+    for _ in range(4):
+        before, _ = feed.read()
+        feed.refresh()
+        told.append([one["event"] for one in changes_between(before, feed.read()[0])])
+    assert told == [[], ["validity"], [], ["validity"]]
 
 
 def test_a_live_run_gives_the_pose_and_may_forbid(tmp_path: Path) -> None:

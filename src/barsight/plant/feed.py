@@ -73,7 +73,8 @@ class StateFeed:
         """Read the state now, as after a step of the handshake."""
         with self._turn:
             began_s = time.monotonic()
-            self._read = self._with_plc(read_state(self._store, self._settings)), began_s
+            state = read_state(self._store, self._settings, self._read[0])
+            self._read = self._with_plc(state), began_s
 
     def take_reading(self, reading: PlcReading) -> None:
         """Take what a PLC tells of the crane; it is told with the states of the next second."""
@@ -109,8 +110,10 @@ def with_age(state: PlantState, read_s: float, life_counter: int) -> PlantState:
     return replace(state, life_counter=life_counter)
 
 
-def read_state(store: Store, settings: PlantSettings) -> PlantState:
-    """Read the state; one that isn't valid where the store or the live run can't be read."""
+def read_state(store: Store, settings: PlantSettings, before: PlantState | None = None) -> PlantState:
+    """Read the state; one that isn't valid where the store or the live run can't be read. Where the store
+    can't be, no alarm of the state before has ended, and no survey comes with the next.
+    """
     source = settings.store
     try:
         state = state_of_store(
@@ -119,4 +122,8 @@ def read_state(store: Store, settings: PlantSettings) -> PlantState:
         )  # fmt: skip
     except BarsightError as error:
         state = PlantState("idle", False, (f"store: {error}",), 0, time.time_ns(), "none")
+        if before is not None:
+            state = replace(
+                state, alarms=before.alarms, map_id=before.map_id, calibration_id=before.calibration_id
+            )
     return state if settings.live is None else with_live_run(state, settings.live.folder)
