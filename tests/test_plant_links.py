@@ -23,12 +23,13 @@ import pytest
 pytest.importorskip("sqlalchemy")
 
 from barsight.cli.main import run
-from barsight.core.errors import ConfigError, Failed, InputError
+from barsight.core.errors import ConfigError, Failed, InputError, OutputError
 from barsight.plant import feed as feed_module
 from barsight.plant.feed import StateFeed
-from barsight.plant.link_settings import OpcUaSettings
+from barsight.plant.link_settings import OpcUaSettings, WebhookSettings
 from barsight.plant.links import opcua_link
 from barsight.plant.links.changes import changes_between
+from barsight.plant.links.running import serve_plant
 from barsight.plant.live_folder import with_live_run
 from barsight.plant.settings import PlantSettings, StoreSource, read_plant
 from barsight.plant.state import PlantAlarm, PlantState, state_of_store
@@ -258,6 +259,24 @@ def test_a_store_that_is_away_for_a_moment_ends_no_alarm_and_brings_no_survey(
         feed.refresh()
         told.append([one["event"] for one in changes_between(before, feed.read()[0])])
     assert told == [[], ["validity"], [], ["validity"]]
+
+
+def test_a_feed_that_ends_ends_the_plants_side(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An error that nobody expects ended it: else a state that is too old would be served for ever."""
+    looks = iter([QUIET])
+
+    def read(*_: object, **__: object) -> PlantState:
+        return next(looks)
+
+    monkeypatch.setattr(feed_module, "read_state", read)
+    monkeypatch.setattr(threading, "excepthook", lambda _: None)
+
+    async def serve() -> None:
+        one: Any = None
+        await asyncio.wait_for(serve_plant(one, PlantSettings(webhooks=WebhookSettings()), print), 10)
+
+    with pytest.raises(OutputError, match="read no more"):
+        asyncio.run(serve())
 
 
 def test_a_live_run_gives_the_pose_and_may_forbid(tmp_path: Path) -> None:

@@ -61,6 +61,11 @@ class StateFeed:
         self._stop.set()
         self._thread.join(5)
 
+    @property
+    def is_alive(self) -> bool:
+        """Tell that the thread goes on."""
+        return self._thread.is_alive()
+
     def newest(self, life_counter: int) -> PlantState:
         """Return the newest state with the link's own life counter; not valid where it is old."""
         return with_age(*self.read(), life_counter)

@@ -26,10 +26,10 @@ Say = Callable[[str], None]
 async def serve_plant(store: Store, settings: PlantSettings, say: Say) -> None:
     """Serve all links until cancelled. say: told where each is served, and what is wrong with one.
 
-    Raises OutputError where a link can't be served.
+    Raises OutputError where a link can't be served, or the state isn't read any more.
     """
     with StateFeed(store, settings) as feed:
-        links = _links(store, settings, feed, say)
+        links = {"state": _watch(feed), **_links(store, settings, feed, say)}
         tasks = [asyncio.create_task(_named(name, link), name=name) for name, link in links.items()]
         try:
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -56,6 +56,13 @@ def _links(store: Store, settings: PlantSettings, feed: StateFeed, say: Say) -> 
     if settings.webhooks is not None:
         links["webhooks"] = _serve_webhooks(settings.webhooks, feed, say)
     return links
+
+
+async def _watch(feed: StateFeed) -> None:
+    """Raise OutputError where no state is read any more: no link would ever offer a lift again."""
+    while feed.is_alive:
+        await asyncio.sleep(1.0)
+    raise OutputError("the state is read no more; the lines above say why")
 
 
 async def _followed(feed: StateFeed) -> AsyncIterator[tuple[PlantState, list[dict[str, Any]]]]:
