@@ -65,6 +65,22 @@ def test_an_address_that_is_away_costs_bounded_memory(hooks: Hooks) -> None:
     assert [one["lost"] for one in hooks.posts] == [990] + 9 * [0]
 
 
+def test_what_was_lost_is_told_until_a_post_is_taken(hooks: Hooks) -> None:
+    """The first post after the outage, which tells it, is refused."""
+    url = f"http://127.0.0.1:{free_port()}/hook"
+    hook = Webhook(url, WebhookSettings((url,), max_waiting=3))
+    try:
+        for number in range(10):
+            hook.tell({"event": "lift", "number": number})
+        until(lambda: hook.problem is not None)
+        hooks.answers = [422]
+        hook.url = hooks.url
+        until(lambda: len(hooks.posts) == 3)
+    finally:
+        hook.stop()
+    assert [(one["number"], one["lost"]) for one in hooks.posts] == [(7, 7), (8, 7), (9, 0)]
+
+
 def test_a_redirect_is_no_answer_and_an_address_is_http(hooks: Hooks) -> None:
     """A redirect may lead anywhere; the state goes to the configured address alone."""
     hooks.answers = [302]

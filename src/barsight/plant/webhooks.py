@@ -88,7 +88,8 @@ class Webhook:
             if problem is None or is_final:
                 wait_s = FIRST_RETRY_S
                 with self._lock:
-                    self._lost -= lost
+                    if problem is None:
+                        self._lost -= lost
                     if self._waiting and self._waiting[0] is first:
                         self._waiting.popleft()
                 continue
