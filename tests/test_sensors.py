@@ -62,6 +62,20 @@ def test_a_clock_that_jumps_settles_anew() -> None:
         assert abs(clock.host_ns(device_ns) - true_ns - 5_000_000) < 1000
 
 
+@pytest.mark.parametrize("back_s", [0.1, 0.3, 0.9])
+def test_a_clock_that_is_set_back_a_little_settles_anew_too(back_s: float) -> None:
+    """Not after two minutes, when the last delays from before are forgotten; a busy host is no such clock."""
+    clock, rng, off_s = DeviceClock(), np.random.default_rng(0), []
+    for k in range(20 * 60):
+        t = k / 20
+        late_s = 0.001 + rng.exponential(0.001) + (0.08 if 10 < t < 12 else 0.0)
+        device_ns = round((1000 + t - (back_s if t > 30 else 0.0)) * SECOND)
+        clock.add(device_ns, round((t + late_s) * SECOND))
+        off_s.append(clock.host_ns(device_ns) / SECOND - t)
+    assert clock.jumps == 1
+    assert np.abs(off_s[: 20 * 30]).max() < 0.005 and np.abs(off_s[20 * 35 :]).max() < 0.005
+
+
 def test_pairs_need_stamp_and_trigger_to_agree() -> None:
     """cam1 counts two ahead; one number is wrong; later cam0 counts anew."""
     former, paired = PairFormer(2), []

@@ -19,6 +19,8 @@ EARLY_NS = 50_000_000
 """A stamp that would have arrived so long before it was made belongs to a clock that jumped."""
 LATE_NS, LATE_COUNT = NS_PER_S, 5
 """So many stamps in turn that arrive so late do too."""
+BEHIND_NS = 3 * NS_PER_S
+"""So do all stamps of so much time that arrive `EARLY_NS` late: no host is busy for so long on end."""
 RECENT = 300
 
 
@@ -40,6 +42,7 @@ class DeviceClock:
         self._delays: deque[int] = deque(maxlen=RECENT)
         self._origin: tuple[int, int] | None = None
         self._count, self._late, self._bucket = 0, 0, -1
+        self._behind, self._behind_ns = 0, 0
         self._offset_ns, self._drift = 0.0, 0.0
 
     def add(self, device_ns: int, arrival_ns: int) -> bool:
@@ -47,7 +50,7 @@ class DeviceClock:
         if self._origin is not None and self.is_settled:
             delay = arrival_ns - self.host_ns(device_ns)
             self._late = self._late + 1 if delay > LATE_NS else 0
-            if delay < -EARLY_NS or self._late >= LATE_COUNT:
+            if delay < -EARLY_NS or self._late >= LATE_COUNT or self._is_behind(delay, arrival_ns):
                 self.jumps += 1
                 self._begin()
             elif self._late:
@@ -68,6 +71,13 @@ class DeviceClock:
         self._fit()
         self._delays.append(arrival_ns - self.host_ns(device_ns))
         return self.is_settled
+
+    def _is_behind(self, delay_ns: int, arrival_ns: int) -> bool:
+        """Take a stamp's delay; tell whether all of the last while were late."""
+        self._behind = self._behind + 1 if delay_ns > EARLY_NS else 0
+        if self._behind <= 1:
+            self._behind_ns = arrival_ns
+        return self._behind >= LATE_COUNT and arrival_ns - self._behind_ns > BEHIND_NS
 
     @property
     def is_settled(self) -> bool:
