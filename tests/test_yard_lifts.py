@@ -529,6 +529,24 @@ def test_two_bundles_at_once_where_they_are_asked_for() -> None:
     assert [lift.bundles for lift in plan.offered] == [(0, 1)]
 
 
+def test_each_of_two_bundles_is_held_by_what_pulls_it() -> None:
+    """The wider bundle lies under most of the faces; the other, 2.4 t, under 0.1 m of them."""
+    thick = laid(0.0, z=0.3, bars=19)
+    thin = laid(0.0, z=0.3 + thick.top_z_m - laid(0.0, z=0.3).top_z_m)
+    thin = replace(thin, x_m=(thick.width_m + thin.width_m) / 2 + 0.01)
+    bundles = record(thick), record(thin, 1)
+    heights, offered = bare(map_of([thick, thin])), {}
+    for width_m in (0.4, 0.6):
+        wide = replace(
+            MAGNET, capacity_kg=15000.0, crane_capacity_kg=20000.0,
+            poles=tuple(replace(p, width_m=width_m) for p in MAGNET.poles),
+            limits=replace(MAGNET.limits, offset_across_m=0.08),
+        )  # fmt: skip
+        plan = plan_lifts(heights, bundles, wide, LiftSettings(bundles=2), ())
+        offered[width_m] = [lift.bundles for lift in plan.offered]
+    assert offered == {0.4: [], 0.6: [(0, 1)]}
+
+
 def test_the_file_fits_its_schema_and_comes_back(tmp_path: Path) -> None:
     stock = [laid(0.3), laid(0.62)]
     bundles = (record(stock[0], 0), record(stock[1], 1, ends_open=(True, False)))

@@ -48,7 +48,13 @@ from barsight.yard.magnet.footprint import (
     Rectangles,
     count_gripped,
 )
-from barsight.yard.magnet.holding import WeakestPole, hold_load, share_checks, weakest_pole
+from barsight.yard.magnet.holding import (
+    WeakestPole,
+    hold_load,
+    share_checks,
+    weakest_bundle,
+    weakest_pole,
+)
 from barsight.yard.magnet.partings import without_parted
 from barsight.yard.magnet.reach import reached_strips
 from barsight.yard.map_lookup import nearest_cells
@@ -150,6 +156,7 @@ def assess_placement(
     needed = mass.upper_kg * NEWTON_PER_KG * magnet.needed_factor
     contact = hold_load(contact, magnet, load, settings.strap_m)
     weakest = weakest_pole(contact, needed, magnet, place, load)
+    worst = weakest_bundle(contact, magnet, place, load, settings.strap_m)
     away = np.array([place.x_m, place.y_m]) - load_centre(load)
     offset = float(away @ place.along), float(away @ place.across)
     overhang = _overhang(place, load, magnet)
@@ -160,7 +167,7 @@ def assess_placement(
         *disturbed_checks(yard.events, place, magnet, load, valid, settings),
         *count_checks(place, yard.heights, magnet, near, contact, held, settings),
         *face_checks(contact, needed, magnet, load, settings),
-        *share_checks(weakest),
+        *share_checks(weakest, worst),
         *clearance_checks(place, yard.heights, magnet, contact, load),
         *resting_checks(place, magnet, contact, load),
         *leaning_checks(place, magnet, contact, load),
@@ -182,7 +189,7 @@ def assess_placement(
         reason = f"within the crane's tolerance {end}"
         what = "the box within which the lift stays as checked, over the crane's tolerance"
         checks.append(check_min("narrow-tolerance", what, scale, SCALES[0], "", reason))
-    safety = _safety(contact, weakest, needed, mass, magnet, scale if search else math.inf)
+    safety = min(_safety(contact, weakest, needed, mass, magnet, scale if search else math.inf), worst)
     return Lift(
         place, tuple(b.id for b in load), len(load), held.probability,
         tuple(b.id for b in load) if len(load) > settings.bundles else (),
@@ -323,7 +330,10 @@ def _change(
         contact = hold_load(contact, magnet, load, settings.strap_m)
         checks = [
             unknown_check(contact, settings), *face_checks(contact, needed_n, magnet, load, settings),
-            *share_checks(weakest_pole(contact, needed_n, magnet, moved, load)),
+            *share_checks(
+                weakest_pole(contact, needed_n, magnet, moved, load),
+                weakest_bundle(contact, magnet, moved, load, settings.strap_m),
+            ),
             *resting_checks(moved, magnet, contact, load),
         ]  # fmt: skip
         for veto in vetoes_of(checks):

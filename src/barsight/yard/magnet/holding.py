@@ -8,19 +8,20 @@ strap, and the noise on top.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 
-from barsight.core.arrays import Float64, frozen, kernel
+from barsight.core.arrays import Bool, Float64, frozen, kernel
 from barsight.yard.lift_settings import UPPER
-from barsight.yard.magnet.contact import Contact, PoleContact
+from barsight.yard.magnet.contact import NEWTON_PER_KG, Contact, PoleContact
 from barsight.yard.magnet.description import Magnet, Pole
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.types import Bundle
 from barsight.yard.vetoes import Check, check_min
-from barsight.yard.weight import load_centre
+from barsight.yard.weight import bundle_mass, load_centre
 
 SMOOTHING_M = 0.016
 """Standard deviation of a map's smoothing across the bars, at most."""
@@ -166,15 +167,58 @@ def weakest_pole(
     return WeakestPole(worst + 1, float(pulls[worst]), float(shares[worst]))
 
 
-def share_checks(weakest: WeakestPole | None) -> list[Check]:
-    """Check that the pole that is worst off carries its share."""
+def weakest_bundle(
+    contact: Contact, magnet: Magnet, place: Placement, load: tuple[Bundle, ...], strap_m: float
+) -> float:
+    """Compute the lower bound of the pull on each of several bundles over what its own weight needs, and
+    return the least; infinite where one or none is taken, NaN where a weight isn't known.
+
+    Only the cells of a face that surely lie over a bundle's outline pull it.
+    """
+    if len(load) < 2:
+        return math.inf
+    ratios = []
+    for bundle in load:
+        poles = tuple(
+            replace(own, gap_map_m=np.where(_over(bundle, pole, place, own), own.gap_map_m, np.nan))
+            for own, pole in zip(contact.poles, magnet.poles, strict=True)
+        )
+        held = hold_load(replace(contact, poles=poles), magnet, (bundle,), strap_m)
+        needed_n = bundle_mass(bundle).upper_kg * NEWTON_PER_KG * magnet.needed_factor
+        ratios.append(held.pull_low_n / needed_n)
+    return float(np.min(ratios))
+
+
+def _over(bundle: Bundle, pole: Pole, place: Placement, own: PoleContact) -> Bool:
+    """Mark the cells (across, along) of a face that surely lie over a bundle's outline."""
+    shape = own.gap_map_m.shape
+    u = pole.across_m + pole.width_m * ((np.arange(shape[0]) + 0.5) / shape[0] - 0.5)
+    v = pole.along_m + pole.length_m * ((np.arange(shape[1]) + 0.5) / shape[1] - 0.5)
+    at = np.array([place.x_m, place.y_m]) - bundle.centre_m[:2]
+    at = at + u[:, None, None] * place.across + v[None, :, None] * place.along
+    sigma, axes = bundle.sigma, Placement(0.0, 0.0, bundle.yaw_rad)
+    sigmas = np.array([(sigma.lateral_m, sigma.width_m / 2), (sigma.along_m, sigma.length_m / 2)])
+    half = np.array([bundle.width_m, bundle.length_m]) / 2
+    half = half - UPPER * np.hypot(*np.nan_to_num(sigmas, nan=0.05).T)
+    return np.asarray((np.abs(at @ axes.across) <= half[0]) & (np.abs(at @ axes.along) <= half[1]))
+
+
+def share_checks(weakest: WeakestPole | None, worst_bundle: float = math.inf) -> list[Check]:
+    """Check that the pole that is worst off carries its share, and that each of several bundles is held by
+    what pulls it, by `weakest_bundle`.
+    """
     if weakest is None:
         return []
     pull, share = weakest.pull_low_n / 1e3, weakest.share_n / 1e3
-    return [
+    checks = [
         check_min(
             "weak-pull", "lower bound of the worst pole's pull over its share", weakest.ratio, 1.0,
             "", f"pole {weakest.number} pulls at least {pull:.1f} kN, its share of what is needed is "
             f"{share:.1f} kN",
         )
     ]  # fmt: skip
+    if worst_bundle < math.inf or math.isnan(worst_bundle):
+        what = "lower bound of the pull on the worst bundle over what it needs"
+        reason = f"one of the bundles is pulled by {worst_bundle:.2f} of what it needs, at least"
+        checks.append(check_min("weak-pull", what, worst_bundle, 1.0, "", reason))
+    return checks
