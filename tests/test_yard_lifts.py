@@ -275,6 +275,14 @@ def test_bars_that_reach_too_far() -> None:
     assert codes(lift) == {"overhang"}
 
 
+def test_poles_on_one_side_leave_the_other_end_hanging() -> None:
+    """The last pole ends 2.55 m beyond the middle, the first begins 1.15 m before it: 2.35 m hang free."""
+    aside = weak(poles=MAGNET.poles[1:], limits=replace(MAGNET.limits, overhang_m=2.0, offset_along_m=2.0))
+    lift = judged([laid(0.3)], magnet=aside)
+    assert lift.overhang_m == pytest.approx(3.5 - 1.15 + 1.645 * SIGMA.length_m / 2)
+    assert "overhang" in codes(lift)
+
+
 def test_an_end_that_was_not_seen() -> None:
     assert codes(judged([laid(0.3)], (record(laid(0.3), ends_open=(False, True)),))) == {"end-open"}
 

@@ -269,14 +269,16 @@ def _map_sigma(heights: HeightMap, place: Placement, magnet: Magnet) -> float:
 
 
 def _overhang(place: Placement, load: tuple[Bundle, ...], magnet: Magnet) -> tuple[float, float]:
-    """Compute the longest way from the outermost pole to an end, and its sigma; NaN where none is taken."""
-    beyond = [
-        (
-            float(abs((end[:2] - (place.x_m, place.y_m)) @ place.along)) - magnet.half_span_m,
-            float(np.nan_to_num(bundle.sigma.length_m, nan=0.05)) / 2,
-        )
-        for bundle in load for end in bundle.ends_m
-    ]  # fmt: skip
+    """Compute the longest way from the outermost pole on its side to an end, and its sigma; NaN where none is
+    taken.
+    """
+    first = min(pole.along_m - pole.length_m / 2 for pole in magnet.poles)
+    last = max(pole.along_m + pole.length_m / 2 for pole in magnet.poles)
+    beyond = []
+    for bundle in load:
+        sigma = float(np.nan_to_num(bundle.sigma.length_m, nan=0.05)) / 2
+        ends = (bundle.ends_m[:, :2] - (place.x_m, place.y_m)) @ place.along
+        beyond += [(max(end - last, first - end), sigma) for end in ends.tolist()]
     return max(beyond, key=lambda way: way[0] + UPPER * way[1], default=(math.nan, math.nan))
 
 
