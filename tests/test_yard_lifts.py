@@ -22,11 +22,13 @@ from barsight.core.records.heights import HeightSource
 from barsight.core.stamps import NS_PER_S
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
+from barsight.yard.events import YardEvent
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.lift_file import lifts_content, read_lifts, write_lifts
 from barsight.yard.lifting.load import reaches_area
 from barsight.yard.lifting.targets import map_vetoes, plan_lifts
 from barsight.yard.lifting.travel_accuracy import Travel
+from barsight.yard.lifting.validity import disturbed_checks, validity
 from barsight.yard.magnet.contact import rest_magnet
 from barsight.yard.magnet.description import Beam, Magnet, Tolerance
 from barsight.yard.magnet.footprint import BundleTable, Placement, count_gripped
@@ -458,7 +460,7 @@ def test_a_place_is_as_old_as_the_last_frame_that_saw_it() -> None:
     gone = travel([(0, 0), (30, 0)], [610.0, 1.0])
     plan = plan_lifts(bare(map_of(stock)), bundles, MAGNET, SETTINGS, (), gone, NOW_NS)
     assert plan.offered == () and codes(plan.refused[0]) == {"map-too-old"}
-    ahead = travel([(0, 0), (0, 0)], [1.0, -60.0])
+    ahead = travel([(0, 0), (0, 0)], [-50.0, -60.0])
     plan = plan_lifts(bare(map_of(stock)), bundles, MAGNET, SETTINGS, (), ahead, NOW_NS)
     assert codes(plan.refused[0]) == {"map-from-the-future"}
 
@@ -503,6 +505,31 @@ def test_a_lift_is_as_old_as_the_oldest_part_that_it_depends_on(old: str, age_s:
     assert Travel.read({"travel": ways[0].content(), "passes": [{}, {}]}) is None, "which pass isn't said"
     again = Travel.read({"travel": joined.content(), "passes": [{}, {}]})
     assert again is not None and again.pass_number.tolist() == [1, 1, 2, 2]
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_beam_that_is_longer_than_its_poles_and_wider_poles_count_whole(turned: bool) -> None:
+    """What was last seen 500 s ago, or moved since, lies under what stands out of the other one."""
+    stock = [laid(0.3)]
+    heights = bare(map_of(stock, x_m=(-3.0, 3.0), y_m=(-6.0, 6.0)))
+    x, y = np.meshgrid(heights.x_m, heights.y_m)
+    if turned:
+        magnet = weak(poles=tuple(replace(pole, width_m=1.4) for pole in MAGNET.poles))
+        far = np.abs(x - 0.3) > 0.6
+        event = YardEvent(NOW_NS, "magnet", 0.3 + 0.7 + 0.9, 0.0, 0.0, 0.1, 0.1)
+    else:
+        magnet = weak(beam=Beam(9.0, 0.3, 0.35))
+        far = np.abs(y) > 4.0
+        event = YardEvent(NOW_NS, "magnet", 0.3, 4.5 + 0.9, 0.0, 0.1, 0.1)
+    heights = replace(heights, passes=np.where(far, 1, 2).astype(np.uint8))
+    way = [(0.0, float(at)) for at in (-4, -2, 0, 2, 4)]
+    joined = Travel.joined([travel(way, [seen_s] * 5) for seen_s in (500.0, 90.0)])
+    place, load = Placement(0.3, 0.0, 0.0), (record(stock[0]),)
+    found = validity(joined, place, magnet, load, heights, SETTINGS)
+    assert found is not None and found.from_ns == NOW_NS - 500 * NS_PER_S
+    assert [one.result for one in disturbed_checks((event,), place, magnet, load, found, SETTINGS)] == [
+        "failed"
+    ]
 
 
 def test_a_place_out_of_the_picture_or_not_measured_again_grows_old() -> None:

@@ -51,8 +51,8 @@ def validity(
     if not (_distances(travel.place_m[measured], here) < travel.sure_reach_m).any():
         return None
     wider = STRAY_FIELD_M + max(magnet.tolerance.x_m, magnet.tolerance.y_m)
-    wider += math.radians(magnet.tolerance.yaw_deg) * magnet.half_span_m
-    outlines = [(here[0], place.yaw_rad, magnet.beam.width_m, 2 * magnet.half_span_m)]
+    wider += math.radians(magnet.tolerance.yaw_deg) * max(magnet.size_m) / 2
+    outlines = [(here[0], place.yaw_rad, *magnet.size_m)]
     outlines += [(b.centre_m[:2], b.yaw_rad, b.width_m, b.length_m) for b in load]
     grid = [_places_in(centre, yaw, width + 2 * wider, length + 2 * wider)
             for centre, yaw, width, length in outlines]  # fmt: skip
@@ -137,8 +137,7 @@ def disturbed_checks(
     seen: Validity | None, settings: LiftSettings,
 ) -> list[Check]:  # fmt: skip
     """Check that nothing happened within reach of magnet and load since the place was last seen."""
-    size = magnet.beam.width_m, 2 * magnet.half_span_m
-    outlines = [corners((place.x_m, place.y_m), place.yaw_rad, *size)]
+    outlines = [corners((place.x_m, place.y_m), place.yaw_rad, *magnet.size_m)]
     for bundle in load:
         x, y = bundle.centre_m[:2]
         outlines.append(corners((x, y), bundle.yaw_rad, bundle.width_m, bundle.length_m))
