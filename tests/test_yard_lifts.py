@@ -475,6 +475,17 @@ def test_ends_that_no_frame_surely_saw_are_as_old_as_the_first_that_may_have() -
     assert lift.validity is not None and lift.validity.from_ns == NOW_NS - 400 * NS_PER_S
 
 
+def test_a_place_that_is_not_known_is_not_surely_beside_a_no_lift_area() -> None:
+    """The area begins 0.1 m beside the load; an unknown sigma counts as 50 mm."""
+    stock = laid(0.3)
+    area = (stock.x_m + stock.width_m / 2 + 0.1, -1.0, 2.0, 1.0)
+    settings = LiftSettings(no_lift_areas=(area,))
+    for sigma_m, clear in ((0.003, True), (math.nan, False)):
+        one = record(stock, sigma=replace(SIGMA, lateral_m=sigma_m))
+        lift = judged([stock], (one,), settings=settings)
+        assert ("no-lift-area" not in codes(lift)) is clear
+
+
 @pytest.mark.parametrize(
     ("old", "age_s"),
     [("nothing", 91), ("an end", 500), ("beside a face", 500), ("a metre beside", 91), ("unknown", 501)],

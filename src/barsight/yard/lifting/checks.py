@@ -102,7 +102,7 @@ def area_checks(
     outlines = [(np.array([place.x_m, place.y_m]), place.yaw_rad, magnet.size_m)]
     for bundle in load:
         one, own = Load.of((bundle,)), bundle.sigma
-        wide, long = (2 * UPPER * float(np.nan_to_num(part)) for part in (own.lateral_m, own.along_m))
+        wide, long = (2 * UPPER * _known(part) for part in (own.lateral_m, own.along_m))
         size = one.width_m + wide, one.length_m + long
         outlines.append((np.array([one.x_m, one.y_m]), one.yaw_rad, size))
     reached = [area for one in outlines for area in reached_areas(*one, magnet.tolerance, settings)]
