@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from barsight.cli.main import run
 from barsight.core.errors import ConfigError, InputError
 from barsight.core.stamps import NS_PER_S
 from barsight.recording.writers.retention import PROTECTED
+from barsight.store import confirmation
 from barsight.store.adding import add_survey, read_survey
 from barsight.store.audit import AuditChain, entry, verify_chain
 from barsight.store.calibrations import (
@@ -27,6 +29,7 @@ from barsight.store.opening import Store, open_store
 from barsight.store.recordings import list_recordings
 from barsight.store.tables import LIFT_STATES
 from page_yards import SECOND, survey
+from result_folders import summary
 from yard_folders import lifts, write_folder
 
 DAY_NS = 86400 * NS_PER_S
@@ -98,6 +101,30 @@ def test_lifts_of_a_calibration_that_is_not_valid_are_not_offered(store: Store, 
     assert expire_stale(store, "ann") == 0
     with store.reading() as connection:
         assert len(open_lifts(connection)) == 3
+
+
+def test_lifts_that_look_back_or_are_ahead_of_the_clock_are_not_offered(
+    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The frames' clock is an hour ahead, then this computer's is set an hour back."""
+    real = summary() | {"is_simulated": False}
+    monkeypatch.setattr("page_yards.summary", lambda: real)
+    folder = survey(tmp_path / "ahead", SECOND, -3600.0, with_lifts=False)
+    assert lifts(folder, "--at", "end") == 0
+    assert json.loads((folder / "lifts.json").read_text())["lifts"]
+    add_survey(store, read_survey(folder), "ann")
+    with store.reading() as connection:
+        newest = newest_survey(connection)
+        assert newest is not None and open_lifts(connection) == ()
+        assert [veto["code"] for veto in map_vetoes(connection, newest.id)] == ["map-too-old"]
+    with open_store(f"sqlite:///{tmp_path / 'back.db'}", create=True) as other:
+        add_survey(other, read_survey(survey(tmp_path / "now", SECOND, 1.0)), "ann")
+        with other.reading() as connection:
+            offers = len(open_lifts(connection))
+        assert offers == 3 and expire_stale(other, "ann") == 0
+        back_ns = time.time_ns() - 3600 * NS_PER_S
+        monkeypatch.setattr(confirmation, "yard_clock_ns", lambda _: back_ns)
+        assert expire_stale(other, "ann") == offers
 
 
 def test_a_recording_is_kept_with_its_reason(

@@ -141,7 +141,8 @@ def add_survey(
         settle_lifts(opened, changes | absences, read.from_ns, is_newest=is_newest)
         is_valid = _note_equipment(opened, read, survey_id, (rig, crane))
         if read.lifts is not None:
-            add_lifts(opened, survey_id, read.lifts, ids, is_newest=is_newest and is_valid)
+            is_sound = is_valid and not _note_looking_back(opened, read, survey_id)
+            add_lifts(opened, survey_id, read.lifts, ids, is_newest=is_newest and is_sound)
             end_disturbed(opened, read.from_ns)
     named = {identity_name(number): change for number, change in changes.items()}
     return AddedSurvey(
@@ -281,6 +282,17 @@ def _note_equipment(
     if reason:
         opened.add(SURVEY_VETOES, survey_id=survey_id, code="calibration-changed", reason=reason)
     return not reason
+
+
+def _note_looking_back(opened: Entry, read: MeasuredSurvey, survey_id: int) -> bool:
+    """Tell whether the lifts of a measured yard were judged as of its last frame, and forbid them where they
+    were: nobody held their age against a clock. A simulated yard's clock goes on from that frame.
+    """
+    if read.lifts is None or not read.lifts["looks_back"] or read.identity.is_simulated:
+        return False
+    reason = "its lifts were judged as of the last frame, to look back: never for a crane"
+    opened.add(SURVEY_VETOES, survey_id=survey_id, code="map-too-old", reason=reason)
+    return True
 
 
 def _add_sighting(

@@ -24,6 +24,7 @@ from barsight.store.states import has_alarm, last_raised_ns, lift_state, raise_a
 from barsight.store.tables import LIFT_BUNDLES, LIFT_STATES, LIFTS, SIGHTINGS, SURVEY_VETOES, SURVEYS
 from barsight.yard.events import corners, gap_between
 from barsight.yard.inventory.bundle_file import bundle_of
+from barsight.yard.lifting.validity import MAX_CLOCK_ERROR_NS
 from barsight.yard.vetoes import VETOES
 
 with extra("store"):
@@ -315,6 +316,8 @@ def _stale(connection: Connection, clock_ns: int) -> dict[int, str]:
             told[lift.lift_id] = "expired: a newer map came"
         elif until_ns is None or until_ns < clock_ns:
             told[lift.lift_id] = "expired: map-too-old: it was valid for a limited time"
+        elif (lift.record.get("valid_from_ns") or 0) - clock_ns > MAX_CLOCK_ERROR_NS:
+            told[lift.lift_id] = "expired: map-from-the-future: the frames are ahead of this clock"
         elif reason:
             told[lift.lift_id] = f"expired: calibration-changed: {reason}"
     return told
