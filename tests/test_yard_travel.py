@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from barsight.core.pose import Pose
@@ -83,6 +85,18 @@ def test_a_slip_of_the_encoders_forbids_lifts_beside_it() -> None:
     assert reasons(one, HERE) == []
     assert any("disagree by 80 mm within 1 m" in s for s in reasons(one, THERE))
     assert reasons(travel(encoders=encoders(0.008, 7.4, 8.6)), THERE) == []
+
+
+def test_a_slip_forbids_lifts_beside_it_whichever_way_the_crane_goes() -> None:
+    """The lift lies 2 m beside the way, along X and along Y."""
+    one = travel(encoders=encoders(0.08, 7.4, 8.6))
+    turned = replace(one, place_m=one.place_m[:, ::-1])
+    for way, near, far in (
+        (one, Placement(8.0, 2.0, 0.0), Placement(2.0, 2.0, 0.0)),
+        (turned, Placement(2.0, 8.0, np.pi / 2), Placement(2.0, 2.0, np.pi / 2)),
+    ):
+        assert any("disagree by 80 mm within 1 m" in s for s in reasons(way, near))
+        assert reasons(way, far) == []
 
 
 def test_a_slip_that_stays_forbids_all_lifts_since_the_crane_would_go_beside() -> None:

@@ -200,7 +200,11 @@ def _encoder_checks(travel: Travel, place: Placement, max_m: float) -> list[Chec
         return []
     sigma = travel.sigma_m[:, :2].max(axis=1, initial=0)
     excess = np.where(known, travel.off_m - SURE_SIGMAS * sigma, -np.inf)
-    passing = known & (np.abs(travel.place_m[:, 0] - place.x_m) < ALONGSIDE_M)
+    away = travel.place_m - (place.x_m, place.y_m)
+    far = np.hypot(away[:, 0], away[:, 1])
+    # However the crane goes by, it counts where it is nearest to the lift, and ALONGSIDE_M of its way about.
+    beside = far < np.hypot(far[known].min(), ALONGSIDE_M)
+    passing = known & (beside | (np.abs(away[:, 0]) < ALONGSIDE_M))
     last = int(np.flatnonzero(known)[-1])
     checks = []
     if passing.any():
