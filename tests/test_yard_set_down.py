@@ -15,6 +15,7 @@ from barsight.yard.lifting.ground import Ground
 from barsight.yard.lifting.load import Load, reaches_area
 from barsight.yard.lifting.set_down import SetDown, find_set_down, sound_ground
 from barsight.yard.lifting.targets import put_down
+from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.types import HeightMap
 from barsight.yard.weight import load_centre
@@ -110,6 +111,37 @@ def test_a_slope_a_neighbour_a_tall_thing_under_the_beam_and_the_unseen_refuse()
     assert carried(tall)
     broad = replace(MAGNET, beam=replace(MAGNET.beam, width_m=0.8))
     assert find_bearing(tall, LOAD, *FREE, 0.0, broad, SETTINGS) is None
+
+
+@pytest.mark.parametrize(
+    ("magnet", "x", "y"),
+    [
+        (MAGNET, (1.5, 1.7), (2.8, 2.9)),
+        (replace(MAGNET, beam=replace(MAGNET.beam, length_m=3.0)), (1.5, 1.7), (2.4, 2.5)),
+        (
+            replace(MAGNET, poles=tuple(replace(p, across_m=-1.0) for p in MAGNET.poles)),
+            (2.5, 2.7),
+            (0.6, 0.8),
+        ),
+    ],
+    ids=["a beam that holds the load 0.3 m off its middle", "poles beyond the beam", "poles beside the beam"],
+)
+def test_what_stands_or_is_not_seen_under_any_part_of_the_magnet_refuses(
+    magnet: Magnet, x: tuple[float, float], y: tuple[float, float]
+) -> None:
+    """The load is 4 m long; nothing stands nearer to it than 0.3 m."""
+    load = Load.of((record(laid(0.3, length_m=4.0)),))
+
+    def found(heights: HeightMap) -> bool:
+        return find_bearing(heights, load, *FREE, 0.0, magnet, SETTINGS) is not None
+
+    open_ = map_of([laid(0.3, length_m=4.0)], x_m=(-3.0, 5.0), y_m=(-5.0, 5.0))
+    assert found(open_)
+    tall, unseen = (replace(open_, z_m=open_.z_m.copy(), source=open_.source.copy()) for _ in range(2))
+    tall.z_m[cells(tall, x, y)] += 3.0
+    unseen.source[cells(unseen, x, y)] = HeightSource.UNKNOWN
+    assert not found(tall) and not found(unseen)
+    assert found(replace(unseen, free_m=np.full(unseen.shape, 0.1, np.float32)))
 
 
 def test_a_stanchion_is_not_touched_and_stands_over_what_it_holds() -> None:

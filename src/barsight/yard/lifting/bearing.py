@@ -65,7 +65,8 @@ class Surroundings:
     """Heights (V, U) about a place on a grid along (v_m) and across (u_m) the load.
 
     z_m: medians over 50 mm squares, which wrong matches don't move. thin_m: over 30 mm, for what is thin.
-    Both have the highest nearby where a few cells were not seen; unseen: those cells and all others.
+    Both have the highest nearby where a few cells were not seen; unseen: those cells and all others. most_m:
+    the most that lines of sight allow there, inf where none passed.
     """
 
     v_m: Float64
@@ -73,6 +74,7 @@ class Surroundings:
     z_m: Float32
     thin_m: Float32
     unseen: Bool
+    most_m: Float32
 
 
 def find_bearing(
@@ -120,9 +122,7 @@ def _surroundings(
     yard: YardMap, load: Load, place: tuple[float, float], yaw_rad: float, margin: Float64, magnet: Magnet
 ) -> Surroundings:
     """Read the heights under the load, under the magnet over it, and in a margin (across, along) beside."""
-    beam = magnet.beam
-    long = max(load.length_m, beam.length_m) / 2 + margin[1]
-    wide = max(load.width_m, beam.width_m, max(p.width_m for p in magnet.poles)) / 2 + margin[0]
+    wide, long = np.maximum((load.width_m / 2, load.length_m / 2), magnet_reach(load, magnet)) + margin
     v, u = (STEP_M * np.arange(-math.ceil(a / STEP_M), math.ceil(a / STEP_M) + 1) for a in (long, wide))
     across, along = axes_of(yaw_rad)
     x, y = (place[k] + v[:, None] * along[k] + u[None] * across[k] for k in (0, 1))
@@ -135,7 +135,22 @@ def _surroundings(
     z, thin = (
         np.where(inside, cv2.medianBlur(filled, side)[row, column], nearby[row, column]) for side in (5, 3)
     )
-    return Surroundings(v, u, z, thin, ~(inside & seen[row, column]))
+    free = np.full(part.shape, np.inf, np.float32) if part.free_m is None else part.free_m
+    most = np.where(inside, free[row, column], np.float32(np.inf)).astype(np.float32)
+    return Surroundings(v, u, z, thin, ~(inside & seen[row, column]), most)
+
+
+def magnet_reach(load: Load, magnet: Magnet) -> Float64:
+    """Return how far (2,) the magnet that holds a load may reach from the load's middle, across and along."""
+    off = np.abs((load.off_across_m, load.off_along_m))
+    return np.asarray(np.array(magnet.size_m) / 2 + _held_off(load, magnet) + off)
+
+
+def _held_off(load: Load, magnet: Magnet) -> Float64:
+    """Return how far (2,) beside the load's centre of mass, across and along, the magnet may hold it."""
+    limits = magnet.limits
+    most = limits.offset_across_m, limits.offset_along_m
+    return np.minimum(most, (load.width_m / 2, load.length_m / 2))
 
 
 def _within(around: Surroundings, load: Load, margin: Float64) -> Bool:
@@ -191,14 +206,16 @@ def _stands_in_the_way(
         cv2.connectedComponentsWithStats(over, connectivity=8)[2][1:, cv2.CC_STAT_AREA] >= MIN_THIN_CELLS
     ).any():
         return True
-    top = low_m + load.height_m
-    beside, beyond = np.abs(around.u_m)[None], np.abs(around.v_m)[:, None]
+    top, aside = low_m + load.height_m, slack + _held_off(load, magnet)
+    beside = np.abs(around.u_m - load.off_across_m)[None]
+    beyond = np.abs(around.v_m - load.off_along_m)[:, None]
+    hidden = wide_parts(around.unseen, MAX_UNSEEN_CELLS) > 0
     for width, length, height in (
-        *((p.width_m, 2 * magnet.half_span_m, top) for p in magnet.poles),
+        *((2 * abs(p.across_m) + p.width_m, 2 * magnet.half_span_m, top) for p in magnet.poles),
         (magnet.beam.width_m, magnet.beam.length_m, top + magnet.beam.above_faces_m / 2),
     ):
-        under = (beside <= width / 2 + slack[0]) & (beyond <= length / 2 + slack[1])
-        if (under & (z > height)).any():
+        under = (beside <= width / 2 + aside[0]) & (beyond <= length / 2 + aside[1])
+        if (under & np.where(hidden, ~(around.most_m <= height), z > height)).any():
             return True
     return False
 
