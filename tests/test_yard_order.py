@@ -13,8 +13,11 @@ from barsight.core.errors import Failed
 from barsight.core.records.heights import HeightSource
 from barsight.yard.events import YardEvent
 from barsight.yard.lift_settings import LiftSettings
+from barsight.yard.lifting.ground import Ground
 from barsight.yard.lifting.lift_file import lifts_content
-from barsight.yard.lifting.order import LiftOrder, begin_order, order_lifts
+from barsight.yard.lifting.load import Load
+from barsight.yard.lifting.order import LiftOrder, begin_order, order_lifts, travel_height
+from barsight.yard.lifting.set_down import SetDown
 from barsight.yard.lifting.targets import plan_lifts
 from barsight.yard.stability.blockers import find_blocked
 from barsight.yard.stability.stability import footing_checks, footings
@@ -121,6 +124,20 @@ def test_no_load_travels_over_what_was_not_seen_or_below_what_may_stand_there() 
     free = np.full(heights.shape, 1.7, np.float32)
     order = order_lifts(5, replace(heights, free_m=free), bundles, plan)
     assert isinstance(order, LiftOrder) and order.steps[0].travel_z_m == pytest.approx(2.2)
+
+
+def test_a_magnet_that_is_longer_than_its_load_travels_over_what_stands_too() -> None:
+    """The load of 4 m and its swing end at 2.5 m, the beam of 5.4 m that holds it may come to 3.5 m."""
+    stock = [laid(0.3, length_m=4.0)]
+    load = Load.of((record(stock[0]),))
+    place = SetDown(2.0, 0.0, 0.0, 0.0, 0.0, 0.0, 4.0, 2.0, 0.1)
+    for y_m, height_m in ((2.8, 3.0), (3.7, 0.0)):
+        heights = map_of(stock, x_m=(-3.0, 5.0), y_m=(-5.0, 5.0))
+        near = np.abs(heights.y_m - y_m) < 0.1
+        heights.z_m[near] = 3.0
+        found = travel_height(Ground.of(heights), load, place, MAGNET, SETTINGS)
+        highest = max(height_m, stock[0].top_z_m)
+        assert found == pytest.approx(highest + SETTINGS.travel_clear_m, abs=0.02)
 
 
 def test_lifts_json_says_the_order_and_what_is_in_the_way() -> None:

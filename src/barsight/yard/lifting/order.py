@@ -15,10 +15,12 @@ from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
 from barsight.yard.events import events_since
 from barsight.yard.lift_settings import LiftSettings
+from barsight.yard.lifting.bearing import magnet_reach
 from barsight.yard.lifting.ground import Ground
 from barsight.yard.lifting.load import Load, axes_of
 from barsight.yard.lifting.set_down import SHADOW_M, SetDown, find_set_down, sound_ground
 from barsight.yard.lifting.targets import LiftPlan, put_down
+from barsight.yard.magnet.description import Magnet
 from barsight.yard.types import Bundle, YardMap
 
 
@@ -69,7 +71,7 @@ def order_lifts(
         place = find_set_down(ground, load, plan.magnet, plan.settings)
         if place is None:
             return Failed("no-set-down", f"no place is known where bundle {bundle.id} can be set down")
-        height = travel_height(ground, load, place, plan.settings)
+        height = travel_height(ground, load, place, plan.magnet, plan.settings)
         if isinstance(height, Failed):
             return height
         steps.append(LiftStep(bundle.id, place, height, not steps))
@@ -89,14 +91,17 @@ def begin_order(order: LiftOrder, plan: LiftPlan, bundles: tuple[Bundle, ...]) -
     return replace(plan, offered=offered)
 
 
-def travel_height(ground: Ground, load: Load, place: SetDown, settings: LiftSettings) -> float | Failed:
-    """Find the height (m) for the load's underside that clears all it may pass over, or why there is none.
+def travel_height(
+    ground: Ground, load: Load, place: SetDown, magnet: Magnet, settings: LiftSettings
+) -> float | Failed:
+    """Find the height (m) for the load's underside that clears all that load and magnet may pass over, or why
+    there is none.
 
     Bridge and trolley may move one before the other and the load may turn and swing: all of the rectangle
-    between both places counts, wider by half the load's diagonal and the swing.
+    between both places counts, wider by how far load and magnet reach, and the swing.
     """
     ends = np.array([[load.x_m, load.y_m], [place.x_m, place.y_m]])
-    reach = _reach(load, place, settings)
+    reach = _reach(load, place, magnet, settings)
     unseen = math.inf if settings.max_stack_m is None else settings.max_stack_m
     highest = ground.highest_m(ends.min(axis=0) - reach, ends.max(axis=0) + reach, unseen)
     if not math.isfinite(highest):
@@ -108,9 +113,9 @@ def travel_height(ground: Ground, load: Load, place: SetDown, settings: LiftSett
     return highest + settings.travel_clear_m
 
 
-def _reach(load: Load, place: SetDown, settings: LiftSettings) -> Float64:
-    """Return how far (x, y) the load reaches from its middle on the way, swing included."""
-    half = np.array([load.width_m, load.length_m]) / 2
+def _reach(load: Load, place: SetDown, magnet: Magnet, settings: LiftSettings) -> Float64:
+    """Return how far (x, y) load and magnet reach from the load's middle on the way, swing included."""
+    half = np.maximum((load.width_m / 2, load.length_m / 2), magnet_reach(load, magnet))
     yaws = load.yaw_rad + math.radians(place.turn_deg) * np.linspace(0, 1, 19)
     reaches = [half @ np.abs(axes_of(float(yaw))) for yaw in yaws]
     return np.asarray(np.max(reaches, axis=0) + settings.swing_m)
