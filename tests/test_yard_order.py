@@ -11,6 +11,7 @@ import pytest
 
 from barsight.core.errors import Failed
 from barsight.core.records.heights import HeightSource
+from barsight.core.stamps import NS_PER_S
 from barsight.yard.events import YardEvent
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.ground import Ground
@@ -19,11 +20,12 @@ from barsight.yard.lifting.load import Load
 from barsight.yard.lifting.order import LiftOrder, begin_order, order_lifts, travel_height
 from barsight.yard.lifting.set_down import SetDown
 from barsight.yard.lifting.targets import plan_lifts
+from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.stability.blockers import find_blocked
 from barsight.yard.stability.stability import footing_checks, footings
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Veto, vetoes_of
-from lift_yards import GIVEN, LENGTH_M, MAGNET, SETTINGS, SIGMA, laid, map_of, record
+from lift_yards import GIVEN, LENGTH_M, MAGNET, SETTINGS, SIGMA, laid, map_of, record, sure_travel
 from yard_folders import schema
 from yard_maps import Laid
 
@@ -182,3 +184,30 @@ def test_nothing_is_set_down_or_carried_over_where_something_happened_since() ->
     assert moved is not None and abs(moved.x_m - place.x_m) > 0.3 + 0.3
     refused = order_lifts(5, heights, bundles, since)
     assert isinstance(refused, Failed) and "not seen" in refused.reason
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_nothing_is_set_down_or_carried_over_where_nobody_looked_for_too_long(several: bool) -> None:
+    """The pile was seen a minute ago, the free floor an hour ago, by this pass or by an earlier one."""
+    heights, bundles = pile()
+    heights.source[:, heights.x_m < -0.1] = HeightSource.UNKNOWN
+    now_ns = 10_000 * NS_PER_S
+    spots = np.array([(x, y) for x in (0.0, 5.0) for y in (-3.0, 0.0, 3.0)])
+    hour, minute = now_ns - 3600 * NS_PER_S, now_ns - 60 * NS_PER_S
+    if several:
+        newest = np.where(heights.x_m > 1.5, 1, 2).astype(np.uint8)
+        heights = replace(heights, passes=np.tile(newest, (heights.shape[0], 1)))
+        ways = [sure_travel(spots, first + np.arange(6)) for first in (hour, minute)]
+        seen = Travel.joined(ways)
+    else:
+        seen = sure_travel(spots[::-1], np.r_[hour + np.arange(3), minute + np.arange(3)])
+        seen = replace(seen, sure_reach_m=1.8)
+    heights = replace(heights, tops=np.full(heights.shape, 90, np.uint8))
+    plan = plan_lifts(heights, bundles, MAGNET, SETTINGS, (), seen, now_ns)
+    (lift,) = plan.offered
+    assert lift.bundles == (5,) and lift.set_down is None
+    refused = order_lifts(5, heights, bundles, plan)
+    assert isinstance(refused, Failed) and refused.code == "no-set-down"
+    late = replace(seen, stamp_ns=minute + np.arange(len(seen.stamp_ns)))
+    (lift,) = plan_lifts(heights, bundles, MAGNET, SETTINGS, (), late, now_ns).offered
+    assert lift.set_down is not None and lift.set_down.x_m > 1.2

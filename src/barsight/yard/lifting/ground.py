@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from barsight.core.arrays import Bool, Float32, Float64
+from barsight.core.arrays import Bool, Float32, Float64, Int64
 from barsight.core.records.heights import HeightSource
 from barsight.yard.events import YardEvent
 from barsight.yard.lifting.load import Load, axes_of
@@ -61,6 +61,21 @@ class Ground:
         offset = (step - 1) / 2 * yard.cell_m
         nothing = np.zeros(shape, np.bool_)
         return cls(yard, yard.x0_m + offset, yard.y0_m + offset, step * yard.cell_m, top, unknown, nothing)
+
+    def oldest_passes(self) -> Int64:
+        """Return the oldest pass (rows, columns) in each cell, from 1; 1 where none is known."""
+        step = max(round(self.cell_m / self.yard.cell_m), 1)
+        found = np.ones(self.top_m.shape, np.int64)
+        for patch in patches(self.yard, _PATCH_CELLS * step):
+            passes = self.yard.part(*patch).passes
+            if passes is None:
+                continue
+            blocks = tuple(slice(cut.start // step, cut.stop // step) for cut in patch)
+            size = found[blocks].shape
+            cells = passes[: size[0] * step, : size[1] * step].reshape(size[0], step, size[1], step)
+            oldest = np.where(cells > 0, cells, np.uint8(255)).min(axis=(1, 3))
+            found[blocks] = np.where(oldest < 255, oldest, 1)
+        return found
 
     def about(self, x_m: float, y_m: float, reach_m: float) -> Ground:
         """Cut out what lies this near to a place, along X and along Y."""

@@ -61,7 +61,9 @@ def order_lifts(
     if isinstance(queue, Failed):
         return queue
     since = events_since(plan.events, plan.captured_ns)
-    ground = sound_ground(Ground.of(yard), bundles, plan.footings, plan.settings, since)
+    ground = sound_ground(
+        Ground.of(yard), bundles, plan.footings, plan.settings, since, plan.travel, plan.judged_at_ns
+    )
     for bundle in queue:
         own = Load.of((bundle,))
         ground = ground.barring(ground.inside(own, own.x_m, own.y_m, own.yaw_rad, SHADOW_M))

@@ -15,6 +15,8 @@ from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.bearing import HOLE_DEPTH_M, MAX_RISE_M, Bearing, find_bearing
 from barsight.yard.lifting.ground import Ground
 from barsight.yard.lifting.load import Load, axes_of, reached_areas
+from barsight.yard.lifting.travel_accuracy import Travel
+from barsight.yard.lifting.validity import old_cells
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.stability.stability import Footing
 from barsight.yard.types import Bundle
@@ -82,10 +84,11 @@ def _reaches_area(
 
 def sound_ground(
     ground: Ground, bundles: tuple[Bundle, ...], standing: tuple[Footing, ...], settings: LiftSettings,
-    events: tuple[YardEvent, ...] = (),
+    events: tuple[YardEvent, ...] = (), travel: Travel | None = None, now_ns: int = 0,
 ) -> Ground:  # fmt: skip
     """Bar what should not be loaded: bundles that lean or stand over an edge, doubtful ones, and places where
-    nothing is put down. What lies within reach of an event in the yard isn't known any more.
+    nothing is put down. What lies within reach of an event in the yard isn't known any more, nor what was
+    last seen too long before now_ns.
     """
     footings = {footing.bundle: footing for footing in standing}
     for bundle in bundles:
@@ -99,6 +102,8 @@ def sound_ground(
     for event in events:
         yaw_rad, reach_m = math.radians(event.yaw_deg), settings.disturbed_reach_m
         ground = ground.forgetting(ground.inside(event, event.x_m, event.y_m, yaw_rad, reach_m))
+    if travel is not None:
+        ground = ground.forgetting(old_cells(ground, travel, now_ns, settings))
     return ground
 
 

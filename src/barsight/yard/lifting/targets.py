@@ -54,7 +54,7 @@ class LiftPlan:
     vetoes: those that hold for the whole map; with any of them nothing is offered. footings: how each bundle
     stands. sides: of the piles. blocked: what must go before each bundle. judged_at_ns: when, on the frames'
     clock; captured_ns: stamps of the first and last frame, None where the map is given. events: in the yard
-    since it was measured.
+    since it was measured. travel: of the map's frames.
     """
 
     magnet: Magnet
@@ -68,6 +68,7 @@ class LiftPlan:
     judged_at_ns: int
     captured_ns: tuple[int, int] | None
     events: tuple[YardEvent, ...] = ()
+    travel: Travel | None = None
 
     @property
     def looks_back(self) -> bool:
@@ -144,7 +145,8 @@ def plan_lifts(
     offered.sort(key=lambda lift: (-round(lift.safety, 2), -max(top[i] for i in lift.bundles)))
     standing, captured_ns = tuple(stands[b.id] for b in bundles), travel.captured_ns if travel else None
     if offered:
-        ground = sound_ground(Ground.of(yard), bundles, standing, settings, events_since(events, captured_ns))
+        since = events_since(events, captured_ns)
+        ground = sound_ground(Ground.of(yard), bundles, standing, settings, since, travel, now_ns)
         by_id = {bundle.id: bundle for bundle in bundles}
         loads = [Load.of(tuple(by_id[k] for k in lift.bundles)) for lift in offered]
         places = ordered_map(lambda load: find_set_down(ground, load, magnet, settings), loads)
@@ -161,6 +163,7 @@ def plan_lifts(
         now_ns,
         captured_ns,
         events,
+        travel,
     )
 
 

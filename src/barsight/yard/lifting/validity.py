@@ -9,11 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from barsight.core.arrays import Float64, Int64
+from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.yard.events import YardEvent, corners, gap_between
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.clearance import STRAY_FIELD_M
+from barsight.yard.lifting.ground import Ground
 from barsight.yard.lifting.load import axes_of
 from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.magnet.description import Magnet
@@ -109,6 +110,37 @@ def _places_in(centre_m: Float64, yaw_rad: float, width_m: float, length_m: floa
     across, along = axes_of(yaw_rad)
     at_m = centre_m + v[:, None, None] * along + u[None, :, None] * across
     return np.asarray(at_m, np.float64).reshape(-1, 2)
+
+
+def old_cells(ground: Ground, travel: Travel, now_ns: int, settings: LiftSettings) -> Bool:
+    """Mark the coarse cells [y, x] that were last seen longer ago than `max_age_s`, by the same rule as a
+    lift's validity, in squares of `SQUARE_M`. Of a cell that several passes made the oldest counts.
+    """
+    since_ns, measured = now_ns - seconds_to_ns(settings.max_age_s), np.flatnonzero(travel.measured)
+    stamps = travel.stamp_ns[measured]
+    if not (stamps < since_ns).any():
+        return np.zeros(ground.top_m.shape, np.bool_)
+    several = len(travel.pass_number) > 0
+    numbers = travel.pass_number[measured] if several else np.ones(len(measured), np.int64)
+    passes, old = ground.oldest_passes(), np.ones(ground.top_m.shape, np.bool_)
+    step = max(round(SQUARE_M / ground.cell_m), 1)
+    rows, columns = ground.top_m.shape
+    x_m, y_m = (
+        first + ground.cell_m * (np.arange(0, count, step) + (step - 1) / 2)
+        for first, count in ((ground.x0_m, columns), (ground.y0_m, rows))
+    )
+    for number in np.unique(numbers):
+        own = measured[numbers == number]
+        late, places = travel.stamp_ns[own] >= since_ns, travel.place_m[own]
+        fresh = np.zeros((len(y_m), len(x_m)), np.bool_)
+        for row, y in enumerate(y_m):
+            far = _distances(places, np.column_stack([x_m, np.full(len(x_m), y)]))
+            sure, may = far < travel.sure_reach_m, far < travel.reach_m
+            may |= ~may.any(axis=1, keepdims=True)
+            fresh[row] = np.where(sure.any(axis=1), (sure & late).any(axis=1), (~may | late).all(axis=1))
+        whole = fresh.repeat(step, axis=0)[:rows].repeat(step, axis=1)[:, :columns]
+        old &= ~((passes == number) & whole)
+    return old
 
 
 def age_checks(captured_to_ns: int | None, now_ns: int, settings: LiftSettings) -> list[Check]:
