@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -159,12 +160,31 @@ def test_a_lift_is_not_offered_after_an_event_beside_it(tmp_path: Path) -> None:
     yard = bs.load(folder)
     assert len(yard.lifts) == 3
     seen_ns = max(lift.record["valid_from_ns"] for lift in yard.lifts)
-    for stamp_ns, offered in ((seen_ns - 10**9, 3), (seen_ns + 1, 2)):
+    for stamp_ns, offered in ((seen_ns - 3 * 10**9, 3), (seen_ns + 1, 2)):
         line = f"{stamp_ns},set-down,3.3,0,0,1,0.3\n"
         (folder / "events.csv").write_text(f"{HEAD}{line}", encoding="utf-8")
         assert len(yard.lifts) == len(bs.load(folder).lifts) == offered
     assert [(lift.rank, lift.bundles) for lift in yard.lifts.refused] == [(None, (2,))]
     assert [code for code, _ in yard.lifts.refused[0].vetoes] == ["disturbed"]
+
+
+def test_a_lift_is_not_offered_after_an_event_where_its_load_would_be_put(tmp_path: Path) -> None:
+    """What happened since is over a metre from load and magnet where they lie, and nearer to the set-down."""
+    folder = write_folder(tmp_path / "out", more=(laid(2.8),))
+    assert lifts(folder) == 0
+    yard = bs.load(folder)
+    (lift,) = (one for one in yard.lifts if one.bundles == (2,))
+    put_m, from_m = lift.record["set_down"]["x_m"], lift.record["target"]["x_m"]
+    x_m = put_m + 0.9 * math.copysign(1.0, put_m - from_m)
+    assert abs(x_m - from_m) > 1.3
+    line = f"{lift.valid_until_ns},set-down,{x_m},0,0,1,0.1\n"
+    (folder / "events.csv").write_text(f"{HEAD}{line}", encoding="utf-8")
+    assert (2,) not in [one.bundles for one in yard.lifts]
+    (refused,) = (one for one in yard.lifts.refused if one.bundles == (2,))
+    assert [code for code, _ in refused.vetoes] == ["disturbed"]
+    assert lifts(folder) == 0
+    (lift,) = (one for one in bs.load(folder).lifts if one.bundles == (2,))
+    assert lift.record["set_down"] is None or abs(lift.record["set_down"]["x_m"] - x_m) > 1.1
 
 
 def test_a_free_tif_that_the_map_never_had_is_refused(folder: Path) -> None:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import asdict
+from dataclasses import asdict, astuple, replace
 from pathlib import Path
 from typing import Any
 
 import cattrs
+import numpy as np
 
 from barsight.core.json_values import DIGITS, json_value
 from barsight.core.reading.json_schema import expect_schema, package_schema
@@ -53,7 +54,7 @@ def forbidden_since(
     content: dict[str, Any], record: dict[str, Any], bundles: Iterable[Bundle],
     events: tuple[YardEvent, ...], now_ns: int,
 ) -> tuple[Veto, ...]:  # fmt: skip
-    """Tell what has forbidden a lift since it was offered: its age, and events in the yard.
+    """Tell what has forbidden a lift since it was offered: its age, and events near it or its set-down.
 
     content: of lifts.json; record: one of its lifts. bundles, events: of the same folder. now_ns: on the
     frames' clock.
@@ -66,14 +67,32 @@ def forbidden_since(
         found.append(
             Veto("map-from-the-future", "the frames are ahead of this computer's clock: set the clocks")
         )
+    magnet = cattrs.structure(content["magnet"], Magnet)
+    settings = cattrs.structure(content["settings"], LiftSettings)
+    load = tuple(bundle for bundle in bundles if bundle.id in record["bundles"])
     checks = disturbed_checks(
-        events, Placement(target["x_m"], target["y_m"], math.radians(target["yaw_deg"])),
-        cattrs.structure(content["magnet"], Magnet),
-        tuple(bundle for bundle in bundles if bundle.id in record["bundles"]),
-        None if seen_ns is None else Validity(seen_ns, until_ns or seen_ns),
-        cattrs.structure(content["settings"], LiftSettings),
+        events, _placement(target), magnet, load,
+        None if seen_ns is None else Validity(seen_ns, until_ns or seen_ns), settings,
     )  # fmt: skip
+    if record["set_down"] is not None and not vetoes_of(checks):
+        place = _placement(record["set_down"])
+        laid = (
+            replace(one, centre_m=np.array([place.x_m, place.y_m, 0.0]), yaw_rad=place.yaw_rad)
+            for one in load
+        )
+        later = _unknown_to(content, events)
+        checks = disturbed_checks(later, place, magnet, tuple(laid), None, settings)
     return (*found, *vetoes_of(checks))
+
+
+def _unknown_to(content: dict[str, Any], events: tuple[YardEvent, ...]) -> tuple[YardEvent, ...]:
+    """Select the events that neither the map may show nor the set-downs of lifts.json keep clear of."""
+    from_ns, known = content["captured_from_ns"] or -1, {tuple(event.values()) for event in content["events"]}
+    return tuple(one for one in events if one.stamp_ns > from_ns and astuple(one) not in known)
+
+
+def _placement(place: dict[str, float]) -> Placement:
+    return Placement(place["x_m"], place["y_m"], math.radians(place["yaw_deg"]))
 
 
 def lifts_content(
