@@ -77,6 +77,18 @@ def test_what_errs_as_stated_is_rarely_called_a_change() -> None:
     assert kinds.count("same") > 90
 
 
+@pytest.mark.parametrize("unknown", ["lateral_m", "along_m", "top_z_m", "yaw_rad"])
+def test_a_bundle_whose_sigma_is_not_known_may_have_moved(unknown: str) -> None:
+    """It went 0.3 m aside or along, rose by 0.15 m or turned by 2 deg."""
+    before = record(laid(0.3))
+    moves = {"lateral_m": (0.3, 0.0, 0.2, 0.0), "along_m": (0.0, 0.3, 0.2, 0.0),
+             "top_z_m": (0.0, 0.0, 0.35, 0.0), "yaw_rad": (0.0, 0.0, 0.2, 2.0)}  # fmt: skip
+    x, y, z, yaw = moves[unknown]
+    after = record(laid(0.3 + x, z=z, y_m=y, yaw_deg=yaw), sigma=replace(SIGMA, **{unknown: math.nan}))
+    (change,) = compared([before], [after])
+    assert change.kind == "moved" and change.significant
+
+
 def test_what_the_other_map_did_not_see_is_neither_taken_nor_added() -> None:
     seen, dark = map_of(STOCK), map_of(STOCK)
     dark.source[:] = 0

@@ -20,6 +20,8 @@ MAX_MOVE_M = 0.5
 SAME_WIDTH = 0.15
 SIGNIFICANT = 2.576
 """Sigmas that chance exceeds in one case of a hundred."""
+UNKNOWN_SIGMA_M, UNKNOWN_SIGMA_RAD = 0.05, 0.005
+"""Of a place and a yaw whose sigma isn't known: as a lift's count takes them."""
 MIN_KNOWN = 0.5
 _NO_PAIR = 1e6
 
@@ -135,7 +137,8 @@ def _change(before: Bundle, after: Bundle) -> Change:
         math.hypot(a.lateral_m, b.lateral_m), sigma_along,
         math.hypot(a.top_z_m, b.top_z_m), math.hypot(a.yaw_rad, b.yaw_rad),
     )  # fmt: skip
-    ratios = (_ratio(across, sigmas[0]), _ratio(along, sigmas[1]), _ratio(turned, sigmas[3]))
+    turn = _ratio(turned, sigmas[3], UNKNOWN_SIGMA_RAD)
+    ratios = (_ratio(across, sigmas[0]), _ratio(along, sigmas[1]), turn)
     lifted = _ratio(up, sigmas[2])
     kind: Kind = "same"
     if max(ratios) > SIGNIFICANT or (lifted > SIGNIFICANT and up > 0):
@@ -149,7 +152,9 @@ def _change(before: Bundle, after: Bundle) -> Change:
     )  # fmt: skip
 
 
-def _ratio(value: float, sigma: float) -> float:
+def _ratio(value: float, sigma: float, unknown: float = UNKNOWN_SIGMA_M) -> float:
+    """Compute how many sigmas a value is; a sigma that isn't known counts as `unknown`."""
+    sigma = unknown if math.isnan(sigma) else sigma
     return abs(value) / sigma if sigma > 0 else 0.0
 
 
