@@ -34,6 +34,8 @@ def test_the_example_is_assumed_where_no_file_is_given(tmp_path: Path) -> None:
         ("crane_capacity_kg = 12500.0", "crane_capacity_kg = 2000.0", "leaves nothing"),
         ("width_m = 0.1", "width_m = 0.0", "pole"),
         ("\nacross_m = 0.0", "\nacross_m = nan", "across_m"),
+        ("along_m = 0.7", "along_m = -0.7", "over each other"),
+        ("along_m = 0.7", "along_m = 0.1", "two poles, at along_m -0.7 and 0.1, lie over each other"),
         ("gap_m = [0.0, 0.002,", "gap_m = [0.0, 0.006,", "rise"),
         ("kilopascal = [800.0, 710.0", "kilopascal = [800.0, 810.0", "fall"),
         ("170.0, 70.0, 0.0]", "170.0, 0.0]", "same length"),

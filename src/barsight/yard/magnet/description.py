@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from importlib import resources
+from itertools import combinations
 from pathlib import Path
 from typing import Literal
 
@@ -37,6 +38,12 @@ class Pole:
         expect(min(self.length_m, self.width_m) >= 0.01, "a pole must be at least 10 mm long and wide")
         expect(max(self.length_m, self.width_m) <= 10, "a pole can't be longer than 10 m")
         expect(max(abs(self.along_m), abs(self.across_m)) <= 20, "a pole lies within 20 m of the centre")
+
+    def is_beside(self, other: Pole) -> bool:
+        """Check that another pole's face has no part of this one's: both would be counted to pull there."""
+        along = abs(self.along_m - other.along_m) - (self.length_m + other.length_m) / 2
+        across = abs(self.across_m - other.across_m) - (self.width_m + other.width_m) / 2
+        return max(along, across) > -1e-6
 
 
 @dataclass(frozen=True)
@@ -146,6 +153,9 @@ class Magnet:
     def __post_init__(self) -> None:
         expect_values(self)
         expect(len(self.poles) >= 1, "there must be at least one pole")
+        for one, other in combinations(self.poles, 2):
+            apart = one.is_beside(other)
+            expect(apart, f"two poles, at along_m {one.along_m:g} and {other.along_m:g}, lie over each other")
         expect(min(self.own_mass_kg, self.capacity_kg) > 0, "own_mass_kg and capacity_kg must be over 0")
         expect(
             self.crane_capacity_kg > self.own_mass_kg,
