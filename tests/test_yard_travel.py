@@ -73,6 +73,13 @@ def test_place_and_height_must_be_as_sure_as_the_magnet_needs_there() -> None:
     assert f"knows height to {1e3 * 1.645 * 0.03:.0f} mm (95 %), 8 mm are allowed" in said[2]
 
 
+def test_a_pass_that_is_unsure_is_not_outvoted_by_surer_ones() -> None:
+    sure, unsure = travel(), travel(sigma_m=0.03)
+    later = [replace(one, stamp_ns=one.stamp_ns + k * 10**12) for k, one in enumerate((sure, sure, unsure))]
+    assert reasons(Travel.joined(later[:2]), HERE) == []
+    assert any("knows x" in s for s in reasons(Travel.joined(later), HERE))
+
+
 def test_a_lift_under_refused_frames_is_forbidden_and_one_beside_them_is_not() -> None:
     one = travel(refused=tuple(range(13, 21)))
     assert reasons(one, HERE) == []

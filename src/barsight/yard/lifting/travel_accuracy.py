@@ -181,7 +181,7 @@ def travel_checks(travel: Travel, place: Placement, magnet: Magnet, settings: Li
     reason = f"no frame was placed within {travel.reach_m:.1f} m of it"
     checks = [check_true(CODE, "frames were placed near it", bool(near.any()), reason)]
     if near.any():
-        checks += _sure_enough(np.median(travel.sigma_m[near], axis=0), magnet)
+        checks += _sure_enough(_near_sigma(travel, near), magnet)
         refused = int((np.linalg.norm(travel.refused_m - here, axis=1) < travel.reach_m).sum())
         seen = refused + int(near.sum())
         reason = (
@@ -191,6 +191,15 @@ def travel_checks(travel: Travel, place: Placement, magnet: Magnet, settings: Li
         what = "refused part of the frames that see it"
         checks.append(check_max(CODE, what, refused / seen, settings.max_refused_ratio, "", reason))
     return [*checks, *_encoder_checks(travel, place, min(magnet.tolerance.x_m, magnet.tolerance.y_m))]
+
+
+def _near_sigma(travel: Travel, near: Bool) -> Float64:
+    """Take the median sigma (3,) of the frames near a place; of several passes the worst one's counts, as any
+    of them may have made the heights there.
+    """
+    passes = travel.pass_number if len(travel.pass_number) else np.ones(len(near), np.int64)
+    medians = [np.median(travel.sigma_m[near & (passes == one)], axis=0) for one in np.unique(passes[near])]
+    return np.asarray(np.max(medians, axis=0))
 
 
 def _encoder_checks(travel: Travel, place: Placement, max_m: float) -> list[Check]:
@@ -270,7 +279,7 @@ def target_covariance(
     found += yaw**2 * np.outer(turn, turn)
     if travel is not None:
         near = np.linalg.norm(travel.place_m - (place.x_m, place.y_m), axis=1) < travel.reach_m
-        shared = np.median(travel.sigma_m[near], axis=0) if near.any() else np.full(3, np.nan)
+        shared = _near_sigma(travel, near) if near.any() else np.full(3, np.nan)
         found[:3, :3] += np.diag(shared**2)
     if offset is not None:
         found[:3, :3] += np.diag(np.square(offset.sigma_m))
