@@ -167,6 +167,18 @@ def test_nothing_is_put_down_in_a_no_lift_area() -> None:
             assert not reaches_area(middle, yaw_rad, (LOAD.width_m, LOAD.length_m), area)
 
 
+def test_a_magnet_that_holds_a_load_off_its_middle_keeps_out_of_a_no_lift_area_too() -> None:
+    """The load is 4 m long, the beam 5.4 m, which may hang 0.3 m further along."""
+    load = Load.of((record(laid(0.3, length_m=4.0)),))
+    heights = map_of([laid(0.3, length_m=4.0)], x_m=(-0.5, 3.0), y_m=(-6.0, 6.0))
+    heights.source[np.abs(heights.y_m) > 3.2] = HeightSource.UNKNOWN
+    heights = replace(heights, free_m=np.zeros(heights.shape, np.float32))
+    for from_y_m in (2.6, 2.95, 4.5):
+        settings = LiftSettings(no_lift_areas=((-9.0, from_y_m, 9.0, 9.0), (-9.0, -9.0, 9.0, -from_y_m)))
+        place = find_set_down(sound_ground(Ground.of(heights), (), (), settings), load, MAGNET, settings)
+        assert (place is None) == (from_y_m < 4), from_y_m
+
+
 def test_the_place_is_the_bundles_own_kind_of_place() -> None:
     heights = yard()
     place = find_set_down(Ground.of(heights), LOAD, MAGNET, SETTINGS)

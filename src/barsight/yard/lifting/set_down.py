@@ -12,9 +12,9 @@ import numpy as np
 from barsight.core.arrays import Float64
 from barsight.yard.events import YardEvent
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.bearing import HOLE_DEPTH_M, MAX_RISE_M, Bearing, find_bearing
+from barsight.yard.lifting.bearing import HOLE_DEPTH_M, MAX_RISE_M, Bearing, find_bearing, magnet_reach
 from barsight.yard.lifting.ground import Ground
-from barsight.yard.lifting.load import Load, axes_of, reached_areas
+from barsight.yard.lifting.load import Load, reached_areas
 from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.lifting.validity import old_cells
 from barsight.yard.magnet.description import Magnet
@@ -75,11 +75,10 @@ def find_set_down(ground: Ground, load: Load, magnet: Magnet, settings: LiftSett
 def _reaches_area(
     load: Load, x_m: float, y_m: float, yaw_rad: float, magnet: Magnet, settings: LiftSettings
 ) -> bool:
-    """Check whether a load put down, or the magnet over its centre of mass, may reach a no-lift area."""
-    middle = np.array([x_m, y_m])
-    over = middle + np.array([load.off_across_m, load.off_along_m]) @ axes_of(yaw_rad)
-    outlines = (middle, (load.width_m, load.length_m)), (over, magnet.size_m)
-    return any(reached_areas(at, yaw_rad, size, magnet.tolerance, settings) for at, size in outlines)
+    """Check whether a load put down, or the magnet wherever it may hold it, may reach a no-lift area."""
+    middle, (wide, long) = np.array([x_m, y_m]), 2 * magnet_reach(load, magnet)
+    sizes = (load.width_m, load.length_m), (float(wide), float(long))
+    return any(reached_areas(middle, yaw_rad, size, magnet.tolerance, settings) for size in sizes)
 
 
 def sound_ground(
