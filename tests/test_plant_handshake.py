@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, Phase, settings
@@ -21,7 +22,9 @@ from barsight.plant.handshake import LiftClaim
 from barsight.plant.settings import LiveSource
 from barsight.plant.state import PlantState
 from barsight.plant.steps import LiftReport, LiftSteps
+from barsight.store.audit import Entry
 from barsight.store.confirmation import begin_lift, confirm_lift, open_lifts
+from barsight.store.lift_records import add_lifts
 from handshake_plant import Plant, make_template
 
 CRANES = integers(0, 1)
@@ -242,6 +245,31 @@ def test_a_place_that_a_load_was_put_on_is_told_to_no_other_lift(
     plant.steps.executing(claim.token)
     assert plant.steps.executed(claim.token, DID) == "unweighed"
     assert ranks_offered(plant) == [2, 3, 5, 6]
+
+
+def test_poles_beside_the_beam_end_the_lifts_that_they_come_near(
+    plant: Plant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Lift 2 is 2.5 m beside lift 1: the beams are 1 m wide, the poles reach 1.05 m to either side."""
+    plain = plant._lift
+    near = plain(1, 0.0)["target"] | {"x_m": 11.5}  # type: ignore[operator]
+    monkeypatch.setattr(
+        plant, "_lift", lambda rank, _: plain(rank, 0.0) | ({"target": near} if rank == 2 else {})
+    )
+    poles = [{"along_m": 0.0, "across_m": side, "length_m": 0.1, "width_m": 0.1} for side in (-1.0, 1.0)]
+
+    def add(
+        opened: Entry, survey_id: int, content: dict[str, Any], *ids: dict[int, int], **more: bool
+    ) -> None:
+        content["magnet"]["poles"] = poles
+        add_lifts(opened, survey_id, content, *ids, **more)
+
+    monkeypatch.setattr("handshake_plant.add_lifts", add)
+    plant.survey()
+    claim = claimed(plant)
+    plant.steps.executing(claim.token)
+    assert plant.steps.executed(claim.token, DID) == "unweighed"
+    assert ranks_offered(plant) == [3, 4, 5, 6]
 
 
 def ranks_offered(plant: Plant) -> list[int]:

@@ -35,7 +35,7 @@ def add_lifts(
     for lift in content["lifts"] if is_newest else ():
         record = {key: value for key, value in lift.items() if key not in ("poles", "checks")}
         record |= {
-            "beam": (content.get("magnet") or {}).get("beam"),
+            "beam": _outline(content.get("magnet") or {}),
             "disturbed_reach_m": content["settings"]["disturbed_reach_m"],
             "begins_fetch": None if fetch is None else lift["bundles"] == [fetch["steps"][0]["bundle"]],
         }
@@ -45,6 +45,18 @@ def add_lifts(
         for number in lift["bundles"]:
             opened.add(LIFT_BUNDLES, lift_id=lift_id, bundle_id=ids[number])
         step_lift(opened, lift_id, "offered")
+
+
+def _outline(magnet: dict[str, Any]) -> dict[str, float] | None:
+    """Return width and length of beam and poles together, as `Magnet.size_m`; None where no beam is known."""
+    beam, poles = magnet.get("beam"), magnet.get("poles") or ()
+    if beam is None:
+        return None
+    sizes = (("width_m", "across_m"), ("length_m", "along_m"))
+    return {
+        size: max([beam[size], *(2 * abs(pole[place]) + pole[size] for pole in poles)])
+        for size, place in sizes
+    }
 
 
 def settle_lifts(opened: Entry, told: dict[int, str], seen_from_ns: int, *, is_newest: bool) -> None:
