@@ -35,6 +35,21 @@ def bundles() -> tuple[Bundle, ...]:
     return find_bundles(draw(list(LAID)), BundleSettings())
 
 
+def test_a_bundle_that_lies_across_the_listed_one_contradicts_it(bundles: tuple[Bundle, ...]) -> None:
+    """Yaw is an axis's: 180 deg is none."""
+    for yaw_deg, turned in (
+        (None, False),
+        (2.0, False),
+        (-179.0, False),
+        (181.0, False),
+        (20.0, True),
+        (90.0, True),
+    ):
+        one = ListedBundle("B0", LAID[0].x_m, LAID[0].y_m, yaw_deg=yaw_deg)
+        told = contradicted_bundles(match_stock((one,), bundles))
+        assert ("turned by" in told.get(0, "")) is turned, yaw_deg
+
+
 def test_a_list_that_fits_has_nothing_missing_moved_or_extra(bundles: tuple[Bundle, ...]) -> None:
     listed = tuple(
         ListedBundle(f"B{k}", one.x_m, one.y_m, one.top_z_m, bars=7, width_m=one.width_m)

@@ -15,6 +15,7 @@ from scipy.optimize import linear_sum_assignment
 from barsight.core.arrays import Float64
 from barsight.core.errors import InputError
 from barsight.core.reading.bounded_reading import MAX_ENTRIES, read_json, read_lines
+from barsight.yard.stability.stability import turn_between
 from barsight.yard.types import Bundle
 
 _NEEDED = ("name", "x_m", "y_m")
@@ -26,6 +27,7 @@ MAX_LISTED = 10_000
 """Each is compared with each bundle of the map."""
 _REACH_M = 1.0
 _MOVED_M = 0.05
+_TURNED_DEG = 5.0
 _SIGMAS = 3.0
 
 
@@ -266,6 +268,11 @@ def _disagreements(one: ListedBundle, bundle: Bundle) -> tuple[str, ...]:
             continue
         if abs(found - listed) > max(_SIGMAS * spread, 0.1 * listed):
             out.append(f"{name} {1e3 * found:.0f} mm instead of {1e3 * listed:.0f} mm")
+    if one.yaw_deg is not None:
+        listed_rad = np.radians(one.yaw_deg)
+        turn_deg = abs(np.degrees(turn_between(listed_rad, bundle.yaw_rad)))
+        if not turn_deg <= max(_SIGMAS * np.degrees(np.nan_to_num(sigma.yaw_rad)), _TURNED_DEG):
+            out.append(f"it lies turned by {turn_deg:.0f} deg")
     if one.bars is not None and bundle.bars not in (None, one.bars):
         out.append(f"{bundle.bars} bars instead of {one.bars}")
     return tuple(out)
