@@ -169,7 +169,7 @@ def test_a_lift_is_not_offered_after_an_event_beside_it(tmp_path: Path) -> None:
 
 
 def test_a_lift_is_not_offered_after_an_event_where_its_load_would_be_put(tmp_path: Path) -> None:
-    """What happened since is over a metre from load and magnet where they lie, and nearer to the set-down."""
+    """The event is over a metre from load and magnet where they lie, and nearer to the set-down."""
     folder = write_folder(tmp_path / "out", more=(laid(2.8),))
     assert lifts(folder) == 0
     yard = bs.load(folder)

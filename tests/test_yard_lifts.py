@@ -520,7 +520,7 @@ def test_a_lift_is_as_old_as_the_oldest_part_that_it_depends_on(old: str, age_s:
 
 @pytest.mark.parametrize("turned", [False, True])
 def test_a_beam_that_is_longer_than_its_poles_and_wider_poles_count_whole(turned: bool) -> None:
-    """What was last seen 500 s ago, or moved since, lies under what stands out of the other one."""
+    """A place last seen 500 s ago, or an event since, lies under what stands out of the other one."""
     stock = [laid(0.3)]
     heights = bare(map_of(stock, x_m=(-3.0, 3.0), y_m=(-6.0, 6.0)))
     x, y = np.meshgrid(heights.x_m, heights.y_m)

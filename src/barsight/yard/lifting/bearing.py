@@ -65,8 +65,8 @@ class Surroundings:
     """Heights (V, U) about a place on a grid along (v_m) and across (u_m) the load.
 
     z_m: medians over 50 mm squares, which wrong matches don't move. thin_m: over 30 mm, for what is thin.
-    Both have the highest nearby where a few cells were not seen; unseen: those cells and all others. most_m:
-    the most that lines of sight allow there, inf where none passed.
+    Both have the highest nearby where a few cells were not seen; unseen: those cells and all others. free_m:
+    upper bound by lines of sight of what may stand there, inf where none passed.
     """
 
     v_m: Float64
@@ -74,7 +74,7 @@ class Surroundings:
     z_m: Float32
     thin_m: Float32
     unseen: Bool
-    most_m: Float32
+    free_m: Float32
 
 
 def find_bearing(
@@ -136,8 +136,8 @@ def _surroundings(
         np.where(inside, cv2.medianBlur(filled, side)[row, column], nearby[row, column]) for side in (5, 3)
     )
     free = np.full(part.shape, np.inf, np.float32) if part.free_m is None else part.free_m
-    most = np.where(inside, free[row, column], np.float32(np.inf)).astype(np.float32)
-    return Surroundings(v, u, z, thin, ~(inside & seen[row, column]), most)
+    free = np.where(inside, free[row, column], np.float32(np.inf)).astype(np.float32)
+    return Surroundings(v, u, z, thin, ~(inside & seen[row, column]), free)
 
 
 def magnet_reach(load: Load, magnet: Magnet) -> Float64:
@@ -215,7 +215,7 @@ def _stands_in_the_way(
         (magnet.beam.width_m, magnet.beam.length_m, top + magnet.beam.above_faces_m / 2),
     ):
         under = (beside <= width / 2 + aside[0]) & (beyond <= length / 2 + aside[1])
-        if (under & np.where(hidden, ~(around.most_m <= height), z > height)).any():
+        if (under & np.where(hidden, ~(around.free_m <= height), z > height)).any():
             return True
     return False
 
