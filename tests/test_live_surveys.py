@@ -5,6 +5,7 @@ import signal
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from barsight.live.crane import run as crane_run
 from barsight.live.crane.run import _drop_standing, _keep, replay_surveys
 from barsight.live.drift import DAY_NS, HEAD, NAMES, drift_figures, note_drift
 from barsight.live.link import Link, LiveInput
-from barsight.live.run import _stopped_by_signals
+from barsight.live.run import _stopped_by_signals, ended_afterwards
 from barsight.live.settings import LiveSettings, SurveySettings
 from barsight.live.shared.counters import Counters
 from barsight.live.supervisor import Supervisor
@@ -114,6 +115,29 @@ def test_an_interruption_counts_though_the_survey_was_ending(ended: str, whole: 
         assert supervisor.stop_because == INTERRUPTED
     finally:
         board.remove()
+
+
+def test_the_first_signal_waits_until_a_survey_is_measured(tmp_path: Path) -> None:
+    """So that `systemctl stop` loses none; the second one ends the measuring too."""
+
+    def end(number: int, _: object) -> None:
+        raise KeyboardInterrupt(number)
+
+    run = SimpleNamespace(stop_because="told to end the survey")
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        with ended_afterwards(run):  # type: ignore[arg-type]
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(0.01)
+            assert run.stop_because == INTERRUPTED
+            with pytest.raises(KeyboardInterrupt):
+                os.kill(os.getpid(), signal.SIGTERM)
+                time.sleep(0.01)
+        with pytest.raises(KeyboardInterrupt), ended_afterwards(run):  # type: ignore[arg-type]
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(0.01)
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def test_the_oldest_surveys_go_but_for_protected_ones(tmp_path: Path) -> None:

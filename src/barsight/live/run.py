@@ -130,7 +130,8 @@ class LiveRun:
                 self._tell_all(f"ends early: {supervisor.stop_because}; what was kept is measured")
             if given is not None:
                 supervisor.state.mode = given.mode
-            return _finish(supervisor, link, board, self._recording, self._asked, request, advance)
+            with ended_afterwards(self):
+                return _finish(supervisor, link, board, self._recording, self._asked, request, advance)
         finally:
             if supervisor is not None:
                 supervisor.end_map(at_once=True)
@@ -213,6 +214,21 @@ def _stopped_by_signals(supervisor: Supervisor) -> contextlib.AbstractContextMan
     """
     told = {signal.SIGINT: INTERRUPTED, signal.SIGTERM: INTERRUPTED, signal.SIGUSR1: "told to end the survey"}
     return handled_signals(told, supervisor.stop)
+
+
+@contextlib.contextmanager
+def ended_afterwards(run: LiveRun) -> Iterator[None]:
+    """Let the first Ctrl-C or SIGTERM of a run wait until what was kept is measured; the next one doesn't."""
+
+    def note(because: str) -> None:
+        run.stop_because = because
+        handled.close()
+
+    with contextlib.ExitStack() as handled:
+        if run.stop_because != INTERRUPTED:
+            both = {signal.SIGINT: INTERRUPTED, signal.SIGTERM: INTERRUPTED}
+            handled.enter_context(handled_signals(both, note))
+        yield
 
 
 @contextlib.contextmanager
