@@ -15,7 +15,7 @@ from barsight.artefacts.plan import AcceptancePlan, plan_text
 from barsight.calibration.files.rig_file import write_rig_file
 from barsight.cli.acceptance.commission import guided_steps
 from barsight.cli.main import run
-from barsight.core.errors import ConfigError, InputError, MeasurementError
+from barsight.core.errors import ConfigError, InputError, MeasurementError, OutputError
 from barsight.motion.rig_check.self_calibration import turn_right_camera
 from barsight.recording.open import open_recording
 
@@ -35,6 +35,12 @@ def steps(folder: Path, log: list[str]) -> tuple[GuidedStep, ...]:
         GuidedStep("first", ("a",), ("b",), "bring a", make("b", "a")),
         GuidedStep("second", ("b", "c"), ("d",), "bring c", make("d", "b", "c")),
     )
+
+
+def test_a_folder_that_cannot_be_made_is_an_output_error(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="a part of the path is a file"):
+        begin(tmp_path / "file" / "crane")
 
 
 def test_each_step_is_done_once_and_again_after_a_change(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from barsight.acceptance.certificate import CommissioningStep
 from barsight.core.errors import ConfigError, InputError
-from barsight.core.files import atomic_path
+from barsight.core.files import atomic_path, translated_os_errors
 from barsight.core.json_values import json_digest, json_value
 from barsight.core.reading.json_schema import expect_schema, list_schema, record_schema
 from barsight.core.reading.sealed_json import read_sealed, write_sealed
@@ -100,7 +100,8 @@ def begin(folder: Path) -> CommissionSettings:
     if not path.exists():
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise InputError(folder, f"holds no {SETTINGS}", REMEDY)
-        folder.mkdir(parents=True, exist_ok=True)
+        with translated_os_errors(folder):
+            folder.mkdir(parents=True, exist_ok=True)
         with atomic_path(path) as made:
             made.write_text(FIRST_SETTINGS, encoding="utf-8")
     return read_settings(path, CommissionSettings, HELP, "folder")
