@@ -322,6 +322,8 @@ def test_the_commands_from_an_empty_folder_to_a_tampered_store(
     assert {(one["identity"], one["what"]) for one in changes} == {("B1", "came"), ("B2", "came")}
     assert run(["yard", "--since", "2001-01-01T00:00:00Z"]) == 0
     assert "came" in capsys.readouterr().out
+    assert run(["yard", "--since", "2001-01-02T00:00:00Z", "--at", "2001-01-01T00:00:00Z"]) == 2
+    assert "name an earlier time" in capsys.readouterr().err
     assert run(["store", "verify"]) == 0
     assert "1 rows of the audit log hold" in capsys.readouterr().out
     with open_store("sqlite:///barsight.db") as store:

@@ -15,6 +15,7 @@ from rich.table import Table
 
 from barsight.cli.arguments import call
 from barsight.cli.safe_console import SafeConsole
+from barsight.core.errors import ConfigError
 from barsight.core.files import atomic_path
 from barsight.core.json_values import json_value
 from barsight.core.stamps import NS_PER_S
@@ -54,6 +55,8 @@ def run(arguments: Sequence[str]) -> None:
         now_ns = time.time_ns() if at_ns is None else at_ns
         if since is not None:
             since_ns = parse_time(since)
+            if since_ns > now_ns:
+                raise ConfigError(f"--since {since} is later than {time_text(now_ns)}; name an earlier time")
             with open_store(url) as store, store.reading() as connection:
                 changes = yard_changes(connection, since_ns, now_ns)
             if json:
