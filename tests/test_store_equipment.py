@@ -128,8 +128,9 @@ def test_lifts_that_look_back_or_are_ahead_of_the_clock_are_not_offered(
 
 
 def test_a_recording_is_kept_with_its_reason(
-    store_url: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    store_url: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
     recording = tmp_path / "recording"
     recording.mkdir()
     told = {"path": str(recording), "format": "euroc"}
@@ -145,7 +146,9 @@ def test_a_recording_is_kept_with_its_reason(
     assert run(["store", "list", store_url]) == 0
     said = capsys.readouterr().out
     assert "kept" in said and "slipped" in said and "never approved" in said and "north" in said
-    assert run(["store", "keep", store_url, str(recording), "looked at", "--release"]) == 0
+    assert "…" not in said and one.surveys[0] in said
+    monkeypatch.chdir(tmp_path)
+    assert run(["store", "keep", store_url, "recording", "looked at", "--release"]) == 0
     assert not (recording / PROTECTED).exists()
     assert run(["store", "keep", store_url, "nowhere", "why"]) == 2
     assert "is no recording that the store knows" in capsys.readouterr().err

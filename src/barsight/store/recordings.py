@@ -132,7 +132,7 @@ def list_recordings(connection: Connection) -> tuple[KnownRecording, ...]:
 
 def _find(connection: Connection, name: str) -> tuple[int, str]:
     rows = connection.execute(select(RECORDINGS).order_by(RECORDINGS.c.id)).all()
-    found = [row for row in rows if row.key == name] or [
+    found = [row for row in rows if row.key in (name, str(Path(name).resolve()))] or [
         row for row in rows if len(name) >= 4 and row.digest.startswith(name)
     ]
     if len(found) != 1:

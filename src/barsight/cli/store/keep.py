@@ -25,7 +25,7 @@ def run(arguments: Sequence[str]) -> None:
 
         Args:
             url: SQLAlchemy's URL of the database.
-            recording: Its path as `store list` tells it, or the beginning of its SHA-256.
+            recording: Its path, or the beginning of its SHA-256; `store list` tells both.
             why: The reason.
             release: Take the protection back, for this reason.
             by: Who says so, for the audit log; the name of the user if not given.

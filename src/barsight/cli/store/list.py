@@ -75,10 +75,10 @@ def _calibration_table(calibrations: tuple[KnownCalibration, ...], clock_ns: int
 def _recording_table(recordings: tuple[KnownRecording, ...]) -> Table:
     table = Table(title="Recordings", box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     for head in ("recording", "SHA-256", "rig", "state", "why kept, or since", "surveys"):
-        table.add_column(head, no_wrap=head in ("SHA-256", "rig", "state"))
+        table.add_column(head, no_wrap=head in ("SHA-256", "rig", "state", "surveys"), overflow="fold")
     for one in recordings:
         why = one.note if one.state == "kept" and one.note else time_text(one.at_ns)
-        table.add_row(one.key, one.digest[:12], one.rig, one.state, why, ", ".join(one.surveys))
+        table.add_row(one.key, one.digest[:12], one.rig, one.state, why, "\n".join(one.surveys))
     return table
 
 
