@@ -398,6 +398,9 @@ def test_a_stale_offer_cannot_be_confirmed(browser: object, address: str) -> Non
     page.wait_for_selector("#told >> text=expired")
     lifts = page.evaluate("fetch('/api/lifts').then((answer) => answer.json())")["lifts"]
     assert {one["state"] for one in lifts} == {"expired"}
+    page.keyboard.press("Escape")
+    sheet.open("bundle")
+    assert "the offer has ended" in page.inner_text("#screen tbody")
 
 
 def test_a_server_that_ends_and_comes_back(browser: object, url: str) -> None:

@@ -2,7 +2,7 @@
 import { OPEN_LIFTS, ask, h, known, metres, row, show, t, table, tell, timeText, ageText } from "./dom.js";
 import { change, get, logOut, may, read, session } from "./api.js";
 import { clockNow, figures, liftButtons, liftPanel } from "./yard.js";
-import { vetoText, whyNot } from "./why.js";
+import { shortWhys, vetoText, whyNot } from "./why.js";
 
 const act = (method, path, body, word) => change(method, path, body).then((given) => { tell(t(word)); return given; }, (error) => { tell(error.message); return null; });
 
@@ -13,7 +13,7 @@ export async function bundleScreen(place, name) {
       h("td", {}, h("a", { href: `#bundle/${one.identity}`, id: `see-${one.identity}` }, one.identity)), h("td", {}, one.stock_name || "–"),
       one.axis_centre_m[0].toFixed(2), one.axis_centre_m[1].toFixed(2), one.top_z_m.toFixed(2), `${one.length_m.toFixed(2)}${one.ends_open.some(Boolean) ? "+" : ""}`,
       ageText(clockNow(state) - one.seen_ns),
-      h("td", {}, one.lift ? t(`lift.${one.lift.state}`) : one.doubt ? vetoText(`doubt-${one.doubt.code}`) : one.vetoes.map((veto) => t(`short.${veto.code}`)).join(", ")),
+      h("td", {}, one.lift ? t(`lift.${one.lift.state}`) : one.doubt ? vetoText(`doubt-${one.doubt.code}`) : shortWhys(one)),
     ]));
     return show(place, h("section", {}, h("h1", {}, t("bundles")), table([t("bundle"), t("stock.name"), "#X m", "#Y m", `#${t("top")} m`, `#${t("length")} m`, `#${t("seen")}`, t("lift.or.why")], rows, t("bundles"))));
   }

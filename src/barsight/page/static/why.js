@@ -34,6 +34,9 @@ export function whyNot(bundle, mapVetoes) {
   return entries;
 }
 
+// Short words for the list of bundles: all reasons, each once.
+export const shortWhys = (bundle) => [...new Set(bundle.vetoes.map((veto) => t(`short.${veto.code}`)))].join(", ") || t("why.none");
+
 // Short words for the drawing: why it is not offered.
 export function shortWhy(bundle) {
   if (bundle.lift) return "";
