@@ -94,9 +94,11 @@ def test_without_a_magnet_nothing_is_offered(tmp_path: Path, capsys: pytest.Capt
     assert written["lifts"] == [] and written["vetoes"][0]["code"] == "no-magnet"
 
 
-def test_an_old_yard_can_be_looked_back_at(tmp_path: Path) -> None:
+def test_an_old_yard_can_be_looked_back_at(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_folder(tmp_path / "out", age_s=3e7)
     assert lifts(folder, "--at", "end") == 0
+    assert "not for a crane" in capsys.readouterr().err
+    assert "to look back: never for a crane" in (folder / "report.html").read_text()
     written = read_lifts(folder / "lifts.json")
     assert len(written["lifts"]) == 2
     assert written["judged_at_ns"] == written["captured_to_ns"] < time.time_ns() - 2e7 * NS_PER_S

@@ -223,7 +223,10 @@ def print_lifts(plan: LiftPlan, console: Console) -> None:
     for veto in plan.vetoes:
         console.print(f"[red]{veto.code}:[/red] {escape(veto.reason)}", highlight=False)
     if plan.offered:
-        table = Table(title="Lifts, safest first", box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+        title = "Lifts, safest first"
+        if plan.looks_back:
+            title += ", as of the recording's end: not for a crane"
+        table = Table(title=title, box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
         heads = (
             "rank", "bundle", "x m", "y m", "yaw deg", "kg", "pull/need", "± mm", "safety",
         )  # fmt: skip
@@ -242,7 +245,7 @@ def print_lifts(plan: LiftPlan, console: Console) -> None:
     else:
         what = "no bundle was found" if not plan.refused else f"all {len(plan.refused)} places are vetoed"
         console.print(f"no lift is offered: {what}", highlight=False)
-    reasons = Counter(veto.code for lift in plan.refused for veto in lift.vetoes)
+    reasons = Counter(code for lift in plan.refused for code in dict.fromkeys(v.code for v in lift.vetoes))
     if reasons:
         listed = ", ".join(f"{code} {count}" for code, count in reasons.most_common())
         console.print(f"refused: {len(plan.refused)} ({listed})", highlight=False)
