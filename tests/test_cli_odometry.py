@@ -48,6 +48,15 @@ def test_what_is_written(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     assert data["reference"] == "world" and "velocity_mps" not in data["frames"][0]
 
 
+def test_a_measured_folder_is_left_alone(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "result.json").touch()
+    assert run(["odometry", str(whole), "-o", str(tmp_path)]) == 4
+    assert "name another folder" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["result.json"]
+
+
 @pytest.fixture(scope="module")
 def development_yard(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return Path(shutil.copytree(data / "yard_dev", tmp_path_factory.mktemp("development") / "yard"))

@@ -15,7 +15,7 @@ from rich.markup import escape
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.cli.arguments import call
 from barsight.cli.safe_console import SafeConsole
-from barsight.core.errors import MeasurementError
+from barsight.core.errors import MeasurementError, OutputError
 from barsight.core.files import atomic_directory
 from barsight.core.records.trajectory import Trajectory
 from barsight.evaluation.board_poses import board_poses, gyro_only_rmse_deg
@@ -52,6 +52,8 @@ def run(arguments: Sequence[str]) -> None:
             reading: How to read the recording.
             settings: The estimate's settings.
         """
+        if out is not None and (out / "result.json").exists():
+            raise OutputError(f"{out}: holds what barsight measure wrote; name another folder")
         console = SafeConsole()
         source: Recording = open_recording(recording, reading)
         rectifier = Rectifier(source.rig)
