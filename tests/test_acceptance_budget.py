@@ -195,7 +195,7 @@ def test_a_frame_that_gives_the_attitude_alone_counts_about_the_body(monkeypatch
     ("arguments", "code", "reason"),
     [
         (["nowhere"], 3, "no such folder"),
-        (["nowhere", "-o", "budget.txt"], 4, "ends in .json"),
+        (["nowhere", "-o", "budget.txt"], 4, "end its name in .json"),
         (["nowhere", "--temperature-k", "-1"], 2, "must lie in 0...100"),
     ],
 )

@@ -153,7 +153,7 @@ def test_an_approval_begins_charts_anew(tmp_path: Path) -> None:
     [
         (["nowhere"], 3, "no such file"),
         (["nowhere", "--approve", "N. N."], 2, "go together"),
-        (["nowhere", "--record", "watch.txt"], 4, "ends in .json"),
+        (["nowhere", "--record", "watch.txt"], 4, "end its name in .json"),
         (["nowhere", "--plan", "plan.toml"], 3, "no such file"),
     ],
 )

@@ -89,7 +89,7 @@ def test_mistakes_are_said_in_one_line(
     recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "rig_imu.yaml"
-    assert "ends in .yaml" in refused(capsys, arguments(recorded, tmp_path / "rig.txt"))
+    assert "end its name in .yaml or .yml" in refused(capsys, arguments(recorded, tmp_path / "rig.txt"))
     assert "no such file" in refused(capsys, arguments(recorded, out, rig=tmp_path / "no.yaml"))
     assert "no such file" in refused(capsys, arguments(recorded, out, imu=tmp_path / "no.yaml"))
     other = arguments(recorded, out)

@@ -42,7 +42,7 @@ def test_without_encoders_the_rows_are_checked(data: Path, capsys: pytest.Captur
     ("arguments", "code", "reason"),
     [
         (["nowhere"], 3, "no such file"),
-        (["nowhere", "-o", "check.txt"], 4, "ends in .json"),
+        (["nowhere", "-o", "check.txt"], 4, "end its name in .json"),
         (["nowhere", "--range-m", "0"], 2, "must lie in 0.1...1000"),
         (["nowhere", "--frames", "0"], 2, "must be positive"),
         (["nowhere", "--max-depth-error-mm", "-1"], 2, "must be positive"),

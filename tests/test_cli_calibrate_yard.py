@@ -59,7 +59,7 @@ def test_other_mistakes(tmp_path: Path, data: Path, capsys: pytest.CaptureFixtur
     for arguments, code, reason in (
         (["no.csv", "-o", out], 3, "no such file"),
         (["no", "-o", out], 3, "no such file or folder"),
-        (["no.csv", "-o", str(tmp_path / "yard.txt")], 4, "ends in .yaml"),
+        (["no.csv", "-o", str(tmp_path / "yard.txt")], 4, "end its name in .yaml or .yml"),
         (["no.csv", "-o", out, "--sigma-m", "0"], 2, "give metres"),
         ([str(data / "kitti_odometry_a"), "-o", out], 5, "no crane encoders"),
         ([str(data / "yard_dev"), "-o", out], 5, "the roll about it can't be seen"),

@@ -20,7 +20,7 @@ LAST = ("lifts.json", "odometry.json", "report.html", "result.json")
 def expect_output(target: Path, *suffixes: str) -> None:
     """Raise `OutputError` early for a file that couldn't be written, or whose name ends otherwise."""
     if target.suffix not in suffixes:
-        raise OutputError(f"{target}: the name of this file ends in {suffixes[0]}")
+        raise OutputError(f"{target}: end its name in {' or '.join(suffixes)}")
     if not target.absolute().parent.is_dir():
         raise OutputError(f"{target}: there is no folder {target.parent}; make it or name another")
 
