@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +63,22 @@ def test_each_step_is_done_once_and_again_after_a_change(tmp_path: Path) -> None
     (tmp_path / "d").write_text("by hand")
     walk(tmp_path, steps(tmp_path, log))
     assert log[-1] == "d" and len(log) == 6 and (tmp_path / "d").read_text() == "other+other"
+
+
+def test_a_step_is_done_again_where_its_settings_change(tmp_path: Path) -> None:
+    log: list[str] = []
+    (tmp_path / "a").write_text("a")
+    for told in (
+        ("checkerboard:9x6:0.025", 7.0),
+        ("checkerboard:9x6:0.025", 7.0),
+        ("checkerboard:9x6:0.1", 7.0),
+    ):
+        walk(tmp_path, [replace(steps(tmp_path, log)[0], told=told)])
+    assert log == ["b", "b"]
+    before, after = (
+        guided_steps(tmp_path, CommissionSettings(board=f"checkerboard:9x6:{m}")) for m in (1, 2)
+    )
+    assert before[0].told != after[0].told
 
 
 def test_a_failing_step_leaves_those_before_it_done(tmp_path: Path) -> None:

@@ -69,7 +69,7 @@ class CommissionSettings:
 @dataclass(frozen=True)
 class GuidedStep:
     """A step: what it takes (files or folders in the folder), what it makes, what to bring where that isn't
-    there, and what does it, which returns its result in words.
+    there, and what does it, which returns its result in words. told: the settings that it follows.
     """
 
     name: str
@@ -77,11 +77,12 @@ class GuidedStep:
     makes: tuple[str, ...]
     bring: str
     do: Callable[[], str]
+    told: tuple[object, ...] = ()
 
 
 @dataclass(frozen=True)
 class DoneStep:
-    """A step that was done. given: digest of what it took, made: of what it made."""
+    """A step that was done. given: digest of what it took and was told, made: of what it made."""
 
     name: str
     result: str
@@ -110,8 +111,8 @@ def begin(folder: Path) -> CommissionSettings:
 def walk(folder: Path, steps: Sequence[GuidedStep]) -> tuple[tuple[DoneStep, ...], GuidedStep | None]:
     """Do every step that can be done, in order: those done, and the next one that waits for something.
 
-    A step is done again where what it took or made has changed since. Raises what a step raises; those
-    before it stay done.
+    A step is done again where what it took, was told or made has changed since. Raises what a step raises;
+    those before it stay done.
     """
     known = {one.name: one for one in read_done(folder)}
     done: list[DoneStep] = []
@@ -119,7 +120,7 @@ def walk(folder: Path, steps: Sequence[GuidedStep]) -> tuple[tuple[DoneStep, ...
         if not all((folder / name).exists() for name in step.takes):
             _write_done(folder, done)
             return tuple(done), step
-        given = _digest(folder, step.takes)
+        given = _digest(folder, step.takes, step.told)
         before = known.get(step.name)
         if before is None or (before.given, before.made) != (given, _digest(folder, step.makes)):
             _write_done(folder, done)
@@ -146,9 +147,11 @@ def _write_done(folder: Path, done: Sequence[DoneStep]) -> None:
     write_sealed(json_value(content), folder / RECORD)
 
 
-def _digest(folder: Path, names: Sequence[str]) -> str:
-    """Compute a digest of files and folders: contents up to 16 MiB, of larger ones and pictures the sizes."""
-    found = []
+def _digest(folder: Path, names: Sequence[str], told: Sequence[object] = ()) -> str:
+    """Compute a digest of files and folders, contents up to 16 MiB, of larger ones and pictures the sizes;
+    and of what was told.
+    """
+    found: list[object] = [json_value(one) for one in told]
     for name in names:
         path = folder / name
         for file in sorted(path.rglob("*")) if path.is_dir() else [path]:

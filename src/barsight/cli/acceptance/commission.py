@@ -64,7 +64,10 @@ def guided_steps(folder: Path, settings: CommissionSettings) -> tuple[GuidedStep
     way = _Way(folder, settings)
     rig = ("rig.yaml",)
     steps = [
-        GuidedStep("cameras", ("board",), rig, "pictures of the board into board/", way.cameras),
+        GuidedStep(
+            "cameras", ("board",), rig, "pictures of the board into board/", way.cameras,
+            (settings.board, settings.range_m),
+        ),
         GuidedStep(
             "travel", (*rig, "survey"), ("check.json",), "a recording of travel into survey/", way.travel
         ),
@@ -73,12 +76,13 @@ def guided_steps(folder: Path, settings: CommissionSettings) -> tuple[GuidedStep
         GuidedStep(
             "acceptance", ("plan.toml", "artefacts", *rig, *way.framed, *way.magnet), ("certificate.json",),
             "plan_drawn.toml with the measured values as plan.toml, recordings of the artefacts into "
-            "artefacts/, each in a folder of its own", way.acceptance,
+            "artefacts/, each in a folder of its own", way.acceptance, (settings.signer, settings.key),
         ),
     ]  # fmt: skip
     if settings.use_tags:
         bring = "the AprilTags that survey/ shows, as surveyed, as tags.csv"
-        steps.insert(2, GuidedStep("yard frame", ("tags.csv", *rig, "survey"), way.framed, bring, way.tags))
+        takes, told = ("tags.csv", *rig, "survey"), (settings.girder_y_m, settings.rails_x_m)
+        steps.insert(2, GuidedStep("yard frame", takes, way.framed, bring, way.tags, told))
     elif settings.use_targets:
         bring = "targets as surveyed and as measured in measured/, as targets.csv"
         steps.insert(3, GuidedStep("yard frame", ("targets.csv", "measured"), way.framed, bring, way.targets))
