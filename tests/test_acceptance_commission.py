@@ -81,6 +81,17 @@ def test_a_step_is_done_again_where_its_settings_change(tmp_path: Path) -> None:
     assert before[0].told != after[0].told
 
 
+def test_the_plan_names_the_yard_of_the_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[tuple[object, ...]] = []
+    monkeypatch.setattr("barsight.cli.acceptance.accept.make_plan", lambda *given: made.append(given))
+    for yard in ("north", ""):
+        step = next(
+            one for one in guided_steps(tmp_path, CommissionSettings(yard=yard)) if one.name == "plan"
+        )
+        step.do()
+    assert [given[-1] for given in made] == ["north", tmp_path.name]
+
+
 def test_a_failing_step_leaves_those_before_it_done(tmp_path: Path) -> None:
     log: list[str] = []
 

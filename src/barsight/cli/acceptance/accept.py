@@ -75,7 +75,9 @@ def run(arguments: Sequence[str]) -> None:
             keep: A new folder for what was measured of each recording.
         """
         if plan:
-            _make_plan(files, out)
+            if len(files) != 1:
+                raise ConfigError("accept --plan takes one folder that barsight measure wrote")
+            make_plan(files[0], out, files[0].name)
             return
         if len(files) < 2:
             raise ConfigError("accept needs PLAN.toml and at least one recording; --plan makes a plan")
@@ -151,14 +153,13 @@ def print_acceptance(found: Acceptance) -> None:
         console.print(f"cause: {one.words}, {one.value:+.3g} ± {one.sigma:.2g} {one.unit}", highlight=False)
 
 
-def _make_plan(files: tuple[Path, ...], out: Path) -> None:
-    if len(files) != 1:
-        raise ConfigError("accept --plan takes one folder that barsight measure wrote")
+def make_plan(measured: Path, out: Path, yard: str) -> None:
+    """Lay artefacts over the free floor of a measured yard, and write the plan."""
     expect_output(out, ".toml")
-    area: Area = measured_area(files[0])
-    made = lay_out(area, files[0].name, read_heights(files[0]))
+    area: Area = measured_area(measured)
+    made = lay_out(area, yard, read_heights(measured))
     if isinstance(made, Failed):
-        raise MeasurementError(f"{files[0]}: {made.reason}; clear more floor, or write the plan by hand")
+        raise MeasurementError(f"{measured}: {made.reason}; clear more floor, or write the plan by hand")
     with atomic_path(out) as path:
         path.write_text(plan_text(made), encoding="utf-8")
     SafeConsole(stderr=True).print_line(f"plan: {out}")

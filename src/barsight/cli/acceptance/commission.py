@@ -72,7 +72,7 @@ def guided_steps(folder: Path, settings: CommissionSettings) -> tuple[GuidedStep
             "travel", (*rig, "survey"), ("check.json",), "a recording of travel into survey/", way.travel
         ),
         GuidedStep("empty yard", (*rig, "survey", *way.placed), ("measured",), "", way.empty_yard),
-        GuidedStep("plan", ("measured",), ("plan_drawn.toml",), "", way.plan),
+        GuidedStep("plan", ("measured",), ("plan_drawn.toml",), "", way.plan, (settings.yard,)),
         GuidedStep(
             "acceptance", ("plan.toml", "artefacts", *rig, *way.framed, *way.magnet), ("certificate.json",),
             "plan_drawn.toml with the measured values as plan.toml, recordings of the artefacts into "
@@ -142,7 +142,8 @@ class _Way:
         return str(read_json(self.folder / "yard.json", REMEDY)["verdict"])
 
     def plan(self) -> str:
-        accept.run(["--plan", self._at("measured"), "-o", self._at("plan_drawn.toml")])
+        yard = self.settings.yard or self.folder.resolve().name
+        accept.make_plan(self.folder / "measured", self.folder / "plan_drawn.toml", yard)
         return "plan_drawn.toml: build the artefacts and have them measured"
 
     def acceptance(self) -> str:
