@@ -35,19 +35,21 @@ from barsight.fleet.ledger import HeldRecording, claim, held, publish, published
 from barsight.fleet.limits import LimitedRun, run_limited
 from barsight.fleet.objects import Objects, open_objects
 from barsight.fleet.planning import TaskChoice, estimate, plan_tasks
-from barsight.fleet.promoting import _fetch
+from barsight.fleet.promoting import _fetch, promote
 from barsight.fleet.records import note_plan, noted_keys
 from barsight.fleet.scratch import _machine, scratch_folder, scratch_root, sweep
 from barsight.fleet.task import run_task
-from barsight.fleet.versions import arguments, publish_version
+from barsight.fleet.versions import FleetTask, arguments, publish_version
 from barsight.fleet.window import RunWindow
 from barsight.measure_settings import MeasureSettings
 from barsight.store.audit import AuditChain, entry, verify_chain
+from barsight.store.history import present_yard
 from barsight.store.opening import open_store
 from barsight.store.promotion import counts, promoted_version
 from barsight.store.tables import FLEET_SURVEYS, PROMOTIONS, SURVEYS
 from barsight.yard.magnet.description import example_magnet
 from fleet_rounds import VERSION, make_archive, moto_server, no_progress, settings
+from page_yards import FIRST, SECOND, survey
 
 
 def test_a_key_tells_content_and_version_and_not_the_place(tmp_path: Path) -> None:
@@ -259,6 +261,18 @@ def test_a_promoted_version_hides_the_other_survey_of_its_recording(tmp_path: Pa
         assert seen() == ["live1", "live2"]
         with store.reading() as connection:
             assert promoted_version(connection) == "" and isinstance(verify_chain(connection), AuditChain)
+
+
+def test_promoted_surveys_share_the_names_of_their_bundles(tmp_path: Path) -> None:
+    results = open_objects(str(tmp_path / "r"), create=True)
+    tasks = [FleetTask(key * 32, key, (), VERSION, key, "archive") for key in "ab"]
+    for task, stock, age_s in zip(tasks, (FIRST, SECOND), (3600.0, 60.0), strict=True):
+        survey(tmp_path / "surveys" / task.key, stock, age_s, with_lifts=False)
+        results.write(f"results/{task.key}/result.json", b"{}")
+    with open_store(f"sqlite:///{tmp_path}/s.db", create=True) as store:
+        assert promote(store, results, VERSION, tasks, tmp_path / "surveys", "ann", no_progress) == 2
+        with store.reading() as connection:
+            assert len(present_yard(connection)) == len(SECOND)
 
 
 @pytest.mark.parametrize("now", [b"other", b"longer than it was", b""])

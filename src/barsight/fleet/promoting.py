@@ -65,7 +65,7 @@ def promote(
                 is_own = bool(is_others.is_own) if is_others else is_there is None
                 opened.add(FLEET_SURVEYS, version=version.name, map_id=map_id, is_own=is_own)
         # An archive is of one yard: rigs and mountings are calibrated anew over the years.
-        add_survey(store, survey, by, same_yard=True)
+        add_survey(store, survey, by, same_yard=True, version=version.name)
     _switch(store, version.name, by, f"promote fleet version {version.name}")
     return len(surveys)
 

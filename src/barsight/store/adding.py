@@ -94,13 +94,14 @@ class MeasuredSurvey:
 
 def add_survey(
     store: Store, read: MeasuredSurvey, who: str, *, same_yard: bool = False, rig: str | None = None,
-    crane: str | None = None,
+    crane: str | None = None, version: str | None = None,
 ) -> AddedSurvey:  # fmt: skip
     """Add a survey in one transaction; one that is there already changes nothing.
 
     An older survey is put into its place in time: its bundles are matched to those seen before it and to
     those seen first after it. same_yard: what places it in the yard may differ from the newest survey's.
-    rig, crane: names of what it was surveyed with, where not given those that its calibration is of.
+    rig, crane: names of what it was surveyed with, where not given those that its calibration is of. version:
+    of a fleet, whose surveys its bundles are matched to before that is promoted.
 
     Raises InputError where simulated and measured surveys would mix, or those of two yard frames.
     """
@@ -110,7 +111,7 @@ def add_survey(
             return AddedSurvey(read.identity.map_id, False, {}, {})
         if not same_yard:
             _expect_same_frame(opened.connection, read)
-        known, last = _known(opened.connection, read)
+        known, last = _known(opened.connection, read, version)
         matched = match_by_place(known, read.found, read.heights)
         partner = {j: i for i, j in matched.found.items()}
         before = {j: last[known[i].bundle_id] for j, i in partner.items() if known[i].bundle_id in last}
@@ -232,13 +233,15 @@ def _add_row(opened: Entry, read: MeasuredSurvey, heights: bytes) -> int:
     )  # fmt: skip
 
 
-def _known(connection: Connection, read: MeasuredSurvey) -> tuple[tuple[KnownBundle, ...], dict[int, Bundle]]:
+def _known(
+    connection: Connection, read: MeasuredSurvey, version: str | None
+) -> tuple[tuple[KnownBundle, ...], dict[int, Bundle]]:
     """Gather the bundles that lay in the yard before this survey or were first seen after it; and of the
     former, as seen last.
     """
-    before = newest_sightings(connection, read.to_ns)
-    after = next_sightings(connection, read.to_ns)
-    absences = newest_absences(connection, read.to_ns)
+    before = newest_sightings(connection, read.to_ns, version)
+    after = next_sightings(connection, read.to_ns, version)
+    absences = newest_absences(connection, read.to_ns, version)
     lifts = {each.bundle_id: each for each in executed_lifts(connection)}
     known, last = [], {}
     for number in sorted({*before, *after}):

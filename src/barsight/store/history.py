@@ -22,7 +22,7 @@ from barsight.yard.inventory.bundle_file import bundle_of
 from barsight.yard.types import Bundle
 
 with extra("store"):
-    from sqlalchemy import Connection, Row, Select, func, select, true
+    from sqlalchemy import Connection, Row, Select, and_, func, select, true
     from sqlalchemy.sql.elements import ColumnElement
 
 
@@ -119,21 +119,32 @@ def time_text(stamp_ns: int) -> str:
     return datetime.fromtimestamp(stamp_ns // NS_PER_S, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
-def newest_sightings(connection: Connection, until_ns: int | None) -> dict[int, BundleSighting]:
-    """Find each bundle's newest sighting up to a time (any time where None), by bundle."""
+def newest_sightings(
+    connection: Connection, until_ns: int | None, version: str | None = None
+) -> dict[int, BundleSighting]:
+    """Find each bundle's newest sighting up to a time (any time where None), by bundle. version: as if that
+    were promoted.
+    """
     condition = true() if until_ns is None else SURVEYS.c.captured_to_ns <= until_ns
-    return _sightings(connection, condition, is_newest=True)
+    return _sightings(connection, and_(condition, counts(version)), is_newest=True)
 
 
-def next_sightings(connection: Connection, after_ns: int) -> dict[int, BundleSighting]:
-    """Find each bundle's first sighting after a time, by bundle."""
-    return _sightings(connection, SURVEYS.c.captured_to_ns > after_ns, is_newest=False)
+def next_sightings(
+    connection: Connection, after_ns: int, version: str | None = None
+) -> dict[int, BundleSighting]:
+    """Find each bundle's first sighting after a time, by bundle. version: as if that were promoted."""
+    condition = and_(SURVEYS.c.captured_to_ns > after_ns, counts(version))
+    return _sightings(connection, condition, is_newest=False)
 
 
-def newest_absences(connection: Connection, until_ns: int | None) -> dict[int, Absence]:
-    """Find the newest survey up to a time that looked for a bundle and did not see it, by bundle."""
+def newest_absences(
+    connection: Connection, until_ns: int | None, version: str | None = None
+) -> dict[int, Absence]:
+    """Find the newest survey up to a time that looked for a bundle and did not see it, by bundle. version:
+    as if that were promoted.
+    """
     condition = true() if until_ns is None else SURVEYS.c.captured_to_ns <= until_ns
-    chosen = select(ABSENCES, SURVEYS.c.captured_to_ns).join(SURVEYS).where(condition, counts())
+    chosen = select(ABSENCES, SURVEYS.c.captured_to_ns).join(SURVEYS).where(condition, counts(version))
     rows = _first_of_each(connection, chosen, ABSENCES.c.bundle_id, is_newest=True)
     return {r.bundle_id: Absence(r.bundle_id, r.captured_to_ns, r.kind, r.reason) for r in rows}
 
@@ -197,9 +208,7 @@ def yard_records(present: tuple[PresentBundle, ...], now_ns: int) -> list[dict[s
 def _sightings(
     connection: Connection, condition: ColumnElement[bool], *, is_newest: bool
 ) -> dict[int, BundleSighting]:
-    chosen = (
-        select(SIGHTINGS, SURVEYS.c.map_id, SURVEYS.c.captured_to_ns).join(SURVEYS).where(condition, counts())
-    )
+    chosen = select(SIGHTINGS, SURVEYS.c.map_id, SURVEYS.c.captured_to_ns).join(SURVEYS).where(condition)
     rows = _first_of_each(connection, chosen, SIGHTINGS.c.bundle_id, is_newest=is_newest)
     return {
         r.bundle_id: BundleSighting(

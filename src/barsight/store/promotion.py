@@ -8,7 +8,7 @@ from barsight.core.extras import extra
 from barsight.store.tables import FLEET_SURVEYS, PROMOTIONS, SURVEYS
 
 with extra("store"):
-    from sqlalchemy import Connection, and_, exists, or_, select
+    from sqlalchemy import Connection, and_, exists, literal, or_, select
     from sqlalchemy.sql.elements import ColumnElement
 
 
@@ -19,13 +19,14 @@ def promoted_version(connection: Connection) -> str:
 
 
 @cache
-def counts() -> ColumnElement[bool]:
-    """Build the condition on SURVEYS that keeps those that count.
+def counts(version: str | None = None) -> ColumnElement[bool]:
+    """Build the condition on SURVEYS that keeps those that count, or would were `version` promoted.
 
     A survey that the store has for a version's sake counts while that version is promoted. Any other counts
     unless the promoted version has one of the same recording, told by its first and last frame's times.
     """
-    promoted = select(PROMOTIONS.c.version).order_by(PROMOTIONS.c.id.desc()).limit(1).scalar_subquery()
+    newest = select(PROMOTIONS.c.version).order_by(PROMOTIONS.c.id.desc()).limit(1).scalar_subquery()
+    promoted = newest if version is None else literal(version)
     own, chosen, other, twin = (
         FLEET_SURVEYS.alias("own"), FLEET_SURVEYS.alias("chosen"), FLEET_SURVEYS.alias("other"),
         SURVEYS.alias("twin"),
