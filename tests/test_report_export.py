@@ -73,7 +73,7 @@ def test_ply_and_tif_are_the_folders_own(folder: Path) -> None:
 def test_what_cant_be_exported(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"\.las \.laz"):
         export(folder, folder / "points.xyz")
-    with pytest.raises(InputError, match="no such file"):
+    with pytest.raises(InputError, match="no such file; name a folder"):
         export(folder / "nowhere", folder / "points.las")
     with pytest.raises(InputError, match="no such file"):
         export(folder, folder / "copy.tif")

@@ -34,10 +34,10 @@ def export(folder: Path, target: Path) -> int:
         frame_id = str(open_folder(folder, lifts=False, cloud=True)[0].get("frame_id") or "")
     kind = target.suffix.lower()
     copies = {".ply": "cloud.ply", ".tif": "height.tif", ".tiff": "height.tif"}
+    source = folder / copies.get(kind, "cloud.ply")
+    if kind in {*copies, *_WRITERS} and not source.is_file():
+        raise InputError(source, "no such file", "name a folder that `barsight measure` wrote")
     if kind in copies:
-        source = folder / copies[kind]
-        if not source.is_file():
-            raise InputError(source, "no such file", "name a folder that `barsight measure` wrote")
         with atomic_path(target) as path:
             shutil.copyfile(source, path)
         return 0
