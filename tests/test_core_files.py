@@ -85,6 +85,8 @@ def test_an_empty_folder_is_filled_a_full_one_kept(tmp_path: Path) -> None:
         (folder / "a").write_text("1")
     with pytest.raises(OutputError, match="exists and is not empty"), atomic_directory(tmp_path):
         pytest.fail("the block must not run")
+    with pytest.raises(OutputError, match="--overwrite"), atomic_directory(tmp_path, owned=("a",)):
+        pytest.fail("the block must not run")
     assert names(tmp_path) == ["a"]
 
 

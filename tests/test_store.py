@@ -324,6 +324,8 @@ def test_the_commands_from_an_empty_folder_to_a_tampered_store(
     assert "came" in capsys.readouterr().out
     assert run(["yard", "--since", "2001-01-02T00:00:00Z", "--at", "2001-01-01T00:00:00Z"]) == 2
     assert "name an earlier time" in capsys.readouterr().err
+    assert run(["yard", "--since", "2001-01-01T00:00:00Z", "--stock-list", "stock.csv"]) == 2
+    assert "leave --since out" in capsys.readouterr().err
     assert run(["store", "verify"]) == 0
     assert "1 rows of the audit log hold" in capsys.readouterr().out
     with open_store("sqlite:///barsight.db") as store:

@@ -84,7 +84,7 @@ def atomic_directory(target: Path, *, replace: bool = False, owned: tuple[str, .
     target = target.absolute()
     with translated_os_errors(target):
         if not replace:
-            expect_empty(target)
+            expect_empty(target, can_overwrite=bool(owned))
         elif target.exists() and not target.is_dir():
             raise OutputError(f"{target}: is a file; name a folder")
         made = [folder for folder in target.parents if not folder.exists()]
@@ -94,7 +94,7 @@ def atomic_directory(target: Path, *, replace: bool = False, owned: tuple[str, .
             yield staging
             if not replace:
                 # Another run may have written there in the meantime.
-                expect_empty(target)
+                expect_empty(target, can_overwrite=bool(owned))
             if target.is_dir():
                 _move_files(staging, target, owned)
             else:
@@ -249,12 +249,15 @@ def _is_temporary(name: object, target: Path) -> bool:
     return path.absolute().parent == target.parent and path.name.startswith(f".{target.name[:40]}.")
 
 
-def expect_empty(target: Path) -> None:
-    """Raise `OutputError` where `target` is a file or a folder that holds something."""
+def expect_empty(target: Path, *, can_overwrite: bool = False) -> None:
+    """Raise `OutputError` where `target` is a file or a folder that holds something; `can_overwrite`: who
+    writes can be told to.
+    """
     if target.exists() and not target.is_dir():
         raise OutputError(f"{target}: is a file; name a folder")
     if target.is_dir() and any(target.iterdir()):
-        raise OutputError(f"{target}: exists and is not empty; name another folder or remove it")
+        remedy = "or overwrite it (--overwrite)" if can_overwrite else "or remove it"
+        raise OutputError(f"{target}: exists and is not empty; name another folder {remedy}")
 
 
 def _replace(source: Path, target: Path) -> None:

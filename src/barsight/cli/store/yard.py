@@ -54,6 +54,8 @@ def run(arguments: Sequence[str]) -> None:
         at_ns = None if at is None else parse_time(at)
         now_ns = time.time_ns() if at_ns is None else at_ns
         if since is not None:
+            if stock_list is not None:
+                raise ConfigError("--stock-list writes the yard at one time; leave --since out")
             since_ns = parse_time(since)
             if since_ns > now_ns:
                 raise ConfigError(f"--since {since} is later than {time_text(now_ns)}; name an earlier time")
