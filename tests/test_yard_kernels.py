@@ -169,7 +169,7 @@ def test_a_fit_from_beside_comes_to_the_outline_that_was_drawn() -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_fit_of_noisy_heights_comes_to_rest(seed: int) -> None:
-    """Where the packing isn't quite the one that was drawn, undamped steps swing by millimetres for ever."""
+    """Undamped steps swing by millimetres for ever where the packing isn't quite the one that was drawn."""
     values = np.array([0.013, 0.0, 0.3, 0.0, 0.4, 0.09])
     heights = drawn_heights(values)
     noise = np.random.default_rng(seed).normal(0, 0.006, heights.z_m.shape[1]).astype(np.float32)

@@ -14,8 +14,8 @@ from barsight.core.pose import Pose, nearest_rotation, skew
 MIN_POINTS = 3
 MIN_WIDTH = 0.01
 """Points that stray less than this share of their length from a line leave the turn about it open."""
-ROUNDS = 3
-"""Gauss-Newton steps from the closed form."""
+ROUNDS, ROUNDING = 5, 1e-9
+"""Gauss-Newton steps from the closed form, and how far chi2 may rise by rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +132,7 @@ def _divided(values: Float64, spread: Float64) -> Float64:
 
 def _refined(source: Float64, target: Float64, pose: Pose, spread: Float64) -> Pose:
     """Refine a pose by least squares under the points' covariance S: it makes r^T S^-1 r least, r being the
-    residuals [Aitken 1936]. A step that doesn't, as a mistaken point may ask for, isn't taken.
+    residuals [Aitken 1936]. A step that makes it more, as a mistaken point may ask for, isn't taken.
     """
     off = target - pose.apply(source)
     for _ in range(ROUNDS):
@@ -146,7 +146,8 @@ def _refined(source: Float64, target: Float64, pose: Pose, spread: Float64) -> P
         shift = pose.translation + centre - turn @ centre + step[3:]
         trial = Pose(pose.target, pose.source, turn @ pose.rotation, shift)
         left = target - trial.apply(source)
-        if not (left * _divided(left, spread)).sum() < (off * _divided(off, spread)).sum():
+        after, before = ((one * _divided(one, spread)).sum() for one in (left, off))
+        if not after <= before * (1 + ROUNDING):
             break
         pose, off = trial, left
     return pose
