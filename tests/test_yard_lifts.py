@@ -202,6 +202,16 @@ def test_a_slope_along_the_bars_is_a_tilt() -> None:
     assert "tilt" in codes(found)
 
 
+@pytest.mark.parametrize(("sigma_m", "offered"), [(0.015, True), (0.02, False), (np.inf, False)])
+def test_heights_that_are_not_known_hold_no_face(sigma_m: float, offered: bool) -> None:
+    """Whatever the map shows: 1.645 sigma may be 30 mm."""
+    stock = [laid(0.3)]
+    heights = bare(map_of(stock))
+    heights = replace(heights, sigma_m=np.full_like(heights.sigma_m, sigma_m))
+    reasons = [veto.reason for veto in judged(stock, heights=heights).vetoes]
+    assert any("knows the height under the faces" in reason for reason in reasons) is not offered
+
+
 def test_a_pole_over_a_hollow_is_a_gap() -> None:
     stock = [laid(0.3)]
     heights = map_of(stock)

@@ -27,6 +27,8 @@ EDGE_M = 0.01
 """Outlines and heights of reach are blurred over this, so that no row of samples goes in or out at once."""
 UNKNOWN_SIGMA = 0.01
 """How well cells tell the part of a face that was seen."""
+MAX_HEIGHT_ERROR_M = 0.03
+"""At 95 %: a map that knows the faces' height worse says nothing of gaps. Drawn yards have 15 mm at most."""
 MAX_ASIDE_RATIO = 1 / 3
 """Of a face's width: so far beside its middle the faces may rest where the suspension's stop holds them."""
 SHOWN_BAR_M, MIN_SHOWN_RATIO = 0.08, 0.3
@@ -153,6 +155,11 @@ def face_checks(
             1e3 * gap if math.isfinite(gap) else math.nan, 1e3 * limits.gap_m, "mm",
             f"a pole hangs {1e3 * gap:.0f} mm above the steel, {1e3 * limits.gap_m:.0f} mm are allowed"
             if math.isfinite(gap) else "under one of the poles no steel is known", sigma=1e3 * sigma,
+        ),
+        check_max(
+            "gap", "how well the map knows the faces' height (95 %)", 1e3 * UPPER * contact.sigma_m,
+            1e3 * MAX_HEIGHT_ERROR_M, "mm", "the map knows the height under the faces to "
+            f"{1e3 * UPPER * contact.sigma_m:.0f} mm (95 %), {1e3 * MAX_HEIGHT_ERROR_M:.0f} mm are allowed",
         ),
         check_min(
             "gap", "part of the faces that lies on steel", high, limits.contact_share, "",
