@@ -84,7 +84,7 @@ def test_the_offered_lift_that_begins_an_order_is_put_where_the_order_has_it() -
     plan = plan_lifts(heights, bundles, MAGNET, SETTINGS, ())
     order = order_lifts(1, heights, bundles, plan)
     assert isinstance(order, LiftOrder)
-    (lift,) = begin_order(order, plan, bundles).offered
+    (lift,) = begin_order(order, plan, bundles, heights).offered
     assert lift.bundles == (5,) and lift.set_down == order.steps[0].set_down
     assert lift.magnet_down is not None
     away = np.array([lift.magnet_down.x_m - lift.place.x_m, lift.magnet_down.y_m - lift.place.y_m])
@@ -211,3 +211,17 @@ def test_nothing_is_set_down_or_carried_over_where_nobody_looked_for_too_long(se
     late = replace(seen, stamp_ns=minute + np.arange(len(seen.stamp_ns)))
     (lift,) = plan_lifts(heights, bundles, MAGNET, SETTINGS, (), late, now_ns).offered
     assert lift.set_down is not None and lift.set_down.x_m > 1.2
+
+
+def test_a_lift_ends_where_the_ground_it_is_put_down_on_grows_old() -> None:
+    """The pile was seen 10 s ago, the floor beside it 540 s ago."""
+    heights, bundles = pile()
+    passes = np.tile(np.where(heights.x_m > 1.5, 1, 2).astype(np.uint8), (heights.shape[0], 1))
+    heights = replace(heights, passes=passes, tops=np.full(heights.shape, 90, np.uint8))
+    heights.source[:, heights.x_m < -0.1] = HeightSource.UNKNOWN
+    now_ns, spots = 10_000 * NS_PER_S, np.array([(x, y) for x in (0.0, 5.0) for y in (-3.0, 0.0, 3.0)])
+    old_ns, new_ns = now_ns - 540 * NS_PER_S, now_ns - 10 * NS_PER_S
+    travel = Travel.joined([sure_travel(spots, first + np.arange(6)) for first in (old_ns, new_ns)])
+    plan = plan_lifts(heights, bundles, MAGNET, SETTINGS, (), travel, now_ns)
+    ends = [lift.validity.until_ns for lift in plan.offered if lift.validity and lift.set_down]
+    assert ends and max(ends) < old_ns + SETTINGS.max_age_s * NS_PER_S + NS_PER_S

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from barsight.core.records.heights import HeightSource
+from barsight.yard.events import YardEvent
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.bearing import find_bearing
 from barsight.yard.lifting.ground import Ground
-from barsight.yard.lifting.load import Load, reaches_area
+from barsight.yard.lifting.load import Load, laid_at, reaches_area
 from barsight.yard.lifting.set_down import SetDown, find_set_down, sound_ground
 from barsight.yard.lifting.targets import put_down
 from barsight.yard.magnet.description import Magnet
@@ -254,3 +255,22 @@ def test_a_magnet_that_holds_a_load_off_its_middle_goes_as_far_beside_the_place(
     assert turned == pytest.approx(math.radians(turn_deg))
     none = put_down(moved, load, None)
     assert none.set_down is None and none.magnet_down is None
+
+
+@pytest.mark.parametrize(("away_m", "fits"), [(2.9, False), (4.0, False), (5.0, True)])
+def test_the_magnet_keeps_off_what_the_map_does_not_know_any_more(away_m: float, fits: bool) -> None:
+    """A beam of 5.4 m over a load of 3: what happened beyond both ends of it counts under the beam."""
+    short = laid(0.3, length_m=3.0)
+    heights = map_of([short], x_m=(-0.5, 3.0), y_m=(-6.0, 6.0))
+    heights = replace(heights, free_m=np.zeros(heights.shape, np.float32))
+    load = Load.of((record(short),))
+    events = tuple(YardEvent(10, "set-down", 1.25, side * away_m, 0.0, 0.4, 4.0) for side in (-1, 1))
+    ground = sound_ground(Ground.of(heights), (), (), SETTINGS, events)
+    assert (find_set_down(ground, load, MAGNET, SETTINGS) is not None) is fits
+
+
+def test_several_bundles_are_laid_as_wide_as_they_lie() -> None:
+    pair = record(laid(0.3)), record(laid(0.75))
+    down, whole = laid_at(pair, 5.0, 1.0, 0.3), Load.of(pair)
+    assert (down.width_m, down.length_m) == (whole.width_m, whole.length_m)
+    assert (*down.centre_m[:2], down.yaw_rad) == (5.0, 1.0, 0.3) and whole.width_m > 0.7

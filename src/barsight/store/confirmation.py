@@ -24,6 +24,7 @@ from barsight.store.states import has_alarm, last_raised_ns, lift_state, raise_a
 from barsight.store.tables import LIFT_BUNDLES, LIFT_STATES, LIFTS, SIGHTINGS, SURVEY_VETOES, SURVEYS
 from barsight.yard.events import corners, gap_between
 from barsight.yard.inventory.bundle_file import bundle_of
+from barsight.yard.lifting.load import laid_at
 from barsight.yard.lifting.validity import MAX_CLOCK_ERROR_NS
 from barsight.yard.vetoes import VETOES
 
@@ -324,7 +325,7 @@ def _stale(connection: Connection, clock_ns: int) -> dict[int, str]:
 
 
 def _outlines(connection: Connection, lift: OpenLift) -> list[Float64]:
-    """Draw the corners (4, 2) of the load and the magnet's beam; and of both where they are set down."""
+    """Draw the corners (4, 2) of the load and the magnet; and of both where they are set down."""
     rows = connection.execute(
         select(SIGHTINGS.c.record)
         .join(LIFT_BUNDLES, LIFT_BUNDLES.c.bundle_id == SIGHTINGS.c.bundle_id)
@@ -339,10 +340,10 @@ def _outlines(connection: Connection, lift: OpenLift) -> list[Float64]:
     for place in places:
         centre, yaw = (place["x_m"], place["y_m"]), math.radians(place["yaw_deg"])
         outlines.append(corners(centre, yaw, beam["width_m"], beam["length_m"]))
-        moved = place is not places[0]
-        for one in bundles:
-            at = centre if moved else (float(one.centre_m[0]), float(one.centre_m[1]))
-            outlines.append(corners(at, yaw if moved else one.yaw_rad, one.width_m, one.length_m))
+        here = bundles if place is places[0] or not bundles else [laid_at(tuple(bundles), *centre, yaw)]
+        for one in here:
+            at = float(one.centre_m[0]), float(one.centre_m[1])
+            outlines.append(corners(at, one.yaw_rad, one.width_m, one.length_m))
     return outlines
 
 

@@ -89,7 +89,7 @@ def run(arguments: Sequence[str]) -> None:
                 now_ns, events=happened, contradicted=folder.contradicted,
             )  # fmt: skip
             order = _first_order(out, folder, plan, fetch) if fetch else None
-            plan = plan if order is None else begin_order(order, plan, folder.bundles)
+            plan = plan if order is None else begin_order(order, plan, folder.bundles, folder.heights)
         console = SafeConsole(stderr=True)
         digest, sequence = bundles_digest(out), next_sequence(out / "lifts.json", folder.identity)
         with changed_folder(out) as staging:

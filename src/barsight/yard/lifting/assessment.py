@@ -189,7 +189,8 @@ def assess_placement(
         reason = f"within the crane's tolerance {end}"
         what = "the box within which the lift stays as checked, over the crane's tolerance"
         checks.append(check_min("narrow-tolerance", what, scale, SCALES[0], "", reason))
-    safety = min(_safety(contact, weakest, needed, mass, magnet, scale if search else math.inf), worst)
+    scale = scale if search else math.inf
+    safety = _safety(contact, weakest, needed, mass, magnet, float(np.min([scale, worst])))
     return Lift(
         place, tuple(b.id for b in load), len(load), held.probability,
         tuple(b.id for b in load) if len(load) > settings.bundles else (),
@@ -225,7 +226,7 @@ def _safety(
     contact: Contact, weakest: WeakestPole | None, needed_n: float, mass: Mass, magnet: Magnet, scale: float
 ) -> float:
     """Compute a lift's safety: the least of pull over what is needed, the weakest pole's pull over its share,
-    capacity over load, and `scale`, the tolerance over the crane's.
+    capacity over load, and `scale`, of the tolerance over the crane's or of the worst bundle.
     """
     capacity_kg = min(magnet.capacity_kg, magnet.crane_capacity_kg - magnet.own_mass_kg)
     ratios = (

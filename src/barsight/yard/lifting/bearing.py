@@ -83,9 +83,7 @@ def find_bearing(
     """Find how the load rests at a place and all over the crane's tolerance; None where it doesn't, or where
     something may stand in its way.
     """
-    axes = axes_of(yaw_rad)
-    slack = magnet.tolerance.along(axes)
-    slack[0] += load.length_m / 2 * math.radians(magnet.tolerance.yaw_deg)
+    axes, slack = axes_of(yaw_rad), placing_slack(load, yaw_rad, magnet)
     around = _surroundings(yard, load, (x_m, y_m), yaw_rad, slack + settings.set_down_clear_m, magnet)
     clear = _within(around, load, slack + settings.set_down_clear_m)
     if (wide_parts(around.unseen, MAX_UNSEEN_CELLS) & clear).any():
@@ -138,6 +136,27 @@ def _surroundings(
     free = np.full(part.shape, np.inf, np.float32) if part.free_m is None else part.free_m
     free = np.where(inside, free[row, column], np.float32(np.inf)).astype(np.float32)
     return Surroundings(v, u, z, thin, ~(inside & seen[row, column]), free)
+
+
+def placing_slack(load: Load, yaw_rad: float, magnet: Magnet) -> Float64:
+    """Return how far (2,) beside its place, across and along, the crane may put a load."""
+    slack = magnet.tolerance.along(axes_of(yaw_rad))
+    slack[0] += load.length_m / 2 * math.radians(magnet.tolerance.yaw_deg)
+    return slack
+
+
+def magnet_rectangles(load: Load, magnet: Magnet, slack: Float64) -> list[tuple[float, float, float]]:
+    """List where poles and beam may be over a load: half width and half length about its centre of mass, and
+    what may stand there over its top, m.
+    """
+    aside, beam = slack + _held_off(load, magnet), magnet.beam
+    return [
+        *(
+            (abs(pole.across_m) + pole.width_m / 2 + aside[0], magnet.half_span_m + aside[1], 0.0)
+            for pole in magnet.poles
+        ),
+        (beam.width_m / 2 + aside[0], beam.length_m / 2 + aside[1], beam.above_faces_m / 2),
+    ]
 
 
 def magnet_reach(load: Load, magnet: Magnet) -> Float64:
@@ -206,15 +225,12 @@ def _stands_in_the_way(
         cv2.connectedComponentsWithStats(over, connectivity=8)[2][1:, cv2.CC_STAT_AREA] >= MIN_THIN_CELLS
     ).any():
         return True
-    top, aside = low_m + load.height_m, slack + _held_off(load, magnet)
     beside = np.abs(around.u_m - load.off_across_m)[None]
     beyond = np.abs(around.v_m - load.off_along_m)[:, None]
     hidden = wide_parts(around.unseen, MAX_UNSEEN_CELLS) > 0
-    for width, length, height in (
-        *((2 * abs(p.across_m) + p.width_m, 2 * magnet.half_span_m, top) for p in magnet.poles),
-        (magnet.beam.width_m, magnet.beam.length_m, top + magnet.beam.above_faces_m / 2),
-    ):
-        under = (beside <= width / 2 + aside[0]) & (beyond <= length / 2 + aside[1])
+    for half_width, half_length, over_m in magnet_rectangles(load, magnet, slack):
+        under = (beside <= half_width) & (beyond <= half_length)
+        height = low_m + load.height_m + over_m
         if (under & np.where(hidden, ~(around.free_m <= height), z > height)).any():
             return True
     return False

@@ -18,6 +18,8 @@ from barsight.yard.events import YardEvent
 from barsight.yard.identity import MapIdentity
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.assessment import Lift
+from barsight.yard.lifting.bearing import magnet_reach
+from barsight.yard.lifting.load import Load, laid_at
 from barsight.yard.lifting.order import LiftOrder
 from barsight.yard.lifting.targets import RULE, LiftPlan
 from barsight.yard.lifting.validity import MAX_CLOCK_ERROR_NS, Validity, disturbed_checks
@@ -76,12 +78,11 @@ def forbidden_since(
     )  # fmt: skip
     if record["set_down"] is not None and not vetoes_of(checks):
         place = _placement(record["set_down"])
-        laid = (
-            replace(one, centre_m=np.array([place.x_m, place.y_m, 0.0]), yaw_rad=place.yaw_rad)
-            for one in load
-        )
+        laid = laid_at(load, place.x_m, place.y_m, place.yaw_rad)
+        wide, long = np.maximum((laid.width_m, laid.length_m), 2 * magnet_reach(Load.of(load), magnet))
+        laid = replace(laid, width_m=float(wide), length_m=float(long))
         later = _unknown_to(content, events)
-        checks = disturbed_checks(later, place, magnet, tuple(laid), None, settings)
+        checks = disturbed_checks(later, place, magnet, (laid,), None, settings)
     return (*found, *vetoes_of(checks))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -59,6 +59,15 @@ class Load:
             ids, float(x), float(y), yaw, float(size[0]), float(size[1]), height, rolls, float(off[0]),
             float(off[1]),
         )  # fmt: skip
+
+
+def laid_at(load: tuple[Bundle, ...], x_m: float, y_m: float, yaw_rad: float) -> Bundle:
+    """Outline a load of one or several bundles as one bundle that lies at a place."""
+    whole = Load.of(load)
+    return replace(
+        load[0], centre_m=np.array([x_m, y_m, load[0].centre_m[2]]), yaw_rad=yaw_rad,
+        width_m=whole.width_m, length_m=whole.length_m,
+    )  # fmt: skip
 
 
 def is_one_bar(bundle: Bundle) -> bool:

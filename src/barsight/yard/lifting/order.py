@@ -19,7 +19,7 @@ from barsight.yard.lifting.bearing import magnet_reach
 from barsight.yard.lifting.ground import Ground
 from barsight.yard.lifting.load import Load, axes_of
 from barsight.yard.lifting.set_down import SHADOW_M, SetDown, find_set_down, sound_ground
-from barsight.yard.lifting.targets import LiftPlan, put_down
+from barsight.yard.lifting.targets import LiftPlan, ended_with_floor, put_down
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.types import Bundle, YardMap
 
@@ -82,15 +82,17 @@ def order_lifts(
     return LiftOrder(bundle_id, tuple(steps))
 
 
-def begin_order(order: LiftOrder, plan: LiftPlan, bundles: tuple[Bundle, ...]) -> LiftPlan:
+def begin_order(order: LiftOrder, plan: LiftPlan, bundles: tuple[Bundle, ...], yard: YardMap) -> LiftPlan:
     """Put the load of the offered lift that begins an order where the order has it, off what is dug out."""
     first = order.steps[0]
-    load = Load.of(tuple(bundle for bundle in bundles if bundle.id == first.bundle))
-    offered = tuple(
-        put_down(lift, load, first.set_down) if lift.bundles == load.bundles else lift
-        for lift in plan.offered
-    )
-    return replace(plan, offered=offered)
+    load = tuple(bundle for bundle in bundles if bundle.id == first.bundle)
+    offered = []
+    for lift in plan.offered:
+        if lift.bundles == (first.bundle,):
+            laid = put_down(lift, Load.of(load), first.set_down)
+            lift = ended_with_floor(laid, load, yard, plan.travel, plan.magnet, plan.settings)
+        offered.append(lift)
+    return replace(plan, offered=tuple(offered))
 
 
 def travel_height(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -12,9 +12,17 @@ import numpy as np
 from barsight.core.arrays import Float64
 from barsight.yard.events import YardEvent
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.bearing import HOLE_DEPTH_M, MAX_RISE_M, Bearing, find_bearing, magnet_reach
+from barsight.yard.lifting.bearing import (
+    HOLE_DEPTH_M,
+    MAX_RISE_M,
+    Bearing,
+    find_bearing,
+    magnet_reach,
+    magnet_rectangles,
+    placing_slack,
+)
 from barsight.yard.lifting.ground import Ground
-from barsight.yard.lifting.load import Load, reached_areas
+from barsight.yard.lifting.load import Load, axes_of, reached_areas
 from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.lifting.validity import old_cells
 from barsight.yard.magnet.description import Magnet
@@ -67,9 +75,28 @@ def find_set_down(ground: Ground, load: Load, magnet: Magnet, settings: LiftSett
         yaw -= math.pi * math.ceil(yaw / math.pi - 0.5)
         for x, y in _candidates(free, load, yaw, settings):
             bearing = find_bearing(ground.yard, load, x, y, yaw, magnet, settings)
-            if bearing is not None and not _reaches_area(load, x, y, yaw, magnet, settings):
+            if (
+                bearing is not None
+                and not _reaches_area(load, x, y, yaw, magnet, settings)
+                and not _magnet_meets(ground, load, x, y, yaw, bearing, magnet)
+            ):
                 return _place(bearing, x, y, yaw, turn)
     return None
+
+
+def _magnet_meets(
+    ground: Ground, load: Load, x_m: float, y_m: float, yaw_rad: float, bearing: Bearing, magnet: Magnet
+) -> bool:
+    """Check whether the magnet may meet what the map's heights don't have: a load that was put down before,
+    or what may stand where nothing is known any more.
+    """
+    over = np.array([x_m, y_m]) + (load.off_across_m, load.off_along_m) @ axes_of(yaw_rad)
+    for wide, long, over_m in magnet_rectangles(load, magnet, placing_slack(load, yaw_rad, magnet)):
+        size = replace(load, width_m=2 * wide, length_m=2 * long)
+        high = ground.top_m > bearing.z_m + load.height_m + over_m
+        if (high & ground.inside(size, float(over[0]), float(over[1]), yaw_rad, 0.0)).any():
+            return True
+    return False
 
 
 def _reaches_area(

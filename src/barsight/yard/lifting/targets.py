@@ -14,17 +14,18 @@ import numpy as np
 
 from barsight.core.notices import FORBIDS
 from barsight.core.parallel import ordered_map
+from barsight.core.stamps import seconds_to_ns
 from barsight.yard.events import YardEvent, events_since
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.assessment import Lift, LiftScene, assess_placement
 from barsight.yard.lifting.ground import Ground
-from barsight.yard.lifting.load import Load, axes_of
+from barsight.yard.lifting.load import Load, axes_of, laid_at
 from barsight.yard.lifting.set_down import SetDown, find_set_down, sound_ground
 from barsight.yard.lifting.travel_accuracy import Travel
-from barsight.yard.lifting.validity import age_checks
+from barsight.yard.lifting.validity import age_checks, validity
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import BundleTable, Placement
-from barsight.yard.sections import split_map
+from barsight.yard.sections import part_about, split_map
 from barsight.yard.stability.blockers import Blocked, find_blocked
 from barsight.yard.stability.pile_sides import PileSide, pile_sides
 from barsight.yard.stability.stability import Footing, footings, high_side, mean_yaw, turn_between
@@ -148,9 +149,14 @@ def plan_lifts(
         since = events_since(events, captured_ns)
         ground = sound_ground(Ground.of(yard), bundles, standing, settings, since, travel, now_ns)
         by_id = {bundle.id: bundle for bundle in bundles}
-        loads = [Load.of(tuple(by_id[k] for k in lift.bundles)) for lift in offered]
+        taken = [tuple(by_id[k] for k in lift.bundles) for lift in offered]
+        loads = [Load.of(bundles) for bundles in taken]
         places = ordered_map(lambda load: find_set_down(ground, load, magnet, settings), loads)
-        offered = [put_down(*one) for one in zip(offered, loads, places, strict=True)]
+        laid = [put_down(*one) for one in zip(offered, loads, places, strict=True)]
+        offered = [
+            ended_with_floor(lift, load, yard, travel, magnet, settings)
+            for lift, load in zip(laid, taken, strict=True)
+        ]
     return LiftPlan(
         magnet,
         settings,
@@ -175,6 +181,26 @@ def put_down(lift: Lift, load: Load, place: SetDown | None) -> Lift:
     turn = math.radians(place.turn_deg)
     x, y = np.array([place.x_m, place.y_m]) + held @ axes_of(load.yaw_rad + turn)
     return replace(lift, set_down=place, magnet_down=Placement(float(x), float(y), lift.place.yaw_rad + turn))
+
+
+def ended_with_floor(
+    lift: Lift, load: tuple[Bundle, ...], yard: YardMap, travel: Travel | None, magnet: Magnet,
+    settings: LiftSettings,
+) -> Lift:  # fmt: skip
+    """End a lift's validity where that of its set-down ends: `max_age_s` after the survey began where no
+    frame surely saw that.
+    """
+    place, down = lift.set_down, lift.magnet_down
+    if travel is None or travel.captured_ns is None or None in (place, down, lift.validity):
+        return lift
+    assert place is not None and down is not None and lift.validity is not None
+    laid = laid_at(load, place.x_m, place.y_m, place.yaw_rad)
+    reach = max(*magnet.size_m, laid.length_m, laid.width_m)
+    about = part_about(yard, *(np.array([at - reach, at + reach]) for at in (down.x_m, down.y_m)))
+    floor = validity(travel, down, magnet, (laid,), about, settings)
+    until_ns = travel.captured_ns[0] + seconds_to_ns(settings.max_age_s) if floor is None else floor.until_ns
+    until_ns = min(lift.validity.until_ns, until_ns)
+    return replace(lift, validity=replace(lift.validity, until_ns=until_ns))
 
 
 def _groups(bundles: tuple[Bundle, ...], count: int) -> Iterator[tuple[Bundle, ...]]:

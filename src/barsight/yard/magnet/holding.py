@@ -185,7 +185,7 @@ def weakest_bundle(
         )
         held = hold_load(replace(contact, poles=poles), magnet, (bundle,), strap_m)
         needed_n = bundle_mass(bundle).upper_kg * NEWTON_PER_KG * magnet.needed_factor
-        ratios.append(held.pull_low_n / needed_n)
+        ratios.append(held.pull_low_n / needed_n if needed_n > 0 else math.nan)
     return float(np.min(ratios))
 
 
