@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import os
 import shutil
 import signal
 import threading
@@ -120,17 +121,17 @@ class LiveRun:
                 board.name, None if given is None else given.stamps_ns,
             )  # fmt: skip
             supervisor = Supervisor(link, board, self._tell_all)
-            with in_background(lambda: load_kernels("measure")), _stopped_by_signals(supervisor):
+            with _stopped_by_signals(supervisor), in_background(lambda: load_kernels("measure")):
                 supervisor.run()
             self.stop_because = supervisor.stop_because
             if self.stop_because == STOOD:
                 return {}
-            supervisor.end_map()
-            if supervisor.stop_because:
-                self._tell_all(f"ends early: {supervisor.stop_because}; what was kept is measured")
-            if given is not None:
-                supervisor.state.mode = given.mode
             with ended_afterwards(self):
+                supervisor.end_map()
+                if supervisor.stop_because:
+                    self._tell_all(f"ends early: {supervisor.stop_because}; what was kept is measured")
+                if given is not None:
+                    supervisor.state.mode = given.mode
                 return _finish(supervisor, link, board, self._recording, self._asked, request, advance)
         finally:
             if supervisor is not None:
@@ -222,6 +223,7 @@ def ended_afterwards(run: LiveRun) -> Iterator[None]:
 
     def note(because: str) -> None:
         run.stop_because = because
+        os.write(2, b"what was kept is measured; a second signal ends that too\n")  # print may be under way
         handled.close()
 
     with contextlib.ExitStack() as handled:
