@@ -16,9 +16,10 @@ def with_live_run(state: PlantState, folder: Path) -> PlantState:
     if told is None:
         return _forbidden(state, f"live-stopped: {folder / 'state.json'} is not there or torn")
     if not told.is_running:
-        return _forbidden(
-            state, f"live-stopped: the live run says nothing for {told.silent_s:.1f} s, phase {told.phase}"
-        )
+        silent = f"says nothing for {told.silent_s:.1f} s"
+        if told.silent_s < 0:
+            silent = "last spoke ahead of this clock, which was set back"
+        return _forbidden(state, f"live-stopped: the live run {silent}, phase {told.phase}")
     pose = read_crane_pose(folder, told.now_ns)
     state = replace(state, mode=told.mode, survey=told.phase, pose=pose)
     if told.may_stand:

@@ -107,7 +107,7 @@ def _moved(rig: StereoRig, names: tuple[str, ...], number: int, step: float) -> 
             camera, fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy, coefficients=tuple(values[INTRINSICS:].tolist())
         )
         return replace(rig, cam0=changed) if owner == "cam0" else replace(rig, cam1=changed)
-    if owner != "cam1_from_cam0":
+    if owner in ("body_from_cam0", "body_from_cam1") or "timeshift" in name:
         return rig
     change = np.zeros(6)
     change[("rx_rad", "ry_rad", "rz_rad", "tx_m", "ty_m", "tz_m").index(name)] = step

@@ -13,7 +13,7 @@ export async function bundleScreen(place, name) {
       h("td", {}, h("a", { href: `#bundle/${one.identity}`, id: `see-${one.identity}` }, one.identity)), h("td", {}, one.stock_name || "–"),
       one.axis_centre_m[0].toFixed(2), one.axis_centre_m[1].toFixed(2), one.top_z_m.toFixed(2), `${one.length_m.toFixed(2)}${one.ends_open.some(Boolean) ? "+" : ""}`,
       ageText(clockNow(state) - one.seen_ns),
-      h("td", {}, one.lift ? t(`lift.${one.lift.state}`) : one.doubt ? vetoText(`doubt-${one.doubt.code}`) : shortWhys(one)),
+      h("td", {}, one.lift ? t(`lift.${one.lift.state}`) : one.doubt ? vetoText(`doubt-${one.doubt.code}`) : shortWhys(one, state.map_vetoes)),
     ]));
     return show(place, h("section", {}, h("h1", {}, t("bundles")), table([t("bundle"), t("stock.name"), "#X m", "#Y m", `#${t("top")} m`, `#${t("length")} m`, `#${t("seen")}`, t("lift.or.why")], rows, t("bundles"))));
   }

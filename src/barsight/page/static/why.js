@@ -35,7 +35,7 @@ export function whyNot(bundle, mapVetoes) {
 }
 
 // Short words for the list of bundles: all reasons, each once.
-export const shortWhys = (bundle) => [...new Set(bundle.vetoes.map((veto) => t(`short.${veto.code}`)))].join(", ") || t("why.none");
+export const shortWhys = (bundle, mapVetoes) => [...new Set([...mapVetoes, ...bundle.vetoes].map((veto) => known(`short.${veto.code}`) ? t(`short.${veto.code}`) : veto.code))].join(", ") || t("why.none");
 
 // Short words for the drawing: why it is not offered.
 export function shortWhy(bundle) {

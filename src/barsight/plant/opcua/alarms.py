@@ -66,7 +66,7 @@ class Conditions:
             if known is None and len(self._by_code) < MAX_CONDITIONS:
                 await self._change(_Condition(await self._add_node(code), alarm))
             elif known is not None and not (known.is_active and known.alarm == alarm):
-                await self._change(replace(known, alarm=alarm, is_active=True, is_acknowledged=False))
+                await self._change(_Condition(known.node, alarm))
         for code, known in list(self._by_code.items()):
             if known.is_active and code not in standing:
                 await self._change(replace(known, is_active=False))
