@@ -189,14 +189,13 @@ def assess_placement(
         reason = f"within the crane's tolerance {end}"
         what = "the box within which the lift stays as checked, over the crane's tolerance"
         checks.append(check_min("narrow-tolerance", what, scale, SCALES[0], "", reason))
-    scale = scale if search else math.inf
-    safety = _safety(contact, weakest, needed, mass, magnet, float(np.min([scale, worst])))
+    least = float(np.min([scale if search else math.inf, worst]))
     return Lift(
         place, tuple(b.id for b in load), len(load), held.probability,
         tuple(b.id for b in load) if len(load) > settings.bundles else (),
         contact, mass, needed, *offset, overhang[0] + UPPER * overhang[1],
         _scaled(magnet.tolerance, scale),
-        safety, tuple(checks), valid,
+        _safety(contact, weakest, needed, mass, magnet, least), tuple(checks), valid,
         target_covariance(
             place, load, contact.gap_sigma_m, _map_sigma(yard.heights, place, magnet), yard.travel,
             magnet.offset,

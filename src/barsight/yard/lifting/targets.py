@@ -148,15 +148,7 @@ def plan_lifts(
     if offered:
         since = events_since(events, captured_ns)
         ground = sound_ground(Ground.of(yard), bundles, standing, settings, since, travel, now_ns)
-        by_id = {bundle.id: bundle for bundle in bundles}
-        taken = [tuple(by_id[k] for k in lift.bundles) for lift in offered]
-        loads = [Load.of(bundles) for bundles in taken]
-        places = ordered_map(lambda load: find_set_down(ground, load, magnet, settings), loads)
-        laid = [put_down(*one) for one in zip(offered, loads, places, strict=True)]
-        offered = [
-            ended_with_floor(lift, load, yard, travel, magnet, settings)
-            for lift, load in zip(laid, taken, strict=True)
-        ]
+        offered = _with_set_downs(offered, bundles, ground, travel, magnet, settings)
     return LiftPlan(
         magnet,
         settings,
@@ -181,6 +173,20 @@ def put_down(lift: Lift, load: Load, place: SetDown | None) -> Lift:
     turn = math.radians(place.turn_deg)
     x, y = np.array([place.x_m, place.y_m]) + held @ axes_of(load.yaw_rad + turn)
     return replace(lift, set_down=place, magnet_down=Placement(float(x), float(y), lift.place.yaw_rad + turn))
+
+
+def _with_set_downs(
+    lifts: list[Lift], bundles: tuple[Bundle, ...], ground: Ground, travel: Travel | None, magnet: Magnet,
+    settings: LiftSettings,
+) -> list[Lift]:  # fmt: skip
+    """Find for each lift where its load can be put down."""
+    by_id = {bundle.id: bundle for bundle in bundles}
+    loads = [tuple(by_id[number] for number in lift.bundles) for lift in lifts]
+    places = ordered_map(lambda load: find_set_down(ground, Load.of(load), magnet, settings), loads)
+    return [
+        ended_with_floor(put_down(lift, Load.of(load), place), load, ground.yard, travel, magnet, settings)
+        for lift, load, place in zip(lifts, loads, places, strict=True)
+    ]
 
 
 def ended_with_floor(
