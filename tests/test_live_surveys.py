@@ -2,6 +2,8 @@
 
 import os
 import signal
+import subprocess
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -138,6 +140,38 @@ def test_the_first_signal_waits_until_a_survey_is_measured(tmp_path: Path) -> No
             time.sleep(0.01)
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+HOLDER = """
+import multiprocessing, time
+from barsight.live.supervisor import end_with_parent
+
+def hold():
+    end_with_parent()
+    time.sleep(60)
+
+if __name__ == "__main__":
+    process = multiprocessing.get_context("forkserver").Process(target=hold)
+    process.start()
+    print(process.pid, flush=True)
+    time.sleep(60)
+"""
+
+
+def test_no_process_outlives_a_command_that_was_killed_at_once(tmp_path: Path) -> None:
+    """Nobody would stop it, and it would hold cameras and ports."""
+    script = tmp_path / "holder.py"
+    script.write_text(HOLDER, encoding="utf-8")
+    with subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, text=True) as command:
+        assert command.stdout is not None
+        held = Path("/proc") / command.stdout.readline().strip()
+        time.sleep(1.0)
+        assert (held / "stat").is_file()
+        command.kill()
+    give_up = time.monotonic() + 10
+    while held.is_dir() and (held / "stat").read_text().rpartition(")")[2].split()[0] != "Z":
+        assert time.monotonic() < give_up
+        time.sleep(0.05)
 
 
 def test_the_oldest_surveys_go_but_for_protected_ones(tmp_path: Path) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import signal
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Callable
@@ -55,10 +57,26 @@ SIGNS = {
 """Counters whose changes go to the log, each with its line."""
 
 
+def end_with_parent() -> None:
+    """End this process when its parent is gone: one that was killed at once stops none, and cameras and ports
+    would stay taken.
+    """
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+
+    def end(sentinel: int = parent.sentinel) -> None:
+        wait([sentinel])
+        os._exit(1)
+
+    threading.Thread(target=end, daemon=True).start()
+
+
 def run_process(role: str, link: Link) -> None:
     """Run a process of the run; Ctrl-C is its parent's to handle, who takes it along when it dies."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
+    end_with_parent()
     reason = link.folder / f"{role}.reason"
     reason.unlink(missing_ok=True)
     try:
