@@ -12,7 +12,7 @@ from barsight.core.reading.live_run import CranePose
 from barsight.store.confirmation import OPEN, OpenLift, map_vetoes, newest_survey, open_lifts, yard_clock_ns
 from barsight.store.opening import Store
 from barsight.store.states import standing_alarms
-from barsight.yard.lifting.validity import MAX_CLOCK_ERROR_NS
+from barsight.yard.lifting.validity import is_ahead
 
 MAX_ALARMS = 20
 """Newest alarms that are told to the plant."""
@@ -131,7 +131,7 @@ def state_of_store(
     usable = [
         one for one in lifts
         if one.survey_id == survey.id and (one.record["valid_until_ns"] or 0) > clock_ns
-        and (one.record.get("valid_from_ns") or 0) - clock_ns <= MAX_CLOCK_ERROR_NS
+        and not is_ahead(one.record.get("valid_from_ns"), clock_ns)
         and (one.state != "offered" or one.record.get("begins_fetch") is not False)
     ]  # fmt: skip
     begun = next((one for one in lifts if one.state == "executing"), None)

@@ -25,7 +25,7 @@ from barsight.store.tables import LIFT_BUNDLES, LIFT_STATES, LIFTS, SIGHTINGS, S
 from barsight.yard.events import corners, gap_between
 from barsight.yard.inventory.bundle_file import bundle_of
 from barsight.yard.lifting.load import laid_at
-from barsight.yard.lifting.validity import MAX_CLOCK_ERROR_NS
+from barsight.yard.lifting.validity import is_ahead
 from barsight.yard.vetoes import VETOES
 
 with extra("store"):
@@ -317,7 +317,7 @@ def _stale(connection: Connection, clock_ns: int) -> dict[int, str]:
             told[lift.lift_id] = "expired: a newer map came"
         elif until_ns is None or until_ns < clock_ns:
             told[lift.lift_id] = "expired: map-too-old: it was valid for a limited time"
-        elif (lift.record.get("valid_from_ns") or 0) - clock_ns > MAX_CLOCK_ERROR_NS:
+        elif is_ahead(lift.record.get("valid_from_ns"), clock_ns):
             told[lift.lift_id] = "expired: map-from-the-future: the frames are ahead of this clock"
         elif reason:
             told[lift.lift_id] = f"expired: calibration-changed: {reason}"

@@ -18,7 +18,7 @@ from barsight.core.records.trajectory import RigDrift
 SIGNIFICANT_SIGMAS = 3.0
 WORTH_MM = 3.0
 MIN_TOLD = 1e-3
-"""What travel tells of a direction counts from this share of what was held before (information)."""
+"""Share of the information held before from which the travel's own on a direction counts."""
 AGREEING_SIGMAS = 1.96
 """Travel that shows yaw and scale within this agrees with the calibration. Over rigs that are off as far as
 they admit, 95 % of the heights then lie inside (tests/test_motion_rig_drift.py)."""

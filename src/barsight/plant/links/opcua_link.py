@@ -44,13 +44,13 @@ async def serve_opcua(
         )  # fmt: skip
         if state.map_id is not None and state.map_id not in folders:
             folders.clear()
-            with (
-                contextlib.suppress(BarsightError),
-                store.reading() as connection,
-            ):  # one that is away comes back
+            # A store that is away comes back: then the survey is told.
+            with contextlib.suppress(BarsightError), store.reading() as connection:
                 folders[state.map_id] = survey_folder(connection, state.map_id)
-        surveys = [Survey(name, folder) for name, folder in folders.items() if name == state.map_id]
-        return Told(state, alarms, surveys[0] if surveys else None)
+        survey = None
+        if state.map_id is not None and state.map_id in folders:
+            survey = Survey(state.map_id, folders[state.map_id])
+        return Told(state, alarms, survey)
 
     presets = typing.get_args(typing.get_type_hints(MeasureSettings)["preset"])
     state = feed.newest(0)

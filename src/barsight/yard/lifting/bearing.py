@@ -65,15 +65,15 @@ class Surroundings:
     """Heights (V, U) about a place on a grid along (v_m) and across (u_m) the load.
 
     z_m: medians over 50 mm squares, which wrong matches don't move. thin_m: over 30 mm, for what is thin.
-    Both have the highest nearby where a few cells were not seen; unseen: those cells and all others. free_m:
-    upper bound by lines of sight of what may stand there, inf where none passed.
+    Both have the highest nearby where a few cells were not seen; hidden: unseen places wide enough to hide
+    what stands. free_m: upper bound by lines of sight of what may stand there, inf where none passed.
     """
 
     v_m: Float64
     u_m: Float64
     z_m: Float32
     thin_m: Float32
-    unseen: Bool
+    hidden: Bool
     free_m: Float32
 
 
@@ -86,7 +86,7 @@ def find_bearing(
     axes, slack = axes_of(yaw_rad), placing_slack(load, yaw_rad, magnet)
     around = _surroundings(yard, load, (x_m, y_m), yaw_rad, slack + settings.set_down_clear_m, magnet)
     clear = _within(around, load, slack + settings.set_down_clear_m)
-    if (wide_parts(around.unseen, MAX_UNSEEN_CELLS) & clear).any():
+    if (around.hidden & clear).any():
         return None
     carrying = around.z_m
     if settings.dunnage_m > 0:
@@ -135,7 +135,8 @@ def _surroundings(
     )
     free = np.full(part.shape, np.inf, np.float32) if part.free_m is None else part.free_m
     free = np.where(inside, free[row, column], np.float32(np.inf)).astype(np.float32)
-    return Surroundings(v, u, z, thin, ~(inside & seen[row, column]), free)
+    hidden = wide_parts(~(inside & seen[row, column]), MAX_UNSEEN_CELLS) > 0
+    return Surroundings(v, u, z, thin, hidden, free)
 
 
 def placing_slack(load: Load, yaw_rad: float, magnet: Magnet) -> Float64:
@@ -227,11 +228,10 @@ def _stands_in_the_way(
         return True
     beside = np.abs(around.u_m - load.off_across_m)[None]
     beyond = np.abs(around.v_m - load.off_along_m)[:, None]
-    hidden = wide_parts(around.unseen, MAX_UNSEEN_CELLS) > 0
     for half_width, half_length, over_m in magnet_rectangles(load, magnet, slack):
         under = (beside <= half_width) & (beyond <= half_length)
         height = low_m + load.height_m + over_m
-        if (under & np.where(hidden, ~(around.free_m <= height), z > height)).any():
+        if (under & np.where(around.hidden, ~(around.free_m <= height), z > height)).any():
             return True
     return False
 

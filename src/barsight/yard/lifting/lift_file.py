@@ -22,7 +22,7 @@ from barsight.yard.lifting.bearing import magnet_reach
 from barsight.yard.lifting.load import Load, laid_at
 from barsight.yard.lifting.order import LiftOrder
 from barsight.yard.lifting.targets import RULE, LiftPlan
-from barsight.yard.lifting.validity import MAX_CLOCK_ERROR_NS, Validity, disturbed_checks
+from barsight.yard.lifting.validity import Validity, disturbed_checks, is_ahead
 from barsight.yard.magnet.description import Magnet, MagnetOffset
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.stability.stability import Footing
@@ -65,7 +65,7 @@ def forbidden_since(
     until_ns, seen_ns = record["valid_until_ns"], record["valid_from_ns"]
     if (until_ns or 0) < now_ns:
         found.append(Veto("map-too-old", "the lift was valid once, it isn't any more"))
-    elif seen_ns is not None and seen_ns - now_ns > MAX_CLOCK_ERROR_NS:
+    elif is_ahead(seen_ns, now_ns):
         found.append(
             Veto("map-from-the-future", "the frames are ahead of this computer's clock: set the clocks")
         )

@@ -181,12 +181,14 @@ def _with_set_downs(
 ) -> list[Lift]:  # fmt: skip
     """Find for each lift where its load can be put down."""
     by_id = {bundle.id: bundle for bundle in bundles}
-    loads = [tuple(by_id[number] for number in lift.bundles) for lift in lifts]
-    places = ordered_map(lambda load: find_set_down(ground, Load.of(load), magnet, settings), loads)
-    return [
-        ended_with_floor(put_down(lift, Load.of(load), place), load, ground.yard, travel, magnet, settings)
-        for lift, load, place in zip(lifts, loads, places, strict=True)
-    ]
+
+    def with_set_down(lift: Lift) -> Lift:
+        taken = tuple(by_id[number] for number in lift.bundles)
+        load = Load.of(taken)
+        laid = put_down(lift, load, find_set_down(ground, load, magnet, settings))
+        return ended_with_floor(laid, taken, ground.yard, travel, magnet, settings)
+
+    return list(ordered_map(with_set_down, lifts))
 
 
 def ended_with_floor(

@@ -64,6 +64,11 @@ class Travel:
         stamps = self.stamp_ns[self.measured]
         return (int(stamps[0]), int(stamps[-1])) if stamps.size else None
 
+    @property
+    def passes(self) -> Int64:
+        """Return the pass (N,) that each frame is of, from 1."""
+        return self.pass_number if len(self.pass_number) else np.ones(len(self.place_m), np.int64)
+
     def pixel_m(self, z_m: float) -> float:
         """Return the size of a pixel at this height below the body; NaN where it isn't known."""
         return (self.eye_z_m - z_m) * self.pixel_rad
@@ -197,7 +202,7 @@ def _near_sigma(travel: Travel, near: Bool) -> Float64:
     """Take the median sigma (3,) of the frames near a place; of several passes the worst one's counts, as any
     of them may have made the heights there.
     """
-    passes = travel.pass_number if len(travel.pass_number) else np.ones(len(near), np.int64)
+    passes = travel.passes
     medians = [np.median(travel.sigma_m[near & (passes == one)], axis=0) for one in np.unique(passes[near])]
     return np.asarray(np.max(medians, axis=0))
 

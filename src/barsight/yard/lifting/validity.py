@@ -29,6 +29,11 @@ MAX_CLOCK_ERROR_NS = NS_PER_S
 """Frames may be this much ahead of this computer's clock."""
 
 
+def is_ahead(stamp_ns: int | None, clock_ns: int) -> bool:
+    """Check whether frames of this stamp are ahead of a clock."""
+    return (stamp_ns or 0) - clock_ns > MAX_CLOCK_ERROR_NS
+
+
 @dataclass(frozen=True)
 class Validity:
     """Stamps (ns, capture clock) between which a lift may be believed."""
@@ -65,8 +70,7 @@ def _last_seen(travel: Travel, measured: Int64, at_m: Float64, heights: HeightMa
     """Find when each of (P, 2) places was seen last, of those that were seen: the last frame that surely
     did, else the first that may have, of the pass whose height the map has there. The first place was seen.
     """
-    several = len(travel.pass_number) > 0
-    numbers = travel.pass_number[measured] if several else np.ones(len(measured), np.int64)
+    several, numbers = len(travel.pass_number) > 0, travel.passes[measured]
     newest = np.ones(len(at_m), np.int64)
     if several and heights.passes is not None:
         column, row, inside = nearest_cells(heights, at_m[:, 0], at_m[:, 1])
@@ -120,8 +124,7 @@ def old_cells(ground: Ground, travel: Travel, now_ns: int, settings: LiftSetting
     stamps = travel.stamp_ns[measured]
     if not (stamps < since_ns).any():
         return np.zeros(ground.top_m.shape, np.bool_)
-    several = len(travel.pass_number) > 0
-    numbers = travel.pass_number[measured] if several else np.ones(len(measured), np.int64)
+    numbers = travel.passes[measured]
     passes, old = ground.oldest_passes(), np.ones(ground.top_m.shape, np.bool_)
     step = max(round(SQUARE_M / ground.cell_m), 1)
     rows, columns = ground.top_m.shape
