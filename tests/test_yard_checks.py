@@ -28,7 +28,7 @@ def test_a_figure_within_its_sigma_of_the_limit_is_a_veto_that_says_so(
     most = check_max("tilt", "slope", value, 10.0, "deg", "too steep", sigma=sigma)
     least = check_min("tilt", "slope", -value, -10.0, "deg", "too steep", sigma=sigma)
     assert most.result == least.result == result
-    assert ("(95 %) only" in most.reason) == close
+    assert ("within its uncertainty" in most.reason) == close
     assert [v.code for v in vetoes_of([most, least])] == ([] if result == "passed" else ["tilt"] * 2)
     assert check_true("covered", "free", None, "not known").result == "unknown"
 
@@ -69,7 +69,7 @@ def test_a_load_near_its_limit_is_refused_and_says_how_near() -> None:
     lift = judged([laid(0.3)])
     near = judged([laid(0.3)], magnet=replace(MAGNET, capacity_kg=lift.mass.kg + lift.mass.sigma_kg))
     assert codes(near) == {"overweight"}
-    assert "(95 %) only" in near.vetoes[0].reason
+    assert "within its uncertainty" in near.vetoes[0].reason
     far = judged([laid(0.3)], magnet=replace(MAGNET, capacity_kg=lift.mass.kg - 1))
     assert "(95 %) only" not in far.vetoes[0].reason
 

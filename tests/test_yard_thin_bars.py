@@ -101,7 +101,7 @@ def test_a_lift_onto_a_thin_bar_is_vetoed_and_one_onto_straps_is_not() -> None:
     assert codes(lift) == {"thin-bar"}
     failed, beside = (check for check in lift.checks if check.result == "failed")
     assert failed.value is not None and failed.bound == MAX_STRENGTH
-    assert "across the load -0.6" in failed.reason and "across bundle 1 -0.56" in beside.reason
+    assert "crosses the load -0.6" in failed.reason and "crosses bundle 1 -0.56" in beside.reason
 
 
 def test_all_lines_across_are_found_the_strongest_first() -> None:

@@ -8,43 +8,46 @@ from dataclasses import dataclass
 from typing import Literal
 
 VETOES = {
-    "no-magnet": "No magnet was described: what is only assumed forbids every lift.",
-    "map-too-old": "The place was last seen longer ago than the settings allow, or nobody knows when.",
+    "no-magnet": "No magnet is described; an assumed one forbids every lift.",
+    "map-too-old": "The place was last seen longer ago than the settings allow, or at an unknown time.",
     "disturbed": "A lift, a set-down or a magnet came near after the place was last seen.",
-    "map-from-the-future": "The last frame is ahead of this computer's clock: ages can't be told.",
-    "calibration-changed": "The calibration changed since map or magnet's offset, or isn't valid any more.",
-    "calibration-drift": "The cameras' calibration doesn't fit the pictures any more.",
-    "trajectory-degraded": "Trajectory or encoders aren't as sure as the magnet needs, near it or at all.",
+    "map-from-the-future": "The last frame is ahead of this computer's clock, so its age is unknown.",
+    "calibration-changed": "The calibration of map or magnet's offset changed since, or has expired.",
+    "calibration-drift": "The cameras' calibration no longer fits the pictures.",
+    "trajectory-degraded": "The trajectory or the encoders are less accurate than the magnet needs.",
     "live-state": "The live run ended without a sensor that lifts need.",
-    "units-doubtful": "A sensor's numbers are of a size that can't be: a wrong unit.",
-    "mounting-doubtful": "Gravity or the floor contradict how rig, IMU and encoders are said to be mounted.",
-    "stock-list": "The stock list says another bundle than the one that was found.",
-    "one-view": "One frame made the map: no height is confirmed by another.",
-    "no-yard-frame": "The map isn't in the crane's yard frame, so the crane can't go there.",
-    "no-lift-area": "The magnet or the load reaches into a place where the settings allow no lift.",
-    "no-bundle": "No bundle lies under the footprint within the magnet's reach.",
-    "unknown-under-footprint": "Under or beside the magnet a place is neither seen nor proven free by sight.",
+    "units-doubtful": "A sensor's readings have an impossible magnitude; the unit is probably wrong.",
+    "mounting-doubtful": "Gravity or the floor contradicts the stated mounting of rig, IMU or encoders.",
+    "stock-list": "The stock list and the measured bundle disagree.",
+    "one-view": "The map was made by a single frame, so no height is confirmed by a second one.",
+    "no-yard-frame": "The map isn't in the crane's yard frame, so the crane can't find the place.",
+    "no-lift-area": "The magnet or the load enters an area where the settings allow no lift.",
+    "no-bundle": "No known bundle is under the poles within the magnet's reach.",
+    "unknown-under-footprint": "A place under or beside the magnet was neither seen nor proven free.",
     "unexplained-surface": "Something under the poles, within reach, belongs to no known bundle.",
-    "bundle-doubtful": "The bundle is less sure than the settings ask.",
-    "covered": "Something lies on the bundle, or whether something does isn't known.",
-    "thin-bar": "The pictures show a line across the load, or a line or an edge across a neighbour that may "
-    "reach under the magnet, or can't show one.",
-    "straddles-neighbour": "The footprint reaches over more bundles than are to be lifted.",
-    "count-uncertain": "How many bundles the magnet would take isn't sure enough.",
-    "narrow-tolerance": "Within the crane's own tolerance the lift would not stay as checked.",
-    "obstructed": "Something stands above the faces' plane under the magnet or beside it.",
-    "tilt": "The faces don't lie: they slope too much, or rest beside their middle and tip.",
-    "gap": "A pole hangs above the steel, too little of the faces lies on it, or a label holds one off.",
-    "weak-pull": "The lower bound of the pull is less than the load's weight times the safety factor.",
-    "mass-unknown": "The mass can't be told from what was seen.",
-    "overweight": "The load's upper bound is more than the magnet or the crane may carry.",
+    "bundle-doubtful": "The bundle's confidence is below the setting.",
+    "covered": "Something lies or may lie on the bundle.",
+    "thin-bar": "The pictures show a line across the load, or across a neighbour and towards the "
+    "magnet, that may be a thin bar; or they are too coarse to show one.",
+    "straddles-neighbour": "The magnet would take more bundles than are to be lifted.",
+    "count-uncertain": "The number of bundles that the magnet would take is too uncertain.",
+    "narrow-tolerance": "A check fails elsewhere within the crane's tolerance.",
+    "obstructed": "Something stands above the plane of the faces, under or beside the magnet.",
+    "tilt": "The faces slope too much along the beam, or touch too far beside their middle.",
+    "gap": "A pole is too far above the steel, too little of the faces touches it, a label is between "
+    "them, or the height of the steel is too uncertain.",
+    "weak-pull": "The lower bound of the pull, in all or at one pole, is less than the load times the "
+    "safety factor needs.",
+    "mass-unknown": "The mass can't be determined from what was seen.",
+    "overweight": "The upper bound of the load's mass is more than the magnet or the crane may carry.",
     "off-centre": "The magnet's centre is too far from the load's centre of mass.",
     "overhang": "The bars reach too far beyond the outermost pole and would sag.",
-    "end-open": "An end of the bundle was not seen: length, mass and balance are not known.",
-    "overhanging": "The bundle lies over the edge of what carries it.",
-    "unstable-side": "A neighbour may follow this bundle, or what carries it shows on neither side.",
-    "no-support": "What should carry the bundle isn't there, as far as can be seen.",
-    "over-stanchion": "The bundle stands higher than the stanchions allow.",
+    "end-open": "An end of the bundle was not seen, so its length, mass and balance are unknown.",
+    "overhanging": "The bundle extends too far beyond what carries it.",
+    "unstable-side": "The side of the pile leans, a neighbour may slide after this bundle, or nothing that "
+    "carries it is visible.",
+    "no-support": "The bundle's middle is beyond what carries it, as far as can be seen.",
+    "over-stanchion": "The bundle is too high for the stanchion beside it.",
 }
 """Code to what it means; a test trips each."""
 
@@ -131,5 +134,5 @@ def _checked(
         return check("passed", "")
     if sign * value <= sign * bound:
         of = f"{1.96 * sigma:.3g} {unit}".rstrip()
-        reason = f"{reason}, but the figure is known to ±{of} (95 %) only"
+        reason = f"{reason}; the value is within its uncertainty of ±{of} (95 %) of the limit"
     return check("failed", reason)

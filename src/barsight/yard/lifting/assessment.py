@@ -186,8 +186,8 @@ def assess_placement(
     scale = 0.0
     if search and not vetoes_of(checks):
         scale, end = _tolerance(place, yard, magnet, near, held, needed, contact, settings)
-        reason = f"within the crane's tolerance {end}"
-        what = "the box within which the lift stays as checked, over the crane's tolerance"
+        reason = f"elsewhere within the crane's tolerance: {end}"
+        what = "size of the box in which all checks pass, relative to the crane's tolerance"
         checks.append(check_min("narrow-tolerance", what, scale, SCALES[0], "", reason))
     least = float(np.min([scale if search else math.inf, worst]))
     return Lift(
@@ -346,5 +346,5 @@ def _change(
             return obstacle.reason
         there = _grip(moved, yard.heights, magnet, exact.tolerance, near, contact)
         if there.gripped != held.gripped:
-            return f"it takes {len(there.gripped)} bundles"
+            return f"the magnet would take {len(there.gripped)} bundles"
     return ""

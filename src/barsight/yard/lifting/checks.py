@@ -50,25 +50,27 @@ def count_checks(
         unknown_check(contact, settings),
         check_min(
             "no-bundle", "bundles under the poles within reach", count, 1, "",
-            "no known bundle lies under the poles within reach",
+            "no known bundle is within reach of the poles",
         ),
         check_max(
-            "straddles-neighbour", "bundles that the footprint takes", count, wanted, "",
-            f"the footprint takes {count} bundles ({ids}), not {wanted}",
+            "straddles-neighbour", "bundles that the magnet would take", count, wanted, "",
+            f"the magnet would take {count} bundles ({ids}) instead of {wanted}",
         ),
     ]  # fmt: skip
     if 0 < count < wanted:
-        reason = f"the footprint takes {count} bundles, {wanted} are asked for"
-        checks.append(check_min("count-uncertain", "bundles that are taken", count, wanted, "", reason))
+        reason = f"the magnet would take {count} of the {wanted} requested bundles"
+        checks.append(
+            check_min("count-uncertain", "bundles that the magnet would take", count, wanted, "", reason)
+        )
     elif near.bundles:
-        why = f": bundle {near.bundles[int(np.argmax(held.flips))].id} may be in or out"
+        why = f"; it is unsure whether bundle {near.bundles[int(np.argmax(held.flips))].id} is taken"
         checks.append(probability_check(held.probability, count, settings, why))
     shares = _unexplained(place, heights, magnet, near, contact, held)
     checks.append(
         check_max(
-            "unexplained-surface", "part within the poles' reach that belongs to no known bundle", shares[0],
-            settings.max_unexplained_ratio, "", f"{100 * shares[1]:.0f} % of what lies within reach of the "
-            "poles belongs to no known bundle", sigma=shares[1] - shares[0],
+            "unexplained-surface", "share of the surface within reach outside known bundles", shares[0],
+            settings.max_unexplained_ratio, "", f"{100 * shares[1]:.0f} % of the surface within reach of "
+            "the poles belongs to no known bundle", sigma=shares[1] - shares[0],
         )
     )  # fmt: skip
     return checks
@@ -77,8 +79,8 @@ def count_checks(
 def unknown_check(contact: Contact, settings: LiftSettings) -> Check:
     """Check that enough was seen under each pole."""
     share, most = contact.unknown_share, settings.max_unknown_ratio
-    reason = f"{100 * share:.0f} % of the cells under a pole were not seen, {100 * most:.0f} % are allowed"
-    what = "unseen part of the cells under the worst pole"
+    reason = f"{100 * share:.0f} % of the cells under a pole were not seen; the limit is {100 * most:.0f} %"
+    what = "share of unseen cells under the worst pole"
     return check_max("unknown-under-footprint", what, share, most, "", reason, sigma=UNKNOWN_SIGMA)
 
 
@@ -88,10 +90,16 @@ def probability_check(probability: float, count: int, settings: LiftSettings, wh
         NormalDist().inv_cdf(min(max(p, 1e-12), 1 - 1e-12))
         for p in (probability, settings.min_count_probability)
     )
-    reason = f"a count of {count} has the probability {probability:.4f} only{why}"
+    reason = f"the probability that exactly {count} are taken is only {probability:.4f}{why}"
     bound = asked / (1 + SURE_OF_SIGMA)
     return check_min(
-        "count-uncertain", "how sure the count is", sure, bound, "sigma", reason, sigma=SURE_OF_SIGMA * bound
+        "count-uncertain",
+        "probability of the count, as a normal quantile",
+        sure,
+        bound,
+        "sigma",
+        reason,
+        sigma=SURE_OF_SIGMA * bound,
     )
 
 
@@ -108,10 +116,10 @@ def area_checks(
         size = one.width_m + wide, one.length_m + long
         outlines.append((np.array([one.x_m, one.y_m]), one.yaw_rad, size))
     reached = [area for one in outlines for area in reached_areas(*one, magnet.tolerance, settings)]
-    what = "magnet and load keep out of no-lift areas"
+    what = "magnet and load stay outside the no-lift areas"
     return [
         check_true(
-            "no-lift-area", what, area not in reached, "magnet or load reaches into the no-lift area from "
+            "no-lift-area", what, area not in reached, "the magnet or the load enters the no-lift area from "
             f"{area[0]:g}, {area[1]:g} to {area[2]:g}, {area[3]:g} m",
         )
         for area in settings.no_lift_areas
@@ -130,45 +138,46 @@ def face_checks(
     share = shown * contact.contact_share
     held = roll >= (1 - 1e-3) * limits.roll_deg
     aside = (
-        f"the faces rest {1e3 * contact.rests_off_m:.0f} mm beside their middle and "
-        f"{'would lean further than' if held else 'lean nearly by'} the {limits.roll_deg:g} deg that the "
-        "suspension allows"
+        f"the faces would touch {1e3 * contact.rests_off_m:.0f} mm beside their middle, tilted by "
+        f"{'more than' if held else 'nearly'} the {limits.roll_deg:g} deg that the suspension allows"
     )
     if not held:
-        aside += ": the lean lies within its sigma of the limit"
+        aside += "; the tilt is within its sigma of the limit"
     needed = (
-        f"{needed_n / 1e3:.1f} kN are needed" if math.isfinite(needed_n) else "the load's weight is not known"
+        f"{needed_n / 1e3:.1f} kN are needed"
+        if math.isfinite(needed_n)
+        else "the weight of the load is unknown"
     )
     return [
         check_max(
             "tilt", "slope of the faces along the beam", pitch, limits.pitch_deg, "deg",
-            f"the faces slope by {pitch:.1f} deg along the beam, {limits.pitch_deg:g} are allowed",
+            f"the faces slope by {pitch:.1f} deg along the beam; the limit is {limits.pitch_deg:g} deg",
             sigma=math.degrees(sigma / magnet.half_span_m),
         ),
         check_max(
-            "tilt", "how far beside their middle the faces rest, leaning as far as the suspension lets them",
+            "tilt", "distance from the faces' middle to where they touch, at the suspension's limit of tilt",
             1e3 * contact.rests_off_m, 1e3 * MAX_ASIDE_RATIO * narrowest, "mm", aside,
             sigma=0.0 if contact.rests_off_m == 0 else 1e3 * EDGE_M / 2,
         ),
         check_max(
-            "gap", "least gap of the pole that is furthest from steel",
+            "gap", "smallest gap under the pole that is furthest from the steel",
             1e3 * gap if math.isfinite(gap) else math.nan, 1e3 * limits.gap_m, "mm",
-            f"a pole hangs {1e3 * gap:.0f} mm above the steel, {1e3 * limits.gap_m:.0f} mm are allowed"
-            if math.isfinite(gap) else "under one of the poles no steel is known", sigma=1e3 * sigma,
+            f"a pole is {1e3 * gap:.0f} mm above the steel; the limit is {1e3 * limits.gap_m:.0f} mm"
+            if math.isfinite(gap) else "no steel is known under one of the poles", sigma=1e3 * sigma,
         ),
         check_max(
-            "gap", "how well the map knows the faces' height (95 %)", 1e3 * UPPER * contact.sigma_m,
-            1e3 * MAX_HEIGHT_ERROR_M, "mm", "the map knows the height under the faces to "
-            f"{1e3 * UPPER * contact.sigma_m:.0f} mm (95 %), {1e3 * MAX_HEIGHT_ERROR_M:.0f} mm are allowed",
+            "gap", "uncertainty of the height under the faces (95 %)", 1e3 * UPPER * contact.sigma_m,
+            1e3 * MAX_HEIGHT_ERROR_M, "mm", "the height under the faces is uncertain by "
+            f"{1e3 * UPPER * contact.sigma_m:.0f} mm (95 %); the limit is {1e3 * MAX_HEIGHT_ERROR_M:.0f} mm",
         ),
         check_min(
-            "gap", "part of the faces that lies on steel", high, limits.contact_share, "",
-            f"only {100 * share:.0f} % of the faces count as lying on steel, "
+            "gap", "share of the faces in contact with steel", high, limits.contact_share, "",
+            f"only {100 * share:.0f} % of the faces count as in contact with steel; "
             f"{100 * limits.contact_share:.0f} % are needed", sigma=high - low,
         ),
         check_min(
             "weak-pull", "pull on the load", contact.pull_n, needed_n, "N",
-            f"the pull is at least {contact.pull_low_n / 1e3:.1f} kN, {needed}",
+            f"the lower bound of the pull is {contact.pull_low_n / 1e3:.1f} kN; {needed}",
             sigma=(contact.pull_n - contact.pull_low_n) / UPPER, sigmas=UPPER,
         ),
     ]  # fmt: skip
@@ -186,17 +195,18 @@ def load_checks(
         return []
     checks = [check for bundle in load for check in _bundle_checks(bundle, settings)]
     known = not math.isnan(mass.kg)
-    reason = "number or diameter of the bars is not known"
+    reason = "the number or the diameter of the bars is unknown"
     checks.append(check_true("mass-unknown", "mass of the load", known or None, reason))
     for carrier, most in (
         ("magnet", magnet.capacity_kg),
         ("crane beside the magnet", magnet.crane_capacity_kg - magnet.own_mass_kg),
     ):
         if known:
-            reason = f"the load may weigh {mass.upper_kg:.0f} kg, the {carrier} carries {most:.0f}"
+            reason = f"the load may weigh {mass.upper_kg:.0f} kg; the {carrier} carries {most:.0f} kg"
             checks.append(
-                check_max("overweight", f"load against what the {carrier} carries", mass.kg, most, "kg",
-                           reason, sigma=mass.sigma_kg, sigmas=UPPER)
+                check_max("overweight", f"mass of the load against the capacity of the {carrier}", mass.kg,
+                           most,
+                           "kg", reason, sigma=mass.sigma_kg, sigmas=UPPER)
             )  # fmt: skip
     limits = magnet.limits
     for name, offset, most, sigma in (
@@ -204,25 +214,25 @@ def load_checks(
         ("across", offset_m[1], limits.offset_across_m, max(_known(b.sigma.lateral_m) for b in load)),
     ):
         reason = (
-            f"the magnet's centre is {1e3 * abs(offset):.0f} mm {name} the bars from the load's, "
-            f"{1e3 * most:.0f} mm are allowed"
+            f"the magnet's centre is {1e3 * abs(offset):.0f} mm {name} the bars from the load's centre; "
+            f"the limit is {1e3 * most:.0f} mm"
         )
-        what = f"the magnet's centre {name} the bars from the load's"
+        what = f"distance {name} the bars between the centres of magnet and load"
         checks.append(
             check_max("off-centre", what, 1e3 * abs(offset), 1e3 * most, "mm", reason, sigma=1e3 * sigma)
         )
     upper = overhang_m[0] + UPPER * overhang_m[1]
-    reason = f"the bars reach {upper:.2f} m beyond the outermost pole, {limits.overhang_m:g} m are allowed"
+    reason = f"the bars extend {upper:.2f} m beyond the outermost pole; the limit is {limits.overhang_m:g} m"
     checks.append(
-        check_max("overhang", "bars beyond the outermost pole", overhang_m[0], limits.overhang_m, "m",
-                   reason, sigma=overhang_m[1], sigmas=UPPER)
+        check_max("overhang", "length of the bars beyond the outermost pole", overhang_m[0],
+                   limits.overhang_m, "m", reason, sigma=overhang_m[1], sigmas=UPPER)
     )  # fmt: skip
     return checks
 
 
 def _bundle_checks(bundle: Bundle, settings: LiftSettings) -> list[Check]:
     covered = bundle.on_top is False
-    what = f"{'something lies' if covered else 'it is not known what lies'} on bundle {bundle.id}"
+    what = f"{'something lies' if covered else 'something may lie'} on bundle {bundle.id}"
     if bundle.on_top and bundle.cover_doubts:
         what += f": {bundle.cover_doubts[0].sentence}"
     ends = " and ".join(e for e, o in zip(ENDS, bundle.ends_open, strict=True) if o)
@@ -232,13 +242,14 @@ def _bundle_checks(bundle: Bundle, settings: LiftSettings) -> list[Check]:
             True if bundle.is_free else False if covered else None, what,
         ),
         check_min(
-            "bundle-doubtful", f"how sure bundle {bundle.id} is", bundle.confidence, settings.min_confidence,
-            "", f"bundle {bundle.id} is {100 * bundle.confidence:.0f} % sure: "
+            "bundle-doubtful", f"confidence of bundle {bundle.id}", bundle.confidence,
+            settings.min_confidence, "",
+            f"the confidence of bundle {bundle.id} is {100 * bundle.confidence:.0f} %: "
             + ("; ".join(doubt.sentence for doubt in bundle.reasons) or "no reason is given"),
         ),
         check_true(
             "end-open", f"both ends of bundle {bundle.id} were seen", None if ends else True,
-            f"the {ends} end of bundle {bundle.id} was not seen: length, mass and balance are not known",
+            f"the {ends} end of bundle {bundle.id} was not seen, so its length, mass and balance are unknown",
         ),
     ]  # fmt: skip
 

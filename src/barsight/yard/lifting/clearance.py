@@ -94,10 +94,10 @@ def clearance_checks(
     sigma = 1e3 * contact.gap_sigma_m
     checks = []
     for code, what, bound_mm in (
-        ("obstructed", "what stands highest above the faces' plane, under the magnet or beside it",
+        ("obstructed", "highest object above the plane of the faces, under or beside the magnet",
          1e3 * MAX_RISE_M),
-        ("unknown-under-footprint", "the widest place under the magnet or beside it that was neither seen "
-         f"nor proven free; beside the load {1e3 * MAX_HOLE_BESIDE_M:.0f} mm are allowed", 1e3 * MAX_HOLE_M),
+        ("unknown-under-footprint", "widest place under or beside the magnet that was neither seen nor "
+         f"proven free; beside the load the limit is {1e3 * MAX_HOLE_BESIDE_M:.0f} mm", 1e3 * MAX_HOLE_M),
     ):  # fmt: skip
         if obstacle is None or obstacle.code != code:
             unknown = obstacle is not None and code == "unknown-under-footprint"
@@ -106,7 +106,7 @@ def clearance_checks(
             continue
         reason = obstacle.reason
         if find_obstacle(place, heights, magnet, faces, load, careful=False) is None:
-            reason += "; it lies within its sigma of the limit"
+            reason += "; the value is within its sigma of the limit"
         checks.append(Check(code, what, obstacle.value_mm, sigma, obstacle.bound_mm, "mm", "failed", reason))
     return checks
 
@@ -215,9 +215,9 @@ def resting_checks(
     sigma = 1e3 * float(sigmas.max())
     return [
         check_max(
-            "obstructed", "how far a face surely rests above the load's top", highest - sigma,
-            1e3 * MAX_RISE_M, "mm", f"a face rests at least {highest:.0f} mm above the load's top, "
-            f"{1e3 * MAX_RISE_M:.0f} mm are allowed: something lies between", sigma=sigma,
+            "obstructed", "lower bound of the height of a face above the load's top", highest - sigma,
+            1e3 * MAX_RISE_M, "mm", f"a face would rest at least {highest:.0f} mm above the load's "
+            f"top, so something lies between them; the limit is {1e3 * MAX_RISE_M:.0f} mm", sigma=sigma,
         )
     ]  # fmt: skip
 
@@ -235,9 +235,9 @@ def leaning_checks(
     rise = 1e3 * float((_tops(place, magnet, load) - contact.z_m + down).max())
     return [
         check_max(
-            "obstructed", "how far the load's top stands above the faces where they lean lowest", rise,
-            1e3 * MAX_TOP_RISE_M, "mm", f"the load's top stands {rise:.0f} mm above the faces where they "
-            f"lean lowest within the crane's tolerance, {1e3 * MAX_TOP_RISE_M:.0f} mm are allowed",
+            "obstructed", "height of the load's top above the lowest edge of the tilted faces", rise,
+            1e3 * MAX_TOP_RISE_M, "mm", f"the load's top is {rise:.0f} mm above the lowest edge of the "
+            f"tilted faces, within the crane's tolerance; the limit is {1e3 * MAX_TOP_RISE_M:.0f} mm",
             sigma=1e3 * contact.gap_sigma_m,
         )
     ]  # fmt: skip
@@ -269,8 +269,8 @@ def _obstructed(rise: Float32, spare: Float32, region: Region) -> Obstacle | Non
             _, ((along, across),) = region.places(at)
             rise_mm, bound_mm = (1e3 * float(least + spare[at]) for least in (smooth[at], allowed_m))
             reason = (
-                f"something stands {rise_mm:.0f} mm above the faces' plane, {along:+.2f} m along and "
-                f"{across:+.2f} m across the beam, {bound_mm:.0f} mm are allowed"
+                f"something stands {rise_mm:.0f} mm above the plane of the faces, {along:+.2f} m along and "
+                f"{across:+.2f} m across the beam; the limit is {bound_mm:.0f} mm"
             )
             return Obstacle("obstructed", reason, rise_mm, bound_mm, region.places(np.nonzero(large))[0])
     return None
@@ -297,8 +297,8 @@ def _unseen(blocked: UInt8, beside: Bool, region: Region) -> Obstacle | None:
     area_m2 = STEP_M**2 * len(grid)
     bound_m = MAX_HOLE_BESIDE_M if beside[largest].all() else MAX_HOLE_M
     reason = (
-        f"{1e4 * area_m2:.0f} cm2 under the magnet or beside it were not seen, around "
-        f"{along:+.2f} m along and {across:+.2f} m across the beam: what is not known counts as an obstacle"
+        f"{1e4 * area_m2:.0f} cm² under or beside the magnet were not seen, around "
+        f"{along:+.2f} m along and {across:+.2f} m across the beam; unknown places count as obstacles"
     )
     width_mm = 1e3 * max(bound_m, math.sqrt(area_m2))
     places = region.places(np.nonzero(hidden))[0]

@@ -55,10 +55,10 @@ def label_checks(place: Placement, heights: HeightMap, magnet: Magnet, plane: Fa
     reason = ""
     if found is not None:
         reason = (
-            f"a label or another bright plate lies under a face, {found[0]:+.2f} m along and "
+            f"a label or another bright plate is under a face, {found[0]:+.2f} m along and "
             f"{found[1]:+.2f} m across the beam: it would hold the faces off the bars"
         )
-    return [check_true("gap", "no label lies under a face", found is None, reason)]
+    return [check_true("gap", "no label is under a face", found is None, reason)]
 
 
 def find_label(

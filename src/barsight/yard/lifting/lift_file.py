@@ -64,10 +64,12 @@ def forbidden_since(
     found, target = [], record["target"]
     until_ns, seen_ns = record["valid_until_ns"], record["valid_from_ns"]
     if (until_ns or 0) < now_ns:
-        found.append(Veto("map-too-old", "the lift was valid once, it isn't any more"))
+        found.append(Veto("map-too-old", "the lift is no longer valid"))
     elif is_ahead(seen_ns, now_ns):
         found.append(
-            Veto("map-from-the-future", "the frames are ahead of this computer's clock: set the clocks")
+            Veto(
+                "map-from-the-future", "the frames are ahead of this computer's clock: synchronise the clocks"
+            )
         )
     magnet = cattrs.structure(content["magnet"], Magnet)
     settings = cattrs.structure(content["settings"], LiftSettings)

@@ -111,7 +111,7 @@ def travel_height(
     if not math.isfinite(highest):
         return Failed(
             "unseen-way",
-            f"the way of bundle {load.bundles[0]} passes over places that were not seen: measure them, or "
+            f"the path of bundle {load.bundles[0]} passes over places that were not seen: measure them, or "
             "give max_stack_m, the most that may stand there",
         )
     return highest + settings.travel_clear_m

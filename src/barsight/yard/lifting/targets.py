@@ -87,9 +87,14 @@ def map_vetoes(
     """
     vetoes = [Veto(FORBIDS[code], text) for code, text in warnings if code in FORBIDS]
     if reference != "yard":
-        vetoes.append(Veto("no-yard-frame", f"the map is in the {reference} frame: no crane gave its place"))
+        vetoes.append(
+            Veto(
+                "no-yard-frame",
+                f"the map is in the {reference} frame, because no crane position was recorded",
+            )
+        )
     if not has_magnet:
-        vetoes.append(Veto("no-magnet", "no magnet was described: give its file as magnet"))
+        vetoes.append(Veto("no-magnet", "no magnet is described: give its file with --magnet"))
     return (*vetoes, *vetoes_of(age_checks(captured_to_ns, now_ns, settings)))
 
 
@@ -103,7 +108,9 @@ def offset_vetoes(magnet: Magnet, calibration_id: str, yard_frame_id: str | None
         ("yard frame", offset.yard_frame_id, yard_frame_id),
     ):
         if own != here:
-            reason = f"the magnet's offset is of another {what} ({own}; the map has {here}): touch down again"
+            reason = (
+                f"the magnet's offset belongs to another {what} ({own}; the map has {here}): touch down again"
+            )
             return (Veto("calibration-changed", reason),)
     return ()
 

@@ -39,26 +39,26 @@ def thin_bar_checks(
     """
     if not load or not has_pictures(heights, pixel_m):
         return []
-    what = "strength of the strongest line across the load that is no strap"
+    what = "strength of the strongest line across the load that isn't a strap"
     if line is None:
         reason = "no photo shows whether a thin bar lies across the load: measure the recording again"
         return [check_true(CODE, what, None, reason)]
     reason = (
-        f"a line runs across the load {line.along_m:+.2f} m along it from its middle, "
-        f"{abs(line.askew_deg):.0f} deg askew: a thin bar may lie there"
+        f"a line crosses the load {line.along_m:+.2f} m along it from its middle, "
+        f"{abs(line.askew_deg):.0f} deg askew, and may be a thin bar"
     )
     checks = [check_max(CODE, what, line.strength, MAX_STRENGTH, "sigma", reason)]
     if pixel_m is not None:
         hidden_m = FOUND_PX * max(pixel_m, heights.cell_m)
         reason = (
-            f"a bar of {1e3 * hidden_m:.0f} mm across the load may not show in the pictures, "
-            f"{1e3 * settings.max_hidden_bar_m:.0f} mm are allowed"
+            f"a bar of up to {1e3 * hidden_m:.0f} mm across the load may not show in the pictures; "
+            f"the limit is {1e3 * settings.max_hidden_bar_m:.0f} mm"
             if math.isfinite(hidden_m)
-            else "how fine the pictures are is not known: measure again"
+            else "the resolution of the pictures is unknown: measure again"
         )
         checks.append(
             check_max(
-                CODE, "thickest bar across the load that the pictures may not show", 1e3 * hidden_m,
+                CODE, "thickest bar across the load that may not show in the pictures", 1e3 * hidden_m,
                 1e3 * settings.max_hidden_bar_m, "mm", reason,
             )
         )  # fmt: skip
@@ -74,7 +74,7 @@ def edge_checks(beside: Iterable[Bundle]) -> list[Check]:
     """Check that no edge runs over a flank of a neighbour from which a bar may come under the magnet: how far
     what has that edge reaches beyond the flank isn't known.
     """
-    what = "nothing that has an edge over a neighbour's flank reaches under the magnet"
+    what = "nothing with an edge over a neighbour's flank extends under the magnet"
     return [
         check_true(CODE, what, None, f"beside the load, on bundle {bundle.id}, {doubt.sentence}")
         for bundle in beside for doubt in bundle.cover_doubts if doubt.kind is DoubtKind.CROSSING_EDGE
@@ -98,7 +98,7 @@ def beside_checks(
         under = (np.abs(way @ place.along) <= half[0]) & (np.abs(way @ place.across) <= half[1])
         return bool(under.any())
 
-    what = "strength of the strongest line across a neighbour that runs on to under the magnet"
+    what = "strength of the strongest line across a neighbour that extends under the magnet"
     checks, strongest, where = [], 0.0, ""
     for bundle, lines in near:
         if lines is None:
@@ -110,10 +110,8 @@ def beside_checks(
         for line in lines:
             if line.strength > strongest and reaches(bundle, line):
                 strongest = line.strength
-                where = (
-                    f"a line runs across bundle {bundle.id} {line.along_m:+.2f} m along it from its middle"
-                )
-    reason = f"{where}: a thin bar may reach from there under the magnet"
+                where = f"a line crosses bundle {bundle.id} {line.along_m:+.2f} m along it from its middle"
+    reason = f"{where}: a thin bar there may extend under the magnet"
     return [*checks, check_max(CODE, what, strongest, MAX_STRENGTH, "sigma", reason)]
 
 

@@ -183,17 +183,17 @@ def travel_checks(travel: Travel, place: Placement, magnet: Magnet, settings: Li
     """Check that the map's place and height are sure enough for this lift."""
     here = np.array([place.x_m, place.y_m])
     near = np.linalg.norm(travel.place_m - here, axis=1) < travel.reach_m
-    reason = f"no frame was placed within {travel.reach_m:.1f} m of it"
-    checks = [check_true(CODE, "frames were placed near it", bool(near.any()), reason)]
+    reason = f"no frame was located within {travel.reach_m:.1f} m of the lift"
+    checks = [check_true(CODE, "frames were located near the lift", bool(near.any()), reason)]
     if near.any():
         checks += _sure_enough(_near_sigma(travel, near), magnet)
         refused = int((np.linalg.norm(travel.refused_m - here, axis=1) < travel.reach_m).sum())
         seen = refused + int(near.sum())
         reason = (
-            f"{refused} of {seen} frames that see it were refused, "
-            f"{100 * settings.max_refused_ratio:.0f} % are allowed"
+            f"{refused} of {seen} frames near the lift were refused; "
+            f"the limit is {100 * settings.max_refused_ratio:.0f} %"
         )
-        what = "refused part of the frames that see it"
+        what = "share of refused frames near the lift"
         checks.append(check_max(CODE, what, refused / seen, settings.max_refused_ratio, "", reason))
     return [*checks, *_encoder_checks(travel, place, min(magnet.tolerance.x_m, magnet.tolerance.y_m))]
 
@@ -224,14 +224,14 @@ def _encoder_checks(travel: Travel, place: Placement, max_m: float) -> list[Chec
     if passing.any():
         worst = int(np.argmax(np.where(passing, excess, -np.inf)))
         checks.append((worst, "beside the lift", "encoders and map disagree by "
-                       f"{1e3 * travel.off_m[worst]:.0f} mm within {ALONGSIDE_M:g} m of it, "
-                       f"{1e3 * max_m:.0f} mm are allowed"))  # fmt: skip
-    checks.append((last, "at the end of the way", f"at the end of the way encoders and map disagreed by "
-                   f"{1e3 * travel.off_m[last]:.0f} mm: the crane would go beside its target, "
-                   f"{1e3 * max_m:.0f} mm are allowed"))  # fmt: skip
+                       f"{1e3 * travel.off_m[worst]:.0f} mm within {ALONGSIDE_M:g} m of the lift; "
+                       f"the limit is {1e3 * max_m:.0f} mm"))  # fmt: skip
+    checks.append((last, "at the end of the travel", f"encoders and map disagree by "
+                   f"{1e3 * travel.off_m[last]:.0f} mm at the end of the travel, so the crane would miss its "
+                   f"target; the limit is {1e3 * max_m:.0f} mm"))  # fmt: skip
     return [
-        check_max(CODE, f"what surely parts encoders and map {where}", 1e3 * float(excess[frame]),
-                   1e3 * max_m, "mm", reason)
+        check_max(CODE, f"lower bound of the disagreement of encoders and map {where}",
+                   1e3 * float(excess[frame]), 1e3 * max_m, "mm", reason)
         for frame, where, reason in checks
     ]  # fmt: skip
 
@@ -240,14 +240,14 @@ def _sure_enough(sigma: Float64, magnet: Magnet) -> list[Check]:
     """Check that the 95 % bound of the map's place is within the crane's tolerance, its height's within the
     gap; of both with that of the magnet's offset, where it is known.
     """
-    known = "the trajectory knows"
+    source = "trajectory"
     if magnet.offset is not None:
-        sigma, known = np.hypot(sigma, magnet.offset.sigma_m), "trajectory and touch-downs know"
+        sigma, source = np.hypot(sigma, magnet.offset.sigma_m), "trajectory and touch-downs"
     return [
         check_max(
-            CODE, f"how well {known} {name} near it (95 %)", 1e3 * UPPER * float(one),
-            1e3 * most, "mm", f"near it {known} {name} to {1e3 * UPPER * one:.0f} mm (95 %), "
-            f"{1e3 * most:.0f} mm are allowed",
+            CODE, f"uncertainty of {name} near the lift (95 %), by {source}", 1e3 * UPPER * float(one),
+            1e3 * most, "mm", f"{name} near the lift is uncertain by {1e3 * UPPER * one:.0f} mm (95 %, "
+            f"{source}); the limit is {1e3 * most:.0f} mm",
         )
         for name, one, most in (
             ("x", sigma[0], magnet.tolerance.x_m),

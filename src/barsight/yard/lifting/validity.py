@@ -151,18 +151,18 @@ def age_checks(captured_to_ns: int | None, now_ns: int, settings: LiftSettings) 
     1970.
     """
     if captured_to_ns is None:
-        reason = "when it was last seen is not known"
+        reason = "the time when the place was last seen is unknown"
         return [check_true("map-too-old", "age of what was seen", None, reason)]
     age_ns, max_age_ns = now_ns - captured_to_ns, seconds_to_ns(settings.max_age_s)
     return [
         check_min(
             "map-from-the-future", "age by this computer's clock", age_ns / NS_PER_S,
             -MAX_CLOCK_ERROR_NS / NS_PER_S, "s",
-            f"the last frame is {_span(-age_ns)} ahead of this computer's clock: set the clocks",
+            f"the last frame is {_span(-age_ns)} ahead of this computer's clock: synchronise the clocks",
         ),
         check_max(
             "map-too-old", "age of what was seen", age_ns / NS_PER_S, settings.max_age_s, "s",
-            f"what it depends on was last seen {_span(age_ns)} ago, {_span(max_age_ns)} are allowed",
+            f"the place was last seen {_span(age_ns)} ago; the limit is {_span(max_age_ns)}",
         ),
     ]  # fmt: skip
 
@@ -181,10 +181,10 @@ def disturbed_checks(
     for event in since:
         away = min(gap_between(outline, event.corners_m) for outline in outlines)
         reason = (
-            f"a {event.kind} at {event.x_m:.2f}, {event.y_m:.2f} m, {away:.2f} m from it, came after it was "
-            f"last seen; {settings.disturbed_reach_m:g} m are needed: measure again"
+            f"a {event.kind} at {event.x_m:.2f}, {event.y_m:.2f} m, {away:.2f} m away, came after the place "
+            f"was last seen; at least {settings.disturbed_reach_m:g} m are needed: measure again"
         )
-        what = f"distance from a {event.kind} since it was last seen"
+        what = f"distance to a {event.kind} since the place was last seen"
         checks.append(check_min("disturbed", what, away, settings.disturbed_reach_m, "m", reason))
     return sorted(checks, key=lambda check: check.value or 0.0)[:1]
 

@@ -212,13 +212,13 @@ def share_checks(weakest: WeakestPole | None, worst_bundle: float = math.inf) ->
     pull, share = weakest.pull_low_n / 1e3, weakest.share_n / 1e3
     checks = [
         check_min(
-            "weak-pull", "lower bound of the worst pole's pull over its share", weakest.ratio, 1.0,
-            "", f"pole {weakest.number} pulls at least {pull:.1f} kN, its share of what is needed is "
-            f"{share:.1f} kN",
+            "weak-pull", "lower bound of the worst pole's pull, relative to its share", weakest.ratio, 1.0,
+            "", f"the lower bound of pole {weakest.number}'s pull is {pull:.1f} kN; its share of the "
+            f"load needs {share:.1f} kN",
         )
     ]  # fmt: skip
     if worst_bundle < math.inf or math.isnan(worst_bundle):
-        what = "lower bound of the pull on the worst bundle over what it needs"
-        reason = f"one of the bundles is pulled by {worst_bundle:.2f} of what it needs, at least"
+        what = "lower bound of the pull on the worst bundle, relative to what it needs"
+        reason = f"the lower bound of the pull on one of the bundles is {worst_bundle:.2f} of what it needs"
         checks.append(check_min("weak-pull", what, worst_bundle, 1.0, "", reason))
     return checks

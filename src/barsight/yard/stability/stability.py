@@ -176,39 +176,42 @@ def footing_checks(
     limit = settings.max_overhang_ratio * target.width_m
     checks = [
         check_max(
-            "no-support", "how far what carries it ends before its edge", mm * over, mm * target.width_m / 2,
-            "mm", f"what carries it ends {mm * over:.0f} mm before its edge, its middle is not carried",
+            "no-support", "distance of the support's end from the bundle's edge", mm * over,
+            mm * target.width_m / 2, "mm",
+            f"what carries it ends {mm * over:.0f} mm before its edge: its middle is unsupported",
         )
     ]  # fmt: skip
     if checks[0].result == "passed":
         checks.append(
             check_max(
-                "overhanging", "how far it stands over the edge of what carries it", mm * over, mm * limit,
-                "mm", f"it stands {mm * over:.0f} mm over the edge of what carries it, {mm * limit:.0f} mm "
-                "are allowed", sigma=mm * _sure(target.sigma.width_m / 2) if over else 0.0, sigmas=UPPER,
+                "overhanging", "overhang beyond the edge of what carries it", mm * over, mm * limit,
+                "mm", f"it extends {mm * over:.0f} mm beyond what carries it; the limit is "
+                f"{mm * limit:.0f} mm", sigma=mm * _sure(target.sigma.width_m / 2) if over else 0.0,
+                sigmas=UPPER,
             )
         )  # fmt: skip
     checks.append(
         check_max(
             "unstable-side", "lean of the side of the pile below it", own.lean_deg, settings.max_lean_deg,
-            "deg", f"the side of the pile below it leans by {own.lean_deg:.1f} deg, "
-            f"{settings.max_lean_deg:g} are allowed",
+            "deg", f"the side of the pile below it leans by {own.lean_deg:.1f} deg; "
+            f"the limit is {settings.max_lean_deg:g} deg",
         )
     )  # fmt: skip
     checks += _column_checks(target, own)
     if not math.isnan(own.freeboard_m):
         checks.append(
             check_min(
-                "over-stanchion", "the lowest stanchion beside it over its top", mm * own.freeboard_m,
-                mm * settings.min_freeboard_m, "mm", f"the stanchion beside it is {mm * own.freeboard_m:.0f} "
-                f"mm above its top, {mm * settings.min_freeboard_m:.0f} mm are needed",
+                "over-stanchion", "height of the lowest stanchion beside it above its top",
+                mm * own.freeboard_m, mm * settings.min_freeboard_m, "mm",
+                f"the stanchion beside it is {mm * own.freeboard_m:.0f} "
+                f"mm above its top; {mm * settings.min_freeboard_m:.0f} mm are needed",
                 sigma=mm * _sure(target.sigma.top_z_m),
             )
         )  # fmt: skip
     for other in bundles:
         leaning = by_id[other.id]
         if lies_over_edge_of(other, target, leaning):
-            reason = f"bundle {other.id} stands {mm * leaning.overhang_m:.0f} mm over the edge on this side"
+            reason = f"bundle {other.id} extends {mm * leaning.overhang_m:.0f} mm over the edge on this side"
             checks += [
                 check_max("unstable-side", f"bundle {other.id} {what}", value, most, unit, reason)
                 for what, value, most, unit in (
@@ -238,9 +241,9 @@ def _column_checks(target: Bundle, own: Footing) -> list[Check]:
     sigma = math.hypot(MAX_COLUMN_RATIO * _sure(target.sigma.width_m), _sure(target.sigma.top_z_m))
     return [
         check_max(
-            "unstable-side", "how far both its sides fall sheer", mm * sheer, mm * most, "mm",
-            f"both its sides fall {mm * sheer:.0f} mm sheer, {mm * most:.0f} mm are as much as two bundles "
-            "on dunnage have: what carries it shows on neither side, as under a wall", sigma=mm * sigma,
+            "unstable-side", "vertical drop on both its sides", mm * sheer, mm * most, "mm",
+            f"both its sides drop by {mm * sheer:.0f} mm, more than the {mm * most:.0f} mm of two bundles "
+            "on dunnage: nothing that carries it is visible, as with a wall", sigma=mm * sigma,
             sigmas=UPPER,
         )
     ]  # fmt: skip
