@@ -1,4 +1,4 @@
-"""Compare a contour with a laser profile: two methods compared, neither taken as truth."""
+"""Compare a contour with a laser profile as two measuring methods, neither of which is the truth."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ _FEWEST_SHARED = 50
 
 
 def profile_difference(contour: Contour, laser: LaserProfile) -> Float64:
-    """Subtract the laser from vision (m) at each laser point (N,), NaN where vision measured
-    nothing there.
-    """
+    """Subtract the laser from vision (m) at each laser point (N,); NaN where vision has no measurement."""
     return _at_laser(contour, contour.z_m, laser) - laser.z_m
 
 
 def _at_laser(contour: Contour, values: Float64, laser: LaserProfile) -> Float64:
-    """Interpolate values (M,) of a contour's samples that vision measured to the laser's points (N,)."""
+    """Interpolate values (M,) of a contour's samples at the laser's points (N,), between measured samples
+    only.
+    """
     if contour.x_m.size == 0:
         return np.full(laser.x_m.shape, np.nan)
     measured = np.where(contour.source == HeightSource.VISION, values, np.nan)
@@ -42,8 +42,8 @@ def _at_laser(contour: Contour, values: Float64, laser: LaserProfile) -> Float64
 
 
 def smooth_places(z_m: Float64, reach: int = 2) -> Bool:
-    """Mark smooth places along the last axis: no neighbour within `reach` samples over 30 mm higher
-    or lower.
+    """Mark smooth places along the last axis: samples with no neighbour within `reach` samples that is
+    more than 30 mm higher or lower.
     """
     broken = np.zeros(z_m.shape, dtype=np.bool_)
     for k in range(1, reach + 1):
@@ -54,10 +54,10 @@ def smooth_places(z_m: Float64, reach: int = 2) -> Bool:
 
 
 def profile_shift(contour: Contour, laser: LaserProfile) -> tuple[float, float]:
-    """Register the laser's profile along x and z, m: the shift of the smallest median of absolute
-    differences, to a fifth of a millimetre in x. NaN where fewer than 50 points can be compared.
+    """Register the laser's profile along x and z, m: find the shift with the smallest median absolute
+    difference, to a fifth of a millimetre in x. NaN where fewer than 50 points can be compared.
 
-    A median over all points, so that steps seen from another side and gullies don't pull.
+    The median over all points isn't pulled by steps seen from another side, nor by gullies.
     """
     best, found = np.inf, (np.nan, np.nan)
     reach, step = _FURTHEST_M, 2e-3
@@ -81,10 +81,10 @@ def profile_shift(contour: Contour, laser: LaserProfile) -> tuple[float, float]:
 def compute_agreement(
     contour: Contour, laser: LaserProfile, speed_mps: float = float("nan")
 ) -> Agreement | Failed:
-    """Compute bias, limits of agreement [Bland 1986], median, MAE, RMSE, P95, max and coverage of the laser's
-    points.
+    """Compute bias, limits of agreement [Bland 1986], median, MAE, RMSE, P95, maximum and coverage of the
+    laser's points.
 
-    Failed `no-overlap` where fewer than two points can be compared.
+    Returns Failed `no-overlap` where fewer than two points can be compared.
     """
     error = profile_difference(contour, laser)
     compared = error[np.isfinite(error)] * 1e3

@@ -1,4 +1,6 @@
-"""Estimate how sure an agreement is: neighbours along a profile repeat each other, so fewer samples count."""
+"""Estimate the confidence intervals of an agreement: samples along a profile are autocorrelated, so fewer
+of them count as independent.
+"""
 
 from __future__ import annotations
 
@@ -10,19 +12,20 @@ from scipy.special import stdtrit
 from barsight.core.arrays import Bool, Float64
 
 FEWEST = 8
-"""Samples under which nothing is said of how sure a mean is."""
+"""Minimum number of samples for which confidence intervals are computed."""
 Z_95 = 1.959964
 
 
 @dataclass(frozen=True)
 class AgreementIntervals:
-    """Intervals of 95 % of a bias (mm), its limits and its slope over height (mm/m); NaN where too little is
-    known.
+    """95 % confidence intervals of a bias (mm), its limits of agreement and its slope over height (mm/m); NaN
+    where there are too few samples.
 
-    effective_samples: independent samples that know the mean as well [Bayley 1946]. loa_low, loa_high: limits
-    of agreement, each known to ± loa_half [Bland 1999]. equivalence_mm: the least margin for which two
-    one-sided tests of 5 % call the means equivalent [Schuirmann 1987]. other_sd_mm: spread that the
-    reference's own sigma doesn't explain. within_95_pct: share inside the 95 % that both sigmas state.
+    effective_samples: number of independent samples that would estimate the mean equally well [Bayley 1946].
+    loa_low, loa_high: limits of agreement, each uncertain by ± loa_half [Bland 1999]. equivalence_mm: the
+    smallest margin for which two one-sided tests at 5 % find the means equivalent [Schuirmann 1987].
+    other_sd_mm: standard deviation that the reference's own sigma doesn't explain. within_95_pct: percentage
+    of differences inside the 95 % interval that both sigmas predict.
     """
 
     samples: int
@@ -42,10 +45,10 @@ class AgreementIntervals:
 
 
 def effective_samples(series: Float64) -> float:
-    """Count the independent samples that know the mean of a series as well; NaN marks gaps in it.
+    """Count the independent samples that would estimate the mean of a series equally well; NaN marks gaps.
 
-    series: (N,) evenly spaced. The sum of autocorrelations ends where a pair of them falls to nothing, and
-    each pair counts at most as much as the one before it [Geyer 1992].
+    series: (N,) evenly spaced. The sum of autocorrelations ends at the first pair of lags whose sum isn't
+    positive, and each pair counts at most as much as the one before it [Geyer 1992].
     """
     known = np.isfinite(series)
     count = int(known.sum())
@@ -70,10 +73,12 @@ def effective_samples(series: Float64) -> float:
 def agreement_intervals(
     difference_m: Float64, reference_m: Float64, sigma_m: Float64, reference_sigma_m: float, places: Bool
 ) -> AgreementIntervals:
-    """Compute the intervals of differences (N,) evenly spaced along a profile, m, at the marked places.
+    """Compute the confidence intervals of differences (N,), evenly spaced along a profile, m, at the marked
+    places.
 
-    difference_m: NaN where there is none. reference_m: (N,) heights. sigma_m: (N,) of what is compared;
-    reference_sigma_m: NaN where nobody states it; it is then taken as nothing. places: (N,) those that count.
+    difference_m: NaN where there is none. reference_m: (N,) heights. sigma_m: (N,) of the heights that are
+    compared with the reference; reference_sigma_m: NaN if unknown, which is treated as 0. places: (N,) True
+    where a difference counts.
     """
     used = places & np.isfinite(difference_m)
     series = np.where(used, 1e3 * difference_m, np.nan)
@@ -98,9 +103,10 @@ def agreement_intervals(
 
 
 def _slope(series: Float64, mean_m: Float64, used: Bool) -> tuple[float, float]:
-    """Fit the difference over the mean of both (proportional bias): mm/m and half its 95 % interval.
+    """Fit the slope of the difference over the mean of both (proportional bias): mm/m, and half its 95 %
+    interval.
 
-    Its variance grows as the residuals' neighbours repeat each other. NaN where all heights are alike.
+    The variance is increased for the residuals' autocorrelation. NaN where all heights are alike.
     """
     height = mean_m[used] - mean_m[used].mean()
     square = float(height @ height)

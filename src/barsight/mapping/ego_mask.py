@@ -1,7 +1,9 @@
-"""Mask what travels with the crane, such as its magnet: it stands still in the picture while the yard moves.
+"""Mask what travels with the crane, such as its magnet: it stays in place in the picture while the yard
+moves.
 
-A view's depth and pose say where each pixel lies in the picture taken before or after it. Where the neighbour
-shows the same not there but where the pixel itself is, the thing was carried along, and no map takes it.
+A view's depth and pose predict where each pixel lies in the picture taken before or after it. If that picture
+shows the same content not there but at the pixel's own place, the thing moved with the crane and is left out
+of every map.
 """
 
 from __future__ import annotations
@@ -15,11 +17,13 @@ from barsight.core.records.pairs import RectifiedCamera
 
 _SHRINK = 4
 _SWING = 2
-"""Shrunk pixels by which a thing that hangs may swing from one picture to the next."""
+"""Maximum distance, in downsampled pixels, by which a hanging thing may swing between two pictures."""
 _MIN_WAY_PX = 6.0 * _SHRINK
 _WINDOW, _SMOOTH, _MIN_SIZE, _MARGIN = 9, 15, 5, 7
 _ALIKE = 0.6
-"""Standing still explains the picture if its difference is at most this share of the motion's."""
+"""Maximum ratio of the difference without motion to the difference with it, for a pixel to count as
+stationary.
+"""
 _MIN_DIFFERENCE = 2.0
 
 
@@ -29,8 +33,8 @@ def mask_carried(
     """Detect stationary pixels (H, W) between the rectified left pictures `left` and `neighbour`, both (H,
     W).
 
-    neighbour_from_here: between the two views' rect0. Nothing is found where the yard itself moves by less
-    than `_MIN_WAY_PX`, nor where the picture shows too little to tell.
+    neighbour_from_here: transform between the two views' rect0. Nothing is detected where the yard itself
+    moves by less than `_MIN_WAY_PX`, nor where the picture has too little texture to decide.
     """
     here, there = _shrunk(left), _shrunk(neighbour)
     first = _SHRINK // 2
@@ -76,5 +80,5 @@ def _shrunk(image: UInt8) -> Float32:
 
 
 def _difference(here: Float32, there: Float32) -> Float32:
-    """Average the absolute difference over a window."""
+    """Average the absolute difference over a square window."""
     return np.asarray(cv2.blur(cv2.absdiff(here, there), (_WINDOW, _WINDOW)), np.float32)

@@ -1,6 +1,6 @@
-"""Free space: each line of sight to a measured height proves that nothing stands in its way.
+"""Carve free space: each line of sight to a measured height proves that nothing stands in its way.
 
-For every cell the least height at which lines of sight of two views have passed over it: nothing there stands
+Each cell stores the lowest height at which lines of sight of two views have passed over it: nothing there is
 higher, whether or not the cell itself was seen.
 """
 
@@ -19,26 +19,29 @@ from barsight.mapping.observation import CellObservations
 from barsight.mapping.spilled_tiles import TileKey
 
 COARSE_CELLS = 2
-"""Cells of the map per cell of free space, to a side."""
+"""Side of a free-space cell, in cells of the map."""
 TILE = 256
 OVER_END_M = 0.02
-"""A line of sight counts from this far above the height that it ends on."""
+"""Margin added to the height of a line of sight when it lowers a cell's bound."""
 REACH_M = 1.5
-"""It counts up to this far above its end: free space matters beside what is to be lifted."""
+"""Height above its end up to which a line of sight is traced; free space matters only near what is to be
+lifted.
+"""
 LEVEL_CELLS, LEVEL_M = 5, 0.05
-"""A line of sight counts if its view sees only heights so close within a square of so many cells about its
-end: at edges, matches mix what is in front with what is behind."""
+"""Window side (cells) and maximum height difference within it for a line of sight to count: around its
+end, the view must see only heights this close. At edges, matching mixes foreground and background.
+"""
 UNPROVEN = np.float32(np.inf)
 _STEPS = 64
-"""Steps of a ray that are worked out at once, as vectors."""
+"""Number of steps along a ray that are computed at once, as vectors."""
 
 
 @dataclass(eq=False)
 class FreeSpace:
-    """Upper bounds (m) of what may stand in each cell, by the two views that bound it best.
+    """Upper bounds (m) of the height of anything in each cell, from the two views with the lowest bounds.
 
-    cell_m: side of the map's cells; those of free space are COARSE_CELLS as wide. tiles: (2, TILE, TILE)
-    each, the best bound and the second; 0.5 MiB per 5 m square at cells of 10 mm.
+    cell_m: side of the map's cells; free-space cells are COARSE_CELLS times as wide. tiles: (2, TILE, TILE)
+    each, the lowest bound and the second lowest; 0.5 MiB per 5 m square at cells of 10 mm.
     """
 
     cell_m: float
@@ -49,7 +52,9 @@ class FreeSpace:
         return self.cell_m * COARSE_CELLS
 
     def carve(self, cells: CellObservations, eyes_m: Float64) -> None:
-        """Carve what one view has seen. eyes_m: (E, 3) places of its cameras, reference frame."""
+        """Carve with the lines of sight of one view. eyes_m: (E, 3) positions of its cameras, reference
+        frame.
+        """
         if cells.x.size == 0:
             return
         x, y, z = _level(cells)
@@ -71,8 +76,8 @@ class FreeSpace:
             self._merge(key, column, row, bound)
 
     def window(self, column: int, row: int, columns: int, rows: int) -> Float32:
-        """Return (rows, columns): bounds on the map's own cells from cell (column, row) on; inf where
-        unproven.
+        """Return bounds (rows, columns) on the map's own cells, starting at cell (column, row); inf where
+        no bound is proven.
         """
         low_x, low_y = column // COARSE_CELLS, row // COARSE_CELLS
         shape = (
@@ -92,8 +97,8 @@ class FreeSpace:
     def join(
         self, newer: FreeSpace, rise_m: float, forgotten: Callable[[NDArray[Any], NDArray[Any]], Bool]
     ) -> None:
-        """Take over what a newer pass proves, moved up by rise_m. forgotten: which places, by x and y (m) of
-        a grid, have changed since, so that only the newer pass tells of them.
+        """Merge the bounds of a newer pass, raised by rise_m. forgotten: marks the places, by x and y (m)
+        of a grid, that have changed since, where only the newer pass's bounds remain valid.
         """
         cells = np.arange(TILE) * self._cell_m
         for key in sorted({*self.tiles, *newer.tiles}):
@@ -115,8 +120,8 @@ class FreeSpace:
 
 
 def _level(cells: CellObservations) -> tuple[Int32, Int32, Float32]:
-    """Choose the level heights of every COARSE_CELLSth cell along x and y, those that differ little from all
-    that the view sees about them: cells of free space along x and y (N,), and the heights (N,).
+    """Choose the level heights of every COARSE_CELLSth cell along x and y: those close to all heights that
+    the view sees around them. Returns their free-space cells along x and y (N,), and the heights (N,).
     """
     corner = int(cells.x.min()), int(cells.y.min())
     shape = int(cells.y.max()) - corner[1] + 1, int(cells.x.max()) - corner[0] + 1
@@ -140,8 +145,8 @@ def covering_tiles(column: int, row: int, shape: tuple[int, int]) -> list[TileKe
 def tile_overlap(
     key: TileKey, column: int, row: int, shape: tuple[int, ...]
 ) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-    """Return the same cells as slices [y, x] of the tile and of an array whose first cell is
-    (column, row).
+    """Return the cells shared by the tile and an array whose first cell is (column, row), as slices [y, x]
+    of each.
     """
     ours, theirs = [], []
     for tile, first, size in ((key[1], row, shape[0]), (key[0], column, shape[1])):
@@ -155,8 +160,8 @@ def tile_overlap(
 def bound_heights(
     x: Int32, y: Int32, z: Float32, corner: tuple[int, int], highest: Float32, lowest: Float32
 ) -> None:
-    """Bound the heights z (N,) of each cell x, y (N,): raise `highest` and lower `lowest` (H, W), in place,
-    whose first cell is `corner` (x, y).
+    """Bound the heights z (N,) of each cell x, y (N,), in place: raise `highest` and lower `lowest` (H,
+    W), whose first cell is `corner` (x, y).
     """
     low_x, low_y = np.int32(corner[0]), np.int32(corner[1])
     for k in range(z.size):
@@ -169,8 +174,9 @@ def bound_heights(
 def _choose_level(
     x: Int32, y: Int32, z: Float32, corner: tuple[int, int], highest: Float32, lowest: Float32
 ) -> Int64:
-    """Choose those (M,) of the heights at x, y, z (N,) that lie in one cell of COARSE_CELLS to a side, and
-    within LEVEL_M of the highest and the lowest about them, (H, W) from `corner` on.
+    """Choose those (M,) of the heights at x, y, z (N,) whose cell is a COARSE_CELLSth one along x and y,
+    and that are within LEVEL_M of the highest and the lowest height around them, (H, W) starting at
+    `corner`.
     """
     low_x, low_y = np.int32(corner[0]), np.int32(corner[1])
     chosen, n = np.empty(z.size, np.int64), 0
@@ -188,8 +194,8 @@ def _choose_level(
 def carve_rays(x: Int32, y: Int32, z: Float32, eye: Float64, cell_m: float, bound: Float32) -> None:
     """Lower the bounds (R, C) along the lines of sight from heights z (N,) to the eye (3,).
 
-    x, y: (N,) the heights' cells. A cell's bound is the ray's height where it leaves the cell, plus
-    OVER_END_M. All places count from the middle of the bounds' first cell.
+    x, y: (N,) cells of the heights. A cell's bound is the ray's height where it leaves the cell, plus
+    OVER_END_M. The origin of all coordinates is the centre of the bounds' first cell.
     """
     over, column, row = np.empty(_STEPS, np.float32), np.empty(_STEPS, np.int32), np.empty(_STEPS, np.int32)
     for k in range(x.size):

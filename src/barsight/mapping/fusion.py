@@ -1,7 +1,8 @@
-"""Fuse views robustly: each cell keeps a few heights, every view votes for one, the best supported stays.
+"""Fuse views robustly: each cell keeps a few heights, each view votes for one, and the best supported wins.
 
-A view's height joins the kept one within its gate (weighted mean, weighted squares for the scatter) or opens
-another; a wrong match thus stands alone and is outvoted. The work of a view doesn't depend on those before.
+A view's height joins the stored one within its gate (weighted mean, weighted squares for the scatter) or
+starts a new one, so that a wrong match stays alone and is outvoted. A view takes the same work however many
+came before.
 """
 
 from __future__ import annotations
@@ -25,11 +26,13 @@ from barsight.mapping.tiles import (
 )
 
 PRIOR_VIEWS = 4.0
-"""How many views' worth the stated sigmas weigh against the views' own scatter."""
+"""Weight of the stated sigmas against the views' own scatter, in views."""
 
 
 def fuse_view(store: TileStore, view: CellObservations, settings: MapSettings) -> None:
-    """Add one view to the tiles in `store`, of which as many stay in memory as the view has touched."""
+    """Add one view to the tiles in `store`; afterwards at most as many stay in memory as the view has
+    touched.
+    """
     first = int(view.x.min()) // TILE_CELLS, int(view.y.min()) // TILE_CELLS
     columns, rows = (
         int(at.max()) // TILE_CELLS - low + 1 for at, low in zip((view.x, view.y), first, strict=True)
@@ -56,10 +59,10 @@ def fuse_view(store: TileStore, view: CellObservations, settings: MapSettings) -
 
 @kernel()
 def _by_tile(x: Int32, y: Int32, first: tuple[int, int], shape: tuple[int, int]) -> tuple[Int64, Int64]:
-    """Sort cells x, y (N,) by counting: their numbers (N,), tile by tile and row by row, and where each tile
-    starts (tiles + 1,).
+    """Sort cells x, y (N,) with a counting sort: their indices (N,), tile by tile and row by row, and where
+    each tile starts (tiles + 1,).
 
-    shape: rows and columns of tiles from the tile `first` (x, y) on.
+    shape: rows and columns of tiles, starting at the tile `first` (x, y).
     """
     starts, order = np.zeros(shape[0] * shape[1] + 1, np.int64), np.empty(x.size, np.int64)
     tile = np.empty(x.size, np.int64)
@@ -94,8 +97,8 @@ def _vote(
     tile: (TILE_CELLS, TILE_CELLS, SLOTS, FIELDS). members: (M,) indices of the heights that lie in the tile;
     first: column and row of its first cell. cells (x, y), z (m), variance (m^2), shared (m), intensity,
     central: (N,), see `CellObservations`. gates (sigma, m): a height joins the nearest slot within the larger
-    of both. One that joins none takes an empty slot, else replaces a height of a single view, else
-    is dropped.
+    of both. If there is none, it takes an empty slot, else replaces a height with a single view, else is
+    dropped.
     """
     (first_column, first_row), (x, y), (gate_sigma, min_gate) = first, cells, gates
     for m in members:
@@ -129,8 +132,8 @@ def _vote(
 def _choose_slots(
     slots: Float32, z: float, variance: float, shared: float, gate_sigma: float, min_gate: float
 ) -> tuple[int, int]:
-    """Choose which of a cell's slots (SLOTS, FIELDS) a height z (m) joins, and which it takes if it joins
-    none; -1 where there is no such slot.
+    """Choose which of a cell's slots (SLOTS, FIELDS) a height z (m) joins, and which one it takes if it
+    joins none; -1 where there is no such slot.
     """
     best, best_gap = -1, np.inf
     empty, weakest = -1, 0
@@ -153,8 +156,8 @@ def _choose_slots(
 def height_sigma(slots: Float32) -> Float32:
     """Compute the sigma (...) of fused heights (..., FIELDS).
 
-    The weights' own noise, scaled by how the views really scatter, and the calibration's part whole: it is
-    the same in all views and doesn't average out.
+    This is the noise by the weights, scaled by the views' actual scatter, plus the calibration's part in
+    full: it is the same in all views and doesn't average out.
     """
     scatter = (PRIOR_VIEWS + slots[..., SQUARES]) / (PRIOR_VIEWS + slots[..., VIEWS] - 1)
     sigma: Float32 = np.sqrt(scatter / slots[..., WEIGHT] + slots[..., SHARED] ** 2)

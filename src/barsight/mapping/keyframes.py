@@ -1,4 +1,4 @@
-"""Select keyframes: frames whose pictures have moved enough since the last one taken."""
+"""Select keyframes: frames whose pictures have moved enough since the last keyframe."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from barsight.core.records.trajectory import PosedFrame
 def select_keyframes(
     frames: Sequence[PosedFrame], rectifier: Rectifier, range_m: float, min_shift: float
 ) -> set[int]:
-    """Select keyframes by parallax: stamps of frames whose picture has moved, since the last one taken, by
-    min_shift of its shorter side on a surface range_m away; the first and the last always.
+    """Select keyframes by parallax: stamps of frames whose picture has moved, since the last keyframe, by
+    at least min_shift of its shorter side on a surface range_m away; the first and the last frame always.
     """
     ahead = np.array([0.0, 0.0, range_m])
     seen = [(frame.reference_from_body @ rectifier.body_from_rect0).apply(ahead) for frame in frames]
@@ -29,10 +29,10 @@ def select_keyframes_by_encoders(
     stamps_ns: Sequence[int], crane: CraneSamples, shift_ns: int, camera: RectifiedCamera, range_m: float,
     min_shift: float,
 ) -> list[int]:  # fmt: skip
-    """Select keyframes by encoders before a trajectory is known: as if the crane carried the camera without a
-    sway.
+    """Select keyframes from the encoders, before a trajectory is known, as if the camera moved with the crane
+    without swaying.
 
-    shift_ns: from the frames' clock to the encoders'.
+    shift_ns: offset from the frames' clock to the encoders'.
     """
     start = int(crane.stamp_ns[0])
     at, known = (np.asarray(times) - start for times in (np.array(stamps_ns) + shift_ns, crane.stamp_ns))
@@ -41,13 +41,13 @@ def select_keyframes_by_encoders(
 
 
 def keyframe_spacing_m(camera: RectifiedCamera, range_m: float, min_shift: float) -> float:
-    """Return the way on a surface range_m away that min_shift of a picture's shorter side spans, m."""
+    """Return the distance (m) on a surface range_m away that min_shift of a picture's shorter side spans."""
     return min_shift * min(camera.width, camera.height) * range_m / camera.focal_px
 
 
 def _spread(stamps_ns: Sequence[int], places_m: Float64, min_m: float) -> list[int]:
-    """Select stamps whose place (N, 3) lies min_m from the last one taken; the first and the last
-    always.
+    """Select the stamps whose position (N, 3) is at least min_m from the last selected one; the first and
+    the last always.
     """
     taken: list[int] = []
     last: Float64 | None = None

@@ -1,7 +1,7 @@
 """Bin one view's points to one observation per cell and surface.
 
 Neighbouring pixels share their matching window, so their errors are nearly the same: the points of one view
-that fall into one cell count as a single observation whose variance is theirs, not theirs over their number.
+in one cell count as a single observation with their mean variance, not divided by their number.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ _HEIGHT, _NOISE, _POSE, _SHARED, _GRAY, _MIDDLE = range(_SAID)
 class CellObservations:
     """A view's heights, cell by cell; a cell may have several (a side, an overhang), highest first.
 
-    x, y: (N,) int32 cell numbers (a cell's centre is its number times the cell's side). central: (N,)
-    bool, whether the view sees this height in the cell's middle and not only at its border. z_m, variance_m2:
-    height and its noise (matching and pose), float32. shared_m: what the calibration may add, float32.
-    intensity: (N,) float32 gray levels.
+    x, y: (N,) int32 cell numbers (a cell's centre is its number times the cell's side). central: (N,) bool,
+    True if the view sees this height in the cell's middle and not only near its border. z_m, variance_m2:
+    height and its noise (matching and pose), float32. shared_m: sigma of the height due to the calibration,
+    which all views share, float32. intensity: (N,) float32 gray levels.
     """
 
     x: Int32
@@ -39,8 +39,8 @@ class CellObservations:
 
 @dataclass(frozen=True, eq=False)
 class SortedPoints:
-    """A view's points, sorted by cell. said: (N, _SAID) what each says of its cell, starts: (cells + 1,), of
-    `_by_cell`, within shape (rows, columns) from corner (column, row) on.
+    """A view's points, sorted by cell. said: (N, _SAID) values of each point, and starts: (cells + 1,), as
+    `_by_cell` returns them, within shape (rows, columns) starting at corner (column, row).
     """
 
     said: Float32
@@ -50,7 +50,7 @@ class SortedPoints:
     shape: tuple[int, int]
 
     def merged(self) -> CellObservations:
-        """Merge the points of each cell and surface, once: it changes their order."""
+        """Merge the points of each cell and surface. Call it only once: it changes their order."""
         return CellObservations(*_gather(self.said, self.starts, self.cell_m, self.corner, self.shape))
 
 
@@ -64,8 +64,8 @@ def sort_points(
 ) -> SortedPoints:
     """Transform a view's points to the reference frame and sort them by cell.
 
-    body_origin_m: (3,) about which the attitude's error turns. covariance: (6, 6) of the body's pose,
-    rotation then translation, reference axes. spacing_rad: angle between neighbouring points.
+    body_origin_m: (3,) centre about which attitude errors rotate the points. covariance: (6, 6) of the body's
+    pose, rotation then translation, reference axes. spacing_rad: angle between neighbouring points.
     """
     if len(points.xyz_m) == 0:
         return SortedPoints(np.empty((0, _SAID), np.float32), np.zeros(1, np.int64), cell_m, (0, 0), (0, 0))
@@ -85,7 +85,7 @@ def sort_points(
 def _cell_numbers(
     xyz: Float32, rotation: Float64, translation: Float64, cell_m: float
 ) -> tuple[Int32, Int32]:
-    """Number the cells (N,) along x and y that points xyz (N, 3) lie in."""
+    """Compute the cell numbers (N,) along x and y of points xyz (N, 3)."""
     x, y = np.empty(len(xyz), np.int32), np.empty(len(xyz), np.int32)
     for i in range(len(xyz)):
         px, py, _ = _turned(xyz, np.uint64(i), rotation)
@@ -96,7 +96,7 @@ def _cell_numbers(
 
 @kernel(inline=True)
 def _turned(xyz: Float32, i: np.uint64, rotation: Float64) -> tuple[float, float, float]:
-    """Turn point i of xyz (N, 3)."""
+    """Rotate point i of xyz (N, 3)."""
     a, b, c = np.float64(xyz[i, 0]), np.float64(xyz[i, 1]), np.float64(xyz[i, 2])
     return (
         rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2] * c,
@@ -111,17 +111,17 @@ def _by_cell(
     pose: tuple[Float64, Float64, Float64, Float64], cell_m: float, half_rad: float,
     numbers: tuple[Int32, Int32], corner: tuple[int, int], shape: tuple[int, int],
 ) -> tuple[Float32, Int64]:  # fmt: skip
-    """Tell what each point says, sorted by counting, cell by cell and row by row (N, _SAID), and where each
+    """List the values of each point, sorted by cell and row (N, _SAID) with a counting sort, and where each
     cell starts (cells + 1,).
 
-    A point says its height, matching variance, pose variance and shared sigma of the height, its gray level
-    and whether it lies within half_rad (half a pixel) of the cell's middle, along x and along y. The height's
-    error is the range error along the ray times the ray's slope, plus that of the pose: dz = dt_z + theta_x *
-    q_y - theta_y * q_x for a point q as seen from the body.
+    A point's values are its height, the height's matching variance, pose variance and shared sigma, its gray
+    level, and whether it lies within half_rad (half a pixel) of the cell's middle, along x and along y. The
+    height's error is the range error along the ray times the ray's slope, plus that of the pose: dz = dt_z +
+    theta_x * q_y - theta_y * q_x for a point q relative to the body.
 
     sigmas: along the ray, matching and shared, (N,) each. pose: rotation, translation, the body's origin and
-    the covariance (3, 3) about it. numbers: the points' cells (N,), within shape (rows, columns) from corner
-    (column, row) on.
+    the covariance (3, 3) about it. numbers: the points' cells (N,), within shape (rows, columns) starting at
+    corner (column, row).
     """
     (x, y), (range_sigma, shared_sigma) = numbers, sigmas
     rotation, translation, origin, about = pose
@@ -163,11 +163,11 @@ def _by_cell(
 def _gather(
     said: Float32, starts: Int64, cell_m: float, corner: tuple[int, int], shape: tuple[int, int]
 ) -> tuple[Int32, Int32, Bool, Float32, Float32, Float32, Float32]:
-    """Merge within each cell, from the top: points no deeper than 4 sigma below the highest are one surface;
-    those below wait at the cell's front.
+    """Merge the points within each cell, from the top: points at most 4 sigma below the highest, or two cell
+    sides if that is more, are one surface; the lower ones move to the cell's front for the next round.
 
-    said: (N, _SAID) and starts: (cells + 1,), of `_by_cell`, as corner and shape; said's order changes.
-    Returns (M,) each: a surface's cell along x and along y, whether a point lies at the cell's middle, height
+    said: (N, _SAID) and starts: (cells + 1,), of `_by_cell`, with its corner and shape; said is reordered.
+    Returns (M,) each: a surface's cell along x and along y, True if a point lies at the cell's middle, height
     (m), its variance (m^2), shared sigma (m), gray level.
     """
     count = said.shape[0]

@@ -1,4 +1,4 @@
-"""Probe a recording: can it be matched at all, and how fine can its map be."""
+"""Probe a recording: check that it can be matched, and find the resolution that its map can have."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _MAX_POINTS_PER_PIXEL = 4
 
 @dataclass(frozen=True, eq=False)
 class RecordingProbe:
-    """The first usable pair: disparity range and the size of its pixels on the surface (median, m).
+    """Result of the first usable pair: disparity range and the size of its pixels on the surface (median, m).
 
-    off_rows_px: how far matches lie off their rows (see `vertical_offset`), NaN where it can't be told.
-    range_m: the depth in the middle of the disparities.
+    off_rows_px: vertical offset of matches from their rows (see `vertical_offset`), NaN where it can't be
+    measured. range_m: depth at the middle of the disparity range.
     """
 
     candidates: DisparityRange
@@ -31,7 +31,7 @@ class RecordingProbe:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """List what is wrong with the calibration, as far as one pair shows it."""
+        """List the faults of the calibration that a single pair reveals."""
         if not self.off_rows_px > MAX_OFFSET_PX:
             return ()
         return (
@@ -71,8 +71,8 @@ def probe_recording(pairs: RectifiedPairs) -> RecordingProbe:
 
 
 def choose_cell_size(first: RecordingProbe, *, has_crane: bool) -> float:
-    """Choose the cell size: 10 mm in the yard; elsewhere the first round size that holds one and a half
-    pixels.
+    """Choose the cell size: 10 mm in the yard; elsewhere the smallest standard size that spans one and a
+    half pixels.
     """
     if has_crane:
         return CELL_SIDES_M[0]
@@ -81,6 +81,8 @@ def choose_cell_size(first: RecordingProbe, *, has_crane: bool) -> float:
 
 
 def points_per_pixel(first: RecordingProbe, cell_m: float) -> int:
-    """Choose points along each axis of a pixel so that no cell between two pixels stays empty."""
+    """Choose the number of points along each axis of a pixel so that no cell between two pixels stays
+    empty.
+    """
     wanted = math.ceil(first.pixel_on_surface_m / (0.9 * cell_m))
     return min(max(1, wanted), _MAX_POINTS_PER_PIXEL)

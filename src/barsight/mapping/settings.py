@@ -14,52 +14,75 @@ class MapSettings:
     """The height surface and the contours."""
 
     cell_m: float | None = None
-    """Side of a cell; 0.01 in the yard, else fitted to the pictures' resolution."""
+    """Side of a map cell; 0.01 in the yard, elsewhere chosen to fit the pictures' resolution."""
     min_views: int = 2
-    """A cell seen in fewer frames is unknown (one is enough where the recording has only one)."""
+    """Minimum number of frames that must see a cell; with fewer it stays unknown (one is enough if the
+    recording has only one frame).
+    """
     min_shift: float = 0.0
-    """A frame is matched once its picture has moved by this share of its shorter side; 0 matches them all."""
+    """Minimum motion of the picture between matched frames, as a share of its shorter side; 0 matches
+    every frame.
+    """
     top_ratio: float = 0.35
-    """What may hide a cell: its highest height that has this share of the best-seen one's views."""
+    """Minimum number of views of a height, as a share of those of its cell's best-seen height, for it to
+    count as a possible occluder; the highest such height of a cell is taken.
+    """
     own_ratio: float = 0.7
-    """A height stands that has the votes of this share of the views with a free line of sight to it."""
+    """Minimum share of votes that makes a height part of the surface, among the views with a free line of
+    sight to it.
+    """
     along_ratio: float = 0.3
-    """Another stands if, averaged along a bar or an edge, it and its like have the votes of this share."""
+    """Minimum share of votes, averaged along a bar or an edge over a height and similar ones, that makes
+    the height part of the surface although its own share is below own_ratio.
+    """
     gate_sigma: float = 3.0
-    """Heights nearer than this many sigma are one surface."""
+    """Heights that differ by at most this many sigma are one surface."""
     min_gate_m: float = 0.015
-    """Heights nearer than this are one surface however small their sigma."""
+    """Heights that differ by at most this much are one surface, however small their sigma."""
     along_m: float = 0.26
-    """Heights are averaged so far to either side, 28 cells at most, along the direction in which they are
-    most alike (a bar's own); 0 leaves each cell as it is."""
+    """Distance to either side over which heights are averaged along the direction in which they are most
+    alike (a bar's own), at most 28 cells; 0 leaves each cell as it is.
+    """
     sharpen_px: float = 1.25
-    """Matching's window lowers crests and lifts valleys across the bars as a blur of so many pixels (sigma)
-    does: heights averaged along a bar are moved back by as much, and sigma grows with it; 0 leaves both."""
+    """Blur across the bars that is undone, in pixels (sigma): matching's window lowers crests and raises
+    valleys as such a blur does. Heights averaged along a bar are moved back by the same amount, and their
+    sigma grows with it; 0 leaves both unchanged.
+    """
     thin_bars: Literal["sigma", "drawn"] = "sigma"
-    """Use of the orthophoto's stripes, where bars are too thin for heights to show them: `sigma` adds what is
-    hidden to the heights' sigma, `drawn` draws round bars over them: nearer in the median on stacks of thin
-    bars, further off on piles of irregular ones, whose bundles are then found less well."""
+    """Use of the orthophoto's stripes where bars are too thin to show in the heights: `sigma` adds the
+    hidden relief to the heights' sigma; `drawn` draws round bars over the heights, which is closer in the
+    median on stacks of thin bars, but further off on piles of irregular ones, whose bundles are then found
+    less well.
+    """
     fill_m: float = 0.03
-    """Unknown cells no further than this from seen ones on opposite sides are filled, and flagged so."""
+    """Maximum distance of an unknown cell from seen cells on opposite sides for it to be filled; filled
+    cells are flagged.
+    """
     max_sigma_m: float = 0.5
-    """Points less sure than this are left out."""
+    """Maximum sigma of a point's depth; less certain points are left out."""
     resident_tiles: int = 64
-    """At most so many tiles of 256 x 256 cells are kept in memory (7 MiB each), and no more than the
-    last view has touched; the others wait on disk."""
+    """Maximum number of tiles of 256 x 256 cells kept in memory (7 MiB each), and no more than the last
+    view has touched; the others are stored on disk.
+    """
     contours: Literal["fused", "paper"] = "fused"
-    """fused: the surface as it is, unknown where not seen. paper: its median, cubic interpolation and
-    filter; what it fills is flagged."""
+    """Processing of the contours. fused: the surface as it is, unknown where it wasn't seen. paper: the
+    paper's median, cubic interpolation and filter; interpolated samples are flagged as filled.
+    """
     laser: Literal["compare", "fuse"] = "compare"
-    """compare: the laser's profiles stay out of the map, as its independent reference. fuse: those that agree
-    with vision are fused into it; agreement is then that of vision before. Those that are off are named and
-    left out."""
+    """Use of the laser. compare: its profiles stay out of the map, as an independent reference. fuse:
+    profiles that agree with vision are fused into the map, and the reported agreement is that of vision
+    before fusion; profiles that are off are named and left out.
+    """
     laser_sigma_m: float = 0.002
-    """Sigma of a laser point's height on a cell; that of its `sensor.yaml`, where that is larger."""
+    """Sigma of a laser point's height in a cell; the `sensor.yaml` value is used if it is larger."""
     laser_off_m: float = 0.01
-    """A profile is fused only where vision would show that it is so far off in height, or twice as far along
-    x; coarser maps need more."""
+    """Offset in height that vision must be able to reveal (twice as much along x) for a profile to be
+    fused; coarser maps need a larger value.
+    """
     profile_y_m: tuple[float, ...] = ()
-    """Where to cut contours; at the laser's profiles when not given, else in the middle."""
+    """Values of y at which to cut contours; if empty, at the laser's profiles, or in the middle without a
+    laser.
+    """
 
     def __post_init__(self) -> None:
         expect_ranges(

@@ -1,4 +1,4 @@
-"""Hold the tiles of a map: a few in memory, the others on disk."""
+"""Store the tiles of a map: a few in memory, the others on disk."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ TileKey = tuple[int, int]
 
 
 class SpilledTiles(MutableMapping[TileKey, Tile]):
-    """Tiles of a map, an array each. At most `resident` are held; the one unused for longest goes to a file
-    in a folder of its own in `folder` and comes back when it is needed, so that memory doesn't grow with the
-    yard.
+    """Tiles of a map, one array each. At most `resident` stay in memory; the least recently used one is
+    written to a file in its own folder inside `folder` and read back when needed, so that memory doesn't grow
+    with the yard.
 
-    A tile may be changed until another one is taken. Several threads may read.
+    A tile may be modified until another one is fetched. Several threads may read.
     """
 
     def __init__(self, folder: Path, resident: int = 16) -> None:
@@ -32,7 +32,7 @@ class SpilledTiles(MutableMapping[TileKey, Tile]):
         self._lock = Lock()
 
     def __getitem__(self, key: TileKey) -> Tile:
-        """Return a tile, from its file where it isn't held."""
+        """Return a tile, reading its file if it isn't in memory."""
         with self._lock:
             if key not in self._known:
                 raise KeyError(key)
@@ -44,7 +44,7 @@ class SpilledTiles(MutableMapping[TileKey, Tile]):
             return tile
 
     def __setitem__(self, key: TileKey, tile: Tile) -> None:
-        """Take a tile in."""
+        """Add or replace a tile."""
         with self._lock:
             self._held.pop(key, None)
             self._write_oldest(self._resident - 1)
@@ -52,25 +52,25 @@ class SpilledTiles(MutableMapping[TileKey, Tile]):
             self._held[key] = tile
 
     def peek(self, key: TileKey) -> Tile:
-        """Return a known tile, not to be written to: it isn't kept if it lay on disk."""
+        """Return a known tile for reading only; a tile that was on disk isn't kept in memory."""
         with self._lock:
             tile = self._held.get(key)
             return self._load(key) if tile is None else tile
 
     def hold(self, max_tiles: int) -> None:
-        """Write those that are unused for longest to disk until so many are held."""
+        """Write the least recently used tiles to disk until at most max_tiles are in memory."""
         with self._lock:
             self._write_oldest(max_tiles)
 
     def __delitem__(self, key: TileKey) -> None:
-        """Forget a tile."""
+        """Delete a tile."""
         with self._lock:
             self._known.remove(key)
             self._held.pop(key, None)
             self._file(key).unlink(missing_ok=True)
 
     def clear(self) -> None:
-        """Forget all tiles."""
+        """Delete all tiles."""
         with self._lock:
             for key in self._known:
                 self._file(key).unlink(missing_ok=True)
@@ -86,7 +86,7 @@ class SpilledTiles(MutableMapping[TileKey, Tile]):
         return len(self._known)
 
     def __contains__(self, key: object) -> bool:
-        """Check for a tile without taking it."""
+        """Check for a tile without fetching it."""
         return key in self._known
 
     def _write_oldest(self, max_tiles: int) -> None:

@@ -11,17 +11,19 @@ from barsight.mapping.spilled_tiles import SpilledTiles, TileKey
 
 TILE_CELLS = 256
 SLOTS = 4
-"""Heights kept per cell."""
+"""Maximum number of heights stored per cell."""
 FIELDS = 7
-"""Of each height: mean z, weight (sum of 1 / variance), weighted squares about the mean, views, shared sigma,
-gray level, views that see it in the cell's middle."""
+"""Number of values stored per height: mean z, weight (sum of 1 / variance), weighted squares about the
+mean, views, shared sigma, gray level, views that see it in the cell's middle.
+"""
 Z, WEIGHT, SQUARES, VIEWS, SHARED, GRAY, CENTRAL = range(FIELDS)
 
 
 class TileStore:
     """Tiles by (column, row) number: (TILE_CELLS, TILE_CELLS, SLOTS, fields) float32, [y, x].
 
-    At most `resident` tiles are held, the others lie in `scratch`. A fresh tile holds `fill`.
+    At most `resident` tiles stay in memory; the others are stored in `scratch`. A new tile is filled with
+    `fill`.
     """
 
     def __init__(self, scratch: Path, resident: int, fields: int = FIELDS, fill: float = 0.0) -> None:
@@ -34,7 +36,7 @@ class TileStore:
         return list(self._tiles)
 
     def take(self, key: TileKey) -> Float32:
-        """Fetch the tile to read and write; a fresh one where there is none yet."""
+        """Fetch the tile for reading and writing; create it if it doesn't exist yet."""
         if key in self._tiles:
             tile = self._tiles[key]
         else:
@@ -46,19 +48,19 @@ class TileStore:
         return tile
 
     def hold(self, max_tiles: int) -> None:
-        """Write those that are untouched for longest to disk until so many are held."""
+        """Write the least recently used tiles to disk until at most max_tiles are in memory."""
         self._tiles.hold(max_tiles)
 
     def read(self, key: TileKey) -> Float32:
-        """Read a tile that holds something, not to be written to: it isn't kept if it lay on disk."""
+        """Read an existing tile for reading only; a tile that was on disk isn't kept in memory."""
         return self._tiles.peek(key)
 
     def version(self, key: TileKey) -> int:
-        """Count how often a tile was taken; 0 where there is none."""
+        """Return the number of times a tile was taken; 0 if it doesn't exist."""
         return self._versions.get(key, 0)
 
     def clear(self) -> None:
-        """Forget all tiles."""
+        """Delete all tiles."""
         self._tiles.clear()
         self._versions.clear()
 

@@ -1,7 +1,8 @@
-"""Top photo: the pictures' mean gray level at the height of the tops around each cell.
+"""Build the top photo: the pictures' mean gray level, projected at the height of the tops around each cell.
 
-What lies across the tops is as sharp there as in a single picture, in every view at the same place, be it
-thinner than matching can measure; what lies deeper is blurred, since each view sees it elsewhere.
+Whatever lies across the tops is as sharp there as in a single picture, because every view shows it at the
+same place, even if it is too thin for matching to measure; whatever lies deeper is blurred, because each view
+shows it elsewhere.
 """
 
 from __future__ import annotations
@@ -22,18 +23,18 @@ from barsight.mapping.observation import CellObservations
 from barsight.mapping.spilled_tiles import TileKey
 
 COARSE_CELLS = 5
-"""Cells of the map per cell, to a side, in which the height of the tops is kept."""
+"""Side, in cells of the map, of the coarse cells in which the height of the tops is computed."""
 SPAN_M = 0.35
-"""The tops' height spans gaps up to so wide, as a bar would that is laid across."""
+"""Maximum width of the gaps that the tops' height bridges, as a bar laid across them would."""
 OVER_TOPS_M = 0.01
-"""A thin bar's middle lies about so high over what carries it."""
+"""Height added to the tops: about that of a thin bar's middle above what carries it."""
 MAX_VIEWS = 250
-"""Views of a cell beyond these are not counted, so that their sum fits 16 bits."""
+"""Maximum number of views added up per cell, so that the sum of gray levels fits into 16 bits."""
 
 
 @dataclass(eq=False)
 class TopPhoto:
-    """Sums of gray levels and how many views made them, per cell of the map.
+    """Sums of gray levels and the number of views in them, per cell of the map.
 
     cell_m: side of the cells. tiles: (2, TILE, TILE) each, sums and numbers of views; 1 MiB per 5 m square at
     cells of 10 mm.
@@ -43,7 +44,9 @@ class TopPhoto:
     tiles: MutableMapping[TileKey, UInt16] = field(default_factory=dict)
 
     def add(self, cells: CellObservations, pair: RectifiedPair, reference_from_rect0: Pose) -> None:
-        """Add both pictures of a view at the height of the tops that the view itself has measured."""
+        """Add both pictures of a view, projected at the height of the tops that the view itself has
+        measured.
+        """
         if cells.x.size == 0:
             return
         column, row = int(cells.x.min()), int(cells.y.min())
@@ -75,8 +78,8 @@ class TopPhoto:
             self._merge(key, column, row, total, count)
 
     def window(self, column: int, row: int, columns: int, rows: int) -> UInt8:
-        """Return (rows, columns): mean gray levels from 1, 0 where no view saw the cell, from cell
-        (column, row) on.
+        """Return mean gray levels (rows, columns) from 1, 0 where no view saw the cell, starting at cell
+        (column, row).
         """
         out = np.zeros((rows, columns), np.uint8)
         for key in covering_tiles(column, row, out.shape):
@@ -112,8 +115,8 @@ class TopPhoto:
 
 
 def _tops(cells: CellObservations, column: int, row: int, cell_m: float) -> tuple[Float32, Bool]:
-    """Compute the height of the tops in coarse cells (R, C) from cell (column, row) on, and which cells of
-    the map, COARSE_CELLS as fine, lie between what was seen.
+    """Compute the height of the tops in coarse cells (R, C) starting at cell (column, row), and a mask, in
+    the map's own cells, of those that were seen or lie between seen ones.
     """
     shape = tuple(-(-(int(at.max()) + 1 - first) // COARSE_CELLS)
                   for at, first in ((cells.y, row), (cells.x, column)))  # fmt: skip
@@ -134,8 +137,8 @@ def _tops(cells: CellObservations, column: int, row: int, cell_m: float) -> tupl
 def _note_highest(
     x: Int32, y: Int32, z: Float32, column: int, row: int, heights: Float32, seen: UInt8
 ) -> None:
-    """Raise heights (H, W) to the highest z (N,) of each cell x, y (N,), and note it as seen (H, W), which
-    begin at (column, row).
+    """Raise heights (H, W) to the highest z (N,) of each cell x, y (N,), and mark the cell in seen (H, W);
+    both arrays start at (column, row).
     """
     first_column, first_row = np.int32(column), np.int32(row)
     for k in range(z.size):
@@ -145,7 +148,7 @@ def _note_highest(
 
 
 def _finer(at: Float64, coarse: Float32, size: tuple[int, ...]) -> Float32:
-    """Interpolate pixels of coarse cells to the map's own, (width, height) of them."""
+    """Interpolate pixel coordinates of coarse cells to the map's own cells, size = (width, height)."""
     return np.asarray(
         cv2.resize(at.reshape(coarse.shape).astype(np.float32), size, interpolation=cv2.INTER_LINEAR),
         np.float32,

@@ -1,4 +1,4 @@
-"""Process one frame: rectified pair and disparity, then points and map-cell observations."""
+"""Process one frame: rectify and match the pair, then triangulate its points and bin them to map cells."""
 
 from __future__ import annotations
 
@@ -26,7 +26,9 @@ from barsight.stereo.triangulation import triangulate_disparity
 
 @dataclass(frozen=True, eq=False)
 class MatchedFrame:
-    """A matched frame without pose: its rectified pair, and its disparity or why not."""
+    """A matched frame without a pose: its rectified pair, and its disparity or the reason why there is
+    none.
+    """
 
     pair: RectifiedPair
     disparity: Disparity | Failed
@@ -39,7 +41,7 @@ class MatchedFrame:
 
 @dataclass(frozen=True, eq=False)
 class Preceding:
-    """The frame before, and a guess of the rectified left camera's motion since."""
+    """The previous frame, and a guess of the rectified left camera's motion since then."""
 
     frame: MatchedFrame
     now_from_before: Pose
@@ -49,7 +51,7 @@ class Preceding:
 class PosedView:
     """A posed frame.
 
-    cells: its observations of the map. pair: its pictures. disparity_px: (H, W), for people to look at.
+    cells: its observations of the map. pair: its pictures. disparity_px: (H, W), for display only.
     """
 
     cells: CellObservations
@@ -62,16 +64,17 @@ Neighbour = tuple[RectifiedPair, PosedFrame]
 
 @dataclass(frozen=True, eq=False)
 class Matcher:
-    """Match a rectified pair; it keeps no state, so that pairs run side by side."""
+    """Match a rectified pair. A matcher keeps no state, so that pairs can be matched in parallel."""
 
     stereo: StereoSettings
     method: StereoMethod
     watch: Stopwatch
 
     def __call__(self, pair: RectifiedPair, preceding: Preceding | None = None) -> MatchedFrame:
-        """Match; the disparity is Failed where the pictures are swapped or have no texture.
+        """Match a pair; the disparity is Failed where the pictures are swapped or have no texture.
 
-        preceding: where there is one whose places look the same now, the pair is only held against it.
+        preceding: if its view can be aligned with this one, its disparity is only confirmed instead of
+        searched for anew.
         """
         return MatchedFrame(pair, self._disparity(pair, preceding))
 
@@ -97,7 +100,7 @@ class Matcher:
 
 
 def _predicted(pair: RectifiedPair, preceding: Preceding) -> Float32 | None:
-    """Predict the disparity (H, W) px, NaN where not; None where the views don't look alike."""
+    """Predict the disparity (H, W) px, NaN where unknown; None where the views can't be aligned."""
     before, camera = preceding.frame, pair.camera
     if isinstance(before.disparity, Failed):
         return None
@@ -108,7 +111,7 @@ def _predicted(pair: RectifiedPair, preceding: Preceding) -> Float32 | None:
 
 @dataclass(frozen=True, eq=False)
 class PointBinner:
-    """Triangulate a matched frame and bin its points at its pose. per_pixel, max_sigma_m: see
+    """Triangulate a matched frame and bin its points using its pose. per_pixel, max_sigma_m: see
     `triangulate_disparity`.
     """
 
@@ -122,10 +125,10 @@ class PointBinner:
     def __call__(
         self, matched: MatchedFrame, posed: PosedFrame, beside: Sequence[Neighbour] = ()
     ) -> PosedView | Failed:
-        """Bin the frame's points. beside: the frames before and after, against which the crane's own parts
-        stand still.
+        """Bin the frame's points. beside: the frames before and after, in which the crane's own parts stay in
+        place.
 
-        Failed where there is no disparity, or no depth within max_depth_m and max_sigma_m.
+        Returns Failed where there is no disparity, or no depth within max_depth_m and max_sigma_m.
         """
         pair, disparity = matched.pair, matched.disparity
         if isinstance(disparity, Failed):
@@ -164,7 +167,9 @@ class PointBinner:
 def disparity_range(
     pair: RectifiedPair, stereo: StereoSettings, predicted: Float32 | None = None
 ) -> DisparityRange | Failed:
-    """Complete the settings' disparity range, its open ends found from the images and what is predicted."""
+    """Complete the settings' disparity range: a missing end is found from the images or the predicted
+    disparity.
+    """
     low, high = stereo.min_disparity_px, stereo.max_disparity_px
     if low is None or high is None:
         found = find_disparity_range(pair) if predicted is None else follow_disparity_range(pair, predicted)

@@ -1,1 +1,1 @@
-"""The election of a whole surface, tile by tile, again and again while views come."""
+"""Elect the whole surface, tile by tile, repeatedly while views arrive."""

@@ -1,4 +1,6 @@
-"""Keep the heights that tiles elect by votes alone, and lay them out around a tile."""
+"""Store the heights that tiles elect by votes alone (their first heights), and assemble them around a
+tile.
+"""
 
 from __future__ import annotations
 
@@ -24,11 +26,11 @@ def first_around(folder: Path, key: TileKey, keys: frozenset[TileKey]) -> Float3
 
 @lru_cache(maxsize=64)
 def read_first(folder: Path, key: TileKey) -> Float32:
-    """Read a tile's first heights, (TILE_CELLS, TILE_CELLS); those of a few tiles are held."""
+    """Read a tile's first heights, (TILE_CELLS, TILE_CELLS); those of a few tiles are cached."""
     heights: Float32 = np.load(first_file(folder, key))
     return heights
 
 
 def first_file(folder: Path, key: TileKey) -> Path:
-    """Name the file of a tile's first heights."""
+    """Return the path of a tile's first heights."""
     return folder / f"first_{key[0]}_{key[1]}.npy"

@@ -1,4 +1,4 @@
-"""The election of a whole surface, tile by tile: what hasn't changed since the last one is kept."""
+"""Elect the whole surface, tile by tile, reusing what hasn't changed since the last election."""
 
 from __future__ import annotations
 
@@ -35,14 +35,16 @@ from barsight.mapping.tiles import TileStore, tiles_around
 Result = TypeVar("Result")
 
 _MIDDLE = 4
-"""A tile among `tiles_around` it."""
+"""Index of a tile among its `tiles_around`."""
 
 
 @dataclass(frozen=True, eq=False)
 class TileElection:
-    """Tell what a tile's election rests on: its own version and its neighbours' (see `TileStore`), and the
-    `near` views that may see something of what it holds, from box[0] to box[1] (m), None where it holds
-    nothing. height_m: of their cameras. is_last: elected as at the end, not as for a snapshot.
+    """Inputs that a tile's election depends on.
+
+    versions: of the tile and its neighbours (see `TileStore`). box: corners (m) of its supported heights,
+    None without any. near: number of views that may see something in the box. height_m: of their cameras.
+    is_last: True for a final election, False for a snapshot's.
     """
 
     versions: tuple[int, ...]
@@ -54,10 +56,10 @@ class TileElection:
 
 
 class SurfaceElection:
-    """Elects the surface of the tiles in `store`; `folder` takes its files and those of the surfaces.
+    """Elects the surface of the tiles in `store`; its files and those of the surfaces are stored in `folder`.
 
-    Poses that were given once stay: the next `ViewFrusta` begin with the same views. Nothing in `store`
-    changes but by `finish`. beat: called for each tile that is done.
+    Poses must not change once given: each `ViewFrusta` begins with the views of the one before. Nothing in
+    `store` is changed except by `finish`. beat: called for each finished tile.
     """
 
     def __init__(
@@ -82,9 +84,9 @@ class SurfaceElection:
         self._figures: dict[TileKey, TileFigures] = {}
 
     def settle(self, min_views: int, frusta: Callable[[], ViewFrusta]) -> None:
-        """Elect as at the end the tiles that lie beside none which the last view touched, and finish those
-        among elected ones: a snapshot and `finish` then have the tiles about the view left to do. Called
-        after each view.
+        """Run the final election of the tiles that the last view touched neither directly nor in a
+        neighbour, and finish those whose neighbours are elected too: a snapshot and `finish` then need to
+        process only the tiles around the view. Call it after each view.
         """
         keys = self._store.keys()
         taken = {key: self._store.version(key) for key in keys}
@@ -100,11 +102,11 @@ class SurfaceElection:
             self._finish(ready, frusta())
 
     def snapshot(self, min_views: int, frusta: ViewFrusta) -> Surface:
-        """Return the surface as it stands, without its cloud, of its own from now on; only tiles that changed
-        are elected anew.
+        """Return the current surface, without its cloud, as a copy of its own; only changed tiles are elected
+        again.
 
-        A tile that lies beside one that changed waits for its own next change, and a view is asked once
-        whether it sees a height, until that moves.
+        A tile next to a changed one is elected again only when it changes itself, and whether a view sees a
+        height is tested only once unless the height moves.
         """
         keys = self._store.keys()
         changed = [key for key in keys if not self._is_current(key, min_views)]
@@ -114,8 +116,8 @@ class SurfaceElection:
         return self._surface(tile_file)
 
     def finish(self, min_views: int, frusta: ViewFrusta) -> Surface:
-        """Return the surface at the end, of which nothing depends on what was asked for meanwhile; the tiles
-        in `store` are given up.
+        """Return the final surface, which doesn't depend on any snapshots taken before; the tiles in
+        `store` are deleted.
         """
         keys = self._store.keys()
         stale = [key for key in keys if not self._stands(key, min_views, frusta)]
@@ -127,15 +129,15 @@ class SurfaceElection:
         return surface
 
     def _is_current(self, key: TileKey, min_views: int) -> bool:
-        """Check whether a tile was elected since it was taken."""
+        """Check whether a tile has been elected since its last change."""
         one = self._elections.get(key)
         return one is not None and (one.versions[_MIDDLE], one.min_views) == (
             self._store.version(key), min_views
         )  # fmt: skip
 
     def _stands(self, key: TileKey, min_views: int, frusta: ViewFrusta | None = None) -> bool:
-        """Check whether a tile was elected as at the end and would be elected so again, by all views of
-        `frusta` if they are given.
+        """Check whether a tile's election was a final one and is still valid, also for all views of
+        `frusta` if given.
         """
         one = self._elections.get(key)
         if (
@@ -160,7 +162,7 @@ class SurfaceElection:
         return tuple(self._elections.get(near) for near in tiles_around(key))
 
     def _surface(self, *names: Callable[[Path, TileKey], Path]) -> Surface:
-        """Gather the finished tiles in a folder of its own, by links to their files of these names, which are
+        """Gather the finished tiles in a new folder, as links to their files of these names, which are
         never written to again.
         """
         keys = self._store.keys()
@@ -173,8 +175,8 @@ class SurfaceElection:
         return surface
 
     def _elect(self, keys: list[TileKey], min_views: int, frusta: ViewFrusta, *, last: bool) -> None:
-        """Elect these tiles, beside neighbours by votes alone as they are now, at last with no regard to what
-        was asked for snapshots.
+        """Elect these tiles, using the current vote-only heights of their neighbours; a last election
+        doesn't reuse the visibility tests made for snapshots.
         """
         known, read = frozenset(self._store.keys()), self._store.read
         states = {key: (self._store.version(key), min_views) for key in known}
@@ -213,7 +215,7 @@ class SurfaceElection:
         self._elections |= dict(zip(keys, elections, strict=True))
 
     def _finish(self, keys: list[TileKey], frusta: ViewFrusta) -> None:
-        """Average, sharpen and fill these tiles; write the cloud of those that are elected as at the end."""
+        """Average, sharpen and fill these tiles; write the cloud of those whose election is final."""
         known = frozenset(self._store.keys())
 
         def finish_tile(item: tuple[TileKey, Float32 | None]) -> tuple[TileKey, TileFigures]:
@@ -239,7 +241,9 @@ class SurfaceElection:
             yield tile
 
     def _seen_from_m(self, key: TileKey) -> float:
-        """Return the height of the cameras that see a tile, or of those that see its neighbours."""
+        """Return the height of the cameras that see a tile or, if none does, of those that see its
+        neighbours.
+        """
         around = [one.height_m for one in self._around_elected(key) if one is not None]
         own = self._elections[key].height_m
         known = [height_m for height_m in around if np.isfinite(height_m)]

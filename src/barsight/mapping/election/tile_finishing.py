@@ -1,4 +1,4 @@
-"""Finish an elected tile: averaged along the bars, sharpened across them, its narrow gaps filled."""
+"""Finish an elected tile: average it along the bars, sharpen it across them, and fill its narrow gaps."""
 
 from __future__ import annotations
 
@@ -27,20 +27,22 @@ from barsight.mapping.surface.surface import Layers, fill_gaps, paste, read_tile
 from barsight.mapping.tiles import TILE_CELLS, tiles_around
 
 _ALONG_CELLS = 28
-"""The longest way along a bar, to either side."""
+"""Maximum distance along a bar, to either side, over which heights are averaged."""
 _HALO = -(-(_ALONG_CELLS + 1 + VOTE_CELLS // 2 + REACH_CELLS) // BLOCK_CELLS) * BLOCK_CELLS
-"""Cells around a tile that it depends on: along a bar, and what is read beside it. Whole blocks, so that
-stripes and directions are sought at the same cells in a tile and in its neighbours' halos."""
+"""Width, in cells, of the margin around a tile that its result depends on: the reach along a bar, and what
+is read beside it. It is rounded up to whole blocks, so that stripes and directions are searched for at the
+same cells in a tile and in its neighbours' halos.
+"""
 
 
 def finished_layers(
     elected: Path, key: TileKey, keys: frozenset[TileKey], frusta: ViewFrusta, seen_from_m: float,
     cell_m: float, settings: MapSettings,
 ) -> tuple[Layers, Float32]:  # fmt: skip
-    """Average the tile lengthways, sharpen it, fill its narrow gaps, looking at most the halo around it;
-    and what blur and gloss leave on bars, 1 sigma.
+    """Average the tile along the bars, sharpen it and fill its narrow gaps, reading no further than the halo
+    around it. Returns the layers, and the sigma that blur and gloss leave on bars.
 
-    elected: the folder of the elected tiles, `keys`. seen_from_m: height of the cameras that see this one.
+    elected: folder of the elected tiles, `keys`. seen_from_m: height of the cameras that see this one.
     """
     along = min(round(settings.along_m / cell_m), _ALONG_CELLS)
     reach = min(round(settings.fill_m / cell_m), _HALO)
@@ -75,7 +77,9 @@ def finished_layers(
 
 
 def _within(direction: Int8, margin: int) -> Int8:
-    """Keep directions of the tile and of so many cells about it, -1 further out: nothing is read there."""
+    """Keep the directions of the tile and of a margin of cells around it, and set those further out to -1,
+    where nothing is read.
+    """
     out = max(_HALO - margin, 0)
     inner = slice(out, direction.shape[0] - out)
     kept = np.full_like(direction, -1)

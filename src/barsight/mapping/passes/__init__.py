@@ -1,1 +1,1 @@
-"""Join the maps of several passes over one yard: ties between them, changes, one surface."""
+"""Join the maps of several passes over one yard: ties between them, changes, and a common surface."""

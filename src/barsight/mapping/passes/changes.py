@@ -1,4 +1,4 @@
-"""Find what changed between passes: places where a newer pass sees another height than those before."""
+"""Detect changes between passes: places where a newer pass sees another height than the earlier ones."""
 
 from __future__ import annotations
 
@@ -12,24 +12,26 @@ from scipy import ndimage
 from barsight.core.arrays import Bool, Float32, Float64
 
 PLACE_M = 0.05
-"""About the side of the places in which heights are compared: their median stands for all cells."""
+"""Approximate side of the places in which heights are compared, each by the median of its cells."""
 MIN_CHANGE_M, CHANGE_SIGMAS = 0.04, 3.0
-"""Least difference of height that is a change, and in sigmas of both."""
+"""Minimum height difference that counts as a change, absolute and in sigmas of both heights combined."""
 MIN_AREA_M2 = 0.04
-"""Smaller patches are errors of matching."""
+"""Minimum area of a change; smaller patches are matching errors."""
 OPENING_PLACES = 3
-"""A change holds a square of so many places: at an edge two views differ over less."""
+"""Side, in places, of the square that must fit into a change: at an edge, two views differ over a narrower
+strip.
+"""
 AXIS_PLACES = 50
-"""Places along a bundle's axis at which its heights are looked up."""
+"""Number of places along a bundle's axis at which earlier changes are looked up."""
 MARGIN_M = 0.15
-"""So far around a change what was seen before is given up."""
+"""Margin around a change within which what was seen before is discarded."""
 
 
 @dataclass(frozen=True)
 class HeightChange:
-    """A change of height. pass_number: of the pass that saw it first, from 0. low_m, high_m: its rectangle,
-    x and y. area_m2: of the places that changed. rise_m: median change of height, negative where something
-    was taken.
+    """A change of height. pass_number: pass that first saw it (of passes recorded at the same time, the
+    first), from 0. low_m, high_m: corners of its bounding rectangle, x and y. area_m2: area of the places
+    that changed. rise_m: median change of height, negative where something was removed.
     """
 
     pass_number: int
@@ -41,10 +43,10 @@ class HeightChange:
 
 @dataclass(frozen=True, eq=False)
 class BundleMove:
-    """A bundle that lies as high as before, and is another one or was moved along itself.
+    """A bundle found at the same height as before that was exchanged or moved along its axis.
 
-    pass_number: of the pass that saw it first, from 0. ends_m: (2, 3) of its axis as the joined map has it,
-    the low-y end first. along_m: how far it was moved towards its high-y end, None where it is another one.
+    pass_number: as in `HeightChange`. ends_m: (2, 3) ends of its axis in the joined map, the low-y end first.
+    along_m: distance moved towards its high-y end, None if it is another bundle.
     """
 
     pass_number: int
@@ -54,11 +56,11 @@ class BundleMove:
 
 
 class PlaceHistory:
-    """Knowledge of each place of the yard as pass after pass is added.
+    """Record of when each place of the yard was seen and changed, as pass after pass is added.
 
     low_m: (x, y), the corner of the first place. shape: (rows, columns). place_m: side of a place. Memory: 10
-    bytes a place. seen_by: number of the newest pass that saw it, -1 for none; changed_by: of the pass that
-    saw it changed last, -1 for none. changes, moves: all that were found.
+    bytes per place. seen_by: number of the newest pass that saw the place, -1 for none; changed_by:
+    pass_number of its last change, -1 for none. changes, moves: all that were found.
     """
 
     def __init__(self, low_m: tuple[float, float], shape: tuple[int, int], place_m: float) -> None:
@@ -71,7 +73,8 @@ class PlaceHistory:
     def add(self, number: int, z_m: Float32, sigma_m: Float32, since: int) -> None:
         """Add the heights (rows, columns) of the next pass with their sigma, NaN where it saw none.
 
-        since: number of the first pass of its time: what those saw is no older, so nothing changed between.
+        since: number of the first pass recorded at the same time: what those passes saw is no older, so
+        nothing changed between them.
         """
         rise = np.where(self.seen_by < since, z_m - self._z_m, np.float32(np.nan))
         bound = np.maximum(MIN_CHANGE_M, CHANGE_SIGMAS * np.hypot(sigma_m, self._sigma_m))
@@ -93,7 +96,9 @@ class PlaceHistory:
         self._z_m[seen], self._sigma_m[seen] = z_m[seen], sigma_m[seen]
 
     def note(self, move: BundleMove) -> None:
-        """Take a bundle's place, before and after, as changed; nothing where its heights told so already."""
+        """Mark a bundle's place, before and after its move, as changed; do nothing for an exchange that
+        the heights have already shown.
+        """
         x_m, y_m = np.linspace(move.ends_m[0, :2], move.ends_m[1, :2], AXIS_PLACES).T
         if move.along_m is None and (self._look_up(self.changed_by, x_m, y_m) >= move.pass_number).any():
             return
@@ -121,22 +126,22 @@ class PlaceHistory:
         return HeightChange(number, (left, bottom), (right, top), area_m2, round(float(np.median(rise)), 4))
 
     def last_change(self, x_m: NDArray[Any], y_m: NDArray[Any]) -> NDArray[np.int8]:
-        """Look up `changed_by` on a grid of columns x (X,) and rows y (Y,), (Y, X); -1 beyond the yard."""
+        """Look up `changed_by` on a grid of columns x (X,) and rows y (Y,), (Y, X); -1 outside the yard."""
         x, y = np.meshgrid(x_m, y_m)
         return self._look_up(self.changed_by, x, y)
 
     def newest_pass(self, x_m: NDArray[Any], y_m: NDArray[Any]) -> NDArray[np.uint8]:
-        """Look up which pass saw each cell of such a grid last, from 1; 0 where none did."""
+        """Look up the last pass that saw each cell of such a grid, counted from 1; 0 where none did."""
         x, y = np.meshgrid(x_m, y_m)
         return (self._look_up(self.seen_by, x, y) + 1).astype(np.uint8)
 
     def is_stale(
         self, centre_m: Float64, yaw_rad: float, length_m: float, width_m: float, reach_m: float
     ) -> bool:
-        """Check whether the yard changed within reach_m of a rectangle of which a part, or what lies just
-        beyond its ends, wasn't seen since.
+        """Check whether the yard changed within reach_m of a rectangle of which some part, or of the strips
+        just beyond its ends, hasn't been seen since.
 
-        centre_m: (2 or more,) x and y first; yaw_rad: of its length from +Y; length_m: along it.
+        centre_m: (2 or more,) x and y first; yaw_rad: of its length, from +Y; length_m: along it.
         """
         along = np.array([-np.sin(yaw_rad), np.cos(yaw_rad)])
         across = np.array([np.cos(yaw_rad), np.sin(yaw_rad)])

@@ -1,5 +1,5 @@
-"""Join the surfaces of passes into one: moved by their corrections, averaged where they agree, the newest
-where the yard changed.
+"""Join the surfaces of passes into one: shifted by their corrections, averaged where they agree, and the
+newest where the yard changed.
 """
 
 from __future__ import annotations
@@ -22,17 +22,21 @@ from barsight.registration.block_shifts import BLOCK_CELLS, BlockShifts, Matched
 from barsight.registration.pass_ties import PassCorrection
 
 EDGE_M = 0.03
-"""Cells further from the nearest one than this lie on another surface: they aren't averaged with it."""
+"""Maximum height difference from the nearest cell for a cell to be on the same surface and used in
+interpolation.
+"""
 AGREE_SIGMAS, AGREE_M = 3.0, 0.03
-"""Two passes' heights within these are averaged."""
+"""Two passes' heights are averaged if they differ by no more than the larger of these: in sigmas of both
+combined, and absolute.
+"""
 _STRIPE_CELLS = 32 * BLOCK_CELLS
-"""Cells of an overlap that are matched at once, along x and y."""
+"""Side, in cells along x and y, of the part of an overlap that is matched at once."""
 
 
 @dataclass(frozen=True, eq=False)
 class PassSurface:
-    """The surface of a pass, and the correction that puts it into the common map. since: number of the first
-    pass of its time.
+    """The surface of a pass, and the correction that transforms it into the common map. since: number of the
+    first pass recorded at the same time.
     """
 
     surface: Surface
@@ -42,14 +46,14 @@ class PassSurface:
 
 @dataclass(frozen=True, eq=False)
 class JoinedSurface:
-    """All passes in one. history: which pass saw each place last, and what changed."""
+    """The joined surface of all passes. history: the pass that last saw each place, and what changed."""
 
     surface: Surface
     history: PlaceHistory
 
 
 def measure_overlaps(surfaces: Sequence[Surface]) -> dict[tuple[int, int], BlockShifts]:
-    """Match all pairs of surfaces where both know something; keys are (first, second)."""
+    """Match all pairs of surfaces where both have heights; keys are (first, second)."""
     found = {}
     for first, second in combinations(range(len(surfaces)), 2):
         blocks = BlockShifts.none()
@@ -63,14 +67,14 @@ def measure_overlaps(surfaces: Sequence[Surface]) -> dict[tuple[int, int], Block
 
 
 def _seen(layers: Layers) -> MatchedMap:
-    """Leave what was filled out of a window."""
+    """Keep only measured cells of a window; filled ones become NaN."""
     seen = layers.source == HeightSource.VISION
     z_m, sigma_m = (np.where(seen, part, np.float32(np.nan)) for part in (layers.z_m, layers.sigma_m))
     return MatchedMap(z_m, sigma_m, layers.intensity)
 
 
 def _shared(first: Surface, second: Surface) -> Iterator[tuple[int, int, int, int]]:
-    """Divide the rectangle that both surfaces lie in: first column and row, columns and rows."""
+    """Divide the rectangle that both surfaces cover into parts: first column and row, columns and rows."""
     (x0, x1), (y0, y1) = (
         (max(a[0], b[0]), min(a[1], b[1]))
         for a, b in ((first.columns, second.columns), (first.rows, second.rows))
@@ -83,8 +87,8 @@ def _shared(first: Surface, second: Surface) -> Iterator[tuple[int, int, int, in
 def join_surfaces(passes: Sequence[PassSurface], folder: Path) -> JoinedSurface:
     """Join passes, the oldest first, into an empty folder.
 
-    A cell's height is the mean of those passes' that saw it since it changed last, by their sigmas; the
-    calibration's part of sigma is common to them, so the mean is taken to be no surer than they are.
+    A cell's height is the mean, weighted by sigma, over the passes that saw it since its last change. Its
+    sigma isn't reduced by averaging, because the calibration's part is common to all passes.
     """
     cell_m = passes[0].surface.cell_m
     keys = sorted(set().union(*(one.surface.tiles for one in passes)))
@@ -124,8 +128,8 @@ def _join_tile(
 
 
 def moved_window(one: PassSurface, column: int, row: int, columns: int, rows: int) -> Layers:
-    """Read a rectangle of the surface as its correction has it: heights and sigma bilinear between cells of
-    one surface, the rest from the nearest cell; unknown where the nearest is.
+    """Read a rectangle of the corrected surface: heights and sigma bilinear between cells of one surface,
+    the rest from the nearest cell; unknown where the nearest cell is.
     """
     cell_m, correction = one.surface.cell_m, one.correction
     x, y = np.meshgrid(cell_m * (column + np.arange(columns)), cell_m * (row + np.arange(rows)))
@@ -158,9 +162,10 @@ def moved_window(one: PassSurface, column: int, row: int, columns: int, rows: in
 
 
 def _averaged(old: Layers, new: Layers, chosen: Bool) -> Layers:
-    """Average where both agree; else the one that was seen, then the one of more views, then the newer one.
+    """Average where both agree; elsewhere prefer a measured height, then the one with more views, then the
+    newer.
 
-    chosen: (rows, columns) where the newer pass counts.
+    chosen: (rows, columns) True where the newer pass counts.
     """
     has_old, has_new = old.source != HeightSource.UNKNOWN, (new.source != HeightSource.UNKNOWN) & chosen
     both = has_old & has_new
@@ -184,8 +189,8 @@ def _averaged(old: Layers, new: Layers, chosen: Bool) -> Layers:
 
 
 def _coarse(one: PassSurface, low: Float64, shape: tuple[int, int], cells: int) -> tuple[Float32, Float32]:
-    """Compute the heights of a pass's places and their sigma, medians of `cells` x `cells` cells; NaN where
-    fewer than half were seen.
+    """Compute the heights of a pass's places and their sigma as medians of `cells` x `cells` cells; NaN
+    where fewer than half were seen.
     """
     out = [np.full(shape, np.nan, np.float32) for _ in range(2)]
     step = TILE_CELLS // cells

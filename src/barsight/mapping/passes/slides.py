@@ -1,4 +1,6 @@
-"""Find what was moved along itself, or exchanged, between two passes: heights stay alike, pictures don't."""
+"""Detect bundles that were moved along their axis or exchanged between two passes: the heights stay alike,
+the pictures don't.
+"""
 
 from __future__ import annotations
 
@@ -15,26 +17,30 @@ from barsight.mapping.passes.joined_surface import PassSurface, moved_window
 
 MAX_SHIFT_M = 2.0
 STILL_M = 0.025
-"""Poses and matching err by no more."""
+"""Maximum shift that errors of poses and matching can cause."""
 MIN_SHARED_M = 1.0
-"""Least length of a picture that is compared with another: of shorter ones some shift agrees by chance."""
+"""Minimum length over which two pictures are compared; shorter ones agree at some shift by chance."""
 MIN_AGREEMENT, MIN_GAIN = 0.4, 0.25
-"""Correlation of the pictures of what was moved, at its shift, and by how much more than without one."""
+"""Minimum correlation of a moved bundle's pictures at their shift, and minimum gain over the correlation
+without a shift.
+"""
 MAX_OTHER, MIN_SAME = 0.3, 0.6
-"""Pictures that correlate less than the first are of two bundles, where half of the bundles that weren't
-moved correlate more than the second.
+"""Two pictures show different bundles if their correlation is at most the first, provided that the median
+over the bundles that weren't moved is at least the second.
 """
 _SLOW_M = 0.15
-"""Brightness that changes more slowly along the bars is the light's."""
+"""Sigma of the high-pass filter along the bars: slower changes of brightness are due to the light."""
 _MAX_CONTRAST = 1.0
-"""In standard deviations of a picture: a strap or a label says no more than rust of its size."""
+"""Clipping bound in standard deviations of a picture, so that a strap or a label weighs no more than a
+rust spot of its size.
+"""
 _INSIDE_RATIO = 0.6
-"""Share of the width that is compared: each pass sees another flank."""
+"""Share of the width that is compared; nearer the flanks, each pass sees another side."""
 
 
 @dataclass(frozen=True, eq=False)
 class SeenBundle:
-    """A bundle's place in the joined map. ends_m: (2, 3) of its axis, the low-y end first."""
+    """A bundle's position in the joined map. ends_m: (2, 3) ends of its axis, the low-y end first."""
 
     ends_m: Float64
     width_m: float
@@ -42,9 +48,9 @@ class SeenBundle:
 
 @dataclass(frozen=True)
 class PictureShift:
-    """The shift of a bundle's picture in a newer pass from an older one's: along_m towards its high-y end.
+    """Shift of a bundle's picture from an older pass to a newer one: along_m towards its high-y end.
 
-    agreement: correlation there. still: correlation where nothing moved.
+    agreement: correlation at that shift. still: highest correlation at shifts up to STILL_M.
     """
 
     along_m: float
@@ -53,13 +59,15 @@ class PictureShift:
 
     @property
     def is_move(self) -> bool:
-        """Check that the picture lies elsewhere along the bundle, for sure."""
+        """Check whether the picture has clearly moved along the bundle."""
         is_away = abs(self.along_m) > STILL_M and self.agreement >= MIN_AGREEMENT
         return is_away and self.agreement - self.still >= MIN_GAIN
 
 
 def find_moves(passes: Sequence[PassSurface], bundles: Sequence[SeenBundle]) -> list[BundleMove]:
-    """Compare the pictures of each bundle in all passes that saw it, the oldest first."""
+    """Find moved and exchanged bundles by comparing the pictures of each in all passes that saw it, the
+    oldest first.
+    """
     pictures = [[picture_along(one, bundle) for one in passes] for bundle in bundles]
     moves = []
     for newer in range(1, len(passes)):
@@ -83,10 +91,10 @@ def find_moves(passes: Sequence[PassSurface], bundles: Sequence[SeenBundle]) -> 
 
 
 def picture_along(one: PassSurface, bundle: SeenBundle) -> Float32 | None:
-    """Sample a pass's picture of a bundle, (lines, places) across and along from its low-y end on; NaN where
-    the pass saw nothing. None where it saw less than MIN_SHARED_M.
+    """Sample a pass's picture of a bundle, (lines, places) across and along from its low-y end; NaN where the
+    pass saw nothing. None if it saw less than MIN_SHARED_M.
 
-    Slow changes along are taken off, and contrast is bounded.
+    Slow changes along the bundle are subtracted, and the contrast is clipped.
     """
     cell_m, ends_m = one.surface.cell_m, bundle.ends_m[:, :2]
     length_m = float(np.hypot(*(ends_m[1] - ends_m[0])))
@@ -113,7 +121,7 @@ def picture_along(one: PassSurface, bundle: SeenBundle) -> Float32 | None:
 
 
 def _shift(older: Float32 | None, newer: Float32 | None, cell_m: float) -> PictureShift | None:
-    """Find the shift along by which two pictures agree best; None where they share too little to tell."""
+    """Find the shift along the bundle at which two pictures agree best; None if they overlap too little."""
     if older is None or newer is None:
         return None
     cells = older.shape[1]
@@ -132,7 +140,7 @@ def _shift(older: Float32 | None, newer: Float32 | None, cell_m: float) -> Pictu
 
 
 def _correlation(older: Float32, newer: Float32, min_cells: float) -> float | None:
-    """Correlate the places that both know; None where those are fewer along than min_cells."""
+    """Correlate two pictures where both are known; None if fewer than min_cells cells along are."""
     both = np.isfinite(older) & np.isfinite(newer)
     if both.any(axis=0).sum() < min_cells or both.sum() < min_cells * len(both) / 2:
         return None

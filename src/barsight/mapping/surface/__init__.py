@@ -1,1 +1,1 @@
-"""The height surface: election among each cell's heights, hole filling, contours, cloud."""
+"""Build the height surface: election among each cell's heights, hole filling, contours, cloud."""

@@ -1,7 +1,8 @@
-"""Find the direction in which a bar runs through each cell: a bar is straight, so along it heights are alike.
+"""Find the direction in which a bar runs through each cell: a bar is straight, so heights along it are alike.
 
-One cell alone can tell it only roughly, and where noise is as high as the bars not even so. So each cell
-chooses one of 16 directions over a short way, and blocks of cells elect one of 80 near that.
+A single cell determines it only roughly, and not at all where the noise is as high as the bars. So each cell
+first chooses one of 16 directions over a short distance, and blocks of cells then elect one of 80 close to
+it.
 """
 
 from __future__ import annotations
@@ -12,22 +13,26 @@ from barsight.core.arrays import Bool, Float32, Int8, Int64, kernel
 
 DIRECTIONS = 16
 FINE_RATIO = 5
-"""Elected directions per chosen one: 26 cells away the nearest lies half a cell beside a bar at most."""
+"""Number of elected directions per chosen one: 26 cells away, the nearest one is at most half a cell off
+the bar.
+"""
 SAMPLE_CELLS = 2
 CHOICE_CELLS, ELECTION_CELLS = 12, 16
-"""Longest way to either side over which a cell's own direction is chosen, and the elected one."""
+"""Maximum distance to either side that is read to choose a cell's own direction, and to elect a block's."""
 BLOCK_CELLS = 8
-"""A block of cells elects its direction with the blocks around it."""
+"""Side of a block of cells, which elects its direction together with the blocks around it."""
 _NEAR, _MAX_SQUARES_RATIO = 8, np.float32(2.0)
-"""Elected directions by which a block's may differ from a cell's own one, as noise turns it, and its squares
-over those along the cell's own: what lies over the bars at an angle keeps its direction."""
+"""Maximum difference, in elected directions, between a block's direction and a cell's own one, which noise
+rotates; and the maximum ratio of the sums of squares along the two: what lies across the bars at an angle
+keeps its own direction.
+"""
 
 
 def choose_directions(z: Float32, known: Bool, gate_m: float, reach: int) -> Int8:
-    """Choose that of 16 directions in which heights (H, W) are most alike, -1 where none is known.
+    """Choose the one of 16 directions in which heights (H, W) are most alike, -1 where no height is known.
 
-    Every other cell up to `reach` on either side is read, and no more than CHOICE_CELLS; heights further than
-    gate_m from a cell's own, and those that are missing or outside, count as so far.
+    Every other cell up to `reach` on either side is read, but none beyond CHOICE_CELLS. Differences from a
+    cell's own height are limited to gate_m, which also stands for cells that are missing or outside.
     """
     reach = min(reach, CHOICE_CELLS)
     rows, columns = line_cells(DIRECTIONS, reach)
@@ -36,9 +41,10 @@ def choose_directions(z: Float32, known: Bool, gate_m: float, reach: int) -> Int
 
 
 def elect_directions(z: Float32, direction: Int8, gate_m: float, reach: int) -> Int8:
-    """Elect one of 80 directions (H, W) for the cells of a block that have chosen one near that.
+    """Elect one of 80 directions (H, W) for the cells of a block whose own direction is close to it.
 
-    In every other row and column a cell votes for the best of five about its own (`choose_directions`).
+    In every other row and column, a cell votes for the best of the five directions around its own one (see
+    `choose_directions`).
     """
     reach = min(reach, ELECTION_CELLS)
     rows, columns = line_cells(FINE_RATIO * DIRECTIONS, reach)
@@ -49,8 +55,8 @@ def elect_directions(z: Float32, direction: Int8, gate_m: float, reach: int) -> 
 
 
 def line_cells(directions: int, reach: int) -> tuple[Int64, Int64]:
-    """Compute rows and columns (directions, N) from a cell to every other one along each direction, itself in
-    the middle.
+    """Compute offsets in rows and columns (directions, N) from a cell to every other cell along each
+    direction, the cell itself in the middle.
     """
     turn = np.arange(directions)[:, None] * np.pi / directions
     onward = np.arange(SAMPLE_CELLS, reach + 1, SAMPLE_CELLS)
@@ -61,10 +67,10 @@ def line_cells(directions: int, reach: int) -> tuple[Int64, Int64]:
 
 @kernel()
 def _choose(z: Float32, known: Bool, gate_m: np.float32, rows: Int64, columns: Int64, reach: int) -> Int8:
-    """Choose the direction with the least sum of squares, the first of those that are alike.
+    """Choose the direction with the smallest sum of squares, the first one in a tie.
 
     z: (H + 2 reach, W + 2 reach). The squares of a whole row of cells are summed at once, direction by
-    direction, which vector instructions do.
+    direction, so that the compiler can use vector instructions.
     """
     height, width = known.shape
     chosen = np.full((height, width), -1, np.int8)
@@ -93,8 +99,8 @@ def _choose(z: Float32, known: Bool, gate_m: np.float32, rows: Int64, columns: I
 
 @kernel()
 def _add_squares(squares: Float32, beside: Float32, own: Float32, gate_m: np.float32) -> None:
-    """Add the squared differences of two rows of heights (W,), each no more than the gate; as much where one
-    is missing.
+    """Add the squared differences between two rows of heights (W,), each limited to the squared gate,
+    which is also added where a height is missing.
     """
     for j in range(squares.size):
         gap = abs(beside[j] - own[j])
@@ -104,7 +110,7 @@ def _add_squares(squares: Float32, beside: Float32, own: Float32, gate_m: np.flo
 @kernel()
 def _elect(z: Float32, direction: Int8, gate_m: np.float32, rows: Int64, columns: Int64, reach: int) -> Int8:
     """Elect the direction (blocks, blocks) with the most votes of a block and its eight neighbours, the first
-    of those that are alike; -1 where nobody votes.
+    one in a tie; -1 where nobody votes.
 
     z: (H + 2 reach, W + 2 reach). direction: (H, W).
     """
@@ -139,8 +145,8 @@ def _elect(z: Float32, direction: Int8, gate_m: np.float32, rows: Int64, columns
 def _near_own(
     z: Float32, direction: Int8, elected: Int8, gate_m: np.float32, rows: Int64, columns: Int64, reach: int
 ) -> Int8:
-    """Take the block's direction where it is near a cell's own and nearly as good there, else that one, in
-    the finer steps (H, W); -1 stays.
+    """Assign the block's direction where it is close to a cell's own and nearly as good there, else the
+    cell's own, both in the finer steps (H, W); -1 stays.
 
     z: (H + 2 reach, W + 2 reach). direction: (H, W); elected: (blocks, blocks).
     """
@@ -163,9 +169,9 @@ def _near_own(
 
 @kernel()
 def _squares(z: Float32, i: int, j: int, rows: Int64, columns: Int64, gate_m: np.float32) -> np.float32:
-    """Sum the squared differences from cell (i, j) along one direction, each no more than the gate.
+    """Sum the squared differences from cell (i, j) along one direction, each limited to the squared gate.
 
-    z: (H, W). rows, columns: (N,) cells from there.
+    z: (H, W). rows, columns: (N,) offsets from the cell.
     """
     squares = np.float32(0)
     for k in range(rows.size):

@@ -1,5 +1,5 @@
-"""Draw round bars that are too thin for the heights to show: the picture's stripes tell where each bar lies,
-the heights how high and how steep a row of them is, and the bars are round.
+"""Draw round bars that are too thin to show in the heights: the picture's stripes give the position of
+each bar, the heights give the level and slope of a row of bars, and the bars are round.
 """
 
 from __future__ import annotations
@@ -14,22 +14,27 @@ from barsight.mapping.surface.bar_directions import DIRECTIONS
 from barsight.mapping.surface.picture_stripes import NODE_CELLS, STEP_CELLS, Stripes
 
 REACH_CELLS = 15
-"""Cells around a cell that its bars depend on: two of the widest pitches, or a stripe window's corner."""
+"""Distance, in cells, up to which a cell's bars depend on its surroundings: twice the widest pitch, or the
+corner of a stripe window.
+"""
 _WIDEST_CELLS, _WIDEST_PX = 7.0, 10.0
 _BLUR_PX = 1.5
-"""Matching's support across the bar, one sigma."""
+"""Blur of the heights across the bar by matching's support, 1 sigma."""
 _PLACE_RATIO, _LINE_RATIO, _UNSEEN_RATIO, _SHOWN_MARGIN = 0.05, 0.25, 0.15, 0.6
 _GLOSS_RATIO = 0.2 * (np.pi / 8 - 0.25)
-"""Error of a row's level per diameter: a fifth of the way to the bars' highlights, which lie a quarter of the
-diameter below the crests, while the row's mean lies (1 / 2 - pi / 8) of it below them."""
+"""Sigma of a row's mean level due to gloss, as a share of the diameter: a fifth of the distance to the
+bars' highlights, which lie a quarter of the diameter below the crests, while the mean lies (1 / 2 - pi /
+8) of it below them.
+"""
 _PHASES, _SLOPE_STEP, _SLOPES = 64, 0.06, 31
 _ROUND = np.float32(np.sqrt(1 / 6 - np.pi**2 / 64))
-"""RMS of a row of half circles about its mean, per diameter: 0.112."""
+"""RMS of a row of half circles about its mean, as a share of the diameter: 0.112."""
 
 
 class _Profiles(NamedTuple):
-    """A row of touching bars, less its line, by slope and phase (slopes, phases), in pitches: expected
-    height, and its spread, where a crest's place is unsure by `_PLACE_RATIO` of the pitch.
+    """Profiles of a row of touching bars minus its line, by slope and phase (slopes, phases), in pitches:
+    expected height and its standard deviation, for a crest position that is uncertain by `_PLACE_RATIO` of
+    the pitch.
     """
 
     expected: Float32
@@ -39,15 +44,15 @@ class _Profiles(NamedTuple):
 def draw_bars(
     z: Float32, direction: Int8, stripes: Stripes, pixel_cells: Float32, cell_m: float, draws: bool = True
 ) -> tuple[Float32, Float32, Float32]:
-    """Draw bars over the heights z (H, W), if it draws: the bars' heights and their sigma, NaN where none is
-    drawn, and the sigma of what the heights z can't show where stripes are seen, else 0.
+    """Draw bars over the heights z (H, W) if `draws` is set. Returns the bars' heights and their sigma, NaN
+    where none is drawn, and the sigma of the relief hidden from the heights z where stripes are seen, else 0.
 
     direction: (H, W), of `smooth_along_bars`. pixel_cells: (H, W) width of a pixel. A row of bars is a line
     through the heights a pitch to either side (or one and two pitches to one side); the bars touch and are
     round: their diameter is the pitch over the line's cosine. They are drawn where the middle height is off
-    the line by no more than 25 % of the pitch, a pitch has at most seven cells and ten pixels, and what the
-    heights show of the profile isn't less than expected by 60 % of it. A blur of 1.5 pixels lets them show
-    that share; without it, the heights' mean over a pitch is the row's level.
+    the line by at most 25 % of the pitch, the pitch is at most seven cells and ten pixels, and the share of
+    the profile that the heights show falls short of the expected share by less than 0.6. A blur of 1.5 pixels
+    (sigma) determines the expected share; the mean height over a pitch, corrected for it, is the row's level.
     """
     drawn = np.full(z.shape, np.nan, np.float32)
     sigma, hidden = drawn.copy(), np.zeros(z.shape, np.float32)
@@ -57,8 +62,8 @@ def draw_bars(
 
 @lru_cache(maxsize=1)
 def _profiles() -> _Profiles:
-    """Work out the profiles of rows of touching bars that rise by -0.9 to 0.9 a pitch; phase 0 is the middle
-    between a bar's two borders with its neighbours, as seen from above.
+    """Compute the profiles of rows of touching bars that rise by -0.9 to 0.9 per pitch; phase 0 is the
+    middle between a bar's two borders with its neighbours, as seen from above.
     """
     fine = 2048
     x = (np.arange(4 * fine) + 0.5) / fine - 2
@@ -134,8 +139,8 @@ def _draw(
 def _line(
     z: Float32, i: int, j: int, ways: tuple[float, float, float], pitch: float, unseen_m: float
 ) -> tuple[float, float]:
-    """Compute the rise (m) over a pitch of the row of bars at cell (i, j), and by how much the middle of
-    three heights a pitch apart is off a line; unseen_m where only two are on one surface, NaN where one is.
+    """Compute the rise (m) per pitch of the row of bars at cell (i, j), and how far the middle of three
+    heights a pitch apart is off a line; unseen_m where only two are on one surface, NaN where only one is.
 
     z: (H, W). ways: see `_level`.
     """
@@ -154,7 +159,8 @@ def _line(
 
 @kernel()
 def _height_at(z: Float32, i: int, j: int, ways: tuple[float, float, float], way: float) -> float:
-    """Read the height (m) `way` cells across the bar from cell (i, j), between two cells; NaN behind a step.
+    """Interpolate the height (m) `way` cells across the bar from cell (i, j); NaN if there is a step in
+    between.
 
     z: (H, W). ways: see `_level`. way: negative for the other side.
     """
@@ -174,11 +180,12 @@ def _level(
     z: Float32, i: int, j: int, ways: tuple[float, float, float], pitch: float, rise_m: float, crest: float,
     profile: Float32, shown: float, cell_m: float,
 ) -> tuple[float, float]:  # fmt: skip
-    """Average the heights over a pitch around cell (i, j), less the row's line and the share of the profile
-    that they show, m; and fit that share over a pitch to either side.
+    """Average the heights over a pitch around cell (i, j), minus the row's line and the expected share of the
+    profile, m; and fit the share that the heights show, over a pitch to either side.
 
-    z: (H, W). ways: a step across in rows and in columns, and the step that ends a surface. crest: cells from
-    the nearest crest to (i, j). profile: (phases,) of a pitch of 1; shown: the share that is expected.
+    z: (H, W). ways: a step across the bar in rows and in columns, and the height difference at which a
+    surface ends. crest: distance in cells from the nearest crest to (i, j). profile: (phases,) for a pitch of
+    1; shown: the expected share.
     """
     down, right, step_m = ways
     total, weights = 0.0, 0.0

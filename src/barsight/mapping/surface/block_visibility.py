@@ -1,6 +1,6 @@
-"""Bound what a view sees of a whole block of cells, so that most cells needn't be asked one by one.
+"""Bound what a view sees of a whole block of cells, so that most cells needn't be tested one by one.
 
-All bounds are careful: what is said of a block holds for each height in it, whatever rounding does.
+All bounds are conservative: what is returned for a block holds for every height in it, despite rounding.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from barsight.mapping.surface.visibility import STRIDE
 from barsight.mapping.tiles import TILE_CELLS, VIEWS, Z
 
 BLOCK = STRIDE
-"""Cells to a side of a block: what is highest about it is highest about a stride."""
+"""Side of a block in cells, equal to the stride of the line-of-sight test, so that both share the roof."""
 NOWHERE, SOMEWHERE, EVERYWHERE = 0, 1, 2
-"""Where in a block heights may lie in both pictures of a view."""
+"""Part of a block in which heights may be inside both pictures of a view."""
 _SURE = 1e-6
-"""More than rounding adds to any bound here, in its own unit (m, or m px)."""
+"""Margin larger than the rounding error of any bound here, in the bound's own unit (m, or m px)."""
 
 
 def highest_about(around: Float32) -> Float32:
-    """Compute the highest of each block's cells and of all about it, a block wide."""
+    """Compute the highest height of each block and the blocks around it."""
     highest = reduce(np.maximum, (around[n::BLOCK] for n in range(BLOCK)))
     highest = reduce(np.maximum, (highest[:, n::BLOCK] for n in range(BLOCK)))
     return np.asarray(cv2.dilate(highest, np.ones((3, 3), np.uint8)), np.float32)
@@ -34,14 +34,14 @@ def bound_blocks(
     tile: Float32, corner: Float64, roof: Float32, ceiling: float, planes: Float64, eyes: Float64,
     cell_m: float, min_views: float, one_point_m: float, first: int,
 ) -> tuple[Int8, Bool, Float64, Bool]:  # fmt: skip
-    """Bound what K views see of a tile's blocks (B, B): where their heights lie in both pictures, (B, B, K);
-    whether `point_density` is 1 all over, (B, B, K); from which height on `is_unoccluded` holds for either
-    camera, (B, B, K, 2) m, inf if that isn't known; and whether min_views views see each of its cells at the
-    ceiling, (B, B).
+    """Bound what K views see of a tile's blocks (B, B).
 
-    roof: see `clear_height`. first: for views before it nothing but where their pictures lie is told. A block
-    without heights is in no picture. tile: (TILE_CELLS, TILE_CELLS, SLOTS, FIELDS); corner: (2,) column and
-    row of its first cell. planes: (6, 4, K), see `ViewFrusta.planes`; eyes: (K, 2, 3) m.
+    Returns where their heights are inside both pictures, (B, B, K); whether `point_density` is 1 everywhere,
+    (B, B, K); the height from which `is_unoccluded` holds for either camera, (B, B, K, 2) m, inf if unknown;
+    and whether min_views views see each of its cells at the ceiling, (B, B). roof: see `clear_height`. first:
+    for views before it, only the first result is computed. A block without heights is in no picture. tile:
+    (TILE_CELLS, TILE_CELLS, SLOTS, FIELDS); corner: (2,) column and row of its first cell. planes: (6, 4, K),
+    see `ViewFrusta.planes`; eyes: (K, 2, 3) m.
     """
     blocks, views = TILE_CELLS // BLOCK, planes.shape[2]
     within, dense = np.zeros((blocks, blocks, views), np.int8), np.zeros((blocks, blocks, views), np.bool_)
@@ -73,7 +73,7 @@ def bound_blocks(
 
 @kernel()
 def supported_span(heights: Float32, min_views: float) -> tuple[float, float]:
-    """Find the lowest and the highest height that min_views support, m; inf and -inf where there is none.
+    """Find the lowest and the highest height with at least min_views views, m; inf and -inf if there is none.
 
     heights: (rows, columns, SLOTS, FIELDS).
     """
@@ -88,9 +88,10 @@ def supported_span(heights: Float32, min_views: float) -> tuple[float, float]:
 
 @kernel()
 def _margins(middle: Float64, half: Float64, planes: Float64) -> tuple[Float64, Float64]:
-    """Bound the margin (K,) of a box's points inside both pictures of each view, from below and from above.
+    """Compute lower and upper bounds (K,) of the margin by which a box's points are inside both pictures of a
+    view.
 
-    middle, half: (3,) m, its middle and half its sides. planes: (6, 4, K), see `ViewFrusta.planes`.
+    middle, half: (3,) m, centre of the box and half its sides. planes: (6, 4, K), see `ViewFrusta.planes`.
     """
     least, most = np.full(planes.shape[2], np.inf), np.full(planes.shape[2], np.inf)
     for p in range(planes.shape[0]):
@@ -105,7 +106,7 @@ def _margins(middle: Float64, half: Float64, planes: Float64) -> tuple[Float64, 
 
 @kernel()
 def _is_dense(way: tuple[float, float, float], half: Float64, one_point_m: float) -> bool:
-    """Check that `point_density` is 1 all over a box. way: from its middle to the eye, m.
+    """Check that `point_density` is 1 everywhere in a box. way: from its centre to the eye, m.
 
     half: (3,) half its sides, m.
     """
@@ -123,12 +124,13 @@ def clear_height(
     ceiling: float,
     cell_m: float,
 ) -> float:
-    """Bound from above the heights from which `is_unoccluded` holds in each cell of a block; inf if unknown.
+    """Compute an upper bound of the height from which `is_unoccluded` holds in each cell of a block; inf if
+    unknown.
 
-    span: its lowest and highest height, m. at: row and column of its middle in the middle tile. way: from the
-    middle of both to the eye, m. roof: (3 B, 3 B), of `highest_about`, B blocks to a tile; ceiling: the
-    highest of all, m. A block's lines of sight never lie further apart than its cells: half a block about the
-    middle's and half a block onward, the roof holds all.
+    span: its lowest and highest height, m. at: row and column of its centre in the middle tile. way: from the
+    centre, at mid-height, to the eye, m. roof: (3 B, 3 B), of `highest_about`, B blocks to a tile; ceiling:
+    the highest of all heights, m. The lines of sight of a block never diverge by more than its cells, so the
+    roof covers all of them: half a block around the centre's line and half a block onward.
     """
     (low, high), (x, y, z) = span, way
     length, side, rise = max(abs(x), abs(y)) / cell_m, BLOCK / 2, z - (high - low) / 2 - _SURE

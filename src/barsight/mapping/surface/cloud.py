@@ -1,6 +1,4 @@
-"""Write the cloud: every height that enough views support, sides and lower surfaces included, a file per
-tile.
-"""
+"""Write the cloud, one file per tile: every height with enough views, including sides and lower surfaces."""
 
 from __future__ import annotations
 
@@ -19,7 +17,7 @@ from barsight.mapping.tiles import GRAY, TILE_CELLS, VIEWS, Z
 class CloudPart:
     """A tile's points: xyz_m (N, 3) float32 in the reference frame, intensity, sigma_z_m, views (N,).
 
-    cell: (N,) the point's cell, row by row; elected: (N,) whether it is its cell's surface.
+    cell: (N,) the point's cell, row by row; elected: (N,) True if the point is its cell's surface.
     """
 
     xyz_m: Float32
@@ -31,8 +29,8 @@ class CloudPart:
 
     @classmethod
     def of(cls, tile: Float32, winner: Int8, key: TileKey, cell_m: float, min_views: int) -> CloudPart:
-        """Select a tile's heights that min_views support; winner: (rows, columns), which of them is the
-        surface.
+        """Select a tile's heights with at least min_views views. winner: (rows, columns) slot of the
+        height that is the surface.
         """
         row, column, slot = np.nonzero(tile[..., VIEWS] >= min_views)
         kept = tile[row, column, slot]
@@ -47,7 +45,7 @@ class CloudPart:
         )
 
     def finished(self, z_m: Float32, sigma_m: Float32, blur_m: Float32) -> CloudPart:
-        """Update elected points to the finished surface; the others' sigma with the part for bars.
+        """Update elected points to the finished surface, and add the blur on bars to the sigma of the others.
 
         z_m, sigma_m, blur_m: (rows, columns) of the tile.
         """
@@ -57,18 +55,18 @@ class CloudPart:
         return replace(self, xyz_m=xyz, sigma_z_m=np.where(self.elected, sigma_m.ravel()[self.cell], beside))
 
     def write(self, folder: Path, key: TileKey) -> None:
-        """Write the tile's file anew: links to an older one keep what they show."""
+        """Write the tile's file as a new one, so that links to an older one keep its content."""
         path = cloud_file(folder, key)
         path.unlink(missing_ok=True)
         np.savez(path, **{field.name: getattr(self, field.name) for field in fields(self)})
 
 
 def read_part(folder: Path, key: TileKey) -> CloudPart:
-    """Read the tile's points as they were written last."""
+    """Read the tile's points as last written."""
     with np.load(cloud_file(folder, key)) as part:
         return CloudPart(**part)
 
 
 def cloud_file(folder: Path, key: TileKey) -> Path:
-    """Name the file of a tile's points."""
+    """Return the path of a tile's points."""
     return folder / f"cloud_{key[0]}_{key[1]}.npz"

@@ -1,4 +1,4 @@
-"""Cut contours from the surface along X at a given y."""
+"""Cut contours from the surface, along X at a given y."""
 
 from __future__ import annotations
 
@@ -25,11 +25,12 @@ def cut_contours(
     profile_y_m: tuple[float, ...],
     kind: Literal["fused", "paper"] = "fused",
 ) -> tuple[Contour, ...]:
-    """Cut a contour at each y asked for; without any at each laser profile; without a laser in the middle.
+    """Cut a contour at each y of profile_y_m; if it is empty, at each laser profile, or in the middle without
+    a laser.
 
-    At a laser profile the samples fall on the laser's own x grid, continued over the whole surface, and the
-    contour has the laser's number; others are numbered on after the laser's. kind: `cut_contour`, or
-    `smooth_contour` too.
+    At a laser profile, the samples lie on the laser's own x grid, extended over the whole surface, and the
+    contour has the laser's number; the others are numbered after the laser's. kind: `fused` for `cut_contour`
+    alone, `paper` to apply `smooth_contour` as well.
     """
     places = [(p.profile, float(np.median(p.y_m)), float(p.x_m[0])) for p in laser]
     if profile_y_m:
@@ -46,10 +47,10 @@ def cut_contours(
 
 
 def cut_contour(surface: Surface, profile: int, y_m: float, phase_m: float = 0.0) -> Contour:
-    """Sample every 10 mm along the whole surface, on the grid through x = phase_m.
+    """Sample a contour every 10 mm along the whole surface, on the grid through x = phase_m.
 
-    Each is the bilinear mean of the four cells around it, without those that lie more than 30 mm above or
-    below the nearest one, so that an edge stays an edge. Unknown where the nearest cell is unknown.
+    Each sample is the bilinear mean of the four cells around it, without those more than 30 mm above or below
+    the nearest one, so that an edge stays sharp. It is unknown where the nearest cell is unknown.
     """
     first, last = ((column * surface.cell_m - phase_m) / SPACING_M for column in surface.columns)
     x = phase_m + np.arange(np.ceil(first), np.floor(last) + 1) * SPACING_M
@@ -72,13 +73,12 @@ def cut_contour(surface: Surface, profile: int, y_m: float, phase_m: float = 0.0
 
 
 def smooth_contour(contour: Contour) -> Contour:
-    """Apply the paper's post-processing [paper 4.4]: median, cubic interpolation where there is no data,
-    filter.
+    """Apply the paper's post-processing [paper 4.4]: median, cubic interpolation of gaps, filter.
 
-    The paper takes the median over the points that several frames have at one place; those the map has fused
-    already, so it is taken over a sample and its neighbours. Interpolated samples are FILLED with half the
-    step that they bridge as their sigma at the least; at the ends nothing is added. The filter is that of
-    Savitzky and Golay (5 samples, second order), which the paper doesn't name.
+    The paper takes the median over the points that several frames have at one place; the map has already
+    fused those, so it is taken over a sample and its neighbours. Interpolated samples are FILLED, and their
+    sigma is at least half the step that they bridge; nothing is added beyond the ends. The filter is Savitzky
+    and Golay's (5 samples, second order), since the paper doesn't name one.
     """
     # Loaded where it is needed: its import takes most of a second.
     from scipy.signal import savgol_filter
@@ -100,7 +100,7 @@ def smooth_contour(contour: Contour) -> Contour:
 
 
 def _blend(z: Float64, sigma: Float64, source: UInt8, weights: Float64) -> tuple[Float64, Float64, UInt8]:
-    """Interpolate (4, N) corners to height, sigma and source (N,)."""
+    """Interpolate four corners (4, N) to height, sigma and source (N,)."""
     nearest = np.argmax(weights, axis=0)[None, :]
     z_nearest = np.take_along_axis(z, nearest, axis=0)
     source_nearest = np.take_along_axis(source, nearest, axis=0)

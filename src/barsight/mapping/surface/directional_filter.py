@@ -1,5 +1,5 @@
-"""Average heights along bars and deblur across them: a bar is straight, so along it the same height is
-measured again and again, and what matching's window has blurred across it can be undone without raising the
+"""Average heights along bars and deblur across them: a bar is straight, so the same height is measured
+repeatedly along it, and the blur of matching's window across it can be undone without amplifying the
 noise.
 """
 
@@ -27,12 +27,12 @@ _FAR_M = np.float32(1e4)
 
 
 def smooth_along_bars(z: Float32, weight: Float32, gate_m: float, reach: int) -> tuple[Float32, Int8]:
-    """Average heights (H, W) along the bar, and return the number of that of 16 directions in which each is
-    most alike over a short way, -1 where there is no height.
+    """Average heights (H, W) along the bar. Also return the index (of 16) of the direction in which each is
+    most alike over a short distance, -1 where there is no height.
 
     weight: (H, W), 0 where there is no height (NaN). Heights further than gate_m from a cell's own are
-    another surface: they don't count. Every other cell up to `reach` on either side is read, in the direction
-    that `elect_directions` gives.
+    another surface and don't count. Every other cell up to `reach` on either side is read, in the direction
+    of `elect_directions`.
     """
     direction = choose_directions(z, weight > 0, gate_m, reach)
     elected = elect_directions(z, direction, gate_m, reach)
@@ -42,8 +42,8 @@ def smooth_along_bars(z: Float32, weight: Float32, gate_m: float, reach: int) ->
 
 
 def vote_directions(direction: Int8) -> Int8:
-    """Replace each direction (H, W) of `smooth_along_bars` by the most frequent one, the first of those that
-    are alike, in 9 x 9 cells; -1 stays. On bars that the heights hardly show, noise turns single ones.
+    """Replace each direction (H, W) of `smooth_along_bars` by the most frequent one in 9 x 9 cells, the
+    first one in a tie; -1 stays. On bars that the heights hardly show, noise rotates single ones.
     """
     most = np.zeros(direction.shape, np.uint16)
     for number in range(DIRECTIONS):
@@ -59,10 +59,10 @@ def vote_directions(direction: Int8) -> Int8:
 def _average_along(
     z: Float32, weight: Float32, elected: Int8, gate_m: float, rows: Int64, columns: Int64, reach: int
 ) -> Float32:  # fmt: skip
-    """Average heights along each cell's direction; NaN and what has no direction stay.
+    """Average heights along each cell's direction; NaN and cells without direction stay as they are.
 
-    z, weight: (H + 2 reach, W + 2 reach). elected: (H, W). rows, columns: (directions, N) cells from the
-    middle.
+    z, weight: (H + 2 reach, W + 2 reach). elected: (H, W). rows, columns: (directions, N) offsets from the
+    cell.
     """
     height, width = elected.shape
     out = z[reach : reach + height, reach : reach + width].copy()
@@ -84,20 +84,21 @@ def _average_along(
 
 
 def deblur_across(z: Float32, direction: Int8, blur_cells: Float32) -> Float32:
-    """Deblur heights (H, W) across the bar, away from the mean of both neighbours: what a blur with a sigma
-    of blur_cells (H, W) takes from crests and gives to valleys [van Cittert 1931, one step].
+    """Deblur heights (H, W) across the bar: move them away from the mean of both neighbours by what a blur
+    with a sigma of blur_cells (H, W) takes from crests and adds to valleys [van Cittert 1931, one step].
 
-    direction: (H, W) the bar's own, of `smooth_along_bars`, whose heights z are. A cell stays as it is where
-    a neighbour is missing or over 30 mm higher or lower, which is a step and no bend. A wider blur than
-    `_WIDEST_CELLS` is undone in part only, since noise would grow more than bars gain.
+    direction: (H, W) the bar's own, of `smooth_along_bars`, which also returned the heights z. A cell stays
+    as it is where a neighbour is missing or more than 30 mm higher or lower, which is a step and not a
+    curvature. A blur wider than `_WIDEST_CELLS` is undone only in part, since the noise would grow more than
+    the bars gain.
     """
     rows, columns = np.rint(_across()).astype(np.int64)
     return _sharpened(z, direction, np.minimum(blur_cells, _WIDEST_CELLS) ** 2, rows, columns)
 
 
 def valley_mask(z: Float32, direction: Int8) -> Bool:
-    """Mark valleys (H, W): heights below something on either side, across the bar and no further than
-    `_VALLEY_CELLS`: what a step of over 30 mm parts from it doesn't count.
+    """Mark valleys (H, W): cells with a higher one on both sides, across the bar and within `_VALLEY_CELLS`;
+    cells beyond a step of more than 30 mm don't count.
 
     z: (H, W) heights, NaN where there is none; direction: (H, W) the bar's own, of `smooth_along_bars`.
     """
@@ -107,13 +108,13 @@ def valley_mask(z: Float32, direction: Int8) -> Bool:
 
 
 def blur_sigma(moved: Float32, valley: Bool) -> Float32:
-    """Estimate the standard deviation (H, W) that blur and gloss leave on bars. moved: (H, W) by how much
-    `deblur_across` has moved heights, NaN or 0 where it couldn't; valley: (H, W), see `valley_mask`.
+    """Estimate the standard deviation (H, W) that blur and gloss leave on bars. moved: (H, W) distance by
+    which `deblur_across` has moved heights, NaN or 0 where it couldn't; valley: (H, W), see `valley_mask`.
 
-    The correction that is best differs from stack to stack by more than itself, and flanks are as unsure as
-    crests: `_BLUR_RATIO` times the RMS over about a bar's width. Two bars of diameter D meet in a cusp: a
-    pixel's width p beside its bottom they lie sqrt(D p) higher, while a crest falls by p^2 / D. So valleys
-    have `_VALLEY_RATIO` times the RMS. Both shares were found on seven yards.
+    The best correction differs between stacks by more than its own size, and flanks are as uncertain as
+    crests: the estimate is `_BLUR_RATIO` times the RMS over about a bar's width. Two bars of diameter D meet
+    in a cusp: a pixel's width p from its bottom, they are sqrt(D p) higher, while a crest falls by p^2 / D.
+    So valleys get `_VALLEY_RATIO` times the RMS. Both ratios were calibrated on seven yards.
     """
     known = np.isfinite(moved) & (moved != 0)
     squares, count = (
@@ -125,12 +126,12 @@ def blur_sigma(moved: Float32, valley: Bool) -> Float32:
 
 
 def step_sigma(z: Float32, pixel_cells: float) -> Float32:
-    """Estimate the standard deviation (H, W) of heights beside steps of over 30 mm, 0 elsewhere.
+    """Estimate the standard deviation (H, W) of heights beside steps of more than 30 mm, 0 elsewhere.
 
     Matching stretches a higher surface over a lower one by one to three pixels, and the map's cells then lie
-    on a ramp between both: half of what a height has over the lowest one within a pixel, and half of the
-    smaller way to the lowest and to the highest one within three. z: (H, W), NaN where there is none.
-    pixel_cells: a pixel's width on the ground.
+    on a ramp between both. The estimate combines half of a height's distance above the lowest one within a
+    pixel, and half of the smaller of its distances to the lowest and the highest one within three pixels. z:
+    (H, W), NaN where there is none. pixel_cells: width of a pixel on the ground.
     """
     unknown = np.isnan(z)
     low, high = np.where(unknown, _FAR_M, z), np.where(unknown, -_FAR_M, z)
@@ -148,7 +149,7 @@ def step_sigma(z: Float32, pixel_cells: float) -> Float32:
 
 
 def _across() -> Float64:
-    """Compute one cell across the bar of each direction (2, 16), as a step in rows and in columns."""
+    """Compute a step of one cell across the bar for each direction (2, 16), in rows and in columns."""
     turn = np.arange(DIRECTIONS) * np.pi / DIRECTIONS
     return np.array([np.cos(turn), -np.sin(turn)])
 
@@ -158,8 +159,8 @@ def _sharpened(z: Float32, direction: Int8, share: Float32, rows: Int64, columns
     """Deblur heights across the bar by one step of van Cittert's iteration [1931]; returns a new array.
 
     z: (H, W) m, NaN where there is none. direction: (H, W), -1 where there is none. share: (H, W) the blur's
-    variance, cells^2. rows, columns: (16,) one cell across each direction. A cell without direction, on the
-    border, beside a missing height or a step stays as it is.
+    variance, cells^2. rows, columns: (16,) offset by one cell across each direction. A cell without
+    direction, on the border, or next to a missing height or a step stays as it is.
     """
     height, width = z.shape
     out = z.copy()
@@ -178,8 +179,8 @@ def _sharpened(z: Float32, direction: Int8, share: Float32, rows: Int64, columns
 def _valleys(z: Float32, direction: Int8, rows: Int64, columns: Int64) -> Bool:
     """Mark valleys (H, W): cells with a higher one on both sides across the bar, before any step.
 
-    z: (H, W) m; a missing height (NaN) on the way is passed over. direction: (H, W), -1 where there is none,
-    and then no valley. rows, columns: (_VALLEY_CELLS, 16) cells across each direction.
+    z: (H, W) m; missing heights (NaN) in between are skipped. direction: (H, W); where it is -1 there is no
+    valley. rows, columns: (_VALLEY_CELLS, 16) offsets across each direction.
     """
     height, width = z.shape
     out = np.zeros(z.shape, np.bool_)

@@ -1,12 +1,12 @@
-"""Elect the surface among a cell's heights: the highest that the views with free line of sight support.
+"""Elect the surface among a cell's heights: the highest one supported by the views that could see it.
 
 A wrong height hangs in the air, most often beside an edge, where matching stretches the nearer surface by a
 few pixels. Every view that looks through it to what lies behind speaks against it. So a height's votes are
-held against the number of views whose two cameras have a free line of sight to it, over the surface as the
-votes alone would have it. A height that fewer than `min_views` views can see at all is an error of matching.
+compared with the number of views whose two cameras have a free line of sight to it, over the surface that the
+votes alone would elect. A height that fewer than `min_views` views can see at all is a matching error.
 
 Where the pictures' border cuts off a high surface, cameras still see beneath its overhang from the side. What
-they see there is no surface to lift from, since the high one may go on above it.
+they see there isn't a surface to lift from, since the high one may continue above it.
 """
 
 from __future__ import annotations
@@ -43,13 +43,14 @@ _ALIKE_CELLS = 3.0
 _BORDER_PX = 3.0
 _NOTHING = np.float32(-1e6)
 _MOVED_CELLS = 0.5
-"""A height that has moved less is seen by the same views as before."""
+"""Maximum change of a height, in cells, for which the stored result of its visibility tests stays valid."""
 
 
 @dataclass(frozen=True, eq=False)
 class ViewFrusta:
-    """Frusta of K views: rect0_from_reference as rotation (K, 3, 3) and translation (K, 3), and the places of
-    both cameras (K, 2, 3) in the reference frame. spacing_rad: angle between points.
+    """Frusta of K views: rect0_from_reference as rotation (K, 3, 3) and translation (K, 3), and the
+    positions of both cameras (K, 2, 3) in the reference frame. spacing_rad: angle between neighbouring
+    points.
     """
 
     camera: RectifiedCamera
@@ -77,13 +78,13 @@ class ViewFrusta:
         return float(np.median(self.eyes[..., 2])) if self.eyes.size else 0.0
 
     def pixel_m(self, z_m: Float32, height_m: float) -> Float32:
-        """Return the width of a pixel on the ground at heights z_m, m, seen from height_m."""
+        """Return the width of a pixel on the ground, m, at heights z_m for a camera at height_m."""
         above = np.abs(np.float32(height_m) - z_m)
         return np.asarray(above / np.float32(self.camera.focal_px), np.float32)
 
     def planes(self) -> Float64:
-        """Compute the frustum planes (6, 4, K), a x + b y + c z + d, of what both pictures of a view hold,
-        less `_BORDER_PX` all around: 0 or more on their inner side.
+        """Compute the frustum planes (6, 4, K), a x + b y + c z + d, of the space inside both pictures of
+        a view, reduced by `_BORDER_PX` on all sides; values are 0 or more on the inner side.
         """
         camera = self.camera
         rays = np.concatenate([self.rotation, self.translation[:, :, None]], axis=2)
@@ -97,9 +98,7 @@ class ViewFrusta:
         return np.ascontiguousarray(np.moveaxis(np.array(low + high), 1, 2))
 
     def touching(self, low_m: Float64, high_m: Float64) -> Bool:
-        """Return (K,): whether a view's left picture may hold something of the box from low_m to
-        high_m (3,).
-        """
+        """Mark the views (K,) whose left picture may show part of the box from low_m to high_m (3,)."""
         corners = np.array(list(product(*zip(low_m, high_m, strict=True))))
         x, y, depth = np.moveaxis(corners @ self.rotation.mT + self.translation[:, None], -1, 0)
         camera = self.camera
@@ -110,7 +109,7 @@ class ViewFrusta:
         return chosen
 
     def only(self, chosen: Bool) -> ViewFrusta:
-        """Those views alone; chosen: (K,)."""
+        """Select some of the views; chosen: (K,)."""
         return replace(
             self,
             rotation=self.rotation[chosen],
@@ -121,8 +120,8 @@ class ViewFrusta:
 
 @dataclass(eq=False)
 class ViewSupport:
-    """A tile's heights as the first `views` views were asked whether they see them: (rows, columns, SLOTS, 3)
-    float32, z, how many see it and how many points these have in its cell; NaN where none was asked.
+    """Visibility of a tile's heights in the first `views` views: (rows, columns, SLOTS, 3) float32, z,
+    number of views that see it and number of points these have in its cell; NaN where nothing was tested.
     """
 
     views: int
@@ -130,14 +129,14 @@ class ViewSupport:
 
     @classmethod
     def none(cls) -> ViewSupport:
-        """No view was asked."""
+        """Create an empty record, with no view tested."""
         return cls(0, np.full((TILE_CELLS, TILE_CELLS, SLOTS, 3), np.nan, np.float32))
 
 
 @kernel()
 def elect_by_votes(tile: Float32, min_views: int, top_ratio: float) -> Float32:
-    """Elect heights (rows, columns) by votes alone: the highest with top_ratio of the best-seen one's views;
-    NaN where none has enough views.
+    """Elect heights (rows, columns) by votes alone: the highest with at least top_ratio of the best-seen
+    one's views; NaN where none has enough views.
     """
     rows, columns = tile.shape[:2]
     highest = np.full((rows, columns), np.nan, np.float32)
@@ -166,7 +165,7 @@ def elect_surface(
     """Elect which of each cell's heights is the surface, (rows, columns), -1 where none is.
 
     around: (3 * TILE_CELLS, 3 * TILE_CELLS) `elect_by_votes` of the tile and its eight neighbours.
-    asked: is brought up to date.
+    asked: updated in place.
     """
     box = supported_box(tile, key, cell_m, min_views)
     if box is None:
@@ -200,8 +199,8 @@ def elect_surface(
 
 
 def supported_box(tile: Float32, key: TileKey, cell_m: float, min_views: int) -> Float64 | None:
-    """Return (2, 3) m, the lowest and the highest corner of the heights that min_views support; None without
-    any.
+    """Return the corners (2, 3) m, lowest and highest, of the box around the heights with min_views views;
+    None without any.
     """
     low_m, high_m = supported_span(tile, min_views)
     if low_m > high_m:
@@ -217,14 +216,15 @@ def _support(
     blocks: tuple[Int8, Bool, Float64, Bool], cell_m: float, min_views: float, one_point_m: float,
     asked: tuple[int, Float32, Float32, Float32],
 ) -> None:  # fmt: skip
-    """Fill support, two arrays (rows, columns, SLOTS) of -1: the ratio of votes to those a height can expect,
-    and how many it can expect; left where fewer than min_views see or can see it or something may lie above.
+    """Fill two arrays (rows, columns, SLOTS) of -1: the ratio of a height's votes to the votes expected for
+    it, and the expected votes; left at -1 where fewer than min_views see or can see it, or it may be
+    occluded.
 
-    A view that can see a height is expected to vote for it in the cell's middle, or less where its points lie
-    further apart than cells: at ranges over one_point_m, and where it looks along the ground. scene: around,
-    roof and ceiling of `is_unoccluded`. blocks: what `bound_blocks` tells. asked: the first view that wasn't
-    yet, and what those before it see, of `ViewSupport`; it holds for a height that has hardly moved, and is
-    brought up to date; then the arrays to fill.
+    A view that can see a height is expected to vote for it in the cell's middle, with less weight where its
+    points are further apart than cells: at ranges over one_point_m, and at grazing angles. scene: around,
+    roof and ceiling of `is_unoccluded`. blocks: result of `bound_blocks`. asked: the first view not yet
+    tested; what the ones before it see, of `ViewSupport`, valid for a height that has hardly moved and
+    updated in place; then the arrays to fill.
     """
     rows, columns = tile.shape[:2]
     (around, _, ceiling), (within, dense, clear, is_open) = scene, blocks
@@ -270,10 +270,10 @@ def _is_seen(
     point: tuple[float, float, float], row: int, column: int, eyes: Float64, view: int, clear: Float64,
     scene: tuple[Float32, Float32, float], cell_m: float,
 ) -> bool:  # fmt: skip
-    """Check that both cameras of a view have a free line of sight to a point, in a cell of the middle tile.
+    """Check that both cameras of a view have a free line of sight to a point in a cell of the middle tile.
 
-    point: m. eyes: (K, 2, 3) m. view: its number among the K. clear: (B, B, K, 2) m, heights from which
-    the lines of a block are known to be free. scene: around, roof and ceiling of `is_unoccluded`.
+    point: m. eyes: (K, 2, 3) m. view: its number among the K. clear: (B, B, K, 2) m, heights from which the
+    lines of a block are known to be free. scene: around, roof and ceiling of `is_unoccluded`.
     """
     (around, roof, ceiling), z = scene, point[2]
     for e in range(2):
@@ -297,8 +297,8 @@ def _elected(
     """Select the highest supported height of each cell: its slot (rows, columns), -1 where there is none.
 
     tile: (rows, columns, SLOTS, FIELDS). share, expected: (rows, columns, SLOTS) of `_support`, share -1
-    where a height can't be the surface. It needs own_ratio of its votes (along_ratio where fewer than
-    min_views are expected), or along_ratio averaged along a bar or an edge.
+    where a height can't be the surface. A height is supported if its share is at least own_ratio (along_ratio
+    where fewer than min_views votes are expected), or at least along_ratio averaged along a bar or an edge.
     """
     rows, columns = tile.shape[:2]
     winner = np.full((rows, columns), -1, np.int8)
@@ -324,8 +324,8 @@ def _elected(
 
 @kernel()
 def _share_along(heights: Float32, share: Float32, row: int, column: int, z: float, cell_m: float) -> float:
-    """Average the support of a height and its like within `_ALONG` cells (every third is read), along that of
-    four directions in which most of the tile's cells have one: the bar's own, or the edge's.
+    """Average the support of a height and similar ones within `_ALONG` cells (every third is read), along the
+    one of four directions in which most of the tile's cells have one: the bar's own, or the edge's.
 
     heights, share: (rows, columns, SLOTS) of `_support`, heights NaN where share is -1. z: the height, m.
     """

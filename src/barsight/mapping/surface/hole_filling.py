@@ -1,4 +1,4 @@
-"""Fill gaps between seen cells."""
+"""Fill gaps between seen cells by interpolation."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from barsight.core.arrays import Bool, Float32, kernel
 
 @kernel()
 def bridge_gaps(z: Float32, sigma: Float32, seen: Bool, reach: int) -> Bool:
-    """Write height and sigma into the cells that aren't seen but have seen ones within `reach` on opposite
-    sides, along x or along y (the nearer pair wins); (H, W) which those are.
+    """Interpolate height and sigma, in place, in unseen cells with seen ones within `reach` on opposite
+    sides, along x or along y (the nearer pair wins). Returns a mask (H, W) of the filled cells.
     """
     filled = np.zeros(seen.shape, np.bool_)
     for i in range(seen.shape[0]):
@@ -33,7 +33,7 @@ def bridge_gaps(z: Float32, sigma: Float32, seen: Bool, reach: int) -> Bool:
 
 @kernel()
 def _steps(seen: Bool, i: int, j: int, di: int, dj: int, reach: int) -> int:
-    """Count steps to the first seen cell that way, 0 where there is none within `reach`.
+    """Count the steps to the first seen cell in one direction, 0 if there is none within `reach`.
 
     seen: (H, W). i, j: row and column of the cell; di, dj: of a step.
     """

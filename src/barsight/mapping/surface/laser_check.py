@@ -1,4 +1,6 @@
-"""Check a profile of the laser against the map of vision: is it off, and would it be seen if it were?"""
+"""Check a laser profile against the map of vision: whether it is off, and whether an offset would be
+noticed.
+"""
 
 from __future__ import annotations
 
@@ -15,13 +17,13 @@ from barsight.mapping.settings import MapSettings
 from barsight.mapping.surface.contours import SPACING_M
 
 FALSE_RATIO, CONTRADICTS_SIGMAS = 0.01, 2.576
-"""Share of right profiles whose offset contradicts, and the sigmas that this is."""
+"""Significance level of the tests (share of correct profiles that are rejected), and the same in sigmas."""
 PLACE_SIGMA_M = 0.002
-"""Sigma of a place along x that all of a profile shares: the map's own."""
+"""Sigma of the map's own position along x, common to a whole profile."""
 MIN_ALIKE_RATIO = 0.7
-"""Share of a profile's points that must lie on the map's surface, or on one within two samples along x."""
+"""Minimum share of a profile's points that lie on the map's surface, there or within two samples along x."""
 MAX_SLOPE = 2.0
-"""Places that are steeper tell no offset."""
+"""Maximum slope of places used to fit the offset."""
 _STRETCH_POINTS, _FEWEST, _FEWEST_STRETCHES = 50, 100, 3
 _SHORT_POINTS, _CAP_M = 25, 0.03
 _REACH = 2
@@ -30,8 +32,8 @@ _ROUNDS, _TUKEY = 15, 4.685
 
 @dataclass(frozen=True)
 class LaserOffset:
-    """A profile's offset from vision, along x and in height (laser above vision), with sigmas. alike_ratio:
-    share of its points on the map's surface.
+    """A profile's offset from vision, along x and in height (laser minus vision), with sigmas.
+    alike_ratio: share of its points on the map's surface.
     """
 
     x_offset_m: float
@@ -41,7 +43,7 @@ class LaserOffset:
     alike_ratio: float
 
     def contradiction(self) -> str:
-        """Say how it contradicts vision; empty where it doesn't."""
+        """Describe how the profile contradicts vision; empty if it doesn't."""
         if not self.alike_ratio >= MIN_ALIKE_RATIO:
             return f"only {100 * self.alike_ratio:.0f} % of its points lie on the map's surface"
         for way, offset, sigma in (
@@ -55,8 +57,8 @@ class LaserOffset:
 
 @dataclass(frozen=True)
 class LaserCheck:
-    """A profile's check. samples: points that vision has. offset: None where they are too few. reason: why
-    the profile is not believed, empty where it is.
+    """Result of checking a profile. samples: number of its points that vision has measured too. offset:
+    None if they are too few. reason: why the profile is rejected, empty if it is accepted.
     """
 
     profile: int
@@ -66,15 +68,16 @@ class LaserCheck:
 
     @property
     def is_believed(self) -> bool:
-        """Tell whether the profile may be fused."""
+        """Check that the profile may be fused."""
         return not self.reason
 
 
 def check_laser(contour: Contour, laser: LaserProfile, settings: MapSettings) -> LaserCheck:
-    """Check a profile against vision's contour at its y, which a right one contradicts in 1 % at most.
+    """Check a profile against vision's contour at its y; a correct profile contradicts it in at most 1 % of
+    cases.
 
-    One that doesn't contradict is believed only where vision would show that it is off: by laser_off_m in
-    height, or by twice that along x. A profile that is off so far is thus believed in 1 % at most.
+    A profile that doesn't contradict vision is accepted only where an offset would show: by laser_off_m in
+    height, or by twice that along x. A profile with such an offset is thus accepted in at most 1 % of cases.
     """
     known = np.isfinite(profile_difference(contour, laser))
     samples = int(known.sum())
@@ -91,10 +94,11 @@ def check_laser(contour: Contour, laser: LaserProfile, settings: MapSettings) ->
 
 
 def _sideways(contour: Contour, laser: LaserProfile, off_m: float) -> str:
-    """Say whether a profile fits better off_m aside, or would not fit worse there; empty where it lies right.
+    """Explain why a profile fits better when shifted by off_m along x, or not clearly worse; empty if
+    neither.
 
-    Mean differences of stretches of a quarter of a metre, each difference 30 mm at most, compared with those
-    of the profile moved: signed ranks [Wilcoxon 1945], 1 %.
+    Compares the mean differences over stretches of a quarter of a metre, each difference limited to 30 mm,
+    with those of the shifted profile: signed ranks [Wilcoxon 1945], 1 %.
     """
     from scipy.stats import wilcoxon  # half a second to import, and only a map with the laser needs it
 
@@ -113,7 +117,9 @@ def _sideways(contour: Contour, laser: LaserProfile, off_m: float) -> str:
 
 
 def _costs(contour: Contour, laser: LaserProfile) -> Float64:
-    """Compute the mean capped difference (m) of each stretch; NaN where vision has less than half of it."""
+    """Compute the mean capped difference (m) of each stretch; NaN where vision covers less than half of
+    it.
+    """
     size: Float64 = np.minimum(np.abs(profile_difference(contour, laser)), _CAP_M)
     count = -(-size.size // _SHORT_POINTS)
     padded = np.full(count * _SHORT_POINTS, np.nan)
@@ -125,11 +131,11 @@ def _costs(contour: Contour, laser: LaserProfile) -> Float64:
 
 
 def _offset(contour: Contour, laser: LaserProfile, settings: MapSettings) -> LaserOffset | None:
-    """Fit a shift along x and in z to the differences on smooth places, by iterated weights [Tukey]; None
-    where fewer than three stretches of half a metre have any.
+    """Fit a shift along x and in z to the differences at smooth places by iteratively reweighted least
+    squares [Tukey]; None if fewer than three stretches of half a metre have such places.
 
-    The sigmas are those of leaving out one stretch after the other. To the height's comes what all heights of
-    the map share, of which their lowest sigmas (1 %) are an upper bound.
+    The sigmas are jackknife estimates that leave out one stretch at a time. To the height's sigma is added
+    the error common to all heights of the map, for which their lowest sigmas (1 %) are an upper bound.
     """
     above = -profile_difference(contour, laser)
     slope = np.gradient(laser.z_m, laser.x_m)
@@ -150,7 +156,7 @@ def _offset(contour: Contour, laser: LaserProfile, settings: MapSettings) -> Las
 
 
 def _robust_fit(design: Float64, values: Float64) -> Float64:
-    """Solve design (N, 2) x = values (N,) with Tukey's weights; on level ground x[0] stays near 0."""
+    """Solve design (N, 2) x = values (N,) with Tukey's weights; on level ground, x[0] stays near 0."""
     weight: Float64 = np.ones(values.size)
     found: Float64 = np.zeros(2)
     ridge = np.diag([1e-6 * values.size, 0.0])
@@ -164,7 +170,9 @@ def _robust_fit(design: Float64, values: Float64) -> Float64:
 
 
 def _alike_ratio(contour: Contour, laser: LaserProfile, settings: MapSettings) -> float:
-    """Share of the laser's points that vision has whose height it has there or within _REACH samples."""
+    """Compute the share of the laser's points seen by vision whose height it has there or within _REACH
+    samples.
+    """
     known = np.isfinite(profile_difference(contour, laser))
     alike: Bool = np.zeros(laser.x_m.size, np.bool_)
     gate = max(settings.min_gate_m, settings.gate_sigma * float(np.nanmedian(contour.sigma_m)))

@@ -1,4 +1,4 @@
-"""Fuse profiles of the laser into the map of vision."""
+"""Fuse laser profiles into the map of vision."""
 
 from __future__ import annotations
 
@@ -20,8 +20,9 @@ from barsight.mapping.surface.tile_figures import gather_surface, tile_figures
 from barsight.mapping.tiles import TILE_CELLS
 
 CARRIED_M = 0.12
-"""Distance along Y over which the share of vision's error that is the same falls to 1/e: it averages so far
-along a bar."""
+"""Distance along Y over which the correlation of vision's error falls to 1/e: heights are averaged that
+far along a bar.
+"""
 _REACH = 2
 _EDGE_M = 0.03
 
@@ -39,15 +40,15 @@ class _Points:
 def fuse_laser(
     surface: Surface, laser: Sequence[LaserProfile], settings: MapSettings, folder: Path
 ) -> Surface:
-    """Fuse profiles that are believed; `folder`, empty, takes the new surface, which shares the tiles that no
-    profile meets. The cloud stays vision's.
+    """Fuse accepted profiles into a new surface in `folder`, which must be empty; tiles that no profile meets
+    are shared with the old surface. The cloud stays vision's.
 
-    In the rows beside a profile: where both agree, or the map has the laser's height within two cells (an
-    edge), the cell takes the mean of both by their sigmas, or the laser's height. Else the higher one counts,
-    with half their difference as sigma at the least. Cells that vision left unknown or filled take the
-    laser's height. Further along Y, on the same surface, vision's error is taken to be the same by
-    exp(-distance / CARRIED_M): where it is within min_gate_m it is taken off by as much, and the source stays
-    vision.
+    In the rows next to a profile: where both agree, the cell takes the mean weighted by their sigmas; where
+    the map has the laser's height within two cells (an edge), it takes the laser's height. Elsewhere the
+    higher one counts, with a sigma of at least half their difference. Cells that vision left unknown or
+    filled take the laser's height. Further along Y, on the same surface, vision's error is taken to be
+    correlated by exp(-distance / CARRIED_M): where it is within min_gate_m, that share of it is subtracted,
+    and the source remains vision.
     """
     points = [_at_cells(profile, surface.cell_m, settings) for profile in laser]
     carry = round(3 * CARRIED_M / surface.cell_m)
@@ -72,10 +73,10 @@ def _tiles_of(points: _Points, carry: int) -> set[TileKey]:
 
 
 def _at_cells(laser: LaserProfile, cell_m: float, settings: MapSettings) -> _Points:
-    """Bring a profile's points to the centres of the cells in the rows beside it.
+    """Interpolate a profile's points at the centres of the cells in the rows next to it.
 
-    Along x heights are interpolated between points up to two cells apart; at a step the nearest point counts,
-    where it lies within a quarter of a cell.
+    Along x, heights are interpolated between points up to two cells apart; at a step, the nearest point
+    counts if it is within a quarter of a cell.
     """
     sigma = max(settings.laser_sigma_m, np.nan_to_num(laser.range_std_m))
     first, last = np.ceil(laser.x_m[0] / cell_m - 0.25), np.floor(laser.x_m[-1] / cell_m + 0.25)
@@ -102,7 +103,7 @@ def _at_cells(laser: LaserProfile, cell_m: float, settings: MapSettings) -> _Poi
 def _fused_tile(
     surface: Surface, key: TileKey, points: Sequence[_Points], carry: int, settings: MapSettings
 ) -> Layers:
-    """Fuse all profiles' points into a tile, looking `carry` rows around it."""
+    """Fuse all profiles' points into a tile, including those up to `carry` rows around it."""
     first, row = key[0] * TILE_CELLS - _REACH, key[1] * TILE_CELLS - carry
     rows, columns = TILE_CELLS + 2 * carry, TILE_CELLS + 2 * _REACH
     around = surface.window(first, row, columns, rows)
@@ -131,7 +132,9 @@ def _fused_tile(
 def _fuse_points(
     around: Layers, fused: Layers, i: Int64, j: Int64, z: Float64, sigma: Float64, settings: MapSettings
 ) -> Bool:
-    """Fuse points (M,) into the cells at rows i, columns j of `fused`, in place; which agree with vision."""
+    """Fuse points (M,) into the cells at rows i, columns j of `fused`, in place; return which agree with
+    vision.
+    """
     own_z, own_sigma = around.z_m[i, j].astype(np.float64), around.sigma_m[i, j].astype(np.float64)
     seen = around.source[i, j] == HeightSource.VISION
     beside = np.stack([around.z_m[i, j + way] for way in range(-_REACH, _REACH + 1)])
@@ -154,11 +157,11 @@ def _carry(
     around: Layers, i: Int64, j: Int64, carried: tuple[Float64, Float64], way: int, reach: int, cell_m: float,
     gate_m: float, into: tuple[Float64, Float64, Float64],
 ) -> None:  # fmt: skip
-    """Carry what vision is off at cells (M,) along Y, up to `reach` rows that way, until vision knows nothing
-    or steps by more than gate_m.
+    """Carry vision's error at cells (M,) along Y, up to `reach` rows in direction `way`, until vision has no
+    measurement or a step of more than gate_m.
 
-    carried: laser above vision (m), and the share of vision in both variances (M,). into: per cell the share
-    of the error that is the same, laser above vision, and the share of vision, where this is nearer.
+    carried: laser minus vision (m), and vision's share of both variances (M,). into: per cell the correlation
+    of the error, laser minus vision, and vision's share, overwritten where this point is nearer.
     """
     shift, gain = carried
     for step in range(1, reach + 1):

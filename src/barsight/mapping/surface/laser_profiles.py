@@ -1,4 +1,6 @@
-"""Cut contours, hold them against the laser's profiles and fuse those into the map where it is asked for."""
+"""Cut contours, compare them with the laser's profiles and, if the settings say so, fuse those into the
+map.
+"""
 
 from __future__ import annotations
 
@@ -23,15 +25,15 @@ from barsight.mapping.surface.surface import Surface
 from barsight.recording.base import Recording
 
 MAX_ASKEW_M = 0.03
-"""A profile's places may lie so far apart across X: three cells of 10 mm."""
+"""Maximum extent of a profile across X for it to count as running along X: three cells of 10 mm."""
 
 
 @dataclass(frozen=True, eq=False)
 class Profiles:
     """The surface, with the laser where it was fused, and its contours. laser: its profiles in the map's
-    frame. agreed: of vision alone with each, or why there is none. checks: of each before it was fused; None
-    where that wasn't asked for. left_out: the laser is of another frame. askew: numbers of profiles that
-    don't run along X.
+    frame. agreed: agreement of vision alone with each profile, or why there is none. checks: of each
+    profile before fusion; None if fusion wasn't requested. left_out: True if the laser is in another
+    frame. askew: numbers of the profiles that don't run along X.
     """
 
     surface: Surface
@@ -44,16 +46,16 @@ class Profiles:
 
     @property
     def agreements(self) -> tuple[Agreement, ...]:
-        """Select the profiles that could be compared."""
+        """Select the agreements of profiles that could be compared."""
         return tuple(one for one in self.agreed if isinstance(one, Agreement))
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """Name the laser where a profile of it was fused."""
+        """List the laser if any of its profiles was fused."""
         return ("laser",) if any(check.is_believed for check in self.checks or ()) else ()
 
     def notices(self) -> Iterator[Notice]:
-        """Yield warnings: profiles that have no agreement, or aren't believed."""
+        """Yield warnings about profiles that have no agreement or are rejected."""
         yield from (Notice(a.code, a.reason) for a in self.agreed if isinstance(a, Failed))
         if self.left_out:
             reason = "without a crane the map isn't in the laser's yard: no agreement"
@@ -69,10 +71,10 @@ class Profiles:
 def cut_profiles(
     source: Recording, trajectory: Trajectory, surface: Surface, settings: MapSettings, folder: Path
 ) -> Profiles:
-    """Cut contours and hold them against the laser's profiles, then fuse those if the settings say so.
+    """Cut contours, compare them with the laser's profiles, then fuse those if the settings say so.
 
-    Profiles are places in the yard: a map in a frame of its own can't be held against them. Agreement is that
-    of vision alone: a fused map would be compared with itself. folder: takes the fused surface.
+    Profiles have positions in the yard: a map in its own frame can't be compared with them. Agreement is that
+    of vision alone, since a fused map would be compared with itself. folder: receives the fused surface.
     """
     whole = source.laser()
     in_frame = whole if trajectory.reference == "yard" else ()
@@ -104,14 +106,12 @@ def cut_profiles(
 
 
 def runs_along_x(profile: LaserProfile) -> bool:
-    """Check that a profile keeps its y, so that a contour at that y shows the same places."""
+    """Check that a profile keeps its y, so that a contour at that y covers the same places."""
     return bool(np.ptp(profile.y_m) <= MAX_ASKEW_M)
 
 
 def _speed_along_x(trajectory: Trajectory) -> float:
-    """Estimate the velocity along X while travelling, signed, m/s: the median over the steps
-    between frames.
-    """
+    """Estimate the travelling velocity along X, signed, m/s: the median over the steps between frames."""
     seconds = np.diff(trajectory.stamp_ns) / NS_PER_S
     if seconds.size == 0:
         return float("nan")

@@ -1,4 +1,4 @@
-"""Find the stripes that bars make in the picture, where heights don't show them."""
+"""Find the stripes that bars make in the picture where the heights don't show the bars."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from barsight.mapping.surface.bar_directions import DIRECTIONS
 
 NODE_CELLS = 2
 STEP_CELLS = 1.4
-"""A surface ends where heights change by more from one cell to the next."""
+"""Height difference between neighbouring cells, in cells, above which a surface ends."""
 _ACROSS_CELLS, _ALONG_CELLS, _TAPER_CELLS = 6, 6, 1.5
 _PITCHES = np.float32(2.4) * np.float32(1.06) ** np.arange(24, dtype=np.float32)
 _MIN_EXPLAINED, _MIN_CONTRAST, _MIN_SPREAD = 0.6, 0.12, 0.06
@@ -20,8 +20,8 @@ _FEWEST_CELLS, _MIN_INDEPENDENCE = 2.5, 0.04
 
 
 class Stripes(NamedTuple):
-    """The picture's stripes at every second cell (rows, columns): pitch and way to the nearest crest across
-    the bar, cells, pitch 0 where there are none.
+    """The picture's stripes at every second cell (rows, columns): pitch and distance to the nearest crest
+    across the bar, cells; pitch 0 where there are none.
     """
 
     pitch: Float32
@@ -29,8 +29,8 @@ class Stripes(NamedTuple):
 
 
 class _Window(NamedTuple):
-    """A node's window for each direction: cells across (16, N) and along (16, L) as steps in rows and
-    columns, weights (16, N), and cosine and sine of each place for each pitch (16, N, pitches).
+    """A node's window for each direction: cells across (16, N) and along (16, L) as offsets in rows and
+    columns, weights (16, N), and cosine and sine at each cell for each pitch (16, N, pitches).
     """
 
     across_rows: Int64
@@ -46,8 +46,8 @@ def find_stripes(z: Float32, gray: Float32, direction: Int8, cell_m: float) -> S
     """Fit a wave across the bars to the gray levels (H, W) around every second cell of heights z (H, W).
 
     direction: (H, W), of `smooth_along_bars`. Each cell across is the mean of 13 along the bar. The pitch
-    (2.4 to 9.2 cells) is that which explains most; stripes are where that is 60 % of the variance, with a
-    swing of 12 % of the mean.
+    (2.4 to 9.2 cells) is the one that explains most of the variance; it is a stripe's if that is at least 60
+    %, with an amplitude of at least 12 % of the mean.
     """
     shape = tuple(-(-side // NODE_CELLS) for side in z.shape)
     stripes = Stripes(np.zeros(shape, np.float32), np.zeros(shape, np.float32))
@@ -57,7 +57,7 @@ def find_stripes(z: Float32, gray: Float32, direction: Int8, cell_m: float) -> S
 
 @lru_cache(maxsize=1)
 def _window() -> _Window:
-    """Make the window of `_fit_stripes`."""
+    """Build the window of `_fit_stripes`."""
     turn = np.arange(DIRECTIONS)[:, None] * np.pi / DIRECTIONS
     across, along = np.arange(-_ACROSS_CELLS, _ACROSS_CELLS + 1), np.arange(-_ALONG_CELLS, _ALONG_CELLS + 1)
     rows, columns = np.rint(np.cos(turn) * across), np.rint(-np.sin(turn) * across)
@@ -82,8 +82,8 @@ def _fit_stripes(
 ) -> None:  # fmt: skip
     """Fit the wave of each node, see `find_stripes`.
 
-    z, gray: (H, W), NaN where there is none. direction: (H, W), -1 where there is none. step_m: a surface
-    ends where heights differ by more from cell to cell. pitches: (P,) cells. Fills pitch and crest (rows,
+    z, gray: (H, W), NaN where there is none. direction: (H, W), -1 where there is none. step_m: height
+    difference between cells above which a surface ends. pitches: (P,) cells. Fills pitch and crest (rows,
     columns).
     """
     count = window.taper.shape[1]
@@ -113,7 +113,8 @@ def _fit_stripes(
 
 @kernel()
 def _sum_waves(level: Float32, weight: Float32, cosine: Float32, sine: Float32, sums: Float32) -> None:
-    """Sum the terms of each wave's normal equations: cos, sin, cos^2, sin^2, cos sin, and level times both.
+    """Sum the terms of each wave's normal equations: cos, sin, cos^2, sin^2, cos sin, and level times cos and
+    sin.
 
     level, weight: (N,). cosine, sine: (N, P). Fills sums (7, P).
     """
@@ -138,10 +139,11 @@ def _sum_waves(level: Float32, weight: Float32, cosine: Float32, sine: Float32, 
 def _best_wave(
     sums: Float32, total: np.float32, mean: np.float32, power: np.float32, pitches: Float32
 ) -> tuple[float, float]:
-    """Select the wave that explains most of the power: its pitch and the way to its crest, cells; pitch 0
-    where none is a stripe's.
+    """Select the wave that explains most of the power: its pitch and the distance to its crest, cells; pitch
+    0 where no wave qualifies as a stripe.
 
-    sums: (7, P), see `_sum_waves`, of levels less their mean. total: the weights' sum. pitches: (P,) cells.
+    sums: (7, P), see `_sum_waves`, of levels minus their mean. total: sum of the weights. pitches: (P,)
+    cells.
     """
     best, pitch, crest = _MIN_EXPLAINED * power, 0.0, 0.0
     for p in range(pitches.size):
@@ -168,9 +170,9 @@ def _read_across(
 ) -> np.float32:  # fmt: skip
     """Average gray levels along the bar at each cell across it, outward from cell (i, j) up to a step.
 
-    z, gray: (H, W). d: the direction. along: (H, W) each, the direction in which a cell was averaged last, -1
-    before the first, with its mean and share of known cells: nodes side by side share cells. Fills level and
-    weight (N,), 0 beyond a step, and returns the weights' sum.
+    z, gray: (H, W). d: the direction. along: (H, W) each, a cache shared by neighbouring nodes: the direction
+    in which a cell was last averaged (-1 before the first), its mean and its share of known cells. Fills
+    level and weight (N,), 0 beyond a step, and returns the weights' sum.
     """
     height, width = z.shape
     middle, (turned, means, shares) = weight.size // 2, along
@@ -197,8 +199,8 @@ def _read_across(
 def _mean_along(
     z: Float32, gray: Float32, row: int, column: int, d: int, step_m: float, window: _Window
 ) -> tuple[np.float32, np.float32]:
-    """Average gray levels (H, W) along direction d about a cell where heights z (H, W) are within step_m of
-    its own; and the share of its places that are known. 0 and 0 without any.
+    """Average gray levels (H, W) along direction d over the cells whose heights z (H, W) are within step_m
+    of the central one; return the mean and the share of cells that are known, 0 and 0 if none is.
     """
     height, width = z.shape
     heard, known, long = np.float32(0), 0, window.along_rows.shape[1]

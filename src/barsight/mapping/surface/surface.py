@@ -1,4 +1,4 @@
-"""The height surface: finished tiles on disk, windows of it read back as layers."""
+"""Store the height surface: finished tiles on disk, and windows of it read back as layers."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from barsight.mapping.tiles import FIELDS, GRAY, TILE_CELLS, VIEWS, Z
 class Layers:
     """A rectangle of the surface, [y, x] with y rising: z_m, sigma_m (NaN where unknown), views, source.
 
-    intensity: mean gray level of the views that make the height, NaN where no view does.
+    intensity: mean gray level of the views that contribute to the height, NaN where no view does.
     """
 
     z_m: Float32
@@ -33,23 +33,23 @@ class Layers:
 
     @classmethod
     def unknown(cls, rows: int, columns: int) -> Layers:
-        """Make a rectangle of which nothing is known."""
+        """Create a rectangle in which everything is unknown."""
         nan = np.full((rows, columns), np.nan, np.float32)
         none = np.zeros((rows, columns), np.float32)
         return cls(nan, nan.copy(), none, none.astype(np.uint8), nan.copy())
 
 
 def gray_levels(intensity: Float32) -> UInt8:
-    """Round to gray levels from 1, 0 where no view saw the cell."""
+    """Round to gray levels from 1; 0 where no view saw the cell."""
     return np.where(np.isfinite(intensity), np.rint(intensity).clip(1, 255), 0).astype(np.uint8)
 
 
 @dataclass(frozen=True)
 class Surface:
-    """A finished height surface whose tiles lie in `folder`.
+    """A finished height surface whose tiles are stored in `folder`.
 
-    Cell (column, row) has its centre at (column * cell_m, row * cell_m). columns, rows: first and one past
-    the last cell that is known. Counts are cells by source.
+    Cell (column, row) has its centre at (column * cell_m, row * cell_m). columns, rows: first known cell and
+    one past the last. seen, filled: numbers of cells by source.
     """
 
     folder: Path
@@ -63,11 +63,11 @@ class Surface:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Return (rows, columns) of the rectangle that holds everything known."""
+        """Return (rows, columns) of the rectangle that contains all known cells."""
         return self.rows[1] - self.rows[0], self.columns[1] - self.columns[0]
 
     def window(self, column: int, row: int, columns: int, rows: int) -> Layers:
-        """Read the rectangle from cell (column, row) on; unknown where there is no tile."""
+        """Read the rectangle that starts at cell (column, row); it is unknown where there is no tile."""
         layers = Layers.unknown(rows, columns)
         for tile_row in range(row // TILE_CELLS, (row + rows - 1) // TILE_CELLS + 1):
             for tile_column in range(column // TILE_CELLS, (column + columns - 1) // TILE_CELLS + 1):
@@ -77,8 +77,8 @@ class Surface:
         return layers
 
     def cloud(self) -> Iterator[CloudPart]:
-        """Yield every height that enough views support, sides and lower surfaces included, tile by tile;
-        those that are the surface are as it has them. A snapshot has none.
+        """Yield every height with enough views, including sides and lower surfaces, tile by tile; those
+        that are the surface have its final values. A snapshot has no cloud.
         """
         for key in sorted(self.tiles):
             yield self.cloud_of(key)
@@ -89,7 +89,7 @@ class Surface:
 
 
 def elected_layers(tile: Float32, winner: Int8) -> Layers:
-    """Take from a tile's heights those that `elect_surface` chose."""
+    """Extract the heights of a tile that `elect_surface` chose."""
     won = _winners(tile, winner)
     source = np.where(winner >= 0, HeightSource.VISION, HeightSource.UNKNOWN).astype(np.uint8)
     return Layers(won[Z], height_sigma(np.moveaxis(won, 0, -1)), won[VIEWS], source, won[GRAY])
@@ -116,20 +116,20 @@ def _winners(tile: Float32, winner: Int8) -> Float32:
 def fill_gaps(layers: Layers, reach: int) -> None:
     """Fill, in place, unknown cells that have seen ones within `reach` on opposite sides, along x or along y.
 
-    The height is interpolated between the two (the nearer pair wins), its sigma is half their difference at
-    the least, and its source says FILLED.
+    The height is interpolated between the two (the nearer pair wins), its sigma is at least half their
+    difference, and its source is FILLED.
     """
     filled = bridge_gaps(layers.z_m, layers.sigma_m, layers.source == HeightSource.VISION, reach)
     layers.source[filled] = HeightSource.FILLED
 
 
 def tile_file(folder: Path, key: TileKey) -> Path:
-    """Name the file of a tile's layers."""
+    """Return the path of a tile's layers."""
     return folder / f"surface_{key[0]}_{key[1]}.npy"
 
 
 def write_tile(folder: Path, key: TileKey, layers: Layers) -> None:
-    """Write a tile's layers as a new file: links to an older one keep what they show."""
+    """Write a tile's layers as a new file, so that links to an older one keep its content."""
     stacked = np.stack([getattr(layers, field.name) for field in fields(Layers)], dtype=np.float32)
     path = tile_file(folder, key)
     path.unlink(missing_ok=True)
@@ -138,7 +138,7 @@ def write_tile(folder: Path, key: TileKey, layers: Layers) -> None:
 
 @lru_cache(maxsize=48)
 def read_tile(folder: Path, key: TileKey) -> Layers:
-    """Read a tile's layers; they are not to be written to."""
+    """Read a tile's layers, which must not be modified."""
     z, sigma, views, source, intensity = np.load(tile_file(folder, key))
     return Layers(z, sigma, views, source.astype(np.uint8), intensity)
 

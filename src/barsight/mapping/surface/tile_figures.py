@@ -1,4 +1,4 @@
-"""Count what finished tiles know, and describe the surface that they make up."""
+"""Count the known cells of finished tiles, and describe the surface that the tiles form."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ from barsight.mapping.tiles import TILE_CELLS
 
 @dataclass(frozen=True, eq=False)
 class TileFigures:
-    """A finished tile in figures. columns, rows: first and last known cell of the map, None without any."""
+    """Figures of a finished tile. columns, rows: first and last known cell, in the map's numbers; None
+    without any.
+    """
 
     seen: int
     filled: int
@@ -26,7 +28,7 @@ class TileFigures:
 
 
 def gather_surface(folder: Path, cell_m: float, tiles: dict[TileKey, TileFigures]) -> Surface:
-    """Describe the surface whose finished tiles lie in `folder`."""
+    """Describe the surface whose finished tiles are stored in `folder`."""
     figures = list(tiles.values())
     columns = [column for one in figures if one.columns for column in one.columns]
     rows = [row for one in figures if one.rows for row in one.rows]
@@ -44,7 +46,7 @@ def gather_surface(folder: Path, cell_m: float, tiles: dict[TileKey, TileFigures
 
 
 def tile_figures(key: TileKey, layers: Layers) -> TileFigures:
-    """Count what a finished tile knows."""
+    """Count the seen and filled cells of a finished tile."""
     there = layers.source != HeightSource.UNKNOWN
     measured = HeightSource.measured(layers.source)
     seen, filled = measured.sum(), (layers.source == HeightSource.FILLED).sum()

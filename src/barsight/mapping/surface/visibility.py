@@ -1,4 +1,6 @@
-"""Trace lines of sight: in the frustum, not occluded, and nothing above it unseen."""
+"""Trace lines of sight: check that a point is in the frustum, isn't occluded and has nothing unseen above
+it.
+"""
 
 from __future__ import annotations
 
@@ -11,14 +13,14 @@ _CUT_CELLS = 30
 _CUT_MARGIN_CELLS = 3
 _OVERHANG_CELLS = 10.0
 STRIDE = 4
-"""Cells that a line of sight passes at once where all around lies below it."""
+"""Number of cells that a line of sight skips at once where everything around lies below it."""
 
 
 @kernel(borrows=True)
 def point_density(way: tuple[float, float, float], one_point_m: float) -> float:
-    """Compute points that a view has in a level cell, at most 1.
+    """Compute the number of points that a view has in a level cell, at most 1.
 
-    way: from the cell to the eye, m. one_point_m: the range at which points lie as far apart as cells.
+    way: from the cell to the eye, m. one_point_m: range at which the spacing of points equals that of cells.
     """
     x, y, z = way
     squared = x * x + y * y + z * z
@@ -49,11 +51,12 @@ def may_be_occluded(
     cell_m: float,
     min_views: float,
 ) -> bool:
-    """Check for possible occlusion: within `_CUT_CELLS` along x or y, a much higher surface ends where fewer
-    than min_views views could see it go on towards the point: their pictures end there.
+    """Check for possible occlusion: within `_CUT_CELLS` along x or y, a much higher surface ends at a place
+    where fewer than min_views views could see it continue towards the point, because their pictures end
+    there.
 
-    point: m. around: (rows, columns) the tile's heights with a tile around it, m; row, column: the
-    point's, in the tile. planes: of all views, as `has_enough_views` takes them.
+    point: m. around: (rows, columns) heights of the tile and its eight neighbours, m; row, column: the
+    point's, in the tile. planes: of all views, as for `has_enough_views`.
     """
     x_m, y_m = point[0], point[1]
     if has_enough_views(x_m, y_m, ceiling, planes, min_views):
@@ -73,7 +76,7 @@ def may_be_occluded(
 
 @kernel(borrows=True)
 def has_enough_views(x_m: float, y_m: float, z_m: float, planes: Float64, min_views: float) -> bool:
-    """Check that at least so many views have the point in both pictures.
+    """Check that at least min_views views have the point in both pictures.
 
     planes: (6, 4, K), see `ViewFrusta.planes`.
     """
@@ -96,11 +99,11 @@ def is_unoccluded(
     ceiling: float,
     cell_m: float,
 ) -> bool:
-    """Check that no cell between rises over the line from a point at z_m, in a cell of the middle tile, to an
-    eye above it. way: from the point to the eye, m.
+    """Check that no cell in between rises above the line from a point at z_m, in a cell of the middle tile,
+    to an eye above it. way: from the point to the eye, m.
 
-    roof: the highest within a stride, of `highest_about`. A line over the roof skips as many cells: it only
-    rises. around: (3 TILE_CELLS, 3 TILE_CELLS) heights of the tile and its neighbours, m; ceiling: the
+    roof: the highest within a stride, of `highest_about`; a rising line that is over the roof skips a stride
+    at once. around: (3 TILE_CELLS, 3 TILE_CELLS) heights of the tile and its neighbours, m; ceiling: the
     highest of them.
     """
     x, y, z = way
