@@ -1,1 +1,3 @@
-"""From stereo pairs to the yard's map: matched, placed, fused and joined, each step kept to go on from."""
+"""Reconstruct the yard's map from stereo pairs: match, locate, fuse and join, with a checkpoint after each
+step.
+"""

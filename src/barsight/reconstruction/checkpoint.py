@@ -1,4 +1,4 @@
-"""Keep checkpoints of a run: whole results, as data, beside the output until the run ends well."""
+"""Save checkpoints of a run: complete results, stored as data next to the output until the run succeeds."""
 
 from __future__ import annotations
 
@@ -72,14 +72,14 @@ _TORN = (
     OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, RecursionError, NotImplementedError,
     zipfile.BadZipFile,
 )  # fmt: skip
-"""Exceptions of reading a file that is cut short or is something else."""
+"""Exceptions raised when reading a file that is truncated or of another kind."""
 
 
 def checkpoint_folder(root: Path, key: str) -> Path:
-    """Make the folder of one measurement under `root`; what stands there under other keys is removed.
+    """Create the folder of one measurement under `root`, and delete everything else there.
 
-    key: tells all that the results depend on. Raises InputError where `root` or the folder is a link, a file
-    or another user's: nothing is removed there.
+    key: identifies everything that the results depend on. Raises InputError where `root` or the folder is a
+    link, a file or another user's; nothing is deleted there.
     """
     folder = root / key[:32]
     _make_own(root)
@@ -101,7 +101,8 @@ def _make_own(folder: Path) -> None:
 def checkpoint_key(
     recording: Recording, source: Recording, settings: MeasureSettings, inputs: dict[str, str]
 ) -> str:
-    """Return a digest of all that trajectory, disparities and map depend on, the package's sources among it.
+    """Return a digest of everything that trajectory, disparities and map depend on, including the package's
+    sources.
 
     source: the recording with the sensors in use, in the yard. inputs: SHA-256 of its files.
     """
@@ -114,7 +115,9 @@ def checkpoint_key(
 
 
 def pictures_digest(recording: Recording) -> str:
-    """SHA-256 over all picture files of a recording; empty for a bag, whose file `digests` has whole."""
+    """Compute the SHA-256 of all picture files of a recording; empty for a bag, whose whole file is in
+    `digests`.
+    """
     if not isinstance(recording, PictureFiles):
         return ""
     found = hashlib.sha256()
@@ -125,9 +128,9 @@ def pictures_digest(recording: Recording) -> str:
 
 
 def checkpointed(folder: Path | None, name: str, make: Callable[[], T]) -> T:
-    """Load the checkpoint of this name, or compute and save make(); without a folder nothing is kept.
+    """Load the checkpoint of this name, or compute and save make(); without a folder nothing is saved.
 
-    The file appears whole or not at all; one that is torn is made anew.
+    The file is written atomically; a damaged one is computed again.
     """
     if folder is None:
         return make()
@@ -146,8 +149,8 @@ def checkpointed(folder: Path | None, name: str, make: Callable[[], T]) -> T:
 
 
 def trajectory_name(recording: Recording, delay_ns: int | None) -> str:
-    """Name the checkpoint of a trajectory by the frames and readings that it rests on: readings up to
-    delay_ns after the last frame, all of them if that is None.
+    """Name the checkpoint of a trajectory after the frames and readings that it depends on: readings up to
+    delay_ns after the last frame, or all of them if that is None.
     """
     stamps = np.array(recording.index.stamps_ns, np.int64)
     found = hashlib.sha256(stamps.tobytes())
@@ -162,7 +165,7 @@ def trajectory_name(recording: Recording, delay_ns: int | None) -> str:
 
 
 def sensor_readings(recording: Recording) -> list[tuple[NDArray[Any], ...]]:
-    """List what encoders and IMU have read, their stamps first."""
+    """List the readings of encoders and IMU, the time stamps first."""
     crane, imu = recording.crane(), recording.imu()
     found: list[tuple[NDArray[Any], ...]] = []
     if crane is not None:
@@ -173,8 +176,8 @@ def sensor_readings(recording: Recording) -> list[tuple[NDArray[Any], ...]]:
 
 
 def _write(value: Any, path: Path, beside: Path) -> None:
-    """Write frozen records as an npz file: the arrays, and a tree of all else as JSON; the files of a folder
-    that they name are linked into one in `beside`.
+    """Write frozen records as an npz file: the arrays, and a JSON tree of everything else; the files of
+    folders named in them are linked into a new folder in `beside`.
     """
     arrays: dict[str, Any] = {}
     tree = json.dumps(_plain(value, arrays, beside)).encode()
@@ -183,7 +186,7 @@ def _write(value: Any, path: Path, beside: Path) -> None:
 
 
 def read_checkpoint(path: Path) -> Any:
-    """Read back what `checkpointed` wrote."""
+    """Read a checkpoint that `checkpointed` wrote."""
     with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
         found = _record(json.loads(file["tree"].tobytes()), file, path.parent)
     if not is_dataclass(found):

@@ -1,4 +1,4 @@
-"""Join several passes over one yard, each measured as a recording of its own, into one map."""
+"""Join several passes over one yard, each measured as its own recording, into one map."""
 
 from __future__ import annotations
 
@@ -29,11 +29,15 @@ from barsight.registration.pass_ties import PairTie, PassCorrection, PassPrior, 
 from barsight.yard.types import Bundle, Doubt, DoubtKind
 
 MIN_SIGMA = np.array([2e-4, 2e-4, 2e-4, 0.002, 0.002, 0.002])
-"""Turn (rad) and shift (m) that no pass is taken to know better: springs and rails that no encoder sees."""
+"""Minimum sigma of a pass's rotation (rad) and shift (m), due to springs and rails that no encoder
+measures.
+"""
 SCALE_SIGMA = 2e-4
-"""By which share two passes' ways along X may differ."""
+"""Prior sigma, as a ratio, of the scale of a pass's travel along X."""
 CHANGE_REACH_M = 0.5
-"""A change so near to a bundle that was not seen whole since may have been one of it."""
+"""Distance from a bundle within which a change may have affected it, if the bundle wasn't seen whole
+since.
+"""
 STALE = Doubt(
     DoubtKind.OTHER, "the yard changed beside it between two passes, and a part of it was not seen since"
 )
@@ -41,7 +45,7 @@ STALE = Doubt(
 
 @dataclass(frozen=True, eq=False)
 class MappedPass:
-    """One recording, measured: what was looked at, its trajectory in the common map, its views."""
+    """One measured recording: its probe, its trajectory in the common map, and its map."""
 
     probed: ProbedRecording
     way: TrackedRecording
@@ -50,8 +54,8 @@ class MappedPass:
 
 @dataclass(frozen=True, eq=False)
 class JoinedPasses:
-    """Several passes in one map. placed: their own surfaces. ties: how they lie against each other; history:
-    what changed between.
+    """Several passes joined into one map. placed: their own surfaces. ties: their relative positions;
+    history: what changed between them.
     """
 
     passes: tuple[MappedPass, ...]
@@ -63,7 +67,7 @@ class JoinedPasses:
     history: PlaceHistory
 
     def notices(self) -> Iterator[Notice]:
-        """Yield warnings: ties that are missing or contradict, and changes."""
+        """Yield warnings about missing or contradictory ties and about changes."""
         tied = {number for pair in self.ties.pairs for number in (pair.first, pair.second)}
         for number in range(len(self.passes)):
             if number not in tied:
@@ -78,8 +82,8 @@ class JoinedPasses:
             yield Notice("yard-changed", _moved_along(move))
 
     def doubted(self, bundles: Sequence[Bundle]) -> tuple[Bundle, ...]:
-        """Mark the bundles at or beside a change of which a part was not seen since; notes what was moved
-        along itself or exchanged.
+        """Mark the bundles at or beside a change that weren't seen whole since; also record the ones that
+        were moved along their axis or exchanged.
         """
         for move in find_moves(self.placed, [SeenBundle(one.ends_m, one.width_m) for one in bundles]):
             self.history.note(move)
@@ -94,9 +98,9 @@ class JoinedPasses:
 
 
 def in_order(recordings: Sequence[Recording], settings: MeasureSettings) -> tuple[Recording, ...]:
-    """Sort passes by time. Raises InputError where they can't be joined: other cameras, mounting or crane, no
-    encoders, or two of one pair of cameras at the same time. Two pairs on one body may record at once; a pass
-    by itself is then taken by one of them.
+    """Sort passes by time. Raises InputError where they can't be joined: their cameras, mounting or crane
+    differ, there are no encoders, or one pair of cameras has two recordings of the same time. Two pairs on
+    one body may record at once; any other pass must be of one of those pairs.
     """
     if len(recordings) == 1:
         return tuple(recordings)
@@ -124,7 +128,7 @@ def in_order(recordings: Sequence[Recording], settings: MeasureSettings) -> tupl
 
 
 def _at_once(ordered: Sequence[Recording]) -> list[list[Recording]]:
-    """Group recordings of the same time: two pairs on one body make one each."""
+    """Group recordings made at the same time; two pairs of cameras on one body make one each."""
     groups, end_ns = list[list[Recording]](), -1
     for one in ordered:
         if groups and one.index.stamps_ns[0] <= end_ns:
@@ -136,7 +140,7 @@ def _at_once(ordered: Sequence[Recording]) -> list[list[Recording]]:
 
 
 def _hung(recording: Recording) -> str:
-    """Return a digest of how the body hangs. Raises InputError without encoders."""
+    """Return a digest of how the body is mounted on the crane. Raises InputError without encoders."""
     crane = recording.crane()
     if crane is None:
         problem = "it has no crane encoders, which place several passes in one yard"
@@ -145,7 +149,9 @@ def _hung(recording: Recording) -> str:
 
 
 def join_passes(passes: Sequence[MappedPass], surfaces: Sequence[Surface], folder: Path) -> JoinedPasses:
-    """Tie passes by their overlaps and join their maps, the oldest first; `folder` takes the surface."""
+    """Tie passes by their overlaps and join their maps, the oldest first; the surface is stored in
+    `folder`.
+    """
     ties = tie_passes([_prior(one.way.trajectory) for one in passes], measure_overlaps(surfaces))
     sizes = [len(group) for group in _at_once([one.probed.source for one in passes])]
     since = np.repeat(np.cumsum([0, *sizes[:-1]]), sizes).tolist()
@@ -170,7 +176,9 @@ def join_passes(passes: Sequence[MappedPass], surfaces: Sequence[Surface], folde
 
 
 def _prior(trajectory: Trajectory) -> PassPrior:
-    """State how far a whole pass may be off: as far as one of its frames, but no less than MIN_SIGMA."""
+    """Compute the prior of a whole pass's error: the median covariance of its frames, but at least
+    MIN_SIGMA and SCALE_SIGMA.
+    """
     covariance = np.zeros((7, 7))
     covariance[:6, :6] = np.median([frame.covariance for frame in trajectory.frames], axis=0)
     floor = np.append(MIN_SIGMA, SCALE_SIGMA) ** 2

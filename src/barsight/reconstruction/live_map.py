@@ -1,4 +1,6 @@
-"""Build the map while packets still come: each pair is placed, and fused as the one after it is."""
+"""Build the map while packets still arrive: each pair is located, and is fused once the next one is
+located.
+"""
 
 from __future__ import annotations
 
@@ -34,9 +36,9 @@ from barsight.yard_frame import frame_of, placed_in_yard
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """The map as it stands. surface: None while nothing is seen by two views, or nothing says where.
+    """The current map. surface: None until two views have been fused.
 
-    frames: in the map. owner: the session, in whose folder the surface lies.
+    frames: number of frames in the map. owner: the session whose folder holds the surface.
     """
 
     surface: Surface | None
@@ -53,13 +55,13 @@ class Snapshot:
 
 
 class PairPlacer:
-    """Places pairs with an estimator whose poses are final at once.
+    """Locates pairs with an estimator whose poses are final at once.
 
-    A pose lies in `checkpoints` by the frames and readings that it rests on. One that lies there needs no
-    pictures, unless `reads` is False or a later one is missing: then those before it are followed again.
-    poses: the estimator, as far as it came. beat: called for each pair that is followed.
+    A pose is stored in `checkpoints` under the frames and readings that it depends on. A stored pose needs no
+    pictures, unless `reads` is False or a later pose is missing: then the pairs before it are tracked again.
+    poses: the estimator, in its current state. beat: called for each pair that is tracked.
 
-    Raises MeasurementError where nothing places the body.
+    Raises MeasurementError if no sensor determines the body's pose.
     """
 
     def __init__(
@@ -74,7 +76,7 @@ class PairPlacer:
         self._key = hashlib.sha256()
 
     def push(self, pair: RectifiedPair | RefusedFrame) -> PosedFrame | RefusedFrame | None:
-        """Return the next pair's pose, or why it has none; None where only the end can tell."""
+        """Return the next pair's pose, or why it has none; None if it can be determined only at the end."""
         before = self._known[-1][1] if self._known else None
         now = self._counts(pair.stamp_ns)
         self._known.append((pair.stamp_ns, now))
@@ -94,8 +96,8 @@ class PairPlacer:
         return checkpointed(self._checkpoints, name, self._follow)
 
     def finish(self) -> Trajectory | None:
-        """Return all poses, which then lie in the checkpoints; None where measuring the recording now would
-        use other frames or readings than those that came in time.
+        """Return all poses and store them in the checkpoints; None if measuring the recording now would use
+        other frames or readings than those that arrived in time.
 
         Raises InputError where the pictures contradict a sensor.
         """
@@ -113,7 +115,7 @@ class PairPlacer:
         return checkpointed(self._checkpoints, trajectory_name(recording, self.poses.delay_ns), finish)
 
     def _follow(self) -> PosedFrame | RefusedFrame | None:
-        """Estimate the poses that weren't yet; return the last one."""
+        """Estimate the poses of the pairs not yet tracked; return the last one."""
         posed = None
         for seen in self._unfollowed:
             (pair,) = (seen,) if isinstance(seen, RefusedFrame) else self._pairs(frozenset((seen,)))
@@ -123,18 +125,18 @@ class PairPlacer:
         return posed
 
     def _counts(self, stamp_ns: int) -> tuple[int, ...]:
-        """Count the readings of each sensor that have come of those that a frame needs."""
+        """Count, for each sensor, the readings that a frame needs and that have arrived."""
         due_ns = stamp_ns + self._pairs.recording.rig.timeshift_cam_imu_ns + (self.poses.delay_ns or 0)
         readings = sensor_readings(self._pairs.recording)
         return tuple(int(np.searchsorted(stamps, due_ns, side="right")) for stamps, *_ in readings)
 
 
 class LiveMap:
-    """Places pairs as they come and fuses them; `folder` takes its tiles and surfaces.
+    """Locates pairs as they arrive and fuses them; its tiles and surfaces are stored in `folder`.
 
-    With settings that make poses final at once (`is_final`), `end` leaves the trajectory and the map in
-    `checkpoints`, as measuring the same pairs makes them. beat: called for each pair and each tile that is
-    done.
+    With settings that make poses final at once (`is_final`), `end` stores the trajectory and the map in
+    `checkpoints`, identical to what measuring the same pairs yields. beat: called for each finished pair and
+    tile.
     """
 
     def __init__(
@@ -156,7 +158,7 @@ class LiveMap:
 
     @property
     def delay_ns(self) -> int:
-        """Return how much later than itself the readings come that a frame needs."""
+        """Return the delay after a frame until all readings that it needs are recorded."""
         return self._placer.poses.delay_ns or 0
 
     @property
@@ -165,8 +167,8 @@ class LiveMap:
         return [] if self._map is None else self._map[0].stamps_ns
 
     def add(self, pair: RectifiedPair | RefusedFrame) -> None:
-        """Place the next pair, and fuse the one before; pairs wait as long as none of them can be matched,
-        and one whose picture has hardly moved is left out.
+        """Locate the next pair, and fuse the one before. Pairs wait until one of them can be matched, and
+        a pair whose picture has hardly moved is left out.
         """
         posed = self._placer.push(pair)
         if not isinstance(posed, PosedFrame) or not isinstance(pair, RectifiedPair):
@@ -184,14 +186,14 @@ class LiveMap:
         self._waiting.clear()
 
     def snapshot(self, owner: object) -> Snapshot:
-        """Elect the surface as it stands; only tiles that changed since the last one are elected anew."""
+        """Elect the current surface; only tiles that changed since the last snapshot are elected again."""
         frames = len(self.stamps_ns)
         if self._map is None or frames < 2:
             return Snapshot(None, frames)
         return Snapshot(self._map[0].snapshot(), frames, owner)
 
     def end(self) -> None:
-        """Leave trajectory and map in the checkpoints, if all readings were there when they were needed.
+        """Store trajectory and map in the checkpoints, if all readings were there when they were needed.
 
         Raises InputError where the pictures contradict a sensor.
         """
@@ -217,7 +219,7 @@ class LiveMap:
         return MapBuilder(binner, rectifier.camera, self._folder, settings.map, yard, self._beat), binner
 
     def _take(self, builder: MapBuilder, pair: RectifiedPair, posed: PosedFrame) -> None:
-        """Take a pair for the map, unless its picture has hardly moved."""
+        """Select a pair for the map unless its picture has hardly moved."""
         seen = (posed.reference_from_body @ self._pairs.rectifier.body_from_rect0).apply(self._ahead)
         if self._last is not None and np.linalg.norm(seen - self._last) < self._min_way_m:
             self._passed = pair, posed
@@ -227,7 +229,7 @@ class LiveMap:
         builder.settle()
 
     def _fuse_held(self, builder: MapBuilder, after: tuple[RectifiedPair, PosedFrame] | None) -> None:
-        """Match and fuse the pair that is held, as the one after it is known, which is held then."""
+        """Match and fuse the pending pair now that the next one is known, which becomes the pending one."""
         if self._held is not None:
             pair, posed = self._held
             builder.add(self._match(pair), posed, after)
@@ -237,5 +239,5 @@ class LiveMap:
 
 
 def is_final(settings: MeasureSettings) -> bool:
-    """Tell whether each pair's pose and disparity are final at once, as measured at the end."""
+    """Check whether each pair's pose and disparity are final at once, the same as measured at the end."""
     return make_estimator(settings.motion).begins_early and settings.self_calibrate == "none"

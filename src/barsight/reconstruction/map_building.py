@@ -1,4 +1,4 @@
-"""Build the map: posed, matched pairs -> votes in the map's cells -> height surface."""
+"""Build the map: located, matched pairs -> votes in the map's cells -> height surface."""
 
 from __future__ import annotations
 
@@ -35,13 +35,15 @@ from barsight.registration.yard_file import YardFrame
 from barsight.yard_frame import frame_of, shared_height_sigma_m
 
 _TIDIED_EVERY = 8
-"""Frames between which freed memory may pile up."""
+"""Number of frames after which freed memory is returned to the system."""
 
 
 class MapBuilder:
-    """Fuses posed frames, one after the other, into the tiles of `folder`, and carves their lines of sight.
+    """Fuses posed frames, one after the other, into tiles in `folder`, and carves free space along their
+    lines of sight.
 
-    placed: reference_from_rect0 of the views used, stamps_ns theirs. beat: called for each tile that is done.
+    placed: reference_from_rect0 of the views used; stamps_ns: their stamps. beat: called for each finished
+    tile.
     """
 
     def __init__(
@@ -60,8 +62,8 @@ class MapBuilder:
         self.refusals: list[Refusal] = []
 
     def add(self, frame: MatchedFrame | Refusal, posed: PosedFrame, after: Neighbour | None) -> None:
-        """Bin a frame's points and fuse them. after: the next frame; against it and the one before the
-        crane's own parts stand still.
+        """Bin a frame's points and fuse them. after: the next frame; compared with it and with the one
+        before, the crane's own parts stay in place.
         """
         beside = [other for other in (self._before, after) if other is not None]
         self._before = None if isinstance(frame, Refusal) else (frame.pair, posed)
@@ -85,15 +87,17 @@ class MapBuilder:
             self._previews = [*self._previews[-1:], (count, Preview(view.pair.left, view.disparity_px))]
 
     def settle(self) -> None:
-        """Elect the tiles that the views have left; called after each view, it leaves less for the end."""
+        """Elect the tiles that the views have left. Called after each view, it leaves less work for the
+        end.
+        """
         self._election.settle(self._min_views, self._frusta)
 
     def snapshot(self) -> Surface:
-        """Elect the surface as it stands; only tiles that changed since the last one are elected anew."""
+        """Elect the current surface; only tiles that changed since the last snapshot are elected again."""
         return self._election.snapshot(self._min_views, self._frusta())
 
     def finish(self) -> BuiltMap:
-        """Elect the surface of all views, of which there is one at least; the tiles are given up."""
+        """Elect the surface of all views, of which there must be at least one; the tiles are deleted."""
         with self._binner.watch("surface"):
             surface = self._election.finish(self._min_views, self._frusta())
         trim_heap()
@@ -112,7 +116,7 @@ class MapBuilder:
         return ViewFrusta.of(self.placed, self._camera, self._binner.per_pixel)
 
     def _with_shared(self, view: PosedView, posed: PosedFrame) -> PosedView:
-        """Add what the yard frame may be off to what the heights' errors share."""
+        """Add the yard frame's uncertainty to the error that all heights share."""
         if self._yard is None:
             return view
         cells, size = view.cells, self._binner.cell_m
@@ -130,9 +134,9 @@ def build_map(
     scratch: Path,
     advance: ProgressCallback,
 ) -> BuiltMap:
-    """Build the map of all matched pairs, or take the one that is kept of just these at these poses.
+    """Build the map of all matched pairs, or load its checkpoint if it is of exactly these pairs and poses.
 
-    Raises MeasurementError where no frame could be measured, or no place was seen often enough.
+    Raises MeasurementError where no frame could be measured, or no place was seen by enough frames.
     """
     source, path = probed.source, probed.source.path
     refusals = [Refusal("recording", frame) for frame in source.index.unpaired]
@@ -168,7 +172,9 @@ def build_map(
 
 
 def map_name(poses: tuple[PosedFrame, ...], binner: PointBinner) -> str:
-    """Name the checkpoint of the map of frames at these poses by what it rests on beside `checkpoint_key`."""
+    """Name the checkpoint of the map of frames at these poses after what it depends on besides
+    `checkpoint_key`.
+    """
     asked = [binner.stereo.calibration_sigma_px, binner.cell_m, binner.per_pixel]
     return f"map_{json_digest([json_value(poses), asked])[:32]}"
 

@@ -1,4 +1,6 @@
-"""Match pairs in chains: the first of each from nothing, the others from the disparity of the one before."""
+"""Match pairs in chains: the first of each chain without a prediction, the others from the previous
+disparity.
+"""
 
 from __future__ import annotations
 
@@ -24,14 +26,16 @@ from barsight.reconstruction.checkpoint import checkpointed
 from barsight.recording.rectified_pairs import RectifiedPairs
 
 _MAX_READING_AGE_NS = NS_PER_S // 2
-"""A place between readings further apart than this is not known. A session has them all by then."""
+"""Maximum age of the encoder readings around a stamp for its position to be known. A live session has them
+all by then.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class _Step:
-    """A pair of a chain. now_from_before: how the rectified left camera moved since the pair before, by the
-    encoders; None at the chain's beginning and where they don't say. name: tells all that its match rests on
-    beside the pictures.
+    """A pair of a chain. now_from_before: motion of the rectified left camera since the previous pair,
+    from the encoders; None at the start of the chain and where they don't give it. name: identifies
+    everything that its match depends on besides the pictures.
     """
 
     stamp_ns: int
@@ -40,12 +44,12 @@ class _Step:
 
 
 class PairChain:
-    """Matches the pairs of `pairs`, each once for all runs that keep checkpoints in `checkpoints`.
+    """Matches the pairs of `pairs`, each once for all runs that share `checkpoints`.
 
-    Results depend on the recording alone, not on which pairs are asked for or in what order: a pair whose
-    predecessor wasn't asked for matches that one too. A chain begins every `length` pairs, and where encoders
-    don't say how the camera moved. Several threads may ask at once. Of a recording that grows, `holds` tells
-    which results still stand.
+    Results depend on the recording alone, not on which pairs are requested or in what order: a pair whose
+    predecessor wasn't requested matches that one too. A chain starts every `length` pairs, and where the
+    encoders don't give the camera's motion. Several threads may call it at once. For a recording that is
+    still growing, `holds` tells which results are still valid.
     """
 
     def __init__(
@@ -71,29 +75,31 @@ class PairChain:
             return frame
 
     def holds(self, stamp_ns: int) -> bool:
-        """Tell whether a pair was matched as it would be with the readings that there are now."""
+        """Check whether a pair was matched as it would be with the readings available now."""
         return self._names.get(stamp_ns) == self._steps(stamp_ns)[-1].name
 
     def follows(self, stamp_ns: int) -> bool:
-        """Tell whether a pair is held against the one before: it begins no chain, encoders say the way."""
+        """Check whether a pair is predicted from the previous one: it isn't the first of a chain, and
+        encoders give the motion.
+        """
         return self._steps(stamp_ns)[-1].now_from_before is not None
 
     def split(
         self, pairs: Iterable[RectifiedPair | RefusedFrame]
     ) -> Iterator[list[RectifiedPair | RefusedFrame]]:
-        """Split pairs in time's order into those of each chain, which can be matched side by side."""
+        """Split pairs in order of time by chain; chains can be matched in parallel."""
         for _, together in groupby(pairs, lambda pair: self.chain(pair.stamp_ns)):
             yield list(together)
 
     def chain(self, stamp_ns: int) -> int:
-        """Number the chain that a pair is of: chains can be matched side by side."""
+        """Return the number of the chain that a pair belongs to; chains can be matched in parallel."""
         return self._place(stamp_ns) // self.length
 
     def _place(self, stamp_ns: int) -> int:
         return bisect_left(self._pairs.recording.index.stamps_ns, stamp_ns)
 
     def _steps(self, stamp_ns: int) -> list[_Step]:
-        """List the pairs of a chain up to one of them."""
+        """List the pairs of a chain up to and including the given one."""
         stamps, crane = self._pairs.recording.index.stamps_ns, self._pairs.recording.crane()
         place = self._place(stamp_ns)
         first = place - place % self.length
@@ -109,7 +115,7 @@ class PairChain:
     def _at(
         self, pair: RectifiedPair | RefusedFrame, steps: list[_Step], chain: int
     ) -> MatchedFrame | Refusal:
-        """Match the last pair of `steps`, and those before it as far as it rests on them."""
+        """Match the last pair of `steps`, and those before it as far as it depends on them."""
         before = self._known(steps[-1], chain)
         if before is not None:
             return before
@@ -139,8 +145,8 @@ class PairChain:
         return checkpointed(self._checkpoints, step.name, match)
 
     def _motion(self, before_ns: int, now_ns: int, crane: CraneSamples | None) -> Pose | None:
-        """Predict now_from_before of the rectified left camera by the encoders, at the nominal attitude; None
-        where they don't say.
+        """Predict now_from_before of the rectified left camera from the encoders, at the nominal attitude;
+        None where they don't give it.
         """
         if crane is None or crane.stamp_ns.size == 0:
             return None
@@ -157,8 +163,8 @@ class PairChain:
 
 
 class MatchedAhead:
-    """Matches pairs before their turn by `chain`, two chains side by side; in its turn a pair that would be
-    matched otherwise by what has been read since is matched anew.
+    """Matches pairs ahead of their turn by `chain`, several chains in parallel; a pair that later readings
+    would have matched otherwise is matched again in its turn.
     """
 
     def __init__(self, chain: PairChain, pairs: RectifiedPairs) -> None:
@@ -167,24 +173,24 @@ class MatchedAhead:
         self._begun: dict[int, Future[MatchedFrame | Refusal]] = {}
 
     def begin(self, stamps_ns: Iterable[int]) -> None:
-        """Begin to match pairs that aren't yet."""
+        """Start matching the pairs that haven't been started yet."""
         for stamp in stamps_ns:
             if stamp not in self._begun:
                 worker = self._workers[self._chain.chain(stamp) % WORKERS]
                 self._begun[stamp] = worker.submit(self._match, stamp)
 
     def __call__(self, pair: RectifiedPair) -> MatchedFrame | Refusal:
-        """Return a pair's match, from its beginning where it hasn't begun."""
+        """Return a pair's match, computing it now if it hasn't been started."""
         begun = self._begun.pop(pair.stamp_ns, None)
         found = None if begun is None else begun.result()
         return self._chain(pair) if found is None or not self.holds(pair.stamp_ns) else found
 
     def holds(self, stamp_ns: int) -> bool:
-        """Tell whether a pair was matched as it would be with the readings that there are now."""
+        """Check whether a pair was matched as it would be with the readings available now."""
         return self._chain.holds(stamp_ns)
 
     def close(self) -> None:
-        """Drop what hasn't begun, and wait for what has."""
+        """Cancel what hasn't started, and wait for the rest."""
         for worker in self._workers:
             worker.shutdown(cancel_futures=True)
 

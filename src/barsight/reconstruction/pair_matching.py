@@ -1,4 +1,4 @@
-"""The disparity of one pair of pictures."""
+"""Compute the disparity of one pair of pictures."""
 
 from __future__ import annotations
 
@@ -23,21 +23,22 @@ from barsight.stereo.settings import MethodName, StereoSettings, make_method
 from barsight.stereo.vertical_offset import MAX_OFFSET_PX, vertical_offset
 
 Picture = Path | UInt8
-"""A file, or (H, W) uint8."""
+"""A file, or an array (H, W) uint8."""
 _IN_COLOUR: tuple[MethodName, ...] = ("csca",)
-"""Methods that look at colours."""
+"""Methods that use colour."""
 _REMEDIES = {
     "swapped": "exchange the two pictures or give the range of disparities",
     "same-image": "give two pictures of one pair",
 }
 _MIN_SIZE = (3, 16)
-"""Rows and columns below which nothing is matched."""
+"""Minimum numbers of rows and columns of a picture that can be matched."""
 
 
 def match_pictures(
     left: Picture, right: Picture, settings: StereoSettings, rig: Path | StereoRig | None = None
 ) -> tuple[RectifiedPair, Disparity]:
-    """Match two pictures, rectified unless a rig is given: the rectified pair and its disparity.
+    """Match two pictures, which must be rectified unless a rig is given; return the rectified pair and its
+    disparity.
 
     Raises InputError, CalibrationError, ConfigError or MeasurementError where they can't be matched.
     """
@@ -60,7 +61,9 @@ def _name(picture: Picture) -> Path:
 
 
 def _pair(left: Picture, right: Picture, rig: Path | StereoRig | None, method: MethodName) -> RectifiedPair:
-    """Load the rectified pair. Raises InputError where the pictures can't be read, differ in size or rows."""
+    """Load the rectified pair. Raises InputError where the pictures can't be read, differ in size, are too
+    small or aren't rectified, and CalibrationError where the rig doesn't fit them.
+    """
     (left_gray, left_colour), (right_gray, right_colour) = _read(left), _read(right)
     frame = StereoFrame(0, left_gray, right_gray)
     colours = None
@@ -115,7 +118,7 @@ def _read(path: Picture) -> tuple[UInt8, UInt8 | None]:
 
 
 def _expect_inside(candidates: DisparityRange, pair: RectifiedPair) -> None:
-    """Raise ConfigError where no candidate, or more than the picture's width of them, can be."""
+    """Raise ConfigError where no candidate is possible, or there are more than the picture's width."""
     width = pair.camera.width
     if candidates.lowest_px >= width or candidates.highest_px <= -width or candidates.count > width:
         raise ConfigError(

@@ -1,4 +1,4 @@
-"""Look at a recording before it is measured: distance, cells, calibration, doubts."""
+"""Inspect a recording before it is measured: distance, cell size, calibration, doubts."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from barsight.yard_frame import in_yard
 
 @dataclass(frozen=True, eq=False)
 class ProbedRecording:
-    """A recording as it was first looked at. calibration_px: sigma of the disparity by the calibration.
-    doubts: what can't be right in the samples. inputs: SHA-256 of the files. checkpoints: their folder, if
-    any. watch: times the stages.
+    """Result of inspecting a recording. calibration_px: sigma of the disparity due to the calibration.
+    doubts: implausible samples. inputs: SHA-256 of the files. checkpoints: their folder, if any. watch:
+    times the stages.
     """
 
     source: Recording
@@ -47,19 +47,20 @@ class ProbedRecording:
 
     @property
     def per_pixel(self) -> int:
-        """Return the points per pixel and side that the cells need."""
+        """Return the number of points along each axis of a pixel that the cells need."""
         return points_per_pixel(self.first, self.cell_m)
 
     @property
     def frames_total(self) -> int:
-        """Return the number of frames recorded, those without a partner among them."""
+        """Return the number of recorded frames, including those without a partner."""
         return len(self.source.index.stamps_ns) + len(self.source.index.unpaired)
 
 
 def inspect_recording(
     recording: Recording, settings: MeasureSettings, scratch: Path, resume: Path | None
 ) -> ProbedRecording:
-    """Look at a recording: how far the scene is, how large the cells, how sure the calibration.
+    """Inspect a recording: measure the distance of the scene, choose the cell size and estimate the
+    calibration's uncertainty.
 
     Raises InputError where the sensors' clocks differ.
     """
@@ -83,8 +84,8 @@ def inspect_recording(
 def look_at(
     pairs: RectifiedPairs, settings: MeasureSettings, checkpoints: Path | None
 ) -> tuple[RecordingProbe, float, float]:
-    """Look at the first usable pair; return what it shows, the side of the map's cells (m) and the sigma of
-    the disparity by the calibration (px).
+    """Probe the first usable pair; return its result, the side of the map's cells (m) and the sigma of the
+    disparity due to the calibration (px).
     """
     first = checkpointed(checkpoints, "look", lambda: probe_recording(pairs))
     has_crane = pairs.recording.crane() is not None

@@ -33,14 +33,17 @@ from barsight.stereo.settings import StereoSettings, make_map_method
 from barsight.yard_frame import frame_of, placed_in_yard
 
 _MATCHED_AHEAD, _MATCHED_AFTER = 16, 4
-"""Pairs that may wait, matched, beside the trajectory and after it: 13 MB each at 1280x1024."""
+"""Maximum number of matched pairs that wait, during and after the trajectory's estimation: 13 MB each at
+1280x1024.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class TrackedRecording:
-    """The trajectory, and the pairs that the map is made of. rectifier: as corrected in service. stereo: with
-    the disparity's calibration sigma. rig_covariance: of yaw, baseline and focal length (3, 3), None where no
-    rig file says it. poses: of the frames taken, by stamp. matched: those frames, in order.
+    """The trajectory, and the pairs from which the map is made. rectifier: corrected by self-calibration
+    if set. stereo: with the disparity's calibration sigma. rig_covariance: of yaw, baseline and focal
+    length (3, 3), None where no rig file gives it. poses: of the selected frames, by stamp. matched: those
+    frames, in order.
     """
 
     trajectory: Trajectory
@@ -56,7 +59,7 @@ class TrackedRecording:
 def estimate_trajectory(
     probed: ProbedRecording, settings: MeasureSettings, advance: ProgressCallback
 ) -> Iterator[TrackedRecording]:
-    """Estimate the trajectory while the first pairs are matched on the core that it leaves idle."""
+    """Estimate the trajectory while the first pairs are matched on the idle core."""
     source, pairs, watch = probed.source, probed.pairs, probed.watch
     rectifier, total = pairs.rectifier, len(source.index.stamps_ns)
     match = matching(pairs, settings, probed.checkpoints, watch)
@@ -100,7 +103,7 @@ def estimate_trajectory(
 
 @contextmanager
 def _naming(probed: ProbedRecording) -> Iterator[None]:
-    """Name what can't be right in the samples as the cause, where nothing can be estimated from them."""
+    """Report implausible samples as the cause if nothing can be estimated from them."""
     try:
         yield
     except (InputError, MeasurementError) as error:
@@ -113,8 +116,8 @@ def _naming(probed: ProbedRecording) -> Iterator[None]:
 def _known_early(
     source: Recording, settings: MeasureSettings, rectifier: Rectifier, range_m: float
 ) -> frozenset[int]:
-    """Select stamps of frames that may be matched before the trajectory is known: all, or the first few that
-    lie apart by the encoders. Where the trajectory says otherwise, it decides.
+    """Select stamps of frames that may be matched before the trajectory is known: all, or the first few
+    that are far enough apart by the encoders. Where the trajectory selects otherwise, it takes precedence.
     """
     stamps, min_shift = source.index.stamps_ns, settings.map.min_shift
     if settings.self_calibrate != "none":
@@ -132,7 +135,7 @@ def _known_early(
 def matching(
     pairs: RectifiedPairs, settings: MeasureSettings, checkpoints: Path | None, watch: Stopwatch
 ) -> PairChain:
-    """Make what matches the pairs of a recording for its map."""
+    """Create the matcher of a recording's pairs for its map."""
     stereo, every = settings.stereo, settings.map.min_shift == 0
     chained = every and stereo.method == "barsight" and stereo.barsight.preset == "best"
     matcher = Matcher(stereo, make_map_method(stereo), watch)
@@ -142,6 +145,6 @@ def matching(
 def _matched_ahead(
     match: PairChain, pairs: Iterator[RectifiedPair | RefusedFrame], max_waiting: int
 ) -> AbstractContextManager[Iterator[MatchedFrame | Refusal]]:
-    """Match pairs ahead, whole chains side by side; about `max_waiting` of them may wait."""
+    """Match pairs ahead, whole chains in parallel; about `max_waiting` of them may wait."""
     chains = max(max_waiting // match.length, WORKERS)
     return prefetched_chain(partial(map, match), match.split(pairs), chains)
