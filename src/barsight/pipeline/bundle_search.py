@@ -1,4 +1,4 @@
-"""Find the bundles of a mapped yard: in its map, then in its pictures."""
+"""Find the bundles of a mapped yard, first in its map, then in its pictures."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from barsight.yard.types import Bundle, YardMap
 
 
 def find_yard_bundles(mapped: MappedYard, heights: YardMap) -> tuple[Bundle, ...]:
-    """Find the bundles, and look at their bars, straps and labels in the newest pass's pictures: what lay
-    there before may be gone.
+    """Find the bundles, and measure their bars, straps and labels in the newest pass's pictures only: what
+    earlier passes saw may be gone.
     """
     settings, newest = mapped.settings, mapped.newest
     poses = {frame.stamp_ns: frame.reference_from_body for frame in newest.way.trajectory.frames}
@@ -38,7 +38,7 @@ def find_yard_bundles(mapped: MappedYard, heights: YardMap) -> tuple[Bundle, ...
 
 
 def _baseline(one: MappedPass) -> Float64:
-    """Average the level unit vector (2,) from the left camera to the right one."""
+    """Average the horizontal unit vector (2,) from the left camera to the right one."""
     right = one.way.rectifier.body_from_rect0.rotation[:, 0]
     poses = (frame.reference_from_body for frame in one.way.trajectory.frames)
     mean = np.mean([pose.rotation @ right for pose in poses], axis=0)[:2]

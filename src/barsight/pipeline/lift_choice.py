@@ -1,4 +1,4 @@
-"""Find the bundles of a mapped yard, choose lifts, and gather all that was measured."""
+"""Find the bundles of a mapped yard, choose lifts, and collect all results."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from barsight.yard_frame import calibration_id, frame_of, with_shared, yard_fram
 
 @dataclass(frozen=True)
 class LiftRequest:
-    """Lifts that are asked for.
+    """A request for lifts.
 
-    magnet: what they are chosen for; where there is none, they are judged for the package's example and all
-    forbidden (`no-magnet`). judged_at: when they are judged: now, or at the recording's last frame, to look
-    back. notices: warnings that the caller has.
+    magnet: magnet that they are chosen for; without one they are judged for the package's example, and all
+    are forbidden (`no-magnet`). judged_at: time for which they are judged: now, or the recording's last
+    frame, to look back. notices: warnings of the caller.
     """
 
     magnet: Magnet | None = None
@@ -91,7 +91,7 @@ def find_lifts(mapped: MappedYard, request: LiftRequest) -> Measurement:
 
 
 def _input_hashes(passes: Sequence[MappedPass]) -> dict[str, str]:
-    """Gather the inputs' digests, by the pass's number where there are several."""
+    """Collect the inputs' digests, prefixed with the pass's number if there are several."""
     if len(passes) == 1:
         return passes[0].probed.inputs
     return {
@@ -101,7 +101,7 @@ def _input_hashes(passes: Sequence[MappedPass]) -> dict[str, str]:
 
 
 def _stages(mapped: MappedYard) -> tuple[StageTime, ...]:
-    """Sum the stages' times over the passes, in the order in which the first pass did them."""
+    """Sum the stages' times over the passes, in the order of the first pass."""
     watches = [one.probed.watch for one in mapped.passes]
     if mapped.joined is not None:
         watches.append(mapped.watch)
@@ -113,7 +113,7 @@ def _stages(mapped: MappedYard) -> tuple[StageTime, ...]:
 
 
 def _records(mapped: MappedYard, travels: Sequence[Travel]) -> tuple[PassRecord, ...]:
-    """Describe each of several passes for result.json."""
+    """Describe each pass for result.json if there are several."""
     if mapped.joined is None:
         return ()
     ties = mapped.joined.ties
@@ -135,7 +135,7 @@ def _records(mapped: MappedYard, travels: Sequence[Travel]) -> tuple[PassRecord,
 def _travel(
     probed: ProbedRecording, way: TrackedRecording, built: BuiltMap, settings: MeasureSettings
 ) -> Travel:
-    """Tell how sure the frames' way is, and how far off the encoders."""
+    """Estimate the uncertainty of the frames' path, and its deviation from the encoders."""
     source = probed.source
     shift_ns, window_ns = source.rig.timeshift_cam_imu_ns, seconds_to_ns(settings.motion.crane.window_s)
     camera = way.rectifier.camera

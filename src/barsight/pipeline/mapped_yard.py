@@ -1,4 +1,4 @@
-"""Measure the surface: recordings in, a mapped yard out."""
+"""Measure the surface, from recordings to a mapped yard."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from barsight.yard_frame import frame_name
 
 @dataclass(frozen=True, eq=False)
 class MappedYard:
-    """The first half's results: trajectories, map and contours. passes: the oldest first. joined: how several
-    became one map. trajectory: of all. watch: times what is done for all. began_s: the clock when it was
-    begun.
+    """Results of the first half: trajectories, map and contours. passes: the oldest first. joined: how
+    several passes became one map. trajectory: of all passes. watch: times what is done for all of them.
+    began_s: clock at the start.
     """
 
     settings: MeasureSettings
@@ -53,12 +53,12 @@ class MappedYard:
 
     @property
     def frame_id(self) -> str:
-        """Return the name of the frame that all places are in."""
+        """Return the name of the frame of all positions."""
         return frame_name(self.newest.probed.source, self.trajectory, self.newest.probed.inputs)
 
     @property
     def history(self) -> PlaceHistory | None:
-        """Return which pass saw each place last, and what changed; None of one pass."""
+        """Return which pass saw each place last, and what changed; None for a single pass."""
         return None if self.joined is None else self.joined.history
 
 
@@ -67,14 +67,14 @@ def map_yard(
     recordings: Sequence[Recording], settings: MeasureSettings, scratch: Path, advance: ProgressCallback,
     resume: Path | None = None,
 ) -> MappedYard:  # fmt: skip
-    """Measure the surface. `scratch` is an empty folder for tiles and pictures; the caller removes it.
+    """Measure the surface. `scratch` is an empty folder for tiles and pictures, which the caller removes.
 
     recordings: passes over one yard, in any order; each is measured by itself, one after the other, then they
-    are tied and joined. resume: a folder that keeps the trajectory and each frame's disparity (about 19 MB
-    for 1.3 megapixels), so that a killed run goes on where it was; the caller removes it when all is written.
+    are tied and joined. resume: a folder that stores the trajectory and each frame's disparity (about 19 MB
+    for 1.3 megapixels), so that a killed run can resume; the caller removes it once everything is written.
 
     Raises InputError or MeasurementError where nothing can be measured, ConfigError where labels are to be
-    read without what reads them; single frames that fail are refused and listed instead.
+    read but their readers aren't installed; single frames that fail are refused and listed instead.
     """
     began_s, settings = time.perf_counter(), settings.chosen()
     stock = read_stock(settings.bundles.stock_list) if settings.bundles.stock_list else None
@@ -123,14 +123,14 @@ def _expect_same_cells(passes: Sequence[MappedPass]) -> None:
 
 
 def _remove_pictures(folder: Path) -> None:
-    """Remove a finished pass's rectified pictures: the next one's shall have their room."""
+    """Delete a finished pass's rectified pictures to make room for those of the next one."""
     for path in folder.glob("rectified_*.npy"):
         path.unlink()
 
 
 def _whole(trajectories: Sequence[Trajectory]) -> Trajectory:
-    """Chain the trajectories of passes, the oldest first; what only one of them knows is left to it. Of two
-    pairs on one body, the first one's frame of a stamp counts.
+    """Chain the trajectories of passes, the oldest first, without what only single ones have. If two pairs
+    on one body have a frame of the same stamp, the first pair's counts.
     """
     if len(trajectories) == 1:
         return trajectories[0]

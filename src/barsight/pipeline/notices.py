@@ -1,4 +1,4 @@
-"""Gather the warnings of a measurement: what its stages assumed, left out or found in doubt."""
+"""Collect the warnings of a measurement: what its stages assumed, left out or doubted."""
 
 from __future__ import annotations
 
@@ -16,13 +16,15 @@ from barsight.yard.inventory.stock_list import ListedBundle, StockMatch, list_co
 from barsight.yard_frame import frame_notes, frame_of
 
 MIN_DOWN_COSINE = 0.5
-"""Cosine between the optical axis and straight down; a rig over a yard looks down."""
+"""Minimum cosine between the optical axis and straight down; a rig over a yard looks down."""
 MAX_BELOW_FLOOR_RATIO = 0.3
-"""Depth under the floor over the working distance, at most; depths of one pair are rough."""
+"""Maximum depth of the seen surface under the floor, as a share of the working distance; depths of one
+pair are rough.
+"""
 
 
 def stage_notices(mapped: MappedYard) -> list[Notice]:
-    """Gather what every stage of every pass had to assume or leave out."""
+    """Collect what every stage of every pass had to assume or leave out."""
     warnings, profiles = list[Notice](), mapped.profiles
     for number, one in enumerate(mapped.passes, start=1):
         own = _pass_notices(one.probed, one.way, one.built)
@@ -42,7 +44,7 @@ def stage_notices(mapped: MappedYard) -> list[Notice]:
 
 
 def stock_notices(listed: tuple[ListedBundle, ...] | None, stock: StockMatch | None) -> Iterator[Notice]:
-    """Yield what the stock list and the map disagree on; nothing where there is no list."""
+    """Yield the disagreements between the stock list and the map; nothing without a list."""
     if listed is None:
         return
     yield from (Notice("stock-list", text) for text in stock_warnings(listed, stock))
@@ -52,7 +54,7 @@ def stock_notices(listed: tuple[ListedBundle, ...] | None, stock: StockMatch | N
 
 
 def _pass_notices(probed: ProbedRecording, way: TrackedRecording, built: BuiltMap) -> list[Notice]:
-    """Gather what a pass's sensors, calibration and trajectory had to assume or leave out."""
+    """Collect what a pass's sensors, calibration and trajectory had to assume or leave out."""
     warnings = [Notice("assumed", text) for text in probed.source.notes]
     warnings += [Notice("assumed", text) for text in frame_notes(frame_of(probed.source))]
     warnings += probed.doubts
@@ -66,7 +68,7 @@ def _pass_notices(probed: ProbedRecording, way: TrackedRecording, built: BuiltMa
 
 
 def _floor_doubts(probed: ProbedRecording, built: BuiltMap, trajectory: Trajectory) -> list[Notice]:
-    """Warn where the cameras' view lies below the yard's floor, or not below the cameras."""
+    """Warn if what the cameras see is far below the yard's floor, or not below the cameras."""
     if trajectory.reference != "yard":
         return []
     ahead = np.array([0.0, 0.0, probed.first.range_m])
