@@ -1,4 +1,4 @@
-"""Unite what several pictures read of one label, attach it to a bundle and hold it against the stock list."""
+"""Merge what several pictures read of one label, attach it to a bundle and compare it with the stock list."""
 
 from __future__ import annotations
 
@@ -12,19 +12,21 @@ from barsight.yard.inventory.stock_list import ListedBundle
 from barsight.yard.types import Bundle
 
 MIN_PICTURES, MIN_NUMBER_PICTURES = 2, 3
-"""Pictures that must read a code, or a plain number, alike before it is believed: a number has no check."""
+"""Minimum number of pictures that must read the same code, or the same plain number, which has no check
+digit, for it to be trusted.
+"""
 NUMBER = "number"
-"""Kind of a plain number."""
+"""Value of `kind` for a plain number."""
 SAME_PLACE_M = 0.15
 BESIDE_M, BELOW_TOP_M = 0.03, 0.15
-"""How far beside a bundle's outline, and below its top, a label's middle may lie."""
+"""Maximum distance of a label's middle outside a bundle's outline, and above or below its top."""
 LISTED_REACH_M = 0.5
-"""How far beyond a bundle's half length and width the list's place for it may lie."""
+"""Maximum distance of a bundle's listed position beyond half its length and half its width."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedCode:
-    """A code that one picture read, at its place (3,) on the map. picture: the stamp and camera."""
+    """A code that one picture read, at its position (3,) on the map. picture: its stamp and camera."""
 
     text: str
     kind: str
@@ -34,9 +36,9 @@ class PlacedCode:
 
 @dataclass(frozen=True, eq=False)
 class Label:
-    """A label. place_m: (3,) median of its pictures'. pictures: that read it so; agreement_ratio: their share
-    of all that read anything there. is_sure: read alike by enough pictures and contradicted by none. bundle:
-    its id, None where it lies on none that is known. doubts: sentences.
+    """A label. place_m: (3,) median position over its pictures. pictures: number that read this text;
+    agreement_ratio: their share of all that read anything there. is_sure: read by enough pictures and
+    contradicted by none. bundle: id of its bundle, None if it is on no known one. doubts: sentences.
     """
 
     text: str
@@ -50,7 +52,7 @@ class Label:
 
 
 def merge_codes(codes: Sequence[PlacedCode], bundles: Sequence[Bundle]) -> tuple[Label, ...]:
-    """Unite readings of one text at one place, in the order of their places along X."""
+    """Merge readings of one text at one position, sorted by their positions along X."""
     groups: list[list[PlacedCode]] = []
     for code in codes:
         for group in groups:
@@ -91,7 +93,9 @@ def _label(
 
 
 def _bundle_at(place_m: Float64, bundles: Sequence[Bundle]) -> Bundle | None:
-    """Find the bundle on whose top a place lies, the highest of several; ends and tops by their edges."""
+    """Find the bundle whose top carries a position, within BESIDE_M and BELOW_TOP_M; the highest of
+    several.
+    """
     found = []
     for bundle in bundles:
         across, along = _across_along(bundle, place_m)
@@ -102,7 +106,9 @@ def _bundle_at(place_m: Float64, bundles: Sequence[Bundle]) -> Bundle | None:
 
 
 def _across_along(bundle: Bundle, place_m: Float64) -> tuple[float, float]:
-    """Compute the distances of a place from a bundle's axis and from its middle, in plan view."""
+    """Compute the distances of a position from a bundle's axis and, along it, from its middle, in plan
+    view.
+    """
     away = place_m[:2] - bundle.centre_m[:2]
     axis = np.array([-np.sin(bundle.yaw_rad), np.cos(bundle.yaw_rad)])
     return abs(float(away @ [axis[1], -axis[0]])), abs(float(away @ axis))
@@ -111,7 +117,7 @@ def _across_along(bundle: Bundle, place_m: Float64) -> tuple[float, float]:
 def contradictions(
     labels: Sequence[Label], bundles: Sequence[Bundle], listed: Sequence[ListedBundle]
 ) -> tuple[str, ...]:
-    """List what sure labels and the stock list contradict each other in, by the list's names."""
+    """List the contradictions between trusted labels and the stock list, which match by the list's names."""
     by_name, by_id = {one.name: one for one in listed}, {bundle.id: bundle for bundle in bundles}
     found, seen = [], dict[str, Label]()
     for label in labels:

@@ -1,4 +1,4 @@
-"""Read the labels of a yard while it is measured, and put on each bundle what its label says."""
+"""Read the labels of a yard while it is measured, and assign the text to each bundle."""
 
 from __future__ import annotations
 
@@ -23,11 +23,13 @@ from barsight.yard.types import Bundle, BundleLabel, YardMap
 
 ILLEGIBLE = BundleLabel(None, "illegible", 0, 0.0)
 _BELOW_M = 1.0
-"""A line of sight is followed so far below the floor."""
+"""Depth below the floor down to which a line of sight is followed."""
 
 
 def expect_readers(settings: LabelSettings) -> None:
-    """Raise ConfigError, before anything is measured, where what is to read the labels isn't installed."""
+    """Raise ConfigError, before anything is measured, if the packages that read the labels aren't
+    installed.
+    """
     if settings.read:
         read_codes(np.zeros((16, 16), np.uint8))
     if settings.numbers:
@@ -39,10 +41,10 @@ def label_bundles(
     pairs: RectifiedPairs, poses: Mapping[int, Pose], heights: YardMap, bundles: tuple[Bundle, ...],
     settings: LabelSettings,
 ) -> tuple[Bundle, ...]:  # fmt: skip
-    """Read the labels in the pairs that have a pose, and give each bundle its own.
+    """Read the labels in the pairs that have a pose, and assign each bundle its own.
 
-    poses: reference_from_body by stamp. A bundle has a label where one text is sure on it and no other is;
-    where something is read but isn't sure, or only a plate of a label's size is seen, it is illegible.
+    poses: reference_from_body by stamp. A bundle gets a label if exactly one text is read on it, and surely.
+    If something is read but isn't sure, or only a plate of a label's size is seen, the label is illegible.
     Raises ConfigError without the extra `labels`.
     """
     labels = merge_codes(read_texts(pairs, poses, heights, bundles, settings), bundles)
@@ -74,15 +76,15 @@ def read_texts(
 
 
 def unread_label(bundle: Bundle, heights: YardMap, size_m: tuple[float, float]) -> BundleLabel | None:
-    """Say that a bundle's label is illegible where a plate of a label's size is seen on it."""
+    """Return an illegible label for a bundle on which a plate of a label's size is seen."""
     return ILLEGIBLE if min(size_m) > 0 and find_plates(bundle, heights, size_m) else None
 
 
 def placed_codes(
     pairs: RectifiedPairs, poses: Mapping[int, Pose], heights: YardMap
 ) -> Iterator[list[PlacedCode]]:
-    """Read the pairs that have a pose, and yield the codes of each at their places on the map; a frame that
-    can't be decoded yields none.
+    """Read the pairs that have a pose, and yield the codes of each with their positions on the map; a frame
+    that can't be decoded yields none.
 
     poses: reference_from_body by stamp.
     """
@@ -105,7 +107,7 @@ def placed_numbers(
     pairs: RectifiedPairs, poses: Mapping[int, Pose], heights: YardMap, bundles: Iterable[Bundle],
     size_m: tuple[float, float],
 ) -> Iterator[list[PlacedCode]]:  # fmt: skip
-    """Read plain numbers on the plates of a label's size (size_m) that lie on bundles, pair by pair.
+    """Read plain numbers on plates of a label's size (size_m) on bundles, pair by pair.
 
     Raises ConfigError without the extra `numbers` or Tesseract's data.
     """
@@ -129,7 +131,7 @@ def placed_numbers(
 
 
 def _on_the_map(heights: YardMap, origin: Float64, direction: Float64) -> Float64 | None:
-    """Intersect a line of sight with the part of the map that it crosses."""
+    """Intersect a line of sight with the map below it; None if it meets no known surface."""
     if direction[2] >= 0:
         return None
     ends = np.array([origin, origin - (origin[2] + _BELOW_M) / direction[2] * direction])
@@ -137,7 +139,7 @@ def _on_the_map(heights: YardMap, origin: Float64, direction: Float64) -> Float6
 
 
 def bundle_label(bundle: Bundle, labels: Iterable[Label]) -> BundleLabel | None:
-    """Choose what a bundle's label says from all that were read; see `label_bundles`."""
+    """Choose a bundle's label from all that were read; see `label_bundles`."""
     here = [label for label in labels if label.bundle == bundle.id]
     sure = {label.text for label in here if label.is_sure}
     if len(sure) == 1 and all(label.text in sure for label in here):

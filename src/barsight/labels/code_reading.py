@@ -1,4 +1,4 @@
-"""Read 1D and 2D codes in a picture, by zxing-cpp."""
+"""Read 1D and 2D codes in a picture with zxing-cpp."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from barsight.core.arrays import Float64, UInt8
 from barsight.core.extras import extra
 
 KINDS = ("DataMatrix", "QRCode", "MicroQRCode", "Aztec", "PDF417", "Code128", "Code93")
-"""Kinds that carry their own check. Code39 and ITF don't: noise reads as one."""
+"""Kinds of code with a built-in check. Code39 and ITF have none, so noise can be read as one."""
 MAX_TEXT = 200
 ENLARGED = 2
-"""Pictures are read enlarged, for the sake of small modules."""
+"""Scale by which pictures are enlarged before reading, so that small modules are recognised."""
 
 
 @dataclass(frozen=True, eq=False)
 class SeenCode:
-    """A code in one picture. kind: of `KINDS`. corners_px: (4, 2), in its own order from its upper left."""
+    """A code in one picture. kind: one of `KINDS`. corners_px: (4, 2), starting at its own upper left."""
 
     text: str
     kind: str
@@ -33,7 +33,7 @@ class SeenCode:
 
 
 def read_codes(image: UInt8) -> tuple[SeenCode, ...]:
-    """Read all codes of a gray picture (H, W) whose check holds and whose text is printable."""
+    """Read all codes of a gray picture (H, W) that pass their check and whose text is printable."""
     with extra("labels"):
         import zxingcpp
 

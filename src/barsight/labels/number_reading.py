@@ -1,4 +1,4 @@
-"""Read plain numbers on labels, by Tesseract."""
+"""Read plain numbers on labels with Tesseract."""
 
 from __future__ import annotations
 
@@ -17,20 +17,23 @@ from barsight.core.extras import extra
 from barsight.labels.placing import PlacedCamera
 
 DIGITS, TURNABLE, MIN_DIGITS = "0123456789", set("01689"), 3
-"""TURNABLE: digits upside down too; a number of these alone is unsure. A shorter run of strokes is too often
-something else."""
+"""TURNABLE: digits that are digits upside down too; a number made only of these is ambiguous. MIN_DIGITS:
+minimum length of a number; a shorter run of strokes is too often something else.
+"""
 MIN_CONFIDENCE = 90
-"""Of the number, in percent, as Tesseract states it."""
+"""Minimum confidence of a number, in percent, as reported by Tesseract."""
 AROUND_RATIO = 1.8
-"""Side of the patch over the label's longer side."""
+"""Ratio of the patch's side to the label's longer side."""
 MIN_LABEL_PX = 80.0
-"""A label is longer than this in the picture, or its digits have no shape."""
+"""Minimum length of a label in the picture for its digits to be readable."""
 PATCH_PX, HEIGHT_PX, MARGIN_PX = 360, 72, 14
-"""Side of a patch; height of the label as Tesseract sees it, and white around it."""
+"""Side of a patch, height of the label image given to Tesseract, and width of the white margin around it."""
 MAX_SIDE_RATIO, MIN_FULL_RATIO = 1.25, 0.85
-"""Of a label's sides over the stated ones, or the other way round; share of its rectangle that is bright."""
+"""Maximum ratio between a label's sides and the stated ones, either way; minimum share of its rectangle
+that is bright.
+"""
 INNER_RATIO = 0.05
-"""Of the label's sides: so far within its edge it is cut, so that no bar shows."""
+"""Margin cut off inside the label's edge so that no bar shows, as a share of its sides."""
 FOLDERS = (
     "/usr/share/tesseract-ocr",
     "/usr/share/tessdata",
@@ -64,9 +67,10 @@ def number_reader() -> Iterator[Any]:
 
 
 def read_number(reader: Any, patch: UInt8, size_ratio: float) -> str | None:
-    """Read the number on the label in the middle of a patch (S, S); None where none is sure.
+    """Read the number on the label in the middle of a patch (S, S); None if none is certain.
 
-    size_ratio: width of the label over its length. What may be upside down, as 1689, is unsure.
+    size_ratio: width of the label over its length. A number that can be read upside down, such as 1689, is
+    uncertain.
     """
     label = cut_label(patch, size_ratio)
     if label is None:
@@ -88,10 +92,11 @@ def _read_line(reader: Any, image: UInt8) -> str | None:
 
 
 def cut_label(patch: UInt8, size_ratio: float) -> UInt8 | None:
-    """Cut the label out of the middle of a patch (S, S), its longer side level; None where nothing bright
-    there has a label's size.
+    """Cut the label out of the middle of a patch (S, S), with its longer side horizontal; None if nothing
+    bright there has a label's size.
 
-    Bars may shine nearly as the label does: of several levels the one counts that shows a label's shape best.
+    Bars may be nearly as bright as the label: of several thresholds, the one that best shows a label's shape
+    is used.
     """
     smooth = cv2.GaussianBlur(patch, (0, 0), 2)
     levels = np.linspace(np.quantile(smooth, 0.3), np.quantile(smooth, 0.98), 12)
@@ -115,8 +120,8 @@ def cut_label(patch: UInt8, size_ratio: float) -> UInt8 | None:
 
 
 def _bright_rectangle(bright: Bool, size_ratio: float) -> tuple[Any, float]:
-    """Find the smallest rectangle around what is bright about the middle, and the share of it that is full; 0
-    where it hasn't a label's size.
+    """Find the smallest rectangle around the bright region in the middle, and the share of it that is
+    filled; 0 if it doesn't have a label's size.
     """
     side = bright.shape[0]
     opened = cv2.morphologyEx(bright.astype(np.uint8), cv2.MORPH_OPEN, np.ones((side // 40,) * 2, np.uint8))
@@ -133,8 +138,8 @@ def _bright_rectangle(bright: Bool, size_ratio: float) -> tuple[Any, float]:
 def label_patch(
     image: UInt8, camera: PlacedCamera, place_m: Float64, size_m: tuple[float, float]
 ) -> UInt8 | None:
-    """Cut a square patch around a place (3,) of the map out of a rectified picture; None where it isn't in
-    view or a label is too small there.
+    """Cut a square patch around a position (3,) of the map out of a rectified picture; None if it isn't
+    fully in view or a label would be too small there.
     """
     middle, depth = camera.project(place_m)
     if depth <= 0:

@@ -1,4 +1,4 @@
-"""Place what a picture shows on the map: the first surface along its line of sight."""
+"""Locate on the map what a picture shows: the first surface along its line of sight."""
 
 from __future__ import annotations
 
@@ -15,12 +15,14 @@ from barsight.result_folder import CameraPath
 from barsight.yard.types import HeightMap
 
 MAX_GAP_S = 1.0
-"""A picture further from the trajectory's nearest pose has no place."""
+"""Maximum time between a picture and the nearest pose of the trajectory for the picture to have a pose."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedCamera:
-    """A rectified camera in the map's frame; principal_px: (cx, cy) of it, left or right."""
+    """A rectified camera in the map's frame. principal_px: its principal point (cx, cy); it differs
+    between left and right.
+    """
 
     map_from_rect: Pose
     focal_px: float
@@ -28,27 +30,29 @@ class PlacedCamera:
 
     @classmethod
     def of_pair(cls, map_from_rect0: Pose, camera: RectifiedCamera) -> tuple[PlacedCamera, PlacedCamera]:
-        """Place both cameras of a rectified pair."""
+        """Create both cameras of a rectified pair."""
         aside = Pose("rect0", "rect1", np.eye(3), np.array([camera.baseline_m, 0.0, 0.0]))
         left = cls(map_from_rect0, camera.focal_px, (camera.cx_px, camera.cy_px))
         principal = (camera.cx_px + camera.doffs_px, camera.cy_px)
         return left, cls(map_from_rect0 @ aside, camera.focal_px, principal)
 
     def line_of_sight(self, pixel: Float64) -> tuple[Float64, Float64]:
-        """Return the line of sight of a pixel (2,): its origin (3,) and its direction (3,) at depth 1."""
+        """Return the line of sight of a pixel (2,): its origin (3,) and its direction (3,), scaled to
+        depth 1.
+        """
         ray = np.array([*(pixel - np.array(self.principal_px)) / self.focal_px, 1.0])
         return self.map_from_rect.translation, self.map_from_rect.rotation @ ray
 
     def project(self, places_m: Float64) -> tuple[Float64, Float64]:
-        """Project places (..., 3) to pixels (..., 2), NaN behind the camera; depth (...), m."""
+        """Project positions (..., 3) to pixels (..., 2), NaN behind the camera, and depth (...), m."""
         seen = self.map_from_rect.inverse().apply(places_m.reshape(-1, 3)).reshape(places_m.shape)
         depth = seen[..., 2]
         ahead = np.where(depth > 0, depth, np.nan)[..., None]
         return self.focal_px * seen[..., :2] / ahead + np.array(self.principal_px), depth
 
     def project_sums(self, ways_m: Float64, places_m: Float64) -> tuple[Float32, Float32, Float64]:
-        """Project the sums of ways (R, 3) and places (N, 3), which is linear before the division: pixels x, y
-        and depth, m, (R, N) each. Pixels are none where the depth isn't over 0.
+        """Project the sums of offsets (R, 3) and positions (N, 3), which are linear before the division:
+        pixels x, y and depth, m, (R, N) each. Pixels are valid only where the depth is positive.
         """
         into = self.map_from_rect.inverse()
         ways, places = ways_m @ into.rotation.T, into.apply(places_m)
@@ -61,7 +65,9 @@ class PlacedCamera:
 
 
 def pose_at(path: CameraPath, stamp_ns: int) -> Pose | None:
-    """Interpolate the body's pose between the poses around a stamp; None beyond `MAX_GAP_S` of them."""
+    """Interpolate the body's pose between the poses around a stamp; None if the nearest is more than
+    `MAX_GAP_S` away.
+    """
     after = int(np.searchsorted(path.stamp_ns, stamp_ns))
     near = path.stamp_ns[max(after - 1, 0) : after + 1] - stamp_ns
     if not near.size or np.abs(near).min() > MAX_GAP_S * NS_PER_S:
@@ -78,9 +84,9 @@ def pose_at(path: CameraPath, stamp_ns: int) -> Pose | None:
 
 
 def first_surface(heights: HeightMap, origin: Float64, direction: Float64) -> Float64 | None:
-    """Intersect a line of sight that looks down with the map; (3,), None where it meets unknown cells only.
+    """Intersect a downward line of sight with the map; (3,), None if it meets only unknown cells.
 
-    Steps of half a cell along the ground; the first place below the surface counts.
+    The line is sampled in steps of at most half a cell; the first sample at or below the surface counts.
     """
     if direction[2] >= 0:
         return None
@@ -102,7 +108,7 @@ def first_surface(heights: HeightMap, origin: Float64, direction: Float64) -> Fl
 
 
 def heights_at(heights: HeightMap, places: Float64) -> Float64:
-    """Look up the height (...) of the cell at each place (..., 2 or 3); NaN outside the map and where
+    """Look up the height (...) of the cell at each position (..., 2 or 3); NaN outside the map and where
     unknown.
     """
     columns = np.round((places[..., 0] - heights.x0_m) / heights.cell_m).astype(np.int64)

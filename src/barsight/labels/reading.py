@@ -27,8 +27,8 @@ FILE = "labels.json"
 
 @dataclass(frozen=True, eq=False)
 class ReadLabels:
-    """The labels of a yard. pictures: that were read. illegible: ids of bundles whose label is seen and not
-    read for sure. contradictions: with the stock list, sentences.
+    """The labels of a yard. pictures: number of pictures read. illegible: ids of bundles whose label is
+    seen but not read with certainty. contradictions: sentences about contradictions with the stock list.
     """
 
     map_id: str
@@ -42,11 +42,10 @@ def read_labels(
     recording: Recording, folder: Path, listed: tuple[ListedBundle, ...], settings: LabelSettings,
     count: Callable[[], None],
 ) -> ReadLabels:  # fmt: skip
-    """Read the labels in a recording's pictures onto the map that `folder` holds.
+    """Read the labels in a recording's pictures and locate them on the map in `folder`.
 
-    count: called after each pair, twice where plain numbers are read.
-    Raises InputError where the folder is not of this recording or has no
-    trajectory, ConfigError without the extra `labels`.
+    count: called after each pair, twice if plain numbers are read. Raises InputError where the folder is not
+    of this recording or has no trajectory, ConfigError without the extra `labels`.
     """
     said, _ = open_folder(folder)
     own, whole = recording.digests(), said["hashes"]["inputs"]
@@ -70,7 +69,7 @@ def read_labels(
 
 
 def write_labels(found: ReadLabels, folder: Path) -> Path:
-    """Write labels.json into a folder of results."""
+    """Write labels.json to a result folder."""
     content: dict[str, Any] = {
         "schema_version": SCHEMA_VERSION,
         "software": f"barsight {barsight.__version__}",
