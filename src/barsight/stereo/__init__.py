@@ -1,1 +1,3 @@
-"""Match pairs by methods behind one Protocol: noise, triangulation and files."""
+"""Match stereo pairs with several methods behind one Protocol; model noise, triangulate, and read and
+write files.
+"""

@@ -25,11 +25,11 @@ _PFM_HEADER = re.compile(rb"^(P[fF])\s+(\d+)\s+(\d+)\s+([-+0-9.eE]+)\s")
 
 
 def write_disparity(target: Path, disparity: Disparity) -> None:
-    """Write to .pfm (float32, bottom row first, no match is inf), .png (16 bits, d * 256, no match is 0) or
-    .tif (float32, bands `disparity_px` and `sigma_px`, no match is NaN). Whole or not at all.
+    """Write to .pfm (float32, bottom row first, inf for no match), .png (16 bits, d * 256, 0 for no match) or
+    .tif (float32, bands `disparity_px` and `sigma_px`, NaN for no match). The file is written atomically.
 
-    Raises `OutputError` for another suffix, and for a PNG whose disparities don't fit 16 bits (d < 1/512 or
-    d > 255.99 px).
+    Raises `OutputError` for another suffix, and for a PNG whose disparities don't fit 16 bits (d < 1/512 or d
+    > 255.99 px).
     """
     suffix = target.suffix.lower()
     if suffix == ".pfm":
@@ -57,7 +57,8 @@ def write_disparity(target: Path, disparity: Disparity) -> None:
 
 
 def write_calib(target: Path, camera: RectifiedCamera) -> None:
-    """Write Middlebury's calib.txt of a rectified pair; its depth, mm, is baseline * f / (disparity + doffs).
+    """Write Middlebury's calib.txt of a rectified pair, in which depth, mm, is baseline * f / (disparity +
+    doffs).
 
     cam0, cam1: px; doffs: cx1 - cx0, px; baseline: mm.
     """
@@ -70,9 +71,9 @@ def write_calib(target: Path, camera: RectifiedCamera) -> None:
 
 
 def read_disparity(path: Path) -> Disparity:
-    """Read what `write_disparity` or others have written; sigma is NaN where the file has none.
+    """Read a file written by `write_disparity` or other software; sigma is NaN where the file has none.
 
-    No match is NaN in the result: inf and NaN in a PFM or TIFF, 0 in a PNG. Raises `InputError`.
+    No match becomes NaN: inf and NaN in a PFM or TIFF, 0 in a PNG. Raises `InputError`.
     """
     suffix = path.suffix.lower()
     try:

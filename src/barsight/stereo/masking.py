@@ -1,13 +1,14 @@
-"""Mask what no map takes: guesses; gaps between bars, so dark that nothing in them is matched itself; bars
-along the rows that are matched in pieces.
+"""Mask what must not enter a map: guesses; gaps between bars that are too dark to be matched themselves; and
+bars along the rows that are matched only in pieces.
 
 A gully whose floor neither camera sees is a black stripe between two edges of the same surface. It matches
-perfectly at that surface's disparity, since both edges do, but nothing lies there.
+perfectly at that surface's disparity, since both edges do, but nothing is there.
 
-Where bars lie along the rows, as the baseline does, little tells one place of a bar from the next. On steel
-that shines it is mostly a lamp's highlight, which lies in no one place: it matches half a metre off in one
-piece, and not at all in the next, and no view contradicts since the highlight moves on with the crane. The
-sigma of such a match is no guide, but the holes beside it are: true surface is matched all along its bars.
+Where bars lie along the rows, as the baseline does, little distinguishes one place of a bar from the next. On
+shiny steel it is mostly a lamp's highlight, which has no fixed position: it matches half a metre off in one
+piece and not at all in the next, and no other view contradicts it since the highlight moves with the crane.
+The sigma of such a match is no guide, but the holes beside it are: a true surface is matched all along its
+bars.
 """
 
 from __future__ import annotations
@@ -25,17 +26,22 @@ _BLUR_PX = 0.7
 _COARSE_PX = 4
 _STREAKS = 11, 3
 _BUNDLE = 41, 9
-"""In coarse pixels, along the rows and across: the window in which streaks are looked for, and the patch of
-streaks that no edge, beam or row of bars' ends fills, but a bundle does."""
+"""Sizes in coarse pixels, along the rows and across: of the window in which streaks are detected, and of the
+patch of streaks that a bundle must contain; no edge, beam or row of bars' ends fills it.
+"""
 _ALONG_PX = 81, 3
-"""Window in which holes are looked for."""
+"""Size of the window in which the share of matched pixels is computed."""
 _MAX_SLOPE_RATIO = 0.35
-"""Power of the gray values' slopes along the rows over that across, below which there are streaks alone."""
+"""Maximum ratio of the power of the gray gradient along the rows to that across them where there are only
+streaks.
+"""
 _MIN_MATCHED_RATIO = 0.85
 
 
 def gap_mask(image: UInt8, darkness: float) -> Bool:
-    """Mark pixels (H, W) (3 x 3 mean) darker than `darkness` times the mean of the 41 x 41 around them."""
+    """Mark pixels (H, W) whose 3 x 3 mean is darker than `darkness` times the mean of the 41 x 41 pixels
+    around them.
+    """
     own = cv2.blur(image, (3, 3))
     around = cv2.blur(image, (_AROUND_PX, _AROUND_PX))
     dark: Bool = own < darkness * around.astype(np.float32)
@@ -43,7 +49,7 @@ def gap_mask(image: UInt8, darkness: float) -> Bool:
 
 
 def mask_gaps(disparity: Disparity, image: UInt8, darkness: float) -> Disparity:
-    """Mask gaps; darkness 0 leaves the disparity as it is."""
+    """Mask gaps; a darkness of 0 leaves the disparity as it is."""
     if darkness <= 0:
         return disparity
     return mask_disparity(disparity, ~gap_mask(image, darkness))
@@ -60,8 +66,8 @@ def mask_pieces(disparity: Disparity, image: UInt8) -> Disparity:
 
 
 def streak_mask(image: UInt8) -> Bool:
-    """Mark bars along the rows (H, W): gray values change across them and hardly along them, in one piece
-    with a patch as large as a bundle.
+    """Mark bars along the rows (H, W): regions where gray values change across the rows and hardly along
+    them, connected to a patch as large as a bundle.
     """
     height, width = image.shape
     small = height // _COARSE_PX, width // _COARSE_PX
@@ -83,8 +89,8 @@ def streak_mask(image: UInt8) -> Bool:
 
 @kernel()
 def _note_slopes(gray: Float32, excess: Float32) -> None:
-    """Fill excess (H, W): the squared slope along the row less its least share of that across; 0 at the
-    border.
+    """Compute excess (H, W): the squared slope along the row minus _MAX_SLOPE_RATIO times that across it;
+    0 at the border.
     """
     ratio = np.float32(_MAX_SLOPE_RATIO)
     excess[:] = 0
@@ -96,12 +102,12 @@ def _note_slopes(gray: Float32, excess: Float32) -> None:
 
 
 def mask_unsure(disparity: Disparity, max_sigma_px: float) -> Disparity:
-    """Mask what is less sure than this, guesses among it."""
+    """Mask disparities whose sigma exceeds max_sigma_px, which includes guesses."""
     return mask_disparity(disparity, disparity.sigma_px <= max_sigma_px)
 
 
 def mask_disparity(disparity: Disparity, kept: Bool) -> Disparity:
-    """Mask all that is not `kept` (H, W)."""
+    """Mask everything that is not `kept` (H, W)."""
     return replace(
         disparity,
         disparity_px=mask_values(disparity.disparity_px, kept),
@@ -110,7 +116,7 @@ def mask_disparity(disparity: Disparity, kept: Bool) -> Disparity:
 
 
 def mask_values(values: Float32, kept: Bool) -> Float32:
-    """Mask by NaN all values (H, W) that aren't `kept`, as `np.where` does in three times the time."""
+    """Set values (H, W) that aren't `kept` to NaN, three times as fast as `np.where`."""
     masked = np.empty(values.shape, np.float32)
     _mask(np.ascontiguousarray(values), kept, masked)
     return masked

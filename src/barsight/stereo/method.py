@@ -9,8 +9,8 @@ from barsight.core.records.pairs import RectifiedPair
 
 
 class StereoMethod(Protocol):
-    """Protocol: match a rectified pair to the left image's disparity. A method keeps no state between calls,
-    so that two pairs can be matched side by side.
+    """Protocol of a method that matches a rectified pair to the left image's disparity. A method keeps no
+    state between calls, so that pairs can be matched in parallel.
     """
 
     def __call__(self, pair: RectifiedPair, candidates: DisparityRange) -> Disparity:

@@ -14,8 +14,9 @@ _FEWEST_ROWS = 3
 
 
 def has_texture(pair: RectifiedPair) -> bool:
-    """Check that in either image at least one pixel in a thousand differs from its neighbour but one by more
-    than 4 gray levels: a black, a burnt out or an all gray image has none, nor one of fewer than 3 rows.
+    """Check that in each image at least one pixel in a thousand differs by more than 4 gray levels from
+    the pixel two columns away: black, burnt-out and uniformly gray images have no texture, nor have images
+    of fewer than 3 rows.
     """
     if pair.left.shape[0] < _FEWEST_ROWS:
         return False
@@ -23,8 +24,8 @@ def has_texture(pair: RectifiedPair) -> bool:
 
 
 def noise_sigma(image: UInt8, radius_px: int) -> Float32:
-    """Compute the Cramer-Rao bound (H, W) float32 px of a match over a window of 2 r + 1: sqrt(2) image sigma
-    over the root of the window's summed squared gradients; 1 px at most.
+    """Compute the Cramer-Rao bound (H, W) float32 px of a match over a window of side 2 r + 1: sqrt(2)
+    times the image sigma over the root of the window's summed squared gradients; at most 1 px.
     """
     gradient = cv2.Sobel(image, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
     side = 2 * radius_px + 1
@@ -41,8 +42,8 @@ def _is_textured(image: UInt8, valid: Bool) -> bool:
 
 
 def image_noise(image: UInt8 | Float32) -> float:
-    """Estimate the image's noise, one sigma in gray levels: robust, from a Laplacian that planes don't excite
-    [Immerkaer 1996], with the median instead of the mean so that texture counts less.
+    """Estimate the image's noise, one sigma in gray levels, robustly from a Laplacian that ignores planes
+    [Immerkaer 1996], with the median instead of the mean to reduce the effect of texture.
     """
     response = _bends(_bends(image).T)
     spread = float(np.median(np.abs(response))) / 0.6745

@@ -1,7 +1,7 @@
-"""Predict a pair's disparity from that of the pair before and the motion between them.
+"""Predict a pair's disparity from that of the previous pair and the motion between them.
 
-A pixel with disparity d sees the place q = d + doffs at depth f b / q. In homogeneous coordinates scaled by
-q / b the motion is X' = R (u - cx, v - cy, f) + t q / b, which gives the pixel there and its q' = f q / X'_z
+A pixel with disparity d sees the point q = d + doffs at depth f b / q. In homogeneous coordinates scaled by q
+/ b the motion is X' = R (u - cx, v - cy, f) + t q / b, which gives the pixel there and its q' = f q / X'_z
 without a division by the depth.
 """
 
@@ -38,11 +38,11 @@ class _Transfer(NamedTuple):
 
 
 def predict_disparity(before: Disparity, camera: RectifiedCamera, now_from_before: Pose) -> Float32:
-    """Predict the disparity (H, W) of the left picture now, NaN where nothing is known.
+    """Predict the disparity (H, W) of the current left picture, NaN where nothing is known.
 
-    Each sure place of the view before is moved to the nearest pixel of the view now; what is nearest to the
-    camera wins. Each pixel then looks up where it lay before and takes the disparity from there, interpolated
-    where the pixels around are one surface (1 px).
+    Each certain point of the previous view is moved to the nearest pixel of the current view; the point
+    nearest to the camera wins. Each pixel then looks up where it was before and takes the disparity from
+    there, interpolated where the surrounding pixels are one surface (1 px).
     """
     known = np.where(before.sigma_px <= _MAX_SIGMA_PX, before.disparity_px, _NAN).astype(np.float32)
     there, back = _transfer(camera, now_from_before), _transfer(camera, now_from_before.inverse())
@@ -69,7 +69,7 @@ def _transfer(camera: RectifiedCamera, motion: Pose) -> _Transfer:
 
 @kernel()
 def _move_row(known: Float32, v: int, motion: _Transfer, moved: Float32) -> None:
-    """Move row v of a view, of disparities known (W,) px, to the other view.
+    """Transform row v of a view, with disparities known (W,) px, to the other view.
 
     Fills moved (3, W): column, row and q = disparity + doffs there, px; NaN where unknown, q 0 behind the
     camera.
@@ -94,7 +94,9 @@ def _move_row(known: Float32, v: int, motion: _Transfer, moved: Float32) -> None
 
 @kernel()
 def _without_gaps(first: Float32) -> Float32:
-    """Fill pixels (H, W) where nothing landed with the largest disparity of the eight around them."""
+    """Fill pixels (H, W) to which nothing was projected with the largest disparity of the eight around
+    them.
+    """
     height, width = first.shape
     filled = np.empty_like(first)
     largest = np.full(width + 2, -np.inf, dtype=np.float32)
@@ -116,9 +118,9 @@ def _without_gaps(first: Float32) -> Float32:
 
 @kernel()
 def _splat(known: Float32, motion: _Transfer, first: Float32) -> None:
-    """Move each pixel's place to the nearest pixel of the other view; the largest disparity stays.
+    """Project each pixel to the nearest pixel of the other view; the largest disparity wins.
 
-    known: (H, W) px, NaN where unknown. Raises first (H, W) px, NaN where nothing lands.
+    known: (H, W) px, NaN where unknown. Raises first (H, W) px, which stays NaN where nothing is projected.
     """
     height, width = known.shape
     half = np.float32(0.5)
@@ -145,11 +147,11 @@ def _look_up(
     start: int,
     end: int,
 ) -> None:
-    """Look up in rows start...end where each pixel lay before, and its disparity.
+    """Look up where each pixel of rows start...end was before, and its disparity there.
 
-    known: (H, W) px of the view before; first: (H, W) px, a guess for the view now. there: the motion from
-    before to now, back: from now to before. Fills predicted (H, W) px: the guess where the place before lies
-    beside an edge or a hole.
+    known: (H, W) px of the previous view; first: (H, W) px, a guess for the current view. there: motion from
+    the previous to the current view, back: the inverse. Fills predicted (H, W) px: the guess where the
+    previous position is beside an edge or a hole, or disagrees with it.
     """
     height, width = known.shape
     moved, seen = np.empty((3, width), dtype=np.float32), np.empty(width, dtype=np.float32)

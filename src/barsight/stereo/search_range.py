@@ -1,7 +1,7 @@
-"""Find the disparity range from the images, and swapped left and right on the way.
+"""Find the disparity range from the images, and detect swapped left and right images.
 
-A coarse match at a quarter of the size over every disparity that could be; its consistent part gives the
-range. A swapped pair has disparities of the wrong sign: the coarse match of the exchanged images is then far
+A coarse match at a quarter of the size covers every possible disparity; its consistent part determines the
+range. A swapped pair has disparities of the wrong sign, so the coarse match of the exchanged images is far
 more consistent than that of the images as given.
 """
 
@@ -28,10 +28,10 @@ _SPAN_PERCENT = (0.1, 99.9)
 
 
 def find_disparity_range(pair: RectifiedPair) -> DisparityRange | Failed:
-    """Find the range of disparities that a pair shows, widened by a margin.
+    """Find the range of disparities in a pair, widened by a margin.
 
-    Failed `no-texture` where too little matches either way, `swapped` where left and right are exchanged; see
-    also `check_matchable`.
+    Returns Failed `no-texture` where too little matches either way, `swapped` where left and right are
+    exchanged; see also `check_matchable`.
     """
     nothing = check_matchable(pair)
     if nothing is not None:
@@ -62,8 +62,9 @@ def find_disparity_range(pair: RectifiedPair) -> DisparityRange | Failed:
 
 
 def follow_disparity_range(pair: RectifiedPair, predicted: Float32) -> DisparityRange | Failed:
-    """Find the range of a pair of which most disparities are predicted, (H, W) px, NaN where not: what is
-    new is looked for in a match at an eighth of the size. As `find_disparity_range` where that says little.
+    """Find the range of a pair for which most disparities are predicted, (H, W) px, NaN where not; new
+    surfaces are found by a match at an eighth of the size. Falls back to `find_disparity_range` where
+    either covers too little.
     """
     nothing = check_matchable(pair)
     if nothing is not None:
@@ -77,7 +78,7 @@ def follow_disparity_range(pair: RectifiedPair, predicted: Float32) -> Disparity
 
 
 def _range_around(low: float, high: float, margin: float, camera: RectifiedCamera) -> DisparityRange:
-    """Widen a span of disparities, px, by a margin to a range of a multiple of 16 candidates."""
+    """Widen a span of disparities, px, by a margin, to a range of a multiple of 16 candidates."""
     ceiling = int(camera.width * 0.9)
     lowest = int(np.floor(min(max(low - margin, -camera.doffs_px), ceiling - 16)))
     highest = int(np.ceil(min(high + margin, ceiling)))
@@ -85,8 +86,8 @@ def _range_around(low: float, high: float, margin: float, camera: RectifiedCamer
 
 
 def check_matchable(pair: RectifiedPair) -> Failed | None:
-    """Return Failed `no-texture` where an image is one gray all over, `same-image` where both are the same
-    one.
+    """Return Failed `no-texture` if an image is one uniform gray, `same-image` if both images are the
+    same.
     """
     for name, image in (("left", pair.left), ("right", pair.right)):
         gray = int(image[0, 0])
@@ -102,12 +103,13 @@ def coarse_disparity(
     left: UInt8, right: UInt8, doffs_px: float = 0.0, width_ratio: float = _USUAL_RATIO,
     known: tuple[float, float] | None = None, both_ways: bool = True, shrink: int = _SCALE,
 ) -> Float32:  # fmt: skip
-    """Match at quarter size (`shrink`) with left-right check; NaN elsewhere, also where nothing changes.
+    """Match at quarter size (`shrink`) with left-right check; NaN where it fails or the image has no
+    gradient.
 
-    From 1 px above -doffs_px, which is infinitely far, over `width_ratio` of the width, and within that from
-    the lowest to the highest disparity `known` beforehand, px. Without `both_ways` the match from right to
-    left is left out, half of the time: for guesses whose places are looked for in both pictures anyhow.
-    Returns (H / 4, W / 4) float32 in full-size px.
+    The search begins 1 px above -doffs_px, which is infinitely far, and covers `width_ratio` of the width;
+    within that, it is limited to the lowest and highest disparity `known` beforehand, px. Without `both_ways`
+    the match from right to left is omitted, which saves half the time, for guesses that are verified in both
+    pictures later. Returns (H / 4, W / 4) float32 in full-size px.
     """
     size = (max(left.shape[1] // shrink, 32), max(left.shape[0] // shrink, 32))
     small_left = cv2.resize(left, size, interpolation=cv2.INTER_AREA)
@@ -153,7 +155,7 @@ def _match(left: UInt8, right: UInt8, lowest: int, count: int) -> Float32:
 
 
 def _changes(image: UInt8) -> Bool:
-    """Check (H, W) for any gradient along the row in a 5 x 5 block; blank places match anything."""
+    """Check (H, W) for any gradient along the row in a 5 x 5 block; uniform places match anything."""
     steps = cv2.convertScaleAbs(cv2.Sobel(image, cv2.CV_16S, 1, 0, ksize=3))
     changes: Bool = cv2.dilate(steps, np.ones((5, 5), np.uint8)) > 0
     return changes

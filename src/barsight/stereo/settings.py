@@ -24,32 +24,38 @@ class StereoSettings:
     """Settings of dense stereo."""
 
     method: MethodName = "barsight"
-    """Which method matches the pairs."""
+    """Stereo method that matches the pairs."""
     min_disparity_px: int | None = None
-    """First candidate; found from the images when not given."""
+    """Lowest candidate disparity; found from the images when not given."""
     max_disparity_px: int | None = None
-    """End of the candidates; found from the images when not given."""
+    """End of the candidate disparities, itself not included; found from the images when not given."""
     calibration_sigma_px: float = 0.05
-    """Disparity error that the calibration may cause everywhere alike (1 sigma), where no rig file's
-    covariance says it. A known travel that agrees with the calibration narrows it."""
+    """Disparity error due to the calibration, the same everywhere (1 sigma); used where no rig file's
+    covariance gives it. A known travel that agrees with the calibration reduces it.
+    """
     max_depth_m: float = 40.0
-    """Points further away are left out."""
+    """Maximum depth; points further away are left out."""
     max_sigma_px: float = 0.99
-    """A map takes no disparity less sure than this; what a method guesses says 1 px or more."""
+    """Maximum sigma of a disparity used in a map; guesses have 1 px or more."""
     confirmed_pairs: int = 5
-    """So many pairs after one that is matched from nothing are started from the disparity of the pair before,
-    moved as encoders and pictures say, where their own pictures confirm it; 0 matches each from nothing. Only
-    with method `barsight`, preset `best`, encoders and map.min_shift 0."""
+    """Number of pairs, after one matched without a prediction, that start from the previous pair's
+    disparity, moved by the encoders' and pictures' motion, where their own pictures confirm it; 0 matches
+    every pair without a prediction. Only with method `barsight`, preset `best`, encoders and map.min_shift
+    0.
+    """
     binned_row_m: float = 0.0
-    """For a map, pairs of rows are averaged where the picture is alike along its columns, as bars across the
-    baseline are, and two rows are no wider than this on the surface: a third less work for errors up to a
-    tenth larger; 0.016 suits, 0 never does. Only with method `barsight`."""
+    """Maximum width on the surface of two rows that are averaged, for a map, where the picture is alike
+    along its columns, as bars across the baseline are: a third less work for errors up to a tenth larger;
+    0.016 suits, 0 never averages. Only with method `barsight`.
+    """
     gap_darkness: float = 0.55
-    """Places darker than this share of their surroundings are gaps between bars: unknown; 0 keeps them."""
+    """Brightness relative to the surroundings below which a pixel is a gap between bars and unknown; 0
+    keeps them.
+    """
     sgbm: SgbmSettings = field(default_factory=SgbmSettings)
     csca: CscaSettings = field(default_factory=CscaSettings)
     nonlocal_tree: NonlocalSettings = field(default_factory=NonlocalSettings)
-    """The method `nonlocal`."""
+    """Settings of the method `nonlocal`."""
     census: CensusSettings = field(default_factory=CensusSettings)
     paper: PaperSettings = field(default_factory=PaperSettings)
     barsight: BarsightSettings = field(default_factory=BarsightSettings)
@@ -66,10 +72,10 @@ class StereoSettings:
 
 
 def make_map_method(settings: StereoSettings) -> StereoMethod:
-    """Make the method that the settings name, for a map.
+    """Create the method that the settings name, for a map.
 
-    It makes no guesses, which no map takes, and is as sure of a pixel's side as if there were no edge: a map
-    holds the views' sides against each other. Rows may be binned.
+    It makes no guesses, which no map accepts, and ignores the risk of the wrong side at depth edges in its
+    sigma, because a map compares the views' sides with each other. Rows may be binned.
     """
     if settings.method != "barsight":
         return make_method(settings)
@@ -78,7 +84,7 @@ def make_map_method(settings: StereoSettings) -> StereoMethod:
 
 
 def make_method(settings: StereoSettings) -> StereoMethod:
-    """Make the method that the settings name."""
+    """Create the method that the settings name."""
     match settings.method:
         case "barsight":
             return BarsightStereo(settings.barsight)

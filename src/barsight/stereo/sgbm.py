@@ -1,4 +1,4 @@
-"""Match by OpenCV's semi-global block matching [Hirschmueller 2008]."""
+"""Match with OpenCV's semi-global block matching [Hirschmueller 2008]."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ class SgbmSettings:
     """Settings of OpenCV's SGBM."""
 
     mode: Literal["3way", "5path", "8path", "hh4"] = "hh4"
-    """Paths along which costs are summed; 8path is the slowest and needs the whole cost volume."""
+    """Set of paths along which costs are summed; 8path is the slowest and needs the whole cost volume."""
     block_px: int = 5
-    """Side of the matching block, odd."""
+    """Side of the matching block; must be odd."""
     uniqueness_pct: int = 5
-    """How much better than the second best the winner must be."""
+    """Minimum margin, in percent, by which the winner's cost must be better than the second best."""
     speckle_px: int = 100
-    """Connected patches smaller than this are dropped."""
+    """Minimum size of a connected patch, in pixels; smaller ones are dropped."""
     subpixel_sigma_px: float = 0.2
-    """The part of the error that image noise doesn't explain: pixel locking and smoothing."""
+    """Error that image noise doesn't explain, from pixel locking and smoothing (1 sigma)."""
 
     def __post_init__(self) -> None:
         if self.block_px % 2 == 0:
@@ -52,9 +52,10 @@ class SgbmSettings:
 
 @dataclass(frozen=True)
 class Sgbm:
-    """`StereoMethod` over OpenCV's SGBM; sigma from the measured noise and the gradients in the block.
+    """`StereoMethod` using OpenCV's SGBM; sigma follows from the measured noise and the gradients in the
+    block.
 
-    Where a block has no gradient at all (black, saturated) nothing was matched and there is no disparity.
+    Where a block has no gradient at all (black, saturated), nothing can be matched and there is no disparity.
     """
 
     settings: SgbmSettings
@@ -77,7 +78,7 @@ class Sgbm:
             speckleRange=2,
             mode=_MODES[settings.mode],
         )
-        # OpenCV leaves out the columns whose candidates run past a border: padding gives them back.
+        # OpenCV leaves out the columns whose candidates extend past a border; padding restores them.
         before, after = max(candidates.lowest_px + count, 0), max(-candidates.lowest_px, 0)
         left, right = (
             cv2.copyMakeBorder(image, 0, 0, before, after, cv2.BORDER_REPLICATE)
@@ -114,8 +115,8 @@ def _texture(image: UInt8, block: int) -> Float32:
 
 
 def _noise_sigma(texture: Float32, noise: float) -> Float32:
-    """Compute the Cramer-Rao bound (H, W) of a block match: sqrt(2) image sigma over the root of the summed
-    gradients.
+    """Compute the Cramer-Rao bound (H, W) of a block match: sqrt(2) times the image sigma over the root of
+    the summed squared gradients.
     """
     sigma: Float32 = np.sqrt(2 * noise**2 / np.maximum(texture, _MIN_TEXTURE), dtype=np.float32)
     return sigma.clip(max=1)

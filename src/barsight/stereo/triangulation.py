@@ -1,4 +1,4 @@
-"""Triangulate disparity with the noise and the shared part of the uncertainty apart."""
+"""Triangulate disparity, with the noise and the shared part of the uncertainty kept separate."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ def triangulate_disparity(
 ) -> StereoPoints:
     """Triangulate points in `rect0` of all pixels that have a disparity.
 
-    depth = f b / (d + doffs); along the ray its sigma is depth^2 / (f b) * sigma_d * |ray|.
-    shared_sigma_px is the disparity error that the calibration may cause, the same in every view; the
-    method's own bias joins it. Pixels deeper than max_depth_m or less sure than max_sigma_m are left out.
-    per_pixel: points per pixel along each axis, for maps whose cells are finer than the pixels.
+    depth = f b / (d + doffs); along the ray its sigma is depth^2 / (f b) * sigma_d * |ray|. shared_sigma_px
+    is the disparity error due to the calibration, the same in every view; the method's own bias is added to
+    it. Pixels deeper than max_depth_m, or with a depth sigma over max_sigma_m, are left out. per_pixel:
+    points per pixel along each axis, for maps whose cells are finer than the pixels.
     """
     camera = pair.camera
     shift = refine_grid(disparity.disparity_px, per_pixel) + np.float32(camera.doffs_px)
@@ -86,8 +86,8 @@ def _points(
 
 
 def refine_grid(disparity: Float32, per_pixel: int) -> Float32:
-    """Upsample (H, W) to (H * per_pixel, W * per_pixel), bilinear inside a surface, nearest at jumps and
-    gaps.
+    """Upsample (H, W) to (H * per_pixel, W * per_pixel), bilinear within a surface and nearest at jumps
+    and gaps.
     """
     if per_pixel == 1:
         return disparity
@@ -98,7 +98,7 @@ def refine_grid(disparity: Float32, per_pixel: int) -> Float32:
 
 
 def _is_smooth(disparity: Float32) -> Bool:
-    """Check (H, W) that no neighbour, oblique ones included, is unknown or further than a jump away."""
+    """Check (H, W) that no neighbour, diagonal ones included, is unknown or beyond a jump."""
     around = np.pad(disparity, 1, mode="edge")
     height, width = disparity.shape
     smooth = np.ones(disparity.shape, dtype=np.bool_)

@@ -1,4 +1,4 @@
-"""Measure the vertical offset between a pair's rows on corner points."""
+"""Measure the vertical offset between a pair's rows at corner points."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ def vertical_offset(left: UInt8, right: UInt8) -> float | Failed:
     """Compute the 75th percentile of |y_left - y_right| over matched corners, px: below about 1 in a
     rectified pair.
 
-    Mutual nearest ORB descriptors whose rows differ by at most a tenth of the height; the percentile finds
-    turned images too, whose offsets average out. Where a coarse dense match succeeds, corners that contradict
-    it are left out. Failed `no-texture` where too few match.
+    Corners are matched by mutual nearest ORB descriptors whose rows differ by at most a tenth of the height;
+    the percentile also detects rotated images, whose offsets average out. Where a coarse dense match
+    succeeds, corners that contradict it are left out. Returns Failed `no-texture` where too few match.
     """
     orb = cv2.ORB.create(nfeatures=3000, nlevels=2, fastThreshold=8)
     places, descriptors = [], []

@@ -1,1 +1,1 @@
-"""Published stereo methods to compare with, and the parts that only they use."""
+"""Provide published stereo methods for comparison, and the parts that only they use."""

@@ -1,10 +1,10 @@
-"""Filter the cost space min(T, (d - D)^2) bilaterally, without the cost space [paper Eq. 5, Figure 2].
+"""Filter the cost space min(T, (d - D)^2) bilaterally, without building it [paper Eq. 5, Figure 2].
 
 A pixel's filtered cost at d is the weighted mean over its window. A neighbour q whose D_q is further than
-sqrt(T) from d adds T and nothing else, so C(d) = T - sum w_q max(0, T - (d - D_q)^2) / sum w_q: only the
-candidates within sqrt(T) of a neighbour are touched. Where all D in the window lie so close together that the
-truncation touches neither the winner nor its two neighbours, C is one parabola there, and its minimum, which
-Eq. 4 then finds exactly, is the weighted mean of D: that is most of an image.
+sqrt(T) from d adds the constant T, so C(d) = T - sum w_q max(0, T - (d - D_q)^2) / sum w_q: only the
+candidates within sqrt(T) of a neighbour need computing. Where all D in the window are so close together that
+the truncation affects neither the winner nor its two neighbours, C is a single parabola there, and its
+minimum, which Eq. 4 then finds exactly, is the weighted mean of D. This is the case in most of an image.
 """
 
 from __future__ import annotations
@@ -30,10 +30,11 @@ def bilateral_update(
     sigma_px: float,
     sigma_gray: float,
 ) -> Float32:
-    """Run one round: cost space from (H, W) disparity_px, filtered, winner, parabola. (H, W) float32.
+    """Run one round on (H, W) disparity_px: build and filter the cost space, take the winner, fit the
+    parabola. Returns (H, W) float32.
 
-    limit: T in px squared. Weights are exp(-(r / sigma_px)^2 / 2 - (gray difference / sigma_gray)^2 / 2).
-    A neighbour without disparity (NaN) adds the same to all candidates; NaN where no neighbour has one.
+    limit: T in px squared. Weights are exp(-(r / sigma_px)^2 / 2 - (gray difference / sigma_gray)^2 / 2). A
+    neighbour without disparity (NaN) adds the same to all candidates; NaN where no neighbour has one.
     """
     known = np.isfinite(disparity_px)
     margins = (radius_px,) * 4
@@ -66,10 +67,10 @@ def bilateral_update(
 def _weighted_means(
     values: Float32, present: Float32, grays: UInt8, near: Float32, alike: Float32, means: Float32
 ) -> None:
-    """Average the window's known values, weighted; NaN (0 / 0) where there is none.
+    """Compute the weighted mean of the window's known values; NaN (0 / 0) where there is none.
 
     values (px, 0 where unknown), present (1, or 0 where unknown), grays: (H + 2 R, W + 2 R). near: (2 R + 1,
-    2 R + 1) weights by place; alike: (256,) by gray difference. Fills means (H, W) px.
+    2 R + 1) weights by distance; alike: (256,) by gray difference. Fills means (H, W) px.
     """
     height, width = means.shape
     side = near.shape[0]
@@ -131,10 +132,10 @@ def _compete_at_edges(
     count: int,
     updated: Float32,
 ) -> None:
-    """Search the candidates that the truncation leaves where the window's values are spread wider.
+    """Search the candidates within reach of the truncation where the window's values are spread more widely.
 
     A neighbour's credit w (T - (d - D)^2) is a polynomial in d between its two ends: its three coefficients
-    are added where it begins and taken off where it ends, and running sums over d give all credits.
+    are added where it begins and subtracted where it ends, and running sums over d yield all credits.
 
     images: disparity (px, 0 where unknown), 1 where it is known, grays; all with the window's margin. lowest,
     highest: (H, W) px of the window. first, count: the candidates. Updates (H, W) px in place.
@@ -178,9 +179,9 @@ def _compete_at_edges(
 
 @kernel()
 def _is_one_parabola(lowest: float, highest: float, mean: float, reach: float) -> bool:
-    """Check whether the winner is the whole candidate nearest to the mean and no truncation touches it nor
-    its neighbours. With all values within `reach` of one another, the credits are those of the parabola at
-    every candidate between them and fall outside.
+    """Check that the winner is the whole candidate nearest to the mean, and that the truncation affects
+    neither it nor its neighbours. With all values within `reach` of one another, the credits are those of
+    the parabola at every candidate between them, and fall outside.
     """
     winner = np.rint(mean)
     near_enough = winner + 1 - lowest <= reach and highest - winner + 1 <= reach
@@ -189,9 +190,9 @@ def _is_one_parabola(lowest: float, highest: float, mean: float, reach: float) -
 
 @kernel()
 def _run_up(starts: Float64, credit: Float64, begin: int, end: int) -> None:
-    """Integrate the credits of begin...end from the coefficients' changes, which are zero afterwards.
+    """Integrate the credits of begin...end from the changes of the coefficients.
 
-    starts: (K + 1, 3) changes of level, slope and bend, zero again afterwards. Fills credit (K,).
+    starts: (K + 1, 3) changes of level, slope and bend, reset to zero. Fills credit (K,).
     """
     level, slope, bend = 0.0, 0.0, 0.0
     for index in range(end - begin):
@@ -205,9 +206,10 @@ def _run_up(starts: Float64, credit: Float64, begin: int, end: int) -> None:
 
 @kernel()
 def _best_place(credit: Float64, begin: int, end: int) -> np.float32:
-    """Find the highest credit's index and the parabola through it and its neighbours [paper Eq. 4].
+    """Find the index of the highest credit, refined by the parabola through it and its neighbours [paper Eq.
+    4].
 
-    credit: (K,), of which begin...end count.
+    credit: (K,), of which only begin...end is used.
     """
     best = begin
     for index in range(begin, end):

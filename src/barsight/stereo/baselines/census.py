@@ -1,8 +1,8 @@
-"""Match by improved Census with outlier elimination, in the way of [Peng, Han, Tang, Shang, Yu 2017].
+"""Match with improved Census and outlier elimination, after [Peng, Han, Tang, Shang, Yu 2017].
 
-A noise-tolerant Census against a weighted mean, aggregation over cross-shaped regions, winner takes all,
-left-right check, region voting on what fails it, filling with a weighted median, a parabola below a pixel.
-Memory: two blocks of 16 candidates, whatever their number.
+The steps are a noise-tolerant Census against a weighted mean, aggregation over cross-shaped regions, winner
+takes all, left-right check, region voting for pixels that fail it, filling with a weighted median, and a
+subpixel parabola. Memory: two blocks of 16 candidates, whatever their number.
 """
 
 from __future__ import annotations
@@ -46,23 +46,23 @@ class CensusSettings:
     """Improved Census."""
 
     tolerance_sigmas: float = 1.0
-    """Gray values this many sigmas of the image's noise apart count as equal."""
+    """Maximum difference, in sigmas of the image's noise, of gray values that count as equal."""
     long_arm_px: int = 11
-    """A region's arms end here at the latest."""
+    """Maximum length of a region's arms."""
     short_arm_px: int = 5
-    """Up to here the loose limit holds."""
+    """Length of an arm up to which loose_gray applies instead of tight_gray."""
     loose_gray: int = 12
-    """Gray difference that ends a short arm."""
+    """Maximum gray difference along an arm up to short_arm_px."""
     tight_gray: int = 6
-    """Gray difference that ends a long arm."""
+    """Maximum gray difference along an arm beyond short_arm_px."""
     rounds: int = 2
-    """Rounds of aggregation."""
+    """Number of aggregation rounds."""
     min_votes: int = 20
-    """An outlier's region votes when it has more reliable pixels than this."""
+    """Number of reliable pixels that an outlier's region must exceed to vote."""
     min_vote_ratio: float = 0.4
-    """The winning disparity needs more than this share of the votes."""
+    """Share of the votes that the winning disparity must exceed."""
     vote_rounds: int = 5
-    """Rounds of voting."""
+    """Number of voting rounds."""
     output: OutputSettings = field(
         default_factory=lambda: OutputSettings(subpixel_sigma_px=0.26, filled_sigma_px=2.7)
     )
@@ -117,7 +117,7 @@ class Census:
 def census_winners(
     pair: RectifiedPair, regions: CrossRegions, candidates: DisparityRange, tolerance: float, rounds: int
 ) -> Winners:
-    """Select the left image's winners; tolerance in gray levels."""
+    """Select the left image's winners. tolerance: gray levels."""
     left, right = census_codes(pair.left, tolerance), census_codes(pair.right, tolerance)
     aggregate = cross_filter(regions, rounds)
 

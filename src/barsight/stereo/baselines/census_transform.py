@@ -1,8 +1,8 @@
 """Compute a noise-tolerant Census transform and its Hamming distance as a matching cost [Peng et al. 2017].
 
-The neighbours are compared with a weighted mean of the 3x3 pixels in the middle instead of the middle pixel,
-and within a tolerance they count as equal: each of the 62 neighbours of the 9x7 window gives two bits,
-brighter and darker. The distance of two codes is the number of bits that differ, 0...124.
+The neighbours are compared with a weighted mean of the central 3x3 pixels instead of the central pixel, and
+count as equal within a tolerance: each of the 62 neighbours of the 9x7 window yields two bits, brighter and
+darker. The distance of two codes is the number of bits that differ, 0...124.
 """
 
 from __future__ import annotations
@@ -20,10 +20,11 @@ WORST = 2 * (WIDTH_PX * HEIGHT_PX - 1)
 
 
 def census_codes(image: UInt8, tolerance: float) -> UInt64:
-    """Encode (2, H, W) uint64: the bits `brighter` and `darker` of each pixel's window, replicated at the
-    border.
+    """Encode (2, H, W) uint64: the bits `brighter` and `darker` of each pixel's window, with replicated
+    borders.
 
-    tolerance: in gray levels; a neighbour differs when it is further than that from the reference.
+    tolerance: in gray levels; a neighbour counts as brighter or darker if it differs from the reference by
+    more.
     """
     gray = image.astype(np.float32)
     reference = cv2.GaussianBlur(gray, (3, 3), 0, borderType=cv2.BORDER_REPLICATE)
@@ -37,15 +38,15 @@ def census_codes(image: UInt8, tolerance: float) -> UInt64:
 def census_cost(
     left: UInt64, right: UInt64, left_valid: Bool, right_valid: Bool, lowest_px: int, slices: Float32
 ) -> None:
-    """Fill (K, H, W) slices with the distances of the candidates lowest_px...; half of `WORST`, as of two
-    codes that have nothing to do with each other, where either pixel is invalid or outside.
+    """Fill (K, H, W) slices with the distances of the candidates lowest_px...; half of `WORST`, the
+    expected distance of two unrelated codes, where either pixel is invalid or outside.
     """
     _distances(left, right, left_valid, right_valid, lowest_px, np.float32(WORST / 2), slices)
 
 
 @kernel()
 def _ones(word: np.uint64) -> np.uint64:
-    """Count set bits: by twos, fours and bytes, the bytes added up by a product [Warren 2012]."""
+    """Count set bits in pairs, fours and bytes, and add up the bytes with a multiplication [Warren 2012]."""
     pairs = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
     fours = (pairs & np.uint64(0x3333333333333333)) + (
         (pairs >> np.uint64(2)) & np.uint64(0x3333333333333333)
@@ -58,9 +59,8 @@ def _ones(word: np.uint64) -> np.uint64:
 def _encode(padded: Float32, reference: Float32, tolerance: np.float32, codes: UInt64) -> None:
     """Compute the ternary Census transform of each pixel [Peng et al. 2017].
 
-    padded: (H + 6, W + 8) gray levels, replicated at the border; reference: (H, W) weighted means to compare
-    with; tolerance: gray levels. codes: (2, H, W), zero at the start, filled with the bits `brighter`,
-    `darker`.
+    padded: (H + 6, W + 8) gray levels with replicated borders; reference: (H, W) weighted means to compare
+    with; tolerance: gray levels. codes: (2, H, W), initially zero, filled with the bits `brighter`, `darker`.
     """
     height, width = reference.shape
     for row in numba.prange(height):
@@ -123,7 +123,8 @@ def _differences(
 ) -> None:
     """Compute a row's Hamming distances at one candidate.
 
-    All (W,), right pixel i being the match of left pixel i. Fills costs; `unknown` where either is invalid.
+    All arrays are (W,), and right pixel i is the match of left pixel i. Fills costs; `unknown` where either
+    is invalid.
     """
     for x in range(costs.shape[0]):
         bits = _ones(left_brighter[x] ^ right_brighter[x]) + _ones(left_darker[x] ^ right_darker[x])

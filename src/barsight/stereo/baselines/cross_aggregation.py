@@ -1,7 +1,7 @@
-"""Build cross-shaped supports and average the cost over them [Zhang 2009, Mei 2011].
+"""Build cross-shaped support regions and average the cost over them [Zhang 2009, Mei 2011].
 
-Each pixel has four arms that end where the gray value leaves the pixel's own; its region is the union of the
-horizontal arms of all pixels on its vertical arms (or the other way round).
+Each pixel has four arms that end where the gray value differs too much from the pixel's own; its region is
+the union of the horizontal arms of all pixels on its vertical arms (or the other way round).
 """
 
 from __future__ import annotations
@@ -26,10 +26,11 @@ class CrossRegions:
 
 @dataclass(frozen=True, eq=False)
 class CrossFilter:
-    """Call it on (K, H, W) float32 slices; they come back aggregated, in place.
+    """Aggregates (K, H, W) float32 slices in place when called.
 
     shares: (2, H, W) float32, one over the number of pixels in the region whose horizontal arms (0) or
-    vertical arms (1) are summed first. rounds: the two kinds of region in turn.
+    vertical arms (1) are summed first. rounds: number of rounds, which alternate between the two kinds of
+    region.
     """
 
     regions: CrossRegions
@@ -43,7 +44,7 @@ class CrossFilter:
 
 
 def cross_filter(regions: CrossRegions, rounds: int) -> CrossFilter:
-    """Make the aggregation over `regions`."""
+    """Create the aggregation over `regions`."""
     sizes = np.ones((2, *regions.arms.shape[1:]), dtype=np.float32)
     total = np.empty((sizes.shape[1] + 1, sizes.shape[2]), dtype=np.float32)
     _along_rows(sizes[0], regions.arms)
@@ -56,9 +57,9 @@ def cross_filter(regions: CrossRegions, rounds: int) -> CrossFilter:
 def cross_regions(
     guide: UInt8, long_px: int, short_px: int, loose_gray: int, tight_gray: int
 ) -> CrossRegions:
-    """Grow arms up to long_px while the gray value stays within loose_gray of the pixel and of the one
-    before, beyond short_px within tight_gray of the pixel [Mei 2011, section 3.2]. An arm is one pixel long
-    at least.
+    """Grow arms up to long_px while the gray value stays within loose_gray of the pixel and of the
+    previous one, and beyond short_px within tight_gray of the pixel [Mei 2011, section 3.2]. An arm is at
+    least one pixel long.
     """
     arms = np.zeros((4, *guide.shape), dtype=np.int16)
     _grow(guide, long_px, short_px, loose_gray, tight_gray, arms)

@@ -1,13 +1,14 @@
 """Aggregate costs across scales [Zhang, Fang, Min, Sun, Yang, Yan, Tian, CVPR 2014].
 
-Costs are aggregated at each scale of a pyramid on their own, then tied: the costs z_s of one place at the
-scales s minimise sum_s |z_s - a_s|^2 + lambda sum_s |z_s - z_(s-1)|^2, a tridiagonal system; the first row of
-its inverse gives the finest scale's cost as a weighted sum over the scales' aggregated costs a_s. Then winner
-takes all, left-right check, a weighted median where it fails, a parabola where it doesn't. Aggregation is by
-the guided filter, in colour where the pair has it, or over the spanning tree of `nonlocal`.
+Costs are first aggregated at each scale of a pyramid separately, then coupled: the costs z_s of one position
+at the scales s minimise sum_s |z_s - a_s|^2 + lambda sum_s |z_s - z_(s-1)|^2, a tridiagonal system; the first
+row of its inverse gives the finest scale's cost as a weighted sum of the scales' aggregated costs a_s. The
+next steps are winner takes all, left-right check, a weighted median where it fails and a parabola where it
+doesn't. Aggregation uses the guided filter, in colour where the pair has it, or the spanning tree of
+`nonlocal`.
 
-Memory: the scales above the finest are kept, a seventh of the volume together (float32); the finest passes
-in blocks of 16 candidates (the tree needs as much again).
+Memory: the scales above the finest are stored, together a seventh of the volume (float32); the finest is
+processed in blocks of 16 candidates (the tree needs the same amount again).
 """
 
 from __future__ import annotations
@@ -56,24 +57,24 @@ class CscaSettings:
     """Settings of cross-scale cost aggregation."""
 
     aggregation: Literal["guided", "tree"] = "guided"
-    """How each scale's costs are aggregated."""
+    """Method that aggregates each scale's costs."""
     cost: GradientCostSettings = field(default_factory=GradientCostSettings)
     regulariser: float = 0.3
-    """How strongly the scales are tied (the authors' lambda); 0 leaves the finest scale alone."""
+    """Strength of the coupling between scales (the authors' lambda); 0 uses the finest scale alone."""
     scales: int = 5
-    """Scales at most; a scale of fewer than five candidates is left out."""
+    """Maximum number of scales; a scale with fewer than five candidates is left out."""
     radius_px: int = 9
     """Radius of the guided filter's window, at every scale."""
     epsilon: float = 6.5
-    """The guided filter's regulariser in gray levels squared."""
+    """Regulariser of the guided filter, in gray levels squared."""
     tree_sigma_gray: float = 25.5
-    """How fast support falls along the tree, in gray levels."""
+    """Gray difference along the tree over which support falls to 1/e."""
     median_radius_px: int = 9
-    """Radius of the weighted median over the pixels that fail the left-right check."""
+    """Radius of the weighted median at pixels that fail the left-right check."""
     median_sigma_px: float = 9.0
-    """How fast its weights fall with the distance."""
+    """Distance at which the median's weights fall to 1/e."""
     median_sigma_gray: float = 14.7
-    """How fast its weights fall with the gray difference (the authors' 0.1 over three colours)."""
+    """Gray difference at which the median's weights fall to 1/e (the authors' 0.1 over three colours)."""
     output: OutputSettings = field(
         default_factory=lambda: OutputSettings(subpixel_sigma_px=0.27, filled_sigma_px=1.0)
     )
@@ -113,8 +114,8 @@ class Csca:
 
 
 def scale_weights(scales: int, regulariser: float) -> Float64:
-    """Compute the weight (scales,) of each scale's cost in the finest's: the inverse's first row [Zhang, Eq.
-    12].
+    """Compute the weight (scales,) of each scale's cost in the finest scale's: the first row of the
+    inverse [Zhang, Eq. 12].
     """
     system = np.eye(scales)
     for scale in range(scales - 1):
@@ -124,7 +125,7 @@ def scale_weights(scales: int, regulariser: float) -> Float64:
 
 
 def cross_scale_winners(pair: RectifiedPair, candidates: DisparityRange, settings: CscaSettings) -> Winners:
-    """Select the left image's winners on the tied costs."""
+    """Select the left image's winners from the coupled costs."""
     pyramid = _pyramid(pair, candidates, settings.scales)
     weights = scale_weights(len(pyramid), settings.regulariser).astype(np.float32)
     tied: _Scale | None = None
@@ -184,11 +185,11 @@ def _aggregation(scale: _Scale, settings: CscaSettings) -> Callable[[Float32], F
 
 
 def _tie(slices: Float32, weight: float, lowest_px: int, coarser: _Scale | None) -> None:
-    """Combine slices = weight * slices + the coarser scale's tied costs at half the place and half the
+    """Combine slices = weight * slices + the coarser scale's coupled costs at half the position and half the
     candidate.
 
     An odd candidate takes the mean of its two neighbours there. The authors' program rounds it up instead,
-    which moves all disparities below a pixel by about -0.12 px.
+    which shifts all subpixel disparities by about -0.12 px.
     """
     if coarser is None:
         slices *= np.float32(weight)
@@ -203,7 +204,7 @@ def _tie_slices(
     """Combine the costs of two neighbouring scales, in place [Zhang, CVPR 2014].
 
     slices: (K, H, W) aggregated costs of the candidates from `lowest` px on, multiplied by `weight`. coarse:
-    (K', ceil(H / 2), ceil(W / 2)) tied costs of the coarser scale from coarse_lowest on, in its own px.
+    (K', ceil(H / 2), ceil(W / 2)) coupled costs of the coarser scale from coarse_lowest on, in its own px.
     """
     count, height, width = slices.shape
     half = np.float32(0.5)

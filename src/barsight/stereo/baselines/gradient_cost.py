@@ -1,6 +1,6 @@
 """Compute truncated differences of gray and horizontal gradient as a matching cost [Hosni 2013, Zhang 2014].
 
-Costs are laid out candidate by candidate, (K, H, W) float32: aggregation works slice by slice.
+Costs are stored candidate by candidate, (K, H, W) float32, because aggregation works slice by slice.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ class GradientCostSettings:
     """Settings of the cost of one pixel against another."""
 
     gray_weight: float = 0.11
-    """Weight of the gray difference; the rest is the gradient's."""
+    """Weight of the gray difference; the gradient has the rest."""
     gray_limit: float = 7.0
-    """Gray differences count up to this."""
+    """Value at which gray differences are truncated."""
     gradient_limit: float = 2.0
-    """Differences of the gradient, next pixel minus previous, count up to this."""
+    """Value at which differences of the gradient (next pixel minus previous) are truncated."""
 
     def __post_init__(self) -> None:
         expect_ranges(self, "cost.", gray_weight=SHARE, gray_limit=POSITIVE, gradient_limit=POSITIVE)
 
     @property
     def worst(self) -> float:
-        """Return the cost where both differences are truncated, or nothing can be compared."""
+        """Return the cost where both differences are truncated, or there is nothing to compare."""
         return self.gray_weight * self.gray_limit + (1 - self.gray_weight) * self.gradient_limit
 
 
@@ -47,7 +47,7 @@ class CostImages:
 
 
 def cost_images(left: Float32, right: Float32, left_valid: Bool, right_valid: Bool) -> CostImages:
-    """Prepare (H, W) float32 gray values 0...255, left and right."""
+    """Prepare the cost's inputs from left and right gray values 0...255, (H, W) float32."""
     return CostImages(
         left, right, horizontal_gradient(left), horizontal_gradient(right), left_valid, right_valid
     )
@@ -134,8 +134,8 @@ def _compare(
 ) -> None:
     """Compute a row's truncated gray and gradient costs at one candidate.
 
-    All (W,), right pixel i being the match of left pixel i. Limits in gray levels. Fills costs; the worst
-    cost where either pixel is invalid.
+    All arrays are (W,), and right pixel i is the match of left pixel i. Limits in gray levels. Fills costs;
+    the worst cost where either pixel is invalid.
     """
     rest = np.float32(1) - share
     worst = share * gray_limit + rest * gradient_limit

@@ -1,8 +1,8 @@
-"""Filter slices of costs by the guided filter [He 2010]: a local linear model of the cost in the image.
+"""Filter slices of costs with the guided filter [He 2010]: a local linear model of the cost in the image.
 
-The gray guide's is our own, four times as fast as OpenCV's; the colour guide's is OpenCV's. With ours each
-slice is filtered in one sweep over its rows with ring buffers of 2 r + 1 rows, which stay in the cache.
-Windows are cut off at the border and divided by what is left of them.
+The filter for a gray guide is our own, four times as fast as OpenCV's; the one for a colour guide is
+OpenCV's. Ours filters each slice in one sweep over its rows with ring buffers of 2 r + 1 rows, which stay in
+the cache. Windows are cut off at the border and divided by the number of pixels that remain.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from barsight.core.arrays import Float32, Float64, kernel
 
 @dataclass(frozen=True, eq=False)
 class GuidedFilter:
-    """Call it on (K, H, W) float32 slices; they come back filtered, in place.
+    """Filters (K, H, W) float32 slices in place when called.
 
     guide: (H, W) float32. mean: its window means. inverse: 1 / (window variance + epsilon).
     """
@@ -36,7 +36,9 @@ class GuidedFilter:
 
 
 def guided_filter(guide: Float32, radius_px: int, epsilon: float) -> GuidedFilter:
-    """Make the filter for one image. epsilon: in the guide's units squared; smaller keeps weaker edges."""
+    """Create the filter for one image. epsilon: in the guide's units squared; a smaller value preserves
+    weaker edges.
+    """
     mean = box_mean(guide, radius_px)
     variance = box_mean(guide * guide, radius_px) - mean * mean
     inverse = 1 / (variance.clip(0, None) + epsilon)
@@ -44,7 +46,7 @@ def guided_filter(guide: Float32, radius_px: int, epsilon: float) -> GuidedFilte
 
 
 def colour_guided_filter(guide: Float32, radius_px: int, epsilon: float) -> Callable[[Float32], Float32]:
-    """Make the filter for a guide in colour, (H, W, 3) float32."""
+    """Create the filter for a colour guide, (H, W, 3) float32."""
     one = cv2.ximgproc.createGuidedFilter(guide, radius_px, epsilon)
 
     def filtered(slices: Float32) -> Float32:
@@ -56,7 +58,7 @@ def colour_guided_filter(guide: Float32, radius_px: int, epsilon: float) -> Call
 
 
 def box_mean(image: Float32, radius_px: int) -> Float64:
-    """Average (H, W) float64 over the windows of 2 r + 1, cut off at the border."""
+    """Average (H, W) float64 over windows of side 2 r + 1, cut off at the border."""
     total = np.zeros((image.shape[0] + 1, image.shape[1] + 1))
     total[1:, 1:] = image.astype(np.float64).cumsum(0).cumsum(1)
     ends = [np.arange(length) for length in image.shape]
@@ -86,9 +88,9 @@ def _filter(slices: Float32, guide: Float32, mean: Float32, inverse: Float32, ra
 def _filter_slice(cost: Float32, guide: Float32, mean: Float32, inverse: Float32, radius: int) -> None:
     """Filter one slice (H, W) row by row, in place; guide, mean, inverse: (H, W), see `GuidedFilter`.
 
-    The window sums of cost and guide * cost give the model of the row `radius` above; the window sums of the
-    models give the filtered row `radius` above that. Rings keep each row's costs and models as long as a
-    window holds them.
+    The window sums of cost and guide * cost determine the model of the row `radius` above; the window sums of
+    the models determine the filtered row `radius` above that. Ring buffers keep each row's costs and models
+    as long as a window contains them.
     """
     height, width = cost.shape
     ring = 2 * radius + 1
@@ -131,7 +133,8 @@ def _filter_slice(cost: Float32, guide: Float32, mean: Float32, inverse: Float32
 def _enter(sum_cost: Float32, sum_product: Float32, cost: Float32, kept: Float32, guide: Float32) -> None:
     """Add a row of costs to the columns' sums. All (W,).
 
-    sum_cost, sum_product: sums of cost and of cost * guide, in place. kept: filled with cost, for `_leave`.
+    sum_cost, sum_product: sums of cost and of cost * guide, in place. kept: filled with cost, for later use
+    in `_leave`.
     """
     for x in range(cost.shape[0]):
         kept[x] = cost[x]
@@ -141,7 +144,7 @@ def _enter(sum_cost: Float32, sum_product: Float32, cost: Float32, kept: Float32
 
 @kernel()
 def _leave(sum_cost: Float32, sum_product: Float32, cost: Float32, guide: Float32) -> None:
-    """Subtract a row of costs, which `_enter` has added, from the columns' sums. All (W,); sums in place."""
+    """Subtract a row of costs that `_enter` has added from the columns' sums. All (W,); sums in place."""
     for x in range(cost.shape[0]):
         sum_cost[x] -= cost[x]
         sum_product[x] -= cost[x] * guide[x]
@@ -160,7 +163,7 @@ def _models(
     """Fit the linear model cost = slope * guide + offset of each window in a row [He 2010].
 
     windows: (2, W) window sums of cost and of guide * cost. share: (W,) one over the window's columns; rows:
-    its rows. mean, inverse: (W,) of the guide, see `GuidedFilter`. Fills slope and offset (W,).
+    number of its rows. mean, inverse: (W,) of the guide, see `GuidedFilter`. Fills slope and offset (W,).
     """
     costs, products = windows[0], windows[1]
     per_row = np.float32(1) / rows
@@ -176,8 +179,8 @@ def _models(
 def _apply(windows: Float32, share: Float32, rows: np.float32, guide: Float32, out: Float32) -> None:
     """Evaluate the mean linear model of a row: the filtered costs, out (W,) [He 2010].
 
-    windows: (2, W) window sums of slope and offset. share: (W,) one over the window's columns; rows: its
-    rows.
+    windows: (2, W) window sums of slope and offset. share: (W,) one over the window's columns; rows: number
+    of its rows.
     """
     slopes, offsets = windows[0], windows[1]
     per_row = np.float32(1) / rows
@@ -208,9 +211,9 @@ def _copy(values: Float32, out: Float32) -> None:
 
 @kernel()
 def _pairs(values: Float32, size: int, sums: Float32) -> None:
-    """Sum pairs `size` places apart: sums[x] = values[x] + values[x + size], N - size of them.
+    """Sum pairs `size` elements apart: sums[x] = values[x] + values[x + size], N - size of them.
 
-    values: (N,). sums: N - size long at least.
+    values: (N,). sums: at least N - size long.
     """
     shifted = values[size:]
     for x in range(shifted.shape[0]):
@@ -219,8 +222,8 @@ def _pairs(values: Float32, size: int, sums: Float32) -> None:
 
 @kernel()
 def _window_sums(padded: Float32, sums: Float32, radius: int, scratch: Float32) -> None:
-    """Sum over 2 r + 1 neighbours of `padded`, which has r zeros at both ends: out of sums over 1, 2, 4...
-    neighbours, so that the adds are few and none waits for the one before, as in a running sum.
+    """Sum over 2 r + 1 neighbours of `padded`, which has r zeros at both ends, from sums over 1, 2, 4...
+    neighbours: there are few additions, and none waits for the previous one as in a running sum.
 
     padded: (W + 2 R,). Fills sums (W,). scratch: (2, W + 2 R).
     """

@@ -1,4 +1,4 @@
-"""Check whole disparities left to right, and fill where they disagree [Hosni 2013]."""
+"""Check whole disparities for left-right consistency, and fill them where they disagree [Hosni 2013]."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from barsight.core.arrays import Bool, Float32, Int32, UInt8, kernel
 
 
 def left_right_agreement(left_px: Int32, right_px: Int32, tolerance_px: int = 0) -> Bool:
-    """Check (H, W) that the right image's disparity at x - d is within the tolerance of the left's d.
+    """Check (H, W) that the right image's disparity at x - d is within the tolerance of the left image's d.
 
     right_px: (H, W) whole disparities of the right image (its pixel x matches the left's x + d).
     """
@@ -19,9 +19,9 @@ def left_right_agreement(left_px: Int32, right_px: Int32, tolerance_px: int = 0)
 
 
 def fill_from_background(values: Int32, usable: Bool) -> Int32:
-    """Fill by the lower (further) of the nearest usable values to the left and right in the row.
+    """Fill with the lower (further) of the nearest usable values to the left and right in the row.
 
-    A row without any usable value keeps what it has.
+    A row without any usable value stays as it is.
     """
     filled = values.copy()
     _fill_rows(values, usable, filled)
@@ -31,8 +31,8 @@ def fill_from_background(values: Int32, usable: Bool) -> Int32:
 def weighted_median(
     values: Int32, guide: UInt8, where: Bool, radius_px: int, sigma_px: float, sigma_gray: float
 ) -> Int32:
-    """Apply the weighted median of the window's values where `where` is True, each weighted by exp(-(r /
-    sigma_px)^2 - (gray difference / sigma_gray)^2) [Hosni 2013]; elsewhere the values as they are.
+    """Compute the weighted median of the window's values where `where` is True, each weighted by exp(-(r /
+    sigma_px)^2 - (gray difference / sigma_gray)^2) [Hosni 2013]; other values stay as they are.
     """
     lowest = int(values.min())
     count = int(values.max()) - lowest + 1
@@ -46,7 +46,7 @@ def weighted_median(
 
 @kernel(parallel=True)
 def _compare(left: Int32, right: Int32, tolerance: int, agrees: Bool) -> None:
-    """Check left-right consistency of whole disparities.
+    """Check the left-right consistency of whole disparities.
 
     left, right: (H, W) px; tolerance: px. Fills agrees (H, W); False where the match lies outside.
     """
@@ -60,9 +60,10 @@ def _compare(left: Int32, right: Int32, tolerance: int, agrees: Bool) -> None:
 
 @kernel(parallel=True)
 def _fill_rows(values: Int32, usable: Bool, filled: Int32) -> None:
-    """Fill each row's unusable runs by the lower of the values beside them, the background's [Hosni 2013].
+    """Fill each row's unusable runs with the lower of the values beside them, which is the background's
+    [Hosni 2013].
 
-    values: (H, W) px; usable: (H, W). filled: a copy of values at the start. A row without any usable value
+    values: (H, W) px; usable: (H, W). filled: initially a copy of values. A row without any usable value
     stays as it is.
     """
     height, width = values.shape
@@ -95,11 +96,11 @@ def _median(
     count: int,
     result: Int32,
 ) -> None:
-    """Compute weighted medians by histogram at the pixels in `where` [Hosni 2013].
+    """Compute weighted medians from histograms at the pixels in `where` [Hosni 2013].
 
-    values: (H, W) px, from `lowest` on, `count` different ones at most. guide: (H, W) gray levels. near: (2 r
-    + 1, 2 r + 1) weights by place; alike: (256,) by gray difference. result: (H, W), a copy of values at the
-    start. Windows are cut off at the border.
+    values: (H, W) px, from `lowest` on, at most `count` different ones. guide: (H, W) gray levels. near: (2 r
+    + 1, 2 r + 1) weights by distance; alike: (256,) by gray difference. result: (H, W), initially a copy of
+    values. Windows are cut off at the border.
     """
     height, width = values.shape
     radius = near.shape[0] // 2

@@ -1,9 +1,9 @@
 """Aggregate costs non-locally [Yang, "A non-local cost aggregation method for stereo matching", CVPR 2012].
 
-Costs are aggregated over the minimum spanning tree of the image, exactly. Where left and right agree, a
-second cost |d - D| holds the disparity D found; everywhere else it is zero, and aggregated over the same tree
-with half the sigma it carries the disparities that are certain to the pixels that have none (his non-local
-refinement). Memory: two blocks of 16 candidates, whatever their number.
+Costs are aggregated over the minimum spanning tree of the image, exactly. For the non-local refinement, a
+second cost is |d - D| where left and right agree on the disparity D, and zero elsewhere; aggregated over the
+same tree with half the sigma, it carries the certain disparities to the pixels that have none. Memory: two
+blocks of 16 candidates, whatever their number.
 """
 
 from __future__ import annotations
@@ -41,9 +41,13 @@ class NonlocalSettings:
     cost: GradientCostSettings = field(
         default_factory=lambda: GradientCostSettings(gray_weight=0.2, gray_limit=7.0, gradient_limit=4.0)
     )
-    """The author's: 0.11 and 0.89, the gradient being half the difference of the next and previous pixel."""
+    """Matching cost with the author's values: 0.11 and 0.89, where the gradient is half the difference
+    between the next and the previous pixel.
+    """
     sigma: float = 0.1
-    """How fast support falls along the tree, as a share of 255 gray levels; the refinement takes half."""
+    """Gray difference along the tree over which support falls to 1/e, as a share of 255 gray levels; the
+    refinement uses half of it.
+    """
     output: OutputSettings = field(
         default_factory=lambda: OutputSettings(subpixel_sigma_px=0.32, filled_sigma_px=1.6)
     )
@@ -71,7 +75,7 @@ class Nonlocal:
         right = _median(np.ascontiguousarray(mirrored.candidate_px[:, ::-1]))
         matched = left_right_agreement(smooth, right)
         chosen = _median(refine_nonlocal(smooth, matched, tree, candidates, settings.sigma * 255 / 2))
-        # A pixel is as sure as a match only where refinement has left what both images agreed on.
+        # A pixel is as certain as a match only where refinement kept the value that both images agreed on.
         matched &= chosen == smooth
         return assemble_disparity(pair, winners, chosen, matched, _SUPPORT_RADIUS_PX, settings.output)
 
@@ -79,7 +83,7 @@ class Nonlocal:
 def tree_winners(
     pair: RectifiedPair, tree: SpanningTree, candidates: DisparityRange, settings: NonlocalSettings
 ) -> Winners:
-    """Select the left image's winners on the aggregated costs."""
+    """Select the left image's winners from the aggregated costs."""
     images = cost_images(
         pair.left.astype(np.float32), pair.right.astype(np.float32), pair.left_valid, pair.right_valid
     )
@@ -95,7 +99,9 @@ def tree_winners(
 def refine_nonlocal(
     values: Int32, matched: Bool, tree: SpanningTree, candidates: DisparityRange, sigma_gray: float
 ) -> Int32:
-    """Refine non-locally: each pixel's weighted median of the matched values over the tree, whole."""
+    """Refine non-locally: compute each pixel's weighted median of the matched values over the tree, in
+    whole pixels.
+    """
     aggregate = tree_filter(tree, sigma_gray)
 
     def fill(lowest_px: int, slices: Float32) -> None:
@@ -106,7 +112,7 @@ def refine_nonlocal(
 
 
 def _median(values: Int32) -> Int32:
-    """Apply a 5x5 median; OpenCV's takes up to 32 bits of float there."""
+    """Apply a 5x5 median in float32, the widest type that OpenCV's accepts there."""
     median: Int32 = np.rint(cv2.medianBlur(values.astype(np.float32), _MEDIAN_PX)).astype(np.int32)
     return median
 

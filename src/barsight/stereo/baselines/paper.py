@@ -1,9 +1,9 @@
-"""Match by the paper's method, literally [paper Figure 2, Eq. 4, Eq. 5; the loop is Yang, CVPR 2007].
+"""Match with the paper's method, taken literally [paper Figure 2, Eq. 4, Eq. 5; the loop is Yang, CVPR 2007].
 
-An initial disparity D makes a cost space C(d) = min(eta L, (d - D)^2); the cost space is filtered
-bilaterally, guided by the image; the winner takes all and the parabola through its neighbours gives a new D,
-which is fed back until it settles. The cost space is never built: see `bilateral_update`. No evidence comes
-from the images after the start, so that the loop smooths D and can't undo its bias.
+An initial disparity D defines a cost space C(d) = min(eta L, (d - D)^2), which is filtered bilaterally,
+guided by the image; winner takes all and the parabola through its neighbours yield a new D, which is fed back
+until it settles. The cost space is never built: see `bilateral_update`. After the start, the images provide
+no more evidence, so the loop smooths D and can't undo its bias.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from barsight.stereo.sgbm import Sgbm, SgbmSettings
 
 _SUPPORT_RADIUS_PX = 4
 _SETTLED_RATIO = 0.95
-_NARROWEST_PX = 16  # OpenCV rounds the candidates up to so many.
+_NARROWEST_PX = 16  # OpenCV rounds the number of candidates up to a multiple of this.
 
 
 @dataclass(frozen=True)
@@ -33,25 +33,25 @@ class PaperSettings:
     """Settings of the paper's loop."""
 
     initial: Literal["sgbm", "census"] = "sgbm"
-    """What makes the first disparity."""
+    """Method that computes the initial disparity."""
     sgbm: SgbmSettings = field(default_factory=lambda: SgbmSettings(mode="5path"))
     census: CensusSettings = field(default_factory=CensusSettings)
     eta: float = 0.1
-    """The cost is cut off at eta times the number of candidates, px squared."""
+    """Value at which the cost is truncated (px squared), as a multiple of the number of candidates."""
     radius_px: int = 5
     """Radius of the bilateral window."""
     sigma_px: float = 3.0
-    """How fast its weights fall with the distance."""
+    """Sigma of the bilateral weights over distance."""
     sigma_gray: float = 10.0
-    """How fast its weights fall with the gray difference."""
+    """Sigma of the bilateral weights over gray difference."""
     max_rounds: int = 3
-    """The loop ends after this many rounds at the latest."""
+    """Maximum number of rounds of the loop."""
     settled_px: float = 0.05
-    """It has settled when 95 % of the disparities change by less than this."""
+    """Change of the disparity below which a pixel has settled; the loop ends when 95 % of the pixels have."""
     output: OutputSettings = field(
         default_factory=lambda: OutputSettings(fill=False, subpixel_sigma_px=0.28, filled_sigma_px=9.0)
     )
-    """The loop doesn't know what lies behind an edge: it fills what is hidden with what is near."""
+    """The loop doesn't know what lies behind an edge: it fills occluded pixels from the nearer surface."""
 
     def __post_init__(self) -> None:
         expect_ranges(
@@ -67,7 +67,7 @@ class Paper:
     settings: PaperSettings
 
     def __call__(self, pair: RectifiedPair, candidates: DisparityRange) -> Disparity:
-        """Match; see `StereoMethod`. Without `output.fill`, NaN where the initial disparity has none."""
+        """Match; see `StereoMethod`. Without `output.fill`, pixels without an initial disparity are NaN."""
         settings = self.settings
         too_narrow = pair.left.shape[1] + min(candidates.lowest_px, 0) <= _NARROWEST_PX
         if too_narrow or not is_matchable(pair, candidates):
@@ -82,7 +82,7 @@ class Paper:
 def iterate_bilateral(
     pair: RectifiedPair, initial_px: Float32, candidates: DisparityRange, settings: PaperSettings
 ) -> Float32:
-    """Iterate (H, W) float32 `bilateral_update` until few disparities move or `max_rounds` are done."""
+    """Iterate (H, W) float32 `bilateral_update` until few disparities change or `max_rounds` is reached."""
     limit = settings.eta * candidates.count
     values = initial_px
     for _ in range(settings.max_rounds):

@@ -1,4 +1,4 @@
-"""Assemble `Disparity` from whole winners: the common end of the peers' pipelines."""
+"""Assemble a `Disparity` from whole winners: the common last step of the baseline methods."""
 
 from __future__ import annotations
 
@@ -20,16 +20,18 @@ _MIN_RELIABLE = 0.01
 class OutputSettings:
     """Settings of a method's output and its sigma.
 
-    Each method has its own sigmas, measured on Middlebury's motorcycle as what 68 % of the errors stay below.
+    Each method has its own sigmas, measured on Middlebury's motorcycle as the value below which 68 % of the
+    errors lie.
     """
 
     fill: bool = True
-    """Give pixels that only one image sees a guess from their surroundings, as the methods' authors do;
-    otherwise they are NaN."""
+    """Fill pixels that only one image sees with a guess from their surroundings, as the methods' authors
+    do; otherwise they are NaN.
+    """
     subpixel_sigma_px: float = 0.3
-    """The part of a match's error that image noise doesn't explain (1 sigma)."""
+    """Error of a match that image noise doesn't explain (1 sigma)."""
     filled_sigma_px: float = 2.0
-    """The error of a filled pixel (1 sigma)."""
+    """Error of a filled pixel (1 sigma)."""
 
     def __post_init__(self) -> None:
         expect_ranges(self, "output.", subpixel_sigma_px=NOT_NEGATIVE, filled_sigma_px=NOT_NEGATIVE)
@@ -43,11 +45,11 @@ def assemble_disparity(
     radius_px: int,
     settings: OutputSettings,
 ) -> Disparity:
-    """Assemble. chosen_px: (H, W) whole disparities after post-processing. matched: where left and right
-    agree.
+    """Assemble the disparity. chosen_px: (H, W) whole disparities after post-processing. matched: where left
+    and right agree.
 
-    Matched pixels that kept their winner get the parabola's disparity, the rest stays whole or NaN. sigma is
-    the noise's bound over a window of radius_px together with the settings' constant.
+    Matched pixels that kept their winner get the parabola's disparity; the rest stays whole or NaN. sigma
+    combines the noise bound over a window of radius_px with the settings' constant.
     """
     matched = matched & hits_valid_pixel(chosen_px, pair)
     if matched.sum() < _MIN_RELIABLE * matched.size:
@@ -60,7 +62,7 @@ def assemble_disparity(
 def with_sigma(
     pair: RectifiedPair, disparity_px: Float32, matched: Bool, radius_px: int, settings: OutputSettings
 ) -> Disparity:
-    """Propagate the noise's bound over a window of radius_px together with the settings' constants."""
+    """Combine the noise bound over a window of radius_px with the settings' constants."""
     sigma = np.hypot(noise_sigma(pair.left, radius_px), np.float32(settings.subpixel_sigma_px))
     sigma = np.where(matched, sigma, np.float32(settings.filled_sigma_px)).astype(np.float32)
     known = pair.left_valid & ~np.isnan(disparity_px)
@@ -105,6 +107,6 @@ def mirror_pair(pair: RectifiedPair) -> RectifiedPair:
 
 
 def is_matchable(pair: RectifiedPair, candidates: DisparityRange) -> bool:
-    """Check that both images have texture and that a candidate leaves them an overlap."""
+    """Check that both images have texture and that some candidate leaves them an overlap."""
     width = pair.left.shape[1]
     return has_texture(pair) and candidates.lowest_px < width and candidates.highest_px > -width

@@ -12,9 +12,9 @@ from barsight.stereo.baselines.cross_aggregation import Arms, CrossRegions
 def region_vote(
     values: Int32, reliable: Bool, regions: CrossRegions, fewest: int, share: float, rounds: int
 ) -> tuple[Int32, Bool]:
-    """Replace outliers by the commonest of the reliable values in their region, where it has more than
-    `fewest` of them and the commonest more than `share`; they count as reliable in the next round. New
-    arrays: values, and reliable with what was voted.
+    """Replace outliers by the most frequent of the reliable values in their region, if it has more than
+    `fewest` of them and the most frequent has more than `share` of the votes; replaced values count as
+    reliable in the next round. Returns new arrays: values, and reliable including the replaced ones.
     """
     lowest = int(values.min())
     count = int(values.max()) - lowest + 1
@@ -39,9 +39,9 @@ def _vote(
 ) -> None:
     """Vote once for each unreliable pixel among its region's reliable values [Mei 2011].
 
-    values: (H, W) px, from `lowest` on, `count` different ones at most; reliable: (H, W); arms: (4, H, W) px.
-    More than `fewest` votes are needed, the winner's share over `share`. voted, joined: (H, W), copies of
-    values and reliable at the start; what wins is written to them.
+    values: (H, W) px, from `lowest` on, at most `count` different ones; reliable: (H, W); arms: (4, H, W) px.
+    More than `fewest` votes are needed, and a share over `share` for the winner. voted, joined: (H, W),
+    initially copies of values and reliable, updated with the winners.
     """
     height, width = values.shape
     for row in numba.prange(height):

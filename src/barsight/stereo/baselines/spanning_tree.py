@@ -1,8 +1,9 @@
-"""Aggregate over a minimum spanning tree of the image, exact in two passes [Yang, CVPR 2012].
+"""Aggregate over a minimum spanning tree of the image, exactly and in two passes [Yang, CVPR 2012].
 
-The pixels are the nodes, neighbours in the row and column are joined by edges as heavy as their gray values
-differ; the tree keeps the lightest edges. Two pixels support one another by exp(-D / sigma), D the sum of the
-edges on the tree's only path between them. Every pixel gets every other's support in two visits of each node.
+The pixels are the nodes; neighbours in the row and column are joined by edges weighted by their gray
+difference, and the tree keeps the lightest edges. Two pixels support one another by exp(-D / sigma), where D
+is the sum of the edges on the only path between them in the tree. Two visits of each node give every pixel
+the support of all others.
 """
 
 from __future__ import annotations
@@ -21,9 +22,9 @@ _HEAVIEST = 256
 
 @dataclass(frozen=True, eq=False)
 class SpanningTree:
-    """node: (N,) int32 flat pixel indices, each after its parent, neighbours mostly in turn (preorder).
-    parent: (N,) int32 flat pixel index of node's parent, the root's own for the root. weight: (N,) uint8 of
-    the edge between them.
+    """node: (N,) int32 flat pixel indices, each after its parent, neighbours mostly in sequence
+    (preorder). parent: (N,) int32 flat pixel index of node's parent; the root is its own. weight: (N,)
+    uint8 of the edge between them.
     """
 
     node: Int32
@@ -33,7 +34,7 @@ class SpanningTree:
 
 @dataclass(frozen=True, eq=False)
 class TreeFilter:
-    """Call it on (K, H, W) float32 slices; they come back aggregated, in place.
+    """Aggregates (K, H, W) float32 slices in place when called.
 
     similarity: (N,) float32 support between a node and its parent, in the order of `tree.node`.
     """
@@ -42,7 +43,7 @@ class TreeFilter:
     similarity: Float32
 
     def __call__(self, slices: Float32) -> Float32:
-        """Aggregate `slices` in place and return them. Memory: as much again."""
+        """Aggregate `slices` in place and return them. Memory: the same amount again."""
         groups = -(-slices.shape[0] // _LANES)
         lanes = np.empty((groups, slices.shape[1] * slices.shape[2], _LANES), dtype=np.float32)
         _aggregate(slices, self.tree.node, self.tree.parent, self.similarity, lanes)
@@ -50,14 +51,14 @@ class TreeFilter:
 
 
 def tree_filter(tree: SpanningTree, sigma_gray: float) -> TreeFilter:
-    """Make the aggregation over `tree` with support exp(-D / sigma_gray), D in gray levels."""
+    """Create the aggregation over `tree` with support exp(-D / sigma_gray), D in gray levels."""
     table = np.exp(-np.arange(_HEAVIEST) / sigma_gray).astype(np.float32)
     return TreeFilter(tree, table[tree.weight])
 
 
 def spanning_tree(guide: UInt8) -> SpanningTree:
-    """Build the minimum spanning tree of the 4-connected (H, W) image [Kruskal 1956]; edges sorted by
-    counting.
+    """Build the minimum spanning tree of the 4-connected (H, W) image [Kruskal 1956]; edges are sorted
+    with a counting sort.
     """
     size = guide.size
     node, parent = np.empty(size, dtype=np.int32), np.empty(size, dtype=np.int32)
@@ -114,7 +115,7 @@ def _tree_edges(guide: UInt8) -> UInt8:
 def _chief_of(chief: Int32, member: int) -> int:
     """Find the root of a pixel's set, halving the path to it [Tarjan & van Leeuwen 1984].
 
-    chief: (N,) flat pixel index of another member, a root's own; shortened in place.
+    chief: (N,) flat pixel index of another member, a root's own; paths are shortened in place.
     """
     here = member
     while chief[here] != here:
@@ -125,11 +126,11 @@ def _chief_of(chief: Int32, member: int) -> int:
 
 @kernel()
 def _walk(guide: UInt8, kept: UInt8, node: Int32, parent: Int32, weight: UInt8) -> None:
-    """Order the nodes in preorder from the middle pixel, so that a node's parent is mostly still in the
+    """Order the nodes in preorder from the central pixel, so that a node's parent is mostly still in the
     cache.
 
     guide, kept: (H, W), of `_tree_edges`. Fills node, parent (flat pixel indices) and weight (gray difference
-    of both), all (H * W,).
+    between the two), all (H * W,).
     """
     height, width = guide.shape
     gray, edges = guide.ravel(), kept.ravel()
@@ -198,8 +199,8 @@ def _two_passes(node: Int32, parent: Int32, similarity: Float32, costs: Float32,
 
 @kernel()
 def _to_lanes(slices: Float32, costs: Float32) -> None:
-    """Transpose (K, H, W) to (H * W, lanes), a tile of a row at a time so that each cache line is
-    read once.
+    """Transpose (K, H, W) to (H * W, lanes), tile by tile within a row so that each cache line is read
+    once.
     """
     count, height, width = slices.shape
     for y in range(height):

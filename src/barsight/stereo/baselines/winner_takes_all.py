@@ -1,7 +1,7 @@
-"""Take the winner over slices of costs, as they come, and the parabola below a pixel [paper Eq. 4].
+"""Select the winner over slices of costs as they arrive, with a subpixel parabola [paper Eq. 4].
 
-Only the best cost, its neighbours and the last slice are kept, so that no cost volume has to be: memory is
-five float32 images whatever the number of candidates.
+Only the best cost, its neighbours and the last slice are stored instead of a cost volume: memory is five
+float32 images whatever the number of candidates.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _BLOCK = 16
 
 @dataclass(frozen=True, eq=False)
 class Winners:
-    """The best candidate of each pixel so far, all (H, W); `take_slices` writes into it.
+    """The best candidate of each pixel so far, all (H, W); updated by `take_slices`.
 
     candidate_px: int32, whole. cost, below, above: its cost and those of the candidates one lower and one
     higher, inf where there was none. last: the costs of the last candidate seen.
@@ -41,7 +41,9 @@ def no_winners(height: int, width: int) -> Winners:
 
 
 def take_slices(winners: Winners, slices: Float32, lowest_px: int) -> None:
-    """Let (K, H, W) slices of the candidates lowest_px... compete; they follow those before without a gap."""
+    """Update the winners with (K, H, W) slices of the candidates lowest_px..., which must directly follow
+    the previous ones.
+    """
     _compete(
         slices,
         lowest_px,
@@ -58,7 +60,7 @@ def sweep(
 ) -> Winners:
     """Select the winners of all candidates; `fill(lowest_px, slices)` writes the costs of the next K of them.
 
-    shape: of the image, (H, W). K is 16 at most: the memory of the sweep is 21 float32 images.
+    shape: of the image, (H, W). K is at most 16: the memory of the sweep is 21 float32 images.
     """
     height, width = shape
     winners = no_winners(height, width)
@@ -71,9 +73,11 @@ def sweep(
 
 
 def subpixel_winners(winners: Winners) -> Float32:
-    """Interpolate the winners (H, W) float32 below a pixel by the parabola through three costs [paper Eq. 4].
+    """Interpolate the winners (H, W) float32 to subpixels with the parabola through three costs [paper Eq.
+    4].
 
-    Whole where a neighbour is missing or the costs don't curve upwards; never further than half a pixel.
+    The result is whole where a neighbour is missing or the costs don't curve upwards, and never moves by more
+    than half a pixel.
     """
     complete = np.isfinite(winners.below) & np.isfinite(winners.above)
     below, above = (np.where(complete, one, 0) for one in (winners.below, winners.above))
@@ -94,7 +98,7 @@ def _compete(
     above: Float32,
     last: Float32,
 ) -> None:
-    """Update the winners by slices (K, H, W) of the candidates from `lowest` px on.
+    """Update the winners with slices (K, H, W) of the candidates from `lowest` px on.
 
     Of equal costs the first wins. candidate: px; cost, below, above, last: costs; all (H, W), in place, see
     `Winners`. above is inf until the winner's next candidate has been seen.

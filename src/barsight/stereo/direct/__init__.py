@@ -1,1 +1,1 @@
-"""Barsight's own stereo method: semi-global start, direct refinement along the bars."""
+"""Implement Barsight's own stereo method: a semi-global start, then direct refinement along the bars."""

@@ -1,8 +1,8 @@
 """Estimate the method's own error beyond noise, calibrated where the truth is known.
 
-In a rectified pair the vertical disparity is zero. Where the images, matched, still show a vertical shift
-beyond what noise makes, something that no model of ours covers (gloss, distortion left over, interpolation,
-blur that differs) moves the match; what moves it up and down moves it left and right as much.
+In a rectified pair the vertical disparity is zero. Where the matched images still show a vertical shift
+larger than the noise explains, something not modelled (gloss, residual distortion, interpolation, differing
+blur) shifts the match; whatever shifts it vertically shifts it horizontally by the same amount.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ _NAN = np.float32(np.nan)
 
 
 def vertical_error_px(left: UInt8, right: UInt8, disparity: Float32, matched: Bool) -> float:
-    """Estimate the robust sigma (px) of vertical shifts between the matched images, less what noise explains.
+    """Estimate the robust sigma (px) of vertical shifts between the matched images, minus the noise's part.
 
-    disparity: (H, W), no NaN. 0 where fewer than 30 windows of 21 px tell anything. Of a large image four
-    stripes are asked: one number for the whole needs no more.
+    disparity: (H, W), no NaN. 0 where fewer than 30 windows of 21 px have a usable shift. In a large image
+    only four stripes are measured, which is enough for a single number.
     """
     height, usable = len(left), matched.astype(np.float32)
     stripes = [slice(0, height)]
@@ -60,10 +60,10 @@ def vertical_error_px(left: UInt8, right: UInt8, disparity: Float32, matched: Bo
 
 
 def disparity_bend(disparity: Float32, widest_px: float) -> Float32:
-    """Compute the bend (H, W) of the disparity off the middle of its neighbours 3 px to both sides, the
-    larger of along rows and along columns, at most widest_px; no NaN in or out.
+    """Compute the bend (H, W): the deviation of the disparity from the mean of its neighbours 3 px to both
+    sides, the larger of along rows and along columns, at most widest_px; no NaN in or out.
 
-    Zero on a plane. On a bend or an edge a match that sits one pixel beside its place errs by as much.
+    It is zero on a plane. On a bend or an edge, a match that is one pixel off has an error of this size.
     """
     bend = np.empty_like(disparity)
 
@@ -76,7 +76,7 @@ def disparity_bend(disparity: Float32, widest_px: float) -> Float32:
 
 @kernel()
 def _bends(disparity: Float32, widest: np.float32, bend: Float32, first: int, end: int) -> None:
-    """Compute bends (H, W) px of rows first...end, see `disparity_bend`, mirrored at the border."""
+    """Compute bends (H, W) px of rows first...end, see `disparity_bend`; borders are mirrored."""
     height, width = disparity.shape
     half = np.float32(0.5)
     framed = np.empty(width + 2 * _BEND_PX, dtype=np.float32)
@@ -97,11 +97,11 @@ def _bends(disparity: Float32, widest: np.float32, bend: Float32, first: int, en
 
 
 def start_disagreement(start: Float32, refined: Float32) -> Float32:
-    """Compute how far (H, W) refinement moved the start in windows of 9 px, px. start: (H, W), NaN where
-    unmatched.
+    """Compute the mean distance (H, W), px, by which refinement moved the start in windows of 9 px. start:
+    (H, W), NaN where unmatched.
 
-    Two estimates from the same images that gloss, blur and depth edges bend differently: where they disagree
-    over a whole window, noise isn't why, and either may be wrong.
+    The two are estimates from the same images on which gloss, blur and depth edges act differently: where
+    they disagree over a whole window, noise isn't the reason, and either may be wrong.
     """
     side = (_START_WINDOW_PX, _START_WINDOW_PX)
     moved, known = np.empty_like(refined), np.empty_like(refined)
@@ -116,7 +116,9 @@ def start_disagreement(start: Float32, refined: Float32) -> Float32:
 
 @kernel()
 def _note_moves(start: Float32, refined: Float32, moved: Float32, known: Float32) -> None:
-    """Note by how much (H, W) px refinement moved the start, and where it did: 1, or 0 for both."""
+    """Compute the distance (H, W) px by which refinement moved the start, and 1 where there is a start;
+    else both are 0.
+    """
     height, width = start.shape
     zero, one = np.float32(0), np.float32(1)
     for y in range(height):
@@ -128,8 +130,9 @@ def _note_moves(start: Float32, refined: Float32, moved: Float32, known: Float32
 
 
 class Doubts(NamedTuple):
-    """unexplained: px^2, of each pixel. edge, start: variance per squared bend and disagreement. furthest: px
-    from the start, sigma: px, from which on a match is none.
+    """Coefficients of the error model. unexplained: variance of each pixel, px^2. edge: variance per
+    squared bend; start: sigma per disagreement with the start. furthest: distance from the start, sigma:
+    sigma, both px, beyond which a match is dropped.
     """
 
     unexplained: np.float32
@@ -142,8 +145,9 @@ class Doubts(NamedTuple):
 def judge_matches(
     start: Float32, refined: Float32, variance: Float32, bend: Float32, disagreement: Float32, doubts: Doubts
 ) -> tuple[Float32, Float32]:
-    """Combine noise, what noise doesn't explain, and what bends and two opinions cost: the disparity and its
-    sigma (H, W) px, NaN where the start is, and where the match is none. start: NaN where unmatched.
+    """Combine the noise, the unexplained error, and those due to bends and to disagreement with the start
+    into the disparity and its sigma (H, W) px; NaN where the start is, and where the match is dropped.
+    start: NaN where unmatched.
     """
     disparity, sigma = np.empty_like(refined), np.empty_like(refined)
 
@@ -159,8 +163,8 @@ def _judge(
     start: Float32, refined: Float32, variance: Float32, opinions: tuple[Float32, Float32], doubts: Doubts,
     disparity: Float32, sigma: Float32, first: int, end: int,
 ) -> None:  # fmt: skip
-    """Judge rows first...end, see `judge_matches`; opinions: bend and disagreement (H, W) px. Fills disparity
-    and sigma (H, W) px.
+    """Judge rows first...end, see `judge_matches`. opinions: bend and disagreement (H, W) px. Fills
+    disparity and sigma (H, W) px.
     """
     zero = np.float32(0)
     for y in range(first, end):
@@ -179,10 +183,10 @@ def _judge(
 
 
 def edge_risk(disparity: Float32, jump_px: float, other_side: bool = True) -> tuple[Float32, Float32 | None]:
-    """Estimate the risk at depth edges: two arrays (H, W) for pixels that may have been given to the wrong
-    side of a jump of more than jump_px between neighbours: 1 on the jump, falling to 1 / e within 3 px; and
-    how far away (px) the other side lies within 4 px, zero further than 2.5 px from the jump, None where
-    that isn't asked for. NaN in `disparity` is no jump.
+    """Estimate the risk at depth edges, two arrays (H, W), for pixels that may have been assigned to the
+    wrong side of a jump of more than jump_px between neighbours: first, 1 on the jump, falling to 1 / e
+    within 3 px; second, the distance (px) in disparity to the other side within 4 px, zero further than
+    2.5 px from the jump, None if not requested. NaN in `disparity` is no jump.
     """
     distance = cv2.distanceTransform(mark_jumps(disparity, jump_px) ^ 1, cv2.DIST_L2, 5)
     beside: Float32 = np.divide(distance, np.float32(-_EDGE_REACH_PX))
@@ -201,8 +205,8 @@ def edge_risk(disparity: Float32, jump_px: float, other_side: bool = True) -> tu
 def add_edge_sigma(
     disparity: Float32, sharp: Float32, beside: Float32, wrong_side_px: float, valid: Bool, sigma: Float32
 ) -> None:
-    """Add to sigma (H, W) px, in quadrature, what sharpening moved the disparity by, and wrong_side_px times
-    what lies `beside` an edge. Where it isn't valid, `sharp` and sigma become NaN.
+    """Add to sigma (H, W) px, in quadrature, the distance by which sharpening moved the disparity, and
+    wrong_side_px times `beside`, the risk of an edge. Where it isn't valid, `sharp` and sigma become NaN.
     """
 
     def work(first: int, end: int) -> None:
@@ -231,7 +235,9 @@ def _add_edge_sigma(
 def _vertical_shifts(
     left: UInt8, right: UInt8, disparity: Float32, usable: Float32
 ) -> tuple[Float32, Float32]:
-    """Solve vertical shifts (N,) and their noise variances with the horizontal ones in windows."""
+    """Solve for the vertical shifts (N,) in windows, together with the horizontal ones; return them with
+    their noise variances.
+    """
     left_gray, right_gray = (
         cv2.GaussianBlur(image.astype(np.float32), (0, 0), _BLUR_PX) for image in (left, right)
     )
@@ -245,7 +251,7 @@ def _vertical_shifts(
     chosen = (slice(None, None, _EVERY_PX), slice(None, None, _EVERY_PX))
     determinant = xx * yy - xy * xy
     told = (usable[chosen] > 0) & (determinant > _MIN_INDEPENDENCE * xx * yy) & (yy > _MIN_SLOPE_POWER)
-    # Half of these windows is a mirror image.
+    # Half of each of these windows is a mirror image.
     told[[0, -1]] = False
     xx, xy, yy, xr, yr, power, determinant = (a[told] for a in (xx, xy, yy, xr, yr, power, determinant))
     variance = power * np.square(xx / determinant) / np.float32(_WINDOW_PX * _WINDOW_PX)
@@ -259,7 +265,7 @@ def _multiply_out(
     usable: Float32, grays: tuple[Float32, Float32], means: tuple[Float32, Float32, Float32],
     x_slopes: tuple[Float32, Float32], y_slopes: tuple[Float32, Float32], products: Float32, trust: Float32,
 ) -> None:  # fmt: skip
-    """Multiply out, pixel by pixel (H, W), what the vertical shifts are solved from.
+    """Compute, pixel by pixel (H, W), the products from which the vertical shifts are solved.
 
     grays, x_slopes, y_slopes: left and right; means over windows: of usable, and of it times each gray. The
     mean slopes x, y and the residual r of the grays about their means fill products (6, H, W): x x, x y, y y,

@@ -1,8 +1,9 @@
-"""Start a pair from a predicted disparity, where its own pictures confirm it.
+"""Start a pair from a predicted disparity where its own pictures confirm it.
 
-The evidence is the pair's: it is matched from nothing at half the size, and where prediction and match differ
-by more than a pixel, the one stays whose 5x5 census, slopes and gray values fit better at full size. What the
-half size alone has matched beside depth edges is left unknown: it is blurred there, and other views see it.
+The evidence comes from the pair itself: it is matched without a prediction at half size, and where the two
+differ by more than a pixel, the one whose 5x5 census, slopes and gray values fit better at full size is kept.
+What only the half-size match has found beside depth edges is left unknown: it is blurred there, and other
+views see it.
 """
 
 from __future__ import annotations
@@ -33,11 +34,11 @@ def confirmed_start(
     left: UInt8, right: UInt8, predicted: Float32, matched: Float32, matched_right: Float32,
     edge_rows: int = EDGE_WINDOW_PX,
 ) -> Float32:  # fmt: skip
-    """Merge a prediction and the pair's own match at half the size into a start (H, W), NaN where unknown.
+    """Merge a prediction and the pair's own half-size match into a start (H, W), NaN where unknown.
 
     predicted, matched: (H, W) px of the left picture, NaN where unknown; matched_right: (H, W) of the right
-    one. Where the match has nothing, the prediction stays if the right picture's match agrees within 2 px.
-    edge_rows: rows of the window in which an edge is looked for.
+    one. Where there is no match, the prediction is kept if the right picture's match agrees within 2 px.
+    edge_rows: height, in rows, of the window in which edges are detected.
     """
     disputed, known = np.empty(matched.shape, dtype=np.bool_), np.empty_like(matched)
     _find_disputes(predicted, matched, disputed, known)
@@ -56,8 +57,8 @@ def confirmed_start(
 
 @kernel()
 def _find_disputes(predicted: Float32, matched: Float32, disputed: Bool, known: Float32) -> None:
-    """Find the pixels (H, W) where both are known and differ by 1 px or more. Fills known (H, W) px: what is
-    matched, _FAR elsewhere.
+    """Mark the pixels (H, W) where both are known and differ by 1 px or more. Fills known (H, W) px: the
+    match, _FAR where there is none.
     """
     height, width = matched.shape
     far = np.float32(_FAR)
@@ -76,8 +77,8 @@ def _merge(
 ) -> None:  # fmt: skip
     """Merge prediction and match in rows first...end, see `confirmed_start`.
 
-    px: predicted, matched, and matched of the right picture. better: where the prediction costs less, if they
-    differ. around: the greatest and the least match near by, holes far off. Fills start (H, W) px.
+    px: predicted, matched, and matched of the right picture. better: True where the prediction costs less, if
+    they differ. around: the largest and the smallest match nearby, with holes far off. Fills start (H, W) px.
     """
     predicted, matched, matched_right = px
     highest, lowest = around
@@ -99,8 +100,8 @@ def _merge(
 def _fits_better(
     left: PixelDescriptors, right: PixelDescriptors, one: Float32, other: Float32, asked: Bool
 ) -> Bool:  # fmt: skip
-    """Check (H, W), where it is asked, whether one disparity costs less than the other over the pixels of
-    windows of 7 px that have both.
+    """Check (H, W), where asked, whether one disparity costs less than the other, summed over the pixels
+    of 7 px windows that have both.
     """
     window = (_COST_WINDOW_PX, _COST_WINDOW_PX)
     near = cv2.dilate(asked.view(np.uint8), np.ones(window, dtype=np.uint8)).view(np.bool_)
@@ -119,8 +120,8 @@ def _cost_differences(
     left: PixelDescriptors, right: PixelDescriptors, disparities: tuple[Float32, Float32], asked: Bool,
     dearer: Float32, first: int, end: int,
 ) -> None:  # fmt: skip
-    """Compute by how much the first disparity (H, W) px of each asked pixel costs more than the other at the
-    nearest column, rows first...end.
+    """Compute the cost of the first disparity (H, W) px minus that of the second, at the nearest column, for
+    each asked pixel in rows first...end.
 
     Fills dearer (H, W) where both are known: a disparity that leaves the picture costs UNKNOWN_COST.
     """

@@ -1,4 +1,4 @@
-"""Check matches: left-right consistency, and no islands (speckles)."""
+"""Check matches: enforce left-right consistency and remove islands (speckles)."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ _NONE = -32768
 
 
 def is_consistent(left_px: Float32, right_px: Float32, tolerance_px: float) -> Bool:
-    """Check left-right consistency (H, W): the right image's disparity at the match is the same within the
-    tolerance.
+    """Check left-right consistency (H, W): the right image's disparity at the match must be the same within
+    the tolerance.
 
     No NaN in left_px.
     """
@@ -23,7 +23,7 @@ def is_consistent(left_px: Float32, right_px: Float32, tolerance_px: float) -> B
 
 
 def hits_valid(valid: Bool, disparity: Float32) -> Bool:
-    """Check (H, W) that the match, or the border's pixel beside it, is valid in the right image. No NaN."""
+    """Check (H, W) that the match, clamped to the image, is valid in the right image. No NaN."""
     landed = np.empty(valid.shape, dtype=np.bool_)
     _land(valid, disparity, landed)
     return landed
@@ -34,7 +34,7 @@ def _agree(left_px: Float32, right_px: Float32, tolerance: np.float32, same: Boo
     """Check left-right consistency at the nearest whole column.
 
     left_px (no NaN), right_px: (H, W) px; tolerance: px. Fills same (H, W); False where the match lies
-    outside or the right image's disparity is NaN.
+    outside or the right image has no disparity (NaN).
     """
     height, width = left_px.shape
     for y in range(height):
@@ -45,10 +45,12 @@ def _agree(left_px: Float32, right_px: Float32, tolerance: np.float32, same: Boo
 
 @kernel(inline=True)
 def agrees_with(right_px: Float32, x: int, disparity: np.float32, tolerance: np.float32) -> bool:
-    """Check that the right picture's disparity (W,) px at the match of column x is the same."""
+    """Check that the right picture's disparity (W,) px at the match of column x is the same within the
+    tolerance.
+    """
     column = np.int32(np.rint(np.float32(x) - disparity))
     is_inside = (column >= 0) & (column < len(right_px))
-    # Without a branch, which would be guessed wrong as often as pictures disagree.
+    # No branch, which would be mispredicted as often as the pictures disagree.
     seen = right_px[np.uint64(column if is_inside else 0)]
     return bool(is_inside & (abs(seen - disparity) <= tolerance))
 
@@ -68,7 +70,7 @@ def _land(valid: Bool, disparity: Float32, landed: Bool) -> None:
 
 @kernel()
 def drop_invalid(left_valid: Bool, right_valid: Bool, disparity: Float32) -> None:
-    """Drop disparities (H, W) px, to NaN, at invalid pixels and where the match isn't valid, in place."""
+    """Set disparities (H, W) px to NaN at invalid pixels and where the match isn't valid, in place."""
     height, width = disparity.shape
     for y in range(height):
         for x in range(width):
@@ -81,7 +83,9 @@ def drop_invalid(left_valid: Bool, right_valid: Bool, disparity: Float32) -> Non
 
 
 def remove_islands(disparity: Float32, min_size_px: int, step_px: float) -> Float32:
-    """Remove connected patches smaller than min_size_px; neighbours within step_px connect."""
+    """Remove connected patches smaller than min_size_px; neighbours that differ by at most step_px are
+    connected.
+    """
     known = np.isfinite(disparity)
     if not known.any() or min_size_px < 2:
         return disparity

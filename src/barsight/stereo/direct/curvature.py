@@ -15,8 +15,8 @@ _ROUNDEST_PX = np.float32(0.75)
 
 @kernel()
 def curvature_row(disparity: Float32, axes: Float32, y: int, curvature: Float32) -> None:
-    """Compute the second derivative (W,) (1 / px) of row y across each tile's axis, out of points 5 px to
-    both sides; 0 beside jumps, where it says nothing. disparity: (H, W), no NaN.
+    """Compute the second derivative (W,) (1 / px) of row y across each tile's axis, from points 5 px to
+    both sides; 0 beside jumps, where it is meaningless. disparity: (H, W), no NaN.
     """
     height, width = disparity.shape
     middle = disparity[y]
@@ -26,7 +26,7 @@ def curvature_row(disparity: Float32, axes: Float32, y: int, curvature: Float32)
         after = disparity[min(max(y + down, 0), height - 1)]
         before = disparity[min(max(y - down, 0), height - 1)]
         start, end = tile_x * TILE_COLUMNS, min(width, tile_x * TILE_COLUMNS + TILE_COLUMNS)
-        # Clamped columns, which only a tile beside the border needs, keep the compiler from making vectors.
+        # Clamped columns, which only a tile beside the border needs, prevent vectorisation.
         if min(start + right, start - right) < 0 or max(end + right, end - right) > width:
             for x in range(start, end):
                 forth = after[min(max(x + right, 0), width - 1)] - middle[x]
@@ -43,8 +43,8 @@ def curvature_row(disparity: Float32, axes: Float32, y: int, curvature: Float32)
 def _bend(forth: np.float32, back: np.float32) -> np.float32:
     """Compute the second derivative (1 / px) from the differences to both sides.
 
-    forth, back: disparity 5 px ahead and 5 px behind minus that here, px. 0 beside a jump: from 2.5 px in
-    either or 0.75 px in their sum on.
+    forth, back: disparity 5 px ahead and 5 px behind minus the one here, px. Returns 0 beside a jump: for at
+    least 2.5 px in either, or 0.75 px in their sum.
     """
     smooth = (max(abs(forth), abs(back)) < _STEEPEST_PX) & (abs(forth + back) < _ROUNDEST_PX)
     return _SCALE * (forth + back) if smooth else np.float32(0)

@@ -1,4 +1,4 @@
-"""Sharpen depth edges to the image's: a weighted median beside every jump of the disparity."""
+"""Sharpen depth edges to those of the image with a weighted median beside every jump of the disparity."""
 
 from __future__ import annotations
 
@@ -26,8 +26,9 @@ _BAND_ROWS = 32
 
 
 def sharpen_edges(disparity: Float32, gray: UInt8, jump_px: float) -> Float32:
-    """Apply, beside jumps of more than jump_px, the weighted median of the known disparities around: near and
-    alike in gray counts more [Ma 2013], to 0.02 px. NaN stays NaN; elsewhere nothing changes.
+    """Apply, beside jumps of more than jump_px, the weighted median of the known disparities around, to
+    0.02 px; pixels that are near and have a similar gray value weigh more [Ma 2013]. NaN stays NaN; other
+    pixels don't change.
     """
     sharpened = disparity.copy()
     offset = np.arange(-_RADIUS_PX, _RADIUS_PX + 1)
@@ -54,7 +55,7 @@ def _beside_jumps(disparity: Float32, jump_px: float) -> Bool:
 
 
 def mark_jumps(disparity: Float32, jump_px: float) -> UInt8:
-    """Mark (1, else 0) the pixels (H, W) around which, within 1 px, known disparities differ by more than
+    """Mark (1, else 0) the pixels (H, W) around which known disparities within 1 px differ by more than
     jump_px. NaN is no jump.
     """
     jumps = np.empty(disparity.shape, dtype=np.uint8)
@@ -95,14 +96,14 @@ def _mark_jumps(disparity: Float32, jump: np.float32, jumps: UInt8, first: int, 
 
 
 def _falling(v: Vectors, gap: Any) -> Any:
-    """Approximate exp(-gap / _GRAY) to 1 % where it exceeds 1 %: the sixteenth power of a cubic, since
-    vectors have no exponential.
+    """Approximate exp(-gap / _GRAY) to 1 % where it exceeds 1 %, by the sixteenth power of a cubic, since
+    there is no vector instruction for the exponential.
     """
     small = v.product(gap, v.all(-1 / (16 * _GRAY), v.floats))
     power = v.all(1 / 6, v.floats)
     for factor in (1 / 2, 1.0, 1.0):
         power = v.sum(v.product(power, small), v.all(factor, v.floats))
-    # Never so small that its power has no full precision any more, which is slow.
+    # Never so small that its power loses full precision (denormals), which is slow.
     power = v.bound_below(power, 0.05)
     for _ in range(4):
         power = v.product(power, power)
@@ -110,8 +111,8 @@ def _falling(v: Vectors, gap: Any) -> Any:
 
 
 def _load_window(v: Vectors, at: Any, stride: Any) -> tuple[list[Any], list[Any], list[Any]]:
-    """Load the window of `_median`: a vector of values and one of weights per line; then two vectors, the
-    least and the greatest of the values that count.
+    """Load the window of `_median`: a vector of values and one of weights per line, then two vectors, the
+    smallest and the largest of the values that count.
     """
     builder, index = v.builder, at.type
     nothing, far = v.all(0.0, v.floats), v.all(_UNKNOWN, v.floats)
@@ -139,11 +140,12 @@ def _load_window(v: Vectors, at: Any, stride: Any) -> tuple[list[Any], list[Any]
 @intrinsic  # type: ignore[untyped-decorator]
 def _median(_: Any, theres: Any, grays: Any, at: Any, stride: Any, near: Any) -> Any:
     """Compute the weighted median of the window that begins at `at`. A value's weight is exp(-gap / _GRAY),
-    of its gray's gap to that of the window's middle, times `near`. All arrays are flat.
+    where gap is the difference between its gray value and that of the window's centre, times `near`. All
+    arrays are flat.
 
-    The interval of values is quartered until it is short enough: faster than to sort a hundred of them. In
-    vector instructions, so that the window stays in registers, where there are as many. Plain loops take 2.1
-    to 2.8 times as long for the same bits (benchmarks/results/2026-11-23-kernels.md).
+    The interval of values is quartered until it is short enough, which is faster than sorting a hundred of
+    them. The vector instructions keep the window in registers where there are enough. Plain loops take 2.1 to
+    2.8 times as long for identical results (benchmarks/results/2026-11-23-kernels.md).
     """
     signature = types.float32(theres, grays, at, stride, near)
 
@@ -157,7 +159,7 @@ def _median(_: Any, theres: Any, grays: Any, at: Any, stride: Any, near: Any) ->
         high = cgutils.alloca_once_value(builder, v.extreme_of(highest, "max"))
 
         def has_half(level: Any) -> Any:
-            """Return whether the values up to a level have half of the weight."""
+            """Return whether the values up to a level have at least half of the weight."""
             every = v.all(level, v.floats)
             below = [
                 builder.select(builder.fcmp_ordered("<=", value, every), weight, nothing)
@@ -185,7 +187,7 @@ def _median(_: Any, theres: Any, grays: Any, at: Any, stride: Any, near: Any) ->
 
 
 def _summed(v: Vectors, terms: list[Any]) -> Any:
-    """Sum in pairs, so that no sum waits for all before it."""
+    """Sum in pairs, so that no addition waits for all previous ones."""
     while len(terms) > 1:
         pairs = zip(terms[::2], terms[1::2], strict=False)
         terms = [v.sum(*pair) for pair in pairs] + terms[len(terms) // 2 * 2 :]
@@ -199,8 +201,9 @@ def _weighted_medians(
 ) -> None:  # fmt: skip
     """Fill in the medians of the pixels `wanted`, in rows first...end.
 
-    disparity, gray: (H, W) with a margin of _RADIUS_PX before and FLOAT_LANES after; the unknown is _UNKNOWN.
-    near: (_SIDE_PX * FLOAT_LANES,) weights by place, 0 beside the window. wanted, medians: (H, W).
+    disparity, gray: (H, W) with a margin of _RADIUS_PX before and FLOAT_LANES after; unknown values are
+    _UNKNOWN. near: (_SIDE_PX * FLOAT_LANES,) weights by distance, 0 outside the window. wanted, medians: (H,
+    W).
     """
     framed_width = disparity.shape[1]
     theres, shades = disparity.reshape(-1), gray.reshape(-1)

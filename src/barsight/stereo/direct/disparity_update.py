@@ -1,4 +1,4 @@
-"""Update the disparity from the fitted planes: choose the support, correct curvature."""
+"""Update the disparity from the fitted planes: blend the supports, and correct for curvature."""
 
 from __future__ import annotations
 
@@ -21,19 +21,24 @@ _SLACK = np.float32(0.5)
 _BLEND_REACH_PX = 4
 _SAG_REACH_PX = 5
 _SPREAD_ACROSS_PX2 = np.float32(3)
-"""Mean square distance across the axis that the supports average over: their own and the axis' error."""
+"""Mean square distance across the axis over which the supports average: their own width and the axis'
+error.
+"""
 _LONGEST_STEP_PX = np.float32(1.5)
 _SUPPORT = np.float32(0.5 * 1.87)
-"""Sum of squared weights over their sum for a Gaussian support in the plane, times what the outlier weights
-cost: measured on rendered planes. What noise in the slopes costs grows with what a step falls short of."""
+"""Factor of a fit's variance: the sum of squared weights over their sum for a Gaussian support in the
+plane, times the loss due to the outlier weights, measured on rendered planes. Noise in the slopes adds in
+proportion to the shortfall of a step.
+"""
 _MIN_INFORMATION = np.float32(0.5)
 
 _MAX_NOISIER, _DAMPED = np.float32(1.5), np.float32(6)
-"""Gain of a step up to which its shortfall counts as noise, by rendered planes. Beyond, a sixth of it is
-taken off again, by rendered bars: a step that is short by half damps its own noise."""
+"""Gain of a step up to which its shortfall counts as noise, from rendered planes. A sixth of the excess is
+subtracted again, from rendered bars: a step that is short by half damps its own noise.
+"""
 
 Fit = tuple[Float32, Float32]
-"""A fitted disparity and its information, (H, W)."""
+"""A fitted disparity and its information (inverse variance up to the noise power), (H, W)."""
 
 
 def fit_variance(power: Float32, information: Float32) -> Float32:
@@ -42,9 +47,10 @@ def fit_variance(power: Float32, information: Float32) -> Float32:
 
 
 def blend_fits(long: Fit, short: Fit, power: Float32, usable: Float32) -> tuple[Float32, Float32]:
-    """Blend the fitted disparities and their variances: of the long support, and of the short one as far as
-    both differ by more than the short one's noise: there the surface is no plane over the long one. All (H,
-    W). Which of the two is right isn't known where they share: the variance is that of the mixture.
+    """Blend the fitted disparities and their variances, all (H, W): the long support's, and the short
+    one's as far as they differ by more than the short one's noise, because there the surface isn't planar
+    over the long support. Where both contribute, which is right is unknown: the variance is that of the
+    mixture.
     """
     fitted, variance = np.empty_like(power), np.empty_like(power)
 
@@ -57,10 +63,11 @@ def blend_fits(long: Fit, short: Fit, power: Float32, usable: Float32) -> tuple[
 
 @kernel()
 def _excess(long: Float32, short: Float32, power: Float32, information: Float32, excess: Float32) -> None:
-    """Compute the excess (W,) px^2 of the supports' squared difference over half the short fit's variance.
+    """Compute the excess (W,) px^2 of the squared difference between the supports over half the short fit's
+    variance.
 
     long, short: (W,) fitted disparities, px. power: (W,), see `noise_power`; information: (W,) of the short
-    fit. Negative where they agree better than that.
+    fit. The excess is negative where they agree better than that.
     """
     for x in range(len(excess)):
         gap = long[x] - short[x]
@@ -74,8 +81,8 @@ def _blend(
 ) -> None:  # fmt: skip
     """Blend the long and short supports' fits in rows first...end, see `blend_fits`.
 
-    long_fit, short_fit: (H, W) px with their information. power: (H, W), see `noise_power`; usable:
-    (H, W) 0...1. The mean excess over a window of 2 reach + 1 px shares between them. Fills fitted (H, W) px
+    long_fit, short_fit: (H, W) px with their information. power: (H, W), see `noise_power`; usable: (H, W)
+    0...1. The mean excess over a window of 2 reach + 1 px determines their weights. Fills fitted (H, W) px
     and variance (H, W) px^2.
     """
     long, long_information = long_fit
@@ -101,7 +108,7 @@ def _blend(
         slide_window(columns[1], reach, seen)
         noise, far, near, certain = power[y], long[y], short[y], short_information[y]
         for x in range(width):
-            # Both variances are so much of the noise's power per information.
+            # Both variances are this factor times the noise power over the information.
             own = _SUPPORT * noise[x] / max(certain[x], _MIN_INFORMATION)
             excess = max(mean[x] / (seen[x] + tiny), zero)
             mean[x] = own / (own + excess + np.float32(1e-9))
@@ -117,7 +124,9 @@ def _blend(
 
 @kernel()
 def raise_noise(short_of: Float32, power: Float32) -> None:
-    """Raise the noise power (H, W) by what steps fall short of (H, W), 1 or more, in place."""
+    """Multiply the noise power (H, W), in place, by the steps' gain short_of (H, W), 1 or more, which is
+    damped beyond _MAX_NOISIER.
+    """
     height, width = power.shape
     for y in range(height):
         short, noise = short_of[y], power[y]
@@ -128,9 +137,10 @@ def raise_noise(short_of: Float32, power: Float32) -> None:
 
 @kernel()
 def complete_step(moved: Float32, usable: Float32, short_of: Float32, disparity: Float32) -> None:
-    """Complete a step that fell short: the disparity (a frame, px, in place) by what it moved in the mean.
+    """Complete a step that fell short: add the missing part of its mean to the disparity (a frame, px, in
+    place).
 
-    moved, usable: (H, W) means over windows, of what is usable. short_of: (H, W), 1 or more.
+    moved, usable: (H, W) means over windows, of the usable steps and of usable. short_of: (H, W), 1 or more.
     """
     height, width = moved.shape
     one, tiny = np.float32(1), np.float32(1e-6)
@@ -142,11 +152,11 @@ def complete_step(moved: Float32, usable: Float32, short_of: Float32, disparity:
 
 
 def update_disparity(fitted: Float32, axes: Float32, disparity: Float32, variance: Float32) -> None:
-    """Move the disparity (a frame) to what was fitted, corrected for curvature; add to the variance.
+    """Move the disparity (a frame) to the fitted one, corrected for curvature, and increase the variance.
 
-    A plane over the support takes off a surface that is round across the axis half its curvature times the
-    support's mean square width. A bar's curvature is the same all along, so that its mean over a window adds
-    hardly any noise. Half of what was put right may still be wrong.
+    A plane fitted to a surface that is round across the axis is off by half its curvature times the support's
+    mean square width. A bar's curvature is constant along it, so its mean over a window adds hardly any
+    noise. Half of the correction may still be wrong.
     """
 
     def work(first: int, end: int) -> None:
@@ -159,10 +169,10 @@ def update_disparity(fitted: Float32, axes: Float32, disparity: Float32, varianc
 def _settle(
     fitted: Float32, axes: Float32, reach: int, disparity: Float32, variance: Float32, first: int, end: int,
 ) -> None:  # fmt: skip
-    """Update the disparity in rows first...end by what was fitted, corrected for curvature, in place.
+    """Update the disparity in rows first...end to the fitted one, corrected for curvature, in place.
 
-    fitted: (H, W) px. axes: (tile rows, tile columns, 2). reach: px, of the window over which the curvature
-    is averaged. disparity: a frame, px, moved by 1.5 px at most; variance: (H, W) px^2, added to.
+    fitted: (H, W) px. axes: (tile rows, tile columns, 2). reach: px, half width of the window over which the
+    curvature is averaged. disparity: a frame, px, moved by at most 1.5 px; variance: (H, W) px^2, increased.
     """
     height, width = fitted.shape
     column = allocate_columns(1, width, reach)[0]

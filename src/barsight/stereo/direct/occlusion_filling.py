@@ -1,9 +1,9 @@
-"""Fill occlusions by extrapolating the surfaces around, marked as guesses.
+"""Fill occlusions by extrapolating the surrounding surfaces, marked as guesses.
 
-From a hole, rays go out in 16 directions to the first matched pixel; the plane through the surface there is
-continued into the hole. The guess is a weighted quantile of these candidates: near and alike in gray counts
-more. What one image hides lies behind what hides it, so a low quantile is taken; beside the image's border
-nothing hides it, and the median is taken.
+From a hole, rays go out in 16 directions to the first matched pixel, whose surrounding plane is extrapolated
+into the hole. The guess is a weighted quantile of these candidates: those that are near and have a similar
+gray value weigh more. What one image hides lies behind what hides it, so a low quantile is used; beyond the
+other image's border nothing hides it, and the median is used.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ _MIDDLE_PERCENT = (45, 55)
 def fill_occlusions_by_planes(
     disparity: Float32, gray: UInt8, right_px: Float32, lowest_px: float, highest_px: float
 ) -> tuple[Float32, Float32]:
-    """Fill the NaN of `disparity` (H, W), as far as any ray finds a match, and give the guesses' sigma (px;
-    NaN where nothing was guessed): twice the spread of the candidates, since the truth may be none of them,
-    and at least 1 px. Inputs stay as they are.
+    """Fill the NaN of `disparity` (H, W) where any ray finds a match, and return the guesses' sigma (px; NaN
+    where nothing was guessed): twice the spread of the candidates, since the truth may be none of them, and
+    at least 1 px. The inputs don't change.
 
-    right_px: (H, W) the right image's disparity: a guess that would be seen there in front of what is there
-    is less likely. Guesses stay within lowest_px...highest_px.
+    right_px: (H, W) the right image's disparity; a guess that would be visible there in front of the surface
+    that is there gets a lower weight. Guesses stay within lowest_px...highest_px.
     """
     slope_x, slope_y = np.zeros_like(disparity), np.zeros_like(disparity)
 
@@ -57,7 +57,7 @@ def fill_occlusions_by_planes(
     holes = np.isnan(disparity).astype(np.uint8)
     if holes.all():
         return filled, sigma
-    # A ray may leap as far as no pixel in any direction is matched.
+    # A ray may skip the distance to the nearest match in any direction.
     leaps = cv2.distanceTransform(holes, cv2.DIST_C, 3).astype(np.int32)
 
     slopes, limits, found = (slope_x, slope_y), (lowest_px, highest_px), (filled, sigma)
@@ -70,9 +70,9 @@ def fill_occlusions_by_planes(
 
 
 def fill_row_holes(disparity: Float32) -> Float32:
-    """Fill NaN by the smaller, farther, neighbour in their row: what is hidden lies behind.
+    """Fill NaN with the smaller (farther) of the neighbours in the row, since what is hidden lies behind.
 
-    Rows without any disparity take the median of all; a map without any is zero.
+    Rows without any disparity get the median of all; a map without any becomes zero.
     """
     filled = np.empty_like(disparity)
     if not _fill_rows(disparity, filled):
@@ -81,8 +81,8 @@ def fill_row_holes(disparity: Float32) -> Float32:
 
 
 def _median(disparity: Float32) -> np.float32:
-    """Compute the median of what is known (H, W) px, 0 where nothing is. Only those are sorted that lie near
-    the median of a few.
+    """Compute the median of the known values (H, W) px, 0 if there are none. Only those near the median of
+    a sample are sorted.
     """
     sample = disparity[::_SAMPLED_EVERY_PX, ::_SAMPLED_EVERY_PX]
     sample, found = sample[np.isfinite(sample)], np.empty(disparity.size, dtype=np.float32)
@@ -100,9 +100,9 @@ def _median(disparity: Float32) -> np.float32:
 def _take_between(
     disparity: Float32, low: np.float32, high: np.float32, found: Float32
 ) -> tuple[int, int, int]:
-    """Count what lies below, between and above two disparities, NaN aside.
+    """Count the values below, between and above two disparities, ignoring NaN.
 
-    disparity: (H, W) px. Fills the first of found (H W,) px with what lies between.
+    disparity: (H, W) px. Fills the first of found (H W,) px with the values in between.
     """
     below = count = above = 0
     for row in disparity:
@@ -119,7 +119,7 @@ def _take_between(
 
 @kernel()
 def _fill_rows(disparity: Float32, filled: Float32) -> bool:
-    """Check whether every row had a disparity; those that had none are NaN.
+    """Fill each row's holes and check whether every row had a disparity; rows that had none become NaN.
 
     disparity: (H, W) px. Fills filled (H, W): holes take the smaller of the values beside them in their row.
     """
@@ -156,8 +156,8 @@ def _slopes_beside_holes(
     disparity: Float32, radius: int, same_surface_px: float, slope_x: Float32, slope_y: Float32, first: int,
     end: int,
 ) -> None:  # fmt: skip
-    """Fit slopes (px per px) of the plane around each matched pixel that touches a hole: three rounds of
-    least squares, each on the pixels near the plane before, held to zero slope where there are few. Every
+    """Fit slopes (px per px) of the plane around each matched pixel next to a hole, in three rounds of least
+    squares, each on the pixels near the previous plane, regularised to zero slope where there are few. Every
     third pixel in each direction is enough for a slope.
 
     disparity: (H, W) px, NaN in holes. radius: px. Fills slope_x and slope_y (H, W), in rows first...end.
@@ -234,12 +234,12 @@ def _fill(
     first: int,
     end: int,
 ) -> None:
-    """Fill the holes (NaN) of rows first...end by planes, see `fill_occlusions_by_planes`.
+    """Fill the holes (NaN) of rows first...end with planes, see `fill_occlusions_by_planes`.
 
     disparity, right_px: (H, W) px. gray: (H, W) smoothed gray levels. leaps: (H, W) px to the nearest match,
-    0 at one. slopes: in x and y, (H, W) px per px. rays: (_RAYS, 2) x, y, the larger of them 1. limits: the
-    least and the greatest px. Fills the guesses and
-    their sigmas (H, W) px in the holes; a hole whose rays find nothing keeps NaN in both.
+    0 at one. slopes: in x and y, (H, W) px per px. rays: (_RAYS, 2) x, y, the larger of them 1. limits:
+    minimum and maximum, px. Fills the guesses and their sigmas (H, W) px in the holes; a hole whose rays find
+    nothing keeps NaN in both.
     """
     (slope_x, slope_y), (lowest, highest), (filled, sigma) = slopes, limits, guesses
     height, width = disparity.shape
@@ -262,7 +262,7 @@ def _fill(
                         j += leaps[yy, xx]
                         continue
                     distance = j * pixels[ray]
-                    # The plane's slope fades out with the distance: far off it says nothing.
+                    # The plane's slope fades out with the distance: far away it means nothing.
                     fade = _SLOPE_LENGTH_PX * (1.0 - math.exp(-distance / _SLOPE_LENGTH_PX)) / distance
                     value = there + fade * (slope_x[yy, xx] * (x - xx) + slope_y[yy, xx] * (y - yy))
                     value = min(max(value, lowest), highest)
@@ -287,7 +287,7 @@ def _weighted_quantile(
 ) -> tuple[np.float32, float]:
     """Compute a weighted quantile of the first `count` candidates and its sigma, px.
 
-    values: (_RAYS,) px; weights: (_RAYS,). Both are sorted by value.
+    values: (_RAYS,) px; weights: (_RAYS,). Both are sorted by value in place.
     """
     wanted = weights[:count].sum() * quantile
     passed, guess = 0.0, np.float32(np.nan)

@@ -1,6 +1,7 @@
 """Compute photometric residuals and their robustly weighted Gauss-Newton terms, pixel by pixel.
 
-Each pass rolls over bands of rows (`box_sums.py`). `Frames` are images with the supports' margin around them.
+Each pass goes through bands of rows with rolling sums (`box_sums.py`). `Frames` are images with the supports'
+margin around them. A pixel's weight is its Gauss-Newton Hessian, its pull the negative gradient.
 """
 
 from __future__ import annotations
@@ -31,9 +32,9 @@ def photometric_residual(
     left: Float32, right: Float32, usable: Float32, side: int, outlier_gray: float, residual: Float32,
     trust: Float32,
 ) -> None:  # fmt: skip
-    """Subtract right from left after the means and contrasts of what is `usable` (0...1) in a window of side
-    x side pixels are made equal, and how far that is to be trusted: half at outlier_gray. Both contrasts are
-    raised by 2 gray levels. (H, W) in, frames out.
+    """Subtract right from left after equalising the means and contrasts of the `usable` (0...1) pixels in
+    a window of side x side pixels, and compute each residual's robust weight `trust`, which is half at
+    outlier_gray. Both contrasts are raised by 2 gray levels. (H, W) in, frames out.
     """
 
     def work(first: int, end: int) -> None:
@@ -49,8 +50,8 @@ def _compare(
 ) -> None:  # fmt: skip
     """Compute photometric residuals and Cauchy weights in rows first...end, see `photometric_residual`.
 
-    left, right: (H, W) gray levels; usable: (H, W) 0...1. Mean and contrast are those of windows of 2 reach +
-    1 px; outlier: gray levels. Fills the frames residual (gray levels) and trust (0...1).
+    left, right: (H, W) gray levels; usable: (H, W) 0...1. Mean and contrast are taken over windows of 2 reach
+    + 1 px; outlier: gray levels. Fills the frames residual (gray levels) and trust (0...1).
     """
     height, width = left.shape
     columns = allocate_columns(5, width, reach)
@@ -90,12 +91,12 @@ def robust_weights(
     residual: Float32, slope: Float32, trust: Float32, means: tuple[Float32, Float32], side: int,
     gloss_px: float, gloss_trust: float, weight: Float32, pull: Float32,
 ) -> None:  # fmt: skip
-    """Weight residuals: each pixel's weight and pull, with what is constant along the axis weighed by how
-    well it agrees.
+    """Compute each pixel's weight and pull; the part that is constant along the axis is weighted by how well
+    it agrees.
 
     means: (H, W) of residual and slope along the axis. Frames in and out.
     """
-    # So many independent samples stand behind a Gaussian mean: noise leaves that much less power in it.
+    # Independent samples in a Gaussian mean: it has that much less of the noise's power.
     samples = np.float32(2 * math.sqrt(math.pi) * gloss_px)
 
     def work(first: int, end: int) -> None:
@@ -115,8 +116,8 @@ def _weigh(
     """Compute the Gauss-Newton weights and pulls of rows first...end, see `robust_weights`.
 
     residual (gray levels), slope (gray levels per px), trust (0...1): frames. means: of residual and slope
-    along the axis, (H, W). samples: independent pixels behind a mean; windows are 2 reach + 1 px. Fills the
-    evidence, two frames: weight ((gray levels / px)^2) and pull (gray levels^2 / px).
+    along the axis, (H, W). samples: number of independent pixels in a mean; windows are 2 reach + 1 px. Fills
+    the evidence, two frames: weight ((gray levels / px)^2) and pull (gray levels^2 / px).
     """
     (residual_mean, slope_mean), (weight, pull) = means, evidence
     height, width = residual_mean.shape
@@ -164,11 +165,11 @@ def step_gain(
     weight: Float32, trust: Float32, slope_noise: float, side: int, is_last: bool, pull: Float32,
     mean_weight: Float32,
 ) -> Float32:  # fmt: skip
-    """Compute the step's gain (H, W): noise in the slopes adds to the weights and nothing to the pulls, so
-    that each step falls short by its share of the weights; 3 at most. The pulls, unless the step is the last,
-    are multiplied by it.
+    """Compute the step's gain (H, W), at most 3: noise in the slopes adds to the weights but not to the
+    pulls, so each step falls short by the noise's share of the weights. Unless the step is the last, the
+    pulls are multiplied by the gain.
 
-    mean_weight: (H, W), is given the weights' means over the windows. The others are frames.
+    mean_weight: (H, W), filled with the weights' means over the windows. The others are frames.
     """
     short_of = np.empty_like(mean_weight)
 
@@ -199,7 +200,7 @@ def _apply_step_gain(
 
     weight, trust, pull: frames; pull is multiplied by the gain unless the step is the last. slope_noise:
     variance of a slope, (gray levels / px)^2. Windows are 2 reach + 1 px. Fills mean_weight and short_of (the
-    gain, 3 at most), (H, W).
+    gain, at most 3), (H, W).
     """
     height, width = mean_weight.shape
     columns = allocate_columns(2, width, reach)
@@ -228,9 +229,9 @@ def _apply_step_gain(
 def noise_power(
     pull: Float32, usable: Float32, mean_usable: Float32, mean_weight: Float32, hold: float, side: int
 ) -> Float32:
-    """Estimate the noise power (H, W) (gray levels^2) that the pulls show, per unit of what holds a disparity
-    in place: from their sums over blocks, so that neighbours which err alike count as what they are. Where
-    the images say little the plain hold takes their place and the power grows. pull is a frame.
+    """Estimate the noise power (H, W) (gray levels^2) of the pulls per unit of weight, from their sums
+    over blocks, so that correlated errors of neighbours are accounted for. Where the weights are small,
+    the plain hold dominates and the power grows. pull is a frame.
     """
     power = np.empty_like(usable)
 
@@ -243,7 +244,7 @@ def noise_power(
 
 @kernel()
 def _blocks(pull: Float32, y: int, height: int, line: Float32, blocks: Float32) -> None:
-    """Sum (W,) over 3 x 3 pixels around row y. line: (W + 2,) for use inside."""
+    """Sum (W,) over 3 x 3 pixels around row y. line: (W + 2,) scratch."""
     width = len(blocks)
     inner = slice(MARGIN, MARGIN + width)
     above, below = mirror_index(y - 1, height) + MARGIN, mirror_index(y + 1, height) + MARGIN
@@ -263,7 +264,7 @@ def _noise_power(
     """Estimate the noise power in rows first...end, see `noise_power`.
 
     pull: a frame. usable (0...1), mean_usable, mean_weight: (H, W), the means over windows of 2 reach + 1 px.
-    hold: the plain hold's weight. Fills power (H, W), gray levels^2.
+    hold: weight of the plain hold. Fills power (H, W), gray levels^2.
     """
     height, width = usable.shape
     column = allocate_columns(1, width, reach)[0]
@@ -286,6 +287,6 @@ def _noise_power(
         slide_window(column, reach, found)
         for x in range(width):
             each = one / (weights[x] + np.float32(1e-3))
-            # Sliding sums of squares round to a little under 0 where no pull is left.
+            # Rounding makes sliding sums of squares slightly negative where no pull is left.
             square = max(found[x], np.float32(0)) / size
             found[x] = square * each * (one + hold * (seen[x] + np.float32(1e-6)) * each)

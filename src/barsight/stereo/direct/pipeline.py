@@ -1,7 +1,7 @@
-"""Match densely by our own method: semi-global start, consistency, direct refinement along the bars, sharp
-edges.
+"""Match densely with our own method: semi-global start, consistency check, direct refinement along the bars,
+sharpening of edges.
 
-What only one image sees stays NaN; with `fill_occlusions` it is guessed and given a large sigma.
+What only one image sees stays NaN; with `fill_occlusions` it is guessed, with a large sigma.
 """
 
 from __future__ import annotations
@@ -52,7 +52,9 @@ _FURTHEST_FROM_START_PX = 2.0
 _MIN_CONTRAST_GRAY = 0.5
 _MIN_HALVED_PX = 128
 _FAR_STEP_PX, _MAX_FAR_RATIO = 0.3, 0.15
-"""A prediction from which more than this share of the pixels step further is off as a whole."""
+"""Length of a refinement step, and maximum share of pixels that step further, above which a prediction is
+rejected as a whole.
+"""
 
 
 @dataclass(frozen=True)
@@ -60,31 +62,35 @@ class BarsightSettings:
     """Settings of Barsight's own stereo."""
 
     preset: Literal["best", "fast"] = "best"
-    """`fast` starts at half the size, refines there in all steps but the last, with the long support alone,
-    and leaves the edges."""
+    """Trade-off between accuracy and speed. `fast` starts at half size, runs all refinement steps but the
+    last there, uses only the long support, and doesn't sharpen edges.
+    """
     fill_occlusions: bool = True
-    """Guess what only one image sees (sigma of 1 px or more, which no map takes) instead of leaving NaN."""
+    """Guess what only one image sees (sigma of 1 px or more, which no map accepts) instead of leaving NaN."""
     consistency_px: float = 1.0
-    """Left and right disparities must agree to this."""
+    """Maximum difference between left and right disparities."""
     island_px: int = 40
-    """Connected patches smaller than this many pixels are dropped."""
+    """Minimum size of a connected patch, in pixels; smaller ones are dropped."""
     model_sigma_px: float = 0.005
-    """The least error of the method itself (1 sigma)."""
+    """Minimum error of the method itself (1 sigma)."""
     vertical_error_ratio: float = 1.5
-    """Error of the disparity per vertical error that the images show: parallax adds its own."""
+    """Disparity error per vertical error measured in the images; above 1, because parallax adds its own."""
     edge_error_ratio: float = 0.55
-    """Error per pixel by which the disparity bends within 3 px."""
+    """Disparity error per pixel by which the disparity bends within 3 px."""
     max_edge_px: float = 0.5
-    """A bend or an edge counts as no more than this."""
+    """Maximum bend of the disparity that is counted, at a curved surface or an edge."""
     start_error_ratio: float = 0.09
-    """Error per pixel by which the start and its refinement disagree over a window."""
+    """Disparity error per pixel of disagreement between the start and its refinement over a window."""
     wrong_side_px: float = 0.3
-    """Error on a depth edge, where a pixel may belong to either side; it falls to 1 / e within 3 px."""
+    """Disparity error on a depth edge, where a pixel may belong to either side; it falls to 1 / e within 3
+    px.
+    """
     other_side_error_ratio: float = 0.5
-    """Error within 2.5 px of a depth edge per pixel that its other side lies away: with a half, 2 sigma
-    reach across. None for a map, which outvotes wrong sides."""
+    """Disparity error within 2.5 px of a depth edge, per pixel of disparity to its other side: at 0.5, 2
+    sigma reach the other side. It isn't used for a map, which outvotes wrong sides.
+    """
     max_sigma_px: float = 1.0
-    """A match less sure than this is none."""
+    """Maximum sigma of a match; less certain ones are dropped, unless fill_occlusions is on."""
     semiglobal: SemiGlobalSettings = field(default_factory=SemiGlobalSettings)
     refinement: RefinementSettings = field(default_factory=RefinementSettings)
 
@@ -100,7 +106,7 @@ class BarsightSettings:
 
 @dataclass(frozen=True, eq=False)
 class _Start:
-    """left_px: (H, W), NaN where nothing is believed. right_px: (H, W), of the right image."""
+    """left_px: (H, W), NaN where unmatched or inconsistent. right_px: (H, W), of the right image."""
 
     left_px: Float32
     right_px: Float32
@@ -110,7 +116,7 @@ class _Start:
 class BarsightStereo:
     """`StereoMethod` of Barsight: direct refinement of a semi-global start.
 
-    binned_row_m: pairs of rows no wider than this are averaged where rows are alike, 0 averages none.
+    binned_row_m: maximum width of two rows that are averaged where rows are alike, 0 averages none.
     """
 
     settings: BarsightSettings
@@ -124,15 +130,15 @@ class BarsightStereo:
         return self._in_rows(pair, candidates, None)
 
     def confirm(self, pair: RectifiedPair, candidates: DisparityRange, predicted: Float32) -> Disparity:
-        """Match a pair whose disparity is predicted, (H, W) px, NaN where not: in one step of refinement,
-        where the pair's own pictures confirm it. In all steps, where that one goes far in many places.
+        """Match a pair whose disparity is predicted, (H, W) px, NaN where not: with a single refinement
+        step where the pair's own pictures confirm it, or with all steps if that one moves many pixels far.
         """
         return self._in_rows(pair, candidates, predicted)
 
     def _in_rows(
         self, pair: RectifiedPair, candidates: DisparityRange, predicted: Float32 | None
     ) -> Disparity:
-        """Match at the pictures' own size, or by pairs of rows."""
+        """Match at the pictures' own size, or with pairs of rows averaged."""
         candidates = _inside(candidates, pair.camera.width)
         if not (self.binned_row_m > 0 and are_rows_alike(pair, candidates, self.binned_row_m)):
             return _Matching(self.settings).match(pair, candidates, predicted)
@@ -143,7 +149,7 @@ class BarsightStereo:
 
 
 def _in_binned_rows(settings: BarsightSettings) -> BarsightSettings:
-    """Convert lengths along the columns to binned rows; a window keeps its area."""
+    """Convert lengths along the columns to binned rows; windows keep their area."""
     refinement = settings.refinement
     return replace(
         settings,
@@ -161,13 +167,15 @@ def _in_binned_rows(settings: BarsightSettings) -> BarsightSettings:
 
 @dataclass(frozen=True)
 class _Matching:
-    """The matching of one pair. halves_rows: half the size has half the rows; not where these are binned."""
+    """The matching of one pair. halves_rows: whether half size halves the rows too; not if they are
+    binned.
+    """
 
     settings: BarsightSettings
     halves_rows: bool = True
 
     def match(self, pair: RectifiedPair, candidates: DisparityRange, predicted: Float32 | None) -> Disparity:
-        """Match a pair, from a predicted disparity where there is one."""
+        """Match a pair, starting from a predicted disparity if there is one."""
         if min(_contrast(pair.left), _contrast(pair.right)) < _MIN_CONTRAST_GRAY:
             nothing = np.full(pair.left.shape, _NAN, dtype=np.float32)
             return Disparity(nothing, nothing.copy())
@@ -212,7 +220,7 @@ class _Matching:
     def _finish(
         self, pair: RectifiedPair, candidates: DisparityRange, start: _Start, refined: RefinedDisparity
     ) -> Disparity:
-        """Judge a refined start: its sigma, occlusions, edges."""
+        """Complete a refined start: compute its sigma, fill occlusions, sharpen edges."""
         settings = self.settings
         disparity, sigma = self._judged(pair, refined, start.left_px)
         if settings.fill_occlusions:
@@ -223,7 +231,7 @@ class _Matching:
         if settings.preset == "best":
             sharp = sharpen_edges(disparity, pair.left, _JUMP_PX)
         beside, other_side = edge_risk(sharp, _JUMP_PX, settings.other_side_error_ratio > 0)
-        # What a pixel was moved by counts as one sigma more.
+        # The distance by which a pixel was moved counts as an additional sigma.
         add_edge_sigma(disparity, sharp, beside, settings.wrong_side_px, pair.left_valid, sigma)
         if other_side is not None:
             sigma = _both(sigma, np.float32(settings.other_side_error_ratio) * other_side)
@@ -232,7 +240,7 @@ class _Matching:
     def _judged(
         self, pair: RectifiedPair, refined: RefinedDisparity, start_px: Float32
     ) -> tuple[Float32, Float32]:
-        """Judge what was refined from a start, NaN where unmatched: the disparity and its sigma."""
+        """Compute the disparity and sigma of a refined start, NaN where unmatched or dropped."""
         settings, found = self.settings, refined.disparity_px
         vertical_px = vertical_error_px(pair.left, pair.right, found, np.isfinite(start_px))
         doubts = Doubts(
@@ -258,7 +266,9 @@ class _Matching:
         return _Start(remove_islands(left_px, settings.island_px, 1.0), found.right_px)
 
     def _start_at_half_size(self, pair: RectifiedPair, candidates: DisparityRange) -> _Start:
-        """Match the start at half size, an eighth of the work: refinement makes up for the coarser steps."""
+        """Match the start at half size, an eighth of the work; refinement compensates for the coarser
+        steps.
+        """
         settings, shape = self.settings, pair.left.shape
         left, right = (halve(image, rows=self.halves_rows) for image in (pair.left, pair.right))
         lowest = candidates.lowest_px // 2
@@ -274,7 +284,7 @@ class _Matching:
 
 
 def _contrast(image: UInt8) -> float:
-    """Compute the standard deviation of the gray values; a black or a blown-out image has none."""
+    """Compute the standard deviation of the gray values; a black or blown-out image has none."""
     return float(image[::2, ::2].std())
 
 
@@ -284,6 +294,8 @@ def _inside(candidates: DisparityRange, width: int) -> DisparityRange:
 
 
 def _both(one: Float32, other: Float32) -> Float32:
-    """Add two sigmas in quadrature. NumPy's hypot, which minds overflow, takes several times as long."""
+    """Add two sigmas in quadrature. NumPy's hypot, which guards against overflow, takes several times as
+    long.
+    """
     together: Float32 = np.sqrt(one * one + other * other)
     return together

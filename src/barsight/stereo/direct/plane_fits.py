@@ -24,12 +24,12 @@ from barsight.stereo.direct.support_regions import (
 _REACH = 2.0
 _LANES = TILE_COLUMNS
 _SAME_PLANE = np.float32(0.5)
-"""Rows share their planes where disparities differ by less than this share of same_surface_px."""
+"""Maximum difference in disparity, as a share of same_surface_px, between rows that share their planes."""
 
 
 class Evidence(NamedTuple):
-    """Each pixel's disparity, its weight and its pull: frames, which are (H, W) with MARGIN and more around,
-    or these flat.
+    """Each pixel's disparity, weight and pull, as frames, which are (H, W) with MARGIN or more around
+    them, or as flattened frames.
     """
 
     disparity: Float32
@@ -38,9 +38,9 @@ class Evidence(NamedTuple):
 
 
 class _Pairs(NamedTuple):
-    """Pairs of points (a, c) and (-a, -c) that a support has beside its middle.
+    """Pairs of points (a, c) and (-a, -c) of a support, besides its central pixel.
 
-    along, across: (K,) px. factors: (K, 6), the share times 1, a, c, a a, a c, c c.
+    along, across: (K,) px. factors: (K, 6), the Gaussian weight times 1, a, c, a a, a c, c c.
     """
 
     along: Int64
@@ -50,7 +50,9 @@ class _Pairs(NamedTuple):
 
 @dataclass(frozen=True)
 class SupportShape:
-    """A Gaussian support: one sigma along and across the axis; it goes along the axis in odd steps (px)."""
+    """A Gaussian support: one sigma along and across the axis; step: odd sampling step along the axis
+    (px).
+    """
 
     along_px: float
     across_px: float
@@ -68,22 +70,23 @@ def fit_planes(
     fitted: Float32,
     information: Float32,
 ) -> None:
-    """Fit a plane through the evidence of each pixel's support: its disparity there, and its information.
+    """Fit a plane through the evidence of each pixel's support; return its disparity there, and its
+    information.
 
-    Pixel i says: disparity[i] + pull[i] / weight[i], with weight[i] (0 = nothing). Its share falls with the
-    distance (Gaussian) and with the difference of disparity (Tukey's biweight that ends at same_surface_px),
-    so that a support doesn't cross a depth edge. Supports along a column have nearly everything in
-    common: of a column's rows one in FITTED_EVERY is fitted, and those between take what the rows above and
-    below say, as far as these are the same surface. Frames in, no NaN, and two more (`room`) for use inside;
-    (H, W) out.
+    Pixel i contributes disparity[i] + pull[i] / weight[i], with weight[i] (0 = nothing). Its share falls with
+    the distance (Gaussian) and with the difference in disparity (Tukey's biweight that ends at
+    same_surface_px), so that a support doesn't cross a depth edge. Supports along a column overlap almost
+    entirely: of a column's rows only one in FITTED_EVERY is fitted, and the rows between are interpolated
+    from those above and below, as far as these are the same surface. Frames in, no NaN, and two more (`room`)
+    as scratch; (H, W) out.
     """
     step, unit = shape.step, np.float32(same_surface_px)
-    # In units of same_surface_px, each point takes one product less.
+    # In units of same_surface_px, each point needs one multiplication less.
     if unit != 1:
         disparity, pull = disparity / unit, pull / unit
     heard = evidence = Evidence(disparity, weight, pull)
     if step > 1:
-        # Summed over a step along the axis first, the support can go in steps and still hear every pixel.
+        # Summing over a step along the axis first lets the support go in steps and still use every pixel.
         near = np.arange(step) - step // 2
 
         def sum_up(first: int, end: int) -> None:
@@ -104,7 +107,7 @@ def fit_planes(
 
 
 def _pairs(shape: SupportShape) -> _Pairs:
-    """List a support's pairs of points, of which each half of the support has one."""
+    """List one point of each of a support's pairs."""
     furthest = min(int(_REACH * shape.along_px), MARGIN - 8) // shape.step
     reach = int(_REACH * shape.across_px + 0.5)
     c, a = np.mgrid[-reach : reach + 1, -furthest : furthest + 1].reshape(2, -1)
@@ -120,9 +123,9 @@ def _sum_pairs(evidence: Evidence, middle: int, offsets: Int64, factors: Float32
     """Sum the nine terms of a plane's normal equations for TILE_COLUMNS pixels from `middle` on: the weights
     times 1, a, c, a a, a c, c c and the pulls times 1, a, c; a along, c across the axis.
 
-    Points come in pairs on both sides of the middle: what a pair has in common is worked out once. evidence:
-    flat. offsets: (K,), from a pixel to one point of each pair. factors: (K, 6), see `_Pairs`. Fills sums
-    (9 TILE_COLUMNS,), term by term.
+    Points come in pairs on opposite sides of the central pixel, so that common terms are computed once.
+    evidence: flat. offsets: (K,), from a pixel to one point of each pair. factors: (K, 6), see `_Pairs`.
+    Fills sums (9 TILE_COLUMNS,), term by term.
     """
     disparity, weight, pull = evidence
     here = np.uint64(middle)
@@ -133,7 +136,7 @@ def _sum_pairs(evidence: Evidence, middle: int, offsets: Int64, factors: Float32
     for i in range(_LANES):
         sums[6 * _LANES + i] = pull[here + np.uint64(i)]
     for j in range(len(offsets)):
-        # Unsigned: no vectors are made of a loop whose index might be negative, which counts from the end.
+        # Unsigned: a loop whose index might be negative, and count from the end, isn't vectorised.
         forth, back = np.uint64(middle + offsets[j]), np.uint64(middle - offsets[j])
         f, fa, fc = factors[j, 0], factors[j, 1], factors[j, 2]
         faa, fac, fcc = factors[j, 3], factors[j, 4], factors[j, 5]
@@ -160,10 +163,10 @@ def _sum_pairs(evidence: Evidence, middle: int, offsets: Int64, factors: Float32
 
 @kernel(borrows=True)
 def _solve_planes(sums: Float32, steps: Float32, information: Float32) -> None:
-    """Solve each plane's height at its pixel and that height's information out of the sums of `_sum_pairs`.
+    """Solve the sums of `_sum_pairs` for each plane's height at its pixel and that height's information.
 
-    A slope of zero is held with a small weight, so that a line of pixels still has a plane. Fills steps
-    (TILE_COLUMNS,) from the pixels' own disparities on, and information (TILE_COLUMNS,).
+    The slopes are regularised to zero with a small weight, so that a line of pixels still has a plane. Fills
+    steps (TILE_COLUMNS,), relative to the pixels' own disparities, and information (TILE_COLUMNS,).
     """
     for i in range(_LANES):
         s, sa, sc = sums[i], sums[_LANES + i], sums[2 * _LANES + i]
@@ -181,7 +184,7 @@ def _solve_planes(sums: Float32, steps: Float32, information: Float32) -> None:
 
 @kernel(borrows=True)
 def _add_near(evidence: Evidence, middle: int, offsets: Int64, sums: Float32) -> None:
-    """Add the weights and the pulls of a few points for TILE_COLUMNS pixels from `middle` on.
+    """Add up the weights and the pulls of a few points for TILE_COLUMNS pixels from `middle` on.
 
     evidence: flat. offsets: (K,), from a pixel to each point. Fills sums (2 TILE_COLUMNS,), the weights'
     before the pulls'.
@@ -214,10 +217,10 @@ def _sum_near(
     evidence: Evidence, axes: Float32, near: Int64, shape: tuple[int, int], sums: tuple[Float32, Float32],
     first_tile: int, end_tile: int,
 ) -> None:  # fmt: skip
-    """Sum weights and pulls from each pixel's own disparity over the points `near` along the axis, in tile
-    rows first_tile...end_tile.
+    """Sum weights, and pulls relative to each pixel's own disparity, over the points `near` along the axis,
+    in tile rows first_tile...end_tile.
 
-    near: (K,) px. shape: of the image, (H, W). Fills the frames of sums, weights' and pulls'.
+    near: (K,) px. shape: of the image, (H, W). Fills the frames of sums, the weights' and the pulls'.
     """
     height, width = shape
     framed_width = evidence.disparity.shape[1]
@@ -247,7 +250,7 @@ def _sum_near(
 
 @kernel(borrows=True)
 def _place_pairs(axis: Float32, pairs: _Pairs, framed_width: int, offsets: Int64) -> None:
-    """Turn the pairs' points to a tile's axis (x, y). Fills offsets (K,) in flat frames."""
+    """Rotate the pairs' points to a tile's axis (x, y). Fills offsets (K,) in flat frames."""
     for j in range(len(offsets)):
         a, c = pairs.along[j], pairs.across[j]
         offsets[j] = round(a * axis[1] + c * axis[0]) * framed_width + round(a * axis[0] - c * axis[1])
@@ -260,7 +263,7 @@ def _fit_lanes(
 ) -> None:  # fmt: skip
     """Fit the planes of up to TILE_COLUMNS pixels from `middle` on.
 
-    sums: (11 TILE_COLUMNS,), for use inside. Fills row and row_information, as many as they have.
+    sums: (11 TILE_COLUMNS,), scratch. Fills row and row_information, which determine the number of pixels.
     """
     steps, certain = sums[9 * _LANES : 10 * _LANES], sums[10 * _LANES :]
     _sum_pairs(flat, middle, offsets, factors, sums)
@@ -276,8 +279,8 @@ def _gather(
     evidence: Evidence, axes: Float32, pairs: _Pairs, only_between: bool, fitted: Float32,
     information: Float32, first_tile: int, end_tile: int,
 ) -> None:  # fmt: skip
-    """Fit each pixel's plane in tile rows first_tile...end_tile, see `fit_planes`: where the axis is a
-    column's one row of FITTED_EVERY, or the rows between these.
+    """Fit each pixel's plane in tile rows first_tile...end_tile, see `fit_planes`: where the axis is along a
+    column, either one row of FITTED_EVERY or, with only_between, the rows in between.
 
     evidence: frames, disparity and pull in units of same_surface_px. axes: (tile rows, tile columns, 2).
     Fills fitted (in the same units) and information, both (H, W).

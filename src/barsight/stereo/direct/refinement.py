@@ -1,17 +1,17 @@
 """Refine disparity directly on both images, to a few hundredths of a pixel.
 
-Each step warps the right image with the current disparity and asks every pixel how far it should move
-(Gauss-Newton [Lucas 1981]), then fits planes to the answers along supports that follow the bars. Gain and
-offset of the images are taken off in a window. The first steps may see the images at half the size. All but
-the last see them softer and use the mean gradient of both [Malis 2004], which carries them further; the last
-one uses the left gradient alone: an interpolated image's noise falls with the fraction of the disparity, and
+Each step warps the right image with the current disparity and computes for every pixel how far it should move
+(Gauss-Newton [Lucas 1981]), then fits planes to the results along supports that follow the bars. Gain and
+offset between the images are removed in a window. The first steps may use half-size images. All but the last
+use blurrier ones and the mean gradient of both [Malis 2004], which converges from further away; the last one
+uses the left gradient alone: the noise of an interpolated image depends on the fraction of the disparity, and
 its own gradient turns that into pixel locking.
 
 Gloss: a highlight is constant along a bar but lies behind its surface, so what is constant along the axis
-bends the match. Residual and gradient are therefore split into their mean along the axis and the detail; the
-mean counts only as far as it agrees with the detail: in the ratio of the residual that noise explains to the
-residual that is there. The mean is taken over places alike in gray: a strap or a shadow across the bars would
-turn the highlights beside it into detail.
+biases the match. Residual and gradient are therefore split into their mean along the axis and the detail. The
+mean is weighted by how well it agrees with the detail: by the ratio of the residual explained by noise to the
+actual residual. The mean is taken over places with similar gray values, since a strap or a shadow across the
+bars would turn the highlights beside it into detail.
 """
 
 from __future__ import annotations
@@ -53,9 +53,11 @@ _SHORT_STEP_PX = 3
 _HALF_STEP_PX = 3
 _HALF_ACROSS = 0.75
 _HALF_HOLD = 4
-"""A pixel at half the size stands for four."""
+"""Weight of the hold at half size relative to full size, where a pixel stands for four."""
 _LONGEST_HALF_STEP_PX = 0.4
-"""In pixels of half the size: a longer step takes places beside depth edges to the other side."""
+"""Maximum step at half size, in half-size pixels; longer ones move pixels beside depth edges to the other
+side.
+"""
 _MIN_HALVED_PX = 128
 _ALIKE_BLUR_PX = 1.5
 _HOLD = 0.1
@@ -67,30 +69,37 @@ class RefinementSettings:
     """Settings of direct refinement on both images."""
 
     steps: int = 3
-    """Gauss-Newton steps."""
+    """Number of Gauss-Newton steps."""
     half_size_steps: int = 0
-    """So many of the steps, the first ones, go at half the size: a quarter of their work, errors a little
-    larger. The last step never does."""
+    """Number of steps, the first ones, that run at half size: a quarter of the work each, with slightly
+    larger errors. The last step never does.
+    """
     along_px: float = 16.0
-    """The long support along the axis, one sigma."""
+    """Length of the long support along the axis, one sigma."""
     across_px: float = 1.5
-    """The long support across the axis, one sigma; a bar's curvature limits it."""
+    """Width of the long support across the axis, one sigma; a bar's curvature limits it."""
     short_px: float = 3.0
-    """The short support along the axis, for surfaces that the long one can't follow; 0 does without."""
+    """Length of the short support along the axis, one sigma, for surfaces that the long one can't follow;
+    0 disables it.
+    """
     short_across_px: float = 2.0
-    """The short support across the axis."""
+    """Width of the short support across the axis, one sigma."""
     gloss_px: float = 10.0
-    """Length along the axis over which what is constant counts as gloss, one sigma; 0 trusts everything."""
+    """Length along the axis over which constant brightness counts as gloss, one sigma; 0 disables the
+    treatment of gloss.
+    """
     alike_gray: float = 20.0
-    """Places along the axis whose gray values differ by this are not one highlight: a strap, a shadow."""
+    """Difference in gray value from which places along the axis aren't the same highlight, but a strap or
+    a shadow.
+    """
     gloss_trust: float = 0.02
-    """Weight of the evidence that is constant along the axis, where noise explains its residual."""
+    """Weight of the evidence that is constant along the axis, if noise explains its residual."""
     outlier_gray: float = 8.0
     """Residual at which a pixel's weight is halved, gray levels."""
     same_surface_px: float = 1.0
-    """Disparities further apart belong to different surfaces."""
+    """Maximum difference between disparities of one surface."""
     window_px: int = 21
-    """Window in which gain and offset are taken off, odd."""
+    """Side of the window in which gain and offset are removed; must be odd."""
 
     def __post_init__(self) -> None:
         if min(self.steps, self.half_size_steps) < 0:
@@ -107,7 +116,9 @@ class RefinementSettings:
 
 @dataclass(frozen=True, eq=False)
 class RefinedDisparity:
-    """disparity_px: (H, W), no NaN. variance_px2: (H, W), what the residual in each support explains."""
+    """disparity_px: (H, W), no NaN. variance_px2: (H, W), the part that the residual in each support
+    explains.
+    """
 
     disparity_px: Float32
     variance_px2: Float32
@@ -119,7 +130,7 @@ def refine_disparity(
 ) -> RefinedDisparity:  # fmt: skip
     """Refine `start` (H, W; no NaN) from the pixels that are `matched`; the others only follow.
 
-    halves_rows: half the size has half the rows too.
+    halves_rows: whether half size halves the rows too.
     """
     halved = max(min(settings.half_size_steps, settings.steps - 1), 0)
     if min(left.shape) < _MIN_HALVED_PX:
@@ -140,8 +151,8 @@ def refine_at_half_size(
     left: UInt8, right: UInt8, start: Float32, matched: Bool, settings: RefinementSettings,
     halves_rows: bool = True, steps: int = 1,
 ) -> Float32:  # fmt: skip
-    """Run steps at half the size with the long support: a fraction of the work, and softer images carry
-    further. halves_rows: that has half the rows too.
+    """Run steps at half size with the long support: they take a fraction of the work, and blurrier images
+    converge from further away. halves_rows: whether half size halves the rows too.
     """
     rows = 2 if halves_rows else 1
     half = replace(
@@ -170,7 +181,7 @@ def refine_at_half_size(
 
 @dataclass(frozen=True, eq=False)
 class _Work:
-    """State shared by the steps. usable, its mean over windows, hold: (H, W). The rest are frames."""
+    """State shared by the steps. usable, its mean over windows, hold: (H, W). The others are frames."""
 
     settings: RefinementSettings
     axes: Float32
@@ -195,7 +206,9 @@ class _Work:
         return cls(settings, tile_axes(left), usable, mean_usable, hold_each, *frames)
 
     def step(self, left: Image, right: Image, blur_px: float, slope_noise: float, is_last: bool) -> Float32:
-        """Run one step of the disparity; its variance. slope_noise: variance of the left image's slope."""
+        """Run one step of the disparity and return its variance. slope_noise: variance of the left image's
+        slope.
+        """
         shape, side = self.usable.shape, self.settings.window_px
         short_of, mean_weight = self.pulls(left, right, blur_px, slope_noise, is_last)
         power = noise_power(self.pull, self.usable, self.mean_usable, mean_weight, _HOLD, side)
@@ -210,9 +223,9 @@ class _Work:
     def pulls(
         self, left: Image, right: Image, blur_px: float, slope_noise: float, is_last: bool
     ) -> tuple[Float32, Float32]:
-        """Compute weights and pulls of this step, weights with the hold.
+        """Compute weights and pulls of this step; the weights include the hold.
 
-        What a step falls short by, and the weights' means over windows, (H, W).
+        Returns the gain by which the step falls short, and the weights' means over windows, (H, W).
         """
         settings, shape = self.settings, self.usable.shape
         left_gray = cv2.GaussianBlur(left.astype(np.float32), (0, 0), blur_px)
@@ -239,8 +252,8 @@ class _Work:
         return short_of, mean_weight
 
     def _complete(self, before: Float32, short_of: Float32) -> None:
-        """Complete a step that fell short, in the mean over a window: a start that gloss has bent is off as a
-        whole, while each pixel's own rest is mostly noise.
+        """Complete a step that fell short, using its mean over a window: a start biased by gloss is off as
+        a whole, while each pixel's own remainder is mostly noise.
         """
         now, side = inside(self.disparity, before.shape), self.settings.window_px
         np.subtract(now, before, out=before)
@@ -254,7 +267,7 @@ class _Work:
             return np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
         means = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
         blurred = cv2.GaussianBlur(gray, (0, 0), _ALIKE_BLUR_PX)
-        alike = self.pull  # whose values of this step come later
+        alike = self.pull  # as scratch: its values of this step are computed later
         np.multiply(blurred, np.float32(1 / settings.alike_gray), out=inside(alike, shape))
         images = self.residual, self.slope, self.trust, alike
         axis_means(*images, self.axes, settings.gloss_px, means)
@@ -270,7 +283,7 @@ class _Work:
 
     def planes(self, support: SupportShape) -> Fit:
         found = np.empty_like(self.usable), np.empty_like(self.usable)
-        # What the weights and pulls were made of isn't needed any more.
+        # The inputs of the weights and pulls are no longer needed.
         room = self.residual, self.trust
         fit_planes(
             self.disparity, self.weight, self.pull, self.axes, support, self.settings.same_surface_px, room,
@@ -286,7 +299,7 @@ def _noise(left: Image, right: Image) -> float:
 
 @lru_cache
 def _slope_gain(blur_px: float) -> float:
-    """Compute the variance of `row_slope` per variance of a white noise in the image."""
+    """Compute the ratio of the variance of `row_slope` to that of white noise in the image."""
     impulse = np.zeros((33, 33), dtype=np.uint8)
     impulse[16, 16] = 100
     return float(np.square(row_slope(impulse, blur_px) / 100).sum())

@@ -1,8 +1,9 @@
-"""Average pairs of rows where the picture is alike along its columns: half the pixels, hardly less is known.
+"""Average pairs of rows where the picture is alike along its columns: this halves the pixels and loses hardly
+any information.
 
-Supports follow the bars over many rows. Where bars run along the columns, two rows say the same but for
-their noise, which their mean has less of; disparities keep all of their columns. Where bars run across, as
-rows of bricks or bars along the baseline do, nothing is averaged.
+Supports follow the bars over many rows. Where bars run along the columns, two rows are the same but for their
+noise, which averaging reduces; disparities keep all of their columns. Where bars run across, as rows of
+bricks or bars along the baseline do, nothing is averaged.
 """
 
 from __future__ import annotations
@@ -21,16 +22,17 @@ from barsight.stereo.direct.support_regions import tile_axes
 
 BINNED_ROWS = 2
 _ASKEW_SINE, _MAX_ASKEW_RATIO = 0.57, 0.2
-"""Tiles whose axis is further from a column's (35 degrees), and the most of them: of the yards' pictures
-up to 0.16 are, of bars along the baseline and of roads from 0.27 on."""
+"""Sine of the angle from the columns (35 degrees) beyond which a tile's axis is askew, and the maximum
+share of askew tiles: yard pictures have up to 0.16, bars along the baseline and roads 0.27 or more.
+"""
 _SAME_SURFACE_PX = np.float32(0.5)
 _BAND_ROWS = 64
 Image = TypeVar("Image", Bool, Float32)
 
 
 def are_rows_alike(pair: RectifiedPair, candidates: DisparityRange, max_row_m: float) -> bool:
-    """Check that the picture is alike along its columns, and pairs of its rows no wider than max_row_m on a
-    surface in the middle of the candidates.
+    """Check that the picture is alike along its columns, and that pairs of its rows are no wider than
+    max_row_m on a surface at the middle of the candidates.
     """
     camera = pair.camera
     middle_px = (candidates.lowest_px + candidates.highest_px) / 2 + camera.doffs_px
@@ -41,8 +43,8 @@ def are_rows_alike(pair: RectifiedPair, candidates: DisparityRange, max_row_m: f
 
 
 def bin_rows(pair: RectifiedPair) -> RectifiedPair:
-    """Average pairs of rows of both pictures; a last odd row stays beside itself. Pixels are then twice as
-    high as wide: of the camera only what concerns columns holds.
+    """Average pairs of rows of both pictures; an odd last row is duplicated. Pixels are then twice as high
+    as wide, so only what concerns columns remains valid in the camera.
     """
     left, right = (halve(image, columns=False) for image in (pair.left, pair.right))
     left_valid, right_valid = (_even(valid) for valid in (pair.left_valid, pair.right_valid))
@@ -54,7 +56,7 @@ def bin_rows(pair: RectifiedPair) -> RectifiedPair:
 
 
 def bin_disparity(disparity: Float32) -> Float32:
-    """Average pairs of rows (H, W) px that are one surface; else the one that is known, or the upper."""
+    """Average pairs of rows (H, W) px where they are one surface; else take the known one, or the upper."""
     even = _even(disparity)
     upper, lower = even[::BINNED_ROWS], even[1::BINNED_ROWS]
     mean = np.float32(0.5) * (upper + lower)
@@ -65,7 +67,7 @@ def bin_disparity(disparity: Float32) -> Float32:
 
 
 def spread_rows(binned: Disparity, height: int) -> Disparity:
-    """Spread binned rows over the picture's (height, W): linear between rows that are one surface."""
+    """Upsample binned rows to the picture's (height, W), linearly between rows that are one surface."""
     shape = height, binned.disparity_px.shape[1]
     found, sigma = np.empty(shape, np.float32), np.empty(shape, np.float32)
 
@@ -80,8 +82,8 @@ def spread_rows(binned: Disparity, height: int) -> Disparity:
 def _spread(
     disparity: Float32, sigma: Float32, found: Float32, found_sigma: Float32, first: int, end: int
 ) -> None:
-    """Spread rows, see `spread_rows`, over first...end. disparity, sigma: (ceil(H / 2), W) px. Fills found
-    and found_sigma (H, W) px.
+    """Upsample rows first...end, see `spread_rows`. disparity, sigma: (ceil(H / 2), W) px. Fills found and
+    found_sigma (H, W) px.
     """
     last = len(disparity) - 1
     near, far = np.float32(0.75), np.float32(0.25)
@@ -96,5 +98,5 @@ def _spread(
 
 
 def _even(image: Image) -> Image:
-    """Repeat the last row of an odd number."""
+    """Repeat the last row of an image with an odd number of rows."""
     return cast(Image, np.concatenate([image, image[-1:]])) if len(image) % BINNED_ROWS else image

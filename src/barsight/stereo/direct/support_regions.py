@@ -1,8 +1,8 @@
 """Build supports that follow a bar: tiles with an axis, and means along it.
 
-The image is cut into tiles; each has one axis, the direction in which the image changes least. A support is
-a fixed pattern of whole-pixel offsets turned to that axis, so the innermost loop runs along a row of the tile
-and the compiler makes vector instructions of it. Arrays read at offsets carry a margin (`allocate_frame`).
+The image is divided into tiles, each with one axis, the direction in which the image changes least. A support
+is a fixed pattern of whole-pixel offsets rotated to that axis, so the innermost loop runs along a row of the
+tile and the compiler can vectorise it. Arrays read at offsets have a margin (`allocate_frame`).
 """
 
 from __future__ import annotations
@@ -20,17 +20,20 @@ TILE_COLUMNS = 32
 MARGIN = 48
 _LINE_FLOATS = 16
 BAND_TILES = 16
-"""Rows of tiles that a thread works through row by row: what lies along a row comes in before it is read."""
+"""Number of tile rows that a thread processes row by row, so that the data along a row are in the cache
+when they are read.
+"""
 _MIN_COHERENCE = 0.35
 FITTED_EVERY = 4
-"""Where a tile's axis is a column's, supports are worked out for one row of so many, a divisor of TILE_ROWS,
-and interpolated between: they have nearly everything in common."""
+"""Interval of rows for which supports are computed where a tile's axis is along the columns; it must
+divide TILE_ROWS. The rows between are interpolated, since their supports overlap almost entirely.
+"""
 _COLUMN_SINE = np.float32(0.17)
 
 
 class AxisImages(NamedTuple):
-    """Two images that are averaged, their weight and what makes places alike: frames, which are (H, W) with
-    MARGIN and more around, or these flat.
+    """Two images that are averaged, their weight, and the image whose differences decide which pixels are
+    alike: frames, which are (H, W) with MARGIN or more around them, or flattened frames.
     """
 
     first: Float32
@@ -43,10 +46,10 @@ def tile_axes(image: Float32, scale_px: float = 8.0) -> Float32:
     """Compute the unit vector (tile rows, tile columns, 2) (x, y) along which the image changes least around
     each tile.
 
-    From the structure tensor [Foerstner 1987] averaged over scale_px. Where no direction stands out it is the
-    column's, across the baseline: there a mean along the axis costs the match least.
+    It follows from the structure tensor [Foerstner 1987] averaged over scale_px. Where no direction is
+    dominant, it is along the columns, across the baseline: there a mean along the axis costs the match least.
     """
-    # Half the size is fine enough for a direction, and a quarter of the work.
+    # Half size is fine enough for a direction, and takes a quarter of the work.
     smooth = cv2.resize(
         cv2.GaussianBlur(image, (0, 0), 1.2), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA
     )
@@ -67,10 +70,10 @@ def tile_axes(image: Float32, scale_px: float = 8.0) -> Float32:
 
 
 def allocate_frame(shape: tuple[int, ...]) -> Float32:
-    """Allocate an image with a margin of zeros that every support offset stays within.
+    """Allocate an image with a margin of zeros that contains every support offset.
 
-    Rows begin with a cache line and take an odd number of them: with most even ones a column's rows compete
-    for a few of the nearest cache's places.
+    Rows begin at a cache line and take an odd number of them: with most even numbers, the rows of a column
+    compete for a few sets of the nearest cache.
     """
     height, width = shape
     lines = -(-(width + 2 * MARGIN + TILE_COLUMNS) // _LINE_FLOATS) | 1
@@ -81,7 +84,7 @@ def allocate_frame(shape: tuple[int, ...]) -> Float32:
 
 
 def inside(frame: Float32, shape: tuple[int, ...]) -> Float32:
-    """View the image in a frame."""
+    """Return a view of the image inside a frame."""
     return frame[MARGIN : MARGIN + shape[0], MARGIN : MARGIN + shape[1]]
 
 
@@ -91,7 +94,7 @@ def axis_means(
 ) -> None:  # fmt: skip
     """Average two images along each tile's axis with Gaussian weights. Frames in, no NaN; (H, W) each out.
 
-    alike: a pixel's share falls with the difference of this image (Tukey's biweight that ends at 1), so that
+    alike: a pixel's weight falls with the difference in this image (Tukey's biweight that ends at 1), so that
     a strap or a shadow across the bars has a mean of its own.
     """
     images = AxisImages(first, second, weight, alike)
@@ -114,24 +117,26 @@ def biweight(gap: np.float32) -> np.float32:
 
 @kernel(inline=True)
 def is_along_column(axis: Float32) -> bool:
-    """Check whether an axis (2,) (x, y) is so near to a column's that its rows can share their fits."""
+    """Check whether an axis (2,) (x, y) is so close to a column's direction that its rows can share their
+    fits.
+    """
     return bool(abs(axis[0]) < _COLUMN_SINE)
 
 
 @kernel(inline=True)
 def fitted_rows(y: int, height: int) -> tuple[int, int]:
-    """Return the rows of one in FITTED_EVERY, and the last one, between which row y lies."""
+    """Return the fitted rows (every FITTED_EVERYth, and the last one) between which row y lies."""
     above = y - y % FITTED_EVERY
     return above, min(above + FITTED_EVERY, height - 1)
 
 
 @kernel(borrows=True)
 def share_rows(frame: Float32, y: int, x0: int, height: int, alike: np.float32, shares: Float32) -> bool:
-    """Share TILE_COLUMNS pixels of row y between the fitted rows above and below, by distance, where both are
-    alike there; else the one that is has all.
+    """Compute the weights with which TILE_COLUMNS pixels of row y are interpolated between the fitted rows
+    above and below: by distance where both are alike there; otherwise the one that is alike counts alone.
 
-    frame: what differs by less than `alike` is alike. Fills shares (TILE_COLUMNS,), of the row below. False
-    where a pixel is like neither.
+    frame: values that differ by less than `alike` are alike. Fills shares (TILE_COLUMNS,), weights of the row
+    below. Returns False if some pixel is like neither.
     """
     above, below = fitted_rows(y, height)
     lanes = slice(MARGIN + x0, MARGIN + x0 + TILE_COLUMNS)
@@ -149,7 +154,7 @@ def share_rows(frame: Float32, y: int, x0: int, height: int, alike: np.float32, 
 
 @kernel(borrows=True)
 def blend_rows(above: Float32, below: Float32, shares: Float32, row: Float32) -> None:
-    """Blend two rows (N,) by the shares of the one below. Fills row (N,)."""
+    """Blend two rows (N,) with the weights `shares` of the one below. Fills row (N,)."""
     for i in range(len(row)):
         row[i] = above[i] + shares[i] * (below[i] - above[i])
 
@@ -158,11 +163,11 @@ def blend_rows(above: Float32, below: Float32, shares: Float32, row: Float32) ->
 def _take_means(images: AxisImages, middle: int, offsets: Int64, shares: Float32, sums: Float32) -> None:
     """Average the first and the second image for TILE_COLUMNS pixels from `middle` on.
 
-    images: flat. offsets: (K,), from a pixel to its support's points on one side; the other side's are mirror
-    images; shares: (K,) their Gaussian weights. Fills sums (3 TILE_COLUMNS,): the weights, both means.
+    images: flat. offsets: (K,), from a pixel to its support's points on one side; those on the other side are
+    mirrored; shares: (K,) their Gaussian weights. Fills sums (3 TILE_COLUMNS,): the weights, both means.
     """
     first, second, weight, alike = images
-    # Unsigned: no vectors are made of a loop whose index might be negative, which counts from the end.
+    # Unsigned: a loop whose index might be negative, and count from the end, isn't vectorised.
     here = np.uint64(middle)
     for i in range(TILE_COLUMNS):
         at = here + np.uint64(i)

@@ -1,1 +1,1 @@
-"""Compiled image operations of the direct method: splines, box sums, pyramids."""
+"""Implement the direct method's compiled image operations: splines, box sums, pyramids."""

@@ -1,9 +1,9 @@
-"""Average over square windows in one pass, with nothing but the result written.
+"""Average over square windows in one pass that writes nothing but the result.
 
-Beyond the image's ends it goes on mirrored at the last pixel, as OpenCV's filters have it. A band's rows roll
-by: each column's sum over a window's rows takes in the row ahead and lets go of the one behind (`roll_*`),
-and `slide_window` adds the columns up. The loops stay this short, with one array written in each, because the
-compiler makes vectors of no others.
+Beyond its ends the image is mirrored at the last pixel, as in OpenCV's filters. A band is processed row by
+row: each column's sum over a window's rows adds the row ahead and subtracts the one behind (`roll_*`), and
+`slide_window` adds up the columns. The loops are this short, with one array written in each, because the
+compiler vectorises no others.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ BAND_ROWS = 128
 
 
 def window_means(images: Float32, weight: Float32, side: int, every: int) -> Float32:
-    """Average weight times each of the images (K, H, W), (K, N, M), over windows of side x side pixels whose
-    middles are every so-manieth row and column, from the first on.
+    """Average weight times each of the images (K, H, W) over windows of side x side pixels, centred on
+    every `every`th row and column from the first on; returns (K, N, M).
     """
     _, height, width = images.shape
     sums = np.empty((len(images), -(-height // every), -(-width // every)), dtype=np.float32)
@@ -40,13 +40,13 @@ def mirror_index(place: int, count: int) -> int:
 
 @kernel()
 def allocate_columns(count: int, width: int, reach: int) -> Float64:
-    """Allocate columns' sums (N, W + 2 reach + 2) for N of the roll_* below, zero at the start."""
+    """Allocate columns' sums (N, W + 2 reach + 2) for N of the roll_* functions below, initially zero."""
     return np.zeros((count, width + 2 * reach + 2))
 
 
 @kernel()
 def roll_sum(column: Float64, reach: int, ahead: Float32, behind: Float32) -> None:
-    """Roll the sum: a row ahead comes in, one behind goes.
+    """Update the columns' sums: add the row ahead, subtract the row behind.
 
     column: (W + 2 reach + 2,), a row of `allocate_columns`, of which column[reach : reach + W] changes.
     ahead, behind: (W,).
@@ -60,7 +60,9 @@ def roll_sum(column: Float64, reach: int, ahead: Float32, behind: Float32) -> No
 def roll_product(
     column: Float64, reach: int, ahead: Float32, ahead_other: Float32, behind: Float32, behind_other: Float32
 ) -> None:
-    """Roll the sum of products: a row of each comes in, one of each goes. All as in `roll_sum`, rows (W,)."""
+    """Update the columns' sums of products: add those of the rows ahead, subtract those behind. See
+    `roll_sum`; rows (W,).
+    """
     inner = column[reach : reach + ahead.shape[0]]
     for x in range(ahead.shape[0]):
         inner[x] += np.float64(ahead[x] * ahead_other[x]) - np.float64(behind[x] * behind_other[x])
@@ -70,7 +72,7 @@ def roll_product(
 def roll_square(
     column: Float64, reach: int, ahead: Float32, ahead_other: Float32, behind: Float32, behind_other: Float32
 ) -> None:
-    """Roll the sum of the first times the square of the other. All as in `roll_sum`, rows (W,)."""
+    """Update the columns' sums of the first row times the square of the other. See `roll_sum`; rows (W,)."""
     inner = column[reach : reach + ahead.shape[0]]
     for x in range(ahead.shape[0]):
         coming = ahead[x] * ahead_other[x] * ahead_other[x]
@@ -79,9 +81,10 @@ def roll_square(
 
 @kernel()
 def _add_columns(column: Float64, threes: Float32, side: int, mean: Float32) -> None:
-    """Average (W,) `side` columns each: three by three first, so that each is read a third as often.
+    """Average (W,) over `side` columns each: sum in threes first, so that each column is read a third as
+    often.
 
-    column: (W + side - 1,) sums at least. threes: as long as column less 2, for use inside.
+    column: at least (W + side - 1,) sums. threes: scratch, 2 shorter than column.
     """
     count, width = side // 3, mean.shape[0]
     one, two, three = column[:-2], column[1:-1], column[2:]
@@ -110,7 +113,7 @@ def _add_columns(column: Float64, threes: Float32, side: int, mean: Float32) -> 
 
 @kernel()
 def slide_window(column: Float64, reach: int, mean: Float32) -> None:
-    """Average (W,) over windows of 2 reach + 1 columns, whose sums are column[reach : reach + W]."""
+    """Average (W,) over windows of 2 reach + 1 columns, with the sums in column[reach : reach + W]."""
     width, side = mean.shape[0], 2 * reach + 1
     for step in range(1, reach + 1):
         column[reach - step] = column[reach + mirror_index(-step, width)]
@@ -124,8 +127,8 @@ def _window_means(
 ) -> None:
     """Average weighted images over square windows, rows first...end of the result.
 
-    images: (K, H, W); weight: (H, W). Windows are 2 reach + 1 px wide, mirrored at the border, their middles
-    `every` px apart. Fills sums (K, ceil(H / every), ceil(W / every)).
+    images: (K, H, W); weight: (H, W). Windows are 2 reach + 1 px wide, with mirrored borders and their
+    centres `every` px apart. Fills sums (K, ceil(H / every), ceil(W / every)).
     """
     count, height, width = images.shape
     scale = np.float32(1.0 / (2 * reach + 1) ** 2)

@@ -1,8 +1,8 @@
-"""Interpolate rows by cubic B-splines: an image at fractional columns, with its exact derivative.
+"""Interpolate rows with cubic B-splines: an image at fractional columns, with its exact derivative.
 
-Linear or Keys-cubic reading damps fine texture by an amount that depends on the fraction, and that pulls a
-match towards whole or half pixels. A B-spline with its prefilter nearly doesn't [Thevenaz 2000]. The
-prefilter falls off fourfold per pixel, so that it can be one convolution together with a blur.
+Linear or Keys-cubic interpolation damps fine texture by an amount that depends on the fraction, which pulls a
+match towards whole or half pixels. A B-spline with its prefilter has almost no such effect [Thevenaz 2000].
+The prefilter decays fourfold per pixel, so it can be combined with a blur in a single convolution.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ _BAND_ROWS = 64
 
 
 def row_coefficients(image: Float32 | UInt8, blur_px: float = 0.0) -> Float32:
-    """Compute spline coefficients (H, W + 3) of each row of a (H, W) image, mirrored at the ends; of the
-    image blurred both ways by blur_px (one sigma) where that isn't 0.
+    """Compute spline coefficients (H, W + 3) of each row of a (H, W) image, mirrored at the ends; if blur_px
+    isn't 0, of the image blurred in both directions by blur_px (one sigma).
 
-    Coefficient k of the image is column k + 1, so that a reader needs no bounds check.
+    Coefficient k of the image is column k + 1, so that reading needs no bounds check.
     """
     inner = cv2.sepFilter2D(image, cv2.CV_32F, *_filters(blur_px))
     coefficients: Float32 = cv2.copyMakeBorder(inner, 0, 0, 1, 2, cv2.BORDER_REFLECT_101)
@@ -35,7 +35,7 @@ def row_coefficients(image: Float32 | UInt8, blur_px: float = 0.0) -> Float32:
 
 
 def row_slope(image: Float32 | UInt8, blur_px: float = 0.0) -> Float32:
-    """Compute the x derivative (H, W) at the pixels of the spline that `row_coefficients` gives."""
+    """Compute the x derivative (H, W), at the pixels, of the spline of `row_coefficients`."""
     along, across = _filters(blur_px)
     slope: Float32 = cv2.sepFilter2D(image, cv2.CV_32F, np.convolve(along, _DIFFERENCE), across)
     return slope
@@ -43,7 +43,7 @@ def row_slope(image: Float32 | UInt8, blur_px: float = 0.0) -> Float32:
 
 @lru_cache
 def _filters(blur_px: float) -> tuple[Float32, Float32]:
-    """Make the filters along the rows, blur and prefilter, and across them, the blur."""
+    """Build the filter along the rows (blur and prefilter) and the one across them (blur)."""
     around = np.abs(np.arange(-_PREFILTER_REACH, _PREFILTER_REACH + 1))
     prefilter = math.sqrt(3.0) * _POLE**around
     if blur_px == 0:
@@ -56,8 +56,8 @@ def _filters(blur_px: float) -> tuple[Float32, Float32]:
 def value_and_slope(coefficients: Float32, disparity: Float32, margin: int = 0) -> tuple[Float32, Float32]:
     """Interpolate the image and its x derivative at column x - disparity of each row, both (H, W) float32.
 
-    Beyond the image's ends the end column is read. `disparity` has no NaN; its pixel (0, 0) lies `margin`
-    rows and columns inside.
+    Beyond the image's ends, the end column is read. `disparity` has no NaN; its pixel (0, 0) is `margin` rows
+    and columns inside.
     """
     shape = len(coefficients), coefficients.shape[1] - 3
     value, slope = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
@@ -76,8 +76,8 @@ def _read(
 ) -> None:  # fmt: skip
     """Evaluate the cubic B-spline and its x derivative at column x - disparity [Thevenaz 2000].
 
-    coefficients: (H, W + 3), see `row_coefficients`. disparity: px, no NaN, its pixel (0, 0) `margin` rows
-    and columns inside. Fills value and slope (per px), (H, W), in rows first_row...end_row.
+    coefficients: (H, W + 3), see `row_coefficients`. disparity: px, no NaN, with its pixel (0, 0) `margin`
+    rows and columns inside. Fills value and slope (per px), (H, W), in rows first_row...end_row.
     """
     width = value.shape[1]
     one, two, three = np.float32(1), np.float32(2), np.float32(3)

@@ -1,4 +1,4 @@
-"""Halve images and upsample what was found there without mixing surfaces."""
+"""Halve images, and upsample half-size results without mixing surfaces."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Image = TypeVar("Image", UInt8, Float32)
 
 
 def halve(image: Image, *, rows: bool = True, columns: bool = True) -> Image:
-    """Average 2 x 2 pixels, or two along one axis; odd images go on with their last row and column."""
+    """Average 2 x 2 pixels, or two along one axis; odd images are extended by their last row and column."""
     down, right = 2 if rows else 1, 2 if columns else 1
     height, width = image.shape
     framed = cv2.copyMakeBorder(image, 0, height % down, 0, width % right, cv2.BORDER_REPLICATE)
@@ -26,8 +26,8 @@ def halve(image: Image, *, rows: bool = True, columns: bool = True) -> Image:
 
 
 def double_disparity(small: Float32, shape: tuple[int, ...]) -> Float32:
-    """Repeat each column, and each row where there are half as many, up to a shape (H, W); disparities then
-    count twice as many pixels.
+    """Repeat each column, and each row if the rows are halved, up to a shape (H, W), and double the
+    disparities.
     """
     doubled = np.empty(shape, dtype=np.float32)
     _double(small, 1 if len(small) == shape[0] else 2, doubled)
@@ -36,7 +36,7 @@ def double_disparity(small: Float32, shape: tuple[int, ...]) -> Float32:
 
 @kernel()
 def _double(small: Float32, rows: int, doubled: Float32) -> None:
-    """Repeat columns, and each row `rows` times, with twice the disparity. Fills doubled (H, W) px."""
+    """Repeat columns, and each row `rows` times, with doubled disparity. Fills doubled (H, W) px."""
     height, width = doubled.shape
     for y in range(0, height, rows):
         own, row = small[y // rows], doubled[y]
@@ -51,9 +51,9 @@ def _double(small: Float32, rows: int, doubled: Float32) -> None:
 
 
 def upsample_update(started: Float32, moved: Float32, disparity: Float32, same_surface_px: float) -> Float32:
-    """Upsample what was found at half size onto `disparity` (H, W): by the bilinear mean of the four nearest
-    places, where those on another surface don't count. started, moved: (H / 2, W / 2), or (H, W / 2) where
-    the rows are all there, in half pixels.
+    """Upsample a half-size update onto `disparity` (H, W), by the bilinear mean of the four nearest pixels
+    without those on another surface. started, moved: (H / 2, W / 2), or (H, W / 2) if the rows aren't
+    halved, in half-size pixels.
     """
     rows = 1 if len(started) == len(disparity) else 2
     result = np.empty_like(disparity)
@@ -73,11 +73,11 @@ def _carry_up(
     started: Float32, moved: Float32, disparity: Float32, inverse_px: np.float32, rows: int, result: Float32,
     first: int, end: int,
 ) -> None:  # fmt: skip
-    """Upsample the update by bilinear weights that fall with the difference of disparity, rows first...end.
+    """Upsample the update with bilinear weights that fall with the difference in disparity, rows first...end.
 
-    started, moved: (ceil(H / rows) + 2, ceil(W / 2) + 2), half size with a border of one, but in full px.
-    disparity: (H, W) px. inverse_px: one over the difference (px) at which a place no longer counts. Fills
-    result (H, W) px.
+    started, moved: (ceil(H / rows) + 2, ceil(W / 2) + 2), half size with a border of one, but in full-size
+    px. disparity: (H, W) px. inverse_px: one over the difference (px) at which a pixel no longer counts.
+    Fills result (H, W) px.
     """
     width = disparity.shape[1]
     zero, one, tiny = np.float32(0), np.float32(1), np.float32(1e-6)

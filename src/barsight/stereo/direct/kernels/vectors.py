@@ -1,8 +1,8 @@
-"""Write vector instructions into compiled kernels, for the loops that the compiler vectorises badly.
+"""Write vector instructions into compiled kernels for loops that the compiler vectorises badly.
 
-A few dozen candidates, or a few columns whose sums should stay in registers: the checks for overlapping
-arrays and the rest beyond whole vectors, which an automatic vectorizer adds, cost more than the work. What is
-built here is the compiler's portable vector code, which it fits to each processor.
+These loops run over a few dozen candidates, or a few columns whose sums should stay in registers: automatic
+vectorisation adds checks for overlapping arrays and a remainder loop, which cost more than the work itself.
+The code built here is LLVM's portable vector code, which it compiles for each processor.
 """
 
 from __future__ import annotations
@@ -20,17 +20,19 @@ FLOAT_LANES = 16
 
 
 def bytes_of(lanes: int) -> Any:
-    """Return the kind of a vector of so many bytes."""
+    """Return the type of a vector of `lanes` bytes."""
     return ir.VectorType(BYTE, lanes)
 
 
 def shorts_of(lanes: int) -> Any:
-    """Return the same of 16 bit numbers."""
+    """Return the type of a vector of `lanes` 16-bit integers."""
     return ir.VectorType(SHORT, lanes)
 
 
 class Vectors:
-    """Writes vector instructions into one kernel: arguments are the kernel's values as Numba hands them."""
+    """Writes vector instructions into one kernel; its arguments are the kernel's values as Numba passes
+    them.
+    """
 
     def __init__(
         self, context: Any, builder: Any, signature: Any, arguments: Any, float_lanes: int = FLOAT_LANES
@@ -44,7 +46,7 @@ class Vectors:
         )
 
     def data(self, place: int) -> Any:
-        """Pointer to the first element of the array that is argument number `place`."""
+        """Return a pointer to the first element of the array that is argument number `place`."""
         array = self._context.make_array(self._kinds[place])
         return array(self._context, self.builder, self._arguments[place]).data
 
@@ -53,8 +55,8 @@ class Vectors:
         return list(cgutils.unpack_tuple(self.builder, self._arguments[place]))
 
     def by_chunks(self, count: Any, body: Callable[[Any, int], None]) -> None:
-        """Write the loop over `count` bytes, a multiple of HALF_LANES: body(offset, lanes) for each vector of
-        LANES and for the half vector that may be left.
+        """Write the loop over `count` bytes, a multiple of HALF_LANES: body(offset, lanes) for each vector
+        of LANES, and for the half vector that may remain.
         """
         chunks = self.builder.udiv(count, count.type(LANES))
         with cgutils.for_range(self.builder, chunks) as loop:
@@ -64,22 +66,22 @@ class Vectors:
             body(whole, HALF_LANES)
 
     def number(self, place: int, at: Any, kind: Any) -> Any:
-        """Return a vector of one element of the array that is argument number `place`."""
+        """Return a vector filled with one element of the array that is argument number `place`."""
         return self.all(self.builder.load(self.builder.gep(self.data(place), [at])), kind)
 
     def load(self, data: Any, at: Any, kind: Any) -> Any:
-        """Return a vector that begins with element `at`."""
+        """Load a vector that begins with element `at`."""
         return self.builder.load(self._pointer(data, at, kind), align=1)
 
     def store(self, vector: Any, data: Any, at: Any) -> None:
-        """Write a vector from element `at` on."""
+        """Store a vector from element `at` on."""
         self.builder.store(vector, self._pointer(data, at, vector.type), align=1)
 
     def _pointer(self, data: Any, at: Any, kind: Any) -> Any:
         return self.builder.bitcast(self.builder.gep(data, [at]), ir.PointerType(kind))
 
     def all(self, value: Any, kind: Any) -> Any:
-        """Return a vector of one value, or of one number."""
+        """Return a vector filled with a value or a number."""
         if isinstance(value, int | float):
             return ir.Constant(kind, [value] * kind.count)
         first = self.builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.IntType(32)(0))
@@ -88,11 +90,11 @@ class Vectors:
         )
 
     def min_each(self, one: Any, other: Any) -> Any:
-        """Return the lesser of both, unsigned."""
+        """Return the elementwise minimum of two unsigned vectors."""
         return self.builder.select(self.builder.icmp_unsigned("<", one, other), one, other)
 
     def apart(self, one: Any, other: Any) -> Any:
-        """Return the absolute difference of whole numbers without sign."""
+        """Return the absolute difference of unsigned integers."""
         forth, back = self.builder.sub(one, other), self.builder.sub(other, one)
         return self.builder.select(self.builder.icmp_unsigned("<", one, other), back, forth)
 
@@ -107,12 +109,12 @@ class Vectors:
         return self.builder.fadd(one, other)
 
     def bound_below(self, vector: Any, floor: float) -> Any:
-        """Return floats, `floor` in place of what is less."""
+        """Return the elementwise maximum of a vector of floats and `floor`."""
         bounds = self.all(floor, self.floats)
         return self.builder.select(self.builder.fcmp_ordered(">", vector, bounds), vector, bounds)
 
     def sum_of(self, vector: Any) -> Any:
-        """Return the sum of a vector's floats, added by halves: the same on every processor."""
+        """Return the sum of a vector's floats, added in halves so that it is the same on every processor."""
         return self._halved(vector, self.sum)
 
     def extreme_of(self, vector: Any, which: str) -> Any:
@@ -124,7 +126,9 @@ class Vectors:
         )
 
     def _halved(self, vector: Any, join: Callable[[Any, Any], Any]) -> Any:
-        """Join the upper half of a power of two of values with the lower, until one is left."""
+        """Combine the upper half of a vector with the lower until one value remains; its length is a power
+        of two.
+        """
         while (half := vector.type.count // 2) > 0:
             lower, upper = (
                 self.builder.shuffle_vector(
@@ -138,7 +142,7 @@ class Vectors:
         return self.builder.extract_element(vector, ir.IntType(32)(0))
 
     def min_of(self, vector: Any) -> Any:
-        """Return the least byte of a vector."""
+        """Return the smallest byte of a vector."""
         kind = ir.FunctionType(BYTE, [vector.type])
         name = f"llvm.vector.reduce.umin.v{vector.type.count}i8"
         return self.builder.call(cgutils.get_or_insert_function(self.builder.module, kind, name), [vector])

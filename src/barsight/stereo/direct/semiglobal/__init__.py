@@ -1,1 +1,1 @@
-"""Semi-global matching in bytes: the direct method's start."""
+"""Match semi-globally in 8-bit integers: the direct method's start."""

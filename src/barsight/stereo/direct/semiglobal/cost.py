@@ -15,17 +15,17 @@ Int16 = NDArray[np.int16]
 
 UNKNOWN_COST = 60
 BESIDE_COST = 61
-"""Of the places that fill up the last vector: dearer than any candidate, so that no path goes there."""
+"""Cost of the padding that fills the last vector: higher than any candidate's, so that no path goes there."""
 LANES = 16
-"""Candidates are filled up to multiples of this, so that no vector is left half empty."""
+"""Multiple to which candidates are padded, so that no vector is left half empty."""
 _MAX_APART = 20
 _CODE_BYTES = 3
 _BAND_ROWS = 64
 
 
 class PixelDescriptors(NamedTuple):
-    """Descriptors of each pixel. codes: (H, 3, W) the census' 24 bits. slope: (H, W) difference of the
-    neighbours in the row. gray: (H, W).
+    """Descriptors of each pixel. codes: (H, 3, W) the 24 bits of the census. slope: (H, W) difference
+    between the neighbours in the row. gray: (H, W).
     """
 
     codes: UInt8
@@ -34,7 +34,7 @@ class PixelDescriptors(NamedTuple):
 
 
 def describe_pixels(image: UInt8) -> PixelDescriptors:
-    """Compute descriptors; see `PixelDescriptors`."""
+    """Compute the descriptors of an image (H, W)."""
     height, width = image.shape
     codes = np.empty((height, _CODE_BYTES, width), dtype=np.uint8)
     framed = cv2.copyMakeBorder(image, 2, 2, 2, 2, cv2.BORDER_REPLICATE)
@@ -44,8 +44,9 @@ def describe_pixels(image: UInt8) -> PixelDescriptors:
 
 
 def reverse_rows(right: PixelDescriptors, lowest: int, places: int) -> PixelDescriptors:
-    """Reverse the rows of the right image, so that a left pixel's candidates lie in memory's order: column W
-    - 1 - x + k holds candidate k of left column x. Filled up so that each of the `places` can be read.
+    """Reverse the rows of the right image, so that a left pixel's candidates are contiguous in memory:
+    column W - 1 - x + k holds candidate k of left column x. Padded so that each of the `places` can be
+    read.
     """
     before, after = max(0, -lowest), max(0, lowest + places)
 
@@ -60,7 +61,7 @@ def reverse_rows(right: PixelDescriptors, lowest: int, places: int) -> PixelDesc
 
 @kernel()
 def _write_census(framed: UInt8, codes: UInt8, first: int, end: int) -> None:
-    """Set a bit where a neighbour is brighter than the centre. framed: (H + 4, W + 4)."""
+    """Set a bit for each neighbour that is brighter than the centre. framed: (H + 4, W + 4)."""
     width = codes.shape[2]
     one = np.uint8(1)
     for y in range(first, end):
@@ -78,7 +79,7 @@ def _write_census(framed: UInt8, codes: UInt8, first: int, end: int) -> None:
 
 @kernel(inline=True)
 def _bits_in_halves(byte: np.uint8) -> np.uint8:
-    """Count the bits set in each half of a byte: in pairs, then in fours."""
+    """Count the bits set in each half of a byte, first in pairs, then in fours."""
     pairs = np.uint8(byte - np.uint8(np.uint8(byte >> np.uint8(1)) & np.uint8(0x55)))
     return np.uint8(
         np.uint8(pairs & np.uint8(0x33)) + np.uint8(np.uint8(pairs >> np.uint8(2)) & np.uint8(0x33))
@@ -87,8 +88,8 @@ def _bits_in_halves(byte: np.uint8) -> np.uint8:
 
 @kernel()
 def descriptor_cost(left: PixelDescriptors, right: PixelDescriptors, y: int, x: int, column: int) -> int:
-    """Compute the cost of matching left pixel (y, x) with the right one in `column`: Hamming distance of the
-    census and half the truncated differences of slope and gray value.
+    """Compute the cost of matching left pixel (y, x) with the right one in `column`: the Hamming distance
+    of the census plus half the truncated differences of slope and gray value.
     """
     # Signed: a difference of unsigned numbers would wrap.
     hamming = np.int64(0)
@@ -111,7 +112,7 @@ def _write_costs(
     """
     one, two, three, slope, gray = own
     ones, twos, threes, slopes, grays = row
-    # Unsigned: no vectors are made of a loop whose index might be negative, which counts from the end.
+    # Unsigned: a loop whose index might be negative, and count from the end, isn't vectorised.
     first, most = np.uint64(at), np.int16(_MAX_APART)
     for part in range(0, cost.shape[0], LANES):
         for lane in range(LANES):
@@ -140,7 +141,9 @@ def _write_costs(
 def row_costs(
     left: PixelDescriptors, right: PixelDescriptors, y: int, lowest: int, count: int, cost: UInt8
 ) -> None:
-    """Compute costs (W, places) of row y, of which `count` are candidates. right: see `reverse_rows`."""
+    """Compute costs (W, places) of row y, of which the first `count` are candidates. right: see
+    `reverse_rows`.
+    """
     width = cost.shape[0]
     code, slope, gray = left.codes[y], left.slope[y], left.gray[y]
     row = right.codes[y, 0], right.codes[y, 1], right.codes[y, 2], right.slope[y], right.gray[y]

@@ -1,9 +1,9 @@
-"""Match semi-globally [Hirschmueller 2008] on a cost that neither gain nor single bright pixels upset.
+"""Match semi-globally [Hirschmueller 2008] with a cost that is robust to gain and to single bright pixels.
 
 Cost of a candidate: Hamming distance of the 5x5 census [Zabih 1994], plus truncated differences of the x
-gradient and of the gray value. Eight paths; the penalty of a jump falls where the image has an edge. The
-image is worked through in stripes of rows, each with its own cost volume, so memory doesn't grow with the
-height.
+gradient and of the gray value. There are eight paths; the penalty of a jump is reduced where the image has an
+edge. The image is processed in stripes of rows, each with its own cost volume, so memory doesn't grow with
+the height.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ class SemiGlobalSettings:
     """Settings of semi-global matching."""
 
     p1: int = 22
-    """Penalty of a change by one candidate between neighbours."""
+    """Penalty for a change of one candidate between neighbours."""
     p2: int = 150
-    """Penalty of a larger change where the image is flat; an edge of 8 gray levels halves it."""
+    """Penalty for a larger change where the image is flat; an edge of 8 gray levels halves it."""
     min_p2: int = 28
-    """Penalty of a larger change across a strong image edge."""
+    """Minimum penalty for a larger change, reached across a strong image edge."""
 
     def __post_init__(self) -> None:
         if not 0 < self.p1 <= self.min_p2 <= self.p2:
@@ -53,9 +53,9 @@ class SemiGlobalSettings:
 
 @dataclass(frozen=True, eq=False)
 class SemiGlobalMatch:
-    """Disparities of both images, (H, W) float32: left_px to a fraction, right_px in whole pixels.
+    """Disparities of both images, (H, W) float32: left_px with subpixels, right_px in whole pixels.
 
-    right_px is -1e6 where no candidate falls into the left image.
+    right_px is -1e6 where no candidate lies in the left image.
     """
 
     left_px: Float32
@@ -65,7 +65,7 @@ class SemiGlobalMatch:
 def match_semiglobal(
     left: UInt8, right: UInt8, lowest_px: int, count: int, settings: SemiGlobalSettings
 ) -> SemiGlobalMatch:
-    """Match every pixel among `count` candidates from lowest_px on by semi-global matching.
+    """Match every pixel among `count` candidates from lowest_px on with semi-global matching.
 
     Memory: at most about 130 MB per thread, or 40 rows' cost volume if that is more.
     """
@@ -73,7 +73,7 @@ def match_semiglobal(
     left_px, right_px = np.empty((2, height, width), dtype=np.float32)
     threads, places = numba.get_num_threads(), -(-count // LANES) * LANES
     affordable = max(_STRIPE_BYTES // (3 * width * places) - 2 * _OVERLAP_ROWS, 16)
-    # Paths end where a stripe ends, so its rows may not depend on this machine's threads: two share the work.
+    # Paths end where a stripe ends, so stripes must not depend on the machine's threads: they suit two.
     stripes = 2 * -(-height // (2 * min(affordable, 256)))
     rows = -(-height // stripes)
     volume = (min(height, rows + 2 * _OVERLAP_ROWS), width, places)
@@ -94,14 +94,14 @@ def match_semiglobal(
 def _compete(
     down: UInt16, up: UInt16, at: int, count: int, minima: Int32, right: int
 ) -> np.int32:  # fmt: skip
-    """Find the least key of one left pixel; its keys are written to `minima` where they are less, that of
-    candidate k at `right` + k.
+    """Find the smallest key of one left pixel; its keys replace larger ones in `minima`, the key of candidate
+    k at `right` + k.
 
-    A key is a candidate's sum and below it, in 16 bits, the candidate: the least number is the winner. down,
+    A key holds a candidate's sum and, in the lower 16 bits, the candidate: the smallest number wins. down,
     up: flat, the pixel's sums of four paths each from `at` on. minima: (W,) with a margin on both sides.
     """
     winner = np.int32(_WORST)
-    # Unsigned: no vectors are made of a loop whose index might be negative, which counts from the end.
+    # Unsigned: a loop whose index might be negative, and count from the end, isn't vectorised.
     first, there = np.uint64(at), np.uint64(right)
     for i in range(count):
         k = np.uint64(i)
@@ -117,10 +117,10 @@ def _compete(
 def _choose(
     down: UInt16, up: UInt16, count: int, lowest: int, minima: Int32, left_px: Float32, right_px: Float32
 ) -> None:
-    """Choose winners of one row for both images; the left one to a fraction with the equiangular line fit,
-    which suits a cost that rises linearly [Shimizu 2002]. The right ones are kept reversed meanwhile, so that
-    a left pixel's candidates meet them in memory's order. down, up: (W, places) sums of four paths each.
-    minima: for use inside, with a margin on both sides that takes what falls beside the right image.
+    """Choose the winners of one row for both images; the left ones get subpixels from the equiangular line
+    fit, which suits a cost that rises linearly [Shimizu 2002]. The right ones are stored reversed in between,
+    so that a left pixel's candidates are contiguous in memory. down, up: (W, places) sums of four paths each.
+    minima: scratch, with a margin on both sides for candidates outside the right image.
 
     Fills left_px and right_px (W,).
     """
@@ -152,11 +152,11 @@ def _match_stripe(
     left: PixelDescriptors, right: PixelDescriptors, lowest: int, count: int, penalties: Penalties,
     room: tuple[UInt8, UInt16], px: tuple[Float32, Float32], start: int, end: int,
 ) -> None:  # fmt: skip
-    """Match rows start...end: once down, where the costs are made, and once up, where the winners are chosen
-    row by row.
+    """Match rows start...end: once downwards, where the costs are computed, and once upwards, where the
+    winners are chosen row by row.
 
-    right: reversed, see `reverse_rows`. room: volumes (rows, W, places) for use inside. Fills px, the
-    disparities (H, W) of the left and the right image.
+    right: reversed, see `reverse_rows`. room: volumes (rows, W, places) as scratch. Fills px, the disparities
+    (H, W) of the left and the right image.
     """
     cost, down = room
     left_px, right_px = px

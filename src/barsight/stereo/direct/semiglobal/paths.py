@@ -1,7 +1,7 @@
 """Aggregate along the paths of semi-global matching [Hirschmueller 2008], four at once, in bytes.
 
-A path's values stay below its least value plus the dearest jump, and each step takes the least off, so a byte
-holds them. Candidates are filled up to whole vectors with places that no path takes.
+A path's values stay below its minimum plus the largest penalty, and each step subtracts the minimum, so they
+fit into a byte. Candidates are padded to whole vectors with places that no path takes.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ UInt16 = NDArray[np.uint16]
 
 
 class Penalties(NamedTuple):
-    """small: P1, of a change by one candidate. jumps: (256,) P2, see `p2_table`."""
+    """small: P1, for a change of one candidate. jumps: (256,) P2, see `p2_table`."""
 
     small: int
     jumps: UInt8
@@ -36,14 +36,15 @@ def _extend_paths(
     _: Any, cost: Any, at: Any, paths: Any, before: Any, after: Any, minima: Any, ceiling: Any, small: Any,
     sums: Any, places: Any,
 ) -> Any:  # fmt: skip
-    """Step one pixel further along four paths [Hirschmueller 2008, Eq. 13]; returns the least value of each.
+    """Advance four paths by one pixel [Hirschmueller 2008, Eq. 13]; returns the minimum of each.
 
     cost: the pixel's `places` costs from `at` on; the sum of the four is written to `sums` there. before,
-    after: where each path's values at the pixels before and here begin in `paths`, with one place before the
-    first. minima, ceiling: each path's least value before, the same with the dearest jump. All arrays flat.
+    after: where each path's values at the previous and the current pixel begin in `paths`, with one place
+    before the first. minima, ceiling: each path's previous minimum, and the same plus the largest penalty.
+    All arrays flat.
 
-    In vector instructions: plain Numba takes four times as long here, a fifth more for all of stereo. The
-    four paths of a pixel are a few vectors of bytes, and checks for overlap cost more than the steps.
+    It uses vector instructions: plain Numba takes four times as long here, a fifth more for all of stereo.
+    The four paths of a pixel are a few vectors of bytes, and checks for overlap cost more than the steps.
     """
     four = types.Tuple((types.uint8,) * _PATHS)
     signature = four(cost, at, paths, before, after, minima, ceiling, small, sums, places)
@@ -85,7 +86,7 @@ def _extend_paths(
 
 @kernel()
 def p2_table(large: int, min_p2: int) -> UInt8:
-    """Tabulate the penalty P2 (256,) by the gray levels that the image changes there."""
+    """Tabulate the penalty P2 (256,) by the difference in gray levels between the neighbours."""
     jumps = np.empty(256, dtype=np.uint8)
     for contrast in range(256):
         jumps[contrast] = max(large * _EDGE_GRAY // (_EDGE_GRAY + contrast), min_p2)
@@ -95,8 +96,8 @@ def p2_table(large: int, min_p2: int) -> UInt8:
 @kernel()
 def allocate_paths(width: int, places: int, small: int) -> UInt8:
     """Allocate the values (N,) of `extend_row`: three paths in two rows, one path in two pixels, and zeros
-    for where a path begins; each with a place to either side that no path takes. N: (6 width + 3) * (places +
-    2).
+    for the start of a path; each with a place on either side that no path takes. N: (6 width + 3) *
+    (places + 2).
     """
     side = places + 2
     paths = np.full((6 * width + 3) * side, 255 - small, dtype=np.uint8)
@@ -109,9 +110,9 @@ def extend_row(
     cost: UInt8, gray: UInt8, gray_before: UInt8, penalties: Penalties, is_first: bool, is_odd: bool,
     backwards: bool, paths: UInt8, leasts: UInt8, sums: UInt16,
 ) -> None:  # fmt: skip
-    """Extend four paths through one row: along it and from the three neighbours in the row before.
+    """Extend four paths through one row: along it and from the three neighbours in the previous row.
 
-    cost: (W, places). gray, gray_before: (W,) of this row and the one before. paths (`allocate_paths`),
+    cost: (W, places). gray, gray_before: (W,) of this row and the previous one. paths (`allocate_paths`),
     leasts (2, W, 3): kept from row to row. Fills sums (W, places).
     """
     small, jumps = penalties
