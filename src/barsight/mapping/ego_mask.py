@@ -54,7 +54,7 @@ def mask_carried(
     at_x, at_y = scale * there_x + camera.cx_px, scale * there_y + camera.cy_px
     way = np.hypot(at_x - u[None], at_y - v[:, None])
     place_x, place_y = (((at + 0.5) / _SHRINK - 0.5).astype(np.float32) for at in (at_x, at_y))
-    # Near the border the wide mean is another picture's.
+    # Near the border, the local mean covers different content in the two pictures.
     known = np.full(here.shape, np.nan, np.float32)
     known[_SMOOTH // 2 : -(_SMOOTH // 2), _SMOOTH // 2 : -(_SMOOTH // 2)] = 0.0
     moved = cv2.remap(there + known, place_x, place_y, cv2.INTER_LINEAR, borderValue=float("nan"))

@@ -24,8 +24,8 @@ class MapSettings:
     every frame.
     """
     top_ratio: float = 0.35
-    """Minimum number of views of a height, as a share of those of its cell's best-seen height, for it to
-    count as a possible occluder; the highest such height of a cell is taken.
+    """Minimum number of views, as a share of those of the cell's best-seen height, that a height needs to
+    count as a possible occluder; the highest such height may hide what is behind it.
     """
     own_ratio: float = 0.7
     """Minimum share of votes that makes a height part of the surface, among the views with a free line of

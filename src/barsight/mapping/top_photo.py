@@ -124,7 +124,7 @@ def _tops(cells: CellObservations, column: int, row: int, cell_m: float) -> tupl
     heights = np.full(tuple(COARSE_CELLS * n for n in shape), lowest, np.float32)
     seen = np.zeros(heights.shape, np.uint8)
     _note_highest(cells.x, cells.y, cells.z_m, column, row, heights, seen)
-    # A single wrong match raises nothing.
+    # The median keeps a single wrong match from raising the tops.
     smooth = cv2.medianBlur(heights, 3).reshape(shape[0], COARSE_CELLS, shape[1], COARSE_CELLS)
     span = round(SPAN_M / (COARSE_CELLS * cell_m)) | 1
     tops = cv2.morphologyEx(smooth.max(axis=1).max(axis=2), cv2.MORPH_CLOSE, np.ones((span, span), np.uint8))

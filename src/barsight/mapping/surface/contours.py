@@ -80,7 +80,7 @@ def smooth_contour(contour: Contour) -> Contour:
     sigma is at least half the step that they bridge; nothing is added beyond the ends. The filter is Savitzky
     and Golay's (5 samples, second order), since the paper doesn't name one.
     """
-    # Loaded where it is needed: its import takes most of a second.
+    # Imported only when needed: it takes most of a second.
     from scipy.signal import savgol_filter
 
     known = np.flatnonzero(np.isfinite(contour.z_m))

@@ -314,7 +314,7 @@ def _elected(
                 z = float(heights[i, j, s])
                 if np.isnan(z) or (best >= 0 and z <= heights[i, j, best]):
                     continue
-                # Where views expect less than min_views points a cell, an empty neighbour says nothing.
+                # Where fewer than min_views votes are expected, an empty neighbour means nothing.
                 needed = along_ratio if expected[i, j, s] < min_views else own_ratio
                 if share[i, j, s] >= needed or _share_along(heights, share, i, j, z, cell_m) >= along_ratio:
                     best = s

@@ -41,8 +41,8 @@ class NonlocalSettings:
     cost: GradientCostSettings = field(
         default_factory=lambda: GradientCostSettings(gray_weight=0.2, gray_limit=7.0, gradient_limit=4.0)
     )
-    """Matching cost with the author's values: 0.11 and 0.89, where the gradient is half the difference
-    between the next and the previous pixel.
+    """Matching cost equivalent to the author's weights of 0.11 and 0.89, where the gradient is half the
+    difference between the next and the previous pixel.
     """
     sigma: float = 0.1
     """Gray difference along the tree over which support falls to 1/e, as a share of 255 gray levels; the

@@ -20,8 +20,7 @@ _MIN_RELIABLE = 0.01
 class OutputSettings:
     """Settings of a method's output and its sigma.
 
-    Each method has its own sigmas, measured on Middlebury's motorcycle as the value below which 68 % of the
-    errors lie.
+    Each method has its own sigmas, measured on Middlebury's motorcycle as the 68 % quantile of the errors.
     """
 
     fill: bool = True

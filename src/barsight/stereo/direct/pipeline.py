@@ -68,7 +68,7 @@ class BarsightSettings:
     fill_occlusions: bool = True
     """Guess what only one image sees (sigma of 1 px or more, which no map accepts) instead of leaving NaN."""
     consistency_px: float = 1.0
-    """Maximum difference between left and right disparities."""
+    """Maximum difference between the left and the right disparity of a match."""
     island_px: int = 40
     """Minimum size of a connected patch, in pixels; smaller ones are dropped."""
     model_sigma_px: float = 0.005
