@@ -1,4 +1,4 @@
-"""Group bundles by kind: neighbours mostly hold the same bars, so some settle what others leave open."""
+"""Group bundles by kind: neighbours mostly hold the same bars, so clear readings settle ambiguous ones."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from barsight.yard.lift_settings import UPPER
 from barsight.yard.types import Bundle, Doubt, DoubtKind
 
 _ALIKE_LOG = 0.08
-"""Standard deviation of the logarithm of diameters read for one kind of bar."""
+"""Standard deviation of the logarithm of the diameters that are read for bars of one kind."""
 _SHARPNESS = 12.0
 _BONUS = 0.5
 _PRIOR_RATIO = 0.015
-"""How much bars of one kind differ, as a share of the diameter."""
+"""Spread of the diameters of one kind of bar, as a fraction; a floor for the common diameter's sigma."""
 _MIN_MEMBERS = 3
 _SAME_WIDTH = 0.2
 _UNLISTED_SIGMAS = 3.0
-"""A diameter so far from all that are listed is none of them."""
+"""Distance, in sigmas, beyond which a measured diameter matches none in the catalogue."""
 _ROLLED_RATIO = 0.01
-"""Of a listed diameter: how far bars are off it, as rolled (EN 10060)."""
+"""Minimum sigma of a catalogue diameter, as a fraction of it: the tolerance of rolled bars (EN 10060)."""
 _AS_WELL, _AS_WELL_SINGLE, _AS_WELL_THIN = 0.95, 0.85, 0.6
 
 
 def reinforce_kinds(fits: list[Fit], weights: Float64, chosen: Int64, overlaps: Float64) -> Float64:
-    """Raise weights by up to a half the more places hold bundles of the same rings and diameter.
+    """Raise each weight by up to a half, in proportion to how many places hold the same rings and diameter.
 
-    overlaps: (chosen, N) share of the chosen reading's place that each reading wants. A place speaks for
-    every kind that explains it nearly as well as the best does.
+    overlaps: (chosen, N), share of each chosen reading's place that every reading claims. A place supports
+    every kind that explains it nearly as well as the best one does.
     """
     if chosen.size == 0:
         return weights
@@ -50,10 +50,11 @@ def reinforce_kinds(fits: list[Fit], weights: Float64, chosen: Int64, overlaps: 
 def other_packings(
     fits: list[Fit], weights: Float64, chosen: Int64, overlaps: Float64, resolved_m: float
 ) -> list[int | None]:
-    """Find for each chosen reading the rings of another packing that explains the places of its kind as well.
+    """Find for each chosen reading the rings of another packing that explains all places of its kind as well.
 
-    weights: as explained, without company. As well: not 5 % less over all those places together; a single
-    bar must lead by 15 %, and bars thinner than resolved_m by 40 %, since a smoothed map flatters them.
+    weights: those before `reinforce_kinds`. "As well" means at most 5 % less over all these places together.
+    A single bar must lead by 15 %, and bars thinner than resolved_m by 40 %, since a smoothed map favours
+    them.
     """
     rings = np.array([fit.rings for fit in fits])
     width = np.array([fit.width_m for fit in fits])
@@ -80,8 +81,8 @@ def _alike(fit: Fit, other: Fit) -> bool:
 
 
 def common_diameter(fit: Fit, others: list[Fit]) -> tuple[float, float] | None:
-    """Compute the median diameter of the bundles of the fit's kind and its sigma; None for fewer
-    than three.
+    """Compute the median diameter of the bundles of the fit's kind, and its sigma; None for fewer than
+    three bundles.
     """
     alike = [other.values[DIAMETER] for other in others if _alike(fit, other)]
     if len(alike) < _MIN_MEMBERS:
@@ -92,9 +93,11 @@ def common_diameter(fit: Fit, others: list[Fit]) -> tuple[float, float] | None:
 
 
 def listed_diameter(bundle: Bundle, catalogue_mm: tuple[float, ...]) -> Bundle:
-    """Replace a diameter d that isn't counted by the mean of the listed ones c, weighed by
-    exp(-(c - d)^2 / 2 sigma^2). Its lower bound is the thinnest one whose weight is that of a one-sided 95 %
-    bound or more, of the largest, however many thick ones are listed. A bundle of none is doubtful.
+    """Replace the diameter d of a bundle whose bars aren't counted by a mean of the catalogue's diameters c.
+
+    The weights are exp(-(c - d)^2 / 2 sigma^2). The lower bound is the thinnest c whose weight, relative to
+    the largest one, reaches that of a one-sided 95 % bound, however many thick ones the catalogue lists.
+    A bundle that matches no listed diameter is doubtful.
     """
     diameter, sigma = bundle.bar_diameter_m, bundle.sigma.bar_diameter_m
     if not catalogue_mm or bundle.bars is not None or not sigma > 0:

@@ -1,4 +1,4 @@
-"""Describe fitted outlines as bundles: ends, layers, what lies on what, how sure all of it is."""
+"""Describe fitted outlines as bundles: ends, layers, which lies on which, and how certain all of it is."""
 
 from __future__ import annotations
 
@@ -41,18 +41,22 @@ from barsight.yard.sections import MapStretch, part_about
 from barsight.yard.types import Bundle, BundleSigma, DoubtKind, FitSigma, YardMap
 
 _SLOPE_RATIO = 0.6
-"""Of the slope's sigma that errors alike over `correlated_along_m` would give: what is alike over so long a
-way moves the bundle aside and turns it little."""
+"""Factor on the slope's sigma, which follows from errors correlated over `correlated_along_m`: errors that
+are correlated over longer distances shift the bundle sideways and hardly turn it.
+"""
 _BOW_RATIO, _TURN_RATIO = 0.15, 0.5
-"""Of the angle between the two halves of bars that bow, and between their mean and the whole: error of the
-heading that is fitted to both."""
+"""Error of the fitted heading of bowed bars, as fractions: of the angle between the headings of the two
+halves, and of the angle between the mean of both and the heading of the whole.
+"""
 
 
 def describe_bundles(
     bundles: list[Bundle], floor_m: float | None, parts: list[MapStretch]
 ) -> tuple[Bundle, ...]:
-    """Number the bundles by rising x of their centres and relate each to its neighbours. What may be a
-    wall is doubtful, and what reaches under the floor, as it isn't as high as told.
+    """Number the bundles by rising x of their centres and relate each one to its neighbours.
+
+    A bundle that may be a wall is doubtful, and so is one that reaches below the floor, since it can't be as
+    high as it was measured.
     """
     ordered = sorted(bundles, key=lambda b: tuple(b.centre_m))
     ordered = [replace(bundle, id=k) for k, bundle in enumerate(ordered)]
@@ -77,8 +81,8 @@ def describe_bundles(
 def make_bundle(
     reading: Reading, others: list[FittedOutline], settings: BundleSettings, floor_m: float | None
 ) -> Bundle:
-    """Make a bundle of the chosen reading, without its number, layer and what lies on it. others: all that
-    were chosen.
+    """Make a bundle of a chosen reading, without its number, its layer and what lies on it. others: all
+    outlines that were chosen.
     """
     grid, fit = reading.found.grid, reading.found.fit
     ends = [find_end(grid, fit, step, settings) for step in (-1, 1)]
@@ -136,7 +140,7 @@ def make_bundle(
 
 
 def map_sigma(yard: YardMap, bundle: Bundle) -> float:
-    """Return the median of the map's own sigma of heights over a bundle; NaN where nothing was seen."""
+    """Return the median of the map's height sigma over a bundle; NaN where nothing was seen."""
     low = np.minimum(*bundle.ends_m[:, :2]) - bundle.width_m / 2
     high = np.maximum(*bundle.ends_m[:, :2]) + bundle.width_m / 2
     part = part_about(yard, np.array([low[0], high[0]]), np.array([low[1], high[1]]))
@@ -158,7 +162,7 @@ def _in_map(grid: AlignedMap, fit: Fit, v_m: float) -> Float64:
 
 
 def _sigma(one: FittedOutline, ends: list[End], top: float, settings: BundleSettings) -> BundleSigma:
-    """Propagate the fit's covariance to each figure, with the parts that the whole map shares."""
+    """Propagate the fit's covariance to each quantity, and add the errors that the whole map shares."""
     fit = one.fit
     along = (ends[0].v_m + ends[1].v_m) / 2 - fit.v_m
     covariance = fit.covariance
@@ -184,13 +188,13 @@ def _sigma(one: FittedOutline, ends: list[End], top: float, settings: BundleSett
 
 
 def _fit_sigma(own: BundleSigma, ends: list[End]) -> FitSigma:
-    """Take the fit's own sigmas, and along the axis that of bars that end alike."""
+    """Return the fit's own sigmas, the one along the axis being that of bars with flush ends."""
     along, _ = middle_and_length_sigma((ends[0].flush_sigma_m, ends[1].flush_sigma_m))
     return FitSigma(own.lateral_m, along, own.yaw_rad, own.width_m, own.top_z_m)
 
 
 def _top_changes(fit: Fit, top: float) -> tuple[float, float]:
-    """Differentiate the highest line over the axis by roll and by diameter."""
+    """Differentiate the height of the outline's top over the axis by roll and by diameter."""
     step = 0.01
     diameter, roll = float(fit.values[DIAMETER]), float(fit.values[ROLL])
     if fit.rings == 0:

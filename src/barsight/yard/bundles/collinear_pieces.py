@@ -1,4 +1,4 @@
-"""Join pieces of one bundle that were read as two, one behind the other."""
+"""Join two collinear pieces that were read as separate bundles but belong to one."""
 
 from __future__ import annotations
 
@@ -10,18 +10,19 @@ from barsight.yard.bundles.fitting.ends import middle_and_length_sigma
 from barsight.yard.types import ENDS, Bundle, Doubt, DoubtKind
 
 _SKEW, _ASIDE_RATIO, _LEVEL_M = 0.05, 0.3, 0.04
-"""Most that two pieces of one bundle differ by: sine of the skew, way between their axes over the narrower
-one's width, height of their tops."""
+"""Maximum differences between two pieces of one bundle: sine of the skew, lateral distance between the axes
+in widths of the narrower one, and height between the tops (m).
+"""
 _GAP_M = 0.6
-"""Longest gap between them, and most that they overlap."""
+"""Maximum gap between two pieces, and maximum length by which they overlap (m)."""
 _ALIKE_LOG = 0.7
-"""Logarithm of the factor between the widths of two readings of one bundle."""
+"""Maximum logarithm of the ratio between the widths of two pieces of one bundle."""
 
 
 def join_pieces(bundles: list[Bundle]) -> list[Bundle]:
-    """Join pieces that run on in each other where the ends that face each other are open.
+    """Join pieces that continue each other where the ends that face each other are open.
 
-    The longer one says what they are; how far the other reads otherwise widens its sigma.
+    The longer piece supplies the values; its sigma is widened by how much the other one differs.
     """
     left = sorted(bundles, key=lambda bundle: -bundle.length_m)
     out: list[Bundle] = []
@@ -37,7 +38,7 @@ def join_pieces(bundles: list[Bundle]) -> list[Bundle]:
 
 
 def _joined(whole: Bundle, piece: Bundle) -> Bundle | None:
-    """Join a piece to a bundle that is longer; None where they are not surely one."""
+    """Join a piece to a longer bundle; None where it isn't certain that they are one."""
     along = np.array([-np.sin(whole.yaw_rad), np.cos(whole.yaw_rad)])
     if abs(np.sin(piece.yaw_rad - whole.yaw_rad)) > _SKEW:
         return None
@@ -75,7 +76,7 @@ def _joined(whole: Bundle, piece: Bundle) -> Bundle | None:
         along_m=middle,
         length_m=length,
     )
-    # Straps on one of them hold both.
+    # Straps on either piece hold both.
     kept, others = (
         tuple(
             doubt for doubt in one.reasons if doubt.kind is not DoubtKind.NO_STRAPS or doubt in other.reasons
@@ -95,7 +96,7 @@ def _joined(whole: Bundle, piece: Bundle) -> Bundle | None:
 
 
 def _at_end(doubt: Doubt, end: int) -> Doubt:
-    """Tell of an end of the whole what is told of a piece's; other doubts stay as they are."""
+    """Transfer a doubt about an end of a piece to an end of the whole; leave other doubts as they are."""
     if doubt.end is None:
         return doubt
     return replace(doubt, sentence=doubt.sentence.replace(ENDS[doubt.end], ENDS[end]), end=end)

@@ -1,4 +1,4 @@
-"""Find long objects across the bundles and their headings: bundles there have a heading of their own."""
+"""Find long objects that lie across the bundles, and their headings, so that bundles are sought there too."""
 
 from __future__ import annotations
 
@@ -17,14 +17,16 @@ from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.types import HeightMap
 
 OVER_M = 0.05
-"""What lies this much over a bundle's outline lies on it: more than the map's errors."""
+"""Height over a bundle's outline from which something counts as lying on it: more than the map's errors."""
 _FURTHER_M = 1.5
-"""So far beyond where a bundle was followed to it may go on under what lies there."""
+"""Distance (m) over which a bundle may continue, under what lies there, beyond the rows
+that were followed.
+"""
 _STEP_M = 0.06
-"""Heights of neighbouring cells that differ more belong to different things."""
+"""Minimum height step (m) between neighbouring cells that belong to different objects."""
 _MIN_CELLS = 30
 _FLANK = (0.3, 0.45)
-"""Of the width to either side: where a bundle falls off as round bars do."""
+"""Range of distances from the axis, in widths, in which a bundle falls off as round bars do."""
 _FOLLOWS_M = 0.03
 _FOLLOWED_RATIO = 0.4
 _READ_RATIO = 0.5
@@ -40,9 +42,10 @@ def crossing_pieces(
     headings: tuple[float, ...],
     settings: BundleSettings,
 ) -> Iterator[tuple[float, HeightMap]]:
-    """Cut out each long thing over the kept outlines: its heading (rad) and the map around it.
+    """Cut out each long object over the kept outlines: its heading (rad) and the map around it.
 
-    Left out is what runs as most bundles do, which is found with these, and what a kept outline follows.
+    Objects along the most common heading are left out, since they are found with the other bundles, and so
+    are those that a kept outline follows.
     """
     over, followed = (np.zeros(height_map.z_m.shape, np.uint8) for _ in range(2))
     for grid, fit in kept:
@@ -64,8 +67,8 @@ def crossing_pieces(
 def _cells_over(
     grid: AlignedMap, fit: Fit, settings: BundleSettings, height_map: HeightMap
 ) -> tuple[tuple[Int64, Int64], tuple[Int64, Int64]]:
-    """Select rows and columns of the map's cells over the outline or where it may go on, and of
-    those on it.
+    """Select rows and columns of the map's cells that lie over the outline, or over where the bundle may
+    continue, and of the cells that lie on it.
     """
     further = round(_FURTHER_M / grid.cell_m)
     rows = np.arange(max(fit.first - further, 0), min(fit.last + further + 1, grid.z_m.shape[0]))
@@ -84,7 +87,7 @@ def _cells_over(
 
 
 def rise_over(grid: AlignedMap, fit: Fit, rows: Int64, u: Float64, settings: BundleSettings) -> Float64:
-    """Sample heights (R, N) over the outline at rows (R,) and places across u (R, N); NaN where unknown."""
+    """Sample heights (R, N) over the outline at rows (R,) and lateral places u (R, N); NaN where unknown."""
     outline = make_outline(
         fit.rings, float(fit.values[DIAMETER]), float(fit.values[ROLL]), settings.smoothing_m
     )
@@ -100,9 +103,11 @@ def rise_over(grid: AlignedMap, fit: Fit, rows: Int64, u: Float64, settings: Bun
 
 
 def is_beam(grid: AlignedMap, fit: Fit, settings: BundleSettings) -> bool:
-    """Check whether the mean section is level to where it ends, not round: a flank leaves the outline, the
-    middle is nearer to level than to the outline, or only bars thinner than any would make it so level. Where
-    both flanks fall off as the outline does, the middle may be level: two bars side by side are.
+    """Check whether the mean section is a beam's: level up to its edges instead of round.
+
+    It is a beam's where the bars would be thinner than any that are allowed, where a flank departs from the
+    outline, or where the middle is closer to level than to the outline. Where both flanks fall off as the
+    outline does, the middle may be level, since two bars side by side look like that.
     """
     if fit.rings > 0 and fit.values[DIAMETER] < settings.min_bar_diameter_m:
         return True
@@ -132,7 +137,7 @@ def is_beam(grid: AlignedMap, fit: Fit, settings: BundleSettings) -> bool:
 
 
 def _level(height_map: HeightMap) -> UInt8:
-    """Mark 1 where measured heights have no step beside them: surfaces that steps bound."""
+    """Mark by 1 the measured cells without a height step beside them: surfaces that are bounded by steps."""
     measured = HeightSource.measured(height_map.source)
     z = height_map.z_m
     around = np.ones((3, 3), np.uint8)
@@ -143,10 +148,10 @@ def _level(height_map: HeightMap) -> UInt8:
 
 
 def _pieces(level: UInt8, over: UInt8) -> Iterator[tuple[Int64, Int64]]:
-    """Group rows and columns of the surfaces of which a part lies over an outline; then of what lies over, as
-    one.
+    """Yield rows and columns of each surface that lies partly over an outline, then of each connected piece
+    of the cells over the outlines.
 
-    Noise may join a thing's surface to those beneath it. Over the outlines alone it stands by itself.
+    Noise may join an object's surface to those beneath it. Among the cells over the outlines it is separate.
     """
     closed = cv2.morphologyEx(over, cv2.MORPH_CLOSE, np.ones((_GAP_CELLS, _GAP_CELLS), np.uint8))
     closed = cv2.morphologyEx(closed, cv2.MORPH_OPEN, np.ones((_THIN_CELLS, _THIN_CELLS), np.uint8))
@@ -161,8 +166,8 @@ def _pieces(level: UInt8, over: UInt8) -> Iterator[tuple[Int64, Int64]]:
 
 
 def _heading(row: Int64, column: Int64, min_cells: float) -> float | None:
-    """Compute the long axis's angle from +y, in (-pi/2, pi/2]; None for what is short or about as wide as
-    long.
+    """Compute the angle of the long axis from +y, in (-pi/2, pi/2]; None for an object that is short, or not
+    much longer than wide.
     """
     if row.size < min_cells:
         return None
@@ -176,7 +181,7 @@ def _heading(row: Int64, column: Int64, min_cells: float) -> float | None:
 
 
 def _is_level(z: Float32, row: Int64, column: Int64, heading: float) -> bool:
-    """Check whether the middle of the section is level, as a beam's: reading it would be in vain."""
+    """Check whether the middle of the section is level like a beam's, so that reading it would be in vain."""
     across = np.rint(np.cos(heading) * column + np.sin(heading) * row).astype(np.int64)
     low, high = np.quantile(across, [0.15, 0.85])
     heights = [float(np.median(z[across == u])) for u in range(int(np.ceil(low)), int(high) + 1)]

@@ -1,4 +1,4 @@
-"""Find bundles in the height map: candidates in cross-sections, grown along the bars, the best set kept."""
+"""Find bundles in the height map: propose candidates in cross-sections, grow them, keep the best set."""
 
 from __future__ import annotations
 
@@ -50,34 +50,38 @@ from barsight.yard.thin_lines import with_thin_lines
 from barsight.yard.types import Bundle, HeightMap, YardMap
 
 _EDGE_CELLS = 3.0
-"""What a bundle costs per row: its edges explain nothing."""
+"""Cost of a bundle in cells per row: the cells at its edges explain nothing."""
 _CLAIM_M = 0.02
 _RIVAL_RATIO = 0.8
 _FLAT_RATIO, _FLAT_WEIGHT = 0.4, 0.5
-"""Largest depth under the floor, in widths, of a circle over the flat top of an irregular pack; weight of
-such an outline beside one that stands on the floor."""
+"""Maximum depth below the floor, in widths, of a circle that is fitted to the flat top of an irregular pack;
+factor on the weight of such an outline, which competes with those that stand on the floor.
+"""
 _LOWER_M = 0.005
-"""Largest error, downwards, of a single bar's measured top."""
+"""Maximum distance (m) by which the top of a single bar is measured too low."""
 _RESOLVED_CELLS = 4.0
 _SLIVER_RATIO = 0.03
 _CROSSING_STEP_M = 0.4
-"""What lies across may be short: cross-sections this far apart meet it."""
+"""Spacing (m) of the cross-sections in which crossing bundles are sought: close enough to meet short ones."""
 _ALONG_COS = 0.87
-"""Cosine of the angle, 30 degrees, within which bars lie along the baseline: single ones aren't matched."""
+"""Cosine of 30 degrees, the angle within which bars run along the baseline: single bars
+aren't matched there.
+"""
 _SEAM_M = 0.1
-"""Two stretches of a yard put a bundle's middle no further apart than this."""
+"""Maximum distance (m) between the middles that two stretches of a yard measure for one bundle."""
 
 
 def find_bundles(
     yard: YardMap, settings: BundleSettings, baseline: Float64 | None = None
 ) -> tuple[Bundle, ...]:
-    """Find all bundles that the map shows, in the map's frame, from low to high x; empty where there are
-    none. baseline: (2,) level unit vector along which the cameras stand, None where it isn't known.
+    """Find all bundles in the map, in the map's frame, ordered by rising x; empty where there are none.
 
-    A bundle is an outline of round bars in hexagonal packing (or one bar) that the measured heights follow.
-    Outlines are guessed in cross-sections, grown along the bars by least squares, and of those that want the
-    same place the set is kept that explains most heights. A long yard is searched stretch by stretch; where
-    two stretches read a place differently the first one holds.
+    baseline: (2,) horizontal unit vector from camera to camera, None where it isn't known.
+
+    A bundle is an outline of round bars in hexagonal packing (or of one bar) that the measured heights
+    follow. Outlines are proposed in cross-sections and grown along the bars by least squares. Among those
+    that compete for a place, the set is kept that explains the most heights. A long yard is searched in
+    stretches; where two stretches read a place differently, the first one takes precedence.
     """
     if yard.cell_m > settings.max_cell_m:
         return ()
@@ -97,7 +101,7 @@ def _search(
     height_map: HeightMap, floor: float | None, templates: Templates, settings: BundleSettings,
     baseline: Float64 | None,
 ) -> list[Bundle]:  # fmt: skip
-    """Search a map that is short enough to be held."""
+    """Find the bundles of a map that is short enough to be kept in memory."""
     if not HeightSource.measured(height_map.source).any():
         return []
     found: list[FittedOutline] = []
@@ -125,7 +129,7 @@ def _search(
 
 
 def _runs_along(grid: AlignedMap, baseline: Float64 | None) -> bool:
-    """Check whether a heading runs about along the baseline."""
+    """Check whether bars of a grid's heading run roughly along the baseline."""
     if baseline is None:
         return False
     axis = np.array([-np.sin(grid.heading_rad), np.cos(grid.heading_rad)])
@@ -135,7 +139,7 @@ def _runs_along(grid: AlignedMap, baseline: Float64 | None) -> bool:
 def _found(
     height_map: HeightMap, heading: float, floor: float | None, templates: Templates, settings: BundleSettings
 ) -> list[FittedOutline]:
-    """Find every outline that runs about as `heading` does."""
+    """Find all outlines that run roughly along `heading`."""
     grid = align_map(height_map, heading, -np.inf if floor is None else floor + settings.min_rise_m)
     return [
         FittedOutline(grid, fit) for fit in _readings(grid, templates, settings) if _on(floor, fit, settings)
@@ -143,7 +147,7 @@ def _found(
 
 
 def _weights(found: list[FittedOutline], floor_m: float | None) -> Float64:
-    """Compute the number of cells that each explains, half for those that reach under the floor."""
+    """Compute the number of cells that each outline explains, halved for those that reach below the floor."""
     return np.array([
         _weight(fit) * (_FLAT_WEIGHT if is_sunken(floor_m, _bottom_m(fit), fit.width_m) else 1.0)
         for fit in (one.fit for one in found)
@@ -154,10 +158,11 @@ def _settled(
     found: list[FittedOutline], weights: Float64, claims: list[Int64], height_map: HeightMap,
     settings: BundleSettings,
 ) -> list[Reading]:  # fmt: skip
-    """Select the best set of readings, once by itself and once more with regard to the kinds of bundles in
-    it.
+    """Select the best set of readings twice: first by themselves, then with regard to the kinds of bundles
+    in the first set.
 
-    Which bars an outline holds is settled by the pictures where they show it, else by its neighbours.
+    The packing of each outline is settled by the photo where that shows the bars, otherwise by its
+    neighbours.
     """
     fits = [one.fit for one in found]
     first = choose_readings(weights, claims)
@@ -194,7 +199,7 @@ def _settled(
 
 
 def _finished(one: FittedOutline, kept: list[Fit], settings: BundleSettings) -> FittedOutline:
-    """Fit again with the diameter that the bundles of its kind have in common."""
+    """Refit an outline with the diameter that the bundles of its kind have in common."""
     fit = one.fit
     common = common_diameter(fit, kept)
     if common is not None and not settings.catalogue_mm:
@@ -203,8 +208,10 @@ def _finished(one: FittedOutline, kept: list[Fit], settings: BundleSettings) -> 
 
 
 def _on(floor_m: float | None, fit: Fit, settings: BundleSettings) -> bool:
-    """Check that a packing lies over the floor, but for what its circle is wider than a flat pack is high; a
-    single bar's top rises from it by the least diameter of one, however wide the map shows it.
+    """Check that an outline lies over the floor.
+
+    A packing may reach below it by as much as its circle is higher than a flat pack. A single bar must rise
+    from it by the minimum diameter of one, however wide it looks in the map.
     """
     if floor_m is None:
         return True
@@ -220,7 +227,7 @@ def _bottom_m(fit: Fit) -> float:
 
 
 def _readings(grid: AlignedMap, templates: Templates, settings: BundleSettings) -> list[Fit]:
-    """Grow every outline that reaches at least the least length."""
+    """Grow every proposed outline and keep those of at least the minimum length."""
     fits: list[Fit] = []
     rows = grid.z_m.shape[0]
     step = max(round(settings.slice_step_m / grid.cell_m), 1)
@@ -232,7 +239,7 @@ def _readings(grid: AlignedMap, templates: Templates, settings: BundleSettings) 
         _worth_growing(propose_candidates(grid, templates, grid.v0_m + row * grid.cell_m, settings))
         for row in sections
     )
-    # The next sections are matched while one's outlines grow.
+    # The next sections are matched while the outlines of this one grow.
     for row, candidates in zip(sections, prefetch(proposed, 2), strict=True):
         v = grid.v0_m + row * grid.cell_m
         taken = _taken(fits, row, v)
@@ -260,8 +267,8 @@ def _seed(candidate: BundleCandidate, row: int, rows: int, grid: AlignedMap, set
 
 
 def _worth_growing(guesses: list[BundleCandidate]) -> list[BundleCandidate]:
-    """Select the best set of candidates that don't overlap, and other packings that do nearly as
-    well there.
+    """Select the best set of candidates that don't overlap, and other packings that explain the same places
+    nearly as well.
     """
     if not guesses:
         return []
@@ -279,7 +286,7 @@ def _worth_growing(guesses: list[BundleCandidate]) -> list[BundleCandidate]:
 
 
 def _best_intervals(low: Float64, high: Float64, weight: Float64) -> list[int]:
-    """Schedule weighted intervals: the disjoint intervals that together weigh most."""
+    """Solve weighted interval scheduling: find the disjoint intervals with the largest total weight."""
     order = np.argsort(high, kind="stable")
     before = np.searchsorted(high[order], low[order], side="right")
     total = np.zeros(order.size + 1)
@@ -297,8 +304,8 @@ def _best_intervals(low: Float64, high: Float64, weight: Float64) -> list[int]:
 
 
 def _taken(fits: list[Fit], row: int, v_m: float) -> dict[int, list[tuple[float, float, float]]]:
-    """Group by rings: where the outlines that cross a row have their axes there, and how near one is the
-    same.
+    """Group by rings the outlines that cross a row: their axes there (u, z), and the distance within which a
+    candidate is the same, all in m.
     """
     taken: dict[int, list[tuple[float, float, float]]] = {}
     for fit in fits:
@@ -313,13 +320,13 @@ def _is_taken(candidate: BundleCandidate, taken: dict[int, list[tuple[float, flo
 
 
 def _weight(fit: Fit) -> float:
-    """Count cells explained beyond the price of the bundle's edges."""
+    """Count the cells that an outline explains, less the cost of its edges."""
     agreeing = fit.state[fit.first : fit.last + 1] == AGREES
     return float((fit.gain[fit.first : fit.last + 1] - _EDGE_CELLS)[agreeing].sum())
 
 
 def _claims(reading: FittedOutline, settings: BundleSettings) -> Int64:
-    """Number the map's patches of 20 mm that lie well inside the outline and near it in height."""
+    """Number the map's patches of 20 mm that lie well inside the outline and close to it in height."""
     grid, fit = reading.grid, reading.fit
     rows = np.arange(fit.first, fit.last + 1)
     rows = rows[fit.state[rows] == AGREES]

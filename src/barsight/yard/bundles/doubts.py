@@ -1,4 +1,4 @@
-"""Say what speaks against a bundle as it was read, whether its bars can be counted, and how sure it is."""
+"""State the doubts about a bundle's reading, whether its bars can be counted, and how certain it is."""
 
 from __future__ import annotations
 
@@ -23,29 +23,33 @@ from barsight.yard.bundles.section.seen_section import (
 from barsight.yard.types import ENDS, Doubt, DoubtKind
 
 _NARROW_M = 0.3
-"""Longest place along a bundle over which a thing that lies across it counts as narrow."""
+"""Maximum length (m) along a bundle over which an object that lies across it counts as narrow."""
 _LIES_M, _ONE_PLACE_M = 0.02, 0.3
-"""Least rise over a bundle of a thing that lies across it; largest gap between runs of rows that are one
-thing. Dunnage comes in twos and more."""
+"""Minimum rise over a bundle of an object that lies across it; maximum gap between runs of rows that belong
+to one object. Dunnage comes in twos or more. Both in m.
+"""
 _LAID_M, _LAID_SIZE_M = 0.02, (0.04, 0.03)
-"""Least rise of a thing that lies over a part of a bundle's width, and its size along and across."""
+"""Minimum rise of an object that lies over a part of a bundle's width, and its size along and across (m)."""
 _GULLY_RATIO = 0.3
-"""Of a bundle's width: where the surface at its rim lies so far under its axis or further, it is no bundle's.
-The rim of an upright triangle of bars lies 0.22 under it, turned by 25 degrees 0.24."""
+"""Minimum depth, in widths, of the surface at a bundle's rim under its axis from which it isn't the bundle's.
+The rim of an upright triangle of bars lies 0.22 under its axis, that of one turned by 25 degrees 0.24.
+"""
 _MAX_DUNNAGE_M = 0.15
-"""Largest height of the dunnage under a bundle."""
+"""Maximum height (m) of the dunnage under a bundle."""
 _CARRIER_M, _CARRIED_RATIO = 0.15, 0.03
-"""Largest distance of a carrier from both flanks; least share of a bundle's length over which it shows."""
+"""Maximum distance (m) of a carrier from both flanks; minimum share of a bundle's length over
+which it shows.
+"""
 _BEFORE_END_M = 0.05
-"""Rows nearer to an end tell nothing of that: bars end unevenly."""
+"""Margin (m) at each end within which rows aren't used: bars end unevenly."""
 _SURE_KNOWN = 0.7
-"""Share of a bundle's length that must have been measured."""
+"""Minimum share of a bundle's length that must have been measured; below it, the bundle gets a doubt."""
 
 
 def count_bars(
     reading: Reading, seen: SeenSection | None, top_m: float, floor_m: float | None
 ) -> tuple[int | None, tuple[Doubt, ...]]:
-    """Count bars by the outline; None and a doubt where it is not surely a full hexagon, where another
+    """Count the bars by the outline. None and a doubt where it may not be a full hexagon, where another
     packing explains its kind as well, or where one bar may as well be many thin ones.
     """
     fit, other = reading.found.fit, reading.other_packing
@@ -67,7 +71,7 @@ def count_bars(
 def list_doubts(
     reading: Reading, rows: UInt8, ends: list[End], settings: BundleSettings
 ) -> tuple[Doubt, ...]:
-    """List what speaks against the bundle as described."""
+    """List the doubts about the bundle as described."""
     out = []
     known = (rows != 0).mean()
     if known < _SURE_KNOWN:
@@ -105,7 +109,7 @@ def list_doubts(
 
 
 def _places(runs: list[tuple[int, int]], reading: Reading, settings: BundleSettings) -> int:
-    """Count the places at which runs of rows lie over an outline; none where all are so low that noise is."""
+    """Count the places at which runs of rows lie over an outline; 0 where all are as low as noise."""
     grid, fit = reading.found.grid, reading.found.fit
     across = np.linspace(-0.35, 0.35, 15) * fit.width_m
     places, highest, last = 0, 0.0, -np.inf
@@ -122,7 +126,9 @@ def _places(runs: list[tuple[int, int]], reading: Reading, settings: BundleSetti
 def list_wall_doubts(
     reading: Reading, seen: SeenSection | None, top_m: float, floor_m: float | None
 ) -> tuple[Doubt, ...]:
-    """List the doubt about what may be a wall: no flank falls off, or nothing carries it so high."""
+    """List the doubt that the bundle may be a wall: no flank falls off, or nothing carries it
+    at its height.
+    """
     if reading.is_flat:
         return (Doubt(DoubtKind.WALL, "neither flank falls off: it may be a wall"),)
     if seen is None or floor_m is None:
@@ -136,7 +142,9 @@ def list_wall_doubts(
 
 
 def _shows_carrier(reading: Reading, width_m: float) -> bool:
-    """Check whether something stands over the floor on both sides: what lies across under it does."""
+    """Check whether something stands over the floor on both sides, as what lies across under
+    a bundle does.
+    """
     grid, fit = reading.found.grid, reading.found.fit
     edge = max(fit.width_m, width_m) / 2 + grid.cell_m
     half = round((edge + _CARRIER_M) / grid.cell_m)
@@ -147,7 +155,7 @@ def _shows_carrier(reading: Reading, width_m: float) -> bool:
 
 
 def list_cover_doubts(reading: Reading, reasons: tuple[Doubt, ...]) -> tuple[Doubt, ...]:
-    """List what may hold the bundle down though no other bundle is known to lie on it."""
+    """List the objects that may hold the bundle down although no other bundle is known to lie on it."""
     out = [doubt for doubt in reasons if doubt.kind is DoubtKind.CROSSED]
     laid, is_clear = measure_laid(reading)
     if is_clear:
@@ -162,13 +170,14 @@ def list_cover_doubts(reading: Reading, reasons: tuple[Doubt, ...]) -> tuple[Dou
 
 
 def measure_laid(reading: Reading) -> tuple[float, bool]:
-    """Measure how high the highest thing rises that lies over a part of a bundle's width, as a beam's end
-    does, 0 where nothing does; and whether one rises so, anywhere, over the section a cell to the side too.
+    """Measure the rise (m) of the highest object that lies over a part of a bundle's width, as a beam's end
+    does, 0 where there is none. Also return whether any object rises by _LAID_M over the section even if
+    the section is shifted sideways by a cell.
 
-    Heights are taken over the bundle's own section, the median along it at each place across. A thing is a
-    patch that everywhere holds a square of _LAID_SIZE_M and rises by _LAID_M. What stands no higher than the
-    axis where a gully shows at the rim lies beside the bundle, as dunnage does. A steep flank that is a cell
-    off rises as much; what lies on a bundle rests on its crest, and rises over that too.
+    Rises are measured over the bundle's own section: the median along it at each place across. An object is a
+    patch that everywhere holds a rectangle of _LAID_SIZE_M and rises by _LAID_M. An object no higher than the
+    axis, where a gully shows at the rim, lies beside the bundle, as dunnage does. A steep flank that is off
+    by a cell rises as much; an object on a bundle rests on its crest and rises over the shifted section too.
     """
     grid, fit, pack = reading.found.grid, reading.found.fit, reading.pack
     low, high, axis_z_m = -fit.width_m / 2, fit.width_m / 2, float(fit.values[Z])
@@ -195,8 +204,8 @@ def measure_laid(reading: Reading) -> tuple[float, bool]:
 
 
 def rate_confidence(reading: Reading, rows: UInt8) -> float:
-    """Estimate the probability from how much of the length agrees and how far the next other reading is
-    behind.
+    """Estimate the probability of a reading by how much of its length agrees and how far it leads over its
+    rival.
     """
     fit, rival = reading.found.fit, reading.rival
     lead = 1.0
@@ -207,11 +216,11 @@ def rate_confidence(reading: Reading, rows: UInt8) -> float:
 
 
 def rate_agreement(rows: UInt8) -> float:
-    """Rate by how much of what was seen of its length agrees with an outline: 1 from four fifths on."""
+    """Rate the share of the measured length that agrees with an outline: 1 from four fifths on."""
     return min(1.0, float((rows == AGREES).sum() / max((rows != 0).sum(), 1)) / 0.8)
 
 
 def _runs(flags: Bool) -> list[tuple[int, int]]:
-    """Find first and one-past-last index of each run of True."""
+    """Find the first and one-past-last index of each run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

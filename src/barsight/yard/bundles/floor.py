@@ -15,13 +15,15 @@ _LEVEL_M = 0.03
 _KNOWN_RATIO = 0.6
 _PATCH_BLOCKS = 64
 _SUNKEN_M, _SUNKEN_RATIO = 0.04, 0.2
-"""Largest depth of an outline under the floor by a map's errors: the lesser of both, the second in widths."""
+"""Maximum depth of an outline below the floor due to the map's errors: the smaller of the first (m) and the
+second (in widths).
+"""
 
 
 def find_floor(yard: YardMap) -> float | None:
     """Find the height (m) of the lowest level ground in the map; None where no block of 0.3 m is level.
 
-    No bundle has a level top of 0.3 m, so level blocks are floor (or a platform: the lowest counts).
+    No bundle has a level top of 0.3 m, so a level block is floor, or a platform: the lowest blocks count.
     """
     block = max(round(_BLOCK_M / yard.cell_m), 2)
     found = [_levels(yard.part(*patch), block) for patch in patches(yard, _PATCH_BLOCKS * block)]
@@ -32,7 +34,7 @@ def find_floor(yard: YardMap) -> float | None:
 
 
 def _levels(height_map: HeightMap, block: int) -> Float32:
-    """Compute the heights of those blocks that are level."""
+    """Compute the median heights of the blocks that are level."""
     rows, columns = (n // block for n in height_map.shape)
     part = np.s_[: rows * block, : columns * block]
     z = np.where(HeightSource.measured(height_map.source[part]), height_map.z_m[part], np.nan)
@@ -47,5 +49,5 @@ def _levels(height_map: HeightMap, block: int) -> Float32:
 
 
 def is_sunken(floor_m: float | None, bottom_m: float, width_m: float) -> bool:
-    """Check whether an outline reaches further under the floor than a map's errors may have it."""
+    """Check whether an outline reaches further below the floor than the map's errors explain."""
     return floor_m is not None and floor_m - bottom_m >= min(_SUNKEN_M, _SUNKEN_RATIO * width_m)

@@ -1,7 +1,7 @@
-"""Read a bundle's packing from the orthophoto: it is dark along the lines where bars meet.
+"""Find a bundle's packing in the orthophoto, which is dark along the lines where bars meet.
 
-The shading across a bundle says which packing lies there, which a smoothed surface often can't. With the
-packing known, the surface says how much it smooths, and so how thick the bars are.
+The shading across a bundle reveals its packing, which a smoothed surface often can't. Once the packing is
+known, the surface shows how much it is smoothed, and so how thick the bars are.
 """
 
 from __future__ import annotations
@@ -35,24 +35,24 @@ from barsight.yard.bundles.section.shades import shade_profile
 from barsight.yard.types import HeightMap
 
 _PIXEL_M = 0.003
-"""Blur by lens and pixel, standard deviation on the surface."""
+"""Standard deviation (m, on the surface) of the blur by lens and pixel."""
 _WIDER = np.arange(-0.04, 0.041, 0.02)
 _SHIFTS_M = np.arange(-0.004, 0.0041, 0.002)
 _ROLLS_RAD = np.radians(np.arange(-6.0, 6.1, 3.0))
 _MAX_REST = 0.4
-"""Of the shades' variance: what the best packing may leave."""
+"""Maximum share of the gray levels' variance that the best packing may leave unexplained."""
 _MAX_DOUBTING = 0.5
-"""The same for a packing that is not sure, but speaks against the surface's."""
+"""The same for a packing that isn't certain, but counts as evidence against the packing of the surface."""
 _SURE = 4.5
-"""Logarithm of how much likelier the best packing must be than the next."""
+"""Minimum log-likelihood ratio between the best packing and the next for the best one to be certain."""
 _SMOOTHINGS_M = np.array([0.004, 0.007, 0.010, 0.013, 0.016])
 _MAX_SMOOTHED = 8
 
 
 @dataclass(frozen=True)
 class Packing:
-    """Packing by the shades. rest: share of their variance that the packing leaves; lead: logarithm of how
-    much likelier it is than the next.
+    """The packing that explains the gray levels best. rest: share of their variance that it leaves
+    unexplained; lead: log-likelihood ratio over the next best.
     """
 
     rings: int
@@ -63,9 +63,9 @@ class Packing:
 
 
 def packing_by_shades(shades: ShadeProfile, fit: Fit, cell_m: float, settings: BundleSettings) -> Packing:
-    """Fit the packing whose shading explains most of the shades within the fit's width, place and roll.
+    """Fit the packing whose shading explains most of the gray levels, near the fit's width, place and roll.
 
-    Each visible bar counts as two independent shades: its sides.
+    Each visible bar counts as two independent samples: its sides.
     """
     tried: list[tuple[float, int, float, float]] = []
     for rings in range(len(BARS_OF_RINGS)):
@@ -97,11 +97,12 @@ def _rests(
     places: Float64, levels: Float64, packing: Float64, diameters: Float64, rolls: Float64, shifts: Float64,
     blur: float,
 ) -> Float64:  # fmt: skip
-    """Compute the fraction (diameters, rolls) of the shades' variance that the best shift leaves unexplained.
+    """Compute the fraction (diameters, rolls) of the gray levels' variance that the best shift leaves
+    unexplained.
 
-    The model: round bars lit from above and from a side, both fading smoothly across the bundle. places: (N,)
-    m beside the axis; levels: (N,) shades. packing: (bars, 2), in diameters. diameters: m; rolls: rad;
-    shifts: (S,) m. blur: m.
+    The model is round bars lit from above and from the side, where both lights vary smoothly across the
+    bundle. places: (N,) m beside the axis; levels: (N,) log gray levels. packing: (bars, 2), in diameters.
+    diameters: m; rolls: rad; shifts: (S,) m. blur: m.
     """
     out = np.ones((diameters.size, rolls.size))
     spread = levels - levels.mean()
@@ -137,10 +138,10 @@ def _rests(
 
 @kernel()
 def _shading(packing: Float64, diameter: float, roll: float, blur: float) -> tuple[Float64, Float64]:
-    """Render how much each place faces up, and how much sideways, STEP_M apart about the axis, blurred; 0
-    beside.
+    """Render how far each place faces up, and how far sideways, blurred; 0 beside the bars.
 
-    packing: (bars, 2), in diameters. Returns two arrays (N,), the axis in the middle. diameter, blur: m.
+    packing: (bars, 2), in diameters. diameter, blur: m. Returns two arrays (N,), STEP_M apart, with the axis
+    in the middle.
     """
     c, s = np.cos(roll), np.sin(roll)
     radius = diameter / 2
@@ -173,7 +174,7 @@ def _shading(packing: Float64, diameter: float, roll: float, blur: float) -> tup
 def refit_with_packing(
     found: FittedOutline, height_map: HeightMap, settings: BundleSettings
 ) -> FittedOutline:
-    """Fit again with the packing that the shades show, where they show one surely."""
+    """Refit with the packing that the gray levels show, where they show one with certainty."""
     shades = shade_profile(height_map, found.grid, found.fit)
     if shades is None:
         return found
@@ -193,7 +194,7 @@ def refit_with_packing(
 
 
 def _visible(rings: int, diameter_m: float, roll_rad: float) -> int:
-    """Count the bars that show from above."""
+    """Count the bars that are visible from above."""
     axes = turned_packing(rings, diameter_m, roll_rad)
     reach = bundle_width(rings, diameter_m) / 2
     highest, _ = highest_bars(axes, diameter_m / 2, np.arange(-reach, reach, STEP_M))
@@ -201,10 +202,11 @@ def _visible(rings: int, diameter_m: float, roll_rad: float) -> int:
 
 
 def estimate_smoothing(found: list[FittedOutline], settings: BundleSettings) -> float:
-    """Estimate the map's smoothing across the bars (m, standard deviation): what fits best where pictures
-    settled the packing. The settings' own where they settled none.
+    """Estimate the map's smoothing across the bars (m, standard deviation): the one that fits best where the
+    photo settled the packing. Returns the settings' value where it settled none.
 
-    Without the packing it can't be told: thin bars under little smoothing look like thick ones under much.
+    Without the packing it can't be determined: thin bars with little smoothing look like thick bars with
+    much.
     """
     known = [one for one in found if one.shades is not None and one.fit.rings > 0]
     known = known[:: 1 + len(known) // _MAX_SMOOTHED]

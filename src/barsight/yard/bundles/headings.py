@@ -1,4 +1,4 @@
-"""Find the headings of the bars from the map's slopes."""
+"""Find the headings of the bars by the map's slopes."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ _STEEPEST = 1.5
 _STRIP_BLOCKS = 64
 _MIN_RATIO = 0.02
 _MIN_RELIEF = 0.15
-"""Of the mean squared slope where most of the relief is: what a block needs to count."""
+"""Minimum mean squared slope of a block that counts, as a fraction of that in the blocks with most relief."""
 
 
 def find_headings(
     height_map: HeightMap, apart_deg: float, stock_over_m: float = -np.inf
 ) -> tuple[float, ...]:
-    """Find headings (rad, in (-pi/2, pi/2], 0 along +y), the commonest first, at least `apart_deg` apart.
+    """Find headings (rad, in (-pi/2, pi/2], 0 along +y), most common first, at least `apart_deg` apart.
 
-    Bars slope across their axis only: the structure tensor of each block of 0.3 m says which way, and how
-    clearly [Bigun 1987]. A heading within `apart_deg` of an axis of the map is that axis. Heights up to
-    stock_over_m are floor, whose ripples run as the pictures do.
+    Bars slope only across their axis, so the structure tensor of each block of 0.3 m shows the direction and
+    how distinct it is [Bigun 1987]. A heading close to an axis of the map (within 0.6 `apart_deg`) is
+    replaced by that axis. Heights up to stock_over_m are floor, whose ripples follow the pictures' direction.
     """
     block = max(round(_BLOCK_M / height_map.cell_m), 1)
     rows, columns = (n // block for n in height_map.z_m.shape)
@@ -36,7 +36,7 @@ def find_headings(
         for first in range(0, columns, _STRIP_BLOCKS)
     ]
     even, odd, energy = np.concatenate(strips, axis=2)
-    # The ripples of a level platform run as the pictures do, not as the bars: they have little relief.
+    # The ripples of a level platform follow the pictures, not the bars, and have little relief.
     usual = float((energy**2).sum() / max(energy.sum(), 1e-12))
     clear = np.hypot(even, odd) > _COHERENT * np.maximum(energy, 1e-12)
     clear &= energy > _MIN_RELIEF * usual
@@ -62,8 +62,9 @@ def find_headings(
 def _slopes(
     height_map: HeightMap, block: int, rows: int, first: int, last: int, stock_over_m: float
 ) -> Float64:
-    """Compute the structure tensor (3, rows, last - first) of those blocks, as the difference of both axes'
-    squared slopes, twice their product and their sum. By strips: a long yard's slopes are many times its map.
+    """Compute the structure tensors (3, rows, last - first) of the blocks: difference of the squared slopes
+    along both axes, twice their product, and their sum. Done in strips: the slopes of a long yard take many
+    times the memory of its map.
     """
     low, high = max(first * block - 1, 0), min(last * block + 1, height_map.z_m.shape[1])
     seen = HeightSource.measured(height_map.source[:, low:high])

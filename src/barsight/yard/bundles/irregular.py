@@ -1,4 +1,4 @@
-"""Widen the sigma of an outline that is not surely the bundle's: irregular bundles are no hexagons."""
+"""Widen the sigma of an outline that may not be the bundle's: irregular bundles aren't hexagons."""
 
 from __future__ import annotations
 
@@ -10,17 +10,19 @@ from barsight.yard.bundles.fitting.outline_fit import DIAMETER, FittedOutline
 from barsight.yard.types import BundleSigma
 
 _WIDTH_RATIOS, _WIDTH_SIGMAS = (0.03, 0.12), (1.5, 2.0)
-"""Of the width, and of a height's sigma: error of the width where the pictures show the packing, and where
-not. A map's sigma rises with the size of its pixels, by which its edges grow."""
+"""Errors of the width, in widths and in sigmas of a height; each where the pictures show the packing, and
+where they don't. A map's sigma rises with the size of its pixels, and so does the growth of its edges.
+"""
 _SECTION_RATIO = 0.5
-"""Of what the width of the section that is seen differs from the outline's."""
+"""Error of the width as a fraction of the difference between the seen section's width and the outline's."""
 _TOP_SIGMAS, _YAW_SIGMAS = 0.8, 0.4
-"""Of a height's sigma: error of the top, and of the ends' places sideways."""
+"""Errors of the top's height and of the ends' lateral places, in sigmas of a height."""
 _RESOLVED_M = 0.07
-"""Bars from this diameter on show their shape in a map."""
+"""Minimum diameter (m) of bars whose shape shows in a map."""
 DIAMETER_RATIOS = 0.06, 0.45, 0.6
-"""Of a diameter: its error where bars show their shape, where they are thinner, and where another packing
-fits as well or many bars may look like one."""
+"""Errors of a diameter, as fractions of it: where bars show their shape, where they are too thin for that,
+and where another packing fits as well or many bars may look like one.
+"""
 
 
 def widen_sigma(
@@ -31,10 +33,10 @@ def widen_sigma(
     *,
     is_one_of_two: bool,
 ) -> BundleSigma:
-    """Add what a hexagon fitted to another outline leaves open. seen_width_m: of what is seen, by its straps
-    where they bound it. is_one_of_two: another packing fits as well.
+    """Add the errors of a hexagon that is fitted to another outline.
 
-    Where one edge is off, the middle is off by half as much.
+    seen_width_m: width of the part that is seen, as bounded by its straps if they bound it. is_one_of_two:
+    another packing fits as well. Where one edge is off, the middle is off by half as much.
     """
     fit, shown = one.fit, one.shades is not None
     ratio, sigmas = (parts[0 if shown else 1] for parts in (_WIDTH_RATIOS, _WIDTH_SIGMAS))

@@ -1,4 +1,4 @@
-"""Relate bundles: which lies on which, in which layer, and beside which."""
+"""Relate bundles to each other: which one lies on which, in which layer, and beside which."""
 
 from __future__ import annotations
 
@@ -12,10 +12,12 @@ _TOUCH_M = 0.03
 _DUNNAGE_M = 0.1
 _HIGHER_RATIO = 0.4
 _LOWER_RATIO = 0.15
-"""A middle that lies lower by this share of the mean width is the lower one, whatever the widths err by."""
+"""Height tolerance in mean widths: a bundle whose middle is lower by more is the lower one, whatever the
+error of the widths.
+"""
 _PARALLEL = 0.08
 _INSIDE = 0.35
-"""Share of a bundle's width, to either side of its axis, within which no other bundle lies."""
+"""Distance from a bundle's axis, as a share of its width, within which no other bundle's middle can lie."""
 _LEAVE_OPEN = frozenset({
     DoubtKind.COVERS_PART, DoubtKind.COVERED_END, DoubtKind.LIES_ACROSS, DoubtKind.THIN_BAR,
     DoubtKind.UNSEEN_FLANK, DoubtKind.WALL,
@@ -23,18 +25,21 @@ _LEAVE_OPEN = frozenset({
 """Doubts that leave open whether something lies on a bundle. A faint line across it, most often a strap,
 only forbids its lift.
 
-A hidden flank does so from the second layer on, where bundles rest on each other's flanks. On the floor a
-higher neighbour that hides the lower part of a flank most often stands beside it."""
+A hidden flank leaves it open from the second layer on, where bundles rest on each other's flanks. On the
+floor, a higher neighbour that hides the lower part of a flank usually stands beside it.
+"""
 _MEET_M, _MEET_LENGTH_M = 0.02, 0.3
-"""Two outlines that overlap by more, over this length, are not both right: one may lie over the other."""
+"""Overlap across (m) of two outlines, and its length along (m), from which they can't both be right: one
+bundle may lie over the other.
+"""
 
 
 def find_layers(bundles: list[Bundle], floor_m: float | None) -> list[int]:
-    """Find each bundle's layer by its height over the floor (the lowest bundle's underside where none was
-    seen).
+    """Find each bundle's layer by its height over the floor, or over the lowest bundle's underside where no
+    floor was seen.
 
-    The distance of the layers is the smallest step between the undersides of bundles of its width and heading
-    that one bundle and its dunnage can make, else the bundle's own height and 0.1 m.
+    The spacing of the layers is the lower quartile of those steps between undersides of bundles of about its
+    width and heading that one bundle and its dunnage can make, otherwise the bundle's own height plus 0.1 m.
     """
     bottoms = np.array([b.bottom_z_m for b in bundles])
     layers = []
@@ -51,7 +56,7 @@ def find_layers(bundles: list[Bundle], floor_m: float | None) -> list[int]:
 
 
 def _is_alike(one: Bundle, other: Bundle) -> bool:
-    """Check for a bundle as wide, and no crossed one: these lie without dunnage."""
+    """Check whether a bundle is about as wide and parallel: crossed bundles lie without dunnage."""
     parallel = abs(np.sin(one.yaw_rad - other.yaw_rad)) < _PARALLEL
     return bool(parallel and abs(other.width_m - one.width_m) < 0.15 * one.width_m)
 
@@ -59,7 +64,7 @@ def _is_alike(one: Bundle, other: Bundle) -> bool:
 def check_uncovered(
     bundle: Bundle, bundles: list[Bundle], layer: int
 ) -> tuple[bool | None, tuple[Doubt, ...]]:
-    """Check whether no other lies on the bundle, and why not; None where what covers it isn't known."""
+    """Check whether no other bundle lies on this one, and list what does; None where it isn't known."""
     covers = [other.id for other in bundles if other.id != bundle.id and _lies_on(other, bundle)]
     if covers:
         return False, (Doubt(DoubtKind.OTHER, f"bundle {', '.join(map(str, covers))} lies on it"),)
@@ -77,9 +82,9 @@ def _lies_on(upper: Bundle, lower: Bundle) -> bool:
 
 
 def list_overlaps(bundle: Bundle, bundles: list[Bundle]) -> tuple[Doubt, ...]:
-    """List other bundles whose outlines overlap this one's and whose middles or tops lie no lower: they may
-    lie over its flank. In plan view two convex sections overlap where one's widest place is above the
-    other's.
+    """List other bundles that may lie over this one's flank: their outlines overlap, and their middles or
+    tops are no lower. In plan view, two convex sections overlap where the widest place of one lies over that
+    of the other.
     """
     ids = [str(other.id) for other in bundles if other.id != bundle.id and _overlaps(other, bundle)]
     if not ids:
@@ -95,7 +100,7 @@ def _overlaps(other: Bundle, bundle: Bundle) -> bool:
 
 
 def list_neighbours(bundle: Bundle, bundles: list[Bundle]) -> tuple[int, ...]:
-    """List ids of the bundles that lie no more than 30 mm beside it, at about its height."""
+    """List ids of the bundles that lie within 30 mm beside this one, at about its height."""
     return tuple(
         other.id
         for other in bundles
@@ -106,7 +111,7 @@ def list_neighbours(bundle: Bundle, bundles: list[Bundle]) -> tuple[int, ...]:
 
 
 def same_place(one: Bundle, other: Bundle) -> bool:
-    """Check whether both claim to fill one place: the middle of either lies well inside the other."""
+    """Check whether two bundles claim the same place: the middle of one lies well inside the other."""
     near = abs(one.centre_m[2] - other.centre_m[2]) < _INSIDE * min(one.width_m, other.width_m)
     return bool(near) and (_holds(one, other.centre_m) or _holds(other, one.centre_m))
 
@@ -117,7 +122,9 @@ def _holds(bundle: Bundle, place: Float64) -> bool:
 
 
 def _common_length(bundle: Bundle, other: Bundle, margin_m: float) -> float:
-    """Compute the length of `bundle` over which the two footprints, grown by margin_m in all, meet."""
+    """Compute the length of `bundle` over which the two footprints meet, with the other one widened by
+    margin_m on each side.
+    """
     skew = abs(np.sin(bundle.yaw_rad - other.yaw_rad))
     reach = (other.width_m + bundle.width_m + skew * bundle.length_m) / 2 + max(margin_m, 0.0)
     if _beside(bundle.centre_m[:2], other)[0] > reach:
@@ -133,7 +140,7 @@ def _common_length(bundle: Bundle, other: Bundle, margin_m: float) -> float:
 
 
 def _beside(places: Float64, bundle: Bundle) -> tuple[Float64, Float64]:
-    """Compute distances of (..., 2) places from the bundle's axis and, along it, from its middle."""
+    """Compute distances of places (..., 2) from the bundle's axis, and along it from the bundle's middle."""
     c, s = np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad)
     offset = places - bundle.centre_m[:2]
     return np.abs(offset @ np.array([c, s])), np.abs(offset @ np.array([-s, c]))

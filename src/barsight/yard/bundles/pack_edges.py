@@ -1,4 +1,4 @@
-"""Hold fitted outlines off the packs beside them: where straps and flanks show a pack, no other is."""
+"""Cut fitted outlines back at the edges of packs beside them: no other bundle is where a pack is seen."""
 
 from __future__ import annotations
 
@@ -9,17 +9,20 @@ import numpy as np
 from barsight.yard.types import Bundle, Doubt, DoubtKind
 
 DOUBTFUL = 0.4
-"""The most confidence in an outline that straps, or their absence, or the floor speak against."""
+"""Maximum confidence in an outline that is contradicted by straps, by their absence or by the floor."""
 _SKEW, _BESIDE_M, _LEVEL_RATIO = 0.05, 0.3, 0.3
-"""Sine of the skew, length beside each other, and height between axes over the mean width: within these two
-bundles lie side by side."""
+"""Limits within which two bundles lie side by side: maximum sine of the skew, minimum length beside each
+other (m), maximum difference in height in mean widths.
+"""
 _NARROWEST_M = 0.04
 _SLIGHT_M = 0.015
-"""An outline that reaches so little into a pack is not doubtful for that."""
+"""Maximum depth (m) to which an outline may reach into a pack without being doubtful for it."""
 
 
 def hold_off(bundles: list[Bundle], packs: list[bool]) -> list[Bundle]:
-    """Cut the outlines that reach into a pack at its edge. packs: which of them are seen whole."""
+    """Cut the outlines that reach into a pack at its edge. packs: whether each bundle is a pack whose bounds
+    are known on both sides.
+    """
     seen = [bundle for bundle, is_pack in zip(bundles, packs, strict=True) if is_pack]
     return [
         bundle if is_pack else _cut_at(bundle, seen) for bundle, is_pack in zip(bundles, packs, strict=True)
@@ -55,7 +58,7 @@ def _cut_at(bundle: Bundle, packs: list[Bundle]) -> Bundle:
 
 
 def _side_by_side(one: Bundle, pack: Bundle) -> bool:
-    """Check whether a bundle lies beside a pack, at about its height, its axis outside of it."""
+    """Check whether a bundle lies beside a pack, at about its height, with its axis outside of the pack."""
     away = one.centre_m - pack.centre_m
     along = np.array([-np.sin(pack.yaw_rad), np.cos(pack.yaw_rad)])
     beside = abs(float(away[0] * along[1] - away[1] * along[0]))

@@ -1,4 +1,4 @@
-"""Define a chosen outline with what speaks for and against it."""
+"""Define a chosen outline together with the evidence for and against it."""
 
 from __future__ import annotations
 
@@ -10,17 +10,19 @@ from barsight.yard.bundles.section.pack_sides import PackSide
 from barsight.yard.bundles.section.packs import Pack
 
 _SAME_RATIO, _SAME_M = 0.12, 0.005
-"""Of the width, and besides: how far an outline's edges lie off those of the pack that it describes."""
+"""Tolerance between an outline's edges and those of the pack that it describes: a fraction of the width, plus
+a constant (m).
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """A chosen outline with its weight (cells explained) and the strongest other reading of its place.
+    """A chosen outline with its weight (cells explained) and the strongest rival reading of its place.
 
-    other_packing: rings of another packing that explains the bundles of this kind as well, if any does. pack:
-    the bars that straps hold together there, None where no straps are seen; has_photo: whether they would
-    show. is_along_baseline: whether the cameras stand about in line with its bars. flanks: of the pack
-    where its bounds are known, else of the outline; None where too little of them is seen.
+    other_packing: rings of another packing that explains the bundles of this kind as well, if there is one.
+    pack: the bars that straps hold together there, None where no straps are seen; has_photo: whether straps
+    would show. is_along_baseline: whether the line from camera to camera runs roughly along its bars. flanks:
+    of the pack where its bounds are known, otherwise of the outline; None where too little of them is seen.
     """
 
     found: FittedOutline
@@ -35,7 +37,7 @@ class Reading:
 
     @property
     def outlines_pack(self) -> bool:
-        """Check whether the fitted outline ends where the pack does, or no pack's bounds are known."""
+        """Check whether the fitted outline ends where the pack does, or the pack's bounds aren't known."""
         pack, width = self.pack, self.found.fit.width_m
         if pack is None or not pack.is_bounded:
             return True
@@ -44,12 +46,14 @@ class Reading:
 
     @property
     def is_flat(self) -> bool:
-        """Check that neither flank falls off, as a plate's or a wall's doesn't, and no straps bound it."""
+        """Check whether neither flank falls off, as with a plate or a wall, and no straps
+        bound the bundle.
+        """
         bounded = self.pack is not None and self.pack.is_bounded
         return self.flanks is not None and self.flanks.are_flat and not bounded
 
     def with_flanks(self) -> Reading:
-        """Return the same with its flanks."""
+        """Return a copy of the reading with its flanks measured."""
         half, pack = self.found.fit.width_m / 2, self.pack
         if pack is None or not pack.is_bounded:
             return replace(self, flanks=seen_flanks(self.found, -half, half))

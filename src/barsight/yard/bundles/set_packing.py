@@ -1,4 +1,4 @@
-"""Select among contradicting readings the set that explains most of the map."""
+"""Select among conflicting readings the set that explains the most of the map."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from barsight.core.arrays import Float64, Int64
 
 
 def choose_readings(weights: Float64, claims: list[Int64]) -> Int64:
-    """Choose the readings (indices) that together weigh most, no place claimed twice.
+    """Choose the readings (indices) with the largest total weight so that no place is claimed twice.
 
-    weights: (N,) what a reading explains. claims: for each reading the numbers of the places it takes.
+    weights: (N,) what each reading explains. claims: for each reading, the numbers of the places it takes.
+    Raises RuntimeError where the solver finds no choice.
     """
     useful = [k for k in range(len(claims)) if weights[k] > 0 and claims[k].size > 0]
     if not useful:
@@ -31,8 +32,8 @@ def choose_readings(weights: Float64, claims: list[Int64]) -> Int64:
 
 
 def without_slivers(claims: list[Int64], min_ratio: float) -> list[Int64]:
-    """Remove from the claims what two have in common where that is under min_ratio of the smaller: there
-    only their edges meet. The larger gives way.
+    """Remove the places that two claims share where these are less than min_ratio of the smaller claim: then
+    only their edges meet. The larger claim gives them up.
     """
     if not claims:
         return []
@@ -48,9 +49,10 @@ def without_slivers(claims: list[Int64], min_ratio: float) -> list[Int64]:
 
 
 def _rivals(owner: Int64, place: Int64, readings: int) -> csc_matrix:
-    """Build a row for each set of two or more readings that want the same places, 1 for those in it.
+    """Build a row for each set of two or more readings that claim the same places, with 1 for its members.
 
-    Places are told apart by the sum of random numbers, one drawn for each reading: 64 bits don't collide.
+    Sets are distinguished by the sum of random numbers, one drawn for each reading: with 62 bits each,
+    collisions don't occur in practice.
     """
     takes = csr_matrix((np.ones(owner.size), (place, owner)), shape=(int(place.max()) + 1, readings))
     mark = np.random.default_rng(0).integers(1 << 62, size=readings)
@@ -61,7 +63,7 @@ def _rivals(owner: Int64, place: Int64, readings: int) -> csc_matrix:
 
 
 def overlaps(chosen: Int64, claims: list[Int64]) -> Float64:
-    """Compute the fraction (chosen, N) of each chosen reading's place that every reading wants."""
+    """Compute the fraction (chosen, N) of each chosen reading's place that every reading claims."""
     if chosen.size == 0:
         return np.empty((0, len(claims)))
     owner, place = _owners(claims)
@@ -72,7 +74,7 @@ def overlaps(chosen: Int64, claims: list[Int64]) -> Float64:
 
 
 def strongest_rivals(chosen: Int64, weights: Float64, wanted: Float64) -> list[int | None]:
-    """Find for each chosen reading the one that weighs most of those that want most of its place."""
+    """Find for each chosen reading the heaviest of the others that claim more than half of its place."""
     if chosen.size == 0:
         return []
     wants = wanted > 0.5
@@ -83,7 +85,7 @@ def strongest_rivals(chosen: Int64, weights: Float64, wanted: Float64) -> list[i
 
 
 def _owners(claims: list[Int64]) -> tuple[Int64, Int64]:
-    """List every claim as a pair: the reading's index and the place's, places counted from 0."""
+    """List every claim as a pair: index of the reading and index of the place, both counted from 0."""
     owner = np.repeat(np.arange(len(claims), dtype=np.int64), [claim.size for claim in claims])
     _, place = np.unique(np.concatenate(claims), return_inverse=True)
     return owner, place.astype(np.int64)

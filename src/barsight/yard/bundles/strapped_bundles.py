@@ -1,4 +1,4 @@
-"""Hold fitted outlines to what straps show."""
+"""Correct fitted outlines by what the straps show."""
 
 from __future__ import annotations
 
@@ -18,41 +18,46 @@ from barsight.yard.bundles.section.seen_section import SeenSection, bulge_sigma,
 from barsight.yard.types import Bundle, BundleSigma, Doubt, DoubtKind
 
 _LINES_SIGMA_RATIO = 0.6
-"""Of a diameter by dark lines: one standard deviation. Where lines between thin bars don't all show, it is
-that of two bars, of three or of more."""
+"""Standard deviation of a diameter measured by dark lines, as a fraction of it. Where not all lines between
+thin bars show, the measured one is that of two bars, of three or of more.
+"""
 _PACK_MIDDLE_M, _PACK_WIDTH_M, _PACK_TOP_M, _PACK_WIDTH_SIGMAS = 0.012, 0.016, 0.006, 3.0
-"""Standard deviations of a pack's middle, width and top, and its width's in those of a height."""
+"""Standard deviations (m) of a pack's middle, width and top, and that of its width in sigmas of a height."""
 _CREST_RATIO, _SMEARED_M = 0.6, 0.03
-"""Share of a pack's width over which straps must show to bound what it holds: heaps of three rows fall off
-under straps that show on the top bar. So much wider the map smears two flanks."""
+"""Minimum share of a pack's width over which straps must show to bound it: heaps of three rows extend beyond
+straps that only show on the top bar. Maximum width (m) that the map adds by smearing two flanks.
+"""
 _SAME_MIDDLE_M = 0.009
-"""Largest distance between the middles of a pack and of the outline that is fitted to it."""
+"""Maximum distance (m) between the middles of a pack and of the outline that is fitted to it."""
 _CREST_M = 0.006
-"""Crest height that a map's mean section cuts off."""
+"""Height (m) by which a map's mean section underestimates the crest."""
 _HIDDEN_RATIO = 0.5
-"""Of the width in sight: one standard deviation of what a neighbour hides of a pack. In the pile that was
-looked at, as much as what was in sight was hidden at most."""
+"""Standard deviation of the part of a pack that a neighbour hides, as a fraction of the width in sight. In
+the pile that was examined, at most as much was hidden as was in sight.
+"""
 _STRAPPED = 0.95
 """Confidence in a bundle whose straps and flanks were seen."""
 _PIECE_M, _PIECE_HIGHER_M, _PIECE_BEYOND_M, _PIECE_SKEW = 0.02, 0.012, 0.1, 0.05
-"""Bounds of a piece: way of its axis within the flanks, most by which its top is higher and its ends lie
-beyond the pack's, sine of its skew."""
+"""Limits for a piece of a pack: minimum distance of its axis from the flanks, maximum by which its top is
+higher, maximum by which its ends extend beyond the pack's (all m), maximum sine of its skew.
+"""
 _ONE_BAR, _TWO_BARS = 1.05, 1.75
-"""Of the diameter: an outline up to the first is one bar's, and one narrower than the second is not a whole
-bundle's, of which two lie side by side at least."""
+"""Limits of the width in bar diameters: an outline up to the first is one bar's. One between the two isn't a
+whole bundle's, which has at least two bars side by side.
+"""
 _ASIDE_M = 0.02
-"""Straps whose middle lies so far beside an outline's make its place that unsure."""
+"""Distance (m) between the middles of straps and outline from which it counts as uncertainty of the place."""
 
 
 def held_by_straps(
     bundle: Bundle, irregular: BundleSigma, reading: Reading, seen: SeenSection | None, floor_m: float | None
 ) -> Bundle:
-    """Hold a bundle to what straps show: place, width and section where the fitted outline misses the pack,
-    the section alone where both agree, a doubt where a neighbour may lie over the pack or it goes on beyond
-    what is in sight, and where no straps show.
+    """Correct a bundle by its straps.
 
-    irregular: its sigma where it is not surely the hexagon that was fitted. seen: what the surface shows of
-    its section.
+    Place, width and section are replaced where the fitted outline misses the pack, only the section where
+    both agree. Doubts are added where a neighbour may lie over the pack, where the pack continues out of
+    sight, and where no straps show. irregular: the bundle's sigma where it may not be the hexagon that was
+    fitted. seen: its section as the surface shows it.
     """
     pack = reading.pack
     if pack is None:
@@ -68,7 +73,7 @@ def held_by_straps(
 
 
 def _without_straps(bundle: Bundle, irregular: BundleSigma, reading: Reading) -> Bundle:
-    """Say of several bars that can't be counted that no straps show where they would."""
+    """Add the doubt to several bars that can't be counted that no straps show where they should."""
     if bundle.bars is not None:
         return bundle
     bundle = replace(bundle, sigma=irregular)
@@ -79,8 +84,8 @@ def _without_straps(bundle: Bundle, irregular: BundleSigma, reading: Reading) ->
 
 
 def doubted_without_straps(bundle: Bundle) -> Bundle:
-    """Doubt several bars that can't be counted, and on which neither the photo nor the pictures show straps:
-    they may lie loose, and the outline may be that of some bars of a pack.
+    """Lower the confidence in several bars that can't be counted and on which neither the photo nor the
+    pictures show straps: they may lie loose, and the outline may be that of some bars of a pack.
     """
     if not any(doubt.kind is DoubtKind.NO_STRAPS for doubt in bundle.reasons):
         return bundle
@@ -88,8 +93,8 @@ def doubted_without_straps(bundle: Bundle) -> Bundle:
 
 
 def doubted_if_narrow(bundle: Bundle) -> Bundle:
-    """Doubt what is wider than one of its bars and narrower than two: it is some of a wider bundle's, or one
-    bar whose diameter is wrong. Its section isn't known.
+    """Mark as doubtful a bundle wider than one of its bars and narrower than two: it is a part of a wider
+    bundle, or one bar whose diameter is wrong. Its section isn't known.
     """
     ratio = bundle.width_m / bundle.bar_diameter_m
     if bundle.bars is not None or not _ONE_BAR < ratio < _TWO_BARS:
@@ -106,7 +111,7 @@ def doubted_if_narrow(bundle: Bundle) -> Bundle:
 
 
 def _may_go_on(pack: Pack, seen: SeenSection | None) -> bool:
-    """Check for straps that show on a pack's crest alone, where its surface doesn't end with its flanks."""
+    """Check whether straps only show on a pack's crest while its surface doesn't end with its flanks."""
     if pack.span.width_m >= _CREST_RATIO * pack.width_m:
         return False
     return seen is None or not seen.sides_seen or seen.width_m >= pack.width_m + _SMEARED_M
@@ -115,7 +120,7 @@ def _may_go_on(pack: Pack, seen: SeenSection | None) -> bool:
 def _held(
     bundle: Bundle, irregular: BundleSigma, reading: Reading, pack: Pack, floor_m: float | None
 ) -> Bundle:
-    """Hold a bundle to its straps as if they showed all across it; see `held_by_straps`."""
+    """Correct a bundle by its straps as if they showed all across it; see `held_by_straps`."""
     if not pack.is_bounded:
         return _partly_seen(bundle, irregular, pack)
     if reading.outlines_pack:
@@ -169,7 +174,9 @@ def _as_pack(
 
 
 def _covered(bundle: Bundle, pack: Pack) -> Bundle:
-    """Doubt a bundle over whose flanks neighbours may lie: its width is what is seen, its section open."""
+    """Mark as doubtful a bundle over whose flanks neighbours may lie: its width is that in sight, its section
+    unknown.
+    """
     sides = [name for name, side in zip(("low", "high"), pack.sides, strict=True) if side == PackSide.COVERED]
     if not sides:
         return bundle
@@ -195,7 +202,9 @@ def _covered(bundle: Bundle, pack: Pack) -> Bundle:
 
 
 def _partly_seen(bundle: Bundle, irregular: BundleSigma, pack: Pack) -> Bundle:
-    """Doubt a bundle whose pack goes on beyond it or lies aside, and whose flanks are not both seen."""
+    """Mark as doubtful a bundle whose pack extends beyond it or lies aside, and whose flanks aren't both
+    seen.
+    """
     beyond_m, said = contradicts(pack, bundle.width_m)
     if said:
         sure, reasons = min(bundle.confidence, DOUBTFUL), (*bundle.reasons, Doubt(DoubtKind.OTHER, said))
@@ -218,8 +227,9 @@ def _partly_seen(bundle: Bundle, irregular: BundleSigma, pack: Pack) -> Bundle:
 
 
 def _confirmed(bundle: Bundle, pack: Pack, floor_m: float | None, pack_sigma_m: float) -> Bundle:
-    """Keep a fitted outline that ends where the pack does. Its width is the mean of both by their sigmas;
-    they are as sure as they agree. Where the pack's flanks are out of sight, the outline tells more.
+    """Keep a fitted outline that ends where the pack does. Its width is the mean of both, weighted by their
+    sigmas, and its sigma reflects how well they agree. The outline counts more where the pack's flanks are
+    out of sight.
     """
     diameter, spread = bundle.bar_diameter_m, bundle.sigma.bar_diameter_m
     if abs(pack.diameter_m - diameter) > SAME_DIAMETER_RATIO * diameter:
@@ -239,18 +249,20 @@ def _confirmed(bundle: Bundle, pack: Pack, floor_m: float | None, pack_sigma_m: 
 
 
 def _pack_sigma(reading: Reading, pack: Pack) -> float:
-    """Compute the standard deviation of a pack's width."""
+    """Compute the standard deviation (m) of a pack's width."""
     return math.hypot(_PACK_WIDTH_M, _PACK_WIDTH_SIGMAS * reading.found.fit.sigma_m, _bulge(reading, pack))
 
 
 def _bulge(reading: Reading, pack: Pack) -> float:
-    """Compute the standard deviation of how much wider a pack is where nothing was seen behind its flanks."""
+    """Compute the standard deviation (m) of how much wider a pack is where nothing was seen behind its
+    flanks.
+    """
     return bulge_sigma(pack.hidden_m, pack.width_m, is_along_baseline=reading.is_along_baseline)
 
 
 def without_pieces(bundles: list[Bundle], readings: list[Reading]) -> list[Bundle]:
-    """Remove bundles that are pieces of one that straps hold: their axes run within its flanks. What else
-    reaches into one is cut.
+    """Remove bundles that are pieces of a strapped one, as their axes run within its flanks, and cut those
+    that otherwise reach into one.
     """
     whole = [k for k, one in enumerate(readings) if one.pack is not None and one.pack.is_bounded]
     whole.sort(key=lambda k: -readings[k].weight)
@@ -264,7 +276,7 @@ def without_pieces(bundles: list[Bundle], readings: list[Reading]) -> list[Bundl
 
 
 def _is_piece(piece: Bundle, whole: Bundle) -> bool:
-    """Check that a bundle's middle lies within another's flanks, at about its height, and along it."""
+    """Check whether a bundle's middle lies within another's flanks, at about its height, and along it."""
     away = piece.centre_m[:2] - whole.centre_m[:2]
     along = np.array([-np.sin(whole.yaw_rad), np.cos(whole.yaw_rad)])
     beside = abs(float(away[0] * along[1] - away[1] * along[0]))

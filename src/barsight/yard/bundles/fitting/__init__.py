@@ -1,1 +1,1 @@
-"""Fits of one bundle: outline templates, Gauss-Newton on heights, ends, bars."""
+"""Fit one bundle: outline templates, Gauss-Newton on heights, ends, single bars."""

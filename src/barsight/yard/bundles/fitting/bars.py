@@ -1,4 +1,4 @@
-"""Fit single bars: which of a bundle's bars are seen from above, and their places."""
+"""Locate single bars: which bars of a bundle are seen from above, and where they are."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from barsight.yard.types import Bar
 _SEEN_RATIO = 0.3
 _RESOLVED_CELLS = 3.0
 _LOOSE_M = 0.001
-"""How far a bar lies from its place in the packing."""
+"""Standard deviation (m) of a bar's distance from its place in the packing."""
 
 
 def visible_bars(fit: Fit) -> Int64:
-    """Select the packing's bars of which at least 30 % of the diameter is seen from straight above."""
+    """Select the bars of the packing of which at least 30 % of the diameter is seen from straight above."""
     diameter = float(fit.values[DIAMETER])
     axes = turned_packing(fit.rings, diameter, float(fit.values[ROLL]))
     highest, _ = highest_bars(axes, diameter / 2, np.arange(-fit.width_m / 2, fit.width_m / 2, STEP_M))
@@ -36,10 +36,11 @@ def visible_bars(fit: Fit) -> Int64:
 
 
 def fit_bars(found: FittedOutline, settings: BundleSettings) -> tuple[Bar, ...]:
-    """Fit a cylinder to each bar seen from above; none where neither heights nor pictures resolve them.
+    """Derive a cylinder for each bar seen from above; none where neither heights nor photo resolve the bars.
 
-    The bundle's fit is one of all its cylinders at once: a bar's figures and their covariance follow from the
-    bundle's place, slopes, roll and diameter. Fitted one by one, smoothed heights move bars by 4 mm.
+    The bundle's fit is a joint fit of all its cylinders: each bar's parameters and their covariance follow
+    from the bundle's place, slopes, roll and diameter. Fitted one by one, bars are off by 4 mm, because the
+    heights are smoothed.
     """
     grid, fit = found.grid, found.fit
     diameter = float(fit.values[DIAMETER])
@@ -69,7 +70,7 @@ def fit_bars(found: FittedOutline, settings: BundleSettings) -> tuple[Bar, ...]:
 
 
 def _covariance(fit: Fit, along: float, side: float, up: float, settings: BundleSettings) -> Float64:
-    """Compute the covariance (5, 5) of a bar's place across, height, yaw, pitch and diameter."""
+    """Compute the covariance (5, 5) of a bar's lateral place, height, yaw, pitch and diameter."""
     change = np.zeros((5, 6))
     change[0, [U, SLOPE_U, ROLL, DIAMETER]] = 1.0, along, -up, side / fit.values[DIAMETER]
     change[1, [Z, SLOPE_Z, ROLL, DIAMETER]] = 1.0, along, side, up / fit.values[DIAMETER]

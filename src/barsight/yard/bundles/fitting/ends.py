@@ -1,4 +1,4 @@
-"""Find the ends of a bundle, and whether they were seen."""
+"""Find the ends of a bundle, and whether each one was seen."""
 
 from __future__ import annotations
 
@@ -20,25 +20,29 @@ _PROOF_M = 0.1
 _RAGGED_M = 0.2
 _SOME, _MAX_VALUE = 0.3, 0.6
 _GROWTH_CELLS = 1.5
-"""A map grows over ends by about one and a half cells."""
+"""Distance, in cells, by which the map extends a bundle beyond its true end."""
 _SEEN_SIGMA_M, _SEEN_SIGMAS = 0.006, 1.0
-"""Standard deviation of an end's place where all bars end alike: a constant part, and one in sigmas of a
-height, which rise with the size of the pixels."""
+"""Standard deviation of an end's place where all bars end flush: a constant part (m), and a multiple of the
+heights' sigma, which rises with the size of the pixels.
+"""
 _UNEVEN_SIGMAS, _RAGGED_RATIO = 2.0, 0.35
-"""Of the sigma by how far apart the visible bars end, since others may end elsewhere; of the way over which
-the surface goes on a little lower."""
+"""Parts of an end's sigma: factor on the sigma that follows from the spread of the visible bars' ends, since
+hidden ones may end elsewhere; fraction of the length over which the surface goes on a little lower.
+"""
 _UNEVEN_M = (-0.15, 0.2)
 _ENDS_M = 0.03
 _QUARTILES = 1.349
-"""Standard deviations between the quartiles of a normal distribution."""
+"""Distance between the quartiles of a normal distribution, in standard deviations."""
 _ALIKE = 0.6
-"""Correlation of how far both ends of a bundle are put outwards: what moves one moves the other."""
+"""Correlation of the outward errors of a bundle's two ends: what moves one outwards moves the other too."""
 
 
 @dataclass(frozen=True)
 class End:
-    """An end of a bundle at v_m. sigma_m, and flush_sigma_m for bars that surely end alike, are NaN where the
-    end is open, and `why` says why it is. is_covered: something higher lies there.
+    """An end of a bundle at v_m along its grid.
+
+    sigma_m, and flush_sigma_m for bars that certainly end flush, are NaN where the end is open; `why` then
+    gives the reason. is_covered: something higher lies there.
     """
 
     v_m: float
@@ -52,9 +56,10 @@ class End:
 def find_end(grid: AlignedMap, fit: Fit, step: int, settings: BundleSettings) -> End:
     """Find the end at the fit's first (step -1) or last row (step 1).
 
-    It is seen where, over most of the bundle's width and for 0.1 m, the surface beyond lies lower than half
-    the bundle's height. The bars end unevenly, so the end is put a quarter of the way from the last row that
-    agrees to the last that lies little lower, less what a map grows over ends.
+    The end is seen where, for 0.1 m beyond it and over most of the bundle's width, the surface lies below the
+    outline by more than half the bundle's height. Since the bars end unevenly, the end is put a quarter of
+    the way from the last row that agrees to the last one that is only a little lower, less what a map grows
+    over ends.
     """
     row = fit.first if step < 0 else fit.last
     known, misfit = _beyond(grid, fit, row, step, settings)
@@ -84,7 +89,9 @@ def find_end(grid: AlignedMap, fit: Fit, step: int, settings: BundleSettings) ->
 
 
 def middle_and_length_sigma(ends_sigma_m: tuple[float, float]) -> tuple[float, float]:
-    """Propagate the sigmas of both ends, whose errors outwards are alike, to the middle and to the length."""
+    """Propagate the sigmas of both ends, whose outward errors are correlated, to the middle
+    and the length.
+    """
     squares, alike = (
         ends_sigma_m[0] ** 2 + ends_sigma_m[1] ** 2,
         2 * _ALIKE * ends_sigma_m[0] * ends_sigma_m[1],
@@ -93,7 +100,7 @@ def middle_and_length_sigma(ends_sigma_m: tuple[float, float]) -> tuple[float, f
 
 
 def _unevenness(grid: AlignedMap, fit: Fit, row: int, step: int, settings: BundleSettings) -> float:
-    """Estimate the sigma (m) of the middle of the visible bars' ends from how far apart they are."""
+    """Estimate the sigma (m) of the mean end of the bars from the spread of the visible bars' ends."""
     first, last = (round(reach / grid.cell_m) for reach in _UNEVEN_M)
     rows = row + step * np.arange(first, last + 1)
     rows = rows[(rows >= 0) & (rows < grid.z_m.shape[0])]
@@ -108,8 +115,8 @@ def _unevenness(grid: AlignedMap, fit: Fit, row: int, step: int, settings: Bundl
 def _beyond(
     grid: AlignedMap, fit: Fit, row: int, step: int, settings: BundleSettings
 ) -> tuple[Float64, Float64]:
-    """Measure for each row beyond: the fraction of the outline that is known, and the median height
-    over it.
+    """Measure for each row beyond the end the known fraction of the outline, and the median height (m) over
+    the outline.
     """
     rows = row + step * np.arange(1, int(_LOOK_M / grid.cell_m) + 1)
     rows = rows[(rows >= 0) & (rows < grid.z_m.shape[0])]

@@ -1,4 +1,4 @@
-"""Run the Gauss-Newton iterations of a bundle's fit over the heights under its outline, compiled."""
+"""Run the compiled Gauss-Newton iterations that fit a bundle's outline to the heights."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ _STEEPEST = 4.5
 _MIN_HEIGHTS = 30
 _STILL_M = 1e-5
 _MIN_SCATTER = 0.04
-"""Of the stated variance."""
+"""Lower bound of the ratio of observed to stated variance by which the covariance is scaled."""
 
 
 class Heights(NamedTuple):
-    """The grid's heights and sigmas (rows, columns), and the rows that count: first, last, stride, the
-    middle's place.
+    """Heights and sigmas of the grid (rows, columns), and the rows that are used: first, last and stride.
+
+    v_m: place along the bars to which the parameters refer.
     """
 
     z_m: Float32
@@ -37,11 +38,11 @@ class Heights(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """packing: (bars, 2), see `packing_axes`. free: (6,) figures that are sought. widths_m: least, most
-    allowed.
+    """Rules of a fit.
 
-    alike: heights that err as one. common_m: diameter known from elsewhere and its sigma, which
-    is infinite where none is known.
+    packing: (bars, 2), see `packing_axes`. free: (6,), the parameters to be estimated. widths_m: minimum and
+    maximum. alike: number of heights that share one error. common_m: diameter known from elsewhere and its
+    sigma, which is infinite where none is known.
     """
 
     packing: Float64
@@ -60,10 +61,10 @@ class Rules(NamedTuple):
 def fit_outline(
     heights: Heights, start: Float64, rules: Rules
 ) -> tuple[bool, Float64, Float64, Float64, float]:
-    """Fit: whether it held, the figures (6,), J'WJ with priors (6, 6), (count, sum w, chi squared), heights
-    alike.
+    """Fit an outline. Return success, parameters (6,), J'WJ with priors (6, 6), (count, sum w, chi squared),
+    and the number of heights that share one error, scaled by the observed variance.
 
-    It does not hold where fewer than 30 heights are left or the width leaves its bounds.
+    The fit fails where fewer than 30 heights are left or the width leaves its bounds.
     """
     values, alike = start.copy(), rules.alike
     normal, moments = np.eye(6), np.zeros(3)
@@ -74,7 +75,7 @@ def fit_outline(
         normal, right, moments = _normal_equations(heights, values, tables, rules.gate_m, rules.placing_m)
         if moments[0] < _MIN_HEIGHTS:
             return False, values, normal, moments, alike
-        # A height's sigma holds what all heights share, too: only what really scatters averages out.
+        # A height's sigma includes errors that all heights share; only the actual scatter averages out.
         alike = rules.alike * max(_MIN_SCATTER, moments[2] / moments[0])
         weight = alike / rules.common_m[1] ** 2
         normal[_DIAMETER, _DIAMETER] += weight
@@ -85,7 +86,7 @@ def fit_outline(
         if rules.free[_DIAMETER]:
             most = 0.05 * values[_DIAMETER]
             change[_DIAMETER] = min(max(change[_DIAMETER], -most), most + 1e-3)
-        # A step that turns back is too long: without damping many fits swing by millimetres for ever.
+        # A step that turns back was too long: without damping, many fits oscillate by millimetres forever.
         if before @ normal @ change < 0:
             damping /= 2
         before, change = change, damping * change
@@ -100,9 +101,9 @@ def fit_outline(
 
 @kernel()
 def _hold(normal: Float64, diameter: float, half: float) -> None:
-    """Add what keeps a step small where the map says nothing of a figure: weak against real evidence.
+    """Add weak priors that keep steps small where the map doesn't determine a parameter.
 
-    normal: (6, 6), added to. diameter: m. half: of the rows' length, m.
+    normal: (6, 6), added to. diameter: m. half: half the length of the rows, m.
     """
     slope = 0.1 / max(half, 0.1)
     sigmas = (0.05, slope, 0.05, slope, 0.3, 0.1 * diameter)
@@ -112,7 +113,7 @@ def _hold(normal: Float64, diameter: float, half: float) -> None:
 
 @kernel()
 def _step(normal: Float64, right: Float64, free: Bool) -> Float64:
-    """Solve for the change of the free figures, 0 of the others.
+    """Solve for the step of the free parameters; that of the others is 0.
 
     normal: (6, 6). right, free: (6,). Returns (6,).
     """
@@ -135,7 +136,8 @@ def _normal_equations(
 ) -> tuple[Float64, Float64, Float64]:
     """Form J'WJ (6, 6), J'Wr (6,) and (count, sum w, chi squared) of the heights under the outline.
 
-    Along one row the two slopes' columns are the places' times the way along: four sums per row make six.
+    Within a row, the derivatives by the two slopes are those by the places times the distance along the bars,
+    so four sums per row yield all six parameters.
     """
     normal, right = np.zeros((6, 6)), np.zeros(6)
     count = weight = chi2 = 0.0
@@ -146,7 +148,7 @@ def _normal_equations(
     for j in range(heights.first, heights.last + 1, heights.stride):
         along = heights.v0_m + cell * j - heights.v_m
         u = values[0] + values[1] * along - heights.u0_m
-        # Plain numbers stay in registers; an array's would be stored and loaded for each height.
+        # Scalars stay in registers; array elements would be stored and loaded for each height.
         uu = uz = ur = ud = zz = zr = zd = rr = rd = dd = 0.0
         side_u = side_z = side_r = side_d = 0.0
         first = max(int(np.ceil((u - inner) / cell - 0.5)), 0)
@@ -164,7 +166,7 @@ def _normal_equations(
             r = z - values[2] - values[3] * along - h
             if not (abs(r) < gate and abs(slope) < _STEEPEST and roll == roll and diameter == diameter):
                 continue
-            # Weights that jump as a cell comes in or goes would let the steps swing about the jump.
+            # If weights jumped as a cell enters or leaves, the steps would oscillate about the jump.
             within = min((inner - abs(cell * i - u)) / cell + 0.5, 1.0) * min(_STEEPEST - abs(slope), 1.0)
             tukey = within * (1 - (r / gate) ** 2) ** 2
             w = tukey / (heights.sigma_m[j, i] ** 2 + (slope * placing) ** 2)
@@ -187,10 +189,10 @@ def _normal_equations(
 def _add_row(
     normal: Float64, right: Float64, part: tuple[Four, Four, Four, Four], side: Four, along: float
 ) -> None:
-    """Spread a row's sums over place, height, roll and diameter to the figures U ... DIAMETER.
+    """Expand a row's sums over place, height, roll and diameter to the six parameters U ... DIAMETER.
 
-    part: (4, 4) and side: (4,), the row's sums. along: the row's way from the middle, m. Added to: normal
-    (6, 6), right (6,).
+    part: (4, 4) and side: (4,), the row's sums. along: distance of the row from the middle, m. Added to:
+    normal (6, 6), right (6,).
     """
     source = (0, 0, 1, 1, 2, 3)
     times = (1.0, along, 1.0, along, 1.0, 1.0)

@@ -32,9 +32,7 @@ _MAX_UNKNOWN_M = 0.6
 
 
 def extend_rows(grid: AlignedMap, fit: Fit, settings: BundleSettings, reach_m: float) -> Fit | None:
-    """Find how far the outline follows the map from the fit's rows on, at most reach_m further to either
-    side.
-    """
+    """Extend the fit's rows as far as the outline follows the map, at most reach_m beyond either end."""
     outline = make_outline(
         fit.rings, float(fit.values[DIAMETER]), float(fit.values[ROLL]), settings.smoothing_m
     )
@@ -57,10 +55,10 @@ def extend_rows(grid: AlignedMap, fit: Fit, settings: BundleSettings, reach_m: f
 
 @kernel()
 def _walk(state: UInt8, start: int, step: int, limit: int, runs: Float64) -> int:
-    """Find the last agreeing row before a run of others gets too long for its kind.
+    """Find the last agreeing row before too many rows of one other state have been passed.
 
     state: (rows,), of `_row_states`. start, step, limit: row to begin with, 1 or -1, last row. runs: (5,)
-    longest run of each kind, rows.
+    maximum number of rows of each state after the last agreeing one.
     """
     last = start
     waiting = np.zeros(5)
@@ -81,7 +79,8 @@ def _walk(state: UInt8, start: int, step: int, limit: int, runs: Float64) -> int
 def _row_states(
     heights: Heights, values: Float64, seen: Float64, slope: Float64, reach: float, agreement: float
 ) -> tuple[UInt8, Float32]:
-    """Classify each row and count the cells it explains, over the parts of the outline that aren't steep.
+    """Classify each row and count the cells that it explains, over the parts of the outline that aren't
+    steep.
 
     values: (6,) of the fit. seen, slope: of the outline at -reach ... reach, m. agreement: m. Returns state
     and gain of all the grid's rows, 0 outside of first ... last.
@@ -130,7 +129,7 @@ def _row_states(
 
 
 def grow_outline(grid: AlignedMap, seed: Fit, settings: BundleSettings) -> Fit | None:
-    """Grow a short piece to the whole bundle: fit, follow, fit again until both ends stand still."""
+    """Grow a short piece to the whole bundle: fit and extend in turn until neither end moves."""
     fit = refine_outline(grid, seed, settings, steps=8, gate_m=3 * settings.agreement_m)
     if fit is None:
         return None

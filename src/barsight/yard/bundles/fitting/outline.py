@@ -1,4 +1,4 @@
-"""Compute a bundle's outline from above: the upper outline of round bars in a full hexagon or a triangle."""
+"""Compute a bundle's upper outline: that of round bars packed in a full hexagon or a triangle."""
 
 from __future__ import annotations
 
@@ -10,14 +10,17 @@ import numpy as np
 from barsight.core.arrays import Float64, Int64, kernel
 
 BARS_OF_RINGS = (1, 7, 19, 37, 61, 3)
-"""Bars of each packing: a full hexagon of 0, 1, 2, ... rings around the middle bar, then the triangle."""
+"""Number of bars of each packing: a full hexagon of 0, 1, 2, ... rings around the middle bar, then a
+triangle.
+"""
 TRIANGLE = 5
-"""In place of a number of rings: one bar on two, as thick bars are strapped."""
+"""Code used instead of a number of rings for a triangle: one bar on two, as thick bars are strapped."""
 TRIANGLE_BARS_M = (0.06, 0.12)
-"""Diameters of its bars: thinner ones' shoulders are lost in a map's smoothing, thicker ones are bundles of
-their own, piled up."""
+"""Minimum and maximum diameter (m) of a triangle's bars: the shoulders of thinner ones are lost in the map's
+smoothing, and thicker ones are bundles of their own that are piled up.
+"""
 LOOSENESS = 1.003
-"""Distance of neighbouring axes over the diameter: bars are never quite straight."""
+"""Distance between neighbouring axes in diameters: bars are never quite straight."""
 STEP_M = 0.001
 _ROLL_STEP_RAD = float(np.radians(1.0))
 _DIAMETER_STEP = 0.01
@@ -25,7 +28,7 @@ _DIAMETER_STEP = 0.01
 
 @lru_cache(maxsize=8)
 def packing_axes(rings: int) -> Float64:
-    """Compute axes of the packing (bars, 2), sideways and up, in diameters, a row lying level."""
+    """Compute the axes of the packing (bars, 2), sideways and up, in diameters, with a row of bars level."""
     if rings == TRIANGLE:
         rise = np.sqrt(0.75) / 2
         return LOOSENESS * np.array([(-0.5, -rise), (0.5, -rise), (0.0, rise)])
@@ -39,24 +42,24 @@ def packing_axes(rings: int) -> Float64:
 
 
 def turned_packing(rings: int, diameter_m: float, roll_rad: float) -> Float64:
-    """Compute axes (bars, 2) in m, the packing rolled clockwise by roll_rad as seen along the bundle."""
+    """Compute the axes (bars, 2) in m of the packing rolled clockwise by roll_rad as seen
+    along the bundle.
+    """
     return _turned(packing_axes(rings), diameter_m, roll_rad)
 
 
 def bundle_width(rings: int, diameter_m: float) -> float:
-    """Compute the diameter of the circle around all bars."""
+    """Compute the diameter (m) of the circle around all bars."""
     return diameter_m * (1 + LOOSENESS * (1 if rings == TRIANGLE else 2 * rings))
 
 
 def period_rad(rings: int) -> float:
-    """Return the turn after which the packing looks the same."""
+    """Return the rotation after which the packing looks the same."""
     return 2 * np.pi / 3 if rings == TRIANGLE else np.pi / 3
 
 
 def highest_bars(axes_m: Float64, radius_m: float, u_m: Float64) -> tuple[Int64, Float64]:
-    """Find for each place the bar that is highest there, -1 where none is, and its height (-inf
-    where none).
-    """
+    """Find the highest bar at each lateral place, and its height there; -1 and -inf where there is none."""
     inside = radius_m**2 - (u_m[:, None] - axes_m[:, 0]) ** 2
     heights = np.where(inside > 0, axes_m[:, 1] + np.sqrt(np.maximum(inside, 0)), -np.inf)
     top: Float64 = heights.max(axis=1)
@@ -65,9 +68,10 @@ def highest_bars(axes_m: Float64, radius_m: float, u_m: Float64) -> tuple[Int64,
 
 @dataclass(frozen=True, eq=False)
 class Outline:
-    """Heights over the bundle's axis at sideways places -reach_m ... reach_m, STEP_M apart; odd in number.
+    """Heights over the bundle's axis at lateral places -reach_m ... reach_m, STEP_M apart; odd in number.
 
-    exact_m: NaN beyond the outermost bar. seen_m: as a map with `smoothing_m` shows it. slope: of seen_m.
+    exact_m: NaN beyond the outermost bar. seen_m: as it appears in a map smoothed by `smoothing_m`. slope:
+    that of seen_m.
     """
 
     reach_m: float
@@ -85,10 +89,11 @@ def make_outline(rings: int, diameter_m: float, roll_rad: float, smoothing_m: fl
 
 @kernel()
 def _trace(axes: Float64, radius: float, sigma: float) -> tuple[Float64, Float64, Float64]:
-    """Trace the outline, its Gaussian mean over the part that is there, and that mean's slope, at -half ...
+    """Trace the outline, its Gaussian mean over the part that exists, and that mean's slope, at -half ...
     half.
 
-    axes: (bars, 2) sideways and up, m. radius, sigma: m. Returns three arrays (N,), STEP_M apart, NaN beside.
+    axes: (bars, 2) sideways and up, m. radius, sigma: m. Returns three arrays (N,), STEP_M apart, NaN where
+    there is no bar.
     """
     half = int(np.ceil((np.abs(axes[:, 0]).max() + radius) / STEP_M)) + 1
     size = 2 * half + 1
@@ -121,8 +126,10 @@ def _trace(axes: Float64, radius: float, sigma: float) -> tuple[Float64, Float64
 
 @kernel(inline=True)
 def add_weighted(sums: Float64, values: Float64, weight: float) -> None:
-    """Add weighted values (N,) to sums (N,): pieces of arrays from 0 on, or else the compiler must check for
-    places before the first and adds one at a time.
+    """Add weighted values (N,) to sums (N,).
+
+    Pass slices that begin at 0: otherwise the compiler has to check for negative indices, and adds the values
+    one at a time.
     """
     for i in range(sums.size):
         sums[i] += weight * values[i]
@@ -130,8 +137,8 @@ def add_weighted(sums: Float64, values: Float64, weight: float) -> None:
 
 @kernel()
 def trace_with_changes(packing: Float64, diameter: float, roll: float, sigma: float) -> Float64:
-    """Trace `packing`'s seen outline (4, N) (see `packing_axes`), its slope, its change by roll and by
-    diameter.
+    """Trace the visible outline of `packing` (see `packing_axes`): heights, slope, and derivatives by roll
+    and by diameter (4, N).
     """
     _, seen, slope = _trace(_turned(packing, diameter, roll), diameter / 2, sigma)
     _, rolled, _ = _trace(_turned(packing, diameter, roll + _ROLL_STEP_RAD), diameter / 2, sigma)

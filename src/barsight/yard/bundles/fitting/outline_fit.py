@@ -20,13 +20,15 @@ from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.fitting.settings import BundleSettings
 
 U, SLOPE_U, Z, SLOPE_Z, ROLL, DIAMETER = range(6)
-"""Figures of a fit: place across, its slope along, height of the axis, its slope, roll, bars' diameter."""
+"""Indices of a fit's parameters: lateral place, its slope along, height of the axis, its slope, roll,
+diameter.
+"""
 UNKNOWN, AGREES, ABOVE, BELOW, MIXED = range(5)
-"""What a row of the map says of a bundle's outline."""
+"""States of a row of the map compared with a bundle's outline."""
 _ROWS_ENOUGH = 150
-"""Neighbouring rows err alike, so more of them than this only cost time."""
+"""Number of rows beyond which more only cost time, since errors of neighbouring rows are correlated."""
 _HALF_STEPS = 3
-"""Gauss-Newton steps from the whole bundle's outline to that of a half."""
+"""Number of Gauss-Newton steps from the whole bundle's outline to that of a half."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +36,7 @@ class Fit:
     """An outline that follows the map from row `first` to row `last` of its grid.
 
     values: (6,) at v_m, see U ... DIAMETER; covariance: (6, 6). state: (rows,) of the whole grid. gain:
-    (rows,) cells explained, 0 where the row doesn't agree. rms_m: of the heights about the outline.
+    (rows,) cells explained, 0 where the row doesn't agree. rms_m: weighted RMS of the heights' residuals.
     """
 
     rings: int
@@ -50,7 +52,7 @@ class Fit:
 
     @property
     def bars(self) -> int:
-        """Return the bars of the packing."""
+        """Return the number of bars in the packing."""
         return BARS_OF_RINGS[self.rings]
 
     @property
@@ -59,14 +61,14 @@ class Fit:
         return bundle_width(self.rings, self.values[DIAMETER])
 
     def at(self, v_m: float) -> tuple[float, float]:
-        """Compute the place across and height of the axis at v_m."""
+        """Compute the lateral place and the height of the axis at v_m."""
         along = v_m - self.v_m
         return self.values[U] + self.values[SLOPE_U] * along, self.values[Z] + self.values[SLOPE_Z] * along
 
 
 @dataclass(frozen=True, eq=False)
 class ShadeProfile:
-    """Logarithms of gray levels (N,) at places (N,) across a bundle from its axis: medians along it."""
+    """Logarithms of gray levels (N,) at lateral places (N,) from a bundle's axis: medians along the bars."""
 
     places_m: Float64
     levels: Float64
@@ -74,10 +76,10 @@ class ShadeProfile:
 
 @dataclass(frozen=True, eq=False)
 class FittedOutline:
-    """A fitted outline and the grid that its figures belong to.
+    """A fitted outline and the grid that its parameters refer to.
 
-    shades: what the pictures show of its bars, where they settle the packing. doubt: rings of another packing
-    that the pictures would rather have, where they don't settle it.
+    shades: gray levels across its bars, where they settle the packing. doubt: rings of another packing that
+    the gray levels favour, where they don't settle it.
     """
 
     grid: AlignedMap
@@ -94,10 +96,12 @@ def refine_outline(
     gate_m: float | None = None,
     common: tuple[float, float] | None = None,
 ) -> Fit | None:
-    """Run Gauss-Newton over the rows first ... last; None where the outline leaves the map or degenerates.
+    """Refine a fit by Gauss-Newton over rows first ... last; None where the outline leaves the map or
+    degenerates.
 
-    The weight of a height falls with its sigma, with the outline's slope (it may lie beside its place) and,
-    by Tukey's biweight, with its misfit over `gate_m`. common: diameter and sigma known from elsewhere.
+    The weight of a height falls with its sigma, with the outline's slope (its lateral position is uncertain)
+    and, by Tukey's biweight, with the ratio of its residual to `gate_m`. common: diameter known from
+    elsewhere, and its sigma.
     """
     rows = (max(start.first, 0), min(start.last, grid.z_m.shape[0] - 1))
     v_m = grid.v0_m + grid.cell_m * (rows[0] + rows[1]) / 2
@@ -140,10 +144,10 @@ def refine_outline(
 
 
 def compare_halves(one: FittedOutline, settings: BundleSettings) -> tuple[float, float]:
-    """Fit both halves of a bundle alone: how far apart their slopes are, 4 b / L of bars of length L that bow
-    by b, and how far the mean of both is off the whole's.
+    """Fit the halves of a bundle separately. Return the difference of their slopes, which is 4 b / L for bars
+    of length L that bow by b, and how far the mean of both slopes is off the whole bundle's.
 
-    A half that holds no outline alone may bow by all that agrees with the whole's.
+    If a half can't be fitted alone, the bars may bow by as much as heights may differ and still agree.
     """
     fit, middle = one.fit, (one.fit.first + one.fit.last) // 2
     finer = replace(settings, slice_m=settings.slice_m / 2)
@@ -158,9 +162,9 @@ def compare_halves(one: FittedOutline, settings: BundleSettings) -> tuple[float,
 
 
 def widen_fit(fit: Fit, settings: BundleSettings) -> Fit:
-    """Add the error of the width that the map's smoothing leaves: it moves the axis, not the top.
+    """Add the error of the width due to the map's smoothing: it moves the axis, but not the top.
 
-    A single bar's top is half as sure: its highlight is measured as far behind as its flanks grow.
+    For a single bar, half of it goes to the top: its highlight is measured as far back as its flanks grow.
     """
     share = settings.packing_error_ratio if fit.rings else settings.single_error_ratio
     top_m = float(np.nanmax(make_outline(fit.rings, fit.values[DIAMETER], fit.values[ROLL], 0.0).exact_m))

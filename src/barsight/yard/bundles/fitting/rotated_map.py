@@ -1,4 +1,4 @@
-"""Resample the height map along one heading: measured heights only, the bars running along the rows' axis."""
+"""Resample the height map along a heading, measured heights only, so that the bars run along the v axis."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class AlignedMap:
     """Measured heights [v, u] in a frame turned by heading_rad from the map's, counter-clockwise about Z.
 
     Cell (row, column) has its centre at u = u0_m + column * cell_m across, v = v0_m + row * cell_m along.
-    z_m, sigma_m: float32, NaN where not measured (filled cells are none). Heights up to stock_over_m are
-    floor.
+    z_m, sigma_m: float32, NaN where not measured; filled cells don't count as measured. Heights up to
+    stock_over_m are floor.
     """
 
     heading_rad: float
@@ -31,21 +31,21 @@ class AlignedMap:
     stock_over_m: float
 
     def to_map(self, uv_m: Float64) -> Float64:
-        """Convert places u, v (N, 2) to x, y of the map."""
+        """Convert positions u, v (N, 2) to x, y of the map."""
         c, s = np.cos(self.heading_rad), np.sin(self.heading_rad)
         turned: Float64 = uv_m @ np.array([[c, s], [-s, c]])
         return turned
 
     def from_map(self, xy_m: Float64) -> Float64:
-        """Convert places x, y of the map (N, 2) to u, v."""
+        """Convert positions x, y of the map (N, 2) to u, v."""
         c, s = np.cos(self.heading_rad), np.sin(self.heading_rad)
         turned: Float64 = xy_m @ np.array([[c, -s], [s, c]])
         return turned
 
 
 def align_map(height_map: HeightMap, heading_rad: float, stock_over_m: float = -np.inf) -> AlignedMap:
-    """Rotate the map's measured heights into a frame whose v axis is (-sin heading, cos heading); nearest
-    cells.
+    """Rotate the map's measured heights, by nearest cells, into a frame whose v axis is (-sin heading, cos
+    heading).
     """
     cell = height_map.cell_m
     if heading_rad == 0.0:
@@ -60,7 +60,7 @@ def align_map(height_map: HeightMap, heading_rad: float, stock_over_m: float = -
     u, v = c * x + s * y, -s * x + c * y
     width, height = (round(float(np.ptp(a)) / cell) + 1 for a in (u, v))
     z, sigma = np.full((2, height, width), np.nan, np.float32)
-    # From cell (row, column) of the grid to that of the map, about both first cells.
+    # Convert cell (row, column) of the grid to that of the map, relative to the first cell of each.
     first_x, first_y = c * u.min() - s * v.min(), s * u.min() + c * v.min()
     first = np.array([(first_x - height_map.x0_m) / cell, (first_y - height_map.y0_m) / cell])
     _turned(height_map.z_m, height_map.sigma_m, height_map.source, first, float(c), float(s), z, sigma)
@@ -78,10 +78,10 @@ def _turned(
     z_turned: Float32,
     sigma_turned: Float32,
 ) -> None:
-    """Fill in, cell by cell, what was measured: whole arrays of places would be ten times the map.
+    """Fill in the measured cells one by one: whole arrays of positions would take ten times the map's memory.
 
-    z, sigma, source: maps (rows, columns). first: (2,) column and row, in their cells, of the first cell that
-    is filled. Fills z_turned and sigma_turned (V, U), m.
+    z, sigma, source: maps (rows, columns). first: (2,) column and row, in their cells, of the first cell to
+    be filled. Fills z_turned and sigma_turned (V, U), m.
     """
     for i in range(z_turned.shape[0]):
         for j in range(z_turned.shape[1]):

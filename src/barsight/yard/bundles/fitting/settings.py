@@ -1,4 +1,4 @@
-"""Define the settings of finding bundles."""
+"""Define the settings for finding bundles."""
 
 from __future__ import annotations
 
@@ -11,53 +11,56 @@ from barsight.core.settings.values import NOT_NEGATIVE, OVER_0, POSITIVE, expect
 
 @dataclass(frozen=True)
 class BundleSettings:
-    """Settings of finding bundles of round bars, or single heavy bars, in the height map."""
+    """Settings for finding bundles of round bars, or single heavy bars, in the height map."""
 
     catalogue_mm: tuple[float, ...] = ()
-    """All diameters of bars that may lie here; any diameter when not given. Lifts count on that."""
+    """All bar diameters (mm) that may lie in the yard; any diameter if not given. Lifts rely on this list."""
     stock_list: Path | None = None
-    """CSV or JSON of the bundles that should lie here, to be held against those found."""
+    """CSV or JSON file of the bundles that should be in the yard, to be compared with those found."""
     min_length_m: float = 0.5
-    """Shorter pieces aren't reported."""
+    """Minimum length of a bundle; shorter pieces aren't reported."""
     min_bar_diameter_m: float = 0.014
-    """Thinnest bars in a bundle."""
+    """Minimum diameter of the bars in a bundle."""
     min_single_diameter_m: float = 0.06
-    """Thinnest bar that counts as a bundle of its own."""
+    """Minimum diameter of a single bar that counts as a bundle of its own."""
     min_width_m: float = 0.09
-    """Narrowest bundle of several bars."""
+    """Minimum width of a bundle of several bars."""
     max_width_m: float = 0.6
-    """Widest bundle."""
+    """Maximum width of a bundle."""
     slice_step_m: float = 1.0
-    """Bundles are first looked for in cross-sections this far apart."""
+    """Distance between the cross-sections in which bundles are first searched for."""
     slice_m: float = 0.2
-    """Length of the bundle that one cross-section averages."""
+    """Length along the bars over which one cross-section is averaged."""
     max_skew_deg: float = 4.0
-    """Bundles turned further from their neighbours are looked for as a heading of their own."""
+    """Maximum angle between bundles of one heading; bundles turned further are searched for separately."""
     agreement_m: float = 0.015
-    """A height within this of the bundle's outline agrees with it."""
+    """Maximum distance between a measured height and the bundle's outline for the two to agree."""
     smoothing_m: float = 0.006
     """Standard deviation of the map's smoothing across the bars."""
     placing_m: float = 0.004
-    """How far a height may lie beside its place: it counts the less the steeper the outline is there."""
+    """Lateral uncertainty of a height's position: the steeper the outline is there, the less the height
+    weighs.
+    """
     correlated_along_m: float = 0.5
-    """Errors of heights along a bar are alike over this distance."""
+    """Distance along the bars over which errors of heights are correlated."""
     correlated_across_m: float = 0.03
-    """Errors of heights across the bars are alike over this distance."""
+    """Distance across the bars over which errors of heights are correlated."""
     shared_lateral_m: float = 0.0018
-    """Error of place that all heights of a bundle share, mostly the trajectory's (one standard deviation)."""
+    """Standard deviation of the lateral error that all heights of a bundle share, mostly the trajectory's."""
     shared_yaw_deg: float = 0.03
-    """Error of direction that all of the map shares (one standard deviation): over a short way encoders can't
-    tell a rail's wave from a turn."""
+    """Standard deviation of the heading error that the whole map shares: over a short distance, encoders
+    can't distinguish a wavy rail from a turn.
+    """
     shared_height_m: float = 0.001
-    """The same of height, but for the calibration's part, which moves the whole map."""
+    """Standard deviation of the height error that the whole map shares, without the calibration's part."""
     packing_error_ratio: float = 0.025
-    """Error of a bundle's width that the map's smoothing leaves, as a share."""
+    """Error of a bundle's width due to the map's smoothing, as a fraction of the width."""
     single_error_ratio: float = 0.05
-    """The same for a single bar, whose flanks a map shows too wide."""
+    """The same for a single bar, whose flanks look too wide in a map."""
     max_cell_m: float = 0.025
-    """In a map of larger cells no bundles are looked for."""
+    """Maximum cell size of a map in which bundles are searched for."""
     min_rise_m: float = 0.03
-    """Heights nearer to the floor than this are floor."""
+    """Height over the floor up to which a surface counts as floor."""
 
     def __post_init__(self) -> None:
         expect_ranges(

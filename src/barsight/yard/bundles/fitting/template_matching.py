@@ -1,4 +1,4 @@
-"""Match cross-sections of the map to the outlines of all bundles that may lie there."""
+"""Match cross-sections of the map to the outlines of all bundles that may be in the yard."""
 
 from __future__ import annotations
 
@@ -29,12 +29,14 @@ _KNOWN = 0.55
 _RIM_M = 0.004
 _BEYOND_M = 0.01
 _BLOCK = 64
-"""Columns that one thread compares with all outlines: they stay in its nearest cache."""
+"""Number of columns that one thread compares with all outlines: they fit in its nearest cache."""
 
 
 @dataclass(frozen=True)
 class BundleCandidate:
-    """A bundle that may cross the section at v_m: place, axis height, kind. gain: cells it explains."""
+    """A bundle that may cross the section at v_m: place, height of the axis, kind. gain:
+    cells it explains.
+    """
 
     v_m: float
     u_m: float
@@ -47,7 +49,8 @@ class BundleCandidate:
 
 @dataclass(frozen=True, eq=False)
 class Templates:
-    """Outlines sampled in cells. kinds: (T, 3) rings, diameter, roll. offsets: cells before the middle, (T,).
+    """Outlines sampled in cells. kinds: (T, 3) rings, diameter, roll. offsets: (T,) first cell from the
+    middle.
 
     heights: (T, widest) float32 over the axis, NaN past the end. phase: (T,) shift of the axis in cells.
     """
@@ -60,8 +63,8 @@ class Templates:
 
 
 def cross_section(grid: AlignedMap, v_m: float, length_m: float) -> Float32:
-    """Compute the median height (columns,) of each column over `length_m` about v_m; NaN where unknown, and
-    on floor.
+    """Compute the median height (columns,) of each column over `length_m` about v_m; NaN where unknown and
+    on the floor.
     """
     first = round((v_m - length_m / 2 - grid.v0_m) / grid.cell_m)
     rows = max(round(length_m / grid.cell_m), 1)
@@ -76,7 +79,7 @@ def cross_section(grid: AlignedMap, v_m: float, length_m: float) -> Float32:
 
 
 def make_templates(settings: BundleSettings, cell_m: float) -> Templates:
-    """Make all kinds of bundles that the settings allow, diameters 6 % apart (or the catalogue's)."""
+    """Sample the outlines of all bundles that the settings allow: diameters 6 % apart, or the catalogue's."""
     kinds, phases, samples = [], [], []
     for rings in range(len(BARS_OF_RINGS)):
         rolls = period_rad(rings) * np.arange(_ROLLS) / _ROLLS if rings else np.zeros(1)
@@ -120,8 +123,8 @@ def _diameters(rings: int, settings: BundleSettings) -> list[float]:
 def propose_candidates(
     grid: AlignedMap, templates: Templates, v_m: float, settings: BundleSettings
 ) -> list[BundleCandidate]:
-    """Propose bundles that may cross the section at v_m, the best first: local best of each number
-    of rings.
+    """Propose bundles that may cross the section at v_m, best first: the local maxima of each number of
+    rings.
     """
     profile = cross_section(grid, v_m, settings.slice_m)
     if not np.isfinite(profile).any():
@@ -147,7 +150,7 @@ def propose_candidates(
 
 
 def _peaks(gain: Float32) -> list[int]:
-    """Find columns that no other within 30 mm or so beats."""
+    """Find the columns whose gain is no smaller than any within three cells."""
     reach = 3
     padded = np.pad(gain, reach, constant_values=-np.inf)
     best = np.max([padded[k : k + gain.size] for k in range(2 * reach + 1)], axis=0)
@@ -158,10 +161,10 @@ def _match(
     profile: Float32, heights: Float32, offsets: Int64, lengths: Int64, of_class: Int64, classes: int,
     agreement: float,
 ) -> tuple[Float32, Float32, Int64]:  # fmt: skip
-    """Match (classes, columns): gain in cells of the best template about each column, its axis height, its
-    number.
+    """Match templates to a profile. Return three arrays (classes, columns), about each column: gain of the
+    best template in cells, height of its axis, its number.
 
-    Each known cell gains 1 - (misfit / agreement)^2, at least -1.
+    Each known cell gains 1 - (misfit / agreement)^2, but at least -1.
     """
     shape = classes, profile.size
     best = (
@@ -182,8 +185,8 @@ def _match_blocks(
     profile: Float32, surface: Float32, seen: Float32, known_before: Int64, heights: Float32, offsets: Int64,
     lengths: Int64, of_class: Int64, agreement: float, best: tuple[Float32, Float32, Int64],
 ) -> None:  # fmt: skip
-    """Match as `_match` does, into `best`. surface: the profile, 0 where unknown; seen: 1 where known, else
-    0; known_before: its sums from 0 on.
+    """Match into `best` as `_match` does. surface: the profile, 0 where unknown; seen: 1 where known, else 0;
+    known_before: cumulative sums of seen, starting with 0.
 
     profile, surface (m), seen: (columns,); known_before: (columns + 1,). heights: (T, widest) m; offsets,
     lengths, of_class: (T,). best: gain, height (m) and template's number, (classes, columns).
@@ -214,9 +217,9 @@ def _match_blocks(
 
 @kernel()
 def _bounds(profile: Float32, template: Float32) -> tuple[float, float]:
-    """Bound the height of the profile over the template at five places; inf, -inf where unknown.
+    """Bound the height of the profile over the template by five samples; inf, -inf where all are unknown.
 
-    profile: (N,) m. template: (N,) m over the axis, or more.
+    profile: (N,) m. template: (N,) m over the axis, or longer.
     """
     low, high = np.inf, -np.inf
     for q in range(5):
@@ -231,11 +234,11 @@ def _bounds(profile: Float32, template: Float32) -> tuple[float, float]:
 def _compare(
     surface: Float32, seen: Float32, template: Float32, known: int, low: float, high: float, agreement: float
 ) -> tuple[float, float]:
-    """Compute height of the axis and gain of a template laid on a piece of the profile.
+    """Compute the height of the axis and the gain of a template placed on a piece of the profile.
 
-    surface: 0 where unknown; seen: 1 where known, else 0. All is finite, so sums may run in any order.
-    surface, seen: (N,); template: (N,) m over the axis, or more. known: sum of seen. low, high: bounds of the
-    height, m.
+    surface: 0 where unknown; seen: 1 where known, else 0. All values are finite, so sums may run in any
+    order. surface, seen: (N,); template: (N,) m over the axis, or longer. known: sum of seen. low, high:
+    bounds of the height, m.
     """
     one, nothing = np.float32(1.0), np.float32(0.0)
     least, most, gate = np.float32(low), np.float32(high), np.float32(1.5 * agreement)

@@ -1,1 +1,1 @@
-"""Read a bundle's cross-section: its heights and flanks, its shades, and the straps that hold it."""
+"""Read a bundle's cross-section: its heights and flanks, its gray levels, and the straps that hold it."""

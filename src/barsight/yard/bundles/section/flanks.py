@@ -1,4 +1,4 @@
-"""See a bundle's flanks: how far it falls off on either side, and what may lie over them."""
+"""Measure a bundle's flanks: how far it falls off on either side, and what may lie over them."""
 
 from __future__ import annotations
 
@@ -12,24 +12,31 @@ from barsight.yard.bundles.section.seen_section import agreeing_rows, mean_secti
 from barsight.yard.types import Doubt, DoubtKind
 
 _CREST_RATIO = 0.35
-"""Of the width, to either side of its middle: where a bundle is highest."""
+"""Maximum distance of the crest, a bundle's highest place, from the middle, in widths."""
 _FLANK_RATIOS = 0.3, 0.5, 0.55
-"""Of the width, from its middle: where a bundle falls off, its edge, and how far a map may grow over that."""
+"""Distances from a bundle's middle, in widths: where it begins to fall off, its edge, and how far a map may
+extend the flank over the edge.
+"""
 _BEYOND_M = 0.15
-"""Largest distance from its edge of a neighbour that may lie over it."""
+"""Maximum distance (m) beyond a bundle's edge of a neighbour that may lie over it."""
 _FLAT_RATIO, _SHALLOW_RATIO, _SURE_RATIO, _HIGHER_M = 0.1, 0.18, 0.3, 0.03
-"""Of the width: a flank that falls less is not seen; nor is one that falls less than the second beside what
-stands higher by so much, and below the third that isn't sure. What stands higher by the whole width is a
-stack on feet of its own."""
+"""Thresholds on a flank's fall, in widths, and on a neighbour's rise over the crest (m).
+
+A flank that falls by less than the first isn't seen. Beside a neighbour that rises by more than the last,
+neither is one that falls by less than the second, and one that falls by less than the third isn't certain.
+A neighbour that rises by the whole width is a separate stack.
+"""
 
 
 @dataclass(frozen=True)
 class Flanks:
-    """Flanks on the low and the high side. falls_m: from the crest to the lowest place of each, inf where it
-    falls to the floor or out of sight, 0 where what hides all of it stands higher; rises_m: from the crest to
-    the highest place beside it, -inf where nothing is seen. are_flat: neither falls off before its edge, as a
-    plate, a cart or a wall does not. ended: on which sides straps show where the bundle ends, however little
-    it falls there.
+    """Flanks on the low and the high side.
+
+    falls_m: from the crest to the lowest place of each flank, inf where it falls to the floor or out of
+    sight, 0 where something higher hides all of it. rises_m: from the crest to the highest place beside each
+    flank, -inf where nothing is seen. are_flat: neither flank falls off before its edge, as with a plate, a
+    cart or a wall. ended: the sides on which straps show where the bundle ends, however little it falls
+    there.
     """
 
     width_m: float
@@ -40,12 +47,12 @@ class Flanks:
 
     @property
     def doubt(self) -> Doubt | None:
-        """Say that something may lie over a flank; None where both are seen."""
+        """Return the doubt that something may lie over a flank; None where both are seen."""
         return self._doubt(_SHALLOW_RATIO)
 
     @property
     def cover_doubt(self) -> Doubt | None:
-        """Say the same of a flank that isn't seen for sure."""
+        """Return the same doubt for a flank that isn't seen with certainty."""
         return self._doubt(_SURE_RATIO)
 
     def _doubt(self, shallow_ratio: float) -> Doubt | None:
@@ -63,7 +70,7 @@ class Flanks:
 
 def seen_flanks(one: FittedOutline, low_m: float, high_m: float) -> Flanks | None:
     """Measure the flanks of a bundle from low_m to high_m beside an outline's axis; None where too few rows
-    agree with it or its crest isn't seen.
+    agree with the outline or the crest isn't seen.
     """
     rows = agreeing_rows(one.fit)
     if rows.size < 3:
@@ -81,8 +88,9 @@ def seen_flanks(one: FittedOutline, low_m: float, high_m: float) -> Flanks | Non
 
 
 def _flank(outwards: Float64, level: Float64, crest: float, width: float) -> tuple[float, float, float]:
-    """Compute how far one side falls before its edge; how far with what a map grows over that, inf where to
-    the floor or out of sight, 0 where what hides it all stands higher; and how far what lies beyond rises.
+    """Measure one side from the crest (m): the fall before its edge; the fall including what a map extends
+    over it, inf where that goes to the floor or out of sight, 0 where something higher hides the whole flank;
+    and the rise of what lies beyond.
     """
     first, edge, last = (ratio * width for ratio in _FLANK_RATIOS)
     inner = level[(outwards > first) & (outwards < edge)]

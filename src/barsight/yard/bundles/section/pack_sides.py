@@ -13,43 +13,55 @@ from barsight.yard.bundles.section.seen_section import is_overhung, unseen_place
 from barsight.yard.bundles.section.strap_lines import FLOOR_M, GULLY_M
 
 _FLANK_RATIO, _FLANK_DEPTH_M, _FLANK_M = 0.6, 0.15, 0.15
-"""Depth of a flank under the top, of the straps' width and at least; how far from them it is looked for."""
+"""Depth under the top that counts as a flank, the larger of a share of the straps' width and a minimum (m);
+distance from the straps within which a flank is searched for (m).
+"""
 _WIDEST_RATIO, _WIDEST_M = 0.6, 0.1
-"""Depth under the top, of the straps' width and at least, under which no pack is wider."""
+"""Depth under the top below which no pack gets wider: the larger of a share of the straps' width and a
+minimum (m).
+"""
 _LEDGE_SLOPE = 1.0
-"""A bar low at the side shows as a ledge: two steps in a row that fall by less than this slope."""
+"""Maximum slope of a ledge, as a low bar at the side shows: two successive steps that fall less steeply."""
 _PARTING_M, _PARTING_RATIO = 0.06, 0.3
-"""Least depth of a gully that parts two packs, whatever their straps, and of the straps' width; it is as deep
-as a bar is thick besides. Within 3757 packs as worlds draw them none is deeper than 86 mm; in 1956 of them
-than 1.7 bars of up to 25 mm, 1.05 of up to 60 mm, 0.85 of 80 to 100 mm."""
+"""Minimum depth of a gully that separates two packs, whatever their straps show: absolute (m) and as a share
+of the straps' width. It must also be as deep as a bar is thick. In 3757 simulated packs no gully is deeper
+than 86 mm; in 1956 of them none is deeper than 1.7 bars of up to 25 mm, 1.05 of up to 60 mm, or 0.85 of 80 to
+100 mm.
+"""
 _HIDDEN_CELLS = 12
-"""Largest number of places out of sight in a flank before the surface is seen to have fallen away."""
+"""Maximum number of places out of sight in a flank behind which the surface can be seen to
+have fallen away.
+"""
 _STEP_M, _DEEP_CELLS = 0.05, 2
-"""Least step that parts the bundle's lowest bars from another thing deep below; least number of places seen
-deep below that rule out an overhang."""
+"""Minimum step (m) that separates the bundle's lowest bars from something far below; minimum number of places
+seen that deep that rule out an overhang.
+"""
 _NEAR_M, _FAR_M = 0.08, 0.25
-"""Distances to another bundle's straps up to which the lowest place between parts both, and a single gully
-does."""
+"""Maximum distances (m) to another bundle's straps at which the lowest place between separates the two, and
+at which only a single gully does.
+"""
 _HIDDEN_DEPTH_M, _TWIN_M = 0.03, 0.012
-"""Depth added to places out of sight; least rise of the surface between two gullies."""
+"""Depth (m) assumed for places out of sight below their neighbours; minimum rise (m) between two gullies."""
 _STEEP_RATIO = 0.3
-"""Of the width: a flank that is seen to fall so far before it is out of sight hides little of the bundle."""
+"""Minimum fall, in widths, of a flank that then goes out of sight: what it hides of the bundle is little."""
 _DENT_M, _RIM_CELLS = 0.006, 8
-"""Least depth of the dent between two bundles that touch, under the highest of so many places on either side:
-a round surface that goes on is one bundle's, whatever lines are seen on it."""
+"""Minimum depth (m) of the dent between two bundles that touch, under the highest of this many places on
+either side. A round surface without a dent belongs to one bundle, whatever lines are seen on it.
+"""
 _HIGHER_M, _COVERED_RATIO = 0.03, 0.5
-"""Height over a pack's top from which a neighbour may lie over its flank, and fall of the flank, of the
-straps' width, from which it does not: a round pack is widest half its width under its top. What rises by more
-than the whole width is a stack on feet of its own."""
+"""Minimum rise (m) over a pack's top of a neighbour that may lie over its flank; minimum fall of the flank,
+in the straps' widths, that rules this out: a round pack is widest half its width under its top. A neighbour
+that rises by more than the whole width is a separate stack.
+"""
 _BEHIND_CELLS = 16
-"""Number of places behind a flank in which a neighbour that stands over it begins."""
+"""Number of places behind a flank within which a neighbour that stands over it must begin."""
 _RISES_M = 0.01
-"""Rise of the surface behind a flank from which it is a neighbour's."""
+"""Minimum rise (m) of the surface behind a flank for it to be a neighbour's."""
 
 
 class PackSide(IntEnum):
-    """Tell a side of a pack whose flank is seen from one where a neighbour begins that may lie over it, and
-    from one whose end isn't known.
+    """State of a pack's side: its flank is seen, a neighbour that may lie over it begins there, or the pack's
+    end isn't known.
     """
 
     SEEN = auto()
@@ -61,11 +73,11 @@ def find_side(
     outwards: Float64, inwards: Float64, begin: int | None, shared: bool | None, top: float, width_m: float,
     cell_m: float, thick_m: float,
 ) -> tuple[int, PackSide]:  # fmt: skip
-    """Find the last place of a bundle that is in sight on one side, and what is there.
+    """Find the last place of a bundle that is in sight on one side, and the state of that side.
 
     outwards, inwards: heights from the last place that its straps hold: NaN unseen, -inf floor. begin: places
-    to the next straps, None where there are none; shared: whether those lie in line with its own. top,
-    width_m: of what the straps hold. thick_m: the most that its bars may be, NaN unknown.
+    to the next straps, None where there are none; shared: whether those are in line with its own. top,
+    width_m: of the part that the straps hold. thick_m: maximum diameter of its bars, NaN if unknown.
     """
     deep = flank_depth(top, width_m)
     limit = round(_FLANK_M / cell_m)
@@ -104,7 +116,9 @@ def find_side(
 
 
 def hidden_places(outwards: Float64, last: int) -> int:
-    """Count the places out of sight behind a flank that ends at `last`, or as high a little further out."""
+    """Count the places out of sight behind a flank that ends at `last`, or at the same height slightly
+    further out.
+    """
     behind = outwards[last + 1 :]
     level = np.append(np.abs(behind - outwards[last]) <= _RISES_M, False)
     first = int(np.argmin(level))
@@ -112,16 +126,17 @@ def hidden_places(outwards: Float64, last: int) -> int:
 
 
 def flank_depth(top: float, width_m: float) -> float:
-    """Compute the height under which nothing is a pack's but what goes on there without a step. width_m: of
-    its straps."""
+    """Compute the height under which only what continues without a step belongs to a pack. width_m: of its
+    straps.
+    """
     return top - max(_FLANK_RATIO * width_m, _FLANK_DEPTH_M)
 
 
 def _parting(level: Float64, limit: int, top: float, min_depth_m: float) -> int | None:
-    """Find the bottom, within `limit` places, of the first gully where it sinks by `min_depth_m` under both
-    of its sides, as none does within one pack. Places out of sight count as no deeper than what is seen.
+    """Find the bottom, within `limit` places, of the first gully that is deeper than `min_depth_m` from both
+    of its sides, as no gully within a pack is. Places out of sight count as no deeper than what is seen.
 
-    None where there is none, or `min_depth_m` is NaN.
+    None where there is no such gully, or `min_depth_m` is NaN.
     """
     lowest, rises = 0, False
     for k, height in enumerate(level):
@@ -129,7 +144,7 @@ def _parting(level: Float64, limit: int, top: float, min_depth_m: float) -> int 
             if rises or k > limit:
                 return None
             lowest = k
-        # What was never seen is as low as can be: it is no depth under itself.
+        # An unseen place may be arbitrarily low, but it has no depth below itself.
         if not height <= level[lowest] and min(top, height) - level[lowest] >= min_depth_m:
             return lowest
         rises |= bool(height > level[lowest] + _RISES_M)
@@ -137,8 +152,8 @@ def _parting(level: Float64, limit: int, top: float, min_depth_m: float) -> int 
 
 
 def _adjoining(behind: Float64, bottom: float) -> Float64:
-    """Cut what lies behind a gully at its first wall where something lower shows before that, which rises
-    from the bottom: the wall stands beyond it.
+    """Cut the surface behind a gully at its first wall if something lower rises from the gully's bottom
+    before it: then the wall isn't adjacent to the gully.
     """
     walls = np.flatnonzero(np.diff(np.maximum(behind, -FLOOR_M), prepend=bottom) > _STEP_M)
     first = int(walls[0]) if walls.size else len(behind)
@@ -147,13 +162,13 @@ def _adjoining(behind: Float64, bottom: float) -> Float64:
 
 
 def _highest(level: Float64) -> float:
-    """Return the highest of the heights that are seen, -inf where none is."""
+    """Return the maximum of the seen heights, -inf where none is seen."""
     return float(level[np.isfinite(level)].max(initial=-np.inf))
 
 
 def _widest(level: Float64, deep: float, cell_m: float) -> int:
-    """Find the last place of a flank: where it goes on deeper than `deep` without a ledge, and so is smeared
-    by the map, the last before that.
+    """Find the last place of a flank. Where the flank continues deeper than `deep` without a ledge, the map
+    has smeared it, and the last place above that depth counts.
     """
     last = len(level) - 1
     deeper = np.flatnonzero(level < deep)
@@ -165,10 +180,11 @@ def _widest(level: Float64, deep: float, cell_m: float) -> int:
 
 
 def _fall(level: Float64, limit: int, deep: float) -> tuple[int, bool]:
-    """Walk outwards to the lowest place before the surface rises; whether it is seen to fall away there.
+    """Walk outwards to the lowest place before the surface rises; also return whether it is seen to fall away
+    there.
 
-    level: heights: NaN unseen, -inf floor. deep: height under which nothing belongs to the bundle but what
-    goes on there without a step.
+    level: heights: NaN unseen, -inf floor. deep: height under which only what continues without a step
+    belongs to the bundle.
     """
     lowest = 0
     for k in range(1, min(len(level), limit + 1)):
@@ -189,11 +205,11 @@ def _fall(level: Float64, limit: int, deep: float) -> tuple[int, bool]:
 
 
 def _gully(level: Float64, top: float, alone: bool) -> int | None:
-    """Find the bottom of the gully between a bundle's straps and another's: the place, None where none parts
-    them.
+    """Find the bottom of the gully between the straps of two bundles: its place, None where no gully
+    separates them.
 
-    level: heights from the last place of the ones to the first of the others. alone: the straps are so far
-    apart that it must be the only one, and deep.
+    level: heights from the last place of one bundle's straps to the first of the other's. alone: the straps
+    are so far apart that the gully must be the only one, and deep.
     """
     filled = _fill_hidden(level)
     bottom = int(np.argmin(filled))
@@ -207,7 +223,9 @@ def _gully(level: Float64, top: float, alone: bool) -> int | None:
 
 
 def _fill_hidden(level: Float64) -> Float64:
-    """Fill places out of sight, and floor, below the lower of their two neighbours; the first is seen."""
+    """Fill places out of sight, and floor, with heights below the lower of their two neighbours; the first
+    place must be seen.
+    """
     filled = level.copy()
     runs, count = ndimage.label(~np.isfinite(level))
     for number in range(1, count + 1):

@@ -1,4 +1,4 @@
-"""Extend what straps hold to its flanks: a pack, whose width is whole where both flanks are seen."""
+"""Extend the part that straps hold to its flanks: a pack, whose whole width is known where both are seen."""
 
 from __future__ import annotations
 
@@ -19,26 +19,29 @@ from barsight.yard.lift_settings import UPPER
 from barsight.yard.types import HeightMap
 
 _OWN_RATIO = 0.5
-"""Least overlap of straps and a fit, of the narrower one's width, for the straps to be the fit's own."""
+"""Minimum overlap of straps with a fit, in widths of the narrower one, for the straps to belong
+to the fit.
+"""
 _DIP_RATIO = 0.12
-"""Depth of a dip in a span, of its width, from which it may part two bundles whose straps lie in line."""
+"""Minimum depth of a dip, in widths of its span, that may separate two bundles whose straps are in line."""
 _SPREAD_M = 0.03
-"""Median distance between the straps' ends from which the pack's is open."""
+"""Maximum median distance (m) between the straps' ends for the pack's bounds to be known."""
 _IN_LINE_M = 0.018
-"""Along the bars: largest distance between the two halves of one strap where they meet."""
+"""Maximum distance (m), along the bars, between the two halves of one strap where they meet."""
 _MIN_WIDTH_BARS = 1.5
-"""Least width of what straps hold, in its bars."""
+"""Minimum width of a strapped pack, in diameters of its bars."""
 _BEYOND_M = 0.03
-"""Distance of straps beyond an outline, or of others' into it, from which they speak against it."""
+"""Distance (m) by which straps beyond an outline, or others' straps inside it, contradict the outline."""
 
 
 @dataclass(frozen=True)
 class Pack:
-    """Bars that straps hold, with their flanks: from low_m to high_m beside a fit's axis. span: of the straps
-    themselves; others_m: where other bundles' begin on either side, infinite where none do. top_m: highest
-    place over the axis; sides: the low and the high one. diameter_m: of its bars by the dark lines along it,
-    NaN where they aren't seen. hidden_m: how far nothing was seen behind the low and the high flank: bars may
-    bulge there.
+    """Bars that straps hold, with their flanks: from low_m to high_m beside a fit's axis.
+
+    span: width of the straps themselves; others_m: where other bundles' straps begin on either side, infinite
+    where there are none. top_m: highest place over the axis; sides: the low and the high one. diameter_m: of
+    its bars by the dark lines along it, NaN where these aren't seen. hidden_m: length out of sight behind the
+    low and the high flank, where bars may bulge.
     """
 
     low_m: float
@@ -52,12 +55,12 @@ class Pack:
 
     @property
     def sides_seen(self) -> bool:
-        """Check whether both flanks sink before a neighbour begins: the width is whole."""
+        """Check whether both flanks fall off before a neighbour begins, so that the whole width is known."""
         return self.sides == (PackSide.SEEN, PackSide.SEEN)
 
     @property
     def is_bounded(self) -> bool:
-        """Check whether it is known on both sides how far the pack is in sight."""
+        """Check whether the extent of the visible pack is known on both sides."""
         return PackSide.OPEN not in self.sides
 
     @property
@@ -72,7 +75,7 @@ class Pack:
 
 
 def strapped_pack(height_map: HeightMap, grid: AlignedMap, fit: Fit) -> Pack | None:
-    """Find what straps hold together over a fit's axis; None where none are seen."""
+    """Find the pack that straps hold together over a fit's axis; None where no straps are seen."""
     rows = agreeing_rows(fit)
     if height_map.gray is None or rows.size < MIN_ROWS:
         return None
@@ -87,7 +90,7 @@ def strapped_pack(height_map: HeightMap, grid: AlignedMap, fit: Fit) -> Pack | N
     if pack is None or not pack.is_bounded:
         return pack and replace(pack, diameter_m=thick)
     pack = replace(pack, diameter_m=bar_diameter(height_map, grid, fit, pack.low_m, pack.high_m))
-    # Straps hold several bars: where no line parts any, what is in sight may be the topmost of thick ones.
+    # Straps hold several bars: where no dark line shows, the visible one may be the top one of several.
     one_bar = fit.rings == 0 and math.isnan(pack.diameter_m)
     if one_bar and pack.width_m < _MIN_WIDTH_BARS * float(fit.values[DIAMETER]):
         return replace(pack, sides=(PackSide.OPEN, PackSide.OPEN))
@@ -95,7 +98,7 @@ def strapped_pack(height_map: HeightMap, grid: AlignedMap, fit: Fit) -> Pack | N
 
 
 def find_own(spans: tuple[StrapSpan, ...], width_m: float) -> int | None:
-    """Find the number of the straps over a fit's axis, of this width; None where none lie over it."""
+    """Find the index of the straps over a fit of this width; None where there are none."""
     shares = [
         (min(s.high_m, 0.5 * width_m) - max(s.low_m, -0.5 * width_m)) / min(s.width_m, width_m) for s in spans
     ]
@@ -105,13 +108,15 @@ def find_own(spans: tuple[StrapSpan, ...], width_m: float) -> int | None:
 def find_pack(
     spans: tuple[StrapSpan, ...], number: int, beside_m: Float64, level_m: Float64, thick_m: float
 ) -> Pack | None:
-    """Extend straps, one of `spans`, to the flanks of what they hold; None where none of it is seen.
+    """Extend one of `spans` to the flanks of what its straps hold; None where nothing of it is seen.
 
     level_m: (N,) mean heights over the axis at beside_m: NaN unknown, -inf floor. thick_m: upper bound of the
-    bars' diameter, NaN where it isn't known. A flank is seen where the surface falls to the floor, or far
-    under the top, where a gully is deeper than one pack's bars leave, or where a neighbour begins that is no
-    higher and whose straps lie elsewhere. What may be a bar of the same bundle leaves it open, as does a
-    neighbour most of whose straps are in line, but one that stands higher: it may lie over the flank.
+    bars' diameter, NaN where it isn't known.
+
+    A flank is seen where the surface falls to the floor or far under the top, where a gully is deeper than
+    the bars of one pack leave, or where a neighbour begins that is no higher and whose straps are elsewhere.
+    The flank stays open at what may be a bar of the same bundle, and at a neighbour most of whose straps are
+    in line. A neighbour that stands higher may lie over the flank.
     """
     own = spans[number]
     inside = np.flatnonzero((beside_m >= own.low_m) & (beside_m <= own.high_m) & np.isfinite(level_m))
@@ -146,14 +151,14 @@ def find_pack(
 
 
 def _lies_below(span: StrapSpan, beside_m: Float64, level_m: Float64, deep_m: float) -> bool:
-    """Check whether straps are another layer's: most of what they hold lies under a pack's flanks."""
+    """Check whether straps belong to another layer: most of what they hold lies below a pack's flanks."""
     seen = level_m[(beside_m >= span.low_m) & (beside_m <= span.high_m) & ~np.isnan(level_m)]
     return bool(seen.size and np.median(seen) <= deep_m)
 
 
 def contradicts(pack: Pack, width_m: float) -> tuple[float, str]:
-    """Say how a pack that isn't seen whole speaks against an outline about the same axis, and how far one is
-    off the other, m; 0 and empty where it doesn't.
+    """State how a pack that isn't wholly seen contradicts an outline about the same axis, and by how many
+    metres; 0 and an empty text where it doesn't.
     """
     beyond = max(-width_m / 2 - pack.span.low_m, pack.span.high_m - width_m / 2)
     if beyond > _BEYOND_M:
@@ -165,15 +170,17 @@ def contradicts(pack: Pack, width_m: float) -> tuple[float, str]:
 
 
 def dip_depth(level: Float64) -> float:
-    """Compute how deep the surface sinks between two higher places; what isn't seen lies on the floor."""
+    """Compute the depth to which the surface sinks between two higher places; unseen places
+    count as floor.
+    """
     seen = np.nan_to_num(level, nan=-FLOOR_M, neginf=-FLOOR_M)
     between = np.minimum(np.maximum.accumulate(seen), np.maximum.accumulate(seen[::-1])[::-1])
     return float((between - seen).max(initial=0.0))
 
 
 def _shared(lower: StrapSpan, upper: StrapSpan) -> bool | None:
-    """Check whether most straps of either lie in line with the other's where they meet, as those of one
-    bundle do; False where none does, None where no more than half do.
+    """Check whether most straps of one are in line with the other's where they meet, as those of one bundle
+    are; False where none is, None where at most half are.
     """
     apart = np.abs(np.subtract.outer([rows[1] for rows in lower.rows_m], [rows[0] for rows in upper.rows_m]))
     nearest = apart.min(axis=1 if len(lower.rows_m) <= len(upper.rows_m) else 0)

@@ -1,4 +1,4 @@
-"""Measure a bundle's section by what is seen from above: its width, its top, and how deep it may reach."""
+"""Measure the section of a bundle that is seen from above: its width, its top, and its possible depth."""
 
 from __future__ import annotations
 
@@ -28,48 +28,66 @@ from barsight.yard.lift_settings import UPPER
 _UNIT = NormalDist()
 _ROWS_ENOUGH = 120
 _GULLY_RATIO = 0.95
-"""Of a bar's diameter: a dip this deep between two crests parts two bundles."""
+"""Minimum depth, in bar diameters, of a dip between two crests that separates two bundles."""
 _REACH_RATIO = 1.5
-"""Of the outline's width: how far from its axis a bundle is looked for."""
+"""Maximum distance from the axis, in widths of the outline, at which parts of a bundle are searched for."""
 _GULLIES_APART = 0.8
-"""Share of the places that are judged: a map smooths gullies each time differently."""
+"""Share of the places, those with the smallest misfits, that are judged: each map smooths gullies
+differently.
+"""
 _MISFIT_RATIO, _HEIGHT_RATIO, _WIDTH_RATIO = 0.05, 0.1, 0.2
-"""Of a bar's diameter: how far surface (root mean square), height and width of counted bars may be off."""
+"""Tolerances, in bar diameters, for bars to be counted: RMS misfit of the surface, height, width."""
 _HIDDEN_M = 0.12
-"""Search reach behind a hidden side."""
+"""Distance (m) behind a hidden side within which the surface is searched."""
 _RIM, _HIGHER_M = 4, 0.03
-"""Places at a flank over which a neighbour may stand higher by so much."""
+"""Number of places on either side of a flank that are compared, and the rise (m) of a neighbour that is
+higher.
+"""
 _WIDER_M = 0.045
 _MIN_PIECE_RATIO, _MAX_PIECE_RATIO = 0.7, 1.5
-"""Of the outline's width: what is seen narrower, or (by _WIDER_M besides) wider, is not its section."""
+"""Bounds of a section's width, in widths of the outline (the upper one widened by _WIDER_M): what is narrower
+or wider isn't the outline's section.
+"""
 _ALIKE_LOG = 0.35
-"""Neighbours whose widths differ by a larger factor's logarithm may be pieces of one irregular pack."""
+"""Maximum logarithm of the ratio of two neighbours' widths: beyond it they may be pieces of one irregular
+pack.
+"""
 _PARTED_RATIO, _PARTED_BARS, _PARTED_DIAMETER_M = 0.3, 1.5, 0.04
-"""Two bundles lie side by side where the surface sinks so far, of the outline's width and in bars, between
-them and their bars are this thick; else they may be pieces of one pack: a bar one layer down beside the
-highest shows a gully 0.87 + 0.5 bars under its top, and a diameter is told with a sigma of 6 %."""
+"""Minimum depth to which the surface sinks between two separate bundles, in outline widths and in bars, and
+minimum diameter (m) of their bars. Below these, they may be pieces of one pack: a bar one layer below the
+highest shows a gully 0.87 + 0.5 bars under its top, and a diameter's sigma is 6 %.
+"""
 MAX_HEIGHT_RATIO, _MAX_FILL_RATIO = 1.25, 0.79
-"""Greatest height of a bundle over its width, and share of steel in the box round it."""
+"""Maximum height of a bundle in widths, and maximum share of steel in its bounding box."""
 _HEIGHT_RATIO_PRIOR = NormalDist(0.92, 0.14)
-"""Height of a bundle over its width. Its mean and deviation, and those of the fill, are by 1500 settled packs
-drawn with seeds 0 to 1499; full hexagons of any turn lie within two deviations of both."""
+"""Prior of a bundle's height in widths. Its mean and deviation, and those of the fill ratio, come from 1500
+settled packs simulated with seeds 0 to 1499; full hexagons at any roll lie within two deviations of both.
+"""
 _FILL_RATIO, _BAR_FILL_RATIO = (0.65, 0.045), (0.70, 0.055)
-"""Mean and deviation of the share of steel in the box round a bundle, and in that round what looks like one
-bar: it is one, or a round pack of thin ones."""
+"""Mean and deviation of the share of steel in a bundle's bounding box, and in that of what looks like one
+bar: it is one, or a round pack of thin ones.
+"""
 _MAX_DEVIATIONS = 4.0
-"""From this many deviations of the prior on, a floor cuts nothing off; below as many it cuts off no more."""
+"""Bounds, in deviations, of the floor's place in the prior: above, the floor cuts off nothing; below, it is
+clamped.
+"""
 _BULGE_RATIO = 0.4
-"""Of what wasn't seen behind a flank: one standard deviation of how far bars bulge there."""
+"""Standard deviation of how far bars bulge behind a flank, as a fraction of the length that wasn't seen
+there.
+"""
 _SEEN_WIDTH_SIGMA_M, _OUTLINE_RATIO = 0.012, 0.5
-"""Of the width between the sides that a map shows, and of what it differs from the outline's."""
+"""Errors of the seen width: a constant standard deviation (m), and a fraction of its difference from the
+outline's width.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class SeenSection:
-    """Seen section of a bundle. width_m: from side to side. misfit_m: root mean square of the mean section
-    over the outline of a full hexagon. sides_seen: both sides fall to the floor, or sink deep before a bundle
-    of about its width begins. sides_free: both fall to the floor. hidden_m: how far nothing was seen behind
-    the low and the high side.
+    """The section of a bundle that is seen.
+
+    width_m: from side to side. misfit_m: RMS of the mean section over the outline of a full hexagon.
+    sides_seen: both sides fall to the floor, or sink deep before a bundle of about its width begins.
+    sides_free: both fall to the floor. hidden_m: length out of sight behind the low and the high side.
     """
 
     width_m: float
@@ -80,7 +98,7 @@ class SeenSection:
 
 
 def seen_section(one: FittedOutline, others: list[FittedOutline], smoothing_m: float) -> SeenSection | None:
-    """Measure the mean section along the rows that agree; None where there are none."""
+    """Measure the mean section over the rows that agree; None where there are too few."""
     grid, fit = one.grid, one.fit
     rows = agreeing_rows(fit)
     if rows.size < 3:
@@ -121,9 +139,10 @@ def seen_section(one: FittedOutline, others: list[FittedOutline], smoothing_m: f
 
 
 def is_no_hexagon(seen: SeenSection | None, fit: Fit, top_m: float, floor_m: float | None) -> str:
-    """Say why a section is not surely that of the full hexagon that was fitted; empty where it is.
+    """State why a section may not be that of the full hexagon that was fitted; empty where it certainly is.
 
-    From above its lower half isn't seen: only where it stands on the floor its height says what is there.
+    From above, its lower half isn't seen; only the height over the floor on which it stands reveals what is
+    there.
     """
     if seen is None or not seen.sides_free:
         return "its sides were not seen down to the floor"
@@ -146,11 +165,11 @@ def is_no_hexagon(seen: SeenSection | None, fit: Fit, top_m: float, floor_m: flo
 
 
 def bulge_sigma(hidden_m: tuple[float, float], width_m: float, *, is_along_baseline: bool) -> float:
-    """Estimate the standard deviation, m, of how much wider a bundle is where nothing was seen behind its
+    """Estimate the standard deviation (m) of how much wider a bundle is where nothing was seen behind its
     flanks.
 
-    Of bars along the cameras' baseline single ones aren't matched at all: there all of what wasn't seen, h,
-    may be bars, and the section's bound, which 2 h / w raises, holds with (1 + h / w)^2 = 1 + 2 h' / w.
+    Single bars along the cameras' baseline aren't matched at all. All of the length h that wasn't seen may
+    then be bars, and the section's bound, which 2 h / w raises, holds with (1 + h / w)^2 = 1 + 2 h' / w.
     """
     if not is_along_baseline:
         return _BULGE_RATIO * math.hypot(*hidden_m)
@@ -166,8 +185,8 @@ def estimate_section(
     *,
     is_along_baseline: bool = False,
 ) -> tuple[float, float]:
-    """Estimate steel's section and its sigma, m2, of a bundle whose bars can't be counted; NaN where its
-    sides were not seen, or where what is seen is not the outline's section.
+    """Estimate the steel section of a bundle whose bars can't be counted, and its sigma (m2); NaN where its
+    sides weren't seen, or where the visible part isn't the outline's section.
     """
     if seen is None or not seen.sides_seen:
         return np.nan, np.nan
@@ -183,11 +202,11 @@ def estimate_section(
 def section_of_pack(
     width_m: float, width_sigma_m: float, over_floor_m: float, fill: tuple[float, float] = _FILL_RATIO
 ) -> tuple[float, float]:
-    """Estimate steel's section and its sigma, m2, of bars by the width between the flanks.
+    """Estimate the steel section of bars and its sigma (m2) from the width between the flanks.
 
-    section = fill x height x width. What lies under the widest place isn't seen: the height is the prior's,
-    cut off where the floor is [Johnson 1994, truncated normal]. over_floor_m: height of the top over the
-    floor, inf where none was seen. fill: share of steel in the box round the bars, and its deviation.
+    section = fill x height x width. Nothing below the widest place is seen, so the height is the prior's,
+    truncated at the floor [Johnson 1994, truncated normal]. over_floor_m: height of the top over the floor,
+    inf where no floor was seen. fill: share of steel in the bars' bounding box, and its deviation.
     """
     if not width_m > 0 or not over_floor_m > 0:
         return np.nan, np.nan
@@ -211,13 +230,13 @@ def over_floor(top_m: float, floor_m: float | None) -> float:
 
 
 def agreeing_rows(fit: Fit) -> Int64:
-    """Choose rows of the map that agree with a fit, no more than tell its mean section."""
+    """Select rows of the map that agree with a fit, no more than its mean section needs."""
     rows = np.flatnonzero(fit.state[fit.first : fit.last + 1] == AGREES) + fit.first
     return rows[:: max(len(rows) // _ROWS_ENOUGH, 1)]
 
 
 def sections(grid: AlignedMap, fit: Fit, rows: Int64, half: int) -> tuple[Float64, Float64]:
-    """Read the heights over the axis (rows, N) at places (N,) across from it; NaN unknown, -inf floor."""
+    """Sample the heights over the axis (rows, N) at lateral places (N,); NaN unknown, -inf floor."""
     v = grid.v0_m + grid.cell_m * rows - fit.v_m
     axis = fit.values[U] + fit.values[SLOPE_U] * v
     up = fit.values[Z] + fit.values[SLOPE_Z] * v
@@ -230,7 +249,9 @@ def sections(grid: AlignedMap, fit: Fit, rows: Int64, half: int) -> tuple[Float6
 
 
 def mean_section(grid: AlignedMap, fit: Fit, rows: Int64, half: int) -> tuple[Float64, Float64]:
-    """Average the heights over the axis at places (N,) across from it; NaN where half are unknown."""
+    """Compute the median heights over the axis at lateral places (N,); NaN where more than
+    half are unknown.
+    """
     beside, heights = sections(grid, fit, rows, half)
     enough = 2 * (~np.isnan(heights)).sum(axis=0) >= len(rows)
     level = np.full(len(beside), np.nan)
@@ -240,12 +261,14 @@ def mean_section(grid: AlignedMap, fit: Fit, rows: Int64, half: int) -> tuple[Fl
 
 
 def unseen_places(level: Float64) -> int:
-    """Count the places before the first that was seen."""
+    """Count the places before the first one that was seen."""
     return int(np.argmin(np.append(np.isnan(level), False)))
 
 
 def _is_neighbour(one: FittedOutline, beside_m: Float64, others: list[FittedOutline]) -> Bool:
-    """Check which places (N,) beside a bundle's axis, at mid-length, lie in another of about its width."""
+    """Check which places (N,) beside a bundle's axis, at mid-length, lie in another bundle of about its
+    width.
+    """
     u = one.fit.values[U] + beside_m
     places = one.grid.to_map(np.column_stack([u, np.full(len(u), one.fit.v_m)]))
     taken = np.zeros(len(u), bool)
@@ -259,7 +282,9 @@ def _is_neighbour(one: FittedOutline, beside_m: Float64, others: list[FittedOutl
 
 
 def is_overhung(inwards: Float64, outwards: Float64) -> bool:
-    """Check whether a neighbour stands higher at a flank, so that it may lie over it; heights from there."""
+    """Check whether a neighbour stands higher at a flank, so that it may lie over it. Both: heights outwards
+    from the flank's edge or inwards.
+    """
     own, theirs = (part[np.isfinite(part)][:_RIM] for part in (inwards, outwards))
     return bool(theirs.size and own.size and theirs.max() > own.max() + _HIGHER_M)
 
@@ -268,10 +293,12 @@ def _edge(
     level: Float64, others_begin: Bool, middle: int, step: int, deep_m: float, parted_m: float,
     lowest_m: float, hidden: int,
 ) -> tuple[int, bool, bool]:  # fmt: skip
-    """Walk from the middle to the last place that belongs to the bundle; whether it falls to the floor there,
-    or sinks by parted_m before another begins; whether it falls to the floor.
+    """Walk from the middle to the last place that belongs to the bundle. Return that place; whether the
+    surface falls to the floor there, or sinks by parted_m before another bundle begins; whether it falls to
+    the floor.
 
-    What shows behind places out of sight may be its own lower bars, down to lowest_m, unless another begins.
+    A surface that shows behind places out of sight may be the bundle's own lower bars, down to lowest_m,
+    unless another bundle begins there.
     """
     last, lowest, lowest_at = middle, level[middle], middle
     for k in range(middle, len(level) if step > 0 else -1, step):

@@ -1,4 +1,4 @@
-"""Sample the orthophoto's shades across a bundle."""
+"""Sample the orthophoto's gray levels across a bundle."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from barsight.yard.types import HeightMap
 
 _BIN_M = 0.002
 _MIN_CELLS = 8
-"""A place across the bundle needs so many cells along it for its median."""
+"""Minimum number of cells along a bundle for the median at one place across it."""
 _MIN_PLACES = 10
 _INSIDE = 0.46
 
@@ -19,8 +19,8 @@ _INSIDE = 0.46
 def shade_profile(
     height_map: HeightMap, grid: AlignedMap, fit: Fit, between_m: tuple[float, float] | None = None
 ) -> ShadeProfile | None:
-    """Sample the orthophoto's shades over the rows that agree with the fit, across its inside or between two
-    places beside its axis; None where too little was seen.
+    """Sample the orthophoto's gray levels over the rows that agree with the fit, across its inside or between
+    two places beside its axis; None where too little was seen.
     """
     if height_map.gray is None:
         return None
@@ -54,7 +54,7 @@ def shade_profile(
 
 
 def _medians(beside: Float64, gray: UInt8) -> tuple[Float64, Float64]:
-    """Compute mean place and logarithm of the median gray level of each 2 mm that has enough cells."""
+    """Compute the mean place and the log median gray level of each bin of 2 mm that has enough cells."""
     number = np.floor(beside / _BIN_M).astype(np.int64)
     order = np.lexsort((gray, number))
     first = np.flatnonzero(np.diff(number[order], prepend=np.iinfo(np.int64).min))

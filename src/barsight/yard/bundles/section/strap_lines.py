@@ -1,4 +1,6 @@
-"""Find lines across the bars in gray levels, and part places that share them from those that do not."""
+"""Find lines across the bars in gray levels, and separate the places that share them from
+those that don't.
+"""
 
 from __future__ import annotations
 
@@ -9,37 +11,43 @@ from barsight.core.arrays import Bool, Float32, Float64, Int64, kernel
 from barsight.core.linalg.robust import mad_sigma, running_median
 
 _AROUND_M = 0.2
-"""Length along the bars over which the steel's own gray level is taken."""
+"""Length (m) along the bars of the running median that yields the steel's own gray level."""
 _MIN_SIGMA_LOG = 0.05
-"""Least scatter of a bar's gray levels along it, in the logarithm."""
+"""Minimum scatter of the log gray level along a bar."""
 _CLIPPED, _NOISE = 6.0, 2.0
-"""Contrasts over noise: from where more counts no more, and what a line must have more of."""
+"""Contrast in units of the noise: the value at which it is clipped, and the one that a line must exceed."""
 _TOOTH = 0.6
-"""Mean of the contrast over noise, beyond _NOISE, that a strap has over a bundle's width."""
+"""Minimum mean contrast, beyond _NOISE and over a bundle's width, of a strap."""
 _PRICE, _GULLY_PRICE = 60.0, 10.0
-"""Contrast that a bundle's straps must have in all, so that chance doesn't part one bundle into two; less is
-asked where the surface does."""
+"""Minimum total contrast of a bundle's straps, so that chance doesn't split one bundle into two; the second,
+lower value applies where the surface shows a gully.
+"""
 _POOL_M = 0.07
-"""Length across the bars over which a faint line's gray levels are averaged."""
+"""Length (m) across the bars over which a faint line's gray levels are averaged."""
 _MIN_VARIANCE = 0.3
-"""Least variance that a place adds to a faint line's sum."""
+"""Minimum variance that one place contributes to a faint line's sum."""
 _SPOT = 3.0
-"""Contrast over noise from where a bar's own spot counts no more for a faint line."""
+"""Contrast over noise at which levels are clipped for faint lines, so that single spots on a
+bar count less.
+"""
 _FAINT, _FAINT_PRICE, _FAINT_GULLY_PRICE = 4.0, 15.0, 5.0
-"""The same for faint lines: mean gray level of one over the noise of such means, and half the squares beyond
-that, in all."""
+"""Thresholds for faint lines: minimum mean level in units of the noise of such means, and minimum total of
+half the squares beyond that, elsewhere and in a gully.
+"""
 GULLY_M, _GULLY_SIDE_M = 0.03, 0.08
-"""Least depth of a gully that may part bundles, and the reach of its two sides."""
+"""Minimum depth (m) of a gully that may separate bundles, and the extent (m) of each of its two sides."""
 CLIFF_M, _CLIFF_CELLS = 0.12, 2
-"""No straps hold bars on both sides of a step of this height, within so many places."""
+"""Minimum height (m) of a step across which no straps hold bars, and the number of places within which it
+occurs.
+"""
 FLOOR_M = 1e3
-"""Depth that stands for the floor and for what is not seen."""
+"""Depth (m) assumed for the floor and for unseen places."""
 
 
 def line_contrast(gray: Float32, cell_m: float) -> Float64:
-    """Compute contrasts (rows, places) of lines across the bars over noise, beyond _NOISE.
+    """Compute the contrast (rows, places) over noise, beyond _NOISE, of lines across the bars.
 
-    Lines may lie a cell off from bar to bar.
+    Lines may be off by a cell from bar to bar.
     """
     beyond = np.minimum(np.abs(_level_along(gray, cell_m)), _CLIPPED) - _NOISE
     lines: Float64 = ndimage.maximum_filter1d(ndimage.uniform_filter1d(beyond, 3, axis=0), 3, axis=0)
@@ -47,11 +55,12 @@ def line_contrast(gray: Float32, cell_m: float) -> Float64:
 
 
 def faint_lines(gray: Float32, stock: Bool, cell_m: float) -> tuple[Float64, Float64]:
-    """Compute how much brighter than the steel before and behind it each place (rows, places) is, averaged
-    along the bar over a strap's width, and the variance that each place (places,) adds to a sum across.
+    """Compute by how much each place (rows, places) is brighter than the steel before and behind it, averaged
+    along the bar over a strap's width, and the variance that each place (places,) contributes to a sum
+    across.
 
-    On rough or rusty bars a strap is fainter than the bar's own spots; it stands out because it is darker, or
-    brighter, on all bars at the same place. stock: where bars lie.
+    On rough or rusty bars a strap is fainter than the bar's own spots, but it is darker or brighter at the
+    same place on all bars. stock: where bars lie.
     """
     level = np.clip(_level_along(gray, cell_m), -_SPOT, _SPOT)
     level = ndimage.uniform_filter1d(np.where(stock, level, 0.0), 3, axis=0)
@@ -61,15 +70,17 @@ def faint_lines(gray: Float32, stock: Bool, cell_m: float) -> tuple[Float64, Flo
 
 
 def pooled_contrast(level: Float64, variance: Float64, cell_m: float) -> Float64:
-    """Compute contrasts (rows, places) of faint lines over noise, averaged across the bars over _POOL_M."""
+    """Compute the contrast (rows, places) over noise of faint lines, averaged across the
+    bars over _POOL_M.
+    """
     pool = round(_POOL_M / cell_m) | 1
     mean = ndimage.uniform_filter1d(level, pool, axis=1)
     return np.asarray(np.abs(mean) / np.sqrt(variance / pool), np.float64)
 
 
 def _level_along(gray: Float32, cell_m: float) -> Float64:
-    """Compute the logarithm of gray levels (rows, places) less their median along the bar, over the bar's own
-    scatter; NaN counts as the bar's median.
+    """Compute the log gray levels (rows, places) minus their running median along the bar, divided by the
+    bar's own scatter; NaN counts as the bar's median.
     """
     level = np.log(gray + 2.0)
     known = np.isfinite(level).sum(axis=0)
@@ -84,9 +95,10 @@ def _level_along(gray: Float32, cell_m: float) -> Float64:
 def split_columns(
     contrast: Float64, narrowest: int, gullies: Bool, cliffs: Bool
 ) -> list[tuple[int, int, Int64]]:
-    """Split places into stretches that share their straps: (first, one past the last, rows of its straps).
+    """Split the places into stretches that share their straps: (first, one past the last, rows of its
+    straps).
 
-    A stretch gains, of each row whose mean contrast is over _TOOTH, its sum. contrast: (rows, places);
+    Each row whose mean contrast exceeds _TOOTH adds its sum to a stretch's gain. contrast: (rows, places);
     gullies, cliffs: (places,).
     """
     spread = np.arange(contrast.shape[1] + 1, dtype=np.float64)
@@ -97,10 +109,10 @@ def split_columns(
 def split_faint(
     level: Float64, variance: Float64, narrowest: int, gullies: Bool, cliffs: Bool
 ) -> list[tuple[int, int, Int64]]:
-    """Split places as `split_columns` does, by lines that stand out over a stretch's whole width only.
+    """Split the places as `split_columns` does, by lines that only stand out over a stretch's whole width.
 
-    A stretch gains, of each row whose sum is over _FAINT standard deviations, half the squares beyond that.
-    level, variance: of `faint_lines`.
+    Each row whose sum exceeds _FAINT standard deviations adds half the excess of its square to a stretch's
+    gain. level, variance: of `faint_lines`.
     """
     prices = _prices(gullies, _FAINT_PRICE, _FAINT_GULLY_PRICE)
     spread = _sums(variance[None])[:, 0].copy()
@@ -108,12 +120,12 @@ def split_faint(
 
 
 def _sums(values: Float64) -> Float64:
-    """Sum up along rows: (places + 1, rows)."""
+    """Compute cumulative sums along rows (places + 1, rows)."""
     return np.concatenate([np.zeros((1, len(values))), np.cumsum(values, axis=1).T])
 
 
 def _prices(gullies: Bool, price: float, gully_price: float) -> Float64:
-    """Return what a stretch costs by its end (places + 1,): less in a gully, or at the last place."""
+    """Return the cost of a stretch by its end (places + 1,): lower in a gully, and at the last place."""
     cheap = np.pad(gullies, (0, 1), constant_values=True)
     cheap[1:] |= gullies
     return np.where(cheap, gully_price, price)
@@ -122,10 +134,10 @@ def _prices(gullies: Bool, price: float, gully_price: float) -> Float64:
 def _split(
     sums: Float64, spread: Float64, prices: Float64, narrowest: int, cliffs: Bool, *, is_faint: bool
 ) -> list[tuple[int, int, Int64]]:
-    """Choose by dynamic programming the stretches (first, one past the last, every other row that gains most
-    about it) that together gain most; none reaches over a cliff.
+    """Find by dynamic programming the stretches with the largest total gain; none extends across a cliff.
 
-    sums: (places + 1, rows) of every other row; spread: (places + 1,) sums of what a place is wide.
+    Each is (first, one past the last, rows with locally maximal gain). sums: (places + 1, rows) of every
+    other row; spread: (places + 1,) cumulative widths of the places.
     """
     before = _best_stretches(sums, spread, prices, narrowest, cliffs, is_faint)
     found, last = [], len(prices) - 1
@@ -143,7 +155,7 @@ def _split(
 def _best_stretches(
     sums: Float64, spread: Float64, prices: Float64, narrowest: int, cliffs: Bool, is_faint: bool
 ) -> Int64:
-    """Find the first place of the best stretch that ends at each place, (places + 1,).
+    """Find the first place of the best stretch that ends at each place (places + 1,).
 
     sums: (places + 1, rows), spread, prices: (places + 1,), cliffs: (places,), see `_split`.
     """
@@ -166,9 +178,11 @@ def _best_stretches(
 
 @kernel()
 def row_gains(begin: Float64, end: Float64, wide: float, is_faint: bool) -> Float64:
-    """Compute what a stretch gains of each row (rows,): see `split_columns`, and `split_faint` if is_faint.
+    """Compute the gain of a stretch from each row (rows,): see `split_columns`, and `split_faint` if
+    is_faint.
 
-    begin, end: (rows,) sums up to its first and last place. wide: how many places, or their variance.
+    begin, end: (rows,) cumulative sums at its first and last place. wide: number of places, or the sum of
+    their variances if is_faint.
     """
     gains = np.empty(begin.size)
     for k in range(begin.size):
@@ -190,7 +204,7 @@ def find_gullies(level_m: Float64, cell_m: float) -> Bool:
 
 
 def find_cliffs(level_m: Float64) -> Bool:
-    """Check at which places (N,) the surface steps by CLIFF_M, seen or behind what is not seen."""
+    """Check at which places (N,) the surface steps by CLIFF_M, in sight or across places out of sight."""
     last_seen = np.maximum.accumulate(np.where(np.isnan(level_m), 0, np.arange(len(level_m))))
     filled = np.nan_to_num(level_m[last_seen], nan=-FLOOR_M, neginf=-FLOOR_M)
     step = np.zeros(len(filled), bool)

@@ -1,7 +1,7 @@
-"""Find the straps of a bundle in the orthophoto: where its bars are held together, it begins and ends.
+"""Find the straps of a bundle in the orthophoto: they hold its bars together, and show where it ends.
 
 A strap is a line across the bars, darker or brighter than the steel before and after it. Bars side by side
-that share their straps belong to one bundle; between two bundles the lines break off or lie elsewhere.
+that share their straps belong to one bundle; between two bundles the lines break off or are elsewhere.
 """
 
 from __future__ import annotations
@@ -28,35 +28,43 @@ from barsight.yard.map_lookup import lookup_heights, sample_levels
 from barsight.yard.types import HeightMap
 
 REACH_M = 0.55
-"""Search reach to either side of a bundle's axis, its neighbours' straps included."""
+"""Distance (m) to either side of a bundle's axis within which straps are sought,
+including its neighbours'.
+"""
 _NARROWEST_M = 0.07
-"""Width of the narrowest place that straps may hold."""
+"""Minimum width (m) of a part that straps may hold."""
 _EDGE = 1.0
-"""Median contrast of the straps, beyond _NOISE, where a bundle's are still seen."""
+"""Minimum contrast of a strap, beyond _NOISE, at the edge of its bundle."""
 _FAINT_EDGE = 2.0
-"""Least contrast over noise of an averaged faint line."""
+"""Minimum contrast over noise of an averaged faint line at the edge of its bundle."""
 _MEET_M, _PART_M = 0.02, 0.04
-"""Overlap of two spans that are one; a span that is so much narrower than another is a part of it."""
+"""Overlap (m) from which two spans are one, and difference in width (m) from which the narrower span is a
+part of the wider one.
+"""
 _BREAK_M = 0.08
-"""A strap may be as bright as the bars over so much of its length."""
+"""Maximum length (m) of a gap in a strap, where it is as bright as the bars."""
 _CLOSE_M = 0.05
-"""Rows nearer to what lies over the outline tell nothing: it throws shade."""
+"""Distance (m) from objects over the outline within which rows aren't used: the objects cast shadows."""
 DENSE_M = 0.45
-"""Straps are no nearer to each other than this, on average over a bundle's length."""
+"""Minimum mean spacing (m) of straps along a bundle."""
 MIN_STRAPS, MIN_ROWS = 2, 20
-"""Fewest straps that hold a bundle, and rows of the map that tell its mean section."""
+"""Minimum number of straps that hold a bundle, and of rows of the map for its mean section."""
 _LINE_M, _END_M = 0.05, 0.08
-"""Half the length along the bars over which a strap's place is averaged, and the width of either end."""
+"""Half the length (m) along the bars over which a strap's place is averaged, and the width (m)
+of either end.
+"""
 _SHOWN_RATIO = 0.9
-"""Least share of a bundle in the photo for straps that don't show to tell anything."""
+"""Minimum share of a bundle in the photo for missing straps to count as evidence."""
 APART_M = 0.3
-"""Lines nearer to each other along the bars are one strap."""
+"""Minimum spacing (m) of two straps: lines closer together along the bars are one strap."""
 
 
 @dataclass(frozen=True)
 class StrapSpan:
-    """Place that straps hold together: from low_m to high_m beside a bundle's axis. rows_m: where along it
-    each strap lies at its low and at its high end; spread_m: how far the straps disagree on an end.
+    """The part that straps hold together, from low_m to high_m beside a bundle's axis.
+
+    rows_m: where along it each strap lies at its low and at its high end; spread_m: how far the straps
+    disagree on an end.
     """
 
     low_m: float
@@ -71,7 +79,7 @@ class StrapSpan:
 
 
 def strap_spans(height_map: HeightMap, grid: AlignedMap, fit: Fit, level_m: Float64) -> tuple[StrapSpan, ...]:
-    """Find what straps hold together within REACH_M of a bundle's axis, from low to high.
+    """Find the parts that straps hold together within REACH_M of a bundle's axis, from low to high.
 
     height_map: one with an orthophoto. level_m: mean heights over the axis at the same places.
     """
@@ -96,8 +104,8 @@ def strap_spans(height_map: HeightMap, grid: AlignedMap, fit: Fit, level_m: Floa
 
 
 def _merged(clear: list[StrapSpan], faint: list[StrapSpan]) -> tuple[StrapSpan, ...]:
-    """Choose among spans of both kinds, from low to high: a clear one tells better where it ends, but may be
-    a part of what a faint one spans.
+    """Select among the spans of both kinds, from low to high: a clear one shows more precisely where it ends,
+    but may be a part of what a faint one spans.
     """
     kept = list(clear)
     for one in faint:
@@ -112,9 +120,9 @@ def _span(
     contrast: Float64, stretch: tuple[int, int, Int64], beside_m: Float64, narrowest: int, *,
     is_faint: bool = False,
 ) -> StrapSpan | None:  # fmt: skip
-    """Tell from where to where straps hold a stretch: (first, one past the last place, rows of lines); None
-    where they are too few, or too many, or hold less than the narrowest. Averaged faint lines end where they
-    are half as strong as over their strongest quarter.
+    """Measure the extent over which straps hold a stretch (first, one past the last place, rows of lines);
+    None where the straps are too few or too many, or hold less than the narrowest part. Averaged faint lines
+    end where they are half as strong as over their strongest quarter.
     """
     first, last, teeth = stretch
     cell_m = float(beside_m[1] - beside_m[0])
@@ -137,7 +145,7 @@ def _span(
 
 
 def is_photographed(height_map: HeightMap, grid: AlignedMap, fit: Fit) -> bool:
-    """Check whether the orthophoto has nearly all of a bundle's middle, where straps would show."""
+    """Check whether the orthophoto covers nearly all of a bundle's middle, where straps would show."""
     if height_map.gray is None:
         return False
     beside, gray, _, _ = _around(height_map, grid, fit)
@@ -145,9 +153,9 @@ def is_photographed(height_map: HeightMap, grid: AlignedMap, fit: Fit) -> bool:
 
 
 def _around(height_map: HeightMap, grid: AlignedMap, fit: Fit) -> tuple[Float64, Float32, Float32, Bool]:
-    """Resample gray levels (rows, places), NaN where unseen, along a bundle's axis: its rows, and places (m)
-    beside it; the same of the pictures at the height of the tops where there are such; and which places lie
-    over the floor.
+    """Resample the pictures along a bundle's axis. Return the lateral places (m); the orthophoto's gray
+    levels (rows, places), NaN where unseen; the same of the pictures at the height of the tops, where there
+    are any; and which places lie over the floor.
     """
     half = round(REACH_M / grid.cell_m)
     beside = np.asarray(grid.cell_m * np.arange(-half, half + 1), np.float64)
@@ -165,7 +173,7 @@ def _around(height_map: HeightMap, grid: AlignedMap, fit: Fit) -> tuple[Float64,
 
 
 def strongest_lines(strength: Float64, teeth: Int64, apart: int) -> Int64:
-    """Keep of lines nearer to each other than `apart` rows the strongest: (S,) rows of straps."""
+    """Keep the strongest of the lines that are closer together than `apart` rows: (S,) rows of straps."""
     kept: list[int] = []
     for k in np.argsort(-strength, kind="stable"):
         if all(abs(teeth[k] - row) >= apart for row in kept):
@@ -174,7 +182,9 @@ def strongest_lines(strength: Float64, teeth: Int64, apart: int) -> Int64:
 
 
 def _row_at_ends(contrast: Float64, row: int, cell_m: float) -> tuple[float, float]:
-    """Compute where along the axis, m, a strap lies at its low and its high end: its contrast's centre."""
+    """Compute where along the axis (m) a strap lies at its low and at its high end:
+    its contrast's centroid.
+    """
     reach, end = round(_LINE_M / cell_m), max(round(_END_M / cell_m), 1)
     first = max(row - reach, 0)
     near = np.maximum(contrast[first : row + reach + 1], 0.0)
@@ -186,9 +196,10 @@ def _row_at_ends(contrast: Float64, row: int, cell_m: float) -> tuple[float, flo
 
 
 def _ends(lines: Bool, bridged: int) -> Float64 | None:
-    """Find where each strap (rows) begins and ends (S, 2), one past the last place; None where few are seen.
+    """Find where each strap (rows) begins and ends (S, 2), one past the last place; None where too few are
+    seen.
 
-    A strap is its longest run, breaks of less than `bridged` places closed. lines: (rows, places).
+    A strap is its longest run, with gaps of less than `bridged` places closed. lines: (rows, places).
     """
     ends = longest_runs(lines, bridged)
     ends = ends[ends[:, 1] > 0]
@@ -197,8 +208,8 @@ def _ends(lines: Bool, bridged: int) -> Float64 | None:
 
 @kernel()
 def longest_runs(lines: Bool, bridged: int) -> Int64:
-    """Find the longest run of each row (rows, 2), its first place and one past its last, 0 where nothing is
-    set; runs less than `bridged` places apart are one, of equal ones the first counts.
+    """Find the longest run in each row (rows, 2): its first place and one past its last, both 0 where nothing
+    is set. Runs less than `bridged` places apart are one; of equally long ones the first counts.
 
     lines: (rows, places).
     """
