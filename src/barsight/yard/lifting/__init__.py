@@ -1,1 +1,1 @@
-"""Lift targets: the magnet's contact, checks with vetoes, ranking, set-down places."""
+"""Plan lift targets: the magnet's contact, checks with vetoes, ranking, set-down places."""

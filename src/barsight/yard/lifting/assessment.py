@@ -1,4 +1,4 @@
-"""Judge one placement of the magnet: what it would take, how it lies, and every reason not to lift."""
+"""Assess one placement of the magnet: the bundles taken, how the magnet lies, and every veto."""
 
 from __future__ import annotations
 
@@ -65,13 +65,13 @@ from barsight.yard.vetoes import Check, Veto, check_min, check_true, vetoes_of
 from barsight.yard.weight import Mass, bundle_mass, load_centre
 
 SCALES = (1.0, 1.5, 2.5)
-"""Multiples of the crane's tolerance that are tried for the box within which a lift stays as checked."""
+"""Multiples of the crane's tolerance that are tried as the box within which a lift remains as checked."""
 
 
 @dataclass(frozen=True, eq=False)
 class LiftScene:
-    """All that lifts are chosen from. travel: None where the map is not measured but given. now_ns: when
-    lifts are judged, on the frames' clock. events: in the yard since it was measured.
+    """Everything that lifts are chosen from. travel: None where the map was given instead of measured.
+    now_ns: time of the assessment on the frames' clock. events: those in the yard since it was measured.
     """
 
     heights: HeightMap
@@ -99,18 +99,18 @@ class LiftScene:
 
 @dataclass(frozen=True, eq=False)
 class Lift:
-    """A judged placement. All in m, rad, N, kg; NaN where unknown.
+    """An assessed placement. All in m, rad, N, kg; NaN where unknown.
 
-    bundles: ids of what would be taken, `count` of them with `count_probability`; straddled: those of them
-    that are too many. contact: how the faces lie, None where nothing is known there. needed_n: weight upper
-    bound times safety factor. offset_along_m, offset_across_m: magnet's centre minus the load's.
+    bundles: ids of the `count` bundles that would be taken, with `count_probability`; straddled: the same ids
+    where they are too many. contact: None where nothing is known under the faces. needed_n: upper bound of
+    the weight times the safety factor. offset_along_m, offset_across_m: magnet's centre minus the load's.
     overhang_m: bars beyond the outermost pole. tolerance: half sides of the box within which all this holds.
-    safety: the smallest of pull over needed, of all and of each pole's share, capacity over load and
-    tolerance over the crane's; at least 1 where nothing is vetoed. checks: all that were made; a check that
-    isn't passed is a veto. validity: in time, None where no frame is known to have seen the place.
-    covariance: (4, 4) of the target's x, y, z and yaw, None without a contact. map_vetoes: those that forbid
-    every lift of the map. set_down: where the load can be put, None where no place is known or none was
-    looked for; magnet_down: the magnet's place when the load lies there.
+    safety: the smallest of pull over needed pull, for all poles and for each one's share, capacity over load,
+    and tolerance over the crane's; at least 1 without vetoes. checks: all that were made; each one that isn't
+    passed is a veto. validity: in time, None where no frame certainly saw the place. covariance: (4, 4) of
+    the target's x, y, z and yaw, None without a contact. map_vetoes: those that forbid every lift of the map.
+    set_down: where the load can be put, None where no place is known or none was sought; magnet_down: the
+    magnet's place when the load lies there.
     """
 
     place: Placement
@@ -135,7 +135,7 @@ class Lift:
 
     @property
     def vetoes(self) -> tuple[Veto, ...]:
-        """List every reason not to lift: the whole map's, then the failed and unknown checks."""
+        """List all vetoes: those of the whole map, then the failed and unknown checks."""
         said = {veto.code for veto in self.map_vetoes}
         own = (veto for veto in vetoes_of(self.checks) if veto.code not in said)
         return (*self.map_vetoes, *own)
@@ -144,7 +144,7 @@ class Lift:
 def assess_placement(
     place: Placement, yard: LiftScene, magnet: Magnet, settings: LiftSettings, *, search: bool = True
 ) -> Lift:
-    """Judge a placement. Without `search` the tolerance is not looked for (and not vetoed)."""
+    """Assess a placement. Without `search`, the tolerance isn't determined, and can't be a veto."""
     near = nearby_bundles(yard.table, place, magnet)
     contact = rest_magnet(yard.heights, place, magnet, settings.contact_gap_m)
     if contact is None:
@@ -207,7 +207,7 @@ def _grip(
     place: Placement, heights: HeightMap, magnet: Magnet, tolerance: Tolerance, near: BundleTable,
     contact: Contact,
 ) -> Grip:  # fmt: skip
-    """Count what the poles take by how far they reach on the map."""
+    """Count the bundles that the poles take, bounded by how far each one reaches on the map."""
     reached = reached_strips(heights, place, magnet, tolerance, contact.z_m)
     held = count_gripped(place, magnet, tolerance, near, contact.z_m, reached)
     return without_parted(held, heights, place, near, reached)
@@ -224,8 +224,8 @@ def _unseen_lift(place: Placement) -> Lift:
 def _safety(
     contact: Contact, weakest: WeakestPole | None, needed_n: float, mass: Mass, magnet: Magnet, scale: float
 ) -> float:
-    """Compute a lift's safety: the least of pull over what is needed, the weakest pole's pull over its share,
-    capacity over load, and `scale`, of the tolerance over the crane's or of the worst bundle.
+    """Compute a lift's safety: the minimum of pull over needed pull, weakest pole's pull over its share,
+    capacity over load, and `scale`: that of the tolerance over the crane's, or of the worst bundle's pull.
     """
     capacity_kg = min(magnet.capacity_kg, magnet.crane_capacity_kg - magnet.own_mass_kg)
     ratios = (
@@ -238,7 +238,7 @@ def _safety(
 
 
 def nearby_bundles(table: BundleTable, place: Placement, magnet: Magnet) -> BundleTable:
-    """Select the bundles that the magnet may reach or that stand beside those."""
+    """Select the bundles that the magnet may reach, and those beside them."""
     reach = magnet.half_span_m + 1.0
     all_of = table.rectangles
     away = np.array([place.x_m, place.y_m]) - all_of.centre
@@ -251,13 +251,13 @@ def nearby_bundles(table: BundleTable, place: Placement, magnet: Magnet) -> Bund
 
 
 def _load_mass(load: tuple[Bundle, ...]) -> Mass:
-    """Sum the load's mass; NaN where one isn't known, or nothing is taken."""
+    """Sum the load's mass; NaN where one bundle's mass isn't known, or nothing is taken."""
     masses = [bundle_mass(bundle) for bundle in load]
     return sum(masses[1:], masses[0]) if masses else Mass(math.nan, math.nan)
 
 
 def _map_sigma(heights: HeightMap, place: Placement, magnet: Magnet) -> float:
-    """Return the median of the map's own sigma along the poles' middles; NaN where nothing was seen."""
+    """Return the median of the map's sigma along the poles' centre lines; NaN where nothing was seen."""
     parts = np.linspace(-0.5, 0.5, 20)
     v = np.concatenate([pole.along_m + parts * pole.length_m for pole in magnet.poles])
     u = np.repeat([pole.across_m for pole in magnet.poles], parts.size)
@@ -269,8 +269,8 @@ def _map_sigma(heights: HeightMap, place: Placement, magnet: Magnet) -> float:
 
 
 def _overhang(place: Placement, load: tuple[Bundle, ...], magnet: Magnet) -> tuple[float, float]:
-    """Compute the longest way from the outermost pole on its side to an end, and its sigma; NaN where none is
-    taken.
+    """Compute the longest distance from the outermost pole to an end beyond it, and its sigma; NaN where
+    nothing is taken.
     """
     first = min(pole.along_m - pole.length_m / 2 for pole in magnet.poles)
     last = max(pole.along_m + pole.length_m / 2 for pole in magnet.poles)
@@ -286,8 +286,8 @@ def _tolerance(
     place: Placement, yard: LiftScene, magnet: Magnet, near: BundleTable, held: Grip, needed_n: float,
     contact: Contact, settings: LiftSettings,
 ) -> tuple[float, str]:  # fmt: skip
-    """Find the largest of SCALES times the crane's tolerance within which the lift stays as checked, and what
-    ends it there.
+    """Find the largest of SCALES times the crane's tolerance within which the lift remains as checked, and
+    the reason why no larger one does.
     """
     found, load = 0.0, tuple(near.bundles[k] for k in held.gripped)
     for scale in SCALES:
@@ -308,7 +308,7 @@ def _tolerance(
 
 
 def _scaled(tolerance: Tolerance, scale: float) -> Tolerance:
-    """Scale the crane's tolerance, up to the most that a tolerance may be."""
+    """Scale the crane's tolerance, up to the maximum that a tolerance may have."""
     return Tolerance(
         min(tolerance.x_m * scale, 1.0), min(tolerance.y_m * scale, 1.0), min(tolerance.yaw_deg * scale, 20.0)
     )
@@ -318,7 +318,7 @@ def _change(
     place: Placement, box: Tolerance, yard: LiftScene, magnet: Magnet, near: BundleTable, held: Grip,
     needed_n: float, settings: LiftSettings,
 ) -> str:  # fmt: skip
-    """Find what changes at a corner of the box, by how the faces rest there; empty where nothing does."""
+    """Find what changes at a corner of the box where the faces come to rest there; empty if nothing does."""
     load = tuple(near.bundles[k] for k in held.gripped)
     exact = replace(magnet, tolerance=Tolerance(0.0, 0.0, 0.0))
     for dx, dy, dyaw in itertools.product((-1, 1), repeat=3):
@@ -340,7 +340,7 @@ def _change(
         ]  # fmt: skip
         for veto in vetoes_of(checks):
             return veto.reason
-        # The whole box was held against the limits with their sigmas: here only how the faces rest is new.
+        # The whole box was checked against the limits with their sigmas; only the resting faces are new here.
         obstacle = find_obstacle(moved, yard.heights, exact, FacePlane.of(contact), load, careful=False)
         if obstacle is not None:
             return obstacle.reason

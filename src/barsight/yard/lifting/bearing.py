@@ -1,4 +1,4 @@
-"""Judge one place for a load: what carries it there, how level it lies, what stands around."""
+"""Assess one place for a load: what supports it there, how level it lies, what stands around it."""
 
 from __future__ import annotations
 
@@ -22,35 +22,39 @@ from barsight.yard.types import YardMap
 
 STEP_M = 0.02
 STATION_STEPS = 5
-"""Heights are the highest of so many steps along the load: what carries it is what stands highest."""
+"""Number of steps along the load in one station, whose height is their maximum: the highest step carries the
+load.
+"""
 NEAR_M = 0.02
-"""A station this little below the underside carries it."""
+"""Maximum distance (m) of a station below the underside at which it still carries the load."""
 LEVEL_M = 0.01
-"""So level a station must be across the load to hold it upright."""
+"""Maximum height difference (m) across the load within the part of a station that holds it upright."""
 MIN_ACROSS_RATIO = 1 / 6
-"""Of the width, to either side of the centre of mass, that a station must carry."""
+"""Minimum distance, in widths, from the centre of mass to either side over which a station must carry."""
 MIN_ALONG_RATIO = 0.2
-"""Of the length, to either side of the centre of mass, that the supports must reach."""
+"""Minimum distance, in lengths, from the centre of mass to either end that the supports must reach."""
 MAX_SPAN_RATIO = 0.65
-"""Of the length between one support and the next."""
+"""Maximum distance, in lengths, between successive supports."""
 MAX_ALONG_DEG, MAX_ACROSS_DEG = 2.0, 3.0
 MAX_HOLE_M, HOLE_DEPTH_M = 0.14, 0.15
-"""Gullies narrower than this between bars are no holes, and dunnage bridges them; nor are shallow ones."""
+"""Minimum width and depth (m) of a hole: narrower gullies between bars are bridged by dunnage, and shallow
+ones don't matter.
+"""
 _HOLE_STEPS = round(MAX_HOLE_M / STEP_M) | 1
 MAX_UNSEEN_CELLS = 3
-"""An unseen place narrower than so many steps hides nothing that stands."""
+"""Minimum width, in steps, of an unseen place that may hide an obstacle."""
 UNSEEN_REACH_CELLS = 9
 MAX_RISE_M = 0.03
-"""What stands this little over the underside beside the load doesn't touch it."""
+"""Maximum rise (m) over the underside of something beside the load that doesn't touch it."""
 MAX_THIN_RISE_M, MIN_THIN_CELLS = 0.1, 6
-"""The same for what is thin, as plates on edge are, in connected steps."""
+"""The same for thin objects, such as plates on edge, and their minimum number of connected steps."""
 
 
 @dataclass(frozen=True)
 class Bearing:
-    """A load's rest at a place. z_m: its underside at the middle, over its dunnage. slope_deg: of the
+    """Support of a load at a place. z_m: its underside at the middle, over its dunnage. slope_deg: of the
     underside. support_m: from the first support to the last. margin_along_m, margin_across_m: from the load's
-    centre of mass to the nearer end and side of what carries it, the least within the crane's tolerance.
+    centre of mass to the nearer end and side of what carries it, minimum within the crane's tolerance.
     """
 
     z_m: float
@@ -62,11 +66,12 @@ class Bearing:
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """Heights (V, U) about a place on a grid along (v_m) and across (u_m) the load.
+    """Heights (V, U) about a place, on a grid along (v_m) and across (u_m) the load.
 
-    z_m: medians over 50 mm squares, which wrong matches don't move. thin_m: over 30 mm, for what is thin.
-    Both have the highest nearby where a few cells were not seen; hidden: unseen places wide enough to hide
-    what stands. free_m: upper bound by lines of sight of what may stand there, inf where none passed.
+    z_m: medians over squares of 50 mm, which wrong matches don't affect. thin_m: over 30 mm, for thin
+    objects. Where a few cells weren't seen, both have the highest value nearby; hidden: unseen places wide
+    enough to hide an obstacle. free_m: upper bound, by lines of sight, of what may stand there, inf where
+    none passed.
     """
 
     v_m: Float64
@@ -80,8 +85,8 @@ class Surroundings:
 def find_bearing(
     yard: YardMap, load: Load, x_m: float, y_m: float, yaw_rad: float, magnet: Magnet, settings: LiftSettings
 ) -> Bearing | None:
-    """Find how the load rests at a place and all over the crane's tolerance; None where it doesn't, or where
-    something may stand in its way.
+    """Find how the load rests at a place and everywhere within the crane's tolerance; None where it doesn't
+    rest stably, or where something may obstruct it.
     """
     axes, slack = axes_of(yaw_rad), placing_slack(load, yaw_rad, magnet)
     around = _surroundings(yard, load, (x_m, y_m), yaw_rad, slack + settings.set_down_clear_m, magnet)
@@ -119,7 +124,9 @@ def find_bearing(
 def _surroundings(
     yard: YardMap, load: Load, place: tuple[float, float], yaw_rad: float, margin: Float64, magnet: Magnet
 ) -> Surroundings:
-    """Read the heights under the load, under the magnet over it, and in a margin (across, along) beside."""
+    """Sample the heights under the load, under the magnet over it, and in a margin (across, along) around
+    them.
+    """
     wide, long = np.maximum((load.width_m / 2, load.length_m / 2), magnet_reach(load, magnet)) + margin
     v, u = (STEP_M * np.arange(-math.ceil(a / STEP_M), math.ceil(a / STEP_M) + 1) for a in (long, wide))
     across, along = axes_of(yaw_rad)
@@ -140,7 +147,7 @@ def _surroundings(
 
 
 def placing_slack(load: Load, yaw_rad: float, magnet: Magnet) -> Float64:
-    """Return how far (2,) beside its place, across and along, the crane may put a load."""
+    """Return the maximum error (2,), across and along (m), with which the crane puts down a load."""
     slack = magnet.tolerance.along(axes_of(yaw_rad))
     slack[0] += load.length_m / 2 * math.radians(magnet.tolerance.yaw_deg)
     return slack
@@ -148,7 +155,7 @@ def placing_slack(load: Load, yaw_rad: float, magnet: Magnet) -> Float64:
 
 def magnet_rectangles(load: Load, magnet: Magnet, slack: Float64) -> list[tuple[float, float, float]]:
     """List where poles and beam may be over a load: half width and half length about its centre of mass, and
-    what may stand there over its top, m.
+    how far something may rise there over the load's top (m).
     """
     aside, beam = slack + _held_off(load, magnet), magnet.beam
     return [
@@ -161,13 +168,15 @@ def magnet_rectangles(load: Load, magnet: Magnet, slack: Float64) -> list[tuple[
 
 
 def magnet_reach(load: Load, magnet: Magnet) -> Float64:
-    """Return how far (2,) the magnet that holds a load may reach from the load's middle, across and along."""
+    """Return how far (2,) the magnet that holds a load may reach from the load's middle, across and along
+    (m).
+    """
     off = np.abs((load.off_across_m, load.off_along_m))
     return np.asarray(np.array(magnet.size_m) / 2 + _held_off(load, magnet) + off)
 
 
 def _held_off(load: Load, magnet: Magnet) -> Float64:
-    """Return how far (2,) beside the load's centre of mass, across and along, the magnet may hold it."""
+    """Return how far (2,) from the load's centre of mass, across and along (m), the magnet may hold it."""
     limits = magnet.limits
     most = limits.offset_across_m, limits.offset_along_m
     return np.minimum(most, (load.width_m / 2, load.length_m / 2))
@@ -180,14 +189,14 @@ def _within(around: Surroundings, load: Load, margin: Float64) -> Bool:
 
 
 def _rest(around: Surroundings, carrying: Float32, load: Load, du: float, dv: float) -> Bearing | None:
-    """Rest the load's underside, a level strip of half its width, this far beside the place."""
+    """Rest the load's underside, taken as a flat strip of half its width, at an offset (m) from the place."""
     rows = np.abs(around.v_m - dv) <= load.length_m / 2
     columns = np.abs(around.u_m - du) <= max(load.width_m / 4, STEP_M)
     count = rows.sum() // STATION_STEPS
     first = int(np.argmax(rows))
     strip = carrying[first : first + count * STATION_STEPS][:, columns]
     stations = strip.reshape(count, STATION_STEPS, -1).max(axis=1).astype(np.float64)
-    # The load settles about its centre of mass.
+    # The load comes to rest about its centre of mass.
     v = around.v_m[first : first + count * STATION_STEPS].reshape(count, -1).mean(axis=1)
     v, u = v - dv - load.off_along_m, around.u_m[columns] - du - load.off_across_m
     vv, uu = np.meshgrid(v, u, indexing="ij")
@@ -217,7 +226,7 @@ def _rest(around: Surroundings, carrying: Float32, load: Load, du: float, dv: fl
 def _stands_in_the_way(
     around: Surroundings, clear: Bool, low_m: float, load: Load, slack: Float64, magnet: Magnet
 ) -> bool:
-    """Check for what stands over the underside beside the load, or under the magnet over the load's top."""
+    """Check for obstacles above the underside beside the load, or under the magnet above the load's top."""
     z = around.z_m
     if (clear & (z > low_m + MAX_RISE_M)).any():
         return True
@@ -237,7 +246,7 @@ def _stands_in_the_way(
 
 
 def _has_hole(z: Float32, outline: Bool, high_m: float) -> bool:
-    """Check for a place under the load that is deep, and too wide for what lies between bars."""
+    """Check for a hole under the load that is deep, and wider than a gully between bars."""
     closed = cv2.morphologyEx(z, cv2.MORPH_CLOSE, np.ones((_HOLE_STEPS, _HOLE_STEPS), np.uint8))
     return bool((outline & (closed < high_m - HOLE_DEPTH_M)).any())
 
@@ -250,7 +259,7 @@ def _stanchion_in_the_way(
     top_m: float,
     settings: LiftSettings,
 ) -> bool:
-    """Check for a stanchion that would be touched, or doesn't stand over what it would hold."""
+    """Check for a stanchion that the load would touch, or that isn't high enough to hold it."""
     for x, y, z in settings.stanchions:
         away = np.abs(axes @ (np.array([x, y]) - place)) - slack
         beyond = away - (load.width_m / 2, load.length_m / 2)

@@ -1,4 +1,4 @@
-"""Check a placement: the count under it, how the faces lie and pull, the load."""
+"""Check a placement: the bundles counted under it, how the faces lie and pull, the load."""
 
 from __future__ import annotations
 
@@ -21,29 +21,36 @@ from barsight.yard.vetoes import Check, check_max, check_min, check_true
 from barsight.yard.weight import Mass
 
 MARGIN_M = 0.015
-"""How far beyond its stated outline a bundle may show."""
+"""Distance (m) by which a bundle's surface may show beyond its outline."""
 STEP_M = 0.02
 EDGE_M = 0.01
-"""Outlines and heights of reach are blurred over this, so that no row of samples goes in or out at once."""
+"""Width (m) over which outlines and reach heights are blurred, so that no row of samples switches all at
+once.
+"""
 UNKNOWN_SIGMA = 0.01
-"""How well cells tell the part of a face that was seen."""
+"""Standard deviation of the unseen share of a face, due to the size of the cells."""
 MAX_HEIGHT_ERROR_M = 0.03
-"""At 95 %: a map that knows the faces' height worse says nothing of gaps. Drawn yards have 15 mm at most."""
+"""Maximum 95 % error (m) of the faces' height: with a larger one, a map says nothing about gaps. Simulated
+yards have at most 15 mm.
+"""
 MAX_ASIDE_RATIO = 1 / 3
-"""Of a face's width: so far beside its middle the faces may rest where the suspension's stop holds them."""
+"""Maximum offset from a face's middle, in its widths, at which it may rest where the suspension stops its
+lean.
+"""
 SHOWN_BAR_M, MIN_SHOWN_RATIO = 0.08, 0.3
-"""A map shows the crests of bars from this diameter on. Of what seems to lie on thinner ones whose packing
-isn't settled as much less counts as they are thinner, down to the ratio. That is no bound: as little as a
-tenth was seen on drawn yards."""
+"""Minimum diameter (m) of bars whose crests a map shows. With thinner bars whose packing isn't settled, the
+contact share is reduced in proportion to their diameter, down to the ratio. That is no bound: as little as a
+tenth was seen in simulated yards.
+"""
 SURE_OF_SIGMA = 0.1
-"""How well sigmas themselves are known, of them."""
+"""Relative standard deviation of the sigmas themselves."""
 
 
 def count_checks(
     place: Placement, heights: HeightMap, magnet: Magnet, near: BundleTable, contact: Contact, held: Grip,
     settings: LiftSettings,
 ) -> list[Check]:  # fmt: skip
-    """Check what the footprint takes: too much, too little, unsure, unseen, unknown."""
+    """Check the bundles that the footprint takes: too many, too few, uncertain, unseen, unknown."""
     count, wanted = len(held.gripped), settings.bundles
     ids = ", ".join(str(near.bundles[k].id) for k in held.gripped)
     checks = [
@@ -77,7 +84,7 @@ def count_checks(
 
 
 def unknown_check(contact: Contact, settings: LiftSettings) -> Check:
-    """Check that enough was seen under each pole."""
+    """Check that the unseen share under each pole isn't too large."""
     share, most = contact.unknown_share, settings.max_unknown_ratio
     reason = f"{100 * share:.0f} % of the cells under a pole were not seen; the limit is {100 * most:.0f} %"
     what = "share of unseen cells under the worst pole"
@@ -85,7 +92,7 @@ def unknown_check(contact: Contact, settings: LiftSettings) -> Check:
 
 
 def probability_check(probability: float, count: int, settings: LiftSettings, why: str = "") -> Check:
-    """Check that a count is sure enough, in sigmas of the normal distribution."""
+    """Check that a count is certain enough, in sigmas of the normal distribution."""
     sure, asked = (
         NormalDist().inv_cdf(min(max(p, 1e-12), 1 - 1e-12))
         for p in (probability, settings.min_count_probability)
@@ -106,8 +113,8 @@ def probability_check(probability: float, count: int, settings: LiftSettings, wh
 def area_checks(
     place: Placement, magnet: Magnet, load: tuple[Bundle, ...], settings: LiftSettings
 ) -> list[Check]:
-    """Check that magnet and load keep out of the places where nothing is lifted, the crane's tolerance and
-    the bundles' sigmas counted.
+    """Check that magnet and load stay out of no-lift areas, including the crane's tolerance and the bundles'
+    sigmas.
     """
     outlines = [(np.array([place.x_m, place.y_m]), place.yaw_rad, magnet.size_m)]
     for bundle in load:
@@ -129,7 +136,7 @@ def area_checks(
 def face_checks(
     contact: Contact, needed_n: float, magnet: Magnet, load: tuple[Bundle, ...], settings: LiftSettings
 ) -> list[Check]:
-    """Check how the faces lie on the load and pull."""
+    """Check how the faces lie on the load, and how strongly they pull."""
     limits, sigma = magnet.limits, contact.gap_sigma_m
     pitch, roll = (abs(math.degrees(angle)) for angle in (contact.pitch_rad, contact.roll_rad))
     narrowest = min(pole.width_m for pole in magnet.poles)
@@ -187,9 +194,9 @@ def load_checks(
     load: tuple[Bundle, ...], mass: Mass, offset_m: tuple[float, float], overhang_m: tuple[float, float],
     magnet: Magnet, settings: LiftSettings,
 ) -> list[Check]:  # fmt: skip
-    """Check the load: covered, doubtful, open, heavy, off balance.
+    """Check whether the load is covered, doubtful, open at an end, too heavy or off balance.
 
-    offset_m: along and across. overhang_m: and its sigma.
+    offset_m: along and across. overhang_m: value and sigma.
     """
     if not load:
         return []
@@ -259,16 +266,16 @@ def _known(sigma: float) -> float:
 
 
 def _shown_ratio(load: tuple[Bundle, ...]) -> float:
-    """Return the part of what seems to lie on steel that counts: crests of thin bars don't show, and one
-    that lies higher than the others carries the faces alone.
+    """Return the factor on the contact share: crests of thin bars don't show in a map, and a bar that lies
+    higher than the others carries the faces alone.
     """
     bars_m = [min_diameter_m(bundle) for bundle in load if bundle.bars is None]
     return float(np.clip(np.min([SHOWN_BAR_M, *bars_m]) / SHOWN_BAR_M, MIN_SHOWN_RATIO, 1.0))
 
 
 def _contact_shares(contact: Contact, near_m: tuple[float, float]) -> Float64:
-    """Compute the part of all faces nearer to steel than each of `near_m`, by gaps blurred by half a
-    millimetre; poles count alike.
+    """Compute the share of all faces that is nearer to steel than each of `near_m`, with gaps blurred by half
+    a millimetre and all poles weighted equally.
     """
     blur = 0.0005
     gaps = np.concatenate([pole.gap_map_m.ravel() for pole in contact.poles])
@@ -279,7 +286,7 @@ def _contact_shares(contact: Contact, near_m: tuple[float, float]) -> Float64:
 
 @lru_cache(maxsize=64)
 def _face_grid(magnet: Magnet, wider_mm: int) -> Float64:
-    """Sample places (N, 3), along, across and pole, over the faces, made wider to either side."""
+    """Sample places (N, 3), along, across and pole, over the faces, each one widened to either side."""
     points = []
     for number, pole in enumerate(magnet.poles):
         long, wide = pole.length_m / 2, pole.width_m / 2 + wider_mm / 1e3
@@ -293,10 +300,11 @@ def _face_grid(magnet: Magnet, wider_mm: int) -> Float64:
 def _unexplained(
     place: Placement, heights: HeightMap, magnet: Magnet, near: BundleTable, contact: Contact, held: Grip
 ) -> tuple[float, float]:
-    """Compute the fraction of the places under the poles, within reach, that lie outside all bundles'
-    outlines, made wider by two sigmas and by one.
+    """Compute the share of the places under the poles, within reach, that lie outside all bundles' outlines,
+    widened by two sigmas and by one.
 
-    What lies in the wider margin of the load may be another's: as far beyond, the surface is looked at too.
+    Surface in the load's wider margin may belong to another object, so places that far beyond the face are
+    sampled too.
     """
     across = magnet.tolerance.along(place.across)
     outlines = np.empty((len(near.bundles), 8))
@@ -320,11 +328,11 @@ def _unexplained(
 def _stray_shares(
     z: Float32, source: UInt8, at: Float64, frame: Float64, grid: Float64, reach_z: Float64, outlines: Float64
 ) -> tuple[float, float]:
-    """Compute the fractions of places within reach that lie outside the outlines' wider and narrower form.
+    """Compute the shares of places within reach that lie outside the wider and the narrower outlines.
 
     z, source: maps (rows, columns). at: x and y of the first cell, and its size. frame: (3, 2) the magnet's
-    place, unit vectors along and across. grid: (N, 3) along, across and pole. reach_z: (P,) heights from
-    which on a pole reaches. outlines: (B, 8) centre, unit vector along, half width and length of both forms.
+    place, unit vectors along and across. grid: (N, 3) along, across and pole. reach_z: (P,) minimum height
+    that each pole reaches. outlines: (B, 8) centre, unit vector along, half width and length of both forms.
     """
     wider, narrower = 0.0, 0.0
     for n in range(len(grid)):

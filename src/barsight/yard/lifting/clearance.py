@@ -1,7 +1,7 @@
-"""Clearance of the magnet: no patch may stand above the faces' plane, and no part may be unseen.
+"""Check the magnet's clearance: no patch may rise above the faces' plane, and nothing may be unseen.
 
-The region is that of the faces and the beam's underside, seen from above, grown by the crane's tolerance and
-by the reach of the stray field.
+The region is the plan view of the faces and of the beam's underside, grown by the crane's tolerance and by
+the range of the stray field.
 """
 
 from __future__ import annotations
@@ -26,28 +26,28 @@ from barsight.yard.vetoes import Check, check_max
 
 STEP_M = 0.01
 STRAY_FIELD_M = 0.03
-"""Steel this near to a face or the beam is drawn to it."""
+"""Distance (m) from a face or the beam within which the stray field attracts steel."""
 MAX_RISE_M = 0.012
-"""A patch that the map shows this much above the faces' plane obstructs, by medians over 50 mm squares."""
+"""Minimum height (m) above the faces' plane of a patch that obstructs, by medians over squares of 50 mm."""
 MAX_TOP_RISE_M = 0.014
-"""So far the load's own top, as its outline was fitted, may stand above the plane where that lies lowest: a
-map cuts crests of thick bars off by some 6 mm."""
+"""Maximum height (m) of the load's own fitted top above the plane where the plane is lowest: a map cuts off
+crests of thick bars by some 6 mm."""
 MAX_NARROW_RISE_M = 0.020
-"""The same for what is too narrow for those: by medians over 30 mm squares."""
+"""Minimum height (m) of a patch that is too narrow for those, by medians over squares of 30 mm."""
 MAX_THIN_RISE_M, MIN_THIN_CELLS = 0.05, 8
-"""The same for a connected patch of so many cells that may be a single one wide, as plates on edge are."""
+"""The same for thin objects such as plates on edge, and the minimum number of connected cells."""
 BEAM_CLEAR_M = 0.1
-"""What stands beside the load must stay so far below the beam, or half the beam's height over the faces."""
+"""Clearance (m) of the beam over objects beside the load; at most half its height over the faces."""
 MIN_PATCH_CELLS = 4
-"""Cells of STEP_M of the smallest patch that counts."""
+"""Minimum size of a patch that counts, in cells of STEP_M."""
 EDGE_SIGMA_M = 0.003
-"""How well a cell of STEP_M tells the edge of what it shows."""
+"""Standard deviation (m) of an object's edge as it shows in cells of STEP_M."""
 MAX_HOLE_M = 0.06
-"""An unseen place narrower than this, over the load, is taken to hide nothing that stands."""
+"""Minimum width (m) of an unseen place over the load that may hide an obstacle."""
 MAX_HOLE_BESIDE_M = 0.04
-"""The same beside the load: about a post, wrong matches prove its rim free."""
+"""The same beside the load: around a post, wrong matches make its edge look free."""
 FLANK_M = 0.03
-"""So near to the load its own flank is what isn't seen."""
+"""Distance (m) from the load within which an unseen place is the load's own flank."""
 _HOLE_CELLS, _HOLE_BESIDE_CELLS = round(MAX_HOLE_M / STEP_M), round(MAX_HOLE_BESIDE_M / STEP_M)
 _UNKNOWN, _FILLED = HeightSource.UNKNOWN, HeightSource.FILLED
 _BEAM_ONLY = 2
@@ -56,7 +56,7 @@ _NO_BOUNDS = np.empty((0, 0), np.float32)
 
 @dataclass(frozen=True)
 class FacePlane:
-    """The faces' plane as it rests: height at the magnet's centre, rise along and across, sigma of height."""
+    """Plane of the faces at rest: height at the magnet's centre, slopes along and across, height sigma."""
 
     centre_z_m: float
     pitch_rad: float
@@ -65,14 +65,14 @@ class FacePlane:
 
     @classmethod
     def of(cls, contact: Contact) -> FacePlane:
-        """Take it from a contact."""
+        """Take the plane from a contact."""
         return cls(contact.centre_z_m, contact.pitch_rad, contact.roll_rad, contact.gap_sigma_m)
 
 
 @dataclass(frozen=True, eq=False)
 class Obstacle:
-    """An obstacle to the magnet. code, reason: of its check. value_mm: its height, or its width where nobody
-    saw it. bound_mm: what is allowed. places_m: (N, 2) its cells, yard axes.
+    """An obstacle to the magnet. code, reason: of its check. value_mm: its height, or its width if it is an
+    unseen place. bound_mm: limit of that value. places_m: (N, 2) its cells, yard axes.
     """
 
     code: str
@@ -85,9 +85,9 @@ class Obstacle:
 def clearance_checks(
     place: Placement, heights: HeightMap, magnet: Magnet, contact: Contact, load: tuple[Bundle, ...]
 ) -> list[Check]:
-    """Check that nothing stands above the faces' plane under the magnet or beside it, seen or not.
+    """Check that nothing, seen or unseen, rises above the faces' plane under the magnet or beside it.
 
-    Limits are held with the plane's sigma in height and a cell's in place.
+    The limits include the sigma of the plane in height and that of a cell in place.
     """
     faces = FacePlane.of(contact)
     obstacle = find_obstacle(place, heights, magnet, faces, load)
@@ -115,10 +115,10 @@ def find_obstacle(
     place: Placement, heights: HeightMap, magnet: Magnet, faces: FacePlane, load: tuple[Bundle, ...], *,
     careful: bool = True,
 ) -> Obstacle | None:  # fmt: skip
-    """Find what obstructs the magnet at its contact plane, or an unseen place that could.
+    """Find an object that obstructs the magnet at its contact plane, or an unseen place that could hide one.
 
-    Under the faces, and under the beam over the load, nothing may stand above the plane; beside the load the
-    beam passes over what stands there. careful: what is within its sigma of a limit obstructs too.
+    Under the faces, and under the beam over the load, nothing may rise above the plane; beside the load the
+    beam passes over objects. careful: an object also obstructs if a limit lies within its sigma.
     """
     region = _region(place, heights, magnet, EDGE_SIGMA_M if careful else 0.0)
     plane = np.array([
@@ -143,14 +143,14 @@ def _look(
     z: Float32, source: UInt8, free: Float32, at: Float64, x: Float64, y: Float64, frame: Float64,
     plane: Float64, parts: Float64, under: UInt8,
 ) -> tuple[Float32, Float32, UInt8]:  # fmt: skip
-    """Look up how high what was seen (-1 or more), and what lines of sight allow, stands over the faces'
-    plane (V, U), NaN where unknown, and which cells are not proven free (1).
+    """Compute heights above the faces' plane (V, U), NaN where unknown: those that were seen (at least -1)
+    and the upper bounds by lines of sight; and mark by 1 the cells that aren't proven free.
 
     z, source, free: maps (rows, columns); free is empty where there is none. at: x and y of the first cell,
     and its size. x, y: (U,), (V,) of the cells. frame: (3, 2) the magnet's place, unit vectors along and
-    across. plane: height at the place, rise along and across, what it may lie lower. parts: (P + 1, 5) poles
-    and beam: middle along and across, reach to either side, rise that is allowed over it. Fills under (V, U):
-    1 under a pole, _BEAM_ONLY under the beam alone, else 0.
+    across. plane: height at the place, slopes along and across, margin by which it may be lower. parts:
+    (P + 1, 5) poles and beam: middle along and across, reach to either side, allowed rise. Fills under
+    (V, U): 1 under a pole, _BEAM_ONLY under the beam alone, else 0.
     """
     rise, most = np.empty((y.size, x.size), np.float32), np.empty((y.size, x.size), np.float32)
     blocked = np.empty((y.size, x.size), np.uint8)
@@ -182,7 +182,7 @@ def _look(
 
 
 def _filled(rise: Float32, max_rise: Float32) -> Float32:
-    """Fill unseen cells (V, U) with the highest seen one two cells about, up to what lines of sight allow."""
+    """Fill unseen cells (V, U) with the highest one seen within two cells, limited by lines of sight."""
     unseen = np.isnan(rise)
     if not unseen.any():
         return rise
@@ -191,8 +191,8 @@ def _filled(rise: Float32, max_rise: Float32) -> Float32:
 
 
 def _over(load: tuple[Bundle, ...], region: Region, margin_m: float = 0.0) -> Bool:
-    """Mark the cells (V, U) over the load's outline and in a margin; all where no load is known, which no
-    lift is offered without.
+    """Mark the cells (V, U) over the load's outline and a margin; all cells where no load is known, in which
+    case no lift is offered.
     """
     over = np.full(region.under.shape, not load)
     for bundle in load:
@@ -206,7 +206,7 @@ def _over(load: tuple[Bundle, ...], region: Region, margin_m: float = 0.0) -> Bo
 def resting_checks(
     place: Placement, magnet: Magnet, contact: Contact, load: tuple[Bundle, ...]
 ) -> list[Check]:
-    """Check that nothing lies between the faces and the load: that no face rests above its top."""
+    """Check that nothing lies between the faces and the load: no face may rest above the load's top."""
     if not load:
         return []
     above = contact.z_m - _tops(place, magnet, load)
@@ -225,7 +225,7 @@ def resting_checks(
 def leaning_checks(
     place: Placement, magnet: Magnet, contact: Contact, load: tuple[Bundle, ...]
 ) -> list[Check]:
-    """Check that the load's top doesn't stand above the faces where they lean lowest within the crane's
+    """Check that the load's top doesn't rise above the faces where they lean lowest within the crane's
     tolerance.
     """
     if not load:
@@ -244,18 +244,18 @@ def leaning_checks(
 
 
 def _tops(place: Placement, magnet: Magnet, load: tuple[Bundle, ...]) -> Float64:
-    """Compute the heights (bundles, poles) of the load's tops where the poles are."""
+    """Compute the heights (bundles, poles) of the load's tops at the poles."""
     return tops_at(load, magnet.pole_table[:, :2] @ place.axes + (place.x_m, place.y_m))
 
 
 def _obstructed(rise: Float32, spare: Float32, region: Region) -> Obstacle | None:
-    """Find the highest connected patch over the plane. rise: (V, U), less `spare`, which is allowed more."""
+    """Find the highest connected patch above the plane. rise: (V, U), minus the extra allowance `spare`."""
     for side, allowed_m, cells in (
         (5, MAX_RISE_M, MIN_PATCH_CELLS),
         (3, MAX_NARROW_RISE_M, MIN_PATCH_CELLS),
         (1, MAX_THIN_RISE_M, MIN_THIN_CELLS),
     ):
-        # The median is over a limit where most of the cells are.
+        # The median exceeds a limit where most of the cells do.
         high = (rise > allowed_m).astype(np.uint8)
         count = cv2.boxFilter(high, -1, (side, side), normalize=False, borderType=cv2.BORDER_REPLICATE)
         over = (count > side * side // 2) & region.under
@@ -277,10 +277,10 @@ def _obstructed(rise: Float32, spare: Float32, region: Region) -> Obstacle | Non
 
 
 def _unseen(blocked: UInt8, beside: Bool, region: Region) -> Obstacle | None:
-    """Find places, unproven or standing, that are wide enough to hide what stands. blocked: (V, U); a few
-    cells free among them, as wrong matches are, prove nothing. beside: (V, U), that no load lies there.
+    """Find unproven or obstructed places that are wide enough to hide an obstacle. blocked: (V, U); a few
+    free cells among blocked ones, as wrong matches are, prove nothing. beside: (V, U), cells without a load.
     """
-    # Three to either side prove something: with what is narrower closed over, the most is hidden.
+    # Only free places of three cells or more prove anything: closing the narrower ones hides the most.
     closed = cv2.morphologyEx(blocked, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     if not (wide_parts(closed, _HOLE_BESIDE_CELLS) & region.under).any():
         return None
@@ -308,7 +308,7 @@ def _unseen(blocked: UInt8, beside: Bool, region: Region) -> Obstacle | None:
 @dataclass(frozen=True, eq=False)
 class Region:
     """Cells (V, U) on the map's own grid about the magnet. x_m: (U,), y_m: (V,) of their centres, yard axes.
-    frame, parts: of `_look`, with margin. under: (V, U) 1 under a part, once looked at.
+    frame, parts: of `_look`, with margin. under: (V, U) 1 under a part, once filled by `_look`.
     """
 
     x_m: Float64
@@ -318,14 +318,14 @@ class Region:
     under: UInt8
 
     def places(self, cells: tuple[Any, ...]) -> tuple[Float64, Float64]:
-        """Return the places (N, 2) of cells, given as rows and columns: yard axes, and along and across."""
+        """Return the places (N, 2) of cells (rows, columns): in yard axes, and along and across."""
         xy = np.stack([np.atleast_1d(self.x_m[cells[1]]), np.atleast_1d(self.y_m[cells[0]])], axis=1)
         return xy, (xy - self.frame[0]) @ self.frame[1:].T
 
 
 def _region(place: Placement, heights: HeightMap, magnet: Magnet, wider_m: float) -> Region:
-    """Lay the grid, a hole's width wider than the region, for a crane that may miss by its tolerance and
-    `wider_m`. It lies on the map's cells: none comes or goes as the place moves, but at the region's edge.
+    """Lay out the grid for the crane's tolerance plus `wider_m`, with a margin as wide as a hole. It is
+    aligned with the map's cells, so a shift of the place adds or removes cells only at the edge.
     """
     beam = magnet.beam
     frame = place.frame

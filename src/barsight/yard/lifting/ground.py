@@ -1,4 +1,4 @@
-"""Summarise the yard in coarse cells: what loads are put down on and carried over."""
+"""Summarise the yard in coarse cells: the ground that loads are put down on and carried over."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from barsight.yard.types import HeightMap, YardMap
 
 COARSE_M = 0.05
 MIN_KNOWN = 0.5
-"""Of a coarse cell that must have been seen."""
+"""Minimum share of a coarse cell that must have been seen."""
 MAX_HOLE_CELLS = 2
-"""An unseen place narrower than so many coarse cells hides nothing that stands."""
+"""Minimum width, in coarse cells, of an unseen place that may hide an obstacle."""
 _PATCH_CELLS = 256
 
 
@@ -28,9 +28,9 @@ _PATCH_CELLS = 256
 class Ground:
     """Coarse cells [y, x] of a yard. Cell (0, 0) has its centre at (x0_m, y0_m).
 
-    top_m: the highest seen in the cell; where it is unknown, the highest that may stand there by lines of
-    sight, inf where none passed. unknown: not seen, and too wide to hide nothing. barred: where nothing may
-    be put down, though its heights are known.
+    top_m: maximum height seen in the cell; where unknown, the upper bound by lines of sight, inf where none
+    passed. unknown: unseen, and wide enough to hide an obstacle. barred: where nothing may be put down
+    although the heights are known.
     """
 
     yard: YardMap
@@ -43,7 +43,7 @@ class Ground:
 
     @classmethod
     def of(cls, yard: YardMap) -> Ground:
-        """Build from a map, patch by patch."""
+        """Build the coarse cells of a map, patch by patch."""
         step = max(round(COARSE_M / yard.cell_m), 1)
         shape = tuple(n // step for n in yard.shape)
         top, share = np.empty((2, *shape), np.float32)
@@ -51,7 +51,7 @@ class Ground:
             blocks = tuple(slice(cut.start // step, cut.stop // step) for cut in patch)
             top[blocks], share[blocks] = _coarse(yard.part(*patch), step)
         unseen = (share < MIN_KNOWN).astype(np.uint8)
-        # What lies beyond the map is unseen, too: a narrow strip at its edge is no hole.
+        # Cells beyond the map are unseen too, so an unseen strip at its edge doesn't count as narrow.
         rim = MAX_HOLE_CELLS
         framed = cv2.copyMakeBorder(unseen, rim, rim, rim, rim, cv2.BORDER_CONSTANT, value=1)
         unknown = wide_parts(framed, MAX_HOLE_CELLS)[rim:-rim, rim:-rim] > 0
@@ -63,7 +63,7 @@ class Ground:
         return cls(yard, yard.x0_m + offset, yard.y0_m + offset, step * yard.cell_m, top, unknown, nothing)
 
     def oldest_passes(self) -> Int64:
-        """Return the oldest pass (rows, columns) in each cell, from 1; 1 where none is known."""
+        """Return the oldest pass (rows, columns) that each cell shows, from 1; 1 where none is known."""
         step = max(round(self.cell_m / self.yard.cell_m), 1)
         found = np.ones(self.top_m.shape, np.int64)
         for patch in patches(self.yard, _PATCH_CELLS * step):
@@ -78,7 +78,7 @@ class Ground:
         return found
 
     def about(self, x_m: float, y_m: float, reach_m: float) -> Ground:
-        """Cut out what lies this near to a place, along X and along Y."""
+        """Cut out the square within this distance of a place along X and Y."""
         low, high = (
             [
                 round((at + side * reach_m - first) / self.cell_m)
@@ -94,7 +94,7 @@ class Ground:
         )  # fmt: skip
 
     def inside(self, size: Load | YardEvent, x_m: float, y_m: float, yaw_rad: float, margin_m: float) -> Bool:
-        """Mark the cells under an outline of this size at a place, and so far around it."""
+        """Mark the cells under an outline of this size at a place, and those in a margin around it."""
         rows, columns = self.top_m.shape
         xx, yy = np.meshgrid(
             self.x0_m + self.cell_m * np.arange(columns) - x_m,
@@ -113,22 +113,22 @@ class Ground:
         return np.asarray(across & ((y > y_min - half) & (y < y_max + half))[:, None])
 
     def barring(self, cells: Bool) -> Ground:
-        """Return the same with nothing to be put down on these cells."""
+        """Return a copy in which nothing may be put down on these cells."""
         return replace(self, barred=self.barred | cells)
 
     def forgetting(self, cells: Bool) -> Ground:
-        """Return the same with nothing known of these cells."""
+        """Return a copy in which nothing is known of these cells."""
         top = np.where(cells, np.float32(np.inf), self.top_m)
         return replace(self, top_m=top, unknown=self.unknown | cells)
 
     def with_load(self, cells: Bool, top_m: float) -> Ground:
-        """Return the same with a load up to top_m on these cells."""
+        """Return a copy with a load up to top_m on these cells."""
         top = np.where(cells, np.maximum(self.top_m, np.float32(top_m)), self.top_m)
         return replace(self, top_m=top, barred=self.barred | cells)
 
     def turned(self, yaw_rad: float) -> tuple[Float32, Bool, Float64]:
-        """Turn the cells into the axes across and along a heading: (V, U) top and what is unknown, barred or
-        beyond the map, and (2,) of the first cell's centre along those axes.
+        """Rotate the cells into the axes across and along a heading. Returns (V, U) top and (V, U) whether a
+        cell is unknown, barred or beyond the map, and (2,) the first cell's centre along those axes.
         """
         rows, columns = self.top_m.shape
         axes = axes_of(yaw_rad)
@@ -148,8 +148,8 @@ class Ground:
         return np.where(shut, np.float32(0), self.top_m[at]).astype(np.float32), shut, low
 
     def highest_m(self, low: Float64, high: Float64, unseen_m: float = math.inf) -> float:
-        """Find the highest that may stand in a rectangle from low to high (x, y); where nothing is known of a
-        part of it, at least unseen_m.
+        """Find the maximum height that may occur in a rectangle from low to high (x, y); at least unseen_m
+        where a part of it isn't known.
         """
         rows, columns = self.top_m.shape
         first = np.floor((low - (self.x0_m, self.y0_m)) / self.cell_m + 0.5).astype(int)
@@ -162,14 +162,14 @@ class Ground:
 
 
 def _coarse(heights: HeightMap, step: int) -> tuple[Float32, Float32]:
-    """Compute the highest that may stand in each block of step x step, and which fraction was seen."""
+    """Compute the maximum height that may occur in each block of step x step, and the share that was seen."""
     rows, columns = (n // step for n in heights.z_m.shape)
     seen = (heights.source != HeightSource.UNKNOWN) & (heights.source != HeightSource.FILLED)
     cut = np.s_[: rows * step, : columns * step]
     blocks = rows, step, columns, step
     share = seen[cut].reshape(blocks).mean(axis=(1, 3)).astype(np.float32)
     free = np.full(heights.z_m.shape, np.inf, np.float32) if heights.free_m is None else heights.free_m
-    # A single wrong cell is none of what stands there.
+    # A single wrong cell doesn't count as an obstacle.
     lowest = np.where(seen, heights.z_m, np.float32(-1e3))
     nearby = cv2.dilate(lowest, np.ones((3, 3), np.uint8))
     smooth = cv2.medianBlur(np.where(seen, heights.z_m, nearby).astype(np.float32), 3)

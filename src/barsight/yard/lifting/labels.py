@@ -1,4 +1,4 @@
-"""Find labels on the load in the orthophoto: bright plates that hold the faces off, though they are thin."""
+"""Find labels on the load in the orthophoto: bright plates that, though thin, hold the faces off the bars."""
 
 from __future__ import annotations
 
@@ -19,34 +19,38 @@ from barsight.yard.types import HeightMap
 from barsight.yard.vetoes import Check, check_true
 
 SIZE_M = LabelSettings().size_m
-"""A usual label; one with a code is too dark in its middle for `mark_labels`."""
+"""Size (m) of a usual label; the middle of one with a code is too dark for `mark_labels`."""
 DEEP_M = 0.02
-"""A label so far below the faces' plane, on the flank of a bundle, holds nothing off; what is unknown may."""
+"""Depth (m) below the faces' plane from which a label, being on a bundle's flank, holds nothing off. Labels
+of unknown height may.
+"""
 EDGE_M = 0.02
-"""Margin of a label around what the orthophoto shows of it: two cells."""
+"""Margin (m) of a label around what the orthophoto shows of it: two cells."""
 BESIDE_M = 0.15
-"""So far beside what lies under the faces the shape of a label may reach."""
+"""Distance (m) beyond the area under the faces over which a label's shape may extend."""
 LENGTH_CELLS, WIDTH_CELLS = range(3, 11), 3
-"""Steps that a label fills along the bars, and at least across."""
+"""Range of a label's length along the bars, and its minimum width across, in steps."""
 EDGE_SIGMAS, MIN_EDGE_LOG, MIN_COLUMN_LOG = 6.0, (0.2, 0.42), 0.06
-"""Logarithm of the darkest of a label's steps over the bare bar's before and behind it, as a mean across the
-label: in scatters of the bars' own, and its least and its largest bound; and of each column. A label ends at
-once, a gleam fades."""
+"""Thresholds on the log ratio of a label's darkest step to the bare bar before and behind it. For its mean
+across the label: in scatters of the bars' own levels, with minimum and maximum; for each column: minimum. A
+label ends abruptly, a reflection fades.
+"""
 AROUND_CELLS = 9
-"""Steps along a bar over which its scatter is taken."""
+"""Number of steps along a bar over which its scatter is measured."""
 WHITE_LEVEL, MIN_WHITE_LOG = 245.0, 0.1
-"""Level from which on a picture tells no more, and the least such mean of what is as bright."""
+"""Level from which a picture is saturated, and the minimum of that mean log ratio for labels this bright."""
 BRIGHTER_RATIO, FULL_LEVEL, MIN_LEVEL = 1.2, 215.0, 140.0
-"""Gray level of a label over the median of the load, the level from which on a picture shows no more, and the
-least of a label."""
+"""Minimum ratio of a label's gray level to the load's median; level at which a picture saturates, which
+limits that; and minimum level of any label.
+"""
 _BESIDE = 4
-"""Steps before and behind a label that are read."""
+"""Number of steps before and behind a label that are read."""
 _DARK = 10.0
-"""Level that is added to both: where hardly any light is, ratios tell nothing."""
+"""Level added to both levels of a ratio, since ratios of very dark levels mean nothing."""
 
 
 def label_checks(place: Placement, heights: HeightMap, magnet: Magnet, plane: FacePlane) -> list[Check]:
-    """Check that no label lies under a face, wherever within its tolerance the crane sets it down; empty
+    """Check that no label lies under a face wherever the crane sets it down within its tolerance; empty
     without an orthophoto.
     """
     if heights.gray is None:
@@ -64,8 +68,8 @@ def label_checks(place: Placement, heights: HeightMap, magnet: Magnet, plane: Fa
 def find_label(
     place: Placement, heights: HeightMap, magnet: Magnet, plane: FacePlane
 ) -> tuple[float, float] | None:
-    """Find a label under the faces that lies nearly as high as they do, m along and across the beam; None
-    where there is none.
+    """Find a label under the faces that is nearly as high as they are. Returns m along and across the beam;
+    None where there is none.
     """
     poles, tolerance = magnet.pole_table, magnet.tolerance
     turned = math.radians(tolerance.yaw_deg)
@@ -91,17 +95,17 @@ def find_label(
 
 
 def _steps(reach_m: float) -> Float64:
-    """List places STEP_M apart to either side of 0."""
+    """List places STEP_M apart to both sides of 0."""
     count = math.ceil(reach_m / STEP_M)
     return np.asarray(STEP_M * np.arange(-count, count + 1), np.float64)
 
 
 def mark_labels(gray: Float32, load: Bool) -> Bool:
-    """Mark the cells (V, U) of labels: bright, and at once darker before and behind along the bars. A bright
-    strap is marked as well.
+    """Mark the cells (V, U) of labels: bright, and abruptly darker before and behind along the bars. A bright
+    strap is marked too.
 
-    gray: levels, 0 where nothing was seen, which counts as dark. load: cells that tell the load's usual level
-    and its scatter.
+    gray: levels, 0 where nothing was seen, which counts as dark. load: cells from which the load's usual
+    level and its scatter are measured.
     """
     if not load.any():
         return np.zeros(gray.shape, np.bool_)
@@ -127,10 +131,11 @@ def mark_labels(gray: Float32, load: Bool) -> Bool:
 
 
 def _edge_logs(level: Float32, length: int) -> tuple[Float32, Float32]:
-    """Compute how far the lowest of `length` steps stands over the bare bar's before and behind it, and the
-    lowest: (V - length - 2 _BESIDE + 1, U), for runs from step _BESIDE on.
+    """Compute the log ratio of the darkest of `length` steps to the bare bar before and behind, and that
+    darkest level: (V - length - 2 _BESIDE + 1, U), for runs from step _BESIDE on.
 
-    The bare bar's are the two next steps but one, or but two: a picture blurs an end over one or two.
+    The bare bar's level is taken two or three steps beyond the run, since a picture blurs an end over one or
+    two steps.
     """
     count = len(level) - length - 2 * _BESIDE + 1
     rows = [level[k : k + count] for k in range(length + 2 * _BESIDE)]
@@ -145,8 +150,8 @@ def _edge_logs(level: Float32, length: int) -> tuple[Float32, Float32]:
 def _look_up(place: Placement, heights: HeightMap, v: Float64, u: Float64) -> tuple[Float32, Float32]:
     """Look up gray levels and heights (V, U) at places along and across; 0 and NaN where nothing was seen.
 
-    Levels are interpolated between the four cells about: along bars that lie a little askew the nearest cell
-    jumps aside from step to step, and a bar's bright crest then seems to begin there.
+    Levels are interpolated between the four nearest cells. Along slightly skewed bars the nearest cell jumps
+    sideways from step to step, so that a bar's bright crest would seem to begin there.
     """
     x = place.x_m + v[:, None] * place.along[0] + u * place.across[0]
     y = place.y_m + v[:, None] * place.along[1] + u * place.across[1]

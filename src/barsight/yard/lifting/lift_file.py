@@ -1,4 +1,4 @@
-"""Read and write `lifts.json`: ranked lift targets and the refused ones."""
+"""Read and write `lifts.json`: the ranked lift targets and the refused ones."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ def write_lifts(
     plan: LiftPlan, reference: str, identity: MapIdentity, bundles_sha256: str, target: Path,
     sequence: int = 1, order: LiftOrder | None = None,
 ) -> str:  # fmt: skip
-    """Write lifts.json whole or not at all; return its digest. reference: the frame, `yard` or `world`.
+    """Write lifts.json completely or not at all; return its digest. reference: the frame, `yard` or `world`.
     bundles_sha256: the digest in bundles.json.
     """
     return write_sealed(lifts_content(plan, reference, identity, bundles_sha256, sequence, order), target)
 
 
 def read_lifts(path: Path) -> dict[str, Any]:
-    """Read lifts.json. Raises InputError where it is missing, torn, changed, of another version or isn't as
-    its schema says.
+    """Read lifts.json. Raises InputError where it is missing, truncated, altered, of another version or
+    doesn't match its schema.
     """
     content = read_sealed(path, SCHEMA_VERSION, REMEDY)
     expect_schema(content, package_schema("barsight.yard", "lifts"), path, REMEDY)
@@ -56,7 +56,7 @@ def forbidden_since(
     content: dict[str, Any], record: dict[str, Any], bundles: Iterable[Bundle],
     events: tuple[YardEvent, ...], now_ns: int,
 ) -> tuple[Veto, ...]:  # fmt: skip
-    """Tell what has forbidden a lift since it was offered: its age, and events near it or its set-down.
+    """List what has forbidden a lift since it was offered: its age, and events near it or near its set-down.
 
     content: of lifts.json; record: one of its lifts. bundles, events: of the same folder. now_ns: on the
     frames' clock.
@@ -89,7 +89,7 @@ def forbidden_since(
 
 
 def _unknown_to(content: dict[str, Any], events: tuple[YardEvent, ...]) -> tuple[YardEvent, ...]:
-    """Select the events that neither the map may show nor the set-downs of lifts.json keep clear of."""
+    """Select the events that the map may not show and that weren't known when lifts.json was written."""
     from_ns, known = content["captured_from_ns"] or -1, {tuple(event.values()) for event in content["events"]}
     return tuple(one for one in events if one.stamp_ns > from_ns and astuple(one) not in known)
 
@@ -102,8 +102,8 @@ def lifts_content(
     plan: LiftPlan, reference: str, identity: MapIdentity, bundles_sha256: str, sequence: int = 1,
     order: LiftOrder | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Build the content of lifts.json, without its digest. order: that digs out the bundle that was asked
-    for, if one was.
+    """Build the content of lifts.json, without its digest. order: the one that digs out the requested bundle,
+    if there is one.
     """
     offset = plan.magnet.offset
     content: dict[str, Any] = json_value(
@@ -189,7 +189,7 @@ def _lift(lift: Lift, rank: int | None, offset: MagnetOffset | None) -> dict[str
 def _crane(
     x_m: float, y_m: float, z_m: float | None, yaw_deg: float, offset: MagnetOffset | None
 ) -> dict[str, float | None]:
-    """Return what the crane's readings must say for the magnet to be at a place; the place itself where no
+    """Return what the crane's readings must be for the magnet to be at a place; the place itself where no
     offset is known.
     """
     off = (0.0, 0.0, 0.0) if offset is None else offset.place_m

@@ -1,4 +1,4 @@
-"""Describe what hangs in the magnet as a box: the outline and height of one bundle or of several."""
+"""Describe the load on the magnet as a box: outline and height of one bundle or several."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ UNKNOWN_SIGMA_M = 0.05
 
 @dataclass(frozen=True)
 class Load:
-    """Outline of the load as it lies, m and rad, upper 95 % bounds of its sizes.
+    """Outline of the load as it lies, m and rad; its sizes are upper 95 % bounds.
 
-    x_m, y_m: its middle. off_across_m, off_along_m: its centre of mass from there. yaw_rad: as a bundle's.
-    height_m: from its underside to its top. rolls: nothing but its roundness would hold it on level ground.
+    x_m, y_m: its middle. off_across_m, off_along_m: centre of mass relative to the middle. yaw_rad: as a
+    bundle's. height_m: from its underside to its top. rolls: it is round, and would roll on level ground.
     """
 
     bundles: tuple[int, ...]
@@ -38,7 +38,7 @@ class Load:
 
     @classmethod
     def of(cls, bundles: tuple[Bundle, ...]) -> Load:
-        """Build from the bundles of one lift, which lie side by side."""
+        """Build a load from the bundles of one lift, which lie side by side."""
         yaw = mean_yaw(bundles)
         axes = axes_of(yaw)
         low, high = np.full(2, np.inf), np.full(2, -np.inf)
@@ -62,7 +62,7 @@ class Load:
 
 
 def laid_at(load: tuple[Bundle, ...], x_m: float, y_m: float, yaw_rad: float) -> Bundle:
-    """Outline a load of one or several bundles as one bundle that lies at a place."""
+    """Describe a load of one or several bundles as one bundle that lies at a place."""
     whole = Load.of(load)
     return replace(
         load[0], centre_m=np.array([x_m, y_m, load[0].centre_m[2]]), yaw_rad=yaw_rad,
@@ -71,15 +71,15 @@ def laid_at(load: tuple[Bundle, ...], x_m: float, y_m: float, yaw_rad: float) ->
 
 
 def is_one_bar(bundle: Bundle) -> bool:
-    """Check whether a bundle may be a single bar: one shows, or it is hardly wider than one."""
+    """Check whether a bundle may be a single bar: one bar shows, or the bundle is hardly wider than one."""
     return bundle.visible_bars == 1 or bundle.width_m < 1.5 * bundle.bar_diameter_m
 
 
 def reaches_area(
     middle_m: Float64, yaw_rad: float, size_m: tuple[float, float], area: tuple[float, float, float, float]
 ) -> bool:
-    """Check whether a rectangle of this width and length, turned by yaw, meets one along X and Y (x_min,
-    y_min, x_max, y_max): no axis of either parts them.
+    """Check whether a rectangle of this width and length, rotated by yaw, meets one along X and Y (x_min,
+    y_min, x_max, y_max): no axis of either separates them.
     """
     axes, half = axes_of(yaw_rad), np.array(size_m) / 2
     low, high = np.array(area[:2]), np.array(area[2:])
@@ -110,7 +110,7 @@ def axes_of(yaw_rad: float) -> Float64:
 
 
 def tops_at(bundles: tuple[Bundle, ...], places_m: Float64) -> Float64:
-    """Compute the heights (bundles, N) of bundles' tops at level places (N, 2) along them."""
+    """Compute the heights (bundles, N) of bundles' tops at places (N, 2) in plan view along them."""
     along = [(places_m - bundle.centre_m[:2]) @ axes_of(bundle.yaw_rad)[1] for bundle in bundles]
     return np.array([
         bundle.top_z_m + away * math.tan(bundle.pitch_rad)

@@ -1,7 +1,7 @@
-"""Order the lifts that dig a bundle out: which lift uncovers which, and how each load travels.
+"""Order the lifts that dig a bundle out: which lift uncovers which bundle, and how each load travels.
 
-Only the first lift of an order is offered: where a load was lifted or set down nothing is known any more
-until the place is measured again.
+Only the first lift of an order is offered: once a load has been lifted or set down somewhere, nothing is
+known about that place until it is measured again.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from barsight.yard.types import Bundle, YardMap
 
 @dataclass(frozen=True)
 class LiftStep:
-    """One lift of an order. travel_z_m: of the load's underside on its way. is_offered: it is one of the
-    plan's lifts; otherwise it is to be confirmed by a measurement after the one before.
+    """One lift of an order. travel_z_m: height of the load's underside on its way. is_offered: the plan
+    offers it; otherwise it has to be confirmed by a measurement after the previous step.
     """
 
     bundle: int
@@ -38,7 +38,7 @@ class LiftStep:
 
 @dataclass(frozen=True)
 class LiftOrder:
-    """Lifts that dig a bundle out, the first one first; the last is the bundle's own."""
+    """Lifts that dig a bundle out, from first to last; the last one is the bundle's own."""
 
     bundle: int
     steps: tuple[LiftStep, ...]
@@ -47,9 +47,9 @@ class LiftOrder:
 def order_lifts(
     bundle_id: int, yard: YardMap, bundles: tuple[Bundle, ...], plan: LiftPlan
 ) -> LiftOrder | Failed:
-    """Find the order that digs a bundle out, or why there is none.
+    """Find the order that digs a bundle out, or the reason why there is none.
 
-    Of the lifts that nothing is in the way of the highest comes first; the first must be an offered one.
+    Among the lifts that nothing blocks, the highest comes first; the first of all must be an offered one.
     """
     by_id = {bundle.id: bundle for bundle in bundles}
     if bundle_id not in by_id:
@@ -83,7 +83,9 @@ def order_lifts(
 
 
 def begin_order(order: LiftOrder, plan: LiftPlan, bundles: tuple[Bundle, ...], yard: YardMap) -> LiftPlan:
-    """Put the load of the offered lift that begins an order where the order has it, off what is dug out."""
+    """Set down the load of the offered lift that begins an order where the order puts it, clear of the
+    bundles that are dug out.
+    """
     first = order.steps[0]
     load = tuple(bundle for bundle in bundles if bundle.id == first.bundle)
     offered = []
@@ -98,11 +100,11 @@ def begin_order(order: LiftOrder, plan: LiftPlan, bundles: tuple[Bundle, ...], y
 def travel_height(
     ground: Ground, load: Load, place: SetDown, magnet: Magnet, settings: LiftSettings
 ) -> float | Failed:
-    """Find the height (m) for the load's underside that clears all that load and magnet may pass over, or why
-    there is none.
+    """Find a height (m) of the load's underside that clears everything load and magnet may pass over, or the
+    reason why there is none.
 
-    Bridge and trolley may move one before the other and the load may turn and swing: all of the rectangle
-    between both places counts, wider by how far load and magnet reach, and the swing.
+    Bridge and trolley may move one after the other, and the load may turn and swing. So the whole rectangle
+    between both places counts, widened by how far load and magnet reach and by the swing.
     """
     ends = np.array([[load.x_m, load.y_m], [place.x_m, place.y_m]])
     reach = _reach(load, place, magnet, settings)
@@ -118,7 +120,7 @@ def travel_height(
 
 
 def _reach(load: Load, place: SetDown, magnet: Magnet, settings: LiftSettings) -> Float64:
-    """Return how far (x, y) load and magnet reach from the load's middle on the way, swing included."""
+    """Return how far (x, y) load and magnet reach from the load's middle on the way, including the swing."""
     half = np.maximum((load.width_m / 2, load.length_m / 2), magnet_reach(load, magnet))
     yaws = load.yaw_rad + math.radians(place.turn_deg) * np.linspace(0, 1, 19)
     reaches = [half @ np.abs(axes_of(float(yaw))) for yaw in yaws]
@@ -132,7 +134,9 @@ def _offered(plan: LiftPlan) -> set[int]:
 def _sequence(
     bundle_id: int, by_id: dict[int, Bundle], blockers: dict[int, tuple[int, ...]], offered: set[int]
 ) -> list[Bundle] | Failed:
-    """Sort all that must go, and the bundle itself last, so that nothing is lifted from under another."""
+    """Sort the bundles that must be moved, ending with the requested one, so that none is lifted from under
+    another.
+    """
     needed, open_ = set[int](), [bundle_id]
     while open_:
         one = open_.pop()

@@ -1,4 +1,4 @@
-"""Find where a load can be set down: its very outline, on what carries it, with nothing in its way."""
+"""Find where a load can be set down: by its exact outline, on sufficient support, with nothing in its way."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ from barsight.yard.stability.stability import Footing
 from barsight.yard.types import Bundle
 
 REACH_M = 30.0
-"""Places further than this from the load, along X or Y, are not looked for."""
+"""Maximum distance (m) along X and Y from the load at which places are searched for."""
 MAX_TRIED = 16
 APART_M = 0.15
 SHADOW_M = 0.3
-"""What lies this near to a load was partly hidden by it and may move when it goes."""
+"""Distance (m) around a load within which things were partly hidden by it, and may move when it goes."""
 SMALL_TURNS_DEG = (0.0, 2.5, -2.5, 5.0, -5.0)
 
 
 @dataclass(frozen=True)
 class SetDown:
-    """Place for a load, yard axes: the middle of its underside; yaw as a bundle's.
+    """A place for a load in yard axes: the middle of its underside; yaw as a bundle's.
 
-    turn_deg: from where it lies. slope_deg: of what it lies on. support_m: from the first support to the
-    last. margin_along_m, margin_across_m: from the load's centre of mass to the end and the side of what
+    turn_deg: from its present yaw. slope_deg: of the ground it lies on. support_m: from the first support to
+    the last. margin_along_m, margin_across_m: from the load's centre of mass to the end and the side of what
     carries it.
     """
 
@@ -59,13 +59,14 @@ class SetDown:
 
     @property
     def yaw_rad(self) -> float:
-        """Return the yaw as the rest of the yard has it."""
+        """Return the yaw in rad, as in the rest of the yard."""
         return math.radians(self.yaw_deg)
 
 
 def find_set_down(ground: Ground, load: Load, magnet: Magnet, settings: LiftSettings) -> SetDown | None:
-    """Find the place with the least turn, then the lowest, then the nearest; None where there is none, or
-    where the load would roll."""
+    """Find the place with the smallest turn, among these the lowest, then the nearest. None where there is
+    none, or where the load would roll.
+    """
     if load.rolls:
         return None
     ground = ground.about(load.x_m, load.y_m, REACH_M)
@@ -87,8 +88,8 @@ def find_set_down(ground: Ground, load: Load, magnet: Magnet, settings: LiftSett
 def _magnet_meets(
     ground: Ground, load: Load, x_m: float, y_m: float, yaw_rad: float, bearing: Bearing, magnet: Magnet
 ) -> bool:
-    """Check whether the magnet may meet what the map's heights don't have: a load that was put down before,
-    or what may stand where nothing is known any more.
+    """Check whether the magnet may meet what the map's heights don't show: a load that was put down before,
+    or something in a place about which nothing is known any more.
     """
     over = np.array([x_m, y_m]) + (load.off_across_m, load.off_along_m) @ axes_of(yaw_rad)
     for wide, long, over_m in magnet_rectangles(load, magnet, placing_slack(load, yaw_rad, magnet)):
@@ -102,7 +103,7 @@ def _magnet_meets(
 def _reaches_area(
     load: Load, x_m: float, y_m: float, yaw_rad: float, magnet: Magnet, settings: LiftSettings
 ) -> bool:
-    """Check whether a load put down, or the magnet wherever it may hold it, may reach a no-lift area."""
+    """Check whether the load set down, or the magnet wherever it may hold it, may reach a no-lift area."""
     middle, (wide, long) = np.array([x_m, y_m]), 2 * magnet_reach(load, magnet)
     sizes = (load.width_m, load.length_m), (float(wide), float(long))
     return any(reached_areas(middle, yaw_rad, size, magnet.tolerance, settings) for size in sizes)
@@ -112,9 +113,9 @@ def sound_ground(
     ground: Ground, bundles: tuple[Bundle, ...], standing: tuple[Footing, ...], settings: LiftSettings,
     events: tuple[YardEvent, ...] = (), travel: Travel | None = None, now_ns: int = 0,
 ) -> Ground:  # fmt: skip
-    """Bar what should not be loaded: bundles that lean or stand over an edge, doubtful ones, and places where
-    nothing is put down. What lies within reach of an event in the yard isn't known any more, nor what was
-    last seen too long before now_ns.
+    """Bar the ground that shouldn't be loaded: leaning bundles, bundles over an edge, doubtful ones, and
+    no-lift areas. Nothing is known any more within reach of an event in the yard, or where the last sight is
+    too old at now_ns.
     """
     footings = {footing.bundle: footing for footing in standing}
     for bundle in bundles:
@@ -142,7 +143,7 @@ def _turns(max_deg: float) -> Iterator[float]:
 def _candidates(
     ground: Ground, load: Load, yaw_rad: float, settings: LiftSettings
 ) -> Iterator[tuple[float, float]]:
-    """Propose places (x, y) where coarse cells rule nothing out: the lowest, of these the nearest first."""
+    """Propose places (x, y) that no coarse cell rules out: the lowest first, and among these the nearest."""
     top, shut, low = ground.turned(yaw_rad)
     cell, margin = ground.cell_m, settings.set_down_clear_m
     size = tuple(
@@ -150,7 +151,7 @@ def _candidates(
     )  # odd, no wider than the clear outline by more than a cell
     if size[0] > top.shape[1] or size[1] > top.shape[0]:
         return
-    # A gully may be as wide as three cells between two that carry.
+    # A gully between two cells that carry may be up to three cells wide.
     closed = cv2.morphologyEx(top, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
     window = np.ones((max(size[1] - 2, 1), max(size[0] - 2, 1)), np.uint8)
     highest = cv2.dilate(top, window)

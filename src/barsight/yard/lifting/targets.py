@@ -1,4 +1,4 @@
-"""Plan lift targets: for every bundle that may be free the best placement of the magnet, ranked, or the
+"""Plan lift targets: the best placement of the magnet for each bundle that may be free, ranked, or the
 vetoes.
 """
 
@@ -35,10 +35,10 @@ from barsight.yard.weight import load_centre
 
 ACROSS_M = (0.0, 0.015, -0.015, 0.03, -0.03)
 BETWEEN_M = (0.0075, -0.0075, 0.0225, -0.0225)
-"""Across, where some of those hold but not within the crane's tolerance."""
+"""Offsets (m) across that are tried where some of those hold, but not within the crane's tolerance."""
 ALONG_M = (0.1, -0.1, 0.25, -0.25)
 ANYWHERE = frozenset({"covered", "bundle-doubtful", "end-open", "mass-unknown", "overweight", "thin-bar"})
-"""Vetoes of the load itself: another place of the magnet changes nothing."""
+"""Vetoes of the load itself, which another place of the magnet can't change."""
 SAME_TOP_M = 0.03
 SAME_YAW_RAD = np.radians(2.0)
 RULE = (
@@ -50,12 +50,13 @@ RULE = (
 
 @dataclass(frozen=True, eq=False)
 class LiftPlan:
-    """offered: lifts without any veto, in `RULE`'s order. refused: the best placement of each other bundle.
+    """The lifts of a yard.
 
-    vetoes: those that hold for the whole map; with any of them nothing is offered. footings: how each bundle
-    stands. sides: of the piles. blocked: what must go before each bundle. judged_at_ns: when, on the frames'
-    clock; captured_ns: stamps of the first and last frame, None where the map is given. events: in the yard
-    since it was measured. travel: of the map's frames.
+    offered: lifts without any veto, in `RULE`'s order. refused: the best placement of each other bundle.
+    vetoes: those of the whole map; with any of them nothing is offered. footings: how each bundle stands.
+    sides: of the piles. blocked: what must be moved before each bundle. judged_at_ns: time of the assessment
+    on the frames' clock; captured_ns: stamps of the first and last frame, None where the map was given.
+    events: in the yard since it was measured. travel: of the map's frames.
     """
 
     magnet: Magnet
@@ -73,7 +74,7 @@ class LiftPlan:
 
     @property
     def looks_back(self) -> bool:
-        """Tell lifts judged as of the last frame, to look back, from those for a crane."""
+        """Distinguish lifts judged as of the last frame, which look back, from lifts for a crane."""
         return self.captured_ns is not None and self.judged_at_ns == self.captured_ns[1]
 
 
@@ -81,7 +82,7 @@ def map_vetoes(
     warnings: Iterable[tuple[str, str]], reference: str, captured_to_ns: int | None, now_ns: int,
     settings: LiftSettings, *, has_magnet: bool,
 ) -> tuple[Veto, ...]:  # fmt: skip
-    """Forbid every lift of a map for its warnings (code, sentence), frame, age or want of a magnet.
+    """Forbid every lift of a map for its warnings (code, sentence), its frame, its age or a missing magnet.
 
     captured_to_ns: stamp of its last frame, None where that isn't known; now_ns: on the same clock.
     """
@@ -99,7 +100,9 @@ def map_vetoes(
 
 
 def offset_vetoes(magnet: Magnet, calibration_id: str, yard_frame_id: str | None) -> tuple[Veto, ...]:
-    """Forbid every lift of a map that another rig or yard frame made than the magnet's offset is of."""
+    """Forbid every lift of a map whose rig or yard frame isn't the one for which the magnet's offset was
+    measured.
+    """
     offset = magnet.offset
     if offset is None:
         return ()
@@ -120,9 +123,11 @@ def plan_lifts(
     vetoes: tuple[Veto, ...], travel: Travel | None = None, now_ns: int = 0,
     events: tuple[YardEvent, ...] = (), contradicted: Mapping[int, str] = MappingProxyType({}),
 ) -> LiftPlan:  # fmt: skip
-    """Choose the lifts. vetoes: those that hold for the whole map (`map_vetoes`). travel: of its frames.
-    now_ns: when the lifts are judged, on the frames' clock. events: in the yard since it was measured.
-    contradicted: bundles, by id, of which the stock list says something else, and what.
+    """Choose the lifts.
+
+    vetoes: those of the whole map (`map_vetoes`). travel: of its frames. now_ns: time for which the lifts are
+    judged, on the frames' clock. events: in the yard since it was measured. contradicted: bundles, by id,
+    that the stock list contradicts, and what it says.
     """
     parts, stands = split_map(yard), dict[int, Footing]()
     for part in parts:
@@ -173,7 +178,7 @@ def plan_lifts(
 
 
 def put_down(lift: Lift, load: Load, place: SetDown | None) -> Lift:
-    """Put a lift's load down; the magnet keeps its place on the load, be it the middle or not."""
+    """Set a lift's load down; the magnet keeps its place on the load, whether that is the middle or not."""
     if place is None:
         return replace(lift, set_down=None, magnet_down=None)
     held = axes_of(load.yaw_rad) @ (lift.place.x_m - load.x_m, lift.place.y_m - load.y_m)
@@ -186,7 +191,7 @@ def _with_set_downs(
     lifts: list[Lift], bundles: tuple[Bundle, ...], ground: Ground, travel: Travel | None, magnet: Magnet,
     settings: LiftSettings,
 ) -> list[Lift]:  # fmt: skip
-    """Find for each lift where its load can be put down."""
+    """Find a place for each lift where its load can be set down."""
     by_id = {bundle.id: bundle for bundle in bundles}
 
     def with_set_down(lift: Lift) -> Lift:
@@ -202,8 +207,8 @@ def ended_with_floor(
     lift: Lift, load: tuple[Bundle, ...], yard: YardMap, travel: Travel | None, magnet: Magnet,
     settings: LiftSettings,
 ) -> Lift:  # fmt: skip
-    """End a lift's validity where that of its set-down ends: `max_age_s` after the survey began where no
-    frame surely saw that.
+    """End a lift's validity when that of its set-down ends: `max_age_s` after the survey began where no frame
+    certainly saw the set-down.
     """
     place, down = lift.set_down, lift.magnet_down
     if travel is None or travel.captured_ns is None or None in (place, down, lift.validity):
@@ -219,7 +224,7 @@ def ended_with_floor(
 
 
 def _groups(bundles: tuple[Bundle, ...], count: int) -> Iterator[tuple[Bundle, ...]]:
-    """Group bundles on which nothing lies (or may), each with its next count - 1 neighbours towards its high
+    """Group the bundles that are free, or may be, each with its next count - 1 neighbours towards its high
     side.
     """
     free = [bundle for bundle in bundles if bundle.on_top is not False]
@@ -243,7 +248,9 @@ def _groups(bundles: tuple[Bundle, ...], count: int) -> Iterator[tuple[Bundle, .
 
 
 def _best(group: tuple[Bundle, ...], yard: LiftScene, magnet: Magnet, settings: LiftSettings) -> Lift:
-    """Choose the placement with the fewest vetoes, then the safest; the middle where the load forbids all."""
+    """Choose the placement with the fewest vetoes, then the safest; the middle where the load itself is
+    vetoed.
+    """
 
     def tried(offsets: Iterable[tuple[float, float]]) -> list[Lift]:
         places = (_place(group, along, across) for along, across in offsets)
@@ -267,14 +274,14 @@ def _best(group: tuple[Bundle, ...], yard: LiftScene, magnet: Magnet, settings: 
 
 
 def _forbidden_anywhere(lifts: list[Lift]) -> bool:
-    """Check whether all are vetoed for the load itself, and for the same reason."""
+    """Check whether all lifts have the same veto of the load itself."""
     return bool(ANYWHERE.intersection(*({veto.code for veto in lift.vetoes} for lift in lifts)))
 
 
 def _sound(quick: list[Lift], yard: LiftScene, magnet: Magnet, settings: LiftSettings) -> Lift | None:
-    """Find the first that holds within the crane's tolerance too; the best that doesn't, None without any.
+    """Find the first lift that also holds within the crane's tolerance; otherwise the best, None without any.
 
-    All are tried: were it some, tiny noise would choose which, and with that whether a lift is offered.
+    All are tried: if only some were, noise would decide which ones, and so whether a lift is offered.
     """
     whole = []
     for lift in quick:

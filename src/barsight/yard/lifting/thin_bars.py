@@ -1,4 +1,4 @@
-"""Check that no thin bar lies loose across a load: matching sees none under three pixels."""
+"""Check that no thin bar lies loose across a load: matching can't see bars thinner than three pixels."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ from barsight.yard.vetoes import Check, check_max, check_true
 
 CODE = "thin-bar"
 FOUND_PX = 1.8
-"""Diameter of a bar, in the photo's pixels, from which on nine of ten are found."""
+"""Minimum diameter, in the photo's pixels, of bars of which nine in ten are found."""
 BEYOND_M = 0.4
-"""So far beyond a bundle's flank a bar that lies across it may stick out."""
+"""Maximum distance (m) by which a bar that lies across a bundle projects beyond its flank."""
 BELOW_M = 0.3
-"""A bar that lies on a bundle so far below the faces doesn't rise to them, though it may lean by a slope of a
-half where it sticks out."""
+"""Depth (m) of a bundle below the faces from which a bar on it can't reach up to them, even if it leans with
+a slope of a half where it projects.
+"""
 WAY_STEP_M, UNSEEN_STEP_M = 0.02, 0.1
 
 
@@ -33,9 +34,9 @@ def thin_bar_checks(
 ) -> list[Check]:  # fmt: skip
     """Check that no thin bar lies across the load, and that the pictures would show one.
 
-    line: of the load, None where the photo doesn't show enough of it. pixel_m: of the pictures on the
-    load, NaN where it isn't known; None for a map that no pictures made: then nothing is checked where
-    there is no photo either.
+    line: the strongest across the load, None where the photo doesn't show enough of it. pixel_m: pixel size
+    of the pictures on the load, NaN where it isn't known; None for a map that wasn't made from pictures: then
+    nothing is checked unless there is a photo.
     """
     if not load or not has_pictures(heights, pixel_m):
         return []
@@ -66,13 +67,13 @@ def thin_bar_checks(
 
 
 def has_pictures(heights: HeightMap, pixel_m: float | None) -> bool:
-    """Check that pictures made a map, or that it has their photo: see `thin_bar_checks`."""
+    """Check that a map was made from pictures, or has their photo: see `thin_bar_checks`."""
     return pixel_m is not None or heights.tops is not None
 
 
 def edge_checks(beside: Iterable[Bundle]) -> list[Check]:
-    """Check that no edge runs over a flank of a neighbour from which a bar may come under the magnet: how far
-    what has that edge reaches beyond the flank isn't known.
+    """Check that no edge crosses the flank of a neighbour from which a bar may reach under the magnet: how
+    far the object with that edge extends beyond the flank isn't known.
     """
     what = "nothing with an edge over a neighbour's flank extends under the magnet"
     return [
@@ -86,8 +87,9 @@ def beside_checks(
 ) -> list[Check]:
     """Check that no thin bar that lies across a neighbour reaches under the magnet.
 
-    In the air beyond its bundle's flank nothing shows such a bar: the map has what lies below it. near: the
-    bundles that `may_reach`, and the lines across each, None where the photo doesn't show enough of it.
+    In the air beyond its bundle's flank nothing shows such a bar, since the map has the surface below it.
+    near: the bundles that `may_reach`, and the lines across each, None where the photo doesn't show enough of
+    it.
     """
     if not near:
         return []
@@ -116,9 +118,9 @@ def beside_checks(
 
 
 def may_reach(bundle: Bundle, place: Placement, magnet: Magnet, faces_z_m: float) -> bool:
-    """Check whether a line of any slope across a bundle could come under the magnet, by the rectangle about
-    all of them along each of the magnet's axes, and by its height: where it can't, the bundle's photo need
-    not be searched. faces_z_m: of the lowest face.
+    """Check whether a line of any slope across a bundle could come under the magnet, by its height and by the
+    bounding rectangle of all such lines along the magnet's axes. If not, the bundle's photo needn't be
+    searched. faces_z_m: height of the lowest face.
     """
     highest_m = bundle.top_z_m + bundle.length_m / 2 * abs(math.tan(bundle.pitch_rad))
     if highest_m < faces_z_m - BELOW_M:
@@ -132,8 +134,8 @@ def may_reach(bundle: Bundle, place: Placement, magnet: Magnet, faces_z_m: float
 
 
 def _under_m(place: Placement, magnet: Magnet) -> Float64:
-    """Compute half the length and half the width (2,) under the magnet, within the crane's tolerance and the
-    stray field.
+    """Compute half the length and half the width (2,) of the area under the magnet, including the crane's
+    tolerance and the stray field.
     """
     slack = magnet.tolerance.along(place.axes)
     half = np.array([magnet.size_m[1], magnet.size_m[0]]) / 2 + slack + STRAY_FIELD_M
@@ -147,7 +149,7 @@ def _axes(bundle: Bundle) -> tuple[Float64, Float64]:
 
 
 def _beyond_flanks(bundle: Bundle, line: ThinLine) -> Float64:
-    """Return places (N, 2) on a line across a bundle, up to BEYOND_M beyond either flank, yard axes."""
+    """Return places (N, 2) on a line across a bundle, up to BEYOND_M beyond either flank, in yard axes."""
     along, across = _axes(bundle)
     askew = math.radians(line.askew_deg)
     way = math.cos(askew) * across + math.sin(askew) * along

@@ -1,4 +1,4 @@
-"""Estimate the map's position uncertainty along the crane's way, and whether it is enough for a
+"""Estimate the map's position uncertainty along the crane's path, and check that it is small enough for a
 lift there.
 """
 
@@ -26,9 +26,9 @@ from barsight.yard.vetoes import Check, check_max, check_true
 from barsight.yard.weight import load_centre
 
 ALONGSIDE_M = 1.0
-"""Encoders are held against the map where the crane passed no further than this from the lift."""
+"""Distance (m) from the lift within which encoders and map are compared where the crane passed."""
 SURE_SIGMAS = 3.0
-"""Encoders this many sigma off the trajectory disagree with it."""
+"""Number of the trajectory's sigmas beyond which encoders count as disagreeing with it."""
 MOVING_MPS = 0.05
 CODE = "trajectory-degraded"
 
@@ -37,13 +37,13 @@ CODE = "trajectory-degraded"
 class Travel:
     """Uncertainty of the frames' poses over the yard.
 
-    place_m: (N, 2) the body, x and y. sigma_m: (N, 3) of the ground below it in x, y, z. off_m: (N,) by how
-    much the encoders are off the trajectory, NaN where there are none; what a constant latency explains is
-    taken off. refused_m: (R, 2) where the refused frames must have been. reach_m: how far from the body a
-    frame may see. stamp_ns: (N,) of the frames, rising. measured: (N,) whether a frame's heights are in the
-    map. sure_reach_m: what is nearer to the body than this is in the picture. eye_z_m: the body's median
-    height; pixel_rad: angle of a pixel; both NaN where an earlier version measured. pass_number: (N,) of the
-    pass that each frame is of, from 1; empty where there is but one.
+    place_m: (N, 2) x and y of the body. sigma_m: (N, 3) of the ground below it in x, y, z. off_m: (N,)
+    distance between encoders and trajectory, NaN where there are no encoders, without what a constant latency
+    explains. refused_m: (R, 2) where the refused frames must have been. reach_m: maximum distance from the
+    body at which a frame may see. stamp_ns: (N,) of the frames, rising. measured: (N,) whether a frame's
+    heights are in the map. sure_reach_m: distance from the body within which everything is in the picture.
+    eye_z_m: the body's median height; pixel_rad: angle of a pixel; both NaN in files of an earlier version.
+    pass_number: (N,) pass of each frame, from 1; empty where there is only one.
     """
 
     place_m: Float64
@@ -60,17 +60,17 @@ class Travel:
 
     @property
     def captured_ns(self) -> tuple[int, int] | None:
-        """Stamps of the first and the last measured frame; None without any."""
+        """Return the stamps of the first and the last measured frame; None without any."""
         stamps = self.stamp_ns[self.measured]
         return (int(stamps[0]), int(stamps[-1])) if stamps.size else None
 
     @property
     def passes(self) -> Int64:
-        """Return the pass (N,) that each frame is of, from 1."""
+        """Return the pass (N,) of each frame, from 1."""
         return self.pass_number if len(self.pass_number) else np.ones(len(self.place_m), np.int64)
 
     def pixel_m(self, z_m: float) -> float:
-        """Return the size of a pixel at this height below the body; NaN where it isn't known."""
+        """Return the size (m) of a pixel on a surface at height z_m; NaN where it isn't known."""
         return (self.eye_z_m - z_m) * self.pixel_rad
 
     @classmethod
@@ -78,9 +78,9 @@ class Travel:
         cls, trajectory: Trajectory, crane: CraneSamples | None, shift_ns: int, window_ns: int,
         range_m: float, camera: RectifiedCamera, measured_ns: Collection[int],
     ) -> Travel:  # fmt: skip
-        """Build from a trajectory. shift_ns: from the camera's clock to the encoders'. window_ns: of readings
-        that make one place.
-        range_m: the surface's depth below the body. measured_ns: stamps of the frames in the map.
+        """Build from a trajectory. shift_ns: from the camera's clock to the encoders'. window_ns: window of
+        readings that are fitted to one position. range_m: depth of the surface below the body. measured_ns:
+        stamps of the frames in the map.
         """
         stamps, places = trajectory.stamp_ns, trajectory.positions_m
         lever = np.array([0.0, 0.0, -range_m])
@@ -102,7 +102,7 @@ class Travel:
 
     @classmethod
     def joined(cls, parts: Sequence[Travel]) -> Travel:
-        """Join the passes of one yard, the oldest first."""
+        """Join the passes of one yard, oldest first."""
         place, sigma, off, refused, stamps, measured = (
             np.concatenate([getattr(part, name) for part in parts])
             for name in ("place_m", "sigma_m", "off_m", "refused_m", "stamp_ns", "measured")
@@ -116,7 +116,7 @@ class Travel:
 
     @classmethod
     def read(cls, summary: dict[str, Any]) -> Travel | None:
-        """Read from result.json; None where it doesn't say, or not the same number of each."""
+        """Read from result.json; None where values are missing or their numbers differ."""
         content: Any = summary.get("travel")
         try:
             place, sigma, off, refused = (
@@ -143,12 +143,12 @@ class Travel:
         )  # fmt: skip
 
     def content(self) -> dict[str, Any]:
-        """Convert to what result.json says; NaN is left to the writer."""
+        """Convert to the content of result.json; the writer handles NaN."""
         return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(self).items()}
 
 
 def _places_at(wanted: Int64, stamps: Int64, places: Float64) -> Float64:
-    """Interpolate x and y (R, 2) at other stamps, on straight lines between and beyond the placed frames."""
+    """Interpolate x and y (R, 2) at other stamps, linearly between the placed frames and beyond them."""
     if stamps.size < 2:
         return np.empty((0, 2))
     way = interp1d(stamps - stamps[0], places[:, :2], axis=0, fill_value="extrapolate")
@@ -158,8 +158,8 @@ def _places_at(wanted: Int64, stamps: Int64, places: Float64) -> Float64:
 def _disagreement(
     stamps: Int64, places: Float64, crane: CraneSamples | None, shift_ns: int, window_ns: int
 ) -> Float64:
-    """Compute the distance (N,) of the encoders' place from the body's, without what a constant latency
-    explains.
+    """Compute the distance (N,) between the encoders' position and the body's, without what a constant
+    latency explains.
     """
     if crane is None or stamps.size < 2:
         return np.full(stamps.size, np.nan)
@@ -180,7 +180,7 @@ def _disagreement(
 
 
 def travel_checks(travel: Travel, place: Placement, magnet: Magnet, settings: LiftSettings) -> list[Check]:
-    """Check that the map's place and height are sure enough for this lift."""
+    """Check that the map's position and height are accurate enough for this lift."""
     here = np.array([place.x_m, place.y_m])
     near = np.linalg.norm(travel.place_m - here, axis=1) < travel.reach_m
     reason = f"no frame was located within {travel.reach_m:.1f} m of the lift"
@@ -199,8 +199,8 @@ def travel_checks(travel: Travel, place: Placement, magnet: Magnet, settings: Li
 
 
 def _near_sigma(travel: Travel, near: Bool) -> Float64:
-    """Take the median sigma (3,) of the frames near a place; of several passes the worst one's counts, as any
-    of them may have made the heights there.
+    """Compute the median sigma (3,) of the frames near a place. Of several passes the worst one counts, since
+    any of them may have measured the heights there.
     """
     passes = travel.passes
     medians = [np.median(travel.sigma_m[near & (passes == one)], axis=0) for one in np.unique(passes[near])]
@@ -208,7 +208,7 @@ def _near_sigma(travel: Travel, near: Bool) -> Float64:
 
 
 def _encoder_checks(travel: Travel, place: Placement, max_m: float) -> list[Check]:
-    """Check that encoders and map agree beside the lift and at the end of the way."""
+    """Check that encoders and map agree beside the lift and at the end of the path."""
     known = np.isfinite(travel.off_m)
     if not known.any():
         return []
@@ -216,7 +216,7 @@ def _encoder_checks(travel: Travel, place: Placement, max_m: float) -> list[Chec
     excess = np.where(known, travel.off_m - SURE_SIGMAS * sigma, -np.inf)
     away = travel.place_m - (place.x_m, place.y_m)
     far = np.hypot(away[:, 0], away[:, 1])
-    # However the crane goes by, it counts where it is nearest to the lift, and ALONGSIDE_M of its way about.
+    # Whatever its path, the crane is beside the lift where it is nearest, and within ALONGSIDE_M of that.
     beside = far < np.hypot(far[known].min(), ALONGSIDE_M)
     passing = known & (beside | (np.abs(away[:, 0]) < ALONGSIDE_M))
     last = int(np.flatnonzero(known)[-1])
@@ -237,8 +237,8 @@ def _encoder_checks(travel: Travel, place: Placement, max_m: float) -> list[Chec
 
 
 def _sure_enough(sigma: Float64, magnet: Magnet) -> list[Check]:
-    """Check that the 95 % bound of the map's place is within the crane's tolerance, its height's within the
-    gap; of both with that of the magnet's offset, where it is known.
+    """Check that the 95 % bounds of the map's position and height are within the crane's tolerance and the
+    gap, each combined with the error of the magnet's offset where that is known.
     """
     source = "trajectory"
     if magnet.offset is not None:
@@ -263,10 +263,10 @@ def target_covariance(
 ) -> Float64:  # fmt: skip
     """Estimate the covariance (4, 4) of a target's x, y, z (m) and yaw (rad), in the map's frame.
 
-    The bundles' own, the plane's over its points, the trajectory's near it, the magnet's offset's, and the
-    map's: only that holds the calibration's part of the heights, which moves the whole map; all of it is
-    taken as shared. Of several bundles the worst counts: their errors are common. NaN where a bundle doesn't
-    know.
+    It adds up the covariances of the bundles, of the plane over its points, of the trajectory near it, of the
+    magnet's offset, and of the map. Only the map's includes the calibration's part of the heights, which
+    moves the whole map; all of it is taken as shared. Of several bundles the worst counts, since their errors
+    are common. NaN where a bundle's sigma isn't known.
     """
     if not load:
         return np.full((4, 4), np.nan)
@@ -278,7 +278,7 @@ def target_covariance(
     found = np.zeros((4, 4))
     found[:2, :2] = axes @ np.diag([lateral**2, along**2]) @ axes.T
     found[2, 2] = top**2 + plane_sigma_m**2 + map_sigma_m**2
-    # The place turns with the load's yaw about the load's centre of mass.
+    # An error of the load's yaw rotates the place about the load's centre of mass.
     away = np.array([place.x_m, place.y_m]) - load_centre(load)
     turn = np.array([-away[1], away[0], 0.0, 1.0])
     found += yaw**2 * np.outer(turn, turn)

@@ -1,4 +1,4 @@
-"""Tell unseen places that may hide what stands from those that are too narrow to."""
+"""Distinguish unseen places that may hide an obstacle from those that are too narrow to."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from barsight.core.arrays import Bool, UInt8
 
 
 def wide_parts(unseen: Bool | UInt8, cells: int) -> UInt8:
-    """Keep the parts (V, U) of what is not seen, 1 or 0, that a square of so many cells fits into."""
+    """Keep the parts (V, U) of the unseen cells, 1 or 0, into which a square of this many cells fits."""
     square = np.ones((cells, cells), np.uint8)
-    # OpenCV's own opening moves everything by a cell where a square has no middle cell.
+    # OpenCV's own opening shifts everything by a cell where a square has no middle cell.
     fits = cv2.erode(unseen.astype(np.uint8), square)
     return np.asarray(cv2.dilate(fits, square, anchor=((cells - 1) // 2,) * 2), np.uint8)

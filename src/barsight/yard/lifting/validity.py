@@ -1,5 +1,5 @@
-"""Validity in time: ages count from the frames' capture, never from the time of computing; what happened in
-the yard since then forbids around it.
+"""Determine validity in time. Ages count from the frames' capture, never from the time of computing, and an
+event in the yard since then forbids lifts around it.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Check, check_max, check_min, check_true
 
 PART_M, SQUARE_M = 0.04, 0.25
-"""Parts of a lift are no further apart than this where passes differ, else than the second."""
+"""Maximum spacing (m) of the places of a lift that are checked, where passes differ and elsewhere."""
 MAX_CLOCK_ERROR_NS = NS_PER_S
-"""Frames may be this much ahead of this computer's clock."""
+"""Maximum time (ns) by which frames may be ahead of this computer's clock."""
 
 
 def is_ahead(stamp_ns: int | None, clock_ns: int) -> bool:
-    """Check whether frames of this stamp are ahead of a clock."""
+    """Check whether frames with this stamp are ahead of a clock."""
     return (stamp_ns or 0) - clock_ns > MAX_CLOCK_ERROR_NS
 
 
 @dataclass(frozen=True)
 class Validity:
-    """Stamps (ns, capture clock) between which a lift may be believed."""
+    """Period, given by two stamps (ns, capture clock), in which a lift is valid."""
 
     from_ns: int
     until_ns: int
@@ -46,11 +46,11 @@ def validity(
     travel: Travel, place: Placement, magnet: Magnet, load: tuple[Bundle, ...], heights: HeightMap,
     settings: LiftSettings,
 ) -> Validity | None:  # fmt: skip
-    """Find the validity of a lift: from when the oldest part that it depends on was last seen, for
-    `max_age_s`. None where no frame surely saw the place itself.
+    """Find the validity of a lift: `max_age_s` from the time when the part it depends on that is oldest was
+    last seen. None where no frame certainly saw the place itself.
 
-    It depends on the magnet's outline and the load's, both wider by the crane's tolerance and the stray
-    field's reach. A part that no pass saw has no age of its own: other checks forbid it where it matters.
+    It depends on the outlines of magnet and load, both widened by the crane's tolerance and the range of the
+    stray field. A part that no pass saw has no age of its own; other checks forbid the lift where it matters.
     """
     measured = np.flatnonzero(travel.measured)
     here = np.array([[place.x_m, place.y_m]])
@@ -67,8 +67,9 @@ def validity(
 
 
 def _last_seen(travel: Travel, measured: Int64, at_m: Float64, heights: HeightMap) -> Int64:
-    """Find when each of (P, 2) places was seen last, of those that were seen: the last frame that surely
-    did, else the first that may have, of the pass whose height the map has there. The first place was seen.
+    """Find the time when each of the places (P, 2) that were seen was last seen. It is that of the last frame
+    that certainly saw it, otherwise of the first that may have, in the pass whose height the map has there.
+    The first place must have been seen.
     """
     several, numbers = len(travel.pass_number) > 0, travel.passes[measured]
     newest = np.ones(len(at_m), np.int64)
@@ -96,20 +97,20 @@ def _last_seen(travel: Travel, measured: Int64, at_m: Float64, heights: HeightMa
 
 
 def _thinned(at_m: Float64, newest: Int64) -> Int64:
-    """Choose the first of each pass's places in every square of `SQUARE_M`."""
+    """Select the first place of each pass in every square of `SQUARE_M`."""
     column, row = np.floor(at_m / SQUARE_M).astype(np.int64).T
     key = ((row - row.min()) * (np.ptp(column) + 1) + column - column.min()) * 256 + newest
     return np.sort(np.unique(key, return_index=True)[1])
 
 
 def _distances(frames_m: Float64, at_m: Float64) -> Float64:
-    """Compute distances (P, N) of places (P, 2) from frames' (N, 2)."""
+    """Compute the distances (P, N) of places (P, 2) from frames (N, 2)."""
     x, y = (at_m[:, None, k] - frames_m[None, :, k] for k in (0, 1))
     return np.asarray(np.hypot(x, y), np.float64)
 
 
 def _places_in(centre_m: Float64, yaw_rad: float, width_m: float, length_m: float) -> Float64:
-    """Lay places (P, 2) over a rectangle, its edges among them, no further apart than `PART_M`."""
+    """Lay out places (P, 2) over a rectangle, including its edges, at most `PART_M` apart."""
     v, u = (np.linspace(-size / 2, size / 2, math.ceil(size / PART_M) + 1) for size in (length_m, width_m))
     across, along = axes_of(yaw_rad)
     at_m = centre_m + v[:, None, None] * along + u[None, :, None] * across
@@ -118,7 +119,7 @@ def _places_in(centre_m: Float64, yaw_rad: float, width_m: float, length_m: floa
 
 def old_cells(ground: Ground, travel: Travel, now_ns: int, settings: LiftSettings) -> Bool:
     """Mark the coarse cells [y, x] that were last seen longer ago than `max_age_s`, by the same rule as a
-    lift's validity, in squares of `SQUARE_M`. Of a cell that several passes made the oldest counts.
+    lift's validity, in squares of `SQUARE_M`. In a cell from several passes, the oldest one counts.
     """
     since_ns, measured = now_ns - seconds_to_ns(settings.max_age_s), np.flatnonzero(travel.measured)
     stamps = travel.stamp_ns[measured]
@@ -147,9 +148,7 @@ def old_cells(ground: Ground, travel: Travel, now_ns: int, settings: LiftSetting
 
 
 def age_checks(captured_to_ns: int | None, now_ns: int, settings: LiftSettings) -> list[Check]:
-    """Check that what was captured isn't too old, of the future, or of nobody knows when. Stamps in ns since
-    1970.
-    """
+    """Check that the capture isn't too old, in the future or at an unknown time. Stamps in ns since 1970."""
     if captured_to_ns is None:
         reason = "the time when the place was last seen is unknown"
         return [check_true("map-too-old", "age of what was seen", None, reason)]
@@ -171,7 +170,7 @@ def disturbed_checks(
     events: tuple[YardEvent, ...], place: Placement, magnet: Magnet, load: tuple[Bundle, ...],
     seen: Validity | None, settings: LiftSettings,
 ) -> list[Check]:  # fmt: skip
-    """Check that nothing happened within reach of magnet and load since the place was last seen."""
+    """Check that no event occurred within reach of magnet and load since the place was last seen."""
     outlines = [corners((place.x_m, place.y_m), place.yaw_rad, *magnet.size_m)]
     for bundle in load:
         x, y = bundle.centre_m[:2]
