@@ -1,1 +1,1 @@
-"""The magnet: its description, its faces on the map, and what they hold."""
+"""Model the magnet: its description, its faces on the map, and what they hold."""

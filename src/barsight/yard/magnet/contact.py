@@ -1,7 +1,7 @@
-"""Model the magnet's contact with what is under it: contact plane and air gaps.
+"""Model the magnet's contact with the surface under it: contact plane and air gaps.
 
-The faces are one rigid plane. Set down, it comes to rest where its middle is lowest: on three points of the
-upper envelope around the middle, or on fewer with the suspension holding it.
+The faces form one rigid plane. When set down, it comes to rest where its middle is lowest: on three points of
+the upper envelope around the middle, or on fewer with the suspension limiting its lean.
 """
 
 from __future__ import annotations
@@ -31,17 +31,20 @@ from barsight.yard.types import HeightMap
 
 NEWTON_PER_KG = 9.81
 HIDING_COLUMNS = 4
-"""Unseen columns of `resting_plane.STEP_M` side by side that may hide what stands: between two bars, where no
-picture shows the steel, nothing does."""
+"""Minimum number of adjacent unseen columns of `resting_plane.STEP_M` that may hide an obstacle: the strip
+between two bars, where no picture shows the steel, hides nothing.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class PoleContact:
-    """One pole's face. gap_m: mean air gap, min_gap_m: where it is nearest to steel; gap_map_m: (across,
-    along) air gaps, NaN where unknown. contact_share: of the face that lies on steel. unknown_share: of the
-    cells under it that were not seen, but for strips along it that are too narrow to hide what stands. z_m:
-    height of its centre. pull_n, pull_low_n: its part of the pull, 0 until a load is known
-    (`holding.hold_load`). pull_across_m: where that acts, across from its centre.
+    """Contact of one pole's face.
+
+    gap_m: mean air gap, min_gap_m: the smallest; gap_map_m: (across, along) air gaps, NaN where unknown.
+    contact_share: share of the face that lies on steel. unknown_share: unseen share of the cells under it,
+    except for strips along it that are too narrow to hide an obstacle. z_m: height of its centre. pull_n,
+    pull_low_n: its part of the pull and its lower bound, 0 until a load is known (`holding.hold_load`).
+    pull_across_m: where the lower bound acts, across from its centre.
     """
 
     gap_m: float
@@ -57,13 +60,12 @@ class PoleContact:
 
 @dataclass(frozen=True, eq=False)
 class Contact:
-    """Contact of all faces. centre_z_m: height of their plane at the magnet's centre, z_m: (P,) at the
-    poles'.
+    """Contact of all faces. centre_z_m: height of their plane at the magnet's centre, z_m: (P,) at the poles.
 
-    pitch_rad: rise along the beam; roll_rad: rise across. rests_off_m: how far beside the middle the faces
-    rest, where the suspension's stop holds them, else 0. sigma_m: of the plane's height, with the error that
-    all of the map shares; gap_sigma_m: of it over the steel. pull_n, pull_low_n: the pull, and its lower
-    bound (95 %). widest_gap_m: the least gap of the pole that is furthest from steel. contact_share: of all
+    pitch_rad: slope along the beam; roll_rad: slope across. rests_off_m: how far from the middle the faces
+    rest where the suspension stops their lean, otherwise 0. sigma_m: of the plane's height, including the
+    error that the whole map shares; gap_sigma_m: of the height over the steel. pull_n, pull_low_n: the pull,
+    and its lower bound (95 %). widest_gap_m: the largest of the poles' smallest gaps. contact_share: of all
     faces; unknown_share: the worst pole's.
     """
 
@@ -78,34 +80,34 @@ class Contact:
 
     @property
     def pull_n(self) -> float:
-        """Sum the pull."""
+        """Sum the poles' pull."""
         return sum(pole.pull_n for pole in self.poles)
 
     @property
     def pull_low_n(self) -> float:
-        """Sum its lower bound (95 %)."""
+        """Sum the lower bounds (95 %) of the poles' pull."""
         return sum(pole.pull_low_n for pole in self.poles)
 
     @property
     def unknown_share(self) -> float:
-        """Return the worst pole's."""
+        """Return the largest unseen share of a pole."""
         return max(pole.unknown_share for pole in self.poles)
 
     @property
     def contact_share(self) -> float:
-        """Average over all faces together."""
+        """Average the contact share over all faces."""
         return sum(pole.contact_share for pole in self.poles) / len(self.poles)
 
     @property
     def widest_gap_m(self) -> float:
-        """Return the least gap of the pole that is furthest from steel; infinite where a pole knows none."""
+        """Return the largest of the poles' smallest gaps; infinite where a pole has no known gap."""
         return max(pole.min_gap_m for pole in self.poles)
 
 
 def rest_magnet(heights: HeightMap, place: Placement, magnet: Magnet, contact_gap_m: float) -> Contact | None:
     """Set the magnet down on the map; None where nothing at all is known under it.
 
-    contact_gap_m: a face nearer than this to steel lies on it.
+    contact_gap_m: maximum gap between a face and steel on which it lies.
     """
     poles = magnet.pole_table
     shape, points = profiles(heights, place, poles)
@@ -145,7 +147,7 @@ def rest_magnet(heights: HeightMap, place: Placement, magnet: Magnet, contact_ga
 def _gaps(
     points: Float64, height: float, roll: float, pitch: float, near: float, poles: Float64
 ) -> tuple[Float64, Float64]:
-    """Compute mean and least gap and the ratio of contact (P, 3); (N,) gaps."""
+    """Compute mean gap, smallest gap and contact share of each pole (P, 3), and all gaps (N,)."""
     table, gaps = np.zeros((len(poles), 3)), np.empty(len(points))
     counts = np.zeros((len(poles), 2))
     table[:, 1] = np.inf

@@ -1,4 +1,4 @@
-"""Load the magnet's description: poles, beam, pull against air gap, limits, the crane's tolerance."""
+"""Load the magnet's description: poles, beam, pull by air gap, limits, the crane's tolerance."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from barsight.yard.magnet.pull import Pull, expect
 
 MagnetType = Literal["electro", "permanent", "electro-permanent"]
 MIN_SAFETY_FACTOR = 3.0
-"""Least safety factor of permanent and electro-permanent magnets [EN 13155], and of one of unknown type."""
+"""Minimum safety factor of permanent, electro-permanent and unknown types of magnet [EN 13155]."""
 MIN_SAFETY_FACTOR_BACKED = 2.0
-"""The same of an electromagnet that a battery holds when the mains fail [EN 13155]."""
+"""Minimum safety factor of an electromagnet that a battery backs up when the mains fail [EN 13155]."""
 MAX_OFFSET_M = 0.2
-"""An offset larger than this is a wrong lever arm of the rig, not how the magnet hangs."""
+"""Maximum offset (m): a larger one isn't how the magnet hangs, but a wrong lever arm of the rig."""
 _EXAMPLE = resources.files("barsight.yard.magnet").joinpath("example_magnet.toml")
 
 
 @dataclass(frozen=True)
 class Pole:
-    """A pole's face: its centre from the magnet's, along the beam and across it, and its size."""
+    """A pole's face: its centre relative to the magnet's, along the beam and across it, and its size."""
 
     along_m: float
     across_m: float
@@ -40,7 +40,9 @@ class Pole:
         expect(max(abs(self.along_m), abs(self.across_m)) <= 20, "a pole lies within 20 m of the centre")
 
     def is_beside(self, other: Pole) -> bool:
-        """Check that another pole's face has no part of this one's: both would be counted to pull there."""
+        """Check that another pole's face doesn't overlap this one's: both would be counted
+        as pulling there.
+        """
         along = abs(self.along_m - other.along_m) - (self.length_m + other.length_m) / 2
         across = abs(self.across_m - other.across_m) - (self.width_m + other.width_m) / 2
         return max(along, across) > -1e-6
@@ -72,13 +74,15 @@ class Tolerance:
         expect(within, "tolerance x_m and y_m lie between 0 and 1, yaw_deg between 0 and 20")
 
     def along(self, axes: Float64) -> Float64:
-        """Return the largest miss (...), m, along level unit vectors (..., 2), but for the turn's."""
+        """Return the maximum error (...) in m along horizontal unit vectors (..., 2), without that of the
+        yaw.
+        """
         return np.asarray(np.abs(axes) @ (self.x_m, self.y_m), np.float64)
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of a lift with the magnet; docs/how-to/describe-a-magnet.md explains each."""
+    """Limits of a lift with the magnet; docs/how-to/describe-a-magnet.md explains each one."""
 
     pitch_deg: float
     roll_deg: float
@@ -98,9 +102,10 @@ class Limits:
 
 @dataclass(frozen=True)
 class MagnetOffset:
-    """Offset of the faces' middle, as the cameras see it, from where the crane's readings say that it is: the
-    mean of touch-downs, yard axes, with the sigma of each mean. calibration_id, yard_frame_id: of the rig and
-    the frame that they were made with; another one's offset forbids every lift.
+    """Offset of the faces' middle, as the cameras see it, from its place by the crane's readings.
+
+    Mean of touch-downs in yard axes, with the sigma of each mean. calibration_id, yard_frame_id: the rig and
+    the frame in which they were made; an offset of another rig or frame forbids every lift.
     """
 
     x_m: float
@@ -124,7 +129,7 @@ class MagnetOffset:
 
     @property
     def sigma_m(self) -> tuple[float, float, float]:
-        """Return its sigma along each."""
+        """Return the offset's sigma along x, y and z."""
         return self.x_sigma_m, self.y_sigma_m, self.z_sigma_m
 
 
@@ -132,8 +137,9 @@ class MagnetOffset:
 class Magnet:
     """A magnet, or several on a beam whose faces lie in one plane. Masses in kg.
 
-    type: None where the file doesn't say, which counts as the worst. battery_backup: it holds the load when
-    the mains fail. offset: None where no touch-down told it; `tolerance` must hold it then.
+    type: None where the file doesn't name one, which counts as the worst. battery_backup: it holds the load
+    when the mains fail. offset: None where it wasn't measured by touch-downs; `tolerance` must then include
+    it.
     """
 
     name: str
@@ -172,18 +178,20 @@ class Magnet:
 
     @property
     def min_safety_factor(self) -> float:
-        """Return the least safety factor of its type."""
+        """Return the minimum safety factor for the magnet's type."""
         backed = self.type == "electro" and self.battery_backup
         return MIN_SAFETY_FACTOR_BACKED if backed else MIN_SAFETY_FACTOR
 
     @property
     def needed_factor(self) -> float:
-        """Return the factor that lifts are held to: where the file names no type, at least the worst's."""
+        """Return the safety factor that lifts must meet: where the file names no type, at least that of the
+        worst.
+        """
         return max(self.safety_factor, self.min_safety_factor)
 
     @property
     def reach_m(self) -> float:
-        """Return the air gap from which on nothing is lifted."""
+        """Return the air gap (m) from which on nothing is lifted."""
         return self.pull.gap_m[-1]
 
     @property
@@ -193,13 +201,13 @@ class Magnet:
 
     @property
     def size_m(self) -> tuple[float, float]:
-        """Return width and length of beam and poles together, about the centre."""
+        """Return width and length (m) of beam and poles together, about the centre."""
         wide = max(abs(p.across_m) + p.width_m / 2 for p in self.poles)
         return max(self.beam.width_m, 2 * wide), max(self.beam.length_m, 2 * self.half_span_m)
 
     @property
     def half_span_m(self) -> float:
-        """Return the way from the centre to the outermost pole's outer edge, along the beam."""
+        """Return the distance (m) along the beam from the centre to the outer edge of the outermost pole."""
         return max(abs(p.along_m) + p.length_m / 2 for p in self.poles)
 
 
@@ -209,9 +217,9 @@ def example_magnet() -> str:
 
 
 def load_magnet(path: Path | None) -> Magnet:
-    """Load the magnet of a TOML file; the package's documented example where there is none.
+    """Load the magnet from a TOML file; the package's documented example where no file is given.
 
-    Raises InputError for a file that can't be read, ConfigError for a value that can't be.
+    Raises InputError for an unreadable file, ConfigError for an invalid value.
     """
     help_at = "docs/how-to/describe-a-magnet.md says how"
     if path is not None:

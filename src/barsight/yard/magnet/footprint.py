@@ -1,8 +1,8 @@
-"""Count the bundles under a magnet's poles, with the count's probability.
+"""Count the bundles under a magnet's poles, with the probability of the count.
 
-Poles and bundles are rectangles seen from above; two overlap where no side of either separates them. Each
+Poles and bundles are rectangles in plan view; two overlap where no side of either separates them. Each
 overlap has a depth, the depth a sigma (of the bundle's place, yaw, width and ends) and a bound on how much
-the crane's tolerance can change it: the count is as sure as all depths together.
+the crane's tolerance can change it. The probability of the count follows from all depths together.
 """
 
 from __future__ import annotations
@@ -20,16 +20,18 @@ from barsight.yard.types import Bundle
 BEYOND_OPEN_END_M = 20.0
 MIN_SIGMA_M = 0.001
 HEIGHT_SIGMA_M = 0.005
-"""How well a bundle's top line stands for its height under a pole, beside its own sigma."""
+"""Standard deviation (m), besides its own sigma, of a bundle's top line as its height under a pole."""
 SURELY = 3.0
-"""Sigmas by which a place lies within a bundle's ends that surely has it."""
+"""Number of sigmas by which a place must lie within a bundle's ends to belong to it with certainty."""
 MAX_TOP_SIGMA_M = 0.008
-"""Faces rest on the same map: what all places share of a top's sigma says nothing of heights between them."""
+"""Upper bound (m) of a top's sigma: the faces rest on the same map, so what all places share of that sigma
+doesn't affect the heights between them.
+"""
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Magnet's centre as set down: yard axes; yaw from +Y about Z, as a bundle's."""
+    """The magnet's centre when set down: yard axes; yaw from +Y about Z, as a bundle's."""
 
     x_m: float
     y_m: float
@@ -37,7 +39,7 @@ class Placement:
 
     @property
     def yaw_deg(self) -> float:
-        """Return the yaw for people and plants."""
+        """Return the yaw in degrees, for people and plant systems."""
         return math.degrees(self.yaw_rad)
 
     @property
@@ -57,16 +59,16 @@ class Placement:
 
     @property
     def frame(self) -> Float64:
-        """Return the rows (3, 2): the place, and `axes`."""
+        """Return the rows (3, 2): the place, then `axes`."""
         return np.vstack([(self.x_m, self.y_m), self.axes])
 
 
 class Rectangles(NamedTuple):
-    """Bundles from above with their tops, for all at once. Lengths in m.
+    """Bundles in plan view with their tops, as arrays. Lengths in m.
 
-    centre: (B, 2). along: (B, 2) unit. half: (B, 2) half width, half length. top: (B,) at mid-length, slope:
-    (B,) rise per metre along. sigma: (B, 5) of lateral, along, yaw, half width, half length; NaN is taken as
-    `unknown_sigma`. sigma_top: (B,). open_ends: (B, 2) low-y and high-y end.
+    centre: (B, 2). along: (B, 2) unit vectors. half: (B, 2) half width, half length. top: (B,) at mid-length,
+    slope: (B,) rise per metre along. sigma: (B, 5) of lateral, along, yaw, half width, half length; an
+    unknown one is replaced. sigma_top: (B,). open_ends: (B, 2) low-y and high-y end.
     """
 
     centre: Float64
@@ -81,14 +83,14 @@ class Rectangles(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class BundleTable:
-    """Bundles, and as arrays (B, ...)."""
+    """Bundles, and the same as arrays (B, ...)."""
 
     bundles: tuple[Bundle, ...]
     rectangles: Rectangles
 
     @classmethod
     def of(cls, bundles: tuple[Bundle, ...]) -> BundleTable:
-        """Build from bundles; a sigma that is unknown counts as 50 mm, 5 mrad: sure enough of nothing."""
+        """Build from bundles. An unknown sigma counts as 50 mm or 5 mrad, with which nothing is certain."""
         yaw = np.array([b.yaw_rad for b in bundles])
         sigma = np.array(
             [
@@ -121,8 +123,8 @@ class BundleTable:
 class Grip:
     """Bundles that the magnet would take at a placement.
 
-    gripped: positions in the table of the bundles under a pole and within reach. probability: of exactly
-    these. flips: (B,) probability for each bundle that it is wrongly counted in or out.
+    gripped: indices in the table of the bundles under a pole and within reach. probability: that it is
+    exactly these. flips: (B,) probability for each bundle that it is wrongly counted in or out.
     """
 
     gripped: tuple[int, ...]
@@ -134,11 +136,11 @@ def count_gripped(
     place: Placement, magnet: Magnet, tolerance: Tolerance, table: BundleTable, face_z_m: Float64,
     reached: Float64,
 ) -> Grip:  # fmt: skip
-    """Count the bundles under the poles whose top lies within the magnet's reach.
+    """Count the bundles under the poles whose tops are within the magnet's reach.
 
-    face_z_m: (P,) height of each pole's face. tolerance: how far off the crane may set down; a hard bound.
-    reached: (P, 4) of `reach.reached_strips`: a bundle that lies beside all of it isn't taken, though its
-    outline comes under a face.
+    face_z_m: (P,) height of each pole's face. tolerance: of the crane's set-down; a hard bound. reached: (P,
+    4) of `reach.reached_strips`: a bundle that lies entirely beside it isn't taken, even if its outline
+    extends under a face.
     """
     if not table.bundles:
         return Grip((), 1.0, np.empty(0))
@@ -169,7 +171,7 @@ def _grip(
     held, holder = _held(x, y, cos, sin, reached, reach_z, bundles)
     for b in range(count):
         kept = 1.0
-        # Poles on one side of the middle err together; those on the other by the opposite yaw.
+        # Poles on one side of the middle share their errors; on the other side the yaw's sign is opposite.
         added = np.zeros(2)
         for p in range(len(poles)):
             part, give = reached[p], none
@@ -185,7 +187,7 @@ def _grip(
                 )
             miss = _below(-max(abs(depth) - loose, 0.0) / spread)
             if depth <= 0 and (open_ends[b, 0] or open_ends[b, 1]):
-                # Where a bundle's open end may lie under the pole, nobody knows.
+                # An open end may lie anywhere under the pole.
                 longer = (open_ends[b, 0] + open_ends[b, 1]) * BEYOND_OPEN_END_M / 2
                 shift = (1.0 * open_ends[b, 1] - 1.0 * open_ends[b, 0]) * BEYOND_OPEN_END_M / 2
                 most, unsure, astray = overlap(
@@ -194,7 +196,7 @@ def _grip(
                 )  # fmt: skip
                 miss = max(miss, 0.5 * _below((most + astray) / unsure))
             if depth <= 0 and holder[p] >= 0 and abs(dx * along[b, 0] + dy * along[b, 1]) < half[b, 1]:
-                # What is one bundle's is not another's that lies beside it.
+                # A strip that belongs to one bundle doesn't belong to another one beside it.
                 miss = min(miss, _below(-held[p, 0 if dx * cos + dy * sin > 0 else 1]))
             over = top[b] + (dx * along[b, 0] + dy * along[b, 1]) * slope[b] - reach_z[p]
             low = _below(-abs(over) / np.hypot(sigma_top[b], HEIGHT_SIGMA_M))
@@ -212,8 +214,9 @@ def _grip(
 def _held(
     x: float, y: float, cos: float, sin: float, reached: Float64, reach_z: Float64, bundles: Rectangles
 ) -> tuple[Float64, Int64]:
-    """Find for each pole the bundle (P,) that has the middle of all that it reaches, -1 where none surely
-    does, and by how many sigmas that lies within its sides (P, 2), towards low and high across the beam.
+    """Find for each pole the bundle (P,) that certainly contains the middle of all that the pole reaches, -1
+    where none does, and by how many sigmas the reached strip lies within its sides (P, 2), towards low and
+    high across the beam.
 
     x, y: the magnet's place, m; cos, sin: of its yaw. reached, reach_z: as in `_grip`.
     """
@@ -227,7 +230,7 @@ def _held(
             ends = math.sqrt(sigma[b, 1] ** 2 + sigma[b, 4] ** 2)
             if top[b] + away * slope[b] < reach_z[p] or half[b, 1] - abs(away) < SURELY * ends:
                 continue
-            # A bundle may be given the other way round than the beam lies.
+            # The bundle's axis may point the opposite way to the beam's.
             same = 1.0 if along[b, 1] * cos - along[b, 0] * sin > 0 else -1.0
             beside = same * (dx * along[b, 1] - dy * along[b, 0])
             turn = abs(along[b, 0] * cos + along[b, 1] * sin)
@@ -244,13 +247,15 @@ def _held(
 
 @kernel()
 def _away(x: float, y: float, cos: float, sin: float, part: Float64, centre: Float64) -> tuple[float, float]:
-    """Compute the way (m) from a bundle's centre (2,) to a rectangle's (4,), along and across the beam."""
+    """Compute the vector (m, yard axes) from a bundle's centre (2,) to that of a rectangle (4,) of the
+    magnet.
+    """
     return x - part[0] * sin + part[1] * cos - centre[0], y + part[0] * cos + part[1] * sin - centre[1]
 
 
 @kernel()
 def _below(z: float) -> float:
-    """Evaluate the normal distribution function at z."""
+    """Evaluate the cumulative normal distribution at z."""
     return 0.5 * math.erfc(-z / math.sqrt(2.0))
 
 
@@ -263,8 +268,8 @@ def overlap(
 
     dx, dy: pole's centre minus bundle's. cos, sin: of the magnet's yaw. pole: (4,) along, across, length,
     width, m. along: (2,) the bundle's unit vector; half_width, half_length, sigma (5,): its own, see
-    `Rectangles`. slack: (3,) on x, y (m) and yaw (rad). Of the four axes across the rectangles' sides the
-    one with the least overlap counts (separating axes).
+    `Rectangles`. slack: (3,) on x, y (m) and yaw (rad). Of the four axes perpendicular to the rectangles'
+    sides, the one with the smallest overlap counts (separating axes).
     """
     best = (np.inf, 1.0, 0.0)
     away = dx * along[0] + dy * along[1]

@@ -1,9 +1,9 @@
-"""Hold a load: what each face pulls on its bars, and what each pole must carry by the load's moments.
+"""Compute how a load is held: what each face pulls on its bars, and what each pole must carry by its moments.
 
-A map is a mean over its smoothing, and pull falls ever less the wider the gap: the sum over a smoothed
-surface is no more than that over the steel, as soon as the faces' plane is not too low [Jensen's inequality].
-So the lower bound takes the plane as high as it may be: on the bars' crests that smoothing has cut, on a
-strap, and the noise on top.
+A map is a smoothed mean, and pull is a convex function of the gap that falls as the gap widens: so the sum
+over the smoothed surface is no more than that over the steel, provided that the faces' plane isn't too low
+[Jensen's inequality]. The lower bound therefore takes the plane as high as it may be: on the bars' crests
+that smoothing has cut off, on a strap, and with the noise added.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from barsight.yard.vetoes import Check, check_min
 from barsight.yard.weight import bundle_mass, load_centre
 
 SMOOTHING_M = 0.016
-"""Standard deviation of a map's smoothing across the bars, at most."""
+"""Upper bound of the standard deviation (m) of a map's smoothing across the bars."""
 MAX_CUT_RATIO = 0.12
-"""Of a bar's diameter: how far its crest may stand over the mean of it and its neighbours."""
+"""Maximum height of a bar's crest over the mean of it and its neighbours, as a fraction of the diameter."""
 
 MIN_DIAMETER_RATIO = 0.1
-"""Of a diameter: its least lower bound. Bars were told as thick as twenty of them."""
+"""Minimum lower bound of a diameter, as a fraction: some twenty thin bars have been read as one thick bar."""
 
 
 def hold_load(contact: Contact, magnet: Magnet, load: tuple[Bundle, ...], strap_m: float) -> Contact:
-    """Add the pull on the load's bars; nothing pulls on no load.
+    """Add the pull on the load's bars; without a load there is none.
 
     strap_m: thickness of a strap that may hold the faces off.
     """
@@ -54,7 +54,7 @@ def hold_load(contact: Contact, magnet: Magnet, load: tuple[Bundle, ...], strap_
 def _pull(
     own: PoleContact, pole: Pole, magnet: Magnet, diameter_m: float, likely_m: float, higher_m: float
 ) -> PoleContact:
-    """Sum the pull over a face whose plane lies so much higher, likely and at most, than over the map."""
+    """Sum the pull over a face whose plane is likely_m, and at most higher_m, higher than over the map."""
     likely, low = magnet.pull.on_bars(diameter_m, min(pole.length_m, pole.width_m))
     sums = _sum_pull(own.gap_map_m, np.array(magnet.pull.gap_m), likely, low, likely_m, higher_m)
     newton = 1e3 * pole.length_m * pole.width_m / own.gap_map_m.size
@@ -66,11 +66,11 @@ def _pull(
 def _sum_pull(
     gaps: Float64, gap_m: Float64, likely: Float64, low: Float64, likely_m: float, higher_m: float
 ) -> tuple[float, float, float]:
-    """Sum a face's pull (kPa) over its cells: what is likely, its lower bound, and that one's moment about
-    the face's middle over its width.
+    """Sum a face's pull (kPa) over its cells: the likely value, its lower bound, and the moment of that bound
+    about the face's middle, divided by the width.
 
     gaps: (across, along) air gaps, m, NaN where unknown: nothing pulls there. likely, low: kPa at gap_m.
-    likely_m, higher_m: by how much the gaps may be wider. gap_m, likely, low: (N,).
+    likely_m, higher_m: likely and maximum amounts by which the gaps are wider. gap_m, likely, low: (N,).
     """
     total, least, moment = 0.0, 0.0, 0.0
     for i in range(gaps.shape[0]):
@@ -99,18 +99,18 @@ def _between(gap: float, gap_m: Float64, curve: Float64) -> float:
 
 
 def min_diameter_m(bundle: Bundle) -> float:
-    """Compute the lower bound of the diameter of a bundle's bars."""
+    """Compute the lower bound (m) of the diameter of a bundle's bars."""
     diameter = bundle.bar_diameter_m
     return float(np.fmax(diameter - UPPER * bundle.sigma.bar_diameter_m, MIN_DIAMETER_RATIO * diameter))
 
 
 def pole_shares(contact: Contact, magnet: Magnet, place: Placement, load: tuple[Bundle, ...]) -> Float64:
-    """Share the needed pull among the poles (P,), each as much as it may have to carry; 1 is all of it.
+    """Compute upper bounds of the poles' shares (P,) of the needed pull; 1 is all of it.
 
-    Magnet and load are rigid: a pole's share grows along the load's offset from all poles' middle in line
-    with its own. Across, where the poles stand in one row, a load that hangs beside the pull pries the face
-    off about its edge: that may use the safety factor up, and no more. The offsets are upper bounds by the
-    sigmas of the load's centre.
+    Magnet and load are rigid, so a pole's share grows linearly with the load's offset from the middle of all
+    poles towards it. Across, where the poles stand in one row, a load that hangs beside the centre of pull
+    pries the face off about its edge; the safety factor may cover that, but no more. The offsets are upper
+    bounds by the sigmas of the load's centre.
     """
     away = load_centre(load) - (place.x_m, place.y_m)
     slack = UPPER * np.max([
@@ -131,7 +131,7 @@ def pole_shares(contact: Contact, magnet: Magnet, place: Placement, load: tuple[
 @lru_cache(maxsize=64)
 def _levers(poles: tuple[Pole, ...]) -> tuple[Float64, Float64, bool]:
     """Compute the poles' middle (2,), along and across, how each one's share (P, 2) grows with the load's
-    offset from it, and whether they stand in one row.
+    offset from it, and whether the poles stand in one row.
     """
     places = np.array([(pole.along_m, pole.across_m) for pole in poles])
     middle = places.mean(axis=0)
@@ -143,7 +143,9 @@ def _levers(poles: tuple[Pole, ...]) -> tuple[Float64, Float64, bool]:
 
 @dataclass(frozen=True)
 class WeakestPole:
-    """The pole whose pull, lower bound, is least over its share of what is needed. number: from 1."""
+    """The pole with the smallest ratio of its pull's lower bound to its share of the needed pull. number:
+    from 1.
+    """
 
     number: int
     pull_low_n: float
@@ -151,14 +153,14 @@ class WeakestPole:
 
     @property
     def ratio(self) -> float:
-        """Return its pull over its share."""
+        """Return the ratio of its pull to its share."""
         return self.pull_low_n / self.share_n
 
 
 def weakest_pole(
     contact: Contact, needed_n: float, magnet: Magnet, place: Placement, load: tuple[Bundle, ...]
 ) -> WeakestPole | None:
-    """Find the pole that is worst off; None where no load, or no weight, is known."""
+    """Find the pole with the smallest ratio of pull to share; None where no load, or no weight, is known."""
     if not load or not needed_n > 0:
         return None
     shares = np.maximum(pole_shares(contact, magnet, place, load), 1e-3) * needed_n
@@ -170,10 +172,10 @@ def weakest_pole(
 def weakest_bundle(
     contact: Contact, magnet: Magnet, place: Placement, load: tuple[Bundle, ...], strap_m: float
 ) -> float:
-    """Compute the lower bound of the pull on each of several bundles over what its own weight needs, and
-    return the least; infinite where one or none is taken, NaN where a weight isn't known.
+    """Compute for each of several bundles the ratio of the pull's lower bound to what its weight needs, and
+    return the minimum; infinite where one or none is taken, NaN where a weight isn't known.
 
-    Only the cells of a face that surely lie over a bundle's outline pull it.
+    Only the cells of a face that certainly lie over a bundle's outline pull it.
     """
     if len(load) < 2:
         return math.inf
@@ -190,7 +192,7 @@ def weakest_bundle(
 
 
 def _over(bundle: Bundle, pole: Pole, place: Placement, own: PoleContact) -> Bool:
-    """Mark the cells (across, along) of a face that surely lie over a bundle's outline."""
+    """Mark the cells (across, along) of a face that certainly lie over a bundle's outline."""
     shape = own.gap_map_m.shape
     u = pole.across_m + pole.width_m * ((np.arange(shape[0]) + 0.5) / shape[0] - 0.5)
     v = pole.along_m + pole.length_m * ((np.arange(shape[1]) + 0.5) / shape[1] - 0.5)
@@ -204,8 +206,8 @@ def _over(bundle: Bundle, pole: Pole, place: Placement, own: PoleContact) -> Boo
 
 
 def share_checks(weakest: WeakestPole | None, worst_bundle: float = math.inf) -> list[Check]:
-    """Check that the pole that is worst off carries its share, and that each of several bundles is held by
-    what pulls it, by `weakest_bundle`.
+    """Check that the weakest pole carries its share, and that each of several bundles is held by the pull on
+    it (`weakest_bundle`).
     """
     if weakest is None:
         return []

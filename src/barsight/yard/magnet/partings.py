@@ -1,4 +1,4 @@
-"""Tell by the map which bundles a deep gully parts from what the poles reach."""
+"""Find in the map which bundles a deep gully separates from what the poles reach."""
 
 from __future__ import annotations
 
@@ -15,23 +15,28 @@ from barsight.yard.map_lookup import lookup_heights
 from barsight.yard.types import Bundle, HeightMap
 
 _DEEP_M, _DEEP_RATIO = 0.1, 0.4
-"""Depth of a gully, and of the wider bundle's width, that parts two bundles: in 3757 packs as worlds draw
-them none is deeper than 86 mm or 0.39 of the width."""
+"""Minimum depth (m) of a gully that separates two bundles, and the same in widths of the wider one: in 3757
+simulated packs no gully is deeper than 86 mm or 0.39 of the width.
+"""
 _STEP_M, _ALONG_M = 0.005, 0.02
 _PARALLEL = 0.05
-"""Sine of the skew up to which a gully between two bundles is looked for."""
+"""Maximum sine of the skew of two bundles between which a gully is sought."""
 _ROWS = 3
-"""A bundle that lies beside fewer rows of a part along a pole lies beyond it."""
+"""Minimum number of rows of a part along a pole that lie beside a bundle; with fewer, the bundle lies beyond
+it.
+"""
 _SEEN_RATIO = 0.5
-"""Of a part along a pole: it must have been seen for its median to count."""
+"""Minimum share of a part along a pole that must have been seen for its median to count."""
 
 
 def without_parted(
     held: Grip, heights: HeightMap, place: Placement, table: BundleTable, reached: Float64
 ) -> Grip:
-    """Leave out of the count's doubts the bundles that are surely parted from all that the poles reach.
+    """Remove from the count's uncertainty the bundles that are certainly separated from all that the poles
+    reach.
 
-    reached: (P, 4) of `reach.reached_strips`. Only what was seen parts: places out of sight count as none.
+    reached: (P, 4) of `reach.reached_strips`. Only a gully that was seen separates; places out of sight don't
+    count.
     """
     if len(held.gripped) != 1:
         return held
@@ -43,7 +48,9 @@ def without_parted(
 
 
 def _parted(load: Bundle, other: Bundle, heights: HeightMap, place: Placement, reached: Float64) -> bool:
-    """Check that a gully runs between every pole's reach and another bundle, as far as that is long."""
+    """Check that a gully runs between every pole's reach and another bundle, over that
+    bundle's whole length.
+    """
     if any(abs(math.sin(bundle.yaw_rad - place.yaw_rad)) > _PARALLEL for bundle in (load, other)):
         return False
     deep = max(_DEEP_M, _DEEP_RATIO * max(load.width_m, other.width_m))
@@ -72,8 +79,8 @@ def _parts(pole: Float64) -> list[Float64]:
 
 
 def _profile(heights: HeightMap, place: Placement, along_m: Float64, from_m: float, to_m: float) -> Float64:
-    """Take median heights along the beam, each _STEP_M from one place across it to another; NaN where too
-    little was seen.
+    """Compute median heights along the beam at places _STEP_M apart across it, from one to another; NaN where
+    too little was seen.
     """
     across = from_m + np.sign(to_m - from_m) * np.arange(0.0, abs(to_m - from_m), _STEP_M)
     at = (
@@ -91,7 +98,9 @@ def _profile(heights: HeightMap, place: Placement, along_m: Float64, from_m: flo
 
 
 def _gully(level: Float64, half_m: float, deep_m: float) -> bool:
-    """Check that a profile, beyond half_m from its begin, sinks by deep_m under both of its sides."""
+    """Check that a profile sinks by deep_m under both of its sides at a place beyond half_m from its
+    beginning.
+    """
     first = math.ceil(half_m / _STEP_M)
     known = np.where(np.isfinite(level), level, -np.inf)
     if first >= len(known) or not np.isfinite(level[:first]).any():

@@ -13,15 +13,17 @@ from barsight.core.arrays import Float64, frozen
 from barsight.core.errors import ConfigError
 
 SATURATED_TESLA = 1.6
-"""Flux density from which on bars let little more through: with no plates in the file, no more counts."""
+"""Flux density from which on bars let little more through; it is the maximum where the file
+gives no plates.
+"""
 _MU0 = 4e-7 * math.pi
 _ACROSS = 201
-"""Places across a face of the sum over one round bar."""
+"""Number of places across a face at which the pull on one round bar is summed."""
 
 
 @dataclass(frozen=True)
 class ThinPlate:
-    """Pull per area on a flat plate of this thickness at each of `Pull.gap_m`."""
+    """Pull per area on a flat plate of this thickness, at each of `Pull.gap_m`."""
 
     thickness_m: float
     kilopascal: tuple[float, ...]
@@ -35,10 +37,11 @@ class ThinPlate:
 class Pull:
     """Pull per area of pole at each air gap; linear between, 0 at the last and beyond.
 
-    thickness_m: of the flat plate that it was measured on, None where the data sheet doesn't say. thin: the
-    same for thinner plates. round_diameter_m, round_ratio: pull on one round bar in the middle of a face over
-    that on a thick plate. grade_ratio, heat_ratio, duty_ratio: what the steel's grade, the magnet's heat and
-    its duty leave of it; the defaults are low (docs/how-to/describe-a-magnet.md says why).
+    thickness_m: of the flat plate on which it was measured, None where the data sheet doesn't give it. thin:
+    the same for thinner plates. round_diameter_m, round_ratio: ratio of the pull on one round bar in the
+    middle of a face to that on a thick plate. grade_ratio, heat_ratio, duty_ratio: fractions that the steel's
+    grade, the magnet's heat and its duty leave; the defaults are low (docs/how-to/describe-a-magnet.md
+    explains why).
     """
 
     gap_m: tuple[float, ...]
@@ -80,10 +83,10 @@ class Pull:
                "pull of a thinner plate can't be more than that of a thicker one")  # fmt: skip
 
     def on_plate(self, thickness_m: float, face_m: float) -> Float64:
-        """Compute kPa at each of `gap_m` on a flat plate, the ratios of grade, heat and duty included.
+        """Compute kPa at each of `gap_m` on a flat plate, including the ratios of grade, heat and duty.
 
-        Below the thinnest plate it falls with the flux that passes, squared. Where no plate's thickness is
-        given, the flux of a face `face_m` wide leaves by both sides at SATURATED_TESLA.
+        Below the thinnest plate the pull falls with the square of the flux that passes. Where no plate's
+        thickness is given, the flux of a face `face_m` wide leaves on both sides at SATURATED_TESLA.
         """
         thick = np.array(self.kilopascal) * self.grade_ratio * self.heat_ratio * self.duty_ratio
         if self.thickness_m is None:
@@ -99,8 +102,9 @@ class Pull:
     def on_bars(self, diameter_m: float, face_m: float) -> tuple[Float64, Float64]:
         """Compute kPa at each of `gap_m` over round bars, and its lower bound.
 
-        Bars offer the section of a plate pi/4 as thick as they are. Where the maker rates round bars, his
-        figure for one holds; the lower bound takes it only where it is less than the sum over the face.
+        Bars offer the cross-section of a plate pi/4 times as thick as they are. Where the maker rates round
+        bars, the rating of one bar holds; the lower bound uses it only where it is less than the sum over the
+        face.
         """
         return _on_bars(self, diameter_m, face_m)
 
@@ -120,14 +124,14 @@ def _on_bars(pull: Pull, diameter_m: float, face_m: float) -> tuple[Float64, Flo
 
 @lru_cache(maxsize=256)
 def _falls_off(diameter_m: float, face_m: float) -> Float64:
-    """Compute the air gaps (N,) between a face and one round bar under its middle; inf beside it."""
+    """Compute the air gaps (N,) between a face and one round bar under its middle; inf beside the bar."""
     u = face_m * ((np.arange(_ACROSS) + 0.5) / _ACROSS - 0.5)
     inside = (diameter_m / 2) ** 2 - u**2
     return frozen(np.where(inside > 0, diameter_m / 2 - np.sqrt(np.maximum(inside, 0)), np.inf))
 
 
 def expect(holds: bool, sentence: str) -> None:
-    """Raise ConfigError with a sentence on the magnet where something doesn't hold."""
+    """Raise ConfigError with a sentence about the magnet unless a condition holds."""
     if not holds:
         raise ConfigError(f"magnet: {sentence}")
 

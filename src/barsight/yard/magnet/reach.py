@@ -1,4 +1,4 @@
-"""Find what lies within reach of each pole, wherever within its tolerance the crane sets the magnet down."""
+"""Find what lies within reach of each pole, wherever the crane sets the magnet down within its tolerance."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from barsight.yard.magnet.resting_plane import Z, profiles
 from barsight.yard.types import HeightMap
 
 DEEPER_M = 0.01
-"""Steel so far below a pole's reach may still be pulled, by the errors of both heights."""
+"""Depth (m) below a pole's reach at which steel may still be pulled, due to the errors of both heights."""
 PART_M = 0.25
-"""Heights are taken as medians along the poles over this length."""
+"""Length (m) along the poles of the parts over which median heights are taken."""
 LOOK_M = 0.05
-"""So far beside a face it is looked for how far a flank falls."""
+"""Distance (m) beside a face over which falling flanks are followed."""
 FLANK_M, SHOULDER_M = 0.003, 0.004
-"""A flank falls at least so much from one place across to the next, and nowhere by so much less than before:
-where another bundle begins there is a groove or a shoulder."""
+"""Minimum fall (m) of a flank from one place across to the next, and maximum decrease (m) of that fall: where
+another bundle begins there is a groove or a shoulder.
+"""
 
 
 def reached_strips(
@@ -28,10 +29,10 @@ def reached_strips(
 ) -> Float64:
     """Bound what each pole may reach by a rectangle (P, 4): along, across, length, width, in the beam's axes.
 
-    It holds every place under the face, grown by the crane's tolerance, where the map's median along PART_M
-    lies less than DEEPER_M below the reach, or nothing was seen; of no size where there is none. Flanks that
-    fall from there to beyond the reach are left out: whose their top is, theirs are they.
-    face_z_m: (P,) height of each pole's face.
+    It contains every place under the face, grown by the crane's tolerance, where the map's median along
+    PART_M lies less than DEEPER_M below the reach, or nothing was seen; its size is 0 where there is none.
+    Flanks that fall from there to below the reach are left out, since they belong to the bundle whose top
+    they fall from. face_z_m: (P,) height of each pole's face.
     """
     poles = magnet.pole_table
     more = tolerance.along(place.axes)
@@ -59,7 +60,7 @@ def reached_strips(
         across, along = (0, 0), (0, 0)
         if reached.any():
             along = _ends(reached.any(axis=0))
-            # The highest counts, and NaN: a flank that something hides in one place is none.
+            # The maximum counts, and so does NaN: a flank that is hidden in one place isn't one.
             level = over_m[:, along[0] : along[1]].max(axis=1)
             low, high = _ends(reached.any(axis=1))
             across = low + _flank(level[:high][::-1], low), high - _flank(level[low:], shape[0] - high)
@@ -77,7 +78,7 @@ def _ends(flags: Bool) -> tuple[int, int]:
 
 
 def _flank(level: Float64, beyond: int) -> int:
-    """Count the places of a flank that falls from within what is reached to beyond the reach.
+    """Count the places of a flank that falls from within the reach to below it.
 
     level: (N,) heights over the reach, outwards, NaN where unknown; the last `beyond` lie outside of what may
     be reached.

@@ -1,6 +1,6 @@
 """Rest a rigid plane on the map under the poles.
 
-The noise of a map would hold the plane up: heights are medians along the bars, made straighter by a prior.
+A map's noise would hold the plane up, so heights are medians along the bars, straightened by a prior.
 """
 
 from __future__ import annotations
@@ -14,22 +14,26 @@ from barsight.yard.magnet.footprint import Placement
 from barsight.yard.types import HeightMap
 
 SEGMENT_M = 0.45
-"""Heights are taken as medians along the bars over this length: bars are straight, noise is not."""
+"""Length (m) along the bars over which median heights are taken: bars are straight, noise isn't."""
 STEP_M = 0.01
 CORRELATED_CELLS = 5.0
-"""Neighbouring cells share their matching windows: so many count as one."""
+"""Number of neighbouring cells that count as one, because they share their matching windows."""
 STRAIGHT_M = 0.002
-"""How straight and even bundles are along their bars, one sigma: what the map shows beyond that is mostly the
-map's own error, as long as its sigma explains it."""
+"""Standard deviation (m) of bundles from straight and even along their bars. Larger deviations in the map are
+mostly the map's own error, as long as its sigma explains them.
+"""
 BENT_SIGMA, STRAIGHT_UP_TO = 3.0, 0.8
-"""What is this many sigma from straight is taken as it was measured; from this part of them on, the more the
-further it is."""
+"""Deviation from straight, in sigmas, that is taken as measured; fraction of it from which on the measured
+value gains weight.
+"""
 NEAR_LINE_M = 0.02
-"""A height further than this from its line along the bars has less say in the load's slope, from twice this
-on none."""
+"""Distance (m) of a height from its line along the bars beyond which it has less weight in the load's slope;
+at twice this it has none.
+"""
 ASKEW, BENT_PER_M = 0.005, 0.002
-"""Turn of a load's axis from the beam (rad), and its bend sideways (m over its middle, a metre along
-squared), one sigma each: its section lies elsewhere under each pole."""
+"""Standard deviations of the angle between a load's axis and the beam (rad), and of its sideways bend (m from
+its middle, per metre along squared): with either, its section lies elsewhere under each pole.
+"""
 COLUMNS = 8
 U, V, Z, SCATTER, SEEN, ALL, SIGMA, POLE = range(COLUMNS)
 _STEEPEST = 0.35
@@ -37,8 +41,8 @@ _UNKNOWN, _FILLED = HeightSource.UNKNOWN, HeightSource.FILLED
 
 
 def profiles(heights: HeightMap, place: Placement, poles: Float64) -> tuple[list[tuple[int, int]], Float64]:
-    """Sample columns across and parts along of each pole; (N, COLUMNS) of all: place across and along, median
-    height, scatter, cells seen and in all, the cells' mean sigma, the pole.
+    """Sample columns across and parts along each pole. Returns (N, COLUMNS) of all: place across and along,
+    median height, scatter, cells seen and in all, the cells' mean sigma, the pole.
     """
     shape = [
         (max(round(width / STEP_M), 2), max(round(length / SEGMENT_M), 1)) for _, _, length, width in poles
@@ -54,11 +58,11 @@ def profiles(heights: HeightMap, place: Placement, poles: Float64) -> tuple[list
 
 @kernel()
 def straighten_heights(points: Float64) -> float:
-    """Correct the heights (N, COLUMNS), in place, towards a straight load; returns the noise that remains.
+    """Correct the heights (N, COLUMNS), in place, towards a straight load; return the noise that remains.
 
-    A load's section is the same under all poles but for a slope along, and for how its axis turns and bends
-    under the beam. What departs from that, pole by pole and point by point, is weighed by how straight
-    bundles are against how sure the map is.
+    A load's section is the same under all poles except for a slope along it, and for how its axis turns and
+    bends under the beam. Deviations from that, by pole and by point, are weighted by how straight bundles are
+    relative to how accurate the map is.
     """
     seen = np.flatnonzero(~np.isnan(points[:, Z]))
     known = points[seen]
@@ -70,7 +74,7 @@ def straighten_heights(points: Float64) -> float:
 
 @kernel()
 def _columns(u: Float64) -> Int64:
-    """Number the places across (N,) of points: those within a micrometre are one."""
+    """Number the points' places across (N,): those within half a micrometre are one."""
     numbers, places, count = np.empty(u.size, np.int64), np.empty(u.size), 0
     for k in range(u.size):
         number = 0
@@ -85,7 +89,7 @@ def _columns(u: Float64) -> Int64:
 
 @kernel()
 def _straight(known: Float64, column: Int64, noise: float) -> Float64:
-    """Estimate the heights (N,) as they most likely are; column: (N,) number of the place across."""
+    """Estimate the most likely heights (N,); column: (N,) number of the place across."""
     u, v, z, pole = known[:, U], known[:, V], known[:, Z], known[:, POLE]
     path, steep, line, along = np.zeros(3), np.zeros(z.size), np.zeros(z.size), np.zeros(z.size)
     rest, near, sigma = np.empty(z.size), np.empty(z.size), known[:, SIGMA]
@@ -131,7 +135,9 @@ def _median_of_each(values: Float64, number: Int64, out: Float64) -> None:
 
 @kernel()
 def _steepness(u: Float64, line: Float64) -> Float64:
-    """Compute the slope (N,) across of a section known at places u (N,) as line (N,), m, to both sides."""
+    """Compute the slope (N,) across, towards both neighbours, of a section known at places u (N,) as line
+    (N,), m.
+    """
     steep = np.zeros(u.size)
     for k in range(u.size):
         low, high = k, k
@@ -147,10 +153,10 @@ def _steepness(u: Float64, line: Float64) -> Float64:
 
 @kernel()
 def _path(v: Float64, rise: Float64, steep: Float64, weight: Float64, noise: float) -> Float64:
-    """Estimate how a load runs under the beam (3,): slope, turn sideways and bend sideways per metre.
+    """Estimate how a load runs under the beam (3,): slope, sideways turn and sideways bend per metre.
 
     rise: (N,) heights over the section at places v (N,) along, m; steep: (N,) its slope across; weight: (N,).
-    noise: m. Linear least squares, turn and bend held to none by ASKEW and BENT_PER_M.
+    noise: m. Linear least squares, with priors of ASKEW and BENT_PER_M on turn and bend.
     """
     normal, right = np.zeros((3, 3)), np.zeros(3)
     for k in range(v.size):
@@ -161,7 +167,7 @@ def _path(v: Float64, rise: Float64, steep: Float64, weight: Float64, noise: flo
                 normal[a, b] += weight[k] * term[a] * term[b]
     for a, sigma in ((0, 1.0), (1, ASKEW), (2, BENT_PER_M)):
         normal[a, a] += (noise / sigma) ** 2
-    # Gauss's elimination: LAPACK's solver would be half of what this module takes to compile.
+    # Gaussian elimination: LAPACK's solver would take half of this module's compile time.
     for a in range(2):
         for b in range(a + 1, 3):
             share = normal[b, a] / normal[a, a]
@@ -177,8 +183,8 @@ def _path(v: Float64, rise: Float64, steep: Float64, weight: Float64, noise: flo
 
 @kernel()
 def _likely(measured: float, sigma: float) -> float:
-    """Estimate what a departure of `measured` from straight most likely is."""
-    # Between straight and bent the share rises steadily: a jump would decide a lift by a micrometre.
+    """Estimate the most likely true value of a deviation from straight that was measured."""
+    # Between straight and bent the share rises continuously: with a jump, a micrometre would decide a lift.
     bent = abs(measured) / (BENT_SIGMA * np.hypot(STRAIGHT_M, sigma))
     share = min(max((bent - STRAIGHT_UP_TO) / (1 - STRAIGHT_UP_TO), 0.0), 1.0)
     shrunk = STRAIGHT_M**2 / (STRAIGHT_M**2 + sigma**2)
@@ -189,14 +195,14 @@ def _likely(measured: float, sigma: float) -> float:
 def rest_faces(
     u: Float64, v: Float64, z: Float64, noise: float, max_roll: float
 ) -> tuple[float, float, float, float]:
-    """Rest the faces: height at the centre, roll, pitch, and how far beside the middle they rest where the
-    suspension holds them, within the lean's sigma; else 0.
+    """Rest the faces: height at the centre, roll, pitch, and how far from the middle they rest where the
+    suspension stops their lean, within the lean's sigma; otherwise 0.
 
     u, v, z: (N,) m across and along from the centre, and up; noise: m. Roll is the slope along u, at most
     max_roll; pitch along v.
     """
     height, roll, pitch = rest_plane(u, v, z, max_roll)
-    # The highest of many noisy points is too high.
+    # The maximum of many noisy points is biased upwards.
     height -= noise
     rests_off = 0.0
     sigma = noise / max(u.max() - u.min(), 1e-3)
@@ -230,11 +236,11 @@ def _profile(
 ) -> None:  # fmt: skip
     """Sample the map's median heights under one pole.
 
-    z, sigma: maps (rows, columns), m; source: `HeightSource`, of which unknown and filled cells aren't seen.
-    at: x and y of the first cell's centre, and its size, m. frame: (3, 2) the magnet's place, m, unit vectors
-    along and across. pole: (4,) along, across, length, width, m. parts: along the pole, sampled every STEP_M.
-    Fills out (columns * parts, COLUMNS) but for POLE; height and scatter are NaN where fewer than half of a
-    part's samples are seen.
+    z, sigma: maps (rows, columns), m; source: `HeightSource`, of which unknown and filled cells count as
+    unseen. at: x and y of the first cell's centre, and its size, m. frame: (3, 2) the magnet's place, m, unit
+    vectors along and across. pole: (4,) along, across, length, width, m. parts: along the pole, sampled every
+    STEP_M. Fills out (columns * parts, COLUMNS) except for POLE; height and scatter are NaN where fewer than
+    half of a part's samples are seen.
     """
     along, across, length, width = pole[0], pole[1], pole[2], pole[3]
     columns = out.shape[0] // parts
@@ -278,9 +284,8 @@ def _profile(
 def rest_plane(u: Float64, v: Float64, z: Float64, max_roll: float) -> tuple[float, float, float]:
     """Rest a plane on the points: height at the origin, slope along u and along v.
 
-    Of all planes on or above the points it has the lowest origin; its slope along u is held within
-    `max_roll`. The height is convex in the slopes: two nested searches find the one lowest place. u, v, z:
-    (N,) m.
+    Of all planes on or above the points it has the lowest origin; its slope along u is limited to `max_roll`.
+    The height is convex in the slopes, so two nested searches find the only minimum. u, v, z: (N,) m.
     """
     low, high = -max_roll, max_roll
     for _ in range(26):
