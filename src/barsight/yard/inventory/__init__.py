@@ -1,1 +1,1 @@
-"""Inventory: bundle files, the stock list and changes between measurements."""
+"""Keep the inventory: bundle files, the stock list and changes between measurements."""

@@ -28,7 +28,9 @@ def write_bundles(
     bundles: tuple[Bundle, ...], stock: StockMatch | None, reference: str, identity: MapIdentity,
     target: Path, sequence: int = 1,
 ) -> str:  # fmt: skip
-    """Write bundles.json whole or not at all; return its digest. reference: the frame, `yard` or `world`."""
+    """Write bundles.json completely or not at all; return its digest. reference: the frame, `yard` or
+    `world`.
+    """
     content = {
         "schema_version": SCHEMA_VERSION,
         **identity.header(sequence),
@@ -40,15 +42,15 @@ def write_bundles(
 
 
 def bundles_content(path: Path) -> dict[str, Any]:
-    """Read what bundles.json holds. Raises InputError as `read_bundles`."""
+    """Read the content of bundles.json. Raises InputError as `read_bundles` does."""
     content = read_sealed(path, SCHEMA_VERSION, REMEDY)
     expect_schema(content, package_schema("barsight.yard", "bundles"), path, REMEDY)
     return content
 
 
 def read_bundles(path: Path) -> tuple[Bundle, ...]:
-    """Read bundles.json. Raises InputError where it is missing, torn, changed, of another version or isn't as
-    its schema says.
+    """Read bundles.json. Raises InputError where it is missing, truncated, altered, of another version or
+    doesn't match its schema.
     """
     content = bundles_content(path)
     try:
@@ -58,7 +60,7 @@ def read_bundles(path: Path) -> tuple[Bundle, ...]:
 
 
 def read_match(path: Path) -> StockMatch | None:
-    """Read how bundles.json, as `read_bundles` takes it, and the stock list fit; None without a list."""
+    """Read from bundles.json, as `read_bundles` does, how it matches the stock list; None without a list."""
     stock = bundles_content(path)["stock"]
     if stock is None:
         return None

@@ -1,4 +1,4 @@
-"""Compare two measured yards: bundles moved, settled, taken or added, and how sure that is."""
+"""Compare two measured yards: bundles moved, settled, taken or added, and how certain that is."""
 
 from __future__ import annotations
 
@@ -19,20 +19,22 @@ Kind = Literal["same", "moved", "settled", "taken", "added", "not-seen"]
 MAX_MOVE_M = 0.5
 SAME_WIDTH = 0.15
 SIGNIFICANT = 2.576
-"""Sigmas that chance exceeds in one case of a hundred."""
+"""Number of sigmas that chance exceeds in one case out of a hundred."""
 UNKNOWN_SIGMA_M, UNKNOWN_SIGMA_RAD = 0.05, 0.005
-"""Of a place and a yaw whose sigma isn't known: as a lift's count takes them."""
+"""Standard deviations of a place (m) and a yaw (rad) whose own isn't known, the same as for
+a lift's count.
+"""
 MIN_KNOWN = 0.5
 _NO_PAIR = 1e6
 
 
 @dataclass(frozen=True)
 class Change:
-    """One bundle's change. old, new: its ids, None where it isn't there.
+    """The change of one bundle. old, new: its ids, None where it isn't present.
 
-    across_mm, along_mm, up_mm, yaw_deg: new minus old, in the old bundle's axes; sigmas: of these four, both
-    measurements'. z: the largest of across, up and yaw over its sigma (along too where both ends were seen).
-    kg, sigma_kg: what was taken (negative) or added; NaN where unknown.
+    across_mm, along_mm, up_mm, yaw_deg: new minus old, in the old bundle's axes; sigmas: of these four, from
+    both measurements. z: the largest ratio of across, up and yaw to its sigma (also of along where both ends
+    were seen). kg, sigma_kg: mass that was taken (negative) or added; NaN where unknown.
     """
 
     kind: Kind
@@ -49,17 +51,17 @@ class Change:
 
     @property
     def significant(self) -> bool:
-        """Check whether chance would do as much in less than one case of a hundred."""
+        """Check whether chance alone causes such a change in less than one case out of a hundred."""
         return self.kind in ("taken", "added") or self.z > SIGNIFICANT
 
 
 def compare_yards(
     old: tuple[Bundle, ...], old_heights: YardMap, new: tuple[Bundle, ...], new_heights: YardMap
 ) -> tuple[Change, ...]:
-    """Match the bundles of two maps of one yard and say what changed, in the old ones' order, then the added.
+    """Match the bundles of two maps of one yard and list the changes: in the old ones' order, then the added.
 
     A bundle that is gone is `taken` only where the new map saw its place, and a new one `added` only where
-    the old map did; else it is `not-seen`.
+    the old map did; otherwise it is `not-seen`.
     """
     pairs = _match(old, new)
     changes = []
@@ -78,7 +80,7 @@ def compare_yards(
 
 
 def _match(old: tuple[Bundle, ...], new: tuple[Bundle, ...]) -> dict[int, int]:
-    """Match positions in `new` to those in `old`: least way in all, no way further than MAX_MOVE_M."""
+    """Match indices in `new` to those in `old`: smallest total distance, none longer than MAX_MOVE_M."""
     if not old or not new:
         return {}
     cost = np.full((len(old), len(new)), _NO_PAIR)
@@ -95,8 +97,8 @@ def _match(old: tuple[Bundle, ...], new: tuple[Bundle, ...]) -> dict[int, int]:
 
 
 def displacement(before: Bundle, after: Bundle) -> tuple[float, float, float, float]:
-    """Compute the displacement across, along, up (m) and yaw (rad), in the old bundle's axes; up is of the
-    top.
+    """Compute the displacement across, along, up (m) and in yaw (rad), in the old bundle's axes; up is that
+    of the top.
     """
     away = after.centre_m[:2] - before.centre_m[:2]
     cos, sin = math.cos(before.yaw_rad), math.sin(before.yaw_rad)
@@ -107,8 +109,8 @@ def displacement(before: Bundle, after: Bundle) -> tuple[float, float, float, fl
 
 
 def displacement_along(before: Bundle, after: Bundle) -> tuple[float, float]:
-    """Compute the displacement along the old bundle's axis and its sigma, m: of the middle where all ends
-    were seen, else of the end that was seen both times; 0 where there is none.
+    """Compute the displacement along the old bundle's axis and its sigma (m): that of the middle where all
+    ends were seen, otherwise that of an end that was seen both times; 0 where there is none.
     """
     along = displacement(before, after)[1]
     if not (any(before.ends_open) or any(after.ends_open)):
@@ -153,7 +155,7 @@ def _change(before: Bundle, after: Bundle) -> Change:
 
 
 def _ratio(value: float, sigma: float, unknown: float = UNKNOWN_SIGMA_M) -> float:
-    """Compute how many sigmas a value is; a sigma that isn't known counts as `unknown`."""
+    """Compute the ratio of a value to its sigma; an unknown sigma counts as `unknown`."""
     sigma = unknown if math.isnan(sigma) else sigma
     return abs(value) / sigma if sigma > 0 else 0.0
 
@@ -164,12 +166,12 @@ def _alone(kind: Kind, old: int | None, new: int | None, mass: Mass, sign: int) 
 
 
 def _seen(bundle: Bundle, heights: YardMap) -> bool:
-    """Check whether a map saw the place where a bundle lies in the other."""
+    """Check whether a map saw the place of a bundle found in the other map."""
     return bool(np.isfinite(heights_over(bundle, heights)).mean() >= MIN_KNOWN)
 
 
 def heights_over(bundle: Bundle, heights: YardMap) -> Float64:
-    """Look up a map's heights (40, 5) over a bundle's outline, along it and across; NaN where it saw none."""
+    """Look up a map's heights (40, 5) over a bundle's outline, along it and across; NaN where unseen."""
     u = np.linspace(-0.4, 0.4, 5) * bundle.width_m
     v = np.linspace(-0.45, 0.45, 40) * bundle.length_m
     vv, uu = np.meshgrid(v, u, indexing="ij")

@@ -1,4 +1,4 @@
-"""Read and write the stock list, what should lie in the yard, and compare it with what was found."""
+"""Read and write the stock list of what should be in the yard, and compare it with what was found."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _REMEDY = (
     f"give a CSV with the columns {', '.join(_NEEDED)} (and any of {', '.join(_OPTIONAL)}), or JSON objects"
 )
 MAX_LISTED = 10_000
-"""Each is compared with each bundle of the map."""
+"""Maximum number of listed bundles: each one is compared with each bundle of the map."""
 _REACH_M = 1.0
 _MOVED_M = 0.05
 _TURNED_DEG = 5.0
@@ -33,7 +33,9 @@ _SIGMAS = 3.0
 
 @dataclass(frozen=True)
 class ListedBundle:
-    """A bundle of the stock list: place of its middle (m, yard); the others are None where not listed."""
+    """A bundle of the stock list: place of its middle (m, yard); the other fields are None
+    where not listed.
+    """
 
     name: str
     x_m: float
@@ -48,9 +50,9 @@ class ListedBundle:
 
 @dataclass(frozen=True)
 class MatchedEntry:
-    """A listed bundle and the found one. moved_m: along x, y (and z where listed; else 0).
+    """A listed bundle and the one found. moved_m: along x, y (and z where listed, otherwise 0).
 
-    disagrees: sentences where the found bundle isn't what the list says.
+    disagrees: sentences on how the found bundle differs from the list.
     """
 
     name: str
@@ -61,10 +63,10 @@ class MatchedEntry:
 
 @dataclass(frozen=True)
 class StockMatch:
-    """The list against the map. moved: names of matched bundles that lie elsewhere than listed.
+    """Comparison of list and map. moved: names of matched bundles that lie elsewhere than listed.
 
-    missing: listed ones that weren't found where they could have been seen; hidden: listed ones under
-    another bundle, so that the map can't tell; extra: ids of found ones that aren't listed.
+    missing: listed bundles that weren't found where they could have been seen; hidden: listed ones under
+    another bundle, where the map can't show them; extra: ids of found ones that aren't listed.
     """
 
     matched: tuple[MatchedEntry, ...]
@@ -75,9 +77,9 @@ class StockMatch:
 
 
 def read_stock(path: Path) -> tuple[ListedBundle, ...]:
-    """Read the list of a CSV or JSON file.
+    """Read the list from a CSV or JSON file.
 
-    Raises InputError where it is missing, torn, or names one twice.
+    Raises InputError where it is missing, truncated, or repeats a name.
     """
     if not path.is_file():
         raise InputError(path, "no such file", _REMEDY)
@@ -96,7 +98,7 @@ def read_stock(path: Path) -> tuple[ListedBundle, ...]:
 
 
 def stock_text(listed: tuple[ListedBundle, ...]) -> str:
-    """Write a list as `read_stock` reads it from CSV; lengths to 0.1 mm, angles to 0.001 deg."""
+    """Format a list as CSV that `read_stock` reads; lengths to 0.1 mm, angles to 0.001 deg."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     names = ("name", *_NEEDED[1:], *_OPTIONAL)
@@ -157,9 +159,9 @@ def _expected(path: Path, number: int, row: dict[str, Any]) -> ListedBundle:
 
 
 def match_stock(listed: tuple[ListedBundle, ...], bundles: tuple[Bundle, ...]) -> StockMatch:
-    """Pair listed and found bundles, each once, so that the distances together are least, none over 1 m.
+    """Pair listed and found bundles, each once, so that the total distance is smallest and none exceeds 1 m.
 
-    A pair further apart than 50 mm, and than three of the found place's sigmas, has moved.
+    A bundle has moved if the distance exceeds both 50 mm and three of the found place's sigmas.
     """
     cost = np.array([[_distance(one, bundle) for bundle in bundles] for one in listed])
     cost = cost.reshape(len(listed), len(bundles))
@@ -186,7 +188,9 @@ def match_stock(listed: tuple[ListedBundle, ...], bundles: tuple[Bundle, ...]) -
 
 
 def contradicted_bundles(match: StockMatch) -> dict[int, str]:
-    """Tell which found bundles (by id) the list contradicts, and how: moved, another kind, or not listed."""
+    """List the found bundles (by id) that the list contradicts, and how: moved, another kind,
+    or not listed.
+    """
     told = dict.fromkeys(match.extra, "the stock list doesn't name it")
     for one in match.matched:
         moved = [f"lies {1e3 * np.linalg.norm(one.moved_m):.0f} mm from there"] * (one.name in match.moved)
@@ -196,7 +200,7 @@ def contradicted_bundles(match: StockMatch) -> dict[int, str]:
 
 
 def list_contradiction(listed: tuple[ListedBundle, ...], match: StockMatch) -> str | None:
-    """Say so where half of the listed bundles or more, hidden ones aside, contradict the map."""
+    """Report it where half of the listed bundles or more, not counting hidden ones, contradict the map."""
     seen = len(listed) - len(match.hidden)
     wrong = len(match.missing) + sum(bool(one.disagrees) or one.name in match.moved for one in match.matched)
     if 2 * wrong < max(seen, 1):
@@ -205,7 +209,7 @@ def list_contradiction(listed: tuple[ListedBundle, ...], match: StockMatch) -> s
 
 
 def stock_warnings(listed: tuple[ListedBundle, ...], match: StockMatch | None) -> tuple[str, ...]:
-    """Warn where list and map differ. match: None where the map isn't in the yard's frame."""
+    """List warnings where list and map differ. match: None where the map isn't in the yard's frame."""
     if match is None:
         return ("the map isn't in the yard's frame: the stock list can't be held against it",)
     differs = [f"{one.name} ({'; '.join(one.disagrees)})" for one in match.matched if one.disagrees]
@@ -233,9 +237,9 @@ def _across_along(shift: tuple[float, float, float], bundle: Bundle) -> tuple[fl
 
 
 def _distance(one: ListedBundle, bundle: Bundle) -> float:
-    """Weigh a shift: across and up count fully; along the axis 1 m is no further than 0.3 m across.
+    """Compute a weighted distance: across and up count fully; 1 m along the axis counts as 0.3 m across.
 
-    What lies higher or lower than listed by half its width is another bundle.
+    A bundle that lies half its width higher or lower than listed is another one.
     """
     shift = _shift(one, bundle)
     if abs(shift[2]) > bundle.width_m / 2:
@@ -247,7 +251,9 @@ def _distance(one: ListedBundle, bundle: Bundle) -> float:
 
 
 def _has_moved(shift: tuple[float, float, float], bundle: Bundle) -> bool:
-    """Check for a move, along the axis only where both ends were seen: else the middle isn't known."""
+    """Check whether a bundle has moved; along the axis only where both ends were seen, so that its middle is
+    known.
+    """
     across, along = _across_along(shift, bundle)
     sigma = bundle.sigma
     moves: Float64 = np.abs([across, shift[2], 0.0 if any(bundle.ends_open) else along])
@@ -279,7 +285,7 @@ def _disagreements(one: ListedBundle, bundle: Bundle) -> tuple[str, ...]:
 
 
 def _other_label(one: ListedBundle, bundle: Bundle, names: set[str]) -> tuple[str, ...]:
-    """Say so where a bundle's label reads another name than the list's; nothing where it wasn't read."""
+    """Report it where a bundle's label gives another name than the list; empty where it wasn't read."""
     if bundle.label is None or bundle.label.text in (None, one.name):
         return ()
     known = "another one's of the list" if bundle.label.text in names else "which the list lacks"
@@ -287,7 +293,9 @@ def _other_label(one: ListedBundle, bundle: Bundle, names: set[str]) -> tuple[st
 
 
 def _is_covered(one: ListedBundle, bundles: tuple[Bundle, ...]) -> bool:
-    """Check whether a found bundle lies over the listed place: at a known height, else anywhere over it."""
+    """Check whether a found bundle lies over the listed place: higher than the listed top, if
+    there is one.
+    """
     for bundle in bundles:
         shift = _shift(one, bundle)
         across, along = _across_along(shift, bundle)

@@ -1,1 +1,1 @@
-"""Stability of the pile: its sides, supports and overhangs."""
+"""Assess the stability of the pile: its sides, supports and overhangs."""

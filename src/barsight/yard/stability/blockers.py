@@ -1,4 +1,6 @@
-"""Find which bundles must go before another can be lifted: the order in which a pile comes apart."""
+"""Find which bundles must be moved before another can be lifted, and so the order in which a pile is taken
+apart.
+"""
 
 from __future__ import annotations
 
@@ -11,14 +13,14 @@ from barsight.yard.stability.stability import Footing, leans_on, rests_against
 from barsight.yard.types import Bundle
 
 HIGHER_RATIO = 0.25
-"""Of the smaller width by which the upper one's underside lies higher."""
+"""Minimum height of the upper bundle's underside over the lower one's, in widths of the narrower one."""
 MEETS_RATIO = 0.05
-"""Of the smaller width by which outlines must overlap to meet."""
+"""Minimum overlap of outlines that meet, in widths of the narrower one."""
 
 
 @dataclass(frozen=True)
 class Blocked:
-    """A bundle and the ids of those that must go before it: they lie on it, lean or rest against it."""
+    """A bundle and the ids of those that must be moved before it: they lie on it, lean or rest against it."""
 
     bundle: int
     blockers: tuple[int, ...]
@@ -27,7 +29,7 @@ class Blocked:
 def find_blocked(
     bundles: tuple[Bundle, ...], standing: tuple[Footing, ...], settings: LiftSettings
 ) -> tuple[Blocked, ...]:
-    """Find for each bundle what must go before it, in the bundles' order."""
+    """Find for each bundle, in the given order, those that must be moved before it."""
     by_id = {footing.bundle: footing for footing in standing}
     centres = np.array([b.centre_m[:2] for b in bundles]).reshape(-1, 2)
     reach = np.array([(b.length_m + b.width_m) / 2 for b in bundles])
@@ -45,7 +47,9 @@ def find_blocked(
 
 
 def lies_on(upper: Bundle, lower: Bundle) -> bool:
-    """Check whether the outlines meet, seen from above, and `upper` has its underside well over `lower`'s."""
+    """Check whether the outlines meet in plan view, with the underside of `upper` well above
+    that of `lower`.
+    """
     width = min(upper.width_m, lower.width_m)
     if upper.bottom_z_m - lower.bottom_z_m <= HIGHER_RATIO * width:
         return False

@@ -1,7 +1,7 @@
-"""Measure the pile's sides: how steep they are, which way they lean, and what stands over at each layer.
+"""Measure the pile's sides: how steep they are, which way they lean, and what overhangs at each layer.
 
-A pile is all parallel bundles that lie near each other. From above a lower layer's side shows only where it
-stands out beyond the upper ones; what stands over is inferred from the other side (`stability.Footing`).
+A pile consists of all parallel bundles that lie near each other. From above, a lower layer's side shows only
+where it projects beyond the upper ones; overhangs are inferred from the other side (`stability.Footing`).
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ PARALLEL_RAD = np.radians(5.0)
 
 @dataclass(frozen=True)
 class LayerOverhang:
-    """Overhang of a side's bundle over the edge of what carries it; negative: so far the next lower layer
-    stands out beyond it. NaN where it can't be told. sigma_m: one standard deviation.
+    """Overhang of a side's bundle over the edge of what carries it; negative where the next lower layer
+    projects beyond it. NaN where it isn't known. sigma_m: one standard deviation.
     """
 
     bundle: int
@@ -41,11 +41,12 @@ class LayerOverhang:
 
 @dataclass(frozen=True)
 class PileSide:
-    """One side of a pile: -1 towards low x, 1 towards high x (y, where the bars lie along X).
+    """One side of a pile: -1 towards low x, 1 towards high x (y, where the bars run along X).
 
-    bundles: the outermost of each layer that shows there, from below. drop_m: from the highest's top to the
-    lowest place beside it. slope_deg: of the line between (90 is sheer). lean_deg: from the lowest edge to
-    the highest, positive outwards, NaN where it can't be told. Sigmas are one standard deviation.
+    bundles: the outermost one of each layer that shows there, from the bottom up. drop_m: from the top of the
+    highest to the lowest place beside it. slope_deg: of the line between (90 is vertical). lean_deg: of the
+    line from the lowest edge to the highest, positive outwards, NaN where it isn't known. Sigmas are one
+    standard deviation.
     """
 
     side: int
@@ -59,7 +60,7 @@ class PileSide:
 
 
 def pile_sides(bundles: tuple[Bundle, ...], standing: tuple[Footing, ...]) -> tuple[PileSide, ...]:
-    """Measure both sides of each pile, piles from low to high x. standing: how each bundle stands."""
+    """Measure both sides of each pile; piles run from low to high x. standing: how each bundle stands."""
     footings = {footing.bundle: footing for footing in standing}
     sides = []
     for pile in _piles(bundles):
@@ -79,7 +80,7 @@ def _piles(bundles: tuple[Bundle, ...]) -> list[list[Bundle]]:
 
 
 def _near(one: Bundle, other: Bundle) -> bool:
-    """Check whether two parallel bundles come nearer than NEAR_M sideways and overlap along."""
+    """Check whether two parallel bundles are within NEAR_M of each other sideways and overlap along."""
     if abs(turn_between(one.yaw_rad, other.yaw_rad)) > PARALLEL_RAD:
         return False
     beside, beyond = gaps_between(one, other)
@@ -91,13 +92,13 @@ def _side(pile: list[Bundle], across: Float64, side: int, footings: dict[int, Fo
         return float(side * (bundle.centre_m[:2] @ across)) + bundle.width_m / 2
 
     def own_side(bundle: Bundle) -> int:
-        """Return this side as the bundle's footing calls it."""
+        """Return this side as the bundle's footing numbers it."""
         return side if high_side(bundle.yaw_rad) @ across > 0 else -side
 
     outer: list[Bundle] = []
     for layer in sorted({b.layer for b in pile}, reverse=True):
         widest = max((b for b in pile if b.layer == layer), key=edge)
-        # Behind an upper layer's edge it isn't this side that shows.
+        # A layer that ends behind an upper layer's edge doesn't show on this side.
         if not outer or edge(widest) > edge(outer[0]) + MIN_LEDGE_M:
             outer.insert(0, widest)
     lowest, highest = outer[0], outer[-1]
@@ -138,8 +139,8 @@ def _side(pile: list[Bundle], across: Float64, side: int, footings: dict[int, Fo
 
 
 def _lean(lowest: Bundle, highest: Bundle, out_m: float) -> tuple[float, float]:
-    """Compute the lean of the line between two edges and its sigma, degrees; NaN where one layer
-    shows only.
+    """Compute the lean of the line between two edges and its sigma, degrees; NaN where only
+    one layer shows.
     """
     rise = float(highest.centre_m[2] - lowest.centre_m[2])
     if not rise > 0:
@@ -150,5 +151,5 @@ def _lean(lowest: Bundle, highest: Bundle, out_m: float) -> tuple[float, float]:
 
 
 def _edge_sigma(bundle: Bundle) -> float:
-    """Compute the sigma of the edge's place: the axis's and half the width's."""
+    """Compute the sigma (m) of the edge's place, from those of the axis and of half the width."""
     return math.hypot(bundle.sigma.lateral_m, bundle.sigma.width_m / 2)

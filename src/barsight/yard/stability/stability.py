@@ -1,8 +1,8 @@
-"""Assess how the pile stands: its sides, what carries each bundle, what leans, how far stanchions reach.
+"""Assess how the pile stands: its sides, what carries each bundle, what leans, how high stanchions rise.
 
 From above only tops are seen. What a bundle stands on is inferred from what shows beside it: where the layer
-below sticks out on one side by less than half a bundle, and by less on the other, where hardly anything
-shows, the bundle stands that much over the other side's edge.
+below projects on one side by less than half a bundle, and on the other hardly at all, the bundle overhangs
+the other side's edge by that much.
 """
 
 from __future__ import annotations
@@ -23,24 +23,28 @@ STEP_M = 0.01
 LOOK_M = 1.5
 STATIONS = 40
 DUNNAGE_M = 0.3
-"""The thickest dunnage that may lie between two layers."""
+"""Maximum thickness (m) of the dunnage between two layers."""
 MIN_LEDGE_M = 0.03
 MIN_KNOWN = 0.3
 SHEER_M = 0.15
 MAX_COLUMN_RATIO = 2.5
-"""Of its width: the most that two bundles, one on the other, are high."""
+"""Maximum height of two bundles, one on the other, in widths."""
 BESIDE_M = 0.3
 TOUCH_M = 0.02
 RAISED_RATIO = 0.25
-"""Of the width by which a neighbour's underside lies higher where it rests against a bundle."""
+"""Minimum height, in widths, of the underside of a neighbour that rests against a bundle over the bundle's
+own.
+"""
 
 
 @dataclass(frozen=True)
 class Side:
-    """Surface beside a bundle. drop_m: from its top to the lowest place within 1.5 m; run_m: from its edge to
-    that place's beginning; slope_deg: of the line between (90 is sheer); ledge_m: how far what lies below the
-    bundle shows beyond its edge; known_share: of the places looked at; sheer_m: from its top to the lowest
-    place within SHEER_M of its edge. NaN where unknown.
+    """Surface beside a bundle; NaN where unknown.
+
+    drop_m: from its top to the lowest place within 1.5 m; run_m: from its edge to the beginning of that
+    place; slope_deg: of the line between (90 is vertical); ledge_m: how far the layer below the bundle shows
+    beyond its edge; known_share: of the places sampled; sheer_m: from its top to the lowest place within
+    SHEER_M of its edge.
     """
 
     drop_m: float
@@ -53,10 +57,11 @@ class Side:
 
 @dataclass(frozen=True)
 class Footing:
-    """Support of a bundle. sides: towards low and high x (y, where it lies nearer to X; see `high_side`).
-    overhang_m: over the edge of what carries it, towards (overhang_side: -1 low, 1 high, 0 none), NaN where
-    it can't be told; lean_deg: of the side below it. freeboard_m: lowest stanchion beside it over its top,
-    NaN where there is none.
+    """Support of a bundle. sides: towards low and high x (y, where it runs closer to X; see `high_side`).
+
+    overhang_m: over the edge of what carries it, on overhang_side (-1 low, 1 high, 0 none), NaN where it
+    isn't known; lean_deg: of the side below it. freeboard_m: height of the lowest stanchion beside it over
+    its top, NaN where there is none.
     """
 
     bundle: int
@@ -68,19 +73,21 @@ class Footing:
 
 
 def high_side(yaw_rad: float) -> Float64:
-    """Return the unit vector (2,) across an axis, towards high x, or high y where it lies nearer to X."""
+    """Return the unit vector (2,) across an axis, towards high x, or high y where the axis runs
+    closer to X.
+    """
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     turned = cos < 0 if abs(cos) > abs(sin) else sin < 0
     return np.array([-cos, -sin] if turned else [cos, sin])
 
 
 def turn_between(yaw_rad: float, other_rad: float) -> float:
-    """Compute the turn in [-pi/2, pi/2) from one axis to another; an axis has no front."""
+    """Compute the angle in [-pi/2, pi/2) from one axis to another; an axis has no direction."""
     return (other_rad - yaw_rad + math.pi / 2) % math.pi - math.pi / 2
 
 
 def mean_yaw(bundles: tuple[Bundle, ...]) -> float:
-    """Average the bundles' yaws as axes, about the first one's."""
+    """Average the bundles' yaws as axes, relative to the first one's."""
     first = bundles[0].yaw_rad
     return first + float(np.mean([turn_between(first, bundle.yaw_rad) for bundle in bundles]))
 
@@ -96,7 +103,7 @@ def _footing(heights: HeightMap, bundle: Bundle, settings: LiftSettings) -> Foot
     if bundle.layer > 0:
         for sign, outer, inner in ((-1, low, high), (1, high, low)):
             stands_over = outer.ledge_m < MIN_LEDGE_M and _is_free(outer, bundle)
-            # A map blurs both edges alike: what shows on both sides tells no shift.
+            # A map blurs both edges alike: what shows equally on both sides doesn't reveal a shift.
             shift = inner.ledge_m - outer.ledge_m
             if not (stands_over and _is_free(inner, bundle)):
                 continue
@@ -114,13 +121,13 @@ def _footing(heights: HeightMap, bundle: Bundle, settings: LiftSettings) -> Foot
 
 
 def _is_free(side: Side, bundle: Bundle) -> bool:
-    """Check whether the surface beside the bundle falls below what it stands on."""
+    """Check whether the surface beside the bundle falls below the bundle's support."""
     return side.drop_m > 1.2 * bundle.width_m
 
 
 def _profile(heights: HeightMap, bundle: Bundle, sign: int) -> Float64:
-    """Compute median height of the seen cells and their fraction (N, 2), from the edge outwards
-    every STEP_M.
+    """Compute the median height of the seen cells and their share (N, 2), from the edge outwards every
+    STEP_M.
     """
     out = bundle.width_m / 2 + np.arange(0, LOOK_M, STEP_M)
     along = np.linspace(-0.45, 0.45, STATIONS) * bundle.length_m
@@ -158,7 +165,7 @@ def _side(profile: Float64, bundle: Bundle) -> Side:
 
 
 def _distance(bundle: Bundle, x: float, y: float) -> float:
-    """Compute the distance from a place to the bundle's outline, seen from above."""
+    """Compute the distance (m) in plan view from a place to the bundle's outline."""
     away = np.array([x, y]) - bundle.centre_m[:2]
     cos, sin = np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad)
     beside = abs(away @ (cos, sin)) - bundle.width_m / 2
@@ -169,7 +176,7 @@ def _distance(bundle: Bundle, x: float, y: float) -> float:
 def footing_checks(
     target: Bundle, bundles: tuple[Bundle, ...], standing: tuple[Footing, ...], settings: LiftSettings
 ) -> list[Check]:
-    """Check what in the pile speaks against lifting this bundle."""
+    """Check for reasons in the pile not to lift this bundle."""
     by_id = {footing.bundle: footing for footing in standing}
     own, mm = by_id[target.id], 1e3
     over = own.overhang_m if own.overhang_side else 0.0
@@ -231,8 +238,8 @@ def footing_checks(
 
 
 def _column_checks(target: Bundle, own: Footing) -> list[Check]:
-    """Check that what carries a bundle shows on a side of it: a wall falls sheer on both, and so does a pile
-    no wider than its highest bundle. Nothing where a side is unknown.
+    """Check that the support of a bundle shows on at least one side: a wall falls vertically on both sides,
+    and so does a pile no wider than its highest bundle. Empty where a side is unknown.
     """
     sheer = min(own.sides[0].sheer_m, own.sides[1].sheer_m)
     if math.isnan(own.sides[0].sheer_m + own.sides[1].sheer_m):
@@ -250,13 +257,15 @@ def _column_checks(target: Bundle, own: Footing) -> list[Check]:
 
 
 def leans_on(other: Bundle, target: Bundle, footing: Footing, settings: LiftSettings) -> bool:
-    """Check whether `other`, of this footing, stands or leans over the edge beside which `target` lies."""
+    """Check whether `other`, which has this footing, overhangs or leans too far over the edge beside
+    `target`.
+    """
     over = footing.overhang_m > settings.max_overhang_ratio * other.width_m
     return (over or footing.lean_deg > settings.max_lean_deg) and lies_over_edge_of(other, target, footing)
 
 
 def lies_over_edge_of(other: Bundle, target: Bundle, footing: Footing) -> bool:
-    """Check whether `other`, of this footing, stands over the edge beside which `target` lies."""
+    """Check whether `other`, which has this footing, overhangs the edge beside which `target` lies."""
     if other.id == target.id or not footing.overhang_side or not _beside(target, other):
         return False
     away = target.centre_m[:2] - other.centre_m[:2]
@@ -264,8 +273,8 @@ def lies_over_edge_of(other: Bundle, target: Bundle, footing: Footing) -> bool:
 
 
 def rests_against(other: Bundle, target: Bundle) -> bool:
-    """Check whether `other`, one of the neighbours that touch `target`, has its underside well over
-    `target`'s and its axis no higher than touching bundles can have it.
+    """Check whether `other`, one of the neighbours that touch `target`, has its underside well above that of
+    `target`, and its axis no further away than that of a bundle that touches it.
     """
     if other.id not in target.neighbours:
         return False
@@ -281,13 +290,13 @@ def _sure(sigma: float) -> float:
 
 
 def _beside(one: Bundle, other: Bundle) -> bool:
-    """Check whether the outlines come nearer than BESIDE_M sideways and overlap along."""
+    """Check whether the outlines are within BESIDE_M of each other sideways and overlap along."""
     beside, beyond = gaps_between(one, other)
     return beside < BESIDE_M and beyond < 0
 
 
 def gaps_between(one: Bundle, other: Bundle) -> tuple[float, float]:
-    """Compute the gaps between two outlines, m, sideways and along the first; negative is an overlap."""
+    """Compute the gaps (m) between two outlines, across and along the first one; negative is an overlap."""
     away = other.centre_m[:2] - one.centre_m[:2]
     cos, sin = np.cos(one.yaw_rad), np.sin(one.yaw_rad)
     beside = abs(away @ (cos, sin)) - (one.width_m + other.width_m) / 2
