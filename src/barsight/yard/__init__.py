@@ -1,1 +1,1 @@
-"""Find bars and bundles in the map, choose lift targets, judge stability, and say why not to lift."""
+"""Find bars and bundles in the map, choose lift targets, assess stability, and explain why not to lift."""

@@ -1,4 +1,4 @@
-"""Record what has happened in the yard since it was measured: lifts, set-downs, magnets seen."""
+"""Record what has happened in the yard since it was measured: lifts, set-downs, magnets that were seen."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ KINDS = ("lift", "set-down", "magnet")
 
 @dataclass(frozen=True)
 class YardEvent:
-    """A rectangle in the yard where something was moved. stamp_ns: on the frames' clock. kind: of KINDS.
+    """A rectangle in the yard where something was moved. stamp_ns: on the frames' clock. kind: one of KINDS.
 
     yaw_deg: of its length, from +Y about Z.
     """
@@ -36,7 +36,7 @@ class YardEvent:
 
     @property
     def corners_m(self) -> Float64:
-        """Compute its corners (4, 2)."""
+        """Compute the corners (4, 2) of the rectangle."""
         return corners((self.x_m, self.y_m), math.radians(self.yaw_deg), self.width_m, self.length_m)
 
 
@@ -51,7 +51,7 @@ def lift_of(bundle: Bundle, stamp_ns: int) -> YardEvent:
 
 
 def read_events(path: Path) -> tuple[YardEvent, ...]:
-    """Read a CSV of COLUMNS. Raises InputError where it is missing or a line is no event."""
+    """Read a CSV of COLUMNS. Raises InputError where it is missing or a line isn't an event."""
     remedy = f"give a CSV with the columns {','.join(COLUMNS)}; a kind is one of {', '.join(KINDS)}"
     try:
         rows = list(csv.reader(read_lines(path, MAX_ENTRIES, remedy)))
@@ -63,7 +63,7 @@ def read_events(path: Path) -> tuple[YardEvent, ...]:
 
 
 def kept_events(folder: Path) -> tuple[YardEvent, ...]:
-    """Read events.csv of a folder; none where it isn't there."""
+    """Read events.csv of a folder; empty where there is none."""
     path = folder / "events.csv"
     return read_events(path) if path.is_file() else ()
 
@@ -82,7 +82,7 @@ def _event(path: Path, number: int, row: list[str], remedy: str) -> YardEvent:
 
 
 def write_events(events: Iterable[YardEvent], target: Path) -> None:
-    """Write a CSV of COLUMNS, whole or not at all."""
+    """Write a CSV of COLUMNS, completely or not at all."""
     with atomic_path(target) as path, path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(COLUMNS)
@@ -90,12 +90,14 @@ def write_events(events: Iterable[YardEvent], target: Path) -> None:
 
 
 def merged(first: Iterable[YardEvent], more: Iterable[YardEvent]) -> tuple[YardEvent, ...]:
-    """Join events, each once, in time's order."""
+    """Join events without duplicates, in order of time."""
     return tuple(sorted({*first, *more}, key=lambda event: tuple(asdict(event).values())))
 
 
 def events_since(events: tuple[YardEvent, ...], captured_ns: tuple[int, int] | None) -> tuple[YardEvent, ...]:
-    """Select the events that a map may not show: those after its first frame; all, where that isn't known."""
+    """Select the events that a map may not show: those after its first frame, or all where
+    that isn't known.
+    """
     return tuple(event for event in events if captured_ns is None or event.stamp_ns > captured_ns[0])
 
 
@@ -108,8 +110,8 @@ def corners(centre: tuple[float, float], yaw_rad: float, width_m: float, length_
 
 
 def gap_between(one: Float64, other: Float64) -> float:
-    """Compute a lower bound (m) of the distance between two rectangles, by the axes across their sides; 0
-    where they overlap.
+    """Compute a lower bound (m) of the distance between two rectangles, by their separating axes; 0 where
+    they overlap.
     """
     widest = 0.0
     for corner in (one, other):

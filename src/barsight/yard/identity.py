@@ -1,4 +1,4 @@
-"""Identify a map, so that what was found in it can't be taken for another's."""
+"""Identify a map, so that results from it can't be mistaken for another map's."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ ID_DIGITS = 16
 
 @dataclass(frozen=True)
 class MapIdentity:
-    """A map that files belong to.
+    """A map to which files belong.
 
-    map_id: digest of the map and of all that its lifts depend on. captured_from_ns, captured_to_ns: stamps of
-    its first and last frame, None where unknown. calibration_id, yard_frame_id: digests of the cameras' rig
-    and of how it hangs from the crane, None where there is no crane. height_sha256: of height.tif.
+    map_id: digest of the map and of everything its lifts depend on. captured_from_ns, captured_to_ns: stamps
+    of its first and last frame, None where unknown. calibration_id, yard_frame_id: digests of the cameras'
+    rig and of its mounting on the crane, None where there is no crane. height_sha256: of height.tif.
     """
 
     map_id: str
@@ -30,7 +30,7 @@ class MapIdentity:
     height_sha256: str
 
     def header(self, sequence: int) -> dict[str, Any]:
-        """Build what files of this map begin with. sequence: counts what was written of the same map."""
+        """Build the header of this map's files. sequence: counts the files written of the same map."""
         software = {"name": "barsight", "version": barsight.__version__}
         return {"software": software, **asdict(self), "sequence": sequence}
 
@@ -42,8 +42,8 @@ class MapIdentity:
 
 
 def expect_same_frame(path: Path, found: str | None, before: str | None, whose: str) -> None:
-    """Raise InputError where two maps lie in different yard frames, by their digests; None is not known.
-    whose: of whom the other is.
+    """Raise InputError where two maps are in different yard frames, by their digests (None where unknown).
+    whose: name of the other map in the message.
     """
     if None not in (found, before) and found != before:
         problem = f"lies in another yard frame ({found}) than {whose} ({before})"

@@ -1,4 +1,4 @@
-"""Define the settings of the labels on bundles."""
+"""Define the settings for labels on bundles."""
 
 from __future__ import annotations
 
@@ -10,17 +10,20 @@ from barsight.core.settings.values import expect_ranges
 
 @dataclass(frozen=True)
 class LabelSettings:
-    """The labels on bundles."""
+    """Settings for labels on bundles."""
 
     read: bool = False
-    """Read their codes in the pictures (extra `labels`; a tenth of a second a picture), attach them to the
-    bundles and hold them against the stock list."""
+    """Read the labels' codes in the pictures (extra `labels`; takes a tenth of a second per picture), attach
+    them to the bundles and compare them with the stock list.
+    """
     numbers: bool = False
-    """Read plain numbers too, of three digits and more, where no code is read (extra `numbers`, and
-    Tesseract's English data: Debian's `tesseract-ocr-eng`)."""
+    """Also read plain numbers of three or more digits where no code is read (extra `numbers`, and Tesseract's
+    English data: Debian's `tesseract-ocr-eng`).
+    """
     size_m: tuple[float, float] = (0.1, 0.06)
-    """Length and width of a label: a bright plate of this size on a bundle that no picture reads is called
-    illegible; 0 0 looks for none."""
+    """Length and width of a label: a bright plate of this size on a bundle that can't be read in any picture
+    is reported as illegible; with 0 0, none are searched for.
+    """
 
     def __post_init__(self) -> None:
         expect_ranges(self, "labels.", size_m=(0, 0.6))

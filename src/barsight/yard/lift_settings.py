@@ -1,4 +1,4 @@
-"""Define the settings of lift targets and of the pile's stability."""
+"""Define the settings for lift targets and for the pile's stability."""
 
 from __future__ import annotations
 
@@ -10,55 +10,58 @@ from barsight.core.settings.values import OVER_0, POSITIVE, SHARE, expect_ranges
 
 @dataclass(frozen=True)
 class LiftSettings:
-    """Limits of a lift, beside the magnet's own."""
+    """Limits of a lift, besides the magnet's own."""
 
     bundles: int = 1
-    """Bundles to be taken by one lift."""
+    """Number of bundles that one lift takes."""
     min_count_probability: float = 0.999
-    """How sure the count under the footprint must be."""
+    """Minimum probability that the bundles under the magnet's poles are counted correctly."""
     max_unknown_ratio: float = 0.25
-    """Of the cells under a pole that were not seen; filled ones count as not seen."""
+    """Maximum share of the cells under a pole that were not seen; filled cells count as not seen."""
     max_unexplained_ratio: float = 0.03
-    """Of the poles' area over something that belongs to no bundle."""
+    """Maximum share of the poles' area that is over something that belongs to no bundle."""
     min_confidence: float = 0.5
-    """A bundle less sure than this is not lifted."""
+    """Minimum confidence in a bundle that is lifted."""
     contact_gap_m: float = 0.003
-    """A face nearer than this to steel lies on it."""
+    """Maximum gap between a face and the steel for the face to lie on it."""
     strap_m: float = 0.0012
-    """Thickest strap, which may hold a face off the bars."""
+    """Maximum thickness of a strap, which may hold a face off the bars."""
     max_hidden_bar_m: float = 0.022
-    """Thickest bar across a load that the pictures may be too coarse to show."""
+    """Maximum diameter of a bar across a load that the pictures may be too coarse to show."""
     max_refused_ratio: float = 0.5
-    """Of the frames that see the place of the lift."""
+    """Maximum share of refused frames among those that see the place of the lift."""
     max_age_s: float = 600.0
-    """A place that was last seen longer ago than this is not lifted from."""
+    """Maximum time since a place was last seen for a lift from it."""
     disturbed_reach_m: float = 1.0
-    """A lift, set-down or magnet since a place was last seen, nearer than this to its lift, forbids that."""
+    """Minimum distance of a lift from any lift, set-down or magnet that came after its place
+    was last seen.
+    """
     max_overhang_ratio: float = 0.25
-    """Of its width that a bundle may stand over the edge of what carries it."""
+    """Maximum overhang of a bundle over the edge of what carries it, as a share of its width."""
     max_lean_deg: float = 5.0
-    """How far a side of the pile may lean outwards."""
+    """Maximum outward lean of a side of the pile."""
     max_turn_deg: float = 5.0
-    """Largest turn of a load by the crane before it is set down; from 90 on places across count."""
+    """Maximum angle by which the crane turns a load before setting it down; from 90 on, also across."""
     set_down_clear_m: float = 0.1
-    """What stands higher must be this far from a load that is set down, beyond the crane's tolerance."""
+    """Minimum distance between a load that is set down and anything higher, beyond the crane's tolerance."""
     dunnage_m: float = 0.0
-    """Thickness of what men lay across under every load that is set down; 0 where nothing is laid."""
+    """Thickness of the dunnage laid across under every load that is set down; 0 where none is laid."""
     travel_clear_m: float = 0.5
-    """Height of a travelling load's underside over all that stands on its way."""
+    """Minimum clearance of a travelling load's underside over everything on its way."""
     swing_m: float = 0.5
-    """How far a travelling load may swing out to any side."""
+    """Maximum distance by which a travelling load may swing out to any side."""
     max_stack_m: float | None = None
-    """The most that may stand where nothing was seen; without it no load travels over such a place."""
+    """Maximum height that may stand where nothing was seen; without it no load travels over such a place."""
     stanchions: tuple[tuple[float, float, float], ...] = ()
-    """x, y and height (m) of the stanchions, where there are any."""
+    """Position x, y and height (m) of each stanchion, where there are any."""
     no_lift_areas: tuple[tuple[float, float, float, float], ...] = ()
-    """x_min, y_min, x_max, y_max (m) of rectangles where nothing is lifted or put down: walls, walkways, what
-    stands there for good."""
+    """Rectangles x_min, y_min, x_max, y_max (m) where nothing is lifted or put down: walls, walkways,
+    permanent objects.
+    """
     min_freeboard_m: float = 0.05
-    """How far a stanchion must stand above the bundles beside it."""
+    """Minimum height of a stanchion above the bundles beside it."""
     beside_stanchion_m: float = 1.0
-    """A bundle nearer than this to a stanchion is held by it."""
+    """Maximum distance between a stanchion and a bundle that it holds."""
 
     def __post_init__(self) -> None:
         expect_ranges(
@@ -77,4 +80,4 @@ class LiftSettings:
 
 
 UPPER = 1.645
-"""Sigmas to a bound that holds in 95 % of cases."""
+"""Number of sigmas to a one-sided bound that holds in 95 % of cases."""

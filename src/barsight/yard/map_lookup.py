@@ -1,4 +1,4 @@
-"""Look up the map's cells at places of the yard."""
+"""Look up the map's cells at given places in the yard."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ _UNKNOWN, _FILLED = HeightSource.UNKNOWN, HeightSource.FILLED
 
 
 def nearest_cells(heights: HeightMap, x: Float64, y: Float64) -> tuple[Int64, Int64, Bool]:
-    """Columns and rows of the nearest cells, and whether they lie in the map; (0, 0) where not."""
+    """Find columns and rows of the nearest cells, and whether they lie in the map; (0, 0)
+    where they don't.
+    """
     column = np.floor((x - heights.x0_m) / heights.cell_m + 0.5).astype(np.int64)
     row = np.floor((y - heights.y0_m) / heights.cell_m + 0.5).astype(np.int64)
     rows, columns = heights.z_m.shape
@@ -24,7 +26,7 @@ def nearest_cells(heights: HeightMap, x: Float64, y: Float64) -> tuple[Int64, In
 
 
 def sample_levels(heights: HeightMap, levels: UInt8, x: Float64, y: Float64) -> Float32:
-    """Interpolate gray levels (V, U) between the four cells about places x and y, m; NaN where one of them
+    """Interpolate gray levels (V, U) between the four cells around places x and y, m; NaN where one of these
     wasn't seen. levels: (rows, columns) of the map, 0 where unseen.
     """
     column, row = (
@@ -43,7 +45,7 @@ def sample_levels(heights: HeightMap, levels: UInt8, x: Float64, y: Float64) -> 
 
 
 def lookup_heights(heights: HeightMap, x: Float64, y: Float64) -> Float64:
-    """Look up heights of the nearest cells; NaN where they were not seen."""
+    """Look up the heights of the nearest cells; NaN where they weren't seen."""
     x, y = np.broadcast_arrays(x, y)
     z = _lookup(
         heights.z_m, heights.source, heights.x0_m, heights.y0_m, heights.cell_m,
@@ -54,7 +56,7 @@ def lookup_heights(heights: HeightMap, x: Float64, y: Float64) -> Float64:
 
 @kernel()
 def _lookup(z: Float32, source: UInt8, x0: float, y0: float, cell: float, x: Float64, y: Float64) -> Float64:
-    """Look up the heights (N,) of the cells nearest to places x and y (N,), m; NaN where none was seen."""
+    """Look up the heights (N,) of the cells nearest to places x and y (N,), m; NaN where unseen."""
     found = np.full(x.size, np.nan)
     for k in range(x.size):
         column = int(np.floor((x[k] - x0) / cell + 0.5))
@@ -68,8 +70,8 @@ def _lookup(z: Float32, source: UInt8, x0: float, y0: float, cell: float, x: Flo
 
 @kernel()
 def interpolate_height(z: Float32, source: UInt8, column: float, row: float) -> float:
-    """Interpolate the height between the four cells about a place in cells; NaN where less than half of it
-    was seen. z, source: maps (rows, columns).
+    """Interpolate the height between the four cells around a place given in cells; NaN where less than half
+    of the weight was seen. z, source: maps (rows, columns).
     """
     left, low = int(np.floor(column)), int(np.floor(row))
     total, weight = 0.0, 0.0

@@ -14,7 +14,7 @@ _WIDEST_PX = 900
 
 def picture_html(x_m: Float64, y_m: Float64, z_m: Float32) -> str:
     """Draw heights (H, W) at x_m (W,), y_m (H,) in colours as an HTML figure: y upwards, unknown cells white,
-    the scale beneath.
+    the range of heights below.
     """
     known = np.isfinite(z_m)
     if not known.any():

@@ -15,36 +15,46 @@ from barsight.yard.types import Bundle, YardMap
 
 STEP_M = 0.01
 ASIDE_M = 0.05
-"""So far beside a bundle is looked: what goes on there is no label."""
+"""Distance (m) beside a bundle that is searched too: what continues there isn't a label."""
 OPENING_RATIO = 1.7
-"""Longest bright run along the bars, in lengths of a label: a longer one is a bar."""
+"""Maximum length of a bright run along the bars, in lengths of a label: a longer one is a bar."""
 CODE_CELLS = 7
-"""A code's dark modules are narrower along the bars."""
+"""Number of cells along the bars that is larger than a code's dark modules."""
 BRIGHTER_LOGS = (0.22, 0.35, 0.5, 0.8)
-"""Logarithms of a plate's level over its bars' before and behind, at one of which it shows its shape."""
+"""Thresholds on the log ratio of a plate's level to its bars' before and behind; at one of them it shows its
+shape.
+"""
 MIDDLE_LOG, USUAL_RATIO = 0.28, 4.6
-"""The same of a plate's middle cell at least, and over what four fifths of the bundle's cells stay below."""
+"""Minimum log ratio of a plate's median cell: absolute, and as a multiple of the value below which four
+fifths of the bundle's cells stay.
+"""
 MIN_SIDE_RATIO, MAX_SIDE_RATIO = (0.6, 0.75), 1.5
-"""A plate's longer and shorter side over a label's."""
+"""Minimum and maximum ratios of a plate's longer and shorter side to a label's."""
 MIN_FULL_RATIO = 0.72
-"""Share of the smallest rectangle around a plate that is bright."""
+"""Minimum share of the smallest rectangle around a plate that is bright."""
 WHITE_LEVEL, CODE_LOGS = 200.0, (0.22, 0.35)
-"""Level of the paper before and behind a code, and logarithms of it over the code's level: on a bar that
-shines as the paper does only the code shows."""
+"""Minimum level of the paper before and behind a code, and thresholds on its log ratio to the code's level:
+on a bar as bright as the paper only the code shows.
+"""
 MAX_CODE_LOG, DARK_QUANTILE = 0.7, 0.75
-"""A code is half white: this share of its cells lacks no more of the white's level. What is darker, or so
-dark that no picture shows it, is a strap."""
+"""Maximum log ratio of the white to a code's cells, and the share of cells within it: a code is half white.
+What is darker, or so dark that no picture shows it, is a strap.
+"""
 MIN_CODE_RATIO, MAX_CODE_RATIO, MIN_CODE_FULL = (0.8, 0.6), 1.3, 0.85
-"""Sides of a code over the label's shorter one, and how full it is."""
+"""Minimum and maximum ratios of a code's sides to the label's shorter one, and minimum share of its rectangle
+that it fills.
+"""
 BESIDE_M, MAX_RISE_M = 0.1, 0.015
-"""A plate stands no more over what lies so far before and behind: blocks do."""
+"""Distance (m) before and behind a plate of the surface that it is compared with, and its maximum rise (m)
+over that: blocks rise more.
+"""
 _DARK = 10.0
-"""Level that is added to all: where hardly any light is, ratios tell nothing."""
+"""Level added to all levels, since ratios of very dark levels mean nothing."""
 
 
 def find_plates(bundle: Bundle, heights: YardMap, size_m: tuple[float, float]) -> list[Float64]:
-    """Find the middles (2,) of bright plates of about size_m on a bundle's top, m, in either direction; none
-    without an orthophoto.
+    """Find the middles (2,) in m of bright plates of about size_m on a bundle's top, in either direction;
+    none without an orthophoto.
     """
     across = np.arange(-bundle.width_m / 2 - ASIDE_M, bundle.width_m / 2 + ASIDE_M, STEP_M)
     along = np.arange(-bundle.length_m / 2, bundle.length_m / 2 + STEP_M / 2, STEP_M)
@@ -65,7 +75,7 @@ def find_plates(bundle: Bundle, heights: YardMap, size_m: tuple[float, float]) -
 
 
 def plate_masks(gray: Float32, z_m: Float32, size_m: tuple[float, float]) -> Iterator[Bool]:
-    """Yield a mask (V, U) of each plate of about size_m, in either direction; one plate may come twice.
+    """Yield a mask (V, U) of each plate of about size_m, in either direction; one plate may occur twice.
 
     gray: levels (V, U) at places STEP_M apart, V along the bars; 0 where nothing was seen. z_m: heights.
     """
@@ -75,7 +85,7 @@ def plate_masks(gray: Float32, z_m: Float32, size_m: tuple[float, float]) -> Ite
 
 
 def _plates(gray: Float32, size_m: tuple[float, float]) -> Iterator[Bool]:
-    """Yield the cells of what is bright and of a label's size."""
+    """Yield the cells of each bright area of a label's size."""
     excess = _excess(gray, size_m)
     limit = max(MIDDLE_LOG, USUAL_RATIO * float(np.quantile(excess, 0.8)))
     for cells in chain.from_iterable(_blobs(excess > level, size_m) for level in BRIGHTER_LOGS):
@@ -86,7 +96,7 @@ def _plates(gray: Float32, size_m: tuple[float, float]) -> Iterator[Bool]:
 
 
 def _codes(gray: Float32, size_m: tuple[float, float]) -> Iterator[Bool]:
-    """Yield the cells of what is darker than the white before and behind it, and of a code's size."""
+    """Yield the cells of each area of a code's size that is darker than the white before and behind it."""
     level, side = np.log(gray + _DARK), min(size_m)
     length = round(1.5 * side / STEP_M) | 1
     white = cv2.morphologyEx(level, cv2.MORPH_CLOSE, np.ones((length, 1), np.uint8))
@@ -100,7 +110,7 @@ def _codes(gray: Float32, size_m: tuple[float, float]) -> Iterator[Bool]:
 
 
 def _excess(gray: Float32, size_m: tuple[float, float]) -> Float32:
-    """Compute the logarithm of levels (V, U) over the bars' own, V along them; 0 where nothing was seen."""
+    """Compute the log ratio of levels (V, U) to the bars' own, V along them; 0 where nothing was seen."""
     level = np.where(gray > 0, np.log(gray + _DARK), np.float32(-1))
     filled = cv2.morphologyEx(level, cv2.MORPH_CLOSE, np.ones((CODE_CELLS, 1), np.uint8))
     seen = filled > 0
@@ -113,7 +123,7 @@ def _excess(gray: Float32, size_m: tuple[float, float]) -> Float32:
 
 
 def _blobs(bright: Bool, size_m: tuple[float, float]) -> list[Bool]:
-    """List the connected cells that may be of about size_m: neither much smaller nor longer."""
+    """List the connected areas that may be of about size_m: neither much smaller nor longer."""
     mask = bright.astype(np.uint8)
     for way in (cv2.MORPH_CLOSE, cv2.MORPH_OPEN):
         mask = cv2.morphologyEx(mask, way, np.ones((3, 3), np.uint8))
@@ -127,8 +137,8 @@ def _blobs(bright: Bool, size_m: tuple[float, float]) -> list[Bool]:
 
 
 def _shape(cells: Bool, size_m: tuple[float, float]) -> tuple[Float64, float]:
-    """Compute the sides of the smallest rectangle around cells over those of size_m, the longer first, and
-    the share of it that they fill.
+    """Compute the ratios of the sides of the smallest rectangle around cells to those of size_m, the longer
+    first, and the share of it that the cells fill.
     """
     rows, columns = np.nonzero(cells)
     _, sides, _ = cv2.minAreaRect(np.stack([columns, rows], axis=1).astype(np.float32))
@@ -138,7 +148,9 @@ def _shape(cells: Bool, size_m: tuple[float, float]) -> tuple[Float64, float]:
 
 
 def _rise(cells: Bool, z_m: Float32) -> float:
-    """Compute how far cells stand over the higher of what lies before and behind them; inf where unknown."""
+    """Compute how far cells rise over the higher of the surfaces before and behind them;
+    inf where unknown.
+    """
     i, j = np.nonzero(cells)
     beside = []
     for way in (-1, 1):

@@ -1,4 +1,4 @@
-"""Divide long yards into stretches: what is held of a map at once doesn't grow with its length."""
+"""Divide long yards into stretches, so that the part of a map kept in memory doesn't grow with its length."""
 
 from __future__ import annotations
 
@@ -16,17 +16,19 @@ from barsight.mapping.top_photo import TopPhoto
 from barsight.yard.types import HeightMap, YardMap
 
 WHOLE_M = 60.0
-"""A map up to so long is one stretch."""
+"""Maximum length (m) of a map that is one stretch."""
 OWN_M, MARGIN_M = 44.0, 8.0
-"""The longest part that is a stretch's own, and what it has of its neighbours' on either side: a bundle whose
-middle is its own lies in it whole if it is not over 13 m long, with a metre to see where it ends."""
+"""Maximum length (m) of a stretch's own part, and how much of its neighbours it includes on either side: a
+bundle whose middle is in its own part is included whole if it is no longer than 13 m, with a metre to see its
+ends.
+"""
 
 
 class PartedMap:
-    """A `YardMap` of which parts are read when they are wanted; the last one read is kept, and smaller ones
-    are cut from it.
+    """A `YardMap` whose parts are read on demand; the last one read is kept, and smaller ones are cut from
+    it.
 
-    read: gives the part of these rows and columns.
+    read: returns the part of these rows and columns.
     """
 
     def __init__(
@@ -56,8 +58,8 @@ def surface_map(
     surface: Surface, free: FreeSpace | None = None, tops: TopPhoto | None = None,
     history: PlaceHistory | None = None,
 ) -> PartedMap:  # fmt: skip
-    """Return all that a surface knows, read from its tiles; free: what lines of sight prove free; tops: the
-    pictures at the height of the tops; history: which of several passes saw each place.
+    """Return everything that a surface knows, read from its tiles. free: what lines of sight prove free;
+    tops: the pictures at the height of the tops; history: which of several passes saw each place.
     """
     cell_m = surface.cell_m
 
@@ -82,8 +84,9 @@ def surface_map(
 
 @dataclass(frozen=True)
 class MapStretch:
-    """A part of a map, by rows and columns, that is worked on as if it were all. What lies in the rectangle
-    from low_m to high_m (x and y, infinite where the map ends) is its own, the rest its neighbours'."""
+    """A part of a map, by rows and columns, that is processed as if it were the whole map. The rectangle from
+    low_m to high_m (x and y, infinite where the map ends) is its own, the rest its neighbours'.
+    """
 
     rows: slice
     columns: slice
@@ -91,21 +94,19 @@ class MapStretch:
     high_m: tuple[float, float]
 
     def owns(self, place_m: Float64, slack_m: float = 0.0) -> bool:
-        """Check whether a place (2 or more figures, x and y first) is its own, or no further off than
-        slack_m.
-        """
+        """Check whether a place (2 or more values, x and y first) is its own, or within slack_m of that."""
         return all(
             low - slack_m <= at < high + slack_m
             for low, at, high in zip(self.low_m, place_m[:2], self.high_m, strict=True)
         )
 
     def reaches(self, place_m: Float64) -> bool:
-        """Check whether a place is its own or in its margin."""
+        """Check whether a place lies in its own part or in its margin."""
         return self.owns(place_m, MARGIN_M)
 
 
 def split_map(yard: YardMap) -> list[MapStretch]:
-    """Divide a map into stretches; one for a map of up to WHOLE_M."""
+    """Divide a map into stretches; only one for a map of up to WHOLE_M."""
     rows, columns = (_cuts(cells, yard.cell_m) for cells in yard.shape)
     return [
         MapStretch(
@@ -117,7 +118,9 @@ def split_map(yard: YardMap) -> list[MapStretch]:
 
 
 def _cuts(cells: int, cell_m: float) -> list[tuple[slice, float, float]]:
-    """Divide one axis: the cells that each stretch holds, and where its own begin and end from the first."""
+    """Divide one axis: the cells of each stretch, and where its own part begins and ends, from the first
+    cell.
+    """
     count = 1 if cells * cell_m <= WHOLE_M else int(np.ceil(cells * cell_m / OWN_M))
     edges = np.linspace(0, cells, count + 1).round().astype(int).tolist()
     margin = round(MARGIN_M / cell_m)
@@ -129,7 +132,7 @@ def _cuts(cells: int, cell_m: float) -> list[tuple[slice, float, float]]:
 
 
 def patches(yard: YardMap, cells: int) -> Iterator[tuple[slice, slice]]:
-    """Divide a map into squares of so many cells, as rows and columns; smaller at its far ends."""
+    """Divide a map into squares of this many cells, as rows and columns; smaller at its far ends."""
     for first, other in product(*(range(0, size, cells) for size in yard.shape)):
         yield (
             slice(first, min(first + cells, yard.shape[0])),
@@ -138,7 +141,7 @@ def patches(yard: YardMap, cells: int) -> Iterator[tuple[slice, slice]]:
 
 
 def part_about(yard: YardMap, x_m: Float64, y_m: Float64) -> HeightMap:
-    """Read the part that holds these places, or the nearest cells where they lie beyond the map."""
+    """Read the part that contains these places, or the nearest cells where they lie beyond the map."""
     cuts = []
     for at, first, size in ((y_m, yard.y0_m, yard.shape[0]), (x_m, yard.x0_m, yard.shape[1])):
         cell = (np.array([at.min(), at.max()]) - first) / yard.cell_m

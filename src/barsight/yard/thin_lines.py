@@ -1,7 +1,7 @@
-"""Find thin bars that lie loose across a load in the top photo: matching sees none under three pixels.
+"""Find thin bars that lie loose across a load in the top photo: matching can't see bars under three pixels.
 
-Such a bar is a narrow bright line that runs on over gullies between bars and gaps between bundles. A strap is
-dark, and ends where its bundle does; dunnage shows beside the load, not on it.
+Such a bar is a narrow bright line that continues over gullies between bars and gaps between bundles. A strap
+is dark, and ends where its bundle does; dunnage shows beside the load, not on it.
 """
 
 from __future__ import annotations
@@ -18,41 +18,45 @@ from barsight.yard.map_lookup import sample_levels
 from barsight.yard.types import Bundle, Doubt, DoubtKind, HeightMap
 
 MAX_STRENGTH = 8.0
-"""Of a line that texture, dunnage or a strap with a bright middle makes on a load, in sigmas of its row."""
+"""Maximum strength, in sigmas of its row, of a line on a load due to texture, dunnage or a strap with a
+bright middle.
+"""
 SURE_STRENGTH = 14.0
-"""From this strength on no strap makes a line."""
+"""Minimum strength of a line that can't be a strap."""
 STEP_M = 0.01
 REACH_M = 0.6
-"""How far beside a bundle's axis a line may add to what is seen of it on the bundle."""
+"""Distance (m) beyond a bundle's flank within which a line may add to its strength on the bundle."""
 AROUND_M = 0.07
-"""Length along the bars over which the steel's own gray level is taken: a line is far narrower."""
+"""Length (m) along the bars of the median that gives the steel's own gray level: a line is far narrower."""
 INNER_RATIO = 0.84
-"""Of the load's width, its middle: a line must show there. Dunnage may show beside it."""
+"""Middle share of the load's width in which a line must show; dunnage may show beside it."""
 BESIDE_M = (0.0, 0.1, 0.2, 0.35, 0.55)
-"""How far beyond the middle, to either side, a line is followed."""
+"""Distances (m) beyond the middle, to either side, to which a line is followed."""
 BESIDE_RATIO = 1.5
-"""What lies beyond counts at most so many times as much as the middle, by length."""
+"""Maximum weight, by length and relative to the middle, of the parts of a line beyond it."""
 DARK, BRIGHT = -2.0, 5.0
-"""Contrasts, in sigmas of a column, beyond which more doesn't count."""
+"""Limits, in sigmas of a column, at which contrasts are clipped."""
 MIN_SIGMA_LOG = 0.05
 HIGHLIGHT_LOG, FADE_LOG = 0.3, 0.4
-"""A bar doesn't show on highlights, this much over the load's median; they count less from FADE_LOG below."""
+"""Log level over the load's median from which highlights have no weight, as a bar doesn't show on them; and
+the range below it over which their weight falls.
+"""
 BESIDE_END_M = 0.12
-"""Rows nearer to an end tell nothing: what lies before it shows there."""
+"""Distance (m) from an end within which rows aren't used, since objects before the end show there."""
 MIN_SEEN_RATIO = 0.8
 APART_M = 0.1
-"""Lines nearer to each other along a bundle are one."""
+"""Minimum distance (m) along a bundle between two lines; closer ones are one."""
 _SLOPES = np.r_[np.arange(-1.2, -0.5, 0.05), np.arange(-0.5, 0.501, 0.02), np.arange(0.55, 1.21, 0.05)]
 MAX_SLOPE = float(_SLOPES.max())
-"""Of a line, from square to the bundle's axis."""
+"""Maximum slope of a line relative to the perpendicular of the bundle's axis."""
 _ROW_SIGMAS = np.float32(math.sqrt(3.0))
-"""Neighbouring columns of the photo share their pixels: a row's sum scatters more by this."""
+"""Factor on the scatter of a row's sum, since neighbouring columns of the photo share their pixels."""
 
 
 @dataclass(frozen=True)
 class ThinLine:
-    """A line across a bundle. strength: its contrast in sigmas. along_m: where it crosses the
-    axis, from the middle. askew_deg: its angle from square to the axis.
+    """A line across a bundle. strength: its contrast in sigmas. along_m: where it crosses the axis, from the
+    middle. askew_deg: its angle from the perpendicular of the axis.
     """
 
     strength: float
@@ -62,7 +66,7 @@ class ThinLine:
 
 def find_thin_lines(heights: HeightMap, bundle: Bundle) -> tuple[ThinLine, ...] | None:
     """Find the strongest line across a bundle in the top photo, then all others over MAX_STRENGTH; None where
-    too little of it is seen.
+    too little of the bundle is seen.
     """
     found = line_strengths(heights, bundle)
     if found is None:
@@ -79,7 +83,9 @@ def find_thin_lines(heights: HeightMap, bundle: Bundle) -> tuple[ThinLine, ...] 
 
 
 def with_thin_lines(bundle: Bundle, heights: HeightMap) -> Bundle:
-    """Return a bundle that says so where a line runs across it; dunnage that heights show is left out."""
+    """Return the bundle with a doubt where a line runs across it, unless heights already show that something,
+    such as dunnage, crosses it.
+    """
     if heights.tops is None or any(doubt.kind is DoubtKind.CROSSED for doubt in bundle.reasons):
         return bundle
     lines = find_thin_lines(heights, bundle)
@@ -91,12 +97,12 @@ def with_thin_lines(bundle: Bundle, heights: HeightMap) -> Bundle:
 
 
 def line_strengths(heights: HeightMap, bundle: Bundle) -> tuple[Float64, Float32] | None:
-    """Compute where lines cross a bundle's axis (V,), m from its middle, and the strengths (S, V) of each
-    slope; None where too little of it is seen.
+    """Compute the places (V,) at which lines cross a bundle's axis, m from its middle, and their strengths
+    (S, V) for each slope; None where too little of the bundle is seen.
 
-    Gray levels are taken along the bars: their logarithm less its median over AROUND_M, over the column's
-    scatter. A line's strength is its sum over sqrt(columns), of columns that aren't highlights; what lies
-    beside the load adds to what lies on it, up to BESIDE_RATIO of it.
+    Contrasts are taken along the bars: log gray level minus its median over AROUND_M, divided by the column's
+    scatter. A line's strength is its sum divided by sqrt(columns), without columns that are highlights. Parts
+    beside the load add to those on it, up to BESIDE_RATIO times as much.
     """
     if heights.tops is None:
         return None
@@ -123,12 +129,12 @@ def line_strengths(heights: HeightMap, bundle: Bundle) -> tuple[Float64, Float32
 def _line_strengths(
     contrast: Float32, power: Float32, reach: int, slopes: Float64, ends: Int64, count: int, width: int
 ) -> Float32:  # fmt: skip
-    """Compute the strength (S, V) of the line of each slope through each row of the middle column: the best
-    of all reaches beside the load's middle.
+    """Compute the strength (S, V) of the line of each slope through each row of the middle column: the
+    maximum over all distances to which it is followed beside the load's middle.
 
-    contrast, power: (U, V + 2 reach) contrasts and squared weights by columns, zeros before and after: as far
-    as the steepest line reaches, and one more. ends: (E,) columns, of which the first `count` lie left of the
-    middle, the nearest last. width: the middle's columns.
+    contrast, power: (U, V + 2 reach) contrasts and squared weights by columns, with zeros before and after
+    for as far as the steepest line reaches, plus one. ends: (E,) columns, of which the first `count` lie left
+    of the middle, the nearest last. width: number of the middle's columns.
     """
     rows = contrast.shape[1] - 2 * reach
     strength = np.full((slopes.size, rows), -np.inf, np.float32)
@@ -151,8 +157,8 @@ def _line_strengths(
 
 @kernel()
 def _add_along(part: Float32, slope: float, ends: Int64, sums: Float32) -> None:
-    """Sum columns from the first of `ends` (E,) to each along lines of one slope, (E, V); interpolated
-    linearly between rows. part: (U, V + 2 reach), see `_line_strengths`.
+    """Sum columns from the first of `ends` (E,) to each of them along lines of one slope, (E, V);
+    interpolated linearly between rows. part: (U, V + 2 reach), see `_line_strengths`.
     """
     rows, middle = sums.shape[1], len(part) // 2
     reach = (part.shape[1] - rows) // 2
@@ -171,8 +177,8 @@ def _add_along(part: Float32, slope: float, ends: Int64, sums: Float32) -> None:
 
 
 def _strip(heights: HeightMap, bundle: Bundle) -> tuple[Float64, Float32]:
-    """Resample the photo along a bundle's axis: places along it (V,), logarithms of gray levels (V, U), NaN
-    where unseen.
+    """Resample the photo along a bundle's axis: places along it (V,), log gray levels (V, U), NaN where
+    unseen.
     """
     assert heights.tops is not None
     axis = np.array([-math.sin(bundle.yaw_rad), math.cos(bundle.yaw_rad)])
@@ -184,7 +190,9 @@ def _strip(heights: HeightMap, bundle: Bundle) -> tuple[Float64, Float32]:
 
 
 def _contrast(level: Float32, middle: int, half: int) -> tuple[Float32, Float32]:
-    """Compute each place's contrast (V, U) to its column around it, in sigmas, and the columns' weights."""
+    """Compute the contrast (V, U) of each place to its column around it, in sigmas, and
+    the columns' weights.
+    """
     seen = np.isfinite(level)
     filled = np.where(seen, level, np.nan_to_num(known_median(level)))
     around = running_median(filled, 2 * round(AROUND_M / STEP_M / 2 - 0.5) + 1)

@@ -1,4 +1,4 @@
-"""Define the records that the yard's stages pass on: bars, bundles and how sure they are.
+"""Define the records that the yard's stages exchange: bars, bundles and their uncertainty.
 
 All in the yard frame, m and rad. Yaw is the axis's angle from +Y about Z, counter-clockwise, in
 (-pi/2, pi/2]: the axis runs along (-sin yaw, cos yaw).
@@ -23,13 +23,13 @@ ENDS = "low-y", "high-y"
 class HeightMap:
     """The map that the yard's stages read: arrays [y, x] with y rising.
 
-    Cell (row, column) has its centre at (x0_m + column * cell_m, y0_m + row * cell_m). z_m, sigma_m:
-    float32, NaN where unknown. views: float32. source: `HeightSource`. gray: the orthophoto, levels from
-    1, 0 where nothing was seen; None where there is none. free_m: float32, upper bound of what may stand
-    in the cell by lines of sight that passed over it, inf where none did; None where no lines of sight
-    are known. tops: gray levels from 1 of the pictures at the height of the tops around (`TopPhoto`), 0
-    where nothing was seen; None where there is no such photo. passes: number of the newest pass that saw
-    the place, from 1, 0 where none did; None where one pass made the map.
+    Cell (row, column) has its centre at (x0_m + column * cell_m, y0_m + row * cell_m). z_m, sigma_m: float32,
+    NaN where unknown. views: float32. source: `HeightSource`. gray: the orthophoto, levels from 1, 0 where
+    nothing was seen; None where there is none. free_m: float32, upper bound of what may stand in the cell by
+    lines of sight that passed over it, inf where none did; None where no lines of sight are known. tops: gray
+    levels, from 1, of the pictures projected at the height of the tops around (`TopPhoto`), 0 where nothing
+    was seen; None where there is no such photo. passes: number of the newest pass that saw the place, from 1,
+    0 where none did; None where one pass made the map.
     """
 
     x0_m: float
@@ -52,16 +52,16 @@ class HeightMap:
 
     @property
     def x_m(self) -> Float64:
-        """Return (columns,): the cells' centres."""
+        """Return the x of the cells' centres (columns,)."""
         return np.asarray(self.x0_m + self.cell_m * np.arange(self.shape[1]), np.float64)
 
     @property
     def y_m(self) -> Float64:
-        """Return (rows,): the cells' centres."""
+        """Return the y of the cells' centres (rows,)."""
         return np.asarray(self.y0_m + self.cell_m * np.arange(self.shape[0]), np.float64)
 
     def to_xarray(self) -> Any:
-        """Return the same as an xarray.Dataset with coordinates `y` and `x` and units as attributes.
+        """Return the map as an xarray.Dataset with coordinates `y` and `x` and units as attributes.
 
         Raises ConfigError where xarray isn't installed.
         """
@@ -98,7 +98,7 @@ class HeightMap:
 
 
 class YardMap(Protocol):
-    """A height map that may be too large to be held: `part` reads what is needed of it. See `HeightMap`."""
+    """A height map that may be too large for memory: `part` reads what is needed of it. See `HeightMap`."""
 
     @property
     def x0_m(self) -> float: ...
@@ -117,11 +117,11 @@ class YardMap(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Bar:
-    """One bar's visible part.
+    """The visible part of one bar.
 
-    centre_m: (3,) the axis at the middle of what is seen. direction: (3,) unit vector, +y part positive.
-    length_m: of what is seen. covariance: (5, 5) of the axis's lateral place and height at the centre (m),
-    its yaw and pitch (rad) and the diameter (m).
+    centre_m: (3,) the axis at the middle of the visible part. direction: (3,) unit vector towards +y.
+    length_m: of the visible part. covariance: (5, 5) of the axis's lateral place and height at the centre
+    (m), its yaw and pitch (rad) and the diameter (m).
     """
 
     centre_m: Float64
@@ -133,9 +133,9 @@ class Bar:
 
 @dataclass(frozen=True)
 class BundleLabel:
-    """The label on a bundle. text: None where codes were read but none for sure. kind: of code, or
-    `illegible`. reads: pictures that read it so. confidence: probability that a further picture reads the
-    same, (reads + 1) / (all readings there + 2); 0 where it is illegible.
+    """The label on a bundle. text: None where codes were read, but none with certainty. kind: of code, or
+    `illegible`. reads: number of pictures that gave this text. confidence: probability that a further picture
+    gives the same, (reads + 1) / (all readings there + 2); 0 where it is illegible.
     """
 
     text: str | None
@@ -146,7 +146,7 @@ class BundleLabel:
 
 @dataclass(frozen=True)
 class BundleSigma:
-    """One standard deviation of each figure of a bundle; NaN where the figure is unknown."""
+    """Standard deviation of each quantity of a bundle; NaN where the quantity is unknown."""
 
     lateral_m: float
     along_m: float
@@ -160,7 +160,7 @@ class BundleSigma:
 
 @dataclass(frozen=True)
 class FitSigma:
-    """One standard deviation of a fitted outline's figures, were it surely the bundle's."""
+    """Standard deviation of each quantity of a fitted outline, assuming that it is the bundle's."""
 
     lateral_m: float
     along_m: float
@@ -170,8 +170,8 @@ class FitSigma:
 
 
 class DoubtKind(Enum):
-    """Tell apart the doubts that something is decided by. A value is the words in every sentence of the kind,
-    and in no other: files hold sentences alone.
+    """Kinds of doubts on which decisions depend. A value is the phrase that every sentence of the kind
+    contains, and no other does, since files contain only sentences.
     """
 
     COVERED_END = "end is open: something higher"
@@ -193,7 +193,7 @@ class DoubtKind(Enum):
 
 @dataclass(frozen=True)
 class Doubt:
-    """Say what speaks against a bundle as described. end: number, in ENDS, of the open end it tells of."""
+    """A doubt about a bundle as described. end: index, in ENDS, of the open end that it concerns."""
 
     kind: DoubtKind
     sentence: str
@@ -205,7 +205,7 @@ class Doubt:
 
     @classmethod
     def read(cls, sentence: str) -> Doubt:
-        """Read a sentence of a file back."""
+        """Read a doubt back from a sentence in a file."""
         end = next((k for k, name in enumerate(ENDS) if f"the {name} end is open" in sentence), None)
         return cls(next(kind for kind in DoubtKind if kind.value in sentence), sentence, end)
 
@@ -217,17 +217,16 @@ class Bundle:
     id: its number in the result, from 0. centre_m: (3,) the axis at mid-length. yaw_rad, pitch_rad: of the
     axis. ends_m: (2, 3) the axis at its low-y and high-y end. ends_open: (2,) True where that end was not
     seen (out of view or covered), so the bundle may be longer. ends_sigma_m: (2,) of the ends along the axis,
-    NaN where open. top_z_m: the highest line at mid-length.
-    visible_bars: bars seen from above. bars: bars in the bundle by its outline, None where that isn't
-    certain; section_m2: steel's section by what was seen, NaN where that isn't known either.
-    layer: 0 lies on the floor or on dunnage. on_top: no other bundle or bar is known to lie on it; None where
-    something lies there that isn't known. cover_doubts: what may hold it down all the same, as dunnage or a
-    hidden flank.
-    neighbours: ids of the bundles it touches. known_share: share of its outline that was measured.
-    confidence: probability that a bundle lies here as described. reasons: all that speaks against it.
-    label: None where none was seen, or they weren't read. fit_sigma: of the outline's fit alone; None where
-    straps tell the place instead. map_sigma_z_m: of heights there, which holds the calibration's part, shared
-    by the whole map and not in `sigma`; NaN where it isn't known.
+    NaN where open. top_z_m: the highest line at mid-length. visible_bars: number of bars seen from above.
+    bars: number of bars in the bundle by its outline, None where that isn't certain; section_m2:
+    cross-section of steel by what was seen, NaN where that isn't known either. layer: 0 lies on the floor or
+    on dunnage. on_top: no other bundle or bar is known to lie on it; None where something unknown lies there.
+    cover_doubts: what may still hold it down, such as dunnage or a hidden flank. neighbours: ids of the
+    bundles it touches. known_share: share of its outline that was measured. confidence: probability that a
+    bundle lies here as described. reasons: all doubts about it. label: None where none was seen, or labels
+    weren't read. fit_sigma: of the outline's fit alone; None where straps determine the place instead.
+    map_sigma_z_m: of heights there, including the calibration's part, which the whole map shares and which
+    isn't in `sigma`; NaN where it isn't known.
     """
 
     id: int
@@ -259,17 +258,17 @@ class Bundle:
 
     @property
     def is_free(self) -> bool:
-        """Check that nothing at all lies on it, for sure."""
+        """Check that nothing lies on the bundle, with certainty."""
         return self.on_top is True and not self.cover_doubts
 
     def with_cover_doubt(self, doubt: Doubt) -> Bundle:
-        """Return it with a doubt whether something lies on it, which speaks against it too."""
+        """Return the bundle with a doubt whether something lies on it, added to both lists of doubts."""
         both = (*self.reasons, doubt), (*self.cover_doubts, doubt)
         return replace(self, reasons=both[0], cover_doubts=both[1])
 
     @property
     def bottom_z_m(self) -> float:
-        """Return the underside's height: a hexagon is as deep below its axis as it rises above it."""
+        """Return the height of the underside: a hexagon reaches as far below its axis as above it."""
         return float(2 * self.centre_m[2] - self.top_z_m)
 
     @property

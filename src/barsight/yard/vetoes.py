@@ -1,4 +1,6 @@
-"""Define all reasons not to lift: one table of codes, the checks that find them, the vetoes that say them."""
+"""Define all reasons not to lift: one table of codes, the checks that find them, the vetoes
+that state them.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +51,7 @@ VETOES = {
     "no-support": "The bundle's middle is beyond what carries it, as far as can be seen.",
     "over-stanchion": "The bundle is too high for the stanchion beside it.",
 }
-"""Code to what it means; a test trips each."""
+"""Meaning of each code; a test triggers each one."""
 
 
 def _expect_veto(code: str) -> None:
@@ -59,7 +61,7 @@ def _expect_veto(code: str) -> None:
 
 @dataclass(frozen=True)
 class Veto:
-    """Reason not to lift: a code of `VETOES` and a sentence with the figures."""
+    """A reason not to lift: a code of `VETOES` and a sentence with the numbers."""
 
     code: str
     reason: str
@@ -70,11 +72,11 @@ class Veto:
 
 @dataclass(frozen=True)
 class Check:
-    """A check of a placement. code: the veto that it is where it isn't passed.
+    """A check of a placement. code: of the veto that applies where it isn't passed.
 
-    what: is checked, in words. value: what was found, with sigma, bound: what it is held against, all in
-    `unit`; None where there is none. result: unknown forbids as failed does. reason: a sentence with the
-    figures, empty where passed.
+    what: description of the check. value: as found, with sigma; bound: its limit; all in `unit`, None where
+    there is none. result: unknown forbids a lift as failed does. reason: a sentence with the numbers, empty
+    where passed.
     """
 
     code: str
@@ -91,7 +93,7 @@ class Check:
 
 
 def vetoes_of(checks: Iterable[Check]) -> tuple[Veto, ...]:
-    """Derive the vetoes: every check that isn't passed."""
+    """List the vetoes: one for every check that isn't passed."""
     return tuple(Veto(check.code, check.reason) for check in checks if check.result != "passed")
 
 
@@ -99,7 +101,7 @@ def check_max(
     code: str, what: str, value: float, bound: float, unit: str, reason: str, *, sigma: float = 0.0,
     sigmas: float = 1.0,
 ) -> Check:  # fmt: skip
-    """Check that a value and `sigmas` times its sigma above it are within an upper bound."""
+    """Check that a value plus `sigmas` times its sigma is at most the bound."""
     return _checked(code, what, value, bound, unit, reason, sigma, sigmas, 1)
 
 
@@ -107,12 +109,12 @@ def check_min(
     code: str, what: str, value: float, bound: float, unit: str, reason: str, *, sigma: float = 0.0,
     sigmas: float = 1.0,
 ) -> Check:  # fmt: skip
-    """Check that a value and `sigmas` times its sigma below it are within a lower bound."""
+    """Check that a value minus `sigmas` times its sigma is at least the bound."""
     return _checked(code, what, value, bound, unit, reason, sigma, sigmas, -1)
 
 
 def check_true(code: str, what: str, holds: bool | None, reason: str) -> Check:
-    """Check what is so or not; None where nobody knows."""
+    """Check a condition that holds or doesn't; None where it isn't known."""
     result: Literal["passed", "failed", "unknown"]
     result = "unknown" if holds is None else "passed" if holds else "failed"
     return Check(code, what, None, None, None, "", result, "" if holds else reason)
@@ -122,7 +124,9 @@ def _checked(
     code: str, what: str, value: float, bound: float, unit: str, reason: str, sigma: float, sigmas: float,
     sign: int,
 ) -> Check:  # fmt: skip
-    """Judge a value, which may not be over its bound, with the sign -1 not under it; a NaN is unknown."""
+    """Check a value that may not exceed its bound, or, with the sign -1, not fall below it; a
+    NaN is unknown.
+    """
     found, spread, limit = (float(x) if math.isfinite(x) else None for x in (value, sigma, bound))
 
     def check(result: Literal["passed", "failed", "unknown"], said: str) -> Check:

@@ -1,4 +1,4 @@
-"""Estimate what a bundle weighs, and how sure that is."""
+"""Estimate what a bundle weighs, and how certain that is."""
 
 from __future__ import annotations
 
@@ -13,30 +13,32 @@ from barsight.yard.types import Bundle
 
 STEEL_KG_PER_M3 = 7850.0
 COUNT_SIGMA_RATIO = 0.08
-"""What the outline of counted bars leaves open of their section."""
+"""Standard deviation of the cross-section of counted bars that their outline leaves, as a fraction."""
 UNKNOWN_LENGTH_SIGMA_M = 0.05
-"""Of a length whose sigma isn't known: as the load's outline and its overhang take it."""
+"""Standard deviation (m) of a length whose own isn't known, as in the load's outline and overhang."""
 
 
 @dataclass(frozen=True)
 class Mass:
-    """kg and one standard deviation; NaN where it can't be told."""
+    """A mass in kg and its standard deviation; NaN where it isn't known."""
 
     kg: float
     sigma_kg: float
 
     @property
     def upper_kg(self) -> float:
-        """Return a bound that holds in 95 % of cases."""
+        """Return the upper bound that holds in 95 % of cases."""
         return self.kg + UPPER * self.sigma_kg
 
     def __add__(self, other: Mass) -> Mass:
-        """Add both; their errors are taken as common, which is the careful sum."""
+        """Add both masses and their sigmas: the errors are taken as common, which is conservative."""
         return Mass(self.kg + other.kg, self.sigma_kg + other.sigma_kg)
 
 
 def bundle_section(bundle: Bundle) -> tuple[float, float]:
-    """Compute steel's section and its sigma, m2: of the bars where their number is known, else as seen."""
+    """Compute the cross-section of steel and its sigma, m2: of the bars where they are counted,
+    else as seen.
+    """
     diameter = bundle.bar_diameter_m
     if bundle.bars is None or not diameter > 0:
         return bundle.section_m2, bundle.sigma.section_m2
@@ -46,9 +48,9 @@ def bundle_section(bundle: Bundle) -> tuple[float, float]:
 
 
 def bundle_mass(bundle: Bundle) -> Mass:
-    """Compute steel's section x length x 7850 kg/m3; NaN where the section or the length is unknown.
+    """Compute the mass as cross-section x length x 7850 kg/m3; NaN where either is unknown.
 
-    Of a bundle with an open end it is the mass of what was seen.
+    For a bundle with an open end it is the mass of the visible part.
     """
     section, sigma = bundle_section(bundle)
     if not (section > 0 and bundle.length_m > 0):
@@ -60,8 +62,8 @@ def bundle_mass(bundle: Bundle) -> Mass:
 
 
 def load_centre(bundles: tuple[Bundle, ...]) -> Float64:
-    """Compute the centre of mass (2,), x and y, of bundles lifted together, NaN of none: by their masses, or
-    all by their outlines where one of those can't be told.
+    """Compute the centre of mass (2,), x and y, of bundles that are lifted together, NaN without any:
+    weighted by mass, or all by outline where a mass isn't known.
     """
     if not bundles:
         return np.full(2, np.nan)
