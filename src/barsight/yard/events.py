@@ -95,9 +95,7 @@ def merged(first: Iterable[YardEvent], more: Iterable[YardEvent]) -> tuple[YardE
 
 
 def events_since(events: tuple[YardEvent, ...], captured_ns: tuple[int, int] | None) -> tuple[YardEvent, ...]:
-    """Select the events that a map may not show: those after its first frame, or all where
-    that isn't known.
-    """
+    """Select events that a map may not show: those after its first frame, or all if that is unknown."""
     return tuple(event for event in events if captured_ns is None or event.stamp_ns > captured_ns[0])
 
 
@@ -110,9 +108,7 @@ def corners(centre: tuple[float, float], yaw_rad: float, width_m: float, length_
 
 
 def gap_between(one: Float64, other: Float64) -> float:
-    """Compute a lower bound (m) of the distance between two rectangles, by their separating axes; 0 where
-    they overlap.
-    """
+    """Compute a lower bound (m) of two rectangles' distance by separating axes; 0 where they overlap."""
     widest = 0.0
     for corner in (one, other):
         for side in (corner[1] - corner[0], corner[2] - corner[1]):

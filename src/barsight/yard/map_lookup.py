@@ -15,9 +15,7 @@ _UNKNOWN, _FILLED = HeightSource.UNKNOWN, HeightSource.FILLED
 
 
 def nearest_cells(heights: HeightMap, x: Float64, y: Float64) -> tuple[Int64, Int64, Bool]:
-    """Find columns and rows of the nearest cells, and whether they lie in the map; (0, 0)
-    where they don't.
-    """
+    """Find columns and rows of the nearest cells, and whether they lie in the map; (0, 0) if not."""
     column = np.floor((x - heights.x0_m) / heights.cell_m + 0.5).astype(np.int64)
     row = np.floor((y - heights.y0_m) / heights.cell_m + 0.5).astype(np.int64)
     rows, columns = heights.z_m.shape

@@ -21,9 +21,7 @@ OPENING_RATIO = 1.7
 CODE_CELLS = 7
 """Number of cells along the bars that is larger than a code's dark modules."""
 BRIGHTER_LOGS = (0.22, 0.35, 0.5, 0.8)
-"""Thresholds on the log ratio of a plate's level to its bars' before and behind; at one of them it shows its
-shape.
-"""
+"""Thresholds on the log ratio of a plate to its bars before and behind; at one of them its shape shows."""
 MIDDLE_LOG, USUAL_RATIO = 0.28, 4.6
 """Minimum log ratio of a plate's median cell: absolute, and as a multiple of the value below which four
 fifths of the bundle's cells stay.
@@ -41,9 +39,7 @@ MAX_CODE_LOG, DARK_QUANTILE = 0.7, 0.75
 What is darker, or so dark that no picture shows it, is a strap.
 """
 MIN_CODE_RATIO, MAX_CODE_RATIO, MIN_CODE_FULL = (0.8, 0.6), 1.3, 0.85
-"""Minimum and maximum ratios of a code's sides to the label's shorter one, and minimum share of its rectangle
-that it fills.
-"""
+"""Range of a code's sides in shorter sides of the label, and minimum share of its rectangle that it fills."""
 BESIDE_M, MAX_RISE_M = 0.1, 0.015
 """Distance (m) before and behind a plate of the surface that it is compared with, and its maximum rise (m)
 over that: blocks rise more.
@@ -148,9 +144,7 @@ def _shape(cells: Bool, size_m: tuple[float, float]) -> tuple[Float64, float]:
 
 
 def _rise(cells: Bool, z_m: Float32) -> float:
-    """Compute how far cells rise over the higher of the surfaces before and behind them;
-    inf where unknown.
-    """
+    """Compute how far cells rise over the higher surface before or behind them; inf if unknown."""
     i, j = np.nonzero(cells)
     beside = []
     for way in (-1, 1):

@@ -118,9 +118,7 @@ def split_map(yard: YardMap) -> list[MapStretch]:
 
 
 def _cuts(cells: int, cell_m: float) -> list[tuple[slice, float, float]]:
-    """Divide one axis: the cells of each stretch, and where its own part begins and ends, from the first
-    cell.
-    """
+    """Divide one axis: each stretch's cells, and where its own part begins and ends, m from the first."""
     count = 1 if cells * cell_m <= WHOLE_M else int(np.ceil(cells * cell_m / OWN_M))
     edges = np.linspace(0, cells, count + 1).round().astype(int).tolist()
     margin = round(MARGIN_M / cell_m)

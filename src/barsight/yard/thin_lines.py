@@ -177,8 +177,8 @@ def _add_along(part: Float32, slope: float, ends: Int64, sums: Float32) -> None:
 
 
 def _strip(heights: HeightMap, bundle: Bundle) -> tuple[Float64, Float32]:
-    """Resample the photo along a bundle's axis: places along it (V,), log gray levels (V, U), NaN where
-    unseen.
+    """Resample the photo along a bundle's axis: places along it (V,), log gray levels (V, U),
+    NaN if unseen.
     """
     assert heights.tops is not None
     axis = np.array([-math.sin(bundle.yaw_rad), math.cos(bundle.yaw_rad)])
@@ -190,9 +190,7 @@ def _strip(heights: HeightMap, bundle: Bundle) -> tuple[Float64, Float32]:
 
 
 def _contrast(level: Float32, middle: int, half: int) -> tuple[Float32, Float32]:
-    """Compute the contrast (V, U) of each place to its column around it, in sigmas, and
-    the columns' weights.
-    """
+    """Compute each place's contrast (V, U) to its column around it, in sigmas, and the columns' weights."""
     seen = np.isfinite(level)
     filled = np.where(seen, level, np.nan_to_num(known_median(level)))
     around = running_median(filled, 2 * round(AROUND_M / STEP_M / 2 - 0.5) + 1)

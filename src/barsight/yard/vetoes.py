@@ -1,6 +1,4 @@
-"""Define all reasons not to lift: one table of codes, the checks that find them, the vetoes
-that state them.
-"""
+"""Define all reasons not to lift: a table of codes, the checks that find them, the vetoes that state them."""
 
 from __future__ import annotations
 
@@ -124,9 +122,7 @@ def _checked(
     code: str, what: str, value: float, bound: float, unit: str, reason: str, sigma: float, sigmas: float,
     sign: int,
 ) -> Check:  # fmt: skip
-    """Check a value that may not exceed its bound, or, with the sign -1, not fall below it; a
-    NaN is unknown.
-    """
+    """Check that a value doesn't exceed its bound (sign 1) or fall below it (sign -1); NaN is unknown."""
     found, spread, limit = (float(x) if math.isfinite(x) else None for x in (value, sigma, bound))
 
     def check(result: Literal["passed", "failed", "unknown"], said: str) -> Check:

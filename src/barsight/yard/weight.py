@@ -36,9 +36,7 @@ class Mass:
 
 
 def bundle_section(bundle: Bundle) -> tuple[float, float]:
-    """Compute the cross-section of steel and its sigma, m2: of the bars where they are counted,
-    else as seen.
-    """
+    """Compute the cross-section of steel and its sigma, m2: of the bars if counted, otherwise as seen."""
     diameter = bundle.bar_diameter_m
     if bundle.bars is None or not diameter > 0:
         return bundle.section_m2, bundle.sigma.section_m2

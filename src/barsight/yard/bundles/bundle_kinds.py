@@ -81,9 +81,7 @@ def _alike(fit: Fit, other: Fit) -> bool:
 
 
 def common_diameter(fit: Fit, others: list[Fit]) -> tuple[float, float] | None:
-    """Compute the median diameter of the bundles of the fit's kind, and its sigma; None for fewer than
-    three bundles.
-    """
+    """Compute the median diameter and its sigma of the fit's kind; None for fewer than three bundles."""
     alike = [other.values[DIAMETER] for other in others if _alike(fit, other)]
     if len(alike) < _MIN_MEMBERS:
         return None

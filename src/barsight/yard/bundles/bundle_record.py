@@ -81,9 +81,7 @@ def describe_bundles(
 def make_bundle(
     reading: Reading, others: list[FittedOutline], settings: BundleSettings, floor_m: float | None
 ) -> Bundle:
-    """Make a bundle of a chosen reading, without its number, its layer and what lies on it. others: all
-    outlines that were chosen.
-    """
+    """Make a bundle of a chosen reading, without number, layer and what lies on it. others: all chosen."""
     grid, fit = reading.found.grid, reading.found.fit
     ends = [find_end(grid, fit, step, settings) for step in (-1, 1)]
     outline = make_outline(fit.rings, float(fit.values[DIAMETER]), float(fit.values[ROLL]), 0.0)

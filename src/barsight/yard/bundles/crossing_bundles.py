@@ -19,9 +19,7 @@ from barsight.yard.types import HeightMap
 OVER_M = 0.05
 """Height over a bundle's outline from which something counts as lying on it: more than the map's errors."""
 _FURTHER_M = 1.5
-"""Distance (m) over which a bundle may continue, under what lies there, beyond the rows
-that were followed.
-"""
+"""Distance (m) beyond a followed piece over which the bundle may continue under what lies there."""
 _STEP_M = 0.06
 """Minimum height step (m) between neighbouring cells that belong to different objects."""
 _MIN_CELLS = 30
@@ -166,9 +164,7 @@ def _pieces(level: UInt8, over: UInt8) -> Iterator[tuple[Int64, Int64]]:
 
 
 def _heading(row: Int64, column: Int64, min_cells: float) -> float | None:
-    """Compute the angle of the long axis from +y, in (-pi/2, pi/2]; None for an object that is short, or not
-    much longer than wide.
-    """
+    """Compute the long axis's angle from +y, in (-pi/2, pi/2]; None if short or not clearly elongated."""
     if row.size < min_cells:
         return None
     places: Float64 = np.stack([column, row]).astype(np.float64)

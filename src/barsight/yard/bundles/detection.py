@@ -64,9 +64,7 @@ _SLIVER_RATIO = 0.03
 _CROSSING_STEP_M = 0.4
 """Spacing (m) of the cross-sections in which crossing bundles are sought: close enough to meet short ones."""
 _ALONG_COS = 0.87
-"""Cosine of 30 degrees, the angle within which bars run along the baseline: single bars
-aren't matched there.
-"""
+"""Cosine of the maximum angle, 30 degrees, of bars along the baseline: single ones aren't matched."""
 _SEAM_M = 0.1
 """Maximum distance (m) between the middles that two stretches of a yard measure for one bundle."""
 

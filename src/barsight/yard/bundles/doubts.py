@@ -37,9 +37,7 @@ The rim of an upright triangle of bars lies 0.22 under its axis, that of one tur
 _MAX_DUNNAGE_M = 0.15
 """Maximum height (m) of the dunnage under a bundle."""
 _CARRIER_M, _CARRIED_RATIO = 0.15, 0.03
-"""Maximum distance (m) of a carrier from both flanks; minimum share of a bundle's length over
-which it shows.
-"""
+"""Maximum distance (m) of a carrier from both flanks; minimum share of the length over which it shows."""
 _BEFORE_END_M = 0.05
 """Margin (m) at each end within which rows aren't used: bars end unevenly."""
 _SURE_KNOWN = 0.7
@@ -126,9 +124,7 @@ def _places(runs: list[tuple[int, int]], reading: Reading, settings: BundleSetti
 def list_wall_doubts(
     reading: Reading, seen: SeenSection | None, top_m: float, floor_m: float | None
 ) -> tuple[Doubt, ...]:
-    """List the doubt that the bundle may be a wall: no flank falls off, or nothing carries it
-    at its height.
-    """
+    """List the doubt that the bundle may be a wall: no flank falls off, or nothing carries it so high."""
     if reading.is_flat:
         return (Doubt(DoubtKind.WALL, "neither flank falls off: it may be a wall"),)
     if seen is None or floor_m is None:
@@ -142,9 +138,7 @@ def list_wall_doubts(
 
 
 def _shows_carrier(reading: Reading, width_m: float) -> bool:
-    """Check whether something stands over the floor on both sides, as what lies across under
-    a bundle does.
-    """
+    """Check whether something stands over the floor on both sides, as a cross-beam underneath does."""
     grid, fit = reading.found.grid, reading.found.fit
     edge = max(fit.width_m, width_m) / 2 + grid.cell_m
     half = round((edge + _CARRIER_M) / grid.cell_m)
@@ -204,8 +198,8 @@ def measure_laid(reading: Reading) -> tuple[float, bool]:
 
 
 def rate_confidence(reading: Reading, rows: UInt8) -> float:
-    """Estimate the probability of a reading by how much of its length agrees and how far it leads over its
-    rival.
+    """Estimate the probability of a reading by the share of its length that agrees and by its lead over the
+    next different one.
     """
     fit, rival = reading.found.fit, reading.rival
     lead = 1.0

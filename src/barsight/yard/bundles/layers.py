@@ -12,9 +12,7 @@ _TOUCH_M = 0.03
 _DUNNAGE_M = 0.1
 _HIGHER_RATIO = 0.4
 _LOWER_RATIO = 0.15
-"""Height tolerance in mean widths: a bundle whose middle is lower by more is the lower one, whatever the
-error of the widths.
-"""
+"""Height tolerance, in mean widths: a bundle whose middle is lower by more is surely the lower one."""
 _PARALLEL = 0.08
 _INSIDE = 0.35
 """Distance from a bundle's axis, as a share of its width, within which no other bundle's middle can lie."""
@@ -122,8 +120,8 @@ def _holds(bundle: Bundle, place: Float64) -> bool:
 
 
 def _common_length(bundle: Bundle, other: Bundle, margin_m: float) -> float:
-    """Compute the length of `bundle` over which the two footprints meet, with the other one widened by
-    margin_m on each side.
+    """Compute the length of `bundle` over which it meets the other footprint, widened by
+    margin_m per side.
     """
     skew = abs(np.sin(bundle.yaw_rad - other.yaw_rad))
     reach = (other.width_m + bundle.width_m + skew * bundle.length_m) / 2 + max(margin_m, 0.0)

@@ -20,9 +20,7 @@ _SLIGHT_M = 0.015
 
 
 def hold_off(bundles: list[Bundle], packs: list[bool]) -> list[Bundle]:
-    """Cut the outlines that reach into a pack at its edge. packs: whether each bundle is a pack whose bounds
-    are known on both sides.
-    """
+    """Cut outlines that reach into a pack at its edge. packs: which bundles are packs with known bounds."""
     seen = [bundle for bundle, is_pack in zip(bundles, packs, strict=True) if is_pack]
     return [
         bundle if is_pack else _cut_at(bundle, seen) for bundle, is_pack in zip(bundles, packs, strict=True)

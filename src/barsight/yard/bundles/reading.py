@@ -46,9 +46,7 @@ class Reading:
 
     @property
     def is_flat(self) -> bool:
-        """Check whether neither flank falls off, as with a plate or a wall, and no straps
-        bound the bundle.
-        """
+        """Check whether neither flank falls off, as on a plate or wall, and no straps bound it."""
         bounded = self.pack is not None and self.pack.is_bounded
         return self.flanks is not None and self.flanks.are_flat and not bounded
 

@@ -174,9 +174,7 @@ def _as_pack(
 
 
 def _covered(bundle: Bundle, pack: Pack) -> Bundle:
-    """Mark as doubtful a bundle over whose flanks neighbours may lie: its width is that in sight, its section
-    unknown.
-    """
+    """Mark as doubtful a bundle over whose flanks neighbours may lie: only its visible width is known."""
     sides = [name for name, side in zip(("low", "high"), pack.sides, strict=True) if side == PackSide.COVERED]
     if not sides:
         return bundle
@@ -202,9 +200,7 @@ def _covered(bundle: Bundle, pack: Pack) -> Bundle:
 
 
 def _partly_seen(bundle: Bundle, irregular: BundleSigma, pack: Pack) -> Bundle:
-    """Mark as doubtful a bundle whose pack extends beyond it or lies aside, and whose flanks aren't both
-    seen.
-    """
+    """Mark as doubtful a bundle whose pack extends beyond it or lies aside, with a flank that isn't seen."""
     beyond_m, said = contradicts(pack, bundle.width_m)
     if said:
         sure, reasons = min(bundle.confidence, DOUBTFUL), (*bundle.reasons, Doubt(DoubtKind.OTHER, said))
@@ -254,9 +250,7 @@ def _pack_sigma(reading: Reading, pack: Pack) -> float:
 
 
 def _bulge(reading: Reading, pack: Pack) -> float:
-    """Compute the standard deviation (m) of how much wider a pack is where nothing was seen behind its
-    flanks.
-    """
+    """Compute the standard deviation (m) of the extra width where nothing was seen behind the flanks."""
     return bulge_sigma(pack.hidden_m, pack.width_m, is_along_baseline=reading.is_along_baseline)
 
 

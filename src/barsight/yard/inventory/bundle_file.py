@@ -28,9 +28,7 @@ def write_bundles(
     bundles: tuple[Bundle, ...], stock: StockMatch | None, reference: str, identity: MapIdentity,
     target: Path, sequence: int = 1,
 ) -> str:  # fmt: skip
-    """Write bundles.json completely or not at all; return its digest. reference: the frame, `yard` or
-    `world`.
-    """
+    """Write bundles.json completely or not at all; return its digest. reference: `yard` or `world` frame."""
     content = {
         "schema_version": SCHEMA_VERSION,
         **identity.header(sequence),

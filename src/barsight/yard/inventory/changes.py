@@ -21,9 +21,7 @@ SAME_WIDTH = 0.15
 SIGNIFICANT = 2.576
 """Number of sigmas that chance exceeds in one case out of a hundred."""
 UNKNOWN_SIGMA_M, UNKNOWN_SIGMA_RAD = 0.05, 0.005
-"""Standard deviations of a place (m) and a yaw (rad) whose own isn't known, the same as for
-a lift's count.
-"""
+"""Sigmas of a place (m) and a yaw (rad) whose own aren't known: the same as for a lift's count."""
 MIN_KNOWN = 0.5
 _NO_PAIR = 1e6
 
@@ -97,8 +95,8 @@ def _match(old: tuple[Bundle, ...], new: tuple[Bundle, ...]) -> dict[int, int]:
 
 
 def displacement(before: Bundle, after: Bundle) -> tuple[float, float, float, float]:
-    """Compute the displacement across, along, up (m) and in yaw (rad), in the old bundle's axes; up is that
-    of the top.
+    """Compute the displacement across, along, up (at the top; m) and in yaw (rad), in the
+    old bundle's axes.
     """
     away = after.centre_m[:2] - before.centre_m[:2]
     cos, sin = math.cos(before.yaw_rad), math.sin(before.yaw_rad)

@@ -33,9 +33,7 @@ _SIGMAS = 3.0
 
 @dataclass(frozen=True)
 class ListedBundle:
-    """A bundle of the stock list: place of its middle (m, yard); the other fields are None
-    where not listed.
-    """
+    """A bundle of the stock list: place of its middle (m, yard); other fields are None if not listed."""
 
     name: str
     x_m: float
@@ -188,8 +186,8 @@ def match_stock(listed: tuple[ListedBundle, ...], bundles: tuple[Bundle, ...]) -
 
 
 def contradicted_bundles(match: StockMatch) -> dict[int, str]:
-    """List the found bundles (by id) that the list contradicts, and how: moved, another kind,
-    or not listed.
+    """List the found bundles (by id) that contradict the list, and how: moved, of another
+    kind, not listed.
     """
     told = dict.fromkeys(match.extra, "the stock list doesn't name it")
     for one in match.matched:
@@ -251,9 +249,7 @@ def _distance(one: ListedBundle, bundle: Bundle) -> float:
 
 
 def _has_moved(shift: tuple[float, float, float], bundle: Bundle) -> bool:
-    """Check whether a bundle has moved; along the axis only where both ends were seen, so that its middle is
-    known.
-    """
+    """Check whether a bundle has moved; along the axis only where both ends, and so its middle, were seen."""
     across, along = _across_along(shift, bundle)
     sigma = bundle.sigma
     moves: Float64 = np.abs([across, shift[2], 0.0 if any(bundle.ends_open) else along])
@@ -293,9 +289,7 @@ def _other_label(one: ListedBundle, bundle: Bundle, names: set[str]) -> tuple[st
 
 
 def _is_covered(one: ListedBundle, bundles: tuple[Bundle, ...]) -> bool:
-    """Check whether a found bundle lies over the listed place: higher than the listed top, if
-    there is one.
-    """
+    """Check whether a found bundle lies over the listed place, above the listed top if there is one."""
     for bundle in bundles:
         shift = _shift(one, bundle)
         across, along = _across_along(shift, bundle)

@@ -269,7 +269,7 @@ def _map_sigma(heights: HeightMap, place: Placement, magnet: Magnet) -> float:
 
 
 def _overhang(place: Placement, load: tuple[Bundle, ...], magnet: Magnet) -> tuple[float, float]:
-    """Compute the longest distance from the outermost pole to an end beyond it, and its sigma; NaN where
+    """Compute the longest distance by which bars extend beyond the outermost pole, and its sigma; NaN where
     nothing is taken.
     """
     first = min(pole.along_m - pole.length_m / 2 for pole in magnet.poles)

@@ -22,9 +22,7 @@ from barsight.yard.types import YardMap
 
 STEP_M = 0.02
 STATION_STEPS = 5
-"""Number of steps along the load in one station, whose height is their maximum: the highest step carries the
-load.
-"""
+"""Steps along the load per station. A station is as high as its highest step, which carries the load."""
 NEAR_M = 0.02
 """Maximum distance (m) of a station below the underside at which it still carries the load."""
 LEVEL_M = 0.01
@@ -124,9 +122,7 @@ def find_bearing(
 def _surroundings(
     yard: YardMap, load: Load, place: tuple[float, float], yaw_rad: float, margin: Float64, magnet: Magnet
 ) -> Surroundings:
-    """Sample the heights under the load, under the magnet over it, and in a margin (across, along) around
-    them.
-    """
+    """Sample the heights under the load, under the magnet over it, and in a margin (across, along)."""
     wide, long = np.maximum((load.width_m / 2, load.length_m / 2), magnet_reach(load, magnet)) + margin
     v, u = (STEP_M * np.arange(-math.ceil(a / STEP_M), math.ceil(a / STEP_M) + 1) for a in (long, wide))
     across, along = axes_of(yaw_rad)
@@ -168,9 +164,7 @@ def magnet_rectangles(load: Load, magnet: Magnet, slack: Float64) -> list[tuple[
 
 
 def magnet_reach(load: Load, magnet: Magnet) -> Float64:
-    """Return how far (2,) the magnet that holds a load may reach from the load's middle, across and along
-    (m).
-    """
+    """Return how far (2,) the magnet may reach from the load's middle, across and along (m)."""
     off = np.abs((load.off_across_m, load.off_along_m))
     return np.asarray(np.array(magnet.size_m) / 2 + _held_off(load, magnet) + off)
 

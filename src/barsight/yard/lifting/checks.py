@@ -24,9 +24,7 @@ MARGIN_M = 0.015
 """Distance (m) by which a bundle's surface may show beyond its outline."""
 STEP_M = 0.02
 EDGE_M = 0.01
-"""Width (m) over which outlines and reach heights are blurred, so that no row of samples switches all at
-once.
-"""
+"""Width (m) over which outlines and reach are blurred, so that no row of samples switches all at once."""
 UNKNOWN_SIGMA = 0.01
 """Standard deviation of the unseen share of a face, due to the size of the cells."""
 MAX_HEIGHT_ERROR_M = 0.03
@@ -34,9 +32,7 @@ MAX_HEIGHT_ERROR_M = 0.03
 yards have at most 15 mm.
 """
 MAX_ASIDE_RATIO = 1 / 3
-"""Maximum offset from a face's middle, in its widths, at which it may rest where the suspension stops its
-lean.
-"""
+"""Maximum offset, in face widths, at which faces may rest beside their middle at the suspension's stop."""
 SHOWN_BAR_M, MIN_SHOWN_RATIO = 0.08, 0.3
 """Minimum diameter (m) of bars whose crests a map shows. With thinner bars whose packing isn't settled, the
 contact share is reduced in proportion to their diameter, down to the ratio. That is no bound: as little as a
@@ -113,9 +109,7 @@ def probability_check(probability: float, count: int, settings: LiftSettings, wh
 def area_checks(
     place: Placement, magnet: Magnet, load: tuple[Bundle, ...], settings: LiftSettings
 ) -> list[Check]:
-    """Check that magnet and load stay out of no-lift areas, including the crane's tolerance and the bundles'
-    sigmas.
-    """
+    """Check that magnet and load avoid no-lift areas, including the crane's tolerance and bundles' sigmas."""
     outlines = [(np.array([place.x_m, place.y_m]), place.yaw_rad, magnet.size_m)]
     for bundle in load:
         one, own = Load.of((bundle,)), bundle.sigma

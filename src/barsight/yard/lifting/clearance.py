@@ -225,9 +225,7 @@ def resting_checks(
 def leaning_checks(
     place: Placement, magnet: Magnet, contact: Contact, load: tuple[Bundle, ...]
 ) -> list[Check]:
-    """Check that the load's top doesn't rise above the faces where they lean lowest within the crane's
-    tolerance.
-    """
+    """Check that the load's top stays below the faces where they lean lowest within the crane's tolerance."""
     if not load:
         return []
     slack = float(magnet.tolerance.along(place.across))

@@ -134,9 +134,7 @@ def _offered(plan: LiftPlan) -> set[int]:
 def _sequence(
     bundle_id: int, by_id: dict[int, Bundle], blockers: dict[int, tuple[int, ...]], offered: set[int]
 ) -> list[Bundle] | Failed:
-    """Sort the bundles that must be moved, ending with the requested one, so that none is lifted from under
-    another.
-    """
+    """Sort the bundles to be moved, the requested one last, so that none is lifted from under another."""
     needed, open_ = set[int](), [bundle_id]
     while open_:
         one = open_.pop()

@@ -1,6 +1,4 @@
-"""Plan lift targets: the best placement of the magnet for each bundle that may be free, ranked, or the
-vetoes.
-"""
+"""Plan lift targets: for each bundle that may be free, the best placement of the magnet or its vetoes."""
 
 from __future__ import annotations
 
@@ -100,9 +98,7 @@ def map_vetoes(
 
 
 def offset_vetoes(magnet: Magnet, calibration_id: str, yard_frame_id: str | None) -> tuple[Veto, ...]:
-    """Forbid every lift of a map whose rig or yard frame isn't the one for which the magnet's offset was
-    measured.
-    """
+    """Forbid every lift if the magnet's offset was measured with another rig or yard frame than the map."""
     offset = magnet.offset
     if offset is None:
         return ()
@@ -224,9 +220,7 @@ def ended_with_floor(
 
 
 def _groups(bundles: tuple[Bundle, ...], count: int) -> Iterator[tuple[Bundle, ...]]:
-    """Group the bundles that are free, or may be, each with its next count - 1 neighbours towards its high
-    side.
-    """
+    """Group bundles that are or may be free, each with its count - 1 next neighbours on its high side."""
     free = [bundle for bundle in bundles if bundle.on_top is not False]
     for first in free:
         group, across = [first], high_side(first.yaw_rad)
@@ -248,9 +242,7 @@ def _groups(bundles: tuple[Bundle, ...], count: int) -> Iterator[tuple[Bundle, .
 
 
 def _best(group: tuple[Bundle, ...], yard: LiftScene, magnet: Magnet, settings: LiftSettings) -> Lift:
-    """Choose the placement with the fewest vetoes, then the safest; the middle where the load itself is
-    vetoed.
-    """
+    """Choose the placement with the fewest vetoes, then the safest; the middle if the load is vetoed."""
 
     def tried(offsets: Iterable[tuple[float, float]]) -> list[Lift]:
         places = (_place(group, along, across) for along, across in offsets)

@@ -158,9 +158,7 @@ def _places_at(wanted: Int64, stamps: Int64, places: Float64) -> Float64:
 def _disagreement(
     stamps: Int64, places: Float64, crane: CraneSamples | None, shift_ns: int, window_ns: int
 ) -> Float64:
-    """Compute the distance (N,) between the encoders' position and the body's, without what a constant
-    latency explains.
-    """
+    """Compute the distance (N,) between encoders and body, without what a constant latency explains."""
     if crane is None or stamps.size < 2:
         return np.full(stamps.size, np.nan)
     off = np.full((stamps.size, 3), np.nan)

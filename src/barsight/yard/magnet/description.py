@@ -40,9 +40,7 @@ class Pole:
         expect(max(abs(self.along_m), abs(self.across_m)) <= 20, "a pole lies within 20 m of the centre")
 
     def is_beside(self, other: Pole) -> bool:
-        """Check that another pole's face doesn't overlap this one's: both would be counted
-        as pulling there.
-        """
+        """Check that another pole's face doesn't overlap this one's, or both would count as pulling there."""
         along = abs(self.along_m - other.along_m) - (self.length_m + other.length_m) / 2
         across = abs(self.across_m - other.across_m) - (self.width_m + other.width_m) / 2
         return max(along, across) > -1e-6
@@ -74,9 +72,7 @@ class Tolerance:
         expect(within, "tolerance x_m and y_m lie between 0 and 1, yaw_deg between 0 and 20")
 
     def along(self, axes: Float64) -> Float64:
-        """Return the maximum error (...) in m along horizontal unit vectors (..., 2), without that of the
-        yaw.
-        """
+        """Return the maximum error (...), m, along horizontal unit vectors (..., 2), without the yaw's."""
         return np.asarray(np.abs(axes) @ (self.x_m, self.y_m), np.float64)
 
 
@@ -184,9 +180,7 @@ class Magnet:
 
     @property
     def needed_factor(self) -> float:
-        """Return the safety factor that lifts must meet: where the file names no type, at least that of the
-        worst.
-        """
+        """Return the safety factor that lifts must meet: at least that of the worst type if none is named."""
         return max(self.safety_factor, self.min_safety_factor)
 
     @property

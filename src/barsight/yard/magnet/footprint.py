@@ -247,9 +247,7 @@ def _held(
 
 @kernel()
 def _away(x: float, y: float, cos: float, sin: float, part: Float64, centre: Float64) -> tuple[float, float]:
-    """Compute the vector (m, yard axes) from a bundle's centre (2,) to that of a rectangle (4,) of the
-    magnet.
-    """
+    """Compute the vector (m, yard axes) from a bundle's centre (2,) to that of a magnet's rectangle (4,)."""
     return x - part[0] * sin + part[1] * cos - centre[0], y + part[0] * cos + part[1] * sin - centre[1]
 
 

@@ -143,9 +143,7 @@ def _levers(poles: tuple[Pole, ...]) -> tuple[Float64, Float64, bool]:
 
 @dataclass(frozen=True)
 class WeakestPole:
-    """The pole with the smallest ratio of its pull's lower bound to its share of the needed pull. number:
-    from 1.
-    """
+    """The pole whose pull, as a lower bound, is smallest relative to its needed share. number: from 1."""
 
     number: int
     pull_low_n: float
@@ -206,8 +204,8 @@ def _over(bundle: Bundle, pole: Pole, place: Placement, own: PoleContact) -> Boo
 
 
 def share_checks(weakest: WeakestPole | None, worst_bundle: float = math.inf) -> list[Check]:
-    """Check that the weakest pole carries its share, and that each of several bundles is held by the pull on
-    it (`weakest_bundle`).
+    """Check that the weakest pole carries its share, and each of several bundles
+    is held (`weakest_bundle`).
     """
     if weakest is None:
         return []

@@ -22,9 +22,7 @@ _STEP_M, _ALONG_M = 0.005, 0.02
 _PARALLEL = 0.05
 """Maximum sine of the skew of two bundles between which a gully is sought."""
 _ROWS = 3
-"""Minimum number of rows of a part along a pole that lie beside a bundle; with fewer, the bundle lies beyond
-it.
-"""
+"""Minimum number of rows of a pole's part that lie beside a bundle; with fewer, the bundle lies beyond it."""
 _SEEN_RATIO = 0.5
 """Minimum share of a part along a pole that must have been seen for its median to count."""
 
@@ -48,9 +46,7 @@ def without_parted(
 
 
 def _parted(load: Bundle, other: Bundle, heights: HeightMap, place: Placement, reached: Float64) -> bool:
-    """Check that a gully runs between every pole's reach and another bundle, over that
-    bundle's whole length.
-    """
+    """Check that a gully runs between every pole's reach and another bundle, over its whole length."""
     if any(abs(math.sin(bundle.yaw_rad - place.yaw_rad)) > _PARALLEL for bundle in (load, other)):
         return False
     deep = max(_DEEP_M, _DEEP_RATIO * max(load.width_m, other.width_m))
@@ -98,9 +94,7 @@ def _profile(heights: HeightMap, place: Placement, along_m: Float64, from_m: flo
 
 
 def _gully(level: Float64, half_m: float, deep_m: float) -> bool:
-    """Check that a profile sinks by deep_m under both of its sides at a place beyond half_m from its
-    beginning.
-    """
+    """Check that, beyond half_m from its beginning, a profile sinks by deep_m under both of its sides."""
     first = math.ceil(half_m / _STEP_M)
     known = np.where(np.isfinite(level), level, -np.inf)
     if first >= len(known) or not np.isfinite(level[:first]).any():

@@ -13,9 +13,7 @@ from barsight.core.arrays import Float64, frozen
 from barsight.core.errors import ConfigError
 
 SATURATED_TESLA = 1.6
-"""Flux density from which on bars let little more through; it is the maximum where the file
-gives no plates.
-"""
+"""Flux density above which bars let little more through; the maximum if the file lists no plates."""
 _MU0 = 4e-7 * math.pi
 _ACROSS = 201
 """Number of places across a face at which the pull on one round bar is summed."""

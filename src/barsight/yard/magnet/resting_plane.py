@@ -135,8 +135,8 @@ def _median_of_each(values: Float64, number: Int64, out: Float64) -> None:
 
 @kernel()
 def _steepness(u: Float64, line: Float64) -> Float64:
-    """Compute the slope (N,) across, towards both neighbours, of a section known at places u (N,) as line
-    (N,), m.
+    """Compute the slope (N,) across of a section with heights line (N,), m, at places u
+    (N,), by neighbours.
     """
     steep = np.zeros(u.size)
     for k in range(u.size):

@@ -1,6 +1,4 @@
-"""Find which bundles must be moved before another can be lifted, and so the order in which a pile is taken
-apart.
-"""
+"""Find which bundles must be moved before another can be lifted, and so in which order a pile comes apart."""
 
 from __future__ import annotations
 
@@ -47,9 +45,7 @@ def find_blocked(
 
 
 def lies_on(upper: Bundle, lower: Bundle) -> bool:
-    """Check whether the outlines meet in plan view, with the underside of `upper` well above
-    that of `lower`.
-    """
+    """Check whether the outlines meet in plan view, and the underside of `upper` is well above `lower`'s."""
     width = min(upper.width_m, lower.width_m)
     if upper.bottom_z_m - lower.bottom_z_m <= HIGHER_RATIO * width:
         return False

@@ -139,9 +139,7 @@ def _side(pile: list[Bundle], across: Float64, side: int, footings: dict[int, Fo
 
 
 def _lean(lowest: Bundle, highest: Bundle, out_m: float) -> tuple[float, float]:
-    """Compute the lean of the line between two edges and its sigma, degrees; NaN where only
-    one layer shows.
-    """
+    """Compute the lean of the line between two edges and its sigma, degrees; NaN for a single layer."""
     rise = float(highest.centre_m[2] - lowest.centre_m[2])
     if not rise > 0:
         return math.nan, math.nan

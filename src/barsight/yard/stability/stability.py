@@ -32,9 +32,7 @@ MAX_COLUMN_RATIO = 2.5
 BESIDE_M = 0.3
 TOUCH_M = 0.02
 RAISED_RATIO = 0.25
-"""Minimum height, in widths, of the underside of a neighbour that rests against a bundle over the bundle's
-own.
-"""
+"""Minimum height, in widths, of a neighbour's underside above that of the bundle it rests against."""
 
 
 @dataclass(frozen=True)
@@ -73,9 +71,7 @@ class Footing:
 
 
 def high_side(yaw_rad: float) -> Float64:
-    """Return the unit vector (2,) across an axis, towards high x, or high y where the axis runs
-    closer to X.
-    """
+    """Return the unit vector (2,) across an axis, towards high x, or high y if the axis is closer to X."""
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     turned = cos < 0 if abs(cos) > abs(sin) else sin < 0
     return np.array([-cos, -sin] if turned else [cos, sin])
@@ -126,9 +122,7 @@ def _is_free(side: Side, bundle: Bundle) -> bool:
 
 
 def _profile(heights: HeightMap, bundle: Bundle, sign: int) -> Float64:
-    """Compute the median height of the seen cells and their share (N, 2), from the edge outwards every
-    STEP_M.
-    """
+    """Compute the seen cells' median height and their share (N, 2), from the edge outwards every STEP_M."""
     out = bundle.width_m / 2 + np.arange(0, LOOK_M, STEP_M)
     along = np.linspace(-0.45, 0.45, STATIONS) * bundle.length_m
     cos, sin = np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad)
@@ -257,9 +251,7 @@ def _column_checks(target: Bundle, own: Footing) -> list[Check]:
 
 
 def leans_on(other: Bundle, target: Bundle, footing: Footing, settings: LiftSettings) -> bool:
-    """Check whether `other`, which has this footing, overhangs or leans too far over the edge beside
-    `target`.
-    """
+    """Check whether `other`, of this footing, overhangs or leans too far over the edge beside `target`."""
     over = footing.overhang_m > settings.max_overhang_ratio * other.width_m
     return (over or footing.lean_deg > settings.max_lean_deg) and lies_over_edge_of(other, target, footing)
 

@@ -89,9 +89,7 @@ def find_end(grid: AlignedMap, fit: Fit, step: int, settings: BundleSettings) ->
 
 
 def middle_and_length_sigma(ends_sigma_m: tuple[float, float]) -> tuple[float, float]:
-    """Propagate the sigmas of both ends, whose outward errors are correlated, to the middle
-    and the length.
-    """
+    """Propagate the sigmas of both ends, whose outward errors correlate, to the middle and the length."""
     squares, alike = (
         ends_sigma_m[0] ** 2 + ends_sigma_m[1] ** 2,
         2 * _ALIKE * ends_sigma_m[0] * ends_sigma_m[1],
@@ -115,8 +113,8 @@ def _unevenness(grid: AlignedMap, fit: Fit, row: int, step: int, settings: Bundl
 def _beyond(
     grid: AlignedMap, fit: Fit, row: int, step: int, settings: BundleSettings
 ) -> tuple[Float64, Float64]:
-    """Measure for each row beyond the end the known fraction of the outline, and the median height (m) over
-    the outline.
+    """Measure for each row beyond the end the known share of the outline, and the median height
+    (m) over it.
     """
     rows = row + step * np.arange(1, int(_LOOK_M / grid.cell_m) + 1)
     rows = rows[(rows >= 0) & (rows < grid.z_m.shape[0])]

@@ -10,9 +10,7 @@ import numpy as np
 from barsight.core.arrays import Float64, Int64, kernel
 
 BARS_OF_RINGS = (1, 7, 19, 37, 61, 3)
-"""Number of bars of each packing: a full hexagon of 0, 1, 2, ... rings around the middle bar, then a
-triangle.
-"""
+"""Bars in each packing: a full hexagon of 0, 1, 2, ... rings around the middle bar, then the triangle."""
 TRIANGLE = 5
 """Code used instead of a number of rings for a triangle: one bar on two, as thick bars are strapped."""
 TRIANGLE_BARS_M = (0.06, 0.12)
@@ -42,9 +40,7 @@ def packing_axes(rings: int) -> Float64:
 
 
 def turned_packing(rings: int, diameter_m: float, roll_rad: float) -> Float64:
-    """Compute the axes (bars, 2) in m of the packing rolled clockwise by roll_rad as seen
-    along the bundle.
-    """
+    """Compute the axes (bars, 2) in m of the packing, rolled clockwise as seen along the bundle."""
     return _turned(packing_axes(rings), diameter_m, roll_rad)
 
 

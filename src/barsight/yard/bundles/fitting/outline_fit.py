@@ -20,9 +20,7 @@ from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.fitting.settings import BundleSettings
 
 U, SLOPE_U, Z, SLOPE_Z, ROLL, DIAMETER = range(6)
-"""Indices of a fit's parameters: lateral place, its slope along, height of the axis, its slope, roll,
-diameter.
-"""
+"""Indices of a fit's parameters: lateral place and its slope, axis height and its slope, roll, diameter."""
 UNKNOWN, AGREES, ABOVE, BELOW, MIXED = range(5)
 """States of a row of the map compared with a bundle's outline."""
 _ROWS_ENOUGH = 150

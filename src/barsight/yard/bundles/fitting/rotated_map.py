@@ -44,9 +44,7 @@ class AlignedMap:
 
 
 def align_map(height_map: HeightMap, heading_rad: float, stock_over_m: float = -np.inf) -> AlignedMap:
-    """Rotate the map's measured heights, by nearest cells, into a frame whose v axis is (-sin heading, cos
-    heading).
-    """
+    """Rotate measured heights by nearest cells into a frame whose v axis is (-sin heading, cos heading)."""
     cell = height_map.cell_m
     if heading_rad == 0.0:
         measured = HeightSource.measured(height_map.source)

@@ -38,9 +38,7 @@ class BundleSettings:
     smoothing_m: float = 0.006
     """Standard deviation of the map's smoothing across the bars."""
     placing_m: float = 0.004
-    """Lateral uncertainty of a height's position: the steeper the outline is there, the less the height
-    weighs.
-    """
+    """Lateral uncertainty of a height's position, which lowers its weight where the outline is steep."""
     correlated_along_m: float = 0.5
     """Distance along the bars over which errors of heights are correlated."""
     correlated_across_m: float = 0.03

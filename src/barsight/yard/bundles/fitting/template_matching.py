@@ -34,9 +34,7 @@ _BLOCK = 64
 
 @dataclass(frozen=True)
 class BundleCandidate:
-    """A bundle that may cross the section at v_m: place, height of the axis, kind. gain:
-    cells it explains.
-    """
+    """A bundle that may cross the section at v_m: place, axis height, kind. gain: cells it explains."""
 
     v_m: float
     u_m: float
@@ -63,9 +61,7 @@ class Templates:
 
 
 def cross_section(grid: AlignedMap, v_m: float, length_m: float) -> Float32:
-    """Compute the median height (columns,) of each column over `length_m` about v_m; NaN where unknown and
-    on the floor.
-    """
+    """Compute each column's median height (columns,) over `length_m` about v_m; NaN if unknown or floor."""
     first = round((v_m - length_m / 2 - grid.v0_m) / grid.cell_m)
     rows = max(round(length_m / grid.cell_m), 1)
     part = grid.z_m[max(first, 0) : first + rows]
@@ -123,8 +119,8 @@ def _diameters(rings: int, settings: BundleSettings) -> list[float]:
 def propose_candidates(
     grid: AlignedMap, templates: Templates, v_m: float, settings: BundleSettings
 ) -> list[BundleCandidate]:
-    """Propose bundles that may cross the section at v_m, best first: the local maxima of each number of
-    rings.
+    """Propose bundles that may cross the section at v_m, best first: local maxima for each
+    number of rings.
     """
     profile = cross_section(grid, v_m, settings.slice_m)
     if not np.isfinite(profile).any():

@@ -17,8 +17,8 @@ _FLANK_RATIO, _FLANK_DEPTH_M, _FLANK_M = 0.6, 0.15, 0.15
 distance from the straps within which a flank is searched for (m).
 """
 _WIDEST_RATIO, _WIDEST_M = 0.6, 0.1
-"""Depth under the top below which no pack gets wider: the larger of a share of the straps' width and a
-minimum (m).
+"""Depth under the top below which no pack gets wider: at least the first (in strap widths) and the second
+(m).
 """
 _LEDGE_SLOPE = 1.0
 """Maximum slope of a ledge, as a low bar at the side shows: two successive steps that fall less steeply."""
@@ -29,9 +29,7 @@ than 86 mm; in 1956 of them none is deeper than 1.7 bars of up to 25 mm, 1.05 of
 100 mm.
 """
 _HIDDEN_CELLS = 12
-"""Maximum number of places out of sight in a flank behind which the surface can be seen to
-have fallen away.
-"""
+"""Maximum number of unseen places in a flank behind which the surface can be seen to have fallen away."""
 _STEP_M, _DEEP_CELLS = 0.05, 2
 """Minimum step (m) that separates the bundle's lowest bars from something far below; minimum number of places
 seen that deep that rule out an overhang.
@@ -116,9 +114,7 @@ def find_side(
 
 
 def hidden_places(outwards: Float64, last: int) -> int:
-    """Count the places out of sight behind a flank that ends at `last`, or at the same height slightly
-    further out.
-    """
+    """Count the places out of sight behind a flank that ends at `last`, or slightly further out, as high."""
     behind = outwards[last + 1 :]
     level = np.append(np.abs(behind - outwards[last]) <= _RISES_M, False)
     first = int(np.argmin(level))
@@ -126,8 +122,8 @@ def hidden_places(outwards: Float64, last: int) -> int:
 
 
 def flank_depth(top: float, width_m: float) -> float:
-    """Compute the height under which only what continues without a step belongs to a pack. width_m: of its
-    straps.
+    """Compute the height below which only what continues without a step is a pack's. width_m:
+    of its straps.
     """
     return top - max(_FLANK_RATIO * width_m, _FLANK_DEPTH_M)
 

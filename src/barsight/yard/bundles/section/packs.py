@@ -19,9 +19,7 @@ from barsight.yard.lift_settings import UPPER
 from barsight.yard.types import HeightMap
 
 _OWN_RATIO = 0.5
-"""Minimum overlap of straps with a fit, in widths of the narrower one, for the straps to belong
-to the fit.
-"""
+"""Minimum overlap of straps and a fit, in widths of the narrower, for the straps to be the fit's own."""
 _DIP_RATIO = 0.12
 """Minimum depth of a dip, in widths of its span, that may separate two bundles whose straps are in line."""
 _SPREAD_M = 0.03
@@ -170,9 +168,7 @@ def contradicts(pack: Pack, width_m: float) -> tuple[float, str]:
 
 
 def dip_depth(level: Float64) -> float:
-    """Compute the depth to which the surface sinks between two higher places; unseen places
-    count as floor.
-    """
+    """Compute how deep the surface sinks between two higher places; unseen places count as floor."""
     seen = np.nan_to_num(level, nan=-FLOOR_M, neginf=-FLOOR_M)
     between = np.minimum(np.maximum.accumulate(seen), np.maximum.accumulate(seen[::-1])[::-1])
     return float((between - seen).max(initial=0.0))

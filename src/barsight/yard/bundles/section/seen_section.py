@@ -32,26 +32,20 @@ _GULLY_RATIO = 0.95
 _REACH_RATIO = 1.5
 """Maximum distance from the axis, in widths of the outline, at which parts of a bundle are searched for."""
 _GULLIES_APART = 0.8
-"""Share of the places, those with the smallest misfits, that are judged: each map smooths gullies
-differently.
-"""
+"""Share of the places, with the smallest misfits, that are judged: maps smooth gullies differently."""
 _MISFIT_RATIO, _HEIGHT_RATIO, _WIDTH_RATIO = 0.05, 0.1, 0.2
 """Tolerances, in bar diameters, for bars to be counted: RMS misfit of the surface, height, width."""
 _HIDDEN_M = 0.12
 """Distance (m) behind a hidden side within which the surface is searched."""
 _RIM, _HIGHER_M = 4, 0.03
-"""Number of places on either side of a flank that are compared, and the rise (m) of a neighbour that is
-higher.
-"""
+"""Number of places compared on either side of a flank, and the rise (m) of a neighbour that is higher."""
 _WIDER_M = 0.045
 _MIN_PIECE_RATIO, _MAX_PIECE_RATIO = 0.7, 1.5
 """Bounds of a section's width, in widths of the outline (the upper one widened by _WIDER_M): what is narrower
 or wider isn't the outline's section.
 """
 _ALIKE_LOG = 0.35
-"""Maximum logarithm of the ratio of two neighbours' widths: beyond it they may be pieces of one irregular
-pack.
-"""
+"""Maximum log ratio of two neighbours' widths: beyond it they may be pieces of one irregular pack."""
 _PARTED_RATIO, _PARTED_BARS, _PARTED_DIAMETER_M = 0.3, 1.5, 0.04
 """Minimum depth to which the surface sinks between two separate bundles, in outline widths and in bars, and
 minimum diameter (m) of their bars. Below these, they may be pieces of one pack: a bar one layer below the
@@ -68,13 +62,9 @@ _FILL_RATIO, _BAR_FILL_RATIO = (0.65, 0.045), (0.70, 0.055)
 bar: it is one, or a round pack of thin ones.
 """
 _MAX_DEVIATIONS = 4.0
-"""Bounds, in deviations, of the floor's place in the prior: above, the floor cuts off nothing; below, it is
-clamped.
-"""
+"""Maximum deviations from the prior's mean: a floor further above cuts off nothing, further below no more."""
 _BULGE_RATIO = 0.4
-"""Standard deviation of how far bars bulge behind a flank, as a fraction of the length that wasn't seen
-there.
-"""
+"""Standard deviation of the bulge of bars behind a flank, as a fraction of the unseen length there."""
 _SEEN_WIDTH_SIGMA_M, _OUTLINE_RATIO = 0.012, 0.5
 """Errors of the seen width: a constant standard deviation (m), and a fraction of its difference from the
 outline's width.
@@ -249,9 +239,7 @@ def sections(grid: AlignedMap, fit: Fit, rows: Int64, half: int) -> tuple[Float6
 
 
 def mean_section(grid: AlignedMap, fit: Fit, rows: Int64, half: int) -> tuple[Float64, Float64]:
-    """Compute the median heights over the axis at lateral places (N,); NaN where more than
-    half are unknown.
-    """
+    """Compute the median heights over the axis at places (N,); NaN where over half are unknown."""
     beside, heights = sections(grid, fit, rows, half)
     enough = 2 * (~np.isnan(heights)).sum(axis=0) >= len(rows)
     level = np.full(len(beside), np.nan)
@@ -266,9 +254,7 @@ def unseen_places(level: Float64) -> int:
 
 
 def _is_neighbour(one: FittedOutline, beside_m: Float64, others: list[FittedOutline]) -> Bool:
-    """Check which places (N,) beside a bundle's axis, at mid-length, lie in another bundle of about its
-    width.
-    """
+    """Check which places (N,) beside a bundle's axis, at mid-length, lie in another of similar width."""
     u = one.fit.values[U] + beside_m
     places = one.grid.to_map(np.column_stack([u, np.full(len(u), one.fit.v_m)]))
     taken = np.zeros(len(u), bool)
@@ -282,8 +268,8 @@ def _is_neighbour(one: FittedOutline, beside_m: Float64, others: list[FittedOutl
 
 
 def is_overhung(inwards: Float64, outwards: Float64) -> bool:
-    """Check whether a neighbour stands higher at a flank, so that it may lie over it. Both: heights outwards
-    from the flank's edge or inwards.
+    """Check whether a neighbour stands higher at a flank and so may lie over it. Heights begin
+    at the flank.
     """
     own, theirs = (part[np.isfinite(part)][:_RIM] for part in (inwards, outwards))
     return bool(theirs.size and own.size and theirs.max() > own.max() + _HIGHER_M)

@@ -1,6 +1,4 @@
-"""Find lines across the bars in gray levels, and separate the places that share them from
-those that don't.
-"""
+"""Find lines across the bars in gray levels, and group the places that share them."""
 
 from __future__ import annotations
 
@@ -27,9 +25,7 @@ _POOL_M = 0.07
 _MIN_VARIANCE = 0.3
 """Minimum variance that one place contributes to a faint line's sum."""
 _SPOT = 3.0
-"""Contrast over noise at which levels are clipped for faint lines, so that single spots on a
-bar count less.
-"""
+"""Contrast over noise at which levels are clipped for faint lines: single spots then count less."""
 _FAINT, _FAINT_PRICE, _FAINT_GULLY_PRICE = 4.0, 15.0, 5.0
 """Thresholds for faint lines: minimum mean level in units of the noise of such means, and minimum total of
 half the squares beyond that, elsewhere and in a gully.
@@ -37,9 +33,7 @@ half the squares beyond that, elsewhere and in a gully.
 GULLY_M, _GULLY_SIDE_M = 0.03, 0.08
 """Minimum depth (m) of a gully that may separate bundles, and the extent (m) of each of its two sides."""
 CLIFF_M, _CLIFF_CELLS = 0.12, 2
-"""Minimum height (m) of a step across which no straps hold bars, and the number of places within which it
-occurs.
-"""
+"""Minimum height (m) of a step that no strap spans, and the number of places within which it occurs."""
 FLOOR_M = 1e3
 """Depth (m) assumed for the floor and for unseen places."""
 
@@ -70,9 +64,7 @@ def faint_lines(gray: Float32, stock: Bool, cell_m: float) -> tuple[Float64, Flo
 
 
 def pooled_contrast(level: Float64, variance: Float64, cell_m: float) -> Float64:
-    """Compute the contrast (rows, places) over noise of faint lines, averaged across the
-    bars over _POOL_M.
-    """
+    """Compute the contrast (rows, places) over noise of faint lines, averaged over _POOL_M."""
     pool = round(_POOL_M / cell_m) | 1
     mean = ndimage.uniform_filter1d(level, pool, axis=1)
     return np.asarray(np.abs(mean) / np.sqrt(variance / pool), np.float64)

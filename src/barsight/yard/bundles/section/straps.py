@@ -28,9 +28,7 @@ from barsight.yard.map_lookup import lookup_heights, sample_levels
 from barsight.yard.types import HeightMap
 
 REACH_M = 0.55
-"""Distance (m) to either side of a bundle's axis within which straps are sought,
-including its neighbours'.
-"""
+"""Distance (m) to either side of a bundle's axis within which its and its neighbours' straps are sought."""
 _NARROWEST_M = 0.07
 """Minimum width (m) of a part that straps may hold."""
 _EDGE = 1.0
@@ -50,9 +48,7 @@ DENSE_M = 0.45
 MIN_STRAPS, MIN_ROWS = 2, 20
 """Minimum number of straps that hold a bundle, and of rows of the map for its mean section."""
 _LINE_M, _END_M = 0.05, 0.08
-"""Half the length (m) along the bars over which a strap's place is averaged, and the width (m)
-of either end.
-"""
+"""Half the length (m) along the bars over which a strap's place is averaged; width (m) of either end."""
 _SHOWN_RATIO = 0.9
 """Minimum share of a bundle in the photo for missing straps to count as evidence."""
 APART_M = 0.3
@@ -182,9 +178,7 @@ def strongest_lines(strength: Float64, teeth: Int64, apart: int) -> Int64:
 
 
 def _row_at_ends(contrast: Float64, row: int, cell_m: float) -> tuple[float, float]:
-    """Compute where along the axis (m) a strap lies at its low and at its high end:
-    its contrast's centroid.
-    """
+    """Compute where along the axis (m) a strap's contrast has its centroid, at its low and high end."""
     reach, end = round(_LINE_M / cell_m), max(round(_END_M / cell_m), 1)
     first = max(row - reach, 0)
     near = np.maximum(contrast[first : row + reach + 1], 0.0)
