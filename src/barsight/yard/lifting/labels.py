@@ -134,8 +134,8 @@ def _edge_logs(level: Float32, length: int) -> tuple[Float32, Float32]:
     """Compute the log ratio of the darkest of `length` steps to the bare bar before and behind, and that
     darkest level: (V - length - 2 _BESIDE + 1, U), for runs from step _BESIDE on.
 
-    The bare bar's level is taken two or three steps beyond the run, since a picture blurs an end over one or
-    two steps.
+    The bare bar's level comes from the second and third, or the third and fourth, step beyond the run, since
+    a picture blurs an end over one or two steps.
     """
     count = len(level) - length - 2 * _BESIDE + 1
     rows = [level[k : k + count] for k in range(length + 2 * _BESIDE)]
