@@ -1,4 +1,4 @@
-"""Define the protocol of every pose estimator, and run one over a finished recording."""
+"""Define the protocol of all pose estimators, and run one over a finished recording."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from barsight.recording.formats.board_corners import CornerRecording
 from barsight.recording.rectified_pairs import RectifiedPairs
 
 FrameInput = RectifiedPair | NamedPoints | RefusedFrame
-"""A frame as an estimator takes it: its pictures, its named points, or only its stamp."""
+"""A frame as an estimator receives it: its pictures, its named points, or only its stamp."""
 
 UNPLACED = "no sensor places it"
-"""Reason of a frame whose picture isn't read, where nothing else places it."""
+"""Reason given for a frame whose pictures aren't read and that nothing else places."""
 
 
 class PoseEstimator(Protocol):
     """Protocol: estimate the body's pose frame by frame; estimators differ in when a pose is final.
 
-    reads_pictures: whether `push` wants the pictures; else frames come as `UNPLACED`.
-    delay_ns: the readings that a frame needs come this much later than itself; None where it needs all.
+    reads_pictures: whether `push` needs the pictures; else frames come as `UNPLACED`. delay_ns: how much
+    later than the frame itself the last readings that it needs are; None where it needs all.
     """
 
     @property
@@ -36,7 +36,7 @@ class PoseEstimator(Protocol):
     def delay_ns(self) -> int | None: ...
 
     def push(self, seen: FrameInput) -> PosedFrame | RefusedFrame | None:
-        """Take the next frame in time's order; return its final pose or why it has none, None where only
+        """Process the next frame in order of time. Return its final pose or why it has none; None where only
         `finish` can tell.
         """
         ...
@@ -47,7 +47,7 @@ class PoseEstimator(Protocol):
 
 
 class ImmediatePoses(ABC):
-    """`PoseEstimator` whose poses are final at once; a subclass places one frame.
+    """`PoseEstimator` whose poses are final at once; a subclass places one frame at a time.
 
     placed, refused: the frames so far.
     """
@@ -85,10 +85,10 @@ def pictures_of(seen: FrameInput) -> RectifiedPair | Failed:
 
 
 class TrajectoryEstimator(ABC):
-    """Settings of an estimator; `begin` makes one for a recording.
+    """Settings of an estimator; `begin` makes the estimator for a recording.
 
-    begins_early: whether each pose depends on no reading beyond the estimator's `delay_ns`, so that a
-    recording that still grows ends with the same poses. delay_ns: see `PoseEstimator`.
+    begins_early: whether no pose depends on readings later than the estimator's `delay_ns`, so that a
+    recording that is still growing ends with the same poses. delay_ns: see `PoseEstimator`.
     """
 
     begins_early: ClassVar[bool] = False
@@ -96,15 +96,15 @@ class TrajectoryEstimator(ABC):
 
     @abstractmethod
     def begin(self, recording: Recording, rectifier: Rectifier) -> PoseEstimator:
-        """Begin at the recording's first frame. recording: its sensors' readings may still grow."""
+        """Begin at the recording's first frame. The recording's sensor readings may still grow."""
 
     def __call__(
         self, recording: Recording, rectifier: Rectifier, advance: Callable[[], None],
         pairs: RectifiedPairs | None = None,
     ) -> Trajectory:  # fmt: skip
-        """Estimate a finished recording; `advance` is called once a frame.
+        """Estimate a finished recording; `advance` is called once per frame.
 
-        pairs: of the recording, where others read them too.
+        pairs: the recording's pictures, if others read them too.
         """
         poses = self.begin(recording, rectifier)
         for seen in _frames(recording, pairs or RectifiedPairs(recording, rectifier), poses.reads_pictures):

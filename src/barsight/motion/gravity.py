@@ -15,7 +15,9 @@ from barsight.recording.base import Recording
 
 @dataclass(frozen=True)
 class GravityAlignment:
-    """world_from_body: the first frame's pose, origin there, Z up. from_imu: whether gravity was measured."""
+    """world_from_body: the first frame's pose, at the origin, Z up. from_imu: whether gravity was
+    measured.
+    """
 
     world_from_body: Pose
     from_imu: bool
@@ -23,10 +25,10 @@ class GravityAlignment:
 
 
 def align_with_gravity(recording: Recording) -> GravityAlignment:
-    """Average gravity from the IMU, 0.5 s before to 1 s after the first frame, else take cam0's rows as
+    """Average gravity from the IMU, from 0.5 s before to 1 s after the first frame; else take cam0's rows as
     level.
 
-    Without motion the accelerometer shows the reaction to gravity: its mean points up. World's X is cam0's
+    At rest the accelerometer measures the reaction to gravity: its mean points up. World's X is cam0's
     viewing direction, or its x axis where the camera looks straight down, made level.
     """
     rig = recording.rig
@@ -56,8 +58,8 @@ def align_with_gravity(recording: Recording) -> GravityAlignment:
 
 
 def _levelled(up: Float64, forward: Float64) -> Float64:
-    """Build world_from_body (3, 3) with world's Z along `up` and its X nearest to `forward`, both
-    in `body`.
+    """Build world_from_body (3, 3) with world's Z along `up` and its X nearest to `forward`, both given in
+    `body`.
     """
     x = forward - (forward @ up) * up
     x /= np.linalg.norm(x)

@@ -20,8 +20,9 @@ class MotionSettings:
 
     estimator: Literal["fused", "live", "crane", "odometry", "paper"] = "fused"
     """fused: all sensors in one estimate. live: the same frame by frame, without looking ahead. crane:
-    encoders, nominal attitude and the gyro's sway, no picture. odometry: frame to frame from the pictures
-    alone, for comparison. paper: the paper's stitching by SVD of matches that follow the IMU's trend."""
+    encoders, nominal attitude and the gyro's sway, no pictures. odometry: frame to frame from the pictures
+    alone, for comparison. paper: the paper's stitching by SVD of matches that follow the IMU's trend.
+    """
     fusion: FusionSettings = field(default_factory=FusionSettings)
     live: FixedLagSettings = field(default_factory=FixedLagSettings)
     crane: CraneSettings = field(default_factory=CraneSettings)
@@ -45,8 +46,8 @@ def make_estimator(settings: MotionSettings) -> TrajectoryEstimator:
 
 
 def make_early_estimator(settings: MotionSettings, *, has_crane: bool) -> TrajectoryEstimator:
-    """Make the estimator for poses before the end: the one that the settings name, if it can, else one of the
-    same sensors.
+    """Make the estimator for poses before the recording's end: the one that the settings name if it can give
+    them, else one that uses the same sensors.
     """
     named = make_estimator(settings)
     if named.begins_early:

@@ -1,1 +1,1 @@
-"""The batch estimator: full bundle adjustment over cameras, IMU and encoders."""
+"""Estimate in batch: full bundle adjustment over cameras, IMU and encoders."""

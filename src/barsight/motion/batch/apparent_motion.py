@@ -1,14 +1,15 @@
 """Model apparent slides and disparity biases of strips of the yard (ribs and gloss).
 
-A ribbed bar is a screw: seen from further on, the side that faces the camera shows other ribs, which seem to
-have slid along the bar; what highlights do to mill scale is alike. In the picture such a point turns about
-the camera's axis, by 4e-4 rad where ribs are: a tenth of a pixel over 250 px of way. Points of a bundle slide
-alike, which can't be told from a heading that is off; so slides are unknowns, each point's about its piece's
-of the yard. How far they go is learnt from the recording: floors don't slide, and lead.
+A ribbed bar is a screw: seen from further along, the side that faces the camera shows other ribs, which seem
+to have slid along the bar; highlights do the same to mill scale. In the picture such a point turns about the
+camera's axis, by 4e-4 rad where there are ribs: a tenth of a pixel over 250 px of travel. The points of a
+bundle slide alike, which can't be told from a heading error. So slides are unknowns: one for each piece of
+the yard, and each point's relative to its piece's. Their size is learnt from the recording: floors don't
+slide, so they dominate.
 
-A highlight on a round bar is the image of a lamp that lies behind the bar, so gloss also falsifies the
-disparity, by 0.01 px on the pieces of a stack and by nothing on floors. The way that encoders and gyro know
-places a point without it: what a piece's disparity is off by is an unknown too.
+A highlight on a round bar is the image of a lamp that lies behind the bar, so gloss also biases the
+disparity, by 0.01 px on the pieces of a stack and not at all on floors. The travel known from encoders and
+gyro fixes a point's position without the disparity, so each piece's disparity bias is an unknown too.
 """
 
 from __future__ import annotations
@@ -33,25 +34,25 @@ from barsight.motion.problem.problem import Pieces, Problem
 
 LENGTH_RATIO = 0.2
 HEIGHT_RATIO = 0.07
-"""A piece is this long along the way, and this high, in terms of the points' distance."""
+"""Length of a piece along the travel and its height, both as ratios to the points' median range."""
 FIRST_SIGMA_RAD = 2e-4
 MIN_SIGMA_RAD = 5e-6
 FIRST_SIGMA_PX = 0.005
 MIN_PIECES = 4
 MIN_SEEN = 4
-"""A point seen less often says nothing of how it slides."""
+"""Minimum number of sightings of a point from which it counts for how far points slide."""
 PRIOR_POINTS = 5
-"""How many points' worth all pieces' scatter counts in that of one."""
+"""Weight, in points, of the mean square slide over all pieces as a prior for that of a single piece."""
 PRIOR_PIECES = 2
-"""How many pieces' worth the first sigma of disparities counts."""
+"""Weight, in pieces, of `FIRST_SIGMA_PX` as a prior for the sigma of the pieces' disparity biases."""
 ROUNDS = 3
 STEPS = 2
-"""Gauss-Newton's, in a round: each begins where the one before ended."""
+"""Maximum optimisation steps in a round; each round starts where the previous one ended."""
 
 
 def partition_points(problem: Problem, state: GraphState, used: Bool) -> Pieces | None:
-    """Partition the points into strips across the way, apart in height; None where there are too few of them,
-    or fewer points than pieces that say how they slide.
+    """Partition the points into strips across the travel and by height. None without encoders, where there
+    are too few strips, or where fewer points than strips are seen often enough to tell how far they slide.
     """
     seen = problem.sightings
     if seen is None or not problem.has_latency:
@@ -73,9 +74,9 @@ def partition_points(problem: Problem, state: GraphState, used: Bool) -> Pieces 
 def solve_with_slides(
     problem: Problem, state: GraphState, used: Bool, rounds: int = ROUNDS
 ) -> tuple[Problem, GraphState, System]:
-    """Solve with slides as unknowns and their sigma by EM, with what pieces share as unknowns, and how far
-    they go as they show it [EM: Dempster 1977; of disparities MacKay 1992, faster where there is little to
-    find].
+    """Solve with slides and disparity biases as unknowns and re-estimate their sigmas in each round by EM
+    [Dempster 1977]; for the disparities by MacKay's update [MacKay 1992], which is faster where there is
+    little to find.
     """
     pieces = problem.pieces or partition_points(problem, state, used)
     graph = build_graph(problem)

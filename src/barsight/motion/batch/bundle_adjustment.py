@@ -43,22 +43,25 @@ from barsight.motion.problem.stereo_factors import (
 FARTHEST_OUTLIER_SIGMAS = 3.5
 MAX_ROUNDS = 3
 MIN_AGREEING = 0.5
-"""Where fewer of the encoders' places agree, none is left out: who is wrong can't be told."""
+"""Minimum share of the encoder positions that must agree for the others to be left out: with fewer, which
+sensor is wrong can't be told.
+"""
 MIN_FACTOR = 0.1
 START_GAIN = 1e-3
-"""The first solution only has to tell outliers: steps that gain less than this share of the cost end it."""
+"""Relative decrease of the cost below which the first solution stops: it only has to reveal outliers."""
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """poses: (M,). covariance: (F, 6, 6) of the frames, rotation then translation, reference axes. relative:
-    (F - 1, 6, 6) of a frame's pose in the frame before, in its own axes. velocity_mps: (M, 3) or
-    None without IMU. biases: (M,). pixel_sigma_px: what the residuals show; used: (N,) sightings kept.
-    drift: of the rig, None where no picture was used or the calibration is taken as exact. encoders: None
-    without. placed: P of them; encoder_off_m, encoder_sigma_m: (P, 3) of each, encoder_used: (P,) those that
-    agree.
-    inertial, pictures, imu: of the nodes, their stamps by the nodes' clock; points: (M,) sightings used at
-    each.
+    """Solution of the batch problem: M nodes, of which F are frames.
+
+    poses: (M,). covariance: (F, 6, 6) of the frames' poses, rotation then translation, in the reference's
+    axes. relative: (F - 1, 6, 6) of each frame's pose relative to the previous frame, in its own axes.
+    velocity_mps: (M, 3), None without IMU. biases: (M,). pixel_sigma_px: the sightings' noise as the
+    residuals show it; used: (N,) sightings kept. drift: of the rig, None where no picture was used or the
+    calibration is taken as exact. encoders: None without them. placed: P encoder positions; encoder_off_m,
+    encoder_sigma_m: (P, 3) residual and sigma of each; encoder_used: (P,) those that agree. inertial,
+    pictures, imu: of the nodes, stamped by the nodes' clock; points: (M,) sightings used at each.
     """
 
     poses: tuple[Pose, ...]
@@ -81,14 +84,14 @@ class Estimate:
 
 
 def solve_batch(problem: Problem, frames: Int64) -> Estimate:
-    """Solve the batch problem. frames: (F,) the nodes whose covariance is wanted, also relative, each with
-    the next.
+    """Solve the batch problem. frames: (F,) the nodes whose covariances are wanted, absolute and relative to
+    the next of them.
 
-    After a first solution, drift of the rig included, encoders' places are taken anew with the accelerations
-    and the unevenness it shows, sightings beyond 3.5 sigma leave and all sigmas grow or shrink to what was
-    seen; then the drift is sought on and weighed against its prior, and encoder places beyond 5 sigma leave.
-    (A cut before the drift is known would take the very sightings that show it best.) Raises LinAlgError
-    where the measurements leave an unknown undetermined.
+    After a first solution, including the rig's drift, the encoder positions are re-estimated with the
+    accelerations and the unevenness that it shows, sightings beyond 3.5 sigma are removed and all sigmas are
+    scaled to the residuals. Then the drift is estimated again and weighed against its prior, and encoder
+    positions beyond 5 sigma are removed. (Removing sightings before the drift is known would take the very
+    ones that show it best.) Raises LinAlgError where the measurements leave an unknown undetermined.
     """
     problem = replace(problem, asked=frames)
     used = np.ones(0 if problem.sightings is None else len(problem.sightings.node), np.bool_)
@@ -125,8 +128,8 @@ def _estimate(
 ) -> Estimate:  # fmt: skip
     """Read the estimate and its covariances from the solved system.
 
-    frames: (F,), see `solve_batch`. everywhere: the problem with those places of the encoders that were left
-    out, too.
+    frames: (F,), see `solve_batch`. everywhere: the problem including the encoder positions that were left
+    out.
     """
     pairs = np.column_stack([np.arange(len(frames) - 1), np.arange(1, len(frames))])
     poses, found = _poses(state, problem), marginals(system, pairs)
@@ -158,8 +161,8 @@ def _estimate(
 
 
 def covariances(found: Marginals, poses: tuple[Pose, ...], drift: RigDrift | None) -> Float64:
-    """Compute pose covariances (F, 6, 6) in the reference's axes, what the rig's drift leaves open
-    included.
+    """Compute pose covariances (F, 6, 6) in the reference's axes, including the uncertainty of the rig's
+    drift.
     """
     shared = np.zeros((2, 2)) if drift is None else drift.covariance
     result = np.zeros((len(poses), 6, 6))
@@ -174,8 +177,8 @@ def covariances(found: Marginals, poses: tuple[Pose, ...], drift: RigDrift | Non
 def relative_covariances(
     found: Marginals, poses: tuple[Pose, ...], drift: RigDrift | None, pairs: Int64
 ) -> Float64:
-    """Compute covariances (P, 6, 6) of the later pose in the earlier one, rotation then translation of a
-    small motion that follows it, in its own axes: what both are off by alike doesn't count.
+    """Compute covariances (P, 6, 6) of the later pose relative to the earlier one, as rotation then
+    translation of a small motion applied after it, in its own axes. Errors common to both cancel.
     """
     shared = np.zeros((2, 2)) if drift is None else drift.covariance
     result = np.empty((len(pairs), 6, 6))
@@ -193,7 +196,9 @@ def relative_covariances(
 
 
 def robust_noise(residual: Float64, seen: StereoObservations, used: Bool) -> tuple[float, Bool]:
-    """Estimate the factor on the sightings' sigmas from their residuals (N, 3) px, and drop outliers."""
+    """Estimate the scale factor of the sightings' sigmas from their residuals (N, 3) px, and remove
+    outliers.
+    """
     share = np.abs(residual) / seen.sigma_px[:, None]
     factor = max(MIN_FACTOR, mad_sigma(share[used]) * dof_correction(seen, used))
     return factor, well_observed(seen, used & (share.max(axis=1) < FARTHEST_OUTLIER_SIGMAS * factor))
@@ -202,7 +207,7 @@ def robust_noise(residual: Float64, seen: StereoObservations, used: Bool) -> tup
 def _with_seen_noise(
     problem: Problem, seen: StereoObservations, state: GraphState, used: Bool
 ) -> tuple[Problem, GraphState, System, Bool]:
-    """Re-solve with the sightings' sigma estimated from their residuals, and without outliers."""
+    """Solve again without outliers and with the sightings' sigmas as their residuals show them."""
     residual = sighting_residuals(problem, state, used)
     factor, used = robust_noise(residual, seen, used)
     seen = replace(seen, sigma_px=factor * seen.sigma_px)
@@ -217,7 +222,7 @@ def _with_seen_noise(
 
 
 def _inertial(state: GraphState, problem: Problem) -> tuple[Float64 | None, tuple[ImuBias, ...]]:
-    """Extract velocities (M, 3) and the biases, where there is an IMU."""
+    """Extract the velocities (M, 3) and the biases; None and () without an IMU."""
     if not problem.has_imu:
         return None, ()
     nodes = range(len(problem.start))

@@ -1,4 +1,4 @@
-"""Tell what a trajectory rests on: its detail by frames, and what was left out or joined."""
+"""Report what a trajectory rests on: details of its frames, and what was left out or joined."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def jumps_alone(crane: CraneSamples | None) -> tuple[str, ...]:
-    """Tell of the encoders' jumps where no estimate of all sensors takes them off."""
+    """Describe the encoders' jumps where no estimate from all sensors determines them."""
     from barsight.motion.problem.encoder_factors import jump_sentences
 
     if crane is None:
@@ -36,7 +36,7 @@ def select_detail(
     encoders: NormalisedResiduals | None,
     shift: int,
 ) -> MotionDetail:
-    """Select details by cam0's clock; of the frames alone where it is of the nodes."""
+    """Select the details, stamped by cam0's clock; of an estimate by nodes, those of the frames alone."""
     inertial = estimate.inertial
     if inertial is not None:
         values = {f.name: getattr(inertial, f.name)[nodes.frame] for f in fields(inertial)}
@@ -58,7 +58,9 @@ def select_detail(
 def untied_pictures(
     sightings: tuple[Sighting, ...], refused: tuple[RefusedFrame, ...]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Warn that pictures don't follow from each other, though encoders may place their frames."""
+    """Warn that pictures don't follow from each other, even where encoders place their frames: as warnings
+    for up to half of the frames, else as doubts.
+    """
     count = len(refused) + sum(one.motion is None and one.again is None for one in sightings[1:])
     if count == 0:
         return (), ()
@@ -72,7 +74,9 @@ def untied_pictures(
 
 
 def joint_sentences(sightings: tuple[Sighting, ...], relative: Float64) -> tuple[str, ...]:
-    """Tell where pictures begin anew and what joins both parts, with its sigma; relative (K - 1, 6, 6)."""
+    """Describe where the pictures begin anew and what joins the two parts, with its sigma; relative
+    (K - 1, 6, 6).
+    """
     told = []
     for k, again in chain_begins(sightings):
         turn, way = np.sqrt(np.diag(relative[k - 1]).reshape(2, 3).sum(axis=1))

@@ -1,4 +1,4 @@
-"""Check sensors for contradictions, in themselves or among each other, before estimation."""
+"""Check each sensor for contradictions, in itself and with the others, before estimation."""
 
 from __future__ import annotations
 
@@ -22,15 +22,21 @@ from barsight.motion.frontend.sightings import Sighting
 
 MIN_FROZEN = 5
 SIDE, SPEED_WINDOW_S = 8, 0.3
-"""The speed before a freeze is taken over so many readings, or so long where that is more."""
+"""Number of readings and duration, s, over which the speed before a freeze is taken; the longer one
+counts.
+"""
 MIN_HELD_M, HELD_SIGMAS = 0.01, 8.0
-"""A crane that froze would have gone further than this, and than so many sigma of a reading."""
+"""Minimum distance, in m and in sigma of a reading (the larger counts), that a crane must have travelled
+during equal readings for these to be frozen.
+"""
 MAX_BRAKING_MPS2 = 1.0
 MAX_FRAMES_OFF = 2
 MANY_STEPS = 8
-"""Recordings that leave fewer steps are looked at for one frame off only."""
+"""Minimum number of steps that must be left to try offsets of more than one frame."""
 MIN_STEPS = 2
-"""Five frames. They tell seven times in ten, seven frames always (docs/explanation/motion.md)."""
+"""Minimum number of steps for an offset to be sought, as five frames leave them. Five frames reveal an offset
+seven times in ten, seven frames always (docs/explanation/motion.md).
+"""
 WINDOW_S = 0.35
 TURN_SIGMA_RAD = 5e-4
 WAY_SIGMA_M = 0.005
@@ -39,7 +45,7 @@ CLEARLY_BETTER = 0.1
 
 @dataclass(frozen=True, eq=False)
 class CheckedCrane:
-    """Usable readings, their jumps told and taken off, and sentences on what was left out."""
+    """Usable readings with their jumps subtracted, and warnings about what was left out."""
 
     samples: CraneSamples
     warnings: tuple[str, ...]
@@ -48,8 +54,8 @@ class CheckedCrane:
 def check_crane(crane: CraneSamples, known: KnownMotion | None = None) -> CheckedCrane:
     """Remove readings that stand still while the crane must be moving, and find the jumps.
 
-    known: what pictures and IMU say of the way. After a freeze an encoder may have lost count by any size,
-    unless these show that it has not.
+    known: the travel according to pictures and IMU. After a freeze an encoder may have lost count by any
+    amount, unless these show that it has not.
     """
     parts = [
         (int(crane.stamp_ns[first]), int(crane.stamp_ns[last])) for first, last in frozen_stretches(crane)
@@ -62,7 +68,7 @@ def check_crane(crane: CraneSamples, known: KnownMotion | None = None) -> Checke
 
 
 def freeze_sentences(parts: Sequence[tuple[int, int]], begin_ns: int) -> tuple[str, ...]:
-    """Tell of frozen parts, from one stamp to another; times from `begin_ns` on."""
+    """Describe the frozen parts, each given by its first and last stamp, in seconds since `begin_ns`."""
     told = [tuple((stamp - begin_ns) / NS_PER_S for stamp in part) for part in parts]
     return tuple(
         f"the encoders were frozen from {first:.1f} s to {last:.1f} s while the crane moved"
@@ -71,14 +77,16 @@ def freeze_sentences(parts: Sequence[tuple[int, int]], begin_ns: int) -> tuple[s
 
 
 def min_way_m(crane: CraneSamples) -> float:
-    """Return the way from which on encoders that stand still are held to be frozen."""
+    """Return the minimum travel (m) from which encoders that stand still count as frozen."""
     return max(MIN_HELD_M, HELD_SIGMAS * crane.position_std_m)
 
 
 def without_frozen(
     crane: CraneSamples, parts: Sequence[tuple[int, int]]
 ) -> tuple[CraneSamples, tuple[EncoderJump, ...]]:
-    """Remove the readings of frozen parts, from one stamp to another; also what may have jumped meanwhile."""
+    """Remove the readings of frozen parts, each given by its first and last stamp; also return the jumps that
+    may have happened during them.
+    """
     after: list[EncoderJump] = []
     for first_ns, last_ns in parts:
         crane = _chosen(crane, (crane.stamp_ns < first_ns) | (crane.stamp_ns > last_ns))
@@ -89,10 +97,10 @@ def without_frozen(
 
 @dataclass(frozen=True, eq=False)
 class StepComparison:
-    """Pictures' and other sensors' measurements of the same K steps between frames.
+    """Measurements of the same K steps between frames by the pictures and by the other sensors.
 
     turn: (K, 3) rotation vector old body from new body and way: (K,) m by the pictures. gyro: (K, 3) and
-    travel: (K,) by IMU and encoders, NaN where they don't cover it. seconds: (K,).
+    travel: (K,) by IMU and encoders, NaN where they don't cover the step. seconds: (K,).
     """
 
     turn: Float64
@@ -106,8 +114,8 @@ def compare_steps(
     sightings: tuple[Sighting, ...], imu: ImuSamples | None, crane: CraneSamples | None,
     rectifier: Rectifier, shift_ns: int, offs: tuple[int, ...] = (0,),
 ) -> tuple[StepComparison, ...]:  # fmt: skip
-    """Measure for each of `offs` the steps with the other sensors taken that many frames further on; the same
-    steps for all, those of the outer frames left out.
+    """Measure the steps once for each of `offs`, with the other sensors read that many frames later. The
+    steps are the same for all offsets, so those of the outer frames are left out.
     """
     count, ends = len(sightings), max(abs(off) for off in offs)
     steps = [k for k in range(1 + ends, count - ends) if sightings[k].motion is not None]
@@ -117,7 +125,7 @@ def compare_steps(
     if imu is not None:
         angle = interpolate_at(stamps, imu.stamp_ns, turned_angle(imu))
     if crane is not None:
-        # A fit, since single readings may be wild.
+        # A fit is robust to single outliers.
         for k, stamp in enumerate(stamps.tolist()):
             fit = fit_position(crane, stamp, seconds_to_ns(WINDOW_S))
             place[k] = np.nan if isinstance(fit, Failed) else fit.position_m
@@ -144,8 +152,9 @@ def frames_off(
     """Estimate by how many frames the cameras' stamps are late against gyro and encoders; 0 where that isn't
     clear.
 
-    The turns and ways that pictures show between neighbouring frames are held against those of the other
-    sensors between the stamps of neighbours further on or back. The gyro's bias is fitted each time.
+    The turns and distances that the pictures show between neighbouring frames are compared with those that
+    the other sensors show between neighbours some frames later or earlier. The gyro's bias is fitted each
+    time.
     """
     most = MAX_FRAMES_OFF if len(sightings) > 2 * MAX_FRAMES_OFF + MANY_STEPS else 1
     offs = tuple(range(-most, most + 1))
@@ -162,12 +171,12 @@ def frames_off(
         cost[off], worst[off] = (float(np.mean(terms)), max(terms)) if terms else (0.0, 0.0)
     best = min(cost, key=lambda off: cost[off])
     clear = cost[best] < CLEARLY_BETTER * cost[0] and cost[0] > 1 / CLEARLY_BETTER
-    # Late stamps alone leave no sensor in doubt once they are shifted back.
+    # If only the stamps are late, all sensors agree once these are shifted back.
     return -best if clear and worst[best] < 1 / CLEARLY_BETTER else 0
 
 
 def _gyro_residual(steps: StepComparison) -> Float64:
-    """Subtract the pictures' turn from the gyro (K, 3), and the constant rate that fits best."""
+    """Subtract from the gyro's turns (K, 3) those of the pictures and the constant rate that fits best."""
     known = np.isfinite(steps.gyro).all(axis=1)
     time = steps.seconds[known, None]
     off = steps.gyro[known] - steps.turn[known]
@@ -180,9 +189,10 @@ def _chosen(crane: CraneSamples, kept: Bool) -> CraneSamples:
 
 
 def frozen_stretches(crane: CraneSamples) -> list[tuple[int, int]]:
-    """Find stretches (first, last) of equal readings that a moving crane runs into or comes out of elsewhere.
+    """Find stretches (first, last) of equal readings during which a moving crane must have travelled on, or
+    after which the readings continue elsewhere.
 
-    A crane that turns gives equal readings too, of coarse encoders most of all, but stays near them.
+    A crane that reverses gives equal readings too, above all with coarse encoders, but stays near them.
     """
     place, time = crane.position_m, (crane.stamp_ns - crane.stamp_ns[:1]) / NS_PER_S
     same = np.r_[False, (np.diff(place, axis=0) == 0).all(axis=1), False]
@@ -202,7 +212,7 @@ def frozen_stretches(crane: CraneSamples) -> list[tuple[int, int]]:
 
 
 def _speed_before(place: Float64, time: Float64, first: int) -> float:
-    """Median speed (m/s) over the readings before one, by those half a window apart."""
+    """Compute the median speed (m/s) before a reading, from pairs of readings half a window apart."""
     begin = min(int(np.searchsorted(time, time[first] - SPEED_WINDOW_S)), max(0, first - SIDE))
     half = (first - begin + 1) // 2
     old, new = slice(begin, first + 1 - half), slice(begin + half, first + 1)

@@ -1,4 +1,4 @@
-"""Estimate a recording's trajectory from cameras, IMU and encoders, whichever there are, in one batch."""
+"""Estimate a recording's trajectory from those of cameras, IMU and encoders that it has, in one batch."""
 
 from __future__ import annotations
 
@@ -59,13 +59,14 @@ class FusionSettings:
     """The estimate from all sensors together."""
 
     use: str = "stereo,imu,crane"
-    """Sensors to use where the recording has them: any of stereo, imu, crane, with commas."""
+    """Sensors to use where the recording has them: any of stereo, imu, crane, separated by commas."""
     front_end: FrontEndSettings = field(default_factory=FrontEndSettings)
     offset_prior_px: float = 0.1
-    """How far a yaw between the cameras may move the disparity (1 sigma); the yaw is estimated too. 0 takes
-    the calibration as exact."""
+    """Standard deviation, in px of disparity, of a yaw between the cameras; the yaw is estimated too. 0 takes
+    the calibration as exact.
+    """
     scale_sigma: float = 5e-4
-    """By which share baseline and encoders may disagree (1 sigma); that is estimated too."""
+    """Standard deviation of the relative scale between baseline and encoders; the scale is estimated too."""
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.sensors if name not in SENSORS]
@@ -87,7 +88,7 @@ class BatchFusion(TrajectoryEstimator):
     crane: CraneSettings
 
     def begin(self, recording: Recording, rectifier: Rectifier) -> BatchPoses:
-        """Begin; the recording's readings must be complete. Raises MeasurementError where no sensor that
+        """Begin; all of the recording's readings must be there. Raises MeasurementError where no sensor that
         places the body is left to use.
         """
         return BatchPoses(self.settings, self.crane, recording, rectifier)
@@ -170,7 +171,7 @@ class BatchPoses:
         nodes = make_nodes(frames + shift, inputs.imu)
         try:
             estimate, seen, doubts, encoders = self._solve(recording, rectifier, inputs, nodes, shift)
-        except np.linalg.LinAlgError as error:  # what the measurements leave undetermined
+        except np.linalg.LinAlgError as error:  # the measurements leave an unknown open
             simple = self._simple(inputs)
             reason = f"the sensors together have no solution ({str(error).split('.')[0].strip()})"
             told = tuple(dict.fromkeys((*simple.warnings, *inputs.warnings)))
@@ -191,14 +192,14 @@ class BatchPoses:
         )  # fmt: skip
 
     def _simple(self, inputs: _Inputs) -> Trajectory:
-        """Estimate without a graph: the encoders' trajectory, or frame to frame."""
+        """Estimate without a graph: from the encoders alone or, without them, frame to frame."""
         simple: TrajectoryEstimator = StereoOdometry(self._settings.front_end.rough)
         if inputs.crane is not None:
             simple = EncoderOdometry(self._crane_settings)
         return simple(self._recording, self._rectifier, lambda: None)
 
     def _inputs(self) -> _Inputs:
-        """Gather what was tracked and the checked sensors. Raises InputError where they contradict."""
+        """Gather the tracked frames and the checked sensors. Raises InputError where they contradict."""
         recording, crane, doubts = self._recording, self._crane, tuple[str, ...]()
         sightings, refused = tuple(self._sightings), tuple(self._refused)
         if isinstance(recording, CornerRecording):
@@ -225,8 +226,8 @@ class BatchPoses:
     def _joined(
         self, sightings: tuple[Sighting, ...], crane: CraneSamples | None
     ) -> tuple[tuple[Sighting, ...], tuple[RefusedFrame, ...]]:
-        """Select the sightings that one estimate can hold: the parts that encoders place, without these the
-        longest; the others are refused.
+        """Select the sightings that one estimate can contain: the parts that encoders place or, without
+        encoders, the longest part. The others are refused.
         """
         shift = self._recording.rig.timeshift_cam_imu_ns
         part = tied_parts(sightings, imu_bridges(self._imu, shift))
@@ -315,8 +316,8 @@ class BatchPoses:
         return estimate, warnings, sure, encoders
 
     def _attitude_sigmas_deg(self, chosen: list[int], still: Container[int]) -> dict[int, float]:
-        """Choose the sigma of the nominal attitude at the chosen nodes: sway turns round within a second or
-        so, so nodes nearer than that aren't independent.
+        """Choose the sigma (degrees) of the nominal attitude at the chosen nodes: larger under way, since
+        sway reverses within about a second and closer nodes aren't independent; at rest for one shared error.
         """
         moving, standing = self._crane_settings.attitude_std_deg * 1.6, [k for k in chosen if k in still]
         at_rest = self._crane_settings.sway_std_deg * len(standing) ** 0.5
@@ -326,7 +327,7 @@ class BatchPoses:
 def _placed_frames(
     recording: Recording, crane: CraneSamples, sighted: Int64, shift: int
 ) -> tuple[Int64, list[RefusedFrame]]:
-    """List stamps of all frames that the encoders or the pictures place, and the refused ones."""
+    """List the stamps of all frames that encoders or pictures place, and the refused frames."""
     known = set(sighted.tolist())
     frames: list[int] = []
     refused: list[RefusedFrame] = []
@@ -340,7 +341,7 @@ def _placed_frames(
 
 
 def _apart(stamp_ns: Int64, min_ns: int) -> list[int]:
-    """Select indices of stamps at least so far apart, from the first on."""
+    """Select indices of stamps at least about `min_ns` apart, starting with the first."""
     chosen = [0]
     for k in range(1, len(stamp_ns)):
         if stamp_ns[k] - stamp_ns[chosen[-1]] >= 0.97 * min_ns:

@@ -1,7 +1,7 @@
-"""Search the rig's drift from the present estimate, weighed against its prior at every step.
+"""Search for the rig's drift from the present estimate, weighed against its prior at every step.
 
-Over a short way yaw and scale look alike: sightings alone would follow a valley far from the truth, where
-what is linear here no longer holds. So each step goes to where sightings and prior together want it.
+Over a short travel yaw and scale look alike: the sightings alone would follow a valley far from the truth,
+to where the linearisation no longer holds. So each step goes to the optimum of sightings and prior together.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ MIN_STEP_PX = 0.02
 def apply_estimated_drift(
     problem: Problem, state: GraphState, system: System, used: Bool
 ) -> tuple[GraphState, RigDrift]:
-    """Move the state to the drift that sightings and prior together show; also that drift."""
+    """Move the state to the drift that sightings and prior together show; also return that drift."""
     own, slope = system.schur(system.forward)
     best = state.drift - np.linalg.solve(own, slope)[-2:]
     drift = combine_with_prior(best, np.linalg.inv(own)[-2:, -2:].astype(np.float64), problem)
@@ -35,7 +35,7 @@ def apply_estimated_drift(
 def optimise_with_drift(
     problem: Problem, state: GraphState, system: System, used: Bool, min_gain: float = RELATIVE_GAIN
 ) -> tuple[GraphState, System, RigDrift]:
-    """Optimise the state together with its drift, from one that is good without.
+    """Optimise the state together with the rig's drift, starting from a state that is optimal without it.
 
     min_gain: see `optimise_graph`.
     """

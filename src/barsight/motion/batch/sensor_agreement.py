@@ -1,7 +1,7 @@
-"""Hold gyro and encoders against the pictures' motion: units, axes and clocks that can't be right.
+"""Compare gyro and encoders with the pictures' motion to reveal wrong units, axes and clocks.
 
-Pictures of a calibrated pair measure turn and way of each step in rad and m, whatever the other sensors say.
-A wrong unit, axis or clock is off by far more than any noise, so every limit is a coarse one.
+The pictures of a calibrated pair measure each step's turn in rad and distance in m, independently of the
+other sensors. A wrong unit, axis or clock causes errors far beyond any noise, so all thresholds are coarse.
 """
 
 from __future__ import annotations
@@ -29,15 +29,19 @@ from barsight.motion.frontend.sightings import Sighting
 
 MIN_STEPS, MAX_STEPS = 3, 200
 MIN_WAY_M = 0.1
-"""Steps shorter than this by pictures and encoders tell no scale and no direction."""
+"""Steps that are shorter than this by both pictures and encoders show neither scale nor direction."""
 MAX_WAY_RATIO, MAX_ANGLE_DEG = 1.15, 5.0
-"""Encoders' way over the pictures', and the angle between them."""
+"""Maximum ratio between the encoders' and the pictures' travel, and maximum angle between the two."""
 TURNS_SIGMAS, MAX_TURN_RATIO, MIN_ALIKE = 4.0, 5.0, 0.7
-"""A turn this many sigma long is seen; gyro's over pictures' turns; cosine between them."""
+"""Turn, in sigma, from which a turn counts as seen; maximum ratio between the gyro's and the pictures' turns;
+minimum cosine between them.
+"""
 MAX_IMU_LATE_S, MAX_CRANE_LATE_S = 0.05, 0.2
-"""The encoders' latency is estimated, so theirs may be longer."""
+"""Maximum offset of each sensor's stamps, s; the encoders' may be larger, since their latency is
+estimated.
+"""
 LATE_S = np.arange(-50, 51) * 0.02
-"""Delays that are tried."""
+"""Delays that are tried, s."""
 
 
 def refuse_contradictions(
@@ -46,7 +50,7 @@ def refuse_contradictions(
 ) -> None:  # fmt: skip
     """Raise InputError where the pictures show that a unit, an axis or a clock is wrong.
 
-    crane: as stated. Too few steps, or steps that are too short, tell nothing.
+    crane: the readings as stated. Steps that are too few or too short show nothing.
     """
     steps = _steps(sightings, rectifier, shift_ns)
     if len(steps.old_ns) < MIN_STEPS:
@@ -58,14 +62,16 @@ def refuse_contradictions(
 
 
 def _check_encoders(path: Path, steps: SeenSteps, crane: CraneSamples) -> None:
-    place = median_filter(crane.position_m, size=(5, 1), mode="nearest")  # single readings may be wild
+    place = median_filter(crane.position_m, size=(5, 1), mode="nearest")  # against single outliers
     seen_m = np.linalg.norm(steps.way_m, axis=1)
 
     def travelled(late_s: float) -> Float64:
         return _between(steps, crane.stamp_ns, place, late_s) @ crane.yard_from_body_nominal
 
     def compared(late_s: float) -> tuple[float, float] | None:
-        """Median of the ratio, third quartile of the angle (deg); None where too few steps are long."""
+        """Compute the median ratio and the third quartile of the angle (degrees); None where too few steps
+        are long.
+        """
         travel = travelled(late_s)
         read_m = np.linalg.norm(travel, axis=1)
         long = np.maximum(read_m, seen_m) > MIN_WAY_M
@@ -110,14 +116,14 @@ def _check_gyro(path: Path, steps: SeenSteps, imu: ImuSamples) -> None:
     seconds = (steps.new_ns - steps.old_ns)[:, None] / 1e9
 
     def varying(turns: Float64) -> Float64:
-        """Take the constant rate off: the gyro's bias."""
+        """Subtract the constant rate, which is the gyro's bias."""
         known = np.isfinite(turns).all(axis=1)
         time = seconds[known]
         rate = (time * turns[known]).sum(axis=0) / max(float((time**2).sum()), 1e-12)
         return np.asarray(turns - seconds * rate)
 
     def turned(late_s: float) -> tuple[Float64, Float64]:
-        """Turns (K, 3) by gyro and pictures over the steps that both know."""
+        """Compute the turns (K, 3) by gyro and by pictures over the steps that both know."""
         gyro = _between(steps, imu.stamp_ns, angle, late_s)
         known = np.asarray(np.isfinite(gyro).all(axis=1))
         return varying(gyro)[known], varying(np.where(known[:, None], steps.turn, np.nan))[known]
@@ -143,7 +149,7 @@ def _check_gyro(path: Path, steps: SeenSteps, imu: ImuSamples) -> None:
 
     alike = float((gyro * seen).sum()) / max(float(np.linalg.norm(gyro) * np.linalg.norm(seen)), 1e-12)
     late_s = _delay(cost, TURN_SIGMA_RAD)
-    # Half a period of the sway late looks like a wrong sign; the sign is what people get wrong.
+    # A delay of half a sway period looks like a wrong sign, which is the more common mistake.
     if abs(late_s) > MAX_IMU_LATE_S and alike > -MIN_ALIKE:
         raise _wrong_clock(path, "gyro's", late_s)
     if min(by_gyro, by_pictures) > least and alike < MIN_ALIKE:
@@ -155,7 +161,9 @@ def _check_gyro(path: Path, steps: SeenSteps, imu: ImuSamples) -> None:
 
 
 def _delay(cost: Callable[[float], float], sigma: float) -> float:
-    """The delay (s) that explains the steps clearly better than none does; 0 where there is none."""
+    """Estimate the delay (s) of a sensor's stamps if it explains the steps clearly better than none; else
+    0.
+    """
     at_none = cost(0.0)
     if not at_none > sigma**2 / CLEARLY_BETTER:
         return 0.0
@@ -165,7 +173,7 @@ def _delay(cost: Callable[[float], float], sigma: float) -> float:
 
 
 def _mean_square(off: Float64) -> float:
-    """Mean over the known steps, per axis; NaN where too few are known."""
+    """Compute the mean square over the known steps and their axes; NaN where too few are known."""
     known = off[np.isfinite(off).all(axis=1)]
     return float((known**2).mean()) if len(known) >= MIN_STEPS else float("nan")
 
@@ -180,13 +188,15 @@ def _wrong_clock(path: Path, sensor: str, late_s: float) -> InputError:
 
 
 def _steps(sightings: Sequence[Sighting], rectifier: Rectifier, shift_ns: int) -> SeenSteps:
-    """Gather the steps that pictures measured, at most `MAX_STEPS`, evenly."""
+    """Gather the steps that the pictures measured: at most `MAX_STEPS`, evenly spaced."""
     known = [k for k in range(1, len(sightings)) if sightings[k].motion is not None]
     return seen_steps(sightings, known[:: -(-len(known) // MAX_STEPS) or 1], rectifier, shift_ns)
 
 
 def _between(steps: SeenSteps, stamp_ns: Int64, values: Float64, late_s: float) -> Float64:
-    """Differences (K, 3) of a sensor's values over the steps, its stamps `late_s` late; NaN beyond."""
+    """Compute the differences (K, 3) of a sensor's values over the steps, with its stamps taken as `late_s`
+    late; NaN outside its readings.
+    """
     late_ns = seconds_to_ns(late_s)
     old, new = (interpolate_at(at + late_ns, stamp_ns, values) for at in (steps.old_ns, steps.new_ns))
     return np.asarray(new - old)

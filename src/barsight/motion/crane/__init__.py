@@ -1,1 +1,1 @@
-"""The crane's encoders and the body's sway as a trajectory and as a prediction."""
+"""Turn the crane's encoders and the body's sway into a trajectory and a prediction."""

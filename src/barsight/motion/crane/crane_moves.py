@@ -21,22 +21,23 @@ WINDOW_S = 0.35
 MIN_FRAMES, MAX_FRAMES = 8, 300
 FADES = 8
 RATIOS = tuple(2.0**k for k in range(-4, 9, 2))
-"""Power of the errors that go together over that of each place's own."""
+"""Ratios to try of the correlated errors' variance to that of each position's own error."""
 
 
 @dataclass(frozen=True, eq=False)
 class MovedYard:
-    """calibration: yard_from_world. yard_from_body: (3, 3) how the rig hangs, mean over the frames."""
+    """calibration: yard_from_world. yard_from_body: (3, 3) mean attitude of the rig over the frames."""
 
     calibration: YardCalibration
     yard_from_body: Float64
 
 
 def yard_from_moves(trajectory: Trajectory, crane: CraneSamples, shift_ns: int) -> MovedYard | Failed:
-    """Align a trajectory in `world` with the encoders' places of the body.
+    """Align a trajectory in `world` with the encoders' positions of the body.
 
-    Odometry drifts, so neighbours err alike: see `error_correlation`. At most `MAX_FRAMES` places, evenly,
-    are used. Failed `few-points`, and `roll` where the crane moved along one axis only.
+    Odometry drifts, so the errors of neighbours are correlated: see `error_correlation`. At most `MAX_FRAMES`
+    evenly spaced positions are used. Failed `few-points`, and `roll` where the crane moved along one axis
+    only.
     """
     seen, counted, stamps_ns = [], [], []
     for frame in trajectory.frames[:: -(-len(trajectory.frames) // MAX_FRAMES)]:
@@ -67,12 +68,12 @@ def yard_from_moves(trajectory: Trajectory, crane: CraneSamples, shift_ns: int) 
 
 
 def error_correlation(measured: Float64, found: YardCalibration, time_s: Float64) -> Float64:
-    """Model the correlation (N, N) m2 of the errors of places (N, 3), on each axis alike.
+    """Model the covariance (N, N) m2 of the errors of positions (N, 3), the same on each axis.
 
-    Each place has an error of its own and one that fades over a time: odometry drifts. Both sizes and the
-    time are those under which the residuals are likely once the fit has taken up its six unknowns [restricted
-    likelihood: Patterson and Thompson 1971]; all are averaged by their likelihood, since a short way hardly
-    tells a slow drift from the yard's place.
+    Each position has an independent error and one whose correlation fades with time, as odometry drifts. Both
+    sizes and the fading time are those under which the residuals are likely once the fit has taken up its six
+    unknowns [restricted likelihood: Patterson and Thompson 1971]. All candidates are averaged by their
+    likelihood, since a short travel hardly tells a slow drift from an error of the alignment.
     """
     design = design_rows((measured - measured.mean(axis=0)) @ found.alignment.target_from_source.rotation.T)
     free = measured.size - 6
@@ -89,7 +90,7 @@ def error_correlation(measured: Float64, found: YardCalibration, time_s: Float64
             pull = rows.T @ off
             power = float(off @ off - pull @ np.linalg.solve(normal, pull)) / free
             whole = 6 * np.log(np.diag(factor)).sum() + np.linalg.slogdet(normal)[1] + free * np.log(power)
-            # None that go together is held as likely as all ratios.
+            # No correlated errors are taken to be as likely as all ratios together.
             likelihood.append(-whole / 2 + (np.log(len(RATIOS)) if ratio == 0 else 0.0))
             covariance.append(power * spread)
     weight = np.exp(np.array(likelihood) - max(likelihood))

@@ -1,4 +1,4 @@
-"""Find jumps of the encoders and take them off; `jump_window` says what a jump is."""
+"""Find jumps of the encoders and subtract them; `jump_window` defines a jump."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ from barsight.motion.crane.known_motion import KnownMotion
 def find_jumps(
     crane: CraneSamples, known: KnownMotion | None = None, first_ns: int | None = None
 ) -> tuple[EncoderJump, ...]:
-    """Find jumps in the readings as they stand; those that `crane` has already may have any size.
+    """Find jumps in the readings; those that `crane` lists already are allowed for within their sigma.
 
-    first_ns: steps before this stamp aren't sought. The sigma of one that isn't sure is its size, and
-    the size that it is taken to have is 0.
+    first_ns: steps before this stamp aren't sought. A jump that isn't certain is returned with size 0 and its
+    measured size as sigma.
     """
     series = _thinned(crane)
     if len(series.stamp_ns) <= 2 * MIN_SIDE:
@@ -65,8 +65,10 @@ def find_jumps(
 def lost_counts(
     crane: CraneSamples, after: Iterable[EncoderJump], known: KnownMotion | None, min_way_m: float
 ) -> tuple[EncoderJump, ...]:
-    """Select of the jumps after freezes those that are seen, or that could hide: an encoder that loses count
-    misses the way since, `min_way_m` or more, and one that reads absolute places goes on where it should.
+    """Select from the possible jumps after freezes those that are seen and those that could go unnoticed.
+
+    An encoder that loses count misses the travel during the freeze, `min_way_m` or more; one that reads
+    absolute positions continues at the right one.
     """
     series, lost = _thinned(crane), []
     known, sigma_m = known or KnownMotion(), _noise_m(crane, series)
@@ -91,8 +93,8 @@ def lost_counts(
 
 
 def take_off_jumps(crane: CraneSamples, jumps: Iterable[EncoderJump]) -> CraneSamples:
-    """Take jumps off the readings beyond each: which side is right can't be told, and where the crane began
-    is held to be.
+    """Subtract jumps from the readings after each of them. Which side is right can't be told, so the crane's
+    first readings are taken as right.
     """
     place, jumps = crane.position_m.copy(), tuple(sorted(jumps, key=lambda jump: jump.stamp_ns))
     for jump in jumps:
@@ -101,7 +103,7 @@ def take_off_jumps(crane: CraneSamples, jumps: Iterable[EncoderJump]) -> CraneSa
 
 
 def _exact_stamp(crane: CraneSamples, series: CraneSamples, step: FoundStep) -> int:
-    """Find the stamp of the first reading beyond a step, among all readings near it."""
+    """Find the stamp of the first reading beyond a step, among all original readings near it."""
     count = len(step.way_m)
     stamps = series.stamp_ns[step.first : step.first + count]
     way = series.position_m[step.first : step.first + count, step.axis] + step.way_m
@@ -119,7 +121,7 @@ def _exact_stamp(crane: CraneSamples, series: CraneSamples, step: FoundStep) -> 
 
 
 def _thinned(crane: CraneSamples) -> CraneSamples:
-    """Put readings together that come faster than `MAX_RATE_HZ`, each axis by its median."""
+    """Combine readings that come faster than `MAX_RATE_HZ` by their median on each axis."""
     spacing = float(np.median(np.diff(crane.stamp_ns))) if len(crane.stamp_ns) > 1 else 1.0
     together = round(NS_PER_S / MAX_RATE_HZ / spacing)
     if together < 2:
@@ -134,14 +136,16 @@ def _thinned(crane: CraneSamples) -> CraneSamples:
 
 
 def _noise_m(crane: CraneSamples, series: CraneSamples) -> float:
-    """Estimate the sigma of one of the series' readings: as stated, or as seen where that is more."""
+    """Estimate the sigma of one of the series' readings: the stated one, or the observed one if that is
+    larger.
+    """
     together = len(crane.stamp_ns) / len(series.stamp_ns)
     stated = crane.position_std_m * (1.0 if together < 1.5 else (np.pi / 2 / together) ** 0.5)
     return max(stated, _seen_sigma_m(series))
 
 
 def _seen_sigma_m(crane: CraneSamples) -> float:
-    """Estimate the noise of a reading on the noisiest axis, by the median distance from the cubic through two
+    """Estimate a reading's noise on the noisiest axis from its median distance to the cubic through the two
     readings on either side.
     """
     time = (crane.stamp_ns - crane.stamp_ns[:1]) / NS_PER_S
@@ -149,7 +153,7 @@ def _seen_sigma_m(crane: CraneSamples) -> float:
         return 0.0
     around = np.arange(2, len(time) - 2)[:, None] + np.array([-2, -1, 1, 2])
     unit = (time[around] - time[2:-2, None]) / float(np.median(np.diff(time)))
-    weights = np.ones_like(unit)  # Lagrange's, at the reading's own time
+    weights = np.ones_like(unit)  # of Lagrange interpolation at the reading's own time
     for i in range(4):
         for j in range(4):
             if i != j:

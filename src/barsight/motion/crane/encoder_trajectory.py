@@ -26,7 +26,7 @@ from barsight.recording.base import Recording
 CAUCHY_SIGMAS = 3.0
 MIN_FOR_NOISE = 100
 NINE_TENTHS = 0.623
-"""Mean square of the smaller nine in ten of normal residuals, over that of all."""
+"""Mean square of the smallest nine tenths of normally distributed residuals, relative to that of all."""
 
 
 @dataclass(frozen=True)
@@ -34,13 +34,17 @@ class CraneSettings:
     """Encoders and nominal attitude."""
 
     window_s: float = 0.35
-    """Readings up to this far before and after a frame are fitted with a parabola."""
+    """Half-width, in seconds, of the window around a frame whose readings are fitted with a parabola."""
     attitude_std_deg: float = 0.15
-    """How far the body may sway from its nominal attitude (1 sigma, each axis), where no IMU measures it."""
+    """Standard deviation of the body's sway about its nominal attitude (degrees, each axis), where no IMU
+    measures it.
+    """
     sway_window_s: float = 8.0
-    """The gyro's mean and trend this long before and after a frame are taken off: what is left is sway."""
+    """Half-width, in seconds, of the window around a frame over which the gyro's mean and trend are removed;
+    the rest is sway.
+    """
     sway_std_deg: float = 0.02
-    """The attitude's error where the gyro measures the sway (1 sigma, each axis)."""
+    """Standard deviation of the attitude (degrees, each axis) where the gyro measures the sway."""
 
     def __post_init__(self) -> None:
         expect_ranges(
@@ -63,7 +67,7 @@ class EncoderOdometry(TrajectoryEstimator):
 
 
 class EncoderPoses(ImmediatePoses):
-    """`PoseEstimator` from the readings on both sides of a frame."""
+    """`PoseEstimator` that uses the encoder readings on both sides of a frame."""
 
     reads_pictures = False
 
@@ -109,8 +113,8 @@ class EncoderPoses(ImmediatePoses):
 
 @dataclass(frozen=True, eq=False)
 class FittedPosition:
-    """The crane point near a stamp: position_m, velocity_mps, acceleration_mps2 (3,) in `yard`; covariance
-    (3, 3) of the position.
+    """Position of the crane point near a stamp: position_m, velocity_mps, acceleration_mps2 (3,) in `yard`;
+    covariance (3, 3) of the position.
     """
 
     position_m: Float64
@@ -124,12 +128,12 @@ def fit_position(
 ) -> FittedPosition | Failed:
     """Fit the crane point at `stamp_ns` to the readings around it.
 
-    A parabola through the readings within the window (a line where they are fewer than six), by least
-    squares with Cauchy's weights, so that single wild readings don't pull however far off they are. A crane
-    that oscillates follows no parabola: where the IMU knows its way, that is taken off the readings, which
-    are `late_ns` late, before the fit and added again, and only what it leaves open is fitted (a line, whose
-    middle has 4/9 of a parabola's variance, where it knows the acceleration too). Failed `no-encoder` where
-    the readings don't enclose the stamp; readings beyond a jump don't count.
+    Fits a parabola to the readings within the window (a line to fewer than six) by least squares with Cauchy
+    weights, so that isolated outliers have no pull however far off they are. A crane that oscillates follows
+    no parabola. So the travel measured by the IMU, where known, is subtracted from the readings, which are
+    `late_ns` late, before the fit and added again after it, and only what the IMU leaves open is fitted (a
+    line where the acceleration is known too: its middle has 4/9 of a parabola's variance). Failed
+    `no-encoder` where the readings don't enclose the stamp; readings beyond a jump don't count.
     """
     begin_ns, end_ns = stamp_ns - window_ns, stamp_ns + window_ns
     for jump in crane.jumps:
@@ -157,7 +161,7 @@ def fit_position(
     place, velocity = coefficients[0], coefficients[1] / window_s
     bend = 2 * coefficients[2] / window_s**2 if degree == 2 else np.zeros(3)
     if way is None:
-        # What the parabola can't follow is all alike over the window: it doesn't average out.
+        # What the parabola can't follow is a common error of the window: it doesn't average out.
         off = places - np.polynomial.polynomial.polyval(time, coefficients).T
         variance += _misfit_m2(off, degree + 1, crane.position_std_m)
     else:
@@ -167,8 +171,8 @@ def fit_position(
 
 
 def _misfit_m2(off_m: Float64, fitted: int, sigma_m: float) -> float:
-    """Estimate the variance of residuals (N, 3) beyond a reading's own, where that is clearly more, by the
-    smaller nine in ten of them: the rest may be wild.
+    """Estimate the variance of residuals (N, 3) in excess of a reading's own, 0 unless it is clearly larger.
+    Uses the smallest nine tenths of them, since the rest may be outliers.
     """
     free, squares = 3 * (len(off_m) - fitted), np.sort(off_m**2, axis=None)
     seen = float(squares[: int(0.9 * squares.size)].mean()) / NINE_TENTHS * squares.size / free
@@ -178,8 +182,8 @@ def _misfit_m2(off_m: Float64, fitted: int, sigma_m: float) -> float:
 def reestimate_noise(crane: CraneSamples) -> CraneSamples:
     """Re-estimate the readings' sigma from themselves, within a factor of two of the stated one.
 
-    From fourth differences, which no smooth motion passes; their median, so that wild ones don't count. (Each
-    wild reading is in five of them, so the far ones leave before the median.)
+    Uses fourth differences, which suppress any smooth motion, and their median, which is robust to outliers.
+    (Each outlier is in five of them, so the largest ones are removed before the median.)
     """
     if len(crane.stamp_ns) < MIN_FOR_NOISE:
         return crane

@@ -1,15 +1,15 @@
-"""Jumps of the encoders: steps between two neighbouring readings that no motion of the crane explains.
+"""Detect jumps of the encoders: steps between two neighbouring readings that no motion of the crane explains.
 
-The readings of four seconds are held to be the sum of the way as the IMU knows it, of what it leaves open,
-of noise with single wild readings, and of a step s h, h being 0 before a reading and 1 from it on. What is
-left open is a Gaussian process of covariance K: a parabola and the accelerometer's noise, twice integrated;
-where no IMU tells the way, all that a crane may do: oscillations of 0.3 to 3.2 Hz and changes of its
-acceleration. What pictures see of the way between two frames are rows of the same system. So
+The readings of four seconds are modelled as the sum of the travel known from the IMU, the travel that it
+leaves unknown, noise with isolated outliers, and a step s h, where h is 0 before a reading and 1 from it on.
+The unknown travel is a Gaussian process of covariance K: a parabola and the accelerometer's noise, twice
+integrated; without an IMU all that a crane may do: oscillations of 0.3 to 3.2 Hz and changes of its
+acceleration. The travel that the pictures show between two frames adds rows to the same system. So
 
     s = h' K^-1 y / h' K^-1 h,    sigma_s^2 = 1 / h' K^-1 h
 
-[generalised least squares: Aitken 1936], with Cauchy's weights on the noise, and a step is told by how much
-less the whole costs with it than without it, in sigma.
+[generalised least squares: Aitken 1936], with Cauchy weights on the noise. A step's significance, in sigma,
+follows from how much lower the total cost is with it than without it.
 """
 
 from __future__ import annotations
@@ -27,40 +27,46 @@ from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.motion.crane.known_motion import KnownMotion, SeenSteps
 
 HALF_S, STRIDE_S = 2.0, 0.5
-"""A window's half, and how far the next one's middle lies."""
+"""Half the length of a window, and the distance between the middles of neighbouring windows, s."""
 MAX_RATE_HZ = 25.0
-"""Readings that come faster are put together by their median."""
+"""Maximum rate of the readings; those that come faster are combined by their median."""
 MIN_SIDE = 4
-"""So many readings must lie on either side of a step."""
+"""Minimum number of readings on either side of a step."""
 SURE_SIGMAS, MAYBE_SIGMAS = 4.7, 4.0
-"""From here on a step is a jump; from here on it may be one, and binds the readings on its sides less."""
+"""Significance from which a step is a jump, and from which it may be one; a possible jump only loosens the
+tie between the readings on its two sides.
+"""
 BLIND_RATIO = 1.7
-"""Factor on both limits where no IMU tells the way: what a crane may do isn't quite normal, and three
-wild readings on end look like a step."""
+"""Factor on both thresholds where no IMU measures the travel: what a crane may do isn't quite normally
+distributed, and three outliers in a row look like a step.
+"""
 MIN_JUMP_M = 0.004
 WIDE_M = 10.0
 CAUCHY_SIGMAS = 3.0
 ROUNDS, MIN_CHANGE = 12, 0.01
 PLAY_M, PLAY_S = 0.0006, 0.4
-"""Standard deviation of an encoder's lag or skew behind its crane, and its correlation time."""
+"""Standard deviation of an encoder's lag or skew behind its crane, m, and its correlation time, s."""
 LATENCY_SIGMA_S = 0.1
 FREQUENCIES_HZ = np.linspace(0.3, 3.2, 12)
 AMPLITUDES_M = np.minimum(0.015, 1.0 / (2 * np.pi * FREQUENCIES_HZ) ** 2)
-"""A crane oscillates no faster, no further and with no more acceleration than this."""
+"""Amplitudes of a crane's oscillations at `FREQUENCIES_HZ`: limited to 15 mm and to 1 m/s^2."""
 CHANGE_MPS2 = 0.35
-"""Standard deviation of an acceleration's change within a second."""
+"""Standard deviation of the change of the crane's acceleration within a second."""
 ACCEL_DENSITY = 2.5e-3
-"""Of the accelerometer, m/s^2/sqrt(Hz), with what sway and its own alignment add."""
+"""Noise density of the accelerometer, m/s^2/sqrt(Hz), including the effects of sway and of its
+misalignment.
+"""
 JERK_MPS3 = 3e-3
-"""Standard deviation of gravity left by the gyro's trend."""
+"""Standard deviation of the rate at which gravity leaks into the acceleration, left by the gyro's trend."""
 SCALE, ASKEW_RAD = 2e-3, 2.6e-3
-"""Standard deviations of the scale common to the pictures' steps, and of their common angle."""
+"""Standard deviations of the scale and of the angle that all of the pictures' steps have in common."""
 
 
 @dataclass(frozen=True, eq=False)
 class FoundStep:
-    """A step found: on which axis, the first of the series' readings beyond it, by how many sigma (with an
-    IMU; without, so much less), its size, and the way (n,) at the window's readings, which begin at `first`.
+    """Step found on an axis. reading: the first of the series' readings beyond it; sigmas: its significance
+    (without an IMU reduced by `BLIND_RATIO`); way_m: (n,) the travel less the values that the step was fitted
+    to, at the window's readings, which begin at `first`.
     """
 
     axis: int
@@ -73,10 +79,12 @@ class FoundStep:
 
 @dataclass(frozen=True, eq=False)
 class JumpWindow:
-    """N readings and then M steps of the pictures as rows: values (N + M, 3) m, variance (N + M,) of each
-    row's noise, open (3, N + M, N + M) the covariance of all else, per axis. steps (N + M, S) columns of the
-    steps that are sought, of which the first readings beyond are `beyond` (S,); stamp_ns: (N,), of which the
-    first is the series' `first`; by_imu: whether that tells the way.
+    """N readings and then M steps of the pictures as rows.
+
+    values: (N + M, 3) m; variance: (N + M,) of each row's noise; open: (3, N + M, N + M) covariance of
+    everything else, per axis. steps: (N + M, S) columns of the steps that are tested; beyond: (S,) the first
+    reading beyond each. stamp_ns: (N,), whose first reading is the series' `first`; by_imu: whether the IMU
+    measures the travel.
     """
 
     values: Float64
@@ -92,7 +100,7 @@ class JumpWindow:
     def around(
         cls, series: CraneSamples, sigma_m: float, middle_ns: int, known: KnownMotion, half_s: float = HALF_S
     ) -> JumpWindow | None:
-        """Gather what is known around a stamp; None where that is too little for any step."""
+        """Gather the measurements around a stamp; None where they are too few for any step."""
         first, end = np.searchsorted(series.stamp_ns, known.span(middle_ns, seconds_to_ns(half_s)))
         stamps, place = series.stamp_ns[first:end], series.position_m[first:end]
         count = len(stamps)
@@ -128,7 +136,7 @@ class JumpWindow:
         )  # fmt: skip
 
     def largest_step(self, axis: int, jumps: Sequence[EncoderJump]) -> FoundStep | None:
-        """Find the step on one axis that is most sure, beside the jumps there; None where there is none."""
+        """Find the most significant step on one axis besides the given jumps; None where there is none."""
         values, open_m2 = self.values[:, axis], self.open[axis]
         if jumps:
             open_m2 = open_m2 + self._jumped(jumps)
@@ -147,19 +155,19 @@ class JumpWindow:
         return FoundStep(axis, self.first + int(self.beyond[k]), sigmas, fit.size_m, self.first, way)
 
     def step_at(self, axis: int, stamp_ns: int) -> tuple[float, float]:
-        """Fit a step from a stamp on: its size and sigma, m."""
+        """Fit a step at a stamp; return its size and sigma, m."""
         step = np.zeros(len(self.values))
         step[: len(self.stamp_ns)] = self.stamp_ns >= stamp_ns
         fit = self._robust(self.values[:, axis], self.open[axis], step)
         return fit.size_m, fit.sigma_m
 
     def _jumped(self, jumps: Sequence[EncoderJump]) -> Float64:
-        """Compute the covariance (N + M, N + M) of what jumps leave open."""
+        """Compute the covariance (N + M, N + M) of the jumps' unknown sizes and of readings next to them."""
         stamps, near = self.stamp_ns, seconds_to_ns(1.3 / MAX_RATE_HZ)
         columns, unsure = np.zeros((len(self.values), len(jumps))), np.zeros(len(self.values))
         for k, jump in enumerate(jumps):
             columns[: len(stamps), k] = jump.sigma_m * jump.share(stamps)
-            # Which side the next readings are on isn't always known.
+            # It isn't always known on which side of the jump the nearest readings are.
             unsure[: len(stamps)][np.abs(stamps - jump.stamp_ns) < near] = WIDE_M**2
         return np.asarray(columns @ columns.T + np.diag(unsure))
 
@@ -173,7 +181,7 @@ class JumpWindow:
         return fit
 
     def _weighted(self, values: Float64, open_m2: Float64, step: Float64, weight: Float64) -> _Fit:
-        """Fit with given weights; a step (N + M,) of zeros fits none."""
+        """Fit with given weights; if step (N + M,) is all zeros, no step is fitted."""
         noise = self.variance / weight
         factor = cholesky(open_m2 + np.diag(noise))
         right = solve_lower(factor, np.column_stack([values, step, self.steps]))
@@ -194,8 +202,9 @@ class JumpWindow:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """size_m, sigma_m: of the step. cost: minus the logarithm of the likelihood. sigmas (S,): of each step
-    that is sought, beside the fitted one. off (N + M,): residuals in sigma; way_m (N + M,) without the step.
+    """Fit of a window. size_m, sigma_m: of the step. cost: negative log-likelihood. sigmas: (S,) of each
+    tested step in addition to the fitted one. off: (N + M,) residuals in sigma; way_m: (N + M,) the travel
+    without the step.
     """
 
     size_m: float
@@ -212,7 +221,9 @@ class _Fit:
 
 
 def _unknown_way(time: Float64, by_imu: bool) -> Float64:
-    """Compute the covariance (n, n) m2 of the way at times (n,) s, but for what the IMU tells."""
+    """Compute the covariance (n, n) m2 of the unknown travel at times (n,) s, given the IMU's if there is
+    one.
+    """
     middle = time - (time[0] + time[-1]) / 2
     near = np.minimum(time[:, None], time)
     apart = np.abs(time[:, None] - time)
@@ -229,19 +240,19 @@ def _unknown_way(time: Float64, by_imu: bool) -> Float64:
 
 
 def _differences(steps: int) -> Float64:
-    """Make the matrix (M, 2 M) that subtracts the first half of the places from the second."""
+    """Make the matrix (M, 2 M) that subtracts the first half of the positions from the second."""
     return np.hstack([-np.eye(steps), np.eye(steps)])
 
 
 def _seen_speed(seen: SeenSteps, way: Float64, stamps: Int64) -> Float64:
-    """Interpolate the speed (n, 3) m/s at the stamps by the pictures' ways (M, 3)."""
+    """Interpolate the speed (n, 3) m/s at the stamps from the displacements (M, 3) that the pictures show."""
     middle, seconds = (seen.old_ns + seen.new_ns) // 2, (seen.new_ns - seen.old_ns) / NS_PER_S
     return np.column_stack([np.interp(stamps, middle, part) for part in (way / seconds[:, None]).T])
 
 
 def _columns(speed: Float64, way: Float64, axis: int) -> Float64:
-    """Make columns (n + M, 3) of what one axis leaves open beside its way, each in its sigma: the latency,
-    how long and how askew the pictures' steps are.
+    """Make columns (n + M, 3) of one axis's unknowns besides its travel, each scaled by its sigma: the
+    latency, and scale and angle of the pictures' steps.
     """
     across = np.linalg.norm(np.delete(way, axis, axis=1), axis=1)
     return block_diag(

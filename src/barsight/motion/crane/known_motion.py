@@ -1,4 +1,4 @@
-"""Gather what pictures and IMU say of the crane's way, to hold encoder readings against it."""
+"""Gather what pictures and IMU show of the crane's travel, for comparison with encoder readings."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ from barsight.inertial.model import GRAVITY_MPS2, ImuBias
 from barsight.motion.crane.sway import MAX_GAP_S, turned_angle
 
 TREND_S = 20.0
-"""The gyro's mean and trend over this long are taken off."""
+"""Duration, s, over which the gyro's mean and trend are removed."""
 MIN_TREND_S = 3.0
 
 
 @dataclass(frozen=True, eq=False)
 class SeenSteps:
-    """K steps between frames by the pictures. old_ns, new_ns: (K,) by the encoders' clock; turn: (K, 3)
-    rotation vector old body from new body; way_m: (K, 3) in the old body's axes; sigma_m: (K,) on each axis.
+    """K steps between frames as the pictures show them. old_ns, new_ns: (K,) by the encoders' clock; turn:
+    (K, 3) rotation vector old body from new body; way_m: (K, 3) in the old body's axes; sigma_m: (K,) of
+    way_m on each axis.
     """
 
     old_ns: Int64
@@ -32,7 +33,7 @@ class SeenSteps:
     sigma_m: Float64
 
     def chosen(self, first_ns: int, last_ns: int) -> SeenSteps:
-        """Select the steps that lie within two stamps."""
+        """Select the steps that lie entirely between two stamps."""
         inside = (self.old_ns >= first_ns) & (self.new_ns <= last_ns)
         return SeenSteps(
             self.old_ns[inside], self.new_ns[inside], self.turn[inside], self.way_m[inside],
@@ -42,13 +43,15 @@ class SeenSteps:
 
 @dataclass(frozen=True, eq=False)
 class KnownMotion:
-    """The way as pictures and IMU know it; either may be None."""
+    """Travel as pictures and IMU know it; either may be None."""
 
     steps: SeenSteps | None = None
     imu: ImuSamples | None = None
 
     def span(self, middle_ns: int, half_ns: int) -> tuple[int, int]:
-        """Return the stamps around one, `half_ns` on either side, but no further than the IMU knows."""
+        """Return the first and last stamp of the interval `half_ns` to either side of one, limited to what
+        the IMU covers.
+        """
         first, end = middle_ns - half_ns, middle_ns + half_ns + 1
         if self.imu is not None and self.imu.stamp_ns[0] <= middle_ns <= self.imu.stamp_ns[-1]:
             return max(first, int(self.imu.stamp_ns[0])), min(end, int(self.imu.stamp_ns[-1]) + 1)
@@ -77,15 +80,15 @@ class KnownMotion:
         angle -= np.polynomial.polynomial.polyval(time, np.polynomial.polynomial.polyfit(time, angle, 1)).T
         turned = crane.yard_from_body_nominal @ Rotation.from_rotvec(angle[begin:end]).as_matrix()
         force = np.einsum("nij,nj->ni", turned, imu.accel_mps2[begin:end])
-        force -= force.mean(axis=0)  # gravity and the biases, which whoever reads this leaves open
+        force -= force.mean(axis=0)  # removes gravity and the biases, which the caller leaves open
         return ImuWay.integrate(stamps[begin:end], force, 2)
 
 
 @dataclass(frozen=True, eq=False)
 class ImuWay:
-    """The way by the IMU alone, but for a polynomial of `open_degree`: a parabola where gravity and bias are
-    open, a line where they are known. stamp_ns: (N,); acceleration_mps2, speed_mps, place_m: (N, 3) in the
-    reference.
+    """Travel by the IMU alone, known up to a polynomial of degree `open_degree`: a parabola where gravity and
+    bias are unknown, a line where they are known. stamp_ns: (N,); acceleration_mps2, speed_mps, place_m:
+    (N, 3) in the reference.
     """
 
     stamp_ns: Int64
@@ -104,7 +107,7 @@ class ImuWay:
         return cls(stamp_ns, acceleration_mps2, speed, place, open_degree)
 
     def place_at(self, stamp_ns: Int64) -> Float64:
-        """Interpolate the place (M, 3)."""
+        """Interpolate the position (M, 3)."""
         return interpolate_at(stamp_ns, self.stamp_ns, self.place_m)
 
     def speed_at(self, stamp_ns: Int64) -> Float64:
@@ -119,7 +122,8 @@ class ImuWay:
 def way_around(
     imu: ImuSamples, stamp_ns: int, half_ns: int, rotation: Float64, bias: ImuBias, open_degree: int
 ) -> ImuWay | None:
-    """Integrate the IMU from `half_ns` before a stamp to as long after it; None where it doesn't cover that.
+    """Integrate the IMU from `half_ns` before a stamp to `half_ns` after it; None where it doesn't cover
+    that.
 
     rotation: (3, 3) reference_from_body at the stamp; open_degree: 1 where it and the bias are known, else 2.
     """

@@ -1,4 +1,4 @@
-"""Fit a robust parabola through readings: the live estimate fits several a frame."""
+"""Fit a robust parabola to readings, compiled: the live estimate fits several per frame."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ ROUNDS = 10
 
 @kernel()
 def fit_parabola(time: Float64, values: Float64, length: float, result: Float64) -> None:
-    """Fit least squares with Cauchy's robust weights, which fall from residuals of `length` on.
+    """Fit by least squares with robust Cauchy weights, which fall off for residuals beyond `length`.
 
     time: (N,), about -1...1; values (N, 3). result: (P, 4) the P coefficients, lowest power first, and the
-    first column of their covariance where a reading's variance is 1.
+    first column of their covariance for a reading's variance of 1.
     """
     size = len(result)
     weight, normal, power = np.ones(len(time)), np.empty((size, size)), np.empty(size)

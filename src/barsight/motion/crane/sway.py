@@ -1,7 +1,7 @@
 """Estimate the body's sway about its nominal attitude from the gyro.
 
-A gantry keeps its attitude on average, so the integrated gyro without its mean and trend over some seconds
-is the sway: the mean stands for the unknown start, the trend for the gyro's bias.
+A gantry keeps its attitude on average, so the sway is the integrated gyro less its mean and trend over some
+seconds: the mean accounts for the unknown initial attitude, the trend for the gyro's bias.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ MAX_GAP_S = 0.2
 
 
 def turned_angle(imu: ImuSamples) -> Float64:
-    """Integrate the gyro (N, 3) by the trapezium rule, rad, body axes: good for turns of a few degrees."""
+    """Integrate the gyro to angles (N, 3) rad in body axes by the trapezium rule; valid for turns of a few
+    degrees.
+    """
     step_s = np.diff(imu.stamp_ns)[:, None] / NS_PER_S
     between = (imu.gyro_radps[1:] + imu.gyro_radps[:-1]) / 2 * step_s
     return np.vstack([np.zeros((1, 3)), np.cumsum(between, axis=0)])
@@ -27,8 +29,8 @@ def turned_angle(imu: ImuSamples) -> Float64:
 def sway_at(imu: ImuSamples, stamp_ns: int, half_window_s: float) -> Float64 | Failed:
     """Compute the rotation vector (3,) `nominal body from body` at a stamp, rad.
 
-    The trend is fitted over half_window_s before and after. Failed `no-imu` where the samples don't enclose
-    the stamp, leave a gap there or span less than 4 s.
+    The trend is fitted over `half_window_s` before and after the stamp. Failed `no-imu` where the samples
+    don't enclose the stamp, have a gap there or span less than 4 s.
     """
     window = seconds_to_ns(half_window_s)
     first, last = np.searchsorted(imu.stamp_ns, (stamp_ns - window, stamp_ns + window))

@@ -1,1 +1,1 @@
-"""The fixed-lag smoother: poses while the crane travels."""
+"""Smooth with a fixed lag: poses while the crane travels."""

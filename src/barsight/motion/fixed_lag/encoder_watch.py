@@ -1,7 +1,7 @@
-"""Watch the encoders while the crane travels: jumps and freezes as soon as they show.
+"""Watch the encoders while the crane travels, to find jumps and freezes as soon as they show.
 
-Once all readings held lie beyond several jumps of one encoder, only the sum of these shows, and it is held
-in their place, so that neither the unknowns nor the time grow with what is past.
+Once all readings held come after several jumps of one encoder, only the sum of these jumps can be observed.
+It then replaces them, so that neither the number of unknowns nor the time grows with what is past.
 """
 
 from __future__ import annotations
@@ -25,12 +25,14 @@ from barsight.motion.fixed_lag.sliding_window import Window
 from barsight.motion.problem.problem import MarginalPrior, encoder_unknowns_of
 
 NEWEST_S = 2.5
-"""Jumps are sought in so much of what came last: one shows more clearly the longer it is past."""
+"""Duration, s, of the newest readings in which jumps are sought: a jump shows more clearly as readings
+follow.
+"""
 
 
 class EncoderWatch:
-    """Encoder faults so far. jumps: those that the readings held need, in time's order; told: every one that
-    was found; frozen: stamps of the first and last frozen readings.
+    """Encoder faults so far. jumps: those that the readings held need, in order of time; told: every jump
+    that was found; frozen: stamps of the first and last reading of each freeze.
     """
 
     def __init__(self) -> None:
@@ -39,12 +41,12 @@ class EncoderWatch:
         self.frozen: list[tuple[int, int]] = []
 
     def check(self, crane: CraneSamples, known: KnownMotion) -> None:
-        """Look for faults in the newest readings. crane: as they came."""
+        """Look for faults in the newest readings. crane: the readings as they came."""
         if not len(crane.stamp_ns):
             return
         stamps, place = crane.stamp_ns, crane.position_m
         parts = [(int(stamps[first]), int(stamps[last])) for first, last in frozen_stretches(crane)]
-        if self.frozen and self.frozen[-1][1] >= stamps[0]:  # one that began before these readings may go on
+        if self.frozen and self.frozen[-1][1] >= stamps[0]:  # a freeze from before these readings may go on
             begin, end = self.frozen[-1]
             k = int(np.searchsorted(stamps, end))
             while k + 1 < len(stamps) and stamps[k] >= end and (place[k + 1] == place[k]).all():
@@ -59,8 +61,8 @@ class EncoderWatch:
         self._add(find_jumps(replace(usable, jumps=self.jumps), known, newest_ns))
 
     def put_together(self, begin_ns: int) -> dict[EncoderJump, tuple[EncoderJump, ...]]:
-        """Put the jumps of each encoder together that no reading held, from `begin_ns` on, is before; return
-        which, by what they became.
+        """Replace the jumps of each encoder that lie before all readings held, from `begin_ns` on, by their
+        sum; return the replaced jumps by their sum.
         """
         found: dict[EncoderJump, tuple[EncoderJump, ...]] = {}
         for axis in range(3):
@@ -74,7 +76,7 @@ class EncoderWatch:
         return found
 
     def usable(self, crane: CraneSamples) -> CraneSamples:
-        """Return readings without the frozen ones, jumps taken off."""
+        """Return the readings without the frozen ones and with the jumps subtracted."""
         since = int(crane.stamp_ns[0]) if len(crane.stamp_ns) else 0
         return take_off_jumps(without_frozen(crane, self._frozen_since(since))[0], self.jumps)
 
@@ -87,7 +89,7 @@ class EncoderWatch:
 
 
 def with_jumps(window: Window, jumps: tuple[EncoderJump, ...]) -> Window:
-    """Make jumps that were found since unknowns of a window."""
+    """Add newly found jumps to a window as unknowns."""
     problem = window.problem
     added = tuple(jump for jump in jumps if jump not in problem.jumps)
     if not added or not problem.has_latency:
@@ -103,10 +105,9 @@ def with_jumps(window: Window, jumps: tuple[EncoderJump, ...]) -> Window:
 
 
 def with_sums(window: Window, sums: dict[EncoderJump, tuple[EncoderJump, ...]]) -> Window:
-    """Make jumps that all nodes held and to come lie beyond one unknown of a window: their sum.
+    """Replace jumps that lie before all present and future nodes of a window by one unknown: their sum.
 
-    What the window knows of the sum is what it knew before, since no residual is moved by anything else of
-    them.
+    The window knows as much of the sum as before, since no residual depends on the single jumps otherwise.
     """
     problem, values = window.problem, gtsam.Values(window.state.values)
     if not problem.has_latency:
@@ -127,13 +128,13 @@ def with_sums(window: Window, sums: dict[EncoderJump, tuple[EncoderJump, ...]]) 
 
 
 def sum_unknowns(prior: MarginalPrior, at: Int64) -> MarginalPrior:
-    """Put a sum of unknowns in the first one's place and marginalise the others. at: (J,) their places in
+    """Replace the first of some unknowns by their sum and marginalise the others. at: (J,) their indices in
     the border.
     """
     first = len(prior.matrix) - len(prior.border)
     others = first + at[1:]
     kept = np.delete(np.arange(len(prior.matrix)), others)
-    # The first is the sum less the others.
+    # The first unknown is the sum minus the others.
     matrix, gradient, border = prior.matrix.copy(), prior.gradient.copy(), prior.border.copy()
     gradient[others] -= gradient[first + at[0]]
     matrix[others] -= matrix[first + at[0]]
@@ -148,7 +149,7 @@ def sum_unknowns(prior: MarginalPrior, at: Int64) -> MarginalPrior:
 
 
 def _widened(prior: MarginalPrior, old: int, sigmas_m: Float64) -> MarginalPrior:
-    """Add unknowns of these sigmas to a prior whose border begins with `old` of the encoders."""
+    """Add unknowns with these sigmas to a prior, after the `old` unknowns of the encoders in its border."""
     at = len(prior.matrix) - len(prior.border) + old
     where, none = np.full(len(sigmas_m), at), np.zeros(len(sigmas_m))
     matrix = np.insert(np.insert(prior.matrix, where, 0.0, axis=0), where, 0.0, axis=1)

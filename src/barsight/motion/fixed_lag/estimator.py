@@ -1,7 +1,7 @@
-"""Estimate while the crane travels (fixed lag): each frame's pose from what is known when it comes.
+"""Estimate while the crane travels (fixed lag): each frame's pose from what is known when it arrives.
 
-The same factors as the batch estimate's, over the last few frames; what leaves stays as a prior, so time and
-memory don't grow with the way.
+The factors are those of the batch estimate, over the last few frames. What leaves the window stays as a
+prior, so time and memory don't grow with the travel.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class FixedLagSettings:
     """The estimate while travelling."""
 
     frames: int = 8
-    """Frames held at a time."""
+    """Number of frames held in the window at a time."""
 
     def __post_init__(self) -> None:
         expect_ranges(self, "live.", frames=(3, 100))
@@ -40,8 +40,8 @@ class FixedLagSettings:
 
 @dataclass(frozen=True)
 class FixedLagFusion(TrajectoryEstimator):
-    """Estimates without looking ahead: `yard` with encoders, else `world`, whose upright is the first
-    second's.
+    """Estimates without looking ahead; the reference is `yard` with encoders, else `world`, whose vertical is
+    taken from the first second.
     """
 
     begins_early = True
@@ -51,8 +51,8 @@ class FixedLagFusion(TrajectoryEstimator):
     crane: CraneSettings
 
     def begin(self, recording: Recording, rectifier: Rectifier) -> FixedLagPoses:
-        """Begin; without encoders the IMU's first second must be there. Raises MeasurementError where no
-        sensor that places the body is left to use.
+        """Begin; without encoders the IMU's first second must already be there. Raises MeasurementError where
+        no sensor that places the body is left to use.
         """
         return FixedLagPoses(self, recording, rectifier)
 
@@ -91,7 +91,7 @@ class FixedLagPoses(ImmediatePoses):
 
     @property
     def navigation(self) -> NavigationState | None:
-        """Return the last state that was estimated; None before the first."""
+        """Return the latest estimated state; None before the first."""
         window = self._estimator.window
         return None if window is None or window.newest is None else window.navigation
 
@@ -115,7 +115,7 @@ class FixedLagPoses(ImmediatePoses):
         )  # fmt: skip
 
     def _readings(self) -> SensorBuffer:
-        """Read the sensors as they stand."""
+        """Read the sensors' readings so far."""
         recording, use = self._recording, self._use
         return SensorBuffer(
             recording.crane() if "crane" in use else None, recording.imu() if "imu" in use else None,

@@ -1,7 +1,7 @@
 """Propagate the last estimate by IMU and encoders: poses between pictures and after the last one.
 
-An error-state Kalman filter [Solà 2017, section 5] that begins anew at each estimate of the window. Without
-an IMU, or where it is silent, the body keeps its attitude and its velocity walks.
+An error-state Kalman filter [Solà 2017, section 5] that starts anew from each estimate of the window. Without
+an IMU, or where it is silent, the attitude is held and the velocity follows a random walk.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ ACCELERATION_DENSITY = 0.3
 SWAY_DENSITY_RADPS = 6e-3
 """Noise density of the turn rate where no IMU measures it, rad/s/sqrt(Hz)."""
 GATE_SIGMAS = 5.0
-"""An encoder reading further off is not used: it jumped, or froze."""
+"""Gate, in sigma, beyond which an encoder reading isn't used: the encoder has jumped or frozen."""
 REFERENCE_S = 0.25
-"""Readings so far about the estimate tell where the encoders were then."""
+"""Half-width, s, of the window of readings that give the encoders' position at the estimate's stamp."""
 _SIZE = 15
 _TURN, _PLACE, _SPEED, _ACCEL, _GYRO, _OFFSET = (slice(k, k + 3) for k in range(0, _SIZE + 3, 3))
 
 
 @dataclass(frozen=True, eq=False)
 class NavigationState:
-    """The window's last node. stamp_ns: on the IMU's clock. target: its frame, `yard` or `world`.
+    """State of the window's last node. stamp_ns: on the IMU's clock. target: its frame, `yard` or `world`.
 
     covariance: (15, 15) of rotation (rad, body axes), position (m) and velocity (m/s, both in the reference's
     axes), accelerometer's and gyro's bias.
@@ -50,7 +50,7 @@ class NavigationState:
 
     @property
     def row(self) -> Float64:
-        """Return its numbers, (`ROW_NUMBERS`,), but for the stamp."""
+        """Return all numbers of the state but its stamp as a row (`ROW_NUMBERS`,)."""
         body, bias = self.body, self.bias
         motion = (float(self.target == "yard"), body.rotation, body.position_m, body.velocity_mps)
         parts = (*motion, bias.accel_mps2, bias.gyro_radps, self.covariance)
@@ -70,7 +70,7 @@ ROW_NUMBERS = 1 + 9 + 4 * 3 + _SIZE**2
 class Propagator:
     """Propagates a `NavigationState` by the readings that come after it.
 
-    crane: its readings about the state, None without encoders. has_imu: whether the IMU gives readings.
+    crane: the readings around the state, None without encoders. has_imu: whether there are IMU readings.
     """
 
     def __init__(
@@ -91,13 +91,13 @@ class Propagator:
             found = fit_position(crane, state.stamp_ns, seconds_to_ns(REFERENCE_S))
             if not isinstance(found, Failed):
                 self._encoders = body.position_m - found.position_m, crane.position_std_m
-                # The offset errs by the state's place and by the encoders' there.
+                # The offset has the errors of the state's position and of the encoders' at that stamp.
                 self._covariance[_OFFSET, :_SIZE] = state.covariance[_PLACE]
                 self._covariance[:_SIZE, _OFFSET] = state.covariance[:, _PLACE]
                 self._covariance[_OFFSET, _OFFSET] = state.covariance[_PLACE, _PLACE] + found.covariance
 
     def take(self, imu_ns: Int64, imu: Float64, crane_ns: Int64, places_m: Float64) -> None:
-        """Take the readings that came since the last call, in the order of their stamps.
+        """Process the readings that came since the last call, in the order of their stamps.
 
         imu: (N, 6) turn rate and specific force. places_m: (M, 3).
         """
@@ -109,7 +109,9 @@ class Propagator:
                 self._correct(int(crane_ns[k - len(imu_ns)]), places_m[k - len(imu_ns)])
 
     def at(self, stamp_ns: int) -> PosedFrame:
-        """Return the pose at a stamp (IMU's clock) after the last reading taken, without taking it."""
+        """Predict the pose at a stamp (IMU's clock) after the last reading; the filter's state stays as it
+        is.
+        """
         rotation, position, _, covariance = self._moved(max(stamp_ns, self.stamp_ns))
         turned = np.zeros((6, _SIZE + 3))
         turned[:3, _TURN], turned[3:, _PLACE] = rotation, np.eye(3)
@@ -117,7 +119,7 @@ class Propagator:
         return PosedFrame(stamp_ns, pose, turned @ covariance @ turned.T)
 
     def _measure(self, stamp_ns: int, reading: Float64) -> None:
-        """Move to an IMU reading by its mean with the one before."""
+        """Move to the stamp of an IMU reading, by its mean with the reading before."""
         rate, force = reading[:3] - self._bias.gyro_radps, reading[3:] - self._bias.accel_mps2
         if self._is_measured and stamp_ns > self.stamp_ns:
             self._rate, self._force = (self._rate + rate) / 2, (self._force + force) / 2
@@ -128,7 +130,7 @@ class Propagator:
         self._imu_ns = max(stamp_ns, self._imu_ns)
 
     def _correct(self, stamp_ns: int, place_m: Float64) -> None:
-        """Update by an encoder reading, less that at the state begun with."""
+        """Update by an encoder reading, relative to the encoders' position at the initial state."""
         if self._encoders is None:
             return
         self._move(stamp_ns)
@@ -161,7 +163,7 @@ class Propagator:
 
     def _moved(self, stamp_ns: int) -> tuple[Float64, Float64, Float64, Float64]:
         """Return rotation, position, velocity and covariance at a later stamp, by the last rate and force
-        as long as the IMU isn't silent.
+        unless the IMU is silent.
         """
         seconds, rate, force = (stamp_ns - self.stamp_ns) / NS_PER_S, self._rate, self._force
         gravity = np.array([0.0, 0.0, GRAVITY_MPS2])

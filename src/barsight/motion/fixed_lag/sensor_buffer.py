@@ -1,4 +1,4 @@
-"""Hold encoder and IMU readings up to now."""
+"""Hold the encoder and IMU readings up to now."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.core.records.sensor_samples import CraneSamples, ImuSamples
 
 SENSOR_DELAY_S = 0.06
-"""A frame is computed once readings this much later are there."""
+"""Delay, s, after a frame's stamp until which readings are awaited before the frame is computed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +22,7 @@ class SensorBuffer:
     noise: ImuNoise
 
     def between(self, first_ns: int, last_ns: int) -> SensorBuffer:
-        """Select those within the stamps."""
+        """Select the readings between two stamps."""
         crane, imu = self.crane, self.imu
         if crane is not None:
             part = slice(*np.searchsorted(crane.stamp_ns, (first_ns, last_ns)))

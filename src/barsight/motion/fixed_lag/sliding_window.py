@@ -1,7 +1,8 @@
-"""Hold the fixed-lag window: the last few frames' unknowns and factors; what leaves stays as a prior.
+"""Hold the fixed-lag window: unknowns and factors of the last few frames; what leaves stays as a prior.
 
-A point begins anew after as many frames as the window holds, each at another frame than its neighbours. So
-every point that was seen at a frame which leaves has ended and is taken out whole, each sighting used once.
+A point begins anew after as many frames as the window holds, neighbouring points at different frames. So
+every point that was seen at a leaving frame has ended and is eliminated as a whole, each sighting being used
+once.
 """
 
 from __future__ import annotations
@@ -28,12 +29,15 @@ from barsight.motion.problem.stereo_factors import initial_points
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """problem: of the nodes held, numbered from 0, and what their frames saw, sigma as stated. state: the
-    unknowns, points named by `names` (T,), NaN as long as they were seen once. slide: a turn of all pictures
-    about the camera's axis, rad. frames: how many there were yet; frame_nodes: those held. noise:
-    sightings' sigma as they show it over the stated one. newest: the last node's covariance; drift_covariance
-    (2, 2) of the rig's drift. seen_ns, placed_ns: stamps of the last node that pictures saw and of the last
-    that encoders placed; stood: whether the attitude at rest has been told.
+    """Contents of the fixed-lag window.
+
+    problem: of the nodes held, numbered from 0, with their frames' sightings and stated sigmas. state: the
+    unknowns; points, named by `names` (T,), are NaN while they have been seen only once. slide: turn of all
+    pictures about the camera's axis, rad. frames: number of frames so far; frame_nodes: nodes of the frames
+    held. noise: factor on the stated sigmas of the sightings, from their residuals. newest: covariance of the
+    last node; drift_covariance: (2, 2) of the rig's drift. seen_ns, placed_ns: stamps of the last node with a
+    picture and of the last one with an encoder position; stood: whether the prior of the attitude at rest has
+    been added.
     """
 
     problem: Problem
@@ -57,7 +61,7 @@ class Window:
 
     @property
     def body(self) -> BodyState:
-        """Return the last node's state, with an IMU."""
+        """Return the last node's state; needs an IMU."""
         last = len(self.problem.start) - 1
         pose = self.pose(last)
         return BodyState(pose.rotation, pose.translation, np.asarray(self.state.values.atVector(V(last))))
@@ -88,8 +92,8 @@ class Window:
 
     @property
     def navigation(self) -> NavigationState:
-        """Return the last node as a state to propagate; without an IMU its velocity is that since the frame
-        before.
+        """Return the last node as a state to propagate; without an IMU its velocity is the mean one since the
+        frame before.
         """
         assert self.newest is not None
         last = len(self.problem.start) - 1
@@ -117,8 +121,8 @@ def add_nodes(
     window: Window, stamp_ns: list[int], poses: list[Pose], velocity_mps: list[Float64],
     parts: tuple[Preintegrated | None, ...],
 ) -> Window:  # fmt: skip
-    """Add nodes at later stamps (IMU's clock), started at the given poses and velocities; parts: the motion
-    to each from the node before.
+    """Add nodes at later stamps (IMU's clock), initialised with the given poses and velocities; parts: the
+    motion to each of them from the node before.
     """
     values, problem = gtsam.Values(window.state.values), window.problem
     bias = gtsam.imuBias.ConstantBias(window.bias.accel_mps2, window.bias.gyro_radps)
@@ -137,7 +141,7 @@ def add_nodes(
 def add_frame(
     window: Window, sighting: Sighting | None, camera: RectifiedCamera, body_from_rect0: Pose, held: int
 ) -> Window:
-    """Make the last node a frame that shows `sighting`; points begin anew every `held` frames."""
+    """Make the last node a frame with this `sighting`; points begin anew every `held` frames."""
     node, count = len(window.problem.start) - 1, window.frames
     grew = replace(window, frames=count + 1, frame_nodes=(*window.frame_nodes, node))
     if sighting is None:
@@ -164,7 +168,7 @@ def add_frame(
 
 
 def _placed(window: Window) -> Float64:
-    """Collect the points (T, 4), those seen once where that sighting has them."""
+    """Collect the points (T, 4); those seen only once are initialised from that sighting."""
     points = window.state.points.copy()
     new = np.flatnonzero(np.isnan(points[:, 0]))
     if len(new):

@@ -1,7 +1,7 @@
 """Update the fixed-lag estimate frame by frame: new nodes, their factors, solution, marginalisation.
 
-Sensors are read no further than they would have come; the encoders' place of a node joins as soon as the
-readings after it do.
+Sensors are read only as far as their readings would have arrived. A node's encoder position is added as soon
+as the readings after the node are there.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ from barsight.motion.problem.nodes import (
 from barsight.motion.problem.problem import AttitudePrior, Problem
 
 RECENT_FRAMES = 40
-"""So many of the last frames' motions are held against the encoders."""
+"""Number of the latest frames whose motions are compared with the encoders."""
 LOOK_BACK_S = 6.0
-"""What is held of IMU and encoders before the first node held."""
+"""Duration, s, of the IMU and encoder readings kept from before the first node held."""
 FIT_S = PLACE_SPACING_S / 2 + 0.01
 
 
 class FixedLagEstimator:
-    """Fixed-lag estimator that holds `held` frames; `window` is all that it knows, beside the `readings`."""
+    """Fixed-lag estimator that holds `held` frames; `window` is all that it knows, besides the `readings`."""
 
     def __init__(
         self, settings: FusionSettings, crane: CraneSettings, held: int, rectifier: Rectifier, shift_ns: int,
@@ -69,7 +69,7 @@ class FixedLagEstimator:
         self._failed = False
 
     def predict(self, old_ns: int, new_ns: int) -> PredictedMotion | None:
-        """Predict the motion as a `Predictor`: by the IMU from the last estimate, else by encoders; None
+        """Predict the motion as a `Predictor` does: by the IMU from the last estimate, else by encoders; None
         without either.
         """
         window, now = self.window, self._now(new_ns)
@@ -90,11 +90,11 @@ class FixedLagEstimator:
         return CranePredictor(now.crane, now.imu, bias, self._rectifier, self._shift_ns)(old_ns, new_ns)
 
     def take(self, seen: Sighting | RefusedFrame) -> PosedFrame | RefusedFrame:
-        """Estimate the frame's pose, or say why it has none."""
+        """Estimate the frame's pose, or return why it has none."""
         stamp = seen.stamp_ns + self._shift_ns
         sighting = seen if isinstance(seen, Sighting) else None
         if sighting is not None:
-            # Without its points: memory doesn't grow with them.
+            # The points are dropped, so that memory doesn't grow with them.
             none = slice(0, 0)
             points = {name: getattr(sighting, name)[none] for name in ("track", "stereo", "sigma_px")}
             self.motions.append(replace(sighting, **points))
@@ -120,7 +120,7 @@ class FixedLagEstimator:
             window, leaving = solve_window(window, self._held)
         except np.linalg.LinAlgError:
             if self._failed and now.crane is not None:
-                self.window = None  # what is held may be the cause, and encoders know where to begin anew
+                self.window = None  # the window may be the cause, and encoders can place a new one
             self._failed = True
             return RefusedFrame(seen.stamp_ns, "the sensors together have no solution here")
         self._failed = False
@@ -136,7 +136,9 @@ class FixedLagEstimator:
         return imu_bridges(now.imu, 0)(int(self.window.problem.stamp_ns[-1]), stamp)
 
     def _old_node(self, sighting: Sighting) -> tuple[int, PredictedMotion] | None:
-        """Return the node that pictures tie a sighting to, and the motion since; None where they tie none."""
+        """Return the node to which pictures tie a sighting and the motion since then; None where there is
+        no tie.
+        """
         assert self.window is not None
         ties = [] if sighting.again is None else [(sighting.again.stamp_ns, sighting.again.motion)]
         if sighting.motion is not None and len(self.motions) > 1:
@@ -148,7 +150,7 @@ class FixedLagEstimator:
         return None
 
     def _check_encoders(self, stamp_ns: int) -> None:
-        """Look for faults in the encoders' newest readings; places that were taken beyond a jump leave."""
+        """Look for faults in the encoders' newest readings; positions taken beyond a new jump are removed."""
         now = self._come(stamp_ns)
         if now.crane is None or not len(now.crane.stamp_ns):
             return
@@ -170,7 +172,9 @@ class FixedLagEstimator:
         self.window = replace(window, problem=replace(problem, placed=kept), placed_ns=placed_ns)
 
     def encoder_faults(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Tell of the encoders' faults: those that make all doubtful, and those that may be."""
+        """Describe the encoders' faults: those that make everything doubtful, and those that are only
+        possible.
+        """
         crane = self.readings.crane
         if crane is None or not len(crane.stamp_ns):
             return (), ()
@@ -179,8 +183,8 @@ class FixedLagEstimator:
         return (*freeze_sentences(self.watch.frozen, begin_ns), *sure), maybe
 
     def _now(self, stamp_ns: int) -> SensorBuffer:
-        """Select the readings that have come when the frame of a stamp is computed, back to before the nodes
-        held, without the encoders' faults.
+        """Select the readings that have arrived when the frame at a stamp is computed, from before the first
+        node held on and without the encoders' faults.
         """
         now = self._come(stamp_ns)
         return now if now.crane is None else replace(now, crane=self.watch.usable(now.crane))
@@ -191,7 +195,7 @@ class FixedLagEstimator:
         return self.readings.between(begin - seconds_to_ns(LOOK_BACK_S), last)
 
     def _begun(self, stamp: int, sighting: Sighting | None, now: SensorBuffer) -> Window | Failed:
-        # Without encoders the first frame is the origin: a node before it would be, and move against it.
+        # Without encoders the first frame is the origin; a node before it would take that role.
         nodes = make_nodes(np.array([stamp]), None if now.crane is None else now.imu)
         if now.crane is None:
             assert sighting is not None
@@ -232,7 +236,9 @@ class FixedLagEstimator:
         self, window: Window, stamps: list[int], parts: tuple[Preintegrated | None, ...],
         sighting: Sighting | None, now: SensorBuffer,
     ) -> tuple[list[Pose], list[Float64]]:  # fmt: skip
-        """Initialise new nodes: by the IMU, else on the line to where pictures or encoders see the last."""
+        """Initialise new nodes: by the IMU, else on a straight line to where pictures or encoders place
+        the last.
+        """
         old = window.pose(len(window.problem.start) - 1)
         if all(part is not None for part in parts):
             poses, speeds, state = [], [], window.body
@@ -260,8 +266,8 @@ class FixedLagEstimator:
         return poses, [way / seconds] * len(stamps)
 
     def _stays(self, window: Window, stamp: int, sighting: Sighting | None, now: SensorBuffer) -> bool:
-        """Check whether encoders, else pictures, see no way since the last node. (An IMU sees none at any
-        constant speed.)
+        """Check whether encoders, else pictures, show no travel since the last node. (An IMU shows none at
+        any constant speed.)
         """
         last_ns = int(window.problem.stamp_ns[-1])
         if now.crane is not None:
@@ -274,8 +280,8 @@ class FixedLagEstimator:
         return float(np.linalg.norm(sighting.motion.translation)) < MAX_STILL_M
 
     def _with_attitudes(self, window: Window, first: int, now: SensorBuffer) -> Window:
-        """Add the nominal attitude at the nodes from `first` on: loose under way; standing still it is told
-        once, since its error is the same each time.
+        """Add priors of the nominal attitude at the nodes from `first` on: loose ones under way, and a single
+        one at rest, since there the error is the same each time.
         """
         if now.crane is None:
             return window
@@ -291,8 +297,8 @@ class FixedLagEstimator:
         return replace(window, problem=told, stood=stood)
 
     def _bound(self, window: Window, sighting: Sighting | None, now: SensorBuffer, stamp: int) -> Window:
-        """Add the encoders' places of nodes whose fit has come to be complete, 0.4 s apart; at once where
-        nothing else ties the last node to the one before.
+        """Add the encoder positions, 0.4 s apart, of the nodes for whose fit all readings have arrived; at
+        once where nothing else ties the last node to the one before.
         """
         if now.crane is None:
             return window

@@ -1,8 +1,8 @@
-"""Form and solve the window's normal equations, dense.
+"""Form and solve the window's normal equations, which are dense.
 
-Unknowns: node by node of the frames held (pose, with an IMU velocity and biases; nodes between are taken out
-first, `gaps`), then the border: with encoders their latency, their jumps and the slide that all points in
-view share (`Window.slide`), then the rig's drift.
+Order of the unknowns: node by node those of the frames held (pose, with an IMU velocity and biases; nodes
+between frames are eliminated first, `gaps`), then the border: with encoders their latency, their jumps and
+the slide that all points in view share (`Window.slide`), then the rig's drift.
 """
 
 from __future__ import annotations
@@ -40,15 +40,17 @@ from barsight.motion.problem.problem import Problem, encoder_unknowns_of
 from barsight.motion.problem.rig_drift import LOOSE, combine_with_prior
 
 SLIDE_SIGMA_RAD = 2.5e-4
-"""How far all points in view slide alike (1 sigma): 1 to 4e-4 over stacks, nothing on floors (`slides`)."""
+"""Standard deviation of the slide common to all points in view: 1 to 4e-4 over stacks, nothing on floors
+(`apparent_motion`).
+"""
 SLIDE_WAY_M = 5.0
-"""The way on which what is in view changes, and its slide with it."""
+"""Travel, m, over which the points in view are replaced and their common slide loses its correlation."""
 MIN_WAY_M = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class DenseEquations:
-    """matrix (n, n) and gradient (n,) of the unknowns; gaps: nodes taken out beforehand."""
+    """matrix (n, n) and gradient (n,) of the unknowns; gaps: nodes eliminated beforehand."""
 
     matrix: Float64
     gradient: Float64
@@ -63,7 +65,7 @@ class DenseEquations:
 @dataclass(frozen=True, eq=False)
 class NewestNode:
     """The last node's covariance (n, n), of pose (body axes), velocity (reference) and biases (accelerometer,
-    gyro), the rig's drift taken as known; swing (n, 2) by which it goes with the drift.
+    gyro), with the rig's drift taken as known; drift_jacobian_of_pose (n, 2) of these by the drift.
     """
 
     covariance: Float64
@@ -72,7 +74,7 @@ class NewestNode:
 
 @dataclass(frozen=True, eq=False)
 class WindowSolution:
-    """state, slide: moved by `step` (n,). drift_covariance: (2, 2), None where the rig is taken as exact."""
+    """state, slide: after the `step` (n,). drift_covariance: (2, 2), None where the rig is taken as exact."""
 
     state: GraphState
     slide: float
@@ -82,14 +84,14 @@ class WindowSolution:
 
 
 def border_of(problem: Problem, state: GraphState, slide: float) -> Float64:
-    """Collect the border (b,): the encoders' unknowns and the slide if there are any, then the drift."""
+    """Collect the border (b,): with encoders their unknowns and the slide, then the drift."""
     slides = [slide] if problem.has_latency else []
     return np.concatenate([encoder_unknowns_of(state.values), slides, state.drift])
 
 
 def slide_twist(body_from_rect0: Pose) -> Float64:
-    """Compute the body's twist (6,) (turn, shift, own axes) by which pictures turn about the
-    camera's axis.
+    """Compute the body's twist (6,) (turn, shift, own axes) per unit of the pictures' turn about the camera's
+    axis.
     """
     axis = body_from_rect0.rotation[:, 2]
     return np.concatenate([axis, skew(body_from_rect0.translation) @ axis])
@@ -98,8 +100,8 @@ def slide_twist(body_from_rect0: Pose) -> Float64:
 def assemble_equations(
     problem: Problem, state: GraphState, used: Bool, first: int, end: int
 ) -> DenseEquations:
-    """Assemble equations of the used sightings and of what else binds nodes first...end - 1 to each other and
-    to node `end`.
+    """Assemble the equations of the used sightings and of everything else that ties nodes first...end - 1 to
+    each other and to node `end`.
     """
     kept, size = problem.retained, problem.width
     last = min(end, len(problem.start) - 1)
@@ -158,8 +160,8 @@ def _add_pictures(
 
 
 def prior_equations(problem: Problem, state: GraphState, slide: float) -> DenseEquations:
-    """Evaluate the marginal prior at the present state; as long as nothing has left, how far all
-    may slide.
+    """Evaluate the marginal prior at the present state; as long as nothing has been marginalised, the prior
+    of the common slide.
     """
     border = border_of(problem, state, slide)
     whole = len(problem.retained) * problem.width + len(border)
@@ -217,7 +219,7 @@ def _stepped(
 
 
 def marginal_prior(left: DenseEquations, step: Float64, count: int) -> tuple[Float64, Float64]:
-    """Marginalise: matrix and gradient of all unknowns but the first `count`, after the step."""
+    """Marginalise the first `count` unknowns: matrix and gradient of all others, after the step."""
     matrix, slope = left.matrix, left.gradient + left.matrix @ step
     share = dense.solve_positive(matrix[:count, :count], matrix[:count, count:]).T
     own = matrix[count:, count:] - share @ matrix[:count, count:]
@@ -227,8 +229,8 @@ def marginal_prior(left: DenseEquations, step: Float64, count: int) -> tuple[Flo
 def propagate_slide(
     matrix: Float64, gradient: Float64, slide: float, way_m: float
 ) -> tuple[Float64, Float64]:
-    """Propagate the slide of a prior's matrix and gradient over a way: what is in view keeps a share of its
-    slide, the rest is drawn anew [Uhlenbeck and Ornstein 1930].
+    """Propagate the slide in a prior's matrix and gradient over a travel: a share of it persists, the rest is
+    drawn anew [Uhlenbeck and Ornstein 1930].
     """
     keeps = float(np.exp(-max(way_m, MIN_WAY_M) / SLIDE_WAY_M))
     fresh = 1 / ((1 - keeps**2) * SLIDE_SIGMA_RAD**2)

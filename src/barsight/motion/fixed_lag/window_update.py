@@ -1,7 +1,7 @@
 """Solve a window by one step and marginalise what leaves it.
 
-The frames before were solved, so the newest is placed by the points that are known, and outliers leave,
-beforehand. What leaves is linearised once, with the rest, and stays as a prior.
+The earlier frames are solved already. So the newest one is placed by the known points beforehand, and
+outliers are removed. What leaves is linearised once, together with the rest, and stays as a prior.
 """
 
 from __future__ import annotations
@@ -45,17 +45,17 @@ from barsight.motion.problem.stereo_factors import (
 )
 
 NOISE_RATIO = 0.2
-"""By how much one window's noise moves the running one."""
+"""Weight of a single window's noise in the running estimate of the noise."""
 MIN_POINTS = 30
-"""So many of the known points seen anew place a frame before all is solved."""
+"""Minimum number of known points seen again for the newest frame to be placed before the window is solved."""
 STEPS = 2
-"""Gauss-Newton's, of the newest frame alone."""
+"""Number of Gauss-Newton steps for the newest frame alone."""
 
 
 @dataclass(frozen=True, eq=False)
 class MarginalisedPart:
-    """Marginalised part: the first `nodes` nodes and the points `ended` (T,), their equations and the step
-    made since.
+    """Part of a window to marginalise: the first `nodes` nodes and the points `ended` (T,), with their
+    equations and the step taken since.
     """
 
     nodes: int
@@ -66,8 +66,8 @@ class MarginalisedPart:
 
 @dense.one_blas_thread()
 def solve_window(window: Window, held: int) -> tuple[Window, MarginalisedPart | None]:
-    """Solve the window, and select what is to leave so that `held` frames are left. Raises LinAlgError where
-    the measurements leave an unknown undetermined.
+    """Solve the window, and select what must leave for `held` frames to remain. Raises LinAlgError where the
+    measurements leave an unknown undetermined.
     """
     problem = replace(window.problem, asked=np.array(window.frame_nodes))
     state, noise, stated = window.state, window.noise, problem.sightings
@@ -119,7 +119,7 @@ def _about_axis(body_from_rect0: Pose, angle: float) -> Pose:
 
 
 def _placed_by_points(problem: Problem, state: GraphState, used: Bool) -> GraphState:
-    """Place the newest frame by the known points, then its points by all frames."""
+    """Place the newest frame by the known points, then the points that it sees by all frames."""
     seen, node = problem.sightings, len(problem.start) - 1
     assert seen is not None
     rig, observations = rig_of(seen), observations_of(problem, used)
@@ -155,7 +155,7 @@ def _placed_by_points(problem: Problem, state: GraphState, used: Bool) -> GraphS
 
 @dense.one_blas_thread()
 def marginalise(window: Window, leaving: MarginalisedPart) -> Window:
-    """Marginalise what leaves."""
+    """Marginalise the part that leaves."""
     problem, count = window.problem, leaving.nodes
     stayed = np.array([k - count for k in window.frame_nodes if k >= count])
     gone = len(window.frame_nodes) - len(stayed)
@@ -205,7 +205,7 @@ def _renumbered(state: GraphState, problem: Problem, count: int) -> gtsam.Values
 
 @cache
 def _no_biases(count: int) -> gtsam.Values:
-    """Make zero biases to add vectors to: to insert a bias itself takes thirty times as long."""
+    """Make zero biases to which vectors are added: inserting a bias itself takes thirty times as long."""
     values = gtsam.Values()
     for k in range(count):
         values.insert(B(k), gtsam.imuBias.ConstantBias())

@@ -1,1 +1,1 @@
-"""Estimators that chain relative poses: visual odometry and the paper's stitching."""
+"""Chain relative poses: visual odometry and the paper's stitching."""

@@ -1,5 +1,5 @@
-"""Predict the body's motion from frame to frame by the IMU's kinematics [paper Eq. 11], corrected by what
-the pictures then show.
+"""Predict the body's motion from frame to frame by the IMU's kinematics [paper Eq. 11], corrected by each
+frame's pose from the pictures.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from barsight.recording.base import Recording
 
 @dataclass(frozen=True, eq=False)
 class TrendState:
-    """A frame's state: its stamp (camera's clock), its pose by the pictures, and the IMU's rotation (levelled
-    axes from body) with the velocity in those axes, NaN where it isn't known.
+    """State at a frame: its stamp (camera's clock), its pose by the pictures, and the IMU's rotation
+    (levelled axes from body) with the velocity in those axes, NaN where it isn't known.
     """
 
     stamp_ns: int
@@ -37,9 +37,9 @@ class MotionTrend:
     """R, V and P of [paper Eq. 11] from one frame to the next.
 
     Biases are those of the rest before the first frame: only they can be subtracted, noise can't. The
-    rotation is the gyro's, levelled at the first frame. The velocity at a frame is the predicted one plus
-    what the predicted place was off by over the step's time: so the pictures hold the accelerometer's drift,
-    as the paper's Figure 6 has it.
+    rotation is the gyro's, levelled at the first frame. The velocity at a frame is the predicted one plus the
+    error of the predicted position divided by the step's duration: so the pictures bound the accelerometer's
+    drift, as in the paper's Figure 6.
     """
 
     def __init__(self, imu: ImuSamples, recording: Recording) -> None:
@@ -59,7 +59,7 @@ class MotionTrend:
         self._free: tuple[int, BodyState] | None = None
 
     def predict(self, stamp_ns: int) -> Pose | None:
-        """Predict old_from_new of `body` at a frame; None without a velocity or in an IMU's gap."""
+        """Predict old_from_new of `body` at a frame; None without a velocity or across a gap of the IMU."""
         self._free = None
         state = self._state
         if state is None:
@@ -77,7 +77,7 @@ class MotionTrend:
         return Pose("body", "body", turned @ free.rotation, turned @ way)
 
     def correct(self, stamp_ns: int, placed: Pose) -> None:
-        """Take the frame's pose as the pictures have it: the state that the next prediction starts from."""
+        """Correct the state by the frame's pose from the pictures; the next prediction starts from it."""
         state = self._state
         if state is None:
             self._state = TrendState(stamp_ns, placed, self._level, self._velocity_mps)

@@ -1,8 +1,8 @@
-"""Stitch as the paper does, for comparison: each frame is tied to the one before by the SVD of matched
+"""Stitch as the paper does, for comparison: each frame is tied to the previous one by the SVD of matched
 points.
 
-Its errors add up along the way, and its homography throws away what lies off the dominant plane; our own
-estimate does neither.
+Its errors accumulate along the travel, and its homography discards whatever lies off the dominant plane; our
+own estimate does neither.
 """
 
 from __future__ import annotations
@@ -38,16 +38,18 @@ class StitchingSettings:
     """The paper's stitching."""
 
     trend: Literal["imu", "crane"] = "imu"
-    """What predicts the motion from frame to frame: imu is the paper's own, its kinematics alone (Eq. 11 and
-    12); crane the encoders. Without the one the other; without both nothing is predicted."""
+    """Source of the predicted motion from frame to frame: imu, the paper's own, by its kinematics alone (Eq.
+    11 and 12), or crane, the encoders. If the chosen one is missing, the other is used; without both nothing
+    is predicted.
+    """
     homography_px: float = 3.0
-    """Matches further off the common homography than this are left out."""
+    """Maximum distance of a match from the common homography; matches further off are left out."""
     trend_px: float = 5.0
-    """Matches further off the predicted motion than this are left out."""
+    """Maximum distance of a match from the predicted motion; matches further off are left out."""
     hamming: int = 256
-    """Matches whose descriptors differ in more bits than this are left out (Eq. 6); 256 leaves all."""
+    """Maximum Hamming distance in bits between matched descriptors (Eq. 6); 256 keeps all matches."""
     min_matches: int = 12
-    """A frame with fewer matches is refused."""
+    """Minimum number of matches; a frame with fewer is refused."""
 
     def __post_init__(self) -> None:
         expect_ranges(
@@ -58,10 +60,10 @@ class StitchingSettings:
 
 @dataclass(frozen=True)
 class PaperStitching(TrajectoryEstimator):
-    """Mutual ORB matches by Hamming distance [paper Eq. 6], filtered by one homography [paper Eq. 7] and by
-    the predicted motion [paper Eq. 12], chained by SVD [paper Eq. 13-20].
+    """Estimates by mutual ORB matches by Hamming distance [paper Eq. 6], filtered by one homography [paper
+    Eq. 7] and by the predicted motion [paper Eq. 12], chained by SVD [paper Eq. 13-20].
 
-    The first frame stands where the crane says (`yard`), else levelled at the origin (`world`).
+    The first frame is placed by the crane (`yard`), else levelled at the origin (`world`).
     """
 
     settings: StitchingSettings
@@ -119,7 +121,7 @@ class StitchedPoses(ImmediatePoses):
     def _chained(
         self, last: tuple[FeatureView, Pose | None], view: FeatureView, predicted: Pose | None
     ) -> Pose | Failed:
-        """Chain the step since the last good frame to its pose, and its covariance."""
+        """Compute the pose from the last good frame's and the step since, and update its covariance."""
         rectifier = self._rectifier
         if self._imu is not None:
             moved = self._imu.predict(view.stamp_ns)

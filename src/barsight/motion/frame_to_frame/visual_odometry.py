@@ -1,5 +1,5 @@
-"""Estimate stereo visual odometry: ORB features, metric PnP with RANSAC, refined on both images of the new
-pair.
+"""Estimate stereo visual odometry: ORB features, metric PnP with RANSAC, refined on both pictures of the
+new pair.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from barsight.recording.base import Recording
 
 @dataclass(frozen=True)
 class StereoOdometry(TrajectoryEstimator):
-    """Estimates any stereo recording; the reference is `world`, its origin the first body.
+    """Estimates any stereo recording; the reference is `world` with its origin at the first body.
 
-    Errors add up along the way, and so does the covariance.
+    Errors accumulate along the travel, and so does the covariance.
     """
 
     settings: OdometrySettings

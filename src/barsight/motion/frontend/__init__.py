@@ -1,1 +1,1 @@
-"""Tracked features: stereo features, motion prediction, consensus on a relative pose."""
+"""Track features: stereo features, motion prediction, consensus on a relative pose."""

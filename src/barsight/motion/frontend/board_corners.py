@@ -1,4 +1,4 @@
-"""Track points with known identities: no search, only the check that they agree."""
+"""Track points with known identities: nothing is searched for, only their agreement is checked."""
 
 from __future__ import annotations
 
@@ -20,16 +20,17 @@ from barsight.motion.frontend.stereo_features import OdometrySettings
 
 TURN = 7
 SIGMA_PX = 0.3
-"""A corner's noise to begin with; the estimate scales it to what the residuals show."""
+"""Initial noise of a corner (1 sigma); the estimate rescales it to the residuals."""
 MAX_OFF_ROW_PX = 2.0
 MIN_POINTS = 12
 MAX_FRAMES = 20
-"""A point takes a new name after so many frames, since the estimate's work grows with the longest track's
-square. Points change their names by turns: neighbouring frames always share most of them."""
+"""Maximum length of a track; after that the point takes a new name, since the estimate's work grows with the
+square of the longest track. Points change their names in turn, so neighbouring frames share most of them.
+"""
 
 
 class PointTracker:
-    """Tracks named points: a frame must share enough of them with the one before."""
+    """Tracks named points; each frame must share enough of them with the one before."""
 
     def __init__(self, rectifier: Rectifier, rough: OdometrySettings) -> None:
         self._rectifier, self._settings = rectifier, replace(rough, min_inliers=MIN_POINTS)
@@ -68,7 +69,7 @@ def _sighting(points: NamedPoints, rectifier: Rectifier) -> Sighting | Failed:
 def _tied(
     old: Sighting, new: Sighting, rectifier: Rectifier, settings: OdometrySettings
 ) -> Sighting | Failed:
-    """Estimate the new sighting's motion since the old one, without the points that don't follow it."""
+    """Estimate the new sighting's motion since the old one, and drop the points that don't follow it."""
     _, first, second = np.intersect1d(old.track, new.track, return_indices=True)
     if len(first) < MIN_POINTS:
         return Failed("no-matches", f"only {len(first)} points are those of the frame before")
@@ -89,8 +90,8 @@ def _tied(
 
 
 def _nearby(points: Float64, pixels: Float64, camera: RectifiedCamera) -> tuple[Float64, Float64]:
-    """Fit the motion to all points, starting from rest: a flat board has a mirrored one that fits almost as
-    well, which three points at a time can't tell apart.
+    """Fit the motion to all points, starting from rest. A flat board has a mirrored solution that fits almost
+    as well, and three points at a time can't tell the two apart.
     """
     matrix = np.array([[camera.focal_px, 0, camera.cx_px], [0, camera.focal_px, camera.cy_px], [0, 0, 1]])
     turn, way = np.zeros(3), np.zeros(3)

@@ -1,4 +1,4 @@
-"""Join chains of sightings: lost pictures begin anew, and what ties both parts isn't always known."""
+"""Join chains of sightings: after a loss the pictures begin anew, and the two parts can't always be tied."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from barsight.motion.crane.sway import MAX_GAP_S
 from barsight.motion.frontend.sightings import Sighting
 
 UNTIED = "the pictures begin anew, and nothing ties them to the part that is placed"
-"""Reason of frames that show enough, but not where they are."""
+"""Reason given for frames that show enough points but can't be placed."""
 
 
 def untied_sentence(count: int) -> str:
-    """Tell that frames were left out since nothing ties them."""
+    """Describe how many frames were left out because nothing ties them to the others."""
     return f"the pictures begin anew and nothing joins the parts: {count} frames are left out"
 
 
 def tied_parts(sightings: Sequence[Sighting], bridged: Callable[[int, int], bool]) -> Int64:
-    """Number the part (K,) that each sighting belongs to; what lies in one part is tied by pictures, or by
-    what is `bridged` from one stamp to the next.
+    """Number the part (K,) that each sighting belongs to; sightings of one part are tied by pictures, or
+    `bridged` from one stamp to the next.
     """
     part = np.arange(len(sightings))
     for k in range(1, len(sightings)):
@@ -37,7 +37,7 @@ def tied_parts(sightings: Sequence[Sighting], bridged: Callable[[int, int], bool
 
 
 def imu_bridges(imu: ImuSamples | None, shift_ns: int) -> Callable[[int, int], bool]:
-    """Return whether the IMU covers the time between two frames without a gap."""
+    """Return a check of whether the IMU covers the time between two frames without a gap."""
 
     def bridges(old_ns: int, new_ns: int) -> bool:
         if imu is None:
@@ -52,7 +52,7 @@ def imu_bridges(imu: ImuSamples | None, shift_ns: int) -> Callable[[int, int], b
 
 
 def chained_poses(sightings: Sequence[Sighting], first: Pose, body_from_rect0: Pose) -> list[Pose]:
-    """Chain the body's poses from the first on; where pictures tie nothing, the body goes on as it went."""
+    """Chain the body's poses from the first on; where pictures tie nothing, the last motion is continued."""
     mount, back = body_from_rect0, body_from_rect0.inverse()
     steps: list[list[tuple[int, Pose]]] = [[] for _ in sightings]
     for k in range(1, len(sightings)):
@@ -76,7 +76,7 @@ def chained_poses(sightings: Sequence[Sighting], first: Pose, body_from_rect0: P
 
 
 def _ties(sightings: Sequence[Sighting], k: int) -> dict[int, PredictedMotion]:
-    """Return which earlier sightings pictures tie one to, and the motion since."""
+    """Return the earlier sightings to which pictures tie one, with the motion since each."""
     seen, ties = sightings[k], dict[int, PredictedMotion]()
     if seen.motion is not None:
         ties[k - 1] = seen.motion
@@ -97,7 +97,9 @@ def _gone_on(sightings: Sequence[Sighting], poses: dict[int, Pose], k: int) -> P
 
 
 def chain_begins(sightings: Sequence[Sighting]) -> list[tuple[int, bool]]:
-    """List the sightings with which chains begin anew, and whether points seen again tie that chain."""
+    """List the sightings at which chains begin anew, and whether points seen again tie that chain to
+    others.
+    """
     begins = [k for k in range(1, len(sightings)) if sightings[k].motion is None]
     ends = [*begins, len(sightings)][1:]
     return [
@@ -107,5 +109,5 @@ def chain_begins(sightings: Sequence[Sighting]) -> list[tuple[int, bool]]:
 
 
 def seconds_after(stamp_ns: int, begin_ns: int) -> str:
-    """Format a time as sentences tell it."""
+    """Format a time for messages."""
     return f"{(stamp_ns - begin_ns) / NS_PER_S:.1f} s"

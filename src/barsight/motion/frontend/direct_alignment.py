@@ -1,8 +1,8 @@
-"""Align two views directly: the motion that makes the places of one look as they do in the other.
+"""Align two views directly: find the motion that makes the points of one look as they do in the other.
 
 Gauss-Newton on the gray values of shrunk pictures [DVO: Kerl 2013], with gain and offset as two more
-unknowns and the guess as a prior: r = I_now(w(p)) - a I_before(p) - c. Encoders know the way to millimetres,
-not how the rig swings; a swing of 0.15 degrees is 2 or 3 px.
+unknowns and the guess as a prior: r = I_now(w(p)) - a I_before(p) - c. Encoders know the travel to
+millimetres, but not the rig's swing; a swing of 0.15 degrees moves the picture by 2 or 3 px.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from barsight.core.records.disparity import Disparity
 from barsight.core.records.pairs import RectifiedCamera
 
 _SHRINKS = (16, 8, 4)
-"""Sizes that the pictures are shrunk to, one after the other: the first ones see past the next bar."""
+"""Factors by which the pictures are shrunk, coarse to fine: the coarsest ones see past the next bar."""
 _MAX_SIGMA_PX = 0.3
 _MIN_SHRUNK_PX = 24
 _EVERY_PX = 16
@@ -32,12 +32,12 @@ _STEPS = 5
 _CLOSE_RAD, _CLOSE_M = 1e-5, 1e-4
 _PRIOR_RAD, _PRIOR_M = 2e-2, 3e-2
 _OUTLIER_SIGMAS = 4.0
-"""Tukey's biweight ends here: highlights move with the view."""
+"""Residual, in sigma, from which Tukey's biweight is zero: highlights move with the view."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Places:
-    """Places of the view before. rays: (N, 3), in px of the shrunk picture; q: (N,) px / m, disparity and
+    """Points of the earlier view. rays: (N, 3), in px of the shrunk picture; q: (N,) px / m, disparity and
     doffs over the baseline; gray: (N,).
     """
 
@@ -49,10 +49,10 @@ class _Places:
 def align_views(
     before: UInt8, disparity: Disparity, now: UInt8, camera: RectifiedCamera, guess: Pose
 ) -> Pose | Failed:
-    """Estimate the motion now_from_before of the rectified left camera, from its guess on.
+    """Estimate the motion now_from_before of the rectified left camera, starting from a guess.
 
-    before, now: (H, W) pictures; disparity: of the one before. The guess may be off by a degree and some cm.
-    Failed `not-alike` where too few places are seen by both or their gray values differ too much.
+    before, now: (H, W) pictures; disparity: of the earlier one. The guess may be off by a degree and some cm.
+    Failed `not-alike` where too few points are seen by both or their gray values differ too much.
     """
     motion, tone = guess, np.array([1.0, 0.0])
     quarters = _shrink(before, _SHRINKS[-1]), _shrink(now, _SHRINKS[-1])
@@ -83,7 +83,7 @@ def align_views(
 
 
 def _principal(camera: RectifiedCamera, shrink: int) -> Float64:
-    """Return the principal point of the shrunk picture, each of whose pixels stands for shrink x shrink."""
+    """Return the principal point of the shrunk picture, each of whose pixels covers shrink x shrink."""
     return (np.array([camera.cx_px, camera.cy_px]) - (shrink - 1) / 2) / shrink
 
 
@@ -99,7 +99,7 @@ def _smooth(image: Float32) -> Float32:
 
 
 def _places(small: Float32, disparity: Disparity, camera: RectifiedCamera, shrink: int) -> _Places:
-    """Choose places on a grid of at least 16 px, in the shrunk picture, of a disparity known to 0.3 px."""
+    """Choose points with a disparity known to 0.3 px, on a grid in the shrunk picture of at least 16 px."""
     every = max(_EVERY_PX // shrink, 1)
     rows, columns = (np.arange(1, count - 1, every) for count in small.shape)
     v, u = (grid.ravel() for grid in np.meshgrid(rows, columns, indexing="ij"))
@@ -108,14 +108,14 @@ def _places(small: Float32, disparity: Disparity, camera: RectifiedCamera, shrin
     u, v, q = u[known], v[known], disparity.disparity_px[middle][known] + camera.doffs_px
     principal, focal = _principal(camera, shrink), np.full(len(u), camera.focal_px / shrink)
     rays = np.column_stack([u - principal[0], v - principal[1], focal]).astype(np.float64)
-    # X' = R ray + t q / b: the ray is shrunk, so is the depth's scale.
+    # X' = R ray + t q / b: the ray is in shrunk pixels, so the depth's scale is too.
     return _Places(rays, q.astype(np.float64) / (shrink * camera.baseline_m), small[v, u].astype(np.float64))
 
 
 @dataclass(frozen=True, eq=False)
 class _Compared:
-    """Places that the view now shows. residual: (N,); rows: (N, 8), its derivatives by a turn, a shift, gain
-    and offset; gray: (N,), of the view before.
+    """Points that the later view contains. residual: (N,); rows: (N, 8), its derivatives by a turn, a shift,
+    gain and offset; gray: (N,), of the earlier view.
     """
 
     residual: Float64
@@ -124,7 +124,7 @@ class _Compared:
 
 
 def _compared(places: _Places, image: Float32, motion: Pose, tone: Float64, principal: Float64) -> _Compared:
-    """Compare the places with the picture now, those that lie in it."""
+    """Compare the points that lie in the later picture with it."""
     count = len(places.q)
     found = np.empty(count), np.empty((count, 8)), np.empty(count)
     seen = _compare(
@@ -139,13 +139,13 @@ def _compare(
     places: tuple[Float64, Float64, Float64], image: Float32, motion: tuple[Float64, Float64], tone: Float64,
     principal: Float64, residual: Float64, rows: Float64, grays: Float64,
 ) -> int:  # fmt: skip
-    """Compute residuals and their derivatives of the places that lie in the picture, and count these.
+    """Compute the residuals of the points that lie in the picture and their derivatives; return their number.
 
-    Scaled by q / b a place moves to X = R ray + t q / b; a turn w and a shift s after that move it by
-    w x X + s q / b. Gray values and slopes are read between pixels, bilinearly.
+    Scaled by q / b a point moves to X = R ray + t q / b; a turn w and a shift s after that move it by
+    w x X + s q / b. Gray values and gradients are interpolated bilinearly.
 
     places: rays (N, 3), q (N,), gray (N,). motion: rotation (3, 3), translation (3,). principal: (2,) px.
-    Fills the first of residual (N,), rows (N, 8) and grays (N,).
+    Fills the first elements of residual (N,), rows (N, 8) and grays (N,).
     """
     (rays, q, gray), (r, t) = places, motion
     height, width = image.shape
@@ -180,7 +180,7 @@ def _compare(
 
 
 def _solve(residual: Float64, rows: Float64, guess: Pose, motion: Pose) -> Float64:
-    """Solve one step (8,) by Tukey's weights, with the guess as prior of turn and shift."""
+    """Solve one step (8,) with Tukey's weights and the guess as prior of turn and shift."""
     sigma = max(mad_sigma(residual), 0.5)
     normal, pull = np.zeros((8, 8)), np.zeros(8)
     _add_equations(residual, rows, _OUTLIER_SIGMAS * sigma, normal, pull)
@@ -194,9 +194,10 @@ def _solve(residual: Float64, rows: Float64, guess: Pose, motion: Pose) -> Float
 
 @kernel()
 def _add_equations(residual: Float64, rows: Float64, end: float, normal: Float64, pull: Float64) -> None:
-    """Add up the normal equations of residuals (N,) and rows (N, 8) by Tukey's biweight that ends at `end`.
+    """Add up the normal equations of residuals (N,) and rows (N, 8), weighted by Tukey's biweight with its
+    zero at `end`.
 
-    Fills normal (8, 8) and pull (8,), zeros before.
+    Fills normal (8, 8) and pull (8,), which must be zeros.
     """
     for i in range(len(residual)):
         off = residual[i] / end

@@ -1,4 +1,4 @@
-"""Extract one pair of neighbouring frames with its matches for the report's pictures."""
+"""Extract one pair of neighbouring frames with its matches for the report's figures."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ FEATURES = 1500
 
 @dataclass(frozen=True, eq=False)
 class MatchingExample:
-    """old, new: (H, W) rectified left pictures of two frames. features: (N, 2) ORB's places in the old one.
+    """old, new: (H, W) rectified left pictures of two frames. features: (N, 2) ORB features in the old one.
 
-    raw: (R, 4) old and new place of each feature's nearest in descriptors; filtered: (R,) mutual ones on
-    one homography. followed: (P, 2) corners followed, predicted (P, 2) where they must be in the new picture,
-    covariance (P, 2, 2) px^2 of that; found (P, 2); agreed, ambiguous (P,). by_sensors: whether encoders and
-    gyro predicted, rather than the pictures themselves.
+    raw: (R, 4) old and new position of each feature and its nearest neighbour by descriptor; filtered: (R,)
+    whether a match is mutual and fits one homography. followed: (P, 2) tracked corners; predicted: (P, 2)
+    their positions expected in the new picture, with covariance (P, 2, 2) px^2; found (P, 2); agreed,
+    ambiguous (P,). by_sensors: whether encoders and gyro predicted, rather than the pictures themselves.
     """
 
     stamps_ns: tuple[int, int]
@@ -59,7 +59,7 @@ class MatchingExample:
 def matching_example(
     recording: Recording, rectifier: Rectifier, placed_ns: Int64, settings: FrontEndSettings, with_crane: bool
 ) -> MatchingExample | Failed:
-    """Match the two neighbouring frames in the middle of those placed (N,)."""
+    """Match the two neighbouring frames in the middle of the placed ones (N,)."""
     pairs = _middle(recording, rectifier, placed_ns)
     if isinstance(pairs, Failed):
         return pairs

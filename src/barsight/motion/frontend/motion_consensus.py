@@ -27,17 +27,21 @@ from barsight.motion.frontend.wide_steps import (
 )
 
 MIN_RATIO = 0.45
-"""One bar off, a twentieth of the points find one alike and agree, on dull bars a third; at the true place
-most do (six in ten from a car, eight over a yard)."""
+"""Minimum share of the unambiguous points in view that must agree. With a motion one bar off, a twentieth of
+the points match and agree, on dull bars a third; at the true place most do (six in ten from a car, eight
+over a yard).
+"""
 
 Consensus = tuple[Bool, GuidedMatches, PredictedMotion]
-"""Which tracked points (N,) agree, all their matches, and the motion on which they do."""
+"""Mask (N,) of the tracked points that agree, the matches of all, and the motion on which they agree."""
 
 
 def wide_consensus(
     tracks: Tracks, pair: PatchPair, wide: DescribedMotion, settings: FrontEndSettings
 ) -> Consensus | Failed:
-    """Select points that agree on a motion which `wide_motion` found, unless the next bars agree too."""
+    """Select the points that agree on a motion found by `wide_motion`, unless a motion some bars off fits
+    almost as well.
+    """
     if failed := check_overlap(tracks, pair, wide, settings.tracks):
         return failed
     repeats = Repeats.of(tracks)
@@ -53,7 +57,9 @@ def motion_consensus(
     tracks: Tracks, pair: PatchPair, prediction: PredictedMotion, settings: FrontEndSettings,
     min_ratio: float = MIN_RATIO,
 ) -> Consensus | Failed:  # fmt: skip
-    """Select points found again in their ellipses that agree on one motion in 3D, and that motion."""
+    """Select the points that are found again in their predicted ellipses and agree on one motion in 3D; also
+    return that motion.
+    """
     assert tracks.last is not None
     repeats = texture_period_px(tracks.last.left, tracks.stereo[:, :2])
     camera = pair.pair.camera
@@ -90,7 +96,9 @@ def _with_ambiguous(
     tracks: Tracks, pair: PatchPair, motion: PredictedMotion, matches: GuidedMatches, kept: Bool,
     repeats: Float64, settings: FrontEndSettings,
 ) -> tuple[Bool, GuidedMatches]:  # fmt: skip
-    """Match points too ambiguous for the prediction anew by the motion on which the others agree."""
+    """Match the points that were too ambiguous for the prediction again, by the motion found from the
+    others.
+    """
     left = np.flatnonzero(matches.ambiguous)
     if left.size == 0:
         return kept, matches

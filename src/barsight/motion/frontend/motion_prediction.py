@@ -25,15 +25,15 @@ WINDOW_S = 0.3
 SWAY_RAD = float(np.deg2rad(0.15))
 GYRO_BIAS_SIGMA_RADPS = 5e-4
 SLEW_SIGMA_S = 0.03
-"""What isn't known of the encoders' latency, s: it matters while the speed changes only."""
+"""Uncertainty of the encoders' latency, s (1 sigma); it matters only while the speed changes."""
 JUMP_SIGMA_M = 0.005
-"""Standard deviation left of a jump that was taken off."""
+"""Standard deviation of the error that remains after a jump has been subtracted."""
 SPARE_SIGMAS = 1.5
-"""By how much a predicted ellipse is wider than the estimate's own covariance says."""
+"""Factor on the sigmas of a prediction from the estimate's own covariance, to allow for its optimism."""
 
 
 class CranePredictor:
-    """A `Predictor` from the encoders' travel and the gyro's turn; the attitude is nominal but for the turn.
+    """A `Predictor` from the encoders' travel and the gyro's turn, starting from the nominal attitude.
 
     gyro_bias_radps: (3,), from standing still. shift_ns: `timeshift_cam_imu`.
     """
@@ -47,7 +47,7 @@ class CranePredictor:
         self._body_from_rect0 = rectifier.body_from_rect0
 
     def __call__(self, old_ns: int, new_ns: int) -> PredictedMotion | None:
-        """Predict; None where the encoders don't cover both frames."""
+        """Predict the motion; None where the encoders don't cover both frames."""
         window = seconds_to_ns(WINDOW_S)
         old = fit_position(self._crane, old_ns + self._shift_ns, window)
         new = fit_position(self._crane, new_ns + self._shift_ns, window)
@@ -71,7 +71,7 @@ class CranePredictor:
         return PredictedMotion(motion.rotation, motion.translation, covariance)
 
     def _turn(self, old_ns: int, new_ns: int) -> tuple[Float64, float]:
-        """Integrate the rotation vector (3,) old body from new body, and its sigma (rad)."""
+        """Integrate the rotation vector (3,) old body from new body; also return its sigma (rad)."""
         seconds = (new_ns - old_ns) / 1e9
         if self._imu is not None:
             stamps = np.array([old_ns, new_ns]) + self._shift_ns
@@ -86,15 +86,15 @@ def predict_by_imu(
     old: Pose, state: BodyState, part: Preintegrated, bias: ImuBias, covariance: Float64,
     body_from_rect0: Pose,
 ) -> PredictedMotion:  # fmt: skip
-    """Predict the motion of `rect0` from an old body to the one that the IMU takes `state` to.
+    """Predict the motion of `rect0` from an old body pose to the one that the IMU leads to from `state`.
 
-    covariance: (15, 15) of the state in GTSAM's order: pose in body axes, velocity, biases. It counts
-    `SPARE_SIGMAS` times.
+    covariance: (15, 15) of the state in GTSAM's order: pose in body axes, velocity, biases. The result's
+    sigmas are widened by `SPARE_SIGMAS`.
     """
     end, dt = part.predict(state, bias), part.seconds
     new = Pose(old.target, "body", end.rotation, end.position_m)
     motion = (new @ body_from_rect0).inverse() @ (old @ body_from_rect0)
-    # What the attitude turns is all but what the IMU itself measured.
+    # An attitude error turns the whole way except the part that the IMU itself measured.
     way = state.velocity_mps * dt + np.array([0.0, 0.0, -GRAVITY_MPS2]) * dt**2 / 2
     by_state = np.zeros((6, 15))
     by_state[3:, :3] = skew(state.rotation.T @ way)

@@ -25,8 +25,8 @@ from barsight.motion.frontend.stereo_features import FeatureView, OdometrySettin
 class RelativePose:
     """new_from_old: pose of the old `rect0` in the new one, and its covariance (6, 6).
 
-    scale_sigma: relative error of the step's length that the calibration may cause; it doesn't average out.
-    kept: (N,) which points agree.
+    scale_sigma: relative error of the step's length due to the calibration; it doesn't average out. kept:
+    (N,) mask of the points that agree.
     """
 
     rotation: Float64
@@ -37,7 +37,7 @@ class RelativePose:
 
 
 def estimate_step(old: FeatureView, new: FeatureView, settings: OdometrySettings) -> RelativePose | Failed:
-    """Estimate the motion between two views by the features that match mutually."""
+    """Estimate the motion between two views from their mutually matching features."""
     camera = new.pair.pair.camera
     pairs = match_mutual(old.features, new.features)
     if len(pairs) < settings.min_inliers:
@@ -94,12 +94,13 @@ def refine_pose(
     camera: RectifiedCamera,
     settings: OdometrySettings,
 ) -> RelativePose | Failed:
-    """Refine by Gauss-Newton on u, v and u_right of the new pair, each residual whitened by its own
+    """Refine by Gauss-Newton on u, v and u_right of the new pair, each point's residual whitened by its own
     covariance.
 
-    The noise of the three places that the old point was triangulated from, most of it along its ray, is
-    projected into the new pair and widens the residual's covariance. Huber's weights; outliers beyond 5
-    sigma leave. The step's covariance is that of a small motion that follows it, in the new frame's axes.
+    The noise of the three coordinates that the old point was triangulated from, most of it along its ray, is
+    projected into the new pair and added to the residual's covariance. Residuals have Huber weights; outliers
+    beyond 5 sigma are removed. The step's covariance is that of a small motion applied after it, in the new
+    frame's axes.
     """
     base = camera.focal_px * camera.baseline_m
     lens = np.array([camera.focal_px, camera.cx_px, camera.cy_px, base, camera.doffs_px])
@@ -125,8 +126,8 @@ def refine_pose(
 
 
 def transport_covariance(covariance: Float64, way: Float64) -> Float64:
-    """Transport a pose covariance (6, 6), rotation then translation in the reference's axes, to a point `way`
-    (m) further on that is fixed to it: what the attitude is off by swings the point.
+    """Transport a pose covariance (6, 6), rotation then translation in the reference's axes, to a point
+    rigidly attached at `way` (m): the attitude's error swings that point.
     """
     further = np.eye(6)
     further[3:, :3] = -skew(way)
@@ -135,7 +136,7 @@ def transport_covariance(covariance: Float64, way: Float64) -> Float64:
 
 
 def rotate_covariance(covariance: Float64, rotation: Float64) -> Float64:
-    """Rotate a pose covariance (6, 6) by (3, 3) to other axes."""
+    """Rotate a pose covariance (6, 6) into other axes by a rotation (3, 3)."""
     turned = np.zeros((6, 6))
     turned[:3, :3] = turned[3:, 3:] = rotation
     result: Float64 = turned @ covariance @ turned.T

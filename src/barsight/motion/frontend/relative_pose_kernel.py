@@ -1,6 +1,4 @@
-"""Form one step's normal equations, point by point: what the consensus of a frame spends its
-iterations on.
-"""
+"""Form one step's normal equations point by point, where a frame's consensus spends its iterations."""
 
 from __future__ import annotations
 
@@ -21,9 +19,10 @@ def step_equations(
     """Compute distance (N,), each point's residual in its own sigmas (infinite behind the camera), and the
     normal matrix (6, 6) and gradient (6,) of a small turn, then shift, in the new frame's axes.
 
-    points (N, 3) in the old frame; by_old_places (N, 3, 3) m per px of the places they were triangulated
-    from; target (N, 3) u, v, right u; turn (3, 3), place (3,) new from old. lens: (5,) focal px, cx, cy,
-    focal times baseline (px m), doffs px. variance: px^2 of one place. Huber's weights; none past 5 sigma.
+    points (N, 3) in the old frame; by_old_places (N, 3, 3) their Jacobian in m per px of the coordinates they
+    were triangulated from; target (N, 3) u, v, right u; turn (3, 3), place (3,) new from old. lens: (5,)
+    focal px, cx, cy, focal times baseline (px m), doffs px. variance: px^2 of one coordinate. Weights are
+    Huber's, and zero beyond 5 sigma.
     """
     moved, residual, pull = np.empty(3), np.empty(3), np.empty(3)
     by_point, carried, spread = np.zeros((3, 3)), np.empty((3, 3)), np.empty((3, 3))

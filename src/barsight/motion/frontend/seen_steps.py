@@ -1,4 +1,4 @@
-"""Convert the front end's motions to steps of the body, which other sensors are held against."""
+"""Convert the front end's motions to steps of the body, for comparison with other sensors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from barsight.motion.frontend.sightings import Sighting
 def seen_steps(
     sightings: Sequence[Sighting], steps: Sequence[int], rectifier: Rectifier, shift_ns: int
 ) -> SeenSteps:
-    """Convert the motions of sightings `steps`, each since the one before, to the body's.
+    """Convert the motions of the sightings `steps`, each since the previous sighting, to the body's.
 
     shift_ns: `timeshift_cam_imu`.
     """
@@ -42,6 +42,6 @@ def seen_steps(
 def known_motion(
     sightings: Sequence[Sighting], imu: ImuSamples | None, rectifier: Rectifier, shift_ns: int
 ) -> KnownMotion:
-    """Gather what the sightings' motions and the IMU know of the way."""
+    """Gather the travel known from the sightings' motions and the IMU."""
     told = [k for k in range(1, len(sightings)) if sightings[k].motion is not None]
     return KnownMotion(seen_steps(sightings, told, rectifier, shift_ns) if told else None, imu)

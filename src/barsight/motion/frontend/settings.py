@@ -14,4 +14,4 @@ class FrontEndSettings:
 
     tracks: TrackSettings = field(default_factory=TrackSettings)
     rough: OdometrySettings = field(default_factory=lambda: OdometrySettings(features=900))
-    """The motion from corners' descriptors where no other sensor predicts it."""
+    """Rough odometry: estimates the motion from corner descriptors where no other sensor predicts it."""

@@ -1,4 +1,4 @@
-"""Define the points that a frame sights, and how far its motion lies from the predicted one."""
+"""Define the points that a frame sees, and the deviation of its motion from the predicted one."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from barsight.features.guided_matching import PredictedMotion
 @dataclass(frozen=True, eq=False)
 class Sighting:
     """Tracked points of one frame. track: (N,) names of points; stereo: (N, 3) u, v and right u, px;
-    sigma_px: (N,) of each as the patches show it.
+    sigma_px: (N,) noise of each, as the patch alignment shows it.
 
-    motion: of `rect0` since the sighting before; None for the first of a chain, which nothing ties to the
-    one before. again: another one that it is tied to, by points that both name. ambiguous: how many points
-    were refused since the prediction was too coarse for the bars. innovation: (6,) turn and way of `motion`
-    minus the predicted ones in sigma, None without a prediction.
+    motion: of `rect0` since the previous sighting; None for the first of a chain, which nothing ties to the
+    previous one. again: an earlier sighting that points named in both tie it to. ambiguous: number of points
+    rejected because the prediction was too coarse to tell the bars apart. innovation: (6,) turn and way of
+    `motion` minus the predicted ones in sigma, None without a prediction.
     """
 
     stamp_ns: int
@@ -35,14 +35,16 @@ class Sighting:
 
 @dataclass(frozen=True, eq=False)
 class SeenAgain:
-    """A place seen again: the stamp of the sighting before a loss, and the motion of `rect0` since it."""
+    """Place seen again: the stamp of the last sighting before a loss, and the motion of `rect0` since
+    then.
+    """
 
     stamp_ns: int
     motion: PredictedMotion
 
 
 def normalised_innovation(predicted: PredictedMotion, found: PredictedMotion) -> Float64:
-    """Compute the innovation (6,): turn and way found minus predicted, each over its sigma."""
+    """Compute the innovation (6,): found minus predicted turn and way, each divided by its sigma."""
     turn = Rotation.from_matrix(found.rotation @ predicted.rotation.T)
     way = found.translation - turn.as_matrix() @ predicted.translation
     sigma = np.sqrt(np.diag(predicted.covariance + found.covariance))
@@ -50,7 +52,7 @@ def normalised_innovation(predicted: PredictedMotion, found: PredictedMotion) ->
 
 
 def innovations(sightings: tuple[Sighting, ...]) -> NormalisedResiduals | None:
-    """Collect the innovations of all frames whose motion was predicted, None if there are none."""
+    """Collect the innovations of all frames whose motion was predicted; None if there are none."""
     told = [(s.stamp_ns, s.innovation) for s in sightings if s.innovation is not None]
     if not told:
         return None

@@ -1,4 +1,4 @@
-"""Detect features with depth in each picture for stereo odometry, or say why there are none."""
+"""Detect features with depth in each picture for stereo odometry, or return why there are none."""
 
 from __future__ import annotations
 
@@ -22,20 +22,21 @@ class OdometrySettings:
     """Stereo visual odometry."""
 
     features: int = 3000
-    """Features a picture."""
+    """Number of features detected per picture."""
     min_range_m: float = 0.5
-    """Points nearer than this aren't used."""
+    """Minimum range of points that are used."""
     max_range_baselines: float = 60.0
-    """Points further than this many baselines aren't used for motion."""
+    """Maximum range, in baselines, of points that are used for motion."""
     min_inliers: int = 25
-    """A frame with fewer agreeing points is refused."""
+    """Minimum number of points that must agree on a motion; a frame with fewer is refused."""
     pixel_sigma_px: float = 0.3
-    """The noise of a feature's place (1 sigma)."""
+    """Standard deviation of a feature's measured position in the picture."""
     offset_sigma_px: float = 0.1
-    """Disparity error common to all features (1 sigma), not estimated: it makes every step too long or too
-    short alike."""
+    """Standard deviation of a disparity error common to all features. It isn't estimated; it makes all steps
+    too long or too short alike.
+    """
     ransac_px: float = 1.0
-    """Points further off than this are outliers."""
+    """Reprojection error above which RANSAC takes a point as an outlier."""
 
     def __post_init__(self) -> None:
         expect_ranges(
@@ -46,8 +47,8 @@ class OdometrySettings:
 
 @dataclass(frozen=True, eq=False)
 class FeatureView:
-    """One frame's features. about_px: (N,) their coarse disparities; coarse: (h, w) the pair's, NaN unknown;
-    both in px of the full picture.
+    """Features of one frame. about_px: (N,) their coarse disparities; coarse: (h, w) the pair's, NaN where
+    unknown; both in px of the full picture.
     """
 
     pair: PatchPair
@@ -61,8 +62,8 @@ class FeatureView:
         return self.pair.pair.stamp_ns
 
     def points(self, index: Int64, settings: OdometrySettings) -> Float64:
-        """Triangulate the features of an index: (M, 3) in `rect0` of the features of an index (M,), NaN where
-        the right picture shows none at a useful depth.
+        """Triangulate the features of an index (M,): (M, 3) in `rect0`, NaN where the right picture shows
+        none at a useful depth.
         """
         camera = self.pair.pair.camera
         places = self.features.pixels[index].astype(np.float64)
@@ -83,7 +84,8 @@ def match_coarsely(
     pair: PatchPair, features: Features, settings: OdometrySettings,
     span: tuple[float, float] | None = None,
 ) -> FeatureView | Failed:  # fmt: skip
-    """Select a pair's left features that have a coarse disparity; Failed `no-features` where too few do.
+    """Select a pair's left features that have a coarse disparity; Failed `no-features` where too few have
+    one.
 
     span: the lowest and highest disparity to expect, px, where that is known.
     """

@@ -1,4 +1,4 @@
-"""Track points from pair to pair, each frame's motion checked by consensus."""
+"""Track points from pair to pair, checking each frame's motion by consensus."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from barsight.stereo.search_range import coarse_disparity
 
 MIN_KNOWN = 200
 SPAN = 1.6
-"""New points are sought up to this much nearer and further than the known ones."""
+"""Factor by which new points may be nearer or further than the known ones."""
 
 MAX_LOST = 3
-"""Ends of chains that are held."""
+"""Maximum number of chain ends that are kept."""
 
 Predictor = Callable[[int, int], PredictedMotion | None]
-"""From two frames' stamps to the motion of `rect0` between them as the other sensors know it, or None."""
+"""Maps two frames' stamps to the motion of `rect0` between them as the other sensors know it, or None."""
 
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """tracks: None to begin anew with unused names from next_track on."""
+    """tracks: None to begin anew, with unused names from `next_track` on."""
 
     tracks: Tracks | None
     next_track: int
@@ -45,7 +45,7 @@ class _State:
 
 @dataclass(frozen=True, eq=False)
 class _Lost:
-    """The end of a chain: number of the chain, its last state, and its last view."""
+    """End of a chain: number of the chain, its last state, and its last view."""
 
     chain: int
     state: _State
@@ -53,11 +53,11 @@ class _Lost:
 
 
 class Tracker:
-    """Tracks points from pair to pair; only the last few views are held.
+    """Tracks points from pair to pair; only the last few views are kept.
 
-    A pair that nothing ties to the one before begins a chain anew. As long as no sensor predicts and it isn't
-    tied to those before, it is held against their ends. `predictor` is asked when a frame's turn comes, so it
-    may know what was made of the frames before.
+    A pair that nothing ties to the previous one begins a new chain. As long as no sensor predicts the motion
+    and a chain isn't tied to the earlier ones, its pairs are compared with their ends. `predictor` is called
+    only when a frame's turn comes, so it may use the estimate of the frames before.
     """
 
     def __init__(self, predictor: Predictor, settings: FrontEndSettings) -> None:
@@ -65,7 +65,7 @@ class Tracker:
         self._state: _State | None = None
         self._lost: list[_Lost] = []
         self._joined = [0]
-        """Of each chain, the first one that it is tied to."""
+        """For each chain the first chain that it is tied to."""
 
     def push(self, pair: RectifiedPair) -> Sighting | RefusedFrame:
         """Track the next pair, or refuse it where it shows too little."""
@@ -84,18 +84,20 @@ class Tracker:
         return sighting if prediction is not None else self._tied(sighting, patches)
 
     def _lose(self, state: _State) -> None:
-        """Keep the end of the chain so far, and begin the next."""
+        """Keep the end of the present chain, and begin the next."""
         assert state.tracks is not None and state.tracks.last is not None
         view = wide_view(patch_pair(state.tracks.last), self._settings.rough)
         self._lost = [*self._lost, _Lost(len(self._joined) - 1, state, view)][-MAX_LOST:]
         self._joined.append(len(self._joined))
 
     def _tied(self, sighting: Sighting, pair: PatchPair) -> Sighting:
-        """Tie a sighting to the ends of chains that its own isn't tied to, if it shows their points again."""
+        """Tie a sighting to the ends of chains that its own isn't tied to yet, if it shows their points
+        again.
+        """
         joined, settings = self._joined, self._settings
         open_ends = [lost for lost in self._lost if joined[lost.chain] != joined[-1]]
         if sighting.motion is None and open_ends:
-            open_ends = open_ends[:-1]  # to the last of them it has just failed
+            open_ends = open_ends[:-1]  # tying it to the last of them has just failed
         view = wide_view(pair, settings.rough) if open_ends else None
         for lost in reversed(open_ends):
             assert view is not None and lost.state.tracks is not None
@@ -155,7 +157,7 @@ def _see(
 
 
 def _span(known: Float64, camera: RectifiedCamera) -> tuple[float, float] | None:
-    """Predict the disparity range (px) from the known points (N, 3); None for too few."""
+    """Predict the disparity range (px) from the known points (N, 3); None where they are too few."""
     if len(known) < MIN_KNOWN:
         return None
     low, high = np.percentile(known[:, 0] - known[:, 2] + camera.doffs_px, (1, 99))
@@ -165,7 +167,7 @@ def _span(known: Float64, camera: RectifiedCamera) -> tuple[float, float] | None
 def _rough(
     state: _State, tracks: Tracks, pair: PatchPair, settings: FrontEndSettings
 ) -> tuple[RelativePose, FeatureView] | Failed:
-    """Estimate the motion by both pairs' corners, without any prediction."""
+    """Estimate the motion from both pairs' corners, without any prediction."""
     assert tracks.last is not None
     span = _span(tracks.stereo, pair.pair.camera)
     old = state.view or describe_corners(patch_pair(tracks.last), settings, span)
@@ -181,7 +183,7 @@ def _rough(
 def describe_corners(
     pair: PatchPair, settings: FrontEndSettings, span: tuple[float, float] | None = None
 ) -> FeatureView | Failed:
-    """Detect and describe the corners of a pair; `match_coarsely` says the rest."""
+    """Detect and describe a pair's corners; see `match_coarsely`."""
     chosen, image = replace(settings.tracks, points=settings.rough.features), pair.pair.left
     corners = detect_corners(image, chosen, np.empty((0, 2)))
     return match_coarsely(pair, describe_upright(image, corners), settings.rough, span)
@@ -190,7 +192,9 @@ def describe_corners(
 def _by_pictures(
     state: _State, tracks: Tracks, pair: PatchPair, settings: FrontEndSettings
 ) -> tuple[Consensus | Failed, FeatureView | None]:
-    """Find the motion by the corners' descriptors, and what they agree on; also the new view."""
+    """Find the motion from the corners' descriptors and the points that agree on it; also return the new
+    view.
+    """
     rough_motion = _rough(state, tracks, pair, settings)
     if isinstance(rough_motion, Failed):
         return rough_motion, None
@@ -201,7 +205,7 @@ def _by_pictures(
 
 
 def _by_wide_step(tracks: Tracks, pair: PatchPair, settings: FrontEndSettings) -> Consensus | Failed:
-    """Find the motion since the last view of tracks by features at several scales."""
+    """Find the motion since the last tracked view from features at several scales."""
     assert tracks.last is not None
     views = [wide_view(one, settings.rough) for one in (patch_pair(tracks.last), pair)]
     motion = wide_motion(views[0], views[1], settings.rough)

@@ -1,7 +1,7 @@
 """Tie two views that tracking can't, by features at several scales: long steps, and places seen again.
 
-Bars repeat, and no sensor says here how far the step goes; so a tie must explain most of the tracked points,
-and clearly more of them than the same motion by a bar's pitch more or less does.
+Bars repeat, and here no sensor tells how long the step is. So a tie must explain most of the tracked points,
+and clearly more of them than the same motion plus or minus some bar pitches does.
 """
 
 from __future__ import annotations
@@ -22,15 +22,25 @@ from barsight.motion.frontend.stereo_features import FeatureView, OdometrySettin
 
 FEATURES = 3000
 MIN_WIDE_RATIO = 0.3
-"""Of points found where nothing repeats: after a step of 3 m by car it is a third to a half."""
+"""Minimum share of the points found where nothing repeats; after a step of 3 m by car it is a third to a
+half.
+"""
 MIN_INSIDE, MIN_INSIDE_UNDISPUTED = 0.65, 0.35
-"""Of the tracked points, that the new pair must show: what is at the edge of a view may lie elsewhere too."""
+"""Minimum share of the tracked points that the new pair must contain, in general and for an undisputed
+motion: what lies at the edge of a view may be found elsewhere too.
+"""
 UNDISPUTED = 0.8
-"""From this share of matching features that agree no other motion competes (elsewhere alike: up to 0.7)."""
+"""Share of the matching features that agree from which no other motion competes (at look-alike places up to
+0.7 agree).
+"""
 REPEATING = 0.1
-"""From this share of points beside which the picture repeats, as many are wanted as of a short step's."""
+"""Share of points next to which the picture repeats, from which as many points must agree as after a short
+step.
+"""
 MAX_RIVAL_RATIO = 0.7
-"""One bar off, up to a half as many are found as at the true place."""
+"""Maximum ratio of the points found some bars off to those found with the motion itself. One bar off, up to
+half as many are found as at the true place.
+"""
 BARS_OFF = (-2, -1, 1, 2)
 
 
@@ -41,14 +51,14 @@ def wide_view(pair: PatchPair, settings: OdometrySettings) -> FeatureView | Fail
 
 @dataclass(frozen=True, eq=False)
 class DescribedMotion:
-    """A motion, its covariance fourfold, and the share of the matched features that agree on it."""
+    """Motion with fourfold covariance, and the share of the matched features that agree on it."""
 
     motion: PredictedMotion
     agreeing: float
 
     @classmethod
     def of(cls, step: RelativePose) -> DescribedMotion:
-        """Take it from a step between two views."""
+        """Build from a step between two views."""
         motion = PredictedMotion(step.rotation, step.translation, 4 * step.covariance)
         return cls(motion, float(step.kept.mean()))
 
@@ -67,8 +77,8 @@ def wide_motion(
 
 @dataclass(frozen=True, eq=False)
 class Repeats:
-    """Repetitions in the last view of tracks. share: of points beside which it repeats; pitches_m: (P, 3)
-    motions in the camera's axes after which it lies on itself.
+    """Repetitions in the last tracked view. share: of the points next to which it repeats; pitches_m: (P, 3)
+    shifts in the camera's axes that map it onto itself.
     """
 
     share: float
@@ -76,7 +86,7 @@ class Repeats:
 
     @classmethod
     def of(cls, tracks: Tracks) -> Repeats:
-        """Find the periods along rows and columns."""
+        """Find the periods along the picture's rows and columns."""
         assert tracks.last is not None
         image, places = tracks.last.left, tracks.stereo[:, :2]
         depth = triangulate_stereo(tracks.stereo, tracks.last.camera)[:, 2]
@@ -94,7 +104,7 @@ class Repeats:
 def check_overlap(
     tracks: Tracks, pair: PatchPair, wide: DescribedMotion, settings: TrackSettings
 ) -> Failed | None:
-    """Fail `ambiguous` where the new pair shows too few of the tracked points to tell places alike apart."""
+    """Fail `ambiguous` where the new pair contains too few tracked points to rule out a look-alike place."""
     points = triangulate_stereo(tracks.stereo, pair.pair.camera)
     inside = predict_projections(points, settings.sigma_px, wide.motion, pair.pair.camera).inside
     least = MIN_INSIDE if wide.agreeing < UNDISPUTED else MIN_INSIDE_UNDISPUTED
@@ -109,7 +119,7 @@ def check_next_bars(
     tracks: Tracks, pair: PatchPair, motion: PredictedMotion, repeats: Repeats, found: int,
     settings: TrackSettings,
 ) -> Failed | None:  # fmt: skip
-    """Fail `ambiguous` where a motion some bars further explains nearly as many points as the one found."""
+    """Fail `ambiguous` where a motion some bars off explains nearly as many points as the one found."""
     camera = pair.pair.camera
     points = triangulate_stereo(tracks.stereo, camera)
     inside = int(predict_projections(points, settings.sigma_px, motion, camera).inside.sum())
@@ -127,7 +137,9 @@ def check_next_bars(
 
 
 def _alike(values: Float64, min_count: float) -> list[float]:
-    """Group values that differ by less than a tenth: the medians of groups large enough."""
+    """Group values whose neighbours differ by less than a tenth; return the medians of the large enough
+    groups.
+    """
     ordered = np.sort(values)
     parts = (
         np.split(ordered, np.flatnonzero(np.diff(ordered) > 0.1 * ordered[:-1]) + 1) if len(values) else []

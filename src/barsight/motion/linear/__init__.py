@@ -1,1 +1,1 @@
-"""Linear algebra of the estimators: skyline Cholesky, Schur complement, their kernels."""
+"""Solve the estimators' linear algebra: Schur complement, elimination, ordering, and their kernels."""

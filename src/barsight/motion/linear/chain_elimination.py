@@ -1,7 +1,7 @@
 """Eliminate nodes between frames, which no picture sees, before all others.
 
-Only the IMU and the encoders bind them, each to its neighbours: between two frames they are a small system of
-their own. The band of what is left is as wide as the longest track in frames, not in nodes.
+Only the IMU and the encoders constrain them, each by its neighbours: between two frames they form a small
+system of their own. The band that remains is as wide as the longest track in frames, not in nodes.
 """
 
 from __future__ import annotations
@@ -18,9 +18,10 @@ from barsight.core.linalg.skyline import Skyline
 
 
 class Chain(NamedTuple):
-    """Normal equations of M nodes of n unknowns that bind their neighbours and S unknowns of the encoders
-    only. own (M, n, n): each one's; link (M, n, n): of each (rows) with the one before, 0 for the first;
-    gradient (M, n); side (M, n, S) with the encoders'; corner (S, S), corner_gradient (S,): of these alone.
+    """Normal equations of M nodes with n unknowns each, which are coupled only to their neighbours and to S
+    unknowns of the encoders. own (M, n, n): each node's block; link (M, n, n): each node (rows) with the one
+    before, 0 for the first; gradient (M, n); side (M, n, S): with the encoders' unknowns; corner (S, S),
+    corner_gradient (S,): of these alone.
     """
 
     own: Float64
@@ -40,7 +41,7 @@ class Chain(NamedTuple):
         )  # fmt: skip
 
     def at(self, nodes: Int64 | slice) -> Chain:
-        """Select nodes. What binds the first of them to one before is no part of it."""
+        """Select nodes, dropping the coupling of the first one to the node before it."""
         link = self.link[nodes].copy()
         link[:1] = 0.0
         return Chain(
@@ -51,8 +52,8 @@ class Chain(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class EliminatedNodes:
-    """Eliminated nodes first...end - 1. answer: (m n, 2 n + S + 1) by which they follow the kept nodes before
-    and after, the encoders' unknowns, and nothing at all.
+    """Eliminated nodes first...end - 1. answer: (m n, 2 n + S + 1) their linear dependence on the kept nodes
+    before and after and on the encoders' unknowns, and a constant.
     """
 
     first: int
@@ -61,8 +62,8 @@ class EliminatedNodes:
 
 
 def eliminate_nodes(chain: Chain, kept: Int64) -> tuple[Chain, tuple[EliminatedNodes, ...]]:
-    """Form the Schur complement on the nodes `kept` (K,), and what was taken out. Raises LinAlgError where
-    the sensors leave a node between undetermined.
+    """Form the Schur complement on the nodes `kept` (K,); also return the eliminated nodes. Raises
+    LinAlgError where the sensors leave a node in between undetermined.
     """
     left, gaps = chain.at(kept), []
     for k, (before, after) in enumerate(pairwise([-1, *kept.tolist(), len(chain.own)])):
@@ -72,7 +73,7 @@ def eliminate_nodes(chain: Chain, kept: Int64) -> tuple[Chain, tuple[EliminatedN
 
 
 def _take_out(chain: Chain, first: int, end: int, k: int, left: Chain) -> EliminatedNodes:
-    """Eliminate the nodes first...end - 1, between the kept nodes k - 1 and k where there are such."""
+    """Eliminate the nodes first...end - 1, which lie between the kept nodes k - 1 and k where these exist."""
     size, here = chain.own.shape[1], slice(first, end)
     right = np.zeros((end - first, size, 2 * size + len(chain.corner) + 1))
     right[0, :, :size] = chain.link[first]
@@ -102,7 +103,7 @@ def _take_out(chain: Chain, first: int, end: int, k: int, left: Chain) -> Elimin
 
 @kernel()
 def add_chain(chain: Chain, at: Int64, band: Skyline) -> None:
-    """Add a chain's nodes, each node's unknowns from at[k] on.
+    """Add a chain's nodes to a band matrix, each node's unknowns from at[k] on.
 
     at: (M,). band: the matrix that they are added to.
     """
@@ -119,9 +120,8 @@ def add_chain(chain: Chain, at: Int64, band: Skyline) -> None:
 
 @kernel()
 def add_products(first: Int64, at: Int64, values: Float64, right: Float64, chain: Chain) -> None:
-    """Add the normal equations of sparse rows: row r has `right` and values[k] at unknown at[k], where
-    first[r] <= k < first[r + 1]. From unknown M n on, after the nodes', are the
-    encoders'.
+    """Add the normal equations of sparse rows: row r has the right-hand side right[r] and values[k] at
+    unknown at[k], where first[r] <= k < first[r + 1]. The encoders' unknowns follow the nodes', from M n on.
 
     first: (R + 1,); at, values: (E,) elements of R rows; right: (R,).
     """
@@ -149,7 +149,7 @@ def add_products(first: Int64, at: Int64, values: Float64, right: Float64, chain
 def back_substitute_nodes(
     step: Float64, shared: Float64, kept: Int64, gaps: tuple[EliminatedNodes, ...], nodes: int
 ) -> Float64:
-    """Back-substitute the step (M, n) of all nodes from that of the kept ones (K, n) and of the encoders'
+    """Back-substitute the step (M, n) of all nodes from those of the kept ones (K, n) and of the encoders'
     unknowns (S,).
     """
     result = np.zeros((nodes, step.shape[1]))

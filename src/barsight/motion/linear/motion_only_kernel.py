@@ -1,4 +1,4 @@
-"""Form one frame's normal equations by points taken as known (motion-only adjustment)."""
+"""Form one frame's normal equations with the points taken as known (motion-only adjustment)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def frame_equations(
     normal: Float64,
     gradient: Float64,
 ) -> None:
-    """Add to the matrix (6, 6) and gradient (6,) of the frame's pose what its used sightings say."""
+    """Add the frame's used sightings to the normal matrix (6, 6) and gradient (6,) of its pose."""
     lens, mount, camera, points, rows = rig.lens, rig.mount, guess.camera, guess.points, empty_rows()
     stereo, weight, node, last = (
         observations.stereo,

@@ -1,9 +1,9 @@
 """Order the unknowns of the normal equations.
 
-Unknowns go node by node (pose, with an IMU velocity and biases). What a piece of the yard has of its own
-(`slides`) is bound to the nodes that see it and follows the last of these. So the equations are a band,
-however long the way is: a pose's row begins at the first node that saw a point which it sees, a velocity's
-and a bias's at the node before, a piece's at the first node that sees it.
+The unknowns go node by node (pose, with an IMU velocity and biases). Those of a piece of the yard
+(`apparent_motion`) are coupled to the nodes that see it and follow the last of these. So the equations form a
+band, however long the travel is: a pose's row begins at the first node that saw a point which the pose sees,
+a velocity's and a bias's at the node before, a piece's at the first node that sees it.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from barsight.core.linalg.skyline import Skyline
 
 @dataclass(frozen=True, eq=False)
 class Ordering:
-    """size: unknowns a node. node: (K,) each node's first unknown; piece: (S,) each piece's slide, its
-    disparity is the next. seen: (S, 2) the first and last node that see a piece. first: (n,) as `Skyline` has
-    it. reach: how many nodes the longest track spans.
+    """size: number of unknowns per node. node: (K,) index of each node's first unknown; piece: (S,) index of
+    each piece's slide, which its disparity follows. seen: (S, 2) the first and last node that see a piece.
+    first: (n,) as in `Skyline`. reach: number of nodes that the longest track spans.
     """
 
     size: int
@@ -44,18 +44,18 @@ class Ordering:
 
     @cached_property
     def pieces(self) -> Int64:
-        """Return the indices (2 S,) of the pieces' slides, then their disparities."""
+        """Return the indices (2 S,) of the pieces' slides, followed by those of their disparities."""
         return np.concatenate([self.piece, self.piece + 1])
 
     def zeros(self) -> Skyline:
-        """Allocate a skyline matrix for all of them."""
+        """Allocate a skyline matrix of zeros for all unknowns."""
         return skyline.empty_skyline(self.first)
 
 
 def order_unknowns(size: int, nodes: int, begin: Int64, end: Int64, piece: Int64 | None) -> Ordering:
     """Order the unknowns.
 
-    begin, end: (T,) the nodes of each point's first and last sighting; piece: (T,) as `Pieces`.
+    begin, end: (T,) the nodes of each point's first and last sighting; piece: (T,) as in `Pieces`.
     """
     index = np.arange(nodes)
     seen = np.empty((0, 2), np.int64)
@@ -71,7 +71,7 @@ def order_unknowns(size: int, nodes: int, begin: Int64, end: Int64, piece: Int64
     nearest = np.maximum(index - 1, 0)
     earliest = nearest.copy()
     np.minimum.at(earliest, end, begin)
-    earliest = np.minimum.accumulate(earliest[::-1])[::-1]  # a track binds all nodes between its ends
+    earliest = np.minimum.accumulate(earliest[::-1])[::-1]  # a track couples all nodes between its ends
     first = np.zeros(size * nodes + 2 * len(seen), np.int64)
     for k in range(size):
         first[node + k] = node[earliest if k < 6 else nearest]

@@ -1,9 +1,9 @@
-"""Project points to both cameras with Jacobians by pose, point and rig, compiled.
+"""Project points into both cameras, with Jacobians by pose, point and rig, compiled.
 
 Errors are predicted minus seen; poses move as GTSAM's do, by a small turn and shift in body axes. A point has
-four unknowns: its place, and how it slides (`slides`), a turn of its image about the camera's axis. The inner
-functions take plain arrays, no slices and no tuples of them: each would be counted, which costs more than the
-sums.
+four unknowns: its position and its slide (`apparent_motion`), a turn of its image about the camera's axis.
+The inner functions take plain arrays, no slices and no tuples of arrays: these would be reference-counted,
+which costs more than the arithmetic.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from barsight.core.arrays import Bool, Float64, Int64, kernel
 
 NEAREST_M = 0.05
 BEHIND_SIGMAS = 100.0
-"""What a point behind the camera is off by."""
+"""Error, in sigma, that a point behind the camera counts with on each coordinate."""
 
 
 class Rig(NamedTuple):
     """lens: (5,) focal px, cx, cy, focal times baseline (px m) and doffs px. mount: (3, 4) the left camera's
-    axes and place in the body. huber: length of a whitened error from which its pull stays.
+    axes and position in the body. huber: threshold on a whitened error's length of Huber's loss.
     """
 
     lens: Float64
@@ -30,9 +30,10 @@ class Rig(NamedTuple):
 
 
 class Observations(NamedTuple):
-    """N sightings of T points, in the points' order. first: (T + 1,) each point's begin; node, used (N,);
-    stereo (N, 3) u, v, right u; weight (N,) 1 / sigma. piece: (T,) which piece of the yard a point is of;
-    tight: (T,) 1 / rad, how it is held to the piece's slide. scale: 1 where the rig's scale is seen, else 0.
+    """N sightings of T points, in the points' order. first: (T + 1,) the start of each point's sightings;
+    node, used (N,); stereo (N, 3) u, v, right u; weight (N,) 1 / sigma. piece: (T,) the piece of the yard
+    that a point belongs to; tight: (T,) 1 / rad, how tightly it is held to its piece's slide. scale: 1 where
+    the rig's scale is observable, else 0.
     """
 
     first: Int64
@@ -47,8 +48,8 @@ class Observations(NamedTuple):
 
 class LinearisationPoint(NamedTuple):
     """Linearisation point of the unknowns. camera: (M, 3, 4) left camera from reference, turn and shift;
-    points (T, 4); shared (2 S + 2,): the slides of S pieces of the yard, what their disparity is too large by
-    (px), then the rig's drift.
+    points (T, 4); shared (2 S + 2,): the slides of S pieces of the yard, their disparity biases (px), then
+    the rig's drift.
     """
 
     camera: Float64
@@ -57,8 +58,8 @@ class LinearisationPoint(NamedTuple):
 
 
 class PointTerms(NamedTuple):
-    """Numbers that a point's sightings share. huber, scale: as `Rig` and `Observations` have them; off_px:
-    what its disparity is too large by with its piece's; yaw, drift: the rig's drift (rad, share).
+    """Values that a point's sightings share. huber, scale: as in `Rig` and `Observations`; off_px: disparity
+    bias of its piece; yaw, drift: the rig's drift (rad, ratio).
     """
 
     huber: float
@@ -69,9 +70,9 @@ class PointTerms(NamedTuple):
 
 
 POINT, POSE, PLACE, SHARED = 1, 2, 8, 12
-"""Columns of a sighting's rows (3, 13). 0: error, predicted minus seen; then the point in the left camera;
-derivatives by the pose (6) and by the point (4); last, one below the other, those of the right column by the
-piece's disparity and by the rig's drift.
+"""Columns of a sighting's rows (3, 13). Column 0: error, predicted minus seen; then the point in the left
+camera; derivatives by the pose (6) and by the point (4); the last column holds, one below the other, those of
+the right column by the piece's disparity bias and by the rig's drift.
 """
 
 
@@ -86,8 +87,8 @@ def _error(
     lens: Float64, camera: Float64, points: Float64, stereo: Float64, given: PointTerms, node: int,
     k: int, t: int, rows: Float64,
 ) -> bool:  # fmt: skip
-    """Compute error px, point and derivatives by what is shared of sighting k, of point t, by node's camera.
-    False behind the camera.
+    """Compute the error (px) of sighting k, of point t, in node's camera, the point there, and the
+    derivatives by the shared unknowns. Returns False behind the camera.
 
     lens: (5,), see `Rig`. camera: (M, 3, 4), points: (T, 4), see `LinearisationPoint`. stereo: (N, 3), see
     `Observations`. Fills rows (3, 13).
@@ -103,7 +104,7 @@ def _error(
     x, y = rows[0, POINT] * z, rows[1, POINT] * z
     slide = points[t, 3] * lens[0]
     u = lens[0] * x + lens[1]
-    # By the predicted place: by the seen one, a scale would shrink the right picture's noise and be liked.
+    # By the predicted position: by the seen one, a scale would be favoured for shrinking the noise.
     across = x - lens[3] / lens[0] * z
     rows[0, SHARED] = -1.0
     rows[1, SHARED] = -lens[0] * (1 + across**2)
@@ -129,7 +130,7 @@ def slide_offset(points: Float64, shared: Float64, piece: Int64, t: int) -> floa
 
 @kernel(inline=True)
 def disparity_offset(shared: Float64, piece: Int64, t: int) -> float:
-    """Return what a point's disparity is too large by with all of its piece, px.
+    """Return the disparity bias of a point's piece, px.
 
     shared: (2 S + 2,), see `LinearisationPoint`; piece: (T,), see `Observations`.
     """
@@ -140,7 +141,7 @@ def disparity_offset(shared: Float64, piece: Int64, t: int) -> float:
 
 @kernel(inline=True)
 def given_of(rig: Rig, observations: Observations, shared: Float64, t: int) -> PointTerms:
-    """Collect the numbers that the sightings of point t have in common.
+    """Collect the values that the sightings of point t share.
 
     shared: (2 S + 2,), see `LinearisationPoint`.
     """
@@ -151,7 +152,7 @@ def given_of(rig: Rig, observations: Observations, shared: Float64, t: int) -> P
 
 @kernel()
 def residuals(rig: Rig, observations: Observations, guess: LinearisationPoint, result: Float64) -> float:
-    """Compute residuals (N, 3) px, seen minus predicted, of the used sightings; returns their robust cost."""
+    """Compute residuals (N, 3) px, seen minus predicted, of the used sightings; return their robust cost."""
     lens, camera, points, shared = rig.lens, guess.camera, guess.points, guess.shared
     first, node, used, stereo, weight = (
         observations.first,
@@ -185,8 +186,8 @@ def whitened_rows(
     lens: Float64, mount: Float64, camera: Float64, points: Float64, stereo: Float64, weight: float,
     given: PointTerms, at: tuple[int, int, int], rows: Float64,
 ) -> None:  # fmt: skip
-    """Compute the whitened rows of a sighting of 1 / sigma `weight`; at: its node, its own number and its
-    point's. All 0 behind the camera.
+    """Compute the whitened rows of a sighting; weight: its 1 / sigma; at: its node, its own index and its
+    point's. All are 0 behind the camera.
 
     lens: (5,), mount: (3, 4), see `Rig`. camera: (M, 3, 4), points: (T, 4), see `LinearisationPoint`. stereo:
     (N, 3), see `Observations`. Fills rows (3, 13).

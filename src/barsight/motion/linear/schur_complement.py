@@ -1,9 +1,9 @@
-"""Form the Schur complement of the points: what is left binds poses and shared unknowns only.
+"""Form the Schur complement of the points, which leaves poses and shared unknowns only.
 
-A point is seen from a few nodes and binds only these, so its unknowns (three where nothing may slide, else
-four) are eliminated where it stands (Schur's complement). With L L^T its own matrix, what it binds loses
-U^T U, U being L's inverse times what it shares with each: products along rows as long as its track, which
-the processor takes four at a time.
+A point is seen from a few nodes and coupled only to these, so its unknowns (three where nothing may slide,
+else four) are eliminated point by point. With L L^T the point's own matrix, the equations of the unknowns
+coupled to it lose U^T U, where U is L's inverse times the coupling: products along rows as long as its track,
+which the processor computes four at a time.
 """
 
 from __future__ import annotations
@@ -32,10 +32,11 @@ NO_PIECES = np.empty((0, 2), np.int64)
 
 
 class ReducedSystem(NamedTuple):
-    """Reduced normal equations of poses and what is shared. band: (M, 6, 6 R) of each pose with those of the
-    nodes k - R + 1...k, of its own block the lower half; gradient (6 M,). What points of S pieces (one where
-    there are none) say of their piece's slide and disparity and of the rig's drift: side (S, 4, 6 Q) with the
-    Q poses from node `first` (S,) on; corner (S, 4, 4), corner_gradient (S, 4) of itself.
+    """Reduced normal equations of poses and shared unknowns. band: (M, 6, 6 R) each pose with those of the
+    nodes k - R + 1...k, of its own block the lower half; gradient (6 M,). The equations of the slide and
+    disparity of S pieces (one where there are none) and of the rig's drift, from the piece's points: side (S,
+    4, 6 Q) with the Q poses from node `first` (S,) on; corner (S, 4, 4), corner_gradient (S, 4) of
+    themselves.
     """
 
     band: Float64
@@ -58,9 +59,9 @@ class ReducedSystem(NamedTuple):
 
 
 class Span(NamedTuple):
-    """A point's place in a reduced system. begun: the first node that sees it; piece, since: its piece, and
-    the node at which that one's side begins; begin: of the piece's slide and disparity and of the drift those
-    from here on count; size: the point's unknowns, 3 or 4.
+    """Location of a point in a reduced system. begun: the first node that sees it; piece, since: its piece,
+    and the node at which that piece's side begins; begin: index from which the piece's slide, disparity and
+    the drift count; size: number of the point's unknowns, 3 or 4.
     """
 
     begun: int
@@ -72,7 +73,7 @@ class Span(NamedTuple):
 
 @kernel(inline=True)
 def _factorise(m: Float64, size: int) -> None:
-    """Replace a symmetric matrix's lower half by its Cholesky factor, the diagonal by that one's inverse.
+    """Replace the lower half of a symmetric matrix by its Cholesky factor with inverted diagonal.
 
     m: (4, 4), of which the first `size` rows and columns count.
     """
@@ -90,7 +91,7 @@ def _factorise(m: Float64, size: int) -> None:
 
 @kernel(inline=True)
 def _add_point(rows: Float64, size: int, normal: Float64, gradient: Float64) -> None:
-    """Add a sighting's part of its point's own equations (4, 4), of the matrix the lower half, and (4,)."""
+    """Add a sighting to its point's own equations: normal (4, 4), the lower half, and gradient (4,)."""
     for a in range(size):
         x, y, z = rows[0, PLACE + a], rows[1, PLACE + a], rows[2, PLACE + a]
         gradient[a] += x * rows[0, 0] + y * rows[1, 0] + z * rows[2, 0]
@@ -102,8 +103,8 @@ def _add_point(rows: Float64, size: int, normal: Float64, gradient: Float64) -> 
 def _add_pose(
     rows: Float64, span: Span, node: int, band: Float64, gradient: Float64, side: Float64, bound: Float64
 ) -> None:
-    """Add a sighting's part of its pose's own equations and of those with what is shared; to bound (4, 6 R)
-    that with its point.
+    """Add a sighting to its pose's own equations and to those with the shared unknowns; write its coupling of
+    pose and point to bound (4, 6 R).
     """
     own, first = band.shape[2] - 6, 6 * (node - span.begun)
     for a in range(6):
@@ -121,8 +122,8 @@ def _add_pose(
 def _take_out(
     bound: Float64, width: int, rest: Float64, factor: Float64, span: Span, result: ReducedSystem
 ) -> None:
-    """Subtract U^T U, U being the factor's inverse times what the point shares: bound (4, width) with poses,
-    rest (4, 5) with the piece's slide and disparity, drift and gradient.
+    """Subtract U^T U, where U is the factor's inverse times the point's coupling: bound (4, width) with
+    poses, rest (4, 5) with the piece's slide and disparity, the drift and the gradient.
     """
     band, gradient, side = result.band, result.gradient, result.side[span.piece]
     corner, corner_gradient = result.corner[span.piece], result.corner_gradient[span.piece]
@@ -223,11 +224,11 @@ def scatter_reduced(
     reduced: ReducedSystem, node: Int64, piece: Int64, rows: Skyline, gradient: Float64, side: Float64,
     corner: Float64, corner_gradient: Float64,
 ) -> None:  # fmt: skip
-    """Scatter `reduced` into the equations of all unknowns, which stand as `Layout` has them; the rig's drift
-    is the border's last.
+    """Scatter `reduced` into the equations of all unknowns, in the order of `Ordering`; the rig's drift comes
+    last in the border.
 
-    node: (M,) where each node's unknowns begin; piece: (S,) where each piece's do, empty where there are
-    none. Added to: rows, gradient (N,) and, of the border, side (B, N), corner (B, B), corner_gradient (B,).
+    node: (M,) index of each node's first unknown; piece: (S,) of each piece's, empty where there are none.
+    Adds to rows, gradient (N,) and, of the border, side (B, N), corner (B, B), corner_gradient (B,).
     """
     band, slope, first, sides, corners, corner_slopes = reduced
     values, offset = rows.values, rows.offset
@@ -274,8 +275,8 @@ def back_substitute(
     moved: Float64,
     variance: Float64,
 ) -> None:
-    """Back-substitute the points `moved` (T, 4) after steps (M, 6) of the poses and (2 S + 2,) of what is
-    shared; variance (T,) of each point's slide, all else taken as known.
+    """Back-substitute the points `moved` (T, 4) after steps (M, 6) of the poses and (2 S + 2,) of the shared
+    unknowns; variance: (T,) of each point's slide with all else taken as known.
     """
     lens, mount, camera, points, shared = rig.lens, rig.mount, guess.camera, guess.points, guess.shared
     first, node, used, stereo, weight = (

@@ -1,1 +1,1 @@
-"""The estimation problem: states, factors, normal equations, Gauss-Newton, marginals."""
+"""Define and solve the estimation problem: states, factors, normal equations, marginals."""

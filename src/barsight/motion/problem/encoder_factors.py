@@ -1,13 +1,15 @@
 """Form the encoders' residuals with an estimated latency, and remove outliers.
 
-A reading stamped t says where the crane was at t minus the latency. That shows wherever the speed changes,
-since pictures and IMU know the way by themselves. Their scale against the baseline is the rig's drift; a
-constant offset is seen by nothing in the recording: it stays what the yard's origin is.
+A reading stamped t gives the crane's position at t minus the latency. The latency can be observed wherever
+the speed changes, since pictures and IMU know the travel by themselves. The encoders' scale against the
+baseline is the rig's drift. A constant offset can't be observed in the recording: it remains part of the
+yard's origin.
 
-Encoders tell where wheels and drum are, not the body: rails that wave and a girder that swings move it by
-millimetres, alike over a stretch of the way. Taken as noise of single readings, which averages out, that
-would tilt the whole yard surely. So a place's variance is the readings' own plus this unevenness's, as often
-as it counts among its neighbours; its size on each axis is learnt from the recording.
+Encoders measure the positions of wheels and drum, not of the body: wavy rails and a swinging girder move it
+by millimetres, by the same amount over a stretch of the travel. Treated as independent noise of readings,
+which averages out, that would tilt the whole yard with great confidence. So a position's variance is that of
+its readings plus that of this unevenness times the number of positions nearby; its size on each axis is
+learnt from the recording.
 """
 
 from __future__ import annotations
@@ -38,14 +40,16 @@ from barsight.motion.problem.rig_drift import HUBER_SIGMAS
 
 FARTHEST_SIGMAS = 5.0
 WINDOW_S = 0.21
-"""Readings this near to a node count for it: all of them, nodes being 0.4 s apart."""
+"""Maximum distance in time of a node's readings: all are used, since nodes are 0.4 s apart."""
 MIN_SIGMA_M = 0.0003
 MIN_AGREEING_SIGMA_M = 0.001
-"""What a parabola through the readings may be off by while the crane jerks, which isn't a disagreement."""
+"""Lower bound of a position's sigma when outliers are removed: the error of a parabola through the readings
+while the crane jerks, which is no disagreement.
+"""
 PRIOR_STRETCHES = 3.0
-"""Weight of the first unevenness as a prior, in stretches of a recording."""
+"""Weight of the initial unevenness as a prior, in stretches of a recording."""
 MAX_UNEVEN_M = 0.006
-"""Largest residual that counts towards the unevenness: more is a fault."""
+"""Largest residual that counts towards the unevenness: a larger one is a fault, and is clipped."""
 NOTED_LATENCY_SIGMAS = 5.0
 NOTED_LATENCY_S = 0.005
 AXES = ("bridge", "trolley", "hoist")
@@ -53,8 +57,8 @@ AXES = ("bridge", "trolley", "hoist")
 
 @dataclass(frozen=True)
 class EncoderState:
-    """latency_s and its sigma: zero and the prior's where nothing shows it. jump_m, jump_sigma_m: (J,) of
-    each jump.
+    """latency_s and its sigma: zero and the prior's where nothing shows it. jump_m, jump_sigma_m: (J,) size
+    of each jump and its sigma.
     """
 
     latency_s: float
@@ -66,7 +70,7 @@ class EncoderState:
 def encoder_position(
     crane: CraneSamples, node: int, stamp_ns: int, window_ns: int, way: ImuWay | None, late_ns: int = 0
 ) -> EncoderPosition | Failed:
-    """Interpolate the body's place at a node by the readings around it; see `fit_position`."""
+    """Interpolate the body's position at a node from the readings around it; see `fit_position`."""
     fit = fit_position(crane, stamp_ns, window_ns, way, late_ns)
     if isinstance(fit, Failed):
         return fit
@@ -77,7 +81,7 @@ def encoder_position(
 def encoder_positions(
     crane: CraneSamples, imu: ImuSamples | None, stamp_ns: Int64, nodes: Sequence[int]
 ) -> tuple[EncoderPosition, ...]:
-    """Interpolate the body's place at the nodes (of stamps (M,)), the attitude about as nominal."""
+    """Interpolate the body's position at some nodes of stamps (M,), with the attitude taken as nominal."""
     found, half = [], seconds_to_ns(WINDOW_S)
     for k in nodes:
         stamp, nominal, none = int(stamp_ns[k]), crane.yard_from_body_nominal, ImuBias.none()
@@ -87,8 +91,8 @@ def encoder_positions(
 
 
 def with_known_way(problem: Problem, values: Any) -> Problem:
-    """Refine places by the way that the IMU tells with the estimate's attitudes, biases and latency: they are
-    1.5 times as good.
+    """Refine the positions by the travel from the IMU, integrated with the estimate's attitudes, biases and
+    latency: they become 1.5 times as precise.
     """
     crane, imu = problem.crane, problem.imu
     if crane is None or imu is None or not problem.has_imu:
@@ -106,8 +110,8 @@ def with_known_way(problem: Problem, values: Any) -> Problem:
 
 
 def add_encoders(chain: Chain, problem: Problem, poses: Float64, unknowns: Float64) -> None:
-    """Add the Huber-weighted place residuals to the chain's nodes and the encoders' `unknowns` (S,). poses:
-    (M, 4, 4).
+    """Add the Huber-weighted position residuals to the chain's nodes and the encoders' `unknowns` (S,).
+    poses: (M, 4, 4).
     """
     if not problem.placed:
         return
@@ -117,7 +121,7 @@ def add_encoders(chain: Chain, problem: Problem, poses: Float64, unknowns: Float
     sigma = encoder_sigmas(problem)
     distance = np.linalg.norm(error / sigma, axis=1)
     weight = (HUBER_SIGMAS / np.maximum(distance, HUBER_SIGMAS))[:, None] / sigma**2
-    shift = np.arange(3, 6)  # GTSAM's, in body axes
+    shift = np.arange(3, 6)  # of GTSAM's pose, in body axes
     chain.own[node[:, None, None], shift[:, None], shift] += np.einsum("pij,pi,pik->pjk", turn, weight, turn)
     chain.gradient[node, 3:6] += np.einsum("pi,pij,pi->pj", weight, turn, error)
     chain.side[node, 3:6] -= np.einsum("pi,pij,pis->pjs", weight, turn, by_unknowns)
@@ -126,7 +130,7 @@ def add_encoders(chain: Chain, problem: Problem, poses: Float64, unknowns: Float
 
 
 def encoders_cost(values: Any, problem: Problem) -> float:
-    """Compute the Huber cost of the places."""
+    """Compute the Huber cost of the positions."""
     distance = np.linalg.norm(encoder_residuals(values, problem) / encoder_sigmas(problem), axis=1)
     near = np.minimum(distance, HUBER_SIGMAS)
     return float((near * (distance - near / 2)).sum())
@@ -142,14 +146,14 @@ def encoder_residuals(values: Any, problem: Problem) -> Float64:
 
 
 def encoder_inliers(values: Any, problem: Problem) -> Bool:
-    """Select places (P,) within 5 sigma of the poses."""
+    """Select the positions (P,) within 5 sigma of the poses."""
     sigma = encoder_sigmas(problem, MIN_AGREEING_SIGMA_M)
     kept: Bool = np.linalg.norm(encoder_residuals(values, problem) / sigma, axis=1) < FARTHEST_SIGMAS
     return kept
 
 
 def with_unevenness(problem: Problem, values: Any) -> Problem:
-    """Estimate the unevenness of each axis by the places' residuals beyond the readings' own."""
+    """Estimate the unevenness of each axis from the positions' residuals in excess of the readings' noise."""
     if not problem.placed:
         return problem
     square = np.minimum(encoder_residuals(values, problem) ** 2, MAX_UNEVEN_M**2)
@@ -161,13 +165,15 @@ def with_unevenness(problem: Problem, values: Any) -> Problem:
 
 
 def encoder_sigmas(problem: Problem, min_m: float = MIN_SIGMA_M) -> Float64:
-    """Compute the places' sigmas (P, 3) m, with the unevenness that neighbours share. min_m: of readings."""
+    """Compute the positions' sigmas (P, 3) m, including the unevenness that neighbours share. min_m: lower
+    bound of the readings' part.
+    """
     own = np.array([max(p.sigma_m, min_m) for p in problem.placed], np.float64)
     return np.hypot(own[:, None], problem.uneven_m * np.sqrt(problem.alike)[:, None])
 
 
 def encoder_state(values: Any, jumps: Sequence[EncoderJump], sigmas: Float64) -> EncoderState:
-    """Extract the encoders' estimated latency and jumps. sigmas: (S,)."""
+    """Extract the encoders' estimated latency and jumps. sigmas: (S,) of these unknowns."""
     found = encoder_unknowns_of(values)
     sizes = np.array([jump.size_m for jump in jumps], np.float64)
     return EncoderState(float(found[0]), float(sigmas[0]), sizes + found[1:], sigmas[1:])
@@ -176,9 +182,9 @@ def encoder_state(values: Any, jumps: Sequence[EncoderJump], sigmas: Float64) ->
 def jump_sentences(
     jumps: Sequence[EncoderJump], begin_ns: int, state: EncoderState | None
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Tell of jumps that are sure and of those that may be, with the sizes that the whole estimate shows.
+    """Describe certain and possible jumps, with the sizes that the whole estimate shows.
 
-    begin_ns: stamp of the first reading, from which times are told.
+    begin_ns: stamp of the first reading, from which times are counted.
     """
     sure, maybe = [], []
     for k, jump in enumerate(jumps):
@@ -203,7 +209,7 @@ def encoder_warnings(
     off_m: Float64,
     kept: Bool,
 ) -> tuple[str, ...]:
-    """Warn of a latency that matters, and of stretches where encoders and the rest disagree.
+    """Warn of a latency that matters, and of stretches where the encoders disagree with the other sensors.
 
     off_m: (P, 3) from `encoder_residuals`. Times are seconds since the first node.
     """
@@ -231,8 +237,8 @@ def encoder_warnings(
 
 
 def _readings(problem: Problem, unknowns: Float64) -> tuple[Float64, Float64]:
-    """Evaluate the encoders' places (P, 3) a latency later, by their parabolas, without what the jumps are
-    larger by, and the derivatives (P, 3, S) by these unknowns.
+    """Extrapolate the encoders' positions (P, 3) by the latency along their parabolas, less the estimated
+    excess of the jumps; also return the derivatives (P, 3, S) by these unknowns.
     """
     placed, latency_s = problem.placed, float(unknowns[0])
     place = np.array([p.position_m for p in placed])

@@ -1,7 +1,8 @@
 """Optimise all unknowns by Levenberg-Marquardt: points eliminated by kernels, the rest linearised by GTSAM.
 
-Unknowns stand as `layout` has them, so the matrix is a band as wide as the longest track; the encoders'
-unknowns, what all pieces of the yard share and the rig's drift touch many nodes and stand at its border.
+The unknowns are in the order of `layout`, so the matrix is a band as wide as the longest track. The encoders'
+unknowns, the slide common to all pieces of the yard and the rig's drift are coupled to many nodes and form
+its border.
 """
 
 from __future__ import annotations
@@ -38,8 +39,9 @@ RELATIVE_GAIN = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class GraphState:
-    """values: GTSAM's, of all but the points (T, 4; the fourth is a point's slide, rad), the rig's
-    drift (2,) and of the pieces (2 S,) the slides, rad, and what their disparities are too large by, px."""
+    """values: GTSAM's, of all unknowns but the points (T, 4; the fourth is a point's slide, rad), the rig's
+    drift (2,) and the pieces' (2 S,): slides, rad, and disparity biases, px.
+    """
 
     values: Any
     points: Float64
@@ -95,7 +97,7 @@ def sighting_residuals(problem: Problem, state: GraphState, used: Bool) -> Float
 
 @dataclass(frozen=True, eq=False)
 class _PoseIterate:
-    """A state, its cost and, made on use and let go with it, its system: never are two held."""
+    """State with its cost and its system, which is made on use and released with it: never are two held."""
 
     problem: Problem
     graph: Any
@@ -125,9 +127,9 @@ def optimise_graph(
 ) -> tuple[GraphState, System]:
     """Find the state that fits best, and its system, by Levenberg-Marquardt.
 
-    graph: GTSAM's factors of all but sightings and encoders. The rig's drift stays. min_gain: the share of
-    the cost that a step must save for another to follow. Raises LinAlgError where the measurements leave an
-    unknown undetermined.
+    graph: GTSAM's factors of everything but sightings and encoders. The rig's drift is kept fixed. min_gain:
+    relative decrease of the cost from which a step is followed by another. Raises LinAlgError where the
+    measurements leave an unknown undetermined.
     """
     found = minimise(_PoseIterate(problem, graph, used, state), Options(max_steps, min_gain, 0.0, 1e-5, 1e6))
     if found.termination is Termination.SINGULAR:
@@ -169,7 +171,7 @@ def _hold_pieces(
 ) -> None:  # fmt: skip
     """Add the prior of `Pieces.cost`.
 
-    What slides have in common, the border's last but the drift, is where it costs least.
+    The common slide, the border's last unknown before the drift, is at its optimum.
     """
     sigma, (slides, disparities) = pieces.slide_sigma_rad, np.split(unknowns, 2)
     slide, disparity = layout.piece, layout.piece + 1
@@ -185,8 +187,8 @@ def retract(
     problem: Problem, state: GraphState, used: Bool, step: Float64, pieces: Float64, border: Float64,
     seen_step: Float64 | None = None,
 ) -> GraphState:  # fmt: skip
-    """Retract a step of the nodes', the pieces' and the border's unknowns; the points follow.
-    seen_step: (K, 6) by which pictures move, where not as the poses do.
+    """Retract a step of the nodes', the pieces' and the border's unknowns; the points are back-substituted.
+    seen_step: (K, 6) the poses' step as the pictures see it, where it differs.
     """
     by_node = step.reshape(len(problem.start), -1)
     vectors = gtsam.VectorValues()

@@ -1,6 +1,6 @@
-"""Build GTSAM's factors of all but sightings and encoders: preintegrated IMU between neighbouring nodes,
-priors on attitude, biases, the encoders' unknowns and, where the body stands still, velocity; and these
-linearised.
+"""Build GTSAM's factors of everything but sightings and encoders, and linearise them: preintegrated IMU
+between neighbouring nodes; priors on attitude, biases, the encoders' unknowns and, where the body stands
+still, velocity.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from barsight.motion.problem.problem import Problem, encoder_unknowns_of
 
 WIDTHS = {"x": 6, "v": 3, "b": 6}
 OFFSETS = {"x": 0, "v": 6, "b": 9}
-"""Where a node's unknowns stand: pose, with an IMU velocity and biases."""
+"""Offsets of a node's unknowns: pose, with an IMU velocity and biases."""
 
 
 def build_graph(problem: Problem, first: int = 0, end: int | None = None) -> Any:
-    """Build the graph without sightings and encoders of what binds the nodes first...end - 1 (None:
-    all) and, by the IMU, each to the next.
+    """Build the graph, without sightings and encoders, of the factors of nodes first...end - 1 (None: all)
+    and, by the IMU, of each with the next.
     """
     graph = gtsam.NonlinearFactorGraph()
     nodes = range(first, len(problem.start) if end is None else end)
@@ -34,7 +34,7 @@ def build_graph(problem: Problem, first: int = 0, end: int | None = None) -> Any
 
 
 def initial_values(problem: Problem) -> Any:
-    """Build GTSAM's start values."""
+    """Build GTSAM's initial values."""
     values = gtsam.Values()
     bias = gtsam.imuBias.ConstantBias(problem.bias.accel_mps2, problem.bias.gyro_radps)
     place = np.array([pose.translation for pose in problem.start])
@@ -51,7 +51,7 @@ def initial_values(problem: Problem) -> Any:
 
 
 def linearise_chain(graph: Any, values: Any, width: int, nodes: int) -> Chain:
-    """Linearise a graph: each node with the next and the encoders' unknowns. width: unknowns a node."""
+    """Linearise a graph of each node with the next and the encoders' unknowns. width: unknowns per node."""
     shared = len(encoder_unknowns_of(values))
     chain = Chain.empty(nodes, width, shared)
     add_products(*_sparse_rows(graph, values, width, nodes * width, shared), chain)
@@ -61,8 +61,8 @@ def linearise_chain(graph: Any, values: Any, width: int, nodes: int) -> Chain:
 def _sparse_rows(
     graph: Any, values: Any, width: int, size: int, shared: int
 ) -> tuple[Int64, Int64, Float64, Float64]:
-    """Convert GTSAM's whitened rows to the form of `add_products`; from unknown `size` on are the encoders'
-    (`shared`).
+    """Convert GTSAM's whitened rows to the form of `add_products`; the `shared` unknowns of the encoders
+    begin at `size`.
     """
     linear = graph.linearize(values)
     if linear.size() == 0:
@@ -91,7 +91,7 @@ def _add_priors(graph: Any, problem: Problem, nodes: range) -> None:
     if problem.first_fixed and begins:
         sigmas = _sigmas(1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6)
         if problem.has_imu:
-            # Gravity turns the first attitude about level axes; its heading stays where it is.
+            # Gravity corrects the first attitude about level axes; its heading stays fixed.
             up = problem.start[0].rotation.T @ np.array([0.0, 0.0, 1.0])
             spread = np.deg2rad(1.0) ** 2 * (np.eye(3) - np.outer(up, up)) + 1e-12 * np.eye(3)
             whole = np.diag([0.0, 0, 0, 1e-12, 1e-12, 1e-12])

@@ -16,11 +16,11 @@ NO_PAIRS = np.empty((0, 2), np.int64)
 
 @dataclass(frozen=True, eq=False)
 class Marginals:
-    """Marginal covariances of the system's K nodes. poses: (K, 6, 6) in GTSAM's order and body axes, the
-    rig's drift taken as known. encoder_sigmas: (S,) of the encoders' unknowns. drift_jacobian_of_pose:
-    (K, 6, 2) how the poses move with the drift. nodes: (K, n, n) of all that a node has, what the border
-    shares taken as known too. cross: (P, 6, 6) of pairs of poses, as `poses`; NaN for those too far apart for
-    the band.
+    """Marginal covariances of the system's K nodes. poses: (K, 6, 6) in GTSAM's order and body axes, with the
+    rig's drift taken as known. encoder_sigmas: (S,) of the encoders' unknowns. drift_jacobian_of_pose: (K, 6,
+    2) derivatives of the poses by the drift. nodes: (K, n, n) of all of a node's unknowns, with the whole
+    border taken as known. cross: (P, 6, 6) of pairs of poses, as `poses`; NaN for pairs too far apart for the
+    band.
     """
 
     poses: Float64
@@ -32,7 +32,7 @@ class Marginals:
 
 @one_blas_thread()
 def marginals(system: System, pairs: Int64 = NO_PAIRS) -> Marginals:
-    """Compute marginals of a system at its best state. pairs: (P, 2) of these nodes, the earlier first."""
+    """Compute the marginals of a system at its optimum. pairs: (P, 2) of these nodes, the earlier first."""
     layout = system.layout
     own, _ = system.schur(system.forward)
     count, size = len(layout.node), layout.size
@@ -55,8 +55,8 @@ def marginals(system: System, pairs: Int64 = NO_PAIRS) -> Marginals:
 
 @one_blas_thread()
 def slide_variances(system: System, weights: Float64) -> tuple[Float64, float]:
-    """Compute variances (2 S,) of the pieces' slides and disparities, and that of their sum with `weights` (2
-    S,), the rig's drift taken as known.
+    """Compute the variances (2 S,) of the pieces' slides and disparities, and that of their sum weighted by
+    `weights` (2 S,), with the rig's drift taken as known.
     """
     at, count = system.layout.pieces, len(system.layout.first)
     diagonal, none = np.empty(count), np.empty((0, 1, 1))
@@ -73,7 +73,7 @@ def slide_variances(system: System, weights: Float64) -> tuple[Float64, float]:
 
 
 def _to_border(system: System) -> Float64:
-    """Solve the matrix's inverse times what binds its unknowns to the border (n, b)."""
+    """Solve for the matrix's inverse times its coupling to the border (n, b)."""
     result = system.forward[:, 1:].copy()
     solve_back_dense(system.factor, result)
     return result

@@ -1,4 +1,4 @@
-"""Place the nodes of the estimate in time: the frames, and with an IMU some between."""
+"""Place the nodes of the estimate in time: at the frames and, with an IMU, in between."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ if TYPE_CHECKING:
 
 MAX_SPACING_S = 0.4
 LEAD_S = 3.0
-"""The IMU's samples this long before the first frame are used too: a crane starts from standing."""
+"""Duration of the IMU's samples before the first frame that are used too: a crane starts from rest."""
 MAX_STILL_M = 0.005
 
 
 @dataclass(frozen=True, eq=False)
 class Nodes:
-    """stamp_ns: (M,) the IMU's clock, increasing. frame: (F,) which node each frame is."""
+    """stamp_ns: (M,) on the IMU's clock, increasing. frame: (F,) the node of each frame."""
 
     stamp_ns: Int64
     frame: Int64
@@ -42,7 +42,7 @@ class Nodes:
 
 @dataclass(frozen=True, eq=False)
 class ImuConstraints:
-    """preintegrated: between nodes k and k + 1 or None. still: nodes at rest. bias: as the rest shows it."""
+    """preintegrated: between nodes k and k + 1, or None. still: nodes at rest. bias: as observed at rest."""
 
     preintegrated: tuple[Preintegrated | None, ...]
     still: tuple[int, ...]
@@ -50,7 +50,7 @@ class ImuConstraints:
 
 
 def make_nodes(frames_ns: Int64, imu: ImuSamples | None) -> Nodes:
-    """Place nodes at the frames' stamps (IMU clock), with an IMU also between them and before the first."""
+    """Place nodes at the frames' stamps (IMU clock); with an IMU also between them and before the first."""
     if imu is None or imu.stamp_ns.size < 2:
         return Nodes(frames_ns, np.arange(len(frames_ns)))
     edges = frames_ns.tolist()
@@ -65,7 +65,7 @@ def make_nodes(frames_ns: Int64, imu: ImuSamples | None) -> Nodes:
 
 
 def subdivide(first_ns: int, last_ns: int) -> list[int]:
-    """Divide an interval: stamps after the first up to the last, at most `MAX_SPACING_S` apart."""
+    """Divide an interval: stamps after the first up to the last, at most about `MAX_SPACING_S` apart."""
     parts = max(1, int(np.ceil((last_ns - first_ns) / seconds_to_ns(MAX_SPACING_S) - 0.05)))
     return [first_ns + (last_ns - first_ns) * part // parts for part in range(1, parts + 1)]
 
@@ -74,7 +74,9 @@ def initial_poses(
     nodes: Nodes, crane: CraneSamples | None, sightings: tuple[Sighting, ...], shift_ns: int,
     rectifier: Rectifier, level: GravityAlignment | None,
 ) -> tuple[Pose, ...]:  # fmt: skip
-    """Initialise the poses: the encoders' places with the nominal attitude, else the frames' chain."""
+    """Initialise the poses: by the encoders' positions and the nominal attitude, else by chaining the
+    frames.
+    """
     if crane is not None:
         stamps, places = [], []
         for stamp in nodes.stamp_ns.tolist():
@@ -94,7 +96,7 @@ def initial_poses(
 def _between(
     target: str, stamp_ns: Int64, known_ns: Int64, places: Float64, turns: Rotation
 ) -> tuple[Pose, ...]:
-    """Interpolate poses at the nodes; the nearest known one beyond the ends."""
+    """Interpolate poses at the nodes; beyond the ends the nearest known one is used."""
     time = (np.clip(stamp_ns, known_ns[0], known_ns[-1]) - known_ns[0]) / NS_PER_S
     known = (known_ns - known_ns[0]) / NS_PER_S
     place = np.column_stack([np.interp(time, known, places[:, axis]) for axis in range(3)])
@@ -107,8 +109,8 @@ def _between(
 def constrain_by_imu(
     nodes: Nodes, start: tuple[Pose, ...], placed_ns: tuple[int, int], imu: ImuSamples | None, noise: ImuNoise
 ) -> ImuConstraints:
-    """Preintegrate between neighbouring nodes and detect those at rest. placed_ns: from when to when the
-    starting poses are known (IMU's clock).
+    """Preintegrate between neighbouring nodes and detect those at rest. placed_ns: first and last stamp
+    (IMU's clock) at which the initial poses are known.
     """
     count = len(nodes.stamp_ns)
     if imu is None:
@@ -133,9 +135,9 @@ def preintegrate_between(
 def _resting(
     stamp_ns: Int64, start: tuple[Pose, ...], known: Bool, imu: ImuSamples, noise: ImuNoise
 ) -> list[int]:
-    """Detect rest at the nodes (M,). That needs both: an IMU that shows nothing but noise, as it does at
-    constant speed, and a place that doesn't change over the neighbours. Where no place is `known` (M,), the
-    rest next to it goes on as long as the IMU shows nothing.
+    """Detect the nodes (M,) at rest. Both must hold: the IMU shows nothing but noise, as it also does at
+    constant speed, and the position doesn't change between the neighbours. Where no position is `known` (M,),
+    an adjacent rest continues as long as the IMU shows nothing but noise.
     """
     quiet = is_imu_quiet(stamp_ns, imu, noise)
     place = np.array([pose.translation for pose in start])
@@ -154,14 +156,14 @@ def _resting(
 
 
 def is_imu_quiet(stamp_ns: Int64, imu: ImuSamples, noise: ImuNoise) -> Bool:
-    """Check (M,) whether the IMU shows nothing but noise around the stamps."""
+    """Check whether the IMU shows nothing but noise around each of the stamps (M,)."""
     nearest = np.clip(np.searchsorted(imu.stamp_ns, stamp_ns), 0, imu.stamp_ns.size - 1)
     quiet: Bool = stands_still(imu, noise)[nearest]
     return quiet
 
 
 def _bias_at_rest(nodes: Nodes, still: list[int], imu: ImuSamples, noise: ImuNoise) -> ImuBias:
-    """Estimate the biases from the first rest, zero where there is none."""
+    """Estimate the biases from the first rest; zero where there is none."""
     if not still:
         return ImuBias.none()
     last = still[0]

@@ -1,4 +1,4 @@
-"""Solve bordered normal equations: a skyline of the nodes, and a border of shared unknowns."""
+"""Solve bordered normal equations: a skyline matrix of the nodes, and a border of shared unknowns."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from barsight.motion.problem.rig_drift import LOOSE
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """Normal equations at a state. rows: n unknowns, which stand as `layout` has them; gradient (n,). side:
-    (b, n) with the border, corner (b, b) and corner_gradient (b,) of the border: the encoders' unknowns if
-    there are any, what pieces' slides have in common if there are any, then the rig's drift. retained: (K,)
-    the nodes that the band is of; gaps: those between. nodes: how many in all.
+    """Normal equations at a state. rows: n unknowns, in the order of `layout`; gradient (n,). side: (b, n)
+    with the border; corner (b, b) and corner_gradient (b,): of the border, which holds the encoders' unknowns
+    if there are any, the pieces' common slide if there are any, then the rig's drift. retained: (K,) nodes of
+    the band; gaps: those eliminated between them. nodes: their total number.
     """
 
     rows: Skyline
@@ -49,7 +49,7 @@ class System:
 
     @cached_property
     def forward(self) -> Float64:
-        """Solve forward (n, 1 + b): the factor's inverse times gradient and side."""
+        """Forward-substitute (n, 1 + b): the factor's inverse times gradient and side."""
         return self._forward(self.factor)
 
     def _forward(self, factor: Skyline) -> Float64:
@@ -67,8 +67,8 @@ class System:
     def step(
         self, free: Bool, damping: float = 0.0, fixed: Float64 | None = None
     ) -> tuple[Float64, Float64, Float64]:
-        """Solve for the step (M n,) of all nodes, (2 S,) of the pieces' slides and disparities, and (b,): the
-        border's `free` (b,) unknowns step too, the others as `fixed` (b,) says.
+        """Solve for the step (M n,) of all nodes, (2 S,) of the pieces' slides and disparities, and (b,) of
+        the border, whose `free` (b,) unknowns are solved for; the others step as given by `fixed` (b,).
         """
         factor = self._factor(damping) if damping else self.factor
         forward = self._forward(factor) if damping else self.forward

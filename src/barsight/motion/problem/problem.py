@@ -1,4 +1,4 @@
-"""Define the batch problem: sightings, encoders' places, priors and preintegrated motions."""
+"""Define the batch problem: sightings, encoder positions, priors and preintegrated motions."""
 
 from __future__ import annotations
 
@@ -23,16 +23,20 @@ from barsight.motion.linear.ordering import Ordering, order_unknowns
 
 FIRST_UNEVEN_M = 0.0005
 ALIKE_M = 0.5
-"""Rails put places so near to each other off alike: a quarter of their waves, which are a few metres long."""
+"""Distance within which rails shift positions by the same amount: a quarter of their waves, which are a few
+metres long.
+"""
 MAX_SIGHTINGS = 40
 MIN_SIGMA_PX = 0.03
-"""What no patch is better than, however well it fits: rectification, splines and aliasing."""
+"""Noise that is added to each sighting's sigma, however well its patch fits: rectification, splines and
+aliasing.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class StereoObservations:
-    """Points seen, N sightings of T points: track (N,) 0...T-1 ascending and within each node (N,)
-    ascending; stereo (N, 3) u, v, right u, px, sigma_px (N,) of each, and how the camera is mounted.
+    """N sightings of T points: track (N,) 0...T-1 ascending and, within each, node (N,) ascending; stereo
+    (N, 3) u, v, right u, px; sigma_px (N,) of each; and how the camera is mounted.
     """
 
     node: Int64
@@ -47,8 +51,8 @@ class StereoObservations:
         cls, sightings: Sequence[Sighting], node: Sequence[int], camera: RectifiedCamera,
         body_from_rect0: Pose,
     ) -> StereoObservations:  # fmt: skip
-        """Build from the front end's, each with its node. A point that is seen at more than `MAX_SIGHTINGS`
-        frames begins anew, which bounds what is tied together.
+        """Build from the front end's sightings, each with its node. A point that is seen in more than
+        `MAX_SIGHTINGS` frames begins anew, which bounds the number of nodes that it couples.
         """
         nodes = np.concatenate([np.full(len(s.track), k) for s, k in zip(sightings, node, strict=True)])
         track = np.concatenate([s.track for s in sightings])
@@ -62,19 +66,21 @@ class StereoObservations:
 
     @cached_property
     def first(self) -> Int64:
-        """Return the start of each point's sightings (T + 1,), and the end."""
+        """Return the start of each point's sightings, and the end of the last (T + 1,)."""
         return np.searchsorted(self.track, np.arange(self.track.max(initial=-1) + 2)).astype(np.int64)
 
     @cached_property
     def reach(self) -> Int64:
-        """Return the number of nodes (T,) between a point's first and last sighting."""
+        """Return the difference (T,) between the nodes of a point's first and last sighting."""
         reach: Int64 = self.node[self.first[1:] - 1] - self.node[self.first[:-1]]
         return reach
 
 
 @dataclass(frozen=True, eq=False)
 class EncoderPosition:
-    """A node's place by the encoders: (3,) of the body in `yard`, how it moves, and the place's sigma, m."""
+    """Position of a node by the encoders: (3,) of the body in `yard`, its motion, and the position's
+    sigma, m.
+    """
 
     node: int
     position_m: Float64
@@ -85,7 +91,7 @@ class EncoderPosition:
 
 @dataclass(frozen=True, eq=False)
 class AttitudePrior:
-    """A prior on a node's attitude, reference_from_body (3, 3); sigma_rad (3,) in body axes."""
+    """Prior on a node's attitude, reference_from_body (3, 3); sigma_rad (3,) in body axes."""
 
     node: int
     rotation: Float64
@@ -94,13 +100,13 @@ class AttitudePrior:
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """Pieces of the yard, and what their points have in common (`slides`). piece: (T,) 0...S-1, which one a
-    point is of. own_sigma_rad: (S,) by how much a piece's points slide apart; share: a piece as a whole
-    slides by this times that (1 sigma), half of the variance in common with all pieces. disparity_sigma_px:
-    how far off its disparity may be.
+    """Pieces of the yard, and what their points have in common (`apparent_motion`). piece: (T,) 0...S-1, the
+    piece of each point. own_sigma_rad: (S,) scatter of the slides of a piece's points; share: ratio to this
+    of the sigma of the piece's own slide, half of whose variance is common to all pieces. disparity_sigma_px:
+    sigma of a piece's disparity bias.
 
-    What slides have in common is an unknown itself (in terms of each piece's sigma), so that pieces are bound
-    to it and not to each other.
+    The common slide is an unknown itself (in units of each piece's sigma), so that pieces are coupled to it
+    and not to each other.
     """
 
     piece: Int64
@@ -115,15 +121,15 @@ class Pieces:
 
     @property
     def slide_sigma_rad(self) -> Float64:
-        """Return the slide sigma (S,) of a piece as a whole."""
+        """Return the sigma (S,) of each piece's slide as a whole."""
         return self.share * self.own_sigma_rad
 
     def common(self, unknowns: Float64) -> float:
-        """Estimate the common slide from `unknowns` (2 S,): slides, then disparities."""
+        """Estimate the common slide, in sigma, from `unknowns` (2 S,): slides, then disparity biases."""
         return float((unknowns[: self.count] / self.slide_sigma_rad).sum()) / (self.count + 1)
 
     def cost(self, unknowns: Float64) -> float:
-        """Compute half the squared sum of these in sigma."""
+        """Compute the prior's cost of these: half their squared sum in sigma."""
         slides, disparities = np.split(unknowns, 2)
         common = self.common(unknowns)
         own = slides / self.slide_sigma_rad - common
@@ -132,10 +138,10 @@ class Pieces:
 
 @dataclass(frozen=True, eq=False)
 class MarginalPrior:
-    """Marginal prior: what marginalised nodes say of those that stay, to second order about `at`.
+    """Information of marginalised nodes on those that stay, to second order about `at`.
 
-    nodes: (P,) those it binds; at: GTSAM's values of these; border (b,) of what all nodes share. matrix
-    (n, n) and gradient (n,) of their unknowns, node by node, then the border.
+    nodes: (P,) those that it constrains; at: GTSAM's values of these; border (b,) of the unknowns that all
+    nodes share. matrix (n, n) and gradient (n,) of their unknowns, node by node, then the border.
     """
 
     nodes: Int64
@@ -153,7 +159,7 @@ class MarginalPrior:
         return inertial_of(self.at, self.nodes)
 
     def since(self, values: Any) -> Float64:
-        """Compute how far the nodes' unknowns have moved from `at`, node by node in one row."""
+        """Compute the change of the nodes' unknowns since `at`, node by node in one row."""
         moved = [
             at.localCoordinates(values.atPose3(X(k)))
             for k, at in zip(self.nodes.tolist(), self._poses, strict=True)
@@ -162,7 +168,7 @@ class MarginalPrior:
 
 
 def poses_of(values: Any) -> Float64:
-    """Extract reference_from_body (M, 4, 4) of GTSAM's values, which hold nodes 0...M - 1."""
+    """Extract reference_from_body (M, 4, 4) from GTSAM's values, which hold nodes 0...M - 1."""
     flat = gtsam.utilities.extractPose3(values)
     poses = np.zeros((len(flat), 4, 4))
     poses[:, :3, :3], poses[:, :3, 3], poses[:, 3, 3] = flat[:, :9].reshape(-1, 3, 3), flat[:, 9:], 1.0
@@ -170,7 +176,7 @@ def poses_of(values: Any) -> Float64:
 
 
 def inertial_of(values: Any, nodes: Int64) -> Float64:
-    """Extract velocities and biases (P, 9) of the nodes in GTSAM's values; (P, 0) without an IMU."""
+    """Extract the nodes' velocities and biases (P, 9) from GTSAM's values; (P, 0) without an IMU."""
     if not values.exists(V(0)):
         return np.empty((len(nodes), 0))
     velocity = [values.atVector(V(k)) for k in nodes.tolist()]
@@ -178,15 +184,15 @@ def inertial_of(values: Any, nodes: Int64) -> Float64:
 
 
 def encoder_unknowns_of(values: Any) -> Float64:
-    """Extract the encoders' unknowns (S,) of GTSAM's values: their latency, s, and by how much more than its
-    size each jump is, m; (0,) without encoders.
+    """Extract the encoders' unknowns (S,) from GTSAM's values: their latency, s, and the excess of each jump
+    over its stated size, m; (0,) without encoders.
     """
     return np.asarray(values.atVector(E(0))) if values.exists(E(0)) else np.empty(0)
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Inputs of the estimate. start: (M,) poses to begin from, one per node.
+    """Inputs of the estimate. start: (M,) initial poses, one per node.
 
     first_fixed: whether the first node defines the reference (no crane). preintegrated: between nodes k and
     k + 1, None where there is no IMU or it has a gap. still: nodes at which the body doesn't move.
@@ -205,32 +211,37 @@ class Problem:
     accel_bias_sigma_mps2: float = 0.1
     encoder_latency_sigma_s: float = 0.02
     offset_prior_px: float = 0.1
-    """How far a yaw between the cameras may move the disparity (1 sigma); 0 takes it as exact."""
+    """Standard deviation, in px of disparity, of a yaw between the cameras; 0 takes the calibration as
+    exact.
+    """
     scale_prior: float = 5e-4
-    """By which share baseline and encoders may disagree (1 sigma)."""
+    """Standard deviation of the relative scale between baseline and encoders."""
     prior: MarginalPrior | None = None
-    """Takes the place of what fixes the first node, the biases and the encoders' unknowns."""
+    """Replaces the priors of the first node, the biases and the encoders' unknowns."""
     crane: CraneSamples | None = None
-    """The readings that `placed` are of."""
+    """Readings from which `placed` is computed."""
     imu: ImuSamples | None = None
-    """The samples that tell how the crane moved between those readings."""
+    """Samples that give the crane's motion between those readings."""
     pieces: Pieces | None = None
-    """What slides together; None where nothing is held to slide."""
+    """Pieces whose points slide together; None where nothing may slide."""
     asked: Int64 | None = None
-    """Nodes whose covariances are asked for, all that pictures see among them; None: all. The others are
-    taken out of the system beforehand (`chain_elimination`)."""
+    """Nodes whose covariances are wanted, which include all that pictures see; None: all. The others are
+    eliminated from the system beforehand (`chain_elimination`).
+    """
     has_latency: bool = False
     """Whether the encoders' latency is an unknown."""
     jumps: tuple[EncoderJump, ...] = ()
-    """Of the encoders' readings, each an unknown."""
+    """Jumps of the encoders, each of which is an unknown."""
     has_imu: bool = False
     """Whether velocities and biases are unknowns."""
     uneven_m: Float64 = field(default_factory=lambda: np.full(3, FIRST_UNEVEN_M))
-    """Standard deviation (3,) of the way that rails and springs move the body by, unseen by encoders."""
+    """Standard deviation (3,) of the body's motion by rails and springs, which the encoders don't see."""
 
     @cached_property
     def alike(self) -> Int64:
-        """Count the encoders' places (P,) that rails and springs put off as one, itself among them."""
+        """Count, for each encoder position (P,), those that rails and springs shift together with it, itself
+        included.
+        """
         place = np.array([p.position_m for p in self.placed]).reshape(-1, 3)
         if not len(place):
             return np.empty(0, np.int64)
@@ -243,12 +254,12 @@ class Problem:
 
     @property
     def width(self) -> int:
-        """Return the number of unknowns a node: a pose, with an IMU velocity and biases."""
+        """Return the number of unknowns per node: a pose, with an IMU also velocity and biases."""
         return 15 if self.has_imu else 6
 
     @cached_property
     def places(self) -> Int64:
-        """Return the index (M,) of each node in the system; those taken out beforehand: nowhere."""
+        """Return the index (M,) of each node in the system; -1 for those eliminated beforehand."""
         places = np.full(len(self.start), -1)
         places[self.retained] = np.arange(len(self.retained))
         return places
@@ -270,19 +281,19 @@ class Problem:
 
     @property
     def border(self) -> int:
-        """Count the unknowns that all nodes share: the encoders', what pieces' slides have in common, the
-        rig's drift.
+        """Count the unknowns that all nodes share: the encoders', the pieces' common slide, the rig's
+        drift.
         """
         return self.encoder_unknowns + int(self.pieces is not None) + 2
 
     @property
     def free(self) -> Bool:
-        """Select (border,) all of these but the drift, which is estimated apart."""
+        """Select all unknowns of the border (border,) but the drift, which is estimated separately."""
         free = np.ones(self.border, np.bool_)
         free[-2:] = False
         return free
 
     @property
     def sees_scale(self) -> bool:
-        """Check whether encoders say how long the way is."""
+        """Check whether encoders give the length of the travel."""
         return self.has_latency

@@ -13,12 +13,14 @@ from barsight.motion.problem.gtsam_factors import build_graph
 from barsight.motion.problem.problem import EncoderPosition, Problem
 
 IMU_PARTS = 9
-"""Of GTSAM's residual: three of turn, of way and of speed; the biases' walk follows."""
+"""Number of leading elements of GTSAM's residual that are used: three each of turn, way and speed; those of
+the biases' random walk follow.
+"""
 
 
 def inertial_states(problem: Problem, state: GraphState, covariance: Float64) -> InertialStates | None:
-    """Extract velocity and biases of all nodes (their own clock). covariance: (M, n, n) as `Marginals.nodes`
-    has it.
+    """Extract velocity and biases of all nodes (on their own clock). covariance: (M, n, n) as
+    `Marginals.nodes`.
 
     The velocity is NaN where the IMU ties the node to neither neighbour.
     """
@@ -41,7 +43,7 @@ def inertial_states(problem: Problem, state: GraphState, covariance: Float64) ->
 def normalised_reprojection(
     problem: Problem, state: GraphState, used: Bool
 ) -> tuple[NormalisedResiduals | None, Int64]:
-    """Compute the RMS of each node's used sightings over their sigmas, and how many there are (M,)."""
+    """Compute the RMS of each node's used sightings in units of their sigmas, and their number (M,)."""
     seen = problem.sightings
     nodes = len(problem.start)
     if seen is None or not used.any():
@@ -55,7 +57,9 @@ def normalised_reprojection(
 
 
 def normalised_imu(problem: Problem, state: GraphState) -> NormalisedResiduals | None:
-    """Compute the RMS over the axes between each node and the one before, at the latter's stamp."""
+    """Compute the RMS over the axes of the IMU residuals between each node and the one before, stamped by the
+    later node.
+    """
     if not problem.has_imu:
         return None
     graph, rows = build_graph(problem), []
@@ -73,7 +77,7 @@ def normalised_imu(problem: Problem, state: GraphState) -> NormalisedResiduals |
 def normalised_encoders(
     node_ns: Int64, placed: tuple[EncoderPosition, ...], in_sigmas: Float64
 ) -> NormalisedResiduals | None:
-    """List the encoders' residuals (P, 3), in sigmas, by the stamps of their nodes."""
+    """List the encoders' residuals (P, 3), in sigma, stamped by their nodes."""
     if not placed:
         return None
     return NormalisedResiduals(("x", "y", "z"), node_ns[[place.node for place in placed]], in_sigmas)

@@ -1,8 +1,8 @@
 """Estimate the rig's drift in the batch: a yaw between the cameras and a scale.
 
-The same point seen from several places of a known way has a depth without stereo; the disparity that this
-depth asks for against the measured one shows the yaw (px nearly the same everywhere) and the scale (px in
-proportion to the disparity).
+A point seen from several positions of a known travel has a depth without stereo. The disparity that this
+depth implies, compared with the measured one, shows the yaw (px nearly the same everywhere) and the scale (px
+proportional to the disparity).
 """
 
 from __future__ import annotations
@@ -16,19 +16,21 @@ from barsight.core.records.trajectory import RigDrift
 from barsight.motion.problem.problem import Problem, StereoObservations
 
 HUBER_SIGMAS = 2.2
-"""For the length of three whitened numbers, of which 19 % are longer; 1.345 is for one."""
+"""Threshold of Huber's loss for the length of three whitened numbers, which 19 % exceed; 1.345 is for one."""
 LOOSE = (0.02, 0.2)
-"""Priors (rad, share) that only keep the system solvable; the real ones are weighed in afterwards."""
+"""Standard deviations (rad, ratio) of priors that only keep the system solvable; the real ones are applied
+afterwards.
+"""
 SERVICE_RAD = float(np.deg2rad(0.2))
-"""How far a camera may turn in service (1 sigma), where encoders are there to see it."""
+"""Prior standard deviation of a camera's turn in service, used where encoders can show it."""
 MATCHING_BIAS_PX = 0.015
-"""Disparity error that matching leaves everywhere alike, whatever the calibration."""
+"""Disparity error that matching causes everywhere alike (1 sigma), whatever the calibration."""
 COMMON_BIAS_PX = 0.01
-"""What of it all pieces of the yard share, where each one's own is an unknown."""
+"""Part of it that all pieces of the yard share, used where each piece's own part is an unknown."""
 
 
 def drift_jacobian(seen: StereoObservations) -> Float64:
-    """Differentiate right columns (N, 2) px by the rig's yaw (rad) and scale ratio."""
+    """Differentiate the right columns (N, 2) px by the rig's yaw (rad) and scale ratio."""
     camera = seen.camera
     x = (seen.stereo[:, 2] - camera.doffs_px - camera.cx_px) / camera.focal_px
     disparity = seen.stereo[:, 0] - seen.stereo[:, 2] + camera.doffs_px
@@ -36,12 +38,12 @@ def drift_jacobian(seen: StereoObservations) -> Float64:
 
 
 def combine_with_prior(theta: Float64, covariance: Float64, problem: Problem) -> RigDrift:
-    """Combine the drift seen with the calibration's prior.
+    """Combine the observed drift with the calibration's prior.
 
-    Matching has a bias of its own, and another one for what lies nearer, glossy bars say: both pass for
-    drift (`_floor`). Where pieces' disparities are unknowns, only what they share does. Without
-    encoders a yaw as large as the calibration's own does too, since what rectification leaves differs from
-    place to place, and near points lie low and far ones high.
+    Matching has a bias common to all points, and glossy bars show another one for nearer points: both pass
+    for drift (`_floor`). Where the pieces' disparity biases are unknowns, only their common part does.
+    Without encoders a yaw as large as the calibration's own sigma does too, since rectification errors vary
+    over the picture, and near points lie low in it and far ones high.
     """
     seen = problem.sightings
     assert seen is not None
@@ -61,8 +63,8 @@ def combine_with_prior(theta: Float64, covariance: Float64, problem: Problem) ->
 
 
 def with_matching_bias(drift: RigDrift, problem: Problem) -> RigDrift:
-    """Add matching bias to the drift's covariance as reported: by it people judge heights, which what single
-    pieces' disparities are off by falsifies too.
+    """Add the full matching bias to the reported covariance of the drift: people judge heights by it, and the
+    disparity biases of single pieces falsify those too.
     """
     seen = problem.sightings
     if problem.pieces is None or seen is None:
@@ -78,8 +80,8 @@ def with_matching_bias(drift: RigDrift, problem: Problem) -> RigDrift:
 
 
 def _weighed(theta: Float64, covariance: Float64, prior: Float64) -> tuple[float, float, Float64]:
-    """Compute yaw, scale and their covariance (2, 2) from those seen, their covariance and the prior
-    information.
+    """Combine observed yaw and scale, with their covariance (2, 2), with the prior information; return both
+    and their covariance (2, 2).
     """
     information = np.linalg.inv(covariance)
     combined = np.linalg.inv(information + prior).astype(np.float64)
@@ -88,8 +90,8 @@ def _weighed(theta: Float64, covariance: Float64, prior: Float64) -> tuple[float
 
 
 def _floor(disparity: Float64, focal_px: float, everywhere_px: float, near_px: float) -> Float64:
-    """Compute the covariance floor (2, 2) of yaw and scale: a matching bias at the mean disparity, another
-    over its spread.
+    """Compute the covariance floor (2, 2) of yaw and scale from two matching biases: one at the mean
+    disparity, another over the disparities' spread.
     """
     per_px = near_px / max(float(disparity.std()), 1e-3)
     by = np.array([[-1 / focal_px, float(disparity.mean()) / focal_px], [0.0, -1.0]])

@@ -13,12 +13,14 @@ MIN_PERSISTENT = 5
 MIN_PAIRS = 300
 CELLS = 8
 MAX_WHITENED = 4.0
-"""Single far residuals say nothing of what neighbours share."""
+"""Sigmas at which residuals are clipped: single outliers say nothing about the errors that neighbours
+share.
+"""
 
 
 def initial_points(problem: Problem, poses: Float64 | None = None, which: Int64 | None = None) -> Float64:
-    """Initialise points (T, 4): place in the reference as the first sighting has it, and slide: none. poses:
-    (M, 4, 4), the problem's own start if None. which: (T,) points, all if None.
+    """Initialise points (T, 4): position in the reference by the first sighting, and zero slide. poses:
+    (M, 4, 4), the problem's initial ones if None. which: (T,) points, all if None.
     """
     seen = problem.sightings
     if seen is None:
@@ -33,15 +35,15 @@ def initial_points(problem: Problem, poses: Float64 | None = None, which: Int64 
 
 
 def well_observed(seen: StereoObservations, used: Bool) -> Bool:
-    """Select sightings of points that are seen often enough to check each other."""
+    """Select sightings of points that are seen often enough for their sightings to check each other."""
     counts = np.bincount(seen.track[used], minlength=len(seen.first) - 1)
     result: Bool = used & (counts[seen.track] >= MIN_SIGHTINGS)
     return result
 
 
 def dof_correction(seen: StereoObservations, used: Bool) -> float:
-    """Compute the degrees-of-freedom correction of residuals: by how much errors are larger than the
-    residuals that a fit of points (three unknowns) and frames (six) leaves of them; at most sqrt(3).
+    """Compute the degrees-of-freedom correction of residuals: the ratio of errors to the residuals that
+    remain after fitting points (three unknowns) and frames (six); at most sqrt(3).
     """
     rows = 3 * int(used.sum())
     points, frames = np.bincount(seen.track[used]) > 0, np.bincount(seen.node[used]) > 0
@@ -50,11 +52,11 @@ def dof_correction(seen: StereoObservations, used: Bool) -> float:
 
 
 def spatial_inflation(residual: Float64, seen: StereoObservations, used: Bool) -> float:
-    """Estimate the sigma inflation by errors that neighbours in a picture share, at least 1.
+    """Estimate the sigma inflation due to errors that neighbours in a picture share, at least 1.
 
     Points of one bar share its gloss, and corners less than a patch apart share pixels. So the residuals of a
-    cell, an eighth of the picture wide, don't add up like independent ones: the sums' squares over the
-    single ones' is the variance that counts.
+    cell, an eighth of the picture wide, don't add up like independent ones: the effective variance is that of
+    the cells' sums over that of single residuals.
     """
     sums, single = _shared_squares(
         residual, seen.sigma_px, seen.stereo, seen.node, used, CELLS / seen.camera.width
@@ -63,11 +65,11 @@ def spatial_inflation(residual: Float64, seen: StereoObservations, used: Bool) -
 
 
 def temporal_inflation(residual: Float64, seen: StereoObservations, used: Bool) -> float:
-    """Estimate the sigma inflation by errors that persist from view to view, at least 1.
+    """Estimate the sigma inflation due to errors that persist from view to view, at least 1.
 
-    A highlight or a shadow edge moves with the view: it pulls a point alike in neighbouring views. With a
-    correlation r between neighbours n sightings are worth n (1 - r) / (1 + r) [AR(1)]. The fitted points
-    take off each track's mean, which lowers the correlation seen by about 1 / n.
+    A highlight or a shadow edge moves with the view: it pulls a point in the same direction in neighbouring
+    views. With a correlation r between neighbours, n sightings are worth n (1 - r) / (1 + r) [AR(1)]. Fitting
+    the points removes each track's mean, which lowers the observed correlation by about 1 / n.
     """
     pairs, product, squares, shorter = _neighbours(residual, seen.sigma_px, seen.track, used)
     if pairs < MIN_PAIRS:
@@ -80,7 +82,7 @@ def temporal_inflation(residual: Float64, seen: StereoObservations, used: Bool) 
 def _shared_squares(
     residual: Float64, sigma: Float64, stereo: Float64, node: Int64, used: Bool, per_px: float
 ) -> tuple[float, float]:
-    """Sum used residuals over their sigmas: the squares of each cell's sum, and of single ones.
+    """Sum used residuals over their sigmas: the squares of each cell's sum, and those of single residuals.
 
     residual, stereo: (N, 3) px; sigma: (N,) px; node, used: (N,). per_px: cells per pixel.
     """
@@ -106,8 +108,8 @@ def _shared_squares(
 def _neighbours(
     residual: Float64, sigma: Float64, track: Int64, used: Bool
 ) -> tuple[int, float, float, float]:
-    """Sum over pairs of neighbouring used sightings of points seen often: how many, their residuals' products
-    and squares, over their sigmas, and one over the point's sightings, all summed.
+    """Sum over the pairs of neighbouring used sightings of points seen often: the number of pairs, the
+    products and squares of their residuals in sigma, and the reciprocal number of the point's sightings.
 
     residual: (N, 3) px; sigma: (N,) px; track, used: (N,), in the tracks' order.
     """

@@ -1,1 +1,1 @@
-"""Drift of the rig's calibration, measured from ordinary crane travel."""
+"""Measure drift of the rig's calibration from ordinary crane travel."""

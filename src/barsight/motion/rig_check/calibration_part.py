@@ -1,4 +1,4 @@
-"""Propagate a rig file's covariance to what rows of matches show of the rig."""
+"""Propagate a rig file's covariance to the errors of the rig that rows of matches show."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from barsight.core.arrays import Float64
 from barsight.motion.rig_check.epipolar_error import row_design
 
 FAR_BASELINES = 15.0
-"""Range that is assumed where none is known, in baselines: rows hardly depend on it."""
+"""Range, in baselines, assumed where none is known; rows hardly depend on it."""
 
 
 def calibration_covariance(path: Path | None, range_m: float) -> Float64:
-    """Propagate to pitch, roll, focal ratio and yaw as rows show them (4, 4): a lens that is calibrated a
-    little wrong shifts rows as a turned camera does. 0 where no file is given or it carries no covariance.
+    """Propagate to the covariance (4, 4) of pitch, roll, focal ratio and yaw as rows show them: a slightly
+    wrong lens shifts rows as a turned camera does. Zeros where there is no file or it has no covariance.
     """
     if path is None or (known := calibrated_covariance(path)) is None:
         return np.zeros((4, 4))
@@ -32,7 +32,7 @@ def calibration_covariance(path: Path | None, range_m: float) -> Float64:
 
 
 def _row_values(rig: StereoRig, left: Float64, right: Float64) -> Float64:
-    """Fit what raw pixels (N, 2) of both cameras show by their rows: (4,)."""
+    """Fit pitch, roll, focal ratio and yaw (4,) to the rows of raw pixels (N, 2) of both cameras."""
     turned = right_from_rectified(rig)
     a = rig.cam0.rays(left) @ rig.cam0_from_cam1.rotation @ turned
     b = rig.cam1.rays(right) @ turned

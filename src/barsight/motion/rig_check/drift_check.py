@@ -1,4 +1,4 @@
-"""Check the rig for drift: rows of matches and the crane's known travel, judged line by line."""
+"""Check the rig for drift by the rows of matches and the crane's known travel, one verdict per line."""
 
 from __future__ import annotations
 
@@ -25,8 +25,9 @@ from barsight.recording.base import Recording
 
 
 class DriftState(StrEnum):
-    """Good: go on. Recalibrate: it has drifted and that costs. Contradiction: two sensors disagree. Not seen:
-    this recording can't tell."""
+    """Good: go on. Recalibrate: it has drifted, and by enough to matter. Contradiction: two sensors disagree.
+    Not seen: this recording can't tell.
+    """
 
     GOOD = "good"
     RECALIBRATE = "recalibrate"
@@ -36,16 +37,18 @@ class DriftState(StrEnum):
 
 @dataclass(frozen=True)
 class CheckSettings:
-    """Limits from which a drift matters."""
+    """Thresholds from which a drift matters."""
 
     range_m: float | None = None
-    """Where the rig measures; the median depth of what it saw when not given."""
+    """Range at which the rig measures; if not given, the median depth of what it saw."""
     max_depth_error_mm: float = 3.0
-    """A drift that costs more depth than this, and is beyond 3 sigma, asks for a new calibration."""
+    """Maximum depth error that a drift may cause; a drift that causes more, and is beyond 3 sigma, asks for a
+    new calibration.
+    """
     max_row_error_px: float = 0.3
-    """Matches further off their rows than this spoil stereo matching."""
+    """Maximum distance of matches from their rows; matches further off spoil stereo matching."""
     frames: int = 30
-    """Pairs whose rows are looked at."""
+    """Number of pairs whose rows are measured."""
 
     def __post_init__(self) -> None:
         expect_ranges(
@@ -56,8 +59,9 @@ class CheckSettings:
 
 @dataclass(frozen=True)
 class CheckLine:
-    """One drift: value and sigma in `unit`, what it costs (mm of depth at the working range, at the worst
-    place of the picture; NaN where it costs none), the state and the reason."""
+    """One drift: its value and sigma in `unit`, its cost (mm of depth error at the working range, at the
+    worst point of the picture; NaN where there is none), the state and the reason.
+    """
 
     name: str
     value: float
@@ -73,8 +77,9 @@ BAD_STATES = (DriftState.RECALIBRATE, DriftState.CONTRADICTION)
 
 @dataclass(frozen=True, eq=False)
 class RigCheck:
-    """lines: the judged drifts. rows, drift: what was seen, or why not. range_m: the working range.
-    row_sigmas: (4,) of the rows' values, with what the calibration itself leaves open; rows' own are noise.
+    """lines: the judged drifts. rows, drift: the measurements, or why there are none. range_m: the working
+    range. row_sigmas: (4,) of the rows' values, including the calibration's own uncertainty; those in `rows`
+    are noise only.
     """
 
     lines: tuple[CheckLine, ...]
@@ -85,14 +90,14 @@ class RigCheck:
 
     @property
     def state(self) -> DriftState:
-        """Return the worst of the lines; what one line doesn't see is no fault of the rig."""
+        """Return the worst state of the lines; a drift that can't be seen is no fault of the rig."""
         found = {line.state for line in self.lines}
         order = (*BAD_STATES, DriftState.GOOD)
         return next((state for state in order if state in found), DriftState.NOT_SEEN)
 
     @property
     def is_bad(self) -> bool:
-        """Tell whether the rig has drifted, or rows and travel contradict each other."""
+        """Check whether the rig has drifted, or sensors contradict each other."""
         return self.state in BAD_STATES
 
 
@@ -100,13 +105,13 @@ def check_rig(
     recording: Recording, fusion: FusionSettings, settings: CheckSettings, advance: Callable[[], None],
     rig_file: Path | None = None,
 ) -> RigCheck:  # fmt: skip
-    """Check for drift. rig_file: that the rig was read from, which may say how well it is known. Raises
+    """Check for drift. rig_file: the file that the rig was read from, for its covariance. Raises
     MeasurementError where neither rows nor travel show anything.
     """
     rig = recording.rig
     rows = measure_row_drift(recording, Rectifier(rig), settings.frames)
     if not isinstance(rows, Failed):
-        # The yaw is sought on rows that match; the rows' own yaw waits for the travel's word.
+        # The travel's yaw is estimated on matching rows; the rows' own yaw is compared with it later.
         pitch, roll = rows.values[:2]
         rig = turn_right_camera(rig, np.array([pitch, 0.0, roll]))
     rectifier = Rectifier(rig)
@@ -141,7 +146,7 @@ def _row_lines(
         return [_unseen(name, "deg", rows.reason) for name in ("pitch", "roll", "focal ratio")]
     f, baseline = camera.focal_px, camera.baseline_m
     x, y = camera.width / 2 / f, camera.height / 2 / f
-    # At the picture's corner: how far rows are off (px per unit), and how far columns are (focal lengths).
+    # Errors at the picture's corner per unit: of rows in px, of columns in focal lengths.
     off_row = {"pitch": f, "roll": f * x, "focal ratio": f * y}
     off_column = {"pitch": x * y, "roll": y, "focal ratio": x}
     lines = []

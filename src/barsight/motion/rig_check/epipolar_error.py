@@ -26,18 +26,18 @@ MIN_IN_CELL = 8
 MIN_CELLS = 12
 TRIM_SIGMAS = 4.0
 MATCHING_BIAS_PX = 0.015
-"""Rows that matching leaves off everywhere alike."""
+"""Row error common to the whole picture that matching itself causes (1 sigma)."""
 MIN_SIGMA_PX = 0.002
-"""What a cell's mean is not better than, however many matches it has."""
+"""Lower bound of a cell mean's sigma, however many matches the cell has."""
 
 
 @dataclass(frozen=True, eq=False)
 class RowDrift:
-    """values: (4,) pitch, roll (rad), ratio of the focal lengths minus 1, yaw (rad): what cam1 has turned and
-    zoomed against its calibration, rectified axes. covariance: (4, 4). pattern_px: what they leave over the
-    picture (standard deviation, noise taken off). matches, frames: how many. rms_px: of single matches.
-    seen_px, left_px: (ROWS * COLUMNS,) means of the picture's cells, as matched and less the fit; NaN where
-    matches are few.
+    """values: (4,) pitch, roll (rad), ratio of the focal lengths minus 1, yaw (rad): turn and zoom of cam1
+    against its calibration, in rectified axes. covariance: (4, 4). pattern_px: standard deviation over the
+    picture of what these leave unexplained, noise subtracted. matches, frames: their numbers. rms_px: of
+    single matches. seen_px, left_px: (ROWS * COLUMNS,) mean row error of the picture's cells, as matched and
+    after the fit; NaN where matches are few.
     """
 
     values: Float64
@@ -51,12 +51,12 @@ class RowDrift:
 
     @property
     def sigmas(self) -> Float64:
-        """Return standard deviations (4,) of the values."""
+        """Return the standard deviations (4,) of the values."""
         return np.sqrt(np.diag(self.covariance))
 
 
 def measure_row_drift(recording: Recording, rectifier: Rectifier, max_frames: int) -> RowDrift | Failed:
-    """Fit the rows of corners matched across at most so many pairs, evenly spread over the recording."""
+    """Fit the rows of corners matched in at most `max_frames` pairs, evenly spread over the recording."""
     total = len(recording.index.stamps_ns)
     chosen = set(np.linspace(0, total - 1, min(max_frames, total)).astype(int).tolist())
     found = []
@@ -73,7 +73,9 @@ def measure_row_drift(recording: Recording, rectifier: Rectifier, max_frames: in
 
 
 def match_off_rows(pair: RectifiedPair) -> Float64:
-    """Match corners within a few rows: right u, right v (px) and right v minus left v (N, 3)."""
+    """Match corners within a few rows of each other; return right u, right v (px) and right v minus left v
+    (N, 3).
+    """
     corners = detect_corners(pair.left, TrackSettings(), np.empty((0, 2))).astype(np.float64)
     coarse = coarse_disparity(pair.left, pair.right, pair.camera.doffs_px)
     row = (corners[:, 1] * coarse.shape[0] / pair.camera.height).astype(int)
@@ -88,11 +90,11 @@ def match_off_rows(pair: RectifiedPair) -> Float64:
 
 
 def fit_rows(matches: Float64, camera: RectifiedCamera, frames: int) -> RowDrift | Failed:
-    """Fit the drift to matches (N, 3) as `match_off_rows` gives them.
+    """Fit the drift to matches (N, 3) from `match_off_rows`.
 
-    Matches are averaged over the cells of a grid first. A cell's mean has its noise and a part that more
-    matches don't average out (lens, texture), found from how far the cells scatter beyond their noise
-    [DerSimonian & Laird 1986]. Failed `few-matches`.
+    Matches are first averaged over the cells of a grid. The error of a cell's mean has a noise part and a
+    part that more matches don't average out (lens, texture), estimated from the cells' scatter in excess of
+    their noise [DerSimonian & Laird 1986]. Failed `few-matches`.
     """
     design = _design(matches, camera)
     kept = np.ones(len(matches), np.bool_)
@@ -118,7 +120,7 @@ def fit_rows(matches: Float64, camera: RectifiedCamera, frames: int) -> RowDrift
         excess = float((weight * (means - rows @ values) ** 2).sum()) / (len(means) - 4)
         if excess <= 1 and pattern == 0:
             break
-        # The scatter that makes chi2 what its degrees of freedom ask for.
+        # Find the scatter for which chi2 equals its degrees of freedom.
         pattern = max(0.0, pattern + (excess - 1) / float(weight.mean()))
     covariance[0, 0] += (MATCHING_BIAS_PX / camera.focal_px) ** 2
     rms = float(np.sqrt(((matches[kept, 2] - design[kept] @ values) ** 2).mean()))
@@ -128,7 +130,7 @@ def fit_rows(matches: Float64, camera: RectifiedCamera, frames: int) -> RowDrift
 
 
 def _design(matches: Float64, camera: RectifiedCamera) -> Float64:
-    """Compute the design (N, 4) px per unit of pitch, roll, focal ratio and yaw."""
+    """Compute the design matrix (N, 4) in px per unit of pitch, roll, focal ratio and yaw."""
     f = camera.focal_px
     x = (matches[:, 0] - camera.cx_px - camera.doffs_px) / f
     y = (matches[:, 1] - camera.cy_px) / f
@@ -136,8 +138,8 @@ def _design(matches: Float64, camera: RectifiedCamera) -> Float64:
 
 
 def row_design(x: Float64, y: Float64) -> Float64:
-    """Compute how rows answer (N, 4) to pitch, roll, focal ratio and yaw at places of the right picture, all
-    in focal lengths.
+    """Compute the derivatives (N, 4) of the row by pitch, roll, focal ratio and yaw at points of the right
+    picture, all in focal lengths.
     """
     return np.column_stack([1 + y**2, -x, y, -x * y])
 
@@ -145,7 +147,7 @@ def row_design(x: Float64, y: Float64) -> Float64:
 def _cells(
     matches: Float64, design: Float64, camera: RectifiedCamera
 ) -> tuple[list[int], Float64, Float64, Float64]:
-    """Average matches by cell: design (C, 4), mean (C,) and the mean's variance (C,)."""
+    """Average matches by cell: the cells, design (C, 4), mean (C,) and the mean's variance (C,)."""
     column = np.clip(matches[:, 0] * COLUMNS / camera.width, 0, COLUMNS - 1).astype(int)
     row = np.clip(matches[:, 1] * ROWS / camera.height, 0, ROWS - 1).astype(int)
     cells, rows, means, variances = [], [], [], []

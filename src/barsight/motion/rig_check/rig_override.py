@@ -1,4 +1,4 @@
-"""View a recording through another calibration than its own."""
+"""View a recording through a calibration other than its own."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from barsight.recording.wrapper import RecordingProxy
 
 @dataclass(frozen=True, eq=False)
 class RecordingWithRig(RecordingProxy):
-    """`whole` with the calibration `own_rig`."""
+    """Recording `whole` with the calibration `own_rig`."""
 
     own_rig: StereoRig
 

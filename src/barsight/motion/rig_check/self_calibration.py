@@ -1,5 +1,5 @@
-"""Apply a rig's drift: a warning where it matters, a rig turned back where that is asked, and how far
-disparities may still be off.
+"""Apply a rig's drift: a warning where it matters, a corrected rig where that is requested, and the
+disparity error that remains.
 """
 
 from __future__ import annotations
@@ -18,16 +18,18 @@ from barsight.core.records.trajectory import RigDrift
 SIGNIFICANT_SIGMAS = 3.0
 WORTH_MM = 3.0
 MIN_TOLD = 1e-3
-"""Share of the information held before from which the travel's own on a direction counts."""
+"""Minimum information of the travel on a direction, relative to the drift's prior, for it to be used."""
 AGREEING_SIGMAS = 1.96
-"""Travel that shows yaw and scale within this agrees with the calibration. Over rigs that are off as far as
-they admit, 95 % of the heights then lie inside (tests/test_motion_rig_drift.py)."""
+"""Distance, in sigma, up to which the travel's yaw and scale agree with the calibration. For rigs that are
+off as far as they admit, 95 % of the heights then lie inside (tests/test_motion_rig_drift.py).
+"""
 
 
 @dataclass(frozen=True)
 class SelfCalibration:
-    """The rectifier to measure with, sentences where the drift needs any, and the disparity error (px, one
-    sigma) that the rig may still cause everywhere alike."""
+    """Rectifier to measure with, messages about the drift, and the disparity error (px, one sigma) common to
+    all points that the rig may still cause.
+    """
 
     rectifier: Rectifier
     warnings: tuple[str, ...]
@@ -37,16 +39,17 @@ class SelfCalibration:
 def residual_covariance(prior: Float64, drift: RigDrift | None, *, corrected: bool) -> Float64:
     """Update a calibration's covariance of yaw, baseline and focal length (3, 3) by what the travel shows.
 
-    What both together find counts as error, for nothing corrects it but the yaw where that is `corrected`.
-    Where the travel contradicts the calibration, it alone is believed. Only encoders show either. What was
-    held of the drift before is no word of the travel's: where that shows nothing, the calibration's stays.
+    The drift found counts as error, for nothing corrects it except the yaw where that is `corrected`. Then,
+    or where the travel contradicts the calibration, the travel alone is believed. Only encoders show yaw and
+    scale. The drift's prior isn't counted as shown by the travel: where that shows nothing, the calibration's
+    covariance stays.
     """
     if drift is None or not drift.by_encoders:
         return prior
     rows, seen, variance = _travel_alone(drift)
     joint = rows @ prior[:2, :2] @ rows.T + np.diag(variance)
     if corrected or seen @ np.linalg.solve(joint, seen) > AGREEING_SIGMAS**2:
-        # A baseline that is longer makes depths too small.
+        # If the baseline is longer than calibrated, depths come out too small.
         left = np.array([drift.yaw_rad, -drift.scale]) * [not corrected, True]
         updated = prior.copy()
         updated[:2, :] = updated[:, :2] = 0.0
@@ -59,8 +62,8 @@ def residual_covariance(prior: Float64, drift: RigDrift | None, *, corrected: bo
 
 
 def _travel_alone(drift: RigDrift) -> tuple[Float64, Float64, Float64]:
-    """Take off the drift's prior: rows (K, 2) of yaw and depths' scale that the travel itself tells, values
-    (K,) and variances (K,) of these; K is 2 or less.
+    """Remove the drift's prior: rows (K, 2) of yaw and the depths' scale that the travel itself observes,
+    their values (K,) and variances (K,); K is 2 or less.
     """
     unit, known = drift.prior_sigma, np.linalg.inv(drift.covariance)
     weight, axes = np.linalg.eigh(known * np.outer(unit, unit) - np.eye(2))
@@ -73,7 +76,7 @@ def _travel_alone(drift: RigDrift) -> tuple[Float64, Float64, Float64]:
 def self_calibrate(
     rig: StereoRig, rectifier: Rectifier, drift: RigDrift | None, calibration_px: float, *, correct: bool
 ) -> SelfCalibration:
-    """Turn the rig by the drift's yaw if `correct`, else leave it; encoders must have shown the drift.
+    """Turn the rig by the drift's yaw if `correct`, else leave it; the drift counts only with encoders.
 
     calibration_px: the disparity error (1 sigma) that the calibration itself admits.
     """
@@ -94,8 +97,9 @@ def self_calibrate(
 def residual_sigma_px(drift: RigDrift, focal_px: float, calibration_px: float, corrected: bool) -> float:
     """Compute the disparity error (1 sigma) left by yaw and scale straight ahead at the points' median depth.
 
-    Where the travel agrees with the calibration, both are believed, the calibration for the yaw. Where it
-    contradicts, the travel alone is, and what it found counts as error unless it is `corrected`.
+    Where the travel agrees with the calibration, both are believed; the calibration's yaw no longer counts
+    once it is `corrected`. Where they contradict, the travel alone is believed, and the drift that it found
+    counts as error, the yaw unless it is `corrected`.
     """
     found, covariance = np.array([drift.yaw_rad, drift.scale]), drift.covariance
     by = np.array([focal_px, focal_px * drift.baseline_m / drift.range_m])
@@ -115,7 +119,7 @@ def is_drifted(drift: RigDrift) -> bool:
 
 
 def describe_drift(drift: RigDrift) -> str:
-    """Describe the yaw and its cost in a sentence."""
+    """Describe the yaw and the depth error that it causes in a sentence."""
     yaw, sigma = np.degrees([drift.yaw_rad, drift.yaw_sigma_rad])
     cost = 1e3 * drift.depth_error_m(drift.range_m)
     return (
