@@ -1,1 +1,1 @@
-"""Integrate the IMU between two instants, and detect standing still."""
+"""Integrate the IMU between two instants, and detect standstill."""

@@ -1,7 +1,8 @@
-"""Define the IMU's measurement model and kinematics as a slow reference; `preintegration` is the fast way.
+"""Define the IMU's measurement model and the body's state, and remove saturated samples.
 
-Measured are the turn rate and the specific force in `body`, each with a bias that walks and white noise:
-`a~ = a + b_a + n_a`, `w~ = w + b_g + n_g` [paper Eq. 9-10], where `a` is the acceleration minus gravity.
+The IMU measures turn rate and specific force in `body`, each with a bias that follows a random walk and white
+noise: `a~ = a + b_a + n_a`, `w~ = w + b_g + n_g` [paper Eq. 9-10], where `a` is the acceleration minus
+gravity. `preintegration` integrates its samples.
 """
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ GRAVITY_MPS2 = 9.80665
 SATURATED_SIGMAS = 6.0
 SATURATED_SAMPLES = 4
 ORDINARY_NOISE = ImuNoise(2.0e-4, 2.0e-5, 2.0e-3, 1.0e-3, 200.0)
-"""A good MEMS IMU's (those of EuRoC and of most cameras), for recordings that don't state their own."""
+"""Noise of a good MEMS IMU (that of EuRoC and of most cameras), for recordings that don't state their own."""
 
 
 @dataclass(frozen=True, eq=False)
 class ImuBias:
-    """gyro_radps, accel_mps2: (3,) in `body`, what the sensors read too much."""
+    """gyro_radps, accel_mps2: (3,) in `body`, the amounts by which the sensors read too much."""
 
     gyro_radps: Float64
     accel_mps2: Float64
@@ -46,9 +47,9 @@ class BodyState:
 
 
 def without_saturation(imu: ImuSamples) -> tuple[ImuSamples, int]:
-    """Remove the samples at which an axis stands at its end of scale; also how many.
+    """Remove the samples at which an axis is saturated; also return their number.
 
-    An axis that keeps its highest or lowest value for four samples, far from its usual ones, can't follow.
+    An axis is saturated where it keeps its highest or lowest value for four samples, far from its usual ones.
     """
     wrong = np.zeros(imu.stamp_ns.size, dtype=np.bool_)
     for axis in np.hstack([imu.gyro_radps, imu.accel_mps2]).T:

@@ -1,4 +1,4 @@
-"""Preintegrate IMU samples on the manifold [Forster 2017] with GTSAM, off the samples' stamps too."""
+"""Preintegrate IMU samples on the manifold [Forster 2017] with GTSAM, also between arbitrary stamps."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from barsight.inertial.model import GRAVITY_MPS2, BodyState, ImuBias
 
 MAX_GAP_S = 0.1
 INTEGRATION_SIGMA = 1e-5
-"""What the discretisation may be off by, m/sqrt(s)."""
+"""Standard deviation of the discretisation error, m/sqrt(s)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Preintegrated:
-    """Relative motion between two stamps by the IMU alone, whatever the state at the first.
+    """Relative motion between two stamps by the IMU alone, independent of the state at the first.
 
-    rotation (3, 3), velocity_mps (3,), position_m (3,): in the body at `start_ns`, gravity not yet in.
+    rotation (3, 3), velocity_mps (3,), position_m (3,): in the body at `start_ns`, without gravity.
     covariance: (9, 9) of rotation, position, velocity (GTSAM's order, body axes at the end).
-    measurements: GTSAM's own record, which a factor is made from.
+    measurements: GTSAM's own record, from which a factor is made.
     """
 
     start_ns: int
@@ -47,11 +47,13 @@ class Preintegrated:
 
     @property
     def covariance(self) -> Float64:
-        """Return the covariance (9, 9) of rotation, position and velocity without that of the biases."""
+        """Return the covariance (9, 9) of rotation, position and velocity, without the part due to the
+        biases.
+        """
         return np.asarray(self.measurements.preintMeasCov())[:9, :9]
 
     def predict(self, state: BodyState, bias: ImuBias | None = None) -> BodyState:
-        """Predict the state at `end_ns`; another bias enters to first order."""
+        """Predict the state at `end_ns`; another bias is applied to first order."""
         pose = gtsam.Pose3(gtsam.Rot3(state.rotation), state.position_m)
         start = gtsam.NavState(pose, state.velocity_mps)
         end = self.measurements.predict(start, _gtsam_bias(bias or self.bias))
@@ -74,7 +76,7 @@ class Preintegrator:
     def between(self, start_ns: int, end_ns: int, bias: ImuBias) -> Preintegrated | Failed:
         """Preintegrate between two stamps.
 
-        Failed `imu-gap` where samples don't enclose both or leave more than 0.1 s out.
+        Failed `imu-gap` where the samples don't enclose both stamps or leave a gap of more than 0.1 s.
         """
         stamps = self._imu.stamp_ns
         inside = stamps[(stamps > start_ns) & (stamps < end_ns)]

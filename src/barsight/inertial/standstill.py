@@ -1,4 +1,4 @@
-"""Detect standstill and estimate gravity's direction and the gyro's bias from it."""
+"""Detect standstill, and estimate gravity's direction and the gyro's bias from it."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from barsight.inertial.model import GRAVITY_MPS2, ImuBias
 
 WINDOW_S = 0.6
 MIN_S = 1.0
-"""A shorter stretch without change is a turning point of the sway."""
+"""Minimum duration of a standstill: a shorter stretch without change is a turning point of the sway."""
 MAX_EXCESS = 1.4
-"""Over a window that stands still the deviation isn't over this times the sensor's own noise."""
+"""Maximum ratio of the deviation over a window to the sensor's own noise at standstill."""
 MAX_DRIFT_SIGMAS = 5.0
 STRENGTH_RANGE_MPS2 = (8.0, 12.0)
 
@@ -27,9 +27,9 @@ STRENGTH_RANGE_MPS2 = (8.0, 12.0)
 class RestEstimate:
     """Gravity and gyro bias of a body at rest.
 
-    up_in_body: (3,) unit vector against gravity; an accelerometer bias across it can't be told from a tilt
-    (5 mm/s^2 are 0.03 degrees), so bias.accel_mps2 holds the part along it only. gyro_sigma_radps,
-    tilt_sigma_rad: noise alone. seconds: how long it stood.
+    up_in_body: (3,) unit vector against gravity. An accelerometer bias perpendicular to it can't be told from
+    a tilt (5 mm/s^2 are 0.03 degrees), so bias.accel_mps2 holds only the part along it. gyro_sigma_radps,
+    tilt_sigma_rad: due to noise alone. seconds: duration of the rest.
     """
 
     up_in_body: Float64
@@ -40,11 +40,11 @@ class RestEstimate:
 
 
 def stands_still(imu: ImuSamples, noise: ImuNoise) -> Bool:
-    """Detect rest: samples (N,) around which, over 0.6 s, both sensors vary no more than their own noise lets
-    them; stretches under a second are left out.
+    """Detect rest: the samples (N,) around which, over 0.6 s, both sensors vary no more than by their own
+    noise; stretches under a second are left out.
 
-    Constant speed looks the same to an IMU: the caller must know that the body didn't travel (a crane's
-    encoders, or that the recording starts before the motion).
+    Constant speed looks the same to an IMU: the caller must know that the body didn't travel (from a crane's
+    encoders, or because the recording starts before the motion).
     """
     count = imu.stamp_ns.size
     if count < 8:
@@ -71,8 +71,9 @@ def stands_still(imu: ImuSamples, noise: ImuNoise) -> Bool:
 def estimate_at_rest(imu: ImuSamples, first_ns: int, last_ns: int, noise: ImuNoise) -> RestEstimate | Failed:
     """Average gravity and the gyro's bias over the samples in [first_ns, last_ns].
 
-    Failed `imu-units` where the accelerometer's strength is not gravity's (the reason names g or degrees),
-    `not-still` where the body moves or less than 0.2 s are there.
+    Failed `imu-units` where the accelerometer's strength is not gravity's (the reason names g where that
+    fits), `not-still` where the body moves or the interval is shorter than 0.2 s or holds fewer than 8
+    samples.
     """
     begin, end = np.searchsorted(imu.stamp_ns, (first_ns, last_ns + 1))
     part = ImuSamples(imu.stamp_ns[begin:end], imu.gyro_radps[begin:end], imu.accel_mps2[begin:end])
