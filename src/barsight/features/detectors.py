@@ -1,4 +1,4 @@
-"""Detect SIFT, ORB and SURF features behind one Protocol, spread over the image, with a sigma each."""
+"""Detect SIFT, ORB and SURF features behind one Protocol, spread over the picture, each with a sigma."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from barsight.features.orb import detect_orb, spread
 DetectorName = Literal["sift", "surf", "orb"]
 DETECTORS: tuple[DetectorName, ...] = get_args(DetectorName)
 WHOLE_PIXEL_SIGMA = 12**-0.5
-"""Sigma of a place known to one pixel of its pyramid level."""
+"""Sigma of a position known to one pixel of its pyramid level, in such pixels."""
 SIFT_SIGMA = 0.015
 SURF_SIGMA = 0.3
-"""Sigma of a place as a share of the feature's scale; a test holds them against known shifts."""
+"""Sigma of a position as a ratio to the feature's scale; a test compares these sigmas with known shifts."""
 SURF_FEWEST = 4
 
 
@@ -35,13 +35,13 @@ class Keypoints:
 
 
 class Detector(Protocol):
-    """At most `count` features of an (H, W) picture, the strongest of each cell of a grid."""
+    """Detects at most `count` features of an (H, W) picture, the strongest of each cell of a grid."""
 
     def __call__(self, image: UInt8, count: int) -> Keypoints: ...
 
 
 def make_detector(name: DetectorName) -> Detector:
-    """Make the detector of that name."""
+    """Make the detector with that name."""
     return {"sift": _sift, "surf": _surf, "orb": _orb}[name]
 
 

@@ -1,7 +1,7 @@
-"""Match by predicted motion: known 3D points are searched only inside their predicted ellipses.
+"""Match by predicted motion: known 3D points are searched for only inside their predicted ellipses.
 
-Bars all look alike: two matches one bar further agree with each other as well as the true ones. So each
-point is carried by the predicted motion, and only what lies in its predicted ellipse is a match.
+All bars look alike: wrong matches one bar further agree with each other as well as the true ones do. So each
+point is moved by the predicted motion, and only what lies in its predicted ellipse is a match.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from barsight.features.patch_alignment import (
 GATE_SIGMAS = 4.0
 MAX_OFF_ROW_PX = 1.0
 MARGIN_PX = 8.0
-"""Nearer to its border a picture doesn't show a patch whole with what its spline needs."""
+"""Minimum distance from the picture's border at which a patch and its spline's support lie fully inside."""
 
 
 @dataclass(frozen=True, eq=False)
 class PredictedMotion:
     """new_from_old: rotation (3, 3) and translation (3,) of `rect0`. covariance: (6, 6), rotation then
-    translation, of a small motion that follows it, in the new frame's axes.
+    translation, of a small motion applied after it, in the new frame's axes.
     """
 
     rotation: Float64
@@ -40,10 +40,10 @@ class PredictedMotion:
 
 @dataclass(frozen=True, eq=False)
 class PredictedProjections:
-    """Predicted projections of N points in the new pair. stereo: (N, 3) u, v and right u, px, NaN behind the
-    camera.
+    """Predicted projections of N points into the new pair. stereo: (N, 3) u, v and right u, px, NaN behind
+    the camera.
 
-    covariance: (N, 3, 3) px^2 of the prediction. inside: (N,) whether both pictures show it.
+    covariance: (N, 3, 3) px^2 of the prediction. inside: (N,) whether both pictures contain the point.
     """
 
     stereo: Float64
@@ -52,15 +52,15 @@ class PredictedProjections:
 
     @property
     def reach_px(self) -> Float64:
-        """Return one sigma (N,) of the predicted place along the ellipse's longer axis."""
+        """Return the standard deviation (N,) of the predicted position along the ellipse's longer axis."""
         result: Float64 = np.sqrt(np.linalg.eigvalsh(self.covariance[:, :2, :2])[:, 1])
         return result
 
 
 @dataclass(frozen=True, eq=False)
 class GuidedMatches:
-    """stereo: (N, 3) u, v, right u where found, sigma_px: (N,) of each. found: (N,). ambiguous: (N,) refused
-    since the ellipse is not clearly finer than the pattern repeats.
+    """stereo: (N, 3) u, v, right u where found, sigma_px: (N,) of each. found: (N,). ambiguous: (N,) rejected
+    because the ellipse is not clearly smaller than the pattern's period.
     """
 
     stereo: Float64
@@ -112,8 +112,8 @@ def predict_projections(
     motion: PredictedMotion,
     camera: RectifiedCamera,
 ) -> PredictedProjections:
-    """Predict projections of points (N, 3) in the old `rect0`, seen there with `sigma_px`, one for all or (N,
-    3), in u, v and right u.
+    """Predict projections of points (N, 3) in the old `rect0`, seen there with noise `sigma_px` in u, v and
+    right u, a number or (N, 3).
     """
     moved = points @ motion.rotation.T + motion.translation
     stereo = project_stereo(moved, camera)
@@ -135,11 +135,11 @@ def match_guided(
     source: PatchImage, places: Float64, depth: Float64, pair: PatchPair, predicted: PredictedProjections,
     sigma_px: float, repeat_px: Float64 | None = None,
 ) -> GuidedMatches:  # fmt: skip
-    """Match the patches of `source` at `places` (N, 2), `depth` (N,) m off, in both pictures of `pair`.
+    """Match the patches of `source` at `places` (N, 2), at depth (N,) m, in both pictures of `pair`.
 
-    From the predicted place in the left picture, by full-size pictures alone where that is near enough, then
-    across to the right one. repeat_px: (N,) how far off each patch's likeness is (the bars' pitch); an
-    ellipse of 2 sigma that reaches a quarter of it is ambiguous.
+    The search starts at the predicted position in the left picture, with the full-size pictures alone where
+    the predictions are precise enough, and goes on across to the right one. repeat_px: (N,) distance at which
+    each patch repeats (the bars' pitch); an ellipse whose 2 sigma exceed a quarter of it is ambiguous.
     """
     count = len(places)
     ambiguous = np.zeros(count, dtype=np.bool_)
@@ -170,10 +170,10 @@ def match_left(
     source: PatchImage, places: Float64, depth: Float64, pair: PatchPair, predicted: PredictedProjections,
     sigma_px: float, repeat_px: Float64,
 ) -> tuple[Float64, Bool]:  # fmt: skip
-    """Match patches that only the left picture of `pair` shows: places (N, 2), found (N,).
+    """Match patches in the left picture of `pair` alone: places (N, 2), found (N,).
 
-    As `match_guided`, but for a prediction that consensus has checked already: one picture alone doesn't
-    check the depth.
+    Works as `match_guided`, but needs a prediction already checked by consensus, since one picture alone
+    doesn't check the depth.
     """
     camera, guess = pair.pair.camera, predicted.stereo
     with np.errstate(invalid="ignore"):
@@ -192,9 +192,9 @@ def match_left(
 
 
 def match_across(pair: PatchPair, left: Float64, disparity: Float64, sure: bool = False) -> AlignedPatches:
-    """Match left places (N, 2) of about known disparity (N,) in the right picture, on their row only.
+    """Match left positions (N, 2) of roughly known disparity (N,) in the right picture, on their row only.
 
-    sure: the disparities are good to a pixel or two.
+    sure: the disparities are correct to a pixel or two.
     """
     guess = np.column_stack([left[:, 0] - disparity, left[:, 1]])
     right = align_patches(pair.left, pair.right, left, guess, sure)

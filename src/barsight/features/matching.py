@@ -1,4 +1,4 @@
-"""Match descriptors, one function a step: nearest, ratio, mutual, along the row, plane, trend."""
+"""Match descriptors, with one function per step: nearest, mutual, ratio test, homography, motion."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ MIN_FOR_PLANE = 4
 
 @dataclass(frozen=True, eq=False)
 class NearestNeighbours:
-    """Nearest neighbours of N first descriptors: index (N,) of the nearest second one, its distance and the
-    next one's.
+    """Nearest neighbours of N first descriptors: index (N,) of the nearest second one, its distance and that
+    of the second nearest.
 
     The distance is Hamming's [paper Eq. 6] for bits, else L2.
     """
@@ -45,13 +45,13 @@ def nearest_neighbours(first: UInt8 | Float32, second: UInt8 | Float32) -> Neare
 
 
 def ratio_test(found: NearestNeighbours, ratio: float = 0.9) -> Bool:
-    """Apply the ratio test (N,) [Lowe 2004]."""
+    """Select the neighbours (N,) that pass the ratio test [Lowe 2004]."""
     kept: Bool = (found.index >= 0) & (found.distance < ratio * found.next_distance)
     return kept
 
 
 def is_mutual(forward: NearestNeighbours, backward: NearestNeighbours) -> Bool:
-    """Check mutual nearest neighbours (N,)."""
+    """Select the mutual nearest neighbours (N,)."""
     kept: Bool = forward.index >= 0
     kept[kept] = backward.index[forward.index[kept]] == np.flatnonzero(kept)
     return kept
@@ -64,7 +64,7 @@ def hamming_distances(first: UInt8, second: UInt8) -> Int64:
 
 
 def match_mutual(first: Features, second: Features, ratio: float = 0.9) -> Int64:
-    """Match mutual nearest neighbours that pass the ratio test: index pairs (M, 2)."""
+    """Match mutual nearest neighbours that pass the ratio test; return index pairs (M, 2)."""
     if len(first) < 2 or len(second) < 2:
         return np.empty((0, 2), dtype=np.int64)
     forward = nearest_neighbours(first.descriptors, second.descriptors)
@@ -75,8 +75,8 @@ def match_mutual(first: Features, second: Features, ratio: float = 0.9) -> Int64
 
 
 def homography_inliers(first: Float64, second: Float64, reach_px: float = 3.0) -> Bool:
-    """Select matches (N,) that fit the best homography [paper Eq. 7], by MAGSAC++; true ones off the plane
-    leave.
+    """Select the matches (N,) that fit the best homography [paper Eq. 7], by MAGSAC++; this also removes true
+    matches off the plane.
     """
     if len(first) < MIN_FOR_PLANE:
         return np.zeros(len(first), np.bool_)
@@ -89,9 +89,9 @@ def motion_inliers(
     points: Float64, second: Float64, rotation: Float64, translation: Float64, camera: RectifiedCamera,
     reach_px: float,
 ) -> Bool:  # fmt: skip
-    """Select matches (N,) within `reach_px` of where the motion takes their points [paper Eq. 12].
+    """Select the matches (N,) within `reach_px` of their points as moved and projected [paper Eq. 12].
 
-    points: (N, 3) in the first `rect0`, rotation and translation new_from_old, from Eq. 11.
+    points: (N, 3) in the first `rect0`; rotation and translation: new_from_old, from Eq. 11.
     """
     expected = project_stereo(points @ rotation.T + translation, camera)[:, :2]
     with np.errstate(invalid="ignore"):

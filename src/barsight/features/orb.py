@@ -1,4 +1,4 @@
-"""Detect ORB features [Rublee 2011] spread evenly over the image."""
+"""Detect ORB features [Rublee 2011], evenly spread over the picture."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ CELLS = (6, 8)
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """pixels: (N, 2) float32, x and y. descriptors: (N, 32) uint8. scale: (N,) px of the pyramid's pixel."""
+    """pixels: (N, 2) float32, x and y. descriptors: (N, 32) uint8. scale: (N,) size in px of a pixel of the
+    feature's pyramid level.
+    """
 
     pixels: Float32
     descriptors: UInt8
@@ -34,7 +36,7 @@ def detect_orb(image: UInt8, count: int, cells: tuple[int, int] = CELLS) -> Feat
     """Detect at most `count` ORB features, the strongest of each cell of a (rows, columns) grid.
 
     Detection uses a low FAST threshold so that dark, dull steel yields features too; the grid keeps a bright
-    label from taking them all.
+    label from taking all of them.
     """
     orb = cv2.ORB.create(nfeatures=4 * count, fastThreshold=7, edgeThreshold=_PATCH_PX, patchSize=_PATCH_PX)
     keypoints = orb.detect(image, None)
@@ -56,7 +58,7 @@ def detect_orb(image: UInt8, count: int, cells: tuple[int, int] = CELLS) -> Feat
 def spread(
     pixels: Float32, strength: Float32, shape: tuple[int, ...], count: int, cells: tuple[int, int] = CELLS
 ) -> Int64:
-    """Select the strongest features of each of (rows, columns) cells: their indices, ascending."""
+    """Select the strongest features in each of (rows, columns) cells; return their indices, ascending."""
     height, width = shape
     row = (pixels[:, 1] * cells[0] / height).astype(int).clip(0, cells[0] - 1)
     column = (pixels[:, 0] * cells[1] / width).astype(int).clip(0, cells[1] - 1)
@@ -68,9 +70,10 @@ def spread(
 
 
 def describe_upright(image: UInt8, places: Float32) -> Features:
-    """Describe given places (N, 2) by ORB's bits, but upright and all of the picture at half size.
+    """Describe given positions (N, 2) by upright ORB descriptors in the picture at half size.
 
-    For pictures that hardly turn or grow from one to the next. Places too near the border are left out.
+    For pictures that hardly rotate or change scale from one to the next. Positions too near the border are
+    left out.
     """
     keypoints = [cv2.KeyPoint(float(x), float(y), _PATCH_PX, 0.0) for x, y in places / 2]
     described, descriptors = cv2.ORB.create(nlevels=1).compute(cv2.pyrDown(image), keypoints)

@@ -1,9 +1,9 @@
-"""Track patches by inverse-compositional alignment with gain and offset, to a few hundredths of a pixel.
+"""Align patches inverse-compositionally, with gain and offset, to a few hundredths of a pixel.
 
-Lucas-Kanade by Gauss-Newton [Baker 2004, inverse compositional] with two more unknowns, gain and offset:
-two cameras never expose alike, and where a patch is brighter on one side an offset of 5 % moves plain
-Lucas-Kanade by tenths of a pixel. Pictures are read as cubic B-splines, which hardly damp fine texture at
-any fraction of a pixel.
+Lucas-Kanade by Gauss-Newton [Baker 2004, inverse compositional] with two more unknowns, gain and offset: two
+cameras never expose alike, and where a patch is brighter on one side an offset of 5 % shifts plain
+Lucas-Kanade by tenths of a pixel. Pictures are interpolated by cubic B-splines, which hardly damp fine
+texture at any fraction of a pixel.
 """
 
 from __future__ import annotations
@@ -19,19 +19,20 @@ from barsight.core.linalg.bspline import sixfold_weights
 from barsight.core.records.pairs import RectifiedPair
 
 HALF_PX = 5
-"""A patch is 2 * HALF_PX + 1 wide."""
+"""Half-width of a patch, which is 2 * HALF_PX + 1 pixels wide."""
 MAX_ROWS = 64
-"""A patch that covers more rows of its source isn't looked for."""
+"""Maximum number of source rows for reading a patch; a patch that needs more isn't aligned."""
 MAX_STEPS = 15
 CLOSE_PX = 0.01
 COARSE_REACH_PX = 6.0
-"""How far from its guess the half-size picture may take a patch, full px."""
+"""Maximum distance from its guess at which a patch is accepted in the half-size picture, in full-size px."""
 FINE_REACH_PX = 2.5
 MIN_LIKENESS = 0.7
 CORE_PX, MIN_CORE_LIKENESS = 2, -0.5
 MIDDLE_PX, MAX_MIDDLE_SIGMA_PX = 3, 0.4
-"""The innermost pixels must be alike and the middle fix its own place: else it was the rim that has matched,
-and the rim may belong to another surface."""
+"""Half-width of a patch's middle, and maximum sigma of a position from the middle alone. With `CORE_PX`, this
+rejects patches of which only the rim has matched, which may belong to another surface.
+"""
 MIN_CONTRAST_DN = 1.0
 _SIZE = 2 * HALF_PX + 1
 _POLE = 3.0**0.5 - 2.0
@@ -40,7 +41,7 @@ _PREFILTER = (3.0**0.5 * _POLE ** np.abs(np.arange(-8, 9))).astype(np.float32)
 
 @dataclass(frozen=True, eq=False)
 class PatchImage:
-    """A picture ready to be read at fractions of a pixel: spline coefficients (H, W), also at half size."""
+    """Picture prepared for reading at fractions of a pixel: spline coefficients (H, W), also at half size."""
 
     fine: Float32
     coarse: Float32
@@ -48,7 +49,7 @@ class PatchImage:
 
 @dataclass(frozen=True, eq=False)
 class PatchPair:
-    """A rectified pair and its pictures ready to be read."""
+    """Rectified pair, and its pictures prepared for reading at fractions of a pixel."""
 
     pair: RectifiedPair
     left: PatchImage
@@ -58,8 +59,8 @@ class PatchPair:
 @dataclass(frozen=True, eq=False)
 class AlignedPatches:
     """pixels: (N, 2) x, y in the target. sigma_px: (N,) of x and y each, from the patch's own misfit, along
-    its weaker direction. likeness: (N,) share of the patch's variance that the other patch explains.
-    found: (N,) whether it settled near its guess and is alike, also in its middle.
+    its weaker direction. likeness: (N,) share of the patch's variance that the other patch explains. found:
+    (N,) whether it converged near its guess and is alike, its middle included.
     """
 
     pixels: Float64
@@ -74,7 +75,7 @@ def patch_image(image: UInt8) -> PatchImage:
 
 
 def patch_pair(pair: RectifiedPair) -> PatchPair:
-    """Prepare both pictures of a pair."""
+    """Prepare both pictures of a pair for reading at fractions of a pixel."""
     return PatchPair(pair, patch_image(pair.left), patch_image(pair.right))
 
 
@@ -82,10 +83,10 @@ def align_patches(
     source: PatchImage, target: PatchImage, places: Float64, guesses: Float64, sure: bool = False,
     grown: Float64 | None = None,
 ) -> AlignedPatches:  # fmt: skip
-    """Align the patches of `source` at `places` (N, 2) in `target`, near the `guesses` (N, 2).
+    """Align the patches of `source` at `places` (N, 2) with `target`, near the `guesses` (N, 2).
 
-    grown: (N,) how much larger the target shows them, 1 where it isn't given. sure: the guesses are within
-    `FINE_REACH_PX`; otherwise the half-size pictures are asked first.
+    grown: (N,) factor by which the target shows them larger, 1 where not given. sure: the guesses are within
+    `FINE_REACH_PX`; otherwise the half-size pictures are aligned first.
     """
     places = np.ascontiguousarray(places, np.float64)
     start = np.ascontiguousarray(guesses, np.float64)
@@ -108,8 +109,8 @@ def _located(
 
 
 def _coefficients(image: UInt8) -> Float32:
-    """Compute cubic B-spline coefficients; the recursive prefilter's tail is cut at 8 px, where it
-    is 3e-5.
+    """Compute cubic B-spline coefficients; the recursive prefilter's tail is cut off at 8 px, where it is
+    3e-5.
     """
     result: Float32 = cv2.sepFilter2D(
         image, cv2.CV_32F, _PREFILTER, _PREFILTER, borderType=cv2.BORDER_REFLECT_101
@@ -119,7 +120,7 @@ def _coefficients(image: UInt8) -> Float32:
 
 @kernel()
 def _weights(t: float, weights: Float32) -> None:
-    """Fill weights (4,) at a fraction t of a pixel; their sum is 1 as near as 32 bits have it."""
+    """Fill weights (4,) for a fraction t of a pixel; their sum is 1 to within 32-bit precision."""
     before, at, _, after = sixfold_weights(t)
     weights[0], weights[1], weights[3] = before / 6, at / 6, after / 6
     weights[2] = 1 - weights[0] - weights[1] - weights[3]
@@ -129,7 +130,7 @@ def _weights(t: float, weights: Float32) -> None:
 def _inside(image: Float32, x: float, y: float, reach: float) -> bool:
     """Check that the spline can be read from x - reach to x + reach and likewise in y, px.
 
-    image: (H, W) coefficients, of which one more is read before a place and two after it.
+    image: (H, W) coefficients, of which one before a position and two after it are needed.
     """
     return (
         x - reach >= 1
@@ -143,7 +144,7 @@ def _inside(image: Float32, x: float, y: float, reach: float) -> bool:
 def _read(
     image: Float32, x: float, y: float, half: int, step: float, patch: Float32, rows: Float32, room: Float32
 ) -> None:
-    """Sample the (2 half + 1)^2 patch around (x, y), `step` px between its pixels, all of it inside.
+    """Sample the (2 half + 1)^2 patch around (x, y) with pixels `step` px apart, all of it inside.
 
     rows: (at least 2 half step + 5, 2 half + 1) and room: (2, at least 2 half + 1, 4) are scratch.
     """
@@ -173,7 +174,8 @@ def _read(
 
 @kernel()
 def _read_whole(image: Float32, x: float, y: float, patch: Float32, rows: Float32, room: Float32) -> None:
-    """Sample a whole patch at full size: all its pixels share their weights, so rows go before columns.
+    """Sample a whole patch at full size: all its pixels have the same weights, which are applied along the
+    rows, then down the columns.
 
     rows: (at least _SIZE + 3, _SIZE) scratch.
     """
@@ -194,8 +196,8 @@ def _read_whole(image: Float32, x: float, y: float, patch: Float32, rows: Float3
 
 @kernel()
 def _prepare(wide: Float32, design: Float32, normal: Float64) -> float:
-    """Build the design (5, _SIZE^2) of a patch: columns' and rows' slope, gain, offset and the patch itself;
-    the normal matrix (4, 4) of the first four. Returns the patch's standard deviation.
+    """Build the design (5, _SIZE^2) of a patch: horizontal and vertical gradient, gain, offset and the patch
+    itself; and the normal matrix (4, 4) of the first four. Returns the patch's standard deviation.
     """
     mean = wide[1:-1, 1:-1].sum() / np.float32(_SIZE * _SIZE)
     half = np.float32(0.5)
@@ -218,7 +220,7 @@ def _prepare(wide: Float32, design: Float32, normal: Float64) -> float:
 
 @kernel()
 def _step(other: Float32, design: Float32, inverse: Any, step: Float64) -> None:
-    """Compute the Gauss-Newton step (4,) from the other patch (_SIZE^2,)."""
+    """Compute the Gauss-Newton step (4,) towards the other patch (_SIZE^2,)."""
     along, down, gain, offset = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
     for k in range(_SIZE * _SIZE):
         off = other[k] - design[4, k]
@@ -232,8 +234,8 @@ def _step(other: Float32, design: Float32, inverse: Any, step: Float64) -> None:
 
 @kernel()
 def _misfit(other: Float32, design: Float32, step: Float64, half: int) -> tuple[float, float]:
-    """Sum squares over the middle (2 half + 1)^2 of the patch: what the step leaves, and the other patch
-    about its mean there.
+    """Sum squares over the middle (2 half + 1)^2 of the patch: those of the residuals after the step, and
+    those of the other patch about its mean there.
 
     other: (_SIZE^2,). design: (5, _SIZE^2), see `_prepare`; step: (4,), see `_step`.
     """
@@ -252,7 +254,7 @@ def _misfit(other: Float32, design: Float32, step: Float64, half: int) -> tuple[
 
 @kernel()
 def _middle_holds(other: Float32, design: Float32, step: Float64, variance: float) -> bool:
-    """Check that the patch's middle alone is found at that place.
+    """Check that the patch's middle matches at that position and would determine it alone.
 
     other: (_SIZE^2,). design: (5, _SIZE^2), see `_prepare`; step: (4,), see `_step`. variance: DN^2 of a
     pixel's noise.
@@ -279,8 +281,8 @@ def _locate(
 
     source, target: (H, W) spline coefficients. places: (N, 2) x, y px in the source. pixels: (N, 2) guesses
     in the target, replaced where the patch is found within `reach` px of them in x and y. grown: (N,), see
-    `align_patches`. sigma: (N,) px, likeness: (N,); filled where it is found, otherwise they stay as they
-    were (NaN and 0).
+    `align_patches`. sigma: (N,) px, likeness: (N,); filled where it is found, else left as they were (NaN and
+    0).
     """
     wide = np.empty((_SIZE + 2, _SIZE + 2), np.float32)
     room = np.empty((2, _SIZE + 2, 4), np.float32)

@@ -1,4 +1,4 @@
-"""Estimate the period of repeated texture along the rows: bars side by side."""
+"""Estimate the period of texture that repeats along the rows: bars side by side."""
 
 from __future__ import annotations
 
@@ -11,15 +11,17 @@ from barsight.core.arrays import Float32, Float64, UInt8
 TILES = (4, 4)
 NEAREST_PX = 5
 ROW_STEP = 8
-"""Rows taken: those between show the same bars."""
+"""Number of rows that are averaged into one: neighbouring rows show the same bars."""
 MIN_LIKENESS = 0.35
-"""Autocorrelation of a tile's rows, at its first peak, from which the tile repeats."""
+"""Minimum autocorrelation of a tile's rows at its first peak for the tile to count as repeating."""
 
 
 def texture_period_px(image: UInt8, places: Float64) -> Float64:
-    """Estimate the period (N,) px along the row of the tile around each place (N, 2); infinite where none.
+    """Estimate the period (N,) px along the rows of the tile around each position (N, 2); infinite where
+    there is none.
 
-    The first peak of the mean autocorrelation of the tile's rows, the slow changes of light taken off.
+    The period is the first peak of the mean autocorrelation of the tile's rows, with slow changes of light
+    removed.
     """
     bands = max(1, image.shape[0] // ROW_STEP)
     rows_of = cv2.resize(image, (image.shape[1], bands), interpolation=cv2.INTER_AREA).astype(np.float32)
@@ -35,7 +37,9 @@ def texture_period_px(image: UInt8, places: Float64) -> Float64:
 
 
 def _likeness(tiles: Float32) -> Float64:
-    """Compute the mean autocorrelation (..., W / 2) of tiles (..., H, W), 1 at no lag; 0 for a blank one."""
+    """Compute the mean autocorrelation (..., W / 2) of tiles (..., H, W), 1 at zero lag; 0 for a blank
+    tile.
+    """
     width = tiles.shape[-1]
     centred = tiles - tiles.mean(axis=-1, keepdims=True)
     power = (np.abs(rfft(centred, 2 * width)) ** 2).mean(axis=-2)
@@ -45,7 +49,9 @@ def _likeness(tiles: Float32) -> Float64:
 
 
 def _first_peak(likeness: Float64) -> float:
-    """Find the lag of the first peak after the autocorrelation has fallen, or infinity."""
+    """Find the lag of the first peak after the autocorrelation's initial fall; infinity where there is
+    none.
+    """
     if likeness[0] <= 0:
         return float("inf")
     fallen = np.flatnonzero(likeness < MIN_LIKENESS / 2)

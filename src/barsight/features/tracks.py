@@ -1,7 +1,8 @@
-"""Track points over many frames: new corners where none are, each aligned with the view it began in.
+"""Track points over many frames: new corners where there are none, each aligned with the view that it began
+in.
 
-A patch is compared with the view where it was first seen as long as its size hardly changes, so that
-errors don't add up from frame to frame; after that its last view takes over.
+A patch is compared with the view in which it was first seen as long as its size hardly changes, so that
+errors don't accumulate from frame to frame; after that it is taken anew from its last view.
 """
 
 from __future__ import annotations
@@ -34,19 +35,19 @@ class TrackSettings:
     """Points followed from frame to frame."""
 
     points: int = 900
-    """Points followed at a time."""
+    """Number of points tracked at a time."""
     spacing_px: int = 14
-    """New points keep this far from others."""
+    """Minimum distance of a new point from all others."""
     quality: float = 0.003
-    """Corners weaker than this share of the strongest aren't used."""
+    """Minimum strength of a corner, as a ratio to that of the strongest one."""
     sigma_px: float = 0.25
-    """The noise of a point's place (1 sigma)."""
+    """Standard deviation of a point's measured position in the picture."""
     max_scale: float = 1.3
-    """A patch that has grown or shrunk by more is taken anew from its last view."""
+    """Maximum factor by which a patch may grow or shrink before it is taken anew from its last view."""
     min_range_m: float = 0.5
-    """Points nearer than this aren't used."""
+    """Minimum range of points that are used."""
     max_range_baselines: float = 60.0
-    """Points further than this many baselines aren't used for motion."""
+    """Maximum range, in baselines, of points that are used for motion."""
 
     def __post_init__(self) -> None:
         expect_ranges(
@@ -57,11 +58,11 @@ class TrackSettings:
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """Tracked points. All of N points: track (their names), stereo (N, 3) in the last view (u, v, right u)
-    and sigma_px (N,) of each, source (index into views of the patch's view), patch (N, 2) its place there,
+    """Tracked points. Of each of N points: track (its name), stereo (N, 3) in the last view (u, v, right u)
+    with sigma_px (N,), source (index into `views` of its patch's view), patch (N, 2) its position there,
     patch_depth (N,) m.
 
-    views: the left pictures that patches are from, the last frame's at the end. last: the last frame.
+    views: the left pictures that the patches are from, the last frame's at the end. last: the last frame.
     """
 
     views: tuple[PatchImage, ...] = ()
@@ -109,9 +110,10 @@ def update_tracks(
     tracks: Tracks, pair: PatchPair, matches: GuidedMatches, kept: Bool, coarse: Float32,
     settings: TrackSettings,
 ) -> Tracks:  # fmt: skip
-    """Update the tracks after a new pair: those `kept` of the matches at their new places, new ones between.
+    """Update the tracks after a new pair: the matches `kept` move to their new positions, and new points are
+    added between them.
 
-    coarse: the pair's coarse disparity (h, w), in px of the full picture, NaN unknown, for new points.
+    coarse: the pair's coarse disparity (h, w), in px of the full picture, NaN where unknown, for new points.
     """
     followed = replace(
         tracks.chosen(kept), stereo=matches.stereo[kept], sigma_px=matches.sigma_px[kept],
@@ -146,10 +148,11 @@ def update_tracks(
 
 
 def detect_corners(image: UInt8, settings: TrackSettings, taken: Float64) -> Float32:
-    """Detect corners (N, 2) [Shi 1994] at least `spacing_px` from each other and from the places `taken` (M,
-    2).
+    """Detect corners (N, 2) [Shi 1994] at least `spacing_px` from each other and from the positions `taken`
+    (M, 2).
 
-    The picture is cut into 4 x 4 tiles that yield alike, so that a bright label doesn't take them all.
+    The picture is divided into 4 x 4 tiles with equal numbers of points, so that a bright label doesn't take
+    them all.
     """
     small = cv2.pyrDown(image)
     mask = np.full(small.shape, 255, np.uint8)
@@ -180,8 +183,8 @@ def detect_corners(image: UInt8, settings: TrackSettings, taken: Float64) -> Flo
 def _across(
     pair: PatchPair, corners: Float32, coarse: Float32, settings: TrackSettings
 ) -> tuple[Float64, Float64]:
-    """Match new corners across: u, v and right u (M, 3) of those at a useful depth in the right picture;
-    sigma.
+    """Match new corners across to the right picture: u, v and right u (M, 3) of those at a useful depth, and
+    their sigmas.
     """
     camera = pair.pair.camera
     row = (corners[:, 1] * coarse.shape[0] / camera.height).astype(int)
@@ -199,6 +202,6 @@ def _across(
 
 
 def _without_old_views(tracks: Tracks) -> Tracks:
-    """Keep only the last `MAX_VIEWS` views in memory."""
+    """Drop all but the last `MAX_VIEWS` views from memory."""
     drop = max(0, len(tracks.views) - MAX_VIEWS)
     return replace(tracks, views=tracks.views[drop:], source=tracks.source - drop)
