@@ -15,21 +15,23 @@ from barsight.registration.yard import YardCalibration, calibrate_yard, predicte
 
 BENDS = ("deflection_m", "skew_rad", "rail_m")
 ORDINARY = (0.02, 0.001, 0.01)
-"""One sigma of each in a crane that nobody measured: what targets don't tell is held to that."""
+"""Prior standard deviation of each bend of a crane that nobody has measured; used where targets don't
+determine it.
+"""
 STEPS = (0.005, 0.0005, 0.005)
-"""Of each, for slopes."""
+"""Step of each bend for numerical derivatives."""
 UNTOLD = 0.8
-"""Share of the ordinary sigma: where more is left, the targets hardly told it."""
+"""Ratio to the prior's sigma above which the targets have hardly determined a bend."""
 
 
 @dataclass(frozen=True, eq=False)
 class CraneBend:
-    """Bending of a crane, which no encoder sees, over readings of its encoders.
+    """Bending of a crane, which no encoder measures, as a function of its encoders' readings.
 
     girder_y_m: the trolley's readings at the girder's ends; rails_x_m: the bridge's at the rails' ends, None
-    where the rails are taken to be straight. values (3,): deflection in the girder's middle under the trolley
-    (m, down), skew (rad: along X for each metre along Y), depth of the rails' middle (m). covariance (9, 9):
-    the frame's turn and place, as `Alignment` has them, then the values.
+    where the rails are taken as straight. values (3,): deflection in the girder's middle under the trolley
+    (m, down), skew (rad: along X for each metre along Y), sag of the rails' middle (m). covariance (9, 9): of
+    the frame's turn and translation, as in `Alignment`, then of the values.
     """
 
     girder_y_m: tuple[float, float]
@@ -38,7 +40,9 @@ class CraneBend:
     covariance: Float64
 
     def slopes(self, place_m: Float64) -> tuple[Float64, Float64]:
-        """Compute how places (N, 3) of the crane point move and tilt, (N, 3, 3) each, by each value."""
+        """Compute the derivatives of the shift and tilt of the crane point at positions (N, 3), (N, 3, 3)
+        each, by each value.
+        """
         shift, tilt = np.zeros((len(place_m), 3, 3)), np.zeros((len(place_m), 3, 3))
         sag, slope = _parabola(place_m[:, 1], self.girder_y_m)
         shift[:, 2, 0], tilt[:, 0, 0] = -sag, -slope
@@ -49,12 +53,16 @@ class CraneBend:
         return shift, tilt
 
     def moved(self, place_m: Float64, lever_m: Float64) -> Float64:
-        """Move readings (N, 3) so that they and the lever (3,) end where the body really is."""
+        """Correct readings (N, 3) so that together with the lever (3,) they give the body's actual
+        position.
+        """
         shift, tilt = self.slopes(place_m)
         return np.asarray(place_m + shift @ self.values + np.cross(tilt @ self.values, lever_m), np.float64)
 
     def turn(self, place_m: Float64) -> Float64:
-        """Return the mean tilt over readings (N, 3), as a rotation (3, 3) from the left; none without any."""
+        """Return the mean tilt over readings (N, 3) as a rotation (3, 3) from the left; the identity
+        without any.
+        """
         if not len(place_m):
             return np.eye(3)
         _, tilt = self.slopes(place_m)
@@ -62,23 +70,23 @@ class CraneBend:
         return turn
 
     def with_values(self, values: Float64) -> CraneBend:
-        """Take other values."""
+        """Replace the values."""
         return replace(self, values=values)
 
     @property
     def fitted(self) -> Bool:
-        """Tell which values are fitted."""
+        """Return which values are fitted (3,)."""
         return np.array([True, True, self.rails_x_m is not None])
 
     @property
     def sigma(self) -> Float64:
-        """Return one sigma of each value (3,)."""
+        """Return the standard deviation of each value (3,)."""
         sigma: Float64 = np.sqrt(np.diag(self.covariance)[6:])
         return sigma
 
 
 def straight(girder_y_m: tuple[float, float], rails_x_m: tuple[float, float] | None) -> CraneBend:
-    """Begin with a crane that doesn't bend, as unsure as an ordinary one."""
+    """Begin with a crane that doesn't bend, with the prior uncertainty of an ordinary one."""
     bend = CraneBend(girder_y_m, rails_x_m, np.zeros(3), np.zeros((9, 9)))
     covariance = np.diag([*np.zeros(6), *np.where(bend.fitted, np.square(ORDINARY), 0.0)])
     return replace(bend, covariance=covariance)
@@ -90,8 +98,8 @@ def calibrate_bent_yard(
 ) -> tuple[YardCalibration, CraneBend] | Failed:  # fmt: skip
     """Estimate the frame as `calibrate_yard` does, together with the crane's bending.
 
-    measured (N, 3): places with `bend` as it is; slopes (N, 3, 3): how they move by each of its values, in
-    the same axes. The values are held to `ORDINARY` where the targets don't tell them.
+    measured (N, 3): positions with `bend` as given; slopes (N, 3, 3): their derivatives by its values, in the
+    same axes. `ORDINARY` is the values' prior where the targets don't determine them.
     """
     used, fitted = ~checks, bend.fitted
     held = np.where(fitted, np.square(ORDINARY), 1.0)
@@ -113,7 +121,7 @@ def calibrate_bent_yard(
     rigid = calibrate_yard(names, at, yard, covariance_m2, checks, frame)
     if isinstance(rigid, Failed):
         return rigid
-    # The frame's turn carries the source's origin along, as `align_rigid` has it.
+    # The frame's turn is about the source's origin, as in `align_rigid`.
     joint = np.linalg.inv(normal)
     joint[6:][~fitted] = joint[:, 6:][:, ~fitted] = 0.0
     joint *= rigid.inflation
@@ -124,7 +132,9 @@ def _joined(
     rigid: YardCalibration, bend: CraneBend, values: Float64, joint: Float64, at: Float64, slopes: Float64,
     covariance_m2: Float64,
 ) -> tuple[YardCalibration, CraneBend]:  # fmt: skip
-    """Replace the frame's covariance by its part of the joint one, and say what the targets didn't tell."""
+    """Replace the frame's covariance by its part of the joint one, and report the bends that the targets
+    didn't determine.
+    """
     alignment = replace(rigid.alignment, covariance=joint[:6, :6])
     bent = replace(bend, values=values, covariance=joint)
     turn = alignment.target_from_source.rotation
@@ -139,7 +149,7 @@ def _joined(
 
 
 def bend_carry(bend: CraneBend, turn: Float64, place_m: Float64) -> Float64:
-    """Compute how a pose's turn and place in the yard (6, 3) answer to the bend's values.
+    """Compute the derivatives of a pose's turn and position in the yard (6, 3) by the bend's values.
 
     turn (3, 3): yard from encoders; place_m (3,): of the crane point there, by its readings.
     """
@@ -148,8 +158,8 @@ def bend_carry(bend: CraneBend, turn: Float64, place_m: Float64) -> Float64:
 
 
 def bend_heights(bend: CraneBend, place_m: Float64, points_m: Float64) -> Float64:
-    """Compute how heights at places (N, 3), seen from the crane point (3,), answer to the bend's values
-    (N, 3); all by readings.
+    """Compute the derivatives (N, 3) of heights at points (N, 3), seen from the crane point (3,), by the
+    bend's values; all in the axes of the readings.
     """
     shift, tilt = bend.slopes(place_m[None])
     rows: Float64 = shift[0, 2] + (-skew(points_m - place_m) @ tilt[0])[:, 2]

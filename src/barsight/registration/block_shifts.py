@@ -1,4 +1,4 @@
-"""Measure by how much one height map with its picture is shifted against another, block by block."""
+"""Measure the shift of one height map with its picture against another, block by block."""
 
 from __future__ import annotations
 
@@ -11,29 +11,33 @@ from barsight.core.arrays import Bool, Float32, Float64
 
 BLOCK_CELLS = 64
 MIN_KNOWN_RATIO = 0.3
-"""A block in which both maps know less of the cells says nothing."""
+"""Minimum share of a block's cells that both maps must know for it to be used."""
 GATE_M = 0.06
-"""Heights further apart are not of the same surface, or it changed."""
+"""Maximum height difference: cells further apart belong to another surface, or it has changed."""
 TOGETHER_CELLS = 40.0
-"""Cells whose errors are nearly the same: the map averages along a bar, and matching has a window."""
+"""Number of cells whose errors are nearly the same, by which the information is divided: the map averages
+along a bar, and matching has a window.
+"""
 STRAY_M = 0.01
-"""A block that shows little strays no further than about this."""
+"""Prior standard deviation of a block's shift, which limits blocks that show little."""
 _FINE_CELLS, _COARSE_CELLS = 1.0, 10.0
 _TURNS = 5
 _MIN_CONTRAST = 2.0
-"""Gray levels; where the picture has less, it is left out by its low weight."""
+"""Lower bound of the pictures' noise, in gray levels, for their weight."""
 
 
 @dataclass(frozen=True, eq=False)
 class MatchedMap:
-    """Heights (H, W) m with sigma m, NaN where unknown, and gray levels, NaN where there are none."""
+    """Heights (H, W) m with their sigmas, NaN where unknown, and gray levels, NaN where there are none."""
 
     z_m: Float32
     sigma_m: Float32
     gray: Float32
 
     def moved(self, shift_m: Float64, cell_m: float) -> MatchedMap:
-        """Move the map by x, y and z; bilinear, unknown beside what is unknown."""
+        """Shift the map by x, y and z (m) with bilinear interpolation; cells next to unknown ones become
+        unknown.
+        """
         rows, columns = self.z_m.shape
         x, y = np.meshgrid(
             np.arange(columns, dtype=np.float32) - np.float32(shift_m[0] / cell_m),
@@ -48,8 +52,8 @@ class MatchedMap:
 
 @dataclass(frozen=True, eq=False)
 class BlockShifts:
-    """K blocks that two maps share. place_m: (K, 3) their middles; shift_m: (K, 3) that takes the second onto
-    the first; information: (K, 3, 3) of it, 1 / m^2, which has no weight in directions that show nothing.
+    """K blocks that two maps share. place_m: (K, 3) their centres; shift_m: (K, 3) that moves the second map
+    onto the first; information: (K, 3, 3) of the shift, 1 / m^2, zero in directions that show nothing.
     """
 
     place_m: Float64
@@ -58,7 +62,7 @@ class BlockShifts:
 
     @classmethod
     def none(cls) -> BlockShifts:
-        """Nothing in common."""
+        """Return no blocks."""
         return cls(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3, 3)))
 
     def __add__(self, other: BlockShifts) -> BlockShifts:
@@ -73,9 +77,9 @@ def block_shifts(
 ) -> BlockShifts:
     """Measure the shifts of all blocks by least squares over heights and pictures (Lucas-Kanade).
 
-    first, second: on one grid whose first cell's centre is origin_m (x, y). Bars alone say nothing of the
-    shift along themselves; straps, ends, rust and mill scale do. A place where heights differ by more than
-    GATE_M takes no part. Slow drifts of the brightness are taken off.
+    first, second: on one grid, whose first cell's centre is origin_m (x, y). Bars alone don't show the shift
+    along themselves; straps, ends, rust and mill scale do. Cells whose heights differ by more than GATE_M are
+    left out. Slow changes of the brightness are removed.
     """
     total, found = np.zeros(3), BlockShifts.none()
     for _ in range(_TURNS):
@@ -90,7 +94,7 @@ def block_shifts(
 
 
 def _middle(found: BlockShifts) -> Float64:
-    """Average the blocks' shifts by their information, each no further from the median than they scatter."""
+    """Average the blocks' shifts weighted by their information, without those that lie far off the median."""
     middle = np.median(found.shift_m, axis=0)
     off = np.abs(found.shift_m - middle)
     near = (off <= 3 * np.median(off, axis=0) + 1e-4).all(axis=1)
@@ -131,7 +135,7 @@ def _measured(
 def _solved(
     known: Bool, z_m: Float32, normal: Float32, said: Float32, origin_m: tuple[float, float], cell_m: float
 ) -> BlockShifts:
-    """Sum the equations of each block and solve them; directions without weight stay at zero."""
+    """Sum the equations of each block and solve them; directions without information stay at zero."""
     counts = _sums(known.astype(np.float32))
     chosen = counts >= MIN_KNOWN_RATIO * BLOCK_CELLS**2
     if not chosen.any():
@@ -160,7 +164,7 @@ def _sums(values: Float32) -> Float64:
 
 
 def _contrast(gray: Float32, known: Bool) -> Float32:
-    """Smooth a picture a little and take off its slow part, reading known cells only."""
+    """Smooth a picture a little and subtract its slow part, using known cells only."""
     weight = known.astype(np.float32)
     filled = np.where(known, gray, 0).astype(np.float32)
     smooth = []

@@ -1,4 +1,4 @@
-"""Estimate how passes over one yard lie against each other, each with a prior of its own."""
+"""Estimate the shifts of passes over one yard against each other, each pass with a prior of its own."""
 
 from __future__ import annotations
 
@@ -13,25 +13,31 @@ from barsight.core.pose import skew
 from barsight.registration.block_shifts import BlockShifts
 
 UNKNOWNS = 7
-"""Of a pass: turn about x, y and z (rad), shift along x, y and z (m), scale of its way along x."""
+"""Number of unknowns of a pass: turn about x, y and z (rad), shift along x, y and z (m), scale along x."""
 DOUBTFUL_SIGMAS = 4.0
-"""A tie further from what the passes' own sigmas allow contradicts them."""
+"""Deviation of a tie, in sigma, from which it contradicts the passes' own sigmas."""
 FLOOR_M = np.array([0.001, 0.001, 0.002])
-"""What the blocks of one overlap have wrong together (1 sigma), however many they are."""
+"""Standard deviation along x, y and z of the error that all blocks of an overlap share, however many they
+are.
+"""
 MIN_BLOCKS, MIN_PLANE = 4, 8
-"""Fewer blocks than these don't show their own scatter, or their scatter about a plane."""
+"""Minimum number of blocks to estimate their scatter, and the number above which it is taken about a
+plane.
+"""
 FEW_INFLATION, MIN_INFLATION = 10.0, 1e-3
-"""Factors of the stated variance: where too few blocks show it, and the least."""
+"""Factor on the stated variance where blocks are too few to show it, and the minimum of the estimated
+factor.
+"""
 CHI2_MEDIAN = 2.366
-"""Of three degrees of freedom."""
+"""Median of chi2 with three degrees of freedom."""
 NOTHING = 1e-3
-"""Information (1 / m^2) of a direction that a block doesn't show."""
+"""Information (1 / m^2) that is assumed for directions which a block doesn't show."""
 _ROUNDS = 15
 
 
 @dataclass(frozen=True, eq=False)
 class PassPrior:
-    """Prior of a pass's own place. about_m: (3,) its middle, about which it turns and stretches.
+    """Prior of a pass's own position. about_m: (3,) its middle, about which it turns and stretches.
     covariance: (7, 7) of the unknowns.
     """
 
@@ -41,9 +47,9 @@ class PassPrior:
 
 @dataclass(frozen=True, eq=False)
 class PassCorrection:
-    """Correction of a pass: p + shift_at(p) is where its point p lies in the common map.
+    """Correction of a pass: its point p lies at p + shift_at(p) in the common map.
 
-    about_m: (3,). unknowns: (7,), covariance: (7, 7) of what is left.
+    about_m: (3,). unknowns: (7,), covariance: (7, 7) of their remaining errors.
     """
 
     about_m: Float64
@@ -51,16 +57,17 @@ class PassCorrection:
     covariance: Float64
 
     def shift_at(self, points_m: Float64) -> Float64:
-        """Compute the shift (N, 3) of points (N, 3), m."""
+        """Compute the shift (N, 3) m of points (N, 3)."""
         shift: Float64 = design_at(points_m, self.about_m) @ self.unknowns
         return shift
 
 
 @dataclass(frozen=True, eq=False)
 class PairTie:
-    """Shift of two passes by their overlap. first, second: their numbers from 0. blocks: in common. shift_m,
-    sigma_m: (3,) that takes the second onto the first in the overlap's middle, before any correction, and
-    its sigma. expected_sigma_m: (3,) what the passes' own sigmas allow. off_sigmas: the shift over both.
+    """Shift between two passes by their overlap. first, second: their numbers from 0. blocks: number of
+    blocks in common. shift_m, sigma_m: (3,) that moves the second onto the first in the overlap's middle,
+    before any correction, and its sigma. expected_sigma_m: (3,) the shift's sigma expected from the passes'
+    own. off_sigmas: the shift relative to both sigmas.
     """
 
     first: int
@@ -79,7 +86,7 @@ class PairTie:
 
 @dataclass(frozen=True, eq=False)
 class PassTies:
-    """corrections: of each pass; pairs: of those that overlap."""
+    """corrections: one per pass; pairs: one per pair of passes that overlap."""
 
     corrections: tuple[PassCorrection, ...]
     pairs: tuple[PairTie, ...]
@@ -96,11 +103,11 @@ def design_at(points_m: Float64, about_m: Float64) -> Float64:
 
 
 def tie_passes(priors: Sequence[PassPrior], overlaps: Mapping[tuple[int, int], BlockShifts]) -> PassTies:
-    """Solve for all passes' corrections at once, by weighted least squares; blocks count by Cauchy weights.
+    """Solve for all passes' corrections at once by weighted least squares, with Cauchy weights of the blocks.
 
-    overlaps: by (first, second). What a block says is spread over both passes by their sigmas; what no
-    overlap shows stays at the prior. The blocks' sigmas grow or shrink as they really scatter, and no overlap
-    is taken to be surer than FLOOR_M.
+    overlaps: by (first, second). A block's shift is distributed over both passes according to their sigmas;
+    what no overlap shows stays at the prior. The blocks' sigmas are scaled to their actual scatter, and no
+    overlap counts as more precise than FLOOR_M.
     """
     chosen = {pair: _scaled(*pair, blocks) for pair, blocks in overlaps.items() if len(blocks.place_m)}
     size = UNKNOWNS * len(priors)
@@ -126,7 +133,7 @@ def tie_passes(priors: Sequence[PassPrior], overlaps: Mapping[tuple[int, int], B
 
 @dataclass(frozen=True, eq=False)
 class _Overlap:
-    """Blocks of two passes with the information (K, 3, 3) that they count by."""
+    """Blocks of two passes with the information (K, 3, 3) by which they are weighted."""
 
     first: int
     second: int
@@ -135,7 +142,7 @@ class _Overlap:
 
 
 def _rows(one: _Overlap, priors: Sequence[PassPrior]) -> Float64:
-    """Compute the Jacobian (K, 3, 7 P) of the blocks' shifts: the second pass moves, less the first."""
+    """Compute the Jacobian (K, 3, 7 P) of the blocks' shifts: the second pass's shift minus the first's."""
     place = one.shifts.place_m
     rows = np.zeros((len(place), 3, UNKNOWNS * len(priors)))
     for number, sign in ((one.second, 1), (one.first, -1)):
@@ -145,8 +152,8 @@ def _rows(one: _Overlap, priors: Sequence[PassPrior]) -> Float64:
 
 
 def _scaled(first: int, second: int, blocks: BlockShifts) -> _Overlap:
-    """Weigh blocks by how far they are off what all say (Cauchy), scale their information to how they scatter
-    about that, and bound it for all together.
+    """Weight blocks by their deviation from the common fit (Cauchy), scale their information to their scatter
+    about it, and bound it for all of them together.
     """
     count = len(blocks.place_m)
     plane = np.ones((count, 1))
@@ -168,7 +175,7 @@ def _scaled(first: int, second: int, blocks: BlockShifts) -> _Overlap:
 
 
 def _told(one: _Overlap, priors: Sequence[PassPrior]) -> PairTie:
-    """Average an overlap, and hold it against what the passes know of themselves."""
+    """Average an overlap, and compare it with the passes' own sigmas."""
     shifts = one.shifts
     spread: Float64 = np.linalg.inv(one.information.sum(axis=0))
     shift: Float64 = spread @ np.einsum("kij,kj->i", one.information, shifts.shift_m)

@@ -1,4 +1,4 @@
-"""Find again in the right pictures what was picked by hand in the left ones, and place it."""
+"""Find targets picked by hand in the left pictures again in the right ones, and place them."""
 
 from __future__ import annotations
 
@@ -15,23 +15,24 @@ from barsight.core.records.trajectory import PosedFrame
 from barsight.registration.tags import SeenTags, TagSighting, sighting_at
 
 HALF_PX = 10
-"""Half the side of the patch about a pick that is sought in the right picture."""
+"""Half-width of the patch around a pick that is searched for in the right picture."""
 ROWS_PX = 2
 PICKED_PX, MATCHED_PX = 0.7, 0.15
-"""Noise of a pick by hand, and of finding it again, one standard deviation."""
+"""Standard deviation of a pick by hand, and of matching it in the right picture."""
 MIN_DISPARITY_PX = 1.0
 MIN_ALIKE, MAX_RIVAL = 0.75, 0.95
-"""Least correlation of a patch with the place that is found; most with another place, as a share of that."""
+"""Minimum correlation of a patch at the match, and maximum correlation elsewhere as a ratio to it."""
 
 
 def see_picks(
     frames: Iterable[StereoFrame | RefusedFrame], rectifier: Rectifier, posed: Mapping[int, PosedFrame],
     picks: Mapping[int, Mapping[int, Float64]], names: tuple[str, ...], count: Callable[[], None],
 ) -> tuple[SeenTags, tuple[str, ...]]:  # fmt: skip
-    """Place the picks of the raw pairs whose pose is known; sentences on those that weren't found again.
+    """Place the picks of the raw pairs whose pose is known; also return messages about those not found again.
 
-    picks: by stamp and target, pixel (2,) in the left picture. Both pictures share the error of the hand,
-    which so moves a target sideways; its height depends on how surely it is found in the right one.
+    picks: by stamp and target, pixel (2,) in the left picture. The error of picking is common to both
+    pictures, so it shifts a target sideways; its height depends on how precisely the right picture is
+    matched.
     """
     seen, lost = SeenTags(names=names, known_px=1.0), list[str]()
     for frame in frames:
@@ -68,7 +69,8 @@ def _sighted(
 
 
 def find_right(pair: RectifiedPair, flat: Float64) -> Float64 | Failed:
-    """Find a rectified left pixel (2,) in the right picture, to a fraction of a pixel, by the patch about it.
+    """Match a rectified left pixel (2,) in the right picture, to a fraction of a pixel, by the patch around
+    it.
 
     Failed `out-of-sight` near the picture's edge, `no-match` where nothing is alike or two places are.
     """
@@ -97,7 +99,7 @@ def find_right(pair: RectifiedPair, flat: Float64) -> Float64 | Failed:
 
 
 def _vertex(values: Float64, k: int) -> float:
-    """Interpolate how far from its place k a maximum lies, by a parabola."""
+    """Interpolate the offset of a maximum from its index k, by a parabola."""
     if not 0 < k < len(values) - 1:
         return 0.0
     low, middle, high = (float(value) for value in values[k - 1 : k + 2])

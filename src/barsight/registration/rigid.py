@@ -13,19 +13,23 @@ from barsight.core.pose import Pose, nearest_rotation, skew
 
 MIN_POINTS = 3
 MIN_WIDTH = 0.01
-"""Points that stray less than this share of their length from a line leave the turn about it open."""
+"""Minimum ratio of the points' width to their length, below which the turn about their line is
+undetermined.
+"""
 ROUNDS, ROUNDING = 5, 1e-9
-"""Gauss-Newton steps from the closed form, and how far chi2 may rise by rounding."""
+"""Maximum number of Gauss-Newton steps after the closed form, and the relative increase of chi2 allowed for
+rounding.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """target_from_source, and how well it is known.
+    """target_from_source, and its uncertainty.
 
     covariance: (6, 6), a small rotation (rad) from the left, then the translation (m), both in target axes.
-    residuals_m: (N, 3) target minus moved source. scale, scale_sigma: what a similarity would have found
-    instead of 1, a diagnosis only. sigma_m: one coordinate's noise as the residuals show it (NaN for three
-    points in a plane fit exactly). chi2: of the residuals by the stated covariances, NaN where none are.
+    residuals_m: (N, 3) target minus moved source. scale, scale_sigma: the scale that a similarity would have
+    found instead of 1, for diagnosis only. sigma_m: noise of a coordinate according to the residuals (NaN
+    without degrees of freedom). chi2: of the residuals with the stated covariances, NaN where there are none.
     """
 
     target_from_source: Pose
@@ -38,7 +42,7 @@ class Alignment:
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Return the degrees of freedom of chi2: the coordinates beyond the six unknowns."""
+        """Return the degrees of freedom of chi2: the number of coordinates minus the six unknowns."""
         return self.residuals_m.size - 6
 
 
@@ -48,11 +52,10 @@ def align_rigid(
     """Align `source` (N, 3) rigidly with `target` (N, 3), m [paper Eq. 13-20, see below].
 
     frames: (target, source). covariance_m2: (N, 3, 3) of each pair's difference, target axes, or (N, N) of
-    the points on each axis alike. Points count by its trace at first, then by all of it (`_refined`), so that
-    chi2 has its degrees of freedom. Without it all count alike and one sigma for all is taken from the
-    residuals.
-    The rotation is the one nearest to sum p'' q''^T; the paper prints its transpose.
-    Failed `few-points`, `collinear`.
+    the points, the same on each axis. Points are first weighted by its trace, then by all of it (`_refined`),
+    so that chi2 has its degrees of freedom. Without it all have the same weight, and a common sigma is
+    estimated from the residuals. The rotation is the one nearest to sum p'' q''^T; the paper prints its
+    transpose. Failed `few-points`, `collinear`.
     """
     expect_shape("source", source, (None, 3))
     expect_shape("target", target, (len(source), 3))
@@ -111,7 +114,7 @@ def _line(centred: Float64, weight: Float64) -> Failed | None:
 
 
 def design_rows(turned: Float64) -> Float64:
-    """Compute Jacobians (N, 3, 6) of points (N, 3), about their centre, by a small turn and a shift."""
+    """Compute Jacobians (N, 3, 6) of points (N, 3), given about their centre, by a small turn and a shift."""
     return np.concatenate([-skew(turned), np.broadcast_to(np.eye(3), (len(turned), 3, 3))], axis=2)
 
 
@@ -131,8 +134,8 @@ def _divided(values: Float64, spread: Float64) -> Float64:
 
 
 def _refined(source: Float64, target: Float64, pose: Pose, spread: Float64) -> Pose:
-    """Refine a pose by least squares under the points' covariance S: it makes r^T S^-1 r least, r being the
-    residuals [Aitken 1936]. A step that makes it more, as a mistaken point may ask for, isn't taken.
+    """Refine a pose by least squares with the points' covariance S: it minimises r^T S^-1 r, where r are the
+    residuals [Aitken 1936]. A step that increases it, as a wrong point may cause, isn't taken.
     """
     off = target - pose.apply(source)
     for _ in range(ROUNDS):
@@ -154,7 +157,8 @@ def _refined(source: Float64, target: Float64, pose: Pose, spread: Float64) -> P
 
 
 def _covariance(turned: Float64, spread: Float64) -> Float64:
-    """Compute (J^T S^-1 J)^-1 (6, 6) of least squares under a covariance S, (N, 3, 3) or (N, N).
+    """Compute the covariance (J^T S^-1 J)^-1 (6, 6) of least squares with a covariance S, (N, 3, 3) or (N,
+    N).
 
     turned: (N, 3) points from the source's origin, target axes.
     """
@@ -162,7 +166,7 @@ def _covariance(turned: Float64, spread: Float64) -> Float64:
     design = design_rows(turned - centre)
     bread = np.linalg.inv(np.einsum("nki,nkj->ij", design, _divided(design, spread)))
     move = np.eye(6)
-    # A turn about the points' centre carries the source's origin along.
+    # A turn about the points' centre also moves the source's origin.
     move[3:, :3] = skew(centre)
     covariance: Float64 = move @ bread @ move.T
     return covariance

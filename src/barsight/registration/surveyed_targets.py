@@ -1,4 +1,4 @@
-"""Read surveyed targets: their places in the yard, and where the rig saw them or which tag they carry."""
+"""Read surveyed targets: their positions in the yard, and where the rig saw them or which tag they carry."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from barsight.core.reading.bounded_reading import MAX_ENTRIES, in_range, read_li
 YARD = ("yard_x", "yard_y", "yard_z")
 PLACE = ("x", "y", "z")
 TAGS = 587
-"""Tags of the family 36h11."""
+"""Number of tags in the family 36h11."""
 
 
 @dataclass(frozen=True, eq=False)
 class Targets:
     """names (N,); yard_m, measured_m (N, 3); sigma_m (N,) of each coordinate's difference, NaN where not
-    said; checks (N,): set apart.
+    given; checks (N,): whether a target is only a check.
     """
 
     names: tuple[str, ...]
@@ -38,8 +38,8 @@ class Targets:
 @dataclass(frozen=True, eq=False)
 class SurveyedTags:
     """numbers (N,) of AprilTags 36h11, or of coded circles where `are_rings`; yard_m (N, 3) of their middles;
-    sigma_m (N,) of each coordinate, NaN where not said; checks (N,): set apart. width_m (N,) of columns that
-    are meant by the middle of their tops, NaN of other targets.
+    sigma_m (N,) of each coordinate, NaN where not given; checks (N,): whether a target is only a check.
+    width_m (N,) of columns, whose position is the middle of their tops; NaN for other targets.
     """
 
     numbers: Int64
@@ -83,9 +83,9 @@ def read_tags(path: Path) -> SurveyedTags:
 
 def read_places(path: Path, text: str | None = None) -> tuple[tuple[str, ...], SurveyedTags]:
     """Read a CSV with a header, m: `name,yard_x,yard_y,yard_z`, optionally `sigma_m`, `check` (1 or 0) and,
-    of columns, `width_m`. Returns the names, and targets numbered in their order.
+    for columns, `width_m`. Returns the names, and targets numbered in their order.
 
-    text: its content where it is no file yet. Raises `InputError` naming the line.
+    text: the content, where it isn't in a file yet. Raises `InputError` naming the line.
     """
     names, table = _read_table(path, "name", YARD, text)
     _expect_once(path, "target", names)
@@ -94,8 +94,8 @@ def read_places(path: Path, text: str | None = None) -> tuple[tuple[str, ...], S
 
 
 def read_picks(path: Path, names: tuple[str, ...]) -> dict[int, dict[int, Float64]]:
-    """Read a CSV with a header: `name,stamp_ns,u,v`, where a target lies in cam0's picture of that stamp, px.
-    Returns pixels (2,) by stamp and the name's number among `names`.
+    """Read a CSV with a header: `name,stamp_ns,u,v`, the position of a target in cam0's picture of that
+    stamp, px. Returns pixels (2,) by stamp and the name's index in `names`.
 
     Raises `InputError` naming the line.
     """
@@ -139,7 +139,7 @@ def _read_table(
     path: Path, key: str, columns: tuple[str, ...], text: str | None = None
 ) -> tuple[tuple[str, ...], Float64]:
     """Read the texts (N,) of `key`, and the numbers (N, columns + 3): `columns`, sigma_m (NaN where not
-    said), check, width_m (NaN where not said).
+    given), check, width_m (NaN where not given).
     """
     remedy = f"give {','.join((key, *columns))} and, if wanted, sigma_m and check"
     first, *others = read_lines(path, MAX_ENTRIES, remedy) if text is None else text.strip().split("\n")

@@ -20,25 +20,29 @@ from barsight.registration.rigid import Alignment, align_rigid
 
 MIN_PAIRS = 2
 MAX_ROWS_PX = 2.0
-"""Corners of one tag that lie further from each other's row are two tags, or the rig is out of order."""
+"""Maximum difference between the rows of a tag's corners in the two pictures: beyond it they are two tags, or
+the rig is misaligned.
+"""
 MIN_SIGMA_PX = 0.03
-"""No middle of a tag is taken to be known better than this in one picture."""
+"""Lower bound of the noise of a tag's middle in one picture."""
 MAX_CHI2 = 16.3
-"""Three coordinates stray further in one of a thousand cases."""
+"""Maximum chi2 of a pair's three coordinates, exceeded by one in a thousand."""
 MEDIAN_CHI2 = 2.37
 MAX_APART_M = 0.1
-"""Two pairs or more that place a tag further off than this saw another one."""
+"""Maximum distance of a pair's position from the tag's; if two or more pairs exceed it, they saw another
+tag.
+"""
 OTHER_FAMILIES = ("25h9", "36h10", "16h5")
 MIRRORED_RATIO = 0.2
-"""Mirrored places that fit with less than this share of the misfit are the right ones."""
+"""Ratio of misfits below which the mirrored positions are the right ones."""
 
 
 @dataclass(frozen=True, eq=False)
 class TagSighting:
-    """One tag in one pair. stamp_ns: of the pair; body_m: (3,) its middle in the body. place_m: (3,) that in
-    the trajectory's frame. noise_m2: (3, 3) of it by one pixel of noise in either picture; pose_m2: (3, 3) by
-    the pose. rows_px: how far its rows differ between the pictures; side_px: its shortest side; camera_m:
-    (3,) where the left camera was.
+    """One tag in one pair. stamp_ns: of the pair; body_m: (3,) the tag's middle in the body. place_m: (3,)
+    the same in the trajectory's frame. noise_m2: (3, 3) its covariance for one pixel of noise in either
+    picture; pose_m2: (3, 3) that due to the pose. rows_px: difference of its rows between the pictures;
+    side_px: its shortest side; camera_m: (3,) the left camera's position.
     """
 
     stamp_ns: int
@@ -53,8 +57,9 @@ class TagSighting:
 
 @dataclass(frozen=True, eq=False)
 class PlacedTag:
-    """One tag from all its pairs. place_m: (3,), covariance_m2: (3, 3), the poses' share in it. pairs: that
-    count; left_out: that don't agree. side_px: median. camera_m: (3,) one place that it was seen from.
+    """One tag from all its pairs. place_m: (3,), covariance_m2: (3, 3), including the poses' share. pairs:
+    number used; left_out: number that don't agree. side_px: median. camera_m: (3,) one position it was seen
+    from.
     """
 
     number: int
@@ -68,9 +73,9 @@ class PlacedTag:
 
 @dataclass(eq=False)
 class SeenTags:
-    """Sightings by tag number, pictures that show a tag twice, by its number, and pairs looked at. names: of
-    targets that bear no number; known_px: noise of a middle in one picture where rows don't tell it.
-    are_rings: they are coded circles.
+    """Sightings by tag number, numbers of pictures that show a tag twice, by tag number, and number of pairs
+    searched. names: of targets that have no number; known_px: noise of a middle in one picture where rows
+    don't show it. are_rings: whether they are coded circles.
     """
 
     sightings: dict[int, list[TagSighting]] = field(default_factory=dict)
@@ -87,14 +92,14 @@ class SeenTags:
 
     @property
     def sigma_px(self) -> float:
-        """Estimate the noise of a middle in one picture, by how rows differ between the pictures."""
+        """Estimate the noise of a middle in one picture from the row differences between the pictures."""
         if self.known_px is not None:
             return self.known_px
         rows = [abs(one.rows_px) for seen in self.sightings.values() for one in seen]
         return max(MIN_SIGMA_PX, 1.4826 * float(np.median(rows)) / 2**0.5) if rows else MIN_SIGMA_PX
 
     def moved(self, posed: dict[int, PosedFrame]) -> SeenTags:
-        """Place the sightings by other poses of the same pairs; those without one are left out."""
+        """Place the sightings by other poses of the same pairs; those without a pose are left out."""
         return SeenTags(
             {
                 number: [
@@ -138,7 +143,7 @@ def see_tags(
 
 
 def other_family(frames: Iterable[StereoFrame | RefusedFrame]) -> str | None:
-    """Find another family of tags, of which two left pictures or more show the same one."""
+    """Find another family of tags, of which at least two left pictures show the same tag."""
     shown = Counter(
         (family, number)
         for frame in frames
@@ -150,7 +155,9 @@ def other_family(frames: Iterable[StereoFrame | RefusedFrame]) -> str | None:
 
 
 def _corners(image: UInt8, twice: Counter[int], are_rings: bool) -> dict[int, Float64]:
-    """Find the fitted corners (4, 2) of the tags that a picture shows once; count the others."""
+    """Find the fitted corners (4, 2) of the tags that a picture shows once; count those it shows
+    repeatedly.
+    """
     numbers, quads = find_rings(image) if are_rings else find_tags(image)
     repeated = {int(n) for n, times in Counter(numbers.tolist()).items() if times > 1}
     twice.update(repeated)
@@ -165,7 +172,9 @@ def _corners(image: UInt8, twice: Counter[int], are_rings: bool) -> dict[int, Fl
 def _triangulated(
     left: Float64, right: Float64, rectifier: Rectifier, frame: PosedFrame
 ) -> TagSighting | None:
-    """Triangulate the middle of a tag from its raw corners (4, 2); None where they aren't of one tag."""
+    """Triangulate the middle of a tag from its raw corners (4, 2); None where they don't belong to one
+    tag.
+    """
     camera, (flat_left, flat_right) = rectifier.camera, rectifier.places(left, right)
     first, second = _middle(flat_left), _middle(flat_right)
     disparity = first[0] - second[0] + camera.doffs_px
@@ -179,7 +188,7 @@ def _triangulated(
 def sighting_at(
     seen_m: Float64, noise: Float64, row_px: float, side_px: float, rectifier: Rectifier, frame: PosedFrame
 ) -> TagSighting:
-    """Carry a point (3,) of `rect0` and its covariance (3, 3) into the body and the trajectory's frame."""
+    """Transform a point (3,) of `rect0` and its covariance (3, 3) to the body and the trajectory's frame."""
     body = frame.reference_from_body
     at = rectifier.body_from_rect0.apply(seen_m[None])[0]
     turn = body.rotation @ rectifier.body_from_rect0.rotation
@@ -192,7 +201,7 @@ def sighting_at(
 
 
 def _middle(corners: Float64) -> Float64:
-    """Intersect the diagonals of corners (4, 2): the picture of the square's middle, whatever its tilt."""
+    """Intersect the diagonals of corners (4, 2): the projection of the square's middle, whatever its tilt."""
     along, across = corners[2] - corners[0], corners[3] - corners[1]
     share = np.linalg.solve(np.column_stack([along, -across]), corners[1] - corners[0])[0]
     middle: Float64 = corners[0] + share * along
@@ -202,7 +211,7 @@ def _middle(corners: Float64) -> Float64:
 def _point(
     first: Float64, second: Float64, disparity: float, camera: RectifiedCamera
 ) -> tuple[Float64, Float64]:
-    """Triangulate a point (3,) in `rect0`, and its covariance (3, 3) by a pixel of noise in each picture."""
+    """Triangulate a point (3,) in `rect0`, and its covariance (3, 3) for a pixel of noise in each picture."""
     depth = camera.focal_px * camera.baseline_m / disparity
     ray = np.array([
         (first[0] - camera.cx_px) / camera.focal_px,
@@ -216,8 +225,8 @@ def _point(
 
 
 def _combined(number: int, name: str, seen: list[TagSighting], sigma_px: float) -> PlacedTag | Failed:
-    """Combine a tag's pairs, without those that stray; the poses' share stays whole, since neighbours err
-    alike.
+    """Combine a tag's pairs without outliers. The poses' share of the variance isn't averaged down, since the
+    errors of neighbouring poses are common.
     """
     places = np.stack([one.place_m for one in seen])
     noise = sigma_px**2 * np.stack([one.noise_m2 for one in seen])
@@ -245,7 +254,7 @@ def _combined(number: int, name: str, seen: list[TagSighting], sigma_px: float) 
 
 
 def turned_covariance(tags: tuple[PlacedTag, ...], yard_m: Float64, sigma_m: Float64) -> Float64:
-    """Turn the tags' covariances into yard axes and add the survey's sigma (N,); (N, 3, 3)."""
+    """Rotate the tags' covariances into yard axes and add the survey's variance, of sigma (N,); (N, 3, 3)."""
     spread = np.stack([one.covariance_m2 for one in tags])
     found = align_rigid(np.stack([one.place_m for one in tags]), yard_m, ("yard", "seen"))
     turn = np.eye(3) if isinstance(found, Failed) else found.target_from_source.rotation
@@ -254,8 +263,8 @@ def turned_covariance(tags: tuple[PlacedTag, ...], yard_m: Float64, sigma_m: Flo
 
 
 def is_mirrored(tags: tuple[PlacedTag, ...], yard_m: Float64, found: Alignment) -> bool:
-    """Check whether the surveyed places (N, 3) are a mirror image: they fit far better mirrored or, in one
-    plane, put the cameras under the tags.
+    """Check whether the surveyed positions (N, 3) are a mirror image: they fit far better mirrored, or they
+    put the cameras under the tags.
     """
     pose, places = found.target_from_source, np.stack([one.place_m for one in tags])
     cameras = np.stack([one.camera_m for one in tags])

@@ -1,4 +1,4 @@
-"""Register the world, or the rig, in the yard and judge it by targets set apart."""
+"""Register the world, or the rig, in the yard, and judge the result by targets kept as checks."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ from barsight.core.errors import Failed
 from barsight.registration.rigid import Alignment, align_rigid, design_rows
 
 DOUBTFUL = 0.001
-"""Residuals rarer than this under the stated sigmas: those are too small, or a point is wrong."""
+"""Probability of the residuals under the stated sigmas below which these are too small, or a point is
+wrong.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class YardCalibration:
-    """alignment: yard_from_<frame>, its covariance grown by `inflation` where the residuals ask for it.
+    """alignment: yard_from_<frame>, its covariance scaled by `inflation` where the residuals require it.
 
-    names: (N,) of the points; yard_m: (N, 3) where they lie; checks: (N,) those that took no part.
-    off_m: (N, 3) yard minus moved point; sigma_m: (N,) what its length should be, one standard deviation per
-    coordinate. doubts: sentences.
+    names: (N,) of the points; yard_m: (N, 3) their positions; checks: (N,) those that took no part. off_m:
+    (N, 3) yard minus moved point; sigma_m: (N,) expected RMS of its coordinates (1 sigma). doubts: sentences.
     """
 
     alignment: Alignment
@@ -35,12 +36,12 @@ class YardCalibration:
 
     @property
     def turn_sigma_deg(self) -> float:
-        """Return the worst axis' standard deviation."""
+        """Return the standard deviation of the frame's rotation about its worst axis, degrees."""
         return float(np.degrees(np.sqrt(np.linalg.eigvalsh(self.alignment.covariance[:3, :3])[-1])))
 
     @property
     def place_sigma_m(self) -> float:
-        """Return the sigma of the frame's origin in the yard, worst axis."""
+        """Return the standard deviation of the frame's origin in the yard along its worst axis."""
         return float(np.sqrt(np.linalg.eigvalsh(self.alignment.covariance[3:, 3:])[-1]))
 
 
@@ -50,8 +51,8 @@ def calibrate_yard(
 ) -> YardCalibration | Failed:  # fmt: skip
     """Estimate `yard_from_<frame>` from points measured in `frame` (N, 3) and known in the yard (N, 3), m.
 
-    covariance_m2: as `align_rigid` takes it, yard axes; None takes one sigma from the residuals.
-    checks: (N,) points that are only compared. Failed `few-points`, `collinear`.
+    covariance_m2: as in `align_rigid`, yard axes; None estimates one sigma from the residuals. checks: (N,)
+    points that are only compared. Failed `few-points`, `collinear`.
     """
     used = ~checks
     covariance = covariance_m2
@@ -91,10 +92,11 @@ def calibrate_yard(
 
 
 def predicted_sigma(design: Float64, covariance: Float64, own_m2: Float64, checks: Bool) -> Float64:
-    """Predict the RMS (N,) over the axes of a point's own noise and, for checks, of where the fit puts it.
+    """Predict the RMS (N,) over the axes of a point's own noise and, for checks, also of the fit's error
+    there.
 
-    design (N, 3, P): how points answer to what was fitted, covariance (P, P) of that. own_m2: variance (N,)
-    of a coordinate, or covariance (N, N) of the points or (N, 3, 3) of the axes.
+    design (N, 3, P): derivatives of the points by the fitted unknowns, covariance (P, P) of these. own_m2:
+    variance (N,) of a coordinate, or covariance (N, N) of the points or (N, 3, 3) of the axes.
     """
     if own_m2.ndim == 2:
         own_m2 = np.diag(own_m2)

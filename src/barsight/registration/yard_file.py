@@ -1,4 +1,6 @@
-"""Read and write `yard.yaml`: where a frame lies in the yard, how surely, and of which rig and crane."""
+"""Read and write `yard.yaml`: a frame's pose in the yard, its covariance, and the rig and crane it holds
+for.
+"""
 
 from __future__ import annotations
 
@@ -20,20 +22,20 @@ from barsight.registration.yard import YardCalibration
 FRAMES = ("world", "encoders", "body")
 REMEDY = "take the file that barsight calibrate yard wrote"
 MAX_BENDS = (0.2, 0.02, 0.2)
-"""No crane in use bends more."""
+"""Maximum absolute value of each bend; no crane in use bends more."""
 MIN_SPAN_M, MAX_SPAN_M = 1.0, 1000.0
 OWNERS = ("calibration_id", "mounting_id", "recording_id")
 
 
 @dataclass(frozen=True, eq=False)
 class YardFrame:
-    """yard_from: the yard from one of `FRAMES`; covariance (6, 6) as `Alignment` has it.
+    """yard_from: the yard from one of `FRAMES`; covariance (6, 6) as in `Alignment`.
 
-    yard_from_body: (3, 3) how the rig hangs, where crane moves told it. calibration_id: of the rig,
-    mounting_id: of how the encoders say that it hangs, recording_id: of the inputs in whose frame the points
-    were measured; None where the file doesn't say. doubts: of the calibration. digest: SHA-256 of the file.
-    bend: how the crane bends, which no encoder sees; None where it is taken to be stiff. targets_m: (N, 3) in
-    the yard, which the frame was found by; None where the file doesn't say.
+    yard_from_body: (3, 3) the rig's attitude, where crane moves showed it. calibration_id: of the rig,
+    mounting_id: of its attitude according to the encoders, recording_id: of the inputs in whose frame the
+    points were measured; None where the file doesn't say. doubts: of the calibration. digest: SHA-256 of the
+    file. bend: the crane's bending, which no encoder measures; None where it is taken as stiff. targets_m:
+    (N, 3) in the yard, from which the frame was found; None where the file doesn't say.
     """
 
     path: Path
@@ -50,7 +52,7 @@ class YardFrame:
 
     @property
     def attitude(self) -> Float64 | None:
-        """Return how the rig hangs (3, 3), yard from body, where the file tells it."""
+        """Return the rig's attitude (3, 3), yard from body, where the file contains it."""
         return self.yard_from.rotation if self.yard_from.source == "body" else self.yard_from_body
 
 
@@ -87,7 +89,7 @@ def write_yard_file(
 
 
 def read_yard_file(path: Path) -> YardFrame:
-    """Read a yard file. Raises CalibrationError naming the file and what can't be."""
+    """Read a yard file. Raises CalibrationError naming the file and the invalid value."""
     document = read_document(path)
     if document.values.get("barsight_yard") != 1:
         raise CalibrationError(path, "is no yard file (barsight_yard: 1 is missing)", REMEDY)
