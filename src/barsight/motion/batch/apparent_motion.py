@@ -34,7 +34,7 @@ from barsight.motion.problem.problem import Pieces, Problem
 
 LENGTH_RATIO = 0.2
 HEIGHT_RATIO = 0.07
-"""Length of a piece along the travel and its height, both as ratios to the points' median range."""
+"""Length of a piece along the path and its height, both as ratios to the points' median range."""
 FIRST_SIGMA_RAD = 2e-4
 MIN_SIGMA_RAD = 5e-6
 FIRST_SIGMA_PX = 0.005
@@ -51,7 +51,7 @@ STEPS = 2
 
 
 def partition_points(problem: Problem, state: GraphState, used: Bool) -> Pieces | None:
-    """Partition the points into strips across the travel and by height. None without encoders, where there
+    """Partition the points into strips across the path and by height. None without encoders, where there
     are too few strips, or where fewer points than strips are seen often enough to tell how far they slide.
     """
     seen = problem.sightings

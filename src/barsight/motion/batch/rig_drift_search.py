@@ -1,6 +1,6 @@
 """Search for the rig's drift from the present estimate, weighed against its prior at every step.
 
-Over a short travel yaw and scale look alike: the sightings alone would follow a valley far from the truth,
+Over a short path yaw and scale look alike: the sightings alone would follow a valley far from the truth,
 to where the linearisation no longer holds. So each step goes to the optimum of sightings and prior together.
 """
 

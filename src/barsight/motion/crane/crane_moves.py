@@ -73,7 +73,7 @@ def error_correlation(measured: Float64, found: YardCalibration, time_s: Float64
     Each position has an independent error and one whose correlation fades with time, as odometry drifts. Both
     sizes and the fading time are those under which the residuals are likely once the fit has taken up its six
     unknowns [restricted likelihood: Patterson and Thompson 1971]. All candidates are averaged by their
-    likelihood, since a short travel hardly tells a slow drift from an error of the alignment.
+    likelihood, since a short path hardly tells a slow drift from an error of the alignment.
     """
     design = design_rows((measured - measured.mean(axis=0)) @ found.alignment.target_from_source.rotation.T)
     free = measured.size - 6

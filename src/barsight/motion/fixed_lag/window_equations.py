@@ -229,7 +229,7 @@ def marginal_prior(left: DenseEquations, step: Float64, count: int) -> tuple[Flo
 def propagate_slide(
     matrix: Float64, gradient: Float64, slide: float, way_m: float
 ) -> tuple[Float64, Float64]:
-    """Propagate the slide in a prior's matrix and gradient over a travel: a share of it persists, the rest is
+    """Propagate the slide in a prior's matrix and gradient over a path: a share of it persists, the rest is
     drawn anew [Uhlenbeck and Ornstein 1930].
     """
     keeps = float(np.exp(-max(way_m, MIN_WAY_M) / SLIDE_WAY_M))

@@ -1,7 +1,7 @@
 """Stitch as the paper does, for comparison: each frame is tied to the previous one by the SVD of matched
 points.
 
-Its errors accumulate along the travel, and its homography discards whatever lies off the dominant plane; our
+Its errors accumulate along the path, and its homography discards whatever lies off the dominant plane; our
 own estimate does neither.
 """
 

@@ -23,7 +23,7 @@ from barsight.recording.base import Recording
 class StereoOdometry(TrajectoryEstimator):
     """Estimates any stereo recording; the reference is `world` with its origin at the first body.
 
-    Errors accumulate along the travel, and so does the covariance.
+    Errors accumulate along the path, and so does the covariance.
     """
 
     settings: OdometrySettings

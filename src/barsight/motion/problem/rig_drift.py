@@ -1,6 +1,6 @@
 """Estimate the rig's drift in the batch: a yaw between the cameras and a scale.
 
-A point seen from several positions of a known travel has a depth without stereo. The disparity that this
+A point seen from several positions on a known path has a depth without stereo. The disparity that this
 depth implies, compared with the measured one, shows the yaw (px nearly the same everywhere) and the scale (px
 proportional to the disparity).
 """
