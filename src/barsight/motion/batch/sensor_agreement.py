@@ -33,8 +33,8 @@ MIN_WAY_M = 0.1
 MAX_WAY_RATIO, MAX_ANGLE_DEG = 1.15, 5.0
 """Maximum ratio between the encoders' and the pictures' travel, and maximum angle between the two."""
 TURNS_SIGMAS, MAX_TURN_RATIO, MIN_ALIKE = 4.0, 5.0, 0.7
-"""Turn, in sigma, from which a turn counts as seen; maximum ratio between the gyro's and the pictures' turns;
-minimum cosine between them.
+"""Minimum size of a turn, in sigma, for it to be seen; maximum ratio between the gyro's and the pictures'
+turns; minimum cosine between them.
 """
 MAX_IMU_LATE_S, MAX_CRANE_LATE_S = 0.05, 0.2
 """Maximum offset of each sensor's stamps, s; the encoders' may be larger, since their latency is

@@ -24,8 +24,9 @@ SIGMA_PX = 0.3
 MAX_OFF_ROW_PX = 2.0
 MIN_POINTS = 12
 MAX_FRAMES = 20
-"""Maximum length of a track; after that the point takes a new name, since the estimate's work grows with the
-square of the longest track. Points change their names in turn, so neighbouring frames share most of them.
+"""Maximum number of frames in a track; after that the point takes a new name, since the estimate's work grows
+with the square of the longest track. Points change their names in turn, so neighbouring frames share most of
+them.
 """
 
 

@@ -97,7 +97,7 @@ def sighting_residuals(problem: Problem, state: GraphState, used: Bool) -> Float
 
 @dataclass(frozen=True, eq=False)
 class _PoseIterate:
-    """State with its cost and its system, which is made on use and released with it: never are two held."""
+    """State with its cost and its system, made on first use and released with it: two are never held."""
 
     problem: Problem
     graph: Any
