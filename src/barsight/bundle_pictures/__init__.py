@@ -1,1 +1,3 @@
-"""Pictures tell of bundles what the map's cells blur: the bars' pitch, and where straps end."""
+"""Measure in the pictures what the map's cells blur: the pitch of a bundle's bars and the ends of its
+straps.
+"""

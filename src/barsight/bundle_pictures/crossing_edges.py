@@ -1,7 +1,7 @@
-"""Find what lies across bundles in the pictures: its straight edges run on over a flank.
+"""Find what lies across a bundle by its straight edges in the pictures, which continue over a flank.
 
 A strap ends at the flanks, and the bundle hides dunnage under it. Edges are found as line segments [Grompone
-von Gioi 2010, LSD], dark or bright; those in line with each other may be broken by gaps.
+von Gioi 2010, LSD], dark or bright; segments in line with each other may be separated by gaps.
 """
 
 from __future__ import annotations
@@ -24,24 +24,30 @@ from barsight.core.arrays import Bool, Float64, UInt8
 from barsight.yard.types import Bundle, Doubt, DoubtKind
 
 _STEP_M, _BESIDE_M = 0.005, 0.15
-"""Way between two places along and across; reach beside the flanks."""
+"""Spacing of the samples along and across the bundle, and how far the window reaches beyond the flanks."""
 _DENSITY = 0.5
-"""Least share of a segment's rectangle that its points fill."""
+"""Minimum share of a segment's rectangle that its points fill (LSD's density threshold)."""
 _DARK_LOG, _LOG_RANGE = 2.0, 3.6
-"""Least logarithm of gray levels, and their range: 8 to 255, with DARKEST added."""
+"""Lowest logarithm of the gray levels, and their range: levels 8 to 255, with DARKEST added."""
 _MAX_SLOPE, _MIN_ACROSS_M, _MIN_FIRST_M = 0.6, 0.03, 0.06
-"""Of a segment, from square to the axis; its least extent across, and that of the first one of an edge."""
+"""Maximum slope of a segment against the direction across the axis; minimum extent across of any segment, and
+of the first segment of an edge.
+"""
 _SAME_SLOPE, _SAME_M = 0.06, 0.008
-"""Segments this much alike, and this near to one's line, are in line with it."""
+"""Maximum difference in slope, and maximum distance from a segment's line, of segments in line with it."""
 _BESIDE_FREE_M, _BELOW_FREE_M = 0.8, 0.3
-"""Reach of what may lie on a bundle towards a free one, and how far its top may be below that one's."""
+"""Distance from a free bundle, and depth of a top below that bundle's top, within which a thing on another
+bundle may reach the free one.
+"""
 _REACH_M, _MIN_COVERED_RATIO, _MAX_GAP_M = 0.1, 0.6, 0.06
-"""An edge runs over a flank where it shows on this share of so much to either side, without a longer gap."""
+"""An edge runs over a flank if it shows on at least this share of the reach to either side of the flank,
+without a longer gap.
+"""
 
 
 class _Segments(NamedTuple):
-    """Line segments (S,): from and to beside the axis and their middles, m; the middles along, m from the
-    bundle's middle; slopes; which side is the darker one, 1 or -1.
+    """Line segments (S,): start and end beside the axis, and their middles, m; the middles along the axis, m
+    from the bundle's middle; slopes; the side that is darker, 1 or -1.
     """
 
     low: Float64
@@ -52,13 +58,13 @@ class _Segments(NamedTuple):
     side: Float64
 
     def chosen(self, those: Bool) -> _Segments:
-        """Return some of them."""
+        """Return the selected segments."""
         return _Segments(*(part[those] for part in self))
 
 
 class _FreeBundles(NamedTuple):
-    """Bundles (F,) that lie free: middles (F, 2) and tops (F,), m; level axes (F, 2, 2), along and across;
-    half their lengths and widths (F, 2).
+    """Free bundles (F,): middles (F, 2) and tops (F,), m; horizontal axes (F, 2, 2), along and across; half
+    their lengths and widths (F, 2).
     """
 
     middle_m: Float64
@@ -77,8 +83,10 @@ class _FreeBundles(NamedTuple):
         )
 
     def reached_from(self, bundle: Bundle) -> bool:
-        """Check whether what lies on a bundle, one of these or another, may reach over one or beside it, by
-        the rectangle about the bundle along that one's axes, and by its height.
+        """Check whether something on a bundle may reach over or beside a free one.
+
+        The bundle may itself be one of the free ones. Compared are the heights, and the rectangle around the
+        bundle along the free bundle's axes.
         """
         half = np.array([bundle.length_m, bundle.width_m]) / 2
         near = np.abs(self.axes @ _level_axes(bundle).T) @ half + self.half_m + _BESIDE_FREE_M
@@ -88,15 +96,16 @@ class _FreeBundles(NamedTuple):
 
 
 def _level_axes(bundle: Bundle) -> Float64:
-    """Stack the level axes (2, 2), along and across."""
+    """Stack a bundle's horizontal axes (2, 2), along and across."""
     return np.array([axis[:2] for axis in bundle_axes(bundle)])
 
 
 def edge_windows(
     frames: PlacedFrames, preferred: Collection[int], bundles: Sequence[Bundle]
 ) -> Iterator[tuple[int, BundleWindow]]:
-    """List windows along each free bundle and those beside one, level at their tops, with the frames nearest
-    over them, of those in `preferred` where one has it.
+    """List windows along each free bundle and its neighbours, at the height of their tops.
+
+    Each comes with the nearest frame over it, from `preferred` if one of these shows it.
     """
     placed = [(k, one) for k, one in enumerate(bundles) if one.on_top is not False and is_placed(one)]
     free = _FreeBundles.of([one for _, one in placed if one.is_free])
@@ -112,7 +121,9 @@ def edge_windows(
 
 
 def find_edge(gray: UInt8, window: BundleWindow, bundle: Bundle) -> float | None:
-    """Find an edge that runs over a flank: its place there, m along from the middle; None without one."""
+    """Find an edge that runs over a flank: its position along the axis, m from the middle; None without
+    one.
+    """
     along, _ = bundle_axes(bundle)
     segments = _find_segments(gray, float(window.rows_m[0] @ along / (along @ along)))
     for flank in (-bundle.width_m / 2, bundle.width_m / 2):
@@ -128,7 +139,7 @@ def find_edge(gray: UInt8, window: BundleWindow, bundle: Bundle) -> float | None
 
 
 def _find_segments(gray: UInt8, first_m: float) -> _Segments:
-    """Find line segments across the bars; first_m: of the first row along."""
+    """Find line segments across the bars. first_m: position along the axis of the first row."""
     level = (np.log(gray + DARKEST) - _DARK_LOG) * (255 / _LOG_RANGE)
     detector = cv2.createLineSegmentDetector(scale=1.0, density_th=_DENSITY)
     found = detector.detect(np.clip(level, 0, 255).astype(np.uint8))[0]
@@ -145,7 +156,7 @@ def _find_segments(gray: UInt8, first_m: float) -> _Segments:
 
 
 def _is_covered(low: Float64, high: Float64, first: float, last: float) -> bool:
-    """Check whether spans (N,) cover enough of a way, without too long a gap."""
+    """Check whether spans (N,) cover enough of an interval without a gap that is too long."""
     covered, gap, at = 0.0, 0.0, first
     for k in np.argsort(low, kind="stable").tolist():
         gap = max(gap, low[k] - at)
@@ -155,7 +166,7 @@ def _is_covered(low: Float64, high: Float64, first: float, last: float) -> bool:
 
 
 def with_edge(bundle: Bundle, along_m: float) -> Bundle:
-    """Return a bundle that says that an edge runs across it."""
+    """Return the bundle with the doubt that an edge runs across it."""
     doubt = Doubt(
         DoubtKind.CROSSING_EDGE,
         f"{DoubtKind.CROSSING_EDGE.value} {along_m:+.2f} m from its middle: something may lie over it",

@@ -1,4 +1,4 @@
-"""Measure the diameters of bars that aren't counted by their pitch in the pictures."""
+"""Measure the diameter of bars that can't be counted by their pitch in the pictures."""
 
 from __future__ import annotations
 
@@ -17,29 +17,31 @@ from barsight.yard.types import Bundle
 
 _SHAPE_SIGMA, _, _ONE_BAR_SIGMA = DIAMETER_RATIOS
 _SHAPE_SHARE = 0.9
-"""Share of the diameters by the bars' shape in the map that are right within their sigma."""
+"""Share of the diameters found by the bars' shape in the map that are right within their sigma."""
 _MAX_SHAPE_SIGMA = 0.1
-"""Of a diameter: one that is said to be surer is told by the bars' shape."""
+"""Maximum sigma, per diameter, of a diameter that the bars' shape in the map determines."""
 _MIN_PLACES = 40
-"""A profile needs so many places."""
+"""Minimum number of samples in a profile."""
 _LOWER, _MAX_LOWER_RATIO = 0.05, 0.75
-"""Quantile of the lower bound, and the largest that it may be of the mean where the pitch alone tells: packs,
-finishes and light differ from those that were learnt from."""
+"""Quantile used as lower bound, and the bound's maximum ratio to the mean where only the pitch is known:
+packs, finishes and light differ from those of the training set.
+"""
 _FINER_RATIO = 0.5
-"""Ratio of the 95 % quantile to what is told as one bar under which it is many thin ones. Where the pitch is
-less fine, the bar is unsure: its gloss and scratches have one too."""
+"""What is detected as one bar is many thin ones if the 95 % quantile of the pitch is below this ratio of its
+diameter. Where the pitch is less fine, the single bar is unsure: its gloss and scratches have a pitch too.
+"""
 _MAX_MISFIT = 1.5
-"""No diameter explains a spectrum with a larger one: 1 % of drawn packs have it."""
+"""Maximum misfit of a spectrum to a diameter that explains it; 1 % of drawn packs exceed it."""
 _MIN_POWER_LOG = -6.0
-"""Logarithm of the highest power: drawn packs have -4.3 and more, noise on a smooth face -8.5."""
+"""Minimum logarithm of the highest power: drawn packs have -4.3 and more, noise on a smooth face -8.5."""
 
 
 def with_pitch(bundle: Bundle, profiles: Sequence[PitchProfile]) -> Bundle:
-    """Replace a diameter by the mean of its distribution given the pitch, and the bars' shape where they show
-    it. One sigma is what the 5 % quantile lies under the mean, over 1.645: lifts count with that quantile.
+    """Replace a diameter by the mean of its posterior, given the pitch and the bars' shape where it shows.
 
-    What is told as one bar keeps its diameter, unless the pitch is far finer. The same bundle where no
-    picture shows enough of it, its axis is too unsure, or no diameter explains what is seen.
+    One sigma is the distance from the mean to the 5 % quantile, over 1.645, because lifts use that quantile.
+    What was detected as one bar keeps its diameter unless the pitch is far finer. Returns the same bundle
+    where no picture shows enough of it, its axis is too uncertain, or no diameter explains the spectrum.
     """
     if not profiles or profiles[0].levels.size < _MIN_PLACES:
         return bundle
@@ -68,12 +70,12 @@ def _told(bundle: Bundle, diameter_m: float, sigma_m: float) -> Bundle:
 
 
 def _shows_shape(bundle: Bundle) -> bool:
-    """Check whether the bars' shape in the map tells their diameter."""
+    """Check whether the bars' shape in the map determines their diameter."""
     return 0 < bundle.sigma.bar_diameter_m <= _MAX_SHAPE_SIGMA * bundle.bar_diameter_m
 
 
 def _by_shape(bundle: Bundle) -> Float64:
-    """Compute the prior (D,) of the diameters by the bars' shape in the map; flat where it doesn't show."""
+    """Compute the prior (D,) of the diameters from the bars' shape in the map; flat where it doesn't show."""
     flat = np.full(DIAMETERS_M.size, 1 / DIAMETERS_M.size)
     if not _shows_shape(bundle):
         return flat

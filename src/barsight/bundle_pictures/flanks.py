@@ -1,4 +1,4 @@
-"""Place a bundle's flanks where its straps end in the pictures."""
+"""Locate a bundle's flanks by the ends of its straps in the pictures."""
 
 from __future__ import annotations
 
@@ -23,42 +23,51 @@ from barsight.yard.sections import part_about
 from barsight.yard.types import Bundle, Doubt, DoubtKind, YardMap
 
 _WEAK_RATIO, _STRONG = 0.5, 4
-"""Lines with less than this share of the fourth strongest's contrast are no straps."""
+"""Minimum contrast of a strap, relative to the fourth strongest line."""
 _SAME_M = 0.01
-"""Ends of straps this near to their median agree."""
+"""Maximum distance of a strap's end from the median at which it agrees with it."""
 _AGREE_RATIO = 0.5
-"""Share of the lines' ends of which more must agree."""
+"""Share of the lines' ends that must be exceeded by those that agree."""
 _FLANK_SIGMA_M, _MIDDLE_SIGMA_M = 0.008, 0.004
-"""Of a flank that straps tell, and at least a pixel; of the centre of mass, from the middle between the
-flanks."""
+"""Sigma of a flank located by straps (at least one pixel); sigma of the centre of mass, taken as the middle
+between the flanks.
+"""
 _PLANE_RATIO = 0.25
-"""Of the width: how well the height is known at which a bundle is widest."""
+"""Uncertainty of the height at which a bundle is widest, as a share of its width."""
 _CELL_M, _ROW_M, _TRIM_M = 0.01, 0.03, 0.1
-"""Places of a mean section across and along, and what is left out at either end."""
+"""Sample spacing of a mean section across and along the bundle, and the length left out at either end."""
 _CREST_RATIO, _BESIDE_M = 0.35, 0.02
-"""Of the width, to either side: where a bundle is highest; what a map smears of a gully."""
+"""Half width of the crest's search interval, as a share of the width; reach by which a map blurs a gully."""
 _INSIDE_M, _OUTSIDE_M, _RIM_M = 0.015, 0.02, 0.045
-"""Distances within and beyond a flank up to which the surface must end; reach of a gully's two sides."""
+"""Distances inside and outside a flank within which the surface must end; reach of a gully's two sides."""
 _DEEP_RATIO, _DEEP_M, _BEFORE = 0.6, 0.15, 3
-"""Depth under the crest, of the width and at least, that no pack's surface has; of so many places before a
-flank one must not lie so deep."""
+"""Minimum depth under the crest, as a share of the width and absolute, that no pack's own surface has; number
+of samples before a flank of which at least one must be less deep.
+"""
 _FALL_RATIO, _MIN_FALL_M, _FALL_BARS, _DENT_M = 0.15, 0.02, 0.5, 0.006
-"""Least depth of a gully that parts a bundle from the next, of the width, and in bars; least rise on either
-side of it."""
+"""Minimum depth of a gully between neighbouring bundles, as a share of the width, absolute, and in bars;
+minimum rise on either side of it.
+"""
 _PARTING_M, _PARTING_RATIO, _PARTING_BARS = 0.06, 0.3, 1.2
-"""A gully that is as deep, of the width and in bars, parts two bundles."""
+"""Minimum depth of a gully that divides the surface into two bundles: absolute, as a share of the width,
+in bars.
+"""
 _HIDDEN_M, _MIN_HIDDEN_M, _HIDDEN_BARS = 0.04, 0.02, 0.6
-"""So does one that is so wide where its ground isn't seen; a flank may be out of sight over the second, and
-over as many bars."""
+"""Minimum width of a gully with an unseen floor that divides it too; then the width over which a flank may be
+out of sight, absolute and in bars.
+"""
 _CONTRADICTED, _MAX_ASIDE_M = 4.0, 0.05
-"""Sigmas of the map's flanks, and way of the middle, from which straps that end elsewhere make the bundle
-unsure, no more."""
+"""Disagreement between straps and the map's flanks, in sigmas and as an offset of the middle, above which the
+bundle is only marked as uncertain.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class MeanSection:
-    """Mean heights (N,) across a bundle at places beside_m; NaN where half of the length isn't known, inf
-    beyond the map's border. width_m: of the bundle as the map tells it.
+    """Mean heights (N,) across a bundle at positions beside_m from its axis.
+
+    NaN where half of the length isn't known, inf beyond the map's border. width_m: the bundle's width by the
+    map.
     """
 
     beside_m: Float64
@@ -85,8 +94,10 @@ class MeanSection:
         return cls(beside, mean, bundle.width_m)
 
     def ends_at(self, flank_m: float, side: int, diameter_m: float) -> bool:
-        """Check whether the surface ends about a flank: it falls far, isn't seen, or rises again behind a
-        gully that is deeper or wider than one between the bundle's bars. side: -1 for the low flank, else 1.
+        """Check whether the surface ends at a flank. side: -1 for the lower flank position, else 1.
+
+        It ends where it falls far, isn't seen, or rises again behind a gully that is deeper or wider than one
+        between the bundle's own bars.
         """
         outwards = side * (self.beside_m - flank_m)
         order = np.argsort(outwards)
@@ -130,11 +141,11 @@ class MeanSection:
 def with_flanks(
     bundle: Bundle, straps: Sequence[StrapEnds], section: MeanSection, floor_m: float | None, tilt: float
 ) -> Bundle:
-    """Place a bundle's flanks where most of its straps end; the same bundle where they don't agree, the map's
-    section speaks against it, or something lies on the bundle or may lie over it.
+    """Move a bundle's flanks to where most of its straps end, and estimate its section again.
 
-    floor_m: height of the floor. tilt: way aside of the lines of sight over their height. The section is
-    estimated anew. Where straps end far off the flanks that the map told, the bundle is only made unsure.
+    floor_m: height of the floor. tilt: horizontal over vertical component of the lines of sight. Returns the
+    same bundle where the straps don't agree, the map's section contradicts them, or something lies or may lie
+    on the bundle. Straps that end far from the map's flanks only make the bundle uncertain.
     """
     flanks = _agreed_flanks(straps) if bundle.is_free else None
     if flanks is None:
@@ -167,7 +178,7 @@ def with_flanks(
 
 
 def _contradicted(bundle: Bundle, middle_m: float, width_m: float) -> Bundle:
-    """Make a bundle unsure whose straps end elsewhere than the map tells its flanks."""
+    """Mark a bundle as uncertain whose straps end elsewhere than the map's flanks."""
     own, wider = bundle.sigma, width_m - bundle.width_m
     said = (
         f"in the pictures its straps end {1e3 * abs(middle_m) + 1e3 * abs(wider) / 2:.0f} mm off its flanks"
@@ -181,7 +192,9 @@ def _contradicted(bundle: Bundle, middle_m: float, width_m: float) -> Bundle:
 
 
 class _Flank(NamedTuple):
-    """Place of a flank beside the axis with its sigma, and mean place along of the straps that tell it."""
+    """Position of a flank beside the axis with its sigma, and mean position along it of the straps behind
+    it.
+    """
 
     beside_m: float
     sigma_m: float
@@ -189,7 +202,7 @@ class _Flank(NamedTuple):
 
 
 def _agreed_flanks(straps: Sequence[StrapEnds]) -> tuple[_Flank, _Flank] | None:
-    """Find where most straps end on either side, of those that stand out; None where they don't agree."""
+    """Find where most of the clear straps end on either side; None where they don't agree."""
     contrasts = sorted((strap.contrast for strap in straps), reverse=True)
     if len(contrasts) < MIN_STRAPS:
         return None
@@ -202,7 +215,7 @@ def _agreed_flanks(straps: Sequence[StrapEnds]) -> tuple[_Flank, _Flank] | None:
 
 
 def _agreed(ends_m: Float64, along_m: Float64, pixel_m: float) -> _Flank | None:
-    """Compute the median of the ends (S,) that agree, of straps at along_m; None where they are too few."""
+    """Compute the median of the ends (S,) that agree, of straps at along_m; None where too few agree."""
     best = np.zeros(ends_m.size, bool)
     for end in ends_m[np.isfinite(ends_m)]:
         same = np.abs(ends_m - end) <= _SAME_M
@@ -216,7 +229,7 @@ def _agreed(ends_m: Float64, along_m: Float64, pixel_m: float) -> _Flank | None:
 
 
 def takes_another(bundle: Bundle, others: Sequence[Bundle]) -> bool:
-    """Check whether another bundle's middle lies within a bundle's flanks, at about its height."""
+    """Check whether another bundle's middle is between a bundle's flanks, at about its height."""
     centres = np.array([other.centre_m for other in others]).reshape(-1, 3) - bundle.centre_m
     along, across = bundle_axes(bundle)
     beside, beyond = centres @ across, centres[:, :2] @ along[:2]

@@ -1,5 +1,5 @@
-"""Measure what pictures show of bundles finer than the map: diameters by the pitch, flanks by the straps, and
-what lies across them by its edges.
+"""Measure bundles in the pictures where these are finer than the map: diameters by the pitch, flanks by the
+straps, things across by their edges.
 """
 
 from __future__ import annotations
@@ -22,9 +22,11 @@ from barsight.yard.types import Bundle, YardMap
 
 @dataclass(frozen=True, eq=False)
 class ShownBundles:
-    """Samples of bundles in pictures. profiles, straps: of each bundle whose bars and flanks are looked for;
-    tilts: how far aside the lines of sight to its straps lead, over their height. edges: m along from its
-    middle, by the number of the bundle that one runs across.
+    """Samples of bundles in pictures.
+
+    profiles, straps: of each bundle whose bars and flanks are searched. tilts: horizontal over vertical
+    component of the lines of sight to its straps. edges: position along the axis, m from the middle, by the
+    index of the bundle that an edge crosses.
     """
 
     profiles: list[list[PitchProfile]]
@@ -36,10 +38,10 @@ class ShownBundles:
 def measure_from_pictures(
     pairs: RectifiedPairs, poses: Mapping[int, Pose], heights: YardMap, bundles: Sequence[Bundle]
 ) -> tuple[Bundle, ...]:
-    """Measure the flanks and the bars' diameters of bundles whose bars aren't counted, see `with_flanks` and
-    `with_pitch`, and doubt free bundles across which an edge runs.
+    """Measure the flanks and bar diameters of bundles whose bars aren't counted, and doubt free bundles that
+    an edge crosses. See `with_flanks` and `with_pitch`.
 
-    poses: reference_from_body by stamp of the frames that may be looked at.
+    poses: reference_from_body by the stamp of each frame that may be used.
     """
     numbers = [k for k, bundle in enumerate(bundles) if bundle.bars is None]
     unsure = [bundles[k] for k in numbers]
@@ -62,8 +64,9 @@ def look_at_bundles(
     pairs: RectifiedPairs, poses: Mapping[int, Pose], heights: YardMap, unsure: Sequence[Bundle],
     crossed: Sequence[Bundle],
 ) -> ShownBundles:  # fmt: skip
-    """Sample profiles and straps of `unsure` bundles, and edges across those that may be `crossed`; poses as
-    for `measure_from_pictures`.
+    """Sample profiles and straps of `unsure` bundles, and edges on those that may be `crossed`.
+
+    poses: as for `measure_from_pictures`.
     """
     frames = PlacedFrames.of(pairs.rectifier, poses)
     windows = list(pitch_windows(frames, heights, unsure))

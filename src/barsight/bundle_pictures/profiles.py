@@ -1,4 +1,4 @@
-"""Sample the pictures' shades across a bundle, over short ways along it."""
+"""Sample the pictures' gray levels across a bundle, over short lengths of it."""
 
 from __future__ import annotations
 
@@ -22,17 +22,21 @@ from barsight.yard.sections import part_about
 from barsight.yard.types import Bundle, HeightMap, YardMap
 
 STEP_M = 0.0015
-"""Way between two places across a bundle: a fifth of a pixel."""
+"""Sample spacing across a bundle: a fifth of a pixel."""
 _ROW_M, WINDOW_M = 0.02, 0.3
-"""Way between two rows along a bundle, and length of the rows whose median is a profile: bars turn by less
-than a pixel over it."""
+"""Row spacing along a bundle, and length of the rows whose median is a profile. Bars turn by less than a
+pixel over that length.
+"""
 _MAX_WINDOWS = 5
-"""Windows along a bundle, each sampled in both pictures of one frame: the same bars lie all along it, so that
-sixteen in two frames tell no more."""
+"""Maximum number of windows along a bundle, each sampled in both pictures of one frame. The same bars lie
+along the whole bundle, so sixteen windows in two frames give no more information.
+"""
 _BESIDE_ENDS_M, _TRIM_M = 0.1, 0.01
 _SMOOTH_M = 0.015
 _AROUND_M = 0.4
-"""The map is read so far beside a bundle's flanks: what stands there may hide it."""
+"""Distance beyond a bundle's flanks up to which the map is read, since what stands there may hide the
+bundle.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +58,8 @@ class PitchProfile:
 def pitch_windows(
     frames: PlacedFrames, heights: YardMap, bundles: Sequence[Bundle]
 ) -> Iterator[tuple[int, BundleWindow]]:
-    """List windows along each bundle with the frames nearest over them; none where what stands higher may
-    hide one.
+    """List windows along each bundle with the nearest frames over them, leaving out those that something
+    higher may hide.
     """
     for number, bundle in enumerate(bundles):
         for part, window in _windows(number, bundle, heights):
@@ -65,7 +69,7 @@ def pitch_windows(
 
 
 def _windows(number: int, bundle: Bundle, heights: YardMap) -> Iterator[tuple[HeightMap, BundleWindow]]:
-    """Divide what is inside a bundle's ends and flanks into windows, at the heights of the map around."""
+    """Divide a bundle, inside its ends and flanks, into windows at the heights of the map around it."""
     half, reach = bundle.width_m / 2 - _TRIM_M, bundle.length_m / 2 - _BESIDE_ENDS_M
     if not (half > STEP_M and 2 * reach >= WINDOW_M and np.isfinite(bundle.centre_m).all()):
         return

@@ -1,4 +1,4 @@
-"""Sample the pictures over bundles, each window in both pictures of the frame nearest over it."""
+"""Sample the pictures over bundles: each window in both pictures of the nearest frame over it."""
 
 from __future__ import annotations
 
@@ -19,26 +19,30 @@ from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.yard.types import Bundle, HeightMap
 
 _OVER_M, _MAX_RISE_M, _HIDDEN_RATIO = 0.05, 1.0, 0.05
-"""A line of sight is followed up to so high, in such steps; the share of a line of places that may be
-hidden."""
+"""Step and maximum rise over which a line of sight is followed; share of a line's points that may be
+hidden.
+"""
 DARKEST = 8.0
-"""Gray levels that are added before their logarithm: noise of dark ones counts less."""
+"""Offset added to gray levels before their logarithm, so that noise in dark areas counts less."""
 _MAX_LENGTH_M = 3.0
-"""Length of a window along a bundle that one picture shows whole."""
+"""Maximum length of a window along a bundle, so that one picture shows all of it."""
 _TRIED = 10
-"""Frames, the nearest ones, that are tried for a window."""
+"""Number of nearest frames that are tried for a window."""
 
 
 def bundle_axes(bundle: Bundle) -> tuple[Float64, Float64]:
-    """Compute a bundle's way (3,) per level metre along it, and the level unit vector (3,) across."""
+    """Compute a bundle's direction (3,) per horizontal metre along it, and the horizontal unit vector (3,)
+    across.
+    """
     along = bundle.direction / np.linalg.norm(bundle.direction[:2])
     return along, np.array([along[1], -along[0], 0.0])
 
 
 @dataclass(frozen=True, eq=False)
 class BundleWindow:
-    """Lines across a bundle: places (N, 3) of the middle one and the others' ways from it (R, 3). number: the
-    bundle's place in its list.
+    """Lines across a bundle: points (N, 3) of the middle line, and the offsets (R, 3) of all lines from it.
+
+    number: index of the bundle in its list.
     """
 
     number: int
@@ -47,14 +51,15 @@ class BundleWindow:
 
     @property
     def corners_m(self) -> Float64:
-        """Return its corners (4, 3)."""
+        """Return the window's corners (4, 3)."""
         return (self.middle_m[[0, -1]] + self.rows_m[[0, -1], None]).reshape(4, 3)
 
 
 @dataclass(frozen=True, eq=False)
 class WindowPicture:
-    """Gray levels (R, N) of a window in one picture. pixel_m: size of its pixels there; is_sharp: whether the
-    picture is.
+    """Gray levels (R, N) of a window in one picture.
+
+    pixel_m: size of the picture's pixels on the window. is_sharp: whether the picture is sharp.
     """
 
     gray: UInt8
@@ -64,7 +69,7 @@ class WindowPicture:
 
 @dataclass(frozen=True, eq=False)
 class PlacedFrames:
-    """Frames by their stamps, with both cameras and the left one's place (K, 3) in the map."""
+    """Frames by their stamps, with both cameras and the left camera's position (K, 3) in the map."""
 
     stamps_ns: tuple[int, ...]
     cameras: tuple[tuple[PlacedCamera, PlacedCamera], ...]
@@ -82,8 +87,10 @@ class PlacedFrames:
         return cls(tuple(poses), cameras, eyes, (camera.width, camera.height))
 
     def nearest(self, window: BundleWindow, preferred: Collection[int] = ()) -> int | None:
-        """Find the number of the frame nearest over a window whose left picture has it whole, of those in
-        `preferred` where one has it; None where none has.
+        """Find the index of the nearest frame whose left picture shows the whole window; None if there is
+        none.
+
+        Frames in `preferred` come first.
         """
         away = np.hypot(*(self.eyes_m - window.middle_m[len(window.middle_m) // 2])[:, :2].T)
         numbers = np.argsort(away, kind="stable").tolist()
@@ -95,15 +102,16 @@ class PlacedFrames:
 
 
 def is_placed(bundle: Bundle) -> bool:
-    """Check that a bundle's place, width and length are known."""
+    """Check that a bundle's position, width and length are known."""
     return bool(np.isfinite(bundle.centre_m).all() and bundle.width_m > 0 and bundle.length_m > 0)
 
 
 def windows_along(
     number: int, bundle: Bundle, beside_m: Float64, z_m: float, row_m: float
 ) -> Iterator[BundleWindow]:
-    """Divide a bundle's length into windows no longer than _MAX_LENGTH_M, with lines across at height z_m of
-    places beside_m (N,) from its axis, each row_m along.
+    """Divide a bundle's length into windows of at most _MAX_LENGTH_M.
+
+    beside_m: (N,) positions from its axis. z_m: height of the lines across. row_m: their spacing.
     """
     along, across = bundle_axes(bundle)
     middle = np.append(bundle.centre_m[:2], z_m) + beside_m[:, None] * across
@@ -115,9 +123,10 @@ def windows_along(
 def sample_windows(
     pairs: RectifiedPairs, frames: PlacedFrames, windows: Sequence[tuple[int, BundleWindow]]
 ) -> Iterator[tuple[int, WindowPicture]]:
-    """Sample windows in the frames of these numbers; tell each picture by the window's place in the list.
+    """Sample windows in the frames with these indices; yield each picture with the window's index in the
+    list.
 
-    A picture that doesn't show all of a window gives nothing, nor does a frame that can't be decoded.
+    Pictures that don't show all of a window and frames that can't be decoded are left out.
     """
     wanted = dict[int, list[int]]()
     for place, (k, _) in enumerate(windows):
@@ -147,7 +156,7 @@ def _sample(
 
 
 def is_hidden(part: HeightMap, line_m: Float64, eye_m: Float64) -> bool:
-    """Check whether the map stands in the way from an eye to a line of places (N, 3)."""
+    """Check whether the map blocks the view from a camera to a line of points (N, 3)."""
     rise = np.arange(_OVER_M, _MAX_RISE_M, _OVER_M)[:, None]
     way = (eye_m - line_m)[:, :2] / np.maximum(eye_m[2] - line_m[:, 2:], _OVER_M)
     there = line_m[:, :2] + rise[..., None] * way

@@ -1,4 +1,4 @@
-"""Tell whether a picture is sharp enough for the pitch of its bars: blur looks like thicker bars."""
+"""Check that a picture is sharp enough to measure the pitch of its bars: blur makes bars look thicker."""
 
 from __future__ import annotations
 
@@ -8,25 +8,29 @@ import numpy as np
 from barsight.core.arrays import UInt8
 
 _STRIDE = 4
-"""Every such row and column is looked at."""
+"""Stride of the rows and columns that are examined."""
 _MIN_CONTRAST, _REACH_PX = 50, 8
-"""Gray levels between both sides of an edge, and pixels over which it may rise."""
+"""Minimum difference in gray level between the two sides of an edge, and maximum number of pixels of its
+rise.
+"""
 _MIN_EDGES, _SHARPEST = 100, 0.05
-"""Edges that are needed, and the quantile of their widths that is the picture's."""
+"""Minimum number of edges, and the quantile of their widths that stands for the picture."""
 _MAX_EDGE_PX = 1.65
-"""Sharp pictures, drawn and path traced, have edges of 1.0 to 1.62 px both ways; a blur of 1 px (one sigma)
-makes them 1.68 or more, of 0.7 px mostly, motion of 4 px 1.7 or more along it."""
+"""Maximum edge width of a sharp picture. Sharp pictures, drawn and path traced, have 1.0 to 1.62 px both
+ways; a blur of 1 px (one sigma) gives 1.68 or more, of 0.7 px mostly, motion blur of 4 px 1.7 or more along
+it.
+"""
 
 
 def is_sharp(picture: UInt8) -> bool:
-    """Check that the edges of a picture (H, W) are narrow along its rows and its columns."""
+    """Check that the edges of a picture (H, W) are narrow both along its rows and along its columns."""
     rows, columns = picture[::_STRIDE], np.ascontiguousarray(picture[:, ::_STRIDE].T)
     return all(sharpest_edge_width(lines) <= _MAX_EDGE_PX for lines in (rows, columns))
 
 
 def sharpest_edge_width(lines: UInt8) -> float:
-    """Compute the width of the sharpest edges along lines (N, W), contrast over slope, px; NaN where too few
-    are seen.
+    """Compute the width of the sharpest edges along lines (N, W), contrast over slope, px; NaN if there are
+    too few edges.
     """
     steps = cv2.absdiff(lines[:, 1:], lines[:, :-1])
     around = np.ones((1, _REACH_PX), np.uint8)

@@ -1,8 +1,8 @@
-"""Estimate a diameter from the power spectrum of a bundle's shades.
+"""Estimate a diameter from the power spectrum of a bundle's gray levels.
 
-Bars that lie beside each other are as far apart as they are thick, or nearer where some are hidden in part:
-the spectrum S of the shades, over the frequency f, rises towards f d = 1 and falls steeply beyond. What it is
-in the mean, over f d, was learnt from drawn packs (benchmarks/pitch_spectra.py).
+Bars side by side are as far apart as they are thick, or closer where some are partly hidden. So the spectrum
+S over the frequency f rises towards f d = 1 and falls steeply beyond. Its mean over f d was learnt from drawn
+packs (benchmarks/pitch_spectra.py).
 """
 
 from __future__ import annotations
@@ -19,28 +19,30 @@ from barsight.core.arrays import Float64, frozen
 FREQUENCIES = np.arange(6.0, 141.0)
 """Frequencies (F,), per m, of a spectrum."""
 DIAMETERS_M = np.exp(np.arange(np.log(0.008), np.log(0.14), 0.02))
-"""Diameters (D,) that are compared."""
+"""Candidate diameters (D,)."""
 CLASSES = 0.13, 0.26
-"""Diameter over width: bounds of the classes for which a mean spectrum is known. The fewer bars a profile
-crosses, the wider are its peaks."""
+"""Limits, in diameter over width, between the classes with a mean spectrum of their own. The fewer bars a
+profile crosses, the wider are its peaks.
+"""
 LOG_RATIOS = np.log(0.08) + 0.12 * np.arange(36)
 """Logarithms (R,) of f d at which mean spectra are known."""
 _HIGH_PASS_M = 0.04
 _FLOOR = 2e-5
-"""Power that is added to a spectrum before its logarithm."""
+"""Power added to a spectrum before its logarithm."""
 _HIGHEST = 0.5
-"""Highest frequency that is used, per pixel."""
+"""Highest frequency used, in cycles per pixel."""
 _DEGREES = 4.0
 """Degrees of freedom of Student's t distribution of a spectrum's logarithm."""
 _APART, _TEMPERATURE = 1.5, 0.5
-"""Frequencies that lie so far apart, over the profile's length, are independent but for errors that all
-frequencies share; those make them worth half."""
+"""Separation of independent frequencies, times the profile's length; exponent of the likelihood, for the
+errors that all frequencies share.
+"""
 _MAX_WIDTHS = 1.2
-"""No bar is thicker than so many lengths of a profile."""
+"""Maximum diameter, relative to the length of a profile."""
 
 
 def power_spectrum(profiles: Sequence[PitchProfile]) -> Float64:
-    """Compute the mean power spectrum (F,) of profiles (N,) of one length, h a Hann window:
+    """Compute the mean power spectrum (F,) of profiles (N,) of equal length, with a Hann window h:
     S(f) = |sum_k h_k l_k exp(-2 pi i f u_k)|^2 / sum_k h_k^2.
     """
     levels = np.array([profile.levels for profile in profiles])
@@ -53,8 +55,8 @@ def power_spectrum(profiles: Sequence[PitchProfile]) -> Float64:
 
 
 def log_spectrum(profiles: Sequence[PitchProfile]) -> tuple[Float64, float]:
-    """Compute the logarithm of the power spectrum before pixels of a size p averaged it, S / sinc(f p)^4,
-    NaN beyond what they show; and the profiles' length, m.
+    """Compute the logarithm of the power spectrum, corrected for the averaging by pixels of size p,
+    S / sinc(f p)^4, and the profiles' length, m. NaN at frequencies that the pixels don't resolve.
     """
     pixel_m = float(np.median([profile.pixel_m for profile in profiles]))
     shown = np.maximum(np.sinc(FREQUENCIES * pixel_m) ** 4, 0.02)
@@ -63,9 +65,10 @@ def log_spectrum(profiles: Sequence[PitchProfile]) -> tuple[Float64, float]:
 
 
 def fit_diameters(level: Float64, length_m: float) -> tuple[Float64, Float64]:
-    """Compute the logarithm of the likelihood of each diameter (D,): with m and s the mean and the scale of
-    the class of d, log S = a + m(f d) + s(f d) t, where t has Student's distribution and a is free. And each
-    one's misfit (D,), the mean of the distribution's negative logarithms: 0.5 is usual.
+    """Compute the log-likelihood and the misfit of each diameter (D,).
+
+    log S = a + m(f d) + s(f d) t, with the mean m and scale s of the class of d, t from Student's
+    distribution, and a free. The misfit is the mean negative logarithm of the distribution: 0.5 is usual.
     """
     known = np.isfinite(level)
     classes = np.searchsorted(CLASSES, DIAMETERS_M / length_m, side="right")
@@ -79,7 +82,9 @@ def fit_diameters(level: Float64, length_m: float) -> tuple[Float64, Float64]:
 
 @cache
 def _tables() -> tuple[Float64, Float64]:
-    """Interpolate mean and scale (C, D, F) of a spectrum's logarithm, by class, diameter and frequency."""
+    """Interpolate the mean and scale (C, D, F) of a spectrum's logarithm, by class, diameter and
+    frequency.
+    """
     at = np.log(DIAMETERS_M[:, None] * FREQUENCIES)
     mean, scale = (
         np.array([np.interp(at, LOG_RATIOS, one[k]) for one in MEAN_SPECTRA]) for k in range(2)

@@ -1,8 +1,8 @@
 """Find where the straps of a bundle end in the pictures: at its flanks, where they turn out of sight.
 
-A strap is a line across the bars, darker or brighter than the steel before and after it. It is followed from
-the middle of the bundle to either side, on the level plane at half its height: there a round bundle is as
-wide as its outline in the picture, whatever the view.
+A strap is a line across the bars that is darker or brighter than the steel on both sides of it. It is
+followed from the middle of the bundle to either side, in the horizontal plane at half the bundle's height:
+there a round bundle is as wide as its outline in the picture, from any viewpoint.
 """
 
 from __future__ import annotations
@@ -30,35 +30,44 @@ from barsight.yard.sections import part_about
 from barsight.yard.types import Bundle, YardMap
 
 _STEP_M, _ROW_M = 0.004, 0.008
-"""Way between two places across a bundle, and along it."""
+"""Sample spacing across and along a bundle."""
 REACH_M = 0.22
-"""Search reach beyond the flanks of a bundle as the map tells it."""
+"""Search distance beyond the flanks that the map shows."""
 _OUTSIDE_M = 0.01
-"""Way from a flank to the line beside it that must be in sight."""
+"""Distance from a flank to the line beside it that must be visible."""
 _OVERHEAD = 0.05
-"""Way aside over height: a line of sight that leads less far aside passes what stands beside a bundle."""
+"""Maximum horizontal over vertical component of a line of sight that passes whatever stands beside a
+bundle.
+"""
 _AROUND_M, _STRAP_ROWS = 0.4, 3
-"""Length along the bars over which the steel's own gray level is taken, and rows that a strap covers."""
+"""Length along the bars over which the steel's own gray level is averaged, and number of rows that a strap
+covers.
+"""
 _SCATTER_LOG, _MIN_SCATTER_LOG, _SCATTER_M = 0.3, 0.03, 0.06
-"""Of the logarithm of gray levels along a bar: the most that counts for its scatter, the least scatter, and
-over how far across it is averaged."""
+"""Maximum and minimum scatter of the logarithmic gray levels along a bar, and the width across over which the
+scatter is averaged.
+"""
 _CLIPPED, _STRAP, _SEEN = 6.0, 1.5, 1.2
-"""Contrasts over noise: from where more counts no more; the least mean of a strap's over the middle, and the
-least by which a place of it is seen."""
+"""Contrasts over noise: the value at which they are clipped, the minimum mean of a strap over the bundle's
+middle, and the minimum at which a single sample of it counts as visible.
+"""
 _MIDDLE_RATIO, _MIN_MIDDLE_M = 0.3, 0.03
-"""Of the width, to either side, and at least: the middle, where straps are looked for."""
+"""Half width of the middle in which straps are searched, as a share of the width, and its minimum."""
 _SMOOTH_M, _END_RATIO = 0.02, 0.5
-"""A strap ends where its contrast, averaged so far across, is less than this share of the middle's."""
+"""A strap ends where its contrast, averaged over this width, falls below this share of the contrast in the
+middle.
+"""
 _GULLY_BARS, _MIN_GULLY_M = 0.45, 0.016
-"""A gully between two bars, of their diameter and at least, doesn't end a strap."""
+"""Maximum width of a gap in a strap at a gully between two bars, in bar diameters, and at least."""
 _LINE_M = 0.0015
-"""A strap shows so far beyond the bundle: it is this thick, and blurred."""
+"""Distance by which a strap shows beyond the bundle, due to its thickness and blur."""
 
 
 class StrapEnds(NamedTuple):
-    """Ends of one strap in one picture: m along the bundle from its middle, m beside its axis, NaN where the
-    strap goes on to the window's side. contrast: of its middle over noise. pixel_m: size of the picture's
-    pixels there.
+    """Ends of one strap in one picture: along the bundle from its middle, and beside its axis, m.
+
+    NaN where the strap continues to the window's border. contrast: over noise, in the middle. pixel_m: size
+    of the picture's pixels there.
     """
 
     along_m: float
@@ -71,8 +80,10 @@ class StrapEnds(NamedTuple):
 def strap_windows(
     frames: PlacedFrames, preferred: Collection[int], heights: YardMap, bundles: Sequence[Bundle]
 ) -> Iterator[tuple[int, BundleWindow]]:
-    """List windows along each free bundle that straps may hold, with the frames nearest over them, of those
-    in `preferred` where one has it; none where what stands higher may hide the flank on the camera's side.
+    """List windows along each free bundle that straps may hold, with the nearest frames over them.
+
+    Frames in `preferred` come first. Windows are left out where something higher may hide the flank on the
+    camera's side.
     """
     for number, bundle in enumerate(bundles):
         is_long = is_placed(bundle) and bundle.length_m > 2 * APART_M
@@ -87,7 +98,7 @@ def strap_windows(
 
 
 def _hides_flank(frames: PlacedFrames, k: int, window: BundleWindow, heights: YardMap) -> bool:
-    """Check whether what stands higher beside a bundle hides its flank from a frame's camera."""
+    """Check whether something higher beside a bundle hides its flank from a frame's camera."""
     tilt = view_tilt(frames, k, window)
     if abs(tilt) < _OVERHEAD:
         return False
@@ -100,8 +111,8 @@ def _hides_flank(frames: PlacedFrames, k: int, window: BundleWindow, heights: Ya
 
 
 def view_tilt(frames: PlacedFrames, k: int, window: BundleWindow) -> float:
-    """Compute how far across a bundle a frame's lines of sight lead, over their height: of the camera that
-    looks from further aside.
+    """Compute the horizontal over vertical component, across a bundle, of a frame's lines of sight: of the
+    camera that looks more obliquely.
     """
     middle = window.middle_m[len(window.middle_m) // 2]
     across = window.middle_m[-1] - window.middle_m[0]
@@ -133,8 +144,10 @@ def find_straps(picture: WindowPicture, window: BundleWindow, bundle: Bundle) ->
 
 
 def _contrast(gray: UInt8) -> Float64:
-    """Compute how much each place (R, N) differs from the steel before and after it, over a bar's own
-    scatter: the logarithm of gray levels less its mean along the bar, averaged over a strap's rows.
+    """Compute the contrast of each sample (R, N) with the steel on both sides along the bar, over the bar's
+    scatter.
+
+    It is the logarithm of the gray level less its mean along the bar, averaged over a strap's rows.
     """
     level = np.log(gray + DARKEST)
     around = 2 * round(_AROUND_M / _ROW_M / 2) + 1
@@ -146,15 +159,15 @@ def _contrast(gray: UInt8) -> Float64:
 
 
 def _strap_rows(strength: Float64) -> list[int]:
-    """Choose the rows (R,) with the strongest lines, APART_M from each other."""
+    """Choose the rows (R,) with the strongest lines, at least APART_M apart."""
     lines = np.flatnonzero(np.abs(strength) >= _STRAP)
     rows = strongest_lines(np.abs(strength[lines]), lines, math.ceil(APART_M / _ROW_M))
     return [int(row) for row in rows[: max(int(strength.size * _ROW_M / DENSE_M), 2)]]
 
 
 def _end(seen: Bool, bridged: int) -> int | None:
-    """Follow a strap outwards to the last place that is seen before more than `bridged` aren't; None where it
-    is seen up to the last.
+    """Follow a strap outwards to the last visible sample before more than `bridged` hidden ones; None if it
+    is visible to the end.
     """
     last = 0
     for k in np.flatnonzero(seen).tolist():
