@@ -1,1 +1,1 @@
-"""Errors, records, poses that know their frames, time stamps, uncertainty, atomic files."""
+"""Provide errors, records, poses that know their frames, time stamps, settings, and atomic files."""

@@ -23,7 +23,9 @@ class ConfigError(BarsightError):
 
 
 class InputError(BarsightError):
-    """An input that is missing, torn or wrong. `path` names it, `problem` says what, `remedy` what to do."""
+    """An input that is missing, damaged or wrong. `path` names it, `problem` says what is wrong, `remedy`
+    what to do.
+    """
 
     exit_code = 3
 
@@ -34,12 +36,12 @@ class InputError(BarsightError):
         super().__init__(f"{path}: {problem}" + (f"; {remedy}" if remedy else ""))
 
     def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:
-        """Take itself apart for another process."""
+        """Return the parts from which another process can rebuild the error."""
         return type(self), (str(self.path), self.problem, self.remedy)
 
 
 class CalibrationError(InputError):
-    """An impossible calibration: a rotation that is none, focal lengths below zero, swapped cameras."""
+    """An impossible calibration: a matrix that isn't a rotation, negative focal lengths, swapped cameras."""
 
 
 class OutputError(BarsightError):
@@ -55,7 +57,7 @@ class MeasurementError(BarsightError):
 
 
 class FrameMismatchError(ValueError):
-    """Two poses chained whose inner frames differ: a bug in the caller."""
+    """Two poses were chained whose inner frames differ: a bug in the caller."""
 
 
 @dataclass(frozen=True)

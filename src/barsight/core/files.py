@@ -14,11 +14,13 @@ from pathlib import Path
 from barsight.core.errors import InputError, OutputError
 
 LAST = ("lifts.json", "odometry.json", "report.html", "result.json")
-"""Files that others rest on, or that show others: without them a folder is not taken for whole."""
+"""Files that are removed first and written last: others depend on them, so a folder without them isn't
+complete.
+"""
 
 
 def expect_output(target: Path, *suffixes: str) -> None:
-    """Raise `OutputError` early for a file that couldn't be written, or whose name ends otherwise."""
+    """Raise `OutputError` early for a file that couldn't be written or has another suffix."""
     if target.suffix not in suffixes:
         raise OutputError(f"{target}: end its name in {' or '.join(suffixes)}")
     if not target.absolute().parent.is_dir():
@@ -26,7 +28,7 @@ def expect_output(target: Path, *suffixes: str) -> None:
 
 
 def lies_within(path: Path, folder: Path) -> bool:
-    """Check whether `path` is `folder` or lies in it, links followed; a link to itself is taken as it is."""
+    """Check whether `path` is `folder` or inside it, following links; a link to itself is taken as it is."""
     return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
 
 
@@ -43,10 +45,10 @@ def atomic_path(target: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def atomic_paths(*targets: Path) -> Iterator[tuple[Path, ...]]:
-    """Yield temporary paths of files of one folder; on success all of them appear, on any failure none.
+    """Yield temporary paths for files of one folder; on success all of them appear, on any failure none.
 
-    They are moved one right after the other, the first of `targets` last: it is the result, the others tell
-    of it.
+    They are moved one right after the other. The first of `targets` is moved last, since it is the result
+    that the others refer to.
     """
     for target in targets:
         if target.is_dir():
@@ -122,8 +124,8 @@ def _turn(name: str) -> int:
 
 @contextlib.contextmanager
 def changed_folder(target: Path) -> Iterator[Path]:
-    """Yield a folder that shows the files of `target`; what is written into it is moved there on success, all
-    or nothing of it.
+    """Yield a folder that shows the files of `target`. On success, all that was written into it is moved
+    to `target`.
     """
     with atomic_directory(target, replace=True) as staging:
         shown = {path.name: path.absolute() for path in target.iterdir()}
@@ -196,10 +198,10 @@ def _taken(staging: Path) -> int | None:
 
 @contextlib.contextmanager
 def translated_os_errors(target: Path) -> Iterator[None]:
-    """Translate the operating system's refusals (full disk, no permission) into one `OutputError` line.
+    """Translate refusals by the operating system (full disk, no permission) into one `OutputError` line.
 
-    `InputError` where it is a file elsewhere that may not be read. Other refusals are translated where they
-    name the temporary file, which the user doesn't know.
+    Raises `InputError` for another file that may not be read. Other errors are translated only if they name
+    the temporary file, which the user doesn't know.
     """
     try:
         yield
@@ -233,7 +235,7 @@ def translated_os_errors(target: Path) -> Iterator[None]:
 
 
 def _belongs(name: object, target: Path) -> bool:
-    """Check whether the file is `target`, lies in it or above it, or is one of ours that waits beside it."""
+    """Check whether the file is `target`, inside it, above it, or one of our temporary files beside it."""
     if not isinstance(name, str):
         return True
     path, target = Path(name).absolute(), target.absolute()
@@ -244,14 +246,15 @@ def _belongs(name: object, target: Path) -> bool:
 
 
 def _is_temporary(name: object, target: Path) -> bool:
-    """Check whether the file is the temporary one, or the temporary folder itself, that waits beside it."""
+    """Check whether the name is that of the temporary file or folder beside `target`."""
     path, target = Path(str(name)), target.absolute()
     return path.absolute().parent == target.parent and path.name.startswith(f".{target.name[:40]}.")
 
 
 def expect_empty(target: Path, *, can_overwrite: bool = False) -> None:
-    """Raise `OutputError` where `target` is a file or a folder that holds something; `can_overwrite`: who
-    writes can be told to.
+    """Raise `OutputError` if `target` is a file or a folder that isn't empty.
+
+    can_overwrite: the caller has an option to overwrite, which the message names.
     """
     if target.exists() and not target.is_dir():
         raise OutputError(f"{target}: is a file; name a folder")

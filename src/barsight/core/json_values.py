@@ -15,7 +15,7 @@ import numpy as np
 from barsight.core.files import atomic_path
 
 DIGITS = 9
-"""Significant digits of a result's documents: a micrometre in any yard."""
+"""Significant digits of numbers in result documents: a micrometre in any yard."""
 
 
 def json_value(value: Any, digits: int | None = None, decimals: int | None = None) -> Any:
@@ -43,7 +43,7 @@ def json_value(value: Any, digits: int | None = None, decimals: int | None = Non
 
 
 def write_json(target: Path, content: Any, digits: int | None = None) -> None:
-    """Write what `json_value` makes of it, indented, whole or not at all."""
+    """Convert with `json_value` and write the JSON, indented, completely or not at all."""
     text = json.dumps(json_value(content, digits), indent=1, allow_nan=False) + "\n"
     with atomic_path(target) as path:
         path.write_text(text, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Read processes' memory, bound what freed memory they keep, and return it to the system."""
+"""Read the memory of processes, limit the freed memory that they keep, and return it to the system."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from pathlib import Path
 
 _ARENA_MAX = "MALLOC_ARENA_MAX", -8, 2
 _MMAP_THRESHOLD = "MALLOC_MMAP_THRESHOLD_", -3, 16 * 2**20
-"""glibc's settings: name in the environment, number [mallopt(3)], value."""
+"""A setting of glibc: its name in the environment, its number [mallopt(3)], its value."""
 
 
 def peak_memory_mib() -> float:
-    """Return the most that this process has held so far; NaN where the system doesn't tell."""
+    """Return the peak resident memory of this process, MiB; NaN if the system doesn't report it."""
     try:
         import resource
     except ImportError:  # Windows
@@ -24,8 +24,8 @@ def peak_memory_mib() -> float:
 
 
 def resident_bytes(pid: int | None = None) -> int:
-    """Read the resident memory of a process, this one by default; 0 where it is gone or the system doesn't
-    tell.
+    """Read the resident memory of a process, by default this one; 0 if it is gone or the system doesn't
+    report it.
     """
     try:
         pages = Path(f"/proc/{'self' if pid is None else pid}/statm").read_text(encoding="ascii").split()[1]
@@ -35,9 +35,11 @@ def resident_bytes(pid: int | None = None) -> int:
 
 
 def bound_heap() -> None:
-    """Bound the freed memory that this process and those it begins keep: glibc makes a heap for each thread,
-    and keeps there what several threads freed. Two heaps are enough for two cores, and blocks of 16 MiB and
-    more aren't kept at all: a tenth less for a measurement. What the environment sets stands.
+    """Limit the freed memory that this process and its children keep.
+
+    glibc makes a heap per thread and keeps in it what several threads have freed. Two heaps are enough for
+    two cores, and blocks of 16 MiB and more are returned at once: a tenth less for a measurement. Values set
+    in the environment stay.
     """
     for name, number, value in (_ARENA_MAX, _MMAP_THRESHOLD):
         if name not in os.environ:
@@ -46,15 +48,17 @@ def bound_heap() -> None:
 
 
 def trim_heap() -> None:
-    """Trim the heap: glibc keeps freed memory in a pool for each thread, large pictures too, so that several
-    threads hold a few hundred MB of nothing. Does nothing where the C library is another.
+    """Return freed memory to the system.
+
+    glibc keeps a pool per thread, for large pictures too, so several threads may hold a few hundred MB that
+    nobody uses. Does nothing with another C library.
     """
     _heap("malloc_trim")(0)
 
 
 @cache
 def _heap(name: str) -> Callable[..., int]:
-    """Find a function of glibc; one that does nothing where the C library is another."""
+    """Find a function of glibc; with another C library, one that does nothing."""
     try:
         function = getattr(ctypes.CDLL(None), name)
     except (OSError, AttributeError, TypeError):

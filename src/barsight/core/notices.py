@@ -25,7 +25,7 @@ WARNINGS = {
     "units-doubtful": "A sensor's readings have an impossible magnitude; no lift is offered.",
     "yard-changed": "The yard changed between two passes; the newer one counts there.",
 }
-"""Code to what it means."""
+"""Meaning of each code."""
 
 FORBIDS = {
     "calibration": "calibration-drift",
@@ -38,7 +38,7 @@ FORBIDS = {
     "trajectory-degraded": "trajectory-degraded",
     "units-doubtful": "units-doubtful",
 }
-"""Code of a warning that forbids every lift to the veto's code."""
+"""Veto that a warning's code leads to, for the warnings that forbid every lift."""
 
 
 @dataclass(frozen=True)

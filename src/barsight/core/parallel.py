@@ -22,7 +22,7 @@ Result = TypeVar("Result")
 Taken = TypeVar("Taken")
 
 WORKERS = 2
-"""Items under way side by side: as many as a user's cores."""
+"""Number of items processed side by side: a user's number of cores."""
 
 
 def ordered_map(
@@ -72,7 +72,9 @@ def prefetched_chain(
 
 
 class _Queued(NamedTuple, Generic[Result]):
-    """Results of an item so far, None after the last, and what raises the exception that ended them."""
+    """Results of an item so far, followed by None, and a function that raises the exception that ended
+    them.
+    """
 
     done: Future[None]
     found: SimpleQueue[tuple[Result] | None]
@@ -181,8 +183,8 @@ def in_background(work: Callable[[], Result]) -> Iterator[Future[Result]]:
 
 @contextmanager
 def single_opencv_thread() -> Iterator[None]:
-    """Keep OpenCV to the thread that calls it: where frames go side by side, its own threads only wait for
-    each other, and spin meanwhile.
+    """Keep OpenCV on the calling thread: if frames are processed side by side, its own threads only spin
+    and wait.
     """
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
@@ -193,7 +195,7 @@ def single_opencv_thread() -> Iterator[None]:
 
 
 def _is_alone() -> bool:
-    """Tell whether this process was given a single thread, as each of several that share the cores is."""
+    """Check whether this process has a single thread, as each of several that share the cores has."""
     return bool(numba.config.NUMBA_NUM_THREADS == 1)
 
 

@@ -1,4 +1,4 @@
-"""Digest passwords, slowly, and tell which names an account may have."""
+"""Hash passwords with a slow function, and check the names of accounts."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from barsight.core.errors import ConfigError
 MIN_PASSWORD = 10
 _MAX_BYTES = 1024
 _COST = {"n": 2**15, "r": 8, "p": 1, "maxmem": 2**26}
-"""scrypt's: 32 MiB and some 80 ms a password."""
+"""Cost parameters of scrypt: 32 MiB and some 80 ms per password."""
 _NAME = re.compile(r"[\w.@-]{1,60}")
 
 

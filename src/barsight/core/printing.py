@@ -1,5 +1,5 @@
-"""Print text: names and texts from files that others made can't give a terminal orders, and a terminal that
-takes no more lines holds nobody up.
+"""Print text safely: names and texts from other people's files can't control the terminal, and a terminal
+that accepts no more lines blocks nobody.
 """
 
 from __future__ import annotations
@@ -12,16 +12,18 @@ from threading import Thread
 
 _HARMLESS = "\n\t"
 _ORDERS = ("Cc", "Cf", "Cs", "Co", "Zl", "Zp")
-"""Unicode's categories of control and format characters, surrogates, private ones and line breaks."""
+"""Unicode categories that aren't printed: control and format characters, surrogates, private use, line
+breaks.
+"""
 
 _ROOM = 1000
-"""Lines that may wait for a terminal; later ones are dropped."""
+"""Maximum number of lines waiting for the terminal; later ones are dropped."""
 _LAST_S = 1.0
-"""The terminal may take so long for the lines that wait at the end."""
+"""Maximum time for the terminal to take the waiting lines at the end."""
 
 
 def printable(text: str) -> str:
-    """Replace control characters, and bytes of names that are no text, by a question mark."""
+    """Replace control characters and undecodable bytes by a question mark."""
     if text.isprintable():
         return text
     return "".join(
@@ -31,7 +33,7 @@ def printable(text: str) -> str:
 
 @contextmanager
 def printed_aside(tell: Callable[[str], None]) -> Iterator[Callable[[str], None]]:
-    """Print lines from a thread of their own: whoever tells one doesn't wait for a terminal or a pipe."""
+    """Print lines from a thread of its own, so that nobody waits for a terminal or a pipe."""
     lines: Queue[str | None] = Queue(_ROOM)
 
     def work() -> None:

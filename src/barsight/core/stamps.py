@@ -30,9 +30,9 @@ def format_seconds(stamp_ns: int) -> str:
 
 
 def parse_seconds(text: str) -> int:
-    """Parse what `format_seconds` writes; any number of decimals, those past the ninth are cut.
+    """Parse what `format_seconds` writes; decimals beyond the ninth are cut.
 
-    Exponents are read too (`1.4e+09`, as `numpy.savetxt` writes). Raises ValueError for what is no number.
+    Exponents are read too (`1.4e+09`, as `numpy.savetxt` writes). Raises ValueError if it isn't a number.
     """
     return int(_stamp(text))
 
@@ -43,7 +43,9 @@ def seconds_in_ns(text: str) -> int:
 
 
 def _stamp(text: str) -> Decimal:
-    """Parse seconds to nanoseconds that 64 bits hold; a large exponent would take forever as an integer."""
+    """Parse seconds to nanoseconds that fit into 64 bits; a large exponent would take forever as an
+    integer.
+    """
     try:
         stamp = Decimal(text) * NS_PER_S
         if not -(2**63) <= stamp < 2**63:

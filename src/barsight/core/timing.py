@@ -1,4 +1,4 @@
-"""Time and count the stages of a run."""
+"""Time the stages of a run and count their frames."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import time
 from collections.abc import Callable, Iterator
 
 ProgressCallback = Callable[[str, int, int], None]
-"""Told of progress: stage, frames done, frames in all."""
+"""Callback for progress: stage, frames done, total frames."""
 
 
 class Stopwatch:
-    """Adds up seconds and frames by stage, from any thread; stages that overlap count each in full."""
+    """Adds up seconds and frames by stage, from any thread; overlapping stages count in full each."""
 
     def __init__(self) -> None:
         self._seconds: dict[str, float] = {}
@@ -48,4 +48,4 @@ def count_frames(stage: str, total: int, advance: ProgressCallback) -> Callable[
 
 
 def unwatched() -> None:
-    """Take a sign of progress that nobody waits for."""
+    """Ignore a sign of progress."""

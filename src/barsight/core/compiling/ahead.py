@@ -13,9 +13,11 @@ import numba
 from barsight.core.compiling.signatures import listed
 
 MAX_PROCESSES = 4
-"""Each takes half a gigabyte, and the more there are, the more compile what another is compiling."""
+"""Maximum number of compiling processes. Each takes half a gigabyte, and the more there are, the more of them
+compile the same functions.
+"""
 FEWEST_KERNELS = 8
-"""For fewer the processes take longer to start than they save."""
+"""Minimum number of kernels for which starting processes pays."""
 _PLACE_BYTES = 4
 
 
@@ -60,9 +62,9 @@ def compile_ahead(advance: Callable[[str, int, int], None], *groups: str) -> Non
 
 
 def load_kernels(*groups: str) -> None:
-    """Load the kernels of some groups from the cache now, not each at its first call.
+    """Load the kernels of some groups from the cache now rather than at each one's first call.
 
-    One whose listed types are those of an earlier version is left to its first call.
+    A kernel whose listed types belong to an earlier version is left to its first call.
     """
     if not numba.config.DISABLE_JIT:
         for one in listed(*groups):
@@ -71,7 +73,9 @@ def load_kernels(*groups: str) -> None:
 
 
 def main() -> None:
-    """Compile the kernels whose places in the list stand in the standard input, and tell which are done."""
+    """Compile the kernels whose list indices are given on standard input, and report each one when it is
+    done.
+    """
     kernels = listed(*sys.argv[1:])
     while place := os.read(0, _PLACE_BYTES):
         with contextlib.suppress(Exception):  # the first call says what is wrong

@@ -18,15 +18,15 @@ from numba.core.caching import FunctionCache
 from numba.core.codegen import JITCodeLibrary
 
 _LIBRARIES = ("numba", "numpy", "llvmlite")
-"""Not followed: the compiler's version is part of every cache already."""
+"""Libraries that aren't followed, since their versions are part of every cache already."""
 _SCALARS = (bool, int, float, complex, str, bytes, type(None), np.generic)
 
 
 class KernelCache(FunctionCache):  # type: ignore[misc]
-    """Cache on disk of one kernel, keyed to its options and to all sources that it reaches.
+    """Disk cache of one kernel, keyed to its options and to all sources that it reaches.
 
-    Numba keys it to the kernel's own file. The code of functions that it calls is copied into its own, and
-    would stay the old one after a change of their files.
+    Numba's own key is the kernel's file alone. But the code of the functions that it calls is copied into it,
+    and would stay outdated after a change of their files.
     """
 
     def __init__(self, function: Callable[..., Any], options: Mapping[str, Any]) -> None:
@@ -61,7 +61,7 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
             return False
 
     def _stamp(self) -> None:
-        """Stamp the index, only now: what the kernel calls may be defined after it."""
+        """Stamp the index. This happens late, since what the kernel calls may be defined after the kernel."""
         self._cache_file._source_stamp = (*self._own, sources_digest(self._py_func))
 
 
@@ -138,6 +138,6 @@ def _text(value: Any) -> str:
 
 @functools.cache
 def _digest(path: str) -> str:
-    """Hash a source file as it was when it was first asked for; of what is no file, the name alone."""
+    """Hash a source file as it was when first asked for. If it isn't a file, hash its name alone."""
     file = Path(path)
     return f"{file.name} {hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else path}"

@@ -1,1 +1,1 @@
-"""Linear algebra: skyline Cholesky and the Levenberg-Marquardt loop."""
+"""Solve linear systems (dense and skyline Cholesky) and nonlinear ones (Levenberg-Marquardt)."""

@@ -1,4 +1,4 @@
-"""Weigh the four coefficients around a place as the uniform cubic B-spline does."""
+"""Weight the four coefficients around a point as the uniform cubic B-spline does."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ _ONE, _THREE, _FOUR, _SIX = np.float32(1), np.float32(3), np.float32(4), np.floa
 
 @kernel()
 def sixfold_weights(t: Any) -> tuple[Any, Any, Any, Any]:
-    """Compute six times the weights of the two coefficients on either side of a place.
+    """Compute six times the weights of the two coefficients on either side of a point.
 
-    (1 - t)^3, 4 - 6 t^2 + 3 t^3, 1 + 3 t + 3 t^2 - 3 t^3 and t^3, in t's precision: 0 at the second
+    (1 - t)^3, 4 - 6 t^2 + 3 t^3, 1 + 3 t + 3 t^2 - 3 t^3 and t^3, in t's precision: t is 0 at the second
     coefficient, 1 at the third.
     """
     t2 = t * t

@@ -1,6 +1,6 @@
-"""Factorise and solve dense positive definite systems: LAPACK through SciPy, on one thread.
+"""Factorise and solve dense positive definite systems with LAPACK through SciPy, on one thread.
 
-Its own threads wait for each other where the machine is busy, and with their number the last digits change.
+Its own threads would wait for each other on a busy machine, and their number changes the last digits.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from barsight.core.arrays import Float64
 
 
 class _Limit:
-    """BLAS's limit in this process: who holds it, and how often one within another."""
+    """BLAS's thread limit in this process: which thread holds it, and how deeply it is nested."""
 
     turn = threading.RLock()
     depth = 0
@@ -32,10 +32,10 @@ def _blas() -> Any:
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Limit BLAS to one thread, as a decorator or in a `with`; within another it costs next to nothing.
+    """Limit BLAS to one thread, as a decorator or in a `with`; nesting costs next to nothing.
 
-    The number is the process's, so threads take turns, and it is what it was when the block is left. Where
-    another thread holds a limit of its own by `threadpoolctl`, that one stays.
+    The limit belongs to the process, so threads take turns; the old limit is restored on leaving. A limit
+    that another thread has set through `threadpoolctl` stays.
     """
     with _Limit.turn, nullcontext() if _Limit.depth else _blas().limit(limits=1):
         _Limit.depth += 1

@@ -15,18 +15,19 @@ _FACTOR = 10.0
 
 
 class Iterate(Protocol):
-    """A state with its cost, and the step from there. What costs memory or time should be made on use:
-    a trial that is refused is asked for its cost only.
+    """A state with its cost, and the step from there.
+
+    What costs memory or time should be computed on use: a rejected trial is only asked for its cost.
     """
 
     @property
     def cost(self) -> float:
-        """Return the sum that is minimised. May raise LinAlgError."""
+        """Return the sum to be minimised. May raise LinAlgError."""
 
     def step(self: I, damping: float) -> I:
-        """Solve the normal equations, their diagonal raised by the share `damping`, and move.
+        """Solve the normal equations with their diagonal raised by the factor `damping`, and take the step.
 
-        Raises LinAlgError where they have no solution.
+        Raises LinAlgError if they have no solution.
         """
 
 
@@ -35,9 +36,11 @@ I = TypeVar("I", bound=Iterate)  # noqa: E741
 
 @dataclass(frozen=True)
 class Options:
-    """max_steps: trials, the refused ones included. min_gain_ratio: the share of the cost below which a
-    step's gain, or loss, ends the search. Damping begins at `first_damping`, falls to `min_damping` at least,
-    or to 0 where it began there, and ends the search above `max_damping`.
+    """Options of the search.
+
+    max_steps: maximum number of trials, including rejected ones. min_gain_ratio: relative change of the cost
+    below which the search ends. Damping starts at `first_damping` and falls to `min_damping`, or to 0 if it
+    started there; above `max_damping` the search ends.
     """
 
     max_steps: int
@@ -48,12 +51,12 @@ class Options:
 
     @property
     def floor(self) -> float:
-        """Return the least damping."""
+        """Return the smallest damping."""
         return min(self.first_damping, self.min_damping)
 
 
 class Termination(Enum):
-    """Name the condition that ended the search."""
+    """The condition that ended the search."""
 
     CONVERGED = "converged"
     MAX_STEPS = "max-steps"
@@ -63,7 +66,7 @@ class Termination(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Minimum(Generic[I]):
-    """The best iterate, the steps tried, and why no more were."""
+    """The best iterate, the number of steps tried, and the reason why the search ended."""
 
     best: I
     steps: int
@@ -77,7 +80,7 @@ class Minimum(Generic[I]):
 
 @one_blas_thread()
 def minimise(best: I, options: Options) -> Minimum[I]:
-    """Find a minimum from the iterate `best` on; never ends at a higher cost."""
+    """Find a minimum, starting from `best`; the cost never increases."""
     damping = options.first_damping
     for steps in range(1, options.max_steps + 1):
         try:

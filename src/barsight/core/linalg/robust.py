@@ -1,4 +1,4 @@
-"""Estimate scatter and level whatever a few gross errors are."""
+"""Estimate scatter and level robustly against a few gross errors."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 SIGMA_PER_MAD = 1.4826
-"""Sigma of normal errors over their median absolute deviation."""
+"""Ratio of the sigma of normal errors to their median absolute deviation."""
 
 
 @overload
@@ -41,9 +41,9 @@ def nan_medians(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def running_median(values: NDArray[Any], count: int) -> NDArray[Any]:
-    """Compute the median of `count` (odd) rows about each, (N, M); the first and last row are repeated.
+    """Compute the median of `count` (odd) rows around each, (N, M); the first and last rows are repeated.
 
-    All columns go as one line through SciPy's 1-D filter, which takes a fraction of the 2-D one's time.
+    All columns go through SciPy's 1-D filter as one line, which takes a fraction of the 2-D filter's time.
     """
     rim = count // 2
     line = np.pad(values.T, ((0, 0), (rim, rim)), mode="edge")

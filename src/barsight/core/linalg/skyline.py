@@ -1,8 +1,8 @@
-"""Factorise and solve symmetric matrices of which each row begins late: the skyline Cholesky factor.
+"""Factorise and solve symmetric matrices whose rows begin at different columns: the skyline Cholesky factor.
 
-A factor's rows begin where the matrix's do [Jennings 1966], so nothing before is stored or worked on. Plain
-loops: poses' rows are long and velocities' and biases' short, which costs LAPACK's band and
-blocks more than they gain (benchmarks/results/2026-11-23-linear-algebra.md).
+The factor's rows begin where the matrix's do [Jennings 1966], so nothing before is stored or computed. Plain
+loops are used, because rows of poses are long and those of velocities and biases short, which costs LAPACK's
+band and block routines more than they gain (benchmarks/results/2026-11-23-linear-algebra.md).
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""Read files that others made: bounded, held against schemas and digests; maps, clouds and documents."""
+"""Read maps, clouds and documents that others made, within bounds and against schemas and digests."""

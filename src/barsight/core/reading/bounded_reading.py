@@ -23,38 +23,46 @@ from numpy.typing import ArrayLike, NDArray
 from barsight.core.errors import InputError
 
 MAX_TABLE_BYTES = 512 << 20
-"""Of a table of numbers: five hours of an IMU at 200 Hz take 400 MB."""
+"""Maximum size of a table of numbers: five hours of an IMU at 200 Hz take 400 MB."""
 MAX_DOCUMENT_BYTES = 256 << 20
-"""Of a result's JSON."""
+"""Maximum size of a JSON result."""
 MAX_SETTINGS_BYTES = 1 << 20
-"""Of a file that people write: settings, magnets, calibrations."""
+"""Maximum size of a file that people write: settings, magnets, calibrations."""
 MAX_ARCHIVE_BYTES, MAX_ARCHIVE_ARRAYS = 1 << 30, 10_000
-"""Of an archive's arrays, unpacked."""
+"""Maximum size of an archive's arrays, unpacked, and their maximum number."""
 MAX_WIDE_BYTES = 64 << 20
-"""Of a text that is not all ASCII: one letter of another alphabet makes every letter take four bytes."""
+"""Maximum size of a text that isn't all ASCII: one letter of another alphabet makes every letter take four
+bytes.
+"""
 MAX_LINES, MAX_LINE_BYTES = 4_000_000, 1 << 20
-"""Of a table: five hours of an IMU at 200 Hz. Short lines cost far more than their bytes."""
+"""Maximum number of lines of a table (five hours of an IMU at 200 Hz; short lines cost far more than their
+bytes), and maximum size of a line.
+"""
 MAX_PICTURES = 500_000
-"""Lines of a list with one for each picture or pose: four hours at 30 Hz."""
+"""Maximum number of lines of a list with one line per picture or pose: four hours at 30 Hz."""
 MAX_ENTRIES = 100_000
-"""Lines of a list that people keep: stock, targets, events."""
+"""Maximum number of lines of a list that people keep: stock, targets, events."""
 MAX_PROFILES = 5_000
-"""Of a laser or a map's contours."""
+"""Maximum number of profiles of a laser or contours of a map."""
 MAX_VALUES = 4_000_000
-"""Of a JSON document, by its commas and opening brackets: so many take half a GiB."""
+"""Maximum number of values in a JSON document, by its commas and opening brackets; that many take half a
+GiB.
+"""
 MAX_DEPTH, MAX_NODES = 64, 1_000_000
-"""Of lists and mappings in each other, and of all values of a settings file."""
+"""Maximum nesting of lists and mappings, and maximum number of values in a settings file."""
 MAX_INTEGER = 2**64
 MAX_DIGITS = 30
 MAX_MAGNITUDE = 1e15
-"""Of a number in a table or a calibration: what is computed of it stays finite."""
+"""Maximum magnitude of a number in a table or a calibration, so that what is computed from it stays
+finite.
+"""
 REMEDY = "take the original file"
 _READING = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
-"""Flags of opening a file. Windows has but the first, and no pipes among its files."""
+"""Flags for opening a file. Windows only has the first, and no pipes among its files."""
 
 
 def in_range(values: ArrayLike) -> NDArray[np.bool_]:
-    """Tell for each number whether it is one and no larger than MAX_MAGNITUDE."""
+    """Check for each value that it is a number of at most MAX_MAGNITUDE."""
     return np.asarray(np.abs(np.asarray(values, dtype=np.float64)) <= MAX_MAGNITUDE)
 
 
@@ -99,7 +107,7 @@ def _expect_regular(
 def read_bytes(
     path: Path, max_bytes: int, remedy: str = REMEDY, kind: type[InputError] = InputError
 ) -> bytes:
-    """Read a regular file of at most so many bytes. Raises `kind`."""
+    """Read a regular file of at most max_bytes. Raises `kind`."""
     with open_regular(path, remedy, kind, max_bytes) as file:
         try:
             return file.read(max_bytes)
@@ -133,7 +141,7 @@ def read_lines(
 def expect_lines(
     path: Path, max_lines: int = MAX_LINES, remedy: str = REMEDY, kind: type[InputError] = InputError
 ) -> None:
-    """Raise `kind` unless the file is a regular one of at most MAX_TABLE_BYTES and so many lines, none of
+    """Raise `kind` unless the file is regular and has at most MAX_TABLE_BYTES and max_lines lines, none of
     them much longer than MAX_LINE_BYTES.
     """
     lines = 0
@@ -148,7 +156,7 @@ def expect_lines(
 
 
 def read_json(path: Path, remedy: str = REMEDY, kind: type[InputError] = InputError) -> Any:
-    """Read a JSON document. Raises `kind` for one that is torn, too large or deep, or holds NaN."""
+    """Read a JSON document. Raises `kind` if it is damaged, too large, too deeply nested, or holds NaN."""
     return _parsed(path, "JSON", _parse_json, MAX_DOCUMENT_BYTES, remedy, kind)
 
 
@@ -163,7 +171,7 @@ def read_toml(path: Path, remedy: str = REMEDY, kind: type[InputError] = InputEr
 
 
 def parse_json(data: bytes, source: str, remedy: str = REMEDY) -> Any:
-    """Parse a JSON document that came from elsewhere than a file. Raises InputError, naming `source`."""
+    """Parse a JSON document that didn't come from a file. Raises InputError, naming `source`."""
     if len(data) > MAX_DOCUMENT_BYTES:
         raise InputError(source, f"has {len(data)} bytes, at most {MAX_DOCUMENT_BYTES} are read", remedy)
     return _told(source, "JSON", _parse_json, data.decode("utf-8-sig", "replace"), remedy, InputError)
@@ -218,8 +226,8 @@ def _expect_shallow(tree: Any) -> None:
 
 
 def expect_modest(tree: Any) -> None:
-    """Raise ValueError for a tree of mappings and lists that is too deep or large, or holds an integer of
-    over 64 bits. A part that stands in several places counts in each.
+    """Raise ValueError for a tree of mappings and lists that is too deep or too large, or holds an integer of
+    more than 64 bits. A part that occurs several times counts each time.
     """
     waiting, nodes = [(tree, 0)], 0
     while waiting:
@@ -240,7 +248,7 @@ def expect_modest(tree: Any) -> None:
 def read_arrays(
     path: Path, remedy: str = REMEDY, kind: type[InputError] = InputError
 ) -> dict[str, NDArray[Any]]:
-    """Read an npz archive's arrays. Raises `kind` for one that is torn, too large, or holds objects."""
+    """Read an npz archive's arrays. Raises `kind` if it is damaged, too large, or holds objects."""
     data = read_bytes(path, MAX_ARCHIVE_BYTES, remedy, kind)
     if (members := data.count(b"PK\x01\x02")) > MAX_ARCHIVE_ARRAYS:
         raise kind(path, f"holds {members} arrays, at most {MAX_ARCHIVE_ARRAYS} are read", remedy)

@@ -1,4 +1,4 @@
-"""Read the GeoTIFFs of a result folder: tiled maps whose row 0 lies at the highest y."""
+"""Read the GeoTIFFs of a result folder: tiled maps whose row 0 is at the highest y."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ HEIGHT_BANDS = 4
 """Bands of height.tif: z, sigma, views, source."""
 REMEDY = "measure the recording again"
 MAX_CELLS = 1 << 28
-"""Of a map: 26,000 m^2 in cells of 10 mm; a small file may claim any number."""
+"""Maximum number of cells of a map: 26,000 m^2 at 10 mm. A small file may claim any number."""
 _MAX_SLACK_BYTES = 1 << 26
-"""Of a map beside its cells: tiles that stand out over its edge, offsets, tags."""
+"""Maximum size of a map's file beyond its cells: tiles that extend over the border, offsets, tags."""
 _READ_BYTES = 1 << 22
-"""tifffile would read ahead 256 MiB."""
+"""Size of a read; tifffile would read 256 MiB ahead."""
 _TORN = (
     tifffile.TiffFileError, zlib.error, struct.error, OSError, ValueError, KeyError, IndexError, RuntimeError,
     TypeError, AttributeError, AssertionError, OverflowError, ZeroDivisionError, MemoryError,
 )  # fmt: skip
-"""Exceptions of tifffile on a file that is cut short or is something else."""
+"""Exceptions that tifffile raises for a file that is cut short or isn't a TIFF."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +45,7 @@ class GeoTiff:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Return the cells down and across."""
+        """Return the numbers of rows and columns."""
         height, width = self.page.shape[-2:]
         return height, width
 
@@ -58,7 +58,7 @@ class GeoTiff:
                 yield int(index[0]), row, column, data[0, : height - row, : width - column, 0]
 
     def rectangle(self, bands: int, rows: slice, columns: slice) -> NDArray[Any]:
-        """Read (bands, R, C), the rows counted and stored from the lowest y."""
+        """Read (bands, R, C); rows are counted and returned from the lowest y."""
         page, (height, width) = self.page, self.size
         top, left = height - rows.stop, columns.start
         out = np.empty((bands, rows.stop - rows.start, columns.stop - left), page.dtype)
@@ -84,9 +84,9 @@ class GeoTiff:
 
 @contextmanager
 def open_geotiff(path: Path, bands: int = 1) -> Iterator[GeoTiff]:
-    """Open a tiled map of so many planar bands.
+    """Open a tiled map with this number of planar bands.
 
-    Raises InputError where it is something else, or where it proves torn while it is open.
+    Raises InputError for anything else, and where the file proves damaged while it is open.
     """
     try:
         with open_regular(path, REMEDY) as stream, tifffile.TiffFile(stream) as file:

@@ -1,4 +1,4 @@
-"""Hold a JSON document against a schema, of the keywords that the package's own schemas use.
+"""Check a JSON document against a schema, by the keywords that the package's own schemas use.
 
 type, const, enum, anyOf, $ref; properties, required, additionalProperties; items, minItems, maxItems;
 minimum, exclusiveMinimum, maximum [JSON Schema 2020-12].
@@ -23,13 +23,13 @@ _TYPES: dict[str, tuple[type, ...]] = {
 
 @cache
 def package_schema(package: str, name: str) -> Any:
-    """Load a schema that lies in a package's folder `schemas`."""
+    """Load a schema from a package's folder `schemas`."""
     text = resources.files(package).joinpath("schemas", f"{name}.schema.json").read_text(encoding="utf-8")
     return json.loads(text)
 
 
 def record_schema(**fields: Any) -> dict[str, Any]:
-    """Make the schema of an object with these fields, no other, all of them there."""
+    """Make the schema of an object that has exactly these fields."""
     return {"type": "object", "required": list(fields), "properties": fields, "additionalProperties": False}
 
 
@@ -39,14 +39,14 @@ def list_schema(items: Any) -> dict[str, Any]:
 
 
 def expect_schema(document: Any, schema: Any, path: Path | str, remedy: str) -> None:
-    """Raise InputError about `path` naming the first place where the document isn't as the schema says."""
+    """Raise InputError about `path`, naming the first place where the document violates the schema."""
     fault = _fault(document, schema, schema, "")
     if fault:
         raise InputError(path, f"isn't as its schema says ({fault})", remedy)
 
 
 def _fault(value: Any, node: dict[str, Any], root: dict[str, Any], where: str) -> str:
-    """Tell the first thing that is wrong; empty where nothing is."""
+    """Describe the first violation; empty if there is none."""
     if "$ref" in node:
         found: Any = root
         for key in node["$ref"].removeprefix("#/").split("/"):
@@ -119,7 +119,7 @@ def _number_fault(value: float, node: dict[str, Any], where: str) -> str:
 
 
 MAX_FIGURE = 2**63
-"""No figure is larger: stamps in ns are the largest."""
+"""Maximum magnitude of a number: time stamps in ns are the largest."""
 
 
 def _short(value: Any) -> str:

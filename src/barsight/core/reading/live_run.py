@@ -1,4 +1,4 @@
-"""Read what a live run says of itself in its folder: state.json, health.json and pose.json."""
+"""Read the state of a live run from its folder: state.json, health.json and pose.json."""
 
 from __future__ import annotations
 
@@ -14,14 +14,16 @@ from barsight.core.errors import BarsightError
 from barsight.core.reading.bounded_reading import read_json
 
 MAX_SILENCE_S = 1.0
-"""A live run writes state.json ten times a second."""
+"""Maximum age of state.json of a run that is alive; it is written ten times a second."""
 _TORN = (BarsightError, OSError, KeyError, TypeError, ValueError)
 
 
 @dataclass(frozen=True)
 class CranePose:
-    """The crane in the yard frame. sigma_m: standard deviations; stamp_ns: of the measurement. magnet_m: x
-    and y of the point that encoders read, below which the magnet hangs; None where it isn't known.
+    """The crane's pose in the yard frame.
+
+    sigma_m: standard deviations. stamp_ns: time of the measurement. magnet_m: x and y of the point that the
+    encoders read, below which the magnet hangs; None if unknown.
     """
 
     x_m: float
@@ -35,8 +37,10 @@ class CranePose:
 
 @dataclass(frozen=True)
 class LiveState:
-    """A run's last state.json, written silent_s ago, which is under 0 where the system's clock was set back
-    since. now_ns: its clock; may_stand: whether lifts may.
+    """A run's last state.json.
+
+    silent_s: time since it was written; negative if the system's clock was set back since. now_ns: the run's
+    clock. may_stand: whether lifts may stay offered.
     """
 
     phase: str
@@ -48,17 +52,17 @@ class LiveState:
 
     @property
     def is_running(self) -> bool:
-        """Check that it was written a moment ago by a run that goes on."""
+        """Check that a running command wrote it recently."""
         return abs(self.silent_s) <= MAX_SILENCE_S and self.phase not in ("done", "failed")
 
 
 def running_folder(folder: Path) -> Path:
-    """Return the folder of the survey that runs: of a crane's surveys the link `current`."""
+    """Return the folder of the current survey: for a crane's surveys, the link `current`."""
     return folder / "current" if (folder / "current").is_dir() else folder
 
 
 def read_live_state(folder: Path) -> LiveState | None:
-    """Read a run's state.json; None where it is not there or torn."""
+    """Read a run's state.json; None if it is missing or damaged."""
     path = folder / "state.json"
     try:
         told = read_json(path)
@@ -71,7 +75,7 @@ def read_live_state(folder: Path) -> LiveState | None:
 
 
 def read_crane_pose(folder: Path, now_ns: int) -> CranePose | None:
-    """Read the latest pose; None where it is old, or not in the yard. It may be newer than now_ns."""
+    """Read the latest pose; None if it is too old or not in the yard frame. It may be newer than now_ns."""
     try:
         told: dict[str, Any] = read_json(folder / "pose.json")
         stamp_ns = int(told["stamp_ns"])

@@ -33,10 +33,10 @@ class _Header(NamedTuple):
 
 
 def read_vertices(path: Path) -> NDArray[Any]:
-    """Read the element `vertex` as a structured array (N,); a binary one is mapped from disk, not loaded.
+    """Read the element `vertex` as a structured array (N,). A binary one is mapped from disk, not loaded.
 
-    What follows the vertices is not read. Raises ValueError for a file that is no PLY or is cut short, and
-    for lists in the vertices or before them.
+    What follows the vertices isn't read. Raises ValueError for a file that isn't PLY or is cut short, and for
+    lists in or before the vertices.
     """
     with open_regular(path) as file:
         header = _read_header(file)

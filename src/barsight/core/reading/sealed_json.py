@@ -1,4 +1,4 @@
-"""Read and write JSON documents that carry their own digest, so that a changed one is refused."""
+"""Read and write JSON documents that carry their own digest, so that changed ones are refused."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SEAL = "content_sha256"
 
 
 def write_sealed(content: dict[str, Any], target: Path) -> str:
-    """Write JSON's own values and their digest, whole or not at all; return the digest."""
+    """Write a document and its digest, completely or not at all; return the digest."""
     digest = json_digest(content)
     sealed = content | {SEAL: digest}
     text = ",\n".join(f"{json.dumps(name)}: {_lines(value)}" for name, value in sealed.items())
@@ -25,14 +25,14 @@ def write_sealed(content: dict[str, Any], target: Path) -> str:
 
 
 def _lines(value: Any) -> str:
-    """Write a list with an item a line, for people and diffs; indenting everything is far slower."""
+    """Format a list with one item per line, for readers and diffs; full indentation is far slower."""
     if isinstance(value, list) and value:
         return "[\n " + ",\n ".join(json.dumps(item, allow_nan=False) for item in value) + "\n]"
     return json.dumps(value, allow_nan=False)
 
 
 def read_sealed(path: Path, version: int, remedy: str) -> dict[str, Any]:
-    """Read a document. Raises InputError where it is missing, torn, of another version or changed."""
+    """Read a document. Raises InputError if it is missing, damaged, of another version, or changed."""
     content = read_json(path, remedy)
     if not isinstance(content, dict) or "schema_version" not in content:
         raise InputError(path, "has no schema_version", remedy)

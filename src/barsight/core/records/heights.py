@@ -1,4 +1,4 @@
-"""Define the records of heights: their origin, contours, agreement with a reference."""
+"""Define the records of heights: their source, contours, and the agreement with a reference."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from barsight.core.arrays import Bool, Float64, UInt8
 
 
 class HeightSource:
-    """Codes of the origin of a cell's height (`height.tif` band `source`, `contour.csv`)."""
+    """Codes of the source of a cell's height (band `source` of `height.tif`, `contour.csv`)."""
 
     UNKNOWN = 0
     VISION = 1

@@ -22,9 +22,9 @@ class StereoFrame:
 
 @dataclass(frozen=True, eq=False)
 class NamedPoints:
-    """Points of a pair that are known one from another. stamp_ns: cam0's clock.
+    """Identified points of a pair. stamp_ns: cam0's clock.
 
-    names: (N,) int64, each once. left, right: (N, 2) raw px in cam0 and cam1.
+    names: (N,) int64, unique. left, right: (N, 2) raw px in cam0 and cam1.
     """
 
     stamp_ns: int

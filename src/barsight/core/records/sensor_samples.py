@@ -1,4 +1,4 @@
-"""Define the records of what IMU, encoders and laser have read."""
+"""Define the records of what IMU, encoders and laser have measured."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ class ImuSamples:
 
 @dataclass(frozen=True)
 class EncoderJump:
-    """A jump of one encoder's readings, from `stamp_ns` on: bridge, trolley or hoist (axis 0, 1, 2).
+    """A jump in one encoder's readings, from `stamp_ns` on. axis: 0 bridge, 1 trolley, 2 hoist.
 
-    size_m: by how much the readings are taken to have jumped; sigma_m: of that. kind: whether it is sure, may
-    be one, or might be since the readings stood still before.
+    size_m, sigma_m: the estimated jump and its sigma. kind: certain, possible, or suspected because the
+    readings stood still before.
     """
 
     stamp_ns: int
@@ -34,18 +34,20 @@ class EncoderJump:
     kind: Literal["sure", "maybe", "freeze"] = "sure"
 
     def share(self, stamp_ns: Int64) -> Float64:
-        """Return (N,) by how many times its size readings of these stamps are off: 0 or, from it on, 1."""
+        """Return (N,) the factor of the jump's size in readings at these stamps: 0 before it, 1 from it
+        on.
+        """
         return np.where(stamp_ns >= self.stamp_ns, 1.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class CraneSamples:
-    """The encoders' place of the crane's reference point.
+    """Positions of the crane's reference point by the encoders.
 
     stamp_ns: (N,) int64 increasing. position_m: (N, 3) in `yard`: bridge x, trolley y, hoist z.
     crane_to_body_m: (3,) the body's origin minus the crane point, yard axes.
-    yard_from_body_nominal: (3, 3) attitude of the body as mounted. position_std_m: one reading's sigma.
-    jumps: found in the readings and taken off them, in time's order; no fit may reach across one.
+    yard_from_body_nominal: (3, 3) attitude of the body as mounted. position_std_m: sigma of one reading.
+    jumps: found in the readings and subtracted from them, in order of time; no fit may span one.
     """
 
     stamp_ns: Int64

@@ -1,4 +1,4 @@
-"""Define the records of the body's way, and of the rig's drift that it shows."""
+"""Define the records of the body's trajectory, and of the rig's drift that it reveals."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ class PosedFrame:
 
 @dataclass(frozen=True, eq=False)
 class RigDrift:
-    """Rig drift against its calibration as the motion shows it.
+    """Drift of the rig from its calibration, as the motion shows it.
 
-    yaw_rad: how far cam1 has turned about `rect0`'s y axis. scale: by which share the baseline is longer than
-    calibrated, if the encoders' metre is right. covariance: (2, 2) of both. prior_sigma: (2,) what was held
-    possible before. range_m: the points' median depth. by_encoders: whether a known way was there.
+    yaw_rad: rotation of cam1 about `rect0`'s y axis. scale: relative lengthening of the baseline, if the
+    encoders' metre is right. covariance: (2, 2) of both. prior_sigma: (2,) of both before. range_m: the
+    points' median depth. by_encoders: whether a known travel was used.
     """
 
     yaw_rad: float
@@ -55,17 +55,17 @@ class RigDrift:
         return float(self.covariance[1, 1] ** 0.5)
 
     def depth_error_m(self, range_m: float) -> float:
-        """Return the depth error by the uncorrected yaw at `range_m` straight ahead."""
+        """Return the depth error that the uncorrected yaw causes at `range_m` straight ahead."""
         return -self.yaw_rad * range_m**2 / self.baseline_m
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Poses of the frames that could be placed, in time's order, and the refused ones.
+    """Poses of the frames that could be located, in order of time, and the refused frames.
 
-    reference: `yard` or `world`. sensors: which were used. warnings: sentences for the result.
-    drift: of the rig, where the estimate sees it. detail: what else it knows, where it is one of all sensors.
-    doubts: sentences on what makes all of it doubtful, so that no lift may be chosen by it.
+    reference: `yard` or `world`. sensors: the ones used. warnings: sentences for the result. drift: of the
+    rig, if the estimate observes it. detail: further figures of an estimate from all sensors. doubts:
+    sentences on what makes the whole trajectory doubtful, so that no lift may be chosen by it.
     """
 
     reference: str

@@ -1,1 +1,3 @@
-"""Settings: built and checked by their types, read from TOML files, old names refused with the new one."""
+"""Build settings, check them by their types, read them from TOML files, and refuse old names with the new
+one.
+"""

@@ -15,8 +15,8 @@ Settings = TypeVar("Settings")
 def read_settings(path: Path, kind: type[Settings], help_at: str, argument: str) -> Settings:
     """Read settings of `kind` from a TOML file over the defaults.
 
-    help_at: where the keys are explained; argument: which one named the file. Raises InputError for a file
-    that can't be read and ConfigError for a key or value that can't be.
+    help_at: page that explains the keys. argument: the argument that named the file. Raises InputError for a
+    file that can't be read and ConfigError for an unknown key or an invalid value.
     """
     if not path.exists():
         raise InputError(path, "no such file", f"check the path given as {argument}")

@@ -64,7 +64,7 @@ RENAMED = {
     "widest_edge_px": "max_edge_px",
     "widest_m": "max_width_m",
 }
-"""New names of settings by their old ones: of one section, or whatever the section."""
+"""New names of settings by their old ones, of one section or of any."""
 
 
 def refuse_old_keys(content: Mapping[str, Any], section: str = "") -> None:

@@ -19,17 +19,18 @@ from barsight.core.settings.renamed import refuse_old_keys
 Settings = TypeVar("Settings")
 MAX_VALUE = 2**31 - 1
 MAX_NAME_BYTES = 255
-"""Of a file's or folder's name, as Linux, macOS and Windows have it."""
+"""Maximum length of the name of a file or folder on Linux, macOS and Windows."""
 OVER_0, UNDER_1 = math.nextafter(0, 1), math.nextafter(1, 0)
 POSITIVE, NOT_NEGATIVE, SHARE = (OVER_0, math.inf), (0.0, math.inf), (0.0, 1.0)
 """Ranges that `expect_ranges` takes, like (lowest, highest)."""
 
 
 def build_settings(content: Any, kind: type[Settings], name: str = "settings") -> Settings:
-    """Build settings of `kind` from nested mappings over the defaults; those that are of the kind stay.
+    """Build settings of `kind` from nested mappings over the defaults; parts that have their kind already
+    stay.
 
-    name: what `content` itself is called. Raises ConfigError naming a setting that there is not, that is
-    missing or can't be what it is.
+    name: of `content` itself. Raises ConfigError naming a setting that doesn't exist, is missing, or has an
+    invalid value.
     """
     if isinstance(content, Mapping):
         refuse_old_keys(content)
@@ -40,8 +41,8 @@ def build_settings(content: Any, kind: type[Settings], name: str = "settings") -
 
 
 def expect_values(settings: Any, prefix: str = "") -> None:
-    """Raise ConfigError naming a setting, in nested ones too, that isn't of its type or none of its choices,
-    is NaN or too large.
+    """Raise ConfigError naming a setting, nested ones included, that isn't of its type, not one of its
+    choices, NaN, or too large.
     """
     record: Any = type(settings)
     for name, kind in _types_of(record).items():
@@ -52,16 +53,16 @@ def expect_values(settings: Any, prefix: str = "") -> None:
 
 
 def expect_choice(name: str, value: Any, choices: tuple[Any, ...]) -> None:
-    """Raise ConfigError where a value is none of the choices."""
+    """Raise ConfigError if a value isn't one of the choices."""
     if value not in choices:
         *most, last = map(str, choices)
         raise ConfigError(f"{name} is {value!r}; choose {', '.join(most)}{' or ' if most else ''}{last}")
 
 
 def expect_ranges(settings: Any, section: str, **ranges: tuple[float, float]) -> None:
-    """Raise ConfigError naming the first setting that lies outside its range (lowest, highest).
+    """Raise ConfigError naming the first setting outside its range (lowest, highest).
 
-    Of a tuple each value counts; None passes.
+    Each value of a tuple is checked; None passes.
     """
     for name, (low, high) in ranges.items():
         value = getattr(settings, name)
@@ -102,7 +103,7 @@ def _built(content: Mapping[str, Any], kind: Any, prefix: str) -> Any:
 
 
 def _checked(value: Any, kind: Any, name: str) -> Any:
-    """Return a value as its type has it: records of mappings, tuples of lists, paths of texts."""
+    """Convert a value to its type: mappings to records, lists to tuples, texts to paths."""
     if get_origin(kind) in (Union, types.UnionType):
         if value is None:
             return None
