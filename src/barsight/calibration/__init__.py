@@ -1,1 +1,1 @@
-"""Calibrate cameras, stereo rig and IMU; rectify pictures."""
+"""Calibrate cameras, stereo rigs and IMUs, and rectify pictures."""

@@ -1,1 +1,1 @@
-"""Calibration boards, their detection and their warp."""
+"""Describe calibration boards, detect them in pictures and model their warp."""

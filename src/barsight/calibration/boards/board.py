@@ -1,4 +1,4 @@
-"""Parse `board` texts and place the board's points."""
+"""Parse the text form of a board, such as `checkerboard:9x6:0.025`, and compute its points."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ BOARD_FORMS = (
 
 
 class BoardKind(StrEnum):
-    """Patterns of a board."""
+    """Kinds of calibration pattern."""
 
     CHECKERBOARD = "checkerboard"
     CHARUCO = "charuco"
@@ -28,12 +28,13 @@ class BoardKind(StrEnum):
 
 @dataclass(frozen=True)
 class Board:
-    """A flat board.
+    """A flat calibration board.
 
-    columns, rows: inner corners of a checkerboard, squares of a ChArUco board, tags of an AprilGrid.
-    size_m: a square's side, or a tag's outer black edge. marker_m: a ChArUco marker's side, 0 elsewhere.
-    spacing: an AprilGrid's gap as a share of the tag [Kalibr], 0 elsewhere. dictionary: ChArUco's markers.
-    Raises ConfigError where the numbers make no board.
+    columns, rows: number of inner corners of a checkerboard, of squares of a ChArUco board, or of tags of an
+    AprilGrid. size_m: side of a square, or side of a tag measured over its black border. marker_m: side of a
+    ChArUco marker, 0 for other boards. spacing: gap between the tags of an AprilGrid as a fraction of the tag
+    size [Kalibr], 0 for other boards. dictionary: marker dictionary of a ChArUco board.
+    Raises ConfigError where the numbers do not describe a board.
     """
 
     kind: BoardKind
@@ -57,10 +58,10 @@ class Board:
 
     @property
     def points_m(self) -> Float64:
-        """Return the board's points (N, 3) at z = 0, indexed by the ids that detections carry.
+        """Return the board's points (N, 3) in metres at z = 0, indexed by the ids that detections carry.
 
-        Checkerboard and ChArUco: inner corners row by row. AprilGrid: four corners a tag, tag after tag, from
-        the lower left counter-clockwise, tags row by row from below [Kalibr].
+        Checkerboard and ChArUco: inner corners row by row. AprilGrid: four corners per tag, counter-clockwise
+        from the lower left, with the tags row by row from the bottom [Kalibr].
         """
         if self.kind is BoardKind.APRILGRID:
             step = self.size_m * (1 + self.spacing)
@@ -81,7 +82,7 @@ class Board:
 
 
 def parse_board(text: str) -> Board:
-    """Parse a text such as `checkerboard:9x6:0.025`. Raises ConfigError naming the forms."""
+    """Parse a text such as `checkerboard:9x6:0.025`. Raises ConfigError that lists the accepted forms."""
     kind, *rest = text.strip().split(":")
     counts = {"checkerboard": (2,), "charuco": (3, 4), "aprilgrid": (3,)}
     try:

@@ -1,4 +1,4 @@
-"""Hold corners per picture, pairs of pictures, and removed ones."""
+"""Hold the corners detected in each picture, the views of a camera pair, and the views left out."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from barsight.core.arrays import Bool, Float64, Int64, expect_shape
 
 @dataclass(frozen=True, eq=False)
 class Corners:
-    """ids: (N,) int64 indices into the board's points, each once. pixels: (N, 2) raw px.
+    """Corners of a board detected in one picture.
 
-    edge_px: the width of the board's black-white edges in the picture (blur), NaN where not known.
+    ids: (N,) int64 indices into the board's points, each at most once. pixels: (N, 2) raw px. edge_px: width
+    of the board's black-white edges in the picture, a measure of blur; NaN where it is unknown.
     """
 
     ids: Int64
@@ -24,13 +25,13 @@ class Corners:
         expect_shape("pixels", self.pixels, (self.ids.size, 2))
 
     def keep(self, mask: Bool) -> Corners:
-        """Select the corners where `mask` (N,) is true."""
+        """Select the corners for which `mask` (N,) is true."""
         return Corners(self.ids[mask], self.pixels[mask], self.edge_px)
 
 
 @dataclass(frozen=True, eq=False)
 class BoardView:
-    """One moment: the board in cam0 and in cam1, None where that camera doesn't see (enough of) it."""
+    """The board as cam0 and cam1 see it at one moment; None for a camera that does not see enough of it."""
 
     name: str
     cam0: Corners | None
@@ -38,13 +39,16 @@ class BoardView:
 
     @property
     def cameras(self) -> tuple[Corners | None, Corners | None]:
-        """Return both cameras' corners."""
+        """Return the corners of cam0 and of cam1."""
         return self.cam0, self.cam1
 
 
 @dataclass(frozen=True)
 class Removed:
-    """Something left out of the solve. view: its name; camera: cam0, cam1 or both; reason: a sentence."""
+    """A view, picture or corners left out of the solve.
+
+    view: name of the view. camera: cam0, cam1 or both. reason: a sentence.
+    """
 
     view: str
     camera: str
@@ -52,7 +56,9 @@ class Removed:
 
 
 def common_corners(view: BoardView) -> tuple[Int64, Float64, Float64]:
-    """Intersect both cameras' corners: ids (N,) and their pixels (N, 2) in cam0 and in cam1."""
+    """Return the ids (N,) of the corners that both cameras see, with their pixels (N, 2) in cam0 and in
+    cam1.
+    """
     if view.cam0 is None or view.cam1 is None:
         return np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2))
     ids, first, second = np.intersect1d(view.cam0.ids, view.cam1.ids, return_indices=True)

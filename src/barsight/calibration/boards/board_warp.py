@@ -1,8 +1,8 @@
-"""Model a board's deviation from flat and from its stated size by a few parameters [mrcal].
+"""Model a board's deviation from flatness and from its stated size with a few parameters [mrcal].
 
-A parabola along each of its axes, zero at the ends; the print's stretch and skew; for an AprilGrid the tags'
-size about their centres. The mean pitch from tag to tag (square to square) stays the stated one: it is the
-calibration's metre.
+The parameters are a parabolic bow along each axis, zero at the ends; the stretch and skew of the print; and,
+for an AprilGrid, the tag size about the tag centres. The mean pitch from tag to tag (or square to square)
+stays as stated, since it sets the metric scale of the calibration.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ from barsight.core.arrays import Float64
 BOW_SIGMA_M = 2e-3
 TAG_SIGMA = 0.01
 PRINT_SIGMA = 3e-3
-"""What is expected of boards before any is seen: weak, so that only few views are held by it."""
+"""Prior standard deviations of a board's shape: bow (m), tag size (ratio), and stretch (ratio) and skew (rad)
+of the print. The priors are weak, so they matter only when there are few views.
+"""
 WORDS = {
     "bow_x_m": ("bow along x", 1e3, "mm"),
     "bow_y_m": ("along y", 1e3, "mm"),
@@ -30,11 +32,11 @@ WORDS = {
 
 @dataclass(frozen=True, eq=False)
 class BoardShape:
-    """A board's shape as found.
+    """A board's estimated shape.
 
-    values: (S,) bow_x_m and bow_y_m, the middle's height along the board's z over its ends; stretch_share, by
-    how much x is longer than y; skew_rad, by how much the angle between x and y is less than a right one;
-    tag_share, by how much the tags are larger than stated. covariance: (S, S).
+    values: (S,), of which bow_x_m and bow_y_m are the height of the board's middle above its ends along z;
+    stretch_share is the excess of x over y as a fraction; skew_rad is a right angle minus the angle between x
+    and y; tag_share is the fraction by which the tags are larger than stated. covariance: (S, S).
     """
 
     names: tuple[str, ...]
@@ -43,7 +45,7 @@ class BoardShape:
 
     @property
     def sigma(self) -> Float64:
-        """Return one standard deviation (S,) of each."""
+        """Return the standard deviation (S,) of each value."""
         return np.sqrt(np.diag(self.covariance))
 
     def __str__(self) -> str:
@@ -62,7 +64,7 @@ class BentBoard(Board):
 
     @property
     def points_m(self) -> Float64:
-        """Return the points (N, 3) of the flat board, moved by the shape."""
+        """Return the points (N, 3) of the flat board, displaced by the shape."""
         flat = super().points_m
         moved: Float64 = flat + _basis(self.kind, flat) @ np.array(self.shape)
         return moved
@@ -76,7 +78,7 @@ class BentBoard(Board):
 
 
 def apply_shape(board: Board, shape: Mapping[str, float]) -> BentBoard:
-    """Apply shape parameters by name to a board. Raises KeyError where one is missing."""
+    """Apply named shape parameters to a board. Raises KeyError where one is missing."""
     values = tuple(shape[name] for name in _names(board))
     return BentBoard(
         board.kind, board.columns, board.rows, board.size_m, board.marker_m, board.spacing, board.dictionary,
@@ -85,20 +87,20 @@ def apply_shape(board: Board, shape: Mapping[str, float]) -> BentBoard:
 
 
 def board_shape(board: Board, steps: Float64, covariance: Float64) -> BoardShape:
-    """Build the shape of (S,) steps along `shape_basis` and their covariance (S, S)."""
+    """Build the board shape from (S,) steps along `shape_basis` and their covariance (S, S)."""
     unit = _units(board)
     return BoardShape(_names(board), unit * steps, covariance * unit[:, None] * unit)
 
 
 def shape_basis(board: Board) -> Float64:
-    """Compute the displacement (N, 3, S) m of the board's points by each shape parameter, in its
-    prior sigma.
+    """Compute the displacement (N, 3, S), in metres, of the board's points for a step of one prior sigma in
+    each shape parameter.
     """
     return _basis(board.kind, board.points_m) * _units(board)
 
 
 def _basis(kind: BoardKind, points: Float64) -> Float64:
-    """Compute displacements (N, 3, S) m per unit of each parameter, for flat points (N, 3)."""
+    """Compute the displacement (N, 3, S), in metres, of flat points (N, 3) per unit of each parameter."""
     low, high = points.min(axis=0), points.max(axis=0)
     across = (2 * points - low - high)[:, :2] / (high - low)[:2]
     basis = np.zeros((len(points), 3, len(WORDS) if kind is BoardKind.APRILGRID else len(WORDS) - 1))

@@ -19,8 +19,9 @@ MAX_CROSSINGS, MIN_ALIKE = 0.75, 0.6
 def detect(board: Board, image: UInt8) -> Corners | Failed:
     """Detect the board's corners in one gray picture (H, W).
 
-    Failed `no-board` where it isn't found; for a checkerboard the reason says which other one the picture
-    shows. AprilGrid and ChArUco boards count when half seen, checkerboards only whole.
+    Failed `no-board` where the board isn't found; for a checkerboard, the reason names the other checkerboard
+    that the picture shows, if any. An AprilGrid or ChArUco board may be partly visible; a checkerboard must
+    be whole.
     """
     if board.kind is BoardKind.APRILGRID:
         return detect_aprilgrid(board, image)
@@ -50,10 +51,10 @@ def _detect_checkerboard(board: Board, image: UInt8) -> Corners | Failed:
 
 
 def _chessboard_corners(image: UInt8, size: tuple[int, int]) -> Float64 | None:
-    """Find a checkerboard's corners (N, 1, 2) by three detectors, the fastest first.
+    """Find a checkerboard's corners (N, 1, 2) with three detectors, the fastest first.
 
-    The last, sector-based and exhaustive [Duda 2018], takes about a second of 1.3 MP without a board, and
-    finds small, tilted and badly lit ones that the others miss.
+    The last one, sector-based and exhaustive [Duda 2018], takes about a second on a 1.3 MP picture without a
+    board, and finds small, tilted and badly lit boards that the others miss.
     """
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
     found, corners = cv2.findChessboardCorners(image, size, flags=flags | cv2.CALIB_CB_FAST_CHECK)
@@ -66,7 +67,7 @@ def _chessboard_corners(image: UInt8, size: tuple[int, int]) -> Float64 | None:
 
 
 def _refine(image: UInt8, grid: Float64) -> Float64:
-    """Refine corners by gradient orthogonality [Foerstner 1987], in a window that stays inside the
+    """Refine corners by gradient orthogonality [Foerstner 1987] in a window that stays within the adjoining
     squares.
     """
     steps = np.concatenate([
@@ -83,7 +84,7 @@ def _refine(image: UInt8, grid: Float64) -> Float64:
 
 
 def _is_grid(grid: Float64) -> bool:
-    """Check that neighbouring grid steps change slowly; a false detection jumps."""
+    """Check that neighbouring grid steps change slowly; in a false detection they jump."""
     for axis in (0, 1):
         steps = np.diff(grid, axis=axis)
         bends = np.linalg.norm(np.diff(steps, axis=axis), axis=2)
@@ -93,7 +94,9 @@ def _is_grid(grid: Float64) -> bool:
 
 
 def _goes_on(image: UInt8, grid: Float64) -> bool:
-    """Check whether the squares go on past a side of the grid: the places one step out are crossings too."""
+    """Check whether the pattern continues beyond a side of the grid: the points one step out are crossings
+    too.
+    """
     for side in (grid, grid[::-1], grid.transpose(1, 0, 2), grid.transpose(1, 0, 2)[::-1]):
         outward = side[0] - side[1]
         steps = np.linalg.norm(outward, axis=1)
@@ -111,7 +114,9 @@ def _goes_on(image: UInt8, grid: Float64) -> bool:
 
 
 def _is_crossing(image: UInt8, place: Float64, step: float) -> bool:
-    """Check for a saddle: four changes on a ring about the corner near a place, opposite sides alike."""
+    """Check for a saddle point near a place: a ring around it shows four changes, with opposite sides
+    alike.
+    """
     half = max(int(0.25 * step), 2)
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
     start = place.reshape(1, 1, 2).astype(np.float32)
@@ -130,11 +135,11 @@ def _is_crossing(image: UInt8, place: Float64, step: float) -> bool:
 
 
 def _canonical(board: Board, grid: Float64, image: UInt8) -> Float64:
-    """Order the corners the way both cameras agree on.
+    """Order the corners so that both cameras agree.
 
-    Mirrored orders are turned right-handed. Where columns + rows is odd the colours tell the ends apart (the
-    square inside the first corner is dark); elsewhere the board looks the same turned by half, and the order
-    that runs to the right (or down) is taken, which two cameras side by side see alike.
+    Mirrored orders are made right-handed. Where columns + rows is odd, the colours distinguish the two ends
+    (the square inside the first corner is dark). Otherwise the board looks the same after half a turn, and
+    the order that runs to the right (or down) is taken, which is the same for two cameras side by side.
     """
     across, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
     if across[0] * down[1] - across[1] * down[0] < 0:
@@ -153,10 +158,11 @@ def _square_brightness(image: UInt8, grid: Float64) -> float:
 
 
 def edge_width(image: UInt8, grid: Float64) -> float:
-    """Measure the edge width (px) between a checkerboard's squares: brightness step over steepest slope.
+    """Measure the edge width (px) between a checkerboard's squares as the brightness step over the steepest
+    slope.
 
-    grid: (rows, columns, 2) corners. The larger of both directions' medians, so that a smear along one of
-    them shows; NaN where no edge has contrast.
+    grid: (rows, columns, 2) corners. Returns the larger of the medians of the two directions, so that smear
+    along one of them shows; NaN where no edge has contrast.
     """
     widths = []
     for axis in (0, 1):
@@ -183,7 +189,9 @@ def edge_width(image: UInt8, grid: Float64) -> float:
 
 
 def _shown_size(board: Board, image: UInt8) -> tuple[int, int] | None:
-    """Find columns and rows of another checkerboard; None for none, or for a part of the wanted one."""
+    """Find the columns and rows of a different checkerboard in the picture; None where there is none or only
+    part of the wanted board.
+    """
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
     found, corners, meta = cv2.findChessboardCornersSBWithMeta(image, (3, 3), flags)
     if not found or corners is None:

@@ -1,6 +1,7 @@
-"""Read corners detected elsewhere: `cam0_detections.npz` and `cam1_detections.npz`.
+"""Read corners that were detected elsewhere, from `cam0_detections.npz` and `cam1_detections.npz`.
 
-Each holds `detections`, a structured array of stamp_ns, tag, corner, u, v (px) and x, y, z (m, on the board).
+Each file holds `detections`, a structured array of stamp_ns, tag, corner, u, v (px) and x, y, z (m, on the
+board).
 """
 
 from __future__ import annotations
@@ -22,19 +23,21 @@ SAME_POINT = 0.02
 
 
 def has_detections(folder: Path) -> bool:
-    """Check whether `folder` holds detections of both cameras."""
+    """Check whether `folder` holds the detections of both cameras."""
     return all((folder / name).is_file() for name in NAMES)
 
 
 def read_detections(folder: Path, board: Board) -> list[BoardView]:
-    """Read one view per stamp that either camera has. Raises CalibrationError for files that don't fit."""
+    """Read one view for each stamp of either camera. Raises CalibrationError where the files don't fit the
+    board.
+    """
     cameras = [_read(folder / name, board) for name in NAMES]
     stamps = sorted({*cameras[0], *cameras[1]})
     return [BoardView(str(stamp), cameras[0].get(stamp), cameras[1].get(stamp)) for stamp in stamps]
 
 
 def read_rows(path: Path, fields: tuple[str, ...] = FIELDS) -> Any:
-    """Read the structured array of one camera.
+    """Read one camera's structured array.
 
     Raises CalibrationError where a field is missing or not finite.
     """

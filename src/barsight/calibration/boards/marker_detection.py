@@ -1,4 +1,6 @@
-"""Detect AprilGrid and ChArUco boards: markers carry numbers, so a half-seen board counts."""
+"""Detect AprilGrid and ChArUco boards, whose numbered markers identify the corners of a partly visible
+board.
+"""
 
 from __future__ import annotations
 
@@ -13,18 +15,22 @@ from barsight.core.errors import ConfigError, Failed
 FEWEST_TAGS = 4
 FEWEST_CORNERS = 8
 BORDER_BITS = (2, 1)
-"""Kalibr prints its tags with a black border of two cells, others with one."""
+"""Border widths to try, in cells: Kalibr prints its tags with a black border of two cells, others use one."""
 TAG_FAMILY = "36h11"
 TAG_MODULES, TAG_QUIET = 8, 1
-"""Modules along a side of a tag 36h11, its black border counted, and of white around it."""
+"""Modules along a side of a 36h11 tag including its black border, and modules of white quiet zone around
+it.
+"""
 MAX_FIT_PX = 2.0
-"""A fit that ends further from where it began is another minimum."""
+"""Maximum distance (px) that a fit may move a corner, or a tenth of the tag's side where that is more."""
 BLUR_PX = 0.5
-"""Blur of lens and pixel that a fitted tag is drawn with."""
+"""Blur (px) of lens and pixel with which the template of a tag is drawn for fitting."""
 
 
 def detect_charuco(board: Board, image: UInt8) -> Corners | Failed:
-    """Detect the inner corners of a ChArUco board, new or legacy pattern. Failed `no-board`."""
+    """Detect the inner corners of a ChArUco board with the current or the legacy pattern. Failed
+    `no-board`.
+    """
     dictionary = _dictionary(board.dictionary)
     size = (board.columns, board.rows)
     best: tuple[Int64, Float64] | None = None
@@ -45,10 +51,11 @@ def detect_charuco(board: Board, image: UInt8) -> Corners | Failed:
 
 
 def detect_aprilgrid(board: Board, image: UInt8) -> Corners | Failed:
-    """Detect tag corners of an AprilGrid (36h11). Failed `no-board` with fewer than four tags not in a row.
+    """Detect the tag corners of an AprilGrid (36h11).
 
-    How each tag is turned on its place differs between printers, so it is taken from the places of the tags'
-    centres, not from the tags.
+    Printers differ in how they turn each tag on its place, so the orientation follows from the positions of
+    the tag centres rather than from the tags. Failed `no-board` unless there are four tags that aren't in one
+    row.
     """
     found = max((_tags(image, bits) for bits in BORDER_BITS), key=lambda tags: len(tags[0]))
     numbers, quads = found
@@ -68,7 +75,7 @@ def detect_aprilgrid(board: Board, image: UInt8) -> Corners | Failed:
 
 
 def _tags(image: UInt8, border_bits: int) -> tuple[Int64, Float64]:
-    """Detect tags: numbers (N,), quads (N, 4, 2); a number seen twice is dropped."""
+    """Detect tags: numbers (N,) and quads (N, 4, 2). A number seen twice is dropped."""
     ids, quads = find_tags(image, border_bits)
     numbers, counts = np.unique(ids, return_counts=True)
     once = np.isin(ids, numbers[counts == 1])
@@ -76,8 +83,8 @@ def _tags(image: UInt8, border_bits: int) -> tuple[Int64, Float64]:
 
 
 def find_tags(image: UInt8, border_bits: int = 1, family: str = TAG_FAMILY) -> tuple[Int64, Float64]:
-    """Detect AprilTags: numbers (N,) in order, corners (N, 4, 2) to a pixel or so, each tag's in its own
-    order.
+    """Detect AprilTags: numbers (N,) in ascending order, and corners (N, 4, 2) accurate to about a pixel, in
+    each tag's own corner order.
     """
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = border_bits
@@ -92,16 +99,16 @@ def find_tags(image: UInt8, border_bits: int = 1, family: str = TAG_FAMILY) -> t
 
 
 def tag_pattern(number: int) -> UInt8:
-    """Draw a tag 36h11 (S, S), one module a cell, 0 dark, with its quiet zone."""
+    """Draw a 36h11 tag (S, S) with its quiet zone, one cell per module, 0 for dark."""
     drawn = cv2.aruco.generateImageMarker(_dictionary(f"DICT_APRILTAG_{TAG_FAMILY}"), number, TAG_MODULES)
     return np.pad(np.asarray(drawn, np.uint8), TAG_QUIET, constant_values=255)
 
 
 def fit_tag(image: UInt8, number: int, quad: Float64) -> Float64 | None:
-    """Fit the whole pattern of a tag 36h11 to a picture [Evangelidis 2008], from corners (4, 2) known to a
-    pixel or so; the corners, or None where it doesn't fit.
+    """Fit the whole pattern of a 36h11 tag to a picture [Evangelidis 2008], starting from corners (4, 2)
+    accurate to about a pixel. Returns the corners, or None where the pattern doesn't fit.
 
-    Every edge counts, not the outer corners alone, and blur that is the same on all sides moves nothing.
+    Every edge contributes, not just the outer corners, so blur that is equal on all sides causes no shift.
     """
     low = np.maximum(np.floor(quad.min(axis=0) - 0.4 * np.ptp(quad, axis=0)).astype(int), 0)
     high = np.ceil(quad.max(axis=0) + 0.4 * np.ptp(quad, axis=0)).astype(int) + 1
@@ -110,7 +117,7 @@ def fit_tag(image: UInt8, number: int, quad: Float64) -> Float64 | None:
     cell = max(2, int(np.ceil(side / TAG_MODULES)))
     drawn = np.kron(tag_pattern(number), np.ones((cell, cell))).astype(np.float32)
     drawn = cv2.GaussianBlur(drawn, (0, 0), BLUR_PX * cell * TAG_MODULES / side)
-    edge = cell // 2  # what lies beside the paper blurs into its rim
+    edge = cell // 2  # the background blurs into the rim of the paper
     drawn = np.ascontiguousarray(drawn[edge:-edge, edge:-edge])
     near, far = TAG_QUIET * cell - edge - 0.5, (TAG_QUIET + TAG_MODULES) * cell - edge - 0.5
     corners = np.array([[near, near], [far, near], [far, far], [near, far]], np.float32)
@@ -118,14 +125,14 @@ def fit_tag(image: UInt8, number: int, quad: Float64) -> Float64 | None:
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-6)
     try:
         _, found = cv2.findTransformECC(drawn, patch, start, cv2.MOTION_HOMOGRAPHY, criteria, None, 1)
-    except cv2.error:  # it doesn't converge
+    except cv2.error:  # no convergence
         return None
     fitted = cv2.perspectiveTransform(corners[None].astype(np.float64), found.astype(np.float64))[0] + low
     return fitted if np.abs(fitted - quad).max() <= max(MAX_FIT_PX, 0.1 * side) else None
 
 
 def _turn(corners: Float64, quads: Float64) -> Float64 | Failed:
-    """Reorder each quad's corners (N, 4, 2) to the order of the board's `corners` (N, 4, 2)."""
+    """Reorder the corners of each quad (N, 4, 2) to match the board's `corners` (N, 4, 2)."""
     homography, _ = cv2.findHomography(corners.mean(axis=1), quads.mean(axis=1), cv2.RANSAC, 5.0)
     if homography is None or abs(np.linalg.det(homography)) < 1e-12:
         return Failed("no-board", "the tags in sight lie on one line")

@@ -1,7 +1,7 @@
-"""Find circular coded targets: a dark disc on white paper with a coded ring about it [Schneider 1991].
+"""Find circular coded targets: a dark disc on white paper, surrounded by a coded ring [Schneider 1991].
 
-The ring lies from 2 to 3 radii of the disc, in twelve sectors of white or dark; white paper reaches to 4. A
-target's number is that of its sectors among all that are no turn of each other.
+The ring extends from 2 to 3 disc radii in twelve sectors, each white or dark, and the white paper to 4. A
+target's number is the index of its code among all codes that differ by more than a rotation.
 """
 
 from __future__ import annotations
@@ -16,25 +16,25 @@ from barsight.core.arrays import Float32, Float64, Int64, UInt8
 
 SECTORS = 12
 INNER, OUTER, PAPER = 2.0, 3.0, 4.0
-"""The ring and the paper, in radii of the disc."""
+"""Inner and outer radius of the ring and radius of the paper, in disc radii."""
 MIN_RADIUS_PX = 2.5
 MIN_CONTRAST = 25.0
-"""Gray levels between the disc and the paper about it."""
+"""Minimum contrast between the disc and the paper around it, in gray levels."""
 WINDOWS = 11, 23, 51
-"""Sides of the windows that a pixel is called dark by, px."""
+"""Window sides (px) of the adaptive threshold that separates dark pixels."""
 SAMPLES = 10
-"""Places along a sector at which the ring is read."""
+"""Number of samples along each sector of the ring."""
 MIN_AGREE = 0.85
-"""Least share of a sector's places that agree, the outer ones left out."""
+"""Minimum share of a sector's samples that must agree, not counting the samples at its two ends."""
 RAYS = 64
 MAX_OVAL = 1.15
-"""Most by which a round disc's axes differ: what isn't known beside it makes it longer."""
+"""Maximum ratio of the axes of a disc that counts as round; clutter next to a disc elongates its outline."""
 
 
 @cache
 def ring_codes() -> tuple[int, ...]:
-    """List the codes, the smallest of their turns each: 4, 6 or 8 dark sectors, so that one sector read
-    wrongly makes no other code.
+    """List the codes, each as the smallest of its rotations. They have 4, 6 or 8 dark sectors, so a single
+    misread sector never yields another code.
     """
     smallest = sorted({min(_turned(code, by) for by in range(SECTORS)) for code in range(1 << SECTORS)})
     return tuple(code for code in smallest if code.bit_count() in (4, 6, 8))
@@ -45,7 +45,7 @@ def _turned(code: int, by: int) -> int:
 
 
 def ring_pattern(number: int, cells: int = 240) -> UInt8:
-    """Draw a target (cells, cells), 0 dark, as far as its paper reaches."""
+    """Draw a target (cells, cells) up to the edge of its paper, 0 for dark."""
     code = ring_codes()[number]
     y, x = (np.indices((cells, cells)) + 0.5) * 2 * PAPER / cells - PAPER
     radius, sector = np.hypot(x, y), np.floor(np.arctan2(y, x) % (2 * np.pi) / (2 * np.pi) * SECTORS)
@@ -55,10 +55,11 @@ def ring_pattern(number: int, cells: int = 240) -> UInt8:
 
 
 def find_rings(image: UInt8) -> tuple[Int64, Float64]:
-    """Find coded targets: numbers (N,) in order, and of each a square (N, 4, 2) about the disc's middle.
+    """Find coded targets: numbers (N,) in ascending order and, for each, a square (N, 4, 2) around the disc
+    centre.
 
-    The middle is that of the ellipse through the disc's edge, to a few hundredths of a pixel. A tilted disc's
-    own middle lies beside it by no more than the disc's size in the picture squared over the focal length.
+    The centre is that of the ellipse fitted to the disc's edge, accurate to a few hundredths of a pixel. The
+    true centre of a tilted disc differs from it by no more than its image size squared over the focal length.
     """
     found: dict[tuple[int, int], tuple[int, Float64]] = {}
     smooth = image.astype(np.float32)
@@ -74,8 +75,8 @@ def find_rings(image: UInt8) -> tuple[Int64, Float64]:
 
 
 def nearest_disc(image: UInt8, pixel: Float64, reach_px: float) -> Float64 | None:
-    """Find the round disc, dark on bright or bright on dark, whose middle lies nearest to a pixel (2,):
-    middle and radius (3,), or None where none lies within reach.
+    """Find the round disc, dark on bright or bright on dark, whose centre is nearest to a pixel (2,). Returns
+    centre and radius (3,) in px, or None where there is none within reach.
     """
     best, nearest = None, reach_px
     for gray in (image, 255 - image):
@@ -87,7 +88,7 @@ def nearest_disc(image: UInt8, pixel: Float64, reach_px: float) -> Float64 | Non
 
 
 def _dark_discs(image: UInt8) -> Iterator[Float64]:
-    """Yield ellipses (5,) through the edges of dark discs, some more than once."""
+    """Yield ellipses (5,) fitted to the edges of dark discs; some discs occur more than once."""
     smooth = image.astype(np.float32)
     for window in WINDOWS:
         dark = cv2.adaptiveThreshold(
@@ -100,7 +101,7 @@ def _dark_discs(image: UInt8) -> Iterator[Float64]:
 
 
 def _without_doubles(ones: list[tuple[int, Float64]]) -> list[tuple[int, Float64]]:
-    """Keep one of two finds within three pixels of each other."""
+    """Keep only one of several targets found within three pixels of each other."""
     kept: list[tuple[int, Float64]] = []
     for number, square in ones:
         if all(np.linalg.norm(square.mean(0) - other.mean(0)) > 3 for _, other in kept):
@@ -109,7 +110,7 @@ def _without_doubles(ones: list[tuple[int, Float64]]) -> list[tuple[int, Float64
 
 
 def _discs(dark: UInt8) -> list[Float64]:
-    """List ellipses (5,) x, y, half axes, turn (rad) of dark spots that are about elliptic."""
+    """List the ellipses (5,) of roughly elliptical dark spots: x, y, semi-axes (px) and rotation (rad)."""
     contours, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     out = []
     for contour in contours:
@@ -125,8 +126,8 @@ def _discs(dark: UInt8) -> list[Float64]:
 
 
 def _fitted(image: Float32, ellipse: Float64) -> Float64 | None:
-    """Fit the ellipse again through the places where the edge is half dark, half bright; None where it is no
-    dark disc on bright paper.
+    """Refit the ellipse to the points where the edge is halfway between dark and bright; None where it is not
+    a dark disc on bright paper.
     """
     angles = np.arange(RAYS) * 2 * np.pi / RAYS
     for _ in range(2):
@@ -153,7 +154,7 @@ def _fitted(image: Float32, ellipse: Float64) -> Float64 | None:
 
 
 def _number(image: Float32, ellipse: Float64) -> int | None:
-    """Read the ring; None where it isn't one."""
+    """Read the target's number from the ring; None where there is no valid ring."""
     count = SECTORS * SAMPLES
     angles = (np.arange(count) + 0.5) * 2 * np.pi / count
     disc, gap, ring, paper = _sampled(image, ellipse, angles, np.array([0.3, 1.5, 2.5, 3.5])).T
@@ -161,7 +162,7 @@ def _number(image: Float32, ellipse: Float64) -> int | None:
     if (gap < middle).mean() > 0.05 or (paper < middle).mean() > 0.1:
         return None
     dark = ring < middle
-    # Sectors begin where most changes are.
+    # Sector borders are where the most changes between dark and white are.
     changes = np.flatnonzero(dark != np.roll(dark, 1)) % SAMPLES
     if changes.size < 2:
         return None
@@ -176,9 +177,9 @@ def _number(image: Float32, ellipse: Float64) -> int | None:
 
 
 def _places(ellipse: Float64, angles: Float64, shares: Float64) -> Float64:
-    """Place points (A, S, 2) at angles and shares (S,) or (A, S) of the ellipse's radius.
+    """Compute points (A, S, 2) at given angles and fractions (S,) or (A, S) of the ellipse's radius.
 
-    The angles are those on the disc: the ellipse's own axes turned back.
+    The angles refer to the picture's axes; the rotation of the ellipse's own axes is taken off first.
     """
     x, y, a, b, turn = ellipse
     c, s = np.cos(angles - turn)[:, None], np.sin(angles - turn)[:, None]

@@ -1,1 +1,1 @@
-"""IMU noise and camera-IMU calibration on a continuous-time spline."""
+"""Estimate IMU noise and calibrate cameras against an IMU with a continuous-time spline."""

@@ -1,8 +1,8 @@
 """Fit an IMU's noise model to a log at rest by Allan deviation.
 
 The overlapping Allan variance of a rate with white noise N, flicker B and random walk K is
-N^2 / tau + (2 ln 2 / pi) B^2 + K^2 tau / 3 [IEEE Std 952]; the three are fitted to all octaves of tau at
-once, each weighted by its degrees of freedom.
+N^2 / tau + (2 ln 2 / pi) B^2 + K^2 tau / 3 [IEEE Std 952]. All three are fitted together over all octaves of
+tau, each weighted by its degrees of freedom.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ MAX_GYRO_CHANGE, MAX_ACCEL_CHANGE = 0.05, 0.5
 
 @dataclass(frozen=True, eq=False)
 class AxisNoise:
-    """One axis. tau_s, deviation, freedom: (T,) its Allan deviation and degrees of freedom.
+    """Noise of one sensor axis. tau_s, deviation, freedom: (T,) Allan deviation and its degrees of freedom.
 
-    density, walk, instability: N (unit / sqrt(Hz)), K (unit / s / sqrt(Hz)), B (unit); *_sigma: one standard
-    deviation of each; 0 where the log shows none of it, and then its sigma is the least that would show.
+    density, walk, instability: N (unit / sqrt(Hz)), K (unit / s / sqrt(Hz)) and B (unit), 0 where the log
+    shows none. *_sigma: standard deviation of each; where the value is 0, the smallest value that would show.
     """
 
     name: str
@@ -46,14 +46,18 @@ class AxisNoise:
     instability_sigma: float
 
     def model(self, tau_s: Float64) -> Float64:
-        """Evaluate the fitted Allan deviation (T,)."""
+        """Evaluate the fitted Allan deviation (T,) at averaging times tau_s (T,)."""
         curve: Float64 = np.sqrt(_terms(tau_s) @ np.square([self.density, self.instability, self.walk]))
         return curve
 
 
 @dataclass(frozen=True, eq=False)
 class ImuNoiseFit:
-    """axes: gyro x y z (rad/s), accel x y z (m/s^2). duration_s: without gaps; gaps: their count."""
+    """Noise fitted to a log.
+
+    axes: gyro x, y, z (rad/s), then accelerometer x, y, z (m/s^2). duration_s: length of the log without its
+    gaps. gaps: number of gaps.
+    """
 
     axes: tuple[AxisNoise, ...]
     rate_hz: float
@@ -62,9 +66,10 @@ class ImuNoiseFit:
 
     @property
     def noise(self) -> ImuNoise:
-        """Return Kalibr's four numbers, of the noisiest axis each, so that no axis is trusted too far.
+        """Return Kalibr's four numbers, each from the noisiest axis, so that no axis is trusted too much.
 
-        A walk that the log doesn't show is given its sigma, the least that would show, not 0.
+        A random walk that does not show in the log is set to its sigma, the smallest value that would show,
+        not to 0.
         """
         gyro, accel = self.axes[:3], self.axes[3:]
         return ImuNoise(
@@ -74,10 +79,11 @@ class ImuNoiseFit:
 
 
 def fit_imu_noise(samples: ImuSamples) -> ImuNoiseFit | Failed:
-    """Fit the noise of an IMU at rest.
+    """Fit the noise model of an IMU at rest.
 
-    Stamps may jitter; where some are missing, the stretches between the gaps are used side by side. Failed
-    `too-short` below 2000 samples, `moving` where a second's mean changes as no resting IMU's does.
+    Stamps may jitter. Where samples are missing, the stretches between the gaps are evaluated together.
+    Failed `too-short` below 2000 samples, `moving` where the mean over a second changes more than that of a
+    resting IMU.
     """
     step = float(np.median(np.diff(samples.stamp_ns))) / NS_PER_S
     bounds = _stretches(samples.stamp_ns, step)
@@ -100,7 +106,7 @@ def fit_imu_noise(samples: ImuSamples) -> ImuNoiseFit | Failed:
 
 
 def _stretches(stamp_ns: Int64, step_s: float) -> Int64:
-    """Find the indices where the log begins, goes on after a gap, and ends."""
+    """Find the indices at which the log begins, resumes after a gap, and ends."""
     gaps = np.flatnonzero(np.diff(stamp_ns) > GAP_STEPS * step_s * NS_PER_S) + 1
     return np.concatenate([[0], gaps, [stamp_ns.size]]).astype(np.int64)
 
@@ -144,7 +150,7 @@ def _fit_axis(name: str, stretches: list[Float64], rate: float) -> AxisNoise:
 
 
 def _allan(stretches: list[Float64], rate: float) -> tuple[Float64, Float64, Float64]:
-    """Compute tau (s), Allan variance and sample count, octave by octave, of all stretches."""
+    """Compute tau (s), Allan variance and sample count for each octave over all stretches."""
     total: dict[int, list[float]] = {}
     for values in stretches:
         octaves = 2 ** np.arange(int(np.log2(values.size / 5)) + 1)
@@ -158,11 +164,11 @@ def _allan(stretches: list[Float64], rate: float) -> tuple[Float64, Float64, Flo
 
 
 def overlapping_allan_variance(values: Float64, steps: Int64) -> Float64:
-    """Return (T,): overlapping Allan variance of evenly sampled values at averaging times of `steps` samples
-    each.
+    """Compute the overlapping Allan variance (T,) of evenly sampled values at averaging times of `steps`
+    samples.
 
-    Half the mean square of the difference of neighbouring averages [NIST SP 1065]. steps: (T,), each
-    at most half of the samples.
+    It is half the mean square of the difference between adjacent averages [NIST SP 1065]. steps: (T,), each
+    at most half the number of samples.
     """
     phase = np.concatenate([[0.0], np.cumsum(values - values.mean())])
     variances = np.empty(len(steps))
@@ -172,13 +178,13 @@ def overlapping_allan_variance(values: Float64, steps: Int64) -> Float64:
 
 
 def _terms(tau_s: Float64) -> Float64:
-    """Compute the design (T, 3): Allan variance per unit of N^2, B^2 and K^2."""
+    """Compute the design matrix (T, 3): Allan variance per unit of N^2, B^2 and K^2."""
     return np.column_stack([1 / tau_s, np.full(tau_s.size, FLICKER), tau_s / 3])
 
 
 def _freedom(count: Float64, steps: Float64, walking: Float64 | np.typing.NDArray[np.bool_]) -> Float64:
-    """Compute degrees of freedom of the overlapping estimate for white noise and random walk [NIST
-    SP 1065].
+    """Compute the degrees of freedom of the overlapping estimate for white noise and random walk [NIST SP
+    1065].
     """
     white = (3 * (count - 1) / (2 * steps) - 2 * (count - 2) / count) * 4 * steps**2 / (4 * steps**2 + 5)
     walk = (

@@ -1,8 +1,8 @@
 """Solve block-tridiagonal least squares with dense common unknowns (an arrowhead matrix).
 
-Every sample has ROWS whitened residuals that depend on the unknowns of ORDER neighbouring control points and
-on the common parameters. The chain is eliminated by a banded Cholesky factor; what is left, the Schur
-complement, is the information of the common parameters.
+Each sample has ROWS whitened residuals that depend on the unknowns of ORDER neighbouring control points and
+on the common parameters. A banded Cholesky factorisation eliminates the chain of control points; what
+remains, the Schur complement, is the information matrix of the common parameters.
 """
 
 from __future__ import annotations
@@ -20,13 +20,18 @@ from barsight.core.linalg.skyline import Skyline
 ROWS = 6
 LOCAL = STATE * ORDER
 RIDGE = 1e-12
-"""Share of the usual information that even a control point which nothing was seen of is given."""
+"""Ridge added to the diagonal as a fraction of its median, so that unobserved control points stay
+solvable.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """K samples' whitened rows: residual (K, ROWS), measured minus predicted; first (K,) control point;
-    by_chain (K, ROWS, LOCAL) and by_common (K, ROWS, P) the prediction's derivatives."""
+    """Whitened rows of K samples.
+
+    residual: (K, ROWS), measured minus predicted. first: (K,) first control point. by_chain: (K, ROWS, LOCAL)
+    and by_common: (K, ROWS, P), derivatives of the prediction.
+    """
 
     first: Int64
     residual: Float64
@@ -36,9 +41,10 @@ class Samples:
 
 @dataclass(frozen=True, eq=False)
 class RandomWalks:
-    """The prior on the biases: neighbouring control points differ by `sigma` (6,), gyro then accelerometer.
+    """Random-walk prior on the biases: the biases of neighbouring control points differ by `sigma` (6,), gyro
+    first, then accelerometer.
 
-    difference: (M - 1, 6) the next control point's biases minus this one's.
+    difference: (M - 1, 6), the biases of the next control point minus those of this one.
     """
 
     difference: Float64
@@ -47,8 +53,11 @@ class RandomWalks:
 
 @dataclass(frozen=True, eq=False)
 class ArrowheadSystem:
-    """The normal equations. chain: (N, LOCAL) the lower band as `skyline.uniform_band`; border (N, P); common
-    (P, P); chain_gradient (N,), common_gradient (P,), both downhill."""
+    """The normal equations.
+
+    chain: (N, LOCAL) lower band as for `skyline.uniform_band`. border: (N, P). common: (P, P).
+    chain_gradient (N,) and common_gradient (P,) point downhill.
+    """
 
     chain: Float64
     border: Float64
@@ -59,15 +68,17 @@ class ArrowheadSystem:
 
 @dataclass(frozen=True, eq=False)
 class EliminatedChain:
-    """The chain's factor; what it takes off: through (N, P) = chain^-1 border;
-    information (P, P)."""
+    """The factorised chain and the reduced system.
+
+    through: (N, P), chain^-1 border. information: (P, P), the Schur complement of the common parameters.
+    """
 
     factor: Skyline
     through: Float64
     information: Float64
 
     def chain_solve(self, right: Float64) -> Float64:
-        """chain^-1 right, (N,)."""
+        """Solve for chain^-1 right (N,)."""
         solved = right.reshape(-1, 1).copy()
         skyline.solve_forward(self.factor, solved)
         skyline.solve_back_dense(self.factor, solved)
@@ -115,7 +126,7 @@ def eliminate(system: ArrowheadSystem, damping: float = 0.0) -> EliminatedChain:
 
 
 def step(system: ArrowheadSystem, eliminated: EliminatedChain) -> tuple[Float64, Float64]:
-    """Solve for the Newton step: chain (N,) and common (P,)."""
+    """Solve for the Newton step of chain (N,) and common parameters (P,)."""
     alone = eliminated.chain_solve(system.chain_gradient)
     target = system.common_gradient - np.einsum("np,n->p", system.border, alone)
     scale = 1 / np.sqrt(np.maximum(np.diag(eliminated.information), 1e-300))
@@ -127,21 +138,21 @@ def step(system: ArrowheadSystem, eliminated: EliminatedChain) -> tuple[Float64,
 
 
 def project_out_chain(samples: Samples, through: Float64) -> Float64:
-    """Project the common Jacobian (K, ROWS, P) off the chain: B - A chain^-1 border."""
+    """Project the chain out of the common Jacobian (K, ROWS, P): B - A chain^-1 border."""
     out = samples.by_common.copy()
     _project(samples.first, samples.by_chain, through, out)
     return out
 
 
 def apply_jacobian(samples: Samples, chain: Float64, common: Float64) -> Float64:
-    """Multiply the Jacobian by a step of the unknowns: change of the predictions (K, ROWS)."""
+    """Multiply the Jacobian by a step of the unknowns to obtain the change of the predictions (K, ROWS)."""
     change: Float64 = np.einsum("krp,p->kr", samples.by_common, common)
     _predict(samples.first, samples.by_chain, chain, change)
     return change
 
 
 def gradient_of(samples: Samples, residual: Float64, count: int) -> tuple[Float64, Float64]:
-    """Compute the gradient, chain (count,) and common (P,), of other whitened residuals (K, ROWS)."""
+    """Compute the gradient, chain (count,) and common (P,), for other whitened residuals (K, ROWS)."""
     gradient = np.zeros(count)
     _pull(samples.first, samples.by_chain, residual, gradient)
     return gradient, np.einsum("krp,kr->p", samples.by_common, residual)
@@ -199,7 +210,7 @@ def _add(
 
 @kernel()
 def _project(first: Int64, by_chain: Float64, through: Float64, out: Float64) -> None:
-    """Subtract by_chain @ through from out (K, ROWS, P), in place: the Jacobian projected off the chain.
+    """Subtract by_chain @ through from out (K, ROWS, P), in place, to project the chain out of the Jacobian.
 
     first: (K,) control points; by_chain: (K, ROWS, LOCAL); through: (N, P), see `EliminatedChain`.
     """

@@ -1,7 +1,7 @@
-"""Calibrate cameras against an IMU from a recording in front of a board [Furgale 2013; paper Eq. 8-10].
+"""Calibrate cameras against an IMU from a recording of a board [Furgale 2013; paper Eq. 8-10].
 
-Corners, gyro and accelerometer are weighted by their own scatter: the corners of one picture share errors
-(board, lens, blur), so a picture is given the weight by which whole pictures scatter, not single corners.
+Corners, gyro and accelerometer are weighted by their own scatter. The corners of one picture share errors
+(board, lens, blur), so a picture is weighted by the scatter of whole pictures, not of single corners.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ MIN_INFLATION = 1.02
 
 @dataclass(frozen=True, eq=False)
 class CameraImuCalibration:
-    """A calibrated rig, whose body is the IMU, and how well it is known.
+    """A calibrated rig, whose body is the IMU, and its uncertainty.
 
-    problem: what was used, its sigmas as found; stated: the IMU's noise as it was given. solution: the way
-    of the body and the residuals. corner_px: single corners' noise; problem.sigmas.corner_px is by how much
-    whole pictures scatter. spreads: corners, gyro, accelerometer against the sigmas.
-    removed_corners: how many outliers.
+    problem: the measurements used, with the estimated sigmas. stated: the IMU noise as given. solution: the
+    body's trajectory and the residuals. corner_px: noise of single corners, whereas problem.sigmas.corner_px
+    is the scatter of whole pictures. spreads: scatter of corners, gyro and accelerometer relative to their
+    sigmas. removed_corners: number of outliers.
     """
 
     source: Path
@@ -64,12 +64,12 @@ class CameraImuCalibration:
 
     @property
     def sigma(self) -> Float64:
-        """Return one standard deviation (P,) of each common parameter, all causes together."""
+        """Return the standard deviation (P,) of each common parameter from all error sources together."""
         return np.sqrt(np.diag(self.uncertainty.covariance))
 
     @property
     def baseline_sigma_m(self) -> float:
-        """One standard deviation of the distance between the cameras."""
+        """Return the standard deviation of the distance between the cameras."""
         first, second = self.solution.state.mounts
         direction = (second.place_m - first.place_m) / np.linalg.norm(second.place_m - first.place_m)
         row = np.zeros(self.sigma.size)
@@ -83,7 +83,7 @@ def calibrate_camera_imu(
 ) -> CameraImuCalibration:  # fmt: skip
     """Calibrate from detections. Only the lenses are taken from `rig`; a view's name is its stamp in ns.
 
-    scales: solve for the IMU's scales and misalignments too. Raises CalibrationError with the remedy.
+    scales: estimate the IMU's scales and misalignments too. Raises CalibrationError that names the remedy.
     """
     setup = prepare(views, imu, rig, board, noise, source)
     problem = replace(setup.problem, scales=scales)
@@ -121,7 +121,9 @@ def calibrate_camera_imu(
 
 
 def _without_outliers(problem: CameraImuProblem, solution: Solution) -> tuple[CameraImuProblem, float, int]:
-    """Remove corners beyond 4.5 robust sigma; also that sigma (px) and their number."""
+    """Remove corners beyond 4.5 robust sigma; also return that sigma (px) and the number of corners
+    removed.
+    """
     lengths = [np.linalg.norm(residual, axis=1) for residual in solution.linearised.residuals_px]
     sigma = float(np.median(np.concatenate(lengths)) / np.sqrt(2 * np.log(2)))
     kept, removed = [], 0
@@ -136,7 +138,9 @@ def _without_outliers(problem: CameraImuProblem, solution: Solution) -> tuple[Ca
 def _without_knocks(
     problem: CameraImuProblem, solution: Solution
 ) -> tuple[CameraImuProblem, tuple[str, ...]]:
-    """Down-weight IMU readings that scatter twice as much as usual; a sentence on where."""
+    """Down-weight IMU readings that scatter more than twice as much as usual; also return a sentence on
+    where.
+    """
     track = problem.imu
     rows = solution.linearised.samples.residual[-track.time_s.size :]
     window = np.ones(KNOCK_SAMPLES) / KNOCK_SAMPLES
@@ -165,9 +169,10 @@ def _chosen(sightings: CornerObservations, good: np.typing.NDArray[np.bool_]) ->
 def _weighted(
     problem: CameraImuProblem, state: CameraImuState, corner_px: float
 ) -> tuple[CameraImuProblem, Solution, tuple[ResidualSpread, ResidualSpread, ResidualSpread]]:
-    """Solve with each sensor's sigma re-estimated from its residuals until both agree.
+    """Solve repeatedly, re-estimating each sensor's sigma from its residuals, until the sigmas settle.
 
-    The IMU's are only ever raised above what was stated, and no picture counts more than its corners' noise.
+    The sigmas of the IMU are only ever raised above the stated noise, and no picture is weighted more
+    strongly than the noise of its corners allows.
     """
     stated = problem.sigmas
     for _ in range(WEIGHT_ROUNDS):
@@ -191,7 +196,7 @@ def _weighted(
 
 
 def _raised(stated: float, shown: float) -> float:
-    """Raise the stated noise where the residuals clearly show more."""
+    """Raise the stated noise where the residuals clearly exceed it."""
     return shown if shown > MIN_INFLATION * stated else stated
 
 
@@ -205,7 +210,9 @@ def _rig(rig: StereoRig, state: CameraImuState) -> StereoRig:
 
 
 def subtract_mounts(state: CameraImuState, other: CameraImuState) -> Float64:
-    """Subtract `other`'s mountings from `state`'s (14,), as the common parameters count them."""
+    """Subtract the mountings of `other` from those of `state` (14,), in the order of the common
+    parameters.
+    """
     parts: list[Float64] = []
     for own, their in zip(state.mounts, other.mounts, strict=True):
         turn = Rotation.from_matrix(own.rotation @ their.rotation.T).as_rotvec()

@@ -1,8 +1,8 @@
 """Estimate start values of a camera-IMU calibration without a prior guess.
 
-The board's pose by each camera alone gives the camera's way; the time shift is where the camera's and the
-gyro's angular speeds correlate best, the mounting's rotation aligns their turn rates, and the gyro's integral
-carries the pose between the pictures.
+The board's pose in each picture gives the camera's trajectory. The time shift is the one at which the angular
+speeds of camera and gyro correlate best, and the rotation of the mounting aligns their turn rates. Between
+the pictures, the integrated gyro carries the pose.
 """
 
 from __future__ import annotations
@@ -33,8 +33,11 @@ DEGREES = 180 / np.pi
 
 @dataclass(frozen=True, eq=False)
 class CameraPoses:
-    """Camera poses by the board alone. stamp_s: (F,). rotation (F, 3, 3), place_m (F, 3): board_from_cam.
-    error_px: (F,) root mean square."""
+    """Camera poses estimated from the board alone.
+
+    stamp_s: (F,). rotation (F, 3, 3) and place_m (F, 3): board_from_cam. error_px: (F,) RMS reprojection
+    error.
+    """
 
     stamp_s: Float64
     rotation: Float64
@@ -44,9 +47,11 @@ class CameraPoses:
 
 @dataclass(frozen=True, eq=False)
 class GyroAlignment:
-    """Fit of the gyro to a camera's turn rates. rotation: (3, 3) body_from_cam. shift_s: t_imu = t_cam +
-    shift.
-    gyro_bias_radps: (3,). correlation: of the turn rates, 1 where they agree."""
+    """Alignment of the gyro with a camera's turn rates.
+
+    rotation: (3, 3) body_from_cam. shift_s: t_imu = t_cam + shift. gyro_bias_radps: (3,). correlation: of the
+    turn rates, 1 where they agree.
+    """
 
     rotation: Float64
     shift_s: float
@@ -57,7 +62,7 @@ class GyroAlignment:
 def camera_poses(
     camera: Camera, stamp_s: Float64, corners: Sequence[Corners], points_m: Float64
 ) -> CameraPoses:
-    """Estimate the camera's poses by PnP on the board in each picture, robust to a few bad corners."""
+    """Estimate the camera's pose in each picture by PnP on the board, robust to a few bad corners."""
     poses = [_robust_pose(camera, own, points_m) for own in corners]
     turn = np.array([pose[0] for pose in poses]).transpose(0, 2, 1)
     place = -np.einsum("nij,nj->ni", turn, np.array([pose[1] for pose in poses]))
@@ -65,7 +70,7 @@ def camera_poses(
 
 
 def _robust_pose(camera: Camera, corners: Corners, points_m: Float64) -> tuple[Float64, Float64, float]:
-    """Run `board_pose` again without outlying corners where the first fit is bad."""
+    """Run `board_pose` again without the outlying corners where the first fit is poor."""
     pose = board_pose(camera, corners, points_m)
     if not REFIT_PX < pose[2] < np.inf:
         return pose
@@ -76,10 +81,10 @@ def _robust_pose(camera: Camera, corners: Corners, points_m: Float64) -> tuple[F
 
 
 def align_gyro(way: CameraPoses, time_s: Float64, gyro_radps: Float64) -> GyroAlignment | Failed:
-    """Estimate mounting rotation and time shift from turn rates alone.
+    """Estimate the rotation of the mounting and the time shift from turn rates alone.
 
-    Failed `too-few`, `still` (hardly a turn), `no-overlap`, `degrees` (the gyro reads 57 times too much),
-    `ratio`, `no-match` (the turns don't agree).
+    Failed `too-few`, `still` (hardly any rotation), `no-overlap`, `degrees` (the gyro's readings are 57 times
+    too large), `ratio`, `no-match` (the turn rates don't agree).
     """
     step = np.diff(way.stamp_s)
     good = (step < MAX_STEP_S) & _near(way)[1:] & _near(way)[:-1]
@@ -118,10 +123,10 @@ def align_gyro(way: CameraPoses, time_s: Float64, gyro_radps: Float64) -> GyroAl
 def body_poses(
     way: CameraPoses, alignment: GyroAlignment, time_s: Float64, gyro_radps: Float64
 ) -> tuple[Float64, Float64, Float64]:
-    """Interpolate body poses at IMU times (K,): rotation (K, 3, 3) world_from_body, place (K, 3) without
-    lever arm.
+    """Interpolate body poses at IMU times (K,): the times, rotation (K, 3, 3) world_from_body and place (K,
+    3) without lever arm.
 
-    The gyro's integral, turned at each picture onto the picture's pose.
+    The rotation is the integrated gyro, corrected at each picture to agree with the picture's pose.
     """
     near = _near(way)
     frame_s = way.stamp_s[near] + alignment.shift_s
@@ -142,7 +147,7 @@ def body_poses(
 
 
 def _near(way: CameraPoses) -> Bool:
-    """Select pictures with a credible board pose."""
+    """Select the pictures whose board pose is credible."""
     finite = np.isfinite(way.error_px)
     usual = float(np.median(way.error_px[finite])) if finite.any() else np.inf
     near: Bool = way.error_px < max(3 * usual, MAX_PNP_PX)
@@ -150,13 +155,15 @@ def _near(way: CameraPoses) -> Bool:
 
 
 def _integral(time_s: Float64, gyro_radps: Float64) -> Float64:
-    """Integrate the gyro over time (S, 3): mean rates are its differences, whatever the pictures' spacing."""
+    """Integrate the gyro over time (S, 3), so that differences give mean rates for any spacing of the
+    pictures.
+    """
     steps = np.diff(time_s)[:, None] * (gyro_radps[1:] + gyro_radps[:-1]) / 2
     return np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
 
 
 def _mean_rate(early: Float64, late: Float64, time_s: Float64, integral: Float64) -> Float64:
-    """Average the gyro between two times (N, 3); NaN outside its log."""
+    """Average the gyro between pairs of times (N, 3); NaN outside the gyro's log."""
     ends = [
         np.column_stack([np.interp(at, time_s, integral[:, i], np.nan, np.nan) for i in range(3)])
         for at in (early, late)
@@ -166,7 +173,9 @@ def _mean_rate(early: Float64, late: Float64, time_s: Float64, integral: Float64
 
 
 def _by_speed(rate: Float64, early: Float64, late: Float64, time_s: Float64, integral: Float64) -> float:
-    """Find the shift that maximises the correlation of angular speeds, to about half a picture's step."""
+    """Find the time shift that maximises the correlation of angular speeds, to about half the picture
+    interval.
+    """
     speed = np.linalg.norm(rate, axis=1)
     step = float(np.median(late - early)) / 4
     best, best_shift = -np.inf, 0.0
@@ -184,7 +193,9 @@ def _by_speed(rate: Float64, early: Float64, late: Float64, time_s: Float64, int
 def _turned(
     rate: Float64, early: Float64, late: Float64, time_s: Float64, integral: Float64, shift_s: float
 ) -> GyroAlignment | None:
-    """Estimate the rotation that aligns both turn rates [Arun 1987], outliers removed in a second round."""
+    """Estimate the rotation that aligns both turn rates [Arun 1987], with outliers removed in a second
+    round.
+    """
     mean = _mean_rate(early, late, time_s, integral)
     kept = np.isfinite(mean).all(axis=1)
     for _ in range(2):

@@ -1,7 +1,7 @@
 """Model a body's trajectory as a cumulative B-spline of its pose with piecewise linear IMU biases.
 
-Furgale et al. 2013 with the rotation on SO(3) instead of as a rotation vector. Times are seconds since the
-spline's `start_ns`, on the IMU's clock.
+This follows Furgale et al. 2013, but with the rotation on SO(3) instead of as a rotation vector. Times are in
+seconds since the spline's `start_ns`, on the IMU's clock.
 """
 
 from __future__ import annotations
@@ -15,16 +15,19 @@ from barsight.calibration.camera_imu.spline_kernels import DEGREE, ORDER, Contro
 from barsight.core.arrays import Float64, Int64, kernel
 
 STATE = 12
-"""Unknowns of a control point: small turn (from the right), place, gyro bias, accelerometer bias."""
+"""Unknowns per control point: small rotation (from the right), place, gyro bias, accelerometer bias."""
 BIAS_AT = (ORDER - 2) // 2
-"""The control point of a segment that holds the biases at its start; the next holds those at its end."""
+"""Index, within a segment, of the control point that holds the biases at its start; the next one holds those
+at its end.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class PoseSpline:
-    """start_ns: the first segment's begin. step_s: the knots' distance. M control points, M - 5 segments.
+    """A spline of M control points and M - 5 segments.
 
-    rotations: (M, 3, 3) and places_m: (M, 3) of world_from_body. gyro_bias_radps, accel_bias_mps2: (M, 3).
+    start_ns: start of the first segment. step_s: knot spacing. rotations (M, 3, 3) and places_m (M, 3):
+    world_from_body. gyro_bias_radps, accel_bias_mps2: (M, 3).
     """
 
     start_ns: int
@@ -40,7 +43,7 @@ class PoseSpline:
         return len(self.places_m) - DEGREE
 
     def control_points(self) -> ControlPoints:
-        """Compute the turns between the control points, for the compiled evaluation."""
+        """Compute the rotations between the control points, as the compiled evaluation needs them."""
         steps = Rotation.from_matrix(self.rotations[:-1].transpose(0, 2, 1) @ self.rotations[1:]).as_rotvec()
         return ControlPoints(self.step_s, self.rotations, self.places_m, steps, inverse_right_jacobian(steps))
 
@@ -54,7 +57,7 @@ class PoseSpline:
         )  # fmt: skip
 
     def at(self, times_s: Float64) -> SplineMotion:
-        """Evaluate the motion at times within the spline (those outside are moved to its ends)."""
+        """Evaluate the motion at given times; times outside the spline are clamped to its ends."""
         segment, u = locate(times_s, self.step_s, self.segments)
         rotation, rate, place = _evaluate(segment, u, self.control_points())
         k, share = segment + BIAS_AT, u[:, None]
@@ -67,8 +70,11 @@ class PoseSpline:
 
 @dataclass(frozen=True, eq=False)
 class SplineMotion:
-    """At N times: rotation (N, 3, 3) world_from_body, rate_radps (N, 3) in body axes; place_m, velocity_mps,
-    acceleration_mps2 (N, 3) in the world; gyro_bias_radps, accel_bias_mps2 (N, 3)."""
+    """Motion at N times.
+
+    rotation (N, 3, 3): world_from_body. rate_radps (N, 3): in body axes. place_m, velocity_mps,
+    acceleration_mps2 (N, 3): in the world. gyro_bias_radps, accel_bias_mps2: (N, 3).
+    """
 
     rotation: Float64
     rate_radps: Float64
@@ -82,10 +88,10 @@ class SplineMotion:
 def fit_spline(
     start_ns: int, end_s: float, step_s: float, times_s: Float64, rotations: Float64, places_m: Float64
 ) -> PoseSpline:
-    """Fit a spline from time 0 to end_s to poses at increasing times; biases are zero.
+    """Fit a spline from time 0 to end_s to poses at increasing times, with zero biases.
 
-    Control points take the pose interpolated at their own times (the middle of where they weigh most); the
-    spline then cuts corners as a B-spline does, which a least squares that starts here mends.
+    Each control point takes the pose interpolated at the time where its weight is centred. The resulting
+    spline cuts corners, as a B-spline does; a least-squares solve that starts from it corrects this.
     """
     count = int(np.ceil(end_s / step_s)) + DEGREE
     own = (np.arange(count) - (ORDER - 2) / 2) * step_s
@@ -99,14 +105,16 @@ def fit_spline(
 
 
 def locate(times_s: Float64, step_s: float, segments: int) -> tuple[Int64, Float64]:
-    """Find segments (N,) and places u (N,) in them, in [0, 1]; times outside are moved to the ends."""
+    """Find the segments (N,) and the positions u (N,) within them, in [0, 1]; times outside are clamped to
+    the ends.
+    """
     scaled = np.clip(times_s / step_s, 0.0, segments)
     segment = np.minimum(scaled.astype(np.int64), segments - 1)
     return segment, scaled - segment
 
 
 def inverse_right_jacobian(turns: Float64) -> Float64:
-    """Compute inverse right Jacobians (N, 3, 3) of rotation vectors (N, 3) shorter than pi."""
+    """Compute the inverse right Jacobians (N, 3, 3) of rotation vectors (N, 3) shorter than pi."""
     square = (turns**2).sum(axis=1)
     angle = np.sqrt(np.maximum(square, 1e-12))
     factor = np.where(square < 1e-8, 1 / 12, 1 / angle**2 - (1 + np.cos(angle)) / (2 * angle * np.sin(angle)))
@@ -122,8 +130,8 @@ def inverse_right_jacobian(turns: Float64) -> Float64:
 def _evaluate(segment: Int64, u: Float64, points: ControlPoints) -> tuple[Float64, Float64, Float64]:
     """Evaluate the pose spline and its time derivatives at K times [Furgale 2013].
 
-    segment: (K,); u: (K,) place within it, 0...1. Returns rotation (K, 3, 3), turn rate (K, 3) rad/s in body
-    axes, and (K, 3, 3) place, velocity, acceleration, m and s.
+    segment: (K,); u: (K,) position within it, 0...1. Returns rotation (K, 3, 3), turn rate (K, 3) in rad/s in
+    body axes, and (K, 3, 3) place, velocity and acceleration in m and s.
     """
     count = segment.size
     rotation, rate, place = np.empty((count, 3, 3)), np.empty((count, 3)), np.empty((count, 3, 3))

@@ -1,8 +1,8 @@
 """Linearise the residuals of a camera-IMU calibration [Furgale 2013; paper Eq. 8].
 
-Unknown are the body's way as a spline, the IMU's biases, and the common parameters: per camera where it is
-mounted and its time shift, the direction of gravity in the board's frame, and if asked for the IMU's scales
-and misalignments. A picture's corners all share one pose, so they are condensed to six whitened rows.
+The unknowns are the body's trajectory as a spline, the IMU's biases, and the common parameters: each camera's
+mounting and time shift, the direction of gravity in the board's frame and, optionally, the IMU's scales and
+misalignments. All corners of a picture share one pose, so they are condensed to six whitened rows.
 """
 
 from __future__ import annotations
@@ -26,13 +26,16 @@ from barsight.core.arrays import Float64, Int64
 
 NEAREST_Z_M = 1e-3
 MOUNT = 7
-"""Parameters of a camera: turn (rad) and shift (m) of body_from_cam in body axes, time shift (s)."""
+"""Parameters per camera: rotation (rad) and shift (m) of body_from_cam in body axes, and time shift (s)."""
 
 
 @dataclass(frozen=True, eq=False)
 class CornerObservations:
-    """One camera's corners. stamp_s: (F,) on the camera's clock, since the spline's start. frame: (N,) into
-    it, rising. ids: (N,). points_m: (N, 3) on the board. pixels: (N, 2)."""
+    """One camera's corners.
+
+    stamp_s: (F,) on the camera's clock, since the spline's start. frame: (N,) ascending indices into stamp_s.
+    ids: (N,). points_m: (N, 3) on the board. pixels: (N, 2).
+    """
 
     camera: Camera
     stamp_s: Float64
@@ -44,9 +47,10 @@ class CornerObservations:
 
 @dataclass(frozen=True, eq=False)
 class ImuTrack:
-    """time_s: (S,) since the spline's start. gyro_radps, accel_mps2: (S, 3) as measured.
+    """The IMU's readings. time_s: (S,) since the spline's start. gyro_radps, accel_mps2: (S, 3) as measured.
 
-    gyro_loose, accel_loose: (S,) factors on the sigmas of readings that shake more than the spline follows.
+    gyro_loose, accel_loose: (S,) factors on the sigmas of readings that vibrate more than the spline can
+    follow.
     """
 
     time_s: Float64
@@ -58,8 +62,9 @@ class ImuTrack:
 
 @dataclass(frozen=True)
 class Sigmas:
-    """One standard deviation of one corner coordinate, of one gyro and accelerometer reading per axis, and of
-    what their biases walk in one second."""
+    """Standard deviations of one corner coordinate, of one gyro and one accelerometer reading per axis, and
+    of the random walk of their biases over one second.
+    """
 
     corner_px: float
     gyro_radps: float
@@ -70,7 +75,9 @@ class Sigmas:
 
 @dataclass(frozen=True, eq=False)
 class Mount:
-    """A camera on the body. rotation (3, 3), place_m (3,): body_from_cam. shift_s: t_imu = t_cam + shift."""
+    """Mounting of a camera on the body. rotation (3, 3), place_m (3,): body_from_cam. shift_s: t_imu =
+    t_cam + shift.
+    """
 
     rotation: Float64
     place_m: Float64
@@ -79,8 +86,11 @@ class Mount:
 
 @dataclass(frozen=True, eq=False)
 class CameraImuState:
-    """mounts: per camera. gravity_mps2: (3,) in the board's frame, pointing down. gyro_matrix, accel_matrix:
-    (3, 3) what is read = matrix @ truth + bias."""
+    """The unknowns.
+
+    mounts: one per camera. gravity_mps2: (3,) in the board's frame, pointing down. gyro_matrix, accel_matrix:
+    (3, 3), where reading = matrix @ truth + bias.
+    """
 
     spline: PoseSpline
     mounts: tuple[Mount, ...]
@@ -93,7 +103,7 @@ class CameraImuState:
 class CameraImuProblem:
     """Measurements of a camera-IMU calibration.
 
-    scales, lenses: whether the IMU's scales and misalignments, and the cameras' lenses are unknown too.
+    scales: estimate the IMU's scales and misalignments too. lenses: estimate the cameras' lenses too.
     """
 
     sightings: tuple[CornerObservations, ...]
@@ -111,7 +121,7 @@ class CameraImuProblem:
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """Return the common parameters in order."""
+        """Return the names of the common parameters in order."""
         parts = ("rx_rad", "ry_rad", "rz_rad", "tx_m", "ty_m", "tz_m", "timeshift_s")
         names = [f"body_from_cam{c}.{part}" for c in range(len(self.sightings)) for part in parts]
         names += ["gravity.a_rad", "gravity.b_rad"]
@@ -125,12 +135,18 @@ class CameraImuProblem:
 
 
 LOWER = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2))
-"""The accelerometer's scales and misalignments: its axes define the body's, so the matrix is triangular."""
+"""Entries of the accelerometer's scale and misalignment matrix. Its axes define those of the body, so the
+matrix is lower triangular.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """residuals_px: per camera (N, 2). samples: each camera's frames, then the IMU's. cost: robust."""
+    """The linearised problem.
+
+    residuals_px: (N, 2) per camera. samples: the frames of each camera, then the IMU readings. cost: the
+    robust cost.
+    """
 
     residuals_px: tuple[Float64, ...]
     samples: Samples
@@ -141,7 +157,7 @@ class Linearised:
 def linearise_camera_imu(problem: CameraImuProblem, state: CameraImuState, huber: float | None) -> Linearised:
     """Compute residuals and Jacobians at a state.
 
-    huber: the length in sigmas from which a corner counts less.
+    huber: residual length, in sigmas, above which a corner is down-weighted.
     """
     spline, sigmas = state.spline, problem.sigmas
     width = len(problem.parameter_names)
@@ -193,7 +209,9 @@ def linearise_camera_imu(problem: CameraImuProblem, state: CameraImuState, huber
 def corner_residuals(
     sightings: CornerObservations, mount: Mount, spline: PoseSpline
 ) -> tuple[Float64, Float64]:
-    """Compute the corners (N, 3) in the camera's frame and residuals (N, 2) px, seen minus projected."""
+    """Compute the corners (N, 3) in the camera's frame and the residuals (N, 2) px, observed minus
+    projected.
+    """
     motion = spline.at(sightings.stamp_s + mount.shift_s)
     body = np.einsum(
         "nji,nj->ni", motion.rotation[sightings.frame], sightings.points_m - motion.place_m[sightings.frame]
@@ -226,7 +244,7 @@ def retract_state(state: CameraImuState, chain: Float64, common: Float64) -> Cam
 
 
 def tangent_basis(direction: Float64) -> Float64:
-    """Compute two axes (3, 2) orthogonal to a direction, about which it can turn."""
+    """Compute two unit axes (3, 2) orthogonal to a direction, about which it can be rotated."""
     least = np.eye(3)[int(np.abs(direction).argmin())]
     first = np.cross(direction, least)
     first /= np.linalg.norm(first)
@@ -235,7 +253,7 @@ def tangent_basis(direction: Float64) -> Float64:
 
 
 def lens_of(camera: Camera) -> tuple[Lens, Float64]:
-    """Convert a camera to its lens model and parameters, as `project_lens` takes them."""
+    """Convert a camera to its lens model and the parameters that `project_lens` takes."""
     coefficients = camera.coefficients or (0.0,) * 4
     lens = (
         Lens.EQUIDISTANT

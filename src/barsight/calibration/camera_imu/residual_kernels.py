@@ -1,4 +1,4 @@
-"""Compile the Jacobian rows of camera-IMU calibration for pictures and IMU readings."""
+"""Compute the Jacobian rows of a camera-IMU calibration for pictures and IMU readings, compiled."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ def sum_corners(
     frame: Int64, points: Float64, by_point: Float64, by_lens: Float64, residual: Float64, weight: Float64,
     frames: int,
 ) -> tuple[Float64, Float64]:  # fmt: skip
-    """Sum each frame's information (F, 6 + L, 6 + L) and gradient (F, 6 + L) on its pose and the lens.
+    """Sum the information (F, 6 + L, 6 + L) and gradient (F, 6 + L) of each frame's pose and the lens.
 
-    The first six are (a, b): a point X in the camera's frame moves by X x a + b. points (N, 3), by_point
-    (N, 2, 3); by_lens (N, 2, L), with L zero where the lens is fixed.
+    The first six parameters are (a, b): a point X in the camera's frame moves by X x a + b. points (N, 3),
+    by_point (N, 2, 3); by_lens (N, 2, L), with L zero where the lens is fixed.
     """
     size = 6 + by_lens.shape[2]
     whole, pull = np.zeros((frames, size, size)), np.zeros((frames, size))
@@ -65,8 +65,8 @@ def _cross(v: Float64, out: Float64) -> None:
 
 @kernel()
 def _whiten(whole: Float64, pull: Float64, factor: Float64, residual: Float64) -> None:
-    """Whiten normal equations: factor (C, C) upper with factor^T factor = whole; residual =
-    factor^-T pull.
+    """Whiten normal equations: factor (C, C) is upper triangular with factor^T factor = whole, and
+    residual = factor^-T pull.
     """
     factor[:] = 0.0
     residual[:] = 0.0
@@ -96,8 +96,8 @@ def frame_rows(
     """Form the rows of one camera's frames; `at`, `lens_at`: indices of its parameters among the common ones.
 
     A frame whose lens is unknown too has more than six rows and becomes several samples. segment, u: (K,)
-    each frame's place on the spline. whole: (K, C, C) information, pull: (K, C) gradient, of `sum_corners`.
-    mount: (3, 3) body_from_cam, mount_place: (3,) m. width: number of common parameters.
+    each frame's position on the spline. whole: (K, C, C) information, pull: (K, C) gradient, of
+    `sum_corners`. mount: (3, 3) body_from_cam, mount_place: (3,) m. width: number of common parameters.
     """
     count, size = segment.size, whole.shape[1]
     split = -(-size // ROWS)
@@ -148,11 +148,11 @@ def imu_rows(
     segment: Int64, u: Float64, points: ControlPoints, gyro: InertialReadings, accel: InertialReadings,
     gravity: Float64, axes: Float64, at: int, scales: bool, width: int,
 ) -> Rows:  # fmt: skip
-    """Form the rows of the IMU's readings: three of the gyro, then three of the accelerometer [Eq. 9-10].
+    """Form the rows of the IMU's readings: three for the gyro, then three for the accelerometer [Eq. 9-10].
 
-    segment, u: (K,) each reading's place on the spline. gravity: (3,) in the board's frame; axes: (3, 2)
-    about which it turns. `at`: index of gravity's two parameters among the `width` common ones; with `scales`
-    those of the accelerometer's and the gyro's matrix follow.
+    segment, u: (K,) each reading's position on the spline. gravity: (3,) in the board's frame; axes: (3, 2)
+    about which it rotates. `at`: index of gravity's two parameters among the `width` common ones; with
+    `scales`, those of the accelerometer's and the gyro's matrix follow.
     """
     count = segment.size
     residual, by_chain = np.zeros((count, ROWS)), np.zeros((count, ROWS, LOCAL))

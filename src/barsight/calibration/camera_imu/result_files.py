@@ -1,4 +1,4 @@
-"""Write a camera-IMU calibration: our rig file and Kalibr's camchain-imucam."""
+"""Write a camera-IMU calibration as Barsight's rig file and Kalibr's camchain-imucam."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ def write_camera_imu(
     calibration: CameraImuCalibration, rig_path: Path, camchain_path: Path,
     lenses: tuple[tuple[str, ...], Float64] | None,
 ) -> None:  # fmt: skip
-    """Write both files, each whole or not at all.
+    """Write both files, each either completely or not at all.
 
-    lenses: names and covariance of the lenses' parameters from the stereo calibration. They were held fixed,
-    so the mountings err with them.
+    lenses: names and covariance of the lens parameters from the stereo calibration. They were held fixed
+    here, so their errors carry over to the mountings.
     """
     names, covariance = joint_covariance(calibration, lenses)
     section: dict[str, object] = {
@@ -46,10 +46,11 @@ def write_camera_imu(
 def joint_covariance(
     calibration: CameraImuCalibration, lenses: tuple[tuple[str, ...], Float64] | None
 ) -> tuple[tuple[str, ...], Float64]:
-    """Compute names and covariance of the lenses, where it is known, mountings, time shifts and the resulting
-    cam1_from_cam0: what lenses are off by, the mountings take up as far as they can.
+    """Compute names and joint covariance of the lenses (where known), mountings, time shifts and the
+    resulting cam1_from_cam0. Lens errors are propagated to the mountings, which absorb them as far as they
+    can.
 
-    Turns are small, from the left: of body_from_cam in body axes, of cam1_from_cam0 in cam1's.
+    Rotations are small, from the left: of body_from_cam in body axes, of cam1_from_cam0 in cam1's.
     """
     names, whole = _by_mounts(calibration)
     known, mounts = calibration.uncertainty, slice(2 * MOUNT)
@@ -66,7 +67,9 @@ def joint_covariance(
 
 
 def _baseline_sigma_m(calibration: CameraImuCalibration, covariance: Float64) -> float:
-    """Compute one standard deviation of the distance between the cameras, whose place ends the covariance."""
+    """Compute the standard deviation of the distance between the cameras from the last three rows of the
+    covariance, the translation of cam1_from_cam0.
+    """
     first, second = calibration.solution.state.mounts
     place = second.rotation.T @ (first.place_m - second.place_m)
     direction = place / np.linalg.norm(place)
@@ -74,8 +77,8 @@ def _baseline_sigma_m(calibration: CameraImuCalibration, covariance: Float64) ->
 
 
 def _by_mounts(calibration: CameraImuCalibration) -> tuple[tuple[str, ...], Float64]:
-    """Differentiate both mountings, time shifts and cam1_from_cam0 by the mountings and shifts: names (20,)
-    and Jacobian (20, 14).
+    """Differentiate mountings, time shifts and cam1_from_cam0 with respect to the mountings and time shifts:
+    names (20,) and Jacobian (20, 14).
     """
     names = calibration.problem.parameter_names[: 2 * MOUNT]
     first, second = calibration.solution.state.mounts

@@ -1,4 +1,6 @@
-"""Prepare a camera-IMU problem with start values from views and IMU samples, or say why it can't be."""
+"""Prepare a camera-IMU problem with start values from views and IMU samples, or explain why it isn't
+possible.
+"""
 
 from __future__ import annotations
 
@@ -60,7 +62,7 @@ REMEDIES = {
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """problem and start; views of the board used per camera; notes: what was left out, as sentences."""
+    """The problem and its start values. notes: sentences on what was left out."""
 
     problem: CameraImuProblem
     start: CameraImuState
@@ -70,9 +72,9 @@ class Setup:
 def prepare(
     views: Sequence[BoardView], imu: ImuSamples, rig: StereoRig, board: Board, noise: ImuNoise, source: Path
 ) -> Setup:
-    """Check the recording and find start values. A view's name is its stamp (ns, the cameras' clock).
+    """Check the recording and find start values. A view's name is its stamp (ns, on the cameras' clock).
 
-    Raises CalibrationError with the remedy where the recording can't be used.
+    Raises CalibrationError that names the remedy where the recording can't be used.
     """
     imu, notes = _checked_imu(imu, source)
     rate = NS_PER_S / float(np.median(np.diff(imu.stamp_ns)))
@@ -122,11 +124,11 @@ def prepare(
 
 
 def knot_rate(track: ImuTrack, sigmas: Sigmas, rate_hz: float) -> float:
-    """Choose the knot rate (Hz): the lowest at which splines follow gyro and accelerometer about as well as a
-    high one.
+    """Choose the knot rate (Hz): the lowest one at which a spline fits gyro and accelerometer about as well
+    as at a high rate.
 
-    As well means a scatter, freed of the unknowns it takes, of at most 1.1 times the stated noise or the
-    least scatter any rate reaches.
+    That means a residual scatter, corrected for the degrees of freedom of the fit, of at most 1.1 times the
+    stated noise or the lowest scatter at any rate, whichever is larger.
     """
     values = np.column_stack([track.gyro_radps, track.accel_mps2])
     span = track.time_s[-1] - track.time_s[0]
@@ -147,7 +149,7 @@ def knot_rate(track: ImuTrack, sigmas: Sigmas, rate_hz: float) -> float:
 
 
 def _checked_imu(imu: ImuSamples, source: Path) -> tuple[ImuSamples, tuple[str, ...]]:
-    """Select the longest stretch without a gap, in SI units, in order of time."""
+    """Check the log and select its longest stretch without a gap, in SI units and in order of time."""
     if imu.stamp_ns.size < 2:
         raise CalibrationError(source, "the IMU's log is empty", "record the IMU too")
     steps = np.diff(imu.stamp_ns)
@@ -189,7 +191,9 @@ def _expect_lenses(ways: Sequence[CameraPoses], source: Path) -> None:
 
 
 def _expect_rig(ways: Sequence[CameraPoses], rig: StereoRig, source: Path) -> None:
-    """Compare the views' own stereo extrinsics with the rig file's: swapped cameras, another rig."""
+    """Compare the stereo extrinsics that the views imply with the rig file's, to detect swapped cameras or
+    another rig.
+    """
     _, left, right = np.intersect1d(ways[0].stamp_s, ways[1].stamp_s, return_indices=True)
     if left.size == 0:
         return
@@ -225,7 +229,7 @@ def _aligned(
 def _sigmas(noise: ImuNoise, rate_hz: float) -> Sigmas:
     """Convert noise densities to sigmas per reading.
 
-    A walk of zero would tie the biases too hard for the arithmetic.
+    A random walk of zero is replaced, as it would tie the biases too rigidly for floating-point arithmetic.
     """
     root = np.sqrt(rate_hz)
     return Sigmas(
@@ -238,7 +242,7 @@ def _sigmas(noise: ImuNoise, rate_hz: float) -> Sigmas:
 def _sightings(
     camera: Camera, way: CameraPoses, corners: Sequence[Corners], board: Board, shift_s: float, end_s: float
 ) -> CornerObservations:
-    """Select corners of frames inside the shifted spline whose board pose makes sense."""
+    """Select the corners of frames that are within the shifted spline and have a credible board pose."""
     at = way.stamp_s + shift_s
     usual = float(np.median(way.error_px))
     good = (at > EDGE_S) & (at < end_s - EDGE_S) & (way.error_px < max(5 * usual, MAX_PNP_PX))

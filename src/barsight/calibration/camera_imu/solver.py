@@ -34,7 +34,9 @@ OPTIONS = Options(max_steps=100, min_gain_ratio=1e-8, first_damping=1e-6, min_da
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """state; linearised and eliminated there, without damping and without robust weights; steps taken."""
+    """A solved state. linearised, eliminated: the system there, without damping or robust weights. steps:
+    number of steps taken.
+    """
 
     state: CameraImuState
     linearised: Linearised
@@ -45,10 +47,11 @@ class Solution:
 
 @dataclass(frozen=True, eq=False)
 class ResidualSpread:
-    """Scatter of each sensor's residuals against the assumed sigma, and the part absorbed by the fit.
+    """Scatter of each sensor's residuals relative to the assumed sigma, and the part that the fit absorbs.
 
-    factor: on the assumed sigma. absorbed: the share of the sensor's numbers that the unknowns take up.
-    after: (LAGS,) the residuals' autocorrelation, after_expected: the same of white noise after the same fit.
+    factor: scatter over assumed sigma. absorbed: share of the sensor's degrees of freedom that the unknowns
+    take up. after: (LAGS,) autocorrelation of the residuals. after_expected: that of white noise after the
+    same fit.
     """
 
     factor: float
@@ -63,7 +66,7 @@ PROBES = 2
 
 @dataclass(frozen=True, eq=False)
 class _CameraImuIterate:
-    """A state and, made on use, what is linear there."""
+    """A state and its linearisation, which is computed on first use."""
 
     problem: CameraImuProblem
     huber: float | None
@@ -87,9 +90,9 @@ class _CameraImuIterate:
 
 
 def solve_camera_imu(problem: CameraImuProblem, start: CameraImuState, huber: float | None) -> Solution:
-    """Run Levenberg-Marquardt from `start`; huber as in `linearise_camera_imu`.
+    """Run Levenberg-Marquardt from `start`, with huber as in `linearise_camera_imu`.
 
-    Raises LinAlgError where the way of the body is not determined.
+    Raises LinAlgError where the body's trajectory is not determined.
     """
     found = minimise(_CameraImuIterate(problem, huber, start), OPTIONS)
     state, here = found.best.state, found.best.here
@@ -104,10 +107,11 @@ def sensor_spreads(
 ) -> tuple[ResidualSpread, ResidualSpread, ResidualSpread]:
     """Estimate the scatter of picture, gyro and accelerometer residuals, corrected for what the fit absorbs.
 
-    A picture's residuals are its six whitened rows: what all its corners together say of the pose.
+    The residuals of a picture are its six whitened rows, the joint information of all its corners about the
+    pose.
 
-    White noise put through the same fit says how much of each sensor's numbers the unknowns absorb (the trace
-    of the hat matrix [Hutchinson 1989]) and how that colours the residuals.
+    White noise passed through the same fit shows how much of each sensor's scatter the unknowns absorb (the
+    trace of the hat matrix [Hutchinson 1989]) and how the fit correlates the residuals.
     """
     samples = solution.linearised.samples
     rng = np.random.default_rng(seed)
@@ -129,7 +133,7 @@ def sensor_spreads(
 
 
 def autocorrelation(series: Float64) -> Float64:
-    """Compute the autocorrelation (LAGS,) of a series (S, A), its axes together."""
+    """Compute the autocorrelation (LAGS,) of a series (S, A), pooled over its axes."""
     power = float((series**2).sum())
     return np.array([float((series[k:] * series[:-k]).sum()) / power for k in range(1, LAGS + 1)])
 
@@ -148,9 +152,9 @@ def _fitted(samples: Samples, solution: Solution, residual: Float64) -> Float64:
 
 
 def block_scores(samples: Samples, by_common: Float64, block: Int64, blocks: int) -> tuple[Float64, Float64]:
-    """Sum the gradient (B, P) and information (B, P, P) on the common parameters per block of time.
+    """Sum the gradient (B, P) and information (B, P, P) of the common parameters over each block of time.
 
-    by_common: (K, ROWS, P) as `projected` gives; block: (K,) the samples' block.
+    by_common: (K, ROWS, P) as `project_out_chain` returns it; block: (K,) block index of each sample.
     """
     width = by_common.shape[2]
     score, information = np.zeros((blocks, width)), np.zeros((blocks, width, width))

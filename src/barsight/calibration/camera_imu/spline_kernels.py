@@ -1,8 +1,8 @@
 """Evaluate one segment of a uniform cumulative B-spline on SO(3) x R3 with Jacobians, compiled.
 
-Control point m is a rotation R_m and a place p_m. In a segment
-R(u) = R_i Exp(l_1(u) d_1) ... Exp(l_5(u) d_5) with d_j = Log(R_{i+j-1}^T R_{i+j}) [Kim 1995], and the turn
-rate and all derivatives by small turns R_m Exp(x) follow by the recursion of [Sommer 2020].
+Control point m is a rotation R_m and a place p_m. Within a segment,
+R(u) = R_i Exp(l_1(u) d_1) ... Exp(l_5(u) d_5) with d_j = Log(R_{i+j-1}^T R_{i+j}) [Kim 1995]. The turn rate
+and all derivatives with respect to small rotations R_m Exp(x) follow from the recursion of [Sommer 2020].
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from barsight.core.arrays import Float64, kernel
 
 ORDER = 6
-"""Control points per segment. Six, as Kalibr: the acceleration is a cubic, the jerk smooth."""
+"""Control points per segment. Six, as in Kalibr, make the acceleration a cubic and the jerk smooth."""
 DEGREE = ORDER - 1
 SMALL = 1e-5
 
@@ -23,7 +23,7 @@ SMALL = 1e-5
 class ControlPoints(NamedTuple):
     """M control points, step_s apart: rotations (M, 3, 3) and places_m (M, 3) of world_from_body.
 
-    steps: (M - 1, 3) turns d_j between them, rad; inverse: (M - 1, 3, 3) their inverse right Jacobians.
+    steps: (M - 1, 3) rotations d_j between them, rad; inverse: (M - 1, 3, 3) their inverse right Jacobians.
     """
 
     step_s: float
@@ -34,7 +34,7 @@ class ControlPoints(NamedTuple):
 
 
 def _blending() -> Float64:
-    """Compute the blending matrix (ORDER, ORDER) of a uniform B-spline, control point by power of u."""
+    """Compute the blending matrix (ORDER, ORDER) of a uniform B-spline, control points by powers of u."""
     k = ORDER
     matrix = np.zeros((k, k))
     for s in range(k):
@@ -50,7 +50,7 @@ CUMULATIVE = np.cumsum(BLENDING[::-1], axis=0)[::-1].copy()
 
 @kernel()
 def weights(u: float, step_s: float, matrix: Float64, out: Float64) -> None:
-    """Fill out (3, ORDER): the weights at u in [0, 1) and their first two derivatives by time."""
+    """Fill out (3, ORDER) with the weights at u in [0, 1) and their first two time derivatives."""
     for row in range(ORDER):
         value, slope, bend = 0.0, 0.0, 0.0
         for n in range(ORDER - 1, -1, -1):
@@ -90,7 +90,7 @@ def exp_so3(v: Float64, scale: float, rotation: Float64, right: Float64) -> None
 
 @kernel()
 def _times(a: Float64, b: Float64, transposed: bool, out: Float64) -> None:
-    """Multiply out = a @ b, or a^T @ b, all (3, 3)."""
+    """Fill out with a @ b, or with a^T @ b, all (3, 3)."""
     for i in range(3):
         for j in range(3):
             total = 0.0
@@ -104,11 +104,12 @@ def rotation_at(
     first: Float64, steps: Float64, inverse_right: Float64, share: Float64, rotation: Float64, rate: Float64,
     turn_by: Float64, rate_by: Float64,
 ) -> None:  # fmt: skip
-    """Evaluate rotation and turn rate (body axes) of a segment, with their Jacobians.
+    """Evaluate the rotation and turn rate (body axes) of a segment, with their Jacobians.
 
     first: (3, 3) R_i. steps: (DEGREE, 3) d_j; inverse_right: (DEGREE, 3, 3) their inverse right Jacobians.
-    share: (3, ORDER) cumulative weights. Filled: rotation (3, 3), rate (3,), turn_by and rate_by
-    (3, 3 * ORDER): the small turn (from the right) and the rate by small turns of the control points.
+    share: (3, ORDER) cumulative weights. Fills rotation (3, 3), rate (3,), turn_by and rate_by (3, 3 *
+    ORDER), the derivatives of rotation (from the right) and rate with respect to small rotations of the
+    control points.
     """
     factor, right = np.empty((ORDER, 3, 3)), np.empty((ORDER, 3, 3))
     carried = np.empty((ORDER, 3))
@@ -158,7 +159,7 @@ def rotation_at(
 
 @kernel()
 def place_at(places: Float64, weight: Float64, out: Float64) -> None:
-    """Fill out (3, 3): place, velocity, acceleration of a segment. places: (ORDER, 3)."""
+    """Fill out (3, 3) with place, velocity and acceleration of a segment. places: (ORDER, 3)."""
     for derivative in range(3):
         for i in range(3):
             total = 0.0
@@ -174,8 +175,8 @@ def motion_at(
 ) -> None:  # fmt: skip
     """Evaluate the motion at u in segment i.
 
-    Filled: weight and share (3, ORDER), the blending and cumulative weights; rotation, rate, turn_by and
-    rate_by as by `rotation_at`; motion (3, 3) as by `place_at`.
+    Fills weight and share (3, ORDER), the blending and cumulative weights; rotation, rate, turn_by and
+    rate_by as `rotation_at` does; motion (3, 3) as `place_at` does.
     """
     weights(u, points.step_s, BLENDING, weight)
     weights(u, points.step_s, CUMULATIVE, share)

@@ -1,4 +1,6 @@
-"""Estimate the covariance of a camera-IMU calibration: noise, correlated residuals, fixed parameters."""
+"""Estimate the covariance of a camera-IMU calibration from noise, correlated residuals and fixed
+parameters.
+"""
 
 from __future__ import annotations
 
@@ -21,16 +23,21 @@ from barsight.core.arrays import Float64
 BLOCK_S = 1.0
 FLOOR = 1e-8
 NEEDED = {"rad": np.radians(0.1), "m": 3e-3, "s": 2e-4, "": 1e-3}
-"""What a yard needs: 0.1 degrees, 3 mm, 0.2 ms, a scale to 0.1 %. Directions are judged in these units."""
+"""Accuracy that a yard needs: 0.1 degrees, 3 mm, 0.2 ms, scales to 0.1 %. Weak directions are judged in these
+units.
+"""
 UNDETERMINED = 10.0
 SHIFT_SIGMAS = 3.0
 
 
 @dataclass(frozen=True)
 class HeldFixed:
-    """Something that was not solved for. chi: how much the residuals would fall by freeing it, per parameter,
-    against what noise would give (1: nothing to gain). changes: (name, change) of its own parameters that
-    stand out. matters: whether the mounting's change by it was counted as uncertainty."""
+    """A group of parameters that was held fixed.
+
+    chi: expected fall of the residuals on freeing the group, per parameter, relative to what noise alone
+    would give (1: nothing to gain). changes: (name, change) of those of its parameters that would change
+    significantly. matters: true if the resulting change of the mounting is counted as uncertainty.
+    """
 
     name: str
     chi: float
@@ -40,11 +47,14 @@ class HeldFixed:
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """covariance: (P, P) of the common parameters, all causes together; noise_sigma: (P,) the corners'
-    and IMU's independent noise alone. correlation: the factor on the variances by which seconds disagree more
-    than that. singular_values: (P,) of the information in units of what is needed, falling; undetermined: the
-    directions known worse than ten times the need, in words. fixed: what was held fixed. lens_names: (L,) of
-    the lenses' parameters; by_lens: (P, L) how the common ones answer to them."""
+    """Uncertainty of the common parameters.
+
+    covariance: (P, P) from all error sources. noise_sigma: (P,) from independent corner and IMU noise alone.
+    correlation: factor on the variances, from how much more the seconds of the recording disagree than that.
+    singular_values: (P,) of the information in units of the needed accuracy, descending. undetermined:
+    directions known to worse than ten times the need, in words. fixed: groups held fixed. lens_names: (L,) of
+    the lens parameters. by_lens: (P, L) derivatives of the common parameters with respect to them.
+    """
 
     covariance: Float64
     noise_sigma: Float64
@@ -57,9 +67,10 @@ class Uncertainty:
 
 
 def uncertainty(problem: CameraImuProblem, solution: Solution) -> Uncertainty:
-    """Compute the covariance from the Schur complement of the common parameters, widened by how seconds
-    disagree and by how far the mounting would move if lenses and IMU scales, held fixed, were free and the
-    residuals gain by it.
+    """Compute the covariance from the Schur complement of the common parameters.
+
+    It is widened by the disagreement between seconds and, where freeing the fixed lenses or IMU scales would
+    improve the residuals, by how far the mounting would then move.
     """
     names = problem.parameter_names
     unit = needed_units(names)
@@ -67,7 +78,7 @@ def uncertainty(problem: CameraImuProblem, solution: Solution) -> Uncertainty:
     values, vectors = np.linalg.eigh(scaled)
     weak = [n for n in range(values.size) if values[n] < UNDETERMINED**-2]
     undetermined = tuple(_direction(names, vectors[:, n]) for n in weak)
-    # A direction that nothing was seen of gets a huge sigma, not an error.
+    # An unobserved direction gets a huge sigma instead of raising an error.
     solid = np.maximum(values, FLOOR)
     inverse = (vectors / solid) @ vectors.T * unit[:, None] * unit
     covariance, correlation = inflate_covariance(inverse, 1.0, *_blocks(problem, solution))
@@ -85,7 +96,7 @@ def uncertainty(problem: CameraImuProblem, solution: Solution) -> Uncertainty:
 
 
 def needed_units(names: Sequence[str]) -> Float64:
-    """Return the needed accuracy (P,) of each parameter, by the unit its name ends with."""
+    """Return the needed accuracy (P,) of each parameter, according to the unit at the end of its name."""
     ends = [name.rsplit("_", 1)[-1] if "_" in name.rsplit(".", 1)[-1] else "" for name in names]
     return np.array([NEEDED.get(end, NEEDED[""]) for end in ends])
 
@@ -104,9 +115,11 @@ def _blocks(problem: CameraImuProblem, solution: Solution) -> tuple[Float64, Flo
 
 @dataclass(frozen=True, eq=False)
 class _FreedSystem:
-    """Information (Q, Q) and gradient (Q,) of the common parameters at the solution, were lenses and IMU
-    scales free too. own: (P,) those that were solved for; lenses, scales: the others, the latter where they
-    were held fixed.
+    """Information (Q, Q) and gradient (Q,) of the common parameters at the solution, as if lenses and IMU
+    scales were free too.
+
+    own: (P,) indices of the parameters that were solved for. lenses, scales: indices of the others; scales is
+    empty where they were solved for.
     """
 
     names: tuple[str, ...]
@@ -135,7 +148,7 @@ def _freed_system(problem: CameraImuProblem, solution: Solution) -> _FreedSystem
 def _freed(
     problem: CameraImuProblem, free: _FreedSystem, inverse: Float64, correlation: float
 ) -> list[tuple[HeldFixed, Float64]]:
-    """Estimate the effect of freeing lenses and IMU scales: one Newton step from the solution."""
+    """Estimate the effect of freeing lenses and IMU scales with one Newton step from the solution."""
     names, own, gradient = free.names, free.own, free.gradient
     groups = {"lenses": free.lenses}
     if not problem.scales:

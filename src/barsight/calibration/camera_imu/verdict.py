@@ -1,4 +1,4 @@
-"""Judge a camera-IMU calibration line by line and advise on the next recording."""
+"""Judge a camera-IMU calibration property by property and advise on the next recording."""
 
 from __future__ import annotations
 
@@ -29,21 +29,27 @@ MIN_RATE_RADPS, MIN_FORCE_MPS2 = 0.3, 1.0
 
 @dataclass(frozen=True, eq=False)
 class Halves:
-    """Two halves of the recording solved apart. difference, predicted: (14,) second minus first of the
-    mountings and time shifts, and the sigma of that. ratio: root mean square of their quotient."""
+    """Comparison of two halves of the recording, solved separately.
+
+    difference: (14,) mountings and time shifts, second half minus first. predicted: (14,) their sigmas.
+    """
 
     difference: Float64
     predicted: Float64
 
     @property
     def ratio(self) -> float:
-        """1 where the halves differ as their sigmas say."""
+        """Return the RMS of difference over predicted sigma; 1 where the halves differ as their sigmas
+        predict.
+        """
         return float(np.sqrt(((self.difference / self.predicted) ** 2).mean()))
 
 
 @dataclass(frozen=True, eq=False)
 class CameraImuAssessment:
-    """lines: the judged properties; advice: how to record again; halves: the cross-validation."""
+    """Verdict on a calibration. lines: judged properties. advice: how to improve the next recording. halves:
+    the cross-validation.
+    """
 
     lines: tuple[Line, ...]
     advice: tuple[str, ...]
@@ -59,8 +65,9 @@ def cross_halves(
     calibration: CameraImuCalibration, views: Sequence[BoardView], imu: ImuSamples, rig: StereoRig,
     board: Board, noise: ImuNoise, source: Path,
 ) -> Halves | Failed:  # fmt: skip
-    """Solve two halves apart. Failed `short` where a half would be under six seconds, `half` where one can't
-    be calibrated."""
+    """Solve two halves of the recording separately. Failed `short` where a half would last less than six
+    seconds, `half` where one can't be calibrated.
+    """
     spline = calibration.solution.state.spline
     if spline.segments * spline.step_s < 2 * MIN_HALF_S:
         return Failed("short", f"halves need {2 * MIN_HALF_S:g} s together")
@@ -79,7 +86,7 @@ def cross_halves(
 
 
 def assess_camera_imu(calibration: CameraImuCalibration, halves: Halves | Failed) -> CameraImuAssessment:
-    """Judge a calibration for measuring in a yard."""
+    """Judge a calibration by the accuracy that a yard needs."""
     sigma = calibration.sigma[: 2 * MOUNT].reshape(2, MOUNT)
     gyro, accel = calibration.spreads[1:]
     stated, found = calibration.stated, calibration.problem.sigmas

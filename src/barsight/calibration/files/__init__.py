@@ -1,1 +1,1 @@
-"""Rig and IMU files: Barsight's own, Kalibr's, OpenCV's, EuRoC's."""
+"""Read and write rig and IMU files: Barsight's own, Kalibr's, OpenCV's and EuRoC's."""

@@ -1,4 +1,4 @@
-"""Read and write EuRoC's `sensor.yaml` files: a rig and an IMU's noise."""
+"""Read and write EuRoC's `sensor.yaml` files, which hold a rig and an IMU's noise."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ DISTORTION_NAMES = {
 
 @dataclass(frozen=True, eq=False)
 class MountedImu:
-    """Mounting and noise of an IMU. noise is None where the file doesn't say."""
+    """Mounting and noise of an IMU; noise is None where the file doesn't state it."""
 
     body_from_imu: Pose
     noise: ImuNoise | None
 
 
 def read_rig(mav0: Path) -> StereoRig:
-    """Read the rig of `cam0/sensor.yaml` and `cam1/sensor.yaml`. Raises `CalibrationError`."""
+    """Read the rig from `cam0/sensor.yaml` and `cam1/sensor.yaml`. Raises `CalibrationError`."""
     documents = [read_document(mav0 / name / "sensor.yaml") for name in ("cam0", "cam1")]
     mounts = [
         document.pose("T_BS", "body", name)
@@ -45,7 +45,7 @@ def read_rig(mav0: Path) -> StereoRig:
 
 
 def read_camera(document: Document, coefficients_key: str) -> Camera:
-    """Read a camera from EuRoC's or Kalibr's keys, which differ in the name of the coefficients only."""
+    """Read a camera from EuRoC's or Kalibr's keys, which differ only in the name of the coefficients."""
     model = str(document.get("camera_model"))
     if model != "pinhole":
         raise document.error("camera_model", f"{model!r} is not supported", "calibrate as pinhole")
@@ -72,7 +72,7 @@ def read_camera(document: Document, coefficients_key: str) -> Camera:
 def build_rig(
     path: Path, cam0: Camera, cam1: Camera, body_from_cam0: Pose, body_from_cam1: Pose, shift_ns: int
 ) -> StereoRig:
-    """Build a `StereoRig`, its refusals turned into `CalibrationError` about `path`."""
+    """Build a `StereoRig`; invalid values raise `CalibrationError` about `path`."""
     try:
         return StereoRig(cam0, cam1, body_from_cam0, body_from_cam1, shift_ns)
     except ValueError as error:
@@ -122,7 +122,7 @@ def write_rig(mav0: Path, rig: StereoRig, rate_hz: float) -> None:
 
 
 def write_imu_description(path: Path, noise: ImuNoise | None, rate_hz: float) -> None:
-    """Write an IMU's `sensor.yaml` for samples that are in `body` already."""
+    """Write an IMU's `sensor.yaml` for samples that are already in the frame `body`."""
     values: dict[str, object] = {
         "sensor_type": "imu",
         "comment": "imu0",

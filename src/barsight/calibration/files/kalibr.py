@@ -1,8 +1,8 @@
 """Read and write Kalibr's `camchain-imucam.yaml` and `imu.yaml`.
 
 Kalibr stores `T_cam_imu` = cam_from_body (the body is the IMU), `T_cn_cnm1` = cam1_from_cam0 and
-`timeshift_cam_imu` with t_imu = t_cam + shift. Radial-tangential lenses of 5 and 8 coefficients, which Kalibr
-itself does not make, are written and read as longer lists.
+`timeshift_cam_imu` with t_imu = t_cam + shift. Radial-tangential lenses with 5 or 8 coefficients, which
+Kalibr itself does not produce, are written and read as longer lists.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ AGREEMENT = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class CamChain:
-    """A camchain file. topics: cam0's and cam1's `rostopic`, None where it isn't stated.
+    """A camchain file. topics: the `rostopic` of cam0 and of cam1, None where it isn't stated.
 
-    knows_imu: the file holds `T_cam_imu`. Without it the rig's body is cam0 and an IMU can't be used.
+    knows_imu: the file holds `T_cam_imu`. Without it, the rig's body is cam0 and an IMU can't be used.
     """
 
     rig: StereoRig
@@ -40,14 +40,14 @@ class CamChain:
 
 @dataclass(frozen=True)
 class ImuFile:
-    """An `imu.yaml`. topic: its `rostopic`, None where it isn't stated."""
+    """An `imu.yaml` file. topic: its `rostopic`, None where it isn't stated."""
 
     noise: ImuNoise
     topic: str | None
 
 
 def read_camchain(path: Path) -> CamChain:
-    """Read the rig of the first two cameras of a camchain. Raises `CalibrationError`."""
+    """Read the rig formed by the first two cameras of a camchain. Raises `CalibrationError`."""
     document = read_document(path)
     cam0, cam1 = document.section("cam0"), document.section("cam1")
     cameras = read_camera(cam0, "distortion_coeffs"), read_camera(cam1, "distortion_coeffs")
@@ -65,7 +65,7 @@ def read_camchain(path: Path) -> CamChain:
 
 
 def read_imu_file(path: Path) -> ImuFile:
-    """Read the noise model of `imu.yaml`, which Kalibr writes flat or below `imu0`.
+    """Read the noise model from `imu.yaml`, whose keys Kalibr writes at the top level or below `imu0`.
 
     Raises `CalibrationError`.
     """
@@ -137,7 +137,9 @@ def _topic(document: Document) -> str | None:
 
 
 def _expect_agreement(cam1: Document, left: Pose, right: Pose) -> None:
-    """Refuse a camchain whose two statements of the stereo extrinsics differ: it was edited by hand."""
+    """Refuse a camchain that states the stereo extrinsics twice with different values, as after editing by
+    hand.
+    """
     if "T_cn_cnm1" not in cam1.values:
         return
     stated = cam1.pose("T_cn_cnm1", "cam0", "cam1", inverted=True)

@@ -1,4 +1,4 @@
-"""Fit the lenses that Kalibr takes (four coefficients) to those with more, and state what that costs."""
+"""Approximate lenses with more coefficients by the four that Kalibr accepts, and state the error."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
 
 MAX_OFF_PX = 0.1
-"""Where a fit is further off than this anywhere in the picture, another lens would be written."""
+"""Maximum error (px) of a fit anywhere in the picture; a larger one would describe a different lens."""
 GRID = (25, 19)
 TAKEN = 4
 
 
 def rig_for_kalibr(rig: StereoRig) -> tuple[StereoRig, float] | Failed:
-    """Return the rig with lenses that Kalibr takes, and how far off they are at most, px.
+    """Return the rig with lenses that Kalibr accepts, and their maximum error in px.
 
-    Failed `lens` where four radial-tangential coefficients don't describe a lens.
+    Failed `lens` where four radial-tangential coefficients can't describe a lens.
     """
     cameras, worst = [], 0.0
     for name, camera in (("cam0", rig.cam0), ("cam1", rig.cam1)):
@@ -41,9 +41,9 @@ def rig_for_kalibr(rig: StereoRig) -> tuple[StereoRig, float] | Failed:
 
 
 def fit_four(camera: Camera) -> tuple[Camera, float]:
-    """Fit a lens of four coefficients to one of more: same rays over the whole picture, by least squares.
+    """Fit a lens with four coefficients to one with more by least squares over the rays of the whole picture.
 
-    Returns the camera and the largest distance, px.
+    Returns the camera and the maximum error in px.
     """
     across, down = np.meshgrid(
         np.linspace(0, camera.width - 1, GRID[0]), np.linspace(0, camera.height - 1, GRID[1])

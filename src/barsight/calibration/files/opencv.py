@@ -1,7 +1,7 @@
-"""Read and write stereo rigs in OpenCV's YAML, XML or JSON (M1 D1 M2 D2 R T, as its stereo sample).
+"""Read and write stereo rigs in OpenCV's YAML, XML or JSON (M1 D1 M2 D2 R T, as in its stereo sample).
 
-R and T are cam1_from_cam0, T in metres. OpenCV's own files don't carry the pictures' size: `image_width` and
-`image_height` must be in them. A key `distortion_model: equidistant` marks fisheye lenses.
+R and T are cam1_from_cam0, with T in metres. OpenCV's own files lack the picture size, so `image_width` and
+`image_height` must be added. The key `distortion_model: equidistant` marks fisheye lenses.
 """
 
 from __future__ import annotations
@@ -33,9 +33,10 @@ ORIGINAL = "take the calibration's original file"
 
 
 def read_opencv_rig(path: Path) -> StereoRig:
-    """Read the rig of one OpenCV file, or of `intrinsics` with `extrinsics` of the same suffix beside it.
+    """Read the rig from one OpenCV file, or from `intrinsics` and the `extrinsics` of the same suffix beside
+    it.
 
-    The body is cam0. Raises `CalibrationError` naming the key that is missing or can't be.
+    The body is cam0. Raises `CalibrationError` that names the missing or invalid key.
     """
     found = _matrices(path)
     beside = path.with_name(f"extrinsics{path.suffix}")
@@ -69,9 +70,9 @@ def read_opencv_rig(path: Path) -> StereoRig:
 
 
 def write_opencv_rig(path: Path, rig: StereoRig, *, xml: bool = False) -> None:
-    """Write what `read_opencv_rig` reads; where the rig sits on its body is not part of such files."""
+    """Write a file that `read_opencv_rig` reads; such files do not hold the rig's mounting on the body."""
     form = cv2.FILE_STORAGE_FORMAT_XML if xml else cv2.FILE_STORAGE_FORMAT_YAML
-    # Writing to a file itself, OpenCV passes over what a full disk refuses.
+    # When it writes the file itself, OpenCV ignores the errors of a full disk.
     storage = cv2.FileStorage("", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | form)
     pose = rig.cam0_from_cam1.inverse()
     storage.write("image_width", rig.cam0.width)
@@ -86,7 +87,7 @@ def write_opencv_rig(path: Path, rig: StereoRig, *, xml: bool = False) -> None:
 
 
 def _matrices(path: Path) -> dict[str, Float64]:
-    """Read the known entries as matrices; `fisheye` is there where the lenses are."""
+    """Read the known entries as matrices; `fisheye` is among them where the lenses are fisheyes."""
     text = read_text(path, MAX_SETTINGS_BYTES, ORIGINAL, CalibrationError)
     if _depth(text) > MAX_DEPTH:
         raise CalibrationError(path, f"brackets in brackets over {MAX_DEPTH} deep", ORIGINAL)
@@ -119,8 +120,8 @@ def _matrices(path: Path) -> dict[str, Float64]:
 
 
 def _depth(text: str) -> int:
-    """Compute how deep brackets, tags and lists in one line stand in each other at most; OpenCV's parser goes
-    down into each and overflows its stack.
+    """Compute the maximum nesting depth of brackets, tags and inline lists. OpenCV's parser recurses into
+    each level and would overflow its stack.
     """
     spoken = re.sub(r"#.*", "", text)
     depth, deepest = 0, max((run[0].count("-") for run in re.finditer(r"(?:-[ \t]*)+", spoken)), default=0)

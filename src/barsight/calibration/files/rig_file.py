@@ -1,6 +1,6 @@
-"""Read and write our own rig file: versioned YAML with the calibration's covariance.
+"""Read and write Barsight's rig file: versioned YAML with the calibration's covariance.
 
-docs/reference/rig-file.md describes the keys. Readers accept every version up to their own.
+docs/reference/rig-file.md describes the keys. Each release reads every version up to its own.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ VERSION = 1
 
 
 def write_rig_file(path: Path, rig: StereoRig, section: Mapping[str, object] | None = None) -> None:
-    """Write a rig and the key `calibration`, which says how well it is known; reads back bit for bit."""
+    """Write a rig and the key `calibration`, which states its uncertainty; the rig reads back bit for bit."""
     values: dict[str, object] = {
         VERSION_KEY: VERSION,
         "cam0": _camera(rig.cam0, rig.body_from_cam0),
@@ -40,7 +40,7 @@ def write_rig_file(path: Path, rig: StereoRig, section: Mapping[str, object] | N
 
 
 def read_own_rig(document: Document) -> StereoRig:
-    """Read the rig of a document with the key `barsight_rig`. Raises `CalibrationError`."""
+    """Read the rig from a document with the key `barsight_rig`. Raises `CalibrationError`."""
     version = document.number(VERSION_KEY)
     if not 1 <= version <= VERSION:
         raise document.error(
@@ -56,7 +56,9 @@ def read_own_rig(document: Document) -> StereoRig:
 
 
 def read_serials(path: Path) -> tuple[str | None, str | None]:
-    """Read the serial numbers of cam0 and cam1 (key `serial`); None where a file of any format has none."""
+    """Read the serial numbers of cam0 and cam1 (key `serial`) from a file of any format; None where it has
+    none.
+    """
     if path.is_dir():
         return None, None
     values = read_document(path).values
@@ -70,7 +72,7 @@ def _serial(section: object) -> str | None:
 
 
 def read_covariance(path: Path) -> tuple[tuple[str, ...], Float64] | None:
-    """Read parameter names (C,) and covariance (C, C) of a rig file, None where it carries none."""
+    """Read the parameter names (C,) and covariance (C, C) from a rig file; None where it has none."""
     document = read_document(path)
     if document.values.get("calibration") is None:
         return None
@@ -86,7 +88,7 @@ def read_covariance(path: Path) -> tuple[tuple[str, ...], Float64] | None:
 
 
 def read_board(path: Path, board: Board) -> Board:
-    """Apply the board shape that `calibrate stereo` found, where the rig file comes from the same board."""
+    """Apply the board shape that `calibrate stereo` estimated, if the rig file comes from the same board."""
     section = read_document(path).values.get("calibration")
     if not isinstance(section, dict) or section.get("board") != str(board):
         return board

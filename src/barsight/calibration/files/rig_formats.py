@@ -1,4 +1,4 @@
-"""Read and write a rig in any format: ours, Kalibr's camchain, OpenCV's, an EuRoC folder."""
+"""Read and write rigs in any format: Barsight's own, Kalibr's camchain, OpenCV's, or an EuRoC folder."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ KNOWN = "a rig.yaml of barsight, Kalibr's camchain, OpenCV's YAML or XML, or an 
 
 
 class RigFormat(StrEnum):
-    """Formats to write a rig in. EUROC is a folder, the others are files."""
+    """Formats in which a rig can be written. EUROC is a folder, the others are files."""
 
     BARSIGHT = "barsight"
     KALIBR = "kalibr"
@@ -34,7 +34,7 @@ class RigFormat(StrEnum):
 
 
 def read_rig_file(path: Path) -> StereoRig:
-    """Read the rig at `path`, in whichever format. Raises `CalibrationError`."""
+    """Read the rig at `path` in any known format. Raises `CalibrationError`."""
     if path.is_dir():
         return read_rig(path / "mav0" if (path / "mav0").is_dir() else path)
     if path.suffix.lower() == ".xml" or _is_opencv(path):
@@ -48,16 +48,17 @@ def read_rig_file(path: Path) -> StereoRig:
 
 
 def holds_own_rig(path: Path) -> bool:
-    """Check for a rig file of our own format, the one with a covariance."""
+    """Check for a rig file in Barsight's own format, the only one with a covariance."""
     if path.is_dir() or path.suffix.lower() == ".xml" or _is_opencv(path):
         return False
     return VERSION_KEY in read_document(path).values
 
 
 def select_rig(path: Path | None, own: StereoRig) -> StereoRig:
-    """Select the rig of a file that the user names, else the recording's `own`.
+    """Select the rig from a file that the user names, or else the recording's `own`.
 
-    A calibration of two cameras alone says nothing of the body: `own` says where cam0 sits, and the clocks.
+    A calibration of the two cameras alone does not know the body, so cam0's mounting and the time shift are
+    taken from `own`.
     """
     if path is None:
         return own
@@ -71,15 +72,15 @@ def select_rig(path: Path | None, own: StereoRig) -> StereoRig:
 
 
 def body_is_cam0(rig: StereoRig) -> bool:
-    """Check whether the rig's body is its left camera: nobody said where an IMU sits."""
+    """Check whether the rig's body is its left camera, that is, no mounting on an IMU is known."""
     return bool(np.array_equal(rig.body_from_cam0.matrix, np.eye(4)))
 
 
 def write_any_rig(path: Path, rig: StereoRig, form: RigFormat) -> float:
-    """Write a rig whole or not at all; an OpenCV file's suffix says YAML or XML.
+    """Write a rig completely or not at all. The suffix of an OpenCV file selects YAML or XML.
 
-    Returns how far off, px, the written lenses are at most: Kalibr's take four coefficients.
-    Raises CalibrationError where a lens has no such form.
+    Returns the maximum error of the written lenses in px: those of Kalibr take four coefficients only.
+    Raises CalibrationError where a lens can't be expressed in the format.
     """
     off_px = 0.0
     if form is RigFormat.KALIBR:

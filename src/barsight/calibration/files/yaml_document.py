@@ -1,4 +1,4 @@
-"""Read and write calibration YAML with errors that name file and key."""
+"""Read and write calibration YAML, with errors that name the file and the key."""
 
 from __future__ import annotations
 
@@ -20,20 +20,24 @@ from barsight.core.reading.bounded_reading import MAX_DEPTH, expect_modest, in_r
 ROTATION_DECIMALS = 13
 TRANSLATION_DECIMALS = 12
 MAX_YAML_BYTES, MAX_YAML_NODES = 1 << 18, 20_000
-"""A calibration with its covariance has some 20 kB and 2000 values; so many take 4 s to parse."""
+"""Limits on a YAML file's size in bytes and number of values. A calibration with its covariance has some 20
+kB and 2000 values; a file at the limit takes 4 s to parse.
+"""
 REMEDY = "take the original file"
 
 
 @dataclass(frozen=True)
 class Document:
-    """One YAML mapping and the file it came from. Every getter raises `CalibrationError` naming both."""
+    """A YAML mapping and the file it came from. Every getter raises `CalibrationError` naming the file and
+    the key.
+    """
 
     path: Path
     values: dict[str, Any]
     prefix: str = ""
 
     def error(self, key: str, problem: str, remedy: str) -> CalibrationError:
-        """Make the error to raise about one key."""
+        """Make the error to raise about a key."""
         return CalibrationError(self.path, f"{self.prefix}{key}: {problem}", remedy)
 
     def get(self, key: str) -> Any:
@@ -43,13 +47,13 @@ class Document:
         return self.values[key]
 
     def number(self, key: str, default: float | None = None) -> float:
-        """Return a finite number; the default where the key is absent and a default is given."""
+        """Return a finite number, or the default where one is given and the key is absent."""
         if default is not None and self.values.get(key) is None:
             return default
         return self.numbers_in(key, [self.get(key)])[0]
 
     def numbers(self, key: str, count: int | None = None) -> tuple[float, ...]:
-        """Return a list of finite numbers, of this length where one is given."""
+        """Return a list of finite numbers, of length `count` where that is given."""
         value = self.get(key)
         if not isinstance(value, list):
             raise self.error(key, "is not a list of numbers", "write it as [a, b, ...]")
@@ -59,7 +63,7 @@ class Document:
         return numbers
 
     def numbers_in(self, key: str, value: Sequence[Any]) -> tuple[float, ...]:
-        """Convert the elements to finite floats. YAML 1.1 reads `1e-5` as text, so text is tried too."""
+        """Convert the elements to finite floats. YAML 1.1 reads `1e-5` as text, so text is converted too."""
         try:
             numbers = tuple(float(v) for v in value if not isinstance(v, bool))
         except (TypeError, ValueError, OverflowError):
@@ -71,8 +75,8 @@ class Document:
         return numbers
 
     def matrix(self, key: str) -> Float64:
-        """Return a (4, 4) matrix from `{rows, cols, data}` (EuRoC), four rows of four (Kalibr) or
-        16 numbers.
+        """Return a (4, 4) matrix from `{rows, cols, data}` (EuRoC), from four rows of four numbers (Kalibr)
+        or from 16 numbers.
         """
         value = self.get(key)
         if isinstance(value, dict):
@@ -84,7 +88,7 @@ class Document:
         return np.array(self.numbers_in(key, value), dtype=np.float64).reshape(4, 4)
 
     def pose(self, key: str, target: str, source: str, *, inverted: bool = False) -> Pose:
-        """Return `target_from_source` of a 4x4 matrix; with `inverted` the file stores
+        """Return `target_from_source` from a 4x4 matrix; `inverted` means that the file stores
         `source_from_target`.
         """
         matrix = self.matrix(key)
@@ -94,7 +98,7 @@ class Document:
             raise self.error(key, str(error), "a calibration must hold a rotation; copy it again") from None
 
     def section(self, key: str) -> Document:
-        """Return a mapping inside this one."""
+        """Return a mapping nested in this one."""
         value = self.get(key)
         if not isinstance(value, dict):
             raise self.error(key, "is not a mapping", "compare with Kalibr's file format")
@@ -102,7 +106,7 @@ class Document:
 
 
 def read_document(path: Path) -> Document:
-    """Read a YAML mapping; a first line `%YAML:1.0` (OpenCV's, which YAML forbids) is passed over."""
+    """Read a YAML mapping; the line `%YAML:1.0`, which OpenCV writes but YAML forbids, is ignored."""
     text = read_text(path, MAX_YAML_BYTES, REMEDY, CalibrationError)
     lines = ["" if line.startswith("%YAML") else line for line in text.splitlines()]
     try:
@@ -114,7 +118,7 @@ def read_document(path: Path) -> Document:
         raise CalibrationError(path, f"{where}not YAML ({problem})", REMEDY) from None
     except RecursionError:
         raise CalibrationError(path, "not YAML (brackets in brackets, too deep)", REMEDY) from None
-    except Exception as error:  # of a date that isn't, a key that is a list, a binary that is none
+    except Exception as error:  # from an invalid date, a key that is a list, or invalid binary data
         raise CalibrationError(path, f"not YAML ({error})", REMEDY) from None
     if not isinstance(values, dict):
         raise CalibrationError(path, "is empty or no list of keys", "take the original file")
@@ -122,7 +126,7 @@ def read_document(path: Path) -> Document:
 
 
 def _load(text: str) -> Any:
-    """Load YAML of MAX_YAML_NODES values at most, those that its aliases stand for among them.
+    """Load YAML with at most MAX_YAML_NODES values, counting the values that its aliases expand to.
 
     Raises ValueError, YAMLError and others.
     """
@@ -147,7 +151,7 @@ def _load(text: str) -> Any:
 
 
 def write_document(path: Path, values: dict[str, Any]) -> None:
-    """Write a YAML mapping; floats as Python's `repr`, so that they read back bit for bit."""
+    """Write a YAML mapping, with floats as Python's `repr` so that they read back bit for bit."""
     yaml = YAML(typ="safe", pure=True)
     yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
     yaml.default_flow_style = None
@@ -158,11 +162,11 @@ def write_document(path: Path, values: dict[str, Any]) -> None:
 def canonical_pose(target: str, source: str, matrix: Float64, *, inverted: bool = False) -> Pose:
     """Build a mounting whose numbers don't depend on which of its two directions a file stores.
 
-    EuRoC stores `body_from_cam`, Kalibr `cam_from_body`; the detour over the inverse costs some 1e-16. The
-    rotation is made orthonormal and rounded to 1e-13, which is fine enough for `Pose` to keep it as it is
-    (it projects above 1e-12), the translation to 1e-12 m; so both files give the same bits. The inverse is
-    the matrix's, not the transpose: a rotation rounded to 1e-13 isn't orthonormal to 1e-16.
-    Raises ValueError where the matrix holds no rotation.
+    EuRoC stores `body_from_cam`, Kalibr `cam_from_body`; going through the inverse costs some 1e-16. The
+    rotation is made orthonormal and rounded to 1e-13, which is fine enough for `Pose` to keep it unchanged
+    (it projects above 1e-12), and the translation is rounded to 1e-12 m, so both files give the same bits.
+    The inverse is that of the matrix, not the transpose: a rotation rounded to 1e-13 isn't orthonormal to
+    1e-16. Raises ValueError where the matrix holds no rotation.
     """
     if inverted:
         Pose.from_matrix(source, target, matrix)

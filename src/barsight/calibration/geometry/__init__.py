@@ -1,1 +1,1 @@
-"""Camera models, projection, stereo rigs, rectification and the IMU's noise model."""
+"""Model cameras, projection, stereo rigs, rectification and IMU noise."""

@@ -11,15 +11,21 @@ import numpy as np
 from barsight.core.arrays import Float64
 
 MAX_PIXELS = 1 << 26
-"""Of a picture; a small file may claim any number. Cameras over a yard have 2 to 25 million."""
+"""Maximum number of pixels of a picture, as a small file may claim any number. Cameras over a yard have 2 to
+25 million.
+"""
 
 
 MIN_FOCAL_SIDES, MAX_FOCAL_SIDES = 1e-3, 1e4
-"""Of a focal length, in sides of the picture: pictures of 180 degrees and of 20 seconds of arc."""
+"""Limits of a focal length, in sides of the picture: fields of view of 180 degrees and of 20 seconds of
+arc.
+"""
 
 
 class Distortion(StrEnum):
-    """RADTAN: k1 k2 p1 p2 [k3 [k4 k5 k6]], OpenCV's order. EQUIDISTANT: k1..k4 [Kannala 2006]."""
+    """Lens distortion models. RADTAN: k1 k2 p1 p2 [k3 [k4 k5 k6]] in OpenCV's order. EQUIDISTANT: k1..k4
+    [Kannala 2006].
+    """
 
     NONE = "none"
     RADTAN = "radial-tangential"
@@ -35,9 +41,9 @@ COEFFICIENT_COUNTS = {
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera: focal lengths and principal point in px, (0, 0) the centre of the first pixel.
+    """A pinhole camera with focal lengths and principal point in px; (0, 0) is the centre of the first pixel.
 
-    Raises ValueError where a number can't be (focal length not positive, a wrong count of coefficients).
+    Raises ValueError for an invalid value (focal length not positive, wrong number of coefficients).
     """
 
     width: int
@@ -78,7 +84,7 @@ class Camera:
 
     @property
     def is_ideal(self) -> bool:
-        """Check for no lens distortion at all.
+        """Check that there is no lens distortion at all.
 
         An equidistant lens bends rays even where its coefficients are zero.
         """

@@ -10,7 +10,7 @@ class ImuNoise:
     """IMU noise model in Kalibr's units.
 
     gyro_density: rad/s/sqrt(Hz). gyro_walk: rad/s^2/sqrt(Hz). accel_density: m/s^2/sqrt(Hz).
-    accel_walk: m/s^3/sqrt(Hz). rate_hz: as the file states it.
+    accel_walk: m/s^3/sqrt(Hz). rate_hz: sampling rate as stated in the file.
     """
 
     gyro_density: float

@@ -1,7 +1,7 @@
-"""Project points with analytic Jacobians by point and lens parameters.
+"""Project points with analytic Jacobians with respect to point and lens parameters.
 
-Pixels come from the same models as `Camera.project` (OpenCV's radial-tangential with 4, 5 or 8 coefficients,
-equidistant [Kannala 2006]); a test holds both together.
+Pixels come from the same models as in `Camera.project` (OpenCV's radial-tangential with 4, 5 or 8
+coefficients, equidistant [Kannala 2006]); a test compares the two.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ INTRINSIC_NAMES = ("fx_px", "fy_px", "cx_px", "cy_px")
 
 
 class Lens(StrEnum):
-    """Lens models a calibration can solve for."""
+    """Lens models that a calibration can estimate."""
 
     RADTAN4 = "radtan4"
     RADTAN5 = "radtan5"
@@ -34,11 +34,11 @@ class Lens(StrEnum):
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """Return fx, fy, cx, cy and the coefficients."""
+        """Return fx, fy, cx, cy and the names of the coefficients."""
         return INTRINSIC_NAMES + self.coefficient_names
 
     def camera(self, parameters: Float64, width: int, height: int) -> Camera:
-        """Build the camera of one parameter vector. Raises ValueError where it can't be."""
+        """Build the camera from a parameter vector. Raises ValueError for invalid parameters."""
         fx, fy, cx, cy, *rest = (float(value) for value in parameters)
         kind = Distortion.EQUIDISTANT if self is Lens.EQUIDISTANT else Distortion.RADTAN
         return Camera(width, height, fx, fy, cx, cy, kind, tuple(rest))
@@ -46,7 +46,9 @@ class Lens(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class Projected:
-    """pixels (N, 2); by_point (N, 2, 3) derivatives by the point; by_lens (N, 2, P) by the parameters."""
+    """Projected points. pixels (N, 2); derivatives with respect to the point, by_point (N, 2, 3), and to the
+    lens parameters, by_lens (N, 2, P).
+    """
 
     pixels: Float64
     by_point: Float64

@@ -1,7 +1,7 @@
-"""Rectify raw pairs so that matches lie on the same row.
+"""Rectify raw pairs so that matches are on the same row.
 
-Both cameras are turned about their centres so that their x axes run along the baseline and their rows agree
-[Fusiello 2000]; the lens distortion is taken off in the same interpolation.
+Both cameras are rotated about their centres so that their x axes are parallel to the baseline and their rows
+agree [Fusiello 2000]; lens distortion is removed in the same interpolation.
 """
 
 from __future__ import annotations
@@ -19,9 +19,10 @@ from barsight.core.records.pairs import RectifiedCamera, RectifiedPair, StereoFr
 
 
 class Rectifier:
-    """Rectifies a rig's pairs. Maps are made once; a pair that is rectified already passes untouched.
+    """Rectifies the pairs of a rig. The maps are computed once; a pair that is already rectified passes
+    unchanged.
 
-    camera: geometry of the rectified pair. body_from_rect0: where the rectified left camera sits.
+    camera: geometry of the rectified pair. body_from_rect0: mounting of the rectified left camera.
     """
 
     def __init__(self, rig: StereoRig) -> None:
@@ -53,7 +54,7 @@ class Rectifier:
         self._left_valid, self._right_valid = left.valid, right.valid
 
     def __call__(self, frame: StereoFrame) -> RectifiedPair | Failed:
-        """Rectify a pair; Failed `wrong-size` where the images don't have the calibration's size."""
+        """Rectify a pair; Failed `wrong-size` where the images differ in size from the calibration."""
         wrong = self.wrong_size(frame)
         if wrong is not None:
             return wrong
@@ -61,7 +62,7 @@ class Rectifier:
         return self.pair(frame.stamp_ns, self.left(frame.left), right)
 
     def wrong_size(self, frame: StereoFrame) -> Failed | None:
-        """Return Failed `wrong-size` where the images don't have the calibration's size."""
+        """Return Failed `wrong-size` where the images differ in size from the calibration, otherwise None."""
         for name, image, size in (
             ("left", frame.left, self._size),
             ("right", frame.right, self._right_size),
@@ -75,15 +76,15 @@ class Rectifier:
         return None
 
     def pair(self, stamp_ns: int, left: UInt8, right: UInt8) -> RectifiedPair:
-        """Name the geometry of two pictures that this rectifier has rectified."""
+        """Combine two pictures that this rectifier has rectified into a pair with its geometry."""
         return RectifiedPair(stamp_ns, left, right, self._left_valid, self._right_valid, self.camera)
 
     def left(self, image: UInt8) -> UInt8:
-        """Rectify the left image alone, of the calibration's size."""
+        """Rectify the left image alone; it must have the calibration's size."""
         return image if self._warps is None else self._warps[0](image)
 
     def places(self, left: Float64, right: Float64) -> tuple[Float64, Float64]:
-        """Rectify raw pixels (N, 2) of cam0 and cam1, (N, 2) each."""
+        """Rectify raw pixels (N, 2) of cam0 and of cam1; returns both, (N, 2) each."""
         camera = self.camera
         placed = []
         for lens, rotation, pixels, cx in zip(
@@ -96,8 +97,8 @@ class Rectifier:
 
 
 def _rectified_axes(rig: StereoRig) -> Float64:
-    """Compute cam0_from_rect0 (3, 3): x along the baseline, z as near as can be to the mean of the optical
-    axes.
+    """Compute cam0_from_rect0 (3, 3): x along the baseline, z as close as possible to the mean optical
+    axis.
     """
     if _is_rectified(rig):
         return np.eye(3)
@@ -131,7 +132,9 @@ def _is_rectified(rig: StereoRig) -> bool:
 
 
 def _principal_point(camera: Camera, rotation: Float64, focal: float) -> tuple[float, float]:
-    """Keep the middle of the raw image in the middle of the rectified one."""
+    """Compute the principal point that keeps the middle of the raw image in the middle of the rectified
+    one.
+    """
     middle = np.array([[(camera.width - 1) / 2, (camera.height - 1) / 2]])
     ray = camera.rays(middle)[0] @ rotation
     x, y = middle[0] - focal * ray[:2] / ray[2]

@@ -1,8 +1,8 @@
 """Warp pictures to rectified pixels in two separable passes.
 
-A rectified row crosses the raw picture's columns one by one on a gentle curve. So the raw picture is first
-read where the curve crosses each column, then along the curve: 8 products a pixel in place of the 16 of
-OpenCV's remap, three times as fast, and places aren't rounded to 1/32 px.
+A rectified row crosses the columns of the raw picture one by one along a gentle curve. The raw picture is
+therefore first sampled where the curve crosses each column and then along the curve. This takes 8 products
+per pixel instead of the 16 of OpenCV's remap, is three times as fast and doesn't round positions to 1/32 px.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import numpy as np
 from barsight.core.arrays import Bool, Float32, UInt8, kernel
 
 _SHARP = np.float32(-0.75)
-"""The cubic convolution's free number, as in OpenCV [Keys 1981]."""
+"""Free parameter of the cubic convolution kernel, as in OpenCV [Keys 1981]."""
 _ZERO, _HALF, _ONE, _MAX_VALUE = (np.float32(v) for v in (0, 0.5, 1, 255))
 
 
 @dataclass(frozen=True, eq=False)
 class Warp:
-    """Rectification map: map_x, map_y (H, W) float32 raw pixels; valid where inside.
+    """Rectification map. map_x, map_y: (H, W) float32 raw pixels. valid: (H, W), true within the raw picture.
 
     crossing: (H, w) float32 raw y at which each rectified row crosses each of the raw picture's w columns.
     """
@@ -32,7 +32,7 @@ class Warp:
 
     @classmethod
     def of(cls, map_x: Float32, map_y: Float32, raw_size: tuple[int, int]) -> Warp:
-        """Build from maps; raw_size: (h, w)."""
+        """Build a warp from its maps; raw_size: (h, w)."""
         height, width = raw_size
         valid = (map_x >= 0) & (map_x <= width - 1) & (map_y >= 0) & (map_y <= height - 1)
         columns = np.arange(width)
@@ -49,13 +49,13 @@ class Warp:
 
 @kernel()
 def _warp(image: UInt8, crossing: Float32, map_x: Float32, warped: UInt8) -> None:
-    """Resample a picture by cubic convolution, down the columns and then along the rows [Keys 1981].
+    """Resample a picture by cubic convolution, first along the columns and then along the rows [Keys 1981].
 
-    image: (h, w). crossing: (H, w) raw y; map_x: (H, W) raw x, px, see `Warp`. Fills warped (H, W), rounded
-    and held within 0...255; border pixels are replicated.
+    image: (h, w). crossing: (H, w) raw y and map_x: (H, W) raw x, in px, see `Warp`. Fills warped (H, W),
+    rounded and clipped to 0...255; border pixels are replicated.
     """
     height, width = image.shape
-    row = np.empty(width + 4, np.float32)  # two more on each side
+    row = np.empty(width + 4, np.float32)  # padded by two on each side
     column, furthest = np.empty(warped.shape[1], np.float32), np.float32(width)
     for i in range(warped.shape[0]):
         curve, begin = crossing[i], 0
@@ -101,7 +101,7 @@ def _warp(image: UInt8, crossing: Float32, map_x: Float32, warped: UInt8) -> Non
 
 @kernel()
 def _weights(t: np.float32) -> tuple[np.float32, np.float32, np.float32, np.float32]:
-    """Compute the cubic weights of the four pixels around a place at fraction t after the second."""
+    """Compute the cubic weights of the four pixels around a position at fraction t after the second."""
     rest = _ONE - t
     outer = _SHARP * t * rest
     second = ((_SHARP + _ONE + _ONE) * t - (_SHARP + _ONE + _ONE + _ONE)) * t * t + _ONE

@@ -10,11 +10,11 @@ from barsight.core.pose import Pose
 
 @dataclass(frozen=True, eq=False)
 class StereoRig:
-    """cam0 is the left camera, cam1 the right one, seen along the viewing direction.
+    """A stereo rig. cam0 is the left and cam1 the right camera, seen in the viewing direction.
 
-    body_from_cam0, body_from_cam1: mounting on the body (the IMU; cam0 itself where there is none).
-    timeshift_cam_imu_ns: Kalibr's, t_imu = t_cam + timeshift.
-    Raises ValueError where cam1 does not lie to the right of cam0 or the cameras look apart.
+    body_from_cam0, body_from_cam1: mounting on the body (the IMU, or cam0 itself where there is none).
+    timeshift_cam_imu_ns: as in Kalibr, t_imu = t_cam + timeshift.
+    Raises ValueError where cam1 isn't to the right of cam0 or the viewing directions diverge too far.
     """
 
     cam0: Camera

@@ -1,1 +1,1 @@
-"""Stereo calibration: bundle adjustment, outliers, uncertainty, verdict."""
+"""Calibrate a stereo rig by bundle adjustment, with outlier removal, uncertainty and a verdict."""

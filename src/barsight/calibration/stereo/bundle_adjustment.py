@@ -1,8 +1,8 @@
 """Adjust lenses, rig, board shape and all board poses in one least-squares problem.
 
-A board point P_W is seen as P_L = R_L P_W + T_L by cam0 and as P_R = R P_L + T by cam1 [paper Eq. 1-3]; the
-residuals are its pixels. Board poses only meet the common parameters, so the normal equations are solved by
-their Schur complement, and the same complement's inverse is the common parameters' covariance.
+cam0 sees a board point P_W at P_L = R_L P_W + T_L and cam1 sees it at P_R = R P_L + T [paper Eq. 1-3]; the
+residuals are in pixels. Board poses are coupled only through the common parameters, so the normal equations
+are solved by their Schur complement, whose inverse is the covariance of the common parameters.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ OPTIONS = Options(
 )
 NEAREST_Z_M = 1e-3
 SHAPE_PX = 0.2
-"""The corner noise at which the board's shape is expected as `shape_basis` says."""
+"""Corner noise (px) at which the prior on the board's shape has the sigmas given by `shape_basis`."""
 
 
 @dataclass(frozen=True, eq=False)
 class CornerTable:
     """One camera's corners, sorted by view. view, ids: (N,). points_m: (N, 3). pixels: (N, 2).
 
-    by_shape: (N, 3, S) how the points move with the board's shape.
+    by_shape: (N, 3, S) derivatives of the points with respect to the board's shape.
     """
 
     view: Int64
@@ -45,10 +45,11 @@ class CornerTable:
 
 @dataclass(frozen=True, eq=False)
 class AdjustmentState:
-    """lenses: a parameter vector per camera. cam1_from_cam0, cam0_from_board: rotations and translations.
+    """The unknowns of the adjustment.
 
-    rotation (3, 3), translation_m (3,) of the rig; board_rotation (V, 3, 3), board_translation_m (V, 3).
-    shape: (S,) steps of the board's shape, none for a flat one.
+    lenses: one parameter vector per camera. rotation (3, 3), translation_m (3,): cam1_from_cam0.
+    board_rotation (V, 3, 3), board_translation_m (V, 3): cam0_from_board of each view. shape: (S,) steps of
+    the board's shape, empty for a flat board.
     """
 
     lenses: tuple[Float64, ...]
@@ -61,9 +62,12 @@ class AdjustmentState:
 
 @dataclass(frozen=True, eq=False)
 class AdjustmentResult:
-    """state; residuals_px: (N, 2) per camera, seen minus projected; reduced: (C, C) Schur complement of the
-    common parameters at unit weights; scores: (V, C) each view's share of the common gradient; steps taken;
-    converged."""
+    """Result of an adjustment.
+
+    residuals_px: (N, 2) per camera, observed minus projected. reduced: (C, C) Schur complement of the common
+    parameters at unit weights. view_reduced (V, C, C), scores (V, C): each view's share of it and of the
+    common gradient. steps: number of steps taken.
+    """
 
     state: AdjustmentState
     residuals_px: tuple[Float64, ...]
@@ -75,7 +79,7 @@ class AdjustmentResult:
 
     @property
     def rig_information(self) -> Float64:
-        """`reduced` of lenses and rig alone, the board's shape eliminated."""
+        """Return the part of `reduced` for lenses and rig, with the board's shape eliminated."""
         own = self.reduced.shape[0] - self.state.shape.size
         mixed = self.reduced[:own, own:]
         return self.reduced[:own, :own] - mixed @ np.linalg.solve(self.reduced[own:, own:], mixed.T)
@@ -96,7 +100,7 @@ class _Normal:
 
 @dataclass(frozen=True, eq=False)
 class _BoardIterate:
-    """A state and, made on use, its normal equations."""
+    """A state and its normal equations, which are computed on first use."""
 
     lens: Lens
     seen: tuple[CornerTable, ...]
@@ -118,7 +122,7 @@ class _BoardIterate:
 def observe(
     views: Sequence[BoardView], board_points_m: Float64, basis: Float64, cameras: int
 ) -> tuple[CornerTable, ...]:
-    """Collect the corners of all views as flat arrays, for the first `cameras` cameras; basis: of
+    """Collect the corners of all views as flat arrays for the first `cameras` cameras; basis: from
     `shape_basis`.
     """
     gathered = []
@@ -135,11 +139,11 @@ def observe(
 def adjust(
     lens: Lens, seen: tuple[CornerTable, ...], start: AdjustmentState, huber_px: float | None
 ) -> AdjustmentResult:
-    """Run Levenberg-Marquardt from `start`; huber_px: where a residual's weight begins to fall, None for
-    never.
+    """Run Levenberg-Marquardt from `start`. huber_px: residual above which the weight falls, None for no
+    robust weights.
 
-    One camera: its lens and the boards. Two: the rig too. The board's shape where `start` has one.
-    `converged` is False where the steps ran out.
+    With one camera, its lens and the board poses are solved for; with two, the rig too. The board's shape is
+    solved for where `start` has one. `converged` is False where the maximum number of steps was reached.
     """
     found = minimise(_BoardIterate(lens, seen, huber_px, start), OPTIONS)
     state = found.best.state
@@ -206,8 +210,8 @@ def _linearise(
 def _derivatives(
     lens: Lens, observed: CornerTable, state: AdjustmentState, camera: int
 ) -> tuple[Float64, Float64, Float64]:
-    """Compute residuals (N, 2) and the projection's derivatives by the common (N, 2, C) and board (N, 2, 6)
-    steps.
+    """Compute the residuals (N, 2) and the derivatives of the projection with respect to steps of the common
+    parameters (N, 2, C) and of the board (N, 2, 6).
     """
     rotation = state.board_rotation[observed.view]
     turned = np.einsum("nij,nj->ni", rotation, observed.points_m + observed.by_shape @ state.shape)
@@ -244,9 +248,10 @@ def _move(state: AdjustmentState, normal: _Normal, damping: float) -> Adjustment
 def retract_adjustment(
     state: AdjustmentState, common: Float64, boards: Float64 | None = None
 ) -> AdjustmentState:
-    """Retract a step (C,) of the common parameters and (V, 6) of the boards, turned from the left.
+    """Retract a step (C,) of the common parameters and (V, 6) of the board poses, with rotations from the
+    left.
 
-    A step without the board's shape leaves it as it is.
+    A step without the board's shape leaves the shape unchanged.
     """
     width = state.lenses[0].size
     lenses = tuple(

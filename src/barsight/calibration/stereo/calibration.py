@@ -1,8 +1,8 @@
-"""Calibrate a stereo rig from views of a board: each camera alone, then both in one least squares.
+"""Calibrate a stereo rig from views of a board: each camera alone, then both in one least-squares problem.
 
-Blurred pictures, corners and views that don't fit are taken out one kind after the other, each with its
-reason. The covariance is that of the least squares, widened where the residuals of a view hang together more
-than independent corner noise would (a warped board, cameras not triggered at once).
+Blurred pictures, outlying corners and misfitting views are removed in turn, each with a reason. The
+covariance is that of the least squares, widened where the residuals within a view are more correlated than
+independent corner noise would be (a warped board, cameras not triggered together).
 """
 
 from __future__ import annotations
@@ -47,15 +47,15 @@ MAX_ROUNDS = 12
 
 @dataclass(frozen=True, eq=False)
 class StereoCalibration:
-    """A calibrated rig and how well it is known.
+    """A calibrated rig and its uncertainty.
 
-    rig: the body is cam0. views: the ones used, without the corners taken out; removed: what was, and why.
-    residuals_px: per camera (N, 2), seen minus projected, in the order of `observed`. sigma_px: one corner
-    coordinate's noise. correlation: the factor on the variances by which views scatter more than
-    independent corners would (1: none). parameter_names: (C,), covariance: (C, C); the rig's rotation is a
-    small turn (rad) of cam1_from_cam0 from the left; what the board's shape leaves open is counted.
-    information: (C, C), the inverse covariance at unit noise. shape: the board's, solved with the rest.
-    alone_rms_px: each camera solved alone, with a flat board.
+    rig: its body is cam0. views: those used, without the corners removed. removed: what was removed, and why.
+    residuals_px: (N, 2) per camera, observed minus projected, in the order of `observed`. sigma_px: noise of
+    one corner coordinate. correlation: factor on the variances, from how much more views scatter than
+    independent corners would (1: no more). parameter_names: (C,). covariance: (C, C), including the
+    uncertainty of the board's shape; the rig's rotation is a small rotation (rad) of cam1_from_cam0 from the
+    left. information: (C, C), the inverse covariance at unit noise. shape: the board's, solved with the rest.
+    alone_rms_px: RMS residual of each camera solved alone, with a flat board.
     """
 
     source: Path
@@ -77,18 +77,20 @@ class StereoCalibration:
 
     @property
     def rms_px(self) -> float:
-        """Return the root mean square reprojection error (px), both cameras together."""
+        """Return the RMS reprojection error (px) of both cameras together."""
         return rms(np.concatenate(self.residuals_px))
 
     @property
     def baseline_sigma_m(self) -> float:
-        """One standard deviation of the baseline."""
+        """Return the standard deviation of the baseline."""
         direction = self.state.translation_m / np.linalg.norm(self.state.translation_m)
         return float(np.sqrt(direction @ self.covariance[-3:, -3:] @ direction))
 
 
 def rig_file_section(calibration: StereoCalibration) -> dict[str, object]:
-    """Form a rig file's key `calibration`: parameters with sigmas and covariance, the board's shape."""
+    """Form the `calibration` section of a rig file: parameters with sigmas and covariance, and the board's
+    shape.
+    """
     sigmas = np.sqrt(np.diag(calibration.covariance))
     return {
         "board": str(calibration.board),
@@ -115,9 +117,9 @@ def calibrate_stereo(
 ) -> StereoCalibration:  # fmt: skip
     """Calibrate from detections; sizes: width and height of cam0's and cam1's pictures.
 
-    source: where the pictures lie, for messages; left_out: what was refused before, for the report.
-    Raises CalibrationError where too few views are left, the cameras are swapped, or the equations leave
-    something undetermined.
+    source: path of the pictures, for messages. left_out: what was rejected before, for the report.
+    Raises CalibrationError where too few views remain, the cameras are swapped, or the equations leave a
+    parameter undetermined.
     """
     points, basis = board.points_m, shape_basis(board)
     kept, small = drop_small(views)
@@ -155,19 +157,21 @@ def calibrate_stereo(
 
 
 def rms(residuals: Float64) -> float:
-    """Compute the root mean square length of (N, 2) residuals."""
+    """Compute the RMS length of residuals (N, 2)."""
     return float(np.sqrt((residuals**2).sum(axis=1).mean()))
 
 
 def parameter_names(lens: Lens) -> tuple[str, ...]:
-    """Return names of the common parameters in the covariance's order."""
+    """Return the names of the common parameters in the order of the covariance."""
     own = [f"cam{camera}.{name}" for camera in (0, 1) for name in lens.parameter_names]
     rig = [f"cam1_from_cam0.{part}" for part in ("rx_rad", "ry_rad", "rz_rad", "tx_m", "ty_m", "tz_m")]
     return (*own, *rig)
 
 
 def calibrated_rig(lens: Lens, state: AdjustmentState, sizes: Sequence[tuple[int, int]]) -> StereoRig:
-    """Build the rig of a solved state, its body at cam0. Raises ValueError where it can't be."""
+    """Build the rig from a solved state, with its body at cam0. Raises ValueError where the rig is
+    invalid.
+    """
     cam1_from_cam0 = Pose("cam1", "cam0", state.rotation, state.translation_m)
     body_from_cam0 = Pose.identity("body", "cam0")
     cameras = [lens.camera(state.lenses[n], *sizes[n]) for n in (0, 1)]

@@ -1,4 +1,4 @@
-"""Widen a covariance for correlated residuals (cluster-robust sandwich estimator)."""
+"""Widen a covariance for correlated residuals with a cluster-robust sandwich estimator."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from barsight.calibration.stereo.bundle_adjustment import AdjustmentResult
 from barsight.core.arrays import Float64
 
 WIDENED_FROM = 3.0
-"""Standard deviations of its own scatter by which the groups' correlation must stand out to widen sigmas."""
+"""Minimum excess of the groups' correlation, in standard deviations of its estimate, at which sigmas are
+widened.
+"""
 
 
 def inflate_covariance(
@@ -16,13 +18,12 @@ def inflate_covariance(
 ) -> tuple[Float64, float]:
     """Compute the cluster-robust covariance (C, C) and the variance inflation (1 for none).
 
-    inverse: (C, C) of the whole information at unit weights; variance: the residuals'. scores (G, C) and
-    informations (G, C, C): each group's (a view's, a second's) share of gradient and information. A group
-    pulls the parameters by inverse @ score. Under independent noise these pulls add up to the covariance
-    variance * inverse, but for the share that the groups' own leverage takes. Where they scatter clearly
-    more, their own covariance takes its place (the sandwich estimator over groups), shrunk towards the
-    multiple of the former with the same trace [Ledoit and Wolf 2004], as groups are often fewer than
-    parameters.
+    inverse: (C, C) inverse of the total information at unit weights. variance: that of the residuals. scores
+    (G, C), informations (G, C, C): share of each group (a view or a second) in gradient and information. Each
+    group pulls the parameters by inverse @ score. Under independent noise these pulls add up to the
+    covariance variance * inverse, apart from the groups' own leverage. Where they scatter significantly more,
+    the sandwich estimator over the groups replaces it. It is shrunk towards the multiple of the former with
+    the same trace [Ledoit and Wolf 2004], because groups are often fewer than parameters.
     """
     groups, size = scores.shape
     covariance = inverse * variance
@@ -43,9 +44,10 @@ def inflate_covariance(
 
 
 def common_covariance(solved: AdjustmentResult, corners: int, views: int) -> tuple[Float64, float, float]:
-    """Compute covariance (C, C), sigma_px and inflation of the common parameters, the board's shape last.
+    """Compute covariance (C, C), sigma_px and inflation of the common parameters, with the board's shape
+    last.
 
-    Widened where views hang together.
+    The covariance is widened where the residuals within views are correlated.
     """
     residuals = np.concatenate(solved.residuals_px)
     freedom = 2 * corners - solved.reduced.shape[0] - 6 * views
@@ -56,7 +58,7 @@ def common_covariance(solved: AdjustmentResult, corners: int, views: int) -> tup
 
 
 def scaled_inverse(matrix: Float64) -> Float64:
-    """Invert a symmetric positive matrix whose parameters have very different scales.
+    """Invert a symmetric positive definite matrix whose parameters have very different scales.
 
     Raises LinAlgError where a direction is not determined.
     """

@@ -1,4 +1,6 @@
-"""Cross-validate a calibration: solve two halves of the views apart and compare with their sigmas."""
+"""Cross-validate a calibration: solve two halves of the views separately and compare them with their
+sigmas.
+"""
 
 from __future__ import annotations
 
@@ -29,11 +31,11 @@ MAX_BLOCKS = 16
 
 @dataclass(frozen=True, eq=False)
 class CrossValidation:
-    """Differences between the halves, root mean square over the covered cells (px) or the points (mm).
+    """Differences between the two halves, as RMS over the covered cells (px) or over the points (mm).
 
-    difference_px, predicted_px: per camera.
-    ranges_m, depth_mm, depth_predicted_mm: (R,) the depth difference of the same pixel pairs.
-    baseline_mm, baseline_predicted_mm: of the baseline, for information.
+    difference_px, predicted_px: of the projection, per camera.
+    ranges_m, depth_mm, depth_predicted_mm: (R,) difference in depth of the same pixel pairs at each range.
+    baseline_mm, baseline_predicted_mm: of the baseline, for information only.
     """
 
     difference_px: tuple[float, float]
@@ -46,15 +48,16 @@ class CrossValidation:
 
     @property
     def ratio(self) -> float:
-        """Return the worst ratio of difference to predicted sigma over projections and depths."""
+        """Return the largest ratio of difference to predicted sigma over projections and depths."""
         pairs = [*zip(self.difference_px, self.predicted_px, strict=True)]
         pairs += [*zip(self.depth_mm, self.depth_predicted_mm, strict=True)]
         return max(measured / predicted for measured, predicted in pairs if predicted > 0)
 
 
 def cross_validate(calibration: StereoCalibration, ranges_m: Sequence[float]) -> CrossValidation | Failed:
-    """Solve two halves apart, blocks of neighbouring views taken in turn so that a film's neighbours, which
-    repeat each other, stay together. Failed `few-views` where a half has fewer than three."""
+    """Solve two halves separately, made of alternating blocks of neighbouring views, so that the
+    near-duplicate neighbours in a film stay together. Failed `few-views` where a half has fewer than three.
+    """
     both = [view for view in calibration.views if view.cam0 is not None and view.cam1 is not None]
     block = max(len(both) // MAX_BLOCKS, 1)
     halves = [[v for n, v in enumerate(both) if n // block % 2 == half] for half in (0, 1)]
@@ -81,10 +84,10 @@ def _solve_half(calibration: StereoCalibration, half: list[BoardView]) -> Adjust
 
 
 def _half_covariance(calibration: StereoCalibration, half: AdjustmentResult) -> Float64:
-    """Widen the half's covariance by its views' correlation as the whole's is.
+    """Widen the covariance of a half for correlation within views as the full solution's was widened.
 
-    With S and S_h the whole's and the half's information: S_h^-1/2 (S^1/2 C S^1/2) S_h^-1/2, which is sigma^2
-    S_h^-1 where C is sigma^2 S^-1.
+    With S and S_h the information of the full solution and of the half: S_h^-1/2 (S^1/2 C S^1/2) S_h^-1/2,
+    which is sigma^2 S_h^-1 where C is sigma^2 S^-1.
     """
     scale = 1 / np.sqrt(np.diag(calibration.information))
     unit = scale[:, None] * scale
@@ -96,7 +99,7 @@ def _half_covariance(calibration: StereoCalibration, half: AdjustmentResult) -> 
 
 
 def _power(matrix: Float64, exponent: float) -> Float64:
-    """Raise a symmetric positive matrix to a power.
+    """Raise a symmetric positive definite matrix to a power.
 
     Raises LinAlgError where a direction is not determined.
     """

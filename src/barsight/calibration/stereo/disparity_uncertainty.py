@@ -1,4 +1,4 @@
-"""Propagate a rig file's covariance to disparity: the systematic part of a sigma."""
+"""Propagate a rig file's covariance to disparity, as the systematic part of its sigma."""
 
 from __future__ import annotations
 
@@ -20,12 +20,14 @@ from barsight.core.pose import Pose
 STEP_SIGMAS = 0.05
 INTRINSICS = 4
 NEAR_RATIO = 0.6
-"""Of the range: the nearer of two distances at which depths tell a wrong yaw from a wrong scale."""
+"""Nearer of the two distances, as a fraction of the range, at which depths separate a yaw error from a scale
+error.
+"""
 
 
 def calibrated_covariance(path: Path) -> tuple[tuple[str, ...], Float64] | None:
-    """Read what a rig file's covariance is of (C,) and that, (C, C); None where it carries none, or none of
-    the lenses: then they were taken as exact and may be off by anything. Raises `CalibrationError`.
+    """Read a rig file's parameter names (C,) and covariance (C, C). None where it has none, or none for the
+    lenses: they were then taken as exact and may have any error. Raises `CalibrationError`.
     """
     if not holds_own_rig(path) or (known := read_covariance(path)) is None:
         return None
@@ -33,9 +35,11 @@ def calibrated_covariance(path: Path) -> tuple[tuple[str, ...], Float64] | None:
 
 
 def disparity_sigma_px(path: Path | None, range_m: float) -> float | None:
-    """Compute the standard deviation (px, median over the picture) that the calibration causes at `range_m`;
-    None where no file is given or it carries no covariance of lenses. Raises `CalibrationError` for one that
-    can't be.
+    """Compute the standard deviation of disparity (px, median over the picture) due to the calibration at
+    `range_m`.
+
+    None without a file, without a covariance of the lenses, or where no point is in both pictures. Raises
+    `CalibrationError` for an invalid file.
     """
     if path is None or (known := calibrated_covariance(path)) is None:
         return None
@@ -50,11 +54,12 @@ def disparity_sigma_px(path: Path | None, range_m: float) -> float | None:
 
 
 def rig_covariance(path: Path | None, range_m: float) -> Float64 | None:
-    """Propagate a rig file's covariance to yaw (rad), baseline and focal length (ratios), (3, 3), as depths
-    up to `range_m` show them; None where no file is given or it carries no covariance.
+    """Propagate a rig file's covariance to that (3, 3) of yaw (rad), baseline and focal length (ratios), as
+    depths up to `range_m` reveal them. None without a file or a covariance, or where both cameras see too
+    little.
 
-    Signs: a right camera that is turned by more, and depths that are seen larger, than the file has it. What
-    lenses do otherwise to depths there counts as yaw. Raises `CalibrationError` for one that can't be.
+    Signs: positive where the right camera is turned further, and depths appear larger, than the file says.
+    Other effects of the lenses on depth count as yaw. Raises `CalibrationError` for an invalid file.
     """
     if path is None or (known := calibrated_covariance(path)) is None:
         return None
@@ -67,7 +72,7 @@ def rig_covariance(path: Path | None, range_m: float) -> Float64 | None:
     design = np.column_stack([np.ones(near.size), rig.baseline_m / near])
 
     def errors(moved: StereoRig) -> Float64:
-        """Fit yaw and scale of depths to b / z; the baseline's part of the scale is known."""
+        """Fit yaw and depth scale to b / z; the baseline's part of the scale is known."""
         parallax = rig.baseline_m / triangulate_depth(moved, left, right)
         yaw, shorter = np.linalg.lstsq(design, parallax, rcond=None)[0]
         longer = moved.baseline_m / rig.baseline_m
@@ -85,7 +90,7 @@ def rig_covariance(path: Path | None, range_m: float) -> Float64 | None:
 def differentiate(
     of: Callable[[StereoRig], Float64], rig: StereoRig, names: tuple[str, ...], covariance: Float64
 ) -> Float64:
-    """Differentiate (N,) of a rig by the parameters that its file names: (N, C)."""
+    """Differentiate a function (N,) of a rig with respect to the parameters that its file names: (N, C)."""
     columns = []
     for number, step in enumerate(STEP_SIGMAS * np.sqrt(np.diag(covariance))):
         ends = [of(_moved(rig, names, number, sign * step)) for sign in (1, -1)]
@@ -94,7 +99,9 @@ def differentiate(
 
 
 def _moved(rig: StereoRig, names: tuple[str, ...], number: int, step: float) -> StereoRig:
-    """Perturb one named parameter of the rig; where it sits on its body, and its clock, move no depth."""
+    """Perturb one named parameter of the rig. Mounting and time shift have no effect on depth and are left
+    alone.
+    """
     owner, _, name = names[number].partition(".")
     if owner in ("cam0", "cam1"):
         first = names.index(next(other for other in names if other.startswith(f"{owner}.")))

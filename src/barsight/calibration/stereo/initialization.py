@@ -22,9 +22,11 @@ TRIED_VIEWS = 12
 def start_lens(
     lens: Lens, corners: Sequence[Corners], points_m: Float64, size: tuple[int, int]
 ) -> Float64 | Failed:
-    """Estimate fx, fy, cx, cy with coefficients of zero: the focal length that fits the boards best.
+    """Estimate fx, fy, cx, cy, with zero coefficients, by choosing the focal length that fits the boards
+    best.
 
-    size: width, height. Candidates are the closed form [Zhang 2000] and shares of the picture's width.
+    size: width, height. Candidates are the closed form [Zhang 2000] and fixed fractions of the picture's
+    width.
     """
     width, height = size
     centre = (width - 1) / 2, (height - 1) / 2
@@ -54,14 +56,14 @@ def start_lens(
 
 
 def board_pose(camera: Camera, corners: Corners, points_m: Float64) -> tuple[Float64, Float64, float]:
-    """Solve PnP: cam_from_board's rotation (3, 3), translation (3,) and RMS in px (inf where there
-    is none).
+    """Solve PnP: rotation (3, 3) and translation (3,) of cam_from_board, and RMS in px (inf where there is no
+    solution).
     """
     rays = camera.rays(corners.pixels)
     inside = np.isfinite(rays).all(axis=1) & (np.abs(rays[:, :2]).max(axis=1) < 10)
     if inside.sum() < 4:
         return np.eye(3), np.array([0.0, 0.0, 1.0]), np.inf
-    # The start is a flat board's; a bow of millimetres moves it by little.
+    # The start values assume a flat board; a bow of some millimetres changes them little.
     flat = points_m[corners.ids[inside]] * [1.0, 1.0, 0.0]
     found, rotations, translations, _ = cv2.solvePnPGeneric(
         flat, rays[inside, :2], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
@@ -82,8 +84,8 @@ def start_rig(
     cameras: tuple[Camera, Camera], lenses: tuple[Float64, Float64], views: Sequence[BoardView],
     points_m: Float64,
 ) -> AdjustmentState | Failed:  # fmt: skip
-    """Solve board poses by each camera alone and the rig as the median over the views of R = R_R R_L^-1, T =
-    T_R - R T_L [paper Eq. 3]. Failed `no-common-view` where no view is seen by both.
+    """Solve the board poses from each camera alone, and the rig as the median over the views of R = R_R
+    R_L^-1, T = T_R - R T_L [paper Eq. 3]. Failed `no-common-view` where both cameras share no view.
     """
     poses = [
         [
@@ -114,7 +116,7 @@ def start_rig(
 
 
 def _middle_rotation(rotations: Float64) -> Float64:
-    """Compute the L1 median rotation: an outlier can't be it."""
+    """Compute the L1 median rotation, which no outlier can be."""
     apart = np.linalg.norm(rotations[:, None] - rotations[None], axis=(2, 3))
     chosen: Float64 = rotations[int(apart.sum(axis=1).argmin())]
     return chosen

@@ -1,4 +1,6 @@
-"""Remove outliers of a stereo calibration: blurred pictures, views of another board, odd corners."""
+"""Remove outliers from a stereo calibration: blurred pictures, views of another board, misdetected
+corners.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,7 @@ SAME_TURN_RAD, SAME_SHIFT = 0.05, 0.15
 
 
 def drop_small(views: Sequence[BoardView]) -> tuple[list[BoardView], list[Removed]]:
-    """Drop the pictures that show fewer than eight corners."""
+    """Drop pictures that show fewer than eight corners."""
     kept, removed = [], []
     for view in views:
         for camera, corners in enumerate(view.cameras):
@@ -40,7 +42,7 @@ def drop_small(views: Sequence[BoardView]) -> tuple[list[BoardView], list[Remove
 
 
 def drop_blurred(views: Sequence[BoardView]) -> tuple[list[BoardView], list[Removed]]:
-    """Drop the pictures whose edges are much wider than the same camera's median."""
+    """Drop pictures whose edges are much wider than the median for the same camera."""
     kept, removed = list(views), []
     for camera in (0, 1):
         widths = np.array([np.nan if c is None else c.edge_px for c in (v.cameras[camera] for v in kept)])
@@ -63,11 +65,11 @@ def drop_misfits(
     cameras: tuple[Camera, Camera],
     points_m: Float64,
 ) -> tuple[list[BoardView], list[Removed]]:
-    """Drop the worst views, where most of their corners' residuals are far above the other views'.
+    """Drop the worst views, those where most corners have residuals far above the other views'.
 
-    A few corners that were wrongly found don't condemn a view: `drop_corners` takes them.
+    A few misdetected corners don't condemn a view; `drop_corners` removes them.
 
-    start: the rig before this solve, which the bad views haven't pulled, for naming the cause.
+    start: the rig before this solve, which the bad views haven't affected; it serves to name the cause.
     """
     errors = _trimmed_rms(observed, solved.residuals_px, len(views))
     usual = float(np.median(errors))
@@ -87,9 +89,10 @@ def drop_misfits(
 def drop_corners(
     views: Sequence[BoardView], observed: tuple[CornerTable, ...], solved: AdjustmentResult
 ) -> tuple[list[BoardView], list[Removed], float | None]:
-    """Drop the corners beyond 4.5 robust sigma, and the pictures that lose a third of theirs.
+    """Drop corners beyond 4.5 robust sigma, and pictures that would lose a third of theirs.
 
-    The third is the limit (px), None where every corner lies within. See `corner_notes` for the reasons.
+    The third value is the limit (px), or None where every corner is within it. `corner_notes` gives the
+    reasons.
     """
     lengths = [np.linalg.norm(residual, axis=1) for residual in solved.residuals_px]
     sigma = float(np.median(np.concatenate(lengths))) / np.sqrt(2 * np.log(2))
@@ -113,7 +116,7 @@ def drop_corners(
 
 
 def corner_notes(before: dict[str, BoardView], after: Sequence[BoardView]) -> list[Removed]:
-    """List what was removed from pictures that are still used."""
+    """List the corners removed from pictures that are still used."""
     notes = []
     for view in after:
         for camera, corners in enumerate(view.cameras):
@@ -127,7 +130,7 @@ def corner_notes(before: dict[str, BoardView], after: Sequence[BoardView]) -> li
 
 
 def view_rms(observed: tuple[CornerTable, ...], residuals: tuple[Float64, ...], views: int) -> Float64:
-    """Compute the root mean square residual (V,) px of each view, over both cameras."""
+    """Compute each view's RMS residual (V,) px over both cameras."""
     squares, counts = np.zeros(views), np.zeros(views)
     for seen, residual in zip(observed, residuals, strict=True):
         squares += np.bincount(seen.view, (residual**2).sum(axis=1), views)
@@ -137,7 +140,7 @@ def view_rms(observed: tuple[CornerTable, ...], residuals: tuple[Float64, ...], 
 
 
 def _trimmed_rms(observed: tuple[CornerTable, ...], residuals: tuple[Float64, ...], views: int) -> Float64:
-    """Compute the root mean square residual (V,) px of the best nine tenths of each view's corners."""
+    """Compute each view's RMS residual (V,) px over the best nine tenths of its corners."""
     view = np.concatenate([seen.view for seen in observed])
     squares = np.concatenate([(residual**2).sum(axis=1) for residual in residuals])
     errors = np.zeros(views)
@@ -149,7 +152,7 @@ def _trimmed_rms(observed: tuple[CornerTable, ...], residuals: tuple[Float64, ..
 
 
 def _cause(view: BoardView, state: AdjustmentState, cameras: tuple[Camera, Camera], points_m: Float64) -> str:
-    """Name what is wrong with a view, as far as the rig it implies by itself tells."""
+    """Name the fault of a view as far as the rig it implies on its own reveals it."""
     if view.cam0 is None or view.cam1 is None:
         return "the board is another one, or bent or badly found"
     turn, shift, fit = _implied(view.cam0, view.cam1, cameras, points_m)
@@ -173,7 +176,9 @@ def _cause(view: BoardView, state: AdjustmentState, cameras: tuple[Camera, Camer
 def _implied(
     left: Corners, right: Corners, cameras: tuple[Camera, Camera], points_m: Float64
 ) -> tuple[Float64, Float64, float]:
-    """Estimate cam1_from_cam0 by one view alone (rotation, translation) and the worse camera's RMS (px)."""
+    """Estimate cam1_from_cam0 (rotation, translation) from one view alone, and the larger of both cameras'
+    RMS (px).
+    """
     first, second = board_pose(cameras[0], left, points_m), board_pose(cameras[1], right, points_m)
     turn = second[0] @ first[0].T
     return turn, second[1] - turn @ first[1], max(first[2], second[2])

@@ -1,7 +1,7 @@
 """Propagate a calibration's covariance to pixels over the picture and to depth over the range.
 
-A turn of the whole camera is not an error of its lens (its mounting takes it up), so projections are compared
-after the best common rotation, as mrcal does for points far away.
+A rotation of the whole camera isn't a lens error (its mounting absorbs it), so projections are compared after
+the best common rotation, as mrcal does for points far away.
 """
 
 from __future__ import annotations
@@ -24,9 +24,10 @@ STEP_SIGMAS = 0.05
 
 @dataclass(frozen=True, eq=False)
 class PictureGrid:
-    """Places over one camera's picture. x_px: (COLUMNS,), y_px: (ROWS,). pixels: (ROWS * COLUMNS, 2).
+    """Grid over one camera's picture. x_px: (COLUMNS,), y_px: (ROWS,). pixels: (ROWS * COLUMNS, 2).
 
-    rays: (N, 3) their viewing rays, z = 1. covered: (N,) the cells that hold corners of used views.
+    rays: (N, 3) viewing rays of the pixels, z = 1. covered: (N,) true for cells with corners of the views
+    used.
     """
 
     x_px: Float64
@@ -51,8 +52,8 @@ def picture_grid(calibration: StereoCalibration, camera: int) -> PictureGrid:
 
 
 def rotation_free_projector(lens: Lens, parameters: Float64, grid: PictureGrid) -> Float64:
-    """Build the projector (2N, 2N) that removes the best-fit rotation, over the covered cells, from pixel
-    changes.
+    """Build the projector (2N, 2N) that removes from pixel changes the rotation that fits the covered
+    cells best.
     """
     by_point = project_lens(lens, parameters, grid.rays).by_point
     x, y, z = grid.rays.T
@@ -66,8 +67,8 @@ def rotation_free_projector(lens: Lens, parameters: Float64, grid: PictureGrid) 
 
 
 def projection_sigma(calibration: StereoCalibration, camera: int, covariance: Float64) -> Float64:
-    """Propagate covariance to projections: standard deviation (N,) px along the larger axis at the grid's
-    rays.
+    """Propagate a covariance to projections: standard deviation (N,) px along the larger axis at the
+    grid's rays.
     """
     grid = picture_grid(calibration, camera)
     width = len(calibration.lens.parameter_names)
@@ -82,8 +83,8 @@ def projection_sigma(calibration: StereoCalibration, camera: int, covariance: Fl
 
 
 def triangulate_depth(rig: StereoRig, left: Float64, right: Float64) -> Float64:
-    """Triangulate raw pixel pairs (N, 2): depth (N,) m along cam0's axis of the point nearest to
-    both rays.
+    """Triangulate raw pixel pairs (N, 2): depth (N,) m along cam0's axis of the point nearest to both
+    rays.
     """
     pose = rig.cam0_from_cam1
     a = rig.cam0.rays(left)
@@ -99,9 +100,9 @@ def triangulate_depth(rig: StereoRig, left: Float64, right: Float64) -> Float64:
 
 
 def sample_pairs(rig: StereoRig, ranges_m: Sequence[float]) -> tuple[Float64, Float64, Float64]:
-    """Sample pixel pairs of points that both cameras see: (range index (N,), left (N, 2), right (N, 2)).
+    """Sample pixel pairs of points that both cameras see: range index (N,), left (N, 2), right (N, 2).
 
-    A 7x5 grid over cam0's picture at each range; points outside cam1's picture are left out.
+    A 7x5 grid over cam0's picture is placed at each range; points outside cam1's picture are left out.
     """
     x, y = np.meshgrid(np.linspace(0.1, 0.9, 7) * rig.cam0.width, np.linspace(0.1, 0.9, 5) * rig.cam0.height)
     left = np.column_stack([x.ravel(), y.ravel()])
@@ -121,7 +122,9 @@ def sample_pairs(rig: StereoRig, ranges_m: Sequence[float]) -> tuple[Float64, Fl
 
 
 def depth_derivatives(calibration: StereoCalibration, left: Float64, right: Float64) -> Float64:
-    """Differentiate triangulated depths by the common parameters (N, C) m, pixels held fixed."""
+    """Differentiate triangulated depths with respect to the common parameters: (N, C) m, with pixels held
+    fixed.
+    """
     sizes = sizes_of(calibration.rig)
     steps = STEP_SIGMAS * np.sqrt(np.diag(calibration.covariance))
     columns = []
@@ -137,8 +140,8 @@ def depth_derivatives(calibration: StereoCalibration, left: Float64, right: Floa
 
 
 def depth_sigma(calibration: StereoCalibration, ranges_m: Sequence[float]) -> Float64:
-    """Propagate covariance to depth: (R, 2) m at each range, median and largest standard deviation over the
-    picture that the calibration alone causes; NaN where no point is seen by both.
+    """Propagate a covariance to depth: (R, 2) m, the median and largest standard deviation over the picture
+    at each range due to the calibration alone; NaN where both cameras see no common point.
     """
     number, left, right = sample_pairs(calibration.rig, ranges_m)
     by = depth_derivatives(calibration, left, right)
@@ -151,7 +154,7 @@ def depth_sigma(calibration: StereoCalibration, ranges_m: Sequence[float]) -> Fl
 
 
 def sizes_of(rig: StereoRig) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Width and height of both cameras' pictures."""
+    """Return the width and height of each camera's pictures."""
     return (rig.cam0.width, rig.cam0.height), (rig.cam1.width, rig.cam1.height)
 
 

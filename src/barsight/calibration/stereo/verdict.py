@@ -1,4 +1,4 @@
-"""Judge a stereo calibration line by line and advise on views to add."""
+"""Judge a stereo calibration property by property and advise on views to add."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ FEWEST_TILT_DEG = 25.0
 
 
 class Verdict(StrEnum):
-    """Good: go on. Usable: works, but more views would pay. Redo: don't measure with it."""
+    """Good: proceed. Usable: works, but more views would help. Redo: do not measure with it."""
 
     GOOD = "good"
     USABLE = "usable"
@@ -38,7 +38,7 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class Line:
-    """One judged property: its measured value as text, the verdict and the reason with the limits."""
+    """A judged property: its measured value as text, the verdict, and the reason with the limits."""
 
     name: str
     value: str
@@ -48,11 +48,11 @@ class Line:
 
 @dataclass(frozen=True, eq=False)
 class Assessment:
-    """Judgement of a calibration as the report shows it.
+    """Verdict on a calibration, as the report shows it.
 
-    lines: the judged properties. advice: which views to add. projection_sigma_px: per camera (ROWS, COLUMNS).
-    epipolar_px: (N,) row differences of matching corners after rectification. ranges_m, depth_sigma_m: (R,),
-    (R, 2) median and largest over the picture. cross: the two halves compared, or why not.
+    lines: judged properties. advice: views to add. projection_sigma_px: (ROWS, COLUMNS) per camera.
+    epipolar_px: (N,) row differences of matching corners after rectification. ranges_m (R,) and depth_sigma_m
+    (R, 2): median and largest over the picture. cross: comparison of the two halves, or why there is none.
     """
 
     lines: tuple[Line, ...]
@@ -65,7 +65,7 @@ class Assessment:
 
     @property
     def verdict(self) -> Verdict:
-        """Return the worst of the lines."""
+        """Return the worst verdict among the lines."""
         order = list(Verdict)
         return max((line.verdict for line in self.lines), key=order.index)
 
@@ -100,7 +100,9 @@ def assess(calibration: StereoCalibration, working_range_m: float) -> Assessment
 
 
 def epipolar_errors(calibration: StereoCalibration) -> Float64:
-    """Compute rectified row errors (N,) px, right minus left, of the corners both cameras see."""
+    """Compute row errors (N,) px after rectification, right minus left, of the corners that both cameras
+    see.
+    """
     rig = calibration.rig
     rectifier = Rectifier(rig)
     left_turn = rectifier.body_from_rect0.rotation
@@ -115,7 +117,7 @@ def epipolar_errors(calibration: StereoCalibration) -> Float64:
 
 
 def tilts(calibration: StereoCalibration) -> Float64:
-    """Compute each board's tilt (V, 2) degrees about the picture's vertical and horizontal axis."""
+    """Compute each board's tilt (V, 2), in degrees, about the picture's vertical and horizontal axes."""
     normal = calibration.state.board_rotation[:, :, 2]
     normal = normal * np.where(normal[:, 2:] < 0, -1.0, 1.0)
     return np.degrees(np.arctan2(normal[:, :2], normal[:, 2:]))
@@ -124,7 +126,7 @@ def tilts(calibration: StereoCalibration) -> Float64:
 def judge(
     name: str, value: float, unit: str, good: float, usable: float, why: str, *, above: bool = False
 ) -> Line:
-    """Judge a value against two limits; `above` where more is better."""
+    """Judge a value against two limits; `above` where larger values are better."""
     sign = -1.0 if above else 1.0
     is_good, is_usable = sign * value <= sign * good, sign * value <= sign * usable
     verdict = Verdict.GOOD if is_good else Verdict.USABLE if is_usable else Verdict.REDO
@@ -172,7 +174,7 @@ def _advice(calibration: StereoCalibration) -> tuple[str, ...]:
 
 
 def summary_sentence(lines: Sequence[Line]) -> str:
-    """Summarise in one sentence what keeps the calibration from being good."""
+    """Summarise in one sentence what prevents the calibration from being good."""
     weak = [
         f"{line.name} {line.value} ({line.verdict})" for line in lines if line.verdict is not Verdict.GOOD
     ]
