@@ -1,1 +1,1 @@
-"""Accept a rig by artefacts: find them, judge errors with their uncertainty, name causes, certify."""
+"""Accept a rig with artefacts: find them, judge errors with their uncertainty, name causes, certify."""

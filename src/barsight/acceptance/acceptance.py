@@ -1,4 +1,4 @@
-"""Run an acceptance: measure each recording, find the artefacts, judge every quantity, name causes."""
+"""Run an acceptance: measure each recording, find the artefacts, judge every quantity and name causes."""
 
 from __future__ import annotations
 
@@ -30,8 +30,10 @@ from barsight.yard_frame import in_yard
 
 @dataclass(frozen=True, eq=False)
 class Acceptance:
-    """All that a certificate says. rig: check of each recording, pictures: of each; inputs: digests of each
-    recording's inputs, by its path; offset: of the magnet, where touch-downs were judged with one.
+    """The content of a certificate.
+
+    rig, pictures: the check of the rig and of the pictures, one per recording. inputs: digests of each
+    recording's inputs, by its path. offset: the magnet's offset, if touch-downs were judged with one.
     """
 
     plan: AcceptancePlan
@@ -45,7 +47,7 @@ class Acceptance:
 
     @property
     def is_passed(self) -> bool:
-        """Check that every quantity passed, nothing wrong is named and no recording shows a drifted rig."""
+        """Check that every quantity passed, no cause was found and no recording shows a drifted rig."""
         sound = not self.causes and not any(one.is_bad for one in self.rig)
         return sound and all(one.decision is Decision.PASSED for one in self.quantities)
 
@@ -54,9 +56,11 @@ def accept(
     plan: AcceptancePlan, recordings: Sequence[Path], settings: MeasureSettings, work: Path,
     advance: ProgressCallback, offset: MagnetOffset | None = None,
 ) -> Acceptance:  # fmt: skip
-    """Accept or refuse by one or several recordings of the artefacts; results are kept in folders of `work`.
+    """Accept or refuse a rig from one or several recordings of the artefacts; results are kept in folders of
+    `work`.
 
-    offset: of the magnet that touched down. Raises a BarsightError where one can't be measured at all.
+    offset: of the magnet that touched down. Raises a BarsightError where a recording can't be measured at
+    all.
     """
     seen, rig, pictures, inputs = [], [], [], {}
     for number, path in enumerate(recordings, 1):
@@ -78,7 +82,9 @@ def accept(
 def look_at_rig(
     source: Recording, rig_file: Path | None
 ) -> tuple[RigCheck, tuple[PictureHealth, ...] | Failed]:
-    """Check what travel and rows show of the rig, which was read from rig_file, and the pictures' health."""
+    """Check the rig, which was read from rig_file, by the travel and the matched rows, and check the
+    pictures.
+    """
     check = check_rig(source, FusionSettings(), CheckSettings(), lambda: None, rig_file)
     return check, check_pictures(_some_frames(source))
 
@@ -101,7 +107,7 @@ def _expect_own_offset(offset: MagnetOffset | None, first: Observation) -> None:
 
 
 def _some_frames(source: Recording) -> Iterator[StereoFrame]:
-    """Yield frames spread evenly over a recording, as many as the check of the pictures takes."""
+    """Yield frames spread evenly over a recording, as many as the check of the pictures needs."""
     stamps = list(source.index.stamps_ns)
     chosen = np.linspace(0, max(len(stamps) - 1, 0), min(FRAMES, len(stamps))).astype(int)
     for frame in source.frames({stamps[k] for k in chosen.tolist()}):

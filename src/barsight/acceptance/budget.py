@@ -1,4 +1,4 @@
-"""Budget the uncertainty of what a crane uses, by GUM, and check it by sampling (JCGM 101)."""
+"""Budget the uncertainty of the figures that a crane uses by GUM, and verify it by sampling (JCGM 101)."""
 
 from __future__ import annotations
 
@@ -17,21 +17,24 @@ FIGURES = (
     ("lift x", "mm", 1e3), ("lift y", "mm", 1e3), ("lift z", "mm", 1e3), ("yaw", "deg", 180 / np.pi),
     ("height", "mm", 1e3), ("width", "mm", 1e3), ("mass", "kg", 1.0),
 )  # fmt: skip
-"""Names, units and scale of what is budgeted."""
+"""Names, units and SI-to-unit factors of the budgeted figures."""
 ERRORS = (
     "yaw", "baseline", "focal", "turn_x", "turn_y", "turn_z", "move_x", "move_y", "move_z",
     "fit_along", "fit_across", "fit_top", "fit_yaw", "fit_height", "fit_width", "fit_mass",
     "magnet_x", "magnet_y", "magnet_z",
 )  # fmt: skip
-"""Errors that the model takes: of the rig, the yard frame, the bundle's fit (fit_height: of a single cell),
-and from camera to magnet."""
+"""Errors that the model accepts: of the rig, of the yard frame, of the bundle's fit (fit_height: of a single
+cell) and of the magnet relative to the camera.
+"""
 RIG, FRAME = ERRORS[:3], ERRORS[3:9]
 
 
 @dataclass(frozen=True, eq=False)
 class ErrorSource:
-    """A source of errors: which of `ERRORS` it causes and their covariance (SI units), its distribution
-    (normal, rectangular, t), degrees of freedom, and what measured it. A NaN in the covariance: not known.
+    """A source of errors.
+
+    errors: which of `ERRORS` it causes. covariance: theirs, in SI units; NaN where unknown. measured_by:
+    where the value comes from. distribution: normal, rectangular or t.
     """
 
     name: str
@@ -44,7 +47,7 @@ class ErrorSource:
 
 @dataclass(frozen=True, eq=False)
 class BudgetedLoad:
-    """A bundle as it lies: its top's middle (3,) in the yard, yaw from +Y, lengths in m, mass in kg."""
+    """Geometry of a bundle: centre (3,) of its top in the yard, yaw from +Y, lengths in m, mass in kg."""
 
     top_m: Float64
     yaw_rad: float
@@ -55,8 +58,10 @@ class BudgetedLoad:
 
 @dataclass(frozen=True)
 class BudgetedFigure:
-    """A figure with its parts, combined uncertainty, and sigma and half width of 95.45 % by sampling; NaN
-    where a part isn't known. agree: both methods do, within 5 % of U.
+    """A figure with its parts and combined uncertainty.
+
+    sampled_sigma, sampled_expanded: sigma and half width of the 95.45 % interval by sampling, NaN where a
+    part is unknown. agree: sampling agrees with the combined U within 5 %.
     """
 
     name: str
@@ -72,11 +77,13 @@ def measured(
     load: BudgetedLoad, view: ViewGeometry, frame_origin_m: Float64, errors: Float64,
     targets_m: Float64 | None = None,
 ) -> Float64:  # fmt: skip
-    """Compute what is measured of a load under errors (N, 19), in the order of `ERRORS`: FIGURES (N, 7), SI.
+    """Compute the measured figures of a load under errors (N, 19), in the order of `ERRORS`: FIGURES (N, 7),
+    SI.
 
-    The bundle's ends are seen from the cameras' mean place over it, triangulated with a wrong rig, and moved
-    by a wrong yard frame about its origin; then the errors of the fit and of the magnet are added. targets_m:
-    (T, 3) by which the same rig found the frame, which so takes up most of what the rig does to them.
+    The bundle's ends are seen from the mean position of the cameras over it, triangulated with an erroneous
+    rig and moved by an erroneous yard frame about its origin; then the errors of the fit and the magnet are
+    added. targets_m: (T, 3) from which the same rig found the frame, which therefore absorbs most of the
+    rig's errors.
     """
     e = dict(zip(ERRORS, errors.T, strict=True))
     if targets_m is not None:
@@ -93,7 +100,7 @@ def measured(
     place[:, 2] += e["fit_top"]
     scale = np.linalg.norm(along, axis=1) / load.length_m
     magnet = np.column_stack([e["magnet_x"], e["magnet_y"], e["magnet_z"]])
-    # Width and length grow with the scale across, the section with its square.
+    # Width and length grow with the scale, the cross-section with its square.
     return np.column_stack([
         place + magnet, yaw, middle[:, 2] + e["fit_height"], load.width_m * scale + e["fit_width"],
         load.mass_kg * scale**3 + e["fit_mass"],
@@ -103,8 +110,8 @@ def measured(
 def _with_frame_found(
     targets: Float64, view: ViewGeometry, origin: Float64, e: dict[str, Float64]
 ) -> dict[str, Float64]:
-    """Take off the frame's errors what best moves targets (T, 3), as the wrong rig sees them, to their places
-    (least squares): errors of the frame (N,), by name.
+    """Subtract from the frame's errors the motion that best moves targets (T, 3), as the erroneous rig sees
+    them, to their true places (least squares). Returns the errors of the frame (N,) by name.
     """
     rig_alone = {name: e[name] if name in RIG else np.zeros_like(e[name]) for name in e}
     off = np.stack([_placed(one, one, view, origin, rig_alone) - one for one in targets], axis=1)
@@ -117,11 +124,13 @@ def _with_frame_found(
 def _placed(
     point: Float64, over: Float64, view: ViewGeometry, origin: Float64, e: dict[str, Float64]
 ) -> Float64:
-    """Triangulate a point (3,) with a wrong rig from over `over`, and move it by a wrong frame: (N, 3)."""
+    """Triangulate a point (3,) with an erroneous rig from above `over`, then move it by an erroneous
+    frame: (N, 3).
+    """
     camera = np.array([over[0], view.camera_m[1], view.camera_m[2]])
     x, y, down = point[0] - camera[0], point[1] - camera[1], camera[2] - point[2]
     left = x / down
-    # The point as the turned right camera sees it.
+    # The point as the rotated right camera sees it.
     rx, rz = x - view.baseline_m, down
     right = (np.cos(e["yaw"]) * rx - np.sin(e["yaw"]) * rz) / (np.sin(e["yaw"]) * rx + np.cos(e["yaw"]) * rz)
     depth = view.baseline_m * (1 + e["baseline"]) * (1 + e["focal"]) / (left - right)
@@ -139,8 +148,8 @@ def budget(
     load: BudgetedLoad, view: ViewGeometry, frame_origin_m: Float64, sources: Sequence[ErrorSource],
     samples: int = 20_000, seed: int = 0, targets_m: Float64 | None = None,
 ) -> tuple[BudgetedFigure, ...]:  # fmt: skip
-    """Budget every figure: parts by the model's derivatives, combined by GUM, and by sampling. targets_m: as
-    `measured` takes them.
+    """Budget every figure: parts by the model's derivatives combined by GUM, and the same by sampling.
+    targets_m: as in `measured`.
     """
     scale = np.array([one[2] for one in FIGURES])
     steps = 1e-6 * np.eye(len(ERRORS))
@@ -164,9 +173,9 @@ def budget(
 
 
 def _part(source: ErrorSource, slopes: Float64) -> UncertaintyPart | None:
-    """Propagate one source to one figure; None where the figure doesn't answer to it."""
+    """Propagate one source to one figure; None where the figure does not depend on it."""
     row = slopes[[ERRORS.index(name) for name in source.errors]]
-    touched = ~(np.abs(row) <= 1e-6)  # NaN: it answers in a way that isn't known
+    touched = ~(np.abs(row) <= 1e-6)  # NaN: it depends on it in an unknown way
     if not touched.any():
         return None
     covariance = source.covariance[np.ix_(touched, touched)]
@@ -178,7 +187,7 @@ def _part(source: ErrorSource, slopes: Float64) -> UncertaintyPart | None:
 
 
 def _drawn(sources: Sequence[ErrorSource], samples: int, rng: np.random.Generator) -> Float64:
-    """Draw errors (samples, 19), each source by its distribution."""
+    """Draw errors (samples, 19) from the distribution of each source."""
     drawn = np.zeros((samples, len(ERRORS)))
     for source in sources:
         places = [ERRORS.index(name) for name in source.errors]

@@ -1,4 +1,4 @@
-"""Name what is wrong with a rig: which single cause explains the artefacts' errors and the travel best."""
+"""Name the fault of a rig: the single cause that best explains the artefacts' errors and the travel."""
 
 from __future__ import annotations
 
@@ -16,21 +16,26 @@ from barsight.core.errors import Failed
 from barsight.motion.rig_check.drift_check import RigCheck
 
 PLATE_PX, PLATE_MM = 0.008, 0.2
-"""Noise of a plate's height, beside what its own uncertainty is: disparity, and the map's. Rendered plates
-scatter by 0.4 mm where a pixel of disparity is 65 mm."""
+"""Noise of a plate's height in addition to the plate's own uncertainty: of disparity (px) and of the map
+(mm). Rendered plates scatter by 0.4 mm where a pixel of disparity is 65 mm.
+"""
 SPHERE_PX, SPHERE_MM = 0.012, 0.5
-"""The same of a sphere's: pixels round its cap; rendered ones scatter by 0.6 mm there."""
+"""The same for a sphere's height (px of disparity, mm); rendered spheres scatter by 0.6 mm under these
+conditions.
+"""
 PLACE_PX, PLACE_MM = 0.2, 1.0
-"""The same across, in pixels on the ground."""
+"""The same for horizontal position, in pixels on the ground and in mm."""
 FALSE_NAMES = 0.01
-"""Chance that a healthy rig has a cause named, over all that are tried together."""
+"""Probability of a false alarm: that any cause at all is named for a healthy rig."""
 ALIKE = 4.0
-"""Another cause that explains the errors by so much less chi-square only, two sigma, isn't told from it."""
+"""Difference in chi-square (two sigma) within which two causes can't be distinguished."""
 
 
 @dataclass(frozen=True)
 class Unknown:
-    """A parameter of the rig. unit and scale: how it is told. ordinary: its sigma in a healthy rig, SI."""
+    """A parameter of the rig. unit, scale: unit of the report and factor to it from SI. ordinary: its
+    standard deviation in a healthy rig, SI.
+    """
 
     name: str
     unit: str
@@ -49,13 +54,15 @@ UNKNOWNS = (
     Unknown("mounting pitch", "deg", 180 / np.pi, np.radians(0.01)),
     Unknown("flattened caps", "mm", 1e3, 3e-3),
 )
-"""The last is no cause: matching's blur lowers the caps of all spheres alike."""
+"""The last one is a nuisance parameter, not a cause: blur in matching lowers the caps of all spheres
+alike.
+"""
 
 
 @dataclass(frozen=True)
 class Cause:
-    """A cause of errors: value and sigma in `unit`; chi2: by how much it explains them better than an
-    ordinary rig. alike: others that explain them nearly as well.
+    """A cause of errors. value, sigma: in `unit`. chi2: reduction of chi-square compared with a healthy rig.
+    alike: other causes that explain the errors almost as well.
     """
 
     name: str
@@ -67,7 +74,7 @@ class Cause:
 
     @property
     def words(self) -> str:
-        """Name it, with those that it isn't told from."""
+        """Return its name with those of the causes that can't be distinguished from it."""
         return " or ".join((self.name, *self.alike))
 
 
@@ -75,7 +82,7 @@ def name_causes(
     plan: AcceptancePlan, seen: Sequence[Observation], checks: Sequence[RigCheck | Failed],
     pictures: Sequence[tuple[PictureHealth, ...] | Failed],
 ) -> tuple[Cause, ...]:  # fmt: skip
-    """Name the causes, none where the rig is as it should be."""
+    """Name the causes of errors, none where the rig is healthy."""
     dirt = max(
         (one for row in pictures if not isinstance(row, Failed) for one in row),
         key=lambda h: h.dirt_pct,
@@ -95,7 +102,9 @@ def name_causes(
 
 @dataclass(frozen=True, eq=False)
 class _Row:
-    """An error, its sigma, and how it answers to the UNKNOWNS. artefact: whose it is; empty of the travel."""
+    """An error, its sigma, and its derivatives with respect to the UNKNOWNS. artefact: name, empty for
+    travel.
+    """
 
     artefact: str
     error: float
@@ -104,8 +113,8 @@ class _Row:
 
 
 def _best_cause(rows: Sequence[_Row]) -> Cause | None:
-    """Let each unknown go free in turn, the others as a healthy rig has them, and leave each artefact out in
-    turn; take what a healthy rig would show most rarely.
+    """Free each unknown in turn, with the others at their priors, and leave out each artefact in turn; return
+    the cause whose effect would be rarest in a healthy rig.
     """
     if not rows:
         return None
@@ -115,7 +124,7 @@ def _best_cause(rows: Sequence[_Row]) -> Cause | None:
     ordinary = np.array([one.ordinary for one in UNKNOWNS])
     names = sorted({row.artefact for row in rows} - {""})
     healthy, _, _ = _solved(design, error, 1 / ordinary**2)
-    # One chance of a false name for all that are tried, whatever each leaves free.
+    # The probability of a false alarm is shared by all hypotheses, whatever each leaves free.
     best: Cause | None = None
     rarest = float(np.log(FALSE_NAMES / (len(UNKNOWNS) - 1 + len(names))))
     gains = {}
@@ -144,7 +153,9 @@ def _best_cause(rows: Sequence[_Row]) -> Cause | None:
 
 
 def _solved(design: Float64, error: Float64, prior: Float64) -> tuple[float, Float64, Float64]:
-    """Solve least squares with a prior about 0: chi-square with the prior's part, values and sigmas."""
+    """Solve least squares with a zero-mean prior: chi-square including the prior's part, values and
+    sigmas.
+    """
     normal = design.T @ design + np.diag(prior)
     scale = 1 / np.sqrt(np.diag(normal).clip(1e-300))
     inverse = scale[:, None] * np.linalg.pinv(normal * scale[:, None] * scale) * scale
@@ -177,7 +188,7 @@ def _artefact_rows(plan: AcceptancePlan, view: Observation) -> Iterator[_Row]:
         ends = [known[name] for name in bar.spheres]
         both = [view.spheres[name] for name in bar.spheres]
         if all(end.place_sigma_m is not None for end in ends) or any(isinstance(b, Failed) for b in both):
-            continue  # their places say it already
+            continue  # already covered by the places of its ends
         first, second = (np.array([e.x_m, e.y_m, e.z_m]) for e in ends)
         a, b = both
         assert not isinstance(a, Failed) and not isinstance(b, Failed)
@@ -188,9 +199,9 @@ def _artefact_rows(plan: AcceptancePlan, view: Observation) -> Iterator[_Row]:
 
 
 def _moves(view: ViewGeometry, place: Float64) -> Float64:
-    """Compute how the measured place (3,) answers to each of the UNKNOWNS (3, U).
+    """Differentiate the measured place (3,) with respect to the UNKNOWNS: (3, U).
 
-    Along the bridge the cameras pass over it from both sides: what grows with x cancels.
+    Along the bridge, the cameras pass over the place from both sides, so terms that grow with x cancel.
     """
     down = float(view.camera_m[2] - place[2])
     aside = float(place[1] - view.camera_m[1])
@@ -209,8 +220,8 @@ def _moves(view: ViewGeometry, place: Float64) -> Float64:
 
 
 def _travel_rows(check: RigCheck) -> Iterator[_Row]:
-    """Take yaw and baseline as the crane's travel shows them, together, as they are known together, and the
-    yaw that rows of matches show, whatever the baseline is.
+    """Yield rows for the yaw and baseline that the crane's travel shows, decorrelated, and for the yaw that
+    the rows of matches show independently of the baseline.
     """
     drift, rows = check.drift, check.rows
     if not isinstance(rows, Failed):
@@ -221,18 +232,20 @@ def _travel_rows(check: RigCheck) -> Iterator[_Row]:
         return
     known = np.linalg.inv(drift.covariance)
     told = known @ np.array([drift.yaw_rad, drift.scale])
-    # What was held possible before isn't the travel's word.
+    # The prior is not evidence from the travel, so it is taken out.
     weight, axes = np.linalg.eigh(known - np.diag(drift.prior_sigma**-2.0))
     for k in range(2):
         if weight[k] > 1e-3 * known.max():
             answer = np.zeros(len(UNKNOWNS))
-            # A rig longer than calibrated was calibrated too short: what is off is the calibration.
+            # A baseline longer than calibrated means a calibrated one that is too short: flip its sign.
             answer[:2] = axes[:, k] * (1, -1)
             yield _Row("", float(axes[:, k] @ told / weight[k]), float(weight[k] ** -0.5), answer)
 
 
 def _ratio_causes(checks: Sequence[RigCheck | Failed]) -> Iterator[Cause]:
-    """Take what rows of matches show between the cameras: pitch, roll and the ratio of focal lengths."""
+    """Yield causes that the rows of matches show between the cameras: pitch, roll and the ratio of focal
+    lengths.
+    """
     for check in checks:
         if isinstance(check, Failed):
             continue

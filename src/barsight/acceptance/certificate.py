@@ -1,4 +1,4 @@
-"""Write a certificate, signed where a key is given: sealed JSON, a page, and a PDF; read it back."""
+"""Write and read certificates: sealed JSON, an HTML page and a PDF, signed where a key is given."""
 
 from __future__ import annotations
 
@@ -30,7 +30,9 @@ RULE = (
 
 @dataclass(frozen=True)
 class CommissioningStep:
-    """A step on the way to acceptance that was done: its name, its result, digest of what it left, when."""
+    """A step completed on the way to acceptance: its name, its result, the digest of its output, and the
+    time.
+    """
 
     name: str
     result: str
@@ -41,7 +43,7 @@ class CommissioningStep:
 def certificate_content(
     found: Acceptance, signer: str, steps: Sequence[CommissioningStep] = ()
 ) -> dict[str, Any]:
-    """Collect all that the certificate says, as JSON values. signer: who answers for it, in words."""
+    """Collect the content of a certificate as JSON values. signer: the person responsible for it."""
     rows = [asdict(one) | {"decision": str(one.decision)} for one in found.quantities]
     content = {
         "schema_version": SCHEMA_VERSION,
@@ -78,15 +80,15 @@ def certificate_content(
 
 
 def certificate_files(out: Path) -> tuple[Path, ...]:
-    """Name the files of a certificate: JSON, page and PDF; a suffix of `out` is left off."""
+    """Return the paths of a certificate's JSON, page and PDF; a suffix of `out` is dropped."""
     stem = out.with_suffix("") if out.suffix in (".json", ".html", ".pdf") else out
     return tuple(stem.with_name(stem.name + suffix) for suffix in (".json", ".html", ".pdf"))
 
 
 def write_certificate(content: dict[str, Any], out: Path, key: Path | None, pdf: bool) -> str:
-    """Write JSON, page and, if asked, the PDF, all or none; return the content's digest.
+    """Write JSON, page and, where `pdf` is set, the PDF, all or none; return the content's digest.
 
-    key: Ed25519 private key (PEM) that signs each file; the signature lies beside it as NAME.sig.
+    key: Ed25519 private key (PEM) that signs each file; the signature is written next to it as NAME.sig.
     """
     files = certificate_files(out)
     files = files if pdf else files[:2]
@@ -106,7 +108,7 @@ def write_certificate(content: dict[str, Any], out: Path, key: Path | None, pdf:
 
 
 def read_certificate(path: Path) -> dict[str, Any]:
-    """Read a certificate. Raises InputError where it is missing, torn or changed since."""
+    """Read a certificate. Raises InputError where it is missing, damaged or altered."""
     content = read_sealed(certificate_files(path)[0], SCHEMA_VERSION, REMEDY)
     if "quantities" not in content or "plan" not in content:
         raise InputError(path, "is no certificate", REMEDY)
@@ -114,7 +116,7 @@ def read_certificate(path: Path) -> dict[str, Any]:
 
 
 def error_bar(row: dict[str, Any]) -> str:
-    """Draw an error with U against its limits as SVG; nothing where it wasn't measured."""
+    """Draw an error with U against its limits as SVG; empty where the error wasn't measured."""
     if row["error"] is None:
         return ""
     reach = 1.6 * row["limit"]

@@ -1,4 +1,4 @@
-"""Walk a rig from the box to its certificate: what is done, what is next, all of it in one folder."""
+"""Guide a rig from unpacking to its certificate: the steps done and the next one, all in one folder."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ use_targets = false                     # true: targets.csv says where the crane
 
 @dataclass(frozen=True)
 class CommissionSettings:
-    """Settings of a commissioning. girder_y_m, rails_x_m: as `barsight calibrate yard` takes them. magnet,
-    key: files beside the settings' own; key: of the signature.
+    """Settings of a commissioning. girder_y_m, rails_x_m: as for `barsight calibrate yard`. magnet, key:
+    files next to the settings file; key: private key for the signature.
     """
 
     yard: str = ""
@@ -68,8 +68,10 @@ class CommissionSettings:
 
 @dataclass(frozen=True)
 class GuidedStep:
-    """A step: what it takes (files or folders in the folder), what it makes, what to bring where that isn't
-    there, and what does it, which returns its result in words. told: the settings that it follows.
+    """A step of the commissioning.
+
+    takes: input files or folders. makes: its output. bring: what the user must supply where the input is
+    missing. do: performs the step and returns its result in words. told: settings that the step depends on.
     """
 
     name: str
@@ -82,7 +84,7 @@ class GuidedStep:
 
 @dataclass(frozen=True)
 class DoneStep:
-    """A step that was done. given: digest of what it took and was told, made: of what it made."""
+    """A completed step. given: digest of its inputs and settings. made: digest of its output."""
 
     name: str
     result: str
@@ -91,12 +93,12 @@ class DoneStep:
     done_at: str
 
     def told(self) -> CommissioningStep:
-        """Return what a certificate says of it."""
+        """Return the step as a certificate lists it."""
         return CommissioningStep(self.name, self.result, self.made, self.done_at)
 
 
 def begin(folder: Path) -> CommissionSettings:
-    """Read the folder's settings; write them for a new folder. Raises InputError and ConfigError."""
+    """Read the folder's settings, which are created in a new folder. Raises InputError and ConfigError."""
     path = folder / SETTINGS
     if not path.exists():
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -109,10 +111,11 @@ def begin(folder: Path) -> CommissionSettings:
 
 
 def walk(folder: Path, steps: Sequence[GuidedStep]) -> tuple[tuple[DoneStep, ...], GuidedStep | None]:
-    """Do every step that can be done, in order: those done, and the next one that waits for something.
+    """Run every step that can be run, in order. Returns the completed steps and the next one that lacks its
+    input.
 
-    A step is done again where what it took, was told or made has changed since. Raises what a step raises;
-    those before it stay done.
+    A step is run again if its inputs, settings or output have changed. Raises what a step raises; the steps
+    before it stay completed.
     """
     known = {one.name: one for one in read_done(folder)}
     done: list[DoneStep] = []
@@ -133,7 +136,7 @@ def walk(folder: Path, steps: Sequence[GuidedStep]) -> tuple[tuple[DoneStep, ...
 
 
 def read_done(folder: Path) -> tuple[DoneStep, ...]:
-    """Read the steps that were done. Raises InputError where the record was changed."""
+    """Read the completed steps. Raises InputError where the record was altered."""
     path = folder / RECORD
     if not path.exists():
         return ()
@@ -148,8 +151,8 @@ def _write_done(folder: Path, done: Sequence[DoneStep]) -> None:
 
 
 def _digest(folder: Path, names: Sequence[str], told: Sequence[object] = ()) -> str:
-    """Compute a digest of files and folders, contents up to 16 MiB, of larger ones and pictures the sizes;
-    and of what was told.
+    """Compute a digest of settings, files and folders. Of pictures, point clouds and files above 16 MiB, only
+    the size is used.
     """
     found: list[object] = [json_value(one) for one in told]
     for name in names:

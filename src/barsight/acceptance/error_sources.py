@@ -1,4 +1,4 @@
-"""Gather the sources of a measured bundle's errors from its folder, yard file and certificate."""
+"""Collect the error sources of a measured bundle from its folder, yard file and certificate."""
 
 from __future__ import annotations
 
@@ -31,21 +31,24 @@ from barsight.yard_frame import shared_covariance
 
 REMEDY = "measure the recording again"
 MAX_SIGMA_RATIO = 0.1
-"""Largest sigma of yaw (rad), baseline and focal length (ratios) of a rig that measures anything."""
+"""Maximum plausible sigma of yaw (rad), baseline and focal length (ratios); above it, the file is refused."""
 SHAPE = "shape of the bundle"
-"""Source of what a bundle that isn't surely the outline leaves open; a dummy bundle's shape is known."""
+"""Name of the error source for the uncertainty about which shape a detected outline belongs to; a dummy
+bundle, whose shape is known, doesn't have it.
+"""
 MIN_TOUCHES = 3
 MAX_APART_M = 0.1
-"""Touch-downs further apart than this along one axis aren't of one magnet at rest."""
+"""Maximum spread (m) along one axis of touch-downs made by one magnet at rest."""
 EXPANSION_PER_K = 23e-6
-"""Of an aluminium bar that carries the cameras."""
+"""Thermal expansion (1/K) of the aluminium bar that carries the cameras."""
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredLoad:
-    """A bundle of a folder with all that its budget takes. origin_m: about which the yard frame's errors
-    turn. assumed: sentences on what nobody measured. targets_m: (T, 3) by which this rig found the yard
-    frame; None where it didn't.
+    """A measured bundle with all inputs of its budget.
+
+    origin_m: point about which the yard frame's errors rotate. assumed: sentences on assumptions that nobody
+    verified. targets_m: (T, 3) from which this rig found the yard frame; None where it didn't.
     """
 
     bundle: int
@@ -61,9 +64,11 @@ def measured_load(
     folder: Path, number: int | None, certificate: Path | None, temperature_k: float,
     offset: MagnetOffset | None = None,
 ) -> MeasuredLoad:  # fmt: skip
-    """Gather a bundle's sources. number: its id, the surest one where None. temperature_k: largest change
-    since the calibration. offset: of the magnet, which is taken off the crane's target; without it the
-    certificate's touch-downs count whole.
+    """Collect the error sources of a bundle.
+
+    number: its id; None for the bundle with the highest confidence. temperature_k: largest change since the
+    calibration. offset: of the magnet, subtracted from the crane's target; without it, the certificate's
+    touch-down errors count in full.
 
     Raises InputError, or MeasurementError where the folder has no such bundle.
     """
@@ -108,7 +113,7 @@ def measured_load(
 
 
 def _expect_own(path: Path, told: dict[str, Any], other: dict[str, Any], whose: str = "the folder") -> None:
-    """Raise InputError where a file is of another rig or yard frame than what it is used with."""
+    """Raise InputError where a file belongs to another rig or yard frame than the data it is used with."""
     for name in ("calibration_id", "yard_frame_id"):
         if told.get(name) != other.get(name):
             what = name.removesuffix("_id").replace("_", " ")
@@ -117,7 +122,9 @@ def _expect_own(path: Path, told: dict[str, Any], other: dict[str, Any], whose: 
 
 
 def _rig_source(summary: dict[str, Any], path: Path, focal_px: float, assumed: list[str]) -> ErrorSource:
-    """Take what the rig file and the travel leave open of the rig, else what the settings assume."""
+    """Form the rig's source from the uncertainty left by rig file and travel, or else from the assumed
+    settings.
+    """
     name, told = "calibration of the cameras", summary.get("rig_uncertainty")
     try:
         if told is not None:
@@ -152,8 +159,9 @@ def _chosen(folder: Path, number: int | None) -> Bundle:
 def fit_sources(
     bundle: Bundle, heights: YardMap, shared_m: tuple[float, float] = (0.0, 0.0)
 ) -> list[ErrorSource]:
-    """Take what matching and fit leave open of a bundle, as its file and the map say. shared_m: what its
-    sigmas across and of the top hold of errors that all its heights share, which is taken off.
+    """Form the sources of matching and fit from the bundle's file and the map.
+
+    shared_m: part of its lateral and top sigmas due to errors common to all its heights, which is subtracted.
     """
     row = round((bundle.centre_m[1] - heights.y0_m) / heights.cell_m)
     column = round((bundle.centre_m[0] - heights.x0_m) / heights.cell_m)
@@ -190,7 +198,7 @@ def _fit_source(name: str, variance: float, free: float) -> ErrorSource:
 
 
 def _shared_m(summary: dict[str, Any], path: Path) -> tuple[float, float]:
-    """Read what bundles take for errors that all of one's heights share, across and up."""
+    """Read the assumed sigmas of errors common to all heights of a bundle, lateral and vertical."""
     try:
         told = summary["configuration"]["bundles"]
         return float(told["shared_lateral_m"]), float(told["shared_height_m"])
@@ -199,9 +207,9 @@ def _shared_m(summary: dict[str, Any], path: Path) -> tuple[float, float]:
 
 
 def frame_covariance(frame: YardFrame, seen_from: Float64, below: Float64) -> Float64:
-    """Compute the covariance (6, 6) of how the yard frame turns and moves what is about a place (3,), seen
-    from the body at `seen_from` (3,), both in the yard: with a bend's part, and without the frame's own place
-    where only the attitude is taken.
+    """Compute the covariance (6, 6) of the rotation and translation that the yard frame causes about a place
+    (3,), seen from the body at `seen_from` (3,), both in the yard. It includes the effect of a bend; where
+    only the attitude is taken from the frame, its own place is left out.
     """
     carry = np.eye(6)
     carry[3:, :3] = -skew(below - seen_from)
@@ -211,9 +219,10 @@ def frame_covariance(frame: YardFrame, seen_from: Float64, below: Float64) -> Fl
 
 
 def _travel_source(sigma_m: Float64, shared: Float64) -> ErrorSource:
-    """Take the trajectory's covariance where the bundle was seen from, the yard frame's part left out.
+    """Form the travel's source from the trajectory's covariance near the bundle, without the yard frame's
+    part.
 
-    sigma_m: (N, 3) there; shared: (6, 6) of `frame_covariance`.
+    sigma_m: (N, 3) there; shared: (6, 6) from `frame_covariance`.
     """
     variance = np.full(3, nan)
     if len(sigma_m):
@@ -236,7 +245,7 @@ def _frame_source(frame: YardFrame | None, shared: Float64, assumed: list[str]) 
 
 
 def _magnet_source(certificate: Path | None, assumed: list[str]) -> list[ErrorSource]:
-    """Take the touch-downs' errors, which nothing corrects, as uncertainty: mean squares about 0."""
+    """Convert uncorrected touch-down errors to uncertainty, as their mean squares about 0."""
     touches = {} if certificate is None else _touch_errors_m(certificate)
     sources = []
     for axis in "xyz":
@@ -253,7 +262,9 @@ def _magnet_source(certificate: Path | None, assumed: list[str]) -> list[ErrorSo
 
 
 def _offset_sources(offset: MagnetOffset) -> list[ErrorSource]:
-    """Take the sigma of a known offset, which already covers how few touch-downs there were."""
+    """Form the sources of a known offset from its sigma, which already allows for the number of
+    touch-downs.
+    """
     return [
         ErrorSource("camera to magnet", (f"magnet_{axis}",), np.array([[sigma**2]]), "calibrate magnet")
         for axis, sigma in zip("xyz", offset.sigma_m, strict=True)
@@ -261,10 +272,12 @@ def _offset_sources(offset: MagnetOffset) -> list[ErrorSource]:
 
 
 def touched_offset(certificate: Path) -> MagnetOffset:
-    """Average the touch-downs of a certificate: how far the magnet hangs from where the crane's readings say.
+    """Average the touch-downs of a certificate into the magnet's offset from where the crane's readings place
+    it.
 
-    The sigma of a mean is the larger of the scatter and what the readings' own sigma leaves, over the root of
-    their number, and covers 95.45 % by Student's t. Raises InputError where the certificate can't carry one.
+    The sigma of a mean is the larger of the scatter and the sigma of one reading, over the root of their
+    number, widened so that two sigma cover 95.45 % by Student's t. Raises InputError where the certificate is
+    unsuitable.
     """
     told, touches = read_certificate(certificate), _touch_errors_m(certificate)
     try:
@@ -284,7 +297,9 @@ def touched_offset(certificate: Path) -> MagnetOffset:
 
 
 def _expect_sound(certificate: Path, told: dict[str, Any]) -> None:
-    """Raise InputError where the rig wasn't accepted, but for its touch-downs, or an offset was taken off."""
+    """Raise InputError where the rig wasn't accepted (touch-downs aside) or an offset was already
+    subtracted.
+    """
     if told.get("magnet_offset") is not None:
         raise InputError(certificate, "was made with a magnet's offset", "accept without --magnet first")
     wrong = [str(one["name"]) for one in told["causes"]]
@@ -298,7 +313,7 @@ def _expect_sound(certificate: Path, told: dict[str, Any]) -> None:
 
 
 def _mean_touch_m(certificate: Path, axis: str, errors_m: list[float], own_m: float) -> tuple[float, float]:
-    """Average one axis; its sigma. own_m: sigma of one reading."""
+    """Average the errors along one axis; also return the sigma of the mean. own_m: sigma of one reading."""
     errors = np.array(errors_m)
     if len(errors) < MIN_TOUCHES:
         problem = f"has {len(errors)} touch-downs that tell {axis}, {MIN_TOUCHES} are the least"
@@ -312,7 +327,7 @@ def _mean_touch_m(certificate: Path, axis: str, errors_m: list[float], own_m: fl
 
 
 def _touch_errors_m(certificate: Path) -> dict[str, list[float]]:
-    """Read the touch-downs' errors by axis."""
+    """Read the errors (m) of the touch-downs by axis."""
     found: dict[str, list[float]] = {}
     try:
         for row in read_certificate(certificate)["quantities"]:

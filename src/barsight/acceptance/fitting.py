@@ -1,4 +1,4 @@
-"""Find spheres and plates in a height map near where a plan says they stand, and fit them."""
+"""Find spheres and plates in a height map near their planned places, and fit them."""
 
 from __future__ import annotations
 
@@ -14,34 +14,38 @@ from barsight.core.records.heights import HeightSource
 from barsight.yard.types import YardMap
 
 CAP_RATIO = 0.7
-"""Share of the radius up to which a sphere's cap is used: its flank slopes by 44 degrees there."""
+"""Fraction of the radius up to which a sphere's cap is used; the surface slopes by 44 degrees there."""
 EDGE_M = 0.08
-"""Margin of a plate that isn't used: matching blurs its edge."""
+"""Width (m) of a plate's margin that is not used, because matching blurs its edge."""
 STEP_M = 0.02
-"""Steps in which a place is sought; the fit goes on from the best."""
+"""Step (m) of the grid on which a place is searched; the fit refines the best one."""
 NEAR_M = 0.02
-"""A height further off isn't the artefact's."""
+"""Maximum distance (m) of a height from the artefact's surface for it to count."""
 LEVEL_RATIO, LEVEL_M = 5.0, 0.001
-"""Heights so many times further off than half of a plate's are no more level with it, and the least of that:
-the floor round a low plate isn't."""
+"""Maximum deviation of a height that is level with a plate, as a multiple of the median deviation on the
+plate, and its lower bound (m). It separates a low plate from the floor around it.
+"""
 TIGHT_RATIO = 0.07
-"""Share of the radius by which a sphere's heights may be off at last."""
+"""Maximum deviation of a sphere's heights in the last fit, as a fraction of the radius."""
 ROUND_RATIO = 0.75
-"""Share of a plane's misfit that a sphere's may have."""
+"""Maximum misfit of a sphere relative to that of a plane."""
 STARTS = 6
 THINNED = 5
-"""Of so many heights one takes part in the search for a plate."""
+"""Thinning factor of the heights in the search for a plate."""
 CORRELATED_M = 0.03
-"""Cells nearer than this see the same pixels: their errors are alike."""
+"""Correlation length (m): closer cells see the same pixels, so their errors aren't independent."""
 MIN_SHARE, MIN_CAP_SHARE = 0.5, 0.35
-"""Share of a plate's cells, and of a sphere's cap, that must be there and fit: matching leaves out more of
-a cap."""
+"""Minimum fraction of the cells of a plate, and of a sphere's cap, that must be present and fit; matching
+leaves out more of a cap.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class FittedSphere:
-    """centre_m: (3,) with the calibrated diameter. sigma_m: one coordinate's noise by the residuals.
-    diameter_m: fitted too. form_m: span of 95 % of the radii. cells: used.
+    """A fitted sphere.
+
+    centre_m: (3,) fitted with the calibrated diameter. sigma_m: noise of one coordinate, from the residuals.
+    diameter_m: from a fit with free radius. form_m: 95 % span of the radii. cells: number used.
     """
 
     centre_m: Float64
@@ -53,8 +57,11 @@ class FittedSphere:
 
 @dataclass(frozen=True, eq=False)
 class FittedPlate:
-    """z_m: height at the plate's middle; sigma_m: its noise by the residuals. shift_m: (2,) from where the
-    plan has it, to a step of the search. tilt_deg: of its plane. flatness_m: span of 95 % about the plane.
+    """A fitted plate.
+
+    z_m: height at its centre. sigma_m: noise of z_m, from the residuals. shift_m: (2,) from the planned
+    place, to the resolution of the search. tilt_deg: of its plane. flatness_m: 95 % span about the plane.
+    cells: number used.
     """
 
     z_m: float
@@ -66,7 +73,7 @@ class FittedPlate:
 
 
 def fit_sphere(yard: YardMap, sphere: Sphere, search_m: float) -> FittedSphere | Failed:
-    """Fit a sphere's cap. Failed `not-found` where too few heights near its place fit one."""
+    """Fit a sphere's cap. Failed `not-found` where too few heights near its place fit a sphere."""
     radius = sphere.diameter_m / 2
     points = _known(yard, sphere.x_m, sphere.y_m, search_m + radius)
     expected = np.pi * (CAP_RATIO * radius / yard.cell_m) ** 2
@@ -94,7 +101,7 @@ def fit_sphere(yard: YardMap, sphere: Sphere, search_m: float) -> FittedSphere |
 
 
 def _is_round(cap: Float64, centre: Float64, radius: float) -> bool:
-    """Check that a sphere fits heights (N, 3) far better than a plane does."""
+    """Check that a sphere fits the heights (N, 3) far better than a plane does."""
     flat = np.column_stack([cap[:, :2], np.ones(len(cap))])
     off_plane = cap[:, 2] - flat @ np.linalg.lstsq(flat, cap[:, 2], rcond=None)[0]
     off_sphere = np.linalg.norm(cap - centre, axis=1) - radius
@@ -102,7 +109,7 @@ def _is_round(cap: Float64, centre: Float64, radius: float) -> bool:
 
 
 def _starts(points: Float64, sphere: Sphere, search_m: float, expected: float) -> list[Float64]:
-    """List the centres (3,) from which the heights look most like the sphere."""
+    """List the centres (3,) around which the heights look most like the sphere."""
     radius, scored = sphere.diameter_m / 2, list[tuple[float, Float64]]()
     for dx in _steps(search_m):
         for dy in _steps(search_m):
@@ -121,7 +128,7 @@ def _starts(points: Float64, sphere: Sphere, search_m: float, expected: float) -
 
 
 def fit_plate(yard: YardMap, plate: Plate, search_m: float) -> FittedPlate | Failed:
-    """Fit a plate's plane. Failed `not-found` where too few heights near its place lie level there."""
+    """Fit a plate's plane. Failed `not-found` where too few heights near its place are level."""
     points = _known(yard, plate.x_m, plate.y_m, search_m + max(plate.size_m))
     points = points[np.abs(points[:, 2] - plate.z_m) < search_m]
     turn = np.radians(plate.yaw_deg)
@@ -154,7 +161,9 @@ def fit_plate(yard: YardMap, plate: Plate, search_m: float) -> FittedPlate | Fai
 def _plate_shift(
     points: Float64, plate: Plate, search_m: float, axes: Float64, expected: float
 ) -> Float64 | None:
-    """Find the shift (2,) at which most heights lie level on the plate and fewest around it."""
+    """Find the shift (2,) with the most heights level on the plate and the fewest around it; None where the
+    plate has too few heights everywhere.
+    """
     half, shift, best = np.array(plate.size_m) / 2, None, -np.inf
     for dx in _steps(search_m):
         for dy in _steps(search_m):
@@ -174,7 +183,7 @@ def _plate_shift(
 
 
 def _known(yard: YardMap, x_m: float, y_m: float, reach_m: float) -> Float64:
-    """Read the heights (N, 3) that vision measured in a square of half side `reach_m`."""
+    """Read the heights (N, 3) measured by vision in a square of half side `reach_m`."""
     spans = [
         slice(
             min(max(int((at - reach_m - low) / yard.cell_m), 0), size),
@@ -191,7 +200,7 @@ def _known(yard: YardMap, x_m: float, y_m: float, reach_m: float) -> Float64:
 
 
 def _steps(search_m: float) -> Float64:
-    """List offsets to try, the smallest first: of equals the nearest is taken."""
+    """List the offsets to try in ascending size, so that the nearest one wins a tie."""
     count = round(search_m / STEP_M)
     steps = STEP_M * np.arange(-count, count + 1, dtype=np.float64)
     return steps[np.argsort(np.abs(steps), kind="stable")]
@@ -203,7 +212,9 @@ def _inside(at: Float64, half: Float64) -> Bool:
 
 
 def _solve(cap: Float64, start: Float64, radius: float | None) -> Float64:
-    """Solve for centre (3,), or centre and radius (4,) where that is None, by distances to the cap (N, 3)."""
+    """Solve for the centre (3,), or for centre and radius (4,) where radius is None, from the cap's points
+    (N, 3).
+    """
 
     def off(unknown: Float64) -> Float64:
         wanted = unknown[3] if radius is None else radius

@@ -1,4 +1,4 @@
-"""Lay out a plan for a given yard: artefacts spread over floor that is free, limits by what a pixel is."""
+"""Lay out a plan for a given yard: artefacts spread over free floor, with limits based on the pixel size."""
 
 from __future__ import annotations
 
@@ -28,20 +28,22 @@ SPHERES = (
     ("monument 1", 0.14, 0.92, 0.0), ("monument 2", 0.12, 0.75, 0.12), ("monument 3", 0.34, 0.14, 0.0),
     ("monument 4", 0.85, 0.86, 0.12), ("monument 5", 0.85, 0.14, 0.0),
 )  # fmt: skip
-"""Names, places as shares of the area, heights as shares of the cameras' height."""
+"""PLATES and SPHERES: names, places as fractions of the area, and heights (tops of plates, undersides of
+spheres) as fractions of the cameras' height.
+"""
 BARS = (("bar along", "monument 3", "monument 5"), ("bar across", "monument 4", "monument 5"),
         ("bar aslant", "monument 1", "monument 4"))  # fmt: skip
 DUMMY = ("dummy bundle", 0.64, 0.5)
 BAR_PX = 12.5
-"""Width of a dummy bundle's bar in pixels on the floor."""
+"""Width of a dummy bundle's bar on the floor, in pixels."""
 FLOOR_M = 0.05
-"""Greatest height of floor."""
+"""Maximum height (m) of a map cell that counts as floor, above or below zero."""
 
 
 @dataclass(frozen=True)
 class Area:
-    """Floor of the yard that the artefacts are spread over, m, and what sees it: height of the cameras over
-    it, focal length (px) and baseline.
+    """Floor area (m) for the artefacts, and the view of it: height of the cameras above it (m), focal length
+    (px) and baseline (m).
     """
 
     x_m: tuple[float, float]
@@ -52,16 +54,16 @@ class Area:
 
     @property
     def ground_px_m(self) -> float:
-        """Return a pixel's size on the floor."""
+        """Return the size of a pixel on the floor."""
         return self.above_floor_m / self.focal_px
 
     @property
     def height_px_m(self) -> float:
-        """Return what one pixel of disparity is in height, on the floor."""
+        """Return the height difference that corresponds to one pixel of disparity on the floor."""
         return self.above_floor_m**2 / (self.focal_px * self.baseline_m)
 
     def at(self, along: float, across: float) -> Float64:
-        """Place shares of the area in the yard, (2,) m."""
+        """Convert fractions of the area to a place (2,) m in the yard."""
         return np.array([
             self.x_m[0] + along * (self.x_m[1] - self.x_m[0]),
             self.y_m[0] + across * (self.y_m[1] - self.y_m[0]),
@@ -69,10 +71,10 @@ class Area:
 
 
 def lay_out(area: Area, yard: str, floor: YardMap | None = None) -> AcceptancePlan | Failed:
-    """Lay out a plan. floor: a map of the yard as it is; artefacts then stand on its free floor.
+    """Lay out a plan. floor: a map of the yard as it is; artefacts are then placed on its free floor.
 
-    Calibrated values are nominal: who builds the artefacts writes in what was measured of them. Failed
-    `no-floor` where the free floor doesn't hold them.
+    Calibrated values are nominal: whoever builds the artefacts enters the measured ones. Failed `no-floor`
+    where there isn't enough free floor.
     """
     side = float(np.clip(70 * area.ground_px_m, 0.4, 1.2))
     wide = float(np.clip(40 * area.ground_px_m, 0.15, 0.6))
@@ -119,7 +121,7 @@ def _bars(spheres: tuple[Sphere, ...]) -> tuple[SphereBar, ...]:
 
 
 def _dummy(place: Float64, ground_px_m: float) -> DummyBundle:
-    """Take seven bars, hexagonally packed, 1.4 m long, each wide enough to be told from the next."""
+    """Make a dummy bundle of seven bars, hexagonally packed, 1.4 m long, each wide enough to be resolved."""
     diameter = round(float(np.clip(BAR_PX * ground_px_m, 0.06, 0.15)), 2)
     pitch = 1.003 * diameter
     return DummyBundle(
@@ -129,7 +131,9 @@ def _dummy(place: Float64, ground_px_m: float) -> DummyBundle:
 
 
 def _limits(area: Area) -> ErrorLimits:
-    """Set limits to shares of a pixel, as a good calibration holds them; figures as metres, then mm."""
+    """Set the limits as multiples of the pixel size that a good calibration can keep. Sizes are in m,
+    limits in mm.
+    """
     up, across = 1e3 * area.height_px_m, 1e3 * area.ground_px_m
     return ErrorLimits(
         height_mm=round(0.14 * up, 1), position_mm=round(1.3 * across, 1), length_mm=round(1.3 * across, 1),
@@ -141,7 +145,7 @@ def _limits(area: Area) -> ErrorLimits:
 
 
 def _free_floor(floor: YardMap) -> Float64:
-    """Compute how far each cell of free floor is from what isn't, m."""
+    """Compute the distance (m) of each cell of free floor from the nearest cell that isn't."""
     part = floor.part(slice(0, floor.shape[0]), slice(0, floor.shape[1]))
     level: Bool = np.isfinite(part.z_m) & (np.abs(part.z_m) < FLOOR_M)
     away: Float64 = distance_transform_edt(np.pad(level, 1))[1:-1, 1:-1] * floor.cell_m

@@ -1,4 +1,4 @@
-"""Observe a plan's artefacts in a measured folder: spheres, plates, bundles, the laser, the cameras' way."""
+"""Observe a plan's artefacts in a measured folder: spheres, plates, bundles, laser and viewing geometry."""
 
 from __future__ import annotations
 
@@ -20,13 +20,14 @@ from barsight.yard.inventory.bundle_file import read_bundles
 from barsight.yard.types import Bundle
 
 MIN_BAR_PX = 10.0
-"""Width of a dummy bundle's bar on the floor from which its sides are found: bars of 8 pixels put them on
-another row in two of five yards."""
+"""Minimum width (px) on the floor of a dummy bundle's bars; the sides of bars of 8 px were assigned to
+another row in two of five yards.
+"""
 
 
 @dataclass(frozen=True)
 class LaserAgreement:
-    """Bias of vision minus laser on smooth places, mm, and the margin within which both are equivalent."""
+    """Bias of vision minus laser on smooth places, mm, and the margin within which the two are equivalent."""
 
     profile: int
     bias_mm: float
@@ -35,14 +36,16 @@ class LaserAgreement:
 
 @dataclass(frozen=True, eq=False)
 class ViewGeometry:
-    """camera_m: (3,) mean place of cam0 in the yard. focal_px, baseline_m: of the rectified pair."""
+    """Geometry of the view. camera_m: (3,) mean position of cam0 in the yard. focal_px, baseline_m: of the
+    rectified pair.
+    """
 
     camera_m: Float64
     focal_px: float
     baseline_m: float
 
     def px_m(self, z_m: float) -> float:
-        """Compute how many metres of height one pixel of disparity is at a height in the yard."""
+        """Compute the metres of height per pixel of disparity at a height in the yard."""
         return float((self.camera_m[2] - z_m) ** 2 / (self.focal_px * self.baseline_m))
 
 
@@ -50,7 +53,7 @@ class ViewGeometry:
 class Observation:
     """The artefacts as one recording shows them.
 
-    map_id, calibration_id, yard_frame_id: of the measured folder; warnings: its codes.
+    map_id, calibration_id, yard_frame_id: of the measured folder; warnings: its warning codes.
     """
 
     recording: str
@@ -93,8 +96,8 @@ def observe(folder: Path, plan: AcceptancePlan, rig: StereoRig, recording: str) 
 def nearest_bundle(
     bundles: tuple[Bundle, ...], dummy: DummyBundle, search_m: float, ground_px_m: float
 ) -> Bundle | Failed:
-    """Find the bundle nearest to a dummy's place. Failed `not-found`, or `thin-bars` where its sides can't be
-    told with pixels of this size on the floor.
+    """Find the bundle nearest to a dummy's place. Failed `not-found`, or `thin-bars` where its bars are too
+    thin to find its sides at this pixel size on the floor.
     """
     wide_px = dummy.bar_diameter_m / ground_px_m
     if wide_px < MIN_BAR_PX:
@@ -110,7 +113,7 @@ def nearest_bundle(
 
 
 def view_geometry(folder: Path, rig: StereoRig) -> ViewGeometry:
-    """Compute from where a measured folder was seen. Raises InputError where it has no trajectory."""
+    """Compute the viewing geometry of a measured folder. Raises InputError where it has no trajectory."""
     path = read_path(folder)
     if path is None:
         raise InputError(folder, "has no trajectory.tum", "measure the recording again")

@@ -1,4 +1,4 @@
-"""Write a certificate as PDF."""
+"""Write a certificate as a PDF."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def write_pdf(content: dict[str, Any], digest: str, signed: bool, target: Path) 
 
 
 def headline(content: dict[str, Any]) -> str:
-    """Say the result in one line."""
+    """State the result in one line."""
     result = "PASSED" if content["passed"] else "FAILED"
     return f"{result}{', of a SIMULATED rig: no certificate of any crane' if content['is_simulated'] else ''}"
 
@@ -92,5 +92,5 @@ def _row(one: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _plain(value: Any, decimals: int) -> str:
-    """Format with characters that the PDF's own fonts have."""
+    """Format a value with characters that the PDF's built-in fonts have."""
     return format_number(value, decimals).replace("−", "-").replace("\u202f", " ").replace("–", "-")

@@ -1,4 +1,6 @@
-"""Check the pictures themselves: dirt and drops on a lens stay where they are while the yard passes by."""
+"""Check the pictures for dirt and drops on a lens, which stay fixed in the picture while the yard passes
+by.
+"""
 
 from __future__ import annotations
 
@@ -14,23 +16,25 @@ from barsight.core.errors import Failed
 from barsight.core.records.pairs import StereoFrame
 
 BLOCKS = 80
-"""Blocks across a picture."""
+"""Number of blocks across a picture."""
 AROUND = 11
-"""Blocks whose median says what a block should be like."""
+"""Width, in blocks, of the median filter that gives a block's surroundings."""
 FRAMES = 12
 FEWEST = 4
 DARKER = 0.12
-"""Spots are darker than around by this share, or blurred to the share below, in almost every picture."""
+"""Minimum fraction by which a spot is darker than its surroundings in almost every picture; or its contrast
+falls below the fraction BLURRED of theirs.
+"""
 BLURRED = 0.55
 EXCEPTIONS = 8
-"""Of so many pictures one may hide a spot: something bright lies just there."""
+"""One in this many pictures may hide a spot, where something bright happens to be behind it."""
 
 
 @dataclass(frozen=True)
 class PictureHealth:
-    """Health of one camera: share of the picture that dirt darkens or drops blur, %.
+    """Health of one camera. dirt_pct: percentage of the picture that dirt darkens or drops blur.
 
-    sharpness: contrast of neighbouring pixels over brightness, median; gray: level, median.
+    sharpness: median contrast of neighbouring pixels over brightness. gray: median gray level.
     """
 
     camera: str
@@ -40,7 +44,7 @@ class PictureHealth:
 
 
 def check_pictures(frames: Iterable[StereoFrame]) -> tuple[PictureHealth, ...] | Failed:
-    """Check both cameras over some frames of a travel. Failed `few-pictures` under four."""
+    """Check both cameras on some frames of a travel. Failed `few-pictures` for fewer than four."""
     pictures: list[tuple[UInt8, UInt8]] = [(frame.left, frame.right) for frame in frames]
     if len(pictures) < FEWEST:
         return Failed("few-pictures", f"{len(pictures)} pictures; {FEWEST} are the least to tell dirt by")
@@ -62,7 +66,7 @@ def _health(camera: str, images: list[UInt8]) -> PictureHealth:
 
 
 def _blocks(image: UInt8) -> tuple[Float32, Float32]:
-    """Compute per block the gray level and the contrast of neighbouring pixels over it."""
+    """Compute each block's gray level and its contrast of neighbouring pixels relative to that level."""
     side = max(image.shape[1] // BLOCKS, 4)
     rows, columns = image.shape[0] // side, image.shape[1] // side
     cut = image[: rows * side, : columns * side].astype(np.float32)

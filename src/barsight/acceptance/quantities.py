@@ -1,4 +1,4 @@
-"""Judge errors against limits by the rule of ISO 14253-1: passed only where |error| + U lies within."""
+"""Judge errors against limits by the rule of ISO 14253-1: passed only if |error| + U is within the limit."""
 
 from __future__ import annotations
 
@@ -29,12 +29,13 @@ from barsight.yard.types import Bundle
 from barsight.yard.weight import bundle_mass
 
 REPEATED = ("height_mm", "position_mm", "length_mm", "step_mm", "lift_mm")
-"""Groups of lengths whose scatter over the recordings is judged."""
+"""Groups of lengths whose repeatability over the recordings is judged."""
 
 
 class Decision(StrEnum):
-    """Passed: the error with its uncertainty lies within the limit. Failed: it lies outside. Not proven: the
-    limit lies in between. Not measured: the artefact wasn't found, or nothing was told of it."""
+    """Passed: the error with its uncertainty is within the limit. Failed: it is outside. Not proven: the
+    limit is within the uncertainty. Not measured: the artefact wasn't found, or no value was given.
+    """
 
     PASSED = "passed"
     FAILED = "failed"
@@ -44,8 +45,11 @@ class Decision(StrEnum):
 
 @dataclass(frozen=True)
 class JudgedQuantity:
-    """A quantity: errors of each recording in `unit` (NaN where not measured), the worst of them, its test
-    value uncertainty [ISO/TS 23165], the limit and the decision. group: which limit.
+    """A judged quantity.
+
+    errors: one per recording, in `unit` (NaN where not measured). error: the largest of them. uncertainty:
+    test value uncertainty [ISO/TS 23165]. limit, decision: as in `decide`. group: the limit's name in the
+    plan.
     """
 
     name: str
@@ -63,8 +67,8 @@ class JudgedQuantity:
 def judge_all(
     plan: AcceptancePlan, seen: Sequence[Observation], offset: MagnetOffset | None = None
 ) -> tuple[JudgedQuantity, ...]:
-    """Judge every quantity that the plan names, over all recordings. offset: of the magnet, which is taken
-    off what the crane gets.
+    """Judge every quantity in the plan over all recordings. offset: of the magnet, added to the crane's
+    readings.
     """
     judge = _Judge(plan, seen, offset)
     judged = [
@@ -80,7 +84,7 @@ def judge_all(
 
 
 def decide(error: float, expanded: float, limit: float) -> Decision:
-    """Decide by ISO 14253-1: NaN is not measured."""
+    """Decide by ISO 14253-1; an error of NaN counts as not measured."""
     if not isfinite(error):
         return Decision.NOT_MEASURED
     if abs(error) + expanded <= limit:
@@ -170,14 +174,14 @@ class _Judge:
         for k, axis in enumerate("xyz"):
             errors = [o[k] for o in off]
             if all(np.isnan(errors)) and not all(isinstance(top, Failed) for top in tops):
-                continue  # a plate shows its height only
+                continue  # a plate only shows its height
             yield self._judged(f"{one.name}: {axis}", "touch_mm", errors, parts[k], _why(tops))
 
     def laser(self) -> Iterator[JudgedQuantity]:
         for profile in sorted({row.profile for view in self._seen for row in view.laser}):
             rows = [row for view in self._seen for row in view.laser if row.profile == profile]
             worst = max(rows, key=lambda row: row.equivalence_mm)
-            # The margin of two one-sided tests is the bias and this.
+            # The equivalence margin of two one-sided tests is the bias plus this.
             half = worst.equivalence_mm - abs(worst.bias_mm)
             part = UncertaintyPart("independent samples of the profile", half / 2, "t", inf, "this test")
             yield self._judged(
@@ -186,7 +190,9 @@ class _Judge:
             )  # fmt: skip
 
     def repeats(self, judged: Sequence[JudgedQuantity]) -> Iterator[JudgedQuantity]:
-        """Judge twice the pooled scatter over the recordings; U reaches to its upper bound of 95 %."""
+        """Judge twice the pooled standard deviation over the recordings; U extends to its upper 95 %
+        bound.
+        """
         rows = [np.array(q.errors) for q in judged if q.group in REPEATED]
         rows = [row[np.isfinite(row)] for row in rows]
         free = sum(row.size - 1 for row in rows if row.size > 1)
@@ -207,7 +213,7 @@ class _Judge:
         known = [e for e in errors if isfinite(e)]
         worst = error if error is not None else (max(known, key=abs) if known else nan)
         if len(known) < len(errors):
-            worst = nan  # every recording must show it
+            worst = nan  # every recording must have measured it
         whole = combine(parts)
         if expanded is not None:
             whole = CombinedUncertainty(whole.sigma, whole.degrees_of_freedom, 2.0, expanded)
@@ -238,7 +244,7 @@ def _why(found: Sequence[object]) -> str:
 
 
 def _bundle_errors(bundle: Bundle, dummy: DummyBundle) -> Float64:
-    """Compute errors (7,) of a bundle: across, along, up (mm), yaw (deg), width, length (mm), mass (%)."""
+    """Compute a bundle's errors (7,): across, along, up (mm), yaw (deg), width, length (mm), mass (%)."""
     turn = (np.degrees(bundle.yaw_rad) - dummy.yaw_deg + 90) % 180 - 90
     ended = not any(bundle.ends_open)
     kg, yaw = bundle_mass(bundle).kg, np.radians(dummy.yaw_deg)
@@ -253,7 +259,9 @@ def _bundle_errors(bundle: Bundle, dummy: DummyBundle) -> Float64:
 
 
 def _top(view: Observation, name: str, artefacts: Sequence[Artefact]) -> Float64 | Failed:
-    """Find where a magnet touches an artefact, (3,) m; a plate's x and y aren't seen (NaN)."""
+    """Find the point (3,) m at which a magnet touches an artefact; NaN for a plate's x and y, which aren't
+    seen.
+    """
     if name in view.plates:
         plate = view.plates[name]
         return plate if isinstance(plate, Failed) else np.array([nan, nan, plate.z_m])

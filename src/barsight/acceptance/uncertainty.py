@@ -1,4 +1,4 @@
-"""Combine parts of an uncertainty: standard uncertainty, degrees of freedom, coverage, expanded U."""
+"""Combine parts of an uncertainty: standard uncertainty, degrees of freedom, coverage factor, expanded U."""
 
 from __future__ import annotations
 
@@ -10,13 +10,15 @@ import numpy as np
 from scipy.stats import t as student
 
 COVERAGE = 0.9545
-"""Probability that U covers: k = 2 for a normal distribution."""
+"""Coverage probability of U, for which k = 2 with a normal distribution."""
 
 
 @dataclass(frozen=True)
 class UncertaintyPart:
-    """One part: its source, standard uncertainty in the quantity's unit, its distribution (normal,
-    rectangular, t), degrees of freedom (inf: known), and what measured it.
+    """One part of an uncertainty.
+
+    sigma: standard uncertainty in the quantity's unit. distribution: normal, rectangular or t.
+    degrees_of_freedom: inf for an exactly known sigma. measured_by: where the value comes from.
     """
 
     source: str
@@ -28,8 +30,10 @@ class UncertaintyPart:
 
 @dataclass(frozen=True)
 class CombinedUncertainty:
-    """sigma: standard uncertainty. degrees_of_freedom: effective ones [Welch 1947]. coverage: k for 95.45 %.
-    expanded: U = k sigma.
+    """A combined uncertainty.
+
+    sigma: standard uncertainty. degrees_of_freedom: effective number [Welch 1947]. coverage: factor k for
+    95.45 %. expanded: U = k sigma.
     """
 
     sigma: float
@@ -39,7 +43,7 @@ class CombinedUncertainty:
 
 
 def combine(parts: Sequence[UncertaintyPart]) -> CombinedUncertainty:
-    """Combine independent parts by GUM: squares added, degrees of freedom by Welch and Satterthwaite."""
+    """Combine independent parts by GUM: variances added, degrees of freedom by Welch and Satterthwaite."""
     variances = np.array([part.sigma**2 for part in parts])
     sigma = float(np.sqrt(variances.sum()))
     quotient = sum(

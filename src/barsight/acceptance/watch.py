@@ -1,4 +1,6 @@
-"""Watch a rig over the years: control charts (CUSUM) on what every survey shows, since the last approval."""
+"""Monitor a rig over the years with control charts (CUSUM) on the figures of every survey since the last
+approval.
+"""
 
 from __future__ import annotations
 
@@ -24,14 +26,18 @@ from barsight.registration.tags import PlacedTag
 SCHEMA_VERSION = 1
 REMEDY = "give the record that barsight verify wrote, or another name to begin a new one"
 LEARNED = 8
-"""Surveys after an approval that say what is normal."""
+"""Number of surveys after an approval from which the normal mean and scatter are learned."""
 SLACK, ALARM = 1.8, 2.8
-"""CUSUM in sigmas of a survey against the learned mean: what of each is taken off, and the sum that alarms
-[Page 1954]. A jump of four sigma is told within three surveys, and a dozen charts of healthy ones alarm less
-than once in a thousand surveys.
+"""Slack and alarm threshold of the CUSUM, in sigmas of a survey's deviation from the learned mean [Page
+1954].
+
+A jump of four sigma is detected within three surveys, and a dozen charts of healthy rigs raise fewer than one
+alarm in a thousand surveys.
 """
 DOUBTED = 1.62
-"""A stated sigma is believed unless the learned ones scatter by more: 1 % would by chance."""
+"""Ratio of the learned scatter to a stated sigma above which the sigma is replaced by the scatter; by chance
+this happens in 1 % of cases.
+"""
 _TEXT = {"type": "string"}
 _FIGURE = record_schema(name=_TEXT, value={"type": "number"}, sigma={"type": "number", "exclusiveMinimum": 0})
 _SURVEY = record_schema(
@@ -46,12 +52,12 @@ _SCHEMA = record_schema(
     approvals=list_schema(_APPROVAL),
 )  # fmt: skip
 SHARPNESS_SIGMA = 0.15
-"""Of the logarithm of a picture's sharpness: yards differ."""
+"""Standard deviation of the logarithm of a picture's sharpness, which varies between yards."""
 
 
 @dataclass(frozen=True)
 class WatchedFigure:
-    """A figure of one survey, with its sigma, in the unit that its name says."""
+    """A figure of one survey with its sigma, in the unit stated in its name."""
 
     name: str
     value: float
@@ -60,8 +66,8 @@ class WatchedFigure:
 
 @dataclass(frozen=True)
 class WatchedSurvey:
-    """A survey: digest of its recording's inputs, of its calibration, its figures, and the digest of what
-    places it in the yard; None where nothing does, or nobody said.
+    """A survey: digests of its recording's inputs and of its calibration, its figures, and the digest of its
+    yard frame, which is None where there is none or it wasn't recorded.
     """
 
     recording: str
@@ -73,7 +79,7 @@ class WatchedSurvey:
 
 @dataclass(frozen=True)
 class Approval:
-    """A calibration put into service: who, why, when (UTC), and how many surveys there were before."""
+    """Approval of a calibration: by whom, why, when (UTC), and the number of surveys before it."""
 
     who: str
     why: str
@@ -84,7 +90,7 @@ class Approval:
 
 @dataclass(frozen=True)
 class WatchRecord:
-    """All surveys and approvals, the oldest first."""
+    """All surveys and approvals, oldest first."""
 
     surveys: tuple[WatchedSurvey, ...] = ()
     approvals: tuple[Approval, ...] = ()
@@ -97,8 +103,11 @@ class WatchRecord:
 
 @dataclass(frozen=True)
 class ControlChart:
-    """A figure's chart: its last value, mean and sigma when normal (NaN while that is learned), the larger of
-    both sums, and at which survey since the approval (from 1) it first alarmed; None where it didn't.
+    """A figure's control chart.
+
+    value: the latest. mean, sigma: the normal ones, NaN while they are being learned. cusum: larger of both
+    sums. alarmed_at: number of the survey since the approval (from 1) that first raised an alarm, None for no
+    alarm.
     """
 
     name: str
@@ -110,8 +119,9 @@ class ControlChart:
 
 
 def rig_figures(check: RigCheck) -> tuple[WatchedFigure, ...]:
-    """Take what rows and travel show of the rig: baseline, pitch, roll, focal ratio, and the yaw, which both
-    see, as their weighted mean. What the calibration leaves open is alike in all surveys: sigmas are noise.
+    """Extract the rig's figures from rows and travel: baseline, pitch, roll, focal ratio, and the weighted
+    mean of the yaw from both. The calibration's uncertainty is the same in all surveys, so sigmas cover noise
+    only.
     """
     noise = {} if isinstance(check.rows, Failed) else dict(
         zip(("pitch", "roll", "focal ratio"), check.rows.sigmas / check.row_sigmas, strict=False)
@@ -135,7 +145,7 @@ def rig_figures(check: RigCheck) -> tuple[WatchedFigure, ...]:
 
 
 def picture_figures(health: tuple[PictureHealth, ...] | Failed) -> tuple[WatchedFigure, ...]:
-    """Take the logarithm of each camera's sharpness."""
+    """Compute the logarithm of each camera's sharpness."""
     if isinstance(health, Failed):
         return ()
     return tuple(
@@ -145,7 +155,7 @@ def picture_figures(health: tuple[PictureHealth, ...] | Failed) -> tuple[Watched
 
 
 def feature_figures(plan: AcceptancePlan, seen: Observation) -> tuple[WatchedFigure, ...]:
-    """Take the mean errors of fixed features, mm: heights of plates, places of surveyed spheres."""
+    """Compute the mean errors (mm) of fixed features: heights of plates and places of surveyed spheres."""
     z = [
         1e3 * (found.z_m - one.z_m)
         for one in plan.plate
@@ -173,8 +183,8 @@ def feature_figures(plan: AcceptancePlan, seen: Observation) -> tuple[WatchedFig
 def tag_figures(
     listed: SurveyedTags, placed: Sequence[PlacedTag | Failed]
 ) -> tuple[WatchedFigure, ...] | Failed:
-    """Take the mean error along each axis of surveyed tags on columns and floor, mm, with the sigma that they
-    share. Failed `not-found` where none was placed.
+    """Compute the mean error (mm) along each axis of surveyed tags on columns and floor, with their common
+    sigma. Failed `not-found` where no tag was located.
     """
     found = [
         (1e3 * (tag.place_m - place), 1e6 * np.diag(tag.covariance_m2))
@@ -191,7 +201,7 @@ def tag_figures(
 
 
 def control_charts(surveys: Sequence[WatchedSurvey]) -> tuple[ControlChart, ...]:
-    """Compute the charts of all figures over surveys of one approval, the oldest first."""
+    """Compute the control charts of all figures over the surveys of one approval, oldest first."""
     names = dict.fromkeys(figure.name for survey in surveys for figure in survey.figures)
     return tuple(_chart(name, surveys) for name in names)
 
@@ -208,7 +218,7 @@ def _chart(name: str, surveys: Sequence[WatchedSurvey]) -> ControlChart:
         return ControlChart(name, rows[-1][1].value, np.nan, np.nan, 0.0, None)
     mean = float(learned.mean())
     scatter = float(learned.std(ddof=1))
-    spread = (1 + 1 / LEARNED) ** 0.5  # the learned mean errs too
+    spread = (1 + 1 / LEARNED) ** 0.5  # the learned mean is uncertain too
     up = down = 0.0
     alarmed, sigma = None, np.nan
     for number, figure in rows[LEARNED:]:
@@ -221,7 +231,7 @@ def _chart(name: str, surveys: Sequence[WatchedSurvey]) -> ControlChart:
 
 
 def read_watch(path: Path) -> WatchRecord:
-    """Read a record; an empty one where there is no such file. Raises InputError where it was changed."""
+    """Read a record, empty where the file doesn't exist. Raises InputError where it was altered."""
     if not path.exists():
         return WatchRecord()
     content = read_sealed(path, SCHEMA_VERSION, REMEDY)
@@ -233,14 +243,14 @@ def read_watch(path: Path) -> WatchRecord:
 
 
 def write_watch(record: WatchRecord, path: Path) -> None:
-    """Write a record whole or not at all."""
+    """Write a record completely or not at all."""
     content: dict[str, Any] = json_value({"schema_version": SCHEMA_VERSION, **asdict(record)})
     write_sealed(content, path)
 
 
 def with_survey(record: WatchRecord, survey: WatchedSurvey, path: Path) -> WatchRecord:
-    """Add a survey. Raises InputError for one that is there already, or of a calibration or yard frame that
-    nobody approved.
+    """Add a survey. Raises InputError for one that is already in the record, or whose calibration or yard
+    frame hasn't been approved.
     """
     if any(one.recording_id == survey.recording_id for one in record.surveys):
         raise InputError(survey.recording, f"is in {path.name} already", "record a new survey")

@@ -1,4 +1,4 @@
-"""Find over which floor a measured yard was seen, and from how high."""
+"""Find the floor area that a measured yard shows, and the height it was seen from."""
 
 from __future__ import annotations
 
@@ -18,11 +18,13 @@ from barsight.result_folder import open_folder, read_heights
 
 MARGIN_M = 0.3
 SHARE = 0.6
-"""A row or column of the map counts where at least this share of the widest one was seen."""
+"""Minimum number of seen cells in a row or column of the map, as a fraction of the best one, for it to
+count.
+"""
 
 
 def measured_area(folder: Path) -> Area:
-    """Find the area of a measured folder whose recording is still there. Raises InputError."""
+    """Find the area of a measured folder whose recording still exists. Raises InputError."""
     summary, _ = open_folder(folder, lifts=False)
     if summary["reference"] != "yard":
         raise InputError(folder, "isn't in the yard's frame", "measure with encoders, or with --yard")
@@ -40,13 +42,13 @@ def measured_area(folder: Path) -> Area:
 
 
 def measured_rig(summary: dict[str, Any]) -> StereoRig:
-    """Read the rig that a folder was measured with; its recording must still be there."""
+    """Read the rig with which a folder was measured; its recording must still exist."""
     recording = Path((summary.get("recording") or {}).get("path") or "")
     return open_recording(recording, RecordingSettings(rig=_rig_file(summary))).rig
 
 
 def _rig_file(summary: dict[str, Any]) -> Path | None:
-    """Take the rig that the folder was measured with, None where it was the recording's own."""
+    """Return the rig file with which the folder was measured, None for the recording's own rig."""
     configuration = summary.get("configuration")
     reading = configuration.get("recording") if isinstance(configuration, dict) else None
     file = reading.get("rig") if isinstance(reading, dict) else None

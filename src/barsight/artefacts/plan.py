@@ -1,4 +1,4 @@
-"""Define the plan of an acceptance: artefacts with their calibrated values, and what errors may be."""
+"""Define the plan of an acceptance: artefacts with their calibrated values, and the error limits."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ HELP = "docs/how-to/accept.md says how a plan is written"
 
 @dataclass(frozen=True)
 class Plate:
-    """A level plate. x_m, y_m, z_m: middle of its top in the yard. size_m: its sides, the first along X where
-    yaw_deg is 0. sigma_m: of its calibrated height; flatness_sigma_m: of its flatness, which is taken as 0.
+    """A level plate. x_m, y_m, z_m: centre of its top in the yard. size_m: its sides, the first along X where
+    yaw_deg is 0. sigma_m: of its calibrated height; flatness_sigma_m: of its flatness error, which is taken
+    as 0.
     """
 
     name: str
@@ -41,10 +42,10 @@ class Plate:
 
 @dataclass(frozen=True)
 class Sphere:
-    """A matt sphere. x_m, y_m, z_m: its centre in the yard. place_sigma_m: of each coordinate where it was
-    surveyed, as a monument is; without it the place only says where to look. diameter_sigma_m: of the
-    calibrated diameter. probing: judge its form and size too; wants a diameter of a tenth of the field of
-    view or more.
+    """A matt sphere. x_m, y_m, z_m: its centre in the yard. place_sigma_m: sigma of each coordinate of a
+    surveyed sphere, such as a monument; without it, the place only says where to search. diameter_sigma_m: of
+    the calibrated diameter. probing: judge its form and size too, which takes a diameter of at least a tenth
+    of the field of view.
     """
 
     name: str
@@ -64,7 +65,7 @@ class Sphere:
 
 @dataclass(frozen=True)
 class SphereBar:
-    """Two spheres, by name, at a calibrated distance between their centres, m."""
+    """Two spheres, by name, with a calibrated distance (m) between their centres."""
 
     name: str
     spheres: tuple[str, str]
@@ -77,7 +78,7 @@ class SphereBar:
 
 @dataclass(frozen=True)
 class HeightStep:
-    """Two plates, by name, and how much the upper one's top lies above the lower one's, m."""
+    """Two plates, by name, with the height (m) of the upper one's top above the lower one's."""
 
     name: str
     lower: str
@@ -91,10 +92,12 @@ class HeightStep:
 
 @dataclass(frozen=True)
 class DummyBundle:
-    """A strapped bundle that was measured by hand. x_m, y_m: middle of its axis; yaw_deg: from +Y, as
-    bundles have it; width_m: circle around all bars; top_z_m: its highest line. sigma_m: of each length.
+    """A strapped bundle that was measured by hand. x_m, y_m: middle of its axis. yaw_deg: from +Y, as for
+    bundles. width_m: diameter of the circle around all bars. top_z_m: height of its highest line. sigma_m: of
+    each length.
 
-    bars and bar_diameter_m: of a hexagonal packing. mass_kg: isn't judged where nobody weighed it.
+    bars, bar_diameter_m: of a hexagonal packing. mass_kg: leave it out if the bundle wasn't weighed; the mass
+    is then not judged.
     """
 
     name: str
@@ -121,10 +124,10 @@ class DummyBundle:
 
 @dataclass(frozen=True)
 class TouchDown:
-    """The magnet stood on an artefact: x_m, y_m, z_m of its faces' middle as the crane's own readings have it
-    then, over the middle of a plate, or the axis' middle of a dummy bundle. sigma_m: of each.
+    """A touch-down of the magnet on an artefact, over the centre of a plate or the middle of a dummy bundle's
+    axis. x_m, y_m, z_m: centre of the magnet's faces according to the crane's own readings. sigma_m: of each.
 
-    For a sphere it touched the highest point.
+    A sphere is touched at its highest point.
     """
 
     name: str
@@ -140,7 +143,7 @@ class TouchDown:
 
 @dataclass(frozen=True)
 class ErrorLimits:
-    """Largest errors that are accepted (MPE), either side; each as the certificate names it."""
+    """Maximum permissible errors (MPE), in either direction, by the names that the certificate uses."""
 
     height_mm: float = 5.0
     """Heights of plates and surveyed spheres."""
@@ -151,15 +154,17 @@ class ErrorLimits:
     step_mm: float = 4.0
     """Steps between plates."""
     flatness_mm: float = 8.0
-    """Span of a plate's heights about its plane, 95 % of the cells."""
+    """Flatness of a plate: span of its heights about its plane, over 95 % of the cells."""
     form_mm: float = 12.0
-    """Span of a sphere's radii, 95 % of the cells (probing error, form)."""
+    """Form of a sphere (probing error): span of its radii, over 95 % of the cells."""
     size_mm: float = 6.0
-    """Diameter of a sphere (probing error, size)."""
+    """Diameter of a sphere (probing error of size)."""
     lift_mm: float = 10.0
-    """Place of a dummy bundle across its axis, and its height, as a lift would take it."""
+    """Lift point of a dummy bundle: its height and its position across the axis."""
     lift_along_mm: float = 50.0
-    """Place of a dummy bundle along its axis: ends are seen less well than flanks."""
+    """Lift point of a dummy bundle: its position along the axis. Ends are measured less accurately than
+    flanks.
+    """
     yaw_deg: float = 0.5
     """Yaw of a dummy bundle."""
     width_mm: float = 20.0
@@ -169,13 +174,13 @@ class ErrorLimits:
     mass_pct: float = 20.0
     """Mass of a dummy bundle."""
     touch_mm: float = 10.0
-    """X, Y and Z between camera and magnet."""
+    """X, Y and Z of the magnet relative to the camera, from touch-downs."""
     repeat_mm: float = 4.0
-    """Twice the standard deviation of a length over the recordings."""
+    """Repeatability: twice the standard deviation of lengths over the recordings."""
     laser_mm: float = 5.0
     """Margin within which vision and laser must be equivalent (TOST)."""
     dirt_pct: float = 1.0
-    """Share of a camera's picture that dirt or drops may spoil."""
+    """Percentage of a camera's picture that dirt or drops may spoil."""
 
     def __post_init__(self) -> None:
         expect_ranges(self, "limits.", **{one.name: POSITIVE for one in fields(self)})
@@ -183,8 +188,9 @@ class ErrorLimits:
 
 @dataclass(frozen=True)
 class AmbientConditions:
-    """Conditions of the whole test. temperature_c: of the artefacts; sigma of it; expansion_per_k: of what
-    they are made of. Calibrated values are of 20 degrees. degrees_of_freedom: of the artefacts' sigmas.
+    """Conditions of the whole test. temperature_c, temperature_sigma_c: temperature of the artefacts and its
+    sigma. expansion_per_k: their thermal expansion; calibrated values refer to 20 degrees.
+    degrees_of_freedom: of the artefacts' sigmas.
     """
 
     temperature_c: float = 20.0
@@ -192,7 +198,7 @@ class AmbientConditions:
     expansion_per_k: float = 11.5e-6
     degrees_of_freedom: float = 50.0
     search_m: float = 0.25
-    """Radius about its planned place in which an artefact is sought."""
+    """Radius, in metres, around its planned place within which an artefact is searched."""
 
     def __post_init__(self) -> None:
         expect_ranges(
@@ -202,7 +208,7 @@ class AmbientConditions:
 
     @property
     def expansion(self) -> float:
-        """Return an artefact's length over its calibrated one: 1 + expansion_per_k (T - 20)."""
+        """Return the ratio of an artefact's length to its calibrated length: 1 + expansion_per_k (T - 20)."""
         return 1 + self.expansion_per_k * (self.temperature_c - 20)
 
 
@@ -211,7 +217,7 @@ Artefact = Plate | Sphere | DummyBundle
 
 @dataclass(frozen=True)
 class AcceptancePlan:
-    """Artefacts, where they stand, and the limits. yard: which yard or crane it is for."""
+    """The artefacts, their places, and the limits. yard: name of the yard or crane that the plan is for."""
 
     yard: str = ""
     plate: tuple[Plate, ...] = ()
@@ -241,12 +247,12 @@ class AcceptancePlan:
     def kinds(
         self,
     ) -> tuple[tuple[Plate | Sphere | SphereBar | HeightStep | DummyBundle | TouchDown, ...], ...]:
-        """Return all that is named, kind by kind."""
+        """Return all named entries, grouped by kind."""
         return self.plate, self.sphere, self.sphere_bar, self.step, self.dummy_bundle, self.touch_down
 
     @property
     def artefacts(self) -> tuple[Artefact, ...]:
-        """Return what stands in the yard."""
+        """Return the artefacts that stand in the yard."""
         return (*self.plate, *self.sphere, *self.dummy_bundle)
 
     def _expect_known(self, name: str, wanted: tuple[str, ...], kind: Iterable[Artefact]) -> None:
@@ -257,12 +263,12 @@ class AcceptancePlan:
 
 
 def read_plan(path: Path) -> AcceptancePlan:
-    """Read a plan (TOML). Raises InputError where it can't be read and ConfigError for what can't be."""
+    """Read a plan (TOML). Raises InputError where it can't be read and ConfigError where it is invalid."""
     return read_settings(path, AcceptancePlan, HELP, "plan")
 
 
 def plan_text(plan: AcceptancePlan) -> str:
-    """Write a plan as TOML that `read_plan` reads to the same."""
+    """Write a plan as TOML from which `read_plan` reads the same plan."""
     lines = [f"yard = {json.dumps(plan.yard)}", ""]
     for one in fields(plan):
         value = getattr(plan, one.name)
@@ -275,6 +281,6 @@ def plan_text(plan: AcceptancePlan) -> str:
 
 
 def _settings(record: Any) -> list[str]:
-    """Write the fields that are given; numbers, texts and lists look in TOML as in JSON."""
+    """Write the fields that are set; numbers, texts and lists look the same in TOML as in JSON."""
     values = {one.name: getattr(record, one.name) for one in fields(record)}
     return [f"{name} = {json.dumps(value)}" for name, value in values.items() if value is not None]
