@@ -33,8 +33,8 @@ REMEDY = "measure the recording again"
 MAX_SIGMA_RATIO = 0.1
 """Maximum plausible sigma of yaw (rad), baseline and focal length (ratios); above it, the file is refused."""
 SHAPE = "shape of the bundle"
-"""Name of the error source for the uncertainty about which shape a detected outline belongs to; a dummy
-bundle, whose shape is known, doesn't have it.
+"""Name of the error source for how far a bundle's shape may differ from its fitted outline. A dummy
+bundle's shape is known, so this source is left out for it.
 """
 MIN_TOUCHES = 3
 MAX_APART_M = 0.1

@@ -18,7 +18,7 @@ CAP_RATIO = 0.7
 EDGE_M = 0.08
 """Width (m) of a plate's margin that is not used, because matching blurs its edge."""
 STEP_M = 0.02
-"""Step (m) of the grid on which a place is searched; the fit refines the best one."""
+"""Step (m) of the search grid for a place; the fit refines the best one."""
 NEAR_M = 0.02
 """Maximum distance (m) of a height from the artefact's surface for it to count."""
 LEVEL_RATIO, LEVEL_M = 5.0, 0.001

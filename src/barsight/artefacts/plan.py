@@ -43,7 +43,7 @@ class Plate:
 @dataclass(frozen=True)
 class Sphere:
     """A matt sphere. x_m, y_m, z_m: its centre in the yard. place_sigma_m: sigma of each coordinate of a
-    surveyed sphere, such as a monument; without it, the place only says where to search. diameter_sigma_m: of
+    surveyed sphere, such as a monument; without it, the place only says where to look. diameter_sigma_m: of
     the calibrated diameter. probing: judge its form and size too, which takes a diameter of at least a tenth
     of the field of view.
     """
@@ -146,35 +146,33 @@ class ErrorLimits:
     """Maximum permissible errors (MPE), in either direction, by the names that the certificate uses."""
 
     height_mm: float = 5.0
-    """Heights of plates and surveyed spheres."""
+    """Error of the heights of plates and surveyed spheres."""
     position_mm: float = 5.0
-    """X and Y of surveyed spheres."""
+    """Error of X and Y of surveyed spheres."""
     length_mm: float = 5.0
-    """Distances between spheres."""
+    """Error of the distances between spheres."""
     step_mm: float = 4.0
-    """Steps between plates."""
+    """Error of the height steps between plates."""
     flatness_mm: float = 8.0
     """Flatness of a plate: span of its heights about its plane, over 95 % of the cells."""
     form_mm: float = 12.0
     """Form of a sphere (probing error): span of its radii, over 95 % of the cells."""
     size_mm: float = 6.0
-    """Diameter of a sphere (probing error of size)."""
+    """Error of a sphere's diameter (probing error of size)."""
     lift_mm: float = 10.0
-    """Lift point of a dummy bundle: its height and its position across the axis."""
+    """Error of a dummy bundle's lift point: its height and its position across the axis."""
     lift_along_mm: float = 50.0
-    """Lift point of a dummy bundle: its position along the axis. Ends are measured less accurately than
-    flanks.
-    """
+    """Error of a dummy bundle's lift point along the axis. Ends are measured less accurately than flanks."""
     yaw_deg: float = 0.5
-    """Yaw of a dummy bundle."""
+    """Error of a dummy bundle's yaw."""
     width_mm: float = 20.0
-    """Width of a dummy bundle."""
+    """Error of a dummy bundle's width."""
     bundle_length_mm: float = 30.0
-    """Length of a dummy bundle."""
+    """Error of a dummy bundle's length."""
     mass_pct: float = 20.0
-    """Mass of a dummy bundle."""
+    """Error of a dummy bundle's mass, in percent."""
     touch_mm: float = 10.0
-    """X, Y and Z of the magnet relative to the camera, from touch-downs."""
+    """Error of X, Y and Z between camera and magnet, from touch-downs."""
     repeat_mm: float = 4.0
     """Repeatability: twice the standard deviation of lengths over the recordings."""
     laser_mm: float = 5.0
@@ -198,7 +196,7 @@ class AmbientConditions:
     expansion_per_k: float = 11.5e-6
     degrees_of_freedom: float = 50.0
     search_m: float = 0.25
-    """Radius, in metres, around its planned place within which an artefact is searched."""
+    """Radius, in metres, around its planned place within which an artefact is searched for."""
 
     def __post_init__(self) -> None:
         expect_ranges(

@@ -1,1 +1,1 @@
-"""The command line: thin wiring, one file per command."""
+"""Provide the command line: thin wiring, one file per command."""

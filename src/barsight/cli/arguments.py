@@ -1,4 +1,4 @@
-"""Parse command lines by function signatures and frozen settings (tyro), optionally from a TOML file."""
+"""Parse command lines from function signatures and frozen settings (tyro), optionally with a TOML file."""
 
 from __future__ import annotations
 
@@ -19,35 +19,36 @@ from barsight.core.settings.renamed import refuse_old_flags
 
 Settings = TypeVar("Settings")
 LISTS = ("--use", "--lifted", "--fetch")
-"""Flags whose values may be told apart by commas."""
+"""Flags whose values may be separated by commas."""
 
 
 def call(command: Callable[..., None], name: str, arguments: Sequence[str]) -> None:
-    """Parse `arguments` by the function's signature and call it; wrong usage exits with 2."""
+    """Parse `arguments` according to the function's signature and call it; wrong usage exits with code 2."""
     refuse_old_flags(arguments)
     listed = _listed(arguments)
     shown = [printable(argument) for argument in listed]
-    if shown != listed:  # tyro prints what it refuses as it stands
+    if shown != listed:  # tyro prints rejected arguments unescaped
         tyro.cli(_only_parsed(command), prog=f"barsight {name}", args=shown, compact_help=False)
     tyro.cli(command, prog=f"barsight {name}", args=listed, compact_help=False)
 
 
 def _only_parsed(command: Callable[..., None]) -> Callable[..., None]:
-    """Make a function of the same signature that does nothing."""
+    """Make a function with the same signature that does nothing."""
     return functools.wraps(command)(lambda *_, **__: None)
 
 
 def by_own_flags(error: InputError) -> InputError:
-    """Name a setting of the recording by the flag that this command has for it: --camchain, not
-    recording.camchain.
+    """Replace the name of a recording's setting in an error's remedy with this command's flag for it:
+    --camchain instead of recording.camchain.
     """
     remedy = re.sub(r"\brecording\.(\w+)", lambda m: "--" + m[1].replace("_", "-"), error.remedy)
     return InputError(error.path, error.problem, remedy)
 
 
 def pass_on(name: str, noun: str, kinds: Mapping[str, str], arguments: Sequence[str]) -> None:
-    """Pass the rest of `name KIND ...` on to the module of that kind. kinds: each with its summary; noun: of
-    a kind, for the errors.
+    """Pass the rest of `name KIND ...` on to the module of that kind.
+
+    kinds: the kinds with their summaries. noun: the word for a kind in error messages.
     """
     if not arguments:
         raise ConfigError(f"{name} needs a kind: {', '.join(kinds)}; --help says what each does")
@@ -63,7 +64,7 @@ def pass_on(name: str, noun: str, kinds: Mapping[str, str], arguments: Sequence[
 
 
 def _listed(arguments: Sequence[str]) -> list[str]:
-    """Rewrite `--use stereo,imu` as `--use stereo imu`; the same for the other LISTS."""
+    """Rewrite `--use stereo,imu` as `--use stereo imu`, and the same for the other LISTS."""
     listed: list[str] = []
     for argument in arguments:
         flag, equals, value = argument.partition("=")
@@ -77,7 +78,7 @@ def _listed(arguments: Sequence[str]) -> list[str]:
 
 
 def config_path(arguments: Sequence[str]) -> Path | None:
-    """Find the FILE of `--config FILE` or `--config=FILE`, needed before the other flags are read."""
+    """Find FILE in `--config FILE` or `--config=FILE`, which is needed before the other flags are parsed."""
     for number, argument in enumerate(arguments):
         if argument == "--config" and number + 1 < len(arguments):
             return Path(arguments[number + 1])
@@ -87,9 +88,9 @@ def config_path(arguments: Sequence[str]) -> Path | None:
 
 
 def load_settings(path: Path | None, kind: type[Settings]) -> Settings:
-    """Load settings of `kind` from a TOML file over the defaults; the defaults where there is no file.
+    """Load settings of `kind` from a TOML file over the defaults, or the defaults where path is None.
 
-    Raises InputError for a file that can't be read and ConfigError for a key or value that can't be.
+    Raises InputError for a file that can't be read and ConfigError for an invalid key or value.
     """
     if path is None:
         return kind()

@@ -18,7 +18,7 @@ from barsight.recording.writers.convert import Target, convert
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse and convert."""
+    """Parse the arguments and convert."""
 
     def command(
         recording: tyro.conf.Positional[Path],
@@ -26,13 +26,13 @@ def run(arguments: Sequence[str]) -> None:
         to: Target,
         settings: Annotated[RecordingSettings, tyro.conf.arg(name="")] = RecordingSettings(),  # noqa: B008
     ) -> None:
-        """Write a recording in another format; pictures, stamps and numbers stay what they are.
+        """Write a recording in another format; pictures, stamps and numbers stay unchanged.
 
         Args:
             recording: The recording to read.
             out: The folder to write; it must not exist yet.
             to: The format to write.
-            settings: How to read it.
+            settings: How to read the recording.
         """
         console = SafeConsole(stderr=True)
         try:

@@ -32,12 +32,12 @@ RECORDINGS, RESULTS = ("recording", "recording_later"), ("result", "result_later
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse and show."""
+    """Parse the arguments and run the demo."""
 
     def command(
         out: Annotated[Path, tyro.conf.arg(aliases=("-o",))] = Path("demo"), serve: bool = True
     ) -> None:
-        """Simulate a small yard twice with a change between, measure it, and end on the operator's page.
+        """Simulate a small yard before and after a change, measure both, and serve the operator's page.
 
         The first survey is compared with its truth and its simulated laser.
 
@@ -64,7 +64,7 @@ def run(arguments: Sequence[str]) -> None:
 
 
 def _simulate(out: Path, advance: Any) -> None:
-    """Write both recordings, the stock list as of the first one, and the magnet."""
+    """Write both recordings, the stock list at the time of the first one, and the magnet."""
     settings = replace(SimulationSettings.demo(), passes=PASSES)
     simulate_passes(out / "passes", settings, advance)
     for number, name in enumerate(RECORDINGS, start=1):
@@ -82,7 +82,7 @@ def _simulate(out: Path, advance: Any) -> None:
 
 
 def _measure(out: Path, console: SafeConsole, number: int) -> dict[str, Any]:
-    """Measure one of the recordings, the first against its truth too."""
+    """Measure one of the recordings; the first is also compared with its truth."""
     settings = MeasureSettings()
     settings = replace(settings, bundles=replace(settings.bundles, stock_list=out / "stock.csv"))
     recording = out / RECORDINGS[number]
@@ -94,7 +94,7 @@ def _measure(out: Path, console: SafeConsole, number: int) -> dict[str, Any]:
 
 
 def _show_page(out: Path, console: SafeConsole, *, serve: bool) -> None:
-    """Put both results into a store and serve its page, or say what it lacks."""
+    """Add both results to a store and serve its page, or say which extra is missing."""
     url = f"sqlite:///{out / 'yard.db'}"
     try:
         with extra("store,page"):

@@ -23,13 +23,15 @@ from barsight.stereo.settings import StereoSettings
 
 _POOR = "warning: hardly anything is matched well: two pictures of one pair, bright and sharp enough?"
 _POOR_SIGMA_PX = 0.7
-"""Lower quartile of our own sigma: sound pairs (Middlebury, EuRoC, KITTI, a yard) have 0.06 to 0.45, noise,
-pictures of different scenes and pictures drowned in noise 1.0 to 42."""
+"""Lower quartile (px) of the method's own sigma above which a poor match is reported. Sound pairs
+(Middlebury, EuRoC, KITTI, a yard) have 0.06 to 0.45; noise, pictures of different scenes and pictures drowned
+in noise have 1.0 to 42.
+"""
 SUFFIXES = (".pfm", ".png", ".tif", ".tiff")
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse and match."""
+    """Parse the arguments and match the pair."""
 
     def command(
         left: tyro.conf.Positional[Path],
@@ -40,17 +42,18 @@ def run(arguments: Sequence[str]) -> None:
         preview: Path | None = None,
         settings: Annotated[StereoSettings, tyro.conf.arg(name="")] = StereoSettings(),  # noqa: B008
     ) -> None:
-        """Match one pair: the left picture's disparity, in pixels, with a sigma per pixel in a .tif.
+        """Match one pair; a .tif holds the left picture's disparity, in pixels, and its sigma per pixel.
 
         Args:
-            left: The left picture, rectified unless a rig is given; colour and 16 bits are turned to gray,
-                but `csca` looks at the colours too.
+            left: The left picture, rectified unless a rig is given. Colour and 16 bits are converted to gray,
+                although `csca` uses the colours too.
             right: The right picture.
             out: The file to write: .pfm, .png (16 bits, disparity times 256) or .tif (disparity and sigma).
-            rig: Rig file (ours, Kalibr's, OpenCV's) or EuRoC folder: the pictures are raw and get rectified.
-                Focal length, baseline and doffs go beside FILE, into NAME_calib.txt (Middlebury's form).
-            range: Candidates A:B in px; found from the pictures when not given.
-            preview: PNG to write with the left picture beside the disparity in colours.
+            rig: Rig file (Barsight's, Kalibr's, OpenCV's) or EuRoC folder; the pictures are then raw and are
+                rectified. Focal length, baseline and doffs are written next to FILE as NAME_calib.txt
+                (Middlebury's format).
+            range: Disparity candidates A:B in px; by default they are found from the pictures.
+            preview: PNG to write with the left picture next to the disparity in colours.
             settings: The method and its settings.
         """
         console = SafeConsole(stderr=True)

@@ -22,19 +22,19 @@ from barsight.recording.open import bag_at, open_recording
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse and print."""
+    """Parse the arguments and print the content of the recording."""
 
     def command(
         recording: tyro.conf.Positional[Path],
         settings: Annotated[RecordingSettings, tyro.conf.arg(name="")] = RecordingSettings(),  # noqa: B008
     ) -> None:
-        """Say what is in a recording: sensors, rates, gaps, dropped pictures and why, calibration.
+        """List the content of a recording: sensors, rates, gaps, dropped pictures and why, calibration.
 
-        Of a bag without a calibration it lists the topics.
+        For a bag without a calibration, the topics are listed.
 
         Args:
             recording: The recording.
-            settings: How to read it.
+            settings: How to read the recording.
         """
         console = SafeConsole()
         try:
@@ -53,7 +53,7 @@ def run(arguments: Sequence[str]) -> None:
 
 
 def print_topics(topics: Sequence[Topic], duration_s: float, console: Console) -> None:
-    """Print what a bag holds, by topic; rates are means over the bag's duration."""
+    """Print the content of a bag by topic; rates are means over the bag's duration."""
     table = Table(title=f"Topics, {duration_s:.2f} s", title_justify="left")
     for name in ("topic", "type"):
         table.add_column(name, overflow="fold")

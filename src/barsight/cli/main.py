@@ -1,4 +1,4 @@
-"""Dispatch `barsight COMMAND ...` and turn a user's mistake into one line."""
+"""Dispatch `barsight COMMAND ...` and report a user's mistake in one line."""
 
 from __future__ import annotations
 
@@ -49,21 +49,21 @@ COMMANDS = {
     "report": "Write report.html anew from a measured yard's files",
 }
 GROUPS = ("bench", "calibrate", "live", "store", "fleet", "plant")
-"""Commands that are packages: `command.py` in them finds the second word."""
+"""Commands that are packages, in which `command.py` dispatches on the second word."""
 SECOND = {"live": ("check", "soak")}
-"""Second words of commands that do something without one too."""
+"""Second words of commands that also work without one."""
 ROOMS = {
     "bench": ("paper",),
     "yard": ("lifts", "explain", "labels", "compare", "view", "report", "export"),
     "store": ("yard", "serve"),
     "acceptance": ("accept", "budget", "verify", "commission"),
 }
-"""Commands that lie in a package of commands, without a second word."""
+"""Commands without a second word whose modules are in a package of related commands."""
 INTERRUPTED = 130
 _interrupts: list[int] = []
-"""Signals that have ended this run."""
+"""Signals that have interrupted this run."""
 _AGAIN_S = 20.0
-"""Time that a run has to tidy up before it is interrupted again."""
+"""Time in seconds that a run has to clean up before it is interrupted again."""
 
 
 def home(name: str) -> str:
@@ -73,7 +73,7 @@ def home(name: str) -> str:
 
 
 def main() -> None:
-    """Run the console script: signals end a run as Ctrl-C does."""
+    """Run the console script; signals end a run in the same way as Ctrl-C."""
     _fill_closed_streams()
     bound_heap()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -82,7 +82,7 @@ def main() -> None:
     if hangup is not None and signal.getsignal(hangup) == signal.SIG_DFL:
         signal.signal(hangup, _interrupt)
     if not sys.warnoptions:
-        warnings.simplefilter("ignore")  # libraries' notes to programmers would stand beside our one line
+        warnings.simplefilter("ignore")  # libraries' notes to programmers would clutter the one-line error
     code = run_and_print(sys.argv[1:])
     if code == INTERRUPTED:
         _leave_at_once(code)
@@ -90,8 +90,8 @@ def main() -> None:
 
 
 def _fill_closed_streams() -> None:
-    """Put the null device where a standard stream is closed: else the next file opened would take its number,
-    and what is printed would go there.
+    """Replace closed standard streams with the null device. Otherwise the next file opened would take the
+    stream's number and receive the printed output.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
@@ -103,22 +103,22 @@ def _fill_closed_streams() -> None:
 
 
 def run_and_print(arguments: Sequence[str]) -> int:
-    """Run a command and write what standard output still holds: its reader may be gone, its disk full."""
+    """Run a command and flush standard output, which may fail if its reader is gone or its disk is full."""
     try:
         try:
             code = run(arguments)
-        except SystemExit as leaving:  # tyro's, after its help or a refusal
+        except SystemExit as leaving:  # from tyro, after its help or an error
             code = leaving.code if isinstance(leaving.code, int) else 1
         sys.stdout.flush()
     except OSError as error:
-        # What can't be written must not be tried again at the interpreter's end.
+        # Output that can't be written must not be tried again when the interpreter exits.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _exit_code(error)
     return code
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run one command and return the exit code: 0 done, 1-5 a user's mistake, 130 interrupted."""
+    """Run one command and return the exit code: 0 success, 1-5 a user's mistake, 130 interrupted."""
     if not arguments or arguments[0] in ("-h", "--help"):
         _print_help()
         return 0 if arguments else 2
@@ -129,7 +129,7 @@ def run(arguments: Sequence[str]) -> int:
     if name not in COMMANDS:
         return _refuse(f"there is no command {name!r}; barsight --help lists them", 2)
     _interrupts.clear()
-    # What OpenCV and tifffile can't decode is told in our one line.
+    # Files that OpenCV and tifffile can't decode are reported in the one-line error.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     logging.getLogger("tifffile").addHandler(logging.NullHandler())
     try:
@@ -137,7 +137,7 @@ def run(arguments: Sequence[str]) -> int:
     except KeyboardInterrupt:
         return _interrupted()
     except Exception as error:
-        # A library that was just being loaded makes another error of an interrupt.
+        # A library that is being loaded may turn an interrupt into another error.
         if _interrupts:
             return _interrupted()
         return _exit_code(error)
@@ -145,7 +145,7 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def _exit_code(error: Exception) -> int:
-    """Print a user's mistake, or what the system refused, as one line; raise anything else again."""
+    """Print a user's mistake or a system error as one line; raise anything else again."""
     if isinstance(error, BarsightError):
         return _refuse(str(error), error.exit_code)
     if isinstance(error, BrokenPipeError):
@@ -161,10 +161,10 @@ def _exit_code(error: Exception) -> int:
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
     for again in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(again, signal.SIG_IGN)  # a second one must not cut the tidying short
+        signal.signal(again, signal.SIG_IGN)  # a second signal must not cut the clean-up short
     _interrupts.append(number)
     if hasattr(signal, "setitimer"):
-        # A library may swallow what is raised here: it is raised again where the run goes on.
+        # A library may swallow this exception, so it is raised again if the run continues.
         signal.signal(signal.SIGALRM, _interrupt_again)
         signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
     raise KeyboardInterrupt
@@ -175,10 +175,10 @@ def _interrupt_again(number: int, frame: FrameType | None) -> None:
 
 
 def _leave_at_once(code: int) -> None:
-    """Exit without the interpreter's own end, which an interrupted import can turn into a crash.
+    """Exit without the interpreter's own shutdown, which an interrupted import can turn into a crash.
 
-    A C library whose loading was cut short frees its memory twice, and Python ends by SIGINT, not by
-    the code, where the interrupt came inside `exec` of a string (dataclasses and namedtuples do that).
+    A C library whose loading was cut short frees its memory twice. Python also ends by SIGINT instead of the
+    exit code if the interrupt came inside `exec` of a string, which dataclasses and namedtuples use.
     """
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):  # closed by the reader

@@ -20,7 +20,7 @@ from barsight.measure_settings import MeasureSettings
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse and measure."""
+    """Parse the arguments and measure."""
     default = load_settings(config_path(arguments), MeasureSettings)
 
     def command(
@@ -36,23 +36,25 @@ def run(arguments: Sequence[str]) -> None:
         resume: bool = False,
         verbose: Annotated[bool, tyro.conf.arg(aliases=("-v",))] = False,
     ) -> None:
-        """Measure a stereo recording, or several passes over one yard, into OUT: map, contours, trajectory,
-        cloud and report.html.
+        """Measure a stereo recording, or several passes over one yard, into OUT.
+
+        The results are map, contours, trajectory, cloud and report.html.
 
         The recording may be an EuRoC folder, a KITTI odometry sequence or a ROS bag; barsight info shows
-        what is in it. Crane encoders give the trajectory in the yard; without them stereo odometry does.
-        OUT is written whole or not at all.
+        its content. Crane encoders give the trajectory in the yard; without them, stereo odometry does.
+        OUT is written completely or not at all.
 
         Args:
             recordings: The recording; or several passes over one yard by one crane with encoders, in any
-                order: they become one map, in which the newer one counts where the yard changed.
+                order. They become one map, in which the newer pass takes precedence where the yard changed.
             out: The folder for the results.
             settings: Settings of the stages.
-            config: TOML file with settings; flags go before it.
-            resume: Keep what is done beside OUT until the end; a killed run started again with it goes on.
+            config: TOML file with settings; flags take precedence.
+            resume: Keep intermediate results next to OUT until the end; to continue a killed run,
+                repeat the command.
             magnet: TOML file of the magnet that lifts are chosen for (docs/how-to/describe-a-magnet.md).
-                Without it nothing is offered.
-            at: When lifts are judged: now, or at the end of the recording, to look back; never for a crane.
+                Without it, no lift is offered.
+            at: Time at which lifts are judged: now, or the recording's end for review, never for a crane.
             overwrite: Replace the result files of an earlier run in OUT.
             verbose: Print the time that each stage took.
         """
@@ -69,7 +71,7 @@ def run(arguments: Sequence[str]) -> None:
 
 
 def print_outcome(content: dict[str, Any], console: Console, *, verbose: bool) -> None:
-    """Print the run in a few lines: frames, agreement with the laser, truth, warnings."""
+    """Summarise the run in a few lines: frames, agreement with the laser, truth, warnings."""
     frames, trajectory = content["frames"], content["trajectory"]
     console.print(
         f"{frames['used']} of {frames['total']} frames over {trajectory['length_m']:.2f} m "

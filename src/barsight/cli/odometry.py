@@ -33,7 +33,7 @@ from barsight.yard_frame import frame_name
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse, estimate, write and compare."""
+    """Parse the arguments, estimate the trajectory, write it and compare it with the truth."""
 
     def command(
         recording: tyro.conf.Positional[Path],
@@ -42,15 +42,15 @@ def run(arguments: Sequence[str]) -> None:
         reading: RecordingSettings = RecordingSettings(),  # noqa: B008
         settings: Annotated[MotionSettings, tyro.conf.arg(name="")] = MotionSettings(),  # noqa: B008
     ) -> None:
-        """Estimate the trajectory from cameras, IMU and encoders, and say how far it is from truth.
+        """Estimate the trajectory from cameras, IMU and encoders, and compare it with any known truth.
 
         Args:
             recording: The recording.
-            out: Folder for trajectory.tum, relative.csv (each frame against the one before, with covariance),
-                report.html and odometry.json; nothing is written without it.
-            use: Sensors that may be used, where the recording has them: stereo,imu,crane if not given.
+            out: Folder for trajectory.tum, relative.csv (each frame relative to the previous one, with
+                covariance), report.html and odometry.json; nothing is written by default.
+            use: Sensors that may be used if the recording has them; stereo,imu,crane by default.
             reading: How to read the recording.
-            settings: The estimate's settings.
+            settings: Settings of the estimate.
         """
         if out is not None and (out / "result.json").exists():
             raise OutputError(f"{out}: holds what barsight measure wrote; name another folder")
@@ -59,7 +59,7 @@ def run(arguments: Sequence[str]) -> None:
         rectifier = Rectifier(source.rig)
         if use is not None:
             settings = replace(settings, fusion=replace(settings.fusion, use=",".join(use)))
-            if settings.estimator == "paper":  # it has no `use` of its own
+            if settings.estimator == "paper":  # it has no `use` setting
                 source = SelectedSensors(source, use)
         trajectory = make_estimator(settings)(source, rectifier, lambda: None)
         if not trajectory.frames:

@@ -14,7 +14,7 @@ from barsight.sensors.rig_plan import CAMERAS, Wish, plan_rig
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse, plan and print."""
+    """Parse the arguments, plan the rig and print it."""
 
     def command(
         range: float,
@@ -25,19 +25,19 @@ def run(arguments: Sequence[str]) -> None:
         speed: float = 0.5,
         camera: Literal["1.3MP", "1.6MP", "5MP", "12MP"] = "1.3MP",
     ) -> None:
-        """Plan a rig: lens, baseline, exposure, rate and data with their sums, and a parts list.
+        """Plan a rig: lens, baseline, exposure, rate and data with their calculations, and a parts list.
 
-        All in metres and seconds. The baseline lies along the travel, the picture's short side along the
-        bars. Exit code 5 where no such rig fits, with what would help.
+        All values are in metres and seconds. The baseline is along the travel, the picture's short side
+        along the bars. The exit code is 5 if no rig meets the demands; the message says what would help.
 
         Args:
-            range: From the cameras to the floor.
-            width: Of the yard, along the bars; it is taken in as many lanes as needed.
+            range: Distance from the cameras to the floor.
+            width: Width of the yard along the bars; it is covered in as many lanes as needed.
             stack: Height of the highest pile.
-            bar_diameter: Of the thinnest bar that shall be told.
-            sigma: Wanted sigma of a single depth on the floor.
-            speed: Of the crane while it measures.
-            camera: Class of camera: its size in megapixels.
+            bar_diameter: Diameter of the thinnest bar that must be resolved.
+            sigma: Required sigma of a single depth on the floor.
+            speed: Speed of the crane while it measures.
+            camera: Class of camera, by its size in megapixels.
         """
         wish = Wish(range, width, stack, bar_diameter, sigma, speed)
         plan, console = plan_rig(wish, CAMERAS[camera]), SafeConsole()

@@ -18,7 +18,7 @@ from rich.progress import (
 
 @contextlib.contextmanager
 def stages(console: Console) -> Iterator[Callable[[str, int, int], None]]:
-    """Yield `advance(stage, done, total)`, which draws a bar per stage; silent where there is no terminal."""
+    """Yield `advance(stage, done, total)`, which draws a bar for each stage; silent without a terminal."""
     columns = (
         TextColumn("{task.description:<11}"),
         BarColumn(),

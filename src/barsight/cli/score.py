@@ -14,14 +14,14 @@ from barsight.evaluation.score import score_folder
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse and compare."""
+    """Parse the arguments and compare."""
 
     def command(recording: tyro.conf.Positional[Path], out: tyro.conf.Positional[Path]) -> None:
         """Compare a measured yard with the truth of its simulated recording; prints JSON.
 
         Args:
             recording: The recording, with its folder truth.
-            out: The folder that barsight measure wrote from it.
+            out: The folder of results from barsight measure for it.
         """
         json.dump(score_folder(recording, out), sys.stdout, indent=1)
         sys.stdout.write("\n")

@@ -27,7 +27,7 @@ MAX_VIEWS = 200
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse and render."""
+    """Parse the arguments and render."""
     default = load_settings(config_path(arguments), SimulationSettings)
 
     def command(
@@ -46,18 +46,18 @@ def run(arguments: Sequence[str]) -> None:
         Args:
             out: The folder to write; it must not exist yet.
             settings: The yard, the cameras, the crane and its sensors.
-            config: TOML file with settings; flags go before it.
-            draw: Seed of a whole world that is drawn: irregular bundles and heaps settled by physics, what
-                stands around them, crane, light, faults of the pictures. Only length, frames, pictures and
-                laser are taken from the settings then; truth/world.json says what was drawn.
+            config: TOML file with settings; flags take precedence.
+            draw: Seed of a whole world to draw: irregular bundles and heaps settled by physics, their
+                surroundings, crane, light, picture faults. Only length, frames, pictures and laser are then
+                taken from the settings; truth/world.json describes the world.
             artefacts: Plan of an acceptance (see barsight accept): its plates, spheres and dummy bundles
-                stand there instead of a stock, exactly where it says.
-            tags: A .csv as calibrate yard --tags takes it: its AprilTags (36h11) lie there too, face up, on
-                thin plates, exactly where it says.
-            tag_m: Side of a tag's black square; diameter of a coded circle's disc.
-            board: A calibration board (see barsight calibrate stereo): pictures of it by the rig that all
-                other recordings of these settings have, instead of a recording.
-            views: Pairs of pictures of the board.
+                replace the stock, at exactly the planned places.
+            tags: A .csv as for calibrate yard --tags: its AprilTags (36h11) are added, face up on thin
+                plates, at exactly the listed places.
+            tag_m: Side of a tag's black square, or diameter of a coded circle's disc, in metres.
+            board: A calibration board (see barsight calibrate stereo): render pictures of it, taken by the
+                rig of all other recordings with these settings, instead of a recording.
+            views: Number of picture pairs of the board.
         """
         console = SafeConsole(stderr=True)
         if (artefacts or tags) is not None and (draw is not None or settings.passes.trolley_y_m):
@@ -99,7 +99,7 @@ def _simulate_drawn(
 ) -> None:
     if not 0 <= seed < MAX_VALUE:
         raise ConfigError(f"simulate: --draw takes a seed of 0 or more, not {seed}")
-    # The package of physics is an extra: only who draws needs it.
+    # The physics package is an extra that only drawing needs.
     from barsight.simulation.worlds.recording import draw_world, simulate_world
 
     simulate_world(out, draw_world(seed, settings), progress)

@@ -1,1 +1,1 @@
-"""Run the commands of acceptance: commission, accept, budget, verify."""
+"""Run the commands for acceptance: commission, accept, budget, verify."""

@@ -38,7 +38,7 @@ COLOURS = {Decision.PASSED: "green", Decision.FAILED: "red"}
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse, accept and print."""
+    """Parse the arguments, run the acceptance and print it."""
 
     def command(
         files: tyro.conf.Positional[tuple[Path, ...]],
@@ -52,27 +52,28 @@ def run(arguments: Sequence[str]) -> None:
         signer: str = "",
         keep: Path | None = None,
     ) -> None:
-        """Accept a rig by artefacts in the yard, in the manner of VDI/VDE 2634-3 and ISO 10360-13.
+        """Accept a rig with artefacts in the yard, in the manner of VDI/VDE 2634-3 and ISO 10360-13.
 
-        Each quantity passes only where |error| + U lies within its limit (ISO 14253-1). The exit code is 5
-        where one doesn't, or where the crane's travel shows a drifted rig; the certificate is written all
-        the same and names the cause.
+        A quantity passes only if |error| + U is within its limit (ISO 14253-1). The exit code is 5 if one
+        does not pass or the crane's travel shows a drifted rig; the certificate is written anyway and
+        names the cause.
 
         Args:
             files: PLAN.toml, then one or more recordings of the artefacts; several show the repeatability.
-                With --plan: a folder that barsight measure wrote of the yard.
+                With --plan: a folder of results from barsight measure that shows the yard.
             out: The certificate: .json, .html and, with the extra `acceptance`, .pdf are written under this
                 name. With --plan: the plan to write, PLAN.toml.
-            plan: Make a plan for the yard instead: artefacts on its free floor, limits by what a pixel is.
-            yard: The file that barsight calibrate yard wrote.
-            rig: A rig file to use instead of the recordings' own calibration.
-            magnet: TOML file of the magnet, whose offset by earlier touch-downs (barsight calibrate magnet)
-                is taken off what the crane gets; the touch-downs of this plan prove it.
-            preset: As of barsight measure.
-            key: Ed25519 private key (PEM) that signs each file of the certificate; the signature lies beside
-                it as NAME.sig.
-            signer: Who answers for the certificate.
-            keep: A new folder for what was measured of each recording.
+            plan: Make a plan for the yard instead, with artefacts on its free floor and limits based on the
+                pixel size.
+            yard: Yard file from barsight calibrate yard.
+            rig: Rig file to use instead of the recordings' own calibration.
+            magnet: TOML file of the magnet. Its offset from earlier touch-downs (barsight calibrate magnet)
+                is applied to the crane's readings; the touch-downs of this plan verify it.
+            preset: Stereo preset, as in barsight measure.
+            key: Ed25519 private key (PEM) that signs each file of the certificate; the signature is written
+                next to the file as NAME.sig.
+            signer: Name of the person responsible for the certificate.
+            keep: A new folder in which to keep the results of measuring each recording.
         """
         if plan:
             if len(files) != 1:
@@ -94,8 +95,8 @@ def run_acceptance(
     files: tuple[Path, ...], out: Path, settings: MeasureSettings, key: Path | None, signer: str,
     keep: Path | None, steps: Sequence[CommissioningStep] = (), offset: MagnetOffset | None = None,
 ) -> Acceptance:  # fmt: skip
-    """Accept by a plan and recordings of it, write the certificate and print. steps: of the commissioning;
-    offset: of the magnet.
+    """Accept a rig by a plan and its recordings, write the certificate and print the result. steps: those
+    completed in a commissioning; offset: of the magnet.
     """
     console = SafeConsole(stderr=True)
     wanted = read_plan(files[0])
@@ -103,7 +104,7 @@ def run_acceptance(
     expect_output(page, ".html")
     has_pdf = find_spec("reportlab") is not None
     with tempfile.TemporaryDirectory(prefix="barsight.") as scratch:
-        if key is not None:  # a wrong key shows before the measuring, not after
+        if key is not None:  # report a wrong key before measuring, not after
             probe = Path(scratch) / "probe"
             probe.touch()
             sign_file(probe, key)
@@ -129,7 +130,7 @@ def _offset(magnet: Path | None) -> MagnetOffset | None:
 
 
 def why_refused(found: Acceptance) -> str:
-    """Say in one line what is wrong: the causes, else the quantities."""
+    """Explain a refusal in one line: by its causes, or else by the quantities that did not pass."""
     if found.causes:
         return ", ".join(f"{one.words} ({one.value:+.3g} {one.unit})" for one in found.causes)
     bad = [q for q in found.quantities if q.decision is not Decision.PASSED]
@@ -154,7 +155,7 @@ def print_acceptance(found: Acceptance) -> None:
 
 
 def make_plan(measured: Path, out: Path, yard: str) -> None:
-    """Lay artefacts over the free floor of a measured yard, and write the plan."""
+    """Lay out artefacts on the free floor of a measured yard, and write the plan."""
     expect_output(out, ".toml")
     area: Area = measured_area(measured)
     made = lay_out(area, yard, read_heights(measured))

@@ -21,7 +21,7 @@ from barsight.yard.magnet.description import load_magnet
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse, budget and print."""
+    """Parse the arguments, compute the budget and print it."""
 
     def command(
         measured: tyro.conf.Positional[Path],
@@ -31,20 +31,19 @@ def run(arguments: Sequence[str]) -> None:
         magnet: Path | None = None,
         temperature_k: float = 10.0,
     ) -> None:
-        """Budget the uncertainty of what a crane uses of a bundle, by GUM: lift x, y, z, yaw, height, width,
-        mass.
+        """Budget the uncertainty of a bundle's lift x, y, z, yaw, height, width and mass by GUM.
 
-        Each part names its source, distribution, degrees of freedom and what measured it. The whole is
-        checked by sampling (JCGM 101). What nobody measured is named, not guessed.
+        Each part states its source, distribution, degrees of freedom and origin. The total is verified by
+        sampling (JCGM 101). Unmeasured contributions are named, not guessed.
 
         Args:
-            measured: A folder that barsight measure wrote; its recording must still be there.
-            out: JSON file for all parts.
-            bundle: Id of the bundle; the surest with both ends seen when not given.
-            certificate: That of barsight accept, whose touch-downs say how the magnet hangs.
-            magnet: TOML file of the magnet; its offset by touch-downs counts with its own sigma, instead of
-                the certificate's.
-            temperature_k: How much warmer or colder than at its calibration the rig may be.
+            measured: A folder of results from barsight measure; its recording must still exist.
+            out: JSON file to write all parts to.
+            bundle: Id of the bundle; by default the most certain one with both ends visible.
+            certificate: Certificate from barsight accept, whose touch-downs show how the magnet hangs.
+            magnet: TOML file of the magnet. Its offset from touch-downs counts with its own sigma and
+                replaces the certificate's touch-downs.
+            temperature_k: Maximum temperature difference of the rig from its calibration, in kelvins.
         """
         if not 0 <= temperature_k <= 100:
             raise ConfigError(f"budget: --temperature-k must lie in 0...100, not {temperature_k:g}")

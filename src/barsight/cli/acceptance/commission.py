@@ -33,17 +33,17 @@ REMEDY = "do this step again"
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse and walk on."""
+    """Parse the arguments and continue the commissioning."""
 
     def command(folder: tyro.conf.Positional[Path]) -> None:
         """Commission a rig step by step, from its board pictures to the certificate, all in one folder.
 
-        Each run does what can be done and says what to bring next. What was changed since is done again,
-        with all that follows from it. The exit code is 0 only where the certificate is passed.
+        Each run completes the steps that it can and says what to supply next. Steps whose inputs or
+        settings have changed are repeated, with all that depend on them. The exit code is 0 only if the
+        certificate is passed.
 
         Args:
-            folder: A new folder, or one that commission made; commission.toml in it says what it needs to
-                know.
+            folder: A new folder, or one that commission made; commission.toml in it holds the settings.
         """
         settings = begin(folder)
         done, next_step = walk(folder, guided_steps(folder, settings))
@@ -60,7 +60,7 @@ def run(arguments: Sequence[str]) -> None:
 
 
 def guided_steps(folder: Path, settings: CommissionSettings) -> tuple[GuidedStep, ...]:
-    """List the steps in their order."""
+    """List the steps in order."""
     way = _Way(folder, settings)
     rig = ("rig.yaml",)
     steps = [
@@ -93,24 +93,24 @@ def guided_steps(folder: Path, settings: CommissionSettings) -> tuple[GuidedStep
 
 @dataclass(frozen=True)
 class _Way:
-    """Steps as they are done in the folder; each returns its result in words."""
+    """The steps as they are run in the folder; each returns its result in words."""
 
     folder: Path
     settings: CommissionSettings
 
     @property
     def framed(self) -> tuple[str, ...]:
-        """Name the yard file, where there is one."""
+        """Return the name of the yard file, empty where the settings use none."""
         return ("yard.yaml",) if self.settings.use_targets or self.settings.use_tags else ()
 
     @property
     def placed(self) -> tuple[str, ...]:
-        """Name the yard file, where the empty yard is measured with it."""
+        """Return the name of the yard file where the empty yard is measured with it, otherwise empty."""
         return ("yard.yaml",) if self.settings.use_tags else ()
 
     @property
     def magnet(self) -> tuple[str, ...]:
-        """Name the magnet's file, where there is one."""
+        """Return the name of the magnet's file, empty where there is none."""
         return () if self.settings.magnet is None else (self.settings.magnet,)
 
     def cameras(self) -> str:
@@ -173,7 +173,9 @@ class _Way:
 
 
 def _verdict(path: Path) -> str:
-    """Return the verdict of a calibration's report. Raises MeasurementError where it asks to redo it."""
+    """Read the verdict from a calibration's report. Raises MeasurementError where the verdict is to redo
+    it.
+    """
     verdict = str(read_json(path, REMEDY)["verdict"])
     if verdict == "redo":
         raise MeasurementError(f"{path}: the calibration is to be redone; rig.html says why")

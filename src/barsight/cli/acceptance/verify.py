@@ -45,7 +45,7 @@ from barsight.yard_frame import calibration_id, in_yard, placing_id, recording_i
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse, verify and print."""
+    """Parse the arguments, verify the rig and print the result."""
 
     def command(
         recording: tyro.conf.Positional[Path],
@@ -57,24 +57,24 @@ def run(arguments: Sequence[str]) -> None:
         approve: str = "",
         why: str = "",
     ) -> None:
-        """Verify that a rig still measures as it did when it was accepted: an ordinary survey is enough.
+        """Verify from an ordinary survey that a rig still measures as it did when it was accepted.
 
-        Control charts (CUSUM) watch yaw, baseline, pitch, roll, focal ratio, the pictures' sharpness and,
-        with a plan, fixed features. The first eight surveys say what is normal. The exit code is 5 where a
-        chart alarms, the rig has drifted, or a lens is dirty; an alarm stands until a calibration is
-        approved.
+        Control charts (CUSUM) monitor yaw, baseline, pitch, roll, focal ratio, the pictures' sharpness
+        and, with a plan or tags, fixed features. The first eight surveys establish what is normal. The
+        exit code is 5 if a chart raises an alarm, the rig has drifted, or a lens is dirty; an alarm
+        persists until a calibration is approved.
 
         Args:
             recording: An ordinary survey with travel.
-            record: The record of all surveys; it is made where it isn't there.
-            plan: An acceptance plan, whose plates and surveyed spheres are fixed features.
-            tags: Surveyed AprilTags on columns or floor, as calibrate yard --tags takes them, which are
-                fixed features.
-            yard: The file that barsight calibrate yard wrote.
-            rig: A rig file to use instead of the recording's own calibration.
-            approve: Who puts this survey's calibration into service, after a recalibration; charts begin
-                anew.
-            why: Reason of the approval; needed with it.
+            record: The record of all surveys; it is created if it does not exist.
+            plan: An acceptance plan, whose plates and surveyed spheres serve as fixed features.
+            tags: CSV of surveyed AprilTags on columns or floor, as for calibrate yard --tags, which serve
+                as fixed features.
+            yard: Yard file from barsight calibrate yard.
+            rig: Rig file to use instead of the recording's own calibration.
+            approve: Name of the person who puts this survey's calibration into service, as after a
+                recalibration; the charts start afresh.
+            why: Reason for the approval; required with --approve.
         """
         if bool(approve) != bool(why):
             raise ConfigError("verify: --approve and --why go together")
@@ -102,7 +102,7 @@ def run(arguments: Sequence[str]) -> None:
 def _look(
     path: Path, settings: MeasureSettings, plan: AcceptancePlan | None, listed: SurveyedTags | None
 ) -> tuple[WatchedSurvey, RigCheck, list[str]]:
-    """Take a survey's figures; also the rig's check and what is said of dirty lenses."""
+    """Compute a survey's figures; also return the rig's check and messages about dirty lenses."""
     source = in_yard(open_recording(path, settings.recording), settings.yard)
     check, health = look_at_rig(source, settings.recording.rig)
     figures = rig_figures(check) + picture_figures(health)

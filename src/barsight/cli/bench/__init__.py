@@ -1,1 +1,1 @@
-"""`barsight bench NAME ...`: one module per group of benchmarks."""
+"""Run `barsight bench NAME ...`, with one module per group of benchmarks."""

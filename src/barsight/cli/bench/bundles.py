@@ -1,4 +1,4 @@
-"""Run `barsight bench bundles`: found bundles against true ones."""
+"""Run `barsight bench bundles`: compare found bundles with the true ones."""
 
 from __future__ import annotations
 
@@ -51,17 +51,17 @@ def bench_found_bundles(
     scheduler: str | None = None,
     save: Json = None,
 ) -> None:
-    """Score found bundles against true ones: of drawn yards, of rendered ones, or of one measured recording.
+    """Score found bundles against true ones: of drawn yards, of rendered yards, or of one measured recording.
 
     Args:
-        recording: A simulated recording; with it goes `out`.
-        out: The folder that `barsight measure` wrote for it.
-        yards: Yards to draw; their exact surfaces get the errors of a measured map.
-        length_m: Length of each drawn yard.
-        seed: Seed of all that is drawn.
-        rendered: Render the yards and measure them instead, half a minute of computing each.
-        keep: Folder for the rendered yards; what is finished there is not done again.
-        workers: Yards at a time, each in a process of its own.
+        recording: A simulated recording; it needs `out`.
+        out: The folder of results from `barsight measure` for that recording.
+        yards: Number of yards to draw; errors of a measured map are added to their exact surfaces.
+        length_m: Length of each drawn yard, in metres.
+        seed: Random seed of all that is drawn.
+        rendered: Render the yards and measure them instead, which takes half a minute each.
+        keep: Folder for the rendered yards; yards already finished there are not repeated.
+        workers: Number of yards processed at a time, each in a process of its own.
         scheduler: Address of a Dask scheduler, tcp://HOST:PORT, whose workers are used instead; they share
             the folder of --keep.
         save: JSON file for all figures, with commit and machine.
@@ -88,7 +88,7 @@ def bench_found_bundles(
         scores = join_scores([found[number][0] for number in range(yards)])
         seconds = tuple(
             found[number][1] for number in range(0 if rendered else 1, yards)
-        )  # the first compiles
+        )  # the first run compiles
     console.print(bundle_table(scores))
     console.print(reliability(scores))
     if seconds:
@@ -110,9 +110,9 @@ def _tell(console: Console, number: int, settings: SimulationSettings, part: Bun
 def _score(
     number: int, given: tuple[tuple[SimulationSettings, ...], Path | None]
 ) -> tuple[BundleErrors, float]:
-    """Score a yard: drawn, or rendered where there is a folder for it.
+    """Score a yard, which is drawn, or rendered where a folder is given for it.
 
-    Bundles are found anew in its kept map, so that a kept folder judges the code as it is.
+    Bundles are detected again in its stored map, so that a kept folder tests the current code.
     """
     yards, folder = given
     if folder is None:
@@ -125,7 +125,7 @@ def _score(
 
 
 def _measured(folder: Path, settings: SimulationSettings) -> tuple[Path, Path]:
-    """Render and measure the yard where its folders are not there yet."""
+    """Render and measure the yard where its folders don't exist yet."""
     recording, out = folder / "recording", folder / "measured"
     folder.mkdir(parents=True, exist_ok=True)
     if not recording.is_dir():

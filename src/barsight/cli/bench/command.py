@@ -1,4 +1,4 @@
-"""Run `barsight bench NAME`: tables of methods, side by side."""
+"""Run `barsight bench NAME`: print tables that compare methods side by side."""
 
 from __future__ import annotations
 
@@ -73,9 +73,9 @@ def _stereo(
     """Measure accuracy and time of stereo methods on Middlebury-style folders with true disparity.
 
     Args:
-        data: A folder of scenes, each with left.png, right.png, disp.pfm and perhaps nonocc.png.
+        data: A folder of scenes, each with left.png, right.png, disp.pfm and optionally nonocc.png.
         methods: The methods to compare.
-        repeats: Runs per method and scene; times are medians and ranges.
+        repeats: Runs per method and scene; times are given as medians and ranges.
         save: JSON file for all figures, with commit and machine.
     """
     bench = bench_stereo(data, _made(methods), repeats)
@@ -92,15 +92,16 @@ def _stereo_speed(
     repeats: int = 5,
     save: Json = None,
 ) -> None:
-    """Time stereo methods on a pair of 1280x1024 with 96 candidates, against OpenCV's 5-path SGBM.
+    """Time stereo methods on a 1280x1024 pair with 96 candidates, against OpenCV's 5-path SGBM.
 
-    Our own is timed in both presets, with guesses as `disparity` wants them and without as a map does.
+    Barsight's method is timed in both presets, with occlusions filled as for `disparity` and without as
+    for a map.
 
     Args:
         methods: The methods to compare.
-        recording: A recording with crane encoders, of which the first pairs are timed too as its map has
-            them: the first matched from nothing, the five after it predicted from the one before.
-        repeats: Rounds, in each of which every method has its turn.
+        recording: A recording with crane encoders, whose first pairs are also timed as its map uses them:
+            the first matched from scratch, the next five each predicted from the pair before.
+        repeats: Number of rounds; every method runs once in each round.
         save: JSON file for all figures, with commit and machine.
     """
     if repeats < 1:
@@ -122,7 +123,7 @@ def _stereo_speed(
 
 
 def _stereo_steps(out: Annotated[Path, tyro.conf.arg(aliases=("-o",))]) -> None:
-    """Draw what each step of our own stereo does to a rendered bar.
+    """Draw the effect of each step of Barsight's stereo method on a rendered bar.
 
     Args:
         out: PNG to write.
@@ -131,11 +132,11 @@ def _stereo_steps(out: Annotated[Path, tyro.conf.arg(aliases=("-o",))]) -> None:
 
 
 def _ablation(data: tyro.conf.Positional[Path], scenes: int = 2, save: Json = None) -> None:
-    """Measure our own stereo with one part left out at a time: accuracy, bias and sigma.
+    """Measure Barsight's stereo method with one part left out at a time: accuracy, bias and sigma.
 
     Args:
-        data: A folder of scenes, each with left.png, right.png, disp.pfm and perhaps nonocc.png.
-        scenes: Rendered scenes of each kind.
+        data: A folder of scenes, each with left.png, right.png, disp.pfm and optionally nonocc.png.
+        scenes: Number of rendered scenes of each kind.
         save: JSON file for all figures of the folder of scenes, with commit and machine.
     """
     variants = without_one_part()
@@ -150,12 +151,12 @@ def _ablation(data: tyro.conf.Positional[Path], scenes: int = 2, save: Json = No
 def _subpixel(
     data: Path | None = None, methods: tuple[MethodName, ...] = METHODS, scenes: int = 6, save: Json = None
 ) -> None:
-    """Measure bias against the fraction of the true disparity (pixel locking), and check sigma.
+    """Measure the bias as a function of the true disparity's fraction (pixel locking), and check sigma.
 
     Args:
-        data: Middlebury folder; its motorcycle joins the rendered plane and bar where it is given.
+        data: Middlebury folder; its motorcycle scene is used too, beside the rendered plane and bar.
         methods: The methods to compare.
-        scenes: Rendered scenes of each kind.
+        scenes: Number of rendered scenes of each kind.
         save: JSON file for all figures, with commit and machine.
     """
     bench = bench_subpixel(_made(methods), data, scenes)
@@ -169,7 +170,7 @@ def _target_size(methods: tuple[MethodName, ...] = METHODS, poses: int = 10, sav
 
     Args:
         methods: The methods to compare.
-        poses: Poses at each range.
+        poses: Number of poses at each range.
         save: JSON file for all figures, with commit and machine.
     """
     bench = bench_target_size(_made(methods), poses)

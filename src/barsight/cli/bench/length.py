@@ -1,4 +1,4 @@
-"""Run `barsight bench length`: time and memory against the length of the yard."""
+"""Run `barsight bench length`: measure time and memory as a function of the yard's length."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from barsight.core.json_values import write_json
 
 @dataclass(frozen=True)
 class LengthRow:
-    """One measured way."""
+    """Time and memory of one travel."""
 
     length_m: float
     frames: int
@@ -29,7 +29,7 @@ class LengthRow:
 
 @dataclass(frozen=True)
 class LengthBench:
-    """The recording once, and the same driven several times end to end."""
+    """Results for the recording driven once, and driven several times end to end."""
 
     rows: tuple[LengthRow, LengthRow]
     provenance: Provenance
@@ -40,11 +40,11 @@ def bench_length(
     times: int = 10,
     save: Annotated[Path | None, tyro.conf.arg(name="json")] = None,
 ) -> None:
-    """Measure time and memory of a recording and of the same recording driven several times end to end.
+    """Measure time and memory for a recording and for the same recording driven several times end to end.
 
     Args:
         recording: A recording with crane encoders, as barsight simulate writes it.
-        times: How many laps the long way has, two at least.
+        times: Number of laps of the long travel, at least two.
         save: JSON file for all figures, with commit and machine.
     """
     if times < 2:

@@ -38,16 +38,18 @@ from barsight.yard.magnet.description import Magnet, example_magnet, load_magnet
 
 @dataclass(frozen=True)
 class YardChoice:
-    """Yards that are drawn, and how each becomes a map."""
+    """Choice of the drawn yards and of how each becomes a map."""
 
     kind: Literal["by-seed", "orderly"] = "by-seed"
-    """Kind of the yards: by-seed is the seed modulo 10; orderly yards hold whole bundles of one sort in even
-    layers."""
+    """Kind of the yards. by-seed: seed modulo 10 selects the kind. orderly: whole bundles of one sort in even
+    layers.
+    """
     rendered: bool = False
-    """Render and measure each yard, a minute of computing; without it the exact map gets noise."""
+    """Render and measure each yard, which takes a minute; otherwise noise is added to the exact map."""
     full_size: bool = False
-    """Render pictures of 1280x1024 instead of 640x512: half the size of a pixel on the surface, four times
-    the computing."""
+    """Render pictures of 1280x1024 instead of 640x512, which halves the pixel size on the surface but takes
+    four times as long.
+    """
 
 
 def bench_lift_targets(
@@ -63,19 +65,19 @@ def bench_lift_targets(
 ) -> None:
     """Judge offered lifts and random placements on drawn yards by exact geometry.
 
-    The yards are irregular bundles and heaps of bars, settled by physics among beams, walls and stanchions,
-    askew and along X, partly out of sight; or orderly ones. Counts what is dangerous and not vetoed, and what
-    is fine and vetoed.
+    By default the yards are irregular bundles and heaps of bars, settled by physics among beams, walls and
+    stanchions, askew and along X, partly out of sight. The benchmark counts dangerous placements that were
+    not vetoed and safe ones that were.
 
     Args:
-        seeds: Seeds of the yards, first:last, the last not included.
-        choice: What is drawn.
-        placements: Random placements on each yard, beside the lifts that are offered there.
-        danger_placements: Placements on each yard besides, of which only those without a veto are judged, so
-            that they bound the danger in less time.
-        keep: Folder for the rendered yards; what is finished there is not done again.
-        magnet: TOML file of the magnet; an example is assumed without it.
-        workers: Yards at a time, each in a process of its own.
+        seeds: Seeds of the yards, first:last, where last is not included.
+        choice: Choice of the yards.
+        placements: Number of random placements on each yard, in addition to the offered lifts.
+        danger_placements: Number of further placements on each yard, of which only those without a veto are
+            judged, to bound the rate of dangerous ones in less time.
+        keep: Folder for the rendered yards; yards already finished there are not repeated.
+        magnet: TOML file of the magnet; an example magnet by default.
+        workers: Number of yards processed at a time, each in a process of its own.
         scheduler: Address of a Dask scheduler, tcp://HOST:PORT, whose workers are used instead; they share
             the folder of --keep.
         save: JSON file for all placements, with commit and machine.
@@ -108,7 +110,9 @@ def bench_lift_targets(
 
 @dataclass(frozen=True)
 class _Given:
-    """Settings that all seeds share. magnet, judged: as the product reads its file, and as the judge does."""
+    """Settings that all seeds share. magnet, judged: the magnet as the product and as the judge read its
+    file.
+    """
 
     keep: Path
     magnet: Magnet
@@ -135,7 +139,7 @@ def _judge_seed(seed: int, given: _Given) -> tuple[JudgedLift, ...]:
 
 
 def _measured(world: DrawnYard, folder: Path, settings: LiftSettings, full_size: bool) -> MappedWorld:
-    """Render and measure the yard where its folders are not there yet."""
+    """Render and measure the yard where its folders don't exist yet."""
     recording, out = folder / "recording", folder / "measured"
     folder.mkdir(parents=True, exist_ok=True)
     if not recording.is_dir():

@@ -20,11 +20,11 @@ def bench_live_estimate(
     held: int = 8,
     save: Annotated[Path | None, tyro.conf.arg(name="json")] = None,
 ) -> None:
-    """Time a keyframe and memory of the live estimate on a simulated way, front end left out.
+    """Measure time per keyframe and memory of the live estimate on a simulated trajectory, without front end.
 
     Args:
-        keyframes: How many; a multiple of ten.
-        held: Frames held at a time.
+        keyframes: Number of keyframes; a multiple of ten.
+        held: Number of frames held at a time.
         save: JSON file for all figures.
     """
     bench = bench_live(keyframes, held)
@@ -38,11 +38,11 @@ def bench_step(
     preset: Literal["best", "fast"] = "best",
     save: Annotated[Path | None, tyro.conf.arg(name="json")] = None,
 ) -> None:
-    """Time a whole live step: a pair comes in, is rectified and placed, and the one before is in the map.
+    """Time a whole live step: a pair arrives, is rectified and located, and the previous one is in the map.
 
     Args:
-        recording: Any recording that `live --replay` takes.
-        preset: That of `measure`.
+        recording: Any recording that `live --replay` accepts.
+        preset: Stereo preset, as in `measure`.
         save: JSON file for all figures, with commit and machine.
     """
     bench = bench_live_step(recording, MeasureSettings(preset=preset, motion=MotionSettings("live")))

@@ -1,4 +1,6 @@
-"""Run `barsight bench features|matching|front-end`: detectors and filters against truth, and their speed."""
+"""Run `barsight bench features|matching|front-end`: test detectors and filters against truth, and time
+them.
+"""
 
 from __future__ import annotations
 
@@ -23,13 +25,13 @@ def features(
     repeats: int = 5,
     save: Json = None,
 ) -> None:
-    """Reproduce the paper's Table 2: number and time of features.
+    """Reproduce the paper's Table 2: number of features and time to detect them.
 
     Args:
-        recordings: Recordings with stored true depth, as `barsight simulate` makes them.
+        recordings: Recordings with stored true depth, as `barsight simulate` writes them.
         detectors: Any of sift, surf, orb.
-        count: Features asked for.
-        repeats: Runs per detector; times are medians and ranges.
+        count: Number of features requested.
+        repeats: Runs per detector; times are given as medians and ranges.
         save: JSON file for all figures, with commit and machine.
     """
     bench = bench_features(recordings, detectors, count, repeats)
@@ -44,12 +46,12 @@ def matching(
     count: int = 2000,
     save: Json = None,
 ) -> None:
-    """Reproduce the paper's Table 3 with the precision and recall of every filter.
+    """Reproduce the paper's Table 3, with the precision and recall of every filter.
 
     Args:
         recordings: Recordings with stored true depth, encoders and IMU.
         detectors: Any of sift, surf, orb.
-        count: Features asked for.
+        count: Number of features requested.
         save: JSON file for all figures, with commit and machine.
     """
     bench = bench_matching(recordings, detectors, count)
@@ -61,11 +63,11 @@ def matching(
 def front_end(
     recordings: tyro.conf.Positional[tuple[Path, ...]], repeats: int = 3, save: Json = None
 ) -> None:
-    """Time the front end in pairs a second, with and without the other sensors.
+    """Measure the front end's speed in pairs per second, with and without the other sensors.
 
     Args:
         recordings: Any recordings.
-        repeats: Runs after one that compiles; times are medians and ranges.
+        repeats: Runs after a first one that compiles; times are given as medians and ranges.
         save: JSON file for all figures, with commit and machine.
     """
     bench = bench_front_end(recordings, repeats)

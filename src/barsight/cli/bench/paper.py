@@ -23,12 +23,12 @@ def run(arguments: Sequence[str]) -> None:
         quick: bool = False,
         recording: Path | None = None,
     ) -> None:
-        """Reproduce the paper: each equation, figure, table and conclusion beside ours, on one page.
+        """Reproduce the paper: each equation, figure, table and conclusion next to Barsight's, on one page.
 
         Args:
             out: A new folder for the page, OUT/paper.html.
-            quick: Draw less and smaller: 10 m of stack in pairs of 320 x 256 instead of 35 m of 640 x 512.
-            recording: Show the figures on this recording; Table 1, the side and the environments stay drawn.
+            quick: Draw fewer and smaller scenes: 10 m of stack in 320 x 256 pairs, not 35 m in 640 x 512.
+            recording: Show the figures for this recording; Table 1, the side and the environments stay drawn.
         """
         expect_recording(recording)
         expect_empty(out)

@@ -1,4 +1,6 @@
-"""Parse the seeds of a benchmark, and run it over them: here, or on the fleet's workers."""
+"""Parse the seeds of a benchmark and run it over them, on this machine or on the workers of a Dask
+cluster.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +14,11 @@ from barsight.core.extras import extra
 
 T = TypeVar("T")
 TRIES = 3
-"""Times that a seed is given to workers before it is given up."""
+"""Number of times that a seed is given to workers before it is abandoned."""
 
 
 def parse_seeds(seeds: str, bench: str) -> range:
-    """Parse `first:last`, the last not included. Raises ConfigError, naming the benchmark."""
+    """Parse `first:last`, where last is not included. Raises ConfigError that names the benchmark."""
     match = re.fullmatch(r"(\d+):(\d+)", seeds)
     if match is None or int(match[2]) <= int(match[1]):
         raise ConfigError(f"{bench}: seeds {seeds!r} is not like 500:560, the last not included")
@@ -26,10 +28,11 @@ def parse_seeds(seeds: str, bench: str) -> range:
 def over_seeds(
     run: Callable[[int, Any], T], seeds: range, given: Any, workers: int, scheduler: str | None
 ) -> Iterator[tuple[int, T]]:
-    """Run `run(seed, given)` for each seed and yield seed and result as each ends.
+    """Run `run(seed, given)` for each seed, and yield each seed with its result as it finishes.
 
-    workers: processes of this machine, which share its cores; 1 runs in this one. scheduler: of a Dask
-    cluster to be used instead. Raises MeasurementError for a seed whose workers die, and what `run` raises.
+    workers: number of processes on this machine, which share its cores; 1 runs in this process. scheduler:
+    address of a Dask cluster to use instead. Raises MeasurementError for a seed whose workers die, and
+    whatever `run` raises.
     """
     if workers < 1:
         raise ConfigError(f"bench: workers must be 1 or more, not {workers}")
@@ -54,7 +57,7 @@ def over_seeds(
 
 
 def _one_seed(seed: int, shared: tuple[Callable[[int, Any], T], Any, str]) -> tuple[int, T]:
-    """Run one seed on a worker, which must have the software that asks."""
+    """Run one seed on a worker, which must have the same software as the caller."""
     from barsight.fleet.versions import expect_software
 
     run, given, software = shared

@@ -42,19 +42,19 @@ def bench_worlds(
 ) -> None:
     """Draw whole worlds, render and measure them, and score map, poses and bundles against truth.
 
-    A world takes about a minute of computing in small pictures. The table has medians, worst cases and the
-    shares in the stated 95 % intervals, over all worlds and by kind.
+    A world takes about a minute with small pictures. The table has medians, worst cases and the shares within
+    the stated 95 % intervals, over all worlds and by kind.
 
     Args:
-        seeds: Seeds of the worlds, first:last, the last not included; the kind is the seed modulo 10.
-        keep: Folder for the worlds. What is finished there is not done again, unless the sources or settings
-            that it depends on have changed.
-        looked_at: Why these seeds count as looked at from now on, such as a threshold that is set on them;
-            kept in the folder and said in the tables.
-        length_m: Length of each world, about.
-        frames: Stereo pairs over that length.
-        width_px: Width of the pictures; they show as much of the yard at any width.
-        workers: Worlds at a time, each in a process of its own.
+        seeds: Seeds of the worlds, first:last, where last is not included; the kind is the seed modulo 10.
+        keep: Folder for the worlds. Worlds already finished there are not repeated, unless the sources or
+            settings that they depend on have changed.
+        looked_at: Reason why these seeds no longer count as unseen, such as a threshold tuned on them; it is
+            kept in the folder and printed with the tables.
+        length_m: Approximate length of each world, in metres.
+        frames: Number of stereo pairs over that length.
+        width_px: Width of the pictures; they show the same part of the yard at any width.
+        workers: Number of worlds processed at a time, each in a process of its own.
         scheduler: Address of a Dask scheduler, tcp://HOST:PORT, whose workers are used instead; they share
             the folder of --keep.
         save: JSON file for all figures, with commit and machine.

@@ -1,4 +1,4 @@
-"""Run `barsight bench yard`: render the field test, measure it with each method, compare."""
+"""Run `barsight bench yard`: render the field test, measure it with each method and compare."""
 
 from __future__ import annotations
 
@@ -35,18 +35,19 @@ def bench_yard(
     methods: tuple[Method, ...] = get_args(Method),
     save: Annotated[Path | None, tyro.conf.arg(name="json")] = None,
 ) -> None:
-    """Run the paper's field test at its scale: laser, the paper's method, SGBM and ours on one recording.
+    """Run the paper's field test at its scale: laser, the paper's method, SGBM and Barsight's.
 
-    Beside errors it shows time, memory and stages of each method, over SGBM's where it is one of them.
-    35 m and 100 pairs take about an hour on two cores; --length 7 --frames 20 gives a first answer.
+    All use one recording. Besides errors, it shows each method's time, memory and stages, relative to SGBM's
+    where that is among the methods. 35 m and 100 pairs take about an hour on two cores; --length 7
+    --frames 20 gives a first answer.
 
     Args:
-        length: Length of the stack, m.
-        frames: Stereo pairs.
-        seed: Seed of the simulated yard.
-        bars: Kinds of bundles in it.
+        length: Length of the stack, in metres.
+        frames: Number of stereo pairs.
+        seed: Random seed of the simulated yard.
+        bars: Kinds of bundles in the yard.
         recording: A simulated recording to use instead.
-        methods: The rows.
+        methods: The methods to compare, one row each.
         save: JSON file for all figures, with commit and machine.
     """
     console = SafeConsole()

@@ -1,1 +1,1 @@
-"""`barsight calibrate KIND ...`: one module per kind."""
+"""Run `barsight calibrate KIND ...`, with one module per kind."""

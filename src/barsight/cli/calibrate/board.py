@@ -21,7 +21,7 @@ MAX_PX = 30_000
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse and draw."""
+    """Parse the arguments and draw the board."""
 
     def command(
         board: str,
@@ -29,13 +29,13 @@ def run(arguments: Sequence[str]) -> None:
         dpi: int = 300,
         views: bool = False,
     ) -> None:
-        """Draw a calibration board to print, in its true size.
+        """Draw a calibration board for printing at true size.
 
         Args:
             board: checkerboard:9x6:0.025, charuco:11x8:0.03:0.022[:DICTIONARY] or aprilgrid:6x6:0.088:0.3.
-            out: The picture (.png or .pdf). Print it at 100 % and measure it afterwards.
+            out: The picture (.png or .pdf). Print it at 100 % and measure the print afterwards.
             dpi: Dots per inch.
-            views: Draw how to hold it before the cameras instead.
+            views: Draw how to hold the board in front of the cameras instead.
         """
         expect_output(out, ".png", ".pdf")
         target = parse_board(board)

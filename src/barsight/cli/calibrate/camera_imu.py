@@ -44,7 +44,7 @@ Recorded = tuple[list[BoardView], ImuSamples, ImuNoise | None]
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse and calibrate."""
+    """Parse the arguments and calibrate."""
 
     def command(
         recording: tyro.conf.Positional[Path],
@@ -58,22 +58,22 @@ def run(arguments: Sequence[str]) -> None:
         accel_unit: tyro.conf.EnumChoicesFromValues[AccelUnit] = AccelUnit.AUTO,
         max_views: int = 2000,
     ) -> None:
-        """Calibrate where the cameras sit on the IMU, and the offset between their clocks.
+        """Calibrate the mounting of the cameras on the IMU and the offset between their clocks.
 
         Args:
             recording: An EuRoC folder or bag taken while the rig was waved in front of the board, or a folder
                 of detections (cam0_detections.npz, cam1_detections.npz) with imu0.csv.
-            rig: The stereo rig whose lenses are taken, of any format; of `calibrate stereo` with the same
-                board, the board's shape too.
+            rig: Stereo rig, in any format, from which the lenses are taken. If it is from `calibrate stereo`
+                with the same board, the board's shape is taken too.
             board: checkerboard:9x6:0.025, charuco:11x8:0.03:0.022[:DICTIONARY] or aprilgrid:6x6:0.088:0.3.
-            out: The rig file to write (.yaml); report (.html, .json) and Kalibr's camchain go beside it.
-            imu: The IMU's noise: imu.yaml of `calibrate imu-noise`, Kalibr's, or EuRoC's sensor.yaml. The
-                recording's own when not given.
-            imu_scales: Solve for the IMU's scales and misalignments too; it takes brisk turns about all axes.
-            imu_topic: A bag's topic of the IMU, where its calibration doesn't say.
-            gyro_unit: The gyroscope's unit in imu0.csv; auto takes degrees where the header says so.
-            accel_unit: The accelerometer's unit in imu0.csv; auto goes by gravity.
-            max_views: Recordings are thinned to so many pictures, evenly.
+            out: The rig file to write (.yaml); the report (.html, .json) and Kalibr's camchain go next to it.
+            imu: The IMU's noise: imu.yaml from `calibrate imu-noise` or Kalibr, or EuRoC's sensor.yaml. By
+                default the recording's own.
+            imu_scales: Estimate the IMU's scales and misalignments too; needs brisk turns about all axes.
+            imu_topic: A bag's topic of the IMU, if its calibration does not state it.
+            gyro_unit: Unit of the gyroscope in imu0.csv; auto assumes degrees if the header says so.
+            accel_unit: Unit of the accelerometer in imu0.csv; auto decides by gravity.
+            max_views: Maximum number of pictures; a longer recording is thinned evenly.
         """
         _expect(out, max_views)
         console = SafeConsole(stderr=True)
@@ -105,7 +105,7 @@ def _write(
     calibration: CameraImuCalibration, assessment: CameraImuAssessment,
     lenses: tuple[tuple[str, ...], Float64] | None, out: Path,
 ) -> None:  # fmt: skip
-    """Write the rig file, Kalibr's camchain and the report, or nothing."""
+    """Write the rig file, Kalibr's camchain and the report, or nothing at all."""
     camchain = out.with_name(f"{out.stem}-camchain-imucam.yaml")
     with atomic_paths(out, camchain, out.with_suffix(".html"), out.with_suffix(".json")) as paths:
         path, chain, *report = paths
@@ -120,7 +120,7 @@ def _expect(out: Path, max_views: int) -> None:
 
 
 def _noise(path: Path, noise: ImuNoise | None) -> ImuNoise:
-    """Refuse noise that isn't known, and densities that no IMU has: another unit's."""
+    """Refuse unknown noise, and densities that no IMU has, which suggest another unit."""
     if noise is None:
         raise ConfigError("the IMU's noise isn't known; give --imu (see barsight calibrate imu-noise)")
     if not (1e-6 < noise.gyro_density < 0.05 and 1e-5 < noise.accel_density < 1.0):

@@ -32,7 +32,7 @@ COLOURS = {
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse and check."""
+    """Parse the arguments and check the rig."""
 
     def command(
         recording: tyro.conf.Positional[Path],
@@ -41,19 +41,19 @@ def run(arguments: Sequence[str]) -> None:
         reading: Annotated[RecordingSettings, tyro.conf.arg(name="recording")] = RecordingSettings(),  # noqa: B008
         fusion: FusionSettings = FusionSettings(),  # noqa: B008
     ) -> None:
-        """Has the rig drifted since its calibration? Ordinary crane travel over any scene shows it.
+        """Check if the rig has drifted since its calibration; ordinary crane travel over any scene is enough.
 
         Rows of matches show pitch, roll and focal ratio between the cameras; the encoders' travel shows the
-        yaw, which costs most, and the baseline. The exit code is 5 where it
-        drifted or readings contradict each other.
+        yaw, which affects depth most, and the baseline. The exit code is 5 if the rig drifted or readings
+        contradict each other.
 
         Args:
             recording: The recording, with encoders for yaw and baseline.
-            out: A .json file for the figures, the report (.html) goes beside it; nothing is written where it
-                is not given.
-            settings: When a drift matters.
+            out: A .json file for the figures; the report (.html) goes next to it. Nothing is written by
+                default.
+            settings: Limits of an acceptable drift.
             reading: How to read the recording; --recording.rig checks another calibration.
-            fusion: The estimate's settings.
+            fusion: Settings of the trajectory estimate.
         """
         if out is not None:
             expect_output(out, ".json")
@@ -71,7 +71,7 @@ def run(arguments: Sequence[str]) -> None:
 
 
 def bad_lines(check: RigCheck) -> list[str]:
-    """List the lines that are not good, each with its reason."""
+    """List the properties that are not good, each with its reason."""
     return [f"{line.name}: {line.reason}" for line in check.lines if line.state in BAD_STATES]
 
 

@@ -1,4 +1,4 @@
-"""Dispatch `barsight calibrate KIND ...` to the calibration asked for."""
+"""Dispatch `barsight calibrate KIND ...` to the requested calibration."""
 
 from __future__ import annotations
 
@@ -19,5 +19,5 @@ KINDS = {
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Pass the rest of the line on to the calibration named first."""
+    """Pass the remaining arguments on to the calibration named first."""
     pass_on("calibrate", "calibration", KINDS, arguments)

@@ -15,7 +15,7 @@ from barsight.cli.safe_console import SafeConsole
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse and write."""
+    """Parse the arguments and write the rig."""
 
     def command(
         rig: tyro.conf.Positional[Path],
@@ -25,11 +25,11 @@ def run(arguments: Sequence[str]) -> None:
         """Write a stereo rig in another format.
 
         Args:
-            rig: The rig to read: ours, Kalibr's camchain, OpenCV's YAML or XML, or an EuRoC folder.
+            rig: The rig to read: Barsight's or OpenCV's file, Kalibr's camchain, or an EuRoC folder.
             out: The file to write (the folder, for euroc).
-            to: The format to write. OpenCV's files lose where the rig sits on its body, and all but ours the
-                covariance. Kalibr takes lenses of four coefficients: others are fitted with four, and refused
-                where that is more than 0.1 px off.
+            to: The format to write. OpenCV's files lose the rig's mounting on its body, and all formats but
+                Barsight's lose the covariance. Kalibr accepts lenses with four coefficients; others are
+                approximated by four, and refused if the error exceeds 0.1 px.
         """
         read = read_rig_file(rig)
         off_px = write_any_rig(out, read, to)

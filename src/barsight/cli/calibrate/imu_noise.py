@@ -22,7 +22,7 @@ SHORT_S = 1800.0
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse and fit."""
+    """Parse the arguments and fit the noise model."""
 
     def command(
         log: tyro.conf.Positional[Path],
@@ -32,16 +32,18 @@ def run(arguments: Sequence[str]) -> None:
         time_unit: tyro.conf.EnumChoicesFromValues[TimeUnit] = TimeUnit.AUTO,
         topic: str = "/imu0",
     ) -> None:
-        """Noise densities, random walks and bias instability of an IMU at rest, in Kalibr's imu.yaml.
+        """Fit the noise model of an IMU at rest: noise densities, random walks and bias instability.
+
+        The result is written as Kalibr's imu.yaml.
 
         Args:
-            log: Columns of time, gyroscope and accelerometer, with commas or spaces (more columns where the
-                header names them); an EuRoC folder with imu0/data.csv; or a bag with one IMU.
-                An hour or more, on something that doesn't shake.
-            out: The file to write (.yaml); its report goes beside it (.html and .json).
-            gyro_unit: The gyroscope's unit; auto takes degrees where the header says so.
-            accel_unit: The accelerometer's unit; auto goes by gravity.
-            time_unit: The stamps' unit, from any epoch; auto goes by the header, else by the rate.
+            log: Columns of time, gyroscope and accelerometer, separated by commas or spaces (with more
+                columns if the header names them); an EuRoC folder with imu0/data.csv; or a bag with one IMU.
+                Record an hour or more, on a base that does not vibrate.
+            out: The file to write (.yaml); its report goes next to it (.html and .json).
+            gyro_unit: Unit of the gyroscope; auto assumes degrees if the header says so.
+            accel_unit: Unit of the accelerometer; auto decides by gravity.
+            time_unit: Unit of the stamps, from any epoch; auto decides by the header, or else by the rate.
             topic: The rostopic to state in the file.
         """
         expect_output(out, ".yaml", ".yml")

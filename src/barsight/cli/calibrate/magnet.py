@@ -18,20 +18,21 @@ from barsight.yard.magnet.description import load_magnet
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse, average and write."""
+    """Parse the arguments, average the touch-downs and write the magnet's file."""
 
     def command(
         certificate: tyro.conf.Positional[Path],
         magnet: Path,
         out: Annotated[Path, tyro.conf.arg(aliases=("-o",))],
     ) -> None:
-        """Find how far the magnet hangs from where the crane's readings say, by touch-downs.
+        """Find the magnet's offset from where the crane's readings place it, from touch-downs.
 
-        The magnet's file is written anew with the mean of the touch-downs and its sigma as [offset]. With it
-        lifts give the crane the readings at which the magnet's centre is over the target (crane_target).
+        The magnet's file is written again with the mean of the touch-downs and its sigma as [offset]. With
+        it, each lift gives the readings at which the magnet's centre is over the target (crane_target).
 
         Args:
-            certificate: That of barsight accept, with three touch-downs or more on spheres or dummy bundles.
+            certificate: Certificate from barsight accept with at least three touch-downs on spheres or dummy
+                bundles.
             magnet: TOML file of the magnet, without an [offset].
             out: The .toml file to write.
         """

@@ -28,7 +28,7 @@ COLOURS = {Verdict.GOOD: "green", Verdict.USABLE: "yellow", Verdict.REDO: "red"}
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse and calibrate."""
+    """Parse the arguments and calibrate."""
 
     def command(
         pictures: tyro.conf.Positional[Path],
@@ -42,15 +42,15 @@ def run(arguments: Sequence[str]) -> None:
         """Calibrate two cameras from pictures of a board that both see.
 
         Args:
-            pictures: Folder of pictures in pairs (left and right inside, or left01.png and right01.png), an
+            pictures: Folder of pictures in pairs (folders left and right, or left01.png and right01.png), an
                 EuRoC recording, a bag, or a folder of detections (cam0_detections.npz, cam1_detections.npz).
             board: checkerboard:9x6:0.025 (inner corners, square in m), charuco:11x8:0.03:0.022[:DICTIONARY]
                 (squares, square and marker in m) or aprilgrid:6x6:0.088:0.3 (tags, tag in m, gap per tag).
-            out: The rig file to write (.yaml); its report goes beside it (.html and .json).
-            lens: The lens model. More coefficients need corners near the pictures' corners.
-            range_m: The range at which the rig will measure; the verdict judges the depth there.
-            max_views: Films are thinned to so many views, evenly.
-            resolution: WIDTHxHEIGHT of the cameras, for detections, which don't carry it.
+            out: The rig file to write (.yaml); its report goes next to it (.html and .json).
+            lens: The lens model. More coefficients need board corners near the pictures' corners.
+            range_m: Range, in metres, at which the rig will measure; the verdict judges the depth there.
+            max_views: Maximum number of views; a longer film is thinned evenly.
+            resolution: WIDTHxHEIGHT of the cameras, required for detections, which do not contain it.
         """
         _expect(out, range_m, max_views)
         console = SafeConsole(stderr=True)

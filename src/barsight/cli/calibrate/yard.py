@@ -39,11 +39,13 @@ MAX_TURN_DEG = 0.05
 MAX_PLACE_M = 0.01
 ALONE = "--tags takes a recording, and says the frame: leave out --frame and --measured"
 MAX_SCALE_OFF = 0.02
-"""A metre further off than this is no baseline's error: units differ, or points are mixed up."""
+"""Maximum deviation of the scale from 1; a larger one is no error of the baseline, but of units or
+mixed-up points.
+"""
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse and calibrate."""
+    """Parse the arguments and calibrate."""
 
     def command(
         source: tyro.conf.Positional[Path],
@@ -57,27 +59,27 @@ def run(arguments: Sequence[str]) -> None:
         sigma_m: float = 0.005,
         reading: Annotated[RecordingSettings, tyro.conf.arg(name="recording")] = RecordingSettings(),  # noqa: B008
     ) -> None:
-        """Register the measurement's world in the yard, from surveyed targets or tags, or from crane moves.
+        """Register the measurement's frame in the yard, from surveyed targets or tags, or from crane moves.
 
         Args:
             source: A .csv of targets (name,yard_x,yard_y,yard_z,x,y,z in m; optionally sigma_m, and check = 1
                 for targets set apart), a recording that shows tags, or one in which bridge and trolley move.
-            out: The .yaml file to write; its report goes beside it (.html and .json).
-            frame: What x, y, z of the targets are measured in: a world, the yard as the encoders have it,
-                or the body, which gives how the rig is mounted.
-            measured: The folder of results in whose map the targets were measured; it says the frame, and
-                the file is then bound to its rig and crane.
-            tags: A .csv of AprilTags 36h11 as surveyed (tag,yard_x,yard_y,yard_z of the middle in m;
-                optionally sigma_m and check), which are found in the recording's pictures. The frame is that
+            out: The .yaml file to write; its report goes next to it (.html and .json).
+            frame: Frame of the targets' x, y, z: a measurement's world, the yard according to the encoders,
+                or the body, which gives the mounting of the rig.
+            measured: The folder of results in whose map the targets were measured; it determines the frame,
+                and the file is then bound to its rig and crane.
+            tags: A .csv of surveyed AprilTags 36h11 (tag,yard_x,yard_y,yard_z of the centre in m; optionally
+                sigma_m and check), which are searched for in the recording's pictures. The frame is the one
                 in which measure maps this recording, and the file is bound to its rig and crane.
-            picks: A .csv of targets of any kind that were picked by hand: name,stamp_ns,u,v, the pixel in
-                cam0's picture of that stamp, two pictures or more each; the spot is found again in cam1's.
-                --tags then lists them as surveyed, by name instead of tag.
-            girder_y_m: With --tags: the trolley's readings at the girder's ends, the lower first. How the
-                crane bends is calibrated too; bridge and trolley must travel in the recording.
+            picks: A .csv of hand-picked targets of any kind: name,stamp_ns,u,v, the pixel in cam0's picture
+                of that stamp, in at least two pictures each; the spot is matched in cam1's picture. --tags
+                then lists the surveyed targets, by name instead of tag.
+            girder_y_m: With --tags: the trolley's readings at the girder's ends, the lower first. The bending
+                of the crane is calibrated too; bridge and trolley must travel in the recording.
             rails_x_m: With --girder-y-m: the bridge's readings at the ends of rails that may bend.
-            sigma_m: One coordinate's error of a target, survey and measurement together, or of a tag's survey
-                alone, where no sigma_m column says it.
+            sigma_m: Standard deviation of one coordinate of a target, survey and measurement together, or of
+                a tag's survey alone, unless a sigma_m column gives it.
             reading: How to read the recording.
         """
         expect_output(out, ".yaml", ".yml")
@@ -101,7 +103,7 @@ def run(arguments: Sequence[str]) -> None:
 
 @dataclass(frozen=True)
 class _YardSource:
-    """A source of a calibration, with what is said of it."""
+    """Input of a yard calibration and its options."""
 
     source: Path
     frame: str
@@ -112,8 +114,8 @@ class _YardSource:
     def calibrated(
         self, listed: Path | None, picks: Path | None, bend: CraneBend | None, console: Console
     ) -> tuple[YardCalibration, dict[str, str | None], Float64 | None, CraneBend | None]:
-        """Calibrate by tags or picks of a list, by targets, or by crane moves: the calibration, whose it is,
-        how the rig hangs where moves told it, and how the crane bends.
+        """Calibrate from listed tags or picks, from targets, or from crane moves. Returns the calibration,
+        the ids of its rig and crane, the rig's mounting where moves showed it, and the bending of the crane.
         """
         is_list = self.source.suffix.lower() == ".csv"
         if listed is not None:
@@ -137,7 +139,7 @@ class _YardSource:
 def _begun_bend(
     girder_y_m: tuple[float, float] | None, rails_x_m: tuple[float, float] | None, *, has_tags: bool
 ) -> CraneBend | None:
-    """Begin with a straight crane. Raises ConfigError for ends that can't be."""
+    """Make a straight crane as start value. Raises ConfigError for invalid ends."""
     if girder_y_m is None:
         if rails_x_m is not None:
             raise ConfigError("--rails-x-m needs --girder-y-m")
@@ -187,7 +189,7 @@ def _from_moves(
 
 
 def _expect_usable(found: YardCalibration, source: Path) -> None:
-    """Raise MeasurementError where units or points are mixed up, or the frame places nothing."""
+    """Raise MeasurementError where units or points are mixed up, or the frame would place nothing."""
     scale, off_m = found.alignment.scale, np.linalg.norm(found.off_m[~found.checks], axis=1)
     if abs(scale - 1) > MAX_SCALE_OFF:
         size = f"{scale:.4g} times as large as" if scale > 1 else f"only {scale:.4g} of"

@@ -1,5 +1,5 @@
-"""Register a recording's frame in the yard by surveyed AprilTags that its pictures show, or by targets that
-were picked in them by hand.
+"""Register a recording's frame in the yard by surveyed AprilTags that its pictures show, or by targets picked
+in them by hand.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ from barsight.yard_frame import (
 
 @dataclass(frozen=True, eq=False)
 class _BentRecording(RecordingProxy):
-    """`whole` with its encoders' readings where a crane that bends so really was."""
+    """A recording whose encoder readings are corrected for the bending of the crane."""
 
     bend: CraneBend
 
@@ -63,11 +63,11 @@ def calibrate_by_tags(
     path: Path, list_path: Path, picks_path: Path | None, sigma_m: float, reading: RecordingSettings,
     bend: CraneBend | None, console: Console,
 ) -> tuple[YardCalibration, dict[str, str | None], CraneBend | None]:  # fmt: skip
-    """Find the listed tags in a recording, or what was picked of the listed targets, and register the frame
-    that `measure` maps it in.
+    """Find the listed tags, or the picks of the listed targets, in a recording, and register the frame in
+    which `measure` maps it.
 
-    sigma_m: of a coordinate's survey, where the list doesn't say it. bend: what to begin with where the
-    crane's bending is calibrated too. Returns the calibration, whose it is, and the bending.
+    sigma_m: of a surveyed coordinate, where the list doesn't give it. bend: start value where the bending of
+    the crane is calibrated too. Returns the calibration, the ids of its rig and crane, and the bending.
     """
     is_picked = picks_path is not None
     names, listed = read_places(list_path) if is_picked else (tuple[str, ...](), read_tags(list_path))
@@ -101,7 +101,7 @@ def calibrate_by_tags(
 
 
 def place_in_yard(recording: Recording, listed: SurveyedTags, console: Console) -> list[PlacedTag | Failed]:
-    """Place listed tags by a recording that is seen in the yard, as `measure` maps it."""
+    """Locate listed tags in the yard from a recording, as `measure` maps it."""
     reference, seen = _see(recording, console, are_rings=listed.are_rings)
     if reference != "yard":
         raise InputError(recording.path, "isn't placed in the yard", "give encoders, or a yard file (--yard)")
@@ -109,7 +109,9 @@ def place_in_yard(recording: Recording, listed: SurveyedTags, console: Console) 
 
 
 def _see(recording: Recording, console: Console, *, are_rings: bool) -> tuple[str, SeenTags]:
-    """Estimate the trajectory as `measure` does and find the tags in its pairs; its reference, and them."""
+    """Estimate the trajectory as `measure` does and find the tags in its pairs; returns its reference and
+    the tags.
+    """
     with stages(console) as advance:
         rectifier = Rectifier(recording.rig)
         trajectory = placed_in_yard(_trajectory(recording, advance), frame_of(recording))
@@ -123,7 +125,9 @@ def _see_picks(
     recording: Recording, picks: dict[int, dict[int, Float64]], names: tuple[str, ...], path: Path,
     console: Console,
 ) -> tuple[str, SeenTags]:  # fmt: skip
-    """Estimate the trajectory as `measure` does and place what was picked; its reference, and the targets."""
+    """Estimate the trajectory as `measure` does and locate the picks; returns its reference and the
+    targets.
+    """
     with stages(console) as advance:
         rectifier, trajectory = Rectifier(recording.rig), _trajectory(recording, advance)
         posed = {frame.stamp_ns: frame for frame in trajectory.frames if frame.stamp_ns in picks}
@@ -148,8 +152,8 @@ def _bent(
     path: Path, recording: Recording, listed: SurveyedTags, seen: SeenTags, placed: list[PlacedTag | Failed],
     sigma_m: float, bend: CraneBend, told: str, console: Console,
 ) -> tuple[YardCalibration, CraneBend]:  # fmt: skip
-    """Register frame and bending together. How the tags' places answer to the bending is seen by estimating
-    the travel anew with a little of each.
+    """Register frame and bending together. The derivatives of the tags' places with respect to the bending
+    come from estimating the travel again with a small amount of each kind of bending.
     """
 
     def places(values: Float64) -> list[PlacedTag | Failed]:
@@ -164,7 +168,7 @@ def _bent(
         for step, axis, is_fitted in zip(STEPS, np.eye(3), bend.fitted, strict=True)
     ], axis=2)  # fmt: skip
     for number in range(2):
-        if number:  # a tag that several places of the trolley saw agrees with itself only now
+        if number:  # only now do the sightings of a tag from several trolley positions agree
             placed = places(bend.values)
         known = np.column_stack([_at(placed), slopes.reshape(len(slopes), -1)])
         kept: Bool = np.all(np.isfinite(known), axis=1)
@@ -181,15 +185,15 @@ def _bent(
 
 
 def _at(placed: Sequence[PlacedTag | Failed]) -> Float64:
-    """Stack places (N, 3), NaN where a tag wasn't placed."""
+    """Stack places (N, 3), NaN where a tag wasn't located."""
     return np.array([one.place_m if isinstance(one, PlacedTag) else np.full(3, np.nan) for one in placed])
 
 
 def _kept(
     path: Path, listed: SurveyedTags, placed: list[PlacedTag | Failed], kept: Bool, sigma_m: float, told: str
 ) -> tuple[tuple[PlacedTag, ...], Float64, Bool, Float64]:
-    """Select the tags that were placed, where they lie, which are checks, and their survey's sigma. told: why
-    others weren't placed, for where too few are left.
+    """Select the located tags, their surveyed places, which are checks, and the sigma of their survey. told:
+    reason why others weren't located, for the error where too few remain.
     """
     tags = tuple(one for one, keep in zip(placed, kept, strict=True) if keep and isinstance(one, PlacedTag))
     checks = listed.checks[kept]
@@ -204,7 +208,7 @@ def _registered(
     path: Path, listed: SurveyedTags, seen: SeenTags, placed: list[PlacedTag | Failed], sigma_m: float,
     frame: str, told: str,
 ) -> YardCalibration:  # fmt: skip
-    """Fit the tags that were placed. told: why others weren't, for where too few are left."""
+    """Fit the located tags. told: reason why others weren't located, for the error where too few remain."""
     kept = np.array([isinstance(one, PlacedTag) for one in placed], bool)
     tags, yard_m, checks, survey = _kept(path, listed, placed, kept, sigma_m, told)
     found = calibrate_yard(
@@ -223,7 +227,7 @@ def _expect_upright(path: Path, tags: tuple[PlacedTag, ...], yard_m: Float64, fo
 
 
 def _told(recording: Recording, seen: SeenTags, placed: list[PlacedTag | Failed]) -> str:
-    """Say why tags weren't placed."""
+    """Explain why tags weren't located."""
     if not seen.sightings and seen.are_rings:
         return f"no coded circle is seen in both pictures of any of {seen.pairs} pairs"
     if not seen.sightings and not seen.names:
@@ -255,7 +259,7 @@ def _print(
 
 
 def print_bend(bend: CraneBend | None, console: Console) -> None:
-    """Print how the crane bends, where it was calibrated."""
+    """Print the bending of the crane, if it was calibrated."""
     if bend is None:
         return
     words = (("girder's deflection", "mm"), ("girder out of square", "mm/m"), ("rails' depth", "mm"))

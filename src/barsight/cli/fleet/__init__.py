@@ -1,1 +1,1 @@
-"""Commands of the fleet: an archive measured anew, compared, promoted."""
+"""Provide the commands of the fleet, which measure an archive again, compare versions and promote one."""

@@ -1,4 +1,4 @@
-"""Dispatch `barsight fleet KIND ...` to what is done with an archive."""
+"""Dispatch `barsight fleet KIND ...` to the requested command on an archive."""
 
 from __future__ import annotations
 
@@ -16,5 +16,5 @@ KINDS = {
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Pass the rest of the line on."""
+    """Pass the remaining arguments on."""
     pass_on("fleet", "task of the fleet", KINDS, arguments)

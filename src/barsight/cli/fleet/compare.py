@@ -21,7 +21,7 @@ from barsight.store.opening import DEFAULT_URL, open_store
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse, compare and write."""
+    """Parse the arguments, compare the versions and write the comparison."""
 
     def command(
         before: tyro.conf.Positional[str],
@@ -30,17 +30,17 @@ def run(arguments: Sequence[str]) -> None:
         out: Annotated[Path, tyro.conf.arg(aliases=("-o",))],
         store: str = DEFAULT_URL,
     ) -> None:
-        """Compare two versions over the archive: bundles moved beyond sigma, vetoes that appeared or
-        vanished, intervals, times. Writes comparison.json, comparison.html and its pictures.
+        """Compare two versions over the archive: bundles moved beyond sigma, vetoes, intervals, times.
 
-        Many figures are looked at together: told is what Holm's rule leaves at 5 % for any false one.
+        Writes comparison.json, comparison.html and its pictures. Findings, such as vetoes that appeared or
+        vanished, are significant by Holm's rule, at 5 % for any false one among all figures.
 
         Args:
             before: Version, by the beginning of its name.
             after: The other version.
-            results: Folder or URL of what was measured.
+            results: Folder or URL of the results.
             out: Folder for the comparison; it must be new or empty.
-            store: SQLAlchemy's URL of the database.
+            store: SQLAlchemy URL of the database.
         """
         with extra("fleet"):
             from barsight.fleet.comparison.comparing import compare_tasks

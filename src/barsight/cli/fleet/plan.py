@@ -20,29 +20,30 @@ from barsight.store.opening import DEFAULT_URL, open_store
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse, plan and print."""
+    """Parse the arguments, plan and print."""
 
     def command(
         archive: tyro.conf.Positional[str], results: str, store: str = DEFAULT_URL,
         config: Path | None = None, rig: Path | None = None, magnet: Path | None = None,
         limit: int | None = None, workers: int = 1, by: str | None = None,
     ) -> None:  # fmt: skip
-        """Find an archive's recordings and plan their measurement; says what is new, done and parked, and
-        estimates hours and gigabytes. Nothing is measured. Recordings that can't be read are left out by
-        name, and the command then ends with 3.
+        """Find an archive's recordings and plan their measurement.
+
+        Prints how many are new, done and parked, and estimates hours and gigabytes. Nothing is measured.
+        Unreadable recordings are named and left out, and the exit code is then 3.
 
         A folder with survey.json, {"passes": ["first", "second"]}, is one survey of several passes.
 
         Args:
-            archive: Folder or s3://, az://, gs:// URL above the recordings.
-            results: Folder or URL for what is measured.
-            store: SQLAlchemy's URL of the database.
+            archive: Folder or s3://, az://, gs:// URL that contains the recordings.
+            results: Folder or URL for the results.
+            store: SQLAlchemy URL of the database.
             config: TOML file of settings, as for barsight measure.
             rig: Calibration to use instead of the recordings' own.
             magnet: TOML file of the magnet that lifts are chosen for.
-            limit: Most recordings to plan, in the order of their names.
-            workers: Workers that the hours are estimated for.
-            by: Who plans, for the audit log; the name of the user if not given.
+            limit: Maximum number of recordings to plan, in the order of their names.
+            workers: Number of workers for which the hours are estimated.
+            by: Name for the audit log; by default the name of the user.
         """
         with extra("fleet"):
             from barsight.fleet.ledger import parked_keys, published_keys

@@ -17,21 +17,21 @@ from barsight.store.opening import DEFAULT_URL, open_store
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse and switch."""
+    """Parse the arguments and switch the version."""
 
     def command(
         version: tyro.conf.Positional[str | None] = None, results: str | None = None,
         into: Path | None = None, store: str = DEFAULT_URL, revert: bool = False, by: str | None = None,
     ) -> None:  # fmt: skip
-        """Switch what the page and the plant see to a version, all its recordings at once; or take that back.
+        """Switch the page and the plant to a version, for all its recordings at once, or undo that.
 
         Args:
             version: Version, by the beginning of its name.
-            results: Folder or URL of what was measured.
-            into: Folder of this machine that the results are copied to; the page reads them there.
-            store: SQLAlchemy's URL of the database.
-            revert: Switch back to what was promoted before, or to what the store had without.
-            by: Who switches, for the audit log; the name of the user if not given.
+            results: Folder or URL of the results.
+            into: Folder on this machine to which the results are copied and from which the page reads them.
+            store: SQLAlchemy URL of the database.
+            revert: Switch back to the version promoted before, or to the store's own results without one.
+            by: Name for the audit log; by default the name of the user.
         """
         with extra("fleet"):
             from barsight.fleet.objects import open_objects

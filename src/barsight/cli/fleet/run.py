@@ -25,7 +25,7 @@ from barsight.store.opening import DEFAULT_URL, open_store
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse and drive."""
+    """Parse the arguments and run the planned measurements."""
 
     def command(
         results: str,
@@ -37,17 +37,17 @@ def run(arguments: Sequence[str]) -> None:
         scheduler: str | None = None,
         by: str | None = None,
     ) -> None:
-        """Measure what is planned; killed, it goes on where it was when it is started again.
+        """Measure the planned recordings; if the command is killed, it continues when started again.
 
         Args:
-            results: Folder or URL for what is measured.
-            choice: Of what is planned.
-            limits: Of each measurement.
-            window: When recordings are started.
-            store: SQLAlchemy's URL of the database.
-            workers: Worker processes on this machine.
+            results: Folder or URL for the results.
+            choice: Choice among the planned recordings.
+            limits: Limits of each measurement.
+            window: Times at which recordings are started.
+            store: SQLAlchemy URL of the database.
+            workers: Number of worker processes on this machine.
             scheduler: Address of a Dask scheduler, tcp://HOST:PORT, whose workers are used instead.
-            by: Who runs it, for the audit log; the name of the user if not given.
+            by: Name for the audit log; by default the name of the user.
         """
         if workers < 1:
             raise ConfigError(f"--workers {workers}: give 1 or more")
@@ -61,7 +61,7 @@ def run(arguments: Sequence[str]) -> None:
                     forgive(target, key)
             who = by or user_name()
             tasks = choice.of(open_tasks(opened, target, planned, who))
-            # Workers of other machines can't write into this machine's file.
+            # Workers on other machines can't write to a database file on this machine.
             is_reached = scheduler is None or not store.startswith("sqlite")
             settings = TaskSettings(target.url, store if is_reached else None, limits, who)
             with connect(workers, scheduler) as client, stages(SafeConsole(stderr=True)) as advance:

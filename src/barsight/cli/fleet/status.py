@@ -12,15 +12,15 @@ from barsight.store.opening import DEFAULT_URL, open_store
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse, count and print."""
+    """Parse the arguments, count and print."""
 
     def command(results: str, store: str = DEFAULT_URL, version: str | None = None) -> None:
-        """Count what is published, under way, left and parked, of each version; parked ones with reasons.
+        """Count each version's recordings: published, under way, left, and parked with reasons.
 
         Args:
-            results: Folder or URL for what is measured.
-            store: SQLAlchemy's URL of the database.
-            version: Version to tell of, by the beginning of its name; all if not given.
+            results: Folder or URL for the results.
+            store: SQLAlchemy URL of the database.
+            version: Version to report, by the beginning of its name; by default all.
         """
         with extra("fleet"):
             from barsight.fleet.driver import count_states, parked_reasons

@@ -1,1 +1,1 @@
-"""Commands of a run beside the crane."""
+"""Provide the commands of a live run at the crane."""

@@ -18,19 +18,19 @@ WORDS = {True: "ok", False: "FAILED", None: "note"}
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse, check and print."""
+    """Parse the arguments, check the machine and print the findings."""
 
     def command(
         config: Path, out: Annotated[Path, tyro.conf.arg(aliases=("-o",))] = Path(),
     ) -> None:  # fmt: skip
         """Check that this machine can run live: cores, memory, disks, network, cameras, readings, clocks.
 
-        Prints a line for each: what, what was found, what is needed, and where it fails a remedy. Exit code 5
-        where something fails that a run needs; `note` where the system doesn't tell or a run does without it.
+        Prints a line for each: item, finding, requirement and, on failure, a remedy. The exit code is 5 if
+        something that a run needs fails; `note` marks what the system does not report or a run does not need.
 
         Args:
             config: crane.toml.
-            out: Where runs will write.
+            out: Folder in which runs will write.
         """
         console, failed = SafeConsole(), []
         for one in check_machine(read_crane(config), out):

@@ -23,7 +23,7 @@ from barsight.measure_settings import MeasureSettings
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse and run."""
+    """Parse the arguments and run."""
     if arguments[:1] in (["check"], ["soak"]):
         {"check": check, "soak": soak}[arguments[0]].run(arguments[1:])
         return
@@ -44,23 +44,23 @@ def run(arguments: Sequence[str]) -> None:
         keyframes: Path | None = None,
         surveys: bool = False,
     ) -> None:
-        """Measure while pictures and readings come, each at its time: poses, a growing map, lifts at the end.
+        """Measure while pictures and readings arrive in real time: poses, a growing map, lifts at the end.
 
-        Capture, tracking and mapping are processes, each started anew if it ends. OUT tells at any time how
-        the run stands (state.json, health.json, health.prom, pose.json) and has at the end all that measure
-        writes, and latency.json. Ctrl-C ends the run as the recording's end does.
+        Capture, tracking and mapping are separate processes, each restarted if it ends. During the run, OUT
+        shows its state (state.json, health.json, health.prom, pose.json); at the end, it holds all files that
+        measure writes, and latency.json. Ctrl-C ends the run in the same way as the end of the recording.
 
         Args:
             out: An empty or new folder.
-            settings: Settings of measuring.
+            settings: Settings of the measurement.
             live: Settings of the run.
             replay: The recording to replay.
-            speed: Recorded seconds a second; 0: as fast as possible, and nothing is lost.
-            config: With --replay a TOML file with settings of measuring, else crane.toml; flags go before it.
-            magnet: TOML file of the magnet that lifts are chosen for; without it nothing is offered.
-            at: When lifts are judged: now, or at the end of the recording, to look back; never for a crane.
-            keyframes: keyframes.json of an earlier run: keep just the pairs that it kept.
-            surveys: Survey after survey, each in a folder of OUT: as the crane moves and stops, or replays.
+            speed: Replay speed as a multiple of real time; 0: as fast as possible, without losing frames.
+            config: TOML file: measurement settings with --replay, else crane.toml; flags take precedence.
+            magnet: TOML file of the magnet that lifts are chosen for; without it, no lift is offered.
+            at: Time at which lifts are judged: now, or the recording's end for review, never for a crane.
+            keyframes: keyframes.json of an earlier run; keep exactly the pairs that it kept.
+            surveys: Run survey after survey, each in a folder of OUT: by the crane's stops, or per replay.
         """
         console = SafeConsole(stderr=True)
         if surveys and keyframes is not None:

@@ -19,7 +19,7 @@ BOUNDS = SoakBounds()
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse, soak and print."""
+    """Parse the arguments, run the soak test and print its result."""
     cut = arguments.index("--") if "--" in arguments else len(arguments)
     own, flags = arguments[:cut], arguments[cut + 1 :]
 
@@ -33,21 +33,21 @@ def run(arguments: Sequence[str]) -> None:
         seed: int = 0,
         bounds: SoakBounds = BOUNDS,
     ) -> None:  # fmt: skip
-        """Soak a live run for hours or weeks: its memory, open descriptors, how it comes back from faults.
+        """Soak-test a live run for hours or weeks: its memory, open descriptors and recovery from faults.
 
-        Writes soak.json and soak.md each minute and at the end, which comes after --hours, at Ctrl-C, or when
-        the run is gone. Exit code 5 where a bound is broken, or where it can't be told yet whether it is.
+        Writes soak.json and soak.md every minute and at the end: after --hours, on Ctrl-C, or when the run
+        has gone. The exit code is 5 if a bound is broken, or if it is too early to tell.
 
         Args:
             out: An empty or new folder for the two files.
-            run: OUT of a run of barsight live that goes on, as its service has it.
-            replay: Instead, a recording, which a run of its own replays over and over; flags of live for it
-                stand at the end, after --.
-            hours: How long, from the beginning; without it until Ctrl-C.
-            warm_up_h: For so long memory may grow.
-            faults_after_h: From then on kill one of the run's processes after the other, at random moments.
-            seed: Of these moments.
-            bounds: What the run must stay within.
+            run: OUT of a barsight live that is already running, such as that of its service.
+            replay: A recording to replay over and over in a run of its own instead; flags for that live run
+                follow at the end, after --.
+            hours: Duration in hours from the beginning; by default until Ctrl-C.
+            warm_up_h: Hours during which memory may grow.
+            faults_after_h: Hours after which the run's processes are killed, one at a time at random moments.
+            seed: Random seed of these moments.
+            bounds: Bounds that the run must stay within.
         """
         if (run is None) == (replay is None):
             raise ConfigError("live soak needs OUT of a run that goes on, or --replay RECORDING")

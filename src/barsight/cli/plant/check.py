@@ -14,21 +14,20 @@ from barsight.report.signing import sign_file
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse, check and print."""
+    """Parse the arguments, check the links and print the findings."""
 
     def command(
         config: Path, seconds: float = 5.0, protocol: Path | None = None, key: Path | None = None
     ) -> None:
-        """Check each link that plant.toml names from its other side: what is sent, how often, and whether
-        the life counter moves.
+        """Check each link in plant.toml from its other side: data, rate, and changes of the life counter.
 
-        Nothing is claimed. Ends with exit code 5 where a link doesn't hold.
+        No lift is claimed. The exit code is 5 if a link fails.
 
         Args:
             config: plant.toml.
-            seconds: Time for the telegram's cycle.
+            seconds: Time, in seconds, over which the telegram's cycle is observed.
             protocol: A text file to write for the commissioning folder.
-            key: Ed25519 key (PEM) that signs the protocol; the signature lies beside it as NAME.sig.
+            key: Ed25519 key (PEM) that signs the protocol; the signature is written next to it as NAME.sig.
         """
         if key is not None and protocol is None:
             raise ConfigError("--key signs a protocol: give --protocol too")

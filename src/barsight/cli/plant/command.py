@@ -1,4 +1,4 @@
-"""Dispatch `barsight plant KIND ...` to what is asked of the plant's side."""
+"""Dispatch `barsight plant KIND ...` to the requested command."""
 
 from __future__ import annotations
 
@@ -15,5 +15,5 @@ KINDS = {
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Pass the rest of the line on."""
+    """Pass the remaining arguments on."""
     pass_on("plant", "task of the plant's side", KINDS, arguments)

@@ -14,11 +14,12 @@ from barsight.store.opening import open_store
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse and serve until Ctrl-C."""
+    """Parse the arguments and serve until Ctrl-C."""
 
     def command(config: Path) -> None:
-        """Serve the plant's state by the links that plant.toml names (telegram, OPC UA, MQTT, S7, webhooks);
-        Ctrl-C ends it.
+        """Serve the plant's state over the links in plant.toml until Ctrl-C.
+
+        Possible links are the telegram, OPC UA, MQTT, S7 and webhooks.
 
         Args:
             config: plant.toml.

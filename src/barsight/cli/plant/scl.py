@@ -14,13 +14,13 @@ from barsight.plant.telegram_texts import scl_source
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse and write."""
+    """Parse the arguments and write the source."""
 
     def command(out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]) -> None:
         """Write the telegram's types and data blocks as a source for TIA Portal (SCL, S7-1500).
 
         Args:
-            out: File, as barsight.scl.
+            out: The file to write, such as barsight.scl.
         """
         with atomic_path(out) as path:
             path.write_text(scl_source(), encoding="utf-8", newline="\r\n")

@@ -15,7 +15,7 @@ from barsight.plant.settings import read_plant
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse, ask for the password and add."""
+    """Parse the arguments, ask for the password and add the user."""
 
     def command(
         name: tyro.conf.Positional[str],
@@ -24,15 +24,15 @@ def run(arguments: Sequence[str]) -> None:
     ) -> None:
         """Add a user of the OPC UA server to the file that opcua.users names, or change role and password.
 
-        The password is asked for; where the input is no terminal its first line is it. A server that runs
-        reads the file at its next start.
+        The command asks for the password; if the input is not a terminal, its first line is the password.
+        A running server reads the file at its next start.
 
         Args:
             name: The user's name.
             config: plant.toml.
             role: viewer, operator or engineer.
         """
-        from barsight.plant.opcua.security.access import add_user  # an extra that other links don't need
+        from barsight.plant.opcua.security.access import add_user  # an extra that only OPC UA needs
 
         opcua = read_plant(config).opcua
         if opcua is None or opcua.users is None:

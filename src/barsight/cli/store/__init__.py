@@ -1,1 +1,1 @@
-"""Commands on the store: add a survey, list, verify, and the yard at a time."""
+"""Provide the commands on the store: add a survey, list, verify, and show the yard at a time."""

@@ -17,7 +17,7 @@ from barsight.store.opening import DEFAULT_URL, open_store
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse, add and print."""
+    """Parse the arguments, add the survey and print the result."""
 
     def command(
         url: tyro.conf.Positional[str],
@@ -28,20 +28,20 @@ def run(arguments: Sequence[str]) -> None:
         rig: str | None = None,
         crane: str | None = None,
     ) -> None:
-        """Add a measured folder to the store: its bundles get names that they keep.
+        """Add a measured folder to the store; its bundles get permanent names.
 
-        Makes the store where there is none. A folder that is there already changes nothing; an older one is
-        put into its place in time. OUT is only read.
+        The store is created if there is none. A folder that is already in it changes nothing; an older one
+        is inserted at its place in time. OUT is only read.
 
         Args:
-            url: SQLAlchemy's URL of the database; sqlite:///barsight.db where only OUT is given.
-            out: A folder written by barsight measure. It should stay where it is.
-            by: Who adds it, for the audit log; the name of the user if not given.
-            same_yard: The survey lies in the store's surveyed yard, though what places it there differs, as
-                after a recalibration.
-            rig: Name of the rig that it was surveyed with; the calibration's or the newest if not given.
-            crane: Name of the crane that the rig hangs from; the one that it hung from, if not given.
-            migrate: Bring the tables of an earlier version on PostgreSQL up to date; back them up before.
+            url: SQLAlchemy URL of the database; sqlite:///barsight.db if only OUT is given.
+            out: A folder of results from barsight measure. It should stay where it is.
+            by: Name for the audit log; by default the name of the user.
+            same_yard: The survey is of the store's surveyed yard although its yard frame differs, as after
+                a recalibration.
+            rig: Name of the rig used for the survey; by default the calibration's rig, or else the newest.
+            crane: Name of the crane that carries the rig; by default the one that carried it before.
+            migrate: Update the tables of an earlier version on PostgreSQL; back them up first.
         """
         survey = read_survey(out)
         with open_store(url, create=True, migrate=migrate) as store:

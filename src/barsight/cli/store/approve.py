@@ -19,27 +19,27 @@ from barsight.yard_frame import calibration_id
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse, approve and print."""
+    """Parse the arguments, approve the calibration and print the result."""
 
     def command(
         url: tyro.conf.Positional[str], calibration: tyro.conf.Positional[str],
         valid_from: str | None = None, valid_until: str | None = None, by: str | None = None,
         note: str = "", rig: str | None = None, crane: str | None = None,
     ) -> None:  # fmt: skip
-        """Approve a calibration of a rig for a time: at its beginning the rig's older ones end.
+        """Approve a calibration of a rig for a period; at its start, the rig's older approvals end.
 
-        Once one calibration of a rig was approved, lifts are offered on maps alone that were measured with
-        one that is valid; offers of others end.
+        Once a calibration of a rig has been approved, lifts are only offered on maps measured with a valid
+        one; offers on other maps end.
 
         Args:
-            url: SQLAlchemy's URL of the database.
-            calibration: Its rig file, or the beginning of the calibration_id that surveys carry.
-            valid_from: ISO 8601 with its zone, like 2026-11-23T14:00:00Z, or integer ns; now if not given.
-            valid_until: Its end, written likewise, which may be now to end it; none if not given.
-            by: Who approves it; the name of the user if not given.
-            note: A sentence for the store, like the number of a certificate.
-            rig: Name of the rig, where the store doesn't know this calibration or its rig yet.
-            crane: Name of the crane that the rig hangs from, where it is new.
+            url: SQLAlchemy URL of the database.
+            calibration: Its rig file, or the beginning of the calibration_id in the surveys.
+            valid_from: Start, in ISO 8601 with zone, like 2026-11-23T14:00:00Z, or integer ns; default now.
+            valid_until: End, in the same form, which may be now to end the approval; no end by default.
+            by: Name of the person who approves it; by default the name of the user.
+            note: A sentence for the store, such as the number of a certificate.
+            rig: Name of the rig, if the store does not know this calibration or its rig yet.
+            crane: Name of the crane that carries the rig, if the rig is new.
         """
         given = Path(calibration)
         digest = calibration_id(read_rig_file(given)) if given.exists() else None

@@ -1,4 +1,4 @@
-"""Dispatch `barsight store KIND ...` to what is asked of the store."""
+"""Dispatch `barsight store KIND ...` to the requested command."""
 
 from __future__ import annotations
 
@@ -17,5 +17,5 @@ KINDS = {
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Pass the rest of the line on."""
+    """Pass the remaining arguments on."""
     pass_on("store", "task of the store", KINDS, arguments)

@@ -14,21 +14,23 @@ from barsight.store.recordings import keep_recording, release_recording
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse, change and print."""
+    """Parse the arguments, change the protection and print the result."""
 
     def command(
         url: tyro.conf.Positional[str], recording: tyro.conf.Positional[str],
         why: tyro.conf.Positional[str], release: bool = False, by: str | None = None,
     ) -> None:  # fmt: skip
-        """Say why a recording is not to be deleted. A folder that is on this computer gets a file PROTECTED,
-        which a crane's recorder leaves alone when the disk fills.
+        """Protect a recording from deletion, with a reason.
+
+        A folder on this computer gets a file PROTECTED,
+        so that a crane's recorder does not delete it when the disk fills up.
 
         Args:
-            url: SQLAlchemy's URL of the database.
-            recording: Its path, or the beginning of its SHA-256; `store list` tells both.
+            url: SQLAlchemy URL of the database.
+            recording: Its path, or the beginning of its SHA-256; `store list` shows both.
             why: The reason.
-            release: Take the protection back, for this reason.
-            by: Who says so, for the audit log; the name of the user if not given.
+            release: Remove the protection, for this reason.
+            by: Name for the audit log; by default the name of the user.
         """
         change = release_recording if release else keep_recording
         with open_store(url) as store, entry(store, by or user_name(), f"recording {recording}") as opened:

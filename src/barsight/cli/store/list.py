@@ -21,7 +21,7 @@ from barsight.store.recordings import KnownRecording, list_recordings
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse, read and print."""
+    """Parse the arguments, read the store and print its content."""
 
     def command(
         url: tyro.conf.Positional[str] = DEFAULT_URL, json: bool = False, migrate: bool = False
@@ -29,9 +29,9 @@ def run(arguments: Sequence[str]) -> None:
         """List the store's surveys, calibrations and recordings, and the bundles of the present yard.
 
         Args:
-            url: SQLAlchemy's URL of the database.
+            url: SQLAlchemy URL of the database.
             json: Write JSON, with each bundle's record as in bundles.json.
-            migrate: Bring the tables of an earlier version on PostgreSQL up to date; back them up before.
+            migrate: Update the tables of an earlier version on PostgreSQL; back them up first.
         """
         now_ns = time.time_ns()
         with open_store(url, migrate=migrate) as store, store.reading() as connection:

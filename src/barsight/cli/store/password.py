@@ -9,7 +9,7 @@ from barsight.core.errors import ConfigError
 
 
 def ask_password() -> str:
-    """Ask twice; where the input is no terminal its first line is the password. Raises ConfigError."""
+    """Ask twice for a password; if the input is not a terminal, read its first line. Raises ConfigError."""
     if not sys.stdin.isatty():
         return sys.stdin.readline().rstrip("\n")
     password = getpass.getpass("password: ")

@@ -14,7 +14,7 @@ from barsight.store.opening import open_store
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse, ask for the password and add."""
+    """Parse the arguments, ask for the password and add the account."""
 
     def command(
         url: tyro.conf.Positional[str], name: tyro.conf.Positional[str], role: Role = "operator",
@@ -22,10 +22,10 @@ def run(arguments: Sequence[str]) -> None:
     ) -> None:  # fmt: skip
         """Add a person who may log in to the page, change role and password, or withdraw the account.
 
-        The password is asked for; where the input is no terminal its first line is it.
+        The command asks for the password; if the input is not a terminal, its first line is the password.
 
         Args:
-            url: SQLAlchemy's URL of the database.
+            url: SQLAlchemy URL of the database.
             name: The person's name.
             role: viewer, operator, engineer or service.
             remove: Withdraw the account.

@@ -14,16 +14,16 @@ from barsight.store.opening import DEFAULT_URL, open_store
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse, walk and print."""
+    """Parse the arguments, verify the chain and print the result."""
 
     def command(url: tyro.conf.Positional[str] = DEFAULT_URL) -> None:
-        """Check the audit chain and the rows that it covers; exit code 5 names the first that doesn't hold.
+        """Verify the audit chain and the rows that it covers; exit code 5 names the first that is invalid.
 
-        Prints the number of rows and the last digest. A chain that was cut off at its end holds too: note
-        both elsewhere and compare.
+        Prints the number of rows and the last digest. A chain that was cut off at its end is also valid, so
+        note both elsewhere and compare them.
 
         Args:
-            url: SQLAlchemy's URL of the database.
+            url: SQLAlchemy URL of the database.
         """
         with open_store(url) as store, store.reading() as connection:
             chain = verify_chain(connection)

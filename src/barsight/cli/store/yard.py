@@ -35,20 +35,21 @@ _UNITS = ((86400, "d"), (3600, "h"), (60, "min"), (1, "s"))
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse, read and print."""
+    """Parse the arguments, read the store and print the yard."""
 
     def command(
         url: tyro.conf.Positional[str] = DEFAULT_URL, at: str | None = None, since: str | None = None,
         json: bool = False, stock_list: Path | None = None,
     ) -> None:  # fmt: skip
-        """Print the yard as it was known at a time: of each bundle the newest sighting, with its age; or what
-        came, went and moved between two times.
+        """Print the yard as known at a time, or its changes between two times.
+
+        The yard is each bundle's newest sighting with its age; changes are bundles that came, went and moved.
 
         Args:
-            url: SQLAlchemy's URL of the database.
-            at: ISO 8601 with its zone, like 2026-11-23T14:00:00Z, or integer ns; now if not given.
-            since: An earlier time, written likewise: print only what changed between it and --at.
-            stock_list: CSV file to write the yard to, as `--bundles.stock-list` reads it.
+            url: SQLAlchemy URL of the database.
+            at: ISO 8601 with its zone, like 2026-11-23T14:00:00Z, or integer ns; by default now.
+            since: An earlier time, in the same form; print only the changes between it and --at.
+            stock_list: CSV file to write the yard to, in the form that `--bundles.stock-list` reads.
             json: Write JSON, with each bundle's record as in bundles.json and its identity.
         """
         at_ns = None if at is None else parse_time(at)
@@ -102,7 +103,7 @@ def print_json(content: object) -> None:
 
 
 def bundle_table(title: str, present: tuple[PresentBundle, ...], now_ns: int) -> Table:
-    """Format the bundles of a yard with place, age and doubt."""
+    """Format the bundles of a yard with place, age and doubts."""
     table = Table(title=title, box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     for head in ("name", "x m", "y m", "top m", "yaw deg", "length m", "age", "stock", "doubt"):
         table.add_column(
@@ -122,7 +123,7 @@ def bundle_table(title: str, present: tuple[PresentBundle, ...], now_ns: int) ->
 
 
 def _age(age_ns: int) -> str:
-    """Write an age in its largest whole unit."""
+    """Format an age in its largest whole unit."""
     seconds = age_ns // NS_PER_S
     size, unit = next(((size, unit) for size, unit in _UNITS if abs(seconds) >= size), (1, "s"))
     return f"{seconds // size} {unit}"

@@ -1,1 +1,1 @@
-"""Commands on a measured yard: lifts, their reasons, changes between two, how it is shown and handed on."""
+"""Provide the commands on a measured yard: choose and explain lifts, compare, view and export it."""

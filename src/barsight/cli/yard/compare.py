@@ -23,22 +23,22 @@ from barsight.yard.inventory.changes import Change, compare_yards
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse, compare and print."""
+    """Parse the arguments, compare the yards and print the changes."""
 
     def command(
         old: tyro.conf.Positional[Path], new: tyro.conf.Positional[Path], json: Path | None = None,
         same_yard: bool = False,
     ) -> None:  # fmt: skip
-        """Say what changed between two measured yards: moved, settled, taken, added, in mm and kg.
+        """Report the changes between two measured yards: moved, settled, taken, added, in mm and kg.
 
-        A change counts as significant where chance would do as much in less than one case of a hundred, by
-        the sigmas of both.
+        A change counts as significant if, by the sigmas of both, its probability by chance is less than
+        one in a hundred.
 
         Args:
-            old: The earlier folder written by barsight measure.
+            old: The earlier folder of results from barsight measure.
             new: The later one.
             json: JSON file for all figures.
-            same_yard: Both frames are of one surveyed yard, though what places them differs, as after a
+            same_yard: Both frames are of one surveyed yard although their yard frames differ, as after a
                 recalibration.
         """
         frames = []

@@ -20,19 +20,19 @@ COLOUR = {"passed": "green", "failed": "red", "unknown": "red"}
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse, print and write."""
+    """Parse the arguments, print the explanation and write its page."""
 
     def command(
         folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")],
         lift: tyro.conf.Positional[str],
         out: Annotated[Path | None, tyro.conf.arg(aliases=("-o",))] = None,
     ) -> None:
-        """Tell why a lift is offered or refused: every check with its figure and bound, and a picture.
+        """Explain why a lift is offered or refused: every check with its figure and bound, and a picture.
 
         Args:
-            folder: A folder written by barsight measure.
+            folder: A folder of results from barsight measure.
             lift: The rank of an offered lift, like 3, or bundle:12 for the lift of bundle 12, offered or not.
-            out: HTML file for checks and picture; OUT/explain-LIFT.html if not given.
+            out: HTML file for checks and picture; by default OUT/explain-LIFT.html.
         """
         told = explain(folder, lift)
         target = out or folder / f"explain-{lift.replace(':', '-')}.html"

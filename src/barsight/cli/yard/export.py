@@ -13,14 +13,14 @@ from barsight.report.export import export
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse and write."""
+    """Parse the arguments and write the file."""
 
     def command(out: tyro.conf.Positional[Path], file: tyro.conf.Positional[Path]) -> None:
         """Write a measured cloud (.ply .pcd .las .laz .e57 .csv) or height map (.tif) for other programs.
 
         Args:
-            out: A folder written by barsight measure.
-            file: The file to write; its suffix names the format.
+            out: A folder of results from barsight measure.
+            file: The file to write; its suffix selects the format.
         """
         points = export(out, file)
         told = f" ({points} points)" if points else ""

@@ -22,7 +22,7 @@ from barsight.yard.label_settings import LabelSettings
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse, read and write."""
+    """Parse the arguments, read the labels and write them."""
 
     def command(
         recording: tyro.conf.Positional[Path],
@@ -32,20 +32,19 @@ def run(arguments: Sequence[str]) -> None:
         numbers: bool = False,
         reading: tyro.conf.OmitArgPrefixes[RecordingSettings] = RecordingSettings(),  # noqa: B008
     ) -> None:
-        """Read the codes on bundles' labels in a recording's pictures, and attach them to the bundles of its
-        result.
+        """Read the codes on labels in a recording's pictures, and assign them to the bundles of its result.
 
-        OUT/labels.json lists each text with its kind, its place, in how many pictures it was read, and the
-        bundle it lies on. DataMatrix, QR, Aztec, PDF417, Code 128 and Code 93 are read, whose own check
-        holds; a label is sure where two pictures or more read it alike. A module must be about two pixels
-        wide.
+        OUT/labels.json lists each text with its kind, its place, the number of pictures in which it was
+        read, and its bundle. DataMatrix, QR, Aztec, PDF417, Code 128 and Code 93 are read if their own
+        checksum is right; a label is certain if at least two pictures agree. A module must be about two
+        pixels wide.
 
         Args:
             recording: The recording that OUT was measured from.
-            out: A folder written by barsight measure; labels.json goes into it.
-            stock_list: CSV or JSON as bundles.stock_list takes it: labels that contradict it are named.
-            label_m: Length and width of a label: a bright plate of this size on a bundle that no picture
-                reads is called illegible; 0 0 looks for none.
+            out: A folder of results from barsight measure; labels.json is written to it.
+            stock_list: CSV or JSON as for bundles.stock_list; labels that contradict it are reported.
+            label_m: Length and width of a label in metres. A bright plate of this size on a bundle that no
+                picture reads is reported as illegible; 0 0 disables the search.
             numbers: Read plain numbers too, where no code is read (extra `numbers`, and Tesseract's
                 English data).
             reading: How to read the recording.

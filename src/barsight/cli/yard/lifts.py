@@ -43,12 +43,14 @@ from barsight.yard.types import Bundle, YardMap
 from barsight.yard.vetoes import Veto
 
 OTHER_UNIT = 500
-"""An event whose stamp is so many times smaller than the first frame's is stamped in us, ms or s."""
+"""Ratio of the first frame's stamp to an event's stamp above which the event is refused as stamped in us,
+ms or s.
+"""
 FETCH_REMEDY = "fetch another one, or measure again once its cause is gone"
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse, choose, write and print."""
+    """Parse the arguments, choose the lifts, write and print them."""
     default = load_settings(config_path(arguments), LiftSettings)
 
     def command(
@@ -61,21 +63,21 @@ def run(arguments: Sequence[str]) -> None:
         lifted: Annotated[tuple[int, ...], tyro.conf.arg(metavar="ID[,ID...]")] = (),
         events: Path | None = None,
     ) -> None:
-        """Choose lift targets anew from a measured yard, without measuring again.
+        """Choose lift targets again from a measured yard, without measuring it again.
 
         Writes OUT/lifts.json and OUT/report.html and prints the lifts, safest first.
 
         Args:
-            out: A folder written by barsight measure.
-            magnet: TOML file of the magnet (docs/how-to/describe-a-magnet.md). Without it nothing is offered.
-            settings: What a lift must fulfil.
-            config: TOML file with settings; flags go before it.
-            lifted: Bundles that were lifted since the yard was measured: what is near them is refused. Kept
-                in OUT/events.csv, which counts from then on.
-            events: CSV of what else was lifted, set down or passed by a magnet since; kept in the same file.
-            at: When lifts are judged: now, or at the end of the recording, to look back; never for a crane.
-            fetch: Bundles that are wanted: the lifts that dig the first of them out that can be, in order. A
-                plant is offered that order's first lift alone.
+            out: A folder of results from barsight measure.
+            magnet: TOML file of the magnet (docs/how-to/describe-a-magnet.md). Without it, none is offered.
+            settings: Requirements of a lift.
+            config: TOML file with settings; flags take precedence.
+            lifted: Bundles that were lifted since the yard was measured; lifts near them are refused. Kept in
+                OUT/events.csv, which applies to later runs too.
+            events: CSV of other lifts, set-downs and passes of a magnet since then; kept in the same file.
+            at: Time at which lifts are judged: now, or the recording's end for review, never for a crane.
+            fetch: Wanted bundles. Prints the sequence of lifts that digs out the first of them that can be
+                reached; a plant is only offered the first lift of that sequence.
         """
         described, folder = load_magnet(magnet), _open(out)
         _expect_bundles(out, folder, "--lifted", lifted)
@@ -108,7 +110,7 @@ def run(arguments: Sequence[str]) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _MeasuredFolder:
-    """A measured folder, opened. captured_to_ns: stamp of the last frame; contradicted: of `plan_lifts`."""
+    """An opened folder of results. contradicted: as `plan_lifts` takes it."""
 
     summary: dict[str, Any]
     identity: MapIdentity
@@ -143,7 +145,7 @@ def _open(out: Path) -> _MeasuredFolder:
 def _vetoes(
     folder: _MeasuredFolder, magnet: Magnet, settings: LiftSettings, now_ns: int, *, has_magnet: bool
 ) -> tuple[Veto, ...]:
-    """Gather what forbids every lift of the map."""
+    """Collect the vetoes that apply to every lift of the map."""
     warnings = [(str(w.get("code")), str(w.get("message"))) for w in folder.summary.get("warnings") or []]
     vetoes = map_vetoes(
         warnings, folder.reference, folder.captured_to_ns, now_ns, settings, has_magnet=has_magnet
@@ -159,7 +161,9 @@ def _vetoes(
 
 
 def _first_order(out: Path, folder: _MeasuredFolder, plan: LiftPlan, wanted: tuple[int, ...]) -> LiftOrder:
-    """Find the order of the first wanted bundle that can be dug out. Raises InputError where none can."""
+    """Find the lift order for the first wanted bundle that can be dug out. Raises InputError where none
+    can.
+    """
     reasons = []
     for number in wanted:
         order = order_lifts(number, folder.heights, folder.bundles, plan)
@@ -170,7 +174,7 @@ def _first_order(out: Path, folder: _MeasuredFolder, plan: LiftPlan, wanted: tup
 
 
 def print_order(order: LiftOrder, console: Console) -> None:
-    """Print the lifts that dig a bundle out, and that only the first is offered."""
+    """Print the sequence of lifts that digs a bundle out, and that only the first is offered."""
     table = Table(title=f"Lifts that fetch bundle {order.bundle}", box=SIMPLE_HEAD)
     for head in ("step", "bundle", "to x m", "y m", "z m", "yaw deg", "travel z m", ""):
         table.add_column(head, justify="right", no_wrap=True)
@@ -196,7 +200,7 @@ def _expect_bundles(out: Path, folder: _MeasuredFolder, flag: str, ids: tuple[in
 def _events(
     out: Path, folder: _MeasuredFolder, ids: tuple[int, ...], file: Path | None
 ) -> tuple[YardEvent, ...]:
-    """Gather what OUT/events.csv, a file and the ids of lifted bundles tell."""
+    """Collect the events from OUT/events.csv, a file and the ids of lifted bundles."""
     by_id, captured_ns = {bundle.id: bundle for bundle in folder.bundles}, folder.captured_ns
     known, told = kept_events(out), read_events(file) if file is not None else ()
     for path, events in ((out / "events.csv", known), (file, told)):
@@ -208,7 +212,7 @@ def _events(
 
 
 def _offset(magnet: Magnet) -> str:
-    """Say how far the magnet hangs from where the crane's readings say."""
+    """Describe the magnet's offset from where the crane's readings place it."""
     if magnet.offset is None:
         return "no touch-down told how the magnet hangs: its tolerance must hold that (calibrate magnet)"
     figures = zip("xyz", magnet.offset.place_m, magnet.offset.sigma_m, strict=True)
@@ -217,7 +221,7 @@ def _offset(magnet: Magnet) -> str:
 
 
 def print_lifts(plan: LiftPlan, console: Console) -> None:
-    """Print the offered lifts as a table, the vetoes as counts."""
+    """Print the offered lifts as a table and the vetoes as counts."""
     console.print(f"magnet: {escape(plan.magnet.name)}", highlight=False)
     console.print(_offset(plan.magnet), highlight=False)
     for veto in plan.vetoes:

@@ -13,13 +13,13 @@ from barsight.report.page import write_report
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse and write."""
+    """Parse the arguments and write the report."""
 
     def command(out: tyro.conf.Positional[Path]) -> None:
-        """Write report.html anew from the files of a measured yard.
+        """Write report.html again from the files of a measured yard.
 
         Args:
-            out: A folder written by barsight measure.
+            out: A folder of results from barsight measure.
         """
         path = out / "report.html"
         write_report(out, path)

@@ -12,14 +12,14 @@ from barsight.core.extras import extra
 
 
 def run(arguments: Sequence[str]) -> None:
-    """Parse and serve until Ctrl-C."""
+    """Parse the arguments and serve until Ctrl-C."""
 
     def command(out: tyro.conf.Positional[Path], port: int = 8080, browser: bool = True) -> None:
-        """Show a measured yard in 3D in the browser; works offline, Ctrl-C ends it.
+        """Show a measured yard in 3D in the browser until Ctrl-C; works offline.
 
         Args:
-            out: A folder written by barsight measure.
-            port: The port on this machine to serve at.
+            out: A folder of results from barsight measure.
+            port: Port on this machine to serve at.
             browser: Open the browser.
         """
         with extra("view"):
