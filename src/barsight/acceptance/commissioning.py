@@ -151,8 +151,8 @@ def _write_done(folder: Path, done: Sequence[DoneStep]) -> None:
 
 
 def _digest(folder: Path, names: Sequence[str], told: Sequence[object] = ()) -> str:
-    """Compute a digest of settings, files and folders. Of pictures, point clouds and files above 16 MiB, only
-    the size is used.
+    """Compute a digest of settings, files and folders. Of pictures, point clouds and files of 16 MiB or more,
+    only the size is used.
     """
     found: list[object] = [json_value(one) for one in told]
     for name in names:

@@ -47,9 +47,9 @@ class Decision(StrEnum):
 class JudgedQuantity:
     """A judged quantity.
 
-    errors: one per recording, in `unit` (NaN where not measured). error: the largest of them. uncertainty:
-    test value uncertainty [ISO/TS 23165]. limit, decision: as in `decide`. group: the limit's name in the
-    plan.
+    errors: one per recording, in `unit`, NaN where not measured. error: the largest in magnitude (for the
+    laser, the least equivalent), NaN where a recording lacks it. uncertainty: test value uncertainty [ISO/TS
+    23165]. limit, decision: as in `decide`. group: the limit's name in the plan.
     """
 
     name: str
