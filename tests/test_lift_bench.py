@@ -71,7 +71,7 @@ def test_the_judge_reads_the_magnet_as_the_product_does(tmp_path: Path) -> None:
     described.write_text(example_magnet(), encoding="utf-8")
     magnet, other = load_magnet(described), read_magnet(described)
     assert other.poles == pytest.approx(magnet.pole_table)
-    assert other.reach_m == magnet.reach_m and other.factor == magnet.safety_factor
+    assert other.reach_m == magnet.reach_m and other.factor == magnet.needed_factor
     assert other.carries_kg == min(magnet.capacity_kg, magnet.crane_capacity_kg - magnet.own_mass_kg)
     with pytest.raises(KeyError):
         magnet_of({"poles": []})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tomllib
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from barsight.benchmarks.lift_judge.judge import Judge, LiftVerdict, Target, cov
 from barsight.benchmarks.lift_judge.lowering import STEEPEST_PITCH, lower
 from barsight.benchmarks.lift_judge.magnet import magnet_of
 from barsight.simulation.worlds.solids import NOTHING, Solid, SolidYard, box, cylinder
+from barsight.yard.magnet.description import example_magnet
 
 MAGNET = magnet_of(
     {
@@ -21,8 +23,12 @@ MAGNET = magnet_of(
         "poles": [
             {"along_m": v, "across_m": 0.0, "length_m": 0.8, "width_m": 0.1} for v in (-1.0, 1.0)
         ],
+        "type": "electro", "battery_backup": True,
         "beam": {"length_m": 3.0, "width_m": 0.3, "above_faces_m": 0.3},
-        "pull": {"gap_m": [0.0, 0.01, 0.03], "kilopascal": [400.0, 200.0, 0.0]},
+        "pull": {
+            "gap_m": [0.0, 0.01, 0.03], "kilopascal": [400.0, 200.0, 0.0], "thickness_m": 0.03,
+            "grade_ratio": 1.0, "heat_ratio": 1.0, "duty_ratio": 1.0,
+        },
         "tolerance": {"x_m": 0.01, "y_m": 0.02, "yaw_deg": 0.2},
         "limits": {
             "pitch_deg": 3.0, "roll_deg": 6.0, "offset_along_m": 0.3, "offset_across_m": 0.04,
@@ -54,6 +60,29 @@ def test_a_level_plate_is_pulled_as_the_table_says_and_fine() -> None:
     assert verdict.pull_n == pytest.approx(2 * 0.8 * 0.1 * 400e3, rel=1e-6)
     assert verdict.figures["a pole's least gap, mm"] == pytest.approx(0.0, abs=1e-3)
     assert verdict.mass_kg == pytest.approx(7850 * math.pi * 0.0718**2 * 3.4)
+
+
+def test_one_bar_is_pulled_as_much_as_the_maker_says() -> None:
+    sheet = tomllib.loads(example_magnet())
+    thick = bar(0.0, 0.3, 0.05, 6.0)
+    verdict = Judge(SolidYard((thick,)), magnet_of(sheet)).judge(Target(0.0, 0.0, 0.0, NOWHERE))
+    # 100 mm: 0.55 of the thick plate's 800 kPa on four faces of 0.9 x 0.1 m, 0.9 of it by the grade.
+    assert verdict.pull_n == pytest.approx(0.55 * 0.9 * 800e3 * 4 * 0.9 * 0.1, rel=0.01)
+
+
+def test_bars_are_pulled_as_plates_pi_quarters_as_thick() -> None:
+    sheet = tomllib.loads(example_magnet())
+    del sheet["pull"]["round_diameter_m"], sheet["pull"]["round_ratio"]
+    gap = np.array([0.0, 0.0035, 0.05])
+    thick = magnet_of(sheet).bar_pressure(gap, 0.1, 0.1)
+    assert thick == pytest.approx([0.9 * 800e3, 0.9 * 635e3, 0.0])
+    half = magnet_of(sheet).bar_pressure(gap, 0.005 * 4 / math.pi, 0.1)
+    assert half == pytest.approx([0.25 * 0.9 * 150e3, 0.25 * 0.9 * 137.5e3, 0.0])
+    del sheet["pull"]["thickness_m"], sheet["pull"]["thin"], sheet["type"]
+    # Flux through both sides of a 20 mm plate at 1.6 T, over a face 0.1 m wide: 0.64 T.
+    unknown = magnet_of(sheet)
+    assert unknown.bar_pressure(gap[:1], 0.08 / math.pi, 0.1) == pytest.approx(0.9 * 0.64**2 / 8e-7 / math.pi)
+    assert unknown.factor == 3.0
 
 
 def test_seven_bars_weigh_what_their_sections_do() -> None:

@@ -217,16 +217,21 @@ class MagnetOnSolids:
     def _pulls(
         self, load: tuple[int, ...], rest: Rest, offset: tuple[float, float, float]
     ) -> tuple[Float64, dict[int, float], tuple[int, ...], Float64, float]:
-        """Integrate the pull over the faces at 1 mm, by pole and by whom it pulls."""
+        """Integrate the pull over the faces at 1 mm, by pole and by whom it pulls: the load by what its bars
+        let through, all else as a thick plate.
+        """
         faces, magnet, around = self._faces, self._magnet, self._around
         z, owner = faces.look(around.steel, around.owner, offset)
         gap = rest.at(faces.v, faces.u) - z
         poles = len(magnet.poles)
         area = magnet.poles[:, 2] * magnet.poles[:, 3] / np.bincount(faces.pole, minlength=poles)
         is_load = np.isin(owner, load)
-        near = is_load & (gap < magnet.reach_m)
-        newton = magnet.pressure(gap[near]) * area[faces.pole[near]]
-        pull = np.asarray(np.bincount(faces.pole[near], newton, poles), np.float64)
+        pull = np.zeros(poles)
+        for bundle in load:
+            diameter = min(2 * float(bar.half[1]) for bar in around.yard.bars(bundle))
+            for p, face in enumerate(magnet.poles[:, 2:].min(axis=1)):
+                of = gap[(owner == bundle) & (faces.pole == p)]
+                pull[p] += area[p] * magnet.bar_pressure(of, diameter, float(face)).sum()
         others, spare = dict[int, float](), list[int]()
         beside = ~is_load & (gap < magnet.reach_m + SPARE_REACH_M)
         for bundle in np.unique(owner[beside]).tolist():
