@@ -211,6 +211,25 @@ def test_a_bar_in_the_groove_of_two_lies_on_both_and_a_neighbour_on_neither() ->
     assert covered_width(SolidYard(tuple(below)), 0, (0,)) == 0.0
 
 
+def test_of_two_bundles_each_must_be_held() -> None:
+    low = plate(bundle=1, x=0.15, top=0.275)
+    yard = SolidYard((*(s.moved(np.array([-0.1, 0, 0])) for s in plate()), *low))
+    verdict = Judge(yard, MAGNET, 2).judge(Target(0.0, 0.0, 0.0, NOWHERE))
+    # A quarter of the faces is over the second one, 25 mm over it: 50 kPa.
+    held = 0.25 * 2 * 0.8 * 0.1 * 50e3 / (432.2 * 9.81)
+    assert verdict.figures["pull over weight"] == pytest.approx(held, rel=0.01)
+    assert any(one.startswith("pull over weight") for one in verdict.dangerous)
+
+
+def test_what_is_lifted_along_with_one_load_covers_another() -> None:
+    first = [s.moved(np.array([-0.125, 0, 0])) for s in plate()]
+    block = [bar(-0.02, 0.32, 0.02, 0.3, 2).moved(1.6 * Y)]
+    judge = Judge(SolidYard((*first, *plate(bundle=1, x=0.125), *block)), MAGNET, 2)
+    assert set(judge.judge(Target(-0.05, 3.0, 0.0, NOWHERE)).load) == {0, 2}
+    both = judge.judge(Target(0.0, 0.0, 0.0, NOWHERE))
+    assert set(both.load) == {0, 1} and any(one.startswith("covered") for one in both.dangerous)
+
+
 def test_a_turned_yard_is_judged_alike() -> None:
     beam = box("beam", np.array([0.3, 1.2, 0.31]), np.array([0.8, 0.1, 0.02]), 0.1)
     yard = SolidYard((*plate(), beam))

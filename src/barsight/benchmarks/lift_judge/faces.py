@@ -133,8 +133,8 @@ class Standing:
 
     rise_m: the highest of what isn't the load over the faces' plane as the load alone would carry it;
     stray_m: the same with STRAY_M around the faces, over the plane at rest. beam_m: the highest of anything
-    over the beam's underside. pull: (P,) N on the load; others: N on each other bundle, and on other steel
-    under NOTHING. spare: bundles within SPARE_REACH_M beyond the reach. gaps: (P,) the least to the load's
+    over the beam's underside. pull: (P,) N on the load; each: N on each bundle of it; others: on each other
+    one, and on other steel under NOTHING. spare: bundles within SPARE_REACH_M beyond the reach. gaps: (P,) the least to the load's
     steel. contact_share: of the faces on the load.
     """
 
@@ -143,6 +143,7 @@ class Standing:
     stray_m: float
     beam_m: float
     pull: Float64
+    each: dict[int, float]
     others: dict[int, float]
     spare: tuple[int, ...]
     gaps: Float64
@@ -216,7 +217,7 @@ class MagnetOnSolids:
 
     def _pulls(
         self, load: tuple[int, ...], rest: Rest, offset: tuple[float, float, float]
-    ) -> tuple[Float64, dict[int, float], tuple[int, ...], Float64, float]:
+    ) -> tuple[Float64, dict[int, float], dict[int, float], tuple[int, ...], Float64, float]:
         """Integrate the pull over the faces at 1 mm, by pole and by whom it pulls: the load by what its bars
         let through, all else as a thick plate.
         """
@@ -226,12 +227,13 @@ class MagnetOnSolids:
         poles = len(magnet.poles)
         area = magnet.poles[:, 2] * magnet.poles[:, 3] / np.bincount(faces.pole, minlength=poles)
         is_load = np.isin(owner, load)
-        pull = np.zeros(poles)
-        for bundle in load:
+        pull = np.zeros((len(load), poles))
+        for k, bundle in enumerate(load):
             diameter = min(2 * float(bar.half[1]) for bar in around.yard.bars(bundle))
             for p, face in enumerate(magnet.poles[:, 2:].min(axis=1)):
                 of = gap[(owner == bundle) & (faces.pole == p)]
-                pull[p] += area[p] * magnet.bar_pressure(of, diameter, float(face)).sum()
+                pull[k, p] = area[p] * magnet.bar_pressure(of, diameter, float(face)).sum()
+        each = dict(zip(load, pull.sum(axis=1).tolist(), strict=True))
         others, spare = dict[int, float](), list[int]()
         beside = ~is_load & (gap < magnet.reach_m + SPARE_REACH_M)
         for bundle in np.unique(owner[beside]).tolist():
@@ -240,4 +242,4 @@ class MagnetOnSolids:
             others[bundle] = float((magnet.pressure(gap[of]) * area[faces.pole[of]]).sum())
         gaps = np.array([gap[is_load & (faces.pole == p)].min(initial=np.inf) for p in range(poles)])
         share = float((is_load & (gap <= CONTACT_GAP_M)).mean())
-        return pull, others, tuple(spare), gaps, share
+        return pull.sum(axis=0), each, others, tuple(spare), gaps, share

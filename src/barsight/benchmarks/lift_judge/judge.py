@@ -11,7 +11,7 @@ every figure is within the second; between it is neither.
 | anything over the plane that the lift states, under faces within tolerance | > 15 mm | <= 10 mm |
 | anything over the beam's underside | > 0 | <= -30 mm |
 | pull on another bundle or on other steel, over the other's weight | >= 5 % | nothing within reach + 10 mm |
-| true pull over true weight | < the safety factor | >= 1.25 of it |
+| true pull over true weight, of each bundle of the load | < the safety factor | >= 1.25 of it |
 | a pole's pull over its share of the weight by moments | < 1 | >= 1.25 |
 | load over what magnet and crane carry | > 1 | <= 0.9 |
 | true mass over the upper bound that the lift states | > 1.25 | <= 1 |
@@ -94,7 +94,7 @@ class Judge:
 
     def __init__(self, yard: SolidYard, magnet: JudgedMagnet, wanted: int = 1) -> None:
         self._yard, self._magnet, self._wanted = yard, magnet, wanted
-        self._cover: dict[int, float] = {}
+        self._cover: dict[tuple[int, tuple[int, ...]], float] = {}
 
     def judge(self, target: Target) -> LiftVerdict:
         """Judge one placement."""
@@ -138,7 +138,8 @@ class Judge:
             heavy = OTHER_STEEL_N if bundle == NOTHING else PULLED_ALONG * self._weight(bundle)
             name = "pull on other steel" if bundle == NOTHING else f"pull on bundle {bundle}"
             checks.add(f"{name}, N", most, heavy, -1.0)
-        checks.bound_below("pull over weight", min(s.pull.sum() for s in stands) / weight, magnet.factor)
+        held = min(newton / self._weight(bundle) for s in stands for bundle, newton in s.each.items())
+        checks.bound_below("pull over weight", held, magnet.factor)
         worst = min(_pole_margin(s.pull, magnet.poles[:, 0], weight, float(centre[1])) for s in stands)
         checks.bound_below("a pole's pull over its share", worst, 1.0)
         slope = max(abs(math.atan(s.rest.pitch)) for s in stands)
@@ -167,9 +168,9 @@ class Judge:
         return self._yard.load(bundle)[0] * NEWTON_PER_KG
 
     def _covered(self, bundle: int, load: tuple[int, ...]) -> float:
-        if bundle not in self._cover:
-            self._cover[bundle] = covered_width(self._yard, bundle, load)
-        return self._cover[bundle]
+        if (bundle, load) not in self._cover:
+            self._cover[bundle, load] = covered_width(self._yard, bundle, load)
+        return self._cover[bundle, load]
 
 
 class _Checks:
