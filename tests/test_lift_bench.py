@@ -9,8 +9,10 @@ import pytest
 
 from barsight.benchmarks.lift_judge.envelopes import envelope
 from barsight.benchmarks.lift_judge.magnet import magnet_of, read_magnet
+from barsight.benchmarks.yard import world_runs
 from barsight.benchmarks.yard.drawn_worlds import drawn_scene, noisy_world, recording_settings
 from barsight.benchmarks.yard.judged_lifts import JudgedBench, bench_table, judge_yard, upper_bound
+from barsight.cli.bench import lifts
 from barsight.cli.bench.lifts import bench_lift_targets
 from barsight.core.errors import ConfigError
 from barsight.simulation.sensors import heights
@@ -81,6 +83,37 @@ def test_the_upper_bound_is_clopper_and_pearsons() -> None:
     assert upper_bound(0, 2995) == pytest.approx(1 - 0.05 ** (1 / 2995))
     assert upper_bound(2, 140) == pytest.approx(0.0443, abs=5e-4)
     assert upper_bound(3, 3) == 1.0
+
+
+def test_what_is_kept_is_done_again_for_other_sources_magnets_and_sizes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done = list[str]()
+
+    def make(name: str, made: Path) -> None:
+        done.append(name)
+        made.mkdir()
+
+    monkeypatch.setattr(lifts, "render_world", lambda _, out, full_size: make("rendered", out))
+    monkeypatch.setattr(lifts, "measure_into", lambda _, out, *a, **b: make("measured", out))
+    monkeypatch.setattr(lifts, "measured_world", lambda *_: noisy_world(draw_yard(4, 3, 1), LiftSettings()))
+    monkeypatch.setattr(lifts, "judge_yard", lambda *_: ())
+    short = tmp_path / "short.toml"
+    short.write_text(example_magnet().replace("2.1", "1.6"), encoding="utf-8")
+
+    def run(magnet: Path | None = None, *, full_size: bool = False) -> list[str]:
+        done.clear()
+        choice = lifts.YardChoice(rendered=True, full_size=full_size)
+        bench_lift_targets("4:5", choice, 0, keep=tmp_path / "kept", magnet=magnet)
+        return done.copy()
+
+    both = ["rendered", "measured"]
+    assert run() == both and run() == []
+    assert run(full_size=True) == both and run(short) == both and run(short) == []
+    monkeypatch.setattr(world_runs, "sources_digest", lambda _, names: str("yard" in names))
+    assert run(short) == both
+    monkeypatch.setattr(world_runs, "sources_digest", lambda _, names: "new" if "yard" in names else "False")
+    assert run(short) == ["measured"]
 
 
 @pytest.mark.parametrize("seeds", ["7", "9:9", "a:b"])

@@ -113,7 +113,12 @@ def test_a_world_is_done_once_and_a_refusal_is_a_score(
     def refuse(*_: object, **__: object) -> None:
         raise MeasurementError("too dark")
 
+    def full(*_: object, **__: object) -> None:
+        raise OutputError("no space left")
+
     keys = WorldKeys.of(GIVEN)
+    with pytest.raises(OutputError, match="no space"):
+        run_world(tmp_path, 101, GIVEN, keys, full, "")
     first = run_world(tmp_path, 101, GIVEN, keys, refuse, "")
     assert (first.seed, first.refused, first.looked_at) == (101, "too dark", "") and not first.maps
 

@@ -134,8 +134,8 @@ class Standing:
     rise_m: the highest of what isn't the load over the faces' plane as the load alone would carry it;
     stray_m: the same with STRAY_M around the faces, over the plane at rest. beam_m: the highest of anything
     over the beam's underside. pull: (P,) N on the load; each: N on each bundle of it; others: on each other
-    one, and on other steel under NOTHING. spare: bundles within SPARE_REACH_M beyond the reach. gaps: (P,) the least to the load's
-    steel. contact_share: of the faces on the load.
+    one, and on other steel under NOTHING. spare: bundles within SPARE_REACH_M beyond the reach. gaps: (P,)
+    the least to the load's steel. contact_share: of the faces on the load.
     """
 
     rest: Rest

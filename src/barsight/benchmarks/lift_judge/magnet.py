@@ -98,12 +98,12 @@ def magnet_of(description: Mapping[str, Any]) -> JudgedMagnet:
     """Take over a description that was read."""
     beam, limits, tolerance = (description[name] for name in ("beam", "limits", "tolerance"))
     pull = description["pull"]
-    thin = [(plate["thickness_m"], *plate["kilopascal"]) for plate in pull.get("thin", ())]
-    if pull.get("thickness_m") is not None:
-        thin.append((pull["thickness_m"], *pull["kilopascal"]))
-    plates = np.array(thin, np.float64).reshape(-1, 1 + len(pull["gap_m"])) * [1.0, *[1e3] * len(pull["gap_m"])]
+    sheets = [*pull.get("thin", ()), pull] if pull.get("thickness_m") is not None else []
+    plates = np.array([(sheet["thickness_m"], *sheet["kilopascal"]) for sheet in sheets], np.float64)
+    plates = plates.reshape(-1, 1 + len(pull["gap_m"]))
+    plates[:, 1:] *= 1e3
     rounds = [pull.get(name, ()) for name in ("round_diameter_m", "round_ratio")]
-    least = 0.0 if description.get("type") else UNTYPED_FACTOR
+    min_factor = 0.0 if description.get("type") else UNTYPED_FACTOR
     names = ("along_m", "across_m", "length_m", "width_m")
     poles = [[pole[name] for name in names] for pole in description["poles"]]
     return JudgedMagnet(
@@ -113,7 +113,7 @@ def magnet_of(description: Mapping[str, Any]) -> JudgedMagnet:
         plates=plates,
         rounds=np.column_stack([np.asarray(column, np.float64) for column in rounds]),
         left=math.prod(pull.get(name, default) for name, default in LEFT_OUT.items()),
-        factor=max(description["safety_factor"], least),
+        factor=max(description["safety_factor"], min_factor),
         carries_kg=min(
             description["capacity_kg"], description["crane_capacity_kg"] - description["own_mass_kg"]
         ),

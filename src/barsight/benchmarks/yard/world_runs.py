@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -39,11 +39,11 @@ class WorldKeys:
     score: str
 
     @classmethod
-    def of(cls, given: SimulationSettings) -> WorldKeys:
-        """Compute them from the settings and the package's sources."""
+    def of(cls, given: object, draws: Sequence[str] = DRAWS) -> WorldKeys:
+        """Compute them from the settings and the package's sources; draws: those that decide a recording."""
         root = Path(barsight.__file__).parent
         measuring = [path.name for path in root.iterdir() if path.name not in (*MEASURES_NOT, "__pycache__")]
-        drawn = json_digest([GENERATOR, json_value(given), sources_digest(root, DRAWS)])
+        drawn = json_digest([GENERATOR, json_value(given), sources_digest(root, draws)])
         measured = json_digest([drawn, sources_digest(root, measuring)])
         return cls(drawn, measured, json_digest([measured, sources_digest(root, SCORES)]))
 
@@ -58,24 +58,12 @@ def run_world(
     folder that is not of this bench.
     """
     folder = keep / f"seed_{seed}"
-    folder.mkdir(parents=True, exist_ok=True)
-    note = _read_note(folder)
-    recording, out = folder / "recording", folder / "measured"
+    note = read_note(folder)
     note["looked_at"] = looked_at or note.get("looked_at", "") or looked_at_list().get(seed, "")
-    if note.get("recording") != keys.recording:
-        _remove(recording, out)
-        note = {"looked_at": note["looked_at"], "recording": keys.recording}
-    if not recording.is_dir():
-        simulate_world(recording, draw_world(seed, given))
-    if note.get("measured") != keys.measured:
-        _remove(out)
-        note |= {"refused": "", "score": ""}
-        try:
-            measure(recording, out)
-        except BarsightError as error:
-            note["refused"] = str(error)
-        note["measured"] = keys.measured
-        _write_note(folder, note)
+    note = keep_measured(
+        folder, note, keys, lambda recording: simulate_world(recording, draw_world(seed, given)), measure
+    )
+    recording, out = folder / "recording", folder / "measured"
     done = None if note["refused"] else out
     if note.get("score") != keys.score:
         score = score_world(recording, done, note["looked_at"], note["refused"])
@@ -83,6 +71,34 @@ def run_world(
     note["scores"]["looked_at"] = note["looked_at"]
     _write_note(folder, note)
     return _score(note["scores"])
+
+
+def keep_measured(
+    folder: Path, note: dict[str, Any], keys: WorldKeys, render: Callable[[Path], object], measure: Measure
+) -> dict[str, Any]:
+    """Render `recording` and measure it into `measured`, in a folder, but for what is kept there by these
+    keys.
+
+    note: of `read_note`. Returns it as it has become: `refused` says why the product refused to measure.
+    """
+    recording, out = folder / "recording", folder / "measured"
+    if note.get("recording") != keys.recording:
+        _remove(recording, out)
+        note = {"looked_at": note.get("looked_at", ""), "recording": keys.recording}
+    if not recording.is_dir():
+        render(recording)
+    if note.get("measured") != keys.measured:
+        _remove(out)
+        note |= {"refused": "", "score": ""}
+        try:
+            measure(recording, out)
+        except OutputError:
+            raise
+        except BarsightError as error:
+            note["refused"] = str(error)
+        note["measured"] = keys.measured
+        _write_note(folder, note)
+    return note
 
 
 def looked_at_list() -> dict[int, str]:
@@ -96,7 +112,11 @@ def looked_at_list() -> dict[int, str]:
     }
 
 
-def _read_note(folder: Path) -> dict[str, Any]:
+def read_note(folder: Path) -> dict[str, Any]:
+    """Read the note on what is kept in a folder, which is made where it isn't there. Raises OutputError for
+    one that is not of these benches.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
     path = folder / NOTE
     if not path.is_file():
         if any(one.name not in ("recording", "measured") for one in folder.iterdir()):

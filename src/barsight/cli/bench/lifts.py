@@ -24,16 +24,20 @@ from barsight.benchmarks.yard.judged_lifts import (
     dangerous_table,
     judge_yard,
 )
+from barsight.benchmarks.yard.world_runs import DRAWS, WorldKeys, keep_measured, read_note
 from barsight.cli.bench.seeds import over_seeds, parse_seeds
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
-from barsight.core.errors import ConfigError
+from barsight.core.errors import ConfigError, MeasurementError
 from barsight.core.json_values import write_json
 from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings
 from barsight.simulation.worlds.yards import DrawnYard
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.magnet.description import Magnet, example_magnet, load_magnet
+
+DRAWN_BY = (*DRAWS, "benchmarks/yard/drawn_worlds.py", "benchmarks/lift_judge/magnet.py")
+"""Sources that decide what a seed's recording is."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +79,8 @@ def bench_lift_targets(
         placements: Number of random placements on each yard, in addition to the offered lifts.
         danger_placements: Number of further placements on each yard, of which only those without a veto are
             judged, to bound the rate of dangerous ones in less time.
-        keep: Folder for the rendered yards; yards already finished there are not repeated.
+        keep: Folder for the rendered yards; yards already finished there are not repeated, unless the
+            sources or settings that they depend on have changed.
         magnet: TOML file of the magnet; an example magnet by default.
         workers: Number of yards processed at a time, each in a process of its own.
         scheduler: Address of a Dask scheduler, tcp://HOST:PORT, whose workers are used instead; they share
@@ -93,12 +98,13 @@ def bench_lift_targets(
         described_at = magnet or Path(scratch) / "magnet.toml"
         if magnet is None:
             described_at.write_text(example_magnet(), encoding="utf-8")
+        judged = read_magnet(described_at)
         given = _Given(
-            (keep or Path(scratch)).absolute(), load_magnet(described_at), read_magnet(described_at),
-            placements, danger_placements, choice,
+            (keep or Path(scratch)).absolute(), load_magnet(described_at), judged, placements,
+            danger_placements, choice, WorldKeys.of((judged.half_span_m, choice.full_size), DRAWN_BY),
         )  # fmt: skip
-        for seed, judged in over_seeds(_judge_seed, numbers, given, workers, scheduler):
-            found[seed] = judged
+        for seed, lifts in over_seeds(_judge_seed, numbers, given, workers, scheduler):
+            found[seed] = lifts
             advance("yards", len(found), len(numbers))
             if save is not None:
                 write_json(save, _bench(found))
@@ -110,8 +116,9 @@ def bench_lift_targets(
 
 @dataclass(frozen=True)
 class _Given:
-    """Settings that all seeds share. magnet, judged: the magnet as the product and as the judge read its
-    file.
+    """Settings that all seeds share.
+
+    magnet, judged: the magnet as the product and as the judge read its file. keys: of the kept results.
     """
 
     keep: Path
@@ -120,6 +127,7 @@ class _Given:
     placements: int
     danger_placements: int
     choice: YardChoice
+    keys: WorldKeys
 
 
 def _bench(found: dict[int, tuple[JudgedLift, ...]]) -> JudgedBench:
@@ -131,19 +139,26 @@ def _judge_seed(seed: int, given: _Given) -> tuple[JudgedLift, ...]:
     settings, folder = LiftSettings(), given.keep / f"{kind or 'seed'}_{seed}"
     world = judged_yard(seed, given.judged, kind)
     if given.choice.rendered:
-        mapped = _measured(world, folder, settings, given.choice.full_size)
+        mapped = _measured(world, folder, settings, given)
     else:
         mapped = noisy_world(world, settings)
     counts = given.placements, given.danger_placements
     return tuple(judge_yard(world, mapped, given.magnet, given.judged, settings, *counts))
 
 
-def _measured(world: DrawnYard, folder: Path, settings: LiftSettings, full_size: bool) -> MappedWorld:
-    """Render and measure the yard where its folders don't exist yet."""
-    recording, out = folder / "recording", folder / "measured"
-    folder.mkdir(parents=True, exist_ok=True)
-    if not recording.is_dir():
-        render_world(world, recording, full_size=full_size)
-    if not (out / "result.json").is_file():
-        measure_into(recording, out, MeasureSettings(), report=False, judged_at="end")
-    return measured_world(out, settings)
+def _measured(world: DrawnYard, folder: Path, settings: LiftSettings, given: _Given) -> MappedWorld:
+    """Render and measure the yard where its folder doesn't keep it. Raises MeasurementError where it can't be
+    measured.
+    """
+    full_size = given.choice.full_size
+    note = keep_measured(
+        folder, read_note(folder), given.keys,
+        lambda recording: render_world(world, recording, full_size=full_size), _measure,
+    )  # fmt: skip
+    if note["refused"]:
+        raise MeasurementError(f"bench lifts: seed {world.seed} can't be measured: {note['refused']}")
+    return measured_world(folder / "measured", settings)
+
+
+def _measure(recording: Path, out: Path) -> None:
+    measure_into(recording, out, MeasureSettings(), report=False, judged_at="end")
