@@ -118,7 +118,8 @@ def test_orderly_yards_hold_whole_bundles_of_one_sort() -> None:
                 away = np.sort(np.hypot(*one.cross_m.T)) / one.diameter_m
                 assert len(away) in (7, 19, 37, 61)
                 assert away[0] < 1e-6 and away[1:7] == pytest.approx(1.001, abs=1e-6)
-                assert one.length_m >= 0.97 * max(o.length_m for o in own)
+                # Cut to 2 %, of which uneven ends take up to 0.13 m on the average.
+                assert one.length_m >= 0.97 * max(o.length_m for o in own) - 0.15
     assert kind_of(seed) != ORDERLY and draw_yard(5, 2.0, 2.4).kind == KINDS[5]
 
 
@@ -139,6 +140,19 @@ def _expect_apart(bundles: list[DrawnBundle], y: float) -> None:
         packs.append(BarPack(b.cross_m + np.array([side + bow, at[2]]), b.diameter_m / 2))
     if len(packs) > 1:
         assert deepest_overlap(packs) < 0.002
+
+
+def test_bundles_end_where_their_bars_do_on_the_average() -> None:
+    world = draw_yard(23, 5.0, 3.5)
+    straight = [b for b in world.bundles if len(world.yard.bars(b.number)) == len(b.cross_m)]
+    assert len(straight) > 5
+    for b in straight:
+        along = np.array([-math.sin(b.yaw_rad), math.cos(b.yaw_rad), 0.0])
+        ends = [
+            [(bar.centre + s * bar.half[0] * bar.axes[0] - b.centre_m) @ along for s in (-1, 1)]
+            for bar in world.yard.bars(b.number)
+        ]  # fmt: skip
+        assert np.mean(ends, axis=0) == pytest.approx([-b.length_m / 2, b.length_m / 2], abs=1e-6)
 
 
 def test_the_same_seed_draws_the_same_world() -> None:

@@ -159,8 +159,9 @@ def _placed(
     solids, bundles = list(pile.others), []
     for k, one in enumerate(pile.lying):
         number = first[0 if one.strapped else 1] + k
-        solids += _bars(one, number, rng)
-        bundles.append(_described(pile.manner, one, number, section, yaw))
+        made = _bars(one, number, rng)
+        solids += made
+        bundles.append(_described(pile.manner, one, made, section, yaw))
     layer = max(one.layer for one in pile.lying) + 1
     for k, bar in enumerate(pile.crossing):
         number = first[1] + len(pile.lying) + k
@@ -174,12 +175,21 @@ def _placed(
     return [s.turned(yaw) for s in solids], bundles
 
 
-def _described(manner: Manner, one: Lying, number: int, section: int, yaw: float) -> DrawnBundle:
+def _described(manner: Manner, one: Lying, made: list[Solid], section: int, yaw: float) -> DrawnBundle:
+    """Describe a bundle by its solids: it ends where its bars do on the average, as a simulated stock's does,
+    not where they were to be cut.
+    """
     middle = one.pack.cross.mean(axis=0)
-    centre = turn_about_z(yaw) @ np.array([middle[0], one.y, middle[1]])
+    turn = turn_about_z(one.yaw)
+    at = np.array([middle[0], one.y, middle[1]])
+    pieces = [s for s in made if s.part == "bar"]
+    ends = np.array([(s.centre - at) @ turn[:, 1] + (-s.half[0], s.half[0]) for s in pieces])
+    ends = ends.reshape(len(one.pack.cross), -1, 2)
+    low, high = float(ends[..., 0].min(axis=1).mean()), float(ends[..., 1].max(axis=1).mean())
+    centre = turn_about_z(yaw) @ (at + (low + high) / 2 * turn[:, 1])
     return DrawnBundle(
-        number, section, one.layer, manner, centre, yaw + one.yaw, one.pack.cross - middle,
-        2 * one.pack.radius, one.length, one.bow,
+        made[0].bundle, section, one.layer, manner, centre, yaw + one.yaw, one.pack.cross - middle,
+        2 * one.pack.radius, high - low, one.bow,
     )  # fmt: skip
 
 
@@ -192,7 +202,7 @@ def _bars(one: Lying, number: int, rng: np.random.Generator) -> list[Solid]:
     cross = one.pack.cross - (centre[0], 0.0)
     solids = []
     for x, z in cross:
-        # The ends of bars that were cut alike stand apart; the longest bars reach both ends.
+        # The ends of bars that were cut alike stand apart.
         short, shift = rng.uniform(0, 1, 2) * one.uneven
         begin, end = -one.length / 2 + shift * 0.3, one.length / 2 - short
         at = middle + x * axes[0] + z * axes[2]
