@@ -1,5 +1,6 @@
 """Scores against a fabricated truth: zero for an exact map, the right figures for known errors."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -74,6 +75,20 @@ def written(out: Path, error_mm: float = 0.0, sigma_m: float = 0.005, hole: slic
     contour = Contour(0, X, X * 0 + 0.1, profile, profile * 0 + sigma_m, source)
     write_contours((contour,), out / "contour.csv")
     return out
+
+
+def test_a_contour_at_another_y_is_not_held_against_a_profile_of_its_number(
+    recording: Path, tmp_path: Path
+) -> None:
+    out = written(tmp_path / "out")
+    z = heights(X, np.array(-0.2))
+    vision = np.full(X.size, HeightSource.VISION, np.uint8)
+    other = Contour(0, X, X * 0 - 0.2, z, z * 0 + 0.005, vision)
+    write_contours((other,), out / "contour.csv")
+    assert "contour, everywhere" not in score_folder(recording, out)
+    profile = heights(X, np.array(0.1))
+    write_contours((other, replace(other, profile=1, y_m=X * 0 + 0.1, z_m=profile)), out / "contour.csv")
+    assert score_folder(recording, out)["contour, everywhere"]["max_mm"] < 0.1
 
 
 def test_an_exact_map_has_no_error(recording: Path, tmp_path: Path) -> None:
