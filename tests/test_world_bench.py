@@ -76,6 +76,9 @@ def test_a_mass_is_held_against_the_true_bars() -> None:
     )  # fmt: skip
     scores = score_bundles((found,), (true,))
     assert scores.found == 1 and 1e3 * scores.errors["mass"][0] == pytest.approx(-30)
+    # A diameter of another packing is an error like any.
+    thick = score_bundles((replace(found, bar_diameter_m=3 * found.bar_diameter_m),), (true,))
+    assert thick.errors["diameter"][0] == pytest.approx(2 * found.bar_diameter_m)
 
 
 def test_poses_are_scored_on_the_ground_below(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -235,9 +235,6 @@ def _errors(found: Bundle, true: TrueBundle) -> dict[str, tuple[float, float]]:
         "diameter": (found.bar_diameter_m - true.bar_diameter_m, sigma.bar_diameter_m),
         "mass": ((mass.kg - true.mass_kg) / 1e3, mass.sigma_kg / 1e3),
     }
-    across = [round(one.width_m / one.bar_diameter_m) for one in (found, true)]
-    if across[0] != across[1]:  # another packing
-        out["diameter"] = (float("nan"), float("nan"))
     for k, name in enumerate(("low end", "high end")):
         side = (-1, 1)[k] * flip
         error = float((found.ends_m[k] - true.centre_m) @ along) - side * true.length_m / 2
