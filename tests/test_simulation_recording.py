@@ -252,8 +252,23 @@ def test_bars_lie_beside_and_above_each_other(bars: str) -> None:
         for bundle in above:
             lowest = bundle.centre_m[2] + bundle.cross_m[:, 1].min() - bundle.kind.diameter_m / 2
             assert lowest >= max(b.top_z_m for b in bundles) + settings.yard.dunnage_m - 1e-9
-        covered = [b for b in bundles if not b.on_top]
-        assert all(any(abs(a.centre_m[0] - b.centre_m[0]) < b.radius_m for a in above) for b in covered)
+
+
+def test_nothing_lies_over_what_lies_on_top() -> None:
+    """Seen from above 20 mm of it and more would show over skewed bundles that it crosses."""
+    for seed, yard in ((3, YardSettings(max_layers=3, skew_deg=1.5)), (4, YardSettings(crossed_ratio=1.0))):
+        stock = stack_yard(replace(SMALL, length_m=8, yard=yard), np.random.default_rng(seed))
+        for one in stock.bundles:
+            covered = False
+            for other in stock.bundles:
+                if other.section != one.section or other.layer <= one.layer:
+                    continue
+                along = np.linspace(-0.5, 0.5, 400) * other.length_m
+                for u in (np.linspace(-0.5, 0.5, 40) * (other.width_m - 0.02)).tolist():
+                    at = other.centre_m + u * other.axes[0] + along[:, None] * other.axes[1] - one.centre_m
+                    beside = np.abs(at @ one.axes[0]) < one.width_m / 2 - 0.01
+                    covered |= bool((beside & (np.abs(at @ one.axes[1]) < one.length_m / 2 - 0.01)).any())
+            assert covered is not one.on_top
 
 
 def test_top_z_is_the_height_of_the_surface_there() -> None:

@@ -7,17 +7,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from barsight.core.files import atomic_directory
 from barsight.simulation.settings.recording import SimulationSettings
 from barsight.simulation.settings.travel import PassesSettings
 from barsight.simulation.simulate import LaidYard, World, lay_stock, simulate, stream
-from barsight.simulation.stock import StackedBundle, Stock, stack_yard
+from barsight.simulation.stock import StackedBundle, Stock, covers, stack_yard
 
 MOVED_M = 0.5
-OVER_M = 0.02
-"""Bundles that overlap by less, seen from above, don't lie on each other."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,15 +100,7 @@ def _lay(stock: Stock, gone: set[int], settings: SimulationSettings) -> LaidYard
     """Lay a stock without those that are gone: what carried them lies on top then."""
     there = [b for k, b in enumerate(stock.bundles) if k not in gone]
     bundles = tuple(
-        replace(b, on_top=b.on_top or not any(_covers(o, b) for o in there)) if gone else b
+        replace(b, on_top=b.on_top or not any(covers(o, b) for o in there)) if gone else b
         for b in stock.bundles
     )
     return lay_stock(replace(stock, bundles=bundles), settings, gone)
-
-
-def _covers(over: StackedBundle, under: StackedBundle) -> bool:
-    """Check whether one bundle of a section lies over another, by their places across."""
-    if over.section != under.section or over.layer <= under.layer:
-        return False
-    apart = float(np.abs((over.centre_m - under.centre_m) @ under.axes[0]))
-    return apart < over.radius_m + under.radius_m - OVER_M

@@ -16,6 +16,8 @@ END_CLEARANCE_M = 0.004
 OVER_EDGE_M = 0.25
 """How far a crossed bundle may reach beyond those that carry it: sections lie further apart."""
 MIN_CROSSED_M = 0.8
+OVER_M = 0.02
+"""Bundles that overlap by less, seen from above, don't lie on each other."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +44,11 @@ class StackedBundle:
     def radius_m(self) -> float:
         """Return the radius of the circle around its bars."""
         return _radius(self.kind)
+
+    @property
+    def width_m(self) -> float:
+        """Return the width seen from above."""
+        return float(np.ptp(self.cross_m[:, 0])) + self.kind.diameter_m
 
     @property
     def top_z_m(self) -> float:
@@ -134,11 +141,10 @@ def _section(
             placed.append(_bundle((section, layer, column), kind, (x, y, base), yaw, length, ribbed, rng))
         layers.append(placed)
         base = max(bundle.top_z_m for bundle in placed)
-    bundles = [_covered(b, layers) for placed in layers for b in placed]
     if yard.crossed_ratio > 0 and rng.random() < yard.crossed_ratio:
-        over = _crossed(layers[-1], base, rng)
-        bundles = [replace(b, on_top=b.on_top and not _overlap(b, over)) for b in bundles] + [over]
-    return bundles, beams
+        layers.append([_crossed(layers[-1], base, rng)])
+    placed = [bundle for layer_placed in layers for bundle in layer_placed]
+    return [replace(b, on_top=not any(covers(over, b) for over in placed)) for b in placed], beams
 
 
 def _columns(
@@ -236,29 +242,24 @@ def _crossed(carriers: list[StackedBundle], base: float, rng: np.random.Generato
     y = float(rng.uniform(-0.2, 0.2)) * first.length_m
     number = (first.section, first.layer + 1, -1)
     place = ((low + high) / 2, y, base)
-    return replace(_bundle(number, first.kind, place, yaw, length, first.ribbed, rng), on_top=True)
+    return _bundle(number, first.kind, place, yaw, length, first.ribbed, rng)
 
 
-def _overlap(one: StackedBundle, other: StackedBundle) -> bool:
-    """Check whether the middle halves, which touch, meet seen from above: no axis of either
-    separates them.
+def covers(over: StackedBundle, under: StackedBundle) -> bool:
+    """Check whether one bundle of a section lies over another, seen from above: no axis of either separates
+    them but for OVER_M.
     """
-    away = one.centre_m - other.centre_m
-    for axis in (*one.axes[:2], *other.axes[:2]):
+    if over.section != under.section or over.layer <= under.layer:
+        return False
+    away = over.centre_m - under.centre_m
+    for axis in (*over.axes[:2], *under.axes[:2]):
         reach = sum(
-            abs(axis @ b.axes[0]) * b.radius_m / 2 + abs(axis @ b.axes[1]) * b.length_m / 2
-            for b in (one, other)
+            abs(axis @ b.axes[0]) * b.width_m / 2 + abs(axis @ b.axes[1]) * b.length_m / 2
+            for b in (over, under)
         )
-        if abs(away @ axis) >= reach:
+        if abs(away @ axis) > reach - OVER_M:
             return False
     return True
-
-
-def _covered(bundle: StackedBundle, layers: list[list[StackedBundle]]) -> StackedBundle:
-    above = layers[bundle.layer + 1] if bundle.layer + 1 < len(layers) else []
-    reach = bundle.radius_m
-    covered = any(abs(other.centre_m[0] - bundle.centre_m[0]) < reach for other in above)
-    return replace(bundle, on_top=not covered)
 
 
 def _dunnage(
