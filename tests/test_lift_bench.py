@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +10,16 @@ import pytest
 
 from barsight.benchmarks.lift_judge.envelopes import envelope
 from barsight.benchmarks.lift_judge.magnet import magnet_of, read_magnet
+from barsight.benchmarks.provenance import provenance
 from barsight.benchmarks.yard import world_runs
 from barsight.benchmarks.yard.drawn_worlds import drawn_scene, noisy_world, recording_settings
-from barsight.benchmarks.yard.judged_lifts import JudgedBench, bench_table, judge_yard, upper_bound
+from barsight.benchmarks.yard.judged_lifts import (
+    JudgedBench,
+    JudgedLift,
+    bench_table,
+    judge_yard,
+    upper_bound,
+)
 from barsight.cli.bench import lifts
 from barsight.cli.bench.lifts import bench_lift_targets
 from barsight.core.errors import ConfigError
@@ -114,6 +122,21 @@ def test_what_is_kept_is_done_again_for_other_sources_magnets_and_sizes(
     assert run(short) == both
     monkeypatch.setattr(world_runs, "sources_digest", lambda _, names: "new" if "yard" in names else "False")
     assert run(short) == ["measured"]
+
+
+def test_a_hundred_placements_on_one_yard_are_not_a_hundred_yards() -> None:
+    """Of yards with a danger, which half of their placements have, one in ten: the bound holds in 95 %."""
+    one = JudgedLift(0, "", False, 0, 0, 0, (), (), (), 1, 1, 1, 1, 1)
+    rng, held, made = np.random.default_rng(5), 0, provenance()
+    for _ in range(100):
+        lifts = [
+            replace(one, seed=seed, dangerous=("over",) * (is_bad and k % 2))
+            for seed, is_bad in enumerate((rng.random(16) < 0.1).tolist()) for k in range(10)
+        ]  # fmt: skip
+        told = str(list(bench_table(JudgedBench(16, tuple(lifts), made)).columns[1].cells)[1])
+        assert "of 16 yards" in told
+        held += float(told.split("bound ")[1].split(" %")[0]) >= 5.0
+    assert held >= 95
 
 
 @pytest.mark.parametrize("seeds", ["7", "9:9", "a:b"])

@@ -169,11 +169,12 @@ def bench_table(bench: JudgedBench) -> Table:
         abs(one.stated_mass_kg - one.true_mass_kg) <= TWO_SIDED * one.stated_sigma_kg
         for one in free if math.isfinite(one.stated_mass_kg)
     ]  # fmt: skip
-    yards = len({one.seed for one in bad})
+    yards, held = (len({one.seed for one in part}) for part in (bad, free))
     for name, value in (
         ("without a veto", f"{len(free)}, {sum(one.offered for one in free)} of them offered"),
-        ("of these dangerous", f"{_share(len(bad), len(free))}, on {yards} yards; 95 % upper bound "
-         f"{100 * upper_bound(len(bad), len(free)):.2f} %"),
+        # Placements on one yard fail together: only yards count as independent.
+        ("of these dangerous", f"{_share(len(bad), len(free))}, on {yards} of {held} yards; 95 % upper bound "
+         f"{100 * upper_bound(yards, held):.1f} % of such yards"),
         ("offered and dangerous", f"{sum(one.offered for one in bad)}"),
         ("why dangerous", _counts(reasons)),
         ("neither dangerous nor fine", f"{len(free) - len(bad) - sum(one.is_fine for one in free)}"),
