@@ -36,7 +36,7 @@ from barsight.simulation.worlds.yards import DrawnYard
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.magnet.description import Magnet, example_magnet, load_magnet
 
-DRAWN_BY = (*DRAWS, "benchmarks/yard/drawn_worlds.py", "benchmarks/lift_judge/magnet.py")
+DRAWN_BY = (*DRAWS, "benchmarks/yard/drawn_worlds.py")
 """Sources that decide what a seed's recording is."""
 
 
