@@ -125,7 +125,7 @@ def test_what_is_kept_is_done_again_for_other_sources_magnets_and_sizes(
 
 
 def test_a_hundred_placements_on_one_yard_are_not_a_hundred_yards() -> None:
-    """Of yards with a danger, which half of their placements have, one in ten: the bound holds in 95 %."""
+    """A tenth of the yards hold a danger in half of their placements: the bound holds in 95 %."""
     one = JudgedLift(0, "", False, 0, 0, 0, (), (), (), 1, 1, 1, 1, 1)
     rng, held, made = np.random.default_rng(5), 0, provenance()
     for _ in range(100):

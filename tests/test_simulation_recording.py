@@ -255,7 +255,7 @@ def test_bars_lie_beside_and_above_each_other(bars: str) -> None:
 
 
 def test_nothing_lies_over_what_lies_on_top() -> None:
-    """Seen from above 20 mm of it and more would show over skewed bundles that it crosses."""
+    """A bundle is free where no other of its section hides 20 mm of it from above, along all of it."""
     for seed, yard in ((3, YardSettings(max_layers=3, skew_deg=1.5)), (4, YardSettings(crossed_ratio=1.0))):
         stock = stack_yard(replace(SMALL, length_m=8, yard=yard), np.random.default_rng(seed))
         for one in stock.bundles:
