@@ -14,8 +14,9 @@ from barsight.core.errors import ConfigError, InputError
 from barsight.core.records.heights import HeightSource
 from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.passes.changes import PlaceHistory
-from barsight.mapping.passes.joined_surface import PassSurface
+from barsight.mapping.passes.joined_surface import PassSurface, join_surfaces
 from barsight.mapping.passes.slides import SeenBundle, find_moves
+from barsight.mapping.surface.cloud import CloudPart
 from barsight.mapping.surface.surface import Layers, write_tile
 from barsight.mapping.surface.tile_figures import gather_surface, tile_figures
 from barsight.mapping.top_photo import TopPhoto
@@ -237,6 +238,36 @@ def test_what_was_moved_along_itself_or_exchanged_is_told_by_its_picture(tmp_pat
     said = [notice.message for notice in joined.notices()]
     assert said[0].endswith("around x 2.00, y 5.00 m was moved 0.50 m along itself towards +Y")
     assert said[1].endswith("was moved 0.30 m along itself towards -Y") and "exchanged" in said[2]
+
+
+def one_tile(folder: Path, z_m: np.ndarray, views: int, since: int) -> PassSurface:
+    """A pass over one tile, all of it seen by so many views."""
+    same = np.ones_like(z_m)
+    layers = Layers(z_m, 0.003 * same, views * same, same.astype(np.uint8), 100 * same)
+    folder.mkdir()
+    write_tile(folder, (0, 0), layers)
+    none = np.empty(0, np.float32)
+    CloudPart(
+        none.reshape(0, 3), none.astype(np.uint8), none, none, none.astype(np.int32), none.astype(bool)
+    ).write(folder, (0, 0))
+    return PassSurface(
+        gather_surface(folder, CELL_M, {(0, 0): tile_figures((0, 0), layers)}), NO_CORRECTION, since
+    )
+
+
+@pytest.mark.parametrize(("since", "shown_m"), [(1, 0.38), (0, 0.3)], ids=["later", "at-one-time"])
+def test_a_bar_laid_across_since_stands_however_often_the_older_pass_saw_the_place(
+    tmp_path: Path, since: int, shown_m: float
+) -> None:
+    """It is too narrow for a change. Of two pairs of one time the one with more views counts."""
+    before = np.full((256, 256), 0.3, np.float32)
+    after = before.copy()
+    after[:, 100:108] += np.float32(0.08)
+    passes = [one_tile(tmp_path / "a", before, 20, 0), one_tile(tmp_path / "b", after, 5, since)]
+    joined = join_surfaces(passes, tmp_path)
+    assert not joined.history.changes
+    z_m = joined.surface.window(0, 0, 256, 256).z_m
+    assert np.abs(z_m[:, 100:108] - shown_m).max() < 1e-6 and np.abs(z_m[:, :99] - 0.3).max() < 1e-6
 
 
 def test_what_was_proven_free_is_given_up_where_it_changed() -> None:

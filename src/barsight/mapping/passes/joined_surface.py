@@ -87,8 +87,8 @@ def _shared(first: Surface, second: Surface) -> Iterator[tuple[int, int, int, in
 def join_surfaces(passes: Sequence[PassSurface], folder: Path) -> JoinedSurface:
     """Join passes, the oldest first, into an empty folder.
 
-    A cell's height is the mean, weighted by sigma, over the passes that saw it since its last change. Its
-    sigma isn't reduced by averaging, because the calibration's part is common to all passes.
+    A cell's height is the mean, weighted by sigma, over the passes that saw it since its last change, where
+    they agree. Its sigma isn't reduced by averaging, because the calibration's part is common to all passes.
     """
     cell_m = passes[0].surface.cell_m
     keys = sorted(set().union(*(one.surface.tiles for one in passes)))
@@ -111,11 +111,13 @@ def _join_tile(
     x_m, y_m = (cell_m * (TILE_CELLS * at + np.arange(TILE_CELLS)) for at in key)
     last = history.last_change(x_m, y_m)
     layers, parts = Layers.unknown(TILE_CELLS, TILE_CELLS), []
+    times = np.full(last.shape, -1)
     for number, one in enumerate(passes):
         if key not in one.surface.tiles:
             continue
         new = moved_window(one, key[0] * TILE_CELLS, key[1] * TILE_CELLS, TILE_CELLS, TILE_CELLS)
-        layers = _averaged(layers, new, last <= number)
+        layers = _averaged(layers, new, last <= number, times < one.since)
+        times[(new.source == HeightSource.VISION) & (last <= number)] = one.since
         part = one.surface.cloud_of(key)
         xyz = part.xyz_m + one.correction.shift_at(part.xyz_m.astype(np.float64)).astype(np.float32)
         kept = last.ravel()[part.cell] <= number
@@ -161,17 +163,18 @@ def moved_window(one: PassSurface, column: int, row: int, columns: int, rows: in
     )  # fmt: skip
 
 
-def _averaged(old: Layers, new: Layers, chosen: Bool) -> Layers:
-    """Average where both agree; elsewhere prefer a measured height, then the one with more views, then the
-    newer.
+def _averaged(old: Layers, new: Layers, chosen: Bool, is_later: Bool) -> Layers:
+    """Average where both agree; elsewhere prefer a measured height, then the later one, and of one time the
+    one with more views.
 
-    chosen: (rows, columns) True where the newer pass counts.
+    chosen: (rows, columns) where the newer pass counts. is_later: (rows, columns) where it is of a later time.
     """
     has_old, has_new = old.source != HeightSource.UNKNOWN, (new.source != HeightSource.UNKNOWN) & chosen
     both = has_old & has_new
     gate = np.maximum(AGREE_SIGMAS * np.hypot(old.sigma_m, new.sigma_m), AGREE_M)
     alike = (old.source == new.source) & (np.abs(old.z_m - new.z_m) <= gate) & both
-    better = np.where(old.source == new.source, new.views >= old.views, new.source == HeightSource.VISION)
+    better = is_later | (new.views >= old.views)
+    better = np.where(old.source == new.source, better, new.source == HeightSource.VISION)
     takes_new = has_new & (~has_old | (~alike & better))
     weights = [np.nan_to_num(1 / np.square(one.sigma_m)) for one in (old, new)]
     share = np.where(alike, weights[1] / np.maximum(weights[0] + weights[1], 1e-12), takes_new)
