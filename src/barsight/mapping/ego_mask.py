@@ -18,7 +18,7 @@ from barsight.core.records.pairs import RectifiedCamera
 _SHRINK = 4
 _SWING = 2
 """Maximum distance, in downsampled pixels, by which a hanging thing may swing between two pictures."""
-_MIN_WAY_PX = 6.0 * _SHRINK
+MIN_WAY_PX = 6.0 * _SHRINK
 _WINDOW, _SMOOTH, _MIN_SIZE, _MARGIN = 9, 15, 5, 7
 _ALIKE = 0.6
 """Maximum ratio of the difference without motion to the difference with it, for a pixel to count as
@@ -34,7 +34,7 @@ def mask_carried(
     W).
 
     neighbour_from_here: transform between the two views' rect0. Nothing is detected where the yard itself
-    moves by less than `_MIN_WAY_PX`, nor where the picture has too little texture to decide.
+    moves by less than `MIN_WAY_PX`, nor where the picture has too little texture to decide.
     """
     here, there = _shrunk(left), _shrunk(neighbour)
     first = _SHRINK // 2
@@ -65,7 +65,7 @@ def mask_carried(
         for j in range(2 * _SWING + 1):
             other = edge[i : i + here.shape[0], j : j + here.shape[1]]
             np.minimum(still, _difference(here, other), out=still)
-    found = ahead & (way > _MIN_WAY_PX) & (by_motion > _MIN_DIFFERENCE) & (still < _ALIKE * by_motion)
+    found = ahead & (way > MIN_WAY_PX) & (by_motion > _MIN_DIFFERENCE) & (still < _ALIKE * by_motion)
     least, margin = np.ones((_MIN_SIZE, _MIN_SIZE), np.uint8), np.ones((_MARGIN, _MARGIN), np.uint8)
     grown = cv2.dilate(cv2.morphologyEx(found.astype(np.uint8), cv2.MORPH_OPEN, least), margin)
     whole: Bool = cv2.resize(grown, left.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0

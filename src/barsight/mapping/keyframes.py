@@ -11,6 +11,7 @@ from barsight.core.arrays import Float64
 from barsight.core.records.pairs import RectifiedCamera
 from barsight.core.records.sensor_samples import CraneSamples
 from barsight.core.records.trajectory import PosedFrame
+from barsight.mapping.ego_mask import MIN_WAY_PX
 
 
 def select_keyframes(
@@ -41,8 +42,14 @@ def select_keyframes_by_encoders(
 
 
 def keyframe_spacing_m(camera: RectifiedCamera, range_m: float, min_shift: float) -> float:
-    """Return the distance (m) on a surface range_m away that min_shift of a picture's shorter side spans."""
-    return min_shift * min(camera.width, camera.height) * range_m / camera.focal_px
+    """Return the distance (m) on a surface range_m away that min_shift of a picture's shorter side spans, or
+    MIN_WAY_PX if that is more.
+
+    A picture that has moved by less repeats the errors of the last one, and what the crane carries can't be
+    told from the yard in it.
+    """
+    shift_px = max(min_shift * min(camera.width, camera.height), MIN_WAY_PX)
+    return shift_px * range_m / camera.focal_px
 
 
 def _spread(stamps_ns: Sequence[int], places_m: Float64, min_m: float) -> list[int]:
