@@ -180,7 +180,9 @@ class MatchedAhead:
                 self._begun[stamp] = worker.submit(self._match, stamp)
 
     def __call__(self, pair: RectifiedPair) -> MatchedFrame | Refusal:
-        """Return a pair's match, computing it now if it hasn't been started."""
+        """Return a pair's match, computing it now if it hasn't been started; earlier pairs are dropped."""
+        for stamp in [stamp for stamp in self._begun if stamp < pair.stamp_ns]:
+            self._begun.pop(stamp).cancel()
         begun = self._begun.pop(pair.stamp_ns, None)
         found = None if begun is None else begun.result()
         return self._chain(pair) if found is None or not self.holds(pair.stamp_ns) else found
