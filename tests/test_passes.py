@@ -3,7 +3,8 @@
 import json
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -11,7 +12,9 @@ import pytest
 
 import barsight as bs
 from barsight.core.errors import ConfigError, InputError
+from barsight.core.pose import Pose
 from barsight.core.records.heights import HeightSource
+from barsight.core.records.trajectory import PosedFrame, Trajectory
 from barsight.mapping.free_space import FreeSpace
 from barsight.mapping.passes.changes import PlaceHistory
 from barsight.mapping.passes.joined_surface import PassSurface, join_surfaces
@@ -20,7 +23,8 @@ from barsight.mapping.surface.cloud import CloudPart
 from barsight.mapping.surface.surface import Layers, write_tile
 from barsight.mapping.surface.tile_figures import gather_surface, tile_figures
 from barsight.mapping.top_photo import TopPhoto
-from barsight.reconstruction.joined_passes import STALE, JoinedPasses
+from barsight.reconstruction.joined_passes import STALE, JoinedPasses, MappedPass, join_passes
+from barsight.reconstruction.tracked_recording import TrackedRecording
 from barsight.registration.block_shifts import BlockShifts, MatchedMap, block_shifts
 from barsight.registration.pass_ties import PassCorrection, PassPrior, PassTies, tie_passes
 from barsight.result_folder import changed_inputs, read_heights
@@ -277,6 +281,36 @@ def test_what_was_proven_free_is_given_up_where_it_changed() -> None:
     old.join(new, 0.01, lambda x, y: np.broadcast_to(x < 1.0, (len(y), len(x))))
     window = old.window(0, 0, 200, 10)
     assert (window[:, :98] == np.float32(0.41)).all() and (window[:, 104:] == np.float32(0.1)).all()
+
+
+def test_what_is_proven_free_is_moved_onto_the_joined_map_with_each_pass(tmp_path: Path) -> None:
+    """The second pass lies 24 mm higher, both are as sure: each is moved by half. Either proves 50 mm over
+    its own surface free, the first one on the left, the second one on the right.
+    """
+    x, y = np.meshgrid(np.arange(256) * CELL_M, np.arange(256) * CELL_M)
+    level = yard(x, y, detail=False)[0].astype(np.float32)
+    passes, surfaces, off_m = list[MappedPass](), [], np.float32(0.024)
+    for number in range(2):
+        free = FreeSpace(CELL_M)
+        bound = np.full((2, 256, 256), np.inf, np.float32)
+        bound[:, :, 64 * number : 64 * number + 64] = 0.35 + number * off_m
+        free.tiles[0, 0] = bound
+        frames = tuple(
+            PosedFrame(k, Pose("yard", "body", np.eye(3), np.array([k, 1.0, 8.0])), 1e-4 * np.eye(6))
+            for k in range(3)
+        )
+        way = TrackedRecording(
+            Trajectory("yard", frames, (), ()), *cast(Any, (None,) * 3), (), {}, iter(())
+        )
+        source = SimpleNamespace(index=SimpleNamespace(stamps_ns=[10 * number, 10 * number + 1]))
+        built = SimpleNamespace(free=free, tops=TopPhoto(CELL_M))
+        passes.append(MappedPass(cast(Any, SimpleNamespace(source=source)), way, cast(Any, built)))
+        surfaces.append(one_tile(tmp_path / f"{number}", level + number * off_m, 5, number).surface)
+    joined = join_passes(passes, surfaces, tmp_path)
+    z_m = joined.surface.window(0, 0, 256, 256).z_m
+    over_m = joined.free.window(0, 0, 256, 256) - (z_m - level + 0.3)
+    assert np.abs(over_m[20:240, 20:120] - 0.05).max() < 0.002
+    assert np.abs(over_m[20:240, 140:240] - 0.05).max() < 0.002
 
 
 PASSES = replace(

@@ -94,6 +94,11 @@ class FreeSpace:
         at_x = np.arange(column, column + columns) // COARSE_CELLS - low_x
         return out[at_y[:, None], at_x]
 
+    def rise(self, rise_m: float) -> None:
+        """Move all bounds up."""
+        for key in self.tiles:
+            self.tiles[key] += np.float32(rise_m)
+
     def join(
         self, newer: FreeSpace, rise_m: float, forgotten: Callable[[NDArray[Any], NDArray[Any]], Bool]
     ) -> None:

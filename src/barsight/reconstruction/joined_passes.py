@@ -158,10 +158,11 @@ def join_passes(passes: Sequence[MappedPass], surfaces: Sequence[Surface], folde
     placed = [PassSurface(*parts) for parts in zip(surfaces, ties.corrections, since, strict=True)]
     joined = join_surfaces(placed, folder)
     free, tops = passes[0].built.free, passes[0].built.tops
+    free.rise(float(ties.corrections[0].unknowns[5]))
     for number, (one, correction) in enumerate(zip(passes, ties.corrections, strict=True)):
         if number == 0:
             continue
-        rise_m = float(correction.unknowns[5] - ties.corrections[0].unknowns[5])
+        rise_m = float(correction.unknowns[5])
 
         def forgotten(x_m: Float64, y_m: Float64, since: int = number) -> Bool:
             return joined.history.last_change(x_m, y_m) >= since
