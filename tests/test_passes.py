@@ -23,7 +23,14 @@ from barsight.mapping.surface.cloud import CloudPart
 from barsight.mapping.surface.surface import Layers, write_tile
 from barsight.mapping.surface.tile_figures import gather_surface, tile_figures
 from barsight.mapping.top_photo import TopPhoto
-from barsight.reconstruction.joined_passes import STALE, JoinedPasses, MappedPass, join_passes
+from barsight.reconstruction.joined_passes import (
+    MAX_PASSES,
+    STALE,
+    JoinedPasses,
+    MappedPass,
+    in_order,
+    join_passes,
+)
 from barsight.reconstruction.tracked_recording import TrackedRecording
 from barsight.registration.block_shifts import BlockShifts, MatchedMap, block_shifts
 from barsight.registration.pass_ties import PassCorrection, PassPrior, PassTies, tie_passes
@@ -154,6 +161,16 @@ def test_two_pairs_of_one_time_see_no_change_but_both_see_what_changed_before() 
     rises = [(change.pass_number, round(change.rise_m, 2)) for change in one.changes]
     assert rises == [(1, 0.5), (1, -0.3)]
     assert set(np.unique(one.changed_by)) == {-1, 1} and one.seen_by.max() == 2
+
+
+def test_more_passes_than_a_place_remembers_are_refused_before_they_are_measured() -> None:
+    one = PlaceHistory((0.0, 0.0), (4, 4), 0.05)
+    for number in range(MAX_PASSES):
+        one.add(number, np.zeros((4, 4), np.float32), np.full((4, 4), 0.01, np.float32), number)
+    assert (one.newest_pass(np.array([0.1]), np.array([0.1])) == MAX_PASSES).all()
+    many = [SimpleNamespace(path=Path(f"pass_{number}")) for number in range(MAX_PASSES + 1)]
+    with pytest.raises(InputError, match="128 passes, 127 are the most"):
+        in_order(cast(Any, many), bs.MeasureSettings())
 
 
 def test_noise_and_edges_are_no_change() -> None:

@@ -34,6 +34,8 @@ measures.
 """
 SCALE_SIGMA = 2e-4
 """Prior sigma, as a ratio, of the scale of a pass's travel along X."""
+MAX_PASSES = 127
+"""Each place of the yard remembers passes by their number, in a byte."""
 CHANGE_REACH_M = 0.5
 """Distance from a bundle within which a change may have affected it, if the bundle wasn't seen whole
 since.
@@ -98,12 +100,15 @@ class JoinedPasses:
 
 
 def in_order(recordings: Sequence[Recording], settings: MeasureSettings) -> tuple[Recording, ...]:
-    """Sort passes by time. Raises InputError where they can't be joined: their cameras, mounting or crane
-    differ, there are no encoders, or one pair of cameras has two recordings of the same time. Two pairs on
-    one body may record at once; any other pass must be of one of those pairs.
+    """Sort passes by time. Raises InputError where they can't be joined: they are too many, their cameras,
+    mounting or crane differ, there are no encoders, or one pair of cameras has two recordings of the same
+    time. Two pairs on one body may record at once; any other pass must be of one of those pairs.
     """
     if len(recordings) == 1:
         return tuple(recordings)
+    if len(recordings) > MAX_PASSES:
+        problem = f"is one of {len(recordings)} passes, {MAX_PASSES} are the most that make one map"
+        raise InputError(recordings[-1].path, problem, "leave the oldest out")
     if "crane" not in settings.use or settings.self_calibrate != "none":
         raise InputError(
             recordings[0].path, "several passes are tied by the crane's encoders and one calibration",
