@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 
 import barsight as bs
+from barsight.core.pose import Pose
 from barsight.core.records.sensor_samples import CraneSamples
+from barsight.core.records.trajectory import PosedFrame
 from barsight.live.link import GrowingRecording, KeptRecording, Link, LiveInput
 from barsight.live.mapper import LIVE_MAP, Mapping
 from barsight.live.settings import LiveSettings
@@ -21,10 +23,11 @@ from barsight.live.shared.counters import Counters
 from barsight.mapping.fusion import fuse_view
 from barsight.measure_folder import write_measured
 from barsight.pipeline.lift_choice import LiftRequest
-from barsight.reconstruction import map_building
+from barsight.reconstruction import live_map, map_building
 from barsight.reconstruction.checkpoint import checkpoint_folder, checkpoint_key
 from barsight.reconstruction.pair_chain import MatchedAhead
 from barsight.recording.base import Recording
+from barsight.stereo.image_pair import pair_from_images
 
 FIELDS = {"map": {"cell_m": 0.05}, "motion": {"estimator": "live"}}
 SETTINGS = bs.MeasureSettings(
@@ -163,3 +166,25 @@ def test_what_was_matched_ahead_and_passed_over_is_let_go() -> None:
     ahead.close()
     gc.collect()
     assert [one for one in found if one() is not None] == []
+
+
+def test_a_crane_in_the_dark_holds_no_pictures_and_looks_at_each_pair_once(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Pairs that can't be matched waited whole, 5 MB each, and each new one had all of them looked at."""
+    looked, held = list[int](), list[weakref.ref[Any]]()
+    monkeypatch.setattr(live_map, "look_at", lambda *_: looked.append(1))
+    pairs = SimpleNamespace(recording=SimpleNamespace(crane=lambda: None))
+    placer = SimpleNamespace(
+        push=lambda pair: PosedFrame(pair.stamp_ns, Pose.identity("yard", "body"), np.eye(6))
+    )
+    one = live_map.LiveMap(
+        cast(Any, pairs), SETTINGS, tmp_path, None, cast(Any, placer), cast(Any, None)
+    )
+    for number in range(5):
+        pair = replace(pair_from_images(*np.zeros((2, 48, 64), np.uint8)), stamp_ns=number)
+        held.append(weakref.ref(pair))
+        one.add(pair)
+    del pair
+    gc.collect()
+    assert not looked and [each for each in held if each() is not None] == []

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from barsight.core.arrays import Float64
-from barsight.core.errors import MeasurementError
+from barsight.core.errors import Failed, MeasurementError
 from barsight.core.records.pairs import RectifiedPair, RefusedFrame
 from barsight.core.records.trajectory import PosedFrame, Trajectory
 from barsight.core.timing import Stopwatch, unwatched
@@ -29,6 +29,7 @@ from barsight.reconstruction.map_building import MapBuilder, map_name
 from barsight.reconstruction.pair_chain import MatchedAhead, PairChain
 from barsight.reconstruction.probed_recording import look_at
 from barsight.recording.rectified_pairs import RectifiedPairs
+from barsight.stereo.search_range import find_disparity_range
 from barsight.yard.sections import surface_map
 from barsight.yard.types import HeightMap
 from barsight.yard_frame import frame_of, placed_in_yard
@@ -148,7 +149,7 @@ class LiveMap:
         self._reference = "world" if pairs.recording.crane() is None else "yard"
         self._placer = placer
         self._checkpoints = checkpoints if is_final(settings) else None
-        self._waiting: list[tuple[RectifiedPair, PosedFrame]] = []
+        self._waiting: list[PosedFrame] = []
         self._passed: tuple[RectifiedPair, PosedFrame] | None = None
         self._held: tuple[RectifiedPair, PosedFrame] | None = None
         self._taken: list[PosedFrame] = []
@@ -167,23 +168,29 @@ class LiveMap:
         return [] if self._map is None else self._map[0].stamps_ns
 
     def add(self, pair: RectifiedPair | RefusedFrame) -> None:
-        """Locate the next pair, and fuse the one before. Pairs wait until one of them can be matched, and
-        a pair whose picture has hardly moved is left out.
+        """Locate the next pair, and fuse the one before. Pairs wait unread until one of them can be matched,
+        and a pair whose picture has hardly moved is left out.
         """
         posed = self._placer.push(pair)
         if not isinstance(posed, PosedFrame) or not isinstance(pair, RectifiedPair):
             return
         way = Trajectory(self._reference, (posed,), (), ())
         (placed,) = placed_in_yard(way, frame_of(self._pairs.recording)).frames
-        self._waiting.append((pair, placed))
         if self._map is None:
+            self._waiting.append(placed)
+            found = find_disparity_range(pair)
+            if isinstance(found, Failed) and found.code != "swapped":
+                return
             try:
                 self._map = self._begun()
             except MeasurementError:
                 return
-        for waiting in self._waiting:
-            self._take(self._map[0], *waiting)
-        self._waiting.clear()
+            for waiting in self._waiting[:-1]:
+                (before,) = self._pairs(frozenset((waiting.stamp_ns,)))
+                if isinstance(before, RectifiedPair):
+                    self._take(self._map[0], before, waiting)
+            self._waiting.clear()
+        self._take(self._map[0], pair, placed)
 
     def snapshot(self, owner: object) -> Snapshot:
         """Elect the current surface; only tiles that changed since the last snapshot are elected again."""
