@@ -178,9 +178,7 @@ def test_a_crane_in_the_dark_holds_no_pictures_and_looks_at_each_pair_once(
     placer = SimpleNamespace(
         push=lambda pair: PosedFrame(pair.stamp_ns, Pose.identity("yard", "body"), np.eye(6))
     )
-    one = live_map.LiveMap(
-        cast(Any, pairs), SETTINGS, tmp_path, None, cast(Any, placer), cast(Any, None)
-    )
+    one = live_map.LiveMap(cast(Any, pairs), SETTINGS, tmp_path, None, cast(Any, placer), cast(Any, None))
     for number in range(5):
         pair = replace(pair_from_images(*np.zeros((2, 48, 64), np.uint8)), stamp_ns=number)
         held.append(weakref.ref(pair))

@@ -167,7 +167,7 @@ def _averaged(old: Layers, new: Layers, chosen: Bool, is_later: Bool) -> Layers:
     """Average where both agree; elsewhere prefer a measured height, then the later one, and of one time the
     one with more views.
 
-    chosen: (rows, columns) where the newer pass counts. is_later: (rows, columns) where it is of a later time.
+    chosen: (rows, columns) where the newer pass counts. is_later: (rows, columns) where its time is later.
     """
     has_old, has_new = old.source != HeightSource.UNKNOWN, (new.source != HeightSource.UNKNOWN) & chosen
     both = has_old & has_new
