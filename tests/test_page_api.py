@@ -124,6 +124,18 @@ def test_what_the_page_reads(local: httpx.Client) -> None:
     assert "/api/lifts/{lift_id}/confirm" in local.get("/openapi.json").json()["paths"]
 
 
+def test_the_yards_clock_goes_on_while_nothing_changes(
+    local: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, now_ns = local.get("/api/state").json(), time.time_ns
+    later_ns = 7200 * NS_PER_S
+    monkeypatch.setattr("barsight.page.watch.time.time_ns", lambda: now_ns() + later_ns)
+    monkeypatch.setattr("barsight.page.watch.StoreWatch.judge", lambda *_, **__: None)
+    later = local.get("/api/state").json()
+    assert later["revision"] == first["revision"], "nothing was added meanwhile"
+    assert abs(later["clock_ns"] - first["clock_ns"] - later_ns) < 2 * NS_PER_S
+
+
 def test_how_far_an_open_end_may_lie_is_told_by_bars_alike() -> None:
     bar = {"bar_diameter_m": 0.05, "width_m": 0.3, "length_m": 6.0, "ends_open": [False, False]}
     cut = bar | {"length_m": 5.2, "ends_open": [False, True]}

@@ -48,13 +48,22 @@ HEARTBEAT_S = 10.0
 @dataclass(frozen=True, eq=False)
 class Published:
     """Documents that the page reads, as one revision of the store has them. revision: rows of the audit log.
-    documents: JSON by name.
+    documents: JSON by name. at_ns: when it was, by this computer's clock.
     """
 
     revision: int = -1
+    at_ns: int = 0
     documents: dict[str, bytes] = field(default_factory=dict)
     accounts: dict[str, Account] = field(default_factory=dict)
     layers: tuple[SurveyLayer, ...] = ()
+
+    def document(self, name: str) -> bytes:
+        """Return a document; the yard's clock in `state` has gone on since it was published."""
+        body = self.documents[name]
+        if name != "state":
+            return body
+        told = json.loads(body)
+        return json.dumps(told | {"clock_ns": told["clock_ns"] + time.time_ns() - self.at_ns}).encode()
 
 
 class StoreWatch:
@@ -90,6 +99,7 @@ class StoreWatch:
         """Publish anew where the store has more rows than were published."""
         with self._lock:
             with self.store.reading() as connection:
+                at_ns = time.time_ns()
                 revision = connection.execute(select(func.coalesce(func.max(AUDIT.c.id), 0))).scalar_one()
                 if revision == self.published.revision:
                     return
@@ -109,7 +119,7 @@ class StoreWatch:
                 name: json.dumps(json_value({"revision": revision, **one}), allow_nan=False).encode()
                 for name, one in content.items()
             }
-            self.published = Published(int(revision), documents, accounts, layers)
+            self.published = Published(int(revision), at_ns, documents, accounts, layers)
         self._wake()
 
     def look_at_crane(self) -> None:

@@ -39,7 +39,7 @@ def add_reading(app: FastAPI, watch: StoreWatch, access: Access) -> None:
 
     def add_document(name: str) -> None:
         async def read(request: Request, _: Caller = reader) -> Response:
-            body = watch.published.documents[name]
+            body = watch.published.document(name)
             tag = f'"{hashlib.blake2b(body, digest_size=12).hexdigest()}"'
             if request.headers.get("if-none-match") == tag:
                 return Response(status_code=304)
