@@ -32,7 +32,7 @@ from barsight.plant.links.changes import changes_between
 from barsight.plant.links.running import serve_plant
 from barsight.plant.live_folder import with_live_run
 from barsight.plant.settings import PlantSettings, StoreSource, read_plant
-from barsight.plant.state import PlantAlarm, PlantState, state_of_store
+from barsight.plant.state import PlantAlarm, PlantState, state_of_store, told_alarms
 from barsight.plant.steps import LiftSteps, take_named_step
 from barsight.report.signing import sign_file
 from barsight.store.opening import open_store
@@ -344,6 +344,17 @@ def test_alarms_that_no_longer_fit_have_not_ended() -> None:
     assert [(one["event"], one["text"]) for one in changes_between(more, cleared)] == [
         ("alarm-raised", "B5"), ("alarm-ended", "B22"),
     ]  # fmt: skip
+
+
+def test_no_crowd_of_lesser_alarms_hides_another_or_tells_its_end() -> None:
+    urgent, live = (PlantAlarm(code, k, "why", True, False) for code, k in (("store-broken", 1), ("live", 2)))
+    moved = tuple(PlantAlarm("bundle-moved", 2, f"B{k}", True, False) for k in range(30, 0, -1))
+    few, crowd = (replace(QUIET, alarms=told_alarms((*newer, live, urgent))) for newer in (moved[25:], moved))
+    assert {urgent, live, moved[0]} <= set(crowd.alarms)
+    assert {one["event"] for one in changes_between(few, crowd)} == {"alarm-raised"}
+    ended = replace(QUIET, alarms=told_alarms((*moved, urgent)))
+    told = [(one["event"], one["code"]) for one in changes_between(crowd, ended)]
+    assert [one for one in told if one[0] == "alarm-ended"] == [("alarm-ended", "live")]
 
 
 def test_another_alarm_of_a_code_is_raised_though_the_first_was_acknowledged() -> None:

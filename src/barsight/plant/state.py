@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -15,7 +16,7 @@ from barsight.store.states import standing_alarms
 from barsight.yard.lifting.validity import is_ahead
 
 MAX_ALARMS = 20
-"""Newest alarms that are told to the plant."""
+"""Alarms that are told to the plant: the urgent ones first, of these the newest; and one of each other code."""
 URGENT = ("store-broken", "load-contradicts", "lift-unrecorded", "lift-failed")
 """Codes of alarms of priority 1: what the store says of the yard may not be true. All others have 2."""
 YAW_SENSE = "of the beam from +Y of the yard frame, counter-clockwise seen from above"
@@ -124,7 +125,7 @@ def state_of_store(
         survey = newest_survey(connection)
         lifts = open_lifts(connection)
         vetoes = [] if survey is None else map_vetoes(connection, survey.id)
-        alarms = tuple(_alarm(*one) for one in standing_alarms(connection)[:MAX_ALARMS])
+        alarms = told_alarms(_alarm(*one) for one in standing_alarms(connection))
     if survey is None:
         empty = ("no-survey: the store holds no survey",)
         return PlantState("idle", False, empty, life_counter, clock_ns, "none", alarms=alarms)
@@ -147,6 +148,16 @@ def state_of_store(
         "simulated" if survey.is_simulated else "surveyed", not reasons, reasons, life_counter, clock_ns,
         "done", None, lift, alarms, survey.map_id, survey.calibration_id,
     )  # fmt: skip
+
+
+def told_alarms(standing: Iterable[PlantAlarm]) -> tuple[PlantAlarm, ...]:
+    """Choose the alarms that the plant is told. standing: the newest first."""
+    ranked = sorted(standing, key=lambda alarm: alarm.priority)
+    told = ranked[:MAX_ALARMS]
+    for alarm in ranked[MAX_ALARMS:]:
+        if all(alarm.code != other.code for other in told):
+            told.append(alarm)
+    return tuple(told)
 
 
 def _alarm(code: str, reason: str, state: str) -> PlantAlarm:

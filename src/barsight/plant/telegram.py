@@ -9,7 +9,7 @@ from pathlib import Path
 
 from barsight.core.errors import Failed
 from barsight.core.reading.bounded_reading import read_toml
-from barsight.plant.state import PlantState
+from barsight.plant.state import MAX_ALARMS, PlantState
 
 TABLE = Path(__file__).parent / "telegram.toml"
 OUT_MAGIC, IN_MAGIC, VERSION = 0xB51A, 0xB51B, 1
@@ -70,7 +70,7 @@ def out_values(state: PlantState, answer: Mapping[str, int]) -> dict[str, int]:
     status = int(state.is_valid) | (8 if state.mode == "simulated" else 0)
     values = {
         "magic": OUT_MAGIC, "version": VERSION, "life": state.life_counter & 0xFFFF, "status": status,
-        "stamp_ns": state.stamp_ns, "approach": NOT_SET, "alarms": len(state.alarms), **answer,
+        "stamp_ns": state.stamp_ns, "approach": NOT_SET, "alarms": min(len(state.alarms), MAX_ALARMS), **answer,
     }  # fmt: skip
     if lift is None:
         return values

@@ -30,16 +30,19 @@ def changes_between(old: PlantState | None, new: PlantState) -> list[dict[str, A
 
 
 def _alarms(state: PlantState) -> list[PlantAlarm]:
-    """List a state's alarms, the newest first, whatever came of each."""
+    """List a state's alarms in their order, whatever came of each."""
     return [replace(alarm, is_active=True, is_acknowledged=False) for alarm in state.alarms]
 
 
 def _ended(old: PlantState, new: PlantState) -> Iterator[PlantAlarm]:
-    """Yield the alarms that don't stand any more; where more stand than are told the oldest may stand on."""
+    """Yield the alarms that don't stand any more; where more stand than are told the last may stand on, as
+    long as one of their code does.
+    """
     stood, standing = _alarms(old), _alarms(new)
     if len(standing) >= MAX_ALARMS:
-        last = max((k for k, alarm in enumerate(stood) if alarm in standing), default=0)
-        stood = stood[:last]
+        first, codes = standing[:MAX_ALARMS], {alarm.code for alarm in standing}
+        last = max((k for k, alarm in enumerate(stood[:MAX_ALARMS]) if alarm in first), default=0)
+        stood = stood[:last] + [alarm for alarm in stood[last:] if alarm.code not in codes]
     yield from (Counter(stood) - Counter(standing)).elements()
 
 
