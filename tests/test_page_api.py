@@ -25,7 +25,7 @@ from barsight.core.errors import ConfigError, InputError
 from barsight.core.stamps import NS_PER_S
 from barsight.page.access import Access, AccessError, Throttle
 from barsight.page.api.serve import ServeOptions, serving
-from barsight.page.documents import unseen_lengths
+from barsight.page.documents import alarm_records, lift_records, unseen_lengths
 from barsight.page.layers import find_layers, newest_at, paint_layer
 from barsight.store import accounts, confirmation
 from barsight.store.adding import add_survey, read_survey
@@ -33,6 +33,7 @@ from barsight.store.audit import AuditChain, entry, verify_chain
 from barsight.store.calibrations import approve_calibration, note_calibration
 from barsight.store.history import list_surveys, present_yard
 from barsight.store.opening import open_store
+from barsight.store.states import raise_alarm, step_alarm
 from barsight.yard.inventory.stock_list import match_stock, read_stock
 from live_folders import live_folder
 from page_yards import FIRST, SECOND, fill_store, survey
@@ -407,6 +408,23 @@ def test_the_header_shows_the_alarm_of_the_first_priority(local: httpx.Client) -
     alarms = local.get("/api/alarms").json()["alarms"]
     assert [one["priority"] for one in alarms] == [1, 2, 3, 3]
     assert local.get("/api/state").json()["top_alarm"]["code"] == "calibration-changed"
+
+
+def test_what_stands_open_is_listed_however_much_came_since(
+    url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("barsight.page.documents.MAX_ALARMS", 2)
+    monkeypatch.setattr("barsight.page.documents.MAX_LIFTS", 1)
+    with open_store(url) as store:
+        with entry(store, "ann", "alarms") as opened:
+            numbers = [raise_alarm(opened, "rig", f"{k}") for k in range(5)]
+            for number in numbers[1:]:
+                step_alarm(opened, number, "cleared")
+        with store.reading() as connection:
+            alarms, lifts = alarm_records(connection), lift_records(connection)
+            begun = [lift.lift_id for lift in confirmation.open_lifts(connection)]
+    assert [one["id"] for one in alarms] == [numbers[0], numbers[4], numbers[3]]
+    assert len(begun) > 1 and {one["id"] for one in lifts} == set(begun)
 
 
 def test_an_alarm_goes_through_its_states(local: httpx.Client, made: Path, tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ from barsight.store.tables import (
 from barsight.yard.inventory.bundle_file import read_match
 
 with extra("store"):
-    from sqlalchemy import Connection, Row, select
+    from sqlalchemy import Connection, Row, or_, select
 
 LIKE_RATIO = 0.15
 """Bundles whose bars' diameters and widths differ by less are of one kind."""
@@ -158,14 +158,15 @@ def bundle_history(connection: Connection, number: int) -> dict[str, Any] | None
 
 
 def lift_records(connection: Connection) -> list[dict[str, Any]]:
-    """List the newest lifts, each with its states, who brought it there, and its figures."""
+    """List the newest lifts and all open ones, each with its states, who brought it there, and its figures."""
     of = _bundles_of_lifts(connection)
+    newest = select(LIFTS.c.id).join(SURVEYS).where(counts()).order_by(LIFTS.c.id.desc()).limit(MAX_LIFTS)
+    open_ids = [lift.lift_id for lift in open_lifts(connection)]
     rows = connection.execute(
         select(LIFTS, SURVEYS.c.map_id, SURVEYS.c.calibration_id, SURVEYS.c.captured_to_ns)
         .join(SURVEYS)
-        .where(counts())
+        .where(or_(LIFTS.c.id.in_(newest), LIFTS.c.id.in_(open_ids)))
         .order_by(LIFTS.c.id.desc())
-        .limit(MAX_LIFTS)
     ).all()
     steps = _steps(connection, LIFT_STATES, LIFT_STATES.c.lift_id, [row.id for row in rows])
     return [
@@ -188,8 +189,14 @@ def _lift_figures(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def alarm_records(connection: Connection) -> list[dict[str, Any]]:
-    """List the newest alarms, the worst state first, each with its states."""
-    rows = connection.execute(select(ALARMS).order_by(ALARMS.c.id.desc()).limit(MAX_ALARMS)).all()
+    """List the newest alarms and all that stand, the worst state first, each with its states."""
+    newest = select(ALARMS.c.id).order_by(ALARMS.c.id.desc()).limit(MAX_ALARMS)
+    cleared = select(ALARM_STATES.c.alarm_id).where(ALARM_STATES.c.state == "cleared")
+    rows = connection.execute(
+        select(ALARMS)
+        .where(or_(ALARMS.c.id.in_(newest), ALARMS.c.id.not_in(cleared)))
+        .order_by(ALARMS.c.id.desc())
+    ).all()
     steps = _steps(connection, ALARM_STATES, ALARM_STATES.c.alarm_id, [row.id for row in rows])
     told = [
         {
