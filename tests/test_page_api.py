@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -400,6 +401,20 @@ def test_files_of_a_survey_are_held_against_their_digests(local: httpx.Client, m
     assert local.get(f"{base}/bundles.json").status_code == 409
     path.write_bytes(whole)
     assert local.get(f"{base}/bundles.json").status_code == 200
+
+
+def test_a_share_with_the_folders_that_is_away_ends_no_watch(
+    local: httpx.Client, url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def away(path: Path) -> bool:
+        raise OSError(errno.ESTALE, "Stale file handle", str(path))
+
+    with open_store(url) as store:
+        monkeypatch.setattr(Path, "is_file", away)
+        wait_for(lambda: "survey-files" in local.get("/api/alarms").text)
+        with entry(store, "ann", "alarm") as opened:
+            raise_alarm(opened, "rig", "loose")
+        wait_for(lambda: "loose" in local.get("/api/alarms").text)
 
 
 def test_the_header_shows_the_alarm_of_the_first_priority(local: httpx.Client) -> None:

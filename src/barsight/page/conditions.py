@@ -59,14 +59,22 @@ def find_chain_condition(connection: Connection) -> set[Condition]:
     return {("store-broken", chain.reason)} if isinstance(chain, Failed) else set()
 
 
+def is_there(path: Path) -> bool:
+    """Tell whether a file is there; one on a share that is away isn't."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
+
+
 def _file_conditions(newest: Row[Any]) -> set[Condition]:
     folder = Path(newest.folder)
-    lost = [name for name in sorted(json.loads(newest.files)) if not (folder / name).is_file()]
+    lost = [name for name in sorted(json.loads(newest.files)) if not is_there(folder / name)]
     if lost:
         return {("survey-files", f"{folder}: {', '.join(lost)} not there")}
     try:
         changed = changed_inputs(read_summary(folder))
-    except InputError as error:
+    except (InputError, OSError) as error:
         return {("survey-files", str(error))}
     return {("calibration-changed", changed)} if changed else set()
 

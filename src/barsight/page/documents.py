@@ -13,7 +13,7 @@ import numpy as np
 
 from barsight.core.errors import InputError
 from barsight.core.extras import extra
-from barsight.page.conditions import PRIORITIES
+from barsight.page.conditions import PRIORITIES, is_there
 from barsight.store.calibrations import list_calibrations
 from barsight.store.confirmation import map_vetoes, newest_survey, open_lifts, yard_clock_ns
 from barsight.store.history import PresentBundle, identity_name, list_surveys, present_yard
@@ -221,8 +221,8 @@ def survey_records(connection: Connection) -> list[dict[str, Any]]:
     for one in reversed(list_surveys(connection)):
         row = files[one.map_id]
         present = Path(one.folder)
-        more = [name for name in ("report.html", "ortho.png") if (present / name).is_file()]
-        kept = [name for name in sorted(json.loads(row.files)) if (present / name).is_file()]
+        more = [name for name in ("report.html", "ortho.png") if is_there(present / name)]
+        kept = [name for name in sorted(json.loads(row.files)) if is_there(present / name)]
         told.append(
             asdict(one)
             | {
@@ -251,11 +251,11 @@ def stock_record(connection: Connection) -> dict[str, Any]:
         return none
     path = Path(newest.folder) / "bundles.json"
     try:
-        match = read_match(path) if path.is_file() else None
-    except (InputError, ValueError):
+        match = read_match(path) if is_there(path) else None
+    except (InputError, OSError, ValueError):
         match = None
     if match is None:
-        return none | {"map_id": newest.map_id, "missing_file": not path.is_file()}
+        return none | {"map_id": newest.map_id, "missing_file": not is_there(path)}
     numbers = {
         row.number: identity_name(row.bundle_id)
         for row in connection.execute(select(SIGHTINGS).where(SIGHTINGS.c.survey_id == newest.id)).all()

@@ -190,6 +190,6 @@ class StoreWatch:
                     judged_s, verified_s = now_s, now_s if with_chain else verified_s
                 self.refresh()
                 self.problem = None
-            except BarsightError as error:  # a database that is away comes back
+            except (BarsightError, OSError) as error:  # a database or a disk that is away comes back
                 self.problem = str(error)
             self._stop.wait(LOOK_S)
