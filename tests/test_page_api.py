@@ -26,15 +26,17 @@ from barsight.core.errors import ConfigError, InputError
 from barsight.core.stamps import NS_PER_S
 from barsight.page.access import Access, AccessError, Throttle
 from barsight.page.api.serve import ServeOptions, serving
+from barsight.page.conditions import find_conditions
 from barsight.page.documents import alarm_records, lift_records, unseen_lengths
 from barsight.page.layers import find_layers, newest_at, paint_layer
 from barsight.store import accounts, confirmation
 from barsight.store.adding import add_survey, read_survey
-from barsight.store.audit import AuditChain, entry, verify_chain
+from barsight.store.audit import AuditChain, Entry, entry, verify_chain
 from barsight.store.calibrations import approve_calibration, note_calibration
 from barsight.store.history import list_surveys, present_yard
 from barsight.store.opening import open_store
-from barsight.store.states import raise_alarm, step_alarm
+from barsight.store.states import raise_alarm, step_alarm, step_lift
+from barsight.store.tables import LIFT_BUNDLES, LIFTS
 from barsight.yard.inventory.stock_list import match_stock, read_stock
 from live_folders import live_folder
 from page_yards import FIRST, SECOND, fill_store, survey
@@ -440,6 +442,25 @@ def test_what_stands_open_is_listed_however_much_came_since(
             begun = [lift.lift_id for lift in confirmation.open_lifts(connection)]
     assert [one["id"] for one in alarms] == [numbers[0], numbers[4], numbers[3]]
     assert len(begun) > 1 and {one["id"] for one in lifts} == set(begun)
+
+
+@pytest.mark.parametrize(
+    ("bundles", "age_s", "told"),
+    [((4,), 600.0, False), ((4, 5), 600.0, False), ((4,), 7200.0, True), ((5,), 600.0, True)],
+)
+def test_a_bundle_is_gone_without_a_lift_unless_one_took_it_since_it_was_seen(
+    url: str, bundles: tuple[int, ...], age_s: float, told: bool
+) -> None:
+    with open_store(url) as store, store.writing() as connection:
+        newest = confirmation.newest_survey(connection)
+        assert newest is not None
+        opened = Entry(connection, "ann", newest.captured_to_ns - round(age_s * NS_PER_S))
+        lift = opened.add(LIFTS, survey_id=1, rank=1, record='{"set_down": null}')
+        for number in bundles:
+            opened.add(LIFT_BUNDLES, lift_id=lift, bundle_id=number)
+        for state in ("offered", "claimed", "executed"):
+            step_lift(opened, lift, state)
+        assert (("bundle-gone", "B4") in find_conditions(connection, None)) is told
 
 
 def test_an_alarm_goes_through_its_states(local: httpx.Client, made: Path, tmp_path: Path) -> None:

@@ -14,13 +14,23 @@ from barsight.result_folder import changed_inputs, read_summary
 from barsight.store.audit import entry, verify_chain
 from barsight.store.calibrations import why_invalid
 from barsight.store.confirmation import newest_survey, yard_clock_ns
-from barsight.store.history import executed_lifts, identity_name
+from barsight.store.history import identity_name
 from barsight.store.opening import Store
+from barsight.store.promotion import counts
 from barsight.store.states import alarm_state, raise_alarm, step_alarm
-from barsight.store.tables import ABSENCES, ALARM_STATES, ALARMS, LIFT_STATES, SIGHTINGS, SURVEY_VETOES
+from barsight.store.tables import (
+    ABSENCES,
+    ALARM_STATES,
+    ALARMS,
+    LIFT_BUNDLES,
+    LIFT_STATES,
+    SIGHTINGS,
+    SURVEY_VETOES,
+    SURVEYS,
+)  # fmt: skip
 
 with extra("store"):
-    from sqlalchemy import Connection, Row, select
+    from sqlalchemy import Connection, Row, func, select
 
 ALARM_CODES = {
     "store-broken": "The audit log of the store doesn't hold: rows were changed outside Barsight.",
@@ -45,7 +55,7 @@ def find_conditions(connection: Connection, live: LiveHealth | None) -> set[Cond
     found: set[Condition] = set()
     newest = newest_survey(connection)
     if newest is not None:
-        found |= _file_conditions(newest) | _yard_conditions(connection, newest.id)
+        found |= _file_conditions(newest) | _yard_conditions(connection, newest)
         reason = why_invalid(connection, newest.calibration_id, yard_clock_ns(connection))
         found |= {("calibration-changed", reason)} if reason else set()
     if live is not None and live.problem is not None:
@@ -79,24 +89,43 @@ def _file_conditions(newest: Row[Any]) -> set[Condition]:
     return {("calibration-changed", changed)} if changed else set()
 
 
-def _yard_conditions(connection: Connection, survey_id: int) -> set[Condition]:
+def _yard_conditions(connection: Connection, newest: Row[Any]) -> set[Condition]:
     """Hold what the newest survey told against what lifts did."""
-    lifted = {lift.bundle_id for lift in executed_lifts(connection)}
     found: set[Condition] = set()
-    gone = select(ABSENCES.c.bundle_id).where(ABSENCES.c.survey_id == survey_id, ABSENCES.c.kind == "gone")
+    gone = select(ABSENCES.c.bundle_id).where(ABSENCES.c.survey_id == newest.id, ABSENCES.c.kind == "gone")
     moved = select(SIGHTINGS.c.bundle_id).where(
-        SIGHTINGS.c.survey_id == survey_id, SIGHTINGS.c.change == "moved"
+        SIGHTINGS.c.survey_id == newest.id, SIGHTINGS.c.change == "moved"
     )
+    lifted = _lifted_since_seen(connection, newest.captured_to_ns)
     for code, query in (("bundle-gone", gone), ("bundle-moved", moved)):
         for number in connection.execute(query).scalars().all():
             if number not in lifted:
                 found.add((code, identity_name(number)))
-    newest = newest_survey(connection)
-    failed = select(LIFT_STATES).where(LIFT_STATES.c.state == "failed")
+    failed = select(LIFT_STATES).where(
+        LIFT_STATES.c.state == "failed", LIFT_STATES.c.at_ns >= newest.captured_to_ns
+    )
     for row in connection.execute(failed).all():
-        if newest is not None and row.at_ns >= newest.captured_to_ns:
-            found.add(("lift-failed", f"lift {row.lift_id}: {row.note}"))
+        found.add(("lift-failed", f"lift {row.lift_id}: {row.note}"))
     return found
+
+
+def _lifted_since_seen(connection: Connection, before_ns: int) -> set[int]:
+    """Find the bundles that a lift, of one or several, has taken since the last survey before a time that saw
+    them began.
+    """
+    earlier = (
+        select(SIGHTINGS.c.bundle_id, func.max(SURVEYS.c.captured_from_ns).label("from_ns"))
+        .join(SURVEYS)
+        .where(SURVEYS.c.captured_to_ns < before_ns, counts())
+        .group_by(SIGHTINGS.c.bundle_id)
+    )
+    seen = {row.bundle_id: row.from_ns for row in connection.execute(earlier)}
+    executed = (
+        select(LIFT_BUNDLES.c.bundle_id, LIFT_STATES.c.at_ns)
+        .join(LIFT_STATES, LIFT_STATES.c.lift_id == LIFT_BUNDLES.c.lift_id)
+        .where(LIFT_STATES.c.state == "executed")
+    )
+    return {row.bundle_id for row in connection.execute(executed) if row.at_ns >= seen.get(row.bundle_id, 0)}
 
 
 def settle_alarms(store: Store, present: set[Condition], judged: set[str]) -> bool:
