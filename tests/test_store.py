@@ -20,9 +20,10 @@ from sqlalchemy.exc import DBAPIError
 
 import barsight.store.opening as opening
 from barsight.cli.main import run
-from barsight.core.errors import Failed, InputError
+from barsight.core.errors import ConfigError, Failed, InputError
 from barsight.store.adding import AddedSurvey, add_survey, read_survey
 from barsight.store.audit import AuditChain, entry, verify_chain
+from barsight.store.calibrations import approve_calibration, note_calibration
 from barsight.store.history import parse_time
 from barsight.store.opening import Store, open_store
 from barsight.store.states import LIFT_STEPS, alarm_state, raise_alarm, step_alarm, step_lift
@@ -375,6 +376,20 @@ def test_a_missing_extra_is_named(tmp_path: Path) -> None:
 def test_times_are_exact() -> None:
     assert parse_time("1700000000000000001") == 1700000000000000001
     assert parse_time("2023-11-14T23:13:20.000001+01:00") == 1700000000000001000
+
+
+@pytest.mark.parametrize("time", ["9999-12-31T00:00:00Z", "0001-01-01T00:00:00Z", "9" * 30])
+def test_a_time_that_no_store_can_hold_is_one_line(
+    store: Store, time: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with entry(store, "ann", "calibration") as opened:
+        note_calibration(opened, "ca1b")
+        with pytest.raises(ConfigError, match="leave it out"):
+            approve_calibration(opened, "ca1b", 0, 10**21)
+    url = store.engine.url.render_as_string(hide_password=False)
+    for arguments in (["store", "approve", url, "ca1b", "--valid-until", time], ["yard", url, "--at", time]):
+        assert run(arguments) == 2
+        assert "from 1970 to 2262" in capsys.readouterr().err
 
 
 def test_vetoes_are_kept_for_the_map_and_for_its_bundles(store: Store, tmp_path: Path) -> None:

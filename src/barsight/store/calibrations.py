@@ -8,7 +8,7 @@ from typing import Any
 from barsight.core.errors import ConfigError, InputError
 from barsight.core.extras import extra
 from barsight.store.audit import Entry
-from barsight.store.history import time_text
+from barsight.store.history import expect_time, time_text
 from barsight.store.tables import CALIBRATIONS, CRANES, RIGS, SURVEYS, VALIDITIES
 
 with extra("store"):
@@ -88,7 +88,7 @@ def approve_calibration(
     number = opened.connection.execute(query).scalar()
     if number is None:
         raise ConfigError(f"the store knows no calibration {digest}")
-    if until_ns is not None and until_ns <= from_ns:
+    if until_ns is not None and expect_time(until_ns) <= from_ns:
         raise ConfigError(f"valid from {time_text(from_ns)} until {time_text(until_ns)}: that is no time")
     opened.add(
         VALIDITIES, calibration_id=number, from_ns=from_ns, until_ns=until_ns, approved_by=opened.who,

@@ -104,14 +104,21 @@ def list_surveys(connection: Connection) -> tuple[SurveyRow, ...]:
 def parse_time(text: str) -> int:
     """Read a time in ns from ISO 8601 with a zone, or from integer ns. Raises ConfigError."""
     if text.isascii() and text.isdigit():
-        return int(text)
+        return expect_time(int(text))
     try:
         parsed = datetime.fromisoformat(text)
     except ValueError:
         parsed = None
     if parsed is None or parsed.tzinfo is None:
         raise ConfigError(f"{text!r} is no time; write it like 2026-11-23T14:00:00Z, with the zone")
-    return (parsed - datetime.fromtimestamp(0, UTC)) // timedelta(microseconds=1) * 1000
+    return expect_time((parsed - datetime.fromtimestamp(0, UTC)) // timedelta(microseconds=1) * 1000)
+
+
+def expect_time(stamp_ns: int) -> int:
+    """Return a stamp that a store can hold. Raises ConfigError."""
+    if not 0 <= stamp_ns < 2**63:
+        raise ConfigError("a time lies from 1970 to 2262; to name no end leave it out")
+    return stamp_ns
 
 
 def time_text(stamp_ns: int) -> str:
