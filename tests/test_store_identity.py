@@ -10,10 +10,11 @@ import pytest
 
 from barsight.store.adding import AddedSurvey, add_survey, read_survey
 from barsight.store.audit import AuditChain, entry, verify_chain
-from barsight.store.history import list_surveys, newest_sightings, present_yard
+from barsight.store.history import ExecutedLift, list_surveys, newest_sightings, present_yard
 from barsight.store.lift_records import add_lifts
 from barsight.store.opening import Store, open_store
 from barsight.store.states import lift_state, step_lift
+from lift_yards import record
 from store_yards import START_NS, WHOLE, CraneYard, View
 from yard_maps import Laid
 
@@ -226,6 +227,14 @@ def test_lifts_are_verified_or_failed_by_the_next_survey(store: Store, tmp_path:
         assert [lift_state(connection, k) for k in (done, undone, waiting)] == [
             "verified", "failed", "expired",
         ]  # fmt: skip
+
+
+def test_a_flat_pack_is_awaited_as_high_as_it_is_where_a_lift_laid_it() -> None:
+    pack = replace(record(Laid(0, 0, 0.05, 0)), width_m=0.6, top_z_m=0.1)
+    to = {"x_m": 3.0, "y_m": 0.0, "z_m": 0.4, "yaw_deg": 0.0}
+    laid = ExecutedLift(1, 1, START_NS, "executed", to).laid(pack)
+    assert laid is not None
+    assert (laid.bottom_z_m, laid.centre_m[2], laid.top_z_m) == pytest.approx((0.4, 0.45, 0.5))
 
 
 def test_two_alike_that_change_places_keep_apart_only_by_what_is_told(store: Store, tmp_path: Path) -> None:
