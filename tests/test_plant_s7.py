@@ -77,6 +77,15 @@ def test_what_is_written_is_as_it_is_then(plc: DrawnPlc, monkeypatch: pytest.Mon
     assert asked_s[0] > 0.5
 
 
+def test_an_error_of_our_own_is_none_of_the_plcs(plc: DrawnPlc) -> None:
+    link = S7Link(S7Settings(port=plc.port), INPUT_BYTES)
+    try:
+        with pytest.raises(ValueError, match="no number"):
+            link.exchange(lambda: int("no number").to_bytes())
+    finally:
+        link.close()
+
+
 def test_nodes7_sees_the_same_numbers(plc: DrawnPlc) -> None:
     """A foreign client on the PLC's side writes the inputs, and reads what was written, by its own types."""
     node_package("@st-one-io/nodes7")

@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from barsight.core.errors import Failed
 from barsight.core.extras import extra
@@ -45,24 +46,34 @@ class S7Link:
 
     def exchange(self, outputs: Callable[[], bytes] | None) -> S7Exchange | Failed:
         """Read the inputs, then write the outputs, if any, as they are by then; return Failed where the PLC
-        can't be reached.
+        can't be reached. An error of `outputs` is raised.
         """
+        one, write_s = self._settings, 0.0
+        read = self._tried(lambda client: client.db_read(one.read_db, one.read_start, self._input_bytes))
+        if isinstance(read, Failed):
+            return read
+        if outputs is not None:
+            content = bytearray(outputs())
+            written = self._tried(lambda client: client.db_write(one.write_db, one.write_start, content))
+            if isinstance(written, Failed):
+                return written
+            write_s = written[1]
+        inputs = bytes(read[0])
+        if len(inputs) != self._input_bytes:
+            return Failed("s7-short", f"the PLC gave {len(inputs)} bytes of {self._input_bytes}")
+        return S7Exchange(inputs, read[1], write_s)
+
+    def _tried(self, act: Callable[[snap7.Client], Any]) -> tuple[Any, float] | Failed:
+        """Ask the PLC for something; return the answer and the time that it took."""
         one = self._settings
         try:
             client = self._connected()
-            began = time.monotonic()
-            inputs = bytes(client.db_read(one.read_db, one.read_start, self._input_bytes))
-            read = time.monotonic()
-            if outputs is not None:
-                client.db_write(one.write_db, one.write_start, bytearray(outputs()))
-            written = time.monotonic()
+            began_s = time.monotonic()
+            return act(client), time.monotonic() - began_s
         except (S7Error, RuntimeError, OSError, ValueError) as error:
             self.close()
             reason = f"the PLC at {one.host}:{one.port} can't be read and written: {error}"
             return Failed("s7-exchange", " ".join(reason.split()))
-        if len(inputs) != self._input_bytes:
-            return Failed("s7-short", f"the PLC gave {len(inputs)} bytes of {self._input_bytes}")
-        return S7Exchange(inputs, read - began, written - read)
 
     def close(self) -> None:
         """End the connection, if there is one."""
