@@ -14,6 +14,7 @@ import time
 from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import replace
+from multiprocessing.connection import Connection
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -30,8 +31,9 @@ from barsight.plant.link_settings import OpcUaSettings, WebhookSettings
 from barsight.plant.links import opcua_link
 from barsight.plant.links.changes import changes_between
 from barsight.plant.links.running import serve_plant
+from barsight.plant.links.telegram_process import serve_telegram
 from barsight.plant.live_folder import with_live_run
-from barsight.plant.settings import PlantSettings, StoreSource, read_plant
+from barsight.plant.settings import PlantSettings, StoreSource, TelegramSettings, read_plant
 from barsight.plant.state import PlantAlarm, PlantState, state_of_store, told_alarms
 from barsight.plant.steps import LiftSteps, take_named_step
 from barsight.report.signing import sign_file
@@ -277,6 +279,36 @@ def test_a_feed_that_ends_ends_the_plants_side(monkeypatch: pytest.MonkeyPatch) 
 
     with pytest.raises(OutputError, match="read no more"):
         asyncio.run(serve())
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_telegram_whose_commands_nobody_answers_any_more_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An error that nobody foresaw ended the thread alone; no command would ever be answered again."""
+    pipes, kept = [multiprocessing.Pipe() for _ in range(2)], list[Connection]()
+
+    def start() -> None:
+        kept.extend(Connection(os.dup(there.fileno())) for _, there in pipes)
+        for word in (2000, ("claim", ())):
+            kept[1].send(word)
+
+    process = SimpleNamespace(start=start, is_alive=lambda: True, kill=lambda: None, join=lambda: None)
+    given = iter(pipes)
+    context = SimpleNamespace(Pipe=lambda: next(given), Process=lambda **_: process)
+    monkeypatch.setattr(multiprocessing, "get_context", lambda _: context)
+    feed: Any = SimpleNamespace(read=lambda: (QUIET, 0.0))
+
+    class Steps:
+        def claim(self) -> None:
+            raise KeyError("what nobody foresaw")
+
+    async def served() -> None:
+        async with asyncio.timeout(5):
+            await serve_telegram(TelegramSettings(), feed, cast(Any, Steps()), lambda _: None)
+
+    with pytest.raises(OutputError, match="what answers it ended"):
+        asyncio.run(served())
+    for each in kept:
+        each.close()
 
 
 def test_a_live_run_gives_the_pose_and_may_forbid(tmp_path: Path) -> None:

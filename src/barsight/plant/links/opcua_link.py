@@ -61,7 +61,7 @@ async def serve_opcua(
     try:
         for counter in itertools.count(1):
             if not process.is_alive:
-                raise OutputError("OPC UA: its process ended; its own lines above say why")
+                raise OutputError("OPC UA: its process or what answers it ended; the lines above say why")
             process.show(told(feed.newest(counter)))
             await asyncio.sleep(READ_EVERY_S)
     finally:

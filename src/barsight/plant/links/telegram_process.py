@@ -55,9 +55,9 @@ async def serve_telegram(
         say(f"{at}:{begun}")
         for thread in threads:
             thread.start()
-        while process.is_alive():
+        while process.is_alive() and all(thread.is_alive() for thread in threads):
             await asyncio.sleep(0.1)
-        raise OutputError(f"{at}: its process ended")
+        raise OutputError(f"{at}: its process or what answers it ended; the lines above say why")
     finally:
         stop.set()
         process.kill()

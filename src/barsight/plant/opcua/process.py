@@ -50,8 +50,8 @@ class OpcUaProcess:
 
     @property
     def is_alive(self) -> bool:
-        """Tell that the process runs."""
-        return self._process.is_alive()
+        """Tell that the process runs, and is answered."""
+        return self._process.is_alive() and self._thread.is_alive()
 
     @property
     def pid(self) -> int | None:
