@@ -26,6 +26,7 @@ with extra("page"):
     import uvicorn
 
 _DRAIN_S = 1
+USUAL_PORTS = {"http": ":80", "https": ":443"}
 
 
 @dataclass(frozen=True)
@@ -69,15 +70,13 @@ class ServeOptions:
             return False
 
     def names(self, port: int) -> tuple[frozenset[str], frozenset[str]]:
-        """List the hosts and origins that requests may carry."""
+        """List the hosts and origins that requests may carry; browsers leave out a scheme's usual port."""
         scheme = "https" if self.certificate else "http"
-        hosts = {f"{name}:{port}" for name in ("127.0.0.1", "localhost", "[::1]")}
-        origins = {f"{scheme}://{host}" for host in hosts}
+        served = [(scheme, f"{name}:{port}") for name in ("127.0.0.1", "localhost", "[::1]")]
         if self.public_url is not None:
-            public = urlsplit(self.public_url).netloc.lower()
-            hosts |= {public}
-            origins |= {f"https://{public}"}
-        return frozenset(hosts), frozenset(origins)
+            served.append(("https", urlsplit(self.public_url).netloc.lower()))
+        served += [(one, host.removesuffix(USUAL_PORTS[one])) for one, host in served]
+        return frozenset(host for _, host in served), frozenset(f"{one}://{host}" for one, host in served)
 
 
 def serve(url: str, options: ServeOptions) -> None:
