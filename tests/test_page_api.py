@@ -215,6 +215,25 @@ def wait_for(holds: object, timeout_s: float = 5.0) -> None:
         time.sleep(0.02)
 
 
+def test_an_older_survey_that_is_added_late_ends_no_offer_of_the_newest(url: str, tmp_path: Path) -> None:
+    """A lift between the two is in the newest map already."""
+    place = {"x_m": 1.4, "y_m": 0.0, "z_m": 0.2, "yaw_deg": 0.0}
+    older = read_survey(survey(tmp_path / "older", FIRST, 1800.0))
+    with open_store(url) as store:
+        with store.writing() as connection:
+            newest = confirmation.newest_survey(connection)
+            assert newest is not None
+            opened = Entry(connection, "ann", newest.captured_from_ns - 10 * NS_PER_S)
+            record = json.dumps({"target": place, "set_down": None})
+            lift = opened.add(LIFTS, survey_id=1, rank=1, record=record)
+            for state in ("offered", "claimed", "executed"):
+                step_lift(opened, lift, state)
+            before = confirmation.open_lifts(connection)
+        add_survey(store, older, "ann")
+        with store.reading() as connection:
+            assert len(before) == 3 and len(confirmation.open_lifts(connection)) == 3
+
+
 def test_a_confirmation_ends_with_its_map(local: httpx.Client, url: str, tmp_path: Path) -> None:
     first, second = offered(local)[:2]
     local.post(f"/api/lifts/{first['id']}/confirm", json={"map_id": first["map_id"]}).raise_for_status()
@@ -512,6 +531,15 @@ def test_it_does_not_stand_open(
     assert run(["serve", "--store", f"sqlite:///{made / 'yard.db'}", *arguments]) in (2, 3, 4)
     said = capsys.readouterr().err
     assert says in said and said.count("\n") == 1
+
+
+def test_the_usual_port_may_be_left_out() -> None:
+    """Browsers leave it out of Host and Origin, whether or not it stands in the address."""
+    hosts, origins = ServeOptions(public_url="https://Yard.example:443").names(8000)
+    assert {"yard.example", "127.0.0.1:8000"} <= hosts and "127.0.0.1" not in hosts
+    assert "https://yard.example" in origins
+    hosts, origins = ServeOptions().names(80)
+    assert "localhost" in hosts and "http://localhost" in origins and "https://localhost" not in origins
 
 
 def test_a_taken_port_is_one_line(made: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -144,7 +144,8 @@ def add_survey(
         if read.lifts is not None:
             is_sound = is_valid and not _note_looking_back(opened, read, survey_id)
             add_lifts(opened, survey_id, read.lifts, ids, is_newest=is_newest and is_sound)
-            end_disturbed(opened, read.from_ns)
+            if is_newest:
+                end_disturbed(opened, read.from_ns)
     named = {identity_name(number): change for number, change in changes.items()}
     return AddedSurvey(
         read.identity.map_id, True, named, {identity_name(n): kind for n, kind in absences.items()}
