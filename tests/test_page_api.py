@@ -29,6 +29,8 @@ from barsight.page.api.serve import ServeOptions, serving
 from barsight.page.conditions import find_conditions
 from barsight.page.documents import alarm_records, lift_records, unseen_lengths
 from barsight.page.layers import find_layers, newest_at, paint_layer
+from barsight.page.live import LiveFolder
+from barsight.page.watch import StoreWatch
 from barsight.store import accounts, confirmation
 from barsight.store.adding import add_survey, read_survey
 from barsight.store.audit import AuditChain, Entry, entry, verify_chain
@@ -126,6 +128,19 @@ def test_what_the_page_reads(local: httpx.Client) -> None:
     assert local.get(f"/api/bundles/B4/pictures/{layer['map_id']}.png").status_code == 404
     assert bundles["B1"]["unseen_m"] is None and bundles["B6"]["unseen_m"] is None
     assert "/api/lifts/{lift_id}/confirm" in local.get("/openapi.json").json()["paths"]
+
+
+def test_two_servers_of_which_one_watches_the_live_run_do_not_alarm_by_turns(
+    url: str, tmp_path: Path
+) -> None:
+    with open_store(url) as store:
+        watching, other = StoreWatch(store, LiveFolder(tmp_path / "none")), StoreWatch(store)
+        for _ in range(4):
+            watching.judge()
+            other.judge()
+        with store.reading() as connection:
+            told = [one["state"] for one in alarm_records(connection) if one["code"] == "live-stopped"]
+    assert told == ["raised", "returned"], "what an earlier server has left ends at the start, once"
 
 
 def test_the_yards_clock_goes_on_while_nothing_changes(

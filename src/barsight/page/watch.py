@@ -77,6 +77,7 @@ class StoreWatch:
         self.health: LiveHealth | None = None
         self.problem: str | None = None
         self.crane = b""
+        self._has_begun = False
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -135,6 +136,9 @@ class StoreWatch:
         """Settle alarms, and let offers end whose time is over or whose calibration was changed."""
         self.health = None if self.live is None else self.live.look()
         judged = {code for code in ALARM_CODES if code != "store-broken" or with_chain}
+        if self.live is None and self._has_begun:  # another server may watch the live run
+            judged = {code for code in judged if not code.startswith("live-")}
+        self._has_begun = True
         with self.store.reading() as connection:
             present = find_conditions(connection, self.health)
             if with_chain:
