@@ -30,6 +30,14 @@ def test_bad_configuration(
     refused(recording, capsys, "settings.toml", *words, flags=("--config", str(path)))
 
 
+@pytest.mark.parametrize("flag", ["--fetch", "--lifted"])
+def test_a_list_of_bundles_without_any_is_refused(flag: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """A script whose variable was empty: all lifts would be offered, or what was lifted forgotten."""
+    for arguments in ([flag, "--magnet", "magnet.toml"], ["--magnet", "magnet.toml", flag]):
+        assert run(["lifts", "out", *arguments]) == 2
+        assert f"{flag} has no value" in capsys.readouterr().err
+
+
 def test_impossible_flag(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
     refused(recording, capsys, "min_views", flags=("--map.min-views", "0"))
 

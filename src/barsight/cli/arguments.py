@@ -64,7 +64,13 @@ def pass_on(name: str, noun: str, kinds: Mapping[str, str], arguments: Sequence[
 
 
 def _listed(arguments: Sequence[str]) -> list[str]:
+<<<<<<< HEAD
     """Rewrite `--use stereo,imu` as `--use stereo imu`, and the same for the other LISTS."""
+=======
+    """Rewrite `--use stereo,imu` as `--use stereo imu`; the same for the other LISTS. Raises ConfigError where
+    one has no value, as of a script whose variable was empty.
+    """
+>>>>>>> 394507e7 (lifts --fetch or --lifted without a number was taken as if it weren't there: a script's empty variable offered all lifts)
     listed: list[str] = []
     for argument in arguments:
         flag, equals, value = argument.partition("=")
@@ -74,6 +80,9 @@ def _listed(arguments: Sequence[str]) -> list[str]:
             listed += argument.split(",")
         else:
             listed.append(argument)
+    for argument, after in zip(listed, [*listed[1:], "--"], strict=True):
+        if argument in LISTS and after[:1] == "-" and not after[1:].isdigit():
+            raise ConfigError(f"{argument} has no value; give one or more, or leave it out")
     return listed
 
 
