@@ -230,6 +230,22 @@ def wait_for(holds: object, timeout_s: float = 5.0) -> None:
         time.sleep(0.02)
 
 
+def test_a_lift_that_was_made_after_its_confirmation_ended_ends_all_offers(
+    local: httpx.Client, url: str, tmp_path: Path
+) -> None:
+    lift = offered(local)[0]
+    assert local.post(f"/api/lifts/{lift['id']}/taken", json={}).status_code == 409
+    local.post(f"/api/lifts/{lift['id']}/confirm", json={"map_id": lift["map_id"]}).raise_for_status()
+    with open_store(url) as store:
+        add_survey(store, read_survey(survey(tmp_path / "third", SECOND[:4], 1.0)), "ann")
+    wait_for(lambda: state_of(local, lift["id"]) == "expired" and offered(local))
+    for _ in range(2):
+        answer = local.post(f"/api/lifts/{lift['id']}/taken", json={})
+        assert answer.status_code == 409 and "survey before the next lift" in answer.text
+    assert not offered(local)
+    assert [one["code"] for one in local.get("/api/alarms").json()["alarms"]].count("lift-unrecorded") == 1
+
+
 def test_an_older_survey_that_is_added_late_ends_no_offer_of_the_newest(url: str, tmp_path: Path) -> None:
     """A lift between the two is in the newest map already."""
     place = {"x_m": 1.4, "y_m": 0.0, "z_m": 0.2, "yaw_deg": 0.0}

@@ -14,6 +14,7 @@ import pytest
 from barsight.page.api.serve import ServeOptions, serving
 from barsight.store.accounts import add_person
 from barsight.store.audit import entry
+from barsight.store.confirmation import confirm_lift, end_lift, open_lifts
 from barsight.store.opening import open_store
 from live_folders import beating, live_folder
 from opcua_servers import node_package
@@ -89,6 +90,26 @@ def wait_for(holds: Callable[[], bool], timeout_s: float = 5.0) -> None:
     while not holds():
         assert time.monotonic() < end_s
         time.sleep(0.02)
+
+
+def test_a_lift_that_was_made_late_is_told_among_those_that_ended(
+    browser: object, address: str, url: str
+) -> None:
+    with open_store(url) as store:
+        with store.reading() as connection:
+            first, second, *_ = open_lifts(connection)
+        confirm_lift(store, first.lift_id, first.map_id, "ann")
+        for lift in (first, second):
+            end_lift(store, lift.lift_id, "expired", "ann", "its time is over")
+    sheet = Sheet(browser, address)
+    sheet.open("lifts")
+    assert not sheet.page.query_selector(f"#taken-{second.lift_id}"), "it was never confirmed"
+    sheet.page.click(f"#taken-{first.lift_id}")
+    wait_for(lambda: "survey before the next lift" in (sheet.page.text_content("#told") or ""))
+    sheet.open("alarms")
+    assert "lift-unrecorded" in sheet.page.content() or "could not be recorded" in sheet.page.content()
+    assert not sheet.errors
+    sheet.context.close()
 
 
 def test_every_screen_by_mouse_and_by_keyboard(browser: object, address: str) -> None:

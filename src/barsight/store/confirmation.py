@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -56,12 +55,6 @@ def _newest_query() -> Select[Any]:
     order = (SURVEYS.c.captured_to_ns.desc(), SURVEYS.c.id.desc())
     columns = (column for column in SURVEYS.c if column.name != "heights")
     return select(*columns).where(counts()).order_by(*order).limit(1)
-
-
-def survey_folder(connection: Connection, map_id: str) -> Path:
-    """Find the result folder of a survey by its map."""
-    query = select(SURVEYS.c.folder).where(SURVEYS.c.map_id == map_id)
-    return Path(connection.execute(query).scalar_one())
 
 
 def map_vetoes(connection: Connection, survey_id: int) -> list[dict[str, str]]:
@@ -148,8 +141,8 @@ def begin_lift(store: Store, lift_id: int, who: str) -> None:
 
 
 def take_lift(store: Store, lift_id: int, who: str, alarm: tuple[str, str] | None = None) -> None:
-    """Report that a confirmed lift was executed; offers and confirmations beside it end.
-
+    """Report that a confirmed lift was executed; offers and confirmations beside it end. Raises InputError
+    where it can't be recorded: one that was confirmed and has ended raises an alarm then, and all offers end.
     alarm: code and reason of one to raise with it.
     """
 
@@ -159,13 +152,20 @@ def take_lift(store: Store, lift_id: int, who: str, alarm: tuple[str, str] | Non
         if alarm is not None:
             raise_alarm(opened, *alarm)
 
-    _change(store, lift_id, who, "lift executed", step)
+    try:
+        _change(store, lift_id, who, "lift executed", step)
+    except InputError:
+        with store.reading() as connection:
+            query = select(LIFT_STATES.c.state).where(LIFT_STATES.c.lift_id == lift_id)
+            states = set(connection.execute(query).scalars())
+        if "claimed" in states and "executed" not in states:
+            _note_unrecorded(store, lift_id, who)
+        raise
 
 
-def note_unrecorded(store: Store, lift_id: int, who: str) -> str:
-    """Note that a lift was executed after it had ended: an alarm, and every offer and confirmation ends.
-
-    Returns the state that it had ended in; noted twice, it is noted once. Raises InputError where it is open.
+def _note_unrecorded(store: Store, lift_id: int, who: str) -> None:
+    """Note, once, that a lift was executed after it had ended: an alarm, and every offer and confirmation
+    ends. Raises InputError, which says so.
     """
     with store.reading() as connection:
         clock_ns = yard_clock_ns(connection)
@@ -173,13 +173,11 @@ def note_unrecorded(store: Store, lift_id: int, who: str) -> str:
         state = lift_state(opened.connection, lift_id) or "unknown"
         if state in OPEN:
             raise InputError(f"lift {lift_id}", f"is {state}", "report it again")
-        told = (
-            f"lift {lift_id} was executed and can't be recorded, it is {state}: survey before the next lift"
-        )
+        told = f"lift {lift_id} was executed and is {state}, unrecorded: survey before the next lift"
         if not has_alarm(opened.connection, "lift-unrecorded", told):
             raise_alarm(opened, "lift-unrecorded", told)
             _end_offers(opened, f"disturbed: lift {lift_id} was executed and isn't recorded")
-    return state
+    raise InputError(f"lift {lift_id}", f"is {state}, it can't be recorded", "survey before the next lift")
 
 
 def end_lift(store: Store, lift_id: int, state: str, who: str, note: str) -> None:

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -99,6 +100,12 @@ def list_surveys(connection: Connection) -> tuple[SurveyRow, ...]:
         )
         for r in rows
     )  # fmt: skip
+
+
+def survey_folder(connection: Connection, map_id: str) -> Path:
+    """Find the result folder of a survey by its map."""
+    query = select(SURVEYS.c.folder).where(SURVEYS.c.map_id == map_id)
+    return Path(connection.execute(query).scalar_one())
 
 
 def parse_time(text: str) -> int:

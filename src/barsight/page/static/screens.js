@@ -38,14 +38,14 @@ export async function bundleScreen(place, name) {
 const stepsOf = (one) => h("div", { className: "small" }, h("strong", {}, `${t("lift")} ${one.id} (${one.map_id})`), h("ul", {}, one.steps.map((step) => h("li", {}, `${timeText(step.at_ns)} · ${t(`lift.${step.state}`)} · ${step.who}${step.note ? ` · ${step.note}` : ""}`))));
 
 export async function liftScreen(place) {
-  const { lifts } = await read("lifts");
+  const [{ lifts }, state] = await Promise.all([read("lifts"), read("state")]);
   const open = lifts.filter((one) => OPEN_LIFTS.includes(one.state)).sort((a, b) => a.rank - b.rank);
   const closed = lifts.filter((one) => !open.includes(one));
   show(place,
     h("section", {}, h("h1", {}, t("lifts.open")), open.length ? h("div", { className: "lifts" }, open.map((one) => h("div", { className: "panel", id: `lift-${one.id}` }, h("h2", {}, `${one.rank} · ${one.bundles.join(", ")}`), liftPanel(one)))) : h("p", {}, t("lifts.none"))),
     h("section", {}, h("h1", {}, t("lifts.closed")), table([t("lift"), t("bundle"), t("state"), t("time"), t("who"), t("note"), t("to.do")], closed.map((one) => {
       const step = one.steps[one.steps.length - 1];
-      return row([h("td", {}, String(one.id)), h("td", {}, one.bundles.map((name) => h("a", { href: `#bundle/${name}` }, name))), h("td", {}, t(`lift.${one.state}`)), h("td", {}, timeText(step.at_ns)), h("td", {}, step.who), h("td", {}, step.note || ""), h("td", {}, liftButtons(one))]);
+      return row([h("td", {}, String(one.id)), h("td", {}, one.bundles.map((name) => h("a", { href: `#bundle/${name}` }, name))), h("td", {}, t(`lift.${one.state}`)), h("td", {}, timeText(step.at_ns)), h("td", {}, step.who), h("td", {}, step.note || ""), h("td", {}, liftButtons(one, clockNow(state)))]);
     }), t("lifts.closed"))));
 }
 

@@ -124,7 +124,10 @@ export function liftPanel(lift) {
   ];
 }
 
-export function liftButtons(lift) {
+const LATE_NS = 3600e9; // so long a lift that was made after its confirmation ended can be told here
+
+// clock_ns: the yard's, for lifts that have ended.
+export function liftButtons(lift, clock_ns = Infinity) {
   const act = (path, body, word) => change("POST", `/api/lifts/${lift.id}/${path}`, body).then(() => tell(t(word)), (error) => tell(error.message));
   const ended = async (state, title) => {
     const given = await ask(t(title), `${lift.bundles.join(", ")} · ${t("map")} ${lift.map_id}`, [["note", t("reason")]], t("accept"));
@@ -140,7 +143,9 @@ export function liftButtons(lift) {
   const button = (id, word, onclick, className, right) => h("button", { id: `${id}-${lift.id}`, onclick, className, disabled: !may(right) }, t(word));
   const ends = [button("taken", "lift.taken", () => act("taken", {}, "told.taken"), "main", "execute"),
     button("failed", "lift.report.failed", () => ended("failed", "lift.report.failed"), "", "execute")];
+  const isLate = lift.steps.some((step) => step.state === "claimed") && clock_ns - lift.steps[lift.steps.length - 1].at_ns < LATE_NS;
   const buttons = {
+    expired: () => (isLate ? ends.slice(0, 1) : []),
     offered: () => [button("confirm", "lift.confirm", confirm, "main", "operate"), button("decline", "lift.decline", () => ended("expired", "lift.decline"), "", "operate")],
     executing: () => ends,
     claimed: () => [...ends, button("back", "lift.back", () => ended("expired", "lift.back"), "", "operate")],

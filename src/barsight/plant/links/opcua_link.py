@@ -18,7 +18,7 @@ from barsight.plant.feed import READ_EVERY_S, StateFeed
 from barsight.plant.link_settings import OpcUaSettings
 from barsight.plant.state import PlantState
 from barsight.plant.steps import LiftSteps, take_named_step
-from barsight.store.confirmation import survey_folder
+from barsight.store.history import survey_folder
 from barsight.store.opening import Store
 
 
