@@ -242,8 +242,20 @@ def test_a_lift_that_was_made_after_its_confirmation_ended_ends_all_offers(
     for _ in range(2):
         answer = local.post(f"/api/lifts/{lift['id']}/taken", json={})
         assert answer.status_code == 409 and "survey before the next lift" in answer.text
-    assert not offered(local)
+    wait_for(lambda: not offered(local))
     assert [one["code"] for one in local.get("/api/alarms").json()["alarms"]].count("lift-unrecorded") == 1
+
+
+@pytest.mark.parametrize(("state", "left"), [("expired", 2), ("failed", 1)])
+def test_a_lift_that_failed_may_have_moved_what_lies_beside(
+    local: httpx.Client, state: str, left: int
+) -> None:
+    """Bundles lie 1.1 m apart, so that offers of neighbours are within the metre that a lift disturbs."""
+    lift = min(offered(local), key=lambda one: one["target"]["x_m"])
+    local.post(f"/api/lifts/{lift['id']}/confirm", json={"map_id": lift["map_id"]}).raise_for_status()
+    body = {"state": state, "note": "slipped"}
+    local.post(f"/api/lifts/{lift['id']}/end", json=body).raise_for_status()
+    assert state_of(local, lift["id"]) == state and len(offered(local)) == left
 
 
 def test_an_older_survey_that_is_added_late_ends_no_offer_of_the_newest(url: str, tmp_path: Path) -> None:

@@ -116,7 +116,7 @@ def report_failed(store: Store, claim: LiftClaim, note: str) -> str | Failed:
     if states[-1] == "failed" and "executed" not in states:
         return "failed"
     try:
-        end_lift(store, claim.lift_id, "failed", claim.who, note)
+        end_lift(store, claim.lift_id, "failed", claim.who, note, tells_begin=True)
     except BarsightError as error:
         if states_of(store, claim.lift_id)[-1] in ("claimed", "executing"):
             raise

@@ -180,10 +180,11 @@ def _note_unrecorded(store: Store, lift_id: int, who: str) -> None:
     raise InputError(f"lift {lift_id}", f"is {state}, it can't be recorded", "survey before the next lift")
 
 
-def end_lift(store: Store, lift_id: int, state: str, who: str, note: str) -> None:
+def end_lift(store: Store, lift_id: int, state: str, who: str, note: str, tells_begin: bool = False) -> None:
     """Decline an offer, take a confirmation back (`expired`), or report that a confirmed lift `failed`.
 
-    One that fails after it has begun may have moved something: offers and confirmations beside it end.
+    One that fails after it has begun may have moved something: offers and confirmations beside it end. That
+    it had begun is assumed where `who` isn't one that tells it (tells_begin), as cranes do.
     """
     if state not in ("expired", "failed"):
         raise ConfigError(f"a lift does not end as {state!r}")
@@ -191,8 +192,11 @@ def end_lift(store: Store, lift_id: int, state: str, who: str, note: str) -> Non
         raise ConfigError("say why, for the audit log")
 
     def step(opened: Entry, lift: OpenLift) -> None:
+        is_assumed = (lift.state, state) == ("claimed", "failed") and not tells_begin
+        if is_assumed:
+            step_lift(opened, lift_id, "executing")
         step_lift(opened, lift_id, state, note)
-        if lift.state == "executing":
+        if is_assumed or lift.state == "executing":
             _end_beside(opened, lift)
 
     _change(store, lift_id, who, f"lift {state}", step)
@@ -208,10 +212,9 @@ def end_disturbed(opened: Entry, since_ns: int) -> None:
     moving = select(LIFT_STATES.c.lift_id).where(
         LIFT_STATES.c.state.in_(("executing", "executed")), LIFT_STATES.c.at_ns >= since_ns
     )
-    begun = select(LIFT_STATES.c.lift_id).where(LIFT_STATES.c.state == "executing")
-    failed = select(LIFT_STATES.c.lift_id).where(
-        LIFT_STATES.c.state == "failed", LIFT_STATES.c.at_ns >= since_ns, LIFT_STATES.c.lift_id.in_(begun)
-    )
+    begun = LIFT_STATES.c.lift_id.in_(select(LIFT_STATES.c.lift_id).where(LIFT_STATES.c.state == "executing"))
+    late = LIFT_STATES.c.state == "failed", LIFT_STATES.c.at_ns >= since_ns
+    failed = select(LIFT_STATES.c.lift_id).where(*late, begun)
     query = _lift_query(LIFTS.c.id.in_(moving) | LIFTS.c.id.in_(failed))
     for lift in _lifts(opened.connection, query):
         _end_beside(opened, lift)
@@ -324,12 +327,9 @@ def _stale(connection: Connection, clock_ns: int) -> dict[int, str]:
 
 def _outlines(connection: Connection, lift: OpenLift) -> list[Float64]:
     """Draw the corners (4, 2) of the load and the magnet; and of both where they are set down."""
-    rows = connection.execute(
-        select(SIGHTINGS.c.record)
-        .join(LIFT_BUNDLES, LIFT_BUNDLES.c.bundle_id == SIGHTINGS.c.bundle_id)
-        .where(LIFT_BUNDLES.c.lift_id == lift.lift_id, SIGHTINGS.c.survey_id == lift.survey_id)
-    ).scalars()
-    bundles = [bundle_of(json.loads(row)) for row in rows]
+    held = select(SIGHTINGS.c.record).join(LIFT_BUNDLES, LIFT_BUNDLES.c.bundle_id == SIGHTINGS.c.bundle_id)
+    own = LIFT_BUNDLES.c.lift_id == lift.lift_id, SIGHTINGS.c.survey_id == lift.survey_id
+    bundles = [bundle_of(json.loads(row)) for row in connection.execute(held.where(*own)).scalars()]
     places = [lift.record["target"]]
     if lift.record["set_down"]:
         places.append(lift.record["set_down"])
