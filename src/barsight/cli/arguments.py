@@ -64,13 +64,10 @@ def pass_on(name: str, noun: str, kinds: Mapping[str, str], arguments: Sequence[
 
 
 def _listed(arguments: Sequence[str]) -> list[str]:
-<<<<<<< HEAD
-    """Rewrite `--use stereo,imu` as `--use stereo imu`, and the same for the other LISTS."""
-=======
-    """Rewrite `--use stereo,imu` as `--use stereo imu`; the same for the other LISTS. Raises ConfigError where
-    one has no value, as of a script whose variable was empty.
+    """Rewrite `--use stereo,imu` as `--use stereo imu`, and the same for the other LISTS.
+
+    Raises ConfigError where one has no value, as from a script whose variable was empty.
     """
->>>>>>> 394507e7 (lifts --fetch or --lifted without a number was taken as if it weren't there: a script's empty variable offered all lifts)
     listed: list[str] = []
     for argument in arguments:
         flag, equals, value = argument.partition("=")

@@ -158,7 +158,7 @@ def bundle_history(connection: Connection, number: int) -> dict[str, Any] | None
 
 
 def lift_records(connection: Connection) -> list[dict[str, Any]]:
-    """List the newest lifts and all open ones, each with its states, who brought it there, and its figures."""
+    """List the newest lifts and all open ones, each with its states, who brought it there, its figures."""
     of = _bundles_of_lifts(connection)
     newest = select(LIFTS.c.id).join(SURVEYS).where(counts()).order_by(LIFTS.c.id.desc()).limit(MAX_LIFTS)
     open_ids = [lift.lift_id for lift in open_lifts(connection)]

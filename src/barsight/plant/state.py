@@ -16,7 +16,7 @@ from barsight.store.states import standing_alarms
 from barsight.yard.lifting.validity import is_ahead
 
 MAX_ALARMS = 20
-"""Alarms that are told to the plant: the urgent ones first, of these the newest; and one of each other code."""
+"""Alarms that are told to the plant, the urgent first, then the newest; and one of each other code."""
 URGENT = ("store-broken", "load-contradicts", "lift-unrecorded", "lift-failed")
 """Codes of alarms of priority 1: what the store says of the yard may not be true. All others have 2."""
 YAW_SENSE = "of the beam from +Y of the yard frame, counter-clockwise seen from above"

@@ -70,7 +70,8 @@ def out_values(state: PlantState, answer: Mapping[str, int]) -> dict[str, int]:
     status = int(state.is_valid) | (8 if state.mode == "simulated" else 0)
     values = {
         "magic": OUT_MAGIC, "version": VERSION, "life": state.life_counter & 0xFFFF, "status": status,
-        "stamp_ns": state.stamp_ns, "approach": NOT_SET, "alarms": min(len(state.alarms), MAX_ALARMS), **answer,
+        "stamp_ns": state.stamp_ns, "approach": NOT_SET, "alarms": min(len(state.alarms), MAX_ALARMS),
+        **answer,
     }  # fmt: skip
     if lift is None:
         return values

@@ -261,9 +261,7 @@ class ExecutedLift:
         turned = (math.radians(to["yaw_deg"]) + math.pi / 2) % math.pi - math.pi / 2
         up_m = to["z_m"] - bundle.bottom_z_m
         centre = np.array([to["x_m"], to["y_m"], bundle.centre_m[2] + up_m])
-        return replace(
-            bundle, centre_m=centre, yaw_rad=turned, pitch_rad=0.0, top_z_m=bundle.top_z_m + up_m
-        )
+        return replace(bundle, centre_m=centre, yaw_rad=turned, pitch_rad=0.0, top_z_m=bundle.top_z_m + up_m)
 
 
 def executed_lifts(connection: Connection) -> tuple[ExecutedLift, ...]:
