@@ -185,6 +185,13 @@ def test_the_oldest_surveys_go_but_for_protected_ones(tmp_path: Path) -> None:
     assert left == ["20261101T101010", "20261103T101010", "20261105T101010", "latest", "notes"]
 
 
+def test_surveys_dated_ahead_go_before_those_made_since_the_clock_was_set_right(tmp_path: Path) -> None:
+    for name in ("20990101T000000", "20990102T000000", "20200101T000000", "20200102T000000"):
+        (tmp_path / name).mkdir()
+    _keep(tmp_path, 2)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["20200101T000000", "20200102T000000"]
+
+
 def test_what_was_recorded_of_a_standing_crane_goes_unless_it_holds_an_alarm(tmp_path: Path) -> None:
     here, recording = tmp_path / "survey", tmp_path / "elsewhere"
     for path in (here, recording / "alarms"):

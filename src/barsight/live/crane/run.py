@@ -6,7 +6,7 @@ import shutil
 import signal
 import time
 from collections.abc import Callable
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Literal
 
@@ -173,10 +173,16 @@ def _point(link: Path, name: str) -> None:
 
 
 def _keep(out: Path, count: int) -> None:
-    """Remove the oldest surveys' folders beyond so many, but for the last that was measured."""
+    """Remove the oldest surveys' folders beyond so many, but for the last that was measured. What is dated
+    ahead is no new survey's: a clock that was wrong has been set back since.
+    """
+    ahead = (datetime.now(UTC) + timedelta(days=1)).strftime(STAMP)
     surveys = sorted(
-        path for path in out.iterdir()
-        if path.is_dir() and not path.is_symlink() and len(path.name) == 15 and path.name[8] == "T"
+        (
+            path for path in out.iterdir()
+            if path.is_dir() and not path.is_symlink() and len(path.name) == 15 and path.name[8] == "T"
+        ),
+        key=lambda path: (path.name < ahead, path.name),
     )  # fmt: skip
     for path in surveys[:-count]:
         is_latest = (out / LATEST).exists() and path.samefile(out / LATEST)
