@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+import uuid
 from collections.abc import Callable
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from sqlalchemy.exc import DBAPIError
 
 import barsight.store.opening as opening
 from barsight.cli.main import run
-from barsight.core.errors import ConfigError, Failed, InputError
+from barsight.core.errors import ConfigError, Failed, InputError, OutputError
 from barsight.store.adding import AddedSurvey, add_survey, read_survey
 from barsight.store.audit import AuditChain, entry, verify_chain
 from barsight.store.calibrations import approve_calibration, note_calibration
@@ -28,6 +29,7 @@ from barsight.store.history import parse_time
 from barsight.store.opening import Store, open_store
 from barsight.store.states import LIFT_STEPS, alarm_state, raise_alarm, step_alarm, step_lift
 from barsight.store.tables import ALARMS, AUDIT, LIFTS, METADATA, SURVEY_VETOES, SURVEYS
+from store_servers import add_database
 from store_yards import CraneYard
 from yard_folders import lifts, write_folder
 
@@ -390,6 +392,27 @@ def test_a_time_that_no_store_can_hold_is_one_line(
     for arguments in (["store", "approve", url, "ca1b", "--valid-until", time], ["yard", url, "--at", time]):
         assert run(arguments) == 2
         assert "from 1970 to 2262" in capsys.readouterr().err
+
+
+def test_a_server_that_may_only_be_read_or_whose_writer_hangs_is_one_line(
+    server: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a failover, and while a writer's computer has lost its network: neither ends a thread for good."""
+    with open_store(add_database(server, f"yard_{uuid.uuid4().hex}"), create=True) as store:
+        monkeypatch.setattr(opening, "WAIT_S", 0.2)
+        with store.writing(), pytest.raises(InputError, match="lock timeout"):
+            alarm(store)
+        monkeypatch.setattr(opening, "IDLE_S", 0.2)
+        with pytest.raises(InputError, match="idle-in-transaction timeout"), store.writing() as connection:
+            time.sleep(0.6)
+            connection.execute(text("SELECT 1"))
+        alarm(store)
+        with store.engine.begin() as connection:
+            name = store.engine.url.database
+            connection.execute(text(f'ALTER DATABASE "{name}" SET default_transaction_read_only = on'))
+        store.engine.dispose()
+        with pytest.raises(OutputError, match="read-only"):
+            alarm(store)
 
 
 def test_vetoes_are_kept_for_the_map_and_for_its_bundles(store: Store, tmp_path: Path) -> None:

@@ -26,6 +26,8 @@ DEFAULT_URL = "sqlite:///barsight.db"
 MIGRATIONS = Path(__file__).parent / "migrations"
 WAIT_S = 60
 """Time that a writer waits for another one."""
+IDLE_S = 300
+"""Time after which PostgreSQL ends a writer of which it hears nothing: its computer may be gone."""
 _LOCK = 0x62617273
 """PostgreSQL's advisory lock that writers of a store take."""
 
@@ -51,6 +53,9 @@ class Store:
         writer = self.engine.execution_options(is_writer=True)
         with _told(self.name), writer.begin() as connection:
             if not self._is_sqlite:
+                limits = {"lock_timeout": WAIT_S, "idle_in_transaction_session_timeout": IDLE_S}
+                told = (f"set_config('{name}', '{1e3 * wait_s:.0f}', true)" for name, wait_s in limits.items())
+                connection.execute(text(f"SELECT {', '.join(told)}"))
                 connection.execute(text(f"SELECT pg_advisory_xact_lock({_LOCK})"))
             yield connection
 
@@ -124,13 +129,15 @@ def _begin_sqlite(connection: Connection) -> None:
     connection.exec_driver_sql("BEGIN IMMEDIATE" if is_writer else "BEGIN")
 
 
-_UNWRITTEN = ("SQLITE_FULL", "SQLITE_IOERR", "SQLITE_READONLY")
+_UNWRITTEN = ("SQLITE_FULL", "SQLITE_IOERR", "SQLITE_READONLY", "25006")
+"""Codes of SQLite's, and PostgreSQL's of a server that may only be read, as after a failover."""
+_TOO_IDLE = "25P03"
 
 
 @contextmanager
 def _told(name: str) -> Iterator[None]:
     """Turn a database that can't be reached, read or written into an InputError of one line, an OutputError
-    where SQLite could not write.
+    where it may not or could not be written.
 
     A statement that it refuses is a bug and raised as it is.
     """
@@ -139,10 +146,13 @@ def _told(name: str) -> Iterator[None]:
     except UnicodeDecodeError as error:  # of SQLite's message about a damaged file
         raise InputError(name, "is damaged", "take the newest backup beside it") from error
     except DatabaseError as error:
-        if not isinstance(error, OperationalError) and type(error) is not DatabaseError:
+        code = getattr(error.orig, "sqlite_errorname", None) or getattr(error.orig, "sqlstate", None) or ""
+        is_unwritten = code.startswith(_UNWRITTEN)
+        is_known = is_unwritten or code == _TOO_IDLE or isinstance(error, OperationalError)
+        if not is_known and type(error) is not DatabaseError:
             raise
         problem = str(error.orig).strip().splitlines()[0]
-        if getattr(error.orig, "sqlite_errorname", "").startswith(_UNWRITTEN):
+        if is_unwritten:
             raise OutputError(f"{name}: {problem}; free some space, or see that it may be written") from error
         raise InputError(
             name, problem, "see that the database is there, is a store and may be written"
