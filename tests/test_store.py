@@ -397,7 +397,7 @@ def test_a_time_that_no_store_can_hold_is_one_line(
 def test_a_server_that_may_only_be_read_or_whose_writer_hangs_is_one_line(
     server: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """After a failover, and while a writer's computer has lost its network: neither ends a thread for good."""
+    """After a failover, or while a writer's computer has lost its network: neither ends a thread."""
     with open_store(add_database(server, f"yard_{uuid.uuid4().hex}"), create=True) as store:
         monkeypatch.setattr(opening, "WAIT_S", 0.2)
         with store.writing(), pytest.raises(InputError, match="lock timeout"):

@@ -54,7 +54,7 @@ class Store:
         with _told(self.name), writer.begin() as connection:
             if not self._is_sqlite:
                 limits = {"lock_timeout": WAIT_S, "idle_in_transaction_session_timeout": IDLE_S}
-                told = (f"set_config('{name}', '{1e3 * wait_s:.0f}', true)" for name, wait_s in limits.items())
+                told = (f"set_config('{name}', '{1e3 * s:.0f}', true)" for name, s in limits.items())
                 connection.execute(text(f"SELECT {', '.join(told)}"))
                 connection.execute(text(f"SELECT pg_advisory_xact_lock({_LOCK})"))
             yield connection
