@@ -282,8 +282,7 @@ def test_a_confirmation_ends_with_its_map(local: httpx.Client, url: str, tmp_pat
     local.post(f"/api/lifts/{first['id']}/confirm", json={"map_id": first["map_id"]}).raise_for_status()
     with open_store(url) as store:
         add_survey(store, read_survey(survey(tmp_path / "third", SECOND, 1.0)), "ann")
-    answer = local.post(f"/api/lifts/{first['id']}/taken", json={})
-    assert answer.status_code == 409 and "expired" in answer.json()["problem"]
+    wait_for(lambda: state_of(local, first["id"]) == "expired")
     answer = local.post(f"/api/lifts/{second['id']}/confirm", json={"map_id": second["map_id"]})
     assert answer.status_code == 409
     new = offered(local)[0]
