@@ -92,6 +92,18 @@ def wait_for(holds: Callable[[], bool], timeout_s: float = 5.0) -> None:
         time.sleep(0.02)
 
 
+def test_a_bundles_age_goes_on_while_nothing_changes(browser: object, address: str) -> None:
+    context = browser.new_context(locale="en", viewport={"width": 1500, "height": 850})
+    page = context.new_page()
+    page.clock.install()
+    page.goto(f"{address}/#yard")
+    page.click("[id^=pick-]")
+    assert " h" not in (page.text_content("#side dl:last-of-type") or "")
+    page.clock.fast_forward(2 * 3600 * 1000)
+    wait_for(lambda: "2.0 h" in (page.text_content("#side dl:last-of-type") or ""))
+    context.close()
+
+
 def test_a_lift_that_was_made_late_is_told_among_those_that_ended(
     browser: object, address: str, url: str
 ) -> None:

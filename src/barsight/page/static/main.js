@@ -13,6 +13,9 @@ const SCREENS = { yard: yardScreen, model: modelScreen, bundle: bundleScreen, li
 const place = document.getElementById("screen");
 let isThere = true;
 let drawn = 0;
+let drawnAt = 0;
+const AGED_MS = 60000; // ages stand on these screens, which nothing else may draw anew for hours
+const AGING = ["yard", "bundle"];
 
 const where = () => {
   const [name, argument] = location.hash.slice(1).split("/");
@@ -21,6 +24,7 @@ const where = () => {
 
 async function draw() {
   const mine = (drawn += 1);
+  drawnAt = performance.now();
   const [name, argument] = where();
   document.body.dataset.screen = name;
   if (!session.isKnown) return logInScreen();
@@ -121,7 +125,8 @@ function mark_away() {
 setInterval(async () => {
   if (!session.isKnown || !isThere) return;
   await showAge();
-  if (where()[0] === "health") draw();
+  const name = where()[0];
+  if (name === "health" || (AGING.includes(name) && performance.now() - drawnAt > AGED_MS)) draw();
 }, 5000);
 window.addEventListener("hashchange", () => draw().then(() => place.focus()));
 await loadWords();
