@@ -38,6 +38,14 @@ def test_a_list_of_bundles_without_any_is_refused(flag: str, capsys: pytest.Capt
         assert f"{flag} has no value" in capsys.readouterr().err
 
 
+def test_a_command_takes_no_argument_at_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(["store", "list"]) == 3
+    assert "there is no such store" in capsys.readouterr().err
+
+
 def test_impossible_flag(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
     refused(recording, capsys, "min_views", flags=("--map.min-views", "0"))
 

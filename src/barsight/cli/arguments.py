@@ -7,6 +7,7 @@ import importlib
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import TypeVar
 
@@ -77,7 +78,7 @@ def _listed(arguments: Sequence[str]) -> list[str]:
             listed += argument.split(",")
         else:
             listed.append(argument)
-    for argument, after in zip(listed, [*listed[1:], "--"], strict=True):
+    for argument, after in pairwise([*listed, "--"]):
         if argument in LISTS and after[:1] == "-" and not after[1:].isdigit():
             raise ConfigError(f"{argument} has no value; give one or more, or leave it out")
     return listed
