@@ -433,7 +433,7 @@ def test_a_stale_offer_cannot_be_confirmed(browser: object, address: str) -> Non
     assert {one["state"] for one in lifts} == {"expired"}
     page.keyboard.press("Escape")
     sheet.open("bundle")
-    assert "the offer has ended" in page.inner_text("#screen tbody")
+    assert page.inner_text("#screen tbody").count("disturbed") == 5, "it forbids the whole map"
 
 
 def test_a_server_that_ends_and_comes_back(browser: object, url: str) -> None:
