@@ -20,7 +20,7 @@ class MapSettings:
     recording has only one frame).
     """
     min_shift: float = 0.0
-    """Minimum motion of the picture between mapped frames, as a share of its shorter side, but at least 24 px:
+    """Minimum motion of the picture between mapped frames, as a share of its shorter side, at least 24 px:
     a frame that has hardly moved, as of a crane at rest, would confirm the errors of the last one.
     """
     top_ratio: float = 0.35
