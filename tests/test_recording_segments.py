@@ -68,6 +68,22 @@ def test_a_torn_segment_is_read_up_to_the_tear_and_taken_up(whole: Path, tmp_pat
     assert mended is not None and np.array_equal(mended.stamp_ns, imu.stamp_ns)
 
 
+def bytes_read() -> int:
+    return int(Path("/proc/self/io").read_text(encoding="ascii").split()[1])
+
+
+def test_a_recorder_begun_anew_reads_no_pictures_again(tmp_path: Path) -> None:
+    # A shift's recording is tens of GB: read whole, the recorder didn't go on for minutes and was ended.
+    image = np.zeros((1000, 2000), np.uint8)
+    writer = SegmentWriter(tmp_path, 10_000_000)
+    for stamp in range(1, 11):
+        writer.pair(stamp, image, image)
+    writer.close()
+    before = bytes_read()
+    again = SegmentWriter(tmp_path)
+    assert again.last_pair_ns == 10 and bytes_read() - before < 2_000_000
+
+
 def test_what_is_no_mcap_is_refused(tmp_path: Path) -> None:
     (tmp_path / "segment_000001.mcap").write_bytes(b"nothing of the kind")
     with pytest.raises(bs.BarsightError, match=r"segment_000001\.mcap: is no MCAP file"):

@@ -6,6 +6,7 @@ whole [MCAP 1.0].
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
@@ -39,17 +40,25 @@ def segments_of(folder: Path) -> list[Path]:
     return sorted(folder.glob(PATTERN))
 
 
-def records(path: Path) -> Iterator[Record]:
-    """Yield a segment's records up to the footer or the first that is torn. Raises InputError for no MCAP."""
+def records(path: Path, max_bytes: int = MAX_RECORD) -> Iterator[Record]:
+    """Yield a segment's records up to the footer or the first that is torn. Raises InputError for no MCAP.
+
+    max_bytes: of each record's data no more is read.
+    """
     with path.open("rb") as stream:
+        length = os.fstat(stream.fileno()).st_size
         magic = stream.read(len(MAGIC))
         if magic != MAGIC[: len(magic)]:
             raise InputError(path, "is no MCAP file", "give the folder as the live run left it")
+        end = len(MAGIC)
         while len(head := stream.read(HEAD.size)) == HEAD.size:
             kind, size = HEAD.unpack(head)
-            if size > MAX_RECORD or len(data := stream.read(size)) < size:
+            end += HEAD.size + size
+            wanted = min(size, max_bytes)
+            if size > MAX_RECORD or end > length or len(data := stream.read(wanted)) < wanted:
                 return
-            yield Record(kind, data, stream.tell())
+            stream.seek(end)
+            yield Record(kind, data, end)
             if kind == FOOTER:
                 return
 

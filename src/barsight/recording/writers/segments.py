@@ -53,8 +53,11 @@ class SegmentWriter:
         self._stream: BinaryIO | None = None
         self._number, self._log_ns, self.bytes = 0, 0, 0
         folder.mkdir(parents=True, exist_ok=True)
-        for path in segments_of(folder):
+        for path in reversed(segments_of(folder)):
+            self._number = max(self._number, int(path.stem.rpartition("_")[2]))
             self._take_up(path)
+            if all(self.last_ns.values()):
+                break
 
     @property
     def last_pair_ns(self) -> int:
@@ -114,13 +117,16 @@ class SegmentWriter:
         return self._stream
 
     def _take_up(self, path: Path) -> None:
-        """Note what an earlier writer wrote; end a segment that it did not end."""
-        self._number = int(path.stem.rpartition("_")[2])
+        """Note what an earlier writer wrote, by heads alone: a shift's tens of GB take minutes to read. End a
+        segment that it did not end.
+        """
         topics, end, is_ended = list(KINDS), 0, False
-        for record in records(path):
+        for record in records(path, MESSAGE_HEAD.size):
             if record.kind == MESSAGE:
-                channel, _, self._log_ns, stamp_ns = MESSAGE_HEAD.unpack_from(record.data)
-                self.last_ns[topics[channel - 1]] = stamp_ns
+                channel, _, log_ns, stamp_ns = MESSAGE_HEAD.unpack_from(record.data)
+                topic = topics[channel - 1]
+                self._log_ns = max(self._log_ns, log_ns)
+                self.last_ns[topic] = max(self.last_ns[topic], stamp_ns)
             is_ended = record.kind == FOOTER
             if record.kind not in (FOOTER, DATA_END):
                 end = record.end
