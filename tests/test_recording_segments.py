@@ -1,5 +1,6 @@
 """Segments of a live recording: all of it back, up to where a kill cut it off."""
 
+import resource
 from pathlib import Path
 
 import numpy as np
@@ -8,8 +9,9 @@ from rosbags.highlevel import AnyReader
 
 import barsight as bs
 from barsight.core.records.pairs import StereoFrame
+from barsight.core.records.sensor_samples import ImuSamples
 from barsight.recording.base import Recording
-from barsight.recording.formats.segments import segments_of
+from barsight.recording.formats.segments import SegmentFile, segments_of
 from barsight.recording.writers.bag import write_descriptions
 from barsight.recording.writers.segments import SegmentWriter
 
@@ -82,6 +84,29 @@ def test_a_recorder_begun_anew_reads_no_pictures_again(tmp_path: Path) -> None:
     before = bytes_read()
     again = SegmentWriter(tmp_path)
     assert again.last_pair_ns == 10 and bytes_read() - before < 2_000_000
+
+
+def test_what_a_full_disk_cut_off_spoils_nothing_that_follows(whole: Path, tmp_path: Path) -> None:
+    # The system writes what there is room for and tells how much; then retention makes room again.
+    imu = bs.open_recording(whole).imu()
+    assert imu is not None
+    most, limits = 50_000, resource.getrlimit(resource.RLIMIT_FSIZE)
+    writer = SegmentWriter(tmp_path)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (most, limits[1]))
+    try:
+        for k in range(len(imu.stamp_ns)):
+            one = ImuSamples(*(values[k : k + 1] for values in vars(imu).values()))
+            try:
+                writer.samples(one)
+            except OSError:
+                resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+                writer.samples(one)
+            if segments_of(tmp_path)[-1].stat().st_size == most:
+                resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    writer.close()
+    assert [one.stamp_ns for one in SegmentFile(tmp_path).messages(["/imu0"])] == imu.stamp_ns.tolist()
 
 
 def test_what_is_no_mcap_is_refused(tmp_path: Path) -> None:

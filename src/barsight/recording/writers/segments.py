@@ -86,7 +86,7 @@ class SegmentWriter:
     def close(self) -> None:
         """End the segment as MCAP asks."""
         if self._stream is not None:
-            self._stream.write(END)
+            _append(self._stream, END)
             self.sync()
             self._stream.close()
             self._stream = None
@@ -99,7 +99,7 @@ class SegmentWriter:
         data = self._messages.serialize(message, kind)
         self._log_ns = max(self._log_ns, stamp_ns)  # readers ask that the log's times do not go back
         head = MESSAGE_HEAD.pack(self._channels[topic], 0, self._log_ns, stamp_ns)
-        self.bytes += stream.write(b"".join((HEAD.pack(MESSAGE, len(head) + len(data)), head, data)))
+        self.bytes += _append(stream, b"".join((HEAD.pack(MESSAGE, len(head) + len(data)), head, data)))
         self.last_ns[topic] = stamp_ns
 
     def _begin(self) -> BinaryIO:
@@ -113,7 +113,7 @@ class SegmentWriter:
             about = _text("offered_qos_profiles") + _text("")
             parts.append(_record(SCHEMA, schema))
             parts.append(_record(CHANNEL, channel + struct.pack("<I", len(about)) + about))
-        self._stream.write(b"".join(parts))
+        _append(self._stream, b"".join(parts))
         return self._stream
 
     def _take_up(self, path: Path) -> None:
@@ -137,6 +137,19 @@ class SegmentWriter:
                 stream.truncate(end)
                 stream.seek(end)
                 stream.write(END)
+
+
+def _append(stream: BinaryIO, data: bytes) -> int:
+    """Write all of it, or nothing and raise OSError: near a full disk the system takes a part and says so."""
+    begin, left = stream.tell(), memoryview(data)
+    try:
+        while left:
+            left = left[stream.write(left) :]
+    except OSError:
+        stream.seek(begin)
+        stream.truncate()
+        raise
+    return len(data)
 
 
 def _text(text: str) -> bytes:
