@@ -133,6 +133,26 @@ def test_units_order_and_stamps_are_recognised(tmp_path: Path) -> None:
     assert "read as deg/s and g" in second.notes
 
 
+@pytest.mark.parametrize(
+    ("rates", "others", "unit"),
+    [
+        ("gyro_{} [rad/s]", ["temp [degC]"], "rad/s"), ("gyro_{} [rad/s]", ["roll [deg]"], "rad/s"),
+        ("gyro_{}", ["temp (deg C)"], "rad/s"), ("gyro_{}", ["temperature °C"], "rad/s"),
+        ("w_{} (deg/s)", ["temp [degC]"], "deg/s"), ("gyr_{} [dps]", ["roll [rad]"], "deg/s"),
+    ],
+)  # fmt: skip
+def test_a_temperature_in_degrees_says_nothing_of_the_gyro(
+    tmp_path: Path, rates: str, others: list[str], unit: str
+) -> None:
+    names = ["time [s]", *(rates.format(a) for a in "xyz"), *(f"acc_{a} [m/s^2]" for a in "xyz"), *others]
+    rows = np.ones((9, 8)) * [0, 0.1, 0.1, 0.1, 0, 0, 9.81, 1]
+    rows[:, 0] = np.arange(9) * 0.01
+    log = tmp_path / "imu.csv"
+    np.savetxt(log, rows, delimiter=",", header=",".join(names), comments="", encoding="utf-8")
+    seen = read_imu_log(log).samples.gyro_radps
+    assert np.allclose(seen, 0.1 if unit == "rad/s" else np.radians(0.1))
+
+
 def test_hfi_log_agrees_with_the_outside_fit(data: Path, tmp_path: Path) -> None:
     out = tmp_path / "imu.yaml"
     assert run(["calibrate", "imu-noise", str(data / "imu_static_hfi" / "imu.txt"), "-o", str(out)]) == 0

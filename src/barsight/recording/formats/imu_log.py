@@ -29,6 +29,9 @@ NAMED = {
     "accel": re.compile(r"acc|^a_|^a[xyz]\b", re.IGNORECASE),
 }
 
+DEGREES = re.compile(r"(?:deg|°)(?!\w*[ _/.]*[CF](?:elsius|ahrenheit)?\b)|dps", re.IGNORECASE)
+"""Of angle, not of temperature."""
+
 
 class TimeUnit(StrEnum):
     """auto: by the header, else the one in which the samples come at 2.5 to 2500 Hz."""
@@ -94,7 +97,7 @@ def read_imu_log(
             )
         accel_unit = AccelUnit.G if norms[1] < 2 else AccelUnit.MPS2
     if gyro_unit is GyroUnit.AUTO:
-        gyro_unit = GyroUnit.DEGREES if re.search(r"deg|°|dps", header, re.IGNORECASE) else GyroUnit.RADIANS
+        gyro_unit = _gyro_unit(header)
     notes.append(f"read as {gyro_unit} and {accel_unit}")
     gyro = np.radians(first) if gyro_unit is GyroUnit.DEGREES else first
     accel = second * GRAVITY_MPS2 if accel_unit is AccelUnit.G else second
@@ -166,6 +169,14 @@ def _stamps_ns(path: Path, stamps: list[Decimal], header: str, unit: TimeUnit) -
     if not all(abs(stamp) < 2**63 for stamp in scaled):
         raise InputError(path, f"holds stamps that are no time in {unit}", "give their unit by --time-unit")
     return np.array([int(stamp) for stamp in scaled], dtype=np.int64)
+
+
+def _gyro_unit(header: str) -> GyroUnit:
+    """Find the gyroscope's unit, by its own columns where these tell one: others may have degrees too."""
+    names = [name for name in re.split(r"[,;\t]", header) if NAMED["gyro"].search(name.strip(" #"))]
+    own = " ".join(names)
+    told = own if re.search(r"rad|deg|°|dps", own, re.IGNORECASE) else header
+    return GyroUnit.DEGREES if DEGREES.search(told) else GyroUnit.RADIANS
 
 
 def _time_unit(path: Path, stamps: list[Decimal], header: str) -> TimeUnit:
