@@ -56,6 +56,18 @@ def test_frozen_encoders_are_found_while_moving_only() -> None:
     assert check_crane(frozen_between(travelling(), 0.2, 1.5)).warnings == ()
 
 
+@pytest.mark.parametrize(("rate_hz", "accel"), [(5, 0.2), (5, 0.35), (10, 0.35), (10, 1.0), (50, 1.0)])
+def test_a_crane_that_brakes_and_starts_anew_froze_nothing(rate_hz: float, accel: float) -> None:
+    """Encoders without noise, in whole mm: standing, all their readings are equal."""
+    time = np.arange(0, 30, 1 / rate_hz)
+    ways = [(1, 9), (14, 22)], [(1, 9), (18, 22)]
+    speed = [sum(np.clip(np.minimum(time - a, b - time) * accel, 0, 0.6) for a, b in way) for way in ways]
+    place = np.column_stack([*np.cumsum(speed, axis=1) / rate_hz, 0 * time + 8]).round(3)
+    crane = CraneSamples((time * 1e9).astype(np.int64), place, np.zeros(3), np.eye(3), 0.001)
+    checked = check_crane(crane)
+    assert checked.warnings == () and len(checked.samples.stamp_ns) == len(time)
+
+
 @pytest.mark.parametrize("size_m", [0.09, 0.2, -0.5])
 def test_a_jump_is_taken_off_what_follows(size_m: float) -> None:
     """Encoders alone tell it: all readings stay, the jump's size open."""

@@ -204,6 +204,7 @@ def frozen_stretches(crane: CraneSamples) -> list[tuple[int, int]]:
             continue
         after = place[last + 1 : last + 4]
         away = float(np.linalg.norm(np.median(after, axis=0) - place[last])) if len(after) == 3 else 0.0
+        away -= MAX_BRAKING_MPS2 * float(time[min(last + 2, len(time) - 1)] - time[last]) ** 2 / 2
         speed = _speed_before(place, time, int(first))
         braked = min(float(time[last] - time[first]), speed / MAX_BRAKING_MPS2)
         if max(away, (speed - MAX_BRAKING_MPS2 * braked / 2) * braked) > min_m:
@@ -212,9 +213,17 @@ def frozen_stretches(crane: CraneSamples) -> list[tuple[int, int]]:
 
 
 def _speed_before(place: Float64, time: Float64, first: int) -> float:
-    """Compute the median speed (m/s) before a reading, from pairs of readings half a window apart."""
+    """Extrapolate the speed (m/s) at a reading from the readings before it.
+
+    It continues the medians of the earlier and the later rates over half a window, since a braking crane is
+    slower than it was.
+    """
     begin = min(int(np.searchsorted(time, time[first] - SPEED_WINDOW_S)), max(0, first - SIDE))
     half = (first - begin + 1) // 2
     old, new = slice(begin, first + 1 - half), slice(begin + half, first + 1)
-    rates = (place[new] - place[old]) / (time[new] - time[old])[:, None]
-    return float(np.linalg.norm(np.median(rates, axis=0)))
+    rates, at = (place[new] - place[old]) / (time[new] - time[old])[:, None], (time[new] + time[old]) / 2
+    parts = (slice(0, (len(at) + 1) // 2), slice(len(at) // 2, None))
+    earlier, later = (np.median(rates[part], axis=0) for part in parts)
+    apart = float(at[parts[1]].mean() - at[parts[0]].mean())
+    drawn_on = (time[first] - at[parts[1]].mean()) / apart if apart > 0 else 0.0
+    return float(np.linalg.norm(later + drawn_on * (later - earlier)))
