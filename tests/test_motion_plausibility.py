@@ -19,6 +19,8 @@ from barsight.motion.batch.fault_detection import check_crane, frozen_stretches
 from barsight.motion.batch.fusion import BatchFusion, FusionSettings
 from barsight.motion.crane.encoder_jumps import find_jumps
 from barsight.motion.crane.encoder_trajectory import CraneSettings, fit_position, reestimate_noise
+from barsight.motion.crane.known_motion import KnownMotion
+from barsight.motion.fixed_lag.encoder_watch import EncoderWatch
 from barsight.motion.fixed_lag.estimator import FixedLagFusion, FixedLagSettings
 from barsight.motion.frontend.seen_steps import known_motion
 from barsight.motion.frontend.sightings import Sighting
@@ -66,6 +68,24 @@ def test_a_crane_that_brakes_and_starts_anew_froze_nothing(rate_hz: float, accel
     crane = CraneSamples((time * 1e9).astype(np.int64), place, np.zeros(3), np.eye(3), 0.001)
     checked = check_crane(crane)
     assert checked.warnings == () and len(checked.samples.stamp_ns) == len(time)
+
+
+def test_one_encoder_alone_that_freezes_is_found() -> None:
+    """By the batch, and by the live watch, which no longer sees where it began."""
+    crane = travelling()
+    held = frozen_between(crane, 8.0, 10.5).position_m
+    frozen = replace(crane, position_m=np.column_stack([held[:, 0], crane.position_m[:, 1:]]))
+    assert check_crane(frozen).warnings == (
+        "the encoders were frozen from 8.1 s to 10.4 s while the crane moved",
+    )
+    watch = EncoderWatch()
+    for now in np.arange(7.0, 12.0, 0.25):
+        part = (crane.stamp_ns <= now * 1e9) & (crane.stamp_ns > (now - 1.5) * 1e9)
+        watch.check(
+            replace(frozen, stamp_ns=crane.stamp_ns[part], position_m=frozen.position_m[part]), KnownMotion()
+        )
+    ((begin, end),) = watch.frozen
+    assert 8.0e9 < begin < 8.2e9 and 10.4e9 <= end < 10.6e9
 
 
 @pytest.mark.parametrize("size_m", [0.09, 0.2, -0.5])

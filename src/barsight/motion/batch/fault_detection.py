@@ -190,14 +190,25 @@ def _chosen(crane: CraneSamples, kept: Bool) -> CraneSamples:
 
 def frozen_stretches(crane: CraneSamples) -> list[tuple[int, int]]:
     """Find stretches (first, last) of equal readings during which a moving crane must have travelled on, or
-    after which the readings continue elsewhere.
+    after which the readings continue elsewhere: of all encoders together, or of one while the others change.
 
     A crane that reverses gives equal readings too, above all with coarse encoders, but stays near them.
     """
-    place, time = crane.position_m, (crane.stamp_ns - crane.stamp_ns[:1]) / NS_PER_S
+    time, min_m = (crane.stamp_ns - crane.stamp_ns[:1]) / NS_PER_S, min_way_m(crane)
+    each = [_frozen(crane.position_m[:, axes], time, min_m) for axes in ([0, 1, 2], [0], [1], [2])]
+    found: list[tuple[int, int]] = []
+    for first, last in sorted(part for parts in each for part in parts):
+        if found and first <= found[-1][1]:
+            found[-1] = found[-1][0], max(found[-1][1], last)
+        else:
+            found.append((first, last))
+    return found
+
+
+def _frozen(place: Float64, time: Float64, min_m: float) -> list[tuple[int, int]]:
+    """Find stretches (first, last) of equal readings (N, A) of encoders that must have moved by `min_m`."""
     same = np.r_[False, (np.diff(place, axis=0) == 0).all(axis=1), False]
     edges = np.flatnonzero(np.diff(same.astype(int)))
-    min_m = min_way_m(crane)
     found = []
     for first, last in zip(edges[::2], edges[1::2], strict=True):
         if last - first + 1 < MIN_FROZEN or first < SIDE // 2:

@@ -122,7 +122,7 @@ def _exact_stamp(crane: CraneSamples, series: CraneSamples, step: FoundStep) -> 
 
 def _thinned(crane: CraneSamples) -> CraneSamples:
     """Combine readings that come faster than `MAX_RATE_HZ` by their median on each axis."""
-    spacing = float(np.median(np.diff(crane.stamp_ns))) if len(crane.stamp_ns) > 1 else 1.0
+    spacing = float(np.median(np.diff(crane.stamp_ns))) if len(crane.stamp_ns) > 1 else np.inf
     together = round(NS_PER_S / MAX_RATE_HZ / spacing)
     if together < 2:
         return crane

@@ -49,7 +49,9 @@ class EncoderWatch:
         if self.frozen and self.frozen[-1][1] >= stamps[0]:  # a freeze from before these readings may go on
             begin, end = self.frozen[-1]
             k = int(np.searchsorted(stamps, end))
-            while k + 1 < len(stamps) and stamps[k] >= end and (place[k + 1] == place[k]).all():
+            held = place[int(np.searchsorted(stamps, begin)) : k + 1]
+            axes = (held == held[-1:]).all(axis=0)  # one encoder alone may freeze
+            while k + 1 < len(stamps) and axes.any() and (place[k + 1] == place[k])[axes].all():
                 k += 1
             self.frozen[-1] = begin, max(end, int(stamps[min(k, len(stamps) - 1)]))
         seen = {first for first, _ in self.frozen}
