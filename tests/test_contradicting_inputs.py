@@ -87,6 +87,18 @@ def test_no_drawn_way_is_refused_and_what_is_wrong_is() -> None:
         assert sum(words in told for told in judged(range(100, 106), spoil)) >= 5
 
 
+@pytest.mark.parametrize("axes", [[0, 1, 2], [0]])
+def test_encoders_that_freeze_have_no_wrong_unit_or_mounting(axes: list[int]) -> None:
+    def frozen(place: np.ndarray) -> np.ndarray:
+        begin, held = len(place) // 5, place.copy()
+        held[begin : 2 * begin + begin // 2, axes] = place[begin, axes]
+        return held
+
+    assert judged(range(100, 110), places(frozen)) == [""] * 10
+    told = judged(range(100, 106), places(lambda place: 1000 * frozen(place)))
+    assert sum("wrong unit" in one for one in told) >= 5
+
+
 @pytest.mark.slow
 def test_a_hundred_drawn_ways() -> None:
     seeds = range(20000, 20100)

@@ -21,6 +21,7 @@ from barsight.motion.batch.fault_detection import (
     CLEARLY_BETTER,
     TURN_SIGMA_RAD,
     WAY_SIGMA_M,
+    frozen_stretches,
 )
 from barsight.motion.crane.known_motion import SeenSteps
 from barsight.motion.crane.sway import turned_angle
@@ -63,6 +64,8 @@ def refuse_contradictions(
 
 def _check_encoders(path: Path, steps: SeenSteps, crane: CraneSamples) -> None:
     place = median_filter(crane.position_m, size=(5, 1), mode="nearest")  # against single outliers
+    for first, last in frozen_stretches(crane):  # reported by itself: no wrong unit or axis
+        place[first : last + 1] = np.nan
     seen_m = np.linalg.norm(steps.way_m, axis=1)
 
     def travelled(late_s: float) -> Float64:
