@@ -143,10 +143,13 @@ def test_the_cameras_lie_as_their_lenses_have_it_and_the_file_says_so(
     names = tuple(f"cam{camera}.{name}" for camera in (0, 1) for name in Lens.RADTAN4.parameter_names)
     at, covariance = names.index("cam1.cx_px"), 1e-12 * np.eye(len(names))
     covariance[at, at] = off_px**2
-    write_camera_imu(found, tmp_path / "rig.yaml", tmp_path / "chain.yaml", (names, covariance))
-    told = read_covariance(tmp_path / "rig.yaml")
-    assert told is not None
-    known, whole = told
+    told = found.with_lenses(names, covariance)
+    turned, plain = (one.sigma[7:10].max() for one in (told, found))  # of cam1, as the report tells it
+    assert turned > 0.5 * off_px / RIG.cam1.fx_px > 1.5 * plain
+    write_camera_imu(told, tmp_path / "rig.yaml", tmp_path / "chain.yaml")
+    read = read_covariance(tmp_path / "rig.yaml")
+    assert read is not None
+    known, whole = read
     first, second = (one.rig.cam0_from_cam1.inverse() for one in (found, other))
     turn = Rotation.from_matrix(second.rotation @ first.rotation.T).as_rotvec()
     change = np.concatenate([turn, second.translation - first.translation])
@@ -154,6 +157,8 @@ def test_the_cameras_lie_as_their_lenses_have_it_and_the_file_says_so(
     assert abs(turn[1]) > 0.5 * off_px / RIG.cam1.fx_px
     np.testing.assert_allclose(whole[known.index("cam1.cx_px"), pair] / off_px, change, atol=3e-5)
     assert np.linalg.eigvalsh(whole).min() > -1e-12
+    ahead = second.translation / np.linalg.norm(second.translation)
+    assert np.sqrt(ahead @ whole[-3:, -3:] @ ahead) == pytest.approx(told.baseline_sigma_m, rel=1e-3)
     sigma_px = disparity_sigma_px(tmp_path / "rig.yaml", 2.0)
     assert sigma_px is not None and sigma_px < 0.3 * off_px
 

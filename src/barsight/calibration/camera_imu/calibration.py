@@ -47,7 +47,8 @@ class CameraImuCalibration:
     problem: the measurements used, with the estimated sigmas. stated: the IMU noise as given. solution: the
     body's trajectory and the residuals. corner_px: noise of single corners, whereas problem.sigmas.corner_px
     is the scatter of whole pictures. spreads: scatter of corners, gyro and accelerometer relative to their
-    sigmas. removed_corners: number of outliers.
+    sigmas. removed_corners: number of outliers. lenses: (L, L) covariance of the lens parameters, which were
+    held fixed, by `uncertainty.lens_names`; None if unknown.
     """
 
     source: Path
@@ -61,11 +62,22 @@ class CameraImuCalibration:
     corner_px: float
     removed_corners: int
     notes: tuple[str, ...]
+    lenses: Float64 | None = None
+
+    @property
+    def covariance(self) -> Float64:
+        """Return the covariance (P, P) of the common parameters, all causes together: what lenses are off by,
+        the mountings take up.
+        """
+        known = self.uncertainty
+        if self.lenses is None:
+            return known.covariance
+        return np.asarray(known.covariance + known.by_lens @ self.lenses @ known.by_lens.T)
 
     @property
     def sigma(self) -> Float64:
         """Return the standard deviation (P,) of each common parameter from all error sources together."""
-        return np.sqrt(np.diag(self.uncertainty.covariance))
+        return np.sqrt(np.diag(self.covariance))
 
     @property
     def baseline_sigma_m(self) -> float:
@@ -74,7 +86,17 @@ class CameraImuCalibration:
         direction = (second.place_m - first.place_m) / np.linalg.norm(second.place_m - first.place_m)
         row = np.zeros(self.sigma.size)
         row[3:6], row[MOUNT + 3 : MOUNT + 6] = -direction, direction
-        return float(np.sqrt(row @ self.uncertainty.covariance @ row))
+        return float(np.sqrt(row @ self.covariance @ row))
+
+    def with_lenses(self, names: Sequence[str], covariance: Float64) -> CameraImuCalibration:
+        """Return it with the lenses' covariance, by names (C,) and values (C, C) of a rig file; as it is where
+        that lacks one of them.
+        """
+        wanted = self.uncertainty.lens_names
+        if not set(wanted) <= set(names):
+            return self
+        at = [tuple(names).index(name) for name in wanted]
+        return replace(self, lenses=covariance[np.ix_(at, at)])
 
 
 def calibrate_camera_imu(

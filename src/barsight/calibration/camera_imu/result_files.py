@@ -20,20 +20,13 @@ PAIR_NAMES = tuple(
 )
 
 
-def write_camera_imu(
-    calibration: CameraImuCalibration, rig_path: Path, camchain_path: Path,
-    lenses: tuple[tuple[str, ...], Float64] | None,
-) -> None:  # fmt: skip
-    """Write both files, each either completely or not at all.
-
-    lenses: names and covariance of the lens parameters from the stereo calibration. They were held fixed
-    here, so their errors carry over to the mountings.
-    """
-    names, covariance = joint_covariance(calibration, lenses)
+def write_camera_imu(calibration: CameraImuCalibration, rig_path: Path, camchain_path: Path) -> None:
+    """Write both files, each either completely or not at all."""
+    names, covariance = joint_covariance(calibration)
     section: dict[str, object] = {
         "board": str(calibration.board),
         "corner_sigma_px": calibration.corner_px,
-        "baseline_sigma_m": _baseline_sigma_m(calibration, covariance),
+        "baseline_sigma_m": calibration.baseline_sigma_m,
         "timeshift_cam1_s": float(calibration.solution.state.mounts[1].shift_s),
         "parameters": list(names),
         "sigmas": [float(value) for value in np.sqrt(np.diag(covariance))],
@@ -43,9 +36,7 @@ def write_camera_imu(
     write_camchain(camchain_path, calibration.rig, TOPICS)
 
 
-def joint_covariance(
-    calibration: CameraImuCalibration, lenses: tuple[tuple[str, ...], Float64] | None
-) -> tuple[tuple[str, ...], Float64]:
+def joint_covariance(calibration: CameraImuCalibration) -> tuple[tuple[str, ...], Float64]:
     """Compute names and joint covariance of the lenses (where known), mountings, time shifts and the
     resulting cam1_from_cam0. Lens errors are propagated to the mountings, which absorb them as far as they
     can.
@@ -54,26 +45,14 @@ def joint_covariance(
     """
     names, whole = _by_mounts(calibration)
     known, mounts = calibration.uncertainty, slice(2 * MOUNT)
-    kept = [n for n, name in enumerate(lenses[0]) if name in known.lens_names] if lenses else []
-    if lenses is None or len(kept) < len(known.lens_names):
+    if calibration.lenses is None:
         return names, whole @ known.covariance[mounts, mounts] @ whole.T
-    lens_names = tuple(lenses[0][n] for n in kept)
-    by_lens = known.by_lens[mounts, [known.lens_names.index(name) for name in lens_names]]
-    carry = np.zeros((len(kept) + len(names), len(kept) + 2 * MOUNT))
-    carry[: len(kept), : len(kept)] = np.eye(len(kept))
-    carry[len(kept) :] = whole @ np.hstack([by_lens, np.eye(2 * MOUNT)])
-    apart = block_diag(lenses[1][np.ix_(kept, kept)], known.covariance[mounts, mounts])
-    return (*lens_names, *names), carry @ apart @ carry.T
-
-
-def _baseline_sigma_m(calibration: CameraImuCalibration, covariance: Float64) -> float:
-    """Compute the standard deviation of the distance between the cameras from the last three rows of the
-    covariance, the translation of cam1_from_cam0.
-    """
-    first, second = calibration.solution.state.mounts
-    place = second.rotation.T @ (first.place_m - second.place_m)
-    direction = place / np.linalg.norm(place)
-    return float(np.sqrt(direction @ covariance[-3:, -3:] @ direction))
+    lenses = len(known.lens_names)
+    carry = np.zeros((lenses + len(names), lenses + 2 * MOUNT))
+    carry[:lenses, :lenses] = np.eye(lenses)
+    carry[lenses:] = whole @ np.hstack([known.by_lens[mounts], np.eye(2 * MOUNT)])
+    apart = block_diag(calibration.lenses, known.covariance[mounts, mounts])
+    return (*known.lens_names, *names), carry @ apart @ carry.T
 
 
 def _by_mounts(calibration: CameraImuCalibration) -> tuple[tuple[str, ...], Float64]:

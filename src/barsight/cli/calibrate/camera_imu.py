@@ -28,7 +28,6 @@ from barsight.calibration.stereo.verdict import Verdict, summary_sentence
 from barsight.cli.arguments import call
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
-from barsight.core.arrays import Float64
 from barsight.core.errors import ConfigError, InputError
 from barsight.core.files import atomic_paths, expect_output
 from barsight.core.parallel import ordered_map
@@ -94,22 +93,21 @@ def run(arguments: Sequence[str]) -> None:
             advance("solve", 1, 3)
             halves = cross_halves(calibration, views, samples, lenses, target, noise, recording)
             advance("solve", 3, 3)
+        if own_file and (known := read_covariance(rig)) is not None:
+            calibration = calibration.with_lenses(*known)
         assessment = assess_camera_imu(calibration, halves)
-        _write(calibration, assessment, read_covariance(rig) if own_file else None, out)
+        _write(calibration, assessment, out)
         _print(console, calibration, assessment, out)
 
     call(command, "calibrate camera-imu", arguments)
 
 
-def _write(
-    calibration: CameraImuCalibration, assessment: CameraImuAssessment,
-    lenses: tuple[tuple[str, ...], Float64] | None, out: Path,
-) -> None:  # fmt: skip
+def _write(calibration: CameraImuCalibration, assessment: CameraImuAssessment, out: Path) -> None:
     """Write the rig file, Kalibr's camchain and the report, or nothing at all."""
     camchain = out.with_name(f"{out.stem}-camchain-imucam.yaml")
     with atomic_paths(out, camchain, out.with_suffix(".html"), out.with_suffix(".json")) as paths:
         path, chain, *report = paths
-        write_camera_imu(calibration, path, chain, lenses)
+        write_camera_imu(calibration, path, chain)
         write_camera_imu_report(calibration, assessment, *report)
 
 
