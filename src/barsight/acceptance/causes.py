@@ -230,16 +230,11 @@ def _travel_rows(check: RigCheck) -> Iterator[_Row]:
         yield _Row("", float(rows.values[3]), float(check.row_sigmas[3]), answer)
     if isinstance(drift, Failed):
         return
-    known = np.linalg.inv(drift.covariance)
-    told = known @ np.array([drift.yaw_rad, drift.scale])
-    # The prior is not evidence from the travel, so it is taken out.
-    weight, axes = np.linalg.eigh(known - np.diag(drift.prior_sigma**-2.0))
-    for k in range(2):
-        if weight[k] > 1e-3 * known.max():
-            answer = np.zeros(len(UNKNOWNS))
-            # A baseline longer than calibrated means a calibrated one that is too short: flip its sign.
-            answer[:2] = axes[:, k] * (1, -1)
-            yield _Row("", float(axes[:, k] @ told / weight[k]), float(weight[k] ** -0.5), answer)
+    for row, seen, variance in zip(*drift.by_travel(), strict=True):
+        answer = np.zeros(len(UNKNOWNS))
+        # A baseline longer than calibrated means a calibrated one that is too short: flip its sign.
+        answer[:2] = row * (1, -1)
+        yield _Row("", float(seen), float(variance**0.5), answer)
 
 
 def _ratio_causes(checks: Sequence[RigCheck | Failed]) -> Iterator[Cause]:

@@ -11,6 +11,9 @@ from barsight.core.motion_detail import MotionDetail
 from barsight.core.pose import Pose
 from barsight.core.records.pairs import RefusedFrame
 
+MIN_TOLD = 1e-3
+"""Share of the information held before from which the travel's own on a direction counts."""
+
 
 @dataclass(frozen=True, eq=False)
 class PosedFrame:
@@ -53,6 +56,17 @@ class RigDrift:
     def scale_sigma(self) -> float:
         """One standard deviation of the scale."""
         return float(self.covariance[1, 1] ** 0.5)
+
+    def by_travel(self) -> tuple[Float64, Float64, Float64]:
+        """Take off what was held possible before: rows (K, 2) of yaw and scale that the travel itself tells,
+        values (K,) and variances (K,) of these; K is 2 or less.
+        """
+        unit, known = self.prior_sigma, np.linalg.inv(self.covariance)
+        weight, axes = np.linalg.eigh(known * np.outer(unit, unit) - np.eye(2))
+        told = weight > MIN_TOLD
+        weight, axes = weight[told], axes[:, told]
+        seen = (unit[:, None] * axes).T @ known @ np.array([self.yaw_rad, self.scale]) / weight
+        return axes.T / unit, seen, 1 / weight
 
     def depth_error_m(self, range_m: float) -> float:
         """Return the depth error that the uncorrected yaw causes at `range_m` straight ahead."""

@@ -57,7 +57,7 @@ def combine_with_prior(theta: Float64, covariance: Float64, problem: Problem) ->
     floor = _floor(disparity, focal, everywhere_px, near_px)
     if not problem.has_latency:
         floor[0, 0] += prior[0]
-    yaw, scale, combined = _weighed(theta, covariance + floor, np.diag(1 / prior))
+    yaw, scale, combined = _weighed(np.eye(2), theta, covariance + floor, np.sqrt(prior))
     range_m = focal * baseline / float(np.median(disparity))
     return RigDrift(yaw, scale, combined, np.sqrt(prior), baseline, range_m, bool(problem.has_latency))
 
@@ -72,20 +72,20 @@ def with_matching_bias(drift: RigDrift, problem: Problem) -> RigDrift:
     disparity = seen.stereo[:, 0] - seen.stereo[:, 2] + seen.camera.doffs_px
     own_px = float(np.sqrt(MATCHING_BIAS_PX**2 - COMMON_BIAS_PX**2))
     floor = _floor(disparity, seen.camera.focal_px, own_px, MATCHING_BIAS_PX)
-    known, prior = np.linalg.inv(drift.covariance), np.diag(drift.prior_sigma**-2)
-    seen_alone = np.linalg.inv(known - prior)
-    theta = seen_alone @ known @ np.array([drift.yaw_rad, drift.scale])
-    yaw, scale, combined = _weighed(theta, seen_alone + floor, prior)
+    rows, told, variance = drift.by_travel()
+    yaw, scale, combined = _weighed(rows, told, np.diag(variance) + rows @ floor @ rows.T, drift.prior_sigma)
     return replace(drift, yaw_rad=yaw, scale=scale, covariance=combined)
 
 
-def _weighed(theta: Float64, covariance: Float64, prior: Float64) -> tuple[float, float, Float64]:
-    """Combine observed yaw and scale, with their covariance (2, 2), with the prior information; return both
-    and their covariance (2, 2).
+def _weighed(
+    rows: Float64, told: Float64, covariance: Float64, prior_sigma: Float64
+) -> tuple[float, float, Float64]:
+    """Estimate yaw, scale and their covariance (2, 2) from observed values of rows (K, 2) of them, with the
+    values' covariance (K, K) and the prior's sigmas (2,).
     """
-    information = np.linalg.inv(covariance)
-    combined = np.linalg.inv(information + prior).astype(np.float64)
-    yaw, scale = combined @ information @ theta
+    information = rows.T @ np.linalg.inv(covariance)
+    combined = np.linalg.inv(information @ rows + np.diag(prior_sigma**-2.0)).astype(np.float64)
+    yaw, scale = combined @ information @ told
     return float(yaw), float(scale), combined
 
 

@@ -17,8 +17,6 @@ from barsight.core.records.trajectory import RigDrift
 
 SIGNIFICANT_SIGMAS = 3.0
 WORTH_MM = 3.0
-MIN_TOLD = 1e-3
-"""Minimum information of the travel on a direction, relative to the drift's prior, for it to be used."""
 AGREEING_SIGMAS = 1.96
 """Distance, in sigma, up to which the travel's yaw and scale agree with the calibration. For rigs that are
 off as far as they admit, 95 % of the heights then lie inside (tests/test_motion_rig_drift.py).
@@ -46,10 +44,10 @@ def residual_covariance(prior: Float64, drift: RigDrift | None, *, corrected: bo
     """
     if drift is None or not drift.by_encoders:
         return prior
-    rows, seen, variance = _travel_alone(drift)
+    rows, seen, variance = drift.by_travel()
+    rows = rows * [1, -1]  # a baseline that is longer makes depths too small
     joint = rows @ prior[:2, :2] @ rows.T + np.diag(variance)
     if corrected or seen @ np.linalg.solve(joint, seen) > AGREEING_SIGMAS**2:
-        # If the baseline is longer than calibrated, depths come out too small.
         left = np.array([drift.yaw_rad, -drift.scale]) * [not corrected, True]
         updated = prior.copy()
         updated[:2, :] = updated[:, :2] = 0.0
@@ -59,18 +57,6 @@ def residual_covariance(prior: Float64, drift: RigDrift | None, *, corrected: bo
     mean = gain @ seen
     posterior: Float64 = prior - gain @ rows @ prior[:2] + np.outer(mean, mean)
     return posterior
-
-
-def _travel_alone(drift: RigDrift) -> tuple[Float64, Float64, Float64]:
-    """Remove the drift's prior: rows (K, 2) of yaw and the depths' scale that the travel itself observes,
-    their values (K,) and variances (K,); K is 2 or less.
-    """
-    unit, known = drift.prior_sigma, np.linalg.inv(drift.covariance)
-    weight, axes = np.linalg.eigh(known * np.outer(unit, unit) - np.eye(2))
-    told = weight > MIN_TOLD
-    weight, axes = weight[told], axes[:, told]
-    seen = (unit[:, None] * axes).T @ known @ np.array([drift.yaw_rad, drift.scale]) / weight
-    return axes.T / unit * [1, -1], seen, 1 / weight
 
 
 def self_calibrate(
