@@ -1,1 +1,1 @@
-"""Speak the plant's own language: the state and the next lift, for PLCs, brokers and OPC UA clients."""
+"""Serve the plant state and the next lift in the plant's protocols, for PLCs, brokers and OPC UA clients."""

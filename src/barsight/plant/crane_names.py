@@ -1,4 +1,4 @@
-"""Name cranes in the store, so that they are told from persons."""
+"""Name cranes in the store so that they can be told apart from persons."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ def plc_name(at: str) -> str:
 
 
 def opcua_name(user: str) -> str:
-    """Name a crane by its user of OPC UA."""
+    """Name a crane by its OPC UA user."""
     return f"{user}{_OPC_UA}"
 
 
 def is_crane(who: str) -> bool:
-    """Tell a crane's name from a person's, whose confirmations last as long as their map."""
+    """Return True for a crane's name. A person's confirmations, unlike a crane's, last as long as the map."""
     return who.startswith(_PLC) or who.endswith(_OPC_UA)

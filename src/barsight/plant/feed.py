@@ -1,4 +1,4 @@
-"""Read the plant's state from the store again and again, for all links together."""
+"""Poll the plant state from the store, once for all links."""
 
 from __future__ import annotations
 
@@ -19,29 +19,31 @@ from barsight.store.confirmation import expire_claims, expire_stale
 from barsight.store.opening import Store
 
 MAX_AGE_S = 0.3
-"""A state that was read longer ago is not valid."""
+"""Maximum age of a state in seconds, counted from when it was read from the store; an older one is marked
+invalid.
+"""
 READ_EVERY_S = 0.1
 JUDGE_EVERY_S = 1.0
 PLC_SILENT_S = 1.0
-"""Greatest age of a PLC's reading that is told."""
+"""Maximum age of a PLC reading in seconds for it to be passed on with the state."""
 WHO = "barsight plant"
 
 
 class StateReader(Protocol):
-    """Reads the newest state for a link."""
+    """Interface from which a link gets the newest state."""
 
     def newest(self, life_counter: int) -> PlantState:
         """Return the newest state with the link's own life counter."""
 
     def refresh(self) -> None:
-        """Read the state now."""
+        """Read the state from the store now."""
 
     def take_reading(self, reading: PlcReading) -> None:
-        """Take what a PLC tells of the crane."""
+        """Accept a PLC's reading of the crane."""
 
 
 class StateFeed:
-    """Hold the newest state; a thread reads it while the block runs, so that no link waits for the store."""
+    """Hold the newest state. A thread reads it while the block runs, so that no link waits for the store."""
 
     def __init__(self, store: Store, settings: PlantSettings) -> None:
         self._store, self._settings = store, settings
@@ -63,26 +65,26 @@ class StateFeed:
 
     @property
     def is_alive(self) -> bool:
-        """Tell that the thread goes on."""
+        """Return True while the reading thread runs."""
         return self._thread.is_alive()
 
     def newest(self, life_counter: int) -> PlantState:
-        """Return the newest state with the link's own life counter; not valid where it is old."""
+        """Return the newest state with the link's own life counter; it is marked invalid if it is too old."""
         return with_age(*self.read(), life_counter)
 
     def read(self) -> tuple[PlantState, float]:
-        """Return the newest state, and when it was read (monotonic clock)."""
+        """Return the newest state and when it was read (seconds of the monotonic clock)."""
         return self._read
 
     def refresh(self) -> None:
-        """Read the state now, as after a step of the handshake."""
+        """Read the state now, for example after a step of the handshake."""
         with self._turn:
             began_s = time.monotonic()
             state = read_state(self._store, self._settings, self._read[0])
             self._read = self._with_plc(state), began_s
 
     def take_reading(self, reading: PlcReading) -> None:
-        """Take what a PLC tells of the crane; it is told with the states of the next second."""
+        """Accept a PLC's reading of the crane; it is in the states of the next `PLC_SILENT_S` seconds."""
         self._plc = time.monotonic(), reading
 
     def _with_plc(self, state: PlantState) -> PlantState:
@@ -101,13 +103,13 @@ class StateFeed:
             self.refresh()
             if time.monotonic() - judged_s > JUDGE_EVERY_S:
                 judged_s = time.monotonic()
-                with contextlib.suppress(BarsightError):  # a store that is away comes back
-                    expire_stale(self._store, WHO)  # in the store, so that no clock set back revives an offer
+                with contextlib.suppress(BarsightError):  # the store may be back later
+                    expire_stale(self._store, WHO)  # stored, so that no clock set back revives an offer
                     expire_claims(self._store, WHO, self._settings.store.claim_s, is_crane)
 
 
 def with_age(state: PlantState, read_s: float, life_counter: int) -> PlantState:
-    """Form the state that a link tells, with its own life counter; not valid where it was read long ago."""
+    """Return a link's state with its own life counter; it is marked invalid if it was read too long ago."""
     age_s = time.monotonic() - read_s
     if age_s > MAX_AGE_S:
         reason = f"state-too-old: the store was read {age_s:.1f} s ago"
@@ -116,8 +118,10 @@ def with_age(state: PlantState, read_s: float, life_counter: int) -> PlantState:
 
 
 def read_state(store: Store, settings: PlantSettings, before: PlantState | None = None) -> PlantState:
-    """Read the state; one that isn't valid where the store or the live run can't be read. Where the store
-    can't be, no alarm of the state before has ended, and no survey comes with the next.
+    """Read the state; it is invalid if the store or the live run can't be read.
+
+    If the store can't be read, the alarms, map and calibration of the state `before` are kept: no alarm
+    counts as ended, and no new survey is reported once the store is back.
     """
     source = settings.store
     try:

@@ -1,4 +1,4 @@
-"""Take a lift from offered to executed or failed by what the crane reports, in the store's own states."""
+"""Take a lift from offered to executed or failed as the crane reports it, using the states of the store."""
 
 from __future__ import annotations
 
@@ -17,14 +17,19 @@ with extra("store"):
     from sqlalchemy import Row, select
 
 LOAD_SIGMAS = 3.0
-"""A load farther from the mass than so many of its standard deviations contradicts it."""
+"""Largest difference between the weighed load and the predicted mass, in standard deviations of that mass;
+a larger one contradicts the prediction.
+"""
 MAX_CLAIMS = 1000
-"""Newest claims among which a token without its lift is looked for."""
+"""Number of newest claims that are searched for a token given without its lift."""
 
 
 @dataclass(frozen=True)
 class LiftClaim:
-    """A claim. token: 32 bits that its later steps carry; it tells claims apart and is no secret."""
+    """A crane's claim on a lift.
+
+    token: 32-bit number that the later steps carry; it identifies the claim and is not a secret.
+    """
 
     lift_id: int
     who: str
@@ -32,7 +37,7 @@ class LiftClaim:
 
 
 def claim_lift(store: Store, lift: OfferedLift, who: str) -> LiftClaim | Failed:
-    """Claim an offered lift. The same claim again returns the same token; another's is refused."""
+    """Claim an offered lift. The same claim again returns the same token; anyone else's is refused."""
     found = claim_of(store, lift.lift_id)
     if found is None:
         try:
@@ -46,7 +51,7 @@ def claim_lift(store: Store, lift: OfferedLift, who: str) -> LiftClaim | Failed:
 
 
 def claim_of(store: Store, lift_id: int) -> LiftClaim | None:
-    """Find the claim of a lift, whatever came after it; a lift is claimed once in its life."""
+    """Find the claim of a lift, whatever state followed it; a lift is claimed only once."""
     with store.reading() as connection:
         query = select(LIFT_STATES).where(LIFT_STATES.c.lift_id == lift_id, LIFT_STATES.c.state == "claimed")
         row = connection.execute(query).first()
@@ -54,7 +59,7 @@ def claim_of(store: Store, lift_id: int) -> LiftClaim | None:
 
 
 def claim_by_token(store: Store, token: int) -> LiftClaim | None:
-    """Find a claim by its token alone, among the newest ones."""
+    """Find a claim by its token alone, among the newest `MAX_CLAIMS`."""
     newest = select(LIFT_STATES).where(LIFT_STATES.c.state == "claimed").order_by(LIFT_STATES.c.id.desc())
     with store.reading() as connection:
         rows = connection.execute(newest.limit(MAX_CLAIMS)).all()
@@ -67,14 +72,14 @@ def _claim(row: Row[tuple[object, ...]]) -> LiftClaim:
 
 
 def states_of(store: Store, lift_id: int) -> list[str]:
-    """List the states that a lift was in, the present one last."""
+    """List the states that a lift has been in, the current one last."""
     steps = select(LIFT_STATES.c.state).where(LIFT_STATES.c.lift_id == lift_id).order_by(LIFT_STATES.c.step)
     with store.reading() as connection:
         return list(connection.execute(steps).scalars())
 
 
 def begin_claimed(store: Store, claim: LiftClaim) -> LiftClaim | Failed:
-    """Begin a claimed lift, once: who has forgotten that it began must not lift again."""
+    """Begin a claimed lift, once only: a crane that lost track of it must not lift again."""
     try:
         begin_lift(store, claim.lift_id, claim.who)
     except InputError as error:
@@ -85,10 +90,10 @@ def begin_claimed(store: Store, claim: LiftClaim) -> LiftClaim | Failed:
 def report_executed(store: Store, claim: LiftClaim, load_kg: float | None) -> str | Failed:
     """Report a claimed lift as executed: `confirmed`, `contradicted` by the load cell, or `unweighed`.
 
-    A contradiction raises the alarm `load-contradicts`; the next survey tells what truly moved. Reported
-    again, it is answered again and changes nothing. A lift that has ended otherwise can't be recorded: that
-    raises the alarm `lift-unrecorded` and ends all offers. Raises BarsightError where the store can't be
-    written: report it again.
+    A contradiction raises the alarm `load-contradicts`; the next survey shows what was really moved. A
+    repeated report gets the same answer and changes nothing. A lift that has already ended in another way
+    can't be recorded: this raises the alarm `lift-unrecorded` and withdraws all offers. Raises BarsightError
+    if the store can't be written; the report must then be repeated.
     """
     with store.reading() as connection:
         query = select(LIFTS.c.record).where(LIFTS.c.id == claim.lift_id)
@@ -111,7 +116,7 @@ def report_executed(store: Store, claim: LiftClaim, load_kg: float | None) -> st
 
 
 def report_failed(store: Store, claim: LiftClaim, note: str) -> str | Failed:
-    """Report that a claimed lift failed; reported again, it changes nothing."""
+    """Report that a claimed lift failed; a repeated report changes nothing."""
     states = states_of(store, claim.lift_id)
     if states[-1] == "failed" and "executed" not in states:
         return "failed"

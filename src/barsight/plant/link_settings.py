@@ -1,4 +1,4 @@
-"""Settings of the links by OPC UA, MQTT, S7 and webhooks: the tables of plant.toml."""
+"""Settings of the OPC UA, MQTT, S7 and webhook links: the tables of plant.toml."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from barsight.core.errors import ConfigError
 from barsight.core.settings.values import expect_ranges, expect_values
 
 OPCUA_ROLES = ("viewer", "operator", "engineer")
-"""A viewer reads, an operator also calls jobs, handshake and acknowledges, an engineer also recipes."""
+"""Roles: a viewer reads; an operator also runs jobs, takes lifts and acknowledges alarms; an engineer also
+handles recipes.
+"""
 
 
 @dataclass(frozen=True)
@@ -18,34 +20,43 @@ class OpcUaSettings:
     """The OPC UA server, from the table `[opcua]` of plant.toml."""
 
     host: str = "127.0.0.1"
-    """Address it listens at; 0.0.0.0 for every network of the computer."""
+    """Address on which the server listens; 0.0.0.0 for all networks of the computer."""
     port: int = 4840
-    """TCP port."""
+    """TCP port on which the server listens."""
     folder: Path = Path("opcua")
-    """Holds certificate, key, `trusted/` with the certificates of clients, and `revoked/` with CRLs."""
+    """Folder with the server's certificate and key, `trusted/` for client certificates, and `revoked/` for
+    CRLs.
+    """
     users: Path | None = None
-    """users.json, which `add_user` of barsight.plant.opcua.security.access writes. Without it nobody is more
-    than a viewer."""
+    """users.json, written by `add_user` of barsight.plant.opcua.security.access. Without it every client is
+    at most a viewer.
+    """
     nodesets: Path | None = None
-    """Folder with Opc.Ua.MachineVision.NodeSet2.xml (npm's node-opcua-nodesets). None: variables only."""
+    """Folder with Opc.Ua.MachineVision.NodeSet2.xml (npm's node-opcua-nodesets). None: plain variables
+    only.
+    """
     allow_anonymous: bool = True
-    """Let anyone with a trusted certificate read."""
+    """Allow anyone with a trusted certificate to read without logging in."""
     allow_unsecured: bool = False
-    """Let clients in without certificate and encryption. For a test bench only."""
+    """Allow clients to connect without certificate and encryption. For a test bench only."""
     max_clients: int = 50
-    """Connections at once."""
+    """Maximum number of client connections at a time."""
     max_subscriptions: int = 100
-    """Subscriptions of all clients together, those of closed sessions counted in."""
+    """Maximum number of subscriptions of all clients together, including those of closed sessions."""
     max_queue: int = 100
-    """Values or events that wait for one client, a monitored item; the oldest go first."""
+    """Maximum number of values or events queued for each monitored item of a client; the oldest are
+    dropped.
+    """
     max_unacknowledged: int = 20
-    """Notifications a subscription keeps for a client that doesn't acknowledge them."""
+    """Maximum number of notifications that a subscription keeps for a client that doesn't acknowledge
+    them.
+    """
     max_subscription_cycles: int = 600
-    """Publishing cycles after which a subscription that nobody asks for is dropped."""
+    """Number of publishing cycles after which a subscription without publish requests is dropped."""
     state_every_s: float = 0.1
-    """Interval between looks at the state."""
+    """Interval in seconds at which the server reads the plant state."""
     kept_results: int = 20
-    """Results that can be asked for; older ones go."""
+    """Number of survey results that clients can request; older ones are dropped."""
 
     def __post_init__(self) -> None:
         expect_values(self, "opcua.")
@@ -57,12 +68,12 @@ class OpcUaSettings:
 
     @property
     def url(self) -> str:
-        """Return the endpoint."""
+        """Return the URL of the endpoint."""
         return f"opc.tcp://{self.host}:{self.port}/barsight"
 
     @property
     def nodeset(self) -> Path | None:
-        """Find the NodeSet's file. Raises ConfigError where a folder is named that hasn't it."""
+        """Find the NodeSet file. Raises ConfigError if the configured folder doesn't contain it."""
         if self.nodesets is None:
             return None
         path = self.nodesets / "Opc.Ua.MachineVision.NodeSet2.xml"
@@ -79,25 +90,29 @@ class MqttSettings:
     """The MQTT publisher, from the table `[mqtt]` of plant.toml."""
 
     host: str = "127.0.0.1"
-    """The broker."""
+    """Host name or address of the broker."""
     port: int = 1883
-    """Its TCP port; 8883 for TLS as a rule."""
+    """TCP port of the broker; usually 8883 with TLS."""
     prefix: str = "barsight/crane"
-    """Topics begin with it."""
+    """Prefix of all topics."""
     user: str | None = None
-    """Name at the broker."""
+    """User name for the broker."""
     password_file: Path | None = None
-    """A file with the password in its first line."""
+    """File whose first line is the password for the broker."""
     authority: Path | None = None
-    """The broker's certificate authority (PEM); with it the connection is encrypted."""
+    """Certificate of the broker's certificate authority (PEM file). If it is set, the connection is
+    encrypted.
+    """
     keepalive_s: int = 5
-    """The broker tells the last will after 1.5 times so long without a sign of life."""
+    """Keep-alive interval in seconds; the broker publishes the last will after 1.5 times this long without a
+    message.
+    """
     max_waiting: int = 100
-    """Events kept while the broker is away."""
+    """Maximum number of events kept while the broker is unreachable."""
     max_retry_s: float = 10.0
-    """Longest wait between attempts to reach the broker; the first is 0.1 s."""
+    """Longest wait in seconds between attempts to reach the broker; the first wait is 0.1 s."""
     state_every_s: float = 0.1
-    """Least interval between states."""
+    """Shortest interval in seconds between published states."""
 
     def __post_init__(self) -> None:
         expect_values(self, "mqtt.")
@@ -116,27 +131,27 @@ class S7Settings:
     """The S7 client, from the table `[s7]` of plant.toml."""
 
     host: str = "127.0.0.1"
-    """The PLC."""
+    """Host name or address of the PLC."""
     port: int = 102
-    """Its TCP port."""
+    """TCP port of the PLC."""
     rack: int = 0
-    """Rack of the CPU."""
+    """Rack number of the CPU."""
     slot: int = 1
-    """Slot of the CPU: 1 for S7-1200 and S7-1500, 2 for S7-300."""
+    """Slot number of the CPU: 1 for S7-1200 and S7-1500, 2 for S7-300."""
     read_db: int = 100
-    """Data block that the PLC writes: encoders, hoist, magnet, clock, life counter."""
+    """Number of the data block that the PLC writes: encoders, hoist, magnet, clock, life counter."""
     read_start: int = 0
-    """First byte there."""
+    """Offset in bytes of the telegram in `read_db`."""
     write_db: int = 101
-    """Data block that Barsight writes."""
+    """Number of the data block that Barsight writes."""
     write_start: int = 0
-    """First byte there."""
+    """Offset in bytes of the telegram in `write_db`."""
     cycle_s: float = 0.1
-    """Interval between exchanges."""
+    """Interval in seconds between exchanges."""
     silent_s: float = 0.3
-    """The PLC's life counter may stand for so long."""
+    """Timeout in seconds: if the PLC's life counter stands still for longer, the state is sent as invalid."""
     max_retry_s: float = 5.0
-    """Longest wait between attempts to reach the PLC."""
+    """Longest wait in seconds between attempts to reach the PLC."""
 
     def __post_init__(self) -> None:
         expect_values(self, "s7.")
@@ -149,18 +164,18 @@ class S7Settings:
 
 @dataclass(frozen=True)
 class WebhookSettings:
-    """Webhooks for the yard management system: each change of the state is posted, as JSON."""
+    """Webhooks for the yard management system: each change of the state is posted as JSON."""
 
     urls: tuple[str, ...] = ()
-    """Addresses, http or https; each gets all changes, in order."""
+    """Addresses to post to, http or https; each gets all changes, in order."""
     secret_file: Path | None = None
-    """A file with a secret in its first line, by which posts are signed (HMAC-SHA-256)."""
+    """File whose first line is the secret with which posts are signed (HMAC-SHA-256)."""
     timeout_s: float = 5.0
-    """Wait for an answer."""
+    """Timeout in seconds for an answer to a post."""
     max_waiting: int = 1000
-    """Changes kept for an address that doesn't answer; the oldest go."""
+    """Maximum number of changes kept for an address that doesn't answer; the oldest are dropped."""
     max_retry_s: float = 30.0
-    """Longest wait between attempts; the first is 0.2 s."""
+    """Longest wait in seconds between attempts to post; the first wait is 0.2 s."""
 
     def __post_init__(self) -> None:
         expect_values(self, "webhooks.")

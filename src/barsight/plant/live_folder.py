@@ -1,4 +1,4 @@
-"""Add what a live run says of itself to the plant's state: its mode, its survey and where the crane is."""
+"""Add what a live run reports to the plant state: its mode, its survey and the crane's position."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from barsight.plant.state import PlantState
 
 
 def with_live_run(state: PlantState, folder: Path) -> PlantState:
-    """Add the crane's pose, the run's mode and its survey to a state; one without a run is not valid."""
+    """Add the crane's pose, the run's mode and its survey to a state; without a run the state is invalid."""
     folder = running_folder(folder)
     told = read_live_state(folder)
     if told is None:

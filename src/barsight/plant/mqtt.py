@@ -1,9 +1,9 @@
-"""Publish the plant's state to an MQTT broker: plain JSON, retained, with a last will.
+"""Publish the plant state to an MQTT broker: plain JSON, retained, with a last will.
 
-Topics below the prefix: `online` (retained `true`, and by the last will `false`), `state` (retained, the
-newest snapshot), `events` (not retained, in order). While the broker is away, only the newest state is
-kept and at most `max_waiting` events; the oldest go, and the next event that gets through says how many
-(`lost`).
+Topics below the prefix: `online` (retained; `true`, or `false` by the last will), `state` (retained, the
+newest snapshot), `events` (not retained, in order). While the broker is unreachable, only the newest state
+and at most `max_waiting` events are kept; the oldest are dropped, and the next event that gets through
+carries their number (`lost`).
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ with extra("mqtt"):
     import aiomqtt
 
 MqttError = aiomqtt.MqttError
-"""Raised where the broker can't be reached or refuses."""
+"""Raised if the broker can't be reached or refuses the connection."""
 
 
 @dataclass(frozen=True)
 class MqttCounts:
-    """States and events that reached the broker, events that were dropped, and connections."""
+    """Numbers of states and events that reached the broker, of events dropped, and of connections."""
 
     states: int
     events: int
@@ -43,7 +43,7 @@ class MqttCounts:
 
 
 class MqttPublisher:
-    """Hold what waits for the broker, and publish it while `run` runs. All in one event loop."""
+    """Queue what is to be sent to the broker, and publish it while `run` runs. All in one event loop."""
 
     def __init__(self, settings: MqttSettings) -> None:
         self._settings = settings
@@ -59,21 +59,21 @@ class MqttPublisher:
 
     @property
     def counts(self) -> MqttCounts:
-        """Count what was sent and lost."""
+        """Return the counts of what was sent and lost."""
         return MqttCounts(self._states_sent, self._events_sent, self._lost, self._connections)
 
     @property
     def waiting(self) -> int:
-        """Count the events that wait."""
+        """Count the queued events."""
         return len(self._events)
 
     def show(self, snapshot: Any) -> None:
-        """Set the state that is published next; one that still waits is replaced."""
+        """Set the state to publish next; it replaces one that is still waiting."""
         self._state = state_json(snapshot)
         self._changed.set()
 
     def tell(self, event: dict[str, Any]) -> None:
-        """Add an event; the oldest goes where too many wait."""
+        """Queue an event; if the queue is full, the oldest is dropped."""
         if len(self._events) >= self._settings.max_waiting:
             self._events.popleft()
             self._lost += 1
@@ -82,7 +82,7 @@ class MqttPublisher:
         self._changed.set()
 
     async def run(self) -> None:
-        """Connect and publish until cancelled; a broker that is away is tried again and again."""
+        """Connect and publish until cancelled; reconnect whenever the broker is lost."""
         wait_s = 0.1
         latest: str | None = None
         while True:
@@ -101,14 +101,14 @@ class MqttPublisher:
                             await client.publish(
                                 self._topic("online"), "false", qos=1, retain=True, timeout=1
                             )
-            if _is_cancelled():  # what a broker that is gone raised on the way out stood in its place
+            if _is_cancelled():  # a lost broker's error on the way out has replaced the cancellation
                 raise asyncio.CancelledError
             wait_s = 0.1 if time.monotonic() - began > self._settings.max_retry_s else wait_s
             await asyncio.sleep(wait_s)
             wait_s = min(2 * wait_s, self._settings.max_retry_s)
 
     async def _publish(self, client: aiomqtt.Client) -> str | None:
-        """Publish what waits; return the state that went out."""
+        """Publish what is waiting; return the state that was sent."""
         try:
             await asyncio.wait_for(self._changed.wait(), self._settings.keepalive_s)
         except TimeoutError:
@@ -129,7 +129,7 @@ class MqttPublisher:
                 self._unsaid -= lost
                 if self._events and self._events[0] is first:
                     self._events.popleft()
-                else:  # it was dropped while it went out, and isn't lost
+                else:  # it was dropped while being sent, so it isn't lost
                     self._lost, self._unsaid = self._lost - 1, self._unsaid - 1
         except BaseException:
             self._state = self._state or state
@@ -138,7 +138,7 @@ class MqttPublisher:
         return state
 
     def _has_newer(self, since_s: float) -> bool:
-        """Check whether another state is to be published, which doesn't wait for all events."""
+        """Check whether a newer state is due; it doesn't wait for all events."""
         return self._state is not None and time.monotonic() - since_s > self._settings.state_every_s
 
     def _event(self) -> str:
@@ -150,9 +150,9 @@ class MqttPublisher:
 
 
 def mqtt_clients(one: MqttSettings, will: str | None = None) -> Callable[[], aiomqtt.Client]:
-    """Read password and authority, and return what makes clients of the broker.
+    """Read password and authority, and return a factory of clients for the broker.
 
-    will: topic below the prefix that tells `false` where a client is lost. Raises InputError.
+    will: topic below the prefix on which the broker publishes `false` if a client is lost. Raises InputError.
     """
     password = None if one.password_file is None else read_text(one.password_file).partition("\n")[0]
     context = None if one.authority is None else _context(one.authority)
@@ -181,5 +181,5 @@ def _is_cancelled() -> bool:
 
 
 def state_json(snapshot: Any) -> str:
-    """Write a frozen snapshot as JSON: its fields by name, what isn't known as null."""
+    """Write a frozen snapshot as JSON: its fields by name, unknown values as null."""
     return json.dumps(json_value(snapshot), allow_nan=False)

@@ -1,4 +1,4 @@
-"""Follow a PLC at the other end of telegrams: its life counter, its commands and the answers to them."""
+"""Track a PLC at the other end of the telegrams: its life counter, its commands and the answers to them."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ class PlcPartner:
 
     @property
     def quiet_s(self) -> float:
-        """Tell how long the PLC's life counter has stood still, or didn't come."""
+        """Return how long the PLC's life counter has stood still or been missing, in seconds."""
         return time.monotonic() - self._alive_s
 
     def receive(self, found: dict[str, int], *, is_busy: bool = False) -> bool:
-        """Take a telegram; tell whether it brings a new command, which `execute` is to be called for.
+        """Accept a telegram; return True if it brings a new command, for which `execute` must be called.
 
-        is_busy: whether `execute` still runs; then a command is left to the telegrams that follow.
+        is_busy: whether `execute` is still running; a command is then left to the telegrams that follow.
         """
         if found["life"] != self._life:
             self._life, self._alive_s = found["life"], time.monotonic()
@@ -49,7 +49,7 @@ class PlcPartner:
         return is_new
 
     def reading(self, found: dict[str, int]) -> PlcReading:
-        """Form what a telegram tells of the crane."""
+        """Form the PLC's reading of the crane from a telegram."""
         flags, now_ns = found["flags"], time.time_ns()
         return PlcReading(
             self.name, now_ns, (found["clock_ns"] - now_ns) / 1e9, found["bridge"] / 1e4,
@@ -58,16 +58,16 @@ class PlcPartner:
         )  # fmt: skip
 
     def seen(self, state: PlantState) -> PlantState:
-        """Form the state that this PLC may act on: not valid where its life counter stands still."""
+        """Return the state that this PLC may act on; it is invalid if the PLC's life counter stands still."""
         if self._life is not None and self.quiet_s <= self._silent_s:
             return state
         reason = "partner-silent: the PLC's life counter stands still"
         return replace(state, is_valid=False, reasons=(*state.reasons, reason))
 
     def execute(self, found: dict[str, int]) -> None:
-        """Take a command to the store; `answer` holds what came of it.
+        """Execute a command on the store; `answer` holds the outcome.
 
-        Where the store can't be reached there is none: the command is taken again with the next telegram.
+        If the store can't be reached there is no answer: the command is tried again with the next telegram.
         """
         try:
             answer, token = self._step(found)

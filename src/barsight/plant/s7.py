@@ -1,9 +1,9 @@
 """Exchange bytes with a Siemens PLC by S7 PUT and GET: read the crane's inputs, write state and next lift.
 
-The bytes are those of the cyclic telegram, from the same layout. Here Barsight is the active side: the
-PLC only needs data blocks without optimised access, and PUT/GET allowed. S7 PUT/GET knows no user: keep
-it to a network of its own. A write longer than one S7 telegram isn't whole in the PLC at every moment, so
-the PLC takes a lift only where its checksum fits.
+The bytes are those of the cyclic telegram, in the same layout. Here Barsight is the active side: the PLC
+only needs data blocks without optimised access, and PUT/GET allowed. S7 PUT/GET has no authentication:
+keep it on a separate network. A write longer than one S7 telegram isn't consistent in the PLC at every
+moment, so the PLC accepts a lift only if its checksum matches.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ with extra("s7"):
 
 @dataclass(frozen=True)
 class S7Exchange:
-    """One exchange. inputs: bytes read. read_s, write_s: time that each took."""
+    """One exchange. inputs: bytes read. read_s, write_s: durations of reading and writing."""
 
     inputs: bytes
     read_s: float
@@ -33,7 +33,7 @@ class S7Exchange:
 
 
 class S7Link:
-    """A connection to a PLC, made anew where it was lost."""
+    """A connection to a PLC, re-established when it is lost."""
 
     def __init__(self, settings: S7Settings, input_bytes: int) -> None:
         self._settings = settings
@@ -41,12 +41,13 @@ class S7Link:
         self._client: snap7.Client | None = None
 
     def read(self) -> S7Exchange | Failed:
-        """Read the inputs; return Failed where the PLC can't be reached."""
+        """Read the inputs; return Failed if the PLC can't be reached."""
         return self.exchange(None)
 
     def exchange(self, outputs: Callable[[], bytes] | None) -> S7Exchange | Failed:
-        """Read the inputs, then write the outputs, if any, as they are by then; return Failed where the PLC
-        can't be reached. An error of `outputs` is raised.
+        """Read the inputs, then write the outputs, if any, as they are at that moment.
+
+        Returns Failed if the PLC can't be reached; an error raised by `outputs` passes through.
         """
         one, write_s = self._settings, 0.0
         read = self._tried(lambda client: client.db_read(one.read_db, one.read_start, self._input_bytes))
@@ -76,7 +77,7 @@ class S7Link:
             return Failed("s7-exchange", " ".join(reason.split()))
 
     def close(self) -> None:
-        """End the connection, if there is one."""
+        """Close the connection, if there is one."""
         client, self._client = self._client, None
         if client is not None:
             try:
@@ -96,10 +97,10 @@ def run_s7(
     settings: S7Settings, input_bytes: int, outputs: Callable[[], bytes],
     take: Callable[[S7Exchange | Failed], None], stop: threading.Event,
 ) -> None:  # fmt: skip
-    """Exchange at each cycle until `stop` is set.
+    """Exchange in each cycle until `stop` is set.
 
-    outputs: the bytes to write, asked for as they are written: to connect and to read may take seconds.
-    take: told of each exchange, and of each that failed.
+    outputs: returns the bytes to write; called right before writing, as connecting and reading may take
+    seconds. take: called with each exchange, and with each failure.
     """
     link = S7Link(settings, input_bytes)
     wait_s = settings.cycle_s

@@ -1,4 +1,4 @@
-"""Serve the cyclic telegram by TCP: one telegram out to each partner a cycle."""
+"""Serve the cyclic telegram over TCP: one telegram to each partner per cycle."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from barsight.plant.steps import LiftSteps
 from barsight.plant.telegram import layout, out_values, pack, unpack
 
 MIN_GAP_RATIO = 0.8
-"""A telegram follows a late one no sooner than after so much of a cycle."""
+"""Shortest gap between a late telegram and the next, as a share of the cycle."""
 MAX_PARTNERS = 32
-"""Connections at once; one more is closed."""
+"""Maximum number of connections at a time; any further one is closed."""
 MAX_QUIET_S = 10.0
-"""A connection ends whose partner's life counter stands for so long."""
+"""Time in seconds after which a connection is closed if the partner's life counter stands still."""
 
 
 class TelegramServer:
-    """Serve the newest state while `run` runs. refused: telegrams that couldn't be one."""
+    """Serve the newest state while `run` runs. refused: number of invalid telegrams received."""
 
     def __init__(self, feed: StateReader, steps: LiftSteps, settings: TelegramSettings) -> None:
         self._feed, self._steps, self._settings = feed, steps, settings
@@ -32,7 +32,7 @@ class TelegramServer:
         self.refused = 0
 
     async def run(self, ready: Callable[[int], None]) -> None:
-        """Listen until cancelled. ready: told the port."""
+        """Listen until cancelled. ready: called with the port."""
         server = await asyncio.start_server(self._serve, self._settings.host, self._settings.port)
         async with server:
             ready(server.sockets[0].getsockname()[1])
@@ -44,16 +44,16 @@ class TelegramServer:
             if self._partners <= MAX_PARTNERS:
                 await self._exchange(reader, writer)
         except asyncio.CancelledError:
-            return  # the server ends; asyncio's streams would log a cancelled task as an error
+            return  # the server is ending; asyncio's streams would log a cancelled task as an error
         finally:
             self._partners -= 1
             writer.close()
 
     async def _exchange(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         one = self._settings
-        name = plc_name(writer.get_extra_info("peername")[0])  # as it is after a new connection
+        name = plc_name(writer.get_extra_info("peername")[0])  # the same after a reconnection
         partner = PlcPartner(name, self._steps, one.silent_s)
-        writer.transport.set_write_buffer_limits(high=0)  # what isn't sent at once grows old
+        writer.transport.set_write_buffer_limits(high=0)  # what isn't sent at once becomes outdated
         listening = asyncio.create_task(self._listen(reader, partner))
         due_s = time.monotonic()
         try:
@@ -74,9 +74,9 @@ class TelegramServer:
                 await listening
 
     async def _listen(self, reader: asyncio.StreamReader, partner: PlcPartner) -> None:
-        """Take telegrams; one that can't be one ends the connection, since its length is lost.
+        """Receive telegrams; an invalid one ends the connection, since the telegram boundaries are lost.
 
-        While a command is at the store the next ones are heard and left: a PLC repeats them until answered.
+        While a command is being executed, the following ones are ignored: a PLC repeats them until answered.
         """
         size = layout("in").size
         step: asyncio.Task[None] | None = None

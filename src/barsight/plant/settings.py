@@ -1,4 +1,4 @@
-"""Settings of the plant's side: the file plant.toml."""
+"""Settings of the plant interface: the file plant.toml."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ class StoreSource:
     """The store that is served, from the table `[store]`."""
 
     url: str = "sqlite:///barsight.db"
-    """SQLAlchemy's URL of the database."""
+    """SQLAlchemy URL of the database."""
     approach_height_m: float | None = None
-    """The magnet's faces may travel over any place of the yard at this height."""
+    """Height in metres at which the magnet's faces may travel over any place of the yard."""
     magnet_steps_kg: tuple[float, ...] = ()
-    """Most load of each step of the magnet's current, from step 1."""
+    """Maximum load in kilograms for each step of the magnet's current, starting with step 1."""
     allow_simulated: bool = False
-    """Offer lifts of a simulated yard too, to try a PLC's program; never with a crane."""
+    """Also offer lifts of a simulated yard, to try out a PLC program; never with a real crane."""
 
     claim_s: float = 120.0
-    """A crane's claim that hasn't begun after so long expires."""
+    """Time in seconds after which a crane's claim expires if the lift hasn't begun."""
 
     def __post_init__(self) -> None:
         expect_values(self, "store.")
@@ -41,18 +41,20 @@ class StoreSource:
 
 @dataclass(frozen=True)
 class TelegramSettings:
-    """The cyclic telegram's server, from the table `[telegram]`."""
+    """The server of the cyclic telegram, from the table `[telegram]`."""
 
     host: str = "127.0.0.1"
-    """Address it listens at."""
+    """Address on which the server listens."""
     port: int = 2000
-    """Its TCP port."""
+    """TCP port on which the server listens."""
     byte_order: str = "big"
-    """`big` for S7, or `little`."""
+    """Byte order of the telegram: `big` for S7, or `little`."""
     cycle_s: float = 0.1
-    """Interval between telegrams."""
+    """Interval in seconds between telegrams."""
     silent_s: float = 0.3
-    """The partner's life counter may stand for so long."""
+    """Timeout in seconds: if the partner's life counter stands still for longer, the state is sent as
+    invalid.
+    """
 
     def __post_init__(self) -> None:
         expect_values(self, "telegram.")
@@ -65,7 +67,7 @@ class LiveSource:
     """A live run, from the table `[live]`: its mode may forbid lifts, and its pose is passed on."""
 
     folder: Path
-    """OUT of `barsight live`; of a run that takes survey after survey its `current` counts."""
+    """OUT of `barsight live`; for a run with one survey after another, its `current` is used."""
 
     def __post_init__(self) -> None:
         expect_values(self, "live.")
@@ -73,11 +75,12 @@ class LiveSource:
 
 @dataclass(frozen=True)
 class PlantCrane:
-    """The crane's encoders, from the table `[crane]`: the position that the PLC sends is the pose where no
-    live run tells one."""
+    """The crane's encoders, from the table `[crane]`: the position that the PLC sends is used as the pose if
+    no live run provides one.
+    """
 
     position_std_m: float
-    """Standard deviation of that position."""
+    """Standard deviation in metres of the position that the PLC sends."""
 
     def __post_init__(self) -> None:
         expect_values(self, "crane.")
@@ -86,7 +89,7 @@ class PlantCrane:
 
 @dataclass(frozen=True)
 class PlantSettings:
-    """All of plant.toml. A link is served where its table is there."""
+    """All settings of plant.toml. A link is served if its table is present."""
 
     store: StoreSource = field(default_factory=StoreSource)
     live: LiveSource | None = None
@@ -104,7 +107,7 @@ class PlantSettings:
 
 
 def read_plant(path: Path) -> PlantSettings:
-    """Read plant.toml; paths in it are relative to it. Raises InputError or ConfigError."""
+    """Read plant.toml; paths in it are relative to its folder. Raises InputError or ConfigError."""
     plant = read_settings(path, PlantSettings, HELP_AT, "config")
     if not plant.links:
         tables = ", ".join(f"[{name}]" for name in LINKS)

@@ -1,4 +1,4 @@
-"""Define the one state that telegram, OPC UA, MQTT and S7 serve, and read it from a store."""
+"""Define the state that telegram, OPC UA, MQTT and S7 share, and read it from a store."""
 
 from __future__ import annotations
 
@@ -16,16 +16,17 @@ from barsight.store.states import standing_alarms
 from barsight.yard.lifting.validity import is_ahead
 
 MAX_ALARMS = 20
-"""Alarms that are told to the plant, the urgent first, then the newest; and one of each other code."""
+"""Maximum number of alarms in the state, most urgent first, then newest; one of each further code is added."""
 URGENT = ("store-broken", "load-contradicts", "lift-unrecorded", "lift-failed")
-"""Codes of alarms of priority 1: what the store says of the yard may not be true. All others have 2."""
+"""Codes of alarms of priority 1: the store may no longer match the yard. All others have priority 2."""
 YAW_SENSE = "of the beam from +Y of the yard frame, counter-clockwise seen from above"
 
 
 @dataclass(frozen=True)
 class PlcReading:
-    """A PLC's telegram, as it came at stamp_ns of this computer's clock. clock_offset_s: the PLC's less it.
-    load_kg: None where it wasn't weighed.
+    """A PLC's telegram, received at stamp_ns of this computer's clock.
+
+    clock_offset_s: the PLC's clock minus this computer's. load_kg: None if the load wasn't weighed.
     """
 
     who: str
@@ -42,11 +43,11 @@ class PlcReading:
 
 @dataclass(frozen=True)
 class OfferedLift:
-    """A lift with all that a crane needs, in the yard frame.
+    """A lift with all data that a crane needs, in the yard frame.
 
-    hoist_height_m: of the faces' plane at contact. approach_height_m: the magnet's faces may travel over any
-    place there, None where the plant names no height. magnet_class: current step for the load, None where the
-    plant has no table. sha256: of all fields but itself and `handshake`.
+    hoist_height_m: height of the faces' plane at contact. approach_height_m: height at which the magnet's
+    faces may travel over any place, None if the plant defines none. magnet_class: current step for the load,
+    None if the plant has no table. sha256: of all fields except itself and `handshake`.
     """
 
     lift_id: int
@@ -82,7 +83,7 @@ class OfferedLift:
 
 @dataclass(frozen=True)
 class PlantAlarm:
-    """An alarm that isn't cleared. priority: 1 (highest) or 2. is_active: its cause may still be there."""
+    """An alarm that isn't cleared. priority: 1 (highest) or 2. is_active: its cause may still exist."""
 
     code: str
     priority: int
@@ -93,7 +94,7 @@ class PlantAlarm:
 
 @dataclass(frozen=True)
 class PlantState:
-    """The plant's state at `stamp_ns` of the yard's clock. reasons: why it isn't valid; none where it is."""
+    """The plant state at `stamp_ns` of the yard's clock. reasons: why it isn't valid; empty if it is."""
 
     mode: str
     is_valid: bool
@@ -113,11 +114,11 @@ def state_of_store(
     store: Store, life_counter: int, *, approach_height_m: float | None = None,
     magnet_steps_kg: tuple[float, ...] = (), allow_simulated: bool = False, now_ns: int | None = None,
 ) -> PlantState:  # fmt: skip
-    """Read the state: the lift that has begun, or else the claimed one, or else the best offer.
+    """Read the state: the lift that has begun, otherwise the claimed one, otherwise the best offer.
 
-    It is valid where the lift's map is the newest and not too old. A lift that has begun stays until it is
-    reported, and nothing else is offered as long. Where a bundle is to be fetched, its order's first lift is
-    the only offer.
+    It is valid if the lift's map is the newest and not too old. A lift that has begun stays until it is
+    reported, and nothing else is offered meanwhile. If a bundle has been ordered, the first lift of its order
+    is the only offer.
     approach_height_m, magnet_steps_kg, allow_simulated: see `PlantSettings`. now_ns: this computer's clock.
     """
     with store.reading() as connection:
@@ -165,7 +166,7 @@ def _alarm(code: str, reason: str, state: str) -> PlantAlarm:
 
 
 def _reasons(lift: OfferedLift | None, is_simulated: bool, has_steps: bool) -> tuple[str, ...]:
-    """List what forbids a crane to act on the state."""
+    """List the reasons why a crane must not act on the state."""
     if lift is None:
         return ("no-lift: no lift is offered that is still valid",)
     found = ["simulated: the yard was never measured"] if is_simulated else []
@@ -177,13 +178,14 @@ def _reasons(lift: OfferedLift | None, is_simulated: bool, has_steps: bool) -> t
 def offered_lift(
     lift: OpenLift, approach_height_m: float | None, magnet_steps_kg: tuple[float, ...]
 ) -> OfferedLift:
-    """Form what the crane is told of a lift of the store.
+    """Form the offer to the crane from a lift of the store.
 
-    The magnet's class is the first step, from 1, that carries mass and two of its standard deviations.
+    The magnet class is the first current step, counted from 1, that carries the mass plus two of its standard
+    deviations.
     """
     record: dict[str, Any] = lift.record
     tolerance = record["tolerance"]
-    # An earlier version knew of no offset between the crane's readings and its magnet.
+    # Records of an earlier version have no offset between the crane's readings and its magnet.
     target = record.get("crane_target", record["target"])
     place = record.get("crane_set_down", record["set_down"]) or {}
     heaviest_kg = record["mass_kg"] + 2 * record["mass_sigma_kg"]

@@ -1,4 +1,4 @@
-"""Take steps of a lift's handshake to the store, whichever link they come by."""
+"""Apply steps of a lift's handshake to the store, whichever link they come from."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from barsight.store.opening import Store
 
 @dataclass(frozen=True)
 class LiftReport:
-    """Report of a crane on a lift that it has made. load_kg: None where the load wasn't weighed."""
+    """A crane's report on a lift that it has made. load_kg: None if the load wasn't weighed."""
 
     is_reached: bool
     is_slack: bool
@@ -33,14 +33,14 @@ class LiftReport:
 
 
 class LiftSteps:
-    """Judge each step against the state in the store, and take it. Steps are taken one at a time."""
+    """Check each step against the state in the store, and apply it. Steps are applied one at a time."""
 
     def __init__(self, store: Store, settings: PlantSettings) -> None:
         self._store, self._settings = store, settings
         self._turn = threading.Lock()
 
     def claim(self, who: str, lift_id: int, checksum: int | None = None) -> LiftClaim | Failed:
-        """Claim the lift that is offered. checksum: first four bytes of its SHA-256, if known."""
+        """Claim the offered lift. checksum: first four bytes of its SHA-256, if known."""
         with self._turn:
             lift = self._valid_lift(lift_id, checksum)
             return lift if isinstance(lift, Failed) else claim_lift(self._store, lift, who)
@@ -54,7 +54,7 @@ class LiftSteps:
             return begun if isinstance(begun, Failed) else begun.token
 
     def executed(self, token: int, report: LiftReport, lift_id: int | None = None) -> str | Failed:
-        """Record a lift that was made: `confirmed`, `contradicted` or `unweighed`; see `report_executed`."""
+        """Record an executed lift: `confirmed`, `contradicted` or `unweighed`; see `report_executed`."""
         with self._turn:
             claim = self._claimed(token, lift_id)
             if isinstance(claim, Failed):
@@ -64,7 +64,7 @@ class LiftSteps:
             return report_executed(self._store, claim, report.load_kg)
 
     def failed(self, token: int, note: str, lift_id: int | None = None) -> str | Failed:
-        """Record a lift that failed."""
+        """Record a failed lift."""
         with self._turn:
             claim = self._claimed(token, lift_id)
             return claim if isinstance(claim, Failed) else report_failed(self._store, claim, note)
@@ -88,9 +88,9 @@ class LiftSteps:
 
 
 def take_named_step(steps: LiftSteps, step: str, who: str, arguments: Mapping[str, Any]) -> str | Failed:
-    """Take a step by its name with the arguments that OPC UA's methods have; return the token as text.
+    """Apply a step given by name, with the arguments of the OPC UA methods; return the token as text.
 
-    mass_kg: 0 or less where the load wasn't weighed.
+    mass_kg: 0 or less if the load wasn't weighed.
     """
     try:
         if step == "claim":

@@ -15,13 +15,15 @@ TABLE = Path(__file__).parent / "telegram.toml"
 OUT_MAGIC, IN_MAGIC, VERSION = 0xB51A, 0xB51B, 1
 NOT_SET = -(2**31)
 MAX_BEHIND = 3
-"""Telegrams that the echo of the PLC's life counter may be behind before a PLC takes them for old."""
+"""Maximum number of telegrams that the echo of the PLC's life counter may be behind before a PLC rejects
+them as outdated.
+"""
 _CODES = {"u16": "H", "u32": "I", "i32": "i", "i64": "q"}
 
 
 @cache
 def table_of(side: str) -> tuple[tuple[str, str, str], ...]:
-    """Read the fields of `out` or `in`: name, type, meaning."""
+    """Read the fields of side `out` or `in`: name, type, meaning."""
     return tuple((name, kind, told) for name, kind, told in read_toml(TABLE)[side]["fields"])
 
 
@@ -35,7 +37,7 @@ def fields_at(side: str) -> list[tuple[int, str, str, str]]:
 
 
 def width_of(kind: str) -> int:
-    """Return the bytes that a field's type takes."""
+    """Return the number of bytes of a field type."""
     return int(kind[1:]) // 8
 
 
@@ -47,12 +49,12 @@ def layout(side: str, byte_order: str = "big") -> struct.Struct:
 
 
 def pack(side: str, values: Mapping[str, int], byte_order: str = "big") -> bytes:
-    """Write a telegram; a field that isn't given is 0."""
+    """Write a telegram; fields that aren't given are 0."""
     return layout(side, byte_order).pack(*(values.get(name, 0) for name, _, _ in table_of(side)))
 
 
 def unpack(side: str, content: bytes, byte_order: str = "big") -> dict[str, int] | Failed:
-    """Read a telegram; return Failed where length, magic, version or a value can't be."""
+    """Read a telegram; return Failed if its length, magic, version or a value is invalid."""
     form = layout(side, byte_order)
     if len(content) != form.size:
         return Failed("telegram-length", f"{len(content)} bytes came, {form.size} are a telegram")
@@ -65,7 +67,7 @@ def unpack(side: str, content: bytes, byte_order: str = "big") -> dict[str, int]
 
 
 def out_values(state: PlantState, answer: Mapping[str, int]) -> dict[str, int]:
-    """Form the fields of the telegram to the PLC. A state that isn't valid carries no lift."""
+    """Form the fields of the telegram to the PLC. An invalid state carries no lift."""
     lift = state.lift if state.is_valid else None
     status = int(state.is_valid) | (8 if state.mode == "simulated" else 0)
     values = {

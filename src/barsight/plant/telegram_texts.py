@@ -1,4 +1,4 @@
-"""Write the telegram's table as a page of the reference and as a source for TIA Portal (SCL)."""
+"""Write the telegram's table as a reference page and as a source file for TIA Portal (SCL)."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ END_FUNCTION_BLOCK
 
 
 def telegram_page() -> str:
-    """Write the page of the reference: each side's bytes."""
+    """Write the reference page: the bytes of each side."""
     lines = [
         "# Telegram\n\nThe bytes of the cyclic telegram ([how to connect](../how-to/connect-a-plant.md)) and "
         f"of the S7 exchange, version {VERSION}. Big-endian unless `byte_order` says otherwise, no gaps. "
@@ -73,9 +73,9 @@ def telegram_page() -> str:
 
 
 def scl_source() -> str:
-    """Write a source for TIA Portal: both sides' types and data blocks, and the judgement of Barsight's life.
+    """Write a source file for TIA Portal: types and data blocks of both sides, and the life counter check.
 
-    For S7-1500, whose 64-bit integers the stamps need.
+    For S7-1500, whose 64-bit integers the time stamps need.
     """
     lines = ["// Made by `barsight plant scl` from the telegram's table. The number after // is the byte.\n"]
     for side in ("out", "in"):

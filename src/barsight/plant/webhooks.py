@@ -1,4 +1,4 @@
-"""Post each change of the state to addresses of the yard management, in order, until each is taken."""
+"""Post each change of the state to addresses of the yard management system, in order, until accepted."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ class _NoRedirect(urllib.request.HTTPRedirectHandler):
 
 
 class Webhook:
-    """One address, with the changes that wait for it and a thread that posts them.
+    """One address, with the changes queued for it and the thread that posts them.
 
-    A change is posted until the address answers with 2xx: it may come twice, with the same `id`. What is
-    answered with 4xx is dropped, but for 408 and 429: it would be refused again. `lost` counts what was
-    dropped before a post.
+    A change is posted until the address answers with 2xx, so it may arrive twice, with the same `id`. A
+    change answered with 4xx other than 408 and 429 is dropped, as it would be refused again. `lost` is the
+    number of changes dropped before a post.
     """
 
     def __init__(self, url: str, settings: WebhookSettings) -> None:
@@ -48,16 +48,16 @@ class Webhook:
 
     @property
     def waiting(self) -> int:
-        """Count the changes that wait."""
+        """Count the queued changes."""
         return len(self._waiting)
 
     @property
     def problem(self) -> str | None:
-        """Tell why the last post was not taken, None where it was."""
+        """Return why the last post was not accepted, None if it was."""
         return self._problem
 
     def tell(self, change: dict[str, Any]) -> None:
-        """Add a change; the oldest goes where too many wait."""
+        """Queue a change; if the queue is full, the oldest is dropped."""
         with self._lock:
             self._numbers += 1
             if len(self._waiting) >= self._settings.max_waiting:
@@ -67,7 +67,7 @@ class Webhook:
         self._changed.set()
 
     def stop(self) -> None:
-        """End the thread; what waits is dropped."""
+        """Stop the thread; queued changes are dropped."""
         self._stop.set()
         self._changed.set()
         self._thread.join(self._settings.timeout_s + 1)
@@ -98,7 +98,7 @@ class Webhook:
 
 
 def post(url: str, settings: WebhookSettings, body: dict[str, Any]) -> tuple[str | None, bool]:
-    """Post a body once; return the problem, None where it was taken, and whether a retry would be in vain."""
+    """Post a body once; return the problem (None if accepted) and whether a retry would be pointless."""
     content = json.dumps(json_value(body), allow_nan=False).encode()
     headers = {"Content-Type": "application/json"}
     opener = urllib.request.build_opener(_NoRedirect)

@@ -17,7 +17,7 @@ def run(arguments: Sequence[str]) -> None:
     """Parse the arguments and write the source."""
 
     def command(out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]) -> None:
-        """Write the telegram's types and data blocks as a source for TIA Portal (SCL, S7-1500).
+        """Write the telegram's types and data blocks as a source file for TIA Portal (SCL, S7-1500).
 
         Args:
             out: The file to write, such as barsight.scl.

@@ -22,7 +22,7 @@ def run(arguments: Sequence[str]) -> None:
         config: Path,
         role: Literal["viewer", "operator", "engineer"] = "operator",
     ) -> None:
-        """Add a user of the OPC UA server to the file that opcua.users names, or change role and password.
+        """Add a user of the OPC UA server to the file named by opcua.users, or change role and password.
 
         The command asks for the password; if the input is not a terminal, its first line is the password.
         A running server reads the file at its next start.

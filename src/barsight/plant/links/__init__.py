@@ -1,1 +1,1 @@
-"""Serve one state by every link that plant.toml names, and check each from the other side."""
+"""Serve one state on every link configured in plant.toml, and check each link from its other end."""

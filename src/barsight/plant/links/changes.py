@@ -1,4 +1,4 @@
-"""Tell what changed between two states, as events for MQTT and webhooks."""
+"""Derive the changes between two states, as events for MQTT and webhooks."""
 
 from __future__ import annotations
 
@@ -30,13 +30,15 @@ def changes_between(old: PlantState | None, new: PlantState) -> list[dict[str, A
 
 
 def _alarms(state: PlantState) -> list[PlantAlarm]:
-    """List a state's alarms in their order, whatever came of each."""
+    """List a state's alarms in their order, ignoring whether they are active or acknowledged."""
     return [replace(alarm, is_active=True, is_acknowledged=False) for alarm in state.alarms]
 
 
 def _ended(old: PlantState, new: PlantState) -> Iterator[PlantAlarm]:
-    """Yield the alarms that don't stand any more; where more stand than are told the last may stand on, as
-    long as one of their code does.
+    """Yield the alarms that have ended.
+
+    If more stand than the state lists, those at the list's end may only have dropped off it; they don't count
+    as long as another alarm of their code stands.
     """
     stood, standing = _alarms(old), _alarms(new)
     if len(standing) >= MAX_ALARMS:

@@ -1,4 +1,4 @@
-"""Check every link of plant.toml from its other side, and write a protocol of it."""
+"""Check every link of plant.toml from its other end, and write a record of the checks."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from barsight.result_folder import file_digest
 
 
 def check_links(settings: PlantSettings, seconds: float) -> tuple[LinkCheck, ...]:
-    """Check each link that is configured; nothing is claimed, and no data block of the PLC is written.
+    """Check each configured link. No lift is claimed, and no data block of the PLC is written.
 
-    seconds: for the telegram's cycle.
+    seconds: duration of the telegram check.
     """
     return tuple(
         LinkCheck(name, (f"{found.reason}; is barsight plant run running?",), False)
@@ -31,7 +31,7 @@ def check_links(settings: PlantSettings, seconds: float) -> tuple[LinkCheck, ...
 
 
 def _found(settings: PlantSettings, seconds: float) -> Iterator[tuple[str, LinkCheck | Failed]]:
-    """Check link after link; what an extra installs is imported where its link is configured."""
+    """Check link after link; packages of an extra are imported only if their link is configured."""
     if settings.telegram is not None:
         yield "telegram", check_telegram(settings.telegram, seconds)
     if settings.opcua is not None:
@@ -57,7 +57,7 @@ def _check_webhooks(settings: WebhookSettings) -> LinkCheck:
 
 
 def write_protocol(path: Path, config: Path, checks: tuple[LinkCheck, ...]) -> None:
-    """Write what was checked, when, with which plant.toml and with what result, as text."""
+    """Write a text file with what was checked, when, with which plant.toml and with what result."""
     lines = [
         "Barsight: protocol of the plant's links", f"date: {datetime.now(UTC).isoformat(timespec='seconds')}",
         f"computer: {platform.node()}", f"software: barsight {barsight.__version__}",

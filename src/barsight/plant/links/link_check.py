@@ -1,4 +1,4 @@
-"""Define the result of a link's check."""
+"""Define the result of a link check."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class LinkCheck:
-    """Result of a link's check. lines: for people. is_good: whether the link holds."""
+    """Result of a link check. lines: human-readable findings. is_good: True if the link passed."""
 
     link: str
     lines: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""Check the MQTT publisher as a reader of its broker."""
+"""Check the MQTT publisher as a subscriber of its broker."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ WAIT_S = 5.0
 
 
 def check_mqtt(settings: MqttSettings) -> LinkCheck | Failed:
-    """Read the retained topics and some states: lines for people, and whether the link holds."""
+    """Read the retained topics and some states; return readable lines and whether the link passed."""
     try:
         return asyncio.run(_read(settings))
     except TimeoutError:
@@ -59,7 +59,7 @@ async def _read(settings: MqttSettings) -> LinkCheck:
 
 
 async def _tells_wills(settings: MqttSettings) -> bool:
-    """Lose a client of the check's own, and wait for its last will."""
+    """Drop the connection of a test client, and check that the broker publishes its last will."""
     topic = f"{settings.prefix}/check"
     async with mqtt_clients(settings)() as client:
         await client.subscribe(topic, qos=1)

@@ -1,4 +1,4 @@
-"""Check the OPC UA server as a client of it."""
+"""Check the OPC UA server as one of its clients."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ SHOWN = ("mode", "is_valid", "reasons", "life_counter", "survey", "lift.lift_id"
 
 
 def check_opcua(settings: OpcUaSettings) -> LinkCheck | Failed:
-    """Connect, read the state again and again: lines for people, and whether the link holds.
+    """Connect and poll the state; return readable lines and whether the link passed.
 
-    With encryption the check makes a certificate, which the server trusts until the check has ended.
+    With encryption the check makes a certificate, which the server trusts until the check ends.
     """
     try:
         return asyncio.run(_read(settings))
@@ -87,7 +87,7 @@ async def _client(settings: OpcUaSettings) -> AsyncIterator[Any]:
 
 
 def _identity(folder: Path, kept: contextlib.ExitStack) -> tuple[Path, Path]:
-    """Make a certificate of an hour that the server trusts as long as `kept` is open."""
+    """Make a certificate that is valid for an hour and that the server trusts while `kept` is open."""
     content, key = make_certificate(URI, "barsight plant check", ["localhost"], 1 / 24)
     paths = folder / "trusted" / "barsight-plant-check.der", folder / "check.key.pem"
     for path, data in zip(paths, (content, key), strict=True):

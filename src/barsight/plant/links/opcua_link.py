@@ -1,4 +1,4 @@
-"""Show the state to the OPC UA server's process, and take the handshakes that it passes on."""
+"""Pass the state to the process of the OPC UA server, and carry out the handshake steps that it passes on."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from barsight.store.opening import Store
 async def serve_opcua(
     store: Store, settings: OpcUaSettings, feed: StateFeed, steps: LiftSteps, say: Callable[[str], None]
 ) -> None:
-    """Serve until cancelled. Raises OutputError where the server's process ends."""
-    from barsight.plant.opcua.process import OpcUaProcess  # an extra that other links don't need
+    """Serve until cancelled. Raises OutputError if the server's process ends."""
+    from barsight.plant.opcua.process import OpcUaProcess  # needs an extra; the other links don't
     from barsight.plant.opcua.recipes import Recipes
     from barsight.plant.opcua.surveys import AlarmLine, Survey, Told
 
@@ -44,7 +44,7 @@ async def serve_opcua(
         )  # fmt: skip
         if state.map_id is not None and state.map_id not in folders:
             folders.clear()
-            # A store that is away comes back: then the survey is told.
+            # The store may be back later; the survey is then reported.
             with contextlib.suppress(BarsightError), store.reading() as connection:
                 folders[state.map_id] = survey_folder(connection, state.map_id)
         survey = None

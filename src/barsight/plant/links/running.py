@@ -1,4 +1,4 @@
-"""Serve telegram, OPC UA, MQTT, S7 and webhooks from one state, until stopped or one of them ends."""
+"""Serve telegram, OPC UA, MQTT, S7 and webhooks from one state, until stopped or until one of them ends."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ Say = Callable[[str], None]
 
 
 async def serve_plant(store: Store, settings: PlantSettings, say: Say) -> None:
-    """Serve all links until cancelled. say: told where each is served, and what is wrong with one.
+    """Serve all links until cancelled. say: called with the address of each link and with any problem of one.
 
-    Raises OutputError where a link can't be served, or the state isn't read any more.
+    Raises OutputError if a link can't be served, or if the state is no longer being read.
     """
     with StateFeed(store, settings) as feed:
         links = {"state": _watch(feed), **_links(store, settings, feed, say)}
@@ -59,14 +59,14 @@ def _links(store: Store, settings: PlantSettings, feed: StateFeed, say: Say) -> 
 
 
 async def _watch(feed: StateFeed) -> None:
-    """Raise OutputError where no state is read any more: no link would ever offer a lift again."""
+    """Raise OutputError if the state is no longer being read: no link would ever offer a lift again."""
     while feed.is_alive:
         await asyncio.sleep(1.0)
     raise OutputError("the state is read no more; the lines above say why")
 
 
 async def _followed(feed: StateFeed) -> AsyncIterator[tuple[PlantState, list[dict[str, Any]]]]:
-    """Yield the newest state again and again, and what has changed since the one before."""
+    """Yield the newest state repeatedly, with the changes since the previous one."""
     last: PlantState | None = None
     for counter in itertools.count(1):
         state = feed.newest(counter)
@@ -93,7 +93,7 @@ async def _serve_webhooks(one: WebhookSettings, feed: StateFeed, say: Say) -> No
 
 
 async def _serve_mqtt(one: MqttSettings, feed: StateFeed, say: Say) -> None:
-    from barsight.plant.mqtt import MqttPublisher  # an extra that other links don't need
+    from barsight.plant.mqtt import MqttPublisher  # needs an extra; the other links don't
 
     publisher = MqttPublisher(one)
     running = asyncio.create_task(publisher.run())

@@ -1,4 +1,4 @@
-"""Check the data blocks of S7 PUT and GET; both are only read."""
+"""Check the data blocks of the S7 PUT/GET link; both are only read."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ LOOKS, EVERY_S = 5, 0.15
 
 
 def check_s7(settings: S7Settings) -> LinkCheck | Failed:
-    """Read both data blocks again and again: lines for people, and whether both life counters move."""
+    """Poll both data blocks; return readable lines and whether both life counters advance."""
     lines: list[str] = []
     is_good = True
     written = replace(settings, read_db=settings.write_db, read_start=settings.write_start)

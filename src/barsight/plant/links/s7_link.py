@@ -1,4 +1,4 @@
-"""Exchange telegrams with a PLC's data blocks by S7 PUT and GET, in a thread of its own."""
+"""Exchange telegrams with a PLC's data blocks by S7 PUT and GET, in a separate thread."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from barsight.plant.telegram import layout, out_values, pack, unpack
 async def serve_s7(
     settings: S7Settings, feed: StateFeed, steps: LiftSteps, say: Callable[[str], None]
 ) -> None:
-    """Exchange until cancelled. say: told once when the PLC can't be reached or gives no telegram, and once
-    when it does again.
+    """Exchange until cancelled. say: called once when the PLC can't be reached or its data is no telegram,
+    and once when it has recovered.
     """
-    from barsight.plant.s7 import S7Exchange, run_s7  # an extra that other links don't need
+    from barsight.plant.s7 import S7Exchange, run_s7  # needs an extra; the other links don't
 
     at = f"{settings.host}:{settings.port}"
     partner = PlcPartner(plc_name(f"{at} by S7"), steps, settings.silent_s)

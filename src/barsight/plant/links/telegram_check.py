@@ -1,4 +1,4 @@
-"""Check the telegram's server from the PLC's side: bytes and their meaning, cycle, answer, life counter."""
+"""Check the telegram server from the PLC's end: bytes and their meaning, cycle, answer, life counter."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from barsight.plant.settings import TelegramSettings
 from barsight.plant.telegram import IN_MAGIC, MAX_BEHIND, VERSION, fields_at, layout, pack, unpack, width_of
 
 TOLERANCE_RATIO = 0.2
-"""The cycle's first and last hundredth may be off by so much of it."""
+"""Largest deviation of the cycle's 1st and 99th percentile from the set cycle, as a share of it."""
 FAILED, NUMBER = 4, 0x5A5A
 
 
 @dataclass
 class _Exchanged:
-    """Telegrams of a check.
+    """Telegrams exchanged during a check.
 
-    stamps_s: when each came. behind: telegrams by which each echo of the PLC's life counter was late.
-    answered_s: from the command to its answer.
+    stamps_s: arrival times. behind: number of telegrams by which each echo of the PLC's life counter was
+    late. answered_s: time from the command to its answer.
     """
 
     sent: bytes = b""
@@ -36,7 +36,7 @@ class _Exchanged:
 
 
 def check_telegram(one: TelegramSettings, seconds: float) -> LinkCheck | Failed:
-    """Exchange telegrams for some time, and judge them. The one command is refused: it names no lift."""
+    """Exchange telegrams for `seconds` and judge them. The single command is refused, as it names no lift."""
     try:
         seen = _exchange(one, seconds)
     except OSError as error:
@@ -93,7 +93,7 @@ def _exchange(one: TelegramSettings, seconds: float) -> _Exchanged | Failed:
 
 
 def told_fields(side: str, content: bytes, byte_order: str) -> list[str]:
-    """List the fields of a telegram with offset, bytes, value and meaning; of another its length alone."""
+    """List a telegram's fields with offset, bytes, value and meaning; only the length of an invalid one."""
     found, head = unpack(side, content, byte_order), f"{side}: {len(content)} bytes"
     if isinstance(found, Failed):
         return [head]

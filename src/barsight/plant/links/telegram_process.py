@@ -1,8 +1,8 @@
-"""Serve the telegram in a process of its own, so that nothing else delays its cycle.
+"""Serve the telegram in a separate process, so that nothing else delays its cycle.
 
-On a busy computer a thread waits for the interpreter's lock while the thread that has it waits for a core.
-So states go to the process as they are read, and commands come back. It dies with its parent, and a state
-that is no longer renewed isn't valid.
+On a busy computer a thread waits for the interpreter lock while the thread that holds it waits for a core.
+So states are sent to the process as they are read, and commands come back. The process dies with its
+parent, and a state that is no longer renewed becomes invalid.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ START_S = 120.0
 async def serve_telegram(
     settings: TelegramSettings, feed: StateFeed, steps: LiftSteps, say: Callable[[str], None]
 ) -> None:
-    """Serve until cancelled. Raises OutputError where the address can't be had or the process ends."""
+    """Serve until cancelled. Raises OutputError if the address is unavailable or the process ends."""
     context = multiprocessing.get_context("spawn")
     states, states_there = context.Pipe()
     calls, calls_there = context.Pipe()
@@ -70,7 +70,7 @@ async def serve_telegram(
 
 
 def _begun(calls: Connection) -> int | str:
-    """Wait for the process: return the port that it listens at, or why it doesn't."""
+    """Wait for the process to start: return the port on which it listens, or why it doesn't."""
     with contextlib.suppress(EOFError, OSError):
         if calls.poll(START_S):
             told: int | str = calls.recv()
@@ -99,11 +99,11 @@ def _answer_calls(calls: Connection, feed: StateFeed, steps: LiftSteps) -> None:
 
 
 class _Unreached(str):
-    """The text of an error that a step ended in."""
+    """Text of the error that kept a step from being carried out."""
 
 
 class _SentFeed:
-    """The newest state that the parent sent; the process ends where no more can come."""
+    """The newest state that the parent sent; the process ends if no more can come."""
 
     def __init__(self, states: Connection, calls: _Calls) -> None:
         self._states, self._calls = states, calls
@@ -111,18 +111,18 @@ class _SentFeed:
         threading.Thread(target=self._receive, daemon=True).start()
 
     def newest(self, life_counter: int) -> PlantState:
-        """Return the newest state with the telegram's life counter; not valid where it is old."""
+        """Return the newest state with the telegram's life counter; it is marked invalid if it is too old."""
         if self._read is None:
             told = ("starting: no state was read yet",)
             return PlantState("idle", False, told, life_counter, time.time_ns(), "none")
         return with_age(*self._read, life_counter)
 
     def refresh(self) -> None:
-        """Let the parent read the state now."""
+        """Make the parent read the state now."""
         self._calls.ask("refresh")
 
     def take_reading(self, reading: PlcReading) -> None:
-        """Pass on what a PLC tells of the crane."""
+        """Pass a PLC's reading of the crane on to the parent."""
         with contextlib.suppress(OSError):
             self._states.send(reading)
 
@@ -135,7 +135,7 @@ class _SentFeed:
 
 
 class _Calls:
-    """The steps of `LiftSteps` by their names, each taken by the parent, one at a time."""
+    """The steps of `LiftSteps` by name, each carried out by the parent, one at a time."""
 
     def __init__(self, calls: Connection) -> None:
         self._calls, self._turn = calls, threading.Lock()
@@ -144,7 +144,7 @@ class _Calls:
         return partial(self.ask, step)
 
     def ask(self, step: str, *arguments: Any) -> Any:
-        """Ask the parent. Raises BarsightError where the step couldn't be judged."""
+        """Ask the parent to carry out a step. Raises BarsightError if it couldn't."""
         with self._turn:
             self._calls.send((step, arguments))
             answer = self._calls.recv()
@@ -154,7 +154,7 @@ class _Calls:
 
 
 def _serve(settings: TelegramSettings, states: Connection, calls: Connection) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which ends this one
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C and ends this process
     asked = _Calls(calls)
     server = TelegramServer(_SentFeed(states, asked), cast(LiftSteps, asked), settings)
     try:

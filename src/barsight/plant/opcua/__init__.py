@@ -1,1 +1,1 @@
-"""Serve the plant's state by OPC UA: plain variables, and OPC 40100-1 for machine vision above them."""
+"""Serve the plant state over OPC UA: plain variables, and OPC 40100-1 for machine vision on top of them."""

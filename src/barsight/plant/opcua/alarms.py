@@ -1,4 +1,4 @@
-"""Keep conditions of alarms: raised, acknowledged with a comment, gone; each change is an event."""
+"""Keep the conditions of alarms: raised, acknowledged with a comment, ended; each change is an event."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from barsight.plant.opcua.security.binding import Node, Server, ua
 from barsight.plant.opcua.surveys import AlarmLine
 
 MAX_CONDITIONS = 200
-"""Nodes made at most; codes of alarms are few, and more than that is a fault that mustn't fill memory."""
+"""Maximum number of condition nodes. There are few alarm codes; more than this is a fault, which must not
+fill memory.
+"""
 SEVERITIES = {"info": 200, "warning": 500, "error": 800}
 _ON_OFF = {
     "EnabledState": ("Disabled", "Enabled"),
@@ -32,7 +34,7 @@ class _Condition:
 
 
 class Conditions:
-    """The conditions below a parent node, which emits their events as `alarm`."""
+    """The conditions below a parent node, which emits their events through `alarm`."""
 
     def __init__(self, server: Server, parent: Node, emitter: Emitter, kind: Any, index: int) -> None:
         self._server = server
@@ -43,7 +45,7 @@ class Conditions:
         self._by_code: dict[str, _Condition] = {}
 
     async def add_methods(self) -> None:
-        """Answer Acknowledge, AddComment and ConditionRefresh of the base types."""
+        """Link the methods Acknowledge, AddComment and ConditionRefresh of the base types."""
         await self._emitter.add("alarm", self._kind)
         await self._emitter.add("refresh start", ua.ObjectIds.RefreshStartEventType)
         await self._emitter.add("refresh end", ua.ObjectIds.RefreshEndEventType)
@@ -56,9 +58,10 @@ class Conditions:
             self._server.iserver.isession.add_method_callback(ua.NodeId(number), method)
 
     async def show(self, alarms: tuple[AlarmLine, ...]) -> None:
-        """Raise what stands now and wasn't active, end what was and doesn't stand any more.
+        """Raise the conditions of new alarms, and end those whose alarm has ended.
 
-        alarms: the newest first. Of each code that one is shown, raised anew where another was.
+        alarms: the newest first. Only the newest of each code is shown, and raised anew if it replaces
+        another.
         """
         standing = {alarm.code: alarm for alarm in reversed(alarms)}
         for code, alarm in standing.items():
@@ -72,7 +75,7 @@ class Conditions:
                 await self._change(replace(known, is_active=False))
 
     async def acknowledge_all(self, comment: str) -> None:
-        """Acknowledge every condition that isn't."""
+        """Acknowledge every condition that isn't acknowledged yet."""
         for known in list(self._by_code.values()):
             if not known.is_acknowledged:
                 user = str(caller().name)
@@ -118,7 +121,7 @@ class Conditions:
         return self._emitter.make("alarm", alarm.text, SEVERITIES.get(alarm.level, 500), fields)
 
     def _find(self, parent: ua.NodeId, arguments: tuple[Any, ...]) -> _Condition | int:
-        """Find the condition that a client means, or the status code to refuse it with."""
+        """Find the condition that a client refers to; otherwise return the status code of the refusal."""
         if not has_role("operator"):
             return int(ua.StatusCodes.BadUserAccessDenied)
         found = [known for known in self._by_code.values() if known.node.nodeid == parent]

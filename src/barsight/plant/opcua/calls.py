@@ -1,4 +1,4 @@
-"""Answer methods: role and arguments are checked before anything is done."""
+"""Answer method calls: role and arguments are checked before anything is done."""
 
 from __future__ import annotations
 
@@ -14,11 +14,13 @@ _PLAIN = {
     1: (bool,), 6: (int,), 7: (int,), 8: (int,), 9: (int,), 11: (float,), 12: (str, type(None)),
     15: (bytes, type(None)), 17: (ua.NodeId,), 21: (ua.LocalizedText, type(None)),
 }  # fmt: skip
-"""Python types by base type: Boolean, integers, Double, String, ByteString, NodeId, LocalizedText."""
+"""Python types of the OPC UA base types: Boolean, integers, Double, String, ByteString, NodeId,
+LocalizedText.
+"""
 
 
 async def answer_method(server: Server, node: Node, role: str, handler: Handler) -> None:
-    """Answer a method by `handler`, for callers with `role` who give the arguments that the node declares."""
+    """Answer a method by `handler`, for callers with `role` whose arguments match the node's declaration."""
     declared: list[Any] = []
     for child in await node.get_properties():
         if (await child.read_browse_name()).Name == "InputArguments":

@@ -1,4 +1,4 @@
-"""Emit events to those who watch the server or the vision system."""
+"""Emit events to clients that monitor the server or the vision system."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from barsight.plant.opcua.security.binding import EventGenerator, Node, Server, 
 
 
 class Emitter:
-    """Hold one event of each type, and send filled copies of them from several nodes.
+    """Hold one event of each type, and send filled-in copies of it from several nodes.
 
-    asyncua sends an event to watchers of one node only; a client that watches the Server object must get
-    those of the objects below it too (OPC 10000-3, 4.6).
+    asyncua sends an event only to clients that monitor one particular node; a client that monitors the Server
+    object must also get the events of the objects below it (OPC 10000-3, 4.6).
     """
 
     def __init__(self, server: Server, sources: list[Node]) -> None:
@@ -23,7 +23,7 @@ class Emitter:
         self._models: dict[str, Any] = {}
 
     async def add(self, name: str, kind: Any) -> None:
-        """Learn the fields of the event type with node id `kind`, under `name`."""
+        """Read the fields of the event type with node id `kind`, and register it under `name`."""
         generator = EventGenerator(self._server.iserver.isession)
         for source in self.sources:
             await generator.init(kind, source, add_generates_event=False)
@@ -32,7 +32,7 @@ class Emitter:
         self._models[name] = generator.event
 
     def make(self, name: str, message: str, severity: int, fields: dict[str, Any]) -> Any:
-        """Make an event. fields: by name (`FromState/Id`), a value, or a Variant to set its type too."""
+        """Make an event. fields: values by name (`FromState/Id`), or Variants, which also set the type."""
         event = copy.copy(self._models[name])
         event.data_types = dict(event.data_types)
         now = datetime.datetime.now(datetime.UTC)
@@ -49,7 +49,7 @@ class Emitter:
         return event
 
     async def send(self, event: Any, subscription: int | None = None) -> None:
-        """Send an event from each source, to all subscriptions or one."""
+        """Send an event from each source, to all subscriptions or to the given one."""
         service = self._server.iserver.subscription_service
         chosen = service.subscriptions if subscription is None else {subscription: None}
         for source in self.sources:

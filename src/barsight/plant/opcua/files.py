@@ -1,4 +1,4 @@
-"""Transfer files of results: a client asks for one, reads it in pieces, and closes it."""
+"""Transfer result files: a client opens one, reads it in pieces, and closes it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from barsight.plant.opcua.security.binding import Node, Server, ua
 MAX_OPEN = 10
 MAX_PIECE_BYTES = 1 << 20
 IDLE_S = 60.0
-"""A file that nobody has read from for so long is closed."""
+"""Time in seconds without a read after which an open file is closed."""
 
 
 @dataclass
@@ -24,7 +24,7 @@ class _OpenFile:
 
 
 class Transfers:
-    """Files that clients read now, each a FileType object below the vision system."""
+    """Files that clients are reading, each a FileType object below the vision system."""
 
     def __init__(self, server: Server, parent: Node, index: int, results: KeptResults) -> None:
         self._server = server
@@ -35,7 +35,7 @@ class Transfers:
         self._handles = 0
 
     async def open(self, options: Any) -> Any:
-        """Answer GenerateFileForRead: open the height map of the result that the options name."""
+        """Answer GenerateFileForRead: open the height map of the result named by the options."""
         await self._close_idle()
         wanted = getattr(options, "Id", None)
         result = self._results.get(str(wanted.Id or "")) if wanted is not None else None

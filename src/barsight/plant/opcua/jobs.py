@@ -1,4 +1,4 @@
-"""Answer the methods of jobs and results: a job waits for the next survey, whose result it gets."""
+"""Answer the methods of jobs and results: a job waits for the next survey and returns its result."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from barsight.plant.opcua.vision import VisionSystem, int32, refusal
 
 
 class JobMethods:
-    """Start and stop jobs, and hand out results.
+    """Start and stop jobs, and return results.
 
     Barsight measures what the crane passes over, so a single job is the next survey that ends, and a
-    continuous one every survey until Stop or Abort.
+    continuous job is every survey until Stop or Abort.
     """
 
     def __init__(self, vision: VisionSystem, recipes: RecipeMethods, kept_results: int) -> None:
@@ -44,8 +44,9 @@ class JobMethods:
         await self._vision.answer(transfer, "viewer", self._transfers.open)
 
     async def end_survey(self, survey: Survey) -> None:
-        """Make a survey that ended the result of the job that runs, and end a single job. Without a job, or
-        where its files can't be read, it is no result.
+        """Make a finished survey the result of the running job, and end a single job.
+
+        Without a job, or if its files can't be read, the survey yields no result.
         """
         if not self._vision.mode.is_executing:
             return

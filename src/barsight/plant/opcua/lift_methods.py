@@ -1,4 +1,4 @@
-"""Answer the handshake of a lift: Claim, Executing, Executed and Failed, for operators only."""
+"""Answer the handshake of a lift: Claim, Executing, Executed and Failed, for operators and above."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ STEPS: dict[str, dict[str, ua.VariantType]] = {
     },
     "failed": {"token": ua.VariantType.String, "reason": ua.VariantType.String},
 }  # fmt: skip
-"""Steps of the handshake with their arguments."""
+"""Steps of the handshake with their arguments and types."""
 _KINDS = {
     ua.VariantType.String: str, ua.VariantType.Double: float, ua.VariantType.Boolean: bool,
 }  # fmt: skip
 
 
 class LiftMethods:
-    """The object `Handshake`: each method returns the token, whether it was taken, and a sentence why not."""
+    """The object `Handshake`: each method returns the token, whether the step was taken, and if not, why."""
 
     def __init__(self, server: Server, source: PlantSource) -> None:
         self._server = server

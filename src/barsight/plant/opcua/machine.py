@@ -13,7 +13,7 @@ from barsight.core.errors import Failed
 
 MAIN_STATES = {"Preoperational": 1, "Halted": 2, "Error": 3, "Operational": 4}
 AUTOMATIC_STATES = {"Initialized": 5, "Ready": 6, "SingleExecution": 7, "ContinuousExecution": 8}
-"""Names and StateNumbers."""
+"""State names and their StateNumbers."""
 EXECUTING = ("SingleExecution", "ContinuousExecution")
 
 Method = Literal[
@@ -48,34 +48,34 @@ _SUFFIX = {
 
 @dataclass(frozen=True)
 class VisionMode:
-    """A state of both machines. automatic: the state below Operational, None elsewhere."""
+    """State of both state machines. automatic: substate of Operational, None in all other states."""
 
     main: str = "Preoperational"
     automatic: str | None = None
 
     @property
     def is_executing(self) -> bool:
-        """Tell that a job runs."""
+        """Return True while a job runs."""
         return self.automatic in EXECUTING
 
 
 @dataclass(frozen=True)
 class Step:
-    """A transition taken: the mode after it, and the transition's name in the NodeSet."""
+    """Completed transition: the resulting mode, and the transition's name in the NodeSet."""
 
     mode: VisionMode
     transition: str
 
 
 def step_by_method(mode: VisionMode, method: str) -> Step | Failed:
-    """Step by a client's method; return Failed where the mode doesn't allow it."""
+    """Apply a client's method; return Failed if the mode doesn't allow it."""
     if method in _MAIN:
         return _step_main(mode, _MAIN[method].get(mode.main), method)
     return _step_automatic(mode, _AUTOMATIC.get(method, {}), method)
 
 
 def step_by_itself(mode: VisionMode, cause: str) -> Step | Failed:
-    """Step by what happens inside: `job done`, `error` or `error resolved`."""
+    """Apply an internal cause: `job done`, `error` or `error resolved`."""
     if cause == "error":
         return _step_main(mode, "Error" if mode.main in ("Preoperational", "Operational") else None, cause)
     if cause == "error resolved":

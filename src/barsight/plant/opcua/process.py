@@ -1,8 +1,8 @@
-"""Run the OPC UA server in a process of its own, which asks for the state and dies with its parent.
+"""Run the OPC UA server in a separate process, which polls the state and dies with its parent.
 
-The server's process asks, and a thread here answers: at most one question is under way, so that nothing
-piles up where either side stalls. A state that is older than `max_age_s`, or a question that isn't
-answered within it, makes all variables Bad.
+The server's process sends requests, and a thread here answers them, at most one at a time, so that nothing
+piles up if either side stalls. A state older than `max_age_s`, or a request not answered within that time,
+sets all variables Bad.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from barsight.plant.opcua.surveys import Told
 
 MAX_AGE_S = 0.3
 Handshake = Callable[[str, str, Mapping[str, Any]], "str | Failed"]
-"""Take a step of the handshake: its name, who asks, and the arguments; return the token."""
+"""Callable that takes a step of the handshake: its name, the caller and the arguments; returns the token."""
 
 
 class OpcUaProcess:
-    """The server's process, and the thread that answers it."""
+    """The server's process, and the thread that answers its requests."""
 
     def __init__(
         self, settings: OpcUaSettings, kind: type, recipes: Recipes, handshake: Handshake,
@@ -50,20 +50,20 @@ class OpcUaProcess:
 
     @property
     def is_alive(self) -> bool:
-        """Tell that the process runs, and is answered."""
+        """Return True while the process runs and its thread answers."""
         return self._process.is_alive() and self._thread.is_alive()
 
     @property
     def pid(self) -> int | None:
-        """Return the process's id."""
+        """Return the process id."""
         return self._process.pid
 
     def show(self, told: Told) -> None:
-        """Set what is true now."""
+        """Set the data that is current now."""
         self._told = (time.monotonic(), told)
 
     def stop(self) -> None:
-        """End the process and the thread."""
+        """Stop the process and the thread."""
         self._stop.set()
         self._process.terminate()
         self._process.join(5)
@@ -100,7 +100,7 @@ class _AskedPlant:
         self._turn = asyncio.Lock()
 
     async def told(self) -> Told | None:
-        """Ask for what is true now; what is shown doesn't outlive a step of the handshake that waits."""
+        """Request the current data; the data already shown expires even while a handshake step is waiting."""
         try:
             async with asyncio.timeout(self._max_age_s):
                 answer = await self._ask(None, self._max_age_s)
@@ -109,7 +109,7 @@ class _AskedPlant:
         return answer if isinstance(answer, Told) else None
 
     async def handshake(self, step: str, who: str, arguments: Mapping[str, Any]) -> str | Failed | None:
-        """Ask for a step of the handshake."""
+        """Request a step of the handshake."""
         answer = await self._ask((step, who, dict(arguments)), 1.0)
         return answer if isinstance(answer, str | Failed) else None
 
@@ -120,7 +120,7 @@ class _AskedPlant:
             )
 
     def _wait(self, question: Any, timeout_s: float) -> Any:
-        """Wait for the answer to this question; answers to earlier ones, that came too late, are left."""
+        """Wait for the answer to this request; late answers to earlier requests are discarded."""
         self._asked += 1
         end = time.monotonic() + timeout_s
         try:

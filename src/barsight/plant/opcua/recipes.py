@@ -1,4 +1,4 @@
-"""Answer the methods of recipes (a preset with its magnet) and of configurations (a calibration)."""
+"""Answer the methods of recipes (a preset with its magnet) and configurations (a calibration)."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from barsight.plant.opcua.security.binding import ua
 from barsight.plant.opcua.vision import VisionSystem, int32, refusal
 
 NOT_FOUND = 1
-"""Error of a method that was given an id that isn't there."""
+"""Error code that a method returns for an unknown id."""
 
 
 @dataclass(frozen=True)
 class Recipes:
-    """Ids of the recipes that the run knows, and of its calibration."""
+    """Ids of the recipes that the run offers, and of its calibration."""
 
     known: tuple[str, ...]
     configuration: str
@@ -26,7 +26,7 @@ class Recipes:
 
 
 class RecipeMethods:
-    """Hold which recipe is prepared, and answer for recipes and configurations."""
+    """Remember which recipe is prepared, and answer the methods of recipes and configurations."""
 
     def __init__(self, vision: VisionSystem, recipes: Recipes) -> None:
         self._vision = vision
@@ -35,11 +35,11 @@ class RecipeMethods:
 
     @property
     def prepared(self) -> str:
-        """Name the recipe that is prepared: none before Ready, and none after Halt or Reset."""
+        """Return the prepared recipe: none before Ready, and none after Halt or Reset."""
         return self._chosen if self._vision.mode.automatic not in (None, "Initialized") else ""
 
     async def add(self) -> None:
-        """Link the methods; what a crane's clients may not do here is refused as not supported."""
+        """Link the methods; those that a crane's clients may not call are refused as not supported."""
         recipes: dict[str, tuple[str, Handler]] = {
             "PrepareRecipe": ("engineer", self._prepare),
             "UnprepareRecipe": ("engineer", self._unprepare),
@@ -128,7 +128,7 @@ class RecipeMethods:
 
 
 def handle() -> ua.Variant:
-    """Make the handle 0: nothing is held for it, so that nothing waits to be released."""
+    """Make the handle 0: no resources are held, so nothing has to be released."""
     return ua.Variant(0, ua.VariantType.UInt32)
 
 

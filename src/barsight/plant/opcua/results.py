@@ -1,4 +1,4 @@
-"""Keep results of surveys: bundles and lifts as JSON in the result, the height map as a file."""
+"""Keep survey results: bundles and lifts as JSON in the result, the height map as a file."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from barsight.plant.opcua.security.binding import ua
 RESULT_FILES = ("bundles.json", "lifts.json")
 TRANSFERRED = "height.tif"
 MAX_CONTENT_BYTES = 4 << 20
-"""A result's JSON may be so long; a longer one is left to file transfer."""
+"""Maximum size of a result's JSON in bytes; a larger one is available by file transfer only."""
 _ID = re.compile(r"[\w.:+-]{1,80}")
 
 
 @dataclass(frozen=True)
 class SurveyResult:
-    """A survey that ended. folder: its result folder. job: the job it was made for."""
+    """A finished survey. folder: its result folder. job: the job that it was made for."""
 
     survey: str
     job: str
@@ -36,12 +36,12 @@ class SurveyResult:
 
     @property
     def has_file(self) -> bool:
-        """Tell that a file can be transferred."""
+        """Return True if the result has a file to transfer."""
         return (self.folder / TRANSFERRED).is_file()
 
 
 def read_result(folder: Path, survey: str, job: str, recipe: str, configuration: str) -> SurveyResult:
-    """Read a result folder. Raises InputError where its files can't be read."""
+    """Read a result folder. Raises InputError if its files can't be read."""
     if not _ID.fullmatch(survey):
         raise InputError(folder, f"{survey[:80]!r} is no id of a survey", "measure it anew")
     documents = [read_json(folder / name) for name in RESULT_FILES]
@@ -54,7 +54,7 @@ def read_result(folder: Path, survey: str, job: str, recipe: str, configuration:
 
 
 class KeptResults:
-    """The last results, by id; the oldest goes as one more comes."""
+    """The latest results, by id; adding one drops the oldest if there are too many."""
 
     def __init__(self, max_results: int) -> None:
         self._max_results = max_results
@@ -76,7 +76,7 @@ class KeptResults:
 
 
 def told(result: SurveyResult) -> Any:
-    """Tell a result as the specification's ResultDataType."""
+    """Convert a result to the specification's ResultDataType."""
     structure = ua.ResultDataType()
     structure.ResultId = ua.ResultIdDataType(Id=result.survey)
     structure.HasTransferableDataOnFile = result.has_file

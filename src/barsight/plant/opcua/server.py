@@ -1,4 +1,4 @@
-"""Run the OPC UA server: variables always, the vision system where its NodeSet is there."""
+"""Run the OPC UA server: variables always, the vision system if its NodeSet is available."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from barsight.plant.opcua.variables import StateVariables
 from barsight.plant.opcua.vision import ERROR_CONDITION, VisionSystem
 
 URI = "urn:barsight:crane"
-"""Application and namespace."""
+"""URI of the application and of its namespace."""
 
 
 @dataclass(frozen=True)
 class _Shown:
-    """The parts of the address space that follow the plant."""
+    """The parts of the address space that are updated from the plant."""
 
     variables: StateVariables
     conditions: Conditions
@@ -38,7 +38,10 @@ class _Shown:
 async def opcua_server(
     settings: OpcUaSettings, kind: type, source: PlantSource, recipes: Recipes
 ) -> AsyncIterator[asyncio.Task[None]]:
-    """Serve `source` while the block runs; yield the task that follows it. kind: the snapshot's dataclass."""
+    """Serve `source` while the block runs; yield the task that updates the server from it.
+
+    kind: dataclass of the snapshot.
+    """
     nodeset = settings.nodeset
     own = own_certificate(settings.folder, URI, settings.host)
     users = PasswordUsers(read_users(settings.users), settings.allow_anonymous)
@@ -98,7 +101,7 @@ async def _add(
 
 
 async def _follow(shown: _Shown, source: PlantSource, settings: OpcUaSettings) -> None:
-    """Show what the source tells, again and again; all variables Bad where it tells nothing."""
+    """Update the address space from the source repeatedly; all variables are Bad if it returns nothing."""
     survey: str | None = None
     is_first = True
     while True:
@@ -118,7 +121,7 @@ async def _follow(shown: _Shown, source: PlantSource, settings: OpcUaSettings) -
 
 
 async def _follow_errors(vision: VisionSystem, told: Told) -> None:
-    """Enter Error with the first alarm of that level, and leave it as the last has gone."""
+    """Enter the state Error with the first alarm of that level, and leave it when the last one has ended."""
     errors = [alarm for alarm in told.alarms if alarm.level == "error"]
     if errors and await vision.step_itself("error") is None:
         await vision.emitter.emit("error", errors[0].text, 800)

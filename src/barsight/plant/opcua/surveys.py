@@ -1,4 +1,4 @@
-"""Define what the OPC UA server asks the plant: state, alarms, surveys, answers to the handshake."""
+"""Define what the OPC UA server requests from the plant: state, alarms, surveys, handshake answers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from barsight.core.errors import Failed
 
 @dataclass(frozen=True)
 class Survey:
-    """A survey that ended. name: its id (the map's); folder: its result folder."""
+    """A finished survey. name: its id (that of its map); folder: its result folder."""
 
     name: str
     folder: Path
@@ -20,7 +20,7 @@ class Survey:
 
 @dataclass(frozen=True)
 class AlarmLine:
-    """An alarm that stands: its stable code, a sentence, and `info`, `warning` or `error`."""
+    """A current alarm: its stable code, a sentence, and its level `info`, `warning` or `error`."""
 
     code: str
     text: str
@@ -29,7 +29,7 @@ class AlarmLine:
 
 @dataclass(frozen=True)
 class Told:
-    """All that is shown at one moment. state: a frozen snapshot. survey: the last that ended."""
+    """All data shown at one moment. state: a frozen snapshot. survey: the last finished one."""
 
     state: Any
     alarms: tuple[AlarmLine, ...] = ()
@@ -37,10 +37,10 @@ class Told:
 
 
 class PlantSource(Protocol):
-    """The plant's side, as the server asks it."""
+    """Interface through which the server requests data from the plant."""
 
     async def told(self) -> Told | None:
-        """Return what is true now, or None where that isn't known (any more)."""
+        """Return the current data, or None if it is unknown or out of date."""
 
     async def handshake(self, step: str, who: str, arguments: Mapping[str, Any]) -> str | Failed | None:
-        """Take a step of the handshake of a lift: `claim` returns a token. None: nobody answers."""
+        """Take a step of a lift's handshake: `claim` returns a token. None: there was no answer."""

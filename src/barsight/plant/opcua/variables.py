@@ -1,4 +1,4 @@
-"""Show a frozen snapshot as plain variables: one node a field, one folder a dataclass within it."""
+"""Show a frozen snapshot as plain variables: a node for each field, a folder for each nested dataclass."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ _ZEROS: dict[ua.VariantType, Any] = {
     ua.VariantType.Double: 0.0,
     ua.VariantType.String: "",
 }
-"""Fill a node as it is made, before its first value."""
+"""Initial values by type, which a node has until its first value is written."""
 
 
 @dataclass(frozen=True)
 class Leaf:
-    """A field that holds a value. path: names from the snapshot down. kind: of a value, or of an array's."""
+    """A field that holds a value. path: names from the snapshot down. kind: of the value or array values."""
 
     path: tuple[str, ...]
     kind: ua.VariantType
@@ -42,7 +42,7 @@ class Leaf:
 
 
 def leaves_of(kind: type, path: tuple[str, ...] = ()) -> Iterator[Leaf]:
-    """List the leaves of a dataclass by its annotations: what is no scalar or array of them goes as JSON."""
+    """List the leaves of a dataclass by its annotations; all but scalars and arrays of them is JSON."""
     hints = typing.get_type_hints(kind)
     for field in dataclasses.fields(kind):
         inner = _without_none(hints[field.name])
@@ -58,7 +58,7 @@ def leaves_of(kind: type, path: tuple[str, ...] = ()) -> Iterator[Leaf]:
 
 
 def value_of(snapshot: Any, leaf: Leaf) -> Any:
-    """Read a leaf's value out of a snapshot; None where it, or what it lies in, is None."""
+    """Read a leaf's value from a snapshot; None if it, or a field that contains it, is None."""
     value = snapshot
     for name in leaf.path:
         if value is None:
@@ -74,9 +74,9 @@ def value_of(snapshot: Any, leaf: Leaf) -> Any:
 
 
 class StateVariables:
-    """The variables of one kind of snapshot under a parent node; written where a value changed.
+    """The variables of one kind of snapshot below a parent node; a value is written when it has changed.
 
-    `quiet` sets all of them Bad, so that no client takes an old value for a true one.
+    `quiet` sets all of them Bad, so that no client takes an outdated value for a current one.
     """
 
     def __init__(self, server: Server, nodes: dict[Leaf, Node]) -> None:
@@ -86,7 +86,7 @@ class StateVariables:
 
     @classmethod
     async def add(cls, server: Server, parent: Node, kind: type, index: int) -> StateVariables:
-        """Add the nodes below `parent`; their ids are `State.lift.x_m` and the like."""
+        """Add the nodes below `parent`; their ids have the form `State.lift.x_m`."""
         folders: dict[tuple[str, ...], Node] = {(): parent}
         nodes: dict[Leaf, Node] = {}
         for leaf in leaves_of(kind):
@@ -106,14 +106,14 @@ class StateVariables:
         return variables
 
     async def show(self, snapshot: Any) -> None:
-        """Write what differs from the values shown."""
+        """Write the values that differ from those shown."""
         for leaf, node in self._nodes.items():
             value = value_of(snapshot, leaf)
             status = ua.StatusCodes.Good if value is not None else ua.StatusCodes.BadNoData
             await self._write(leaf, node, value, status)
 
     async def quiet(self, status: int) -> None:
-        """Set all variables to a Bad status and no value."""
+        """Set all variables to a Bad status without a value."""
         for leaf, node in self._nodes.items():
             await self._write(leaf, node, None, status)
 

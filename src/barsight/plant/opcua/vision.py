@@ -1,4 +1,4 @@
-"""Stand a vision system of OPC 40100-1 in the address space, and drive its state machine."""
+"""Provide a vision system of OPC 40100-1 in the address space, and drive its state machine."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ _BARE_IDS = {
     "ConfigurationIdDataType": 3008,
 }
 _SYSTEM_STATES = {"Preoperational": 3, "Halted": 4, "Error": 5, "Operational": 2}
-"""SystemStateDataType: engineering, scheduled downtime, unscheduled downtime, stand by; 1 is production."""
+"""SystemStateDataType: engineering, scheduled downtime, unscheduled downtime, standby; 1 is production."""
 
 
 class VisionSystem:
-    """The vision system's nodes and its mode. Methods come from clients, one at a time (one event loop)."""
+    """The vision system's nodes and its mode. Clients call methods one at a time (one event loop)."""
 
     def __init__(self, server: Server, index: int, vision_index: int, system: Node, emitter: Emitter) -> None:
         self.server = server
@@ -52,7 +52,7 @@ class VisionSystem:
 
     @classmethod
     async def add(cls, server: Server, nodeset: Path, index: int) -> VisionSystem:
-        """Import the NodeSet, add `VisionSystem` below Objects, and begin in Preoperational."""
+        """Import the NodeSet, add `VisionSystem` below Objects, and start in Preoperational."""
         await server.import_xml(nodeset)
         await server.load_data_type_definitions()
         vision_index = await server.get_namespace_index(VISION_URI)
@@ -75,11 +75,11 @@ class VisionSystem:
         return vision
 
     def node(self, number: int) -> ua.NodeId:
-        """Name a node of the companion specification."""
+        """Form the id of a node of the companion specification."""
         return ua.NodeId(number, self.vision_index)
 
     async def find(self, path: tuple[str, ...]) -> Node:
-        """Find a node below the system by names of the companion specification (`0:` ones of the base)."""
+        """Find a node below the system by names of the companion specification (`0:` for base names)."""
         names = [name if ":" in name else f"{self.vision_index}:{name}" for name in path]
         return await self.system.get_child(names)
 
@@ -90,11 +90,11 @@ class VisionSystem:
         await answer_method(self.server, node, role, handler)
 
     async def step(self, method: str) -> Failed | None:
-        """Step by a client's method, tell it by an event; return Failed where the mode doesn't allow it."""
+        """Apply a client's method and emit the event; return Failed if the mode doesn't allow it."""
         return await self._take(step_by_method(self.mode, method), f"{method} by {caller().name}")
 
     async def step_itself(self, cause: str) -> Failed | None:
-        """Step by what happens inside."""
+        """Apply an internal cause and emit the event."""
         return await self._take(step_by_itself(self.mode, cause), cause)
 
     async def _take(self, step: Step | Failed, cause: str) -> Failed | None:
@@ -126,7 +126,7 @@ class VisionSystem:
         return stepped
 
     async def _learn(self) -> None:
-        """Learn node ids of states and transitions from the types, and add optional nodes that lack."""
+        """Read the node ids of states and transitions from the types, and add missing optional nodes."""
         for number in (_MACHINE, _AUTOMATIC):
             for child in await self.server.get_node(self.node(number)).get_children():
                 name = (await child.read_browse_name()).Name
@@ -176,9 +176,9 @@ class VisionSystem:
 
 
 async def _register_ids(server: Server, vision_index: int) -> None:
-    """Register the ids that add no field to their base.
+    """Register the ids of types that add no field to their base type.
 
-    asyncua takes them for the base itself, whose encoding is another's.
+    asyncua takes them for the base type itself, whose encoding has another id.
     """
     for name, number in _BARE_IDS.items():
         kind = server.get_node(ua.NodeId(number, vision_index))
@@ -190,16 +190,16 @@ async def _register_ids(server: Server, vision_index: int) -> None:
 
 
 def int32(value: int) -> ua.Variant:
-    """Make the Int32 that the specification's methods end with: 0 for success."""
+    """Make the Int32 with which the specification's methods end: 0 for success."""
     return ua.Variant(value, ua.VariantType.Int32)
 
 
 def refusal(failed: Failed | None) -> ua.StatusCode | None:
-    """Answer a method that the state machine doesn't allow now."""
+    """Return the status code for a method that the state machine doesn't currently allow."""
     return None if failed is None else ua.StatusCode(ua.StatusCodes.BadInvalidState)
 
 
 def _name_of(mode: VisionMode, step: Step) -> str:
-    """Name the state that a transition leaves or enters: of the machine that has the transition."""
+    """Name the state that a transition leaves or enters, in the state machine that has the transition."""
     is_automatic = any(step.transition.startswith(f"{name}To") for name in AUTOMATIC_STATES)
     return mode.automatic or mode.main if is_automatic else mode.main

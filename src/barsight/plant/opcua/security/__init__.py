@@ -1,1 +1,1 @@
-"""Bind asyncua: its settings, certificates, users and roles."""
+"""Connect asyncua: its settings, certificates, users and roles."""

@@ -1,4 +1,4 @@
-"""Let clients in by certificate and password, and hold each call to its user's role."""
+"""Authenticate clients by certificate and password, and restrict each call to its user's role."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ with extra("opcua"):
 
 @dataclass(frozen=True)
 class OpcUaUser:
-    """A user: role, salt and scrypt digest of the password (hex)."""
+    """A user: role, and salt and scrypt digest of the password (hex)."""
 
     role: str
     salt: str
@@ -43,7 +43,7 @@ class OpcUaUser:
 
 @dataclass
 class RoleUser(User):  # type: ignore[misc]
-    """asyncua's user, with the role in Barsight."""
+    """An asyncua user with a Barsight role."""
 
     plant_role: str = "viewer"
 
@@ -52,17 +52,17 @@ _CALLER: contextvars.ContextVar[RoleUser] = contextvars.ContextVar("opcua_caller
 
 
 def caller() -> RoleUser:
-    """Tell who calls the method that runs."""
+    """Return the caller of the method that is running."""
     return _CALLER.get(RoleUser(UserRole.Anonymous, "nobody"))
 
 
 def has_role(role: str) -> bool:
-    """Tell that the caller of the method that runs has at least `role`."""
+    """Return True if the caller of the running method has at least `role`."""
     return OPCUA_ROLES.index(caller().plant_role) >= OPCUA_ROLES.index(role)
 
 
 def read_users(path: Path | None) -> dict[str, OpcUaUser]:
-    """Read users.json. Raises InputError where it isn't what `add_user` writes."""
+    """Read users.json. Raises InputError if it wasn't written by `add_user`."""
     if path is None or not path.exists():
         return {}
     try:
@@ -78,7 +78,7 @@ def read_users(path: Path | None) -> dict[str, OpcUaUser]:
 
 
 def add_user(path: Path, name: str, role: str, password: str) -> None:
-    """Add a user to users.json, or give one that is there another role and password. Raises ConfigError."""
+    """Add a user to users.json, or change role and password of an existing one. Raises ConfigError."""
     expect_password(password)
     if role not in OPCUA_ROLES or not is_account_name(name):
         raise ConfigError(f"{name!r}: a name has letters and digits, and the role is one of {OPCUA_ROLES}")
@@ -91,7 +91,7 @@ def add_user(path: Path, name: str, role: str, password: str) -> None:
 
 
 class PasswordUsers:
-    """Judge names and passwords, for asyncua."""
+    """Check user names and passwords for asyncua."""
 
     def __init__(self, users: Mapping[str, OpcUaUser], allow_anonymous: bool) -> None:
         self._users = users
@@ -100,7 +100,7 @@ class PasswordUsers:
     def get_user(
         self, iserver: Any, username: str | None = None, password: str | None = None, certificate: Any = None
     ) -> RoleUser | None:
-        """Return the user, or None for one that is refused."""
+        """Return the user, or None if the login is refused."""
         if username is None:
             return RoleUser(UserRole.User, "anonymous") if self._allow_anonymous else None
         known = self._users.get(username)
@@ -112,21 +112,21 @@ class PasswordUsers:
 
 
 class PlantSession(InternalSession):  # type: ignore[misc]
-    """A client's session: its certificate is that of its channel, and its methods know who calls.
+    """A client's session, bound to its channel's certificate; its methods know their caller.
 
-    asyncua judges the certificate that CreateSession carries, and takes the signature of the channel's: here
-    they must be one and the same, or a client could show another's.
+    asyncua validates the certificate in CreateSession, but verifies the signature with that of the channel.
+    Here both must be the same; otherwise a client could present someone else's certificate.
     """
 
     shown: bytes | None = None
 
     async def create_session(self, params: Any, sockname: Any = None) -> Any:
-        """Keep the certificate that the client shows."""
+        """Keep the certificate that the client presents."""
         self.shown = params.ClientCertificate or None
         return await super().create_session(params, sockname)
 
     def activate_session(self, params: Any, peer_certificate: bytes | None) -> Any:
-        """Refuse a channel without certificate, and one whose certificate isn't the judged one."""
+        """Refuse a channel without a certificate, or with one other than the validated certificate."""
         if not peer_certificate and not self.iserver.allow_unsecured:
             raise ServiceError(ua.StatusCodes.BadSecurityModeRejected)
         if peer_certificate and peer_certificate != self.shown:
@@ -143,7 +143,7 @@ class PlantSession(InternalSession):  # type: ignore[misc]
 
 
 class BoundedServer(InternalServer):  # type: ignore[misc]
-    """asyncua's inner server with bounds: of clients, subscriptions, queues and how long they last."""
+    """asyncua's internal server with limits on clients, subscriptions, queues and their lifetime."""
 
     def __init__(self, settings: OpcUaSettings, users: PasswordUsers) -> None:
         self.allow_unsecured = settings.allow_unsecured
@@ -168,7 +168,7 @@ class BoundedServer(InternalServer):  # type: ignore[misc]
         self.certificate_validator = judge
 
     def create_session(self, name: str, user: Any = None, external: bool = False) -> PlantSession:
-        """Create a session of a client."""
+        """Create a client's session."""
         return PlantSession(
             self, self.aspace, self.subscription_service, name, user=user or RoleUser(UserRole.Anonymous),
             external=external,
@@ -176,4 +176,4 @@ class BoundedServer(InternalServer):  # type: ignore[misc]
 
 
 class PlantRules(SimpleRoleRuleset):  # type: ignore[misc]
-    """Services that a client may use: everything but changes of the address space."""
+    """Services that a client may use: all except those that change the address space."""

@@ -1,4 +1,4 @@
-"""Bind the package asyncua, which the extra `opcua` installs: the one file that imports it."""
+"""Import the package asyncua, which the extra `opcua` installs; no other file imports it."""
 
 from __future__ import annotations
 

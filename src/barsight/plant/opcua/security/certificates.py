@@ -1,4 +1,4 @@
-"""Make the server's own certificate, and judge those of clients by the trust list."""
+"""Make the server's own certificate, and check client certificates against the trust list."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ class OwnCertificate:
 
 
 def own_certificate(folder: Path, uri: str, host: str) -> OwnCertificate:
-    """Find the server's certificate in `folder`, or make one that it signs itself.
+    """Find the server's certificate in `folder`, or make a self-signed one.
 
-    uri: the application's URI, which the certificate carries. The key's file is readable by its owner only.
-    Makes `trusted/` and `revoked/` too. Raises InputError where only one of both files is there.
+    uri: application URI, which the certificate contains. The key file is readable by its owner only. Also
+    creates `trusted/` and `revoked/`. Raises InputError if only one of the two files exists.
     """
     for name in ("", "trusted", "revoked"):
         (folder / name).mkdir(parents=True, exist_ok=True)
@@ -61,7 +61,7 @@ def own_certificate(folder: Path, uri: str, host: str) -> OwnCertificate:
 
 
 def make_certificate(uri: str, name: str, hosts: list[str], days: float = _DAYS) -> tuple[bytes, bytes]:
-    """Make a certificate of an OPC UA application that signs itself; return it (DER) and its key (PEM)."""
+    """Make a self-signed certificate of an OPC UA application; return it (DER) and its key (PEM)."""
     key = rsa.generate_private_key(public_exponent=65537, key_size=MIN_KEY_BITS)
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
     now = datetime.datetime.now(datetime.UTC)
@@ -95,10 +95,10 @@ def make_certificate(uri: str, name: str, hosts: list[str], days: float = _DAYS)
 
 
 def judge_certificate(folder: Path, certificate: x509.Certificate, uri: str | None) -> str | None:
-    """Judge a client's certificate by the trust list; return the status code's name where it is refused.
+    """Check a client's certificate against the trust list; return the status code's name if it is refused.
 
-    Trusted is what lies in `trusted/` (DER or PEM) or was issued by an authority there, and isn't on a CRL in
-    `revoked/`. Both are read at each connection, so that nothing has to be restarted.
+    A certificate is trusted if it is in `trusted/` (DER or PEM) or was issued by an authority there, and
+    isn't on a CRL in `revoked/`. Both are read at each connection, so changes need no restart.
     """
     now = datetime.datetime.now(datetime.UTC)
     if not certificate.not_valid_before_utc <= now <= certificate.not_valid_after_utc:
@@ -143,7 +143,7 @@ def _issued(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
 def _read_all(
     folder: Path, der: Callable[[bytes], _Parsed], pem: Callable[[bytes], _Parsed]
 ) -> list[_Parsed]:
-    """Read what can be read of a folder: a file that is no certificate trusts and revokes nothing."""
+    """Read all parsable files of a folder; a file that is no certificate or CRL has no effect."""
     read: list[_Parsed] = []
     for path in sorted(folder.glob("*")):
         if path.suffix not in (".der", ".pem", ".crl", ".crt", ".cer") or not path.is_file():
