@@ -1,1 +1,1 @@
-"""Measuring while the crane travels: capture, track and map are processes under a supervisor."""
+"""Measure while the crane travels: capture, tracking and mapping are processes under a supervisor."""

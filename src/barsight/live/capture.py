@@ -22,7 +22,7 @@ POLL_S = 0.002
 
 
 def capture(link: Link) -> None:
-    """Capture until the source ends or the supervisor says so."""
+    """Capture until the source ends or the supervisor stops it."""
     board = link.open_counters()
 
     def may_go_on() -> bool:
@@ -45,7 +45,7 @@ def capture(link: Link) -> None:
             recording, ReplayClock(began_ns, first_ns, link.source.speed), may_go_on
         )
     else:
-        # Not before: what comes while nobody reads would be lost.
+        # Not earlier: data arriving while nobody reads would be lost.
         source = open_crane(link.source.crane, link.open_recording().rig, link.source.epoch_ns, may_go_on)
     board["capture", "interval_ns"] = source.interval_ns
     Capture(link, board, link.open_ring()).run(source)
@@ -55,27 +55,27 @@ def capture(link: Link) -> None:
 def open_crane(
     crane: CraneConfig, rig: StereoRig, epoch_ns: int, may_go_on: Callable[[], bool]
 ) -> CraneSource:
-    """Open the sensors of crane.toml. Raises ConfigError where a port or a library is missing."""
+    """Open the sensors of crane.toml. Raises ConfigError if a port or a library is missing."""
     cameras = both_cameras(crane.cameras, (rig.cam0.width, rig.cam0.height))
     receivers = {name: ReadingReceiver(name, one) for name, one in crane.sensors().items()}
     return CraneSource(cameras, receivers, crane.cameras.rate_hz, epoch_ns, may_go_on)
 
 
 class Capture:
-    """Takes what a source gives, and counts it."""
+    """Accepts the packets of a source, and counts them."""
 
     def __init__(self, link: Link, board: Counters, ring: PairRing) -> None:
         self._board, self._ring, self._speed = board, ring, link.source.speed
         self._readings = {sensor: link.readings(sensor) for sensor in ("imu", "crane")}
         tolerance_ns = seconds_to_ns(link.settings.recording.pair_tolerance_s)
-        if half_ns := board["capture", "interval_ns"] // 2:  # further apart they can be neighbours'
+        if half_ns := board["capture", "interval_ns"] // 2:  # beyond it, a neighbouring pair's
             tolerance_ns = min(tolerance_ns, half_ns)
         self._pairs = PairFormer(tolerance_ns)
         self._lost = [board["capture", f"unpaired_cam{camera}"] for camera in (0, 1)]
         self._contradicted = board["capture", "trigger"]
 
     def run(self, source: Source) -> None:
-        """Take packets until there are no more."""
+        """Process packets until there are no more."""
         after = {f"cam{camera}": self._board["capture", f"last_cam{camera}_ns"] for camera in (0, 1)}
         for sensor, log in self._readings.items():
             stamps, _ = log.last(1)
@@ -94,7 +94,7 @@ class Capture:
         self._count_lost()
 
     def _take(self, picture: LivePicture) -> None:
-        """Note the camera's last picture, and write the pair that a picture completes."""
+        """Note the camera's last picture, and write the pair if the picture completes one."""
         board, camera = self._board, f"cam{picture.camera}"
         board["capture", f"last_{camera}_ns"] = picture.stamp_ns
         board.add("capture", f"pictures_{camera}")
@@ -106,7 +106,7 @@ class Capture:
         self._count_lost()
 
     def _wait_for_reader(self) -> None:
-        """Wait until the last pair was taken: as fast as possible, none may be lost."""
+        """Wait until the last pair has been read: at full speed, none may be lost."""
         board, newest = self._board, self._ring.newest
         while board["track", "taken"] < newest and not board["supervisor", "stop"]:
             board.beat("capture")

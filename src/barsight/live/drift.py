@@ -1,4 +1,4 @@
-"""Watch the calibration in service: what each survey's rows say of the right camera, and how that grows."""
+"""Monitor the calibration in service: the right camera's drift from each survey's rows, and its trend."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ DAY_NS = 86400 * NS_PER_S
 
 
 def note_drift(recording: Recording, path: Path) -> str:
-    """Append what a survey's rows say to drift.csv; return why nothing could be said, empty where it was."""
+    """Append a survey's drift to drift.csv; return why there is none, or an empty string."""
     found = measure_row_drift(recording, Rectifier(recording.rig), FRAMES)
     if isinstance(found, Failed):
         return found.reason
@@ -36,7 +36,7 @@ def note_drift(recording: Recording, path: Path) -> str:
 
 
 def drift_figures(path: Path) -> dict[str, float]:
-    """Read the last survey's drift and, of `MIN_SURVEYS` or more, how much it grows a day; empty without."""
+    """Read the last survey's drift and, from `MIN_SURVEYS` on, its growth per day; empty without surveys."""
     known = _read(path)
     figures: dict[str, float] = {}
     for k, name in enumerate(NAMES if len(known) else ()):
@@ -47,14 +47,14 @@ def drift_figures(path: Path) -> dict[str, float]:
 
 
 def _read(path: Path) -> Float64:
-    """Read the last surveys of drift.csv, a row each, stamps in days; a torn last line isn't there."""
+    """Read the last surveys of drift.csv, one per row, stamps in days; an incomplete last line is ignored."""
     lines = path.read_text(encoding="ascii").split("\n")[1:-1] if path.is_file() else []
     rows = [line.split(",") for line in lines[-TREND_SURVEYS:] if line.count(",") == HEAD.count(",")]
     return np.array([(int(row[0]) / DAY_NS, *map(float, row[1:])) for row in rows]).reshape(len(rows), 7)
 
 
 def _slope(days: Float64, values: Float64) -> float:
-    """Compute the median slope over all pairs (Theil and Sen's), which single surveys don't move."""
+    """Compute the median slope over all pairs (Theil-Sen), which is robust to single surveys."""
     first, second = np.triu_indices(len(days), 1)
     apart = days[second] - days[first]
     slopes = (values[second] - values[first])[apart > 0] / apart[apart > 0]

@@ -1,4 +1,4 @@
-"""Sum up a run: how long poses, tiles and lifts took from the exposure, and where frames were lost."""
+"""Summarize a run: latencies of poses, tiles and lifts from the exposure, and where frames were lost."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ LOST = (
     "unpaired_cam0", "unpaired_cam1", "torn", "capture_down", "incomplete", "missed", "backpressure", "late",
     "clock", "trigger",
 )  # fmt: skip
-"""Causes that capture counts pictures by: no partner; damaged; due while capture was down; packets missing;
-all packets missing; the host too slow; out of order; while a camera's clock settles; a trigger's number that
-contradicts the stamps.
+"""Causes by which capture counts lost pictures: no partner; damaged; due while capture was down; packets
+missing; all packets missing; the host too slow; out of order; while a camera's clock settles; a trigger
+number that contradicts the stamps.
 """
 
 
 def latencies(link: Link, board: Counters, lifts_s: float | None) -> dict[str, Any]:
-    """Build the content of latency.json. lifts_s: from the last frame's exposure to the lifts, if they came.
+    """Build the content of latency.json. lifts_s: from the last frame's exposure to the lifts, if any.
 
-    A pose counts from the time that it is of to where it is written (as fast as possible none counts), a pair
-    from its exposure to its pose by pictures, a tile from its keyframe's exposure to where the keyframe is
-    fused; keyframes that only the end fused have none.
+    Latency of a pose: from its stamp until it is written (none at full speed); of a pair: from its exposure
+    to its pose from pictures; of a tile: from its keyframe's exposure until the keyframe is fused, without
+    those that are fused only at the end.
     """
     poses = [late for _, late in link.outputs().read()]
     pairs = [done - exposed for _, exposed, done, _, has_pose in link.frames().read() if has_pose]
@@ -43,7 +43,7 @@ def latencies(link: Link, board: Counters, lifts_s: float | None) -> dict[str, A
 
 
 def spread(seconds: Sequence[float]) -> dict[str, Any]:
-    """Count and sum up durations: n, p50, p99, max; null where there are none."""
+    """Count and summarize durations: n, p50, p99, max; null without durations."""
     if not seconds:
         return {"n": 0, "p50": None, "p99": None, "max": None}
     low, high = np.percentile(seconds, (50, 99)).tolist()
@@ -51,9 +51,9 @@ def spread(seconds: Sequence[float]) -> dict[str, Any]:
 
 
 def counts(board: Counters) -> dict[str, Any]:
-    """Count frames on their way, and those lost by cause. captured: pairs, and pictures without a partner.
+    """Count frames by stage, and those lost by cause. captured: pairs, and pictures without a partner.
 
-    Pictures that were torn, or due while capture was down, count one by one.
+    Pictures that were damaged, or due while capture was down, are counted individually.
     """
     capture, track, built = (board.row(role) for role in ("capture", "track", "map"))
     dropped = {cause: capture[cause] for cause in LOST}

@@ -1,4 +1,4 @@
-"""Tell a process of the run what it needs: settings, files and shared memory."""
+"""Hand a process of the run what it needs: settings, files and shared memory."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from barsight.yard_frame import in_yard
 class LiveInput:
     """A recording to replay, or a crane's own sensors.
 
-    speed: recorded seconds a second; 0: as fast as possible. crane: the sensors of crane.toml; then
-    `recording` is the folder that the run records into. epoch_ns: what stamps are ahead of the monotonic
-    clock there. surveys: the run ends as the crane stops.
+    speed: recorded seconds per second; 0: as fast as possible. crane: the sensors of crane.toml; `recording`
+    is then the folder that the run records into. epoch_ns: offset of the stamps from the monotonic clock
+    there. surveys: the run ends when the crane stops.
     """
 
     recording: Path
@@ -42,10 +42,10 @@ class LiveInput:
 
 @dataclass(frozen=True)
 class Link:
-    """Share a run's settings, files and memory among its processes.
+    """Settings, files and memory of a run that its processes share.
 
     checkpoints: the folder in `folder` for pictures and disparities. ring, counters: names of the shared
-    memory. keyframes: stamps of the only pairs to keep, None where the run chooses.
+    memory. keyframes: stamps of the only pairs to keep, None if the run chooses them.
     """
 
     source: LiveInput
@@ -58,7 +58,7 @@ class Link:
     keyframes: tuple[int, ...] | None
 
     def open_recording(self) -> Recording:
-        """Open the recording that is replayed, or of a crane what is known beforehand."""
+        """Open the recording that is replayed; at a crane, what is known about it beforehand."""
         crane = self.source.crane
         return self.open_replayed() if crane is None else crane.awaited(self.source.recording)
 
@@ -67,7 +67,7 @@ class Link:
         return open_recording(self.source.recording, self.settings.recording)
 
     def sensors(self, recording: Recording) -> set[str]:
-        """Tell which of `imu` and `crane` the recording has and may be used."""
+        """Name those of `imu` and `crane` that the recording has and that may be used."""
         have = {"imu": recording.imu, "crane": recording.crane}
         return {sensor for sensor, read in have.items() if sensor in self.settings.use and read() is not None}
 
@@ -85,11 +85,11 @@ class Link:
         return ReadingLog(self.folder / f"{sensor}.log", {"imu": 6, "crane": 3}[sensor])
 
     def states(self) -> ReadingLog:
-        """Open the log of the states that poses are propagated from (IMU's clock)."""
+        """Open the log of the states from which poses are propagated (IMU clock)."""
         return ReadingLog(self.folder / "states.log", ROW_NUMBERS)
 
     def outputs(self) -> NumberLog:
-        """Open the log of the poses written: stamp, and how long after it (ns)."""
+        """Open the log of the poses written: stamp, and delay after it (ns)."""
         return NumberLog(self.folder / "outputs.log")
 
     def frames(self) -> NumberLog:
@@ -97,17 +97,17 @@ class Link:
         return NumberLog(self.folder / "frames.log")
 
     def tiles(self) -> NumberLog:
-        """Open the log of mapped frames: stamp, exposure and end (ns, monotonic)."""
+        """Open the log of mapped frames: stamp, exposure and completion (ns, monotonic)."""
         return NumberLog(self.folder / "tiles.log")
 
     def raw_file(self, stamp_ns: int) -> Path:
-        """Return the file of a kept pair's pictures as they came, until they are recorded."""
+        """Return the file of a kept pair's raw pictures, which exists until they are recorded."""
         return self.folder / f"raw_{stamp_ns}.npy"
 
 
 @dataclass(frozen=True, eq=False)
 class KeptRecording(RecordingProxy):
-    """`whole` as if it had no pairs but those of `stamps_ns`, which may grow."""
+    """View of `whole` with only the pairs of `stamps_ns`, which may grow."""
 
     stamps_ns: list[int]
 
@@ -122,7 +122,7 @@ class KeptRecording(RecordingProxy):
 
 @dataclass(frozen=True, eq=False)
 class GrowingRecording(KeptRecording):
-    """A `KeptRecording` with those readings only that have come so far; `grow` takes in what came since."""
+    """A `KeptRecording` with only the readings received so far; `grow` adds those received since."""
 
     link: Link
 
@@ -133,7 +133,7 @@ class GrowingRecording(KeptRecording):
         return self._held.crane()
 
     def grow(self) -> None:
-        """Take in the readings that came since the last call."""
+        """Add the readings received since the last call."""
         stamps, values = self._logs["imu"].read()
         self._held.add(ImuSamples(stamps, values[:, :3], values[:, 3:]))
         stamps, values = self._logs["crane"].read()
@@ -141,12 +141,12 @@ class GrowingRecording(KeptRecording):
             self._held.add(replace(self._mounted, stamp_ns=stamps, position_m=values))
 
     def in_use(self) -> Recording:
-        """View it with the sensors in use, in the yard."""
+        """Return a view with the sensors in use, in the yard frame."""
         use, yard = self.link.settings.use, self.link.settings.yard
         return in_yard(SelectedSensors(self, use), yard, SelectedSensors(self.whole, use))
 
     def last_readings_ns(self) -> dict[str, int]:
-        """Return the stamp of the last reading of each sensor that gave any."""
+        """Return the stamp of the last reading of each sensor that has provided any."""
         use = self.link.settings.use
         return {sensor: last for sensor in use for last in self._held.last_readings_ns((sensor,))}
 

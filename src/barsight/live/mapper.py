@@ -1,4 +1,4 @@
-"""Run the map process: keyframes from the queue on disk, matched and fused while more come."""
+"""Run the map process: match and fuse keyframes from the queue on disk while more arrive."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ from barsight.yard_frame import placing_id
 
 POLL_S = 0.02
 AHEAD = 12
-"""Keyframes that are matched beside what else is done, the one whose turn it is among them: two chains."""
+"""Number of keyframes matched in the background, including the next one to be fused: two chains."""
 SHOW_EVERY_S = 5.0
-"""The heights so far are written at most this often: keyframes go first."""
+"""Shortest interval in seconds between writings of the heights so far: keyframes have priority."""
 TIDIED_EVERY = 8
-"""Keyframes between which freed memory may pile up."""
+"""Number of keyframes after which freed memory is returned to the system."""
 GRACE_NS = NS_PER_S
-"""A keyframe waits for readings until one so much later is there."""
+"""Margin in ns: a keyframe waits for readings until one that is this much later has arrived."""
 DELAY_NS = seconds_to_ns(SENSOR_DELAY_S)
 NICENESS = 10
-"""Poses go before maps, where cores are few."""
+"""Nice value of the process: poses have priority over maps if cores are scarce."""
 LIVE_MAP = "live_height.tif"
 
 
 def build_live_map(link: Link) -> None:
-    """Map keyframes until the supervisor says so, then those that are left where the map is final."""
+    """Map keyframes until the supervisor stops this, then the remaining ones if the map is final."""
     os.nice(NICENESS)
     board = link.open_counters()
     load_kernels("measure")
@@ -74,9 +74,9 @@ def build_live_map(link: Link) -> None:
 
 
 class Mapping:
-    """A `LiveMap` of the keyframes so far. queue: stamps of those that wait. beat: called as work goes on.
+    """A `LiveMap` of the keyframes so far. queue: stamps of those waiting. beat: called as work progresses.
 
-    A process begun anew fuses all again: their disparities are there.
+    A restarted process fuses all keyframes again; their disparities are stored.
     """
 
     def __init__(self, link: Link, recording: GrowingRecording, beat: Callable[[], None]) -> None:
@@ -93,9 +93,9 @@ class Mapping:
         self._map: LiveMap | None = None
 
     def read_queue(self) -> int:
-        """Read what was kept since; return how many keyframes wait."""
+        """Read the keyframes kept since the last call; return how many are waiting."""
         frames = self._frames.read()
-        self._recording.grow()  # after the frames: what was there for them is here too
+        self._recording.grow()  # after the frames, so that all readings they had are here too
         for stamp, exposed_ns, _, is_kept, _ in frames:
             if is_kept:
                 self._recording.stamps_ns.append(stamp)
@@ -104,8 +104,9 @@ class Mapping:
         return len(self.queue)
 
     def is_due(self, *, ended: bool) -> bool:
-        """Tell whether the keyframe that waits longest has all the readings that place it, or won't get more:
-        later frames are there, or capture has ended.
+        """Return True if the oldest waiting keyframe has all readings needed to place it, or won't get more.
+
+        It gets no more once later frames have arrived or capture has ended.
         """
         if not self.queue:
             return False
@@ -117,10 +118,11 @@ class Mapping:
         return all(last.get(sensor, 0) >= due_ns for sensor in sensors)
 
     def add_next(self) -> int:
-        """Place and fuse the keyframe that waits longest, while those after it are matched; return how many
-        are in the map.
+        """Place and fuse the oldest waiting keyframe, while those after it are matched.
+
+        Returns how many keyframes are in the map.
         """
-        # Where not all pairs are matched, only the place of each tells which are.
+        # If not all pairs are matched, each pair must be placed first to know which are.
         if self._link.settings.map.min_shift == 0:
             self._match.begin(self.queue[:AHEAD])
         stamp = self.queue.pop(0)
@@ -151,7 +153,7 @@ class Mapping:
         return True
 
     def end(self) -> None:
-        """Leave trajectory and map for what measures what was kept; where that can't be, it says why."""
+        """Save trajectory and map for the final measurement; if that isn't possible, log why."""
         if self._map is not None and self.is_final:
             with contextlib.suppress(BarsightError):
                 self._map.end()
@@ -159,7 +161,7 @@ class Mapping:
         self._match.close()
 
     def _begun(self) -> LiveMap:
-        """Begin with the poses that track has found, as far as it had the same pairs and readings."""
+        """Begin with the poses that tracking has found, as far as it had the same pairs and readings."""
         link = self._link
         estimator = make_estimator(replace(link.settings.motion, estimator="live"))
         placer = PairPlacer(self._pairs, estimator, link.checkpoints, beat=self._beat)
@@ -168,7 +170,7 @@ class Mapping:
         )  # fmt: skip
 
     def _tell_fused(self) -> None:
-        """Note when each keyframe came into the map."""
+        """Log when each keyframe was fused into the map."""
         assert self._map is not None
         for stamp in self._map.stamps_ns[::-1]:
             if stamp in self._told:

@@ -1,4 +1,4 @@
-"""Tell what the run can do at the moment, and why no more: the mode, its reasons, and whether lifts hold."""
+"""Judge what the run can currently do: the mode, the reasons for it, and whether lifts are valid."""
 
 from __future__ import annotations
 
@@ -27,26 +27,29 @@ FOR_LIFTS = ("full", "no-imu")
 MIN_CAMERA_SILENCE_S = 0.3
 MAX_CLOCK_STEP_S = 1.0
 JUMP_SIGMAS, MIN_JUMP_M, MAX_CHANGE_MPS2 = 8.0, 0.03, 1.0
-"""A reading further than this from where the crane's speed led, whatever it brakes by, has jumped."""
+"""Thresholds of a jump: sigmas of a reading, least distance (m), and largest acceleration (m/s²) assumed when
+a reading is predicted from the crane's speed.
+"""
 SPEED_READINGS = 6
 JUMP_HELD_S = 1.0
-"""Encoders that came back from a jump are out for so long."""
+"""Time in seconds for which encoders stay excluded after they came back from a jump."""
 AFTER_FREEZE_S = 0.3
 STAMP_SIGMA_S = 0.02
-"""A device's clock is known no better while it is estimated anew."""
+"""Standard deviation (s) of stamps while a device's clock is being estimated anew."""
 HELD_NS, HELD_READINGS = 5 * NS_PER_S, 100
-"""Faults are sought in readings of so much time, and in so many at least."""
+"""Window in which faults are searched: its length in ns, and its minimum number of readings."""
 LOOK_NS = NS_PER_S // 10
-"""Faults are looked for this often by the readings' stamps."""
+"""Interval in ns between searches for faults, by the readings' stamps."""
 
 
 @dataclass(frozen=True)
 class SensorActivity:
-    """Last signs of each sensor: stamps on the cameras' clock, 0 for never.
+    """Last activity of each sensor: stamps on the cameras' clock, 0 for never.
 
-    cameras_ns: of cam0 and cam1. interval_ns: between pictures, at most. readings_ns: of `imu` and `crane`,
-    where the recording has them. frozen: whether the encoders repeat one reading that a moving crane can't.
-    jumped_m: by how much (m) they have jumped, 0 where they haven't. clock_step_s: of the system's clock.
+    cameras_ns: of cam0 and cam1. interval_ns: longest interval between pictures. readings_ns: of `imu` and
+    `crane`, if the recording has them. frozen: whether the encoders repeat one reading although the crane
+    must be moving. jumped_m: by how much (m) they have jumped, otherwise 0. clock_step_s: of the system's
+    clock.
     """
 
     cameras_ns: tuple[int, int]
@@ -59,7 +62,10 @@ class SensorActivity:
 
 @dataclass(frozen=True)
 class Mode:
-    """name: of MODES. reasons: why not `full`, or which process is down. lifts: whether any may stand."""
+    """Mode of a run, and whether its lifts may be valid.
+
+    name: of MODES. reasons: why it isn't `full`, or which process is down.
+    """
 
     name: ModeName
     reasons: tuple[str, ...]
@@ -69,7 +75,7 @@ class Mode:
 def judge_mode(
     heard: SensorActivity, now_ns: int, settings: LiveSettings, down: Mapping[str, str] = MappingProxyType({})
 ) -> Mode:
-    """Judge the mode at a stamp of the cameras' clock. down: processes that don't run, each with why."""
+    """Judge the mode at a stamp of the cameras' clock. down: processes that aren't running, with reasons."""
     reasons = [f"{process} is down: {why}" for process, why in down.items()]
     silent = _silent_cameras(heard, now_ns, settings)
     imu = _silent_sensor("imu", "the IMU", heard, now_ns, settings.imu_silence_s)
@@ -93,7 +99,7 @@ def judge_mode(
 
 
 def _silent_cameras(heard: SensorActivity, now_ns: int, settings: LiveSettings) -> list[str]:
-    """Tell which cameras gave no picture for too long."""
+    """List the cameras that have provided no picture for too long."""
     told = []
     bound_s = max(MIN_CAMERA_SILENCE_S, settings.camera_silence_intervals * heard.interval_ns / NS_PER_S)
     for camera, last_ns in enumerate(heard.cameras_ns):
@@ -105,7 +111,7 @@ def _silent_cameras(heard: SensorActivity, now_ns: int, settings: LiveSettings) 
 
 
 def _silent_sensor(sensor: str, name: str, heard: SensorActivity, now_ns: int, bound_s: float) -> str | None:
-    """Tell why a sensor is out, None if it isn't."""
+    """Return why a sensor is out, None if it isn't."""
     if sensor not in heard.readings_ns:
         return f"{name}: none in use"
     last_ns = heard.readings_ns[sensor]
@@ -119,14 +125,14 @@ def _silence(name: str, silent_ns: int, bound_s: float) -> str:
 
 
 class FreezeWatch:
-    """Tells whether the encoders are frozen now. mounted: gives all but the readings."""
+    """Detects frozen encoders. mounted: provides everything but the readings."""
 
     def __init__(self, mounted: CraneSamples) -> None:
         self._mounted = mounted
         self._since: Float64 | None = None
 
     def check(self, stamp_ns: Int64, position_m: Float64) -> bool:
-        """Look at the newest readings: (N,) and (N, 3), the last few seconds."""
+        """Examine the newest readings, (N,) and (N, 3), of the last few seconds."""
         if len(stamp_ns) == 0:
             return False
         if self._since is not None and (position_m[-1] == self._since).all():
@@ -139,8 +145,9 @@ class FreezeWatch:
 
 
 class JumpWatch:
-    """Tells by how much the encoders have jumped, until they come back. sigma_m: of a reading. after_ns:
-    readings up to this stamp aren't judged.
+    """Detects a jump of the encoders and measures it until they come back.
+
+    sigma_m: standard deviation of a reading. after_ns: readings up to this stamp aren't judged.
     """
 
     def __init__(self, sigma_m: float, after_ns: int = 0) -> None:
@@ -151,7 +158,7 @@ class JumpWatch:
         self._bound_m = 0.0
 
     def check(self, stamp_ns: Int64, position_m: Float64) -> float:
-        """Look at the newest readings, (N,) and (N, 3), the last few seconds; return the jump in m, or 0."""
+        """Examine the newest readings, (N,) and (N, 3), of the last few seconds; return the jump (m) or 0."""
         for k in range(int(np.searchsorted(stamp_ns, self._last_ns, side="right")), len(stamp_ns)):
             if k >= SPEED_READINGS and stamp_ns[k - SPEED_READINGS] > self._from_ns:
                 self._take(stamp_ns[k - SPEED_READINGS : k + 1], position_m[k - SPEED_READINGS : k + 1])
@@ -163,18 +170,18 @@ class JumpWatch:
         return float(np.linalg.norm(self._jump_m)) if held else 0.0
 
     def begin_anew(self) -> None:
-        """Forget the readings so far and those of the next moment: they are frozen."""
+        """Discard the readings so far and those of the next moment, as they are frozen."""
         self._from_ns = self._last_ns + seconds_to_ns(AFTER_FREEZE_S)
 
     def _take(self, stamp_ns: Int64, position_m: Float64) -> None:
-        """Hold the last reading against the speed of those before it."""
+        """Compare the last reading with the one predicted from the speed before it."""
         t = (stamp_ns - stamp_ns[-2]) / NS_PER_S
         place = position_m + (stamp_ns < self._jump_ns)[:, None] * self._jump_m
         off = place[-1] - place[-2] - (place[-2] - place[0]) / -t[0] * t[-1]
         speed = float(np.linalg.norm(place[-2] - place[0])) / -t[0]
         bound_m = self._min_jump_m + STAMP_SIGMA_S * speed + MAX_CHANGE_MPS2 * t[-1] * (t[-1] - t[0])
         if np.linalg.norm(off) > bound_m:
-            # Back means back within the bounds of the jump there and the jump back.
+            # Coming back means within the sum of the bounds of both jumps, there and back.
             is_away = np.linalg.norm(self._off_m) > self._bound_m
             self._off_m, self._bound_m = (
                 (self._off_m + off, self._bound_m + bound_m) if is_away else (off, bound_m)
@@ -183,9 +190,9 @@ class JumpWatch:
 
 
 class EncoderFaults:
-    """Finds freezes and jumps of the encoders, whatever their rate and however late they are looked at.
+    """Detects freezes and jumps of the encoders, whatever their rate and however late they are examined.
 
-    mounted: gives all but the readings.
+    mounted: provides everything but the readings.
     """
 
     def __init__(self, mounted: CraneSamples) -> None:
@@ -194,8 +201,9 @@ class EncoderFaults:
         self._frozen, self._jumped_m = False, 0.0
 
     def take(self, stamp_ns: Int64, position_m: Float64) -> tuple[bool, float]:
-        """Take the readings that came since the last call, (N,) and (N, 3); return whether the encoders are
-        frozen, and by how much (m) they have jumped.
+        """Process the readings received since the last call, (N,) and (N, 3).
+
+        Returns whether the encoders are frozen, and by how much (m) they have jumped.
         """
         if not len(stamp_ns):
             return self._frozen, self._jumped_m

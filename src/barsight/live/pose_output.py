@@ -1,4 +1,4 @@
-"""Run the pose process: write the body's pose at a steady rate, by IMU and encoders between pairs."""
+"""Run the pose process: write the body's pose at a steady rate, between pairs from IMU and encoders."""
 
 from __future__ import annotations
 
@@ -22,16 +22,18 @@ from barsight.recording.sensor_selection import SelectedSensors
 from barsight.yard_frame import crane_in_yard, frame_of, in_yard, shared_covariance
 
 WAIT_S = 0.01
-"""A pose waits so long for the readings at its stamp; what hasn't come then is extrapolated."""
+"""Longest time in seconds that a pose waits for the readings at its stamp; missing ones are extrapolated."""
 POLL_S = 0.001
 BEAT_S = 0.2
-"""While no pose is due the process tells this often that it goes on."""
+"""Longest interval in seconds between the process's heartbeats while no pose is due."""
 BEFORE_STATE_S = 5.0
-"""Readings held from before the oldest state that a pose carries on: they tell the noise of the encoders."""
+"""Time in seconds before the oldest state in use from which readings are kept, to estimate the encoder
+noise.
+"""
 
 
 def output_poses(link: Link) -> None:
-    """Write poses until the supervisor says so."""
+    """Write poses until the supervisor stops this."""
     board = link.open_counters()
     output = PoseOutput(link)
     board["pose", "ready"] = 1
@@ -51,7 +53,7 @@ def output_poses(link: Link) -> None:
 
 
 class PoseOutput:
-    """Writes pose.json and notes in `link.outputs()` how late each was."""
+    """Writes pose.json and logs in `link.outputs()` how late each pose was."""
 
     def __init__(self, link: Link) -> None:
         self._link, whole = link, link.open_recording()
@@ -72,8 +74,9 @@ class PoseOutput:
         self._states, self._outputs = link.states(), link.outputs()
 
     def write(self, now_ns: int | None) -> bool:
-        """Write the pose at a stamp (cameras' clock), as fast as possible that of a new state; return whether
-        there is one that isn't older than `live.max_predicted_s`.
+        """Write the pose at a stamp (cameras' clock); at full speed, that of a new state.
+
+        Returns True if there is a pose that isn't older than `live.max_predicted_s`.
         """
         began = time.monotonic_ns()
         is_new = self._begin_anew()
@@ -87,14 +90,14 @@ class PoseOutput:
             return False
         self._await(stamp_ns, began + int(WAIT_S * NS_PER_S))
         if self._has_encoders and self._trusted_encoders() is None:
-            self._begin()  # they froze or jumped since, and must not hold the pose where it isn't
+            self._begin()  # they have frozen or jumped, and must not tie the pose to a wrong place
         self._take(stamp_ns)
         self._publish(self._propagator.at(stamp_ns))
         self._outputs.append((now_ns, time.monotonic_ns() - began))
         return True
 
     def _begin_anew(self) -> bool:
-        """Begin with the newest state of `track`, if there is a new one."""
+        """Start from the newest state of `track`, if there is a new one."""
         stamps, rows = self._states.last(1)
         if not len(stamps) or int(stamps[0]) == self._state_ns:
             return False
@@ -109,7 +112,7 @@ class PoseOutput:
         return True
 
     def _begin(self) -> None:
-        """Begin with the last state, by the encoders where they can be trusted now."""
+        """Start from the last state, with the encoders if they can be trusted now."""
         for held in (self._imu, self._crane):
             held.taken_ns = self._state_ns
         has_imu, known = "imu" in self._sensors, self._trusted_encoders()
@@ -117,8 +120,8 @@ class PoseOutput:
         self._propagator = Propagator(self._state, self._noise, known, has_imu=has_imu)
 
     def _trusted_encoders(self) -> CraneSamples | None:
-        """Return the encoder readings held; None where there are none in use, they are frozen or they have
-        jumped since the last state or about it.
+        """Return the encoder readings held; None if none are in use, or they are frozen, or they have jumped
+        since the last state or around it.
         """
         held = self._crane.since(0)
         if self._freeze is None or self._freeze.check(*held):
@@ -128,7 +131,7 @@ class PoseOutput:
         return self._placed(*held)
 
     def _await(self, stamp_ns: int, give_up_ns: int) -> None:
-        """Wait for the IMU's reading at a stamp, for a while."""
+        """Wait a limited time for the IMU reading at a stamp."""
         self._imu.grow()
         while "imu" in self._sensors and self._imu.last_ns < stamp_ns and time.monotonic_ns() < give_up_ns:
             time.sleep(POLL_S)
@@ -136,7 +139,7 @@ class PoseOutput:
         self._crane.grow()
 
     def _take(self, stamp_ns: int) -> None:
-        """Give the propagator what each sensor gave since it last took any of it, up to a stamp."""
+        """Pass the propagator each sensor's readings since the last call, up to a stamp."""
         assert self._propagator is not None
         imu, crane = (
             held.take(stamp_ns) if name in self._sensors else held.since(0, 0)
@@ -146,14 +149,14 @@ class PoseOutput:
         self._propagator.take(*imu, crane[0], np.empty((0, 3)) if places is None else places.position_m)
 
     def _placed(self, stamps_ns: Int64, places_m: Float64) -> CraneSamples | None:
-        """Return encoder readings in the surveyed yard; None where there are none."""
+        """Return encoder readings in the surveyed yard; None if there are none."""
         if self._mounted is None or not len(stamps_ns):
             return None
         crane = replace(self._mounted, stamp_ns=stamps_ns, position_m=places_m)
         return crane if self._frame is None else crane_in_yard(crane, self._frame)
 
     def _publish(self, posed: PosedFrame) -> None:
-        """Write the pose for readers, whole or not at all. predicted_s: how long after the last pair."""
+        """Write the pose for readers, atomically. predicted_s: time since the last pair."""
         pose = posed.reference_from_body
         lever_m, covariance = None, posed.covariance
         if pose.target == "yard":
@@ -182,11 +185,11 @@ class HeldReadings:
 
     @property
     def last_ns(self) -> int:
-        """Return the stamp of the last one, 0 before the first."""
+        """Return the stamp of the last reading, 0 if there is none."""
         return int(self._stamps_ns[-1]) if len(self._stamps_ns) else 0
 
     def grow(self) -> None:
-        """Take in what came since the last call."""
+        """Add the readings received since the last call."""
         stamps, values = self._log.read()
         if len(stamps):
             first = int(np.searchsorted(self._stamps_ns, stamps[-1] - self._held_ns))
@@ -194,13 +197,13 @@ class HeldReadings:
             self._values = np.concatenate([self._values[first:], values])
 
     def take(self, until_ns: int) -> tuple[Int64, Float64]:
-        """Take those after the last one taken, up to a stamp."""
+        """Take the readings after the last one taken, up to a stamp."""
         found = self.since(self.taken_ns, until_ns)
         self.taken_ns = max([self.taken_ns, *found[0][-1:].tolist()])
         return found
 
     def since(self, after_ns: int, until_ns: int | None = None) -> tuple[Int64, Float64]:
-        """Return those after a stamp, up to another: (N,) stamps, (N, width) values."""
+        """Return the readings after one stamp, up to another: (N,) stamps, (N, width) values."""
         begin = int(np.searchsorted(self._stamps_ns, after_ns, side="right"))
         end = None if until_ns is None else int(np.searchsorted(self._stamps_ns, until_ns, side="right"))
         return self._stamps_ns[begin:end], self._values[begin:end]

@@ -1,4 +1,4 @@
-"""Run the record process: keyframes, IMU and encoders into segments, the ring around alarms, retention."""
+"""Run the record process: keyframes, IMU and encoders in segments, the ring around alarms, retention."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LOOK_EVERY_S = 0.5
 
 
 def record(link: Link) -> None:
-    """Record until the supervisor says that all else has ended, and what there is then."""
+    """Record until the supervisor reports that everything else has ended, and then what is left."""
     assert link.source.crane is not None
     board = link.open_counters()
     recorder = Recorder(link, board)
@@ -35,7 +35,7 @@ def record(link: Link) -> None:
 
 
 class Recorder:
-    """Moves what came since into the recording; a recorder begun anew goes on after what is written."""
+    """Moves new data into the recording; a restarted recorder continues after what is written."""
 
     def __init__(self, link: Link, board: Counters) -> None:
         assert link.source.crane is not None
@@ -54,7 +54,7 @@ class Recorder:
         self._bytes_before = board["record", "bytes"]
 
     def take(self) -> None:
-        """Record what came since the last call, unless the disk is too full."""
+        """Record the data received since the last call, unless the disk is too full."""
         now = time.monotonic()
         if now >= self._look_at:
             self._look_at = now + LOOK_EVERY_S
@@ -83,7 +83,7 @@ class Recorder:
             self._writer.sync()
 
     def close(self) -> None:
-        """End the segments."""
+        """Close the segments."""
         self._writer.close()
         self._alarms.close()
 
@@ -91,7 +91,7 @@ class Recorder:
         while self._waiting:
             stamp = self._waiting.pop(0)
             file = self._link.raw_file(stamp)
-            if file.is_file():  # else an earlier recorder wrote it
+            if file.is_file():  # otherwise an earlier recorder has written it
                 left, right = np.load(file)
                 if stamp > self._writer.last_pair_ns:
                     self._writer.pair(stamp, left, right)
@@ -99,7 +99,7 @@ class Recorder:
                 file.unlink()
 
     def _take_alarm(self, now: float) -> None:
-        """Save the ring's pairs where an alarm came, and those that follow for a while."""
+        """Save the ring's pairs after an alarm, and those that follow for a while."""
         if (count := self._board["supervisor", "alarms"]) > self._alarm_count:
             self._alarm_count = self._board["record", "alarms"] = count
             self._alarm_until = now + self._after_s

@@ -1,4 +1,4 @@
-"""Run `barsight live`: supervise until the recording or the crane's run ends, then measure what was kept."""
+"""Run `barsight live`: supervise until the recording or the crane's run ends, then measure the pairs kept."""
 
 from __future__ import annotations
 
@@ -48,12 +48,12 @@ from barsight.yard_frame import in_yard
 
 MAX_SPEED = 1000.0
 LATEST = ("pose.json", LIVE_MAP)
-"""Files that hold the latest value while the run lasts."""
+"""Files that hold the latest value during the run."""
 
 
 @dataclass(frozen=True)
 class Keyframes:
-    """Pairs that a run kept (stamps, ns), and the mode that it ended in."""
+    """Pairs that a run kept (stamps, ns), and the mode at its end."""
 
     stamps_ns: tuple[int, ...]
     mode: Mode
@@ -64,10 +64,11 @@ def replay(
     magnet: Path | None = None, judged_at: Literal["now", "end"] = "now", keyframes: Path | None = None,
     tell: Callable[[str], None] = print, advance: ProgressCallback = ignore_progress,
 ) -> dict[str, Any]:  # fmt: skip
-    """Measure a recording as if it came from the crane now, into `out`; return what result.json says.
+    """Measure a recording as if it came from the crane now, into `out`; return the content of result.json.
 
-    speed: recorded seconds a second; 0: as fast as possible, where nothing is lost. keyframes: keyframes.json
-    of an earlier run, to keep just what it kept. tell: takes each line of the log. Raises a BarsightError.
+    speed: recorded seconds per second; 0: as fast as possible, without losses. keyframes: keyframes.json of
+    an earlier run, to keep exactly the pairs it kept. tell: receives each line of the log. Raises a
+    BarsightError.
     """
     given = None if keyframes is None else read_keyframes(keyframes)
     request = LiftRequest(None if magnet is None else load_magnet(magnet), judged_at)
@@ -104,8 +105,9 @@ class LiveRun:
     def measure(
         self, given: Keyframes | None, request: LiftRequest, advance: ProgressCallback
     ) -> dict[str, Any]:
-        """Run until the recording or the survey ends or a signal comes, then measure what was kept; return
-        nothing where the crane only stood.
+        """Run until the recording or the survey ends or a signal arrives, then measure the pairs kept.
+
+        Returns an empty result if the crane only stood.
         """
         compile_ahead(advance, "measure")
         folder = self._out.absolute() / ".live"
@@ -139,7 +141,7 @@ class LiveRun:
             ring.remove()
             board.remove()
             shutil.rmtree(folder, ignore_errors=True)
-            trim_heap()  # the command lives on, survey after survey
+            trim_heap()  # the command continues with the next survey
 
     def _tell_all(self, line: str) -> None:
         with (self._out / "live.log").open("a", encoding="utf-8") as file:
@@ -148,7 +150,7 @@ class LiveRun:
 
 
 def _key(recording: Recording, settings: MeasureSettings) -> str:
-    """Name the checkpoints as measuring what is kept of the recording will."""
+    """Name the checkpoints as the measurement of the pairs kept will name them."""
     empty, chosen = KeptRecording(recording, []), settings.chosen()
     source = in_yard(SelectedSensors(empty, chosen.use), chosen.yard)
     return checkpoint_key(empty, source, chosen, source.digests())
@@ -158,7 +160,7 @@ def _finish(
     supervisor: Supervisor, link: Link, board: Counters, recording: Recording, settings: MeasureSettings,
     request: LiftRequest, advance: ProgressCallback,
 ) -> dict[str, Any]:  # fmt: skip
-    """Measure what was kept, with the poses' and disparities' work that is done already."""
+    """Measure the pairs kept, reusing the poses and disparities computed during the run."""
     state, out = supervisor.state, link.folder.parent
     frames = link.frames().read()
     kept = [stamp for stamp, _, _, is_kept, _ in frames if is_kept]
@@ -192,9 +194,9 @@ def _finish(
 
 
 def _recorded(link: Link, kept: list[int], settings: MeasureSettings) -> tuple[Recording, Link]:
-    """Open what a run at a crane recorded, with the work on it that is done already.
+    """Open the recording of a run at a crane, with the results already computed on it.
 
-    Where the recorder had to stop, the run's own notes take the recording's place.
+    If the recorder had to stop, the run's own logs replace the recording.
     """
     recording: Recording = open_recording(link.source.recording, settings.recording)
     if set(kept) - set(recording.index.stamps_ns):
@@ -210,8 +212,8 @@ def _why_no_lifts(mode: Mode) -> str:
 
 
 def _stopped_by_signals(supervisor: Supervisor) -> contextlib.AbstractContextManager[None]:
-    """Let Ctrl-C and SIGTERM end the run, so that what was kept is measured; a second one ends that too.
-    SIGUSR1 ends the survey.
+    """Let Ctrl-C and SIGTERM end the run, so that the pairs kept are measured; a second one ends that as
+    well. SIGUSR1 ends the survey.
     """
     told = {signal.SIGINT: INTERRUPTED, signal.SIGTERM: INTERRUPTED, signal.SIGUSR1: "told to end the survey"}
     return handled_signals(told, supervisor.stop)
@@ -219,11 +221,11 @@ def _stopped_by_signals(supervisor: Supervisor) -> contextlib.AbstractContextMan
 
 @contextlib.contextmanager
 def ended_afterwards(run: LiveRun) -> Iterator[None]:
-    """Let the first Ctrl-C or SIGTERM of a run wait until what was kept is measured; the next one doesn't."""
+    """Hold back the first Ctrl-C or SIGTERM until the pairs kept are measured; the next one ends the run."""
 
     def note(because: str) -> None:
         run.stop_because = because
-        os.write(2, b"what was kept is measured; a second signal ends that too\n")  # print may be under way
+        os.write(2, b"what was kept is measured; a second signal ends that too\n")  # print may be running
         handled.close()
 
     with contextlib.ExitStack() as handled:
@@ -235,7 +237,7 @@ def ended_afterwards(run: LiveRun) -> Iterator[None]:
 
 @contextlib.contextmanager
 def handled_signals(told: Mapping[signal.Signals, str], take: Callable[[str], object]) -> Iterator[None]:
-    """Let `take` have what is told by each signal; other threads than the main one leave signals alone."""
+    """Call `take` with each signal's text; threads other than the main one leave signals alone."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -264,7 +266,7 @@ def write_keyframes(keyframes: Keyframes, target: Path) -> None:
 
 
 def read_keyframes(path: Path) -> Keyframes:
-    """Read keyframes.json. Raises InputError where it is none."""
+    """Read keyframes.json. Raises InputError if the file isn't one."""
     remedy = "give keyframes.json of a folder that barsight live wrote"
     try:
         content = json.loads(path.read_text(encoding="utf-8"))

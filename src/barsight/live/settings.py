@@ -1,4 +1,4 @@
-"""Settings of `barsight live` beyond those of measuring."""
+"""Settings of `barsight live` in addition to those of measuring."""
 
 from __future__ import annotations
 
@@ -22,30 +22,38 @@ from barsight.sensors.settings import CamerasSettings, EncodersSettings, ImuSett
 
 @dataclass(frozen=True)
 class LiveSettings:
-    """The run beside the crane."""
+    """Settings of a live run at the crane."""
 
     ring_pairs: int = 8
-    """Pairs that the ring in shared memory holds: 2.6 MB each at 1280x1024."""
+    """Number of pairs that the ring in shared memory holds: 2.6 MB each at 1280x1024."""
     keyframe_way_m: float = 0.1
-    """A pair becomes a keyframe, which is kept and mapped, where the body has gone so far since the last."""
+    """Distance in metres that the body must have moved since the last keyframe for a pair to become one,
+    which is kept and mapped.
+    """
     still_pairs: int = 5
-    """So many pairs of a crane that stands are kept too, `passed_every_s` apart: they fix where it begins."""
+    """Number of pairs kept while the crane stands, `passed_every_s` apart: they fix its starting position."""
     passed_every_s: float = 0.2
-    """Of pairs that tracking passes over for a newer one, those so far apart are kept without a pose."""
+    """Shortest interval in seconds between pairs that are kept without a pose, of those that tracking
+    skips.
+    """
     imu_silence_s: float = 0.2
-    """An IMU without readings for so long is out."""
+    """Time in seconds without readings after which the IMU is considered out."""
     encoder_silence_s: float = 0.3
-    """Encoders without readings for so long are out."""
+    """Time in seconds without readings after which the encoders are considered out."""
     camera_silence_intervals: float = 2.5
-    """A camera without pictures for so many of its intervals, at least 0.3 s, is out."""
+    """Time without pictures after which a camera is considered out, in picture intervals, but at least 0.3
+    s.
+    """
     hang_s: float = 30.0
-    """A process that hasn't gone round its loop for so long hangs: it is ended and started anew."""
+    """Time in seconds without a heartbeat after which a process is considered hung and is restarted."""
     pose_rate_hz: float = 30.0
-    """Poses that are written a second."""
+    """Rate in poses per second at which poses are written."""
     max_predicted_s: float = 2.0
-    """IMU and encoders carry the last pair's pose on for so long; then no pose is written."""
+    """Longest time in seconds that IMU and encoders extend the last pair's pose; after that no pose is
+    written.
+    """
     health_every_s: float = 1.0
-    """Interval between writings of health.json and health.prom."""
+    """Interval in seconds between updates of health.json and health.prom."""
 
     def __post_init__(self) -> None:
         expect_values(self, "live.")
@@ -62,15 +70,17 @@ class RecorderSettings:
     """Settings of the recorder at a crane, for keyframes, IMU and encoders, and the ring around alarms."""
 
     folder: Path | None = None
-    """Folder of the recordings, a folder in it for each run; one in the output where it isn't given."""
+    """Folder of the recordings, with a subfolder for each run; without it, one in the output folder."""
     max_used_ratio: float = 0.85
-    """From so full a disk on the oldest unprotected segments of earlier recordings are deleted."""
+    """Share of the disk in use above which the oldest unprotected segments of earlier recordings are
+    deleted.
+    """
     stop_used_ratio: float = 0.95
-    """From so full a disk on nothing is recorded; measuring goes on."""
+    """Share of the disk in use above which nothing is recorded; measuring continues."""
     segment_mib: int = 256
-    """Size of a segment."""
+    """Size of a segment in MiB."""
     alarm_after_s: float = 1.0
-    """After an alarm all pairs are saved for so long, besides those that the ring holds."""
+    """Time in seconds after an alarm for which all pairs are saved, in addition to those in the ring."""
 
     def __post_init__(self) -> None:
         expect_values(self, "recorder.")
@@ -87,15 +97,15 @@ class SurveySettings:
     """Settings of when a survey begins and ends at a crane."""
 
     way_m: float = 0.5
-    """With `--surveys` one has begun when the crane has gone so far."""
+    """Distance in metres that the crane must travel for a survey to have begun, with `--surveys`."""
     stop_s: float = 5.0
-    """It ends when the crane then stands for so long."""
+    """Standstill in seconds after which a survey that has begun ends."""
     rest_s: float = 600.0
-    """While the crane stands what was recorded is dropped this often, and the run begins anew."""
+    """Interval in seconds at which a run is restarted, and its recording dropped, while the crane stands."""
     max_s: float = 3600.0
-    """A survey ends after so long whatever the crane does: disk and memory are bounded by it."""
+    """Longest duration of a survey in seconds, whatever the crane does; it bounds disk and memory use."""
     keep: int = 200
-    """So many surveys' folders are kept: the oldest go, but for those with a file `PROTECTED`."""
+    """Number of survey folders kept; the oldest are deleted, except those with a file `PROTECTED`."""
 
     def __post_init__(self) -> None:
         expect_values(self, "survey.")
@@ -110,7 +120,7 @@ class CraneConfig:
     """A crane as crane.toml describes it."""
 
     calibration: Path
-    """Rig file of the two cameras: ours, Kalibr's, OpenCV's or an EuRoC folder."""
+    """Rig file of the two cameras: Barsight's, Kalibr's, OpenCV's or an EuRoC folder."""
     cameras: CamerasSettings
     imu: ImuSettings | None = None
     encoders: EncodersSettings | None = None
@@ -120,12 +130,12 @@ class CraneConfig:
     live: LiveSettings = LiveSettings()
 
     def sensors(self) -> dict[str, ImuSettings | EncodersSettings]:
-        """Return the settings of `imu` and `crane`, where there are any."""
+        """Return the settings of `imu` and `crane`, if there are any."""
         have = {"imu": self.imu, "crane": self.encoders}
         return {name: one for name, one in have.items() if one is not None}
 
     def rig(self) -> StereoRig:
-        """Read the calibration, and check that it is of these cameras by their serial numbers."""
+        """Read the calibration, and check by the serial numbers that it belongs to these cameras."""
         rig = read_rig_file(self.calibration)
         calibrated, here = read_serials(self.calibration), self.cameras.serials
         if None not in calibrated and calibrated == here[::-1]:
@@ -147,12 +157,12 @@ class CraneConfig:
         return rig
 
     def described(self, folder: Path) -> AwaitedRecording:
-        """Return the recording that is to come into `folder`, as crane.toml describes it."""
+        """Return the recording that will be written to `folder`, as crane.toml describes it."""
         noise = None if self.imu is None or self.imu.noise is None else read_imu_file(self.imu.noise).noise
         return AwaitedRecording(folder, self.rig(), self._no_imu(), self._no_crane(), noise)
 
     def awaited(self, folder: Path) -> AwaitedRecording:
-        """Return the same with the calibration as it stands in `folder`, so that replays have just that."""
+        """Return the same with the calibration as stored in `folder`, so that replays use exactly that."""
         noise = read_imu_file(folder / "imu.yaml").noise if (folder / "imu.yaml").is_file() else None
         rig = read_camchain(folder / "camchain-imucam.yaml").rig
         return AwaitedRecording(folder, rig, self._no_imu(), self._no_crane(), noise)

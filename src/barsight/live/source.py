@@ -16,16 +16,18 @@ from barsight.recording.stored_images import StoredImage, StoredPictures
 from barsight.sensors.source import LivePicture, LostPicture, Readings
 
 BATCH_NS = 10_000_000
-"""Readings come in batches of so much time."""
+"""Time span in ns of a batch of readings."""
 USUAL_PERCENT = 95
 AHEAD_NS = NS_PER_S // 5
-"""As fast as possible, readings come so far ahead of the pictures: more than any pose waits for."""
+"""Lead in ns of readings over pictures at full speed: more than any pose waits for."""
 
 
 @dataclass(frozen=True)
 class ReplayClock:
-    """Relates stamps to the monotonic clock. began_ns: when (monotonic) `first_ns` (stamp) was. speed:
-    recorded seconds a second; 0: as fast as possible, where a stamp is due when it is asked for.
+    """Relates stamps to the monotonic clock.
+
+    began_ns: monotonic time of the stamp `first_ns`. speed: recorded seconds per second; 0: as fast as
+    possible, when a stamp is due as soon as it is requested.
     """
 
     began_ns: int
@@ -33,23 +35,23 @@ class ReplayClock:
     speed: float
 
     def due_ns(self, stamp_ns: int) -> int:
-        """Return when (monotonic) a stamp is due."""
+        """Return the monotonic time at which a stamp is due."""
         if self.speed == 0:
             return time.monotonic_ns()
         return self.began_ns + round((stamp_ns - self.first_ns) / self.speed)
 
     def stamp_now_ns(self) -> int | None:
-        """Return the stamp that is due now; None as fast as possible, which has no now."""
+        """Return the stamp that is due now; None at full speed, where there is no such stamp."""
         if self.speed == 0:
             return None
         return self.first_ns + round((time.monotonic_ns() - self.began_ns) * self.speed)
 
 
 class ReplaySource:
-    """`Source` of a recording. It ends with the pictures: readings after them come at once.
+    """`Source` of a recording. It ends with the pictures: readings after them are delivered at once.
 
-    may_go_on: asked before each picture and while waiting; the source ends where it says no. A capture begun
-    anew finds all readings, as a driver would have kept them, but the pictures due meanwhile are lost.
+    may_go_on: called before each picture and while waiting; the source ends if it returns False. A restarted
+    capture finds all readings, as a driver would have kept them, but the pictures due meanwhile are lost.
     """
 
     def __init__(self, recording: StoredPictures, clock: ReplayClock, may_go_on: Callable[[], bool]) -> None:
@@ -64,12 +66,12 @@ class ReplaySource:
 
     @property
     def interval_ns(self) -> int:
-        """Return an interval that only a twentieth of cam0's exceed: a recording may have gaps."""
+        """Return the 95th percentile of cam0's picture intervals, as a recording may have gaps."""
         stamps = self._recording.camera_stamps.left_ns
         return int(np.percentile(np.diff(stamps), USUAL_PERCENT)) if len(stamps) > 1 else 0
 
     def packets(self, after: dict[str, int]) -> Iterator[LivePicture | LostPicture | Readings]:
-        """Yield what comes, when it is due; see `Source.packets`."""
+        """Yield packets when they are due; see `Source.packets`."""
         given = {
             sensor: int(np.searchsorted(stamps, after[sensor], side="right"))
             for sensor, (stamps, _) in self._readings.items()

@@ -20,7 +20,7 @@ from barsight.live.shared.counters import Counters
 
 @dataclass
 class ProcessState:
-    """A process of the run. state: `starting`, `running`, `restarting`, `done`. reason: of its last end."""
+    """A process of the run. state: `starting`, `running`, `restarting`, `done`. reason: why it last ended."""
 
     pid: int = 0
     state: str = "starting"
@@ -30,9 +30,9 @@ class ProcessState:
 
 @dataclass
 class RunState:
-    """The run as state.json has it. phase: `starting`, `measuring`, `finishing`, `done` or `failed`.
+    """Content of state.json. phase: `starting`, `measuring`, `finishing`, `done` or `failed`.
 
-    now_ns: on the cameras' clock. lifts_until: why lifts may not stand, empty where they may.
+    now_ns: on the cameras' clock. lifts_until: why lifts aren't valid, empty if they are.
     """
 
     phase: str = "starting"
@@ -64,7 +64,7 @@ def write_state(state: RunState, board: Counters, out: Path) -> None:
 
 
 def write_health(state: RunState, board: Counters, seconds: float, out: Path) -> None:
-    """Write health.json and health.prom, Prometheus' text for a file collector. seconds: since it began."""
+    """Write health.json and health.prom, Prometheus' text for a file collector. seconds: since the start."""
     frames = counts(board)
     free = shutil.disk_usage(out).free
     memory = {name: resident_bytes(process.pid) for name, process in state.processes.items()}
@@ -94,7 +94,7 @@ def write_health(state: RunState, board: Counters, seconds: float, out: Path) ->
 
 
 def prometheus(health: Mapping[str, Any]) -> str:
-    """Write health as Prometheus' text format, one metric a line."""
+    """Write health in Prometheus' text format, one metric per line."""
     frames = dict(health["frames"])
     dropped = frames.pop("dropped")
     metrics = {
@@ -124,7 +124,7 @@ def prometheus(health: Mapping[str, Any]) -> str:
 
 
 def _disk_days(free_bytes: int, recorded_bytes: int, seconds: float) -> float | None:
-    """Compute how many days the free disk lasts at the pace so far; None where nothing is recorded."""
+    """Compute how many days the free disk space lasts at the rate so far; None if nothing is recorded."""
     if recorded_bytes <= 0 or seconds <= 0:
         return None
     return round(free_bytes / (recorded_bytes / seconds) / 86400, 2)

@@ -1,4 +1,4 @@
-"""Supervise capture, track and map: start them, restart each alone, judge the mode, tell it."""
+"""Supervise the run's processes: start them, restart each on its own, judge the mode and report it."""
 
 from __future__ import annotations
 
@@ -32,15 +32,17 @@ PROCESSES: dict[str, Callable[[Link], None]] = {
     "capture": capture, "track": track, "pose": output_poses, "map": build_live_map, "record": record,
 }  # fmt: skip
 BEAT_S = 0.1
-"""Interval between judgements of the mode and looks after the processes."""
+"""Interval in seconds at which the mode is judged and the processes are checked."""
 MAX_RESTARTS, RESTARTS_WITHIN_S = 5, 30.0
-"""A process that ends more often than that ends the run."""
+"""Maximum number of restarts of a process, and the time in seconds within which they count; more end the
+run.
+"""
 START_S = 120.0
-"""Processes may take so long to start on a busy machine."""
+"""Longest time in seconds that processes may take to start on a busy machine."""
 FINISH_S = 60.0
-"""At the end the map process may be silent so long, between one pair or tile and the next."""
+"""Longest silence of the map process in seconds at the end, between one pair or tile and the next."""
 DRAIN_S = 60.0
-"""The recorder may take so long to write what is left."""
+"""Longest time in seconds that the recorder may take to write what is left."""
 SIGNS = {
     ("record", "paused"): "recording stopped, the disk is too full: {} (1: stopped, 0: goes on)",
     ("record", "deleted"): "{} old segments were deleted so far, the disk is filling",
@@ -54,12 +56,12 @@ SIGNS = {
         ("sensors", f"{one}_restarts"): f"{one}: its sender began anew {{}} times" for one in ("imu", "crane")
     },
 }
-"""Counters whose changes go to the log, each with its line."""
+"""Counters whose changes are logged, each with its line."""
 
 
 def end_with_parent() -> None:
-    """End this process when its parent is gone: one that was killed at once stops none, and cameras and ports
-    would stay taken.
+    """End this process when its parent is gone: a killed parent can't stop its processes, and cameras and
+    ports would stay occupied.
     """
     parent = multiprocessing.parent_process()
     if parent is None:
@@ -73,7 +75,7 @@ def end_with_parent() -> None:
 
 
 def run_process(role: str, link: Link) -> None:
-    """Run a process of the run; Ctrl-C is its parent's to handle, who takes it along when it dies."""
+    """Run one process of the run. Ctrl-C is left to its parent, with which it dies."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     end_with_parent()
@@ -89,7 +91,7 @@ def run_process(role: str, link: Link) -> None:
 
 
 class Supervisor:
-    """Runs the processes of a run. tell: takes each line of the log."""
+    """Runs the processes of a run. tell: receives each line of the log."""
 
     def __init__(self, link: Link, board: Counters, tell: Callable[[str], None]) -> None:
         self._link, self._board, self._tell = link, board, tell
@@ -115,7 +117,7 @@ class Supervisor:
         self.stop_because = ""
 
     def run(self) -> None:
-        """Run until the recording ends, `stop` is called or a process can't be kept up; then end all."""
+        """Run until the recording ends, `stop` is called or a process can't be kept running; then end all."""
         try:
             for role in self._roles:
                 self._start(role)
@@ -130,12 +132,12 @@ class Supervisor:
         self._write(health=True)
 
     def stop(self, because: str) -> None:
-        """Ask the run to end. An interruption counts though it was ending already: no other run follows."""
+        """Request the end of the run. An interruption counts even if it is already ending: no run follows."""
         if not self.stop_because or because == INTERRUPTED:
             self.stop_because = because
 
     def final_mode(self) -> Mode:
-        """Judge the mode at the last picture, whatever the processes' pace was."""
+        """Judge the mode at the last picture, independently of the processes' pace."""
         heard = self._heard()
         if self._crane is not None:
             freeze = FreezeWatch(self._crane)
@@ -152,7 +154,7 @@ class Supervisor:
         self.state.processes[role].pid = process.pid or 0
 
     def _await_start(self) -> None:
-        """Wait until all are ready, then let the recording's time begin."""
+        """Wait until all processes are ready, then start the recording's clock."""
         give_up = time.monotonic() + START_S
         while not all(self._board[role, "ready"] for role in self._roles) and not self.stop_because:
             wait([process.sentinel for process in self._running.values()], BEAT_S)
@@ -168,7 +170,7 @@ class Supervisor:
         self.state.phase = "measuring"
 
     def _look_after(self) -> None:
-        """Start each process anew that has ended and wasn't done."""
+        """Restart each process that has ended without being done."""
         done = {
             "capture": self._board["capture", "ended"],
             "track": self._board["track", "done"],
@@ -200,7 +202,7 @@ class Supervisor:
             self._start(role)
 
     def _end_if_hung(self, role: str, process: BaseProcess) -> None:
-        """End a process that lives but doesn't go on; while it starts, `START_S` bounds it."""
+        """End a process that is alive but hangs; while it is starting, `START_S` applies."""
         silent_s = (time.monotonic_ns() - self._board[role, "beat_ns"]) / NS_PER_S
         bound_s = self._link.live.hang_s if self._board[role, "ready"] else START_S
         if silent_s > bound_s:
@@ -218,7 +220,7 @@ class Supervisor:
         return f"ended with code {code}"
 
     def _judge(self) -> None:
-        """Judge the mode and write it, to the log too where it changed."""
+        """Judge the mode and write it; log it if it has changed."""
         assert self._clock is not None
         now_ns = self._clock.stamp_now_ns()
         heard = self._heard()
@@ -246,14 +248,14 @@ class Supervisor:
         self._write(health=time.monotonic() >= self._health_at)
 
     def _watch_survey(self, now_ns: int) -> None:
-        """Stop where the survey is over; encoders that can't be trusted don't end one."""
+        """Stop when the survey is over; encoders that can't be trusted don't end one."""
         if self._survey is not None:
             _, place = self._link.readings("crane").last(1 if self.state.mode.name in FOR_LIFTS else 0)
             if because := self._survey.judge(now_ns, place):
                 self.stop(because)
 
     def _watch_sensors(self) -> None:
-        """Log what the recorder and the sensors' clocks have come to."""
+        """Log changes in the counters of the recorder and of the sensors' clocks."""
         for key, told in SIGNS.items():
             value = self._board[key]
             if value != self._signs.get(key, 0):
@@ -262,7 +264,7 @@ class Supervisor:
 
     def _heard(self) -> SensorActivity:
         board, frozen, jumped_m, step_s = self._board, False, 0.0, 0.0
-        # First the pictures: readings that come meanwhile must not look late beside them.
+        # Pictures first: readings that arrive meanwhile must not look late in comparison.
         last_ns = board["capture", "last_cam0_ns"], board["capture", "last_cam1_ns"]
         readings: dict[str, int] = {}
         for sensor in sorted(self._sensors):
@@ -288,7 +290,7 @@ class Supervisor:
         self._tell(f"{seconds:8.2f} s  {text}")
 
     def end_map(self, *, at_once: bool = False) -> None:
-        """Wait until what was kept is in the map, where the map process can finish it; `at_once` ends it."""
+        """Wait until everything kept is in the map, if the map process can finish it; `at_once` ends it."""
         process = self._running.get("map")
         while process is not None and process.is_alive():
             silent_s = (time.monotonic_ns() - self._board["map", "beat_ns"]) / NS_PER_S
@@ -299,7 +301,7 @@ class Supervisor:
             self.state.processes["map"].state = "done"
 
     def _end_all(self) -> None:
-        """End the processes but for the map's, which goes on until `end_map`."""
+        """End the processes except the map process, which continues until `end_map`."""
         self._board["supervisor", "stop"] = 1
         for role in self._running.keys() - {"map", "record"}:
             self._end(role, self._running[role], 5.0)

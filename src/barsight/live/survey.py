@@ -1,4 +1,4 @@
-"""Tell when a survey has begun and ended, by the crane's way."""
+"""Detect when a survey begins and ends, from the crane's travel."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from barsight.core.stamps import seconds_to_ns
 from barsight.live.settings import SurveySettings
 
 STILL_M = 0.05
-"""A crane that stays so near to a place stands."""
+"""Distance in metres from a place within which the crane counts as standing."""
 STOOD = "the crane stood, there is nothing to measure"
 INTERRUPTED = "interrupted"
 
 
 class SurveyWatch:
-    """Watches the crane's way. is_alone: the run is one survey, which only its length ends."""
+    """Tracks the crane's travel. is_alone: the run is a single survey, which ends only by its length."""
 
     def __init__(self, settings: SurveySettings, *, is_alone: bool) -> None:
         self._settings, self._is_alone = settings, is_alone
@@ -24,8 +24,10 @@ class SurveyWatch:
         self._way_m = 0.0
 
     def judge(self, now_ns: int, position_m: Float64) -> str:
-        """Tell why the survey is over, empty where it isn't. now_ns: rising. position_m: (N, 3) the encoders'
-        newest readings; none where they can't be trusted: a survey doesn't end by those.
+        """Return why the survey is over, empty if it isn't.
+
+        now_ns: must increase. position_m: (N, 3) the encoders' newest readings; empty if they can't be
+        trusted, as they don't end a survey then.
         """
         self._first_ns = self._first_ns or now_ns
         place = position_m[-1] if len(position_m) else self._still_m

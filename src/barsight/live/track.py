@@ -1,4 +1,4 @@
-"""Run the track process: the newest pair from the ring, its pose at once, keyframes kept for the map."""
+"""Run the track process: estimate the pose of the newest pair in the ring, keep keyframes for the map."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from barsight.recording.rectified_pairs import RectifiedPairs
 
 POLL_S = 0.002
 GRACE_S = 0.3
-"""A frame waits so long for the readings of a sensor that has become silent."""
+"""Longest time in seconds that a frame waits for the readings of a sensor that has gone silent."""
 AGAIN_FRAMES = 10
-"""A process begun anew follows so many of the last keyframes first: more than the window holds."""
+"""Number of last keyframes that a restarted process tracks first: more than the window holds."""
 
 
 def track(link: Link) -> None:
-    """Track until capture has ended and its last pair is taken, or the supervisor says so."""
+    """Track until capture has ended and its last pair is processed, or the supervisor stops this."""
     whole, board = link.open_recording(), link.open_counters()
     ring = link.open_ring()
     tracking = Tracking(link, GrowingRecording(whole, [], link), board, ring)
@@ -59,7 +59,7 @@ def track(link: Link) -> None:
 
 
 class Tracking:
-    """Estimates each pair's pose with what is known when it comes, and keeps those that are keyframes."""
+    """Estimates each pair's pose from the data available when it arrives, and keeps the keyframes."""
 
     def __init__(self, link: Link, recording: GrowingRecording, board: Counters, ring: PairRing) -> None:
         self._link, self._recording, self._board, self._ring = link, recording, board, ring
@@ -74,27 +74,29 @@ class Tracking:
         self._last_kept_ns, self._still = 0, 0
 
     def follow_again(self) -> None:
-        """Follow the last keyframes anew after a restart, all of them without encoders."""
+        """Track the last keyframes again after a restart; without encoders, all of them."""
         kept = [stamp for stamp, _, _, is_kept, _ in self._frames.read() if is_kept]
         self._recording.grow()
         again = kept if self._source.crane() is None else kept[-AGAIN_FRAMES:]
         self._recording.stamps_ns[:] = kept
         for seen in self._pairs(frozenset(again)) if again else ():
-            self._board.beat("track")  # without encoders they are all of them, which may take minutes
+            self._board.beat("track")  # without encoders all keyframes are tracked, which may take minutes
             posed = self._placed(seen)
             self._last_kept_ns = seen.stamp_ns
             if isinstance(posed, PosedFrame):
                 self._last_kept = posed.reference_from_body.translation
 
     def end(self) -> None:
-        """Leave the trajectory, if it is of just the pairs kept."""
+        """Save the trajectory, if it consists of exactly the pairs kept."""
         if self._placer is not None:
             with contextlib.suppress(BarsightError):
                 self._placer.finish()
 
     def take(self, pair: CapturedPair, passed: range) -> None:
-        """Track a pair from the ring and keep it if it is a keyframe. passed: numbers of the pairs before it
-        that were passed over; of these are kept, without a pose, as many as the map would lack.
+        """Track a pair from the ring and keep it if it is a keyframe.
+
+        passed: numbers of the skipped pairs before it; as many of them as the map would otherwise lack are
+        kept without a pose.
         """
         stamp = pair.frame.stamp_ns
         rectified = self._rectifier(pair.frame)
@@ -118,14 +120,14 @@ class Tracking:
         self._frames.append((stamp, pair.exposed_ns, done_ns, is_kept, has_pose))
 
     def _tell_state(self) -> None:
-        """Note the state for the process that writes poses."""
+        """Log the state for the process that writes poses."""
         poses = None if self._placer is None else self._placer.poses
         state = poses.navigation if isinstance(poses, FixedLagPoses) else None
         if state is not None:
             self._states.append(np.array([state.stamp_ns]), state.row[None])
 
     def _keep_passed(self, pair: CapturedPair | None) -> None:
-        """Keep a pair that was passed over if it is far enough from the last one kept."""
+        """Keep a skipped pair if it is far enough from the last one kept."""
         if pair is not None and self._is_wanted(pair.frame.stamp_ns):
             rectified = self._rectifier(pair.frame)
             if isinstance(rectified, RectifiedPair):
@@ -150,8 +152,8 @@ class Tracking:
         self._board.add("track", "kept")
 
     def _is_keyframe(self, stamp_ns: int, posed: PosedFrame | RefusedFrame) -> bool:
-        """Choose what is kept: pairs that the body has gone far enough for, the first few of a crane
-        that stands, and those whose place isn't known.
+        """Choose keyframes: pairs for which the body has moved far enough, the first few of a standing crane,
+        and those without a pose.
         """
         if self._link.keyframes is not None:
             return stamp_ns in self._link.keyframes
@@ -165,7 +167,7 @@ class Tracking:
         return self._is_wanted(stamp_ns) and self._still <= self._link.live.still_pairs
 
     def _wait_for_readings(self, stamp_ns: int) -> None:
-        """Wait for the readings that the pose needs, `GRACE_S` at most."""
+        """Wait for the readings that the pose needs, at most `GRACE_S`."""
         delay_ns = 0 if self._placer is None else self._placer.poses.delay_ns or 0
         due_ns = stamp_ns + self._recording.rig.timeshift_cam_imu_ns + delay_ns
         give_up_ns = time.monotonic_ns() + int(GRACE_S * NS_PER_S)

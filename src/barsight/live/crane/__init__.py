@@ -1,1 +1,1 @@
-"""Run at a crane: prove its sensors, measure from them, check the machine."""
+"""Run at a crane: check its sensors, measure with them, check the machine."""

@@ -21,19 +21,19 @@ from barsight.sensors.drivers import prove_cameras
 
 MIN_CORES, MIN_MEMORY_GIB = 2, 2.0
 KEYFRAME_BYTES_PER_PIXEL = 16
-"""A kept pair with its disparity, on disk until it is measured: 20 MB at 1.3 megapixels."""
+"""Disk space per pixel of a kept pair with its disparity until it is measured: 20 MB at 1.3 megapixels."""
 SURVEY_M, TRAVEL_MPS = 50.0, 1.0
-"""The disk must take a survey so long, kept at this speed."""
+"""Length (m) and speed (m/s) of a survey whose pairs the disk must be able to store."""
 WRITTEN_MIB = 64
 HEADERS_BYTES = 28
-"""Of IPv4 and UDP, within a packet."""
+"""Size of the IPv4 and UDP headers within a packet."""
 UNSYNCHRONISED = 0x40
-"""Status bit of adjtimex."""
+"""Status bit of adjtimex for a clock that isn't synchronised."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A line of the check. passed: None where the system doesn't tell, or a run can do without it."""
+    """A line of the check. passed: None if the system doesn't say, or if a run can do without it."""
 
     what: str
     found: str
@@ -43,7 +43,7 @@ class Finding:
 
 
 def check_machine(crane: CraneConfig, out: Path) -> Iterator[Finding]:
-    """Yield what was found, one thing after the other. out: where runs will write; it or a parent exists."""
+    """Yield the findings one by one. out: output folder of the runs; it or one of its parents exists."""
     yield _cores()
     yield _memory()
     yield _shared_memory(crane)
@@ -74,7 +74,7 @@ def _memory() -> Finding:
 
 
 def _shared_memory(crane: CraneConfig) -> Finding:
-    """Check that the ring of pairs has room."""
+    """Check that there is room for the ring of pairs."""
     camera = crane.rig().cam0
     needed = 2 * camera.width * camera.height * crane.live.ring_pairs
     free = shutil.disk_usage("/dev/shm").free
@@ -85,11 +85,11 @@ def _shared_memory(crane: CraneConfig) -> Finding:
 
 
 def _disk(name: str, folder: Path, crane: CraneConfig, *, is_run: bool) -> Iterator[Finding]:
-    """Check space and write speed where a run keeps its pairs, or its recording alone."""
+    """Check free space and write speed for a run's pairs, or for its recording alone."""
     there = next(path for path in (folder, *folder.parents) if path.is_dir())
     camera = crane.rig().cam0
     kept = camera.width * camera.height * (KEYFRAME_BYTES_PER_PIXEL if is_run else 2)
-    way_m = crane.live.keyframe_way_m or TRAVEL_MPS / crane.cameras.rate_hz  # 0: each pair is one
+    way_m = crane.live.keyframe_way_m or TRAVEL_MPS / crane.cameras.rate_hz  # 0: each pair is a keyframe
     free, needed = shutil.disk_usage(there).free, kept * SURVEY_M / way_m
     remedy = "free some, or name a folder on a larger disk"
     yield Finding(
@@ -109,7 +109,7 @@ def _disk(name: str, folder: Path, crane: CraneConfig, *, is_run: bool) -> Itera
 
 
 def write_speed_mib(folder: Path) -> float:
-    """Measure how fast a file reaches the disk, MiB/s. Raises OSError where none can be written."""
+    """Measure how fast a file is written to the disk, MiB/s. Raises OSError if no file can be written."""
     block = os.urandom(1 << 20)
     with tempfile.NamedTemporaryFile(dir=folder, prefix=".barsight.") as file:
         began = time.perf_counter()
@@ -121,7 +121,7 @@ def write_speed_mib(folder: Path) -> float:
 
 
 def _serials(crane: CraneConfig) -> Finding:
-    """Check that exchanged cameras and another rig's calibration would be noticed."""
+    """Check that exchanged cameras or the calibration of another rig would be noticed."""
     known = [serial or "none" for serial in read_serials(crane.calibration)]
     remedy = (
         f"put serial: under cam0 and cam1 of {crane.calibration.name}: else exchanged cameras aren't noticed"
@@ -131,7 +131,7 @@ def _serials(crane: CraneConfig) -> Finding:
 
 
 def _network(crane: CraneConfig) -> Iterator[Finding]:
-    """Check the interface to the cameras, and how much the system may hold of what comes."""
+    """Check the interface to the cameras and the system's receive buffers."""
     named, camera = crane.cameras.interface, crane.rig().cam0
     name = interface_of(named)
     if name is None or not (Path("/sys/class/net") / name).is_dir():
@@ -148,7 +148,7 @@ def _network(crane: CraneConfig) -> Iterator[Finding]:
 
 
 def _interface(name: str, crane: CraneConfig) -> Iterator[Finding]:
-    """Check an interface's packets and speed, and tell whether its clock can do PTP."""
+    """Check an interface's packet size and speed, and whether its clock supports PTP."""
     at, cameras, camera = Path("/sys/class/net") / name, crane.cameras, crane.rig().cam0
     needed, mtu = cameras.packet_size_bytes + HEADERS_BYTES, _number(at / "mtu") or 0
     remedy = f"ip link set {name} mtu 9000, here and in the switch, or lower cameras.packet_size_bytes"
@@ -165,7 +165,7 @@ def _interface(name: str, crane: CraneConfig) -> Iterator[Finding]:
 
 
 def interface_of(named: str | None) -> str | None:
-    """Return the name of an interface that is given by name or IPv4 address; None where neither is."""
+    """Return the name of an interface given by name or IPv4 address; None if there is none."""
     if named is None or not named.replace(".", "").isdigit():
         return named
     import fcntl
@@ -183,7 +183,7 @@ def interface_of(named: str | None) -> str | None:
 
 
 def _number(path: Path) -> int | None:
-    """Read a whole number; None where the system doesn't tell."""
+    """Read a whole number; None if the system doesn't provide it."""
     try:
         return int(path.read_text(encoding="ascii"))
     except (OSError, ValueError):
@@ -191,7 +191,7 @@ def _number(path: Path) -> int | None:
 
 
 def _sensors(crane: CraneConfig) -> Iterator[Finding]:
-    """Prove both cameras, then IMU and encoders."""
+    """Check both cameras, then IMU and encoders."""
     awaited = crane.described(Path("recording"))
     size = awaited.rig.cam0.width, awaited.rig.cam0.height
     told = f"{' and '.join(crane.cameras.serials)}, {size[0]}x{size[1]}, Mono8"
@@ -213,7 +213,7 @@ def _sensors(crane: CraneConfig) -> Iterator[Finding]:
 
 
 def _ptp(told: list[str]) -> Finding:
-    """Tell whether PTP makes the cameras' clocks one."""
+    """Report whether the cameras' clocks are synchronised by PTP."""
     is_one = are_one_clock(told)
     return Finding(
         "PTP of the cameras", " and ".join(one or "none told" for one in told),
@@ -233,7 +233,7 @@ def _proved(what: str, needed: str, prove: Callable[[], None]) -> Finding:
 
 
 class _TimeX(ctypes.Structure):
-    """Hold what adjtimex(2) tells."""
+    """Result of adjtimex(2)."""
 
     _fields_ = (
         ("modes", ctypes.c_uint), ("offset", ctypes.c_long), ("freq", ctypes.c_long),
@@ -243,7 +243,7 @@ class _TimeX(ctypes.Structure):
 
 
 def _clock() -> Finding:
-    """Ask the system whether something, as chrony or ptp4l, keeps its clock."""
+    """Check whether the system clock is synchronised, for example by chrony or ptp4l."""
     told, needed = _TimeX(), "kept by chrony, ntpd or ptp4l"
     remedy = "install chrony: other computers judge the age of lifts by their own clocks"
     try:

@@ -1,4 +1,4 @@
-"""Prove a crane's sensors before a run: cameras there and as calibrated, readings that can be a crane's."""
+"""Check a crane's sensors before a run: cameras present and as calibrated, readings plausible for a crane."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from barsight.sensors.settings import ReadingsSettings
 
 LISTEN_S = 3.0
 ENOUGH_S = 0.5
-"""Readings of so much time are judged."""
+"""Time span in seconds of the readings that are judged."""
 
 
 def prove_sensors(crane: CraneConfig, folder: AwaitedRecording) -> None:
-    """Prove that all sensors of crane.toml answer. Raises InputError naming the one that doesn't."""
+    """Check that all sensors of crane.toml answer. Raises InputError naming the one that doesn't."""
     prove_cameras(crane.cameras, (folder.rig.cam0.width, folder.rig.cam0.height))
     for name in crane.sensors():
         folder = prove_sensor(crane, folder, name)
@@ -31,7 +31,7 @@ def prove_sensors(crane: CraneConfig, folder: AwaitedRecording) -> None:
 def prove_sensor(crane: CraneConfig, folder: AwaitedRecording, name: str) -> AwaitedRecording:
     """Receive `imu` or `crane` for a moment; return the recording with those readings.
 
-    Raises InputError where none come, or other ones than crane.toml says.
+    Raises InputError if none arrive, or if they aren't as crane.toml describes them.
     """
     sensor = crane.sensors()[name]
     found = _listen(name, sensor)
@@ -62,7 +62,7 @@ def held(folder: AwaitedRecording, name: str, found: list[RawReading]) -> Awaite
 
 
 def expect_plausible(folder: AwaitedRecording) -> None:
-    """Raise InputError where what was heard can't be a crane's: units, gravity against the mounting."""
+    """Raise InputError if the readings are implausible for a crane: units, gravity against the mounting."""
     for notice in doubts(folder):
         raise InputError("crane.toml", notice.message)
 

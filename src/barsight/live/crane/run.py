@@ -1,4 +1,4 @@
-"""Run `barsight live`: one survey by the crane's own sensors, or survey after survey, of a replay too."""
+"""Run `barsight live`: one survey or many with the crane's own sensors, or a replay over and over."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ from barsight.yard.magnet.description import load_magnet
 
 STAMP = "%Y%m%dT%H%M%S"
 AGAIN_S = 5.0
-"""After a survey that failed the sensors are proved this often until they answer."""
+"""Interval in seconds at which the sensors are checked after a failed survey, until they answer."""
 REPLAYS_KEPT = 5
-"""Of a recording that is replayed over and over so many surveys' folders are kept."""
+"""Number of survey folders kept when a recording is replayed over and over."""
 RUNNING, LATEST = "current", "latest"
-"""Links to the survey that runs, and to the last that was measured."""
+"""Names of the links to the running survey and to the last one measured."""
 _NO_SURVEY_RUNS = {one: "no survey runs" for one in signal.Signals if one.name == "SIGUSR1"}
-"""While one is measured, or none can begin, the signal that ends a survey must not end the command. (Windows
-has none.)
+"""Reply to the signal that ends a survey while one is being measured or none can begin: the signal must not
+end the command. (Windows has no such signal.)
 """
 
 
@@ -47,9 +47,9 @@ def measure_crane(
     magnet: Path | None = None, tell: Callable[[str], None] = print,
     advance: ProgressCallback = ignore_progress,
 ) -> dict[str, Any]:  # fmt: skip
-    """Measure one survey into `out`, until Ctrl-C or SIGTERM; return what result.json says.
+    """Measure one survey into `out`, until Ctrl-C or SIGTERM; return the content of result.json.
 
-    All sensors are proved first; nothing is written where one of them isn't as crane.toml says.
+    All sensors are checked first; nothing is written if one of them isn't as crane.toml describes it.
     Raises a BarsightError.
     """
     request = LiftRequest(None if magnet is None else load_magnet(magnet))
@@ -64,10 +64,10 @@ def measure_surveys(
     magnet: Path | None = None, tell: Callable[[str], None] = print,
     advance: ProgressCallback = ignore_progress,
 ) -> dict[str, Any]:  # fmt: skip
-    """Measure survey after survey, each into a folder of its own in `out`, until Ctrl-C or SIGTERM.
+    """Measure survey after survey, each into its own folder in `out`, until Ctrl-C or SIGTERM.
 
-    A survey that fails is told, and the next begun once all sensors answer. Returns nothing of its own: each
-    folder has it. Raises a BarsightError where the sensors don't answer at the start.
+    A failed survey is reported, and the next one begins once all sensors answer. Returns an empty result, as
+    each folder has its own. Raises a BarsightError if the sensors don't answer at the start.
     """
     if crane.encoders is None:
         raise ConfigError("crane.toml has no [encoders], by which surveys begin and end")
@@ -109,8 +109,9 @@ def replay_surveys(
     magnet: Path | None = None, judged_at: Literal["now", "end"] = "now", tell: Callable[[str], None] = print,
     advance: ProgressCallback = ignore_progress,
 ) -> dict[str, Any]:  # fmt: skip
-    """Measure a recording over and over, each time into a folder in `out`, until Ctrl-C or SIGTERM; the
-    newest few are kept. Raises a BarsightError where the first time fails.
+    """Measure a recording over and over, each time into a folder in `out`, until Ctrl-C or SIGTERM.
+
+    The newest few folders are kept. Raises a BarsightError if the first run fails.
     """
     request = LiftRequest(None if magnet is None else load_magnet(magnet), judged_at)
     ended, is_first = "", True
@@ -137,7 +138,7 @@ def _begin(
     crane: CraneConfig, out: Path, folder: Path, settings: MeasureSettings, live: LiveSettings,
     tell: Callable[[str], None], *, surveys: bool = False, proved: bool = False,
 ) -> LiveRun:  # fmt: skip
-    """Prove the sensors and make the folders of a run; it records into `folder`."""
+    """Check the sensors and create the folders of a run; it records into `folder`."""
     awaited = crane.described(folder)
     if not proved:
         prove_sensors(crane, awaited)
@@ -157,14 +158,14 @@ def _recorded(crane: CraneConfig, out: Path, name: str) -> Path:
 
 
 def _drop_standing(here: Path, recording: Path) -> None:
-    """Remove the folders of a run in which the crane only stood, but for pictures around alarms."""
+    """Remove the folders of a run in which the crane only stood, except pictures around alarms."""
     if not any((recording / "alarms").glob(PATTERN)):
         for path in (recording, here):
             shutil.rmtree(path, ignore_errors=True)
 
 
 def _point(link: Path, name: str) -> None:
-    """Make or turn a link to a folder beside it, at once."""
+    """Create a link to a folder beside it, or redirect it, atomically."""
     fresh = link.with_name(f".{link.name}.new")
     with translated_os_errors(link):
         fresh.unlink(missing_ok=True)
@@ -173,8 +174,9 @@ def _point(link: Path, name: str) -> None:
 
 
 def _keep(out: Path, count: int) -> None:
-    """Remove the oldest surveys' folders beyond so many, but for the last that was measured. What is dated
-    ahead is no new survey's: a clock that was wrong has been set back since.
+    """Remove the oldest survey folders beyond `count`, except the last one measured.
+
+    Folders dated ahead belong to no new survey: the clock was wrong then and has been set back since.
     """
     ahead = (datetime.now(UTC) + timedelta(days=1)).strftime(STAMP)
     surveys = sorted(

@@ -1,4 +1,4 @@
-"""Count in shared memory: each process writes a row of its own, so that no lock can be left held."""
+"""Count in shared memory: each process writes its own row, so that no lock can be left held."""
 
 from __future__ import annotations
 
@@ -32,17 +32,18 @@ ROWS: dict[str, tuple[str, ...]] = {
     "record": ("ready", "pairs", "readings", "deleted", "paused", "alarms", "backlog", "bytes", "beat_ns"),
     "map": ("ready", "mapped", "refused", "backlog", "snapshots", "beat_ns"),
 }  # fmt: skip
-"""Counters of each process; those of `sensors` are capture's too. Those in _ns are stamps or spans; began_ns
-and beat_ns, when a process last went round its loop, are of the monotonic clock."""
+"""Counters of each process; those of `sensors` are also capture's. Those in _ns are stamps or durations;
+began_ns and beat_ns, the time of a process's last loop, are on the monotonic clock.
+"""
 DRAIN = 2
-"""Value of `stop` once nothing more comes from capture and track, and what is left is to be done."""
+"""Value of `stop` when capture and tracking have ended and only the remaining work is to be done."""
 _WIDTH = max(len(names) for names in ROWS.values())
 
 
 class Counters:
-    """Counters in shared memory: `board["track", "taken"]`. A process writes its own row only.
+    """Counters in shared memory: `board["track", "taken"]`. A process writes only its own row.
 
-    name: of an existing board; a new one is made without it, which its maker unlinks by `remove`.
+    name: of an existing board; without it a new one is made, whose maker unlinks it by `remove`.
     """
 
     def __init__(self, name: str | None = None) -> None:
@@ -65,7 +66,7 @@ class Counters:
         self[role, name] += count
 
     def beat(self, role: str) -> None:
-        """Note that a process goes on."""
+        """Record the heartbeat of a process."""
         self[role, "beat_ns"] = time.monotonic_ns()
 
     def row(self, role: str) -> dict[str, int]:
@@ -73,7 +74,7 @@ class Counters:
         return {name: self[role, name] for name in ROWS[role]}
 
     def remove(self) -> None:
-        """Unlink the memory; for its maker."""
+        """Unlink the memory; only its maker may call this."""
         self.close()
         self._memory.unlink()
 

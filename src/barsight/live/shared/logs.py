@@ -14,7 +14,7 @@ from barsight.core.arrays import Float64, Int64
 class ReadingLog:
     """Rows of a stamp (int64, ns) and `width` float64; one process appends, any may read.
 
-    An unfinished row at the end is what a killed writer left: nobody reads it, the next writer cuts it off.
+    An incomplete row at the end was left by a killed writer: readers ignore it, the next writer cuts it off.
     """
 
     def __init__(self, path: Path, width: int) -> None:
@@ -33,7 +33,7 @@ class ReadingLog:
             file.write(rows.tobytes())
 
     def read(self) -> tuple[Int64, Float64]:
-        """Return the rows that came since the last call: (N,) stamps, (N, width) values."""
+        """Return the rows appended since the last call: (N,) stamps, (N, width) values."""
         rows = self._rows(self._rows_read)
         self._rows_read += len(rows)
         return rows[:, 0].copy().view(np.int64), rows[:, 1:].copy()
@@ -55,13 +55,13 @@ class ReadingLog:
 
 
 class NumberLog:
-    """Lines of whole numbers; one process appends, any may read. An unfinished last line isn't there."""
+    """Lines of whole numbers; one process appends, any may read. An incomplete last line is ignored."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._place, self._is_whole = path, 0, False
 
     def append(self, numbers: Iterable[int]) -> None:
-        """Append a line in one write; the first cuts off what a killed writer left."""
+        """Append a line in one write; the first write cuts off what a killed writer left."""
         line = (",".join(str(int(number)) for number in numbers) + "\n").encode("ascii")
         if not self._is_whole and self._path.exists():
             os.truncate(self._path, self._path.read_bytes().rfind(b"\n") + 1)
@@ -70,7 +70,7 @@ class NumberLog:
             file.write(line)
 
     def read(self) -> list[tuple[int, ...]]:
-        """Return the lines that came since the last call."""
+        """Return the lines appended since the last call."""
         if not self._path.exists():
             return []
         with self._path.open("rb") as file:

@@ -1,4 +1,4 @@
-"""Hand pairs from one process to others: a ring in shared memory that its writer never waits for."""
+"""Pass pairs from one process to others through a ring in shared memory whose writer never waits."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _VERSION, _STAMP, _EXPOSED = range(3)
 
 @dataclass(frozen=True, eq=False)
 class CapturedPair:
-    """A pair from the ring. number: 1, 2, ... as written. exposed_ns: on the monotonic clock."""
+    """A pair from the ring. number: 1, 2, ... in the order of writing. exposed_ns: on the monotonic clock."""
 
     number: int
     exposed_ns: int
@@ -26,8 +26,8 @@ class PairRing:
     """The last `slots` pairs of (height, width) pictures; one process writes, any may read.
 
     A slot's version is 2 number - 1 while pair `number` is being written and 2 number after it, so a reader
-    sees whether what it copied is whole, and a writer that was killed leaves nothing that looks whole.
-    name: of an existing ring; a new one is made without it, which its maker unlinks by `remove`.
+    sees whether its copy is complete, and a killed writer leaves nothing that looks complete.
+    name: of an existing ring; without it a new one is made, whose maker unlinks it by `remove`.
     """
 
     def __init__(self, slots: int, height: int, width: int, name: str | None = None) -> None:
@@ -41,7 +41,7 @@ class PairRing:
 
     @property
     def newest(self) -> int:
-        """Return the number of the newest whole pair, 0 before the first."""
+        """Return the number of the newest complete pair, 0 before the first."""
         versions = self._heads[:, _VERSION].copy()
         return int(versions[versions % 2 == 0].max(initial=0)) // 2
 
@@ -56,7 +56,7 @@ class PairRing:
         return number
 
     def read(self, number: int) -> CapturedPair | None:
-        """Copy a pair; None where it is written over or not whole."""
+        """Copy a pair; None if it has been overwritten or is incomplete."""
         slot = number % len(self._heads)
         _, stamp_ns, exposed_ns = self._heads[slot].tolist()
         left, right = self._pictures[slot].copy()
@@ -65,7 +65,7 @@ class PairRing:
         return CapturedPair(number, exposed_ns, StereoFrame(stamp_ns, left, right))
 
     def remove(self) -> None:
-        """Unlink the memory; for its maker."""
+        """Unlink the memory; only its maker may call this."""
         self.close()
         self._memory.unlink()
 

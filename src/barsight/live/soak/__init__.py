@@ -1,1 +1,1 @@
-"""Watch a live run for hours or weeks: memory, descriptors, faults."""
+"""Monitor a live run for hours or weeks: memory, descriptors, faults."""

@@ -1,4 +1,4 @@
-"""Kill a run's processes at random, and time how soon it tells, revokes lifts and is well again."""
+"""Kill a run's processes at random, and time how soon it reports this, revokes lifts and has recovered."""
 
 from __future__ import annotations
 
@@ -18,14 +18,16 @@ PAUSE_S = (5.0, 30.0)
 GIVE_UP_S = 60.0
 LOOK_S = 0.01
 WITHOUT_LIFTS = ("record",)
-"""Processes without which lifts may stand."""
+"""Processes that lifts don't depend on."""
 
 
 @dataclass
 class Killed:
-    """Killings of a role's process, in seconds: to where state.json told it, to where lifts were revoked, to
-    where all was well again. over: the survey ended meanwhile; not_told, not_revoked, not_back: not before
-    all was well again, or within `GIVE_UP_S`.
+    """Kills of a role's process, and times in seconds until state.json reported it, until lifts were revoked,
+    and until the run had recovered.
+
+    over: the survey ended meanwhile. not_told, not_revoked, not_back: not before the run had recovered, or
+    not within `GIVE_UP_S`.
     """
 
     told_s: list[float] = field(default_factory=list)
@@ -39,7 +41,7 @@ class Killed:
 
 
 class RandomKills:
-    """Kills one process after another, by `seed`, as long as the run is well. rest: called while it waits."""
+    """Kills one process after another, by `seed`, while the run is healthy. rest: called while it waits."""
 
     def __init__(self, watch: RunWatch, seed: int, rest: Callable[[float], None]) -> None:
         self._watch, self._rest, self._rng = watch, rest, np.random.default_rng(seed)
@@ -47,7 +49,7 @@ class RandomKills:
         self._due_s = 0.0
 
     def step(self) -> None:
-        """Kill a process where one is due and the run is well."""
+        """Kill a process if one is due and the run is healthy."""
         state = self._watch.state()
         if state is None or not _is_well(state):
             self._due_s = max(self._due_s, self._watch.seconds + PAUSE_S[0])

@@ -1,4 +1,4 @@
-"""Read from the system what a run's processes use."""
+"""Read the resource usage of a run's processes from the system."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ HELPERS = {
     b"multiprocessing.forkserver": SERVER,
     b"multiprocessing.resource_tracker": "resource tracker",
 }
-"""Processes that the command keeps beside its run's own, by a word of their command line."""
+"""Helper processes that the command keeps beside those of its run, by a word of their command line."""
 COMMAND = "command"
 
 
 @dataclass(frozen=True)
 class Usage:
-    """Memory (shared pages whole, and shared out among who shares them), open descriptors and CPU time."""
+    """Memory (shared pages in full, and divided among their users), open descriptors and CPU time."""
 
     rss_mib: float
     pss_mib: float
@@ -29,7 +29,7 @@ class Usage:
 
 
 def read_usage(pid: int) -> Usage | None:
-    """Read what a process uses; None where it is gone. Raises ConfigError for another user's."""
+    """Read the usage of a process; None if it is gone. Raises ConfigError for another user's process."""
     at = PROC / str(pid)
     try:
         rollup = (at / "smaps_rollup").read_text(encoding="ascii").splitlines()
@@ -44,7 +44,7 @@ def read_usage(pid: int) -> Usage | None:
 
 
 def parents() -> dict[int, int]:
-    """Read each process's parent."""
+    """Read the parent of each process."""
     found = {}
     for entry in PROC.iterdir():
         if entry.name.isdigit():
@@ -57,7 +57,7 @@ def parents() -> dict[int, int]:
 
 
 def command_of(pid: int) -> int | None:
-    """Return the command that a run's process belongs to: the parent of the fork server that began it."""
+    """Return the command that a run's process belongs to: the parent of the fork server that started it."""
     above = parents()
     server = above.get(pid, 0)
     if not server or b"multiprocessing.forkserver" not in _command_line(server):
@@ -66,7 +66,7 @@ def command_of(pid: int) -> int | None:
 
 
 def family(command: int, roles: dict[int, str]) -> dict[int, str]:
-    """List the command and all that it began, each with its name; "" for those that are none of the run's.
+    """List the command and all its descendants with their names; "" for those that aren't the run's.
 
     roles: of the run's processes.
     """

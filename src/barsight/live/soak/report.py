@@ -1,4 +1,4 @@
-"""Judge a soak by its bounds, and write what was found: soak.json and soak.md."""
+"""Judge a soak test by its bounds, and write the results: soak.json and soak.md."""
 
 from __future__ import annotations
 
@@ -22,18 +22,20 @@ DIGITS = 5
 
 @dataclass(frozen=True)
 class SoakBounds:
-    """Bounds that a soak must stay within."""
+    """Bounds that a soak test must stay within."""
 
     slope_mib_per_h: float = 1.0
-    """Growth of each process's memory after the warm-up; held where it is sure within two sigma."""
+    """Largest growth of each process's memory after the warm-up, in MiB per hour, confirmed within two
+    sigma.
+    """
     total_mib: float = 2048.0
-    """Memory of all processes together, shared pages once."""
+    """Largest memory of all processes together in MiB, with shared pages counted once."""
     descriptors: int = 2
-    """Open descriptors of a process that came since the warm-up's end."""
+    """Largest number of open descriptors that a process gains after the warm-up."""
     told_s: float = 1.0
-    """From a killing to where state.json tells it, and to where lifts are revoked."""
+    """Longest time in seconds from a kill until state.json reports it, and until lifts are revoked."""
     back_s: float = 10.0
-    """From a killing to where all is well again."""
+    """Longest time in seconds from a kill until the run has recovered."""
 
     def __post_init__(self) -> None:
         expect_values(self, "bounds.")
@@ -67,7 +69,7 @@ def soak_content(
 
 def _figures(role: str, one: Watched, watch: RunWatch, warm_s: float) -> dict[str, Any]:
     memory = one.rss_mib.trend(warm_s, watch.survey_s, of_peaks=role not in LASTING)
-    # Between two surveys the command has fewer for an instant, which a sample meets by chance.
+    # Between two surveys the command briefly has fewer; a sample may happen to fall there.
     descriptors = one.descriptors.trend(warm_s, watch.survey_s, of_peaks=True)
     return {
         "memory_mib": {"first": one.rss_mib.first, "last": one.rss_mib.last, "max": one.rss_mib.peak},
@@ -102,7 +104,7 @@ def _spread(seconds: Sequence[float]) -> dict[str, Any]:
 
 
 def _broken(content: dict[str, Any], bounds: SoakBounds) -> Iterator[tuple[bool, str]]:
-    """List what isn't within the bounds, or isn't known to be (False)."""
+    """List what exceeds the bounds (True), or can't be judged yet (False)."""
     if not content["processes"]:
         yield False, "no process was seen"
     for role, one in content["processes"].items():
@@ -145,7 +147,7 @@ def write_soak(content: dict[str, Any], out: Path) -> None:
 
 
 def soak_table(content: dict[str, Any]) -> str:
-    """Write a soak as Markdown."""
+    """Write the results of a soak test as Markdown."""
     surveys, total = content["surveys"], content["total_mib"]
     lines = [
         "# Soak", "",

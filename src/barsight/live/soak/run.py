@@ -1,4 +1,4 @@
-"""Run a soak: watch a live run, or one that is begun for it, until it is long enough or told to end."""
+"""Run a soak test: monitor a live run, existing or started for it, until it is long enough or stopped."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ SAMPLE_S = 10.0
 WRITE_S = 60.0
 POLL_S = 0.25
 LOST_S = 120.0
-"""A run that isn't there for so long is over: a service that begins it anew has had its time."""
+"""Time in seconds after which a missing run counts as ended: a service would have restarted it by then."""
 END_S = 600.0
-"""A run that was begun for the soak may take so long to end."""
+"""Longest time in seconds that a run started for the soak test may take to end."""
 
 
 @dataclass(frozen=True)
 class SoakPlan:
-    """Hours that a soak lasts, those of them that are warm-up, and from when on processes are killed."""
+    """Hours of a soak test, hours of warm-up within it, and the hour from which processes are killed."""
 
     hours: float = math.inf
     warm_up_h: float = 0.5
@@ -50,9 +50,9 @@ def soak_replays(
     replay: Path, out: Path, plan: SoakPlan, bounds: SoakBounds, flags: Sequence[str],
     tell: Callable[[str], None],
 ) -> dict[str, Any]:  # fmt: skip
-    """Replay a recording over and over into `out/surveys`, and soak that run; `out` as `soak_run` has it.
+    """Replay a recording over and over into `out/surveys`, and soak-test that run; `out` as in `soak_run`.
 
-    flags: of `barsight live`, for the run. Raises MeasurementError where the run ended by itself.
+    flags: of `barsight live`, for the run. Raises MeasurementError if the run ended by itself.
     """
     expect_empty(out)
     surveys = out / "surveys"
@@ -61,7 +61,7 @@ def soak_replays(
     command = [sys.executable, "-m", "barsight", "live", "--replay", str(replay), "--surveys"]
     log = out / "run.log"
     with log.open("wb") as stream:
-        # A session of its own: Ctrl-C is the soak's, which then ends the run.
+        # In its own session: Ctrl-C goes to the soak test, which then ends the run.
         run = subprocess.Popen(
             [*command, "-o", str(surveys), *flags], stdout=stream, stderr=stream, start_new_session=True
         )
@@ -79,11 +79,10 @@ def soak_replays(
 def soak_run(
     folder: Path, out: Path, plan: SoakPlan, bounds: SoakBounds, tell: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Soak the run that writes into `folder`, OUT of `barsight live`; soak.json and soak.md go to `out` each
-    minute and at the end. Return the content of soak.json.
+    """Soak-test the run that writes into `folder`, OUT of `barsight live`; return the content of soak.json.
 
-    Ends after plan.hours, at Ctrl-C or SIGTERM, and where the run is gone. Raises InputError where there is
-    none.
+    soak.json and soak.md are written to `out` each minute and at the end. Ends after plan.hours, at Ctrl-C or
+    SIGTERM, or if the run is gone. Raises InputError if there is no run.
     """
     watch = RunWatch(folder)
     if not PROC.is_dir() or not watch.sample():
@@ -106,7 +105,7 @@ def _soak(
     watch: RunWatch, out: Path, plan: SoakPlan, bounds: SoakBounds, tell: Callable[[str], None],
     is_there: Callable[[], bool],
 ) -> dict[str, Any]:  # fmt: skip
-    """Sample, kill and write until it is over."""
+    """Sample, kill and write until the end."""
     sample_at = write_at = 0.0
     told: list[str] = []
 
@@ -126,7 +125,7 @@ def _soak(
         write_soak(content, out)
         return content
 
-    # Ctrl-C and SIGTERM end the soak as its time does, so that all is written.
+    # Ctrl-C and SIGTERM end the soak test like its time limit, so that everything is written.
     ends = dict.fromkeys((signal.SIGINT, signal.SIGTERM), INTERRUPTED)
     with handled_signals(ends, told.append), contextlib.suppress(_ToldError):
         tell(f"soaking; {out / 'soak.md'} has the table, each minute anew; Ctrl-C ends it")
@@ -141,11 +140,11 @@ def _soak(
 
 
 class _ToldError(Exception):
-    """The soak was told to end."""
+    """The soak test was told to end."""
 
 
 def _end(run: subprocess.Popen[bytes]) -> None:
-    """End the run as Ctrl-C does; a second one ends its measuring too."""
+    """End the run by Ctrl-C; a second one ends its measuring as well."""
     for number in (signal.SIGINT, signal.SIGINT, signal.SIGKILL):
         if run.poll() is None:
             run.send_signal(number)

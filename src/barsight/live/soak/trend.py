@@ -1,4 +1,4 @@
-"""Keep the least and the most of a figure over windows of time, and tell whether it grows."""
+"""Keep minimum and maximum of a quantity in time windows, and estimate whether it grows."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 MAX_WINDOWS = 240
-"""Beyond so many, two become one: memory is bounded however long it lasts."""
+"""Maximum number of windows; beyond it they are merged in pairs, so that memory is bounded for any
+duration.
+"""
 GROUPS, MIN_GROUPS = 24, 6
-"""A trend goes through the extremes of so many spans of time."""
+"""Maximum and minimum number of time spans through whose extremes a trend is fitted."""
 CYCLES = 2.0
 WINDOW_S = 20.0
 S_PER_H = 3600.0
@@ -17,7 +19,7 @@ S_PER_H = 3600.0
 
 @dataclass(frozen=True)
 class Trend:
-    """Growth of a figure an hour with 1 sigma, and its first and last value."""
+    """Growth of a quantity per hour with 1 sigma, and its first and last value."""
 
     per_h: float
     sigma_per_h: float
@@ -26,7 +28,7 @@ class Trend:
 
 
 class Windows:
-    """A figure's least and most in windows of time. last, peak: of all values."""
+    """Minimum and maximum of a quantity in time windows. last, peak: of all values."""
 
     def __init__(self) -> None:
         self._width_s = WINDOW_S
@@ -34,7 +36,7 @@ class Windows:
         self.first = self.last = self.peak = float("nan")
 
     def add(self, at_s: float, value: float) -> None:
-        """Take a value; at_s: rising."""
+        """Add a value; at_s must increase."""
         if not self._windows:
             self.first = self.peak = value
         self.last, self.peak = value, max(self.peak, value)
@@ -46,10 +48,10 @@ class Windows:
                 self._put(number // 2, low, high)
 
     def trend(self, after_s: float, cycle_s: float, *, of_peaks: bool) -> Trend | None:
-        """Fit a line through the least values from after_s on, or the most; None where they are too few.
+        """Fit a line through the minima from after_s on, or the maxima; None if there are too few.
 
-        cycle_s: after so long all begins anew; each span has `CYCLES` of them. The window that isn't over is
-        left out.
+        cycle_s: period after which everything begins anew; each span covers at least `CYCLES` of them. The
+        window in progress is left out.
         """
         first = int(np.ceil(after_s / self._width_s))
         whole = [one for one in self._windows[:-1] if one[0] >= first]

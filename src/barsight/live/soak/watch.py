@@ -1,4 +1,4 @@
-"""Watch a live run, survey after survey: its processes, what it says of them, how surveys ended."""
+"""Monitor a live run, survey after survey: its processes, what it reports of them, how surveys ended."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from barsight.live.soak.processes import COMMAND, HELPERS, SERVER, command_of, f
 from barsight.live.soak.trend import Windows
 
 LASTING = (COMMAND, *HELPERS.values())
-"""Processes that live as long as the command; the others live one survey."""
+"""Processes that live as long as the command; the others last one survey."""
 
 
 @dataclass
 class Watched:
-    """A process over the whole time, all that had its role. new: how often its number changed."""
+    """A role's process over the whole time, across restarts. new: how often its process id changed."""
 
     pid: int = 0
     new: int = -1
@@ -29,7 +29,7 @@ class Watched:
     descriptors: Windows = field(default_factory=Windows)
 
     def add(self, at_s: float, pid: int, rss_mib: float, descriptors: int, cpu_s: float) -> None:
-        """Take a sample."""
+        """Add a sample."""
         if pid != self.pid:
             self.pid, self._before_s, self.new = pid, 0.0, self.new + 1
         self.cpu_s += cpu_s - self._before_s
@@ -39,10 +39,10 @@ class Watched:
 
 
 class RunWatch:
-    """Watches the run in `folder`, that of one run or of surveys. command: its process, if it is known.
+    """Monitors the run in `folder`, a single one or one of surveys. command: its process, if known.
 
-    processes: by role. total_mib: memory of all together. restarts: processes that were started anew within
-    a survey. surveys: how many ended, by phase.
+    processes: by role. total_mib: memory of all together. restarts: processes that were restarted within a
+    survey. surveys: how many ended, by phase.
     """
 
     def __init__(self, folder: Path, command: int | None = None) -> None:
@@ -58,11 +58,11 @@ class RunWatch:
 
     @property
     def seconds(self) -> float:
-        """Return for how long it was watched."""
+        """Return how long the run has been monitored."""
         return time.monotonic() - self._began
 
     def state(self) -> dict[str, Any] | None:
-        """Read the run's state.json and count what came to an end since; None where there is none."""
+        """Read the run's state.json and count what has ended since the last call; None if there is no run."""
         here = running_folder(self._folder).resolve()
         if here != self._here:
             if self._here is not None:
@@ -87,31 +87,31 @@ class RunWatch:
 
     @property
     def survey_s(self) -> float:
-        """Return how long a survey takes, 0 where none has ended."""
+        """Return the duration of a survey, 0 if none has ended."""
         ended = sum(self.surveys.values())
         return self.seconds / ended if ended else 0.0
 
     @property
     def has_command(self) -> bool:
-        """Check that the command was there at the last sample."""
+        """Check that the command was running at the last sample."""
         return self._command is not None
 
     def owns(self, pid: int) -> bool:
-        """Check that a process is one of the run's now."""
+        """Check that a process currently belongs to the run."""
         return self._command is not None and command_of(pid) == self._command
 
     @property
     def survey(self) -> Path | None:
-        """Return the folder of the survey that was seen last."""
+        """Return the folder of the survey seen last."""
         return self._here
 
     def sample(self) -> bool:
-        """Note what each process uses now; return whether the run is there."""
+        """Record the current usage of each process; return whether the run exists."""
         state = self.state()
         roles = {} if state is None else {one["pid"]: role for role, one in state["processes"].items()}
         there = {} if self._command is None else family(self._command, roles)
         if not there and state is not None:
-            # A process of that number may be another by now: the run's has a fork server.
+            # The process id may have been reused; the run's own process has a fork server.
             told = family(state.get("pid", 0), roles)
             there = told if SERVER in told.values() else {}
             self._command = state["pid"] if there else None
