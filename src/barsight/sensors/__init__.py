@@ -1,1 +1,1 @@
-"""Sensors beside the crane: cameras, IMU and encoders, each with its clock."""
+"""Read the sensors of a crane: cameras, IMU and encoders, each with its clock."""

@@ -1,4 +1,4 @@
-"""Connect a camera by its serial number, count its blocks, and seek it again: what all drivers share."""
+"""Connect a camera by its serial number, count its blocks, and reconnect it: shared by all drivers."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from barsight.sensors.settings import CamerasSettings
 WAIT_MS = 200
 AGAIN_S = 1.0
 WRAP = 65535
-"""Cameras of GigE Vision 1 count blocks from 1 to this, then from 1 again."""
+"""Last block number of GigE Vision 1 cameras, which count from 1 to this, then from 1 again."""
 
 
 @dataclass(frozen=True, eq=False)
 class RawPicture:
-    """A picture as it came. device_ns: the camera's stamp of its exposure. arrival_ns: monotonic.
+    """A picture as received. device_ns: the camera's stamp of its exposure. arrival_ns: monotonic.
 
-    trigger: blocks that the camera has counted since it was connected.
+    trigger: number of blocks that the camera has counted since it was connected.
     """
 
     device_ns: int
@@ -33,7 +33,7 @@ class RawPicture:
 
 @dataclass(frozen=True)
 class RawLoss:
-    """Pictures that the camera counted and that did not come whole."""
+    """Pictures that the camera counted but that did not arrive complete."""
 
     cause: str
     count: int
@@ -44,14 +44,15 @@ PTP_ROLES = {"Master": 1, "Slave": 2}
 
 
 def are_one_clock(ptp: Iterable[str]) -> bool:
-    """Check by the cameras' PTP states whether their clocks are one: both follow a master, or one follows the
-    other.
+    """Check from the cameras' PTP states whether they share one clock.
+
+    They do if both follow a master, or if one follows the other.
     """
     return sorted(ptp) in (["Master", "Slave"], ["Slave", "Slave"])
 
 
 class Blocks:
-    """Counts the blocks of one stream. trigger: the last one's number, those that didn't come counted too."""
+    """Counts the blocks of one stream. trigger: number of the last block, missing ones included."""
 
     def __init__(self) -> None:
         self.trigger = 0
@@ -65,7 +66,7 @@ class Blocks:
         return gap
 
     def losses(self, gap: int, counters: Mapping[str, int]) -> Iterator[RawLoss]:
-        """Tell the causes of a gap from the driver's counters; what they don't explain is `missed`."""
+        """Yield the causes of a gap from the driver's counters; what they don't explain is `missed`."""
         for cause, counted in counters.items():
             count = min(counted - self._told.get(cause, 0), gap)
             self._told[cause] = counted
@@ -77,14 +78,14 @@ class Blocks:
 
 
 class CameraDriver(ABC):
-    """A camera of one serial number, connected when pictures are asked for and anew after it was lost.
+    """A camera with a given serial number, connected when pictures are requested and reconnected when lost.
 
-    size: width and height that the calibration has. connects: how often it was connected. ptp: the state that
-    it tells of its clock's PTP, "" where it is not connected or tells none.
+    size: width and height of the calibration. connects: how often it was connected. ptp: the PTP state that
+    it reports of its clock, "" if it is not connected or reports none.
     """
 
     errors: ClassVar[type[Exception]]
-    """All that the driver's library raises."""
+    """Exceptions that the driver's library raises."""
 
     def __init__(self, number: int, settings: CamerasSettings, size: tuple[int, int]) -> None:
         self.name, self.serial = f"cam{number}", settings.serials[number]
@@ -95,22 +96,22 @@ class CameraDriver(ABC):
     @staticmethod
     @abstractmethod
     def find(settings: CamerasSettings) -> dict[str, Any]:
-        """Find all cameras by serial number, without taking control of one."""
+        """Find all cameras by serial number, without taking control of any."""
 
     @abstractmethod
     def _control(self, device: Any) -> None:
-        """Take control, and set the camera."""
+        """Take control of the camera and configure it."""
 
     @abstractmethod
     def _release(self) -> None:
-        """Give the camera back."""
+        """Release the camera."""
 
     @abstractmethod
     def _stream(self, may_go_on: Callable[[], bool]) -> Iterator[RawPicture | RawLoss]:
         """Yield from one stream until the camera is lost."""
 
     def open(self, device: Any) -> None:
-        """Take control and set the camera. Raises InputError where it can't be or does not fit."""
+        """Take control and configure the camera. Raises InputError if this fails or it does not fit."""
         try:
             self._control(device)
         except InputError:
@@ -124,14 +125,14 @@ class CameraDriver(ABC):
             ) from error  # fmt: skip
 
     def close(self) -> None:
-        """Give the camera back, if it is held."""
+        """Release the camera, if it is held."""
         self.ptp = ""
         if self._camera is not None:
             self._release()
             self._camera = None
 
     def pictures(self, may_go_on: Callable[[], bool]) -> Iterator[RawPicture | RawLoss]:
-        """Yield pictures and losses as long as `may_go_on` says so; a camera that is lost is sought again."""
+        """Yield pictures and losses while `may_go_on` returns True; a lost camera is reconnected."""
         while may_go_on():
             try:
                 if self._camera is None:
@@ -145,7 +146,7 @@ class CameraDriver(ABC):
         self.close()
 
     def _expect(self, width: int, height: int, pixels: str) -> None:
-        """Raise InputError where the camera doesn't give what was calibrated."""
+        """Raise InputError if the camera doesn't provide what was calibrated."""
         if (width, height) != self._size:
             raise InputError(
                 self.name,
@@ -171,7 +172,7 @@ class CameraDriver(ABC):
 
 
 def _step(last: int, block: int) -> int:
-    """Count blocks from one number to the next."""
+    """Count the blocks from one number to another."""
     if last <= WRAP and block <= WRAP:
         return (block - last) % WRAP or 1
     return max(block - last, 1)

@@ -1,4 +1,4 @@
-"""Map a device's stamps to the host's monotonic clock, by when they arrive, without asking the device."""
+"""Map a device's stamps to the host's monotonic clock by their arrival times, without querying the device."""
 
 from __future__ import annotations
 
@@ -12,25 +12,29 @@ BUCKET_NS = NS_PER_S
 BUCKETS = 120
 SETTLE_NS, SETTLE_COUNT = NS_PER_S, 3
 DRIFT_AFTER_NS = 10 * NS_PER_S
-"""Drift is estimated once so much time is there; before, delays of a busy host would pass for drift."""
+"""Time span of stamps from which drift is estimated; over less, delays of a busy host would look like
+drift.
+"""
 MAX_DRIFT = 2e-4
-"""Quartz clocks are within 1e-4 of each other: a line that is steeper is made by a few late stamps."""
+"""Largest drift. Quartz clocks agree within 1e-4: a steeper line results from a few late stamps."""
 EARLY_NS = 50_000_000
-"""A stamp that would have arrived so long before it was made belongs to a clock that jumped."""
+"""A clock has jumped if a stamp seems to arrive this much (ns) before it was made."""
 LATE_NS, LATE_COUNT = NS_PER_S, 5
-"""So many stamps in turn that arrive so late do too."""
+"""A clock has also jumped if this many successive stamps arrive this late (ns)."""
 BEHIND_NS = 3 * NS_PER_S
-"""So do all stamps of so much time that arrive `EARLY_NS` late: no host is busy for so long on end."""
+"""A clock has also jumped if all stamps arrive `EARLY_NS` late for this long (ns): no host is busy that
+long.
+"""
 RECENT = 300
 
 
 class DeviceClock:
-    """Estimates offset and drift of a device's clock against the host's.
+    """Estimates offset and drift of a device's clock relative to the host's.
 
-    A stamp s arrives at a = s + offset + drift s + delay with delay >= 0. The least delays hardly vary, so
-    the line that lies under all points (s, a - s) and nearest to their middle gives offset and drift: an
-    edge of the lower convex hull [Zhang, Liu, Xia 2002]. The least delay itself stays in the offset: it is
-    constant, and the calibration of the camera against the IMU holds it.
+    A stamp s arrives at a = s + offset + drift s + delay with delay >= 0. The smallest delays hardly vary, so
+    the line below all points (s, a - s) and closest to them in their middle gives offset and drift: it is an
+    edge of the lower convex hull [Zhang, Liu, Xia 2002]. The smallest delay itself stays in the offset: it is
+    constant, and the calibration of the camera against the IMU includes it.
     """
 
     def __init__(self) -> None:
@@ -46,7 +50,7 @@ class DeviceClock:
         self._offset_ns, self._drift = 0.0, 0.0
 
     def add(self, device_ns: int, arrival_ns: int) -> bool:
-        """Take a stamp and when it arrived (monotonic); return whether the clock is settled."""
+        """Add a stamp and its arrival time (monotonic); return whether the clock is settled."""
         if self._origin is not None and self.is_settled:
             delay = arrival_ns - self.host_ns(device_ns)
             self._late = self._late + 1 if delay > LATE_NS else 0
@@ -73,7 +77,7 @@ class DeviceClock:
         return self.is_settled
 
     def _is_behind(self, delay_ns: int, arrival_ns: int) -> bool:
-        """Take a stamp's delay; tell whether all of the last while were late."""
+        """Add a stamp's delay; return whether all recent stamps were late."""
         self._behind = self._behind + 1 if delay_ns > EARLY_NS else 0
         if self._behind <= 1:
             self._behind_ns = arrival_ns
@@ -81,29 +85,29 @@ class DeviceClock:
 
     @property
     def is_settled(self) -> bool:
-        """Check whether enough stamps came since the beginning or the last jump."""
+        """Check whether enough stamps have arrived since the beginning or the last jump."""
         if self._origin is None or not self._minima:
             return False
         return self._count >= SETTLE_COUNT and self._bucket * BUCKET_NS >= SETTLE_NS
 
     def host_ns(self, device_ns: int) -> int:
-        """Return a device's stamp on the host's monotonic clock."""
+        """Convert a device's stamp to the host's monotonic clock."""
         assert self._origin is not None
         since = device_ns - self._origin[0]
         return device_ns + self._origin[1] + round(self._offset_ns + self._drift * since)
 
     @property
     def drift_ppb(self) -> int:
-        """Return how much slower than the host's the device's clock runs, in 1e-9."""
+        """Return by how much the device's clock runs slower than the host's, in 1e-9."""
         return round(self._drift * 1e9)
 
     @property
     def jitter_ns(self) -> int:
-        """Return the 99th percentile of the last stamps' delays beyond the least one."""
+        """Return the 99th percentile of the latest stamps' delays beyond the smallest one."""
         return round(float(np.percentile(self._delays, 99))) if self._delays else 0
 
     def _fit(self) -> None:
-        """Lay the line under the least delays."""
+        """Fit the line below the smallest delays."""
         points = list(self._minima)
         if points[-1][0] - points[0][0] < DRIFT_AFTER_NS:
             self._drift, self._offset_ns = 0.0, float(min(apart for _, apart in points))

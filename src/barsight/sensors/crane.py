@@ -1,4 +1,4 @@
-"""Bring cameras, IMU and encoders onto one clock and into time's order: the `Source` of a real crane."""
+"""Bring cameras, IMU and encoders onto one clock and into time order: the `Source` of a real crane."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from barsight.sensors.source import LivePicture, LostPicture, Packet, Readings, 
 WAIT_S = 0.01
 SIGNS_EVERY_S = 1.0
 HOLD_INTERVALS = 3
-"""A picture waits so many intervals for an older one of the other camera."""
+"""Time in picture intervals that a picture waits for an older one of the other camera."""
 RAW_PICTURES, RAW_READINGS = 256, 1 << 16
-"""So many wait at most while all is held up: the fastest IMU's readings of ten seconds."""
+"""Queue sizes for pictures and readings: as many readings as the fastest IMU provides in ten seconds."""
 ONE_CLOCK_NS = 5_000_000
-"""The least delays of two cameras on one network are no further apart."""
+"""Largest difference in ns between the smallest delays of two cameras on one network."""
 
 Item = tuple[str, RawPicture | RawLoss | RawReading]
 
 
 @dataclass
 class _Stream:
-    """A sensor's clock, its last stamp given on, and what it lost. dropped: readings that found no room."""
+    """A sensor's clock, the last stamp delivered, and losses. dropped: readings that found the queue full."""
 
     clock: DeviceClock = field(default_factory=DeviceClock)
     last_ns: int = 0
@@ -42,9 +42,9 @@ class _Stream:
 class CraneSource:
     """`Source` of two cameras, an IMU and encoders.
 
-    Every stamp is the device's own, mapped to the host's monotonic clock by its `DeviceClock`; `epoch_ns`
-    added to that gives the run's stamps, which a step of the host's wall clock can't move. Cameras whose
-    clocks PTP makes one are mapped by one, cam0's, so that no delay tells them apart.
+    Every stamp is the device's own, mapped to the host's monotonic clock by its `DeviceClock`. Adding
+    `epoch_ns` gives the run's stamps, which a step of the host's wall clock can't shift. Cameras with clocks
+    synchronised by PTP are mapped with one clock, cam0's, so that their delays can't separate them.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class CraneSource:
         self._overflow = self._device_ns = 0
 
     def packets(self, after: dict[str, int]) -> Iterator[Packet]:
-        """Yield what comes, pictures in time's order; see `Source.packets`."""
+        """Yield packets as they arrive, pictures in time order; see `Source.packets`."""
         for name, stream in self._streams.items():
             stream.last_ns = after[name]
         threads = [
@@ -106,7 +106,7 @@ class CraneSource:
             self._items.put((name, item))
 
     def _next(self) -> Iterator[Packet]:
-        """Yield what one wait gives; readings that came together make one packet."""
+        """Yield the result of one wait; readings that arrived together form one packet."""
         readings: dict[str, list[tuple[int, tuple[float, ...]]]] = {}
         try:
             name, item = self._items.get(timeout=WAIT_S)
@@ -162,7 +162,7 @@ class CraneSource:
         heapq.heappush(self._held, (stamp_ns, camera, item.arrival_ns, picture))
 
     def _are_one(self, device_ns: int) -> bool:
-        """Check whether both cameras' clocks are one: they say so, and a stamp is as old on both."""
+        """Check whether the cameras share one clock: they report so, and a stamp has the same age on both."""
         clocks = [self._streams[f"cam{k}"].clock for k in (0, 1)]
         if not are_one_clock(camera.ptp for camera in self._cameras):
             return False
@@ -171,8 +171,8 @@ class CraneSource:
         return abs(clocks[0].host_ns(device_ns) - clocks[1].host_ns(device_ns)) < ONE_CLOCK_NS
 
     def _ordered(self, until_ns: int | None) -> Iterator[Packet]:
-        """Yield held pictures that no older one can follow: both cameras are past them, or they came before
-        `until_ns` (monotonic); None: all.
+        """Yield held pictures that no older one can follow: both cameras are past them, or they arrived
+        before `until_ns` (monotonic); None: all.
         """
         past_ns = min(self._streams[f"cam{k}"].last_ns for k in (0, 1))
         while self._held:

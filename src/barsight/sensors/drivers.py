@@ -1,4 +1,4 @@
-"""Choose the cameras' driver that crane.toml names, and prove cameras by it."""
+"""Choose the camera driver named in crane.toml, and check cameras with it."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from barsight.sensors.settings import CamerasSettings
 
 
 def both_cameras(settings: CamerasSettings, size: tuple[int, int]) -> tuple[CameraDriver, CameraDriver]:
-    """Make cam0 and cam1, not connected yet. size: width and height that the calibration has.
+    """Make cam0 and cam1, not connected yet. size: width and height of the calibration.
 
-    Raises ConfigError where the driver isn't installed.
+    Raises ConfigError if the driver isn't installed.
     """
     driver = _driver(settings)
     return driver(0, settings, size), driver(1, settings, size)
 
 
 def prove_cameras(settings: CamerasSettings, size: tuple[int, int]) -> tuple[str, str]:
-    """Prove that cam0 and cam1 are there and can be set; return what they tell of their clocks' PTP. size:
-    width and height that the calibration has.
+    """Check that cam0 and cam1 are present and can be configured; return their PTP states.
 
-    Raises InputError for one that isn't there, is in use, or does not fit its calibration.
+    size: width and height of the calibration. Raises InputError for a camera that is absent, in use, or does
+    not fit its calibration.
     """
     cameras = both_cameras(settings, size)
     found = cameras[0].find(settings)
@@ -40,7 +40,7 @@ def prove_cameras(settings: CamerasSettings, size: tuple[int, int]) -> tuple[str
 
 
 def _driver(settings: CamerasSettings) -> type[CameraDriver]:
-    """Import the driver, an extra, which replays do without."""
+    """Import the driver, an extra that replays don't need."""
     if settings.driver == "pylon":
         from barsight.sensors.pylon import PylonCamera
 

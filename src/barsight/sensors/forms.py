@@ -1,4 +1,4 @@
-"""Lay out readings of IMU and encoders as their senders do.
+"""Pack readings of IMU and encoders in the format of their senders.
 
 A reading is little-endian: four bytes of kind (`BSI1` for the IMU, `BSC1` for the crane), a sequence number
 (uint32), the stamp of the measurement on the sender's clock (int64, ns), and float64 values: gyro x, y, z

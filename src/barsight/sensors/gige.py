@@ -1,4 +1,4 @@
-"""Take pictures from a GigE Vision camera, through viva-genicam."""
+"""Acquire pictures from a GigE Vision camera, through viva-genicam."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ with extra("cameras"):
 
 SEARCH_MS = 1000
 SILENT_S = 2.0
-"""A camera that gives nothing for so long and can't be controlled any more is connected anew."""
+"""Time in seconds without data after which a camera that can't be controlled either is reconnected."""
 STOPPED_S = 0.1
-"""A camera needs so long to end its stream."""
+"""Time in seconds that a camera needs to end its stream."""
 SERIALS = ("DeviceSerialNumber", "DeviceID")
 PTP_STATES = {"PtpStatus": "PtpDataSetLatch", "GevIEEE1588Status": "GevIEEE1588DataSetLatch"}
-"""The feature that tells PTP's state, by its newer and its older name, and the command that latches it."""
+"""Features with the PTP state, by the newer and the older name, and the command that latches each."""
 PTP_EVERY_S = 2.0
 CAUSES = {"frames_incomplete": "incomplete", "frames_missed": "missed", "frames_backpressure": "backpressure"}
 
@@ -33,7 +33,7 @@ class GigeCamera(CameraDriver):
 
     @staticmethod
     def find(settings: CamerasSettings) -> dict[str, Any]:
-        """Find all cameras on the network by serial number, without taking control of one."""
+        """Find all cameras on the network by serial number, without taking control of any."""
         found: dict[str, Any] = {}
         for device in vg.discover(timeout_ms=SEARCH_MS, iface=settings.interface):
             try:
@@ -45,7 +45,7 @@ class GigeCamera(CameraDriver):
 
     def _control(self, device: Any) -> None:
         camera = self._camera = vg.connect_gige(device, iface=self._settings.interface)
-        # A camera whose host was killed sends on to where that was.
+        # A camera whose host was killed continues to send to it.
         with contextlib.suppress(vg.GenicamError):
             camera.acquisition_stop()
             time.sleep(STOPPED_S)
@@ -89,7 +89,7 @@ class GigeCamera(CameraDriver):
                         time.monotonic() - heard > SILENT_S
                         and self._camera.control_state != vg.ControlState.HELD
                     ):
-                        return  # else nothing triggers it
+                        return  # otherwise it isn't being triggered
                     continue
                 arrival_ns, heard = time.monotonic_ns(), time.monotonic()
                 if (gap := blocks.gap(frame.block_id)) > 0:

@@ -1,4 +1,4 @@
-"""Form pairs of pictures as they come, by stamp and, where cameras count it, by trigger."""
+"""Form pairs of pictures as they arrive, by stamp and, if the cameras count it, by trigger."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ NEW_STEPS = 3
 
 @dataclass(eq=False)
 class PairFormer:
-    """Pairs each picture with the other camera's whose stamp is nearest, no further off than `tolerance_ns`.
+    """Pairs each picture with the other camera's picture nearest in time, at most `tolerance_ns` apart.
 
-    Where both carry a trigger's number, the difference of the two numbers must stay as it was: pictures of
-    which it does not are dropped, until `NEW_STEPS` in turn agree on another difference. lost: pictures of
-    cam0 and cam1 that found no partner. contradicted: pictures whose stamps and numbers contradict each
-    other. skew_ns: cam1's stamp minus cam0's of the last pair; max_skew_ns: its largest size.
+    If both carry a trigger number, the difference of the two numbers must stay constant: pictures for which
+    it changes are dropped, until `NEW_STEPS` in succession agree on another difference. lost: unpaired
+    pictures of cam0 and cam1. contradicted: pictures whose stamps and numbers contradict each other. skew_ns:
+    cam1's stamp minus cam0's in the last pair; max_skew_ns: its largest magnitude.
     """
 
     tolerance_ns: int
@@ -34,8 +34,8 @@ class PairFormer:
     )
 
     def push(self, picture: LivePicture) -> Iterator[tuple[StereoFrame, int]]:
-        """Take the next picture in time's order; yield pairs that are certain, each with its exposure (ns,
-        monotonic clock).
+        """Add the next picture in time order; yield pairs that are certain, each with its exposure
+        (monotonic, ns).
         """
         self._waiting[picture.camera].append(picture)
         lefts, rights = self._waiting
@@ -62,13 +62,13 @@ class PairFormer:
                 self._drop(camera)
 
     def end(self) -> None:
-        """Count what still waits as lost."""
+        """Count the pictures still waiting as lost."""
         for camera in (0, 1):
             while self._waiting[camera]:
                 self._drop(camera)
 
     def _triggers_agree(self, left: LivePicture, right: LivePicture) -> bool:
-        """Check whether the numbers of both triggers are as far apart as before."""
+        """Check whether the difference of the trigger numbers is unchanged."""
         if left.trigger is None or right.trigger is None:
             return True
         step = left.trigger - right.trigger

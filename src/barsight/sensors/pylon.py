@@ -1,4 +1,4 @@
-"""Take pictures from a Basler camera, through pypylon."""
+"""Acquire pictures from a Basler camera, through pypylon."""
 
 from __future__ import annotations
 
@@ -16,27 +16,29 @@ with extra("basler"):
     from pypylon import genicam, pylon
 
 EXPOSURE, RATE = ("ExposureTime", "ExposureTimeAbs"), ("AcquisitionFrameRate", "AcquisitionFrameRateAbs")
-"""Names of newer cameras, and of older ones by GigE."""
+"""Feature names of newer cameras, and of older GigE cameras."""
 TICKS, STAMPS_NS = "GevTimestampTickFrequency", "TimestampLatchValue"
-"""Older cameras by GigE tell how long a tick is; the others that have a clock stamp in ns."""
+"""Features of older GigE cameras, which report the length of a tick; other cameras with a clock stamp in
+ns.
+"""
 UNDERRUNS = "Statistic_Buffer_Underrun_Count"
 HEADERS_BYTES = 28
-"""Of IPv4 and UDP, which the camera counts as part of a packet."""
+"""Size of the IPv4 and UDP headers, which the camera counts as part of a packet."""
 
 
 class PylonCamera(CameraDriver):
-    """A Basler camera, by GigE or USB."""
+    """A Basler camera, connected by GigE or USB."""
 
     errors = genicam.GenericException
 
     @staticmethod
     def find(settings: CamerasSettings) -> dict[str, Any]:
-        """Find all cameras at this computer by serial number, without taking control of one."""
+        """Find all cameras at this computer by serial number, without taking control of any."""
         return {one.GetSerialNumber(): one for one in pylon.TlFactory.GetInstance().EnumerateDevices()}
 
     def _control(self, device: Any) -> None:
         camera = self._camera = pylon.InstantCamera(pylon.TlFactory.GetInstance().CreateDevice(device))
-        # pylon's own configuration would take away the camera's trigger.
+        # pylon's default configuration would disable the camera's trigger.
         camera.RegisterConfiguration(
             pylon.ConfigurationEventHandler(), pylon.RegistrationMode_ReplaceAll, pylon.Cleanup_Delete
         )
@@ -71,10 +73,10 @@ class PylonCamera(CameraDriver):
             arrival_ns = time.monotonic_ns()
             if not result.IsValid():
                 if camera.IsCameraDeviceRemoved() or not camera.IsGrabbing():
-                    return  # else nothing triggers it
+                    return  # otherwise it isn't being triggered
                 continue
             if not result.GrabSucceeded():
-                failed += 1  # its block is missing before the next one that comes
+                failed += 1  # its block counts as missing before the next one
                 continue
             if (gap := blocks.gap(result.BlockID)) > 0:
                 starved = underruns.Value if genicam.IsReadable(underruns) else 0
@@ -85,7 +87,7 @@ class PylonCamera(CameraDriver):
             yield picture
 
     def _find_ticks(self) -> int:
-        """Return how many ticks of the camera's clock make a second. Raises InputError where it has none."""
+        """Return the ticks per second of the camera's clock. Raises InputError if it has no clock."""
         if genicam.IsReadable(ticks := self._nodes.GetNode(TICKS)):
             return int(ticks.Value)
         if genicam.IsImplemented(self._nodes.GetNode(STAMPS_NS)):

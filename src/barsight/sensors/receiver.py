@@ -1,4 +1,4 @@
-"""Receive readings of IMU and encoders, by UDP or a serial line; `forms` lays them out."""
+"""Receive readings of IMU and encoders, by UDP or a serial line, in the format of `forms`."""
 
 from __future__ import annotations
 
@@ -17,12 +17,14 @@ from barsight.sensors.settings import ReadingsSettings
 MAX_BYTES = 65536
 NUMBERS = 1 << 32
 ANEW_AFTER_NS, ANEW_COUNT = NS_PER_S // 2, 3
-"""No network holds a reading back for so long, nor so many, one after another, with none newer between."""
+"""Time (ns) since the last newer reading, and number of older readings in succession, that prove a sender's
+restart: no network delays so many for so long.
+"""
 
 
 @dataclass(frozen=True)
 class RawReading:
-    """A reading as it came. device_ns: its stamp. arrival_ns: monotonic. lost: readings missing before it."""
+    """A reading as received. device_ns: its stamp. arrival_ns: monotonic. lost: readings missing before."""
 
     device_ns: int
     arrival_ns: int
@@ -31,27 +33,30 @@ class RawReading:
 
 
 class Way(Protocol):
-    """A way that readings come. keeps_order: none is overtaken. trouble: why nothing can come now, or ""."""
+    """Channel by which readings arrive.
+
+    keeps_order: no reading overtakes another. trouble: why nothing can arrive now, or "".
+    """
 
     keeps_order: bool
     trouble: str
 
     def receive(self) -> tuple[bytes, int]:
-        """Wait 0.1 s at most; return whole readings, one after another, and how many were torn."""
+        """Wait at most 0.1 s; return complete readings, concatenated, and the number of damaged ones."""
         ...
 
     def close(self) -> None:
-        """Give it free."""
+        """Release the port or device."""
         ...
 
 
 class UdpPort:
-    """Receives datagrams of readings of `size` bytes."""
+    """Receives datagrams with readings of `size` bytes."""
 
     keeps_order, trouble = False, ""
 
     def __init__(self, sensor: str, size: int, port: int, host: str = "0.0.0.0") -> None:
-        """Raises ConfigError where the port is taken."""
+        """Open the port. Raises ConfigError if it is taken."""
         self._size = size
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.settimeout(0.1)
@@ -64,7 +69,7 @@ class UdpPort:
             ) from error
 
     def receive(self) -> tuple[bytes, int]:
-        """Return a datagram, see `Way`."""
+        """Return a datagram; see `Way`."""
         try:
             data = self._socket.recv(MAX_BYTES)
         except TimeoutError:
@@ -72,17 +77,17 @@ class UdpPort:
         return (b"", 1) if not data or len(data) % self._size else (data, 0)
 
     def close(self) -> None:
-        """Free the port."""
+        """Release the port."""
         self._socket.close()
 
 
 class Sequence:
-    """Judges the numbers that a sender counts its readings by.
+    """Judges the sequence numbers of a sender's readings.
 
-    A number that isn't ahead is doubled or was overtaken on its way, or its sender began anew: then its stamp
-    is later than the last one's, or, where the sender's clock began anew too, nothing newer comes any more.
-    So did one that is further ahead than the sensor could have counted meanwhile. overtaken: readings left
-    out; restarts: how often a sender began anew.
+    A number that isn't ahead is a duplicate or was overtaken, or its sender has restarted: then its stamp is
+    later than the last one or, if the sender's clock has restarted too, nothing newer arrives any more. A
+    number further ahead than the sensor could have counted meanwhile is also a restart. overtaken: readings
+    left out; restarts: how often a sender has restarted.
     """
 
     def __init__(self, rate_hz: float, *, keeps_order: bool) -> None:
@@ -91,7 +96,7 @@ class Sequence:
         self._behind = self.overtaken = self.restarts = 0
 
     def lost_before(self, number: int, stamp_ns: int, arrival_ns: int) -> int | None:
-        """Take a reading; return how many are missing before it, None where it is to be left out."""
+        """Add a reading; return how many are missing before it, or None if it must be left out."""
         before, self._last = self._last, (number, stamp_ns, arrival_ns)
         if before is None:
             return 0
@@ -112,17 +117,17 @@ class Sequence:
 
 
 class ReadingReceiver:
-    """Receives readings of `imu` or `crane`. torn: datagrams or pieces of a stream that aren't ours."""
+    """Receives readings of `imu` or `crane`. torn: datagrams or pieces of a stream in an unknown format."""
 
     def __init__(self, sensor: str, settings: ReadingsSettings) -> None:
-        """Raises ConfigError where a UDP port is taken; a serial device may come later."""
+        """Open the channel. Raises ConfigError if a UDP port is taken; a serial device may appear later."""
         self._mark, self._form = FORMS[sensor]
         self.torn = 0
         self._way: Way
         if settings.port is not None:
             self._way = UdpPort(sensor, self._form.size, settings.port)
         else:
-            from barsight.sensors.serial_line import SerialLine  # termios isn't everywhere
+            from barsight.sensors.serial_line import SerialLine  # termios isn't available everywhere
 
             assert settings.device is not None and settings.baud is not None
             self._way = SerialLine(self._mark, self._form.size, settings.device, settings.baud)
@@ -130,18 +135,18 @@ class ReadingReceiver:
 
     @property
     def trouble(self) -> str:
-        """Tell why nothing can come now; "" where something may."""
+        """Return why nothing can arrive now, "" if something can."""
         return self._way.trouble
 
     def readings(self, may_go_on: Callable[[], bool], now_ns: Callable[[], int]) -> Iterator[RawReading]:
-        """Yield readings as long as `may_go_on` says so. now_ns: tells the monotonic clock."""
+        """Yield readings while `may_go_on` returns True. now_ns: returns the monotonic time."""
         while may_go_on():
             data, torn = self._way.receive()
             self.torn += torn
             yield from self._parsed(data, now_ns())
 
     def close(self) -> None:
-        """Free the port or device."""
+        """Release the port or device."""
         self._way.close()
 
     def _parsed(self, data: bytes, arrival_ns: int) -> Iterator[RawReading]:

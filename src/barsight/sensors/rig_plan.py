@@ -1,4 +1,4 @@
-"""Plan a rig for a yard: lens, baseline, exposure, rate and data from range, width and what shall be told."""
+"""Plan a rig for a yard: lens, baseline, exposure, rate and data from range, width and required accuracy."""
 
 from __future__ import annotations
 
@@ -9,31 +9,35 @@ from barsight.core.errors import ConfigError, MeasurementError
 from barsight.core.settings.values import expect_ranges
 
 DISPARITY_SIGMA_PX = 0.1
-"""Robust sigma of a match on rendered yards (benchmarks/results/2026-11-23-live-faults-and-plan.md)."""
+"""Robust sigma in pixels of a match on rendered yards
+(benchmarks/results/2026-11-23-live-faults-and-plan.md).
+"""
 LENSES_MM = (3.5, 4.0, 5.0, 6.0, 8.0, 12.0, 16.0, 25.0, 35.0)
-"""Focal lengths that lenses for C mount are sold with."""
+"""Focal lengths in millimetres of common C-mount lenses."""
 STOPS = (1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0)
 LANE_OVERLAP_RATIO = 0.1
-"""Neighbouring passes share so much of a lane."""
+"""Overlap of neighbouring passes, as a share of a lane."""
 MIN_BAR_PX = 10.0
-"""Pixels across a bar on the floor: thinner ones are measured worse (docs/explanation/stereo.md)."""
+"""Minimum width of a bar on the floor in pixels: thinner bars are measured less accurately
+(docs/explanation/stereo.md).
+"""
 MAX_DISPARITY_RATIO = 1 / 3
-"""Of a row at the highest pile: what is beyond its disparity only one camera sees."""
+"""Largest disparity at the highest pile, as a share of a row; only one camera sees the pixels beyond it."""
 MAX_BLUR_PX = 0.5
 TURN_RADPS = 0.01
-"""Turn rate of a swaying crane."""
+"""Turn rate of a swaying crane in rad/s."""
 MIN_VIEWS, MIN_RATE_HZ = 8, 5.0
-"""Frames that see each place, and the least rate at which the crane's way is followed."""
+"""Minimum number of frames that see each place, and minimum rate (Hz) for tracking the crane."""
 KEYFRAME_WAY_M, KEPT_BYTES_PER_PIXEL = 0.1, 16
-"""Of a live run: its keyframes' distance, and what it keeps of a pair until it is measured."""
+"""Keyframe distance (m) of a live run, and bytes per pixel of a pair kept until it is measured."""
 MAX_PASSES = 12
 LINK_RATIO = 1.1
-"""What packets' headers add."""
+"""Data rate with packet headers, relative to that of the pixels alone."""
 
 
 @dataclass(frozen=True)
 class CatalogueCamera:
-    """A class of camera by its sensor: size, pixel in micrometres, the most pictures a second on 1 Gbit/s."""
+    """Camera class by its sensor: size, pixel pitch in micrometres, largest picture rate on 1 Gbit/s."""
 
     width_px: int
     height_px: int
@@ -51,10 +55,10 @@ CAMERAS = {
 
 @dataclass(frozen=True)
 class Wish:
-    """Wishes of a yard. range_m: from the cameras to the floor. width_m: of the yard, along the bars.
+    """Requirements of a yard. range_m: from the cameras to the floor. width_m: of the yard, along the bars.
 
-    stack_m: height of the highest pile. bar_m: diameter of the thinnest bar. sigma_m: of a depth on the
-    floor, one match. speed_mps: of the crane.
+    stack_m: height of the highest pile. bar_m: diameter of the thinnest bar. sigma_m: of a depth on the floor
+    from one match. speed_mps: of the crane.
     """
 
     range_m: float
@@ -76,16 +80,16 @@ class Wish:
 
     @property
     def near_m(self) -> float:
-        """Return the range to the highest pile's top."""
+        """Return the range to the top of the highest pile."""
         return self.range_m - self.stack_m
 
 
 @dataclass(frozen=True)
 class RigPlan:
-    """A rig that fits. focal_px, focal_mm: of the lens. baseline_m: along the travel, across the bars.
+    """A rig that meets the requirements. focal_px, focal_mm: of the lens.
 
-    passes: lanes that the width is taken in. exposure_us, f_number: the longest, the least. rate_hz: of
-    pictures.
+    baseline_m: along the travel, across the bars. passes: number of lanes that cover the width.
+    exposure_us: longest exposure. f_number: smallest f-number. rate_hz: picture rate.
     """
 
     wish: Wish
@@ -99,26 +103,26 @@ class RigPlan:
 
     @property
     def focal_px(self) -> float:
-        """Return f / pixel."""
+        """Return the focal length in pixels: f / pixel."""
         return 1e3 * self.focal_mm / self.camera.pixel_um
 
     @property
     def common_m(self) -> float:
-        """Return what both cameras see along the travel at the highest pile: W z / f - B."""
+        """Return the common field of view along the travel at the highest pile: W z / f - B."""
         return self.camera.width_px * self.wish.near_m / self.focal_px - self.baseline_m
 
     @property
     def lane_m(self) -> float:
-        """Return what is seen along the bars at the highest pile: H z / f."""
+        """Return the field of view along the bars at the highest pile: H z / f."""
         return self.camera.height_px * self.wish.near_m / self.focal_px
 
     @property
     def data_mbps(self) -> float:
-        """Return what both cameras send, Mbit/s: 2 W H rate 8 bits, and headers."""
+        """Return the data rate of both cameras, Mbit/s: 2 W H rate 8 bits, plus headers."""
         return LINK_RATIO * 2 * self.camera.width_px * self.camera.height_px * self.rate_hz * 8e-6
 
     def sums(self) -> tuple[tuple[str, str, str], ...]:
-        """Return each figure: name, value, formula."""
+        """List the calculated figures: name, value, formula."""
         wish, f, near = self.wish, self.focal_px, self.wish.near_m
         far_mm, near_mm = (1e3 * depth_sigma_m(z, f, self.baseline_m) for z in (wish.range_m, near))
         max_px, min_px = (f * self.baseline_m / z for z in (near, wish.range_m))
@@ -142,12 +146,12 @@ class RigPlan:
         )
 
     def disk_gib(self) -> float:
-        """Compute what 35 m need until they are measured, GiB."""
+        """Compute the disk space in GiB that 35 m of travel need until they are measured."""
         kept = self.camera.width_px * self.camera.height_px * KEPT_BYTES_PER_PIXEL
         return 35 / KEYFRAME_WAY_M * kept / 2**30
 
     def parts(self) -> tuple[tuple[str, str], ...]:
-        """Return the parts list: what, and what it must do."""
+        """List the parts: item and requirement."""
         camera, links = self.camera, 1 if self.data_mbps < 900 else 2
         size = f"{camera.width_px}x{camera.height_px}, {camera.pixel_um:g} um, mono, global shutter"
         return (
@@ -167,14 +171,14 @@ class RigPlan:
 
 
 def depth_sigma_m(range_m: float, focal_px: float, baseline_m: float) -> float:
-    """Compute the sigma of one depth, m: Z^2 sigma_d / (f B)."""
+    """Compute the sigma of a depth from one match, m: Z^2 sigma_d / (f B)."""
     return range_m**2 * DISPARITY_SIGMA_PX / (focal_px * baseline_m)
 
 
 def plan_rig(wish: Wish, camera: CatalogueCamera) -> RigPlan:
-    """Choose the fewest lanes, and the longest lens for them, that tell the thinnest bar.
+    """Choose the fewest lanes, and the longest lens for them, that resolve the thinnest bar.
 
-    Raises MeasurementError where no lens or baseline does, with what would help.
+    Raises MeasurementError if no lens or baseline does, with what would help.
     """
     for passes in range(1, MAX_PASSES + 1):
         lane_m = wish.width_m / passes * (1 + LANE_OVERLAP_RATIO * (passes > 1))

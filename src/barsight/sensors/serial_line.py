@@ -1,4 +1,4 @@
-"""Read a serial line, a stream of readings that may begin, tear and end anywhere. Needs termios (Linux)."""
+"""Read a serial line: a stream of readings that may start, tear and end anywhere. Needs termios (Linux)."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from barsight.sensors.forms import CRC_BYTES
 
 WAIT_S = 0.1
 AGAIN_S = 1.0
-"""A device that isn't there is opened anew this often."""
+"""Interval in seconds between attempts to open a missing device."""
 READ_BYTES = 4096
 
 
 class SerialLine:
     """Receives readings that begin with `mark`, have `size` bytes and are each followed by their CRC-32.
 
-    A device that goes away is opened anew until it is back.
+    A device that disappears is reopened when it is back.
     """
 
     keeps_order = True
@@ -31,7 +31,7 @@ class SerialLine:
         self._buffer, self._skipped = bytearray(), 0
 
     def receive(self) -> tuple[bytes, int]:
-        """Return what came, see `Way`."""
+        """Return the data received; see `Way`."""
         if self._file is None and not self._opened():
             time.sleep(WAIT_S)
             return b"", 0
@@ -40,7 +40,7 @@ class SerialLine:
             return b"", 0
         try:
             data = os.read(self._file, READ_BYTES)
-        except BlockingIOError:  # something else reads it too
+        except BlockingIOError:  # another process reads it too
             return b"", 0
         except OSError:
             data = b""
@@ -57,14 +57,14 @@ class SerialLine:
             self._file = None
 
     def _opened(self) -> bool:
-        """Open the device raw, 8N1 without flow control; False where that can't be or isn't due."""
+        """Open the device raw, 8N1 without flow control; False if this fails or isn't due yet."""
         if time.monotonic() < self._due:
             return False
         self._due, file = time.monotonic() + AGAIN_S, None
         try:
             file = os.open(self._device, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
             *_, control = termios.tcgetattr(file)
-            control[termios.VMIN], control[termios.VTIME] = 1, 0  # else no bytes look like an end
+            control[termios.VMIN], control[termios.VTIME] = 1, 0  # else no data looks like the end
             speed, frame = getattr(termios, f"B{self._baud}"), termios.CS8 | termios.CREAD | termios.CLOCAL
             termios.tcsetattr(file, termios.TCSAFLUSH, [0, 0, frame, 0, speed, speed, control])
         except (OSError, termios.error) as error:
@@ -73,12 +73,12 @@ class SerialLine:
             self.trouble = os.strerror(error.args[0])
             return False
         self._file, self.trouble = file, ""
-        # The reading that is under way now came too early, and isn't torn.
+        # The reading in transit now began before the line was opened, so it isn't torn.
         self._buffer, self._skipped = bytearray(), 1 - self._size - CRC_BYTES
         return True
 
     def _cut(self) -> tuple[bytes, int]:
-        """Cut whole readings out of the buffer. Skipped bytes are torn readings, lengths rounded up."""
+        """Cut complete readings out of the buffer. Skipped bytes count as damaged readings, rounded up."""
         held, length = self._buffer, self._size + CRC_BYTES
         found, torn, at = bytearray(), 0, 0
         while at + length <= len(held):

@@ -19,7 +19,7 @@ BAUDS = (
     2000000, 2500000, 3000000, 3500000, 4000000,
 )  # fmt: skip
 BITS_PER_BYTE = 10
-"""On a serial line, start and stop bit among them."""
+"""Bits per byte on a serial line, including start and stop bit."""
 MAX_LEVER_M = 30.0
 
 
@@ -28,22 +28,24 @@ class CamerasSettings:
     """The two cameras, triggered together, Mono8."""
 
     serials: tuple[str, str]
-    """Serial numbers (DeviceSerialNumber, else DeviceID) of cam0 and cam1."""
+    """Serial numbers (DeviceSerialNumber, otherwise DeviceID) of cam0 and cam1."""
     rate_hz: float
-    """Pictures a second."""
+    """Picture rate in pictures per second."""
     exposure_us: float | None = None
-    """Time of exposure in microseconds; the camera's own where it isn't given."""
+    """Exposure time in microseconds; without it the camera's own setting is kept."""
     trigger: str = "free"
-    """Line that triggers both cameras, like Line1; `free` leaves the camera's own setting."""
+    """Input line that triggers both cameras, for example Line1; `free` keeps the camera's own setting."""
     packet_size_bytes: int = 8000
-    """Payload of a packet; over 1500 the network must carry jumbo frames (MTU 9000)."""
+    """Payload of a packet in bytes; above 1500 the network must carry jumbo frames (MTU 9000)."""
     interface: str | None = None
-    """Name or IPv4 address of the host's interface to the cameras; all are searched where it isn't given.
+    """Name or IPv4 address of the host's network interface to the cameras; without it all are searched.
 
-    The driver `pylon` searches all.
+    The driver `pylon` always searches all.
     """
     driver: Literal["gige", "pylon"] = "gige"
-    """`gige`: GigE Vision of any make, extra `cameras`. `pylon`: Basler's, by GigE or USB, extra `basler`."""
+    """Camera driver. `gige`: any GigE Vision camera, extra `cameras`. `pylon`: Basler by GigE or USB, extra
+    `basler`.
+    """
 
     def __post_init__(self) -> None:
         expect_values(self, "cameras.")
@@ -56,24 +58,26 @@ class CamerasSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class ReadingsSettings:
-    """Tells how a sensor's readings come: to a UDP port, or by a serial line."""
+    """Input of a sensor's readings: a UDP port or a serial line."""
 
     port: int | None = None
-    """UDP port that the datagrams come to; this or `device`."""
+    """UDP port on which the datagrams arrive; give this or `device`."""
     device: str | None = None
-    """Serial line that the readings come by, like /dev/serial/by-id/usb-...; this or `port`. Linux only."""
+    """Serial line that carries the readings, such as /dev/serial/by-id/usb-...; give this or `port`. Linux
+    only.
+    """
     baud: int | None = None
-    """Speed of the serial line, bits a second, like 921600."""
+    """Speed of the serial line in bits per second, for example 921600."""
     rate_hz: float
-    """Readings a second."""
+    """Rate in readings per second."""
 
     @property
     def way(self) -> str:
-        """Tell the way in words."""
+        """Describe the input in words."""
         return f"UDP port {self.port}" if self.device is None else f"{self.device} at {self.baud} baud"
 
     def _expect_way(self, section: str, sensor: str) -> None:
-        """Raise ConfigError where no way is named or two are, or where the line is too slow."""
+        """Raise ConfigError if neither or both inputs are given, or if the line is too slow."""
         expect_ranges(self, section, port=PORTS)
         if (self.port is None) == (self.device is None):
             told = "neither is" if self.port is None else "both are"
@@ -94,10 +98,10 @@ class ReadingsSettings:
 
 @dataclass(frozen=True)
 class ImuSettings(ReadingsSettings):
-    """The IMU, by UDP or a serial line; its axes are the body's."""
+    """The IMU, connected by UDP or a serial line; its axes are those of the body."""
 
     noise: Path | None = None
-    """Kalibr's imu.yaml with its noise densities."""
+    """Kalibr's imu.yaml with the noise densities of the IMU."""
 
     def __post_init__(self) -> None:
         expect_values(self, "imu.")
@@ -107,14 +111,14 @@ class ImuSettings(ReadingsSettings):
 
 @dataclass(frozen=True)
 class EncodersSettings(ReadingsSettings):
-    """The crane's encoders, by UDP or a serial line, and how the body hangs on the crane."""
+    """The crane's encoders, connected by UDP or a serial line, and the mounting of the body on the crane."""
 
     p_crane_body_m: tuple[float, float, float]
-    """The body's origin minus the crane point, yard axes, in metres."""
+    """Position of the body's origin relative to the crane point, in yard axes and metres."""
     R_yard_body: tuple[float, ...]
-    """Nominal rotation, nine numbers row by row."""
+    """Nominal rotation from body to yard, nine numbers row by row."""
     position_std_m: float
-    """Sigma of a reading in metres."""
+    """Standard deviation of a reading in metres."""
 
     def __post_init__(self) -> None:
         expect_values(self, "encoders.")

@@ -1,4 +1,4 @@
-"""Define the protocol of what gives pictures and readings, and what it gives."""
+"""Define the protocol of sources of pictures and readings, and the packets that they deliver."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from barsight.core.arrays import Float64, Int64, UInt8
 class LivePicture:
     """A picture of one camera. image: (H, W) uint8. exposed_ns: the exposure on the monotonic clock.
 
-    trigger: number of the exposure as the camera counts, from any start; None where it does not count.
+    trigger: number of the exposure as counted by the camera, from any start; None if it does not count.
     """
 
     camera: int
@@ -25,7 +25,7 @@ class LivePicture:
 
 @dataclass(frozen=True)
 class LostPicture:
-    """Pictures that were lost before they could be used. cause: of `capture`'s counters; count: how many."""
+    """Pictures that were lost before use. cause: one of `capture`'s counters; count: how many."""
 
     camera: int
     stamp_ns: int
@@ -35,7 +35,7 @@ class LostPicture:
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """Readings of `imu` (gyro rad/s, then accelerometer m/s2) or `crane` (place, m): (N,), (N, width)."""
+    """Readings of `imu` (gyro rad/s, then accelerometer m/s2) or `crane` (position, m): (N,), (N, width)."""
 
     sensor: str
     stamp_ns: Int64
@@ -44,7 +44,7 @@ class Readings:
 
 @dataclass(frozen=True)
 class SensorSigns:
-    """Signs of the sensors' health. values: by the names of the counters' row `sensors`."""
+    """Health data of the sensors. values: by the counter names of the row `sensors`."""
 
     values: Mapping[str, int]
 
@@ -59,11 +59,11 @@ class Source(Protocol):
 
     @property
     def interval_ns(self) -> int:
-        """Return the time between two pictures of a camera, at most, as long as all is well."""
+        """Return the longest time between two pictures of a camera in normal operation."""
         ...
 
     def packets(self, after: dict[str, int]) -> Iterator[Packet]:
-        """Yield what comes, when it comes. after: last stamp already taken, of `cam0`, `cam1`, `imu` and
-        `crane`; 0 where none was.
+        """Yield packets as they arrive. after: last stamp already processed of `cam0`, `cam1`, `imu` and
+        `crane`, 0 for none.
         """
         ...
