@@ -1,4 +1,4 @@
-"""Stand for a recording that is still to come: its calibration and sensors are known, its data is not."""
+"""Represent a recording that is still to come: its calibration and sensors are known, its data is not."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from barsight.recording.base import FrameIndex
 
 @dataclass(frozen=True, eq=False)
 class AwaitedRecording:
-    """A `Recording` without frames. imu_samples, crane_samples: empty or the first few; None where there is
-    no such sensor.
+    """A `Recording` without frames. imu_samples, crane_samples: empty or the first few; None without the
+    sensor.
     """
 
     path: Path

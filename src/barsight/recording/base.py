@@ -1,4 +1,4 @@
-"""Define the protocol of every reader: calibration, paired frames one at a time, slow sensors as arrays."""
+"""Define the protocol of all readers: calibration, paired frames one at a time, slow sensors as arrays."""
 
 from __future__ import annotations
 
@@ -19,21 +19,25 @@ class RecordingSettings:
     """Settings of reading a recording."""
 
     pair_tolerance_s: float = 0.002
-    """How far apart the stamps of a left and a right picture may lie. Triggered cameras' stamps agree
-    exactly; 2 ms leave room for drivers that stamp on arrival, in which a crane moves 1 mm."""
+    """Largest difference in seconds between the stamps of a left and a right picture that form a pair. Stamps
+    of triggered cameras agree exactly; 2 ms, in which a crane moves 1 mm, allow for drivers that stamp on
+    arrival.
+    """
     rig: Path | None = None
-    """A rig file to use instead of the recording's own calibration: ours, Kalibr's, OpenCV's or an EuRoC
-    folder. Where it doesn't say how the cameras sit on the body, the recording's mounting of cam0 stays."""
+    """Rig file to use instead of the recording's own calibration: Barsight's, Kalibr's, OpenCV's or an EuRoC
+    folder. If it doesn't state the mounting of the cameras on the body, the recording's mounting of cam0 is
+    kept.
+    """
     camchain: Path | None = None
-    """Kalibr's camchain-imucam.yaml for a bag; found in or beside the bag when not given."""
+    """Kalibr's camchain-imucam.yaml for a bag; without it, it is searched for in or beside the bag."""
     imu_yaml: Path | None = None
-    """Kalibr's imu.yaml for a bag; found in or beside the bag when not given."""
+    """Kalibr's imu.yaml for a bag; without it, it is searched for in or beside the bag."""
     cam0_topic: str | None = None
-    """A bag's topic of left pictures; the camchain's rostopic, else recognised by type, when not given."""
+    """Topic of the left pictures in a bag; without it, the camchain's rostopic or one recognised by type."""
     cam1_topic: str | None = None
-    """A bag's topic of right pictures, likewise."""
+    """Topic of the right pictures in a bag, likewise."""
     imu_topic: str | None = None
-    """A bag's topic of the IMU, likewise."""
+    """Topic of the IMU in a bag, likewise."""
 
     def __post_init__(self) -> None:
         expect_ranges(self, "recording.", pair_tolerance_s=(0, UNDER_1))
@@ -41,8 +45,8 @@ class RecordingSettings:
 
 @dataclass(frozen=True)
 class FrameIndex:
-    """stamps_ns: the paired frames' stamps (cam0's clock), increasing; a session's grow. unpaired: frames on
-    one side only.
+    """stamps_ns: the paired frames' stamps (cam0's clock), increasing; a session's grow. unpaired: number of
+    frames of one side only.
     """
 
     stamps_ns: Sequence[int]
@@ -50,10 +54,10 @@ class FrameIndex:
 
 
 class Recording(Protocol):
-    """A stereo recording on disk. Every stage reads recordings through this and nothing else.
+    """A stereo recording on disk. All stages read recordings only through this protocol.
 
-    path, format: where it lies and which reader took it. is_simulated: said by the recording itself.
-    rig: the calibration. Readers check as they go and raise `InputError` naming the file and the remedy.
+    path, format: its location and the reader used. is_simulated: stated by the recording itself. rig: the
+    calibration. Readers check as they go and raise `InputError` naming the file and the remedy.
     """
 
     @property
@@ -70,9 +74,7 @@ class Recording(Protocol):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Return sentences on what the reader had to assume (a frame rate, a missing file), for the
-        result.
-        """
+        """Return sentences on the reader's assumptions (a frame rate, a missing file), for the result."""
         ...
 
     @property
@@ -81,7 +83,7 @@ class Recording(Protocol):
         ...
 
     def frames(self, wanted: Container[int] | None = None) -> Iterator[StereoFrame | RefusedFrame]:
-        """Yield the paired frames in time's order, decoded one at a time; a torn image yields a
+        """Yield the paired frames in time order, decoded one at a time; a damaged image yields a
         `RefusedFrame`.
 
         wanted: the stamps of those to decode; all, if None.
@@ -89,7 +91,7 @@ class Recording(Protocol):
         ...
 
     def imu(self) -> ImuSamples | None:
-        """Read the IMU in `body`, or None where the recording has none."""
+        """Read the IMU in `body`, or None if the recording has none."""
         ...
 
     def imu_noise(self) -> ImuNoise | None:
@@ -101,11 +103,11 @@ class Recording(Protocol):
         ...
 
     def laser(self) -> tuple[LaserProfile, ...]:
-        """Read reference profiles; empty where there are none."""
+        """Read reference profiles; empty if there are none."""
         ...
 
     def digests(self) -> dict[str, str]:
-        """Compute SHA-256 of each input file that isn't an image (calibration, CSVs, bag), by
-        relative name.
+        """Compute SHA-256 of each input file that isn't an image (calibration, CSVs, bag), by relative
+        name.
         """
         ...

@@ -1,8 +1,8 @@
-"""Decode stored pictures to (H, W) uint8 gray, refusing what is torn.
+"""Decode stored pictures to (H, W) uint8 gray, refusing damaged ones.
 
-OpenCV fills the missing rows of a cut PNG or JPEG with gray and says so on stderr only, so a picture is
-checked before it is decoded: a PNG chunk by chunk with its checksums, a JPEG by its end marker.
-Colour becomes gray by the weights 0.299 R + 0.587 G + 0.114 B [ITU-R BT.601]; 16 bits become 8 by the same
+OpenCV fills the missing rows of a truncated PNG or JPEG with gray and reports it on stderr only, so a picture
+is checked before it is decoded: a PNG chunk by chunk with its checksums, a JPEG by its end marker.
+Colour becomes gray with the weights 0.299 R + 0.587 G + 0.114 B [ITU-R BT.601]; 16 bits become 8 by the same
 fixed scale for every frame (65535 -> 255), so that brightness stays comparable along a recording.
 """
 
@@ -28,31 +28,30 @@ _PNG_KINDS = {
     for colour, depths in {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 4: (8, 16), 6: (8, 16)}.items()
     for depth in depths
 }
-"""Bits a sample and colour types that go together [PNG spec 11.2.2]."""
+"""Valid combinations of bits per sample and colour type [PNG spec 11.2.2]."""
 JPEG_SIGNATURE = b"\xff\xd8\xff"
 
 
 MAX_PICTURE_BYTES = 1 << 28
 _NARROWED = ((np.arange(1 << 16) + 128) // 257).astype(np.uint8)
-"""Values of 8 bits by those of 16."""
+"""Lookup table from 16-bit to 8-bit values."""
 
 
 class TornImageError(ValueError):
-    """A picture that can't be used; the text says why, without the file's name."""
+    """A picture that can't be used; the text gives the reason, without the file's name."""
 
 
 def decode_gray(data: bytes, size: tuple[int, int] | None = None, max_pixels: int = MAX_PIXELS) -> UInt8:
     """Decode the bytes of a PNG, JPEG, TIFF, BMP, PNM or WebP to (H, W) uint8.
 
-    size: the width and height that it must have; max_pixels: width times height at most. Raises
-    `TornImageError` for a picture that is cut short, damaged, of an unknown kind, of another size or too
-    large.
+    size: the required width and height; max_pixels: limit of width times height. Raises `TornImageError` for
+    a picture that is cut short, damaged, of an unknown kind, of another size or too large.
     """
     return to_gray(_decoded(data, size, max_pixels))
 
 
 def decode_with_colour(data: bytes) -> tuple[UInt8, UInt8 | None]:
-    """Decode to gray and to (H, W, 3) uint8 BGR, None where the picture holds gray values only."""
+    """Decode to gray and to (H, W, 3) uint8 BGR, None if the picture contains only gray values."""
     image = _eight_bits(_decoded(data))
     if image.ndim != 3 or image.shape[2] not in (3, 4):
         return to_gray(image), None
@@ -61,7 +60,7 @@ def decode_with_colour(data: bytes) -> tuple[UInt8, UInt8 | None]:
 
 
 def expect_size(found: tuple[int, int], size: tuple[int, int]) -> None:
-    """Raise `TornImageError` where a picture's width and height aren't those of its calibration."""
+    """Raise `TornImageError` if a picture's width and height aren't those of its calibration."""
     if found != size:
         raise TornImageError(f"is {found[0]}x{found[1]}, the calibration is for {size[0]}x{size[1]}")
 
@@ -79,7 +78,7 @@ def _header_size(data: bytes) -> tuple[int, int]:
                 return page.imagewidth, page.imagelength
         with Image.open(BytesIO(data), formats=("JPEG", "BMP", "PPM", "WEBP")) as picture:
             return picture.size
-    except Exception:  # Pillow and tifffile raise all kinds on a torn header
+    except Exception:  # Pillow and tifffile raise many types for a damaged header
         raise TornImageError("is no readable picture") from None
 
 
@@ -103,8 +102,8 @@ def _decoded(data: bytes, size: tuple[int, int] | None = None, max_pixels: int =
 def to_gray(image: NDArray[np.uint8] | NDArray[np.uint16]) -> UInt8:
     """Convert (H, W), (H, W, 3) BGR or (H, W, 4) BGRA, 8 or 16 bits, to (H, W) uint8.
 
-    Raises `TornImageError` for other kinds, and for 16-bit pictures that use the lowest 12 bits only: those
-    would come out all but black.
+    Raises `TornImageError` for other kinds, and for 16-bit pictures that use only the lowest 12 bits, which
+    would be almost black.
     """
     image = _eight_bits(image)
     if image.ndim == 3:
@@ -135,7 +134,10 @@ def _eight_bits(image: NDArray[Any]) -> UInt8:
 
 
 def check_png(data: bytes) -> tuple[int, int]:
-    """Walk a PNG's chunks, lengths and checksums; (width, height). Raises `TornImageError`. [PNG spec 5.3]"""
+    """Check a PNG's chunks, lengths and checksums. Raises `TornImageError`. [PNG spec 5.3]
+
+    Returns width and height.
+    """
     view = memoryview(data)
     place, size = len(PNG_SIGNATURE), (0, 0)
     has_pixels = False

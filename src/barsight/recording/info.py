@@ -1,4 +1,4 @@
-"""Describe what a recording holds: sensors, rates, gaps, pairs, calibration. Decodes one pair at most."""
+"""Describe the content of a recording: sensors, rates, gaps, pairs, calibration. Decodes at most one pair."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ GAP_FACTOR = 1.5
 
 @dataclass(frozen=True)
 class StreamInfo:
-    """One sensor's samples. rate_hz: from the median interval, NaN below two samples.
+    """One sensor's samples. rate_hz: from the median interval, NaN for fewer than two samples.
 
-    gaps: intervals over 1.5 times the median. longest_gap_s: the longest of them, 0 where there is none.
+    gaps: number of intervals over 1.5 times the median. longest_gap_s: the longest of them, 0 without gaps.
     """
 
     name: str
@@ -43,7 +43,7 @@ class StreamInfo:
 
 @dataclass(frozen=True)
 class CalibrationSummary:
-    """The rig in the numbers people compare. baseline_m: distance of the cameras. angle_deg: between them."""
+    """Key figures of the rig. baseline_m: distance of the cameras. angle_deg: angle between them."""
 
     cam0: Camera
     cam1: Camera
@@ -54,7 +54,7 @@ class CalibrationSummary:
 
 @dataclass(frozen=True)
 class CraneInfo:
-    """lowest_m, highest_m: the encoders' extents in `yard` (bridge x, trolley y, hoist z)."""
+    """lowest_m, highest_m: the range of the encoders in `yard` (bridge x, trolley y, hoist z)."""
 
     lowest_m: tuple[float, float, float]
     highest_m: tuple[float, float, float]
@@ -63,7 +63,7 @@ class CraneInfo:
 
 @dataclass(frozen=True)
 class ProfileInfo:
-    """One laser profile: its number, count of points, y, and extent along x (m, `yard`)."""
+    """One laser profile: its number, number of points, y, and extent along x (m, `yard`)."""
 
     profile: int
     count: int
@@ -74,10 +74,10 @@ class ProfileInfo:
 
 @dataclass(frozen=True)
 class RecordingInfo:
-    """Record of `barsight info`. dropped: pictures without partner, with the reason.
+    """Content of `barsight info`. dropped: pictures without partner, with the reason.
 
-    first_refused: why the first pair can't be used, None where it can. notes: what the reader assumed and
-    what looks odd.
+    first_refused: why the first pair can't be used, None if it can. notes: the reader's assumptions and any
+    oddities.
     """
 
     path: Path
@@ -94,7 +94,7 @@ class RecordingInfo:
 
 
 def describe_recording(recording: StoredPictures) -> RecordingInfo:
-    """Describe a recording. Raises `InputError` where a sensor's file is wrong, as measuring would."""
+    """Describe a recording. Raises `InputError` if a sensor's file is wrong, as measuring would."""
     stamps = recording.camera_stamps
     streams = [stream_info("cam0", stamps.left_ns), stream_info("cam1", stamps.right_ns)]
     imu, crane, laser = recording.imu(), recording.crane(), recording.laser()
@@ -153,7 +153,7 @@ def _laser(profiles: Iterable[LaserProfile]) -> tuple[ProfileInfo, ...]:
 
 
 def _time_notes(streams: Iterable[StreamInfo]) -> Iterable[str]:
-    """Note a sensor whose samples don't span the pictures."""
+    """Note sensors whose samples don't cover the time of the pictures."""
     cam0, *others = streams
     for stream in others:
         before = (stream.first_ns - cam0.first_ns) / NS_PER_S

@@ -1,4 +1,4 @@
-"""Print `RecordingInfo` as tables on a terminal."""
+"""Print `RecordingInfo` as tables in a terminal."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ EPOCH_LIKELY_S = 1_000_000_000
 
 
 def print_info(info: RecordingInfo, console: Console) -> None:
-    """Print what `describe` found."""
+    """Print the result of `describe_recording`."""
     simulated = ", simulated" if info.is_simulated else ""
     console.print(
         f"[bold]{escape(str(info.path))}[/bold]: {info.format}{simulated}, {_begin(info)}", highlight=False

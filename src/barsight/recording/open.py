@@ -1,6 +1,4 @@
-"""Open a recording of any format: `open_recording` looks at what lies at a path and takes the right
-reader.
-"""
+"""Open a recording of any format: `open_recording` examines the path and chooses the right reader."""
 
 from __future__ import annotations
 
@@ -26,9 +24,9 @@ KNOWN = (
 
 
 def open_recording(path: Path, settings: RecordingSettings | None = None) -> StoredPictures:
-    """Open the recording at `path`, of whichever format; calibration and the lists of pictures are checked.
+    """Open the recording at `path`, of any format; calibration and the lists of pictures are checked.
 
-    Raises `InputError` for no such folder or an unknown format, and what the readers raise.
+    Raises `InputError` for a missing folder or an unknown format, and the errors of the readers.
     """
     try:
         return _open(path, settings or RecordingSettings())
@@ -59,7 +57,7 @@ def _open(path: Path, settings: RecordingSettings) -> StoredPictures:
 
 
 def bag_at(path: Path) -> BagFile | None:
-    """Open the bag at `path`, whatever is in it; None where there is none. Raises `InputError`."""
+    """Open the bag at `path`, whatever it contains; None if there is none. Raises `InputError`."""
     if path.is_dir():
         is_bag = (path / "metadata.yaml").is_file()
     else:
@@ -82,7 +80,7 @@ def _open_bag_folder(path: Path, bags: list[Path], settings: RecordingSettings) 
 
 
 def _hint(path: Path) -> str:
-    """Find the folder inside, where just one of them is a recording."""
+    """Find the folder inside, if exactly one of them is a recording."""
     inside = [
         child
         for child in sorted(path.iterdir())

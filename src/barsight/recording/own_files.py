@@ -1,4 +1,4 @@
-"""Keep to a recording's own files: names in it don't lead out of it, and a result tells their hashes."""
+"""Restrict a recording to its own files: no name leads out of it, and the result lists the files' hashes."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from barsight.core.reading.bounded_reading import MAX_TABLE_BYTES, open_regular,
 from barsight.recording.image_decoding import MAX_PICTURE_BYTES, TornImageError
 
 MAX_NAME_BYTES = 1000
-"""Of a file below the recording; a system takes 4096 with all folders above."""
+"""Maximum length of a file's path below the recording; systems allow 4096 with all folders above."""
 
 
 def expect_inner_name(name: str, path: Path, where: str) -> None:
-    """Raise InputError about `path` for a name that is absolute, climbs out of its folder, too long or none.
+    """Raise InputError about `path` for a name that is absolute, climbs out of its folder, too long or empty.
 
-    where: the place in the file, like `line 3`.
+    where: the place in the file, such as `line 3`.
     """
     parts = PurePosixPath(name)
     if not name.isprintable() or parts.is_absolute() or ".." in parts.parts or not parts.parts:
@@ -30,12 +30,12 @@ def expect_inner_name(name: str, path: Path, where: str) -> None:
 
 
 def leads_outside(path: Path, root: Path) -> bool:
-    """Check whether a file lies outside the recording `root`, by a symbolic link in its way."""
+    """Check whether a file is outside the recording `root`, through a symbolic link in its path."""
     return not lies_within(path, root)
 
 
 def expect_own_files(root: Path, names: Iterable[str]) -> None:
-    """Raise InputError for the first of a recording's files that lies outside it."""
+    """Raise InputError for the first of a recording's files that is outside it."""
     for name in names:
         if leads_outside(root / name, root):
             raise InputError(
@@ -46,8 +46,8 @@ def expect_own_files(root: Path, names: Iterable[str]) -> None:
 def read_picture(path: Path, root: Path) -> bytes:
     """Read a picture's bytes as stored.
 
-    Raises `TornImageError` for a link out of the recording `root`, for what is no regular file, too large or
-    may not be read, and FileNotFoundError.
+    Raises `TornImageError` for a link out of the recording `root` and for a file that is not regular, too
+    large or not readable; and FileNotFoundError.
     """
     if not path.exists():
         raise FileNotFoundError(path)
@@ -60,10 +60,9 @@ def read_picture(path: Path, root: Path) -> bytes:
 
 
 def file_digests(root: Path, paths: Iterable[Path], bags: Iterable[Path] = ()) -> dict[str, str]:
-    """Compute SHA-256 by the name relative to `root` (or the bare name outside it), of those paths that
-    exist. bags: of any size.
+    """Compute SHA-256 of the existing paths, by the name relative to `root` (or the bare name outside it).
 
-    Raises InputError for another file that is larger than any table.
+    bags: of any size. Raises InputError for another file that is larger than any table.
     """
     digests = {}
     bounded = [(path, MAX_TABLE_BYTES) for path in paths]

@@ -1,4 +1,4 @@
-"""A recording as time-ordered packets: from one that lies on disk, and back into one that grows."""
+"""Convert a recording to time-ordered packets, and build a growing recording from packets."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from barsight.recording.base import FrameIndex, Recording
 
 Samples = TypeVar("Samples", ImuSamples, CraneSamples)
 Packet = StereoFrame | RefusedFrame | ImuSamples | CraneSamples | LaserProfile
-"""A pair, or samples that came since the last packet of their kind, or a reference profile."""
+"""A pair, or samples received since the last packet of their kind, or a reference profile."""
 
 
 def packets(recording: Recording) -> Iterator[Packet]:
-    """Read a recording in time's order: before each pair the samples up to it, then what is left."""
+    """Read a recording in time order: before each pair the samples up to it, then the rest."""
     yield from recording.laser()
     imu, crane, shift_ns = recording.imu(), recording.crane(), recording.rig.timeshift_cam_imu_ns
     last_ns: int | None = None
@@ -36,10 +36,10 @@ def packets(recording: Recording) -> Iterator[Packet]:
 
 
 class PacketRecording:
-    """A `Recording` of the packets that came so far; `folder` takes the pictures' pixels.
+    """A `Recording` of the packets received so far; `folder` stores the pictures' pixels.
 
     Raises InputError for a packet that is older than the last of its kind, or whose samples aren't finite or
-    not in time's order. One without samples says nothing.
+    not in time order. A packet without samples has no effect.
     """
 
     path, format = Path("session"), "packets"
@@ -57,7 +57,7 @@ class PacketRecording:
         self.last_frame_ns: int | None = None
 
     def add(self, packet: Packet) -> None:
-        """Take a packet."""
+        """Add a packet."""
         if isinstance(packet, LaserProfile):
             self._laser.append(packet)
         elif isinstance(packet, ImuSamples):
@@ -122,7 +122,7 @@ class PacketRecording:
         return tuple(self._laser)
 
     def digests(self) -> dict[str, str]:
-        """Return none: no input is a file."""
+        """Return an empty result: no input is a file."""
         return {}
 
     def _read(self, stamp_ns: int) -> StereoFrame:
@@ -140,7 +140,7 @@ _ARRAYS = {
 
 
 class _Grown(Generic[Samples]):
-    """Samples that grow; adding costs the same however many there are."""
+    """Growing samples; the cost of adding does not depend on their number."""
 
     def __init__(self) -> None:
         self._first: Samples | None = None
@@ -167,7 +167,7 @@ class _Grown(Generic[Samples]):
 
     @property
     def samples(self) -> Samples | None:
-        count = self._count  # once: another thread may add meanwhile
+        count = self._count  # read once: another thread may be adding
         if self._first is None:
             return None
         return replace(self._first, **{name: held[:count] for name, held in self._arrays.items()})
@@ -176,7 +176,7 @@ class _Grown(Generic[Samples]):
 def _between(
     imu: ImuSamples | None, crane: CraneSamples | None, after_ns: int | None, last_ns: int | None
 ) -> Iterator[ImuSamples | CraneSamples]:
-    """Return the samples after one stamp up to another; None has no bound."""
+    """Return the samples after one stamp up to another; None for no bound."""
     for samples in (imu, crane):
         if samples is not None:
             stamps = samples.stamp_ns

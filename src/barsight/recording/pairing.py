@@ -1,4 +1,4 @@
-"""Pair left and right pictures by stamp, and decode a stored picture for its camera."""
+"""Pair left and right pictures by stamp, and decode stored pictures for their camera."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class PairedStamps:
 
 
 class PairedAtOpening:
-    """Index of a `Recording` whose reader pairs the stamps, as `_pairs`, when it opens."""
+    """Index of a `Recording` whose reader pairs the stamps when it opens, as `_pairs`."""
 
     _pairs: PairedStamps
 
@@ -43,7 +43,7 @@ class PairedAtOpening:
 
 
 def pair_cameras(path: Path, left_ns: Int64, right_ns: Int64, tolerance_s: float) -> PairedStamps:
-    """Pair two cameras' stamps. Raises `InputError` about `path` where not a single pair comes together."""
+    """Pair two cameras' stamps. Raises `InputError` about `path` if not a single pair is found."""
     for name, stamps_ns in (("cam0", left_ns), ("cam1", right_ns)):
         if stamps_ns.size == 0:
             raise InputError(path, f"holds no picture of {name}", "copy the recording again")
@@ -65,5 +65,5 @@ def pair_cameras(path: Path, left_ns: Int64, right_ns: Int64, tolerance_s: float
 
 
 def decode_for(camera: Camera, data: bytes) -> UInt8:
-    """Decode a stored picture; `TornImageError` too where it does not have the calibration's size."""
+    """Decode a stored picture; also raises `TornImageError` if it does not have the calibration's size."""
     return decode_gray(data, (camera.width, camera.height))

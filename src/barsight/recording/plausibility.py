@@ -1,4 +1,4 @@
-"""Doubt samples that no crane's sensors give: units, clocks and mounting, by the numbers alone."""
+"""Find implausible samples from the numbers alone: wrong units, clocks and mounting."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from barsight.recording.base import Recording
 GRAVITY_MPS2 = (8.0, 12.0)
 MAX_TURN_RADPS = 5.0
 MAX_TILT_DEG = 5.0
-"""Gravity may lie this far off the vertical that encoders' attitude states."""
+"""Largest angle in degrees between gravity and the vertical given by the attitude of the encoders."""
 MAX_SPEED_MPS, SPEED_WINDOW_S = 5.0, 0.5
-"""No crane travels faster; over so long, by the median."""
+"""Largest plausible speed of a crane (m/s), as a median, and the time span (s) over which it is computed."""
 LARGE_YARD_M, LARGE_HOIST_M = 3000.0, 100.0
 LARGE_SHIFT_S = 0.5
 MAX_RATE_HZ = 20_000.0
 MAX_MISSING_RATIO = 0.5
-"""Share of the pictures' time that a sensor may leave out."""
+"""Largest share of the pictures' time that a sensor may be missing."""
 
 
 def clock_faults(recording: Recording) -> tuple[str, ...]:
-    """List why stamps can't be of one clock in ns; nothing can be measured by them."""
+    """List the reasons why stamps can't be of one clock in ns; they rule out any measurement."""
     shift_s = recording.rig.timeshift_cam_imu_ns / NS_PER_S
     found, frames_ns = [], recording.index.stamps_ns
     if abs(shift_s) > LARGE_SHIFT_S:
@@ -41,7 +41,7 @@ def clock_faults(recording: Recording) -> tuple[str, ...]:
 
 
 def doubts(recording: Recording) -> tuple[Notice, ...]:
-    """List what can't be right in a recording's samples; each forbids every lift."""
+    """List implausible properties of a recording's samples; each forbids every lift."""
     imu, crane, found = recording.imu(), recording.crane(), list[Notice]()
     if imu is not None and len(imu.stamp_ns):
         found += _imu_doubts(imu)

@@ -1,4 +1,4 @@
-"""The rectified pairs of a recording, each picture decoded and rectified once."""
+"""Read the rectified pairs of a recording, each picture decoded and rectified once."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from barsight.core.timing import Stopwatch
 from barsight.recording.base import Recording
 
 MAX_STORED_BYTES = 8 << 30
-"""Capacity of the folder; pairs beyond it are decoded again where they are asked for again."""
+"""Capacity of the folder in bytes; pairs beyond it are decoded again when they are requested again."""
 
 
 class RectifiedPairs:
-    """Reads rectified pairs; `folder` takes their pixels, so that a second reader gets them from there.
+    """Reads rectified pairs; `folder` stores their pixels, so that a second reader gets them from there.
 
-    Without a folder a pair that is asked for again is decoded again. Several threads may read at once.
+    Without a folder a pair is decoded at each request. Several threads may read at once.
     """
 
     def __init__(
@@ -35,7 +35,7 @@ class RectifiedPairs:
         self._lock, self._turns = Lock(), dict[int, Lock]()
 
     def __call__(self, wanted: Container[int] | None = None) -> Iterator[RectifiedPair | RefusedFrame]:
-        """Yield the pairs in time's order; a frame that can't be decoded or rectified is refused.
+        """Yield the pairs in time order; a frame that can't be decoded or rectified is refused.
 
         wanted: the stamps of those to read; all, if None.
         """
@@ -47,14 +47,14 @@ class RectifiedPairs:
             if ahead is None and not self.has(stamp):
                 ahead = next(fresh, None)
             if ahead is None or ahead.stamp_ns != stamp:
-                # Another reader was quicker.
+                # Another reader was faster.
                 yield self._read(stamp)
                 continue
             frame, ahead = ahead, None
             yield frame if isinstance(frame, RefusedFrame) else self.rectify(frame)
 
     def rectify(self, frame: StereoFrame) -> RectifiedPair | RefusedFrame:
-        """Rectify a frame once for all threads, and store it for who asks later."""
+        """Rectify a frame once for all threads, and store it for later requests."""
         with self._turns.setdefault(frame.stamp_ns, Lock()):
             if self.has(frame.stamp_ns):
                 return self._read(frame.stamp_ns)
@@ -66,7 +66,7 @@ class RectifiedPairs:
             return pair
 
     def store(self, pair: RectifiedPair) -> None:
-        """Store a pair for who asks for it later."""
+        """Store a pair for later requests."""
         with self._lock:
             if self._folder is not None and self._bytes < MAX_STORED_BYTES:
                 self._bytes += pair.left.nbytes + pair.right.nbytes
@@ -74,7 +74,7 @@ class RectifiedPairs:
                     np.save(stream, np.stack([pair.left, pair.right]))
 
     def has(self, stamp_ns: int) -> bool:
-        """Check whether a pair lies in the folder."""
+        """Check whether a pair is in the folder."""
         return self._folder is not None and self._file(stamp_ns).is_file()
 
     def _read(self, stamp_ns: int) -> RectifiedPair:
@@ -88,7 +88,7 @@ class RectifiedPairs:
 
 @dataclass(frozen=True)
 class _Missing:
-    """The wanted stamps that aren't stored, as of when they are asked for."""
+    """The wanted stamps that aren't stored at the time of the query."""
 
     pairs: RectifiedPairs
     wanted: Container[int] | None

@@ -1,4 +1,4 @@
-"""Check the slow sensors' numbers the same way whichever format they came from."""
+"""Check the values of the slow sensors in the same way for all formats."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from barsight.core.records.sensor_samples import CraneSamples, ImuSamples, Laser
 def make_imu(path: Path, stamp_ns: Int64, gyro: Float64, accel: Float64, body_from_imu: Pose) -> ImuSamples:
     """Rotate samples into `body`.
 
-    gyro (rad/s), accel (m/s^2): (N, 3) in the IMU's axes. Where the IMU sits away from the body's origin the
-    acceleration is not carried over (that takes the angular acceleration): lever arms are neglected.
-    Raises `InputError` where the accelerations look like multiples of g.
+    gyro (rad/s), accel (m/s^2): (N, 3) in the IMU's axes. If the IMU is away from the body's origin, the
+    acceleration is not transferred (that needs the angular acceleration): lever arms are neglected.
+    Raises `InputError` if the accelerations look like multiples of g.
     """
     rotation = body_from_imu.rotation
     if not np.array_equal(rotation, np.eye(3)):
@@ -35,7 +35,7 @@ def make_imu(path: Path, stamp_ns: Int64, gyro: Float64, accel: Float64, body_fr
 
 
 def make_crane(document: Document, stamp_ns: Int64, position_m: Float64) -> CraneSamples:
-    """Build the encoders' places with the mounting of the crane's `sensor.yaml`.
+    """Build the encoder positions with the mounting from the crane's `sensor.yaml`.
 
     Raises `CalibrationError`.
     """
@@ -53,7 +53,7 @@ def make_crane(document: Document, stamp_ns: Int64, position_m: Float64) -> Cran
 
 
 def make_laser(path: Path, profile: Int64, xyz_m: Float64, range_std_m: float) -> tuple[LaserProfile, ...]:
-    """Sort profiles by number and each by x. range_std_m is NaN where nobody states it.
+    """Sort profiles by number and each by x. range_std_m: NaN if unknown.
 
     Raises InputError about `path` for more than MAX_PROFILES.
     """
@@ -71,7 +71,7 @@ def make_laser(path: Path, profile: Int64, xyz_m: Float64, range_std_m: float) -
 
 
 def laser_std(document: Document | None) -> float:
-    """Read the laser's range sigma (m) of its `sensor.yaml`; NaN where it isn't stated."""
+    """Read the laser's range sigma (m) from its `sensor.yaml`; NaN if it isn't stated."""
     if document is None or document.values.get("range_std_m") is None:
         return float("nan")
     return document.number("range_std_m")

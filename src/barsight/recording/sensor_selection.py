@@ -1,4 +1,4 @@
-"""View a recording with some of its sensors left out, as `use` asks."""
+"""View a recording without the sensors excluded by the setting `use`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from barsight.recording.wrapper import RecordingProxy
 
 @dataclass(frozen=True, eq=False)
 class SelectedSensors(RecordingProxy):
-    """`whole` seen through `use` (`stereo`, `imu`, `crane`); what isn't used isn't even read."""
+    """View of `whole` through `use` (`stereo`, `imu`, `crane`); a sensor that isn't used isn't even read."""
 
     use: tuple[str, ...]
 

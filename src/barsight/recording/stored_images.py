@@ -23,7 +23,7 @@ class StoredImage:
 
 
 class StoredPictures(Recording, Protocol):
-    """Protocol of a recording that hands out its pictures undecoded: all of Barsight's readers."""
+    """Protocol of a recording that provides its pictures undecoded: all of Barsight's readers."""
 
     @property
     def camera_stamps(self) -> PairedStamps:
@@ -31,12 +31,12 @@ class StoredPictures(Recording, Protocol):
         ...
 
     def stored_images(self) -> Iterator[StoredImage]:
-        """Yield every picture's bytes as stored, both cameras in time's order."""
+        """Yield every picture's bytes as stored, both cameras in time order."""
         ...
 
 
 def merge_cameras(pairs: PairedStamps, left: Sequence[T], right: Sequence[T]) -> Iterator[tuple[int, int, T]]:
-    """Merge (camera, stamp, item) of both cameras in time's order, cam0 first where they agree."""
+    """Merge (camera, stamp, item) of both cameras in time order, cam0 first for equal stamps."""
     both = [(int(stamp), 0, k) for k, stamp in enumerate(pairs.left_ns)]
     both += [(int(stamp), 1, k) for k, stamp in enumerate(pairs.right_ns)]
     for stamp, camera, k in sorted(both):

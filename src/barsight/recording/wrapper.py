@@ -1,4 +1,4 @@
-"""Forward a recording to a wrapper that changes a part of it."""
+"""Forward a recording to a wrapper that changes part of it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from barsight.recording.base import FrameIndex, Recording
 
 @dataclass(frozen=True, eq=False)
 class RecordingProxy:
-    """`whole` as it is; a subclass answers differently where it must."""
+    """Forwards everything to `whole`; a subclass overrides what it changes."""
 
     whole: Recording
 

@@ -1,7 +1,7 @@
 """Read ROS 1 and ROS 2 bags with Kalibr's calibration.
 
 A bag is read from front to back twice: once for the stamps and the slow sensors when one of them is first
-asked for, once for the pictures. Nothing but the pictures that wait for their partner is held.
+requested, once for the pictures. Only pictures that wait for their partner are held.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ from barsight.recording.sensor_samples import laser_std, make_crane, make_imu, m
 from barsight.recording.stored_images import StoredImage
 
 BESIDE = ("crane0.yaml", "laser0.yaml", "body.yaml")
-"""Files that describe what a bag's messages don't."""
+"""Files that describe what the messages of a bag don't."""
 WAITING_LIMIT = 64
 
 
 @dataclass
 class _Column:
-    """Stamps and numbers of one sensor while the bag is scanned."""
+    """Stamps and values of one sensor while the bag is scanned."""
 
     stamps: array[int] = field(default_factory=lambda: array("q"))
     values: array[float] = field(default_factory=lambda: array("d"))
@@ -81,7 +81,7 @@ class BagRecording:
 
     @cached_property
     def is_simulated(self) -> bool:
-        """Return `is_simulated` of a `body.yaml` in the bag's folder; False where it isn't said."""
+        """Return `is_simulated` of a `body.yaml` in the bag's folder; False if it isn't stated."""
         path = self._folder / "body.yaml"
         return path.is_file() and read_document(path).values.get("is_simulated") is True
 
@@ -161,7 +161,7 @@ class BagRecording:
                 )
 
     def stored_images(self) -> Iterator[StoredImage]:
-        """Yield every picture as a file's bytes, in the bag's order; raw pixels as a PNG, torn ones
+        """Yield every picture as a file's bytes, in the bag's order: raw pixels as PNG, damaged pictures
         left out.
         """
         for message in self._pictures():

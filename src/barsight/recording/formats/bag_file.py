@@ -1,6 +1,6 @@
 """Stream a bag file of any kind as messages; `rosbags` reads it, no ROS is needed.
 
-A torn bag makes the parsers below raise all kinds of errors; every one becomes an `InputError` here.
+A damaged bag makes the underlying parsers raise all kinds of errors; each becomes an `InputError` here.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
 
 
 def ros2_types() -> Any:
-    """Return the message types of ROS 2, which read and write messages."""
+    """Return the message types of ROS 2, for reading and writing messages."""
     return get_typestore(Stores.ROS2_HUMBLE)
 
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic of a bag, its message type and how many messages it holds."""
+    """A topic of a bag, its message type and number of messages."""
 
     name: str
     kind: str
@@ -56,7 +56,7 @@ class RawMessage:
 
 
 class BagFile:
-    """One bag. Every call of `messages` opens it anew and reads once from front to back.
+    """One bag. Every call of `messages` opens it again and reads it once from front to back.
 
     Raises `InputError` for a bag that is cut short, damaged or not indexed.
     """
@@ -79,7 +79,7 @@ class BagFile:
         self.topics = tuple(Topic(name, kind, count) for (name, kind), count in sorted(counts.items()))
 
     def _expect_bag(self) -> None:
-        """Refuse a file that doesn't begin as a bag; rosbags would read its first line, however long."""
+        """Refuse a file without the signature of a bag; rosbags would read its first line, however long."""
         try:
             with self.path.open("rb") as file:
                 begin = file.read(len(_MAGIC))
@@ -106,7 +106,7 @@ class BagFile:
     def decode(self, message: RawMessage) -> Any:
         """Decode the message to an object with the fields of its definition.
 
-        Raises ValueError where it is torn.
+        Raises ValueError if it is damaged.
         """
         typestore = self._typestore
         read = typestore.deserialize_ros1 if self._is_ros1 else typestore.deserialize_cdr
@@ -116,8 +116,8 @@ class BagFile:
             raise ValueError(f"is a torn message ({_short(error)})") from error
 
     def _header_stamp(self, data: bytes) -> int:
-        """Read the header's stamp: ROS 1 (after `seq`) and CDR (after four bytes of byte order) put it at
-        byte 4.
+        """Read the header's stamp, at byte 4 in ROS 1 (after `seq`) and in CDR (after four bytes of byte
+        order).
         """
         if len(data) < 12:
             raise ValueError("a message is too short for a header")
@@ -137,13 +137,13 @@ class BagFile:
             reader.close()
 
     def _whole(self, number: Any) -> int:
-        """Expect a number of metadata.yaml, which rosbags takes as it stands."""
+        """Require a number of metadata.yaml to be whole, as rosbags uses it unchecked."""
         if not isinstance(number, int):
             raise self._torn(ValueError(f"{number!r} is no whole number"))
         return number
 
     def _text(self, text: Any) -> str:
-        """Expect a text of metadata.yaml, which rosbags takes as it stands."""
+        """Require a value of metadata.yaml to be text, as rosbags uses it unchecked."""
         if not isinstance(text, str):
             raise self._torn(ValueError(f"{text!r} is no text"))
         return text
@@ -156,9 +156,7 @@ class BagFile:
 
 
 def _files(path: Path) -> list[Path]:
-    """List the files to hand to rosbags, which takes a ROS 2 folder for a ROS 1 file where its name ends in
-    `.bag`.
-    """
+    """List the files for rosbags, which takes a ROS 2 folder whose name ends in `.bag` for a ROS 1 file."""
     if path.is_dir() and path.suffix == ".bag":
         return sorted(file for file in path.iterdir() if file.suffix in (".mcap", ".db3"))
     return [path]
@@ -179,10 +177,9 @@ def _expect_own_files(path: Path) -> None:
 
 
 def _expect_whole_database(paths: list[Path]) -> None:
-    """Refuse a torn database: SQLite reads a file that lost its last pages without a word until a lost page
-    is needed.
+    """Refuse a truncated database: SQLite reads a file without its last pages silently until one is needed.
 
-    Its header says the page size (byte 16) and the count of pages (byte 28) [SQLite file format 1.3].
+    Its header states the page size (byte 16) and the number of pages (byte 28) [SQLite file format 1.3].
     """
     files = [file for path in paths for file in (path.glob("*.db3") if path.is_dir() else [path])]
     for file in files:

@@ -1,4 +1,4 @@
-"""Convert ROS picture messages to gray pictures, and to PNG files for copying."""
+"""Convert ROS picture messages to gray pictures, or to PNG files for copying."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from barsight.recording.image_decoding import (
     to_gray,
 )
 
-# encoding: (dtype, channels, conversion to BGR or gray, None where there is nothing to convert)
+# encoding: (dtype, channels, conversion to BGR or gray, None if no conversion is needed)
 ENCODINGS: dict[str, tuple[type[np.generic], int, int | None]] = {
     "mono8": (np.uint8, 1, None),
     "8UC1": (np.uint8, 1, None),
@@ -49,7 +49,7 @@ def gray_of(kind: str, message: Any, size: tuple[int, int]) -> UInt8:
 
 
 def file_of(kind: str, message: Any) -> tuple[str, bytes]:
-    """Encode as a file (suffix, bytes) of the same pixels: a compressed picture's own bytes, else a PNG.
+    """Encode as a file (suffix, bytes) of the same pixels: a compressed picture's own bytes, otherwise a PNG.
 
     Raises `TornImageError`.
     """
@@ -67,7 +67,7 @@ def file_of(kind: str, message: Any) -> tuple[str, bytes]:
 
 
 def _pixels(message: Any) -> NDArray[Any]:
-    """View the message's pixels as OpenCV orders them: (H, W) or (H, W, C), BGR."""
+    """View the message's pixels in OpenCV's order: (H, W) or (H, W, C), BGR."""
     if message.encoding not in ENCODINGS:
         raise TornImageError(f"has the encoding {message.encoding!r}; {', '.join(ENCODINGS)} are read")
     dtype, channels, conversion = ENCODINGS[message.encoding]

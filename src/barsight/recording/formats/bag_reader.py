@@ -1,4 +1,4 @@
-"""Open bags whose types can't all be parsed: a service's events are listed, not read."""
+"""Open bags with types that can't all be parsed: events of a service are listed, not read."""
 
 from __future__ import annotations
 
@@ -12,9 +12,7 @@ from rosbags.typesys import get_types_from_msg
 
 
 class BagReader(AnyReader):
-    """An AnyReader that passes over connections whose definition can't be parsed. all_connections: every one
-    of them too.
-    """
+    """An AnyReader that skips connections whose definition can't be parsed; all_connections includes them."""
 
     def __init__(self, paths: Sequence[Path], default_typestore: Any) -> None:
         super().__init__(paths, default_typestore=default_typestore)
@@ -29,7 +27,7 @@ class BagReader(AnyReader):
 
 
 class _ReadableConnections:
-    """One file's reader without the connections that can't be parsed; all else is its own."""
+    """One file's reader without the connections that can't be parsed; otherwise unchanged."""
 
     def __init__(self, whole: Any) -> None:
         self.whole = whole
@@ -51,7 +49,7 @@ class _ReadableConnections:
 
 
 def _parses(connection: Any) -> bool:
-    """Check whether a service's events have a definition that is one; other types' faults are told."""
+    """Check whether the definition of a service's events can be parsed; errors of other types are raised."""
     if not connection.msgtype.endswith("_Event"):
         return True
     if connection.msgdef.format != MessageDefinitionFormat.MSG:

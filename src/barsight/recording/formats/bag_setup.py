@@ -27,7 +27,7 @@ LASER_TOPIC = "/laser0/profiles"
 
 @dataclass(frozen=True, eq=False)
 class BagCalibration:
-    """Kalibr's files of a bag. imu is None where there is no imu.yaml. files: what was read."""
+    """Kalibr's files for a bag. imu: None without imu.yaml. files: the files read."""
 
     chain: CamChain
     imu: ImuFile | None
@@ -36,7 +36,7 @@ class BagCalibration:
 
 @dataclass(frozen=True)
 class BagTopics:
-    """The topics to read; None where the bag has no such sensor."""
+    """The topics to read; None if the bag has no such sensor."""
 
     cam0: str
     cam1: str
@@ -48,7 +48,7 @@ class BagTopics:
 def find_calibration(path: Path, settings: RecordingSettings) -> BagCalibration:
     """Find Kalibr's files, named by the settings or in the bag's folder, then beside it.
 
-    Raises `InputError` where there is no camchain or several that could be meant.
+    Raises `InputError` if there is no camchain or if it is ambiguous.
     """
     folders = [path, path.parent] if path.is_dir() else [path.parent]
     chain_path = settings.camchain or _find(folders, ("*camchain-imucam*", "*camchain*"), ())
@@ -72,9 +72,9 @@ def find_calibration(path: Path, settings: RecordingSettings) -> BagCalibration:
 def choose_topics(
     path: Path, topics: Sequence[Topic], calibration: BagCalibration, settings: RecordingSettings
 ) -> BagTopics:
-    """Assign topics to sensors: as the settings say, else the camchain, else by the message types.
+    """Assign topics to sensors: by the settings, otherwise by the camchain, otherwise by the message types.
 
-    Raises `InputError` for a topic that isn't there and where several could be meant.
+    Raises `InputError` for a missing topic and for an ambiguous one.
     """
     pictures = [topic for topic in topics if topic.kind in (IMAGE_TYPE, COMPRESSED_TYPE) and topic.count]
     wanted = (settings.cam0_topic, settings.cam1_topic)
@@ -97,7 +97,7 @@ def choose_topics(
 
 
 def _find(folders: Sequence[Path], patterns: tuple[str, ...], without: tuple[str, ...]) -> Path | None:
-    """Find the file of the nearest folder and the most exact pattern; several of one kind are refused."""
+    """Find the file in the nearest folder by the most specific pattern; several matches are refused."""
     for folder in folders:
         for pattern in patterns:
             found = [
@@ -132,13 +132,13 @@ def _named(path: Path, topics: Sequence[Topic], name: str, setting: str) -> str:
 
 
 def _stated(topics: Sequence[Topic], name: str | None) -> str | None:
-    """Find the camchain's topic, or its compressed copy; calibration is often done on another recording."""
+    """Find the camchain's topic, or its compressed copy; the calibration may be of another recording."""
     names = {topic.name for topic in topics}
     return next((n for n in (name, f"{name}/compressed") if n in names), None)
 
 
 def _two_cameras(path: Path, pictures: Sequence[Topic]) -> list[str | None]:
-    """Find the two picture topics of a bag that has just two, the left one first."""
+    """Find the two picture topics of a bag that has exactly two, the left one first."""
     names = {topic.name for topic in pictures}
     bases = sorted(name for name in names if name.removesuffix("/compressed") not in names - {name})
     if len(bases) != 2:
@@ -157,9 +157,7 @@ def _two_cameras(path: Path, pictures: Sequence[Topic]) -> list[str | None]:
 
 
 def side_by_side(left: str, right: str) -> bool:
-    """Check whether two names differ in left and right, l and r, or in a number and the next, and in nothing
-    else.
-    """
+    """Check whether two names differ only in left and right, l and r, or in a number and the next one."""
     first, second = (re.findall(r"\d+|[a-z]+", name.lower()) for name in (left, right))
     if len(first) != len(second):
         return False
@@ -177,7 +175,7 @@ def _is_next(a: str, b: str) -> bool:
 def _imu_topic(
     path: Path, topics: Sequence[Topic], calibration: BagCalibration, settings: RecordingSettings
 ) -> str | None:
-    """Find the IMU's topic; None too where the camchain does not say where the IMU sits."""
+    """Find the IMU's topic; also None if the camchain does not state the IMU's mounting."""
     imus = [topic for topic in topics if topic.kind == IMU_TYPE and topic.count]
     if settings.imu_topic:
         return _named(path, imus, settings.imu_topic, "recording.imu_topic")

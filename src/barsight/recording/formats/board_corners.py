@@ -1,6 +1,6 @@
 """Read recordings of a board's corners instead of pictures: `camN_detections.npz` and `imu0.csv`.
 
-The corners are known one from another, so the motion can be estimated from them; nothing can be mapped.
+Each corner is identified, so the motion can be estimated from them; nothing can be mapped.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ NO_PICTURES = "corners were recorded, no pictures"
 
 
 class CornerRecording(PairedAtOpening):
-    """A `Recording` that has `points` in place of pictures: every frame is refused as a picture.
+    """A `Recording` that has `points` instead of pictures: every frame is refused as a picture.
 
-    The folder doesn't say how the cameras see: the settings must name a rig. Raises `InputError` and
+    The folder contains no camera calibration: the settings must name a rig. Raises `InputError` and
     `CalibrationError`.
     """
 
@@ -63,7 +63,7 @@ class CornerRecording(PairedAtOpening):
         return () if imu is None else imu.notes
 
     def points(self) -> Iterator[NamedPoints]:
-        """Yield what both cameras see at each of the index's stamps."""
+        """Yield the points that both cameras see at each of the index's stamps."""
         pairing = self._pairs.pairing
         seen = [_by_stamp(rows) for rows in self._rows]
         for left, right in zip(pairing.left, pairing.right, strict=True):
@@ -93,7 +93,7 @@ class CornerRecording(PairedAtOpening):
         return None if log is None else log.samples
 
     def imu_noise(self) -> ImuNoise | None:
-        """Read the settings' imu.yaml: the folder holds none."""
+        """Read the settings' imu.yaml, as the folder has none."""
         return None if self._imu_yaml is None else read_imu_file(self._imu_yaml).noise
 
     def crane(self) -> CraneSamples | None:

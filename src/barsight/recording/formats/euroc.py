@@ -24,7 +24,7 @@ CRANE_COLUMNS = ("timestamp", "bridge_x", "trolley_y", "hoist_z")
 LASER_COLUMNS = ("profile", "x", "y", "z")
 SENSORS = ("cam0", "cam1", "imu0", "crane0", "laser0")
 FILES = ("body.yaml", *(f"{sensor}/{name}" for sensor in SENSORS for name in ("data.csv", "sensor.yaml")))
-"""All that is read but pictures."""
+"""All files that are read, except pictures."""
 
 
 class EurocRecording(PictureFiles):
@@ -62,7 +62,7 @@ class EurocRecording(PictureFiles):
 
     @cached_property
     def is_simulated(self) -> bool:
-        """Return `is_simulated` of `body.yaml`; False where it isn't said."""
+        """Return `is_simulated` of `body.yaml`; False if it isn't stated."""
         path = self._root / "body.yaml"
         return path.is_file() and read_document(path).values.get("is_simulated") is True
 

@@ -1,4 +1,4 @@
-"""Read EuRoC's CSV files: fast, stamps exact, and a wrong line named by its number."""
+"""Read EuRoC's CSV files: fast, with exact stamps, and with line numbers in errors."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Table:
     rest: Float64
 
     def line(self, row: int) -> int:
-        """Return the line of the file (from 1) that holds a row."""
+        """Return the line number in the file (from 1) of a row."""
         for k, (number, _) in enumerate(_data_lines(self.path)):
             if k == row:
                 return number
@@ -43,7 +43,7 @@ class Table:
             )
 
     def expect_increasing(self) -> None:
-        """Raise `InputError` naming the line where stamps repeat or go back."""
+        """Raise `InputError` naming the line at which stamps repeat or go back."""
         bad = np.flatnonzero(np.diff(self.first) <= 0)
         if bad.size:
             row = int(bad[0]) + 1
@@ -51,11 +51,11 @@ class Table:
 
 
 def read_table(path: Path, columns: tuple[str, ...], *, extra_allowed: bool = False) -> Table:
-    """Read a CSV of an integer and numbers; `#` lines, blank lines, CRLF and a BOM are passed over.
+    """Read a CSV of an integer and numbers; `#` lines, blank lines, CRLF and a BOM are skipped.
 
-    columns: their names, for the errors. extra_allowed: further columns on the right are ignored.
-    Raises `InputError` naming file and line for no such file, no rows, a wrong count of columns, text
-    where a number belongs, or a first column that isn't whole.
+    columns: their names, for error messages. extra_allowed: further columns on the right are ignored.
+    Raises `InputError` naming file and line for a missing file, no rows, a wrong number of columns, text
+    in place of a number, or a first column that isn't whole.
     """
     expect_lines(path, MAX_LINES, COPY)
     width = len(columns) - 1
@@ -121,13 +121,13 @@ def _data_lines(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def _is_header(text: str) -> bool:
-    """Check for a first line of names that lacks its `#`."""
+    """Check for a first line of names without `#`."""
     first = text.partition(",")[0].strip().lower()
     return first.startswith(("timestamp", "time", "profile", "stamp"))
 
 
 def _header_lines(path: Path) -> int:
-    """Count lines to pass over so that a header without `#` does not reach the number parser."""
+    """Count the lines to skip so that a header without `#` does not reach the number parser."""
     with path.open(encoding="utf-8-sig", errors="replace") as file:
         for number, line in enumerate(file, 1):
             text = line.partition("#")[0].strip()
@@ -137,7 +137,7 @@ def _header_lines(path: Path) -> int:
 
 
 def _diagnosis(path: Path, columns: tuple[str, ...], extra_allowed: bool) -> InputError:
-    """Find why the fast parser refused the file: the first line that is wrong."""
+    """Find the first wrong line, for which the fast parser refused the file."""
     empty = True
     for number, text in _data_lines(path):
         empty = False

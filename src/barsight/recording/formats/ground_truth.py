@@ -23,14 +23,14 @@ EUROC_COLUMNS = ("timestamp", "p_x", "p_y", "p_z", "q_w", "q_x", "q_y", "q_z")
 
 @dataclass(frozen=True, eq=False)
 class GroundTruth:
-    """stamp_ns: (N,) int64 increasing. poses: `reference_from_body`, where reference is `yard` or `world`."""
+    """stamp_ns: (N,) int64 increasing. poses: `reference_from_body`, the reference is `yard` or `world`."""
 
     stamp_ns: Int64
     poses: tuple[Pose, ...]
 
 
 def find_ground_truth(recording: Path) -> Path | None:
-    """Find the truth that lies with a recording of any format, or None."""
+    """Find the ground truth stored with a recording of any format, or None."""
     candidates = (
         recording / "mav0" / EUROC_FOLDER / "data.csv",
         recording / EUROC_FOLDER / "data.csv",
@@ -45,9 +45,9 @@ def find_ground_truth(recording: Path) -> Path | None:
 def read_ground_truth(path: Path, stamp_ns: Int64 | None = None, *, reference: str = "world") -> GroundTruth:
     """Read a trajectory file: EuRoC's `data.csv`, TUM's lines of eight, or KITTI's `poses.txt` of twelve.
 
-    path: the file, or a recording that holds one. stamp_ns: KITTI's file has no times; give the frames'.
-    reference: the name of the frame the poses are in. The body is the IMU (KITTI: cam0).
-    Raises `InputError` where it can't be read.
+    path: the file, or a recording that contains one. stamp_ns: the frames' stamps, for KITTI's file without
+    times. reference: the name of the poses' reference frame. The body is the IMU (KITTI: cam0).
+    Raises `InputError` if it can't be read.
     """
     file = find_ground_truth(path) if path.is_dir() else path
     if file is None:
@@ -71,7 +71,7 @@ def read_ground_truth(path: Path, stamp_ns: Int64 | None = None, *, reference: s
 
 
 def truth_of(recording: Recording) -> GroundTruth | None:
-    """Read the true trajectory that lies with a recording, None where there is none."""
+    """Read the true trajectory stored with a recording, None if there is none."""
     if find_ground_truth(recording.path) is None:
         return None
     return read_ground_truth(recording.path, np.array(recording.index.stamps_ns, np.int64))

@@ -1,4 +1,4 @@
-"""Read pictures that are files of their own: EuRoC's and KITTI's folders."""
+"""Read pictures stored as separate files: EuRoC's and KITTI's folders."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from barsight.recording.stored_images import StoredImage, merge_cameras
 
 
 class PictureFiles(PairedAtOpening):
-    """The pictures' part of a `Recording`; the reader sets what is named here.
+    """The part of a `Recording` that reads pictures; the reader sets the attributes below.
 
-    _root: the folder below which refusals name a file. _left, _right: a file for each of the pairs' stamps.
+    _root: the folder to which file names in refusals are relative. _left, _right: a file for each pair's
+    stamp.
     """
 
     rig: StereoRig
@@ -33,7 +34,7 @@ class PictureFiles(PairedAtOpening):
                 yield self._read_pair(stamp, self._left[left], self._right[right])
 
     def stored_images(self) -> Iterator[StoredImage]:
-        """Yield the bytes as stored of every picture that can be read, both cameras in time's order."""
+        """Yield the stored bytes of every readable picture, both cameras in time order."""
         for camera, stamp, path in merge_cameras(self._pairs, self._left, self._right):
             try:
                 data = read_picture(path, self.path)
@@ -42,7 +43,7 @@ class PictureFiles(PairedAtOpening):
             yield StoredImage(camera, stamp, path.suffix.lstrip(".").lower(), data)
 
     def _read_pair(self, stamp_ns: int, left: Path, right: Path) -> StereoFrame | RefusedFrame:
-        """Read one pair; refused, with the file's name, where either picture can't be used."""
+        """Read one pair; it is refused, with the file's name, if either picture can't be used."""
         images = []
         for path, camera in ((left, self.rig.cam0), (right, self.rig.cam1)):
             name = path.relative_to(self._root)

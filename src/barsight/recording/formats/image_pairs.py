@@ -1,4 +1,4 @@
-"""Find pairs of pictures that no calibration goes with yet: what `barsight calibrate` reads."""
+"""Find pairs of pictures without a calibration, the input of `barsight calibrate`."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ INSIDE = tuple(
         r"(?<=[a-z0-9_.-])(?P<side>[LR])(?=[-_.\d]|$)", r"(?<=[-_.])(?P<side>[lr])(?=[-_.\d])",
     )
 )  # fmt: skip
-"""Marks inside a name, as in imageL0 and imageR0."""
+"""Marks of the side within a name, as in imageL0 and imageR0."""
 FORMS = (
     "a folder with left and right (or cam0 and cam1) inside, with pictures named left01.png and right01.png, "
     "or an EuRoC recording"
@@ -33,7 +33,7 @@ FORMS = (
 
 @dataclass(frozen=True)
 class PicturePair:
-    """name: what both pictures are called, without left and right. left, right: their files."""
+    """name: common name of both pictures, without left and right. left, right: their files."""
 
     name: str
     left: Path
@@ -53,7 +53,8 @@ class ReadPair:
 def find_pairs(path: Path) -> tuple[PicturePair, ...]:
     """Find the pairs below `path`, in the order of their names (numbers by value).
 
-    Two folders pair by equal names, with `left`/`right` taken off. Raises InputError where there are none.
+    Files of two folders pair if their names are equal without `left`/`right`. Raises InputError if there are
+    none.
     """
     if not path.is_dir():
         what = "is a file" if path.exists() else "no such folder"

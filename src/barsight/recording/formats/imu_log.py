@@ -1,4 +1,4 @@
-"""Read an IMU's log at rest of any writer: CSV or columns, s or ns, g or m/s^2, degrees or radians."""
+"""Read a log of a resting IMU in any common form: CSV or columns, s or ns, g or m/s^2, degrees or radians."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from barsight.recording.formats.bag_file import IMU_TYPE, BagFile
 GRAVITY_MPS2 = 9.80665
 COLUMNS = 7
 MAX_SAMPLES = 2_000_000
-"""Lines of a log: three hours at 200 Hz."""
+"""Maximum number of samples of a log: three hours at 200 Hz."""
 FORM = "seven columns: time, three of the gyroscope, three of the accelerometer (or these two exchanged)"
 NAMES_FORM = "more than seven columns need a header that names gyro and accel"
 BAGS = (".bag", ".mcap", ".db3")
@@ -34,7 +34,7 @@ DEGREES = re.compile(r"(?:deg|°)(?!\w*[ _/.]*[CF](?:elsius|ahrenheit)?\b)|dps",
 
 
 class TimeUnit(StrEnum):
-    """auto: by the header, else the one in which the samples come at 2.5 to 2500 Hz."""
+    """auto: by the header, otherwise the unit in which the sample rate is between 2.5 and 2500 Hz."""
 
     AUTO = "auto"
     S = "s"
@@ -48,7 +48,7 @@ SLOWEST_S = 0.4
 
 
 class GyroUnit(StrEnum):
-    """auto: degrees where the file's header says deg, else radians."""
+    """auto: degrees if the file's header says deg, otherwise radians."""
 
     AUTO = "auto"
     RADIANS = "rad/s"
@@ -56,7 +56,7 @@ class GyroUnit(StrEnum):
 
 
 class AccelUnit(StrEnum):
-    """auto: g where the resting IMU shows about 1, m/s^2 where it shows about 9.8."""
+    """auto: g if the resting IMU measures about 1, m/s^2 if it measures about 9.8."""
 
     AUTO = "auto"
     MPS2 = "m/s^2"
@@ -65,7 +65,7 @@ class AccelUnit(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class ImuLog:
-    """samples: SI units, in the IMU's own axes. notes: what was assumed of units and order."""
+    """samples: SI units, in the IMU's own axes. notes: assumptions on units and order."""
 
     samples: ImuSamples
     notes: tuple[str, ...]
@@ -77,7 +77,7 @@ def read_imu_log(
 ) -> ImuLog:  # fmt: skip
     """Read a log of an IMU at rest, or a bag; a folder's `imu0/data.csv` is found. Raises InputError.
 
-    Stamps may be of any epoch, also from start-up; their unit is as `TimeUnit` has it.
+    Stamps may have any epoch, also start-up; their unit is given by `TimeUnit`.
     """
     is_bag = path.suffix in BAGS or (path / "metadata.yaml").is_file()
     file = path if is_bag else _file(path)
@@ -116,7 +116,7 @@ def _file(path: Path) -> Path:
 
 
 def _rows(path: Path, unit: TimeUnit) -> tuple[str, Int64, Float64]:
-    """Read header text, stamps (N,) ns in time's order and values (N, 6), by name where there are more."""
+    """Read header text, stamps (N,) ns in time order and values (N, 6), by column name if there are more."""
     lines = read_lines(path, MAX_SAMPLES, f"give {FORM}")
     start = next((k for k, line in enumerate(lines) if re.match(r"\s*[-+.\d]", line)), len(lines))
     rows = [(k + 1, line) for k, line in enumerate(lines[start:], start) if line.strip() and line[0] != "#"]
@@ -146,7 +146,7 @@ def _parts(line: str) -> list[str]:
 
 
 def _named_columns(path: Path, header: str, count: int) -> list[int]:
-    """Find time, gyroscope and accelerometer among more columns, by their names."""
+    """Find time, gyroscope and accelerometer among more columns by their names."""
     names = [name.strip() for name in re.split(r"[,;\t]", header)]
     if count < COLUMNS:
         problem = f"line 1: not {COLUMNS} numbers" if count else "holds no samples"

@@ -105,7 +105,7 @@ class KittiRecording(PictureFiles):
 
 
 def _pictures(folder: Path) -> dict[int, Path]:
-    """List the pictures by their number, in its order."""
+    """List the pictures in the order of their numbers."""
     found = {
         int(match[1]): path for path in folder.iterdir() if (match := PICTURE.match(path.name)) is not None
     }
@@ -189,7 +189,7 @@ def _rig(path: Path, projections: tuple[Float64, Float64], sizes: tuple[tuple[in
             )
         except ValueError as error:
             raise CalibrationError(path, str(error), ORIGINAL) from None
-        # P = K [I | t]: t is where the reference camera's origin lies in this camera.
+        # P = K [I | t]: t is the position of the reference camera's origin in this camera's frame.
         along_z = p[2, 3]
         places.append(
             [(p[0, 3] - p[0, 2] * along_z) / p[0, 0], (p[1, 3] - p[1, 2] * along_z) / p[1, 1], along_z]
@@ -204,7 +204,7 @@ def _rig(path: Path, projections: tuple[Float64, Float64], sizes: tuple[tuple[in
 
 
 def _size(paths: list[Path]) -> tuple[int, int]:
-    """Read (width, height) of the first picture that is whole: KITTI's calibration does not state it."""
+    """Read (width, height) of the first intact picture, as KITTI's calibration does not state it."""
     for path in paths:
         try:
             height, width = decode_gray(read_picture(path, path.parents[1])).shape

@@ -1,7 +1,7 @@
-"""Read the MCAP segments that a live run records, up to where a kill cut the last one off.
+"""Read the MCAP segments that a live run records, up to the point where a kill cut off the last one.
 
-A segment is an MCAP file without chunks: each record stands by itself, so what came before a torn one is
-whole [MCAP 1.0].
+A segment is an MCAP file without chunks: each record is independent, so everything before a torn one is
+intact [MCAP 1.0].
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ MAX_RECORD = 1 << 30
 
 @dataclass(frozen=True)
 class Record:
-    """A record of a segment. end: the file's offset behind it."""
+    """A record of a segment. end: file offset of its end."""
 
     kind: int
     data: bytes
@@ -36,14 +36,14 @@ class Record:
 
 
 def segments_of(folder: Path) -> list[Path]:
-    """List a folder's segments in the order that they were written in."""
+    """List a folder's segments in the order of writing."""
     return sorted(folder.glob(PATTERN))
 
 
 def records(path: Path, max_bytes: int = MAX_RECORD) -> Iterator[Record]:
-    """Yield a segment's records up to the footer or the first that is torn. Raises InputError for no MCAP.
+    """Yield a segment's records up to the footer or the first damaged one. Raises InputError if not MCAP.
 
-    max_bytes: of each record's data no more is read.
+    max_bytes: maximum number of bytes read of each record's data.
     """
     with path.open("rb") as stream:
         length = os.fstat(stream.fileno()).st_size
@@ -64,7 +64,7 @@ def records(path: Path, max_bytes: int = MAX_RECORD) -> Iterator[Record]:
 
 
 def text_at(data: bytes, place: int) -> tuple[str, int]:
-    """Read a text of a record; returns it and the place behind it."""
+    """Read a text of a record; return it and the position after it."""
     (size,) = struct.unpack_from("<I", data, place)
     return data[place + 4 : place + 4 + size].decode(), place + 4 + size
 
@@ -76,7 +76,7 @@ def channel_of(data: bytes, schemas: dict[int, str]) -> tuple[int, str, str]:
 
 
 class SegmentFile:
-    """Streams the messages of a folder of segments, as `BagFile` does those of a bag."""
+    """Streams the messages of a folder of segments, as `BagFile` does for a bag."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -87,14 +87,14 @@ class SegmentFile:
         self.topics = tuple(Topic(name, kind, count) for (name, kind), count in sorted(counts.items()))
 
     def messages(self, names: Collection[str]) -> Iterator[RawMessage]:
-        """Yield the messages of these topics as they were written."""
+        """Yield the messages of these topics in the order of writing."""
         for topic, kind, data in self._walk():
             if topic in names:
                 seconds, rest = struct.unpack_from("<II", data, 4)
                 yield RawMessage(topic, kind, seconds * NS_PER_S + rest, data)
 
     def decode(self, message: RawMessage) -> Any:
-        """Decode the message. Raises ValueError where it is torn."""
+        """Decode the message. Raises ValueError if it is torn."""
         try:
             return self._typestore.deserialize_cdr(message.data, message.kind)
         except MemoryError:

@@ -47,7 +47,7 @@ MAX_NS = 2**31 * NS_PER_S
 
 @dataclass(frozen=True)
 class BagFlavour:
-    """A kind of bag. storage is None for ROS 1."""
+    """A kind of bag. storage: None for ROS 1."""
 
     storage: StoragePlugin | None
 
@@ -65,10 +65,10 @@ Item = tuple[int, int, str, str, Any]
 def write_bag(
     recording: StoredPictures, folder: Path, name: str, flavour: BagFlavour, progress: Callable[[int], None]
 ) -> int:
-    """Write the bag `name` and its calibration into `folder`; returns the number of pictures written.
+    """Write the bag `name` and its calibration into `folder`; return the number of pictures written.
 
-    Messages come in time's order, so that a reader need not hold more than a chunk.
-    Raises `InputError` for stamps that ROS can't hold.
+    Messages are in time order, so that a reader need not hold more than a chunk.
+    Raises `InputError` for stamps that ROS can't represent.
     """
     messages = BagMessages(ros1=flavour.storage is None)
     imu, crane, laser = recording.imu(), recording.crane(), recording.laser()
@@ -92,7 +92,7 @@ def write_bag(
 
 
 def _expect_ros_times(path: Path, stamps: Int64) -> None:
-    """Refuse stamps (N,) that ROS can't hold: unsigned, increasing, seconds below 2^31."""
+    """Refuse stamps (N,) that ROS can't represent: unsigned, increasing, seconds below 2^31."""
     for stamp in (int(stamps[0]), int(stamps[-1])):
         if not 0 <= stamp < MAX_NS:
             raise InputError(
@@ -101,7 +101,7 @@ def _expect_ros_times(path: Path, stamps: Int64) -> None:
 
 
 def write_descriptions(recording: Recording, folder: Path) -> None:
-    """Write the calibration and the other descriptions that lie beside a bag's messages."""
+    """Write the calibration and the other descriptions beside a bag's messages."""
     write_camchain(folder / "camchain-imucam.yaml", recording.rig, CAMERA_TOPICS)
     if (noise := recording.imu_noise()) is not None:
         write_imu_file(folder / "imu.yaml", noise, IMU_TOPIC)
@@ -117,7 +117,7 @@ def _order(item: Item) -> tuple[int, int]:
 
 
 class BagMessages:
-    """Makes the messages of either ROS, stamped and in time's order per sensor."""
+    """Makes the messages for ROS 1 or ROS 2, stamped and in time order for each sensor."""
 
     def __init__(self, *, ros1: bool) -> None:
         self.typestore = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
@@ -139,7 +139,7 @@ class BagMessages:
             yield image.stamp_ns, image.camera, topic, COMPRESSED_TYPE, message
 
     def picture(self, camera: int, stamp_ns: int, image: UInt8) -> Item:
-        """Make the message of a picture (H, W) as it is."""
+        """Make the message of a picture (H, W) unchanged."""
         height, width = image.shape
         make, header = self._types[IMAGE_TYPE], self._header(stamp_ns, f"cam{camera}")
         message = make(header, height, width, "mono8", 0, width, np.ascontiguousarray(image).reshape(-1))
@@ -170,7 +170,7 @@ class BagMessages:
             yield stamp, 3, CRANE_TOPIC, POINT_TYPE, make(self._header(stamp, "yard"), point(*place))
 
     def laser(self, stamp_ns: int, laser: tuple[LaserProfile, ...]) -> Iterator[Item]:
-        """Make one cloud of all profiles, at the first picture's stamp: the contract gives the laser no
+        """Make one cloud of all profiles, at the first picture's stamp, as the contract gives the laser no
         times.
         """
         profile, xyz = laser_table(laser)
@@ -193,7 +193,7 @@ def _write(
 ) -> int:
     """Write the bag itself.
 
-    rosbags names the files of a ROS 2 bag after its folder, so it gets one of its own.
+    rosbags names the files of a ROS 2 bag after its folder, so it gets its own folder.
     """
     place = folder / name
     writer: Any

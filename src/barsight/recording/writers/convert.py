@@ -1,7 +1,7 @@
-"""Convert a recording to another format, without loss and without holding more than a picture at a time.
+"""Convert a recording to another format, without loss and with at most one picture in memory at a time.
 
 Stored pictures are copied byte for byte, stamps as integers, the slow sensors' numbers as float64, and the
-rig so that it reads back bit for bit; a round trip is the same recording. Pictures that are missing or torn
+rig so that it reads back bit for bit; a round trip yields the same recording. Missing pictures and damaged
 messages are left out and counted.
 """
 
@@ -25,7 +25,7 @@ Target = Literal["euroc", "ros2-mcap", "ros2-sqlite3", "ros1"]
 
 @dataclass(frozen=True)
 class ConversionReport:
-    """out: the folder written. images: pictures copied. left_out: pictures named but missing or torn."""
+    """out: the folder written. images: pictures copied. left_out: pictures listed but missing or damaged."""
 
     out: Path
     images: int
@@ -38,11 +38,11 @@ def convert(
     target: Target,
     progress: Callable[[int, int], None] | None = None,
 ) -> ConversionReport:
-    """Write `recording` into the folder `out` in another format, whole or not at all.
+    """Write `recording` into the folder `out` in another format, completely or not at all.
 
-    progress: called with pictures done and pictures in all. Ground truth that lies with the recording is
-    copied, but never read. Raises `InputError` for what can't be read, `OutputError` for what can't be
-    written or an `out` that lies inside the recording.
+    progress: called with the number of pictures done and in total. Ground truth stored with the recording is
+    copied, but never read. Raises `InputError` if something can't be read, `OutputError` if something can't
+    be written or if `out` is inside the recording.
     """
     if lies_within(out, recording.path):
         raise OutputError(f"{out}: lies in the recording itself; name a folder elsewhere")

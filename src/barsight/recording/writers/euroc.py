@@ -26,7 +26,7 @@ LASER_HEADER = "#profile,x [m],y [m],z [m]"
 
 
 def write_euroc(recording: StoredPictures, folder: Path, progress: Callable[[int], None]) -> int:
-    """Write `folder/mav0`; returns the number of pictures written."""
+    """Write `folder/mav0`; return the number of pictures written."""
     mav0 = folder / "mav0"
     stamps = recording.camera_stamps.left_ns
     write_rig(mav0, recording.rig, median_rate(stamps))
@@ -60,7 +60,7 @@ def laser_table(laser: Iterable[LaserProfile]) -> tuple[Int64, Float64]:
 
 
 def write_crane_description(path: Path, crane: CraneSamples) -> None:
-    """Write the crane's `sensor.yaml` of the contract."""
+    """Write the crane's `sensor.yaml` as the contract defines it."""
     write_document(
         path,
         {
@@ -82,7 +82,7 @@ def write_laser_description(path: Path, laser: tuple[LaserProfile, ...]) -> None
 
 
 def copy_truth(recording: StoredPictures, folder: Path) -> None:
-    """Carry ground truth along as EuRoC's file; KITTI's `poses.txt` is turned into one."""
+    """Copy ground truth as EuRoC's file; KITTI's `poses.txt` is converted to one."""
     source = find_ground_truth(recording.path)
     if source is None:
         return

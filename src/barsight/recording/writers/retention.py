@@ -1,4 +1,4 @@
-"""Keep a disk from filling: delete the oldest segments of earlier recordings, but for protected ones."""
+"""Keep a disk from filling up: delete the oldest segments of earlier recordings, except protected ones."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from pathlib import Path
 from barsight.recording.formats.segments import PATTERN
 
 PROTECTED = "PROTECTED"
-"""A file of this name in a recording's folder protects it."""
+"""Name of a file that protects the recording whose folder it is in."""
 
 
 def used_ratio(folder: Path) -> float:
-    """Compute the share of the disk that is used, as those who aren't root may use it."""
+    """Compute the share of the disk in use, of the space available to users other than root."""
     usage = shutil.disk_usage(folder)
     return usage.used / max(usage.used + usage.free, 1)
 
 
 class Retention:
-    """Tidies the folder that `current`, a recording, lies in among earlier ones.
+    """Cleans up the folder that contains the recording `current` and earlier ones.
 
-    is_full: whether the disk is fuller than `stop_used_ratio`, and nothing more may be recorded.
+    is_full: whether the disk is fuller than `stop_used_ratio`, so that nothing more may be recorded.
     """
 
     def __init__(
@@ -37,7 +37,7 @@ class Retention:
         self.is_full = False
 
     def tidy(self) -> int:
-        """Delete the oldest segments until the disk is emptier than `max_used_ratio`; return how many."""
+        """Delete the oldest segments until the disk's use is below `max_used_ratio`; return how many."""
         deleted = 0
         for path in self._deletable():
             if self._measure(self._current) < self._max:
@@ -50,7 +50,7 @@ class Retention:
         return deleted
 
     def _deletable(self) -> list[Path]:
-        """List segments of the other recordings, the oldest first; folders are named by when they began."""
+        """List the segments of the other recordings, the oldest first; folders are named by their start."""
         return [
             path
             for folder in sorted(self._current.parent.iterdir())

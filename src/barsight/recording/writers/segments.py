@@ -1,4 +1,4 @@
-"""Write a live run's recording as MCAP segments that a kill leaves readable."""
+"""Write a live run's recording as MCAP segments that stay readable after a kill."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ KINDS = {
     IMU_TOPIC: IMU_TYPE,
     CRANE_TOPIC: POINT_TYPE,
 }
-"""Topics of a segment; a channel's number is its place here plus one."""
+"""Topics of a segment with their types; a channel's number is its position here plus one."""
 SEGMENT_BYTES = 256 << 20
 END = struct.pack("<BQI", DATA_END, 4, 0) + struct.pack("<BQQQI", FOOTER, 20, 0, 0, 0) + MAGIC
 
 
 class SegmentWriter:
-    """Appends messages to the last segment of a folder, and begins a new one where that is full.
+    """Appends messages to the last segment of a folder, and begins a new one when that is full.
 
-    Each message goes to the system at once: a killed writer loses at most the one that it was writing, which
-    the next writer cuts off. last_ns: the last stamp of each topic that is written, 0 for none. bytes:
-    written by this writer.
+    Each message is passed to the system at once: a killed writer loses at most the message that it was
+    writing, which the next writer cuts off. last_ns: the last stamp written for each topic, 0 for none.
+    bytes: number written by this writer.
     """
 
     def __init__(self, folder: Path, segment_bytes: int = SEGMENT_BYTES) -> None:
@@ -61,7 +61,7 @@ class SegmentWriter:
 
     @property
     def last_pair_ns(self) -> int:
-        """Return the stamp of the last whole pair, 0 before the first."""
+        """Return the stamp of the last complete pair, 0 before the first."""
         return min(self.last_ns[topic] for topic in CAMERA_TOPICS)
 
     def pair(self, stamp_ns: int, left: UInt8, right: UInt8) -> None:
@@ -71,7 +71,7 @@ class SegmentWriter:
                 self._write(self._messages.picture(camera, stamp_ns, image))
 
     def samples(self, samples: ImuSamples | CraneSamples) -> None:
-        """Append readings; those that are written already are left out."""
+        """Append readings, except those already written."""
         made = self._messages
         items = made.imu(samples) if isinstance(samples, ImuSamples) else made.crane(samples)
         for item in items:
@@ -79,12 +79,12 @@ class SegmentWriter:
                 self._write(item)
 
     def sync(self) -> None:
-        """Wait until all is on the disk."""
+        """Wait until everything is on the disk."""
         if self._stream is not None:
             os.fsync(self._stream.fileno())
 
     def close(self) -> None:
-        """End the segment as MCAP asks."""
+        """End the segment as MCAP requires."""
         if self._stream is not None:
             _append(self._stream, END)
             self.sync()
@@ -97,7 +97,7 @@ class SegmentWriter:
             self.close()
         stream = self._stream or self._begin()
         data = self._messages.serialize(message, kind)
-        self._log_ns = max(self._log_ns, stamp_ns)  # readers ask that the log's times do not go back
+        self._log_ns = max(self._log_ns, stamp_ns)  # readers need log times that don't go back
         head = MESSAGE_HEAD.pack(self._channels[topic], 0, self._log_ns, stamp_ns)
         self.bytes += _append(stream, b"".join((HEAD.pack(MESSAGE, len(head) + len(data)), head, data)))
         self.last_ns[topic] = stamp_ns
@@ -117,8 +117,9 @@ class SegmentWriter:
         return self._stream
 
     def _take_up(self, path: Path) -> None:
-        """Note what an earlier writer wrote, by heads alone: a shift's tens of GB take minutes to read. End a
-        segment that it did not end.
+        """Read an earlier writer's progress, and end a segment that it did not end.
+
+        Only the messages' heads are read: a shift's tens of GB would take minutes.
         """
         topics, end, is_ended = list(KINDS), 0, False
         for record in records(path, MESSAGE_HEAD.size):
