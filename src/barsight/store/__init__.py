@@ -1,1 +1,1 @@
-"""The yard over time: surveys, bundles that keep their names, lifts, alarms, an audit log; one database."""
+"""Keep the yard over time in one database: surveys, bundles with lasting names, lifts, alarms, audit log."""

@@ -1,4 +1,4 @@
-"""Keep the accounts of the page: people with passwords, programs with tokens, each with a role."""
+"""Keep the accounts of the page: persons with passwords, programs with tokens, each with a role."""
 
 from __future__ import annotations
 
@@ -26,8 +26,10 @@ _NOBODY = f"{'0' * 32}${'0' * 128}"
 
 @dataclass(frozen=True)
 class Account:
-    """A name that may use the page. kind: `person` or `token`. secret: scrypt's salt and digest of a person's
-    password, SHA-256 of a token.
+    """A name that may use the page.
+
+    kind: `person` or `token`. secret: a person's scrypt salt and digest of the password, or SHA-256 of a
+    token.
     """
 
     name: str
@@ -37,7 +39,7 @@ class Account:
 
 
 def list_accounts(connection: Connection) -> dict[str, Account]:
-    """List the accounts that may be used, by name."""
+    """List the active accounts by name."""
     newest: dict[str, Account] = {}
     for row in connection.execute(select(ACCOUNTS).order_by(ACCOUNTS.c.id)).all():
         newest[row.name] = Account(row.name, row.kind, row.role, row.secret)
@@ -45,21 +47,21 @@ def list_accounts(connection: Connection) -> dict[str, Account]:
 
 
 def add_person(opened: Entry, name: str, role: str, password: str) -> None:
-    """Add a person, or give one that is there another role and password. Raises ConfigError."""
+    """Add a person, or change role and password of an existing one. Raises ConfigError."""
     expect_password(password)
     salt = secrets.token_bytes(16)
     _add(opened, name, "person", role, f"{salt.hex()}${password_digest(password, salt)}")
 
 
 def add_token(opened: Entry, name: str, role: str) -> str:
-    """Add a token for a program and return it: the store keeps its digest only. Raises ConfigError."""
+    """Add a token for a program and return it; the store keeps only its digest. Raises ConfigError."""
     token = secrets.token_urlsafe(32)
     _add(opened, name, "token", role, token_digest(token))
     return token
 
 
 def withdraw(opened: Entry, name: str) -> None:
-    """Withdraw an account. Raises ConfigError where there is none, or it is the last engineer."""
+    """Withdraw an account. Raises ConfigError if there is none, or if it is the last engineer."""
     accounts = list_accounts(opened.connection)
     if name not in accounts:
         raise ConfigError(f"there is no account {name!r}")
@@ -73,14 +75,14 @@ def withdraw(opened: Entry, name: str) -> None:
 
 
 def is_password(account: Account | None, password: str) -> bool:
-    """Check a person's password; it takes as long for a name that there is not."""
+    """Check a person's password; an unknown name takes the same time."""
     secret = account.secret if account is not None and account.kind == "person" else _NOBODY
     salt, _, digest = secret.partition("$")
     return hmac.compare_digest(password_digest(password, bytes.fromhex(salt)), digest)
 
 
 def token_digest(token: str) -> str:
-    """Compute SHA-256 of a token: it is drawn from 256 bits, so that no slow digest is needed."""
+    """Compute SHA-256 of a token: it has 256 random bits, so that no slow digest is needed."""
     return hashlib.sha256(token.encode()).hexdigest()
 
 

@@ -1,4 +1,4 @@
-"""Add a measured folder to the store: its bundles get names, and what became of the others is told."""
+"""Add a measured folder to the store: name its bundles, and find what became of those known before."""
 
 from __future__ import annotations
 
@@ -56,9 +56,9 @@ REASONS: dict[Finding, str] = {
 class AddedSurvey:
     """One survey's place in the yard's history.
 
-    is_new: False where the store had it before. changes: of its bundles by name: `same`, `moved`, `added`
-    (its place was empty before), `found` (its place had not been seen, or lay covered). absences: of bundles
-    that it did not see.
+    is_new: False if the store already had it. changes: of its bundles by name: `same`, `moved`, `added` (its
+    place was empty before), `found` (its place had not been seen, or was covered). absences: of bundles that
+    it did not see.
     """
 
     map_id: str
@@ -74,7 +74,7 @@ class AddedSurvey:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredSurvey:
-    """A measured folder, read and held against its digests.
+    """A measured folder, read and checked against its digests.
 
     from_ns, to_ns: of its frames. records: of bundles.json, without the bars.
     """
@@ -96,14 +96,14 @@ def add_survey(
     store: Store, read: MeasuredSurvey, who: str, *, same_yard: bool = False, rig: str | None = None,
     crane: str | None = None, version: str | None = None,
 ) -> AddedSurvey:  # fmt: skip
-    """Add a survey in one transaction; one that is there already changes nothing.
+    """Add a survey in one transaction; one that the store already has changes nothing.
 
-    An older survey is put into its place in time: its bundles are matched to those seen before it and to
-    those seen first after it. same_yard: what places it in the yard may differ from the newest survey's.
-    rig, crane: names of what it was surveyed with, where not given those that its calibration is of. version:
-    of a fleet, whose surveys its bundles are matched to before that is promoted.
+    An older survey is inserted at its place in time: its bundles are matched to those seen before it and to
+    those first seen after it. same_yard: its placement in the yard may differ from the newest survey's.
+    rig, crane: names of the equipment used, by default those of its calibration. version: of a fleet; its
+    bundles are matched to the surveys of that version before the version is promoted.
 
-    Raises InputError where simulated and measured surveys would mix, or those of two yard frames.
+    Raises InputError if simulated and measured surveys, or surveys of two yard frames, would mix.
     """
     heights = pack(read.heights)
     with entry(store, who, f"survey {read.identity.map_id}") as opened:
@@ -116,7 +116,7 @@ def add_survey(
         partner = {j: i for i, j in matched.found.items()}
         before = {j: last[known[i].bundle_id] for j, i in partner.items() if known[i].bundle_id in last}
         shown = _shown_before(opened.connection, read, set(range(len(read.found))) - set(before))
-        # What lay covered was not laid there since.
+        # A bundle that was covered was not put there since.
         laid = [j for j, finding in shown.items() if j not in partner and finding != "covered"]
         carried = match_carried(known, read.found, matched, laid)
         partner |= {j: i for i, j in carried.items()}
@@ -153,10 +153,10 @@ def add_survey(
 
 
 def read_survey(folder: Path) -> MeasuredSurvey:
-    """Open a measured folder, with every file held against its digest.
+    """Open a measured folder, with every file checked against its digest.
 
-    Raises InputError for a folder that was changed or has no bundles or times, MeasurementError where its
-    map has no place in the yard.
+    Raises InputError for a folder that was changed or has no bundles or times, MeasurementError if its map
+    has no place in the yard.
     """
     summary, identity = open_folder(folder, cloud=True)
     path = folder / "bundles.json"
@@ -186,7 +186,7 @@ def read_survey(folder: Path) -> MeasuredSurvey:
 
 
 def _expect_new(connection: Connection, read: MeasuredSurvey) -> bool:
-    """Check that the store has no such map. Raises InputError where simulated and real ones would mix."""
+    """Check that the store has no such map. Raises InputError if simulated and real ones would mix."""
     kinds = select(SURVEYS.c.is_simulated).limit(1)
     simulated = connection.execute(kinds).scalar()
     if simulated is not None and simulated != read.identity.is_simulated:
@@ -205,7 +205,7 @@ def _expect_same_frame(connection: Connection, read: MeasuredSurvey) -> None:
 
 
 def _shown_before(connection: Connection, read: MeasuredSurvey, new: set[int]) -> dict[int, Finding]:
-    """Tell what the newest earlier survey that saw a bundle's place saw there. new: positions in
+    """Find what the newest earlier survey that saw a bundle's place saw there. new: positions in
     `read.found`.
     """
     told: dict[int, Finding] = dict.fromkeys(new, "unseen")
@@ -237,8 +237,8 @@ def _add_row(opened: Entry, read: MeasuredSurvey, heights: bytes) -> int:
 def _known(
     connection: Connection, read: MeasuredSurvey, version: str | None
 ) -> tuple[tuple[KnownBundle, ...], dict[int, Bundle]]:
-    """Gather the bundles that lay in the yard before this survey or were first seen after it; and of the
-    former, as seen last.
+    """Collect the bundles in the yard before this survey or first seen after it; and the former as last
+    seen.
     """
     before = newest_sightings(connection, read.to_ns, version)
     after = next_sightings(connection, read.to_ns, version)
@@ -267,7 +267,7 @@ def _known(
 
 
 def _change(before: Bundle | None, found: Bundle, shown: Finding | None) -> str:
-    """Tell what became of a bundle at its place, or how a new one came: shown, what its place was before."""
+    """Classify a bundle's change, or the origin of a new one. shown: the earlier finding at its place."""
     if before is not None:
         return "moved" if has_moved(before, found) else "same"
     return "added" if shown == "gone" else "found"
@@ -276,8 +276,9 @@ def _change(before: Bundle | None, found: Bundle, shown: Finding | None) -> str:
 def _note_equipment(
     opened: Entry, read: MeasuredSurvey, survey_id: int, named: tuple[str | None, str | None]
 ) -> bool:
-    """Add rig, calibration and recordings of a survey; tell whether the calibration is valid now, and forbid
-    the map's lifts where it isn't.
+    """Add rig, calibration and recordings of a survey; return whether the calibration is valid now.
+
+    If it isn't, the map's lifts are forbidden.
     """
     digest = read.identity.calibration_id
     rig = note_calibration(opened, digest, *named)
@@ -289,8 +290,8 @@ def _note_equipment(
 
 
 def _note_looking_back(opened: Entry, read: MeasuredSurvey, survey_id: int) -> bool:
-    """Tell whether the lifts of a measured yard were judged as of its last frame, and forbid them where they
-    were: nobody held their age against a clock. A simulated yard's clock goes on from that frame.
+    """Return True, and forbid the lifts, if a measured yard's lifts were judged as of its last frame: their
+    age was not compared with a clock. A simulated yard's clock continues from that frame.
     """
     if read.lifts is None or not read.lifts["looks_back"] or read.identity.is_simulated:
         return False

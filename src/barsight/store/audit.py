@@ -1,4 +1,4 @@
-"""Log each addition to the store in a chain of digests, and check the chain and the rows that it covers."""
+"""Log each addition to the store in a chain of digests, and verify the chain and the rows that it covers."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ with extra("store"):
 
 _FIRST = "0" * 64
 _CHUNK = 500
-"""Ids asked for at once: databases limit the parameters of a statement."""
+"""Maximum number of ids in one query, as databases limit the parameters of a statement."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One addition under way. at_ns: when it happened. rows: ids of what was added, by table."""
+    """An addition in progress. at_ns: when it happened. rows: ids of the rows added, by table."""
 
     connection: Connection
     who: str
@@ -45,8 +45,8 @@ class Entry:
 
 @dataclass(frozen=True)
 class AuditChain:
-    """A chain that holds. entries: their number. digest: of the last; whoever notes it elsewhere can tell
-    later whether the end of the chain was cut off.
+    """A valid chain. entries: number of entries. digest: of the last entry; if it is also kept elsewhere, a
+    missing end of the chain can be detected later.
     """
 
     entries: int
@@ -55,9 +55,9 @@ class AuditChain:
 
 @contextmanager
 def entry(store: Store, who: str, what: str, at_ns: int | None = None) -> Iterator[Entry]:
-    """Begin one addition: all of its rows and its line in the audit log are committed together, or none.
+    """Begin one addition: its rows and its line in the audit log are all committed together, or none.
 
-    at_ns: when it happened; now where None.
+    at_ns: when it happened; None for now.
     """
     with store.writing() as connection:
         opened = Entry(connection, who, time.time_ns() if at_ns is None else at_ns)
@@ -81,9 +81,9 @@ def _append(opened: Entry, what: str) -> None:
 
 
 def verify_chain(connection: Connection) -> AuditChain | Failed:
-    """Walk the log from its first row: each digest, the row before it, and the rows that it covers.
+    """Verify the log from its first row: each digest, the link to the row before, and the rows it covers.
 
-    Fails with the first row that doesn't hold, or where a table has rows that no row of the log covers.
+    Fails with the first invalid row, or if a table has rows that no row of the log covers.
     """
     previous, count = _FIRST, 0
     covered: dict[str, set[int]] = {}
@@ -104,7 +104,7 @@ def verify_chain(connection: Connection) -> AuditChain | Failed:
 def _problem(
     connection: Connection, row: dict[str, Any], count: int, previous: str, covered: dict[str, set[int]]
 ) -> str:
-    """Tell what is wrong with a row of the log; empty where nothing is. covered: takes its rows' ids."""
+    """Return what is wrong with a row of the log, empty if it is valid. covered: receives its rows' ids."""
     digest = row.pop("digest")
     if row["id"] != count:
         return f"it is missing, row {row['id']} follows"
@@ -122,7 +122,7 @@ def _problem(
 
 
 def _rows_digest(connection: Connection, rows: dict[str, list[int]]) -> str:
-    """Compute SHA-256 over rows as the database has them."""
+    """Compute SHA-256 over rows as stored in the database."""
     found: list[Any] = []
     for name in sorted(rows):
         table, ids = METADATA.tables[name], sorted(rows[name])
@@ -137,12 +137,12 @@ def _plain(row: Any) -> list[Any]:
 
 
 def _digest(row: dict[str, Any]) -> str:
-    """Compute SHA-256 of the digest before and a row's canonical JSON."""
+    """Compute SHA-256 of the previous digest and a row's canonical JSON."""
     return hashlib.sha256((row["previous"] + _canonical(row)).encode()).hexdigest()
 
 
 def _canonical(value: Any) -> str:
-    """Write JSON with sorted keys and without spaces, so that the same value is the same text."""
+    """Write JSON with sorted keys and without spaces, so that equal values give equal text."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
 
 
@@ -150,5 +150,5 @@ def user_name() -> str:
     """Name the computer's user for the audit log."""
     try:
         return getpass.getuser()
-    except (KeyError, OSError):  # a container's user may have no name
+    except (KeyError, OSError):  # in a container the user may have no name
         return f"uid {os.getuid()}"

@@ -1,4 +1,4 @@
-"""Keep which calibration of a rig is valid when, and who approved it: a newer one ends the older."""
+"""Record which calibration of a rig is valid when, and who approved it: a newer one ends the older one."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ with extra("store"):
     from sqlalchemy import Connection, Row, select
 
 FIRST = "1"
-"""Name of a crane or rig that nobody has named."""
+"""Name of a crane or rig without a given name."""
 
 
 @dataclass(frozen=True)
 class ApprovedTime:
-    """A time for which a calibration was approved. until_ns: its own end, or where a newer one of the rig
-    begins; None where neither is known.
+    """A period for which a calibration was approved.
+
+    until_ns: its own end, or the beginning of the rig's next one; None if neither is known.
     """
 
     digest: str
@@ -33,13 +34,13 @@ class ApprovedTime:
     at_ns: int
 
     def holds(self, clock_ns: int) -> bool:
-        """Tell whether it holds at a time."""
+        """Return True if the period includes a time."""
         return self.from_ns <= clock_ns and (self.until_ns is None or clock_ns < self.until_ns)
 
 
 @dataclass(frozen=True)
 class KnownCalibration:
-    """A calibration with its rig and crane. times: for which it was approved, the oldest first."""
+    """A calibration with its rig and crane. times: periods of its approval, the oldest first."""
 
     digest: str
     rig: str
@@ -48,10 +49,10 @@ class KnownCalibration:
 
 
 def note_calibration(opened: Entry, digest: str, rig: str | None = None, crane: str | None = None) -> str:
-    """Add a calibration, its rig and its crane where the store lacks them; return the rig's name.
+    """Add a calibration, its rig and its crane if the store lacks them; return the rig's name.
 
-    rig, crane: their names; where not given those of this calibration, or else of the newest one. Raises
-    InputError where the calibration is another rig's.
+    rig, crane: their names; by default those of this calibration, otherwise of the newest one. Raises
+    InputError if the calibration belongs to another rig.
     """
     known = {row.digest: row.rig for row in _rows(opened.connection)}
     own = known.get(digest)
@@ -65,7 +66,7 @@ def note_calibration(opened: Entry, digest: str, rig: str | None = None, crane: 
 
 
 def _hang(opened: Entry, rig: str, crane: str | None) -> None:
-    """Note at which crane a rig hangs, where that is new."""
+    """Record on which crane a rig is mounted, if that is new."""
     hung = _cranes(opened.connection)
     wanted = crane or hung.get(rig) or (list(hung.values()) or [FIRST])[-1]
     if hung.get(rig) == wanted:
@@ -80,9 +81,9 @@ def _hang(opened: Entry, rig: str, crane: str | None) -> None:
 def approve_calibration(
     opened: Entry, digest: str, from_ns: int, until_ns: int | None, note: str | None = None
 ) -> None:
-    """Approve a calibration that the store knows for a time, by whoever makes the entry. Raises ConfigError.
+    """Approve a known calibration for a period, in the name of the entry's author. Raises ConfigError.
 
-    Once one of a rig's is approved, lifts are offered under approved ones alone.
+    Once a calibration of a rig has been approved, lifts are offered only with approved ones.
     """
     query = select(CALIBRATIONS.c.id).where(CALIBRATIONS.c.digest == digest)
     number = opened.connection.execute(query).scalar()
@@ -97,8 +98,8 @@ def approve_calibration(
 
 
 def find_calibration(connection: Connection, start: str) -> str:
-    """Find a calibration's digest by its beginning, of those that are known or that a survey was measured
-    with. Raises ConfigError.
+    """Find a calibration's digest by its beginning, among known ones and those of surveys. Raises
+    ConfigError.
     """
     surveyed = connection.execute(select(SURVEYS.c.calibration_id)).scalars()
     known = {row.digest for row in _rows(connection)} | set(surveyed)
@@ -121,12 +122,12 @@ def list_calibrations(connection: Connection) -> tuple[KnownCalibration, ...]:
 
 
 def why_invalid(connection: Connection, digest: str, clock_ns: int) -> str:
-    """Tell why a map's calibration isn't valid at a time; empty where it is, or none of its rig's was ever
+    """Return why a map's calibration isn't valid at a time; empty if it is, or if none of its rig's was ever
     approved.
     """
     times = _times(connection)
     rigs = {row.digest: row.rig for row in _rows(connection)}
-    # One that the store doesn't know, of a survey of an earlier schema, may be of any rig.
+    # A calibration unknown to the store, from a survey of an earlier schema, may belong to any rig.
     own = [one for one in times if digest not in rigs or one.rig == rigs[digest]]
     if not own or any(one.digest == digest and one.holds(clock_ns) for one in own):
         return ""
@@ -143,7 +144,7 @@ def why_invalid(connection: Connection, digest: str, clock_ns: int) -> str:
 
 
 def _times(connection: Connection) -> list[ApprovedTime]:
-    """List the approved times, each ended where the next one of its rig begins."""
+    """List the approved periods, each ended at the beginning of its rig's next one."""
     rows = connection.execute(
         select(VALIDITIES, CALIBRATIONS.c.digest, CALIBRATIONS.c.rig)
         .join(CALIBRATIONS)
@@ -165,6 +166,6 @@ def _rows(connection: Connection) -> list[Row[Any]]:
 
 
 def _cranes(connection: Connection) -> dict[str, str]:
-    """Read the crane of each rig, in the order in which they were hung."""
+    """Read the crane of each rig, in the order of mounting."""
     query = select(RIGS.c.name.label("rig"), CRANES.c.name).join(CRANES).order_by(RIGS.c.id)
     return {row.rig: row.name for row in connection.execute(query).all()}

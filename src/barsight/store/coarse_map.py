@@ -1,4 +1,4 @@
-"""Keep a coarse copy of each survey's heights in the store, to tell later what a place looked like."""
+"""Keep a coarse copy of each survey's heights in the store, to look up the state of a place later."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _UNKNOWN = np.iinfo(np.int16).min
 
 
 def pack(heights: YardMap) -> bytes:
-    """Take every tenth cell of 10 mm in both directions, in mm; cells that were filled are unknown."""
+    """Take every tenth 10 mm cell in both directions, in mm; filled cells become unknown."""
     step = max(1, round(CELL_M / heights.cell_m))
     rows, columns = heights.shape
     stripe = step * max(1, _STRIPE // step)
@@ -31,12 +31,12 @@ def pack(heights: YardMap) -> bytes:
 
 
 def _seen(part: HeightMap) -> Float32:
-    """Return a part's heights (rows, columns), NaN where no sensor saw the cell."""
+    """Return a part's heights (rows, columns), NaN for cells that no sensor saw."""
     return np.where((part.source == 1) | (part.source == 2), part.z_m, np.float32(np.nan))
 
 
 def unpack(packed: bytes) -> HeightMap:
-    """Read what `pack` wrote; sigma and views are not kept."""
+    """Read the output of `pack`; sigma and views are not kept."""
     head, _, body = zlib.decompress(packed).partition(b"\n")
     x0_m, y0_m, cell_m, rows, columns = json.loads(head)
     mm = np.frombuffer(body, "<i2").reshape(rows, columns)

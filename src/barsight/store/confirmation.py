@@ -1,4 +1,4 @@
-"""Confirm offered lifts and report what came of them; end offers and confirmations with their map."""
+"""Confirm offered lifts and report their outcome; end offers and confirmations together with their map."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ OPEN = ("offered", "claimed", "executing")
 
 @dataclass(frozen=True, eq=False)
 class OpenLift:
-    """A lift that is offered, claimed or executing. record: its JSON of lifts.json, without poles, checks."""
+    """An offered, claimed or executing lift. record: its JSON in lifts.json, without poles and checks."""
 
     lift_id: int
     survey_id: int
@@ -46,7 +46,7 @@ class OpenLift:
 
 
 def newest_survey(connection: Connection) -> Row[Any] | None:
-    """Return the row of the survey with the newest frames, without its heights; None where there is none."""
+    """Return the row of the survey with the newest frames, without its heights; None if there is none."""
     return connection.execute(_newest_query()).first()
 
 
@@ -67,8 +67,8 @@ def map_vetoes(connection: Connection, survey_id: int) -> list[dict[str, str]]:
 
 
 def yard_clock_ns(connection: Connection, now_ns: int | None = None) -> int:
-    """Tell the time of the yard: this computer's; of a simulated yard its own, which went on from the newest
-    survey's last frame when that survey was added.
+    """Return the yard's time: this computer's clock, or that of a simulated yard, which has run from the
+    newest survey's last frame since that survey was added.
     """
     now_ns = time.time_ns() if now_ns is None else now_ns
     newest = newest_survey(connection)
@@ -78,7 +78,7 @@ def yard_clock_ns(connection: Connection, now_ns: int | None = None) -> int:
 
 
 def open_lifts(connection: Connection) -> tuple[OpenLift, ...]:
-    """List the lifts that are offered, claimed or executing, in the order of their ids."""
+    """List the offered, claimed or executing lifts in the order of their ids."""
     return _lifts(connection, _open_query())
 
 
@@ -114,7 +114,7 @@ def _lifts(connection: Connection, query: Select[Any]) -> tuple[OpenLift, ...]:
 
 
 def confirm_lift(store: Store, lift_id: int, map_id: str, who: str) -> None:
-    """Confirm an offered lift on the map that the operator saw. Raises InputError where it may not be."""
+    """Confirm an offered lift on the map that the operator saw. Raises InputError if this isn't allowed."""
 
     def step(opened: Entry, lift: OpenLift) -> None:
         if lift.map_id != map_id:
@@ -127,7 +127,7 @@ def confirm_lift(store: Store, lift_id: int, map_id: str, who: str) -> None:
 
 
 def begin_lift(store: Store, lift_id: int, who: str) -> None:
-    """Begin a confirmed lift, once. Raises InputError where it may not begin, or another one has begun."""
+    """Begin a confirmed lift, once. Raises InputError if it may not begin, or if another one has begun."""
 
     def step(opened: Entry, lift: OpenLift) -> None:
         for other in open_lifts(opened.connection):
@@ -141,9 +141,10 @@ def begin_lift(store: Store, lift_id: int, who: str) -> None:
 
 
 def take_lift(store: Store, lift_id: int, who: str, alarm: tuple[str, str] | None = None) -> None:
-    """Report that a confirmed lift was executed; offers and confirmations beside it end. Raises InputError
-    where it can't be recorded: one that was confirmed and has ended raises an alarm then, and all offers end.
-    alarm: code and reason of one to raise with it.
+    """Report a confirmed lift as executed; this ends nearby offers and confirmations.
+
+    alarm: code and reason of an alarm to raise with it. Raises InputError if the lift can't be recorded; if it
+    had been confirmed and has ended, an alarm is raised and all offers end.
     """
 
     def step(opened: Entry, lift: OpenLift) -> None:
@@ -164,8 +165,8 @@ def take_lift(store: Store, lift_id: int, who: str, alarm: tuple[str, str] | Non
 
 
 def _note_unrecorded(store: Store, lift_id: int, who: str) -> None:
-    """Note, once, that a lift was executed after it had ended: an alarm, and every offer and confirmation
-    ends. Raises InputError, which says so.
+    """Record, once, that a lift was executed after it had ended: raise an alarm, end all offers and
+    confirmations. Raises InputError, which says so.
     """
     with store.reading() as connection:
         clock_ns = yard_clock_ns(connection)
@@ -181,10 +182,10 @@ def _note_unrecorded(store: Store, lift_id: int, who: str) -> None:
 
 
 def end_lift(store: Store, lift_id: int, state: str, who: str, note: str, tells_begin: bool = False) -> None:
-    """Decline an offer, take a confirmation back (`expired`), or report that a confirmed lift `failed`.
+    """Decline an offer, withdraw a confirmation (`expired`), or report that a confirmed lift `failed`.
 
-    One that fails after it has begun may have moved something: offers and confirmations beside it end. That
-    it had begun is assumed where `who` isn't one that tells it (tells_begin), as cranes do.
+    A lift that fails after it has begun may have moved something: nearby offers and confirmations end. It is
+    assumed to have begun unless `who` reports beginnings (tells_begin), as cranes do.
     """
     if state not in ("expired", "failed"):
         raise ConfigError(f"a lift does not end as {state!r}")
@@ -203,8 +204,8 @@ def end_lift(store: Store, lift_id: int, state: str, who: str, note: str, tells_
 
 
 def end_disturbed(opened: Entry, since_ns: int) -> None:
-    """End offers beside lifts that moved something after `since_ns`, as a map that is being added saw it; all
-    of them after a lift that isn't recorded, as nobody knows its place.
+    """End offers near lifts that moved something after `since_ns`, the beginning of a map being added; all
+    after a lift that isn't recorded, as its place is unknown.
     """
     unrecorded_ns = last_raised_ns(opened.connection, "lift-unrecorded")
     if unrecorded_ns is not None and unrecorded_ns >= since_ns:
@@ -227,7 +228,7 @@ def _end_offers(opened: Entry, reason: str) -> None:
 
 
 def _end_beside(opened: Entry, lift: OpenLift) -> None:
-    """End offers and confirmations within reach of what a lift may have moved."""
+    """End offers and confirmations within reach of anything that a lift may have moved."""
     moved = _outlines(opened.connection, lift)
     for other in open_lifts(opened.connection):
         reach_m = other.record.get("disturbed_reach_m")
@@ -239,8 +240,8 @@ def _end_beside(opened: Entry, lift: OpenLift) -> None:
 
 
 def forbid(store: Store, code: str, reason: str, who: str) -> None:
-    """Add a veto against the newest map: what is offered or confirmed on it ends, a lift that has begun stays
-    open until it is reported. Raises ConfigError.
+    """Add a veto against the newest map: its offers and confirmations end, a lift that has begun stays open
+    until it is reported. Raises ConfigError.
     """
     if code not in VETOES:
         raise ConfigError(f"{code!r} is no veto; the reference of codes lists them")
@@ -255,9 +256,7 @@ def forbid(store: Store, code: str, reason: str, who: str) -> None:
 
 
 def expire_stale(store: Store, who: str) -> int:
-    """End offers and confirmations whose map is no longer the newest, too old, or of a calibration that isn't
-    valid any more. Returns their number.
-    """
+    """End offers and confirmations with an outdated map or an invalid calibration; return their number."""
     with store.reading() as connection:
         clock_ns = yard_clock_ns(connection)
         if not _stale(connection, clock_ns):
@@ -270,7 +269,7 @@ def expire_stale(store: Store, who: str) -> int:
 
 
 def expire_claims(store: Store, who: str, claim_s: float, is_of: Callable[[str], bool]) -> int:
-    """End claims that weren't begun in time, of those whose names `is_of` tells. Returns their number."""
+    """End overdue claims by those for whose names `is_of` returns True; return their number."""
     with store.reading() as connection:
         clock_ns = yard_clock_ns(connection)
         before_ns = clock_ns - round(claim_s * 1e9)
@@ -292,7 +291,7 @@ def _overdue(connection: Connection, before_ns: int, is_of: Callable[[str], bool
 
 
 def _change(store: Store, lift_id: int, who: str, what: str, step: Callable[[Entry, OpenLift], None]) -> None:
-    """Step a lift in one transaction with the check that it may still be believed."""
+    """Change a lift's state in one transaction with the check that it is still valid."""
     expire_stale(store, who)
     with store.reading() as connection:
         clock_ns = yard_clock_ns(connection)
@@ -306,7 +305,7 @@ def _change(store: Store, lift_id: int, who: str, what: str, step: Callable[[Ent
 
 
 def _stale(connection: Connection, clock_ns: int) -> dict[int, str]:
-    """Tell why offers and confirmations may no longer be believed, by id."""
+    """Return why offers and confirmations are no longer valid, by id."""
     newest = newest_survey(connection)
     told = {}
     reason = "" if newest is None else why_invalid(connection, newest.calibration_id, clock_ns)
@@ -326,7 +325,7 @@ def _stale(connection: Connection, clock_ns: int) -> dict[int, str]:
 
 
 def _outlines(connection: Connection, lift: OpenLift) -> list[Float64]:
-    """Draw the corners (4, 2) of the load and the magnet; and of both where they are set down."""
+    """Compute the corners (4, 2) of the load and the magnet, at pick-up and at set-down."""
     held = select(SIGHTINGS.c.record).join(LIFT_BUNDLES, LIFT_BUNDLES.c.bundle_id == SIGHTINGS.c.bundle_id)
     own = LIFT_BUNDLES.c.lift_id == lift.lift_id, SIGHTINGS.c.survey_id == lift.survey_id
     bundles = [bundle_of(json.loads(row)) for row in connection.execute(held.where(*own)).scalars()]

@@ -1,4 +1,4 @@
-"""Read from the store what was known of each bundle at a time, what changed, and what came of the lifts."""
+"""Read from the store what was known of each bundle at a time, what changed, and the outcome of the lifts."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class BundleSighting:
 
     @property
     def bundle(self) -> Bundle:
-        """Return it as the stages of the yard know bundles."""
+        """Return the bundle in the form that the stages of the yard use."""
         return bundle_of(self.record)
 
 
@@ -62,7 +62,7 @@ class Absence:
 
 @dataclass(frozen=True, eq=False)
 class PresentBundle:
-    """A bundle of the yard at a time: its newest sighting, and what a later survey says against it."""
+    """A bundle in the yard at a time: its newest sighting, and any later survey that contradicts it."""
 
     sighting: BundleSighting
     doubt: Absence | None
@@ -75,7 +75,7 @@ def identity_name(bundle_id: int) -> str:
 
 @dataclass(frozen=True)
 class SurveyRow:
-    """A survey, and how many bundles it told `same`, `moved`, `added`, `found`, `gone` ... when added."""
+    """A survey, and its numbers of bundles `same`, `moved`, `added`, `found`, `gone` ... when added."""
 
     map_id: str
     captured_from_ns: int
@@ -86,7 +86,7 @@ class SurveyRow:
 
 
 def list_surveys(connection: Connection) -> tuple[SurveyRow, ...]:
-    """List the surveys in the order of time."""
+    """List the surveys in time order."""
     counts: dict[int, Counter[str]] = {}
     for table, kind in ((SIGHTINGS, SIGHTINGS.c.change), (ABSENCES, ABSENCES.c.kind)):
         grouped = select(table.c.survey_id, kind, func.count()).group_by(table.c.survey_id, kind)
@@ -136,8 +136,8 @@ def time_text(stamp_ns: int) -> str:
 def newest_sightings(
     connection: Connection, until_ns: int | None, version: str | None = None
 ) -> dict[int, BundleSighting]:
-    """Find each bundle's newest sighting up to a time (any time where None), by bundle. version: as if that
-    were promoted.
+    """Find each bundle's newest sighting up to a time (None for no limit). version: as if it were
+    promoted.
     """
     condition = true() if until_ns is None else SURVEYS.c.captured_to_ns <= until_ns
     return _sightings(connection, and_(condition, counts(version)), is_newest=True)
@@ -146,7 +146,7 @@ def newest_sightings(
 def next_sightings(
     connection: Connection, after_ns: int, version: str | None = None
 ) -> dict[int, BundleSighting]:
-    """Find each bundle's first sighting after a time, by bundle. version: as if that were promoted."""
+    """Find each bundle's first sighting after a time. version: as if it were promoted."""
     condition = and_(SURVEYS.c.captured_to_ns > after_ns, counts(version))
     return _sightings(connection, condition, is_newest=False)
 
@@ -154,9 +154,7 @@ def next_sightings(
 def newest_absences(
     connection: Connection, until_ns: int | None, version: str | None = None
 ) -> dict[int, Absence]:
-    """Find the newest survey up to a time that looked for a bundle and did not see it, by bundle. version:
-    as if that were promoted.
-    """
+    """Find each bundle's newest absence from a survey up to a time. version: as if it were promoted."""
     condition = true() if until_ns is None else SURVEYS.c.captured_to_ns <= until_ns
     chosen = select(ABSENCES, SURVEYS.c.captured_to_ns).join(SURVEYS).where(condition, counts(version))
     rows = _first_of_each(connection, chosen, ABSENCES.c.bundle_id, is_newest=True)
@@ -164,10 +162,10 @@ def newest_absences(
 
 
 def present_yard(connection: Connection, at_ns: int | None = None) -> tuple[PresentBundle, ...]:
-    """List the bundles of the yard at a time (now where None), in the order of their names.
+    """List the bundles in the yard at a time (None for now), in the order of their names.
 
-    A bundle that a survey found gone isn't there any more; one that was covered, or not told where it lay,
-    is, with that doubt.
+    A bundle found gone by a survey is no longer there; one that was covered, or not found in its place, is
+    still there, with that doubt.
     """
     absences = newest_absences(connection, at_ns)
     present = []
@@ -181,7 +179,7 @@ def present_yard(connection: Connection, at_ns: int | None = None) -> tuple[Pres
 
 
 def yard_changes(connection: Connection, before_ns: int, after_ns: int) -> list[dict[str, Any]]:
-    """Tell what changed between two times: `came`, `went`, `moved`; what lies as it lay is left out."""
+    """List the changes between two times: `came`, `went`, `moved`; unchanged bundles are left out."""
     before = {one.sighting.bundle_id: one.sighting for one in present_yard(connection, before_ns)}
     after = {one.sighting.bundle_id: one.sighting for one in present_yard(connection, after_ns)}
     told = []
@@ -235,7 +233,7 @@ def _sightings(
 def _first_of_each(
     connection: Connection, chosen: Select[Any], key: ColumnElement[int], *, is_newest: bool
 ) -> Iterable[Row[Any]]:
-    """Keep of each key the newest row by its survey's time, or the oldest."""
+    """Keep the newest row of each key by its survey's time, or the oldest."""
     times = (SURVEYS.c.captured_to_ns, SURVEYS.c.id)
     order = [time.desc() if is_newest else time.asc() for time in times]
     place = func.row_number().over(partition_by=key, order_by=order).label("place")
@@ -245,7 +243,7 @@ def _first_of_each(
 
 @dataclass(frozen=True)
 class ExecutedLift:
-    """A lift that took a bundle. target, set_down: its JSON in lifts.json. state: `executed` or later."""
+    """A lift that took a bundle. target, set_down: their JSON in lifts.json. state: `executed` or later."""
 
     lift_id: int
     bundle_id: int
@@ -254,7 +252,7 @@ class ExecutedLift:
     set_down: dict[str, float] | None
 
     def laid(self, bundle: Bundle) -> Bundle | None:
-        """Return the bundle as it would lie where it was set down; None where that isn't known."""
+        """Return the bundle at the place where it was set down; None if that is unknown."""
         if self.set_down is None:
             return None
         to = self.set_down

@@ -1,4 +1,4 @@
-"""Keep a survey's lifts and vetoes, and settle the lifts that were offered or executed before it."""
+"""Store a survey's lifts and vetoes, and settle the lifts that were offered or executed before it."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ with extra("store"):
 def add_lifts(
     opened: Entry, survey_id: int, content: dict[str, Any], ids: dict[int, int], *, is_newest: bool
 ) -> None:
-    """Add what lifts.json says. ids: identities by id in bundles.json.
+    """Add the content of lifts.json. ids: identities by id in bundles.json.
 
-    Lifts are offered only where no later survey is known (is_newest); vetoes are kept of any.
+    Lifts are offered only if no later survey is known (is_newest); vetoes are always stored.
     """
     fetch = content.get("fetch")
     for veto in content["vetoes"]:
@@ -48,7 +48,7 @@ def add_lifts(
 
 
 def _outline(magnet: dict[str, Any]) -> dict[str, float] | None:
-    """Return width and length of beam and poles together, as `Magnet.size_m`; None where no beam is known."""
+    """Return width and length of beam and poles together, as `Magnet.size_m`; None if no beam is known."""
     beam, poles = magnet.get("beam"), magnet.get("poles") or ()
     if beam is None:
         return None
@@ -60,10 +60,10 @@ def _outline(magnet: dict[str, Any]) -> dict[str, float] | None:
 
 
 def settle_lifts(opened: Entry, told: dict[int, str], seen_from_ns: int, *, is_newest: bool) -> None:
-    """Judge executed lifts by what a later survey tells of their bundles; let offers of those expire.
+    """Judge executed lifts by the state of their bundles in a later survey; let offers of those expire.
 
-    told: change or absence by bundle. A lift holds where its bundle moved or is gone, it failed where the
-    bundle lies as it lay.
+    told: change or absence by bundle. A lift is verified if its bundle has moved or is gone, and has failed
+    if the bundle is where it was.
     """
     for lift in executed_lifts(opened.connection):
         if lift.state != "executed" or lift.executed_ns > seen_from_ns:

@@ -1,4 +1,4 @@
-"""Match a survey's bundles to those known before: by place and figures, each at most once."""
+"""Match a survey's bundles to known ones by place and dimensions, each at most once."""
 
 from __future__ import annotations
 
@@ -20,16 +20,18 @@ from barsight.yard.inventory.changes import (
 from barsight.yard.types import Bundle, YardMap
 
 SIGMAS = 4.0
-"""Sigmas of both measurements within which two figures agree."""
+"""Tolerance for two measured values to agree, in combined standard deviations."""
 MAX_TURN_RAD = math.radians(6.0)
 MOVED_M = 0.05
 MOVED_RAD = math.radians(1.0)
 _PLACE_SIGMA_M = 0.02
 _YAW_SIGMA_RAD = math.radians(0.3)
-"""Error common to a whole survey, beside the stated sigmas: of its place in the yard."""
+"""Standard deviations of errors common to a whole survey (its place in the yard), beside the stated
+sigmas.
+"""
 _MIN_LENGTH_TOLERANCE_M = 0.1
 _LEFT_BEHIND = 100.0
-"""Cost of a lifted bundle being where it was lifted from."""
+"""Cost of finding a lifted bundle at the place it was lifted from."""
 _NO_PAIR = 1e9
 
 Finding = Literal["gone", "covered", "not-found", "unseen"]
@@ -39,9 +41,9 @@ Finding = Literal["gone", "covered", "not-found", "unseen"]
 class KnownBundle:
     """A bundle that other surveys saw.
 
-    last: as seen last before this survey; later: as seen first after it. One of the two is there. is_lifted:
-    whether a lift took it since it was seen last; set_down: as it would lie where that lift laid it, None
-    where that isn't known.
+    last: as last seen before this survey; later: as first seen after it. At least one is given. is_lifted:
+    whether a lift has taken it since it was last seen; set_down: at the place where that lift laid it, None
+    if that is unknown.
     """
 
     bundle_id: int
@@ -53,14 +55,14 @@ class KnownBundle:
 
     @property
     def figures(self) -> Bundle:
-        """Return it as measured, wherever it lies."""
+        """Return the bundle as measured, regardless of its place."""
         found = self.last or self.later
         assert found is not None
         return found
 
     @property
     def places(self) -> tuple[tuple[Bundle, float], ...]:
-        """Return where it may lie, each with the cost of lying there."""
+        """Return the bundle at each place where it may be, with the cost of being there."""
         left_behind = _LEFT_BEHIND if self.is_lifted else 0.0
         listed = ((self.set_down, 0.0), (self.last, left_behind), (self.later, 0.0))
         return tuple((place, cost) for place, cost in listed if place is not None)
@@ -68,7 +70,7 @@ class KnownBundle:
 
 @dataclass(frozen=True, eq=False)
 class FoundBundle:
-    """A bundle as a survey found it. stock_name: by its stock list, None where that names none."""
+    """A bundle as a survey found it. stock_name: from its stock list, None if the list names none."""
 
     bundle: Bundle
     stock_name: str | None
@@ -76,9 +78,9 @@ class FoundBundle:
 
 @dataclass(frozen=True)
 class MatchedBundles:
-    """Outcome of a match, by positions in `known` and `found`.
+    """Result of matching, by positions in `known` and `found`.
 
-    found: the found bundle of each known one that was told. findings: of the known ones that were not found.
+    found: the found bundle for each matched known one. findings: for the known ones that were not found.
     """
 
     found: dict[int, int]
@@ -88,7 +90,7 @@ class MatchedBundles:
 def match_by_place(
     known: tuple[KnownBundle, ...], found: tuple[FoundBundle, ...], heights: YardMap
 ) -> MatchedBundles:
-    """Match with the least sum of squared normalised differences. heights: the survey's map."""
+    """Match with the smallest sum of squared normalised differences. heights: the survey's map."""
     shape = (len(known), len(found))
     cost, is_taken = np.full(shape, _NO_PAIR), np.zeros(shape, np.bool_)
     for i, j in _near(known, found):
@@ -104,7 +106,7 @@ def match_by_place(
 
 
 def _near(known: tuple[KnownBundle, ...], found: tuple[FoundBundle, ...]) -> list[tuple[int, int]]:
-    """List the pairs whose middles are no further apart than the longer one is long."""
+    """List the pairs whose centres are at most the longer bundle's length apart."""
     centre = np.array([other.bundle.centre_m[:2] for other in found]).reshape(-1, 2)
     length = np.array([other.bundle.length_m for other in found])
     pairs = []
@@ -118,7 +120,7 @@ def _near(known: tuple[KnownBundle, ...], found: tuple[FoundBundle, ...]) -> lis
 
 
 def _place_cost(known: KnownBundle, found: FoundBundle) -> tuple[float, bool]:
-    """Weigh a pair; _NO_PAIR where it is none, and whether another bundle lies at the known one's place."""
+    """Compute a pair's cost (_NO_PAIR if it is none), and whether another bundle is at the known place."""
     best, is_taken = _NO_PAIR, False
     for place, extra_cost in known.places:
         if not _is_same_place(place, found.bundle):
@@ -131,7 +133,7 @@ def _place_cost(known: KnownBundle, found: FoundBundle) -> tuple[float, bool]:
 
 
 def _is_same_place(before: Bundle, after: Bundle) -> bool:
-    """Check that two can't lie side by side: less than half a width, and half a height, apart."""
+    """Check that two bundles can't be side by side: less than half a width, and half a height, apart."""
     across, along, up, turned = displacement(before, after)
     half = min(before.width_m, after.width_m) / 2
     is_open = any(before.ends_open) or any(after.ends_open)
@@ -140,7 +142,7 @@ def _is_same_place(before: Bundle, after: Bundle) -> bool:
 
 
 def _is_same_kind(known: KnownBundle, found: FoundBundle) -> bool:
-    """Check names, length, width, bars' diameter and section, each as far as both are known."""
+    """Compare names, length, width, bar diameter and section, each if both are known."""
     if known.stock_name and found.stock_name:
         return known.stock_name == found.stock_name
     before, after = known.figures, found.bundle
@@ -159,7 +161,7 @@ def _agree(before: float, sigma_before: float, after: float, sigma_after: float)
 
 
 def _is_same_length(before: Bundle, after: Bundle) -> bool:
-    """Compare lengths; one with an open end may be longer than it was seen to be."""
+    """Compare lengths; a bundle with an open end may be longer than seen."""
     sigma = math.hypot(_known(before.sigma.length_m), _known(after.sigma.length_m))
     tolerance = max(_MIN_LENGTH_TOLERANCE_M, SIGMAS * sigma)
     longer = after.length_m - before.length_m
@@ -168,7 +170,7 @@ def _is_same_length(before: Bundle, after: Bundle) -> bool:
 
 
 def _difference(before: Bundle, after: Bundle) -> float:
-    """Sum squared differences over their variances: across, up, yaw, and along where all ends were seen."""
+    """Sum squared differences over their variances: across, up, yaw, and along if all ends were seen."""
     across, along, up, turned = displacement(before, after)
     a, b = before.sigma, after.sigma
     terms = [
@@ -187,9 +189,9 @@ def _known(sigma: float) -> float:
 
 
 def _finding(known: KnownBundle, heights: YardMap, *, is_replaced: bool) -> Finding:
-    """Tell why a bundle was not found: by what the survey's map shows where it was seen last.
+    """Determine why a bundle was not found, from the survey's map at its last place.
 
-    One that was lifted is gone only where the place is empty too on which the lift laid it.
+    A lifted bundle is gone only if the place where the lift laid it is also empty.
     """
     if known.last is None:
         return "unseen"
@@ -203,9 +205,9 @@ def _finding(known: KnownBundle, heights: YardMap, *, is_replaced: bool) -> Find
 
 
 def look_at(bundle: Bundle, heights: YardMap) -> Finding:
-    """Tell what a map shows where a bundle lies or lay: something lower, higher, as high, or nothing known.
+    """Compare a map with a bundle at its place: the map is lower, higher, level or unknown there.
 
-    Something lower over most of its length means `gone`, as high `not-found`: something is there.
+    Lower over most of its length means `gone`, higher `covered`, level `not-found`: something is there.
     """
     z = heights_over(bundle, heights)[:, 1:4]
     known: Bool = np.isfinite(z)
@@ -222,8 +224,9 @@ def look_at(bundle: Bundle, heights: YardMap) -> Finding:
 def match_carried(
     known: tuple[KnownBundle, ...], found: tuple[FoundBundle, ...], matched: MatchedBundles, new: list[int]
 ) -> dict[int, int]:
-    """Pair what is gone with what is new elsewhere, where each agrees with no other one: by name, else by
-    figures. new: positions in `found` at which a bundle may have been laid.
+    """Pair gone bundles with new ones elsewhere, if each agrees with no other: by name, else by dimensions.
+
+    new: positions in `found` at which a bundle may have been laid.
     """
     gone = [i for i, finding in matched.findings.items() if finding == "gone"]
     agree = np.array([[_is_carried(known[i], found[j]) for j in new] for i in gone], dtype=bool)
@@ -243,7 +246,7 @@ def _is_carried(known: KnownBundle, found: FoundBundle) -> bool:
 
 
 def has_moved(before: Bundle, after: Bundle) -> bool:
-    """Check for a move that is neither noise nor the settling of a pile."""
+    """Detect a move that is neither noise nor the settling of a pile."""
     across, _, up, turned = displacement(before, after)
     along, sigma_along = displacement_along(before, after)
     a, b = before.sigma, after.sigma

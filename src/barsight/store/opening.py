@@ -1,4 +1,4 @@
-"""Open a store: find the database, bring its tables up to date, lend connections."""
+"""Open a store: find the database, bring its tables up to date, provide connections."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ with extra("store"):
 DEFAULT_URL = "sqlite:///barsight.db"
 MIGRATIONS = Path(__file__).parent / "migrations"
 WAIT_S = 60
-"""Time that a writer waits for another one."""
+"""Time in seconds that a writer waits for another one."""
 IDLE_S = 300
 """Time after which PostgreSQL ends a writer of which it hears nothing: its computer may be gone."""
 _LOCK = 0x62617273
-"""PostgreSQL's advisory lock that writers of a store take."""
+"""PostgreSQL advisory lock that writers of a store take."""
 
 
 @dataclass(frozen=True)
 class Store:
-    """An open store. engine: SQLAlchemy's. name: its URL without the password."""
+    """An open store. engine: the SQLAlchemy engine. name: its URL without the password."""
 
     engine: Engine
     name: str
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
-        """Lend a connection in a transaction that only reads."""
+        """Provide a connection in a read-only transaction."""
         with _told(self.name), self.engine.connect() as connection:
             if not self._is_sqlite:
                 connection.execute(text("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ, READ ONLY"))
@@ -49,7 +49,7 @@ class Store:
 
     @contextmanager
     def writing(self) -> Iterator[Connection]:
-        """Lend a connection in a transaction of its only writer; it commits unless an error is raised."""
+        """Provide a connection in an exclusive write transaction; it commits unless an error is raised."""
         writer = self.engine.execution_options(is_writer=True)
         with _told(self.name), writer.begin() as connection:
             if not self._is_sqlite:
@@ -68,9 +68,9 @@ class Store:
 def open_store(url: str, *, create: bool = False, migrate: bool = False) -> Iterator[Store]:
     """Open a store and close it at the end.
 
-    create: whether to make one where there is none. migrate: whether tables of an earlier version on
-    PostgreSQL may be brought up to date; a SQLite file is backed up and brought up to date without being
-    asked. Raises ConfigError for a URL that is none, InputError for a database that can't be used.
+    create: whether to create a missing one. migrate: whether tables of an earlier version on PostgreSQL may
+    be brought up to date; a SQLite file is backed up and brought up to date in any case. Raises ConfigError
+    for an invalid URL, InputError for an unusable database.
     """
     parsed = _parse(url)
     store = Store(_engine(parsed), parsed.render_as_string(hide_password=True))
@@ -124,7 +124,7 @@ def _set_up_sqlite(connection: Any, _: Any) -> None:
 
 
 def _begin_sqlite(connection: Connection) -> None:
-    """Take the writer's lock at once, so that no other writer comes in between its reads and writes."""
+    """Take the write lock at once, so that no other writer intervenes between its reads and writes."""
     is_writer = connection.get_execution_options().get("is_writer")
     connection.exec_driver_sql("BEGIN IMMEDIATE" if is_writer else "BEGIN")
 
@@ -136,14 +136,14 @@ _TOO_IDLE = "25P03"
 
 @contextmanager
 def _told(name: str) -> Iterator[None]:
-    """Turn a database that can't be reached, read or written into an InputError of one line, an OutputError
-    where it may not or could not be written.
+    """Convert the error of a database that can't be reached, read or written into an InputError of one line,
+    or into an OutputError if it could not or may not be written.
 
-    A statement that it refuses is a bug and raised as it is.
+    A statement that the database rejects is a bug and raised unchanged.
     """
     try:
         yield
-    except UnicodeDecodeError as error:  # of SQLite's message about a damaged file
+    except UnicodeDecodeError as error:  # in SQLite's message about a damaged file
         raise InputError(name, "is damaged", "take the newest backup beside it") from error
     except DatabaseError as error:
         code = getattr(error.orig, "sqlite_errorname", None) or getattr(error.orig, "sqlstate", None) or ""
@@ -160,7 +160,7 @@ def _told(name: str) -> Iterator[None]:
 
 
 def _bring_up_to_date(store: Store, url: URL, *, create: bool, migrate: bool) -> None:
-    """Migrate inside the writer's transaction: killed in between, the database is as it was."""
+    """Migrate inside the write transaction: if it is killed, the database is unchanged."""
     config = Config()
     config.set_main_option("script_location", str(MIGRATIONS).replace("%", "%%"))
     config.set_main_option("version_locations", str(MIGRATIONS / "versions").replace("%", "%%"))
@@ -173,7 +173,7 @@ def _bring_up_to_date(store: Store, url: URL, *, create: bool, migrate: bool) ->
     with store.writing() as connection:
         found = MigrationContext.configure(connection).get_current_revision()
         if found == newest:
-            return  # another one made it in the meantime
+            return  # another process created it in the meantime
         _expect_migration(store.name, connection, found, script, create=create)
         if found is not None:
             _back_up(store.name, url, found, migrate=migrate)
@@ -184,7 +184,7 @@ def _bring_up_to_date(store: Store, url: URL, *, create: bool, migrate: bool) ->
 def _expect_migration(
     name: str, connection: Connection, found: str | None, script: ScriptDirectory, *, create: bool
 ) -> None:
-    """Raise InputError where a database's tables aren't a store's, or are a newer version's."""
+    """Raise InputError if a database's tables aren't those of a store, or are of a newer version."""
     if found is None:
         if set(inspect(connection).get_table_names()) & set(METADATA.tables):
             raise InputError(name, "has tables of another program", "name a database of its own")
@@ -195,7 +195,7 @@ def _expect_migration(
 
 
 def _back_up(name: str, url: URL, found: str, *, migrate: bool) -> None:
-    """Copy a SQLite file while its writer's lock is held; on PostgreSQL ask the operator."""
+    """Copy a SQLite file while its write lock is held; on PostgreSQL ask the operator."""
     if url.get_backend_name() != "sqlite":
         if not migrate:
             raise ConfigError(
@@ -204,7 +204,7 @@ def _back_up(name: str, url: URL, found: str, *, migrate: bool) -> None:
             )
         return
     path = Path(str(url.database))
-    # SQLite's own copy: closing a file that was opened beside it would drop SQLite's locks on it.
+    # SQLite's own backup: closing a separately opened file would release SQLite's locks on it.
     with (
         atomic_path(path.with_name(f"{path.name}.schema-{found}.backup")) as backup,
         closing(sqlite3.connect(path)) as source,

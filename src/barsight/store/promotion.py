@@ -1,4 +1,4 @@
-"""Tell which surveys count: of recordings that were measured anew, those of the promoted version."""
+"""Determine which surveys count: of recordings that were measured anew, those of the promoted version."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ with extra("store"):
 
 
 def promoted_version(connection: Connection) -> str:
-    """Return the version that page and plant see; empty where none was promoted."""
+    """Return the version that page and plant use; empty if none was promoted."""
     newest = select(PROMOTIONS.c.version).order_by(PROMOTIONS.c.id.desc()).limit(1)
     return str(connection.execute(newest).scalar() or "")
 
 
 @cache
 def counts(version: str | None = None) -> ColumnElement[bool]:
-    """Build the condition on SURVEYS that keeps those that count, or would were `version` promoted.
+    """Build the condition on SURVEYS that selects those that count, or that would if `version` were promoted.
 
-    A survey that the store has for a version's sake counts while that version is promoted. Any other counts
-    unless the promoted version has one of the same recording, told by its first and last frame's times.
+    A survey that was added only for a version counts while that version is promoted. Any other survey counts
+    unless the promoted version has one of the same recording, identified by its first and last frame times.
     """
     newest = select(PROMOTIONS.c.version).order_by(PROMOTIONS.c.id.desc()).limit(1).scalar_subquery()
     promoted = newest if version is None else literal(version)

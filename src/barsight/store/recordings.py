@@ -1,4 +1,4 @@
-"""Keep which recordings there are, what surveys were measured from them, and why one is not to be deleted."""
+"""Record which recordings there are, which surveys were measured from them, and why one must be kept."""
 
 from __future__ import annotations
 
@@ -23,8 +23,9 @@ _MAX_WHY_BYTES = 4096
 
 @dataclass(frozen=True)
 class FoundRecording:
-    """A recording. key: its path or URL. digest: of its files' digests. kept_because: why its folder is
-    protected from deletion; None where it isn't.
+    """A recording. key: its path or URL. digest: of its files' digests.
+
+    kept_because: why its folder is protected from deletion; None if it isn't.
     """
 
     key: str
@@ -34,8 +35,10 @@ class FoundRecording:
 
 @dataclass(frozen=True)
 class KnownRecording:
-    """A recording of the store. state: its last one, since at_ns, brought there by `who`; note: why it is
-    kept, or the survey. surveys: maps measured from it.
+    """A recording in the store.
+
+    state: its last state, set at at_ns by `who`; note: why it is kept, or the survey. surveys: maps measured
+    from it.
     """
 
     key: str
@@ -49,7 +52,7 @@ class KnownRecording:
 
 
 def recordings_of(summary: dict[str, Any]) -> tuple[FoundRecording, ...]:
-    """Find the recordings that result.json names, whose files have digests there."""
+    """Find the recordings named in result.json whose files have digests there."""
     whole = {"recording": summary.get("recording"), "inputs": (summary.get("hashes") or {}).get("inputs")}
     found = {}
     for one in summary.get("passes") or [whole]:
@@ -71,7 +74,7 @@ def _protection(folder: Path) -> str | None:
 def note_recordings(
     opened: Entry, found: tuple[FoundRecording, ...], rig: str, survey: tuple[int, str] | None
 ) -> None:
-    """Add recordings that the store lacks, and that a survey (its id and map) was measured from them."""
+    """Add missing recordings, and that a survey (its id and map) was measured from them."""
     for one in found:
         known = select(RECORDINGS.c.id).where(RECORDINGS.c.digest == one.digest)
         number = opened.connection.execute(known).scalar()
@@ -90,7 +93,7 @@ def note_recordings(
 
 
 def keep_recording(opened: Entry, name: str, why: str) -> str:
-    """Say why a recording is not to be deleted, and return its key; a folder that is here is protected too.
+    """Record why a recording must not be deleted, and return its key; a local folder is also protected.
 
     name: its key, or the beginning of its digest. Raises ConfigError.
     """
@@ -104,7 +107,7 @@ def keep_recording(opened: Entry, name: str, why: str) -> str:
 
 
 def release_recording(opened: Entry, name: str, why: str) -> str:
-    """Take the protection back, and return its key."""
+    """Remove the protection, and return the recording's key."""
     number, key = _find(opened.connection, name)
     step_recording(opened, number, "released", why or None)
     (Path(key) / PROTECTED).unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""Step lifts, alarms and recordings from state to state, each step a row with who and when."""
+"""Move lifts, alarms and recordings from state to state, each step a row with author and time."""
 
 from __future__ import annotations
 
@@ -20,14 +20,16 @@ LIFT_STEPS: dict[str | None, tuple[str, ...]] = {
     "executing": ("executed", "failed"),
     "executed": ("verified", "failed"),
 }
-"""Which states may follow a lift's state; none follows `failed`, `verified` and `expired`."""
+"""States that may follow each state of a lift; none follows `failed`, `verified` and `expired`."""
 ALARM_STEPS: dict[str | None, tuple[str, ...]] = {
     None: ("raised",),
     "raised": ("acknowledged", "cleared", "returned"),
     "acknowledged": ("cleared",),
     "returned": ("cleared",),
 }
-"""`returned`: the cause is gone, and nobody has acknowledged it; acknowledging it clears it (ISA-18.2)."""
+"""States that may follow each state of an alarm. `returned`: the cause has ended without an acknowledgement;
+acknowledging the alarm then clears it (ISA-18.2).
+"""
 RECORDING_STEPS: dict[str | None, tuple[str, ...]] = {
     None: ("archived", "measured"),
     "archived": ("measured", "kept"),
@@ -35,11 +37,13 @@ RECORDING_STEPS: dict[str | None, tuple[str, ...]] = {
     "kept": ("released",),
     "released": ("kept",),
 }
-"""`archived`: a fleet's plan found it; `kept`: it is not to be deleted, its note says why."""
+"""States that may follow each state of a recording. `archived`: found by a fleet's plan; `kept`: not to be
+deleted, for the reason in its note.
+"""
 
 
 def step_lift(opened: Entry, lift_id: int, state: str, note: str | None = None) -> None:
-    """Bring a lift into a state. Raises InputError where that may not follow the state that it is in."""
+    """Move a lift to a state. Raises InputError if it may not follow the current state."""
     _step(opened, LIFT_STATES, "lift", lift_id, LIFT_STEPS, state, note)
 
 
@@ -51,13 +55,13 @@ def raise_alarm(opened: Entry, code: str, reason: str) -> int:
 
 
 def has_alarm(connection: Connection, code: str, reason: str) -> bool:
-    """Tell whether this alarm was ever raised."""
+    """Check whether this alarm was ever raised."""
     query = select(ALARMS.c.id).where(ALARMS.c.code == code, ALARMS.c.reason == reason)
     return connection.execute(query).first() is not None
 
 
 def last_raised_ns(connection: Connection, code: str) -> int | None:
-    """Tell when an alarm with this code was raised last, whatever came of it; None where none ever was."""
+    """Return when an alarm with this code was last raised, whatever its state now; None if never."""
     query = (
         select(func.max(ALARM_STATES.c.at_ns))
         .join(ALARMS, ALARMS.c.id == ALARM_STATES.c.alarm_id)
@@ -68,27 +72,27 @@ def last_raised_ns(connection: Connection, code: str) -> int | None:
 
 
 def step_alarm(opened: Entry, alarm_id: int, state: str, note: str | None = None) -> None:
-    """Acknowledge or clear an alarm. Raises InputError where that may not follow the state that it is in."""
+    """Acknowledge or clear an alarm. Raises InputError if that may not follow the current state."""
     _step(opened, ALARM_STATES, "alarm", alarm_id, ALARM_STEPS, state, note)
 
 
 def step_recording(opened: Entry, recording_id: int, state: str, note: str | None = None) -> None:
-    """Bring a recording into a state. Raises InputError where that may not follow the state that it is in."""
+    """Move a recording to a state. Raises InputError if it may not follow the current state."""
     _step(opened, RECORDING_STATES, "recording", recording_id, RECORDING_STEPS, state, note)
 
 
 def recording_state(connection: Connection, recording_id: int) -> str | None:
-    """Return a recording's state, None where there is no such recording."""
+    """Return a recording's state, None if there is no such recording."""
     return _last(connection, RECORDING_STATES, "recording", recording_id)[1]
 
 
 def lift_state(connection: Connection, lift_id: int) -> str | None:
-    """Return a lift's state, None where there is no such lift."""
+    """Return a lift's state, None if there is no such lift."""
     return _last(connection, LIFT_STATES, "lift", lift_id)[1]
 
 
 def alarm_state(connection: Connection, alarm_id: int) -> str | None:
-    """Return an alarm's state, None where there is no such alarm."""
+    """Return an alarm's state, None if there is no such alarm."""
     return _last(connection, ALARM_STATES, "alarm", alarm_id)[1]
 
 

@@ -1,4 +1,4 @@
-"""Write the yard as a stock list, and record what was decided of a difference to one."""
+"""Write the yard as a stock list, and record decisions on differences from one."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from barsight.store.tables import STOCK_DECISIONS
 from barsight.yard.inventory.stock_list import ListedBundle
 
 Decision = Literal["accepted", "rejected"]
-"""accepted: the yard is right, the list is to be changed; rejected: the list is right, the yard is to be
-looked at.
+"""accepted: the yard is right, and the list must be changed; rejected: the list is right, and the yard must
+be checked.
 """
 
 
 def listed_bundles(present: Iterable[PresentBundle]) -> tuple[ListedBundle, ...]:
-    """List the bundles of a yard: by the name that a list gave, or else their label or the store's name.
+    """List the bundles of a yard, named by a stock list, otherwise by their label or the store's name.
 
-    Figures that aren't known stay out: the length of one with an open end too.
+    Unknown values are left out, including the length of a bundle with an open end.
     """
     names: set[str] = set()
     listed = []
@@ -44,7 +44,7 @@ def listed_bundles(present: Iterable[PresentBundle]) -> tuple[ListedBundle, ...]
 
 
 def decide(opened: Entry, map_id: str, difference: str, decision: Decision, note: str) -> None:
-    """Add a decision on the newest survey's difference. Raises InputError where a newer survey came."""
+    """Add a decision on the newest survey's difference. Raises InputError if there is a newer survey."""
     newest = newest_survey(opened.connection)
     if newest is None or newest.map_id != map_id:
         raise InputError(map_id, "is not the newest survey any more", "look at the differences again")

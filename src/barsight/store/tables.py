@@ -1,6 +1,6 @@
 """Define the store's tables: facts that are added and never changed or removed.
 
-Times are integers in ns on the frames' clock (`captured_*`) or this computer's (`at_ns`, `added_ns`).
+Times are integers in ns on the frames' clock (`captured_*`) or this computer's clock (`at_ns`, `added_ns`).
 """
 
 from __future__ import annotations
@@ -52,10 +52,10 @@ SURVEYS = Table(
     Column("yard_frame_id", Text), Column("is_simulated", Boolean, nullable=False),
     *_texts("software_version", "folder", "files"), Column("heights", LargeBinary, nullable=False),
 )  # fmt: skip
-"""Measured folders. files: JSON, SHA-256 of each file. heights: of `coarse_map.pack`."""
+"""Measured folders. files: JSON with SHA-256 of each file. heights: from `coarse_map.pack`."""
 
 BUNDLES = Table("bundles", METADATA, _key(), _of("surveys"))
-"""Identities: one row per bundle that ever lay in the yard, with the survey that named it."""
+"""Identities: one row for each bundle that was ever in the yard, with the survey that named it."""
 
 SIGHTINGS = Table(
     "sightings", METADATA, _key(), _of("surveys"), _of("bundles"),
@@ -89,7 +89,7 @@ LIFT_STATES = Table(
 SURVEY_VETOES = Table(
     "vetoes", METADATA, _key(), _of("surveys"), _of("bundles", is_optional=True), *_texts("code", "reason"),
 )  # fmt: skip
-"""Vetoes of a survey's lifts.json; of the whole map where they name no bundle."""
+"""Vetoes of a survey's lifts.json; without a bundle they apply to the whole map."""
 
 ALARMS = Table("alarms", METADATA, _key(), *_texts("code", "reason"))
 
@@ -103,80 +103,86 @@ ACCOUNTS = Table(
     "accounts", METADATA, _key(), *_texts("name", "kind", "role", "secret"), *_stamps("at_ns"),
     *_texts("who"),
 )  # fmt: skip
-"""Who may use the page: of a name the newest row counts. kind: `person` or `token`; see `accounts`."""
+"""Accounts that may use the page; for each name the newest row counts. kind: `person` or `token`; see
+`accounts`.
+"""
 
 STOCK_DECISIONS = Table(
     "stock_decisions", METADATA, _key(), _of("surveys"), *_texts("difference", "decision"),
     *_stamps("at_ns"), *_texts("who"), Column("note", Text),
 )  # fmt: skip
-"""What was decided of a difference between a survey and its stock list; of each the newest row counts."""
+"""Decisions on a difference between a survey and its stock list; for each difference the newest row
+counts.
+"""
 
 AUDIT = Table(
     "audit", METADATA, _key(), *_stamps("at_ns"), *_texts("who", "what", "content"),
     Column("previous", Text, nullable=False, unique=True), Column("digest", Text, nullable=False),
 )  # fmt: skip
-"""The chain of what was added; see `audit`."""
+"""The chain of additions; see `audit`."""
 
 FLEET_VERSIONS = Table(
     "fleet_versions", METADATA, _key(), Column("name", Text, nullable=False, unique=True),
     *_texts("configuration", "calibration", "magnet", "software", "rig"), *_stamps("at_ns"),
 )  # fmt: skip
-"""Ways to measure an archive; digests, see `fleet.versions`."""
+"""Versions for measuring an archive; for the digests see `fleet.versions`."""
 
 FLEET_TASKS = Table(
     "fleet_tasks", METADATA, _key(), Column("key", Text, nullable=False, unique=True),
     *_texts("version", "archive", "recording", "passes"), *_stamps("bytes", "pairs", "at_ns"),
 )  # fmt: skip
-"""Recordings planned under a version. key: of `fleet.versions.Version.key`; passes: JSON; archive, recording:
-where it was found first.
+"""Recordings planned for a version. key: of `fleet.versions.Version.key`; passes: JSON; archive, recording:
+where it was first found.
 """
 
 FLEET_PLACES = Table(
     "fleet_places", METADATA, _key(), Column("key", Text, nullable=False, index=True),
     *_texts("manifest", "archive", "recording"), *_stamps("at_ns"),
 )  # fmt: skip
-"""Places of a task's recording; the newest row of a key counts. manifest: digest of its files."""
+"""Places of a task's recording; for each key the newest row counts. manifest: digest of its files."""
 
 FLEET_RESULTS = Table(
     "fleet_results", METADATA, _key(), Column("key", Text, nullable=False, unique=True),
     *_figures("measured_s", "whole_s"), *_stamps("peak_bytes", "result_bytes", "at_ns"),
 )  # fmt: skip
-"""Tasks that are done; the results' own objects are the truth."""
+"""Completed tasks; the results' own objects are authoritative."""
 
 FLEET_SURVEYS = Table(
     "fleet_surveys", METADATA, _key(), *_texts("version", "map_id"),
     Column("is_own", Boolean, nullable=False), UniqueConstraint("version", "map_id"),
 )  # fmt: skip
-"""Surveys of a version. is_own: the store has it for the version's sake only."""
+"""Surveys of a version. is_own: the survey was added to the store only for the version."""
 
 PROMOTIONS = Table("promotions", METADATA, _key(), *_texts("version", "who"), *_stamps("at_ns"))
-"""Versions that page and plant were switched to; the newest row counts, an empty version is none."""
+"""Versions that page and plant were switched to; the newest row counts, an empty version means none."""
 
 CRANES = Table(
     "cranes", METADATA, _key(), Column("name", Text, nullable=False, unique=True), *_stamps("at_ns")
 )
 
 RIGS = Table("rigs", METADATA, _key(), _of("cranes"), *_texts("name"), *_stamps("at_ns"))
-"""Rigs and the crane that each hangs from; of a name the newest row counts."""
+"""Rigs and the crane on which each is mounted; for each name the newest row counts."""
 
 CALIBRATIONS = Table(
     "calibrations", METADATA, _key(), Column("digest", Text, nullable=False, unique=True), *_texts("rig"),
     *_stamps("at_ns"),
 )  # fmt: skip
-"""Calibrations, each of one rig, by its name. digest: surveys' `calibration_id`."""
+"""Calibrations, each with the name of its rig. digest: the `calibration_id` of surveys."""
 
 VALIDITIES = Table(
     "validities", METADATA, _key(), _of("calibrations"), *_stamps("from_ns"),
     Column("until_ns", BigInteger), *_texts("approved_by"), Column("note", Text), *_stamps("at_ns"),
 )  # fmt: skip
-"""Times for which a calibration was approved; of a rig the one that begins last counts, then the newest."""
+"""Periods for which a calibration was approved; for each rig the one that begins last counts, then the
+newest.
+"""
 
 RECORDINGS = Table(
     "recordings", METADATA, _key(), Column("digest", Text, nullable=False, unique=True),
     *_texts("key", "rig"), *_stamps("at_ns"),
 )  # fmt: skip
-"""Recordings. digest: of their files' digests; key: path or URL where it was found first; rig: its name,
-empty where it isn't known.
+"""Recordings. digest: of their files' digests; key: path or URL where it was first found; rig: its name,
+empty if unknown.
 """
 
 RECORDING_STATES = Table(

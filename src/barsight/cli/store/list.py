@@ -26,7 +26,7 @@ def run(arguments: Sequence[str]) -> None:
     def command(
         url: tyro.conf.Positional[str] = DEFAULT_URL, json: bool = False, migrate: bool = False
     ) -> None:
-        """List the store's surveys, calibrations and recordings, and the bundles of the present yard.
+        """List the store's surveys, calibrations and recordings, and the bundles currently in the yard.
 
         Args:
             url: SQLAlchemy URL of the database.

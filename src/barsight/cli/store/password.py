@@ -1,4 +1,4 @@
-"""Ask for a password at the terminal."""
+"""Read a password from the terminal."""
 
 from __future__ import annotations
 

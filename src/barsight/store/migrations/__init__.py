@@ -1,1 +1,1 @@
-"""Alembic's migrations of the store, which run when a store is opened."""
+"""Alembic migrations of the store, which run when a store is opened."""

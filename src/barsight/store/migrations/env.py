@@ -1,4 +1,4 @@
-"""Run the migrations on the connection that `opening` hands over; Alembic loads this file."""
+"""Run the migrations on the connection provided by `opening`; Alembic loads this file."""
 
 from alembic import context
 

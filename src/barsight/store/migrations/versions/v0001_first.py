@@ -1,4 +1,4 @@
-"""Create the tables, and triggers that refuse to change or remove a row."""
+"""Create the tables, and triggers that reject any change or removal of a row."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ TABLES = (
 
 
 def upgrade() -> None:
-    """Create all of it."""
+    """Create all tables and triggers."""
     _create_surveys()
     _create_lifts()
     _create_logs()

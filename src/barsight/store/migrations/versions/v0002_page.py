@@ -1,4 +1,4 @@
-"""Create the tables of the page: accounts, and what was decided of the stock list's differences."""
+"""Create the tables of the page: accounts, and decisions on the stock list's differences."""
 
 import sqlalchemy as sa
 from alembic import op
@@ -10,7 +10,7 @@ TABLES = ("accounts", "stock_decisions")
 
 
 def upgrade() -> None:
-    """Create both, with triggers as those of the first version."""
+    """Create both tables, with triggers like those of the first version."""
     op.create_table(
         "accounts", sa.Column("id", sa.Integer, primary_key=True),
         *(sa.Column(name, sa.Text, nullable=False) for name in ("name", "kind", "role", "secret")),

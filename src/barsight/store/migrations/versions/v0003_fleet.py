@@ -26,7 +26,7 @@ def _unique(name: str) -> sa.Column[str]:
 
 
 def upgrade() -> None:
-    """Create them, with triggers as those of the first version."""
+    """Create the tables, with triggers like those of the first version."""
     op.create_table(
         "fleet_versions", _key(), _unique("name"),
         *_texts("configuration", "calibration", "magnet", "software", "rig"), *_stamps("at_ns"),

@@ -8,7 +8,7 @@ down_revision = "0003"
 
 
 def upgrade() -> None:
-    """Create it, with triggers as those of the first version."""
+    """Create the table, with triggers like those of the first version."""
     op.create_table(
         "fleet_places", sa.Column("id", sa.Integer, primary_key=True),
         *(sa.Column(name, sa.Text, nullable=False) for name in ("key", "manifest", "archive", "recording")),

@@ -14,7 +14,7 @@ TABLES = (
 
 
 def _wanted(kind: type[sa.types.TypeEngine[Any]], names: str) -> list[sa.Column[Any]]:
-    """Make columns that must be given. names: with spaces between."""
+    """Make required columns. names: separated by spaces."""
     return [sa.Column(name, kind, nullable=False) for name in names.split()]
 
 
@@ -32,7 +32,7 @@ def _of(table: str) -> sa.Column[int]:
 
 
 def upgrade() -> None:
-    """Create them, with triggers as those of the first version."""
+    """Create the tables, with triggers like those of the first version."""
     op.create_table("cranes", _key(), _unique("name"), *_wanted(sa.BigInteger, "at_ns"))
     op.create_table(
         "rigs", _key(), _of("cranes"), *_wanted(sa.Text, "name"), *_wanted(sa.BigInteger, "at_ns")
