@@ -1,1 +1,1 @@
-"""The archive of many cranes, measured anew: plan, run on Dask, compare two versions, promote one."""
+"""Measure the archive of many cranes anew: plan, run on Dask, compare two versions, promote one."""

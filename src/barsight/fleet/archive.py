@@ -1,4 +1,4 @@
-"""Find the recordings of an archive, and the manifest of each: paths, sizes, digests of what is in them."""
+"""Find the recordings of an archive, and each one's manifest: paths, sizes and digests of its files."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from barsight.recording.formats.segments import PATTERN
 from barsight.recording.own_files import leads_outside
 
 SURVEY = "survey.json"
-"""File that makes one survey of the recordings in its folder: the passes, in its list `passes`."""
+"""File that combines the recordings in its folder into one survey: its list `passes` names them."""
 _BAGS = (".bag", ".mcap", ".db3")
 _INSIDE = {"mav0", "cam0", "cam1", "image_0", "image_1"}
 _PICTURES = (".png", ".jpg", ".pgm", ".tif")
 _UNREAD = {"truth", "alarms"}
-"""Folders of a recording that a measurement doesn't read."""
+"""Folders of a recording that measuring doesn't read."""
 
 
 @dataclass(frozen=True)
 class ArchivedRecording:
-    """A recording, or a survey of several passes, as an archive holds it.
+    """A recording, or a survey of several passes, in an archive.
 
     name: its path in the archive. passes: paths of its recordings, relative to `name`; "." for itself.
     files: its own, and the calibration beside a bag.
@@ -38,16 +38,16 @@ class ArchivedRecording:
 
     @property
     def size(self) -> int:
-        """Add up its bytes."""
+        """Return its size in bytes."""
         return sum(file.size for file in self.files)
 
     @property
     def pairs(self) -> int:
-        """Count its pictures by two; 0 for a bag, whose pictures the listing doesn't show."""
+        """Return half its number of pictures; 0 for a bag, whose pictures the listing doesn't show."""
         return sum(file.path.lower().endswith(_PICTURES) for file in self.files) // 2
 
     def relative(self, file: StoredObject) -> str:
-        """Return a file's path in the recording; `../` and its name for one that lies beside it."""
+        """Return a file's path in the recording; `../` and its name for one beside it."""
         if not self.name:
             return file.path
         name = PurePosixPath(file.path).name
@@ -56,9 +56,9 @@ class ArchivedRecording:
 
 
 def find_recordings(archive: Objects) -> tuple[ArchivedRecording, ...]:
-    """Find recordings and surveys by the archive's listing, in the order of their names.
+    """Find recordings and surveys in the archive's listing, in the order of their names.
 
-    Raises InputError where there is none.
+    Raises InputError if there are none.
     """
     files = {one.path: one for one in archive.list()}
     surveys = {_above(path): _passes(archive, path) for path in files if PurePosixPath(path).name == SURVEY}
@@ -84,7 +84,7 @@ def find_recordings(archive: Objects) -> tuple[ArchivedRecording, ...]:
 
 
 def _roots(files: Collection[str], surveys: Collection[str]) -> set[str]:
-    """Find the paths of recordings: folders of pictures, folders of a bag's parts, bags by themselves."""
+    """Find the paths of recordings: folders of pictures, folders of a bag's parts, single bags."""
     parted = {
         _above(path)
         for path in files
@@ -98,8 +98,8 @@ def _roots(files: Collection[str], surveys: Collection[str]) -> set[str]:
 
 
 def _root(path: str, parted: Collection[str]) -> str | None:
-    """Return the path of the recording that a file belongs to; None for any other file. parted: folders whose
-    bags are parts of one.
+    """Return the path of the recording that a file belongs to, or None. parted: folders with a bag in
+    parts.
     """
     parts = PurePosixPath(path).parts
     for place, part in enumerate(parts[:-1]):
@@ -111,7 +111,7 @@ def _root(path: str, parted: Collection[str]) -> str | None:
 
 
 def _beside(root: str, own: Collection[StoredObject], near: Iterable[StoredObject]) -> list[StoredObject]:
-    """List the calibration beside a bag, where it holds none. near: the files of the folder above it."""
+    """List the calibration beside a bag that contains none. near: the files of the folder above it."""
     is_bag = any(PurePosixPath(one.path).suffix in _BAGS and one.path.count("/") <= root.count("/") + 1
                  for one in own)  # fmt: skip
     if not root or not is_bag or any(_is_calibration(one.path, "camchain") for one in own):
@@ -125,7 +125,7 @@ def _is_calibration(path: str, word: str) -> bool:
 
 
 def _above(path: str) -> str:
-    """Return the folder of a path; empty for the archive's own."""
+    """Return the folder of a path; empty for the archive's top folder."""
     return _plain(PurePosixPath(path).parent)
 
 
@@ -151,12 +151,11 @@ def _passes(archive: Objects, path: str) -> tuple[str, ...]:
 def manifest_digest(
     archive: Objects, results: Objects, recording: ArchivedRecording, read: Callable[[int], None]
 ) -> str:
-    """Compute SHA-256 over paths, sizes and content of a recording's files; its place in the archive is no
-    part of it.
+    """Compute SHA-256 over paths, sizes and content of a recording's files, but not its place in the archive.
 
-    read: told of the bytes that were read. A recording whose listing is unchanged is not read again: the
-    digest is kept in the results under `manifests/`. Raises InputError for a file that is too large for what
-    it is, as only bags have no bound, and for a link out of the recording.
+    read: called with the number of bytes read. A recording with an unchanged listing is not read again: the
+    digest is kept in the results under `manifests/`. Raises InputError for a file that is too large for its
+    kind (only bags have no limit), and for a link out of the recording.
     """
     expect_own(archive, recording.name, recording.files)
     listed = json_digest([archive.url, recording.name, [[f.path, f.size, f.mark] for f in recording.files]])
@@ -175,8 +174,8 @@ def manifest_digest(
 
 
 def expect_own(archive: Objects, name: str, files: Iterable[StoredObject]) -> None:
-    """Raise InputError for the first file of a folder's recording that a link brings in from elsewhere: a
-    copy of the recording would hold what isn't its own.
+    """Raise InputError for the first file of a folder's recording that is linked from elsewhere: a copy of
+    the recording would contain foreign files.
     """
     if "://" in archive.url:
         return
@@ -197,7 +196,7 @@ def _digest(archive: Objects, file: StoredObject) -> str:
 def download(archive: Objects, name: str, passes: tuple[str, ...], folder: Path) -> Iterator[Path]:
     """Copy a recording's files into a folder, and yield the path of each pass.
 
-    Raises InputError for what the archive has no longer.
+    Raises InputError for anything that the archive no longer contains.
     """
     recording = ArchivedRecording(name, passes, ())
     is_file = PurePosixPath(name).suffix in _BAGS

@@ -1,4 +1,4 @@
-"""Run tasks on Dask: a cluster of this machine's processes, or one whose scheduler is named."""
+"""Run tasks on Dask: a cluster of local processes, or one with a given scheduler."""
 
 from __future__ import annotations
 
@@ -18,24 +18,26 @@ with extra("fleet"):
 
 T = TypeVar("T")
 _LOST = 1000
-"""Deaths of workers that a task may see: killed machines are no fault of it; the ledger counts them too."""
+"""Number of worker deaths that Dask accepts for a task: killed machines are no fault of it; the ledger counts
+them as well.
+"""
 AHEAD = 4
-"""Tasks that wait at the scheduler for each worker; no more are held there, however many are planned."""
+"""Number of tasks queued at the scheduler for each worker, however many are planned."""
 
 
 LOOK_S = 0.5
-"""Time after which workers that came and a window that opened are noticed."""
+"""Interval in seconds at which new workers and an opened window are noticed."""
 
 
 @contextmanager
 def connect(workers: int, scheduler: str | None, threads: int = 0) -> Iterator[Any]:
-    """Lend a client of the cluster at `scheduler`, or of one of so many processes that ends with it.
+    """Provide a client of the cluster at `scheduler`, or of one with `workers` processes that ends with it.
 
-    threads: of the kernels in each process of this machine; 0 leaves it alone.
+    threads: of the kernels in each local process; 0 leaves them unchanged.
 
-    Raises ConfigError for an address that is none, InputError for a scheduler that doesn't answer.
+    Raises ConfigError for an invalid address, InputError for a scheduler that doesn't answer.
     """
-    for name in ("distributed", "distributed.client"):  # each has a level of its own; what matters is raised
+    for name in ("distributed", "distributed.client"):  # each has its own level; relevant errors are raised
         logging.getLogger(name).setLevel(logging.CRITICAL)
     options = {
         "distributed.nanny.pre-spawn-environ.DASK_LOGGING__DISTRIBUTED": "critical",
@@ -65,7 +67,7 @@ def connect(workers: int, scheduler: str | None, threads: int = 0) -> Iterator[A
 
 
 def slots(client: Any) -> int:
-    """Count the threads of the workers that are there now, at least 1."""
+    """Count the threads of the current workers, at least 1."""
     threads: dict[str, int] = client.nthreads()
     return max(1, sum(threads.values()))
 
@@ -74,11 +76,11 @@ def run_all(
     client: Any, run: Callable[[Any, Any], T], tasks: Iterable[Any], settings: Any,
     may_go_on: Callable[[], bool] = lambda: True, ahead: int = AHEAD,
 ) -> Iterator[T | None]:  # fmt: skip
-    """Run tasks in their order, `ahead` of them a worker at a time, and yield what each returns as it ends;
-    None for one that was lost. may_go_on: asked before each, and again while others run; where it refuses and
-    nothing runs, the rest is left.
+    """Run tasks in their order, `ahead` per worker at a time; yield each result as it ends, None for a lost
+    task.
 
-    Raises what a task raised, InputError where the scheduler is gone.
+    may_go_on: called before each task, and again while others run; if it returns False and nothing runs, the
+    rest is left. Raises a task's exception, InputError if the scheduler is gone.
     """
     waiting = iter(tasks)
     running = as_completed(loop=client.loop)
@@ -107,7 +109,7 @@ def run_all(
 
 @contextmanager
 def _told(client: Any) -> Iterator[None]:
-    """Turn what Dask raises where its scheduler has died into one line."""
+    """Turn the errors that Dask raises after its scheduler has died into one line."""
     address = client.scheduler.address if client.scheduler else "the scheduler"
     try:
         yield
@@ -116,8 +118,8 @@ def _told(client: Any) -> Iterator[None]:
 
 
 def _ended(run: Callable[[Any, Any], T], task: Any, settings: Any) -> T | Exception:
-    """Run a task on a worker; what it raises is returned, as a worker that died raises too, and as Dask would
-    log it.
+    """Run a task on a worker and return its exception: if it were raised, Dask would log it, and it would
+    look like that of a dead worker.
     """
     try:
         return run(task, settings)

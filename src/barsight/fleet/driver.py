@@ -1,4 +1,4 @@
-"""Drive a version's tasks to their end: submit what is left, ask the results what is done, begin again."""
+"""Drive a version's tasks to completion: submit what is left, check the results, repeat."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from barsight.store.opening import Store
 
 POLL_S = 2.0
 _ROWS = 200
-"""Rows that are written in one transaction."""
+"""Number of rows written in one transaction."""
 
 
 @dataclass(frozen=True)
 class FleetCounts:
-    """Keys by state."""
+    """Numbers of keys by state."""
 
     published: int
     parked: int
@@ -33,7 +33,7 @@ class FleetCounts:
 
 
 def count_states(results: Objects, tasks: list[FleetTask]) -> FleetCounts:
-    """Count the tasks that are published, parked, worked on now, and left."""
+    """Count the tasks that are published, parked, running, and left."""
     keys = {task.key for task in tasks}
     published, parked = published_keys(results) & keys, parked_keys(results) & keys
     open_keys = keys - published - parked
@@ -51,10 +51,10 @@ def drive(
     advance: Callable[[int, int], None],
     run: Callable[[Any, Any], str] = run_task,
 ) -> None:
-    """Run all tasks that the results don't have until each is published or parked.
+    """Run all tasks missing in the results until each is published or parked.
 
-    advance: told of the tasks that are done and of all. Rows that workers could not write are written at
-    the end of each round. What another driver's workers have claimed is waited for.
+    advance: called with the number of tasks done and in total. Rows that workers could not write are written
+    at the end of each round. Tasks claimed by another driver's workers are waited for.
     """
     wanted = {task.key for task in tasks}
     while True:
@@ -70,7 +70,7 @@ def drive(
         busy = running_keys(results, {task.key for task in left})
         free = [task for task in left if task.key not in busy]
         done = len(ended)
-        # What waits at the workers would start after the window has closed.
+        # Tasks queued at the workers would start after the window has closed.
         ahead = 1 if window.is_limited else AHEAD
         for key in run_all(client, run, free, settings, window.is_open, ahead):
             if key is not None:
@@ -81,14 +81,14 @@ def drive(
 
 
 def open_tasks(store: Store, results: Objects, tasks: list[FleetTask], by: str) -> list[FleetTask]:
-    """List the tasks that are neither published nor parked; rows that the others lack are written."""
+    """List the tasks that are neither published nor parked; write the missing rows of the others."""
     note_missing(store, results, by, {task.key for task in tasks})
     ended = published_keys(results) | parked_keys(results)
     return [task for task in tasks if task.key not in ended]
 
 
 def note_missing(store: Store, results: Objects, by: str, wanted: set[str]) -> int:
-    """Write the rows of published tasks that the store lacks; return their number."""
+    """Write the rows of published tasks missing in the store; return their number."""
     with store.reading() as connection:
         known = noted_keys(connection)
     missing = sorted((published_keys(results) & wanted) - known)

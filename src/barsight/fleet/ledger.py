@@ -1,4 +1,4 @@
-"""Keep in the results who works on a key, how often it failed, and that it is done: the truth of a run."""
+"""Record in the results who works on a key, its failures, and its completion: the authority on a run."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from typing import Any, Literal
 from barsight.fleet.objects import Objects
 
 TRIES = 3
-"""Failures after which a recording is parked,"""
+"""Number of failures after which a recording is parked."""
 MAX_LOST = 12
-"""and claims whose worker died without a word, which others' faults cause too."""
+"""Number of claims whose worker died silently, possibly through the fault of others, before parking."""
 REMEDY = "promote nothing of it; measure the recording again"
-"""Remedy for a published result that isn't what was written."""
+"""Remedy for a published result that isn't as it was written."""
 Held = Literal["published", "parked", "claimed"]
 _TEXT, _NUMBER = {"type": "string"}, {"type": "number"}
 _FILE = {
@@ -38,12 +38,12 @@ _RESULT = {
 }  # fmt: skip
 _CLAIM = {"type": "object", "required": ["expires"], "properties": {"expires": _NUMBER}}
 PARKED = {"type": "object", "required": ["reason"], "properties": {"reason": _TEXT}}
-"""Schemas of what is kept here."""
+"""Schemas of the objects kept here."""
 
 
 @dataclass(frozen=True)
 class HeldRecording:
-    """A key that is ours for a while. token: of this try. number: counts the claims of the key from 1."""
+    """A key claimed by this worker. token: of this try. number: counts the claims of the key from 1."""
 
     key: str
     number: int
@@ -51,9 +51,9 @@ class HeldRecording:
 
 
 def claim(results: Objects, key: str, lease_s: float) -> HeldRecording | Held:
-    """Take a key by put-if-absent, or tell who has it. One whose lease has run out is taken over.
+    """Claim a key by put-if-absent, or report its state. A claim whose lease has expired is taken over.
 
-    Clocks of the machines must agree to a small part of the lease.
+    The machines' clocks must agree to within a small part of the lease.
     """
     if results.read(f"results/{key}/result.json") is not None:
         return "published"
@@ -76,14 +76,14 @@ def claim(results: Objects, key: str, lease_s: float) -> HeldRecording | Held:
 
 @contextmanager
 def held(results: Objects, mine: HeldRecording, lease_s: float) -> Iterator[None]:
-    """Renew a claim from a thread of its own while the block runs, and let it run out at once after it."""
+    """Renew a claim from a separate thread while the block runs, and let it expire right after it."""
     ended = threading.Event()
 
     def renew() -> None:
         while not ended.wait(lease_s / 4):
             try:
                 results.write(_path(mine), _claim_text(mine, lease_s))
-            except Exception:  # the next one may go through; if none does another worker takes over
+            except Exception:  # the next renewal may succeed; if none does, another worker takes over
                 continue
 
     thread = threading.Thread(target=renew, daemon=True)
@@ -97,13 +97,13 @@ def held(results: Objects, mine: HeldRecording, lease_s: float) -> Iterator[None
 
 
 def publish(results: Objects, mine: HeldRecording, content: dict[str, Any]) -> bool:
-    """Write the key's result.json, its last object, where there is none; tell whether it is ours."""
+    """Write the key's result.json, its last object, if there is none; return whether it is this worker's."""
     text = json.dumps({"key": mine.key, "token": mine.token, **content}, indent=1)
     return results.write_new(f"results/{mine.key}/result.json", text.encode())
 
 
 def discard(results: Objects, mine: HeldRecording, *, is_ours: bool) -> None:
-    """Remove the files of a key's other tries once it is published by ours, or ours where it isn't."""
+    """Remove the files of a key's other tries if this one was published, otherwise those of this one."""
     own = f"files/{mine.key}/{mine.token}/"
     for one in list(results.list(f"files/{mine.key}/")):
         if one.path.startswith(own) is not is_ours:
@@ -111,13 +111,13 @@ def discard(results: Objects, mine: HeldRecording, *, is_ours: bool) -> None:
 
 
 def result_note(results: Objects, key: str) -> dict[str, Any] | None:
-    """Read what was published of a key; None where nothing is. Raises InputError."""
+    """Read the published result of a key; None if there is none. Raises InputError."""
     note: dict[str, Any] | None = results.read_json(f"results/{key}/result.json", _RESULT)
     return note
 
 
 def fail(results: Objects, mine: HeldRecording, reason: str) -> bool:
-    """Note a failure; tell whether the recording is parked by it."""
+    """Record a failure; return True if it parks the recording."""
     note = {"token": mine.token, "reason": reason, "host": socket.gethostname(), "at": time.time()}
     results.write_new(f"failures/{mine.key}/{mine.number:04d}.json", json.dumps(note).encode())
     count = sum(1 for _ in results.list(f"failures/{mine.key}/"))
@@ -132,7 +132,7 @@ def park(results: Objects, key: str, reason: str, tries: int) -> None:
 
 
 def forgive(results: Objects, key: str) -> None:
-    """Forget a key's failures, so that it is tried again."""
+    """Delete a key's failures, so that it is tried again."""
     for prefix in (f"failures/{key}/", f"claims/{key}/"):
         for one in list(results.list(prefix)):
             results.remove(one.path)
@@ -140,17 +140,17 @@ def forgive(results: Objects, key: str) -> None:
 
 
 def published_keys(results: Objects) -> set[str]:
-    """List the keys that are done."""
+    """List the published keys."""
     return {PurePosixPath(one.path).parent.name for one in results.list("results/")}
 
 
 def parked_keys(results: Objects) -> set[str]:
-    """List the keys that are parked."""
+    """List the parked keys."""
     return {PurePosixPath(one.path).stem for one in results.list("parked/")}
 
 
 def running_keys(results: Objects, among: set[str]) -> set[str]:
-    """List the keys of `among` that someone works on now."""
+    """List the keys of `among` that a worker currently holds."""
     newest: dict[str, str] = {}
     for one in results.list("claims/"):
         key = PurePosixPath(one.path).parent.name

@@ -1,4 +1,4 @@
-"""Run a command under limits of memory and time, and tell in one line why it did not end well."""
+"""Run a command under limits of memory and time, and report in one line why it failed."""
 
 from __future__ import annotations
 
@@ -25,24 +25,24 @@ _THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 
 @dataclass(frozen=True)
 class LimitedRun:
-    """A command that ended well. peak_bytes: resident memory of it and its children together."""
+    """A successful command. peak_bytes: peak resident memory of it and its children together."""
 
     seconds: float
     peak_bytes: int
 
 
 def thread_variables(threads: int) -> dict[str, str]:
-    """Form the environment that bounds a process's threads; empty for 0, which leaves them alone."""
+    """Form the environment that limits a process's threads; empty for 0, which sets no limit."""
     return dict.fromkeys(_THREADS, str(threads)) if threads else {}
 
 
 def run_limited(
     command: Sequence[str], folder: Path, environment: Mapping[str, str], memory_gib: float, timeout_s: float
 ) -> LimitedRun | Failed:
-    """Run a command in `folder`; it and its children are killed once they pass a limit, or we die.
+    """Run a command in `folder`; it is killed with its children at a limit, or if this process dies.
 
-    Fails with `over-memory`, `timeout`, or `refused` and the last line that it wrote; `output` where that is
-    about what it could not write.
+    Fails with `over-memory`, `timeout`, or `refused` and its last line of output; `output` if that line is
+    about output that it could not write.
     """
     started = time.monotonic()
     peak = 0

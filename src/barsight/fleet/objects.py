@@ -1,4 +1,4 @@
-"""Read and write objects of a folder, S3, Azure or Google storage; nothing else here knows of obstore."""
+"""Read and write objects of a folder, S3, Azure or Google storage; the only module that uses obstore."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ with extra("fleet"):
 
 REMEDY = "remove it, or write it anew"
 RETRY_S = 180
-"""Time for which a request that a server refuses or loses is tried again."""
+"""Time in seconds for which a refused or lost request is retried."""
 _LARGE = 8 << 20
 
 
 class UnreachableError(InputError):
-    """Storage that does not answer, or refuses its keys: the fault of none of what lies in it."""
+    """Storage that does not answer, or refuses its keys; no object in it is at fault."""
 
 
 @dataclass(frozen=True)
 class StoredObject:
-    """An object of a listing. mark: changes when its content does."""
+    """An object of a listing. mark: changes whenever the content does."""
 
     path: str
     size: int
@@ -42,29 +42,28 @@ class StoredObject:
 
 @dataclass(frozen=True)
 class Objects:
-    """Objects under one URL. url: of a folder, s3://, az:// or gs://; without its keys, which come from the
-    environment.
+    """Objects under one URL. url: of a folder, s3://, az:// or gs://.
+
+    The URL contains no keys; they come from the environment.
     """
 
     url: str
     store: ObjectStore
 
     def list(self, prefix: str = "") -> Iterator[StoredObject]:
-        """List what lies under a prefix, which ends at a slash."""
+        """List all objects under a prefix that ends with a slash."""
         with _told(self.url):
             for part in obstore.list(self.store, prefix.rstrip("/") or None):
                 yield from map(_listed, part)
 
     def list_folder(self, prefix: str) -> Iterator[StoredObject]:
-        """List what lies in a folder itself."""
+        """List the objects directly in a folder."""
         with _told(self.url):
             for one in obstore.list_with_delimiter(self.store, prefix or None)["objects"]:
                 yield _listed(one)
 
     def read(self, path: str) -> bytes | None:
-        """Read a small object; None where there is none. Raises InputError for one of over
-        MAX_DOCUMENT_BYTES.
-        """
+        """Read a small object; None if there is none. Raises InputError above MAX_DOCUMENT_BYTES."""
         with _told(f"{self.url}/{path}"):
             try:
                 found = self._get(path)
@@ -74,13 +73,13 @@ class Objects:
             return bytes(found.bytes())
 
     def expect_size(self, path: str, size: int, max_bytes: int) -> None:
-        """Raise InputError for an object of more bytes."""
+        """Raise InputError if an object has more bytes than `max_bytes`."""
         if size > max_bytes:
             raise InputError(f"{self.url}/{path}", f"has {size} bytes, at most {max_bytes} are read", REMEDY)
 
     def read_json(self, path: str, schema: Any = None) -> Any:
-        """Read a JSON object; None where there is none. Raises InputError for one that is torn, or isn't as
-        the schema says.
+        """Read a JSON object; None if there is none. Raises InputError if it is damaged or violates the
+        schema.
         """
         data = self.read(path)
         if data is None:
@@ -91,15 +90,15 @@ class Objects:
         return content
 
     def write(self, path: str, data: bytes) -> None:
-        """Write an object over what is there. Raises OutputError where it can't be."""
+        """Write an object, replacing any existing one. Raises OutputError if this fails."""
         with _told(f"{self.url}/{path}", writes=True):
             obstore.put(self.store, path, data)
 
     def write_new(self, path: str, data: bytes) -> bool:
-        """Write an object only where there is none; tell whether it is ours.
+        """Write an object only if there is none; return True if the object is this writer's.
 
-        data: tells its writer apart. A put whose answer was lost is tried again and finds itself.
-        Raises OutputError where it can't be.
+        data: must identify its writer: a put whose answer was lost is retried and finds itself. Raises
+        OutputError if this fails.
         """
         with _told(f"{self.url}/{path}", writes=True):
             try:
@@ -109,7 +108,7 @@ class Objects:
         return True
 
     def remove(self, path: str) -> None:
-        """Remove an object; one that is gone is fine."""
+        """Remove an object, if it still exists."""
         with _told(f"{self.url}/{path}"):
             try:
                 obstore.delete(self.store, path)
@@ -117,7 +116,7 @@ class Objects:
                 return
 
     def chunks(self, path: str) -> Iterator[bytes]:
-        """Read a large object in parts. Raises InputError where there is none."""
+        """Read a large object in parts. Raises InputError if there is none."""
         with _told(f"{self.url}/{path}"):
             try:
                 found = self._get(path)
@@ -127,22 +126,22 @@ class Objects:
                 yield bytes(part)
 
     def _get(self, path: str) -> Any:
-        """Open an object. In a folder it must be a regular file: a pipe there would be waited for."""
+        """Open an object. In a folder it must be a regular file, since reading a pipe could block."""
         file = Path(self.url) / path
         if isinstance(self.store, LocalStore) and file.exists():
             open_regular(file).close()
         return obstore.get(self.store, path)
 
     def upload(self, file: Path, path: str) -> None:
-        """Write a file as an object. Raises OutputError where it can't be."""
+        """Write a file as an object. Raises OutputError if this fails."""
         with _told(f"{self.url}/{path}", writes=True):
             obstore.put(self.store, path, file)
 
 
 def open_objects(url: str, *, create: bool = False) -> Objects:
-    """Open a folder or a bucket. create: make the folder where there is none.
+    """Open a folder or a bucket. create: make a missing folder.
 
-    Raises ConfigError for a URL that is none, InputError for a folder that isn't there.
+    Raises ConfigError for an invalid URL, InputError for a missing folder.
     """
     if "://" in url and not url.startswith("file://"):
         options = {"allow_http": True} if _is_plain(os.environ.get("AWS_ENDPOINT_URL", "")) else None
@@ -170,7 +169,7 @@ def _is_plain(endpoint: str) -> bool:
 
 
 class _told:  # noqa: N801
-    """Turn what a server or disk refuses into one line: InputError, or OutputError where it `writes`."""
+    """Turn the error of a server or disk into one line: InputError, or OutputError if it `writes`."""
 
     def __init__(self, name: str, *, writes: bool = False) -> None:
         self.name, self.writes = name, writes
@@ -180,7 +179,7 @@ class _told:  # noqa: N801
 
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         """Translate."""
-        if kind is not None and kind.__name__ == "PanicException":  # of obstore, where no thread can be begun
+        if kind is not None and kind.__name__ == "PanicException":  # obstore can't start a thread
             raise MemoryError from error
         if isinstance(error, BaseError) or (isinstance(error, OSError) and error.errno is None):
             problem = _first_line(error)

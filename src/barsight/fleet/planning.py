@@ -1,4 +1,4 @@
-"""Plan an archive: a task for each recording, and an estimate of the hours and gigabytes that are left."""
+"""Plan an archive: a task for each recording, and an estimate of the remaining hours and gigabytes."""
 
 from __future__ import annotations
 
@@ -14,12 +14,14 @@ from barsight.fleet.objects import Objects, UnreachableError
 from barsight.fleet.versions import FleetTask, Version
 
 FIRST_S, PER_PAIR_S, PER_BYTE_S, RESULT_BYTES = 8.0, 1.5, 1e-6, 15_000_000
-"""Rough figures of two cores, for an archive of which nothing was measured yet."""
+"""Rough rates on two cores, for an archive of which nothing has been measured yet: seconds per recording, per
+pair and per byte, and bytes per result.
+"""
 
 
 @dataclass(frozen=True)
 class WorkEstimate:
-    """Work that is left: seconds of one worker, bytes to fetch and to write. known: tasks it rests on."""
+    """Remaining work: seconds of one worker, bytes to fetch and to write. known: number of tasks used."""
 
     seconds: float
     fetched_bytes: int
@@ -35,9 +37,10 @@ def plan_tasks(
     advance: Callable[[int, int], None],
     leave_out: Callable[[InputError], None] | None = None,
 ) -> list[FleetTask]:
-    """Make the tasks of an archive's recordings, in the order of their names; recordings with the same
-    content under two names are one task. advance: told of bytes read and of all. leave_out: told of a
-    recording that can't be read, which then has no task; without it the error is raised.
+    """Make the tasks of an archive's recordings in the order of their names, one task for equal content.
+
+    advance: called with the bytes read and in total. leave_out: called with the error of a recording that
+    can't be read, which then has no task; without it the error is raised.
     """
     recordings = find_recordings(archive)[:limit]
     total, done = sum(one.size for one in recordings), 0
@@ -70,9 +73,9 @@ def plan_tasks(
 
 
 def estimate(tasks: list[FleetTask], measured: list[tuple[int, int, float, int]]) -> WorkEstimate:
-    """Estimate the work of tasks by what others took: by their pairs, or by bytes where these aren't known.
+    """Estimate the work of tasks from completed ones: by their pairs, or by bytes if these aren't known.
 
-    measured: bytes, pairs, seconds and bytes of result of tasks that are done.
+    measured: bytes, pairs, seconds and bytes of result of completed tasks.
     """
     per_pair = [seconds / pairs for _, pairs, seconds, _ in measured if pairs]
     per_byte = [seconds / size for size, _, seconds, _ in measured if size]
@@ -89,14 +92,14 @@ def estimate(tasks: list[FleetTask], measured: list[tuple[int, int, float, int]]
 
 @dataclass(frozen=True)
 class TaskChoice:
-    """Tasks that are run, and their order."""
+    """Choice and order of the tasks to run."""
 
     version: str | None = None
-    """Version to measure, by the beginning of its name; the newest if not given."""
+    """Version to measure, given by the beginning of its name; the newest if not given."""
     limit: int | None = None
-    """Most recordings to measure now, of those that are left."""
+    """Maximum number of remaining recordings to measure now."""
     first: tuple[str, ...] = ()
-    """Beginnings of the names of recordings that come first, in this order."""
+    """Beginnings of the names of recordings to measure first, in this order."""
     again: bool = False
     """Try parked recordings again."""
 
@@ -105,8 +108,8 @@ class TaskChoice:
             expect_ranges(self, "", limit=(1, inf))
 
     def of(self, tasks: list[FleetTask]) -> list[FleetTask]:
-        """Put first the tasks whose names begin with the first of `first`, and so on; then all others; cut to
-        the limit.
+        """Sort the tasks by the beginnings of names in `first`, all others last, and cut them to the
+        limit.
         """
 
         def rank(task: FleetTask) -> int:

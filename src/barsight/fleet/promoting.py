@@ -1,4 +1,4 @@
-"""Switch what the page and the plant see to a version's results, and take it back."""
+"""Switch page and plant to a version's results, and revert the switch."""
 
 from __future__ import annotations
 
@@ -35,9 +35,10 @@ def promote(
 ) -> int:
     """Copy a version's results into `folder`, add them to the store as surveys, and switch to them at once.
 
-    Until the switch nobody sees them; killed before it, it is done again. Raises MeasurementError while a
-    recording of the version is neither published nor parked. Returns the number of surveys.
-    """  # fmt: skip
+    They are invisible until the switch; if killed before it, the promotion can be repeated. Raises
+    MeasurementError while a recording of the version is neither published nor parked. Returns the number of
+    surveys.
+    """
     done = published_keys(results)
     open_ones = [t for t in tasks if t.key not in done and results.read(f"parked/{t.key}.json") is None]
     if open_ones or not done & {task.key for task in tasks}:
@@ -64,22 +65,22 @@ def promote(
                 ).first()
                 is_own = bool(is_others.is_own) if is_others else is_there is None
                 opened.add(FLEET_SURVEYS, version=version.name, map_id=map_id, is_own=is_own)
-        # An archive is of one yard: rigs and mountings are calibrated anew over the years.
+        # An archive covers one yard; its rigs and mountings are recalibrated over the years.
         add_survey(store, survey, by, same_yard=True, version=version.name)
     _switch(store, version.name, by, f"promote fleet version {version.name}")
     return len(surveys)
 
 
 def take_back(store: Store, by: str) -> str:
-    """Switch back to the version that was promoted before, and return its name; empty for none.
+    """Switch back to the version promoted before, and return its name; empty for none.
 
-    Raises ConfigError where nothing is promoted.
+    Raises ConfigError if nothing is promoted.
     """
     with store.reading() as connection:
         now = promoted_version(connection)
         rows = connection.execute(select(PROMOTIONS.c.version).order_by(PROMOTIONS.c.id)).scalars()
         stack: list[str] = [""]
-        for name in rows:  # a switch to what lies below the top took the top back
+        for name in rows:  # a switch to the version below the top reverted the top
             if len(stack) > 1 and stack[-2] == name:
                 stack.pop()
             elif stack[-1] != name:

@@ -1,4 +1,4 @@
-"""Keep a fleet's facts in the store: versions, tasks, what is done; each addition is in the audit log."""
+"""Keep a fleet's facts in the store: versions, tasks, results; each addition is in the audit log."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ with extra("store"):
 
 
 def note_plan(store: Store, tasks: Iterable[FleetTask], by: str) -> int:
-    """Add a version, those of its tasks that the store doesn't have, and where they lie now.
+    """Add a version, its tasks that are missing in the store, and their current places.
 
     Returns the number of new tasks.
     """
@@ -52,13 +52,13 @@ def found_recording(task: FleetTask) -> FoundRecording:
 
 
 def note_result(url: str, key: str, content: dict[str, Any], by: str) -> None:
-    """Add a published task's row from a worker; nothing where it is there."""
+    """Add a published task's row from a worker, if it is missing."""
     with open_store(url) as store:
         note_results(store, {key: content}, by)
 
 
 def note_results(store: Store, contents: dict[str, dict[str, Any]], by: str) -> None:
-    """Add the rows of published tasks that the store lacks. contents: their result.json."""
+    """Add the missing rows of published tasks. contents: their result.json."""
     with entry(store, by, f"fleet results of {len(contents)} recordings") as opened:
         known = noted_keys(opened.connection)
         for key, content in contents.items():
@@ -71,18 +71,18 @@ def note_results(store: Store, contents: dict[str, dict[str, Any]], by: str) -> 
 
 
 def noted_keys(connection: Connection) -> set[str]:
-    """List the keys that have a row of their result."""
+    """List the keys that have a result row."""
     return set(connection.execute(select(FLEET_RESULTS.c.key)).scalars())
 
 
 def read_versions(connection: Connection) -> list[Version]:
-    """List the versions in the order in which they were planned first."""
+    """List the versions in the order in which they were first planned."""
     rows = connection.execute(select(FLEET_VERSIONS).order_by(FLEET_VERSIONS.c.id)).all()
     return [Version(r.name, r.configuration, r.calibration, r.magnet, r.software, r.rig) for r in rows]
 
 
 def find_version(connection: Connection, name: str | None) -> Version:
-    """Find a version by the beginning of its name; the newest where None. Raises ConfigError."""
+    """Find a version by the beginning of its name; the newest if None. Raises ConfigError."""
     versions = read_versions(connection)
     if not versions:
         raise ConfigError("the store knows no version of a fleet; barsight fleet plan makes one")
@@ -96,7 +96,7 @@ def find_version(connection: Connection, name: str | None) -> Version:
 
 
 def read_tasks(connection: Connection, version: Version) -> list[FleetTask]:
-    """List a version's tasks in the order of the plan, each where it was found last."""
+    """List a version's tasks in the order of the plan, each at its last known place."""
     chosen = select(FLEET_TASKS).where(FLEET_TASKS.c.version == version.name).order_by(FLEET_TASKS.c.id)
     places = _places(connection)
     tasks = []
@@ -108,13 +108,13 @@ def read_tasks(connection: Connection, version: Version) -> list[FleetTask]:
 
 
 def _places(connection: Connection) -> dict[str, tuple[str, str, str]]:
-    """Read by key the manifest of each recording, the archive where it was found last, and its name there."""
+    """Read the manifest of each key's recording, the archive where it was last found, and its name there."""
     rows = connection.execute(select(FLEET_PLACES).order_by(FLEET_PLACES.c.id)).all()
     return {row.key: (row.manifest, row.archive, row.recording) for row in rows}
 
 
 def seconds_by_size(connection: Connection) -> list[tuple[int, int, float, int]]:
-    """List bytes, pairs, seconds and bytes of result of tasks that are done, the newest thousand."""
+    """List bytes, pairs, seconds and result bytes of the newest thousand completed tasks."""
     joined = (
         select(
             FLEET_TASKS.c.bytes, FLEET_TASKS.c.pairs, FLEET_RESULTS.c.whole_s, FLEET_RESULTS.c.result_bytes

@@ -1,4 +1,4 @@
-"""Lend temporary folders to tasks, and sweep those that dead ones left."""
+"""Provide temporary folders for tasks, and remove those left by dead ones."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ with extra("fleet"):
     import psutil
 
 MIN_AGE_S = 60.0
-"""A younger folder may be one whose owner is just being written down."""
+"""Minimum age in seconds of a folder to remove: a younger one may not state its owner yet."""
 
 
 def scratch_root() -> Path:
-    """Return this user's folder for all tasks of this machine. Raises InputError where others have it."""
+    """Return this user's folder for all tasks of this machine. Raises InputError if it belongs to others."""
     root = Path(tempfile.gettempdir()) / f"barsight-fleet-{os.getuid()}"
     with translated_os_errors(root), contextlib.suppress(FileExistsError):
         root.mkdir(mode=0o700)
@@ -41,8 +41,9 @@ def scratch_root() -> Path:
 
 @contextlib.contextmanager
 def scratch_folder(key: str) -> Iterator[Path]:
-    """Yield an empty folder, named after its owner's machine, process and start, that is gone at the end;
-    folders that dead tasks left are swept first.
+    """Yield an empty folder, named after its owner's machine, process and start, and remove it at the end.
+
+    Folders left by dead tasks are removed first.
     """
     sweep()
     name = f"{key[:16]}-{_machine()}-{os.getpid()}-{psutil.Process().create_time():.2f}-"
@@ -55,9 +56,7 @@ def scratch_folder(key: str) -> Iterator[Path]:
 
 
 def sweep(min_age_s: float = MIN_AGE_S) -> int:
-    """Remove this user's folders whose owner ran on this machine, no longer does, and that are old enough;
-    count them.
-    """
+    """Remove this user's old folders whose owner ran on this machine and has ended; return their number."""
     count = 0
     for folder in scratch_root().iterdir():
         parts = folder.name.split("-")
@@ -72,7 +71,7 @@ def sweep(min_age_s: float = MIN_AGE_S) -> int:
 
 
 def _machine() -> str:
-    """Name this machine, as several may share the disk of temporary files."""
+    """Name this machine, as several may share the disk with the temporary files."""
     return hashlib.sha256(socket.gethostname().encode()).hexdigest()[:8]
 
 
@@ -84,7 +83,7 @@ def _lives(pid: int, started: float) -> bool:
 
 
 def compile_once() -> None:
-    """Compile the kernels of a measurement unless this machine has done so: one compiles, others wait."""
+    """Compile the kernels of a measurement once per machine: one process compiles, others wait."""
     package = Path(barsight.__file__).parent
     stamp = max(int(path.stat().st_mtime) for path in package.rglob("*.py"))
     mark = scratch_root() / f"kernels-{_machine()}-{barsight.__version__}-{stamp}"

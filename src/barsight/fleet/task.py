@@ -1,4 +1,4 @@
-"""Measure one recording of an archive: claim, download, measure under limits, upload, publish, note."""
+"""Measure one recording of an archive: claim, download, measure under limits, upload, publish, record."""
 
 from __future__ import annotations
 
@@ -30,13 +30,15 @@ class TaskLimits:
     """Limits of one measurement of an archive."""
 
     memory_gib: float = 8.0
-    """Memory that one measurement may take."""
+    """Maximum memory of one measurement in GiB."""
     timeout_s: float = 7200.0
-    """Time that one measurement may take."""
+    """Maximum duration of one measurement in seconds."""
     lease_s: float = 60.0
-    """Time after which a dead worker's recording is taken over; more than clocks differ."""
+    """Time in seconds after which a dead worker's recording is taken over; must exceed the clocks'
+    differences.
+    """
     threads: int = 0
-    """Threads of each measurement; all cores if 0."""
+    """Number of threads of each measurement; 0 for all cores."""
 
     def __post_init__(self) -> None:
         expect_ranges(
@@ -46,7 +48,7 @@ class TaskLimits:
 
 @dataclass(frozen=True)
 class TaskSettings:
-    """All that tasks of a run share: URLs of results and store (None: the driver writes the rows), limits."""
+    """Settings shared by all tasks: URLs of results and store (None: the driver writes the rows), limits."""
 
     results: str
     store: str | None
@@ -56,11 +58,11 @@ class TaskSettings:
 
 
 def run_task(task: FleetTask, settings: TaskSettings) -> str:
-    """Measure a recording unless another worker has it or did it, and return its key, whatever came of it.
+    """Measure a recording unless another worker has claimed or done it; return its key in any case.
 
-    A recording that fails is tried again at once until it is parked. Raises ConfigError where this machine's
-    software isn't the version's, and what ends the whole run: results or archive that can't be reached, a
-    disk that takes nothing more.
+    A failed recording is retried at once until it is parked. Raises ConfigError if this machine's software
+    isn't the version's, and any error that ends the whole run: unreachable results or archive, or a full
+    disk.
     """
     expect_software(task.version.software)
     results = open_objects(settings.results)
@@ -80,7 +82,7 @@ def run_task(task: FleetTask, settings: TaskSettings) -> str:
 
 
 def _try(task: FleetTask, mine: HeldRecording, settings: TaskSettings, results: Objects) -> Failed | None:
-    """Measure once; None where it is published, by this try or another."""
+    """Measure once; return None if the result is published, by this try or another."""
     started = time.monotonic()
     with scratch_folder(task.key) as folder, translated_os_errors(folder):
         words = arguments(results, task.version, folder)

@@ -1,4 +1,4 @@
-"""Name a version: configuration and the files it names, calibration, magnet, software; and a task's key."""
+"""Define a version: configuration and the files it names, calibration, magnet, software; and a task's key."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ FLAGS = {
     "config": "--config", "rig": "--recording.rig", "magnet": "--magnet", "yard": "--yard",
     "stock": "--bundles.stock-list", "imu": "--recording.imu-yaml",
 }  # fmt: skip
-"""Names, without their suffixes, under which a version's files are kept in the results; what names them to
-`barsight measure`.
+"""File names, without suffix, of a version's files in the results, and their options of `barsight
+measure`.
 """
 _FILES = "files.json"
 _FILES_SCHEMA = {"type": "object", "additionalProperties": {"type": "string"}}
@@ -33,8 +33,9 @@ LIBRARIES = ("numpy", "scipy", "numba", "opencv-contrib-python-headless")
 
 @functools.cache
 def installed_software() -> str:
-    """Name what measures here: Barsight's version, and a digest of its sources and of the libraries that
-    compute, as those may change a result without the version.
+    """Name the installed software: Barsight's version, and a digest of its sources and numerical libraries.
+
+    Sources and libraries may change a result without a change of the version.
     """
     sources = sources_digest(Path(barsight.__file__).parent)
     found = json_digest([sources, [metadata.version(name) for name in LIBRARIES]])
@@ -42,7 +43,7 @@ def installed_software() -> str:
 
 
 def expect_software(wanted: str) -> None:
-    """Raise ConfigError where this machine would measure with other software."""
+    """Raise ConfigError if this machine would measure with other software."""
     if installed_software() != wanted:
         raise ConfigError(
             f"{socket.gethostname()}: has Barsight {installed_software()}, not {wanted}; install the same on "
@@ -52,10 +53,9 @@ def expect_software(wanted: str) -> None:
 
 @dataclass(frozen=True)
 class Version:
-    """A way to measure. name: 16 digits of the digest of all else; the others are digests, empty for none.
+    """Definition of a measurement. name: 16 digits of the digest of the rest; the others: digests or empty.
 
-    rig: name of the file of a calibration that takes the place of the recordings' own. software: as
-    `installed_software` tells it.
+    rig: file name of a calibration that replaces the recordings' own. software: from `installed_software`.
     """
 
     name: str
@@ -72,8 +72,9 @@ class Version:
 
 @dataclass(frozen=True)
 class FleetTask:
-    """A recording to be measured under a version. manifest: digest of its files, which tells it from others
-    wherever it lies; archive: URL of where that is.
+    """A recording to measure under a version.
+
+    manifest: digest of its files, which identifies it at any place; archive: URL of its archive.
     """
 
     key: str
@@ -87,7 +88,7 @@ class FleetTask:
 
 
 def places(tasks: Iterable[FleetTask]) -> dict[str, str]:
-    """Name tasks, by key: their paths in the archive, with the archive's URL where there are several."""
+    """Name tasks by key: their paths in the archive, with the archive's URL if there are several."""
     listed = list(tasks)
     is_one = len({task.archive for task in listed}) == 1
     return {
@@ -99,9 +100,9 @@ def places(tasks: Iterable[FleetTask]) -> dict[str, str]:
 def publish_version(
     results: Objects, settings: Any, config: Path | None, rig: Path | None, magnet: Path | None
 ) -> Version:
-    """Keep a version's files in the results, where workers read them, and return it.
+    """Store a version's files in the results, from which workers read them, and return the version.
 
-    settings: what `config` holds, already checked. The files that it names count by their content. Raises
+    settings: the content of `config`, already checked. The files that it names count by their content. Raises
     ConfigError for a configuration that names a calibration by a path.
     """
     if settings.recording.rig is not None or settings.recording.camchain is not None:
@@ -129,7 +130,7 @@ def publish_version(
 def arguments(results: Objects, version: Version, folder: Path) -> list[str]:
     """Copy a version's files into a folder and return the arguments of `barsight measure` that name them.
 
-    Raises ConfigError where the results don't hold them as they were planned.
+    Raises ConfigError if the results don't contain them as planned.
     """
     words: list[str] = []
     prefix = f"versions/{version.name}"
@@ -143,7 +144,7 @@ def arguments(results: Objects, version: Version, folder: Path) -> list[str]:
 
 
 def _version_files(results: Objects, version: Version) -> dict[str, str]:
-    """Read the names and digests of a version's files. Raises ConfigError where the results don't know it."""
+    """Read the names and digests of a version's files. Raises ConfigError if the results don't know it."""
     files: dict[str, str] | None = results.read_json(f"versions/{version.name}/{_FILES}", _FILES_SCHEMA)
     if files is None:
         raise ConfigError(

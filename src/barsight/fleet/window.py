@@ -1,4 +1,4 @@
-"""Tell whether new tasks may start now: at night only, or while the machine has idle cores."""
+"""Decide whether new tasks may start now: only at night, or only while the machine has idle cores."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ with extra("fleet"):
 
 @dataclass(frozen=True)
 class RunWindow:
-    """The times at which tasks start."""
+    """Times at which tasks may start."""
 
     between: tuple[str, str] | None = None
     """Start recordings only between two local times, like 22:00 06:00."""
@@ -29,7 +29,7 @@ class RunWindow:
 
     @property
     def is_limited(self) -> bool:
-        """Tell whether it may ever be closed."""
+        """Return True if the window may ever be closed."""
         return self.between is not None or self.idle
 
     def is_open(self, now: datetime | None = None, busy_ratio: float | None = None) -> bool:

@@ -36,7 +36,7 @@ def run(arguments: Sequence[str]) -> None:
         vanished, are significant by Holm's rule, at 5 % for any false one among all figures.
 
         Args:
-            before: Version, by the beginning of its name.
+            before: Version, given by the beginning of its name.
             after: The other version.
             results: Folder or URL of the results.
             out: Folder for the comparison; it must be new or empty.

@@ -1,1 +1,1 @@
-"""Compare two versions of an archive: each recording, all of them held against chance, and the page."""
+"""Compare two versions of an archive: each recording, the significance over all of them, and the page."""

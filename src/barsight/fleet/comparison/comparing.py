@@ -18,17 +18,19 @@ from barsight.fleet.objects import Objects
 from barsight.fleet.versions import FleetTask, places
 
 FIGURES = ("x_m", "y_m", "top_z_m", "yaw_deg", "length_m", "width_m")
-"""Figures of a bundle that are compared."""
+"""Quantities of a bundle that are compared."""
 _UNREAD = (KeyError, TypeError, ValueError, AttributeError, OverflowError)
-"""Exceptions of a document that is torn."""
+"""Exceptions that a damaged document raises."""
 MAX_APART_M = 0.5
-"""Distance up to which two bundles are taken for one."""
+"""Largest distance in metres between two bundles that count as the same one."""
 
 
 @dataclass(frozen=True)
 class FigureChange:
-    """A figure of a bundle under two versions. sigma: of the difference, as if the two were independent;
-    both saw the same pictures, so it is an upper bound. p: two-sided chance of a difference this large.
+    """A quantity of a bundle under two versions.
+
+    sigma: of the difference, as if the two were independent; since both saw the same pictures, it is an upper
+    bound. p: two-sided probability of a difference this large.
     """
 
     recording: str
@@ -46,9 +48,9 @@ class RecordingComparison:
 
     only_before, only_after: numbers of bundles without a partner. vetoes: codes that forbid all lifts and
     appeared (+) or vanished (-). lifts: how many lifts each other code forbids, before and after, and how
-    many are `offered`. intervals: mean half width of the 95 % interval by figure, before and after, None
-    where no bundle has one. seconds: measured, before and after. pictures: objects of the results, of the two
-    reports' pictures.
+    many are `offered`. intervals: mean half width of the 95 % interval by quantity, before and after, None
+    without an interval. seconds: measuring times, before and after. pictures: objects of the results with the
+    pictures of the two reports.
     """
 
     recording: str
@@ -68,7 +70,7 @@ def compare_tasks(
     after: Sequence[FleetTask],
     advance: Callable[[int, int], None],
 ) -> tuple[list[RecordingComparison], list[str]]:
-    """Compare the recordings of two versions, told by their content; the others are named, with why."""
+    """Compare the recordings of two versions, identified by their content; list the others with a reason."""
     old, new = ({task.manifest or task.key: task for task in tasks} for tasks in (before, after))
     names = places((*before, *after))
     untold = [
@@ -91,7 +93,7 @@ def compare_tasks(
 
 
 def compare_recording(results: Objects, name: str, before: str, after: str) -> RecordingComparison | None:
-    """Compare the results of two keys; None where one of them isn't published."""
+    """Compare the results of two keys; None if one of them isn't published."""
     found = [result_note(results, key) for key in (before, after)]
     notes = [note for note in found if note is not None]
     if len(notes) < len(found):
@@ -117,7 +119,7 @@ def compare_recording(results: Objects, name: str, before: str, after: str) -> R
 
 
 def _bundles(results: Objects, folder: str) -> dict[int, dict[str, float]]:
-    """Read a result's bundles: each figure, and its sigma as `figure sigma`."""
+    """Read a result's bundles: each quantity, and its sigma as `figure sigma`."""
     content = _document(results, f"{folder}/bundles.json")
     try:
         return {int(one["id"]): _figures(one) for one in content["bundles"]}
@@ -127,7 +129,7 @@ def _bundles(results: Objects, folder: str) -> dict[int, dict[str, float]]:
 
 def _figures(one: dict[str, Any]) -> dict[str, float]:
     sigma, (ahead_x, ahead_y, _) = one["sigma"], one["direction"]
-    # An open end leaves the place along the bars unknown, and with it whatever it goes into.
+    # An open end leaves the position along the bars unknown, and everything that depends on it.
     along, across = (math.inf if sigma[name] is None else sigma[name] for name in ("along_m", "lateral_m"))
     x_m, y_m, _ = one["axis_centre_m"]
     figures = {"x_m": x_m, "y_m": y_m, **{name: one[name] for name in FIGURES[2:]}}
@@ -147,7 +149,7 @@ def _share(sigma: float, cosine: float) -> float:
 
 
 def _document(results: Objects, path: str) -> dict[str, Any]:
-    """Read a sealed document of a result, of whatever version. Raises InputError."""
+    """Read a sealed document of a result, of any version. Raises InputError."""
     content = results.read_json(path)
     if not isinstance(content, dict):
         problem = "is gone" if content is None else "is no object"
@@ -189,8 +191,8 @@ def _change(
 
 
 def _vetoes(results: Objects, folder: str) -> tuple[set[str], Counter[str]]:
-    """Read the codes that forbid all lifts, and for each other one how many lifts it forbids; those that are
-    offered are counted as `offered`.
+    """Read the codes that forbid all lifts, and the number of lifts that each other code forbids; offered
+    lifts are counted as `offered`.
     """
     path = f"{folder}/lifts.json"
     content = _document(results, path)

@@ -1,4 +1,4 @@
-"""Write the comparison of two versions as a page, with the pictures of the worst cases beside it."""
+"""Write the comparison of two versions as a page, with pictures of the worst cases beside it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from barsight.fleet.comparison.findings import LEVEL, MIN_RECORDINGS, ArchiveShi
 from barsight.fleet.objects import Objects
 
 MAX_LISTED = 100
-"""Bundles and recordings that the page lists; the JSON has all."""
+"""Maximum number of bundles and of recordings listed on the page; the JSON has all."""
 _STYLE = (
     "body{font:15px/1.45 system-ui,sans-serif;margin:2rem auto;max-width:70rem;padding:0 1rem;color:#1c2733}"
     "table{border-collapse:collapse;margin:1rem 0}td,th{padding:.25rem .8rem;border-bottom:1px solid #d5dce3;"
@@ -21,8 +21,9 @@ _STYLE = (
 
 
 def copy_pictures(results: Objects, findings: Findings, folder: Path) -> dict[str, tuple[str, str]]:
-    """Copy the pictures of the recordings that the page lists into `folder`, and return by recording where
-    they lie in it, before and after; empty for one that a result lacks.
+    """Copy the pictures of the recordings that the page lists into `folder`.
+
+    Returns their paths in it by recording, before and after; empty for a picture that a result lacks.
     """
     worst = [c.recording for c in findings.beyond[:MAX_LISTED]]
     worst += [one.recording for one in _other(findings)]
@@ -42,8 +43,8 @@ def copy_pictures(results: Objects, findings: Findings, folder: Path) -> dict[st
 
 
 def _other(findings: Findings) -> list[RecordingComparison]:
-    """List the recordings with other vetoes of the map, other numbers of lifts offered, or bundles of one
-    version only, those with most vetoes and bundles first.
+    """List the recordings with other vetoes of the map, other numbers of lifts offered, or bundles of only
+    one version, those with most vetoes and bundles first.
     """
     told = [
         one for one in findings.recordings
@@ -54,9 +55,9 @@ def _other(findings: Findings) -> list[RecordingComparison]:
 
 
 def comparison_page(findings: Findings, pictures: dict[str, tuple[str, str]]) -> str:
-    """Format the page: shifts of the archive, bundles beyond sigma, vetoes, bundles of one version, times.
+    """Format the page: shifts of the archive, bundles beyond sigma, vetoes, unmatched bundles, times.
 
-    pictures: of `copy_pictures`.
+    pictures: from `copy_pictures`.
     """
     parts = [
         f"<h1>Version {escape(findings.before)} and version {escape(findings.after)}</h1>",

@@ -1,4 +1,4 @@
-"""Judge all comparisons of an archive together: what is beyond chance, with many looked at at once."""
+"""Judge all comparisons of an archive together: significant differences under multiple testing."""
 
 from __future__ import annotations
 
@@ -12,17 +12,20 @@ from scipy.stats import ttest_1samp
 from barsight.fleet.comparison.comparing import FIGURES, FigureChange, RecordingComparison
 
 LEVEL = 0.05
-"""Chance that anything at all is told of two versions that measure alike: of the bundles, once more of the
-shifts of the whole archive, and once more of what forbids lifts."""
+"""Family-wise error rate for two versions that measure alike, once for the bundles, once for the shifts of
+the whole archive, and once for what forbids lifts.
+"""
 MIN_RECORDINGS = 5
-"""Fewer don't tell a shift of the archive from chance."""
+"""Minimum number of recordings for which a shift of the archive can be distinguished from chance."""
 
 
 @dataclass(frozen=True)
 class ArchiveShift:
-    """A shift that the recordings share. shift: mean over the recordings of each one's median difference, or
-    of the lifts that a code forbids more; p: of Student's t over the recordings. is_found: by Holm's rule
-    over the figures, or the codes.
+    """A shift common to the recordings.
+
+    shift: mean over the recordings of each one's median difference, or of the additional lifts that a code
+    forbids; p: of Student's t over the recordings. is_found: significant by Holm's method over the
+    quantities, or the codes.
     """
 
     figure: str
@@ -34,9 +37,10 @@ class ArchiveShift:
 
 @dataclass(frozen=True)
 class Findings:
-    """All that is told of two versions. beyond: bundles beyond sigma, the least likely first. tests: how
-    many figures were looked at. lifts: of the codes that forbid single lifts, and of `offered`. untold:
-    recordings that one of the versions lacks.
+    """Findings on two versions.
+
+    beyond: bundles beyond sigma, the least likely first. tests: number of quantities tested. lifts: shifts of
+    the codes that forbid single lifts, and of `offered`. untold: recordings missing in one of the versions.
     """
 
     before: str
@@ -62,7 +66,7 @@ class Findings:
 def judge(
     before: str, after: str, recordings: Sequence[RecordingComparison], untold: Sequence[str]
 ) -> Findings:
-    """Find the bundles beyond sigma and the shifts of the archive, each by Holm's rule at LEVEL."""
+    """Find the bundles beyond sigma and the shifts of the archive, each by Holm's method at LEVEL."""
     changes = [change for one in recordings for change in one.changes]
     found = holm([change.p for change in changes])
     beyond = sorted((c for c, is_found in zip(changes, found, strict=True) if is_found), key=lambda c: c.p)
@@ -73,8 +77,9 @@ def judge(
 
 
 def holm(chances: Sequence[float]) -> list[bool]:
-    """Tell which chances are too small for chance, with at most LEVEL for any false one among all (Holm,
-    "A simple sequentially rejective multiple test procedure", 1979).
+    """Find the significant p-values, with a family-wise error rate of at most LEVEL.
+
+    Source: Holm, "A simple sequentially rejective multiple test procedure", 1979.
     """
     found = [False] * len(chances)
     for rank, place in enumerate(sorted(range(len(chances)), key=lambda i: chances[i])):
@@ -85,7 +90,7 @@ def holm(chances: Sequence[float]) -> list[bool]:
 
 
 def _shifts(recordings: Sequence[RecordingComparison]) -> tuple[ArchiveShift, ...]:
-    """Judge the median difference of each recording, by figure."""
+    """Judge the median difference of each recording, by quantity."""
     return _judged({
         figure: [
             median(differences)
@@ -97,7 +102,7 @@ def _shifts(recordings: Sequence[RecordingComparison]) -> tuple[ArchiveShift, ..
 
 
 def _lift_shifts(recordings: Sequence[RecordingComparison]) -> tuple[ArchiveShift, ...]:
-    """Judge how many lifts more each code forbids, by recording."""
+    """Judge how many more lifts each code forbids, by recording."""
     codes = sorted({code for one in recordings for code in one.lifts})
     none = (0, 0)
     return _judged({
