@@ -1,1 +1,1 @@
-"""Write result files, and the page that shows them."""
+"""Write result files, and the pages that show them."""

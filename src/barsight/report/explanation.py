@@ -1,4 +1,4 @@
-"""Explain a lift: every check with its figure and bound, and a picture of the place."""
+"""Explain a lift: each check with its value and bound, and a picture of the place."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ from barsight.yard.vetoes import Veto
 
 PIXELS_PER_M = 180.0
 BEYOND_M = 0.5
-"""Margin shown around the magnet."""
+"""Margin in metres shown around the magnet."""
 LOW_M, HIGH_M = -0.3, 0.1
-"""Heights from the faces' plane that the colours span."""
+"""Range in metres of the colour scale, relative to the faces' plane."""
 BGR = {
     "face": (180, 47, 255), "beam": (255, 255, 255), "tolerance": (0, 215, 255), "bundle": (83, 211, 57),
     "offending": (30, 30, 230),
@@ -43,9 +43,10 @@ UNSEEN_BGR, HATCH_BGR = (225, 225, 225), (150, 150, 150)
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """A lift of lifts.json with what its checks found. title: in words. picture: (H, W, 3) BGR, None where
-    nothing was known under the magnet. map_vetoes: what forbids every lift of the map; since: what has
-    forbidden this one since it was offered.
+    """A lift of lifts.json with the findings of its checks.
+
+    title: in words. picture: (H, W, 3) BGR, None if nothing was known under the magnet. map_vetoes: what
+    forbids every lift of the map; since: what has forbidden this lift since it was offered.
     """
 
     title: str
@@ -63,10 +64,10 @@ class Explanation:
 
 
 def explain(folder: Path, which: str) -> Explanation:
-    """Explain the lift `which` of a folder: `3` is the offered lift of rank 3, `bundle:12` the one that would
-    take bundle 12, offered or refused.
+    """Explain the lift `which` of a folder: `3` is the offered lift of rank 3, `bundle:12` the offered or
+    refused lift of bundle 12.
 
-    Raises ConfigError where there is no such lift, InputError for a folder that can't be read.
+    Raises ConfigError if there is no such lift, InputError if the folder can't be read.
     """
     summary, _ = open_folder(folder)
     lifts = read_lifts(folder / "lifts.json")
@@ -113,7 +114,7 @@ def _find(lifts: dict[str, Any], which: str, folder: Path) -> dict[str, Any]:
 
 
 def format_check(check: dict[str, Any]) -> tuple[str, str]:
-    """Format a check's figure with sigma, and its bound."""
+    """Format a check's value with sigma, and its bound."""
     unit = {"deg": "°", "s": "s"}.get(check["unit"], check["unit"])
     decimals = {"mm": 1, "N": 0, "kg": 0, "s": 0, "": 3, "deg": 2}.get(check["unit"], 2)
     if float(check["value"] or 0).is_integer() and float(check["bound"] or 0).is_integer():
@@ -125,7 +126,7 @@ def format_check(check: dict[str, Any]) -> tuple[str, str]:
 
 
 def write_explanation(told: Explanation, target: Path) -> None:
-    """Write the page, one file, whole or not at all."""
+    """Write the page as one file, completely or not at all."""
     rows = [{**check, "figure": figure, "limit": limit} for check in told.checks
             for figure, limit in [format_check(check)]]  # fmt: skip
     picture = None
@@ -141,8 +142,8 @@ def write_explanation(told: Explanation, target: Path) -> None:
 
 
 def draw_place(heights: Any, record: dict[str, Any], magnet: Magnet, bundles: tuple[Bundle, ...]) -> UInt8:
-    """Draw the heights about a lift (H, W, 3), the beam from left to right, with faces, tolerance, bundles
-    and the cells that offend.
+    """Draw the heights around a lift (H, W, 3), with the beam from left to right, faces, tolerance, bundles
+    and the offending cells.
     """
     target = record["target"]
     place = Placement(target["x_m"], target["y_m"], math.radians(target["yaw_deg"]))
@@ -188,7 +189,7 @@ def draw_place(heights: Any, record: dict[str, Any], magnet: Magnet, bundles: tu
 
 
 def _part(heights: YardMap, place: Placement, reach_m: float) -> HeightMap:
-    """Cut the map about a place."""
+    """Cut out the map around a place."""
     cuts = []
     for centre, first, count in (
         (place.y_m, heights.y0_m, heights.shape[0]), (place.x_m, heights.x0_m, heights.shape[1]),
@@ -200,7 +201,7 @@ def _part(heights: YardMap, place: Placement, reach_m: float) -> HeightMap:
 
 
 def _paint(heights: HeightMap, place: Placement, faces: FacePlane, long: float, wide: float) -> UInt8:
-    """Paint the heights from the faces' plane in colours, what was not seen hatched."""
+    """Paint the heights above the faces' plane in colours, unseen cells hatched."""
     v = np.arange(-long, long, 1 / PIXELS_PER_M)
     u = np.arange(-wide, wide, 1 / PIXELS_PER_M)
     vv, uu = np.meshgrid(v, u)

@@ -1,7 +1,7 @@
-"""Export a measured cloud or map to other programs' formats, chosen by the file's name.
+"""Export a measured cloud or map to other programs' formats, chosen by the file name.
 
 All keep metres and the reference frame, which LAS (system identifier), PCD and CSV (a comment) and E57 (the
-scan's name) say too. LAS and PCD keep sigma and view count as fields of their own; E57 has no place for them.
+scan's name) also state. LAS and PCD store sigma and view count in fields of their own; E57 can't store them.
 """
 
 from __future__ import annotations
@@ -22,12 +22,11 @@ _LAS_STEP_M = 1e-4
 
 
 def export(folder: Path, target: Path) -> int:
-    """Write `target` from the files of a measured folder; the points written (0 for a raster or a copy).
+    """Write `target` from the files of a measured folder; return the points written (0 for raster or copy).
 
     .ply and .tif are the folder's own files, .csv needs nothing else, the others the extra `export`. Raises
-    ConfigError for another suffix or without the extra, InputError where the folder lacks the file,
-    or has
-    a file that was changed, OutputError where `target` can't be written.
+    ConfigError for another suffix or without the extra, InputError if the folder's file is missing or was
+    changed, OutputError if `target` can't be written.
     """
     frame_id = ""
     if (folder / "result.json").is_file():
@@ -52,7 +51,7 @@ def export(folder: Path, target: Path) -> int:
             raise InputError(folder / "cloud.ply", f"doesn't fit a {kind} file ({error})", REMEDY) from error
         except (OSError, BarsightError):
             raise
-        except Exception as error:  # the libraries' own, where the system refuses to write
+        except Exception as error:  # errors of the libraries, if the system refuses to write
             reason = str(error).strip().partition("\n")[0][:200]
             raise OutputError(f"{target}: could not be written whole ({reason}); free some space") from error
     return cloud.total
@@ -70,7 +69,7 @@ def _write_las(cloud: Cloud, path: Path, frame_id: str, *, compress: bool) -> No
     header.offsets = np.floor(cloud.xyz_m.min(axis=0)).astype(np.float64)
     las = laspy.LasData(header)
     las.x, las.y, las.z = cloud.xyz_m.T.astype(np.float64)
-    # LAS wants the full range of 16 bits.
+    # LAS requires the full range of 16 bits.
     las.intensity = (cloud.intensity * 257).astype(np.uint16)
     las.sigma_z = cloud.sigma_m
     las.views = cloud.views.astype(np.uint16)
@@ -98,7 +97,7 @@ def _write_e57(cloud: Cloud, path: Path, frame_id: str) -> None:
         file.write_scan_raw(values, name=frame_id or None)
         file.close()
     except BaseException:
-        file.close = lambda: None  # its destructor would fail again and print it
+        file.close = lambda: None  # its destructor would fail again and print the error
         raise
 
 

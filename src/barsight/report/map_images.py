@@ -1,4 +1,4 @@
-"""Render the height map as pictures: read tile by tile, downsampled, coloured, ready for the page's SVG."""
+"""Render the height map as pictures: read tile by tile, downsampled and coloured for the page's SVG."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LONGEST_PX = 2400
 MAX_PIXELS = 3_000_000
 MAX_STRIPS = 12
 FOLD_ASPECT = 7.0
-"""A map longer than this many times its breadth is folded into strips below each other."""
+"""Ratio of length to width above which a map is folded into strips below each other."""
 
 Codes = dict[int, tuple[int, int, int]]
 SOURCE_RGB: Codes = {
@@ -31,16 +31,18 @@ SOURCE_RGB: Codes = {
 }
 FILLED_TINT_RGB = (255, 90, 160)
 _BAND_ROWS, _SHADE_REACH_PX = 128, 8
-"""Rows that are painted at once; the hillshade of a pixel rests on none further off."""
+"""Number of rows painted at a time, and margin of neighbouring pixels that the hillshade needs."""
 _SLOPE_NOISE = 0.25
-"""RMS slope of floors over sigma by pixel: 0.17 to 0.25 on four maps. Most of sigma is alike nearby."""
+"""RMS slope of floors over sigma per pixel: 0.17 to 0.25 on four maps. Most of sigma is common to
+neighbours.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Raster:
-    """height.tif made smaller: row 0 at the highest y, each pixel the mean of step x step cells.
+    """Downsampled height.tif: row 0 at the highest y, each pixel the mean of step x step cells.
 
-    z_m, sigma_m, views: (H, W) float32, NaN where no cell knows it. source: (H, W) uint8, the commonest code
+    z_m, sigma_m, views: (H, W) float32, NaN if no cell is known. source: (H, W) uint8, the most frequent code
     of the known cells. cell_m: side of a pixel; (left_m, top_m): the outer corner of pixel (0, 0).
     """
 
@@ -56,7 +58,7 @@ class Raster:
 
 @dataclass(frozen=True)
 class Strip:
-    """A piece of a map: the picture as a data URI and the rectangle that it covers (m)."""
+    """A strip of a map: the picture as a data URI and the rectangle that it covers (m)."""
 
     image: str
     x_min_m: float
@@ -66,7 +68,7 @@ class Strip:
 
 
 def strip_count(width: int, height: int) -> int:
-    """Choose into how many strips along X a map of this shape is folded."""
+    """Choose the number of strips along X into which a map of this shape is folded."""
     aspect = width / max(height, 1)
     return 1 if aspect <= FOLD_ASPECT else min(MAX_STRIPS, int(np.ceil(aspect / (FOLD_ASPECT - 1))))
 
@@ -74,7 +76,7 @@ def strip_count(width: int, height: int) -> int:
 def read_raster(path: Path) -> Raster:
     """Read height.tif tile by tile: memory holds the small map and a few tiles, whatever its size.
 
-    Raises InputError where the file is torn or is not a map of four bands.
+    Raises InputError if the file is damaged or is not a map of four bands.
     """
     with open_geotiff(path, HEIGHT_BANDS) as file:
         return _reduce(file)
@@ -122,13 +124,13 @@ def _pool(values: NDArray[np.generic], into: NDArray[np.generic], row: int, colu
 
 
 def _block_starts(first: int, count: int, step: int) -> NDArray[np.int64]:
-    """Find where in a run of cells, the first of which is `first`, new blocks begin."""
+    """Find where new blocks begin in a run of cells that starts at `first`."""
     boundaries = np.arange((first // step + 1) * step, first + count, step) - first
     return np.concatenate([[0], boundaries]).astype(np.int64)
 
 
 def colours(values: Float32, low: float, high: float, scale: int) -> UInt8:
-    """Colour to RGB (H, W, 3) on one of OpenCV's uniform colour scales; NaN gets the lowest colour."""
+    """Convert values to RGB (H, W, 3) on one of OpenCV's uniform colour scales; NaN gets the lowest one."""
     share = np.clip((np.nan_to_num(values, nan=low) - low) / max(high - low, 1e-9), 0, 1)
     painted = cv2.applyColorMap(np.round(share * 255).astype(np.uint8), scale)
     return np.asarray(painted[..., ::-1], dtype=np.uint8)
@@ -141,10 +143,10 @@ def gradient_stops(scale: int, count: int = 9) -> tuple[str, ...]:
 
 
 def hillshade(z_m: Float32, cell_m: float, sigma_m: Float32 | float = 0.0) -> Float32:
-    """Shade (H, W) by a lamp in the north-west at 45 degrees, 1 on a flat floor [Horn 1981]; NaN is flat.
+    """Shade (H, W) by a light in the north-west at 45 degrees, 1 on a flat floor [Horn 1981]; NaN is flat.
 
-    Of a slope s with noise n = _SLOPE_NOISE sigma_m / cell_m, s^2 / (s^2 + n^2) of it counts [Wiener 1949];
-    all of it where sigma isn't known.
+    A slope s with noise n = _SLOPE_NOISE sigma_m / cell_m is weighted by s^2 / (s^2 + n^2) [Wiener 1949]; it
+    is used in full if sigma is unknown.
     """
     known = np.isfinite(z_m)
     weight = cv2.GaussianBlur(known.astype(np.float32), (0, 0), 1.0)
@@ -162,9 +164,7 @@ def hillshade(z_m: Float32, cell_m: float, sigma_m: Float32 | float = 0.0) -> Fl
 
 
 def paint_height(raster: Raster, low_m: float, high_m: float) -> UInt8:
-    """Paint (H, W, 4): colour by height, darkened and lightened by the hillshade; filled cells
-    tinted pink.
-    """
+    """Paint (H, W, 4): colour by height, brightness by the hillshade; filled cells are tinted pink."""
     height, width = raster.z_m.shape
     painted = np.empty((height, width, 4), np.uint8)
     for first in range(0, height, _BAND_ROWS):
@@ -177,7 +177,7 @@ def paint_height(raster: Raster, low_m: float, high_m: float) -> UInt8:
 
 
 def _paint_shaded(z_m: Float32, light: Float32, source: UInt8, low_m: float, high_m: float) -> UInt8:
-    """Paint (H, W, 4) in the light of the hillshade (H, W)."""
+    """Paint (H, W, 4) with the given hillshade (H, W)."""
     base = colours(z_m, low_m, high_m, cv2.COLORMAP_VIRIDIS).astype(np.float32)
     light = np.clip(light, 0.0, 1.4)[..., None]
     shaded = np.where(light < 1, base * (0.35 + 0.65 * light), base + (255 - base) * (light - 1) * 0.9)
@@ -187,12 +187,12 @@ def _paint_shaded(z_m: Float32, light: Float32, source: UInt8, low_m: float, hig
 
 
 def paint_scale(values: Float32, low: float, high: float, scale: int) -> UInt8:
-    """Paint (H, W, 4) by a plain colour scale, transparent where NaN."""
+    """Paint (H, W, 4) with a plain colour scale, transparent for NaN."""
     return _with_alpha(colours(values, low, high, scale), np.isfinite(values))
 
 
 def paint_source(source: UInt8) -> UInt8:
-    """Paint (H, W, 4): a colour per code, transparent where unknown."""
+    """Paint (H, W, 4): a colour for each source code, transparent if unknown."""
     picture = np.zeros((*source.shape, 3), np.uint8)
     for code, rgb in SOURCE_RGB.items():
         picture[source == code] = rgb
@@ -233,9 +233,9 @@ def data_uri(rgba: UInt8, *, lossless: bool) -> str:
 
 
 def preview_uri(path: Path) -> str:
-    """Encode preview.png, packed smaller, as a data URI; empty where there is none.
+    """Encode preview.png as a smaller data URI; empty if there is none.
 
-    InputError where it is torn or too large.
+    Raises InputError if it is damaged or too large.
     """
     if not path.is_file():
         return ""
@@ -249,7 +249,7 @@ def preview_uri(path: Path) -> str:
 
 
 def robust_range(values: Float32 | Float64, low_pct: float, high_pct: float) -> tuple[float, float]:
-    """Compute percentiles of the finite values; (0, 1) where there are none, never an empty range."""
+    """Compute percentiles of the finite values; (0, 1) if there are none, and never an empty range."""
     known = values[np.isfinite(values)]
     if known.size == 0:
         return 0.0, 1.0

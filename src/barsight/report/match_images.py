@@ -1,4 +1,4 @@
-"""Draw matches on pictures as in the paper's figures 5, 8 and 9: features, raw against filtered, guided."""
+"""Draw matches on pictures as in the paper's figures 5, 8 and 9: features, raw and filtered, guided."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ ZOOM = 4
 CROP_PX = (200, 320)
 GREEN, RED, ORANGE, BLUE = (57, 211, 83), (255, 90, 79), (242, 177, 52), (96, 190, 255)
 SHIFT = 4
-"""OpenCV draws at fractions of a pixel in 16ths."""
+"""Number of fractional bits of OpenCV's drawing coordinates: 16ths of a pixel."""
 
 
 def draw_matches(example: MatchingExample) -> tuple[Picture, ...]:
-    """Draw features, raw and filtered matches, guided matches whole and enlarged."""
+    """Draw features, raw and filtered matches, guided matches in full and enlarged."""
     scale = min(1.0, LONGEST_PX / max(example.old.shape))
     wrong = ~example.filtered
     agreed, lost = example.agreed, ~example.agreed & np.isfinite(example.found).all(axis=1)
@@ -97,7 +97,7 @@ def _guided(example: MatchingExample, scale: float, corner: tuple[int, int], sha
 
 
 def _enlarged(example: MatchingExample) -> str:
-    """Find the window of the new picture that holds the most agreed points."""
+    """Find the window of the new picture with the most agreed points."""
     shown = example.found[example.agreed]
     best, most = (0, 0), -1
     height, width = CROP_PX
@@ -110,7 +110,7 @@ def _enlarged(example: MatchingExample) -> str:
 
 
 def canvas_of(image: UInt8, scale: float) -> UInt8:
-    """Stretch a gray picture (H, W) in brightness to (h, w, 3), a little darkened so that lines show."""
+    """Stretch the contrast of a gray picture (H, W) to (h, w, 3), slightly darkened to show lines."""
     low, high = np.percentile(image, (1, 99.5))
     light = np.clip((image - low) * (215 / max(high - low, 1.0)), 0, 230).astype(np.uint8)
     way = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC

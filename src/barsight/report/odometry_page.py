@@ -1,4 +1,4 @@
-"""Write the page of `barsight odometry`: path, velocity, biases, residuals, drift, matches; and its JSON."""
+"""Write page and JSON of `barsight odometry`: path, velocity, biases, residuals, drift, matches."""
 
 from __future__ import annotations
 
@@ -30,8 +30,9 @@ AXES = "xyz"
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class OdometryResult:
-    """Content of the page. frames: of the recording. example: a pair's matches, or why there are none.
-    drift, errors: None without truth.
+    """Content of the page. frames: number in the recording. example: a pair's matches, or why there are none.
+
+    drift, errors: None without ground truth.
     """
 
     source: str
@@ -43,7 +44,7 @@ class OdometryResult:
 
 
 def write_odometry_page(result: OdometryResult, html: Path, data: Path) -> None:
-    """Write the page to `html` and its numbers to `data`, each whole or not at all."""
+    """Write the page to `html` and its numbers to `data`, each completely or not at all."""
     pictures = () if isinstance(result.example, Failed) else draw_matches(result.example)
     summary = odometry_summary(result)
     plots = [*_path(result.trajectory), *_states(result), *_in_sigmas(result), *_sigma(result)]
@@ -53,7 +54,7 @@ def write_odometry_page(result: OdometryResult, html: Path, data: Path) -> None:
 
 
 def odometry_summary(result: OdometryResult) -> dict[str, Any]:
-    """Collect everything of the page as JSON values; NaN is null."""
+    """Collect all data of the page as JSON values; NaN is null."""
     trajectory, detail = result.trajectory, result.trajectory.detail
     frames: list[dict[str, Any]] = [
         {
@@ -143,7 +144,7 @@ def _path(trajectory: Trajectory) -> tuple[Plot, ...]:
 
 
 def _states(result: OdometryResult) -> list[Plot]:
-    """Draw velocity and biases with two sigma to either side."""
+    """Draw velocity and biases with a band of two sigma to either side."""
     detail = result.trajectory.detail
     if detail is None or detail.inertial is None:
         return []
@@ -185,7 +186,7 @@ def _in_sigmas(result: OdometryResult) -> list[Plot]:
 
 
 def _innovations(part: NormalisedResiduals, trajectory: Trajectory) -> Plot:
-    """Draw innovations with the band in which 99.7 % lie where the prediction's sigma is right."""
+    """Draw innovations with the band that holds 99.7 % of them if the predicted sigma is right."""
     time = _seconds(part.stamp_ns, trajectory)
     traces = [_line(label, time, part.values[:, k], k) for k, label in enumerate(part.names)]
     for side in (-3.0, 3.0):
@@ -208,7 +209,7 @@ def _sensor(name: str, part: NormalisedResiduals, caption: str, trajectory: Traj
 
 
 def _sigma(result: OdometryResult) -> list[Plot]:
-    """Draw the stated sigma of every frame, and where there is truth the errors."""
+    """Draw the stated sigma of every frame, and the errors if there is ground truth."""
     trajectory = result.trajectory
     time, sigma = _seconds(trajectory.stamp_ns, trajectory), _sigmas(trajectory)
     plots = []
@@ -241,7 +242,7 @@ def _rig_drift(trajectory: Trajectory) -> dict[str, float] | None:
 
 
 def _sigmas(trajectory: Trajectory) -> Float64:
-    """Compute sigmas (F, 6) of attitude (rad) and place (m)."""
+    """Compute sigmas (F, 6) of attitude (rad) and position (m)."""
     variances = np.array([np.diag(frame.covariance) for frame in trajectory.frames])
     return np.asarray(np.sqrt(variances), np.float64)
 

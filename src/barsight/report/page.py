@@ -29,12 +29,12 @@ TRUTH_HEADS = {
     "mae_mm": "MAE / mm", "p95_mm": "P95 / mm", "max_mm": "max / mm",
     "within_95_pct": "within the stated 95 % / %",
 }  # fmt: skip
-"""Figures against the truth, in words."""
+"""Quantities compared with the ground truth, with their column headings."""
 
 
 @dataclass(frozen=True)
 class KeyFigure:
-    """A key figure of the first lines: what it is, its value with unit, and a note in small print."""
+    """A key figure at the top of the page: name, value with unit, and a note in small print."""
 
     label: str
     value: str
@@ -43,14 +43,14 @@ class KeyFigure:
 
 @dataclass(frozen=True, eq=False)
 class PagePictures:
-    """Pictures of the height map, and those that bundles and lifts are drawn on; none without height.tif."""
+    """Pictures of the height map, and those for bundles and lifts; none without height.tif."""
 
     maps: tuple[MapFigure, ...] = ()
     yard: tuple[MapFigure, ...] = ()
 
 
 def draw_pictures(out_dir: Path) -> PagePictures:
-    """Draw what of the page doesn't depend on the lifts and takes longest. Raises InputError as
+    """Draw the parts of the page that don't depend on the lifts and take longest. Raises InputError like
     `write_report`.
     """
     height = out_dir / "height.tif"
@@ -63,15 +63,15 @@ def draw_pictures(out_dir: Path) -> PagePictures:
 
 
 def write_report(out_dir: Path, target: Path, pictures: PagePictures | None = None) -> None:
-    """Write the page of the folder `out_dir` to `target`, whole or not at all.
+    """Write the page of the folder `out_dir` to `target`, completely or not at all.
 
-    pictures: those of the folder, where they are drawn already. result.json must be there; a section whose
-    file is missing says so in a sentence. Raises InputError for a missing or torn file, OutputError where
-    `target` can't be written.
+    pictures: those of the folder, if already drawn. result.json is required; a section whose file is missing
+    says so in a sentence. Raises InputError for a missing or damaged file, OutputError if `target` can't be
+    written.
     """
     page = render_page(out_dir, pictures)
     with atomic_path(target) as path:
-        # A path may hold bytes that are no text; the page shows a question mark there.
+        # A path may contain bytes that aren't text; the page shows a question mark for them.
         path.write_text(page, encoding="utf-8", errors="replace")
 
 
@@ -84,8 +84,10 @@ def write_summary_page(
     data: Path,
     pictures: Sequence[Picture] = (),
 ) -> None:
-    """Write a page of key figures and plots to `html`, and its summary as JSON to `data`, both whole or
-    neither. The template finds the plots in `plots`, by name, and the pictures in `pictures`."""
+    """Write a page of key figures and plots to `html`, and its summary as JSON to `data`, both or neither.
+
+    The template finds the plots in `plots`, by name, and the pictures in `pictures`.
+    """
     page = environment().get_template(template).render(
         summary=summary, figures=figures, plots={plot.name: plot for plot in plots},
         plot_data=plot_json(plots), plotly_js=get_plotlyjs(), css=resource("page.css"),
@@ -133,7 +135,7 @@ def render_page(out_dir: Path, pictures: PagePictures | None = None) -> str:
 
 
 def _filled(out_dir: Path, **content: Any) -> str:
-    """Fill the page. Raises InputError where result.json lacks something of it."""
+    """Fill in the page. Raises InputError if result.json lacks required content."""
     try:
         return environment().get_template("page.html.jinja").render(**content)
     except jinja2.UndefinedError as error:
@@ -144,7 +146,7 @@ def _filled(out_dir: Path, **content: Any) -> str:
 
 
 def key_figures(result: dict[str, Any]) -> list[KeyFigure]:
-    """Select the figures that an operator looks at first."""
+    """Select the figures that an operator needs first."""
     frames = result.get("frames") or {}
     trajectory = result.get("trajectory") or {}
     surface = result.get("map") or {}
@@ -189,9 +191,7 @@ def key_figures(result: dict[str, Any]) -> list[KeyFigure]:
 
 
 def format_number(value: Any, decimals: int = 1, unit: str = "") -> str:
-    """Format a number for people, with a narrow space per thousand and the unit; a dash where there
-    is none.
-    """
+    """Format a number for people, with narrow spaces between thousands and the unit; a dash for none."""
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
         return NONE
     text = f"{value:,.{decimals}f}".replace(",", "\u202f").replace("-", "−")
@@ -215,7 +215,7 @@ def flatten(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]
 
 
 def _truth_table(truth: dict[str, dict[str, float]]) -> dict[str, Any]:
-    """Arrange the figures against the truth: a row for each kind of place, a column for each figure."""
+    """Arrange the comparison with the truth: a row for each kind of place, a column for each quantity."""
     kept = {key: head for key, head in TRUTH_HEADS.items() if any(key in row for row in truth.values())}
     rows = [
         (place, [format_number(figures.get(key), int(key != "samples")) for key in kept])
@@ -225,7 +225,7 @@ def _truth_table(truth: dict[str, dict[str, float]]) -> dict[str, Any]:
 
 
 def _stages(result: dict[str, Any]) -> list[dict[str, Any]]:
-    """List the stages with their part of the whole time (%) and, where done by frame, seconds per frame."""
+    """List the stages with their share of the total time (%) and, for stages by frame, seconds per frame."""
     stages = result.get("stages") or []
     whole = sum(stage.get("seconds") or 0.0 for stage in stages)
     rows = []
@@ -247,15 +247,13 @@ def _refused_by_stage(result: dict[str, Any]) -> dict[str, int]:
 
 
 def plot_json(plots: list[Plot]) -> str:
-    """Serialise all figures for the script; `<` is escaped so that no text can end the element that carries
-    it.
-    """
+    """Serialize all figures for the script; `<` is escaped so that no text can end the enclosing element."""
     figures = {plot.name: {"data": plot.traces, "layout": plot.layout} for plot in plots}
     return json.dumps(figures, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
 
 
 def environment() -> jinja2.Environment:
-    """Make the templates' environment: escaping, the package's own files, numbers for people."""
+    """Make the environment of the templates: escaping, the package's own files, number formats."""
     environment = jinja2.Environment(
         loader=jinja2.FunctionLoader(resource),
         autoescape=True,

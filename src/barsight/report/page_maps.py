@@ -26,12 +26,12 @@ from barsight.report.map_images import (
 WIDTH = 1000.0
 TALLEST = 680.0
 LARGE_TEXT, SMALL_MAP_TEXT = 13.0, 32.0
-"""Sizes of the lettering in drawing units; the three smaller maps are shown at a third of the size."""
+"""Font sizes in drawing units; the three smaller maps are shown at a third of the size."""
 
 
 @dataclass(frozen=True)
 class Tick:
-    """A mark on an axis: its place in the drawing and its label."""
+    """A tick on an axis: its position in the drawing and its label."""
 
     place: float
     label: str
@@ -39,7 +39,7 @@ class Tick:
 
 @dataclass(frozen=True)
 class MapLine:
-    """A dashed line across the map, a laser profile."""
+    """A dashed line across the map, for a laser profile."""
 
     place: float
     label: str
@@ -47,7 +47,7 @@ class MapLine:
 
 @dataclass(frozen=True)
 class Shape:
-    """A line over a map, in m or in the drawing's units, with a label at its middle where there is one."""
+    """A line over a map, in m or in drawing units, with an optional label at its middle."""
 
     points: tuple[tuple[float, float], ...]
     colour: str
@@ -57,12 +57,12 @@ class Shape:
 
     @property
     def path(self) -> str:
-        """Format the points as SVG wants them."""
+        """Format the points as an SVG path."""
         return " ".join(f"{x:.1f},{y:.1f}" for x, y in self.points)
 
     @property
     def middle(self) -> tuple[float, float]:
-        """Return the label's place."""
+        """Return the label's position."""
         low, high = np.min(self.points, axis=0), np.max(self.points, axis=0)
         return float((low[0] + high[0]) / 2), float((low[1] + high[1]) / 2)
 
@@ -88,7 +88,7 @@ class Drawing:
 
 @dataclass(frozen=True)
 class ColourBar:
-    """CSS colours from low to high with labels at even distances."""
+    """CSS colours from low to high with labels at equal distances."""
 
     stops: tuple[str, ...]
     labels: tuple[str, ...]
@@ -97,7 +97,7 @@ class ColourBar:
 
 @dataclass(frozen=True)
 class Key:
-    """A colour that stands for a kind of cell; without a colour it is the hatch of the unknown."""
+    """A legend entry: the colour of a kind of cell, or no colour for the hatch of unknown cells."""
 
     label: str
     colour: str = ""
@@ -105,7 +105,7 @@ class Key:
 
 @dataclass(frozen=True)
 class MapFigure:
-    """A map with all that is drawn around it."""
+    """A map with everything drawn around it."""
 
     name: str
     title: str
@@ -174,7 +174,7 @@ def draw_map(
 ) -> tuple[Drawing, ...]:
     """Draw a picture in strips with axes around them.
 
-    levels: label and y (m) of lines across; text: its size.
+    levels: label and y (m) of lines across; text: font size.
     """
     strips = cut_strips(picture, raster, lossless=lossless)
     widest = max(strip.x_max_m - strip.x_min_m for strip in strips)

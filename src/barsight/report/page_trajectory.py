@@ -17,7 +17,7 @@ MIN_SPAN_DEG = 0.2
 
 
 def path_plots(path: CameraPath, reference: str) -> tuple[Plot, ...]:
-    """Plot from above, and over time. Empty where the path has no pose."""
+    """Plot the trajectory from above, and over time. Empty if the path has no pose."""
     if path.stamp_ns.size == 0:
         return ()
     step = -(-path.stamp_ns.size // MAX_POINTS)
@@ -91,9 +91,9 @@ def _over_time(path: CameraPath, reference: str, note: str) -> Plot:
 
 
 def turned_since_start_deg(path: CameraPath) -> Float64:
-    """Compute rotation vectors (N, 3) from the first attitude to each, reference axes, degrees.
+    """Compute rotation vectors (N, 3) from the first attitude to each one, reference axes, degrees.
 
-    A rotation has many vectors, 360 degrees apart; each is the one nearest to the one before it.
+    Rotation vectors are ambiguous by 360 degrees; each is the one nearest to its predecessor.
     """
     attitude = Rotation.from_quat(path.quaternion_xyzw)
     vectors = (attitude * attitude[0].inv()).as_rotvec()
@@ -119,7 +119,7 @@ def _mark(name: str, x: float, y: float, colour: str) -> Trace:
 
 
 def _range(values: Float64, min_span: float) -> list[float]:
-    """Choose a range that holds all values and doesn't blow noise up to the panel's height."""
+    """Choose a range that includes all values and doesn't magnify noise to the panel's height."""
     low, high = float(values.min()), float(values.max())
     half = max((high - low) * 0.55, min_span / 2)
     return [(low + high) / 2 - half, (low + high) / 2 + half]

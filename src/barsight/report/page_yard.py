@@ -25,7 +25,7 @@ FREE_RGB, COVERED_RGB, LIFT_RGB = "#39d353", "#f2b134", "#ff2fb3"
 
 @dataclass(frozen=True)
 class YardPart:
-    """Part of the page on bundles and lifts. lifts: lifts.json, None where there is none."""
+    """Part of the page on bundles and lifts. lifts: content of lifts.json, None if there is none."""
 
     figures: tuple[MapFigure, ...]
     bundles: tuple[Bundle, ...]
@@ -33,8 +33,8 @@ class YardPart:
 
 
 def yard_pictures(out_dir: Path, raster: Raster) -> tuple[MapFigure, ...]:
-    """Draw the orthophoto, where there is one, and the height map, as yet without bundles and lifts; none
-    where the folder has no bundles.json.
+    """Draw the orthophoto, if there is one, and the height map, without bundles and lifts; none if the folder
+    has no bundles.json.
     """
     if not (out_dir / "bundles.json").is_file():
         return ()
@@ -58,7 +58,7 @@ def yard_pictures(out_dir: Path, raster: Raster) -> tuple[MapFigure, ...]:
 
 
 def yard_part(out_dir: Path, pictures: tuple[MapFigure, ...]) -> YardPart | None:
-    """Collect bundles and lifts and draw them on the pictures; None where the folder has no bundles.json."""
+    """Collect bundles and lifts and draw them on the pictures; None if the folder has no bundles.json."""
     if not (out_dir / "bundles.json").is_file():
         return None
     bundles = read_bundles(out_dir / "bundles.json")
@@ -99,7 +99,7 @@ def _with(drawing: Drawing, shapes: tuple[Shape, ...]) -> Drawing:
 
 
 def bundle_shapes(bundles: tuple[Bundle, ...]) -> tuple[Shape, ...]:
-    """Draw outline and axis of each bundle, in m; open ends dashed."""
+    """Draw outline and axis of each bundle, in m; open ends are dashed."""
     shapes = []
     for bundle in bundles:
         colour = FREE_RGB if bundle.is_free else COVERED_RGB
@@ -142,7 +142,7 @@ def pole_corners(
 def rectangle(
     centre: Float64, yaw_rad: float, width: float, length: float
 ) -> tuple[tuple[float, float], ...]:
-    """Compute corners: low-y end from low to high side, then the high-y end back."""
+    """Compute the corners: of the low-y end from the low to the high side, then of the high-y end back."""
     across = width / 2 * np.array([np.cos(yaw_rad), np.sin(yaw_rad)])
     along = length / 2 * np.array([-np.sin(yaw_rad), np.cos(yaw_rad)])
     corners = (centre - along - across, centre - along + across, centre + along + across,

@@ -24,7 +24,7 @@ Trace = dict[str, Any]
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture for the page: `name` is its id, uri its data, alt says what it shows."""
+    """A picture for the page: `name` is its id, `uri` its data, `alt` its description."""
 
     name: str
     title: str
@@ -34,7 +34,7 @@ class Picture:
 
 @dataclass(frozen=True, eq=False)
 class Plot:
-    """One figure: `name` is its id on the page, `height_px` its height, `caption` says how to read it."""
+    """A figure: `name` is its id on the page, `height_px` its height, `caption` explains how to read it."""
 
     name: str
     traces: list[Trace]
@@ -45,7 +45,7 @@ class Plot:
 
 @dataclass(frozen=True, eq=False)
 class ComparedContour:
-    """A contour, the laser profile beside it where there is one, and vision minus laser at its points (m)."""
+    """A contour, the laser profile beside it if there is one, and vision minus laser at its points (m)."""
 
     contour: Contour
     laser: LaserProfile | None
@@ -66,12 +66,12 @@ def pair_with_laser(
 
 
 def json_numbers(values: Float64, decimals: int) -> list[float | None]:
-    """Round for the page; None, which breaks a line, where not finite."""
+    """Round for the page; a value that isn't finite becomes None, which interrupts a line."""
     return [float(v) if np.isfinite(v) else None for v in np.round(values, decimals)]
 
 
 def keep_extremes(values: Float64, max_count: int) -> Int64:
-    """Thin to at most `max_count` samples that draw the same line: the lowest and the highest of each bin."""
+    """Thin to at most `max_count` samples that draw the same line: the minimum and maximum of each bin."""
     count = values.size
     if count <= max_count:
         return np.arange(count)
@@ -87,9 +87,7 @@ def keep_extremes(values: Float64, max_count: int) -> Int64:
 
 
 def contour_plot(compared: ComparedContour) -> Plot:
-    """Plot heights along X with their band over the laser's; below it the difference, where there
-    is a laser.
-    """
+    """Plot heights along X with their band and the laser's; below, the difference if there is a laser."""
     contour, laser = compared.contour, compared.laser
     kept = keep_extremes(contour.z_m, MAX_POINTS)
     x, z, sigma = contour.x_m[kept], contour.z_m[kept] * 1e3, contour.sigma_m[kept] * 1e3
@@ -134,7 +132,7 @@ def contour_plot(compared: ComparedContour) -> Plot:
 
 
 def histogram_plot(compared: tuple[ComparedContour, ...]) -> Plot | None:
-    """Plot how often each difference occurs, a step line per profile; None without a difference."""
+    """Plot the frequency of differences, a step line per profile; None without a difference."""
     errors = {c.contour.profile: c.error_m[np.isfinite(c.error_m)] * 1e3 for c in compared}
     together = np.abs(np.concatenate([*errors.values(), np.empty(0)]))
     if together.size == 0:
@@ -159,7 +157,7 @@ def histogram_plot(compared: tuple[ComparedContour, ...]) -> Plot | None:
 
 
 def limits_plot(compared: tuple[ComparedContour, ...], agreement: list[dict[str, Any]]) -> Plot | None:
-    """Plot difference over mean height, bias, 95 % limits of agreement [Bland 1986]; None without a laser."""
+    """Plot difference over mean height, bias, 95 % limits of agreement [Bland 1986]; None without laser."""
     traces: list[Trace] = []
     shapes: list[dict[str, Any]] = []
     rows = {row.get("profile"): row for row in agreement}
@@ -193,12 +191,12 @@ def limits_plot(compared: tuple[ComparedContour, ...], agreement: list[dict[str,
 
 
 def _reach(sizes: Float64) -> float:
-    """Estimate where the bulk of the sizes ends: almost four sigma of a normal distribution, robust."""
+    """Estimate the extent of most sizes: almost four sigma of a normal distribution, robust."""
     return 3 * float(np.percentile(sizes, 80)) if sizes.size else 0.0
 
 
 def _band(x: Float64, z: Float64, half: Float64) -> Trace:
-    """Draw the band as one closed polygon per run of known samples, so that gaps stay open."""
+    """Draw the band as one closed polygon for each run of known samples, so that gaps stay open."""
     known = np.isfinite(z) & np.isfinite(half)
     steps = np.diff(np.concatenate([[0], known.astype(np.int8), [0]]))
     gap = np.array([np.nan])

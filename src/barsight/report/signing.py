@@ -1,4 +1,4 @@
-"""Sign files with an Ed25519 key, for openssl and others to verify."""
+"""Sign files with an Ed25519 key, so that openssl and others can verify them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def sign_file(path: Path, key: Path) -> Path:
     """Write the signature (64 bytes) of a file beside it, `NAME.sig`. key: a PEM file without a password.
 
     `openssl pkeyutl -verify -pubin -inkey public.pem -rawin -in NAME -sigfile NAME.sig` verifies it.
-    Raises InputError where the key can't be used.
+    Raises InputError if the key can't be used.
     """
     with extra("signing"):
         from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey

@@ -1,6 +1,4 @@
-"""Write the page of a camera-IMU calibration: verdicts, mountings, residuals over time; and the
-same as JSON.
-"""
+"""Write the page and JSON of a camera-IMU calibration: verdicts, mountings, residuals over time."""
 
 from __future__ import annotations
 
@@ -23,7 +21,7 @@ SENSORS = ("pictures", "gyro", "accel")
 
 
 def camera_imu_summary(calibration: CameraImuCalibration, assessment: CameraImuAssessment) -> dict[str, Any]:
-    """Collect everything of the report as JSON values."""
+    """Collect all data of the report as JSON values."""
     problem, state = calibration.problem, calibration.solution.state
     sigma = calibration.sigma
     return {
@@ -74,7 +72,7 @@ def camera_imu_summary(calibration: CameraImuCalibration, assessment: CameraImuA
 
 
 def _parameters(calibration: CameraImuCalibration, assessment: CameraImuAssessment) -> dict[str, Any]:
-    """Collect the parameters with their sigmas, how well they are determined, and what two halves give."""
+    """Collect the parameters with sigmas and observability, and the estimates from each half of the data."""
     known, halves = calibration.uncertainty, assessment.halves
     names = calibration.problem.parameter_names
     values = np.zeros(len(names))
@@ -104,7 +102,7 @@ def _parameters(calibration: CameraImuCalibration, assessment: CameraImuAssessme
 def write_camera_imu_report(
     calibration: CameraImuCalibration, assessment: CameraImuAssessment, html: Path, data: Path
 ) -> None:
-    """Write the page to `html` and its numbers to `data`, each whole or not at all."""
+    """Write the page to `html` and its numbers to `data`, each completely or not at all."""
     summary = camera_imu_summary(calibration, assessment)
     write_summary_page(
         "camera_imu_page.html.jinja", summary, _figures(summary), camera_imu_plots(calibration), html, data

@@ -1,4 +1,4 @@
-"""Write the page of an IMU's noise: Allan deviations with their fits, and the same as JSON."""
+"""Write the page and JSON of an IMU's noise: Allan deviations with their fits."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ UNITS = {"gyro": "rad/s", "accel": "m/s²"}
 
 
 def imu_noise_summary(fit: ImuNoiseFit, source: str, notes: tuple[str, ...]) -> dict[str, Any]:
-    """Collect everything of the report as JSON values; SI units."""
+    """Collect all data of the report as JSON values in SI units."""
     keys = ("density", "walk", "instability")
     return {
         "schema": 1,
@@ -39,7 +39,7 @@ def imu_noise_summary(fit: ImuNoiseFit, source: str, notes: tuple[str, ...]) -> 
 def write_imu_noise_report(
     fit: ImuNoiseFit, source: str, notes: tuple[str, ...], html: Path, data: Path
 ) -> None:
-    """Write the page to `html` and its numbers to `data`, each whole or not at all."""
+    """Write the page to `html` and its numbers to `data`, each completely or not at all."""
     summary = imu_noise_summary(fit, source, notes)
     plots = [_allan_plot("gyro", fit.axes[:3]), _allan_plot("accel", fit.axes[3:])]
     noise = fit.noise

@@ -1,6 +1,4 @@
-"""Write the page of a check for drift: every line with its cost, the rows over the picture, depth against
-range.
-"""
+"""Write the page of a drift check: each result with its cost, row errors over the picture, depth by range."""
 
 from __future__ import annotations
 
@@ -19,11 +17,11 @@ from barsight.report.page import KeyFigure, format_number, write_summary_page
 from barsight.report.plots import BAND_SIGMAS, Plot, json_numbers
 
 FARTHEST = 2.0
-"""Times the working range that the plot of depth shows."""
+"""Largest range in the depth plot, as a multiple of the working range."""
 
 
 def rig_check_summary(check: RigCheck, source: str) -> dict[str, Any]:
-    """Collect everything of the report as JSON values: angles in degrees, ratios in %, costs in mm."""
+    """Collect all data of the report as JSON values: angles in degrees, ratios in %, costs in mm."""
     return {
         "schema": 1,
         "software": {"name": "barsight", "version": barsight.__version__},
@@ -35,7 +33,7 @@ def rig_check_summary(check: RigCheck, source: str) -> dict[str, Any]:
 
 
 def write_rig_check_report(check: RigCheck, source: str, html: Path, data: Path) -> None:
-    """Write the page to `html` and its numbers to `data`, each whole or not at all."""
+    """Write the page to `html` and its numbers to `data`, each completely or not at all."""
     rows, summary = check.rows, rig_check_summary(check, source)
     figures = [KeyFigure("State", check.state)]
     if not isinstance(rows, Failed):
@@ -59,7 +57,7 @@ def write_rig_check_report(check: RigCheck, source: str, html: Path, data: Path)
 
 
 def _rows_plot(rows: RowDrift, left: bool) -> Plot:
-    """Plot row errors of matches over the picture: as seen, or what the fitted drift leaves."""
+    """Plot row errors of matches over the picture, as measured or after the fitted drift is removed."""
     values = rows.left_px if left else rows.seen_px
     reach = float(np.nanmax(np.abs(rows.seen_px)))
     trace = {

@@ -1,6 +1,4 @@
-"""Write the page of a stereo calibration: verdicts, residuals, coverage, uncertainty; and the same
-as JSON.
-"""
+"""Write the page and JSON of a stereo calibration: verdicts, residuals, coverage, uncertainty."""
 
 from __future__ import annotations
 
@@ -26,7 +24,7 @@ ARROW_LENGTH_PX = 40.0
 
 
 def calibration_summary(calibration: StereoCalibration, assessment: Assessment) -> dict[str, Any]:
-    """Collect everything of the report as JSON values."""
+    """Collect all data of the report as JSON values."""
     rig = calibration.rig
     errors = view_rms(calibration.observed, calibration.residuals_px, len(calibration.views))
     sigmas = np.sqrt(np.diag(calibration.covariance))
@@ -81,7 +79,7 @@ def calibration_summary(calibration: StereoCalibration, assessment: Assessment) 
 
 
 def _cross_validation(assessment: Assessment) -> dict[str, Any]:
-    """Collect what two halves of the views give, or why they give nothing."""
+    """Collect the results of cross-validation with two halves of the views, or why there are none."""
     cross = assessment.cross
     if isinstance(cross, Failed):
         return {"failed": cross.reason}
@@ -96,7 +94,7 @@ def _cross_validation(assessment: Assessment) -> dict[str, Any]:
 def write_calibration_report(
     calibration: StereoCalibration, assessment: Assessment, html: Path, data: Path
 ) -> None:
-    """Write the page to `html` and its numbers to `data`, each whole or not at all."""
+    """Write the page to `html` and its numbers to `data`, each completely or not at all."""
     summary = calibration_summary(calibration, assessment)
     write_summary_page(
         "calibration_page.html.jinja",
@@ -139,9 +137,7 @@ def _figures(summary: dict[str, Any]) -> list[KeyFigure]:
 
 
 def _residual_plot(calibration: StereoCalibration, camera: int) -> Plot:
-    """Draw corners over the picture with their residuals as lines: coverage and reprojection in one
-    figure.
-    """
+    """Draw corners over the picture with lines for their residuals: coverage and reprojection errors."""
     seen, residual = calibration.observed[camera].pixels, calibration.residuals_px[camera]
     most = 4000
     kept = np.linspace(0, len(seen) - 1, min(most, len(seen))).astype(int)

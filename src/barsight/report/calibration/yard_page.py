@@ -1,4 +1,4 @@
-"""Write the page of a yard calibration: each point's residual, in plan and along the list."""
+"""Write the page of a yard calibration: each point's residual, in plan view and in list order."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from barsight.report.page import KeyFigure, format_number, write_summary_page
 from barsight.report.plots import SERIES, Plot, json_numbers
 
 ARROW_RATIO = 0.15
-"""How much of the plan the longest arrow takes."""
+"""Length of the longest arrow as a share of the plan."""
 MAX_ROWS = 200
 
 
 def write_yard_report(found: YardCalibration, verdict: str, source: str, html: Path, data: Path) -> None:
-    """Write the page to `html` and its numbers to `data`, each whole or not at all."""
+    """Write the page to `html` and its numbers to `data`, each completely or not at all."""
     rms = float(np.sqrt((found.off_m[~found.checks] ** 2).sum(axis=1).mean()))
     summary: dict[str, Any] = {
         "schema": 1,

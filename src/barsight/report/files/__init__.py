@@ -1,1 +1,1 @@
-"""The files of a result folder, written from a measurement: tables, rasters, cloud, result.json."""
+"""Write the files of a result folder from a measurement: tables, rasters, cloud, result.json."""

@@ -1,4 +1,4 @@
-"""Write the map's heights as a cloud of points."""
+"""Write the map's heights as a point cloud."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _CLOUD_POINT = np.dtype(
 
 
 def write_cloud(surface: Surface, target: Path, frame_id: str) -> None:
-    """Write binary little-endian PLY of every height that enough views support, the frame in a comment."""
+    """Write binary little-endian PLY with every height supported by enough views, the frame in a comment."""
     count = sum(len(part.views) for part in surface.cloud())
     fields = "".join(
         f"property {kind} {name}\n"

@@ -1,4 +1,4 @@
-"""Write heights and free space as tiled GeoTIFFs; tiles stream, memory stays bounded."""
+"""Write heights and free space as tiled GeoTIFFs; tiles are streamed, so memory stays bounded."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from barsight.report.files.orthophoto import georeference
 BANDS = ("z_m", "sigma_m", "views", "source")
 _TILE = 256
 _DEFLATE_LEVEL = 1
-"""Of heights, which hardly compress: at the usual 6 they take 3 % less room and twice the time."""
+"""Compression level of heights, which hardly compress: the usual 6 saves 3 % of space in twice the time."""
 
 
 def write_height(surface: Surface, target: Path, frame_id: str) -> None:
-    """Write a tiled GeoTIFF of four float32 bands; row 0 at the highest y; pixels are areas, NaN is
-    no data.
+    """Write a tiled GeoTIFF of four float32 bands; row 0 at the highest y; pixels are areas, NaN is no
+    data.
     """
     rows, columns = surface.shape
     bands = "".join(
@@ -52,7 +52,7 @@ def write_height(surface: Surface, target: Path, frame_id: str) -> None:
 
 
 def write_free(surface: Surface, free: FreeSpace, target: Path, frame_id: str) -> None:
-    """Write the upper bounds of what may stand in each cell (m) as a GeoTIFF on height.tif's grid."""
+    """Write the upper bound of anything that may be in each cell (m) as a GeoTIFF on height.tif's grid."""
 
     def tiles() -> Iterator[Float32]:
         for row, column, height, width in _tiles_of(surface):
@@ -78,7 +78,7 @@ def write_free(surface: Surface, free: FreeSpace, target: Path, frame_id: str) -
 
 
 def _tiles_of(surface: Surface) -> Iterator[tuple[int, int, int, int]]:
-    """First row from the highest y, first column, height and width of each tile of a raster."""
+    """Yield first row from the highest y, first column, height and width of each tile of a raster."""
     rows, columns = surface.shape
     for row in range(0, rows, _TILE):
         for column in range(0, columns, _TILE):

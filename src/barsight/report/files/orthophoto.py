@@ -1,6 +1,4 @@
-"""Write the orthophoto: the gray level of each cell's height, as a GeoTIFF on height.tif's grid and
-as a PNG.
-"""
+"""Write the orthophoto: each cell's gray level, as a GeoTIFF on height.tif's grid and as a PNG."""
 
 from __future__ import annotations
 
@@ -23,8 +21,8 @@ _COLUMNS = 1024
 
 
 def georeference(surface: Surface, frame_id: str) -> list[tuple[int, str, int, Any, bool]]:
-    """Make the tags that place a raster of the surface: a projected system of its own (32767) that is cited
-    by its frame, pixels as areas, m.
+    """Make the georeferencing tags of a raster: a user-defined projected system (32767) that cites the frame,
+    pixels as areas, m.
     """
     cell, citation = surface.cell_m, f"{frame_id}|"
     left, top = (surface.columns[0] - 0.5) * cell, (surface.rows[1] - 0.5) * cell
@@ -39,9 +37,7 @@ def georeference(surface: Surface, frame_id: str) -> list[tuple[int, str, int, A
 
 
 def orthophoto(surface: Surface) -> UInt8:
-    """Render gray levels (rows, columns) from 1, NO_DATA where no view saw the cell; row 0 at the
-    highest y.
-    """
+    """Render gray levels (rows, columns) from 1, NO_DATA if no view saw the cell; row 0 at the highest y."""
     rows, columns = surface.shape
     picture = np.empty((rows, columns), np.uint8)
     for column in range(0, columns, _COLUMNS):
@@ -52,7 +48,7 @@ def orthophoto(surface: Surface) -> UInt8:
 
 
 def write_orthophoto(surface: Surface, folder: Path, frame_id: str) -> None:
-    """Write ortho.tif and ortho.png, each whole or not at all."""
+    """Write ortho.tif and ortho.png, each completely or not at all."""
     picture = orthophoto(surface)
     _write_gray(surface, picture, folder / "ortho.tif", frame_id)
     with atomic_path(folder / "ortho.png") as path:
@@ -67,7 +63,7 @@ def write_top_photo(surface: Surface, tops: TopPhoto, target: Path, frame_id: st
 
 
 def write_passes(surface: Surface, history: PlaceHistory, target: Path, frame_id: str) -> None:
-    """Write which of several passes saw each cell last, from 1, on height.tif's grid."""
+    """Write the number (from 1) of the pass that saw each cell last, on height.tif's grid."""
     x_m, y_m = (
         surface.cell_m * (first[0] + np.arange(count))
         for first, count in ((surface.columns, surface.shape[1]), (surface.rows, surface.shape[0]))

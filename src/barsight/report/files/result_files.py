@@ -1,4 +1,4 @@
-"""Write the result files of formats.md, each whole or not at all."""
+"""Write the result files of formats.md, each completely or not at all."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ RESULT_FILES = (
     "laser.csv", "bundles.json", "lifts.json", "events.csv", "ortho.tif", "ortho.png", "preview.png",
     "result.json", "report.html",
 )  # fmt: skip
-"""Everything that a run may leave in its folder."""
+"""All files that a run may leave in its folder."""
 
 
 def write_surface(
     surface: Surface, free: FreeSpace, tops: TopPhoto, folder: Path, frame_id: str,
     history: PlaceHistory | None = None,
 ) -> None:  # fmt: skip
-    """Write what the map alone fills into an existing folder: cloud, heights, free space, photos, and of
-    several passes which saw each cell last; each with the frame that its places are in.
+    """Write the files of the map into an existing folder: cloud, heights, free space, photos, and for several
+    passes the last to see each cell; each file names the frame of its coordinates.
     """
     write_height(surface, folder / "height.tif", frame_id)
     write_free(surface, free, folder / "free.tif", frame_id)
@@ -55,7 +55,7 @@ def write_tables(measurement: Measurement, folder: Path) -> None:
 
 
 def write_results(measurement: Measurement, identity: MapIdentity, folder: Path) -> None:
-    """Write all other files that a measurement fills but result.json, into an existing folder."""
+    """Write all other files of a measurement except result.json into an existing folder."""
     reference = measurement.trajectory.reference
     path = folder / "bundles.json"
     digest = write_bundles(measurement.bundles, measurement.stock, reference, identity, path)
@@ -65,7 +65,7 @@ def write_results(measurement: Measurement, identity: MapIdentity, folder: Path)
 
 
 def write_preview(preview: Preview, target: Path) -> None:
-    """Write the rectified left picture beside its disparity in colours; black where there is none."""
+    """Write the rectified left picture beside its coloured disparity; black without a disparity."""
     known = np.isfinite(preview.disparity_px)
     low, high = np.percentile(preview.disparity_px[known], (1, 99)) if known.any() else (0.0, 1.0)
     scaled = (preview.disparity_px - low) / max(high - low, 1e-6) * 255

@@ -82,7 +82,7 @@ def summary(measurement: Measurement) -> dict[str, Any]:
 
 
 def _ids(measurement: Measurement) -> dict[str, Any]:
-    """Name the rig, and the frame of all places."""
+    """Return the ids of the rig and of the frame of all coordinates."""
     return {
         "calibration_id": measurement.calibration_hash[:ID_DIGITS],
         "yard_frame_id": measurement.yard_frame_id, "frame_id": measurement.frame_id,
@@ -90,7 +90,7 @@ def _ids(measurement: Measurement) -> dict[str, Any]:
 
 
 def _rig_content(covariance: Float64 | None) -> dict[str, Any] | None:
-    """Describe what the cameras' calibration and the travel leave open of the rig."""
+    """Describe the remaining uncertainty of the rig after the calibration and the travel."""
     if covariance is None:
         return None
     sigma = np.sqrt(np.diag(covariance))
@@ -103,7 +103,7 @@ def _rig_content(covariance: Float64 | None) -> dict[str, Any] | None:
 
 
 def _laser_content(measurement: Measurement) -> dict[str, Any]:
-    """Describe the laser's agreement, and its profiles' checks where they were to be fused."""
+    """Describe the agreement with the laser, and its profiles' checks if they were to be fused."""
     checks = measurement.laser_checks
     return {
         "agreement": [asdict(agreement) for agreement in measurement.agreements],
@@ -112,7 +112,7 @@ def _laser_content(measurement: Measurement) -> dict[str, Any]:
 
 
 def _check_content(check: LaserCheck) -> dict[str, Any]:
-    """Describe a profile's check; offsets in mm, null where they can't be told."""
+    """Describe a profile's check; offsets in mm, null if undetermined."""
     offset = {field.name: getattr(check.offset, field.name, None) for field in fields(LaserOffset)}
     ratio = offset.pop("alike_ratio")
     told = {name.replace("_m", "_mm"): None if m is None else 1e3 * m for name, m in offset.items()}
@@ -123,7 +123,7 @@ def _check_content(check: LaserCheck) -> dict[str, Any]:
 
 
 def _pass_content(number: int, one: PassRecord) -> dict[str, Any]:
-    """Describe one of several passes; turns in degrees, the scale as a share."""
+    """Describe one of several passes; angles in degrees, the scale as a ratio."""
     unknowns, sigma = one.correction.unknowns, np.sqrt(np.diag(one.correction.covariance))
     return {
         "number": number,

@@ -14,8 +14,8 @@ from barsight.core.stamps import format_seconds
 
 
 def write_trajectory(trajectory: Trajectory, target: Path, frame_id: str) -> None:
-    """Write TUM: seconds with nine decimals, x y z qx qy qz qw of `yard_from_body` (or `world_from_body`).
-    The frame stands in a comment.
+    """Write TUM: seconds with nine decimals, x y z qx qy qz qw of `yard_from_body` (or `world_from_body`). A
+    comment names the frame.
     """
     with atomic_path(target) as path, path.open("w", encoding="ascii") as file:
         file.write(f"# {trajectory.reference}_from_body: timestamp_s x y z qx qy qz qw\n")
@@ -27,9 +27,9 @@ def write_trajectory(trajectory: Trajectory, target: Path, frame_id: str) -> Non
 
 
 def write_relative(trajectory: Trajectory, target: Path) -> None:
-    """Write CSV, a row for each frame but the first: its pose in the body's axes of the frame before, x y z
-    (m) and quaternion, and the upper triangle of its covariance row by row (rotation in rad, then translation
-    in m, of a small motion that follows it); nan where it isn't known.
+    """Write CSV with a row for each frame but the first: its pose in the body axes of the previous frame, x y
+    z (m) and quaternion, and the upper triangle of its covariance row by row (rotation in rad, then
+    translation in m, of a small motion that follows it); nan if unknown.
     """
     detail = trajectory.detail
     if detail is None or detail.relative is None:
@@ -47,7 +47,7 @@ def write_relative(trajectory: Trajectory, target: Path) -> None:
 
 
 def write_contours(contours: tuple[Contour, ...], target: Path) -> None:
-    """Write `profile,x_m,y_m,z_m,sigma_m,source`; z and sigma are empty where nothing is known."""
+    """Write `profile,x_m,y_m,z_m,sigma_m,source`; z and sigma are empty if unknown."""
     with atomic_path(target) as path, path.open("w", encoding="ascii") as file:
         file.write("profile,x_m,y_m,z_m,sigma_m,source\n")
         for contour in contours:
@@ -59,7 +59,7 @@ def write_contours(contours: tuple[Contour, ...], target: Path) -> None:
 
 
 def write_laser_csv(laser: tuple[LaserProfile, ...], target: Path) -> None:
-    """Write the reference profiles as they were read: `profile,x_m,y_m,z_m,sigma_m`."""
+    """Write the reference profiles as read: `profile,x_m,y_m,z_m,sigma_m`."""
     with atomic_path(target) as path, path.open("w", encoding="ascii") as file:
         file.write("profile,x_m,y_m,z_m,sigma_m\n")
         for profile in laser:
