@@ -1,1 +1,1 @@
-"""The operator's page and its API on a store: `barsight serve`."""
+"""Serve the operator's page and its API on a store: `barsight serve`."""

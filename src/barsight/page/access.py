@@ -1,4 +1,4 @@
-"""Tell who asks, by cookie, token or the loopback, and what each role may do."""
+"""Identify callers by cookie, token or the loopback, and define the rights of each role."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FREE_TRIES = 5
 MAX_WAIT_S = 300.0
 MAX_THROTTLED = 10_000
 LOCAL = "local"
-"""Name of whoever sits at this computer where the store has no accounts."""
+"""Name of the user at this computer if the store has no accounts."""
 
 Right = Literal["read", "operate", "report", "administer", "execute"]
 RIGHTS: dict[Role, tuple[Right, ...]] = {
@@ -31,13 +31,13 @@ RIGHTS: dict[Role, tuple[Right, ...]] = {
     "engineer": ("read", "operate", "execute", "report", "administer"),
     "service": ("read", "execute", "report"),
 }
-"""operate: confirm and decline lifts, acknowledge alarms, decide on stock. execute: report lifts as taken or
-failed. report: raise and clear alarms, forbid lifts.
+"""Rights of each role. operate: confirm and decline lifts, acknowledge alarms, decide on stock. execute:
+report lifts as taken or failed. report: raise and clear alarms, forbid lifts.
 """
 
 
 class AccessError(BarsightError):
-    """A request that is refused. status: HTTP's. wait_s: after which it may be tried again."""
+    """A refused request. status: HTTP status. wait_s: time after which it may be tried again."""
 
     def __init__(self, status: int, problem: str, wait_s: float = 0.0) -> None:
         self.status, self.wait_s = status, wait_s
@@ -46,8 +46,9 @@ class AccessError(BarsightError):
 
 @dataclass(frozen=True)
 class Caller:
-    """A person or program that asks. csrf: token that a change must carry; None for a
-    program's token, which no browser adds.
+    """A person or program that makes a request.
+
+    csrf: token that a change must carry; None for a program's token, which no browser adds.
     """
 
     name: str
@@ -55,7 +56,7 @@ class Caller:
     csrf: str | None
 
     def may(self, right: Right) -> bool:
-        """Check a right of the role."""
+        """Check whether the role has a right."""
         return right in RIGHTS[self.role]
 
 
@@ -70,7 +71,7 @@ class _LogIn:
 
 @dataclass
 class Throttle:
-    """Counts failed log-ins by key; after FREE_TRIES each waits twice as long as the one before."""
+    """Counts failed log-ins by key; after FREE_TRIES, each failure doubles the waiting time."""
 
     clock: Callable[[], float] = time.monotonic
     _failed: dict[str, tuple[int, float]] = field(default_factory=dict)
@@ -91,13 +92,13 @@ class Throttle:
             self._failed.pop(next(iter(self._failed)))
 
     def clear(self, *keys: str) -> None:
-        """Forget the failures after a log-in that succeeded."""
+        """Clear the failures after a successful log-in."""
         for key in keys:
             self._failed.pop(key, None)
 
 
 class Access:
-    """Log-ins of one running server; they end with it. accounts: gives the store's present ones, by name."""
+    """Log-ins of one running server; they end with it. accounts: returns the store's current ones by name."""
 
     def __init__(
         self, accounts: Callable[[], dict[str, Account]], clock: Callable[[], float] = time.monotonic
@@ -110,9 +111,9 @@ class Access:
         self._local_csrf = secrets.token_urlsafe(24)
 
     def log_in(self, name: str, password: str, client: str) -> tuple[str, Caller]:
-        """Check a password; return the cookie's value and who it is. Raises AccessError."""
+        """Check a password; return the cookie's value and the caller. Raises AccessError."""
         keys = (f"name {name[:60]}", f"client {client}")
-        with self._one_at_a_time:  # scrypt takes 32 MiB: no crowd of them
+        with self._one_at_a_time:  # scrypt takes 32 MiB, so no parallel calls
             self._throttle.expect_free(*keys)
             account = self._accounts().get(name)
             if not is_password(account, password) or account is None:
@@ -131,7 +132,7 @@ class Access:
         self._sessions.pop(token_digest(_cookie(cookies)), None)
 
     def caller(self, cookies: str, authorization: str) -> Caller:
-        """Tell who asks. Raises AccessError (401) where nobody known does."""
+        """Identify the caller. Raises AccessError (401) for an unknown one."""
         accounts = self._accounts()
         if authorization:
             scheme, _, token = authorization.partition(" ")
@@ -159,7 +160,7 @@ class Access:
 
 
 def expect_csrf(caller: Caller, given: str) -> None:
-    """Raise AccessError where a change by a browser lacks its token."""
+    """Raise AccessError if a change by a browser lacks its token."""
     if caller.csrf is not None and not hmac.compare_digest(caller.csrf.encode(), given.encode()):
         raise AccessError(403, "the request lacks the page's token: load the page again")
 

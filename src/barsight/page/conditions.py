@@ -1,4 +1,4 @@
-"""Find what needs an operator's or engineer's act, and raise, return and clear its alarms (ISA-18.2)."""
+"""Find conditions that need an operator or engineer, and raise, return and clear their alarms (ISA-18.2)."""
 
 from __future__ import annotations
 
@@ -42,16 +42,16 @@ ALARM_CODES = {
     "live-stopped": "The live run writes no health any more.",
     "live-degraded": "The live run lacks a sensor or a process that lifts need.",
 }
-"""Alarms that the page's server raises itself: code to what it means."""
+"""Alarms that the page's server raises itself: meaning by code."""
 PRIORITIES = {"store-broken": 1, "calibration-changed": 1, "bundle-moved": 3, "survey-files": 3}
-"""Of alarms, 1 first; all others have 2."""
+"""Priorities of alarms by code, 1 is the highest; all others have 2."""
 WHO = "barsight serve"
 Condition = tuple[str, str]
 """Code and reason of an alarm."""
 
 
 def find_conditions(connection: Connection, live: LiveHealth | None) -> set[Condition]:
-    """Find what is wrong at present, the audit log aside."""
+    """Find all current conditions except those of the audit log."""
     found: set[Condition] = set()
     newest = newest_survey(connection)
     if newest is not None:
@@ -64,7 +64,7 @@ def find_conditions(connection: Connection, live: LiveHealth | None) -> set[Cond
 
 
 def find_chain_condition(connection: Connection) -> set[Condition]:
-    """Walk the audit log."""
+    """Verify the audit log; return its condition if it is invalid."""
     chain = verify_chain(connection)
     return {("store-broken", chain.reason)} if isinstance(chain, Failed) else set()
 
@@ -90,7 +90,7 @@ def _file_conditions(newest: Row[Any]) -> set[Condition]:
 
 
 def _yard_conditions(connection: Connection, newest: Row[Any]) -> set[Condition]:
-    """Hold what the newest survey told against what lifts did."""
+    """Compare the newest survey with what the lifts did."""
     found: set[Condition] = set()
     gone = select(ABSENCES.c.bundle_id).where(ABSENCES.c.survey_id == newest.id, ABSENCES.c.kind == "gone")
     moved = select(SIGHTINGS.c.bundle_id).where(
@@ -129,9 +129,9 @@ def _lifted_since_seen(connection: Connection, before_ns: int) -> set[int]:
 
 
 def settle_alarms(store: Store, present: set[Condition], judged: set[str]) -> bool:
-    """Raise an alarm for each new condition, and let those return or clear whose condition is gone.
+    """Raise an alarm for each new condition, and return or clear those whose condition has ended.
 
-    judged: codes that were looked for. Returns whether anything was to do.
+    judged: codes that were checked. Returns whether anything was changed.
     """
     with store.reading() as connection:
         if _changes(connection, present, judged) == ([], []):
@@ -149,7 +149,7 @@ def settle_alarms(store: Store, present: set[Condition], judged: set[str]) -> bo
 def _changes(
     connection: Connection, present: set[Condition], judged: set[str]
 ) -> tuple[list[Condition], list[int]]:
-    """Tell which conditions have no active alarm, and which alarms' conditions are gone."""
+    """Find conditions without an active alarm, and alarms whose condition has ended."""
     last: dict[int, str] = {}
     for row in connection.execute(select(ALARM_STATES).order_by(ALARM_STATES.c.step)).all():
         last[row.alarm_id] = row.state

@@ -1,4 +1,4 @@
-"""Build the documents that the page reads from the store: the present yard, lifts, surveys, alarms, stock."""
+"""Build the documents that the page reads from the store: the current yard, lifts, surveys, alarms, stock."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ with extra("store"):
     from sqlalchemy import Connection, Row, or_, select
 
 LIKE_RATIO = 0.15
-"""Bundles whose bars' diameters and widths differ by less are of one kind."""
+"""Largest relative difference of bar diameter and width between bundles of the same kind."""
 MAX_LIFTS = 500
 MAX_ALARMS = 500
 MAX_RECORDINGS = 500
@@ -50,7 +50,7 @@ _ALARM_ORDER = {"raised": 0, "returned": 1, "acknowledged": 2, "cleared": 3}
 
 
 def state_document(connection: Connection) -> dict[str, Any]:
-    """Tell the header: the newest survey, the yard's clock, the numbers of what is open."""
+    """Build the header: the newest survey, the yard's clock, the numbers of open items."""
     newest = newest_survey(connection)
     alarms = alarm_records(connection)
     active = [one for one in alarms if one["state"] != "cleared"]
@@ -86,8 +86,10 @@ def bundle_records(connection: Connection, at_ns: int | None = None) -> list[dic
 
 
 def unseen_lengths(records: list[dict[str, Any]]) -> list[float | None]:
-    """Tell by how much each bundle with an open end is shorter than those of like bars whose ends were both
-    seen; None where it has no open end, or there are none such.
+    """Estimate by how much each bundle with an open end is seen too short.
+
+    The reference is the median length of longer bundles of the same kind with both ends seen; None without an
+    open end or a reference.
     """
     whole = np.array(
         [
@@ -125,7 +127,7 @@ def _bundle(one: PresentBundle, vetoes: Any, offers: Any) -> dict[str, Any]:
 
 
 def bundle_history(connection: Connection, number: int) -> dict[str, Any] | None:
-    """Tell all surveys that saw a bundle or looked for it, and its lifts; None where there is no such one."""
+    """List all surveys that saw a bundle or looked for it, and its lifts; None if there is no such bundle."""
     seen = connection.execute(
         select(SIGHTINGS, SURVEYS.c.map_id, SURVEYS.c.captured_to_ns)
         .join(SURVEYS)
@@ -158,7 +160,7 @@ def bundle_history(connection: Connection, number: int) -> dict[str, Any] | None
 
 
 def lift_records(connection: Connection) -> list[dict[str, Any]]:
-    """List the newest lifts and all open ones, each with its states, who brought it there, its figures."""
+    """List the newest lifts and all open ones, each with its states, who set them, and its figures."""
     of = _bundles_of_lifts(connection)
     newest = select(LIFTS.c.id).join(SURVEYS).where(counts()).order_by(LIFTS.c.id.desc()).limit(MAX_LIFTS)
     open_ids = [lift.lift_id for lift in open_lifts(connection)]
@@ -189,7 +191,7 @@ def _lift_figures(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def alarm_records(connection: Connection) -> list[dict[str, Any]]:
-    """List the newest alarms and all that stand, the worst state first, each with its states."""
+    """List the newest alarms and all that stand, the most urgent state first, each with its states."""
     newest = select(ALARMS.c.id).order_by(ALARMS.c.id.desc()).limit(MAX_ALARMS)
     cleared = select(ALARM_STATES.c.alarm_id).where(ALARM_STATES.c.state == "cleared")
     rows = connection.execute(
@@ -210,12 +212,12 @@ def alarm_records(connection: Connection) -> list[dict[str, Any]]:
 
 
 def _urgency(alarm: dict[str, Any]) -> tuple[int, int, int]:
-    """Rank an alarm: the least state first, then priority, then the newest."""
+    """Rank an alarm by state, then priority, then age, the newest first."""
     return _ALARM_ORDER[alarm["state"]], alarm["priority"], -alarm["at_ns"]
 
 
 def survey_records(connection: Connection) -> list[dict[str, Any]]:
-    """List the surveys, the newest first, with what each told and its files."""
+    """List the surveys, the newest first, with the findings and files of each."""
     files = {row.map_id: row for row in connection.execute(select(SURVEYS)).all()}
     told = []
     for one in reversed(list_surveys(connection)):
@@ -236,7 +238,7 @@ def survey_records(connection: Connection) -> list[dict[str, Any]]:
 
 
 def equipment_record(connection: Connection) -> dict[str, Any]:
-    """List the calibrations with rig, crane and the times for which they are approved, and the recordings."""
+    """List the calibrations with rig, crane and periods of approval, and the recordings."""
     return {
         "calibrations": [asdict(one) for one in list_calibrations(connection)],
         "recordings": [asdict(one) for one in reversed(list_recordings(connection))][:MAX_RECORDINGS],
@@ -244,7 +246,7 @@ def equipment_record(connection: Connection) -> dict[str, Any]:
 
 
 def stock_record(connection: Connection) -> dict[str, Any]:
-    """Tell the differences between the newest survey and the stock list that it was measured with."""
+    """List the differences between the newest survey and the stock list with which it was measured."""
     newest = newest_survey(connection)
     none: dict[str, Any] = {"map_id": None, "list": None, "differences": []}
     if newest is None:

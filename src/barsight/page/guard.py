@@ -1,4 +1,4 @@
-"""Refuse requests that another page in the same browser makes, and say in headers what a browser may do."""
+"""Refuse requests from other pages in the same browser, and restrict browsers by response headers."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ _HEADERS = {
 
 
 class Guard:
-    """ASGI middleware: lets through only what names one of `hosts` and comes from one of `origins` or from no
-    page at all.
+    """ASGI middleware that passes only requests that name one of `hosts` and come from one of `origins` or
+    from no page at all.
     """
 
     def __init__(self, app: Any, hosts: frozenset[str], origins: frozenset[str]) -> None:
         self._app, self._hosts, self._origins = app, hosts, origins
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Refuse or pass on, with headers of ours where the answer has none of the kind."""
+        """Refuse or pass on; add our headers to the answer unless it has its own."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return

@@ -1,4 +1,4 @@
-"""Paint the yard from above: of each survey the places that no later one saw, unknown places left blank."""
+"""Paint the yard from above: for each survey the places that no later one saw, unknown places left blank."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _KEPT = 64
 
 @dataclass(frozen=True, eq=False)
 class SurveyLayer:
-    """Places that one survey knows best. shown: (rows, columns) of its coarse heights, from the lowest y."""
+    """Places that one survey was last to see. shown: (rows, columns) of its coarse heights, from low y."""
 
     map_id: str
     seen_ns: int
@@ -41,19 +41,19 @@ class SurveyLayer:
     shown: Bool
 
     def content(self) -> dict[str, Any]:
-        """Tell its place: outer edges in m."""
+        """Describe its extent: outer edges in m."""
         return {"map_id": self.map_id, "seen_ns": self.seen_ns, "edges_m": edges(self.heights)}
 
 
 def edges(heights: HeightMap) -> list[float]:
-    """Compute the outer edges: least x, least y, largest x, largest y, in m."""
+    """Compute the outer edges: smallest x, smallest y, largest x, largest y, in m."""
     rows, columns = heights.shape
     left, low = heights.x0_m - heights.cell_m / 2, heights.y0_m - heights.cell_m / 2
     return [left, low, left + columns * heights.cell_m, low + rows * heights.cell_m]
 
 
 def find_layers(connection: Connection, at_ns: int | None = None) -> tuple[SurveyLayer, ...]:
-    """Share the yard at a time out among its surveys, each place to the newest that saw it; oldest first."""
+    """Divide the yard at a time among its surveys, each place to the newest that saw it; oldest first."""
     query = select(SURVEYS.c.map_id, SURVEYS.c.captured_to_ns, SURVEYS.c.folder, SURVEYS.c.heights).where(
         counts()
     )
@@ -74,7 +74,7 @@ def find_layers(connection: Connection, at_ns: int | None = None) -> tuple[Surve
 
 
 def newest_at(layers: tuple[SurveyLayer, ...], at_m: tuple[float, float]) -> int | None:
-    """Tell when a place (x, y) was seen last, ns; None where no survey saw it."""
+    """Return when a place (x, y) was last seen, ns; None if no survey saw it."""
     for layer in reversed(layers):
         column, row, inside = nearest_cells(layer.heights, *np.array(at_m).reshape(2, 1))
         if inside[0] and layer.shown[row[0], column[0]]:
@@ -83,7 +83,7 @@ def newest_at(layers: tuple[SurveyLayer, ...], at_m: tuple[float, float]) -> int
 
 
 def _known_at(other: HeightMap, heights: HeightMap) -> Bool:
-    """Tell for each cell of `heights` whether `other` knows it."""
+    """Check for each cell of `heights` whether it is known to `other`."""
     columns = np.round((heights.x_m - other.x0_m) / other.cell_m).astype(int)
     rows = np.round((heights.y_m - other.y0_m) / other.cell_m).astype(int)
     inside = ((rows >= 0) & (rows < other.shape[0]))[:, None] & ((columns >= 0) & (columns < other.shape[1]))
@@ -94,8 +94,9 @@ def _known_at(other: HeightMap, heights: HeightMap) -> Bool:
 
 
 def paint_layer(layer: SurveyLayer, kind: Kind) -> bytes:
-    """Paint a layer as PNG, gray with alpha, row 0 at the highest y. The photo is the folder's ortho.tif, the
-    store's coarse heights where that isn't there any more.
+    """Paint a layer as PNG, gray with alpha, row 0 at the highest y.
+
+    The photo is the folder's ortho.tif, or the store's coarse heights if that no longer exists.
     """
     gray = _photo(layer) if kind == "photo" else None
     if gray is None:
@@ -119,7 +120,7 @@ def _photo(layer: SurveyLayer) -> UInt8 | None:
     except (InputError, OSError, ValueError):
         return None
     given = edges(layer.heights)
-    # The coarse map ends at whole coarse cells: cut or pad the photo to its edges.
+    # The coarse map consists of whole coarse cells: crop or pad the photo to its edges.
     per_m = columns / (right - left)
     wide, high = (round((given[k + 2] - given[k]) * per_m) for k in (0, 1))
     first_x, first_y = round((given[0] - left) * per_m), round((given[1] - low) * per_m)
@@ -131,7 +132,7 @@ def _photo(layer: SurveyLayer) -> UInt8 | None:
 
 
 def _shaded(heights: HeightMap) -> UInt8:
-    """Paint heights from dark to light, shaded from a side; 0 where unknown."""
+    """Paint heights from dark to light, shaded from one side; 0 for unknown."""
     known = np.isfinite(heights.z_m)
     low, high = np.percentile(heights.z_m[known], (1, 99)) if known.any() else (0.0, 1.0)
     level = (heights.z_m - low) / max(float(high - low), 0.2)
@@ -142,13 +143,13 @@ def _shaded(heights: HeightMap) -> UInt8:
 
 
 class PaintedLayers:
-    """Keeps the pictures painted last."""
+    """Cache of the pictures painted last."""
 
     def __init__(self) -> None:
         self._kept: OrderedDict[tuple[str, Kind, bytes], bytes] = OrderedDict()
 
     def paint(self, layer: SurveyLayer, kind: Kind) -> bytes:
-        """Paint a layer, or return it as painted before."""
+        """Paint a layer, or return it from the cache."""
         key = (layer.map_id, kind, np.packbits(layer.shown).tobytes())
         if key not in self._kept:
             self._kept[key] = paint_layer(layer, kind)

@@ -1,4 +1,4 @@
-"""Read the health of a live run, and where crane and magnet are, from the files that it writes."""
+"""Read a live run's health and the positions of crane and magnet from the files that it writes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _FOR_LIFTS = ("full", "no-imu")
 
 @dataclass(frozen=True)
 class LiveHealth:
-    """A live run's last health.json (None where there is none), its age, and an alarm's code and reason."""
+    """A live run's last health.json (None if there is none), its age, and an alarm's code and reason."""
 
     content: dict[str, Any] | None
     age_s: float | None
@@ -28,14 +28,14 @@ class LiveHealth:
 
 
 class LiveFolder:
-    """Looks at a live run's folder, and keeps what it saw for the trends."""
+    """Reads a live run's folder, and keeps its history for the trends."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.history: deque[dict[str, Any]] = deque(maxlen=HISTORY)
 
     def look(self) -> LiveHealth:
-        """Read health.json; a new one is added to the history."""
+        """Read health.json; add a new one to the history."""
         path = running_folder(self.folder) / "health.json"
         try:
             changed_s = path.stat().st_mtime
@@ -53,15 +53,15 @@ class LiveFolder:
             self.history.append(kept)
         age_s = time.time() - changed_s
         problem = None
-        if abs(age_s) > STOPPED_S:  # under 0: the clock was set back since
+        if abs(age_s) > STOPPED_S:  # below 0: the clock has been set back since
             problem = ("live-stopped", str(path))
         elif mode not in _FOR_LIFTS:
             problem = ("live-degraded", str(mode))
         return LiveHealth(content, age_s, problem)
 
     def crane(self, seen_at: Callable[[tuple[float, float]], int | None]) -> bytes:
-        """Tell as JSON how the run stands, where crane and magnet are, and when that place was seen last; no
-        place where that is old. seen_at: tells that by place, ns.
+        """Return as JSON the run's state, the positions of crane and magnet, and when that place was last
+        seen; no position if it is outdated. seen_at: returns the time (ns) at which a place was last seen.
         """
         folder = running_folder(self.folder)
         told = read_live_state(folder)

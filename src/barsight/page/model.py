@@ -1,4 +1,4 @@
-"""Pack a survey's surface and the lines over it for the 3D screen: the viewer's points, in one document."""
+"""Pack a survey's surface and the lines over it for the 3D screen: the viewer's points in one document."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ _KEPT = 4
 def survey_model(connection: Connection, map_id: str, by: str) -> bytes:
     """Pack a survey's surface, coloured by one of COLOURS, with the bundles' boxes and axes and the poles.
 
-    Four bytes with the length of a JSON head, the head, (N, 3) float32 places, (M, 2, 3) float32 ends of
-    lines, (N, 3) uint8 colours. Raises AccessError where there is no such survey, InputError where its folder
+    Format: four bytes with the length of a JSON head, the head, (N, 3) float32 points, (M, 2, 3) float32 ends
+    of lines, (N, 3) uint8 colours. Raises AccessError if there is no such survey, InputError if its folder
     isn't as it was added.
     """
     if by not in COLOURS:

@@ -20,12 +20,13 @@ with extra("store"):
 MARGIN_M = 0.3
 PIXEL_M = 0.005
 MAX_LONG = 1600
-"""Pixels along a bundle."""
+"""Maximum picture length along a bundle in pixels."""
 
 
 def paint_bundle(connection: Connection, number: int, map_id: str) -> bytes | None:
-    """Paint the bundle as PNG, lying along the picture, its first end on the left; None where the survey did
-    not see it or its orthophoto is gone.
+    """Paint the bundle as PNG, along the picture with its first end on the left.
+
+    Returns None if the survey did not see it or its orthophoto is gone.
     """
     query = (
         select(SIGHTINGS.c.record, SURVEYS.c.folder)

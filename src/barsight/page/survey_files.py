@@ -1,4 +1,4 @@
-"""Find a survey's folder, and its files for whoever asks for one by name."""
+"""Find a survey's folder, and its files by name."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ with extra("store"):
     from sqlalchemy import Connection, select
 
 UNSEALED = ("report.html", "ortho.png")
-"""Files that the store keeps no digest of."""
+"""Files for which the store keeps no digest."""
 
 
 def survey_folder(connection: Connection, map_id: str) -> Path:
-    """Return a survey's folder. Raises AccessError where there is no such survey."""
+    """Return a survey's folder. Raises AccessError if there is no such survey."""
     folder = connection.execute(select(SURVEYS.c.folder).where(SURVEYS.c.map_id == map_id)).scalar()
     if folder is None:
         raise AccessError(404, f"there is no survey {map_id}")
@@ -28,7 +28,7 @@ def survey_folder(connection: Connection, map_id: str) -> Path:
 
 
 def expect_map(folder: Path, map_id: str) -> dict[str, Any]:
-    """Return a folder's result.json. Raises InputError where the folder isn't as it was added."""
+    """Return a folder's result.json. Raises InputError if the folder isn't as it was added."""
     summary, identity = open_folder(folder)
     if identity is None or identity.map_id != map_id:
         raise InputError(folder, f"holds another map than {map_id}", "measure into a folder of its own")
@@ -36,7 +36,7 @@ def expect_map(folder: Path, map_id: str) -> dict[str, Any]:
 
 
 def find_file(connection: Connection, map_id: str, name: str) -> Path:
-    """Return a file's path, held against its digest. Raises InputError where it can't be had."""
+    """Return a file's path after a check of its digest. Raises InputError if it is missing or changed."""
     row = connection.execute(select(SURVEYS).where(SURVEYS.c.map_id == map_id)).first()
     if row is None:
         raise InputError(map_id, "there is no such survey")

@@ -1,4 +1,4 @@
-"""Place targets picked on a survey's orthophoto, and register its map by them, for `calibrate yard`."""
+"""Locate targets picked on a survey's orthophoto, and register its map to them, for `calibrate yard`."""
 
 from __future__ import annotations
 
@@ -33,31 +33,36 @@ with extra("store"):
 
 Found = Literal["disc", "column", "hand"]
 CLOSE_M = 0.08
-"""A disc whose middle lies no further from a pick is what was meant."""
+"""Largest distance in metres from a pick to the centre of a disc for the disc to be the target."""
 AROUND_M = 0.5
-"""Half the side of the photo that is searched for it."""
+"""Half side in metres of the part of the photo that is searched for the disc."""
 SIDE: dict[Found, float] = {"disc": 0.12, "column": 0.35, "hand": 0.7}
-"""Sigma of a pick's x and y, in cells of the map, or in pixels there where these are coarser."""
+"""Sigma of x and y by kind of target, in cells of the map, or in pixels if these are coarser."""
 LEVEL_M, DISC_RATIO = 0.03, 2.0
-"""Heights so near to a pick tell its own, or within so many radii of a disc: a black one itself has none."""
+"""Radius around a pick within which heights are used: in metres, or for a disc in its radii, since a black
+disc itself has no heights.
+"""
 TOP_M = 0.03
-"""Cells of a column's top lie no further from the height at the pick."""
+"""Largest height difference in metres of cells of a column's top from the height at the pick."""
 WIDER_PX, MAX_OFF_RATIO = 2.0, 0.25
-"""Widening of a top by matching, and the most by which its width may then be off the column's."""
+"""Widening of a top by matching in pixels, and largest remaining error of its width relative to the
+column's.
+"""
 JUMP_M = 0.02
-"""A height further off than this, and than twice its sigma, isn't that of the same face."""
+"""Minimum threshold in metres, beside twice sigma, above which a height belongs to another face."""
 MIN_SHARE, MIN_LEVEL = 0.3, 0.8
-"""Least share of the cells about a pick that are measured, and of these that lie on one face."""
+"""Minimum share of the cells around a pick that are measured, and of these that are on one face."""
 SAME_M = 0.02
-"""No two targets lie so near to each other: it was clicked twice."""
+"""Minimum distance in metres between two targets; closer picks are of the same target."""
 MIN_TARGETS = 3
 LISTED = Path("list of places")
 
 
 @dataclass(frozen=True)
 class Pick:
-    """A target's pick in the map, m. is_exact: take the place itself, even where a disc lies beside it.
-    width_m: of a column whose top is meant; None of another target.
+    """A target's pick in the map, m. is_exact: use the picked position, even with a disc near it.
+
+    width_m: of a column whose top is the target; None for other targets.
     """
 
     name: str
@@ -69,7 +74,7 @@ class Pick:
 
 @dataclass(frozen=True, eq=False)
 class PickedPlace:
-    """place_m (3,) in the map's frame, sigma_m (3,) of each coordinate; found: what told x and y."""
+    """place_m (3,) in the map's frame, sigma_m (3,) of each coordinate; found: source of x and y."""
 
     place_m: Float64
     sigma_m: Float64
@@ -78,7 +83,7 @@ class PickedPlace:
 
 @dataclass(frozen=True, eq=False)
 class _PickedSurvey:
-    """A survey whose map targets can be picked in. frame: that of its places."""
+    """A survey in whose map targets can be picked. frame: frame of its coordinates."""
 
     folder: Path
     frame: str
@@ -87,9 +92,9 @@ class _PickedSurvey:
 
 
 def picking_record(connection: Connection, map_id: str) -> dict[str, Any]:
-    """Tell a survey's grid, its folder, and what `calibrate yard --measured` needs of it.
+    """Return a survey's grid, its folder, and what `calibrate yard --measured` needs of it.
 
-    Raises AccessError where there is no such survey, InputError where its map can't be registered.
+    Raises AccessError if there is no such survey, InputError if its map can't be registered.
     """
     survey = _opened(survey_folder(connection, map_id), map_id)
     rows, columns = survey.heights.shape
@@ -104,8 +109,8 @@ def picking_record(connection: Connection, map_id: str) -> dict[str, Any]:
 def paint_photo(
     connection: Connection, map_id: str, columns: tuple[int, int], rows: tuple[int, int]
 ) -> bytes:
-    """Paint cells from first to last of the orthophoto as PNG, gray with alpha, row 0 at the highest y,
-    coarser where they are many.
+    """Paint a range of cells of the orthophoto as PNG, gray with alpha, row 0 at the highest y; coarser if
+    there are many.
     """
     survey = _opened(survey_folder(connection, map_id), map_id)
     high, wide = survey.heights.shape
@@ -123,11 +128,11 @@ def paint_photo(
 def fit_targets(
     connection: Connection, map_id: str, listed: str, sigma_m: float, picks: Sequence[Pick]
 ) -> dict[str, Any]:
-    """Place all picks of a list's targets; how the yard lies by them, once there are three besides checks,
-    and the list for `calibrate yard`.
+    """Locate all picks of a list's targets, fit the yard frame, and write the list for `calibrate yard`.
 
-    listed: CSV as `read_places` takes it. sigma_m: of a coordinate's survey where it doesn't say. Raises
-    InputError naming the line of the list, or the target whose pick can't be placed.
+    The fit needs three targets that aren't checks. listed: CSV as `read_places` reads it. sigma_m: survey
+    accuracy of a coordinate, if the list has none. Raises InputError naming the line of the list, or the
+    target whose pick can't be located.
     """
     survey = _opened(survey_folder(connection, map_id), map_id)
     names, places = read_places(LISTED, listed)
@@ -170,11 +175,10 @@ def fit_targets(
 
 
 def place_pick(heights: YardMap, travel: Travel | None, pick: Pick) -> PickedPlace:
-    """Place a pick: x and y of the column or the disc beside it, or its own, and the height of the face that
-    it lies on.
+    """Locate a pick: x and y of its column, of the disc near it or of itself, and the height of its face.
 
-    Raises InputError naming the target where that wasn't measured, where the height jumps, or where no such
-    column stands.
+    Raises InputError naming the target if that wasn't measured, if the height jumps, or if there is no such
+    column.
     """
     part = _around(heights, pick)
     cell_m, corner = part.cell_m, (part.x0_m, part.y0_m)
@@ -201,8 +205,9 @@ def place_pick(heights: YardMap, travel: Travel | None, pick: Pick) -> PickedPla
 
 
 def _face_height(part: HeightMap, near: Bool, known: Bool, name: str) -> tuple[float, tuple[float, float]]:
-    """Take the median height of the face that the known cells (rows, columns) near a pick show: height, the
-    map's sigma of it, and the heights' scatter.
+    """Compute the median height of the face around a pick from its known cells (rows, columns).
+
+    Returns the height, the map's sigma of it, and the scatter of the heights.
     """
     if known.sum() < MIN_SHARE * near.sum():
         raise InputError(name, "about its pick too few heights were measured", "pick a place that was")
@@ -216,10 +221,10 @@ def _face_height(part: HeightMap, near: Bool, known: Bool, name: str) -> tuple[f
 
 
 def _column_top(part: HeightMap, travel: Travel | None, pixel: Float64, pick: Pick) -> tuple[Float64, float]:
-    """Find the level top that a pick lies on, holes in it too: its middle (2,), column and row, and by how
-    much its width is off the column's.
+    """Find the level top around a pick, with its holes filled.
 
-    Raises InputError where none as wide ends on all sides.
+    Returns its centre (2,) in column and row, and the error of its width relative to the column's, m. Raises
+    InputError if there is no top of that width.
     """
     assert pick.width_m is not None
     remedy = "pick the column's top, and list its width"
@@ -240,7 +245,7 @@ def _column_top(part: HeightMap, travel: Travel | None, pixel: Float64, pick: Pi
 
 
 def _pixel_m(travel: Travel | None, z_m: float, cell_m: float) -> float:
-    """Return a pixel's size at a height; a cell's where it isn't known."""
+    """Return the size of a pixel at a height; that of a cell if unknown."""
     pixel_m = float("nan") if travel is None else travel.pixel_m(z_m)
     return pixel_m if math.isfinite(pixel_m) else cell_m
 
@@ -253,7 +258,7 @@ def _expect_apart(picks: Sequence[Pick], found: Sequence[PickedPlace]) -> None:
 
 
 def _around(heights: YardMap, pick: Pick) -> HeightMap:
-    """Read the map about a pick. Raises InputError where it lies outside."""
+    """Read the map around a pick. Raises InputError if it is outside the map."""
     cell_m, (high, wide) = heights.cell_m, heights.shape
     x, y = (pick.x_m - heights.x0_m) / cell_m, (pick.y_m - heights.y0_m) / cell_m
     if not (-0.5 < x < wide - 0.5 and -0.5 < y < high - 0.5):
@@ -267,7 +272,7 @@ def _around(heights: YardMap, pick: Pick) -> HeightMap:
 
 
 def _fitted(targets: Targets, frame: str) -> tuple[dict[str, Any] | None, Float64 | None]:
-    """Register the frame as `calibrate yard` does: what it tells, and off_m (N, 3), None while it can't."""
+    """Register the frame as `calibrate yard` does: its results and off_m (N, 3), None if it can't be."""
     if (~targets.checks).sum() < MIN_TARGETS:
         return None, None
     covariance = targets.sigma_m[:, None, None] ** 2 * np.eye(3)

@@ -1,4 +1,4 @@
-"""Watch the store for additions, of this process or another, and keep the documents of its present state."""
+"""Watch the store for additions by any process, and keep the documents of its current state."""
 
 from __future__ import annotations
 
@@ -47,8 +47,9 @@ HEARTBEAT_S = 10.0
 
 @dataclass(frozen=True, eq=False)
 class Published:
-    """Documents that the page reads, as one revision of the store has them. revision: rows of the audit log.
-    documents: JSON by name. at_ns: when it was, by this computer's clock.
+    """Documents for the page at one revision of the store.
+
+    revision: number of rows of the audit log. documents: JSON by name. at_ns: time by this computer's clock.
     """
 
     revision: int = -1
@@ -67,8 +68,9 @@ class Published:
 
 
 class StoreWatch:
-    """Runs in a thread of its own; requests read what it published last. crane: JSON of the live run's crane,
-    empty where none is watched.
+    """Runs in a separate thread; requests read its last publication.
+
+    crane: JSON of the live run's crane, empty without a live run.
     """
 
     def __init__(self, store: Store, live: LiveFolder | None = None) -> None:
@@ -85,19 +87,19 @@ class StoreWatch:
         self._thread = threading.Thread(target=self._run, name="store watch", daemon=True)
 
     def start(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Begin to watch; who waits for events does so in this loop."""
+        """Start watching; clients that wait for events do so in this loop."""
         self._loop, self._changed = loop, asyncio.Event()
         self._thread.start()
 
     def stop(self) -> None:
-        """End it, and all streams of events."""
+        """Stop watching, and end all event streams."""
         self._stop.set()
         self._thread.join(10.0)
         if self._changed is not None:
             self._changed.set()
 
     def refresh(self) -> None:
-        """Publish anew where the store has more rows than were published."""
+        """Publish again if rows were added to the store."""
         with self._lock:
             with self.store.reading() as connection:
                 at_ns = time.time_ns()
@@ -124,7 +126,7 @@ class StoreWatch:
         self._wake()
 
     def look_at_crane(self) -> None:
-        """Read where the crane of the live run is, and tell it where it moved."""
+        """Read the live crane's position, and report it if it has moved."""
         if self.live is None:
             return
         layers = self.published.layers
@@ -133,7 +135,7 @@ class StoreWatch:
             self._wake()
 
     def judge(self, *, with_chain: bool = False) -> None:
-        """Settle alarms, and let offers end whose time is over or whose calibration was changed."""
+        """Settle alarms, and end offers that have expired or whose calibration was changed."""
         self.health = None if self.live is None else self.live.look()
         judged = {code for code in ALARM_CODES if code != "store-broken" or with_chain}
         if self.live is None and self._has_begun:  # another server may watch the live run
@@ -153,8 +155,8 @@ class StoreWatch:
         self.refresh()
 
     async def events(self) -> AsyncIterator[bytes]:
-        """Stream server-sent events: the newest revision and the crane's place, whenever there is a newer one
-        than was sent. A reader that is slow skips those in between.
+        """Stream server-sent events: each new revision and crane position. A slow reader skips those in
+        between.
         """
         sent, told = -1, b""
         while not self._stop.is_set():
@@ -194,6 +196,6 @@ class StoreWatch:
                     judged_s, verified_s = now_s, now_s if with_chain else verified_s
                 self.refresh()
                 self.problem = None
-            except (BarsightError, OSError) as error:  # a database or a disk that is away comes back
+            except (BarsightError, OSError) as error:  # a database or a disk may be back later
                 self.problem = str(error)
             self._stop.wait(LOOK_S)

@@ -1,1 +1,1 @@
-"""The page's API: its routes, the forms that they take, and the server that runs them."""
+"""Define the page's API: its routes, their forms, and the server that runs them."""

@@ -1,4 +1,4 @@
-"""Find who calls the page's API, check the right to it, and name the caller in the audit log."""
+"""Identify the callers of the page's API, check their rights, and name them in the audit log."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ with extra("page"):
 
 
 def need(access: Access, right: Right) -> Any:
-    """Make the dependency that finds the caller and checks the right; changes by a browser need its token."""
+    """Make the dependency that identifies the caller and checks the right; browsers' changes need the
+    token.
+    """
 
     async def find(request: Request) -> Caller:
         caller = access.caller(request.headers.get("cookie", ""), request.headers.get("authorization", ""))
@@ -26,7 +28,7 @@ def need(access: Access, right: Right) -> Any:
 
 
 def signature(caller: Caller, name: str = "") -> str:
-    """Name the caller for the audit log; who has no account says a name."""
+    """Name the caller for the audit log; a caller without an account gives a name."""
     if caller.csrf is not None and caller.name == "local" and name.strip():
         return f"{name.strip()} (no account)"
     return f"{caller.name} ({caller.role})"

@@ -31,7 +31,7 @@ with extra("page"):
 
 
 def add_lifts(app: FastAPI, watch: StoreWatch, access: Access) -> None:
-    """Add confirmation and end of lifts, vetoes, and decisions on the stock list."""
+    """Add the routes for confirmation and end of lifts, vetoes, and decisions on the stock list."""
     operate, execute, report = (need(access, right) for right in ("operate", "execute", "report"))
 
     def done(change: Callable[[], None]) -> dict[str, int]:
@@ -67,7 +67,7 @@ def add_lifts(app: FastAPI, watch: StoreWatch, access: Access) -> None:
 
 
 def add_alarms(app: FastAPI, watch: StoreWatch, access: Access) -> None:
-    """Add alarms' raising, acknowledgement and clearing."""
+    """Add the routes to raise, acknowledge and clear alarms."""
     operate, report = need(access, "operate"), need(access, "report")
 
     def change(who: str, what: str, act: Callable[[Entry], object]) -> dict[str, int]:
@@ -101,7 +101,7 @@ def add_alarms(app: FastAPI, watch: StoreWatch, access: Access) -> None:
 
 
 def add_accounts(app: FastAPI, watch: StoreWatch, access: Access) -> None:
-    """Add the accounts' list, their making and their withdrawal."""
+    """Add the routes to list, add and withdraw accounts."""
     engineer = need(access, "administer")
 
     @app.get("/api/accounts")
@@ -129,7 +129,7 @@ def add_accounts(app: FastAPI, watch: StoreWatch, access: Access) -> None:
 
 
 def add_calibrations(app: FastAPI, watch: StoreWatch, access: Access) -> None:
-    """Add the approval of a calibration."""
+    """Add the route to approve a calibration."""
     engineer = need(access, "administer")
 
     @app.post("/api/calibrations")

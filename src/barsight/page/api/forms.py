@@ -1,4 +1,4 @@
-"""Define the forms that requests carry to the page's API."""
+"""Define the forms of requests to the page's API."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class LogInForm(BaseModel):
 
 
 class ConfirmForm(BaseModel):
-    """The map that the operator saw, and the operator's name where the store has no accounts."""
+    """The map that the operator saw, and the operator's name if the store has no accounts."""
 
     map_id: str = Field(max_length=64)
     name: str = Field("", max_length=60)
@@ -31,7 +31,7 @@ class NoteForm(BaseModel):
 
 
 class EndForm(NoteForm):
-    """End of a lift that was not taken: `expired` (declined, or taken back) or `failed`."""
+    """End of a lift that was not taken: `expired` (declined, or withdrawn) or `failed`."""
 
     state: str
 
@@ -44,7 +44,7 @@ class AlarmForm(BaseModel):
 
 
 class VetoForm(BaseModel):
-    """A veto against the newest map, by a code of the reference of codes."""
+    """A veto against the newest map, by a code from the reference of codes."""
 
     code: str
     reason: str = Field(min_length=1, max_length=1000)
@@ -59,14 +59,14 @@ class DecisionForm(NoteForm):
 
 
 class ApprovalForm(NoteForm):
-    """A calibration and for how long it is approved, from now on."""
+    """A calibration and the period of its approval, from now on."""
 
     digest: str = Field(max_length=64)
     until_ns: int | None = None
 
 
 class PickForm(BaseModel):
-    """A target's pick in a survey's map, m. is_exact: take the place itself, no disc beside it."""
+    """A target's pick in a survey's map, m. is_exact: use the picked position, not a disc near it."""
 
     name: str = Field(max_length=200)
     x_m: float
@@ -75,7 +75,7 @@ class PickForm(BaseModel):
 
 
 class TargetsForm(BaseModel):
-    """A list of surveyed places (CSV), the sigma of a coordinate where it says none, and the picks."""
+    """A list of surveyed places (CSV), the sigma of a coordinate for lists without one, and the picks."""
 
     listed: str = Field(min_length=1, max_length=200_000)
     sigma_m: float
@@ -83,7 +83,7 @@ class TargetsForm(BaseModel):
 
 
 class AccountForm(BaseModel):
-    """An account to add or change. password: of a person; a token is drawn for a program."""
+    """An account to add or change. password: of a person; for a program a token is generated."""
 
     name: str
     kind: str = Field(pattern="^(person|token)$")

@@ -1,4 +1,4 @@
-"""Build the routes that change nothing: documents, pictures, files, fits of surveyed places."""
+"""Build the read-only routes: documents, pictures, files, fits of surveyed places."""
 
 from __future__ import annotations
 
@@ -30,11 +30,13 @@ _SANDBOX = (
     "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
     "img-src data:"
 )
-"""Of a survey's own files: a report runs its scripts apart from the page and reaches nothing."""
+"""Content security policy of a survey's own files: a report runs its scripts isolated and can reach
+nothing.
+"""
 
 
 def add_reading(app: FastAPI, watch: StoreWatch, access: Access) -> None:
-    """Add the documents on the yard and the store, events among them, and the yard as it was."""
+    """Add the routes for the documents on yard and store, including events and the yard at a past time."""
     reader = need(access, "read")
 
     def add_document(name: str) -> None:
@@ -86,7 +88,7 @@ def add_reading(app: FastAPI, watch: StoreWatch, access: Access) -> None:
 
 
 def add_files(app: FastAPI, watch: StoreWatch, access: Access) -> None:
-    """Add layers, pictures, models and files of surveys, and the health of what runs."""
+    """Add the routes for layers, pictures, models and files of surveys, and for the health of a live run."""
     painted = PaintedLayers()
     reader = need(access, "read")
 
@@ -133,7 +135,7 @@ def add_files(app: FastAPI, watch: StoreWatch, access: Access) -> None:
 
 
 def add_targets(app: FastAPI, watch: StoreWatch, access: Access) -> None:
-    """Add a survey's grid and photo to pick surveyed places in, and the yard frame's fit to them."""
+    """Add the routes to pick surveyed places in a survey's grid and photo, and to fit the yard frame."""
     reader, engineer = need(access, "read"), need(access, "administer")
 
     @app.get("/api/surveys/{map_id}/targets")
@@ -155,5 +157,5 @@ def add_targets(app: FastAPI, watch: StoreWatch, access: Access) -> None:
 
 
 def identity_number(name: str) -> int:
-    """Read a bundle's number from its name; 0, which none has, where it is no name."""
+    """Read a bundle's number from its name; 0, which no bundle has, for an invalid name."""
     return int(name[1:]) if name[:1] == "B" and name[1:].isdigit() and len(name) < 10 else 0

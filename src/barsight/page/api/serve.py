@@ -1,4 +1,4 @@
-"""Run the page's server: check who may reach it and how before a port is opened."""
+"""Run the page's server; before a port is opened, check that access to it is restricted."""
 
 from __future__ import annotations
 
@@ -31,9 +31,10 @@ USUAL_PORTS = {"http": ":80", "https": ":443"}
 
 @dataclass(frozen=True)
 class ServeOptions:
-    """Addresses at which the page is reached. public_url: what browsers call it, where that isn't this
-    computer's loopback.
-    certificate, key: PEM files for TLS. live: a live run's folder.
+    """Addresses at which the page is reached.
+
+    public_url: URL for browsers if it isn't this computer's loopback. certificate, key: PEM files for TLS.
+    live: a live run's folder.
     """
 
     host: str = "127.0.0.1"
@@ -63,14 +64,14 @@ class ServeOptions:
 
     @property
     def is_loopback(self) -> bool:
-        """Check that only this computer reaches the address."""
+        """Check that the address can only be reached from this computer."""
         try:
             return self.host == "localhost" or ipaddress.ip_address(self.host).is_loopback
         except ValueError:
             return False
 
     def names(self, port: int) -> tuple[frozenset[str], frozenset[str]]:
-        """List the hosts and origins that requests may carry; browsers leave out a scheme's usual port."""
+        """List the hosts and origins that requests may name; browsers leave out a usual port."""
         scheme = "https" if self.certificate else "http"
         served = [(scheme, f"{name}:{port}") for name in ("127.0.0.1", "localhost", "[::1]")]
         if self.public_url is not None:
@@ -80,7 +81,7 @@ class ServeOptions:
 
 
 def serve(url: str, options: ServeOptions) -> None:
-    """Serve a store's page until Ctrl-C and print where. Raises ConfigError where it would stand open."""
+    """Serve a store's page until Ctrl-C and print its address. Raises ConfigError if it were unprotected."""
     with serving(url, options) as address:
         print(f"{address} (Ctrl-C ends it)", flush=True)
         with contextlib.suppress(KeyboardInterrupt):
@@ -89,7 +90,7 @@ def serve(url: str, options: ServeOptions) -> None:
 
 @contextlib.contextmanager
 def serving(url: str, options: ServeOptions) -> Iterator[str]:
-    """Serve as long as the context is open; yields the address."""
+    """Serve while the context is open; yield the address."""
     with open_store(url) as store:
         _expect_accounts(store, options)
         with contextlib.closing(_bind(options)) as listener:
@@ -120,7 +121,7 @@ def serving(url: str, options: ServeOptions) -> Iterator[str]:
 
 
 def _is_no_cancelled_stream(record: logging.LogRecord) -> bool:
-    """Leave out that streams of events were still open when the server ended: they always are."""
+    """Suppress the message that event streams were still open when the server ended: they always are."""
     return "timeout graceful shutdown exceeded" not in record.getMessage() and "CancelledError" not in str(
         record.exc_info
     )

@@ -1,4 +1,4 @@
-"""Log in and out of the page, and tell who is logged in."""
+"""Log in and out of the page, and report who is logged in."""
 
 from __future__ import annotations
 
