@@ -1,4 +1,4 @@
-"""Build the viewer's points: every height seen or the elected surface, coloured by a property."""
+"""Build the viewer's points: all measured heights or the map's surface, coloured by a property."""
 
 from __future__ import annotations
 
@@ -25,8 +25,9 @@ _PATCH_CELLS = 2048
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """xyz_m: (N, 3) float32. properties: (N,) each, by the names that it can be coloured by (height and sigma
-    in mm). total: points before thinning."""
+    """xyz_m: (N, 3) float32. properties: (N,) each, by name, for colouring (height and sigma in mm). total:
+    number of points before thinning.
+    """
 
     xyz_m: Float32
     properties: dict[str, Float32]
@@ -35,8 +36,7 @@ class Layer:
 
 @dataclass(frozen=True, eq=False)
 class Colouring:
-    """rgb: (N, 3) uint8. ramp: (256, 3) uint8, the scale's colours from left to right. caption: what they
-    mean."""
+    """rgb: (N, 3) uint8. ramp: (256, 3) uint8, the colour scale from left to right. caption: its meaning."""
 
     rgb: UInt8
     ramp: UInt8
@@ -44,7 +44,7 @@ class Colouring:
 
 
 def seen_layer(cloud: Cloud) -> Layer:
-    """Collect every height that enough views support: sides and lower surfaces too."""
+    """Collect every height supported by enough views, including sides and lower surfaces."""
     values = {
         "height": cloud.xyz_m[:, 2] * 1e3,
         "intensity": cloud.intensity,
@@ -55,7 +55,7 @@ def seen_layer(cloud: Cloud) -> Layer:
 
 
 def surface_layer(yard: YardMap, max_points: int) -> Layer:
-    """Collect the known cells of the map, filled ones too, at most `max_points` of them, evenly drawn."""
+    """Collect at most `max_points` evenly drawn known cells of the map, including filled ones."""
     cuts = list(patches(yard, _PATCH_CELLS))
     known = np.cumsum([0, *((yard.part(*cut).source != HeightSource.UNKNOWN).sum() for cut in cuts)])
     total = int(known[-1])
@@ -78,7 +78,7 @@ def surface_layer(yard: YardMap, max_points: int) -> Layer:
 
 
 def colour_layer(layer: Layer, by: str) -> Colouring:
-    """Colour the points by one of their properties; the ends of a scale leave out 1 % of outliers."""
+    """Colour the points by one of their properties; 1 % of outliers are outside the colour scale."""
     values = layer.properties[by]
     if by == "source":
         return _by_source(values)
@@ -110,7 +110,7 @@ def _by_source(codes: Float32) -> Colouring:
 
 
 def _ramp(scale: int | None) -> UInt8:
-    """Sample (256, 3) RGB from low to high on one of OpenCV's scales; None is gray."""
+    """Sample (256, 3) RGB from low to high on one of OpenCV's scales; None for gray."""
     levels = np.arange(256, dtype=np.uint8)[:, None]
     painted = np.repeat(levels, 3, axis=1) if scale is None else cv2.applyColorMap(levels, scale)[:, 0, ::-1]
     return np.ascontiguousarray(painted, dtype=np.uint8)

@@ -1,4 +1,4 @@
-"""Serve `barsight view`: surface, cloud, camera's way and contours in the browser, by this machine."""
+"""Serve `barsight view`: surface, cloud, camera path and contours in the browser of this computer."""
 
 from __future__ import annotations
 
@@ -48,10 +48,10 @@ LASER_RGB, CONTOUR_RGB, PATH_RGB = (230, 40, 40), (255, 140, 0), (30, 110, 200)
 
 
 def view(out_dir: Path, port: int = 8080, open_browser: bool = True, max_points: int = MAX_POINTS) -> None:
-    """Serve the folder until Ctrl-C and print where. Port 0 takes a free one.
+    """Serve the folder until Ctrl-C and print the URL. Port 0 chooses a free one.
 
-    Raises InputError for a folder without a readable result.json and cloud.ply, OutputError where the port
-    is taken or may not be used.
+    Raises InputError for a folder without a readable result.json and cloud.ply, OutputError if the port is
+    taken or may not be used.
     """
     with serving(out_dir, port, max_points) as url:
         print(f"{out_dir}: {url} (Ctrl-C ends it)", flush=True)
@@ -63,7 +63,7 @@ def view(out_dir: Path, port: int = 8080, open_browser: bool = True, max_points:
 
 @contextlib.contextmanager
 def serving(out_dir: Path, port: int, max_points: int = MAX_POINTS) -> Iterator[str]:
-    """Serve the folder to this machine's browsers as long as the context is open; yields the URL."""
+    """Serve the folder to this computer's browsers while the context is open; yield the URL."""
     summary, _ = open_folder(out_dir, cloud=True)
     cloud = read_cloud(out_dir / "cloud.ply", max_points)
     path, laser, contours = read_path(out_dir), read_laser(out_dir), read_contours(out_dir)
@@ -95,14 +95,14 @@ def serving(out_dir: Path, port: int, max_points: int = MAX_POINTS) -> Iterator[
 
 
 def _quiet() -> contextlib.redirect_stdout[io.StringIO]:
-    """Silence viser, which announces itself in a box; the command line prints its own line."""
+    """Suppress viser's own announcement; the command prints its own line."""
     return contextlib.redirect_stdout(io.StringIO())
 
 
 @contextlib.contextmanager
 def _own_pages_only() -> Iterator[None]:
-    """Let the server that is started here refuse what other pages in the same browser ask of it: a Host or an
-    Origin that isn't this machine's. viser has no setting for it, so its websockets server gets the check.
+    """Make the server that is started here refuse requests from other pages in the same browser, with a
+    foreign Host or Origin. viser has no setting for it, so its websockets server gets the check.
     """
     library: Any = _infra
     module = library.websockets.asyncio.server
@@ -128,7 +128,7 @@ def _own_pages_only() -> Iterator[None]:
 
 
 def _expect_free(port: int) -> None:
-    """Refuse a taken port: viser silently takes the next one; here that is an error."""
+    """Raise an error if the port is taken, as viser silently takes the next one."""
     if not 0 <= port <= 65535:
         raise OutputError(f"port {port} does not exist; name a port from 1024 to 65535")
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
@@ -141,7 +141,7 @@ def _expect_free(port: int) -> None:
 
 
 def _aim(server: viser.ViserServer, cloud: Cloud, path: CameraPath | None) -> None:
-    """Look at the bulk of the points and the camera's way, obliquely from the side of low y and above."""
+    """Aim at most of the points and the camera path, obliquely from above on the low-y side."""
     low, high = np.percentile(cloud.xyz_m, (2, 98), axis=0).astype(np.float64)
     if path is not None and path.stamp_ns.size:
         low, high = (
@@ -157,7 +157,7 @@ def _aim(server: viser.ViserServer, cloud: Cloud, path: CameraPath | None) -> No
 
 
 def _show_points(server: viser.ViserServer, layers: dict[str, Layer]) -> None:
-    """Show one of the layers at a time, and what colours it."""
+    """Show one of the layers at a time, with a choice of its colouring."""
     shown = server.gui.add_dropdown("Show", tuple(layers))
     by = server.gui.add_dropdown("Colour by", tuple(layers[shown.value].properties))
     scale = server.gui.add_image(_legend(np.zeros((256, 3), np.uint8)))
@@ -194,12 +194,12 @@ def _show_points(server: viser.ViserServer, layers: dict[str, Layer]) -> None:
 
 
 def _legend(ramp: UInt8) -> UInt8:
-    """Draw the colours as a picture (12, 256, 3), low at the left."""
+    """Draw the colour scale as a picture (12, 256, 3), low at the left."""
     return np.tile(ramp, (12, 1, 1))
 
 
 def _spacing_m(xyz_m: Float32) -> float:
-    """Estimate the distance of neighbouring points: the bulk's area shared by the points, 2 mm to 100 mm."""
+    """Estimate the distance between neighbouring points from the area of most points: 2 mm to 100 mm."""
     low, high = np.percentile(xyz_m[:, :2], (2, 98), axis=0)
     area = float(np.prod(np.maximum(high - low, 0.01)))
     return float(np.clip(np.sqrt(area / len(xyz_m)), 0.002, 0.1))
@@ -238,7 +238,7 @@ def _show_lines(
 
 
 def _show_yard(server: viser.ViserServer, yard: dict[str, Float32]) -> None:
-    """Show boxes and axes of the bundles, the magnet's poles at offered lifts."""
+    """Show boxes and axes of the bundles, and the magnet's poles at offered lifts."""
     if {"free", "covered"} & set(yard):
         _checkbox(server, "Bundles", "/bundles", True)
     if "poles" in yard:
@@ -266,7 +266,7 @@ def _line(server: viser.ViserServer, name: str, points_m: Float64, rgb: tuple[in
 
 
 def line_segments(points_m: Float64) -> Float32:
-    """Join consecutive points of (N, 3) to segments (M, 2, 3), open where a point is unknown.
+    """Join consecutive points of (N, 3) to segments (M, 2, 3), with gaps at unknown points.
 
     A line of more than MAX_LINE_POINTS points is thinned.
     """

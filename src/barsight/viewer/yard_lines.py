@@ -13,13 +13,13 @@ from barsight.yard.lifting.lift_file import read_lifts
 from barsight.yard.types import Bundle
 
 POLE_HEIGHT_M = 0.15
-"""How high a pole is drawn above its face."""
+"""Height in metres of a pole drawn above its face."""
 _EDGES = [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)]
 
 
 def yard_lines(out_dir: Path) -> dict[str, Float32]:
-    """Collect segments (N, 2, 3) by name: free and covered bundles' boxes, axes, poles; without what isn't
-    there.
+    """Collect segments (N, 2, 3) by name: boxes of free and covered bundles, axes, poles; absent ones are
+    left out.
     """
     lines: dict[str, list[Float64]] = {"free": [], "covered": [], "axes": [], "poles": []}
     if (out_dir / "bundles.json").is_file():
@@ -33,8 +33,8 @@ def yard_lines(out_dir: Path) -> dict[str, Float32]:
 
 
 def bundle_box(bundle: Bundle) -> Float64:
-    """Compute edges (12, 2, 3) of the box around a bundle: its width, its length, from its top down by its
-    width.
+    """Compute edges (12, 2, 3) of the box around a bundle: its width, its length, and its width as the
+    height.
     """
     along = bundle.direction
     across = np.array([np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad), 0.0])
@@ -45,7 +45,7 @@ def bundle_box(bundle: Bundle) -> Float64:
 
 
 def pole_boxes(lift: dict[str, Any], poles: list[dict[str, float]]) -> Float64:
-    """Compute edges (12 * P, 2, 3) of the poles as they lie."""
+    """Compute edges (12 * P, 2, 3) of the poles at their places."""
     target = lift["target"]
     yaw, pitch = np.radians(target["yaw_deg"]), np.radians(lift["pitch_deg"])
     roll = np.radians(lift["roll_deg"])
@@ -66,7 +66,7 @@ def pole_boxes(lift: dict[str, Any], poles: list[dict[str, float]]) -> Float64:
 
 
 def _box(middle: Float64, a: Float64, b: Float64, c: Float64) -> Float64:
-    """Compute edges (12, 2, 3) of a box by its middle and half sides."""
+    """Compute edges (12, 2, 3) of a box from its centre and half sides."""
     corners = np.array([middle + s * c + p for s in (-1, 1) for p in (-a - b, a - b, a + b, b - a)])
     edges: Float64 = corners[np.array(_EDGES)]
     return edges
