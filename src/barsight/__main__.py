@@ -1,4 +1,4 @@
-"""`python -m barsight` is the command `barsight`."""
+"""Run the command `barsight` by `python -m barsight`."""
 
 from barsight.cli.main import main
 

@@ -1,4 +1,4 @@
-"""The Python API: what `import barsight as bs` offers, each a thin call of the library."""
+"""Define the Python API of `import barsight as bs`, each function a thin call of the library."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ def measure(
     advance: ProgressCallback = ignore_progress,
     **settings: Any,
 ) -> Yard:
-    """Measure a recording; the files lie in a temporary folder, which goes with the yard unless saved.
+    """Measure a recording; the files are in a temporary folder, which is deleted with the yard unless saved.
 
     recording: one, or several passes over one yard, which become one map.
 
-    magnet: TOML file of the magnet that lifts are chosen for; without it none is offered. at: when lifts are
-    judged: now, or at the recording's end, to look back. advance: told of progress (stage, done, total).
-    settings: fields of `MeasureSettings`; those of a stage as a mapping, `map={"cell_m": 0.02}`.
-    Raises a BarsightError whose text is one line where nothing can be measured.
+    magnet: TOML file of the magnet that lifts are chosen for; without it none is offered. at: time at which
+    lifts are judged: now, or the recording's end, in retrospect. advance: called with progress (stage, done,
+    total). settings: fields of `MeasureSettings`; those of a stage as a mapping, `map={"cell_m": 0.02}`.
+    Raises a BarsightError with a one-line text if nothing can be measured.
     """
     chosen = build_settings({"preset": preset, **settings}, MeasureSettings)
     described = None if magnet is None else Path(magnet)
@@ -68,7 +68,7 @@ def measure(
 
 
 def load(folder: Path | str) -> Yard:
-    """Return the yard of a folder that `barsight measure` or `Yard.save` wrote. Raises InputError."""
+    """Return the yard of a folder written by `barsight measure` or `Yard.save`. Raises InputError."""
     return Yard(Path(folder))
 
 
@@ -80,10 +80,10 @@ def disparity(
     range_px: tuple[int, int] | None = None,
     **settings: Any,
 ) -> Disparity:
-    """Match two pictures: the left one's disparity and its sigma, px, NaN where there is no match.
+    """Match two pictures: the left one's disparity and its sigma, px, NaN without a match.
 
-    left, right: files or (H, W) uint8, rectified unless a rig is given. range_px: candidates from, to; found
-    from the pictures if None. settings: fields of `StereoSettings`.
+    left, right: files or (H, W) uint8, rectified unless a rig is given. range_px: first and last candidate;
+    determined from the pictures if None. settings: fields of `StereoSettings`.
     """
     if range_px is not None:
         settings |= {"min_disparity_px": range_px[0], "max_disparity_px": range_px[1]}
@@ -95,9 +95,9 @@ def disparity(
 def calibrate_stereo(
     pictures: Path | str, board: str, *, lens: str = Lens.RADTAN4.value, max_views: int = 150
 ) -> StereoCalibration:
-    """Calibrate two cameras from pictures of a board that both see; `.rig` is what measuring needs.
+    """Calibrate two cameras from pictures of a board seen by both; `.rig` is the input for measuring.
 
-    pictures, board, lens: as `barsight calibrate stereo` takes them.
+    pictures, board, lens: as for `barsight calibrate stereo`.
     """
     expect_choice("lens", lens, tuple(one.value for one in Lens))
     target, path = parse_board(board), Path(pictures)

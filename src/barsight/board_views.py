@@ -1,4 +1,4 @@
-"""Views of a calibration board from pictures, recordings or files of detections."""
+"""Collect views of a calibration board from pictures, recordings or files of detections."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Size = tuple[int, int]
 def views_from_detections(
     folder: Path, board: Board, max_views: int, resolution: str | None
 ) -> tuple[list[BoardView], tuple[Size, Size], list[Removed]]:
-    """Read the views of a folder of detections, their cameras' sizes and what is left out.
+    """Read the views in a folder of detections, the cameras' sizes and the views left out.
 
     resolution: WIDTHxHEIGHT of the cameras. Raises ConfigError without it.
     """
@@ -41,7 +41,7 @@ def views_from_detections(
 def views_from_pictures(
     path: Path, board: Board, max_views: int, advance: Callable[[str, int, int], None]
 ) -> tuple[list[BoardView], tuple[Size, Size], list[Removed]]:
-    """Detect the board in pairs of pictures, or of a bag: views, the cameras' sizes, what is left out."""
+    """Detect the board in pairs of pictures, or of a bag: views, the cameras' sizes, views left out."""
     count, pairs = _pairs(path, max_views)
     views: list[BoardView] = []
     left_out: list[Removed] = []

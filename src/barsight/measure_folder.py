@@ -29,7 +29,7 @@ from barsight.yard.magnet.description import load_magnet
 
 
 def ignore_progress(stage: str, done: int, total: int) -> None:
-    """Take progress that nobody asked for."""
+    """Ignore progress; the default callback."""
 
 
 def measure_into(
@@ -45,12 +45,12 @@ def measure_into(
     judged_at: Literal["now", "end"] = "now",
     report: bool = True,
 ) -> dict[str, Any]:
-    """Measure, write all files and, if asked, the report into `out`; return what result.json says.
+    """Measure, write all files and, if requested, the report into `out`; return the content of result.json.
 
-    paths: a recording, or several passes over one yard, which become one map.
-    resume: keep what is done in `.NAME.resume` beside `out`, and go on from what is there.
-    truth_of: a recording with truth to score against; only after the measuring is done. judged_at: when
-    lifts are judged, see `barsight.pipeline.lift_choice.LiftRequest`.
+    paths: a recording, or several passes over one yard, which become one map. resume: keep completed work in
+    `.NAME.resume` beside `out`, and continue from what is there. truth_of: a recording with ground truth to
+    evaluate against, only after measuring. judged_at: time at which lifts are judged, see
+    `barsight.pipeline.lift_choice.LiftRequest`.
     """
     expect_choice("at", judged_at, ("now", "end"))
     chosen = [paths] if isinstance(paths, Path) else list(paths)
@@ -82,7 +82,7 @@ def write_measured(
     truth_of: Path | None = None,
     report: bool = True,
 ) -> dict[str, Any]:
-    """Measure open recordings; see `measure_into`. keep: a folder of checkpoints to go on from."""
+    """Measure open recordings; see `measure_into`. keep: a folder of checkpoints to continue from."""
     with atomic_directory(out, replace=overwrite, owned=RESULT_FILES) as staging:
         scratch = staging / "scratch"
         scratch.mkdir()
@@ -98,7 +98,7 @@ def write_measured(
         write_tables(measured, staging)
         write_results(measured, seal_map(content, staging), staging)
         shutil.rmtree(scratch)
-        read_tile.cache_clear()  # 60 MB of tiles that are gone
+        read_tile.cache_clear()  # frees 60 MB of tiles that no longer exist
         if truth_of is not None:
             content["truth"] = score_folder(truth_of, staging)
         write_json(staging / "result.json", content)

@@ -1,4 +1,4 @@
-"""The settings of a measurement."""
+"""Define the settings of a measurement."""
 
 from __future__ import annotations
 
@@ -21,17 +21,22 @@ _FAST_SHIFT = 0.15
 
 @dataclass(frozen=True)
 class MeasureSettings:
-    """Settings of `barsight measure`; each stage gets its own part only."""
+    """Settings of `barsight measure`; each stage receives only its own part."""
 
     preset: Literal["best", "fast"] = "best"
-    """fast: the stereo preset `fast`, and pictures matched 0.15 of their shorter side apart, or further."""
+    """Choice between accuracy and speed. `fast`: the stereo preset `fast`, and only pictures are matched that
+    are at least 0.15 of their shorter side apart.
+    """
     use: tuple[Literal["stereo", "imu", "crane"], ...] = ("stereo", "imu", "crane")
-    """Sensors that may be used, where the recording has them."""
+    """Sensors that may be used if the recording has them."""
     self_calibrate: Literal["none", "yaw"] = "none"
-    """yaw: turn the right camera as the crane's known travel asks for (see `barsight calibrate check`)."""
+    """Correction of the rig by the travel. `yaw`: turn the right camera to agree with the crane's known
+    travel (see `barsight calibrate check`).
+    """
     yard: Path | None = None
-    """The file that `barsight calibrate yard` wrote: the map, its poses and lifts then lie in the surveyed
-    yard, and its sigma is in theirs."""
+    """File written by `barsight calibrate yard`: the map, its poses and lifts are then in the surveyed yard,
+    and their sigma includes that of the file.
+    """
     recording: RecordingSettings = field(default_factory=RecordingSettings)
     stereo: StereoSettings = field(default_factory=StereoSettings)
     motion: MotionSettings = field(default_factory=MotionSettings)

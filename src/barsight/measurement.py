@@ -1,4 +1,4 @@
-"""Define the record of a measurement that the result files and the report are written from."""
+"""Define the record of a measurement, from which the result files and the report are written."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from barsight.yard.types import Bundle
 
 @dataclass(frozen=True)
 class StageTime:
-    """Duration of a stage in all, seconds, and its number of frames (0 where it isn't done by frame)."""
+    """Total duration of a stage, seconds, and its number of frames (0 if it isn't done by frame)."""
 
     name: str
     seconds: float
@@ -49,7 +49,7 @@ class Refusal:
 
 @dataclass(frozen=True, eq=False)
 class Preview:
-    """One rectified left picture (H, W) uint8 and its disparity (H, W) float32, for people to look at."""
+    """One rectified left picture (H, W) uint8 and its disparity (H, W) float32, for inspection."""
 
     left: UInt8
     disparity_px: Float32
@@ -57,8 +57,8 @@ class Preview:
 
 @dataclass(frozen=True, eq=False)
 class BuiltMap:
-    """All views' map. placed: reference_from_rect0 of the views used, stamps_ns theirs. preview: of a view
-    about the middle.
+    """Map of all views. placed: reference_from_rect0 of the views used, stamps_ns: their stamps. preview: of
+    a view near the middle.
     """
 
     surface: Surface
@@ -73,8 +73,8 @@ class BuiltMap:
 @dataclass(frozen=True, eq=False)
 class PassRecord:
     """One of several passes, the oldest first. captured_ns: stamps of its first and last measured frame.
-    first_ns, last_ns: of its part of the trajectory. ties: with passes before it; changes, moves: which it
-    saw.
+
+    first_ns, last_ns: of its part of the trajectory. ties: with earlier passes; changes, moves: seen by it.
     """
 
     recording_path: Path
@@ -94,14 +94,13 @@ class PassRecord:
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """A measured recording; `surface` reads its tiles from a scratch folder that must still be there.
+    """A measured recording; `surface` reads its tiles from a scratch folder that must still exist.
 
-    rig_covariance: of yaw (rad), baseline and focal length (ratios) after the travel, (3, 3); None where no
-    rig file says it. seconds: by the clock on the wall; the stages' own seconds overlap. yard_frame_id:
-    digest of how the body hangs from the crane; None where the map isn't in the yard's frame. frame_id: name
-    of the frame that all places are in. passes: of several recordings; the recording is then the newest.
-    agreements: of vision alone. laser_checks: of the laser before it was fused; None where that wasn't asked
-    for.
+    rig_covariance: of yaw (rad), baseline and focal length (ratios) after the travel, (3, 3); None if no rig
+    file states it. seconds: wall-clock time; the stages' own seconds overlap. yard_frame_id: digest of the
+    mounting of the body on the crane; None if the map isn't in the yard's frame. frame_id: name of the frame
+    of all coordinates. passes: of several recordings; the recording is then the newest. agreements: of vision
+    alone. laser_checks: of the laser before it was fused; None if fusion wasn't requested.
     """
 
     recording_path: Path

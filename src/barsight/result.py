@@ -1,4 +1,4 @@
-"""A measured yard as Python sees it: a result folder, read as parts of it are asked for."""
+"""Represent a measured yard in Python: a result folder whose parts are read on demand."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ from barsight.yard.types import Bundle, HeightMap
 
 @dataclass(frozen=True)
 class LiftTarget:
-    """A lift: the magnet's place (yard frame), yaw of its beam, the bundles under it, and what forbids it.
+    """A lift: the magnet's position (yard frame), yaw of its beam, the bundles under it, and any vetoes.
 
-    rank: 1 is the safest; None where it is refused. z_m: None without a contact. valid_until_ns: on the
-    frames' clock, after which it must not be used. vetoes: (code, sentence).
-    record: everything that lifts.json says of it.
+    rank: 1 is the safest; None if it is refused. z_m: None without a contact. valid_until_ns: time on the
+    frames' clock after which it must not be used. vetoes: (code, sentence).
+    record: its complete content in lifts.json.
     """
 
     rank: int | None
@@ -54,9 +54,9 @@ class LiftTarget:
 
 @dataclass(frozen=True)
 class Lifts:
-    """offered: safest first, which iterating and `len` see. refused: one of each other bundle. vetoes: (code,
-    sentence) that forbid every lift of the map. past: what was offered as of the recording's end, where the
-    lifts look back (`at="end"`): never for a crane, and then nothing is offered.
+    """offered: safest first; iteration and `len` use these. refused: one of each other bundle. vetoes: (code,
+    sentence) that forbid every lift of the map. past: lifts offered as of the recording's end, if they were
+    judged in retrospect (`at="end"`): never for a crane, and then nothing is offered.
     """
 
     offered: tuple[LiftTarget, ...]
@@ -77,9 +77,9 @@ class Lifts:
 
 
 class Yard:
-    """A measured yard; `folder` holds its files, which are read when they are asked for.
+    """A measured yard; `folder` holds its files, which are read on demand.
 
-    owner: what `folder` goes with; it lives as long as the yard.
+    owner: object that `folder` belongs to; it lives as long as the yard.
     """
 
     def __init__(self, folder: Path, owner: object = None) -> None:
@@ -95,12 +95,12 @@ class Yard:
 
     @cached_property
     def contours(self) -> tuple[Contour, ...]:
-        """Heights along X, one contour for each profile."""
+        """Return the heights along X, one contour for each profile."""
         return read_contours(self.folder)
 
     @cached_property
     def trajectory(self) -> CameraPath:
-        """Return the body's poses. Raises InputError where the folder has none."""
+        """Return the body's poses. Raises InputError if the folder has none."""
         path = read_path(self.folder)
         if path is None:
             raise InputError(self.folder, "has no trajectory.tum", "measure the recording again")
@@ -117,7 +117,7 @@ class Yard:
 
     @property
     def lifts(self) -> Lifts:
-        """Return the lifts as they hold now: what is too old, or was disturbed since, is refused."""
+        """Return the lifts as currently valid: those too old, or disturbed since, are refused."""
         content = self._chosen
         offered, refused = (tuple(map(_target, content[name])) for name in ("lifts", "refused"))
         vetoes = _vetoes(content)
@@ -141,13 +141,13 @@ class Yard:
 
     @property
     def warnings(self) -> tuple[tuple[str, str], ...]:
-        """Return (code, sentence): of each warning."""
+        """Return code and sentence of each warning."""
         return tuple((str(one["code"]), str(one["message"])) for one in self.summary["warnings"])
 
     def save(self, out: Path | str, *, overwrite: bool = False) -> Path:
         """Write the result files and report.html into the folder `out`, all or nothing, and return it.
 
-        Raises OutputError where `out` exists already and may not be overwritten.
+        Raises OutputError if `out` exists already and may not be overwritten.
         """
         target = Path(out)
         if target.resolve() == self.folder.resolve():
@@ -170,7 +170,7 @@ class Yard:
         )
 
     def _repr_html_(self) -> str:
-        """Return the map as a picture with what was found in it, for a notebook."""
+        """Return the map as a picture with the bundles and lifts, for a notebook."""
         warnings = "".join(f"<li>{escape(text)}</li>" for _, text in self.warnings)
         return f"{self.height_map._repr_html_()}<p>{escape(self._figures())}</p><ul>{warnings}</ul>"
 

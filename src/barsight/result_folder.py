@@ -1,4 +1,4 @@
-"""Read back the folder that `barsight measure` wrote, for page, viewer, export and lifts."""
+"""Read the folder written by `barsight measure`, for page, viewer, export and lifts."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from barsight.yard.types import HeightMap
 MAP_FILES = ("height.tif", "free.tif", "tops.tif", "passes.tif", "cloud.ply")
 TABLES = ("contour.csv", "laser.csv", "trajectory.tum")
 SEALED = (*MAP_FILES, *TABLES)
-"""Files whose digests result.json carries."""
+"""Files whose digests are in result.json."""
 MAP_FIELDS = (
     "captured_from_ns", "captured_to_ns", "is_simulated", "reference", "hashes", "calibration_id",
     "yard_frame_id", "travel", "warnings", "map", "files",
@@ -60,7 +60,7 @@ class CameraPath:
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """xyz_m: (N, 3) float32. intensity, sigma_m, views: (N,) float32. total: points in the file."""
+    """xyz_m: (N, 3) float32. intensity, sigma_m, views: (N,) float32. total: number of points in the file."""
 
     xyz_m: Float32
     intensity: Float32
@@ -70,7 +70,7 @@ class Cloud:
 
 
 def read_summary(folder: Path) -> dict[str, Any]:
-    """Read result.json. Raises InputError where the folder or the file is missing or the file is torn."""
+    """Read result.json. Raises InputError if the folder or the file is missing or the file is damaged."""
     path = folder / "result.json"
     remedy = "name a folder that `barsight measure` wrote"
     if not folder.is_dir():
@@ -94,7 +94,7 @@ def identify_map(summary: dict[str, Any]) -> MapIdentity:
 
 
 def seal_map(summary: dict[str, Any], folder: Path) -> MapIdentity:
-    """Add to result.json's content the digests of the SEALED files, and the map's id."""
+    """Add the digests of the SEALED files and the map's id to the content of result.json."""
     files = (folder / name for name in SEALED)
     summary["files"] = {path.name: file_digest(path) for path in files if path.is_file()}
     identity = identify_map(summary)
@@ -111,11 +111,10 @@ def file_digest(path: Path) -> str:
 def open_folder(
     folder: Path, *, lifts: bool = True, cloud: bool = False
 ) -> tuple[dict[str, Any], MapIdentity | None]:
-    """Read result.json and check that the folder's files are the map's and unchanged; None for the identity
-    of a folder that holds neither bundles nor lifts.
+    """Read result.json and check that the folder's files belong to the map and are unchanged.
 
-    lifts, cloud: whether lifts.json and cloud.ply matter. Raises InputError for the first file that was
-    changed or belongs to another map.
+    Returns None as the identity of a folder with neither bundles nor lifts. lifts, cloud: whether lifts.json
+    and cloud.ply matter. Raises InputError for the first file that was changed or belongs to another map.
     """
     summary = read_summary(folder)
     path = folder / "result.json"
@@ -148,7 +147,7 @@ def open_folder(
 
 
 def _expect_form(file: Path) -> None:
-    """Refuse by its header a file that would take long to digest and is no map, cloud or table."""
+    """Refuse, by its header, a file that would take long to digest and is no map, cloud or table."""
     if file.name in TABLES:
         expect_lines(file, remedy=REMEDY)
     elif file.suffix == ".tif":
@@ -159,12 +158,12 @@ def _expect_form(file: Path) -> None:
 
 
 def bundles_digest(folder: Path) -> str:
-    """Return the digest that bundles.json carries. Raises InputError."""
+    """Return the digest stored in bundles.json. Raises InputError."""
     return str(bundle_file.bundles_content(folder / "bundles.json")[SEAL])
 
 
 def next_sequence(lifts: Path, identity: MapIdentity) -> int:
-    """Count on from the lifts.json that is there; 1 where there is none of this map."""
+    """Return the next sequence number after that of lifts.json; 1 if there is none of this map."""
     try:
         found = read_lifts(lifts)
     except InputError:
@@ -173,8 +172,8 @@ def next_sequence(lifts: Path, identity: MapIdentity) -> int:
 
 
 def changed_inputs(summary: dict[str, Any]) -> str:
-    """Find a calibration file of the recording that is no longer the one that was measured with; empty where
-    none is, or the recording isn't there any more.
+    """Find a calibration file of the recording that has changed since the measurement; empty if there is
+    none, or if the recording no longer exists.
     """
     hashes = (summary.get("hashes") or {}).get("inputs") or {}
     passes = summary.get("passes") or [{"recording": summary.get("recording"), "inputs": hashes}]
@@ -189,10 +188,9 @@ def changed_inputs(summary: dict[str, Any]) -> str:
 
 
 def read_heights(folder: Path) -> PartedMap:
-    """height.tif, and ortho.tif, free.tif, tops.tif, passes.tif where there are any, read as parts are
-    wanted.
+    """Open height.tif, and ortho.tif, free.tif, tops.tif, passes.tif if present; parts are read on demand.
 
-    Raises InputError, then or later, where one is missing or torn.
+    Raises InputError, then or later, if one is missing or damaged.
     """
     names = ("height.tif", "ortho.tif", "free.tif", "tops.tif", "passes.tif")
     path, photo, free, tops, passes = (folder / name for name in names)
@@ -225,7 +223,7 @@ def read_heights(folder: Path) -> PartedMap:
 
 
 def read_path(folder: Path) -> CameraPath | None:
-    """Read trajectory.tum; None where there is none. Raises InputError for a line that is none of TUM's."""
+    """Read trajectory.tum; None if there is none. Raises InputError for a line that isn't in TUM format."""
     path = folder / "trajectory.tum"
     if not path.is_file():
         return None
@@ -254,7 +252,7 @@ def read_path(folder: Path) -> CameraPath | None:
 def read_cloud(path: Path, max_points: int | None = None) -> Cloud:
     """Read at most `max_points` evenly drawn points of cloud.ply (all, if None) from disk.
 
-    Raises InputError where the file is missing, torn, empty or has other properties than formats.md says.
+    Raises InputError if the file is missing, damaged or empty or has other properties than formats.md says.
     """
     if not path.is_file():
         raise InputError(path, "no such file", REMEDY)
@@ -280,7 +278,7 @@ def read_cloud(path: Path, max_points: int | None = None) -> Cloud:
 
 
 def read_contours(folder: Path) -> tuple[Contour, ...]:
-    """Read contour.csv, a contour per profile; empty where there is no such file."""
+    """Read contour.csv, a contour per profile; empty if there is no such file."""
     table = _read_table(folder / "contour.csv", 3, 6)
     parts = _by_profile(folder / "contour.csv", table)
     return tuple(
@@ -290,8 +288,8 @@ def read_contours(folder: Path) -> tuple[Contour, ...]:
 
 
 def read_laser(folder: Path) -> tuple[LaserProfile, ...]:
-    """Read laser.csv; empty where there is no such file. range_std_m is NaN where nobody stated it, as in
-    folders of older versions.
+    """Read laser.csv; empty if there is no such file. range_std_m: NaN if unknown, as in folders of older
+    versions.
     """
     table = _read_table(folder / "laser.csv", 4, 4, 5)
     stated = table.shape[1] == 5
@@ -311,8 +309,9 @@ def _by_profile(path: Path, table: Float64) -> dict[int, Float64]:
 
 
 def _read_table(path: Path, known: int, *columns: int) -> Float64:
-    """Read (N, one of `columns`) from a CSV with a header; an empty field is NaN, which none of the first
-    `known` may be.
+    """Read (N, one of `columns`) from a CSV with a header.
+
+    An empty field is NaN, which isn't allowed in the first `known` columns.
     """
     if not path.is_file():
         return np.empty((0, columns[0]))

@@ -1,4 +1,4 @@
-"""Measure packets as they come, with a snapshot at any time and the batch's result at the end."""
+"""Measure packets as they arrive, with a snapshot at any time and the batch result at the end."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ from barsight.yard.magnet.description import load_magnet
 from barsight.yard_frame import expect_fits, in_yard
 
 GRACE_NS = NS_PER_S
-"""A frame waits so long for a sensor's readings, the first one for signs of every sensor."""
+"""Time in ns that a frame waits for a sensor's readings, and the first one for any sign of every sensor."""
 
 
 class Session:
-    """Measures packets as they come; `snapshot` any time, `next_pass` between passes, `finish` once.
+    """Measures packets as they arrive: `snapshot` at any time, `next_pass` between passes, `finish` once.
 
-    Each picture is rectified once and each pair matched once, for the snapshots and the end; both lie on disk
-    (20 MB a pair of 1.3 megapixels), in a temporary folder that goes with the session. The estimator `live`
-    also places each pair once; with the batch estimators the snapshots' poses are provisional.
+    Each picture is rectified once and each pair matched once, for the snapshots and the end; both are on disk
+    (20 MB per pair of 1.3 megapixels), in a temporary folder that is deleted with the session. The estimator
+    `live` also places each pair once; with the batch estimators the poses of snapshots are provisional.
     """
 
     def __init__(
@@ -50,8 +50,9 @@ class Session:
         magnet: Path | str | None = None, imu_noise: ImuNoise | None = None, is_simulated: bool = False,
         **fields: Any,
     ) -> None:  # fmt: skip
-        """settings: or their fields by name, as `measure` takes them. magnet: TOML file of the magnet that
-        lifts are chosen for. is_simulated: said in the result. Raises InputError or ConfigError.
+        """Open a session. settings: or their fields by name, as for `measure`. magnet: TOML file of the
+        magnet that lifts are chosen for. is_simulated: stated in the result. Raises InputError or
+        ConfigError.
         """
         if not isinstance(rig, StereoRig):
             raise ConfigError(f"rig is {rig!r}; give a StereoRig, like open_recording(PATH).rig")
@@ -59,7 +60,7 @@ class Session:
             raise ConfigError(f"settings are given twice; add {', '.join(fields)} to them")
         self._asked = build_settings(fields if settings is None else settings, MeasureSettings)
         self._magnet = None if magnet is None else load_magnet(Path(magnet))
-        compile_ahead(ignore_progress, "measure")  # a crane that travels doesn't wait for kernels
+        compile_ahead(ignore_progress, "measure")  # a moving crane doesn't wait for kernels
         self._settings = self._asked.chosen()
         self._folder = Path(tempfile.mkdtemp(prefix="barsight."))
         self._yard = self._folder / "yard"
@@ -81,16 +82,16 @@ class Session:
         key = checkpoint_key(self._recording, self._source, self._settings, {})
         self._checkpoints = checkpoint_folder(self._folder / "checkpoints" / name, key)
         self._pairs = RectifiedPairs(self._source, Rectifier(self._rig), self._checkpoints)
-        # A rig that is to be turned at the end gives other disparities then.
+        # A rig that is corrected at the end then gives other disparities.
         checkpoints = self._checkpoints if self._settings.self_calibrate == "none" else None
         self._match = matching(self._pairs, self._settings, checkpoints, Stopwatch())
         self._waiting: deque[RectifiedPair | RefusedFrame] = deque()
         self._map: LiveMap | None = None
 
     def push(self, packet: Packet) -> None:
-        """Take the next packet, a pair after all readings before it; it enters the map once those are there
-        that place it. Raises MeasurementError after `finish`, InputError where the yard file isn't of this
-        rig and crane.
+        """Add the next packet; a pair comes after all earlier readings, and enters the map once the readings
+        that place it have arrived. Raises MeasurementError after `finish`, InputError if the yard file
+        doesn't belong to this rig and crane.
         """
         self._expect_open()
         self._recording.add(packet)
@@ -102,15 +103,15 @@ class Session:
             self._place(self._waiting.popleft())
 
     def next_pass(self) -> None:
-        """Begin another pass over the same yard: packets from now on are of its own recording, and a snapshot
-        shows that pass alone. Raises MeasurementError after `finish`.
+        """Begin another pass over the same yard: further packets belong to its own recording, and a snapshot
+        shows only that pass. Raises MeasurementError after `finish`.
         """
         self._expect_open()
         self._end_pass()
         self._begin_pass()
 
     def snapshot(self) -> Snapshot:
-        """Return the map of what came so far of this pass; it changes nothing at the end.
+        """Return the map of this pass so far; the final result is not affected.
 
         Raises MeasurementError after `finish`, whose yard has the map.
         """
@@ -118,10 +119,10 @@ class Session:
         return Snapshot(None, 0) if self._map is None else self._map.snapshot(self)
 
     def finish(self) -> Yard:
-        """Return the yard from all packets, as `measure` has it of the same recording or passes: the matched
-        pairs on disk are fused at the final poses, bundles and lifts found, once.
+        """Return the yard from all packets, as `measure` does for the same recording or passes.
 
-        Raises MeasurementError where it did already.
+        The matched pairs on disk are fused at the final poses, and bundles and lifts found. Raises
+        MeasurementError if it was called before.
         """
         self._expect_open()
         self._end_pass()
@@ -145,7 +146,7 @@ class Session:
             raise MeasurementError("the session is finished: begin another one; finish returned its yard")
 
     def _is_due(self, stamp_ns: int) -> bool:
-        """Check whether all readings that place a frame have come, or won't come any more."""
+        """Check whether all readings that place a frame have arrived, or will not arrive any more."""
         shift_ns = self._source.rig.timeshift_cam_imu_ns
         last_ns = self._recording.last_frame_ns
         if last_ns is not None and last_ns >= stamp_ns + GRACE_NS:

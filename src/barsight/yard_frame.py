@@ -1,4 +1,4 @@
-"""Apply a yard file to a measurement: encoders, poses, map and sigma; refuse one of another rig or crane."""
+"""Apply a yard file to a measurement (encoders, poses, map and sigma); refuse one of another rig or crane."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ from barsight.result_folder import open_folder
 from barsight.yard.identity import ID_DIGITS
 
 MAX_TURN_DEG, MAX_PLACE_M = 1.0, 0.5
-"""A frame less sure than this (1 sigma, worst axis) places nothing for a crane."""
+"""Largest sigma of a frame on its worst axis, in degrees and metres, with which it may place anything."""
 
 
 @dataclass(frozen=True, eq=False)
 class RecordingInYard(RecordingProxy):
-    """`whole` with its encoders' readings and laser profiles in the surveyed yard."""
+    """`whole` with its encoder readings and laser profiles in the surveyed yard."""
 
     frame: YardFrame
 
     def crane(self) -> CraneSamples | None:
-        """Return the readings, moved into the yard or with the attitude that was calibrated."""
+        """Return the readings, transformed to the yard or with the calibrated attitude."""
         crane = self.whole.crane()
         return None if crane is None else crane_in_yard(crane, self.frame)
 
     def laser(self) -> tuple[LaserProfile, ...]:
-        """Return the profiles, moved as the encoders that placed them."""
+        """Return the profiles, transformed like the encoder readings that placed them."""
         pose = self.frame.yard_from
         if pose.source != "encoders":
             return self.whole.laser()
@@ -55,12 +55,12 @@ class RecordingInYard(RecordingProxy):
 def in_yard(
     recording: Recording, yard: Path | None, known: Recording | None = None, *, is_awaited: bool = False
 ) -> Recording:
-    """View a recording through the yard file, the recording itself where there is none.
+    """View a recording through the yard file; return the recording itself without a yard file.
 
-    Where the recording's own readings are yet to come, the file must fit `known`, or, if it is_awaited,
-    `expect_fits` is to be asked once they are there.
+    If the recording's own readings are yet to come, the file must fit `known`; if is_awaited, `expect_fits`
+    must be called once they are there.
 
-    Raises CalibrationError for a file that can't be, InputError for one of another rig, crane or recording.
+    Raises CalibrationError for an invalid file, InputError for one of another rig, crane or recording.
     """
     if yard is None:
         return recording
@@ -73,25 +73,26 @@ def in_yard(
 
 
 def expect_fits(recording: Recording, known: Recording | None = None) -> None:
-    """Raise InputError where the yard file that a recording is seen through is of another rig, crane or
-    recording. known: what it must fit, the recording itself if None.
+    """Raise InputError if a recording's yard file belongs to another rig, crane or recording.
+
+    known: the recording that the file must fit; the recording itself if None.
     """
     if isinstance(recording, RecordingInYard):
         _expect_fits(recording.frame, known or recording.whole)
 
 
 def frame_of(recording: Recording) -> YardFrame | None:
-    """Return the yard file that a recording is seen through."""
+    """Return the yard file through which a recording is viewed."""
     return recording.frame if isinstance(recording, RecordingInYard) else None
 
 
 def calibration_id(rig: StereoRig) -> str:
-    """Compute the digest of a rig that results carry."""
+    """Compute the digest of a rig that is stored in results."""
     return json_digest(json_value(rig))[:ID_DIGITS]
 
 
 def mounting_id(crane: CraneSamples) -> str:
-    """Compute the digest of how the body hangs from the crane."""
+    """Compute the digest of the mounting of the body on the crane."""
     hung = {"crane_to_body_m": crane.crane_to_body_m, "yard_from_body": crane.yard_from_body_nominal}
     return json_digest(json_value(hung))[:ID_DIGITS]
 
@@ -102,8 +103,9 @@ def recording_id(inputs: Mapping[str, str]) -> str:
 
 
 def measured_owners(folder: Path) -> dict[str, str | None]:
-    """Read which rig, crane and recording a folder of results is of. Raises InputError for one whose map says
-    nothing of a frame of one recording.
+    """Read the rig, crane and recording of a result folder.
+
+    Raises InputError for a map measured with a yard file, or in several passes.
     """
     said, path = open_folder(folder)[0], folder / "result.json"
     if said["configuration"].get("yard") is not None:
@@ -119,27 +121,27 @@ def measured_owners(folder: Path) -> dict[str, str | None]:
 
 
 def yard_frame_id(recording: Recording, trajectory: Trajectory) -> str | None:
-    """Compute a digest of what places the map in the yard; None where it isn't there."""
+    """Compute a digest of what places the map in the yard; None if the map isn't in the yard."""
     return placing_id(recording) if trajectory.reference == "yard" else None
 
 
 def placing_id(recording: Recording) -> str | None:
-    """Compute a digest of what can place a recording in the yard; None where nothing does."""
+    """Compute a digest of what can place a recording in the yard; None if nothing can."""
     crane, frame = recording.crane(), frame_of(recording)
     mounted = None if crane is None else mounting_id(crane)
     return mounted if frame is None else json_digest([mounted, frame.digest])[:ID_DIGITS]
 
 
 def frame_name(recording: Recording, trajectory: Trajectory, inputs: Mapping[str, str]) -> str:
-    """Name the frame that a trajectory is in: `yard:` and the digest of what places it there, or `world:` and
-    that of the recording's inputs, whose world no other recording shares.
+    """Name a trajectory's frame: `yard:` and the digest of what places it there, or `world:` and that of the
+    recording's inputs, as no other recording shares its world.
     """
     placed = yard_frame_id(recording, trajectory)
     return f"world:{recording_id(inputs)}" if placed is None else f"yard:{placed}"
 
 
 def crane_in_yard(crane: CraneSamples, frame: YardFrame) -> CraneSamples:
-    """Move encoder readings into the surveyed yard, or give the body the attitude that was calibrated."""
+    """Transform encoder readings to the surveyed yard, or give the body the calibrated attitude."""
     pose = frame.yard_from
     if pose.source == "encoders":
         crane = crane if frame.bend is None else bent_crane(crane, frame.bend)
@@ -152,7 +154,7 @@ def crane_in_yard(crane: CraneSamples, frame: YardFrame) -> CraneSamples:
 
 
 def bent_crane(crane: CraneSamples, bend: CraneBend) -> CraneSamples:
-    """Move readings to where a bending crane really was, and turn the body by the mean of its tilt there."""
+    """Move readings to the true positions of a bending crane, and turn the body by the mean tilt there."""
     place = crane.position_m
     return replace(
         crane, position_m=bend.moved(place, crane.crane_to_body_m),
@@ -161,7 +163,7 @@ def bent_crane(crane: CraneSamples, bend: CraneBend) -> CraneSamples:
 
 
 def placed_in_yard(trajectory: Trajectory, frame: YardFrame | None) -> Trajectory:
-    """Move a trajectory of `world` into the yard, each pose with its own covariance alone."""
+    """Transform a trajectory from `world` to the yard, each pose only with its own covariance."""
     if frame is None or trajectory.reference != "world" or frame.yard_from.source != "world":
         return trajectory
     turn = np.kron(np.eye(2), frame.yard_from.rotation)
@@ -176,7 +178,7 @@ def placed_in_yard(trajectory: Trajectory, frame: YardFrame | None) -> Trajector
 
 
 def with_shared(trajectory: Trajectory, frame: YardFrame | None) -> Trajectory:
-    """Add what the yard frame may be off to each pose's covariance; it is common to all of them."""
+    """Add the uncertainty of the yard frame to each pose's covariance; it is common to all poses."""
     if frame is None or trajectory.reference != "yard":
         return trajectory
     frames = tuple(
@@ -190,7 +192,7 @@ def shared_covariance(yard_from_body: Pose, frame: YardFrame) -> Float64:
     """Compute the covariance (6, 6) that the yard frame adds to a pose, rotation first, in the yard."""
     carry, covariance = np.eye(6), frame.covariance
     if frame.yard_from.source == "body" or frame.attitude is not None:
-        carry[3:] = 0.0  # only the attitude is taken; the encoders say where the body is
+        carry[3:] = 0.0  # only the attitude is used; the encoders give the body's position
     else:
         carry[3:, :3] = -skew(yard_from_body.translation - frame.yard_from.translation)
     if frame.bend is not None:
@@ -202,8 +204,9 @@ def shared_covariance(yard_from_body: Pose, frame: YardFrame) -> Float64:
 
 
 def shared_height_sigma_m(frame: YardFrame, x_m: Float64, y_m: Float64, body_m: Float64) -> Float64:
-    """Compute what the yard frame may add to heights at places (N,), m. body_m: (3,) of the body that saw
-    them.
+    """Compute the sigma (m) that the yard frame adds to heights at places (N,).
+
+    body_m: (3,) position of the body that saw them.
     """
     about = body_m if frame.attitude is not None else frame.yard_from.translation
     lifted = 0.0 if frame.attitude is not None else 1.0
@@ -232,7 +235,7 @@ def _expect_sure(frame: YardFrame) -> None:
 
 
 def _expect_fits(frame: YardFrame, recording: Recording) -> None:
-    """Raise InputError where the frame is of another rig, crane or recording, or of no use to this one."""
+    """Raise InputError if the frame belongs to another rig, crane or recording, or can't be used here."""
     crane, path, source = recording.crane(), frame.path, frame.yard_from.source
     own = calibration_id(recording.rig)
     if frame.calibration_id not in (None, own):
@@ -259,7 +262,7 @@ def _expect_fits(frame: YardFrame, recording: Recording) -> None:
 
 
 def frame_notes(frame: YardFrame | None) -> tuple[str, ...]:
-    """List what is only assumed of the yard frame."""
+    """List the assumptions made about the yard frame."""
     if frame is None:
         return ()
     notes = [f"yard frame {frame.path.name}: {doubt}" for doubt in frame.doubts]
