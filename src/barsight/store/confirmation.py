@@ -143,8 +143,8 @@ def begin_lift(store: Store, lift_id: int, who: str) -> None:
 def take_lift(store: Store, lift_id: int, who: str, alarm: tuple[str, str] | None = None) -> None:
     """Report a confirmed lift as executed; this ends nearby offers and confirmations.
 
-    alarm: code and reason of an alarm to raise with it. Raises InputError if the lift can't be recorded; if it
-    had been confirmed and has ended, an alarm is raised and all offers end.
+    alarm: code and reason of an alarm to raise with it. Raises InputError if the lift can't be recorded; if
+    it had been confirmed and has ended, an alarm is raised and all offers end.
     """
 
     def step(opened: Entry, lift: OpenLift) -> None:

@@ -89,8 +89,9 @@ class CameraImuCalibration:
         return float(np.sqrt(row @ self.covariance @ row))
 
     def with_lenses(self, names: Sequence[str], covariance: Float64) -> CameraImuCalibration:
-        """Return it with the lenses' covariance, by names (C,) and values (C, C) of a rig file; as it is where
-        that lacks one of them.
+        """Add the covariance of the lens parameters from a rig file: names (C,) and values (C, C).
+
+        Returns the same calibration if one of its lens parameters is missing there.
         """
         wanted = self.uncertainty.lens_names
         if not set(wanted) <= set(names):

@@ -12,7 +12,7 @@ from barsight.core.pose import Pose
 from barsight.core.records.pairs import RefusedFrame
 
 MIN_TOLD = 1e-3
-"""Share of the information held before from which the travel's own on a direction counts."""
+"""Minimum information of the travel on a direction, relative to the prior, for it to be used."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +58,8 @@ class RigDrift:
         return float(self.covariance[1, 1] ** 0.5)
 
     def by_travel(self) -> tuple[Float64, Float64, Float64]:
-        """Take off what was held possible before: rows (K, 2) of yaw and scale that the travel itself tells,
-        values (K,) and variances (K,) of these; K is 2 or less.
+        """Remove the prior: return rows (K, 2) of yaw and scale that the travel itself observes, their values
+        (K,) and variances (K,); K is 2 or less.
         """
         unit, known = self.prior_sigma, np.linalg.inv(self.covariance)
         weight, axes = np.linalg.eigh(known * np.outer(unit, unit) - np.eye(2))
