@@ -29,7 +29,7 @@ words = sys.argv[1:]
 source, out = pathlib.Path(words[0]), pathlib.Path(words[words.index("-o") + 1])
 kind = (source / "mav0" / "kind").read_text()
 if kind == "poison":
-    sys.exit("barsight: this recording is torn")
+    sys.exit("barsight: this recording is damaged")
 if kind == "large":
     held = bytearray(600 << 20)
     held[::4096] = b"1" * len(held[::4096])

@@ -108,4 +108,4 @@ def test_a_budget_names_the_torn_certificate(
     ids = {name: told[name] for name in ("calibration_id", "yard_frame_id")}
     write_sealed({"schema_version": 1, "quantities": [row], "plan": {}, **ids}, path)
     assert run(["budget", str(tmp_path / "out"), "--certificate", str(path)]) == 3
-    assert "certificate.json: is torn" in capsys.readouterr().err
+    assert "certificate.json: is damaged" in capsys.readouterr().err

@@ -109,7 +109,7 @@ EXPORT = "calibrate export F/rig.xml -o F/made.yaml --to kalibr"
 OPENCV = "calibrate export F/opencv.yaml -o F/made.yaml --to kalibr"
 FOUND: list[tuple[str, Damage, str, str]] = [
     ("mcap/mcap.mcap", link_to_itself, "info F/mcap", "mcap.mcap: can't be read"),
-    ("one.bag", sparse, "info F/one.bag", "is no ROS 1 bag"),
+    ("one.bag", sparse, "info F/one.bag", "is not a ROS 1 bag"),
     (
         "mcap/metadata.yaml", number(r"(?<=  - message_count: )\d+", "[]"),
         "info F/mcap", "no whole number",
@@ -140,7 +140,7 @@ FOUND: list[tuple[str, Damage, str, str]] = [
     ("out/laser.csv", then_sealed(number(A_NUMBER, "1e999990")), "report F/out", "out of range"),
     ("out/laser.csv", then_sealed(number(A_NUMBER, "nan")), "report F/out", "laser.csv: holds a number out"),
     ("out/contour.csv", then_sealed(number(A_NUMBER, "nan")), "report F/out", "contour.csv: holds a number"),
-    ("out/laser.csv", then_sealed(number(A_NUMBER, "x")), "report F/out", "laser.csv: is torn"),
+    ("out/laser.csv", then_sealed(number(A_NUMBER, "x")), "report F/out", "laser.csv: is damaged"),
     ("out/contour.csv", number(A_NUMBER, "7"), "report F/out", "is not the one that result.json was written"),
     ("out/trajectory.tum", number(A_NUMBER, "7"), "lifts F/out", "is not the one that result.json was wr"),
     ("out/contour.csv", sparse, "report F/out", "at most"),
@@ -161,8 +161,8 @@ FOUND: list[tuple[str, Damage, str, str]] = [
     ("out/contour.csv", then_sealed(profiles), "report F/out", "holds 200000 profiles, at most 5000"),
     ("euroc/mav0/laser0/data.csv", profiles, "measure F/euroc -o F/made", "has 200000 profiles, at most"),
     ("out/bundles.json", repeated(b"[],", 10_000_000), "lifts F/out", "over 4000000 values"),
-    ("out/height.tif", sparse, "explain F/out 1", "is torn"),
-    ("out/tops.tif", sparse, "export F/out F/made.las", "is torn"),
+    ("out/height.tif", sparse, "explain F/out 1", "is damaged"),
+    ("out/tops.tif", sparse, "export F/out F/made.las", "is damaged"),
     ("out/cloud.ply", sparse, "store add sqlite:///F/yard.db F/out", "cloud.ply"),
 ]  # fmt: skip
 

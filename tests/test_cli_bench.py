@@ -81,7 +81,7 @@ def test_a_live_step_is_timed_whole_and_by_parts(
     assert run(["bench", "live-step", str(recording), "--json", str(saved)]) == 0
     assert "2 in the map" in capsys.readouterr().out
     bench = json.loads(saved.read_text())
-    assert (bench["pairs"], bench["fused"]) == (4, 2), "one is torn, the last waits for the one after it"
+    assert (bench["pairs"], bench["fused"]) == (4, 2), "one is damaged, the last waits for the one after it"
     assert bench["others"] == 1, "the torn one's step isn't counted"
     parts = {part["part"].strip(): part for part in bench["parts"]}
     step, added = parts["step"], parts["placed, matched, fused"]

@@ -40,7 +40,7 @@ def test_targets_place_the_world(tmp_path: Path, capsys: pytest.CaptureFixture[s
         (HEADER + ROWS[0] + ROWS[0], 3, "target a is there twice"),
         (HEADER + "a,1,2,x,0,0,0,,\n", 3, "line 2: a number is missing or is none"),
         (HEADER + "a,1,2\n", 3, "line 2: a number is missing"),
-        (HEADER + "a,1,2,3,0,0,0,-1,\n", 3, "line 2: a value can't be"),
+        (HEADER + "a,1,2,3,0,0,0,-1,\n", 3, "line 2: a value is out of range"),
         ("name,x,y,z\n", 3, "has no column yard_x"),
         ("", 3, "has no column name"),
     ],

@@ -81,7 +81,7 @@ BAD = {
     "text cut short": (TEXT[:-12].replace(b"1 2 3 4 5 6\n", b"1000000 2000000 3 4 5 6\n"), "1 of 2"),
     "blank text": (header("ascii") + b"\n" * 100, "0 of 2"),
     "a text count too high": (TEXT.replace(b"vertex 2", b"vertex 999999999999"), "don't fit"),
-    "text that is no number": (TEXT.replace(b"5 6", b"5 six"), "six"),
+    "text that is not a number": (TEXT.replace(b"5 6", b"5 six"), "six"),
     "too few numbers": (TEXT.replace(b"5 6", b"567"), "columns"),
     "a number out of range": (TEXT.replace(b"3 4", b"300 4"), "300"),
 }

@@ -86,7 +86,7 @@ def test_nonocc_png_is_used_where_there_is_one(tmp_path: Path) -> None:
 
 
 def test_a_missing_folder_and_a_torn_scene_are_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="is no folder"):
+    with pytest.raises(InputError, match="is not a folder"):
         load_scenes(tmp_path / "nowhere")
     with pytest.raises(InputError, match="holds no scene"):
         load_scenes(tmp_path)

@@ -113,7 +113,7 @@ def test_a_claim_has_one_owner_until_its_lease_runs_out(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("code", "wanted"),
     [
-        ("import sys; sys.exit('it is torn')", "refused: exit code 1: it is torn"),
+        ("import sys; sys.exit('it is damaged')", "refused: exit code 1: it is damaged"),
         ("x = bytearray(300 << 20); x[::4096] = b'1' * len(x[::4096]); import time; time.sleep(9)",
          "over-memory"),
         ("import time; time.sleep(9)", "timeout: did not end in 0.8 s"),
@@ -150,7 +150,7 @@ def test_a_run_on_s3_parks_the_bad_and_publishes_the_rest_once(
                 assert isinstance(verify_chain(connection), AuditChain)
         assert count_states(results, tasks).published == 6
         told = {task.name: reason for task, reason in parked_reasons(results, tasks)}
-        assert told["bad"] == "refused: exit code 1: barsight: this recording is torn"
+        assert told["bad"] == "refused: exit code 1: barsight: this recording is damaged"
         assert told["slow"] == "timeout: did not end in 1 s"
         for task in tasks:
             note = results.read_json(f"results/{task.key}/result.json")

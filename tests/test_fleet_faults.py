@@ -145,7 +145,7 @@ def test_results_that_don_t_hold_a_version_measure_nothing_by_it(tmp_path: Path)
     with pytest.raises(ConfigError, match=r"config\.toml: is not as it was planned"):
         arguments(planned, version, tmp_path / "task")
     planned.write(f"versions/{version.name}/files.json", b'{"../config.toml": "0"}')
-    with pytest.raises(ConfigError, match="is torn"):
+    with pytest.raises(ConfigError, match="is damaged"):
         arguments(planned, version, tmp_path / "task")
 
 
@@ -234,12 +234,12 @@ def test_nothing_starts_after_the_window_has_shut(tmp_path: Path) -> None:
 
 
 def raise_input_error(_: Any, __: Any) -> None:
-    raise CalibrationError("rig.yaml", "is torn", "mend it")
+    raise CalibrationError("rig.yaml", "is damaged", "mend it")
 
 
 def test_a_worker_s_errors_arrive_as_they_are(capfd: pytest.CaptureFixture[str]) -> None:
 
-    with pytest.raises(CalibrationError, match=r"^rig\.yaml: is torn; mend it$"):
+    with pytest.raises(CalibrationError, match=r"^rig\.yaml: is damaged; mend it$"):
         list(over_seeds(raise_input_error, range(1), None, 2, None))
     assert "Traceback" not in capfd.readouterr().err
     again = pickle.loads(pickle.dumps(InputError("a", "b", "c")))
@@ -253,7 +253,7 @@ def test_seeds_run_on_workers_of_the_same_software() -> None:
 
 @pytest.mark.parametrize("address", ["nonsense", "tcp://host", "http://host:1", "tcp://:8786"])
 def test_an_address_that_is_none_is_told_at_once(address: str) -> None:
-    with pytest.raises(ConfigError, match="is no address"), connect(1, address):
+    with pytest.raises(ConfigError, match="is not an address"), connect(1, address):
         pass
 
 

@@ -207,7 +207,7 @@ def test_keyframes_come_back_and_torn_ones_are_refused(tmp_path: Path) -> None:
     write_keyframes(kept, tmp_path / "keyframes.json")
     assert read_keyframes(tmp_path / "keyframes.json") == kept
     (tmp_path / "keyframes.json").write_text('{"keyframes_ns": [1]}')
-    with pytest.raises(bs.BarsightError, match="is no list of keyframes"):
+    with pytest.raises(bs.BarsightError, match="is not a list of keyframes"):
         read_keyframes(tmp_path / "keyframes.json")
 
 

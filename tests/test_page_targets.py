@@ -257,7 +257,7 @@ def test_the_list_says_which_targets_are_columns(local: httpx.Client, path: str)
     told = asked(local, path, [picks[0] | {"is_exact": True}, picks[1]], listed).json()
     assert [one["found"] for one in told["targets"]] == ["hand", "hand"]
     answer = asked(local, path, [], listed.replace("0.3", "-0.3"))
-    assert "line 2: a value can't be; places finite, sigma_m and width_m positive" in answer.json()["problem"]
+    assert "line 2: a value is out of range; places finite, sigma_m" in answer.json()["problem"]
 
 
 @pytest.mark.slow

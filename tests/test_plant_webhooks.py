@@ -91,5 +91,5 @@ def test_a_redirect_is_no_answer_and_an_address_is_http(hooks: Hooks) -> None:
     finally:
         hook.stop()
     for url in ("file:///etc/passwd", "wms.example", "http://"):
-        with pytest.raises(ConfigError, match="is no address"):
+        with pytest.raises(ConfigError, match="is not an address"):
             WebhookSettings((url,))

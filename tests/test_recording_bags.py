@@ -362,7 +362,7 @@ def test_a_type_that_is_no_text_is_refused(tmp_path: Path) -> None:
     write_kalibr(tmp_path)
     metadata = path / "metadata.yaml"
     metadata.write_text(metadata.read_text().replace("type: sensor_msgs/msg/Imu", "type: [Imu]"))
-    with pytest.raises(InputError, match=r"\['Imu'\] is no text.*copy it again"):
+    with pytest.raises(InputError, match=r"\['Imu'\] is not text.*copy it again"):
         open_recording(path)
 
 

@@ -33,7 +33,7 @@ def test_describe_and_print(tmp_path: Path) -> None:
     info = describe_recording(open_recording(root))
     assert info.pairs == 3
     assert [frame.stamp_ns for frame in info.dropped] == [stamps(4)[3]]
-    assert info.first_refused == f"cam0/data/{stamps(4)[0]}.png is no readable picture"
+    assert info.first_refused == f"cam0/data/{stamps(4)[0]}.png is not a readable picture"
     assert [stream.name for stream in info.streams] == ["cam0", "cam1", "imu0", "crane0"]
     assert info.streams[2].rate_hz == 200
     assert info.calibration.timeshift_cam_imu_ms == -3.5

@@ -111,5 +111,5 @@ def test_what_a_full_disk_cut_off_spoils_nothing_that_follows(whole: Path, tmp_p
 
 def test_what_is_no_mcap_is_refused(tmp_path: Path) -> None:
     (tmp_path / "segment_000001.mcap").write_bytes(b"nothing of the kind")
-    with pytest.raises(bs.BarsightError, match=r"segment_000001\.mcap: is no MCAP file"):
+    with pytest.raises(bs.BarsightError, match=r"segment_000001\.mcap: is not an MCAP file"):
         bs.open_recording(tmp_path)

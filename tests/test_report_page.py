@@ -175,7 +175,7 @@ def test_mistakes_are_one_line(tmp_path: Path) -> None:
     whole = (folder / "height.tif").read_bytes()
     for torn in (whole[:100], whole[: len(whole) // 2], b"no tiff at all"):
         (folder / "height.tif").write_bytes(torn)
-        with pytest.raises(InputError, match=r"height\.tif: is torn"):
+        with pytest.raises(InputError, match=r"height\.tif: is damaged"):
             write_report(folder, tmp_path / "report.html")
     write_height(folder / "height.tif", bands()[:3])
     with pytest.raises(InputError, match=r"height\.tif: has the shape .*, not 4 planar bands in tiles"):

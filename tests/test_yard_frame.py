@@ -104,10 +104,10 @@ def test_units_that_differ_are_no_calibration(tmp_path: Path, capsys: pytest.Cap
 @pytest.mark.parametrize(
     ("key", "value", "said"),
     [
-        ("barsight_yard", 7, "is no yard file"),
+        ("barsight_yard", 7, "is not a yard file"),
         ("covariance", [[1.0]], "covariance: is not a 6x6 matrix"),
         ("yard_from_encoders", [[2.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], "rotation"),
-        ("calibration_id", 5, "is no text"),
+        ("calibration_id", 5, "is not text"),
     ],
 )
 def test_a_spoilt_file_is_refused(tmp_path: Path, key: str, value: object, said: str) -> None:

@@ -211,7 +211,7 @@ def test_a_mirrored_list_is_told(relief_m: float) -> None:
         (HEADER + "a,0,0,0,,\n", "'a' is no tag of the family 36h11"),
         (HEADER + "4,0,0,0,,\n04,1,0,0,,\n", "tag 4 is there twice; give each tag once"),
         (HEADER + "4,0,0,,,\n", "line 2: a number is missing or is none"),
-        (HEADER + "4,0,0,0,-1,\n", "line 2: a value can't be"),
+        (HEADER + "4,0,0,0,-1,\n", "line 2: a value is out of range"),
     ],
 )
 def test_a_list_that_cannot_be_is_refused(

@@ -259,7 +259,7 @@ def read_cloud(path: Path, max_points: int | None = None) -> Cloud:
     try:
         data = read_vertices(path)
     except (ValueError, OSError) as error:
-        raise InputError(path, f"is torn ({error})", REMEDY) from error
+        raise InputError(path, f"is damaged ({error})", REMEDY) from error
     missing = [name for name in PROPERTIES if name not in (data.dtype.names or ())]
     if missing:
         raise InputError(path, f"has no property {missing[0]}", REMEDY)
@@ -322,7 +322,7 @@ def _read_table(path: Path, known: int, *columns: int) -> Float64:
     try:
         table = np.loadtxt(filled, dtype=np.float64, delimiter=",", ndmin=2)
     except ValueError as error:
-        raise InputError(path, f"is torn ({str(error).split(';')[0]})", REMEDY) from error
+        raise InputError(path, f"is damaged ({str(error).split(';')[0]})", REMEDY) from error
     if table.shape[1] not in columns:
         raise InputError(path, f"has {table.shape[1]} columns instead of {columns[-1]}", REMEDY)
     if (~in_range(table) & ~np.isnan(table)).any() or np.isnan(table[:, :known]).any():

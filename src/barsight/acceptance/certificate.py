@@ -111,7 +111,7 @@ def read_certificate(path: Path) -> dict[str, Any]:
     """Read a certificate. Raises InputError where it is missing, damaged or altered."""
     content = read_sealed(certificate_files(path)[0], SCHEMA_VERSION, REMEDY)
     if "quantities" not in content or "plan" not in content:
-        raise InputError(path, "is no certificate", REMEDY)
+        raise InputError(path, "is not a certificate", REMEDY)
     return content
 
 

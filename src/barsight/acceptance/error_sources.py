@@ -138,7 +138,7 @@ def _rig_source(summary: dict[str, Any], path: Path, focal_px: float, assumed: l
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(path, "doesn't say how sure the rig's calibration is", REMEDY) from error
     if not (np.isfinite(covariance).all() and (np.diag(covariance) <= MAX_SIGMA_RATIO**2).all()):
-        raise InputError(path, "what it says of the rig's calibration can't be", REMEDY)
+        raise InputError(path, "what it says of the rig's calibration is impossible", REMEDY)
     if told is not None:
         by = "the rig file's covariance, and the travel"
         return ErrorSource(name, ("yaw", "baseline", "focal"), covariance, by)
@@ -286,7 +286,7 @@ def touched_offset(certificate: Path) -> MagnetOffset:
         own_m = 1e-3 * max((float(row["uncertainty"]["sigma"]) for row in rows), default=0.0)
         ids = str(told["calibration_id"]), str(told["yard_frame_id"])
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(certificate, f"is torn ({type(error).__name__}: {error})", OTHER) from error
+        raise InputError(certificate, f"is damaged ({type(error).__name__}: {error})", OTHER) from error
     told_by = [_mean_touch_m(certificate, axis, touches.get(axis, []), own_m) for axis in "xyz"]
     (x, x_sigma), (y, y_sigma), (z, z_sigma) = told_by
     max_m = max(abs(x), abs(y), abs(z))
@@ -334,7 +334,7 @@ def _touch_errors_m(certificate: Path) -> dict[str, list[float]]:
             if row["group"] == "touch_mm" and row["error"] is not None:
                 found.setdefault(row["name"][-1:], []).append(1e-3 * float(row["error"]))
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(certificate, f"is torn ({type(error).__name__}: {error})", OTHER) from error
+        raise InputError(certificate, f"is damaged ({type(error).__name__}: {error})", OTHER) from error
     if not in_range([error for errors in found.values() for error in errors]).all():
-        raise InputError(certificate, "has an error that can't be", OTHER)
+        raise InputError(certificate, "has an impossible error", OTHER)
     return found

@@ -65,7 +65,7 @@ def _prepared(*targets: Path) -> Iterator[tuple[Path, ...]]:
     with translated_os_errors(first):
         for target in targets:
             if target.exists() and not target.is_file() and not target.is_dir():
-                raise OutputError(f"{target}: is no regular file but a pipe or a device; name a file")
+                raise OutputError(f"{target}: is not a regular file but a pipe or a device; name a file")
         with _staging(first.absolute()) as folder:
             temporary = tuple(folder / target.name for target in targets)
             yield temporary

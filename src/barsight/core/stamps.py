@@ -51,7 +51,7 @@ def _stamp(text: str) -> Decimal:
         if not -(2**63) <= stamp < 2**63:
             raise ValueError
     except (ArithmeticError, ValueError):
-        raise ValueError(f"{text[:40]!r} is no time in seconds") from None
+        raise ValueError(f"{text[:40]!r} is not a time in seconds") from None
     return stamp
 
 

@@ -48,7 +48,7 @@ def connect(workers: int, scheduler: str | None, threads: int = 0) -> Iterator[A
     with dask.config.set(options):
         if scheduler is not None:
             if re.fullmatch(r"(tcp|tls)://[^:/]+:\d{1,5}", scheduler) is None:
-                raise ConfigError(f"--scheduler {scheduler}: is no address; write tcp://HOST:8786")
+                raise ConfigError(f"--scheduler {scheduler}: is not an address; write tcp://HOST:8786")
             try:
                 client = Client(scheduler, timeout=20, set_as_default=False)
             except (OSError, ValueError) as error:

@@ -35,7 +35,7 @@ def scratch_root() -> Path:
         root.mkdir(mode=0o700)
     found = root.lstat()
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o022:
-        raise InputError(root, "is no folder that this user alone may write to", "remove it, or set TMPDIR")
+        raise InputError(root, "is not a folder that only this user may write to", "remove it, or set TMPDIR")
     return root
 
 

@@ -151,7 +151,7 @@ def _version_files(results: Objects, version: Version) -> dict[str, str]:
             f"{results.url}: version {version.name} was planned for other results; name those, or plan again"
         )
     if any(PurePosixPath(name).name != name or PurePosixPath(name).stem not in FLAGS for name in files):
-        raise ConfigError(f"{results.url}/versions/{version.name}/{_FILES}: is torn; plan again")
+        raise ConfigError(f"{results.url}/versions/{version.name}/{_FILES}: is damaged; plan again")
     return files
 
 

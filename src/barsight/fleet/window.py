@@ -50,4 +50,4 @@ def _clock(text: str) -> time:
     try:
         return datetime.strptime(text, "%H:%M").time()
     except ValueError:
-        raise ConfigError(f"--between {text!r}: is no time of day; write it like 22:00") from None
+        raise ConfigError(f"--between {text!r}: is not a time of day; write it like 22:00") from None

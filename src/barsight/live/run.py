@@ -279,5 +279,5 @@ def read_keyframes(path: Path) -> Keyframes:
         raise InputError(path, "no such file", remedy) from error
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(
-            path, f"is no list of keyframes ({type(error).__name__}: {error})", remedy
+            path, f"is not a list of keyframes ({type(error).__name__}: {error})", remedy
         ) from error

@@ -42,7 +42,7 @@ def find_file(connection: Connection, map_id: str, name: str) -> Path:
         raise InputError(map_id, "there is no such survey")
     digests = json.loads(row.files)
     if name not in digests and name not in UNSEALED:
-        raise InputError(name, f"is no file of survey {map_id}")
+        raise InputError(name, f"is not a file of survey {map_id}")
     path = Path(row.folder) / name
     if not path.is_file():
         raise InputError(path, "is not there any more")

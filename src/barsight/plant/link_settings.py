@@ -122,7 +122,7 @@ class MqttSettings:
         )  # fmt: skip
         if not self.prefix or set("#+\0") & set(self.prefix) or self.prefix.startswith("$"):
             raise ConfigError(
-                f"mqtt.prefix: {self.prefix!r} is no topic; leave out #, + and a $ at the front"
+                f"mqtt.prefix: {self.prefix!r} is not a topic; leave out #, + and a $ at the front"
             )
 
 
@@ -184,4 +184,4 @@ class WebhookSettings:
         )
         for url in self.urls:
             if urlsplit(url).scheme not in ("http", "https") or not urlsplit(url).hostname:
-                raise ConfigError(f"webhooks.urls: {url!r} is no address; write https://HOST/PATH")
+                raise ConfigError(f"webhooks.urls: {url!r} is not an address; write https://HOST/PATH")

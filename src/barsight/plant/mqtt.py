@@ -171,7 +171,9 @@ def _context(authority: Path) -> ssl.SSLContext:
     try:
         return ssl.create_default_context(cafile=authority)
     except OSError as error:
-        raise InputError(authority, f"is no certificate authority ({error})", "give its PEM file") from error
+        raise InputError(
+            authority, f"isn't a certificate authority ({error})", "give its PEM file"
+        ) from error
 
 
 def _is_cancelled() -> bool:

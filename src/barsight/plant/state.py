@@ -16,7 +16,7 @@ from barsight.store.states import standing_alarms
 from barsight.yard.lifting.validity import is_ahead
 
 MAX_ALARMS = 20
-"""Maximum number of alarms in the state, urgent ones first, then newest; one of each further code is added."""
+"""Maximum number of alarms in the state: urgent ones, then the newest; one of each further code is added."""
 URGENT = ("store-broken", "load-contradicts", "lift-unrecorded", "lift-failed")
 """Codes of alarms of priority 1: the store may no longer match the yard. All others have priority 2."""
 YAW_SENSE = "of the beam from +Y of the yard frame, counter-clockwise seen from above"

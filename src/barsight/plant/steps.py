@@ -114,5 +114,5 @@ def take_named_step(steps: LiftSteps, step: str, who: str, arguments: Mapping[st
 
 def _number(text: str) -> int:
     if not text.isascii() or not text.isdigit() or len(text) > 10:
-        raise ValueError(f"{text[:20]!r} is no number")
+        raise ValueError(f"{text[:20]!r} is not a number")
     return int(text)

@@ -95,7 +95,7 @@ def _make_own(folder: Path) -> None:
         folder.mkdir(parents=True)
     found = folder.lstat()
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid():
-        raise InputError(folder, "is no folder of this user's own", "remove it, or name another OUT")
+        raise InputError(folder, "is not this user's own folder", "remove it, or name another OUT")
 
 
 def checkpoint_key(

@@ -79,7 +79,7 @@ def _header_size(data: bytes) -> tuple[int, int]:
         with Image.open(BytesIO(data), formats=("JPEG", "BMP", "PPM", "WEBP")) as picture:
             return picture.size
     except Exception:  # Pillow and tifffile raise many types for a damaged header
-        raise TornImageError("is no readable picture") from None
+        raise TornImageError("is not a readable picture") from None
 
 
 def _decoded(data: bytes, size: tuple[int, int] | None = None, max_pixels: int = MAX_PIXELS) -> NDArray[Any]:
@@ -95,7 +95,7 @@ def _decoded(data: bytes, size: tuple[int, int] | None = None, max_pixels: int =
     except cv2.error:
         image = None
     if image is None or image.shape[:2] != (height, width):
-        raise TornImageError("is no readable picture")
+        raise TornImageError("is not a readable picture")
     return np.asarray(image)
 
 

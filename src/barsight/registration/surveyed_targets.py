@@ -163,7 +163,7 @@ def _read_table(
         sigma_m, check, width_m = values[-3:]
         if not in_range(values[:-3]).all() or sigma_m <= 0 or check not in (0, 1) or width_m <= 0:
             help_ = "places finite, sigma_m and width_m positive, check 0 or 1"
-            raise InputError(path, f"line {n}: a value can't be", help_)
+            raise InputError(path, f"line {n}: a value is out of range", help_)
         numbers.append(values)
     table = np.array(numbers, np.float64).reshape(-1, len(columns) + 3)
     return tuple((row[key] or "").strip() for row in rows), table

@@ -92,7 +92,7 @@ def read_yard_file(path: Path) -> YardFrame:
     """Read a yard file. Raises CalibrationError naming the file and the invalid value."""
     document = read_document(path)
     if document.values.get("barsight_yard") != 1:
-        raise CalibrationError(path, "is no yard file (barsight_yard: 1 is missing)", REMEDY)
+        raise CalibrationError(path, "is not a yard file (barsight_yard: 1 is missing)", REMEDY)
     frames = [name for name in FRAMES if f"yard_from_{name}" in document.values]
     if len(frames) != 1:
         raise CalibrationError(path, "must hold one of yard_from_world, _encoders, _body", REMEDY)
@@ -100,7 +100,7 @@ def read_yard_file(path: Path) -> YardFrame:
     owners = {name: document.values.get(name) for name in OWNERS}
     for name, value in owners.items():
         if value is not None and not isinstance(value, str):
-            raise document.error(name, "is no text", REMEDY)
+            raise document.error(name, "is not text", REMEDY)
     doubts = document.values.get("doubts")
     return YardFrame(
         path, pose, _covariance(document), _attitude(document), owners["calibration_id"],
@@ -129,7 +129,7 @@ def _targets(document: Document) -> Float64 | None:
     if rows is None:
         return None
     if not isinstance(rows, list) or any(not isinstance(row, list) or len(row) != 3 for row in rows):
-        raise document.error("targets_m", "is no list of x, y, z", REMEDY)
+        raise document.error("targets_m", "is not a list of x, y, z", REMEDY)
     numbers = document.numbers_in("targets_m", [number for row in rows for number in row])
     return np.array(numbers, np.float64).reshape(-1, 3)
 

@@ -25,9 +25,9 @@ def sign_file(path: Path, key: Path) -> Path:
     try:
         loaded = load_pem_private_key(read_bytes(key, MAX_KEY_BYTES, REMEDY), password=None)
     except (ValueError, TypeError) as error:
-        raise InputError(key, f"is no private key that can be read ({error})", REMEDY) from error
+        raise InputError(key, f"is not a readable private key ({error})", REMEDY) from error
     if not isinstance(loaded, Ed25519PrivateKey):
-        raise InputError(key, "is no Ed25519 key", REMEDY)
+        raise InputError(key, "is not an Ed25519 key", REMEDY)
     signature = path.with_name(f"{path.name}.sig")
     with atomic_path(signature) as made:
         made.write_bytes(loaded.sign(read_bytes(path, MAX_SIGNED_BYTES)))

@@ -85,7 +85,7 @@ def read_disparity(path: Path) -> Disparity:
             return _read_tiff(path)
         else:
             raise InputError(
-                path, f"is no disparity file ({suffix or 'no suffix'})", "name a .pfm, .png or .tif"
+                path, f"is not a disparity file ({suffix or 'no suffix'})", "name a .pfm, .png or .tif"
             )
     except (ValueError, OverflowError) as error:
         raise InputError(path, f"can't be read ({error})", "write it again") from None
@@ -101,7 +101,7 @@ def _pfm_bytes(values: Float32) -> bytes:
 def _parse_pfm(path: Path, data: bytes) -> Float32:
     header = _PFM_HEADER.match(data)
     if header is None or header[1] != b"Pf":
-        raise InputError(path, "is no one-channel PFM", "write it with a `Pf` header")
+        raise InputError(path, "is not a one-channel PFM", "write it with a `Pf` header")
     width, height, scale = int(header[2]), int(header[3]), float(header[4])
     body = data[header.end() :]
     if len(body) != 4 * width * height:
@@ -132,7 +132,7 @@ def _kitti_bytes(target: Path, values: Float32) -> bytes:
 def _parse_kitti(path: Path, data: bytes) -> Float32:
     image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED) if data else None
     if image is None or image.dtype != np.uint16 or image.ndim != 2:
-        raise InputError(path, "is no 16-bit gray PNG", "KITTI's disparities are d * 256 in 16 bits")
+        raise InputError(path, "is not a 16-bit gray PNG", "KITTI's disparities are d * 256 in 16 bits")
     values: Float32 = (image / _KITTI_STEPS).astype(np.float32)
     values[image == 0] = np.nan
     return values
@@ -142,7 +142,7 @@ def _read_tiff(path: Path) -> Disparity:
     try:
         bands = np.asarray(tifffile.imread(path), dtype=np.float32)
     except (tifffile.TiffFileError, ValueError) as error:
-        raise InputError(path, f"is no readable TIFF ({error})", "write it again") from error
+        raise InputError(path, f"is not a readable TIFF ({error})", "write it again") from error
     if bands.ndim == 2:
         bands = np.stack([bands, np.full(bands.shape, np.nan, dtype=np.float32)])
     if bands.ndim != 3 or bands.shape[0] != 2:

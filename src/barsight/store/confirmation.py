@@ -244,7 +244,7 @@ def forbid(store: Store, code: str, reason: str, who: str) -> None:
     until it is reported. Raises ConfigError.
     """
     if code not in VETOES:
-        raise ConfigError(f"{code!r} is no veto; the reference of codes lists them")
+        raise ConfigError(f"{code!r} is not a veto; the reference of codes lists them")
     with store.reading() as connection:
         clock_ns = yard_clock_ns(connection)
     with entry(store, who, f"veto {code}", clock_ns) as opened:

@@ -117,7 +117,7 @@ def parse_time(text: str) -> int:
     except ValueError:
         parsed = None
     if parsed is None or parsed.tzinfo is None:
-        raise ConfigError(f"{text!r} is no time; write it like 2026-11-23T14:00:00Z, with the zone")
+        raise ConfigError(f"{text!r} is not a time; write it like 2026-11-23T14:00:00Z, with the zone")
     return expect_time((parsed - datetime.fromtimestamp(0, UTC)) // timedelta(microseconds=1) * 1000)
 
 

@@ -88,7 +88,7 @@ def _parse(url: str) -> URL:
         parsed = make_url(url)
     except ArgumentError as error:
         remedy = "write sqlite:///FILE or postgresql://USER@HOST/NAME"
-        raise ConfigError(f"{url!r} is no database URL; {remedy}") from error
+        raise ConfigError(f"{url!r} is not a database URL; {remedy}") from error
     if parsed.get_backend_name() not in ("sqlite", "postgresql"):
         raise ConfigError(f"{parsed.get_backend_name()}: a store is in SQLite or PostgreSQL")
     if parsed.get_backend_name() == "sqlite" and parsed.database in (None, "", ":memory:"):

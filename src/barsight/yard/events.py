@@ -74,10 +74,10 @@ def _event(path: Path, number: int, row: list[str], remedy: str) -> YardEvent:
         x, y, yaw, length, width = (float(value) for value in rest)
         event = YardEvent(int(stamp), kind, x, y, yaw, length, width)
     except ValueError as error:
-        raise InputError(path, f"line {number} is no event ({error})", remedy) from error
+        raise InputError(path, f"line {number} is not an event ({error})", remedy) from error
     finite = all(math.isfinite(value) for value in (x, y, yaw, length, width))
     if kind not in KINDS or not finite or min(length, width) < 0 or not 0 <= event.stamp_ns < 2**63:
-        raise InputError(path, f"line {number} is no event", remedy)
+        raise InputError(path, f"line {number} is not an event", remedy)
     return event
 
 

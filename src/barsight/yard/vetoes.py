@@ -54,7 +54,7 @@ VETOES = {
 
 def _expect_veto(code: str) -> None:
     if code not in VETOES:
-        raise ValueError(f"{code!r} is no veto")
+        raise ValueError(f"{code!r} is not a veto")
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,7 @@ def load_scenes(data: Path) -> tuple[StereoScene, ...]:
         return (load_scene(data),)
     if not data.is_dir():
         raise InputError(
-            data, "is no folder", "name one that holds scenes with left.png, right.png, disp.pfm"
+            data, "is not a folder", "name one that holds scenes with left.png, right.png, disp.pfm"
         )
     folders = sorted(path for path in data.iterdir() if (path / "disp.pfm").is_file())
     if not folders:
@@ -101,7 +101,7 @@ def _read_gray(path: Path) -> UInt8:
         raise InputError(path, f"can't be read ({error.strerror})", "check the folder") from error
     image = cv2.imdecode(data, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE) if data.size else None
     if image is None:
-        raise InputError(path, "is no readable picture", "fetch it again")
+        raise InputError(path, "is not a readable picture", "fetch it again")
     if image.dtype == np.uint16:
         image = ((image.astype(np.uint32) + _BRIGHTEST_16_BIT // 2) // _BRIGHTEST_16_BIT).astype(np.uint8)
     gray: UInt8 = np.ascontiguousarray(image, dtype=np.uint8)

@@ -125,7 +125,7 @@ def read_note(folder: Path) -> dict[str, Any]:
     try:
         return dict(json.loads(path.read_text(encoding="utf-8")))
     except ValueError as error:
-        raise ConfigError(f"{path}: is torn; remove it, and the world is done anew") from error
+        raise ConfigError(f"{path}: is damaged; remove it, and the world is done anew") from error
 
 
 def _write_note(folder: Path, note: dict[str, Any]) -> None:

@@ -48,13 +48,13 @@ class Board:
     def __post_init__(self) -> None:
         least = {BoardKind.CHECKERBOARD: 3, BoardKind.CHARUCO: 3, BoardKind.APRILGRID: 1}[self.kind]
         if not (least <= self.columns <= MAX_PER_SIDE and least <= self.rows <= MAX_PER_SIDE):
-            raise ConfigError(f"a {self.kind} of {self.columns}x{self.rows} can't be; {BOARD_FORMS}")
+            raise ConfigError(f"a {self.kind} of {self.columns}x{self.rows} is impossible; {BOARD_FORMS}")
         if not 0 < self.size_m <= LARGEST_M:
-            raise ConfigError(f"a size of {self.size_m} m can't be; sizes are in metres: {BOARD_FORMS}")
+            raise ConfigError(f"a size of {self.size_m} m is impossible; sizes are in metres: {BOARD_FORMS}")
         if self.kind is BoardKind.CHARUCO and not 0 < self.marker_m < self.size_m:
             raise ConfigError(f"a marker of {self.marker_m} m doesn't fit a square of {self.size_m} m")
         if self.kind is BoardKind.APRILGRID and not 0 < self.spacing < 10:
-            raise ConfigError(f"a spacing of {self.spacing} can't be; Kalibr's boards have 0.3")
+            raise ConfigError(f"a spacing of {self.spacing} is impossible; Kalibr's boards have 0.3")
 
     @property
     def points_m(self) -> Float64:
@@ -91,7 +91,7 @@ def parse_board(text: str) -> Board:
         columns, rows = (int(part) for part in rest[0].lower().split("x"))
         sizes = [float(part) for part in rest[1:3]]
     except (KeyError, ValueError):
-        raise ConfigError(f"board {text!r} is no board; give {BOARD_FORMS}") from None
+        raise ConfigError(f"board {text!r} is not a board; give {BOARD_FORMS}") from None
     if kind == "checkerboard":
         return Board(BoardKind.CHECKERBOARD, columns, rows, sizes[0])
     if kind == "aprilgrid":

@@ -159,5 +159,5 @@ def _refine(image: UInt8, quads: Float64) -> Float64:
 def _dictionary(name: str) -> cv2.aruco.Dictionary:
     spelt = {key.upper(): key for key in dir(cv2.aruco) if key.startswith("DICT_")}
     if name.upper() not in spelt:
-        raise ConfigError(f"{name!r} is no marker dictionary; known are {', '.join(sorted(spelt))}")
+        raise ConfigError(f"{name!r} is not a marker dictionary; known are {', '.join(sorted(spelt))}")
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, spelt[name.upper()]))

@@ -90,7 +90,7 @@ def _matrices(path: Path) -> dict[str, Float64]:
     """Read the known entries as matrices; `fisheye` is among them where the lenses are fisheyes."""
     text = read_text(path, MAX_SETTINGS_BYTES, ORIGINAL, CalibrationError)
     if _depth(text) > MAX_DEPTH:
-        raise CalibrationError(path, f"brackets in brackets over {MAX_DEPTH} deep", ORIGINAL)
+        raise CalibrationError(path, f"brackets nested over {MAX_DEPTH} deep", ORIGINAL)
     if BASE64.search(text):
         raise CalibrationError(path, "holds base64, whose reader may not end", "write its numbers as text")
     try:
@@ -100,7 +100,7 @@ def _matrices(path: Path) -> dict[str, Float64]:
     except (cv2.error, SystemError):
         names = set()
     if not names:
-        raise CalibrationError(path, "is no file that OpenCV reads", ORIGINAL)
+        raise CalibrationError(path, "is not a file that OpenCV reads", ORIGINAL)
     found: dict[str, Float64] = {}
     for key, spellings in KEYS.items():
         for name in spellings:
@@ -135,14 +135,14 @@ def _matrix(path: Path, storage: cv2.FileStorage, name: str) -> Any:
     try:
         return storage.getNode(name).mat()
     except (cv2.error, SystemError):
-        raise CalibrationError(path, f"{name} is no matrix", ORIGINAL) from None
+        raise CalibrationError(path, f"{name} is not a matrix", ORIGINAL) from None
 
 
 def _camera(
     path: Path, matrix: Float64, coefficients: Float64, size: tuple[int, int], is_fisheye: bool, number: int
 ) -> Camera:
     if matrix.shape != (3, 3) or abs(matrix[0, 1]) > 1e-9:
-        raise CalibrationError(path, f"M{number} is no 3x3 matrix without skew", ORIGINAL)
+        raise CalibrationError(path, f"M{number} is not a 3x3 matrix without skew", ORIGINAL)
     values = tuple(float(value) for value in coefficients.ravel())
     while len(values) > 8 and values[-1] == 0:
         values = values[:-1]

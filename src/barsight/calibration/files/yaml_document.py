@@ -69,7 +69,7 @@ class Document:
         except (TypeError, ValueError, OverflowError):
             numbers = ()
         if len(numbers) != len(value):
-            raise self.error(key, "holds something that is no number", "correct the entry")
+            raise self.error(key, "holds something that is not a number", "correct the entry")
         if not in_range(numbers).all():
             raise self.error(key, "is not finite or out of range", "write the calibrated number")
         return numbers
@@ -117,7 +117,7 @@ def read_document(path: Path) -> Document:
         problem = getattr(error, "problem", None) or "not readable"
         raise CalibrationError(path, f"{where}not YAML ({problem})", REMEDY) from None
     except RecursionError:
-        raise CalibrationError(path, "not YAML (brackets in brackets, too deep)", REMEDY) from None
+        raise CalibrationError(path, "not YAML (brackets nested too deeply)", REMEDY) from None
     except Exception as error:  # from an invalid date, a key that is a list, or invalid binary data
         raise CalibrationError(path, f"not YAML ({error})", REMEDY) from None
     if not isinstance(values, dict):

@@ -60,14 +60,14 @@ class Camera:
         if not np.isfinite(numbers).all():
             raise ValueError("a camera parameter is not finite")
         if self.width < 1 or self.height < 1:
-            raise ValueError(f"the image size {self.width}x{self.height} can't be")
+            raise ValueError(f"the image size {self.width}x{self.height} is impossible")
         if self.width * self.height > MAX_PIXELS:
             raise ValueError(f"an image of {self.width}x{self.height} has over {MAX_PIXELS} pixels")
         if self.fx_px <= 0 or self.fy_px <= 0:
             raise ValueError(f"the focal lengths {self.fx_px}, {self.fy_px} must be positive")
         sides = (self.fx_px / self.width, self.fy_px / self.height)
         if not all(MIN_FOCAL_SIDES < ratio < MAX_FOCAL_SIDES for ratio in sides):
-            raise ValueError(f"the focal lengths {self.fx_px}, {self.fy_px} px can't be")
+            raise ValueError(f"the focal lengths {self.fx_px}, {self.fy_px} px are impossible")
         if not (-self.width < self.cx_px < 2 * self.width and -self.height < self.cy_px < 2 * self.height):
             raise ValueError(f"the principal point ({self.cx_px}, {self.cy_px}) lies far outside the image")
         counts = COEFFICIENT_COUNTS[self.distortion]

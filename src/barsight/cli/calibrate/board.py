@@ -40,7 +40,7 @@ def run(arguments: Sequence[str]) -> None:
         expect_output(out, ".png", ".pdf")
         target = parse_board(board)
         if not 30 <= dpi <= 2400:
-            raise ConfigError(f"--dpi {dpi} can't be; give 30 to 2400")
+            raise ConfigError(f"--dpi {dpi} is out of range; give 30 to 2400")
         longest = (max(target.columns, target.rows) + 3) * target.size_m * (1 + target.spacing) * dpi / INCH_M
         if longest > MAX_PX:
             raise ConfigError(f"--dpi {dpi} makes {longest:.0f} px of this board; give less")

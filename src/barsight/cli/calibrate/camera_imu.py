@@ -124,7 +124,7 @@ def _noise(path: Path, noise: ImuNoise | None) -> ImuNoise:
     if not (1e-6 < noise.gyro_density < 0.05 and 1e-5 < noise.accel_density < 1.0):
         raise InputError(
             path, f"noise densities of {noise.gyro_density:g} rad/s/sqrt(Hz) and {noise.accel_density:g} "
-            "m/s^2/sqrt(Hz) can't be", "give them in these units",
+            "m/s^2/sqrt(Hz) are impossible", "give them in these units",
         )  # fmt: skip
     return noise
 

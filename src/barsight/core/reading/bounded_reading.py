@@ -98,7 +98,7 @@ def _expect_regular(
     path: Path, found: os.stat_result, remedy: str, kind: type[InputError], max_bytes: int | None
 ) -> None:
     if not stat.S_ISREG(found.st_mode):
-        what = "is a folder" if stat.S_ISDIR(found.st_mode) else "is no regular file but a pipe or a device"
+        what = "is a folder" if stat.S_ISDIR(found.st_mode) else "is a pipe or a device, not a regular file"
         raise kind(path, what, remedy)
     if max_bytes is not None and found.st_size > max_bytes:
         raise kind(path, f"has {found.st_size} bytes, at most {max_bytes} are read", remedy)
@@ -126,7 +126,7 @@ def read_text(
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise kind(path, f"is no UTF-8 text (byte {error.start})", remedy) from None
+        raise kind(path, f"is not UTF-8 text (byte {error.start})", remedy) from None
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
@@ -166,7 +166,7 @@ def read_toml(path: Path, remedy: str = REMEDY, kind: type[InputError] = InputEr
     try:
         expect_modest(content)
     except ValueError as error:
-        raise kind(path, f"is no TOML file: {error}", remedy) from None
+        raise kind(path, f"is not a TOML file: {error}", remedy) from None
     return content
 
 
@@ -189,9 +189,9 @@ def _told(
     try:
         return parse(text)
     except RecursionError:
-        raise kind(path, f"is no {form} file: brackets in brackets over {MAX_DEPTH} deep", remedy) from None
+        raise kind(path, f"is not a {form} file: brackets nested over {MAX_DEPTH} deep", remedy) from None
     except ValueError as error:
-        raise kind(path, f"is no {form} file: {error}", remedy) from None
+        raise kind(path, f"is not a {form} file: {error}", remedy) from None
 
 
 def _parse_json(text: str) -> Any:
@@ -209,7 +209,7 @@ def _whole(digits: str) -> int:
 
 
 def _constant(name: str) -> Any:
-    raise ValueError(f"{name} is no number")
+    raise ValueError(f"{name} is not a number")
 
 
 def _expect_shallow(tree: Any) -> None:
@@ -222,7 +222,7 @@ def _expect_shallow(tree: Any) -> None:
         ]  # fmt: skip
         if not level:
             return
-    raise ValueError(f"brackets in brackets over {MAX_DEPTH} deep")
+    raise ValueError(f"brackets nested over {MAX_DEPTH} deep")
 
 
 def expect_modest(tree: Any) -> None:
@@ -234,7 +234,7 @@ def expect_modest(tree: Any) -> None:
         node, depth = waiting.pop()
         nodes += 1
         if depth > MAX_DEPTH:
-            raise ValueError(f"brackets in brackets over {MAX_DEPTH} deep")
+            raise ValueError(f"brackets nested over {MAX_DEPTH} deep")
         if nodes > MAX_NODES:
             raise ValueError(f"over {MAX_NODES} values")
         if isinstance(node, int) and abs(node) >= MAX_INTEGER:
@@ -262,4 +262,4 @@ def read_arrays(
     except InputError:
         raise
     except Exception as error:  # NumPy, zipfile and zlib raise all kinds on a torn archive
-        raise kind(path, f"is no archive of arrays ({error})", remedy) from None
+        raise kind(path, f"is not an archive of arrays ({error})", remedy) from None

@@ -110,7 +110,7 @@ def open_geotiff(path: Path, bands: int = 1) -> Iterator[GeoTiff]:
             cell_m = float(page.tags["ModelPixelScaleTag"].value[0])
             left_m, top_m = (float(v) for v in page.tags["ModelTiepointTag"].value[3:5])
             if not (0 < cell_m < 1e3 and abs(left_m) < 1e6 and abs(top_m) < 1e6):
-                raise InputError(path, "lies nowhere on earth: its cells or its corner can't be", REMEDY)
+                raise InputError(path, "is nowhere on earth: its cells or its corner are impossible", REMEDY)
             yield GeoTiff(page, cell_m, left_m, top_m)
     except _TORN as error:
-        raise InputError(path, f"is torn ({error})", REMEDY) from error
+        raise InputError(path, f"is damaged ({error})", REMEDY) from error

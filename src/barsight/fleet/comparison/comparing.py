@@ -160,7 +160,7 @@ def _document(results: Objects, path: str) -> dict[str, Any]:
 
 
 def _torn(results: Objects, path: str, error: Exception) -> InputError:
-    return InputError(f"{results.url}/{path}", f"is torn ({type(error).__name__}: {error})", REMEDY)
+    return InputError(f"{results.url}/{path}", f"is damaged ({type(error).__name__}: {error})", REMEDY)
 
 
 def _partners(before: dict[int, dict[str, float]], after: dict[int, dict[str, float]]) -> dict[int, int]:

@@ -43,7 +43,7 @@ class SurveyResult:
 def read_result(folder: Path, survey: str, job: str, recipe: str, configuration: str) -> SurveyResult:
     """Read a result folder. Raises InputError if its files can't be read."""
     if not _ID.fullmatch(survey):
-        raise InputError(folder, f"{survey[:80]!r} is no id of a survey", "measure it anew")
+        raise InputError(folder, f"{survey[:80]!r} is not the id of a survey", "measure it anew")
     documents = [read_json(folder / name) for name in RESULT_FILES]
     content = tuple(json.dumps(one, separators=(",", ":")) for one in documents)
     simulated = [one.get("is_simulated") for one in documents if isinstance(one, dict)]

@@ -86,7 +86,7 @@ class BagFile:
         except OSError as error:
             raise self._torn(error) from error
         if len(begin) == len(_MAGIC) and begin != _MAGIC:
-            raise InputError(self.path, "is no ROS 1 bag (#ROSBAG V2.0 is missing)", "copy it again")
+            raise InputError(self.path, "is not a ROS 1 bag (#ROSBAG V2.0 is missing)", "copy it again")
 
     def messages(self, names: Collection[str]) -> Iterator[RawMessage]:
         """Yield the messages of these topics in the order of their receipt."""
@@ -145,7 +145,7 @@ class BagFile:
     def _text(self, text: Any) -> str:
         """Require a value of metadata.yaml to be text, as rosbags uses it unchecked."""
         if not isinstance(text, str):
-            raise self._torn(ValueError(f"{text!r} is no text"))
+            raise self._torn(ValueError(f"{text!r} is not text"))
         return text
 
     def _torn(self, error: Exception) -> InputError:

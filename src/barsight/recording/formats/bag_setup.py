@@ -126,7 +126,7 @@ def _find(folders: Sequence[Path], patterns: tuple[str, ...], without: tuple[str
 def _named(path: Path, topics: Sequence[Topic], name: str, setting: str) -> str:
     if name not in {topic.name for topic in topics}:
         raise InputError(
-            path, f"{setting} {name} is no topic of the bag that fits", f"choose one of {_list(topics)}"
+            path, f"{setting} {name} is not a suitable topic of the bag", f"choose one of {_list(topics)}"
         )
     return name
 

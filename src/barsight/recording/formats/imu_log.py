@@ -162,12 +162,12 @@ def _stamps_ns(path: Path, stamps: list[Decimal], header: str, unit: TimeUnit) -
     if len(stamps) < 2:
         raise InputError(path, "holds no samples", f"give {FORM}")
     if not all(stamp.is_finite() for stamp in stamps):
-        raise InputError(path, "holds a stamp that is no number", "drop that line")
+        raise InputError(path, "holds a stamp that is not a number", "drop that line")
     if unit is TimeUnit.AUTO:
         unit = _time_unit(path, stamps, header)
     scaled = [stamp * UNIT_NS[unit] for stamp in stamps]
     if not all(abs(stamp) < 2**63 for stamp in scaled):
-        raise InputError(path, f"holds stamps that are no time in {unit}", "give their unit by --time-unit")
+        raise InputError(path, f"holds stamps that are not times in {unit}", "give their unit by --time-unit")
     return np.array([int(stamp) for stamp in scaled], dtype=np.int64)
 
 

@@ -162,7 +162,7 @@ def _read_projections(path: Path, keys: tuple[str, str]) -> tuple[Float64, Float
             values = np.array([float(field) for field in rest.split()])
         except ValueError:
             raise CalibrationError(
-                path, f"line {number}: holds something that is no number", "mend it"
+                path, f"line {number}: holds something that is not a number", "mend it"
             ) from None
         if values.size != 12 or not in_range(values).all():
             raise CalibrationError(

@@ -49,7 +49,7 @@ def records(path: Path, max_bytes: int = MAX_RECORD) -> Iterator[Record]:
         length = os.fstat(stream.fileno()).st_size
         magic = stream.read(len(MAGIC))
         if magic != MAGIC[: len(magic)]:
-            raise InputError(path, "is no MCAP file", "give the folder as the live run left it")
+            raise InputError(path, "is not an MCAP file", "give the folder as the live run left it")
         end = len(MAGIC)
         while len(head := stream.read(HEAD.size)) == HEAD.size:
             kind, size = HEAD.unpack(head)
@@ -94,7 +94,7 @@ class SegmentFile:
                 yield RawMessage(topic, kind, seconds * NS_PER_S + rest, data)
 
     def decode(self, message: RawMessage) -> Any:
-        """Decode the message. Raises ValueError if it is torn."""
+        """Decode the message. Raises ValueError if it is damaged."""
         try:
             return self._typestore.deserialize_cdr(message.data, message.kind)
         except MemoryError:

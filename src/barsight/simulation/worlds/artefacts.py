@@ -66,7 +66,7 @@ def _on_post(sphere: Sphere) -> list[Float64]:
 
 def _bundle(dummy: DummyBundle) -> StackedBundle:
     if dummy.bars not in BARS_OF_RINGS:
-        raise ConfigError(f"{dummy.name}: {dummy.bars} bars are no hexagonal packing; {BARS_OF_RINGS} are")
+        raise ConfigError(f"{dummy.name}: {dummy.bars} bars make no hexagonal packing; {BARS_OF_RINGS} do")
     kind = BarKind(dummy.bar_diameter_m, dummy.bars)
     cross = hexagonal_packing(kind)
     centre = np.array([dummy.x_m, dummy.y_m, -cross[:, 1].min() + kind.diameter_m / 2])

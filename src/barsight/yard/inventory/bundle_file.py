@@ -54,7 +54,7 @@ def read_bundles(path: Path) -> tuple[Bundle, ...]:
     try:
         return tuple(bundle_of(record) for record in content["bundles"])
     except (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError) as error:
-        raise InputError(path, f"is torn ({type(error).__name__}: {error})", REMEDY) from error
+        raise InputError(path, f"is damaged ({type(error).__name__}: {error})", REMEDY) from error
 
 
 def read_match(path: Path) -> StockMatch | None:
@@ -69,7 +69,7 @@ def read_match(path: Path) -> StockMatch | None:
         )
         return StockMatch(matched, *(tuple(stock[name]) for name in ("moved", "missing", "hidden", "extra")))
     except (KeyError, TypeError) as error:
-        raise InputError(path, f"is torn ({type(error).__name__}: {error})", REMEDY) from error
+        raise InputError(path, f"is damaged ({type(error).__name__}: {error})", REMEDY) from error
 
 
 def _record(bundle: Bundle) -> dict[str, Any]:

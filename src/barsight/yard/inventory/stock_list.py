@@ -128,7 +128,7 @@ def _json_rows(path: Path) -> list[dict[str, Any]]:
     content = read_json(path, _REMEDY)
     rows = content.get("bundles") if isinstance(content, dict) else content
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
-        raise InputError(path, "is no list of bundles", _REMEDY)
+        raise InputError(path, "is not a list of bundles", _REMEDY)
     return rows
 
 

@@ -73,7 +73,7 @@ def read_users(path: Path | None) -> dict[str, OpcUaUser]:
             if user.role not in OPCUA_ROLES:
                 raise ValueError(f"{user.role!r} is no role")
     except (ValueError, TypeError, AttributeError) as error:
-        raise InputError(path, f"is no list of users ({error})", "write it anew") from error
+        raise InputError(path, f"is not a list of users ({error})", "write it anew") from error
     return users
 
 

@@ -143,7 +143,7 @@ def _issued(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
 def _read_all(
     folder: Path, der: Callable[[bytes], _Parsed], pem: Callable[[bytes], _Parsed]
 ) -> list[_Parsed]:
-    """Read all parsable files of a folder; a file that is no certificate or CRL has no effect."""
+    """Read all parsable files of a folder; a file that is not a certificate or CRL has no effect."""
     read: list[_Parsed] = []
     for path in sorted(folder.glob("*")):
         if path.suffix not in (".der", ".pem", ".crl", ".crt", ".cer") or not path.is_file():
