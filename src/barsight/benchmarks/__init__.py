@@ -1,1 +1,1 @@
-"""Compare methods in one run and print a table."""
+"""Compare methods in one run and tabulate the results."""

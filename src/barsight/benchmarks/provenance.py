@@ -1,4 +1,4 @@
-"""Record machine, commit and times of a benchmark: what makes a table repeatable."""
+"""Record the machine, commit and times of a benchmark, which make its table reproducible."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MIN_REPEATS = 5
 
 @dataclass(frozen=True)
 class Provenance:
-    """commit: of the source, with `+` where files differ from it, or `unknown`. The machine in words."""
+    """commit: of the source, with `+` if files differ from it, or `unknown`. machine: its description."""
 
     commit: str
     machine: str
@@ -32,7 +32,7 @@ class Provenance:
 
 @dataclass(frozen=True)
 class Timing:
-    """Wall time in ms: median, fastest and slowest of `repeats` runs after one that compiles and warms up."""
+    """Wall time in ms: median, fastest and slowest of `repeats` runs after a warm-up run that compiles."""
 
     median_ms: float
     fastest_ms: float
@@ -48,7 +48,7 @@ def provenance() -> Provenance:
 
 
 def time_repeats(work: Callable[[], T], repeats: int = MIN_REPEATS) -> tuple[T, list[float]]:
-    """Time `repeats` runs of `work` (wall seconds) after one that isn't counted; also its result."""
+    """Time `repeats` runs of `work` after a warm-up run: its result, and the wall times, s."""
     result = work()
     seconds = []
     for _ in range(repeats):
@@ -59,7 +59,7 @@ def time_repeats(work: Callable[[], T], repeats: int = MIN_REPEATS) -> tuple[T, 
 
 
 def summarise_times(seconds: Sequence[float] | Float64) -> Timing:
-    """Summarise the seconds of `time_repeats`."""
+    """Summarise the times, s, of `time_repeats`."""
     ms = 1e3 * np.array(seconds)
     return Timing(float(np.median(ms)), float(ms.min()), float(ms.max()), len(seconds))
 

@@ -1,1 +1,1 @@
-"""Judge lifts by exact geometry alone; nothing here imports what it judges."""
+"""Judge lifts from exact geometry alone; nothing here imports the code that it judges."""

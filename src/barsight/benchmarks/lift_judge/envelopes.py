@@ -1,4 +1,4 @@
-"""Cut exact solids by vertical lines: the highest surface over a grid, the underside of one solid."""
+"""Intersect exact solids with vertical lines: highest surface over a grid, underside of one solid."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ STEP_M = 0.001
 
 @dataclass(frozen=True, eq=False)
 class Envelope:
-    """Highest surface over a grid of STEP_M or coarser. Cell (i, j) is at (x0 + i step, y0 + j step).
+    """Highest surface over a grid of spacing STEP_M or more. Cell (i, j) is at (x0 + i step, y0 + j step).
 
-    z: (X, Y), 0 where there is the floor only. top: (X, Y) number of the solid, NOTHING for the floor.
+    z: (X, Y) height, m, 0 where there is only the floor. top: (X, Y) number of the topmost solid, NOTHING for
+    the floor.
     """
 
     x0: float
@@ -31,7 +32,7 @@ def envelope(
     yard: SolidYard, low: tuple[float, float], high: tuple[float, float], take: Float64 | None = None,
     step: float = STEP_M,
 ) -> Envelope:  # fmt: skip
-    """Draw the envelope of the solids, or of those for which `take` (N,) is not 0, from corner to corner."""
+    """Rasterise the highest surface of the solids between two corners, except those with `take` (N,) 0."""
     shape = tuple(round((b - a) / step) + 1 for a, b in zip(low, high, strict=True))
     z, top = np.zeros(shape, np.float32), np.full(shape, NOTHING, np.int32)
     chosen = np.ones(len(yard.solids)) if take is None else np.asarray(take, float)
@@ -43,7 +44,7 @@ def envelope(
 def undersides(
     yard: SolidYard, low: tuple[float, float], high: tuple[float, float], number: int, step: float
 ) -> Float64:
-    """Compute the lowest surface (X, Y) of one solid over a grid, inf beside it."""
+    """Compute the lowest surface (X, Y), m, of one solid over a grid; inf where the solid is not."""
     shape = tuple(round((b - a) / step) + 1 for a, b in zip(low, high, strict=True))
     out = np.full(shape, np.inf)
     _draw_underside(yard.table[number], low[0], low[1], step, out)
@@ -54,11 +55,12 @@ def undersides(
 def _draw(
     table: Float64, bounds: Float64, take: Float64, x0: float, y0: float, step: float, z: Float32, top: Int32
 ) -> None:
-    """Draw the highest surface over the cells (X, Y) into z, m, and its solid's number into top.
+    """Rasterise the highest surface into z (X, Y), m, and the number of its solid into top (X, Y).
 
-    table: (N, 16); bounds: (N, 2, 3) of each solid; take: (N,), 0 for those that are left out.
+    table: (N, 16); bounds: (N, 2, 3), lower and upper corner of each solid; take: (N,), 0 for solids to
+    ignore.
     """
-    # The highest first: most of what lies below is then passed over.
+    # The highest solids first, so that most of those below them are skipped.
     for n in np.argsort(-bounds[:, 1, 2]):
         if take[n] == 0:
             continue
@@ -77,7 +79,7 @@ def _draw(
 
 @kernel()
 def _draw_underside(solid: Float64, x0: float, y0: float, step: float, out: Float64) -> None:
-    """Draw the lowest surface of one row (16,) of the table over the cells (X, Y) into out, m."""
+    """Rasterise the lowest surface of one solid, a row (16,) of the table, into out (X, Y), m."""
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
             low, high = cut(solid, x0 + i * step, y0 + j * step)
@@ -87,7 +89,7 @@ def _draw_underside(solid: Float64, x0: float, y0: float, step: float, out: Floa
 
 @kernel()
 def cut(solid: Float64, x: float, y: float) -> tuple[float, float]:
-    """Cut a solid by the vertical line at (x, y): from z to z, empty where it misses.
+    """Intersect a solid with the vertical line at (x, y): lower and upper z, m; lower > upper if it misses.
 
     solid: (16,), a row of `SolidYard.table`.
     """

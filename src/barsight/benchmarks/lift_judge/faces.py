@@ -1,4 +1,4 @@
-"""Set the magnet down at one place on the exact solids: what it rests on, pulls, touches."""
+"""Set the magnet down at one position on the exact solids: find contacts, pull and obstructions."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from barsight.core.arrays import Float32, Float64, Int32, Int64, kernel
 from barsight.simulation.worlds.solids import NOTHING, SolidYard
 
 STRAY_M = 0.03
-"""Margin around the faces in which the stray field, and the poles' bodies, want nothing above them."""
+"""Margin, m, around the faces to be free above their plane, for the stray field and the pole bodies."""
 CONTACT_GAP_M = 0.003
-"""A face nearer than this to steel lies on it."""
+"""Largest gap, m, between a point of a face and the load's steel at which the point counts as in contact."""
 NEAR_M = 0.15
-"""A bundle further below the resting faces than this is not what they are set down for."""
+"""Largest depth, m, of steel below the resting faces at which its bundle can still be the intended load."""
 SPARE_REACH_M = 0.01
 
 
 @dataclass(frozen=True, eq=False)
 class DrawnSurroundings:
-    """The solids near a magnet, in its frame: X across, Y along the beam; drawn at 1 mm where its faces may
-    come and at 5 mm under the beam. owner: of each solid.
+    """Solids near a magnet in the magnet's frame (X across, Y along the beam), rasterised at 1 mm wherever
+    its faces may come and at 5 mm under the beam. owner: bundle of each solid.
     """
 
     yard: SolidYard
@@ -36,11 +36,11 @@ class DrawnSurroundings:
 
     @classmethod
     def around(cls, yard: SolidYard, magnet: JudgedMagnet, slack_m: float) -> DrawnSurroundings:
-        """Draw what stands around the frame's origin. slack_m: how far any point of the magnet may be off."""
+        """Rasterise the solids around the origin. slack_m: largest displacement of a magnet's point, m."""
         poles = magnet.poles
         across = float((np.abs(poles[:, 1]) + poles[:, 3] / 2).max()) + STRAY_M + slack_m + 0.01
         along = magnet.half_span_m + STRAY_M + slack_m + 0.01
-        # Cells lie where the points of a face of whole millimetres do.
+        # Puts cell centres at the sample points of faces whose size is whole millimetres.
         across, along = (math.ceil(half / STEP_M) * STEP_M + STEP_M / 2 for half in (across, along))
         wide, long = max(magnet.beam[1] / 2 + slack_m, across), max(magnet.beam[0] / 2 + slack_m, along)
         near = SolidYard(
@@ -59,15 +59,15 @@ class DrawnSurroundings:
         )  # fmt: skip
 
     def own(self, load: tuple[int, ...]) -> Envelope:
-        """Draw the load alone."""
+        """Rasterise the load alone."""
         low = self.all.x0, self.all.y0
         return envelope(self.yard, low, (-low[0], -low[1]), take=np.isin(self.owner, load).astype(float))
 
 
 @dataclass(frozen=True, eq=False)
 class Spread:
-    """Points over rectangles of the magnet, before it is moved: u across, v along (N,). pole: whose each is;
-    cell: its part of a face, of eight.
+    """Sample points on rectangles of the magnet, before it is moved: u across, v along (N,), m. pole:
+    number of each point's rectangle. cell: number of the eighth of a rectangle that holds it.
     """
 
     u: Float64
@@ -77,7 +77,7 @@ class Spread:
 
     @classmethod
     def over(cls, rectangles: Float64, margin: float, step: float) -> Spread:
-        """Spread points over rectangles (P, 4) of along, across, length, width, `margin` larger all round."""
+        """Sample rectangles (P, 4), each along, across, length, width, enlarged by `margin` on every side."""
         parts = []
         for number, (along, across, length, width) in enumerate(rectangles):
             v = _middles(along, length / 2 + margin, step)
@@ -92,8 +92,8 @@ class Spread:
     def look(
         self, drawn: Envelope, owner: Int32, offset: tuple[float, float, float]
     ) -> tuple[Float64, Int32]:
-        """Look up height and bundle under the points, moved by across, along and a turn; the height is -inf
-        and the bundle NOTHING where nothing was drawn.
+        """Look up height, m, and bundle under the points after a displacement (across, along, turn); the
+        height is -inf and the bundle NOTHING over the bare floor.
         """
         z, found = np.empty(len(self.u)), np.empty(len(self.u), np.int32)
         grid = np.array([drawn.x0, drawn.y0, drawn.step])
@@ -106,9 +106,10 @@ def _look(
     u: Float64, v: Float64, offset: Float64, grid: Float64, drawn: Float32, top: Int32, owner: Int32,
     z: Float64, found: Int32,
 ) -> None:  # fmt: skip
-    """Look up the nearest cells of points u, v (N,), moved by `offset`: across, along and a turn. grid: x0,
-    y0 and step of drawn, top: (X, Y) of an `Envelope`; owner: of each solid. Fills z, m, and found, the
-    bundle (N,).
+    """Look up the nearest cells of points u, v (N,), displaced by `offset`: across, along, turn.
+
+    grid: x0, y0 and step of drawn, top: (X, Y) of an `Envelope`; owner: (S,) bundle of each solid. Fills z
+    (N,), m, and found (N,), the bundle.
     """
     across, along, turn = offset
     x0, y0, step = grid
@@ -129,13 +130,14 @@ def _middles(centre: float, half: float, step: float) -> Float64:
 
 @dataclass(frozen=True, eq=False)
 class Standing:
-    """The magnet at rest at one place.
+    """The magnet at rest in one position.
 
-    rise_m: the highest of what isn't the load over the faces' plane as the load alone would carry it;
-    stray_m: the same with STRAY_M around the faces, over the plane at rest. beam_m: the highest of anything
-    over the beam's underside. pull: (P,) N on the load; each: N on each bundle of it; others: on each other
-    one, and on other steel under NOTHING. spare: bundles within SPARE_REACH_M beyond the reach. gaps: (P,)
-    the least to the load's steel. contact_share: of the faces on the load.
+    rise_m: largest height of anything but the load above the face plane, with the faces carried by the load
+    alone; stray_m: the same within STRAY_M of the faces, above the plane at rest. beam_m: largest height of
+    anything above the beam's underside. pull: (P,) pull on the load, N; each: pull on each bundle of it, N;
+    others: pull on each other bundle, N, and on other steel under the key NOTHING. spare: bundles within the
+    magnet's reach plus SPARE_REACH_M. gaps: (P,) smallest gap to the load's steel, m. contact_share: share of
+    the faces in contact with the load.
     """
 
     rest: Rest
@@ -151,7 +153,7 @@ class Standing:
 
 
 class MagnetOnSolids:
-    """Sets one magnet down at places around the origin of its surroundings."""
+    """Sets one magnet down at positions around the origin of its surroundings."""
 
     def __init__(self, magnet: JudgedMagnet, around: DrawnSurroundings) -> None:
         self._magnet, self._around = magnet, around
@@ -162,12 +164,12 @@ class MagnetOnSolids:
         self._own: dict[tuple[int, ...], Envelope] = {}
 
     def rest(self, z: Float64) -> Rest:
-        """Lower the faces onto heights z (N,) under their points."""
+        """Lower the faces onto the heights z (N,), m, under their points."""
         faces = self._faces
         return lower(faces.v, faces.u, z, faces.cell, math.tan(self._magnet.roll_rad))
 
     def loads(self, count: int) -> tuple[int, ...]:
-        """Tell which bundles the magnet is set down for: the `count` with most of the faces over them."""
+        """Find the intended load: the `count` bundles under the largest area of the faces."""
         around, here = self._around, (0.0, 0.0, 0.0)
         z, _ = self._faces.look(around.all, around.owner, here)
         if not np.isfinite(z).any():
@@ -179,7 +181,7 @@ class MagnetOnSolids:
         return tuple(int(b) for b in bundles[np.argsort(-points, kind="stable")][:count])
 
     def stand(self, load: tuple[int, ...], offset: tuple[float, float, float]) -> Standing:
-        """Set down at an offset (across, along, turn) from the origin."""
+        """Set the magnet down at an offset (across, along, turn) from the origin."""
         faces, around = self._faces, self._around
         z, owner = faces.look(around.all, around.owner, offset)
         foreign = ~np.isin(owner, load)
@@ -189,7 +191,7 @@ class MagnetOnSolids:
             if load not in self._own:
                 self._own[load] = around.own(load)
             own, _ = faces.look(self._own[load], around.owner, offset)
-            # Without any of the load below them nothing but what is foreign carries the faces.
+            # If none of the load is below the faces, only foreign objects carry them.
             rise = math.inf
             if np.isfinite(own).any():
                 rise = float((z - self.rest(own).at(faces.v, faces.u))[foreign].max())
@@ -200,7 +202,7 @@ class MagnetOnSolids:
         )  # fmt: skip
 
     def over_plane(self, plane: Rest, offset: tuple[float, float, float]) -> float:
-        """Compute the highest of anything over a plane given in the magnet's frame, under moved faces."""
+        """Compute the largest height above a plane in the magnet's frame, m, under displaced faces."""
         faces = self._faces
         z, _ = faces.look(self._around.all, self._around.owner, offset)
         c, s = math.cos(offset[2]), math.sin(offset[2])
@@ -218,8 +220,9 @@ class MagnetOnSolids:
     def _pulls(
         self, load: tuple[int, ...], rest: Rest, offset: tuple[float, float, float]
     ) -> tuple[Float64, dict[int, float], dict[int, float], tuple[int, ...], Float64, float]:
-        """Integrate the pull over the faces at 1 mm, by pole and by whom it pulls: the load by what its bars
-        let through, all else as a thick plate.
+        """Integrate the pull over the faces at 1 mm, split by pole and by the bundle it acts on.
+
+        On the load the pull is limited by the thickness of its bars, on all else it is that of a thick plate.
         """
         faces, magnet, around = self._faces, self._magnet, self._around
         z, owner = faces.look(around.steel, around.owner, offset)

@@ -1,26 +1,26 @@
-"""Judge a placement of the magnet by exact solids: dangerous or fine, with reasons and figures.
+"""Judge a placement of the magnet on exact solids: dangerous or fine, with reasons and figures.
 
-The magnet is set down at the target and at the corners and the middles of the sides of the tolerance box (15
-places). Each figure is the worst of them. Over the first bound a lift is dangerous; it is fine only where
-every figure is within the second; between it is neither.
+The magnet is set down at the target, at the corners of the tolerance box and at the centres of its sides (15
+positions). Each figure is the worst of them. Beyond the first bound a lift is dangerous; it is fine only if
+every figure is within its second bound; otherwise it is unclear.
 
 | figure | dangerous | fine |
 |---|---|---|
-| what isn't the load, over the faces' plane as the load alone carries it | > 15 mm | <= 5 mm |
-| what isn't the load, over the plane at rest within 30 mm of a face | | <= 5 mm |
-| anything over the plane that the lift states, under faces within tolerance | > 15 mm | <= 10 mm |
-| anything over the beam's underside | > 0 | <= -30 mm |
-| pull on another bundle or on other steel, over the other's weight | >= 5 % | nothing within reach + 10 mm |
-| true pull over true weight, of each bundle of the load | < the safety factor | >= 1.25 of it |
+| height of foreign objects above the face plane as the load alone would carry it | > 15 mm | <= 5 mm |
+| height of foreign objects above the plane at rest, within 30 mm of a face | | <= 5 mm |
+| height of anything above the stated plane, under faces within tolerance | > 15 mm | <= 10 mm |
+| height of anything above the beam's underside | > 0 | <= -30 mm |
+| pull on another bundle over its weight; on other steel | > 5 %; > 500 N | nothing within reach + 10 mm |
+| true pull over true weight, of each bundle of the load | < safety factor | >= 1.25 of it |
 | a pole's pull over its share of the weight by moments | < 1 | >= 1.25 |
-| load over what magnet and crane carry | > 1 | <= 0.9 |
-| true mass over the upper bound that the lift states | > 1.25 | <= 1 |
-| lower bound of the pull that the lift states, over the true pull | > 1.25 | <= 1 |
-| what lies on the load or hangs over it: width seen from above | >= 8 mm | <= 3 mm |
-| faces' slope, the worst pole's least gap, overhang, centre of mass off, over limits | > 1.25 | <= 0.75 |
-| share of the faces on the load, over its limit | < 0.75 | >= 1.25 |
+| load over the capacity of magnet and crane | > 1 | <= 0.9 |
+| true mass over its stated upper bound | > 1.25 | <= 1 |
+| stated lower bound of the pull over the true pull | > 1.25 | <= 1 |
+| width, seen from above, of what lies on the load or overhangs it | > 8 mm | <= 3 mm |
+| slope, worst pole's smallest gap, overhang, offset of the centre of mass, over limits | > 1.25 | <= 0.75 |
+| share of the faces in contact with the load, over its limit | < 0.75 | >= 1.25 |
 
-The load is the bundle with most of the faces over it. A pole's share of the weight is that of a stiff beam:
+The load is the bundle under most of the face area. A pole's share of the weight is that of a rigid beam:
 linear along it, so that forces and moments balance.
 """
 
@@ -51,14 +51,15 @@ COVER_M = (0.008, 0.003)
 COVER_STEP_M = 0.002
 TOUCHING_M = 0.003
 OTHER_STEEL_N = 500.0
-"""Pull on steel that belongs to no bundle from which it counts as taken along."""
+"""Pull, N, above which steel that belongs to no bundle counts as lifted along."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """A magnet's place: centre, yaw of the beam from +Y; half sides of the box (m, m, rad) within which the
-    lift claims to hold. What the lift states, None where it states nothing: plane: (height, slope along,
-    slope across) of the faces; upper_kg: of the load's mass; pull_low_n: of the pull.
+    """A magnet's pose: centre; yaw of the beam from +Y; half sides of the tolerance box (m, m, rad) within
+    which the lift claims to be safe. Values that the lift states, None if it states none: plane: (height,
+    slope along, slope across) of the faces; upper_kg: upper bound of the load's mass; pull_low_n: lower
+    bound of the pull.
     """
 
     x_m: float
@@ -72,8 +73,8 @@ class Target:
 
 @dataclass(frozen=True)
 class LiftVerdict:
-    """dangerous, unclear: reasons, in words and figures. load: bundles that the lift is for. figures: each
-    check's worst. mass_kg, pull_n: of the load, the pull at the target itself.
+    """dangerous, unclear: reasons, with names and values. load: bundles that the lift is for. figures:
+    worst value of each check. mass_kg: mass of the load. pull_n: pull at the target itself.
     """
 
     dangerous: tuple[str, ...]
@@ -85,7 +86,7 @@ class LiftVerdict:
 
     @property
     def is_fine(self) -> bool:
-        """Tell whether every figure is clear of its limit."""
+        """Tell whether every figure is within its safe limit."""
         return not self.dangerous and not self.unclear
 
 
@@ -174,7 +175,7 @@ class Judge:
 
 
 class _Checks:
-    """Figures held against their bounds."""
+    """Figures compared with their bounds."""
 
     def __init__(self) -> None:
         self.dangerous: list[str] = []
@@ -182,7 +183,7 @@ class _Checks:
         self.figures: dict[str, float] = {}
 
     def add(self, name: str, value: float, dangerous_over: float, fine_to: float) -> None:
-        """Hold a figure of which less is better against both bounds."""
+        """Compare a figure that should be small with both bounds."""
         self.figures[name] = float(value)
         text = f"{name}: {abs(value) if fine_to < 0 and value < 0 else value:.3g}"
         if value > dangerous_over:
@@ -191,17 +192,17 @@ class _Checks:
             self.unclear.append(f"{text} (fine to {abs(fine_to):.3g})")
 
     def bound_above(self, name: str, value: float, limit: float) -> None:
-        """Hold a figure against a limit of the magnet's, by a quarter to either side."""
+        """Compare a figure with one of the magnet's limits, with a margin of a quarter on either side."""
         self.add(name, value, MORE * limit, LESS * limit)
 
     def bound_below(self, name: str, value: float, limit: float) -> None:
-        """Hold a figure of which more is better: dangerous below the limit, fine from a quarter over it."""
+        """Compare a figure that should be large: dangerous below the limit, fine from 1.25 of it."""
         self.add(name, -value, -limit, -MORE * limit)
         self.figures[name] = float(value)
 
 
 def _offsets(target: Target) -> list[tuple[float, float, float]]:
-    """List the target and the box's corners and sides' middles as (across, along, turn)."""
+    """List the target, the box's corners and the centres of its sides as (across, along, turn)."""
     c, s = math.cos(target.yaw_rad), math.sin(target.yaw_rad)
     signs = [(0, 0, 0), *itertools.product((-1, 1), repeat=3)]
     signs += [(0,) * k + (sign,) + (0,) * (2 - k) for k in range(3) for sign in (-1, 1)]
@@ -219,7 +220,10 @@ def _total(yard: SolidYard, load: tuple[int, ...]) -> tuple[float, Float64]:
 
 
 def _pole_margin(pull: Float64, along: Float64, weight: float, centre_along: float) -> float:
-    """Compute the least of pull over share, the share linear along the beam so that moments balance."""
+    """Compute the smallest ratio of pull to weight share over the poles.
+
+    The share is linear along the beam, so that forces and moments balance.
+    """
     away = along - along.mean()
     spread = float(away @ away)
     turn = away * (centre_along - along.mean()) / spread if spread > 0 else 0.0 * away
@@ -228,10 +232,10 @@ def _pole_margin(pull: Float64, along: Float64, weight: float, centre_along: flo
 
 
 def covered_width(yard: SolidYard, bundle: int, load: tuple[int, ...]) -> float:
-    """Measure how wide, seen from above, anything lies on a bundle or hangs over it, m.
+    """Measure the width, seen from above, of anything that lies on a bundle or overhangs it, m.
 
-    Other solids whose underside is above the bundle's top (or within TOUCHING_M of it) at the same place; the
-    narrower width of the largest patch, to COVER_STEP_M.
+    Counts other solids whose underside is above the bundle's top at the same place (or within TOUCHING_M of
+    it). The result is the shorter side of the largest patch, with a resolution of COVER_STEP_M.
     """
     bars = yard.bars(bundle)
     longest = max(bars, key=lambda bar: float(bar.half[0]))
@@ -251,7 +255,7 @@ def covered_width(yard: SolidYard, bundle: int, load: tuple[int, ...]) -> float:
         under = undersides(local, *corners, number=number, step=COVER_STEP_M)
         over = (tops.top != NOTHING) & np.isfinite(under) & (under > tops.z - TOUCHING_M)
         inside = np.pad(over, 1)
-        # A patch k cells wide is (k + 1) / 2 deep.
+        # The largest depth inside a patch k cells wide is (k + 1) / 2 cells.
         deepest = float(ndimage.distance_transform_cdt(inside, metric="chessboard").max())
         widest = max(widest, max(2 * deepest - 1, 0.0) * COVER_STEP_M)
     return widest

@@ -1,8 +1,8 @@
-"""Lower the faces, one rigid plane hung at the magnet's centre, until they rest.
+"""Lower the faces, one rigid plane suspended at the magnet's centre, until they rest.
 
-A plane that hangs at its centre comes to rest where its centre is lowest and it still clears every point:
-minimise h over h + v pitch + u roll >= z, a linear programme in three unknowns. Where the centre lies within
-the triangle of three contacts they carry it; else the suspension's stop does.
+Such a plane comes to rest where its centre is lowest while it still clears every point: minimise h subject to
+h + v pitch + u roll >= z, a linear programme in three unknowns. If the centre lies within the triangle of
+three contacts, these carry the plane; otherwise the suspension's stop limits the slope.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from scipy.optimize import linprog
 from barsight.core.arrays import Float64, Int64, kernel
 
 STEEPEST_PITCH = 0.6
-"""Slope along the beam at which the lowering ends: far beyond what any magnet allows."""
+"""Largest slope along the beam that the lowering allows: far more than any magnet permits."""
 EXACT_M = 1e-6
 CONTACT_M = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class Rest:
-    """The faces at rest: z = height + v pitch + u roll, v along the beam and u across. contacts: (C,) numbers
-    of the points that carry them.
+    """The faces at rest: z = height + v pitch + u roll, v along the beam and u across. contacts: (C,)
+    indices of the points that carry them.
     """
 
     height: float
@@ -32,15 +32,15 @@ class Rest:
     contacts: Int64
 
     def at(self, v: Float64, u: Float64) -> Float64:
-        """Compute the faces' plane, m."""
+        """Compute the height of the face plane, m."""
         return self.height + v * self.pitch + u * self.roll
 
 
 def lower(v: Float64, u: Float64, z: Float64, cell: Int64, max_roll: float) -> Rest:
-    """Lower the plane onto points (N,); one at -inf isn't there. max_roll: slope across that stops it.
+    """Lower the plane onto points (N,), ignoring those at -inf. max_roll: limit of the slope across.
 
-    Points are added to the programme as the plane is found to cut into them, the deepest of each cell (N,
-    numbers from 0) at a time; it ends when none is cut by more than EXACT_M.
+    Points are added to the programme as the plane turns out to cut into them, the deepest of each cell (N,
+    numbered from 0) at a time; it ends when none is cut by more than EXACT_M.
     """
     chosen = [int(k) for k in _highest(v, u, z, cell, 0.0, 0.0, 0.0) if k >= 0]
     if not chosen:
@@ -67,10 +67,10 @@ def lower(v: Float64, u: Float64, z: Float64, cell: Int64, max_roll: float) -> R
 def _highest(
     v: Float64, u: Float64, z: Float64, cell: Int64, height: float, pitch: float, roll: float
 ) -> Int64:
-    """Find the point of each cell that is highest over a plane, -1 where a cell has none.
+    """Find the point of each cell that is highest above a plane, -1 for a cell without points.
 
-    v, u, z: (N,) m; cell: (N,) from 0 on. The plane rises from height by pitch along v and roll along u.
-    Returns (cells,) the points' numbers.
+    v, u, z: (N,) m; cell: (N,) numbers from 0. The plane is z = height + v pitch + u roll. Returns (cells,)
+    indices of the points.
     """
     best, found = np.full(cell.max() + 1, -np.inf), np.full(cell.max() + 1, -1)
     for k in range(len(z)):

@@ -1,4 +1,4 @@
-"""Read a magnet's description as the judge needs it, from its TOML file or from `lifts.json`."""
+"""Read the parts of a magnet's description that the judge needs, from its TOML file or from `lifts.json`."""
 
 from __future__ import annotations
 
@@ -23,11 +23,12 @@ _MU0 = 4e-7 * math.pi
 
 @dataclass(frozen=True, eq=False)
 class JudgedMagnet:
-    """poles: (P, 4) along, across, length, width. beam: length, width, height over the faces. pull: (K, 2)
-    gap and Pa on a thick plate. plates: (T, 1 + K) thickness and the Pa on it, from the thinnest to that of
-    `pull`; none where no thickness is known. rounds: (R, 2) diameter of one bar, its pull over the thick
-    plate's. left: of the pull, by the steel's grade, heat and duty. tolerance: half sides in yard axes and
-    rad. carries_kg: the least of magnet and crane.
+    """poles: (P, 4) along, across, length, width, m. beam: length, width, height over the faces, m. pull:
+    (K, 2) gap, m, and pull per area on a thick plate, Pa. plates: (T, 1 + K) thickness and the pull per area
+    on it, from the thinnest plate to that of `pull`; empty if no thickness is given. rounds: (R, 2) diameter
+    of a single bar, and its pull over the thick plate's. left: share of the pull left by the steel's grade,
+    heat and duty. tolerance: half sides along the yard's axes, m, and rad. carries_kg: the smaller capacity
+    of magnet and crane.
     """
 
     poles: Float64
@@ -49,16 +50,16 @@ class JudgedMagnet:
 
     @property
     def reach_m(self) -> float:
-        """Return the gap from which on nothing is pulled."""
+        """Return the gap beyond which the magnet pulls nothing, m."""
         return float(self.pull[-1, 0])
 
     @property
     def half_span_m(self) -> float:
-        """Return the way from the centre to the outermost pole's outer edge."""
+        """Return the distance from the centre to the outer edge of the outermost pole, m."""
         return float((np.abs(self.poles[:, 0]) + self.poles[:, 2] / 2).max())
 
     def pressure(self, gap_m: Float64) -> Float64:
-        """Compute the pull per area at each gap, Pa, at most: the data sheet's line, 0 beyond its end."""
+        """Interpolate the pull per area at each gap, Pa, from the data sheet; 0 beyond its last gap."""
         return np.interp(gap_m, self.pull[:, 0], self.pull[:, 1], right=0.0)
 
     def bar_pressure(self, gap_m: Float64, diameter_m: float, face_m: float) -> Float64:
@@ -95,7 +96,7 @@ def read_magnet(path: Path) -> JudgedMagnet:
 
 
 def magnet_of(description: Mapping[str, Any]) -> JudgedMagnet:
-    """Take over a description that was read."""
+    """Convert a description that has been read."""
     beam, limits, tolerance = (description[name] for name in ("beam", "limits", "tolerance"))
     pull = description["pull"]
     sheets = [*pull.get("thin", ()), pull] if pull.get("thickness_m") is not None else []

@@ -1,4 +1,4 @@
-"""Time the live estimate per keyframe, and its memory, over a long way."""
+"""Measure the live estimator's time per keyframe, and its memory, over a long run."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ LEVER_M = np.array([0.35, -0.2, -0.55])
 
 @dataclass(frozen=True)
 class LiveSpeed:
-    """Cost of each tenth of the way: ms a keyframe, wall and CPU, and MiB grown since the first tenth.
+    """Cost of each tenth of the run: wall and CPU ms per keyframe, and MiB grown since the first tenth.
 
-    rmse_mm: the places against the truth. nees: per degree of freedom.
+    rmse_mm: error of the positions against the truth. nees: NEES of the positions per degree of freedom.
     """
 
     keyframes: int
@@ -56,9 +56,8 @@ class LiveSpeed:
 
 
 def bench_live(keyframes: int = 1000, held: int = 8, seed: int = 1) -> LiveSpeed:
-    """Simulate a crane's way over points without pictures: noise of 0.1 px, IMU and encoders as they are
-    simulated.
-    The front end is left out; `keyframes` is a multiple of ten.
+    """Simulate a crane's run over points without rendering images: 0.1 px of image noise, simulated IMU
+    and encoders. The front end is left out. keyframes: a multiple of ten.
     """
     if keyframes < 20 or keyframes % 10:
         raise ConfigError("keyframes must be a multiple of ten, at least 20")
@@ -99,7 +98,7 @@ def bench_live(keyframes: int = 1000, held: int = 8, seed: int = 1) -> LiveSpeed
 
 
 def live_table(bench: LiveSpeed) -> Table:
-    """Tabulate for the terminal."""
+    """Tabulate the results for the terminal."""
     table = Table(
         title=f"{bench.keyframes} keyframes of {bench.points:.0f} points; {bench.rmse_mm:.2f} mm RMSE, "
         f"NEES {bench.nees:.2f}; peak {bench.peak_mib:.0f} MiB"
@@ -116,7 +115,7 @@ def live_table(bench: LiveSpeed) -> Table:
 def _sightings(
     poses: list[Pose], stamps: Int64, rectifier: Rectifier, rng: np.random.Generator
 ) -> Iterator[Sighting]:
-    """Project points on a strip of floor and stacks under the way; those in view, `MAX_POINTS` at most."""
+    """Project points on a strip of floor and stacks below the run; `MAX_POINTS` of those in view at most."""
     camera = rectifier.camera
     x = np.array([pose.translation[0] for pose in poses])
     low, high = x.min() - 5, x.max() + 5

@@ -1,4 +1,4 @@
-"""Time the front end (`bench front-end`): pairs read, rectified and followed a second, decoding included."""
+"""Time the front end (`bench front-end`): reading, decoding, rectifying and tracking pairs."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from barsight.recording.rectified_pairs import RectifiedPairs
 
 @dataclass(frozen=True)
 class FrontEndRow:
-    """One recording, predicted by encoders and gyro or by pictures alone. points: mean of a pair.
+    """One recording, with motion predicted from encoders and gyro or from images alone.
 
-    time: wall ms a pair. cpu_ms: of all threads, a pair.
+    points: mean number of points per pair. time: wall ms per pair. cpu_ms: ms per pair, all threads.
     """
 
     recording: str
@@ -40,14 +40,14 @@ class FrontEndRow:
 
 @dataclass(frozen=True)
 class FrontEndBench:
-    """The rows and where they were made."""
+    """The rows, and the machine and commit that they were measured with."""
 
     made: Provenance
     rows: tuple[FrontEndRow, ...]
 
 
 def bench_front_end(paths: tuple[Path, ...], repeats: int = 3) -> FrontEndBench:
-    """Time each recording whole, `repeats` times after a first run that compiles."""
+    """Time each whole recording, `repeats` times after a warm-up run that compiles."""
     rows = []
     for path in paths:
         recording = open_recording(path)
@@ -87,7 +87,7 @@ def _row(recording: Recording, name: str, predictor: Predictor, repeats: int) ->
 
 
 def front_end_table(bench: FrontEndBench) -> Table:
-    """Tabulate for the terminal."""
+    """Tabulate the results for the terminal."""
     table = Table(title=f"Front end on {bench.made.cores} cores ({bench.made.machine})", title_justify="left")
     for column in ("recording", "size", "predicted by", "pairs", "points", "ms a pair", "CPU ms", "pairs/s"):
         table.add_column(column)

@@ -1,7 +1,7 @@
-"""Reproduce the paper's tables 2 and 3 (`bench features`, `bench matching`) with precision and recall.
+"""Reproduce the paper's Tables 2 and 3 (`bench features`, `bench matching`) with precision and recall.
 
-Truth is the true depth of a view and the true poses: a match is true within 2 px of where the feature's
-point truly reprojects. Needs a recording with encoders, IMU and stored true depth.
+The reference is the true depth of a view and the true poses: a match is true if it lies within 2 px of the
+reprojection of the feature's true point. Needs a recording with encoders, IMU and stored true depth.
 """
 
 from __future__ import annotations
@@ -49,15 +49,17 @@ from barsight.stereo.search_range import coarse_disparity
 
 TRUE_PX = 2.0
 TREND_PX = 5.0
-"""How near a match must be to the paper's motion trend."""
+"""Largest distance, px, of a match from the position that the paper's motion trend predicts."""
 NEIGHBOURS = 5
 GUESSED_PX = 2.0
-"""How far a disparity taken from neighbours that agree may be off (1 sigma)."""
+"""Standard deviation, px, of a disparity interpolated from neighbours, and the largest spread of those
+neighbours' disparities at which they count as agreeing.
+"""
 
 
 @dataclass(frozen=True)
 class FeatureRow:
-    """One detector on one picture."""
+    """Features of one detector in one image."""
 
     recording: str
     detector: str
@@ -67,8 +69,8 @@ class FeatureRow:
 
 @dataclass(frozen=True)
 class MatchRow:
-    """One filter after one detector on one pair of views. precision, kept: shares; kept is of the true
-    initial matches (NaN where there are none).
+    """One filter after one detector on one recording. precision: share of its matches that are true. kept:
+    share of the true initial matches that it keeps (NaN if there are none).
     """
 
     recording: str
@@ -82,7 +84,7 @@ class MatchRow:
 
 @dataclass(frozen=True)
 class MatchingBench:
-    """The rows and where they were made."""
+    """The rows, and the machine and commit that they were measured with."""
 
     made: Provenance
     features: tuple[FeatureRow, ...]
@@ -93,7 +95,7 @@ def bench_features(
     paths: tuple[Path, ...], detectors: tuple[DetectorName, ...] = DETECTORS, count: int = 2000,
     repeats: int = 5,
 ) -> MatchingBench:  # fmt: skip
-    """Count and time features on the first view with true depth of each recording [paper Table 2]."""
+    """Count and time the features in each recording's first view with true depth [paper Table 2]."""
     rows = []
     for path in paths:
         image = true_steps(path)[0].old.pair.left
@@ -110,9 +112,7 @@ def _detecting(name: DetectorName, image: UInt8, count: int) -> Callable[[], Key
 def bench_matching(
     paths: tuple[Path, ...], detectors: tuple[DetectorName, ...] = DETECTORS, count: int = 2000
 ) -> MatchingBench:
-    """Measure precision and recall of matching [paper Table 3]; the rows of a recording's steps are
-    added up.
-    """
+    """Measure precision and recall of the matching [paper Table 3], pooled over each recording's steps."""
     rows: list[MatchRow] = []
     for path in paths:
         steps = true_steps(path)
@@ -133,7 +133,11 @@ def bench_matching(
 
 
 def _match(step: TrueStep, name: DetectorName, count: int) -> list[tuple[str, int, int, int, int, float]]:
-    """Count per step: name, judged pairs, true ones, true initial ones, true initial ones kept, seconds."""
+    """Match one step with every filter.
+
+    Returns for each filter: name, counts of judged matches, true ones, true initial ones and true initial
+    ones kept, and time, s.
+    """
     detector = make_detector(name)
     begin = time.perf_counter()
     first, second = detector(step.old.pair.left, count), detector(step.new.pair.left, count)
@@ -181,7 +185,7 @@ def _match(step: TrueStep, name: DetectorName, count: int) -> list[tuple[str, in
 
 
 def stereo_places(pair: PatchPair, places: Float64) -> tuple[Float64, Float64, Bool]:
-    """Match left to right: u, v, right u (N, 3), sigma (N,) and which features have a depth."""
+    """Match left to right: u, v, right u (N, 3), px; sigma (N,), px; and which features have a depth (N,)."""
     camera = pair.pair.camera
     coarse = coarse_disparity(pair.pair.left, pair.pair.right, camera.doffs_px)
     row = (places[:, 1] * coarse.shape[0] / camera.height).astype(int)
@@ -193,9 +197,7 @@ def stereo_places(pair: PatchPair, places: Float64) -> tuple[Float64, Float64, B
 
 
 def _trend(step: TrueStep) -> tuple[Float64, Float64]:
-    """Predict new_from_old of rect0 by [paper Eq. 11]: the IMU from nominal attitude and the
-    encoders' speed.
-    """
+    """Predict new_from_old of rect0 by [paper Eq. 11], from IMU, nominal attitude and encoder velocity."""
     recording, shift = step.recording, step.recording.rig.timeshift_cam_imu_ns
     imu, crane = recording.imu(), recording.crane()
     if imu is None or crane is None:
@@ -204,7 +206,7 @@ def _trend(step: TrueStep) -> tuple[Float64, Float64]:
         )
     old_ns, new_ns = step.old.pair.stamp_ns + shift, step.new.pair.stamp_ns + shift
     noise = recording.imu_noise() or ORDINARY_NOISE
-    # A crane's way begins and ends at rest, so the means over it are the biases (the paper calibrates them).
+    # A run begins and ends at rest, so the means over it are the biases (the paper calibrates them).
     up_in_body = crane.yard_from_body_nominal.T @ np.array([0.0, 0.0, GRAVITY_MPS2])
     bias = ImuBias(imu.gyro_radps.mean(axis=0), imu.accel_mps2.mean(axis=0) - up_in_body)
     place = fit_position(crane, old_ns, seconds_to_ns(0.35))
@@ -223,7 +225,7 @@ def _trend(step: TrueStep) -> tuple[Float64, Float64]:
 
 
 def _ours(step: TrueStep, stereo: Float64, sigma: Float64, known: Bool) -> tuple[Bool, Float64]:
-    """Match features (N,) inside their predicted ellipses with 3D consensus, and their places (N, 2)."""
+    """Match features within their predicted ellipses with 3D consensus: kept (N,), positions (N, 2)."""
     recording, settings = step.recording, FrontEndSettings()
     crane, imu = recording.crane(), recording.imu()
     assert crane is not None and imu is not None
@@ -252,8 +254,9 @@ def _ours(step: TrueStep, stereo: Float64, sigma: Float64, known: Bool) -> tuple
 def _alone(
     step: TrueStep, stereo: Float64, known: Bool, motion: PredictedMotion, kept: Bool, found: Float64
 ) -> None:
-    """Add to `kept` and `found` what only the left pictures show: features without a partner in the new right
-    picture, and those that had none in the old one, at the depth on which their neighbours agree.
+    """Add to `kept` and `found` the matches seen in the left images only: features without a match in the
+    new right image, and those without one in the old right image, at the disparity on which their
+    neighbours agree.
     """
     camera, sigma_px = step.rectifier.camera, FrontEndSettings().tracks.sigma_px
     nearest_known = cKDTree(stereo[known, :2]).query(stereo[:, :2], k=NEIGHBOURS)[1]
@@ -272,7 +275,7 @@ def _alone(
 
 
 def feature_table(bench: MatchingBench) -> Table:
-    """Tabulate for the terminal."""
+    """Tabulate the features for the terminal."""
     table = Table(title="Features (paper, Table 2)", title_justify="left")
     for column in ("recording", "detector", "features", "ms"):
         table.add_column(column)
@@ -286,7 +289,7 @@ def feature_table(bench: MatchingBench) -> Table:
 
 
 def match_table(bench: MatchingBench) -> Table:
-    """Tabulate for the terminal."""
+    """Tabulate the matches for the terminal."""
     table = Table(title="Matches (paper, Table 3); true within 2 px", title_justify="left")
     for column in ("recording", "detector", "step", "pairs", "precision %", "true kept %", "ms"):
         table.add_column(column)

@@ -1,4 +1,4 @@
-"""Compute true feature positions in the next view from true poses and depth, for evaluation only."""
+"""Compute the true positions of features in the next view from true poses and depth, for evaluation only."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from barsight.recording.open import open_recording
 
 @dataclass(frozen=True, eq=False)
 class TrueStep:
-    """Two neighbouring views, the first with true depth (H, W) of the raw cam0, and their true poses."""
+    """Two successive views with true poses, the first with the true depth (H, W), m, of the raw cam0."""
 
     name: str
     recording: Recording
@@ -37,7 +37,7 @@ class TrueStep:
 
 
 def true_steps(path: Path) -> list[TrueStep]:
-    """Yield every view with stored true depth and a view after it. Raises InputError where there is none."""
+    """List the views with stored true depth, each with the next view. Raises InputError if there are none."""
     recording = open_recording(path)
     rectifier = Rectifier(recording.rig)
     truth = read_ground_truth(path, np.array(recording.index.stamps_ns, np.int64), reference="yard")
@@ -67,7 +67,7 @@ def true_steps(path: Path) -> list[TrueStep]:
 
 
 def reproject(step: TrueStep, pixels: Float64) -> Float64:
-    """Reproject features' true points (N, 2) to the new left picture, NaN at depth steps and outside."""
+    """Reproject features' true points to the new left image (N, 2), px; NaN outside and at depth steps."""
     camera = step.rectifier.camera
     rig = step.recording.rig
     cam0_from_rect0 = rig.body_from_cam0.inverse() @ step.rectifier.body_from_rect0

@@ -9,7 +9,7 @@ from barsight.stereo.method import StereoMethod
 
 
 def without_one_part() -> dict[str, StereoMethod]:
-    """Build the whole method, and each variant under the name of what it lacks."""
+    """Build the complete method, and variants of it, each under the name of the part that it lacks."""
     whole = BarsightSettings()
     refinement = whole.refinement
     variants = {

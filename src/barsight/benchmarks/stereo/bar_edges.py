@@ -1,7 +1,7 @@
-"""Measure a bar's diameter from its two outlines in each image and its disparities.
+"""Measure a bar's diameter from its two outlines in each image and from its disparities.
 
-An outline is a plane through the camera; the two planes give the bar's direction and the ratio of its radius
-to its distance, and the disparities of the bar's points give the distance.
+An outline is a plane through the camera centre; the two planes give the bar's direction and the ratio of its
+radius to its distance, and the disparities of the bar's points give the distance.
 """
 
 from __future__ import annotations
@@ -27,19 +27,17 @@ _FEWEST_PIXELS = 200
 
 @dataclass(frozen=True, eq=False)
 class Outlines:
-    """normals: (2, 3) unit normals of the planes through the camera and each outline, towards the bar."""
+    """normals: (2, 3) unit, towards the bar, of the planes through the camera centre and each outline."""
 
     normals: Float64
 
 
 def edge_diameter(disparity: Disparity, pair: RectifiedPair, start: BarFit) -> float | Failed:
-    """Measure the diameter (m): the mean over both images' outlines at the distance that the disparities
-    give.
+    """Measure the diameter, m: the mean of both images, each from its outlines and the distance by disparity.
 
-    start: the fit to the map, which says where to look: outlines are searched around its own, as far
-    as 4 px or four tenths of the radius.
-    Failed `no-outline` where too few stretches are in an image, `no-points` where too few of the bar's points
-    have a disparity.
+    start: fit to the disparity map, around whose outlines the outlines are searched for, up to 4 px or 0.4 of
+    the radius away. Failed `no-outline` if too few stretches lie in an image, `no-points` if too few of the
+    bar's points have a disparity.
     """
     camera = pair.camera
     seen_left = find_outlines(pair.left, camera, start)
@@ -49,7 +47,7 @@ def edge_diameter(disparity: Disparity, pair: RectifiedPair, start: BarFit) -> f
     distance = _distance(disparity, camera, axis, towards, sine)
     if distance is None:
         return Failed("no-points", "too few of the bar's points have a disparity")
-    # The right camera's own frame: its principal point is doffs_px to the right, the bar shifted to the left.
+    # In the right camera's frame the principal point is doffs_px to the right and the bar is shifted left.
     right_camera = replace(camera, cx_px=camera.cx_px + camera.doffs_px)
     baseline = np.array([camera.baseline_m, 0.0, 0.0])
     moved = replace(start, centre_m=start.centre_m - baseline)
@@ -63,7 +61,7 @@ def edge_diameter(disparity: Disparity, pair: RectifiedPair, start: BarFit) -> f
 
 
 def _cone(outlines: Outlines) -> tuple[Float64, Float64, float]:
-    """Intersect the outline planes: axis direction, direction towards the axis, and radius over distance."""
+    """Intersect the outline planes: direction of the axis, direction towards it, and radius over distance."""
     first, second = outlines.normals
     axis = np.cross(first, second)
     axis /= np.linalg.norm(axis)
@@ -91,7 +89,7 @@ def find_outlines(image: UInt8, camera: RectifiedCamera, start: BarFit) -> Outli
 
 
 def _plane_through(points_px: Float64, camera: RectifiedCamera) -> Float64:
-    """Compute the unit normal (3,) of the plane through the camera and two points of the image."""
+    """Compute the unit normal (3,) of the plane through the camera centre and two image points."""
     rays = (np.column_stack([points_px, np.zeros(2)]) - [camera.cx_px, camera.cy_px, 0]) / camera.focal_px
     rays[:, 2] = 1
     plane: Float64 = np.cross(rays[0], rays[1])
@@ -99,9 +97,7 @@ def _plane_through(points_px: Float64, camera: RectifiedCamera) -> Float64:
 
 
 def tangent_planes(centre_m: Float64, axis: Float64, radius_m: float) -> Float64:
-    """Compute unit normals (2, 3) of the planes through the camera tangent to the cylinder, towards
-    its axis.
-    """
+    """Compute unit normals (2, 3), towards the axis, of the tangent planes through the camera centre."""
     across = centre_m - axis * float(axis @ centre_m)
     distance = float(np.linalg.norm(across))
     towards = across / distance
@@ -112,9 +108,7 @@ def tangent_planes(centre_m: Float64, axis: Float64, radius_m: float) -> Float64
 
 
 def _image_line(normal: Float64, camera: RectifiedCamera) -> Float64:
-    """Project a plane to its image line (3,): a x + b y + c is the distance in px, positive towards
-    the bar.
-    """
+    """Project a plane to its image line (3,): a x + b y + c is the distance, px, positive at the bar."""
     a, b = normal[0] / camera.focal_px, normal[1] / camera.focal_px
     c = normal[2] - a * camera.cx_px - b * camera.cy_px
     line: Float64 = np.array([a, b, c]) / math.hypot(a, b)
@@ -124,10 +118,10 @@ def _image_line(normal: Float64, camera: RectifiedCamera) -> Float64:
 def _distance(
     disparity: Disparity, camera: RectifiedCamera, axis: Float64, towards: Float64, sine: float
 ) -> float | None:
-    """Estimate metres from the camera to the axis: the robust mean over the bar's inner points.
+    """Estimate the distance from the camera to the axis, m: the robust mean over the bar's inner points.
 
-    A point on a ray r at depth z lies on the cylinder of distance D and radius D sine when D solves
-    |z r_perp - D towards|^2 = (D sine)^2, where r_perp is the ray without its part along the axis.
+    A point at depth z on a ray r lies on the cylinder of distance D and radius D sine if D solves
+    |z r_perp - D towards|^2 = (D sine)^2, where r_perp is the ray without its component along the axis.
     """
     rows, columns = np.nonzero(np.isfinite(disparity.disparity_px) & (disparity.sigma_px > 0))
     rays = np.column_stack(
@@ -146,9 +140,9 @@ def _distance(
         return None
     shift = disparity.disparity_px[rows, columns][inner] + camera.doffs_px
     sigma = disparity.sigma_px[rows, columns][inner] / shift
-    # z |r_perp| = D (cos - sqrt(sine^2 - sin^2)), with the angle between the ray and the axis's direction.
+    # z |r_perp| = D (cos - sqrt(sine^2 - sin^2)), with sin and cos of the angle between r_perp and `towards`.
     depth_ratio = np.sqrt(1 - aside[inner] ** 2) - np.sqrt(sine**2 - aside[inner] ** 2)
-    # In disparities: shift = f b |r_perp| / (D depth_ratio), so that 1 / D is linear in what was measured.
+    # In disparities: shift = f b |r_perp| / (D depth_ratio), so 1 / D is linear in the measurement.
     inverse = shift * depth_ratio / (camera.focal_px * camera.baseline_m * length[inner])
     weight = 1 / sigma**2
     found = float(np.median(inverse))

@@ -1,10 +1,10 @@
-"""Fit one cylinder over one floor to a whole disparity map for the bar's diameter.
+"""Fit one cylinder above a floor plane to a whole disparity map, for the bar's diameter.
 
-The floor is a plane, whose disparity is linear in the image; it is fitted away from the bar. Then a cylinder
-(place, direction, radius) in front of it predicts each pixel's disparity near the bar: the bar's points hold
-its place and curvature, and where the map changes from bar to floor, its edges hold its width. Residuals are
-divided by the method's own sigma, scaled so that they suit one another, and count through Cauchy's robust
-loss. Nothing but the map is used; the images aren't looked at.
+The floor is a plane, whose disparity is linear in the image; it is fitted away from the bar. A cylinder
+(position, direction, radius) in front of it then predicts the disparity of each pixel near the bar: the
+pixels on the bar constrain its position and curvature, and the edges, where the map changes from bar to
+floor, constrain its width. Residuals are divided by the method's own sigma, scaled to be consistent with each
+other, and enter through Cauchy's robust loss. Only the map is used, not the images.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ _LARGEST_PRODUCT = 1e100
 
 
 class BarPixels(NamedTuple):
-    """Pixels near a bar. rays: (N, 2) x, y with z = 1. behind: (N,) the floor's disparity, px. scale: focal
-    length times baseline, px m; doffs: px. found: (N,) px.
+    """Pixels near a bar. rays: (N, 2) x, y with z = 1. behind: (N,) disparity of the floor, px. scale:
+    focal length times baseline, px m; doffs: px. found: (N,) disparity in the map, px.
     """
 
     rays: Float64
@@ -44,7 +44,7 @@ class BarPixels(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class BarGuess:
-    """Rough bar in `rect0`: a point of its axis, its direction, its radius."""
+    """Rough bar in `rect0`: a point of its axis, its direction and its radius."""
 
     centre_m: Float64
     axis: Float64
@@ -53,7 +53,7 @@ class BarGuess:
 
 @dataclass(frozen=True, eq=False)
 class BarFit:
-    """The cylinder found."""
+    """The fitted cylinder."""
 
     centre_m: Float64
     axis: Float64
@@ -61,10 +61,10 @@ class BarFit:
 
 
 def fit_bar(disparity: Disparity, camera: RectifiedCamera, guess: BarGuess) -> BarFit | Failed:
-    """Fit the cylinder from a guess that is good to about a quarter of the radius.
+    """Fit the cylinder, starting from a guess that is correct to about a quarter of the radius.
 
-    Failed `no-floor`, `no-bar` where too few pixels have a disparity, `diverged` where the radius leaves
-    0.3...3 times the guess.
+    Failed `no-floor` or `no-bar` if too few pixels have a disparity, `diverged` if the radius leaves 0.3...3
+    times the guess.
     """
     beside = _beside_the_axis(camera, guess)
     near = np.abs(beside) < _REACH_RADII * guess.radius_m
@@ -92,7 +92,7 @@ def fit_bar(disparity: Disparity, camera: RectifiedCamera, guess: BarGuess) -> B
 
 
 def _beside_the_axis(camera: RectifiedCamera, guess: BarGuess) -> Float64:
-    """Compute the signed distance (H, W) m of each pixel's ray from the guessed axis, at its depth."""
+    """Compute the signed distance (H, W), m, of each pixel's ray from the guessed axis."""
     columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     rays = np.stack(
         [
@@ -109,16 +109,14 @@ def _beside_the_axis(camera: RectifiedCamera, guess: BarGuess) -> Float64:
 
 
 def _fit_floor(disparity: Disparity, where: Bool) -> Float64 | None:
-    """Fit the floor's disparity (3,), a * column + b * row + c, by reweighted least squares; None where too
-    few.
-    """
+    """Fit the floor's disparity (3,), a * column + b * row + c, robustly; None for too few pixels."""
     rows, columns = np.nonzero(where)
     if rows.size < _FEWEST_PIXELS:
         return None
     design = np.column_stack([columns, rows, np.ones(rows.size)]).astype(np.float64)
     values = disparity.disparity_px[rows, columns].astype(np.float64)
     sigma = disparity.sigma_px[rows, columns].astype(np.float64)
-    # The start must stand a good share of wrong values: the median of the residual from a constant slope.
+    # The start must tolerate many outliers: a constant disparity, the median.
     plane = np.array([0.0, 0.0, float(np.median(values))])
     for step in range(15):
         residual = np.abs(values - design @ plane) / sigma
@@ -129,15 +127,15 @@ def _fit_floor(disparity: Disparity, where: Bool) -> Float64 | None:
 
 
 def _frame(guess: BarGuess) -> Float64:
-    """Build the guess's frame (4, 3): centre, axis, and the directions sideways and towards the camera."""
+    """Build the guess's frame (4, 3): centre, axis, sideways direction and direction towards the camera."""
     sideways = np.cross(guess.axis, guess.centre_m)
     sideways = sideways / np.linalg.norm(sideways)
     return np.array([guess.centre_m, guess.axis, sideways, np.cross(sideways, guess.axis)])
 
 
 def _placed(place: Float64, frame: Float64, radius_m: float) -> tuple[Float64, Float64, float]:
-    """Apply place (5,): shifts sideways and towards the camera, turns likewise, growth, in radii of the
-    guess.
+    """Apply parameters (5,), in radii of the guess: shifts sideways and towards the camera, tilts of the
+    axis in the same directions, and growth of the radius.
     """
     centre = frame[0] + radius_m * (place[0] * frame[2] + place[1] * frame[3])
     axis = frame[1] + radius_m * (place[2] * frame[2] + place[3] * frame[3])
@@ -145,9 +143,7 @@ def _placed(place: Float64, frame: Float64, radius_m: float) -> tuple[Float64, F
 
 
 def _descend(start: Float64, problem: tuple[Float64, float, BarPixels, Float64]) -> Float64:
-    """Minimise by Nelder and Mead's simplex: the loss has small steps where pixels change from
-    floor to bar.
-    """
+    """Minimise the loss, which has small steps where pixels change surface, by Nelder and Mead's simplex."""
     simplex = np.vstack([start, start + 0.1 * np.eye(5)])
     best: Float64 = fmin(
         _loss,
@@ -169,7 +165,7 @@ def _loss(place: Float64, frame: Float64, radius_m: float, pixels: BarPixels, we
 
 @kernel()
 def _residual(centre: Float64, axis: Float64, radius: float, pixels: BarPixels, index: int) -> float:
-    """Intersect a pixel's ray with the cylinder and the floor behind: found minus the nearer's disparity.
+    """Compute one pixel's residual: its disparity minus that of the nearer of cylinder and floor on its ray.
 
     centre: (3,) m; axis: (3,) unit vector; radius: m.
     """
@@ -189,7 +185,7 @@ def _residual(centre: Float64, axis: Float64, radius: float, pixels: BarPixels, 
 
 @kernel()
 def _cauchy(centre: Float64, axis: Float64, radius: float, pixels: BarPixels, weight: Float64) -> float:
-    """Compute the mean Cauchy loss of the pixels' disparities.
+    """Compute the mean Cauchy loss of the pixels' residuals.
 
     centre: (3,) m; axis: (3,) unit vector; radius: m. weight: (N,) 1 / px.
     """
@@ -197,7 +193,7 @@ def _cauchy(centre: Float64, axis: Float64, radius: float, pixels: BarPixels, we
     for index in range(len(weight)):
         away = _residual(centre, axis, radius, pixels, index) * weight[index]
         product *= 1 + away * away
-        # One logarithm for many factors: logarithms are what takes the time.
+        # One logarithm for many factors, because logarithms dominate the run time.
         if product > _LARGEST_PRODUCT:
             total += math.log(product)
             product = 1.0
@@ -206,7 +202,7 @@ def _cauchy(centre: Float64, axis: Float64, radius: float, pixels: BarPixels, we
 
 @kernel()
 def _residuals(centre: Float64, axis: Float64, radius: float, pixels: BarPixels) -> Float64:
-    """Compute each pixel's disparity (N,) less the cylinder's or the floor's behind it.
+    """Compute residuals (N,), px: each pixel's disparity minus that of the cylinder or of the floor.
 
     centre: (3,) m; axis: (3,) unit vector; radius: m.
     """

@@ -1,9 +1,9 @@
-"""Locate a straight outline of a round bar in an image, below a pixel.
+"""Locate a straight outline of a round bar in an image, to a fraction of a pixel.
 
-The outline of a round bar is no step: shading falls towards the limb like cos(angle), whose slope there is
-endless. The profile across the outline is therefore fitted whole, stretch by stretch along the bar: floor
-b0 + b1 x outside, c0 + c1 cos(angle) + c2 sin(angle) inside (what matt shading under any lamp gives), both
-seen through the lens. The straight line whose stretches together are likeliest is the outline.
+The outline of a round bar is not a step edge: shading falls towards the limb like cos(angle), whose slope is
+infinite there. The whole profile across the outline is therefore fitted, stretch by stretch along the bar:
+floor b0 + b1 x outside, c0 + c1 cos(angle) + c2 sin(angle) inside (matt shading under any lamp), both blurred
+by the lens. The outline is the straight line with the highest likelihood over all stretches.
 """
 
 from __future__ import annotations
@@ -27,8 +27,9 @@ _PARTS = 5
 
 @dataclass(frozen=True, eq=False)
 class OutlineSearch:
-    """Search window. reach_px: how far from the line the outline is looked for, in steps of step_px.
-    outside_px, inside_px: how far the profile goes beyond that, over the floor and over the bar.
+    """Search window. reach_px: largest distance from the line at which the outline is searched for, in
+    steps of step_px. outside_px, inside_px: extent of the profile beyond that, over the floor and over the
+    bar.
     """
 
     reach_px: float
@@ -42,10 +43,10 @@ class OutlineSearch:
 
 
 def find_outline(image: UInt8, line: Float64, radius_px: float, search: OutlineSearch) -> Float64 | Failed:
-    """Find two points x, y (2, 2) of the outline near the line a x + b y + c = 0 (unit normal towards the
-    bar).
+    """Find two points x, y (2, 2) of the outline near a x + b y + c = 0 (unit normal towards the bar).
 
-    radius_px: of the bar in the image, about. Failed `no-outline` where too little of it is in the image.
+    radius_px: approximate radius of the bar in the image. Failed `no-outline` if too little of it lies in the
+    image.
     """
     stretches = _stretches(image, line, radius_px, search)
     if len(stretches.place_px) < _FEWEST_STRETCHES:
@@ -57,8 +58,8 @@ def find_outline(image: UInt8, line: Float64, radius_px: float, search: OutlineS
 
 @dataclass(frozen=True, eq=False)
 class _Stretches:
-    """place_px: (N,) middles along the line, from its foot. misfit: (N, S) of `_misfits` with the outline
-    shifted by each of shifts_px (S,) towards the bar.
+    """Fits of the stretches. place_px: (N,) their centres along the line, from its foot. misfit: (N, S)
+    result of `_misfits` with the outline shifted by each of shifts_px (S,) towards the bar.
     """
 
     place_px: Float64
@@ -67,7 +68,7 @@ class _Stretches:
 
 
 def _stretches(image: UInt8, line: Float64, radius_px: float, search: OutlineSearch) -> _Stretches:
-    """Cut the line into stretches that lie in the image with all their profiles."""
+    """Divide the line into stretches and compute the misfits of those whose profiles lie in the image."""
     height, width = image.shape
     margin = search.reach_px + max(search.outside_px, search.inside_px) + 1
     foot, along = _foot_and_direction(line)
@@ -94,9 +95,7 @@ def _foot_and_direction(line: Float64) -> tuple[Float64, Float64]:
 
 
 def _profile(image: UInt8, core: Float64, line: Float64, search: OutlineSearch) -> tuple[Float64, Float64]:
-    """Sample gray values of the pixels beside a stretch and their distances from the line, px towards the
-    bar.
-    """
+    """Sample pixels beside a stretch: gray values and distances from the line, px, positive on the bar."""
     across = np.arange(-search.reach_px - search.outside_px, search.reach_px + search.inside_px + 0.5, 1.0)
     columns = np.rint(core[:, :1] + across * line[0]).astype(np.intp)
     rows = np.rint(core[:, 1:] + across * line[1]).astype(np.intp)
@@ -106,7 +105,7 @@ def _profile(image: UInt8, core: Float64, line: Float64, search: OutlineSearch) 
 
 
 def _best_line(stretches: _Stretches, line: Float64) -> Float64:
-    """Fit two points (2, 2) of the outline: the shifted, turned line whose stretches fit best together."""
+    """Fit two points (2, 2) of the outline: shift and rotate the line to the lowest total misfit."""
     place = stretches.place_px
     centre, half = (place.max() + place.min()) / 2, max((place.max() - place.min()) / 2, 1.0)
     along = (place - centre) / half
@@ -131,8 +130,8 @@ def _best_line(stretches: _Stretches, line: Float64) -> Float64:
 def _total_misfit(
     stretches: _Stretches, curves: list[CubicSpline], along: Float64, shifts: Float64, turns: Float64
 ) -> Float64:
-    """Sum the stretches' misfits (len(shifts), len(turns)), each read from its curve; outside the search the
-    worst.
+    """Sum the stretches' misfits (len(shifts), len(turns)), interpolated from their curves; outside the
+    search window each counts with its worst value.
     """
     total = np.zeros((len(shifts), len(turns)))
     low, high = stretches.shifts_px[[0, -1]]
@@ -144,8 +143,8 @@ def _total_misfit(
 
 
 def _basis(radius_px: float, half_px: float) -> Float64:
-    """Build the profile's basis (M, 5) through the lens, on a fine grid from -half_px to half_px: floor 1 and
-    x, bar 1, cos and sin.
+    """Build the profile's basis (M, 5), blurred by the lens, on a fine grid from -half_px to half_px: 1
+    and x for the floor; 1, cos and sin for the bar.
     """
     margin = 4 * _LENS_SIGMA_PX
     half = half_px + margin
@@ -167,9 +166,9 @@ def _basis(radius_px: float, half_px: float) -> Float64:
 def _misfits(gray: Float64, away: Float64, shifts: Float64, basis: Float64, misfit: Float64) -> None:
     """Compute the profile's negative log-likelihood per pixel, with the outline at each shift.
 
-    Floor and bar have each their own texture, hence their own variance; the pixels are always the same. gray,
-    away: (N,) gray values and distances from the line, px. shifts: (S,) px. basis: (M, 5), see `_basis`.
-    Fills misfit (S,).
+    Floor and bar differ in texture and so have separate variances; the set of pixels is the same for all
+    shifts. gray, away: (N,) gray values and distances from the line, px. shifts: (S,) px. basis: (M, 5), see
+    `_basis`. Fills misfit (S,).
     """
     half = (basis.shape[0] - 1) * _FINE_PX / 2
     size = gray.shape[0]
@@ -200,7 +199,7 @@ def _misfits(gray: Float64, away: Float64, shifts: Float64, basis: Float64, misf
 
 @kernel()
 def _solve(design: Float64, gray: Float64, bar_variance: float, floor_variance: float) -> Float64:
-    """Solve weighted least squares (5,) with a trace of damping."""
+    """Solve weighted least squares (5,) with slight damping."""
     normal = np.zeros((_PARTS, _PARTS))
     right = np.zeros(_PARTS)
     for pixel in range(design.shape[0]):

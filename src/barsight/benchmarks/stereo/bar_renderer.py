@@ -1,9 +1,9 @@
-"""Render one bar over a floor, or the floor alone, exactly for a rectified pair.
+"""Render one bar above a floor, or the floor alone, exactly for a rectified pair.
 
-Rays are cast at 25 places of each pixel's neighbourhood, weighted by a Gaussian of 0.5 px (lens and pixel),
-so that images are those of continuous surfaces, not of shifted pixels. Albedo is band-limited noise fixed to
-the surfaces; lamps are far away; gloss is a Blinn-Phong lobe that depends on each camera's own line of sight,
-and so moves between the views. Truth is the pixel centre's.
+Rays are cast at 25 points around each pixel, weighted by a Gaussian of 0.5 px (lens and pixel), so that the
+images are those of continuous surfaces rather than of shifted pixels. Albedo is band-limited noise attached
+to the surfaces; lamps are far away; gloss is a Blinn-Phong lobe that depends on each camera's own line of
+sight and so moves between the views. The truth holds for the pixel centre.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ _SAMPLE_STEP_PX = 0.4
 _LENS_SIGMA_PX = 0.5
 _TABLE = 512
 _OCTAVES = 6
-_LAMP_HALF_WIDTH = 0.2  # radians, a field of lamps under a hall's roof
+_LAMP_HALF_WIDTH = 0.2  # radians, the extent of a field of lamps under a hall's roof
 
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """brightness: mean albedo in gray levels under full light. contrast: albedo's spread per octave of
-    detail, relative. finest_m: size of the finest detail. stretch: how much longer details are along the
-    bar's axis (the floor's x). gloss: strength of the highlight in gray levels. sharpness: its Blinn-Phong
-    exponent.
+    """brightness: mean albedo, in gray levels under full light. contrast: relative spread of the albedo
+    per octave of detail. finest_m: size of the finest detail, m. stretch: elongation of the details along
+    the bar's axis (on the floor: along x). gloss: strength of the highlight, gray levels. sharpness: its
+    Blinn-Phong exponent.
     """
 
     brightness: float
@@ -45,7 +45,7 @@ class Material:
 
 @dataclass(frozen=True, eq=False)
 class RenderedBar:
-    """An endless round bar. centre_m: (3,) a point of its axis in `rect0`. axis: (3,) unit."""
+    """An infinitely long round bar. centre_m: (3,) a point of its axis in `rect0`. axis: (3,) unit vector."""
 
     centre_m: Float64
     axis: Float64
@@ -55,9 +55,9 @@ class RenderedBar:
 
 @dataclass(frozen=True, eq=False)
 class BarScene:
-    """The floor is normal . X = offset_m in `rect0`, its normal towards the camera. lamp: (3,) unit, towards
-    the lamp. ambient: the share of light that comes from everywhere. noise: read noise (gray levels) and the
-    variance per gray level.
+    """The floor is normal . X = offset_m in `rect0`, with its normal towards the camera. lamp: (3,) unit
+    vector towards the lamp. ambient: share of the light that is ambient. noise: read noise (gray levels)
+    and variance per gray level.
     """
 
     camera: RectifiedCamera
@@ -74,7 +74,7 @@ class BarScene:
 @dataclass(frozen=True, eq=False)
 class Rendered:
     """truth_px: (H, W) float64 disparity of the left image. surface: (H, W) uint8, FLOOR or BAR, 0 where a
-    pixel mixes both. visible: (H, W) bool, the right image sees the point.
+    pixel contains both. visible: (H, W) bool, True where the right image sees the point.
     """
 
     pair: RectifiedPair
@@ -111,7 +111,7 @@ def render_pair(scene: BarScene, seed: int) -> Rendered:
 
 
 def _shape(scene: BarScene) -> Float64:
-    """Pack the geometry (4, 3): normal; offset, radius (0: no bar), 0; centre; axis."""
+    """Pack the geometry (4, 3): normal; offset, radius (0 without a bar), 0; centre; axis."""
     bar = scene.bar
     if bar is None:
         return np.array([scene.normal, [scene.offset_m, 0, 0], [0, 0, 0], [0, 1, 0]], dtype=np.float64)
@@ -120,9 +120,7 @@ def _shape(scene: BarScene) -> Float64:
 
 
 def _looks(scene: BarScene) -> Float64:
-    """Pack the materials (3, 6): floor's and bar's brightness, contrast, finest, stretch, gloss, sharpness;
-    lamp and ambient.
-    """
+    """Pack the appearance (3, 6): a row of `Material` for floor and for bar; then lamp and ambient."""
     bar = scene.floor if scene.bar is None else scene.bar.surface
     rows = [
         [s.brightness, s.contrast, s.finest_m, s.stretch, s.gloss, s.sharpness] for s in (scene.floor, bar)
@@ -132,8 +130,7 @@ def _looks(scene: BarScene) -> Float64:
 
 @kernel()
 def _hit(x: float, dx: float, dy: float, shape: Float64) -> tuple[float, int]:
-    """Intersect the ray (x, 0, 0) + z (dx, dy, 1): depth z and surface of the first hit; inf and 0 where
-    none.
+    """Intersect the ray (x, 0, 0) + z (dx, dy, 1): depth z and surface of the hit, or inf and 0.
 
     shape: (4, 3), see `_shape`.
     """
@@ -161,9 +158,9 @@ def _hit(x: float, dx: float, dy: float, shape: Float64) -> tuple[float, int]:
 
 @kernel()
 def _light_left(px: float, py: float, pz: float, lamp: Float64, shape: Float64) -> float:
-    """Compute the fraction of the lamp that a floor point sees past the bar: a shadow with soft edges.
+    """Compute the fraction of the lamp that a floor point sees past the bar: a soft-edged shadow.
 
-    lamp: (3,) unit, towards it. shape: (4, 3), see `_shape`.
+    lamp: (3,) unit vector towards it. shape: (4, 3), see `_shape`.
     """
     centre, axis, radius = shape[2], shape[3], shape[1, 1]
     if radius <= 0:
@@ -184,9 +181,9 @@ def _light_left(px: float, py: float, pz: float, lamp: Float64, shape: Float64) 
 
 @kernel()
 def _noise(table: Float32, x: float, y: float) -> float:
-    """Interpolate random numbers on a unit lattice by a cubic B-spline: little above half a cycle per unit.
+    """Interpolate random numbers on a unit lattice by a cubic B-spline, low-pass at 0.5 cycles per unit.
 
-    table: (_TABLE, _TABLE), repeated without end.
+    table: (_TABLE, _TABLE), repeated periodically.
     """
     column, row = math.floor(x), math.floor(y)
     across, down = sixfold_weights(x - column), sixfold_weights(y - row)
@@ -202,7 +199,7 @@ def _noise(table: Float32, x: float, y: float) -> float:
 
 @kernel()
 def _albedo(table: Float32, x: float, y: float, looks: Float64) -> float:
-    """Sum octaves of detail, each twice as coarse as the one before, of equal strength.
+    """Sum octaves of detail of equal strength, each twice as coarse as the one before.
 
     table: (_TABLE, _TABLE). x, y: m. looks: (6,), a row of `_looks`.
     """
@@ -218,16 +215,16 @@ def _albedo(table: Float32, x: float, y: float, looks: Float64) -> float:
 def _shade(
     x: float, dx: float, dy: float, depth: float, surface: int, shape: Float64, looks: Float64, table: Float32
 ) -> float:
-    """Shade the gray value that one ray brings back.
+    """Compute the gray value seen along one ray.
 
-    The ray (x, 0, 0) + z (dx, dy, 1) meets `surface` at z = depth. shape: (4, 3), see `_shape`; looks: (3,
-    6), see `_looks`; table: (_TABLE, _TABLE).
+    The ray (x, 0, 0) + z (dx, dy, 1) hits `surface` at z = depth. shape: (4, 3), see `_shape`; looks: (3, 6),
+    see `_looks`; table: (_TABLE, _TABLE).
     """
     px, py, pz = x + depth * dx, depth * dy, depth
     lamp, ambient = looks[2, :3], looks[2, 3]
     if surface == FLOOR:
         nx, ny, nz = shape[0, 0], shape[0, 1], shape[0, 2]
-        # Two directions in the floor: across the image's columns and rows as they fall on it.
+        # Coordinates along two directions in the floor: the camera's x and y axes, projected along z.
         albedo = _albedo(table, px - nx / nz * pz, py - ny / nz * pz, looks[0])
         gloss, sharpness = looks[0, 4], looks[0, 5]
         lit = _light_left(px, py, pz, lamp, shape)
@@ -238,7 +235,7 @@ def _shade(
         nx = (ox - lift * axis[0]) / radius
         ny = (oy - lift * axis[1]) / radius
         nz = (oz - lift * axis[2]) / radius
-        # The angle round the bar is counted from the side of the camera.
+        # The angle around the bar is measured from the side that faces the camera.
         side = -shape[0, 2] * nz - shape[0, 1] * ny - shape[0, 0] * nx
         sx = axis[1] * nz - axis[2] * ny
         sy = axis[2] * nx - axis[0] * nz
@@ -269,7 +266,7 @@ def _expose(
     table: Float32,
     image: Float64,
 ) -> None:
-    """Expose one camera at (x, 0, 0): (H, W) gray values without noise."""
+    """Expose one camera at (x, 0, 0): fills image (H, W) with gray values without noise."""
     height, width = image.shape
     reach = _SAMPLES // 2
     weights = np.empty(_SAMPLES)
@@ -302,7 +299,7 @@ def _measure(
     surface: UInt8,
     visible: Bool,
 ) -> None:
-    """Compute the left image's true disparity, surface, and visibility in the right camera.
+    """Compute the left image's true disparity, its surfaces, and their visibility in the right camera.
 
     focal, cx, cy, doffs: px; baseline: m. shape: (4, 3), see `_shape`. Fills truth (px), surface and visible,
     (H, W), see `Rendered`.

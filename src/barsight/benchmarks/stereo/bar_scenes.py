@@ -1,8 +1,8 @@
-"""Render the scenes of `bench subpixel` and `bench target-size`: a tilted floor, a bar lying on it.
+"""Draw the scenes of `bench subpixel` and `bench target-size`: a tilted floor, with or without a bar over it.
 
-The camera is the one of the crane: 1250 px focal length, 0.5 m baseline; the paper doesn't say what its own
-was. Only a window of the image is rendered. The right image's window is moved by a whole number of pixels
-(`doffs_px`), as a search range found from the images would be.
+The camera is the crane's: 1250 px focal length, 0.5 m baseline; the paper doesn't state its own. Only a
+window of the image is rendered. The right image's window is offset by a whole number of pixels (`doffs_px`),
+as by a search range derived from the images.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ _MARGIN_PX = 12
 
 @dataclass(frozen=True)
 class PoseSpread:
-    """Spread of a benchmark's poses; each is drawn evenly from plus or minus these."""
+    """Half ranges of a benchmark's random poses; values are drawn uniformly from plus or minus each field."""
 
     roll_deg: float = 20.0
-    """The bar's direction in the image against the columns."""
+    """Angle in the image between the bar and the columns, degrees."""
     tilt_deg: float = 8.0
-    """The floor's normal against the optical axis, about either image axis."""
+    """Angle of the floor's normal from the optical axis, about each image axis, degrees."""
     off_centre_px: float = 40.0
-    """The bar's place in the window; its fraction of a pixel is as good as even."""
+    """Offset of the bar from the window's centre, px; its fractional part is nearly uniform."""
 
 
 @dataclass(frozen=True, eq=False)
 class PosedScene:
-    """A scene and the whole candidates that cover it. range_m: depth of the bar's (floor's) nearest point on
-    the window's middle ray.
+    """A scene and the disparity range that covers it. range_m: depth of the bar's top near the window's
+    centre, or of the floor at the centre if there is no bar, m.
     """
 
     scene: BarScene
@@ -54,10 +54,13 @@ def bar_over_floor(
     raised_m: float = 0.0,
     spread: PoseSpread | None = None,
 ) -> PosedScene:
-    """Draw a bar of 90 mm whose top is range_m deep at the window's middle; pose, light and texture by
-    chance.
+    """Draw a bar of 90 mm whose top is range_m deep near the window's centre, in a random pose.
 
-    gloss: gray levels of the strongest highlight. raised_m: the free space between bar and floor.
+    gloss: gray levels of the strongest highlight. raised_m: clearance between bar and floor, m.
+    Draw a bar of 90 mm whose top is range_m deep near the window's centre; all else is random.
+
+    gloss: gray levels of the strongest highlight. raised_m: clearance between bar and floor, m. Light and
+    texture are random too.
     """
     spread = spread or PoseSpread()
     normal = _tilted(rng, spread.tilt_deg)
@@ -66,7 +69,7 @@ def bar_over_floor(
     middle = rng.uniform(-spread.off_centre_px, spread.off_centre_px, 2) / FOCAL_PX
     top = range_m * np.array([middle[0], middle[1], 1.0])
     centre = top - normal * radius
-    # The floor's direction that falls on the image's column, turned by the roll.
+    # The direction in the floor that projects onto the image's columns, rotated by the roll.
     column = np.cross(normal, [math.cos(roll), math.sin(roll), 0.0])
     axis = column / np.linalg.norm(column)
     offset = float(normal @ (centre - normal * (radius + raised_m)))
@@ -107,7 +110,7 @@ def _finish(
     range_m: float,
     roll_deg: float,
 ) -> PosedScene:
-    """Add light, floor, window and range to the geometry."""
+    """Add light, floor, window and disparity range to the geometry."""
     camera, candidates = _window(normal, offset, range_m)
     side = rng.uniform(0, 2 * math.pi)
     height = math.radians(rng.uniform(35, 75))
@@ -119,9 +122,9 @@ def _finish(
 
 
 def _window(normal: Float64, offset: float, range_m: float) -> tuple[RectifiedCamera, DisparityRange]:
-    """Build the window's camera, whose disparities begin a margin above zero, and their range.
+    """Build the window's camera, with the smallest disparity a margin above zero, and its disparity range.
 
-    The floor's disparity is f b (normal . ray) / offset; the bar's top is the nearest there is.
+    The floor's disparity is f b (normal . ray) / offset; the bar's top is the nearest point of the scene.
     """
     cx, cy = (WIDTH_PX - 1) / 2, (HEIGHT_PX - 1) / 2
     corners = [
@@ -130,7 +133,7 @@ def _window(normal: Float64, offset: float, range_m: float) -> tuple[RectifiedCa
         for y in (-cy, cy)
     ]
     lowest = math.floor(min(corners)) - _MARGIN_PX
-    # Along a tilted bar the nearest point of the window is nearer than in its middle, as the floor's is.
+    # The nearest point of a tilted bar or floor in the window is nearer than the point at its centre.
     floor_middle = FOCAL_PX * BASELINE_M * float(normal[2]) / offset
     rise = FOCAL_PX * BASELINE_M / range_m - floor_middle
     highest = math.ceil(max(corners) + max(rise, 0.0) * max(corners) / floor_middle) + _MARGIN_PX

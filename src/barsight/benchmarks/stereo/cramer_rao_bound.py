@@ -14,11 +14,11 @@ _WINDOW_PX = 21
 
 
 def noise_limit_px(pair: RectifiedPair, where: Bool) -> float:
-    """Compute the Cramer-Rao bound (px) over our long support: the root of twice the noise's variance over
-    the squared gradients that the support sums up; the median over `where`.
+    """Compute the Cramer-Rao bound, px, of a match over our elongated support, the median over `where`.
 
-    Noise is measured in the images; what it adds to the gradients' power is taken off. A Gaussian support of
-    sigmas a and b hears as much as 4 pi a b pixels in full.
+    The bound is the root of twice the noise variance over the sum of the squared gradients in the support.
+    The noise is measured in the images, and its contribution to the squared gradients is subtracted. A
+    Gaussian support of sigmas a and b counts as 4 pi a b fully weighted pixels.
     """
     shape = RefinementSettings()
     noise = (image_noise(pair.left) ** 2 + image_noise(pair.right) ** 2) / 2

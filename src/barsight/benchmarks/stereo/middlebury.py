@@ -25,7 +25,7 @@ from barsight.stereo.method import StereoMethod
 
 @dataclass(frozen=True)
 class SceneResult:
-    """One method on one scene. mask: which pixels counted, see `StereoScene`."""
+    """One method on one scene. mask: the pixels that are scored, see `StereoScene`."""
 
     scene: str
     mask: str
@@ -36,7 +36,7 @@ class SceneResult:
 
 @dataclass(frozen=True)
 class MethodResult:
-    """One method: its scenes, the mean of their scores, and the time of all scenes per megapixel."""
+    """One method: its scenes, the mean of their scores, and its time over all scenes per megapixel."""
 
     method: str
     scenes: tuple[SceneResult, ...]
@@ -77,7 +77,7 @@ _HEADINGS = (
 
 
 def bench_stereo(data: Path, methods: Mapping[str, StereoMethod], repeats: int = MIN_REPEATS) -> StereoBench:
-    """Run every method on every scene in `data`; candidates as `load_scene` says. Raises `InputError`."""
+    """Run every method on every scene in `data`, with the candidates of `load_scene`. Raises `InputError`."""
     scenes = load_scenes(data)
     results = tuple(_bench_method(name, method, scenes, repeats) for name, method in methods.items())
     return StereoBench(provenance(), data.name, _MASKS, results)
@@ -95,7 +95,7 @@ def stereo_table(bench: StereoBench) -> Table:
 
 
 def scene_table(bench: StereoBench) -> Table:
-    """Tabulate every method on every scene."""
+    """Tabulate the score of every method on every scene."""
     table = Table(title=f"{bench.data}: scene by scene", caption=_CAPTION)
     table.add_column("method")
     table.add_column("scene")

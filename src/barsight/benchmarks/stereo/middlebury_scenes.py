@@ -21,9 +21,10 @@ _BRIGHTEST_16_BIT = 257
 
 @dataclass(frozen=True, eq=False)
 class StereoScene:
-    """name. pair. truth_px: (H, W) true disparity of the left image, NaN where unknown.
-    counted: (H, W) bool, the pixels that scores count. mask: where that comes from, `nonocc.png` (what both
-    images see) or `known` (every pixel with truth). candidates: the range that every method is given.
+    """A rectified pair with its truth. truth_px: (H, W) true disparity of the left image, NaN where
+    unknown. counted: (H, W) bool, the pixels that are scored. mask: their origin, `nonocc.png` (visible in
+    both images) or `known` (every pixel with truth). candidates: disparity range that every method is
+    given.
     """
 
     name: str
@@ -35,12 +36,12 @@ class StereoScene:
 
     @property
     def megapixels(self) -> float:
-        """Return the left image's size."""
+        """Return the left image's size, megapixels."""
         return self.truth_px.size / 1e6
 
 
 def load_scenes(data: Path) -> tuple[StereoScene, ...]:
-    """Load the scenes in `data`: a folder of folders, or one scene's own folder. Raises `InputError`."""
+    """Load the scenes in `data`: a folder of scene folders, or one scene's folder. Raises `InputError`."""
     if (data / "disp.pfm").is_file():
         return (load_scene(data),)
     if not data.is_dir():
@@ -54,10 +55,10 @@ def load_scenes(data: Path) -> tuple[StereoScene, ...]:
 
 
 def load_scene(folder: Path) -> StereoScene:
-    """Load one folder: left.png, right.png, disp.pfm [nonocc.png, white where both see it].
+    """Load one folder: left.png, right.png, disp.pfm [nonocc.png, white for pixels visible in both images].
 
-    Without nonocc.png every pixel with known truth counts. The candidates run from 0 (or the truth's lowest
-    where that is negative) to the next multiple of 16 above the truth's highest.
+    Without nonocc.png every pixel with known truth is scored. The candidates run from 0 (or the lowest true
+    disparity if that is negative) to the next multiple of 16 above the highest one.
     """
     left, right = _read_gray(folder / "left.png"), _read_gray(folder / "right.png")
     if left.shape != right.shape:

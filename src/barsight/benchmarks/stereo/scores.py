@@ -1,4 +1,4 @@
-"""Score a disparity against the truth by Middlebury's measures."""
+"""Score a disparity map against the truth with Middlebury's measures."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from barsight.core.records.disparity import Disparity
 
 @dataclass(frozen=True)
 class StereoScore:
-    """Percentages are of the pixels with known truth, a missing disparity counts as bad.
+    """Percentages refer to the pixels with known truth; a missing disparity counts as bad.
 
-    bad05, bad1, bad2: wrong by more than 0.5, 1 and 2 px, all known pixels. counted_bad05, counted_bad1,
-    counted_bad2: of those that the scene counts. average_px: mean absolute error and median_px: median, over
-    the known pixels that have a disparity. coverage_pct, counted_coverage_pct: pixels that have one.
-    within1_pct, within2_pct: of the counted that have one, those within 1 and 2 of their sigma.
+    bad05, bad1, bad2: wrong by more than 0.5, 1 and 2 px, of all known pixels. counted_bad05, counted_bad1,
+    counted_bad2: the same of the scene's scored pixels. average_px, median_px: mean and median absolute error
+    over the known pixels that have a disparity. coverage_pct, counted_coverage_pct: pixels that have a
+    disparity. within1_pct, within2_pct: of the scored pixels that have one, those with errors within 1 and 2
+    of their sigma.
     """
 
     bad05_pct: float
@@ -35,9 +36,9 @@ class StereoScore:
 
 
 def score_disparity(disparity: Disparity, truth_px: Float32, counted: Bool) -> StereoScore:
-    """Score against truth_px (NaN where unknown); counted: (H, W) bool, seen in both images.
+    """Score against truth_px (NaN where unknown); counted: (H, W) bool, the scene's scored pixels.
 
-    A figure is NaN where no pixel could be counted.
+    A figure is NaN if there are no pixels to compute it from.
     """
     known = np.isfinite(truth_px)
     visible = counted & known

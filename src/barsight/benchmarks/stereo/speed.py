@@ -1,5 +1,5 @@
-"""Time every method on 1280x1024 with 96 candidates, and pairs of a recording as a map matches them
-(`bench stereo-speed`), against OpenCV's 5-path SGBM.
+"""Time every method on 1280x1024 with 96 candidates, and on a recording's pairs as they are matched for a
+map (`bench stereo-speed`), against OpenCV's 5-path SGBM.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ WIDTH_PX, HEIGHT_PX, CANDIDATES = 1280, 1024, 96
 
 @dataclass(frozen=True)
 class SpeedResult:
-    """One method. ratio: its wall time over OpenCV's 5-path SGBM's, median of the rounds. cpu_ratio: the same
-    of the processor time of all cores: what other programs on the machine take doesn't count there.
-    median_error_px: of the absolute error where there is a disparity; NaN on a recording.
+    """One method. ratio: its wall time over that of OpenCV's 5-path SGBM, median of the rounds. cpu_ratio:
+    the same for the CPU time of all cores, which other programs on the machine don't affect.
+    median_error_px: median absolute error where there is a disparity; NaN on a recording.
     """
 
     method: str
@@ -51,8 +51,8 @@ class SpeedResult:
 
 @dataclass(frozen=True)
 class SpeedBench:
-    """The whole run. reference: OpenCV's 5-path SGBM alone, 96 candidates, blocks of 5.
-    reference_error_px: its median error.
+    """The whole run. reference: time of OpenCV's 5-path SGBM with 96 candidates and blocks of 5.
+    reference_error_px: its median absolute error.
     """
 
     provenance: Provenance
@@ -62,8 +62,9 @@ class SpeedBench:
 
 
 def bench_speed(methods: Mapping[str, StereoMethod], repeats: int = MIN_REPEATS) -> SpeedBench:
-    """Time every method on the same textured pair, two tilted planes with a step between them: in each of
-    `repeats` rounds SGBM and all methods in turn, after one round that gives the errors.
+    """Time every method on the same textured pair of two tilted planes with a step between them.
+
+    Each of `repeats` rounds runs SGBM and all methods in turn, after one round that yields the errors.
     """
     pair, candidates, truth_px = speed_pair()
     matcher = _five_path_sgbm(candidates)
@@ -81,11 +82,11 @@ def bench_speed(methods: Mapping[str, StereoMethod], repeats: int = MIN_REPEATS)
 
 
 def time_chain(path: Path, repeats: int = MIN_REPEATS) -> tuple[SpeedResult, ...]:
-    """Time the first chain of pairs of a recording as `measure` matches them for its map, range and masks
-    included: the first from nothing, each other from the one before. SGBM has its turns on each of them, with
-    96 candidates and with those that the first pair shows. A round before isn't counted.
+    """Time a recording's first chain of pairs as `measure` matches them for its map, with range and masks.
 
-    Raises InputError or MeasurementError where the recording has no such chain.
+    The first pair is matched without a prediction, each other pair with one from the pair before. SGBM also
+    runs on each pair, with 96 candidates and with the range found in the first pair. A warm-up round isn't
+    counted. Raises InputError or MeasurementError if the recording has no such chain.
     """
     recording, settings = open_recording(path), MeasureSettings()
     reader = RectifiedPairs(recording, Rectifier(recording.rig))
@@ -136,7 +137,7 @@ def speed_pair() -> tuple[RectifiedPair, DisparityRange, Float32]:
 
 
 def speed_table(bench: SpeedBench) -> Table:
-    """Tabulate one row per method."""
+    """Tabulate the times, one row per method."""
     table = Table(
         title=f"{WIDTH_PX}x{HEIGHT_PX}, {CANDIDATES} candidates where a row says no other; "
         f"{bench.provenance.cores} cores",
@@ -159,7 +160,7 @@ def speed_table(bench: SpeedBench) -> Table:
 
 
 def _five_path_sgbm(candidates: DisparityRange) -> cv2.StereoSGBM:
-    """Make OpenCV's SGBM for no fewer candidates, a multiple of 16, blocks of 5."""
+    """Create OpenCV's SGBM with blocks of 5 and the candidates rounded up to a multiple of 16."""
     return cv2.StereoSGBM.create(
         minDisparity=candidates.lowest_px, numDisparities=-(-candidates.count // 16) * 16, blockSize=5,
         P1=200, P2=800, mode=cv2.STEREO_SGBM_MODE_SGBM,
@@ -167,13 +168,13 @@ def _five_path_sgbm(candidates: DisparityRange) -> cv2.StereoSGBM:
 
 
 def _result(method: str, times: Float64, reference: Float64, error_px: float) -> SpeedResult:
-    """Summarise times (..., 2) of a method, wall and CPU s, against SGBM's of the same turns."""
+    """Summarise a method's times (..., 2), wall and CPU s, relative to SGBM's in the same rounds."""
     wall, cpu = np.median((times / reference).reshape(-1, 2), axis=0)
     return SpeedResult(method, summarise_times(times[..., 0].ravel()), float(wall), float(cpu), error_px)
 
 
 def _seconds(work: Callable[[], object]) -> tuple[float, float]:
-    """Measure wall time, and processor time of all cores."""
+    """Measure wall time, and CPU time of all cores, s."""
     wall, processor = time.perf_counter(), time.process_time()
     work()
     return time.perf_counter() - wall, time.process_time() - processor

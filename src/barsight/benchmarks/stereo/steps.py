@@ -23,8 +23,8 @@ _ERROR_PX, _SIGMA_PX = 0.5, 0.5
 
 
 def steps_picture(seed: int = 3) -> UInt8:
-    """Draw the steps, (0.9 H, 1.35 W, 3) BGR. Above: left image; disparity; sigma. Below, error of the
-    disparity: as started, as refined, with edges sharpened and guesses.
+    """Draw the steps, (0.9 H, 1.35 W, 3) BGR. Top row: left image, disparity, sigma. Bottom row: error of
+    the disparity initially, after refinement, and after sharpened edges and guesses.
     """
     posed = bar_over_floor(np.random.default_rng(seed), _RANGE_M, _GLOSS, raised_m=0.15)
     rendered = render_pair(posed.scene, seed)
@@ -49,7 +49,7 @@ def steps_picture(seed: int = 3) -> UInt8:
 
 
 def write_steps(target: Path) -> None:
-    """Write `steps_picture` as PNG."""
+    """Write `steps_picture` as a PNG file."""
     if target.suffix.lower() != ".png":
         raise OutputError(f"{target}: the picture is written as .png")
     with atomic_path(target) as temporary:
@@ -57,7 +57,7 @@ def write_steps(target: Path) -> None:
 
 
 def _coloured(values: Float32, low: float, high: float) -> UInt8:
-    """Colour values by viridis in 32 steps from low to high, black where there is none."""
+    """Colour values by viridis in 32 steps from low to high; missing ones are black."""
     known = np.isfinite(values)
     share = np.where(known, (values - low) / (high - low), 0).clip(0, 1)
     coloured: UInt8 = cv2.applyColorMap((np.rint(share * 31) * 8).astype(np.uint8), cv2.COLORMAP_VIRIDIS)

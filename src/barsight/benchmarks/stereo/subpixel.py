@@ -1,9 +1,9 @@
 """Measure bias against the fractional part of the true disparity (`bench subpixel`), and check sigma.
 
-Scenes are rendered (`bar_scenes`): tilted floors, matt bars, glossy bars. Counted are pixels well
-inside one surface that the right image sees. Per tenth of a pixel of the true disparity's fraction the bias
-is the median error; a method that favours whole disparities shows a wave, whose peak-to-peak height is the
-figure.
+Scenes are rendered (`bar_scenes`): tilted floors, matt bars, glossy bars. Only pixels well inside one surface
+that the right image sees are counted. The bias is the median error per tenth of a pixel of the true
+disparity's fraction; a method that favours whole disparities shows a wave in it, and its peak-to-peak height
+is the score.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ _FLOOR_MARGIN_PX, _BAR_MARGIN_PX = 12, 4
 class FractionBias:
     """Errors of one method on one kind of scene.
 
-    bias_px: median error per tenth of a pixel of the true disparity's fraction, from 0 on. peak_to_peak_px:
-    their highest minus their lowest. median_bias_px: of all pixels. median_error_px: of the absolute error.
-    gross_pct: errors of more than 1 px. coverage_pct: pixels that have a disparity. within1_pct, within2_pct:
-    those within 1 and 2 of their sigma. pixels: counted.
+    bias_px: median error per tenth of a pixel of the true disparity's fraction, from 0. peak_to_peak_px:
+    their maximum minus their minimum. median_bias_px: median error of all pixels. median_error_px: median
+    absolute error. gross_pct: errors above 1 px. coverage_pct: pixels that have a disparity. within1_pct,
+    within2_pct: pixels with errors within 1 and 2 of their sigma. pixels: number of pixels counted.
     """
 
     bias_px: tuple[float, ...]
@@ -53,7 +53,7 @@ class FractionBias:
 
 @dataclass(frozen=True)
 class SubpixelResult:
-    """One method on every kind of scene, by the kind's name."""
+    """One method on every kind of scene, by the name of the kind."""
 
     method: str
     kinds: dict[str, FractionBias]
@@ -61,7 +61,7 @@ class SubpixelResult:
 
 @dataclass(frozen=True)
 class SubpixelBench:
-    """The whole run. scenes: rendered per kind. limit_px: per kind the median of `noise_limit_px`."""
+    """The whole run. scenes: number of scenes per kind. limit_px: median of `noise_limit_px` per kind."""
 
     provenance: Provenance
     scenes: int
@@ -72,8 +72,9 @@ class SubpixelBench:
 def bench_subpixel(
     methods: Mapping[str, StereoMethod], data: Path | None = None, scenes: int = 6, seed: int = 1
 ) -> SubpixelBench:
-    """Run every method on `scenes` rendered scenes of each kind, and on the real scene with sub-pixel truth
-    `data`/motorcycle, where there is one, for sigma alone (its fractions are those of one geometry).
+    """Run every method on `scenes` rendered scenes of each kind, and on the real scene `data`/motorcycle
+    if there is one. Its truth is sub-pixel too, but its fractions come from one geometry: it is used for
+    sigma only.
     """
     gathered: dict[str, dict[str, list[PixelErrors]]] = {name: {} for name in methods}
     limits: dict[str, list[float]] = {kind: [] for kind in _KINDS}
@@ -102,7 +103,7 @@ def bench_subpixel(
 
 
 def inner_pixels(rendered: Rendered, surface: int) -> Bool:
-    """Select pixels (H, W) of the surface that the right image sees, away from its edges."""
+    """Select pixels (H, W) of the surface that the right image sees, away from the surface's edges."""
     margin = _BAR_MARGIN_PX if surface == BAR else _FLOOR_MARGIN_PX
     window = np.ones((2 * margin + 1,) * 2, dtype=np.uint8)
     usable: UInt8 = ((rendered.surface == surface) & rendered.visible).astype(np.uint8)
@@ -111,7 +112,7 @@ def inner_pixels(rendered: Rendered, surface: int) -> Bool:
 
 
 def subpixel_table(bench: SubpixelBench) -> Table:
-    """Tabulate one row per method and kind of scene."""
+    """Tabulate the errors, one row per method and kind of scene."""
     table = Table(
         title="Below the pixel",
         caption="bias: median error per tenth of a pixel of the true disparity's fraction; "
@@ -148,7 +149,7 @@ def subpixel_table(bench: SubpixelBench) -> Table:
 
 @dataclass(frozen=True, eq=False)
 class PixelErrors:
-    """Per counted pixel: fraction of the truth, error (NaN where missing), error over sigma."""
+    """Per counted pixel: fraction of the true disparity, error (NaN if missing), and error over sigma."""
 
     fraction: Float64
     error_px: Float64
@@ -156,14 +157,14 @@ class PixelErrors:
 
 
 def pixel_errors(found: Disparity, truth_px: Float64, where: Bool) -> PixelErrors:
-    """Collect errors of the pixels in `where`, (H, W) bool."""
+    """Collect the errors of the pixels in `where`, (H, W) bool."""
     truth = truth_px[where]
     error = found.disparity_px[where] - truth
     return PixelErrors(truth - np.floor(truth), error, error / found.sigma_px[where])
 
 
 def fraction_bias(parts: list[PixelErrors]) -> FractionBias:
-    """Summarise all pixels together; NaN where there is none."""
+    """Summarise the errors of all pixels together; NaN if there are none."""
     fraction = np.concatenate([part.fraction for part in parts])
     error = np.concatenate([part.error_px for part in parts])
     ratio = np.abs(np.concatenate([part.ratio for part in parts]))

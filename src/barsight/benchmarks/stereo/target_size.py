@@ -1,13 +1,13 @@
 """Measure a 90 mm bar at eight ranges by each method (`bench target-size`, the paper's Table 1).
 
-The paper says neither what its camera was nor how it measured. Assumed here: the crane's camera (1250 px,
-0.5 m, `bar_scenes`); one round bar on supports 0.3 m above a floor, darker than the floor, glossy to a
-varying degree; poses by chance (place below a pixel, roll, tilt of the floor, lamp, texture). Two sizes are
-measured, both from the same rough guess as a person's click would give (15 % off):
+The paper states neither its camera nor its way of measuring. Assumed here: the crane's camera (1250 px, 0.5
+m, `bar_scenes`); one round bar on supports 0.3 m above a floor, darker than the floor and glossy to a varying
+degree; random poses (sub-pixel position, roll, tilt of the floor, lamp, texture). Two sizes are measured,
+both from the same rough guess as a person's click would give (15 % off):
 
-- `map`: one cylinder over one floor, fitted to the disparity map alone (`bar_fit`);
-- `size`: the bar's outlines in the images, looked for where the map has them, at the distance that the
-  disparities of the bar's points say (`bar_edges`).
+- `map`: one cylinder above a floor plane, fitted to the disparity map alone (`bar_fit`);
+- `size`: the bar's outlines in the images, searched for near those of the map, at the distance given by the
+  disparities of the bar's points (`bar_edges`).
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ _GUESS_ERROR = 0.15
 
 @dataclass(frozen=True)
 class SizeErrors:
-    """Relative errors of one size, in percent: their mean, the mean of their absolute values, and their
-    spread (one standard deviation) over the poses that could be measured; failed: the poses that couldn't.
+    """Relative errors of one size, %: their mean, their mean absolute value and their standard deviation
+    over the poses that could be measured. failed: number of poses that couldn't.
     """
 
     mean_pct: float
@@ -52,7 +52,7 @@ class SizeErrors:
 
 @dataclass(frozen=True)
 class RangeResult:
-    """One method at one range: from outlines and disparities, and from the map alone."""
+    """One method at one range: sizes from outlines and disparities, and from the map alone."""
 
     range_mm: int
     size: SizeErrors
@@ -86,7 +86,7 @@ def bench_target_size(
     """Render `poses` poses at each range and measure the bar in every method's disparities."""
     poses_at = [(range_mm, pose) for range_mm in ranges_mm for pose in range(poses)]
     jobs = (job for range_mm, pose in poses_at for job in _matched(methods, range_mm, pose, seed))
-    # Rendering and matching use all cores, but the fits behind them one each: so two run beside them.
+    # Rendering and matching use all cores but a fit only one, so fits run alongside on a pool of threads.
     measured = np.array(list(ordered_map(lambda job: measure_bar(*job), jobs)))
     found = measured.reshape(len(ranges_mm), poses, len(methods), 2)
     results = tuple(
@@ -105,7 +105,7 @@ def bench_target_size(
 def _matched(
     methods: Mapping[str, StereoMethod], range_mm: int, pose: int, seed: int
 ) -> Iterator[tuple[Disparity, RectifiedPair, BarGuess]]:
-    """Match one pose by each method; its pair and the guess that the fit starts from."""
+    """Match one pose by each method; yields disparities, the pair, and the guess from which fits start."""
     rng = np.random.default_rng([seed, range_mm, pose])
     posed = bar_over_floor(rng, range_mm / 1000, rng.uniform(0, _MAX_GLOSS), _RAISED_M)
     assert posed.scene.bar is not None
@@ -116,9 +116,7 @@ def _matched(
 
 
 def measure_bar(disparity: Disparity, pair: RectifiedPair, guess: BarGuess) -> tuple[float, float]:
-    """Measure the diameter from outlines and disparities, and from the map alone; metres, NaN where it
-    failed.
-    """
+    """Measure the diameter, m, from outlines and disparities, and from the map alone; NaN if that failed."""
     fitted = fit_bar(disparity, pair.camera, guess)
     if isinstance(fitted, Failed):
         return math.nan, math.nan
@@ -127,9 +125,7 @@ def measure_bar(disparity: Disparity, pair: RectifiedPair, guess: BarGuess) -> t
 
 
 def target_size_table(bench: TargetSizeBench) -> Table:
-    """Tabulate ranges down, methods across: mean absolute error and spread of `size`, and of `map` in
-    brackets.
-    """
+    """Tabulate ranges by methods: mean absolute error and spread of `size`, in brackets those of `map`."""
     table = Table(
         title=f"A bar of {bench.diameter_mm:.0f} mm: mean |error| ± spread, %",
         caption=f"{bench.poses} poses each. First line: outlines in the images at the distance that the "
@@ -147,7 +143,7 @@ def target_size_table(bench: TargetSizeBench) -> Table:
 
 
 def _rough_guess(rng: np.random.Generator, bar: RenderedBar) -> BarGuess:
-    """Draw a rough bar as a person would point at it: place and radius up to 15 % of the radius off."""
+    """Draw a rough bar as a person would point at it: position and radius off by up to 15 % of the radius."""
     shift = bar.radius_m * _GUESS_ERROR * rng.uniform(-1, 1, 3)
     radius = bar.radius_m * (1 + _GUESS_ERROR * rng.uniform(-1, 1))
     return BarGuess(bar.centre_m + shift, bar.axis, radius)

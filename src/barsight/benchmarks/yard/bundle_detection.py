@@ -1,4 +1,4 @@
-"""Find bundles in many degraded maps of drawn yards and score them against the truth."""
+"""Detect bundles in many degraded maps of drawn yards and score them against the truth."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _RENDERED_KINDS = (
 
 
 def score_drawn(settings: SimulationSettings) -> tuple[BundleErrors, float]:
-    """Draw a yard, degrade its map, find its bundles and score them; the CPU time that finding took, too."""
+    """Draw a yard, degrade its map, detect its bundles: their scores, and the detection's CPU time, s."""
     height_map, true = drawn_map(settings)
     start = time.process_time()
     found = find_bundles(height_map, BundleSettings())
@@ -41,9 +41,7 @@ def score_drawn(settings: SimulationSettings) -> tuple[BundleErrors, float]:
 
 
 def drawn_yards(yards: int, seed: int, length_m: float) -> Iterator[SimulationSettings]:
-    """Draw yards of 1 to 5 layers with all kinds of bars: gaps, skews, missing and crossed bundles,
-    dunnage.
-    """
+    """Draw varied yards of 1 to 5 layers: kinds of bars, gaps, skew, missing and crossed bundles, dunnage."""
     rng = np.random.default_rng(seed)
     for k in range(yards):
         bars = _KINDS[k % len(_KINDS)]
@@ -60,10 +58,10 @@ def drawn_yards(yards: int, seed: int, length_m: float) -> Iterator[SimulationSe
 
 
 def rendered_yards(yards: int, seed: int) -> Iterator[SimulationSettings]:
-    """Choose short yards for small pictures, half a minute each to render and measure; of as many sorts as
-    drawn.
+    """Choose short yards for small images, as varied as the drawn ones; each takes about half a minute.
 
-    The pictures are cut to a quarter, the resolution stays. Short bars have both ends in view, long ones one.
+    The images are cropped to a quarter of their area at the same resolution. Short bars have both ends in
+    view, long ones one.
     """
     rng = np.random.default_rng((seed, 1))
     for k in range(yards):
@@ -87,7 +85,7 @@ def rendered_yards(yards: int, seed: int) -> Iterator[SimulationSettings]:
 
 
 def drawn_map(settings: SimulationSettings) -> tuple[HeightMap, tuple[TrueBundle, ...]]:
-    """Draw the degraded map of a yard and its true bundles."""
+    """Draw the degraded map of a yard, and its true bundles."""
     stock = stack_yard(settings, np.random.default_rng((settings.seed, 0)))
     scene = build_scene(stock, settings, np.random.default_rng((settings.seed, 1)))
     rng = np.random.default_rng((settings.seed, 20))

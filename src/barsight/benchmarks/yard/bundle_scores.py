@@ -1,4 +1,4 @@
-"""Score found bundles against the true ones of a simulated yard."""
+"""Score detected bundles against the true ones of a simulated yard."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _COUNTS = ("free", "found", "claimed", "wrong", "said_count", "right_count")
 
 @dataclass(frozen=True, eq=False)
 class TrueBundle:
-    """centre_m: (3,) the axis at mid-length. on_top: no bundle lies on it. mass_kg: of its bars."""
+    """centre_m: (3,) midpoint of the axis. on_top: no bundle lies on it. mass_kg: total mass of its bars."""
 
     centre_m: Float64
     yaw_rad: float
@@ -39,11 +39,12 @@ class TrueBundle:
 
 @dataclass(frozen=True, eq=False)
 class BundleErrors:
-    """Errors of the free true bundles that were found, stacked over yards, and what was missed or false.
+    """Errors of the detected free bundles, pooled over yards, with counts of missed and false ones.
 
-    errors, sigmas: by figure (N,), found minus true, m, rad, t; NaN where the figure is unknown. free: true
-    bundles with nothing on them; found: of those; claimed: found bundles said to be free; wrong: of those
-    without a true free one. said_count, right_count: pairs whose number of bars was said, and right.
+    errors, sigmas: (N,) by figure, detected minus true, m, rad, t; NaN where the figure is unknown. free:
+    true bundles with nothing on them; found: those of them that were detected; claimed: detected bundles
+    reported as free; wrong: those of them without a free true bundle. said_count, right_count: pairs whose
+    number of bars was reported, and those in which it was right.
     """
 
     errors: dict[str, Float64]
@@ -74,19 +75,19 @@ def read_true_bundles(recording: Path) -> tuple[TrueBundle, ...]:
 
 
 def _width(row: dict[str, Any]) -> float:
-    """Compute a true bundle's extent across, from its outline (x, z) where there is one, else all round."""
+    """Compute a true bundle's width, m, from its outline (x, z), its stored width or its enclosing circle."""
     if "outline" in row:
         return float(np.ptp(np.array(row["outline"])[:, 0]))
     return float(row.get("width", 2 * row["bundle_radius"]))
 
 
 def bars_mass(bars: int, diameter_m: float, length_m: float) -> float:
-    """Compute the mass of round steel bars of one length, kg."""
+    """Compute the mass of round steel bars of equal length, kg."""
     return STEEL_KG_PER_M3 * np.pi / 4 * diameter_m**2 * length_m * bars
 
 
 def score_bundles(found: tuple[Bundle, ...], true: tuple[TrueBundle, ...]) -> BundleErrors:
-    """Pair each true free bundle with the nearest found one whose axis runs inside it."""
+    """Pair each free true bundle with the nearest detected one whose axis runs inside it."""
     free = [t for t in true if t.on_top]
     claimed = [b for b in found if b.on_top]
     pairs, used = [], set()
@@ -139,8 +140,8 @@ def join_scores(parts: list[BundleErrors]) -> BundleErrors:
 
 
 def score_figures(scores: BundleErrors) -> dict[str, dict[str, float]]:
-    """Summarise each figure: count, bias, median, P95 of the size (mm, degrees, kg), ratio in the 95 %
-    interval.
+    """Summarise each figure: count, bias, median and P95 of the absolute error (mm, degrees, kg), and the
+    share of errors within the 95 % interval.
     """
     out = {}
     for name, error in scores.errors.items():
@@ -163,7 +164,7 @@ def score_figures(scores: BundleErrors) -> dict[str, dict[str, float]]:
 
 @dataclass(frozen=True)
 class BundleReport:
-    """A bundle benchmark's record, for a file. cpu_seconds: per yard, none for a measured folder."""
+    """A bundle benchmark's record, for a file. cpu_seconds: per yard; empty for a measured folder."""
 
     provenance: Provenance
     counts: dict[str, int]
@@ -172,13 +173,13 @@ class BundleReport:
 
 
 def bundle_report(scores: BundleErrors, cpu_seconds: tuple[float, ...]) -> BundleReport:
-    """Build counts and figures with commit and machine."""
+    """Build the counts and figures, with commit and machine."""
     counts = {name: int(getattr(scores, name)) for name in _COUNTS}
     return BundleReport(provenance(), counts, score_figures(scores), cpu_seconds)
 
 
 def bundle_table(scores: BundleErrors) -> Table:
-    """Tabulate the figures for people; lengths in mm, yaw in degrees, mass in kg."""
+    """Tabulate the figures for the terminal; lengths in mm, yaw in degrees, mass in kg."""
     title = (
         f"{scores.found} of {scores.free} free bundles found, {scores.wrong} of {scores.claimed} false; "
         f"bars counted right in {scores.right_count} of {scores.said_count}"
@@ -194,7 +195,7 @@ def bundle_table(scores: BundleErrors) -> Table:
 
 
 def reliability(scores: BundleErrors) -> str:
-    """Compare stated confidence of the bundles said to be free with the ratio that is right."""
+    """Compare the stated confidence of the bundles reported as free with the share of them that is right."""
     out = []
     for name, part in (("0.9 or more", scores.confidence >= 0.9), ("less", scores.confidence < 0.9)):
         if part.any():
@@ -209,7 +210,7 @@ def _axes(true: TrueBundle) -> tuple[Float64, Float64]:
 
 
 def _offset(found: Bundle, true: TrueBundle) -> tuple[float, float]:
-    """Compute the offset sideways of the true axis at the found middle, and along it."""
+    """Compute the detected centre's offset from the true one, across and along the true axis, m."""
     across, along = _axes(true)
     step = found.centre_m - true.centre_m
     return float(step @ across), float(step @ along)

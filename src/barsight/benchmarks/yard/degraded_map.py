@@ -1,8 +1,8 @@
-"""Draw a height map as the cameras would measure it from the exact surface: a minute for thirty yards.
+"""Generate a height map with the errors of a measured one from the exact surface: a minute for thirty yards.
 
-What goes wrong in a measured map is put on the exact heights: the cameras' field, places that no pair sees,
-edges that grow over what they hide, smoothing by the matching window, noise that is alike along the bars,
-a shared error, flying cells. benchmarks/results holds its errors against measured ones.
+The errors of a measured map are applied to the exact heights: the cameras' field of view, places that no pair
+sees, edges that grow over what they hide, smoothing by the matching window, noise correlated along the bars,
+a common offset, flying cells. benchmarks/results compares its errors with measured ones.
 """
 
 from __future__ import annotations
@@ -26,26 +26,28 @@ _MARGIN_M = 0.5
 
 @dataclass(frozen=True)
 class Defects:
-    """Standard deviations and shares of what is wrong with a measured map."""
+    """Standard deviations and shares of the errors of a measured map."""
 
     white_m: float = 0.002
     short_m: float = 0.0025
-    """Alike over 10 mm across and 0.1 m along the bars."""
+    """Standard deviation of the height noise correlated over 10 mm across and 0.1 m along the bars, m."""
     long_m: float = 0.004
-    """Alike over 10 mm across and 1.5 m along the bars: gloss and shading of each bar."""
+    """Standard deviation of the height noise correlated over 10 mm across and 1.5 m along the bars, m:
+    gloss and shading of each bar.
+    """
     shared_m: float = 0.001
-    """The same over the whole map."""
+    """Standard deviation of the height offset common to the whole map, m."""
     placed_m: float = 0.0014
-    """How far the trajectory places the whole map beside itself, along X and along Y."""
+    """Standard deviation of the whole map's displacement along X and along Y by the trajectory's error, m."""
     stated_m: float = 0.0045
-    """The sigma that the map states."""
+    """Standard deviation that the map states for its heights, m."""
     window_m: tuple[float, float] = (0.005, 0.014)
-    """Smoothing across the bars: least and most, drawn for each yard."""
+    """Smallest and largest sigma of the smoothing across the bars, m; drawn for each yard."""
     window_along_m: float = 0.015
     growth_cells: float = 1.2
-    """Mean growth of an edge over what it hides."""
+    """Mean number of cells by which an edge grows over what it hides."""
     frame_step_m: float = 0.4
-    """Travel from frame to frame: a gully must be open to a pair somewhere along it."""
+    """Travel from frame to frame, m: a gully must be open to some pair along the travel."""
     flying_ratio: float = 0.008
     hole_ratio: float = 0.01
 
@@ -53,7 +55,7 @@ class Defects:
 def degraded_map(
     scene: Scene, length_m: float, camera: CameraSettings, rng: np.random.Generator, defects: Defects
 ) -> HeightMap:
-    """Draw the map of a yard `length_m` long in X, 10 mm cells."""
+    """Generate the map of a yard `length_m` long in X, with 10 mm cells."""
     xs = CELL_M * np.arange(round(-_MARGIN_M / CELL_M), round((length_m + _MARGIN_M) / CELL_M) + 1)
     ys = CELL_M * np.arange(round(-_HALF_WIDTH_M / CELL_M), round(_HALF_WIDTH_M / CELL_M) + 1)
     x, y = np.meshgrid(xs, ys)
@@ -78,8 +80,9 @@ def degraded_map(
 
 
 def _seen(exact: Float64, y: Float64, camera: CameraSettings, defects: Defects) -> Bool:
-    """Mark cells in the field of view that nothing hides: towards the trolley's line, and from two places on
-    X.
+    """Mark visible cells: in the field of view, and not occluded across or along the travel.
+
+    Along X they must be visible from two positions, across it from the trolley's line.
     """
     depth = camera.above_floor_m - exact
     side = (y - camera.trolley_y_m) / depth
@@ -94,7 +97,7 @@ def _seen(exact: Float64, y: Float64, camera: CameraSettings, defects: Defects) 
 
 @kernel()
 def _opening(exact: Float64, cell: float) -> Float64:
-    """Compute how wide each cell sees the sky along X: the sum of the tangents to either side, at most 4.
+    """Compute the opening of each cell to the sky along X: the sum of the tangents to either side, at most 4.
 
     exact: (rows, columns) heights, m; cell: m. Returns (rows, columns).
     """
@@ -118,7 +121,7 @@ def _opening(exact: Float64, cell: float) -> Float64:
 
 
 def _windowed(exact: Float64, seen: Bool, window_m: tuple[float, float]) -> Float64:
-    """Average seen heights under the matching window, of the same surface (within 80 mm) only."""
+    """Average visible heights under the matching window, on the same surface (within 80 mm) only."""
     z = np.where(seen, exact, np.nan)
     total, weight = np.zeros_like(z), np.zeros_like(z)
     across, along = (int(2 * s / CELL_M + 0.5) for s in window_m)
@@ -133,7 +136,7 @@ def _windowed(exact: Float64, seen: Bool, window_m: tuple[float, float]) -> Floa
 
 
 def _grown(z: Float64, seen: Bool, rng: np.random.Generator, defects: Defects) -> tuple[Float64, Bool]:
-    """Grow edges over hidden cells and lower ones beside them, ends of bars half as far."""
+    """Grow edges over hidden cells and over lower ones beside them; the ends of bars grow half as far."""
     steps = rng.poisson(defects.growth_cells, (z.shape[0] // 8 + 1, z.shape[1])).repeat(8, axis=0)[
         : z.shape[0]
     ]
@@ -163,7 +166,7 @@ def _flying(z: Float64, seen: Bool, rng: np.random.Generator, defects: Defects) 
 
 
 def _patches(shape: tuple[int, ...], rng: np.random.Generator, share: float) -> Bool:
-    """Draw blobs of about 3 x 3 cells over a fraction of the map."""
+    """Draw blobs of about 3 x 3 cells that cover a given share of the map."""
     field = ndimage.gaussian_filter(rng.normal(0, 1, shape), 1.5)
     blobs: Bool = field > np.quantile(field[::3, ::3], 1 - share)
     return blobs

@@ -1,4 +1,4 @@
-"""Turn drawn worlds into what lifts are chosen from: a recording to be measured, or a map with noise."""
+"""Turn drawn worlds into the input of lift planning: a recording to be measured, or a map with noise."""
 
 from __future__ import annotations
 
@@ -32,27 +32,27 @@ from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Veto
 
 SPAN_M = 3.0
-"""Of the stacks that lifts are judged on, across their bars."""
+"""Approximate extent along X of the yards on which lifts are judged, m."""
 OVER_MAGNET_M = 0.3
-"""Length of their bars beyond the magnet's."""
+"""Length of their bars beyond the magnet's span, m."""
 CELL_M, MARGIN_M = 0.01, 0.6
 WHITE_M, ALIKE_M, ALIKE_CELLS = 0.001, 0.0015, 3.0
-"""Noise of `noisy_world`: of each cell, and alike over cells."""
+"""Noise of `noisy_world`: sigma of the white noise, m; sigma, m, and smoothing, cells, of the other."""
 
 
 def judged_yard(seed: int, magnet: JudgedMagnet, kind: str | None = None) -> DrawnYard:
-    """Draw the yard of a seed on which lifts of a magnet are judged: full bars a little longer than it."""
+    """Draw a seed's yard for judging lifts of a magnet: its bars are slightly longer than the magnet."""
     return draw_yard(seed, 2 * magnet.half_span_m + OVER_MAGNET_M, SPAN_M, min_length_ratio=1.0, kind=kind)
 
 
 def drawn_scene(world: DrawnYard) -> Scene:
-    """Give the solids surfaces and sort them for the renderer."""
+    """Assign surfaces to the solids and sort them for the renderer."""
     rng = np.random.default_rng((29, world.seed))
     return scene_of(world.yard, draw_finishes(world.yard.bundles, rng), rng)
 
 
 def recording_settings(world: DrawnYard, *, full_size: bool = False) -> SimulationSettings:
-    """Choose a short recording over a world: small pictures, or of full size; ten pairs for 3 m."""
+    """Choose a short recording of a world, with small images or full-size ones: ten pairs for 3 m."""
     base, length = SimulationSettings.demo(), world.size_m[0]
     camera = CameraSettings() if full_size else base.camera
     aside = ASIDE_M * (-1 if world.seed // 10 % 2 else 1) if world.hides else camera.trolley_y_m
@@ -63,21 +63,21 @@ def recording_settings(world: DrawnYard, *, full_size: bool = False) -> Simulati
 
 
 def render_world(world: DrawnYard, recording: Path, *, full_size: bool = False) -> None:
-    """Render a world as a recording."""
+    """Render a recording of a world."""
     settings = recording_settings(world, full_size=full_size)
     simulate(recording, settings, laid=LaidYard(drawn_scene(world), {}))
 
 
 @dataclass(frozen=True, eq=False)
 class MappedWorld:
-    """All that lifts are chosen from. vetoes: those that hold for the whole map."""
+    """The whole input of lift planning. vetoes: those that apply to the whole map."""
 
     scene: LiftScene
     vetoes: tuple[Veto, ...]
 
 
 def measured_world(out: Path, settings: LiftSettings) -> MappedWorld:
-    """Read what lifts are chosen from out of a measured folder, as of its last frame."""
+    """Read the input of lift planning from a measured folder, as of its last frame."""
     summary = read_summary(out)
     travel = Travel.read(summary)
     captured = travel.captured_ns if travel else None
@@ -91,8 +91,8 @@ def measured_world(out: Path, settings: LiftSettings) -> MappedWorld:
 
 
 def noisy_world(world: DrawnYard, settings: LiftSettings) -> MappedWorld:
-    """Draw noise onto the exact heights of every cell, and find the bundles in that: all is seen, nothing is
-    smoothed; no travel is known.
+    """Add noise to the exact height of every cell and detect the bundles in the result. Every cell is
+    seen, nothing is smoothed, and no travel is known.
     """
     rng = np.random.default_rng((31, world.seed))
     (x, y), margin = world.size_m, MARGIN_M
@@ -110,6 +110,6 @@ def map_world(
     heights: HeightMap, bundles: tuple[Bundle, ...], vetoes: tuple[Veto, ...], travel: Travel | None,
     now_ns: int, settings: LiftSettings,
 ) -> MappedWorld:  # fmt: skip
-    """Gather what lifts are chosen from."""
+    """Assemble the input of lift planning."""
     stands = footings(heights, bundles, settings)
     return MappedWorld(LiftScene(heights, BundleTable.of(bundles), stands, travel, now_ns), vetoes)

@@ -1,4 +1,4 @@
-"""Simulate the paper's field test: methods side by side on one recording, against truth and noisy laser."""
+"""Simulate the paper's field test: compare methods on one recording, against the truth and a noisy laser."""
 
 from __future__ import annotations
 
@@ -26,17 +26,19 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "ours self-calibrated": ("--self-calibrate", "yaw"),
     "ours paper-contours": ("--map.contours", "paper"),
 }
-"""Flags of `barsight measure`, by method. sgbm has our trajectory and fusion; it sums costs along four paths,
-`sgbm 5path` along five. The last rows are the ablation: trajectory, fusion (any height that
-enough views see, each cell for itself), self-calibration, contours."""
+"""Flags of `barsight measure`, by method. `sgbm` has our trajectory and fusion and sums its costs along
+four paths, `sgbm 5path` along five. The last rows are the ablation: trajectory, fusion (any height that
+enough views see, each cell on its own), self-calibration, contours.
+"""
 
 _HEADS = ("bias_mm", "mae_mm", "p95_mm", "coverage_pct", "within_95_pct")
 
 
 @dataclass(frozen=True)
 class YardRow:
-    """One method. smooth, everywhere: its contours against truth; heights: all cells that two frames see.
-    laser_mae_mm, laser_smooth_mae_mm: against the noisy laser, mean over the profiles (NaN without overlap).
+    """One method. smooth, everywhere: errors of its contours against the truth; heights: of all cells that
+    two frames see. laser_mae_mm, laser_smooth_mae_mm: MAE against the noisy laser, mean over the profiles
+    (NaN without overlap).
     """
 
     method: str
@@ -51,7 +53,7 @@ class YardRow:
 
 @dataclass(frozen=True)
 class YardBench:
-    """The laser's own error against truth (mm), and a row per method. what: the recording in words."""
+    """The laser's own error against the truth (mm), and a row per method. what: the recording in words."""
 
     what: str
     laser_bias_mm: float
@@ -88,10 +90,11 @@ def yard_row(method: str, flags: tuple[str, ...], recording: Path, out: Path, co
 
 
 def yard_table(bench: YardBench) -> Table:
-    """Tabulate like the paper's Table 4, with what it leaves out.
+    """Tabulate as in the paper's Table 4, with the figures that it omits.
 
-    seen, in 95: % of visible places claimed, of errors inside the stated 95 %. all, cells, laser: MAE of
-    whole contours, of all cells that two frames see, and against the laser on smooth places.
+    seen, in 95: % of visible places that are measured, % of errors within the stated 95 % interval. all,
+    cells, laser: MAE of whole contours, of all cells that two frames see, and against the laser on smooth
+    places.
     """
     title = f"{bench.what}; mm against truth on smooth places, commit {bench.provenance.commit}"
     table = Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))

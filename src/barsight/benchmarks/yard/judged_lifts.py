@@ -1,9 +1,9 @@
-"""Let the independent judge try to prove lifts wrong (`barsight bench lifts`).
+"""Have the independent judge try to prove lifts wrong (`barsight bench lifts`).
 
-The lifts that are offered, and random placements, are assessed on a measured map of a drawn world; each that
-is not vetoed is judged by the world's solids at the stated tolerance, and so are the vetoed ones over a
-bundle on which nothing lies, for what is refused although it is fine. Of more placements only those without
-a veto are judged: they bound the danger.
+The offered lifts, and random placements, are assessed on a measured map of a drawn world. The judge checks
+each one without a veto against the world's solids at the stated tolerance; it also checks the vetoed ones
+over a bundle on which nothing lies, to find safe lifts that are refused. Of further placements it checks only
+those without a veto, which bound the rate of dangerous lifts.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from barsight.yard.magnet.footprint import Placement
 
 TWO_SIDED = 1.96
 SPREAD = (0.1, 0.012, math.radians(0.1))
-"""Standard deviations along, across and of the yaw with which placements miss a bundle's middle."""
+"""Standard deviations, m, m, rad, of random placements from a bundle's centre: along, across, yaw."""
 
 
 @dataclass(frozen=True)
 class JudgedLift:
-    """One placement and what the judge says. offered: it is in the plan's list; vetoes: the product's codes.
+    """One placement and its verdict. offered: it is one of the plan's lifts; vetoes: the planner's codes.
 
-    dangerous: of what is vetoed and dangerous at the target already, the reasons there. stated_*: by the
-    product; true_*: by the judge, NaN where there is no load. for_danger: it is listed as it has no veto, and
-    tells nothing of what is refused.
+    dangerous: the judge's reasons; for a vetoed placement that is dangerous at the target itself, only those
+    found there. stated_*: values stated by the planner; true_*: values by the judge, NaN if there is no load.
+    for_danger: a further placement, listed only because it has no veto; it must not count for the refusals.
     """
 
     seed: int
@@ -60,13 +60,13 @@ class JudgedLift:
 
     @property
     def is_fine(self) -> bool:
-        """Tell whether the judge finds every figure clear of its limit."""
+        """Tell whether the judge finds every figure within its safe limit."""
         return not self.dangerous and not self.unclear
 
 
 @dataclass(frozen=True)
 class JudgedBench:
-    """All that was judged, over how many yards."""
+    """All judged placements, and the number of yards that they come from."""
 
     yards: int
     lifts: tuple[JudgedLift, ...]
@@ -74,17 +74,17 @@ class JudgedBench:
 
     @classmethod
     def of(cls, yards: int, lifts: Sequence[JudgedLift]) -> JudgedBench:
-        """Record what was judged, with commit and machine."""
+        """Record the judged placements, with commit and machine."""
         return cls(yards, tuple(lifts), provenance())
 
     @property
     def unvetoed(self) -> tuple[JudgedLift, ...]:
-        """Return those that nothing forbids."""
+        """Return the placements without a veto."""
         return tuple(one for one in self.lifts if not one.vetoes)
 
     @property
     def dangerous(self) -> tuple[JudgedLift, ...]:
-        """Return those of them that the judge finds dangerous."""
+        """Return the placements without a veto that the judge finds dangerous."""
         return tuple(one for one in self.unvetoed if one.dangerous)
 
 
@@ -92,8 +92,8 @@ def judge_yard(
     world: DrawnYard, mapped: MappedWorld, magnet: Magnet, judged: JudgedMagnet, settings: LiftSettings,
     placements: int, for_danger: int = 0,
 ) -> Iterator[JudgedLift]:  # fmt: skip
-    """Assess and judge the offered lifts and so many placements of one world, and what isn't vetoed of
-    `for_danger` more.
+    """Assess and judge the offered lifts and `placements` random placements in one world, and those of
+    `for_danger` further placements that have no veto.
     """
     rng, judge = np.random.default_rng((37, world.seed)), Judge(world.yard, judged, settings.bundles)
     scene = mapped.scene
@@ -122,7 +122,7 @@ def over_bundle(world: DrawnYard, bundle: int) -> Placement:
 
 
 def draw_beside(middle: Placement, rng: np.random.Generator) -> Placement:
-    """Draw a placement that misses the middle by SPREAD."""
+    """Draw a placement around the given one, with the standard deviations SPREAD."""
     along, across, turn = rng.normal(0, SPREAD)
     x, y = (middle.x_m, middle.y_m) + along * middle.along + across * middle.across
     return Placement(float(x), float(y), middle.yaw_rad + float(turn))
@@ -139,7 +139,7 @@ def _judged(world: DrawnYard, lift: Lift, judge: Judge, magnet: JudgedMagnet, *,
         )
     verdict = None
     if lift.vetoes:
-        # What is dangerous at the target itself needs no look at the corners.
+        # If it is dangerous at the target itself, the corners needn't be checked.
         verdict = judge.judge(replace(target, box=(0.0, 0.0, 0.0)))
     if verdict is None or not verdict.dangerous:
         verdict = judge.judge(target)
@@ -152,12 +152,12 @@ def _judged(world: DrawnYard, lift: Lift, judge: Judge, magnet: JudgedMagnet, *,
 
 
 def upper_bound(found: int, of: int) -> float:
-    """Compute the 95 % upper bound of a share [Clopper 1934], one-sided."""
+    """Compute the one-sided 95 % upper confidence bound of a proportion [Clopper 1934]."""
     return float(beta.ppf(0.95, found + 1, of - found)) if found < of else 1.0
 
 
 def bench_table(bench: JudgedBench) -> Table:
-    """Tabulate the bench for people."""
+    """Tabulate the results for the terminal."""
     table = Table("figure", "value", title=f"{len(bench.lifts)} placements on {bench.yards} yards")
     free, bad = bench.unvetoed, bench.dangerous
     fine = [one for one in bench.lifts if one.is_fine and not one.for_danger]
@@ -189,7 +189,7 @@ def bench_table(bench: JudgedBench) -> Table:
 
 
 def dangerous_table(bench: JudgedBench) -> Table:
-    """List each dangerous placement that nothing forbids, with its reasons."""
+    """List each dangerous placement without a veto, with its reasons."""
     table = Table("seed", "kind", "offered", "x m", "y m", "yaw deg", "why")
     for one in bench.dangerous:
         table.add_row(

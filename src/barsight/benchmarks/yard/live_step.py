@@ -1,4 +1,4 @@
-"""Time a live step (`bench live-step`): a pair comes in, the map has it."""
+"""Time a live step (`bench live-step`), from the arrival of a pair to its entry into the map."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from barsight.recording.open import open_recording
 from barsight.recording.rectified_pairs import RectifiedPairs
 
 _WARMING_PAIRS = 3
-"""Pairs mapped before and not timed: with the third, a pair is matched by the one before it."""
+"""Number of untimed warm-up pairs; the third is the first matched by a prediction."""
 
 
 @dataclass(frozen=True)
 class StepTime:
-    """A step or a part of it: ms a pair by the clock and of all threads' CPU, median and 95th percentile."""
+    """A step or a part of it: wall ms and CPU ms of all threads per pair, median and 95th percentile."""
 
     part: str
     wall_ms: float
@@ -45,11 +45,10 @@ class StepTime:
 
 @dataclass(frozen=True)
 class LiveStepBench:
-    """A recording's steps in which a pair came into the map. The first step, which also looks what there is,
-    took first_s.
+    """A recording's steps that added a pair to the map. first_s: time of the first step, not among them.
 
-    fused: pairs in the map. others: steps besides the first in which none came into it, not counted. parts:
-    CPU of stereo is NaN, it isn't told apart.
+    fused: pairs in the map. others: steps besides the first that added none, not counted. parts: the CPU time
+    of stereo is NaN, as it isn't measured separately.
     """
 
     recording: str
@@ -65,8 +64,8 @@ class LiveStepBench:
 
 
 def bench_live_step(path: Path, settings: MeasureSettings) -> LiveStepBench:
-    """Time each pair of a recording, one after the other and none matched ahead, after a few that load all
-    kernels. settings: with the estimator `live`.
+    """Time each pair of a recording, in sequence and without matching ahead, after warm-up pairs that load
+    all kernels. settings: with the estimator `live`.
     """
     compile_ahead(lambda stage, done, total: None, "measure")
     recording, chosen = open_recording(path, settings.recording), settings.chosen()
@@ -94,7 +93,7 @@ def bench_live_step(path: Path, settings: MeasureSettings) -> LiveStepBench:
 
 
 def live_step_table(bench: LiveStepBench) -> Table:
-    """Tabulate for the terminal."""
+    """Tabulate the results for the terminal."""
     width, height = bench.size
     table = Table(
         title=f"{bench.recording}: {bench.pairs} pairs of {width}x{height}, {bench.fused} in the map, preset "
@@ -117,8 +116,9 @@ def live_step_table(bench: LiveStepBench) -> Table:
 def _steps(
     recording: Recording, settings: MeasureSettings, folder: Path, count: int | None
 ) -> tuple[Float64, Int64]:
-    """Map the first `count` pairs in `folder`. Returns (n, 3, 3): s by the clock, of CPU and by the clock in
-    stereo of rectifying, adding and electing; and how many pairs are in the map after each.
+    """Map the first `count` pairs into `folder`. Returns times (n, 3, 3), s: wall, CPU and wall in stereo,
+    each for rectifying, adding and surface election; and the number of pairs in the map after each step
+    (n,).
     """
     folder.mkdir()
     watch = Stopwatch()
@@ -145,6 +145,6 @@ def _now(watch: Stopwatch) -> tuple[float, float, float]:
 
 
 def _part(name: str, seconds: Float64) -> StepTime:
-    """Summarise seconds (n, 2) by the clock and of CPU."""
+    """Summarise times (n, 2), wall and CPU s."""
     (wall, cpu), (wall_p95, cpu_p95) = 1e3 * np.percentile(seconds, (50, 95), axis=0)
     return StepTime(name, float(wall), float(wall_p95), float(cpu), float(cpu_p95))

@@ -1,8 +1,8 @@
-"""Repeat a recording end to end: a long yard without rendering every metre of it.
+"""Repeat a recording end to end, to get a long yard without rendering every metre of it.
 
-Each lap goes on where the crane stopped; the pictures are the first lap's. At a joint the picture changes
-while the crane stands, as if the yard had been exchanged under it: what is measured there is wrong, and no
-truth goes with it. It is made to see how time and memory grow.
+Each lap continues where the crane stopped; its images are those of the first lap. At a joint the image
+changes while the crane is at rest, as if the yard had been exchanged below it: measurements there are wrong,
+and the result has no truth. It shows how time and memory grow.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ _CAMERAS, _CLOCKED = ("cam0", "cam1"), ("imu0", "crane0")
 
 
 def repeat(recording: Path, target: Path, times: int) -> None:
-    """Write `target`, an EuRoC folder with crane encoders; its pictures are links to those of `recording`.
+    """Write `target`, an EuRoC folder with crane encoders; its images are links to those of `recording`.
 
-    Raises InputError where `recording` lacks cameras or encoders, or has other pictures than PNGs by stamp.
+    Raises InputError if `recording` lacks cameras or encoders, or if its images aren't PNGs named by stamp.
     """
     mav = recording.resolve() / "mav0"
     for name in (*_CAMERAS, "crane0"):
@@ -73,6 +73,6 @@ def _write(folder: Path, head: str, rows: Iterable[tuple[object, ...]]) -> None:
 
 
 def _table(folder: Path) -> tuple[str, list[list[str]]]:
-    """Read the first line of a data.csv and its rows."""
+    """Read the header line of a data.csv, and its rows."""
     lines = (folder / "data.csv").read_text(encoding="ascii").splitlines()
     return lines[0], [[field.strip() for field in line.split(",")] for line in lines[1:] if line.strip()]

@@ -1,4 +1,4 @@
-"""Measure a recording in a process of its own, and tabulate what that costs: time, memory, stages."""
+"""Measure a recording in a separate process, and tabulate its cost: time, memory, stages."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from barsight.core.errors import MeasurementError
 
 @dataclass(frozen=True)
 class RunCost:
-    """One run of `barsight measure`. wall_s, cpu_s: of the whole process, its start included, by the clock
-    and of all its threads. stage_s: seconds by stage, in which stages that run side by side count in full.
+    """One run of `barsight measure`. wall_s, cpu_s: wall time, and CPU time of all threads, of the whole
+    process including its start. stage_s: seconds by stage; stages that run in parallel each count in full.
     """
 
     wall_s: float
@@ -31,8 +31,8 @@ class RunCost:
 
 
 def measure_apart(recording: Path, out: Path, flags: tuple[str, ...]) -> RunCost:
-    """Measure in a process of its own, so that memory and time are this run's alone. Kernels that the cache
-    lacks are compiled before.
+    """Measure in a separate process, so that memory and time are those of this run alone. Kernels missing
+    from the cache are compiled first.
     """
     compile_ahead(lambda stage, done, total: None, "measure")
     command = [sys.executable, "-m", "barsight", "measure", str(recording), "-o", str(out), *flags]
@@ -48,7 +48,7 @@ def measure_apart(recording: Path, out: Path, flags: tuple[str, ...]) -> RunCost
 
 
 def cost_table(title: str, costs: Mapping[str, RunCost], reference: str) -> Table:
-    """Tabulate runs side by side, over `reference` where it is one of them, then their stages in s."""
+    """Tabulate runs side by side, relative to `reference` if it is one of them, then their stages in s."""
     caption = "One run each. Stages: s by the clock; those that run side by side count each in full."
     if reference in costs:
         caption = f"times: over {reference}. {caption}"

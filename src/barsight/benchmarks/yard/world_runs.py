@@ -1,4 +1,4 @@
-"""Render, measure and score drawn worlds; what is kept is done again only where it must."""
+"""Render, measure and score drawn worlds; stored results are recomputed only if their inputs changed."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from barsight.simulation.worlds.recording import GENERATOR, draw_world, simulate
 NOTE = "world.json"
 LIST = "looked_at.toml"
 DRAWS = ("simulation", "calibration/geometry")
-"""Packages that decide what a seed's recording is,"""
+"""Packages that determine a seed's recording."""
 MEASURES_NOT = ("simulation", "benchmarks", "cli", "viewer", "evaluation")
-"""those that don't decide what is measured from it,"""
+"""Packages that don't affect the measurement of a recording."""
 SCORES = ("benchmarks/yard", "evaluation")
-"""and those that decide the score."""
+"""Packages that determine the score of a measurement."""
 Measure = Callable[[Path, Path], object]
 
 
 @dataclass(frozen=True)
 class WorldKeys:
-    """Digests of what recording, measurement and score of every seed depend on."""
+    """Digests of everything on which the recording, measurement and score of every seed depend."""
 
     recording: str
     measured: str
@@ -40,7 +40,10 @@ class WorldKeys:
 
     @classmethod
     def of(cls, given: object, draws: Sequence[str] = DRAWS) -> WorldKeys:
-        """Compute them from the settings and the package's sources; draws: those that decide a recording."""
+        """Compute the digests from the settings and the package's sources.
+
+        draws: the sources that decide a recording.
+        """
         root = Path(barsight.__file__).parent
         measuring = [path.name for path in root.iterdir() if path.name not in (*MEASURES_NOT, "__pycache__")]
         drawn = json_digest([GENERATOR, json_value(given), sources_digest(root, draws)])
@@ -51,11 +54,11 @@ class WorldKeys:
 def run_world(
     keep: Path, seed: int, given: SimulationSettings, keys: WorldKeys, measure: Measure, looked_at: str
 ) -> WorldScore:
-    """Score one world in its own folder of `keep`, by the recording, result and scores kept there.
+    """Score one world in its own folder of `keep`, reusing what is still valid there.
 
-    measure: measures a recording into a folder. looked_at: why the seed counts as looked at from now on;
-    empty where it does not. What the product refuses to measure is a score too. Raises OutputError for a
-    folder that is not of this bench.
+    measure: measures a recording into a folder. looked_at: reason why the seed counts as looked at from now
+    on; empty if it doesn't. A recording that Barsight refuses to measure gets a score too. Raises OutputError
+    for a folder that doesn't belong to this benchmark.
     """
     folder = keep / f"seed_{seed}"
     note = read_note(folder)
@@ -102,7 +105,7 @@ def keep_measured(
 
 
 def looked_at_list() -> dict[int, str]:
-    """Read the project's list of seeds that were looked at while something was set, with why."""
+    """Read the project's list of seeds that were looked at during tuning, each with the reason."""
     content = tomllib.loads((files("barsight.benchmarks.yard") / LIST).read_text(encoding="utf-8"))
     return {
         seed: entry["why"]
@@ -139,7 +142,7 @@ def _remove(*folders: Path) -> None:
 
 
 def _score(content: dict[str, Any]) -> WorldScore:
-    """Make a score of what JSON kept of it: null for NaN, lists for tuples."""
+    """Restore a score from its JSON: null stands for NaN, lists for tuples."""
 
     def numbers(values: list[float | None]) -> list[float]:
         return [float("nan") if v is None else v for v in values]

@@ -1,4 +1,4 @@
-"""Score the measurement of a drawn world against its truth: map, contours, poses, bundles; tabulate many."""
+"""Score measurements of drawn worlds against their truth: map, contours, poses, bundles."""
 
 from __future__ import annotations
 
@@ -30,10 +30,11 @@ UNSEEN = frozenset({
     DoubtKind.UNSEEN_FLANK, DoubtKind.HIDDEN_FLANK, DoubtKind.OVERLAP, DoubtKind.FAINT_LINE,
     DoubtKind.CROSSING_EDGE,
 })  # fmt: skip
-"""In `cover_doubts` on what isn't seen to lie there: a bundle with no others is said to be free. A beam or
-bar that is seen across it covers it, in a world's truth."""
+"""Doubts in `cover_doubts` about what isn't seen to lie on a bundle: a bundle with no other doubts is
+reported as free. A beam or bar that is seen across it does cover it in a world's truth.
+"""
 SEEN_FRAMES, SEEN_RATIO = 2, 0.5
-"""A bundle is asked for where so many frames see at least this share of its axis in both cameras."""
+"""A bundle is in view if this many frames see this share of its axis, at least, in both cameras."""
 MAP_ROWS = ("contour, smooth places", "contour, everywhere", "height, smooth stack", "height, seen by two")
 POSE_ROWS = {
     "ground below the frames: RMSE, mm": "rmse_mm",
@@ -49,13 +50,13 @@ BUNDLE_ROWS = {
 
 @dataclass(frozen=True)
 class WorldScore:
-    """Scores of one world. refused: why it could not be measured, empty where it was.
+    """Scores of one world. refused: reason why it could not be measured, empty if it was.
 
-    maps: as `score_folder` has them, mm. poses: of the ground below the frames and of their attitude, as they
-    stand and but for one rigid motion that all share. counts: free bundles in sight, how many were found,
-    bundles said to be free, how many of those are wrong, at how many of those no bundle lies whether free or
-    not, how often a number of bars was said and right, single bars in sight and found. errors, sigmas: by
-    figure of the bundles that were found, m (yaw rad, mass t).
+    maps: figures of `score_folder`, mm. poses: errors of the ground below the frames and of their attitude,
+    as they are and after removing one common rigid motion. counts: free bundles in view and found; bundles
+    reported as free, how many of those are wrong, and how many have no true bundle at all, free or not;
+    numbers of bars reported and right; single bars in view and found. errors, sigmas: of the found bundles by
+    figure, m (yaw rad, mass t).
     """
 
     seed: int
@@ -72,7 +73,7 @@ class WorldScore:
 
 @dataclass(frozen=True)
 class WorldRow:
-    """One figure over the worlds of a kind. n: samples of the interval's share; seed: of the worst."""
+    """One figure over the worlds of a kind. n: samples behind within_95_pct; seed: of the worst world."""
 
     kind: str
     figure: str
@@ -85,7 +86,7 @@ class WorldRow:
 
 @dataclass(frozen=True)
 class WorldBench:
-    """All worlds and what they give together."""
+    """All worlds, and their pooled figures."""
 
     worlds: tuple[WorldScore, ...]
     rows: tuple[WorldRow, ...]
@@ -93,7 +94,7 @@ class WorldBench:
 
 
 def score_world(recording: Path, out: Path | None, looked_at: str, refused: str) -> WorldScore:
-    """Score the folder that a world was measured into; out: None where measuring was refused."""
+    """Score the folder that a world was measured into; out: None if measuring was refused."""
     truth = json.loads((recording / "truth" / "world.json").read_text(encoding="utf-8"))
     names = tuple(name for name, holds in truth["conditions"].items() if holds)
     known = (truth["seed"], truth["kind"], names, looked_at, refused)
@@ -119,7 +120,7 @@ def score_world(recording: Path, out: Path | None, looked_at: str, refused: str)
 
 
 def _said_free(bundle: Bundle) -> bool:
-    """Check that a bundle is on top, and that nothing is seen to lie on it."""
+    """Check that a bundle is on top and that nothing is seen to lie on it."""
     return bundle.on_top is True and all(doubt.kind in UNSEEN for doubt in bundle.cover_doubts)
 
 
@@ -134,7 +135,7 @@ def world_rows(worlds: Sequence[WorldScore]) -> tuple[WorldRow, ...]:
 
 
 def world_table(bench: WorldBench) -> Table:
-    """Tabulate for people: medians, worst cases with their seed, shares in the stated 95 %."""
+    """Tabulate medians, worst cases with their seeds, and shares within the stated 95 % intervals."""
     worlds = bench.worlds
     refused = [w for w in worlds if w.refused]
     looked = sum(bool(w.looked_at) for w in worlds)
@@ -156,7 +157,7 @@ def world_table(bench: WorldBench) -> Table:
 
 
 def world_list(bench: WorldBench) -> Table:
-    """List the worlds: kind, conditions, whether looked at, what is found, why refused."""
+    """List the worlds: kind, conditions, whether looked at, what was found, reason of a refusal."""
     table = Table("seed", "kind", "conditions", "looked at", "found", "false", box=SIMPLE_HEAD)
     for w in bench.worlds:
         c = w.counts
@@ -183,7 +184,7 @@ def _over_worlds(
     kind: str, name: str, figures: list[tuple[dict[str, float], int]], key: str,
     worst: Callable[[list[tuple[float, int]]], tuple[float, int]],
 ) -> Iterable[WorldRow]:  # fmt: skip
-    """Take the median and the worst of one figure over the worlds, its share weighted by their samples."""
+    """Compute one figure's median and worst value over the worlds, and its share weighted by samples."""
     values = [(one[key], seed) for one, seed in figures if key in one]
     if not values:
         return
@@ -239,7 +240,7 @@ def _rows(recording: Path) -> list[dict[str, Any]]:
 
 
 def _shown(recording: Path, true: tuple[TrueBundle, ...]) -> list[bool]:
-    """Tell which bundles the cameras had in view, by the truth's count of frames along their axes."""
+    """Tell which bundles the cameras had in view, from the truth's count of frames along their axes."""
     with np.load(recording / "truth" / "height.npz") as truth:
         x, y, visible = truth["x"], truth["y"], truth["visible"]
     out = []
@@ -254,9 +255,7 @@ def _shown(recording: Path, true: tuple[TrueBundle, ...]) -> list[bool]:
 
 
 def _poses(recording: Path, out: Path) -> dict[str, float]:
-    """Compare the ground below each frame, as its pose places it, and its attitude with truth; empty in
-    `world`.
-    """
+    """Compare each frame's attitude, and the ground below it, with the truth; empty in `world`."""
     summary = read_summary(out)
     travel = summary.get("travel")
     if summary["reference"] != "yard" or not travel:
@@ -285,7 +284,7 @@ def _poses(recording: Path, out: Path) -> dict[str, float]:
     ground = ground + down
     error = found.place_m[known] + np.cross(turn, down)
     sigmas = [sigma_of[stamp] for stamp in stamps]
-    # One rigid motion: the mean turn, and the mean shift that is left.
+    # One rigid motion: the mean rotation, and the mean shift that remains.
     aligned = error - error.mean(axis=0) - np.cross(turn.mean(axis=0), ground - ground.mean(axis=0))
     inside = np.abs(error) <= TWO_SIDED * np.array(sigmas, np.float64)
     return {

@@ -1,4 +1,4 @@
-"""Time a whole yard of 35 m: its bundles found, its lifts chosen."""
+"""Time bundle detection and lift planning on a whole yard of 35 m."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LENGTH_M = 35.0
 
 @dataclass(frozen=True)
 class YardSpeed:
-    """Seconds by the clock and of CPU for a drawn yard; the process's peak memory, drawing included."""
+    """Wall and CPU times, s, for a drawn yard; the process's peak memory, drawing included."""
 
     length_m: float
     bundles: int
@@ -37,7 +37,7 @@ class YardSpeed:
 
 
 def time_yard(magnet: Magnet, seed: int, length_m: float = LENGTH_M) -> YardSpeed:
-    """Draw one yard, find its bundles and choose its lifts, after a short one that compiles everything."""
+    """Draw one yard, detect its bundles and plan its lifts, after a warm-up on a short yard."""
     for length in (2.0, length_m):
         height_map, _ = drawn_map(next(drawn_yards(1, seed, length)))
         wall, cpu = [time.perf_counter()], [time.process_time()]
