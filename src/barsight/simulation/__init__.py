@@ -1,1 +1,1 @@
-"""Render recordings with exact truth."""
+"""Render recordings with exact ground truth."""

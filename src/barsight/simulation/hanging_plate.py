@@ -1,6 +1,4 @@
-"""Render what hangs from the crane into the pictures: a level plate that travels along and sways like the
-rig.
-"""
+"""Render a level plate that hangs from the crane into the images; it travels along and sways with the rig."""
 
 from __future__ import annotations
 
@@ -18,14 +16,14 @@ ALBEDO = 0.3
 
 @dataclass(frozen=True, eq=False)
 class MagnetPlate:
-    """A level rectangle of one frame. centre_m: (3,) in the yard. half_m: (2,) along x and y."""
+    """The plate in one frame, a level rectangle. centre_m: (3,) in the yard. half_m: (2,) along x and y."""
 
     centre_m: Float64
     half_m: Float64
 
     def covers(self, origin: Float64, directions: Float64) -> tuple[Bool, Float64, Float64]:
-        """Intersect rays (..., 3) from `origin`: whether they hit, at which multiple of theirs, and where:
-        (..., 2) m from the centre. A hit beyond 1 lies behind what the ray reaches.
+        """Intersect rays (..., 3) from `origin`: whether they hit, the ray parameter of the hit, and its
+        position from the centre (..., 2), m. A hit with a parameter above 1 lies beyond the ray's end.
         """
         share = (self.centre_m[2] - origin[2]) / np.minimum(directions[..., 2], -1e-9)
         place = origin[:2] + share[..., None] * directions[..., :2] - self.centre_m[:2]
@@ -34,7 +32,7 @@ class MagnetPlate:
 
 
 def plate_at(settings: MagnetSettings, share: float, yard_from_body: Pose) -> MagnetPlate | None:
-    """Place the plate at `share` of the frames, None while it is drawn up."""
+    """Place the plate at `share` of the frames, None while it is hoisted out of view."""
     if min(settings.size_m) == 0 or not settings.first_ratio <= share <= settings.last_ratio:
         return None
     offset = np.array([*settings.offset_m, -settings.below_body_m])
@@ -44,7 +42,7 @@ def plate_at(settings: MagnetSettings, share: float, yard_from_body: Pose) -> Ma
 def paint_plate(
     radiance: Float32, plate: MagnetPlate, rays: Float32, side: int, yard_from_cam: Pose, tile: Float32
 ) -> None:
-    """Paint the plate over a view in place; `rays` and `side` as `render` takes them."""
+    """Paint the plate over a view in place; `rays` and `side` as for `render_view`."""
     directions = np.dstack([rays, np.ones(rays.shape[:2])]) @ yard_from_cam.rotation.T
     hit, _, place = plate.covers(yard_from_cam.translation, directions)
     texel = np.floor(place[hit] / ALONG_M).astype(np.int64) & (TILE - 1)

@@ -1,7 +1,7 @@
-"""Bake the light of the hall's lamps on each surface: once, as nothing in the yard moves.
+"""Bake the light of the hall's lamps on each surface, once, because nothing in the yard moves.
 
-A lamp hangs at every `spacing` along X in each of two rows; its beam ends 1.5 spacings away, so at most
-three lamps of a row reach a place, and lamp number i of row r has slot (i mod 3) + 3 r there.
+In each of two rows, lamps hang at every `spacing` along X; the beam of a lamp ends 1.5 spacings away, so at
+most three lamps of a row reach a point. Lamp number i of row r has slot (i mod 3) + 3 r there.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from barsight.simulation.scene import Grid, Primitives, Scene
 SLOTS = 6
 TEXEL_M = 0.05
 AROUND = 16
-"""Lightmap cells around a bar."""
+"""Number of lightmap cells around a bar."""
 FLOOR_MARGIN_M = 5.0
 SUN_EDGE_M = 0.07
-"""Width of a sun patch's edge: half a degree of sun over 8 m."""
+"""Width of a sun patch's soft edge, m: the sun's diameter of half a degree over a distance of 8 m."""
 ORDINARY_LIGHT = LightSettings()
 
 
 class Lamps(NamedTuple):
-    """Lamp positions (m): spacing and offset along X, the two rows' y (2,), height z; half length along Y.
+    """Lamp positions (m): spacing and offset along X, y of the two rows (2,), height z; half length along Y.
 
     ambient: irradiance from the hall on an open level surface; bounce: share of it that reaches any surface.
-    sun: (8,) unit direction to the sun, the patch that it lights on the floor (x from, to, y from, to),
+    sun: (8,) unit direction towards the sun, patch that it lights on the floor (x from, to, y from, to),
     irradiance of a surface that faces it.
     """
 
@@ -48,10 +48,10 @@ class Lamps(NamedTuple):
 class Lightmap(NamedTuple):
     """Light per texel. Texel t of primitive p: start[p] + s * around[p] + a; the floor is the last primitive.
 
-    start: (P + 2,). along, around: (P + 1,). A cylinder's `a` runs around it, a box's is its face (2 k for
-    -axis k, 2 k + 1 for +axis k), with `along` on its longest axis; the floor's texels lie along X, then Y.
-    diffuse: (T,) irradiance from lamps and hall. seen: (T, SLOTS) share of each lamp that is seen, 255 all.
-    sun: (T,) irradiance from the sun, were its patch everywhere; (0,) without a sun.
+    start: (P + 2,). along, around: (P + 1,). For a cylinder `a` runs around it; for a box it is the face (2 k
+    for -axis k, 2 k + 1 for +axis k), with `along` on its longest axis; the floor's texels run along X, then
+    Y. diffuse: (T,) irradiance from lamps and hall. seen: (T, SLOTS) visible share of each lamp, 255 for all
+    of it. sun: (T,) irradiance from the sun if its patch covered everything; (0,) without a sun.
     """
 
     start: Int64
@@ -64,7 +64,7 @@ class Lightmap(NamedTuple):
 
 
 def hall_lamps(above_floor_m: float, light: LightSettings = ORDINARY_LIGHT) -> Lamps:
-    """Make two rows of lamps over a crane whose cameras hang `above_floor_m` high, and perhaps a sun."""
+    """Create two rows of lamps above a crane with cameras at `above_floor_m`, and optionally a sun."""
     z = above_floor_m + 3.5
     height, turn = np.radians([light.sun_elevation_deg, light.sun_azimuth_deg])
     to_sun = [np.cos(height) * np.cos(turn), np.cos(height) * np.sin(turn), np.sin(height)]
@@ -76,7 +76,7 @@ def hall_lamps(above_floor_m: float, light: LightSettings = ORDINARY_LIGHT) -> L
 
 
 def bake(scene: Scene, lamps: Lamps, rng: np.random.Generator) -> Lightmap:
-    """Send rays from every texel to the lamps and over the hall's ceiling."""
+    """Bake the scene's lightmap with rays from every texel to the lamps and over the hall's ceiling."""
     shape, _, cylinders = scene.primitives
     count = len(shape)
     along = np.ones(count + 1, dtype=np.int32)
@@ -101,7 +101,7 @@ def bake(scene: Scene, lamps: Lamps, rng: np.random.Generator) -> Lightmap:
 
 
 def _ceiling_directions() -> Float64:
-    """Compute unit directions (16, 3) into the upper half space, three rings and the zenith."""
+    """Compute unit directions (16, 3) into the upper half-space: three rings and the zenith."""
     rings = ((15, 5), (35, 5), (60, 5))
     directions = [(0.0, 0.0, 1.0)]
     for number, (elevation_deg, count) in enumerate(rings):
@@ -119,13 +119,13 @@ def _bake(
     primitives: Primitives, grid: Grid, lamps: Lamps, lightmap: Lightmap, rows: Int32, places: Int64,
     ceiling: Float64, diffuse: Float32, seen: UInt8, sun: Float32,
 ) -> None:  # fmt: skip
-    """Bake the irradiance of each texel by shadow rays to the lamps and the hall's ceiling.
+    """Bake the irradiance of each texel with shadow rays to the lamps and the hall's ceiling.
 
-    rows, places: (R,) each row of texels'
-    primitive and place along it. ceiling: (16, 3) unit directions. Fills diffuse (T,) and seen (T, SLOTS, 255
-    for all of a lamp), sun (T,) or (0,), see `Lightmap`; texels at or below the floor's z = 0 stay 0.
+    rows, places: (R,) primitive of each row of texels and its place along the primitive. ceiling: (16, 3)
+    unit directions. Fills diffuse (T,), seen (T, SLOTS), 255 for all of a lamp, and sun (T,) or (0,), see
+    `Lightmap`; texels at or below the floor's z = 0 stay 0.
     """
-    # Writes go to plain arrays: Numba 0.68 loses what a prange writes to a named tuple's field.
+    # Write to plain arrays: Numba 0.68 loses writes of a prange to the fields of a named tuple.
     for r in numba.prange(rows.shape[0]):
         scene, p, s = Scene(primitives, grid), rows[r], places[r]
         for a in range(lightmap.around[p]):
@@ -166,14 +166,14 @@ def _bake(
 
 @kernel()
 def lamp_beam(lamps: Lamps, along_x: float) -> float:
-    """Compute the lamp's power towards a place `along_x` away along X; zero from 1.5 spacings on."""
+    """Compute a lamp's power towards a point at distance `along_x` along X; zero from 1.5 spacings on."""
     u = along_x / (1.5 * lamps.spacing)
     return lamps.power * (1 - u * u) ** 2 if u * u < 1 else 0.0
 
 
 @kernel()
 def sun_patch(sun: Float64, x: float, y: float, z: float) -> float:
-    """Compute how much of the sun's patch reaches (x, y, z) m: 1 inside, soft edges.
+    """Compute the share of the sun's patch at (x, y, z), m: 1 inside, with soft edges.
 
     sun: (8,), see `Lamps`.
     """
@@ -188,10 +188,9 @@ def _hall_light(
     scene: Scene, ceiling: Float64, x: float, y: float, z: float, nx: float, ny: float, nz: float,
     bounce: float,
 ) -> float:  # fmt: skip
-    """Compute irradiance from the hall itself, 1 for an open level surface; the share `bounce` comes from
-    anywhere.
+    """Compute the hall's irradiance, 1 on an open level surface; its share `bounce` is never occluded.
 
-    ceiling: (16, 3) unit directions. x, y, z: the place, m; nx, ny, nz: its normal.
+    ceiling: (16, 3) unit directions. x, y, z: point, m; nx, ny, nz: its normal.
     """
     total, norm = 0.0, 0.0
     for k in range(ceiling.shape[0]):
@@ -210,7 +209,7 @@ def _hall_light(
 def _texel(
     primitives: Primitives, lightmap: Lightmap, p: int, s: int, a: int
 ) -> tuple[float, float, float, float, float, float]:
-    """Compute the middle of a texel, lifted 1 mm off the surface, and its normal."""
+    """Compute the centre of a texel, lifted 1 mm off the surface, and its normal."""
     shape, lift = primitives.shape, 1e-3
     if p == shape.shape[0]:
         step = lightmap.floor[2]

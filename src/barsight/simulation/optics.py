@@ -19,20 +19,20 @@ from barsight.simulation.settings.rig import CameraSettings
 
 LATTICE_PX = 8
 WHITE_DN = 215.0
-"""Gray level of radiance 1 in cam0 before it is clipped."""
+"""Gray level of radiance 1 in cam0, before clipping."""
 
 
 @dataclass(frozen=True, eq=False)
 class MountedRig:
-    """The rig and the body's attitude while nothing sways, (3, 3)."""
+    """The rig, and the body's attitude (3, 3) while nothing sways."""
 
     rig: StereoRig
     nominal_yard_from_body: Float64
 
 
 def mount_rig(settings: SimulationSettings, rng: np.random.Generator) -> MountedRig:
-    """Mount cam0 looking down (but for the tilt), its rows along X (but for the heading); angles drawn by
-    chance: from the rig's own seed where it has one.
+    """Mount cam0 looking down (apart from the tilt) with its rows along X (apart from the heading). The
+    mounting angles are random; their seed is the rig's own if it has one.
     """
     camera = settings.camera
     if camera.rig_seed is not None:
@@ -71,7 +71,7 @@ def _camera(settings: CameraSettings, focal: float, spot: Float64) -> Camera:
 
 
 def sample_rays(camera: Camera, side: int) -> Float32:
-    """Compute x and y (side H, side W, 2) of the directions with z = 1 of side^2 samples on each raw pixel.
+    """Compute x and y (side H, side W, 2) of the directions, with z = 1, of side^2 samples in each raw pixel.
 
     The lens is inverted on a lattice of 8 px and interpolated by cubic splines, to 1e-4 px.
     """
@@ -88,7 +88,7 @@ def sample_rays(camera: Camera, side: int) -> Float32:
 
 
 def vignette(camera: Camera, loss: float) -> Float32:
-    """Compute the vignetting (H, W) of each pixel, 1 - loss in the farthest corner."""
+    """Compute the vignetting factor (H, W) of each pixel, 1 - loss in the farthest corner."""
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     square = ((u - camera.cx_px) ** 2 + (v - camera.cy_px) ** 2).astype(np.float32)
     share: Float32 = (1 - loss * square / square.max()).astype(np.float32)

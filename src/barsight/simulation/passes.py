@@ -1,4 +1,4 @@
-"""Simulate several passes over one yard: other trolley places, both ways of travel, changes in between."""
+"""Simulate several passes over one yard: trolley positions, directions, changes in between."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MOVED_M = 0.5
 
 @dataclass(frozen=True, eq=False)
 class ChangedStock:
-    """A yard before and after a change. rows: of truth/changes.json."""
+    """A yard before and after a change. rows: content of truth/changes.json."""
 
     before: LaidYard
     after: LaidYard
@@ -31,8 +31,8 @@ def simulate_passes(
 ) -> None:  # fmt: skip
     """Write a recording for each pass of `settings.passes` to the new folder `out`: pass_1, pass_2 and so on.
 
-    laid: what lies there all the time, instead of a stock drawn from the seed. truth/changes.json of the
-    last pass says what changed before it.
+    laid: a yard that doesn't change, instead of a stock drawn from the seed. truth/changes.json of the last
+    pass lists what changed before it.
     """
     wanted = settings.passes
     yard = _unchanged(laid) if laid is not None else _draw_changes(settings)
@@ -66,7 +66,7 @@ def _unchanged(laid: LaidYard) -> ChangedStock:
 
 
 def _draw_changes(settings: SimulationSettings) -> ChangedStock:
-    """Draw which bundles of the stock change: each lies on top, and no two are beside each other."""
+    """Draw the bundles of the stock that change: each lies on top, and no two are neighbours."""
     stock, rng = stack_yard(settings, stream(settings, 0)), stream(settings, 20)
     free = [k for k, bundle in enumerate(stock.bundles) if bundle.on_top]
     before, after, rows = set[int](), set[int](), []
@@ -97,7 +97,7 @@ def _beside(one: StackedBundle, other: StackedBundle) -> bool:
 
 
 def _lay(stock: Stock, gone: set[int], settings: SimulationSettings) -> LaidYard:
-    """Lay a stock without those that are gone: what carried them lies on top then."""
+    """Lay a stock without the bundles in `gone`; those that they covered are then on top."""
     there = [b for k, b in enumerate(stock.bundles) if k not in gone]
     bundles = tuple(
         replace(b, on_top=b.on_top or not any(covers(o, b) for o in there)) if gone else b

@@ -1,4 +1,4 @@
-"""Cast rays against the scene: exact intersections with capped cylinders and boxes, by walking the grid."""
+"""Cast rays against the scene: exact intersections with cylinders, boxes, spheres, by walking the grid."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FAR = 1e30
 def hit_cylinder(
     shape: Float64, p: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, near: float
 ) -> float:
-    """Find the first ray parameter over `near` at which the ray enters the capped cylinder, else FAR.
+    """Find the first ray parameter above `near` at which the ray enters the capped cylinder, else FAR.
 
     shape: (P, 15), see `Primitives`; p: the cylinder's number. Origin o in m, direction d of any length.
     """
@@ -46,7 +46,7 @@ def hit_cylinder(
 def _hit_sphere(
     shape: Float64, p: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, near: float
 ) -> float:
-    """Find the first ray parameter over `near` at which the ray enters the sphere, else FAR.
+    """Find the first ray parameter above `near` at which the ray enters the sphere, else FAR.
 
     shape: (P, 15), see `Primitives`; p: its number. Origin o in m, direction d of any length.
     """
@@ -64,7 +64,7 @@ def _hit_sphere(
 def hit_box(
     shape: Float64, p: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, near: float
 ) -> float:
-    """Find the first ray parameter over `near` at which the ray enters the box or sphere, else FAR.
+    """Find the first ray parameter above `near` at which the ray enters the box or sphere, else FAR.
 
     shape: (P, 15), see `Primitives`; p: its number. Origin o in m, direction d of any length.
     """
@@ -92,7 +92,7 @@ def hit_box(
 def _inside(
     grid: Grid, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, near: float, far: float
 ) -> tuple[float, float]:
-    """Clip near .. far to the grid; empty (first over second) where the ray misses it."""
+    """Clip the interval near .. far to the grid; empty (first > second) if the ray misses the grid."""
     enter, leave = near, far
     for k in range(3):
         o = ox if k == 0 else (oy if k == 1 else oz)
@@ -109,8 +109,9 @@ def _inside(
 
 @kernel()
 def _first_cell(grid: Grid, axis: int, o: float, d: float, enter: float) -> tuple[int, int, float, float]:
-    """Find the cell along one axis in which the ray o + t d enters the grid, at t = enter; its step to the
-    next cell, 1 or -1; t at the next cell and from cell to cell, FAR where the ray runs across the axis.
+    """Find the cell along one axis in which the ray o + t d enters the grid at t = enter, and its step to
+    the next cell, 1 or -1; t at the next cell boundary and between boundaries, FAR if the ray is
+    perpendicular to the axis.
     """
     low, cell = grid.low[axis], grid.cell[axis]
     place = min(max(math.floor((o + enter * d - low) / cell), 0), grid.counts[axis] - 1)
@@ -127,8 +128,8 @@ def trace(
 ) -> tuple[float, int]:  # fmt: skip
     """Find the first hit between `near` and `far`: (ray parameter, primitive), or (FAR, -1).
 
-    The floor z = 0 answers with the number of primitives as its id. With `any_hit` the first hit found is
-    good enough (shadows). [Amanatides 1987]
+    For the floor z = 0 the id is the number of primitives. With `any_hit` the search ends at any hit, not
+    necessarily the first one (shadow rays). [Amanatides 1987]
     """
     shape, _, cylinders = scene.primitives
     grid = scene.grid
@@ -187,7 +188,7 @@ def _cast(
     """Trace each ray to its first hit.
 
     origins: (N, 3) or (1, 3) m, directions: (N, 3), both in `yard`. Fills distance (N,), the ray parameter,
-    inf where nothing is hit, and primitive (N,), -1 for nothing and the number of primitives for the floor.
+    inf without a hit, and primitive (N,), -1 without a hit and the number of primitives for the floor.
     """
     step = 0 if origins.shape[0] == 1 else 1
     for r in numba.prange(directions.shape[0]):
@@ -201,7 +202,7 @@ def cast_rays(scene: Scene, origins: Float64, directions: Float64) -> tuple[Floa
     """Find the first hit of each ray.
 
     origins: (N, 3) or (1, 3) in `yard`. directions: (N, 3), any length. Returns the ray parameter (N,), inf
-    where nothing is hit, and the primitive (N,), -1 for nothing and the number of primitives for the floor.
+    without a hit, and the primitive (N,), -1 without a hit and the number of primitives for the floor.
     """
     distance = np.empty(len(directions))
     primitive = np.empty(len(directions), dtype=np.int32)

@@ -1,4 +1,4 @@
-"""Render a camera's view of the yard as linear gray levels: four rays a pixel, textured and lightmapped."""
+"""Render a camera's view of the yard as linear radiance: four rays per pixel, textured and lightmapped."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from barsight.simulation.textures import ALONG_M, AROUND_M, TILE
 
 FLOOR_ALBEDO = 0.22
 SPREAD_ALONG = 0.38
-"""Roughness along the bar: highlights are stretched that way [Ward 1992]."""
+"""Roughness along the bar, by which highlights are stretched along it [Ward 1992]."""
 SPREAD_AROUND = 0.17
 HIGHLIGHT = 0.28
-"""Radiance of a highlight's middle under a lamp, as a share of white paper's."""
+"""Radiance at the centre of a highlight under a lamp, relative to that of white paper."""
 DUST_ALBEDO = 0.6
 MASK = TILE - 1
 
 
 NO_CODES: UInt8 = np.zeros((0, 1, 1), np.uint8)
 INK = 0.12
-"""Albedo of a code's dark modules over paper's."""
+"""Albedo of a code's dark modules relative to that of the paper."""
 
 
 class Shading(NamedTuple):
-    """Shading inputs besides the geometry. tile: (TILE, TILE, 4), see `surface_tile`. codes: (N, S, S) uint8,
-    one module a cell, 0 dark: what `Primitives.material` numbers from 1.
+    """Shading inputs besides the geometry. tile: (TILE, TILE, 4), see `surface_tile`. codes: (N, S, S)
+    uint8, one cell per module, 0 dark; `Primitives.material` refers to them by numbers from 1.
     """
 
     lamps: Lamps
@@ -42,10 +42,10 @@ class Shading(NamedTuple):
 
 
 def render_view(scene: Scene, look: Shading, rays: Float32, side: int, yard_from_cam: Pose) -> Float32:
-    """Render radiance (H, W) float32, 1 about white paper under the lamps.
+    """Render the radiance (H, W) float32, about 1 for white paper under the lamps.
 
-    rays: (side H, side W, 2) float32, x and y of each sample's direction with z = 1: side^2 samples a pixel,
-    of which a pixel inside one primitive takes the diagonal ones only.
+    rays: (side H, side W, 2) float32, x and y of each sample's direction with z = 1: side^2 samples per
+    pixel, of which only the diagonal ones are traced if they all hit the same primitive.
     """
     image = np.empty((rays.shape[0] // side, rays.shape[1] // side), dtype=np.float32)
     pose = np.column_stack([yard_from_cam.rotation, yard_from_cam.translation])
@@ -58,10 +58,10 @@ def _render(
     primitives: Primitives, grid: Grid, lamps: Lamps, lightmap: Lightmap, tile: Float32, codes: UInt8,
     rays: Float32, side: int, pose: Float64, image: Float32,
 ) -> None:  # fmt: skip
-    """Render the radiance image (H, W) by ray casting, 1 about white paper under the lamps.
+    """Render the radiance image (H, W) by ray casting, about 1 for white paper under the lamps.
 
-    codes: see `Shading`. rays: (side H, side W, 2) directions with z = 1. pose: (3, 4),
-    turn and place (m) of yard_from_cam. Fills image; a ray that hits nothing adds 0.
+    codes: see `Shading`. rays: (side H, side W, 2) directions with z = 1. pose: (3, 4), rotation and
+    translation (m) of yard_from_cam. Fills image; a ray that hits nothing adds 0.
     """
     R = pose[:, :3]
     ox, oy, oz = pose[0, 3], pose[1, 3], pose[2, 3]
@@ -70,7 +70,7 @@ def _render(
         for u in range(image.shape[1]):
             total, taken, first, same = 0.0, 0, -2, True
             for n in range(side * side):
-                # The diagonal first: where it meets one primitive only, the other samples add nothing.
+                # The diagonal first: if it hits a single primitive, the other samples aren't needed.
                 row = n % side
                 column = (row + n // side) % side
                 x, y = rays[v * side + row, u * side + column, 0], rays[v * side + row, u * side + column, 1]
@@ -93,7 +93,7 @@ def shade(
     primitives: Primitives, look: Shading, p: int, ox: float, oy: float, oz: float,
     rx: float, ry: float, rz: float,
 ) -> float:  # fmt: skip
-    """Shade radiance towards the eye at (ox, oy, oz) from primitive `p` at eye + (rx, ry, rz), m."""
+    """Compute the radiance towards the eye at (ox, oy, oz) from primitive `p` at eye + (rx, ry, rz), m."""
     lamps, lightmap, tile, _ = look
     x, y, z = ox + rx, oy + ry, oz + rz
     if p == primitives.shape.shape[0]:
@@ -156,10 +156,10 @@ def _shine(
     shape: Float64, p: int, lamps: Lamps, seen: UInt8, place: tuple[int, int, int, int, float, float],
     point: tuple[float, float, float], eye: tuple[float, float, float], turn: tuple[float, float, float],
 ) -> float:  # fmt: skip
-    """Compute the lamps' highlight that bar `p` mirrors to the eye; `turn`: see `_mirrored`.
+    """Compute the lamps' highlight that bar `p` reflects to the eye; `turn`: see `_mirrored`.
 
-    shape: (P, 15), see `Primitives`; seen: (T, SLOTS), see `Lightmap`. place: of `_lightmap_place`. point: m;
-    eye: unit vector towards it.
+    shape: (P, 15), see `Primitives`; seen: (T, SLOTS), see `Lightmap`. place: result of `_lightmap_place`.
+    point: m; eye: unit vector towards it.
     """
     t00, t01, t10, t11, ws, wa = place
     x, y, z = point
@@ -183,10 +183,10 @@ def _shine(
 def _mirrored(
     shape: Float64, p: int, turn: tuple[float, float, float], half: tuple[float, float, float]
 ) -> float:
-    """Compute how much bar `p` mirrors where `half` points between light and eye, 1 at the most [Ward 1992].
+    """Compute the specular reflection of bar `p`, at most 1, for the half vector `half` [Ward 1992].
 
     shape: (P, 15), see `Primitives`. turn: cosine and sine of the normal's angle around the bar, and its
-    roughness over the ordinary.
+    roughness relative to the ordinary.
     """
     c, d, rough = turn
     hx, hy, hz = half
@@ -213,7 +213,7 @@ def _between(light: Float32, place: tuple[int, int, int, int, float, float]) -> 
 
 @kernel()
 def _shade_floor(lamps: Lamps, lightmap: Lightmap, tile: Float32, p: int, x: float, y: float) -> float:
-    """Shade the floor at (x, y) m: its diffuse radiance, lightmap and texture interpolated.
+    """Compute the floor's diffuse radiance at (x, y), m, with lightmap and texture interpolated.
 
     p: the floor's id, the number of primitives. tile: (TILE, TILE, 4).
     """
@@ -238,9 +238,9 @@ def _shade_floor(lamps: Lamps, lightmap: Lightmap, tile: Float32, p: int, x: flo
 
 @kernel()
 def _shade_box(primitives: Primitives, look: Shading, p: int, x: float, y: float, z: float) -> float:
-    """Shade box `p` at (x, y, z) m in `yard`: its diffuse radiance, lit per face and along its longest axis.
+    """Compute box `p`'s diffuse radiance at (x, y, z), m, in `yard`, lit per face along its longest axis.
 
-    The face is that which the point lies nearest to, by the box's half sizes.
+    The face is the one nearest to the point, relative to the box's half sizes.
     """
     lamps, lightmap, tile, codes = look
     shape, material = primitives.shape, primitives.material
@@ -281,10 +281,10 @@ def _shade_box(primitives: Primitives, look: Shading, p: int, x: float, y: float
 
 @kernel()
 def _shade_sphere(primitives: Primitives, look: Shading, p: int, x: float, y: float, z: float) -> float:
-    """Shade sphere `p` at (x, y, z) m in `yard`: its diffuse radiance, between those of its axes' six ends.
+    """Compute sphere `p`'s diffuse radiance at (x, y, z), m, in `yard`, from the six ends of its axes.
 
-    An end counts as the square of the normal along it. The texture runs around the first axis. tile:
-    (TILE, TILE, 4); x, y, z: in `yard`, m.
+    An end is weighted with the square of the normal's component along it. The texture runs around the first
+    axis. tile: (TILE, TILE, 4).
     """
     lamps, lightmap, tile, _ = look
     shape, material = primitives.shape, primitives.material
@@ -311,7 +311,7 @@ def _shade_sphere(primitives: Primitives, look: Shading, p: int, x: float, y: fl
 def _lightmap_place(
     lightmap: Lightmap, p: int, share: float, angle: float
 ) -> tuple[int, int, int, int, float, float]:
-    """Find the four texels around a place on a bar, and the weights of the second along and around it."""
+    """Find the four texels around a point on a bar, and the weights of the second ones."""
     n, m = lightmap.along[p], lightmap.around[p]
     i = min(max(share * n - 0.5, 0.0), n - 1.0)
     i0 = min(int(i), n - 1)
@@ -325,7 +325,7 @@ def _lightmap_place(
 
 @kernel()
 def _texels(tile: Float32, a: float, b: float) -> tuple[float, float, float, float]:
-    """Interpolate the tile's four channels at texel (a, b), bilinear, repeated without end.
+    """Interpolate the tile's four channels at texel (a, b) bilinearly, with periodic repetition.
 
     tile: (TILE, TILE, 4).
     """

@@ -1,12 +1,12 @@
-"""Build the stock as primitives, capped cylinders, boxes and spheres with materials, in a grid of cells.
+"""Build the stock from primitives (capped cylinders, boxes and spheres with materials) in a grid of cells.
 
 Primitives 0 .. cylinders-1 are cylinders, the rest boxes and spheres. Rows of `shape` (float64, `yard`, m):
-cylinder: centre 0:3, axis 3:6 (unit), direction of angle 0 6:9, of angle 90 degrees 9:12, radius 12,
-half length 13. Box: centre 0:3, three unit axes 3:12, half sizes 12:15. A sphere has its radius at 12 and
-no sizes at 13 and 14.
-Rows of `material` (float32): base albedo, gloss, texture offsets (m) around and along, twist (m/m), texture
-scale along, rib pitch (m, 0 none), weight of the texture, dust on what faces up (share) or, of a box,
-the number of the code on its third axis' upper face from 1 (0 none), roughness over the ordinary.
+cylinder: centre 0:3, axis 3:6 (unit), direction of angle 0 6:9, of angle 90 degrees 9:12, radius 12, half
+length 13. Box: centre 0:3, three unit axes 3:12, half sizes 12:15. A sphere has its radius at 12 and zeros at
+13 and 14. Rows of `material` (float32): base albedo, gloss, texture offsets (m) around and along, twist
+(m/m), texture scale along, rib pitch (m, 0 for none), weight of the texture, dust on upward-facing surfaces
+(share) or, for a box, the number, from 1, of the code on the upper face of its third axis (0 for none),
+roughness relative to the ordinary.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ STRAP_WIDTH_M = 0.032
 STRAP_THICKNESS_M = 0.0012
 LABEL_HALF_M = (0.032, 0.018, 0.0015)
 CODE = 8
-"""Column of `Primitives.material` that holds a box's code."""
+"""Column of `Primitives.material` that holds the number of a box's code."""
 
 
 class Primitives(NamedTuple):
-    """shape: (P, 15). material: (P, 10). cylinders: how many of the P are cylinders."""
+    """shape: (P, 15). material: (P, 10). cylinders: number of cylinders among the P primitives."""
 
     shape: Float64
     material: Float32
@@ -38,8 +38,8 @@ class Primitives(NamedTuple):
 class Grid(NamedTuple):
     """Cells over the stock. Cell c = (i * ny + j) * nz + k lists `items[first[c]:first[c + 1]]`.
 
-    low: (3,) the lowest corner, m; cell: (3,) size, m; counts: (3,) nx, ny, nz. first: (cells + 1,). items:
-    (N,) numbers of primitives.
+    low: (3,) lowest corner, m; cell: (3,) size, m; counts: (3,) nx, ny, nz. first: (cells + 1,). items: (N,)
+    numbers of primitives.
     """
 
     low: Float64
@@ -50,14 +50,14 @@ class Grid(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """Geometry that a ray can meet: primitives and, under them, the floor z = 0 (its id is their number)."""
+    """Geometry that a ray can hit: primitives and, below them, the floor z = 0 (its id is their number)."""
 
     primitives: Primitives
     grid: Grid
 
 
 def build_scene(stock: Stock, settings: SimulationSettings, rng: np.random.Generator) -> Scene:
-    """Turn the stock into primitives and sort them into the grid."""
+    """Convert the stock to primitives and sort them into the grid."""
     cylinders: list[Float64] = []
     cylinder_materials: list[list[float]] = []
     boxes: list[Float64] = []
@@ -89,14 +89,14 @@ def build_scene(stock: Stock, settings: SimulationSettings, rng: np.random.Gener
 
 
 def select_primitives(scene: Scene, kept: Bool) -> Scene:
-    """Leave out primitives; kept: (P,)."""
+    """Keep only the primitives marked in `kept` (P,)."""
     shape, material, cylinders = scene.primitives
     left = Primitives(shape[kept], material[kept], int(kept[:cylinders].sum()))
     return Scene(left, build_grid(left, (float(scene.grid.cell[0]), float(scene.grid.cell[1]))))
 
 
 def build_grid(primitives: Primitives, cell_m: tuple[float, float]) -> Grid:
-    """Build cells of cell_m[0] across (X, Z) and cell_m[1] along (Y), the way the bars run."""
+    """Build cells of size cell_m[0] across (X, Z) and cell_m[1] along the bars (Y)."""
     low, high = _bounds(primitives)
     margin = 1e-3
     low_corner = low.min(axis=0) - margin if len(low) else np.zeros(3)
@@ -115,7 +115,7 @@ def build_grid(primitives: Primitives, cell_m: tuple[float, float]) -> Grid:
 
 
 def _bounds(primitives: Primitives) -> tuple[Float64, Float64]:
-    """Compute lower and upper corners (P, 3) of the primitives' boxes."""
+    """Compute lower and upper corners (P, 3) of the primitives' bounding boxes."""
     shape, n = primitives.shape, primitives.cylinders
     reach = np.empty((len(shape), 3))
     axis = np.abs(shape[:n, 3:6])
@@ -129,10 +129,10 @@ def _bounds(primitives: Primitives) -> tuple[Float64, Float64]:
 
 @kernel()
 def _fill(shape: Float64, cylinders: int, grid: Grid) -> None:
-    """Count each cell's primitives into first[c + 1] without items; with items write them, in order.
+    """Count each cell's primitives into first[c + 1] if items is empty; otherwise fill items with them.
 
-    While writing, first[c] runs up to first[c + 1]; the caller's offsets are put back at the end. shape: (P,
-    15), of which the first are cylinders, see `Primitives`.
+    The numbers of cell c are written in order from items[first[c]]. shape: (P, 15), cylinders first, see
+    `Primitives`.
     """
     low, cell, counts = grid.low, grid.cell, grid.counts
     writing = grid.items.size > 0
@@ -165,9 +165,9 @@ def _fill(shape: Float64, cylinders: int, grid: Grid) -> None:
 
 @kernel()
 def _slab_extent(s: Float64, round_bar: bool, y0: float, y1: float) -> tuple[float, float, float, float]:
-    """Bound in x and z the part of a primitive that can lie between y0 and y1.
+    """Compute bounds in x and z of the part of a primitive that can lie between y0 and y1.
 
-    s: (15,), a row of `Primitives.shape`. Returns the least and the largest x, then z, m.
+    s: (15,), a row of `Primitives.shape`. Returns smallest and largest x, then z, m.
     """
     if not round_bar and s[13] == 0:
         reach = s[12] + 1e-6
@@ -232,9 +232,7 @@ def _beam_shape(beam: DunnageBeam) -> Float64:
 def _straps(
     bundle: StackedBundle, yard: YardSettings, rng: np.random.Generator
 ) -> list[tuple[list[Float64], list[Float64], Float64]]:
-    """Build per strap: arcs on the corner bars (thin cylinders), flat runs between them (boxes),
-    one label.
-    """
+    """Build each strap: arcs on the corner bars (cylinders), flat runs between them (boxes), one label."""
     spacing = yard.strap_spacing_m
     half_m = LABEL_HALF_M
     if max(yard.label_m) > 0:

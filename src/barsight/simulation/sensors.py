@@ -1,4 +1,4 @@
-"""Record IMU, encoders and laser of the exact motion and the exact surface."""
+"""Record IMU, encoders and laser from the exact motion and the exact surface."""
 
 from __future__ import annotations
 
@@ -15,13 +15,15 @@ from barsight.simulation.trajectory import SimulatedTrajectory
 
 GRAVITY_MPS2 = 9.80665
 EPOCH_NS = 1_700_000_000_000_000_000
-"""Stamp of the IMU's first sample."""
+"""Stamp of the IMU's first sample, ns."""
 SKY_M = 100.0
 
 
 @dataclass(frozen=True, eq=False)
 class ImuRecord:
-    """stamp_ns (N,): IMU clock. gyro_radps, accel_mps2 (N, 3): `body`. Biases at the start (3,)."""
+    """Samples of the IMU. stamp_ns: (N,) on the IMU's clock. gyro_radps, accel_mps2: (N, 3) in `body`.
+    gyro_bias_radps, accel_bias_mps2: (3,) biases at the start.
+    """
 
     stamp_ns: Int64
     gyro_radps: Float64
@@ -31,7 +33,7 @@ class ImuRecord:
 
 
 def stamps(trajectory: SimulatedTrajectory, rate_hz: int) -> Int64:
-    """Space stamps (N,) evenly to the nanosecond, from the recording's begin to its end."""
+    """Compute stamps (N,), evenly spaced to the nanosecond, over the recording."""
     begin_s = trajectory.motion.begin_s
     count = int((trajectory.duration_s - begin_s) * rate_hz) + 1
     return EPOCH_NS + seconds_to_ns(begin_s) + np.arange(count, dtype=np.int64) * NS_PER_S // rate_hz
@@ -43,7 +45,7 @@ def seconds(stamp_ns: Int64) -> Float64:
 
 
 def exact_imu(trajectory: SimulatedTrajectory, stamp_ns: Int64) -> tuple[Float64, Float64]:
-    """Compute turn rate (rad/s) and specific force (m/s^2) in `body`, each (N, 3), without any error."""
+    """Compute angular rate (rad/s) and specific force (m/s^2) in `body`, each (N, 3), without errors."""
     motion = trajectory.at(seconds(stamp_ns))
     force = motion.acceleration_mps2 + np.array([0.0, 0.0, GRAVITY_MPS2])
     return motion.body_rate_radps, np.einsum("nij,ni->nj", motion.yard_from_body, force)
@@ -52,7 +54,7 @@ def exact_imu(trajectory: SimulatedTrajectory, stamp_ns: Int64) -> tuple[Float64
 def record_imu(
     trajectory: SimulatedTrajectory, settings: SensorSettings, rng: np.random.Generator
 ) -> ImuRecord:
-    """Record the IMU with white noise and biases that walk, both of the stated densities."""
+    """Record the IMU with white noise and random-walk biases of the densities in the settings."""
     stamp_ns = stamps(trajectory, settings.imu_rate_hz)
     gyro, accel = exact_imu(trajectory, stamp_ns)
     gyro_bias = _walk(rng, len(stamp_ns), settings.gyro_bias_radps, settings.gyro_random_walk, settings)
@@ -75,9 +77,9 @@ def _walk(
 def record_encoders(
     trajectory: SimulatedTrajectory, settings: SensorSettings, lever_m: Float64, rng: np.random.Generator
 ) -> tuple[Int64, Float64]:
-    """Record stamps (N,) and the crane point's place (N, 3) as read: late, noisy and in whole steps.
+    """Record stamps (N,) and readings (N, 3) of the crane point's position: delayed, noisy and quantised.
 
-    They read the wheels and the drum: not what springs and rails move.
+    The encoders read the wheels and the drum; they don't see movements by springs and rails.
     """
     stamp_ns = stamps(trajectory, settings.encoder_rate_hz)
     latency = np.full(len(stamp_ns), settings.encoder_latency_s)
@@ -92,7 +94,7 @@ def record_encoders(
 
 
 def _with_play(x: Float64, play: float) -> Float64:
-    """Follow x (N,) as what it drags along within `play`: from the middle at first."""
+    """Apply backlash: drag a follower along x (N,) within the play, starting from its centre."""
     out, at = np.empty_like(x), float(x[0])
     for k, now in enumerate(x.tolist()):
         at = min(max(at, now - play / 2), now + play / 2)
@@ -101,7 +103,7 @@ def _with_play(x: Float64, play: float) -> Float64:
 
 
 def heights(scene: Scene, x_m: Float64, y_m: Float64) -> Float64:
-    """Cast rays straight down: exact height (N,) of the highest surface over each place (x, y)."""
+    """Compute the exact height (N,), m, of the highest surface at each position (x, y) with vertical rays."""
     origins = np.column_stack([x_m, y_m, np.full(len(x_m), SKY_M)])
     distance, _ = cast_rays(scene, origins, np.tile([0.0, 0.0, -1.0], (len(x_m), 1)))
     return SKY_M - distance

@@ -1,4 +1,4 @@
-"""Simulate a recording on disk: stack a yard, drive over it, render, write the truth beside."""
+"""Simulate a recording on disk: stack a yard, drive over it, render it, and write the truth alongside."""
 
 from __future__ import annotations
 
@@ -40,9 +40,7 @@ SUNK_M = 5.0
 
 @dataclass(frozen=True, eq=False)
 class LaidYard:
-    """Geometry of all that lies in the yard. truth: JSON values by the names of their files in `truth`.
-    codes: see `Shading`.
-    """
+    """Everything in the yard. truth: JSON values by their files' names in `truth`. codes: see `Shading`."""
 
     scene: Scene
     truth: Mapping[str, Any]
@@ -51,9 +49,9 @@ class LaidYard:
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """All that is fixed before the first picture: yard, rig, way of the crane, frames' stamps.
+    """Everything that is fixed before the first image: yard, rig, path of the crane, frame stamps.
 
-    number: of the pass over the yard, from 0; noise and sway are drawn anew for each.
+    number: of the pass over the yard, from 0; noise and sway are drawn anew for each pass.
     """
 
     settings: SimulationSettings
@@ -65,12 +63,12 @@ class World:
 
     @classmethod
     def build(cls, settings: SimulationSettings) -> World:
-        """Draw everything from the seed; each part has its own stream, so that one can change alone."""
+        """Draw everything from the seed; each part has its own random stream."""
         return cls.over(laid_stock(settings), settings)
 
     @classmethod
     def over(cls, laid: LaidYard, settings: SimulationSettings, number: int = 0) -> World:
-        """Draw rig and way over a yard that may come from elsewhere."""
+        """Draw rig and path over a given yard, which may come from elsewhere."""
         mounted = mount_rig(settings, stream(settings, 2))
         trajectory = SimulatedTrajectory.plan(
             settings.length_m, settings.camera, settings.motion, mounted.nominal_yard_from_body,
@@ -80,12 +78,12 @@ class World:
         return cls(settings, laid, mounted, trajectory, frame_stamps(settings, trajectory), number)
 
     def stream(self, *number: int) -> np.random.Generator:
-        """Make the stream of what is drawn anew in each pass."""
+        """Create a random stream for what is drawn anew in each pass."""
         return stream(self.settings, *number, *((self.number,) if self.number else ()))
 
     @property
     def scene(self) -> Scene:
-        """Return the geometry of what lies in the yard."""
+        """Return the geometry of everything in the yard."""
         return self.laid.scene
 
     def yard_from_body(self, camera_stamp_ns: int) -> Pose:
@@ -95,9 +93,7 @@ class World:
         return Pose("yard", "body", motion.yard_from_body[0], motion.position_m[0])
 
     def image_velocity(self, camera_stamp_ns: int, camera: Camera, mounting: Pose) -> Float64:
-        """Compute how fast the picture's middle moves over the sensor, right and down, px/s: of a point
-        STACK_M over the floor.
-        """
+        """Compute the image centre's velocity, right and down, px/s, for a point STACK_M above the floor."""
         now = self.yard_from_body(camera_stamp_ns) @ mounting
         ray = now.rotation[:, 2]
         point = now.translation + ray * (STACK_M - now.translation[2]) / ray[2]
@@ -120,9 +116,9 @@ def simulate(
 ) -> None:
     """Write a simulated recording with its truth to the new folder `out`.
 
-    progress: called with (pairs written, pairs in all). laid: what lies there, instead of a stock drawn from
-    the seed. number: of the pass over it, see `World`. Raises OutputError where `out` can't be written;
-    nothing half-written is left then, nor after an interruption.
+    progress: called with (pairs written, total pairs). laid: a yard to use instead of a stock drawn from the
+    seed. number: of the pass over it, see `World`. Raises OutputError if `out` can't be written; no partial
+    output is left then, nor after an interruption.
     """
     with atomic_directory(out) as folder:
         world = World.build(settings) if laid is None else World.over(laid, settings, number)
@@ -141,9 +137,7 @@ def simulate(
 
 
 def frame_stamps(settings: SimulationSettings, trajectory: SimulatedTrajectory) -> Int64:
-    """Place stamps (frames,) on the camera's clock: the first and the last at rest, the others evenly along
-    X.
-    """
+    """Compute stamps (frames,) on the camera's clock: first and last at rest, others evenly along X."""
     distance = settings.length_m + 2 * settings.motion.overrun_m
     inner = trajectory.begin_x_m + distance * np.arange(1, settings.frames - 1) / (settings.frames - 1)
     inner = inner[::-1] if settings.motion.backward else inner
@@ -225,13 +219,13 @@ def _write_pictures(
 
 
 def depth_views(settings: SimulationSettings) -> set[int]:
-    """Choose the frames whose true depth is stored, evenly spread."""
+    """Choose the frames whose true depth is stored, evenly spaced."""
     views = (np.arange(settings.depth_views) + 0.5) / max(settings.depth_views, 1) * settings.frames
     return {int(v) for v in views}
 
 
 def _quaternions(rotations: Float64) -> Float64:
-    """Convert to quaternions (N, 4) w x y z, without jumps of sign."""
+    """Convert to quaternions (N, 4) w x y z, without sign changes between successive ones."""
     q = Rotation.from_matrix(rotations).as_quat()[:, [3, 0, 1, 2]]
     flips = np.cumprod(np.where((q[1:] * q[:-1]).sum(axis=1) < 0, -1, 1))
     q[1:] *= flips[:, None]
@@ -239,7 +233,7 @@ def _quaternions(rotations: Float64) -> Float64:
 
 
 def lay_stock(stock: Stock, settings: SimulationSettings, gone: Collection[int] = ()) -> LaidYard:
-    """Lay a stock; the looks of each bundle stay the same whichever are gone, by their places in it."""
+    """Lay a stock without the bundles in `gone`, which doesn't alter the appearance of the others."""
     sunk = np.array([0.0, 0.0, -SUNK_M])
     bundles = [
         replace(b, centre_m=b.centre_m + sunk) if k in gone else b for k, b in enumerate(stock.bundles)
@@ -257,10 +251,10 @@ def lay_stock(stock: Stock, settings: SimulationSettings, gone: Collection[int] 
 
 
 def laid_stock(settings: SimulationSettings) -> LaidYard:
-    """Lay the stock that the seed draws."""
+    """Lay the stock drawn from the seed."""
     return lay_stock(stack_yard(settings, stream(settings, 0)), settings)
 
 
 def stream(settings: SimulationSettings, *number: int) -> np.random.Generator:
-    """Make the stream of random numbers of one thing that is drawn."""
+    """Create the random stream of one drawn quantity."""
     return np.random.default_rng((settings.seed, *number))

@@ -11,10 +11,10 @@ from barsight.simulation.settings.recording import SimulationSettings
 from barsight.simulation.settings.yard import BarKind
 
 PACKING = 1.003
-"""Distance of neighbouring bars' axes over their diameter."""
+"""Distance between the axes of neighbouring bars relative to their diameter."""
 END_CLEARANCE_M = 0.004
 OVER_EDGE_M = 0.25
-"""How far a crossed bundle may reach beyond those that carry it: sections lie further apart."""
+"""Largest overhang of a crossed bundle beyond its carriers, m; less than the gap between sections."""
 MIN_CROSSED_M = 0.8
 OVER_M = 0.02
 """Bundles that overlap by less, seen from above, don't lie on each other."""
@@ -22,10 +22,10 @@ OVER_M = 0.02
 
 @dataclass(frozen=True, eq=False)
 class StackedBundle:
-    """One bundle. Its axis is level, turned by yaw_rad from Y towards -X; all lengths in `yard`, metres.
+    """One bundle. Its axis is level, rotated by yaw_rad from Y towards -X; all lengths in `yard`, metres.
 
-    centre_m: (3,) middle of the axis. cross_m: (count, 2) the bars' axes in the bundle's cross-section
-    (sideways, up). top_z_m: the highest point of its bars. on_top: no bundle lies on it.
+    centre_m: (3,) midpoint of the axis. cross_m: (count, 2) axes of the bars in the bundle's cross-section
+    (sideways, up). top_z_m: highest point of its bars. on_top: no bundle lies on it.
     """
 
     section: int
@@ -42,7 +42,7 @@ class StackedBundle:
 
     @property
     def radius_m(self) -> float:
-        """Return the radius of the circle around its bars."""
+        """Return the radius of the circle around its bars, m."""
         return _radius(self.kind)
 
     @property
@@ -52,19 +52,19 @@ class StackedBundle:
 
     @property
     def top_z_m(self) -> float:
-        """Return the highest point of its bars."""
+        """Return the highest point of its bars, m."""
         return float(self.centre_m[2] + self.cross_m[:, 1].max() + self.kind.diameter_m / 2)
 
     @property
     def axes(self) -> Float64:
-        """Return rows (3, 3): sideways, along, up, in `yard`."""
+        """Return its axes as rows (3, 3) in `yard`: sideways, along, up."""
         c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
         return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True, eq=False)
 class DunnageBeam:
-    """A wooden beam of dunnage: centre_m (3,), half_m (3,) along itself, across, up; yaw_rad from X."""
+    """A wooden beam of dunnage: centre_m (3,); half_m (3,) along, across and up; yaw_rad from X."""
 
     centre_m: Float64
     half_m: Float64
@@ -80,7 +80,7 @@ class Stock:
 
 
 def stack_yard(settings: SimulationSettings, rng: np.random.Generator) -> Stock:
-    """Fill `length_m` of the yard with sections of different height, kind of bar and length."""
+    """Fill `length_m` of the yard with sections of different heights, kinds of bundles and bar lengths."""
     bundles: list[StackedBundle] = []
     beams: list[DunnageBeam] = []
     x, section = 0.0, 0
@@ -100,7 +100,7 @@ def stack_yard(settings: SimulationSettings, rng: np.random.Generator) -> Stock:
 
 
 def hexagonal_packing(kind: BarKind) -> Float64:
-    """Compute the bars' axes (count, 2) in a hexagonal packing, a row lying level, the middle bar first."""
+    """Compute the bars' axes (count, 2) in a hexagonal packing with level rows, the central bar first."""
     rings, pitch = kind.rings, kind.diameter_m * PACKING
     cells = [
         (q + r / 2, r * np.sqrt(0.75))
@@ -151,7 +151,7 @@ def _columns(
     settings: SimulationSettings, rng: np.random.Generator, kind: BarKind, span_m: tuple[float, float],
     length: float,
 ) -> list[tuple[float, float]]:  # fmt: skip
-    """Place the lowest layer's (x, yaw), so far apart that skewed neighbours don't meet."""
+    """Place the lowest layer's bundles (x, yaw), far enough apart that skewed neighbours don't collide."""
     columns: list[tuple[float, float]] = []
     radius, yard = _radius(kind), settings.yard
     x = span_m[0] + radius
@@ -183,7 +183,7 @@ def _limit(skew_deg: float) -> float:
 
 
 def _above(below: tuple[float, float], skew_deg: float, rng: np.random.Generator) -> tuple[float, float]:
-    """Place a bundle on the column below, a little beside it and turned a little otherwise."""
+    """Place a bundle on the column below, slightly offset and rotated."""
     limit = np.radians(_limit(skew_deg))
     yaw = np.clip(below[1] + rng.normal(0, 0.3) * np.radians(skew_deg), -limit, limit)
     return below[0] + float(rng.normal(0, 0.006)), float(yaw)
@@ -192,7 +192,7 @@ def _above(below: tuple[float, float], skew_deg: float, rng: np.random.Generator
 def _clear(
     x: float, yaw: float, placed: list[StackedBundle], kind: BarKind, length: float
 ) -> tuple[float, float]:
-    """Shift the bundle so far along X that it clears the one before it on its layer."""
+    """Shift the bundle along X until it clears the previous one on its layer."""
     if placed:
         last = placed[-1]
         x = max(x, float(last.centre_m[0]) + _needed(_radius(kind), yaw - last.yaw_rad, length))
@@ -200,7 +200,7 @@ def _clear(
 
 
 def _heights(columns: int, max_layers: int, missing_ratio: float, rng: np.random.Generator) -> list[int]:
-    """Draw layers per column: runs of random height, single columns lower or empty."""
+    """Draw the number of layers per column: runs of random height, with single columns lower or empty."""
     heights: list[int] = []
     while len(heights) < columns:
         run = int(rng.integers(1, max_layers + 1))
@@ -220,7 +220,7 @@ def _bundle(
     number: tuple[int, int, int], kind: BarKind, place: tuple[float, float, float], yaw: float, length: float,
     ribbed: bool, rng: np.random.Generator,
 ) -> StackedBundle:  # fmt: skip
-    """Make a bundle; `place`: x, y of the middle and z of what the bundle lies on."""
+    """Create a bundle. place: x and y of its centre, and z of the surface that it lies on, m."""
     roll = rng.uniform(0, np.pi / 3) if kind.count <= 7 else np.radians(rng.normal(0, 1.5))
     c, s = np.cos(roll), np.sin(roll)
     cross = hexagonal_packing(kind) @ np.array([[c, s], [-s, c]])
@@ -230,7 +230,7 @@ def _bundle(
 
 
 def _crossed(carriers: list[StackedBundle], base: float, rng: np.random.Generator) -> StackedBundle:
-    """Make a bundle of the same bars over the highest layer: across it, or turned by 6 to 20 degrees."""
+    """Create a bundle of the same bars on the highest layer, across it or rotated by 6 to 20 degrees."""
     first = carriers[0]
     low, high = (float(b.centre_m[0]) + s * b.radius_m for b, s in ((first, -1), (carriers[-1], 1)))
     reach = (high - low) / 2 + OVER_EDGE_M
@@ -246,8 +246,9 @@ def _crossed(carriers: list[StackedBundle], base: float, rng: np.random.Generato
 
 
 def covers(over: StackedBundle, under: StackedBundle) -> bool:
-    """Check whether one bundle of a section lies over another, seen from above: no axis of either separates
-    them but for OVER_M.
+    """Check whether one bundle of a section covers another as seen from above.
+
+    It does if they overlap in plan view by more than OVER_M on every axis of either (separating axes).
     """
     if over.section != under.section or over.layer <= under.layer:
         return False

@@ -1,4 +1,4 @@
-"""Synthesise surface texture: tiles of noise whose spectrum ends where the image sensor's does."""
+"""Synthesise surface texture: tiles of noise band-limited to the resolution of the image sensor."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from barsight.core.arrays import Float32, Float64, UInt8
 TILE = 1024
 """Texels per side; a power of two, so that an index wraps with a mask."""
 AROUND_M = 0.0015
-"""Texel size across a bar."""
+"""Texel size across a bar, m."""
 ALONG_M = 0.002
-"""Texel size along a bar."""
+"""Texel size along a bar, m."""
 
 
 def surface_tile(rng: np.random.Generator, footprint_m: float, texture_ratio: float = 1.0) -> Float32:
     """Synthesise a (TILE, TILE, 4) periodic float32 tile, first axis around the bar, second along it.
 
     Channels: albedo factor (mean 1), gloss factor (mean 1), slope of the surface around the bar (rad),
-    isotropic albedo factor in texels of ALONG_M for floor and wood (mean 1).
-    footprint_m: a pixel's size on the floor. The pattern is drawn for 6.4 mm and grows with it, so that a
-    coarser camera finds contrast at its pixels' scale too and nothing finer to alias. texture_ratio: contrast
-    of all channels over the ordinary.
+    isotropic albedo factor in texels of ALONG_M for floor and wood (mean 1). footprint_m: size of a pixel on
+    the floor. The pattern is designed for 6.4 mm and scales with it, so that a coarser camera also finds
+    contrast at the scale of its pixels and nothing finer that would alias. texture_ratio: contrast of all
+    channels relative to the ordinary.
     """
     grown = float(np.clip(footprint_m / 0.0064, 0.8, 8.0))
     streaks = _noise(rng, 0.0035 * grown, 0.05)
@@ -57,13 +57,14 @@ def _noise(rng: np.random.Generator, around_m: float, along_m: float) -> Float64
 
 
 def label_text(seed: int, number: int) -> str:
-    """Return the nine digits on the label of bundle `number`, from 1."""
+    """Return the nine digits on the label of bundle `number`, counted from 1."""
     return f"{seed % 100000:05d}{number:04d}"
 
 
 def label_codes(seed: int, count: int) -> UInt8:
-    """Encode the texts of bundles 1 to count as QR codes (count, S, S), one module a cell, 0 dark, with a
-    quiet zone of two modules.
+    """Encode the texts of bundles 1 to count as QR codes (count, S, S).
+
+    One cell per module, 0 dark, with a quiet zone of two modules.
     """
     encoder = cv2.QRCodeEncoder.create()
     codes = [encoder.encode(label_text(seed, number)) for number in range(1, count + 1)]

@@ -16,15 +16,15 @@ from barsight.simulation.settings.travel import GirderSettings, TravelSettings
 SMOOTHSTEP_PEAK_SLOPE = 1.875
 CRANE_TO_BODY_M = (0.35, -0.2, -0.55)
 RAIL_WAVE_M = (3.7, 5.3)
-"""Lengths of the rails' waves, up and down and aside."""
+"""Wavelengths of the rails' errors, m: vertical and lateral."""
 SKEW_WAVE_M = 6.1
 RAILS = 14
-"""Number of the first phase that belongs to the rails."""
+"""Index of the first phase that belongs to the rails."""
 
 
 @dataclass(frozen=True, eq=False)
 class Jet:
-    """A function of time with its first and second derivative, each (N,); products follow Leibniz."""
+    """A function of time with its first and second derivative, each (N,); products follow Leibniz's rule."""
 
     value: Float64
     rate: Float64
@@ -56,7 +56,7 @@ class Jet:
 
 @dataclass(frozen=True)
 class Leg:
-    """A travel from rest to rest: starts at start_s, brakes from brake_s; each takes ramp_s."""
+    """A run from rest to rest: it starts at start_s and brakes from brake_s; each ramp takes ramp_s."""
 
     start_s: float
     ramp_s: float
@@ -65,13 +65,13 @@ class Leg:
 
     @property
     def end_s(self) -> float:
-        """Return when it stands."""
+        """Return the time at which the crane stops, s."""
         return self.brake_s + self.ramp_s
 
 
 @dataclass(frozen=True, eq=False)
 class BodyMotion:
-    """The body at N instants. All (N, ...) in `yard` unless named.
+    """The body at N instants. All (N, ...) in `yard` unless stated otherwise.
 
     position_m, velocity_mps, acceleration_mps2: (N, 3). yard_from_body: (N, 3, 3). body_rate_radps: (N, 3) in
     `body`.
@@ -86,10 +86,10 @@ class BodyMotion:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedTrajectory:
-    """The body's way, defined for every instant (s on the IMU's clock since the epoch).
+    """The body's path, defined for every instant (s on the IMU's clock since the epoch).
 
-    The crane rests until the first leg's start; after the last it settles. begin_x_m, distance_m: where the
-    way begins at low X, and how long it is.
+    The crane is at rest until the start of the first leg and settles after the last. begin_x_m: low-X end of
+    the path; distance_m: its length.
     """
 
     camera: CameraSettings
@@ -109,9 +109,9 @@ class SimulatedTrajectory:
         nominal_yard_from_body: Float64, rng: np.random.Generator, again: np.random.Generator | None = None,
         girder: GirderSettings = GirderSettings(),  # noqa: B008
     ) -> SimulatedTrajectory:  # fmt: skip
-        """Plan the travel from `overrun_m` before the stack to as far behind it.
+        """Plan the travel from `overrun_m` before the stack to the same distance beyond it.
 
-        again: draws what is new where the yard is passed once more: all but the rails.
+        again: stream for what is drawn anew in a further pass over the yard: everything but the rails.
         """
         distance = length_m + 2 * motion.overrun_m
         phases = rng.uniform(0, 2 * np.pi, 16)
@@ -131,7 +131,7 @@ class SimulatedTrajectory:
 
     @property
     def start_s(self) -> float:
-        """Return when the crane begins to travel."""
+        """Return the time at which the crane begins to travel, s."""
         return self.legs[0].start_s
 
     def at(self, time_s: Float64) -> BodyMotion:
@@ -162,11 +162,11 @@ class SimulatedTrajectory:
         )
 
     def wheels_m(self, time_s: Float64) -> Float64:
-        """Evaluate the body's place (N, 3) as wheels and drum have it: neither springs nor rails move it."""
+        """Evaluate the body's position (N, 3) by wheels and drum, without springs and rails."""
         return np.stack([jet.value for jet in self._wheels(np.asarray(time_s, np.float64))], axis=1)
 
     def time_at_x(self, x_m: float) -> float:
-        """Find when the travel (sway aside) has reached `x_m`, by bisection."""
+        """Find by bisection the time at which the travel, without sway, reaches `x_m`."""
         low, high = self.start_s, self.legs[-1].end_s
         for _ in range(60):
             middle = (low + high) / 2
@@ -185,12 +185,12 @@ class SimulatedTrajectory:
         return total
 
     def _way(self, t: Float64) -> Jet:
-        """Compute the distance from the end at low X."""
+        """Compute the distance from the path's end at low X."""
         travel = self._travel(t)
         return travel.scaled(-1).shifted(self.distance_m) if self.motion.backward else travel
 
     def _envelope(self, t: Float64) -> Jet:
-        """Fade 0 at rest to 1 under way; the sway dies down while the crane brakes and settles."""
+        """Fade from 0 at rest to 1 under way; the sway decays while the crane brakes and settles."""
         first, last = self.legs[0], self.legs[-1]
         fade = _smoothstep(t, last.brake_s, self.settled_s - last.brake_s)
         return _smoothstep(t, first.start_s, first.ramp_s) * fade.scaled(-1).shifted(1)
@@ -221,7 +221,7 @@ class SimulatedTrajectory:
         )
 
     def _springs(self, t: Float64) -> tuple[Jet, Jet, Jet]:
-        """Compute what moves the body along x, y and z and no encoder sees: springs and rails."""
+        """Compute the movement along x, y and z that no encoder sees: springs and rails."""
         envelope, motion = self._envelope(t), self.motion
         waves = [
             self._wave(t, hertz, 11 + k).scaled(amplitude)
@@ -235,8 +235,8 @@ class SimulatedTrajectory:
         return envelope * waves[0], envelope * waves[1] + aside, envelope * waves[2] + up
 
     def _bent(self, wheels: tuple[Jet, Jet, Jet]) -> tuple[tuple[Jet, Jet, Jet], tuple[Jet, Jet]]:
-        """Bend girder and rails under the crane point: the body moves along x, y and z, and tilts about x and
-        y with the slope that it stands on.
+        """Bend girder and rails under the crane point: the displacement along x, y and z, and the tilt
+        about x and y with the local slope.
         """
         girder, lever = self.girder, CRANE_TO_BODY_M
         x, y = wheels[0].shifted(-lever[0]), wheels[1].shifted(-lever[1])
@@ -251,7 +251,7 @@ class SimulatedTrajectory:
         ), (tilt_x, tilt_y)  # fmt: skip
 
     def _along(self, t: Float64, wave_m: float, number: int) -> Jet:
-        """Wave over the way along X: the same at a place, whichever way the crane travels."""
+        """Evaluate a wave over the path along X, which is the same in both directions of travel."""
         return self._way(t).scaled(2 * np.pi / wave_m).shifted(float(self.phases_rad[number])).sine()
 
     def _turn(self, t: Float64) -> tuple[Jet, Jet, Jet]:
@@ -266,7 +266,7 @@ class SimulatedTrajectory:
 
 
 def _parabola(place: Jet, ends_m: tuple[float, float]) -> tuple[Jet, Jet]:
-    """Evaluate the parabola that is 0 at both ends and 1 in the middle, and its slope per metre."""
+    """Evaluate the parabola that is 0 at both ends and 1 at the centre, and its slope per metre."""
     span = ends_m[1] - ends_m[0]
     share = place.shifted(-ends_m[0]).scaled(1 / span)
     rest = share.scaled(-1).shifted(1)
@@ -274,7 +274,7 @@ def _parabola(place: Jet, ends_m: tuple[float, float]) -> tuple[Jet, Jet]:
 
 
 def _leg(start_s: float, distance_m: float, motion: TravelSettings) -> Leg:
-    """Plan a travel from rest to rest, slower where the way is too short for full speed."""
+    """Plan a run from rest to rest, slower if the distance is too short for full speed."""
     acceleration = motion.acceleration_mps2
     speed = min(motion.speed_mps, float(np.sqrt(distance_m * acceleration / SMOOTHSTEP_PEAK_SLOPE)))
     ramp = SMOOTHSTEP_PEAK_SLOPE * speed / acceleration

@@ -1,6 +1,4 @@
-"""Write the exact truth beside a recording: heights, what the cameras see, depth of some views,
-bundles, rig.
-"""
+"""Write the exact truth with a recording: heights, visibility, depth of some views, bundles, rig."""
 
 from __future__ import annotations
 
@@ -31,7 +29,7 @@ OCCLUSION_M = 0.001
 
 
 class SurfaceTruth:
-    """The height map, the laser's profiles, and a count per cell of the frames in which both cameras see it.
+    """Height map, laser profiles, and the number of frames in which both cameras see each of their points.
 
     x_m (X,), y_m (Y,), z_m (X, Y), visible (X, Y); profile_x_m (N,), profile_z_m and profile_visible (K, N).
     """
@@ -58,7 +56,7 @@ class SurfaceTruth:
         self.profile_visible = self._seen[gx.size :].reshape(px.shape)
 
     def count_frame(self, rig: StereoRig, yard_from_body: Pose, plate: MagnetPlate | None = None) -> None:
-        """Add one to every cell that both cameras see in this frame."""
+        """Increment the count of every point that both cameras see in this frame."""
         low, high = _floor_reach(rig.cam0, yard_from_body @ rig.body_from_cam0)
         rows = np.flatnonzero((self._points[:, 0] >= low) & (self._points[:, 0] <= high))
         for camera, mounting in ((rig.cam0, rig.body_from_cam0), (rig.cam1, rig.body_from_cam1)):
@@ -71,7 +69,7 @@ class SurfaceTruth:
         self._seen[rows] += 1
 
     def _sees(self, camera: Camera, yard_from_cam: Pose, points: Float64) -> Bool:
-        """Check which points (N,) a camera sees: in its image, and nothing between."""
+        """Check which points (N,) a camera sees: inside its image, and not occluded."""
         in_camera = yard_from_cam.inverse().apply(points)
         plane = in_camera[:, :2] / in_camera[:, 2:]
         limit = 0.75 * np.hypot(camera.width, camera.height) / camera.fx_px
@@ -97,7 +95,7 @@ class SurfaceTruth:
 
 
 def _floor_reach(camera: Camera, yard_from_cam: Pose) -> tuple[float, float]:
-    """Bound in x (m) all that a camera over the floor can see, with a margin; infinite at the horizon."""
+    """Compute bounds in x (m), with a margin, of a camera's view of the yard; infinite near the horizon."""
     half = 0.65 * np.array([camera.width / camera.fx_px, camera.height / camera.fy_px])
     corners = [[i * half[0], j * half[1], 1.0] for i in (-1, 1) for j in (-1, 1)]
     rays = np.array(corners) @ yard_from_cam.rotation.T
@@ -111,9 +109,7 @@ def _floor_reach(camera: Camera, yard_from_cam: Pose) -> tuple[float, float]:
 def true_depth(
     scene: Scene, camera: Camera, yard_from_cam: Pose, plate: MagnetPlate | None = None
 ) -> Float32:
-    """Compute depth (H, W) along the raw camera's optical axis at each pixel's centre, m; inf where nothing
-    is.
-    """
+    """Compute depth (H, W), m, along the raw camera's optical axis at pixel centres; inf without a hit."""
     plane = sample_rays(camera, 1).reshape(-1, 2).astype(np.float64)
     directions = np.column_stack([plane, np.ones(len(plane))]) @ yard_from_cam.rotation.T
     depth, _ = cast_rays(scene, yard_from_cam.translation[None], directions)
@@ -124,7 +120,7 @@ def true_depth(
 
 
 def bundle_rows(bundles: tuple[StackedBundle, ...]) -> list[dict[str, Any]]:
-    """Describe stacked bundles as `bundles.json` lists them."""
+    """Describe stacked bundles in the format of `bundles.json`."""
     return [
         {
             "sec": b.section, "lay": b.layer, "col": b.column, "center": b.centre_m.tolist(),
@@ -137,7 +133,7 @@ def bundle_rows(bundles: tuple[StackedBundle, ...]) -> list[dict[str, Any]]:
 
 
 def label_rows(scene: Scene, seed: int) -> list[dict[str, Any]]:
-    """Describe the labels as truth: text, and the middle of the paper in the yard, m."""
+    """Describe the labels: text, and centre of the paper in the yard, m."""
     shape, material, cylinders = scene.primitives
     boxes = np.arange(cylinders, len(shape))
     return [
@@ -150,7 +146,7 @@ def write_rig_truth(
     rig: StereoRig, gyro_bias: Float64, accel_bias: Float64, lever_m: Float64, settings: SimulationSettings,
     folder: Path,
 ) -> None:  # fmt: skip
-    """Write `rig.json`."""
+    """Write `rig.json`, the true calibration, biases and lever arm."""
     content = {
         "gyro_bias0": gyro_bias.tolist(),
         "accel_bias0": accel_bias.tolist(),

@@ -1,1 +1,1 @@
-"""Draw calibration boards, to print and as the simulated cameras see them."""
+"""Draw calibration boards, for printing and as the simulated cameras see them."""

@@ -1,4 +1,4 @@
-"""Draw calibration boards: to print, and as a camera would see them held well and badly."""
+"""Draw calibration boards: for printing, and as a camera sees them held well and badly."""
 
 from __future__ import annotations
 
@@ -20,14 +20,16 @@ VIEWS = (
     ("at the working range too", (12, 20, 0), (-0.2, 0.1), 0.25, True),
     ("bad: always small, frontal, in the middle", (0, 0, 0), (0.0, 0.0), 0.25, False),
 )
-"""What, turns about x, y, z (degrees), place (shares of the picture), share of its width, whether good."""
+"""Example views: caption, rotations about x, y, z (degrees), position and width (shares of the image), and
+whether the view is a good one.
+"""
 
 
 def draw_board(board: Board, px_per_m: float, margin_m: float) -> UInt8:
-    """Draw the board (H, W) seen straight on with a white margin.
+    """Draw the board (H, W) in frontal view with a white margin.
 
-    A point (x, y) lies at (margin + x, margin + y), y up for an AprilGrid. A checkerboard's points are its
-    inner corners: one more square lies around them.
+    A point (x, y) lies at (margin + x, margin + y), with y up for an AprilGrid. A checkerboard's points are
+    its inner corners: the squares extend by one more on every side.
     """
     if board.kind is BoardKind.CHECKERBOARD:
         side = round(board.size_m * px_per_m)
@@ -55,7 +57,7 @@ def draw_board(board: Board, px_per_m: float, margin_m: float) -> UInt8:
 
 
 def draw_views(board: Board) -> UInt8:
-    """Draw pictures (H, W) of a board held well, and one of how not to, each with its caption."""
+    """Draw an image (H, W) with views of a board held well, and one bad example, each with its caption."""
     px_per_m, margin_m = 60 / board.size_m, board.size_m
     flat = draw_board(board, px_per_m, margin_m)
     width_m, height_m = flat.shape[1] / px_per_m, flat.shape[0] / px_per_m

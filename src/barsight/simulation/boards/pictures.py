@@ -1,4 +1,4 @@
-"""Photograph a calibration board with the simulated rig: pairs of pictures as an engineer would take them."""
+"""Photograph a calibration board with the simulated rig: image pairs as an engineer would take them."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ from barsight.simulation.settings.recording import SimulationSettings
 from barsight.simulation.simulate import stream
 
 SHARES = 0.2, 0.75
-"""Least and greatest share of the picture's width that the board takes up."""
+"""Smallest and largest share of the image width that the board covers."""
 TILT_DEG, ROLL_DEG = 40.0, 12.0
 MARGIN_PX = 6.0
 SIDE_PX = 150
-"""Pixels of a square or tag as it is drawn: gaps of tenths of it are whole too."""
+"""Side of a drawn square or tag, px; a multiple of ten, so that gaps of tenths of it are whole too."""
 TRIES = 2000
 DARK, BRIGHT, BEHIND = 0.08, 0.75, 0.3
-"""Radiance of the board's ink and paper, and of what stands behind it."""
+"""Radiance of the board's ink, of its paper, and of the background."""
 
 
 def photograph_board(
     out: Path, board: Board, views: int, settings: SimulationSettings,
     progress: Callable[[int, int], None] | None = None,
 ) -> None:  # fmt: skip
-    """Write pictures of a board, whole in both cameras, to the new folder `out`: left/ and right/, each PNG
-    by the view's number.
+    """Write images of a board, fully visible in both cameras, to the new folder `out`: left/ and right/, one
+    PNG per view, named by its number.
 
-    The rig is that of `simulate` with the same settings. progress: called with (pairs written, pairs in all).
-    Raises ConfigError where the cameras can't both see the board.
+    The rig is that of `simulate` with the same settings. progress: called with (pairs written, total pairs).
+    Raises ConfigError if the board can't be fully visible in both cameras.
     """
     rig, rng = mount_rig(settings, stream(settings, 2)).rig, stream(settings, 15)
     sheet = _Sheet(board)
@@ -63,7 +63,7 @@ def photograph_board(
 
 
 class _Sheet:
-    """The printed board; its middle is its frame's origin, x to the right, y down, z away from who looks."""
+    """The printed board. Its frame: origin at the centre, x right, y down, z away from the viewer."""
 
     def __init__(self, board: Board) -> None:
         self._px_per_m = SIDE_PX / board.size_m
@@ -73,19 +73,19 @@ class _Sheet:
 
     @property
     def corners_m(self) -> Float64:
-        """Return the paper's corners (4, 3)."""
+        """Return the corners of the paper (4, 3), m."""
         x, y = self.size_m / 2
         return np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]])
 
     def seen(self, pose: Pose, rays: Float32, side: int) -> Float32:
-        """Render the radiance (H, W) that a camera sees of the board at `pose`, camera from board."""
+        """Render the radiance (H, W) that a camera receives with the board at `pose`, camera from board."""
         normal = pose.rotation[:, 2]
         directions = np.dstack([rays, np.ones(rays.shape[:2], np.float32)])
         depth = (pose.translation @ normal) / (directions @ normal)
         at = (directions * depth[..., None] - pose.translation) @ pose.rotation[:, :2]
         coarser = self._px_per_m * float(np.linalg.norm(np.diff(at, axis=1), axis=2).min())
         drawn = self._drawn
-        if coarser > 1:  # a ray sees the mean of what lies around it
+        if coarser > 1:  # anti-aliasing: a ray samples the mean of its surroundings
             size = np.ceil(np.array(drawn.shape[::-1]) / coarser).astype(int)
             drawn = cv2.resize(drawn, size.tolist(), interpolation=cv2.INTER_AREA)
         place = ((at / self.size_m + 0.5) * drawn.shape[::-1] - 0.5).astype(np.float32)
@@ -100,7 +100,7 @@ class _Sheet:
 
 
 def _held(sheet: _Sheet, rig: StereoRig, rng: np.random.Generator) -> Pose:
-    """Draw how the board is held: anywhere in the picture, near and far, tilted; whole in both cameras."""
+    """Draw a random pose of the board, near or far, tilted, and fully visible in both cameras."""
     left = rig.cam0
     for _ in range(TRIES):
         depth = left.fx_px * sheet.size_m[0] / (rng.uniform(*SHARES) * left.width)

@@ -1,1 +1,1 @@
-"""Light and pictures as yards have them: settings, and what they do to a picture."""
+"""Light and image faults as they occur in yards: settings, and their effects on an image."""

@@ -1,4 +1,4 @@
-"""Spoil pictures: dirt, drops and glare of a lens, haze, motion blur, exposure steps, dead pixels."""
+"""Degrade images: dirt, drops and glare on a lens, haze, motion blur, exposure steps, dead pixels."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from barsight.core.arrays import Float32, Float64, Int64, UInt8
 from barsight.simulation.effects.settings import FaultSettings
 
 HAZE_GRAY = 0.45
-"""Radiance of thick haze; 1 is white paper under the lamps."""
+"""Radiance of thick haze, where 1 is white paper under the lamps."""
 MIN_BLUR_PX = 0.05
 DROP_SIGMA_PX = 3.0
 
 
 @dataclass(frozen=True, eq=False)
 class SpoiledLens:
-    """Faults of one camera, the same in every picture. clear: (H, W) share of light that comes through.
+    """Faults of one camera, the same in every image. clear: (H, W) share of the light that is transmitted.
 
-    stray: (H, W) light that is added. drop: (H, W) weight of the picture without focus. dead: (N, 2) row and
-    column; stuck: (N,) their gray levels.
+    stray: (H, W) stray light that is added. drop: (H, W) weight of the defocused image. dead: (N, 2) row and
+    column of the dead pixels; stuck: (N,) their gray levels.
     """
 
     clear: Float32
@@ -33,7 +33,7 @@ class SpoiledLens:
 
     @classmethod
     def draw(cls, settings: FaultSettings, shape: tuple[int, int], rng: np.random.Generator) -> SpoiledLens:
-        """Draw the lens and the sensor of one camera, for pictures (H, W) of this shape."""
+        """Draw the faults of one camera's lens and sensor, for images (H, W) of this shape."""
         clear, drop = np.ones(shape, np.float32), np.zeros(shape, np.float32)
         for _ in range(settings.dirt_spots):
             radius = settings.dirt_px * float(np.exp(rng.normal(0, 0.5)))
@@ -49,9 +49,9 @@ class SpoiledLens:
         return cls(clear, stray, drop, dead, stuck)
 
     def spoil(self, radiance: Float32, settings: FaultSettings, velocity_px: Float64) -> Float32:
-        """Blur, veil and stain a picture's radiance (H, W).
+        """Apply motion blur, haze, drops, dirt and glare to an image's radiance (H, W).
 
-        velocity_px: (2,) right and down, by which the picture moves over the sensor in a second.
+        velocity_px: (2,) velocity of the image over the sensor, right and down, px/s.
         """
         out = _motion_blur(radiance, velocity_px * settings.exposure_s)
         if settings.haze_ratio > 0:
@@ -62,20 +62,20 @@ class SpoiledLens:
         return np.asarray(out * self.clear + self.stray, np.float32)
 
     def kill(self, image: UInt8) -> None:
-        """Write the dead pixels into a picture (H, W)."""
+        """Write the dead pixels into an image (H, W)."""
         image[self.dead[:, 0], self.dead[:, 1]] = self.stuck
 
 
 def exposure_gain(settings: FaultSettings, step: float, phase_rad: float) -> float:
-    """Compute the exposure of one picture over the ordinary one.
+    """Compute the exposure of one image relative to the nominal exposure.
 
-    step: standard normal, the same for both cameras. phase_rad: of the lamps' flicker.
+    step: standard normal deviate, the same for both cameras. phase_rad: phase of the lamps' flicker.
     """
     return math.exp(settings.exposure_step_ratio * step) * (1 + settings.flicker_ratio * math.sin(phase_rad))
 
 
 def _blot(shape: tuple[int, int], radius: float, rng: np.random.Generator, soft: float = 0.3) -> Float32:
-    """Draw a round blot (H, W), 1 in its middle, that fades over `soft` of its radius."""
+    """Draw a round blot (H, W), 1 at its centre, that fades out over the outer share `soft` of its radius."""
     v, u = rng.uniform(0, shape[0]), rng.uniform(0, shape[1])
     rows, columns = np.ogrid[: shape[0], : shape[1]]
     away = np.sqrt((rows - v) ** 2 + (columns - u) ** 2) / radius
@@ -84,7 +84,7 @@ def _blot(shape: tuple[int, int], radius: float, rng: np.random.Generator, soft:
 
 
 def _motion_blur(radiance: Float32, smear_px: Float64) -> Float32:
-    """Average a picture along the straight way (right, down) that it moves while the shutter is open."""
+    """Average an image along its straight motion (right, down), px, while the shutter is open."""
     length = float(np.hypot(*smear_px))
     if length < MIN_BLUR_PX:
         return radiance

@@ -1,4 +1,4 @@
-"""Define the settings of the hall's light and of what spoils pictures."""
+"""Define the settings of the hall's light and of the image faults."""
 
 from __future__ import annotations
 
@@ -10,24 +10,26 @@ from barsight.core.settings.values import OVER_0, SHARE, UNDER_1, expect_ranges
 
 @dataclass(frozen=True)
 class LightSettings:
-    """Light of the hall, and a patch of sun."""
+    """Light of the hall, and optionally a patch of sunlight."""
 
     lamp_ratio: float = 1.0
-    """Strength of the lamps over the ordinary."""
+    """Strength of the lamps relative to the ordinary hall."""
     ambient: float = 0.34
-    """Light from the hall itself on an open level surface; 1 is white paper under the lamps."""
+    """Ambient light of the hall on an open level surface, where 1 is white paper under the lamps."""
     bounce_ratio: float = 0.05
-    """Share of the hall's light that reaches every surface, however hidden, from surfaces around it."""
+    """Share of the ambient light that reaches every surface, however hidden, by reflection from its
+    surroundings.
+    """
     lamp_length_m: float = 1.0
-    """Length of a lamp, across the travel."""
+    """Length of each lamp, across the travel."""
     sun_ratio: float = 0.0
-    """Strength of the sun on a level surface; 0 leaves it out."""
+    """Strength of the sunlight on a level surface, where 1 is about that of the lamps; 0 switches it off."""
     sun_elevation_deg: float = 45.0
-    """Height of the sun."""
+    """Elevation of the sun above the horizon."""
     sun_azimuth_deg: float = 30.0
-    """Direction of the sun, from X towards Y."""
+    """Azimuth of the sun, from X towards Y."""
     sun_patch_m: tuple[float, float, float, float] = (0.0, 2.0, -1.0, 1.0)
-    """Patch that the sun would light on the open floor: x from, x to, y from, y to."""
+    """Patch of the open floor that the sun lights: x from, x to, y from, y to."""
 
     def __post_init__(self) -> None:
         expect_ranges(
@@ -41,26 +43,28 @@ class LightSettings:
 
 @dataclass(frozen=True)
 class FaultSettings:
-    """Faults of the pictures; with zeros there are none."""
+    """Faults of the images; all zeros switch them off."""
 
     exposure_s: float = 0.0
-    """Time that the shutter is open: what moves is blurred."""
+    """Exposure time: what moves during it is blurred."""
     haze_ratio: float = 0.0
-    """Share of the light that haze on the way replaces by its own, at the floor."""
+    """Share of the light that haze between floor and camera replaces by its own gray light."""
     dirt_spots: int = 0
-    """Spots of dirt on each lens."""
+    """Number of dirt spots on each lens."""
     dirt_px: float = 25.0
-    """Radius of a spot, drawn about this."""
+    """Median radius of a dirt spot; drops are somewhat larger."""
     drops: int = 0
-    """Drops of water or oil on each lens: places without focus."""
+    """Number of drops of water or oil on each lens, which defocus the image there."""
     dead_pixels: int = 0
-    """Pixels of each camera that are black or white always."""
+    """Number of pixels in each camera that are always black or white."""
     exposure_step_ratio: float = 0.0
-    """Standard deviation of the exposure from one pair to the next, as a ratio."""
+    """Standard deviation of the exposure from one pair to the next, relative to the nominal exposure."""
     flicker_ratio: float = 0.0
-    """Amplitude of the lamps' flicker from picture to picture, each camera for itself."""
+    """Amplitude of the lamps' flicker from image to image, relative to their light; independent in each
+    camera.
+    """
     glare_ratio: float = 0.0
-    """Stray light in the middle of a wide blot on each lens; 1 is white."""
+    """Strength of the stray light at the centre of a wide blot on each lens, where 1 is white."""
 
     def __post_init__(self) -> None:
         expect_ranges(

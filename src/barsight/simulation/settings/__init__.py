@@ -1,1 +1,1 @@
-"""The settings of a simulated recording: frozen dataclasses, checked once, units in the names."""
+"""Settings of a simulated recording: frozen dataclasses, validated once, with units in the names."""

@@ -21,13 +21,15 @@ class SimulationSettings:
     length_m: Annotated[float, tyro.conf.arg(aliases=("--length",))] = 7.0
     """Length of the stack along the travel."""
     frames: int = 20
-    """Stereo pairs, spread evenly over the travel."""
+    """Number of stereo pairs, evenly spaced over the travel."""
     seed: int = 0
     """Random seed."""
     bars: str = "90mm:7"
-    """Kinds of bundles, diameter and bars: 90mm:7,40mm:37; each section of the stack takes one."""
+    """Kinds of bundles as bar diameter and number of bars: 90mm:7,40mm:37; each section of the stack takes
+    one.
+    """
     depth_views: int = 2
-    """Pairs whose true depth is stored."""
+    """Number of pairs whose true depth is stored."""
     camera: CameraSettings = field(default_factory=CameraSettings)
     yard: YardSettings = field(default_factory=YardSettings)
     motion: TravelSettings = field(default_factory=TravelSettings)
@@ -57,7 +59,7 @@ class SimulationSettings:
 
     @classmethod
     def demo(cls) -> SimulationSettings:
-        """Make a small yard for `barsight demo`: 3 m of stack, 10 pairs of 640x512."""
+        """Create the settings of the small yard of `barsight demo`: 3 m of stack, 10 pairs of 640x512."""
         camera = CameraSettings(width_px=640, height_px=512, focal_px=625.0)
         return cls(
             length_m=3.0, frames=10, seed=1, camera=camera, yard=YardSettings(max_layers=3, bar_length_m=5.0)

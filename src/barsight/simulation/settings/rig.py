@@ -9,45 +9,50 @@ from barsight.core.settings.values import NOT_NEGATIVE, UNDER_1, expect, expect_
 
 @dataclass(frozen=True)
 class CameraSettings:
-    """Stereo pair and its mounting under the crane."""
+    """Stereo cameras and their mounting under the crane."""
 
     width_px: int = 1280
-    """Image width."""
+    """Width of the images."""
     height_px: int = 1024
-    """Image height."""
+    """Height of the images."""
     focal_px: float = 1250.0
-    """Focal length of cam0; cam1's differs by 0.2 %."""
+    """Focal length of cam0; that of cam1 is 0.2 % longer."""
     baseline_m: float = 0.5
     """Distance between the cameras."""
     misalignment_deg: float = 0.3
-    """Standard deviation of the cameras' mounting angles, drawn from the seed."""
+    """Standard deviation of cam1's mounting angles relative to cam0; that of cam0's relative to the body
+    is twice as large.
+    """
     rig_seed: int | None = None
-    """Seed of the rig, the same for recordings of one crane; by default that of all else."""
+    """Seed of the rig, to be the same for recordings of one crane; by default the seed of everything else."""
     distortion: tuple[float, float, float, float] = (-0.06, 0.02, 0.0003, -0.0002)
-    """Radial-tangential coefficients k1 k2 p1 p2 of both lenses; 0 0 0 0 switches them off."""
+    """Radial-tangential coefficients k1 k2 p1 p2 of both lenses; 0 0 0 0 switches distortion off."""
     above_floor_m: float = 8.0
-    """Height of the body over the floor."""
+    """Height of the body above the floor."""
     trolley_y_m: float = 0.15
-    """Place of the body across the travel."""
+    """Position of the body across the travel."""
     aside_m: float = 0.0
-    """Place of both cameras in the body, across the travel: a second pair on the same body is a recording of
-    its own, all else alike."""
+    """Offset of both cameras on the body, across the travel; to simulate a second pair on the same body,
+    make another recording that differs only in this.
+    """
     heading_deg: float = 4.0
-    """Turn of the rig about the vertical: 0 has the baseline along the travel."""
+    """Rotation of the rig about the vertical; with 0 the baseline is along the travel."""
     tilt_deg: float = 0.0
-    """Turn of the optical axis about the baseline: 0 looks straight down."""
+    """Rotation of the optical axis about the baseline; with 0 it points straight down."""
     samples_per_side: int = 2
-    """Rays per pixel and side; 2 means four rays a pixel."""
+    """Rays per pixel in each direction; 2 means four rays per pixel."""
     psf_sigma_px: float = 0.45
-    """Blur of lens and pixel."""
+    """Sigma of the blur by lens and pixel."""
     vignetting: float = 0.25
-    """Loss of light in the corners, as a share."""
+    """Share of the light lost in the image corners."""
     cam1_gain: float = 0.95
     """Exposure of cam1 relative to cam0."""
     shot_noise_dn: float = 0.18
-    """Shot noise of one gray level; it grows with the root of the signal."""
+    """Standard deviation of the shot noise at a signal of one gray level; it grows with the root of the
+    signal.
+    """
     read_noise_dn: float = 0.9
-    """Noise that doesn't depend on the signal, in gray levels."""
+    """Standard deviation of the noise that doesn't depend on the signal, in gray levels."""
 
     def __post_init__(self) -> None:
         expect_ranges(
@@ -61,42 +66,42 @@ class CameraSettings:
 
 @dataclass(frozen=True)
 class SensorSettings:
-    """IMU, encoders, laser and the clocks."""
+    """IMU, encoders, laser and clock offset."""
 
     timeshift_cam_imu_s: float = -0.0035
-    """t_imu = t_cam + timeshift (Kalibr)."""
+    """Offset of the IMU's clock: t_imu = t_cam + timeshift (Kalibr)."""
     imu_rate_hz: int = 200
     """Samples of the IMU per second."""
     gyro_noise_density: float = 2.4e-4
-    """rad/s/sqrt(Hz)."""
+    """Noise density of the gyro, rad/s/sqrt(Hz)."""
     gyro_random_walk: float = 2.0e-5
-    """rad/s^2/sqrt(Hz)."""
+    """Random walk of the gyro's bias, rad/s^2/sqrt(Hz)."""
     gyro_bias_radps: float = 0.006
-    """Standard deviation of the bias at the start."""
+    """Standard deviation of the gyro's bias at the start."""
     accel_noise_density: float = 1.9e-3
-    """m/s^2/sqrt(Hz)."""
+    """Noise density of the accelerometer, m/s^2/sqrt(Hz)."""
     accel_random_walk: float = 4.0e-4
-    """m/s^3/sqrt(Hz)."""
+    """Random walk of the accelerometer's bias, m/s^3/sqrt(Hz)."""
     accel_bias_mps2: float = 0.04
-    """Standard deviation of the bias at the start."""
+    """Standard deviation of the accelerometer's bias at the start."""
     encoder_rate_hz: int = 20
     """Readings of the crane's encoders per second."""
     encoder_std_m: float = 0.0015
-    """Noise of one reading."""
+    """Standard deviation of an encoder reading's noise."""
     encoder_step_m: float = 0.001
-    """Quantisation of a reading."""
+    """Quantisation step of an encoder reading; 0 switches it off."""
     encoder_latency_s: float = 0.0
-    """Latency: a reading stamped t gives the position at t minus this."""
+    """Latency of the encoders: a reading stamped t gives the position at t minus this."""
     encoder_jitter_s: float = 0.0
-    """Jitter on top of the latency, uniform between 0 and this."""
+    """Largest jitter on top of the latency; it is uniformly distributed from 0 to this."""
     encoder_scale: float = 1.0
     """Scale of the bridge's encoder: metres read per metre travelled."""
     encoder_backlash_m: float = 0.0
     """Backlash between bridge and encoder, centred at the start."""
     laser_std_m: float = 0.001
-    """Noise of a laser point."""
+    """Standard deviation of a laser point's noise."""
     laser_y_m: tuple[float, ...] = (0.45, -1.15)
-    """y of the laser's profiles; none leaves the laser out."""
+    """y of each laser profile; with none the laser is left out."""
 
     def __post_init__(self) -> None:
         expect_ranges(

@@ -16,37 +16,37 @@ class TravelSettings:
     speed_mps: float = 0.6
     """Speed of the bridge between accelerating and braking."""
     acceleration_mps2: float = 0.35
-    """Highest acceleration and braking."""
+    """Maximum acceleration and deceleration."""
     standstill_s: float = 2.0
     """Time at rest before the start and after the end."""
     overrun_m: float = 0.6
-    """Travel beyond either end of the stack."""
+    """Travel beyond each end of the stack."""
     sway_deg: float = 0.15
-    """Amplitude of the body's swing."""
+    """Amplitude of the body's sway."""
     sway_hz: float = 0.4
-    """Frequency of the swing."""
+    """Frequency of the sway."""
     vibration_m: float = 0.00004
-    """Amplitude of the vibration."""
+    """Amplitude of the body's vibration."""
     vibration_hz: float = 9.0
     """Frequency of the vibration."""
     stops: int = 0
-    """Times that the crane stops under way, at places drawn from the seed."""
+    """Number of stops on the way, at positions drawn from the seed."""
     stop_s: float = 2.0
     """Duration of a stop."""
     trolley_m: float = 0.0
     """Travel of the trolley during the pass."""
     backward: bool = False
-    """The bridge travels from high X to low X."""
+    """Make the bridge travel from high X to low X."""
     begin_s: float = 0.0
-    """Time after the simulation's epoch at which the recording begins."""
+    """Beginning of the recording, after the simulation's epoch."""
     oscillation_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Amplitudes at which bridge, trolley and hoist oscillate, unseen by their encoders."""
+    """Amplitudes of the oscillation of bridge, trolley and hoist, which their encoders don't see."""
     oscillation_hz: tuple[float, float, float] = (0.7, 1.1, 1.9)
     """Frequencies of these oscillations."""
     rail_m: float = 0.0
-    """Amplitude of the rails' errors in height and straightness, with a wave every few metres."""
+    """Amplitude of the rails' height and straightness errors, which have wavelengths of a few metres."""
     skew_deg: float = 0.0
-    """Amplitude by which the bridge skews as it travels."""
+    """Amplitude of the bridge's skew as it travels."""
 
     def __post_init__(self) -> None:
         expect_ranges(
@@ -59,18 +59,18 @@ class TravelSettings:
 
 @dataclass(frozen=True)
 class GirderSettings:
-    """Bending of girder and rails, and a girder out of square: no encoder sees it."""
+    """Bending of girder and rails, and skew of the girder, none of which the encoders see."""
 
     deflection_m: float = 0.0
-    """Deflection of the girder with the trolley in its middle: a parabola, 0 at its ends."""
+    """Deflection of the girder with the trolley at its centre; a parabola that is 0 at the girder's ends."""
     ends_y_m: tuple[float, float] = (-10.0, 10.0)
-    """The crane point's Y with the trolley at either end of the girder."""
+    """The crane point's Y with the trolley at each end of the girder."""
     skew_mm_per_m: float = 0.0
-    """Skew of the girder against square to the rails: shift along X for a metre of the trolley's way."""
+    """Deviation of the girder from square to the rails: shift along X per metre of trolley travel."""
     rail_m: float = 0.0
-    """Sag of the rails in their middle against their ends: a parabola."""
+    """Sag of the rails at their centre relative to their ends; a parabola."""
     rail_ends_x_m: tuple[float, float] = (-10.0, 30.0)
-    """The crane point's X with the bridge at either end of the rails."""
+    """The crane point's X with the bridge at each end of the rails."""
 
     def __post_init__(self) -> None:
         expect_ranges(
@@ -85,17 +85,20 @@ class GirderSettings:
 
 @dataclass(frozen=True)
 class PassesSettings:
-    """Several passes over one yard, in time's order; OUT then holds a recording for each: pass_1, pass_2."""
+    """Several passes over one yard, in chronological order; OUT then holds a recording of each: pass_1,
+    pass_2.
+    """
 
     trolley_y_m: tuple[float, ...] = ()
-    """Place of the body across the travel in each pass; none makes OUT a single recording."""
+    """Position of the body across the travel in each pass; with none OUT is a single recording."""
     alternate: bool = True
-    """Every second pass travels back, from high X to low X."""
+    """Reverse every second pass, so that it travels from high X to low X."""
     pause_s: float = 120.0
-    """Time from one pass's end to the next one's begin."""
+    """Time from the end of one pass to the beginning of the next."""
     changes: tuple[Literal["taken", "added", "moved"], ...] = ()
-    """Changes to bundles on top before the last pass, to one each: it is taken away, only comes then, or is
-    moved half a metre along itself."""
+    """Changes before the last pass, each to one bundle on top: it is taken away, is added only then, or is
+    moved half a metre along its axis.
+    """
 
     def __post_init__(self) -> None:
         expect_ranges(self, "passes.", trolley_y_m=(-50, 50), pause_s=(0, 1e6))
@@ -104,18 +107,18 @@ class PassesSettings:
 
 @dataclass(frozen=True)
 class MagnetSettings:
-    """A magnet's plate that hangs from the crane into the pictures, for a part of the travel."""
+    """A magnet's plate that hangs from the crane into the images during part of the travel."""
 
     size_m: tuple[float, float] = (0.0, 0.0)
-    """Along the travel and across; 0 0 leaves it out."""
+    """Size of the plate along the travel and across; 0 0 leaves it out."""
     below_body_m: float = 3.0
-    """Distance below the body."""
+    """Distance of the plate below the body."""
     offset_m: tuple[float, float] = (0.6, 0.3)
-    """Its middle relative to the body, along the travel and across."""
+    """Offset of the plate's centre from the body, along the travel and across."""
     first_ratio: float = 0.3
-    """Share of the frames after which it appears."""
+    """Share of the frames after which the plate appears."""
     last_ratio: float = 0.6
-    """Share of the frames after which it disappears."""
+    """Share of the frames after which the plate disappears."""
 
     def __post_init__(self) -> None:
         expect_ranges(

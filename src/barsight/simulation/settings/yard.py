@@ -13,19 +13,19 @@ BARS_OF_RINGS = (1, 7, 19, 37, 61)
 
 @dataclass(frozen=True)
 class BarKind:
-    """One kind of bundle: the bars' diameter (m) and how many lie in a bundle (1, 7, 19, 37 or 61)."""
+    """One kind of bundle: bar diameter (m) and number of bars in a bundle (1, 7, 19, 37 or 61)."""
 
     diameter_m: float
     count: int
 
     @property
     def rings(self) -> int:
-        """Return the rings of bars around the middle one."""
+        """Return the number of rings of bars around the central one."""
         return BARS_OF_RINGS.index(self.count)
 
 
 def parse_bars(text: str) -> tuple[BarKind, ...]:
-    """Parse `"90mm:7,40mm:37"` to kinds of bundles. Raises ConfigError where it can't be read."""
+    """Parse `"90mm:7,40mm:37"` to kinds of bundles. Raises ConfigError if it can't be read."""
     kinds = []
     for part in text.split(","):
         match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*mm\s*:\s*(\d+)\s*", part)
@@ -44,35 +44,40 @@ def parse_bars(text: str) -> tuple[BarKind, ...]:
 
 @dataclass(frozen=True)
 class YardSettings:
-    """The stack: bundles side by side along X, bars along Y."""
+    """The stack: bundles side by side along X, with their bars along Y."""
 
     max_layers: int = 4
-    """Layers of bundles at the highest place."""
+    """Maximum number of layers of bundles."""
     bar_length_m: float = 7.5
     """Length of the bars; some sections hold shorter ones."""
     gap_m: float = 0.02
-    """Mean clearance between neighbouring bundles, over what their skew needs."""
+    """Mean clearance between neighbouring bundles, beyond what their skew requires."""
     skew_deg: float = 0.3
-    """Standard deviation of the bundles' yaw; they stay within 1 degree, or within twice this."""
+    """Standard deviation of the bundles' yaw, which is limited to 1 degree or to twice this, whichever is
+    larger.
+    """
     uneven_ends_m: float = 0.03
-    """Largest shift of a bar along its bundle, either way."""
+    """Largest shift of a bar along its bundle, in either direction."""
     missing_ratio: float = 0.08
-    """Share of places on the lowest layer that are empty (gullies)."""
+    """Probability that a place on the lowest layer is empty (a gully)."""
     crossed_ratio: float = 0.0
-    """Share of sections with a bundle lying across the others, or over them turned by 6 to 20 degrees."""
+    """Probability that a section has a bundle on top that lies across the others or is rotated by 6 to 20
+    degrees.
+    """
     dunnage_m: float = 0.09
-    """Height and width of the wooden beams between the layers."""
+    """Height and width of the dunnage, wooden beams between the layers."""
     strap_spacing_m: float = 1.7
     """Distance between a bundle's straps; 0 leaves them out."""
     label_m: tuple[float, float] = (0.0, 0.0)
-    """Length and width of a label with a QR code of its own on each strapped bundle, over the middle strap;
-    0 0 leaves a small plain one there."""
+    """Length and width of the label on each strapped bundle, which carries the bundle's own QR code and
+    lies over the middle strap; 0 0 makes it small and plain.
+    """
     ribbed_ratio: float = 0.25
-    """Share of sections that hold ribbed bars."""
+    """Probability that a section holds ribbed bars."""
     gloss: float = 1.0
-    """Strength of the highlights; 0 is matt steel."""
+    """Strength of the highlights; 0 makes the steel matt."""
     texture_ratio: float = 1.0
-    """Contrast of the surfaces' texture, steel's and the floor's, over the ordinary."""
+    """Contrast of the texture on steel and floor, relative to the ordinary."""
 
     def __post_init__(self) -> None:
         expect_ranges(

@@ -1,1 +1,1 @@
-"""Draw whole worlds from a seed: piles settled by physics, what stands about, crane, light, faults."""
+"""Draw whole worlds from a seed: piles settled by physics, surrounding objects, crane, light, faults."""

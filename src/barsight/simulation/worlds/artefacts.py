@@ -17,17 +17,18 @@ from barsight.simulation.stock import StackedBundle, Stock, hexagonal_packing
 from barsight.simulation.truth import bundle_rows
 
 POST_M = 0.04
-"""Half the side of a post that carries a sphere."""
+"""Half the side of a post that carries a sphere, m."""
 CELL_M = (0.1, 0.5)
 SPECKLED = 2.5
-"""Contrast of a sphere's speckles over a bare surface's texture."""
+"""Contrast of a sphere's speckles relative to the texture of a bare surface."""
 
 
 def lay_artefacts(plan: AcceptancePlan, settings: SimulationSettings) -> LaidYard:
-    """Lay what a plan names exactly where it says, each on a block or post down to the floor. Bars of a dummy
-    bundle end flush.
+    """Lay the artefacts exactly where the plan puts them, each on a block or post that reaches the floor. The
+    bars of a dummy bundle end flush.
 
-    Raises ConfigError for a dummy bundle whose bars no hexagonal packing has, or whose figures contradict it.
+    Raises ConfigError for a dummy bundle whose number of bars isn't that of a hexagonal packing, or whose
+    figures contradict it.
     """
     rng = stream(settings, 13)
     bundles = tuple(_bundle(one) for one in plan.dummy_bundle)
@@ -54,7 +55,7 @@ def _block(plate: Plate) -> Float64:
 
 
 def _on_post(sphere: Sphere) -> list[Float64]:
-    """Build the sphere and, where it doesn't lie on the floor, the post under it."""
+    """Build the sphere and, unless it lies on the floor, the post below it."""
     radius = sphere.diameter_m / 2
     axes = np.eye(3).ravel()
     made = [np.array([sphere.x_m, sphere.y_m, sphere.z_m, *axes, radius, 0.0, 0.0])]

@@ -1,4 +1,4 @@
-"""Draw under which conditions a yard is recorded: rig, crane, sensors, light, faults of the pictures."""
+"""Draw the conditions under which a yard is recorded: rig, crane, sensors, light, image faults."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ DRAWN = ("seed", "bars", "yard", "motion", "magnet", "light", "faults")
 MOUNTING = ("above_floor_m", "trolley_y_m", "heading_deg", "tilt_deg", "misalignment_deg")
 BAR_LENGTH_M = (2.5, 7.0)
 ASIDE_M = 1.3
-"""Offset of the trolley from a yard's middle where a part of it is to be hidden."""
+"""Offset of the trolley from the centre of a yard of which a strip is to be hidden, m."""
 
 
 def draw_conditions(seed: int, given: SimulationSettings, *, hides: bool) -> SimulationSettings:
-    """Draw the conditions of a seed; what `given` says of length, frames, pictures, laser and labels stays.
+    """Draw the conditions of a seed; length, frames, images, laser and labels are taken from `given`.
 
-    hides: a strip of the yard is to lie out of sight. Raises ConfigError where `given` sets what is drawn.
+    hides: a strip of the yard is to be out of sight. Raises ConfigError if `given` sets anything that is
+    drawn.
     """
     _expect_ordinary(given)
     rng = np.random.default_rng((41, seed))
@@ -121,7 +122,7 @@ def _light(rng: np.random.Generator, length_m: float) -> LightSettings:
 
 
 def _faults(rng: np.random.Generator, width_px: int) -> FaultSettings:
-    """Draw each fault with a probability of its own."""
+    """Draw each fault independently, with its own probability."""
 
     def some(probability: float, low: float, high: float) -> float:
         return float(rng.uniform(low, high)) * float(rng.random() < probability)

@@ -1,4 +1,4 @@
-"""BarPack round bars as they lie when they are strapped: drawn together at random, in no full hexagon."""
+"""Pack round bars as they lie when strapped: pulled together at random, without forming a full hexagon."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from barsight.core.arrays import Float64, kernel
 from barsight.simulation.worlds.solids import Part, Solid, cylinder
 
 STRAP_M = (0.032, 0.0012)
-"""Width and thickness of a strap."""
+"""Width and thickness of a strap, m."""
 
 
 def packed(count: int, diameter_m: float, rng: np.random.Generator) -> Float64:
-    """BarPack discs (count, 2): attracted to their middle and a little downwards, pushed off each other.
+    """Pack discs (count, 2), m: attracted to their centre, more so vertically, and pushed off each other.
 
-    They shake less and less, some long enough to find a lattice, most not, and lie apart by 0.1 % of their
-    diameter at the end.
+    They are shaken with decreasing amplitude, some long enough to form a lattice, most not, and end up 0.1 %
+    of their diameter apart.
     """
     places = rng.uniform(-1, 1, (count, 2)) * diameter_m * math.sqrt(count)
     flat = float(rng.uniform(0.6, 1.0))
@@ -35,7 +35,7 @@ def packed(count: int, diameter_m: float, rng: np.random.Generator) -> Float64:
 
 
 def hexagon(rings: int, diameter_m: float) -> Float64:
-    """Lay discs (3 rings (rings + 1) + 1, 2) in a full hexagon around the first, a side down."""
+    """Arrange discs (3 rings (rings + 1) + 1, 2), m, in a full hexagon around the origin, a side down."""
     cells = np.arange(-rings, rings + 1)
     row, place = (index.ravel() for index in np.meshgrid(cells, cells, indexing="ij"))
     within = np.abs(row + place) <= rings
@@ -45,9 +45,9 @@ def hexagon(rings: int, diameter_m: float) -> Float64:
 
 @kernel()
 def _push_apart(places: Float64, min_apart: float, times: int) -> float:
-    """Push discs that overlap off each other, in place; returns the deepest overlap of the last time.
+    """Push overlapping discs off each other in place; returns the deepest overlap of the last iteration, m.
 
-    places: (N, 2) centres. min_apart: the distance at which two touch.
+    places: (N, 2) centres, m. min_apart: distance at which two discs touch, m.
     """
     deepest = 0.0
     for _ in range(times):
@@ -68,7 +68,7 @@ def _push_apart(places: Float64, min_apart: float, times: int) -> float:
 
 
 def strap(cross: Float64, radius_m: float, centre: Float64, axes: Float64, bundle: int) -> list[Solid]:
-    """Lay a strap around discs (count, 2) of a bundle: arcs on the outermost, flat runs between them.
+    """Build a strap around the discs (count, 2) of a bundle: arcs on the outermost, flat runs between them.
 
     centre: (3,) of the strap; axes: (3, 3) sideways, along and up, in `yard`.
     """
@@ -94,7 +94,7 @@ def strap(cross: Float64, radius_m: float, centre: Float64, axes: Float64, bundl
 
 
 def tag(cross: Float64, radius_m: float, centre: Float64, axes: Float64, bundle: int) -> Solid:
-    """Lay a tag of 64 x 36 x 3 mm on the topmost bar."""
+    """Place a tag of 64 x 36 x 3 mm on the topmost bar."""
     sideways, _, up = axes
     top = cross[int(np.argmax(cross[:, 1]))]
     place = centre + top[0] * sideways + (top[1] + radius_m + STRAP_M[1] + 0.0015) * up

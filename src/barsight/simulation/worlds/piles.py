@@ -1,6 +1,6 @@
-"""Pile bars up: layers on beams, packs that nest in each other's grooves, heaps of single bars.
+"""Pile up bars: layers on beams, bundles that nest in each other's grooves, heaps of single bars.
 
-A pile's own frame: x across the bars, y along them from its middle, z up from the floor.
+A pile's own frame: x across the bars, y along them from its centre, z up from the floor.
 """
 
 from __future__ import annotations
@@ -18,19 +18,21 @@ from barsight.simulation.worlds.solids import Solid, box, cylinder
 
 DIAMETERS_M = (0.016, 0.02, 0.025, 0.032, 0.04, 0.05, 0.06, 0.08, 0.09, 0.1)
 SECTION_M2 = (0.006, 0.045)
-"""Steel in a bundle's cross-section, from and to."""
+"""Smallest and largest cross-sectional area of the steel in a bundle, m2."""
 BARS = (3, 200)
 BEAMS_M = (0.05, 0.09, 0.14)
 BOW = 0.002
-"""Standard deviation of the bow over the length, where there is room."""
+"""Standard deviation of the bow relative to the length, if there is room for it."""
 SHORTEST, SHORTEST_ORDERLY = 0.8, 0.98
-"""Least length of a bundle over the longest of its pile."""
+"""Minimum length of a bundle relative to the pile's bar length: in general, and in an orderly pile."""
 RINGS = (1, 2, 3, 4)
-"""Of the full hexagons of an orderly pile."""
+"""Possible numbers of rings of the full hexagons in an orderly pile."""
 GAPS_M = (0.002, 0.006, 0.02, 0.05, 0.12, 0.25)
-"""Between neighbours of a layer; those of an orderly pile are all alike, between the third and the fifth."""
+"""Gaps between neighbours in a layer, m. In an orderly pile all gaps are equal, between the third and the
+fifth value.
+"""
 ROLLED_M = 0.8
-"""Largest distance of a bundle from its pile."""
+"""Largest distance of a bundle from its pile, m; bundles that roll farther are removed."""
 
 Manner = Literal["layered", "nested", "loose", "orderly"]
 Upright = Literal["wedges", "stanchions", "walls"]
@@ -38,10 +40,10 @@ Upright = Literal["wedges", "stanchions", "walls"]
 
 @dataclass(frozen=True, eq=False)
 class Lying:
-    """A bundle, or a bar alone, as it lies. y: its middle along the pile.
+    """A bundle, or a single bar, as it lies. y: position of its centre along the pile, m.
 
-    yaw: its own, rad. bow: how far its middle stands out sideways, m. uneven: how far its bars' ends stand
-    apart, m.
+    yaw: its own, rad. bow: sideways deviation of its centre from its ends, m. uneven: spread of its bars'
+    ends, m.
     """
 
     pack: BarPack
@@ -60,8 +62,7 @@ class Lying:
 
 @dataclass
 class Pile:
-    """Bars that lie together; others: what lies under them, holds them or lies upon them; crossing: single
-    bars across them."""
+    """Bars that lie together. others: what is below, beside or on them; crossing: single bars across them."""
 
     manner: Manner
     upright: Upright
@@ -71,12 +72,12 @@ class Pile:
 
     @property
     def top(self) -> float:
-        """Return the highest point of what lies."""
+        """Return the highest point of the bars, m."""
         return max(one.pack.top for one in self.lying)
 
 
 def pile_up(manner: Manner, upright: Upright, span: float, length: float, rng: np.random.Generator) -> Pile:
-    """Pile up over `span` m across, bars of up to `length` m; upright: what holds the pile's sides."""
+    """Build a pile `span` m wide of bars up to `length` m long; upright: what holds the pile's sides."""
     pile = Pile(manner, upright)
     sides = _stand_sides(pile, span, length, rng)
     sorts = [float(d) for d in rng.choice(DIAMETERS_M, 2, replace=False)]
@@ -97,7 +98,7 @@ def pile_up(manner: Manner, upright: Upright, span: float, length: float, rng: n
 
 
 def _whole_bundle(rng: np.random.Generator) -> BarPack:
-    """Lay out a bundle that is a full hexagon, of a usual section."""
+    """Create a bundle that is a full hexagon, with a cross-section within SECTION_M2."""
     area = {
         (rings, diameter): (3 * rings * (rings + 1) + 1) * math.pi / 4 * diameter**2
         for rings in RINGS for diameter in DIAMETERS_M
@@ -108,7 +109,7 @@ def _whole_bundle(rng: np.random.Generator) -> BarPack:
 
 
 def _bundle(sorts: Sequence[float], rng: np.random.Generator) -> BarPack:
-    """BarPack a bundle of one of two sorts of bars, the first most often, turned at random."""
+    """Pack a bundle of one of two bar diameters, most often the first, with a random roll."""
     diameter = float(sorts[int(rng.random() < 0.25)])
     count = round(float(rng.uniform(*SECTION_M2)) / (math.pi / 4 * diameter**2))
     cross = packed(int(np.clip(count, *BARS)), diameter, rng)
@@ -120,7 +121,7 @@ def _bundle(sorts: Sequence[float], rng: np.random.Generator) -> BarPack:
 def _over(
     packs: Sequence[BarPack], span: tuple[float, float], base: float, rng: np.random.Generator
 ) -> list[BarPack]:
-    """Hang packs over `span` in rows, from height `base` up, none over another's side."""
+    """Arrange packs in rows above `span`, from height `base` up, without lateral overlap."""
     out: list[BarPack] = []
     x, z, row = span[0], base, 0.0
     for pack in packs:
@@ -139,7 +140,7 @@ def _layers(
     pile: Pile, span: float, length: float, sides: list[Rectangle], bundle: Callable[[], BarPack],
     rng: np.random.Generator,
 ) -> None:  # fmt: skip
-    """Lay one to three layers on beams, each settled on those below."""
+    """Lay one to three layers on beams, each settled on the layers below."""
     is_orderly = pile.manner == "orderly"
     gaps = (float(rng.uniform(GAPS_M[2], GAPS_M[4])),) if is_orderly else GAPS_M
     reach = (0.0, span)
@@ -175,7 +176,7 @@ def _laid(
 
 
 def _slackened(laid: list[Lying], reach: tuple[float, float], rng: np.random.Generator) -> list[Lying]:
-    """Turn and bow what lies alone, within the gaps to its neighbours seen from above."""
+    """Rotate and bow each bundle or bar within the gaps to its neighbours, seen from above."""
     out = []
     for one in laid:
         low, high = one.pack.extent
@@ -191,7 +192,7 @@ def _slackened(laid: list[Lying], reach: tuple[float, float], rng: np.random.Gen
 
 
 def _heap(pile: Pile, span: float, length: float, sides: list[Rectangle], rng: np.random.Generator) -> None:
-    """Heap single bars of several diameters up, most of them of one."""
+    """Heap up single bars of several diameters, most of them of the same one."""
     usual = float(rng.choice(DIAMETERS_M[2:]))
     bars = []
     for _ in range(int(rng.integers(15, 110))):
@@ -206,16 +207,16 @@ def _heap(pile: Pile, span: float, length: float, sides: list[Rectangle], rng: n
 
 
 def _within(packs: Sequence[BarPack], span: float) -> list[BarPack]:
-    """Take away what fell or rolled far out of the pile."""
+    """Remove the packs that fell or rolled far out of the pile."""
     return [p for p in packs if p.extent[0] > -ROLLED_M and p.extent[1] < span + ROLLED_M]
 
 
 def _bear(
     pile: Pile, base: float, reach: tuple[float, float], length: float, rng: np.random.Generator
 ) -> tuple[float, list[Rectangle]]:
-    """Place beams across the bars at z = base: their upper side's height, and what packs meet of them.
+    """Place beams across the bars at z = base. Returns the height of their tops and their collision boxes.
 
-    Wedges on their ends keep from rolling off what no stanchion or wall holds.
+    Wedges at their ends stop bars from rolling off if there are no stanchions or walls.
     """
     height = float(rng.choice(BEAMS_M))
     low, high = reach[0] - 0.09, reach[1] + 0.09
@@ -239,7 +240,7 @@ def _bear(
 
 
 def _stand_sides(pile: Pile, span: float, length: float, rng: np.random.Generator) -> list[Rectangle]:
-    """Stand posts, walls or blocks on both sides of the pile, and tell what packs meet of them."""
+    """Place posts, walls or blocks on both sides of the pile, and return their collision boxes."""
     sides: list[Rectangle] = []
     for sign, edge in ((-1, 0.0), (1, span)):
         gap = float(rng.choice([0.005, 0.03, 0.08])) if pile.upright != "wedges" else 0.0

@@ -1,4 +1,4 @@
-"""Simulate a recording of a whole world that is drawn from a seed, with its truth."""
+"""Simulate a recording, with its truth, of a whole world drawn from a seed."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from barsight.simulation.worlds.surfaces import draw_finishes, owners, scene_of
 from barsight.simulation.worlds.yards import LOOSE, DrawnBundle, DrawnYard, bow_at, draw_yard, kind_of
 
 GENERATOR = 1
-"""Raised whenever a seed draws another world than it did."""
+"""Version of the generator: incremented whenever the same seed draws a different world."""
 ABOVE_M = 50.0
 COVER_STEP_M = (0.004, 0.05)
-"""Spacing of the lines that look down on a bundle, across and along it."""
+"""Spacing, across and along a bundle, of the vertical rays that look down on it, m."""
 COVERED_RATIO = 0.02
-"""A bundle of which less is hidden from above has nothing on it,"""
+"""Hidden share of a bundle, seen from above, at and above which the bundle counts as covered."""
 CROSSED_RATIO = 0.3
-"""unless at some place along it this much of its width is hidden."""
+"""Hidden share of a bundle's width, anywhere along it, at and above which the bundle counts as covered."""
 DIM_RATIO, BLURRED_S = 0.7, 0.004
 
 
@@ -45,9 +45,9 @@ class DrawnWorld:
 
 
 def draw_world(seed: int, given: SimulationSettings) -> DrawnWorld:
-    """Draw a whole world from a seed; see `draw_conditions` for what `given` decides.
+    """Draw a whole world from a seed; see `draw_conditions` for the settings taken from `given`.
 
-    The way is as long as the yard has become, with as many pairs a metre as `given` says.
+    The travel is as long as the yard has become, with as many pairs per metre as in `given`.
     """
     settings = draw_conditions(seed, given, hides=kind_of(seed) == "unseen")
     drawn = draw_yard(seed, settings.yard.bar_length_m, settings.length_m)
@@ -72,7 +72,7 @@ def simulate_world(out: Path, world: DrawnWorld, progress: Callable[[int, int], 
 
 
 def bundle_truth(world: DrawnWorld) -> list[dict[str, Any]]:
-    """Describe the bundles, and the bars that are in none, as `bundles.json` lists them."""
+    """Describe the bundles, and the bars that belong to none, in the format of `bundles.json`."""
     owner = owners(world.drawn.yard)
     return [_row(bundle, world, owner) for bundle in world.drawn.bundles]
 
@@ -94,16 +94,15 @@ def _row(bundle: DrawnBundle, world: DrawnWorld, owner: Int64) -> dict[str, Any]
 
 
 def is_uncovered(covered: float, crossed: float) -> bool:
-    """Tell whether nothing lies on a bundle, by its `cover`."""
+    """Tell from a bundle's `cover` whether nothing lies on it."""
     return covered < COVERED_RATIO and crossed < CROSSED_RATIO
 
 
 def cover(scene: Scene, owner: Int64, bundle: DrawnBundle) -> tuple[float, float]:
-    """Look down on a bundle's bars: the share of what they take up seen from above that other things hide,
-    and the largest such share on a line across it.
+    """Compute the share of a bundle's bars hidden from above, and the largest share on a line across it.
 
-    owner: (P + 1,) the bundle of each primitive of the scene, the floor last. Beyond a bar's end, and between
-    two bars, what is seen lies lower than the bars do: it hides nothing.
+    owner: (P + 1,) bundle of each primitive of the scene, the floor last. Surfaces seen beyond a bar's end
+    and between two bars are lower than the bars and hide nothing.
     """
     x, z, radius = bundle.cross_m[:, 0], bundle.cross_m[:, 1], bundle.diameter_m / 2
     u = np.arange(x.min() - radius + COVER_STEP_M[0] / 2, x.max() + radius, COVER_STEP_M[0])
@@ -125,7 +124,7 @@ def cover(scene: Scene, owner: Int64, bundle: DrawnBundle) -> tuple[float, float
 
 
 def world_truth(world: DrawnWorld) -> dict[str, Any]:
-    """Describe what was drawn, as `world.json` has it: the kind, the conditions, and flags to split by."""
+    """Describe the drawn world for `world.json`: its kind, its conditions, and flags to split scores by."""
     drawn, settings = world.drawn, world.settings
     finishes = sorted(world.finishes.values())
     return {
@@ -142,7 +141,7 @@ def world_truth(world: DrawnWorld) -> dict[str, Any]:
 
 
 def conditions(settings: SimulationSettings) -> dict[str, bool]:
-    """Name what is out of the ordinary in light, crane and pictures, to split scores by."""
+    """Flag what is out of the ordinary in light, crane and images, to split scores by."""
     light, faults, motion = settings.light, settings.faults, settings.motion
     return {
         "sun": light.sun_ratio > 0,

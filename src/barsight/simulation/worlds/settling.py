@@ -18,7 +18,7 @@ with extra("bench"):
 GRAVITY_MPS2 = 9.81
 STEP_S = 1 / 500
 SKIN_M = 0.0003
-"""Margin around each pack while it falls; contacts sink in by less."""
+"""Collision margin around each pack while it falls, m; contacts penetrate by less."""
 FRICTION = 0.45
 REST_MPS = 0.002
 MAX_SETTLING_S = 20.0
@@ -26,40 +26,40 @@ CHECKED_STEPS = 50
 FLOOR = (-200.0, -1.0, 200.0, 0.0)
 
 Rectangle = tuple[float, float, float, float]
-"""Fixed boxes: x and z of the lower and of the upper corner."""
+"""Fixed box: x and z of its lower corner, then of its upper corner, m."""
 
 
 @dataclass(frozen=True, eq=False)
 class BarPack:
-    """Bars that are strapped together, or a single one: discs (count, 2), x and z in m, of one radius."""
+    """Bars strapped together, or a single bar: discs (count, 2), x and z in m, with a common radius."""
 
     cross: Float64
     radius: float
 
     @property
     def extent(self) -> tuple[float, float]:
-        """Return the least and the greatest x."""
+        """Return the smallest and the largest x, m."""
         x = self.cross[:, 0]
         return float(x.min()) - self.radius, float(x.max()) + self.radius
 
     @property
     def top(self) -> float:
-        """Return the greatest z."""
+        """Return the largest z, m."""
         return float(self.cross[:, 1].max()) + self.radius
 
     @property
     def reach(self) -> float:
-        """Return the radius of the circle about the middle that holds the discs."""
+        """Return the radius of the circle around the centre that contains the discs, m."""
         return float(np.hypot(*(self.cross - self.cross.mean(axis=0)).T).max()) + self.radius
 
     @property
     def corners(self) -> Float64:
-        """Return the discs (M, 2) that a strap around them bends over, in order."""
+        """Return the discs (M, 2) on the pack's convex hull, over which a strap bends, in order."""
         if len(self.cross) < 3:
             return self.cross
         try:
             return np.asarray(self.cross[ConvexHull(self.cross).vertices], np.float64)
-        except QhullError:  # all in a line
+        except QhullError:  # all discs are collinear
             order = np.lexsort((self.cross[:, 1], self.cross[:, 0]))
             return np.asarray(self.cross[order[[0, -1]]], np.float64)
 
@@ -67,10 +67,11 @@ class BarPack:
 def settle(
     falling: Sequence[BarPack], lying: Sequence[BarPack] = (), boxes: Sequence[Rectangle] = ()
 ) -> list[BarPack]:
-    """Let packs fall until they rest: each the stiff hull of its discs, with friction.
+    """Let packs fall until they rest: each is the rigid hull of its discs, with friction.
 
     lying: packs that stay where they are. boxes: beams, posts and walls; the floor z = 0 is always there.
-    Packs that fall must not overlap what is there. Those that still roll after MAX_SETTLING_S stop there.
+    Falling packs must not overlap anything initially. Those that still roll after MAX_SETTLING_S are stopped
+    there.
     """
     space = pymunk.Space()
     space.gravity, space.damping = (0.0, -GRAVITY_MPS2), 0.05

@@ -1,4 +1,4 @@
-"""Give the solids of a yard surfaces: mill scale to polished, rust, oil, dust; sort them for the renderer."""
+"""Assign surfaces to a yard's solids: mill scale to polished, rust, oil, dust; sort them for the renderer."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ ALBEDO = {
 }  # fmt: skip
 RIBBED_RATIO = 0.2
 RIB_PITCH = 0.7
-"""Pitch of ribs over the bar's diameter."""
+"""Pitch of the ribs relative to the bar's diameter."""
 
 
 class Finish(NamedTuple):
-    """From and to: albedo, gloss, weight of the texture, dust, roughness over the ordinary."""
+    """Ranges (from, to) of albedo, gloss, texture weight, dust, and roughness relative to the ordinary."""
 
     albedo: tuple[float, float]
     gloss: tuple[float, float]
@@ -41,7 +41,7 @@ FINISHES = {
 
 
 def draw_finishes(numbers: tuple[int, ...], rng: np.random.Generator) -> dict[int, str]:
-    """Draw each bundle's finish by its number: one of FINISHES, most of a yard's alike."""
+    """Draw each bundle's finish by its number: one of FINISHES, mostly the same within a yard."""
     names = list(FINISHES)
     usual = names[int(rng.integers(len(names)))]
     return {
@@ -53,9 +53,9 @@ def scene_of(
     yard: SolidYard, finishes: dict[int, str], rng: np.random.Generator,
     label_m: tuple[float, float] = (0.0, 0.0),
 ) -> Scene:  # fmt: skip
-    """Give the solids surfaces and sort them for the renderer.
+    """Assign surfaces to the solids and sort them for the renderer.
 
-    label_m: length and width of the labels that the tags then are, each with the code of its bundle's number
+    label_m: length and width of the labels that replace the tags, each with the code of its bundle's number
     from 1; 0 0 leaves the tags plain and small.
     """
     looks = {number: _look(FINISHES[name], rng) for number, name in finishes.items()}
@@ -72,13 +72,13 @@ def scene_of(
 
 
 def owners(yard: SolidYard) -> Int64:
-    """Return the bundle of each primitive of `scene_of` (P + 1,), NOTHING for the floor at the end."""
+    """Return the bundle of each primitive of `scene_of` (P + 1,), ending with NOTHING for the floor."""
     ordered = sorted(yard.solids, key=lambda s: not s.is_round)
     return np.array([*(s.bundle for s in ordered), NOTHING])
 
 
 def _look(finish: Finish, rng: np.random.Generator) -> tuple[float, float, float, float, float, bool]:
-    """Draw a bundle's albedo, gloss, texture, dust, roughness and whether its bars have ribs."""
+    """Draw a bundle's albedo, gloss, texture, dust, roughness, and whether its bars are ribbed."""
     values = [float(rng.uniform(*limits)) for limits in finish]
     return values[0], values[1], values[2], values[3], values[4], bool(rng.random() < RIBBED_RATIO)
 

@@ -1,4 +1,4 @@
-"""Lay surveyed AprilTags into a yard: thin level plates, their tops exactly where the list says."""
+"""Lay surveyed AprilTags into a yard: thin level plates with their tops exactly at the listed positions."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from barsight.simulation.simulate import LaidYard, stream
 
 HALF_THICK_M = 0.005
 MIN_Z_M = 0.002
-"""A plate's top must lie over the floor to be seen."""
+"""Minimum height of a plate's top above the floor, m, so that it is visible."""
 
 
 def lay_tags(laid: LaidYard, tags: SurveyedTags, side_m: float, settings: SimulationSettings) -> LaidYard:
-    """Lay tags besides what lies there. side_m: of the black square; white paper stands out one module. Of
-    coded circles it is the disc's diameter.
+    """Add tags to a yard. side_m: side of the black square, m; the white paper extends one module beyond it.
+    For coded circles it is the diameter of the disc.
 
-    Each is turned about the vertical by an angle from the seed. Raises ConfigError for a tag under the floor,
-    and where labels are drawn.
+    Each tag is rotated about the vertical by an angle drawn from the seed. Raises ConfigError for a tag below
+    the floor, and if labels are drawn.
     """
     if laid.codes.size:
         raise ConfigError("simulate: --tags takes no labels; leave yard.label_m at 0 0")

@@ -1,7 +1,7 @@
-"""Draw yards from more than any model of them knows: `draw_yard(seed)` makes one of KINDS, or an orderly one.
+"""Draw yards more varied than any model of them: `draw_yard(seed)` makes one of KINDS or an orderly one.
 
-Piles (`piles`) stand one after the other along X; what yards have besides stands and lies around them.
-No code of the simulated stock or of the yard's stages is used.
+Piles (`piles`) are lined up along X; other objects of a yard stand and lie around them. No code of the
+simulated stock or of the yard's stages is used.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ KINDS = (
     "layered", "beams", "walls", "along-x", "nested", "askew", "stanchions", "unseen", "loose", "mixed",
 )  # fmt: skip
 ORDERLY = "orderly"
-"""Kind of yard that is drawn where it is named, not by a seed: layers of whole bundles of one sort."""
+"""Kind of yard that is drawn only if named, not by a seed: layers of identical full-hexagon bundles."""
 LOOSE = 1000
-"""Number of the first bar that is in no bundle."""
+"""Number of the first bar that belongs to no bundle."""
 SEGMENT_M = 1.2
-"""Length of the straight pieces that make a bowed bar."""
+"""Maximum length of the straight pieces that make up a bowed bar, m."""
 AISLE_M = (0.3, 1.2)
 SPAN_M = (1.6, 3.6)
 MAX_SIDE_M = 3.4
-"""Across X, of piles that lie along it."""
+"""Maximum width, along Y, of piles whose bars lie along X, m."""
 STRAIGHT_M = 0.0005
 MIN_BAR_M = 1.5
 ON_STRAP_M = 0.0013
@@ -39,8 +39,8 @@ ON_STRAP_M = 0.0013
 class DrawnBundle:
     """A bundle, or a single bar, of a drawn yard. number: of its solids; section, layer: of its pile.
 
-    centre_m: (3,) middle of its bars. yaw_rad: of its axis, from Y towards -X. cross_m: (count, 2) its bars'
-    axes from the centre, sideways and up. bow_m: how far the middle stands out sideways, or below its ends.
+    centre_m: (3,) centre of its bars. yaw_rad: of its axis, from Y towards -X. cross_m: (count, 2) axes of
+    its bars from the centre, sideways and up. bow_m: sideways deviation of its centre from its ends.
     """
 
     number: int
@@ -57,10 +57,7 @@ class DrawnBundle:
 
 @dataclass(frozen=True, eq=False)
 class DrawnYard:
-    """A yard of one of KINDS or ORDERLY. size_m: along X and Y; it begins at x = 0, its middle is at y = 0.
-
-    free: see there.
-    """
+    """A yard of one of KINDS or ORDERLY, from x = 0 and centred on y = 0. size_m: along X and Y."""
 
     seed: int
     kind: str
@@ -70,12 +67,12 @@ class DrawnYard:
 
     @property
     def hides(self) -> bool:
-        """Tell whether a strip of it should not be seen."""
+        """Tell whether a strip of it is meant to be out of sight."""
         return self.kind == "unseen"
 
     @property
     def free(self) -> tuple[int, ...]:
-        """Return the bundles of the highest layer of each pile; what nests may be covered all the same."""
+        """Return the bundles in the highest layer of each pile; nested ones may be covered all the same."""
         strapped = [b for b in self.bundles if b.number < LOOSE]
         tops = {b.section: b.layer for b in sorted(strapped, key=lambda b: b.layer)}
         return tuple(b.number for b in strapped if b.layer == tops[b.section])
@@ -89,10 +86,10 @@ def kind_of(seed: int) -> str:
 def draw_yard(
     seed: int, bar_length_m: float, length_m: float, min_length_ratio: float = 0.75, kind: str | None = None
 ) -> DrawnYard:
-    """Draw the yard of a seed, of its own kind (see `kind_of`) where none is given.
+    """Draw the yard of a seed, of the seed's own kind (see `kind_of`) unless one is given.
 
-    length_m: along X, about. bar_length_m: of the longest bars; min_length_ratio: those of a pile have at
-    least this share of it.
+    length_m: approximate extent along X, m. bar_length_m: length of the longest bars, m; min_length_ratio:
+    smallest bar length of a pile relative to it.
     """
     rng = np.random.default_rng((23, seed))
     kind = kind or kind_of(seed)
@@ -125,7 +122,7 @@ def draw_yard(
 
 
 def _sort(kind: str, section: int, rng: np.random.Generator) -> tuple[Manner, Upright]:
-    """Choose how a pile lies and what holds it."""
+    """Choose how a pile is stacked and what holds its sides."""
     manner: Manner = "nested" if rng.random() < 0.3 else "layered"
     upright: Upright = "wedges"
     if kind == "nested":
@@ -155,7 +152,7 @@ def _yaw(kind: str, section: int, rng: np.random.Generator) -> float:
 def _placed(
     pile: Pile, section: int, first: tuple[int, int], yaw: float, rng: np.random.Generator
 ) -> tuple[list[Solid], list[DrawnBundle]]:
-    """Make the solids of a pile, turned; first: numbers of its first bundle and its first single bar."""
+    """Create a pile's solids, rotated by yaw; first: numbers of its first bundle and first single bar."""
     solids, bundles = list(pile.others), []
     for k, one in enumerate(pile.lying):
         number = first[0 if one.strapped else 1] + k
@@ -194,7 +191,7 @@ def _described(manner: Manner, one: Lying, made: list[Solid], section: int, yaw:
 
 
 def _bars(one: Lying, number: int, rng: np.random.Generator) -> list[Solid]:
-    """Make a bundle's bars, straps and perhaps a tag, or a single bar."""
+    """Create a bundle's bars, its straps and perhaps a tag, or a single bar."""
     turn = turn_about_z(one.yaw)
     axes = np.stack([turn[:, 0], turn[:, 1], np.array([0.0, 0.0, 1.0])])
     centre = one.pack.cross.mean(axis=0)
@@ -202,7 +199,7 @@ def _bars(one: Lying, number: int, rng: np.random.Generator) -> list[Solid]:
     cross = one.pack.cross - (centre[0], 0.0)
     solids = []
     for x, z in cross:
-        # The ends of bars that were cut alike stand apart.
+        # The ends of bars of equal nominal length are uneven.
         short, shift = rng.uniform(0, 1, 2) * one.uneven
         begin, end = -one.length / 2 + shift * 0.3, one.length / 2 - short
         at = middle + x * axes[0] + z * axes[2]
@@ -222,7 +219,7 @@ def _bars(one: Lying, number: int, rng: np.random.Generator) -> list[Solid]:
 
 
 def bow_at(bow_m: float, length_m: float, along_m: Float64) -> Float64:
-    """Compute how far places along a bowed bar stand out sideways, m; zero on the average over its length."""
+    """Compute the sideways deviation of points along a bowed bar, m; its mean over the length is zero."""
     return np.asarray(bow_m * (1 / 3 - (2 * along_m / length_m) ** 2), np.float64)
 
 
@@ -231,7 +228,7 @@ def _bow_at(one: Lying, along: float) -> float:
 
 
 def _bowed(at: Float64, axes: Float64, ends: tuple[float, float], one: Lying, number: int) -> list[Solid]:
-    """Make one bar as straight pieces that follow the bow."""
+    """Create one bar from straight pieces that follow the bow."""
     pieces = 1 if abs(one.bow) < STRAIGHT_M else max(2, math.ceil(one.length / SEGMENT_M))
     along = np.linspace(*ends, pieces + 1)
     points = np.array([at + a * axes[1] + _bow_at(one, a) * axes[0] for a in along])
@@ -242,7 +239,7 @@ def _bowed(at: Float64, axes: Float64, ends: tuple[float, float], one: Lying, nu
 
 
 def _lay_upon(pile: Pile, share: float, rng: np.random.Generator) -> None:
-    """Lay beams, single bars and blocks across bundles that may be free."""
+    """Lay beams, single bars and blocks across bundles of the highest layer."""
     top = max(one.layer for one in pile.lying)
     free = [one for one in pile.lying if one.layer == top and one.strapped]
     taken: set[int] = set()
@@ -270,7 +267,7 @@ def _lay_upon(pile: Pile, share: float, rng: np.random.Generator) -> None:
 
 
 def _stand_about(end_x: float, bar_length: float, rng: np.random.Generator) -> list[Solid]:
-    """Stand carts and people beside the piles, off the bars' ends."""
+    """Place carts and people beside the piles, beyond the ends of the bars."""
     solids = []
     for _ in range(int(rng.integers(0, 3))):
         x, side = float(rng.uniform(0, end_x)), float(rng.choice([-1, 1]))
