@@ -1,1 +1,1 @@
-"""Score measured results against truth."""
+"""Score measured results against ground truth."""

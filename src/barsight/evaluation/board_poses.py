@@ -1,4 +1,4 @@
-"""Compute PnP poses of recorded board corners and the drift of the gyro alone against them."""
+"""Compute PnP poses from recorded board corners, and the drift of the gyro alone against them."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ MIN_POSES = 3
 
 
 def board_poses(recording: CornerRecording) -> GroundTruth | None:
-    """Solve PnP of cam0's corners for the body over the board at each frame, by the board's places as stored.
+    """Solve PnP with cam0's corners for the pose of the body over the board at each frame.
 
-    It takes the board as stored and the lens as calibrated: what both are off by is in these poses. Frames
-    of fewer than 12 corners are left out; None for fewer than three. Raises CalibrationError where the
-    corners have no place on the board.
+    It takes the board as stored and the lens as calibrated; errors of both are contained in these poses.
+    Frames with fewer than 12 corners are left out; None if fewer than three remain. Raises CalibrationError
+    if the corners have no position on the board.
     """
     rows = read_rows(recording.path / NAMES[0], FIELDS)
     rows = rows[np.argsort(rows["stamp_ns"], kind="stable")]
@@ -50,10 +50,10 @@ def board_poses(recording: CornerRecording) -> GroundTruth | None:
 
 
 def gyro_only_rmse_deg(imu: ImuSamples, truth: GroundTruth, shift_ns: int) -> float:
-    """Compute the RMSE of the gyro's turns against the poses, NaN where it covers fewer than three of them.
+    """Compute the RMSE, degrees, of the gyro's attitude against the poses; NaN if it covers fewer than three.
 
-    The rates are integrated step by step; the start and one constant bias, fitted to the poses themselves,
-    are all that is free. An estimate that believes the gyro comes hardly nearer.
+    The rates are integrated step by step; the only unknowns, the initial attitude and a constant bias, are
+    fitted to the poses themselves. An estimate that trusts the gyro hardly gets closer to the poses.
     """
     stamps = truth.stamp_ns + shift_ns
     known = (stamps >= imu.stamp_ns[0]) & (stamps <= imu.stamp_ns[-1])
@@ -64,9 +64,9 @@ def gyro_only_rmse_deg(imu: ImuSamples, truth: GroundTruth, shift_ns: int) -> fl
     frames_s = (stamps[known] - imu.stamp_ns[0]) / NS_PER_S
 
     def off(unknowns: Float64) -> Float64:
-        """Return (K * 3,): turns from the gyro's attitude to the pose's, rad.
+        """Return (K * 3,): rotations from the gyro's attitude to the pose's, rad.
 
-        unknowns: bias, turn of the start.
+        unknowns: bias, then rotation of the initial attitude.
         """
         gyro = Slerp(samples_s, _integrated(imu, unknowns[:3]))(frames_s)
         start = turns[0] * gyro[0].inv() * Rotation.from_rotvec(unknowns[3:])
@@ -77,7 +77,7 @@ def gyro_only_rmse_deg(imu: ImuSamples, truth: GroundTruth, shift_ns: int) -> fl
 
 
 def _integrated(imu: ImuSamples, bias: Float64) -> Rotation:
-    """Integrate the attitude at each sample (N,), from the identity."""
+    """Integrate the attitude at each sample (N,), starting from the identity."""
     rate = (imu.gyro_radps[1:] + imu.gyro_radps[:-1]) / 2 - bias
     steps = Rotation.from_rotvec(rate * np.diff(imu.stamp_ns)[:, None] / NS_PER_S).as_matrix()
     attitude = np.empty((len(steps) + 1, 3, 3))

@@ -1,6 +1,4 @@
-"""Score a measured folder against the truth of its (simulated) recording: evaluation only, never
-measuring.
-"""
+"""Score a measured folder against its (simulated) recording's truth; only for evaluation."""
 
 from __future__ import annotations
 
@@ -25,10 +23,10 @@ Figures = dict[str, float]
 def score_folder(recording: Path, out: Path) -> dict[str, Figures]:
     """Score contours and heights in mm against `truth/height.npz` of the recording.
 
-    `smooth` places have no step over 30 mm within two samples, in the height map along x and along y;
-    `seen by two` are those that at least two frames see in both cameras. coverage is the share of those that
-    vision claims; within_95 the share of smooth errors
-    inside 1.96 stated sigma. Raises InputError where either side has no such file.
+    `smooth` places have no step above 30 mm within two samples, in the height map along x and along y; `seen
+    by two` are those that at least two frames see in both cameras. coverage is the share of those for which
+    vision gives a height; within_95 is the share of errors within 1.96 stated sigma. Raises InputError if
+    such a file is missing on either side.
     """
     truth_file = recording / "truth" / "height.npz"
     for file in (truth_file, out / "contour.csv", out / "height.tif"):

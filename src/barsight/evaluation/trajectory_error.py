@@ -1,4 +1,4 @@
-"""Compare a trajectory with the true one: evaluation only, never measuring."""
+"""Compare a trajectory with the true one; for evaluation only, never for measuring."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from barsight.recording.formats.ground_truth import GroundTruth
 
 @dataclass(frozen=True)
 class Drift:
-    """frames: compared. aligned_*: after the best rigid motion. reference_*: as they stand, NaN in `world`.
+    """frames: number compared. aligned_*: after the best rigid motion. reference_*: without, NaN in `world`.
 
-    drift_percent: translation error over all stretches of `min_length_m` and more, relative to their length
-    [Geiger 2012]; NaN where the way is shorter. nees_*: squared error per degree of freedom in terms of the
-    stated covariance, 1 where it is right; NaN in `world`, which truth knows up to a rigid motion only.
+    drift_percent: translation error over all segments of at least `min_length_m`, relative to their length
+    [Geiger 2012]; NaN if the trajectory is shorter. nees_*: NEES per degree of freedom, 1 if the stated
+    covariance is right; NaN in `world`, for which the truth is known only up to a rigid motion.
     """
 
     frames: int
@@ -36,8 +36,8 @@ class Drift:
 
 @dataclass(frozen=True, eq=False)
 class FrameErrors:
-    """Estimate minus truth of the frames that truth covers. stamp_ns: (N,). place_m, turn_rad: (N, 3),
-    reference axes; in `world` after the best rigid motion.
+    """Estimate minus truth of the frames that the truth covers. stamp_ns: (N,). place_m, turn_rad: (N, 3)
+    on the axes of the reference; in `world` after the best rigid motion.
     """
 
     stamp_ns: Int64
@@ -46,8 +46,9 @@ class FrameErrors:
 
 
 def frame_errors(trajectory: Trajectory, truth: GroundTruth, shift_ns: int) -> FrameErrors | None:
-    """Compute per-frame errors; shift_ns: truth's clock minus the frames'. None where fewer than 3
-    overlap.
+    """Compute per-frame errors; None if fewer than 3 frames overlap the truth.
+
+    shift_ns: the truth's clock minus the frames'.
     """
     met = _met(trajectory, truth, shift_ns)
     if met is None:
@@ -62,7 +63,7 @@ def frame_errors(trajectory: Trajectory, truth: GroundTruth, shift_ns: int) -> F
 
 @dataclass(frozen=True, eq=False)
 class _Met:
-    """The frames that truth covers, and truth at their stamps."""
+    """The frames that the truth covers, and the truth at their stamps."""
 
     frames: list[PosedFrame]
     place: Float64
@@ -90,9 +91,9 @@ def _met(trajectory: Trajectory, truth: GroundTruth, shift_ns: int) -> _Met | No
 def trajectory_drift(
     trajectory: Trajectory, truth: GroundTruth, shift_ns: int, min_length_m: float = 10.0
 ) -> Drift | None:
-    """Compute drift figures; shift_ns: truth's clock minus the frames' (`timeshift_cam_imu`).
+    """Compute the drift of a trajectory; None if fewer than 3 frames overlap the truth.
 
-    None where fewer than 3 overlap.
+    shift_ns: the truth's clock minus the frames' (`timeshift_cam_imu`).
     """
     met = _met(trajectory, truth, shift_ns)
     if met is None:
@@ -120,14 +121,14 @@ def trajectory_drift(
 
 
 def align_umeyama(place: Float64, target: Float64) -> Float64:
-    """Align places (N, 3) rigidly to the target [Umeyama 1991], without scale."""
+    """Align positions (N, 3) rigidly to the target, without scale [Umeyama 1991]."""
     centred, wanted = place - place.mean(axis=0), target - target.mean(axis=0)
     aligned: Float64 = centred @ nearest_rotation(wanted.T @ centred).T + target.mean(axis=0)
     return aligned
 
 
 def rms(vectors: Float64) -> float:
-    """Compute the root mean square of vectors' lengths (N, 3)."""
+    """Compute the root mean square of the lengths of vectors (N, 3)."""
     return float(np.sqrt((vectors**2).sum(axis=1).mean()))
 
 
