@@ -1,1 +1,1 @@
-"""The paper that Barsight began from: each equation, figure, table and conclusion beside ours."""
+"""The paper on which Barsight is based: each equation, figure, table and conclusion next to our result."""

@@ -1,4 +1,4 @@
-"""Measure what IMU and cameras give each other in the paper's method [paper Figure 6]."""
+"""Measure what IMU and cameras contribute to each other in the paper's method [paper Figure 6]."""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ from barsight.recording.sensor_selection import SelectedSensors
 
 @dataclass(frozen=True)
 class Architecture:
-    """Parts of the paper's method, each against truth. seconds, way_m: of the whole travel. alone_m: what the
-    IMU alone is off by at its end. trend_mm, stitched_mm: RMS error of a step's length, by the IMU whose
-    velocity the pictures hold and by the matches that its trend leaves. steps: how many of these.
+    """Parts of the paper's method, each compared with the truth. seconds, way_m: duration and length of
+    the whole travel. alone_m: error, by the IMU alone, of the distance from start to end. trend_mm,
+    stitched_mm: RMS error of a step's length, from the IMU with its velocity corrected by the images, and
+    from the matches that pass its trend. steps: number of predicted steps.
     """
 
     steps: int
@@ -63,7 +64,7 @@ def _predicted(trend: MotionTrend, stamp_ns: int, pose: Pose) -> Pose | None:
 
 
 def _dead_reckoning(trend: MotionTrend, stamps_ns: Sequence[int], start: Pose) -> float:
-    """Chain the IMU's own predictions: how far from its start it ends, m; NaN where it can't go on."""
+    """Chain the IMU's own predictions: distance of their end from the start, m; NaN if the chain breaks."""
     pose = start
     trend.correct(stamps_ns[0], start)
     for stamp in stamps_ns[1:]:

@@ -1,4 +1,4 @@
-"""Check equations by numbers: the printed Eq. 20 against the minimiser."""
+"""Check equations numerically: the printed Eq. 20 against the true minimiser."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def printed_rotation(source: Float64, target: Float64) -> Float64:
 
 
 def rotation_errors_deg(turn_deg: float = 10.0, seed: int = 20) -> tuple[float, float]:
-    """Compute how far Eq. 20 as printed and as corrected are off a known turn about Z, degrees."""
+    """Compute the errors of Eq. 20, as printed and as corrected, for a known rotation about Z, degrees."""
     rng = np.random.default_rng(seed)
     truth = Rotation.from_euler("z", turn_deg, degrees=True)
     source = rng.normal(size=(50, 3))

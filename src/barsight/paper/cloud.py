@@ -1,4 +1,4 @@
-"""Stitch clouds, draw maps and contours, and score them [paper Figures 10-12, Table 4]."""
+"""Stitch point clouds, draw maps and contours, and score them [paper Figures 10-12, Table 4]."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _CELL_M = 0.02
 
 @dataclass(frozen=True)
 class DriftRow:
-    """One trajectory: frames placed of all, RMSE after the best rigid motion (mm), drift (%), turn (deg)."""
+    """One trajectory: frames placed and in total, aligned RMSE (mm), drift (%), attitude RMSE (deg)."""
 
     what: str
     placed: int
@@ -45,8 +45,8 @@ class DriftRow:
 
 @dataclass(frozen=True)
 class ContourScore:
-    """Vision minus laser over a folder's contours, both filtered. relative_pct: MAE against the paper's
-    3.77 m and against the stack's height; the largest likewise (an error over a named length).
+    """Vision minus laser over a folder's contours, both filtered. relative_pct: MAE relative to the
+    paper's 3.77 m and to the stack's height; max_relative_pct: largest error relative to the same lengths.
     """
 
     samples: int
@@ -58,7 +58,7 @@ class ContourScore:
 
 
 def drift_row(what: str, trajectory: Trajectory, recording: Recording) -> DriftRow:
-    """Compare a trajectory with the true one; NaN where there is none."""
+    """Compare a trajectory with the true one; NaN without truth."""
     truth, nan = truth_of(recording), float("nan")
     drift = None
     if truth is not None and len(trajectory.frames) > 2:
@@ -70,8 +70,8 @@ def drift_row(what: str, trajectory: Trajectory, recording: Recording) -> DriftR
 
 
 def view_clouds(recording: Recording, trajectory: Trajectory, apart: int) -> list[tuple[Float64, Pose]]:
-    """Triangulate two views `apart` frames from each other by the paper's stereo: points (N, 3) in rect0 and
-    reference_from_rect0.
+    """Triangulate two views `apart` frames from each other by the paper's stereo: for each, points (N, 3)
+    in rect0 and reference_from_rect0.
     """
     rectifier, frames = Rectifier(recording.rig), trajectory.frames
     first = max(0, len(frames) // 2 - apart)
@@ -87,7 +87,7 @@ def view_clouds(recording: Recording, trajectory: Trajectory, apart: int) -> lis
 
 
 def cloud_of(pair: RectifiedPair) -> Float64:
-    """Triangulate a pair by the paper's stereo: (N, 3) in rect0."""
+    """Triangulate a pair by the paper's stereo: points (N, 3) in rect0, m."""
     candidates = find_disparity_range(pair)
     if isinstance(candidates, Failed):
         return np.empty((0, 3))
@@ -136,7 +136,7 @@ def _two_colours(clouds: list[Float64], caption: str) -> PaperPicture:
 
 
 def map_picture(out: Path, caption: str) -> PaperPicture:
-    """Paint a measured folder's map from above [paper Figure 11]."""
+    """Draw a measured folder's map from above [paper Figure 11]."""
     raster = read_raster(out / "height.tif")
     low, high = robust_range(raster.z_m, 1, 99)
     painted = paint_height(raster, low, high)[..., :3].copy()
@@ -149,7 +149,7 @@ def map_picture(out: Path, caption: str) -> PaperPicture:
 
 
 def _filtered(laser: LaserProfile) -> Contour:
-    """Filter a laser's profile as the paper filters vision's contour."""
+    """Filter a laser profile as the paper filters the contour from vision."""
     step = float(np.median(np.diff(laser.x_m)))
     count = round((laser.x_m[-1] - laser.x_m[0]) / step) + 1
     x, z = laser.x_m[0] + step * np.arange(count), np.full(count, np.nan)
@@ -159,7 +159,7 @@ def _filtered(laser: LaserProfile) -> Contour:
 
 
 def _met(out: Path) -> list[tuple[Float64, Float64, Float64]]:
-    """Pair each contour with its laser, both filtered: x, vision, laser (N,) each, m."""
+    """Pair each contour with its laser profile, both filtered: x, vision, laser (N,) each, m."""
     lasers = {one.profile: one for one in read_laser(out)}
     met = []
     for contour in read_contours(out):
@@ -171,7 +171,7 @@ def _met(out: Path) -> list[tuple[Float64, Float64, Float64]]:
 
 
 def contour_picture(out: Path, what: str) -> PaperPicture | None:
-    """Draw the first contour over its laser, both filtered [paper Figure 12]; None without a laser."""
+    """Draw the first contour and its laser profile, both filtered [paper Figure 12]; None without a laser."""
     met = _met(out)
     if not met:
         return None

@@ -1,4 +1,4 @@
-"""Find, match and filter features as the paper does [Figures 4, 5, 8, 9; Tables 2, 3], on two views."""
+"""Detect, match and filter features as the paper does [Figures 4, 5, 8, 9; Tables 2, 3], on two views."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ COUNT = 2000
 
 @dataclass(frozen=True, eq=False)
 class TwoViews:
-    """Neighbouring views and the trend's rotation and translation, new_from_old of rect0 (None: not known).
+    """Two successive views, and the trend's new_from_old of rect0: rotation, translation (None: unknown).
 
-    reproject: gives features' true new places, NaN where not known; None without truth. true_depth_m:
-    (H, W) of the old rectified view, None without truth.
+    reproject: gives the features' true new positions, NaN if unknown; None without truth. true_depth_m: (H,
+    W) of the old rectified view, None without truth.
     """
 
     old: PatchPair
@@ -51,9 +51,11 @@ class TwoViews:
 
 @dataclass(frozen=True, eq=False)
 class FilteredMatches:
-    """One detector on two views. places, target, expected: (N, 2) px, the last by the trend (NaN unknown);
-    initial, on_plane, kept: (N,); detect_ms, total_ms: times; true_before, true_plane, true_after: %, true of
-    what each leaves; kept_true: % of the true ones that are left at the end (NaN: no truth).
+    """One detector on two views. places, target, expected: (N, 2) px: old position, match, and prediction
+    by the trend (NaN if unknown). initial, on_plane, kept: (N,), matches left after each filter.
+    detect_ms, total_ms: times. true_before, true_plane, true_after: true matches among those left after
+    each filter, %; kept_true: share of the true initial matches that is left at the end, % (NaN without
+    truth).
     """
 
     detector: str
@@ -72,7 +74,7 @@ class FilteredMatches:
 
 
 def two_views(recording: Recording) -> TwoViews:
-    """Choose two views in a recording's middle, or with true depth, and predict the motion by the IMU."""
+    """Choose the first two views with true depth, else the middle two, and predict the motion by the IMU."""
     step = None
     if (recording.path / "truth").is_dir():
         try:
@@ -118,7 +120,7 @@ def _middle(recording: Recording) -> set[int]:
 def _trend(
     recording: Recording, rectifier: Rectifier, old_ns: int, new_ns: int
 ) -> tuple[Float64, Float64] | None:
-    """Predict by [paper Eq. 11] from the poses that the paper's stitching has up to the old view."""
+    """Predict the motion by [paper Eq. 11] from the poses of the paper's stitching up to the old view."""
     alone = SelectedSensors(recording, ("stereo", "imu"))
     imu = alone.imu()
     if imu is None:
@@ -180,7 +182,7 @@ def _match(views: TwoViews, name: DetectorName) -> FilteredMatches:
 def _true_shares(
     views: TwoViews, places: Float64, target: Float64, chosen: tuple[Bool, Bool, Bool]
 ) -> tuple[float, float, float, float]:
-    """Compute the true ones' share of each choice, and that of the first one's true ones left in the last."""
+    """Compute each selection's share of true matches, and that of the first's true ones in the last, %."""
     if views.reproject is None:
         return (np.nan,) * 4
     off = np.linalg.norm(target - views.reproject(places), axis=1)
@@ -194,7 +196,7 @@ def _pct(flags: Bool) -> float:
 
 
 def draw_features(views: TwoViews, row: FilteredMatches, where: str) -> PaperPicture:
-    """Draw the features on the old picture [paper Figure 4]."""
+    """Draw the features on the old image [paper Figure 4]."""
     image = views.old.pair.left
     scale = WIDTH_PX / image.shape[1]
     canvas = canvas_of(image, scale)
@@ -204,7 +206,7 @@ def draw_features(views: TwoViews, row: FilteredMatches, where: str) -> PaperPic
 
 
 def draw_pairs(views: TwoViews, row: FilteredMatches, where: str, *, filtered: bool) -> PaperPicture:
-    """Draw initial matches [paper Figure 5], or those after filtering with the trend [Figures 8, 9]."""
+    """Draw the initial matches [paper Figure 5], or those left after filtering [Figures 8, 9]."""
     image = views.new.pair.left
     scale = WIDTH_PX / image.shape[1]
     canvas = canvas_of(image, scale)

@@ -1,4 +1,4 @@
-"""Say in a sentence what was measured for each of the paper's conclusions."""
+"""State in a sentence what was measured for each of the paper's conclusions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Results = dict[str, dict[str, Any] | BarsightError]
 
 
 def of_drift(rows: Sequence[DriftRow]) -> str:
-    """Say how many frames each estimate placed, and how far it drifts."""
+    """State how many frames each estimate placed, and its drift."""
     parts = []
     for row in rows:
         drift = f", {row.drift_pct:.2f} % off" if math.isfinite(row.drift_pct) else ""
@@ -27,7 +27,7 @@ def of_drift(rows: Sequence[DriftRow]) -> str:
 
 
 def of_depth(errors_mm: dict[str, float]) -> str:
-    """Say each depth's median error."""
+    """State the median error of each depth."""
     known = [f"{label} {error:.0f} mm" for label, error in errors_mm.items() if math.isfinite(error)]
     if not known:
         return "Nothing: the recording has no true depth."
@@ -35,7 +35,7 @@ def of_depth(errors_mm: dict[str, float]) -> str:
 
 
 def of_matches(rows: Sequence[FilteredMatches]) -> str:
-    """Say how many matches are true at each step, and how many true ones are lost."""
+    """State how many matches are true at each step, and how many true ones are lost."""
     shares = np.array([[row.true_before, row.true_plane, row.true_after, row.kept_true] for row in rows])
     if not np.isfinite(shares).any():
         return "Nothing: the recording has no truth."
@@ -48,7 +48,7 @@ def of_matches(rows: Sequence[FilteredMatches]) -> str:
 
 
 def of_results(results: Results) -> str:
-    """Say each method's rate, and its contours' error against truth."""
+    """State each method's rate, and the error of its contours against the truth."""
     parts = []
     for method, result in results.items():
         if isinstance(result, BarsightError):
@@ -61,7 +61,7 @@ def of_results(results: Results) -> str:
 
 
 def of_bundles(scratch: Path, results: Results, recording: Path) -> str:
-    """Say how many bundles each method's map shows, and how many lie on top in truth."""
+    """State how many bundles each method's map shows, and how many truly lie on top."""
     parts = []
     for method, result in results.items():
         if not isinstance(result, BarsightError):

@@ -1,4 +1,4 @@
-"""Refine a stitched step by ICP, point to plane, to measure what section 4.3's refinement is worth."""
+"""Refine a stitched step by point-to-plane ICP, to measure the benefit of the refinement in section 4.3."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MAX_POINTS = 6000
 
 @dataclass(frozen=True)
 class IcpScore:
-    """Errors of the steps' lengths against truth, RMS in mm: as stitched, and after ICP."""
+    """RMS errors of the steps' lengths against the truth, mm: as stitched, and after ICP."""
 
     steps: int
     stitched_mm: float
@@ -35,7 +35,7 @@ class IcpScore:
 
 
 def refine(source: Float64, target: Float64, start: Pose) -> Pose:
-    """Refine target_from_source by point to plane between points (N, 3) [Chen and Medioni 1992]."""
+    """Refine target_from_source by point-to-plane ICP between points (N, 3) [Chen and Medioni 1992]."""
     tree = cKDTree(target)
     around = target[np.asarray(tree.query(target, k=NEIGHBOURS)[1])]
     spread = around - around.mean(axis=1, keepdims=True)
@@ -57,9 +57,7 @@ def refine(source: Float64, target: Float64, start: Pose) -> Pose:
 
 
 def icp_score(recording: Recording, trajectory: Trajectory, max_steps: int) -> IcpScore | None:
-    """Refine the first steps of the paper's stitching by ICP and compare their lengths with truth; None
-    without truth.
-    """
+    """Refine the paper's first stitched steps by ICP and score their lengths; None without truth."""
     truth, frames = truth_of(recording), trajectory.frames[: max_steps + 1]
     if truth is None or len(frames) < 2:
         return None

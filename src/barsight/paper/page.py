@@ -1,4 +1,4 @@
-"""Write the page of the paper: every entry with its pictures and tables, in one file."""
+"""Write the page about the paper: every entry with its pictures and tables, in one file."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _NAMES = {"barsight": "ours"}
 
 @dataclass(frozen=True)
 class PaperTable:
-    """A table of the page: heads, rows of cells, and a line below."""
+    """A table of the page: headers, rows of cells, and a note below."""
 
     heads: tuple[str, ...]
     rows: Cells
@@ -49,7 +49,7 @@ class PaperTable:
 
 @dataclass(frozen=True)
 class PageContent:
-    """Pictures, tables and findings by the place of their entry; further tables with their titles."""
+    """Pictures, tables and findings by the id of their entry; further tables with their titles."""
 
     pictures: dict[str, list[PaperPicture]]
     tables: dict[str, PaperTable]
@@ -58,7 +58,7 @@ class PageContent:
 
 
 def write_paper(out: Path, advance: ProgressCallback, *, quick: bool, recording: Path | None) -> None:
-    """Run everything and write OUT/paper.html, whole or not at all."""
+    """Run everything and write OUT/paper.html, completely or not at all."""
     scale = runs.QUICK if quick else runs.FULL
     began, cpu = time.perf_counter(), time.process_time()
     with atomic_directory(out) as folder, tempfile.TemporaryDirectory() as scratch_name:
@@ -141,7 +141,7 @@ def _feature_pictures(
 
 
 def _surface_pictures(view: TwoViews, pictures: dict[str, list[PaperPicture]]) -> dict[str, float]:
-    """Draw the figures of stereo; each depth's median error, mm."""
+    """Draw the figures about stereo; returns the median error of each depth, mm."""
     pair = view.old.pair
     disparities = surface.match_three(pair)
     if not disparities:
@@ -329,6 +329,6 @@ def _icp(score: IcpScore) -> PaperTable:
 
 
 def expect_recording(path: Path | None) -> None:
-    """Check that a recording is there. Raises InputError where it isn't."""
+    """Check that the recording exists. Raises InputError otherwise."""
     if path is not None and not path.exists():
         raise InputError(path, "no such recording", "name a recording, or leave --recording out")

@@ -1,4 +1,4 @@
-"""Draw the pictures that the figures share: gray pictures with lines, coloured maps, and lines in a plot."""
+"""Draw what the figures share: gray images with lines, coloured maps, and line plots."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ WIDTH_PX = 560
 
 @dataclass(frozen=True)
 class PaperPicture:
-    """A picture of a figure: its data URI and a line below it. is_wide: it takes the page's whole width."""
+    """A picture of a figure: its data URI and caption. is_wide: it takes the full width of the page."""
 
     uri: str
     caption: str
@@ -25,14 +25,14 @@ class PaperPicture:
 
 
 def picture_of(canvas: UInt8, caption: str) -> PaperPicture:
-    """Encode a picture (H, W, 3) for the page; one broader than `WIDTH_PX` takes its whole width."""
+    """Encode a picture (H, W, 3) for the page; one wider than `WIDTH_PX` takes the page's full width."""
     opaque = np.full((*canvas.shape[:2], 1), 255, np.uint8)
     uri = data_uri(np.dstack([canvas, opaque]), lossless=False)
     return PaperPicture(uri, caption, canvas.shape[1] > WIDTH_PX)
 
 
 def draw_lines(canvas: UInt8, old: Float64, new: Float64, kept: Bool, colour: Colour) -> None:
-    """Draw lines from old to new places (N, 2) where `kept`; a dot stands at the new one."""
+    """Draw lines from old to new positions (N, 2) where `kept`, with a small circle at the new one."""
     for (x0, y0), (x1, y1) in zip(old[kept], new[kept], strict=True):
         start, end = (round(x0), round(y0)), (round(x1), round(y1))
         cv2.line(canvas, start, end, colour, 1, cv2.LINE_AA)
@@ -40,7 +40,7 @@ def draw_lines(canvas: UInt8, old: Float64, new: Float64, kept: Bool, colour: Co
 
 
 def heat_picture(values: Float32, caption: str, span: tuple[float, float] | None = None) -> PaperPicture:
-    """Paint values (H, W) by colour, dark where unknown."""
+    """Draw values (H, W) in colour; unknown ones are dark."""
     low, high = span or robust_range(values, 2, 98)
     painted = colours(values, low, high, cv2.COLORMAP_VIRIDIS)
     painted[~np.isfinite(values)] = 25
@@ -51,7 +51,7 @@ def heat_picture(values: Float32, caption: str, span: tuple[float, float] | None
 def line_picture(
     lines: list[tuple[Float64, Float64, Colour]], axes: tuple[str, str], caption: str
 ) -> PaperPicture:
-    """Plot lines (x, y, colour) over one pair of axes; their ends are written beside them."""
+    """Plot lines (x, y, colour) on common axes, with the ends of the axes labelled."""
     width, height, edge = 2 * WIDTH_PX, 320, 46
     canvas = np.full((height, width, 3), 252, np.uint8)
     xs = np.concatenate([x[np.isfinite(y)] for x, y, _ in lines])

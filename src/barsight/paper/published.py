@@ -1,4 +1,4 @@
-"""Hold the paper's published tables, and recompute what is printed wrong."""
+"""List the values of the paper's published tables, and recompute those printed wrong."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ TARGET_SIZE = (
 )  # fmt: skip
 """Table 1: range (mm), then size (mm) and printed error (%) by SGBM, CSCA and the paper's method."""
 FEATURES = {"sift": (18972, 7840, 107, 1980), "surf": (8240, 6070, 36, 2160), "orb": (500, 1580, 41, 1580)}
-"""Table 2: features and ms on the side, then on the top."""
+"""Table 2: number of features and ms in the side view, then in the top view."""
 MATCHES = {
     "sift": (2823, 837, 12050, 107, 4, 1930), "surf": (534, 208, 6630, 69, 17, 2170),
     "orb": (59, 28, 2620, 41, 20, 1750),
 }  # fmt: skip
-"""Table 3: initial matches, after filtering and ms on the side, then on the top."""
+"""Table 3: initial matches, matches after filtering and ms in the side view, then in the top view."""
 RELATIVE_TO_M = 3.77
-"""What Table 4's relative errors are taken against: 9.82 mm / 0.26 % and 17.73 mm / 0.47 % both say so."""
+"""Reference length of Table 4's relative errors, m: 9.82 mm / 0.26 % and 17.73 mm / 0.47 % both imply it."""
 LASER = ("0", "0", "0", "0", "2D", "single point scan", "10", "2")
 VISION = ("9.82", "0.26 %", "17.73", "0.47 %", "3D", "face scan", "9.56", "30 (the camera's)")
 """Table 4: MAE (mm), MRE, largest error (mm), largest relative error, dimension, method, spacing (mm), Hz."""

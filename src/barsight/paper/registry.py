@@ -1,4 +1,4 @@
-"""List what the paper has, the code that implements each thing, and its place on the page."""
+"""List the paper's contents, the code that implements each item, and its place on the page."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ CAMERA_IMU = "barsight calibrate camera-imu R -o OUT"
 
 @dataclass(frozen=True)
 class PaperEntry:
-    """A thing of the paper. code: `module:name` of what implements it, below `barsight`; paper: what it is
-    there; ours: a sentence on ours; command: what runs it.
+    """An item of the paper. code: `module:name` of its implementation, below `barsight`; paper: its
+    content there; ours: a sentence on our version; command: the command that runs it.
     """
 
     kind: Kind
@@ -33,7 +33,7 @@ class PaperEntry:
 
 
 def find_code(name: str) -> Any:
-    """Find what `module:name` names. Raises ImportError or AttributeError where there is no such thing."""
+    """Find the object named `module:name`. Raises ImportError or AttributeError if it doesn't exist."""
     module, _, attributes = name.partition(":")
     found: Any = importlib.import_module(f"barsight.{module}")
     for attribute in attributes.split("."):
@@ -336,4 +336,4 @@ FURTHER = (
     ("more sensors (6): a second pair on the same body", "barsight measure PAIR1 PAIR2 -o OUT"),
     ("other environments (6)", "barsight simulate R --draw 7"),
 )
-"""Parts of the paper without a number: each one's name, its place here, and its command."""
+"""Parts of the paper without a number: name of each, its place here, and its command."""

@@ -1,4 +1,4 @@
-"""Run what the page shows: draw the recordings, measure them by the paper's method and by ours."""
+"""Run what the page shows: render the recordings, and measure them by the paper's method and by ours."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ PAPER = MeasureSettings(
     motion=MotionSettings(estimator="paper"),
     map=MapSettings(contours="paper"),
 )
-"""The paper's method; only the first frame's place is the crane's."""
+"""The paper's method; it takes only the first frame's position from the crane."""
 OURS = MeasureSettings()
 ENVIRONMENTS: dict[str, tuple[LightSettings, FaultSettings]] = {
     "dim lamps": (LightSettings(lamp_ratio=0.25, ambient=0.08), FaultSettings()),
@@ -45,13 +45,13 @@ ENVIRONMENTS: dict[str, tuple[LightSettings, FaultSettings]] = {
     "flicker": (LightSettings(), FaultSettings(flicker_ratio=0.2, exposure_step_ratio=0.2)),
     "sun": (LightSettings(sun_ratio=3.0), FaultSettings(glare_ratio=0.3)),
 }
-"""Degradations of the paper's scene."""
+"""Degradations of the paper's scene, by name: light, and image faults."""
 QUICK_ENVIRONMENTS = ("dim lamps", "haze")
 
 
 @dataclass(frozen=True)
 class PaperScale:
-    """Scale of a run sets how much is drawn. size_px: width, height; ranges_mm, poses: of Table 1."""
+    """Amount of work of a run. size_px: image width and height; ranges_mm, poses: of Table 1."""
 
     length_m: float
     frames: int
@@ -62,20 +62,20 @@ class PaperScale:
     icp_steps: int
 
     def recording(self) -> SimulationSettings:
-        """Describe the stack that is travelled over."""
+        """Define the recording over a stack."""
         return SimulationSettings(
             length_m=self.length_m, frames=self.frames, seed=SEED, bars=BARS, camera=self.camera(),
             yard=YardSettings(bar_length_m=5.0),
         )  # fmt: skip
 
     def side(self) -> SimulationSettings:
-        """Describe views of a stack's side, from near and aslant."""
+        """Define the recording of a stack's side, near and at an oblique angle."""
         camera = replace(self.camera(), above_floor_m=3.2, trolley_y_m=3.6, tilt_deg=-28.0)
         yard = YardSettings(bar_length_m=5.0, max_layers=3)
         return SimulationSettings(length_m=3.0, frames=8, seed=SEED, camera=camera, yard=yard)
 
     def environment(self, name: str) -> SimulationSettings:
-        """Describe a short stack under a degradation."""
+        """Define the recording of a short stack under a degradation."""
         light, faults = ENVIRONMENTS[name] if name in ENVIRONMENTS else (LightSettings(), FaultSettings())
         camera = self.camera()
         return replace(
@@ -83,7 +83,7 @@ class PaperScale:
         )
 
     def camera(self) -> CameraSettings:
-        """Describe the crane's camera at this size."""
+        """Define the crane's camera at this image size."""
         width, height = self.size_px
         return CameraSettings(width_px=width, height_px=height, focal_px=1250 * width / 1280)
 
@@ -94,7 +94,7 @@ QUICK = PaperScale(10.0, 25, (320, 256), (1800, 8500), 1, QUICK_ENVIRONMENTS, 4)
 
 @dataclass(frozen=True)
 class EnvironmentRow:
-    """One method under one degradation: frames placed, and its contour's figures; why it failed, else ""."""
+    """One method under one degradation: frames placed, figures of its contour, and failure or ""."""
 
     name: str
     method: str
@@ -105,7 +105,7 @@ class EnvironmentRow:
 
 
 def draw(out: Path, settings: SimulationSettings, stage: str, advance: ProgressCallback) -> Path:
-    """Draw a recording and return its folder."""
+    """Render a recording and return its folder."""
     simulate(out, settings, lambda done, total: advance(stage, done, total))
     return out
 
@@ -114,7 +114,7 @@ def measure(
     recording: Path, out: Path, settings: MeasureSettings, *, with_truth: bool, stage: str = "",
     advance: ProgressCallback | None = None,
 ) -> dict[str, Any] | BarsightError:  # fmt: skip
-    """Measure a recording and return what result.json says, or why it can't be measured."""
+    """Measure a recording and return the content of result.json, or the error if it can't be measured."""
 
     def report(part: str, done: int, total: int) -> None:
         if advance is not None:
@@ -129,7 +129,7 @@ def measure(
 
 
 def trajectories(recording: Recording) -> tuple[Trajectory, list[DriftRow]]:
-    """Estimate by the paper's stitching on stereo and IMU alone, and by ours; each against truth."""
+    """Estimate trajectories by the paper's stitching (stereo, IMU) and by ours, each with its drift."""
     alone, rectifier = SelectedSensors(recording, ("stereo", "imu")), Rectifier(recording.rig)
     paper = make_estimator(MotionSettings(estimator="paper"))(alone, rectifier, lambda: None)
     rows = [drift_row("paper, stereo and IMU", paper, recording)]
@@ -173,6 +173,6 @@ def _environment_row(name: str, method: str, content: dict[str, Any] | BarsightE
 
 
 def target_sizes(scale: PaperScale) -> TargetSizeBench:
-    """Measure a drawn bar of 90 mm by the methods of Table 1."""
+    """Measure a rendered bar of 90 mm by the methods of Table 1."""
     methods: dict[str, StereoMethod] = {name: make_method(StereoSettings(method=name)) for name in METHODS}
     return bench_target_size(methods, scale.poses, scale.ranges_mm)

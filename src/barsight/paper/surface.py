@@ -1,4 +1,4 @@
-"""Show stereo below the pixel on one view [paper Figures 1-3]."""
+"""Show sub-pixel stereo on one view [paper Figures 1-3]."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ WINDOW_PX = 7
 
 
 def match_three(pair: RectifiedPair) -> dict[str, Float32]:
-    """Match by SGBM (the loop's D0), the paper's loop and ours: disparities (H, W) px."""
+    """Match by SGBM (the loop's D0), by the paper's loop and by our method: disparities (H, W), px."""
     candidates = find_disparity_range(pair)
     if isinstance(candidates, Failed):
         return {}
@@ -29,7 +29,7 @@ def match_three(pair: RectifiedPair) -> dict[str, Float32]:
 
 
 def cost_curve(pair: RectifiedPair, disparity: Float32) -> PaperPicture:
-    """Draw the costs about the best of a textured pixel, and the parabola through three [paper Figure 1]."""
+    """Draw a textured pixel's costs around their minimum, and the parabola through three [paper Figure 1]."""
     gray = pair.left.astype(np.float32)
     strength = cv2.boxFilter(np.abs(cv2.Sobel(gray, cv2.CV_32F, 1, 0)), -1, (WINDOW_PX, WINDOW_PX))
     reach = WINDOW_PX + 4
@@ -64,7 +64,7 @@ def cost_curve(pair: RectifiedPair, disparity: Float32) -> PaperPicture:
 
 
 def loop_pictures(disparities: dict[str, Float32]) -> tuple[PaperPicture, ...]:
-    """Paint D0 and the loop's end [paper Figure 2], with how far from half a pixel they keep."""
+    """Draw D0 and the loop's result [paper Figure 2], with their shares of nearly whole disparities."""
     return tuple(
         heat_picture(disparities[label], f"{label}: {whole_pct(disparities[label]):.0f} % lie within "
                      "0.1 px of a whole disparity (20 % would by chance)")
@@ -73,13 +73,13 @@ def loop_pictures(disparities: dict[str, Float32]) -> tuple[PaperPicture, ...]:
 
 
 def whole_pct(disparity: Float32) -> float:
-    """Compute the share of disparities within 0.1 px of whole ones, %."""
+    """Compute the share of disparities within 0.1 px of a whole number, %."""
     known = disparity[np.isfinite(disparity)]
     return 100 * float((np.abs(known - np.round(known)) < 0.1).mean()) if known.size else float("nan")
 
 
 def depth_maps(pair: RectifiedPair, disparities: dict[str, Float32]) -> dict[str, Float64]:
-    """Compute depth (H, W) from whole disparities, the paper's and ours, m; NaN where not matched."""
+    """Compute depth (H, W), m, from whole disparities, the paper's and ours; NaN where unmatched."""
     shown = {"whole disparities": np.round(disparities["paper"])}
     shown |= {"paper, below the pixel": disparities["paper"], "ours": disparities["ours"]}
     camera = pair.camera
@@ -91,7 +91,7 @@ def depth_maps(pair: RectifiedPair, disparities: dict[str, Float32]) -> dict[str
 
 
 def depth_errors_mm(depths: dict[str, Float64], true_m: Float64 | None) -> dict[str, float]:
-    """Compute each map's median depth error, mm, where all know it; NaN without true depth (H, W)."""
+    """Compute each map's median depth error, mm, where all have a depth; NaN without true depth (H, W)."""
     if true_m is None:
         return dict.fromkeys(depths, float("nan"))
     off = {label: 1e3 * np.abs(depth - true_m) for label, depth in depths.items()}
@@ -104,8 +104,8 @@ def depth_errors_mm(depths: dict[str, Float64], true_m: Float64 | None) -> dict[
 def relief_pictures(
     pair: RectifiedPair, depths: dict[str, Float64], errors_mm: dict[str, float]
 ) -> tuple[PaperPicture, ...]:
-    """Paint the view's relief from whole disparities, the paper's and ours [paper Figure 3], lit aslant; the
-    median depth error stands below where it is known.
+    """Draw the view's relief from whole disparities, the paper's and ours [paper Figure 3], lit obliquely;
+    captioned with the median depth error if it is known.
     """
     made = []
     for label, depth in depths.items():
