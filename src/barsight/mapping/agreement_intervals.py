@@ -14,6 +14,9 @@ from barsight.core.arrays import Bool, Float64
 FEWEST = 8
 """Minimum number of samples for which confidence intervals are computed."""
 Z_95 = 1.959964
+ROUNDS = 10
+MIN_ALONE = 1.5
+"""So many independent samples any series has: of fewer, the spread about their mean says nothing."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,8 @@ def effective_samples(series: Float64) -> float:
     """Count the independent samples that would estimate the mean of a series equally well; NaN marks gaps.
 
     series: (N,) evenly spaced. The sum of autocorrelations ends at the first pair of lags whose sum isn't
-    positive, and each pair counts at most as much as the one before it [Geyer 1992].
+    positive, and each pair counts at most as much as the one before it [Geyer 1992]. Autocorrelations about
+    the series' own mean are too small by that mean's variance, which is added back.
     """
     known = np.isfinite(series)
     count = int(known.sum())
@@ -62,12 +66,15 @@ def effective_samples(series: Float64) -> float:
     pairs = np.rint(np.fft.irfft(np.abs(np.fft.rfft(known.astype(float), size)) ** 2, size)[: series.size])
     lags = np.arange(count // 2)
     lags = lags[pairs[lags] > 0]
-    rho = products[lags] / pairs[lags] * count / products[0]
-    weight = np.where(lags == 0, 1.0, 2 * pairs[lags] / count)
-    terms = (weight * rho)[: 2 * (lags.size // 2)].reshape(-1, 2).sum(axis=1)
-    ended = np.flatnonzero(terms <= 0)
-    terms = np.minimum.accumulate(terms[: ended[0]] if ended.size else terms)
-    return count / max(float(terms.sum()), 1.0)
+    seen = products[lags] / pairs[lags] * count / products[0]
+    weight, alone = np.where(lags == 0, 1.0, 2 * pairs[lags] / count), float(count)
+    for _ in range(ROUNDS):
+        rho = seen + (1 - seen) / alone
+        terms = (weight * rho)[: 2 * (lags.size // 2)].reshape(-1, 2).sum(axis=1)
+        ended = np.flatnonzero(terms <= 0)
+        terms = np.minimum.accumulate(terms[: ended[0]] if ended.size else terms)
+        alone = max(count / max(float(terms.sum()), 1.0), MIN_ALONE)
+    return alone
 
 
 def agreement_intervals(
@@ -86,7 +93,7 @@ def agreement_intervals(
     if count < FEWEST:
         return AgreementIntervals(count, *[float("nan")] * 13)
     alone = effective_samples(series)
-    bias, spread = float(d.mean()), float(d.std(ddof=1))
+    bias, spread = float(d.mean()), float(d.std() / np.sqrt(1 - 1 / alone))
     free = max(alone - 1, 1.0)
     standard = spread / np.sqrt(alone)
     half, one_sided = (float(stdtrit(free, share)) * standard for share in (0.975, 0.95))
