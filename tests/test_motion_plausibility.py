@@ -307,6 +307,25 @@ def test_both_sides_of_a_jump_are_used(data: Path) -> None:
     assert len(found.doubts) == 1 and "encoder jumps" in found.doubts[0]
 
 
+def test_a_shock_beyond_the_imus_scale_throws_no_live_pose(data: Path) -> None:
+    """A bundle set down: 0.1 s at 4 g. The live estimate believed it, and was 11.8 m off."""
+
+    def shock(imu: ImuSamples) -> ImuSamples:
+        accel, at = imu.accel_mps2.copy(), int(np.searchsorted(imu.stamp_ns, imu.stamp_ns[0] + 9_300_000_000))
+        accel[at : at + 20, 2] = 39.2
+        return replace(imu, accel_mps2=accel)
+
+    path = data / "yard_dev"
+    recording = SpoiledRecording(open_recording(path), spoil_imu=shock)
+    live = FixedLagFusion(FusionSettings(), FixedLagSettings(), CraneSettings())
+    found = live(recording, Rectifier(recording.rig), lambda: None)
+    drift = trajectory_drift(found, read_ground_truth(path), recording.rig.timeshift_cam_imu_ns)
+    assert drift is not None and drift.reference_rmse_mm < 0.9 and drift.nees_position < 1.5
+    assert found.doubts == () and found.warnings == (
+        "20 IMU samples are at the end of their scale and were left out",
+    )
+
+
 def test_an_encoder_that_lost_count_is_told(data: Path) -> None:
     """One that goes on where it should after 2 s costs nothing; one that misses 30 mm is taken off."""
     mm, _, told = estimated(

@@ -55,16 +55,21 @@ def without_saturation(imu: ImuSamples) -> tuple[ImuSamples, int]:
     """
     wrong = np.zeros(imu.stamp_ns.size, dtype=np.bool_)
     for axis in np.hstack([imu.gyro_radps, imu.accel_mps2]).T:
-        middle = np.median(axis)
-        usual = mad_sigma(axis - middle) + 1e-6
-        counts = np.diff(np.unique(axis))
-        count = counts[counts > MIN_COUNT].min(initial=np.inf)
         for end in (axis.min(initial=np.inf), axis.max(initial=-np.inf)):
-            if axis.size and abs(end - middle) > SATURATED_SIGMAS * usual:
+            if np.count_nonzero(axis == end) < SATURATED_SAMPLES:  # nearly always, and quickly seen
+                continue
+            middle, counts = np.median(axis), np.diff(np.unique(axis))
+            if abs(end - middle) > SATURATED_SIGMAS * (mad_sigma(axis - middle) + 1e-6):
+                count = counts[counts > MIN_COUNT].min(initial=np.inf)
                 wrong |= _held(axis, float(end), SWING_COUNTS * float(count))
     kept = ~wrong
     part = ImuSamples(imu.stamp_ns[kept], imu.gyro_radps[kept], imu.accel_mps2[kept])
     return part, int(wrong.sum())
+
+
+def saturation_sentences(count: int) -> tuple[str, ...]:
+    """Tell of so many samples that left."""
+    return (f"{count} IMU samples are at the end of their scale and were left out",) if count else ()
 
 
 def _held(axis: Float64, end: float, min_step: float) -> Bool:

@@ -17,7 +17,7 @@ from barsight.core.records.sensor_samples import CraneSamples, ImuSamples
 from barsight.core.records.trajectory import PosedFrame, Trajectory
 from barsight.core.settings.values import NOT_NEGATIVE, OVER_0, expect_ranges
 from barsight.core.stamps import seconds_to_ns
-from barsight.inertial.model import ORDINARY_NOISE, without_saturation
+from barsight.inertial.model import ORDINARY_NOISE, saturation_sentences, without_saturation
 from barsight.motion.batch.detail import joint_sentences, jumps_alone, select_detail, untied_pictures
 from barsight.motion.batch.fault_detection import check_crane, frames_off
 from barsight.motion.batch.sensor_agreement import refuse_contradictions
@@ -212,8 +212,7 @@ class BatchPoses:
             known = known_motion(sightings, self._imu, self._rectifier, shift)
             checked = check_crane(reestimate_noise(self._stated), known)
             crane, doubts = checked.samples, checked.warnings
-        if self._spoiled:
-            warnings += (f"{self._spoiled} IMU samples are at the end of their scale and were left out",)
+        warnings += saturation_sentences(self._spoiled)
         if self.reads_pictures:
             few, most = untied_pictures(sightings, refused)
             warnings, doubts = warnings + few, doubts + most

@@ -14,7 +14,7 @@ from barsight.core.records.pairs import RefusedFrame
 from barsight.core.records.trajectory import PosedFrame, Trajectory
 from barsight.core.settings.values import expect_ranges
 from barsight.core.stamps import seconds_to_ns
-from barsight.inertial.model import ORDINARY_NOISE
+from barsight.inertial.model import ORDINARY_NOISE, saturation_sentences, without_saturation
 from barsight.motion.batch.fusion import FusionSettings
 from barsight.motion.batch.sensor_agreement import refuse_contradictions
 from barsight.motion.crane.encoder_trajectory import CraneSettings
@@ -98,8 +98,9 @@ class FixedLagPoses(ImmediatePoses):
     def finish(self) -> Trajectory:
         """Return all poses. Raises InputError where the pictures contradict a sensor."""
         readings = self._estimator.readings
+        imu, spoiled = (None, 0) if readings.imu is None else without_saturation(readings.imu)
         refuse_contradictions(
-            self._recording.path, self._estimator.motions, readings.imu, readings.crane, self._rectifier,
+            self._recording.path, self._estimator.motions, imu, readings.crane, self._rectifier,
             self._recording.rig.timeshift_cam_imu_ns,
         )  # fmt: skip
         names = {"crane": readings.crane, "imu": readings.imu, "stereo": self.reads_pictures or None}
@@ -107,6 +108,7 @@ class FixedLagPoses(ImmediatePoses):
         doubts, warnings = self._estimator.encoder_faults()
         if self._level is not None:
             warnings += self._level.warnings
+        warnings += saturation_sentences(spoiled)
         if untied := sum(frame.reason == UNTIED for frame in self.refused):
             doubts += (untied_sentence(untied),)
         return Trajectory(
