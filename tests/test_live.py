@@ -323,6 +323,19 @@ def test_a_freeze_shows_within_a_second_and_a_stop_is_none() -> None:
         assert (first is not None and 3 < first < 4 and all(seen[80:])) if frozen else first is None
 
 
+def test_one_encoder_alone_that_freezes_shows_as_long_as_it_does() -> None:
+    """The bridge stands at 1.5 m from 3 to 10 s; the trolley jitters by a count, then travels too."""
+    t = np.arange(0, 14, 0.05)
+    stamps, rng = (1e9 * t).astype(np.int64), np.random.default_rng(5)
+    place = np.zeros((t.size, 3))
+    place[:, 0] = np.where((t > 3) & (t < 10), 1.5, 0.5 * t).round(3)
+    place[:, 1] = (np.clip(t - 5, 0, None) * 0.2 + rng.normal(0, 0.0007, t.size)).round(3)
+    watch = FreezeWatch(CraneSamples(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(3), np.eye(3), 0.002))
+    parts = [slice(max(k - 100, 0), k) for k in range(t.size)]
+    seen = np.array([watch.check(stamps[part], place[part]) for part in parts])
+    assert not seen[t <= 3].any() and seen[(t > 4) & (t <= 10)].all() and not seen[t > 10.2].any()
+
+
 def test_a_replay_gives_all_in_order_and_goes_on_where_it_was(whole: Path) -> None:
     recording = bs.open_recording(whole)
     source = ReplaySource(recording, ReplayClock(0, 0, 0.0), lambda: True)

@@ -13,7 +13,7 @@ from barsight.core.arrays import Float64, Int64
 from barsight.core.records.sensor_samples import CraneSamples
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.live.settings import LiveSettings
-from barsight.motion.batch.fault_detection import frozen_stretches
+from barsight.motion.batch.fault_detection import frozen_now
 
 ModeName = Literal["full", "no-imu", "no-encoders", "encoders-only", "blind"]
 MODES: dict[ModeName, str] = {
@@ -125,23 +125,21 @@ def _silence(name: str, silent_ns: int, bound_s: float) -> str:
 
 
 class FreezeWatch:
-    """Detects frozen encoders. mounted: provides everything but the readings."""
+    """Detects that the encoders, or one of them, are frozen. mounted: provides everything but the readings."""
 
     def __init__(self, mounted: CraneSamples) -> None:
         self._mounted = mounted
-        self._since: Float64 | None = None
+        self._since, self._axes = np.zeros(3), np.zeros(3, np.bool_)
 
     def check(self, stamp_ns: Int64, position_m: Float64) -> bool:
         """Examine the newest readings, (N,) and (N, 3), of the last few seconds."""
         if len(stamp_ns) == 0:
             return False
-        if self._since is not None and (position_m[-1] == self._since).all():
+        if self._axes.any() and (position_m[-1] == self._since)[self._axes].all():
             return True
-        self._since = None
         crane = replace(self._mounted, stamp_ns=stamp_ns, position_m=position_m)
-        if any(last == len(stamp_ns) - 1 for _, last in frozen_stretches(crane)):
-            self._since = position_m[-1]
-        return self._since is not None
+        self._since, self._axes = position_m[-1], frozen_now(crane)
+        return bool(self._axes.any())
 
 
 class JumpWatch:

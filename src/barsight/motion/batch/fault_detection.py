@@ -205,6 +205,18 @@ def frozen_stretches(crane: CraneSamples) -> list[tuple[int, int]]:
     return found
 
 
+def frozen_now(crane: CraneSamples) -> Bool:
+    """Check which encoders (3,) stand frozen at the last reading: each by itself, else all together."""
+    time, min_m = (crane.stamp_ns - crane.stamp_ns[:1]) / NS_PER_S, min_way_m(crane)
+    last = len(time) - 1
+
+    def is_frozen(axes: list[int]) -> bool:
+        return any(end == last for _, end in _frozen(crane.position_m[:, axes], time, min_m))
+
+    each = np.array([is_frozen([axis]) for axis in range(3)])
+    return each if each.any() else np.full(3, is_frozen([0, 1, 2]))
+
+
 def _frozen(place: Float64, time: Float64, min_m: float) -> list[tuple[int, int]]:
     """Find stretches (first, last) of equal readings (N, A) of encoders that must have moved by `min_m`."""
     same = np.r_[False, (np.diff(place, axis=0) == 0).all(axis=1), False]
