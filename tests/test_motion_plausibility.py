@@ -71,7 +71,7 @@ def test_a_crane_that_brakes_and_starts_anew_froze_nothing(rate_hz: float, accel
 
 
 def test_one_encoder_alone_that_freezes_is_found() -> None:
-    """By the batch, and by the live watch, which no longer sees where it began."""
+    """Batch and live watch find it, though the latter no longer sees where it began."""
     crane = travelling()
     held = frozen_between(crane, 8.0, 10.5).position_m
     frozen = replace(crane, position_m=np.column_stack([held[:, 0], crane.position_m[:, 1:]]))
