@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from barsight.core.errors import BarsightError, InputError
 from barsight.core.notices import FORBIDS, WARNINGS
+from barsight.core.records.sensor_samples import ImuSamples
 from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings
 from barsight.motion.batch.sensor_agreement import refuse_contradictions
@@ -97,6 +98,17 @@ def test_encoders_that_freeze_have_no_wrong_unit_or_mounting(axes: list[int]) ->
     assert judged(range(100, 110), places(frozen)) == [""] * 10
     told = judged(range(100, 106), places(lambda place: 1000 * frozen(place)))
     assert sum("wrong unit" in one for one in told) >= 5
+
+
+def test_a_gap_of_the_imu_is_no_wrong_mounting() -> None:
+    """How the body turned over 6 s without readings isn't known."""
+
+    def change(steps: DrawnSteps) -> DrawnSteps:
+        time_s = (steps.imu.stamp_ns - steps.imu.stamp_ns[0]) / 1e9
+        kept = np.abs(time_s - 0.4 * time_s[-1] - 3) > 3
+        return replace(steps, imu=ImuSamples(*(values[kept] for values in vars(steps.imu).values())))
+
+    assert judged(range(100, 130), change) == [""] * 30
 
 
 @pytest.mark.slow

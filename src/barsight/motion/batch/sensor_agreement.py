@@ -13,7 +13,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from barsight.calibration.geometry.rectification import Rectifier
-from barsight.core.arrays import Float64, Int64
+from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.errors import InputError
 from barsight.core.records.sensor_samples import CraneSamples, ImuSamples
 from barsight.core.stamps import interpolate_at, seconds_to_ns
@@ -24,7 +24,7 @@ from barsight.motion.batch.fault_detection import (
     frozen_stretches,
 )
 from barsight.motion.crane.known_motion import SeenSteps
-from barsight.motion.crane.sway import turned_angle
+from barsight.motion.crane.sway import MAX_GAP_S, turned_angle
 from barsight.motion.frontend.seen_steps import seen_steps
 from barsight.motion.frontend.sightings import Sighting
 
@@ -128,6 +128,7 @@ def _check_gyro(path: Path, steps: SeenSteps, imu: ImuSamples) -> None:
     def turned(late_s: float) -> tuple[Float64, Float64]:
         """Compute the turns (K, 3) by gyro and by pictures over the steps that both know."""
         gyro = _between(steps, imu.stamp_ns, angle, late_s)
+        gyro[_over_gap(steps, imu.stamp_ns, late_s)] = np.nan
         known = np.asarray(np.isfinite(gyro).all(axis=1))
         return varying(gyro)[known], varying(np.where(known[:, None], steps.turn, np.nan))[known]
 
@@ -194,6 +195,14 @@ def _steps(sightings: Sequence[Sighting], rectifier: Rectifier, shift_ns: int) -
     """Gather the steps that the pictures measured: at most `MAX_STEPS`, evenly spaced."""
     known = [k for k in range(1, len(sightings)) if sightings[k].motion is not None]
     return seen_steps(sightings, known[:: -(-len(known) // MAX_STEPS) or 1], rectifier, shift_ns)
+
+
+def _over_gap(steps: SeenSteps, stamp_ns: Int64, late_s: float) -> Bool:
+    """Select the steps (K,) over a gap of the IMU, whose stamps are `late_s` late: how it turned isn't known."""
+    late_ns, after = seconds_to_ns(late_s), np.flatnonzero(np.diff(stamp_ns) > seconds_to_ns(MAX_GAP_S)) + 1
+    begun = np.searchsorted(stamp_ns[after - 1], steps.new_ns + late_ns)
+    over: Bool = begun > np.searchsorted(stamp_ns[after], steps.old_ns + late_ns, side="right")
+    return over
 
 
 def _between(steps: SeenSteps, stamp_ns: Int64, values: Float64, late_s: float) -> Float64:
