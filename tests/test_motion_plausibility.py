@@ -326,6 +326,24 @@ def test_a_shock_beyond_the_imus_scale_throws_no_live_pose(data: Path) -> None:
     )
 
 
+@pytest.mark.parametrize(("first_s", "last_s"), [(3, 99), (-1, 8)])
+def test_a_live_estimate_goes_on_without_its_imu(data: Path, first_s: float, last_s: float) -> None:
+    """Unplugged for longer than readings are held, or plugged in late: every frame is placed by the rest."""
+
+    def silent(imu: ImuSamples) -> ImuSamples:
+        time_s = (imu.stamp_ns - imu.stamp_ns[0]) / 1e9
+        kept = (time_s < first_s) | (time_s > last_s)
+        return ImuSamples(*(values[kept] for values in vars(imu).values()))
+
+    path = data / "yard_dev"
+    recording = SpoiledRecording(open_recording(path), spoil_imu=silent)
+    live = FixedLagFusion(FusionSettings(), FixedLagSettings(frames=3), CraneSettings())
+    found = live(recording, Rectifier(recording.rig), lambda: None)
+    drift = trajectory_drift(found, read_ground_truth(path), recording.rig.timeshift_cam_imu_ns)
+    assert len(found.frames) == 19 and drift is not None
+    assert drift.reference_rmse_mm < 2 and drift.nees_position < 1.5
+
+
 def test_an_encoder_that_lost_count_is_told(data: Path) -> None:
     """One that goes on where it should after 2 s costs nothing; one that misses 30 mm is taken off."""
     mm, _, told = estimated(

@@ -43,7 +43,7 @@ class SeenSteps:
 
 @dataclass(frozen=True, eq=False)
 class KnownMotion:
-    """Travel as pictures and IMU know it; either may be None."""
+    """Travel as pictures and IMU know it; either may be None, and the IMU may have no readings."""
 
     steps: SeenSteps | None = None
     imu: ImuSamples | None = None
@@ -53,13 +53,14 @@ class KnownMotion:
         the IMU covers.
         """
         first, end = middle_ns - half_ns, middle_ns + half_ns + 1
-        if self.imu is not None and self.imu.stamp_ns[0] <= middle_ns <= self.imu.stamp_ns[-1]:
-            return max(first, int(self.imu.stamp_ns[0])), min(end, int(self.imu.stamp_ns[-1]) + 1)
+        stamps = () if self.imu is None else self.imu.stamp_ns
+        if len(stamps) and stamps[0] <= middle_ns <= stamps[-1]:
+            return max(first, int(stamps[0])), min(end, int(stamps[-1]) + 1)
         return first, end
 
     def by_imu(self, crane: CraneSamples, first_ns: int, last_ns: int) -> ImuWay | None:
         """Integrate the IMU between two stamps; None where it doesn't cover them or has a gap there."""
-        if self.imu is None:
+        if self.imu is None or not len(self.imu.stamp_ns):
             return None
         stamps, trend = self.imu.stamp_ns, seconds_to_ns(TREND_S)
         middle = (first_ns + last_ns) // 2

@@ -224,6 +224,8 @@ class FixedLagEstimator:
         parts: tuple[Preintegrated | None, ...] = (None,) * len(stamps)
         if now.imu is not None:
             parts = preintegrate_between(np.array([last_ns, *stamps]), now.imu, now.noise, window.bias)
+            if any(part is None for part in parts):  # a node between that no IMU ties, nothing else may place
+                stamps, parts = [stamp], (None,)
         poses, speeds = self._started(window, stamps, parts, sighting, now)
         grew = add_nodes(window, stamps, poses, speeds, parts)
         if now.imu is not None and self._stays(window, stamp, sighting, now):

@@ -156,7 +156,9 @@ def _resting(
 
 
 def is_imu_quiet(stamp_ns: Int64, imu: ImuSamples, noise: ImuNoise) -> Bool:
-    """Check whether the IMU shows nothing but noise around each of the stamps (M,)."""
+    """Check (M,) whether the IMU shows nothing but noise around each of the stamps; False without readings."""
+    if not imu.stamp_ns.size:
+        return np.zeros(len(stamp_ns), np.bool_)
     nearest = np.clip(np.searchsorted(imu.stamp_ns, stamp_ns), 0, imu.stamp_ns.size - 1)
     quiet: Bool = stands_still(imu, noise)[nearest]
     return quiet
