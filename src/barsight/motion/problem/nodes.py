@@ -19,7 +19,7 @@ from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.inertial.model import ImuBias
 from barsight.inertial.standstill import estimate_at_rest, stands_still
 from barsight.motion.crane.encoder_trajectory import fit_position
-from barsight.motion.frontend.chains import chained_poses
+from barsight.motion.frontend.chains import chained_poses, imu_bridges
 from barsight.motion.frontend.sightings import Sighting
 from barsight.motion.gravity import GravityAlignment
 
@@ -50,16 +50,19 @@ class ImuConstraints:
 
 
 def make_nodes(frames_ns: Int64, imu: ImuSamples | None) -> Nodes:
-    """Place nodes at the frames' stamps (IMU clock); with an IMU also between them and before the first."""
+    """Place nodes at the frames' stamps (IMU clock); with IMU readings also between them and before the first.
+
+    Only the IMU ties those additional nodes, so there are none where it is silent.
+    """
     if imu is None or imu.stamp_ns.size < 2:
         return Nodes(frames_ns, np.arange(len(frames_ns)))
-    edges = frames_ns.tolist()
+    edges, tied = frames_ns.tolist(), imu_bridges(imu, 0)
     lead = max(int(imu.stamp_ns[0]), edges[0] - seconds_to_ns(LEAD_S))
-    if edges[0] - lead > seconds_to_ns(0.1):
+    if edges[0] - lead > seconds_to_ns(0.1) and tied(lead, edges[0]):
         edges.insert(0, lead)
     stamps = [edges[0]]
     for first, last in pairwise(edges):
-        stamps += subdivide(first, last)
+        stamps += subdivide(first, last) if tied(first, last) else [last]
     stamp_ns = np.array(stamps, np.int64)
     return Nodes(stamp_ns, np.searchsorted(stamp_ns, frames_ns))
 
