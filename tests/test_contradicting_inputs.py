@@ -101,7 +101,7 @@ def test_encoders_that_freeze_have_no_wrong_unit_or_mounting(axes: list[int]) ->
 
 
 def test_a_gap_of_the_imu_is_no_wrong_mounting() -> None:
-    """How the body turned over 6 s without readings isn't known."""
+    """Over 6 s without readings nothing is known of the body's turn."""
 
     def change(steps: DrawnSteps) -> DrawnSteps:
         time_s = (steps.imu.stamp_ns - steps.imu.stamp_ns[0]) / 1e9
