@@ -241,7 +241,7 @@ def test_saturated_samples_leave() -> None:
 
 @pytest.mark.parametrize("period_s", [1.0, 2.5, 8.0])
 def test_the_top_of_a_slow_swing_is_no_end_of_scale(period_s: float) -> None:
-    """An IMU that filters and counts coarsely, as many do by default, on a crane that stands after it swung."""
+    """An IMU that filters and counts coarsely, as many do, on a crane that stands after it swung."""
     time = np.arange(8000) / 200
     swing = np.where(time < 16, np.sin(2 * np.pi * time / period_s), 0)[:, None]
     gyro, accel = 0.03 * swing * [1, 0.4, 0], 0.2 * swing * [0.3, 1, 0] + [0, 0, 9.8]

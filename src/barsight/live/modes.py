@@ -125,7 +125,7 @@ def _silence(name: str, silent_ns: int, bound_s: float) -> str:
 
 
 class FreezeWatch:
-    """Detects that the encoders, or one of them, are frozen. mounted: provides everything but the readings."""
+    """Detects that some or all encoders are frozen. mounted: provides everything but the readings."""
 
     def __init__(self, mounted: CraneSamples) -> None:
         self._mounted = mounted

@@ -50,7 +50,7 @@ class ImuConstraints:
 
 
 def make_nodes(frames_ns: Int64, imu: ImuSamples | None) -> Nodes:
-    """Place nodes at the frames' stamps (IMU clock); with IMU readings also between them and before the first.
+    """Place nodes at the frames' stamps (IMU clock); with an IMU also between them and before the first.
 
     Only the IMU ties those additional nodes, so there are none where it is silent.
     """
@@ -159,7 +159,7 @@ def _resting(
 
 
 def is_imu_quiet(stamp_ns: Int64, imu: ImuSamples, noise: ImuNoise) -> Bool:
-    """Check (M,) whether the IMU shows nothing but noise around each of the stamps; False without readings."""
+    """Check (M,) whether the IMU shows only noise around each of the stamps; False without readings."""
     if not imu.stamp_ns.size:
         return np.zeros(len(stamp_ns), np.bool_)
     nearest = np.clip(np.searchsorted(imu.stamp_ns, stamp_ns), 0, imu.stamp_ns.size - 1)
