@@ -53,7 +53,7 @@ class KnownMotion:
         the IMU covers.
         """
         first, end = middle_ns - half_ns, middle_ns + half_ns + 1
-        stamps = () if self.imu is None else self.imu.stamp_ns
+        stamps = np.empty(0, np.int64) if self.imu is None else self.imu.stamp_ns
         if len(stamps) and stamps[0] <= middle_ns <= stamps[-1]:
             return max(first, int(stamps[0])), min(end, int(stamps[-1]) + 1)
         return first, end
