@@ -98,7 +98,7 @@ def test_an_old_yard_can_be_looked_back_at(tmp_path: Path, capsys: pytest.Captur
     folder = write_folder(tmp_path / "out", age_s=3e7)
     assert lifts(folder, "--at", "end") == 0
     assert "not for a crane" in capsys.readouterr().err
-    assert "to look back: never for a crane" in (folder / "report.html").read_text()
+    assert "for review only. Never use these lifts at a crane." in (folder / "report.html").read_text()
     written = read_lifts(folder / "lifts.json")
     assert len(written["lifts"]) == 2
     assert written["judged_at_ns"] == written["captured_to_ns"] < time.time_ns() - 2e7 * NS_PER_S

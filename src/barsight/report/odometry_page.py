@@ -115,7 +115,7 @@ def _figures(result: OdometryResult) -> list[KeyFigure]:
         KeyFigure(
             "Frames", f"{len(trajectory.frames)} of {result.frames}", f"{len(trajectory.refused)} refused"
         ),
-        KeyFigure("Way", format_number(trajectory.length_m, 2, "m"), f"in {trajectory.reference}"),
+        KeyFigure("Travel", format_number(trajectory.length_m, 2, "m"), f"in {trajectory.reference}"),
         KeyFigure(
             "Stated sigma",
             format_number(place * 1e3, 2, "mm"),

@@ -156,7 +156,7 @@ def key_figures(result: dict[str, Any]) -> list[KeyFigure]:
             "Frames used", f"{frames.get('used', NONE)} of {frames.get('total', NONE)}", f"{refused} refused"
         ),
         KeyFigure(
-            "Way",
+            "Travel",
             format_number(trajectory.get("length_m"), 2, "m"),
             format_number(trajectory.get("duration_s"), 1, "s"),
         ),

@@ -295,7 +295,7 @@ def _note_looking_back(opened: Entry, read: MeasuredSurvey, survey_id: int) -> b
     """
     if read.lifts is None or not read.lifts["looks_back"] or read.identity.is_simulated:
         return False
-    reason = "its lifts were judged as of the last frame, to look back: never for a crane"
+    reason = "its lifts were judged at the time of the last frame, for review only, never for a crane"
     opened.add(SURVEY_VETOES, survey_id=survey_id, code="map-too-old", reason=reason)
     return True
 

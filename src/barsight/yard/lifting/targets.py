@@ -40,9 +40,9 @@ ANYWHERE = frozenset({"covered", "bundle-doubtful", "end-open", "mass-unknown", 
 SAME_TOP_M = 0.03
 SAME_YAW_RAD = np.radians(2.0)
 RULE = (
-    "Offered lifts come safest first: by the smallest of pull over needed pull, the worst pole's pull over "
-    "its share, capacity over load, and tolerance over the crane's tolerance; the higher bundle first where "
-    "two are equal."
+    "Lifts are sorted by their safety: the smallest of pull over needed pull, the worst pole's pull over its "
+    "share, capacity over load, and tolerance over the crane's tolerance. Of equal ones the higher bundle "
+    "comes first."
 )
 
 
