@@ -378,7 +378,7 @@ def test_a_wrong_key_is_refused_before_anything_is_measured(
     (tmp_path / "plan.toml").write_text(plan_text(planned()))
     line = ["accept", str(tmp_path / "plan.toml"), "nowhere", "-o", str(tmp_path / "cert")]
     assert run([*line, "--key", str(tmp_path / "key.pem")]) == 3
-    assert "is no private key" in capsys.readouterr().err
+    assert "is not a readable private key" in capsys.readouterr().err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["key.pem", "plan.toml"]
 
 

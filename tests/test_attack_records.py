@@ -70,7 +70,7 @@ def _no_space(path: Path, text: str, **_: Any) -> None:
             {"configuration": {"stereo": {"calibration_sigma_px": []}}},
             "doesn't say how sure the rig's calibration is",
         ),
-        ({"configuration": {"stereo": {"calibration_sigma_px": 1e100}}}, "rig's calibration can't be"),
+        ({"configuration": {"stereo": {"calibration_sigma_px": 1e100}}}, "rig's calibration is impossible"),
         ({"rig_uncertainty": {"yaw_deg": 0.01}}, "doesn't say how sure the rig's calibration is"),
         ({"rig_uncertainty": [3]}, "isn't as its schema says"),
         (

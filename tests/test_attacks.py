@@ -55,7 +55,7 @@ def test_yaml_of_any_kind_is_refused_at_once(tmp_path: Path, text: str) -> None:
 def test_json_of_any_kind_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "x.json"
     path.write_text(text)
-    with pytest.raises(InputError, match=r"x\.json: is no JSON"):
+    with pytest.raises(InputError, match=r"x\.json: is not a JSON"):
         read_json(path)
 
 

@@ -81,7 +81,7 @@ def test_the_matrix_projects() -> None:
         ({"fy_px": -500.0}, "must be positive"),
         ({"cx_px": float("nan")}, "not finite"),
         ({"cx_px": 5000.0}, "far outside"),
-        ({"width": 0}, "can't be"),
+        ({"width": 0}, "is impossible"),
         (
             {"distortion": Distortion.RADTAN, "coefficients": (0.1,) * 3},
             "takes 4 or 5 or 8 coefficients, not 3",

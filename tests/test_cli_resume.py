@@ -251,7 +251,7 @@ def test_a_planted_link_or_file_is_refused_and_nothing_behind_it_removed(tmp_pat
     (tmp_path / "link").symlink_to(tmp_path / "victim")
     (tmp_path / "file").touch()
     for root in ("link", "file"):
-        with pytest.raises(InputError, match="no folder of this user's own"):
+        with pytest.raises(InputError, match="not this user's own folder"):
             checkpoint_folder(tmp_path / root, "key")
     own = checkpoint_folder(tmp_path / "own", "key")
     (own.parent / "stale").symlink_to(tmp_path / "victim")

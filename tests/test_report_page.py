@@ -169,7 +169,7 @@ def test_mistakes_are_one_line(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"has no result\.json"):
         write_report(tmp_path, tmp_path / "report.html")
     (tmp_path / "result.json").write_text("{")
-    with pytest.raises(InputError, match="is no JSON file"):
+    with pytest.raises(InputError, match="is not a JSON file"):
         write_report(tmp_path, tmp_path / "report.html")
     folder = write_folder(tmp_path / "out")
     whole = (folder / "height.tif").read_bytes()

@@ -133,7 +133,7 @@ def test_a_missing_or_torn_list_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
         read_stock(tmp_path / "none.csv")
     (tmp_path / "torn.json").write_text("[{", encoding="utf-8")
-    with pytest.raises(InputError, match="is no JSON"):
+    with pytest.raises(InputError, match="is not a JSON"):
         read_stock(tmp_path / "torn.json")
     (tmp_path / "number.json").write_text("3", encoding="utf-8")
     with pytest.raises(InputError, match="no list of bundles"):
@@ -183,7 +183,7 @@ def test_no_bundles_make_a_valid_file(tmp_path: Path) -> None:
 def test_a_torn_or_other_version_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "bundles.json"
     for text, says in (
-        ("{", "is no JSON"),
+        ("{", "is not a JSON"),
         ('{"schema_version": 9}', "version 9"),
         ('{"bundles": []}', "schema_version"),
     ):
