@@ -255,7 +255,8 @@ def test_topics_are_recognised_by_type_or_named(tmp_path: Path) -> None:
     frame = next(open_recording(path, swapped).frames())
     assert isinstance(frame, StereoFrame)
     np.testing.assert_array_equal(frame.left, picture(1))
-    with pytest.raises(InputError, match=r"cam0_topic /nowhere is not a suitable topic .* choose one of /stereo/eye0"):
+    wrong = r"cam0_topic /nowhere is not a suitable topic .* choose one of /stereo/eye0"
+    with pytest.raises(InputError, match=wrong):
         open_recording(path, RecordingSettings(cam0_topic="/nowhere"))
     with pytest.raises(InputError, match="imu_topic /nowhere"):
         open_recording(path, RecordingSettings(imu_topic="/nowhere"))
