@@ -214,7 +214,7 @@ def _events(
 def _offset(magnet: Magnet) -> str:
     """Describe the magnet's offset from where the crane's readings place it."""
     if magnet.offset is None:
-        return "no touch-down told how the magnet hangs: its tolerance must hold that (calibrate magnet)"
+        return "the magnet's offset is not calibrated, so its tolerance must cover it (calibrate magnet)"
     figures = zip("xyz", magnet.offset.place_m, magnet.offset.sigma_m, strict=True)
     told = ", ".join(f"{axis} {1e3 * off:+.1f} ± {1e3 * sigma:.1f}" for axis, off, sigma in figures)
     return f"the magnet hangs off the crane's readings by {told} mm; crane_target has that taken off"
@@ -229,7 +229,7 @@ def print_lifts(plan: LiftPlan, console: Console) -> None:
     if plan.offered:
         title = "Lifts, safest first"
         if plan.looks_back:
-            title += ", as of the recording's end: not for a crane"
+            title += ", at the recording's end: not for a crane"
         table = Table(title=title, box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
         heads = (
             "rank", "bundle", "x m", "y m", "yaw deg", "kg", "pull/need", "± mm", "safety",

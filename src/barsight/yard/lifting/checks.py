@@ -66,7 +66,7 @@ def count_checks(
             check_min("count-uncertain", "bundles that the magnet would take", count, wanted, "", reason)
         )
     elif near.bundles:
-        why = f"; it is unsure whether bundle {near.bundles[int(np.argmax(held.flips))].id} is taken"
+        why = f"; it is uncertain whether bundle {near.bundles[int(np.argmax(held.flips))].id} is taken"
         checks.append(probability_check(held.probability, count, settings, why))
     shares = _unexplained(place, heights, magnet, near, contact, held)
     checks.append(
@@ -93,7 +93,8 @@ def probability_check(probability: float, count: int, settings: LiftSettings, wh
         NormalDist().inv_cdf(min(max(p, 1e-12), 1 - 1e-12))
         for p in (probability, settings.min_count_probability)
     )
-    reason = f"the probability that exactly {count} are taken is only {probability:.4f}{why}"
+    taken = "1 bundle is" if count == 1 else f"{count} bundles are"
+    reason = f"the probability that exactly {taken} taken is only {probability:.4f}{why}"
     bound = asked / (1 + SURE_OF_SIGMA)
     return check_min(
         "count-uncertain",
