@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 
 from barsight.benchmarks.yard import world_runs, world_scores
 from barsight.benchmarks.yard.bundle_scores import TrueBundle, bars_mass, read_true_bundles, score_bundles
-from barsight.benchmarks.yard.world_runs import WorldKeys, looked_at_list, run_world
+from barsight.benchmarks.yard.world_runs import WorldKeys, keep_measured, looked_at_list, read_note, run_world
 from barsight.benchmarks.yard.world_scores import WorldScore, world_rows
 from barsight.cli.main import run
 from barsight.core.errors import MeasurementError, OutputError
@@ -142,6 +143,37 @@ def test_a_world_is_done_once_and_a_refusal_is_a_score(
     (tmp_path / "seed_1/letter.txt").write_text("dear")
     with pytest.raises(OutputError, match="other things"):
         run_world(tmp_path, 1, GIVEN, keys, never, "")
+
+
+def test_a_killed_run_leaves_nothing_under_another_runs_keys(tmp_path: Path) -> None:
+    """Pictures of one yard were measured as another's."""
+    one, other = WorldKeys("r1", "m1", "s1"), WorldKeys("r2", "m2", "s2")
+    seen: list[str] = []
+
+    def run(keys: WorldKeys, *, killed: bool = False) -> list[str]:
+        def render(recording: Path) -> None:
+            recording.mkdir()
+            (recording / "of").write_text(keys.recording)
+
+        def measure(recording: Path, out: Path) -> None:
+            if killed:
+                raise KeyboardInterrupt
+            seen.append((recording / "of").read_text())
+            out.mkdir()
+
+        seen.clear()
+        keep_measured(tmp_path, read_note(tmp_path, "worlds"), keys, render, measure)
+        return seen.copy()
+
+    assert run(one) == ["r1"] and run(one) == []
+    with pytest.raises(KeyboardInterrupt):
+        run(other, killed=True)
+    assert run(one) == ["r1"]
+    assert run(replace(one, measured="m3")) == ["r1"]
+    shutil.rmtree(tmp_path / "measured")
+    assert run(replace(one, measured="m3")) == ["r1"], "what was removed by hand is done again"
+    with pytest.raises(OutputError, match="belongs to bench worlds"):
+        read_note(tmp_path, "lifts")
 
 
 def test_keys_follow_settings() -> None:

@@ -35,8 +35,13 @@ def main(folder: Path) -> None:
         page.evaluate("window.scrollTo(0, 0)")
         box = page.get_by_role("heading", name="Lifts", exact=True).bounding_box()
         assert box is not None
-        clip = {"x": box["x"] - 12, "y": box["y"], "width": WIDTH_PX - 2 * box["x"] + 24, "height": TABLES_PX}
-        _save("report_tables", page.screenshot(full_page=True, clip=clip))
+        left, width = box["x"] - 12, WIDTH_PX - 2 * box["x"] + 24
+        _save(
+            "report_tables",
+            page.screenshot(
+                full_page=True, clip={"x": left, "y": box["y"], "width": width, "height": TABLES_PX}
+            ),
+        )
         browser.close()
 
 

@@ -61,7 +61,7 @@ def run_world(
     for a folder that doesn't belong to this benchmark.
     """
     folder = keep / f"seed_{seed}"
-    note = read_note(folder)
+    note = read_note(folder, "worlds")
     note["looked_at"] = looked_at or note.get("looked_at", "") or looked_at_list().get(seed, "")
     note = keep_measured(
         folder, note, keys, lambda recording: simulate_world(recording, draw_world(seed, given)), measure
@@ -79,20 +79,23 @@ def run_world(
 def keep_measured(
     folder: Path, note: dict[str, Any], keys: WorldKeys, render: Callable[[Path], object], measure: Measure
 ) -> dict[str, Any]:
-    """Render `recording` and measure it into `measured`, in a folder, but for what is kept there by these
-    keys.
+    """Render `recording` and measure it into `measured`, in a folder, reusing what these keys find there.
 
-    note: of `read_note`. Returns it as it has become: `refused` says why the product refused to measure.
+    note: from `read_note`. Returns the updated note, whose `refused` says why the product refused to measure.
+    The note is written before anything is removed, so that a killed run leaves nothing under wrong keys.
     """
     recording, out = folder / "recording", folder / "measured"
     if note.get("recording") != keys.recording:
+        note = {"bench": note["bench"], "looked_at": note.get("looked_at", ""), "recording": ""}
+        _write_note(folder, note)
         _remove(recording, out)
-        note = {"looked_at": note.get("looked_at", ""), "recording": keys.recording}
     if not recording.is_dir():
         render(recording)
-    if note.get("measured") != keys.measured:
+    note["recording"] = keys.recording
+    if note.get("measured") != keys.measured or not (note["refused"] or out.is_dir()):
+        note |= {"measured": "", "refused": "", "score": ""}
+        _write_note(folder, note)
         _remove(out)
-        note |= {"refused": "", "score": ""}
         try:
             measure(recording, out)
         except OutputError:
@@ -115,20 +118,24 @@ def looked_at_list() -> dict[int, str]:
     }
 
 
-def read_note(folder: Path) -> dict[str, Any]:
-    """Read the note on what is kept in a folder, which is made where it isn't there. Raises OutputError for
-    one that is not of these benches.
+def read_note(folder: Path, bench: str) -> dict[str, Any]:
+    """Read the note on what a folder keeps; create the folder if it doesn't exist.
+
+    Raises OutputError for a folder that doesn't belong to this benchmark (`bench`).
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / NOTE
     if not path.is_file():
         if any(one.name not in ("recording", "measured") for one in folder.iterdir()):
             raise OutputError(f"{folder}: holds other things; name another folder with --keep")
-        return {}
+        return {"bench": bench}
     try:
-        return dict(json.loads(path.read_text(encoding="utf-8")))
+        note = {"bench": bench} | dict(json.loads(path.read_text(encoding="utf-8")))
     except ValueError as error:
         raise ConfigError(f"{path}: is damaged; remove it, and the world is done anew") from error
+    if note["bench"] != bench:
+        raise OutputError(f"{folder}: belongs to bench {note['bench']}; name another folder with --keep")
+    return note
 
 
 def _write_note(folder: Path, note: dict[str, Any]) -> None:

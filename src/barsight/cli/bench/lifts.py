@@ -152,7 +152,7 @@ def _measured(world: DrawnYard, folder: Path, settings: LiftSettings, given: _Gi
     """
     full_size = given.choice.full_size
     note = keep_measured(
-        folder, read_note(folder), given.keys,
+        folder, read_note(folder, "lifts"), given.keys,
         lambda recording: render_world(world, recording, full_size=full_size), _measure,
     )  # fmt: skip
     if note["refused"]:
