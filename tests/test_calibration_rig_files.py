@@ -101,7 +101,7 @@ def test_what_is_no_rig_is_said(tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match="no such file"):
         read_rig_file(tmp_path / "none.xml")
     (tmp_path / "torn.xml").write_text("<a")
-    with pytest.raises(CalibrationError, match="no file that OpenCV reads"):
+    with pytest.raises(CalibrationError, match="not a file that OpenCV reads"):
         read_rig_file(tmp_path / "torn.xml")
 
 

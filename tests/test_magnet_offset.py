@@ -108,7 +108,7 @@ def test_an_unsure_offset_forbids_what_the_tolerance_cannot_hold() -> None:
     plan = plan_lifts(map_of(stock), (record(stock[0]),), unsure, SETTINGS, (), travel, 1)
     assert plan.offered == ()
     (veto,) = plan.refused[0].vetoes
-    assert veto.code == "trajectory-degraded" and "touch-downs know x" in veto.reason
+    assert veto.code == "trajectory-degraded" and "trajectory and touch-downs" in veto.reason
 
 
 def test_another_rigs_or_frames_offset_forbids_every_lift() -> None:

@@ -496,7 +496,7 @@ def test_bad_configurations_and_keys_are_told(tmp_path: Path, capsys: pytest.Cap
     assert run(["plant", "check", "--config", str(config), "--key", str(config)]) == 2
     assert "--protocol" in capsys.readouterr().err
     pytest.importorskip("cryptography")
-    with pytest.raises(InputError, match="no private key"):
+    with pytest.raises(InputError, match="not a readable private key"):
         sign_file(config, config)
     config.write_text('[mqtt]\npassword_file = "secret"\n[opcua]\nfolder = "pki"\n')
     told = read_plant(config)

@@ -45,7 +45,7 @@ def test_describe_and_print(tmp_path: Path) -> None:
     print_info(info, console)
     text = console.export_text()
     console.file.close()
-    for part in ("a [b] c", "cam1", "200.00", "cam0 only", "no readable picture", "-3.500 ms"):
+    for part in ("a [b] c", "cam1", "200.00", "cam0 only", "not a readable picture", "-3.500 ms"):
         assert part in text
     assert "120.02" in text
 

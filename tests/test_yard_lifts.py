@@ -617,7 +617,7 @@ def test_the_file_fits_its_schema_and_comes_back(tmp_path: Path) -> None:
 
 
 def test_an_unknown_code_is_no_veto() -> None:
-    with pytest.raises(ValueError, match="no veto"):
+    with pytest.raises(ValueError, match="not a veto"):
         Veto("because", "so")
     assert all(re.fullmatch(r"[a-z]+(-[a-z]+)*", code) for code in VETOES)
 

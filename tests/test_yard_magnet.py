@@ -43,7 +43,7 @@ def test_the_example_is_assumed_where_no_file_is_given(tmp_path: Path) -> None:
         ("contact_share = 0.1", "contact_share = 2.0", "contact_share"),
         ("safety_factor = 2.0", "saftey_factor = 2.0", "safety_factor"),
         ("safety_factor = 2.0", "safety_factor = true", "safety_factor is True; give a number"),
-        ("safety_factor = 2.0", "safety_factor = ", "no TOML"),
+        ("safety_factor = 2.0", "safety_factor = ", "not a TOML"),
     ],
 )
 def test_impossible_magnets_are_one_line(tmp_path: Path, old: str, new: str, word: str) -> None:

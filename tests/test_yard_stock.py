@@ -136,7 +136,7 @@ def test_a_missing_or_torn_list_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is not a JSON"):
         read_stock(tmp_path / "torn.json")
     (tmp_path / "number.json").write_text("3", encoding="utf-8")
-    with pytest.raises(InputError, match="no list of bundles"):
+    with pytest.raises(InputError, match="not a list of bundles"):
         read_stock(tmp_path / "number.json")
 
 

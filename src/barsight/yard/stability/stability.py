@@ -209,8 +209,16 @@ def footing_checks(
                 sigma=mm * _sure(target.sigma.top_z_m),
             )
         )  # fmt: skip
+    return [*checks, *_neighbour_checks(target, bundles, by_id, settings)]
+
+
+def _neighbour_checks(
+    target: Bundle, bundles: tuple[Bundle, ...], footings: dict[int, Footing], settings: LiftSettings
+) -> list[Check]:
+    """Check that no neighbour leans over this bundle or rests against it."""
+    checks, mm = list[Check](), 1e3
     for other in bundles:
-        leaning = by_id[other.id]
+        leaning = footings[other.id]
         if lies_over_edge_of(other, target, leaning):
             reason = f"bundle {other.id} extends {mm * leaning.overhang_m:.0f} mm over the edge on this side"
             checks += [
