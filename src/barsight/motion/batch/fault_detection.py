@@ -29,7 +29,10 @@ MIN_HELD_M, HELD_SIGMAS = 0.01, 8.0
 """Minimum distance, in m and in sigma of a reading (the larger counts), that a crane must have travelled
 during equal readings for these to be frozen.
 """
-MAX_BRAKING_MPS2 = 1.0
+MAX_BRAKING_MPS2, MAX_ALONE_MPS2 = 1.0, (1.0, 4.0, 4.0)
+"""Maximum braking of the crane as a whole, and of bridge, trolley and hoist alone, whose brakes differ."""
+STOP_WINDOW_S = 0.1
+"""Minimum duration, s, of the last steps before a freeze: in full if frozen, shorter if braking."""
 MAX_FRAMES_OFF = 2
 MANY_STEPS = 8
 """Minimum number of steps that must be left to try offsets of more than one frame."""
@@ -190,12 +193,13 @@ def _chosen(crane: CraneSamples, kept: Bool) -> CraneSamples:
 
 def frozen_stretches(crane: CraneSamples) -> list[tuple[int, int]]:
     """Find stretches (first, last) of equal readings during which a moving crane must have travelled on, or
-    after which the readings continue elsewhere: of all encoders together, or of one while the others change.
+    after which the readings continue elsewhere: of all encoders together, or of any one.
 
-    A crane that reverses gives equal readings too, above all with coarse encoders, but stays near them.
+    A crane that reverses gives equal readings too, above all with coarse encoders, but stays near them. One
+    axis often stops while another travels on.
     """
     time, min_m = (crane.stamp_ns - crane.stamp_ns[:1]) / NS_PER_S, min_way_m(crane)
-    each = [_frozen(crane.position_m[:, axes], time, min_m) for axes in ([0, 1, 2], [0], [1], [2])]
+    each = [_frozen(crane.position_m, axes, time, min_m) for axes in ([0, 1, 2], [0], [1], [2])]
     found: list[tuple[int, int]] = []
     for first, last in sorted(part for parts in each for part in parts):
         if found and first <= found[-1][1]:
@@ -211,14 +215,18 @@ def frozen_now(crane: CraneSamples) -> Bool:
     last = len(time) - 1
 
     def is_frozen(axes: list[int]) -> bool:
-        return any(end == last for _, end in _frozen(crane.position_m[:, axes], time, min_m))
+        return any(end == last for _, end in _frozen(crane.position_m, axes, time, min_m))
 
     each = np.array([is_frozen([axis]) for axis in range(3)])
     return each if each.any() else np.full(3, is_frozen([0, 1, 2]))
 
 
-def _frozen(place: Float64, time: Float64, min_m: float) -> list[tuple[int, int]]:
-    """Find stretches (first, last) of equal readings (N, A) of encoders that must have moved by `min_m`."""
+def _frozen(position_m: Float64, axes: list[int], time: Float64, min_m: float) -> list[tuple[int, int]]:
+    """Find stretches (first, last) of equal readings (N, 3) of encoders `axes` that must have moved by
+    `min_m`: all of them, or one.
+    """
+    place = position_m[:, axes]
+    braking = MAX_ALONE_MPS2[axes[0]] if len(axes) == 1 else MAX_BRAKING_MPS2
     same = np.r_[False, (np.diff(place, axis=0) == 0).all(axis=1), False]
     edges = np.flatnonzero(np.diff(same.astype(int)))
     found = []
@@ -226,11 +234,12 @@ def _frozen(place: Float64, time: Float64, min_m: float) -> list[tuple[int, int]
         if last - first + 1 < MIN_FROZEN or first < SIDE // 2:
             continue
         after = place[last + 1 : last + 4]
-        away = float(np.linalg.norm(np.median(after, axis=0) - place[last])) if len(after) == 3 else 0.0
-        away -= MAX_BRAKING_MPS2 * float(time[min(last + 2, len(time) - 1)] - time[last]) ** 2 / 2
+        # Two of the three may be wild.
+        away = float(np.linalg.norm(after - place[last], axis=1).min()) if len(after) == 3 else 0.0
+        away -= braking * float(time[min(last + 2, len(time) - 1)] - time[last]) ** 2 / 2
         speed = _speed_before(place, time, int(first))
-        braked = min(float(time[last] - time[first]), speed / MAX_BRAKING_MPS2)
-        if max(away, (speed - MAX_BRAKING_MPS2 * braked / 2) * braked) > min_m:
+        braked = min(float(time[last] - time[first]), speed / braking)
+        if max(away, (speed - braking * braked / 2) * braked) > min_m:
             found.append((int(first), int(last)))
     return found
 
@@ -239,7 +248,7 @@ def _speed_before(place: Float64, time: Float64, first: int) -> float:
     """Extrapolate the speed (m/s) at a reading from the readings before it.
 
     It continues the medians of the earlier and the later rates over half a window, since a braking crane is
-    slower than it was.
+    slower than it was, and is at most that of the last steps.
     """
     begin = min(int(np.searchsorted(time, time[first] - SPEED_WINDOW_S)), max(0, first - SIDE))
     half = (first - begin + 1) // 2
@@ -249,4 +258,9 @@ def _speed_before(place: Float64, time: Float64, first: int) -> float:
     earlier, later = (np.median(rates[part], axis=0) for part in parts)
     apart = float(at[parts[1]].mean() - at[parts[0]].mean())
     drawn_on = (time[first] - at[parts[1]].mean()) / apart if apart > 0 else 0.0
-    return float(np.linalg.norm(later + drawn_on * (later - earlier)))
+    speed = float(np.linalg.norm(later + drawn_on * (later - earlier)))
+    near = int(np.searchsorted(time, time[first] - STOP_WINDOW_S))
+    # The third, since two may be wild.
+    last = np.array([min(first - 1, near), min(first - 3, near)])
+    steps = np.linalg.norm(place[first] - place[last], axis=1) / (time[first] - time[last])
+    return min(speed, float(steps.min()))
