@@ -12,7 +12,7 @@ from barsight.core.errors import Failed
 from barsight.core.records.pairs import RefusedFrame
 from barsight.core.records.sensor_samples import CraneSamples, EncoderJump, ImuSamples
 from barsight.evaluation.trajectory_error import trajectory_drift
-from barsight.inertial.model import without_saturation
+from barsight.inertial.model import ORDINARY_NOISE, without_saturation
 from barsight.live.modes import FreezeWatch
 from barsight.motion.batch import fusion
 from barsight.motion.batch.detail import untied_pictures
@@ -23,6 +23,7 @@ from barsight.motion.crane.encoder_trajectory import CraneSettings, fit_position
 from barsight.motion.crane.known_motion import KnownMotion
 from barsight.motion.fixed_lag.encoder_watch import EncoderWatch
 from barsight.motion.fixed_lag.estimator import FixedLagFusion, FixedLagSettings
+from barsight.motion.fixed_lag.sensor_buffer import SensorBuffer
 from barsight.motion.frontend.seen_steps import known_motion
 from barsight.motion.frontend.sightings import Sighting
 from barsight.recording.formats.ground_truth import GroundTruth, read_ground_truth
@@ -283,6 +284,25 @@ def test_the_top_of_a_slow_swing_is_no_end_of_scale(period_s: float) -> None:
     gyro, accel = 0.03 * swing * [1, 0.4, 0], 0.2 * swing * [0.3, 1, 0] + [0, 0, 9.8]
     imu = ImuSamples((time * 1e9).astype(np.int64), (gyro / 1.07e-3).round() * 1.07e-3, accel.round(2))
     assert without_saturation(imu)[1] == 0
+
+
+@pytest.mark.parametrize("count", [0.0024, 0.01])
+@pytest.mark.parametrize("accel_mps2", [0.3, 1.0])
+def test_a_constant_acceleration_after_a_rest_is_no_end_of_scale(accel_mps2: float, count: float) -> None:
+    """The live estimate sees no more than the rest and this; a clip in the same window is found."""
+    time, rng = np.arange(1700) / 200, np.random.default_rng(3)
+    ramp = accel_mps2 * np.clip(np.minimum((time - 6.5) / 0.05, (8.6 - time) / 0.05), 0, 1)
+    accel = np.column_stack([ramp, 0 * time, 9.81 + 0 * time]) + rng.normal(0, 0.08 * count, (1700, 3))
+    accel = (accel / count).round() * count
+    stamps, gyro = (time * 1e9).astype(np.int64), rng.normal(0, 1e-4, (1700, 3))
+    for end_s in (7.0, 7.5, 8.5):
+        readings = SensorBuffer(None, ImuSamples(stamps, gyro, accel), ORDINARY_NOISE)
+        imu = readings.between(0, int(end_s * 1e9)).imu
+        assert imu is not None and len(imu.stamp_ns) == round(200 * end_s)
+    accel[300:320, 2] = 39.2
+    assert without_saturation(ImuSamples(stamps, gyro, accel))[1] == 20
+    gyro[400:410, 1] = -4.36
+    assert without_saturation(ImuSamples(stamps, gyro, accel))[1] == 30
 
 
 def jumping(crane: CraneSamples, at_s: float, size_m: float) -> CraneSamples:

@@ -10,17 +10,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import binary_opening
 
 from barsight.calibration.geometry.imu_noise import ImuNoise
-from barsight.core.arrays import Bool, Float64
+from barsight.core.arrays import Float64
 from barsight.core.linalg.robust import mad_sigma
 from barsight.core.records.sensor_samples import ImuSamples
 
 GRAVITY_MPS2 = 9.80665
 SATURATED_SIGMAS = 6.0
 SATURATED_SAMPLES = 4
-SWING_COUNTS, MIN_COUNT = 4.5, 1e-9
-"""A swing's top is left by fewer counts before and after; smaller differences are rounding."""
+MIN_SCALE = (1.0,) * 3 + (1.2 * GRAVITY_MPS2,) * 3
+"""Bound, in rad/s and m/s^2, that the range of every IMU exceeds."""
 ORDINARY_NOISE = ImuNoise(2.0e-4, 2.0e-5, 2.0e-3, 1.0e-3, 200.0)
 """Noise of a good MEMS IMU (that of EuRoC and of most cameras), for recordings that don't state their own."""
 
@@ -50,18 +51,19 @@ class BodyState:
 def without_saturation(imu: ImuSamples) -> tuple[ImuSamples, int]:
     """Remove the samples at which an axis is saturated; also return their number.
 
-    An axis is saturated where it keeps its highest or lowest value for four samples, far from its usual ones.
-    A coarse axis also does so at the top of a slow swing, but reaches and leaves it in single counts.
+    An axis is saturated where it keeps its highest or lowest value for four samples, far from its usual ones
+    and high enough for a range to end there. A coarse axis also keeps a low one at the top of a slow swing or
+    in a constant acceleration, far from the usual ones after a rest.
     """
     wrong = np.zeros(imu.stamp_ns.size, dtype=np.bool_)
-    for axis in np.hstack([imu.gyro_radps, imu.accel_mps2]).T:
+    for axis, scale in zip(np.hstack([imu.gyro_radps, imu.accel_mps2]).T, MIN_SCALE, strict=True):
         for end in (axis.min(initial=np.inf), axis.max(initial=-np.inf)):
-            if np.count_nonzero(axis == end) < SATURATED_SAMPLES:  # nearly always, and quickly seen
+            held = axis == end
+            if abs(end) < scale or np.count_nonzero(held) < SATURATED_SAMPLES:  # nearly always, quickly seen
                 continue
-            middle, counts = np.median(axis), np.diff(np.unique(axis))
+            middle = np.median(axis)
             if abs(end - middle) > SATURATED_SIGMAS * (mad_sigma(axis - middle) + 1e-6):
-                count = counts[counts > MIN_COUNT].min(initial=np.inf)
-                wrong |= _held(axis, float(end), SWING_COUNTS * float(count))
+                wrong |= binary_opening(held, np.ones(SATURATED_SAMPLES, np.bool_))
     kept = ~wrong
     part = ImuSamples(imu.stamp_ns[kept], imu.gyro_radps[kept], imu.accel_mps2[kept])
     return part, int(wrong.sum())
@@ -70,13 +72,3 @@ def without_saturation(imu: ImuSamples) -> tuple[ImuSamples, int]:
 def saturation_sentences(count: int) -> tuple[str, ...]:
     """Tell of so many samples that left."""
     return (f"{count} IMU samples are at the end of their scale and were left out",) if count else ()
-
-
-def _held(axis: Float64, end: float, min_step: float) -> Bool:
-    """Select the samples (N,) that keep a value which an axis comes to and leaves by more than `min_step`."""
-    edges = np.flatnonzero(np.diff(np.r_[False, axis == end, False]))
-    held = np.zeros(axis.size, np.bool_)
-    for first, beyond in zip(edges[::2], edges[1::2], strict=True):
-        beside = axis[[max(first - 1, 0), min(beyond, axis.size - 1)]]
-        held[first:beyond] = beyond - first >= SATURATED_SAMPLES and np.abs(beside - end).sum() > min_step
-    return held
