@@ -13,10 +13,9 @@ from barsight.core.records.pairs import RefusedFrame
 from barsight.core.records.sensor_samples import CraneSamples, EncoderJump, ImuSamples
 from barsight.evaluation.trajectory_error import trajectory_drift
 from barsight.inertial.model import ORDINARY_NOISE, without_saturation
-from barsight.live.modes import FreezeWatch
 from barsight.motion.batch import fusion
 from barsight.motion.batch.detail import untied_pictures
-from barsight.motion.batch.fault_detection import check_crane, frozen_now, frozen_stretches
+from barsight.motion.batch.fault_detection import check_crane, frozen_stretches
 from barsight.motion.batch.fusion import BatchFusion, FusionSettings
 from barsight.motion.crane.encoder_jumps import find_jumps
 from barsight.motion.crane.encoder_trajectory import CraneSettings, fit_position, reestimate_noise
@@ -70,36 +69,6 @@ def test_a_crane_that_brakes_and_starts_anew_froze_nothing(rate_hz: float, accel
     crane = CraneSamples((time * 1e9).astype(np.int64), place, np.zeros(3), np.eye(3), 0.001)
     checked = check_crane(crane)
     assert checked.warnings == () and len(checked.samples.stamp_ns) == len(time)
-
-
-@pytest.mark.parametrize(("rate_hz", "accel"), [(5, 0.7), (8, 1.0), (10, 1.5), (20, 2.0)])
-def test_a_trolley_that_stops_while_the_bridge_travels_on_froze_nothing(rate_hz: float, accel: float) -> None:
-    for phase in range(16):
-        time = np.arange(0, 30, 1 / rate_hz) + 0.013 * phase
-        bridge = np.clip(np.minimum(time - 1, 29 - time) * 0.3, 0, 0.6)
-        ways = ((3, 8 + 0.1 * phase, 1), (12, 17, -1), (20, 26, 1))
-        trolley = sum(np.clip(np.minimum(time - a, b - time) * accel, 0, 0.5) * sign for a, b, sign in ways)
-        place = np.column_stack([*np.cumsum([bridge, trolley], axis=1) / rate_hz, 0 * time + 8]).round(3)
-        crane = CraneSamples((time * 1e9).astype(np.int64), place, np.zeros(3), np.eye(3), 0.001)
-        assert frozen_stretches(crane) == [] and not frozen_now(crane).any()
-        watch = FreezeWatch(crane)
-        ends = np.searchsorted(time, np.arange(9, 20, 0.5))
-        assert not any(watch.check(crane.stamp_ns[:end], place[:end]) for end in ends.tolist())
-
-
-@pytest.mark.parametrize("axis", [0, 1, 2])
-@pytest.mark.parametrize("rate_hz", [5, 20, 100])
-def test_one_encoder_alone_that_is_still_frozen_is_found(axis: int, rate_hz: float) -> None:
-    """At a fair speed, and the bridge, which brakes gently, at a slow one too."""
-    for speed_mps in (0.2, 0.4) if axis == 0 else (0.4,):
-        for seed in range(4):
-            time = np.arange(0, 13, 1 / rate_hz)
-            place = 0.1 * time[:, None] * [1, 1, 1]
-            place[:, axis] = speed_mps * time
-            place = (place + np.random.default_rng(seed).normal(0, 0.001, place.shape)).round(4)
-            place[time > 10 + 0.1 * seed, axis] = place[np.searchsorted(time, 10 + 0.1 * seed), axis]
-            crane = CraneSamples((time * 1e9).astype(np.int64), place, np.zeros(3), np.eye(3), 0.001)
-            assert frozen_now(crane).tolist() == [one == axis for one in range(3)]
 
 
 def test_one_encoder_alone_that_freezes_is_found() -> None:
@@ -197,11 +166,6 @@ def test_jumps_of_drawn_cranes(sensors: str, count: int, sizes_m: tuple[float, .
         either = sum(is_found(drawn[seed], told_of[seed], ("sure", "maybe")) for seed in seeds)
         print(f"[{sensors}] {1e3 * size_m:.0f} mm: sure {sure}, with maybe {either} of {count}", flush=True)
         assert either >= 0.97 * count or "imu" not in sensors
-
-
-@pytest.mark.parametrize("seed", [20061, 20095, 20154])
-def test_two_wild_readings_beside_a_stand_are_no_freeze(seed: int) -> None:
-    assert frozen_stretches(drawn_crane(seed).readings) == []
 
 
 @pytest.mark.slow

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -45,6 +45,9 @@ TURN_SIGMA_RAD = 5e-4
 WAY_SIGMA_M = 0.005
 CLEARLY_BETTER = 0.1
 
+Stretch = tuple[int, int, tuple[int, ...]]
+"""First and last reading of a freeze, by index or stamp, and the frozen axes."""
+
 
 @dataclass(frozen=True, eq=False)
 class CheckedCrane:
@@ -61,7 +64,7 @@ def check_crane(crane: CraneSamples, known: KnownMotion | None = None) -> Checke
     amount, unless these show that it has not.
     """
     parts = [
-        (int(crane.stamp_ns[first]), int(crane.stamp_ns[last])) for first, last in frozen_stretches(crane)
+        (int(crane.stamp_ns[first]), int(crane.stamp_ns[last])) for first, last, _ in frozen_stretches(crane)
     ]
     samples, after = without_frozen(crane, parts)
     after = lost_counts(samples, after, known, min_way_m(crane))
@@ -191,21 +194,30 @@ def _chosen(crane: CraneSamples, kept: Bool) -> CraneSamples:
     return replace(crane, stamp_ns=crane.stamp_ns[kept], position_m=crane.position_m[kept])
 
 
-def frozen_stretches(crane: CraneSamples) -> list[tuple[int, int]]:
-    """Find stretches (first, last) of equal readings during which a moving crane must have travelled on, or
-    after which the readings continue elsewhere: of all encoders together, or of any one.
+def frozen_stretches(crane: CraneSamples) -> list[Stretch]:
+    """Find stretches of equal readings during which a moving crane must have travelled on, or after which the
+    readings continue elsewhere: of all encoders together, or of any one.
 
     A crane that reverses gives equal readings too, above all with coarse encoders, but stays near them. One
     axis often stops while another travels on.
     """
     time, min_m = (crane.stamp_ns - crane.stamp_ns[:1]) / NS_PER_S, min_way_m(crane)
-    each = [_frozen(crane.position_m, axes, time, min_m) for axes in ([0, 1, 2], [0], [1], [2])]
-    found: list[tuple[int, int]] = []
-    for first, last in sorted(part for parts in each for part in parts):
+    return merge_stretches(
+        (first, last, axes)
+        for axes in ((0, 1, 2), (0,), (1,), (2,))
+        for first, last in _frozen(crane.position_m, axes, time, min_m)
+    )
+
+
+def merge_stretches(stretches: Iterable[Stretch]) -> list[Stretch]:
+    """Merge stretches that overlap. The axes are those that are frozen last, if in doubt the fewer."""
+    found: list[Stretch] = []
+    for first, last, axes in sorted(stretches):
         if found and first <= found[-1][1]:
-            found[-1] = found[-1][0], max(found[-1][1], last)
+            longer = max(found[-1], (first, last, axes), key=lambda part: (part[1], -len(part[2])))
+            found[-1] = found[-1][0], longer[1], longer[2]
         else:
-            found.append((first, last))
+            found.append((first, last, axes))
     return found
 
 
@@ -214,18 +226,18 @@ def frozen_now(crane: CraneSamples) -> Bool:
     time, min_m = (crane.stamp_ns - crane.stamp_ns[:1]) / NS_PER_S, min_way_m(crane)
     last = len(time) - 1
 
-    def is_frozen(axes: list[int]) -> bool:
+    def is_frozen(*axes: int) -> bool:
         return any(end == last for _, end in _frozen(crane.position_m, axes, time, min_m))
 
-    each = np.array([is_frozen([axis]) for axis in range(3)])
-    return each if each.any() else np.full(3, is_frozen([0, 1, 2]))
+    each = np.array([is_frozen(axis) for axis in range(3)])
+    return each if each.any() else np.full(3, is_frozen(0, 1, 2))
 
 
-def _frozen(position_m: Float64, axes: list[int], time: Float64, min_m: float) -> list[tuple[int, int]]:
+def _frozen(position_m: Float64, axes: tuple[int, ...], time: Float64, min_m: float) -> list[tuple[int, int]]:
     """Find stretches (first, last) of equal readings (N, 3) of encoders `axes` that must have moved by
     `min_m`: all of them, or one.
     """
-    place = position_m[:, axes]
+    place = position_m[:, list(axes)]
     braking = MAX_ALONE_MPS2[axes[0]] if len(axes) == 1 else MAX_BRAKING_MPS2
     same = np.r_[False, (np.diff(place, axis=0) == 0).all(axis=1), False]
     edges = np.flatnonzero(np.diff(same.astype(int)))

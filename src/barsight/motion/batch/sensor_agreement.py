@@ -64,7 +64,7 @@ def refuse_contradictions(
 
 def _check_encoders(path: Path, steps: SeenSteps, crane: CraneSamples) -> None:
     place = median_filter(crane.position_m, size=(5, 1), mode="nearest")  # against single outliers
-    for first, last in frozen_stretches(crane):  # reported by itself: no wrong unit or axis
+    for first, last, _ in frozen_stretches(crane):  # reported by itself: no wrong unit or axis
         place[first : last + 1] = np.nan
     seen_m = np.linalg.norm(steps.way_m, axis=1)
 

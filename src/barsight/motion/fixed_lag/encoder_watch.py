@@ -18,7 +18,7 @@ from barsight.core.arrays import Float64, Int64
 from barsight.core.linalg import dense
 from barsight.core.records.sensor_samples import CraneSamples, EncoderJump
 from barsight.core.stamps import seconds_to_ns
-from barsight.motion.batch.fault_detection import frozen_stretches, without_frozen
+from barsight.motion.batch.fault_detection import Stretch, frozen_stretches, merge_stretches, without_frozen
 from barsight.motion.crane.encoder_jumps import find_jumps, take_off_jumps
 from barsight.motion.crane.known_motion import KnownMotion
 from barsight.motion.fixed_lag.sliding_window import Window
@@ -32,30 +32,33 @@ follow.
 
 class EncoderWatch:
     """Encoder faults so far. jumps: those that the readings held need, in order of time; told: every jump
-    that was found; frozen: stamps of the first and last reading of each freeze.
+    that was found; frozen: stamps of the first and last reading of each freeze, which lasts as long as the
+    encoders that froze, whatever the others do.
     """
 
     def __init__(self) -> None:
         self.jumps: tuple[EncoderJump, ...] = ()
         self.told: list[EncoderJump] = []
-        self.frozen: list[tuple[int, int]] = []
+        self._frozen: list[Stretch] = []
+
+    @property
+    def frozen(self) -> list[tuple[int, int]]:
+        return [(first, last) for first, last, _ in self._frozen]
 
     def check(self, crane: CraneSamples, known: KnownMotion) -> None:
         """Look for faults in the newest readings. crane: the readings as they came."""
         if not len(crane.stamp_ns):
             return
         stamps, place = crane.stamp_ns, crane.position_m
-        parts = [(int(stamps[first]), int(stamps[last])) for first, last in frozen_stretches(crane)]
-        if self.frozen and self.frozen[-1][1] >= stamps[0]:  # a freeze from before these readings may go on
-            begin, end = self.frozen[-1]
+        if self._frozen and self._frozen[-1][1] >= stamps[0]:  # a freeze from before may go on
+            begin, end, axes = self._frozen[-1]
             k = int(np.searchsorted(stamps, end))
-            held = place[int(np.searchsorted(stamps, begin)) : k + 1]
-            axes = (held == held[-1:]).all(axis=0)  # one encoder alone may freeze
-            while k + 1 < len(stamps) and axes.any() and (place[k + 1] == place[k])[axes].all():
+            while k + 1 < len(stamps) and (place[k + 1] == place[k])[list(axes)].all():
                 k += 1
-            self.frozen[-1] = begin, max(end, int(stamps[min(k, len(stamps) - 1)]))
-        seen = {first for first, _ in self.frozen}
-        self.frozen += [part for part in parts if part[0] not in seen]
+            self._frozen[-1] = begin, max(end, int(stamps[min(k, len(stamps) - 1)])), axes
+        parts = frozen_stretches(crane)
+        new = ((int(stamps[first]), int(stamps[last]), axes) for first, last, axes in parts)
+        self._frozen = merge_stretches((*self._frozen, *new))
         usable, after = without_frozen(crane, self._frozen_since(int(stamps[0])))
         told = {jump.stamp_ns for jump in self.jumps}
         self._add([jump for jump in after if jump.stamp_ns not in told])
