@@ -198,7 +198,9 @@ def _steps(sightings: Sequence[Sighting], rectifier: Rectifier, shift_ns: int) -
 
 
 def _over_gap(steps: SeenSteps, stamp_ns: Int64, late_s: float) -> Bool:
-    """Select the steps (K,) over a gap of the IMU, whose stamps are `late_s` late: the turn isn't known."""
+    """Select the steps (K,) that reach over a gap of the IMU, so that it doesn't know their turn. Its stamps
+    are `late_s` late.
+    """
     late_ns, after = seconds_to_ns(late_s), np.flatnonzero(np.diff(stamp_ns) > seconds_to_ns(MAX_GAP_S)) + 1
     begun = np.searchsorted(stamp_ns[after - 1], steps.new_ns + late_ns)
     over: Bool = begun > np.searchsorted(stamp_ns[after], steps.old_ns + late_ns, side="right")
