@@ -206,6 +206,21 @@ def test_a_lift_that_was_made_after_its_end_ends_all_offers(plant: Plant) -> Non
     assert [(one.code, one.priority) for one in state.alarms] == [("lift-unrecorded", 1)]
 
 
+@pytest.mark.parametrize("writes_before", [0, 1])
+def test_a_late_report_is_not_lost_where_the_store_was_locked(plant: Plant, writes_before: int) -> None:
+    """It is answered only once the alarm is committed; until then the crane sends it again."""
+    claim = claimed(plant)
+    plant.survey()
+    plant.store.fault[:] = ["locked"] * 2 + [""] * writes_before
+    with pytest.raises(InputError, match="locked"):
+        plant.steps.executed(claim.token, DID)
+    assert offered(plant).alarms == () and offered(plant).lift is not None
+    plant.store.fault.clear()
+    assert isinstance(plant.steps.executed(claim.token, DID), Failed)
+    assert [one.code for one in offered(plant).alarms] == ["lift-unrecorded"]
+    assert offered(plant).lift is None
+
+
 def test_a_map_begun_before_an_unrecorded_lift_was_told_offers_nothing(plant: Plant) -> None:
     claim = claimed(plant)
     plant.survey()

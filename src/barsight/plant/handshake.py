@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from barsight.core.errors import BarsightError, Failed, InputError
 from barsight.core.extras import extra
 from barsight.plant.state import OfferedLift
-from barsight.store.confirmation import begin_lift, confirm_lift, end_lift, take_lift
+from barsight.store.confirmation import LateReportError, begin_lift, confirm_lift, end_lift, take_lift
 from barsight.store.opening import Store
 from barsight.store.tables import LIFT_STATES, LIFTS
 
@@ -108,9 +108,7 @@ def report_executed(store: Store, claim: LiftClaim, load_kg: float | None) -> st
         return told
     try:
         take_lift(store, claim.lift_id, claim.who, alarm)
-    except InputError as error:
-        if states_of(store, claim.lift_id)[-1] in ("claimed", "executing"):
-            raise
+    except LateReportError as error:
         return Failed("refused", str(error))
     return told
 

@@ -3,27 +3,22 @@
 from __future__ import annotations
 
 import json
-import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-import numpy as np
-
 from barsight.core.arrays import Float64
 from barsight.core.errors import ConfigError, InputError
 from barsight.core.extras import extra
 from barsight.store.audit import Entry, entry
 from barsight.store.calibrations import why_invalid
+from barsight.store.lift_records import find_gap, find_outlines
 from barsight.store.opening import Store
 from barsight.store.promotion import counts
 from barsight.store.states import has_alarm, last_raised_ns, lift_state, raise_alarm, step_lift
-from barsight.store.tables import LIFT_BUNDLES, LIFT_STATES, LIFTS, SIGHTINGS, SURVEY_VETOES, SURVEYS
-from barsight.yard.events import corners, gap_between
-from barsight.yard.inventory.bundle_file import bundle_of
-from barsight.yard.lifting.load import laid_at
+from barsight.store.tables import LIFT_STATES, LIFTS, SURVEY_VETOES, SURVEYS
 from barsight.yard.lifting.validity import is_ahead
 from barsight.yard.vetoes import VETOES
 
@@ -31,6 +26,10 @@ with extra("store"):
     from sqlalchemy import ColumnElement, Connection, Row, Select, func, select
 
 OPEN = ("offered", "claimed", "executing")
+
+
+class LateReportError(InputError):
+    """A lift was reported after it had ended: it can't be recorded, but the alarm is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +143,7 @@ def take_lift(store: Store, lift_id: int, who: str, alarm: tuple[str, str] | Non
     """Report a confirmed lift as executed; this ends nearby offers and confirmations.
 
     alarm: code and reason of an alarm to raise with it. Raises InputError if the lift can't be recorded; if
-    it had been confirmed and has ended, an alarm is raised and all offers end.
+    it had been confirmed and has ended, an alarm is raised and all offers end (LateReportError).
     """
 
     def step(opened: Entry, lift: OpenLift) -> None:
@@ -156,29 +155,34 @@ def take_lift(store: Store, lift_id: int, who: str, alarm: tuple[str, str] | Non
     try:
         _change(store, lift_id, who, "lift executed", step)
     except InputError:
-        with store.reading() as connection:
-            query = select(LIFT_STATES.c.state).where(LIFT_STATES.c.lift_id == lift_id)
-            states = set(connection.execute(query).scalars())
-        if "claimed" in states and "executed" not in states:
-            _note_unrecorded(store, lift_id, who)
+        _note_unrecorded(store, lift_id, who, "executed")
         raise
 
 
-def _note_unrecorded(store: Store, lift_id: int, who: str) -> None:
-    """Record, once, that a lift was executed after it had ended: raise an alarm, end all offers and
-    confirmations. Raises InputError, which says so.
+def _note_unrecorded(store: Store, lift_id: int, who: str, reported: str) -> None:
+    """Record, once, that a lift was made after its confirmation had ended: raise an alarm, end all offers and
+    confirmations. Raises LateReportError, which says so; returns if there is nothing to record.
+
+    reported: `executed` or `failed`. A lift that was never confirmed, or was reported before, isn't recorded.
     """
     with store.reading() as connection:
+        query = select(LIFT_STATES.c.state).where(LIFT_STATES.c.lift_id == lift_id)
+        states = set(connection.execute(query).scalars())
         clock_ns = yard_clock_ns(connection)
+    if "claimed" not in states or states & {"executed", reported}:
+        return
+    did = "failed" if reported == "failed" else "was executed"
     with entry(store, who, f"lift unrecorded {lift_id}", clock_ns) as opened:
         state = lift_state(opened.connection, lift_id) or "unknown"
         if state in OPEN:
             raise InputError(f"lift {lift_id}", f"is {state}", "report it again")
-        told = f"lift {lift_id} was executed and is {state}, unrecorded: survey before the next lift"
+        told = f"lift {lift_id} {did} and is {state}, unrecorded: survey before the next lift"
         if not has_alarm(opened.connection, "lift-unrecorded", told):
             raise_alarm(opened, "lift-unrecorded", told)
-            _end_offers(opened, f"disturbed: lift {lift_id} was executed and isn't recorded")
-    raise InputError(f"lift {lift_id}", f"is {state}, it can't be recorded", "survey before the next lift")
+            _end_offers(opened, f"disturbed: lift {lift_id} {did} and isn't recorded")
+    raise LateReportError(
+        f"lift {lift_id}", f"is {state}, it can't be recorded", "survey before the next lift"
+    )
 
 
 def end_lift(store: Store, lift_id: int, state: str, who: str, note: str, tells_begin: bool = False) -> None:
@@ -200,7 +204,12 @@ def end_lift(store: Store, lift_id: int, state: str, who: str, note: str, tells_
         if is_assumed or lift.state == "executing":
             _end_beside(opened, lift)
 
-    _change(store, lift_id, who, f"lift {state}", step)
+    try:
+        _change(store, lift_id, who, f"lift {state}", step)
+    except InputError:
+        if state == "failed" and not tells_begin:
+            _note_unrecorded(store, lift_id, who, state)
+        raise
 
 
 def end_disturbed(opened: Entry, since_ns: int) -> None:
@@ -209,7 +218,7 @@ def end_disturbed(opened: Entry, since_ns: int) -> None:
     """
     unrecorded_ns = last_raised_ns(opened.connection, "lift-unrecorded")
     if unrecorded_ns is not None and unrecorded_ns >= since_ns:
-        _end_offers(opened, "disturbed: a lift that isn't recorded was executed after this map was begun")
+        _end_offers(opened, "disturbed: a lift that isn't recorded was reported after this map was begun")
     moving = select(LIFT_STATES.c.lift_id).where(
         LIFT_STATES.c.state.in_(("executing", "executed")), LIFT_STATES.c.at_ns >= since_ns
     )
@@ -229,12 +238,14 @@ def _end_offers(opened: Entry, reason: str) -> None:
 
 def _end_beside(opened: Entry, lift: OpenLift) -> None:
     """End offers and confirmations within reach of anything that a lift may have moved."""
-    moved = _outlines(opened.connection, lift)
+
+    def outlines(one: OpenLift) -> list[Float64]:
+        return find_outlines(opened.connection, one.lift_id, one.survey_id, one.record)
+
+    moved = outlines(lift)
     for other in open_lifts(opened.connection):
         reach_m = other.record.get("disturbed_reach_m")
-        if other.state != "executing" and (
-            reach_m is None or _gap(moved, _outlines(opened.connection, other)) < reach_m
-        ):
+        if other.state != "executing" and (reach_m is None or find_gap(moved, outlines(other)) < reach_m):
             note = f"disturbed: lift {lift.lift_id} came near its place, or near where its load would be put"
             step_lift(opened, other.lift_id, "expired", note)
 
@@ -322,27 +333,3 @@ def _stale(connection: Connection, clock_ns: int) -> dict[int, str]:
         elif reason:
             told[lift.lift_id] = f"expired: calibration-changed: {reason}"
     return told
-
-
-def _outlines(connection: Connection, lift: OpenLift) -> list[Float64]:
-    """Compute the corners (4, 2) of the load and the magnet, at pick-up and at set-down."""
-    held = select(SIGHTINGS.c.record).join(LIFT_BUNDLES, LIFT_BUNDLES.c.bundle_id == SIGHTINGS.c.bundle_id)
-    own = LIFT_BUNDLES.c.lift_id == lift.lift_id, SIGHTINGS.c.survey_id == lift.survey_id
-    bundles = [bundle_of(json.loads(row)) for row in connection.execute(held.where(*own)).scalars()]
-    places = [lift.record["target"]]
-    if lift.record["set_down"]:
-        places.append(lift.record["set_down"])
-    beam = lift.record.get("beam") or {"width_m": 0.0, "length_m": 0.0}
-    outlines = []
-    for place in places:
-        centre, yaw = (place["x_m"], place["y_m"]), math.radians(place["yaw_deg"])
-        outlines.append(corners(centre, yaw, beam["width_m"], beam["length_m"]))
-        here = bundles if place is places[0] or not bundles else [laid_at(tuple(bundles), *centre, yaw)]
-        for one in here:
-            at = float(one.centre_m[0]), float(one.centre_m[1])
-            outlines.append(corners(at, one.yaw_rad, one.width_m, one.length_m))
-    return outlines
-
-
-def _gap(first: list[Float64], second: list[Float64]) -> float:
-    return float(np.min([gap_between(one, other) for one in first for other in second], initial=math.inf))

@@ -1,18 +1,27 @@
-"""Store a survey's lifts and vetoes, and settle the lifts that were offered or executed before it."""
+"""Store a survey's lifts and vetoes, settle the lifts that were offered or executed before it, and compute
+the outlines of what a lift may have moved.
+"""
 
 from __future__ import annotations
 
 import json
+import math
 from typing import Any
 
+import numpy as np
+
+from barsight.core.arrays import Float64
 from barsight.core.extras import extra
 from barsight.store.audit import Entry
 from barsight.store.history import executed_lifts
 from barsight.store.states import step_lift
-from barsight.store.tables import LIFT_BUNDLES, LIFT_STATES, LIFTS, SURVEY_VETOES
+from barsight.store.tables import LIFT_BUNDLES, LIFT_STATES, LIFTS, SIGHTINGS, SURVEY_VETOES
+from barsight.yard.events import corners, gap_between
+from barsight.yard.inventory.bundle_file import bundle_of
+from barsight.yard.lifting.load import laid_at
 
 with extra("store"):
-    from sqlalchemy import select
+    from sqlalchemy import Connection, select
 
 
 def add_lifts(
@@ -97,3 +106,33 @@ def _claimed(opened: Entry) -> list[int]:
         .order_by(LIFT_STATES.c.lift_id)
     )
     return list(opened.connection.execute(claimed).scalars())
+
+
+def find_outlines(
+    connection: Connection, lift_id: int, survey_id: int, record: dict[str, Any]
+) -> list[Float64]:
+    """Compute the corners (4, 2) of the load and the magnet, at pick-up and at set-down.
+
+    record: the lift's JSON in lifts.json.
+    """
+    held = select(SIGHTINGS.c.record).join(LIFT_BUNDLES, LIFT_BUNDLES.c.bundle_id == SIGHTINGS.c.bundle_id)
+    own = LIFT_BUNDLES.c.lift_id == lift_id, SIGHTINGS.c.survey_id == survey_id
+    bundles = [bundle_of(json.loads(row)) for row in connection.execute(held.where(*own)).scalars()]
+    places = [record["target"]]
+    if record["set_down"]:
+        places.append(record["set_down"])
+    beam = record.get("beam") or {"width_m": 0.0, "length_m": 0.0}
+    outlines = []
+    for place in places:
+        centre, yaw = (place["x_m"], place["y_m"]), math.radians(place["yaw_deg"])
+        outlines.append(corners(centre, yaw, beam["width_m"], beam["length_m"]))
+        here = bundles if place is places[0] or not bundles else [laid_at(tuple(bundles), *centre, yaw)]
+        for one in here:
+            at = float(one.centre_m[0]), float(one.centre_m[1])
+            outlines.append(corners(at, one.yaw_rad, one.width_m, one.length_m))
+    return outlines
+
+
+def find_gap(first: list[Float64], second: list[Float64]) -> float:
+    """Find the smallest gap between outlines of two lifts."""
+    return float(np.min([gap_between(one, other) for one in first for other in second], initial=math.inf))
