@@ -20,6 +20,7 @@ import cv2
 import httpx
 import numpy as np
 import pytest
+from sqlalchemy import select
 
 from barsight.cli.main import run
 from barsight.core.errors import ConfigError, InputError
@@ -37,8 +38,8 @@ from barsight.store.audit import AuditChain, Entry, entry, verify_chain
 from barsight.store.calibrations import approve_calibration, note_calibration
 from barsight.store.history import list_surveys, present_yard
 from barsight.store.opening import open_store
-from barsight.store.states import raise_alarm, step_alarm, step_lift
-from barsight.store.tables import LIFT_BUNDLES, LIFTS
+from barsight.store.states import alarm_state, last_raised_ns, raise_alarm, step_alarm, step_lift
+from barsight.store.tables import ALARMS, LIFT_BUNDLES, LIFTS
 from barsight.yard.inventory.stock_list import match_stock, read_stock
 from live_folders import live_folder
 from page_yards import FIRST, SECOND, fill_store, survey
@@ -139,8 +140,11 @@ def test_two_servers_of_which_one_watches_the_live_run_do_not_alarm_by_turns(
             watching.judge()
             other.judge()
         with store.reading() as connection:
-            told = [one["state"] for one in alarm_records(connection) if one["code"] == "live-stopped"]
-    assert told == ["raised", "returned"], "what an earlier server has left ends at the start, once"
+            raised = select(ALARMS.c.id).where(ALARMS.c.code == "live-stopped").order_by(ALARMS.c.id)
+            told = [alarm_state(connection, one) for one in connection.execute(raised).scalars()]
+            listed = [one["state"] for one in alarm_records(connection) if one["code"] == "live-stopped"]
+    assert told == ["returned", "raised"], "what an earlier server has left ends at the start, once"
+    assert listed == ["raised"]
 
 
 def test_the_yards_clock_goes_on_while_nothing_changes(
@@ -244,6 +248,43 @@ def test_a_lift_that_was_made_after_its_confirmation_ended_ends_all_offers(
         assert answer.status_code == 409 and "survey before the next lift" in answer.text
     wait_for(lambda: not offered(local))
     assert [one["code"] for one in local.get("/api/alarms").json()["alarms"]].count("lift-unrecorded") == 1
+
+
+def test_a_lift_that_failed_after_its_confirmation_ended_ends_all_offers(
+    local: httpx.Client, url: str
+) -> None:
+    first, second = offered(local)[:2]
+
+    def fail(lift: dict[str, object], note: str) -> httpx.Response:
+        return local.post(f"/api/lifts/{lift['id']}/end", json={"state": "failed", "note": note})
+
+    def told() -> list[str]:
+        alarms = local.get("/api/alarms").json()["alarms"]
+        return [str(one["reason"]) for one in alarms if one["code"] == "lift-unrecorded"]
+
+    local.post(f"/api/lifts/{first['id']}/confirm", json={"map_id": first["map_id"]}).raise_for_status()
+    with open_store(url) as store:
+        for lift in (first, second):
+            confirmation.end_lift(store, int(str(lift["id"])), "expired", "ann", "its time is over")
+    assert fail(second, "slipped").status_code == 409 and told() == [], "it was never confirmed"
+    for _ in range(2):
+        answer = fail(first, "slipped")
+        assert answer.status_code == 409 and "survey before the next lift" in answer.text
+    wait_for(lambda: not offered(local) and len(told()) == 1)
+    assert told()[0].startswith(f"lift {first['id']} failed and is expired")
+
+
+def test_a_failure_that_is_told_twice_raises_no_alarm(local: httpx.Client, url: str) -> None:
+    lift = min(offered(local), key=lambda one: one["target"]["x_m"])
+    local.post(f"/api/lifts/{lift['id']}/confirm", json={"map_id": lift["map_id"]}).raise_for_status()
+    codes = []
+    for _ in range(2):
+        body = {"state": "failed", "note": "slipped"}
+        codes.append(local.post(f"/api/lifts/{lift['id']}/end", json=body).status_code)
+    assert codes == [200, 409]
+    with open_store(url) as store, store.reading() as connection:
+        assert last_raised_ns(connection, "lift-unrecorded") is None
+        assert any(one.state == "offered" for one in confirmation.open_lifts(connection))
 
 
 @pytest.mark.parametrize(("state", "left"), [("expired", 2), ("failed", 1)])
@@ -503,6 +544,16 @@ def test_what_stands_open_is_listed_however_much_came_since(
             begun = [lift.lift_id for lift in confirmation.open_lifts(connection)]
     assert [one["id"] for one in alarms] == [numbers[0], numbers[4], numbers[3]]
     assert len(begun) > 1 and {one["id"] for one in lifts} == set(begun)
+
+
+def test_the_crane_s_readings_are_told_beside_the_target(url: str) -> None:
+    with open_store(url) as store, store.reading() as connection:
+        records = {lift.lift_id: lift.record for lift in confirmation.open_lifts(connection)}
+        told = {one["id"]: one for one in lift_records(connection)}
+    assert records
+    for number, record in records.items():
+        for name in ("crane_target", "crane_set_down"):
+            assert told[number][name] == record[name]
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ from barsight.plant.links.running import serve_plant
 from barsight.plant.links.telegram_process import serve_telegram
 from barsight.plant.live_folder import with_live_run
 from barsight.plant.settings import PlantSettings, StoreSource, TelegramSettings, read_plant
-from barsight.plant.state import PlantAlarm, PlantState, state_of_store, told_alarms
+from barsight.plant.state import MAX_ALARMS, MAX_CODES, PlantAlarm, PlantState, state_of_store, told_alarms
 from barsight.plant.steps import LiftSteps, take_named_step
 from barsight.report.signing import sign_file
 from barsight.store.opening import open_store
@@ -387,6 +387,21 @@ def test_no_crowd_of_lesser_alarms_hides_another_or_tells_its_end() -> None:
     ended = replace(QUIET, alarms=told_alarms((*moved, urgent)))
     told = [(one["event"], one["code"]) for one in changes_between(crowd, ended)]
     assert [one for one in told if one[0] == "alarm-ended"] == [("alarm-ended", "live")]
+
+
+def test_active_alarms_come_before_returned_ones_of_their_priority() -> None:
+    returned = [PlantAlarm("live-stopped", 2, f"crane {k}", False, False) for k in range(25)]
+    active = PlantAlarm("live-stopped", 2, "crane 99", True, False)
+    urgent = PlantAlarm("lift-failed", 1, "lift 3", False, False)
+    assert told_alarms((*returned, active, urgent))[:3] == (urgent, active, returned[0])
+
+
+def test_the_state_holds_a_limited_number_of_codes_and_those_beyond_have_not_ended() -> None:
+    codes = [PlantAlarm(f"code-{k}", 2, "why", True, False) for k in range(60)]
+    full = replace(QUIET, alarms=told_alarms(codes))
+    assert len(full.alarms) == MAX_ALARMS + MAX_CODES
+    more = replace(QUIET, alarms=told_alarms((PlantAlarm("new", 2, "why", True, False), *codes)))
+    assert [(one["event"], one["code"]) for one in changes_between(full, more)] == [("alarm-raised", "new")]
 
 
 def test_another_alarm_of_a_code_is_raised_though_the_first_was_acknowledged() -> None:

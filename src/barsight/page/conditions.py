@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import time
+from collections import defaultdict
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +32,7 @@ from barsight.store.tables import (
 )  # fmt: skip
 
 with extra("store"):
-    from sqlalchemy import Connection, Row, func, select
+    from sqlalchemy import CompoundSelect, Connection, Row, func, select
 
 ALARM_CODES = {
     "store-broken": "The audit log of the store doesn't hold: rows were changed outside Barsight.",
@@ -96,7 +98,7 @@ def _yard_conditions(connection: Connection, newest: Row[Any]) -> set[Condition]
     moved = select(SIGHTINGS.c.bundle_id).where(
         SIGHTINGS.c.survey_id == newest.id, SIGHTINGS.c.change == "moved"
     )
-    lifted = _lifted_since_seen(connection, newest.captured_to_ns)
+    lifted = _lifted_since_seen(connection, newest.captured_to_ns, gone.union(moved))
     for code, query in (("bundle-gone", gone), ("bundle-moved", moved)):
         for number in connection.execute(query).scalars().all():
             if number not in lifted:
@@ -109,35 +111,38 @@ def _yard_conditions(connection: Connection, newest: Row[Any]) -> set[Condition]
     return found
 
 
-def _lifted_since_seen(connection: Connection, before_ns: int) -> set[int]:
-    """Find the bundles that a lift, of one or several, has taken since the last survey before a time that saw
-    them began.
+def _lifted_since_seen(connection: Connection, before_ns: int, asked: CompoundSelect[Any]) -> set[int]:
+    """Find which of the bundles asked about a lift, of one or several, has taken since the last survey before
+    a time that saw them began.
     """
     earlier = (
         select(SIGHTINGS.c.bundle_id, func.max(SURVEYS.c.captured_from_ns).label("from_ns"))
         .join(SURVEYS)
-        .where(SURVEYS.c.captured_to_ns < before_ns, counts())
+        .where(SIGHTINGS.c.bundle_id.in_(asked), SURVEYS.c.captured_to_ns < before_ns, counts())
         .group_by(SIGHTINGS.c.bundle_id)
     )
     seen = {row.bundle_id: row.from_ns for row in connection.execute(earlier)}
     executed = (
         select(LIFT_BUNDLES.c.bundle_id, LIFT_STATES.c.at_ns)
         .join(LIFT_STATES, LIFT_STATES.c.lift_id == LIFT_BUNDLES.c.lift_id)
-        .where(LIFT_STATES.c.state == "executed")
+        .where(LIFT_BUNDLES.c.bundle_id.in_(asked), LIFT_STATES.c.state == "executed")
     )
     return {row.bundle_id for row in connection.execute(executed) if row.at_ns >= seen.get(row.bundle_id, 0)}
 
 
-def settle_alarms(store: Store, present: set[Condition], judged: set[str]) -> bool:
+def settle_alarms(
+    store: Store, present: set[Condition], judged: set[str], seen: Mapping[str, set[str]]
+) -> bool:
     """Raise an alarm for each new condition, and return or clear those whose condition has ended.
 
-    judged: codes that were checked. Returns whether anything was changed.
+    judged: codes that were checked. seen: reasons that may have ended, by code; all those of a code that it
+    lacks. Returns whether anything was changed.
     """
     with store.reading() as connection:
-        if _changes(connection, present, judged) == ([], []):
+        if _changes(connection, present, judged, seen) == ([], []):
             return False
     with entry(store, WHO, "alarms", time.time_ns()) as opened:
-        new, ended = _changes(opened.connection, present, judged)
+        new, ended = _changes(opened.connection, present, judged, seen)
         for code, reason in new:
             raise_alarm(opened, code, reason)
         for number in ended:
@@ -147,18 +152,18 @@ def settle_alarms(store: Store, present: set[Condition], judged: set[str]) -> bo
 
 
 def _changes(
-    connection: Connection, present: set[Condition], judged: set[str]
+    connection: Connection, present: set[Condition], judged: set[str], seen: Mapping[str, set[str]]
 ) -> tuple[list[Condition], list[int]]:
     """Find conditions without an active alarm, and alarms whose condition has ended."""
     last: dict[int, str] = {}
     for row in connection.execute(select(ALARM_STATES).order_by(ALARM_STATES.c.step)).all():
         last[row.alarm_id] = row.state
-    active: dict[Condition, int] = {}
+    active: dict[Condition, list[int]] = defaultdict(list)
     for row in connection.execute(select(ALARMS).order_by(ALARMS.c.id)).all():
         if last.get(row.id) in ("raised", "acknowledged") and row.code in judged:
-            active[row.code, row.reason] = row.id
-    ended = [number for condition, number in active.items() if condition not in present]
-    return sorted(present - set(active)), ended
+            active[row.code, row.reason].append(row.id)
+    gone = [one for one in active if one not in present and one[1] in seen.get(one[0], {one[1]})]
+    return sorted(present - set(active)), [number for one in gone for number in active[one]]
 
 
 def has_veto(connection: Connection, survey_id: int, code: str) -> bool:

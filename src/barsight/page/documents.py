@@ -14,6 +14,7 @@ import numpy as np
 from barsight.core.errors import InputError
 from barsight.core.extras import extra
 from barsight.page.conditions import PRIORITIES, is_there
+from barsight.store.audit import IDS_PER_QUERY
 from barsight.store.calibrations import list_calibrations
 from barsight.store.confirmation import map_vetoes, newest_survey, open_lifts, yard_clock_ns
 from barsight.store.history import PresentBundle, identity_name, list_surveys, present_yard
@@ -34,7 +35,7 @@ from barsight.store.tables import (
 from barsight.yard.inventory.bundle_file import read_match
 
 with extra("store"):
-    from sqlalchemy import Connection, Row, or_, select
+    from sqlalchemy import Connection, Row, func, or_, select
 
 LIKE_RATIO = 0.15
 """Largest relative difference of bar diameter and width between bundles of the same kind."""
@@ -187,16 +188,21 @@ def _lift_figures(record: dict[str, Any]) -> dict[str, Any]:
         "target", "tolerance", "set_down", "mass_kg", "mass_sigma_kg", "pull_low_n", "pull_needed_n",
         "safety", "count", "count_probability", "valid_from_ns", "valid_until_ns",
     )  # fmt: skip
-    return {name: record[name] for name in names}
+    crane = ("crane_target", "crane_set_down")  # not in records of an earlier version
+    return {name: record[name] for name in names} | {name: record.get(name) for name in crane}
 
 
 def alarm_records(connection: Connection) -> list[dict[str, Any]]:
-    """List the newest alarms and all that stand, the most urgent state first, each with its states."""
-    newest = select(ALARMS.c.id).order_by(ALARMS.c.id.desc()).limit(MAX_ALARMS)
+    """List the alarms that stand and the newest cleared ones, the most urgent state first, each with its
+    states. Of those alike in code and reason that stand, only the newest is listed.
+    """
     cleared = select(ALARM_STATES.c.alarm_id).where(ALARM_STATES.c.state == "cleared")
+    past = select(ALARMS.c.id).where(ALARMS.c.id.in_(cleared)).order_by(ALARMS.c.id.desc()).limit(MAX_ALARMS)
+    alike = (ALARMS.c.code, ALARMS.c.reason)
+    standing = select(func.max(ALARMS.c.id)).where(ALARMS.c.id.not_in(cleared)).group_by(*alike)
     rows = connection.execute(
         select(ALARMS)
-        .where(or_(ALARMS.c.id.in_(newest), ALARMS.c.id.not_in(cleared)))
+        .where(or_(ALARMS.c.id.in_(past), ALARMS.c.id.in_(standing)))
         .order_by(ALARMS.c.id.desc())
     ).all()
     steps = _steps(connection, ALARM_STATES, ALARM_STATES.c.alarm_id, [row.id for row in rows])
@@ -302,10 +308,10 @@ def _steps(
     connection: Connection, table: Any, owner: Any, numbers: Iterable[int]
 ) -> dict[int, list[dict[str, Any]]]:
     found: dict[int, list[dict[str, Any]]] = defaultdict(list)
-    rows = connection.execute(
-        select(table).where(owner.in_(list(numbers))).order_by(owner, table.c.step)
-    ).all()
-    for row in rows:
-        step = {"state": row.state, "at_ns": row.at_ns, "who": row.who, "note": row.note}
-        found[getattr(row, owner.name)].append(step)
+    known = list(numbers)
+    for first in range(0, len(known), IDS_PER_QUERY):
+        part = owner.in_(known[first : first + IDS_PER_QUERY])
+        for row in connection.execute(select(table).where(part).order_by(owner, table.c.step)):
+            step = {"state": row.state, "at_ns": row.at_ns, "who": row.who, "note": row.note}
+            found[getattr(row, owner.name)].append(step)
     return found

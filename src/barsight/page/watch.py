@@ -79,8 +79,8 @@ class StoreWatch:
         self.health: LiveHealth | None = None
         self.problem: str | None = None
         self.crane = b""
-        self._has_begun = False
-        self._lock = threading.Lock()
+        self._seen: dict[str, set[str]] = {}
+        self._lock, self._judging = threading.Lock(), threading.Lock()
         self._stop = threading.Event()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._changed: asyncio.Event | None = None
@@ -136,11 +136,13 @@ class StoreWatch:
 
     def judge(self, *, with_chain: bool = False) -> None:
         """Settle alarms, and end offers that have expired or whose calibration was changed."""
+        with self._judging:
+            self._judge(with_chain=with_chain)
+        self.refresh()
+
+    def _judge(self, *, with_chain: bool) -> None:
         self.health = None if self.live is None else self.live.look()
         judged = {code for code in ALARM_CODES if code != "store-broken" or with_chain}
-        if self.live is None and self._has_begun:  # another server may watch the live run
-            judged = {code for code in judged if not code.startswith("live-")}
-        self._has_begun = True
         with self.store.reading() as connection:
             present = find_conditions(connection, self.health)
             if with_chain:
@@ -150,9 +152,10 @@ class StoreWatch:
             is_told = newest is not None and has_veto(connection, newest.id, "calibration-changed")
         if changed and not is_told:
             forbid(self.store, "calibration-changed", changed[0], WHO)
-        settle_alarms(self.store, present, judged)
+        # What another server sees may not be seen from here: after the start only what was seen here ends.
+        settle_alarms(self.store, present, judged, self._seen)
+        self._seen |= {code: {reason for other, reason in present if other == code} for code in judged}
         expire_stale(self.store, WHO)
-        self.refresh()
 
     async def events(self) -> AsyncIterator[bytes]:
         """Stream server-sent events: each new revision and crane position. A slow reader skips those in
@@ -198,4 +201,6 @@ class StoreWatch:
                 self.problem = None
             except (BarsightError, OSError) as error:  # a database or a disk may be back later
                 self.problem = str(error)
+            except Exception as error:  # a watch that has ended would show an old yard
+                self.problem = f"{type(error).__name__}: {error}"
             self._stop.wait(LOOK_S)

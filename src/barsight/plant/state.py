@@ -16,7 +16,11 @@ from barsight.store.states import standing_alarms
 from barsight.yard.lifting.validity import is_ahead
 
 MAX_ALARMS = 20
-"""Maximum number of alarms in the state: urgent ones, then the newest; one of each further code is added."""
+"""Maximum number of alarms in the state: urgent ones, then active ones, then the newest. One of each further
+code is added, up to `MAX_CODES`.
+"""
+MAX_CODES = 20
+"""Maximum number of alarms that are added so that each code is told."""
 URGENT = ("store-broken", "load-contradicts", "lift-unrecorded", "lift-failed")
 """Codes of alarms of priority 1: the store may no longer match the yard. All others have priority 2."""
 YAW_SENSE = "of the beam from +Y of the yard frame, counter-clockwise seen from above"
@@ -153,10 +157,12 @@ def state_of_store(
 
 def told_alarms(standing: Iterable[PlantAlarm]) -> tuple[PlantAlarm, ...]:
     """Choose the alarms that the plant is told. standing: the newest first."""
-    ranked = sorted(standing, key=lambda alarm: alarm.priority)
+    ranked = sorted(standing, key=lambda alarm: (alarm.priority, not alarm.is_active))
     told = ranked[:MAX_ALARMS]
+    codes = {alarm.code for alarm in told}
     for alarm in ranked[MAX_ALARMS:]:
-        if all(alarm.code != other.code for other in told):
+        if alarm.code not in codes and len(told) < MAX_ALARMS + MAX_CODES:
+            codes.add(alarm.code)
             told.append(alarm)
     return tuple(told)
 

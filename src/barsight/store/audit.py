@@ -21,7 +21,7 @@ with extra("store"):
     from sqlalchemy import Connection, Table, func, insert, select
 
 _FIRST = "0" * 64
-_CHUNK = 500
+IDS_PER_QUERY = 500
 """Maximum number of ids in one query, as databases limit the parameters of a statement."""
 
 
@@ -126,9 +126,12 @@ def _rows_digest(connection: Connection, rows: dict[str, list[int]]) -> str:
     found: list[Any] = []
     for name in sorted(rows):
         table, ids = METADATA.tables[name], sorted(rows[name])
-        for first in range(0, len(ids), _CHUNK):
-            part = select(table).where(table.c.id.in_(ids[first : first + _CHUNK])).order_by(table.c.id)
-            found += [[name, *_plain(row)] for row in connection.execute(part).all()]
+        for first in range(0, len(ids), IDS_PER_QUERY):
+            part = table.c.id.in_(ids[first : first + IDS_PER_QUERY])
+            found += [
+                [name, *_plain(row)]
+                for row in connection.execute(select(table).where(part).order_by(table.c.id)).all()
+            ]
     return hashlib.sha256(_canonical(found).encode()).hexdigest()
 
 

@@ -76,6 +76,21 @@ def step_alarm(opened: Entry, alarm_id: int, state: str, note: str | None = None
     _step(opened, ALARM_STATES, "alarm", alarm_id, ALARM_STEPS, state, note)
 
 
+def acknowledge_alarm(opened: Entry, alarm_id: int, note: str | None = None) -> None:
+    """Acknowledge an alarm, or clear it if its cause has ended; alarms alike in code and reason whose cause
+    has ended are cleared with it. Raises InputError for an alarm that can't be acknowledged.
+    """
+    is_returned = alarm_state(opened.connection, alarm_id) == "returned"
+    step_alarm(opened, alarm_id, "cleared" if is_returned else "acknowledged", note)
+    own = select(ALARMS.c.code, ALARMS.c.reason).where(ALARMS.c.id == alarm_id)
+    code, reason = opened.connection.execute(own).one()
+    alike = _standing_query().where(
+        ALARMS.c.code == code, ALARMS.c.reason == reason, ALARM_STATES.c.state == "returned"
+    )
+    for row in opened.connection.execute(alike).all():
+        step_alarm(opened, row.id, "cleared", note)
+
+
 def step_recording(opened: Entry, recording_id: int, state: str, note: str | None = None) -> None:
     """Move a recording to a state. Raises InputError if it may not follow the current state."""
     _step(opened, RECORDING_STATES, "recording", recording_id, RECORDING_STEPS, state, note)
@@ -106,7 +121,7 @@ def _standing_query() -> Select[Any]:
     last = select(ALARM_STATES.c.alarm_id, func.max(ALARM_STATES.c.step).label("step"))
     newest = last.group_by(ALARM_STATES.c.alarm_id).subquery()
     return (
-        select(ALARMS.c.code, ALARMS.c.reason, ALARM_STATES.c.state)
+        select(ALARMS.c.id, ALARMS.c.code, ALARMS.c.reason, ALARM_STATES.c.state)
         .join(ALARM_STATES, ALARM_STATES.c.alarm_id == ALARMS.c.id)
         .join(newest, (newest.c.alarm_id == ALARMS.c.id) & (newest.c.step == ALARM_STATES.c.step))
         .where(ALARM_STATES.c.state != "cleared")

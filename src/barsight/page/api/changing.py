@@ -23,7 +23,7 @@ from barsight.store.accounts import add_person, add_token, withdraw
 from barsight.store.audit import Entry, entry
 from barsight.store.calibrations import approve_calibration, find_calibration, note_calibration
 from barsight.store.confirmation import confirm_lift, end_lift, forbid, take_lift, yard_clock_ns
-from barsight.store.states import alarm_state, raise_alarm, step_alarm
+from barsight.store.states import acknowledge_alarm, raise_alarm, step_alarm
 from barsight.store.stock import decide
 
 with extra("page"):
@@ -86,11 +86,10 @@ def add_alarms(app: FastAPI, watch: StoreWatch, access: Access) -> None:
 
     @app.post("/api/alarms/{alarm_id}/acknowledge")
     def acknowledge(alarm_id: int, form: NoteForm, caller: Caller = operate) -> dict[str, int]:
-        def act(opened: Entry) -> None:
-            is_returned = alarm_state(opened.connection, alarm_id) == "returned"
-            step_alarm(opened, alarm_id, "cleared" if is_returned else "acknowledged", form.note or None)
-
-        return change(signature(caller), f"alarm {alarm_id} acknowledged", act)
+        return change(
+            signature(caller), f"alarm {alarm_id} acknowledged",
+            lambda opened: acknowledge_alarm(opened, alarm_id, form.note or None),
+        )  # fmt: skip
 
     @app.post("/api/alarms/{alarm_id}/clear")
     def clear(alarm_id: int, form: NoteForm, caller: Caller = report) -> dict[str, int]:

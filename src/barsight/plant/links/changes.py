@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
-from barsight.plant.state import MAX_ALARMS, PlantAlarm, PlantState
+from barsight.plant.state import MAX_ALARMS, MAX_CODES, PlantAlarm, PlantState
 
 
 def changes_between(old: PlantState | None, new: PlantState) -> list[dict[str, Any]]:
@@ -38,13 +38,15 @@ def _ended(old: PlantState, new: PlantState) -> Iterator[PlantAlarm]:
     """Yield the alarms that have ended.
 
     If more stand than the state lists, those at the list's end may only have dropped off it; they don't count
-    as long as another alarm of their code stands.
+    as long as another alarm of their code stands, or the state lists as many codes as it may. An active one
+    whose cause is gone may drop off too, as active ones come first: that counts.
     """
     stood, standing = _alarms(old), _alarms(new)
     if len(standing) >= MAX_ALARMS:
         first, codes = standing[:MAX_ALARMS], {alarm.code for alarm in standing}
         last = max((k for k, alarm in enumerate(stood[:MAX_ALARMS]) if alarm in first), default=0)
-        stood = stood[:last] + [alarm for alarm in stood[last:] if alarm.code not in codes]
+        is_full = len(standing) >= MAX_ALARMS + MAX_CODES
+        stood = stood[:last] + [one for one in stood[last:] if one.code not in codes and not is_full]
     yield from (Counter(stood) - Counter(standing)).elements()
 
 
