@@ -108,6 +108,10 @@ export function figures(bundle, clock_ns) {
   return h("dl", {}, pairs.map(([name, value]) => [h("dt", {}, name), h("dd", {}, String(value))]));
 }
 
+const at = (place) => `X ${place.x_m.toFixed(2)}  Y ${place.y_m.toFixed(2)}  Z ${place.z_m === null ? "–" : place.z_m.toFixed(2)} m · ${place.yaw_deg.toFixed(1)}°`;
+// What the crane's own display must say there, where that differs: the magnet hangs off its readings, or the load off the magnet's middle.
+const readings = (word, place, crane) => crane && at(crane) !== at(place) && [t(word), at(crane)];
+
 export function liftPanel(lift) {
   const pull = lift.pull_low_n === null ? t("unknown") : `${(lift.pull_low_n / 1000).toFixed(0)} / ${(lift.pull_needed_n / 1000).toFixed(0)} kN`;
   const to = lift.set_down;
@@ -115,11 +119,11 @@ export function liftPanel(lift) {
     h("ol", { className: "steps" }, ["offered", "claimed", "executing", "executed", "verified"].map((state) => h("li", { className: state === lift.state ? "at" : "" }, t(`lift.${state}`))),
       ["expired", "failed"].includes(lift.state) && h("li", { className: "at" }, t(`lift.${lift.state}`))),
     h("dl", {}, [
-      [t("lift.target"), `X ${lift.target.x_m.toFixed(2)}  Y ${lift.target.y_m.toFixed(2)}  Z ${lift.target.z_m === null ? "–" : lift.target.z_m.toFixed(2)} m · ${lift.target.yaw_deg.toFixed(1)}°`],
+      [t("lift.target"), at(lift.target)], readings("lift.readings", lift.target, lift.crane_target),
       [t("lift.takes"), t("lift.sure", lift.count, (100 * lift.count_probability).toFixed(2))],
       [t("mass"), figure(lift.mass_kg, lift.mass_sigma_kg, 1, "kg")], [t("lift.pull"), pull],
-      [t("lift.setdown"), to ? `X ${to.x_m.toFixed(2)}  Y ${to.y_m.toFixed(2)} m` : "–"], [t("map"), lift.map_id],
-    ].map(([name, value]) => [h("dt", {}, name), h("dd", {}, value)])),
+      [t("lift.setdown"), to ? at(to) : "–"], to && readings("lift.setdown.readings", to, lift.crane_set_down), [t("map"), lift.map_id],
+    ].filter(Boolean).map(([name, value]) => [h("dt", {}, name), h("dd", {}, value)])),
     liftButtons(lift),
   ];
 }
@@ -129,9 +133,14 @@ const LATE_NS = 3600e9; // so long a lift that was made after its confirmation e
 // clock_ns: the yard's, for lifts that have ended.
 export function liftButtons(lift, clock_ns = Infinity) {
   const act = (path, body, word) => change("POST", `/api/lifts/${lift.id}/${path}`, body).then(() => tell(t(word)), (error) => tell(error.message));
+  const which = `${lift.bundles.join(", ")} · ${t("map")} ${lift.map_id}`;
+  const late = lift.state === "expired" && h("p", {}, t("lift.late.text"));
   const ended = async (state, title) => {
-    const given = await ask(t(title), `${lift.bundles.join(", ")} · ${t("map")} ${lift.map_id}`, [["note", t("reason")]], t("accept"));
+    const given = await ask(t(title), [h("p", {}, which), late], [["note", t("reason")]], t("accept"));
     if (given) act("end", { state, note: given.note }, `told.${state}`);
+  };
+  const taken = async () => {
+    if (!late || await ask(t("lift.taken"), [h("p", {}, which), late], [], t("accept"))) act("taken", {}, "told.taken");
   };
   const confirm = async () => {
     const fields = session.name === "local" ? [["name", t("your.name")]] : [];
@@ -141,11 +150,11 @@ export function liftButtons(lift, clock_ns = Infinity) {
     if (given) act("confirm", { map_id: lift.map_id, name: given.name || "" }, "told.confirmed");
   };
   const button = (id, word, onclick, className, right) => h("button", { id: `${id}-${lift.id}`, onclick, className, disabled: !may(right) }, t(word));
-  const ends = [button("taken", "lift.taken", () => act("taken", {}, "told.taken"), "main", "execute"),
+  const ends = [button("taken", "lift.taken", taken, "main", "execute"),
     button("failed", "lift.report.failed", () => ended("failed", "lift.report.failed"), "", "execute")];
   const isLate = lift.steps.some((step) => step.state === "claimed") && clock_ns - lift.steps[lift.steps.length - 1].at_ns < LATE_NS;
   const buttons = {
-    expired: () => (isLate ? ends.slice(0, 1) : []),
+    expired: () => (isLate ? ends : []),
     offered: () => [button("confirm", "lift.confirm", confirm, "main", "operate"), button("decline", "lift.decline", () => ended("expired", "lift.decline"), "", "operate")],
     executing: () => ends,
     claimed: () => [...ends, button("back", "lift.back", () => ended("expired", "lift.back"), "", "operate")],
