@@ -180,7 +180,7 @@ def test_the_oldest_surveys_go_but_for_protected_ones(tmp_path: Path) -> None:
     (tmp_path / "20261101T101010" / PROTECTED).touch()
     (tmp_path / "notes").mkdir()
     (tmp_path / "latest").symlink_to("20261103T101010")
-    _keep(tmp_path, 1)
+    _keep(tmp_path, 1, "20261105T101010")
     left = sorted(path.name for path in tmp_path.iterdir())
     assert left == ["20261101T101010", "20261103T101010", "20261105T101010", "latest", "notes"]
 
@@ -188,8 +188,15 @@ def test_the_oldest_surveys_go_but_for_protected_ones(tmp_path: Path) -> None:
 def test_surveys_dated_ahead_go_before_those_made_since_the_clock_was_set_right(tmp_path: Path) -> None:
     for name in ("20990101T000000", "20990102T000000", "20200101T000000", "20200102T000000"):
         (tmp_path / name).mkdir()
-    _keep(tmp_path, 2)
+    _keep(tmp_path, 2, "20200102T000000")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["20200101T000000", "20200102T000000"]
+
+
+def test_the_newest_survey_stays_though_the_clock_was_two_hours_ahead(tmp_path: Path) -> None:
+    for name in ("20261105T080000", "20261105T120000", "20261105T121000", "20261105T101000"):
+        (tmp_path / name).mkdir()
+    _keep(tmp_path, 2, "20261105T101000")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["20261105T080000", "20261105T101000"]
 
 
 def test_what_was_recorded_of_a_standing_crane_goes_unless_it_holds_an_alarm(tmp_path: Path) -> None:

@@ -206,6 +206,20 @@ def test_the_oldest_unprotected_segments_go_first(tmp_path: Path) -> None:
     assert keeper.tidy() == 0 and not keeper.is_full
 
 
+def test_recordings_dated_ahead_go_first(tmp_path: Path) -> None:
+    """The clock was wrong when they were made, and has been set back since: they are the older ones."""
+    for name in ("20200101T000000", "20200102T000000", "20990101T000000", "20200103T000000"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "segment_000000.mcap").touch()
+
+    def used(_: Path) -> float:
+        return 0.1 * len(list(tmp_path.rglob("*.mcap")))
+
+    assert Retention(tmp_path / "20200103T000000", 0.35, 0.95, used).tidy() == 1
+    left = sorted(path.name for path in tmp_path.iterdir())
+    assert left == ["20200101T000000", "20200102T000000", "20200103T000000"]
+
+
 GOOD = """
 calibration = "rig.yaml"
 [cameras]

@@ -6,7 +6,7 @@ import shutil
 import signal
 import time
 from collections.abc import Callable
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
@@ -99,7 +99,7 @@ def measure_surveys(
         except BarsightError as error:
             ended, proved = run.stop_because, False
             tell(f"{here.name} offers no lifts: {error}")
-        _keep(out, crane.survey.keep)
+        _keep(out, crane.survey.keep, here.name)
     return {}
 
 
@@ -130,7 +130,7 @@ def replay_surveys(
                 raise
             tell(f"{here.name} offers no lifts: {error}")
         ended, is_first = run.stop_because, False
-        _keep(out, REPLAYS_KEPT)
+        _keep(out, REPLAYS_KEPT, here.name)
     return {}
 
 
@@ -173,18 +173,18 @@ def _point(link: Path, name: str) -> None:
         fresh.replace(link)
 
 
-def _keep(out: Path, count: int) -> None:
+def _keep(out: Path, count: int, newest: str) -> None:
     """Remove the oldest survey folders beyond `count`, except the last one measured.
 
-    Folders dated ahead belong to no new survey: the clock was wrong then and has been set back since.
+    newest: name of the folder just written. Those named later are older: the clock was wrong then and has
+    been set back since.
     """
-    ahead = (datetime.now(UTC) + timedelta(days=1)).strftime(STAMP)
     surveys = sorted(
         (
             path for path in out.iterdir()
             if path.is_dir() and not path.is_symlink() and len(path.name) == 15 and path.name[8] == "T"
         ),
-        key=lambda path: (path.name < ahead, path.name),
+        key=lambda path: (path.name <= newest, path.name),
     )  # fmt: skip
     for path in surveys[:-count]:
         is_latest = (out / LATEST).exists() and path.samefile(out / LATEST)

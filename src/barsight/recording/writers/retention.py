@@ -50,10 +50,14 @@ class Retention:
         return deleted
 
     def _deletable(self) -> list[Path]:
-        """List the segments of the other recordings, the oldest first; folders are named by their start."""
+        """List the segments of the other recordings, the oldest first; folders are named by their start.
+
+        Those named later than the current one are older: the clock was wrong then, and was set back since.
+        """
+        now = self._current.name
         return [
             path
-            for folder in sorted(self._current.parent.iterdir())
+            for folder in sorted(self._current.parent.iterdir(), key=lambda one: (one.name <= now, one.name))
             if folder.is_dir() and folder != self._current and not (folder / PROTECTED).exists()
             for path in sorted(folder.glob(PATTERN))
         ]
