@@ -38,6 +38,15 @@ def test_a_list_of_bundles_without_any_is_refused(flag: str, capsys: pytest.Capt
         assert f"{flag} has no value" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("arguments", [["--fetch", "-h"], ["--lifted", "--help"], ["--fetch", "3", "-h"]])
+def test_a_list_without_any_still_leads_to_the_help(
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        run(["lifts", "out", *arguments])
+    assert ended.value.code == 0 and "--magnet" in capsys.readouterr().out
+
+
 def test_a_command_takes_no_argument_at_all(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -13,6 +13,7 @@ import uuid
 from collections.abc import Callable
 from pathlib import Path
 
+import psycopg
 import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
@@ -413,6 +414,25 @@ def test_a_server_that_may_only_be_read_or_whose_writer_hangs_is_one_line(
         store.engine.dispose()
         with pytest.raises(OutputError, match="read-only"):
             alarm(store)
+        with psycopg.connect(host=server, user="postgres", dbname="postgres", autocommit=True) as connection:
+            connection.execute(f'ALTER DATABASE "{name}" RESET default_transaction_read_only'.encode())
+        alarm(store)  # on a new connection, as the kept one may only read
+
+
+def test_a_user_without_the_right_to_write_is_told_in_one_line(server: str) -> None:
+    url = add_database(server, f"yard_{uuid.uuid4().hex}")
+    with open_store(url, create=True) as store, store.engine.begin() as connection:
+        connection.execute(text("CREATE ROLE reader LOGIN"))
+        connection.execute(text("GRANT SELECT ON ALL TABLES IN SCHEMA public TO reader"))
+    try:
+        with open_store(url.replace("postgres@", "reader@")) as store:
+            with pytest.raises(OutputError, match="permission denied") as refused:
+                alarm(store)
+            assert "\n" not in str(refused.value)
+    finally:
+        with open_store(url) as store, store.engine.begin() as connection:
+            connection.execute(text("DROP OWNED BY reader"))
+            connection.execute(text("DROP ROLE reader"))
 
 
 def test_vetoes_are_kept_for_the_map_and_for_its_bundles(store: Store, tmp_path: Path) -> None:

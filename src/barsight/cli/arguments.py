@@ -7,7 +7,7 @@ import importlib
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from itertools import pairwise
+from itertools import pairwise, takewhile
 from pathlib import Path
 from typing import TypeVar
 
@@ -67,8 +67,11 @@ def pass_on(name: str, noun: str, kinds: Mapping[str, str], arguments: Sequence[
 def _listed(arguments: Sequence[str]) -> list[str]:
     """Rewrite `--use stereo,imu` as `--use stereo imu`, and the same for the other LISTS.
 
-    Raises ConfigError where one has no value, as from a script whose variable was empty.
+    Raises ConfigError where one has no value, as from a script whose variable was empty. Before -h and --help
+    it may be missing.
     """
+    if {"-h", "--help"} & set(arguments):
+        return [*takewhile(lambda one: one.partition("=")[0] not in LISTS, arguments), "--help"]
     listed: list[str] = []
     for argument in arguments:
         flag, equals, value = argument.partition("=")

@@ -51,7 +51,7 @@ class Store:
     def writing(self) -> Iterator[Connection]:
         """Provide a connection in an exclusive write transaction; it commits unless an error is raised."""
         writer = self.engine.execution_options(is_writer=True)
-        with _told(self.name), writer.begin() as connection:
+        with _told(self.name, writer), writer.begin() as connection:
             if not self._is_sqlite:
                 limits = {"lock_timeout": WAIT_S, "idle_in_transaction_session_timeout": IDLE_S}
                 told = (f"set_config('{name}', '{1e3 * s:.0f}', true)" for name, s in limits.items())
@@ -129,13 +129,16 @@ def _begin_sqlite(connection: Connection) -> None:
     connection.exec_driver_sql("BEGIN IMMEDIATE" if is_writer else "BEGIN")
 
 
-_UNWRITTEN = ("SQLITE_FULL", "SQLITE_IOERR", "SQLITE_READONLY", "25006")
-"""Codes of SQLite's, and PostgreSQL's of a server that may only be read, as after a failover."""
+_READ_ONLY = "25006"
+_UNWRITTEN = ("SQLITE_FULL", "SQLITE_IOERR", "SQLITE_READONLY", _READ_ONLY, "42501")
+"""Codes of SQLite's, and PostgreSQL's of a server that may only be read, as after a failover, and of a user
+without the right.
+"""
 _TOO_IDLE = "25P03"
 
 
 @contextmanager
-def _told(name: str) -> Iterator[None]:
+def _told(name: str, writer: Engine | None = None) -> Iterator[None]:
     """Convert the error of a database that can't be reached, read or written into an InputError of one line,
     or into an OutputError if it could not or may not be written.
 
@@ -153,6 +156,8 @@ def _told(name: str) -> Iterator[None]:
             raise
         problem = str(error.orig).strip().splitlines()[0]
         if is_unwritten:
+            if writer is not None and code == _READ_ONLY:
+                writer.dispose()  # kept connections would stay read-only when the server no longer is
             raise OutputError(f"{name}: {problem}; free some space, or see that it may be written") from error
         raise InputError(
             name, problem, "see that the database is there, is a store and may be written"
