@@ -3,21 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from barsight.core.errors import ConfigError
 from barsight.core.pose import Pose
-from barsight.core.records.pairs import RectifiedCamera
+from barsight.core.records.pairs import RectifiedCamera, RectifiedPair, RefusedFrame
 from barsight.core.records.sensor_samples import CraneSamples
 from barsight.core.records.trajectory import PosedFrame
 from barsight.mapping.ego_mask import MIN_WAY_PX
-from barsight.mapping.keyframes import keyframe_spacing_m, select_keyframes, select_keyframes_by_encoders
+from barsight.mapping.keyframes import (
+    KeyframeSelection,
+    keyframe_spacing_m,
+    select_keyframes_by_encoders,
+)
 from barsight.mapping.settings import MapSettings
 from barsight.measure_settings import MeasureSettings
+from barsight.reconstruction import tracked_recording
+from barsight.reconstruction.live_map import LiveMap
+from barsight.stereo.image_pair import pair_from_images
 
 CAMERA = RectifiedCamera(1000.0, 499.5, 399.5, 0.5, 0.0, 1000, 800)
 RANGE_M = 8.0
@@ -31,6 +39,27 @@ def _frames(places_m: list[float], turns_rad: list[float]) -> list[PosedFrame]:
         pose = Pose("yard", "body", about_y, np.array([x, 0.0, 0.0]))
         frames.append(PosedFrame(stamp, pose, np.eye(6)))
     return frames
+
+
+NOISE = np.random.default_rng(1).integers(0, 255, (64, 160)).astype(np.uint8)
+GOOD = pair_from_images(NOISE[:, :128], NOISE[:, 16:144])
+
+
+def _picture(stamp: int) -> RectifiedPair:
+    return replace(GOOD, stamp_ns=stamp)
+
+
+def _strobed(stamp: int) -> RectifiedPair | RefusedFrame:
+    """Every other picture is black, and a cable is loose now and then."""
+    if stamp % 4 == 2:
+        return RefusedFrame(stamp, "cut off")
+    black = pair_from_images(*np.zeros((2, 64, 128), np.uint8))
+    return _picture(stamp) if stamp % 2 else replace(black, stamp_ns=stamp)
+
+
+def select_keyframes(frames: list[PosedFrame], rectifier: Any, range_m: float, share: float) -> set[int]:
+    selection = KeyframeSelection(rectifier, range_m, share)
+    return set(tracked_recording.select_keyframes(frames, _picture, selection, MeasureSettings().stereo)[0])
 
 
 def _rectifier() -> Any:
@@ -59,6 +88,33 @@ def test_a_crane_at_rest_or_slow_confirms_no_frame_by_itself() -> None:
     assert keyframe_spacing_m(replace(CAMERA, width=320, height=256), RANGE_M, 0.01) == pytest.approx(
         MIN_WAY_PX * RANGE_M / CAMERA.focal_px
     )
+
+
+def test_a_frame_without_a_picture_displaces_none_that_has_one(tmp_path: Path) -> None:
+    """Strobes and faulty cables: encoders place what can't be matched. A live map selects the same frames."""
+    frames = _frames([0.1 * k for k in range(23)], [0.0] * 23)
+    selection = KeyframeSelection(_rectifier(), RANGE_M, 0.0)
+    settings = MeasureSettings()
+    taken, refused = tracked_recording.select_keyframes(frames, _strobed, selection, settings.stereo)
+    assert list(taken) == list(range(1, 22, 2))
+    assert [(one.frame.stamp_ns, one.stage) for one in refused[:2]] == [(0, "stereo"), (22, "recording")]
+
+    fused = list[int]()
+    builder = SimpleNamespace(add=lambda match, posed, after: fused.append(posed.stamp_ns), settle=int)
+    builder.placed, builder.stamps_ns = [], fused
+    pairs = SimpleNamespace(recording=SimpleNamespace(crane=lambda: None), rectifier=_rectifier())
+    by_stamp = {frame.stamp_ns: frame for frame in frames}
+    placer = SimpleNamespace(push=lambda pair: by_stamp[pair.stamp_ns], finish=lambda: 1)
+    live = LiveMap(
+        cast(Any, pairs), settings, tmp_path, None, cast(Any, placer), cast(Any, lambda pair: pair)
+    )
+    live._checkpoints = tmp_path
+    live._map = cast(Any, (builder, None))
+    live._selection = KeyframeSelection(_rectifier(), RANGE_M, 0.0)
+    for frame in frames:
+        live.add(_strobed(frame.stamp_ns))
+    live.end()
+    assert fused == list(taken)
 
 
 def test_encoders_choose_as_the_trajectory_does() -> None:

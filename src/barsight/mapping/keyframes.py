@@ -14,16 +14,31 @@ from barsight.core.records.trajectory import PosedFrame
 from barsight.mapping.ego_mask import MIN_WAY_PX
 
 
-def select_keyframes(
-    frames: Sequence[PosedFrame], rectifier: Rectifier, range_m: float, min_shift: float
-) -> set[int]:
-    """Select keyframes by parallax: stamps of frames whose picture has moved, since the last keyframe, by
-    at least min_shift of its shorter side on a surface range_m away; the first and the last frame always.
+class KeyframeSelection:
+    """Selects keyframes by parallax: the first frame, and those whose picture has moved, since the last
+    keyframe, by at least `keyframe_spacing_m` on a surface range_m away.
     """
-    ahead = np.array([0.0, 0.0, range_m])
-    seen = [(frame.reference_from_body @ rectifier.body_from_rect0).apply(ahead) for frame in frames]
-    stamps = [frame.stamp_ns for frame in frames]
-    return set(_spread(stamps, np.array(seen), keyframe_spacing_m(rectifier.camera, range_m, min_shift)))
+
+    def __init__(self, rectifier: Rectifier, range_m: float, min_shift: float) -> None:
+        self._rectifier, self._range_m, self._min_shift = rectifier, range_m, min_shift
+        self._last: Float64 | None = None
+
+    def is_due(self, frame: PosedFrame) -> bool:
+        """Return True if the frame's picture has moved enough since the last keyframe."""
+        if self._last is None:
+            return True
+        spacing_m = keyframe_spacing_m(self._rectifier.camera, self._range_m, self._min_shift)
+        return bool(np.linalg.norm(self._seen(frame) - self._last) >= spacing_m)
+
+    def take(self, frame: PosedFrame) -> None:
+        """Make the frame the last keyframe. A frame that can't be matched mustn't be: the good ones after it
+        would be passed over.
+        """
+        self._last = self._seen(frame)
+
+    def _seen(self, frame: PosedFrame) -> Float64:
+        camera = frame.reference_from_body @ self._rectifier.body_from_rect0
+        return camera.apply(np.array([0.0, 0.0, self._range_m]))
 
 
 def select_keyframes_by_encoders(

@@ -19,7 +19,12 @@ from barsight.stereo.direct.pipeline import BarsightStereo
 from barsight.stereo.masking import mask_disparity, mask_gaps, mask_pieces, mask_unsure
 from barsight.stereo.method import StereoMethod
 from barsight.stereo.prediction import predict_disparity
-from barsight.stereo.search_range import find_disparity_range, follow_disparity_range
+from barsight.stereo.search_range import (
+    check_matchable,
+    find_disparity_range,
+    follow_disparity_range,
+    is_well_textured,
+)
 from barsight.stereo.settings import StereoSettings
 from barsight.stereo.triangulation import triangulate_disparity
 
@@ -162,6 +167,16 @@ class PointBinner:
         if cells.z_m.size == 0:
             return Failed("no-depth", "no pixel has a depth within max_depth_m and max_sigma_m")
         return PosedView(cells, pair, disparity.disparity_px)
+
+
+def check_pair(pair: RectifiedPair, stereo: StereoSettings) -> Failed | None:
+    """Return Failed if `Matcher` would find no disparity in the pair; takes a small part of its time."""
+    if stereo.min_disparity_px is not None and stereo.max_disparity_px is not None:
+        return check_matchable(pair)
+    if is_well_textured(pair):
+        return None
+    found = find_disparity_range(pair)
+    return found if isinstance(found, Failed) else None
 
 
 def disparity_range(

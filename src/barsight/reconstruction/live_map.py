@@ -12,15 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-from barsight.core.arrays import Float64
 from barsight.core.errors import Failed, MeasurementError
 from barsight.core.records.pairs import RectifiedPair, RefusedFrame
 from barsight.core.records.trajectory import PosedFrame, Trajectory
 from barsight.core.timing import Stopwatch, unwatched
-from barsight.mapping.keyframes import keyframe_spacing_m
+from barsight.mapping.keyframes import KeyframeSelection
 from barsight.mapping.recording_probe import points_per_pixel
 from barsight.mapping.surface.surface import Surface
-from barsight.mapping.view import PointBinner
+from barsight.mapping.view import PointBinner, check_pair
 from barsight.measure_settings import MeasureSettings
 from barsight.motion.estimator import PoseEstimator, TrajectoryEstimator
 from barsight.motion.settings import make_estimator
@@ -154,8 +153,7 @@ class LiveMap:
         self._held: tuple[RectifiedPair, PosedFrame] | None = None
         self._taken: list[PosedFrame] = []
         self._map: tuple[MapBuilder, PointBinner] | None = None
-        self._min_way_m, self._ahead = 0.0, np.zeros(3)
-        self._last: Float64 | None = None
+        self._selection: KeyframeSelection | None = None
 
     @property
     def delay_ns(self) -> int:
@@ -172,7 +170,10 @@ class LiveMap:
         and a pair whose picture has hardly moved is left out.
         """
         posed = self._placer.push(pair)
-        if not isinstance(posed, PosedFrame) or not isinstance(pair, RectifiedPair):
+        if not isinstance(posed, PosedFrame):
+            return
+        self._passed = None
+        if not isinstance(pair, RectifiedPair):
             return
         way = Trajectory(self._reference, (posed,), (), ())
         (placed,) = placed_in_yard(way, frame_of(self._pairs.recording)).frames
@@ -207,7 +208,7 @@ class LiveMap:
         if self._checkpoints is None or self._map is None or self._placer.finish() is None:
             return
         builder, binner = self._map
-        if self._passed is not None:
+        if self._passed is not None and check_pair(self._passed[0], self._settings.stereo) is None:
             self._fuse_held(builder, self._passed)
         self._fuse_held(builder, None)
         if builder.placed and all(self._match.holds(one.stamp_ns) for one in self._taken):
@@ -216,8 +217,7 @@ class LiveMap:
     def _begun(self) -> tuple[MapBuilder, PointBinner]:
         settings, rectifier = self._settings, self._pairs.rectifier
         first, cell_m, sigma_px = look_at(self._pairs, settings, self._checkpoints)
-        self._min_way_m = keyframe_spacing_m(rectifier.camera, first.range_m, settings.map.min_shift)
-        self._ahead = np.array([0.0, 0.0, first.range_m])
+        self._selection = KeyframeSelection(rectifier, first.range_m, settings.map.min_shift)
         binner = PointBinner(
             replace(settings.stereo, calibration_sigma_px=sigma_px), rectifier.body_from_rect0, cell_m,
             points_per_pixel(first, cell_m), settings.map.max_sigma_m, Stopwatch(),
@@ -226,12 +226,14 @@ class LiveMap:
         return MapBuilder(binner, rectifier.camera, self._folder, settings.map, yard, self._beat), binner
 
     def _take(self, builder: MapBuilder, pair: RectifiedPair, posed: PosedFrame) -> None:
-        """Select a pair for the map unless its picture has hardly moved."""
-        seen = (posed.reference_from_body @ self._pairs.rectifier.body_from_rect0).apply(self._ahead)
-        if self._last is not None and np.linalg.norm(seen - self._last) < self._min_way_m:
+        """Select a pair for the map unless its picture has hardly moved or can't be matched."""
+        assert self._selection is not None
+        if not self._selection.is_due(posed):
             self._passed = pair, posed
             return
-        self._last, self._passed = seen, None
+        if check_pair(pair, self._settings.stereo) is not None:
+            return
+        self._selection.take(posed)
         self._fuse_held(builder, (pair, posed))
         builder.settle()
 

@@ -141,6 +141,7 @@ def build_map(
     source, path = probed.source, probed.source.path
     refusals = [Refusal("recording", frame) for frame in source.index.unpaired]
     refusals += [Refusal("trajectory", frame) for frame in way.trajectory.refused]
+    refusals += way.refusals
     binner = PointBinner(
         way.stereo, way.rectifier.body_from_rect0, probed.cell_m, probed.per_pixel, settings.map.max_sigma_m,
         probed.watch,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,8 +18,8 @@ from barsight.core.parallel import WORKERS, prefetched_chain
 from barsight.core.records.pairs import RectifiedPair, RefusedFrame
 from barsight.core.records.trajectory import PosedFrame, Trajectory
 from barsight.core.timing import ProgressCallback, Stopwatch, count_frames
-from barsight.mapping.keyframes import select_keyframes, select_keyframes_by_encoders
-from barsight.mapping.view import MatchedFrame, Matcher
+from barsight.mapping.keyframes import KeyframeSelection, select_keyframes_by_encoders
+from barsight.mapping.view import MatchedFrame, Matcher, check_pair
 from barsight.measure_settings import MeasureSettings
 from barsight.measurement import Refusal
 from barsight.motion.rig_check.self_calibration import residual_covariance, self_calibrate
@@ -42,8 +42,8 @@ _MATCHED_AHEAD, _MATCHED_AFTER = 16, 4
 class TrackedRecording:
     """The trajectory, and the pairs from which the map is made. rectifier: corrected by self-calibration
     if set. stereo: with the disparity's calibration sigma. rig_covariance: of yaw, baseline and focal
-    length (3, 3), None where no rig file gives it. poses: of the selected frames, by stamp. matched: those
-    frames, in order.
+    length (3, 3), None where no rig file gives it. poses: of the selected frames, by stamp. refusals: of
+    frames that would have been selected. matched: the selected frames, in order.
     """
 
     trajectory: Trajectory
@@ -52,6 +52,7 @@ class TrackedRecording:
     rig_covariance: Float64 | None
     drift_warnings: tuple[str, ...]
     poses: dict[int, PosedFrame]
+    refusals: tuple[Refusal, ...]
     matched: Iterator[MatchedFrame | Refusal]
 
 
@@ -86,8 +87,8 @@ def estimate_trajectory(
             pairs = RectifiedPairs(source, rectifier, watch=watch)
             match = matching(pairs, settings, probed.checkpoints, watch)
         stereo = replace(settings.stereo, calibration_sigma_px=calibrated.sigma_px)
-        taken = select_keyframes(trajectory.frames, rectifier, probed.first.range_m, settings.map.min_shift)
-        poses = {frame.stamp_ns: frame for frame in trajectory.frames if frame.stamp_ns in taken}
+        selection = KeyframeSelection(rectifier, probed.first.range_m, settings.map.min_shift)
+        poses, refusals = select_keyframes(trajectory.frames, pairs.reader(), selection, settings.stereo)
         late = min((stamp for stamp in poses if stamp not in early), default=None)
         matched: Iterator[MatchedFrame | Refusal] = ahead
         if late is not None:
@@ -98,7 +99,31 @@ def estimate_trajectory(
         if rig is not None:
             corrected = settings.self_calibrate == "yaw"
             rig = residual_covariance(rig, trajectory.drift, corrected=corrected)
-        yield TrackedRecording(trajectory, rectifier, stereo, rig, calibrated.warnings, poses, matched)
+        yield TrackedRecording(
+            trajectory, rectifier, stereo, rig, calibrated.warnings, poses, refusals, matched
+        )
+
+
+def select_keyframes(
+    frames: Sequence[PosedFrame], read: Callable[[int], RectifiedPair | RefusedFrame],
+    selection: KeyframeSelection, stereo: StereoSettings,
+) -> tuple[dict[int, PosedFrame], tuple[Refusal, ...]]:  # fmt: skip
+    """Select the frames to be mapped, by stamp: keyframes and the last frame. A frame that can't be matched
+    is refused instead, and the next one is considered. read: reads a frame's pair.
+    """
+    taken, refusals = dict[int, PosedFrame](), list[Refusal]()
+    for frame in frames:
+        if not selection.is_due(frame) and frame is not frames[-1]:
+            continue
+        pair = read(frame.stamp_ns)
+        if isinstance(pair, RefusedFrame):
+            refusals.append(Refusal("recording", pair))
+        elif (nothing := check_pair(pair, stereo)) is not None:
+            refusals.append(Refusal("stereo", RefusedFrame(pair.stamp_ns, nothing.reason)))
+        else:
+            taken[pair.stamp_ns] = frame
+            selection.take(frame)
+    return taken, tuple(refusals)
 
 
 @contextmanager

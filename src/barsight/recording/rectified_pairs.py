@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator
+from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
@@ -52,6 +52,25 @@ class RectifiedPairs:
                 continue
             frame, ahead = ahead, None
             yield frame if isinstance(frame, RefusedFrame) else self.rectify(frame)
+
+    def reader(self) -> Callable[[int], RectifiedPair | RefusedFrame]:
+        """Return a function that reads the pair of a stamp, later ones at each call; unlike a new iterator
+        for each, it reads a bag once.
+        """
+        wanted = set[int]()
+        fresh = self.recording.frames(wanted)
+
+        def read(stamp_ns: int) -> RectifiedPair | RefusedFrame:
+            if self.has(stamp_ns):
+                return self._read(stamp_ns)
+            wanted.clear()
+            wanted.add(stamp_ns)
+            frame = next(fresh, None)
+            if frame is None or frame.stamp_ns != stamp_ns:
+                return next(self({stamp_ns}))
+            return frame if isinstance(frame, RefusedFrame) else self.rectify(frame)
+
+        return read
 
     def rectify(self, frame: StereoFrame) -> RectifiedPair | RefusedFrame:
         """Rectify a frame once for all threads, and store it for later requests."""

@@ -77,6 +77,14 @@ def follow_disparity_range(pair: RectifiedPair, predicted: Float32) -> Disparity
     return _range_around(lows.min(), highs.max(), _FOLLOW_MARGIN_PX, pair.camera)
 
 
+def is_well_textured(pair: RectifiedPair) -> bool:
+    """Check quickly whether most of a pair matches, at an eighth of the size: then it has a range."""
+    if check_matchable(pair) is not None:
+        return False
+    coarse = coarse_disparity(pair.left, pair.right, pair.camera.doffs_px, shrink=2 * _SCALE)
+    return _finite_ratio(coarse) >= _POOR
+
+
 def _range_around(low: float, high: float, margin: float, camera: RectifiedCamera) -> DisparityRange:
     """Widen a span of disparities, px, by a margin, to a range of a multiple of 16 candidates."""
     ceiling = int(camera.width * 0.9)
