@@ -90,6 +90,18 @@ def test_a_crane_at_rest_or_slow_confirms_no_frame_by_itself() -> None:
     )
 
 
+@pytest.mark.parametrize("range_m", [4.0, 5.33, 8.0])
+def test_what_hangs_low_over_the_floor_is_told_from_it_beside_a_pile(range_m: float) -> None:
+    """The first pair's range may be that of a pile, but a magnet can hang deeper: each has 24 px to move."""
+    frames = _frames([0.03 * k for k in range(40)], [0.0] * 40)
+    height = np.array([0.0, 0.0, RANGE_M])
+    high = [replace(f, reference_from_body=Pose("yard", "body", np.eye(3),
+            f.reference_from_body.translation + height)) for f in frames]  # fmt: skip
+    taken = sorted(select_keyframes(high, _rectifier(), range_m, 0.0))[:-1]
+    at_floor_px = 0.03 * np.diff(taken) * CAMERA.focal_px / RANGE_M
+    assert len(taken) > 4 and at_floor_px.min() >= MIN_WAY_PX
+
+
 def test_a_frame_without_a_picture_displaces_none_that_has_one(tmp_path: Path) -> None:
     """Strobes and faulty cables: encoders place what can't be matched. A live map selects the same frames."""
     frames = _frames([0.1 * k for k in range(23)], [0.0] * 23)

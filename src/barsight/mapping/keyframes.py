@@ -27,7 +27,9 @@ class KeyframeSelection:
         """Return True if the frame's picture has moved enough since the last keyframe."""
         if self._last is None:
             return True
-        spacing_m = keyframe_spacing_m(self._rectifier.camera, self._range_m, self._min_shift)
+        pose = frame.reference_from_body
+        height_m = (pose @ self._rectifier.body_from_rect0).translation[2] if pose.target == "yard" else 0.0
+        spacing_m = keyframe_spacing_m(self._rectifier.camera, self._range_m, self._min_shift, height_m)
         return bool(np.linalg.norm(self._seen(frame) - self._last) >= spacing_m)
 
     def take(self, frame: PosedFrame) -> None:
@@ -56,15 +58,17 @@ def select_keyframes_by_encoders(
     return _spread(stamps_ns, places, keyframe_spacing_m(camera, range_m, min_shift))
 
 
-def keyframe_spacing_m(camera: RectifiedCamera, range_m: float, min_shift: float) -> float:
-    """Return the distance (m) on a surface range_m away that min_shift of a picture's shorter side spans, or
-    MIN_WAY_PX if that is more.
+def keyframe_spacing_m(
+    camera: RectifiedCamera, range_m: float, min_shift: float, height_m: float = 0.0
+) -> float:
+    """Return the distance (m) that min_shift of a picture's shorter side spans on a surface range_m away, or
+    MIN_WAY_PX on it or on the floor, height_m below the camera, if that is more.
 
     A picture that has moved by less repeats the errors of the last one, and what the crane carries can't be
-    told from the yard in it.
+    told from the yard in it, wherever above the floor it hangs: the first pair's range may be a pile's.
     """
-    shift_px = max(min_shift * min(camera.width, camera.height), MIN_WAY_PX)
-    return shift_px * range_m / camera.focal_px
+    shift_m = min_shift * min(camera.width, camera.height) * range_m
+    return max(shift_m, MIN_WAY_PX * max(range_m, height_m)) / camera.focal_px
 
 
 def _spread(stamps_ns: Sequence[int], places_m: Float64, min_m: float) -> list[int]:
