@@ -276,6 +276,22 @@ def one_tile(folder: Path, z_m: np.ndarray, views: int, since: int) -> PassSurfa
     )
 
 
+@pytest.mark.parametrize(("late_views", "shown_m"), [(2, 0.345), (9, 0.3)])
+def test_a_thin_bar_stays_that_a_later_pass_of_fewer_views_missed(
+    tmp_path: Path, late_views: int, shown_m: float
+) -> None:
+    """It may forbid a lift; nor does a wrong match of the later pass dig a hole where many views saw none."""
+    before = np.full((256, 256), 0.3, np.float32)
+    after = before.copy()
+    before[100:104], after[50:53, 50:53] = 0.345, 0.0
+    passes = [one_tile(tmp_path / "a", before, 9, 0), one_tile(tmp_path / "b", after, late_views, 1)]
+    joined = join_surfaces(passes, tmp_path)
+    assert not joined.history.changes
+    z_m = joined.surface.window(0, 0, 256, 256).z_m
+    assert z_m[101, 50] == pytest.approx(shown_m)
+    assert z_m[51, 51] == pytest.approx(0.3 if late_views == 2 else 0.0)
+
+
 @pytest.mark.parametrize(("since", "shown_m"), [(1, 0.38), (0, 0.3)], ids=["later", "at-one-time"])
 def test_a_bar_laid_across_since_stands_however_often_the_older_pass_saw_the_place(
     tmp_path: Path, since: int, shown_m: float

@@ -164,8 +164,8 @@ def moved_window(one: PassSurface, column: int, row: int, columns: int, rows: in
 
 
 def _averaged(old: Layers, new: Layers, chosen: Bool, is_later: Bool) -> Layers:
-    """Average where both agree; elsewhere prefer a measured height, then the later one, and of one time the
-    one with more views.
+    """Average where both agree; elsewhere prefer a measured height, then a later one that is higher, then
+    the one with more views: a bar laid since appears, one that a few views missed stays.
 
     chosen: (rows, columns) where the newer pass counts. is_later: (rows, columns) where its time is later.
     """
@@ -173,7 +173,7 @@ def _averaged(old: Layers, new: Layers, chosen: Bool, is_later: Bool) -> Layers:
     both = has_old & has_new
     gate = np.maximum(AGREE_SIGMAS * np.hypot(old.sigma_m, new.sigma_m), AGREE_M)
     alike = (old.source == new.source) & (np.abs(old.z_m - new.z_m) <= gate) & both
-    better = is_later | (new.views >= old.views)
+    better = (is_later & (new.z_m > old.z_m)) | (new.views >= old.views)
     better = np.where(old.source == new.source, better, new.source == HeightSource.VISION)
     takes_new = has_new & (~has_old | (~alike & better))
     weights = [np.nan_to_num(1 / np.square(one.sigma_m)) for one in (old, new)]
