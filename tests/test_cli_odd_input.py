@@ -70,6 +70,17 @@ def test_unpaired_pictures_count_as_frames(recording: Path) -> None:
     assert "1 of 4 frames were refused" in [w["message"] for w in result["warnings"]]
 
 
+def test_each_frame_is_used_refused_or_passed_over(
+    recording: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    keep_rows(recording, 3, "cam1")
+    _, result = measured(recording, "--map.min-shift", "0.5")
+    frames = result["frames"]
+    assert frames["used"] + len(frames["refused"]) + frames["passed_over"]["count"] == frames["total"] == 4
+    assert frames["passed_over"]["count"] and "24 px" in frames["passed_over"]["reason"]
+    assert f"({frames['passed_over']['count']} had hardly moved)" in " ".join(capsys.readouterr().err.split())
+
+
 def test_the_laser_is_compared_in_the_yard_only(recording: Path) -> None:
     shutil.rmtree(recording / "mav0" / "crane0")
     out, result = measured(recording)

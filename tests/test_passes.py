@@ -332,7 +332,9 @@ def test_what_is_proven_free_is_moved_onto_the_joined_map_with_each_pass(tmp_pat
             PosedFrame(k, Pose("yard", "body", np.eye(3), np.array([k, 1.0, 8.0])), 1e-4 * np.eye(6))
             for k in range(3)
         )
-        way = TrackedRecording(Trajectory("yard", frames, (), ()), *cast(Any, (None,) * 3), (), {}, iter(()))
+        way = TrackedRecording(
+            Trajectory("yard", frames, (), ()), *cast(Any, (None,) * 3), (), {}, (), iter(())
+        )
         source = SimpleNamespace(index=SimpleNamespace(stamps_ns=[10 * number, 10 * number + 1]))
         built = SimpleNamespace(free=free, tops=TopPhoto(CELL_M))
         passes.append(MappedPass(cast(Any, SimpleNamespace(source=source)), way, cast(Any, built)))

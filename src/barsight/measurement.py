@@ -97,10 +97,11 @@ class Measurement:
     """A measured recording; `surface` reads its tiles from a scratch folder that must still exist.
 
     rig_covariance: of yaw (rad), baseline and focal length (ratios) after the travel, (3, 3); None if no rig
-    file states it. seconds: wall-clock time; the stages' own seconds overlap. yard_frame_id: digest of the
-    mounting of the body on the crane; None if the map isn't in the yard's frame. frame_id: name of the frame
-    of all coordinates. passes: of several recordings; the recording is then the newest. agreements: of vision
-    alone. laser_checks: of the laser before it was fused; None if fusion wasn't requested.
+    file states it. frames_passed_over: number of located frames whose picture had hardly moved. seconds:
+    wall-clock time; the stages' own seconds overlap. yard_frame_id: digest of the mounting of the body on
+    the crane; None if the map isn't in the yard's frame. frame_id: name of the frame of all coordinates.
+    passes: of several recordings; the recording is then the newest. agreements: of vision alone.
+    laser_checks: of the laser before it was fused; None if fusion wasn't requested.
     """
 
     recording_path: Path
@@ -113,6 +114,7 @@ class Measurement:
     trajectory: Trajectory
     frames_total: int
     frames_used: int
+    frames_passed_over: int
     refusals: tuple[Refusal, ...]
     sensors_used: tuple[str, ...]
     surface: Surface

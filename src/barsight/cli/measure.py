@@ -73,8 +73,10 @@ def run(arguments: Sequence[str]) -> None:
 def print_outcome(content: dict[str, Any], console: Console, *, verbose: bool) -> None:
     """Summarise the run in a few lines: frames, agreement with the laser, truth, warnings."""
     frames, trajectory = content["frames"], content["trajectory"]
+    passed_over = frames["passed_over"]["count"]
+    hardly_moved = f" ({passed_over} had hardly moved)" if passed_over else ""
     console.print(
-        f"{frames['used']} of {frames['total']} frames over {trajectory['length_m']:.2f} m "
+        f"{frames['used']} of {frames['total']} frames{hardly_moved} over {trajectory['length_m']:.2f} m "
         f"({', '.join(content['sensors_used'])}), {content['map']['cells_seen']} cells of "
         f"{1e3 * content['map']['cell_m']:.0f} mm seen, peak memory {content['peak_memory_mib']:.0f} MiB",
         highlight=False,

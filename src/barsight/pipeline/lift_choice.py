@@ -67,6 +67,7 @@ def find_lifts(mapped: MappedYard, request: LiftRequest) -> Measurement:
         trajectory=trajectory,
         frames_total=sum(one.probed.frames_total for one in mapped.passes),
         frames_used=sum(len(one.built.placed) for one in mapped.passes),
+        frames_passed_over=sum(one.way.passed_over for one in mapped.passes),
         refusals=tuple(refusal for one in mapped.passes for refusal in one.built.refusals),
         sensors_used=tuple(dict.fromkeys(("stereo", *trajectory.sensors, *profiles.sensors))),
         surface=mapped.surface,

@@ -55,6 +55,11 @@ class TrackedRecording:
     refusals: tuple[Refusal, ...]
     matched: Iterator[MatchedFrame | Refusal]
 
+    @property
+    def passed_over(self) -> int:
+        """Return the number of located frames whose picture had moved too little to be mapped."""
+        return len(self.trajectory.frames) - len(self.poses) - len(self.refusals)
+
 
 @contextmanager
 def estimate_trajectory(

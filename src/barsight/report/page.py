@@ -150,11 +150,11 @@ def key_figures(result: dict[str, Any]) -> list[KeyFigure]:
     frames = result.get("frames") or {}
     trajectory = result.get("trajectory") or {}
     surface = result.get("map") or {}
-    refused = len(frames.get("refused") or [])
+    unused = f"{len(frames.get('refused') or [])} refused"
+    if passed_over := (frames.get("passed_over") or {}).get("count"):
+        unused += f", {passed_over} hardly moved"
     figures = [
-        KeyFigure(
-            "Frames used", f"{frames.get('used', NONE)} of {frames.get('total', NONE)}", f"{refused} refused"
-        ),
+        KeyFigure("Frames used", f"{frames.get('used', NONE)} of {frames.get('total', NONE)}", unused),
         KeyFigure(
             "Travel",
             format_number(trajectory.get("length_m"), 2, "m"),

@@ -12,11 +12,15 @@ import barsight
 from barsight.core.arrays import Float64
 from barsight.core.json_values import json_value
 from barsight.core.stamps import NS_PER_S
+from barsight.mapping.ego_mask import MIN_WAY_PX
 from barsight.mapping.surface.laser_check import LaserCheck, LaserOffset
 from barsight.measurement import Measurement, PassRecord
 from barsight.yard.identity import ID_DIGITS
 
 SCHEMA_VERSION = 1
+PASSED_OVER = (
+    f"the picture had moved by less than {MIN_WAY_PX:.0f} px, or map.min_shift, since the last mapped one"
+)
 
 
 def summary(measurement: Measurement) -> dict[str, Any]:
@@ -49,6 +53,7 @@ def summary(measurement: Measurement) -> dict[str, Any]:
                 {"stamp_ns": r.frame.stamp_ns, "stage": r.stage, "reason": r.frame.reason}
                 for r in measurement.refusals
             ],
+            "passed_over": {"count": measurement.frames_passed_over, "reason": PASSED_OVER},
         },
         "trajectory": {
             "length_m": sum(one.length_m for one in measurement.passes) or trajectory.length_m,
