@@ -10,11 +10,14 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+import barsight as bs
+from barsight.core import parallel
 from barsight.core.errors import ConfigError
 from barsight.core.pose import Pose
 from barsight.core.records.pairs import RectifiedCamera, RectifiedPair, RefusedFrame
 from barsight.core.records.sensor_samples import CraneSamples
 from barsight.core.records.trajectory import PosedFrame
+from barsight.mapping import keyframes
 from barsight.mapping.ego_mask import MIN_WAY_PX
 from barsight.mapping.keyframes import (
     KeyframeSelection,
@@ -22,9 +25,11 @@ from barsight.mapping.keyframes import (
     select_keyframes_by_encoders,
 )
 from barsight.mapping.settings import MapSettings
+from barsight.mapping.view import Matcher
 from barsight.measure_settings import MeasureSettings
 from barsight.reconstruction import tracked_recording
 from barsight.reconstruction.live_map import LiveMap
+from barsight.reconstruction.pair_chain import PairChain
 from barsight.stereo.image_pair import pair_from_images
 
 CAMERA = RectifiedCamera(1000.0, 499.5, 399.5, 0.5, 0.0, 1000, 800)
@@ -137,6 +142,23 @@ def test_encoders_choose_as_the_trajectory_does() -> None:
     for share in (0.1, 0.15):
         chosen = select_keyframes_by_encoders(range(7), crane, 100, CAMERA, RANGE_M, share)
         assert set(chosen) == select_keyframes(frames, _rectifier(), RANGE_M, share)
+
+
+def test_frames_that_are_passed_over_are_not_matched(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ten minutes at rest are 6000 pairs, of which two are mapped."""
+    matched, stamps = list[int](), bs.open_recording(whole).index.stamps_ns
+    call = Matcher.__call__
+    monkeypatch.setattr(
+        Matcher,
+        "__call__",
+        lambda self, pair, *more: matched.append(pair.stamp_ns) or call(self, pair, *more),
+    )
+    monkeypatch.setattr(keyframes, "MIN_WAY_PX", 1e4)
+    monkeypatch.setattr(parallel, "_is_alone", lambda: True)  # nothing is matched ahead of the trajectory
+    bs.measure(whole, map={"cell_m": 0.05}, stereo={"method": "sgbm"})
+    assert matched == [stamps[0], stamps[-1]]
+    pairs = SimpleNamespace(recording=SimpleNamespace(index=SimpleNamespace(stamps_ns=list(range(9)))))
+    assert PairChain(cast(Any, pairs), cast(Any, None), 4, None).with_predecessors([1, 6]) == {0, 1, 4, 5, 6}
 
 
 def test_preset_fast_says_what_it_changes() -> None:

@@ -84,6 +84,13 @@ class PairChain:
         """
         return self._steps(stamp_ns)[-1].now_from_before is not None
 
+    def with_predecessors(self, stamps_ns: Iterable[int]) -> set[int]:
+        """Return stamps of pairs, and of those before them in their chains, which are matched for them."""
+        stamps, found = self._pairs.recording.index.stamps_ns, set[int]()
+        for place in map(self._place, stamps_ns):
+            found.update(stamps[place - place % self.length : place + 1])
+        return found
+
     def split(
         self, pairs: Iterable[RectifiedPair | RefusedFrame]
     ) -> Iterator[list[RectifiedPair | RefusedFrame]]:

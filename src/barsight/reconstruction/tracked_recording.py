@@ -70,7 +70,8 @@ def estimate_trajectory(
     rectifier, total = pairs.rectifier, len(source.index.stamps_ns)
     match = matching(pairs, settings, probed.checkpoints, watch)
     early = _known_early(source, settings, rectifier, probed.first.range_m)
-    begun = islice(pairs(early), len(early))
+    wanted = set(early)
+    begun = (pair for pair in islice(pairs(early), len(early)) if pair.stamp_ns in wanted)
     with ExitStack() as pools:
         ahead = pools.enter_context(_matched_ahead(match, begun, _MATCHED_AHEAD))
         with watch("trajectory", total):
@@ -94,6 +95,7 @@ def estimate_trajectory(
         stereo = replace(settings.stereo, calibration_sigma_px=calibrated.sigma_px)
         selection = KeyframeSelection(rectifier, probed.first.range_m, settings.map.min_shift)
         poses, refusals = select_keyframes(trajectory.frames, pairs.reader(), selection, settings.stereo)
+        wanted &= match.with_predecessors(poses)
         late = min((stamp for stamp in poses if stamp not in early), default=None)
         matched: Iterator[MatchedFrame | Refusal] = ahead
         if late is not None:
