@@ -113,7 +113,8 @@ class Session:
     def snapshot(self) -> Snapshot:
         """Return the map of this pass so far; the final result is not affected.
 
-        Raises MeasurementError after `finish`, whose yard has the map.
+        The last view is missing until the crane has moved on: a crane that has stood since the beginning has
+        no surface yet. Raises MeasurementError after `finish`, whose yard has the map.
         """
         self._expect_open()
         return Snapshot(None, 0) if self._map is None else self._map.snapshot(self)

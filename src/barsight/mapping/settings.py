@@ -20,8 +20,9 @@ class MapSettings:
     recording has only one frame).
     """
     min_shift: float = 0.0
-    """Minimum motion of the picture between mapped frames, as a share of its shorter side, at least 24 px:
-    a frame that has hardly moved, as of a crane at rest, would confirm the errors of the last one.
+    """Minimum motion of the picture between mapped frames, as a share of its shorter side, at the first
+    pair's middle range; in any case at least 24 px there and on the floor. A frame that has hardly moved,
+    as of a crane at rest, would confirm the errors of the last one; only the last frame is mapped anyway.
     """
     top_ratio: float = 0.35
     """Minimum number of views, as a share of those of the cell's best-seen height, that a height needs to

@@ -194,7 +194,11 @@ class LiveMap:
         self._take(self._map[0], pair, placed)
 
     def snapshot(self, owner: object) -> Snapshot:
-        """Elect the current surface; only tiles that changed since the last snapshot are elected again."""
+        """Elect the current surface; only tiles that changed since the last snapshot are elected again.
+
+        The last selected view isn't in it until the next one is selected, which shows what the crane carries:
+        while the crane stands, none is.
+        """
         frames = len(self.stamps_ns)
         if self._map is None or frames < 2:
             return Snapshot(None, frames)
