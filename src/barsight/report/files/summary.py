@@ -46,15 +46,7 @@ def summary(measurement: Measurement) -> dict[str, Any]:
         },
         "configuration": measurement.configuration,
         "sensors_used": list(measurement.sensors_used),
-        "frames": {
-            "total": measurement.frames_total,
-            "used": measurement.frames_used,
-            "refused": [
-                {"stamp_ns": r.frame.stamp_ns, "stage": r.stage, "reason": r.frame.reason}
-                for r in measurement.refusals
-            ],
-            "passed_over": {"count": measurement.frames_passed_over, "reason": PASSED_OVER},
-        },
+        "frames": _frames_content(measurement),
         "trajectory": {
             "length_m": sum(one.length_m for one in measurement.passes) or trajectory.length_m,
             "duration_s": float(stamps[-1] - stamps[0]) / NS_PER_S if stamps.size else 0.0,
@@ -92,6 +84,20 @@ def _ids(measurement: Measurement) -> dict[str, Any]:
         "calibration_id": measurement.calibration_hash[:ID_DIGITS],
         "yard_frame_id": measurement.yard_frame_id, "frame_id": measurement.frame_id,
     }  # fmt: skip
+
+
+def _frames_content(measurement: Measurement) -> dict[str, Any]:
+    """Account for every frame: used, refused or passed over."""
+    refused = [
+        {"stamp_ns": one.frame.stamp_ns, "stage": one.stage, "reason": one.frame.reason}
+        for one in measurement.refusals
+    ]
+    return {
+        "total": measurement.frames_total,
+        "used": measurement.frames_used,
+        "refused": refused,
+        "passed_over": {"count": measurement.frames_passed_over, "reason": PASSED_OVER},
+    }
 
 
 def _rig_content(covariance: Float64 | None) -> dict[str, Any] | None:
