@@ -61,3 +61,20 @@ def store(store_url: str) -> Iterator["Store"]:
 
     with open_store(store_url, create=True) as opened:
         yield opened
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a store for the page: a yard surveyed twice (`page_yards`)."""
+    from page_yards import fill_store
+
+    folder = tmp_path_factory.mktemp("made")
+    fill_store(folder)
+    return folder
+
+
+@pytest.fixture
+def url(made: Path, tmp_path: Path) -> str:
+    """URL of a copy of that store on the same folders; its lifts were offered a minute ago."""
+    shutil.copy(made / "yard.db", tmp_path / "yard.db")
+    return f"sqlite:///{tmp_path / 'yard.db'}"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import shutil
 import sqlite3
 import threading
 import time
@@ -32,20 +31,6 @@ from barsight.store.states import (
     step_lift,
 )  # fmt: skip
 from barsight.store.tables import ALARMS, BUNDLES, LIFT_BUNDLES, LIFTS
-from page_yards import fill_store
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("made")
-    fill_store(folder)
-    return folder
-
-
-@pytest.fixture
-def url(made: Path, tmp_path: Path) -> str:
-    shutil.copy(made / "yard.db", tmp_path / "yard.db")
-    return f"sqlite:///{tmp_path / 'yard.db'}"
 
 
 def wait_for(holds: Callable[[], bool], timeout_s: float = 10.0) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import json
 import os
-import shutil
 import signal
 import socket
 import subprocess
@@ -42,7 +41,7 @@ from barsight.store.states import alarm_state, last_raised_ns, raise_alarm, step
 from barsight.store.tables import ALARMS, LIFT_BUNDLES, LIFTS
 from barsight.yard.inventory.stock_list import match_stock, read_stock
 from live_folders import live_folder
-from page_yards import FIRST, SECOND, fill_store, survey
+from page_yards import FIRST, SECOND, survey
 
 PASSWORD = "four words that nobody guesses"
 CHANGES = [
@@ -66,20 +65,6 @@ MAY = {
     "engineer": {"operate", "execute", "report", "administer"},
 }
 """Said again here, not read from the code: who may what."""
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("made")
-    fill_store(folder)
-    return folder
-
-
-@pytest.fixture
-def url(made: Path, tmp_path: Path) -> str:
-    """A store of its own on the same folders; its lifts were offered a minute ago and hold for minutes."""
-    shutil.copy(made / "yard.db", tmp_path / "yard.db")
-    return f"sqlite:///{tmp_path / 'yard.db'}"
 
 
 @pytest.fixture

@@ -21,7 +21,6 @@ from barsight.store.opening import open_store
 from barsight.store.states import last_raised_ns
 from live_folders import beating, live_folder
 from opcua_servers import node_package
-from page_yards import fill_store
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -66,19 +65,6 @@ class Sheet:
     def open(self, name: str) -> None:
         self.page.click(f"#nav-{name}")
         self.page.wait_for_selector(f"body[data-shown={name}] #nav-{name}[aria-current]")
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("made")
-    fill_store(folder)
-    return folder
-
-
-@pytest.fixture
-def url(made: Path, tmp_path: Path) -> str:
-    shutil.copy(made / "yard.db", tmp_path / "yard.db")
-    return f"sqlite:///{tmp_path / 'yard.db'}"
 
 
 @pytest.fixture

@@ -27,7 +27,7 @@ from barsight.store.audit import entry
 from barsight.store.opening import open_store
 from barsight.yard.types import HeightMap
 from lift_yards import sure_travel
-from page_yards import DISCS, SECOND, fill_store
+from page_yards import DISCS, SECOND
 from yard_maps import draw
 
 PASSWORD = "four words that nobody guesses"
@@ -47,13 +47,6 @@ def clicks(numbers: range, aside_m: float = 0.02) -> list[dict[str, object]]:
 
 
 TWICE = [*clicks(range(1)), clicks(range(1))[0] | {"name": "post, 1"}]
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("made")
-    fill_store(folder)
-    return folder
 
 
 @pytest.fixture(scope="module")
