@@ -27,8 +27,9 @@ _LOWER, _MAX_LOWER_RATIO = 0.05, 0.75
 packs, finishes and light differ from those of the training set.
 """
 _FINER_RATIO = 0.5
-"""What is detected as one bar is many thin ones if the 95 % quantile of the pitch is below this ratio of its
-diameter. Where the pitch is less fine, the single bar is unsure: its gloss and scratches have a pitch too.
+"""Minimum ratio of the pitch's 95 % quantile to the diameter of what is detected as one bar; below it the bar
+is many thin ones. Where the pitch is less fine, the single bar is unsure: its gloss and scratches have a
+pitch too.
 """
 _MAX_MISFIT = 1.5
 """Maximum misfit of a spectrum to a diameter that explains it; 1 % of drawn packs exceed it."""

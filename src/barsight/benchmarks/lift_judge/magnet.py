@@ -16,7 +16,7 @@ from barsight.core.arrays import Float64
 
 SATURATED_TESLA = 1.6
 LEFT_OUT = {"grade_ratio": 0.7, "heat_ratio": 0.5, "duty_ratio": 0.7}
-"""What is left of the pull where the file doesn't say."""
+"""Default share of the pull that remains, for a magnet file that doesn't state it."""
 UNTYPED_FACTOR = 3.0
 _MU0 = 4e-7 * math.pi
 

@@ -43,6 +43,7 @@ class EncoderWatch:
 
     @property
     def frozen(self) -> list[tuple[int, int]]:
+        """Return the stamps of the first and last reading of each freeze."""
         return [(first, last) for first, last, _ in self._frozen]
 
     def check(self, crane: CraneSamples, known: KnownMotion) -> None:
