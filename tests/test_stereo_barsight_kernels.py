@@ -58,7 +58,7 @@ from barsight.stereo.direct.photometric_residuals import (
     robust_weights,
     step_gain,
 )
-from barsight.stereo.direct.plane_fits import SupportShape, fit_planes
+from barsight.stereo.direct.plane_fits import Evidence, SupportShape, fit_planes
 from barsight.stereo.direct.semiglobal.cost import BESIDE_COST, describe_pixels, reverse_rows, row_costs
 from barsight.stereo.direct.semiglobal.matching import SemiGlobalSettings, match_semiglobal
 from barsight.stereo.direct.semiglobal.paths import Penalties, allocate_paths, extend_row, p2_table
@@ -68,6 +68,7 @@ from barsight.stereo.direct.support_regions import (
     allocate_frame,
     axis_means,
     biweight,
+    biweight_of_both,
     blend_rows,
     fitted_rows,
     inside,
@@ -159,19 +160,19 @@ def test_axis_means_are_weighted_means_along_the_axis(direction: tuple[float, fl
 
 def _planes(
     disparity: np.ndarray, weight: np.ndarray, pull: np.ndarray, shape: SupportShape, same_px: float,
-    axis: tuple[float, float] = (0, 1),
+    axis: tuple[float, float] = (0, 1), gray: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     found = np.empty_like(disparity), np.empty_like(disparity)
-    frames = [_frame(image) for image in (disparity, weight, pull)]
+    frames = [_frame(image) for image in (disparity, weight, pull, 0 * pull if gray is None else gray)]
     room = allocate_frame(disparity.shape), allocate_frame(disparity.shape)
-    fit_planes(*frames, _axes(*axis), shape, same_px, room, *found)
+    fit_planes(Evidence(*frames), _axes(*axis), shape, same_px, room, *found)
     return found
 
 
 def test_planes_are_weighted_least_squares_on_the_support() -> None:
     disparity, weight, pull = _noise(6, 0.2), 0.2 + np.abs(_noise(7)), _noise(8, 0.1)
-    shape, same = SupportShape(4.0, 1.5), 1.0
-    fitted, information = _planes(disparity, weight, pull, shape, same)
+    shape, same, gray = SupportShape(4.0, 1.5), 1.0, _noise(9, 0.3)
+    fitted, information = _planes(disparity, weight, pull, shape, same, gray=gray)
     for y, x in ((0, 0), (12, 20), (39, 69), (24, 33)):
         rows, values = [], []
         for down in range(-8, 9):
@@ -181,7 +182,7 @@ def test_planes_are_weighted_least_squares_on_the_support() -> None:
                 if not (0 <= row < HEIGHT and 0 <= column < WIDTH):
                     continue
                 gap = float(disparity[row, column] - disparity[y, x])
-                kept = max(1 - (gap / same) ** 2, 0) ** 2
+                kept = max(1 - (gap / same) ** 2 - (gray[row, column] - gray[y, x]) ** 2, 0) ** 2
                 kept *= np.exp(-0.5 * (down / 4) ** 2 - 0.5 * (right / 1.5) ** 2)
                 w = kept * weight[row, column]
                 rows.append((w, down, right))
@@ -239,6 +240,21 @@ def test_planes_keep_a_plane_in_steps_and_stop_at_a_jump() -> None:
     for step in (1, 3, 5):
         fitted, _ = _planes(plane, ones, zeros, SupportShape(8.0, 1.5, step), 1.0)
         np.testing.assert_allclose(fitted, plane, atol=0.03)
+
+
+def test_planes_stop_at_the_outline_of_something_low() -> None:
+    """A beam 0.4 px nearer, and brighter, than the floor does not pull the floor beside it."""
+    disparity, gray = np.zeros((HEIGHT, WIDTH), np.float32), np.zeros((HEIGHT, WIDTH), np.float32)
+    disparity[16:24], gray[16:24] = 0.4, 2.0
+    weight, zeros = np.ones_like(gray), np.zeros_like(gray)
+    weight[16:24] = 20  # The beam has more texture.
+    for step in (1, 5):
+        shape = SupportShape(8.0, 1.5, step)
+        # An axis that is no column's, so that each row is fitted.
+        blind, _ = _planes(disparity, weight, zeros, shape, 1.0, (0.3, 0.954))
+        fitted, _ = _planes(disparity, weight, zeros, shape, 1.0, (0.3, 0.954), gray)
+        assert np.abs(blind - disparity).max() > 0.2
+        np.testing.assert_allclose(fitted, disparity, atol=1e-4)
 
 
 def _slow_semiglobal(left: np.ndarray, right: np.ndarray, lowest: int, count: int) -> np.ndarray:
@@ -749,3 +765,6 @@ def test_places_are_mirrored_at_the_last_pixel() -> None:
 def test_biweight_ends_at_one() -> None:
     gaps = np.array([-2, -1, -0.5, 0, 0.25, 1, 3], dtype=np.float32)
     assert [biweight(gap) for gap in gaps] == [0, 0, 0.5625, 1, 0.87890625, 0, 0]
+    zero, half = np.float32(0), np.float32(0.5)
+    assert [biweight_of_both(gap, zero) for gap in gaps] == [biweight(gap) for gap in gaps]
+    assert [biweight_of_both(half, tone) for tone in (half, -half, np.float32(0.9))] == [0.25, 0.25, 0]

@@ -1,4 +1,6 @@
-"""Fit planes to the pixels' disparity steps on supports that follow a bar and don't cross a depth edge."""
+"""Fit planes to the pixels' disparity steps on supports that follow a bar and cross no edge of depth or gray
+value.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,7 @@ from barsight.stereo.direct.support_regions import (
     MARGIN,
     TILE_COLUMNS,
     TILE_ROWS,
-    biweight,
+    biweight_of_both,
     blend_rows,
     fitted_rows,
     is_along_column,
@@ -28,13 +30,14 @@ _SAME_PLANE = np.float32(0.5)
 
 
 class Evidence(NamedTuple):
-    """Each pixel's disparity, weight and pull, as frames, which are (H, W) with MARGIN or more around
-    them, or as flattened frames.
+    """Each pixel's disparity, weight, pull and gray value, as frames, which are (H, W) with MARGIN or more
+    around them, or as flattened frames. gray: in units of alike_gray.
     """
 
     disparity: Float32
     weight: Float32
     pull: Float32
+    gray: Float32
 
 
 class _Pairs(NamedTuple):
@@ -60,9 +63,7 @@ class SupportShape:
 
 
 def fit_planes(
-    disparity: Float32,
-    weight: Float32,
-    pull: Float32,
+    evidence: Evidence,
     axes: Float32,
     shape: SupportShape,
     same_surface_px: float,
@@ -74,8 +75,9 @@ def fit_planes(
     information.
 
     Pixel i contributes disparity[i] + pull[i] / weight[i], with weight[i] (0 = nothing). Its share falls with
-    the distance (Gaussian) and with the difference in disparity (Tukey's biweight that ends at
-    same_surface_px), so that a support doesn't cross a depth edge. Supports along a column overlap almost
+    the distance (Gaussian) and with the differences in disparity and in gray value (Tukey's biweight, which
+    ends at same_surface_px and at a gray of 1), so that a support doesn't cross a depth edge, or the outline
+    of something so low that its disparities differ by less. Supports along a column overlap almost
     entirely: of a column's rows only one in FITTED_EVERY is fitted, and the rows between are interpolated
     from those above and below, as far as these are the same surface. Frames in, no NaN, and two more (`room`)
     as scratch; (H, W) out.
@@ -83,8 +85,8 @@ def fit_planes(
     step, unit = shape.step, np.float32(same_surface_px)
     # In units of same_surface_px, each point needs one multiplication less.
     if unit != 1:
-        disparity, pull = disparity / unit, pull / unit
-    heard = evidence = Evidence(disparity, weight, pull)
+        evidence = evidence._replace(disparity=evidence.disparity / unit, pull=evidence.pull / unit)
+    heard = evidence
     if step > 1:
         # Summing over a step along the axis first lets the support go in steps and still use every pixel.
         near = np.arange(step) - step // 2
@@ -93,7 +95,7 @@ def fit_planes(
             _sum_near(evidence, axes, near, fitted.shape, room, first, end)
 
         parallel_bands(sum_up, len(axes), BAND_TILES)
-        heard = Evidence(disparity, *room)
+        heard = Evidence(evidence.disparity, *room, evidence.gray)
     pairs = _pairs(shape)
 
     for only_between in (False, True):
@@ -127,7 +129,7 @@ def _sum_pairs(evidence: Evidence, middle: int, offsets: Int64, factors: Float32
     evidence: flat. offsets: (K,), from a pixel to one point of each pair. factors: (K, 6), see `_Pairs`.
     Fills sums (9 TILE_COLUMNS,), term by term.
     """
-    disparity, weight, pull = evidence
+    disparity, weight, pull, gray = evidence
     here = np.uint64(middle)
     for i in range(_LANES, 9 * _LANES):
         sums[i] = 0
@@ -142,9 +144,10 @@ def _sum_pairs(evidence: Evidence, middle: int, offsets: Int64, factors: Float32
         faa, fac, fcc = factors[j, 3], factors[j, 4], factors[j, 5]
         for i in range(_LANES):
             lane = np.uint64(i)
-            centre = disparity[here + lane]
+            centre, shade = disparity[here + lane], gray[here + lane]
             gap, gap_back = disparity[forth + lane] - centre, disparity[back + lane] - centre
-            alike, alike_back = biweight(gap), biweight(gap_back)
+            tone, tone_back = gray[forth + lane] - shade, gray[back + lane] - shade
+            alike, alike_back = biweight_of_both(gap, tone), biweight_of_both(gap_back, tone_back)
             one, other = alike * weight[forth + lane], alike_back * weight[back + lane]
             one_pull = one * gap + alike * pull[forth + lane]
             other_pull = other * gap_back + alike_back * pull[back + lane]
@@ -189,7 +192,7 @@ def _add_near(evidence: Evidence, middle: int, offsets: Int64, sums: Float32) ->
     evidence: flat. offsets: (K,), from a pixel to each point. Fills sums (2 TILE_COLUMNS,), the weights'
     before the pulls'.
     """
-    disparity, weight, pull = evidence
+    disparity, weight, pull, gray = evidence
     here = np.uint64(middle)
     for i in range(_LANES):
         sums[i] = 0
@@ -200,7 +203,7 @@ def _add_near(evidence: Evidence, middle: int, offsets: Int64, sums: Float32) ->
         for i in range(_LANES):
             lane = np.uint64(i)
             gap = disparity[there + lane] - disparity[here + lane]
-            alike = biweight(gap)
+            alike = biweight_of_both(gap, gray[there + lane] - gray[here + lane])
             heard = alike * weight[there + lane]
             sums[i] += heard
             sums[_LANES + i] += heard * gap + alike * pull[there + lane]
@@ -208,8 +211,11 @@ def _add_near(evidence: Evidence, middle: int, offsets: Int64, sums: Float32) ->
 
 @kernel()
 def _flat(evidence: Evidence) -> Evidence:
-    """Flatten the three frames."""
-    return Evidence(evidence.disparity.reshape(-1), evidence.weight.reshape(-1), evidence.pull.reshape(-1))
+    """Flatten the four frames."""
+    return Evidence(
+        evidence.disparity.reshape(-1), evidence.weight.reshape(-1), evidence.pull.reshape(-1),
+        evidence.gray.reshape(-1),
+    )  # fmt: skip
 
 
 @kernel()

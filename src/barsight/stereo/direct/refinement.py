@@ -40,7 +40,7 @@ from barsight.stereo.direct.photometric_residuals import (
     robust_weights,
     step_gain,
 )
-from barsight.stereo.direct.plane_fits import SupportShape, fit_planes
+from barsight.stereo.direct.plane_fits import Evidence, SupportShape, fit_planes
 from barsight.stereo.direct.support_regions import MARGIN, allocate_frame, axis_means, inside, tile_axes
 from barsight.stereo.noise import image_noise
 
@@ -60,6 +60,10 @@ side.
 """
 _MIN_HALVED_PX = 128
 _ALIKE_BLUR_PX = 1.5
+_LAST_SAME_SURFACE = 0.5
+"""Share of same_surface_px at which supports end in the last step: the start's steps of whole pixels are
+gone by then, while dunnage of 40 mm is half a pixel high.
+"""
 _HOLD = 0.1
 _HOLD_UNMATCHED = 0.02
 
@@ -89,8 +93,8 @@ class RefinementSettings:
     treatment of gloss.
     """
     alike_gray: float = 20.0
-    """Difference in gray value from which places along the axis aren't the same highlight, but a strap or
-    a shadow.
+    """Difference in gray value from which places aren't one surface or the same highlight, but a strap, a
+    piece of dunnage or a shadow.
     """
     gloss_trust: float = 0.02
     """Weight of the evidence that is constant along the axis, if noise explains its residual."""
@@ -194,14 +198,17 @@ class _Work:
     trust: Float32
     weight: Float32
     pull: Float32
+    gray: Float32
 
     @classmethod
     def of(
         cls, left: Float32, start: Float32, usable: Float32, settings: RefinementSettings, hold: float = _HOLD
     ) -> _Work:
         mean_usable = cv2.boxFilter(usable, -1, (settings.window_px, settings.window_px))
-        frames = [allocate_frame(start.shape) for _ in range(6)]
+        frames = [allocate_frame(start.shape) for _ in range(7)]
         inside(frames[0], start.shape)[:] = start
+        gray = cv2.GaussianBlur(left, (0, 0), _ALIKE_BLUR_PX)
+        np.multiply(gray, np.float32(1 / settings.alike_gray), out=inside(frames[6], start.shape))
         hold_each = np.float32(hold) * (usable + np.float32(_HOLD_UNMATCHED))
         return cls(settings, tile_axes(left), usable, mean_usable, hold_each, *frames)
 
@@ -213,7 +220,7 @@ class _Work:
         short_of, mean_weight = self.pulls(left, right, blur_px, slope_noise, is_last)
         power = noise_power(self.pull, self.usable, self.mean_usable, mean_weight, _HOLD, side)
         raise_noise(short_of, power)
-        fitted, variance = self._fit(power)
+        fitted, variance = self._fit(power, _LAST_SAME_SURFACE if is_last else 1.0)
         before = inside(self.disparity, shape).copy()
         update_disparity(fitted, self.axes, self.disparity, variance)
         if is_last:
@@ -244,7 +251,7 @@ class _Work:
         )
         gloss = settings.gloss_px, settings.gloss_trust
         evidence = self.residual, self.slope, self.trust
-        robust_weights(*evidence, self._along(left_gray), side, *gloss, self.weight, self.pull)
+        robust_weights(*evidence, self._along(), side, *gloss, self.weight, self.pull)
         mean_weight = np.empty(shape, dtype=np.float32)
         short_of = step_gain(self.weight, self.trust, slope_noise, side, is_last, self.pull, mean_weight)
         weight = inside(self.weight, shape)
@@ -260,34 +267,33 @@ class _Work:
         before *= self.usable
         complete_step(cv2.boxFilter(before, -1, (side, side)), self.mean_usable, short_of, self.disparity)
 
-    def _along(self, gray: Float32) -> tuple[Float32, Float32]:
+    def _along(self) -> tuple[Float32, Float32]:
         """Average residual and slope along the axis, (H, W)."""
-        settings, shape = self.settings, gray.shape
+        settings, shape = self.settings, self.usable.shape
         if settings.gloss_px == 0:
             return np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
         means = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
-        blurred = cv2.GaussianBlur(gray, (0, 0), _ALIKE_BLUR_PX)
-        alike = self.pull  # as scratch: its values of this step are computed later
-        np.multiply(blurred, np.float32(1 / settings.alike_gray), out=inside(alike, shape))
-        images = self.residual, self.slope, self.trust, alike
+        images = self.residual, self.slope, self.trust, self.gray
         axis_means(*images, self.axes, settings.gloss_px, means)
         return means
 
-    def _fit(self, power: Float32) -> tuple[Float32, Float32]:
+    def _fit(self, power: Float32, same_surface: float) -> tuple[Float32, Float32]:
         settings = self.settings
-        long = self.planes(SupportShape(settings.along_px, settings.across_px, _LONG_STEP_PX))
+        long = self.planes(SupportShape(settings.along_px, settings.across_px, _LONG_STEP_PX), same_surface)
         if settings.short_px == 0:
             return long[0], fit_variance(power, long[1])
-        short = self.planes(SupportShape(settings.short_px, settings.short_across_px, _SHORT_STEP_PX))
+        short_support = SupportShape(settings.short_px, settings.short_across_px, _SHORT_STEP_PX)
+        short = self.planes(short_support, same_surface)
         return blend_fits(long, short, power, self.usable)
 
-    def planes(self, support: SupportShape) -> Fit:
+    def planes(self, support: SupportShape, same_surface: float = 1.0) -> Fit:
+        """Fit the planes of a support; same_surface: the share of same_surface_px at which it ends."""
         found = np.empty_like(self.usable), np.empty_like(self.usable)
         # The inputs of the weights and pulls are no longer needed.
         room = self.residual, self.trust
+        evidence = Evidence(self.disparity, self.weight, self.pull, self.gray)
         fit_planes(
-            self.disparity, self.weight, self.pull, self.axes, support, self.settings.same_surface_px, room,
-            *found,
+            evidence, self.axes, support, same_surface * self.settings.same_surface_px, room, *found,
         )  # fmt: skip
         return found
 

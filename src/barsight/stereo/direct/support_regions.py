@@ -116,6 +116,14 @@ def biweight(gap: np.float32) -> np.float32:
 
 
 @kernel(inline=True)
+def biweight_of_both(gap: np.float32, tone: np.float32) -> np.float32:
+    """Evaluate Tukey's biweight of two differences, which ends where their squares add up to 1."""
+    rest = np.float32(1) - gap * gap - tone * tone
+    rest = rest if rest > np.float32(0) else np.float32(0)
+    return rest * rest
+
+
+@kernel(inline=True)
 def is_along_column(axis: Float32) -> bool:
     """Check whether an axis (2,) (x, y) is so close to a column's direction that its rows can share their
     fits.
