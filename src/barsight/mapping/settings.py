@@ -44,7 +44,7 @@ class MapSettings:
     """Distance to either side over which heights are averaged along the direction in which they are most
     alike (a bar's own), at most 28 cells; 0 leaves each cell as it is.
     """
-    sharpen_px: float = 0.9
+    sharpen_px: float = 1.25
     """Blur across the bars that is undone, in pixels (sigma): matching's window lowers crests and raises
     valleys as such a blur does. Heights averaged along a bar are moved back by the same amount, and their
     sigma grows with it; 0 leaves both unchanged.

@@ -20,7 +20,7 @@ from barsight.mapping.surface.bar_directions import (
 VOTE_CELLS = 9
 _STEP_M = 0.03
 _WIDEST_CELLS = np.float32(1.5)
-_BLUR_CELLS, _BLUR_RATIO, _VALLEY_RATIO = 11, 2.5, 5.6
+_BLUR_CELLS, _BLUR_RATIO, _VALLEY_RATIO = 11, 2.0, 4.5
 _VALLEY_CELLS = 6
 _RAMP_PX, _RAMP_RATIO, _RIM_PX, _RIM_RATIO = 3.0, 0.5, 1.0, 0.5
 _FAR_M = np.float32(1e4)
