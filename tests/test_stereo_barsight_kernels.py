@@ -182,7 +182,8 @@ def test_planes_are_weighted_least_squares_on_the_support() -> None:
                 if not (0 <= row < HEIGHT and 0 <= column < WIDTH):
                     continue
                 gap = float(disparity[row, column] - disparity[y, x])
-                kept = max(1 - (gap / same) ** 2 - (gray[row, column] - gray[y, x]) ** 2, 0) ** 2
+                tone = float(gray[row, column] - gray[y, column])
+                kept = max(1 - (gap / same) ** 2 - tone**2, 0) ** 2
                 kept *= np.exp(-0.5 * (down / 4) ** 2 - 0.5 * (right / 1.5) ** 2)
                 w = kept * weight[row, column]
                 rows.append((w, down, right))

@@ -121,12 +121,16 @@ def _pairs(shape: SupportShape) -> _Pairs:
 
 
 @kernel(borrows=True)
-def _sum_pairs(evidence: Evidence, middle: int, offsets: Int64, factors: Float32, sums: Float32) -> None:
+def _sum_pairs(
+    evidence: Evidence, middle: int, offsets: tuple[Int64, Int64], factors: Float32, sums: Float32
+) -> None:
     """Sum the nine terms of a plane's normal equations for TILE_COLUMNS pixels from `middle` on: the weights
     times 1, a, c, a a, a c, c c and the pulls times 1, a, c; a along, c across the axis.
 
     Points come in pairs on opposite sides of the central pixel, so that common terms are computed once.
-    evidence: flat. offsets: (K,), from a pixel to one point of each pair. factors: (K, 6), see `_Pairs`.
+    evidence: flat. offsets: (K,), from a pixel to one point of each pair, and to the point beside the pixel
+    on the same line along the axis, whose gray value the first one's must resemble. factors: (K, 6), see
+    `_Pairs`.
     Fills sums (9 TILE_COLUMNS,), term by term.
     """
     disparity, weight, pull, gray = evidence
@@ -137,16 +141,18 @@ def _sum_pairs(evidence: Evidence, middle: int, offsets: Int64, factors: Float32
         sums[i] = weight[here + np.uint64(i)]
     for i in range(_LANES):
         sums[6 * _LANES + i] = pull[here + np.uint64(i)]
-    for j in range(len(offsets)):
+    there, beside = offsets
+    for j in range(len(there)):
         # Unsigned: a loop whose index might be negative, and count from the end, isn't vectorised.
-        forth, back = np.uint64(middle + offsets[j]), np.uint64(middle - offsets[j])
+        forth, back = np.uint64(middle + there[j]), np.uint64(middle - there[j])
+        left, right = np.uint64(middle + beside[j]), np.uint64(middle - beside[j])
         f, fa, fc = factors[j, 0], factors[j, 1], factors[j, 2]
         faa, fac, fcc = factors[j, 3], factors[j, 4], factors[j, 5]
         for i in range(_LANES):
             lane = np.uint64(i)
-            centre, shade = disparity[here + lane], gray[here + lane]
+            centre = disparity[here + lane]
             gap, gap_back = disparity[forth + lane] - centre, disparity[back + lane] - centre
-            tone, tone_back = gray[forth + lane] - shade, gray[back + lane] - shade
+            tone, tone_back = gray[forth + lane] - gray[left + lane], gray[back + lane] - gray[right + lane]
             alike, alike_back = biweight_of_both(gap, tone), biweight_of_both(gap_back, tone_back)
             one, other = alike * weight[forth + lane], alike_back * weight[back + lane]
             one_pull = one * gap + alike * pull[forth + lane]
@@ -256,10 +262,13 @@ def _sum_near(
 
 @kernel(borrows=True)
 def _place_pairs(axis: Float32, pairs: _Pairs, framed_width: int, offsets: Int64) -> None:
-    """Rotate the pairs' points to a tile's axis (x, y). Fills offsets (K,) in flat frames."""
-    for j in range(len(offsets)):
+    """Rotate the pairs' points, and those beside the pixel, to a tile's axis (x, y). Fills offsets (2, K) in
+    flat frames.
+    """
+    for j in range(offsets.shape[1]):
         a, c = pairs.along[j], pairs.across[j]
-        offsets[j] = round(a * axis[1] + c * axis[0]) * framed_width + round(a * axis[0] - c * axis[1])
+        offsets[0, j] = round(a * axis[1] + c * axis[0]) * framed_width + round(a * axis[0] - c * axis[1])
+        offsets[1, j] = round(c * axis[0]) * framed_width + round(-c * axis[1])
 
 
 @kernel(borrows=True)
@@ -272,7 +281,7 @@ def _fit_lanes(
     sums: (11 TILE_COLUMNS,), scratch. Fills row and row_information, which determine the number of pixels.
     """
     steps, certain = sums[9 * _LANES : 10 * _LANES], sums[10 * _LANES :]
-    _sum_pairs(flat, middle, offsets, factors, sums)
+    _sum_pairs(flat, middle, (offsets[0], offsets[1]), factors, sums)
     _solve_planes(sums, steps, certain)
     for i in range(len(row)):
         row[i] = flat.disparity[np.uint64(middle + i)] + steps[i]
@@ -295,7 +304,7 @@ def _gather(
     framed_width = evidence.disparity.shape[1]
     flat = _flat(evidence)
     sums, part = np.empty(11 * _LANES, dtype=np.float32), np.empty(_LANES, dtype=np.float32)
-    offsets = np.empty((axes.shape[1], len(pairs.along)), dtype=np.int64)
+    offsets = np.empty((axes.shape[1], 2, len(pairs.along)), dtype=np.int64)
     for tile_y in range(first_tile, end_tile):
         for tile_x in range(axes.shape[1]):
             _place_pairs(axes[tile_y, tile_x], pairs, framed_width, offsets[tile_x])
