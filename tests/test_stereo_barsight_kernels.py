@@ -183,7 +183,7 @@ def test_planes_are_weighted_least_squares_on_the_support() -> None:
                     continue
                 gap = float(disparity[row, column] - disparity[y, x])
                 tone = float(gray[row, column] - gray[y, column])
-                kept = max(1 - (gap / same) ** 2 - tone**2, 0) ** 2
+                kept = max(1 - (gap / same) ** 2 - min(tone**2, 0.86), 0) ** 2
                 kept *= np.exp(-0.5 * (down / 4) ** 2 - 0.5 * (right / 1.5) ** 2)
                 w = kept * weight[row, column]
                 rows.append((w, down, right))
@@ -251,11 +251,12 @@ def test_planes_stop_at_the_outline_of_something_low() -> None:
     weight[16:24] = 20  # The beam has more texture.
     for step in (1, 5):
         shape = SupportShape(8.0, 1.5, step)
-        # An axis that is no column's, so that each row is fitted.
+        # An axis that is no column's, so that each row is fitted; across it, a support is a row or two high.
+        clear = np.r_[:13, 19:21, 27:HEIGHT]
         blind, _ = _planes(disparity, weight, zeros, shape, 1.0, (0.3, 0.954))
         fitted, _ = _planes(disparity, weight, zeros, shape, 1.0, (0.3, 0.954), gray)
-        assert np.abs(blind - disparity).max() > 0.2
-        np.testing.assert_allclose(fitted, disparity, atol=1e-4)
+        assert np.abs(blind - disparity)[clear].max() > 0.1
+        assert np.abs(fitted - disparity)[clear].max() < 0.03
 
 
 def _slow_semiglobal(left: np.ndarray, right: np.ndarray, lowest: int, count: int) -> np.ndarray:
@@ -769,3 +770,4 @@ def test_biweight_ends_at_one() -> None:
     zero, half = np.float32(0), np.float32(0.5)
     assert [biweight_of_both(gap, zero) for gap in gaps] == [biweight(gap) for gap in gaps]
     assert [biweight_of_both(half, tone) for tone in (half, -half, np.float32(0.9))] == [0.25, 0.25, 0]
+    assert biweight_of_both(zero, np.float32(5)) == pytest.approx(0.0196, abs=1e-4)
