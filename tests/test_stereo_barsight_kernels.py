@@ -183,7 +183,7 @@ def test_planes_are_weighted_least_squares_on_the_support() -> None:
                     continue
                 gap = float(disparity[row, column] - disparity[y, x])
                 tone = float(gray[row, column] - gray[y, column])
-                kept = max(1 - (gap / same) ** 2 - min(tone**2, 0.86), 0) ** 2
+                kept = max(1 - (gap / same) ** 2 - min(tone**2, 0.78), 0) ** 2
                 kept *= np.exp(-0.5 * (down / 4) ** 2 - 0.5 * (right / 1.5) ** 2)
                 w = kept * weight[row, column]
                 rows.append((w, down, right))
@@ -770,4 +770,4 @@ def test_biweight_ends_at_one() -> None:
     zero, half = np.float32(0), np.float32(0.5)
     assert [biweight_of_both(gap, zero) for gap in gaps] == [biweight(gap) for gap in gaps]
     assert [biweight_of_both(half, tone) for tone in (half, -half, np.float32(0.9))] == [0.25, 0.25, 0]
-    assert biweight_of_both(zero, np.float32(5)) == pytest.approx(0.0196, abs=1e-4)
+    assert biweight_of_both(zero, np.float32(5)) == pytest.approx(0.0484, abs=1e-4)

@@ -29,7 +29,7 @@ FITTED_EVERY = 4
 divide TILE_ROWS. The rows between are interpolated, since their supports overlap almost entirely.
 """
 _COLUMN_SINE = np.float32(0.17)
-_MOST_TONE = np.float32(0.86)
+_MAX_TONE_SQUARE = np.float32(0.78)
 """Maximum square of a difference in gray value, where it counts with one in disparity."""
 
 
@@ -120,9 +120,9 @@ def biweight(gap: np.float32) -> np.float32:
 @kernel(inline=True)
 def biweight_of_both(gap: np.float32, tone: np.float32) -> np.float32:
     """Evaluate Tukey's biweight of two differences, which ends where their squares add up to 1; a tone of any
-    size alone leaves 2 %, so that a strap without texture of its own still has a fit.
+    size alone leaves 5 %, so that a strap without texture of its own still has a fit.
     """
-    rest = np.float32(1) - gap * gap - min(tone * tone, _MOST_TONE)
+    rest = np.float32(1) - gap * gap - min(tone * tone, _MAX_TONE_SQUARE)
     rest = rest if rest > np.float32(0) else np.float32(0)
     return rest * rest
 
