@@ -75,12 +75,12 @@ def fit_planes(
     information.
 
     Pixel i contributes disparity[i] + pull[i] / weight[i], with weight[i] (0 = nothing). Its share falls with
-    the distance (Gaussian) and with the differences in disparity and in gray value (Tukey's biweight, which
-    ends at same_surface_px and at a gray of 1), so that a support doesn't cross a depth edge, or the outline
-    of something so low that its disparities differ by less. Supports along a column overlap almost
-    entirely: of a column's rows only one in FITTED_EVERY is fitted, and the rows between are interpolated
-    from those above and below, as far as these are the same surface. Frames in, no NaN, and two more (`room`)
-    as scratch; (H, W) out.
+    the distance (Gaussian) and with the differences in disparity and, along the axis, in gray value (Tukey's
+    biweight, see `biweight_of_both`), so that a support doesn't cross a depth edge, or the outline of
+    something so low that its disparities hardly differ. Shading across a bar doesn't narrow its support.
+    Supports along a column overlap almost entirely: of a column's rows only one in FITTED_EVERY is fitted,
+    and the rows between are interpolated from those above and below, as far as these are the same surface.
+    Frames in, no NaN, and two more (`room`) as scratch; (H, W) out.
     """
     step, unit = shape.step, np.float32(same_surface_px)
     # In units of same_surface_px, each point needs one multiplication less.
@@ -145,14 +145,15 @@ def _sum_pairs(
     for j in range(len(there)):
         # Unsigned: a loop whose index might be negative, and count from the end, isn't vectorised.
         forth, back = np.uint64(middle + there[j]), np.uint64(middle - there[j])
-        left, right = np.uint64(middle + beside[j]), np.uint64(middle - beside[j])
+        forth_line, back_line = np.uint64(middle + beside[j]), np.uint64(middle - beside[j])
         f, fa, fc = factors[j, 0], factors[j, 1], factors[j, 2]
         faa, fac, fcc = factors[j, 3], factors[j, 4], factors[j, 5]
         for i in range(_LANES):
             lane = np.uint64(i)
             centre = disparity[here + lane]
             gap, gap_back = disparity[forth + lane] - centre, disparity[back + lane] - centre
-            tone, tone_back = gray[forth + lane] - gray[left + lane], gray[back + lane] - gray[right + lane]
+            tone = gray[forth + lane] - gray[forth_line + lane]
+            tone_back = gray[back + lane] - gray[back_line + lane]
             alike, alike_back = biweight_of_both(gap, tone), biweight_of_both(gap_back, tone_back)
             one, other = alike * weight[forth + lane], alike_back * weight[back + lane]
             one_pull = one * gap + alike * pull[forth + lane]
