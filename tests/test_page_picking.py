@@ -14,11 +14,11 @@ from barsight.cli.main import run
 from barsight.page.api.serve import ServeOptions, serving
 from barsight.registration.yard_file import read_yard_file
 from page_yards import DISCS
-from test_page_browser import Sheet, address, browser, frame, made, pytestmark, url, violations, wait_for
+from test_page_browser import Sheet, address, browser, frame, pytestmark, violations, wait_for
 from test_yard_picks import row
 from test_yard_tags import LAID, SHIFT, SURVEY_M, TURN
 
-__all__ = ["address", "browser", "made", "pytestmark", "url"]
+__all__ = ["address", "browser", "pytestmark"]
 HEADER = "name,yard_x,yard_y,yard_z,sigma_m,check\n"
 LISTED = HEADER + "".join(f"post {k},{x},{y},0,0.001,\n" for k, (x, y) in enumerate(DISCS))
 
