@@ -130,8 +130,7 @@ def _sum_pairs(
     Points come in pairs on opposite sides of the central pixel, so that common terms are computed once.
     evidence: flat. offsets: (K,), from a pixel to one point of each pair, and to the point beside the pixel
     on the same line along the axis, whose gray value the first one's must resemble. factors: (K, 6), see
-    `_Pairs`.
-    Fills sums (9 TILE_COLUMNS,), term by term.
+    `_Pairs`. Fills sums (9 TILE_COLUMNS,), term by term.
     """
     disparity, weight, pull, gray = evidence
     here = np.uint64(middle)
