@@ -22,6 +22,7 @@ from barsight.benchmarks.yard.judged_lifts import (
 )
 from barsight.cli.bench import lifts
 from barsight.cli.bench.lifts import bench_lift_targets
+from barsight.cli.main import run
 from barsight.core.errors import ConfigError
 from barsight.simulation.sensors import heights
 from barsight.simulation.simulate import LaidYard, World
@@ -137,6 +138,20 @@ def test_a_hundred_placements_on_one_yard_are_not_a_hundred_yards() -> None:
         assert "of 16 yards" in told
         held += float(told.split("bound ")[1].split(" %")[0]) >= 5.0
     assert held >= 95
+
+
+@pytest.mark.parametrize(
+    ("offered", "vetoes", "dangerous", "code"),
+    [(True, (), ("on",), 5), (False, (), ("on",), 5), (False, ("edge",), ("on",), 0), (True, (), (), 0)],
+)
+def test_a_danger_without_a_veto_fails_the_bench(
+    offered: bool, vetoes: tuple[str, ...], dangerous: tuple[str, ...], code: int,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    one = JudgedLift(0, "", offered, 0, 0, 0, vetoes, dangerous, (), 1, 1, 1, 1, 1)
+    monkeypatch.setattr(lifts, "over_seeds", lambda *_: [(0, (one,))])
+    assert run(["bench", "lifts", "--seeds", "0:1"]) == code
+    assert ("dangerous placements without a veto: 1" in capsys.readouterr().err) == (code != 0)
 
 
 @pytest.mark.parametrize("seeds", ["7", "9:9", "a:b"])
