@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any, get_args, get_origin, get_type_hints
 
 import numba
 import numpy as np
@@ -12,12 +13,15 @@ import pytest
 from numba import types
 
 import barsight
-from barsight.core.arrays import kernel
+from barsight.core.arrays import Float64, kernel
 from barsight.core.compiling import ahead, signatures
 from barsight.core.compiling.signatures import Listed, listed
 from barsight.core.linalg.skyline import Skyline
 
 SOURCE = Path(barsight.__file__).parents[1]
+NUMBERS = {float: ("float32", "float64", "int64"), int: ("int8", "int32", "int64"), bool: ("bool",)}
+"""Types that an annotation stands for."""
+SKYLINE, FLOATS, INTS = "barsight.core.linalg.skyline:Skyline", ["float64", 1, "C"], ["int64", 1, "C"]
 CALLER = """
 from barsight.core.arrays import kernel
 from yards.called import Rule, through
@@ -111,11 +115,47 @@ def test_a_loaded_kernel_is_compiled_into_a_new_one(tmp_path: Path, monkeypatch:
     assert kernel()(four_times.py_func)(1.5) == 6.0  # type: ignore[attr-defined]
 
 
-def test_the_list_names_kernels_with_all_their_arguments() -> None:
+def fits(value: Any, kind: Any) -> bool:
+    """A listed type is one of the annotation: its number, its array's element, its class and members."""
+    name, rest = (value, []) if isinstance(value, str) else (value[0], value[1:])
+    if kind is Any:
+        return True
+    if name == "literal":
+        return type(rest[0]) is kind or kind is float
+    if get_origin(kind) is np.ndarray:
+        (element,) = get_args(get_args(kind)[1])
+        return len(rest) >= 2 and name == np.dtype(element).name
+    if get_origin(kind) is tuple or hasattr(kind, "_fields"):
+        is_plain = not hasattr(kind, "_fields")
+        members = get_args(kind) if is_plain else tuple(get_type_hints(kind).values())
+        wanted = "tuple" if is_plain else f"{kind.__module__}:{kind.__qualname__}"
+        return name == wanted and len(rest) == len(members) and all(map(fits, rest, members))
+    return not rest and name in NUMBERS.get(kind, (np.dtype(kind).name,))
+
+
+def test_the_list_names_kernels_with_all_their_arguments_as_annotated() -> None:
+    """Run tools/signatures.py where this fails."""
     found = listed("simulate", "measure")
     assert len(found) > 100 and len(listed("simulate")) > 5
     for one in found:
-        assert len(one.types()) == len(inspect.signature(one.kernel().py_func).parameters)
+        function = one.kernel().py_func
+        hints, names = get_type_hints(function), list(inspect.signature(function).parameters)
+        assert len(one.types()) == len(names), one
+        assert [n for n, v in zip(names, one.arguments, strict=True) if not fits(v, hints[n])] == [], one
+
+
+@pytest.mark.parametrize(
+    ("value", "kind"),
+    [
+        ("float64", Float64), (["float32", 2, "C"], Float64), (["float64", 1, "C"], float), ("int64", bool),
+        ("float64", int), ("float64", np.float32), (["literal", 1], bool), (["literal", True], int),
+        (["tuple", "int64"], tuple[int, int]), (["tuple", "int64", "float64"], tuple[int, int]),
+        ([SKYLINE, FLOATS, INTS], Skyline), ([SKYLINE, FLOATS, INTS, FLOATS], Skyline),
+        (["barsight.core.linalg.skyline:Renamed", FLOATS, INTS, INTS], Skyline),
+    ],
+)  # fmt: skip
+def test_a_listed_type_of_an_earlier_annotation_is_noticed(value: Any, kind: Any) -> None:
+    assert not fits(value, kind)
 
 
 def test_types_are_read_as_they_were_written() -> None:
