@@ -25,7 +25,7 @@ from barsight.pipeline.lift_choice import LiftRequest
 from barsight.recording.formats.segments import PATTERN
 from barsight.recording.open import open_recording
 from barsight.recording.writers.bag import write_descriptions
-from barsight.recording.writers.retention import PROTECTED
+from barsight.recording.writers.retention import PROTECTED, oldest_first
 from barsight.yard.magnet.description import load_magnet
 
 STAMP = "%Y%m%dT%H%M%S"
@@ -176,17 +176,13 @@ def _point(link: Path, name: str) -> None:
 def _keep(out: Path, count: int, newest: str) -> None:
     """Remove the oldest survey folders beyond `count`, except the last one measured.
 
-    newest: name of the folder just written. Those named later are older: the clock was wrong then and has
-    been set back since.
+    newest: name of the folder just written.
     """
-    surveys = sorted(
-        (
-            path for path in out.iterdir()
-            if path.is_dir() and not path.is_symlink() and len(path.name) == 15 and path.name[8] == "T"
-        ),
-        key=lambda path: (path.name <= newest, path.name),
-    )  # fmt: skip
-    for path in surveys[:-count]:
+    surveys = [
+        path for path in out.iterdir()
+        if path.is_dir() and not path.is_symlink() and len(path.name) == 15 and path.name[8] == "T"
+    ]  # fmt: skip
+    for path in oldest_first(surveys, newest)[:-count]:
         is_latest = (out / LATEST).exists() and path.samefile(out / LATEST)
         if not is_latest and not (path / PROTECTED).exists():
             shutil.rmtree(path, ignore_errors=True)

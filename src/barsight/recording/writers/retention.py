@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from barsight.recording.formats.segments import PATTERN
@@ -16,6 +16,15 @@ def used_ratio(folder: Path) -> float:
     """Compute the share of the disk in use, of the space available to users other than root."""
     usage = shutil.disk_usage(folder)
     return usage.used / max(usage.used + usage.free, 1)
+
+
+def oldest_first(folders: Iterable[Path], newest: str) -> list[Path]:
+    """Sort folders that are named by their start, the oldest first.
+
+    newest: name of the one written last. Those named later are older: the clock was wrong then, and was set
+    back since.
+    """
+    return sorted(folders, key=lambda folder: (folder.name <= newest, folder.name))
 
 
 class Retention:
@@ -50,14 +59,10 @@ class Retention:
         return deleted
 
     def _deletable(self) -> list[Path]:
-        """List the segments of the other recordings, the oldest first; folders are named by their start.
-
-        Those named later than the current one are older: the clock was wrong then, and was set back since.
-        """
-        now = self._current.name
+        """List the segments of the other recordings, the oldest first."""
         return [
             path
-            for folder in sorted(self._current.parent.iterdir(), key=lambda one: (one.name <= now, one.name))
+            for folder in oldest_first(self._current.parent.iterdir(), self._current.name)
             if folder.is_dir() and folder != self._current and not (folder / PROTECTED).exists()
             for path in sorted(folder.glob(PATTERN))
         ]
