@@ -116,7 +116,9 @@ def over_planned(path: Path) -> list[float]:
         (("--range", "8", "--width", "12", "--sigma", "0.001"), 5, "needs a baseline of 5.15 m"),
         (("--range", "20", "--width", "12", "--bar-diameter", "0.01"), 5, "take a camera of more pixels"),
         (("--range", "8", "--width", "12", "--stack", "7"), 2, "less than a fifth of the range"),
-        (("--range", "-8", "--width", "12"), 2, "range_m must lie in"),
+        (("--range", "-8", "--width", "12"), 2, "--range must lie in 0.5...60 m, not -8"),
+        (("--range", "8", "--width", "12", "--bar-diameter", "9"), 2, "--bar-diameter must lie in 0.005"),
+        (("--range", "8", "--width", "12", "--speed", "nan"), 2, "--speed must lie in 0.01...5 m/s, not nan"),
         (
             ("--range", "3", "--stack", "1.5", "--width", "2", "--speed", "5", "--camera", "12MP"),
             5,

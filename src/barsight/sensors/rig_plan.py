@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from barsight.core.errors import ConfigError, MeasurementError
-from barsight.core.settings.values import expect_ranges
+from barsight.core.settings.values import expect
 
 DISPARITY_SIGMA_PX = 0.1
 """Robust sigma in pixels of a match on rendered yards
@@ -69,10 +69,13 @@ class Wish:
     speed_mps: float = 0.5
 
     def __post_init__(self) -> None:
-        expect_ranges(
-            self, "", range_m=(0.5, 60), width_m=(0.5, 200), stack_m=(0, 50), bar_m=(0.005, 2),
-            sigma_m=(1e-4, 1), speed_mps=(0.01, 5),
-        )  # fmt: skip
+        for flag, value, low, high in (
+            ("range", self.range_m, 0.5, 60), ("width", self.width_m, 0.5, 200),
+            ("stack", self.stack_m, 0, 50), ("bar-diameter", self.bar_m, 0.005, 2),
+            ("sigma", self.sigma_m, 1e-4, 1), ("speed", self.speed_mps, 0.01, 5),
+        ):  # fmt: skip
+            unit = "m/s" if flag == "speed" else "m"
+            expect(low <= value <= high, f"--{flag} must lie in {low:g}...{high:g} {unit}, not {value:g}")
         if self.stack_m > 0.8 * self.range_m:
             raise ConfigError(
                 f"the stack of {self.stack_m:g} m leaves less than a fifth of the range of {self.range_m:g} m"
