@@ -19,6 +19,7 @@ from barsight.page.conditions import _lifted_since_seen, find_conditions, settle
 from barsight.page.documents import alarm_records
 from barsight.page.live import LiveFolder
 from barsight.page.watch import StoreWatch
+from barsight.plant.state import state_of_store
 from barsight.store import confirmation, opening
 from barsight.store.audit import Entry, entry
 from barsight.store.opening import Store, open_store
@@ -143,6 +144,18 @@ def test_a_bug_in_a_condition_ends_no_watch_and_is_told(url: str, monkeypatch: p
         finally:
             watch.stop()
             loop.close()
+
+
+def test_page_and_plant_give_alarms_the_same_priority(url: str) -> None:
+    wanted = {"calibration-changed": 1, "lift-failed": 1, "lift-unrecorded": 1, "survey-files": 3, "rig": 2}
+    with open_store(url) as store:
+        with entry(store, "ann", "alarms") as opened:
+            for code in wanted:
+                raise_alarm(opened, code, "why")
+        with store.reading() as connection:
+            page = {one["code"]: one["priority"] for one in alarm_records(connection)}
+        plant = {one.code: one.priority for one in state_of_store(store, 1).alarms}
+    assert page == plant == wanted
 
 
 def test_alarms_alike_are_listed_once_and_acknowledged_together(url: str) -> None:

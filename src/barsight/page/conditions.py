@@ -45,8 +45,6 @@ ALARM_CODES = {
     "live-degraded": "The live run lacks a sensor or a process that lifts need.",
 }
 """Alarms that the page's server raises itself: meaning by code."""
-PRIORITIES = {"store-broken": 1, "calibration-changed": 1, "bundle-moved": 3, "survey-files": 3}
-"""Priorities of alarms by code, 1 is the highest; all others have 2."""
 WHO = "barsight serve"
 Condition = tuple[str, str]
 """Code and reason of an alarm."""

@@ -13,13 +13,14 @@ import numpy as np
 
 from barsight.core.errors import InputError
 from barsight.core.extras import extra
-from barsight.page.conditions import PRIORITIES, is_there
+from barsight.page.conditions import is_there
 from barsight.store.audit import IDS_PER_QUERY
 from barsight.store.calibrations import list_calibrations
 from barsight.store.confirmation import map_vetoes, newest_survey, open_lifts, yard_clock_ns
 from barsight.store.history import PresentBundle, identity_name, list_surveys, present_yard
 from barsight.store.promotion import counts
 from barsight.store.recordings import list_recordings
+from barsight.store.states import alarm_priority
 from barsight.store.tables import (
     ABSENCES,
     ALARM_STATES,
@@ -210,7 +211,7 @@ def alarm_records(connection: Connection) -> list[dict[str, Any]]:
         {
             "id": row.id, "code": row.code, "reason": row.reason, "state": steps[row.id][-1]["state"],
             "at_ns": steps[row.id][0]["at_ns"], "steps": steps[row.id],
-            "priority": PRIORITIES.get(row.code, 2),
+            "priority": alarm_priority(row.code),
         }
         for row in rows
     ]  # fmt: skip

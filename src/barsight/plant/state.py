@@ -12,7 +12,7 @@ from barsight.core.json_values import json_value
 from barsight.core.reading.live_run import CranePose
 from barsight.store.confirmation import OPEN, OpenLift, map_vetoes, newest_survey, open_lifts, yard_clock_ns
 from barsight.store.opening import Store
-from barsight.store.states import standing_alarms
+from barsight.store.states import alarm_priority, standing_alarms
 from barsight.yard.lifting.validity import is_ahead
 
 MAX_ALARMS = 20
@@ -21,8 +21,6 @@ code is added, up to `MAX_CODES`.
 """
 MAX_CODES = 20
 """Maximum number of alarms that are added so that each code is told."""
-URGENT = ("store-broken", "load-contradicts", "lift-unrecorded", "lift-failed")
-"""Codes of alarms of priority 1: the store may no longer match the yard. All others have priority 2."""
 YAW_SENSE = "of the beam from +Y of the yard frame, counter-clockwise seen from above"
 
 
@@ -87,7 +85,7 @@ class OfferedLift:
 
 @dataclass(frozen=True)
 class PlantAlarm:
-    """An alarm that isn't cleared. priority: 1 (highest) or 2. is_active: its cause may still exist."""
+    """An alarm that isn't cleared. priority: 1 (highest) to 3. is_active: its cause may still exist."""
 
     code: str
     priority: int
@@ -168,7 +166,7 @@ def told_alarms(standing: Iterable[PlantAlarm]) -> tuple[PlantAlarm, ...]:
 
 
 def _alarm(code: str, reason: str, state: str) -> PlantAlarm:
-    return PlantAlarm(code, 1 if code in URGENT else 2, reason, state != "returned", state == "acknowledged")
+    return PlantAlarm(code, alarm_priority(code), reason, state != "returned", state == "acknowledged")
 
 
 def _reasons(lift: OfferedLift | None, is_simulated: bool, has_steps: bool) -> tuple[str, ...]:

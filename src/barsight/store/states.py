@@ -30,6 +30,11 @@ ALARM_STEPS: dict[str | None, tuple[str, ...]] = {
 """States that may follow each state of an alarm. `returned`: the cause has ended without an acknowledgement;
 acknowledging the alarm then clears it (ISA-18.2).
 """
+PRIORITIES = {
+    "store-broken": 1, "load-contradicts": 1, "lift-unrecorded": 1, "lift-failed": 1,
+    "calibration-changed": 1, "bundle-moved": 3, "survey-files": 3,
+}  # fmt: skip
+"""Priorities of alarms by code for page and plant, 1 is the highest; all others have 2."""
 RECORDING_STEPS: dict[str | None, tuple[str, ...]] = {
     None: ("archived", "measured"),
     "archived": ("measured", "kept"),
@@ -52,6 +57,11 @@ def raise_alarm(opened: Entry, code: str, reason: str) -> int:
     alarm_id = opened.add(ALARMS, code=code, reason=reason)
     _step(opened, ALARM_STATES, "alarm", alarm_id, ALARM_STEPS, "raised", None)
     return alarm_id
+
+
+def alarm_priority(code: str) -> int:
+    """Return an alarm's priority, 1 to 3."""
+    return PRIORITIES.get(code, 2)
 
 
 def has_alarm(connection: Connection, code: str, reason: str) -> bool:
