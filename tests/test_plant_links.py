@@ -519,6 +519,14 @@ def test_bad_configurations_and_keys_are_told(tmp_path: Path, capsys: pytest.Cap
     assert told.opcua.folder == tmp_path / "pki" and told.mqtt.password_file == tmp_path / "secret"
 
 
+@pytest.mark.parametrize("table", ["opcua", "mqtt"])
+def test_no_link_may_show_a_state_for_longer_than_it_may_be_old(table: str, tmp_path: Path) -> None:
+    config = tmp_path / "plant.toml"
+    config.write_text(f"[{table}]\nstate_every_s = 0.31\n")
+    with pytest.raises(ConfigError, match=rf"{table}\.state_every_s must lie in 0\.01\.\.\.0\.3, not 0\.31"):
+        read_plant(config)
+
+
 def test_files_of_secrets_that_cannot_be_are_told_at_the_start(tmp_path: Path) -> None:
     pytest.importorskip("aiomqtt")
     pytest.importorskip("asyncua")

@@ -12,16 +12,13 @@ from typing import Protocol
 from barsight.core.errors import BarsightError
 from barsight.core.reading.live_run import CranePose
 from barsight.plant.crane_names import is_crane
+from barsight.plant.link_settings import MAX_AGE_S
 from barsight.plant.live_folder import with_live_run
 from barsight.plant.settings import PlantSettings
 from barsight.plant.state import PlantState, PlcReading, state_of_store
 from barsight.store.confirmation import expire_claims, expire_stale
 from barsight.store.opening import Store
 
-MAX_AGE_S = 0.3
-"""Maximum age of a state in seconds, counted from when it was read from the store; an older one is marked
-invalid.
-"""
 READ_EVERY_S = 0.1
 JUDGE_EVERY_S = 1.0
 PLC_SILENT_S = 1.0

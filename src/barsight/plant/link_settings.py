@@ -9,6 +9,10 @@ from urllib.parse import urlsplit
 from barsight.core.errors import ConfigError
 from barsight.core.settings.values import expect_ranges, expect_values
 
+MAX_AGE_S = 0.3
+"""Maximum age of a state in seconds, counted from when it was read from the store; an older one is marked
+invalid. No link may show a state for longer either.
+"""
 OPCUA_ROLES = ("viewer", "operator", "engineer")
 """Roles: a viewer reads; an operator also runs jobs, takes lifts and acknowledges alarms; an engineer also
 handles recipes.
@@ -54,7 +58,7 @@ class OpcUaSettings:
     max_subscription_cycles: int = 600
     """Number of publishing cycles after which a subscription without publish requests is dropped."""
     state_every_s: float = 0.1
-    """Interval in seconds at which the server reads the plant state."""
+    """Interval in seconds at which the server reads the plant state, at most 0.3."""
     kept_results: int = 20
     """Number of survey results that clients can request; older ones are dropped."""
 
@@ -63,7 +67,7 @@ class OpcUaSettings:
         expect_ranges(
             self, "opcua.", port=(1, 65535), max_clients=(1, 1000), max_subscriptions=(1, 10000),
             max_queue=(1, 10000), max_unacknowledged=(1, 1000), max_subscription_cycles=(10, 15000),
-            state_every_s=(0.01, 10), kept_results=(1, 1000),
+            state_every_s=(0.01, MAX_AGE_S), kept_results=(1, 1000),
         )  # fmt: skip
 
     @property
@@ -112,13 +116,13 @@ class MqttSettings:
     max_retry_s: float = 10.0
     """Longest wait in seconds between attempts to reach the broker; the first wait is 0.1 s."""
     state_every_s: float = 0.1
-    """Shortest interval in seconds between published states."""
+    """Shortest interval in seconds between published states, at most 0.3."""
 
     def __post_init__(self) -> None:
         expect_values(self, "mqtt.")
         expect_ranges(
             self, "mqtt.", port=(1, 65535), keepalive_s=(1, 3600), max_waiting=(1, 100000),
-            max_retry_s=(0.1, 600), state_every_s=(0.01, 60),
+            max_retry_s=(0.1, 600), state_every_s=(0.01, MAX_AGE_S),
         )  # fmt: skip
         if not self.prefix or set("#+\0") & set(self.prefix) or self.prefix.startswith("$"):
             raise ConfigError(

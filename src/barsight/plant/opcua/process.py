@@ -17,12 +17,11 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from barsight.core.errors import Failed
-from barsight.plant.link_settings import OpcUaSettings
+from barsight.plant.link_settings import MAX_AGE_S, OpcUaSettings
 from barsight.plant.opcua.recipes import Recipes
 from barsight.plant.opcua.server import opcua_server
 from barsight.plant.opcua.surveys import Told
 
-MAX_AGE_S = 0.3
 Handshake = Callable[[str, str, Mapping[str, Any]], "str | Failed"]
 """Callable that takes a step of the handshake: its name, the caller and the arguments; returns the token."""
 
