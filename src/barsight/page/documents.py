@@ -207,7 +207,7 @@ def alarm_records(connection: Connection) -> list[dict[str, Any]]:
         .order_by(ALARMS.c.id.desc())
     ).all()
     steps = _steps(connection, ALARM_STATES, ALARM_STATES.c.alarm_id, [row.id for row in rows])
-    told = [
+    alarms = [
         {
             "id": row.id, "code": row.code, "reason": row.reason, "state": steps[row.id][-1]["state"],
             "at_ns": steps[row.id][0]["at_ns"], "steps": steps[row.id],
@@ -215,7 +215,7 @@ def alarm_records(connection: Connection) -> list[dict[str, Any]]:
         }
         for row in rows
     ]  # fmt: skip
-    return sorted(told, key=_urgency)
+    return sorted(alarms, key=_urgency)
 
 
 def _urgency(alarm: dict[str, Any]) -> tuple[int, int, int]:

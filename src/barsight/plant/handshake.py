@@ -98,19 +98,19 @@ def report_executed(store: Store, claim: LiftClaim, load_kg: float | None) -> st
     with store.reading() as connection:
         query = select(LIFTS.c.record).where(LIFTS.c.id == claim.lift_id)
         record = json.loads(connection.execute(query).scalar_one())
-    told, alarm = "unweighed", None
+    verdict, alarm = "unweighed", None
     if load_kg is not None:
-        told = "confirmed"
+        verdict = "confirmed"
         if abs(load_kg - record["mass_kg"]) > LOAD_SIGMAS * record["mass_sigma_kg"]:
             weighed = f"{load_kg:.0f} kg were weighed, {record['mass_kg']:.0f} kg were told"
-            told, alarm = "contradicted", ("load-contradicts", f"lift {claim.lift_id}: {weighed}")
+            verdict, alarm = "contradicted", ("load-contradicts", f"lift {claim.lift_id}: {weighed}")
     if "executed" in states_of(store, claim.lift_id):
-        return told
+        return verdict
     try:
         take_lift(store, claim.lift_id, claim.who, alarm)
     except LateReportError as error:
         return Failed("refused", str(error))
-    return told
+    return verdict
 
 
 def report_failed(store: Store, claim: LiftClaim, note: str) -> str | Failed:

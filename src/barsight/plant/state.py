@@ -156,13 +156,13 @@ def state_of_store(
 def told_alarms(standing: Iterable[PlantAlarm]) -> tuple[PlantAlarm, ...]:
     """Choose the alarms that the plant is told. standing: the newest first."""
     ranked = sorted(standing, key=lambda alarm: (alarm.priority, not alarm.is_active))
-    told = ranked[:MAX_ALARMS]
-    codes = {alarm.code for alarm in told}
+    chosen = ranked[:MAX_ALARMS]
+    codes = {alarm.code for alarm in chosen}
     for alarm in ranked[MAX_ALARMS:]:
-        if alarm.code not in codes and len(told) < MAX_ALARMS + MAX_CODES:
+        if alarm.code not in codes and len(chosen) < MAX_ALARMS + MAX_CODES:
             codes.add(alarm.code)
-            told.append(alarm)
-    return tuple(told)
+            chosen.append(alarm)
+    return tuple(chosen)
 
 
 def _alarm(code: str, reason: str, state: str) -> PlantAlarm:

@@ -169,12 +169,12 @@ def bench_table(bench: JudgedBench) -> Table:
         abs(one.stated_mass_kg - one.true_mass_kg) <= TWO_SIDED * one.stated_sigma_kg
         for one in free if math.isfinite(one.stated_mass_kg)
     ]  # fmt: skip
-    yards, held = (len({one.seed for one in part}) for part in (bad, free))
+    bad_yards, free_yards = (len({one.seed for one in part}) for part in (bad, free))
     for name, value in (
         ("without a veto", f"{len(free)}, {sum(one.offered for one in free)} of them offered"),
         # Placements on one yard fail together: only yards count as independent.
-        ("of these dangerous", f"{_share(len(bad), len(free))}, on {yards} of {held} yards; 95 % upper bound "
-         f"{100 * upper_bound(yards, held):.1f} % of such yards"),
+        ("of these dangerous", f"{_share(len(bad), len(free))}, on {bad_yards} of {free_yards} yards; 95 % "
+         f"upper bound {100 * upper_bound(bad_yards, free_yards):.1f} % of such yards"),
         ("offered and dangerous", f"{sum(one.offered for one in bad)}"),
         ("why dangerous", _counts(reasons)),
         ("neither dangerous nor fine", f"{len(free) - len(bad) - sum(one.is_fine for one in free)}"),
