@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 
 from barsight.mapping.free_space import (
-    COARSE_CELLS,
     LEVEL_CELLS,
     LEVEL_M,
+    NO_END,
     OVER_END_M,
-    REACH_M,
     FreeSpace,
-    _level,
     bound_heights,
-    carve_rays,
+    level_heights,
+    sweep_rays,
 )
 from barsight.mapping.observation import CellObservations
 
@@ -79,41 +78,59 @@ def test_matches_that_mix_front_and_back_at_an_edge_prove_nothing() -> None:
     assert (free.window(int(X[0]), 10, X.size, 20) >= HEIGHT[None]).all()
 
 
-def test_the_kernel_agrees_with_a_slow_reference() -> None:
-    rng = np.random.default_rng(2)
-    x, y = rng.integers(20, 60, (2, 50)).astype(np.int32)
-    z = rng.uniform(0, 1, 50).astype(np.float32)
-    eye, cell_m = np.array([0.3, 1.4, 6.0]), CELL_M * COARSE_CELLS
-    bound = np.full((80, 80), np.inf, np.float32)
-    carve_rays(x, y, z, eye, cell_m, bound)
-    slow = np.full((80, 80), np.inf)
-    for k in range(50):
-        start = np.array([x[k] * cell_m, y[k] * cell_m])
-        run = (eye[:2] - start) / (eye[2] - z[k])
-        step = cell_m / np.hypot(*run)
-        for i in range(1, int(REACH_M / step)):
-            column, row = np.floor((start + run * i * step) / cell_m + 0.5).astype(int)
-            if not (0 <= row < 80 and 0 <= column < 80):
-                break
-            slow[row, column] = min(slow[row, column], z[k] + (i + 1) * step + OVER_END_M)
-    np.testing.assert_allclose(bound, slow, rtol=1e-6)
-    assert np.isfinite(slow).sum() > 300
+@pytest.mark.parametrize("eye_cells", [(30.0, 41.0), (-25.0, 12.0), (90.0, 100.0)])
+def test_bounds_are_those_of_single_lines_of_sight(eye_cells: tuple[float, float]) -> None:
+    rng, shape, eye_z_m = np.random.default_rng(2), (80, 70), 6.0
+    ends = np.full(shape, NO_END)
+    ends[tuple(rng.integers(0, 70, (2, 40)))] = rng.uniform(0, 1, 40).astype(np.float32)
+    bound = np.full(shape, np.inf, np.float32)
+    sweep_rays(ends, np.array([*(CELL_M * np.array(eye_cells)), eye_z_m]), CELL_M, bound)
+    lowest, middle = np.full(shape, np.inf), np.full(shape, np.inf)
+    for row, column in np.argwhere(np.isfinite(ends)):
+        for aside in np.ndindex(5, 5):
+            start = (column, row) + 0.24 * (np.array(aside) - 2)
+            to_eye = np.array(eye_cells) - start
+            t = np.arange(0, 1, 0.1 / np.hypot(*to_eye))
+            at_x, at_y = np.floor(start + t[:, None] * to_eye + 0.5).astype(int).T
+            inside = (at_y >= 0) & (at_y < shape[0]) & (at_x >= 0) & (at_x < shape[1])
+            inside &= (at_y != row) | (at_x != column)
+            height = ends[row, column] + t * (eye_z_m - ends[row, column]) + OVER_END_M
+            np.minimum.at(lowest, (at_y[inside], at_x[inside]), height[inside])
+            if aside == (2, 2):
+                np.minimum.at(middle, (at_y[inside], at_x[inside]), height[inside])
+    # A line enters a cell lower than it leaves it, by its slope (m per cell).
+    both = np.isfinite(bound) & np.isfinite(middle)
+    slope = (eye_z_m - 0.5) / np.hypot(*(np.argwhere(both) - eye_cells[::-1]).T)
+    assert both.sum() > 0.7 * np.isfinite(middle).sum() > 300
+    assert (bound >= lowest).all()
+    assert np.median((bound[both] - middle[both]) / slope) < 1.5
+
+
+def test_a_plane_lets_no_wall_through() -> None:
+    ends = np.full((60, 60), np.float32(0.2))
+    ends[:, 40:] = NO_END
+    ends[20:22, :] = NO_END
+    bound = np.full(ends.shape, np.inf, np.float32)
+    sweep_rays(ends, np.array([6.0, 0.3, 7.0]), CELL_M, bound)
+    # From +X, the eye sees the ends at the left through the cells to the right of them.
+    assert np.isfinite(bound[5:15, 20:60]).all()
+    assert (bound[5:15, 1:38] < 0.2 + OVER_END_M + 0.06).all()
+    assert (bound[:, 45] > 0.2 + 0.05).all()
 
 
 @pytest.mark.parametrize("corner", [(-300, -300), (250, 130)])
 def test_tiles_join_without_a_seam(corner: tuple[int, int]) -> None:
     cells = seen_from(0.0)
     whole, moved = FreeSpace(CELL_M), FreeSpace(CELL_M)
-    even = (corner[0] // 2 * 2, corner[1] // 2 * 2)
     shifted = CellObservations(
-        cells.x + np.int32(even[0]), cells.y + np.int32(even[1]), cells.central, cells.z_m, cells.variance_m2,
+        cells.x + np.int32(corner[0]), cells.y + np.int32(corner[1]), cells.central, cells.z_m, cells.variance_m2,
         cells.shared_m, cells.intensity,
     )  # fmt: skip
     for _ in range(2):
-        whole.carve(cells, np.array([[0.0, 0.2, 7.0]]))
-        moved.carve(shifted, np.array([[CELL_M * even[0], 0.2 + CELL_M * even[1], 7.0]]))
+        whole.carve(cells, np.array([[0.003, 0.201, 7.0]]))
+        moved.carve(shifted, np.array([[0.003 + CELL_M * corner[0], 0.201 + CELL_M * corner[1], 7.0]]))
     here = whole.window(int(X[0]), 0, X.size, 40)
-    there = moved.window(int(X[0]) + even[0], even[1], X.size, 40)
+    there = moved.window(int(X[0]) + corner[0], corner[1], X.size, 40)
     np.testing.assert_allclose(here, there, atol=1e-4)
 
 
@@ -129,17 +146,17 @@ def test_heights_of_a_cell_are_bounded_by_its_highest_and_its_lowest() -> None:
         assert lowest[i, j] == min(of_cell, default=np.inf)
 
 
-def test_one_height_in_four_is_level_as_a_slow_reference_has_it() -> None:
+def test_level_heights_agree_with_a_slow_reference() -> None:
     rng, side = np.random.default_rng(6), 30
     x, y = rng.integers(-side, side, (2, 900)).astype(np.int32)
     z = (0.2 * (x // 6 % 2) + rng.uniform(0, 0.04, x.size)).astype(np.float32)
     none = np.zeros(x.size, np.float32)
-    level_x, level_y, level_z = _level(CellObservations(x, y, none > 0, z, none, none, none))
-    slow = []
+    cells = CellObservations(x, y, none > 0, z, none, none, none)
+    level = level_heights(cells, (-side, -side), (2 * side, 2 * side))
+    slow = np.full_like(level, NO_END)
     for k in range(x.size):
         near = (abs(x - x[k]) <= LEVEL_CELLS // 2) & (abs(y - y[k]) <= LEVEL_CELLS // 2)
-        if x[k] % COARSE_CELLS == y[k] % COARSE_CELLS == 0 and abs(z[near] - z[k]).max() < LEVEL_M:
-            slow.append((x[k] // COARSE_CELLS, y[k] // COARSE_CELLS, z[k]))
-    assert slow == list(zip(level_x, level_y, level_z, strict=True))
-    even = (x % COARSE_CELLS == 0) & (y % COARSE_CELLS == 0)
-    assert 20 < len(slow) < even.sum() - 20
+        if abs(z[near] - z[k]).max() < LEVEL_M:
+            slow[y[k] + side, x[k] + side] = max(slow[y[k] + side, x[k] + side], z[k])
+    np.testing.assert_array_equal(level, slow)
+    assert 100 < np.isfinite(slow).sum() < len({*zip(x, y, strict=True)}) - 100

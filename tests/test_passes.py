@@ -326,7 +326,7 @@ def test_what_is_proven_free_is_moved_onto_the_joined_map_with_each_pass(tmp_pat
     for number in range(2):
         free = FreeSpace(CELL_M)
         bound = np.full((2, 256, 256), np.inf, np.float32)
-        bound[:, :, 64 * number : 64 * number + 64] = 0.35 + number * off_m
+        bound[:, :, 128 * number : 128 * number + 128] = 0.35 + number * off_m
         free.tiles[0, 0] = bound
         frames = tuple(
             PosedFrame(k, Pose("yard", "body", np.eye(3), np.array([k, 1.0, 8.0])), 1e-4 * np.eye(6))

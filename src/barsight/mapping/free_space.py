@@ -6,6 +6,7 @@ higher, whether or not the cell itself was seen.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, MutableMapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,42 +15,36 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from barsight.core.arrays import Bool, Float32, Float64, Int32, Int64, kernel
+from barsight.core.arrays import Bool, Float32, Float64, Int32, kernel
 from barsight.mapping.observation import CellObservations
 from barsight.mapping.spilled_tiles import TileKey
 
-COARSE_CELLS = 2
-"""Side of a free-space cell, in cells of the map."""
 TILE = 256
 OVER_END_M = 0.02
 """Margin added to the height of a line of sight when it lowers a cell's bound."""
-REACH_M = 1.5
-"""Height above its end up to which a line of sight is traced; free space matters only near what is to be
-lifted.
-"""
+MARGIN_M = 0.5
+"""Distance around a view's heights within which cells are bounded."""
 LEVEL_CELLS, LEVEL_M = 5, 0.05
 """Window side (cells) and maximum height difference within it for a line of sight to count: around its
 end, the view must see only heights this close. At edges, matching mixes foreground and background.
 """
 UNPROVEN = np.float32(np.inf)
-_STEPS = 64
-"""Number of steps along a ray that are computed at once, as vectors."""
+NO_END = np.float32(-np.inf)
+_NEAREST_CELLS = 2
+"""Number of steps from the eye's own place at which a sweep ends."""
+_DIAGONAL_CELLS = math.sqrt(2.0)
 
 
 @dataclass(eq=False)
 class FreeSpace:
     """Upper bounds (m) of the height of anything in each cell, from the two views with the lowest bounds.
 
-    cell_m: side of the map's cells; free-space cells are COARSE_CELLS times as wide. tiles: (2, TILE, TILE)
-    each, the lowest bound and the second lowest; 0.5 MiB per 5 m square at cells of 10 mm.
+    cell_m: side of the map's cells. tiles: (2, TILE, TILE) each, the lowest bound and the second lowest;
+    2 MiB per 5 m square at cells of 10 mm.
     """
 
     cell_m: float
     tiles: MutableMapping[TileKey, Float32] = field(default_factory=dict)
-
-    @property
-    def _cell_m(self) -> float:
-        return self.cell_m * COARSE_CELLS
 
     def carve(self, cells: CellObservations, eyes_m: Float64) -> None:
         """Carve with the lines of sight of one view. eyes_m: (E, 3) positions of its cameras, reference
@@ -57,42 +52,24 @@ class FreeSpace:
         """
         if cells.x.size == 0:
             return
-        x, y, z = _level(cells)
-        if x.size == 0:
-            return
-        margin = int(np.ceil(2 * REACH_M / self._cell_m))
-        column, row = int(x.min()) - margin, int(y.min()) - margin
-        bound = np.full((int(y.max()) - row + margin + 1, int(x.max()) - column + margin + 1), UNPROVEN)
+        margin = math.ceil(MARGIN_M / self.cell_m)
+        column, row = int(cells.x.min()) - margin, int(cells.y.min()) - margin
+        shape = int(cells.y.max()) - row + margin + 1, int(cells.x.max()) - column + margin + 1
+        ends, bound = level_heights(cells, (column, row), shape), np.full(shape, UNPROVEN)
         for eye in eyes_m:
-            carve_rays(
-                x - column,
-                y - row,
-                z,
-                eye - (column * self._cell_m, row * self._cell_m, 0),
-                self._cell_m,
-                bound,
-            )
-        for key in covering_tiles(column, row, bound.shape):
+            sweep_rays(ends, eye - (column * self.cell_m, row * self.cell_m, 0), self.cell_m, bound)
+        for key in covering_tiles(column, row, shape):
             self._merge(key, column, row, bound)
 
     def window(self, column: int, row: int, columns: int, rows: int) -> Float32:
-        """Return bounds (rows, columns) on the map's own cells, starting at cell (column, row); inf where
-        no bound is proven.
-        """
-        low_x, low_y = column // COARSE_CELLS, row // COARSE_CELLS
-        shape = (
-            (row + rows - 1) // COARSE_CELLS - low_y + 1,
-            (column + columns - 1) // COARSE_CELLS - low_x + 1,
-        )
-        out = np.full(shape, UNPROVEN)
-        for key in covering_tiles(low_x, low_y, shape):
+        """Return bounds (rows, columns) starting at cell (column, row); inf where no bound is proven."""
+        out = np.full((rows, columns), UNPROVEN)
+        for key in covering_tiles(column, row, out.shape):
             tile = self.tiles.get(key)
             if tile is not None:
-                ours, theirs = tile_overlap(key, low_x, low_y, shape)
+                ours, theirs = tile_overlap(key, column, row, out.shape)
                 out[theirs] = tile[1][ours]
-        at_y = np.arange(row, row + rows) // COARSE_CELLS - low_y
-        at_x = np.arange(column, column + columns) // COARSE_CELLS - low_x
-        return out[at_y[:, None], at_x]
+        return out
 
     def rise(self, rise_m: float) -> None:
         """Move all bounds up."""
@@ -105,9 +82,9 @@ class FreeSpace:
         """Merge the bounds of a newer pass, raised by rise_m. forgotten: marks the places, by x and y (m)
         of a grid, that have changed since, where only the newer pass's bounds remain valid.
         """
-        cells = np.arange(TILE) * self._cell_m
+        cells = np.arange(TILE) * self.cell_m
         for key in sorted({*self.tiles, *newer.tiles}):
-            x, y = (cells + at * TILE * self._cell_m for at in key)
+            x, y = (cells + at * TILE * self.cell_m for at in key)
             mine = self.tiles.setdefault(key, np.full((2, TILE, TILE), UNPROVEN))
             mine[:, forgotten(x, y)] = UNPROVEN
             if key in newer.tiles:
@@ -124,18 +101,17 @@ class FreeSpace:
         tile[0][ours] = np.minimum(first, new)
 
 
-def _level(cells: CellObservations) -> tuple[Int32, Int32, Float32]:
-    """Choose the level heights of every COARSE_CELLSth cell along x and y: those close to all heights that
-    the view sees around them. Returns their free-space cells along x and y (N,), and the heights (N,).
+def level_heights(cells: CellObservations, corner: tuple[int, int], shape: tuple[int, int]) -> Float32:
+    """Return the highest level height in each cell (H, W) of a grid that starts at `corner` (x, y); NO_END
+    where there is none. A height is level if it is close to all heights that the view sees around it.
     """
-    corner = int(cells.x.min()), int(cells.y.min())
-    shape = int(cells.y.max()) - corner[1] + 1, int(cells.x.max()) - corner[0] + 1
-    highest, lowest = np.full(shape, -np.inf, np.float32), np.full(shape, np.inf, np.float32)
+    highest, lowest = np.full(shape, NO_END), np.full(shape, UNPROVEN)
     bound_heights(cells.x, cells.y, cells.z_m, corner, highest, lowest)
     about = np.ones((LEVEL_CELLS, LEVEL_CELLS), np.uint8)
     highest, lowest = cv2.dilate(highest, about), cv2.erode(lowest, about)
-    chosen = _choose_level(cells.x, cells.y, cells.z_m, corner, highest, lowest)
-    return cells.x[chosen] // COARSE_CELLS, cells.y[chosen] // COARSE_CELLS, cells.z_m[chosen]
+    level = np.full(shape, NO_END)
+    _mark_level(cells.x, cells.y, cells.z_m, corner, highest, lowest, level)
+    return level
 
 
 def covering_tiles(column: int, row: int, shape: tuple[int, int]) -> list[TileKey]:
@@ -176,58 +152,65 @@ def bound_heights(
 
 
 @kernel()
-def _choose_level(
-    x: Int32, y: Int32, z: Float32, corner: tuple[int, int], highest: Float32, lowest: Float32
-) -> Int64:
-    """Choose those (M,) of the heights at x, y, z (N,) whose cell is a COARSE_CELLSth one along x and y,
-    and that are within LEVEL_M of the highest and the lowest height around them, (H, W) starting at
-    `corner`.
+def _mark_level(
+    x: Int32, y: Int32, z: Float32, corner: tuple[int, int], highest: Float32, lowest: Float32, level: Float32
+) -> None:
+    """Raise `level` (H, W), which starts at `corner`, to those of the heights z (N,) of the cells x, y (N,)
+    that are within LEVEL_M of the highest and the lowest height around them (H, W).
     """
     low_x, low_y = np.int32(corner[0]), np.int32(corner[1])
-    chosen, n = np.empty(z.size, np.int64), 0
     for k in range(z.size):
-        if x[k] % COARSE_CELLS or y[k] % COARSE_CELLS:
-            continue
         i, j = np.uint32(y[k] - low_y), np.uint32(x[k] - low_x)
         if max(highest[i, j] - z[k], z[k] - lowest[i, j]) < np.float32(LEVEL_M):
-            chosen[n] = k
-            n += 1
-    return chosen[:n]
+            level[i, j] = max(level[i, j], z[k])
 
 
 @kernel()
-def carve_rays(x: Int32, y: Int32, z: Float32, eye: Float64, cell_m: float, bound: Float32) -> None:
-    """Lower the bounds (R, C) along the lines of sight from heights z (N,) to the eye (3,).
+def sweep_rays(ends: Float32, eye: Float64, cell_m: float, bound: Float32) -> None:
+    """Lower the bounds (R, C) along the lines of sight from the eye (3,) to the heights `ends` (R, C), which
+    are NO_END where no line of sight ends.
 
-    x, y: (N,) cells of the heights. A cell's bound is the ray's height where it leaves the cell, plus
-    OVER_END_M. The origin of all coordinates is the centre of the bounds' first cell.
+    Vertical planes through the eye and each cell of the border are swept inwards. Of all lines of sight that
+    end farther out than a cell at the horizontal distance d, the steepest is the lowest there:
+    z_eye - d max((z_eye - z_end) / d_end). A cell's bound is its height where it leaves the cell, plus
+    OVER_END_M. The origin is the centre of the first cell.
     """
-    over, column, row = np.empty(_STEPS, np.float32), np.empty(_STEPS, np.int32), np.empty(_STEPS, np.int32)
-    for k in range(x.size):
-        rise = eye[2] - z[k]
-        if rise <= 0:
-            continue
-        run_x, run_y = (eye[0] - x[k] * cell_m) / rise, (eye[1] - y[k] * cell_m) / rise
-        run = np.hypot(run_x, run_y)
-        if run < 1e-6:
-            continue
-        step = cell_m / run
-        count, first = int(REACH_M / step), 1
-        begin_x, begin_y, begin_z = np.float64(x[k]), np.float64(y[k]), np.float64(z[k])
-        while first < count and first * step < rise:
-            many = min(_STEPS, count - first)
-            for i in range(many):
-                height = (first + i) * step
-                column[i] = np.int32(np.floor(begin_x + height * run_x / cell_m + 0.5))
-                row[i] = np.int32(np.floor(begin_y + height * run_y / cell_m + 0.5))
-                over[i] = np.float32(begin_z + height + step + OVER_END_M)
-            for i in range(many):
-                at_x, at_y = column[i], row[i]
-                if at_y < 0 or at_x < 0 or at_y >= bound.shape[0] or at_x >= bound.shape[1]:
-                    count = 0
-                    break
-                if (first + i) * step >= rise:
-                    break
-                if over[i] < bound[np.uint32(at_y), np.uint32(at_x)]:
-                    bound[np.uint32(at_y), np.uint32(at_x)] = over[i]
-            first += many
+    rows, columns = bound.shape
+    x0, y0 = eye[0] / cell_m, eye[1] / cell_m
+    steepness, over_eye = _steepness(ends, x0, y0, eye[2]), np.float32(eye[2] + OVER_END_M)
+    for n in range(2 * (rows + columns)):
+        side, place = (n // columns, n % columns) if n < 2 * columns else divmod(n - 2 * columns, rows)
+        if n < 2 * columns:
+            first_x, first_y = float(place), float(side * (rows - 1))
+        else:
+            first_x, first_y = float(side * (columns - 1)), float(place)
+        # One column or one row on with each step.
+        steps = max(abs(x0 - first_x), abs(y0 - first_y))
+        step_x, step_y = (x0 - first_x) / max(steps, 1.0), (y0 - first_y) / max(steps, 1.0)
+        step = np.sqrt(step_x**2 + step_y**2)
+        steepest, next_steepest = -np.float32(np.inf), -np.float32(np.inf)
+        for k in range(int(steps - _NEAREST_CELLS) + 1):
+            x, y = first_x + k * step_x + 0.5, first_y + k * step_y + 0.5
+            if not (0 <= x < columns and 0 <= y < rows):
+                break
+            row, column = np.uint32(y), np.uint32(x)
+            steepest = max(steepest, next_steepest)
+            over = over_eye - np.float32((steps - k) * step - _DIAGONAL_CELLS) * steepest
+            if over < bound[row, column]:
+                bound[row, column] = over
+            next_steepest = steepness[row, column]
+
+
+@kernel()
+def _steepness(ends: Float32, x0: float, y0: float, z_m: float) -> Float32:
+    """Compute the drop per cell (R, C) of the lines of sight from the height z_m over the place x0, y0
+    (cells) to the ends (R, C); -inf where there is no end below the eye.
+    """
+    steepness = np.empty(ends.shape, np.float32)
+    for i in range(ends.shape[0]):
+        across = np.float32((i - y0) ** 2)
+        for j in range(ends.shape[1]):
+            drop = np.float32(z_m) - ends[i, j]
+            away = np.sqrt(across + np.float32(j - x0) ** 2)
+            steepness[i, j] = drop / away if 0 < drop < np.inf else -np.float32(np.inf)
+    return steepness

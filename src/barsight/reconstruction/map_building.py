@@ -36,6 +36,8 @@ from barsight.yard_frame import frame_of, shared_height_sigma_m
 
 _TIDIED_EVERY = 8
 """Number of frames after which freed memory is returned to the system."""
+_FREE_TILES = 32
+"""Number of tiles of free space in memory: those under a view, with room for the next one."""
 
 
 class MapBuilder:
@@ -53,7 +55,7 @@ class MapBuilder:
         self._binner, self._camera, self._settings, self._yard = binner, camera, settings, yard
         self._store = TileStore(folder, settings.resident_tiles)
         self._election = SurfaceElection(self._store, folder, binner.cell_m, settings, beat)
-        self._free = FreeSpace(binner.cell_m, SpilledTiles(folder))
+        self._free = FreeSpace(binner.cell_m, SpilledTiles(folder, _FREE_TILES))
         self._tops = TopPhoto(binner.cell_m, SpilledTiles(folder))
         self._before: Neighbour | None = None
         self._previews: list[tuple[int, Preview]] = []
