@@ -5,10 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
-import signal
 import socket
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -628,31 +625,6 @@ def test_a_taken_port_is_one_line(made: Path, capsys: pytest.CaptureFixture[str]
         assert run(["serve", "--store", f"sqlite:///{made / 'yard.db'}", "--port", port]) == 4
     said = capsys.readouterr().err
     assert "is taken" in said and said.count("\n") == 1
-
-
-@pytest.mark.slow
-def test_the_demo_ends_on_the_page_with_a_change_and_a_stock_list(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "barsight", "demo"]
-    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True) as demo:
-        assert demo.stdout is not None
-        address = demo.stdout.readline().split()[0]
-        with httpx.Client(base_url=address) as client:
-            surveys = client.get("/api/surveys").json()["surveys"]
-            later, first = (one["captured_to_ns"] for one in surveys)
-            times = {"before_ns": first + 10**6, "after_ns": later + 10**6}
-            changes = client.get("/api/compare", params=times).json()["changes"]
-            stock = client.get("/api/stock").json()["differences"]
-            state = client.get("/api/state").json()
-        demo.send_signal(signal.SIGINT)
-        assert demo.wait(30) == 0
-    told = json.loads((tmp_path / "demo/recording_later/truth/changes.json").read_text())
-    true = {one["kind"]: one["center"][:2] for one in told}
-    found = {one["what"]: one["from_m"][:2] for one in changes if one["what"] != "came"}
-    assert set(found) == {"went", "moved"} and set(true) == {"taken", "moved"}
-    for what, kind in (("went", "taken"), ("moved", "moved")):
-        assert found[what] == pytest.approx(true[kind], abs=0.1)
-    assert "missing" in {one["kind"] for one in stock}
-    assert state["survey"]["is_simulated"] and state["alarms"] >= 2
 
 
 def test_slow_readers_skip(local: httpx.Client) -> None:

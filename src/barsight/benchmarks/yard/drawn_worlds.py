@@ -33,6 +33,8 @@ from barsight.yard.vetoes import Veto
 
 SPAN_M = 3.0
 """Approximate extent along X of the yards on which lifts are judged, m."""
+SMALL = CameraSettings(width_px=640, height_px=512, focal_px=625.0)
+"""Cameras with half the usual picture size."""
 OVER_MAGNET_M = 0.3
 """Length of their bars beyond the magnet's span, m."""
 CELL_M, MARGIN_M = 0.01, 0.6
@@ -53,13 +55,11 @@ def drawn_scene(world: DrawnYard) -> Scene:
 
 def recording_settings(world: DrawnYard, *, full_size: bool = False) -> SimulationSettings:
     """Choose a short recording of a world, with small images or full-size ones: ten pairs for 3 m."""
-    base, length = SimulationSettings.demo(), world.size_m[0]
-    camera = CameraSettings() if full_size else base.camera
+    length, camera = world.size_m[0], CameraSettings() if full_size else SMALL
     aside = ASIDE_M * (-1 if world.seed // 10 % 2 else 1) if world.hides else camera.trolley_y_m
-    return replace(
-        base, seed=world.seed, length_m=length, frames=round(3 + 2.3 * length), depth_views=0,
-        camera=replace(camera, trolley_y_m=aside),
-    )  # fmt: skip
+    return SimulationSettings(
+        length, round(3 + 2.3 * length), world.seed, depth_views=0, camera=replace(camera, trolley_y_m=aside)
+    )
 
 
 def render_world(world: DrawnYard, recording: Path, *, full_size: bool = False) -> None:

@@ -59,8 +59,12 @@ class SimulationSettings:
 
     @classmethod
     def demo(cls) -> SimulationSettings:
-        """Create the settings of the small yard of `barsight demo`: 3 m of stack, 10 pairs of 640x512."""
-        camera = CameraSettings(width_px=640, height_px=512, focal_px=625.0)
-        return cls(
-            length_m=3.0, frames=10, seed=1, camera=camera, yard=YardSettings(max_layers=3, bar_length_m=5.0)
+        """Create the settings of the small yard of `barsight demo`: 3 m of stack, 10 pairs of 960x768.
+
+        The bars reach beyond the example magnet and lie within the pictures.
+        """
+        camera = CameraSettings(
+            width_px=960, height_px=768, focal_px=937.5, above_floor_m=8.5, trolley_y_m=0.0
         )
+        yard = YardSettings(max_layers=3, bar_length_m=5.6)
+        return cls(length_m=3.0, frames=10, seed=1, bars="60mm:19", camera=camera, yard=yard)
