@@ -76,6 +76,28 @@ def test_a_clock_that_is_set_back_a_little_settles_anew_too(back_s: float) -> No
     assert np.abs(off_s[: 20 * 30]).max() < 0.005 and np.abs(off_s[20 * 35 :]).max() < 0.005
 
 
+@pytest.mark.parametrize(("rate_hz", "back_s"), [(5, 0.6), (10, 0.3), (200, 0.02)])
+def test_no_stamp_is_wrong_once_a_clock_was_set_back_by_over_two_intervals(
+    rate_hz: int, back_s: float
+) -> None:
+    clock, newest_ns, off_ns = DeviceClock(), 0, []
+    for k in range(6 * rate_hz):
+        true_ns = k * SECOND // rate_hz
+        device_ns = true_ns + 50 * SECOND - (round(back_s * SECOND) if k > 3 * rate_hz else 0)
+        if clock.add(device_ns, true_ns + 1_000_000) and clock.host_ns(device_ns) > newest_ns:
+            newest_ns = clock.host_ns(device_ns)
+            off_ns.append(newest_ns - true_ns)
+    assert clock.jumps == 1 and max(map(abs, off_ns)) < 2_000_000
+    assert newest_ns > 5.7 * SECOND and len(off_ns) > 3.4 * rate_hz
+
+
+def test_a_stamp_that_was_overtaken_or_comes_again_is_no_jump() -> None:
+    clock = DeviceClock()
+    for k, tick in enumerate([*range(400), 401, 400, 402, 404, 403, 405, 405, 405, 405, 406]):
+        clock.add(tick * SECOND // 200, k * SECOND // 200)
+    assert clock.jumps == 0 and clock.is_settled
+
+
 def test_pairs_need_stamp_and_trigger_to_agree() -> None:
     """cam1 counts two ahead; one number is wrong; later cam0 counts anew."""
     former, paired = PairFormer(2), []

@@ -25,6 +25,11 @@ BEHIND_NS = 3 * NS_PER_S
 """A clock has also jumped if all stamps arrive `EARLY_NS` late for this long (ns): no host is busy that
 long.
 """
+OLDER_COUNT = 2
+"""A clock has also jumped if this many successive stamps are older than the newest: one alone may be late.
+`Sequence` leaves out readings that were overtaken, so that more come only of a driver that doesn't keep the
+order. A false alarm costs about a second of readings, and the drift for ten.
+"""
 RECENT = 300
 
 
@@ -47,20 +52,18 @@ class DeviceClock:
         self._origin: tuple[int, int] | None = None
         self._count, self._late, self._bucket = 0, 0, -1
         self._behind, self._behind_ns = 0, 0
+        self._newest_ns, self._older = 0, 0
         self._offset_ns, self._drift = 0.0, 0.0
 
     def add(self, device_ns: int, arrival_ns: int) -> bool:
         """Add a stamp and its arrival time (monotonic); return whether the clock is settled."""
-        if self._origin is not None and self.is_settled:
-            delay = arrival_ns - self.host_ns(device_ns)
-            self._late = self._late + 1 if delay > LATE_NS else 0
-            if delay < -EARLY_NS or self._late >= LATE_COUNT or self._is_behind(delay, arrival_ns):
-                self.jumps += 1
-                self._begin()
-            elif self._late:
-                return True
+        if self._origin is not None and self._has_jumped(device_ns, arrival_ns):
+            self.jumps += 1
+            self._begin()
+        elif self._late:
+            return True
         if self._origin is None:
-            self._origin = device_ns, arrival_ns - device_ns
+            self._origin, self._newest_ns = (device_ns, arrival_ns - device_ns), device_ns
         since, apart = device_ns - self._origin[0], arrival_ns - device_ns - self._origin[1]
         self._count += 1
         bucket = since // BUCKET_NS
@@ -75,6 +78,16 @@ class DeviceClock:
         self._fit()
         self._delays.append(arrival_ns - self.host_ns(device_ns))
         return self.is_settled
+
+    def _has_jumped(self, device_ns: int, arrival_ns: int) -> bool:
+        """Add a stamp; return whether the clock has jumped since the stamps before."""
+        self._older = self._older + 1 if device_ns < self._newest_ns else 0
+        self._newest_ns = max(self._newest_ns, device_ns)
+        if self._older >= OLDER_COUNT or not self.is_settled:
+            return self._older >= OLDER_COUNT
+        delay = arrival_ns - self.host_ns(device_ns)
+        self._late = self._late + 1 if delay > LATE_NS else 0
+        return delay < -EARLY_NS or self._late >= LATE_COUNT or self._is_behind(delay, arrival_ns)
 
     def _is_behind(self, delay_ns: int, arrival_ns: int) -> bool:
         """Add a stamp's delay; return whether all recent stamps were late."""
