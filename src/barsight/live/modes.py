@@ -100,14 +100,14 @@ def judge_mode(
 
 def _silent_cameras(heard: SensorActivity, now_ns: int, settings: LiveSettings) -> list[str]:
     """List the cameras that have provided no picture for too long."""
-    told = []
+    silences = []
     bound_s = max(MIN_CAMERA_SILENCE_S, settings.camera_silence_intervals * heard.interval_ns / NS_PER_S)
     for camera, last_ns in enumerate(heard.cameras_ns):
         if not last_ns:
-            told.append(f"cam{camera}: no picture yet")
+            silences.append(f"cam{camera}: no picture yet")
         elif now_ns - last_ns > seconds_to_ns(bound_s):
-            told.append(_silence(f"cam{camera}", now_ns - last_ns, bound_s))
-    return told
+            silences.append(_silence(f"cam{camera}", now_ns - last_ns, bound_s))
+    return silences
 
 
 def _silent_sensor(sensor: str, name: str, heard: SensorActivity, now_ns: int, bound_s: float) -> str | None:
@@ -164,8 +164,8 @@ class JumpWatch:
         away = float(np.linalg.norm(self._off_m))
         if away > self._bound_m:
             return away
-        held = self._jump_ns and self._last_ns - self._jump_ns < seconds_to_ns(JUMP_HELD_S)
-        return float(np.linalg.norm(self._jump_m)) if held else 0.0
+        is_recent = self._jump_ns and self._last_ns - self._jump_ns < seconds_to_ns(JUMP_HELD_S)
+        return float(np.linalg.norm(self._jump_m)) if is_recent else 0.0
 
     def begin_anew(self) -> None:
         """Discard the readings so far and those of the next moment, as they are frozen."""
@@ -210,8 +210,8 @@ class EncoderFaults:
         steps = 1 + np.flatnonzero(np.diff(stamps // LOOK_NS))
         begin = 0
         for end in (*steps[steps > len(stamps) - len(stamp_ns)].tolist(), len(stamps)):
-            held = int(np.searchsorted(stamps, stamps[end - 1] - HELD_NS))
-            begin = max(min(held, end - HELD_READINGS), 0)
+            oldest = int(np.searchsorted(stamps, stamps[end - 1] - HELD_NS))
+            begin = max(min(oldest, end - HELD_READINGS), 0)
             now = stamps[begin:end], places[begin:end]
             self._frozen, self._jumped_m = self._freeze.check(*now), self._jump.check(*now)
             if self._frozen:

@@ -103,8 +103,8 @@ class PoseOutput:
             return False
         self._state_ns = int(stamps[0])
         self._state = NavigationState.of(self._state_ns, rows[0])
-        for held in (self._imu, self._crane):
-            held.grow()
+        for buffer in (self._imu, self._crane):
+            buffer.grow()
         if self._mounted is not None:
             about_ns = self._state_ns - seconds_to_ns(REFERENCE_S)
             self._jump = JumpWatch(self._mounted.position_std_m, about_ns)
@@ -113,8 +113,8 @@ class PoseOutput:
 
     def _begin(self) -> None:
         """Start from the last state, with the encoders if they can be trusted now."""
-        for held in (self._imu, self._crane):
-            held.taken_ns = self._state_ns
+        for buffer in (self._imu, self._crane):
+            buffer.taken_ns = self._state_ns
         has_imu, known = "imu" in self._sensors, self._trusted_encoders()
         self._has_encoders = known is not None
         self._propagator = Propagator(self._state, self._noise, known, has_imu=has_imu)
@@ -123,12 +123,12 @@ class PoseOutput:
         """Return the encoder readings held; None if none are in use, or they are frozen, or they have jumped
         since the last state or around it.
         """
-        held = self._crane.since(0)
-        if self._freeze is None or self._freeze.check(*held):
+        readings = self._crane.since(0)
+        if self._freeze is None or self._freeze.check(*readings):
             return None
-        if self._jump is None or self._jump.check(*held):
+        if self._jump is None or self._jump.check(*readings):
             return None
-        return self._placed(*held)
+        return self._placed(*readings)
 
     def _await(self, stamp_ns: int, give_up_ns: int) -> None:
         """Wait a limited time for the IMU reading at a stamp."""
@@ -142,8 +142,8 @@ class PoseOutput:
         """Pass the propagator each sensor's readings since the last call, up to a stamp."""
         assert self._propagator is not None
         imu, crane = (
-            held.take(stamp_ns) if name in self._sensors else held.since(0, 0)
-            for name, held in (("imu", self._imu), ("crane", self._crane))
+            buffer.take(stamp_ns) if name in self._sensors else buffer.since(0, 0)
+            for name, buffer in (("imu", self._imu), ("crane", self._crane))
         )
         places = self._placed(*crane)
         self._propagator.take(*imu, crane[0], np.empty((0, 3)) if places is None else places.position_m)

@@ -215,8 +215,8 @@ def _stopped_by_signals(supervisor: Supervisor) -> contextlib.AbstractContextMan
     """Let Ctrl-C and SIGTERM end the run, so that the pairs kept are measured; a second one ends that as
     well. SIGUSR1 ends the survey.
     """
-    told = {signal.SIGINT: INTERRUPTED, signal.SIGTERM: INTERRUPTED, signal.SIGUSR1: "told to end the survey"}
-    return handled_signals(told, supervisor.stop)
+    ends = {signal.SIGINT: INTERRUPTED, signal.SIGTERM: INTERRUPTED, signal.SIGUSR1: "told to end the survey"}
+    return handled_signals(ends, supervisor.stop)
 
 
 @contextlib.contextmanager

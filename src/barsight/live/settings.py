@@ -138,14 +138,14 @@ class CraneConfig:
     def rig(self) -> StereoRig:
         """Read the calibration, and check by the serial numbers that it belongs to these cameras."""
         rig = read_rig_file(self.calibration)
-        calibrated, here = read_serials(self.calibration), self.cameras.serials
-        if None not in calibrated and calibrated == here[::-1]:
+        calibrated, configured = read_serials(self.calibration), self.cameras.serials
+        if None not in calibrated and calibrated == configured[::-1]:
             raise CalibrationError(
                 self.calibration,
                 f"cam0 is {calibrated[0]} and cam1 {calibrated[1]}: crane.toml exchanges them",
                 "exchange the two in cameras.serials, or the cameras' places",
             )  # fmt: skip
-        for number, (one, other) in enumerate(zip(calibrated, here, strict=True)):
+        for number, (one, other) in enumerate(zip(calibrated, configured, strict=True)):
             if one is not None and one != other:
                 raise CalibrationError(
                     self.calibration,

@@ -212,11 +212,11 @@ class Supervisor:
     def _why(self, role: str) -> str:
         if role in self._hung:
             return self._hung.pop(role)
-        code, told = self._running[role].exitcode or 0, self._link.folder / f"{role}.reason"
+        code, reason = self._running[role].exitcode or 0, self._link.folder / f"{role}.reason"
         if code < 0:
             return f"was ended by {signal.Signals(-code).name}"
-        if told.is_file():
-            return f"ended by {' '.join(told.read_text(encoding='utf-8').split())}"
+        if reason.is_file():
+            return f"ended by {' '.join(reason.read_text(encoding='utf-8').split())}"
         return f"ended with code {code}"
 
     def _judge(self) -> None:
@@ -256,10 +256,10 @@ class Supervisor:
 
     def _watch_sensors(self) -> None:
         """Log changes in the counters of the recorder and of the sensors' clocks."""
-        for key, told in SIGNS.items():
+        for key, text in SIGNS.items():
             value = self._board[key]
             if value != self._signs.get(key, 0):
-                self._log(told.format(value))
+                self._log(text.format(value))
             self._signs[key] = value
 
     def _heard(self) -> SensorActivity:

@@ -86,20 +86,20 @@ def _shared_memory(crane: CraneConfig) -> Finding:
 
 def _disk(name: str, folder: Path, crane: CraneConfig, *, is_run: bool) -> Iterator[Finding]:
     """Check free space and write speed for a run's pairs, or for its recording alone."""
-    there = next(path for path in (folder, *folder.parents) if path.is_dir())
+    existing = next(path for path in (folder, *folder.parents) if path.is_dir())
     camera = crane.rig().cam0
     kept = camera.width * camera.height * (KEYFRAME_BYTES_PER_PIXEL if is_run else 2)
     way_m = crane.live.keyframe_way_m or TRAVEL_MPS / crane.cameras.rate_hz  # 0: each pair is a keyframe
-    free, needed = shutil.disk_usage(there).free, kept * SURVEY_M / way_m
+    free, needed = shutil.disk_usage(existing).free, kept * SURVEY_M / way_m
     remedy = "free some, or name a folder on a larger disk"
     yield Finding(
-        f"disk for {name} ({there})", f"{free / 2**30:.1f} GiB free",
+        f"disk for {name} ({existing})", f"{free / 2**30:.1f} GiB free",
         f"{needed / 2**30:.1f} GiB for {SURVEY_M:g} m", remedy, free >= needed,
     )  # fmt: skip
     rate = kept * min(TRAVEL_MPS / way_m, crane.cameras.rate_hz) / 2**20
     needed_text = f"{rate:.0f} MiB/s at {TRAVEL_MPS:g} m/s"
     try:
-        speed = write_speed_mib(there)
+        speed = write_speed_mib(existing)
     except OSError as error:
         yield Finding(f"writing {name}", error.strerror or str(error), needed_text, "make it writable", False)
         return
@@ -135,9 +135,9 @@ def _network(crane: CraneConfig) -> Iterator[Finding]:
     named, camera = crane.cameras.interface, crane.rig().cam0
     name = interface_of(named)
     if name is None or not (Path("/sys/class/net") / name).is_dir():
-        told = "none is named" if named is None else f"{named} isn't there"
+        found = "none is named" if named is None else f"{named} isn't there"
         is_missing = None if named is None else False
-        yield Finding("interface to the cameras", told, "one", "name it in cameras.interface", is_missing)
+        yield Finding("interface to the cameras", found, "one", "name it in cameras.interface", is_missing)
     else:
         yield from _interface(name, crane)
     limit, needed = _number(Path("/proc/sys/net/core/rmem_max")), 2 * camera.width * camera.height
@@ -194,9 +194,9 @@ def _sensors(crane: CraneConfig) -> Iterator[Finding]:
     """Check both cameras, then IMU and encoders."""
     awaited = crane.described(Path("recording"))
     size = awaited.rig.cam0.width, awaited.rig.cam0.height
-    told = f"{' and '.join(crane.cameras.serials)}, {size[0]}x{size[1]}, Mono8"
+    cameras = f"{' and '.join(crane.cameras.serials)}, {size[0]}x{size[1]}, Mono8"
     ptp: list[str] = []
-    yield _proved("cameras", told, lambda: ptp.extend(prove_cameras(crane.cameras, size)))
+    yield _proved("cameras", cameras, lambda: ptp.extend(prove_cameras(crane.cameras, size)))
     if ptp:
         yield _ptp(ptp)
     for name, sensor in crane.sensors().items():
@@ -212,11 +212,11 @@ def _sensors(crane: CraneConfig) -> Iterator[Finding]:
         yield _proved("readings", "those of a crane, in SI units", lambda: expect_plausible(awaited))
 
 
-def _ptp(told: list[str]) -> Finding:
+def _ptp(states: list[str]) -> Finding:
     """Report whether the cameras' clocks are synchronised by PTP."""
-    is_one = are_one_clock(told)
+    is_one = are_one_clock(states)
     return Finding(
-        "PTP of the cameras", " and ".join(one or "none told" for one in told),
+        "PTP of the cameras", " and ".join(one or "none told" for one in states),
         "none, offset and drift are estimated from the stamps; Slave and Slave: one clock",
         "" if is_one else "to have one clock, enable PTP in both cameras and give their network one master",
         is_one or None,
@@ -244,12 +244,12 @@ class _TimeX(ctypes.Structure):
 
 def _clock() -> Finding:
     """Check whether the system clock is synchronised, for example by chrony or ptp4l."""
-    told, needed = _TimeX(), "kept by chrony, ntpd or ptp4l"
+    timex, needed = _TimeX(), "kept by chrony, ntpd or ptp4l"
     remedy = "install chrony: other computers judge the age of lifts by their own clocks"
     try:
-        state = ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.byref(told))
+        state = ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.byref(timex))
     except (OSError, AttributeError):
         return Finding("clock", "not told", needed, remedy, None)
-    is_kept = state >= 0 and not told.status & UNSYNCHRONISED
-    found = f"kept, within {told.maxerror / 1e3:.1f} ms" if is_kept else "free"
+    is_kept = state >= 0 and not timex.status & UNSYNCHRONISED
+    found = f"kept, within {timex.maxerror / 1e3:.1f} ms" if is_kept else "free"
     return Finding("clock", found, needed, remedy, is_kept or None)

@@ -79,10 +79,10 @@ def _listen(name: str, sensor: ReadingsSettings) -> list[RawReading]:
                 return found
     finally:
         receiver.close()
-    told = f", and {receiver.torn} of another form" if receiver.torn else ""
-    told += f" ({receiver.trouble})" if receiver.trouble else ""
+    remark = f", and {receiver.torn} of another form" if receiver.torn else ""
+    remark += f" ({receiver.trouble})" if receiver.trouble else ""
     means = "the port and the firewall" if sensor.device is None else "the cable, the baud and the rights"
     raise InputError(
-        name, f"{len(found)} readings came to {sensor.way} within {LISTEN_S:g} s{told}",
+        name, f"{len(found)} readings came to {sensor.way} within {LISTEN_S:g} s{remark}",
         f"check the sender and its form (docs/how-to/run-a-crane.md), {means}",
     )  # fmt: skip

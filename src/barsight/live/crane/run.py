@@ -74,10 +74,10 @@ def measure_surveys(
     request = LiftRequest(None if magnet is None else load_magnet(magnet))
     proved, ended, is_first = False, "", True
     while ended != INTERRUPTED:
-        here = out / datetime.now(UTC).strftime(STAMP)
-        recording = _recorded(crane, here, here.name)
+        folder = out / datetime.now(UTC).strftime(STAMP)
+        recording = _recorded(crane, folder, folder.name)
         try:
-            run = _begin(crane, here, recording, settings, live, tell, surveys=True, proved=proved)
+            run = _begin(crane, folder, recording, settings, live, tell, surveys=True, proved=proved)
         except BarsightError as error:
             if is_first:
                 raise
@@ -85,21 +85,21 @@ def measure_surveys(
             time.sleep(AGAIN_S)
             continue
         is_first, proved = False, True
-        _point(out / RUNNING, here.name)
+        _point(out / RUNNING, folder.name)
         try:
             run.measure(None, request, advance)
             ended = run.stop_because
             if ended == STOOD:
-                _drop_standing(here, recording)
+                _drop_standing(folder, recording)
             else:
-                _point(out / LATEST, here.name)
-                tell(f"{here.name} is measured")
+                _point(out / LATEST, folder.name)
+                tell(f"{folder.name} is measured")
                 if why := note_drift(open_recording(recording, settings.recording), out / DRIFT_FILE):
-                    tell(f"{here.name} says nothing of the calibration: {why}")
+                    tell(f"{folder.name} says nothing of the calibration: {why}")
         except BarsightError as error:
             ended, proved = run.stop_because, False
-            tell(f"{here.name} offers no lifts: {error}")
-        _keep(out, crane.survey.keep, here.name)
+            tell(f"{folder.name} offers no lifts: {error}")
+        _keep(out, crane.survey.keep, folder.name)
     return {}
 
 
@@ -116,21 +116,21 @@ def replay_surveys(
     request = LiftRequest(None if magnet is None else load_magnet(magnet), judged_at)
     ended, is_first = "", True
     while ended != INTERRUPTED:
-        here = out / datetime.now(UTC).strftime(STAMP)
-        run = begin_replay(path, here, settings, live, speed, tell)
-        with translated_os_errors(here):
-            here.mkdir(parents=True, exist_ok=True)
-        _point(out / RUNNING, here.name)
+        folder = out / datetime.now(UTC).strftime(STAMP)
+        run = begin_replay(path, folder, settings, live, speed, tell)
+        with translated_os_errors(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+        _point(out / RUNNING, folder.name)
         try:
             run.measure(None, request, advance)
-            _point(out / LATEST, here.name)
-            tell(f"{here.name} is measured")
+            _point(out / LATEST, folder.name)
+            tell(f"{folder.name} is measured")
         except BarsightError as error:
             if is_first:
                 raise
-            tell(f"{here.name} offers no lifts: {error}")
+            tell(f"{folder.name} offers no lifts: {error}")
         ended, is_first = run.stop_because, False
-        _keep(out, REPLAYS_KEPT, here.name)
+        _keep(out, REPLAYS_KEPT, folder.name)
     return {}
 
 
@@ -157,10 +157,10 @@ def _recorded(crane: CraneConfig, out: Path, name: str) -> Path:
     return out.absolute() / "recording" if where is None else where / name
 
 
-def _drop_standing(here: Path, recording: Path) -> None:
+def _drop_standing(folder: Path, recording: Path) -> None:
     """Remove the folders of a run in which the crane only stood, except pictures around alarms."""
     if not any((recording / "alarms").glob(PATTERN)):
-        for path in (recording, here):
+        for path in (recording, folder):
             shutil.rmtree(path, ignore_errors=True)
 
 

@@ -60,18 +60,18 @@ class RandomKills:
         self._due_s = self._watch.seconds + float(self._rng.uniform(*PAUSE_S))
 
     def _kill(self, role: str, before: dict[str, Any]) -> None:
-        one, survey = self.killed.setdefault(role, Killed()), self._watch.survey
+        killed, survey = self.killed.setdefault(role, Killed()), self._watch.survey
         pid, restarts = before["processes"][role]["pid"], before["processes"][role]["restarts"]
         if not self._watch.owns(pid):
             return
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
         began, told_s, revoked_s = time.monotonic(), None, None
-        one.times += 1
+        killed.times += 1
         while (now_s := time.monotonic() - began) < GIVE_UP_S:
             state = self._watch.state()
             if self._watch.survey != survey or (state is not None and state["phase"] != "measuring"):
-                one.over += 1
+                killed.over += 1
                 break
             if state is not None:
                 if told_s is None and state["processes"][role]["restarts"] > restarts:
@@ -79,15 +79,15 @@ class RandomKills:
                 if revoked_s is None and not state["lifts"]["may_stand"]:
                     revoked_s = now_s
                 if told_s is not None and _is_well(state):
-                    one.back_s.append(now_s)
-                    one.not_revoked += revoked_s is None and role not in WITHOUT_LIFTS
+                    killed.back_s.append(now_s)
+                    killed.not_revoked += revoked_s is None and role not in WITHOUT_LIFTS
                     break
             self._rest(LOOK_S)
         else:
-            one.not_told += told_s is None
-            one.not_back += 1
-        one.told_s += [] if told_s is None else [told_s]
-        one.revoked_s += [] if revoked_s is None or role in WITHOUT_LIFTS else [revoked_s]
+            killed.not_told += told_s is None
+            killed.not_back += 1
+        killed.told_s += [] if told_s is None else [told_s]
+        killed.revoked_s += [] if revoked_s is None or role in WITHOUT_LIFTS else [revoked_s]
 
 
 def _is_well(state: dict[str, Any]) -> bool:

@@ -67,21 +67,21 @@ def soak_content(
     return content
 
 
-def _figures(role: str, one: Watched, watch: RunWatch, warm_s: float) -> dict[str, Any]:
-    memory = one.rss_mib.trend(warm_s, watch.survey_s, of_peaks=role not in LASTING)
+def _figures(role: str, usage: Watched, watch: RunWatch, warm_s: float) -> dict[str, Any]:
+    memory = usage.rss_mib.trend(warm_s, watch.survey_s, of_peaks=role not in LASTING)
     # Between two surveys the command briefly has fewer; a sample may happen to fall there.
-    descriptors = one.descriptors.trend(warm_s, watch.survey_s, of_peaks=True)
+    descriptors = usage.descriptors.trend(warm_s, watch.survey_s, of_peaks=True)
     return {
-        "memory_mib": {"first": one.rss_mib.first, "last": one.rss_mib.last, "max": one.rss_mib.peak},
+        "memory_mib": {"first": usage.rss_mib.first, "last": usage.rss_mib.last, "max": usage.rss_mib.peak},
         "slope_mib_per_h": None if memory is None else memory.per_h,
         "slope_sigma_mib_per_h": None if memory is None else memory.sigma_per_h,
         "descriptors": {
-            "first": one.descriptors.first, "last": one.descriptors.last, "max": one.descriptors.peak,
+            "first": usage.descriptors.first, "last": usage.descriptors.last, "max": usage.descriptors.peak,
             "more_since_warm_up": None if descriptors is None else _growth(descriptors),
         },
-        "begun": one.new + 1,
+        "begun": usage.new + 1,
         "restarts": watch.restarts.get(role, 0),
-        "cores": one.cpu_s / max(watch.seconds, 1e-9),
+        "cores": usage.cpu_s / max(watch.seconds, 1e-9),
     }  # fmt: skip
 
 
@@ -89,11 +89,11 @@ def _growth(trend: Trend) -> int:
     return round(trend.last - trend.first)
 
 
-def _times(one: Killed) -> dict[str, Any]:
+def _times(kill: Killed) -> dict[str, Any]:
     return {
-        "times": one.times, "survey_ended": one.over,
-        "told_s": _spread(one.told_s), "revoked_s": _spread(one.revoked_s), "back_s": _spread(one.back_s),
-        "not_told": one.not_told, "not_revoked": one.not_revoked, "not_back": one.not_back,
+        "times": kill.times, "survey_ended": kill.over,
+        "told_s": _spread(kill.told_s), "revoked_s": _spread(kill.revoked_s), "back_s": _spread(kill.back_s),
+        "not_told": kill.not_told, "not_revoked": kill.not_revoked, "not_back": kill.not_back,
     }  # fmt: skip
 
 
@@ -107,32 +107,32 @@ def _broken(content: dict[str, Any], bounds: SoakBounds) -> Iterator[tuple[bool,
     """List what exceeds the bounds (True), or can't be judged yet (False)."""
     if not content["processes"]:
         yield False, "no process was seen"
-    for role, one in content["processes"].items():
-        slope, sigma = one["slope_mib_per_h"], one["slope_sigma_mib_per_h"]
+    for role, figures in content["processes"].items():
+        slope, sigma = figures["slope_mib_per_h"], figures["slope_sigma_mib_per_h"]
         bound, kills = bounds.slope_mib_per_h, content["faults"].get(role, {"times": 0})["times"]
         if slope is None:
             yield False, f"{role}: too short to tell whether its memory grows"
         elif slope + 2 * sigma > bound:
             grows = f"{role}: memory grows by {slope:.2f} MiB/h, sigma {sigma:.2f} (bound {bound:g})"
             yield slope - 2 * sigma > bound, grows
-        more = one["descriptors"]["more_since_warm_up"]
+        more = figures["descriptors"]["more_since_warm_up"]
         if more is not None and more > bounds.descriptors:
             yield True, f"{role}: {more} descriptors more (bound {bounds.descriptors})"
-        if role in LASTING and one["begun"] > 1:
-            yield True, f"{role}: begun anew {one['begun'] - 1} times"
-        if one["restarts"] > kills:
-            yield True, f"{role}: restarted {one['restarts']} times, killed {kills} times"
+        if role in LASTING and figures["begun"] > 1:
+            yield True, f"{role}: begun anew {figures['begun'] - 1} times"
+        if figures["restarts"] > kills:
+            yield True, f"{role}: restarted {figures['restarts']} times, killed {kills} times"
     peak = content["total_mib"]["max"]
     if peak > bounds.total_mib:
         yield True, f"all together: {peak:.0f} MiB (bound {bounds.total_mib:g})"
     if failed := content["surveys"]["failed"]:
         yield True, f"{failed} surveys failed"
-    for role, one in content["faults"].items():
+    for role, figures in content["faults"].items():
         for name, bound, missed in (
-            ("told", bounds.told_s, one["not_told"]), ("revoked", bounds.told_s, one["not_revoked"]),
-            ("back", bounds.back_s, one["not_back"]),
+            ("told", bounds.told_s, figures["not_told"]), ("revoked", bounds.told_s, figures["not_revoked"]),
+            ("back", bounds.back_s, figures["not_back"]),
         ):  # fmt: skip
-            longest_s = one[f"{name}_s"]["max"]
+            longest_s = figures[f"{name}_s"]["max"]
             if missed:
                 yield True, f"{role} killed: {missed} times never {name}"
             elif longest_s is not None and longest_s > bound:
@@ -184,9 +184,9 @@ def soak_table(content: dict[str, Any]) -> str:
         counts = [str(one[name]) for name in ("not_told", "not_revoked", "not_back")]
         cells = [role, str(one["times"]), str(one["survey_ended"]), *spreads, *counts]
         lines.append(f"| {' | '.join(cells)} |")
-    for name, told in (("broken", "Broken"), (UNSURE, "Not sure yet")):
+    for name, title in (("broken", "Broken"), (UNSURE, "Not sure yet")):
         if content[name]:
-            lines += ["", f"{told}:", "", *(f"- {text}" for text in content[name])]
+            lines += ["", f"{title}:", "", *(f"- {text}" for text in content[name])]
     if not content["broken"] and not content[UNSURE]:
         lines += ["", "All bounds hold."]
     return "\n".join(lines) + "\n"

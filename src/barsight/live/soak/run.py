@@ -107,11 +107,11 @@ def _soak(
 ) -> dict[str, Any]:  # fmt: skip
     """Sample, kill and write until the end."""
     sample_at = write_at = 0.0
-    told: list[str] = []
+    reasons: list[str] = []
 
     def rest(seconds: float) -> None:
         nonlocal sample_at
-        if told:
+        if reasons:
             raise _ToldError
         if watch.seconds >= sample_at:
             sample_at = watch.seconds + SAMPLE_S
@@ -127,7 +127,7 @@ def _soak(
 
     # Ctrl-C and SIGTERM end the soak test like its time limit, so that everything is written.
     ends = dict.fromkeys((signal.SIGINT, signal.SIGTERM), INTERRUPTED)
-    with handled_signals(ends, told.append), contextlib.suppress(_ToldError):
+    with handled_signals(ends, reasons.append), contextlib.suppress(_ToldError):
         tell(f"soaking; {out / 'soak.md'} has the table, each minute anew; Ctrl-C ends it")
         while watch.seconds < plan.hours * S_PER_H and is_there():
             rest(POLL_S)

@@ -63,12 +63,12 @@ class RunWatch:
 
     def state(self) -> dict[str, Any] | None:
         """Read the run's state.json and count what has ended since the last call; None if there is no run."""
-        here = running_folder(self._folder).resolve()
-        if here != self._here:
+        folder = running_folder(self._folder).resolve()
+        if folder != self._here:
             if self._here is not None:
                 self._take(_read_state(self._here))
-            self._here, self._ended, self._state = here, False, {}
-        state = _read_state(here)
+            self._here, self._ended, self._state = folder, False, {}
+        state = _read_state(folder)
         self._take(state)
         return state
 
@@ -77,8 +77,8 @@ class RunWatch:
         if state is None:
             return
         before = self._state.get("processes", {})
-        for role, one in state["processes"].items():
-            more = one["restarts"] - before.get(role, {}).get("restarts", 0)
+        for role, process in state["processes"].items():
+            more = process["restarts"] - before.get(role, {}).get("restarts", 0)
             self.restarts[role] = self.restarts.get(role, 0) + max(more, 0)
         if state["phase"] in self.surveys and not self._ended:
             self._ended = True
@@ -109,24 +109,24 @@ class RunWatch:
         """Record the current usage of each process; return whether the run exists."""
         state = self.state()
         roles = {} if state is None else {one["pid"]: role for role, one in state["processes"].items()}
-        there = {} if self._command is None else family(self._command, roles)
-        if not there and state is not None:
+        running = {} if self._command is None else family(self._command, roles)
+        if not running and state is not None:
             # The process id may have been reused; the run's own process has a fork server.
-            told = family(state.get("pid", 0), roles)
-            there = told if SERVER in told.values() else {}
-            self._command = state["pid"] if there else None
-        if not there:
+            named = family(state.get("pid", 0), roles)
+            running = named if SERVER in named.values() else {}
+            self._command = state["pid"] if running else None
+        if not running:
             self._command = None
             return False
         at_s, total = self.seconds, 0.0
-        for pid, role in there.items():
+        for pid, role in running.items():
             used = read_usage(pid)
             if used is None:
                 continue
             total += used.pss_mib
             if role:
-                one = self.processes.setdefault(role, Watched())
-                one.add(at_s, pid, used.rss_mib, used.descriptors, used.cpu_s)
+                watched = self.processes.setdefault(role, Watched())
+                watched.add(at_s, pid, used.rss_mib, used.descriptors, used.cpu_s)
         self.total_mib.add(at_s, total)
         return True
 
