@@ -88,11 +88,11 @@ class StateFeed:
         known, crane = self._plc, self._settings.crane
         if known is None or time.monotonic() - known[0] > PLC_SILENT_S:
             return state
-        one, pose = known[1], state.pose
+        plc, pose = known[1], state.pose
         if pose is None and crane is not None and self._settings.live is None:
             sigma_m = (crane.position_std_m,) * 3
-            pose = CranePose(one.bridge_m, one.trolley_m, one.hoist_m, None, sigma_m, one.stamp_ns)
-        return replace(state, plc=one, pose=pose)
+            pose = CranePose(plc.bridge_m, plc.trolley_m, plc.hoist_m, None, sigma_m, plc.stamp_ns)
+        return replace(state, plc=plc, pose=pose)
 
     def _follow(self) -> None:
         judged_s = time.monotonic()

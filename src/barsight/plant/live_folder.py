@@ -12,19 +12,19 @@ from barsight.plant.state import PlantState
 def with_live_run(state: PlantState, folder: Path) -> PlantState:
     """Add the crane's pose, the run's mode and its survey to a state; without a run the state is invalid."""
     folder = running_folder(folder)
-    told = read_live_state(folder)
-    if told is None:
+    live = read_live_state(folder)
+    if live is None:
         return _forbidden(state, f"live-stopped: {folder / 'state.json'} is not there or torn")
-    if not told.is_running:
-        silent = f"says nothing for {told.silent_s:.1f} s"
-        if told.silent_s < 0:
+    if not live.is_running:
+        silent = f"says nothing for {live.silent_s:.1f} s"
+        if live.silent_s < 0:
             silent = "last spoke ahead of this clock, which was set back"
-        return _forbidden(state, f"live-stopped: the live run {silent}, phase {told.phase}")
-    pose = read_crane_pose(folder, told.now_ns)
-    state = replace(state, mode=told.mode, survey=told.phase, pose=pose)
-    if told.may_stand:
+        return _forbidden(state, f"live-stopped: the live run {silent}, phase {live.phase}")
+    pose = read_crane_pose(folder, live.now_ns)
+    state = replace(state, mode=live.mode, survey=live.phase, pose=pose)
+    if live.may_stand:
         return state
-    return _forbidden(state, f"live-state: {told.mode}: {'; '.join(told.reasons)}")
+    return _forbidden(state, f"live-state: {live.mode}: {'; '.join(live.reasons)}")
 
 
 def _forbidden(state: PlantState, reason: str) -> PlantState:

@@ -142,8 +142,8 @@ class MqttPublisher:
         return self._state is not None and time.monotonic() - since_s > self._settings.state_every_s
 
     def _event(self) -> str:
-        told = {**self._events[0], "lost": self._unsaid}
-        return json.dumps(json_value(told), allow_nan=False)
+        event = {**self._events[0], "lost": self._unsaid}
+        return json.dumps(json_value(event), allow_nan=False)
 
     def _topic(self, name: str) -> str:
         return f"{self._settings.prefix}/{name}"

@@ -82,15 +82,15 @@ class PlcPartner:
             claim = self._steps.claim(self.name, *lift)
             return (REFUSED, 0) if isinstance(claim, Failed) else (DONE, claim.token)
         token, flags = found["token"], found["flags"]
-        told: str | int | Failed
+        answer: str | int | Failed
         if found["command"] == EXECUTING:
-            told = self._steps.executing(token, *lift)
+            answer = self._steps.executing(token, *lift)
         elif found["command"] == EXECUTED:
             load_kg = found["load"] / 10 if flags & _WEIGHED else None
             report = LiftReport(bool(flags & _REACHED), bool(flags & _SLACK), load_kg)
-            told = self._steps.executed(token, report, found["lift_id"])
+            answer = self._steps.executed(token, report, found["lift_id"])
         else:
-            told = self._steps.failed(token, f"the PLC says so, flags {flags}", found["lift_id"])
-        if isinstance(told, Failed):
-            return REFUSED, 0 if told.code in ("unknown", "checksum", "token") else token
-        return (CONTRADICTED if told == "contradicted" else DONE), token
+            answer = self._steps.failed(token, f"the PLC says so, flags {flags}", found["lift_id"])
+        if isinstance(answer, Failed):
+            return REFUSED, 0 if answer.code in ("unknown", "checksum", "token") else token
+        return (CONTRADICTED if answer == "contradicted" else DONE), token

@@ -66,14 +66,14 @@ class S7Link:
 
     def _tried(self, act: Callable[[snap7.Client], Any]) -> tuple[Any, float] | Failed:
         """Ask the PLC for something; return the answer and the time that it took."""
-        one = self._settings
+        settings = self._settings
         try:
             client = self._connected()
             began_s = time.monotonic()
             return act(client), time.monotonic() - began_s
         except (S7Error, RuntimeError, OSError, ValueError) as error:
             self.close()
-            reason = f"the PLC at {one.host}:{one.port} can't be read and written: {error}"
+            reason = f"the PLC at {settings.host}:{settings.port} can't be read and written: {error}"
             return Failed("s7-exchange", " ".join(reason.split()))
 
     def close(self) -> None:

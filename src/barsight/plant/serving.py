@@ -50,9 +50,9 @@ class TelegramServer:
             writer.close()
 
     async def _exchange(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        one = self._settings
+        settings = self._settings
         name = plc_name(writer.get_extra_info("peername")[0])  # the same after a reconnection
-        partner = PlcPartner(name, self._steps, one.silent_s)
+        partner = PlcPartner(name, self._steps, settings.silent_s)
         writer.transport.set_write_buffer_limits(high=0)  # what isn't sent at once becomes outdated
         listening = asyncio.create_task(self._listen(reader, partner))
         due_s = time.monotonic()
@@ -61,10 +61,10 @@ class TelegramServer:
                 self._counter += 1
                 sent_s = time.monotonic()
                 state = partner.seen(self._feed.newest(self._counter))
-                writer.write(pack("out", out_values(state, partner.answer), one.byte_order))
-                await asyncio.wait_for(writer.drain(), one.silent_s)
-                due_s = max(due_s + one.cycle_s, time.monotonic() - one.cycle_s)
-                wait_s = max(due_s, sent_s + MIN_GAP_RATIO * one.cycle_s) - time.monotonic()
+                writer.write(pack("out", out_values(state, partner.answer), settings.byte_order))
+                await asyncio.wait_for(writer.drain(), settings.silent_s)
+                due_s = max(due_s + settings.cycle_s, time.monotonic() - settings.cycle_s)
+                wait_s = max(due_s, sent_s + MIN_GAP_RATIO * settings.cycle_s) - time.monotonic()
                 await asyncio.wait({listening}, timeout=max(0.0, wait_s))
         except (OSError, TimeoutError):
             return

@@ -97,19 +97,19 @@ def take_named_step(steps: LiftSteps, step: str, who: str, arguments: Mapping[st
             claim = steps.claim(who, _number(arguments["lift"]))
             return claim if isinstance(claim, Failed) else str(claim.token)
         token = _number(arguments["token"])
-        told: str | int | Failed
+        answer: str | int | Failed
         if step == "executing":
-            told = steps.executing(token)
+            answer = steps.executing(token)
         elif step == "executed":
             mass_kg = arguments["mass_kg"]
             load_kg = mass_kg if mass_kg > 0 else None
             report = LiftReport(arguments["position_reached"], arguments["slack_rope"], load_kg)
-            told = steps.executed(token, report)
+            answer = steps.executed(token, report)
         else:
-            told = steps.failed(token, arguments["reason"] or "the crane says so")
+            answer = steps.failed(token, arguments["reason"] or "the crane says so")
     except (BarsightError, ValueError) as error:
         return Failed("refused", str(error))
-    return told if isinstance(told, Failed) else str(token)
+    return answer if isinstance(answer, Failed) else str(token)
 
 
 def _number(text: str) -> int:

@@ -24,7 +24,7 @@ _CODES = {"u16": "H", "u32": "I", "i32": "i", "i64": "q"}
 @cache
 def table_of(side: str) -> tuple[tuple[str, str, str], ...]:
     """Read the fields of side `out` or `in`: name, type, meaning."""
-    return tuple((name, kind, told) for name, kind, told in read_toml(TABLE)[side]["fields"])
+    return tuple((name, kind, text) for name, kind, text in read_toml(TABLE)[side]["fields"])
 
 
 def fields_at(side: str) -> list[tuple[int, str, str, str]]:

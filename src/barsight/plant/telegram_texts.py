@@ -68,7 +68,7 @@ def telegram_page() -> str:
     for side in ("out", "in"):
         lines.append(f"\n## {_ABOUT[side]}: {layout(side).size} bytes\n\n")
         lines.append("| byte | field | type | meaning |\n|---|---|---|---|\n")
-        lines += [f"| {at} | `{name}` | {kind} | {told} |\n" for at, name, kind, told in fields_at(side)]
+        lines += [f"| {at} | `{name}` | {kind} | {text} |\n" for at, name, kind, text in fields_at(side)]
     return "".join(lines)
 
 
@@ -81,7 +81,7 @@ def scl_source() -> str:
     for side in ("out", "in"):
         lines.append(f'\nTYPE "{_NAMES[side]}"\nVERSION : 0.1\n   STRUCT\n')
         lines += [
-            f'      "{name}" : {_SCL[kind]};   // {at}: {told}\n' for at, name, kind, told in fields_at(side)
+            f'      "{name}" : {_SCL[kind]};   // {at}: {text}\n' for at, name, kind, text in fields_at(side)
         ]
         lines.append("   END_STRUCT;\nEND_TYPE\n")
     for side in ("out", "in"):
@@ -89,7 +89,7 @@ def scl_source() -> str:
             f"\nDATA_BLOCK \"{_NAMES[side]}DB\"\n{{ S7_Optimized_Access := 'FALSE' }}\nVERSION : 0.1\n"
             f'   STRUCT\n      telegram : "{_NAMES[side]}";\n   END_STRUCT;\nBEGIN\nEND_DATA_BLOCK\n'
         )
-    magic = {name: told for name, _, told in table_of("out")}["magic"]
+    magic = {name: text for name, _, text in table_of("out")}["magic"]
     judge = (
         _JUDGE.replace("{magic}", f"16#{magic.removeprefix('0x')}")
         .replace("{version}", str(VERSION))

@@ -14,19 +14,19 @@ def changes_between(old: PlantState | None, new: PlantState) -> list[dict[str, A
     """List the events: `validity`, `survey`, `lift`, `alarm-raised`, `alarm-ended`. old: None at first."""
     if old is None:
         return []
-    told: list[dict[str, Any]] = []
+    events: list[dict[str, Any]] = []
     if old.is_valid != new.is_valid:
-        told.append({"event": "validity", "is_valid": new.is_valid, "reasons": list(new.reasons)})
+        events.append({"event": "validity", "is_valid": new.is_valid, "reasons": list(new.reasons)})
     if new.map_id is not None and old.map_id != new.map_id:
-        told.append({"event": "survey", "map_id": new.map_id})
+        events.append({"event": "survey", "map_id": new.map_id})
     before, after = _lift(old), _lift(new)
     if before != after:
-        told.append({"event": "lift", "was": before, "is": after})
+        events.append({"event": "lift", "was": before, "is": after})
     for alarm in (Counter(_alarms(new)) - Counter(_alarms(old))).elements():
         text = {"code": alarm.code, "text": alarm.text, "priority": alarm.priority}
-        told.append({"event": "alarm-raised", **text})
-    told += [{"event": "alarm-ended", "code": one.code, "text": one.text} for one in _ended(old, new)]
-    return [{**one, "stamp_ns": new.stamp_ns} for one in told]
+        events.append({"event": "alarm-raised", **text})
+    events += [{"event": "alarm-ended", "code": one.code, "text": one.text} for one in _ended(old, new)]
+    return [{**one, "stamp_ns": new.stamp_ns} for one in events]
 
 
 def _alarms(state: PlantState) -> list[PlantAlarm]:

@@ -63,11 +63,11 @@ def write_protocol(path: Path, config: Path, checks: tuple[LinkCheck, ...]) -> N
         f"computer: {platform.node()}", f"software: barsight {barsight.__version__}",
         f"configuration: {config.name}, SHA-256 {file_digest(config)}",
     ]  # fmt: skip
-    for one in checks:
+    for check in checks:
         lines += [
             "",
-            f"{one.link}: {'holds' if one.is_good else 'DOES NOT HOLD'}",
-            *(f"  {line}" for line in one.lines),
+            f"{check.link}: {'holds' if check.is_good else 'DOES NOT HOLD'}",
+            *(f"  {line}" for line in check.lines),
         ]
     with atomic_path(path) as made:
         made.write_text("\n".join(lines) + "\n", encoding="utf-8")

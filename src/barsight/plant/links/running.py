@@ -75,29 +75,29 @@ async def _followed(feed: StateFeed) -> AsyncIterator[tuple[PlantState, list[dic
         await asyncio.sleep(READ_EVERY_S)
 
 
-async def _serve_webhooks(one: WebhookSettings, feed: StateFeed, say: Say) -> None:
-    hooks = [Webhook(url, one) for url in one.urls]
-    told = {hook.url: "" for hook in hooks}
+async def _serve_webhooks(settings: WebhookSettings, feed: StateFeed, say: Say) -> None:
+    hooks = [Webhook(url, settings) for url in settings.urls]
+    reported = {hook.url: "" for hook in hooks}
     try:
         async for _, changes in _followed(feed):
             for hook in hooks:
                 for change in changes:
                     hook.tell(change)
                 now = hook.problem or "takes posts"
-                if now != told[hook.url]:
+                if now != reported[hook.url]:
                     say(f"webhook {hook.url}: {now}")
-                told[hook.url] = now
+                reported[hook.url] = now
     finally:
         for hook in hooks:
             await asyncio.to_thread(hook.stop)
 
 
-async def _serve_mqtt(one: MqttSettings, feed: StateFeed, say: Say) -> None:
+async def _serve_mqtt(settings: MqttSettings, feed: StateFeed, say: Say) -> None:
     from barsight.plant.mqtt import MqttPublisher  # needs an extra; the other links don't
 
-    publisher = MqttPublisher(one)
+    publisher = MqttPublisher(settings)
     running = asyncio.create_task(publisher.run())
-    say(f"MQTT to {one.host}:{one.port}, topics {one.prefix}/...")
+    say(f"MQTT to {settings.host}:{settings.port}, topics {settings.prefix}/...")
     try:
         async for state, changes in _followed(feed):
             publisher.show(state)

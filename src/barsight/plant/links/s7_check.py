@@ -20,8 +20,8 @@ def check_s7(settings: S7Settings) -> LinkCheck | Failed:
     lines: list[str] = []
     is_good = True
     written = replace(settings, read_db=settings.write_db, read_start=settings.write_start)
-    for side, one in (("in", settings), ("out", written)):
-        looked = _look(one, layout(side).size)
+    for side, side_settings in (("in", settings), ("out", written)):
+        looked = _look(side_settings, layout(side).size)
         if isinstance(looked, Failed):
             return looked
         content, took_s = looked
@@ -29,7 +29,7 @@ def check_s7(settings: S7Settings) -> LinkCheck | Failed:
         moved = {each["life"] for each in lives if not isinstance(each, Failed)}
         wrong = next((each.reason for each in lives if isinstance(each, Failed)), None)
         who = "the PLC's" if side == "in" else "Barsight's"
-        lines += [f"data block {one.read_db}, {who}:", *told_fields(side, content[-1], "big")]
+        lines += [f"data block {side_settings.read_db}, {who}:", *told_fields(side, content[-1], "big")]
         lines.append(f"read in {max(took_s) * 1e3:.1f} ms at most")
         if wrong is not None:
             lines.append(f"NO TELEGRAM: {wrong}")

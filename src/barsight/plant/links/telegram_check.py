@@ -64,10 +64,10 @@ def check_telegram(one: TelegramSettings, seconds: float) -> LinkCheck | Failed:
     return LinkCheck("telegram", lines, all(checks))
 
 
-def _exchange(one: TelegramSettings, seconds: float) -> _Exchanged | Failed:
+def _exchange(settings: TelegramSettings, seconds: float) -> _Exchanged | Failed:
     seen, size = _Exchanged(), layout("out").size
     asked_s: float | None = None
-    with socket.create_connection((one.host, one.port), timeout=2) as link:
+    with socket.create_connection((settings.host, settings.port), timeout=2) as link:
         until_s = time.monotonic() + seconds
         while time.monotonic() < until_s or len(seen.lives) < 12:
             values = {
@@ -77,11 +77,11 @@ def _exchange(one: TelegramSettings, seconds: float) -> _Exchanged | Failed:
             if len(seen.lives) >= 5 and seen.answered_s is None:
                 values |= {"command": FAILED, "command_number": NUMBER}
                 asked_s = asked_s or time.monotonic()
-            seen.sent = pack("in", values, one.byte_order)
+            seen.sent = pack("in", values, settings.byte_order)
             link.sendall(seen.sent)
             seen.content = link.recv(size, socket.MSG_WAITALL)
             seen.stamps_s.append(time.monotonic())
-            found = unpack("out", seen.content, one.byte_order)
+            found = unpack("out", seen.content, settings.byte_order)
             if isinstance(found, Failed):
                 return found
             seen.lives.append(found["life"])

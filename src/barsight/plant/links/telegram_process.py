@@ -73,8 +73,8 @@ def _begun(calls: Connection) -> int | str:
     """Wait for the process to start: return the port on which it listens, or why it doesn't."""
     with contextlib.suppress(EOFError, OSError):
         if calls.poll(START_S):
-            told: int | str = calls.recv()
-            return told
+            answer: int | str = calls.recv()
+            return answer
     return "its process didn't start"
 
 
@@ -113,8 +113,8 @@ class _SentFeed:
     def newest(self, life_counter: int) -> PlantState:
         """Return the newest state with the telegram's life counter; it is marked invalid if it is too old."""
         if self._read is None:
-            told = ("starting: no state was read yet",)
-            return PlantState("idle", False, told, life_counter, time.time_ns(), "none")
+            reasons = ("starting: no state was read yet",)
+            return PlantState("idle", False, reasons, life_counter, time.time_ns(), "none")
         return with_age(*self._read, life_counter)
 
     def refresh(self) -> None:

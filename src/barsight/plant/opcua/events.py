@@ -53,11 +53,11 @@ class Emitter:
         service = self._server.iserver.subscription_service
         chosen = service.subscriptions if subscription is None else {subscription: None}
         for source in self.sources:
-            one = copy.copy(event)
-            one.emitting_node = source.nodeid
+            sent = copy.copy(event)
+            sent.emitting_node = source.nodeid
             for number in list(chosen):
                 if (found := service.subscriptions.get(number)) is not None:
-                    await found.monitored_item_srv.trigger_event(one)
+                    await found.monitored_item_srv.trigger_event(sent)
 
     async def emit(self, name: str, message: str, severity: int = 100, **fields: Any) -> None:
         """Make an event and send it."""

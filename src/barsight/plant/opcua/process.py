@@ -34,16 +34,16 @@ class OpcUaProcess:
         max_age_s: float = MAX_AGE_S,
     ) -> None:  # fmt: skip
         context = multiprocessing.get_context("spawn")
-        self._here, there = context.Pipe()
+        self._here, far_end = context.Pipe()
         self._process = context.Process(
-            target=_serve, args=(settings, kind, recipes, there, max_age_s), daemon=True, name="opcua"
+            target=_serve, args=(settings, kind, recipes, far_end, max_age_s), daemon=True, name="opcua"
         )  # fmt: skip
         self._handshake = handshake
         self._max_age_s = max_age_s
         self._told: tuple[float, Told] | None = None
         self._stop = threading.Event()
         self._process.start()
-        there.close()
+        far_end.close()
         self._thread = threading.Thread(target=self._answer, name="opcua answers", daemon=True)
         self._thread.start()
 

@@ -104,11 +104,11 @@ class RecipeMethods:
         ]  # fmt: skip
 
     def _configuration(self) -> Any:
-        told = ua.ConfigurationDataType()
-        told.HasTransferableDataOnFile = False
-        told.InternalId = ua.ConfigurationIdDataType(Id=self.recipes.configuration)
-        told.LastModified = self.recipes.calibrated_at
-        return told
+        configuration = ua.ConfigurationDataType()
+        configuration.HasTransferableDataOnFile = False
+        configuration.InternalId = ua.ConfigurationIdDataType(Id=self.recipes.configuration)
+        configuration.LastModified = self.recipes.calibrated_at
+        return configuration
 
     async def _list_configurations(self, max_results: int, start: int, timeout: int) -> Any:
         page = [self._configuration()][start : start + max_results if max_results else None]
@@ -119,8 +119,8 @@ class RecipeMethods:
 
     async def _get_configuration(self, internal: Any, timeout: int) -> Any:
         is_there = _id_of(internal) == self.recipes.configuration
-        told = self._configuration() if is_there else ua.ConfigurationDataType()
-        shown = ua.Variant(told, ua.VariantType.ExtensionObject)
+        configuration = self._configuration() if is_there else ua.ConfigurationDataType()
+        shown = ua.Variant(configuration, ua.VariantType.ExtensionObject)
         return [handle(), shown, int32(0 if is_there else NOT_FOUND)]
 
     async def _activate(self, internal: Any) -> Any:

@@ -105,24 +105,24 @@ async def _follow(shown: _Shown, source: PlantSource, settings: OpcUaSettings) -
     survey: str | None = None
     is_first = True
     while True:
-        told = await source.told()
-        if told is None:
+        newest = await source.told()
+        if newest is None:
             await shown.variables.quiet(ua.StatusCodes.BadNoCommunication)
         else:
-            await shown.variables.show(told.state)
-            await shown.conditions.show(told.alarms)
+            await shown.variables.show(newest.state)
+            await shown.conditions.show(newest.alarms)
             if shown.vision is not None:
-                await _follow_errors(shown.vision, told)
-            name = told.survey.name if told.survey is not None else None
-            if shown.jobs is not None and told.survey is not None and name != survey and not is_first:
-                await shown.jobs.end_survey(told.survey)
+                await _follow_errors(shown.vision, newest)
+            name = newest.survey.name if newest.survey is not None else None
+            if shown.jobs is not None and newest.survey is not None and name != survey and not is_first:
+                await shown.jobs.end_survey(newest.survey)
             survey, is_first = name, False
         await asyncio.sleep(settings.state_every_s)
 
 
-async def _follow_errors(vision: VisionSystem, told: Told) -> None:
+async def _follow_errors(vision: VisionSystem, newest: Told) -> None:
     """Enter the state Error with the first alarm of that level, and leave it when the last one has ended."""
-    errors = [alarm for alarm in told.alarms if alarm.level == "error"]
+    errors = [alarm for alarm in newest.alarms if alarm.level == "error"]
     if errors and await vision.step_itself("error") is None:
         await vision.emitter.emit("error", errors[0].text, 800)
     if not errors and await vision.step_itself("error resolved") is None:

@@ -46,15 +46,15 @@ def leaves_of(kind: type, path: tuple[str, ...] = ()) -> Iterator[Leaf]:
     hints = typing.get_type_hints(kind)
     for field in dataclasses.fields(kind):
         inner = _without_none(hints[field.name])
-        here = (*path, field.name)
+        inner_path = (*path, field.name)
         if isinstance(inner, type) and dataclasses.is_dataclass(inner):
-            yield from leaves_of(inner, here)
+            yield from leaves_of(inner, inner_path)
         elif (scalar := _scalar(inner)) is not None:
-            yield Leaf(here, scalar, False, False)
+            yield Leaf(inner_path, scalar, False, False)
         elif typing.get_origin(inner) is tuple and (scalar := _common(typing.get_args(inner))) is not None:
-            yield Leaf(here, scalar, True, False)
+            yield Leaf(inner_path, scalar, True, False)
         else:
-            yield Leaf(here, ua.VariantType.String, False, True)
+            yield Leaf(inner_path, ua.VariantType.String, False, True)
 
 
 def value_of(snapshot: Any, leaf: Leaf) -> Any:

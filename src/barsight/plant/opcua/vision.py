@@ -133,8 +133,8 @@ class VisionSystem:
                 if name in MAIN_STATES or name in AUTOMATIC_STATES:
                     self._states[name] = child.nodeid
                 elif await child.read_type_definition() == ua.NodeId(ua.ObjectIds.TransitionType):
-                    told = await (await child.get_child("0:TransitionNumber")).read_value()
-                    self._transitions[name] = (child.nodeid, int(told))
+                    transition = await (await child.get_child("0:TransitionNumber")).read_value()
+                    self._transitions[name] = (child.nodeid, int(transition))
         main = await self.find(("VisionStateMachine",))
         self._machines = {
             "main": main, "automatic": await self.find(("VisionStateMachine", "AutomaticModeStateMachine"))

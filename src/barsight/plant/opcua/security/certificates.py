@@ -45,10 +45,10 @@ def own_certificate(folder: Path, uri: str, host: str) -> OwnCertificate:
     for name in ("", "trusted", "revoked"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     own = OwnCertificate(folder / "own.der", folder / "own-key.pem")
-    there = [path for path in (own.certificate, own.key) if path.exists()]
-    if len(there) == 1:
-        raise InputError(folder, f"holds {there[0].name} only", "restore the other file, or remove it")
-    if not there:
+    existing = [path for path in (own.certificate, own.key) if path.exists()]
+    if len(existing) == 1:
+        raise InputError(folder, f"holds {existing[0].name} only", "restore the other file, or remove it")
+    if not existing:
         certificate, key = make_certificate(uri, "Barsight", [host, socket.gethostname(), "localhost"])
         with (
             atomic_path(own.key) as path,
