@@ -100,18 +100,18 @@ def unseen_lengths(records: list[dict[str, Any]]) -> list[float | None]:
             if not any(one["ends_open"])
         ]
     ).reshape(-1, 3)
-    told: list[float | None] = []
-    for one in records:
-        own = np.array([one["bar_diameter_m"] or np.nan, one["width_m"]])
-        alike = (np.abs(whole[:, :2] - own) <= LIKE_RATIO * own).all(axis=1)
-        alike &= whole[:, 2] > one["length_m"]
-        is_told = any(one["ends_open"]) and bool(alike.any())
-        told.append(float(np.median(whole[alike, 2])) - one["length_m"] if is_told else None)
-    return told
+    unseen_m: list[float | None] = []
+    for record in records:
+        size = np.array([record["bar_diameter_m"] or np.nan, record["width_m"]])
+        alike = (np.abs(whole[:, :2] - size) <= LIKE_RATIO * size).all(axis=1)
+        alike &= whole[:, 2] > record["length_m"]
+        is_known = any(record["ends_open"]) and bool(alike.any())
+        unseen_m.append(float(np.median(whole[alike, 2])) - record["length_m"] if is_known else None)
+    return unseen_m
 
 
-def _bundle(one: PresentBundle, vetoes: Any, offers: Any) -> dict[str, Any]:
-    sighting = one.sighting
+def _bundle(shown: PresentBundle, vetoes: Any, offers: Any) -> dict[str, Any]:
+    sighting = shown.sighting
     lift = offers.get(sighting.bundle_id)
     return {
         "identity": sighting.identity,
@@ -119,7 +119,7 @@ def _bundle(one: PresentBundle, vetoes: Any, offers: Any) -> dict[str, Any]:
         "seen_ns": sighting.seen_ns,
         "change": sighting.change,
         "stock_name": sighting.stock_name,
-        "doubt": None if one.doubt is None else {"code": one.doubt.kind, "reason": one.doubt.reason},
+        "doubt": None if shown.doubt is None else {"code": shown.doubt.kind, "reason": shown.doubt.reason},
         "vetoes": vetoes.get((sighting.survey_id, sighting.bundle_id), []),
         "lift": None
         if lift is None
@@ -143,7 +143,7 @@ def bundle_history(connection: Connection, number: int) -> dict[str, Any] | None
         .join(SURVEYS)
         .where(ABSENCES.c.bundle_id == number)
     ).all()
-    told = [
+    entries = [
         {
             "map_id": row.map_id, "at_ns": row.captured_to_ns, "what": row.change, "x_m": row.x_m,
             "y_m": row.y_m, "top_z_m": row.top_z_m, "length_m": row.length_m,
@@ -151,12 +151,12 @@ def bundle_history(connection: Connection, number: int) -> dict[str, Any] | None
         }
         for row in seen
     ]  # fmt: skip
-    told += [
+    entries += [
         {"map_id": r.map_id, "at_ns": r.captured_to_ns, "what": r.kind, "reason": r.reason} for r in missed
     ]
     return {
         "identity": identity_name(number),
-        "history": sorted(told, key=lambda each: each["at_ns"]),
+        "history": sorted(entries, key=lambda each: each["at_ns"]),
         "lifts": [one for one in lift_records(connection) if identity_name(number) in one["bundles"]],
     }
 
@@ -226,14 +226,14 @@ def _urgency(alarm: dict[str, Any]) -> tuple[int, int, int]:
 def survey_records(connection: Connection) -> list[dict[str, Any]]:
     """List the surveys, the newest first, with the findings and files of each."""
     files = {row.map_id: row for row in connection.execute(select(SURVEYS)).all()}
-    told = []
-    for one in reversed(list_surveys(connection)):
-        row = files[one.map_id]
-        present = Path(one.folder)
+    records = []
+    for survey in reversed(list_surveys(connection)):
+        row = files[survey.map_id]
+        present = Path(survey.folder)
         more = [name for name in ("report.html", "ortho.png") if is_there(present / name)]
         kept = [name for name in sorted(json.loads(row.files)) if is_there(present / name)]
-        told.append(
-            asdict(one)
+        records.append(
+            asdict(survey)
             | {
                 "calibration_id": row.calibration_id, "software_version": row.software_version,
                 "added_ns": row.added_ns, "files": kept + more, "missing": sorted(
@@ -241,7 +241,7 @@ def survey_records(connection: Connection) -> list[dict[str, Any]]:
                 ),
             }
         )  # fmt: skip
-    return told
+    return records
 
 
 def equipment_record(connection: Connection) -> dict[str, Any]:
@@ -269,25 +269,27 @@ def stock_record(connection: Connection) -> dict[str, Any]:
         row.number: identity_name(row.bundle_id)
         for row in connection.execute(select(SIGHTINGS).where(SIGHTINGS.c.survey_id == newest.id)).all()
     }
-    told: list[dict[str, Any]] = [{"kind": "missing", "name": name, "bundle": None} for name in match.missing]
-    told += [{"kind": "hidden", "name": name, "bundle": None} for name in match.hidden]
-    told += [{"kind": "extra", "name": None, "bundle": numbers.get(number)} for number in match.extra]
-    for one in match.matched:
-        entry = {"name": one.name, "bundle": numbers.get(one.bundle)}
-        if one.name in match.moved:
-            told.append({"kind": "moved", "moved_m": one.moved_m, **entry})
-        if one.disagrees:
-            told.append({"kind": "differs", "says": one.disagrees, **entry})
+    differences: list[dict[str, Any]] = [
+        {"kind": "missing", "name": name, "bundle": None} for name in match.missing
+    ]
+    differences += [{"kind": "hidden", "name": name, "bundle": None} for name in match.hidden]
+    differences += [{"kind": "extra", "name": None, "bundle": numbers.get(number)} for number in match.extra]
+    for matched in match.matched:
+        entry = {"name": matched.name, "bundle": numbers.get(matched.bundle)}
+        if matched.name in match.moved:
+            differences.append({"kind": "moved", "moved_m": matched.moved_m, **entry})
+        if matched.disagrees:
+            differences.append({"kind": "differs", "says": matched.disagrees, **entry})
     query = select(STOCK_DECISIONS).where(STOCK_DECISIONS.c.survey_id == newest.id)
     decided = {row.difference: row for row in connection.execute(query.order_by(STOCK_DECISIONS.c.id)).all()}
-    for each in told:
+    for each in differences:
         each["key"] = f"{each['kind']} {each['name'] or each['bundle']}"
         row = decided.get(each["key"])
         each["decision"] = None
         if row is not None:
             each["decision"] = {"what": row.decision, "who": row.who, "at_ns": row.at_ns, "note": row.note}
     agree = [one.name for one in match.matched if one.name not in match.moved and not one.disagrees]
-    return {"map_id": newest.map_id, "list": len(match.matched), "agree": agree, "differences": told}
+    return {"map_id": newest.map_id, "list": len(match.matched), "agree": agree, "differences": differences}
 
 
 def _survey_of(row: Row[Any]) -> dict[str, Any]:

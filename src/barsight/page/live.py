@@ -64,14 +64,14 @@ class LiveFolder:
         seen; no position if it is outdated. seen_at: returns the time (ns) at which a place was last seen.
         """
         folder = running_folder(self.folder)
-        told = read_live_state(folder)
-        if told is None or not told.is_running:
+        live = read_live_state(folder)
+        if live is None or not live.is_running:
             return json.dumps({"mode": None, "reasons": [], "place": None}).encode()
-        pose = read_crane_pose(folder, told.now_ns)
+        pose = read_crane_pose(folder, live.now_ns)
         place = None
         if pose is not None:
             body_m = pose.x_m, pose.y_m
             seen_ns = seen_at(pose.magnet_m or body_m)
             place = {"body_m": body_m, "magnet_m": pose.magnet_m, "map_seen_ns": seen_ns}
-        content = {"mode": told.mode, "reasons": told.reasons, "place": place}
+        content = {"mode": live.mode, "reasons": live.reasons, "place": place}
         return json.dumps(json_value(content, decimals=3), allow_nan=False).encode()

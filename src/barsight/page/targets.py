@@ -215,8 +215,8 @@ def _face_height(part: HeightMap, near: Bool, known: Bool, name: str) -> tuple[f
     level = known & (np.abs(part.z_m - z) < np.maximum(JUMP_M, 2 * part.sigma_m))
     if level.sum() < MIN_LEVEL * known.sum():
         jump_m = float(np.ptp(np.percentile(part.z_m[known], (5, 95))))
-        said = f"about its pick the height jumps by {jump_m:.2f} m"
-        raise InputError(name, said, "pick a face's middle, not its edge")
+        problem = f"about its pick the height jumps by {jump_m:.2f} m"
+        raise InputError(name, problem, "pick a face's middle, not its edge")
     return z, (float(np.median(part.sigma_m[level])), float(part.z_m[level].std()))
 
 
@@ -239,8 +239,8 @@ def _column_top(part: HeightMap, travel: Travel | None, pixel: Float64, pick: Pi
     wide_m = math.sqrt(rows.size) * part.cell_m
     off_m = wide_m - WIDER_PX * _pixel_m(travel, z, part.cell_m) - pick.width_m
     if abs(off_m) > MAX_OFF_RATIO * pick.width_m:
-        said = f"where it is picked no column of {pick.width_m:g} m ends"
-        raise InputError(pick.name, f"{said}: the level place is {wide_m:.2f} m wide", remedy)
+        problem = f"where it is picked no column of {pick.width_m:g} m ends"
+        raise InputError(pick.name, f"{problem}: the level place is {wide_m:.2f} m wide", remedy)
     return np.array([columns.mean(), rows.mean()]), off_m
 
 
@@ -281,12 +281,12 @@ def _fitted(targets: Targets, frame: str) -> tuple[dict[str, Any] | None, Float6
     )
     if isinstance(found, Failed):
         return {"problem": found.reason}, None
-    told = {
+    content = {
         "turn_sigma_deg": found.turn_sigma_deg, "place_sigma_m": found.place_sigma_m,
         "scale": found.alignment.scale, "scale_sigma": found.alignment.scale_sigma,
         "doubts": list(found.doubts),
     }  # fmt: skip
-    return told, found.off_m
+    return content, found.off_m
 
 
 @functools.lru_cache(maxsize=4)

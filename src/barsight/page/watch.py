@@ -63,8 +63,8 @@ class Published:
         body = self.documents[name]
         if name != "state":
             return body
-        told = json.loads(body)
-        return json.dumps(told | {"clock_ns": told["clock_ns"] + time.time_ns() - self.at_ns}).encode()
+        content = json.loads(body)
+        return json.dumps(content | {"clock_ns": content["clock_ns"] + time.time_ns() - self.at_ns}).encode()
 
 
 class StoreWatch:
@@ -161,7 +161,7 @@ class StoreWatch:
         """Stream server-sent events: each new revision and crane position. A slow reader skips those in
         between.
         """
-        sent, told = -1, b""
+        sent, shown = -1, b""
         while not self._stop.is_set():
             changed = self._changed
             assert changed is not None
@@ -169,9 +169,9 @@ class StoreWatch:
                 sent = self.published.revision
                 yield f"event: revision\nid: {sent}\ndata: {sent}\n\n".encode()
                 continue
-            if self.crane != told:
-                told = self.crane
-                yield b"event: crane\ndata: " + told + b"\n\n"
+            if self.crane != shown:
+                shown = self.crane
+                yield b"event: crane\ndata: " + shown + b"\n\n"
                 continue
             try:
                 await asyncio.wait_for(changed.wait(), HEARTBEAT_S)
