@@ -120,17 +120,17 @@ def add_survey(
         laid = [j for j, finding in shown.items() if j not in partner and finding != "covered"]
         carried = match_carried(known, read.found, matched, laid)
         partner |= {j: i for i, j in carried.items()}
-        told = {
+        findings = {
             j: "moved" if j in carried.values() else _change(before.get(j), one.bundle, shown.get(j))
             for j, one in enumerate(read.found)
         }
         survey_id = _add_row(opened, read, heights)
         changes: dict[int, str] = {}
         ids: dict[int, int] = {}
-        for j, one in enumerate(read.found):
+        for j, found in enumerate(read.found):
             number = known[partner[j]].bundle_id if j in partner else opened.add(BUNDLES, survey_id=survey_id)
-            _add_sighting(opened, survey_id, number, told[j], one, read.records[j])
-            changes[number], ids[one.bundle.id] = told[j], number
+            _add_sighting(opened, survey_id, number, findings[j], found, read.records[j])
+            changes[number], ids[found.bundle.id] = findings[j], number
         absences = {
             known[i].bundle_id: finding
             for i, finding in matched.findings.items()
@@ -190,9 +190,9 @@ def _expect_new(connection: Connection, read: MeasuredSurvey) -> bool:
     kinds = select(SURVEYS.c.is_simulated).limit(1)
     simulated = connection.execute(kinds).scalar()
     if simulated is not None and simulated != read.identity.is_simulated:
-        told = ("was measured", "simulated") if simulated else ("is simulated", "measured")
+        words = ("was measured", "simulated") if simulated else ("is simulated", "measured")
         raise InputError(
-            read.path, f"{told[0]}, the store holds {told[1]} surveys", "keep it in a store of its own"
+            read.path, f"{words[0]}, the store holds {words[1]} surveys", "keep it in a store of its own"
         )
     same = select(SURVEYS.c.id).where(SURVEYS.c.map_id == read.identity.map_id)
     return connection.execute(same).first() is None
@@ -208,20 +208,20 @@ def _shown_before(connection: Connection, read: MeasuredSurvey, new: set[int]) -
     """Find what the newest earlier survey that saw a bundle's place saw there. new: positions in
     `read.found`.
     """
-    told: dict[int, Finding] = dict.fromkeys(new, "unseen")
+    findings: dict[int, Finding] = dict.fromkeys(new, "unseen")
     earlier = (
         select(SURVEYS.c.id)
         .where(SURVEYS.c.captured_to_ns <= read.to_ns)
         .order_by(SURVEYS.c.captured_to_ns.desc(), SURVEYS.c.id.desc())
     )
     for survey_id in connection.execute(earlier).scalars().all():
-        unseen = [j for j, finding in told.items() if finding == "unseen"]
+        unseen = [j for j, finding in findings.items() if finding == "unseen"]
         if not unseen:
             break
         packed = select(SURVEYS.c.heights).where(SURVEYS.c.id == survey_id)
         heights = unpack(connection.execute(packed).scalar_one())
-        told |= {j: look_at(read.found[j].bundle, heights) for j in unseen}
-    return told
+        findings |= {j: look_at(read.found[j].bundle, heights) for j in unseen}
+    return findings
 
 
 def _add_row(opened: Entry, read: MeasuredSurvey, heights: bytes) -> int:
@@ -301,11 +301,11 @@ def _note_looking_back(opened: Entry, read: MeasuredSurvey, survey_id: int) -> b
 
 
 def _add_sighting(
-    opened: Entry, survey_id: int, bundle_id: int, change: str, one: FoundBundle, record: dict[str, Any]
+    opened: Entry, survey_id: int, bundle_id: int, change: str, found: FoundBundle, record: dict[str, Any]
 ) -> None:
     x_m, y_m, _ = record["axis_centre_m"]
     figures = {name: record[name] for name in ("top_z_m", "yaw_deg", "length_m", "width_m")}
     opened.add(
         SIGHTINGS, survey_id=survey_id, bundle_id=bundle_id, number=record["id"], change=change,
-        stock_name=one.stock_name, x_m=x_m, y_m=y_m, **figures, record=json.dumps(record, sort_keys=True),
+        stock_name=found.stock_name, x_m=x_m, y_m=y_m, **figures, record=json.dumps(record, sort_keys=True),
     )  # fmt: skip

@@ -96,8 +96,8 @@ def verify_chain(connection: Connection) -> AuditChain | Failed:
     for name, table in METADATA.tables.items():
         found = connection.execute(select(func.count()).select_from(table)).scalar_one()
         if table is not AUDIT and found != len(covered.get(name, ())):
-            told = f"{found} rows, the audit log covers {len(covered.get(name, ()))}"
-            return Failed("audit", f"table {name} has {told}")
+            counts = f"{found} rows, the audit log covers {len(covered.get(name, ()))}"
+            return Failed("audit", f"table {name} has {counts}")
     return AuditChain(count, previous)
 
 

@@ -138,9 +138,9 @@ def why_invalid(connection: Connection, digest: str, clock_ns: int) -> str:
     if clock_ns < last.from_ns:
         return f"calibration {digest} is valid from {time_text(last.from_ns)} on only"
     newer = next((one for one in own if one.digest != digest and one.holds(clock_ns)), None)
-    told = "" if newer is None else f", when {newer.digest} took its place"
+    successor = "" if newer is None else f", when {newer.digest} took its place"
     until = "" if last.until_ns is None else time_text(last.until_ns)
-    return f"calibration {digest} was valid until {until}{told}; measure with one that is, or approve it"
+    return f"calibration {digest} was valid until {until}{successor}; measure with one that is, or approve it"
 
 
 def _times(connection: Connection) -> list[ApprovedTime]:
@@ -150,15 +150,15 @@ def _times(connection: Connection) -> list[ApprovedTime]:
         .join(CALIBRATIONS)
         .order_by(CALIBRATIONS.c.rig, VALIDITIES.c.from_ns, VALIDITIES.c.id)
     ).all()
-    told = []
+    times = []
     for place, row in enumerate(rows, start=1):
         until, after = row.until_ns, rows[place] if place < len(rows) else None
         if after is not None and after.rig == row.rig:
             until = after.from_ns if until is None else min(until, after.from_ns)
-        told.append(
+        times.append(
             ApprovedTime(row.digest, row.rig, row.from_ns, until, row.approved_by, row.note, row.at_ns)
         )
-    return told
+    return times
 
 
 def _rows(connection: Connection) -> list[Row[Any]]:

@@ -176,9 +176,9 @@ def _note_unrecorded(store: Store, lift_id: int, who: str, reported: str) -> Non
         state = lift_state(opened.connection, lift_id) or "unknown"
         if state in OPEN:
             raise InputError(f"lift {lift_id}", f"is {state}", "report it again")
-        told = f"lift {lift_id} {did} and is {state}, unrecorded: survey before the next lift"
-        if not has_alarm(opened.connection, "lift-unrecorded", told):
-            raise_alarm(opened, "lift-unrecorded", told)
+        alarm = f"lift {lift_id} {did} and is {state}, unrecorded: survey before the next lift"
+        if not has_alarm(opened.connection, "lift-unrecorded", alarm):
+            raise_alarm(opened, "lift-unrecorded", alarm)
             _end_offers(opened, f"disturbed: lift {lift_id} {did} and isn't recorded")
     raise LateReportError(
         f"lift {lift_id}", f"is {state}, it can't be recorded", "survey before the next lift"
@@ -318,18 +318,18 @@ def _change(store: Store, lift_id: int, who: str, what: str, step: Callable[[Ent
 def _stale(connection: Connection, clock_ns: int) -> dict[int, str]:
     """Return why offers and confirmations are no longer valid, by id."""
     newest = newest_survey(connection)
-    told = {}
+    reasons = {}
     reason = "" if newest is None else why_invalid(connection, newest.calibration_id, clock_ns)
     for lift in open_lifts(connection):
         until_ns = lift.record["valid_until_ns"]
         if lift.state == "executing":
             continue
         if newest is not None and lift.survey_id != newest.id:
-            told[lift.lift_id] = "expired: a newer map came"
+            reasons[lift.lift_id] = "expired: a newer map came"
         elif until_ns is None or until_ns < clock_ns:
-            told[lift.lift_id] = "expired: map-too-old: it was valid for a limited time"
+            reasons[lift.lift_id] = "expired: map-too-old: it was valid for a limited time"
         elif is_ahead(lift.record.get("valid_from_ns"), clock_ns):
-            told[lift.lift_id] = "expired: map-from-the-future: the frames are ahead of this clock"
+            reasons[lift.lift_id] = "expired: map-from-the-future: the frames are ahead of this clock"
         elif reason:
-            told[lift.lift_id] = f"expired: calibration-changed: {reason}"
-    return told
+            reasons[lift.lift_id] = f"expired: calibration-changed: {reason}"
+    return reasons

@@ -182,13 +182,13 @@ def yard_changes(connection: Connection, before_ns: int, after_ns: int) -> list[
     """List the changes between two times: `came`, `went`, `moved`; unchanged bundles are left out."""
     before = {one.sighting.bundle_id: one.sighting for one in present_yard(connection, before_ns)}
     after = {one.sighting.bundle_id: one.sighting for one in present_yard(connection, after_ns)}
-    told = []
+    changes = []
     for number in sorted({*before, *after}):
         old, new = before.get(number), after.get(number)
         kind = "went" if new is None else "came" if old is None else "moved"
         if old is not None and new is not None and not has_moved(old.bundle, new.bundle):
             continue
-        told.append(
+        changes.append(
             {
                 "identity": identity_name(number), "what": kind,
                 "from_m": None if old is None else old.record["axis_centre_m"],
@@ -198,7 +198,7 @@ def yard_changes(connection: Connection, before_ns: int, after_ns: int) -> list[
                 "width_m": [one.record["width_m"] for one in (old, new) if one is not None][-1],
             }
         )  # fmt: skip
-    return told
+    return changes
 
 
 def yard_records(present: tuple[PresentBundle, ...], now_ns: int) -> list[dict[str, Any]]:
@@ -256,10 +256,10 @@ class ExecutedLift:
         if self.set_down is None:
             return None
         to = self.set_down
-        turned = (math.radians(to["yaw_deg"]) + math.pi / 2) % math.pi - math.pi / 2
+        yaw_rad = (math.radians(to["yaw_deg"]) + math.pi / 2) % math.pi - math.pi / 2
         up_m = to["z_m"] - bundle.bottom_z_m
         centre = np.array([to["x_m"], to["y_m"], bundle.centre_m[2] + up_m])
-        return replace(bundle, centre_m=centre, yaw_rad=turned, pitch_rad=0.0, top_z_m=bundle.top_z_m + up_m)
+        return replace(bundle, centre_m=centre, yaw_rad=yaw_rad, pitch_rad=0.0, top_z_m=bundle.top_z_m + up_m)
 
 
 def executed_lifts(connection: Connection) -> tuple[ExecutedLift, ...]:

@@ -115,9 +115,9 @@ def find_outlines(
 
     record: the lift's JSON in lifts.json.
     """
-    held = select(SIGHTINGS.c.record).join(LIFT_BUNDLES, LIFT_BUNDLES.c.bundle_id == SIGHTINGS.c.bundle_id)
-    own = LIFT_BUNDLES.c.lift_id == lift_id, SIGHTINGS.c.survey_id == survey_id
-    bundles = [bundle_of(json.loads(row)) for row in connection.execute(held.where(*own)).scalars()]
+    query = select(SIGHTINGS.c.record).join(LIFT_BUNDLES, LIFT_BUNDLES.c.bundle_id == SIGHTINGS.c.bundle_id)
+    which = LIFT_BUNDLES.c.lift_id == lift_id, SIGHTINGS.c.survey_id == survey_id
+    bundles = [bundle_of(json.loads(row)) for row in connection.execute(query.where(*which)).scalars()]
     places = [record["target"]]
     if record["set_down"]:
         places.append(record["set_down"])
@@ -126,10 +126,10 @@ def find_outlines(
     for place in places:
         centre, yaw = (place["x_m"], place["y_m"]), math.radians(place["yaw_deg"])
         outlines.append(corners(centre, yaw, beam["width_m"], beam["length_m"]))
-        here = bundles if place is places[0] or not bundles else [laid_at(tuple(bundles), *centre, yaw)]
-        for one in here:
-            at = float(one.centre_m[0]), float(one.centre_m[1])
-            outlines.append(corners(at, one.yaw_rad, one.width_m, one.length_m))
+        lying = bundles if place is places[0] or not bundles else [laid_at(tuple(bundles), *centre, yaw)]
+        for bundle in lying:
+            at = float(bundle.centre_m[0]), float(bundle.centre_m[1])
+            outlines.append(corners(at, bundle.yaw_rad, bundle.width_m, bundle.length_m))
     return outlines
 
 

@@ -110,9 +110,9 @@ def _near(known: tuple[KnownBundle, ...], found: tuple[FoundBundle, ...]) -> lis
     centre = np.array([other.bundle.centre_m[:2] for other in found]).reshape(-1, 2)
     length = np.array([other.bundle.length_m for other in found])
     pairs = []
-    for i, one in enumerate(known):
+    for i, bundle in enumerate(known):
         near = np.zeros(len(found), np.bool_)
-        for place, _ in one.places:
+        for place, _ in bundle.places:
             away = np.hypot(*(centre - place.centre_m[:2]).T)
             near |= away < np.maximum(length, place.length_m)
         pairs += [(i, int(j)) for j in np.flatnonzero(near)]
@@ -134,11 +134,11 @@ def _place_cost(known: KnownBundle, found: FoundBundle) -> tuple[float, bool]:
 
 def _is_same_place(before: Bundle, after: Bundle) -> bool:
     """Check that two bundles can't be side by side: less than half a width, and half a height, apart."""
-    across, along, up, turned = displacement(before, after)
+    across, along, up, turn_rad = displacement(before, after)
     half = min(before.width_m, after.width_m) / 2
     is_open = any(before.ends_open) or any(after.ends_open)
     reach = (0.5 if is_open else 0.25) * max(before.length_m, after.length_m)
-    return abs(across) < half and abs(up) < half and abs(along) < reach and abs(turned) < MAX_TURN_RAD
+    return abs(across) < half and abs(up) < half and abs(along) < reach and abs(turn_rad) < MAX_TURN_RAD
 
 
 def _is_same_kind(known: KnownBundle, found: FoundBundle) -> bool:
@@ -171,12 +171,12 @@ def _is_same_length(before: Bundle, after: Bundle) -> bool:
 
 def _difference(before: Bundle, after: Bundle) -> float:
     """Sum squared differences over their variances: across, up, yaw, and along if all ends were seen."""
-    across, along, up, turned = displacement(before, after)
+    across, along, up, turn_rad = displacement(before, after)
     a, b = before.sigma, after.sigma
     terms = [
         (across, a.lateral_m, b.lateral_m, _PLACE_SIGMA_M),
         (up, a.top_z_m, b.top_z_m, _PLACE_SIGMA_M),
-        (turned, a.yaw_rad, b.yaw_rad, _YAW_SIGMA_RAD),
+        (turn_rad, a.yaw_rad, b.yaw_rad, _YAW_SIGMA_RAD),
         (after.width_m - before.width_m, a.width_m, b.width_m, _PLACE_SIGMA_M),
     ]
     if not (any(before.ends_open) or any(after.ends_open)):
@@ -200,8 +200,8 @@ def _finding(known: KnownBundle, heights: YardMap, *, is_replaced: bool) -> Find
         finding = "gone"
     if known.set_down is None or finding == "unseen":
         return finding
-    there = look_at(known.set_down, heights)
-    return finding if there == "gone" else there
+    set_down_finding = look_at(known.set_down, heights)
+    return finding if set_down_finding == "gone" else set_down_finding
 
 
 def look_at(bundle: Bundle, heights: YardMap) -> Finding:
@@ -247,7 +247,7 @@ def _is_carried(known: KnownBundle, found: FoundBundle) -> bool:
 
 def has_moved(before: Bundle, after: Bundle) -> bool:
     """Detect a move that is neither noise nor the settling of a pile."""
-    across, _, up, turned = displacement(before, after)
+    across, _, up, turn_rad = displacement(before, after)
     along, sigma_along = displacement_along(before, after)
     a, b = before.sigma, after.sigma
     return any(
@@ -256,6 +256,6 @@ def has_moved(before: Bundle, after: Bundle) -> bool:
             (across, a.lateral_m, b.lateral_m, MOVED_M),
             (along, sigma_along, 0.0, MOVED_M),
             (up, a.top_z_m, b.top_z_m, MOVED_M),
-            (turned, a.yaw_rad, b.yaw_rad, MOVED_RAD),
+            (turn_rad, a.yaw_rad, b.yaw_rad, MOVED_RAD),
         )
     )

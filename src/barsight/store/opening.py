@@ -42,7 +42,7 @@ class Store:
     @contextmanager
     def reading(self) -> Iterator[Connection]:
         """Provide a connection in a read-only transaction."""
-        with _told(self.name), self.engine.connect() as connection:
+        with _translated_errors(self.name), self.engine.connect() as connection:
             if not self._is_sqlite:
                 connection.execute(text("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ, READ ONLY"))
             yield connection
@@ -51,11 +51,11 @@ class Store:
     def writing(self) -> Iterator[Connection]:
         """Provide a connection in an exclusive write transaction; it commits unless an error is raised."""
         writer = self.engine.execution_options(is_writer=True)
-        with _told(self.name, writer), writer.begin() as connection:
+        with _translated_errors(self.name, writer), writer.begin() as connection:
             if not self._is_sqlite:
                 limits = {"lock_timeout": WAIT_S, "idle_in_transaction_session_timeout": IDLE_S}
-                told = (f"set_config('{name}', '{1e3 * s:.0f}', true)" for name, s in limits.items())
-                connection.execute(text(f"SELECT {', '.join(told)}"))
+                calls = (f"set_config('{name}', '{1e3 * s:.0f}', true)" for name, s in limits.items())
+                connection.execute(text(f"SELECT {', '.join(calls)}"))
                 connection.execute(text(f"SELECT pg_advisory_xact_lock({_LOCK})"))
             yield connection
 
@@ -138,7 +138,7 @@ _TOO_IDLE = "25P03"
 
 
 @contextmanager
-def _told(name: str, writer: Engine | None = None) -> Iterator[None]:
+def _translated_errors(name: str, writer: Engine | None = None) -> Iterator[None]:
     """Convert the error of a database that can't be reached, read or written into an InputError of one line,
     or into an OutputError if it could not or may not be written.
 

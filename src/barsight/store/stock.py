@@ -26,10 +26,10 @@ def listed_bundles(present: Iterable[PresentBundle]) -> tuple[ListedBundle, ...]
     """
     names: set[str] = set()
     listed = []
-    for one in present:
-        bundle = one.sighting.bundle
+    for shown in present:
+        bundle = shown.sighting.bundle
         label = None if bundle.label is None else bundle.label.text
-        wanted = (one.sighting.stock_name, label, one.sighting.identity)
+        wanted = (shown.sighting.stock_name, label, shown.sighting.identity)
         name = next(each for each in wanted if each and each not in names)
         names.add(name)
         x_m, y_m, _ = (float(value) for value in bundle.centre_m)
