@@ -103,8 +103,8 @@ def describe_recording(recording: StoredPictures) -> RecordingInfo:
     if crane is not None:
         streams.append(stream_info("crane0", crane.stamp_ns))
     first = next(iter(recording.frames()), None)
-    told = (doubt.message for doubt in doubts(recording))
-    notes = (*recording.notes, *clock_faults(recording), *told, *_time_notes(streams))
+    messages = (doubt.message for doubt in doubts(recording))
+    notes = (*recording.notes, *clock_faults(recording), *messages, *_time_notes(streams))
     return RecordingInfo(
         path=recording.path,
         format=recording.format,

@@ -73,14 +73,14 @@ class PacketRecording:
                 self._refused[packet.stamp_ns] = packet
             self._stamps_ns.append(packet.stamp_ns)
 
-    def _add_samples(self, packet: Samples, held: _Grown[Samples]) -> None:
+    def _add_samples(self, packet: Samples, series: _Grown[Samples]) -> None:
         if not len(packet.stamp_ns):
             return
-        self._expect_later(packet.stamp_ns, held.last_ns)
+        self._expect_later(packet.stamp_ns, series.last_ns)
         if not all(np.isfinite(getattr(packet, name)).all() for name in _ARRAYS[type(packet)]):
             problem = f"a packet of {packet.stamp_ns[0]} ns holds NaN or infinite values"
             raise InputError(self.path, problem, "leave such samples out")
-        held.add(packet)
+        series.add(packet)
 
     def _expect_later(self, stamps_ns: Sequence[int] | Int64, last_ns: int | None) -> None:
         late = last_ns is not None and stamps_ns[0] <= last_ns
@@ -91,7 +91,9 @@ class PacketRecording:
 
     def last_readings_ns(self, use: Container[str]) -> tuple[int, ...]:
         """Return the stamp of the last reading of each sensor in `use` (`imu`, `crane`) that has any."""
-        last = (held.last_ns for name, held in (("imu", self._imu), ("crane", self._crane)) if name in use)
+        last = (
+            series.last_ns for name, series in (("imu", self._imu), ("crane", self._crane)) if name in use
+        )
         return tuple(stamp for stamp in last if stamp is not None)
 
     @property
@@ -154,10 +156,10 @@ class _Grown(Generic[Samples]):
             self._count = len(part.stamp_ns)
             return
         end = self._count + len(part.stamp_ns)
-        held: Any
-        for name, held in self._arrays.items():
-            if end > len(held):
-                self._arrays[name] = np.resize(held, (2 * end, *held.shape[1:]))
+        array: Any
+        for name, array in self._arrays.items():
+            if end > len(array):
+                self._arrays[name] = np.resize(array, (2 * end, *array.shape[1:]))
             self._arrays[name][self._count : end] = getattr(part, name)
         self._count = end
 
@@ -170,7 +172,7 @@ class _Grown(Generic[Samples]):
         count = self._count  # read once: another thread may be adding
         if self._first is None:
             return None
-        return replace(self._first, **{name: held[:count] for name, held in self._arrays.items()})
+        return replace(self._first, **{name: array[:count] for name, array in self._arrays.items()})
 
 
 def _between(

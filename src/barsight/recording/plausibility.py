@@ -80,8 +80,8 @@ def _crane_doubts(crane: CraneSamples) -> Iterator[Notice]:
     ahead = np.searchsorted(time, time + SPEED_WINDOW_S)
     old = np.flatnonzero(ahead < len(time))
     if old.size:
-        way = np.linalg.norm(crane.position_m[ahead[old]] - crane.position_m[old], axis=1)
-        speed = float(np.percentile(way / (time[ahead[old]] - time[old]), 75))
+        distance = np.linalg.norm(crane.position_m[ahead[old]] - crane.position_m[old], axis=1)
+        speed = float(np.percentile(distance / (time[ahead[old]] - time[old]), 75))
         if speed > MAX_SPEED_MPS:
             yield Notice("units-doubtful", f"the crane travels at {speed:.3g} m/s: give metres, not mm")
 

@@ -175,8 +175,8 @@ def _gyro_unit(header: str) -> GyroUnit:
     """Find the gyroscope's unit, by its own columns where these tell one: others may have degrees too."""
     names = [name for name in re.split(r"[,;\t]", header) if NAMED["gyro"].search(name.strip(" #"))]
     own = " ".join(names)
-    told = own if re.search(r"rad|deg|°|dps", own, re.IGNORECASE) else header
-    return GyroUnit.DEGREES if DEGREES.search(told) else GyroUnit.RADIANS
+    stated = own if re.search(r"rad|deg|°|dps", own, re.IGNORECASE) else header
+    return GyroUnit.DEGREES if DEGREES.search(stated) else GyroUnit.RADIANS
 
 
 def _time_unit(path: Path, stamps: list[Decimal], header: str) -> TimeUnit:
@@ -198,9 +198,9 @@ def _bag_rows(path: Path) -> tuple[str, Int64, Float64]:
     bag = BagFile(path)
     topics = [topic for topic in bag.topics if topic.kind == IMU_TYPE and topic.count]
     if len(topics) != 1:
-        held = ", ".join(topic.name for topic in topics or bag.topics) or "nothing"
+        names = ", ".join(topic.name for topic in topics or bag.topics) or "nothing"
         what = "several IMU topics" if topics else "no IMU topic"
-        raise InputError(path, f"has {what} ({held})", "give a bag with one")
+        raise InputError(path, f"has {what} ({names})", "give a bag with one")
     stamps, values = [], []
     for message in bag.messages([topics[0].name]):
         try:
