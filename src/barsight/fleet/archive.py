@@ -63,23 +63,25 @@ def find_recordings(archive: Objects) -> tuple[ArchivedRecording, ...]:
     files = {one.path: one for one in archive.list()}
     surveys = {_above(path): _passes(archive, path) for path in files if PurePosixPath(path).name == SURVEY}
     roots = _roots(files, surveys)
-    held: dict[str, list[StoredObject]] = {root: [] for root in roots}
+    by_root: dict[str, list[StoredObject]] = {root: [] for root in roots}
     near: dict[str, list[StoredObject]] = {_above(root): [] for root in roots}
     for path, file in files.items():
         if (above := _above(path)) in near:
             near[above].append(file)
-        owner = next((one for one in (path, *map(_plain, PurePosixPath(path).parents)) if one in held), None)
+        owner = next(
+            (one for one in (path, *map(_plain, PurePosixPath(path).parents)) if one in by_root), None
+        )
         if owner is not None:
             inner = PurePosixPath(path.removeprefix(owner).lstrip("/")).parts
             if not _UNREAD & set(inner[:-1]):
-                held[owner].append(file)
-    if not held:
+                by_root[owner].append(file)
+    if not by_root:
         raise InputError(archive.url, "holds no recording", "name the folder above the recordings")
-    for root, own in held.items():
-        own += _beside(root, own, near[_above(root)])
+    for root, listed in by_root.items():
+        listed += _beside(root, listed, near[_above(root)])
     return tuple(
-        ArchivedRecording(root, surveys.get(root, (".",)), tuple(sorted(held[root], key=lambda f: f.path)))
-        for root in sorted(held)
+        ArchivedRecording(root, surveys.get(root, (".",)), tuple(sorted(by_root[root], key=lambda f: f.path)))
+        for root in sorted(by_root)
     )
 
 
@@ -200,13 +202,13 @@ def download(archive: Objects, name: str, passes: tuple[str, ...], folder: Path)
     """
     recording = ArchivedRecording(name, passes, ())
     is_file = PurePosixPath(name).suffix in _BAGS
-    own = [StoredObject(name, 0, "")] if is_file else list(archive.list(name))
-    own += _beside(name, own, archive.list_folder(_above(name)))
-    expect_own(archive, name, own)
-    if not own:
+    files = [StoredObject(name, 0, "")] if is_file else list(archive.list(name))
+    files += _beside(name, files, archive.list_folder(_above(name)))
+    expect_own(archive, name, files)
+    if not files:
         raise InputError(f"{archive.url}/{name}", "is gone", "plan the archive again")
     root = folder / (PurePosixPath(name).name or "recording")
-    for file in own:
+    for file in files:
         inner = PurePosixPath("" if file.path == name else recording.relative(file))
         is_beside = inner.parts[:1] == ("..",)
         if _UNREAD & set(inner.parts[:-1]) or ".." in inner.parts[is_beside:]:

@@ -86,7 +86,7 @@ def run_all(
     running = as_completed(loop=client.loop)
     is_more = True
     while True:
-        with _told(client):
+        with _translated_errors(client):
             while is_more and running.count() < ahead * slots(client) and may_go_on():
                 task = next(waiting, None)
                 is_more = task is not None
@@ -99,7 +99,7 @@ def run_all(
                 running.thread_condition.wait(LOOK_S)
         while running.has_ready():
             future = next(running)
-            with _told(client):
+            with _translated_errors(client):
                 ended = future.result() if future.status == "finished" else None
             if isinstance(ended, Exception):
                 raise ended
@@ -108,7 +108,7 @@ def run_all(
 
 
 @contextmanager
-def _told(client: Any) -> Iterator[None]:
+def _translated_errors(client: Any) -> Iterator[None]:
     """Turn the errors that Dask raises after its scheduler has died into one line."""
     address = client.scheduler.address if client.scheduler else "the scheduler"
     try:

@@ -101,7 +101,7 @@ def note_missing(store: Store, results: Objects, by: str, wanted: set[str]) -> i
 def parked_reasons(results: Objects, tasks: list[FleetTask]) -> list[tuple[FleetTask, str]]:
     """List the parked tasks, each with its reason."""
     keys = parked_keys(results)
-    told = []
+    parked = []
     for task in tasks:
         if task.key in keys:
             note = results.read_json(f"parked/{task.key}.json", PARKED)
@@ -109,5 +109,5 @@ def parked_reasons(results: Objects, tasks: list[FleetTask]) -> list[tuple[Fleet
                 raise InputError(
                     f"{results.url}/parked/{task.key}.json", "is gone", "ask for the status again"
                 )
-            told.append((task, str(note["reason"])))
-    return told
+            parked.append((task, str(note["reason"])))
+    return parked

@@ -104,9 +104,9 @@ def publish(results: Objects, mine: HeldRecording, content: dict[str, Any]) -> b
 
 def discard(results: Objects, mine: HeldRecording, *, is_ours: bool) -> None:
     """Remove the files of a key's other tries if this one was published, otherwise those of this one."""
-    own = f"files/{mine.key}/{mine.token}/"
+    prefix = f"files/{mine.key}/{mine.token}/"
     for one in list(results.list(f"files/{mine.key}/")):
-        if one.path.startswith(own) is not is_ours:
+        if one.path.startswith(prefix) is not is_ours:
             results.remove(one.path)
 
 

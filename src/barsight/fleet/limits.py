@@ -55,8 +55,8 @@ def run_limited(
             while process.poll() is None:
                 peak = max(peak, _resident(process.pid))
                 if peak > memory_gib * GIB:
-                    told = f"took {peak / GIB:.2f} GiB of memory, {memory_gib:g} GiB are allowed"
-                    return Failed("over-memory", told)
+                    reason = f"took {peak / GIB:.2f} GiB of memory, {memory_gib:g} GiB are allowed"
+                    return Failed("over-memory", reason)
                 if time.monotonic() - started > timeout_s:
                     return Failed("timeout", f"did not end in {timeout_s:g} s")
                 with contextlib.suppress(subprocess.TimeoutExpired):

@@ -184,8 +184,8 @@ class _told:  # noqa: N801
         if isinstance(error, BaseError) or (isinstance(error, OSError) and error.errno is None):
             problem = _first_line(error)
             if self.writes:
-                told = f"{self.name}: can't be written ({problem}); free some space or set its keys"
-                raise OutputError(told) from error
+                message = f"{self.name}: can't be written ({problem}); free some space or set its keys"
+                raise OutputError(message) from error
             raise UnreachableError(
                 self.name, f"can't be reached ({problem})", "see that it is there and its keys are set"
             ) from error

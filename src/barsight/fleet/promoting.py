@@ -103,14 +103,14 @@ def _fetch(results: Objects, key: str, out: Path) -> None:
     if note is None:
         raise InputError(f"{results.url}/results/{key}/result.json", "is gone", "run the version again")
     with atomic_directory(out) as staging:
-        for name, told in note["files"].items():
+        for name, stated in note["files"].items():
             path, digest, size = f"files/{key}/{note['token']}/{name}", hashlib.sha256(), 0
             with (staging / Path(name).name).open("wb") as stream:
                 for part in results.chunks(path):
                     size += len(part)
-                    if size > told["bytes"]:
+                    if size > stated["bytes"]:
                         break
                     digest.update(part)
                     stream.write(part)
-            if size != told["bytes"] or digest.hexdigest() != told["sha256"]:
+            if size != stated["bytes"] or digest.hexdigest() != stated["sha256"]:
                 raise InputError(f"{results.url}/{path}", "was changed after it was published", REMEDY)

@@ -105,12 +105,12 @@ def compare_recording(results: Objects, name: str, before: str, after: str) -> R
         _change(name, i, figure, bundles[0][i], bundles[1][j]) for i, j in pairs.items() for figure in FIGURES
     )
     (whole, forbidden), (whole_after, forbidden_after) = (_vetoes(results, folder) for folder in folders)
-    told = [f"+{code}" for code in sorted(whole_after - whole)]
-    told += [f"-{code}" for code in sorted(whole - whole_after)]
+    changed = [f"+{code}" for code in sorted(whole_after - whole)]
+    changed += [f"-{code}" for code in sorted(whole - whole_after)]
     codes = (forbidden.keys() | forbidden_after.keys()) - whole - whole_after
     return RecordingComparison(
         name, changes, tuple(sorted(bundles[0].keys() - pairs.keys())),
-        tuple(sorted(bundles[1].keys() - set(pairs.values()))), tuple(told),
+        tuple(sorted(bundles[1].keys() - set(pairs.values()))), tuple(changed),
         {code: (forbidden[code], forbidden_after[code]) for code in sorted(codes)},
         {figure: _half_widths(figure, *bundles) for figure in FIGURES} if all(bundles) else {},
         (notes[0]["measured_s"], notes[1]["measured_s"]),
@@ -134,8 +134,8 @@ def _figures(one: dict[str, Any]) -> dict[str, float]:
     x_m, y_m, _ = one["axis_centre_m"]
     figures = {"x_m": x_m, "y_m": y_m, **{name: one[name] for name in FIGURES[2:]}}
     sigmas = {
-        "x_m": math.hypot(_share(along, ahead_x), _share(across, ahead_y)),
-        "y_m": math.hypot(_share(along, ahead_y), _share(across, ahead_x)),
+        "x_m": math.hypot(_projected(along, ahead_x), _projected(across, ahead_y)),
+        "y_m": math.hypot(_projected(along, ahead_y), _projected(across, ahead_x)),
         **{name: sigma[name] for name in FIGURES[2:]},
     }
     figures |= {f"{name} sigma": one for name, one in sigmas.items() if one is not None and one < math.inf}
@@ -144,7 +144,7 @@ def _figures(one: dict[str, Any]) -> dict[str, float]:
     return {f"{name} sigma": math.inf for name in FIGURES} | figures
 
 
-def _share(sigma: float, cosine: float) -> float:
+def _projected(sigma: float, cosine: float) -> float:
     return sigma * abs(cosine) if cosine else 0.0
 
 

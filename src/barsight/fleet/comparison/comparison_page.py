@@ -46,12 +46,12 @@ def _other(findings: Findings) -> list[RecordingComparison]:
     """List the recordings with other vetoes of the map, other numbers of lifts offered, or bundles of only
     one version, those with most vetoes and bundles first.
     """
-    told = [
+    listed = [
         one for one in findings.recordings
         if one.vetoes or len(set(one.lifts.get("offered", ()))) > 1 or one.only_before or one.only_after
     ]  # fmt: skip
-    told.sort(key=lambda one: -len(one.vetoes) - len(one.only_before) - len(one.only_after))
-    return told[:MAX_LISTED]
+    listed.sort(key=lambda one: -len(one.vetoes) - len(one.only_before) - len(one.only_after))
+    return listed[:MAX_LISTED]
 
 
 def comparison_page(findings: Findings, pictures: dict[str, tuple[str, str]]) -> str:
@@ -114,8 +114,8 @@ def _offered(one: RecordingComparison) -> str:
 def _intervals(findings: Findings) -> list[tuple[str, ...]]:
     rows = list[tuple[str, ...]]()
     for figure in FIGURES:
-        told = [one.intervals[figure] for one in findings.recordings if one.intervals]
-        known = [(before, after) for before, after in told if before is not None and after is not None]
+        intervals = [one.intervals[figure] for one in findings.recordings if one.intervals]
+        known = [(before, after) for before, after in intervals if before is not None and after is not None]
         means = (f"{mean(one[side] for one in known):.4f}" if known else "not known" for side in (0, 1))
         rows.append((figure, *means, str(len(known))))
     return rows
