@@ -88,15 +88,15 @@ def measured(
     e = dict(zip(ERRORS, errors.T, strict=True))
     if targets_m is not None:
         e |= _with_frame_found(targets_m, view, frame_origin_m, e)
-    way = np.array([-np.sin(load.yaw_rad), np.cos(load.yaw_rad), 0.0])
+    direction = np.array([-np.sin(load.yaw_rad), np.cos(load.yaw_rad), 0.0])
     ends = [
-        _placed(load.top_m + share * load.length_m * way, load.top_m, view, frame_origin_m, e)
+        _placed(load.top_m + share * load.length_m * direction, load.top_m, view, frame_origin_m, e)
         for share in (-0.5, 0.5)
     ]
     middle, along = (ends[0] + ends[1]) / 2, ends[1] - ends[0]
     yaw = np.arctan2(-along[:, 0], along[:, 1]) + e["fit_yaw"]
-    across = np.array([way[1], -way[0], 0.0])
-    place = middle + e["fit_along"][:, None] * way + e["fit_across"][:, None] * across
+    across = np.array([direction[1], -direction[0], 0.0])
+    place = middle + e["fit_along"][:, None] * direction + e["fit_across"][:, None] * across
     place[:, 2] += e["fit_top"]
     scale = np.linalg.norm(along, axis=1) / load.length_m
     magnet = np.column_stack([e["magnet_x"], e["magnet_y"], e["magnet_z"]])

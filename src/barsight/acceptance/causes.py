@@ -135,8 +135,8 @@ def _best_cause(rows: Sequence[_Row]) -> Cause | None:
         gains[one.name] = healthy - chi2
         rare = float(chi_square.logsf(healthy - chi2, 1))
         if rare < rarest:
-            told = one.scale * float(value[k]), one.scale * float(sigma[k])
-            best, rarest = Cause(one.name, *told, one.unit, healthy - chi2), rare
+            estimate = one.scale * float(value[k]), one.scale * float(sigma[k])
+            best, rarest = Cause(one.name, *estimate, one.unit, healthy - chi2), rare
     for name in names:
         others = np.array([row.artefact != name for row in rows])
         chi2, _, _ = _solved(design[others], error[others], 1 / ordinary**2)
@@ -144,8 +144,8 @@ def _best_cause(rows: Sequence[_Row]) -> Cause | None:
         if rare < rarest:
             off = [1e3 * row.error for row in rows if row.artefact == name]
             sigma_mm = max(1e3 * row.sigma for row in rows if row.artefact == name)
-            told = float(max(off, key=abs)), sigma_mm
-            best, rarest = Cause(f"{name} stands elsewhere", *told, "mm", healthy - chi2), rare
+            estimate = float(max(off, key=abs)), sigma_mm
+            best, rarest = Cause(f"{name} stands elsewhere", *estimate, "mm", healthy - chi2), rare
     if best is None or best.name not in gains:
         return best
     alike = (name for name, gain in gains.items() if name != best.name and gain > best.chi2 - ALIKE)
@@ -170,8 +170,8 @@ def _artefact_rows(plan: AcceptancePlan, view: Observation) -> Iterator[_Row]:
         if not isinstance(found, Failed):
             place = np.array([plate.x_m, plate.y_m, plate.z_m])
             noise = np.hypot(1e-3 * PLATE_MM, PLATE_PX * view.view.px_m(plate.z_m))
-            error, own = found.z_m - plate.z_m, float(np.hypot(noise, plate.sigma_m))
-            yield _Row(plate.name, error, own, _moves(view.view, place)[2])
+            error, sigma_m = found.z_m - plate.z_m, float(np.hypot(noise, plate.sigma_m))
+            yield _Row(plate.name, error, sigma_m, _moves(view.view, place)[2])
     for sphere in plan.sphere:
         seen = view.spheres[sphere.name]
         if isinstance(seen, Failed) or sphere.place_sigma_m is None:
@@ -180,9 +180,9 @@ def _artefact_rows(plan: AcceptancePlan, view: Observation) -> Iterator[_Row]:
         noise = np.hypot(1e-3 * PLACE_MM, PLACE_PX * (view.view.camera_m[2] - place[2]) / view.view.focal_px)
         noises = [noise, noise, np.hypot(1e-3 * SPHERE_MM, SPHERE_PX * view.view.px_m(place[2]))]
         for k, answer in enumerate(_moves(view.view, place)):
-            own = float(np.hypot(noises[k], sphere.place_sigma_m))
+            sigma_m = float(np.hypot(noises[k], sphere.place_sigma_m))
             answer[-1] = -1.0 if k == 2 else 0.0
-            yield _Row(sphere.name, float(seen.centre_m[k] - place[k]), own, answer)
+            yield _Row(sphere.name, float(seen.centre_m[k] - place[k]), sigma_m, answer)
     known = {s.name: s for s in plan.sphere}
     for bar in plan.sphere_bar:
         ends = [known[name] for name in bar.spheres]
@@ -192,8 +192,8 @@ def _artefact_rows(plan: AcceptancePlan, view: Observation) -> Iterator[_Row]:
         first, second = (np.array([e.x_m, e.y_m, e.z_m]) for e in ends)
         a, b = both
         assert not isinstance(a, Failed) and not isinstance(b, Failed)
-        way = (second - first) / np.linalg.norm(second - first)
-        answer = way @ (_moves(view.view, second) - _moves(view.view, first))
+        direction = (second - first) / np.linalg.norm(second - first)
+        answer = direction @ (_moves(view.view, second) - _moves(view.view, first))
         error = float(np.linalg.norm(b.centre_m - a.centre_m)) - bar.length_m * plan.conditions.expansion
         yield _Row(bar.name, error, float(np.hypot(2e-3 * PLACE_MM, bar.sigma_m)), answer)
 

@@ -150,11 +150,11 @@ def _write_done(folder: Path, done: Sequence[DoneStep]) -> None:
     write_sealed(json_value(content), folder / RECORD)
 
 
-def _digest(folder: Path, names: Sequence[str], told: Sequence[object] = ()) -> str:
+def _digest(folder: Path, names: Sequence[str], settings: Sequence[object] = ()) -> str:
     """Compute a digest of settings, files and folders. Of pictures, point clouds and files of 16 MiB or more,
     only the size is used.
     """
-    found: list[object] = [json_value(one) for one in told]
+    found: list[object] = [json_value(one) for one in settings]
     for name in names:
         path = folder / name
         for file in sorted(path.rglob("*")) if path.is_dir() else [path]:

@@ -112,12 +112,12 @@ def measured_load(
     return MeasuredLoad(bundle.id, load, view, below, tuple(sources), tuple(assumed), targets)
 
 
-def _expect_own(path: Path, told: dict[str, Any], other: dict[str, Any], whose: str = "the folder") -> None:
+def _expect_own(path: Path, stated: dict[str, Any], other: dict[str, Any], whose: str = "the folder") -> None:
     """Raise InputError where a file belongs to another rig or yard frame than the data it is used with."""
     for name in ("calibration_id", "yard_frame_id"):
-        if told.get(name) != other.get(name):
+        if stated.get(name) != other.get(name):
             what = name.removesuffix("_id").replace("_", " ")
-            problem = f"is of another {what} ({told.get(name)}; {whose} has {other.get(name)})"
+            problem = f"is of another {what} ({stated.get(name)}; {whose} has {other.get(name)})"
             raise InputError(path, problem, "accept this rig in this yard frame, and touch down with it")
 
 
@@ -125,13 +125,13 @@ def _rig_source(summary: dict[str, Any], path: Path, focal_px: float, assumed: l
     """Form the rig's source from the uncertainty left by rig file and travel, or else from the assumed
     settings.
     """
-    name, told = "calibration of the cameras", summary.get("rig_uncertainty")
+    name, stated = "calibration of the cameras", summary.get("rig_uncertainty")
     try:
-        if told is not None:
+        if stated is not None:
             sigma = np.array(
-                [np.radians(told["yaw_deg"]), told["baseline_ratio"], told["focal_ratio"]], float
+                [np.radians(stated["yaw_deg"]), stated["baseline_ratio"], stated["focal_ratio"]], float
             )
-            covariance = np.outer(sigma, sigma) * np.array(told["correlation"], float).reshape(3, 3)
+            covariance = np.outer(sigma, sigma) * np.array(stated["correlation"], float).reshape(3, 3)
         else:
             sigma_px = float(summary["configuration"]["stereo"]["calibration_sigma_px"])
             covariance = np.array([[(sigma_px / focal_px) ** 2]])
@@ -139,7 +139,7 @@ def _rig_source(summary: dict[str, Any], path: Path, focal_px: float, assumed: l
         raise InputError(path, "doesn't say how sure the rig's calibration is", REMEDY) from error
     if not (np.isfinite(covariance).all() and (np.diag(covariance) <= MAX_SIGMA_RATIO**2).all()):
         raise InputError(path, "what it says of the rig's calibration is impossible", REMEDY)
-    if told is not None:
+    if stated is not None:
         by = "the rig file's covariance, and the travel"
         return ErrorSource(name, ("yaw", "baseline", "focal"), covariance, by)
     assumed.append("no rig file with a covariance was used: baseline and focal length are taken as right")
@@ -173,7 +173,7 @@ def fit_sources(
     views = float(np.median(part.views[known])) if known.any() else 1.0
     cell_m = float(np.median(part.sigma_m[known])) if known.any() else nan
     sigma, fit, free = bundle.sigma, bundle.fit_sigma or bundle.sigma, max(views - 1, 1.0)
-    told = {
+    sigmas = {
         "fit_along": (sigma.along_m, fit.along_m, 0.0),
         "fit_across": (sigma.lateral_m, fit.lateral_m, shared_m[0]),
         "fit_top": (sigma.top_z_m, fit.top_z_m, shared_m[1]),
@@ -181,7 +181,7 @@ def fit_sources(
     }  # fmt: skip
     mass_kg = bundle_mass(bundle).sigma_kg
     sources = [_fit_source("fit_mass", mass_kg**2, free)]
-    for name, (whole, alone, shared) in told.items():
+    for name, (whole, alone, shared) in sigmas.items():
         own = alone**2 if np.isnan(alone) else max(alone**2 - shared**2, 0.0)
         sources.append(_fit_source(name, own, free))
         rest = whole**2 - alone**2
@@ -200,8 +200,8 @@ def _fit_source(name: str, variance: float, free: float) -> ErrorSource:
 def _shared_m(summary: dict[str, Any], path: Path) -> tuple[float, float]:
     """Read the assumed sigmas of errors common to all heights of a bundle, lateral and vertical."""
     try:
-        told = summary["configuration"]["bundles"]
-        return float(told["shared_lateral_m"]), float(told["shared_height_m"])
+        settings = summary["configuration"]["bundles"]
+        return float(settings["shared_lateral_m"]), float(settings["shared_height_m"])
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(path, "doesn't say bundles.shared_lateral_m and shared_height_m", REMEDY) from error
 
@@ -279,16 +279,16 @@ def touched_offset(certificate: Path) -> MagnetOffset:
     number, widened so that two sigma cover 95.45 % by Student's t. Raises InputError where the certificate is
     unsuitable.
     """
-    told, touches = read_certificate(certificate), _touch_errors_m(certificate)
+    content, touches = read_certificate(certificate), _touch_errors_m(certificate)
     try:
-        _expect_sound(certificate, told)
-        rows = [row for row in told["quantities"] if row["group"] == "touch_mm"]
+        _expect_sound(certificate, content)
+        rows = [row for row in content["quantities"] if row["group"] == "touch_mm"]
         own_m = 1e-3 * max((float(row["uncertainty"]["sigma"]) for row in rows), default=0.0)
-        ids = str(told["calibration_id"]), str(told["yard_frame_id"])
+        ids = str(content["calibration_id"]), str(content["yard_frame_id"])
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(certificate, f"is damaged ({type(error).__name__}: {error})", OTHER) from error
-    told_by = [_mean_touch_m(certificate, axis, touches.get(axis, []), own_m) for axis in "xyz"]
-    (x, x_sigma), (y, y_sigma), (z, z_sigma) = told_by
+    errors_m = [_mean_touch_m(certificate, axis, touches.get(axis, []), own_m) for axis in "xyz"]
+    (x, x_sigma), (y, y_sigma), (z, z_sigma) = errors_m
     max_m = max(abs(x), abs(y), abs(z))
     if max_m > MAX_OFFSET_M:
         problem = f"the magnet hangs {1e3 * max_m:.0f} mm off: that is the rig's lever arm"
@@ -296,16 +296,16 @@ def touched_offset(certificate: Path) -> MagnetOffset:
     return MagnetOffset(x, y, z, x_sigma, y_sigma, z_sigma, *ids)
 
 
-def _expect_sound(certificate: Path, told: dict[str, Any]) -> None:
+def _expect_sound(certificate: Path, content: dict[str, Any]) -> None:
     """Raise InputError where the rig wasn't accepted (touch-downs aside) or an offset was already
     subtracted.
     """
-    if told.get("magnet_offset") is not None:
+    if content.get("magnet_offset") is not None:
         raise InputError(certificate, "was made with a magnet's offset", "accept without --magnet first")
-    wrong = [str(one["name"]) for one in told["causes"]]
+    wrong = [str(one["name"]) for one in content["causes"]]
     wrong += [
         str(row["name"])
-        for row in told["quantities"]
+        for row in content["quantities"]
         if row["group"] != "touch_mm" and row["decision"] != "passed"
     ]
     if wrong:

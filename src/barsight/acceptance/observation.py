@@ -118,6 +118,6 @@ def view_geometry(folder: Path, rig: StereoRig) -> ViewGeometry:
     if path is None:
         raise InputError(folder, "has no trajectory.tum", "measure the recording again")
     lever = rig.body_from_cam0.translation.copy()
-    turned = Rotation.from_quat(path.quaternion_xyzw).apply(lever)
+    levers_m = Rotation.from_quat(path.quaternion_xyzw).apply(lever)
     camera = Rectifier(rig).camera
-    return ViewGeometry((path.position_m + turned).mean(axis=0), camera.focal_px, camera.baseline_m)
+    return ViewGeometry((path.position_m + levers_m).mean(axis=0), camera.focal_px, camera.baseline_m)

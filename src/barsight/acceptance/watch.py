@@ -131,13 +131,13 @@ def rig_figures(check: RigCheck) -> tuple[WatchedFigure, ...]:
         for line in check.lines
         if isfinite(line.value) and isfinite(line.sigma) and not line.name.startswith("yaw")
     ]
-    told = []
+    estimates = []
     if not isinstance(check.rows, Failed):
-        told.append((float(check.rows.values[3]), float(check.rows.sigmas[3])))
+        estimates.append((float(check.rows.values[3]), float(check.rows.sigmas[3])))
     if not isinstance(check.drift, Failed):
-        told.append((check.drift.yaw_rad, check.drift.yaw_sigma_rad))
-    if told:
-        values, sigmas = np.degrees(np.array(told).T)
+        estimates.append((check.drift.yaw_rad, check.drift.yaw_sigma_rad))
+    if estimates:
+        values, sigmas = np.degrees(np.array(estimates).T)
         weight = sigmas**-2.0
         yaw = float((weight * values).sum() / weight.sum())
         figures.append(WatchedFigure("yaw / deg", yaw, float(weight.sum() ** -0.5)))
@@ -269,5 +269,5 @@ def with_survey(record: WatchRecord, survey: WatchedSurvey, path: Path) -> Watch
 
 def _survey(one: dict[str, Any]) -> WatchedSurvey:
     figures = tuple(WatchedFigure(**figure) for figure in one["figures"])
-    told = one["recording"], one["recording_id"], one["calibration_id"]
-    return WatchedSurvey(*told, figures, one.get("yard_frame_id"))
+    identity = one["recording"], one["recording_id"], one["calibration_id"]
+    return WatchedSurvey(*identity, figures, one.get("yard_frame_id"))
