@@ -35,7 +35,7 @@ def _detect_checkerboard(board: Board, image: UInt8) -> Corners | Failed:
     corners = _chessboard_corners(image, size)
     if corners is None:
         return Failed(
-            "no-board", f"no {size[0]}x{size[1]} checkerboard found{_told(_shown_size(board, image))}"
+            "no-board", f"no {size[0]}x{size[1]} checkerboard found{_remark(_shown_size(board, image))}"
         )
     grid = corners.reshape(board.rows, board.columns, 2)
     if not _is_grid(grid):
@@ -44,7 +44,7 @@ def _detect_checkerboard(board: Board, image: UInt8) -> Corners | Failed:
     if _goes_on(image, grid):
         shown = _shown_size(board, image)
         if shown is not None and shown[0] * shown[1] > size[0] * size[1]:
-            return Failed("no-board", f"no {size[0]}x{size[1]} checkerboard found{_told(shown)}")
+            return Failed("no-board", f"no {size[0]}x{size[1]} checkerboard found{_remark(shown)}")
     grid = _canonical(board, grid, image)
     ids = np.arange(board.rows * board.columns)
     return Corners(ids, grid.reshape(-1, 2), edge_width(image, grid))
@@ -201,5 +201,5 @@ def _shown_size(board: Board, image: UInt8) -> tuple[int, int] | None:
     return None if is_part else (columns, rows)
 
 
-def _told(shown: tuple[int, int] | None) -> str:
+def _remark(shown: tuple[int, int] | None) -> str:
     return "" if shown is None else f"; the picture shows one of {shown[0]}x{shown[1]} inner corners"

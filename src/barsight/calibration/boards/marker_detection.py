@@ -66,11 +66,11 @@ def detect_aprilgrid(board: Board, image: UInt8) -> Corners | Failed:
         note = f", {strange} of another board" if strange else ""
         return Failed("no-board", f"no AprilGrid found ({numbers.size} tags{note}; {FEWEST_TAGS} are needed)")
     corners = board.points_m.reshape(-1, 4, 3)[numbers, :, :2]
-    turned = _turn(corners, quads)
-    if isinstance(turned, Failed):
-        return turned
+    ordered = _turn(corners, quads)
+    if isinstance(ordered, Failed):
+        return ordered
     ids = (4 * numbers[:, None] + np.arange(4)).ravel()
-    pixels = _refine(image, turned)
+    pixels = _refine(image, ordered)
     return Corners(ids, pixels.reshape(-1, 2))
 
 

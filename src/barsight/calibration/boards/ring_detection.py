@@ -36,11 +36,11 @@ def ring_codes() -> tuple[int, ...]:
     """List the codes, each as the smallest of its rotations. They have 4, 6 or 8 dark sectors, so a single
     misread sector never yields another code.
     """
-    smallest = sorted({min(_turned(code, by) for by in range(SECTORS)) for code in range(1 << SECTORS)})
+    smallest = sorted({min(_rotated(code, by) for by in range(SECTORS)) for code in range(1 << SECTORS)})
     return tuple(code for code in smallest if code.bit_count() in (4, 6, 8))
 
 
-def _turned(code: int, by: int) -> int:
+def _rotated(code: int, by: int) -> int:
     return (code >> by | code << (SECTORS - by)) & ((1 << SECTORS) - 1)
 
 
@@ -172,7 +172,7 @@ def _number(image: Float32, ellipse: Float64) -> int | None:
     if (np.maximum(read, 1 - read) < MIN_AGREE).any():
         return None
     code = int(((read > 0.5) * (1 << np.arange(SECTORS))).sum())
-    smallest = min(_turned(code, by) for by in range(SECTORS))
+    smallest = min(_rotated(code, by) for by in range(SECTORS))
     return ring_codes().index(smallest) if smallest in ring_codes() else None
 
 

@@ -168,8 +168,8 @@ def _without_knocks(
     rows = solution.linearised.samples.residual[-track.time_s.size :]
     window = np.ones(KNOCK_SAMPLES) / KNOCK_SAMPLES
     factors = []
-    for own in (slice(0, 3), slice(3, 6)):
-        scatter = np.sqrt(np.convolve((rows[:, own] ** 2).mean(axis=1), window, mode="same"))
+    for axes in (slice(0, 3), slice(3, 6)):
+        scatter = np.sqrt(np.convolve((rows[:, axes] ** 2).mean(axis=1), window, mode="same"))
         ratio = scatter / np.median(scatter)
         factors.append(np.where(ratio > KNOCK_FACTOR, ratio, 1.0))
     problem = replace(problem, imu=replace(track, gyro_loose=factors[0], accel_loose=factors[1]))

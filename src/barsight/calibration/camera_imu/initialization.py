@@ -100,7 +100,7 @@ def align_gyro(way: CameraPoses, time_s: Float64, gyro_radps: Float64) -> GyroAl
     best: GyroAlignment | None = None
     for span in (0.05, 0.01, 0.002):
         for trial in shift + span * np.linspace(-1, 1, 11):
-            found = _turned(rate, early + trial, late + trial, time_s, integral, trial)
+            found = _rotation_between(rate, early + trial, late + trial, time_s, integral, trial)
             if found is not None and (best is None or found.correlation > best.correlation):
                 best = found
         shift = shift if best is None else best.shift_s
@@ -190,7 +190,7 @@ def _by_speed(rate: Float64, early: Float64, late: Float64, time_s: Float64, int
     return best_shift
 
 
-def _turned(
+def _rotation_between(
     rate: Float64, early: Float64, late: Float64, time_s: Float64, integral: Float64, shift_s: float
 ) -> GyroAlignment | None:
     """Estimate the rotation that aligns both turn rates [Arun 1987], with outliers removed in a second

@@ -94,14 +94,14 @@ def fit_spline(
     spline cuts corners, as a B-spline does; a least-squares solve that starts from it corrects this.
     """
     count = int(np.ceil(end_s / step_s)) + DEGREE
-    own = (np.arange(count) - (ORDER - 2) / 2) * step_s
-    own = np.clip(own, times_s[0], times_s[-1])
-    after = np.clip(np.searchsorted(times_s, own), 1, times_s.size - 1)
-    share = (own - times_s[after - 1]) / (times_s[after] - times_s[after - 1])
+    centre_s = (np.arange(count) - (ORDER - 2) / 2) * step_s
+    centre_s = np.clip(centre_s, times_s[0], times_s[-1])
+    after = np.clip(np.searchsorted(times_s, centre_s), 1, times_s.size - 1)
+    share = (centre_s - times_s[after - 1]) / (times_s[after] - times_s[after - 1])
     between = Rotation.from_matrix(rotations[after - 1].transpose(0, 2, 1) @ rotations[after]).as_rotvec()
-    turned = rotations[after - 1] @ Rotation.from_rotvec(between * share[:, None]).as_matrix()
-    placed = np.column_stack([np.interp(own, times_s, places_m[:, i]) for i in range(3)])
-    return PoseSpline(start_ns, step_s, turned, placed, np.zeros((count, 3)), np.zeros((count, 3)))
+    control_rotations = rotations[after - 1] @ Rotation.from_rotvec(between * share[:, None]).as_matrix()
+    placed = np.column_stack([np.interp(centre_s, times_s, places_m[:, i]) for i in range(3)])
+    return PoseSpline(start_ns, step_s, control_rotations, placed, np.zeros((count, 3)), np.zeros((count, 3)))
 
 
 def locate(times_s: Float64, step_s: float, segments: int) -> tuple[Int64, Float64]:

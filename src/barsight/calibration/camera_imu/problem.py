@@ -226,9 +226,9 @@ def retract_state(state: CameraImuState, chain: Float64, common: Float64) -> Cam
     """Retract a step, chain (M, 12) and common (P,), onto `state`."""
     mounts = []
     for number, mount in enumerate(state.mounts):
-        own = common[number * MOUNT : (number + 1) * MOUNT]
-        turn = Rotation.from_rotvec(own[:3]).as_matrix()
-        mounts.append(Mount(turn @ mount.rotation, mount.place_m + own[3:6], mount.shift_s + float(own[6])))
+        step = common[number * MOUNT : (number + 1) * MOUNT]
+        turn = Rotation.from_rotvec(step[:3]).as_matrix()
+        mounts.append(Mount(turn @ mount.rotation, mount.place_m + step[3:6], mount.shift_s + float(step[6])))
     rest = common[MOUNT * len(mounts) :]
     turn = Rotation.from_rotvec(tangent_basis(state.gravity_mps2) @ rest[:2]).as_matrix()
     state = replace(

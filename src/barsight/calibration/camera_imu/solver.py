@@ -95,11 +95,11 @@ def solve_camera_imu(problem: CameraImuProblem, start: CameraImuState, huber: fl
     Raises LinAlgError where the body's trajectory is not determined.
     """
     found = minimise(_CameraImuIterate(problem, huber, start), OPTIONS)
-    state, here = found.best.state, found.best.here
+    state, linearised = found.best.state, found.best.here
     if huber is not None:
-        here = linearise_camera_imu(problem, state, None)
-    eliminated = eliminate(assemble(here.samples, here.walks, len(state.spline.places_m)))
-    return Solution(state, here, eliminated, found.steps, found.converged)
+        linearised = linearise_camera_imu(problem, state, None)
+    eliminated = eliminate(assemble(linearised.samples, linearised.walks, len(state.spline.places_m)))
+    return Solution(state, linearised, eliminated, found.steps, found.converged)
 
 
 def sensor_spreads(

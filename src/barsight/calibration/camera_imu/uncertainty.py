@@ -132,8 +132,8 @@ class _FreedSystem:
 
 def _freed_system(problem: CameraImuProblem, solution: Solution) -> _FreedSystem:
     freed = replace(problem, scales=True, lenses=True)
-    here = linearise_camera_imu(freed, solution.state, None)
-    system = assemble(here.samples, here.walks, len(solution.state.spline.places_m))
+    linearised = linearise_camera_imu(freed, solution.state, None)
+    system = assemble(linearised.samples, linearised.walks, len(solution.state.spline.places_m))
     whole: EliminatedChain = eliminate(system)
     gradient = system.common_gradient - np.einsum("np,n->p", whole.through, system.chain_gradient)
     names = freed.parameter_names

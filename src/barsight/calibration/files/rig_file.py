@@ -67,8 +67,8 @@ def read_serials(path: Path) -> tuple[str | None, str | None]:
 
 
 def _serial(section: object) -> str | None:
-    told = section.get("serial") if isinstance(section, Mapping) else None
-    return None if told is None else str(told)
+    serial = section.get("serial") if isinstance(section, Mapping) else None
+    return None if serial is None else str(serial)
 
 
 def read_covariance(path: Path) -> tuple[tuple[str, ...], Float64] | None:

@@ -80,9 +80,9 @@ class AdjustmentResult:
     @property
     def rig_information(self) -> Float64:
         """Return the part of `reduced` for lenses and rig, with the board's shape eliminated."""
-        own = self.reduced.shape[0] - self.state.shape.size
-        mixed = self.reduced[:own, own:]
-        return self.reduced[:own, :own] - mixed @ np.linalg.solve(self.reduced[own:, own:], mixed.T)
+        count = self.reduced.shape[0] - self.state.shape.size
+        mixed = self.reduced[:count, count:]
+        return self.reduced[:count, :count] - mixed @ np.linalg.solve(self.reduced[count:, count:], mixed.T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,9 +198,9 @@ def _linearise(
             board_gradient[view] += wb.T @ r
         residuals.append(residual)
     whole, pull = common.sum(axis=0), gradient.sum(axis=0)
-    own = np.arange(size - shape, size)
-    whole[own, own] += SHAPE_PX**2
-    pull[own] -= SHAPE_PX**2 * state.shape
+    of_shape = np.arange(size - shape, size)
+    whole[of_shape, of_shape] += SHAPE_PX**2
+    pull[of_shape] -= SHAPE_PX**2 * state.shape
     return _Normal(
         cost, tuple(residuals), whole, pull, mixed, boards,
         board_gradient, common, gradient,
@@ -214,10 +214,10 @@ def _derivatives(
     parameters (N, 2, C) and of the board (N, 2, 6).
     """
     rotation = state.board_rotation[observed.view]
-    turned = np.einsum("nij,nj->ni", rotation, observed.points_m + observed.by_shape @ state.shape)
+    rotated = np.einsum("nij,nj->ni", rotation, observed.points_m + observed.by_shape @ state.shape)
     by_shape = rotation @ observed.by_shape
-    point = turned + state.board_translation_m[observed.view]
-    by_board = np.concatenate([-skew(turned), np.broadcast_to(np.eye(3), (len(point), 3, 3))], axis=2)
+    point = rotated + state.board_translation_m[observed.view]
+    by_board = np.concatenate([-skew(rotated), np.broadcast_to(np.eye(3), (len(point), 3, 3))], axis=2)
     if camera == 1:
         rig_turned = point @ state.rotation.T
         point = rig_turned + state.translation_m

@@ -269,9 +269,9 @@ def _finish(
     except ValueError as error:
         raise CalibrationError(source, str(error), "check the pictures' order and the board") from None
     names = parameter_names(lens)
-    own = len(names)
+    count = len(names)
     return StereoCalibration(
         source, board, lens, rig, solved.state, tuple(kept), observed, tuple(removed),
-        solved.residuals_px, sigma, correlation, names, covariance[:own, :own], solved.rig_information,
-        board_shape(board, solved.state.shape, covariance[own:, own:]), alone,
+        solved.residuals_px, sigma, correlation, names, covariance[:count, :count], solved.rig_information,
+        board_shape(board, solved.state.shape, covariance[count:, count:]), alone,
     )  # fmt: skip

@@ -119,6 +119,6 @@ def _moved(rig: StereoRig, names: tuple[str, ...], number: int, step: float) -> 
     change = np.zeros(6)
     change[("rx_rad", "ry_rad", "rz_rad", "tx_m", "ty_m", "tz_m").index(name)] = step
     old = rig.cam0_from_cam1.inverse()
-    turned = Rotation.from_rotvec(change[:3]).as_matrix() @ old.rotation
-    cam1_from_cam0 = Pose("cam1", "cam0", turned, old.translation + change[3:])
+    rotation = Rotation.from_rotvec(change[:3]).as_matrix() @ old.rotation
+    cam1_from_cam0 = Pose("cam1", "cam0", rotation, old.translation + change[3:])
     return replace(rig, body_from_cam1=rig.body_from_cam0 @ cam1_from_cam0.inverse())
