@@ -134,8 +134,8 @@ def why_refused(found: Acceptance) -> str:
     if found.causes:
         return ", ".join(f"{one.words} ({one.value:+.3g} {one.unit})" for one in found.causes)
     bad = [q for q in found.quantities if q.decision is not Decision.PASSED]
-    said = [f"{q.name} {q.decision}" for q in bad[:3]] + ([f"{len(bad) - 3} more"] if len(bad) > 3 else [])
-    return ", ".join(said) or "the crane's travel contradicts the rig"
+    reasons = [f"{q.name} {q.decision}" for q in bad[:3]] + ([f"{len(bad) - 3} more"] if len(bad) > 3 else [])
+    return ", ".join(reasons) or "the crane's travel contradicts the rig"
 
 
 def print_acceptance(found: Acceptance) -> None:

@@ -81,8 +81,8 @@ def guided_steps(folder: Path, settings: CommissionSettings) -> tuple[GuidedStep
     ]  # fmt: skip
     if settings.use_tags:
         bring = "the AprilTags that survey/ shows, as surveyed, as tags.csv"
-        takes, told = ("tags.csv", *rig, "survey"), (settings.girder_y_m, settings.rails_x_m)
-        steps.insert(2, GuidedStep("yard frame", takes, way.framed, bring, way.tags, told))
+        takes, given = ("tags.csv", *rig, "survey"), (settings.girder_y_m, settings.rails_x_m)
+        steps.insert(2, GuidedStep("yard frame", takes, way.framed, bring, way.tags, given))
     elif settings.use_targets:
         bring = "targets as surveyed and as measured in measured/, as targets.csv"
         steps.insert(3, GuidedStep("yard frame", ("targets.csv", "measured"), way.framed, bring, way.targets))
@@ -156,11 +156,11 @@ class _Way:
             yard=folder / "yard.yaml" if self.framed else None,
             recording=RecordingSettings(rig=folder / "rig.yaml"),
         )
-        told = [one.told() for one in read_done(folder)]
+        steps = [one.told() for one in read_done(folder)]
         offset = load_magnet(folder / settings.magnet).offset if settings.magnet else None
         files = (folder / "plan.toml", *recordings)
         found = accept.run_acceptance(
-            files, folder / "certificate", chosen, key, settings.signer, None, told, offset
+            files, folder / "certificate", chosen, key, settings.signer, None, steps, offset
         )
         return "passed" if found.is_passed else "failed"
 

@@ -125,15 +125,15 @@ def _look(
 
 
 def _problems(charts: Sequence[ControlChart], check: RigCheck) -> list[str]:
-    said = [
+    problems = [
         f"{one.name.partition(' / ')[0]} left its control limits at survey {one.alarmed_at}"
         for one in charts
         if one.alarmed_at is not None
     ]
     if check.is_bad:
         bad = [line.name for line in check.lines if line.state is check.state]
-        said.append(f"{check.state}: {', '.join(bad)}")
-    return said
+        problems.append(f"{check.state}: {', '.join(bad)}")
+    return problems
 
 
 def _print(charts: Sequence[ControlChart], check: RigCheck, surveys: int) -> None:

@@ -88,8 +88,9 @@ def run(arguments: Sequence[str]) -> None:
         if picks is not None and tags is None:
             raise ConfigError("--picks needs --tags, the list of what was picked, as surveyed")
         bend = _begun_bend(girder_y_m, rails_x_m, has_tags=tags is not None)
-        console, way = SafeConsole(stderr=True), _YardSource(source, frame, measured, sigma_m, reading)
-        found, owners, hangs, bend = way.calibrated(tags, picks, bend, console)
+        console = SafeConsole(stderr=True)
+        yard_source = _YardSource(source, frame, measured, sigma_m, reading)
+        found, owners, hangs, bend = yard_source.calibrated(tags, picks, bend, console)
         _expect_usable(found, source if tags is None else tags)
         verdict = "good" if _is_good(found) else "usable with care"
         with atomic_paths(out, out.with_suffix(".html"), out.with_suffix(".json")) as (path, html, data):
@@ -150,8 +151,8 @@ def _begun_bend(
         )
     for name, ends in (("--girder-y-m", girder_y_m), ("--rails-x-m", rails_x_m)):
         if ends is not None and not MIN_SPAN_M <= ends[1] - ends[0] <= MAX_SPAN_M:
-            said = f"{name} {ends[0]:g} {ends[1]:g}"
-            raise ConfigError(f"{said}: give the lower reading first, {MIN_SPAN_M:g} m or more apart")
+            given = f"{name} {ends[0]:g} {ends[1]:g}"
+            raise ConfigError(f"{given}: give the lower reading first, {MIN_SPAN_M:g} m or more apart")
     return straight(girder_y_m, rails_x_m)
 
 

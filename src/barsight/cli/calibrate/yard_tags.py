@@ -84,12 +84,12 @@ def calibrate_by_tags(
     for one in placed:
         if isinstance(one, Failed) and one.code == "ambiguous":
             raise MeasurementError(f"{path}: {one.reason}")
-    told = _told(recording, seen, placed)
+    why = _why_unlocated(recording, seen, placed)
     if bend is None:
         frame = "encoders" if reference == "yard" else "world"
-        found = _registered(path, listed, seen, placed, sigma_m, frame, told)
+        found = _registered(path, listed, seen, placed, sigma_m, frame, why)
     else:
-        found, bend = _bent(path, recording, listed, seen, placed, sigma_m, bend, told, console)
+        found, bend = _bent(path, recording, listed, seen, placed, sigma_m, bend, why, console)
     _print(listed, seen, placed, list_path, console)
     crane = recording.crane() if reference == "yard" else None
     owners = {
@@ -150,7 +150,7 @@ def _trajectory(recording: Recording, advance: Callable[[str, int, int], None]) 
 
 def _bent(
     path: Path, recording: Recording, listed: SurveyedTags, seen: SeenTags, placed: list[PlacedTag | Failed],
-    sigma_m: float, bend: CraneBend, told: str, console: Console,
+    sigma_m: float, bend: CraneBend, why: str, console: Console,
 ) -> tuple[YardCalibration, CraneBend]:  # fmt: skip
     """Register frame and bending together. The derivatives of the tags' places with respect to the bending
     come from estimating the travel again with a small amount of each kind of bending.
@@ -158,8 +158,8 @@ def _bent(
 
     def places(values: Float64) -> list[PlacedTag | Failed]:
         with stages(console) as advance:
-            way = _trajectory(_BentRecording(recording, bend.with_values(values)), advance)
-        moved = seen.moved({frame.stamp_ns: frame for frame in way.frames})
+            trajectory = _trajectory(_BentRecording(recording, bend.with_values(values)), advance)
+        moved = seen.moved({frame.stamp_ns: frame for frame in trajectory.frames})
         return [moved.place(int(number)) for number in listed.numbers]
 
     first = _at(placed)
@@ -172,7 +172,7 @@ def _bent(
             placed = places(bend.values)
         known = np.column_stack([_at(placed), slopes.reshape(len(slopes), -1)])
         kept: Bool = np.all(np.isfinite(known), axis=1)
-        tags, yard_m, checks, survey = _kept(path, listed, placed, kept, sigma_m, told)
+        tags, yard_m, checks, survey = _kept(path, listed, placed, kept, sigma_m, why)
         found = calibrate_bent_yard(
             tuple(seen.name(one.number) for one in tags), _at(tags), slopes[kept], yard_m,
             turned_covariance(tags, yard_m, survey), checks, "encoders", bend,
@@ -190,7 +190,7 @@ def _at(placed: Sequence[PlacedTag | Failed]) -> Float64:
 
 
 def _kept(
-    path: Path, listed: SurveyedTags, placed: list[PlacedTag | Failed], kept: Bool, sigma_m: float, told: str
+    path: Path, listed: SurveyedTags, placed: list[PlacedTag | Failed], kept: Bool, sigma_m: float, why: str
 ) -> tuple[tuple[PlacedTag, ...], Float64, Bool, Float64]:
     """Select the located tags, their surveyed places, which are checks, and the sigma of their survey. told:
     reason why others weren't located, for the error where too few remain.
@@ -199,18 +199,18 @@ def _kept(
     checks = listed.checks[kept]
     if (~checks).sum() < 3:
         counted = f"{kept.sum()} of {kept.size} listed tags were placed, 3 besides checks are the least"
-        raise MeasurementError(f"{path}: {counted}: {told}")
+        raise MeasurementError(f"{path}: {counted}: {why}")
     survey = np.where(np.isnan(listed.sigma_m), sigma_m, listed.sigma_m)[kept]
     return tags, listed.yard_m[kept], checks, survey
 
 
 def _registered(
     path: Path, listed: SurveyedTags, seen: SeenTags, placed: list[PlacedTag | Failed], sigma_m: float,
-    frame: str, told: str,
+    frame: str, why: str,
 ) -> YardCalibration:  # fmt: skip
     """Fit the located tags. told: reason why others weren't located, for the error where too few remain."""
     kept = np.array([isinstance(one, PlacedTag) for one in placed], bool)
-    tags, yard_m, checks, survey = _kept(path, listed, placed, kept, sigma_m, told)
+    tags, yard_m, checks, survey = _kept(path, listed, placed, kept, sigma_m, why)
     found = calibrate_yard(
         tuple(seen.name(one.number) for one in tags), np.stack([one.place_m for one in tags]), yard_m,
         turned_covariance(tags, yard_m, survey), checks, frame,
@@ -226,7 +226,7 @@ def _expect_upright(path: Path, tags: tuple[PlacedTag, ...], yard_m: Float64, fo
         raise MeasurementError(f"{path}: the listed places are mirrored; are yard_x and yard_y swapped?")
 
 
-def _told(recording: Recording, seen: SeenTags, placed: list[PlacedTag | Failed]) -> str:
+def _why_unlocated(recording: Recording, seen: SeenTags, placed: list[PlacedTag | Failed]) -> str:
     """Explain why tags weren't located."""
     if not seen.sightings and seen.are_rings:
         return f"no coded circle is seen in both pictures of any of {seen.pairs} pairs"
@@ -254,8 +254,8 @@ def _print(
     known = set(listed.numbers.tolist())
     strange = [n for n, ones in sorted(seen.sightings.items()) if n not in known and len(ones) >= MIN_PAIRS]
     if strange:
-        told = f"seen, but not in {list_path}: tag {', '.join(map(str, strange))}; left out"
-        console.print(f"[yellow]{escape(told)}[/yellow]", soft_wrap=True, highlight=False)
+        warning = f"seen, but not in {list_path}: tag {', '.join(map(str, strange))}; left out"
+        console.print(f"[yellow]{escape(warning)}[/yellow]", soft_wrap=True, highlight=False)
 
 
 def print_bend(bend: CraneBend | None, console: Console) -> None:

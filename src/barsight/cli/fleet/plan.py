@@ -81,11 +81,11 @@ def run(arguments: Sequence[str]) -> None:
     call(command, "fleet plan", arguments)
 
 
-def _tell_work(told: Any, workers: int) -> None:
-    basis = f"by {told.known} measured" if told.known else "roughly: none was measured yet"
+def _tell_work(work: Any, workers: int) -> None:
+    basis = f"by {work.known} measured" if work.known else "roughly: none was measured yet"
     _tell(
-        f"about {told.seconds / 3600 / workers:.2f} h with {workers} workers, "
-        f"{told.fetched_bytes / 1e9:.2f} GB to fetch, {told.written_bytes / 1e9:.2f} GB to write ({basis})"
+        f"about {work.seconds / 3600 / workers:.2f} h with {workers} workers, "
+        f"{work.fetched_bytes / 1e9:.2f} GB to fetch, {work.written_bytes / 1e9:.2f} GB to write ({basis})"
     )
 
 

@@ -41,8 +41,8 @@ def run(arguments: Sequence[str]) -> None:
         with open_store(store) as opened:
             if revert:
                 before = take_back(opened, who)
-                told = f"promoted again: version {before}" if before else "no version is promoted any more"
-                console.print(told, highlight=False)
+                message = f"promoted again: version {before}" if before else "no version is promoted any more"
+                console.print(message, highlight=False)
                 return
             if version is None or results is None or into is None:
                 raise ConfigError("fleet promote needs a version, --results and --into; or --revert")

@@ -58,8 +58,8 @@ def _print(added: AddedSurvey, console: Console) -> None:
     if not added.is_new:
         console.print(f"survey {added.map_id} is in the store already: nothing changed", highlight=False)
         return
-    told = ", ".join(f"{count} {kind}" for kind, count in sorted(added.counts.items()))
-    console.print(f"survey {added.map_id}: {told or 'no bundles'}", highlight=False)
+    counts = ", ".join(f"{count} {kind}" for kind, count in sorted(added.counts.items()))
+    console.print(f"survey {added.map_id}: {counts or 'no bundles'}", highlight=False)
     for kind in ("moved", "added", "gone"):
         names = [name for name, each in {**added.changes, **added.absences}.items() if each == kind]
         if names:

@@ -52,7 +52,7 @@ def run(arguments: Sequence[str]) -> None:
             name = note_calibration(opened, digest, rig, crane)
             approve_calibration(opened, digest, from_ns, until_ns, note)
         until = "" if until_ns is None else f" until {time_text(until_ns)}"
-        told = f"calibration {digest} of rig {name} is approved by {who}, from {time_text(from_ns)}{until}"
-        SafeConsole().print(told, highlight=False, soft_wrap=True)
+        message = f"calibration {digest} of rig {name} is approved by {who}, from {time_text(from_ns)}{until}"
+        SafeConsole().print(message, highlight=False, soft_wrap=True)
 
     call(command, "store approve", arguments)

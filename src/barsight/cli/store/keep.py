@@ -35,7 +35,7 @@ def run(arguments: Sequence[str]) -> None:
         change = release_recording if release else keep_recording
         with open_store(url) as store, entry(store, by or user_name(), f"recording {recording}") as opened:
             key = change(opened, recording, why)
-        told = f"{key} is {'released' if release else 'kept'}: {why}"
-        SafeConsole().print(told, highlight=False, soft_wrap=True)
+        message = f"{key} is {'released' if release else 'kept'}: {why}"
+        SafeConsole().print(message, highlight=False, soft_wrap=True)
 
     call(command, "store keep", arguments)

@@ -67,8 +67,8 @@ def _calibration_table(calibrations: tuple[KnownCalibration, ...], clock_ns: int
             table.add_row(*named, "-", "-", "-", "never approved")
         for time_ in one.times:
             until = "-" if time_.until_ns is None else time_text(time_.until_ns)
-            told = "valid" if time_.holds(clock_ns) else "to come" if clock_ns < time_.from_ns else "ended"
-            table.add_row(*named, time_text(time_.from_ns), until, time_.approved_by, told)
+            status = "valid" if time_.holds(clock_ns) else "to come" if clock_ns < time_.from_ns else "ended"
+            table.add_row(*named, time_text(time_.from_ns), until, time_.approved_by, status)
     return table
 
 

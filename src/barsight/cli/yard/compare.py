@@ -69,12 +69,12 @@ def _write(changes: tuple[Change, ...], target: Path) -> None:
 
 
 def _print(changes: tuple[Change, ...], console: Console) -> None:
-    told = [change for change in changes if change.kind != "same"]
-    if told:
+    shown = [change for change in changes if change.kind != "same"]
+    if shown:
         table = Table(box=SIMPLE_HEAD, title="Changes")
         for head in ("what", "old", "new", "across mm", "along mm", "up mm", "yaw deg", "kg"):
             table.add_column(head, justify="right", no_wrap=True)
-        for change in told:
+        for change in shown:
             across, along, up, yaw = change.sigmas
             table.add_row(
                 change.kind, _name(change.old), _name(change.new), _figure(change.across_mm, across, 0),
@@ -82,7 +82,7 @@ def _print(changes: tuple[Change, ...], console: Console) -> None:
                 _figure(change.yaw_deg, yaw, 2), _figure(change.kg, change.sigma_kg, 0),
             )  # fmt: skip
         console.print(table)
-    same = len(changes) - len(told)
+    same = len(changes) - len(shown)
     console.print(f"{same} of {len(changes)} bundles lie where they lay", highlight=False)
 
 

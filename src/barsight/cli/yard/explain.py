@@ -34,26 +34,26 @@ def run(arguments: Sequence[str]) -> None:
             lift: The rank of an offered lift, like 3, or bundle:12 for the lift of bundle 12, offered or not.
             out: HTML file for checks and picture; by default OUT/explain-LIFT.html.
         """
-        told = explain(folder, lift)
+        explanation = explain(folder, lift)
         target = out or folder / f"explain-{lift.replace(':', '-')}.html"
-        write_explanation(told, target)
+        write_explanation(explanation, target)
         console = SafeConsole()
-        _print(told, console)
+        _print(explanation, console)
         console.print_line(f"page: {target}")
 
     call(command, "explain", arguments)
 
 
-def _print(told: Explanation, console: Console) -> None:
-    console.print(told.title, highlight=False)
-    for veto in told.map_vetoes:
+def _print(explanation: Explanation, console: Console) -> None:
+    console.print(explanation.title, highlight=False)
+    for veto in explanation.map_vetoes:
         console.print(f"[red]{veto['code']}:[/red] {escape(veto['reason'])}", highlight=False)
-    for since in told.since:
+    for since in explanation.since:
         console.print(f"[red]{since.code}:[/red] {escape(since.reason)}", highlight=False)
     table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     for head in ("result", "what is checked", "figure", "bound", "veto"):
         table.add_column(head, overflow="fold", no_wrap=head != "what is checked")
-    for check in told.checks:
+    for check in explanation.checks:
         figure, bound = format_check(check)
         what = check["what"] + (f"\n{check['reason']}" if check["reason"] else "")
         colour = COLOUR[check["result"]]

@@ -23,7 +23,7 @@ def run(arguments: Sequence[str]) -> None:
             file: The file to write; its suffix selects the format.
         """
         points = export(out, file)
-        told = f" ({points} points)" if points else ""
-        SafeConsole(stderr=True).print_line(f"written: {file}{told}")
+        remark = f" ({points} points)" if points else ""
+        SafeConsole(stderr=True).print_line(f"written: {file}{remark}")
 
     call(command, "export", arguments)

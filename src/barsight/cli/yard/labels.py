@@ -66,10 +66,10 @@ def run(arguments: Sequence[str]) -> None:
 def _print(found: ReadLabels, console: SafeConsole) -> None:
     table = Table("text", "kind", "x m", "y m", "pictures", "bundle", "", box=SIMPLE_HEAD)
     for one in found.labels:
-        told = "sure" if one.is_sure else "; ".join(one.doubts)
+        verdict = "sure" if one.is_sure else "; ".join(one.doubts)
         bundle = "-" if one.bundle is None else str(one.bundle)
         x, y = (f"{value:.2f}" for value in one.place_m[:2])
-        table.add_row(escape(one.text), one.kind, x, y, str(one.pictures), bundle, escape(told))
+        table.add_row(escape(one.text), one.kind, x, y, str(one.pictures), bundle, escape(verdict))
     console.print(table if found.labels else f"no label was read in {found.pictures} pictures")
     if found.illegible:
         console.print(f"illegible: the labels on bundles {', '.join(map(str, found.illegible))}")

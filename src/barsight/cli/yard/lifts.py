@@ -202,13 +202,13 @@ def _events(
 ) -> tuple[YardEvent, ...]:
     """Collect the events from OUT/events.csv, a file and the ids of lifted bundles."""
     by_id, captured_ns = {bundle.id: bundle for bundle in folder.bundles}, folder.captured_ns
-    known, told = kept_events(out), read_events(file) if file is not None else ()
-    for path, events in ((out / "events.csv", known), (file, told)):
+    known, given = kept_events(out), read_events(file) if file is not None else ()
+    for path, events in ((out / "events.csv", known), (file, given)):
         for event in events:
             if captured_ns is not None and event.stamp_ns < captured_ns[0] / OTHER_UNIT:
                 problem = f"stamp {event.stamp_ns} isn't ns on the frames' clock, which said {captured_ns[0]}"
                 raise InputError(path or out, problem, "give stamps in ns, by the clock of the frames")
-    return merged(known, (*told, *(lift_of(by_id[number], time.time_ns()) for number in ids)))
+    return merged(known, (*given, *(lift_of(by_id[number], time.time_ns()) for number in ids)))
 
 
 def _offset(magnet: Magnet) -> str:
@@ -216,8 +216,8 @@ def _offset(magnet: Magnet) -> str:
     if magnet.offset is None:
         return "the magnet's offset is not calibrated, so its tolerance must cover it (calibrate magnet)"
     figures = zip("xyz", magnet.offset.place_m, magnet.offset.sigma_m, strict=True)
-    told = ", ".join(f"{axis} {1e3 * off:+.1f} ± {1e3 * sigma:.1f}" for axis, off, sigma in figures)
-    return f"the magnet hangs off the crane's readings by {told} mm; crane_target has that taken off"
+    offsets = ", ".join(f"{axis} {1e3 * off:+.1f} ± {1e3 * sigma:.1f}" for axis, off, sigma in figures)
+    return f"the magnet hangs off the crane's readings by {offsets} mm; crane_target has that taken off"
 
 
 def print_lifts(plan: LiftPlan, console: Console) -> None:
