@@ -95,15 +95,15 @@ def explain(folder: Path, which: str) -> Explanation:
 
 
 def _find(lifts: dict[str, Any], which: str, folder: Path) -> dict[str, Any]:
-    told = re.fullmatch(r"(bundle:)?(\d+)", which)
-    if told is None:
+    match = re.fullmatch(r"(bundle:)?(\d+)", which)
+    if match is None:
         raise ConfigError(f"{which!r} names no lift; give a rank like 3, or a bundle like bundle:12")
-    number = int(told[2])
+    number = int(match[2])
     every: list[dict[str, Any]] = [*lifts["lifts"], *lifts["refused"]]
     for record in every:
-        if number in record["bundles"] if told[1] else number == record["rank"]:
+        if number in record["bundles"] if match[1] else number == record["rank"]:
             return record
-    if told[1]:
+    if match[1]:
         known = sorted({k for record in every for k in record["bundles"]})
         listed = f"it judges those of {', '.join(str(k) for k in known)}" if known else "it judges none"
         raise ConfigError(f"{folder}: lifts.json has no lift of bundle {number}; {listed}")

@@ -157,8 +157,8 @@ def hillshade(z_m: Float32, cell_m: float, sigma_m: Float32 | float = 0.0) -> Fl
         north = -np.gradient(surface, cell_m, axis=0) if surface.shape[0] > 1 else np.zeros_like(surface)
         noise = (_SLOPE_NOISE / cell_m * np.nan_to_num(sigma_m, nan=0, posinf=0)) ** 2
         squares = east**2 + north**2
-        share = squares / np.maximum(squares + noise, 1e-12)
-        east, north = share * east, share * north
+        gain = squares / np.maximum(squares + noise, 1e-12)
+        east, north = gain * east, gain * north
     facing: Float64 = (1 + (east - north) / np.sqrt(2)) / np.sqrt(1 + east**2 + north**2)
     return np.nan_to_num(facing, nan=1.0).astype(np.float32)
 

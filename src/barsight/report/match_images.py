@@ -113,8 +113,8 @@ def canvas_of(image: UInt8, scale: float) -> UInt8:
     """Stretch the contrast of a gray picture (H, W) to (h, w, 3), slightly darkened to show lines."""
     low, high = np.percentile(image, (1, 99.5))
     light = np.clip((image - low) * (215 / max(high - low, 1.0)), 0, 230).astype(np.uint8)
-    way = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
-    sized = light if scale == 1 else cv2.resize(light, None, fx=scale, fy=scale, interpolation=way)
+    interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+    sized = light if scale == 1 else cv2.resize(light, None, fx=scale, fy=scale, interpolation=interpolation)
     return np.ascontiguousarray(np.dstack([sized] * 3))
 
 

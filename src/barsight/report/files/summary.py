@@ -126,9 +126,9 @@ def _check_content(check: LaserCheck) -> dict[str, Any]:
     """Describe a profile's check; offsets in mm, null if undetermined."""
     offset = {field.name: getattr(check.offset, field.name, None) for field in fields(LaserOffset)}
     ratio = offset.pop("alike_ratio")
-    told = {name.replace("_m", "_mm"): None if m is None else 1e3 * m for name, m in offset.items()}
+    offset_mm = {name.replace("_m", "_mm"): None if m is None else 1e3 * m for name, m in offset.items()}
     return {
-        "profile": check.profile, "fused": check.is_believed, "samples": check.samples, **told,
+        "profile": check.profile, "fused": check.is_believed, "samples": check.samples, **offset_mm,
         "alike_ratio": ratio, "reason": check.reason,
     }  # fmt: skip
 
