@@ -102,7 +102,7 @@ def calibrate_bent_yard(
     same axes. `ORDINARY` is the values' prior where the targets don't determine them.
     """
     used, fitted = ~checks, bend.fitted
-    held = np.where(fitted, np.square(ORDINARY), 1.0)
+    prior_variance = np.where(fitted, np.square(ORDINARY), 1.0)
     values = bend.values.copy()
     for _ in range(4):
         at = measured + slopes @ (values - bend.values)
@@ -113,9 +113,9 @@ def calibrate_bent_yard(
         design = np.concatenate([design_rows(at @ turn.T), turn @ slopes * fitted], axis=2)[used]
         weighted = np.linalg.solve(covariance_m2[used], design)
         normal = np.einsum("nki,nkj->ij", design, weighted)
-        normal[6:, 6:] += np.diag(1 / held)
+        normal[6:, 6:] += np.diag(1 / prior_variance)
         wanted = np.einsum("nki,nk->i", weighted, found.residuals_m)
-        wanted[6:] -= values / held * fitted
+        wanted[6:] -= values / prior_variance * fitted
         values = values + np.linalg.solve(normal, wanted)[6:]
     at = measured + slopes @ (values - bend.values)
     rigid = calibrate_yard(names, at, yard, covariance_m2, checks, frame)

@@ -100,8 +100,8 @@ def _middle(found: BlockShifts) -> Float64:
     near = (off <= 3 * np.median(off, axis=0) + 1e-4).all(axis=1)
     information = found.information[near]
     ridge = 1e-6 * np.trace(information.sum(axis=0)) * np.eye(3)
-    said = np.einsum("kij,kj->i", information, found.shift_m[near])
-    return np.asarray(np.linalg.solve(information.sum(axis=0) + ridge, said), np.float64)
+    weighted = np.einsum("kij,kj->i", information, found.shift_m[near])
+    return np.asarray(np.linalg.solve(information.sum(axis=0) + ridge, weighted), np.float64)
 
 
 def _measured(
@@ -117,7 +117,7 @@ def _measured(
     noise = pictures[0] - pictures[1]
     spread = float(1.4826 * np.median(np.abs(noise[pictured]))) if pictured.any() else 1.0
     normal = np.zeros((3, 3, *known.shape), np.float32)
-    said = np.zeros((3, *known.shape), np.float32)
+    wanted = np.zeros((3, *known.shape), np.float32)
     for pair, weight, lifts in (
         (heights, np.where(known, 1 / variance, 0), 1.0),
         (pictures, np.where(pictured, 1 / max(spread, _MIN_CONTRAST) ** 2, 0), 0.0),
@@ -126,14 +126,14 @@ def _measured(
         down, right = np.gradient(middle, cell_m)
         jacobian = (-right, -down, np.full_like(middle, lifts))
         for i in range(3):
-            said[i] += weight * jacobian[i] * (pair[0] - pair[1])
+            wanted[i] += weight * jacobian[i] * (pair[0] - pair[1])
             for j in range(3):
                 normal[i, j] += weight * jacobian[i] * jacobian[j]
-    return _solved(known, heights[0], normal, said, origin_m, cell_m)
+    return _solved(known, heights[0], normal, wanted, origin_m, cell_m)
 
 
 def _solved(
-    known: Bool, z_m: Float32, normal: Float32, said: Float32, origin_m: tuple[float, float], cell_m: float
+    known: Bool, z_m: Float32, normal: Float32, wanted: Float32, origin_m: tuple[float, float], cell_m: float
 ) -> BlockShifts:
     """Sum the equations of each block and solve them; directions without information stay at zero."""
     counts = _sums(known.astype(np.float32))
@@ -141,7 +141,7 @@ def _solved(
     if not chosen.any():
         return BlockShifts.none()
     information = _sums(normal)[..., chosen].transpose(2, 0, 1) / TOGETHER_CELLS
-    right = _sums(said)[..., chosen].T / TOGETHER_CELLS
+    right = _sums(wanted)[..., chosen].T / TOGETHER_CELLS
     ridge = np.eye(3) / STRAY_M**2
     shift = np.asarray(np.linalg.solve(information + ridge, right[..., None])[..., 0], np.float64)
     rows, columns = np.nonzero(chosen)
@@ -169,6 +169,6 @@ def _contrast(gray: Float32, known: Bool) -> Float32:
     filled = np.where(known, gray, 0).astype(np.float32)
     smooth = []
     for sigma in (_FINE_CELLS, _COARSE_CELLS):
-        held = cv2.GaussianBlur(weight, (0, 0), sigma)
-        smooth.append(cv2.GaussianBlur(filled, (0, 0), sigma) / np.maximum(held, 1e-3))
+        total = cv2.GaussianBlur(weight, (0, 0), sigma)
+        smooth.append(cv2.GaussianBlur(filled, (0, 0), sigma) / np.maximum(total, 1e-3))
     return np.where(known, smooth[0] - smooth[1], 0).astype(np.float32)

@@ -128,7 +128,7 @@ def tie_passes(priors: Sequence[PassPrior], overlaps: Mapping[tuple[int, int], B
     for k, one in enumerate(priors):
         part = slice(UNKNOWNS * k, UNKNOWNS * (k + 1))
         corrections.append(PassCorrection(one.about_m, found[part], left[part, part]))
-    return PassTies(tuple(corrections), tuple(_told(one, priors) for one in chosen.values()))
+    return PassTies(tuple(corrections), tuple(_averaged(one, priors) for one in chosen.values()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,11 +141,11 @@ class _Overlap:
     information: Float64
 
 
-def _rows(one: _Overlap, priors: Sequence[PassPrior]) -> Float64:
+def _rows(overlap: _Overlap, priors: Sequence[PassPrior]) -> Float64:
     """Compute the Jacobian (K, 3, 7 P) of the blocks' shifts: the second pass's shift minus the first's."""
-    place = one.shifts.place_m
+    place = overlap.shifts.place_m
     rows = np.zeros((len(place), 3, UNKNOWNS * len(priors)))
-    for number, sign in ((one.second, 1), (one.first, -1)):
+    for number, sign in ((overlap.second, 1), (overlap.first, -1)):
         part = slice(UNKNOWNS * number, UNKNOWNS * (number + 1))
         rows[:, :, part] = sign * design_at(place, priors[number].about_m)
     return rows
@@ -174,17 +174,17 @@ def _scaled(first: int, second: int, blocks: BlockShifts) -> _Overlap:
     return _Overlap(first, second, blocks, weight[:, None, None] * np.linalg.inv(together))
 
 
-def _told(one: _Overlap, priors: Sequence[PassPrior]) -> PairTie:
+def _averaged(overlap: _Overlap, priors: Sequence[PassPrior]) -> PairTie:
     """Average an overlap, and compare it with the passes' own sigmas."""
-    shifts = one.shifts
-    spread: Float64 = np.linalg.inv(one.information.sum(axis=0))
-    shift: Float64 = spread @ np.einsum("kij,kj->i", one.information, shifts.shift_m)
+    shifts = overlap.shifts
+    spread: Float64 = np.linalg.inv(overlap.information.sum(axis=0))
+    shift: Float64 = spread @ np.einsum("kij,kj->i", overlap.information, shifts.shift_m)
     allowed = np.zeros((3, 3))
-    for number in (one.first, one.second):
+    for number in (overlap.first, overlap.second):
         design = design_at(shifts.place_m.mean(axis=0, keepdims=True), priors[number].about_m)[0]
         allowed += design @ priors[number].covariance @ design.T
     off_sigmas = float(np.sqrt(shift @ np.linalg.solve(allowed + spread, shift) / 3))
     return PairTie(
-        one.first, one.second, len(shifts.place_m), shift, np.sqrt(np.diag(spread)),
+        overlap.first, overlap.second, len(shifts.place_m), shift, np.sqrt(np.diag(spread)),
         np.sqrt(np.diag(allowed)), off_sigmas,
     )  # fmt: skip

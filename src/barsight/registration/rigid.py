@@ -139,9 +139,9 @@ def _refined(source: Float64, target: Float64, pose: Pose, spread: Float64) -> P
     """
     off = target - pose.apply(source)
     for _ in range(ROUNDS):
-        turned = source @ pose.rotation.T
-        centre = turned.mean(axis=0)
-        design = design_rows(turned - centre)
+        rotated = source @ pose.rotation.T
+        centre = rotated.mean(axis=0)
+        design = design_rows(rotated - centre)
         weighted = _divided(design, spread)
         normal = np.einsum("nki,nkj->ij", design, weighted)
         step = np.linalg.solve(normal, np.einsum("nki,nk->i", weighted, off))
@@ -156,14 +156,14 @@ def _refined(source: Float64, target: Float64, pose: Pose, spread: Float64) -> P
     return pose
 
 
-def _covariance(turned: Float64, spread: Float64) -> Float64:
+def _covariance(rotated: Float64, spread: Float64) -> Float64:
     """Compute the covariance (J^T S^-1 J)^-1 (6, 6) of least squares with a covariance S, (N, 3, 3) or (N,
     N).
 
     turned: (N, 3) points from the source's origin, target axes.
     """
-    centre = turned.mean(axis=0)
-    design = design_rows(turned - centre)
+    centre = rotated.mean(axis=0)
+    design = design_rows(rotated - centre)
     bread = np.linalg.inv(np.einsum("nki,nkj->ij", design, _divided(design, spread)))
     move = np.eye(6)
     # A turn about the points' centre also moves the source's origin.

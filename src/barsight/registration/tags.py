@@ -258,8 +258,8 @@ def turned_covariance(tags: tuple[PlacedTag, ...], yard_m: Float64, sigma_m: Flo
     spread = np.stack([one.covariance_m2 for one in tags])
     found = align_rigid(np.stack([one.place_m for one in tags]), yard_m, ("yard", "seen"))
     turn = np.eye(3) if isinstance(found, Failed) else found.target_from_source.rotation
-    turned: Float64 = turn @ spread @ turn.T + sigma_m[:, None, None] ** 2 * np.eye(3)
-    return turned
+    covariance: Float64 = turn @ spread @ turn.T + sigma_m[:, None, None] ** 2 * np.eye(3)
+    return covariance
 
 
 def is_mirrored(tags: tuple[PlacedTag, ...], yard_m: Float64, found: Alignment) -> bool:
