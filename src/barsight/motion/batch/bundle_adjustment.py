@@ -167,10 +167,10 @@ def covariances(found: Marginals, poses: tuple[Pose, ...], drift: RigDrift | Non
     shared = np.zeros((2, 2)) if drift is None else drift.covariance
     result = np.zeros((len(poses), 6, 6))
     for k, pose in enumerate(poses):
-        turned = np.zeros((6, 6))
-        turned[:3, :3] = turned[3:, 3:] = pose.rotation
+        rotation = np.zeros((6, 6))
+        rotation[:3, :3] = rotation[3:, 3:] = pose.rotation
         own = found.poses[k] + found.drift_jacobian_of_pose[k] @ shared @ found.drift_jacobian_of_pose[k].T
-        result[k] = turned @ own @ turned.T
+        result[k] = rotation @ own @ rotation.T
     return result
 
 
@@ -199,9 +199,9 @@ def robust_noise(residual: Float64, seen: StereoObservations, used: Bool) -> tup
     """Estimate the scale factor of the sightings' sigmas from their residuals (N, 3) px, and remove
     outliers.
     """
-    share = np.abs(residual) / seen.sigma_px[:, None]
-    factor = max(MIN_FACTOR, mad_sigma(share[used]) * dof_correction(seen, used))
-    return factor, well_observed(seen, used & (share.max(axis=1) < FARTHEST_OUTLIER_SIGMAS * factor))
+    ratio = np.abs(residual) / seen.sigma_px[:, None]
+    factor = max(MIN_FACTOR, mad_sigma(ratio[used]) * dof_correction(seen, used))
+    return factor, well_observed(seen, used & (ratio.max(axis=1) < FARTHEST_OUTLIER_SIGMAS * factor))
 
 
 def _with_seen_noise(

@@ -65,11 +65,11 @@ def untied_pictures(
     if count == 0:
         return (), ()
     total = len(sightings) + len(refused)
-    told = f"the pictures of {count} of {total} frames can't be tied to those before"
+    problem = f"the pictures of {count} of {total} frames can't be tied to those before"
     if 2 * count <= total:
-        return (told,), ()
+        return (problem,), ()
     return (), (
-        f"{told}: too little texture, too long a step, or left and right pictures of different times",
+        f"{problem}: too little texture, too long a step, or left and right pictures of different times",
     )
 
 
@@ -77,12 +77,12 @@ def joint_sentences(sightings: tuple[Sighting, ...], relative: Float64) -> tuple
     """Describe where the pictures begin anew and what joins the two parts, with its sigma; relative
     (K - 1, 6, 6).
     """
-    told = []
+    sentences = []
     for k, again in chain_begins(sightings):
-        turn, way = np.sqrt(np.diag(relative[k - 1]).reshape(2, 3).sum(axis=1))
+        turn, shift = np.sqrt(np.diag(relative[k - 1]).reshape(2, 3).sum(axis=1))
         at = seconds_after(sightings[k].stamp_ns, sightings[0].stamp_ns)
-        told.append(
+        sentences.append(
             f"the pictures begin anew at {at}; {'a place seen again' if again else 'the IMU'} joins both "
-            f"parts, 1 sigma {1e3 * way:.1f} mm and {np.degrees(turn):.3f} degrees"
+            f"parts, 1 sigma {1e3 * shift:.1f} mm and {np.degrees(turn):.3f} degrees"
         )
-    return tuple(told)
+    return tuple(sentences)

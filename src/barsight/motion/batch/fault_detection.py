@@ -75,10 +75,10 @@ def check_crane(crane: CraneSamples, known: KnownMotion | None = None) -> Checke
 
 def freeze_sentences(parts: Sequence[tuple[int, int]], begin_ns: int) -> tuple[str, ...]:
     """Describe the frozen parts, each given by its first and last stamp, in seconds since `begin_ns`."""
-    told = [tuple((stamp - begin_ns) / NS_PER_S for stamp in part) for part in parts]
+    spans = [tuple((stamp - begin_ns) / NS_PER_S for stamp in part) for part in parts]
     return tuple(
         f"the encoders were frozen from {first:.1f} s to {last:.1f} s while the crane moved"
-        for first, last in told
+        for first, last in spans
     )
 
 
@@ -166,11 +166,11 @@ def frames_off(
     offs = tuple(range(-most, most + 1))
     cost, worst = {}, {}
     for off, steps in zip(offs, compare_steps(sightings, imu, crane, rectifier, shift_ns, offs), strict=True):
-        turned = _gyro_residual(steps)
+        turn_residual = _gyro_residual(steps)
         travelled = np.isfinite(steps.travel)
         terms = []
-        if len(turned) >= MIN_STEPS:
-            terms.append(float((turned**2).mean()) / TURN_SIGMA_RAD**2)
+        if len(turn_residual) >= MIN_STEPS:
+            terms.append(float((turn_residual**2).mean()) / TURN_SIGMA_RAD**2)
         if travelled.sum() >= MIN_STEPS:
             wrong = (steps.travel - steps.way)[travelled]
             terms.append(float((wrong**2).mean()) / WAY_SIGMA_M**2)

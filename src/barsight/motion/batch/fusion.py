@@ -174,9 +174,9 @@ class BatchPoses:
         except np.linalg.LinAlgError as error:  # the measurements leave an unknown open
             simple = self._simple(inputs)
             reason = f"the sensors together have no solution ({str(error).split('.')[0].strip()})"
-            told = tuple(dict.fromkeys((*simple.warnings, *inputs.warnings)))
+            warnings = tuple(dict.fromkeys((*simple.warnings, *inputs.warnings)))
             doubts = inputs.doubts + jumps_alone(inputs.crane)
-            return replace(simple, warnings=told, doubts=(*doubts, f"{reason}: estimated one by one"))
+            return replace(simple, warnings=warnings, doubts=(*doubts, f"{reason}: estimated one by one"))
         placed = tuple(
             PosedFrame(int(stamp), estimate.poses[k], covariance)
             for stamp, k, covariance in zip(frames, nodes.frame, estimate.covariance, strict=True)

@@ -47,8 +47,8 @@ def find_jumps(
     jumps = [[jump for jump in crane.jumps if jump.axis == axis] for axis in range(3)]
     steps = {(m, axis): windows[m].largest_step(axis, jumps[axis]) for m in windows for axis in range(3)}
     found: list[EncoderJump] = []
-    while told := [step for step in steps.values() if step is not None]:
-        best = max(told, key=lambda step: step.sigmas)
+    while candidates := [step for step in steps.values() if step is not None]:
+        best = max(candidates, key=lambda step: step.sigmas)
         stamp, axis = _exact_stamp(crane, series, best), best.axis
         if best.sigmas > SURE_SIGMAS:
             found.append(EncoderJump(stamp, axis, best.size_m, WIDE_M))
@@ -84,10 +84,10 @@ def lost_counts(
             continue
         size, sigma = window.step_at(jump.axis, jump.stamp_ns)
         read = crane.position_m[:, jump.axis]
-        way = abs(float(np.median(read[following : following + 3]) - np.median(read[:following][-3:])) - size)
+        net = abs(float(np.median(read[following : following + 3]) - np.median(read[:following][-3:])) - size)
         if abs(size) > MAYBE_SIGMAS * sigma:
             lost.append(replace(jump, size_m=size))
-        elif min_way_m < way < MAYBE_SIGMAS * sigma:
+        elif min_way_m < net < MAYBE_SIGMAS * sigma:
             lost.append(jump)
     return tuple(lost)
 
@@ -106,14 +106,14 @@ def _exact_stamp(crane: CraneSamples, series: CraneSamples, step: FoundStep) -> 
     """Find the stamp of the first reading beyond a step, among all original readings near it."""
     count = len(step.way_m)
     stamps = series.stamp_ns[step.first : step.first + count]
-    way = series.position_m[step.first : step.first + count, step.axis] + step.way_m
+    position_m = series.position_m[step.first : step.first + count, step.axis] + step.way_m
     k = step.reading - step.first
     if len(series.stamp_ns) == len(crane.stamp_ns):
         return int(stamps[k])
     begin, end = np.searchsorted(crane.stamp_ns, (stamps[k - 2], stamps[k + 1]))
     near = crane.stamp_ns[begin : end + 1]
     off = crane.position_m[begin : end + 1, step.axis] - np.interp(
-        (near - stamps[0]) / NS_PER_S, (stamps - stamps[0]) / NS_PER_S, way
+        (near - stamps[0]) / NS_PER_S, (stamps - stamps[0]) / NS_PER_S, position_m
     )
     before, after = np.abs(off), np.abs(off - step.size_m)
     cost = np.concatenate([[0.0], np.cumsum(before)]) + np.concatenate([np.cumsum(after[::-1])[::-1], [0.0]])

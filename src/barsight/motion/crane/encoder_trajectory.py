@@ -151,7 +151,7 @@ def fit_position(
     time = (stamps - stamp_ns) / window_ns
     window_s = window_ns / NS_PER_S
     degree = min(2 if stamps.size >= 6 else 1, 2 if way is None else way.open_degree)
-    places, here = crane.position_m[first:last], np.array([stamp_ns - late_ns])
+    places, stamp = crane.position_m[first:last], np.array([stamp_ns - late_ns])
     if way is not None:
         places = places - way.place_at(stamps - late_ns)
     fitted = np.empty((degree + 1, 4))
@@ -165,8 +165,8 @@ def fit_position(
         off = places - np.polynomial.polynomial.polyval(time, coefficients).T
         variance += _misfit_m2(off, degree + 1, crane.position_std_m)
     else:
-        place, velocity = place + way.place_at(here)[0], velocity + way.speed_at(here)[0]
-        bend = bend + way.acceleration_at(here)[0]
+        place, velocity = place + way.place_at(stamp)[0], velocity + way.speed_at(stamp)[0]
+        bend = bend + way.acceleration_at(stamp)[0]
     return FittedPosition(place, velocity, bend, np.eye(3) * variance)
 
 

@@ -79,8 +79,8 @@ class KnownMotion:
         time = (stamps - middle) / NS_PER_S
         angle = turned_angle(imu)
         angle -= np.polynomial.polynomial.polyval(time, np.polynomial.polynomial.polyfit(time, angle, 1)).T
-        turned = crane.yard_from_body_nominal @ Rotation.from_rotvec(angle[begin:end]).as_matrix()
-        force = np.einsum("nij,nj->ni", turned, imu.accel_mps2[begin:end])
+        rotations = crane.yard_from_body_nominal @ Rotation.from_rotvec(angle[begin:end]).as_matrix()
+        force = np.einsum("nij,nj->ni", rotations, imu.accel_mps2[begin:end])
         force -= force.mean(axis=0)  # removes gravity and the biases, which the caller leaves open
         return ImuWay.integrate(stamps[begin:end], force, 2)
 
@@ -138,6 +138,6 @@ def way_around(
     near = ImuSamples(stamps, imu.gyro_radps[part] - bias.gyro_radps, imu.accel_mps2[part] - bias.accel_mps2)
     angle = turned_angle(near)
     angle -= interpolate_at(np.array([stamp_ns]), stamps, angle)
-    turned = rotation @ Rotation.from_rotvec(angle).as_matrix()
-    force = np.einsum("nij,nj->ni", turned, near.accel_mps2)
+    rotations = rotation @ Rotation.from_rotvec(angle).as_matrix()
+    force = np.einsum("nij,nj->ni", rotations, near.accel_mps2)
     return ImuWay.integrate(stamps, force - [0.0, 0.0, GRAVITY_MPS2], open_degree)

@@ -43,6 +43,6 @@ def sway_at(imu: ImuSamples, stamp_ns: int, half_window_s: float) -> Float64 | F
     design = np.column_stack([np.ones(time.size), time])
     angle = turned_angle(ImuSamples(stamps, imu.gyro_radps[first:last], imu.accel_mps2[first:last]))
     trend, *_ = np.linalg.lstsq(design, angle, rcond=None)
-    here = interpolate_at(np.array([stamp_ns]), stamps, angle)[0]
-    sway: Float64 = here - trend[0]
+    current = interpolate_at(np.array([stamp_ns]), stamps, angle)[0]
+    sway: Float64 = current - trend[0]
     return sway

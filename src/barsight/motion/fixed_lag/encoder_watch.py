@@ -61,8 +61,8 @@ class EncoderWatch:
         new = ((int(stamps[first]), int(stamps[last]), axes) for first, last, axes in parts)
         self._frozen = merge_stretches((*self._frozen, *new))
         usable, after = without_frozen(crane, self._frozen_since(int(stamps[0])))
-        told = {jump.stamp_ns for jump in self.jumps}
-        self._add([jump for jump in after if jump.stamp_ns not in told])
+        reported = {jump.stamp_ns for jump in self.jumps}
+        self._add([jump for jump in after if jump.stamp_ns not in reported])
         newest_ns = int(stamps[-1]) - seconds_to_ns(NEWEST_S)
         self._add(find_jumps(replace(usable, jumps=self.jumps), known, newest_ns))
 
@@ -146,11 +146,11 @@ def sum_unknowns(prior: MarginalPrior, at: Int64) -> MarginalPrior:
     matrix[others] -= matrix[first + at[0]]
     matrix[:, others] -= matrix[:, [first + at[0]]]
     border[at[0]] = border[at].sum()
-    share = dense.solve_positive(matrix[np.ix_(others, others)], matrix[np.ix_(others, kept)]).T
-    own = matrix[np.ix_(kept, kept)] - share @ matrix[np.ix_(others, kept)]
+    gain = dense.solve_positive(matrix[np.ix_(others, others)], matrix[np.ix_(others, kept)]).T
+    own = matrix[np.ix_(kept, kept)] - gain @ matrix[np.ix_(others, kept)]
     return replace(
         prior, border=np.delete(border, at[1:]), matrix=(own + own.T) / 2,
-        gradient=gradient[kept] - share @ gradient[others],
+        gradient=gradient[kept] - gain @ gradient[others],
     )  # fmt: skip
 
 

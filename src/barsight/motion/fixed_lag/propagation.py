@@ -113,10 +113,10 @@ class Propagator:
         is.
         """
         rotation, position, _, covariance = self._moved(max(stamp_ns, self.stamp_ns))
-        turned = np.zeros((6, _SIZE + 3))
-        turned[:3, _TURN], turned[3:, _PLACE] = rotation, np.eye(3)
+        by_state = np.zeros((6, _SIZE + 3))
+        by_state[:3, _TURN], by_state[3:, _PLACE] = rotation, np.eye(3)
         pose = Pose(self._target, "body", rotation, position)
-        return PosedFrame(stamp_ns, pose, turned @ covariance @ turned.T)
+        return PosedFrame(stamp_ns, pose, by_state @ covariance @ by_state.T)
 
     def _measure(self, stamp_ns: int, reading: Float64) -> None:
         """Move to the stamp of an IMU reading, by its mean with the reading before."""

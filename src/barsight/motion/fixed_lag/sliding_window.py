@@ -80,13 +80,13 @@ class Window:
         axes.
         """
         assert self.newest is not None
-        turned = np.kron(np.eye(2), self.pose(len(self.problem.start) - 1).rotation)
+        rotation = np.kron(np.eye(2), self.pose(len(self.problem.start) - 1).rotation)
         shared = np.zeros((2, 2)) if self.drift_covariance is None else self.drift_covariance
         drift_jacobian_of_pose = self.newest.drift_jacobian_of_pose[:6]
         result: Float64 = (
-            turned
+            rotation
             @ (self.newest.covariance[:6, :6] + drift_jacobian_of_pose @ shared @ drift_jacobian_of_pose.T)
-            @ turned.T
+            @ rotation.T
         )
         return result
 
@@ -101,10 +101,10 @@ class Window:
         shared = np.zeros((2, 2)) if self.drift_covariance is None else self.drift_covariance
         jacobian = self.newest.drift_jacobian_of_pose
         known = self.newest.covariance + jacobian @ shared @ jacobian.T
-        turned = np.eye(len(known))
-        turned[3:6, 3:6] = pose.rotation
+        rotation = np.eye(len(known))
+        rotation[3:6, 3:6] = pose.rotation
         covariance = np.zeros((15, 15))
-        covariance[: len(known), : len(known)] = turned @ known @ turned.T
+        covariance[: len(known), : len(known)] = rotation @ known @ rotation.T
         if self.problem.has_imu:
             return NavigationState(stamp_ns, pose.target, self.body, self.bias, covariance)
         velocity = np.zeros(3)

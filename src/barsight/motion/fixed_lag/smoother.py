@@ -157,11 +157,11 @@ class FixedLagEstimator:
         sums = self.watch.put_together(int(now.crane.stamp_ns[0]))
         if sums and self.window is not None:
             self.window = with_sums(self.window, sums)
-        told = len(self.watch.told)
+        reported = len(self.watch.told)
         recent = self.motions[-RECENT_FRAMES:]
         known = known_motion(recent, now.imu, self._rectifier, self._shift_ns)
         self.watch.check(reestimate_noise(now.crane), known)
-        new, window = self.watch.told[told:], self.window
+        new, window = self.watch.told[reported:], self.window
         if not new or window is None:
             return
         window = with_jumps(window, self.watch.jumps)
@@ -295,8 +295,8 @@ class FixedLagEstimator:
                     continue
                 sigma, stood = crane.sway_std_deg, True
             added.append(AttitudePrior(k, now.crane.yard_from_body_nominal, np.full(3, np.deg2rad(sigma))))
-        told = replace(problem, attitudes=problem.attitudes + tuple(added))
-        return replace(window, problem=told, stood=stood)
+        extended = replace(problem, attitudes=problem.attitudes + tuple(added))
+        return replace(window, problem=extended, stood=stood)
 
     def _bound(self, window: Window, sighting: Sighting | None, now: SensorBuffer, stamp: int) -> Window:
         """Add the encoder positions, 0.4 s apart, of the nodes for whose fit all readings have arrived; at

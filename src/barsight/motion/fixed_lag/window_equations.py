@@ -113,11 +113,11 @@ def assemble_equations(
     if used.any():
         _add_pictures(problem, state, used, matrix, gradient)
     begin = int(np.searchsorted(kept, first)) * size
-    here = slice(begin, begin + chain.gradient.size)
-    add_chain(chain, np.arange(here.start, here.stop, size), skyline.full(matrix))
-    gradient[here] += chain.gradient.ravel()
+    columns = slice(begin, begin + chain.gradient.size)
+    add_chain(chain, np.arange(columns.start, columns.stop, size), skyline.full(matrix))
+    gradient[columns] += chain.gradient.ravel()
     encoders = slice(count, count + problem.encoder_unknowns)
-    matrix[encoders, here] += chain.side.reshape(chain.gradient.size, -1).T
+    matrix[encoders, columns] += chain.side.reshape(chain.gradient.size, -1).T
     matrix[encoders, encoders] += np.tril(chain.corner)
     gradient[encoders] += chain.corner_gradient
     matrix += np.tril(matrix, -1).T
@@ -221,9 +221,9 @@ def _stepped(
 def marginal_prior(left: DenseEquations, step: Float64, count: int) -> tuple[Float64, Float64]:
     """Marginalise the first `count` unknowns: matrix and gradient of all others, after the step."""
     matrix, slope = left.matrix, left.gradient + left.matrix @ step
-    share = dense.solve_positive(matrix[:count, :count], matrix[:count, count:]).T
-    own = matrix[count:, count:] - share @ matrix[:count, count:]
-    return (own + own.T) / 2, slope[count:] - share @ slope[:count]
+    gain = dense.solve_positive(matrix[:count, :count], matrix[:count, count:]).T
+    own = matrix[count:, count:] - gain @ matrix[:count, count:]
+    return (own + own.T) / 2, slope[count:] - gain @ slope[:count]
 
 
 def propagate_slide(

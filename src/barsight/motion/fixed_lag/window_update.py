@@ -102,8 +102,8 @@ def solve_window(window: Window, held: int) -> tuple[Window, MarginalisedPart | 
     if len(kept) <= MIN_AGREEING * len(problem.placed):
         kept = problem.placed
     if stated is not None:
-        turned = _about_axis(stated.body_from_rect0, found.slide - window.slide)
-        stated = replace(stated, body_from_rect0=turned)
+        mounting = _about_axis(stated.body_from_rect0, found.slide - window.slide)
+        stated = replace(stated, body_from_rect0=mounting)
     result = replace(
         window, problem=replace(window.problem, placed=kept, sightings=stated), state=found.state,
         slide=found.slide, noise=noise, drift_covariance=found.drift_covariance, newest=found.newest,

@@ -72,9 +72,9 @@ class MotionTrend:
         self._free = stamp_ns, free
         if not np.isfinite(state.velocity_mps).all():
             return None
-        way = free.position_m + state.velocity_mps * ((stamp_ns - state.stamp_ns) / NS_PER_S)
-        turned = state.rotation.T
-        return Pose("body", "body", turned @ free.rotation, turned @ way)
+        place = free.position_m + state.velocity_mps * ((stamp_ns - state.stamp_ns) / NS_PER_S)
+        to_body = state.rotation.T
+        return Pose("body", "body", to_body @ free.rotation, to_body @ place)
 
     def correct(self, stamp_ns: int, placed: Pose) -> None:
         """Correct the state by the frame's pose from the pictures; the next prediction starts from it."""

@@ -95,8 +95,8 @@ def _nearby(points: Float64, pixels: Float64, camera: RectifiedCamera) -> tuple[
     as well, and three points at a time can't tell the two apart.
     """
     matrix = np.array([[camera.focal_px, 0, camera.cx_px], [0, camera.focal_px, camera.cy_px], [0, 0, 1]])
-    turn, way = np.zeros(3), np.zeros(3)
-    _, turn, way = cv2.solvePnP(
-        points, np.ascontiguousarray(pixels), matrix, None, turn, way, True, cv2.SOLVEPNP_ITERATIVE
+    turn, translation = np.zeros(3), np.zeros(3)
+    _, turn, translation = cv2.solvePnP(
+        points, np.ascontiguousarray(pixels), matrix, None, turn, translation, True, cv2.SOLVEPNP_ITERATIVE
     )
-    return Rotation.from_rotvec(turn.ravel()).as_matrix(), way.ravel()
+    return Rotation.from_rotvec(turn.ravel()).as_matrix(), translation.ravel()

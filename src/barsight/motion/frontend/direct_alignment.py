@@ -67,10 +67,10 @@ def align_views(
             if len(seen.gray) < max(_MIN_INSIDE_RATIO * len(places.gray), _MIN_POINTS):
                 return Failed("not-alike", "the views have too little in common")
             step = _solve(seen.residual, seen.rows, guess, motion)
-            turned = Rotation.from_rotvec(step[:3]).as_matrix()
+            rotation = Rotation.from_rotvec(step[:3]).as_matrix()
             motion = Pose(
-                motion.target, motion.source, turned @ motion.rotation,
-                turned @ motion.translation + step[3:6],
+                motion.target, motion.source, rotation @ motion.rotation,
+                rotation @ motion.translation + step[3:6],
             )  # fmt: skip
             tone = tone + step[6:]
             if np.abs(step[:3]).max() < _CLOSE_RAD and np.abs(step[3:6]).max() < _CLOSE_M:
@@ -185,9 +185,9 @@ def _solve(residual: Float64, rows: Float64, guess: Pose, motion: Pose) -> Float
     normal, pull = np.zeros((8, 8)), np.zeros(8)
     _add_equations(residual, rows, _OUTLIER_SIGMAS * sigma, normal, pull)
     off = (motion @ guess.inverse()).rotation
-    turned = Rotation.from_matrix(off).as_rotvec()
+    turn = Rotation.from_matrix(off).as_rotvec()
     prior = np.array([_PRIOR_RAD**-2] * 3 + [_PRIOR_M**-2] * 3 + [1e-6] * 2)
-    so_far = np.concatenate([turned, motion.translation - guess.translation, [0.0, 0.0]])
+    so_far = np.concatenate([turn, motion.translation - guess.translation, [0.0, 0.0]])
     step: Float64 = -np.linalg.solve(normal / sigma**2 + np.diag(prior), pull / sigma**2 + prior * so_far)
     return step
 

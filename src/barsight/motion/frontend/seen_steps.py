@@ -43,5 +43,5 @@ def known_motion(
     sightings: Sequence[Sighting], imu: ImuSamples | None, rectifier: Rectifier, shift_ns: int
 ) -> KnownMotion:
     """Gather the travel known from the sightings' motions and the IMU."""
-    told = [k for k in range(1, len(sightings)) if sightings[k].motion is not None]
-    return KnownMotion(seen_steps(sightings, told, rectifier, shift_ns) if told else None, imu)
+    numbers = [k for k in range(1, len(sightings)) if sightings[k].motion is not None]
+    return KnownMotion(seen_steps(sightings, numbers, rectifier, shift_ns) if numbers else None, imu)

@@ -46,16 +46,16 @@ class SeenAgain:
 def normalised_innovation(predicted: PredictedMotion, found: PredictedMotion) -> Float64:
     """Compute the innovation (6,): found minus predicted turn and way, each divided by its sigma."""
     turn = Rotation.from_matrix(found.rotation @ predicted.rotation.T)
-    way = found.translation - turn.as_matrix() @ predicted.translation
+    shift = found.translation - turn.as_matrix() @ predicted.translation
     sigma = np.sqrt(np.diag(predicted.covariance + found.covariance))
-    return np.asarray(np.concatenate([turn.as_rotvec(), way]) / sigma, np.float64)
+    return np.asarray(np.concatenate([turn.as_rotvec(), shift]) / sigma, np.float64)
 
 
 def innovations(sightings: tuple[Sighting, ...]) -> NormalisedResiduals | None:
     """Collect the innovations of all frames whose motion was predicted; None if there are none."""
-    told = [(s.stamp_ns, s.innovation) for s in sightings if s.innovation is not None]
-    if not told:
+    known = [(s.stamp_ns, s.innovation) for s in sightings if s.innovation is not None]
+    if not known:
         return None
     names = tuple(f"{part} {axis}" for part in ("turn", "way") for axis in "xyz")
-    stamps = np.array([stamp for stamp, _ in told], np.int64)
-    return NormalisedResiduals(names, stamps, np.array([values for _, values in told]))
+    stamps = np.array([stamp for stamp, _ in known], np.int64)
+    return NormalisedResiduals(names, stamps, np.array([values for _, values in known]))

@@ -74,16 +74,16 @@ def eliminate_nodes(chain: Chain, kept: Int64) -> tuple[Chain, tuple[EliminatedN
 
 def _take_out(chain: Chain, first: int, end: int, k: int, left: Chain) -> EliminatedNodes:
     """Eliminate the nodes first...end - 1, which lie between the kept nodes k - 1 and k where these exist."""
-    size, here = chain.own.shape[1], slice(first, end)
+    size, nodes = chain.own.shape[1], slice(first, end)
     right = np.zeros((end - first, size, 2 * size + len(chain.corner) + 1))
     right[0, :, :size] = chain.link[first]
     if end < len(chain.own):
         right[-1, :, size : 2 * size] = chain.link[end].T
-    right[..., 2 * size : -1], right[..., -1] = chain.side[here], chain.gradient[here]
+    right[..., 2 * size : -1], right[..., -1] = chain.side[nodes], chain.gradient[nodes]
     right = right.reshape(-1, right.shape[2])
     at = size * np.arange(end - first)
     band = skyline.empty_skyline(np.repeat(np.maximum(at - size, 0), size))
-    add_chain(chain.at(here), at, band)
+    add_chain(chain.at(nodes), at, band)
     if not skyline.factorise_skyline(band):
         raise np.linalg.LinAlgError("the measurements leave an unknown undetermined")
     skyline.solve_forward(band, right)

@@ -189,16 +189,16 @@ def jump_sentences(
     sure, maybe = [], []
     for k, jump in enumerate(jumps):
         at = f"at {(jump.stamp_ns - begin_ns) / NS_PER_S:.1f} s"
-        encoder, told = f"the {AXES[jump.axis]}'s encoder", f"{1e3 * jump.size_m:.1f} mm"
+        encoder, size = f"the {AXES[jump.axis]}'s encoder", f"{1e3 * jump.size_m:.1f} mm"
         if state is not None:
-            told = f"{1e3 * state.jump_m[k]:.1f} mm (1 sigma {1e3 * state.jump_sigma_m[k]:.1f} mm)"
+            size = f"{1e3 * state.jump_m[k]:.1f} mm (1 sigma {1e3 * state.jump_sigma_m[k]:.1f} mm)"
         match jump.kind:
             case "sure":
-                sure.append(f"{encoder} jumps by {told} {at}; the readings before are held to be right")
+                sure.append(f"{encoder} jumps by {size} {at}; the readings before are held to be right")
             case "freeze":
-                sure.append(f"{encoder} goes on {at}, after the freeze, off by {told}")
+                sure.append(f"{encoder} goes on {at}, after the freeze, off by {size}")
             case "maybe":
-                maybe.append(f"{encoder} may jump {at}, by {told}: sigma holds it")
+                maybe.append(f"{encoder} may jump {at}, by {size}: sigma holds it")
     return tuple(sure), tuple(maybe)
 
 

@@ -72,20 +72,22 @@ def with_matching_bias(drift: RigDrift, problem: Problem) -> RigDrift:
     disparity = seen.stereo[:, 0] - seen.stereo[:, 2] + seen.camera.doffs_px
     own_px = float(np.sqrt(MATCHING_BIAS_PX**2 - COMMON_BIAS_PX**2))
     floor = _floor(disparity, seen.camera.focal_px, own_px, MATCHING_BIAS_PX)
-    rows, told, variance = drift.by_travel()
-    yaw, scale, combined = _weighed(rows, told, np.diag(variance) + rows @ floor @ rows.T, drift.prior_sigma)
+    rows, values, variance = drift.by_travel()
+    yaw, scale, combined = _weighed(
+        rows, values, np.diag(variance) + rows @ floor @ rows.T, drift.prior_sigma
+    )
     return replace(drift, yaw_rad=yaw, scale=scale, covariance=combined)
 
 
 def _weighed(
-    rows: Float64, told: Float64, covariance: Float64, prior_sigma: Float64
+    rows: Float64, values: Float64, covariance: Float64, prior_sigma: Float64
 ) -> tuple[float, float, Float64]:
     """Estimate yaw, scale and their covariance (2, 2) from observed values of rows (K, 2) of them, with the
     values' covariance (K, K) and the prior's sigmas (2,).
     """
     information = rows.T @ np.linalg.inv(covariance)
     combined = np.linalg.inv(information @ rows + np.diag(prior_sigma**-2.0)).astype(np.float64)
-    yaw, scale = combined @ information @ told
+    yaw, scale = combined @ information @ values
     return float(yaw), float(scale), combined
 
 

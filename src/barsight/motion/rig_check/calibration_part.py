@@ -33,9 +33,9 @@ def calibration_covariance(path: Path | None, range_m: float) -> Float64:
 
 def _row_values(rig: StereoRig, left: Float64, right: Float64) -> Float64:
     """Fit pitch, roll, focal ratio and yaw (4,) to the rows of raw pixels (N, 2) of both cameras."""
-    turned = right_from_rectified(rig)
-    a = rig.cam0.rays(left) @ rig.cam0_from_cam1.rotation @ turned
-    b = rig.cam1.rays(right) @ turned
+    rotation = right_from_rectified(rig)
+    a = rig.cam0.rays(left) @ rig.cam0_from_cam1.rotation @ rotation
+    b = rig.cam1.rays(right) @ rotation
     a, b = a / a[:, 2:], b / b[:, 2:]
     found = np.linalg.lstsq(row_design(b[:, 0], b[:, 1]), b[:, 1] - a[:, 1], rcond=None)[0]
     return np.asarray(found, np.float64)

@@ -204,14 +204,14 @@ def _travel_lines(
 
 
 def _scale_line(drift: RigDrift, range_m: float) -> CheckLine:
-    share = drift.scale_sigma / float(drift.prior_sigma[1])
+    ratio = drift.scale_sigma / float(drift.prior_sigma[1])
     contradicts = abs(drift.scale) > 3 * drift.scale_sigma
     if contradicts:
         state, reason = (
             DriftState.CONTRADICTION,
             "baseline and encoders disagree: one of them has a wrong metre",
         )
-    elif share > 0.8:
+    elif ratio > 0.8:
         state = DriftState.NOT_SEEN
         reason = f"not told apart from the yaw by these depths: held at ± {100 * drift.prior_sigma[1]:.2g} %"
     else:

@@ -74,8 +74,8 @@ def self_calibrate(
         residual_sigma_px(drift, rectifier.camera.focal_px, calibration_px, correct),
     )
     if correct:
-        turned = turn_right_camera(rig, np.array([0.0, drift.yaw_rad, 0.0]))
-        return SelfCalibration(Rectifier(turned), (f"the rig is self-calibrated: {seen}",), sigma_px)
+        corrected = turn_right_camera(rig, np.array([0.0, drift.yaw_rad, 0.0]))
+        return SelfCalibration(Rectifier(corrected), (f"the rig is self-calibrated: {seen}",), sigma_px)
     warnings = (f"{seen}; calibrate anew",) if is_drifted(drift) else ()
     return SelfCalibration(rectifier, warnings, sigma_px)
 
