@@ -58,11 +58,18 @@ from barsight.stereo.direct.photometric_residuals import (
     robust_weights,
     step_gain,
 )
-from barsight.stereo.direct.plane_fits import Evidence, SupportShape, fit_planes
+from barsight.stereo.direct.plane_fits import SupportShape, fit_planes
+from barsight.stereo.direct.plane_sums import (
+    Evidence,
+    SupportPairs,
+    fit_lanes,
+    place_pairs,
+)
 from barsight.stereo.direct.semiglobal.cost import BESIDE_COST, describe_pixels, reverse_rows, row_costs
 from barsight.stereo.direct.semiglobal.matching import SemiGlobalSettings, match_semiglobal
 from barsight.stereo.direct.semiglobal.paths import Penalties, allocate_paths, extend_row, p2_table
 from barsight.stereo.direct.support_regions import (
+    MARGIN,
     TILE_COLUMNS,
     TILE_ROWS,
     allocate_frame,
@@ -162,11 +169,9 @@ def _planes(
     disparity: np.ndarray, weight: np.ndarray, pull: np.ndarray, shape: SupportShape, same_px: float,
     axis: tuple[float, float] = (0, 1), gray: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    found = np.empty_like(disparity), np.empty_like(disparity)
     frames = [_frame(image) for image in (disparity, weight, pull, 0 * pull if gray is None else gray)]
     room = allocate_frame(disparity.shape), allocate_frame(disparity.shape)
-    fit_planes(Evidence(*frames), _axes(*axis), shape, same_px, room, *found)
-    return found
+    return fit_planes(Evidence(*frames), _axes(*axis), [shape], same_px, room, disparity.shape)[0]
 
 
 def test_planes_are_weighted_least_squares_on_the_support() -> None:
@@ -196,6 +201,45 @@ def test_planes_are_weighted_least_squares_on_the_support() -> None:
         value = np.linalg.solve(normal, basis.T @ np.array(values))[0]
         assert fitted[y, x] == pytest.approx(disparity[y, x] + value, abs=2e-4)
         assert information[y, x] == pytest.approx(1 / np.linalg.inv(normal)[0, 0], rel=2e-3)
+
+
+def _support(points: list[tuple[int, int]], on_axis: int) -> SupportPairs:
+    a, c = np.array(points).T
+    share = 0.9 ** np.abs(a) * 0.8 ** np.abs(c)
+    factors = share[:, None] * np.stack([np.ones_like(a), a, c, a * a, a * c, c * c], axis=1)
+    return SupportPairs(a, c, factors.astype(np.float32), on_axis)
+
+
+def test_pairs_are_rotated_to_the_axis() -> None:
+    offsets = np.empty((2, 3), dtype=np.int64)
+    place_pairs(np.array([0.6, 0.8], np.float32), _support([(5, 2), (-5, 2), (10, 0)], 1), 1000, offsets)
+    # Along the axis is (3, 4) for 5 px, across it (-1.6, 1.2) for 2 px.
+    np.testing.assert_array_equal(offsets[0], [5 * 1000 + 1, -3 * 1000 - 5, 8 * 1000 + 6])
+    np.testing.assert_array_equal(offsets[1], [1 * 1000 - 2, 1 * 1000 - 2, 0])
+
+
+def test_planes_of_a_row_are_those_of_their_points_one_by_one() -> None:
+    disparity, weight, pull, gray = (_noise(seed, 0.3) for seed in (20, 21, 22, 23))
+    frames = [_frame(image) for image in (disparity, 0.1 + np.abs(weight), pull, gray)]
+    framed_width, flat = frames[0].shape[1], Evidence(*(frame.reshape(-1) for frame in frames))
+    points = [(-3, -2), (0, -2), (3, -2), (-3, -1), (0, -1), (3, -1), (-3, 0)]
+    pairs, offsets = _support(points, 1), np.empty((2, len(points)), dtype=np.int64)
+    place_pairs(np.array([0, 1], dtype=np.float32), pairs, framed_width, offsets)
+    row, certain = np.empty(30, dtype=np.float32), np.empty(30, dtype=np.float32)
+    middle = (20 + MARGIN) * framed_width + 5 + MARGIN
+    fit_lanes(flat, middle, offsets, pairs, row, certain)
+    for x in (0, 17, 29):
+        normal, right, here = np.zeros((3, 3)), np.zeros(3), flat.disparity[middle + x]
+        for a, c in [(0, 0), *points, *((-a, -c) for a, c in points)]:
+            at = middle + x + a * framed_width - c
+            gap, tone = flat.disparity[at] - here, flat.gray[at] - flat.gray[middle + x - c]
+            share = 0.9 ** abs(a) * 0.8 ** abs(c) * max(1 - gap**2 - min(tone**2, 0.78), 0) ** 2
+            basis = np.array([1, a, c])
+            normal += share * flat.weight[at] * np.outer(basis, basis)
+            right += share * (flat.weight[at] * gap + flat.pull[at]) * basis
+        normal[[1, 2], [1, 2]] += 0.02 * (normal[1, 1] + normal[2, 2]) + 1e-3
+        assert row[x] == pytest.approx(here + np.linalg.solve(normal, right)[0], abs=2e-5)
+        assert certain[x] == pytest.approx(1 / np.linalg.inv(normal)[0, 0], rel=1e-4)
 
 
 def test_a_row_goes_to_the_fitted_ones_that_are_like_it() -> None:

@@ -40,7 +40,8 @@ from barsight.stereo.direct.photometric_residuals import (
     robust_weights,
     step_gain,
 )
-from barsight.stereo.direct.plane_fits import Evidence, SupportShape, fit_planes
+from barsight.stereo.direct.plane_fits import SupportShape, fit_planes
+from barsight.stereo.direct.plane_sums import Evidence
 from barsight.stereo.direct.support_regions import MARGIN, allocate_frame, axis_means, inside, tile_axes
 from barsight.stereo.noise import image_noise
 
@@ -176,7 +177,7 @@ def refine_at_half_size(
     now, moved = inside(work.disparity, started.shape), np.zeros_like(started)
     for _ in range(steps):
         work.pulls(small_left, small_right, _BLUR_PX, slope_noise, is_last=False)
-        fitted, _ = work.planes(SupportShape(half.along_px, half.across_px, _HALF_STEP_PX))
+        fitted, _ = work.planes([SupportShape(half.along_px, half.across_px, _HALF_STEP_PX)])[0]
         step = np.clip(fitted - now, -_LONGEST_HALF_STEP_PX, _LONGEST_HALF_STEP_PX)
         now += step
         moved += step
@@ -279,23 +280,21 @@ class _Work:
 
     def _fit(self, power: Float32, same_surface: float) -> tuple[Float32, Float32]:
         settings = self.settings
-        long = self.planes(SupportShape(settings.along_px, settings.across_px, _LONG_STEP_PX), same_surface)
+        supports = [SupportShape(settings.along_px, settings.across_px, _LONG_STEP_PX)]
+        if settings.short_px > 0:
+            supports.append(SupportShape(settings.short_px, settings.short_across_px, _SHORT_STEP_PX))
+        fits = self.planes(supports, same_surface)
         if settings.short_px == 0:
-            return long[0], fit_variance(power, long[1])
-        short_support = SupportShape(settings.short_px, settings.short_across_px, _SHORT_STEP_PX)
-        short = self.planes(short_support, same_surface)
-        return blend_fits(long, short, power, self.usable)
+            return fits[0][0], fit_variance(power, fits[0][1])
+        return blend_fits(fits[0], fits[1], power, self.usable)
 
-    def planes(self, support: SupportShape, same_surface: float = 1.0) -> Fit:
-        """Fit the planes of a support; same_surface: the share of same_surface_px at which it ends."""
-        found = np.empty_like(self.usable), np.empty_like(self.usable)
+    def planes(self, supports: list[SupportShape], same_surface: float = 1.0) -> list[Fit]:
+        """Fit the planes of each support; same_surface: the share of same_surface_px at which they end."""
         # The inputs of the weights and pulls are no longer needed.
         room = self.residual, self.trust
         evidence = Evidence(self.disparity, self.weight, self.pull, self.gray)
-        fit_planes(
-            evidence, self.axes, support, same_surface * self.settings.same_surface_px, room, *found,
-        )  # fmt: skip
-        return found
+        reach_px = same_surface * self.settings.same_surface_px
+        return fit_planes(evidence, self.axes, supports, reach_px, room, self.usable.shape)
 
 
 def _noise(left: Image, right: Image) -> float:
