@@ -14,14 +14,20 @@ import numpy as np
 
 from barsight.core.arrays import Float32, Int64, kernel
 from barsight.core.parallel import parallel_bands
+from barsight.stereo.direct.kernels.vectors import stack_array
 
 TILE_ROWS = 16
 TILE_COLUMNS = 32
 MARGIN = 48
+_SUMS = 3 * TILE_COLUMNS
 _LINE_FLOATS = 16
 BAND_TILES = 16
 """Number of tile rows that a thread processes row by row, so that the data along a row are in the cache
 when they are read.
+"""
+_STRIP_TILES = 8
+"""Number of tiles beside each other that are averaged before those beside them: a strip's rows within reach
+stay in the second cache, which a whole row's don't.
 """
 _MIN_COHERENCE = 0.35
 FITTED_EVERY = 4
@@ -172,20 +178,26 @@ def blend_rows(above: Float32, below: Float32, shares: Float32, row: Float32) ->
 
 
 @kernel(borrows=True)
-def _take_means(images: AxisImages, middle: int, offsets: Int64, shares: Float32, sums: Float32) -> None:
-    """Average the first and the second image for TILE_COLUMNS pixels from `middle` on.
+def _take_means(
+    images: AxisImages, middle: int, offsets: Int64, shares: Float32, first_mean: Float32,
+    second_mean: Float32,
+) -> None:  # fmt: skip
+    """Average the first and the second image for up to TILE_COLUMNS pixels from `middle` on.
 
     images: flat. offsets: (K,), from a pixel to its support's points on one side; those on the other side are
-    mirrored; shares: (K,) their Gaussian weights. Fills sums (3 TILE_COLUMNS,): the weights, both means.
+    mirrored; shares: (K,) their Gaussian weights. Fills both means (N,), which determine the number of
+    pixels.
     """
     first, second, weight, alike = images
+    sums = stack_array(_SUMS, np.float32)
     # Unsigned: a loop whose index might be negative, and count from the end, isn't vectorised.
     here = np.uint64(middle)
     for i in range(TILE_COLUMNS):
-        at = here + np.uint64(i)
-        sums[i] = weight[at]
-        sums[TILE_COLUMNS + i] = weight[at] * first[at]
-        sums[2 * TILE_COLUMNS + i] = weight[at] * second[at]
+        sums[i] = weight[here + np.uint64(i)]
+    for i in range(TILE_COLUMNS):
+        sums[TILE_COLUMNS + i] = sums[i] * first[here + np.uint64(i)]
+    for i in range(TILE_COLUMNS):
+        sums[2 * TILE_COLUMNS + i] = sums[i] * second[here + np.uint64(i)]
     for j in range(len(offsets)):
         forth, back, share = np.uint64(middle + offsets[j]), np.uint64(middle - offsets[j]), shares[j]
         for i in range(TILE_COLUMNS):
@@ -196,10 +208,10 @@ def _take_means(images: AxisImages, middle: int, offsets: Int64, shares: Float32
             sums[i] += share * (one + other)
             sums[TILE_COLUMNS + i] += share * (one * first[forth + lane] + other * first[back + lane])
             sums[2 * TILE_COLUMNS + i] += share * (one * second[forth + lane] + other * second[back + lane])
-    for i in range(TILE_COLUMNS):
-        whole = sums[i] + np.float32(1e-6)
-        sums[TILE_COLUMNS + i] /= whole
-        sums[2 * TILE_COLUMNS + i] /= whole
+    for i in range(len(first_mean)):
+        first_mean[i] = sums[TILE_COLUMNS + i] / (sums[i] + np.float32(1e-6))
+    for i in range(len(second_mean)):
+        second_mean[i] = sums[2 * TILE_COLUMNS + i] / (sums[i] + np.float32(1e-6))
 
 
 @kernel()
@@ -213,7 +225,7 @@ def _axis_means(
     Gaussian weights. Fills both means (H, W).
     """
     first_mean, second_mean = means
-    height, width = first_mean.shape
+    height = first_mean.shape[0]
     framed_width = images.first.shape[1]
     flat = AxisImages(
         images.first.reshape(-1),
@@ -221,20 +233,18 @@ def _axis_means(
         images.weight.reshape(-1),
         images.alike.reshape(-1),
     )
-    sums = np.empty(3 * TILE_COLUMNS, dtype=np.float32)
-    offsets = np.empty((axes.shape[1], len(steps)), dtype=np.int64)
-    for tile_y in range(first_tile, end_tile):
-        for tile_x in range(axes.shape[1]):
-            axis_x, axis_y = axes[tile_y, tile_x, 0], axes[tile_y, tile_x, 1]
-            for j in range(len(steps)):
-                offsets[tile_x, j] = round(steps[j] * axis_y) * framed_width + round(steps[j] * axis_x)
-        for y in range(tile_y * TILE_ROWS, min(height, tile_y * TILE_ROWS + TILE_ROWS)):
-            for tile_x in range(axes.shape[1]):
-                x0 = tile_x * TILE_COLUMNS
-                count = min(TILE_COLUMNS, width - x0)
-                middle = (y + MARGIN) * framed_width + x0 + MARGIN
-                _take_means(flat, middle, offsets[tile_x], shares, sums)
-                for i in range(count):
-                    first_mean[y, x0 + i] = sums[TILE_COLUMNS + i]
-                for i in range(count):
-                    second_mean[y, x0 + i] = sums[2 * TILE_COLUMNS + i]
+    offsets = np.empty((_STRIP_TILES, len(steps)), dtype=np.int64)
+    for first_x in range(0, axes.shape[1], _STRIP_TILES):
+        end_x = min(first_x + _STRIP_TILES, axes.shape[1])
+        for tile_y in range(first_tile, end_tile):
+            for tile_x in range(first_x, end_x):
+                axis_x, axis_y = axes[tile_y, tile_x, 0], axes[tile_y, tile_x, 1]
+                for j in range(len(steps)):
+                    offset = round(steps[j] * axis_y) * framed_width + round(steps[j] * axis_x)
+                    offsets[tile_x - first_x, j] = offset
+            for y in range(tile_y * TILE_ROWS, min(height, tile_y * TILE_ROWS + TILE_ROWS)):
+                for tile_x in range(first_x, end_x):
+                    x0 = tile_x * TILE_COLUMNS
+                    row = first_mean[y, x0 : x0 + TILE_COLUMNS], second_mean[y, x0 : x0 + TILE_COLUMNS]
+                    middle = (y + MARGIN) * framed_width + x0 + MARGIN
+                    _take_means(flat, middle, offsets[tile_x - first_x], shares, row[0], row[1])
