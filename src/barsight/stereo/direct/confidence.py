@@ -17,7 +17,7 @@ from barsight.core.linalg.robust import mad_sigma
 from barsight.core.parallel import parallel_bands
 from barsight.stereo.direct.depth_edges import mark_jumps
 from barsight.stereo.direct.kernels.box_sums import mirror_index, window_means
-from barsight.stereo.direct.kernels.cubic_spline import row_coefficients, value_and_slope
+from barsight.stereo.direct.kernels.cubic_spline import interpolated_value, row_coefficients, value_and_slope
 
 _BLUR_PX = 0.7
 _WINDOW_PX = 21
@@ -242,7 +242,7 @@ def _vertical_shifts(
         cv2.GaussianBlur(image.astype(np.float32), (0, 0), _BLUR_PX) for image in (left, right)
     )
     warped, right_x = value_and_slope(row_coefficients(right_gray), disparity)
-    right_y, _ = value_and_slope(row_coefficients(_derivative(right_gray, (0, 1))), disparity)
+    right_y = interpolated_value(row_coefficients(_derivative(right_gray, (0, 1))), disparity)
     left_x, left_y = _derivative(left_gray, (1, 0)), _derivative(left_gray, (0, 1))
     means = _mean(usable), _mean(usable * left_gray), _mean(usable * warped)
     products, trust = np.empty((6, *usable.shape), np.float32), np.empty_like(usable)

@@ -32,7 +32,12 @@ from barsight.stereo.direct.disparity_update import (
     raise_noise,
     update_disparity,
 )
-from barsight.stereo.direct.kernels.cubic_spline import row_coefficients, row_slope, value_and_slope
+from barsight.stereo.direct.kernels.cubic_spline import (
+    interpolated_value,
+    row_coefficients,
+    row_slope,
+    value_and_slope,
+)
 from barsight.stereo.direct.kernels.pyramid import halve, upsample_update
 from barsight.stereo.direct.photometric_residuals import (
     noise_power,
@@ -237,12 +242,14 @@ class _Work:
         """
         settings, shape = self.settings, self.usable.shape
         left_gray = cv2.GaussianBlur(left.astype(np.float32), (0, 0), blur_px)
-        warped, right_slope = value_and_slope(row_coefficients(right, blur_px), self.disparity, MARGIN)
+        coefficients = row_coefficients(right, blur_px)
         slope = inside(self.slope, shape)
         left_slope = row_slope(left, blur_px)
         if is_last:
+            warped = interpolated_value(coefficients, self.disparity, MARGIN)
             slope[:] = left_slope
         else:
+            warped, right_slope = value_and_slope(coefficients, self.disparity, MARGIN)
             left_slope += right_slope
             np.multiply(left_slope, np.float32(0.5), out=slope)
             slope_noise *= 0.5

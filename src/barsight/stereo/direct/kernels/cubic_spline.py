@@ -59,14 +59,24 @@ def value_and_slope(coefficients: Float32, disparity: Float32, margin: int = 0) 
     Beyond the image's ends, the end column is read. `disparity` has no NaN; its pixel (0, 0) is `margin` rows
     and columns inside.
     """
-    shape = len(coefficients), coefficients.shape[1] - 3
-    value, slope = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
+    slope = np.empty((len(coefficients), coefficients.shape[1] - 3), dtype=np.float32)
+    return _read_bands(coefficients, disparity, margin, slope), slope
+
+
+def interpolated_value(coefficients: Float32, disparity: Float32, margin: int = 0) -> Float32:
+    """Interpolate the image alone, (H, W), as `value_and_slope` does."""
+    return _read_bands(coefficients, disparity, margin, np.empty((0, 0), dtype=np.float32))
+
+
+def _read_bands(coefficients: Float32, disparity: Float32, margin: int, slope: Float32) -> Float32:
+    """Return the values (H, W), and fill the slopes (H, W) unless there are none."""
+    value = np.empty((len(coefficients), coefficients.shape[1] - 3), dtype=np.float32)
 
     def read(first: int, end: int) -> None:
         _read(coefficients, disparity, margin, value, slope, first, end)
 
-    parallel_bands(read, shape[0], _BAND_ROWS)
-    return value, slope
+    parallel_bands(read, len(value), _BAND_ROWS)
+    return value
 
 
 @kernel()
@@ -77,27 +87,55 @@ def _read(
     """Evaluate the cubic B-spline and its x derivative at column x - disparity [Thevenaz 2000].
 
     coefficients: (H, W + 3), see `row_coefficients`. disparity: px, no NaN, with its pixel (0, 0) `margin`
-    rows and columns inside. Fills value and slope (per px), (H, W), in rows first_row...end_row.
+    rows and columns inside. Fills value and slope (per px), (H, W), in rows first_row...end_row; the slope
+    may have no rows, then it isn't asked for.
     """
     width = value.shape[1]
-    one, two, three = np.float32(1), np.float32(2), np.float32(3)
-    four, half, sixth = np.float32(4), np.float32(0.5), np.float32(1 / 6)
     last, last_first = np.float32(width - 1), np.int32(max(width - 2, 0))
+    firsts, parts = np.empty(width, dtype=np.int32), np.empty(width, dtype=np.float32)
+    near = np.empty((4, width), dtype=np.float32)
     for y in range(first_row, end_row):
         row, shift = coefficients[y], disparity[y + margin, margin : margin + width]
-        values, slopes = value[y], slope[y]
         for x in range(width):
             place = min(max(np.float32(np.int32(x)) - shift[x], np.float32(0)), last)
             first = min(np.int32(place), last_first)
-            t = place - np.float32(first)
-            t2 = t * t
-            w0, w1, w2, w3 = sixfold_weights(t)
-            at = np.uint64(first)
-            c0, c1, c2, c3 = row[at], row[at + np.uint64(1)], row[at + np.uint64(2)], row[at + np.uint64(3)]
-            values[x] = sixth * (c0 * w0 + c1 * w1 + c2 * w2 + c3 * w3)
-            slopes[x] = half * (
-                c1 * (three * t2 - four * t)
-                - c0 * (one - two * t + t2)
-                + c2 * (one + two * t - three * t2)
-                + c3 * t2
-            )
+            firsts[x] = first
+            parts[x] = place - np.float32(first)
+        c0, c1, c2, c3 = near[0], near[1], near[2], near[3]
+        # What lies anywhere is gathered apart, so that all else is vector code.
+        for x in range(width):
+            at = np.uint64(firsts[x])
+            c0[x], c1[x] = row[at], row[at + np.uint64(1)]
+            c2[x], c3[x] = row[at + np.uint64(2)], row[at + np.uint64(3)]
+        _blend(c0, c1, c2, c3, parts, value[y])
+        if len(slope) > 0:
+            _blend_slopes(c0, c1, c2, c3, parts, slope[y])
+
+
+@kernel(inline=True)
+def _blend(c0: Float32, c1: Float32, c2: Float32, c3: Float32, parts: Float32, values: Float32) -> None:
+    """Blend four coefficients (W,) each to the spline's values (W,), `parts` (W,) of a pixel behind the
+    second.
+    """
+    sixth = np.float32(1 / 6)
+    for x in range(len(values)):
+        w0, w1, w2, w3 = sixfold_weights(parts[x])
+        values[x] = sixth * (c0[x] * w0 + c1[x] * w1 + c2[x] * w2 + c3[x] * w3)
+
+
+@kernel(inline=True)
+def _blend_slopes(
+    c0: Float32, c1: Float32, c2: Float32, c3: Float32, parts: Float32, slopes: Float32
+) -> None:
+    """Blend four coefficients (W,) each to the spline's slopes (W,), as `_blend`."""
+    one, two, three = np.float32(1), np.float32(2), np.float32(3)
+    four, half = np.float32(4), np.float32(0.5)
+    for x in range(len(slopes)):
+        t = parts[x]
+        t2 = t * t
+        slopes[x] = half * (
+            c1[x] * (three * t2 - four * t)
+            - c0[x] * (one - two * t + t2)
+            + c2[x] * (one + two * t - three * t2)
+            + c3[x] * t2
+        )
