@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from barsight.core.arrays import UInt8, kernel
 from barsight.core.parallel import parallel_bands
+from barsight.stereo.direct.kernels.vectors import stack_array
 
 Int16 = NDArray[np.int16]
 
@@ -114,6 +115,7 @@ def _write_costs(
     ones, twos, threes, slopes, grays = row
     # Unsigned: a loop whose index might be negative, and count from the end, isn't vectorised.
     first, most = np.uint64(at), np.int16(_MAX_APART)
+    found = stack_array(LANES, np.uint8)
     for part in range(0, cost.shape[0], LANES):
         for lane in range(LANES):
             i = np.uint64(part) + np.uint64(lane)
@@ -134,7 +136,9 @@ def _write_costs(
             bright = bright if bright > 0 else np.int16(-bright)
             steep = steep if steep < most else most
             bright = bright if bright < most else most
-            cost[i] = np.uint8(hamming + np.uint8(np.int16(steep + bright) >> np.int16(1)))
+            found[lane] = np.uint8(hamming + np.uint8(np.int16(steep + bright) >> np.int16(1)))
+        for lane in range(LANES):
+            cost[np.uint64(part) + np.uint64(lane)] = found[lane]
 
 
 @kernel()
