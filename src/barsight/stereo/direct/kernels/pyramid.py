@@ -80,20 +80,41 @@ def _carry_up(
     Fills result (H, W) px.
     """
     width = disparity.shape[1]
-    zero, one, tiny = np.float32(0), np.float32(1), np.float32(1e-6)
-    shares = np.array([9, 3, 3, 1], dtype=np.float32)
+    around = np.empty((8, width + width % 2), dtype=np.float32)
     for y in range(first, end):
         near = y // rows + 1
         far = near - 1 + 2 * (y & 1) if rows == 2 else near
-        for x in range(width):
-            column = x // 2 + 1
-            beside = column - 1 + 2 * (x & 1)
-            here, total, weights = disparity[y, x], zero, tiny
-            for k in range(4):
-                row, place = (near if k < 2 else far), (beside if k & 1 else column)
-                gap = (started[row, place] - here) * inverse_px
-                alike = max(one - gap * gap, zero)
-                weight = shares[k] * alike * alike
-                weights += weight
-                total += weight * moved[row, place]
-            result[y, x] = here + total / weights
+        for k in range(2):
+            row = near if k == 0 else far
+            _repeat(started[row], around[2 * k], around[2 * k + 1])
+            _repeat(moved[row], around[4 + 2 * k], around[5 + 2 * k])
+        _blend_moves(around, disparity[y], inverse_px, result[y])
+
+
+@kernel(inline=True)
+def _repeat(small: Float32, columns: Float32, beside: Float32) -> None:
+    """Repeat the half-size pixel (W / 2 + 2,) of each column, and the nearest one beside it. Fills columns
+    and beside (W,), of even width.
+    """
+    for i in range(len(columns) // 2):
+        columns[2 * i] = small[i + 1]
+        columns[2 * i + 1] = small[i + 1]
+    for i in range(len(beside) // 2):
+        beside[2 * i] = small[i]
+        beside[2 * i + 1] = small[i + 2]
+
+
+@kernel(inline=True)
+def _blend_moves(around: Float32, disparity: Float32, inverse_px: np.float32, result: Float32) -> None:
+    """Blend the four pixels around each, see `_carry_up`: around (8, W) px, first started, then moved."""
+    zero, one, tiny = np.float32(0), np.float32(1), np.float32(1e-6)
+    shares = np.array([9, 3, 3, 1], dtype=np.float32)
+    for x in range(len(result)):
+        here, total, weights = disparity[x], zero, tiny
+        for k in range(4):
+            gap = (around[k, x] - here) * inverse_px
+            alike = max(one - gap * gap, zero)
+            weight = shares[k] * alike * alike
+            weights += weight
+            total += weight * around[4 + k, x]
+        result[x] = here + total / weights
