@@ -103,6 +103,15 @@ def test_image_noise() -> None:
     assert image_noise(np.zeros((50, 50), np.uint8)) == 0.5
 
 
+def test_noise_of_whole_gray_levels_is_counted_as_it_is_sorted() -> None:
+    rng = np.random.default_rng(4)
+    for shape in ((3, 3), (4, 9), (50, 51), (101, 200)):
+        image = rng.integers(0, 256, shape).astype(np.uint8)
+        assert image_noise(image) == image_noise(image.astype(np.float32))
+    checks = (255 * (np.indices((60, 61)).sum(axis=0) % 2)).astype(np.uint8)
+    assert image_noise(checks) == image_noise(checks.astype(np.float32)) > 300
+
+
 @pytest.mark.parametrize(
     "setting", [{"block_px": 4}, {"block_px": -1}, {"uniqueness_pct": 101}, {"subpixel_sigma_px": -0.1}]
 )
