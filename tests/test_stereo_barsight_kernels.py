@@ -170,7 +170,7 @@ def _planes(
     axis: tuple[float, float] = (0, 1), gray: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     frames = [_frame(image) for image in (disparity, weight, pull, 0 * pull if gray is None else gray)]
-    room = allocate_frame(disparity.shape), allocate_frame(disparity.shape)
+    room = tuple(allocate_frame(disparity.shape) for _ in range(3))
     return fit_planes(Evidence(*frames), _axes(*axis), [shape], same_px, room, disparity.shape)[0]
 
 

@@ -50,7 +50,7 @@ def fit_planes(
     axes: Float32,
     shapes: Sequence[SupportShape],
     same_surface_px: float,
-    room: tuple[Float32, Float32],
+    room: tuple[Float32, Float32, Float32],
     size: tuple[int, ...],
 ) -> list[tuple[Float32, Float32]]:
     """Fit a plane through the evidence of each pixel's support, for each of the supports' shapes; return its
@@ -62,16 +62,17 @@ def fit_planes(
     something so low that its disparities hardly differ. Shading across a bar doesn't narrow its support.
     Supports along a column overlap almost entirely: of a column's rows only one in FITTED_EVERY is fitted,
     and the rows between are interpolated from those above and below, as far as these are the same surface.
-    Frames in, no NaN, and two more (`room`) as scratch; size: (H, W).
+    Frames in, no NaN, and three more (`room`) as scratch; the pulls change. size: (H, W).
     """
     unit = np.float32(same_surface_px)
     # In units of same_surface_px, each point needs one multiplication less.
     if unit != 1:
-        evidence = evidence._replace(disparity=evidence.disparity / unit, pull=evidence.pull / unit)
+        np.divide(evidence.pull, unit, out=evidence.pull)
+        evidence = evidence._replace(disparity=np.divide(evidence.disparity, unit, out=room[2]))
     found = []
     for shape in shapes:
         fit = np.empty(size, dtype=np.float32), np.empty(size, dtype=np.float32)
-        _fit_shape(evidence, axes, shape, room, fit)
+        _fit_shape(evidence, axes, shape, room[:2], fit)
         if unit != 1:
             np.multiply(fit[0], unit, out=fit[0])
         found.append(fit)

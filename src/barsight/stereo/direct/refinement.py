@@ -297,8 +297,8 @@ class _Work:
 
     def planes(self, supports: list[SupportShape], same_surface: float = 1.0) -> list[Fit]:
         """Fit the planes of each support; same_surface: the share of same_surface_px at which they end."""
-        # The inputs of the weights and pulls are no longer needed.
-        room = self.residual, self.trust
+        # The inputs of the weights and pulls are no longer needed, nor will the pulls be.
+        room = self.residual, self.trust, self.slope
         evidence = Evidence(self.disparity, self.weight, self.pull, self.gray)
         reach_px = same_surface * self.settings.same_surface_px
         return fit_planes(evidence, self.axes, supports, reach_px, room, self.usable.shape)
