@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import cv2
 import numpy as np
 
@@ -57,7 +59,7 @@ def _median_bend(image: UInt8 | Float32) -> float:
     if image.dtype != np.uint8 or min(image.shape) < _FEWEST_ROWS:
         return float(np.median(np.abs(_bends(_bends(image).T))))
     sizes = np.zeros(_MAX_BEND_GRAY + 1, dtype=np.int64)
-    _count_bends(image, sizes)
+    _count_bends(cast(UInt8, image), sizes)
     below, count = np.cumsum(sizes), int(sizes.sum())
     middle = np.searchsorted(below, [(count - 1) // 2, count // 2], side="right")
     return float(middle.mean())
