@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from barsight.mapping.free_space import (
     LEVEL_CELLS,
@@ -78,13 +79,14 @@ def test_matches_that_mix_front_and_back_at_an_edge_prove_nothing() -> None:
     assert (free.window(int(X[0]), 10, X.size, 20) >= HEIGHT[None]).all()
 
 
-@pytest.mark.parametrize("eye_cells", [(30.0, 41.0), (-25.0, 12.0), (90.0, 100.0)])
+@pytest.mark.parametrize("eye_cells", [(30.0, 41.0), (-25.0, 12.0), (90.0, 100.0), (1.2, 30.0), (-1.2, 40.0)])
 def test_bounds_are_those_of_single_lines_of_sight(eye_cells: tuple[float, float]) -> None:
     rng, shape, eye_z_m = np.random.default_rng(2), (80, 70), 6.0
     ends = np.full(shape, NO_END)
     ends[tuple(rng.integers(0, 70, (2, 40)))] = rng.uniform(0, 1, 40).astype(np.float32)
     bound = np.full(shape, np.inf, np.float32)
-    sweep_rays(ends, np.array([*(CELL_M * np.array(eye_cells)), eye_z_m]), CELL_M, bound)
+    eye = np.array([*(CELL_M * np.array(eye_cells)), eye_z_m])
+    sweep_rays(ends, np.zeros(shape, np.uint8), eye, CELL_M, bound)
     lowest, middle = np.full(shape, np.inf), np.full(shape, np.inf)
     for row, column in np.argwhere(np.isfinite(ends)):
         for aside in np.ndindex(5, 5):
@@ -111,7 +113,7 @@ def test_a_plane_lets_no_wall_through() -> None:
     ends[:, 40:] = NO_END
     ends[20:22, :] = NO_END
     bound = np.full(ends.shape, np.inf, np.float32)
-    sweep_rays(ends, np.array([6.0, 0.3, 7.0]), CELL_M, bound)
+    sweep_rays(ends, np.zeros(ends.shape, np.uint8), np.array([6.0, 0.3, 7.0]), CELL_M, bound)
     # From +X, the eye sees the ends at the left through the cells to the right of them.
     assert np.isfinite(bound[5:15, 20:60]).all()
     assert (bound[5:15, 1:38] < 0.2 + OVER_END_M + 0.06).all()
@@ -123,8 +125,8 @@ def test_tiles_join_without_a_seam(corner: tuple[int, int]) -> None:
     cells = seen_from(0.0)
     whole, moved = FreeSpace(CELL_M), FreeSpace(CELL_M)
     shifted = CellObservations(
-        cells.x + np.int32(corner[0]), cells.y + np.int32(corner[1]), cells.central, cells.z_m, cells.variance_m2,
-        cells.shared_m, cells.intensity,
+        cells.x + np.int32(corner[0]), cells.y + np.int32(corner[1]), cells.central, cells.z_m,
+        cells.variance_m2, cells.shared_m, cells.intensity,
     )  # fmt: skip
     for _ in range(2):
         whole.carve(cells, np.array([[0.003, 0.201, 7.0]]))
@@ -152,7 +154,7 @@ def test_level_heights_agree_with_a_slow_reference() -> None:
     z = (0.2 * (x // 6 % 2) + rng.uniform(0, 0.04, x.size)).astype(np.float32)
     none = np.zeros(x.size, np.float32)
     cells = CellObservations(x, y, none > 0, z, none, none, none)
-    level = level_heights(cells, (-side, -side), (2 * side, 2 * side))
+    level, holes = level_heights(cells, (-side, -side), (2 * side, 2 * side))
     slow = np.full_like(level, NO_END)
     for k in range(x.size):
         near = (abs(x - x[k]) <= LEVEL_CELLS // 2) & (abs(y - y[k]) <= LEVEL_CELLS // 2)
@@ -160,3 +162,20 @@ def test_level_heights_agree_with_a_slow_reference() -> None:
             slow[y[k] + side, x[k] + side] = max(slow[y[k] + side, x[k] + side], z[k])
     np.testing.assert_array_equal(level, slow)
     assert 100 < np.isfinite(slow).sum() < len({*zip(x, y, strict=True)}) - 100
+    seen = np.zeros(level.shape, bool)
+    seen[y + side, x + side] = True
+    assert not holes[seen].any() and holes[~ndimage.binary_dilation(seen, np.ones((3, 3)))].all()
+
+
+def test_the_background_matched_beside_a_post_proves_nothing() -> None:
+    """A post at x = 40 hides a strip of the floor from an eye at +X; the background is matched over a half of
+    the strip's width.
+    """
+    shape, eye = (61, 81), np.array([3.0, 0.30, 7.0])
+    ends, holes = np.zeros(shape, np.float32), np.zeros(shape, np.uint8)
+    ends[26:35, 10:41], holes[26:35, 10:41] = NO_END, 1
+    ends[28:31, 10:41], holes[28:31, 10:41] = 0.0, 0
+    bound = np.full(shape, np.inf, np.float32)
+    sweep_rays(ends, holes, eye, CELL_M, bound)
+    assert bound[30, 38] > 0.7
+    assert bound[15, 38] < 0.15 and bound[30, 50] < 0.15

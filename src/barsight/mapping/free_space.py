@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from barsight.core.arrays import Bool, Float32, Float64, Int32, kernel
+from barsight.core.arrays import Bool, Float32, Float64, Int32, UInt8, kernel
 from barsight.mapping.observation import CellObservations
 from barsight.mapping.spilled_tiles import TileKey
 
@@ -28,6 +28,8 @@ LEVEL_CELLS, LEVEL_M = 5, 0.05
 """Window side (cells) and maximum height difference within it for a line of sight to count: around its
 end, the view must see only heights this close. At edges, matching mixes foreground and background.
 """
+BESIDE_CELLS = 2
+"""Maximum distance of a hole beside the end of a line of sight that doesn't count."""
 UNPROVEN = np.float32(np.inf)
 NO_END = np.float32(-np.inf)
 _NEAREST_CELLS = 2
@@ -55,9 +57,10 @@ class FreeSpace:
         margin = math.ceil(MARGIN_M / self.cell_m)
         column, row = int(cells.x.min()) - margin, int(cells.y.min()) - margin
         shape = int(cells.y.max()) - row + margin + 1, int(cells.x.max()) - column + margin + 1
-        ends, bound = level_heights(cells, (column, row), shape), np.full(shape, UNPROVEN)
+        ends, holes = level_heights(cells, (column, row), shape)
+        bound = np.full(shape, UNPROVEN)
         for eye in eyes_m:
-            sweep_rays(ends, eye - (column * self.cell_m, row * self.cell_m, 0), self.cell_m, bound)
+            sweep_rays(ends, holes, eye - (column * self.cell_m, row * self.cell_m, 0), self.cell_m, bound)
         for key in covering_tiles(column, row, shape):
             self._merge(key, column, row, bound)
 
@@ -101,17 +104,23 @@ class FreeSpace:
         tile[0][ours] = np.minimum(first, new)
 
 
-def level_heights(cells: CellObservations, corner: tuple[int, int], shape: tuple[int, int]) -> Float32:
-    """Return the highest level height in each cell (H, W) of a grid that starts at `corner` (x, y); NO_END
-    where there is none. A height is level if it is close to all heights that the view sees around it.
+def level_heights(
+    cells: CellObservations, corner: tuple[int, int], shape: tuple[int, int]
+) -> tuple[Float32, UInt8]:
+    """Return the highest level height in each cell (H, W) of a grid that starts at `corner` (x, y), NO_END
+    where there is none, and the view's holes: 1 where it sees nothing, other than in gaps a cell wide.
+
+    A height is level if it is close to all heights that the view sees around it.
     """
     highest, lowest = np.full(shape, NO_END), np.full(shape, UNPROVEN)
     bound_heights(cells.x, cells.y, cells.z_m, corner, highest, lowest)
+    seen = (highest > NO_END).astype(np.uint8)
+    holes = 1 - cv2.morphologyEx(seen, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     about = np.ones((LEVEL_CELLS, LEVEL_CELLS), np.uint8)
     highest, lowest = cv2.dilate(highest, about), cv2.erode(lowest, about)
     level = np.full(shape, NO_END)
     _mark_level(cells.x, cells.y, cells.z_m, corner, highest, lowest, level)
-    return level
+    return level, holes
 
 
 def covering_tiles(column: int, row: int, shape: tuple[int, int]) -> list[TileKey]:
@@ -166,9 +175,9 @@ def _mark_level(
 
 
 @kernel()
-def sweep_rays(ends: Float32, eye: Float64, cell_m: float, bound: Float32) -> None:
+def sweep_rays(ends: Float32, holes: UInt8, eye: Float64, cell_m: float, bound: Float32) -> None:
     """Lower the bounds (R, C) along the lines of sight from the eye (3,) to the heights `ends` (R, C), which
-    are NO_END where no line of sight ends.
+    are NO_END where no line of sight ends. holes: (R, C), 1 where the view sees nothing.
 
     Vertical planes through the eye and each cell of the border are swept inwards. Of all lines of sight that
     end farther out than a cell at the horizontal distance d, the steepest is the lowest there:
@@ -177,7 +186,7 @@ def sweep_rays(ends: Float32, eye: Float64, cell_m: float, bound: Float32) -> No
     """
     rows, columns = bound.shape
     x0, y0 = eye[0] / cell_m, eye[1] / cell_m
-    steepness, over_eye = _steepness(ends, x0, y0, eye[2]), np.float32(eye[2] + OVER_END_M)
+    steepness, over_eye = _steepness(ends, holes, x0, y0, eye[2]), np.float32(eye[2] + OVER_END_M)
     for n in range(2 * (rows + columns)):
         side, place = (n // columns, n % columns) if n < 2 * columns else divmod(n - 2 * columns, rows)
         if n < 2 * columns:
@@ -189,7 +198,7 @@ def sweep_rays(ends: Float32, eye: Float64, cell_m: float, bound: Float32) -> No
         step_x, step_y = (x0 - first_x) / max(steps, 1.0), (y0 - first_y) / max(steps, 1.0)
         step = np.sqrt(step_x**2 + step_y**2)
         steepest, next_steepest = -np.float32(np.inf), -np.float32(np.inf)
-        for k in range(int(steps - _NEAREST_CELLS) + 1):
+        for k in range(int(steps) - _NEAREST_CELLS + 1):
             x, y = first_x + k * step_x + 0.5, first_y + k * step_y + 0.5
             if not (0 <= x < columns and 0 <= y < rows):
                 break
@@ -202,15 +211,29 @@ def sweep_rays(ends: Float32, eye: Float64, cell_m: float, bound: Float32) -> No
 
 
 @kernel()
-def _steepness(ends: Float32, x0: float, y0: float, z_m: float) -> Float32:
+def _steepness(ends: Float32, holes: UInt8, x0: float, y0: float, z_m: float) -> Float32:
     """Compute the drop per cell (R, C) of the lines of sight from the height z_m over the place x0, y0
-    (cells) to the ends (R, C); -inf where there is no end below the eye.
+    (cells) to the ends (R, C); -inf where there is no end below the eye, or a hole is beside it, across the
+    line of sight: there the background may have been matched in place of something that stands.
     """
-    steepness = np.empty(ends.shape, np.float32)
+    steepness = np.full(ends.shape, -np.float32(np.inf), np.float32)
     for i in range(ends.shape[0]):
         across = np.float32((i - y0) ** 2)
         for j in range(ends.shape[1]):
             drop = np.float32(z_m) - ends[i, j]
-            away = np.sqrt(across + np.float32(j - x0) ** 2)
-            steepness[i, j] = drop / away if 0 < drop < np.inf else -np.float32(np.inf)
+            if 0 < drop < np.inf:
+                away = np.sqrt(across + np.float32(j - x0) ** 2)
+                aside_x, aside_y = (y0 - i) / away, (j - x0) / away
+                if not _is_beside_hole(holes, i, j, aside_x, aside_y):
+                    steepness[i, j] = drop / away
     return steepness
+
+
+@kernel()
+def _is_beside_hole(holes: UInt8, i: int, j: int, aside_x: float, aside_y: float) -> bool:
+    """Check whether a cell i, j has a hole within BESIDE_CELLS to either side."""
+    for aside in range(-BESIDE_CELLS, BESIDE_CELLS + 1):
+        y, x = i + aside * aside_y + 0.5, j + aside * aside_x + 0.5
+        if 0 <= x < holes.shape[1] and 0 <= y < holes.shape[0] and holes[int(y), int(x)]:
+            return True
+    return False
