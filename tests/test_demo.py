@@ -18,8 +18,8 @@ from barsight.simulation.simulate import stream
 from barsight.simulation.stock import Stock, stack_yard
 from barsight.yard.magnet.description import load_magnet
 
-LONGER_M = 0.03
-"""Length (m) by which single bars may extend beyond their bundle, at most."""
+LONGER_M = 0.0375
+"""Maximum length (m) by which single bars extend beyond their bundle."""
 
 
 @pytest.mark.slow
@@ -48,7 +48,7 @@ def test_the_demo_ends_on_the_page_with_a_change_and_a_stock_list(tmp_path: Path
     offered = json.loads((tmp_path / "demo/result/lifts.json").read_text())["lifts"]
     assert len(offered) >= 3
     for lift in offered:
-        assert true_rise_m(lift) < 0.015
+        assert -0.01 < true_rise_m(lift) < 0.015
 
 
 def true_rise_m(lift: Any) -> float:

@@ -164,7 +164,7 @@ class JumpWatch:
         away = float(np.linalg.norm(self._off_m))
         if away > self._bound_m:
             return away
-        is_recent = self._jump_ns and self._last_ns - self._jump_ns < seconds_to_ns(JUMP_HELD_S)
+        is_recent = self._jump_ns > 0 and self._last_ns - self._jump_ns < seconds_to_ns(JUMP_HELD_S)
         return float(np.linalg.norm(self._jump_m)) if is_recent else 0.0
 
     def begin_anew(self) -> None:

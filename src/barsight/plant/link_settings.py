@@ -11,7 +11,7 @@ from barsight.core.settings.values import expect_ranges, expect_values
 
 MAX_AGE_S = 0.3
 """Maximum age of a state in seconds, counted from when it was read from the store; an older one is marked
-invalid. No link may show a state for longer either.
+invalid. A link shows a state for as long again at most.
 """
 OPCUA_ROLES = ("viewer", "operator", "engineer")
 """Roles: a viewer reads; an operator also runs jobs, takes lifts and acknowledges alarms; an engineer also

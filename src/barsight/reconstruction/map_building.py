@@ -36,8 +36,8 @@ from barsight.yard_frame import frame_of, shared_height_sigma_m
 
 _TIDIED_EVERY = 8
 """Number of frames after which freed memory is returned to the system."""
-_FREE_TILES = 32
-"""Number of tiles of free space in memory: those under a view, with room for the next one."""
+_FREE_TILES = 64
+"""Number of tiles of free space in memory: those under a view from 20 m."""
 
 
 class MapBuilder:

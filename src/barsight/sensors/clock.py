@@ -81,7 +81,8 @@ class DeviceClock:
 
     def _has_jumped(self, device_ns: int, arrival_ns: int) -> bool:
         """Add a stamp; return whether the clock has jumped since the stamps before."""
-        self._older = self._older + 1 if device_ns < self._newest_ns else 0
+        # A stamp that comes again is neither older nor newer.
+        self._older = 0 if device_ns > self._newest_ns else self._older + (device_ns < self._newest_ns)
         self._newest_ns = max(self._newest_ns, device_ns)
         if self._older >= OLDER_COUNT or not self.is_settled:
             return self._older >= OLDER_COUNT

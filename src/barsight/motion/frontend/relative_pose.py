@@ -137,7 +137,7 @@ def transport_covariance(covariance: Float64, way: Float64) -> Float64:
 
 def rotate_covariance(covariance: Float64, rotation: Float64) -> Float64:
     """Rotate a pose covariance (6, 6) into other axes by a rotation (3, 3)."""
-    rotations = np.zeros((6, 6))
-    rotations[:3, :3] = rotations[3:, 3:] = rotation
-    result: Float64 = rotations @ covariance @ rotations.T
+    block_rotation = np.zeros((6, 6))
+    block_rotation[:3, :3] = block_rotation[3:, 3:] = rotation
+    result: Float64 = block_rotation @ covariance @ block_rotation.T
     return result

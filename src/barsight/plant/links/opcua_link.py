@@ -21,6 +21,9 @@ from barsight.plant.steps import LiftSteps, take_named_step
 from barsight.store.history import survey_folder
 from barsight.store.opening import Store
 
+ERRORS = frozenset({"store-broken", "load-contradicts", "lift-unrecorded", "lift-failed"})
+"""Codes of alarms that lead to the state Error: the store may no longer match the yard."""
+
 
 async def serve_opcua(
     store: Store, settings: OpcUaSettings, feed: StateFeed, steps: LiftSteps, say: Callable[[str], None]
@@ -39,7 +42,7 @@ async def serve_opcua(
 
     def told(state: PlantState) -> Told:
         alarms = tuple(
-            AlarmLine(alarm.code, alarm.text, "error" if alarm.priority == 1 else "warning")
+            AlarmLine(alarm.code, alarm.text, "error" if alarm.code in ERRORS else "warning")
             for alarm in state.alarms if alarm.is_active
         )  # fmt: skip
         if state.map_id is not None and state.map_id not in folders:

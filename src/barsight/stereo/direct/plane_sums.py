@@ -119,7 +119,7 @@ def _add_on_axis(
 
 @kernel(inline=True)
 def _solve_planes(sums: Float32, steps: Float32, information: Float32) -> None:
-    """Solve the sums of `_sum_pairs` for each plane's height at its pixel and that height's information.
+    """Solve the sums of `fit_lanes` for each plane's height at its pixel and that height's information.
 
     The slopes are regularised to zero with a small weight, so that a line of pixels still has a plane. Fills
     steps (TILE_COLUMNS,), relative to the pixels' own disparities, and information (TILE_COLUMNS,).
