@@ -231,7 +231,7 @@ def _steepness(ends: Float32, holes: UInt8, x0: float, y0: float, z_m: float) ->
 
 @kernel()
 def _is_beside_hole(holes: UInt8, i: int, j: int, aside_x: float, aside_y: float) -> bool:
-    """Check whether a cell i, j has a hole within BESIDE_CELLS to either side."""
+    """Check whether a cell i, j has one of the holes (R, C) within BESIDE_CELLS to either side."""
     for aside in range(-BESIDE_CELLS, BESIDE_CELLS + 1):
         y, x = i + aside * aside_y + 0.5, j + aside * aside_x + 0.5
         if 0 <= x < holes.shape[1] and 0 <= y < holes.shape[0] and holes[int(y), int(x)]:
