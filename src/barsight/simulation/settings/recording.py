@@ -59,12 +59,12 @@ class SimulationSettings:
 
     @classmethod
     def demo(cls) -> SimulationSettings:
-        """Create the settings of the small yard of `barsight demo`: 3 m of stack, 10 pairs of 960x768.
+        """Create the settings of the small yard of `barsight demo`: 3 m of stack, 11 pairs of 960x768.
 
-        The bars reach beyond the example magnet and lie within the pictures.
+        The bars reach beyond the example magnet, and the pictures beyond the bars even if one is moved.
         """
         camera = CameraSettings(
-            width_px=960, height_px=768, focal_px=937.5, above_floor_m=8.5, trolley_y_m=0.0
+            width_px=960, height_px=768, focal_px=850.0, above_floor_m=8.5, trolley_y_m=0.0
         )
-        yard = YardSettings(max_layers=3, bar_length_m=5.6)
-        return cls(length_m=3.0, frames=10, seed=1, bars="60mm:19", camera=camera, yard=yard)
+        yard = YardSettings(max_layers=3, bar_length_m=5.4)
+        return cls(length_m=3.0, frames=11, seed=1, bars="60mm:19", camera=camera, yard=yard)
