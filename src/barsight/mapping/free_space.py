@@ -28,8 +28,8 @@ LEVEL_CELLS, LEVEL_M = 5, 0.05
 """Window side (cells) and maximum height difference within it for a line of sight to count: around its
 end, the view must see only heights this close. At edges, matching mixes foreground and background.
 """
-BESIDE_CELLS = 2
-"""Maximum distance of a hole beside the end of a line of sight that doesn't count."""
+BESIDE_M = 0.02
+"""Maximum distance of a hole beside the end of a line of sight that doesn't count, in whole cells."""
 UNPROVEN = np.float32(np.inf)
 NO_END = np.float32(-np.inf)
 _NEAREST_CELLS = 2
@@ -186,7 +186,9 @@ def sweep_rays(ends: Float32, holes: UInt8, eye: Float64, cell_m: float, bound: 
     """
     rows, columns = bound.shape
     x0, y0 = eye[0] / cell_m, eye[1] / cell_m
-    steepness, over_eye = _steepness(ends, holes, x0, y0, eye[2]), np.float32(eye[2] + OVER_END_M)
+    beside_cells = int(np.ceil(BESIDE_M / cell_m - 1e-6))
+    steepness = _steepness(ends, holes, x0, y0, eye[2], beside_cells)
+    over_eye = np.float32(eye[2] + OVER_END_M)
     for n in range(2 * (rows + columns)):
         side, place = (n // columns, n % columns) if n < 2 * columns else divmod(n - 2 * columns, rows)
         if n < 2 * columns:
@@ -211,10 +213,11 @@ def sweep_rays(ends: Float32, holes: UInt8, eye: Float64, cell_m: float, bound: 
 
 
 @kernel()
-def _steepness(ends: Float32, holes: UInt8, x0: float, y0: float, z_m: float) -> Float32:
+def _steepness(ends: Float32, holes: UInt8, x0: float, y0: float, z_m: float, beside_cells: int) -> Float32:
     """Compute the drop per cell (R, C) of the lines of sight from the height z_m over the place x0, y0
-    (cells) to the ends (R, C); -inf where there is no end below the eye, or a hole is beside it, across the
-    line of sight: there the background may have been matched in place of something that stands.
+    (cells) to the ends (R, C); -inf where there is no end below the eye, or one of the holes (R, C) is within
+    beside_cells of it across the line of sight: there the background may have been matched in place of
+    something that stands.
     """
     steepness = np.full(ends.shape, -np.float32(np.inf), np.float32)
     for i in range(ends.shape[0]):
@@ -224,15 +227,15 @@ def _steepness(ends: Float32, holes: UInt8, x0: float, y0: float, z_m: float) ->
             if 0 < drop < np.inf:
                 away = np.sqrt(across + np.float32(j - x0) ** 2)
                 aside_x, aside_y = (y0 - i) / away, (j - x0) / away
-                if not _is_beside_hole(holes, i, j, aside_x, aside_y):
+                if not _is_beside_hole(holes, i, j, aside_x, aside_y, beside_cells):
                     steepness[i, j] = drop / away
     return steepness
 
 
 @kernel()
-def _is_beside_hole(holes: UInt8, i: int, j: int, aside_x: float, aside_y: float) -> bool:
-    """Check whether a cell i, j has one of the holes (R, C) within BESIDE_CELLS to either side."""
-    for aside in range(-BESIDE_CELLS, BESIDE_CELLS + 1):
+def _is_beside_hole(holes: UInt8, i: int, j: int, aside_x: float, aside_y: float, beside_cells: int) -> bool:
+    """Check whether a cell i, j has one of the holes (R, C) within beside_cells to either side."""
+    for aside in range(-beside_cells, beside_cells + 1):
         y, x = i + aside * aside_y + 0.5, j + aside * aside_x + 0.5
         if 0 <= x < holes.shape[1] and 0 <= y < holes.shape[0] and holes[int(y), int(x)]:
             return True
