@@ -16,19 +16,16 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
-from barsight.benchmarks.lift_judge.envelopes import envelope
 from barsight.benchmarks.lift_judge.magnet import read_magnet
-from barsight.benchmarks.yard.drawn_worlds import judged_yard
+from barsight.benchmarks.yard.drawn_worlds import CELL_M, exact_heights, judged_yard, measured_world
 from barsight.core.records.heights import HeightSource
-from barsight.result_folder import read_heights
 from barsight.simulation.worlds.yards import DrawnYard
-from barsight.yard.inventory.bundle_file import read_bundles
+from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.clearance import FacePlane, find_obstacle
 from barsight.yard.magnet.description import Beam, Pole, Tolerance, example_magnet, load_magnet
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.types import Bundle, HeightMap
 
-CELL_M, MARGIN_M = 0.01, 0.6
 FACE = (Pole(0, 0, 0.1, 0.1),), Beam(0.1, 0.1, 0.35), Tolerance(0.005, 0.005, 0.0)
 DEPTHS_M = (0.03, 0.06, 0.1, 0.2, 0.3)
 ASIDE_M = ((0, 0), (0.05, 0), (-0.05, 0), (0, 0.05), (0, -0.05))
@@ -36,8 +33,7 @@ ASIDE_M = ((0, 0), (0.05, 0), (-0.05, 0), (0, 0.05), (0, -0.05))
 
 def count_bounds(world: DrawnYard, heights: HeightMap) -> Counter[str]:
     """Count the unseen cells by how far their bound lies from the truth."""
-    (x, y), margin = world.size_m, MARGIN_M
-    true = envelope(world.yard, (-margin, -y / 2 - margin), (x + margin, y / 2 + margin), step=CELL_M)
+    true = exact_heights(world)
     lowest = ndimage.minimum_filter(np.nan_to_num(true.z.T), 3)
     column = np.rint((true.x0 + CELL_M * np.arange(lowest.shape[1]) - heights.x0_m) / CELL_M).astype(int)
     row = np.rint((true.y0 + CELL_M * np.arange(lowest.shape[0]) - heights.y0_m) / CELL_M).astype(int)
@@ -76,13 +72,11 @@ def main(folders: list[Path]) -> None:
     for folder in folders:
         kind, seed = folder.name.rsplit("_", 1)
         world = judged_yard(int(seed), judged, None if kind == "seed" else kind)
-        whole = read_heights(folder / "measured")
-        heights = whole.part(slice(0, whole.shape[0]), slice(0, whole.shape[1]))
-        here = count_bounds(world, heights)
-        bundles = read_bundles(folder / "measured" / "bundles.json")
-        bounds += here
-        posts += count_posts(world, heights, bundles[0]) if bundles else Counter()
-        print(folder.name, dict(here), flush=True)
+        scene = measured_world(folder / "measured", LiftSettings()).scene
+        counted, bundles = count_bounds(world, scene.heights), scene.table.bundles
+        bounds += counted
+        posts += count_posts(world, scene.heights, bundles[0]) if bundles else Counter()
+        print(folder.name, dict(counted), flush=True)
     print("all", dict(bounds), dict(sorted(posts.items())))
 
 

@@ -29,7 +29,9 @@ LEVEL_CELLS, LEVEL_M = 5, 0.05
 end, the view must see only heights this close. At edges, matching mixes foreground and background.
 """
 BESIDE_M = 0.02
-"""Maximum distance of a hole beside the end of a line of sight that doesn't count, in whole cells."""
+"""Maximum distance of a hole beside an end, rounded up to whole cells, for which its line of sight doesn't
+count.
+"""
 UNPROVEN = np.float32(np.inf)
 NO_END = np.float32(-np.inf)
 _NEAREST_CELLS = 2

@@ -30,10 +30,9 @@ ALARM_STEPS: dict[str | None, tuple[str, ...]] = {
 """States that may follow each state of an alarm. `returned`: the cause has ended without an acknowledgement;
 acknowledging the alarm then clears it (ISA-18.2).
 """
-PRIORITIES = {
-    "store-broken": 1, "load-contradicts": 1, "lift-unrecorded": 1, "lift-failed": 1,
-    "calibration-changed": 1, "bundle-moved": 3, "survey-files": 3,
-}  # fmt: skip
+MISMATCHES = ("store-broken", "load-contradicts", "lift-unrecorded", "lift-failed")
+"""Codes of alarms after which the store may no longer match the yard."""
+PRIORITIES = dict.fromkeys(MISMATCHES, 1) | {"calibration-changed": 1, "bundle-moved": 3, "survey-files": 3}
 """Priorities of alarms by code for page and plant, 1 is the highest; all others have 2."""
 RECORDING_STEPS: dict[str | None, tuple[str, ...]] = {
     None: ("archived", "measured"),

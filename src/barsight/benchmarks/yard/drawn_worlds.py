@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
-from barsight.benchmarks.lift_judge.envelopes import envelope
+from barsight.benchmarks.lift_judge.envelopes import Envelope, envelope
 from barsight.benchmarks.lift_judge.magnet import JudgedMagnet
 from barsight.core.records.heights import HeightSource
 from barsight.result_folder import read_heights, read_summary
@@ -90,13 +90,18 @@ def measured_world(out: Path, settings: LiftSettings) -> MappedWorld:
     return map_world(heights, read_bundles(out / "bundles.json"), vetoes, travel, now_ns, settings)
 
 
+def exact_heights(world: DrawnYard) -> Envelope:
+    """Compute the exact height of every cell of a world and a margin around it."""
+    (x, y), margin = world.size_m, MARGIN_M
+    return envelope(world.yard, (-margin, -y / 2 - margin), (x + margin, y / 2 + margin), step=CELL_M)
+
+
 def noisy_world(world: DrawnYard, settings: LiftSettings) -> MappedWorld:
     """Add noise to the exact height of every cell and detect the bundles in the result. Every cell is
     seen, nothing is smoothed, and no travel is known.
     """
     rng = np.random.default_rng((31, world.seed))
-    (x, y), margin = world.size_m, MARGIN_M
-    drawn = envelope(world.yard, (-margin, -y / 2 - margin), (x + margin, y / 2 + margin), step=CELL_M)
+    drawn = exact_heights(world)
     alike = ndimage.gaussian_filter(rng.normal(0, 1, drawn.z.T.shape), ALIKE_CELLS)
     noise = WHITE_M * rng.normal(0, 1, alike.shape) + ALIKE_M * alike / alike.std()
     z = (drawn.z.T + noise).astype(np.float32)

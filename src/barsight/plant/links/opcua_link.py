@@ -20,9 +20,7 @@ from barsight.plant.state import PlantState
 from barsight.plant.steps import LiftSteps, take_named_step
 from barsight.store.history import survey_folder
 from barsight.store.opening import Store
-
-ERRORS = frozenset({"store-broken", "load-contradicts", "lift-unrecorded", "lift-failed"})
-"""Codes of alarms that lead to the state Error: the store may no longer match the yard."""
+from barsight.store.states import MISMATCHES
 
 
 async def serve_opcua(
@@ -42,7 +40,7 @@ async def serve_opcua(
 
     def told(state: PlantState) -> Told:
         alarms = tuple(
-            AlarmLine(alarm.code, alarm.text, "error" if alarm.code in ERRORS else "warning")
+            AlarmLine(alarm.code, alarm.text, "error" if alarm.code in MISMATCHES else "warning")
             for alarm in state.alarms if alarm.is_active
         )  # fmt: skip
         if state.map_id is not None and state.map_id not in folders:
