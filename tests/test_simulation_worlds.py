@@ -172,6 +172,7 @@ def bar(x: float, z: float, number: int, along: np.ndarray = Y, length: float = 
         (bar(0.5, 0.2, 1), 0.0, 0.0),
         (bar(0.05, 0.2, 1), 0.5, 0.5),
         (bar(0.0, 0.2, 1, np.array([1.0, 0.0, 0.0]), 0.4), 0.05, 1.0),
+        (cylinder("bar", np.array([0.0, 0.013, 0.11]), np.array([1.0, 0.0, 0.0]), 0.005, 0.4, 1), 0.005, 1.0),
     ],
 )
 def test_cover_is_what_hides_a_bundle_from_above(above: tuple, share: float, widest: float) -> None:

@@ -25,11 +25,11 @@ from barsight.simulation.worlds.yards import LOOSE, DrawnBundle, DrawnYard, bow_
 GENERATOR = 1
 """Version of the generator: incremented whenever the same seed draws a different world."""
 ABOVE_M = 50.0
-COVER_STEP_M = (0.004, 0.05)
-"""Spacing, across and along a bundle, of the vertical rays that look down on it, m."""
+COVER_STEP_M = 0.004
+"""Spacing of the vertical rays that look down on a bundle, m: a quarter of the thinnest diameter."""
 COVERED_RATIO = 0.02
 """Hidden share of a bundle, seen from above, at and above which the bundle counts as covered."""
-CROSSED_RATIO = 0.3
+CROSSED_RATIO = 0.1
 """Hidden share of a bundle's width, anywhere along it, at and above which the bundle counts as covered."""
 DIM_RATIO, BLURRED_S = 0.7, 0.004
 
@@ -105,11 +105,11 @@ def cover(scene: Scene, owner: Int64, bundle: DrawnBundle) -> tuple[float, float
     and between two bars are lower than the bars and hide nothing.
     """
     x, z, radius = bundle.cross_m[:, 0], bundle.cross_m[:, 1], bundle.diameter_m / 2
-    u = np.arange(x.min() - radius + COVER_STEP_M[0] / 2, x.max() + radius, COVER_STEP_M[0])
+    u = np.arange(x.min() - radius + COVER_STEP_M / 2, x.max() + radius, COVER_STEP_M)
     rise = radius**2 - (u[:, None] - x) ** 2
     own = np.where(rise > 0, z + np.sqrt(np.maximum(rise, 0)), -np.inf).max(axis=1) + bundle.centre_m[2]
     u, own = u[np.isfinite(own)], own[np.isfinite(own)]
-    v = np.linspace(-0.5, 0.5, max(3, round(bundle.length_m / COVER_STEP_M[1]))) * bundle.length_m
+    v = np.linspace(-0.5, 0.5, max(3, round(bundle.length_m / COVER_STEP_M))) * bundle.length_m
     c, s = np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad)
     across, along = np.array([c, s, 0.0]), np.array([-s, c, 0.0])
     aside = u + bow_at(bundle.bow_m, bundle.length_m, v)[:, None]
