@@ -359,15 +359,34 @@ def test_dunnage_that_shows_in_a_gully_lies_beside_the_bundle(
     assert laid == (pytest.approx(laid_m), laid_m > 0)
 
 
-@pytest.mark.parametrize(("cells", "over_m", "is_clear"), [(1, 0.0, False), (2, 0.0, True), (1, 0.03, True)])
-def test_a_steep_flank_that_is_a_cell_off_is_not_clearly_another_thing(
-    cells: int, over_m: float, *, is_clear: bool
-) -> None:
-    """Flanks fall by 25 mm a cell. Over 0.4 m the bundle lies so many cells aside, and over_m higher."""
+@pytest.mark.parametrize(("aside_m", "over_m"), [(0.0, 0.0), (0.04, 0.0), (0.0, 0.03), (0.04, 0.03)])
+def test_a_bow_is_not_another_thing(aside_m: float, over_m: float) -> None:
+    """Flanks fall by 25 mm a cell. At both ends the bundle lies aside, and something may lie over its top."""
+    v, u = 0.01 * np.arange(200) - 1, 0.01 * np.arange(25) - 0.12
+    bow = aside_m * v[:, None] ** 2
+    z = 0.24 - 2.5 * np.maximum(np.abs(np.round(u - bow, 2)) - 0.06, 0.0)
+    z[80:90, 10:18] += over_m
+    assert measure_laid(_reading_of(z, 0.24)) == (pytest.approx(over_m), over_m > 0)
+
+
+def test_a_flank_that_ends_early_is_not_clearly_another_thing() -> None:
+    """Over 60 mm the flank, which falls by 25 mm a cell, reaches a cell further."""
     u = 0.01 * np.arange(25) - 0.12
     z = np.tile(0.24 - 2.5 * np.maximum(np.abs(u) - 0.06, 0.0), (200, 1))
-    z[80:120] = np.roll(z[80:120], cells, axis=1) + over_m
-    assert measure_laid(_reading_of(z, 0.24)) == (pytest.approx(0.025 * cells + over_m), is_clear)
+    z[80:86] = 0.24 - 2.5 * np.maximum(np.abs(u) - 0.07, 0.0)
+    assert measure_laid(_reading_of(z, 0.24)) == (pytest.approx(0.025), False)
+
+
+@pytest.mark.parametrize(("lost", "is_found"), [(0, True), (2, True), (6, False)])
+def test_what_lies_on_a_bundle_is_found_though_matching_loses_its_edge(lost: int, *, is_found: bool) -> None:
+    """A beam's end, 60 mm wide, lies on a bundle. lost: places of a row, from its edge on, that aren't known;
+    in every other row all but the first of them.
+    """
+    z = np.full((200, 25), 0.24)
+    z[80:86, 20:] += 0.06
+    for row in range(80, 86):
+        z[row, 20 + row % 2 : 20 + lost] = np.nan
+    assert (measure_laid(_reading_of(z, 0.24))[0] > 0) is is_found
 
 
 def test_outlines_that_overlap_leave_open_which_bundle_lies_over_the_other() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from barsight.core.arrays import Bool, UInt8
+from barsight.core.arrays import Bool, Float64, Int64, UInt8
 from barsight.core.linalg.robust import known_median
 from barsight.yard.bundles.crossing_bundles import rise_over
 from barsight.yard.bundles.fitting.ends import End
@@ -30,6 +30,14 @@ to one object. Dunnage comes in twos or more. Both in m.
 """
 _LAID_M, _LAID_SIZE_M = 0.02, (0.04, 0.03)
 """Minimum rise of an object that lies over a part of a bundle's width, and its size along and across (m)."""
+_MIN_SEEN_RATIO = 0.75
+"""Minimum share of such an object's places that is measured: matching loses places along its edges."""
+_BOW_CELLS, _BOW_LENGTH_M, _BOW_COST_M = 4, 0.3, 5e-4
+"""Range of the shift of a bowed bundle's section, length (m) over which it is averaged, and the mean misfit
+(m) by which a shift must be better for each of its cells.
+"""
+_MAX_MISFIT_M = 0.03
+"""Misfit (m) from which a place tells nothing of the shift: something lies there."""
 _GULLY_RATIO = 0.3
 """Minimum depth, in widths, of the surface at a bundle's rim under its axis from which it isn't the bundle's.
 The rim of an upright triangle of bars lies 0.22 under its axis, that of one turned by 25 degrees 0.24.
@@ -177,24 +185,54 @@ def measure_laid(reading: Reading) -> tuple[float, bool]:
     low, high, axis_z_m = -fit.width_m / 2, fit.width_m / 2, float(fit.values[Z])
     if pack is not None and pack.is_bounded:
         low, high, axis_z_m = pack.low_m, pack.high_m, axis_z_m + pack.top_m - pack.width_m / 2
-    rim = round(_BEFORE_END_M / grid.cell_m)
-    rows = np.arange(fit.first + rim, fit.last + 1 - rim)
-    along = grid.v0_m + grid.cell_m * rows - fit.v_m
-    beside = np.arange(low, high + grid.cell_m / 2, grid.cell_m)
-    column = np.rint(
-        (fit.values[U] + fit.values[SLOPE_U] * along[:, None] + beside - grid.u0_m) / grid.cell_m
-    )
-    inside = (column >= 0) & (column < grid.z_m.shape[1])
-    z = grid.z_m[rows[:, None], np.where(inside, column, 0).astype(np.int64)]
-    z = np.where(inside, z - fit.values[SLOPE_Z] * along[:, None], np.nan)
+    z = _straight_sections(reading, low, high)
     own = known_median(z)
     sunken = (own < axis_z_m - _GULLY_RATIO * (high - low))[0]
     gully = np.logical_and.accumulate(sunken) | np.logical_and.accumulate(sunken[::-1])[::-1]
-    may_lie = np.isfinite(z) & ~(gully & (z < axis_z_m))
+    rises = np.isfinite(z) & ~(gully & (z < axis_z_m)) & (z - own > _LAID_M)
     size = [max(round(side / grid.cell_m), 1) for side in _LAID_SIZE_M]
-    laid = ndimage.binary_opening(may_lie & (z - own > _LAID_M), np.ones(size, bool))
+    square = np.ones(size, bool)
+    seen = ndimage.uniform_filter(rises.astype(np.float64), size, mode="constant")
+    fits = ndimage.binary_erosion(rises | np.isnan(z), square) & (seen > _MIN_SEEN_RATIO - 1e-6)
+    laid = ndimage.binary_dilation(fits, square) & rises
     highest = ndimage.maximum_filter(np.where(np.isfinite(own), own, -np.inf), (1, 3))
     return float((z - own)[laid].max(initial=0.0)), bool((z - highest > _LAID_M)[laid].any())
+
+
+def _straight_sections(reading: Reading, low_m: float, high_m: float) -> Float64:
+    """Look up the heights (R, C) of a bundle's rows at the places low_m to high_m across, less the rise along
+    its axis; NaN where unknown. Rows of a bowed bundle are shifted sideways until they lie in line.
+
+    A row's shift is the one that brings the rows around it closest to the median section.
+    """
+    grid, fit = reading.found.grid, reading.found.fit
+    rim = round(_BEFORE_END_M / grid.cell_m)
+    rows = np.arange(fit.first + rim, fit.last + 1 - rim)
+    beside = np.arange(low_m, high_m + grid.cell_m / 2, grid.cell_m)
+    own = known_median(_sections(reading, rows, beside))
+    window = max(round(_BOW_LENGTH_M / grid.cell_m), 1)
+    costs = []
+    for shift in range(-_BOW_CELLS, _BOW_CELLS + 1):
+        misfit = np.abs(_sections(reading, rows, beside + shift * grid.cell_m) - own)
+        known = np.isfinite(misfit)
+        total = np.where(known, np.minimum(misfit, _MAX_MISFIT_M), 0).sum(axis=1) + _MAX_MISFIT_M / 2
+        mean = total / (known.sum(axis=1) + 1)
+        costs.append(ndimage.uniform_filter1d(mean, window) + _BOW_COST_M * abs(shift))
+    shifts = np.argmin(costs, axis=0) - float(_BOW_CELLS)
+    bow = ndimage.uniform_filter1d(shifts, window) * grid.cell_m
+    return _sections(reading, rows, beside + bow[:, None])
+
+
+def _sections(reading: Reading, rows: Int64, beside: Float64) -> Float64:
+    """Look up the heights (R, C) of a bundle's rows at places beside its axis, (C,) or (R, C), less the rise
+    along it; NaN where unknown.
+    """
+    grid, fit = reading.found.grid, reading.found.fit
+    along = grid.v0_m + grid.cell_m * rows[:, None] - fit.v_m
+    column = np.rint((fit.values[U] + fit.values[SLOPE_U] * along + beside - grid.u0_m) / grid.cell_m)
+    inside = (column >= 0) & (column < grid.z_m.shape[1])
+    z = grid.z_m[rows[:, None], np.where(inside, column, 0).astype(np.int64)]
+    return np.where(inside, z - fit.values[SLOPE_Z] * along, np.nan)
 
 
 def rate_confidence(reading: Reading, rows: UInt8) -> float:
