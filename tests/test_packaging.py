@@ -25,8 +25,8 @@ import release_files
 ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "src" / "barsight"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-INSTALLED = packages_distributions() | {"pypylon": ["pypylon"]}
-"""pypylon is too large for the development lock."""
+INSTALLED = packages_distributions() | {name: [name] for name in ("pypylon", "mitsuba", "drjit")}
+"""These are too large for the development lock."""
 EXTRAS = {
     "view": {"viewer/view.py"},
     "export": {"report/export.py"},
@@ -34,6 +34,7 @@ EXTRAS = {
     "notebook": {"yard/types.py"},
     "cameras": {"sensors/gige.py"},
     "basler": {"sensors/pylon.py"},
+    "mitsuba": {"simulation/path_tracing.py"},
     "store": {
         "store/tables.py",
         "store/calibrations.py",
@@ -150,7 +151,7 @@ def test_locks_pin_with_hashes_and_name_no_index(lock: str) -> None:
     wanted = [*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["view"], "setuptools"]
     if lock == "requirements-dev.lock":
         extras = PROJECT["optional-dependencies"]
-        wanted += [text for extra in extras.keys() - {"basler"} for text in extras[extra]]
+        wanted += [text for extra in extras.keys() - {"basler", "mitsuba"} for text in extras[extra]]
     assert named(wanted) - {"barsight"} <= locked
     assert lock != "requirements.lock" or len(locked) + len(("barsight", "pip")) < 45 + len(
         {"colorama"} & locked

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from barsight.calibration.geometry.camera import Camera
-from barsight.core.arrays import Float64, Int64, UInt8
+from barsight.core.arrays import Float32, Float64, Int64, UInt8
 from barsight.core.files import atomic_directory
 from barsight.core.pose import Pose
 from barsight.core.records.sensor_samples import CraneSamples, LaserProfile
@@ -20,8 +20,9 @@ from barsight.core.stamps import seconds_to_ns
 from barsight.simulation import euroc_files
 from barsight.simulation.effects.faults import SpoiledLens, exposure_gain
 from barsight.simulation.hanging_plate import paint_plate, plate_at
-from barsight.simulation.lighting import bake, hall_lamps
+from barsight.simulation.lighting import Lamps, bake, hall_lamps
 from barsight.simulation.optics import MountedRig, expose, mount_rig, sample_rays, vignette
+from barsight.simulation.path_tracing import PathTracer
 from barsight.simulation.render import NO_CODES, Shading, render_view
 from barsight.simulation.scene import Scene, build_scene, select_primitives
 from barsight.simulation.sensors import EPOCH_NS, ImuRecord, record_encoders, record_imu, seconds, stamps
@@ -182,13 +183,13 @@ def _write_pictures(
     lamps = hall_lamps(settings.camera.above_floor_m, settings.light)
     footprint_m = settings.camera.above_floor_m / settings.camera.focal_px
     tile = surface_tile(stream(settings, 7), footprint_m, settings.yard.texture_ratio)
-    look = Shading(lamps, bake(world.scene, lamps, stream(settings, 8)), tile, world.laid.codes)
     side = settings.camera.samples_per_side
     cameras = (
         ("cam0", rig.cam0, rig.body_from_cam0, 1.0),
         ("cam1", rig.cam1, rig.body_from_cam1, settings.camera.cam1_gain),
     )
     rays = [sample_rays(camera, side) for _, camera, _, _ in cameras]
+    render = _renderer(world, lamps, tile, rays)
     shares = [vignette(camera, settings.camera.vignetting) for _, camera, _, _ in cameras]
     shape = (settings.camera.height_px, settings.camera.width_px)
     lenses = [SpoiledLens.draw(settings.faults, shape, stream(settings, 10, k)) for k in range(2)]
@@ -199,7 +200,7 @@ def _write_pictures(
         surface.count_frame(rig, yard_from_body, plate)
         for k, (name, camera, mounting, exposure) in enumerate(cameras):
             yard_from_cam = yard_from_body @ mounting
-            radiance = render_view(world.scene, look, rays[k], side, yard_from_cam)
+            radiance = render(k, yard_from_cam, 2 * number + k)
             if plate is not None:
                 paint_plate(radiance, plate, rays[k], side, yard_from_cam, tile)
             step = float(world.stream(11, number).normal())
@@ -216,6 +217,19 @@ def _write_pictures(
                 np.savez_compressed(folder / "truth" / f"depth_{name}_{stamp}.npz", z=depth)
         if progress is not None:
             progress(number + 1, settings.frames)
+
+
+def _renderer(
+    world: World, lamps: Lamps, tile: Float32, rays: Sequence[Float32]
+) -> Callable[[int, Pose, int], Float32]:
+    """Prepare the renderer: a function of the camera's number, its pose and the picture's number."""
+    settings = world.settings
+    side = settings.camera.samples_per_side
+    if settings.renderer == "mitsuba":
+        tracer = PathTracer(world.scene.primitives, lamps, tile, settings.paths)
+        return lambda k, pose, number: tracer.render(rays[k], side, pose, number)
+    look = Shading(lamps, bake(world.scene, lamps, stream(settings, 8)), tile, world.laid.codes)
+    return lambda k, pose, _: render_view(world.scene, look, rays[k], side, pose)
 
 
 def depth_views(settings: SimulationSettings) -> set[int]:

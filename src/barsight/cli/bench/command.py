@@ -21,6 +21,7 @@ from barsight.cli.bench.bundles import bench_found_bundles
 from barsight.cli.bench.length import bench_length
 from barsight.cli.bench.lifts import bench_lift_targets
 from barsight.cli.bench.live import bench_live_estimate, bench_step
+from barsight.cli.bench.renderers import bench_renderers
 from barsight.cli.bench.worlds import bench_worlds
 from barsight.cli.bench.yard import bench_yard
 from barsight.cli.safe_console import SafeConsole
@@ -46,6 +47,7 @@ def run(arguments: Sequence[str]) -> None:
         "bundles": bench_found_bundles,
         "lifts": bench_lift_targets,
         "worlds": bench_worlds,
+        "renderers": bench_renderers,
         "features": matching.features,
         "matching": matching.matching,
         "front-end": matching.front_end,

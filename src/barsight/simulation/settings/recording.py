@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -30,6 +31,12 @@ class SimulationSettings:
     """
     depth_views: int = 2
     """Number of pairs whose true depth is stored."""
+    renderer: Literal["barsight", "mitsuba"] = "barsight"
+    """Renderer of the pictures: `barsight`, or path tracing by Mitsuba 3, some hundred times slower, which
+    draws neither ribbed bars, dust, codes nor the sun.
+    """
+    paths: int = 64
+    """Number of paths per ray in Mitsuba, a square; at 64 its noise is about that of the camera."""
     camera: CameraSettings = field(default_factory=CameraSettings)
     yard: YardSettings = field(default_factory=YardSettings)
     motion: TravelSettings = field(default_factory=TravelSettings)
@@ -43,8 +50,10 @@ class SimulationSettings:
     def __post_init__(self) -> None:
         expect_values(self)
         expect_ranges(
-            self, "", length_m=(1, 500), frames=(2, 100_000), seed=NOT_NEGATIVE, depth_views=(0, self.frames)
-        )
+            self, "", length_m=(1, 500), frames=(2, 100_000), seed=NOT_NEGATIVE,
+            depth_views=(0, self.frames), paths=(1, 4096),
+        )  # fmt: skip
+        expect(math.isqrt(self.paths) ** 2 == self.paths, "paths must be a square number, such as 16 or 64")
         layers = self.yard.max_layers + (self.yard.crossed_ratio > 0)
         tallest = max(2 * k.diameter_m * (k.rings + 0.5) for k in self.kinds) + self.yard.dunnage_m
         expect(
