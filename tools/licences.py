@@ -32,8 +32,8 @@ with the GCC Runtime Library Exception), OpenCV's FFmpeg (LGPL-2.1). Whoever pas
 the libraries on too; their licences lie in the wheels' `.dist-info` folders.
 
 The extra `basler` is not listed: it installs pypylon, whose wheel holds Basler's pylon under Basler's own
-licence (in its `.dist-info` folder); read it before you use it or pass it on. Nor is `mitsuba`, which no lock holds:
-Mitsuba 3 and Dr.Jit are under BSD-3-Clause.
+licence (in its `.dist-info` folder); read it before you use it or pass it on. Nor is `mitsuba`, which
+no lock holds: Mitsuba 3 and Dr.Jit are under BSD-3-Clause.
 
 GTSAM's wheel declares that it needs pytest, so pytest's packages are listed under Run time;
 `requirements.lock` leaves them out.
