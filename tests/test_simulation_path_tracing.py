@@ -2,6 +2,7 @@
 
 import sys
 from dataclasses import replace
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -15,8 +16,11 @@ from barsight.simulation.path_tracing import MeshPart, PathTracer, box, end_face
 from barsight.simulation.render import Shading, render_view
 from barsight.simulation.scene import Primitives, Scene, build_grid
 from barsight.simulation.settings.recording import SimulationSettings
-from barsight.simulation.textures import TILE
+from barsight.simulation.textures import TILE, surface_tile
 
+NEEDS_MITSUBA = pytest.mark.skipif(
+    find_spec("mitsuba") is None, reason="Mitsuba isn't installed (extra mitsuba; it needs libllvm19)"
+)
 UP, Y, X = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0])
 PLAIN: Float32 = np.tile(np.array([1.0, 1.0, 0.0, 1.0], np.float32), (TILE, TILE, 1))
 DOWN = Pose("yard", "cam", np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 4.0]))
@@ -45,39 +49,50 @@ def test_meshes_lie_on_their_primitives() -> None:
     assert np.abs(block.points - [0.5, 0.0, 0.1]) == pytest.approx(np.tile([0.1, 0.2, 0.1], (24, 1)))
 
 
-def test_texture_runs_as_in_the_renderer() -> None:
-    """At the angle 90 degrees and the far end: r angle + twist s + offset around, in tiles."""
+@pytest.mark.parametrize("side", [-1, 1])
+def test_texture_runs_as_in_the_renderer(side: int) -> None:
+    """At 90 degrees to either side and the far end: r angle + twist s + offset around, in tiles."""
     part = tube(yard(), 0)
-    at = np.flatnonzero((part.points[:, 1] > 0) & (part.points[:, 0] > 0.0499))
-    around, along = (0.05 * np.pi / 2 + 0.05 * 0.5 + 1) / 0.0015, (0.5 * 1.1 + 2) / 0.002
-    assert part.texture[at] * TILE == pytest.approx(np.array([[along, around]]), rel=1e-6)
+    at = np.flatnonzero((part.points[:, 1] > 0) & (side * part.points[:, 0] > 0.0499))
+    around, along = (side * 0.05 * np.pi / 2 + 0.05 * 0.5 + 1) / 0.0015, (0.5 * 1.1 + 2) / 0.002
+    assert part.texture[at] * TILE == pytest.approx(np.array([[along, around]]) + 0.5, rel=1e-6)
 
 
-def rays(count: int = 48, side: int = 2) -> Float32:
-    place = (np.arange(count * side) + 0.5) / (count * side) - 0.5
+def rays(half: float, count: int = 48, side: int = 2) -> Float32:
+    """Rays of a camera that sees `half` times its height to either side."""
+    place = 2 * half * ((np.arange(count * side) + 0.5) / (count * side) - 0.5)
     return np.stack(np.meshgrid(place, place), axis=-1).astype(np.float32)
 
 
-def pictures(gloss: float, light: LightSettings) -> tuple[Float32, Float32]:
-    primitives, lamps = yard(gloss), hall_lamps(4.0, light)
+def pictures(gloss: float, half: float, tile: Float32) -> tuple[Float32, Float32]:
+    lamps = hall_lamps(4.0, LightSettings(ambient=0.5, bounce_ratio=0.3))
+    primitives = yard(gloss)
     scene = Scene(primitives, build_grid(primitives, (0.1, 0.5)))
-    try:
-        tracer = PathTracer(primitives, lamps, PLAIN, 64)
-    except ConfigError as error:
-        pytest.skip(str(error))
-    look = Shading(lamps, bake(scene, lamps, np.random.default_rng(0)), PLAIN)
-    return render_view(scene, look, rays(), 2, DOWN), tracer.render(rays(), 2, DOWN, 0)
+    tracer = PathTracer(primitives, lamps, tile, 64)
+    look = Shading(lamps, bake(scene, lamps, np.random.default_rng(0)), tile)
+    return render_view(scene, look, rays(half), 2, DOWN), tracer.render(rays(half), 2, DOWN, 2_000_000)
 
 
+@NEEDS_MITSUBA
 @pytest.mark.slow
-def test_light_and_highlight_agree_with_the_renderer() -> None:
-    """On the open floor, and in the middle of the bar with gloss and without; in turn, at the same pixels."""
-    light = LightSettings(ambient=0.5, bounce_ratio=0.3)
-    for gloss in (0.0, 1.0):
-        ours, traced = pictures(gloss, light)
-        floor, bar = (slice(2, 46), slice(2, 10)), (slice(20, 28), slice(23, 25))
-        assert traced[floor].mean() == pytest.approx(ours[floor].mean(), rel=0.05)
-        assert traced[bar].mean() == pytest.approx(ours[bar].mean(), rel=0.15)
+@pytest.mark.parametrize("gloss", [0.0, 1.0])
+def test_light_and_highlight_agree_with_the_renderer(gloss: float) -> None:
+    ours, traced = pictures(gloss, 0.5, PLAIN)
+    floor, bar = (slice(2, 46), slice(2, 10)), (slice(20, 28), slice(23, 25))
+    assert traced[floor].mean() == pytest.approx(ours[floor].mean(), rel=0.05)
+    assert traced[bar].mean() == pytest.approx(ours[bar].mean(), rel=0.15)
+
+
+@NEEDS_MITSUBA
+@pytest.mark.slow
+@pytest.mark.parametrize("gloss", [0.0, 1.0])
+def test_textures_agree_with_the_renderer(gloss: float) -> None:
+    """On both sides of the bar's crest, on the floor and on the block."""
+    ours, traced = pictures(gloss, 0.15, surface_tile(np.random.default_rng(1), 0.025))
+    for part in (slice(20, 24), slice(24, 28), slice(2, 16), slice(40, 47)):
+        one, two = (np.log(picture[2:46, part]) for picture in (ours, traced))
+        one, two = (part - part.mean(axis=0) for part in (one, two))
+        assert np.corrcoef(one.ravel(), two.ravel())[0, 1] > 0.8
 
 
 def test_what_is_not_drawn_is_named() -> None:
@@ -95,6 +110,13 @@ def test_without_mitsuba_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch) ->
     lamps: Lamps = hall_lamps(4.0)
     with pytest.raises(ConfigError, match=r"barsight\[mitsuba\]"):
         PathTracer(yard(), lamps, PLAIN, 16)
+
+
+def test_a_yard_that_is_too_large_is_refused() -> None:
+    primitives = yard()
+    primitives.shape[0, 1] = 300.0
+    with pytest.raises(ConfigError, match="shorten it"):
+        PathTracer(primitives, hall_lamps(4.0), PLAIN, 16)
 
 
 def test_paths_are_a_square() -> None:

@@ -62,6 +62,8 @@ def run(arguments: Sequence[str]) -> None:
         console = SafeConsole(stderr=True)
         if (artefacts or tags) is not None and (draw is not None or settings.passes.trolley_y_m):
             raise ConfigError("simulate: --artefacts or --tags takes no drawn world and no passes")
+        if settings.renderer != "barsight" and (draw is not None or board is not None):
+            raise ConfigError("simulate: --draw and --board take no --renderer mitsuba")
         if not 0.01 <= tag_m <= 2:
             raise ConfigError(f"simulate: --tag-m {tag_m:g} must lie between 0.01 and 2")
         if board is not None:

@@ -1,7 +1,7 @@
 """Trace paths through the yard with Mitsuba 3: area lamps, light between bars, shadows of the hall's light.
 
-Geometry, textures, rays and lamps are those of `render_view`. Lamps are rectangles instead of points, and
-what `bounce_ratio` stands for is traced.
+Geometry, textures, rays and the lamps' places are those of `render_view`. Lamps are rectangles without a
+beam, albedo and gloss are rounded, and what `bounce_ratio` stands for is traced.
 """
 
 from __future__ import annotations
@@ -21,17 +21,20 @@ from barsight.simulation.textures import ALONG_M, AROUND_M, TILE
 
 FACETS = 72
 """Number of facets around a bar: with normals between them they deviate by a thousandth of the radius."""
+HALF_TEXEL = 0.5
+"""Place of a texel's centre in Mitsuba's bitmaps; in `render_view` it is at 0."""
 ALBEDO_STEP, GLOSS_STEP = 0.1, 0.2
 """Steps of the logarithms of albedo and gloss by which bars share a material."""
 LAMP_WIDTH_M = 0.2
-FLOOR_MARGIN_M = 6.0
+FLOOR_MARGIN_M, MAX_FLOOR_M2 = 4.0, 800.0
+"""Margin of the floor around the stack, and its maximum area: a square metre takes 1 MB."""
 CHUNK = 4_000_000
 """Number of paths that are traced at once."""
 MAX_DEPTH = 6
 """Maximum number of segments of a path."""
 MIN_LLVM = 16
 """Minimum version of LLVM: 15 lacks an instruction and aborts."""
-REMEDY = "install barsight[mitsuba] and LLVM (Debian's libllvm19), or leave --renderer out"
+REMEDY = "install barsight[mitsuba] and LLVM (Debian's libllvm19)"
 END_FACE_RATIO = 0.7
 """Albedo of a bar's end face relative to its side's, as `shade` has it."""
 
@@ -48,12 +51,14 @@ class MeshPart(NamedTuple):
 
 
 class PathTracer:
-    """A yard ready to be path-traced. paths: number of paths of each ray of `sample_rays`."""
+    """A yard ready to be path-traced. paths: number per ray of `sample_rays`. seed: of the paths' noise."""
 
-    def __init__(self, primitives: Primitives, lamps: Lamps, tile: Float32, paths: int) -> None:
+    def __init__(
+        self, primitives: Primitives, lamps: Lamps, tile: Float32, paths: int, seed: int = 0
+    ) -> None:
         _expect_known(primitives, lamps)
         self._mi = _mitsuba()
-        self._paths = paths
+        self._paths, self._seed = paths, seed
         parts: dict[str, Any] = {"type": "scene"}
         for number, shape in enumerate(self._shapes(primitives, tile)):
             parts[f"shape{number}"] = shape
@@ -63,8 +68,11 @@ class PathTracer:
         self._scene = self._mi.load_dict(parts)
         self._integrator = self._mi.load_dict({"type": "path", "max_depth": MAX_DEPTH})
 
-    def render(self, rays: Float32, side: int, yard_from_cam: Pose, seed: int) -> Float32:
-        """Render the radiance (H, W), about 1 for white paper under the lamps; see `render_view`."""
+    def render(self, rays: Float32, side: int, yard_from_cam: Pose, number: int) -> Float32:
+        """Render the radiance (H, W), about 1 for white paper under the lamps; see `render_view`.
+
+        number: of the picture, whose noise is its own.
+        """
         mi = self._mi
         directions = np.concatenate([rays, np.ones_like(rays[..., :1])], axis=-1).reshape(-1, 3)
         directions = directions @ yard_from_cam.rotation.T.astype(np.float32)
@@ -75,7 +83,8 @@ class PathTracer:
             part = directions[first : first + CHUNK // self._paths]
             sampler = mi.load_dict({"type": "multijitter", "sample_count": self._paths})
             sampler.set_samples_per_wavefront(self._paths)
-            sampler.seed(seed * len(directions) + first, len(part) * self._paths)
+            noise = np.random.SeedSequence((self._seed, number, first)).generate_state(1)
+            sampler.seed(int(noise[0]), len(part) * self._paths)
             repeated = np.repeat(part, self._paths, axis=0)
             ray = mi.Ray3f(eye, mi.Vector3f(repeated.T))
             found, _, _ = self._integrator.sample(self._scene, sampler, ray)
@@ -101,7 +110,7 @@ class PathTracer:
             surface = {"type": "diffuse", "reflectance": self._bitmap(albedo)}
             if np.isfinite(gloss_step):
                 gloss = np.exp(GLOSS_STEP * gloss_step)
-                surface = self._glossy(surface, gloss * tile[..., 1], rough, tile[..., 2])
+                surface = self._glossy(surface, gloss * tile[..., 1], rough, weight * tile[..., 2])
             yield self._mesh(join_parts(parts), surface)
         yield self._floor(primitives, tile)
 
@@ -144,19 +153,18 @@ class PathTracer:
 
     def _floor(self, primitives: Primitives, tile: Float32) -> Any:
         """Build the floor with both of its textures in one bitmap."""
-        low = primitives.shape[:, :2].min(axis=0) - FLOOR_MARGIN_M
-        high = primitives.shape[:, :2].max(axis=0) + FLOOR_MARGIN_M
+        low, high = _floor_bounds(primitives)
         count = np.ceil((high - low) / ALONG_M).astype(int)
         x, y = (low[k] + ALONG_M * (np.arange(count[k]) + 0.5) for k in (0, 1))
-        fine = _texels(tile, x[None] / ALONG_M, y[:, None] / ALONG_M)
+        albedo = np.empty((len(y), len(x)), np.float32)
         wide = 7.3 * ALONG_M
-        coarse = _texels(tile, (x[None] + 0.31 * y[:, None]) / wide, (y[:, None] - 0.31 * x[None]) / wide)
+        for row, at in enumerate(y):
+            fine = _texels(tile, x / ALONG_M, at / ALONG_M)
+            albedo[row] = FLOOR_ALBEDO * fine * _texels(tile, (x + 0.31 * at) / wide, (at - 0.31 * x) / wide)
         corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float64)
         points = np.column_stack([low + corners * (count * ALONG_M), np.zeros(4)])
         part = MeshPart(points, np.tile([0.0, 0.0, 1.0], (4, 1)), corners, np.array([[0, 1, 2], [0, 2, 3]]))
-        return self._mesh(
-            part, {"type": "diffuse", "reflectance": self._bitmap(FLOOR_ALBEDO * fine * coarse)}
-        )
+        return self._mesh(part, {"type": "diffuse", "reflectance": self._bitmap(albedo)})
 
 
 def _mitsuba() -> Any:
@@ -168,25 +176,37 @@ def _mitsuba() -> Any:
         mitsuba.set_variant("llvm_ad_mono")
         version = drjit.detail.llvm_version()
     except ImportError as error:
-        raise ConfigError(f"simulate: --renderer mitsuba can't start ({error}); {REMEDY}") from error
+        raise ConfigError(f"Mitsuba can't start ({error}): {REMEDY}") from error
     if version[0] < MIN_LLVM:
-        raise ConfigError(f"simulate: --renderer mitsuba found LLVM {version[0]}, which is too old; {REMEDY}")
+        raise ConfigError(f"Mitsuba found LLVM {version[0]}, which is too old: {REMEDY}")
     return mitsuba
 
 
 def _expect_known(primitives: Primitives, lamps: Lamps) -> None:
-    """Raise ConfigError if the scene has what isn't converted."""
+    """Raise ConfigError if the scene has what isn't converted, or is too large."""
     shape, material, cylinders = primitives
     unknown = {
-        "spheres": bool((shape[cylinders:, 13] == 0).any()),
-        "ribbed bars": bool((material[:cylinders, 6] > 0).any()),
+        "spheres (give no --artefacts with spheres)": bool((shape[cylinders:, 13] == 0).any()),
+        "ribbed bars (set --yard.ribbed-ratio 0)": bool((material[:cylinders, 6] > 0).any()),
         "dust": bool((material[:cylinders, 8] > 0).any()),
-        "labels with codes": bool((material[cylinders:, CODE] > 0).any()),
-        "the sun": bool(lamps.sun[7] > 0),
+        "labels with codes (set --yard.label-m 0 0)": bool((material[cylinders:, CODE] > 0).any()),
+        "the sun (set --light.sun-ratio 0)": bool(lamps.sun[7] > 0),
     }
     named = [name for name, there in unknown.items() if there]
     if named:
-        raise ConfigError(f"simulate: --renderer mitsuba doesn't draw {', '.join(named)}: leave them out")
+        raise ConfigError(f"Mitsuba isn't given {', '.join(named)}")
+    low, high = _floor_bounds(primitives)
+    if np.prod(high - low) > MAX_FLOOR_M2:
+        area = f"{np.prod(high - low):.0f} m2 of floor, and path tracing takes {MAX_FLOOR_M2:.0f}"
+        raise ConfigError(f"the yard with its margin has {area}: shorten it (--length)")
+
+
+def _floor_bounds(primitives: Primitives) -> tuple[Float64, Float64]:
+    """Compute the lowest and highest corner (2,) of the floor around the stack."""
+    reach = np.abs(primitives.shape[:, 3:12].reshape(-1, 3, 3)).sum(axis=1)[:, :2]
+    reach = reach * primitives.shape[:, 12:15].max(axis=1)[:, None]
+    low, high = primitives.shape[:, :2] - reach, primitives.shape[:, :2] + reach
+    return low.min(axis=0) - FLOOR_MARGIN_M, high.max(axis=0) + FLOOR_MARGIN_M
 
 
 def _lamp_shapes(mi: Any, primitives: Primitives, lamps: Lamps) -> Iterator[dict[str, Any]]:
@@ -195,7 +215,8 @@ def _lamp_shapes(mi: Any, primitives: Primitives, lamps: Lamps) -> Iterator[dict
     They have no beam that narrows along X as `lamp_beam` does, and less power instead, so that the floor in
     the middle of the stack is as bright.
     """
-    first, last = primitives.shape[:, 0].min(), primitives.shape[:, 0].max()
+    low, high = _floor_bounds(primitives)
+    first, last = low[0] + FLOOR_MARGIN_M, high[0] - FLOOR_MARGIN_M
     reach = 1.5 * lamps.spacing
     numbers = np.arange(
         np.ceil((first - reach - lamps.offset) / lamps.spacing), (last + reach - lamps.offset) / lamps.spacing
@@ -238,16 +259,16 @@ def join_parts(parts: Iterable[MeshPart]) -> MeshPart:
 
 
 def tube(primitives: Primitives, p: int) -> MeshPart:
-    """Build the round side of cylinder `p`."""
+    """Build the round side of cylinder `p`, with the seam of its texture where `shade` has it."""
     shape, material = primitives.shape[p], primitives.material[p]
     radius, half = shape[12:14]
-    angle = np.linspace(0, 2 * np.pi, FACETS + 1)
+    angle = np.linspace(-np.pi, np.pi, FACETS + 1)
     normals = np.cos(angle)[:, None] * shape[6:9] + np.sin(angle)[:, None] * shape[9:12]
     ends = np.array([-half, half])
     points = shape[:3] + ends[:, None, None] * shape[3:6] + radius * normals
     along = (ends * material[5] + material[3]) / ALONG_M
     around = (radius * angle + material[4] * ends[:, None] + material[2]) / AROUND_M
-    texture = np.stack(np.broadcast_arrays(along[:, None], around), axis=-1) / TILE
+    texture = (np.stack(np.broadcast_arrays(along[:, None], around), axis=-1) + HALF_TEXEL) / TILE
     low = np.arange(FACETS)
     high = low + FACETS + 1
     faces = np.stack([low, low + 1, high + 1, low, high + 1, high], axis=1).reshape(-1, 3)
@@ -261,7 +282,7 @@ def end_faces(primitives: Primitives, p: int) -> MeshPart:
     angle = 2 * np.pi * np.arange(FACETS) / FACETS
     e, f = radius * np.cos(angle), radius * np.sin(angle)
     rim = e[:, None] * shape[6:9] + f[:, None] * shape[9:12]
-    texture = np.stack([f / ALONG_M, e / AROUND_M + 37.0 * p], axis=1) / TILE
+    texture = (np.stack([f / ALONG_M, e / AROUND_M + 37.0 * p], axis=1) + HALF_TEXEL) / TILE
     low = np.arange(1, FACETS - 1)
     fan = np.stack([np.zeros_like(low), low, low + 1], axis=1)
     parts = []
@@ -290,5 +311,6 @@ def box(primitives: Primitives, p: int) -> MeshPart:
             texture = np.stack([(along + material[3]) / ALONG_M, (around + material[2]) / AROUND_M], axis=1)
             normals = np.tile(side * axes[face], (4, 1))
             faces = np.array([[0, 1, 2], [0, 2, 3]])
-            parts.append(MeshPart(shape[:3] + local @ axes, normals, texture / TILE, faces))
+            texture = (texture + HALF_TEXEL) / TILE
+            parts.append(MeshPart(shape[:3] + local @ axes, normals, texture, faces))
     return join_parts(parts)

@@ -226,7 +226,7 @@ def _renderer(
     settings = world.settings
     side = settings.camera.samples_per_side
     if settings.renderer == "mitsuba":
-        tracer = PathTracer(world.scene.primitives, lamps, tile, settings.paths)
+        tracer = PathTracer(world.scene.primitives, lamps, tile, settings.paths, settings.seed)
         return lambda k, pose, number: tracer.render(rays[k], side, pose, number)
     look = Shading(lamps, bake(world.scene, lamps, stream(settings, 8)), tile, world.laid.codes)
     return lambda k, pose, _: render_view(world.scene, look, rays[k], side, pose)

@@ -33,8 +33,6 @@ SCENE = SimulationSettings(
 """A small yard seen from near, with pixels as wide as those of a full-size picture from 8 m, and light and
 texture in the middle of what drawn worlds have.
 """
-NOISE_RATIO = 0.5
-"""Noise of the camera in path-traced pictures relative to ours: that of the paths makes up the rest."""
 FIGURES = {"median": "median_mm", "bias": "bias_mm", "P95": "p95_mm", "in 95 %": "within_95_pct"}
 
 
@@ -55,20 +53,6 @@ class RendererBench:
     provenance: Provenance
 
 
-def scene_settings(
-    bars: str, seed: int, renderer: Literal["barsight", "mitsuba"], paths: int
-) -> SimulationSettings:
-    """Make the settings of one scene by one renderer."""
-    camera = SCENE.camera
-    if renderer == "mitsuba":
-        camera = replace(
-            camera,
-            shot_noise_dn=NOISE_RATIO * camera.shot_noise_dn,
-            read_noise_dn=NOISE_RATIO * camera.read_noise_dn,
-        )
-    return replace(SCENE, bars=bars, seed=seed, renderer=renderer, paths=paths, camera=camera)
-
-
 def render_scenes(
     bars: Sequence[str], seed: int, paths: int, folder: Path, measure: Callable[[Path, Path], None],
     done: Callable[[RenderedScene], None],
@@ -80,8 +64,9 @@ def render_scenes(
     scenes = []
     for number, kind in enumerate(bars):
         for renderer in RENDERERS:
-            settings = scene_settings(kind, seed + number, renderer, paths)
+            settings = replace(SCENE, bars=kind, seed=seed + number, renderer=renderer, paths=paths)
             own = folder / f"{kind.replace(':', '_')}_{settings.seed}_{renderer}"
+            own = own.with_name(f"{own.name}_{paths}") if renderer == "mitsuba" else own
             if not (own / "recording").exists():
                 own.mkdir(parents=True, exist_ok=True)
                 simulate(own / "recording", settings)

@@ -19,13 +19,13 @@ from barsight.measure_settings import MeasureSettings
 def bench_renderers(
     bars: tuple[str, ...] = ("20mm:61", "25mm:37", "32mm:37", "40mm:19", "60mm:19", "90mm:7"),
     seed: int = 1,
-    paths: int = 64,
+    paths: int = 36,
     keep: Annotated[Path | None, tyro.conf.arg(aliases=("-o",))] = None,
     save: Annotated[Path | None, tyro.conf.arg(name="json")] = None,
 ) -> None:
     """Simulate small yards by our renderer and by path tracing with Mitsuba, and measure both.
 
-    Needs the extra `mitsuba` and LLVM (Debian's libllvm19). Six yards take about half an hour on two cores.
+    Needs the extra `mitsuba` and LLVM (Debian's libllvm19). Six yards take about ten minutes on two cores.
 
     Args:
         bars: Kinds of bundles as bar diameter and number of bars, one yard of each.

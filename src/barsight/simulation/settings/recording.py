@@ -32,11 +32,11 @@ class SimulationSettings:
     depth_views: int = 2
     """Number of pairs whose true depth is stored."""
     renderer: Literal["barsight", "mitsuba"] = "barsight"
-    """Renderer of the pictures: `barsight`, or path tracing by Mitsuba 3, some hundred times slower, which
-    draws neither ribbed bars, dust, codes nor the sun.
+    """Renderer of the pictures: `barsight`, or path tracing by Mitsuba 3, which is much slower and draws
+    neither ribbed bars, dust, codes, spheres nor the sun.
     """
-    paths: int = 64
-    """Number of paths per ray in Mitsuba, a square; at 64 its noise is about that of the camera."""
+    paths: int = 36
+    """Number of paths per ray in Mitsuba, a square; 36 add a third of the camera's noise."""
     camera: CameraSettings = field(default_factory=CameraSettings)
     yard: YardSettings = field(default_factory=YardSettings)
     motion: TravelSettings = field(default_factory=TravelSettings)

@@ -32,9 +32,9 @@ _LAID_M, _LAID_SIZE_M = 0.02, (0.04, 0.03)
 """Minimum rise of an object that lies over a part of a bundle's width, and its size along and across (m)."""
 _MIN_SEEN_RATIO = 0.75
 """Minimum share of such an object's places that is measured: matching loses places along its edges."""
-_BOW_CELLS, _BOW_LENGTH_M, _BOW_COST_M = 4, 0.3, 5e-4
-"""Range of the shift of a bowed bundle's section, length (m) over which it is averaged, and the mean misfit
-(m) by which a shift must be better for each of its cells.
+_MAX_BOW_CELLS, _BOW_COST_M, _BOW_STEP = 8, 2e-4, 4
+"""Range of a bundle's bow, in cells between its middle and its ends; cost of each, m of mean misfit; step of
+the rows by which it is found.
 """
 _MAX_MISFIT_M = 0.03
 """Misfit (m) from which a place tells nothing of the shift: something lies there."""
@@ -185,6 +185,8 @@ def measure_laid(reading: Reading) -> tuple[float, bool]:
     low, high, axis_z_m = -fit.width_m / 2, fit.width_m / 2, float(fit.values[Z])
     if pack is not None and pack.is_bounded:
         low, high, axis_z_m = pack.low_m, pack.high_m, axis_z_m + pack.top_m - pack.width_m / 2
+    if fit.last - fit.first < 2 * _BEFORE_END_M / grid.cell_m + 1:
+        return 0.0, False
     z = _straight_sections(reading, low, high)
     own = known_median(z)
     sunken = (own < axis_z_m - _GULLY_RATIO * (high - low))[0]
@@ -201,26 +203,24 @@ def measure_laid(reading: Reading) -> tuple[float, bool]:
 
 def _straight_sections(reading: Reading, low_m: float, high_m: float) -> Float64:
     """Look up the heights (R, C) of a bundle's rows at the places low_m to high_m across, less the rise along
-    its axis; NaN where unknown. Rows of a bowed bundle are shifted sideways until they lie in line.
+    its axis; NaN where unknown. The rows of a bowed bundle are shifted sideways into line.
 
-    A row's shift is the one that brings the rows around it closest to the median section.
+    The bow is the parabola b (x^2 - 1/3), x from -1 to 1 along the bundle, that brings all rows closest to
+    their median section: the fitted axis is the mean of such a bundle.
     """
     grid, fit = reading.found.grid, reading.found.fit
     rim = round(_BEFORE_END_M / grid.cell_m)
     rows = np.arange(fit.first + rim, fit.last + 1 - rim)
     beside = np.arange(low_m, high_m + grid.cell_m / 2, grid.cell_m)
-    own = known_median(_sections(reading, rows, beside))
-    window = max(round(_BOW_LENGTH_M / grid.cell_m), 1)
-    costs = []
-    for shift in range(-_BOW_CELLS, _BOW_CELLS + 1):
-        misfit = np.abs(_sections(reading, rows, beside + shift * grid.cell_m) - own)
-        known = np.isfinite(misfit)
-        total = np.where(known, np.minimum(misfit, _MAX_MISFIT_M), 0).sum(axis=1) + _MAX_MISFIT_M / 2
-        mean = total / (known.sum(axis=1) + 1)
-        costs.append(ndimage.uniform_filter1d(mean, window) + _BOW_COST_M * abs(shift))
-    shifts = np.argmin(costs, axis=0) - float(_BOW_CELLS)
-    bow = ndimage.uniform_filter1d(shifts, window) * grid.cell_m
-    return _sections(reading, rows, beside + bow[:, None])
+    parabola = grid.cell_m * (np.linspace(-1, 1, len(rows)) ** 2 - 1 / 3)[:, None]
+    best, least = 0, np.inf
+    for bow in sorted(range(-_MAX_BOW_CELLS, _MAX_BOW_CELLS + 1), key=abs):
+        z = _sections(reading, rows[::_BOW_STEP], beside + bow * parabola[::_BOW_STEP])
+        misfit = np.minimum(np.abs(z - known_median(z)), _MAX_MISFIT_M)
+        cost = float(np.nanmean(misfit)) + _BOW_COST_M * abs(bow) if np.isfinite(misfit).any() else np.inf
+        if cost < least:
+            best, least = bow, cost
+    return _sections(reading, rows, beside + best * parabola)
 
 
 def _sections(reading: Reading, rows: Int64, beside: Float64) -> Float64:
