@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,6 +34,11 @@ SCENE = SimulationSettings(
 """A small yard seen from near, with pixels as wide as those of a full-size picture from 8 m, and light and
 texture in the middle of what drawn worlds have.
 """
+PLACES = {
+    "contour, smooth places": "contours",
+    "height, smooth stack": "stack",
+    "height, seen by two": "all cells",
+}
 FIGURES = {"median": "median_mm", "bias": "bias_mm", "P95": "p95_mm", "in 95 %": "within_95_pct"}
 
 
@@ -79,19 +85,17 @@ def render_scenes(
 
 
 def renderer_table(bench: RendererBench) -> Table:
-    """Tabulate the figures of both renderers side by side."""
+    """Tabulate both renderers: contours and stack on smooth places, and all cells that two views see."""
     table = Table("bars", "places", title="barsight | mitsuba, mm and %", box=SIMPLE_HEAD)
     for name in FIGURES:
         table.add_column(name, justify="right")
     pairs = zip(bench.scenes[::2], bench.scenes[1::2], strict=True)
     for ours, theirs in pairs:
-        for places in ours.figures:
+        for places, name in PLACES.items():
+            figures = [scene.figures.get(places, {}) for scene in (ours, theirs)]
             values = [
-                " | ".join(
-                    f"{scene.figures.get(places, {}).get(key, float('nan')):.1f}" for scene in (ours, theirs)
-                )
-                for key in FIGURES.values()
+                " | ".join(f"{one.get(key, math.nan):.1f}" for one in figures) for key in FIGURES.values()
             ]
-            table.add_row(ours.bars, places, *values)
+            table.add_row(ours.bars, name, *values)
         table.add_section()
     return table
