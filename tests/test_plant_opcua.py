@@ -150,5 +150,5 @@ def test_users_are_kept_by_digest(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="at least 10"):
         add_user(path, "crane", "operator", "short")
     path.write_text('{"crane": {"role": "king", "salt": "00", "digest": "00"}}')
-    with pytest.raises(InputError, match="no list of users"):
+    with pytest.raises(InputError, match="not a list of users"):
         read_users(path)
