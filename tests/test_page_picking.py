@@ -21,6 +21,8 @@ from test_yard_tags import LAID, SHIFT, SURVEY_M, TURN
 __all__ = ["address", "browser", "pytestmark"]
 HEADER = "name,yard_x,yard_y,yard_z,sigma_m,check\n"
 LISTED = HEADER + "".join(f"post {k},{x},{y},0,0.001,\n" for k, (x, y) in enumerate(DISCS))
+OVER_EDGES = ("--stereo.barsight.refinement.alike-gray", "1000")
+"""As the how-to measures targets that are picked: plain discs are matched by their edges."""
 
 
 def listed(sheet: Sheet, text: str) -> None:
@@ -114,7 +116,7 @@ def surveyed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, s
     words = ("--length", "3.6", "--frames", "12", "--seed", "8665", "--depth-views", "0", *camera, *yard)
     recording, store = str(folder / "recording"), f"sqlite:///{folder / 'yard.db'}"
     assert run(["simulate", recording, *words, "--tags", str(folder / "laid.csv"), "--tag-m", "0.1"]) == 0
-    assert run(["measure", recording, "-o", str(folder / "out")]) == 0
+    assert run(["measure", recording, "-o", str(folder / "out"), *OVER_EDGES]) == 0
     assert run(["store", "add", store, str(folder / "out")]) == 0
     with serving(store, ServeOptions(port=0)) as address:
         yield folder, address

@@ -272,7 +272,8 @@ def test_rendered_columns_place_the_yard(tmp_path: Path) -> None:
     recording, out = str(tmp_path / "recording"), str(tmp_path / "out")
     more = ("--camera.above-floor-m", "6", "--artefacts", str(tmp_path / "plan.toml"))
     assert run(["simulate", recording, *words, *more]) == 0
-    assert run(["measure", recording, "-o", out]) == 0
+    over_edges = ("--stereo.barsight.refinement.alike-gray", "1000")
+    assert run(["measure", recording, "-o", out, *over_edges]) == 0
     url = f"sqlite:///{tmp_path / 'yard.db'}"
     assert run(["store", "add", url, out]) == 0
     true = np.array(at) @ TURN.T + SHIFT
