@@ -16,7 +16,7 @@ from barsight.core.errors import ConfigError
 from barsight.core.pose import Pose
 from barsight.simulation.lighting import Lamps, lamp_beam
 from barsight.simulation.render import FLOOR_ALBEDO, HIGHLIGHT, SPREAD_ALONG, SPREAD_AROUND
-from barsight.simulation.scene import CODE, Primitives
+from barsight.simulation.scene import CODE, Primitives, primitive_bounds
 from barsight.simulation.textures import ALONG_M, AROUND_M, TILE
 
 FACETS = 72
@@ -26,7 +26,7 @@ HALF_TEXEL = 0.5
 ALBEDO_STEP, GLOSS_STEP = 0.1, 0.2
 """Steps of the logarithms of albedo and gloss by which bars share a material."""
 LAMP_WIDTH_M = 0.2
-FLOOR_MARGIN_M, MAX_FLOOR_M2 = 4.0, 800.0
+FLOOR_MARGIN_M, MAX_FLOOR_M2 = 6.0, 800.0
 """Margin of the floor around the stack, and its maximum area: a square metre takes 1 MB."""
 CHUNK = 4_000_000
 """Number of paths that are traced at once."""
@@ -203,10 +203,8 @@ def _expect_known(primitives: Primitives, lamps: Lamps) -> None:
 
 def _floor_bounds(primitives: Primitives) -> tuple[Float64, Float64]:
     """Compute the lowest and highest corner (2,) of the floor around the stack."""
-    reach = np.abs(primitives.shape[:, 3:12].reshape(-1, 3, 3)).sum(axis=1)[:, :2]
-    reach = reach * primitives.shape[:, 12:15].max(axis=1)[:, None]
-    low, high = primitives.shape[:, :2] - reach, primitives.shape[:, :2] + reach
-    return low.min(axis=0) - FLOOR_MARGIN_M, high.max(axis=0) + FLOOR_MARGIN_M
+    low, high = primitive_bounds(primitives)
+    return low.min(axis=0)[:2] - FLOOR_MARGIN_M, high.max(axis=0)[:2] + FLOOR_MARGIN_M
 
 
 def _lamp_shapes(mi: Any, primitives: Primitives, lamps: Lamps) -> Iterator[dict[str, Any]]:

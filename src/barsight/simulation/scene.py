@@ -97,7 +97,7 @@ def select_primitives(scene: Scene, kept: Bool) -> Scene:
 
 def build_grid(primitives: Primitives, cell_m: tuple[float, float]) -> Grid:
     """Build cells of size cell_m[0] across (X, Z) and cell_m[1] along the bars (Y)."""
-    low, high = _bounds(primitives)
+    low, high = primitive_bounds(primitives)
     margin = 1e-3
     low_corner = low.min(axis=0) - margin if len(low) else np.zeros(3)
     high_corner = high.max(axis=0) + margin if len(high) else np.ones(3)
@@ -114,7 +114,7 @@ def build_grid(primitives: Primitives, cell_m: tuple[float, float]) -> Grid:
     return grid
 
 
-def _bounds(primitives: Primitives) -> tuple[Float64, Float64]:
+def primitive_bounds(primitives: Primitives) -> tuple[Float64, Float64]:
     """Compute lower and upper corners (P, 3) of the primitives' bounding boxes."""
     shape, n = primitives.shape, primitives.cylinders
     reach = np.empty((len(shape), 3))
