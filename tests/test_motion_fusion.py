@@ -19,6 +19,7 @@ from barsight.motion.batch import fusion
 from barsight.motion.batch.fusion import BatchFusion, FusionSettings
 from barsight.motion.crane.encoder_trajectory import CraneSettings
 from barsight.motion.frontend.sightings import Sighting
+from barsight.motion.problem.problem import ALIKE_M, FIRST_UNEVEN_M
 from barsight.recording.base import Recording
 from barsight.recording.formats.ground_truth import GroundTruth, read_ground_truth
 from barsight.recording.open import open_recording
@@ -43,10 +44,22 @@ class NoisyRecording(MemoryRecording):
         )
 
 
+def unevenness(x_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Draw by how much rails move the body, unseen by encoders: (N, 3) m at (N,) places x of the bridge.
+
+    On each axis the sigma is the prior's, and the integral of the correlation over the way is 2 `ALIKE_M`,
+    the length within which the estimate counts neighbours.
+    """
+    stretches = np.subtract.outer(x_m, x_m) / (2 * ALIKE_M)
+    alike = np.exp(-np.pi * stretches**2)
+    return FIRST_UNEVEN_M * rng.multivariate_normal(np.zeros(len(x_m)), alike, 3, method="eigh").T
+
+
 def simulated(seed: int) -> tuple[NoisyRecording, tuple[Sighting, ...], GroundTruth]:
     """A crane's way over points on a stack, without pictures: sightings with noise, IMU and encoders.
 
-    The nominal attitude and the disparity are off by as much as the settings say they may be.
+    The nominal attitude, the disparity and the encoders' places are off by as much as the estimate holds
+    that they may be.
     """
     rng = np.random.default_rng(seed)
     way = SimulatedTrajectory.plan(6.0, CameraSettings(), TravelSettings(), DOWN, rng)
@@ -75,6 +88,7 @@ def simulated(seed: int) -> tuple[NoisyRecording, tuple[Sighting, ...], GroundTr
         seen[:, 2] += offset_px
         sightings.append(Sighting(stamp, np.flatnonzero(shown), seen, np.full(len(seen), SIGMA_PX), None, 0))
     mounted_so = Rotation.from_rotvec(np.deg2rad(rng.normal(0, CraneSettings().sway_std_deg, 3))).as_matrix()
+    place = place + unevenness(place[:, 0], rng)
     crane = CraneSamples(crane_ns, place, LEVER, mounted_so @ DOWN, 0.002)
     samples = ImuSamples(imu.stamp_ns, imu.gyro_radps, imu.accel_mps2)
     recording = NoisyRecording(
