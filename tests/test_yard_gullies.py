@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from barsight.yard.bundles import gully_shading
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.outline import STEP_M, packing_axes, turned_packing
 from barsight.yard.bundles.fitting.settings import BundleSettings
@@ -78,3 +80,19 @@ def test_the_rest_is_that_of_a_plain_least_squares() -> None:
     model = np.stack([np.ones(60), q, q * q, up, up * q, up * q * q, side], axis=1)
     _, plain, *_ = np.linalg.lstsq(model, levels, rcond=None)
     assert rest == pytest.approx(plain[0] / ((levels - levels.mean()) ** 2).sum(), rel=1e-3)
+
+
+def test_a_bundle_that_does_not_converge_leaves_the_smoothing_to_the_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of two bundles, one fits best at 11 mm, and the other can't be fitted at 4 mm."""
+
+    def refined(grid: str, fit: object, settings: BundleSettings) -> SimpleNamespace | None:
+        if grid == "lost" and settings.smoothing_m < 0.005:
+            return None
+        return SimpleNamespace(rms_m=(1 + 1e4 * (settings.smoothing_m - 0.011) ** 2) ** 0.5)
+
+    monkeypatch.setattr(gully_shading, "refine_outline", refined)
+    found = [SimpleNamespace(grid=grid, fit=SimpleNamespace(rings=1), shades=1) for grid in ("kept", "lost")]
+    assert gully_shading.estimate_smoothing(found, SETTINGS) == pytest.approx(0.011)
+    assert gully_shading.estimate_smoothing(found[1:], SETTINGS) == SETTINGS.smoothing_m

@@ -214,12 +214,11 @@ def estimate_smoothing(found: list[FittedOutline], settings: BundleSettings) -> 
     for one in known:
         tried = [refine_outline(one.grid, one.fit, replace(settings, smoothing_m=s)) for s in _SMOOTHINGS_M]
         rms = np.array([np.nan if fit is None else fit.rms_m for fit in tried])
-        misfits.append((rms / np.nanmin(rms)) ** 2)
+        if np.isfinite(rms).all():
+            misfits.append((rms / rms.min()) ** 2)
     if not misfits:
         return settings.smoothing_m
     mean = np.mean(misfits, axis=0)
-    if not np.isfinite(mean).all():
-        return settings.smoothing_m
     k = int(np.clip(mean.argmin(), 1, mean.size - 2))
     bend, slope, _ = np.polyfit(_SMOOTHINGS_M[k - 1 : k + 2], mean[k - 1 : k + 2], 2)
     least = -slope / (2 * bend) if bend > 0 else _SMOOTHINGS_M[mean.argmin()]
