@@ -85,7 +85,7 @@ def test_the_rest_is_that_of_a_plain_least_squares() -> None:
 def test_a_bundle_that_does_not_converge_leaves_the_smoothing_to_the_others(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Of two bundles, one fits best at 11 mm, and the other can't be fitted at 4 mm."""
+    """One fits best at 11 mm; the other can't be fitted at 4 mm."""
 
     def refined(grid: str, fit: object, settings: BundleSettings) -> SimpleNamespace | None:
         if grid == "lost" and settings.smoothing_m < 0.005:
