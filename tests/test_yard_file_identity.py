@@ -193,6 +193,18 @@ def test_a_free_tif_that_the_map_never_had_is_refused(folder: Path) -> None:
         bs.load(folder)
 
 
+def test_lifts_need_the_maps_own_photo(folder: Path) -> None:
+    """Nothing else shows the labels under a face."""
+    own = (folder / "ortho.tif").read_bytes()
+    for photo in (None, own + b"\x00"):
+        (folder / "ortho.tif").unlink(missing_ok=True)
+        if photo is not None:
+            (folder / "ortho.tif").write_bytes(photo)
+        assert lifts(folder) == 3
+    (folder / "ortho.tif").write_bytes(own)
+    assert lifts(folder) == 0
+
+
 HEAD = "stamp_ns,kind,x_m,y_m,yaw_deg,length_m,width_m\n"
 
 

@@ -58,9 +58,10 @@ def write_folder(
         heights.z_m[np.ix_(rows, columns)] = stock[1].top_z_m + block_m
     place = write_heights(heights, folder / "height.tif")
     photo = np.full(heights.z_m.shape, 90, np.uint8)
-    tifffile.imwrite(
-        folder / "tops.tif", photo, photometric="minisblack", tile=(256, 256), metadata=None, extratags=place
-    )
+    for name in ("ortho.tif", "tops.tif"):
+        tifffile.imwrite(
+            folder / name, photo, photometric="minisblack", tile=(256, 256), metadata=None, extratags=place
+        )
     (folder / "ortho.png").write_bytes(cv2.imencode(".png", photo)[1].tobytes())
     bundles = tuple(record(one, k) for k, one in enumerate(stock))
     stamps = np.array([time.time_ns() - round((age_s + k) * NS_PER_S) for k in (2, 1, 0)], np.int64)

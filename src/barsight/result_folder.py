@@ -37,7 +37,9 @@ from barsight.yard.lifting.lift_file import read_lifts
 from barsight.yard.sections import PartedMap
 from barsight.yard.types import HeightMap
 
-MAP_FILES = ("height.tif", "free.tif", "tops.tif", "passes.tif", "cloud.ply")
+PHOTO = "ortho.tif"
+"""File without a digest in folders of earlier versions. Only it shows labels, so lifts need it."""
+MAP_FILES = ("height.tif", PHOTO, "free.tif", "tops.tif", "passes.tif", "cloud.ply")
 TABLES = ("contour.csv", "laser.csv", "trajectory.tum")
 SEALED = (*MAP_FILES, *TABLES)
 """Files whose digests are in result.json."""
@@ -129,6 +131,8 @@ def open_folder(
     for name in SEALED:
         file, digest = folder / name, (summary.get("files") or {}).get(name)
         if not file.is_file() or (name == "cloud.ply" and not cloud):
+            continue
+        if digest is None and name == PHOTO:
             continue
         if digest is None:
             raise InputError(path, f"has no digest of {name}: an earlier version wrote it", REMEDY)

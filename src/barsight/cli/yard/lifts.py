@@ -23,6 +23,7 @@ from barsight.core.parallel import in_background
 from barsight.core.reading.geotiff import REMEDY
 from barsight.report.page import draw_pictures, write_report
 from barsight.result_folder import (
+    PHOTO,
     bundles_digest,
     changed_inputs,
     next_sequence,
@@ -137,6 +138,8 @@ def _open(out: Path) -> _MeasuredFolder:
     bundles = read_bundles(out / "bundles.json")
     if identity is None:
         raise InputError(out / "result.json", "has no map_id: an earlier version wrote it", REMEDY)
+    if PHOTO in summary["files"] and not (out / PHOTO).is_file():
+        raise InputError(out / PHOTO, "is missing: nothing else shows labels under a face", REMEDY)
     stock = read_match(out / "bundles.json")
     listed = {} if stock is None else contradicted_bundles(stock)
     return _MeasuredFolder(summary, identity, read_heights(out), bundles, Travel.read(summary), listed)
