@@ -12,9 +12,11 @@ import jsonschema
 import pytest
 
 import barsight as bs
+import barsight.cli.yard.lifts as lift_command
 from barsight.cli.main import run
 from barsight.core.errors import InputError
 from barsight.result_folder import file_digest
+from barsight.store.adding import read_survey
 from lift_yards import laid
 from yard_folders import lifts, schema, write_folder
 
@@ -217,6 +219,34 @@ def test_lifted_bundles_forbid_around_them_from_then_on(tmp_path: Path) -> None:
         assert [v["code"] for lift in found["refused"] for v in lift["vetoes"]] == ["disturbed"] * 2
         assert lifts(folder) == 0, "the event is kept"
     assert (folder / "events.csv").read_text(encoding="utf-8").count("lift") == 1
+
+
+def test_a_lift_reported_while_lifts_are_chosen_is_neither_lost_nor_offered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = write_folder(tmp_path / "out", more=(laid(2.8), laid(5.0)))
+    choose, others = lift_command.plan_lifts, iter(["2"])
+
+    def meanwhile(*given: object, **more: object) -> object:
+        for other in others:
+            assert lifts(folder, "--lifted", other) == 0
+        return choose(*given, **more)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(lift_command, "plan_lifts", meanwhile)
+    assert lifts(folder, "--lifted", "3") == 0
+    assert [lift["bundles"] for lift in content(folder / "lifts.json")["lifts"]] == [[0], [1]]
+    assert (folder / "events.csv").read_text(encoding="utf-8").count("lift") == 2
+
+
+def test_a_lift_reported_with_a_fetch_that_fails_is_kept_and_the_old_lifts_are_no_longer_added(
+    folder: Path,
+) -> None:
+    assert lifts(folder, "--lifted", "0", "--fetch", "1") == 3
+    assert (folder / "events.csv").read_text(encoding="utf-8").count("lift") == 1
+    with pytest.raises(InputError, match=r"before the newest of events\.csv"):
+        read_survey(folder)
+    assert lifts(folder) == 0
+    assert read_survey(folder).lifts is not None
 
 
 def test_what_was_seen_after_an_event_is_not_disturbed_by_it(tmp_path: Path) -> None:

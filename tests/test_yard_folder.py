@@ -116,7 +116,7 @@ def test_a_bundle_is_fetched_by_name_or_said_why_not(
     before = {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
     assert lifts(folder, "--fetch", "1,0") != 0
     said = capsys.readouterr().err
-    assert said.count("not seen") == 2 and "nothing was written" in said and said.count("\n") == 1
+    assert said.count("not seen") == 2 and "no lifts were written" in said and said.count("\n") == 1
     assert {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()} == before
 
 

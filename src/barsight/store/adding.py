@@ -36,9 +36,11 @@ from barsight.store.matching import (
 from barsight.store.opening import Store
 from barsight.store.recordings import FoundRecording, note_recordings, recordings_of
 from barsight.store.tables import ABSENCES, BUNDLES, SIGHTINGS, SURVEY_VETOES, SURVEYS
+from barsight.yard.events import kept_events
 from barsight.yard.identity import MapIdentity, expect_same_frame
 from barsight.yard.inventory.bundle_file import bundle_of, bundles_content, read_match
-from barsight.yard.lifting.lift_file import read_lifts
+from barsight.yard.lifting import lift_file
+from barsight.yard.lifting.lift_file import read_lifts, unknown_events
 from barsight.yard.types import Bundle, YardMap
 
 with extra("store"):
@@ -176,12 +178,15 @@ def read_survey(folder: Path) -> MeasuredSurvey:
     found = tuple(FoundBundle(bundle_of(one), names.get(one["id"])) for one in records)
     chosen = folder / "lifts.json"
     own = {name: file_digest(folder / name) for name in ("result.json", "bundles.json")}
-    if chosen.is_file():
+    lifts = read_lifts(chosen) if chosen.is_file() else None
+    if lifts is not None:
         own["lifts.json"] = file_digest(chosen)
+        if unknown_events(lifts, kept_events(folder)):
+            raise InputError(chosen, "was chosen before the newest of events.csv", lift_file.REMEDY)
     return MeasuredSurvey(
         folder.absolute(), identity, identity.captured_from_ns, identity.captured_to_ns,
         str((summary.get("software") or {}).get("version")), {**summary["files"], **own}, records, found,
-        read_heights(folder), read_lifts(chosen) if chosen.is_file() else None, recordings_of(summary),
+        read_heights(folder), lifts, recordings_of(summary),
     )  # fmt: skip
 
 

@@ -85,13 +85,17 @@ def run(arguments: Sequence[str]) -> None:
         _expect_bundles(out, folder, "--fetch", fetch)
         happened = _events(out, folder, lifted, events)
         now_ns = folder.captured_to_ns if at == "end" and folder.captured_to_ns else time.time_ns()
+        vetoes = _vetoes(folder, described, settings, now_ns, has_magnet=magnet is not None)
         with in_background(lambda: draw_pictures(out)) as pictures:
-            plan = plan_lifts(
-                folder.heights, folder.bundles, described, settings,
-                _vetoes(folder, described, settings, now_ns, has_magnet=magnet is not None), folder.travel,
-                now_ns, events=happened, contradicted=folder.contradicted,
-            )  # fmt: skip
-            order = _first_order(out, folder, plan, fetch) if fetch else None
+            planned: tuple[YardEvent, ...] | None = None
+            while planned != happened:
+                planned = happened
+                plan = plan_lifts(
+                    folder.heights, folder.bundles, described, settings, vetoes, folder.travel, now_ns,
+                    events=happened, contradicted=folder.contradicted,
+                )  # fmt: skip
+                order = _first_order(out, folder, plan, fetch) if fetch else None
+                happened = _recorded(out, happened)
             plan = plan if order is None else begin_order(order, plan, folder.bundles, folder.heights)
         console = SafeConsole(stderr=True)
         digest, sequence = bundles_digest(out), next_sequence(out / "lifts.json", folder.identity)
@@ -99,8 +103,6 @@ def run(arguments: Sequence[str]) -> None:
             write_lifts(
                 plan, folder.reference, folder.identity, digest, staging / "lifts.json", sequence, order
             )
-            if happened:
-                write_events(happened, staging / "events.csv")
             write_report(staging, staging / "report.html", pictures.result())
         print_lifts(plan, console)
         if order is not None:
@@ -173,7 +175,7 @@ def _first_order(out: Path, folder: _MeasuredFolder, plan: LiftPlan, wanted: tup
         if not isinstance(order, Failed):
             return order
         reasons.append(f"bundle {number} can't be fetched: {order.reason}")
-    raise InputError(out, f"nothing was written, {'; '.join(reasons)}", FETCH_REMEDY)
+    raise InputError(out, f"no lifts were written, {'; '.join(reasons)}", FETCH_REMEDY)
 
 
 def print_order(order: LiftOrder, console: Console) -> None:
@@ -211,7 +213,20 @@ def _events(
             if captured_ns is not None and event.stamp_ns < captured_ns[0] / OTHER_UNIT:
                 problem = f"stamp {event.stamp_ns} isn't ns on the frames' clock, which said {captured_ns[0]}"
                 raise InputError(path or out, problem, "give stamps in ns, by the clock of the frames")
-    return merged(known, (*given, *(lift_of(by_id[number], time.time_ns()) for number in ids)))
+    return _recorded(out, (*given, *(lift_of(by_id[number], time.time_ns()) for number in ids)))
+
+
+def _recorded(out: Path, events: tuple[YardEvent, ...]) -> tuple[YardEvent, ...]:
+    """Add events to OUT/events.csv; return all that are there.
+
+    They are written before the lifts are chosen, and are looked at again afterwards: another run may have
+    added its own meanwhile, and a fetch that fails leaves them.
+    """
+    known = kept_events(out)
+    whole = merged(known, events)
+    if whole != known:
+        write_events(whole, out / "events.csv")
+    return whole
 
 
 def _offset(magnet: Magnet) -> str:

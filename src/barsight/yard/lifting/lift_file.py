@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import asdict, astuple, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -83,15 +83,17 @@ def forbidden_since(
         laid = laid_at(load, place.x_m, place.y_m, place.yaw_rad)
         wide, long = np.maximum((laid.width_m, laid.length_m), 2 * magnet_reach(Load.of(load), magnet))
         laid = replace(laid, width_m=float(wide), length_m=float(long))
-        later = _unknown_to(content, events)
+        later = unknown_events(content, events)
         checks = disturbed_checks(later, place, magnet, (laid,), None, settings)
     return (*found, *vetoes_of(checks))
 
 
-def _unknown_to(content: dict[str, Any], events: tuple[YardEvent, ...]) -> tuple[YardEvent, ...]:
+def unknown_events(content: dict[str, Any], events: tuple[YardEvent, ...]) -> tuple[YardEvent, ...]:
     """Select the events that the map may not show and that weren't known when lifts.json was written."""
-    from_ns, known = content["captured_from_ns"] or -1, {tuple(event.values()) for event in content["events"]}
-    return tuple(one for one in events if one.stamp_ns > from_ns and astuple(one) not in known)
+    from_ns, known = content["captured_from_ns"] or -1, content["events"]
+    return tuple(
+        one for one in events if one.stamp_ns > from_ns and json_value(asdict(one), DIGITS) not in known
+    )
 
 
 def _placement(place: dict[str, float]) -> Placement:
