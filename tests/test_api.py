@@ -14,6 +14,7 @@ from barsight.cli.main import run
 from barsight.core.records.pairs import StereoFrame
 from barsight.core.settings.values import build_settings
 from barsight.mapping.settings import MapSettings
+from barsight.yard.events import YardEvent, kept_events, write_events
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.lift_file import read_lifts
 from cli_runs import FAST
@@ -63,6 +64,20 @@ def test_a_notebook_measures_looks_and_saves(
     gc.collect()
     assert not folder.exists()
     capsys.readouterr()
+
+
+def test_what_was_reported_in_a_folder_outlives_a_measurement_into_it(whole: Path, tmp_path: Path) -> None:
+    """The same recording shows nothing of it a second time either."""
+    out = tmp_path / "out"
+    yard = bs.measure(whole, **NOTEBOOK)
+    yard.save(out)
+    from_ns = yard.summary["captured_from_ns"]
+    before, since = (YardEvent(from_ns + ns, "lift", 0.5, 0.0, 0.0, 7.0, 0.3) for ns in (0, 1))
+    write_events((before, since), out / "events.csv")
+    assert run(["measure", str(whole), "-o", str(out), *FAST, "--overwrite"]) == 0
+    assert kept_events(out) == (since,) and len(read_lifts(out / "lifts.json")["events"]) == 1
+    yard.save(out, overwrite=True)
+    assert kept_events(out) == (since,)
 
 
 def test_misspelt_settings_and_missing_recordings_say_so(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,6 +26,7 @@ from barsight.report.files.result_files import RESULT_FILES, write_results, writ
 from barsight.report.files.summary import summary
 from barsight.report.page import write_report
 from barsight.result_folder import seal_map
+from barsight.yard.events import kept_events
 from barsight.yard.magnet.description import load_magnet
 
 
@@ -82,7 +84,10 @@ def write_measured(
     truth_of: Path | None = None,
     report: bool = True,
 ) -> dict[str, Any]:
-    """Measure open recordings; see `measure_into`. keep: a folder of checkpoints to continue from."""
+    """Measure open recordings; see `measure_into`. keep: a folder of checkpoints to continue from.
+
+    Events that were reported in `out` and that the new map may not show are kept.
+    """
     with atomic_directory(out, replace=overwrite, owned=RESULT_FILES) as staging:
         scratch = staging / "scratch"
         scratch.mkdir()
@@ -93,7 +98,7 @@ def write_measured(
                 mapped.surface, mapped.free, mapped.tops, staging, mapped.frame_id, mapped.history
             )
         ):
-            measured = find_lifts(mapped, request)
+            measured = find_lifts(mapped, replace(request, events=kept_events(out)))
         content = summary(measured)
         write_tables(measured, staging)
         write_results(measured, seal_map(content, staging), staging)

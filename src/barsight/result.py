@@ -24,7 +24,7 @@ from barsight.result_folder import (
     read_heights,
     read_path,
 )
-from barsight.yard.events import YardEvent, kept_events
+from barsight.yard.events import YardEvent, events_since, kept_events, merged, write_events
 from barsight.yard.inventory.bundle_file import read_bundles
 from barsight.yard.lifting.lift_file import forbidden_since, read_lifts
 from barsight.yard.types import Bundle, HeightMap
@@ -147,6 +147,7 @@ class Yard:
     def save(self, out: Path | str, *, overwrite: bool = False) -> Path:
         """Write the result files and report.html into the folder `out`, all or nothing, and return it.
 
+        Events that were reported there, and that the map may not show, are kept.
         Raises OutputError if `out` exists already and may not be overwritten.
         """
         target = Path(out)
@@ -156,6 +157,10 @@ class Yard:
             for name in RESULT_FILES:
                 if (self.folder / name).is_file():
                     shutil.copyfile(self.folder / name, staging / name)
+            from_ns = self.summary.get("captured_from_ns")
+            later = events_since(kept_events(target), None if from_ns is None else (from_ns, from_ns))
+            if told := merged(self._events, later):
+                write_events(told, staging / "events.csv")
             write_report(staging, staging / "report.html")
         return target
 

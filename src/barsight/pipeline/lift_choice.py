@@ -19,6 +19,7 @@ from barsight.pipeline.notices import stage_notices, stock_notices
 from barsight.reconstruction.joined_passes import MappedPass
 from barsight.reconstruction.probed_recording import ProbedRecording
 from barsight.reconstruction.tracked_recording import TrackedRecording
+from barsight.yard.events import YardEvent, events_since
 from barsight.yard.inventory.stock_list import StockMatch, contradicted_bundles, match_stock
 from barsight.yard.lifting.targets import LiftPlan, map_vetoes, offset_vetoes, plan_lifts
 from barsight.yard.lifting.travel_accuracy import Travel
@@ -34,12 +35,14 @@ class LiftRequest:
 
     magnet: magnet that they are chosen for; without one they are judged for the package's example, and all
     are forbidden (`no-magnet`). judged_at: time for which they are judged: now, or the recording's last
-    frame, to look back. notices: warnings of the caller.
+    frame, to look back. notices: warnings of the caller. events: reported before the yard was measured again;
+    those that the new map may not show count.
     """
 
     magnet: Magnet | None = None
     judged_at: Literal["now", "end"] = "now"
     notices: tuple[Notice, ...] = ()
+    events: tuple[YardEvent, ...] = ()
 
 
 def find_lifts(mapped: MappedYard, request: LiftRequest) -> Measurement:
@@ -169,5 +172,6 @@ def _lifts(
         forbidden,
         travel,
         now_ns,
-        contradicted=listed,
+        events_since(request.events, travel.captured_ns),
+        listed,
     )

@@ -17,6 +17,7 @@ from barsight.report.files.cloud import write_cloud
 from barsight.report.files.height_rasters import write_free, write_height
 from barsight.report.files.orthophoto import write_orthophoto, write_passes, write_top_photo
 from barsight.report.files.tables import write_contours, write_laser_csv, write_trajectory
+from barsight.yard.events import write_events
 from barsight.yard.identity import MapIdentity
 from barsight.yard.inventory.bundle_file import write_bundles
 from barsight.yard.lifting.lift_file import write_lifts
@@ -60,6 +61,8 @@ def write_results(measurement: Measurement, identity: MapIdentity, folder: Path)
     path = folder / "bundles.json"
     digest = write_bundles(measurement.bundles, measurement.stock, reference, identity, path)
     write_lifts(measurement.lifts, reference, identity, digest, folder / "lifts.json")
+    if measurement.lifts.events:
+        write_events(measurement.lifts.events, folder / "events.csv")
     if measurement.preview is not None:
         write_preview(measurement.preview, folder / "preview.png")
 
