@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from barsight.yard import sections as cutting
+from barsight.yard.bundles.bundle_record import describe_bundles
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.targets import plan_lifts
 from barsight.yard.sections import part_about, patches, split_map
 from barsight.yard.types import HeightMap
-from lift_yards import MAGNET
+from lift_yards import MAGNET, laid, record
 from yard_maps import Laid, draw
 
 LENGTH_M = 13.0
@@ -91,3 +92,14 @@ def test_the_part_about_places_beyond_the_map_is_its_border() -> None:
     heights = draw([], x_m=(0.0, 1.0), y_m=(0.0, 1.0))
     assert part_about(heights, np.array([0.314, 0.32]), np.array([0.5])).shape == (1, 2)
     assert part_about(heights, np.array([-3.0]), np.array([9.0])).shape == (1, 1)
+
+
+def test_a_bundle_whose_middle_is_far_beyond_the_seam_still_lies_on_another() -> None:
+    low, high = laid(0.3, y_m=-0.2, length_m=10.0), laid(0.535, z=0.335, y_m=8.1, length_m=11.0)
+    heights = draw([low, high], x_m=(-1.5, 2.5), y_m=(-31.0, 31.0), sigma_m=0.002)
+    parts = split_map(heights)
+    bundles = describe_bundles([record(one) for one in (low, high)], 0.0, parts)
+    assert len(parts) == 2 and not bundles[0].is_free and bundles[0].neighbours == (1,)
+    plan = plan_lifts(heights, bundles, MAGNET, LiftSettings(), ())
+    vetoes = {veto.code for lift in plan.refused if lift.bundles == (0,) for veto in lift.vetoes}
+    assert vetoes == {"covered", "unstable-side"}

@@ -20,7 +20,7 @@ WHOLE_M = 60.0
 OWN_M, MARGIN_M = 44.0, 8.0
 """Maximum length (m) of a stretch's own part, and how much of its neighbours it includes on either side: a
 bundle whose middle is in its own part is included whole if it is no longer than 13 m, with a metre to see its
-ends.
+ends. Of a bundle beyond, an end may be included alone; it counts as a neighbour.
 """
 
 
@@ -100,9 +100,9 @@ class MapStretch:
             for low, at, high in zip(self.low_m, place_m[:2], self.high_m, strict=True)
         )
 
-    def reaches(self, place_m: Float64) -> bool:
-        """Check whether a place lies in its own part or in its margin."""
-        return self.owns(place_m, MARGIN_M)
+    def reaches(self, *places_m: Float64) -> bool:
+        """Check whether one of these places lies in its own part or in its margin."""
+        return any(self.owns(place_m, MARGIN_M) for place_m in places_m)
 
 
 def split_map(yard: YardMap) -> list[MapStretch]:

@@ -62,7 +62,7 @@ def describe_bundles(
     ordered = [replace(bundle, id=k) for k, bundle in enumerate(ordered)]
     out = list(ordered)
     for part in parts:
-        near = [bundle for bundle in ordered if part.reaches(bundle.centre_m)]
+        near = [bundle for bundle in ordered if part.reaches(bundle.centre_m, *bundle.ends_m)]
         for bundle, layer in zip(near, find_layers(near, floor_m), strict=True):
             if part.owns(bundle.centre_m):
                 on_top, why = check_uncovered(bundle, near, layer)

@@ -132,7 +132,7 @@ def plan_lifts(
     groups = list(_groups(bundles, settings.bundles))
     lifts = dict[int, Lift]()
     for part in parts:
-        near = tuple(bundle for bundle in bundles if part.reaches(bundle.centre_m))
+        near = tuple(bundle for bundle in bundles if part.reaches(bundle.centre_m, *bundle.ends_m))
         heights, standing = yard.part(part.rows, part.columns), tuple(stands[bundle.id] for bundle in near)
         here = LiftScene(heights, BundleTable.of(near), standing, travel, now_ns, events)
         own_groups = [n for n, group in enumerate(groups) if part.owns(group[0].centre_m)]
