@@ -8,13 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from barsight.core.stamps import NS_PER_S
 from barsight.yard.events import YardEvent, corners, gap_between
 from barsight.yard.lifting.targets import plan_lifts
 from barsight.yard.lifting.travel_accuracy import target_covariance
 from barsight.yard.magnet.contact import rest_magnet
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.vetoes import check_max, check_min, check_true, vetoes_of
-from lift_yards import MAGNET, SETTINGS, codes, judged, laid, map_of, record
+from lift_yards import MAGNET, SETTINGS, bare, codes, judged, laid, map_of, record, sure_travel
 
 
 @pytest.mark.parametrize(
@@ -92,6 +93,19 @@ def test_gaps_between_rectangles() -> None:
     assert gap_between(here, corners((1.0, 0.0), 0.0, 0.4, 6.0)) == pytest.approx(0.6)
     assert gap_between(here, corners((0.0, 4.0), math.pi / 2, 1.0, 2.0)) == pytest.approx(0.5)
     assert gap_between(here, corners((0.3, 1.0), 0.7, 0.4, 1.0)) == 0.0
+
+
+@pytest.mark.parametrize(("after_s", "disturbed"), [(-1, False), (50, True), (103, True)])
+def test_what_happened_between_two_looks_of_one_recording_forbids(after_s: int, disturbed: bool) -> None:
+    """Its map may show what was there before: of as many views with and without it, the higher counts."""
+    at_ns = 10**18 + NS_PER_S * np.array([0, 1, 2, 100, 101, 102], np.int64)
+    travel = replace(sure_travel(np.zeros((6, 2)), at_ns), reach_m=10.0, sure_reach_m=8.0)
+    stock, bundles = [laid(0.3)], (record(laid(0.3)),)
+    event = YardEvent(10**18 + after_s * NS_PER_S, "lift", 0.3, 0.0, 0.0, 7.0, 0.3)
+    plan = plan_lifts(
+        bare(map_of(stock)), bundles, MAGNET, SETTINGS, (), travel, int(at_ns[-1]), events=(event,)
+    )
+    assert [codes(lift) for lift in plan.refused] == ([{"disturbed"}] if disturbed else [])
 
 
 def test_what_happened_near_forbids_and_what_was_far_does_not() -> None:

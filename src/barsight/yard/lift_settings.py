@@ -33,7 +33,7 @@ class LiftSettings:
     max_age_s: float = 600.0
     """Maximum time since a place was last seen for a lift from it."""
     disturbed_reach_m: float = 1.0
-    """Minimum distance of a lift from any event (lift, set-down, magnet) since its place was last seen."""
+    """Minimum distance of a lift from any event (lift, set-down, magnet) since its place was first seen."""
     max_overhang_ratio: float = 0.25
     """Maximum overhang of a bundle over the edge of what carries it, as a share of its width."""
     max_lean_deg: float = 5.0

@@ -10,7 +10,7 @@ from typing import Literal
 VETOES = {
     "no-magnet": "No magnet is described; an assumed one forbids every lift.",
     "map-too-old": "The place was last seen longer ago than the settings allow, or at an unknown time.",
-    "disturbed": "A lift, a set-down or a magnet came near after the place was last seen.",
+    "disturbed": "A lift, a set-down or a magnet came near after the map's frames of the place began.",
     "map-from-the-future": "The last frame is ahead of this computer's clock, so its age is unknown.",
     "calibration-changed": "The calibration of map or magnet's offset changed since, or has expired.",
     "calibration-drift": "The cameras' calibration no longer fits the pictures.",

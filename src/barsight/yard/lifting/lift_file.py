@@ -22,7 +22,7 @@ from barsight.yard.lifting.bearing import magnet_reach
 from barsight.yard.lifting.load import Load, laid_at
 from barsight.yard.lifting.order import LiftOrder
 from barsight.yard.lifting.targets import RULE, LiftPlan
-from barsight.yard.lifting.validity import Validity, disturbed_checks, is_ahead
+from barsight.yard.lifting.validity import disturbed_checks, is_ahead
 from barsight.yard.magnet.description import Magnet, MagnetOffset
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.stability.stability import Footing
@@ -74,16 +74,13 @@ def forbidden_since(
     magnet = cattrs.structure(content["magnet"], Magnet)
     settings = cattrs.structure(content["settings"], LiftSettings)
     load = tuple(bundle for bundle in bundles if bundle.id in record["bundles"])
-    checks = disturbed_checks(
-        events, _placement(target), magnet, load,
-        None if seen_ns is None else Validity(seen_ns, until_ns or seen_ns), settings,
-    )  # fmt: skip
+    later = unknown_events(content, events)
+    checks = disturbed_checks(later, _placement(target), magnet, load, None, settings)
     if record["set_down"] is not None and not vetoes_of(checks):
         place = _placement(record["set_down"])
         laid = laid_at(load, place.x_m, place.y_m, place.yaw_rad)
         wide, long = np.maximum((laid.width_m, laid.length_m), 2 * magnet_reach(Load.of(load), magnet))
         laid = replace(laid, width_m=float(wide), length_m=float(long))
-        later = unknown_events(content, events)
         checks = disturbed_checks(later, place, magnet, (laid,), None, settings)
     return (*found, *vetoes_of(checks))
 

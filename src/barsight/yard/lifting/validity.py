@@ -36,10 +36,14 @@ def is_ahead(stamp_ns: int | None, clock_ns: int) -> bool:
 
 @dataclass(frozen=True)
 class Validity:
-    """Period, given by two stamps (ns, capture clock), in which a lift is valid."""
+    """Period, given by two stamps (ns, capture clock), in which a lift is valid.
+
+    begun_ns: of the first frame that may have seen it, in the passes that the map shows there.
+    """
 
     from_ns: int
     until_ns: int
+    begun_ns: int
 
 
 def validity(
@@ -62,14 +66,14 @@ def validity(
     outlines += [(b.centre_m[:2], b.yaw_rad, b.width_m, b.length_m) for b in load]
     grid = [_places_in(centre, yaw, width + 2 * wider, length + 2 * wider)
             for centre, yaw, width, length in outlines]  # fmt: skip
-    seen_ns = int(_last_seen(travel, measured, np.concatenate([here, *grid]), heights).min())
-    return Validity(seen_ns, seen_ns + seconds_to_ns(settings.max_age_s))
+    seen_ns, begun_ns = _times_seen(travel, measured, np.concatenate([here, *grid]), heights).min(axis=1)
+    return Validity(int(seen_ns), int(seen_ns) + seconds_to_ns(settings.max_age_s), int(begun_ns))
 
 
-def _last_seen(travel: Travel, measured: Int64, at_m: Float64, heights: HeightMap) -> Int64:
-    """Find the time when each of the places (P, 2) that were seen was last seen. It is that of the last frame
-    that certainly saw it, otherwise of the first that may have, in the pass whose height the map has there.
-    The first place must have been seen.
+def _times_seen(travel: Travel, measured: Int64, at_m: Float64, heights: HeightMap) -> Int64:
+    """Find the times (2, P) when the places (P, 2) that were seen were last and first seen. The last is that
+    of the last frame that certainly saw it, otherwise of the first that may have, as the first is; all in the
+    pass whose height the map has there. The first place must have been seen.
     """
     several, numbers = len(travel.pass_number) > 0, travel.passes[measured]
     newest = np.ones(len(at_m), np.int64)
@@ -85,15 +89,15 @@ def _last_seen(travel: Travel, measured: Int64, at_m: Float64, heights: HeightMa
     for number in np.unique(newest[newest > 0]):
         stamps = travel.stamp_ns[measured[(numbers == number) & near]]
         if not len(stamps):
-            found.append(travel.stamp_ns[measured[numbers <= number][:1]])
+            found.append(np.repeat(travel.stamp_ns[measured[numbers <= number][:1]][None], 2, axis=0))
             continue
         places = travel.place_m[measured[(numbers == number) & near]]
         far = _distances(places, at_m[newest == number])
         last = np.where(far < travel.sure_reach_m, stamps, -1).max(axis=1)
         may = (far < travel.reach_m) | ~(far < travel.reach_m).any(axis=1, keepdims=True)
         first = np.where(may, stamps, stamps.max()).min(axis=1)
-        found.append(np.where(last >= 0, last, first))
-    return np.concatenate(found)
+        found.append(np.stack([np.where(last >= 0, last, first), first]))
+    return np.concatenate(found, axis=1)
 
 
 def _thinned(at_m: Float64, newest: Int64) -> Int64:
@@ -170,20 +174,22 @@ def disturbed_checks(
     events: tuple[YardEvent, ...], place: Placement, magnet: Magnet, load: tuple[Bundle, ...],
     seen: Validity | None, settings: LiftSettings,
 ) -> list[Check]:  # fmt: skip
-    """Check that no event occurred within reach of magnet and load since the place was last seen."""
+    """Check that no event occurred within reach of magnet and load since the frames that the map shows there
+    began: heights from before and after it are fused.
+    """
     outlines = [corners((place.x_m, place.y_m), place.yaw_rad, *magnet.size_m)]
     for bundle in load:
         x, y = bundle.centre_m[:2]
         outlines.append(corners((x, y), bundle.yaw_rad, bundle.width_m, bundle.length_m))
-    since = [event for event in events if seen is None or event.stamp_ns > seen.from_ns]
+    since = [event for event in events if seen is None or event.stamp_ns > seen.begun_ns]
     checks = []
     for event in since:
         away = min(gap_between(outline, event.corners_m) for outline in outlines)
         reason = (
             f"a {event.kind} at {event.x_m:.2f}, {event.y_m:.2f} m, {away:.2f} m away, came after the place "
-            f"was last seen; at least {settings.disturbed_reach_m:g} m are needed: measure again"
+            f"was first seen; at least {settings.disturbed_reach_m:g} m are needed: measure again"
         )
-        what = f"distance to a {event.kind} since the place was last seen"
+        what = f"distance to a {event.kind} since the place was first seen"
         checks.append(check_min("disturbed", what, away, settings.disturbed_reach_m, "m", reason))
     return sorted(checks, key=lambda check: check.value or 0.0)[:1]
 
