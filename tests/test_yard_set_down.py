@@ -145,6 +145,15 @@ def test_what_stands_or_is_not_seen_under_any_part_of_the_magnet_refuses(
     assert found(replace(unseen, free_m=np.full(unseen.shape, 0.1, np.float32)))
 
 
+@pytest.mark.parametrize(("bars", "fits"), [(7, True), (None, False)])
+def test_a_magnet_on_a_pack_that_may_be_flat_needs_room_beyond_its_ends(bars: int | None, fits: bool) -> None:
+    """A pack is taken to be as high as it is wide where its bars aren't counted; it may be half as high."""
+    load = Load.of((record(laid(0.3, length_m=4.0), bars=bars),))
+    heights = map_of([laid(0.3, length_m=4.0)], x_m=(-3.0, 5.0), y_m=(-5.0, 5.0))
+    heights.z_m[cells(heights, (1.5, 1.7), (2.35, 2.45))] = 0.8 * load.height_m
+    assert (find_bearing(heights, load, *FREE, 0.0, MAGNET, SETTINGS) is not None) is fits
+
+
 def test_a_stanchion_is_not_touched_and_stands_over_what_it_holds() -> None:
     for x, top, fits in ((1.65, 2.0, False), (2.3, 2.0, True), (2.3, 0.2, False), (2.95, 0.2, True)):
         settings = LiftSettings(stanchions=((x, 1.0, top),))

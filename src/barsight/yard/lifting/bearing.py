@@ -233,7 +233,7 @@ def _stands_in_the_way(
     beyond = np.abs(around.v_m - load.off_along_m)[:, None]
     for half_width, half_length, over_m in magnet_rectangles(load, magnet, slack):
         under = (beside <= half_width) & (beyond <= half_length)
-        height = low_m + load.height_m + over_m
+        height = low_m + load.min_height_m + over_m
         if (under & np.where(around.hidden, ~(around.free_m <= height), z > height)).any():
             return True
     return False

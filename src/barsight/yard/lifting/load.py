@@ -10,6 +10,7 @@ import numpy as np
 from barsight.core.arrays import Float64
 from barsight.yard.lift_settings import UPPER, LiftSettings
 from barsight.yard.magnet.description import Tolerance
+from barsight.yard.magnet.holding import min_diameter_m
 from barsight.yard.stability.stability import mean_yaw
 from barsight.yard.types import Bundle
 from barsight.yard.weight import load_centre
@@ -22,7 +23,8 @@ class Load:
     """Outline of the load as it lies, m and rad; its sizes are upper 95 % bounds.
 
     x_m, y_m: its middle. off_across_m, off_along_m: centre of mass relative to the middle. yaw_rad: as a
-    bundle's. height_m: from its underside to its top. rolls: it is round, and would roll on level ground.
+    bundle's. height_m: from its underside to its top, as high as it is wide where its bars aren't counted;
+    min_height_m: the minimum that it may then be. rolls: it is round, and would roll on level ground.
     """
 
     bundles: tuple[int, ...]
@@ -32,6 +34,7 @@ class Load:
     width_m: float
     length_m: float
     height_m: float
+    min_height_m: float
     rolls: bool
     off_across_m: float = 0.0
     off_along_m: float = 0.0
@@ -56,9 +59,16 @@ class Load:
         ids = tuple(b.id for b in bundles)
         off = axes @ (load_centre(bundles) - (x, y))
         return cls(
-            ids, float(x), float(y), yaw, float(size[0]), float(size[1]), height, rolls, float(off[0]),
-            float(off[1]),
+            ids, float(x), float(y), yaw, float(size[0]), float(size[1]), height,
+            max(_min_height(bundle) for bundle in bundles), rolls, float(off[0]), float(off[1]),
         )  # fmt: skip
+
+
+def _min_height(bundle: Bundle) -> float:
+    """Return the minimum height (m) of a bundle: a pack that is wider than high may be as thin as one bar."""
+    if bundle.bars is not None:
+        return bundle.top_z_m - bundle.bottom_z_m
+    return float(np.nan_to_num(min_diameter_m(bundle)))
 
 
 def laid_at(load: tuple[Bundle, ...], x_m: float, y_m: float, yaw_rad: float) -> Bundle:

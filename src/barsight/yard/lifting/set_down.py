@@ -94,7 +94,7 @@ def _magnet_meets(
     over = np.array([x_m, y_m]) + (load.off_across_m, load.off_along_m) @ axes_of(yaw_rad)
     for wide, long, over_m in magnet_rectangles(load, magnet, placing_slack(load, yaw_rad, magnet)):
         size = replace(load, width_m=2 * wide, length_m=2 * long)
-        high = ground.top_m > bearing.z_m + load.height_m + over_m
+        high = ground.top_m > bearing.z_m + load.min_height_m + over_m
         if (high & ground.inside(size, float(over[0]), float(over[1]), yaw_rad, 0.0)).any():
             return True
     return False
