@@ -173,6 +173,18 @@ def test_more_passes_than_a_place_remembers_are_refused_before_they_are_measured
         in_order(cast(Any, many), bs.MeasureSettings())
 
 
+def test_of_passes_of_one_time_the_one_that_hangs_differently_is_named() -> None:
+    first, second = (
+        SimpleNamespace(
+            path=Path(name), index=SimpleNamespace(stamps_ns=(0, 5)), rig=name,
+            crane=lambda lever=lever: SimpleNamespace(crane_to_body_m=lever, yard_from_body_nominal=0.0),
+        )
+        for name, lever in (("first", 1.0), ("second", 2.0))
+    )  # fmt: skip
+    with pytest.raises(InputError, match=r"^second: its cameras.* differ from those of first"):
+        in_order(cast(Any, [first, second]), bs.MeasureSettings())
+
+
 def test_noise_and_edges_are_no_change() -> None:
     rng, one = np.random.default_rng(5), PlaceHistory((0.0, 0.0), (160, 120), 0.05)
     z = np.zeros((160, 120))

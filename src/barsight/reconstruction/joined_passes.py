@@ -125,9 +125,10 @@ def in_order(recordings: Sequence[Recording], settings: MeasureSettings) -> tupl
         if twin is not None:
             problem = f"it and {group[pairs.index(pairs[twin])].path.name} were recorded at the same time"
             raise InputError(group[twin].path, problem, "name each pass once")
-        if any(_hung(one) != hung for one in group) or (known and known.isdisjoint(pairs)):
+        odd = [one for one in group if _hung(one) != hung]
+        if odd or (known and known.isdisjoint(pairs)):
             problem = f"its cameras, or how they hang from the crane, differ from those of {ordered[0].path}"
-            raise InputError(group[0].path, problem, "measure passes of one rig and crane together")
+            raise InputError((odd or group)[0].path, problem, "measure passes of one rig and crane together")
         known.update(pairs)
     return tuple(ordered)
 
