@@ -64,7 +64,9 @@ def test_a_newer_calibration_ends_the_older(store: Store) -> None:
         assert ends == [(10 * DAY_NS, 20 * DAY_NS), (20 * DAY_NS, 30 * DAY_NS)]
         assert {one.approved_by for each in known for one in each.times} == {"ann"}
         assert find_calibration(connection, "a") == "aaaa"
-        with pytest.raises(ConfigError, match="known are aaaa, bbbb, cccc"):
+        with pytest.raises(
+            ConfigError, match=r"^x: is neither a file nor a known calibration; known are aaaa, bbbb, cccc"
+        ):
             find_calibration(connection, "x")
     approve(store, "aaaa", 25 * DAY_NS)
     with store.reading() as connection:
@@ -148,8 +150,12 @@ def test_a_recording_is_kept_with_its_reason(
     assert "kept" in said and "slipped" in said and "never approved" in said and "north" in said
     assert "…" not in said and one.surveys[0] in said
     monkeypatch.chdir(tmp_path)
+    assert run(["store", "keep", store_url, "recording", "again"]) == 2
+    assert f"{recording}: is kept already" in capsys.readouterr().err
     assert run(["store", "keep", store_url, "recording", "looked at", "--release"]) == 0
     assert not (recording / PROTECTED).exists()
+    assert run(["store", "keep", store_url, "recording", "looked at", "--release"]) == 2
+    assert f"{recording}: isn't kept" in capsys.readouterr().err
     assert run(["store", "keep", store_url, "nowhere", "why"]) == 2
     assert "is no recording that the store knows" in capsys.readouterr().err
     (recording / PROTECTED).write_text("an accident\n")
@@ -176,4 +182,4 @@ def test_a_calibration_is_approved_at_the_terminal(
     assert time["until_ns"] == parse_time("2021-01-01T00:00:00Z") and time["note"] == "certificate 7"
     assert content["recordings"][0]["state"] == "measured"
     assert run(["store", "approve", store_url, "f00d"]) == 2
-    assert "is no calibration that the store knows" in capsys.readouterr().err
+    assert "is neither a file nor a known calibration" in capsys.readouterr().err

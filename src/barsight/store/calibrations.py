@@ -105,7 +105,7 @@ def find_calibration(connection: Connection, start: str) -> str:
     known = {row.digest for row in _rows(connection)} | set(surveyed)
     found = sorted(one for one in known if start and one.startswith(start))
     if len(found) != 1:
-        problem = "names several calibrations" if found else "is no calibration that the store knows"
+        problem = "names several calibrations" if found else "is neither a file nor a known calibration"
         raise ConfigError(f"{start}: {problem}; known are {', '.join(found or sorted(known)) or 'none'}")
     return str(found[0])
 

@@ -100,6 +100,8 @@ def keep_recording(opened: Entry, name: str, why: str) -> str:
     if not why.strip():
         raise ConfigError("say why it is kept")
     number, key = _find(opened.connection, name)
+    if recording_state(opened.connection, number) == "kept":
+        raise ConfigError(f"{key}: is kept already; --release takes that back first")
     step_recording(opened, number, "kept", why)
     if Path(key).is_dir():
         (Path(key) / PROTECTED).write_text(f"{why}\n", encoding="utf-8")
@@ -107,8 +109,12 @@ def keep_recording(opened: Entry, name: str, why: str) -> str:
 
 
 def release_recording(opened: Entry, name: str, why: str) -> str:
-    """Remove the protection, and return the recording's key."""
+    """Remove the protection, and return the recording's key. Raises ConfigError if it isn't kept."""
     number, key = _find(opened.connection, name)
+    if recording_state(opened.connection, number) != "kept":
+        raise ConfigError(
+            f"{key}: isn't kept, so nothing can be released; barsight store list tells which are"
+        )
     step_recording(opened, number, "released", why or None)
     (Path(key) / PROTECTED).unlink(missing_ok=True)
     return key
