@@ -14,6 +14,7 @@ from barsight.cli.main import run
 from barsight.core.records.pairs import StereoFrame
 from barsight.core.settings.values import build_settings
 from barsight.mapping.settings import MapSettings
+from barsight.reconstruction.map_building import nothing_seen
 from barsight.yard.events import YardEvent, kept_events, write_events
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.lift_file import read_lifts
@@ -214,3 +215,9 @@ def test_importing_loads_nothing_heavy() -> None:
     assert dir(bs) == sorted(bs.__all__)
     with pytest.raises(AttributeError, match="no attribute 'mesure'"):
         bs.mesure  # noqa: B018
+
+
+def test_where_nothing_is_seen_cells_that_were_set_are_named() -> None:
+    told = [str(nothing_seen(Path("way"), 2, MapSettings(cell_m=cell))) for cell in (None, 10.0)]
+    assert told[0] == "way: no place was seen by 2 frames; lower map.min_views"
+    assert told[1] == f"{told[0]}, or choose smaller cells than map.cell_m = 10 m"

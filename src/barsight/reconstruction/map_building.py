@@ -170,8 +170,18 @@ def build_map(
     built = checkpointed(probed.checkpoints, name, build)
     if built.surface.seen == 0:
         least = settings.map.min_views if len(built.placed) > 1 else 1
-        raise MeasurementError(f"{path}: no place was seen by {least} frames; lower map.min_views")
+        raise nothing_seen(path, least, settings.map)
     return replace(built, refusals=(*refusals, *built.refusals))
+
+
+def nothing_seen(path: Path, frames: int, settings: MapSettings) -> MeasurementError:
+    """Word the refusal of a map without a seen cell, with what to change."""
+    cell = (
+        ""
+        if settings.cell_m is None
+        else f", or choose smaller cells than map.cell_m = {settings.cell_m:g} m"
+    )
+    return MeasurementError(f"{path}: no place was seen by {frames} frames; lower map.min_views{cell}")
 
 
 def map_name(poses: tuple[PosedFrame, ...], binner: PointBinner) -> str:
