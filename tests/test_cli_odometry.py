@@ -57,6 +57,17 @@ def test_a_measured_folder_is_left_alone(
     assert [path.name for path in tmp_path.iterdir()] == ["result.json"]
 
 
+@pytest.mark.parametrize(("out", "why"), [("mav0/out", "lies in the recording"), ("a_file", "is a file")])
+def test_an_out_that_can_not_be_is_refused_at_once(
+    recording: Path, capsys: pytest.CaptureFixture[str], out: str, why: str
+) -> None:
+    (recording.parent / "a_file").touch()
+    target = recording / out if "/" in out else recording.parent / out
+    assert run(["odometry", str(recording), "-o", str(target)]) == 4
+    assert f"{target}: {why}" in capsys.readouterr().err
+    assert not target.is_dir()
+
+
 @pytest.fixture(scope="module")
 def development_yard(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return Path(shutil.copytree(data / "yard_dev", tmp_path_factory.mktemp("development") / "yard"))

@@ -16,7 +16,7 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.cli.arguments import call
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import MeasurementError, OutputError
-from barsight.core.files import atomic_directory
+from barsight.core.files import atomic_directory, lies_within
 from barsight.core.records.trajectory import Trajectory
 from barsight.evaluation.board_poses import board_poses, gyro_only_rmse_deg
 from barsight.evaluation.trajectory_error import Drift, frame_errors, trajectory_drift
@@ -52,8 +52,8 @@ def run(arguments: Sequence[str]) -> None:
             reading: How to read the recording.
             settings: Settings of the estimate.
         """
-        if out is not None and (out / "result.json").exists():
-            raise OutputError(f"{out}: holds what barsight measure wrote; name another folder")
+        if out is not None:
+            _expect_own_folder(out, recording)
         console = SafeConsole()
         source: Recording = open_recording(recording, reading)
         rectifier = Rectifier(source.rig)
@@ -89,6 +89,16 @@ def run(arguments: Sequence[str]) -> None:
             console.print(escape(line), soft_wrap=True, highlight=False)
 
     call(command, "odometry", arguments)
+
+
+def _expect_own_folder(out: Path, recording: Path) -> None:
+    """Raise OutputError for a folder inside the recording, a measured one, or a file."""
+    if lies_within(out, recording):
+        raise OutputError(f"{out}: lies in the recording itself; name a folder elsewhere")
+    if (out / "result.json").exists():
+        raise OutputError(f"{out}: holds what barsight measure wrote; name another folder")
+    if out.exists() and not out.is_dir():
+        raise OutputError(f"{out}: is a file; name a folder")
 
 
 def _summary(trajectory: Trajectory) -> list[str]:
