@@ -133,6 +133,9 @@ def test_what_is_refused(pair: tuple[Path, Path], tmp_path: Path, capsys: pytest
     refused([left, right, *out, "--range", "0:900"], capsys, "0:900", "260 px wide")
     refused([left, right, *out, "--range", "many"], capsys, "many")
     refused([left, right, "-o", str(tmp_path / "d.jpg")], capsys, "d.jpg", ".pfm")
+    refused([left, right, "-o", left], capsys, left, "is an input")
+    refused([left, right, *out, "--preview", right], capsys, right, "is an input")
+    assert (cv2.imread(right, cv2.IMREAD_GRAYSCALE) == picture).all()
     assert not any(tmp_path.glob("d.*"))
 
 

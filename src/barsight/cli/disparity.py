@@ -59,6 +59,7 @@ def run(arguments: Sequence[str]) -> None:
         console = SafeConsole(stderr=True)
         if out.suffix.lower() not in SUFFIXES:
             raise OutputError(f"{out}: disparities are written as {', '.join(SUFFIXES)}")
+        _expect_no_input((out, preview), (left, right, rig))
         if range is not None:
             low, high = _parsed_range(range)
             settings = replace(settings, min_disparity_px=low, max_disparity_px=high)
@@ -74,6 +75,14 @@ def run(arguments: Sequence[str]) -> None:
             console.print(_POOR, soft_wrap=True, highlight=False)
 
     call(command, "disparity", arguments)
+
+
+def _expect_no_input(outputs: tuple[Path | None, ...], inputs: tuple[Path | None, ...]) -> None:
+    """Raise OutputError for an output that is one of the inputs, which it would replace."""
+    read = {path.resolve() for path in inputs if path is not None}
+    for path in outputs:
+        if path is not None and path.resolve() in read:
+            raise OutputError(f"{path}: is an input of this command; name another file")
 
 
 def _summary(out: Path, disparity: Disparity) -> str:
