@@ -77,6 +77,8 @@ def test_what_cant_be_exported(folder: Path, tmp_path: Path) -> None:
         export(folder / "nowhere", folder / "points.las")
     with pytest.raises(InputError, match="no such file"):
         export(folder, folder / "copy.tif")
+    assert run(["export", str(folder), str(folder / "contour.csv")]) == 4
+    assert not (folder / "contour.csv").exists()
     assert not list(tmp_path.glob("*.part"))
 
 

@@ -9,7 +9,9 @@ import tyro
 
 from barsight.cli.arguments import call
 from barsight.cli.safe_console import SafeConsole
+from barsight.core.errors import OutputError
 from barsight.report.export import export
+from barsight.report.files.result_files import RESULT_FILES
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -22,6 +24,8 @@ def run(arguments: Sequence[str]) -> None:
             out: A folder of results from barsight measure.
             file: The file to write; its suffix selects the format.
         """
+        if file.name in RESULT_FILES and file.resolve().parent == out.resolve():
+            raise OutputError(f"{file}: is a file of the result itself; name another")
         points = export(out, file)
         remark = f" ({points} points)" if points else ""
         SafeConsole(stderr=True).print_line(f"written: {file}{remark}")
