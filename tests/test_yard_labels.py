@@ -112,8 +112,9 @@ def test_a_dull_label_between_dark_straps_is_marked_on_bright_bars(ratio: float)
         ([150, 148, 156, 164, 163, 161, 185, 211, 215, 214, 201, 176, 155, 157, 153, 144, 147], False),
         ([179, 182, 184, 178, 184, 204, 216, 236, 230, 239, 239, 213, 186, 180, 177, 173, 176], False),
         ([135, 132, 122, 116, 122, 138, 153, 165, 172, 181, 181, 163, 141, 113, 0, 0, 0], False),
+        ([206, 205, 205, 189, 204, 252, 252, 250, 243, 244, 252, 202, 193, 213, 208, 208, 206], True),
     ],
-    ids=["label", "gleam", "bright gleam", "gleam at an end"],
+    ids=["label", "gleam", "bright gleam", "gleam at an end", "label on polished steel"],
 )
 def test_a_short_label_ends_at_once_and_a_gleam_fades(levels: list[int], is_label: bool) -> None:
     """Take levels along a bar from a demo's orthophoto, with a label of 36 mm, on bars as mottled."""

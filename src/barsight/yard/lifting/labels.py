@@ -37,8 +37,10 @@ label ends abruptly, a reflection fades.
 """
 AROUND_CELLS = 9
 """Number of steps along a bar over which its scatter is measured."""
-WHITE_LEVEL, MIN_WHITE_LOG = 245.0, 0.1
-"""Level from which a picture is saturated, and the minimum of that mean log ratio for labels this bright."""
+MAX_LEVEL, ROOM_RATIO = 255.0, 0.7
+"""Level at which a picture saturates; minimum share, of the log ratio from the bare bar to it, of a label's: on
+polished steel white paper can't be brighter by more.
+"""
 BRIGHTER_RATIO, FULL_LEVEL, MIN_LEVEL = 1.2, 215.0, 140.0
 """Minimum ratio of a label's gray level to the load's median; level at which a picture saturates, which
 limits that; and minimum level of any label.
@@ -122,8 +124,8 @@ def mark_labels(gray: Float32, load: Bool) -> Bool:
         columns = _edge_logs(level, length)[0] > MIN_COLUMN_LOG
         wide = ndimage.binary_erosion(columns, np.ones((1, WIDTH_CELLS), np.bool_))
         edges, lowest = _edge_logs(mean, length)
-        is_white = lowest > np.log(WHITE_LEVEL + _DARK)
-        found = wide & (edges > np.where(is_white, MIN_WHITE_LOG, edge))
+        room = math.log(MAX_LEVEL + _DARK) - (lowest - edges)
+        found = wide & (edges > np.clip(ROOM_RATIO * room, MIN_COLUMN_LOG, edge))
         found = ndimage.binary_dilation(found, np.ones((1, WIDTH_CELLS), np.bool_))
         for row in range(_BESIDE, _BESIDE + length):
             marked[row : row + len(found)] |= found
