@@ -185,3 +185,21 @@ def test_a_label_that_ends_beside_a_face_counts_two_cells_further(beside_m: floa
     gray[np.ix_(rows, np.abs(heights.x_m - 0.3) < 0.03)] = 250.0
     heights = replace(heights, gray=gray.astype(np.uint8))
     assert (find_label(PLACE, heights, exact, plane(PLACE, heights)) is not None) == found
+
+
+@pytest.mark.parametrize("exposure", [1.0, 0.5, 0.3])
+def test_a_label_in_an_underexposed_picture_is_found(exposure: float) -> None:
+    heights = map_of([laid(0.3)], x_m=(-1.5, 2.0))
+    gray = bars(heights.shape)
+    gray[np.ix_(np.abs(heights.y_m - MAGNET.poles[0].along_m) < 0.033, np.abs(heights.x_m - 0.3) < 0.02)] = (
+        250
+    )
+    heights = replace(heights, gray=np.clip(exposure * gray, 1, 255).astype(np.uint8))
+    assert find_label(PLACE, heights, MAGNET, plane(PLACE, heights)) is not None
+
+
+@pytest.mark.parametrize(("cells", "may_hide"), [(3, True), (2, False)])
+def test_saturated_steel_as_wide_as_a_label_may_hide_one(cells: int, may_hide: bool) -> None:
+    gray = np.clip(bars((60, 20)), 1, 200)
+    gray[:, 8 : 8 + cells] = 255
+    assert mark_labels(gray).any() == may_hide

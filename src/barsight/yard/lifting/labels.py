@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 from scipy import ndimage
@@ -38,12 +39,16 @@ label ends abruptly, a reflection fades.
 AROUND_CELLS = 9
 """Number of steps along a bar over which its scatter is measured."""
 MAX_LEVEL, ROOM_RATIO = 255.0, 0.7
-"""Level at which a picture saturates; minimum share, of the log ratio from the bare bar to it, of a label's: on
-polished steel white paper can't be brighter by more.
+"""Level at which a picture saturates; a label's minimum share of the log ratio from the bare bar to it: on
+polished steel paper can't be brighter by more.
 """
-BRIGHTER_RATIO, FULL_LEVEL, MIN_LEVEL = 1.2, 215.0, 140.0
-"""Minimum ratio of a label's gray level to the load's median; level at which a picture saturates, which
-limits that; and minimum level of any label.
+BRIGHTER_RATIO, FULL_LEVEL = 1.2, 215.0
+"""Minimum ratio of a label's gray level to the load's median, and the maximum of that level."""
+MIN_RATIO, MIN_LEVEL = 1.65, 140.0
+"""Minimum ratio of a label's gray level to the orthophoto's median, and the maximum of that level."""
+WHITE_LEVEL, WHITE_CELLS = 245.0, (6, 3)
+"""Level from which white paper isn't told from saturated steel, and the size along and across, in steps, of
+a place so bright that may be a label.
 """
 _BESIDE = 4
 """Number of steps before and behind a label that are read."""
@@ -83,7 +88,7 @@ def find_label(
     faces_z_m = plane.centre_z_m + math.tan(plane.pitch_rad) * v[:, None] + math.tan(plane.roll_rad) * u
     is_low = z_m < faces_z_m - DEEP_M
     load = (gray > 0) & ~is_low
-    labels = mark_labels(gray, load & (np.abs(u) <= wide + broad))
+    labels = mark_labels(gray, load & (np.abs(u) <= wide + broad), min_label_level(heights))
     for mask in plate_masks(gray, z_m, SIZE_M):
         labels |= mask
     labels &= ~is_low
@@ -102,9 +107,18 @@ def _steps(reach_m: float) -> Float64:
     return np.asarray(STEP_M * np.arange(-count, count + 1), np.float64)
 
 
-def mark_labels(gray: Float32, load: Bool) -> Bool:
+@lru_cache(maxsize=4)
+def min_label_level(heights: HeightMap) -> float:
+    """Return the minimum gray level of a label, by how brightly the orthophoto is exposed."""
+    counts = np.bincount(heights.gray.ravel(), minlength=256) if heights.gray is not None else np.zeros(256)
+    counts[0] = 0
+    median = int(np.searchsorted(np.cumsum(counts), counts.sum() / 2))
+    return min(MIN_RATIO * median, MIN_LEVEL)
+
+
+def mark_labels(gray: Float32, load: Bool, min_level: float = MIN_LEVEL) -> Bool:
     """Mark the cells (V, U) of labels: bright, and abruptly darker before and behind along the bars. A bright
-    strap is marked too.
+    strap is marked too, and saturated steel on which a label wouldn't show.
 
     gray: levels, 0 where nothing was seen, which counts as dark. load: cells from which the load's usual
     level and its scatter are measured.
@@ -115,7 +129,7 @@ def mark_labels(gray: Float32, load: Bool) -> Bool:
     mean = ndimage.uniform_filter1d(level, WIDTH_CELLS, axis=1)
     scatter = mad_sigma((mean - ndimage.uniform_filter1d(mean, AROUND_CELLS, axis=0))[load])
     edge = float(np.clip(EDGE_SIGMAS * scatter, *MIN_EDGE_LOG))
-    needed = max(min(BRIGHTER_RATIO * float(np.median(gray[load])), FULL_LEVEL), MIN_LEVEL)
+    needed = max(min(BRIGHTER_RATIO * float(np.median(gray[load])), FULL_LEVEL), min_level)
     bright = mean > np.log(needed + _DARK)
     marked = np.zeros(gray.shape, np.bool_)
     for length in LENGTH_CELLS:
@@ -129,7 +143,8 @@ def mark_labels(gray: Float32, load: Bool) -> Bool:
         found = ndimage.binary_dilation(found, np.ones((1, WIDTH_CELLS), np.bool_))
         for row in range(_BESIDE, _BESIDE + length):
             marked[row : row + len(found)] |= found
-    return np.asarray(bright & marked, np.bool_)
+    white = ndimage.binary_opening(gray >= WHITE_LEVEL, np.ones(WHITE_CELLS, np.bool_))
+    return np.asarray((bright & marked) | white, np.bool_)
 
 
 def _edge_logs(level: Float32, length: int) -> tuple[Float32, Float32]:
