@@ -15,9 +15,14 @@ from barsight.artefacts.plan import TouchDown
 from barsight.cli.main import run
 from barsight.plant.state import offered_lift
 from barsight.store.confirmation import OpenLift
+from barsight.store.lift_records import find_gap, find_outlines
+from barsight.store.opening import Store
+from barsight.yard.events import corners
 from barsight.yard.lifting.lift_file import lifts_content, read_lifts, write_lifts
-from barsight.yard.lifting.targets import offset_vetoes, plan_lifts
+from barsight.yard.lifting.load import Load
+from barsight.yard.lifting.targets import offset_vetoes, plan_lifts, put_down
 from barsight.yard.magnet.description import MagnetOffset, example_magnet, load_magnet
+from barsight.yard.magnet.footprint import Placement
 from lift_yards import GIVEN, MAGNET, SETTINGS, laid, map_of, record, sure_travel
 from test_acceptance import CLEAN, observed, off_by, planned
 from yard_folders import schema
@@ -99,6 +104,26 @@ def test_an_offset_is_taken_off_what_the_crane_gets(tmp_path: Path) -> None:
     row = kept["lifts"][0] | {"valid_until_ns": 5}
     offered = offered_lift(OpenLift(1, 1, "map", "cal", "offered", row), None, ())
     assert offered.x_m == row["crane_target"]["x_m"] and offered.set_down_y_m == row["crane_set_down"]["y_m"]
+
+
+def test_a_magnet_off_the_middle_of_its_load_hangs_there_at_set_down_too(store: Store) -> None:
+    """Its own place there decides which offers end."""
+    stock = [laid(0.3)]
+    bundles = (record(stock[0]),)
+    plan = plan_lifts(map_of(stock), bundles, replace(MAGNET, offset=OFFSET), SETTINGS, ())
+    lift = replace(plan.offered[0], place=Placement(0.3, 0.25, 0.0))
+    lift = put_down(lift, Load.of(bundles), plan.offered[0].set_down)
+    (row,) = lifts_content(replace(plan, offered=(lift,)), "yard", GIVEN, "0")["lifts"]
+    size = dict(zip(("width_m", "length_m"), MAGNET.size_m, strict=True))
+    down, load = lift.magnet_down, lift.set_down
+    assert down is not None and load is not None
+    assert np.hypot(down.x_m - load.x_m, down.y_m - load.y_m) == pytest.approx(0.25, abs=0.01)
+    with store.reading() as connection:
+        found = find_outlines(connection, 1, 1, row | {"beam": size})
+    wanted = corners((down.x_m, down.y_m), down.yaw_rad, *MAGNET.size_m)
+    assert np.abs(found[1] - wanted).max() < 1e-3
+    beyond = corners((down.x_m, down.y_m + MAGNET.size_m[1] / 2 + 0.9), 0.0, 0.1, 0.0)
+    assert find_gap(found, [beyond]) < SETTINGS.disturbed_reach_m
 
 
 def test_an_unsure_offset_forbids_what_the_tolerance_cannot_hold() -> None:

@@ -118,19 +118,32 @@ def find_outlines(
     query = select(SIGHTINGS.c.record).join(LIFT_BUNDLES, LIFT_BUNDLES.c.bundle_id == SIGHTINGS.c.bundle_id)
     which = LIFT_BUNDLES.c.lift_id == lift_id, SIGHTINGS.c.survey_id == survey_id
     bundles = [bundle_of(json.loads(row)) for row in connection.execute(query.where(*which)).scalars()]
-    places = [record["target"]]
-    if record["set_down"]:
-        places.append(record["set_down"])
     beam = record.get("beam") or {"width_m": 0.0, "length_m": 0.0}
-    outlines = []
-    for place in places:
-        centre, yaw = (place["x_m"], place["y_m"]), math.radians(place["yaw_deg"])
-        outlines.append(corners(centre, yaw, beam["width_m"], beam["length_m"]))
-        lying = bundles if place is places[0] or not bundles else [laid_at(tuple(bundles), *centre, yaw)]
-        for bundle in lying:
-            at = float(bundle.centre_m[0]), float(bundle.centre_m[1])
-            outlines.append(corners(at, bundle.yaw_rad, bundle.width_m, bundle.length_m))
+    lying, outlines = list(bundles), []
+    for place in (record["target"], _magnet_down(record)):
+        if place is not None:
+            centre, yaw = (place["x_m"], place["y_m"]), math.radians(place["yaw_deg"])
+            outlines.append(corners(centre, yaw, beam["width_m"], beam["length_m"]))
+    if record["set_down"] and bundles:
+        place = record["set_down"]
+        lying.append(laid_at(tuple(bundles), place["x_m"], place["y_m"], math.radians(place["yaw_deg"])))
+    for bundle in lying:
+        at = float(bundle.centre_m[0]), float(bundle.centre_m[1])
+        outlines.append(corners(at, bundle.yaw_rad, bundle.width_m, bundle.length_m))
     return outlines
+
+
+def _magnet_down(record: dict[str, Any]) -> dict[str, float] | None:
+    """Return where the magnet hangs at set-down, which the load's middle needn't be; the middle where an
+    earlier version recorded nothing else, None without a set-down.
+    """
+    middle: dict[str, float] | None = record["set_down"]
+    crane = record.get("crane_set_down")
+    if middle is None or crane is None:
+        return middle
+    target, hung = record["target"], record["crane_target"]
+    off = {name: target[name] - hung[name] for name in ("x_m", "y_m")}
+    return {**crane, "x_m": crane["x_m"] + off["x_m"], "y_m": crane["y_m"] + off["y_m"]}
 
 
 def find_gap(first: list[Float64], second: list[Float64]) -> float:
