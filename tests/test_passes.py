@@ -319,6 +319,37 @@ def test_a_bar_laid_across_since_stands_however_often_the_older_pass_saw_the_pla
     assert np.abs(z_m[:, 100:108] - shown_m).max() < 1e-6 and np.abs(z_m[:, :99] - 0.3).max() < 1e-6
 
 
+def mapped(stamps_ns: list[int], free: FreeSpace, tops: TopPhoto) -> MappedPass:
+    """A pass of three frames with its free space and its top photo."""
+    frames = tuple(
+        PosedFrame(k, Pose("yard", "body", np.eye(3), np.array([k, 1.0, 8.0])), 1e-4 * np.eye(6))
+        for k in range(3)
+    )
+    way = TrackedRecording(Trajectory("yard", frames, (), ()), *cast(Any, (None,) * 3), (), {}, (), iter(()))
+    source = SimpleNamespace(index=SimpleNamespace(stamps_ns=stamps_ns))
+    built = SimpleNamespace(free=free, tops=tops)
+    return MappedPass(cast(Any, SimpleNamespace(source=source)), way, cast(Any, built))
+
+
+def test_a_top_photo_shows_each_place_as_the_newest_passes_saw_it(tmp_path: Path) -> None:
+    """The second and the third pass are of one time. A bar laid since the first one, of many views, would
+    pale among its pictures.
+    """
+    x, y = np.meshgrid(np.arange(256) * CELL_M, np.arange(256) * CELL_M)
+    level = yard(x, y, detail=False)[0].astype(np.float32)
+    passes, surfaces = list[MappedPass](), []
+    seen = (([0, 1], 90, 20, 0, 256), ([10, 12], 200, 4, 0, 128), ([11, 13], 100, 4, 64, 192))
+    for number, (stamps_ns, gray, views, left, right) in enumerate(seen):
+        tops = TopPhoto(CELL_M)
+        tops.tiles[0, 0] = np.zeros((2, 256, 256), np.uint16)
+        tops.tiles[0, 0][:, :, left:right] = np.array([gray * views, views])[:, None, None]
+        passes.append(mapped(stamps_ns, FreeSpace(CELL_M), tops))
+        surfaces.append(one_tile(tmp_path / f"{number}", level, 5, number).surface)
+    shown = join_passes(passes, surfaces, tmp_path).tops.window(0, 0, 256, 256)
+    for at, gray in ((30, 200), (100, 150), (150, 100), (220, 90)):
+        assert (shown[:, at] == gray).all()
+
+
 def test_what_was_proven_free_is_given_up_where_it_changed() -> None:
     old, new = FreeSpace(CELL_M), FreeSpace(CELL_M)
     old.tiles[0, 0] = np.full((2, 256, 256), 0.1, np.float32)
@@ -340,16 +371,7 @@ def test_what_is_proven_free_is_moved_onto_the_joined_map_with_each_pass(tmp_pat
         bound = np.full((2, 256, 256), np.inf, np.float32)
         bound[:, :, 128 * number : 128 * number + 128] = 0.35 + number * off_m
         free.tiles[0, 0] = bound
-        frames = tuple(
-            PosedFrame(k, Pose("yard", "body", np.eye(3), np.array([k, 1.0, 8.0])), 1e-4 * np.eye(6))
-            for k in range(3)
-        )
-        way = TrackedRecording(
-            Trajectory("yard", frames, (), ()), *cast(Any, (None,) * 3), (), {}, (), iter(())
-        )
-        source = SimpleNamespace(index=SimpleNamespace(stamps_ns=[10 * number, 10 * number + 1]))
-        built = SimpleNamespace(free=free, tops=TopPhoto(CELL_M))
-        passes.append(MappedPass(cast(Any, SimpleNamespace(source=source)), way, cast(Any, built)))
+        passes.append(mapped([10 * number, 10 * number + 1], free, TopPhoto(CELL_M)))
         surfaces.append(one_tile(tmp_path / f"{number}", level + number * off_m, 5, number).surface)
     joined = join_passes(passes, surfaces, tmp_path)
     z_m = joined.surface.window(0, 0, 256, 256).z_m

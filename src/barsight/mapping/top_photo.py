@@ -90,6 +90,14 @@ class TopPhoto:
                 out[theirs] = np.where(count > 0, mean, 0).astype(np.uint8)
         return out
 
+    def give_way(self, later: TopPhoto) -> None:
+        """Discard the pictures where a pass of a later time has its own: what was laid across since would
+        pale among those from before.
+        """
+        for key, (_, seen) in later.tiles.items():
+            if key in self.tiles:
+                self.tiles[key][:, seen > 0] = 0
+
     def join(self, newer: TopPhoto, forgotten: Callable[[NDArray[Any], NDArray[Any]], Bool]) -> None:
         """Add a newer pass's pictures. forgotten: see `FreeSpace.join`."""
         cells = np.arange(TILE) * self.cell_m

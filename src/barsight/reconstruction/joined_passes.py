@@ -174,6 +174,10 @@ def join_passes(passes: Sequence[MappedPass], surfaces: Sequence[Surface], folde
             return joined.history.last_change(x_m, y_m) >= since
 
         free.join(one.built.free, rise_m, forgotten)
+        if since[number] == number:
+            for later, first in zip(passes, since, strict=True):
+                if first == number:
+                    tops.give_way(later.built.tops)
         tops.join(one.built.tops, forgotten)
     moved = tuple(
         replace(one, way=replace(one.way, trajectory=_moved(one.way.trajectory, correction)))
