@@ -273,10 +273,10 @@ def test_what_was_moved_along_itself_or_exchanged_is_told_by_its_picture(tmp_pat
     assert said[1].endswith("was moved 0.30 m along itself towards -Y") and "exchanged" in said[2]
 
 
-def one_tile(folder: Path, z_m: np.ndarray, views: int, since: int) -> PassSurface:
+def one_tile(folder: Path, z_m: np.ndarray, views: int, since: int, gray: float = 100.0) -> PassSurface:
     """A pass over one tile, all of it seen by so many views."""
     same = np.ones_like(z_m)
-    layers = Layers(z_m, 0.003 * same, views * same, same.astype(np.uint8), 100 * same)
+    layers = Layers(z_m, 0.003 * same, views * same, same.astype(np.uint8), gray * same)
     folder.mkdir()
     write_tile(folder, (0, 0), layers)
     none = np.empty(0, np.float32)
@@ -317,6 +317,15 @@ def test_a_bar_laid_across_since_stands_however_often_the_older_pass_saw_the_pla
     assert not joined.history.changes
     z_m = joined.surface.window(0, 0, 256, 256).z_m
     assert np.abs(z_m[:, 100:108] - shown_m).max() < 1e-6 and np.abs(z_m[:, :99] - 0.3).max() < 1e-6
+
+
+@pytest.mark.parametrize(("since", "shown"), [(1, 180), (0, 140)], ids=["later", "at-one-time"])
+def test_the_photo_is_the_newest_pass_s_where_heights_agree(tmp_path: Path, since: int, shown: int) -> None:
+    """A label put on since is as bright as that pass saw it."""
+    level = np.full((256, 256), 0.3, np.float32)
+    passes = [one_tile(tmp_path / "a", level, 20, 0), one_tile(tmp_path / "b", level, 5, since, 180.0)]
+    window = join_surfaces(passes, tmp_path).surface.window(0, 0, 256, 256)
+    assert np.abs(window.intensity - shown).max() < 1e-3 and (window.views == 25).all()
 
 
 def mapped(stamps_ns: list[int], free: FreeSpace, tops: TopPhoto) -> MappedPass:

@@ -165,7 +165,8 @@ def moved_window(one: PassSurface, column: int, row: int, columns: int, rows: in
 
 def _averaged(old: Layers, new: Layers, chosen: Bool, is_later: Bool) -> Layers:
     """Average where both agree; elsewhere prefer a measured height, then a later one that is higher, then
-    the one with more views: a bar laid since appears, one that a few views missed stays.
+    the one with more views: a bar laid since appears, one that a few views missed stays. Where both agree,
+    a later pass's gray level counts: a label would pale.
 
     chosen: (rows, columns) where the newer pass counts. is_later: (rows, columns) where its time is later.
     """
@@ -178,13 +179,14 @@ def _averaged(old: Layers, new: Layers, chosen: Bool, is_later: Bool) -> Layers:
     takes_new = has_new & (~has_old | (~alike & better))
     weights = [np.nan_to_num(1 / np.square(one.sigma_m)) for one in (old, new)]
     share = np.where(alike, weights[1] / np.maximum(weights[0] + weights[1], 1e-12), takes_new)
+    shares = {"z_m": share, "sigma_m": share, "intensity": np.where(alike & is_later, 1.0, share)}
     mixed = {
         name: np.where(
-            share == 0, getattr(old, name),
-            np.where(share == 1, getattr(new, name),
-                     (1 - share) * getattr(old, name) + share * getattr(new, name)),
+            part == 0, getattr(old, name),
+            np.where(part == 1, getattr(new, name),
+                     (1 - part) * getattr(old, name) + part * getattr(new, name)),
         ).astype(np.float32)
-        for name in ("z_m", "sigma_m", "intensity")
+        for name, part in shares.items()
     }  # fmt: skip
     views = np.where(alike, old.views + new.views, np.where(takes_new, new.views, old.views))
     source = np.where(takes_new, new.source, old.source)
