@@ -354,7 +354,7 @@ def test_a_top_photo_shows_each_place_as_the_newest_passes_saw_it(tmp_path: Path
         tops.tiles[0, 0][:, :, left:right] = np.array([gray * views, views])[:, None, None]
         passes.append(mapped(stamps_ns, FreeSpace(CELL_M), tops))
         surfaces.append(one_tile(tmp_path / f"{number}", level, 5, number).surface)
-    shown = join_passes(passes, surfaces, tmp_path).tops.window(0, 0, 256, 256)
+    shown = join_passes(passes, surfaces, tmp_path, 600.0).tops.window(0, 0, 256, 256)
     for at, gray in ((30, 200), (100, 150), (150, 100), (220, 90)):
         assert (shown[:, at] == gray).all()
 
@@ -366,6 +366,31 @@ def test_what_was_proven_free_is_given_up_where_it_changed() -> None:
     old.join(new, 0.01, lambda x, y: np.broadcast_to(x < 1.0, (len(y), len(x))))
     window = old.window(0, 0, 200, 10)
     assert (window[:, :98] == np.float32(0.41)).all() and (window[:, 104:] == np.float32(0.1)).all()
+
+
+@pytest.mark.parametrize(("late_s", "stays"), [(500, True), (700, False)])
+def test_what_an_old_pass_proved_free_counts_only_away_from_what_was_seen_since(
+    tmp_path: Path, late_s: int, stays: bool
+) -> None:
+    """Neither pass saw the place, which has no height that shows an age; what stands there since hides."""
+    level = np.full((256, 256), 0.3, np.float32)
+    hole = slice(100, 110), slice(100, 110)
+    passes, surfaces = list[MappedPass](), []
+    for number in range(2):
+        free = FreeSpace(CELL_M)
+        free.tiles[0, 0] = np.full((2, 256, 256), 0.35, np.float32)
+        z_m = level.copy()
+        z_m[hole] = np.nan
+        if number:
+            free.tiles[0, 0][:, *hole] = np.inf
+            z_m[:, 200:] = np.nan
+            free.tiles[0, 0][:, :, 200:] = np.inf
+        begin_ns = number * late_s * 10**9
+        passes.append(mapped([begin_ns, begin_ns + 1], free, TopPhoto(CELL_M)))
+        surfaces.append(one_tile(tmp_path / f"{number}", z_m, 5, number).surface)
+    found = join_passes(passes, surfaces, tmp_path, 600.0).free.window(0, 0, 256, 256)
+    assert (np.isfinite(found[hole]) == stays).all() and np.isfinite(found[:, :90]).all()
+    assert np.isfinite(found[:, 255]).all(), "only the old pass saw it, and its heights are as old"
 
 
 def test_what_is_proven_free_is_moved_onto_the_joined_map_with_each_pass(tmp_path: Path) -> None:
@@ -382,7 +407,7 @@ def test_what_is_proven_free_is_moved_onto_the_joined_map_with_each_pass(tmp_pat
         free.tiles[0, 0] = bound
         passes.append(mapped([10 * number, 10 * number + 1], free, TopPhoto(CELL_M)))
         surfaces.append(one_tile(tmp_path / f"{number}", level + number * off_m, 5, number).surface)
-    joined = join_passes(passes, surfaces, tmp_path)
+    joined = join_passes(passes, surfaces, tmp_path, 600.0)
     z_m = joined.surface.window(0, 0, 256, 256).z_m
     over_m = joined.free.window(0, 0, 256, 256) - (z_m - level + 0.3)
     assert np.abs(over_m[20:240, 20:120] - 0.05).max() < 0.002

@@ -81,6 +81,12 @@ class FreeSpace:
         for key in self.tiles:
             self.tiles[key] += np.float32(rise_m)
 
+    def forget(self, forgotten: Callable[[NDArray[Any], NDArray[Any]], Bool]) -> None:
+        """Discard bounds. forgotten: marks the places, by x and y (m) of a grid."""
+        cells = np.arange(TILE) * self.cell_m
+        for key in sorted(self.tiles):
+            self.tiles[key][:, forgotten(*(cells + at * TILE * self.cell_m for at in key))] = UNPROVEN
+
     def join(
         self, newer: FreeSpace, rise_m: float, forgotten: Callable[[NDArray[Any], NDArray[Any]], Bool]
     ) -> None:

@@ -102,7 +102,7 @@ def map_yard(
         with watch("join"):
             folder = scratch / "joined"
             folder.mkdir()
-            joined = join_passes(passes, surfaces, folder)
+            joined = join_passes(passes, surfaces, folder, settings.lift.max_age_s)
     done = joined.passes if joined else tuple(passes)
     surface = joined.surface if joined else surfaces[0]
     free, tops = (joined.free, joined.tops) if joined else (passes[0].built.free, passes[0].built.tops)

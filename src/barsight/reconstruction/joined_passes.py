@@ -14,7 +14,8 @@ from barsight.core.json_values import json_digest, json_value
 from barsight.core.notices import Notice
 from barsight.core.pose import Pose, nearest_rotation, skew
 from barsight.core.records.trajectory import PosedFrame, Trajectory
-from barsight.mapping.free_space import FreeSpace
+from barsight.core.stamps import seconds_to_ns
+from barsight.mapping.free_space import MARGIN_M, FreeSpace
 from barsight.mapping.passes.changes import BundleMove, HeightChange, PlaceHistory
 from barsight.mapping.passes.joined_surface import PassSurface, join_surfaces, measure_overlaps
 from barsight.mapping.passes.slides import SeenBundle, find_moves
@@ -154,15 +155,18 @@ def _hung(recording: Recording) -> str:
     return json_digest(json_value({"lever": crane.crane_to_body_m, "attitude": crane.yard_from_body_nominal}))
 
 
-def join_passes(passes: Sequence[MappedPass], surfaces: Sequence[Surface], folder: Path) -> JoinedPasses:
+def join_passes(
+    passes: Sequence[MappedPass], surfaces: Sequence[Surface], folder: Path, max_age_s: float
+) -> JoinedPasses:
     """Tie passes by their overlaps and join their maps, the oldest first; the surface is stored in
-    `folder`.
+    `folder`. max_age_s: as in `LiftSettings`.
     """
     ties = tie_passes([_prior(one.way.trajectory) for one in passes], measure_overlaps(surfaces))
     sizes = [len(group) for group in _at_once([one.probed.source for one in passes])]
     since = np.repeat(np.cumsum([0, *sizes[:-1]]), sizes).tolist()
     placed = [PassSurface(*parts) for parts in zip(surfaces, ties.corrections, since, strict=True)]
     joined = join_surfaces(placed, folder)
+    _forget_old(passes, joined.history, max_age_s)
     free, tops = passes[0].built.free, passes[0].built.tops
     free.rise(float(ties.corrections[0].unknowns[5]))
     for number, (one, correction) in enumerate(zip(passes, ties.corrections, strict=True)):
@@ -184,6 +188,23 @@ def join_passes(passes: Sequence[MappedPass], surfaces: Sequence[Surface], folde
         for one, correction in zip(passes, ties.corrections, strict=True)
     )
     return JoinedPasses(moved, tuple(placed), joined.surface, free, tops, ties, joined.history)
+
+
+def _forget_old(passes: Sequence[MappedPass], history: PlaceHistory, max_age_s: float) -> None:
+    """Discard what a pass proved free where one that began more than max_age_s later saw anything near:
+    heights show their age, proofs don't.
+    """
+    stamps = [one.probed.source.index.stamps_ns for one in passes]
+    about = history.seen_about(MARGIN_M)
+    for one, own in zip(passes, stamps, strict=True):
+        ends_ns = own[-1] + seconds_to_ns(max_age_s)
+        later = [number for number, other in enumerate(stamps) if other[0] > ends_ns]
+        if later:
+
+            def forgotten(x_m: Float64, y_m: Float64, first: int = later[0]) -> Bool:
+                return about(x_m, y_m) >= first
+
+            one.built.free.forget(forgotten)
 
 
 def _prior(trajectory: Trajectory) -> PassPrior:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -134,6 +136,13 @@ class PlaceHistory:
         """Look up the last pass that saw each cell of such a grid, counted from 1; 0 where none did."""
         x, y = np.meshgrid(x_m, y_m)
         return (self._look_up(self.seen_by, x, y) + 1).astype(np.uint8)
+
+    def seen_about(self, margin_m: float) -> Callable[[NDArray[Any], NDArray[Any]], NDArray[np.int8]]:
+        """Build a look-up, on such a grid, of the newest pass that saw anything within about margin_m of a
+        cell, from 0; -1 for none.
+        """
+        about = ndimage.maximum_filter(self.seen_by, 2 * math.ceil(margin_m / self.place_m) + 1)
+        return lambda x_m, y_m: self._look_up(about, *np.meshgrid(x_m, y_m))
 
     def is_stale(
         self, centre_m: Float64, yaw_rad: float, length_m: float, width_m: float, reach_m: float
