@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from barsight.core.errors import Failed
 from barsight.core.records.pairs import RectifiedCamera
+from barsight.motion.rig_check.drift_check import CheckSettings, DriftState, _row_lines
 from barsight.motion.rig_check.epipolar_error import RowDrift, fit_rows
 
 CAMERA = RectifiedCamera(1250.0, 640.0, 512.0, 0.5, 3.0, 1280, 1024)
@@ -50,3 +51,14 @@ def test_too_few_matches_are_said() -> None:
     assert "corners match" in few.reason
     assert isinstance(corner, Failed)
     assert "parts of the picture" in corner.reason
+
+
+@pytest.mark.parametrize("range_m", [7.5, np.nan])
+def test_a_drift_that_matters_is_told_where_no_travel_tells_the_range(range_m: float) -> None:
+    """A roll of 0.2 px on the rows turns the surface by 20 mm."""
+    found = fit_rows(matches(np.array([0.0, 3e-4, 0.0, 0.0]), np.random.default_rng(3)), CAMERA, 1)
+    assert isinstance(found, RowDrift)
+    states = {
+        line.name: line.state for line in _row_lines(found, found.sigmas, CAMERA, range_m, CheckSettings())
+    }
+    assert states["roll"] is DriftState.RECALIBRATE

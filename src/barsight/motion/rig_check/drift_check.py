@@ -17,7 +17,7 @@ from barsight.core.records.trajectory import RigDrift
 from barsight.core.settings.values import POSITIVE, expect_ranges
 from barsight.motion.batch.fusion import BatchFusion, FusionSettings
 from barsight.motion.crane.encoder_trajectory import CraneSettings
-from barsight.motion.rig_check.calibration_part import calibration_covariance
+from barsight.motion.rig_check.calibration_part import FAR_BASELINES, calibration_covariance
 from barsight.motion.rig_check.epipolar_error import RowDrift, measure_row_drift
 from barsight.motion.rig_check.rig_override import RecordingWithRig
 from barsight.motion.rig_check.self_calibration import turn_right_camera
@@ -40,7 +40,9 @@ class CheckSettings:
     """Thresholds from which a drift matters."""
 
     range_m: float | None = None
-    """Range at which the rig measures; if not given, the median depth of what it saw."""
+    """Range at which the rig measures; if not given, the median depth of what it saw. Where that isn't known,
+    15 baselines are assumed for what the rows cost.
+    """
     max_depth_error_mm: float = 3.0
     """Maximum depth error that a drift may cause; a drift that causes more, and is beyond 3 sigma, asks for a
     new calibration.
@@ -145,6 +147,8 @@ def _row_lines(
     if isinstance(rows, Failed):
         return [_unseen(name, "deg", rows.reason) for name in ("pitch", "roll", "focal ratio")]
     f, baseline = camera.focal_px, camera.baseline_m
+    if not np.isfinite(range_m):
+        range_m = FAR_BASELINES * baseline
     x, y = camera.width / 2 / f, camera.height / 2 / f
     # Errors at the picture's corner per unit: of rows in px, of columns in focal lengths.
     off_row = {"pitch": f, "roll": f * x, "focal ratio": f * y}
