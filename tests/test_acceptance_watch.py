@@ -1,5 +1,6 @@
 """The watch over the years: false alarms, a jump, approvals, and the command on a simulated survey."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -98,6 +99,7 @@ def test_fixed_features_watch_mounting_and_yard_frame() -> None:
         for k in range(13):
             off = moved * (k >= 10)
             figures = feature_figures(plan, observed(plan, lambda place, off=off: place + off, rng))
+            assert not isinstance(figures, Failed)
             drawn.append(WatchedSurvey(f"rec{k}", f"id{k}", "cal", figures))
         return drawn
 
@@ -108,6 +110,19 @@ def test_fixed_features_watch_mounting_and_yard_frame() -> None:
             charts = control_charts(surveys(np.array(moved), seed))
             alarmed = {one.name.partition(" / ")[0]: one.alarmed_at for one in charts if one.alarmed_at}
             assert list(alarmed) == [name] and 10 < alarmed[name] <= 13
+
+
+@pytest.mark.parametrize("kind", ["plates", "spheres"])
+def test_fixed_features_that_all_got_lost_are_no_quiet_chart(kind: str) -> None:
+    """The rig may see them further off than they are sought; one that is lost says nothing."""
+    plan = planned()
+    seen = observed(plan, lambda place: place, np.random.default_rng(5))
+    found = dict(getattr(seen, kind))
+    for count, name in enumerate(found):
+        assert not isinstance(feature_figures(plan, replace(seen, **{kind: dict(found)})), Failed), count
+        found[name] = Failed("not-found", f"{name}: nothing there")
+    lost = feature_figures(plan, replace(seen, **{kind: found}))
+    assert isinstance(lost, Failed) and "nothing there" in lost.reason
 
 
 def test_tags_on_columns_are_fixed_features() -> None:

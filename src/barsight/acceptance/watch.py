@@ -154,8 +154,15 @@ def picture_figures(health: tuple[PictureHealth, ...] | Failed) -> tuple[Watched
     )
 
 
-def feature_figures(plan: AcceptancePlan, seen: Observation) -> tuple[WatchedFigure, ...]:
-    """Compute the mean errors (mm) of fixed features: heights of plates and places of surveyed spheres."""
+def feature_figures(plan: AcceptancePlan, seen: Observation) -> tuple[WatchedFigure, ...] | Failed:
+    """Compute the mean errors (mm) of fixed features: heights of plates and places of surveyed spheres.
+    Failed `not-found` where none of either was found: the rig may see the yard too far off.
+    """
+    surveyed = [one for one in plan.sphere if one.place_sigma_m is not None]
+    for kind in ([seen.plates[one.name] for one in plan.plate], [seen.spheres[one.name] for one in surveyed]):
+        lost = [str(found) for found in kind if isinstance(found, Failed)]
+        if kind and len(lost) == len(kind):
+            return Failed("not-found", "; ".join(lost))
     z = [
         1e3 * (found.z_m - one.z_m)
         for one in plan.plate
@@ -163,8 +170,8 @@ def feature_figures(plan: AcceptancePlan, seen: Observation) -> tuple[WatchedFig
     ]
     places = [
         1e3 * (ball.centre_m - (one.x_m, one.y_m, one.z_m))
-        for one in plan.sphere
-        if one.place_sigma_m is not None and not isinstance(ball := seen.spheres[one.name], Failed)
+        for one in surveyed
+        if not isinstance(ball := seen.spheres[one.name], Failed)
     ]
     px_mm = 1e3 * seen.view.px_m(0.0)
     figures = []

@@ -111,7 +111,12 @@ def _look(
         with tempfile.TemporaryDirectory(prefix="barsight.") as scratch, stages(console) as advance:
             measure_into(path, Path(scratch) / "out", settings, advance=advance, report=False)
             seen = observe(Path(scratch) / "out", plan, source.rig, str(path))
-        figures += feature_figures(plan, seen)
+        fixed = feature_figures(plan, seen)
+        if isinstance(fixed, Failed):
+            raise MeasurementError(
+                f"{path}: none of the plan's plates, or spheres, was found: {fixed.reason}"
+            )
+        figures += fixed
     if listed is not None:
         placed = tag_figures(listed, place_in_yard(source, listed, SafeConsole(stderr=True)))
         if isinstance(placed, Failed):
