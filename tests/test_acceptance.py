@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 from scipy.spatial.transform import Rotation
 
-from barsight.acceptance.acceptance import Acceptance
+from barsight.acceptance import acceptance
+from barsight.acceptance.acceptance import Acceptance, accept
 from barsight.acceptance.causes import name_causes
 from barsight.acceptance.certificate import (
     CommissioningStep,
@@ -31,6 +33,8 @@ from barsight.cli.main import run
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed, InputError
 from barsight.core.records.pairs import StereoFrame
+from barsight.measure_folder import ignore_progress
+from barsight.measure_settings import MeasureSettings
 from barsight.simulation.effects.faults import SpoiledLens
 from barsight.simulation.effects.settings import FaultSettings
 from barsight.simulation.rays import cast_rays
@@ -255,6 +259,24 @@ def test_repeats_are_judged_by_their_upper_bound() -> None:
     (repeat,) = (q for q in judged if q.group == "repeat_mm")
     assert 2.0 < repeat.error < 3.2 and 0 < repeat.uncertainty.expanded < 1  # 2 s of 1 to 1.5 mm
     assert not any(q.group == "repeat_mm" for q in judge_all(plan, [observed(plan, off_by(), rng)]))
+
+
+def test_a_recording_given_twice_proves_no_repeatability(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A copy of it doesn't either."""
+    plan = planned()
+    seen = observed(plan, off_by(), np.random.default_rng(3))
+    source = SimpleNamespace(rig=None, digests=lambda: {"mav0/cam0/data.csv": "0a"})
+    for name, found in (
+        ("open_recording", source), ("in_yard", source), ("measure_into", None), ("observe", seen),
+        ("look_at_rig", (SimpleNamespace(is_bad=False), CLEAN)), ("name_causes", ()),
+    ):  # fmt: skip
+        monkeypatch.setattr(acceptance, name, lambda *_, found=found, **__: found)
+    settings = MeasureSettings()
+    assert accept(plan, [tmp_path / "a"], settings, tmp_path, ignore_progress).quantities
+    with pytest.raises(InputError, match="the same recording as"):
+        accept(plan, [tmp_path / "a", tmp_path / "copy"], settings, tmp_path, ignore_progress)
 
 
 def test_a_touch_down_is_held_against_what_was_touched() -> None:

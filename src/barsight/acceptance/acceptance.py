@@ -62,16 +62,18 @@ def accept(
     offset: of the magnet that touched down. Raises a BarsightError where a recording can't be measured at
     all.
     """
-    seen, rig, pictures, inputs = [], [], [], {}
+    seen, rig, pictures, inputs = [], [], [], dict[str, dict[str, str]]()
     for number, path in enumerate(recordings, 1):
         folder = work / f"measured_{number}"
-        measure_into(path, folder, settings, advance=advance, report=False)
         source = in_yard(open_recording(path, settings.recording), settings.yard)
+        own = dict(source.digests())
+        _expect_another(path, own, inputs)
+        measure_into(path, folder, settings, advance=advance, report=False)
         seen.append(observe(folder, plan, source.rig, str(path)))
         check, health = look_at_rig(source, settings.recording.rig)
         rig.append(check)
         pictures.append(health)
-        inputs[str(path)] = dict(source.digests())
+        inputs[str(path)] = own
     _expect_one_rig(seen)
     _expect_own_offset(offset, seen[0])
     judged = judge_all(plan, seen, offset) + tuple(_dirt(pictures, plan.limits))
@@ -87,6 +89,14 @@ def look_at_rig(
     """
     check = check_rig(source, FusionSettings(), CheckSettings(), lambda: None, rig_file)
     return check, check_pictures(_some_frames(source))
+
+
+def _expect_another(path: Path, own: dict[str, str], inputs: dict[str, dict[str, str]]) -> None:
+    """Raise InputError for a recording given twice: it would repeat itself exactly."""
+    for other, digests in inputs.items():
+        if digests == own:
+            problem = f"is the same recording as {other}"
+            raise InputError(path, problem, "record the artefacts anew, or name it once")
 
 
 def _expect_one_rig(seen: Sequence[Observation]) -> None:
