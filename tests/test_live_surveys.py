@@ -8,11 +8,13 @@ import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 import barsight as bs
+from barsight.core.settings.values import build_settings
 from barsight.live.crane import run as crane_run
 from barsight.live.crane.run import _drop_standing, _keep, replay_surveys
 from barsight.live.drift import DAY_NS, HEAD, NAMES, drift_figures, note_drift
@@ -22,7 +24,10 @@ from barsight.live.settings import LiveSettings, SurveySettings
 from barsight.live.shared.counters import Counters
 from barsight.live.supervisor import Supervisor
 from barsight.live.survey import INTERRUPTED, STOOD, SurveyWatch
+from barsight.measure_folder import write_measured
+from barsight.pipeline.lift_choice import LiftRequest
 from barsight.recording.writers.retention import PROTECTED
+from barsight.yard.events import YardEvent, kept_events, write_events
 
 SETTINGS = SurveySettings(way_m=0.5, stop_s=2.0, rest_s=30.0, max_s=100.0)
 
@@ -99,6 +104,39 @@ def test_a_signal_that_ends_surveys_ends_no_command_that_measures_one(
     monkeypatch.setattr(crane_run, "begin_replay", lambda *_: Measuring())
     replay_surveys(tmp_path, tmp_path / "out", bs.MeasureSettings(), LiveSettings(), tell=lambda _: None)
     assert callable(held[0]) and signal.getsignal(signal.SIGUSR1) == signal.SIG_DFL
+
+
+def test_what_was_lifted_while_a_survey_ran_counts_for_it(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is reported in the folder of the survey before, whose lift it was."""
+    settings = build_settings({"stereo": {"method": "sgbm"}, "map": {"cell_m": 0.05}}, bs.MeasureSettings)
+    recording = bs.open_recording(whole)
+    lifted = YardEvent(int(recording.index.stamps_ns[0]) + 1, "lift", 0.5, 0.0, 0.0, 7.0, 0.3)
+    out = tmp_path / "out"
+    before = out / "20260101T000000"
+    before.mkdir(parents=True)
+
+    class Measuring:
+        """A run whose survey is measured while a lift is reported."""
+
+        stop_because = INTERRUPTED
+
+        def __init__(self, folder: Path) -> None:
+            self.folder = folder
+
+        def measure(self, _: object, request: LiftRequest, advance: object) -> None:
+            write_events([lifted], before / "events.csv")
+            write_measured([recording], self.folder, settings, request, report=False)
+
+    monkeypatch.setattr(crane_run, "_begin", lambda _, folder, *__, **___: Measuring(folder))
+    monkeypatch.setattr(crane_run, "note_drift", lambda *_: "")
+    monkeypatch.setattr(crane_run, "open_recording", lambda *_: recording)
+    crane: Any = SimpleNamespace(
+        encoders=1, recorder=SimpleNamespace(folder=None), survey=SimpleNamespace(keep=5)
+    )
+    crane_run.measure_surveys(crane, out, settings, LiveSettings(), tell=lambda _: None)
+    assert kept_events((out / "latest").resolve()) == (lifted,)
 
 
 @pytest.mark.parametrize("ended", ["the crane stopped", STOOD])

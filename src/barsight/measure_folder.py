@@ -26,7 +26,7 @@ from barsight.report.files.result_files import RESULT_FILES, write_results, writ
 from barsight.report.files.summary import summary
 from barsight.report.page import write_report
 from barsight.result_folder import seal_map
-from barsight.yard.events import kept_events
+from barsight.yard.events import events_beside, kept_events, merged
 from barsight.yard.magnet.description import load_magnet
 
 
@@ -86,7 +86,8 @@ def write_measured(
 ) -> dict[str, Any]:
     """Measure open recordings; see `measure_into`. keep: a folder of checkpoints to continue from.
 
-    Events that were reported in `out` and that the new map may not show are kept.
+    Events that were reported in `out`, or beside it in `request.surveys`, and that the new map may not show
+    are kept.
     """
     with atomic_directory(out, replace=overwrite, owned=RESULT_FILES) as staging:
         scratch = staging / "scratch"
@@ -98,7 +99,8 @@ def write_measured(
                 mapped.surface, mapped.free, mapped.tops, staging, mapped.frame_id, mapped.history
             )
         ):
-            measured = find_lifts(mapped, replace(request, events=kept_events(out)))
+            beside = () if request.surveys is None else events_beside(request.surveys)
+            measured = find_lifts(mapped, replace(request, events=merged(kept_events(out), beside)))
         content = summary(measured)
         write_tables(measured, staging)
         write_results(measured, seal_map(content, staging), staging)

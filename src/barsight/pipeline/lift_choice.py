@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 from barsight.core.json_values import json_digest, json_value
@@ -36,13 +37,15 @@ class LiftRequest:
     magnet: magnet that they are chosen for; without one they are judged for the package's example, and all
     are forbidden (`no-magnet`). judged_at: time for which they are judged: now, or the recording's last
     frame, to look back. notices: warnings of the caller. events: reported before the yard was measured again;
-    those that the new map may not show count.
+    those that the new map may not show count. surveys: folder of the same yard's results, in which they are
+    reported too.
     """
 
     magnet: Magnet | None = None
     judged_at: Literal["now", "end"] = "now"
     notices: tuple[Notice, ...] = ()
     events: tuple[YardEvent, ...] = ()
+    surveys: Path | None = None
 
 
 def find_lifts(mapped: MappedYard, request: LiftRequest) -> Measurement:

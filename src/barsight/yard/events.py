@@ -68,6 +68,12 @@ def kept_events(folder: Path) -> tuple[YardEvent, ...]:
     return read_events(path) if path.is_file() else ()
 
 
+def events_beside(surveys: Path) -> tuple[YardEvent, ...]:
+    """Read events.csv of every folder in a folder of surveys."""
+    folders = (one for one in sorted(surveys.iterdir()) if one.is_dir() and not one.is_symlink())
+    return merged((), (event for one in folders for event in kept_events(one)))
+
+
 def _event(path: Path, number: int, row: list[str], remedy: str) -> YardEvent:
     try:
         stamp, kind, *rest = row

@@ -66,12 +66,13 @@ def measure_surveys(
 ) -> dict[str, Any]:  # fmt: skip
     """Measure survey after survey, each into its own folder in `out`, until Ctrl-C or SIGTERM.
 
-    A failed survey is reported, and the next one begins once all sensors answer. Returns an empty result, as
-    each folder has its own. Raises a BarsightError if the sensors don't answer at the start.
+    Events in any folder count for a survey that had begun. A failed survey is reported, and the next one
+    begins once all sensors answer. Returns an empty result, as each folder has its own. Raises a
+    BarsightError if the sensors don't answer at the start.
     """
     if crane.encoders is None:
         raise ConfigError("crane.toml has no [encoders], by which surveys begin and end")
-    request = LiftRequest(None if magnet is None else load_magnet(magnet))
+    request = LiftRequest(None if magnet is None else load_magnet(magnet), surveys=out)
     proved, ended, is_first = False, "", True
     while ended != INTERRUPTED:
         folder = out / datetime.now(UTC).strftime(STAMP)
