@@ -30,6 +30,8 @@ source, out = pathlib.Path(words[0]), pathlib.Path(words[words.index("-o") + 1])
 kind = (source / "mav0" / "kind").read_text()
 if kind == "poison":
     sys.exit("barsight: this recording is damaged")
+if kind == "named":
+    sys.exit(f"barsight: {source}: is damaged; record it again ({source.parent}/imu.yaml is fine)")
 if kind == "large":
     held = bytearray(600 << 20)
     held[::4096] = b"1" * len(held[::4096])

@@ -159,6 +159,15 @@ def test_a_recording_that_is_gone_is_parked_by_its_reason(tmp_path: Path) -> Non
     assert reason == f"refused: {tmp_path}/a/r: is gone; plan the archive again"
 
 
+def test_a_parked_recording_is_named_by_its_place_in_the_archive(tmp_path: Path) -> None:
+    archive = open_objects(str(make_archive(tmp_path / "a", {"crane/r": "named"})))
+    results = open_objects(str(tmp_path / "r"), create=True)
+    tasks = plan_tasks(archive, results, VERSION, None, no_progress)
+    run_task(tasks[0], settings(tmp_path, results.url))
+    ((_, reason),) = parked_reasons(results, tasks)
+    assert f": {tmp_path}/a/crane/r: is damaged; record it again ({tmp_path}/a/crane/imu.yaml" in reason
+
+
 def test_storage_that_does_not_answer_parks_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     results = open_objects(str(tmp_path / "r"), create=True)
     archive = open_objects(str(make_archive(tmp_path / "a", {"r": "good"})))

@@ -207,7 +207,7 @@ def download(archive: Objects, name: str, passes: tuple[str, ...], folder: Path)
     expect_own(archive, name, files)
     if not files:
         raise InputError(f"{archive.url}/{name}", "is gone", "plan the archive again")
-    root = folder / (PurePosixPath(name).name or "recording")
+    root = copied_to(name, folder)
     for file in files:
         inner = PurePosixPath("" if file.path == name else recording.relative(file))
         is_beside = inner.parts[:1] == ("..",)
@@ -219,3 +219,8 @@ def download(archive: Objects, name: str, passes: tuple[str, ...], folder: Path)
             for part in archive.chunks(file.path):
                 stream.write(part)
     yield from (root / one for one in passes)
+
+
+def copied_to(name: str, folder: Path) -> Path:
+    """Return where `download` puts the recording of that name."""
+    return folder / (PurePosixPath(name).name or "recording")

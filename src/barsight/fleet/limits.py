@@ -69,7 +69,7 @@ def run_limited(
     line = (lines or ["no word"])[-1]
     code = "output" if process.returncode == OutputError.exit_code else "refused"
     ended = f"exit code {process.returncode}" if process.returncode > 0 else f"signal {-process.returncode}"
-    return Failed(code, f"{ended}: {line[:300]}")
+    return Failed(code, f"{ended}: {line}")
 
 
 def _die_with_parent() -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 from barsight.core.errors import BarsightError, Failed, InputError, OutputError
 from barsight.core.files import translated_os_errors
 from barsight.core.settings.values import NOT_NEGATIVE, POSITIVE, expect_ranges
-from barsight.fleet.archive import download
+from barsight.fleet.archive import copied_to, download
 from barsight.fleet.ledger import HeldRecording, claim, discard, fail, held, publish
 from barsight.fleet.limits import LimitedRun, run_limited, thread_variables
 from barsight.fleet.objects import Objects, UnreachableError, open_objects
@@ -23,6 +23,8 @@ from barsight.fleet.scratch import compile_once, scratch_folder
 from barsight.fleet.versions import FleetTask, arguments, expect_software
 
 COMMAND = (sys.executable, "-m", "barsight", "measure")
+_REASON = 400
+"""Number of characters kept of a measurement's last line."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,7 @@ def _try(task: FleetTask, mine: HeldRecording, settings: TaskSettings, results: 
         if isinstance(ran, Failed):
             if ran.code == "output":
                 raise OutputError(ran.reason)
-            return ran
+            return Failed(ran.code, _in_archive(ran.reason, task, folder)[:_REASON])
         files = _upload(folder / "out", f"files/{task.key}/{mine.token}", results)
         content = _content(task, ran, fetched_s, time.monotonic() - started, files)
         is_ours = publish(results, mine, content)
@@ -119,6 +121,15 @@ def _try(task: FleetTask, mine: HeldRecording, settings: TaskSettings, results: 
             except BarsightError as error:  # the driver writes what is missing
                 sys.stderr.write(f"{error}\n")
     return None
+
+
+def _in_archive(reason: str, task: FleetTask, folder: Path) -> str:
+    """Replace the places of the copies in a reason by those in the archive: the copies are gone by then."""
+    place = f"{task.archive}/{task.name}".rstrip("/")
+    above = place.rpartition("/")[0] if task.name else place
+    for copy, original in ((copied_to(task.name, folder / "in"), place), (folder / "in", above)):
+        reason = reason.replace(str(copy), original)
+    return reason
 
 
 def _upload(out: Path, target: str, results: Objects) -> dict[str, dict[str, object]]:

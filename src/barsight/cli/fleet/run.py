@@ -70,7 +70,8 @@ def run(arguments: Sequence[str]) -> None:
         SafeConsole().print(
             f"version {chosen.name}: {now.published} published and {now.parked} parked now; of "
             f"{len(planned)} recordings {counts.published} are published, {counts.parked} parked, "
-            f"{counts.running + counts.left} left",
+            f"{counts.running + counts.left} left"
+            + ("; barsight fleet status names the reasons" if counts.parked else ""),
             highlight=False, soft_wrap=True,
         )  # fmt: skip
 
