@@ -290,7 +290,7 @@ def test_what_a_command_could_not_write_is_no_fault_of_its_recording(
     assert isinstance(ended, Failed) and f"{ended.code}: {ended.reason}" == wanted
 
 
-def test_versions_are_named_by_their_beginning(tmp_path: Path) -> None:
+def test_versions_are_named_by_their_beginning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def refusal(name: str | None) -> str:
         with store.reading() as connection, pytest.raises(ConfigError) as told:
             find_version(connection, name)
@@ -307,6 +307,9 @@ def test_versions_are_named_by_their_beginning(tmp_path: Path) -> None:
         assert refusal("x") == "x: names no version that is planned; known are ab, ac"
         words = ["fleet", "compare", "ab", "ac", "--results", results.url, "-o", str(tmp_path / "c")]
         assert run([*words, "--store", f"sqlite:///{tmp_path}/s.db"]) == 5
+        words[3] = "ab"
+        assert run([*words, "--store", f"sqlite:///{tmp_path}/s.db"]) == 2
+        assert "ab and ab name one version, ab; name two" in capsys.readouterr().err
         assert not (tmp_path / "c").exists()
 
 

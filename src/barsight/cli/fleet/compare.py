@@ -13,7 +13,7 @@ import tyro
 from barsight.cli.arguments import call
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
-from barsight.core.errors import MeasurementError
+from barsight.core.errors import ConfigError, MeasurementError
 from barsight.core.extras import extra
 from barsight.core.files import atomic_directory
 from barsight.core.json_values import json_value
@@ -51,6 +51,8 @@ def run(arguments: Sequence[str]) -> None:
         target = open_objects(results)
         with open_store(store) as opened, opened.reading() as connection:
             versions = [find_version(connection, name) for name in (before, after)]
+            if versions[0].name == versions[1].name:
+                raise ConfigError(f"{before} and {after} name one version, {versions[0].name}; name two")
             planned = [read_tasks(connection, one) for one in versions]
         with stages(SafeConsole(stderr=True)) as advance:
             compared, untold = compare_tasks(target, planned[0], planned[1], partial(advance, "compare"))
