@@ -87,6 +87,13 @@ def test_a_certificate_of_another_frame_budgets_nothing(tmp_path: Path) -> None:
         measured_load(folder, None, tmp_path / "certificate.json", 5.0)
 
 
+def test_a_bundle_that_is_not_there_is_a_wrong_argument(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["budget", str(write_folder(tmp_path / "out")), "--bundle", "99"]) == 2
+    assert "there is no bundle 99; bundles.json has " in capsys.readouterr().err
+
+
 def test_a_watch_of_another_yard_frame_wants_an_approval(tmp_path: Path) -> None:
     path, first = tmp_path / "watch.json", WatchedSurvey("a", "1", "cal", (), "f00d")
     record = with_survey(WatchRecord(), first, path)

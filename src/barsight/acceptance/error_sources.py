@@ -17,7 +17,7 @@ from barsight.acceptance.observation import ViewGeometry, view_geometry
 from barsight.acceptance.uncertainty import COVERAGE
 from barsight.acceptance.yard_area import measured_rig
 from barsight.core.arrays import Float64
-from barsight.core.errors import InputError, MeasurementError
+from barsight.core.errors import ConfigError, InputError, MeasurementError
 from barsight.core.pose import Pose, skew
 from barsight.core.reading.bounded_reading import in_range
 from barsight.registration.yard_file import YardFrame, read_yard_file
@@ -70,7 +70,7 @@ def measured_load(
     calibration. offset: of the magnet, subtracted from the crane's target; without it, the certificate's
     touch-down errors count in full.
 
-    Raises InputError, or MeasurementError where the folder has no such bundle.
+    Raises InputError, ConfigError where the folder has no such bundle, MeasurementError where it has none.
     """
     summary, _ = open_folder(folder, lifts=False)
     if summary["reference"] != "yard":
@@ -148,11 +148,13 @@ def _rig_source(summary: dict[str, Any], path: Path, focal_px: float, assumed: l
 
 def _chosen(folder: Path, number: int | None) -> Bundle:
     bundles = read_bundles(folder / "bundles.json")
-    if number is not None:
-        bundles = tuple(one for one in bundles if one.id == number)
     if not bundles:
-        what = "no bundle" if number is None else f"no bundle {number}"
-        raise MeasurementError(f"{folder}: {what} was found there; nothing can be budgeted")
+        raise MeasurementError(f"{folder}: no bundle was found there; nothing can be budgeted")
+    if number is not None:
+        listed = ", ".join(str(one.id) for one in bundles)
+        bundles = tuple(one for one in bundles if one.id == number)
+        if not bundles:
+            raise ConfigError(f"{folder}: there is no bundle {number}; bundles.json has {listed}")
     return max(bundles, key=lambda one: (not any(one.ends_open), one.confidence))
 
 
