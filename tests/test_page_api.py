@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import os
@@ -11,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import httpx
@@ -22,7 +24,7 @@ from barsight.cli.main import run
 from barsight.core.errors import ConfigError, InputError
 from barsight.core.stamps import NS_PER_S
 from barsight.page.access import Access, AccessError, Throttle
-from barsight.page.api.serve import ServeOptions, serving
+from barsight.page.api.serve import ServeOptions, serve, serving
 from barsight.page.conditions import find_conditions
 from barsight.page.documents import alarm_records, lift_records, unseen_lengths
 from barsight.page.layers import find_layers, newest_at, paint_layer
@@ -606,6 +608,19 @@ def test_it_does_not_stand_open(
     assert run(["serve", "--store", f"sqlite:///{made / 'yard.db'}", *arguments]) in (2, 3, 4)
     said = capsys.readouterr().err
     assert says in said and said.count("\n") == 1
+
+
+def test_a_live_folder_that_is_not_there_is_told(
+    url: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="is a file; name the folder that barsight live writes"):
+        ServeOptions(live=tmp_path / "file")
+    ended = SimpleNamespace(Event=lambda: SimpleNamespace(wait=lambda: None))
+    monkeypatch.setattr("barsight.page.api.serve.serving", lambda *_: contextlib.nullcontext("http://here"))
+    monkeypatch.setattr("barsight.page.api.serve.threading", ended)
+    serve(url, ServeOptions(live=tmp_path / "later"))
+    assert "later: not there yet" in capsys.readouterr().err
 
 
 def test_the_usual_port_may_be_left_out() -> None:

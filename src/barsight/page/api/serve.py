@@ -7,6 +7,7 @@ import errno
 import ipaddress
 import logging
 import socket
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -52,6 +53,8 @@ class ServeOptions:
         for path in (self.certificate, self.key):
             if path is not None and not path.is_file():
                 raise InputError(path, "no such file", "give a PEM file")
+        if self.live is not None and self.live.exists() and not self.live.is_dir():
+            raise InputError(self.live, "is a file", "name the folder that barsight live writes")
         if not self.is_loopback and self.public_url is None:
             raise ConfigError(
                 f"--host {self.host} is reached from other computers: say with --public-url "
@@ -84,6 +87,8 @@ def serve(url: str, options: ServeOptions) -> None:
     """Serve a store's page until Ctrl-C and print its address. Raises ConfigError if it were unprotected."""
     with serving(url, options) as address:
         print(f"{address} (Ctrl-C ends it)", flush=True)
+        if options.live is not None and not options.live.exists():
+            print(f"{options.live}: not there yet; the page shows the live run once it is", file=sys.stderr)
         with contextlib.suppress(KeyboardInterrupt):
             threading.Event().wait()
 
