@@ -194,3 +194,11 @@ def test_agreement_is_of_vision_alone_and_a_profile_that_is_off_stays_out(tmp_pa
     assert [HeightSource.LASER in one.source for one in both.contours] == [True, False]
     none = cut(before, (off,), tmp_path / "d", SETTINGS)
     assert none.surface is before and none.sensors == ()
+
+
+def test_a_contour_outside_the_map_is_told(tmp_path: Path) -> None:
+    before = surface(np.tile(stack(X_M), (ROWS, 1)), tmp_path / "a")
+    made = cut(before, (), tmp_path / "b", MapSettings(profile_y_m=(0.0, 100.0)))
+    (notice,) = made.notices()
+    assert notice.code == "profile-outside"
+    assert notice.message.startswith("contour at y 100 m: empty, the map reaches from ")

@@ -18,6 +18,7 @@ WARNINGS = {
     "one-view": "The map was made by a single frame, so no height is confirmed; no lift is offered.",
     "passes-contradict": "Two passes disagree by more than their sigmas allow; no lift is offered.",
     "passes-untied": "A pass shares no surface with another, so only the encoders place it.",
+    "profile-outside": "A contour's y (map.profile_y_m) lies outside the map, so the contour is empty.",
     "stock-contradicts": "At least half of the stock list contradicts the map; no lift is offered.",
     "stock-list": "Stock list and map disagree, or can't be compared; bundles that disagree aren't offered.",
     "trajectory": "Sensors contradict each other in places; the message says which.",

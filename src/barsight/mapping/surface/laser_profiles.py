@@ -63,6 +63,12 @@ class Profiles:
         if self.askew:
             reason = f"profiles {', '.join(map(str, self.askew))} don't run along X: no agreement"
             yield Notice("laser-askew", reason)
+        first, last = (row * self.surface.cell_m for row in self.surface.rows)
+        beside = {profile.profile for profile in self.laser}
+        for y in (float(one.y_m[0]) for one in self.contours if one.y_m.size and one.profile not in beside):
+            if not first <= y <= last:
+                extent = f"the map reaches from {first:.2f} to {last:.2f} m"
+                yield Notice("profile-outside", f"contour at y {y:g} m: empty, {extent}")
         for check in self.checks or ():
             if not check.is_believed:
                 yield Notice("laser-off", f"profile {check.profile} is not fused: {check.reason}")
