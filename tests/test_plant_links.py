@@ -12,12 +12,13 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
+from unittest.mock import patch
 
 import pytest
 
@@ -27,10 +28,10 @@ from barsight.cli.main import run
 from barsight.core.errors import ConfigError, Failed, InputError, OutputError
 from barsight.plant import feed as feed_module
 from barsight.plant.feed import StateFeed
-from barsight.plant.link_settings import OpcUaSettings, WebhookSettings
+from barsight.plant.link_settings import MqttSettings, OpcUaSettings, WebhookSettings
 from barsight.plant.links import opcua_link
 from barsight.plant.links.changes import changes_between
-from barsight.plant.links.running import serve_plant
+from barsight.plant.links.running import _serve_mqtt, _serve_webhooks, serve_plant
 from barsight.plant.links.telegram_process import serve_telegram
 from barsight.plant.live_folder import with_live_run
 from barsight.plant.settings import PlantSettings, StoreSource, TelegramSettings, read_plant
@@ -546,3 +547,23 @@ def test_files_of_secrets_that_cannot_be_are_told_at_the_start(tmp_path: Path) -
     (tmp_path / "users.json").write_text("[" * 100_000)
     with pytest.raises(InputError, match="deep"):
         read_users(tmp_path / "users.json")
+
+
+def test_a_broker_that_is_away_is_told_and_a_hook_takes_nothing_before_a_post() -> None:
+    said: list[str] = []
+    url = f"http://127.0.0.1:{free_port()}/hook"
+    states = StateFeed.__new__(StateFeed)
+
+    async def serve() -> None:
+        links = (
+            _serve_mqtt(MqttSettings(port=free_port()), states, said.append),
+            _serve_webhooks(WebhookSettings(urls=(url,)), states, said.append),
+        )
+        with suppress(TimeoutError):
+            await asyncio.wait_for(asyncio.gather(*links), 3)
+
+    with patch.object(StateFeed, "newest", lambda *_: QUIET):
+        asyncio.run(serve())
+    assert said.count(f"webhook {url}: each change is posted") == 1
+    assert any(line.startswith("MQTT to 127.0.0.1:") and "refused" in line for line in said)
+    assert not any("takes posts" in line for line in said)

@@ -9,7 +9,6 @@ carries their number (`lost`).
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
 import ssl
 import time
@@ -55,12 +54,18 @@ class MqttPublisher:
         self._states_sent = 0
         self._events_sent = 0
         self._connections = 0
+        self._problem: str | None = None
         self._changed = asyncio.Event()
 
     @property
     def counts(self) -> MqttCounts:
         """Return the counts of what was sent and lost."""
         return MqttCounts(self._states_sent, self._events_sent, self._lost, self._connections)
+
+    @property
+    def problem(self) -> str | None:
+        """Return why the broker isn't connected; None before the first try ends, and while it is."""
+        return self._problem
 
     @property
     def waiting(self) -> int:
@@ -87,9 +92,10 @@ class MqttPublisher:
         latest: str | None = None
         while True:
             began = time.monotonic()
-            with contextlib.suppress(aiomqtt.MqttError, OSError):
+            try:
                 async with self._client() as client:
                     self._connections += 1
+                    self._problem = None
                     await client.publish(self._topic("online"), "true", qos=1, retain=True)
                     latest = self._state = self._state or latest
                     self._changed.set()
@@ -101,6 +107,8 @@ class MqttPublisher:
                             await client.publish(
                                 self._topic("online"), "false", qos=1, retain=True, timeout=1
                             )
+            except (aiomqtt.MqttError, OSError) as error:
+                self._problem = str(error).strip() or type(error).__name__
             if _is_cancelled():  # a lost broker's error on the way out has replaced the cancellation
                 raise asyncio.CancelledError
             wait_s = 0.1 if time.monotonic() - began > self._settings.max_retry_s else wait_s

@@ -77,15 +77,16 @@ async def _followed(feed: StateFeed) -> AsyncIterator[tuple[PlantState, list[dic
 
 async def _serve_webhooks(settings: WebhookSettings, feed: StateFeed, say: Say) -> None:
     hooks = [Webhook(url, settings) for url in settings.urls]
-    reported = {hook.url: "" for hook in hooks}
+    reported: dict[str, str | None] = {hook.url: None for hook in hooks}
+    for hook in hooks:
+        say(f"webhook {hook.url}: each change is posted")
     try:
         async for _, changes in _followed(feed):
             for hook in hooks:
                 for change in changes:
                     hook.tell(change)
-                now = hook.problem or "takes posts"
-                if now != reported[hook.url]:
-                    say(f"webhook {hook.url}: {now}")
+                if (now := hook.problem) != reported[hook.url]:
+                    say(f"webhook {hook.url}: {now or 'takes posts again'}")
                 reported[hook.url] = now
     finally:
         for hook in hooks:
@@ -97,12 +98,16 @@ async def _serve_mqtt(settings: MqttSettings, feed: StateFeed, say: Say) -> None
 
     publisher = MqttPublisher(settings)
     running = asyncio.create_task(publisher.run())
-    say(f"MQTT to {settings.host}:{settings.port}, topics {settings.prefix}/...")
+    at, reported = f"{settings.host}:{settings.port}", None
+    say(f"MQTT to {at}, topics {settings.prefix}/...")
     try:
         async for state, changes in _followed(feed):
             publisher.show(state)
             for change in changes:
                 publisher.tell(change)
+            if (now := publisher.problem) != reported:
+                say(f"MQTT to {at}: {now or 'connected'}")
+            reported = now
             if running.done():
                 running.result()
     finally:
