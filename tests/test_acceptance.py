@@ -232,6 +232,11 @@ def test_an_artefact_that_was_moved_is_named_and_dirt_comes_first() -> None:
     moved = replace(seen.spheres["monument 3"], centre_m=seen.spheres["monument 3"].centre_m + 0.03)  # type: ignore[union-attr, type-var]
     seen = replace(seen, spheres={**seen.spheres, "monument 3": moved})
     assert name_causes(plan, [seen], [], [CLEAN])[0].name == "monument 3 stands elsewhere"
+    high = np.array([0, 0, 0.004])  # the whole rig: the artefact is off by what the others leave of it
+    lifted = {k: replace(one, centre_m=one.centre_m + high) for k, one in seen.spheres.items()}  # type: ignore[union-attr, type-var]
+    raised = {k: replace(one, z_m=one.z_m + 0.004) for k, one in seen.plates.items()}  # type: ignore[union-attr, type-var]
+    (cause,) = name_causes(plan, [replace(seen, spheres=lifted, plates=raised)], [], [CLEAN])
+    assert cause.name == "monument 3 stands elsewhere" and cause.value == pytest.approx(30, abs=1.5)
     dirty = (CLEAN[0], replace(CLEAN[1], dirt_pct=3.0))
     assert name_causes(plan, [seen], [], [dirty])[0].name == "dirty lens of cam1"
 

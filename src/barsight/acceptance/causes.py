@@ -139,10 +139,10 @@ def _best_cause(rows: Sequence[_Row]) -> Cause | None:
             best, rarest = Cause(one.name, *estimate, one.unit, healthy - chi2), rare
     for name in names:
         others = np.array([row.artefact != name for row in rows])
-        chi2, _, _ = _solved(design[others], error[others], 1 / ordinary**2)
+        chi2, told, _ = _solved(design[others], error[others], 1 / ordinary**2)
         rare = float(chi_square.logsf(healthy - chi2, int((~others).sum())))
         if rare < rarest:
-            off = [1e3 * row.error for row in rows if row.artefact == name]
+            off = [1e3 * (row.error - row.answer @ told) for row in rows if row.artefact == name]
             sigma_mm = max(1e3 * row.sigma for row in rows if row.artefact == name)
             estimate = float(max(off, key=abs)), sigma_mm
             best, rarest = Cause(f"{name} stands elsewhere", *estimate, "mm", healthy - chi2), rare
