@@ -85,3 +85,23 @@ def test_what_is_not_configured_or_served_is_told_in_one_line(
     config = write_config(tmp_path, telegram={"port": free_port()})
     assert run(["plant", "check", "--config", str(config)]) == 5
     assert "telegram: does not hold" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("table", "settings", "wanted"),
+    [
+        ("opcua", {"nodesets": "nowhere"}, "NodeSet2.xml: no such file; run: npm install"),
+        (
+            "webhooks",
+            {"urls": ["http://127.0.0.1:1/"], "secret_file": "none"},
+            "give the file with the secret",
+        ),
+    ],
+)
+def test_a_file_that_a_link_needs_is_told_in_one_line_before_it_serves(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], table: str, settings: dict[str, object], wanted: str
+) -> None:
+    told = settings | ({"port": free_port()} if table == "opcua" else {})
+    assert run(["plant", "run", "--config", str(write_config(tmp_path, **{table: told}))]) in (2, 3)
+    (line,) = capfd.readouterr().err.splitlines()
+    assert wanted in line

@@ -26,7 +26,9 @@ from barsight.store.states import MISMATCHES
 async def serve_opcua(
     store: Store, settings: OpcUaSettings, feed: StateFeed, steps: LiftSteps, say: Callable[[str], None]
 ) -> None:
-    """Serve until cancelled. Raises OutputError if the server's process ends."""
+    """Serve until cancelled. Raises ConfigError for a wrong folder of NodeSets, OutputError if the server's
+    process ends.
+    """
     from barsight.plant.opcua.process import OpcUaProcess  # needs an extra; the other links don't
     from barsight.plant.opcua.recipes import Recipes
     from barsight.plant.opcua.surveys import AlarmLine, Survey, Told
@@ -53,6 +55,7 @@ async def serve_opcua(
             survey = Survey(state.map_id, folders[state.map_id])
         return Told(state, alarms, survey)
 
+    _ = settings.nodeset  # told here by one line, and not as the process dies
     presets = typing.get_args(typing.get_type_hints(MeasureSettings)["preset"])
     state = feed.newest(0)
     captured = datetime.datetime.fromtimestamp(state.stamp_ns / 1e9, datetime.UTC)

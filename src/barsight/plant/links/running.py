@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Any
 
 from barsight.core.errors import OutputError
+from barsight.core.reading.bounded_reading import read_text
 from barsight.plant.feed import READ_EVERY_S, StateFeed
 from barsight.plant.link_settings import MqttSettings, WebhookSettings
 from barsight.plant.links.changes import changes_between
@@ -76,6 +77,8 @@ async def _followed(feed: StateFeed) -> AsyncIterator[tuple[PlantState, list[dic
 
 
 async def _serve_webhooks(settings: WebhookSettings, feed: StateFeed, say: Say) -> None:
+    if settings.secret_file is not None:
+        read_text(settings.secret_file, remedy="give the file with the secret")
     hooks = [Webhook(url, settings) for url in settings.urls]
     reported: dict[str, str | None] = {hook.url: None for hook in hooks}
     for hook in hooks:
