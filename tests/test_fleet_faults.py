@@ -309,7 +309,7 @@ def test_versions_are_named_by_their_beginning(tmp_path: Path, capsys: pytest.Ca
         assert run([*words, "--store", f"sqlite:///{tmp_path}/s.db"]) == 5
         words[3] = "ab"
         assert run([*words, "--store", f"sqlite:///{tmp_path}/s.db"]) == 2
-        assert "ab and ab name one version, ab; name two" in capsys.readouterr().err
+        assert "BEFORE and AFTER name one version, ab; name two" in capsys.readouterr().err
         assert not (tmp_path / "c").exists()
 
 

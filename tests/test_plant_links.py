@@ -28,10 +28,11 @@ from barsight.cli.main import run
 from barsight.core.errors import ConfigError, Failed, InputError, OutputError
 from barsight.plant import feed as feed_module
 from barsight.plant.feed import StateFeed
-from barsight.plant.link_settings import MqttSettings, OpcUaSettings, WebhookSettings
+from barsight.plant.link_settings import MqttSettings, OpcUaSettings, S7Settings, WebhookSettings
 from barsight.plant.links import opcua_link
 from barsight.plant.links.changes import changes_between
 from barsight.plant.links.running import _serve_mqtt, _serve_webhooks, serve_plant
+from barsight.plant.links.s7_link import serve_s7
 from barsight.plant.links.telegram_process import serve_telegram
 from barsight.plant.live_folder import with_live_run
 from barsight.plant.settings import PlantSettings, StoreSource, TelegramSettings, read_plant
@@ -448,7 +449,8 @@ def test_a_store_that_goes_away_as_a_survey_came_ends_no_link(
     from barsight.plant.opcua import process
 
     shown: list[Any] = []
-    shower = SimpleNamespace(is_alive=True, show=shown.append, stop=lambda: None)
+    said: list[str] = []
+    shower = SimpleNamespace(is_alive=True, is_serving=False, show=shown.append, stop=lambda: None)
     monkeypatch.setattr(process, "OpcUaProcess", lambda *_: shower)
 
     class Store:
@@ -465,9 +467,13 @@ def test_a_store_that_goes_away_as_a_survey_came_ends_no_link(
     async def serve() -> None:
         store, steps = cast(Any, Store()), cast(Any, None)
         serving = asyncio.create_task(
-            serve_opcua(store, OpcUaSettings(folder=tmp_path), feed, steps, lambda _: None)
+            serve_opcua(store, OpcUaSettings(folder=tmp_path), feed, steps, said.append)
         )
         while len(shown) < 3 and not serving.done():
+            await asyncio.sleep(0.05)
+        assert not said  # its address is told once it listens
+        shower.is_serving = True
+        while not said and not serving.done():
             await asyncio.sleep(0.05)
         serving.cancel()
         with pytest.raises(asyncio.CancelledError):
@@ -547,6 +553,25 @@ def test_files_of_secrets_that_cannot_be_are_told_at_the_start(tmp_path: Path) -
     (tmp_path / "users.json").write_text("[" * 100_000)
     with pytest.raises(InputError, match="deep"):
         read_users(tmp_path / "users.json")
+
+
+def test_a_plc_that_was_never_reached_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    s7 = pytest.importorskip("barsight.plant.s7")
+    said: list[str] = []
+
+    def exchange(_: Any, __: int, ___: Any, take: Any, stop: Any) -> None:
+        take(Failed("unreachable", "connection refused"))
+        take(Failed("unreachable", "connection refused"))
+        stop.wait()
+
+    async def serve() -> None:
+        feed: Any = SimpleNamespace(newest=lambda _: QUIET)
+        with suppress(TimeoutError):
+            await asyncio.wait_for(serve_s7(S7Settings(), feed, cast(Any, None), said.append), 0.5)
+
+    monkeypatch.setattr(s7, "run_s7", exchange)
+    asyncio.run(serve())
+    assert said == ["S7 with 127.0.0.1:102: connection refused"]
 
 
 def test_a_broker_that_is_away_is_told_and_a_hook_takes_nothing_before_a_post() -> None:

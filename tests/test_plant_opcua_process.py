@@ -59,6 +59,7 @@ def test_a_state_that_nobody_renews_goes_bad_at_once(tmp_path: Path) -> None:
 
         try:
             await until("Good")
+            assert process.is_serving
             took = await until("BadNoCommunication")
         finally:
             await client.disconnect()

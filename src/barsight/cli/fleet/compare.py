@@ -17,6 +17,7 @@ from barsight.core.errors import ConfigError, MeasurementError
 from barsight.core.extras import extra
 from barsight.core.files import atomic_directory
 from barsight.core.json_values import json_value
+from barsight.fleet.versions import Version
 from barsight.store.opening import DEFAULT_URL, open_store
 
 
@@ -50,9 +51,7 @@ def run(arguments: Sequence[str]) -> None:
             from barsight.fleet.records import find_version, read_tasks
         target = open_objects(results)
         with open_store(store) as opened, opened.reading() as connection:
-            versions = [find_version(connection, name) for name in (before, after)]
-            if versions[0].name == versions[1].name:
-                raise ConfigError(f"{before} and {after} name one version, {versions[0].name}; name two")
+            versions = _expect_two([find_version(connection, name) for name in (before, after)])
             planned = [read_tasks(connection, one) for one in versions]
         with stages(SafeConsole(stderr=True)) as advance:
             compared, untold = compare_tasks(target, planned[0], planned[1], partial(advance, "compare"))
@@ -82,3 +81,10 @@ def run(arguments: Sequence[str]) -> None:
         console.print(f"page: {out / 'comparison.html'}", highlight=False, soft_wrap=True, markup=False)
 
     call(command, "fleet compare", arguments)
+
+
+def _expect_two(versions: list[Version]) -> list[Version]:
+    """Raise ConfigError for one version against itself: the comparison would say that nothing changed."""
+    if versions[0].name == versions[1].name:
+        raise ConfigError(f"BEFORE and AFTER name one version, {versions[0].name}; name two")
+    return versions

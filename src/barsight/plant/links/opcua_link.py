@@ -61,12 +61,15 @@ async def serve_opcua(
     captured = datetime.datetime.fromtimestamp(state.stamp_ns / 1e9, datetime.UTC)
     recipes = Recipes(presets, state.calibration_id or "", captured)
     process = await asyncio.to_thread(OpcUaProcess, settings, PlantState, recipes, handshake)
-    say(f"OPC UA at {settings.url}")
+    is_said = False
     try:
         for counter in itertools.count(1):
             if not process.is_alive:
                 raise OutputError("OPC UA: its process or what answers it ended; the lines above say why")
             process.show(told(feed.newest(counter)))
+            if process.is_serving and not is_said:
+                say(f"OPC UA at {settings.url}")
+                is_said = True
             await asyncio.sleep(READ_EVERY_S)
     finally:
         await asyncio.to_thread(process.stop)

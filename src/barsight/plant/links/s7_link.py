@@ -25,7 +25,8 @@ async def serve_s7(
 
     at = f"{settings.host}:{settings.port}"
     partner = PlcPartner(plc_name(f"{at} by S7"), steps, settings.silent_s)
-    counter, wrong, stop = 0, "not reached yet", threading.Event()
+    counter, stop = 0, threading.Event()
+    wrong: str | None = None
 
     def outputs() -> bytes:
         nonlocal counter
@@ -36,7 +37,7 @@ async def serve_s7(
         nonlocal wrong
         found = exchanged if isinstance(exchanged, Failed) else unpack("in", exchanged.inputs)
         now = found.reason if isinstance(found, Failed) else ""
-        if bool(now) != bool(wrong):
+        if wrong is None or bool(now) != bool(wrong):
             say(f"S7 with {at}: {now or 'exchanging'}")
         wrong = now
         if isinstance(found, Failed):

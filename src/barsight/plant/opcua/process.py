@@ -41,6 +41,7 @@ class OpcUaProcess:
         self._handshake = handshake
         self._max_age_s = max_age_s
         self._told: tuple[float, Told] | None = None
+        self._is_serving = False
         self._stop = threading.Event()
         self._process.start()
         far_end.close()
@@ -51,6 +52,11 @@ class OpcUaProcess:
     def is_alive(self) -> bool:
         """Return True while the process runs and its thread answers."""
         return self._process.is_alive() and self._thread.is_alive()
+
+    @property
+    def is_serving(self) -> bool:
+        """Return True once the server listens: its first request for data comes after that."""
+        return self._is_serving
 
     @property
     def pid(self) -> int | None:
@@ -77,6 +83,7 @@ class OpcUaProcess:
             try:
                 if self._here.poll(0.1):
                     number, question = self._here.recv()
+                    self._is_serving = True
                     self._here.send((number, self._answer_one(question)))
             except (EOFError, OSError):
                 return
