@@ -341,6 +341,8 @@ def test_a_folder_that_can_t_be_made_is_an_output_that_failed(tmp_path: Path) ->
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match="a part of the path is a file"):
         open_objects(str(tmp_path / "file" / "results"), create=True)
+    with pytest.raises(InputError, match="file: is a file; name the folder"):
+        open_objects(str(tmp_path / "file"))
 
 
 def test_a_full_disk_is_no_wrong_key(tmp_path: Path) -> None:

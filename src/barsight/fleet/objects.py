@@ -154,7 +154,8 @@ def open_objects(url: str, *, create: bool = False) -> Objects:
     folder = Path(url.removeprefix("file://")).absolute()
     if not folder.is_dir():
         if not create:
-            raise InputError(folder, "there is no such folder", "name the folder, or s3://BUCKET/PATH")
+            problem = "is a file" if folder.is_file() else "there is no such folder"
+            raise InputError(folder, problem, "name the folder, or s3://BUCKET/PATH")
         with translated_os_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
     return Objects(str(folder), LocalStore(folder))
