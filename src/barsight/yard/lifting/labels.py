@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 
 import numpy as np
 from scipy import ndimage
 
-from barsight.core.arrays import Bool, Float32, Float64
+from barsight.core.arrays import Bool, Float32, Float64, UInt8
 from barsight.core.linalg.robust import mad_sigma
 from barsight.yard.label_settings import LabelSettings
 from barsight.yard.lifting.clearance import FacePlane
@@ -46,6 +45,8 @@ BRIGHTER_RATIO, FULL_LEVEL = 1.2, 215.0
 """Minimum ratio of a label's gray level to the load's median, and the maximum of that level."""
 MIN_RATIO, MIN_LEVEL = 1.65, 140.0
 """Minimum ratio of a label's gray level to the orthophoto's median, and the maximum of that level."""
+SAMPLED_EVERY = 8
+"""Number of cells between those from which that median is taken."""
 WHITE_LEVEL, WHITE_CELLS = 245.0, (6, 3)
 """Level from which white paper isn't told from saturated steel, and the size along and across, in steps, of
 a place so bright that may be a label.
@@ -84,11 +85,12 @@ def find_label(
     long = float(tolerance.along(place.along)) + turned * wide + EDGE_M
     broad = float(tolerance.along(place.across)) + turned * magnet.half_span_m + EDGE_M
     v, u = _steps(magnet.half_span_m + long + BESIDE_M), _steps(wide + broad + BESIDE_M)
+    assert heights.gray is not None
     gray, z_m = _look_up(place, heights, v, u)
     faces_z_m = plane.centre_z_m + math.tan(plane.pitch_rad) * v[:, None] + math.tan(plane.roll_rad) * u
     is_low = z_m < faces_z_m - DEEP_M
     load = (gray > 0) & ~is_low
-    labels = mark_labels(gray, load & (np.abs(u) <= wide + broad), min_label_level(heights))
+    labels = mark_labels(gray, load & (np.abs(u) <= wide + broad), min_label_level(heights.gray))
     for mask in plate_masks(gray, z_m, SIZE_M):
         labels |= mask
     labels &= ~is_low
@@ -107,13 +109,11 @@ def _steps(reach_m: float) -> Float64:
     return np.asarray(STEP_M * np.arange(-count, count + 1), np.float64)
 
 
-@lru_cache(maxsize=4)
-def min_label_level(heights: HeightMap) -> float:
-    """Return the minimum gray level of a label, by how brightly the orthophoto is exposed."""
-    counts = np.bincount(heights.gray.ravel(), minlength=256) if heights.gray is not None else np.zeros(256)
-    counts[0] = 0
-    median = int(np.searchsorted(np.cumsum(counts), counts.sum() / 2))
-    return min(MIN_RATIO * median, MIN_LEVEL)
+def min_label_level(photo: UInt8) -> float:
+    """Return the minimum gray level of a label, by how brightly the orthophoto (rows, columns) is exposed."""
+    sampled = photo[::SAMPLED_EVERY, ::SAMPLED_EVERY]
+    seen = sampled[sampled > 0]
+    return min(MIN_RATIO * float(np.median(seen)), MIN_LEVEL) if seen.size else MIN_LEVEL
 
 
 def mark_labels(gray: Float32, load: Bool, min_level: float = MIN_LEVEL) -> Bool:
