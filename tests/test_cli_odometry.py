@@ -139,10 +139,10 @@ def test_wrong_units_are_refused(
     yard: Path, capsys: pytest.CaptureFixture[str], sensor: str, scale: list[float], words: str
 ) -> None:
     change(yard, sensor, lambda time, values: values * scale)
-    assert run(["odometry", str(yard), "-o", str(yard / "out")]) == 3
+    assert run(["odometry", str(yard), "-o", str(yard.parent / "out")]) == 3
     error = capsys.readouterr().err
     assert words in error and error.count("\n") == 1
-    assert not (yard / "out").exists()
+    assert not (yard.parent / "out").exists()
 
 
 @pytest.mark.parametrize("frames", [7, 18])

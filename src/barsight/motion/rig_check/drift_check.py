@@ -147,8 +147,10 @@ def _row_lines(
     if isinstance(rows, Failed):
         return [_unseen(name, "deg", rows.reason) for name in ("pitch", "roll", "focal ratio")]
     f, baseline = camera.focal_px, camera.baseline_m
+    at = f"{range_m:.1f} m"
     if not np.isfinite(range_m):
         range_m = FAR_BASELINES * baseline
+        at = f"{range_m:.1f} m, which is assumed"
     x, y = camera.width / 2 / f, camera.height / 2 / f
     # Errors at the picture's corner per unit: of rows in px, of columns in focal lengths.
     off_row = {"pitch": f, "roll": f * x, "focal ratio": f * y}
@@ -158,7 +160,11 @@ def _row_lines(
         cost = 1e3 * abs(value) * off_column[name] * range_m**2 / baseline
         px = abs(value) * off_row[name]
         real = abs(value) > 3 * sigma
-        bad = real and (px > settings.max_row_error_px or cost > settings.max_depth_error_mm)
+        turns = real and cost > settings.max_depth_error_mm
+        bad = turns or (real and px > settings.max_row_error_px)
+        reason = f"rows are off by up to {px:.2f} px ({settings.max_row_error_px:g} are fine)"
+        if turns:
+            reason += f", depth by {cost:.1f} mm at {at} ({settings.max_depth_error_mm:g} are fine)"
         scale, unit = (1e2, "%") if name == "focal ratio" else (float(np.degrees(1)), "deg")
         lines.append(
             CheckLine(
@@ -168,7 +174,7 @@ def _row_lines(
                 unit,
                 cost,
                 DriftState.RECALIBRATE if bad else DriftState.GOOD,
-                f"rows are off by up to {px:.2f} px ({settings.max_row_error_px:g} are fine)",
+                reason,
             )
         )
     return lines
