@@ -203,3 +203,14 @@ def test_saturated_steel_as_wide_as_a_label_may_hide_one(cells: int, may_hide: b
     gray = np.clip(bars((60, 20)), 1, 200)
     gray[:, 8 : 8 + cells] = 255
     assert mark_labels(gray).any() == may_hide
+
+
+@pytest.mark.parametrize("exposure", [1.0, 0.6, 0.35])
+def test_a_code_on_steel_as_bright_as_its_paper_is_found_in_a_dark_picture(exposure: float) -> None:
+    heights = map_of([laid(0.3)], x_m=(-1.5, 2.0))
+    along, across = np.abs(heights.y_m - MAGNET.poles[0].along_m), np.abs(heights.x_m - 0.3)
+    gray = np.full(heights.shape, 84.0)
+    gray[:, across < 0.14] = 225.0
+    gray[np.ix_(along < 0.024, across < 0.024)] = 140.0
+    heights = replace(heights, gray=np.rint(exposure * gray).astype(np.uint8))
+    assert find_label(PLACE, heights, MAGNET, plane(PLACE, heights)) is not None

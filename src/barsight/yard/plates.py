@@ -70,12 +70,15 @@ def find_plates(bundle: Bundle, heights: YardMap, size_m: tuple[float, float]) -
     return [np.array([x[at], y[at]]) for at in middles if abs(across[at[1]]) <= bundle.width_m / 2]
 
 
-def plate_masks(gray: Float32, z_m: Float32, size_m: tuple[float, float]) -> Iterator[Bool]:
+def plate_masks(
+    gray: Float32, z_m: Float32, size_m: tuple[float, float], white_level: float = WHITE_LEVEL
+) -> Iterator[Bool]:
     """Yield a mask (V, U) of each plate of about size_m, in either direction; one plate may occur twice.
 
     gray: levels (V, U) at places STEP_M apart, V along the bars; 0 where nothing was seen. z_m: heights.
+    white_level: minimum level of the paper around a code.
     """
-    for cells in (*_plates(gray, size_m), *_codes(gray, size_m)):
+    for cells in (*_plates(gray, size_m), *_codes(gray, size_m, white_level)):
         if abs(_rise(cells, z_m)) <= MAX_RISE_M:
             yield cells
 
@@ -91,13 +94,13 @@ def _plates(gray: Float32, size_m: tuple[float, float]) -> Iterator[Bool]:
             yield cells
 
 
-def _codes(gray: Float32, size_m: tuple[float, float]) -> Iterator[Bool]:
+def _codes(gray: Float32, size_m: tuple[float, float], white_level: float) -> Iterator[Bool]:
     """Yield the cells of each area of a code's size that is darker than the white before and behind it."""
     level, side = np.log(gray + _DARK), min(size_m)
     length = round(1.5 * side / STEP_M) | 1
     white = cv2.morphologyEx(level, cv2.MORPH_CLOSE, np.ones((length, 1), np.uint8))
     dark = np.where(gray > 0, white - level, np.float32(np.inf))
-    lack = np.where((white > np.log(WHITE_LEVEL)) & (gray > 0), dark, 0)
+    lack = np.where((white > np.log(white_level)) & (gray > 0), dark, 0)
     for cells in chain.from_iterable(_blobs(lack > least, (side, side)) for least in CODE_LOGS):
         ratio, full = _shape(cells, (side, side))
         fits = (ratio >= MIN_CODE_RATIO).all() and (ratio <= MAX_CODE_RATIO).all() and full >= MIN_CODE_FULL

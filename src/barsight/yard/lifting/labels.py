@@ -14,7 +14,7 @@ from barsight.yard.lifting.clearance import FacePlane
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.map_lookup import nearest_cells, sample_levels
-from barsight.yard.plates import STEP_M, plate_masks
+from barsight.yard.plates import STEP_M, WHITE_LEVEL, plate_masks
 from barsight.yard.types import HeightMap
 from barsight.yard.vetoes import Check, check_true
 
@@ -47,7 +47,9 @@ MIN_RATIO, MIN_LEVEL = 1.65, 140.0
 """Minimum ratio of a label's gray level to the orthophoto's median, and the maximum of that level."""
 SAMPLED_EVERY = 8
 """Number of cells between those from which that median is taken."""
-WHITE_LEVEL, WHITE_CELLS = 245.0, (6, 3)
+PAPER_RATIO = 2.3
+"""Minimum ratio of the level of a code's paper to the orthophoto's median; WHITE_LEVEL is always enough."""
+SATURATED_LEVEL, WHITE_CELLS = 245.0, (6, 3)
 """Level from which white paper isn't told from saturated steel, and the size along and across, in steps, of
 a place so bright that may be a label.
 """
@@ -90,8 +92,10 @@ def find_label(
     faces_z_m = plane.centre_z_m + math.tan(plane.pitch_rad) * v[:, None] + math.tan(plane.roll_rad) * u
     is_low = z_m < faces_z_m - DEEP_M
     load = (gray > 0) & ~is_low
-    labels = mark_labels(gray, load & (np.abs(u) <= wide + broad), min_label_level(heights.gray))
-    for mask in plate_masks(gray, z_m, SIZE_M):
+    median = median_level(heights.gray)
+    min_level = min(MIN_RATIO * median, MIN_LEVEL)
+    labels = mark_labels(gray, load & (np.abs(u) <= wide + broad), min_level)
+    for mask in plate_masks(gray, z_m, SIZE_M, min(PAPER_RATIO * median, WHITE_LEVEL)):
         labels |= mask
     labels &= ~is_low
     under = np.zeros(gray.shape, np.bool_)
@@ -109,11 +113,13 @@ def _steps(reach_m: float) -> Float64:
     return np.asarray(STEP_M * np.arange(-count, count + 1), np.float64)
 
 
-def min_label_level(photo: UInt8) -> float:
-    """Return the minimum gray level of a label, by how brightly the orthophoto (rows, columns) is exposed."""
+def median_level(photo: UInt8) -> float:
+    """Return the median gray level of the orthophoto (rows, columns): how brightly it is exposed; infinite
+    where nothing was seen.
+    """
     sampled = photo[::SAMPLED_EVERY, ::SAMPLED_EVERY]
     seen = sampled[sampled > 0]
-    return min(MIN_RATIO * float(np.median(seen)), MIN_LEVEL) if seen.size else MIN_LEVEL
+    return float(np.median(seen)) if seen.size else math.inf
 
 
 def mark_labels(gray: Float32, load: Bool, min_level: float = MIN_LEVEL) -> Bool:
@@ -143,7 +149,7 @@ def mark_labels(gray: Float32, load: Bool, min_level: float = MIN_LEVEL) -> Bool
         found = ndimage.binary_dilation(found, np.ones((1, WIDTH_CELLS), np.bool_))
         for row in range(_BESIDE, _BESIDE + length):
             marked[row : row + len(found)] |= found
-    white = ndimage.binary_opening(gray >= WHITE_LEVEL, np.ones(WHITE_CELLS, np.bool_))
+    white = ndimage.binary_opening(gray >= SATURATED_LEVEL, np.ones(WHITE_CELLS, np.bool_))
     return np.asarray((bright & marked) | white, np.bool_)
 
 
