@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import yard_maps
 from barsight.core.records.heights import HeightSource
 from barsight.yard.lifting.clearance import BEAM_CLEAR_M, leaning_checks
 from barsight.yard.magnet.contact import Contact
@@ -173,3 +174,14 @@ def test_the_loads_top_does_not_stand_above_leaning_faces(
     half_m = MAGNET.pole_table[0, 3] / 2 + 0.02
     assert check.value == pytest.approx(1e3 * (down_m + half_m * np.tan(np.radians(abs(roll_deg)))), abs=0.01)
     assert (not vetoes_of([check])) is passes
+
+
+@pytest.mark.parametrize("cell_m", [0.01, 0.008, 0.005])
+def test_a_plate_on_edge_one_cell_wide_obstructs_whatever_the_maps_cells_are(
+    cell_m: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(yard_maps, "CELL_M", cell_m)
+    for cell in range(5):
+        middle = (cell + 25) * cell_m
+        heights = with_block((0.0, 0.6), (middle - 0.4 * cell_m, middle + 0.4 * cell_m), TOP_M + 0.3)
+        assert "obstructed" in found(heights)

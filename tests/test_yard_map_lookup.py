@@ -1,9 +1,10 @@
 """Looking up the map at places of the yard, beside plain references."""
 
 import numpy as np
+import pytest
 from scipy.ndimage import map_coordinates
 
-from barsight.yard.map_lookup import lookup_heights, sample_levels
+from barsight.yard.map_lookup import cell_spans, highest_seen, lookup_heights, sample_levels
 from test_yard_resting_plane import some_map, was_seen
 
 
@@ -38,3 +39,23 @@ def test_levels_are_interpolated_between_four_seen_cells() -> None:
     np.testing.assert_allclose(found[within], plain[within], atol=255 / 32)
     assert np.isnan(sample_levels(heights, levels, x + 5, y)).all()
     assert 0.2 < np.isfinite(found).mean() < 0.8
+
+
+@pytest.mark.parametrize("cell_m", [0.003, 0.005, 0.008, 0.01, 0.015, 0.02])
+def test_steps_of_10_mm_leave_out_no_cell(cell_m: float) -> None:
+    places = 1e4 - 0.3 + 0.01 * np.arange(60)
+    spans = cell_spans(places, 1e4 - 0.5, cell_m, 0.01)
+    assert (spans[:, 0] <= spans[:, 1]).all() and (spans[:, 1] < spans[:, 2]).all()
+    assert (abs(1e4 - 0.5 + cell_m * spans[:, 1] - places) <= cell_m / 2 + 1e-6).all()
+    assert (spans[1:, 0] <= spans[:-1, 2]).all()
+    if cell_m <= 0.005:
+        np.testing.assert_array_equal(spans[1:, 0], spans[:-1, 2])
+
+
+def test_the_highest_seen_cell_of_a_span_counts() -> None:
+    heights = some_map()
+    z = np.where(was_seen(heights), heights.z_m, -np.inf)
+    for low, top, left, right in ((-2, 3, 4, 9), (10, 12, 57, 70), (20, 21, 30, 31), (200, 210, 0, 5)):
+        highest = z[max(low, 0) : top, left:right].max(initial=-np.inf)
+        found = highest_seen(heights.z_m, heights.source, low, top, left, right)
+        assert found == highest or (np.isnan(found) and highest == -np.inf)

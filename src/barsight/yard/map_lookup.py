@@ -67,6 +67,35 @@ def _lookup(z: Float32, source: UInt8, x0: float, y0: float, cell: float, x: Flo
 
 
 @kernel()
+def cell_spans(places: Float64, first: float, cell_m: float, step_m: float) -> Int64:
+    """List the cells whose centres lie within half a step of each place (N,), m, or else the nearest one:
+    (N, 3) first, nearest, and one past the last. first: place of the first cell.
+    """
+    spans, half = np.empty((places.size, 3), np.int64), step_m / 2 / cell_m
+    for k in range(places.size):
+        at = (places[k] - first) / cell_m
+        nearest = int(np.floor(at + 0.5))
+        spans[k, 0] = min(int(np.ceil(at - half - 1e-6)), nearest)
+        spans[k, 1] = nearest
+        spans[k, 2] = max(int(np.ceil(at + half - 1e-6)), nearest + 1)
+    return spans
+
+
+@kernel()
+def highest_seen(z: Float32, source: UInt8, low: int, top: int, left: int, right: int) -> float:
+    """Return the height of the highest cell seen in rows low to top and columns left to right, without the
+    last of each; NaN where none is. z, source: maps (rows, columns).
+    """
+    highest = np.nan
+    for row in range(max(low, 0), min(top, z.shape[0])):
+        for column in range(max(left, 0), min(right, z.shape[1])):
+            seen = source[row, column] != _UNKNOWN and source[row, column] != _FILLED
+            if seen and not highest >= z[row, column]:
+                highest = float(z[row, column])
+    return highest
+
+
+@kernel()
 def interpolate_height(z: Float32, source: UInt8, column: float, row: float) -> float:
     """Interpolate the height between the four cells around a place given in cells; NaN where less than half
     of the weight was seen. z, source: maps (rows, columns).

@@ -14,13 +14,13 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, UInt8, kernel
-from barsight.core.records.heights import HeightSource
 from barsight.yard.lift_settings import UPPER
 from barsight.yard.lifting.load import tops_at
 from barsight.yard.lifting.unseen import wide_parts
 from barsight.yard.magnet.contact import Contact
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
+from barsight.yard.map_lookup import cell_spans, highest_seen
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Check, check_max
 
@@ -49,7 +49,6 @@ MAX_HOLE_BESIDE_M = 0.04
 FLANK_M = 0.03
 """Distance (m) from the load within which an unseen place is the load's own flank."""
 _HOLE_CELLS, _HOLE_BESIDE_CELLS = round(MAX_HOLE_M / STEP_M), round(MAX_HOLE_BESIDE_M / STEP_M)
-_UNKNOWN, _FILLED = HeightSource.UNKNOWN, HeightSource.FILLED
 _BEAM_ONLY = 2
 _NO_BOUNDS = np.empty((0, 0), np.float32)
 
@@ -154,12 +153,11 @@ def _look(
     """
     rise, most = np.empty((y.size, x.size), np.float32), np.empty((y.size, x.size), np.float32)
     blocked = np.empty((y.size, x.size), np.uint8)
-    columns = np.floor((x - at[0]) / at[2] + 0.5).astype(np.int64)
-    rows = np.floor((y - at[1]) / at[2] + 0.5).astype(np.int64)
+    columns, rows = cell_spans(x, at[0], at[2], STEP_M), cell_spans(y, at[1], at[2], STEP_M)
     for i in range(y.size):
-        row, dy = rows[i], y[i] - frame[0, 1]
+        row, dy = rows[i, 1], y[i] - frame[0, 1]
         for k in range(x.size):
-            column, dx = columns[k], x[k] - frame[0, 0]
+            column, dx = columns[k, 1], x[k] - frame[0, 0]
             v = dx * frame[1, 0] + dy * frame[1, 1]
             u = dx * frame[2, 0] + dy * frame[2, 1]
             level = plane[0] + (v * plane[1] + u * plane[2]) - plane[3]
@@ -172,8 +170,8 @@ def _look(
                     break
             height, bound = np.nan, np.inf
             if 0 <= row < z.shape[0] and 0 <= column < z.shape[1]:
-                if source[row, column] != _UNKNOWN and source[row, column] != _FILLED:
-                    height = z[row, column] - level
+                left, right = columns[k, 0], columns[k, 2]
+                height = highest_seen(z, source, rows[i, 0], rows[i, 2], left, right) - level
                 if free.size:
                     bound = free[row, column] - level
             rise[i, k], most[i, k] = max(height, -1.0) if height == height else np.nan, bound
