@@ -9,7 +9,6 @@ import pytest
 from scipy import ndimage
 
 from barsight.mapping.free_space import (
-    LEVEL_CELLS,
     LEVEL_M,
     NO_END,
     OVER_END_M,
@@ -148,16 +147,17 @@ def test_heights_of_a_cell_are_bounded_by_its_highest_and_its_lowest() -> None:
         assert lowest[i, j] == min(of_cell, default=np.inf)
 
 
-def test_level_heights_agree_with_a_slow_reference() -> None:
+@pytest.mark.parametrize(("cell_m", "reach"), [(0.005, 4), (0.008, 3), (0.01, 2), (0.02, 2)])
+def test_level_heights_agree_with_a_slow_reference(cell_m: float, reach: int) -> None:
     rng, side = np.random.default_rng(6), 30
     x, y = rng.integers(-side, side, (2, 900)).astype(np.int32)
-    z = (0.2 * (x // 6 % 2) + rng.uniform(0, 0.04, x.size)).astype(np.float32)
+    z = (0.2 * (x // (3 * reach) % 2) + rng.uniform(0, 0.04, x.size)).astype(np.float32)
     none = np.zeros(x.size, np.float32)
     cells = CellObservations(x, y, none > 0, z, none, none, none)
-    level, holes = level_heights(cells, (-side, -side), (2 * side, 2 * side))
+    level, holes = level_heights(cells, (-side, -side), (2 * side, 2 * side), cell_m)
     slow = np.full_like(level, NO_END)
     for k in range(x.size):
-        near = (abs(x - x[k]) <= LEVEL_CELLS // 2) & (abs(y - y[k]) <= LEVEL_CELLS // 2)
+        near = (abs(x - x[k]) <= reach) & (abs(y - y[k]) <= reach)
         if abs(z[near] - z[k]).max() < LEVEL_M:
             slow[y[k] + side, x[k] + side] = max(slow[y[k] + side, x[k] + side], z[k])
     np.testing.assert_array_equal(level, slow)
@@ -179,3 +179,18 @@ def test_the_background_matched_beside_a_post_proves_nothing() -> None:
     sweep_rays(ends, holes, eye, CELL_M, bound)
     assert bound[30, 38] > 0.7
     assert bound[15, 38] < 0.15 and bound[30, 50] < 0.15
+
+
+@pytest.mark.parametrize("cell_m", [0.005, 0.008, 0.01])
+def test_the_background_matched_on_the_rim_of_a_block_proves_nothing_whatever_the_cells_are(
+    cell_m: float,
+) -> None:
+    """A block of 0.6 m from x = 0.4 on; on its near rim, 20 mm wide, the floor is matched."""
+    count = round(0.6 / cell_m)
+    x, y = (axis.ravel().astype(np.int32) for axis in np.meshgrid(np.arange(count), np.arange(count)))
+    none, free = np.zeros(x.size, np.float32), FreeSpace(cell_m)
+    z_m = np.where(x >= round(0.42 / cell_m), np.float32(0.6), np.float32(0))
+    for eye_x_m in (-3.0, -3.4):
+        cells = CellObservations(x, y, none == 0, z_m, none, none, none)
+        free.carve(cells, np.array([[eye_x_m, 0.3, 7.0]]))
+    assert (free.window(0, 0, count, count)[:, round(0.4 / cell_m) :] >= 0.6).all()

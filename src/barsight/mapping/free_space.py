@@ -24,9 +24,9 @@ OVER_END_M = 0.02
 """Margin added to the height of a line of sight when it lowers a cell's bound."""
 MARGIN_M = 0.5
 """Distance around a view's heights within which cells are bounded."""
-LEVEL_CELLS, LEVEL_M = 5, 0.05
-"""Window side (cells) and maximum height difference within it for a line of sight to count: around its
-end, the view must see only heights this close. At edges, matching mixes foreground and background.
+LEVEL_CELLS, LEVEL_REACH_M, LEVEL_M = 2, 0.02, 0.05
+"""Distance, minimum in cells and in m, and maximum height difference within it for a line of sight to count:
+around its end, the view must see only heights this close. At edges, matching mixes foreground and background.
 """
 BESIDE_M = 0.02
 """Maximum distance of a hole beside an end, rounded up to whole cells, for which its line of sight doesn't
@@ -59,7 +59,7 @@ class FreeSpace:
         margin = math.ceil(MARGIN_M / self.cell_m)
         column, row = int(cells.x.min()) - margin, int(cells.y.min()) - margin
         shape = int(cells.y.max()) - row + margin + 1, int(cells.x.max()) - column + margin + 1
-        ends, holes = level_heights(cells, (column, row), shape)
+        ends, holes = level_heights(cells, (column, row), shape, self.cell_m)
         bound = np.full(shape, UNPROVEN)
         for eye in eyes_m:
             sweep_rays(ends, holes, eye - (column * self.cell_m, row * self.cell_m, 0), self.cell_m, bound)
@@ -113,7 +113,7 @@ class FreeSpace:
 
 
 def level_heights(
-    cells: CellObservations, corner: tuple[int, int], shape: tuple[int, int]
+    cells: CellObservations, corner: tuple[int, int], shape: tuple[int, int], cell_m: float
 ) -> tuple[Float32, UInt8]:
     """Return the highest level height in each cell (H, W) of a grid that starts at `corner` (x, y), NO_END
     where there is none, and the view's holes: 1 where it sees nothing, other than in gaps a cell wide.
@@ -124,7 +124,8 @@ def level_heights(
     bound_heights(cells.x, cells.y, cells.z_m, corner, highest, lowest)
     seen = (highest > NO_END).astype(np.uint8)
     holes = 1 - cv2.morphologyEx(seen, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
-    about = np.ones((LEVEL_CELLS, LEVEL_CELLS), np.uint8)
+    reach = max(math.ceil(LEVEL_REACH_M / cell_m - 1e-6), LEVEL_CELLS)
+    about = np.ones((2 * reach + 1,) * 2, np.uint8)
     highest, lowest = cv2.dilate(highest, about), cv2.erode(lowest, about)
     level = np.full(shape, NO_END)
     _mark_level(cells.x, cells.y, cells.z_m, corner, highest, lowest, level)
