@@ -117,6 +117,17 @@ def test_all_lines_across_are_found_the_strongest_first() -> None:
     assert strengths == sorted(strengths, reverse=True)
 
 
+@pytest.mark.parametrize("ratio", [1.5, 2.0, 2.5])
+@pytest.mark.parametrize("half_m", [0.2, 0.8])
+def test_a_thin_bar_where_the_sun_shines_on_the_load_is_found(half_m: float, ratio: float) -> None:
+    heights = photo(0, 0.02, 0.05)
+    assert heights.tops is not None
+    sunny = np.abs(heights.y_m + 0.6) < half_m
+    lit = np.where(sunny[:, None], ratio * heights.tops, heights.tops)
+    line = strongest(replace(heights, tops=lit.clip(1, 255).astype(np.uint8)), LOAD[0])
+    assert line is not None and line.strength > SURE_STRENGTH and abs(line.along_m + 0.6) < 0.025
+
+
 @pytest.mark.parametrize(("gap_m", "vetoed"), [(0.2, True), (0.5, False)])
 def test_a_bar_across_a_neighbour_that_may_reach_under_the_magnet_forbids(gap_m: float, vetoed: bool) -> None:
     place, half = Placement(0.0, 0.0, 0.0), MAGNET.size_m[0] / 2

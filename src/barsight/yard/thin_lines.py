@@ -41,6 +41,10 @@ HIGHLIGHT_LOG, FADE_LOG = 0.3, 0.4
 """Log level over the load's median from which highlights have no weight, as a bar doesn't show on them; and
 the range below it over which their weight falls.
 """
+LIT_M = 0.3
+"""Length (m) along the load of the median of its rows' medians: where that is higher than the load's own
+median, the load is lit more brightly there, as by the sun, and highlights are told by that level.
+"""
 BESIDE_END_M = 0.12
 """Distance (m) from an end within which rows aren't used, since objects before the end show there."""
 MIN_SEEN_RATIO = 0.8
@@ -198,6 +202,8 @@ def _contrast(level: Float32, middle: int, half: int) -> tuple[Float32, Float32]
     off -= np.median(off, axis=0)
     sigma = np.maximum(mad_sigma(off, axis=0), MIN_SIGMA_LOG)
     contrast = np.clip(off / sigma, DARK, BRIGHT)
-    base = float(np.median(around[:, middle - half : middle + half + 1]))
+    own = around[:, middle - half : middle + half + 1]
+    lit = running_median(np.median(own, axis=1, keepdims=True), 2 * round(LIT_M / STEP_M / 2 - 0.5) + 1)
+    base = np.maximum(np.median(own), lit)
     weight = np.clip((base + HIGHLIGHT_LOG - around) / FADE_LOG, 0, 1)
     return ((contrast - contrast.mean(axis=0)) * weight).astype(np.float32), weight.astype(np.float32)
