@@ -128,6 +128,17 @@ def test_a_thin_bar_where_the_sun_shines_on_the_load_is_found(half_m: float, rat
     assert line is not None and line.strength > SURE_STRENGTH and abs(line.along_m + 0.6) < 0.025
 
 
+@pytest.mark.parametrize("half_m", [0.2, 9.0])
+@pytest.mark.parametrize("ratio", [1.5, 3.3, 4.0, 5.0, 8.0])
+def test_no_thin_bar_is_ruled_out_where_the_photo_is_saturated(half_m: float, ratio: float) -> None:
+    heights = photo(0, 0.02, 0.05)
+    assert heights.tops is not None
+    bright = np.abs(heights.y_m + 0.6) < half_m
+    tops = np.where(bright[:, None], ratio * heights.tops, heights.tops).clip(1, 255).astype(np.uint8)
+    assert codes(judged(STOCK, heights=replace(heights, tops=tops))) == {"thin-bar"}
+    assert ratio > 3 or strongest(replace(heights, tops=tops), LOAD[0]) is not None
+
+
 @pytest.mark.parametrize(("gap_m", "vetoed"), [(0.2, True), (0.5, False)])
 def test_a_bar_across_a_neighbour_that_may_reach_under_the_magnet_forbids(gap_m: float, vetoed: bool) -> None:
     place, half = Placement(0.0, 0.0, 0.0), MAGNET.size_m[0] / 2

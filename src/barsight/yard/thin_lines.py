@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d
+from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
 from barsight.core.arrays import Float32, Float64, Int64, kernel
 from barsight.core.linalg.robust import known_median, mad_sigma, running_median
@@ -48,11 +48,17 @@ median, the load is lit more brightly there, as by the sun, and highlights are t
 BESIDE_END_M = 0.12
 """Distance (m) from an end within which rows aren't used, since objects before the end show there."""
 MIN_SEEN_RATIO = 0.8
+SATURATED_LEVEL, MAX_SATURATED_RATIO, SATURATED_M = 245.0, 0.65, 0.2
+"""Level from which steel is saturated, so that no bar shows on it; the maximum share of a load's cells that
+may be, over a length (m) that is longer than a label.
+"""
 APART_M = 0.1
 """Minimum distance (m) along a bundle between two lines; closer ones are one."""
 _SLOPES = np.r_[np.arange(-1.2, -0.5, 0.05), np.arange(-0.5, 0.501, 0.02), np.arange(0.55, 1.21, 0.05)]
 MAX_SLOPE = float(_SLOPES.max())
 """Maximum slope of a line relative to the perpendicular of the bundle's axis."""
+_DARK = 2
+"""Level added to all levels, since ratios of very dark levels mean nothing."""
 _ROW_SIGMAS = np.float32(math.sqrt(3.0))
 """Factor on the scatter of a row's sum, since neighbouring columns of the photo share their pixels."""
 
@@ -70,7 +76,7 @@ class ThinLine:
 
 def find_thin_lines(heights: HeightMap, bundle: Bundle) -> tuple[ThinLine, ...] | None:
     """Find the strongest line across a bundle in the top photo, then all others over MAX_STRENGTH; None where
-    too little of the bundle is seen.
+    too little of the bundle is seen, or a part of it is saturated.
     """
     found = line_strengths(heights, bundle)
     if found is None:
@@ -102,7 +108,7 @@ def with_thin_lines(bundle: Bundle, heights: HeightMap) -> Bundle:
 
 def line_strengths(heights: HeightMap, bundle: Bundle) -> tuple[Float64, Float32] | None:
     """Compute the places (V,) at which lines cross a bundle's axis, m from its middle, and their strengths
-    (S, V) for each slope; None where too little of the bundle is seen.
+    (S, V) for each slope; None where too little of the bundle is seen, or a part of it is saturated.
 
     Contrasts are taken along the bars: log gray level minus its median over AROUND_M, divided by the column's
     scatter. A line's strength is its sum divided by sqrt(columns), without columns that are highlights. Parts
@@ -115,6 +121,9 @@ def line_strengths(heights: HeightMap, bundle: Bundle) -> tuple[Float64, Float32
     middle, half = level.shape[1] // 2, max(round(INNER_RATIO * bundle.width_m / 2 / STEP_M), 3)
     first, last = middle - half, middle + half + 1
     if len(along) <= 2 * rim or np.isfinite(level[:, first:last]).mean() < MIN_SEEN_RATIO:
+        return None
+    saturated = (level[:, first:last] >= np.log(SATURATED_LEVEL + _DARK)).mean(axis=1)
+    if uniform_filter1d(saturated, round(SATURATED_M / STEP_M)).max() > MAX_SATURATED_RATIO:
         return None
     contrast, weight = _contrast(level, middle, round(bundle.width_m / 2 / STEP_M))
     reaches = [round(beside / STEP_M) for beside in BESIDE_M]
@@ -190,7 +199,7 @@ def _strip(heights: HeightMap, bundle: Bundle) -> tuple[Float64, Float32]:
     along, beside = (STEP_M * np.arange(-half, half + 1.0) for half in (half_v, half_u))
     x = bundle.centre_m[0] + along[:, None] * axis[0] + beside * axis[1]
     y = bundle.centre_m[1] + along[:, None] * axis[1] - beside * axis[0]
-    return along, np.log(sample_levels(heights, heights.tops, x, y) + 2)
+    return along, np.log(sample_levels(heights, heights.tops, x, y) + _DARK)
 
 
 def _contrast(level: Float32, middle: int, half: int) -> tuple[Float32, Float32]:
