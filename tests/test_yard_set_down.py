@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import yard_maps
 from barsight.core.records.heights import HeightSource
 from barsight.yard.events import YardEvent
 from barsight.yard.lift_settings import LiftSettings
@@ -283,3 +284,17 @@ def test_several_bundles_are_laid_as_wide_as_they_lie() -> None:
     down, whole = laid_at(pair, 5.0, 1.0, 0.3), Load.of(pair)
     assert (down.width_m, down.length_m) == (whole.width_m, whole.length_m)
     assert (*down.centre_m[:2], down.yaw_rad) == (5.0, 1.0, 0.3) and whole.width_m > 0.7
+
+
+@pytest.mark.parametrize("cell_m", [0.005, 0.008, 0.01, 0.015, 0.02])
+@pytest.mark.parametrize(("wide_m", "rise_m"), [(0.02, 0.12), (0.05, 0.05)])
+def test_nothing_is_put_down_on_a_thing_whatever_the_maps_cells_are(
+    wide_m: float, rise_m: float, cell_m: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A plate on edge of 20 mm and a block of 50 mm."""
+    monkeypatch.setattr(yard_maps, "CELL_M", cell_m)
+    assert carried(yard())
+    for shift in range(4):
+        heights, low = yard(), FREE[0] + shift * 0.006
+        heights.z_m[cells(heights, (low, low + wide_m - 1e-6), (1.0, 1.3))] += rise_m
+        assert not carried(heights)

@@ -21,6 +21,8 @@ from barsight.yard.sections import part_about
 from barsight.yard.types import YardMap
 
 STEP_M = 0.02
+SMOOTH_M, NARROW_M = 0.05, 0.03
+"""Sides (m) of the squares over which heights are medians, against wrong matches; narrow for thin objects."""
 STATION_STEPS = 5
 """Steps along the load per station. A station is as high as its highest step, which carries the load."""
 NEAR_M = 0.02
@@ -66,7 +68,7 @@ class Bearing:
 class Surroundings:
     """Heights (V, U) about a place, on a grid along (v_m) and across (u_m) the load.
 
-    z_m: medians over squares of 50 mm, which wrong matches don't affect. thin_m: over 30 mm, for thin
+    z_m: medians over squares of SMOOTH_M, which wrong matches don't affect. thin_m: over NARROW_M, for thin
     objects. Where a few cells weren't seen, both have the highest value nearby; hidden: unseen places wide
     enough to hide an obstacle. free_m: upper bound, by lines of sight, of what may stand there, inf where
     none passed.
@@ -133,13 +135,21 @@ def _surroundings(
     lowest = np.where(seen, part.z_m, np.float32(-1e3))
     nearby = cv2.dilate(lowest, np.ones((UNSEEN_REACH_CELLS,) * 2, np.uint8))
     filled = np.where(seen, part.z_m, nearby).astype(np.float32)
-    z, thin = (
-        np.where(inside, cv2.medianBlur(filled, side)[row, column], nearby[row, column]) for side in (5, 3)
-    )
+    # Steps skip no thin object that is at least two cells wide, as medians leave them.
+    skipped = 2 * math.ceil(max(STEP_M / 2 / part.cell_m - 1, 0) - 1e-6) + 1
+    smooth, narrow = (_medians(filled, side_m, part.cell_m) for side_m in (SMOOTH_M, NARROW_M))
+    narrow = cv2.dilate(narrow, np.ones((skipped, skipped), np.uint8))
+    z, thin = (np.where(inside, one[row, column], nearby[row, column]) for one in (smooth, narrow))
     free = np.full(part.shape, np.inf, np.float32) if part.free_m is None else part.free_m
     free = np.where(inside, free[row, column], np.float32(np.inf)).astype(np.float32)
     hidden = wide_parts(~(inside & seen[row, column]), MAX_UNSEEN_CELLS) > 0
     return Surroundings(v, u, z, thin, hidden, free)
+
+
+def _medians(z: Float32, side_m: float, cell_m: float) -> Float32:
+    """Compute medians of a map (rows, columns) over squares of at most side_m, and at most 5 cells."""
+    side = min((int(side_m / cell_m + 1e-6) - 1) // 2 * 2 + 1, 5)
+    return np.asarray(cv2.medianBlur(z, side) if side > 1 else z, np.float32)
 
 
 def placing_slack(load: Load, yaw_rad: float, magnet: Magnet) -> Float64:
