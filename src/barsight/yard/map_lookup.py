@@ -11,6 +11,8 @@ from barsight.core.arrays import Bool, Float32, Float64, Int64, UInt8, kernel
 from barsight.core.records.heights import HeightSource
 from barsight.yard.types import HeightMap
 
+SATURATED_LEVEL = 245.0
+"""Gray level from which steel is saturated, so that neither white paper nor a bar shows on it."""
 _UNKNOWN, _FILLED = HeightSource.UNKNOWN, HeightSource.FILLED
 
 

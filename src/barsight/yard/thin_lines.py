@@ -14,7 +14,7 @@ from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
 from barsight.core.arrays import Float32, Float64, Int64, kernel
 from barsight.core.linalg.robust import known_median, mad_sigma, running_median
-from barsight.yard.map_lookup import sample_levels
+from barsight.yard.map_lookup import SATURATED_LEVEL, sample_levels
 from barsight.yard.types import Bundle, Doubt, DoubtKind, HeightMap
 
 MAX_STRENGTH = 8.0
@@ -48,10 +48,8 @@ median, the load is lit more brightly there, as by the sun, and highlights are t
 BESIDE_END_M = 0.12
 """Distance (m) from an end within which rows aren't used, since objects before the end show there."""
 MIN_SEEN_RATIO = 0.8
-SATURATED_LEVEL, MAX_SATURATED_RATIO, SATURATED_M = 245.0, 0.65, 0.2
-"""Level from which steel is saturated, so that no bar shows on it; the maximum share of a load's cells that
-may be, over a length (m) that is longer than a label.
-"""
+MAX_SATURATED_RATIO, SATURATED_M = 0.65, 0.2
+"""Maximum share of a load's cells that may be saturated, over a length (m) that is longer than a label."""
 APART_M = 0.1
 """Minimum distance (m) along a bundle between two lines; closer ones are one."""
 _SLOPES = np.r_[np.arange(-1.2, -0.5, 0.05), np.arange(-0.5, 0.501, 0.02), np.arange(0.55, 1.21, 0.05)]
@@ -206,13 +204,18 @@ def _contrast(level: Float32, middle: int, half: int) -> tuple[Float32, Float32]
     """Compute each place's contrast (V, U) to its column around it, in sigmas, and the columns' weights."""
     seen = np.isfinite(level)
     filled = np.where(seen, level, np.nan_to_num(known_median(level)))
-    around = running_median(filled, 2 * round(AROUND_M / STEP_M / 2 - 0.5) + 1)
+    around = running_median(filled, _odd_steps(AROUND_M))
     off = np.where(seen, filled - around, 0)
     off -= np.median(off, axis=0)
     sigma = np.maximum(mad_sigma(off, axis=0), MIN_SIGMA_LOG)
     contrast = np.clip(off / sigma, DARK, BRIGHT)
     own = around[:, middle - half : middle + half + 1]
-    lit = running_median(np.median(own, axis=1, keepdims=True), 2 * round(LIT_M / STEP_M / 2 - 0.5) + 1)
+    lit = running_median(np.median(own, axis=1, keepdims=True), _odd_steps(LIT_M))
     base = np.maximum(np.median(own), lit)
     weight = np.clip((base + HIGHLIGHT_LOG - around) / FADE_LOG, 0, 1)
     return ((contrast - contrast.mean(axis=0)) * weight).astype(np.float32), weight.astype(np.float32)
+
+
+def _odd_steps(length_m: float) -> int:
+    """Return the odd number of steps nearest to a length."""
+    return 2 * round(length_m / STEP_M / 2 - 0.5) + 1

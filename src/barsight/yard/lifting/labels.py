@@ -13,7 +13,7 @@ from barsight.yard.label_settings import LabelSettings
 from barsight.yard.lifting.clearance import FacePlane
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
-from barsight.yard.map_lookup import nearest_cells, sample_levels
+from barsight.yard.map_lookup import SATURATED_LEVEL, nearest_cells, sample_levels
 from barsight.yard.plates import STEP_M, WHITE_LEVEL, plate_masks
 from barsight.yard.types import HeightMap
 from barsight.yard.vetoes import Check, check_true
@@ -49,10 +49,8 @@ SAMPLED_EVERY = 8
 """Number of cells between those from which that median is taken."""
 PAPER_RATIO = 2.3
 """Minimum ratio of the level of a code's paper to the orthophoto's median; WHITE_LEVEL is always enough."""
-SATURATED_LEVEL, WHITE_CELLS = 245.0, (6, 3)
-"""Level from which white paper isn't told from saturated steel, and the size along and across, in steps, of
-a place so bright that may be a label.
-"""
+WHITE_CELLS = 6, 3
+"""Size along and across, in steps, of a saturated place that may be a label."""
 _BESIDE = 4
 """Number of steps before and behind a label that are read."""
 _DARK = 10.0
