@@ -136,6 +136,19 @@ def test_single_low_cells_do_not_prove_an_unseen_place_free(every: int) -> None:
     assert found(seen_in_part(every, 0.2)) == {"unknown-under-footprint"}
 
 
+@pytest.mark.parametrize("cell_m", [0.01, 0.015, 0.02])
+def test_one_low_cell_does_not_prove_a_hole_under_a_face_free(
+    cell_m: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(yard_maps, "CELL_M", cell_m)
+    heights = with_block((0.245, 0.355), (0.745, 0.855), None)
+    rows, columns = np.nonzero(heights.source == HeightSource.UNKNOWN)
+    middle = len(rows) // 2
+    heights.z_m[rows[middle], columns[middle]] = TOP_M - 0.01
+    heights.source[rows[middle], columns[middle]] = HeightSource.VISION
+    assert "unknown-under-footprint" in found(heights)
+
+
 def test_a_bound_that_is_no_number_proves_nothing() -> None:
     assert found(with_block(*WALL, None, np.nan)) == {"unknown-under-footprint"}
 

@@ -39,7 +39,7 @@ MAX_THIN_RISE_M, MIN_THIN_CELLS = 0.05, 8
 BEAM_CLEAR_M = 0.1
 """Clearance (m) of the beam over objects beside the load; at most half its height over the faces."""
 MIN_PATCH_CELLS = 4
-"""Minimum size of a patch that counts, in cells of STEP_M."""
+"""Minimum size of a patch that counts, in cells of STEP_M, or of the map where its cells are larger."""
 EDGE_SIGMA_M = 0.003
 """Standard deviation (m) of an object's edge as it shows in cells of STEP_M."""
 MAX_HOLE_M = 0.06
@@ -134,7 +134,8 @@ def find_obstacle(
     spares = np.where(passed_over, np.float32(spare), np.float32(0))
     np.minimum(region.under, 1, out=region.under)
     beside = ~_over(load, region, FLANK_M)
-    return _obstructed(_filled(rise, most) - spares, spares, region) or _unseen(blocked, beside, region)
+    obstacle = _obstructed(_filled(rise, most) - spares, spares, region)
+    return obstacle or _unseen(blocked, beside, region, max(heights.cell_m / STEP_M, 1.0))
 
 
 @kernel()
@@ -272,16 +273,19 @@ def _obstructed(rise: Float32, spare: Float32, region: Region) -> Obstacle | Non
     return None
 
 
-def _unseen(blocked: UInt8, beside: Bool, region: Region) -> Obstacle | None:
+def _unseen(blocked: UInt8, beside: Bool, region: Region, cell_steps: float) -> Obstacle | None:
     """Find unproven or obstructed places that are wide enough to hide an obstacle. blocked: (V, U); a few
     free cells among blocked ones, as wrong matches are, prove nothing. beside: (V, U), cells without a load.
+    cell_steps: side of a map's cell in steps, at least 1.
     """
-    # Only free places of three cells or more prove anything: closing the narrower ones hides the most.
-    closed = cv2.morphologyEx(blocked, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    # Fewer than four cells of the map hold no square of two: closing what holds none hides the most.
+    side = max(math.ceil(cell_steps) + 1, 3)
+    closed = cv2.morphologyEx(blocked, cv2.MORPH_CLOSE, np.ones((side, side), np.uint8))
     if not (wide_parts(closed, _HOLE_BESIDE_CELLS) & region.under).any():
         return None
     _, patch, boxes, _ = cv2.connectedComponentsWithStats(1 - blocked, connectivity=4)
-    unproven = blocked.astype(np.bool_) | (boxes[:, cv2.CC_STAT_AREA] < MIN_PATCH_CELLS)[patch]
+    too_small = boxes[:, cv2.CC_STAT_AREA] < MIN_PATCH_CELLS * cell_steps**2
+    unproven = blocked.astype(np.bool_) | too_small[patch]
     hidden = wide_parts(unproven, _HOLE_CELLS) | (wide_parts(unproven, _HOLE_BESIDE_CELLS) & beside)
     hidden &= region.under
     if not hidden.any():
