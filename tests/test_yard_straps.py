@@ -19,7 +19,7 @@ from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.pack_edges import hold_off
 from barsight.yard.bundles.reading import Reading
 from barsight.yard.bundles.section.dark_lines import dark_lines
-from barsight.yard.bundles.section.pack_sides import PackSide, _parting, _widest
+from barsight.yard.bundles.section.pack_sides import PackSide, _parting, _widest, ends_over_lower_bar
 from barsight.yard.bundles.section.packs import Pack, contradicts, find_pack, strapped_pack
 from barsight.yard.bundles.section.seen_section import SeenSection, section_of_pack
 from barsight.yard.bundles.section.strap_lines import _best_stretches, row_gains, split_columns
@@ -300,7 +300,7 @@ def pack_beside(
     return pack
 
 
-LEFT = (-0.4, -1.0), (-0.14, -1.0), (-0.13, -0.06), (0.0, 0.0)
+LEFT = (-0.4, -1.0), (-0.14, -1.0), (-0.13, -0.06), (-0.06, -0.01), (0.0, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -367,6 +367,20 @@ def test_no_drawn_pack_has_a_gully_that_parts_two() -> None:
         crest = int(level.argmax())
         for outwards in (level[crest:], level[crest::-1]):
             assert _parting(outwards, len(outwards), level[crest], max(1.2 * diameter, 0.06)) is None
+
+
+@pytest.mark.parametrize(("leans_rad", "over"), [(-0.1, False), (0.7, True)], ids=["beside", "over"])
+def test_a_lower_bar_may_rest_on_the_flank_of_an_upright_triangle(leans_rad: float, *, over: bool) -> None:
+    """Three bars of 90 mm, and one that touches the lower right one."""
+    radius = 0.045
+    bars = radius * np.array([[-1, 0], [1, 0], [0, math.sqrt(3)], [1 + 2 * math.cos(leans_rad), 0]])
+    bars[3, 1] = 2 * radius * math.sin(leans_rad)
+    u = np.arange(-0.12, 0.3, CELL)
+    under = radius**2 - (u[:, None] - bars[:, 0]) ** 2
+    level = np.where(under > 0, bars[:, 1] + np.sqrt(np.maximum(under, 0.0)), -np.inf).max(axis=1)
+    at = int(np.searchsorted(u, 0.04))
+    last = int(np.argmin(level[at : at + 7]))
+    assert ends_over_lower_bar(level[at:], level[at::-1], last, bars[2, 1] + radius, 0.17, CELL) is over
 
 
 @pytest.mark.parametrize(("rows", "side"), [(OTHER_ROWS, PackSide.SEEN), (ROWS, PackSide.OPEN)])

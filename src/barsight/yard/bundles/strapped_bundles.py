@@ -180,7 +180,7 @@ def _covered(bundle: Bundle, pack: Pack) -> Bundle:
         return bundle
     hidden_m = _HIDDEN_RATIO * bundle.width_m
     doubts = tuple(
-        Doubt(DoubtKind.HIDDEN_FLANK, f"what stands higher beside it may lie over its {name} flank")
+        Doubt(DoubtKind.HIDDEN_FLANK, f"what stands beside it may lie over its {name} flank")
         for name in sides
     )
     return replace(

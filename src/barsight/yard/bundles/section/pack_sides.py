@@ -51,6 +51,12 @@ _HIGHER_M, _COVERED_RATIO = 0.03, 0.5
 in the straps' widths, that rules this out: a round pack is widest half its width under its top. A neighbour
 that rises by more than the whole width is a separate stack.
 """
+_PEAK_FALL_RATIO, _PEAK_RATIO, _PEAKED_FALL_RATIO = 0.12, 0.5, 0.6
+"""A section is peaked where the part that falls by less than the first is narrower than the second, in
+widths: 0.43 of an upright triangle of three bars, 0.65 of a round pack and of a hexagon of seven. A triangle
+is widest 0.68 widths under its top: a flank that falls by less than the third ends over its lower bar, on
+which a neighbour may rest, even a lower one.
+"""
 _BEHIND_CELLS = 16
 """Number of places behind a flank within which a neighbour that stands over it must begin."""
 _RISES_M = 0.01
@@ -111,6 +117,23 @@ def find_side(
     if steep or not (higher or is_overhung(before, beside)):
         return last, PackSide.SEEN
     return last, PackSide.OPEN if rise > width_m else PackSide.COVERED
+
+
+def ends_over_lower_bar(
+    outwards: Float64, inwards: Float64, last: int, top: float, width_m: float, cell_m: float
+) -> bool:
+    """Check whether a flank that ends at `last` may end over its own lower bar, as that of an upright
+    triangle of bars does where a neighbour rests on it. Arguments: of `find_side`.
+    """
+    beyond = outwards[last:][:_BEHIND_CELLS]
+    beyond = beyond[~np.isnan(beyond)]
+    lowest = np.minimum.accumulate(beyond)
+    rises = np.flatnonzero(beyond > lowest + _RISES_M)
+    if not rises.size or top - lowest[rises[0]] >= _PEAKED_FALL_RATIO * width_m:
+        return False
+    section = np.concatenate([outwards[last:0:-1], inwards])[: round(width_m / cell_m)]
+    high = np.flatnonzero(section >= top - _PEAK_FALL_RATIO * width_m)
+    return bool(high.size and (high[-1] - high[0] + 1) * cell_m < _PEAK_RATIO * width_m)
 
 
 def hidden_places(outwards: Float64, last: int) -> int:

@@ -11,7 +11,13 @@ from barsight.core.arrays import Float64
 from barsight.yard.bundles.fitting.outline_fit import DIAMETER, Fit
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.section.dark_lines import SAME_DIAMETER_RATIO, bar_diameter
-from barsight.yard.bundles.section.pack_sides import PackSide, find_side, flank_depth, hidden_places
+from barsight.yard.bundles.section.pack_sides import (
+    PackSide,
+    ends_over_lower_bar,
+    find_side,
+    flank_depth,
+    hidden_places,
+)
 from barsight.yard.bundles.section.seen_section import agreeing_rows, mean_section
 from barsight.yard.bundles.section.strap_lines import FLOOR_M
 from barsight.yard.bundles.section.straps import MIN_ROWS, REACH_M, StrapSpan, strap_spans
@@ -139,6 +145,8 @@ def find_pack(
         last, side = find_side(*around, begin, None if shared else shared, top, own.width_m, cell, thick_m)
         if shared and side is PackSide.SEEN:
             last, side = find_side(*around, begin, True, top, own.width_m, cell, thick_m)
+        if side is PackSide.SEEN and ends_over_lower_bar(*around, last, top, own.width_m, cell):
+            side = PackSide.COVERED
         ends.append(float(beside_m[at]) + step * cell * (last + 0.5))
         sides.append(side if is_one else PackSide.OPEN)
         hidden.append(cell * hidden_places(around[0], last))
