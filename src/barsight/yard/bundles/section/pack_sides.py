@@ -51,6 +51,8 @@ _HIGHER_M, _COVERED_RATIO = 0.03, 0.5
 in the straps' widths, that rules this out: a round pack is widest half its width under its top. A neighbour
 that rises by more than the whole width is a separate stack.
 """
+MAX_FEW_RATIO = 2.4
+"""Maximum width of a pack of three or four bars, in their maximum diameter."""
 _PEAK_FALL_RATIO, _PEAK_RATIO, _PEAKED_FALL_RATIO = 0.12, 0.5, 0.6
 """A section is peaked where the part that falls by less than the first is narrower than the second, in
 widths: 0.43 of an upright triangle of three bars, 0.65 of a round pack and of a hexagon of seven. A triangle

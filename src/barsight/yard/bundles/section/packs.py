@@ -12,6 +12,7 @@ from barsight.yard.bundles.fitting.outline_fit import DIAMETER, Fit
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.section.dark_lines import SAME_DIAMETER_RATIO, bar_diameter
 from barsight.yard.bundles.section.pack_sides import (
+    MAX_FEW_RATIO,
     PackSide,
     ends_over_lower_bar,
     find_side,
@@ -145,7 +146,8 @@ def find_pack(
         last, side = find_side(*around, begin, None if shared else shared, top, own.width_m, cell, thick_m)
         if shared and side is PackSide.SEEN:
             last, side = find_side(*around, begin, True, top, own.width_m, cell, thick_m)
-        if side is PackSide.SEEN and ends_over_lower_bar(*around, last, top, own.width_m, cell):
+        few = not own.width_m > MAX_FEW_RATIO * thick_m
+        if few and side is PackSide.SEEN and ends_over_lower_bar(*around, last, top, own.width_m, cell):
             side = PackSide.COVERED
         ends.append(float(beside_m[at]) + step * cell * (last + 0.5))
         sides.append(side if is_one else PackSide.OPEN)
