@@ -20,6 +20,7 @@ from barsight.yard.thin_lines import (
     BESIDE_RATIO,
     MAX_STRENGTH,
     SURE_STRENGTH,
+    WIDE_M,
     ThinLine,
     _line_strengths,
     find_thin_lines,
@@ -82,6 +83,26 @@ def test_a_thin_bar_across_the_load_is_found_where_it_lies(bar_m: float, slope: 
         assert line.askew_deg == pytest.approx(math.degrees(math.atan(slope)), abs=4.0)
 
 
+@pytest.mark.parametrize(("bar_m", "told"), [(0.0, False), (0.02, True)])
+def test_a_bar_across_a_narrow_load_is_found_on_a_bright_floor(bar_m: float, *, told: bool) -> None:
+    narrow = replace(laid(0.0), bars=7, diameter_m=0.03)
+    heights, bundle = map_of([narrow]), record(narrow)
+    x, fine = heights.x_m, 4
+    profile = 50 + 110 * np.cos(np.pi * x / 0.03) ** 4
+    y = heights.y0_m + heights.cell_m * ((np.arange(heights.shape[0] * fine) + 0.5) / fine - 0.5)
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        mottle = ndimage.gaussian_filter1d(rng.normal(0, 1, (y.size, x.size)), 1.5 * fine, axis=0)
+        gray = np.where(np.abs(x) < bundle.width_m / 2, profile, 84.0)
+        gray = gray * np.exp(0.05 * mottle / mottle.std())
+        gray[np.ix_(np.abs(y + 0.2) < bar_m / 2, np.abs(x) < 0.6)] = profile.mean()
+        pixels = 0.5 * PIXEL_M / heights.cell_m
+        cells = ndimage.gaussian_filter(gray, (pixels * fine, pixels)).reshape(-1, fine, x.size).mean(axis=1)
+        noisy = np.rint(cells + rng.normal(0, 0.7, cells.shape)).clip(1, 255).astype(np.uint8)
+        line = strongest(replace(heights, tops=noisy), bundle)
+        assert line is not None and (line.excess_ratio > 1) is told
+
+
 def test_straps_dunnage_and_a_bar_that_lies_along_are_no_bar_across() -> None:
     for seed in range(2):
         for heights in (photo(seed), photo(seed, 0.02, along=True)):
@@ -100,7 +121,7 @@ def test_a_lift_onto_a_thin_bar_is_vetoed_and_one_onto_straps_is_not() -> None:
     lift = judged(STOCK, heights=photo(0, 0.02, 0.1))
     assert codes(lift) == {"thin-bar"}
     failed, beside = (check for check in lift.checks if check.result == "failed")
-    assert failed.value is not None and failed.bound == MAX_STRENGTH
+    assert failed.value is not None and failed.bound == MAX_STRENGTH * math.sqrt(LOAD[0].width_m / WIDE_M)
     assert "crosses the load -0.6" in failed.reason and "crosses bundle 1 -0.56" in beside.reason
 
 

@@ -19,8 +19,11 @@ from barsight.yard.types import Bundle, Doubt, DoubtKind, HeightMap
 
 MAX_STRENGTH = 8.0
 """Maximum strength, in sigmas of its row, of a line on a load due to texture, dunnage or a strap with a
-bright middle.
+bright middle, where the load is at least WIDE_M wide. A bar's strength grows as the square root of the
+length of its line, and beside a narrow load a floor as bright as the bar shows none of it: there the limit
+falls as that root.
 """
+WIDE_M = 0.28
 SURE_STRENGTH = 14.0
 """Minimum strength of a line that can't be a strap."""
 STEP_M = 0.01
@@ -64,28 +67,36 @@ _ROW_SIGMAS = np.float32(math.sqrt(3.0))
 @dataclass(frozen=True)
 class ThinLine:
     """A line across a bundle. strength: its contrast in sigmas. along_m: where it crosses the axis, from the
-    middle. askew_deg: its angle from the perpendicular of the axis.
+    middle. askew_deg: its angle from the perpendicular of the axis. limit: strength from which it may be a
+    bar.
     """
 
     strength: float
     along_m: float
     askew_deg: float
+    limit: float = MAX_STRENGTH
+
+    @property
+    def excess_ratio(self) -> float:
+        """Return the strength relative to its limit."""
+        return self.strength / self.limit
 
 
 def find_thin_lines(heights: HeightMap, bundle: Bundle) -> tuple[ThinLine, ...] | None:
-    """Find the strongest line across a bundle in the top photo, then all others over MAX_STRENGTH; None where
+    """Find the strongest line across a bundle in the top photo, then all others over the limit; None where
     too little of the bundle is seen, or a part of it is saturated.
     """
     found = line_strengths(heights, bundle)
     if found is None:
         return None
     along, strength = found
+    limit = MAX_STRENGTH * math.sqrt(min(bundle.width_m / WIDE_M, 1.0))
     number, best = strength.argmax(axis=0), strength.max(axis=0)
     peaks = best == maximum_filter1d(best, 2 * round(APART_M / STEP_M) + 1)
-    peaks &= best >= min(MAX_STRENGTH, best.max())
+    peaks &= best >= min(limit, best.max())
     rows = np.flatnonzero(peaks)
     return tuple(
-        ThinLine(float(best[row]), float(along[row]), math.degrees(math.atan(_SLOPES[number[row]])))
+        ThinLine(float(best[row]), float(along[row]), math.degrees(math.atan(_SLOPES[number[row]])), limit)
         for row in rows[np.argsort(-best[rows], kind="stable")]
     )
 
@@ -97,7 +108,7 @@ def with_thin_lines(bundle: Bundle, heights: HeightMap) -> Bundle:
     if heights.tops is None or any(doubt.kind is DoubtKind.CROSSED for doubt in bundle.reasons):
         return bundle
     lines = find_thin_lines(heights, bundle)
-    if lines is None or lines[0].strength < MAX_STRENGTH:
+    if lines is None or lines[0].excess_ratio < 1:
         return bundle
     kind = DoubtKind.THIN_BAR if lines[0].strength >= SURE_STRENGTH else DoubtKind.FAINT_LINE
     doubt = Doubt(kind, f"a line runs across it {lines[0].along_m:+.2f} m from its middle: {kind.value}")

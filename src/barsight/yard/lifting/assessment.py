@@ -92,9 +92,9 @@ class LiftScene:
         return self._thin_lines[bundle.id]
 
     def thin_line(self, load: tuple[Bundle, ...]) -> ThinLine | None:
-        """Return the strongest line across a load; None where one of its bundles isn't seen."""
+        """Return the line across a load that most exceeds its limit; None where a bundle isn't seen."""
         lines = [found[0] for bundle in load if (found := self.thin_lines(bundle)) is not None]
-        return max(lines, key=lambda line: line.strength) if lines and len(lines) == len(load) else None
+        return max(lines, key=lambda line: line.excess_ratio) if lines and len(lines) == len(load) else None
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.clearance import STRAY_FIELD_M
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
-from barsight.yard.thin_lines import MAX_SLOPE, MAX_STRENGTH, ThinLine
+from barsight.yard.thin_lines import MAX_SLOPE, ThinLine
 from barsight.yard.types import Bundle, DoubtKind, HeightMap
 from barsight.yard.vetoes import Check, check_max, check_true
 
@@ -48,7 +48,7 @@ def thin_bar_checks(
         f"a line crosses the load {line.along_m:+.2f} m along it from its middle, "
         f"{abs(line.askew_deg):.0f} deg askew, and may be a thin bar"
     )
-    checks = [check_max(CODE, what, line.strength, MAX_STRENGTH, "sigma", reason)]
+    checks = [check_max(CODE, what, line.strength, line.limit, "sigma", reason)]
     if pixel_m is not None:
         hidden_m = FOUND_PX * max(pixel_m, heights.cell_m)
         reason = (
@@ -101,7 +101,7 @@ def beside_checks(
         return bool(under.any())
 
     what = "strength of the strongest line across a neighbour that extends under the magnet"
-    checks, strongest, where = [], 0.0, ""
+    checks, strongest, where = [], ThinLine(0.0, 0.0, 0.0), ""
     for bundle, lines in near:
         if lines is None:
             ends = np.linspace(-0.5, 0.5, math.ceil(bundle.length_m / UNSEEN_STEP_M) + 1) * bundle.length_m
@@ -110,11 +110,11 @@ def beside_checks(
                 checks.append(check_true(CODE, what, None, reason))
             continue
         for line in lines:
-            if line.strength > strongest and reaches(bundle, line):
-                strongest = line.strength
+            if line.excess_ratio > strongest.excess_ratio and reaches(bundle, line):
+                strongest = line
                 where = f"a line crosses bundle {bundle.id} {line.along_m:+.2f} m along it from its middle"
     reason = f"{where}: a thin bar there may extend under the magnet"
-    return [*checks, check_max(CODE, what, strongest, MAX_STRENGTH, "sigma", reason)]
+    return [*checks, check_max(CODE, what, strongest.strength, strongest.limit, "sigma", reason)]
 
 
 def may_reach(bundle: Bundle, place: Placement, magnet: Magnet, faces_z_m: float) -> bool:
