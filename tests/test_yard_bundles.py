@@ -518,6 +518,17 @@ def test_two_readings_of_one_bundle_are_joined() -> None:
     assert len(join_pieces([replace(piece, ends_open=(False, False)) for piece in pieces])) == 2
 
 
+@pytest.mark.parametrize("gap_m", [0.02, 0.04, 0.06, 0.08, 0.1])
+def test_a_gap_parts_two_bundles_end_to_end(gap_m: float) -> None:
+    laid = Laid(0.7, -1.6, 0.12, 0.0, diameter_m=0.05, bars=19)
+    behind = replace(laid, y_m=laid.y_m + laid.length_m + gap_m)
+    found = find_bundles(draw([laid, behind], y_m=(-3.5, 3.5)), SETTINGS)
+    for bundle in found:
+        assert any(bundle.ends_open) if len(found) == 2 else bundle.confidence < 0.5
+        doubts = [doubt for doubt in bundle.reasons if doubt.kind is DoubtKind.GAP]
+        assert doubts and [Doubt.read(doubt.sentence) for doubt in doubts] == doubts
+
+
 def test_ripples_of_the_floor_are_no_heading() -> None:
     """Matching ripples a flat floor along the pictures' columns; the bars alone say how bundles lie."""
     x, y = np.meshgrid(0.01 * np.arange(900), 0.01 * np.arange(400))

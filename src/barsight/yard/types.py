@@ -185,6 +185,7 @@ class DoubtKind(Enum):
     HIDDEN_FLANK = "beside it may lie over its"
     OVERLAP = "overlap: one may lie over the other"
     WALL = "it may be a wall"
+    GAP = "a gap as deep as half its width"
     MAY_GO_ON = "it may be wider"
     NO_STRAPS = "no straps that hold it"
     RIVAL = "explains the surface nearly as well"

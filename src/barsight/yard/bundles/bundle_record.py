@@ -55,8 +55,8 @@ def describe_bundles(
 ) -> tuple[Bundle, ...]:
     """Number the bundles by rising x of their centres and relate each one to its neighbours.
 
-    A bundle that may be a wall is doubtful, and so is one that reaches below the floor, since it can't be as
-    high as it was measured.
+    A bundle that may be a wall or two bundles end to end is doubtful, and so is one that reaches below the
+    floor, since it can't be as high as it was measured.
     """
     ordered = sorted(bundles, key=lambda b: tuple(b.centre_m))
     ordered = [replace(bundle, id=k) for k, bundle in enumerate(ordered)]
@@ -67,7 +67,8 @@ def describe_bundles(
             if part.owns(bundle.centre_m):
                 on_top, why = check_uncovered(bundle, near, layer)
                 doubtful = is_sunken(floor_m, bundle.bottom_z_m, bundle.width_m) or any(
-                    doubt.kind is DoubtKind.WALL for doubt in bundle.reasons
+                    doubt.kind is DoubtKind.WALL or (doubt.kind is DoubtKind.GAP and doubt.end is None)
+                    for doubt in bundle.reasons
                 )
                 out[bundle.id] = replace(
                     bundle, layer=layer, on_top=on_top, neighbours=list_neighbours(bundle, near),

@@ -20,7 +20,7 @@ _ALIKE_LOG = 0.7
 
 
 def join_pieces(bundles: list[Bundle]) -> list[Bundle]:
-    """Join pieces that continue each other where the ends that face each other are open.
+    """Join pieces that continue each other where the ends that face each other are open and no gap shows.
 
     The longer piece supplies the values; its sigma is widened by how much the other one differs.
     """
@@ -59,6 +59,8 @@ def _joined(whole: Bundle, piece: Bundle) -> Bundle | None:
         and abs(np.log(width)) < _ALIKE_LOG
     ):
         return None
+    if _shows_gap(whole, side) or _shows_gap(piece, order[1 - side]):
+        return None
     end = whole.ends_m[side] + (away[side, 0] - own) * whole.direction / np.cos(whole.pitch_rad)
     ends = np.array([whole.ends_m[0], end] if side else [end, whole.ends_m[1]])
     far = order[side]
@@ -93,6 +95,10 @@ def _joined(whole: Bundle, piece: Bundle) -> Bundle | None:
         confidence=min(whole.confidence, piece.confidence), reasons=reasons,
         cover_doubts=tuple(dict.fromkeys(whole.cover_doubts + piece.cover_doubts)),
     )  # fmt: skip
+
+
+def _shows_gap(bundle: Bundle, end: int) -> bool:
+    return any(doubt.kind is DoubtKind.GAP and doubt.end == end for doubt in bundle.reasons)
 
 
 def _at_end(doubt: Doubt, end: int) -> Doubt:

@@ -8,7 +8,7 @@ from scipy import ndimage
 from barsight.core.arrays import Bool, Float64, Int64, UInt8
 from barsight.core.linalg.robust import known_median
 from barsight.yard.bundles.crossing_bundles import rise_over
-from barsight.yard.bundles.fitting.ends import End
+from barsight.yard.bundles.fitting.ends import End, gap_rows
 from barsight.yard.bundles.fitting.outline import BARS_OF_RINGS, bundle_width
 from barsight.yard.bundles.fitting.outline_fit import ABOVE, AGREES, BELOW, DIAMETER, SLOPE_U, SLOPE_Z, U, Z
 from barsight.yard.bundles.fitting.settings import BundleSettings
@@ -103,6 +103,12 @@ def list_doubts(
         if end.is_open:
             kind = DoubtKind.COVERED_END if end.is_covered else DoubtKind.OTHER
             out.append(Doubt(kind, f"the {name} end is open: {end.why}", number))
+        if end.shows_gap:
+            said = f"the {name} end is open: behind it shows {DoubtKind.GAP.value}"
+            out.append(Doubt(DoubtKind.GAP, said, number))
+    if deep := gap_rows(reading.found.grid, reading.found.fit, settings):
+        said = f"{DoubtKind.GAP.value}, {deep * cell:.2f} m long, parts it: two bundles may lie end to end"
+        out.append(Doubt(DoubtKind.GAP, said))
     if reading.rival is not None and reading.rival_weight > 0.9 * reading.weight:
         gap = abs(reading.rival.fit.width_m - reading.found.fit.width_m)
         if gap > 0.15 * reading.found.fit.width_m:

@@ -19,6 +19,8 @@ _LOOK_M = 1.3
 _PROOF_M = 0.1
 _RAGGED_M = 0.2
 _SOME, _MAX_VALUE = 0.3, 0.6
+_DEEP_RATIO = 0.5
+"""Minimum depth of the surface under the outline, in widths, from which the bundle has ended."""
 _GROWTH_CELLS = 1.5
 """Distance, in cells, by which the map extends a bundle beyond its true end."""
 _SEEN_SIGMA_M, _SEEN_SIGMAS = 0.006, 1.0
@@ -42,7 +44,8 @@ class End:
     """An end of a bundle at v_m along its grid.
 
     sigma_m, and flush_sigma_m for bars that certainly end flush, are NaN where the end is open; `why` then
-    gives the reason. is_covered: something higher lies there.
+    gives the reason. is_covered: something higher lies there. shows_gap: the surface sinks deep behind the
+    open end, but not far enough to prove it.
     """
 
     v_m: float
@@ -51,6 +54,7 @@ class End:
     why: str = ""
     flush_sigma_m: float = np.nan
     is_covered: bool = False
+    shows_gap: bool = False
 
 
 def find_end(grid: AlignedMap, fit: Fit, step: int, settings: BundleSettings) -> End:
@@ -65,17 +69,17 @@ def find_end(grid: AlignedMap, fit: Fit, step: int, settings: BundleSettings) ->
     known, misfit = _beyond(grid, fit, row, step, settings)
     cell = grid.cell_m
     v = grid.v0_m + cell * (row + step / 2)
-    deep = -0.5 * fit.width_m
+    deep = -_DEEP_RATIO * fit.width_m
     ragged = lower = 0
     for k in range(known.size):
         if known[k] < _SOME:
             continue
         if misfit[k] > 2 * settings.agreement_m:
-            return End(v, float("nan"), True, "something higher lies there", is_covered=True)
+            return _open_end(v, "something higher lies there", lower, is_covered=True)
         if misfit[k] > deep:
             ragged = k + 1
             if ragged * cell > _RAGGED_M:
-                return End(v, float("nan"), True, "the surface goes on at about its height")
+                return _open_end(v, "the surface goes on at about its height", lower)
         elif known[k] >= _MAX_VALUE:
             lower += 1
             if lower * cell >= _PROOF_M:
@@ -85,7 +89,19 @@ def find_end(grid: AlignedMap, fit: Fit, step: int, settings: BundleSettings) ->
                 flush = math.hypot(_SEEN_SIGMA_M, _SEEN_SIGMAS * fit.sigma_m)
                 sigma = math.hypot(flush, _RAGGED_RATIO * spread, _UNEVEN_SIGMAS * uneven)
                 return End(end, sigma, is_open=False, flush_sigma_m=flush)
-    return End(v, float("nan"), True, "the map doesn't show what lies beyond")
+    return _open_end(v, "the map doesn't show what lies beyond", lower)
+
+
+def _open_end(v_m: float, why: str, lower: int, *, is_covered: bool = False) -> End:
+    """Make an end that wasn't seen. lower: number of rows beyond it in which the surface lies deep."""
+    return End(v_m, float("nan"), True, why, is_covered=is_covered, shows_gap=lower > 0)
+
+
+def gap_rows(grid: AlignedMap, fit: Fit, settings: BundleSettings) -> int:
+    """Count the rows between a bundle's ends in which most of its width is seen to lie deep."""
+    over = _over(grid, fit, np.arange(fit.first, fit.last + 1), settings)
+    over = over[np.isfinite(over).mean(axis=1) >= _MAX_VALUE]
+    return int((nan_medians(over.T) <= -_DEEP_RATIO * fit.width_m).sum()) if len(over) else 0
 
 
 def middle_and_length_sigma(ends_sigma_m: tuple[float, float]) -> tuple[float, float]:
