@@ -518,6 +518,15 @@ def test_two_readings_of_one_bundle_are_joined() -> None:
     assert len(join_pieces([replace(piece, ends_open=(False, False)) for piece in pieces])) == 2
 
 
+def test_a_bundle_of_the_next_row_is_no_neighbour_at_a_flank() -> None:
+    laid = Laid(0.7, -1.7, 0.1355, 0.0)
+    (alone,) = find_bundles(draw([laid], y_m=(-3.7, 3.7)), SETTINGS)
+    for aside_m in (0.0, 0.1):
+        row = [laid, replace(laid, x_m=laid.x_m + aside_m, y_m=1.7)]
+        found = nearest(find_bundles(draw(row, y_m=(-3.7, 3.7)), SETTINGS), laid)
+        assert found.bars == alone.bars and found.section_m2 == pytest.approx(alone.section_m2, rel=0.03)
+
+
 @pytest.mark.parametrize("gap_m", [0.02, 0.04, 0.06, 0.08, 0.1])
 def test_a_gap_parts_two_bundles_end_to_end(gap_m: float) -> None:
     laid = Laid(0.7, -1.6, 0.12, 0.0, diameter_m=0.05, bars=19)

@@ -254,17 +254,29 @@ def unseen_places(level: Float64) -> int:
 
 
 def _is_neighbour(one: FittedOutline, beside_m: Float64, others: list[FittedOutline]) -> Bool:
-    """Check which places (N,) beside a bundle's axis, at mid-length, lie in another of similar width."""
+    """Check which places (N,) beside a bundle's axis, at mid-length, lie in another of similar width that
+    lies beside some of its length.
+    """
     u = one.fit.values[U] + beside_m
     places = one.grid.to_map(np.column_stack([u, np.full(len(u), one.fit.v_m)]))
+    ends = one.grid.to_map(_axis_ends(one))
     taken = np.zeros(len(u), bool)
     for other in others:
         fit = other.fit
         if other is one or abs(np.log(fit.width_m / one.fit.width_m)) > _ALIKE_LOG:
             continue
+        along, own_along = other.grid.from_map(ends)[:, 1], _axis_ends(other)[:, 1]
+        if along.max() < own_along[0] or along.min() > own_along[1]:
+            continue
         away = other.grid.from_map(places) - [fit.values[U], fit.v_m]
         taken |= np.abs(away[:, 0] - fit.values[SLOPE_U] * away[:, 1]) < fit.width_m / 2
     return taken
+
+
+def _axis_ends(one: FittedOutline) -> Float64:
+    """Return the ends (2, 2) of a bundle's axis, u and v of its grid."""
+    v = one.grid.v0_m + one.grid.cell_m * np.array([one.fit.first, one.fit.last])
+    return np.column_stack([one.fit.values[U] + one.fit.values[SLOPE_U] * (v - one.fit.v_m), v])
 
 
 def is_overhung(inwards: Float64, outwards: Float64) -> bool:
