@@ -518,6 +518,13 @@ def test_two_readings_of_one_bundle_are_joined() -> None:
     assert len(join_pieces([replace(piece, ends_open=(False, False)) for piece in pieces])) == 2
 
 
+def test_a_bar_along_a_bundle_five_times_as_wide_lies_on_it() -> None:
+    laid = Laid(0.7, 0.0, 0.2155, 0.0, bars=19)
+    bar = Laid(0.7, 0.0, laid.top_z_m + 0.033, 0.0, bars=1, length_m=2.0)
+    found = find_bundles(draw([laid, bar]), SETTINGS)
+    assert nearest(found, laid).on_top is False and nearest(found, bar).on_top
+
+
 def test_a_bundle_of_the_next_row_is_no_neighbour_at_a_flank() -> None:
     laid = Laid(0.7, -1.7, 0.1355, 0.0)
     (alone,) = find_bundles(draw([laid], y_m=(-3.7, 3.7)), SETTINGS)

@@ -7,7 +7,10 @@ import numpy as np
 from barsight.core.arrays import Float64
 from barsight.yard.types import Bundle, Doubt, DoubtKind
 
-_OVERLAP_M = 0.05
+_OVERLAP_M, _MARGIN_RATIO = 0.05, 0.2
+"""Length (m) along a bundle from which a higher one covers it, and the depth to which that must reach over
+its side, in widths of the narrower one.
+"""
 _TOUCH_M = 0.03
 _DUNNAGE_M = 0.1
 _HIGHER_RATIO = 0.4
@@ -76,7 +79,7 @@ def _lies_on(upper: Bundle, lower: Bundle) -> bool:
     """Check whether `upper` is higher and its footprint covers a place on `lower`."""
     if upper.centre_m[2] - lower.centre_m[2] < _HIGHER_RATIO * (upper.width_m + lower.width_m) / 2:
         return False
-    return _common_length(lower, upper, -0.2 * lower.width_m) > _OVERLAP_M
+    return _common_length(lower, upper, -_MARGIN_RATIO * min(lower.width_m, upper.width_m)) > _OVERLAP_M
 
 
 def list_overlaps(bundle: Bundle, bundles: list[Bundle]) -> tuple[Doubt, ...]:
