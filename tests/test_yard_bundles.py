@@ -273,7 +273,13 @@ def test_the_bars_of_a_bundle_are_found_one_by_one() -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [{"catalogue_mm": (0.5,)}, {"max_width_m": 0.05}, {"slice_m": 0.0}, {"max_skew_deg": 40.0}],
+    [
+        {"catalogue_mm": (0.5,)},
+        {"catalogue_mm": (6.0, 8.0)},
+        {"max_width_m": 0.05},
+        {"slice_m": 0.0},
+        {"max_skew_deg": 40.0},
+    ],
 )
 def test_impossible_settings_are_refused(change: dict[str, object]) -> None:
     with pytest.raises(ConfigError):

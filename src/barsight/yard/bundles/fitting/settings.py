@@ -7,6 +7,7 @@ from pathlib import Path
 
 from barsight.core.errors import ConfigError
 from barsight.core.settings.values import NOT_NEGATIVE, OVER_0, POSITIVE, expect_ranges
+from barsight.yard.bundles.fitting.outline import BARS_OF_RINGS, TRIANGLE, TRIANGLE_BARS_M, bundle_width
 
 
 @dataclass(frozen=True)
@@ -71,3 +72,24 @@ class BundleSettings:
         )  # fmt: skip
         if self.max_width_m <= self.min_width_m:
             raise ConfigError("bundles.max_width_m must be over bundles.min_width_m")
+        if self.catalogue_mm and not any(
+            self.allows(rings, d / 1000) for rings in range(len(BARS_OF_RINGS)) for d in self.catalogue_mm
+        ):
+            raise ConfigError(
+                "bundles.catalogue_mm lists no diameter of which a bundle may consist: list one, or change "
+                "bundles.min_bar_diameter_m, bundles.min_single_diameter_m or the bounds of the width"
+            )
+
+    def allows(self, rings: int, diameter_m: float) -> bool:
+        """Check whether bars of a diameter may form a bundle of so many rings."""
+        low, high = self.diameters_m(rings)
+        return low <= diameter_m <= high
+
+    def diameters_m(self, rings: int) -> tuple[float, float]:
+        """Return the minimum and maximum diameter of bars that form a bundle of so many rings."""
+        narrowest = self.min_width_m if rings else self.min_single_diameter_m
+        low = max(narrowest / bundle_width(rings, 1.0), self.min_bar_diameter_m)
+        high = self.max_width_m / bundle_width(rings, 1.0)
+        if rings == TRIANGLE:
+            return max(low, TRIANGLE_BARS_M[0]), min(high, TRIANGLE_BARS_M[1])
+        return low, high

@@ -12,8 +12,6 @@ from barsight.core.linalg.robust import nan_medians
 from barsight.yard.bundles.fitting.outline import (
     BARS_OF_RINGS,
     STEP_M,
-    TRIANGLE,
-    TRIANGLE_BARS_M,
     bundle_width,
     make_outline,
     period_rad,
@@ -104,13 +102,9 @@ def make_templates(settings: BundleSettings, cell_m: float) -> Templates:
 
 
 def _diameters(rings: int, settings: BundleSettings) -> list[float]:
-    narrowest = settings.min_single_diameter_m if rings == 0 else settings.min_width_m
-    low = max(narrowest / bundle_width(rings, 1.0), settings.min_bar_diameter_m)
-    high = settings.max_width_m / bundle_width(rings, 1.0)
-    if rings == TRIANGLE:
-        low, high = max(low, TRIANGLE_BARS_M[0]), min(high, TRIANGLE_BARS_M[1])
     if settings.catalogue_mm:
-        return [d / 1000 for d in settings.catalogue_mm if low <= d / 1000 <= high]
+        return [d / 1000 for d in settings.catalogue_mm if settings.allows(rings, d / 1000)]
+    low, high = settings.diameters_m(rings)
     if low > high:
         return []
     return list(np.geomspace(low, high, int(np.log(high / low) / np.log(_RATIO)) + 2))
