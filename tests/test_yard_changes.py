@@ -60,6 +60,17 @@ def test_an_end_that_was_seen_twice_tells_a_move_along(
     assert change.along_mm == pytest.approx(500 if moved else 0)
 
 
+def test_a_bundle_along_x_that_turns_through_the_right_angle_has_not_moved_along() -> None:
+    """One end is open; its low end is the other one once its yaw passes 90 deg."""
+    before, after = (
+        record(replace(STOCK[0], yaw_deg=yaw_deg), k, ends_open=is_open)
+        for k, (yaw_deg, is_open) in enumerate(((89.99, (True, False)), (-89.99, (False, True))))
+    )
+    (change,) = compared([before], [after])
+    assert change.kind == "same" and not has_moved(before, after)
+    assert change.along_mm == pytest.approx(0, abs=0.1) and change.sigmas[1] > 0
+
+
 @pytest.mark.slow
 def test_what_errs_as_stated_is_rarely_called_a_change() -> None:
     rng = np.random.default_rng(5)

@@ -114,10 +114,12 @@ def displacement_along(before: Bundle, after: Bundle) -> tuple[float, float]:
     if not (any(before.ends_open) or any(after.ends_open)):
         return along, math.hypot(before.sigma.along_m, after.sigma.along_m)
     axis = np.array([-math.sin(before.yaw_rad), math.cos(before.yaw_rad)])
-    for end in (0, 1):
-        if not (before.ends_open[end] or after.ends_open[end]):
-            away = after.ends_m[end, :2] - before.ends_m[end, :2]
-            return float(away @ axis), math.hypot(_end_sigma(before, end), _end_sigma(after, end))
+    # Along X, a small turn swaps which end is the low one.
+    swapped = math.cos(after.yaw_rad - before.yaw_rad) < 0
+    for end, then in ((0, int(swapped)), (1, int(not swapped))):
+        if not (before.ends_open[end] or after.ends_open[then]):
+            away = after.ends_m[then, :2] - before.ends_m[end, :2]
+            return float(away @ axis), math.hypot(_end_sigma(before, end), _end_sigma(after, then))
     return 0.0, 0.0
 
 
