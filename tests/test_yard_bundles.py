@@ -513,6 +513,9 @@ def test_two_readings_of_one_bundle_are_joined() -> None:
         False,
     )
     assert whole.sigma.lateral_m > one.sigma.lateral_m
+    wide = replace(pieces[1], bars=None, width_m=1.4 * one.width_m, section_m2=2 * one.section_m2)
+    (mixed,) = join_pieces([replace(pieces[0], bars=None, length_m=one.length_m + 0.01), wide])
+    assert bundle_mass(mixed).upper_kg > 1.5 * bundle_mass(mixed).kg, "one piece holds twice the steel"
     doubt = Doubt(DoubtKind.NO_STRAPS, "the photo shows no straps that hold it")
     for strapped in ((True, False), (False, True), (False, False)):
         told = [

@@ -67,6 +67,8 @@ def _joined(whole: Bundle, piece: Bundle) -> Bundle | None:
     is_open, sigmas = list(whole.ends_open), list(whole.ends_sigma_m)
     is_open[side], sigmas[side] = piece.ends_open[far], piece.ends_sigma_m[far]
     middle, length = middle_and_length_sigma((sigmas[0], sigmas[1]))
+    known = np.isfinite(piece.section_m2)
+    section = piece.section_m2 if known else whole.section_m2 * width**2
     sigma = replace(
         whole.sigma,
         lateral_m=float(np.hypot(whole.sigma.lateral_m, aside)),
@@ -77,6 +79,7 @@ def _joined(whole: Bundle, piece: Bundle) -> Bundle | None:
         ),
         along_m=middle,
         length_m=length,
+        section_m2=float(np.hypot(whole.sigma.section_m2, section - whole.section_m2)),
     )
     # Straps on either piece hold both.
     kept, others = (
