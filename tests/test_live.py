@@ -413,6 +413,16 @@ def test_a_jump_of_the_encoders_shows_at_once_and_stays_until_they_come_back(
         assert out[-1] == pytest.approx(4 + back_s + 0.95 if back_s < 5 else t[-1])
 
 
+@pytest.mark.parametrize("begin_s", [-1000, -1, 0, 1_700_000_000])
+def test_a_jump_shows_wherever_the_clock_begins(begin_s: int) -> None:
+    stamps = np.arange(40) * 50_000_000 + begin_s * 10**9
+    place = np.zeros((40, 3))
+    place[:, 0] = 0.015 * np.arange(40)
+    assert JumpWatch(0.002).check(stamps, place) == 0
+    place[10:, 0] += 0.5
+    assert JumpWatch(0.002).check(stamps, place) == pytest.approx(0.5)
+
+
 def test_encoders_that_come_back_from_a_freeze_have_not_jumped() -> None:
     t = np.arange(0, 8, 0.05)
     mounted = CraneSamples(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(3), np.eye(3), 0.002)

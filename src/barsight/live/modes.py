@@ -38,6 +38,8 @@ STAMP_SIGMA_S = 0.02
 """Standard deviation (s) of stamps while a device's clock is being estimated anew."""
 HELD_NS, HELD_READINGS = 5 * NS_PER_S, 100
 """Window in which faults are searched: its length in ns, and its minimum number of readings."""
+BEFORE_ALL_NS = -(2**63)
+"""A stamp before all others: a clock may count from any moment, so stamps may be 0 or negative."""
 LOOK_NS = NS_PER_S // 10
 """Interval in ns between searches for faults, by the readings' stamps."""
 
@@ -148,10 +150,10 @@ class JumpWatch:
     sigma_m: standard deviation of a reading. after_ns: readings up to this stamp aren't judged.
     """
 
-    def __init__(self, sigma_m: float, after_ns: int = 0) -> None:
+    def __init__(self, sigma_m: float, after_ns: int = BEFORE_ALL_NS) -> None:
         self._min_jump_m = max(MIN_JUMP_M, JUMP_SIGMAS * sigma_m)
         self._off_m: Float64 = np.zeros(3)
-        self._last_ns, self._jump_ns, self._from_ns = after_ns, 0, 0
+        self._last_ns, self._jump_ns, self._from_ns = after_ns, BEFORE_ALL_NS, BEFORE_ALL_NS
         self._jump_m: Float64 = np.zeros(3)
         self._bound_m = 0.0
 
@@ -164,7 +166,7 @@ class JumpWatch:
         away = float(np.linalg.norm(self._off_m))
         if away > self._bound_m:
             return away
-        is_recent = self._jump_ns > 0 and self._last_ns - self._jump_ns < seconds_to_ns(JUMP_HELD_S)
+        is_recent = self._last_ns - self._jump_ns < seconds_to_ns(JUMP_HELD_S)
         return float(np.linalg.norm(self._jump_m)) if is_recent else 0.0
 
     def begin_anew(self) -> None:
