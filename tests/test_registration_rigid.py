@@ -88,3 +88,15 @@ def test_what_cant_be_aligned_is_refused_with_the_reason() -> None:
         result = align_rigid(source, TRUTH.apply(source), FRAMES)
         assert isinstance(result, Failed)
         assert result.code == code
+
+
+@pytest.mark.parametrize("count", [3, 4, 6])
+def test_few_points_without_sigmas_are_no_surer_than_they_may_be(count: int) -> None:
+    beyond = []
+    for seed in range(600):
+        rng = np.random.default_rng((5, seed))
+        corners = [[-5, -3, 0], [5, -2, 0.5], [-1, 3, 0], [6, 4, 1], [0, 0, 1], [-6, 2, 0.5]]
+        source = np.array(corners[:count], float)
+        result = found(source, TRUTH.apply(source) + rng.normal(0, 5e-3, (count, 3)))
+        beyond.append(np.abs(error(result, TRUTH)) > 1.96 * np.sqrt(np.diag(result.covariance)))
+    assert np.mean(beyond) < 0.06

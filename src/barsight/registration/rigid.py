@@ -28,8 +28,8 @@ class Alignment:
 
     covariance: (6, 6), a small rotation (rad) from the left, then the translation (m), both in target axes.
     residuals_m: (N, 3) target minus moved source. scale, scale_sigma: the scale that a similarity would have
-    found instead of 1, for diagnosis only. sigma_m: noise of a coordinate according to the residuals (NaN
-    without degrees of freedom). chi2: of the residuals with the stated covariances, NaN where there are none.
+    found instead of 1, for diagnosis only. sigma_m: noise of a coordinate according to the residuals. chi2:
+    of the residuals with the stated covariances, NaN where there are none.
     """
 
     target_from_source: Pose
@@ -54,7 +54,8 @@ def align_rigid(
     frames: (target, source). covariance_m2: (N, 3, 3) of each pair's difference, target axes, or (N, N) of
     the points, the same on each axis. Points are first weighted by its trace, then by all of it (`_refined`),
     so that chi2 has its degrees of freedom. Without it all have the same weight, and a common sigma is
-    estimated from the residuals. The rotation is the one nearest to sum p'' q''^T; the paper prints its
+    estimated from the residuals: errors divided by that follow Student's t distribution, of which the
+    covariance is the variance. The rotation is the one nearest to sum p'' q''^T; the paper prints its
     transpose. Failed `few-points`, `collinear`.
     """
     expect_shape("source", source, (None, 3))
@@ -81,9 +82,10 @@ def align_rigid(
     residuals = target - pose.apply(source)
     extent = float((weight * (q**2).sum(1)).sum())
 
-    free = max(residuals.size - 6, 0)
-    sigma = float(np.sqrt((weight[:, None] * residuals**2).sum() / free / weight.mean())) if free else np.nan
-    spread, known, chi2 = np.broadcast_to(np.eye(3), (len(source), 3, 3)), sigma**2, np.nan
+    free = residuals.size - 6
+    sigma = float(np.sqrt((weight[:, None] * residuals**2).sum() / free / weight.mean()))
+    spread, chi2 = np.broadcast_to(np.eye(3), (len(source), 3, 3)), np.nan
+    known = sigma**2 * free / (free - 2)
     if covariance_m2 is not None:
         spread, known = covariance_m2, 1.0
         chi2 = float((residuals * _divided(residuals, spread)).sum())
