@@ -17,9 +17,11 @@ from barsight.cli.main import run
 
 
 def calibrate(pictures: Path, out: Path, board: str) -> dict:
-    assert run(["calibrate", "stereo", str(pictures), "--board", board, "-o", str(out)]) == 0
+    code = run(["calibrate", "stereo", str(pictures), "--board", board, "-o", str(out)])
     assert out.with_suffix(".html").read_text().count("plotly") > 10
-    return json.loads(out.with_suffix(".json").read_text())
+    report = json.loads(out.with_suffix(".json").read_text())
+    assert code == (5 if report["verdict"] == "redo" else 0)
+    return report
 
 
 def refused(capsys: pytest.CaptureFixture[str], arguments: list[str]) -> str:
@@ -50,6 +52,7 @@ def test_sourishgs_rig(data: Path, tmp_path: Path) -> None:
 
 def test_every_view_of_the_webcams_is_used(data: Path, tmp_path: Path) -> None:
     report = calibrate(data / "checkerboard_webcams", tmp_path / "rig.yaml", "checkerboard:9x6:0.025")
+    assert report["verdict"] == "redo"
     assert {r["view"] for r in report["removed"] if r["camera"] == "both"} == set()
     assert not [r for r in report["removed"] if "checkerboard" in r["reason"]]
     assert abs(report["baseline_mm"] - 60.39) <= 0.003 * 60.39

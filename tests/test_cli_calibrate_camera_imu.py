@@ -131,6 +131,19 @@ def test_degrees_and_g_are_read_when_said(recorded: Path, tmp_path: Path) -> Non
     assert read_rig_file(out).body_from_cam0.distance_to(true_rig().body_from_cam0) < 3e-3
 
 
+def test_a_mounting_to_be_redone_is_no_success(
+    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    views, imu, _ = simulated(4, one_axis=True)
+    write_detections(tmp_path, views, imu)
+    out = tmp_path / "rig_imu.yaml"
+    other = {name: recorded / f"{name}.yaml" for name in ("rig", "imu")}
+    assert run(arguments(tmp_path, out, **other)) == 5
+    last = capsys.readouterr().err.strip().splitlines()[-1]
+    assert "redo the calibration" in last and str(out) in last
+    assert json.loads(out.with_suffix(".json").read_text())["verdict"] == "redo"
+
+
 @pytest.mark.slow
 def test_pictures_of_a_recording_with_its_own_noise(tmp_path: Path) -> None:
     truth, out = draw_recording(tmp_path / "waved"), tmp_path / "rig.yaml"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from pathlib import Path
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from barsight.calibration.stereo.projection_uncertainty import (
     projection_sigma,
 )
 from barsight.core.arrays import Float64
-from barsight.core.errors import Failed
+from barsight.core.errors import Failed, MeasurementError
 
 RANGES_M = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 10.0, 12.0)
 CROSS_RANGES_M = (2.0, 4.0, 7.0, 12.0)
@@ -179,3 +180,11 @@ def summary_sentence(lines: Sequence[Line]) -> str:
         f"{line.name} {line.value} ({line.verdict})" for line in lines if line.verdict is not Verdict.GOOD
     ]
     return "good in every line" if not weak else "; ".join(weak)
+
+
+def expect_usable(lines: Sequence[Line], path: Path) -> None:
+    """Raise MeasurementError if a line says that the calibration in a file must be redone."""
+    redo = [line for line in lines if line.verdict is Verdict.REDO]
+    if redo:
+        told = "; ".join(f"{line.name} {line.value}" for line in redo)
+        raise MeasurementError(f"{path}: redo the calibration, don't measure with it ({told}); see its report")

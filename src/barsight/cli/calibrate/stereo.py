@@ -16,7 +16,7 @@ from barsight.calibration.boards.detection_files import has_detections
 from barsight.calibration.files.rig_file import write_rig_file
 from barsight.calibration.geometry.projection import Lens
 from barsight.calibration.stereo.calibration import StereoCalibration, calibrate_stereo, rig_file_section
-from barsight.calibration.stereo.verdict import Verdict, assess, summary_sentence
+from barsight.calibration.stereo.verdict import Verdict, assess, expect_usable, summary_sentence
 from barsight.cli.arguments import call
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
@@ -40,6 +40,8 @@ def run(arguments: Sequence[str]) -> None:
         resolution: str | None = None,
     ) -> None:
         """Calibrate two cameras from pictures of a board that both see.
+
+        The exit code is 5 if the verdict is to redo it; the files are written all the same.
 
         Args:
             pictures: Folder of pictures in pairs (folders left and right, or left01.png and right01.png), an
@@ -71,6 +73,7 @@ def run(arguments: Sequence[str]) -> None:
         console.print(f"[{colour}]{assessment.verdict}[/{colour}]: {summary_sentence(assessment.lines)}")
         for sentence in assessment.advice:
             console.print(f"  {sentence}", highlight=False)
+        expect_usable(assessment.lines, out)
 
     call(command, "calibrate stereo", arguments)
 
