@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import socket
 import struct
 import subprocess
@@ -35,13 +34,14 @@ def read_out(content: bytes) -> dict[str, int]:
 
 
 @cache
-def _filled() -> Path:
-    return Path(fill_store(Path(tempfile.mkdtemp(prefix="barsight-plant-"))).removeprefix("sqlite:///"))
+def _filled() -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        return Path(fill_store(Path(folder)).removeprefix("sqlite:///")).read_bytes()
 
 
 def yard_store(folder: Path) -> str:
     """A store of its own with three lifts on offer, made once; return its URL."""
-    shutil.copy(_filled(), folder / "yard.db")
+    (folder / "yard.db").write_bytes(_filled())
     return f"sqlite:///{folder / 'yard.db'}"
 
 
