@@ -184,6 +184,14 @@ def test_one_lift_at_a_time_has_begun(plant: Plant) -> None:
         begin_lift(plant.store, second.lift_id, "ann")
 
 
+def test_who_confirms_a_lift_too_late_reads_that_it_is_claimed_already(plant: Plant) -> None:
+    claim = claimed(plant)
+    with plant.store.reading() as connection:
+        lift = next(one for one in open_lifts(connection) if one.lift_id == claim.lift_id)
+    with pytest.raises(InputError, match=f"lift {claim.lift_id}: is claimed already"):
+        confirm_lift(plant.store, lift.lift_id, lift.map_id, "ann")
+
+
 def test_a_report_is_taken_once_and_answered_again(plant: Plant) -> None:
     claim = claimed(plant)
     heavy = LiftReport(True, False, 9000.0)

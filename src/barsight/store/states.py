@@ -156,8 +156,7 @@ def _step(
     count, present = _last(opened.connection, table, owner, number)
     if state not in steps.get(present, ()):
         allowed = ", ".join(steps.get(present, ())) or "nothing"
-        raise InputError(
-            f"{owner} {number}", f"is {present}: {state} can't follow", f"what can follow is {allowed}"
-        )
+        problem = f"is {state} already" if state == present else f"is {present}: {state} can't follow"
+        raise InputError(f"{owner} {number}", problem, f"what can follow is {allowed}")
     values = {f"{owner}_id": number, "step": count + 1, "state": state, "who": opened.who, "note": note}
     opened.add(table, at_ns=opened.at_ns, **values)
