@@ -30,7 +30,7 @@ from barsight.yard.lifting.targets import map_vetoes, plan_lifts
 from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.lifting.validity import disturbed_checks, validity
 from barsight.yard.magnet.contact import rest_magnet
-from barsight.yard.magnet.description import Beam, Magnet, Tolerance
+from barsight.yard.magnet.description import Beam, Magnet, Pole, Tolerance
 from barsight.yard.magnet.footprint import BundleTable, Placement, count_gripped
 from barsight.yard.magnet.holding import hold_load, pole_shares, share_checks, weakest_pole
 from barsight.yard.magnet.resting_plane import rest_plane
@@ -257,6 +257,27 @@ def test_the_weakest_pole_is_named() -> None:
     checks = share_checks(weakest_pole(lift.contact, 120e3, MAGNET, lift.place, (record(laid(0.3)),)))
     assert [(one.code, one.result) for one in checks] == [("weak-pull", "failed")]
     assert "pole 1's pull" in checks[0].reason
+
+
+@pytest.mark.parametrize("across", [(0.0,), (-0.06, 0.06)])
+def test_a_load_beyond_the_end_of_the_only_face_along_pries_it_off(across: tuple[float, ...]) -> None:
+    magnet = weak(poles=tuple(Pole(0.0, u, 0.5, 0.1) for u in across))
+    lift = judged([laid(0.3)], place=Placement(0.3, 0.28, 0.0), magnet=magnet)
+    assert lift.contact is not None
+    shares = pole_shares(lift.contact, magnet, lift.place, (record(laid(0.3)),))
+    # Moments about the face's far edge, which the safety factor of 2 covers in part.
+    pried = (1 + 2 * (0.28 + 1.645 * SIGMA.along_m) / 0.5) / 2
+    assert shares.max() >= pried / len(across) > 1.1 / len(across)
+
+
+def test_poles_off_their_row_by_a_millimetre_are_pried_off_across_as_in_one_row() -> None:
+    for off in (0.0, 0.0012):
+        poles = tuple(replace(pole, across_m=off if k % 2 else -off) for k, pole in enumerate(MAGNET.poles))
+        magnet = weak(poles=poles)
+        lift = judged([laid(0.3)], magnet=magnet)
+        assert lift.contact is not None
+        shares = pole_shares(lift.contact, magnet, lift.place, (record(laid(0.37)),))
+        assert shares.max() > 1.2 * (0.25 + 2.1 / 9.8 * 1.645 * SIGMA.along_m)
 
 
 def test_too_heavy_for_magnet_or_crane() -> None:

@@ -44,7 +44,7 @@ class PoleContact:
     contact_share: share of the face that lies on steel. unknown_share: unseen share of the cells under it,
     except for strips along it that are too narrow to hide an obstacle. z_m: height of its centre. pull_n,
     pull_low_n: its part of the pull and its lower bound, 0 until a load is known (`holding.hold_load`).
-    pull_across_m: where the lower bound acts, across from its centre.
+    pull_across_m, pull_along_m: where the lower bound acts, across and along from its centre.
     """
 
     gap_m: float
@@ -56,6 +56,7 @@ class PoleContact:
     pull_n: float = 0.0
     pull_low_n: float = 0.0
     pull_across_m: float = 0.0
+    pull_along_m: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

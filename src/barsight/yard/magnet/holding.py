@@ -31,6 +31,9 @@ MAX_CUT_RATIO = 0.12
 MIN_DIAMETER_RATIO = 0.1
 """Minimum lower bound of a diameter, as a fraction: some twenty thin bars have been read as one thick bar."""
 
+SAME_PLACE = 1e-6
+"""Spread of the poles' centres in a direction, relative to the other one's, below which it is no lever."""
+
 
 def hold_load(contact: Contact, magnet: Magnet, load: tuple[Bundle, ...], strap_m: float) -> Contact:
     """Add the pull on the load's bars; without a load there is none.
@@ -58,21 +61,24 @@ def _pull(
     likely, low = magnet.pull.on_bars(diameter_m, min(pole.length_m, pole.width_m))
     sums = _sum_pull(own.gap_map_m, np.array(magnet.pull.gap_m), likely, low, likely_m, higher_m)
     newton = 1e3 * pole.length_m * pole.width_m / own.gap_map_m.size
-    across = pole.width_m * sums[2] / sums[1] if sums[1] > 0 else 0.0
-    return replace(own, pull_n=newton * sums[0], pull_low_n=newton * sums[1], pull_across_m=across)
+    across, along = (moment / sums[1] if sums[1] > 0 else 0.0 for moment in sums[2:])
+    return replace(
+        own, pull_n=newton * sums[0], pull_low_n=newton * sums[1],
+        pull_across_m=pole.width_m * across, pull_along_m=pole.length_m * along,
+    )  # fmt: skip
 
 
 @kernel()
 def _sum_pull(
     gaps: Float64, gap_m: Float64, likely: Float64, low: Float64, likely_m: float, higher_m: float
-) -> tuple[float, float, float]:
-    """Sum a face's pull (kPa) over its cells: the likely value, its lower bound, and the moment of that bound
-    about the face's middle, divided by the width.
+) -> tuple[float, float, float, float]:
+    """Sum a face's pull (kPa) over its cells: the likely value, its lower bound, and the moments of that
+    bound about the face's middle, across divided by the width and along by the length.
 
     gaps: (across, along) air gaps, m, NaN where unknown: nothing pulls there. likely, low: kPa at gap_m.
     likely_m, higher_m: likely and maximum amounts by which the gaps are wider. gap_m, likely, low: (N,).
     """
-    total, least, moment = 0.0, 0.0, 0.0
+    total, least, across, along = 0.0, 0.0, 0.0, 0.0
     for i in range(gaps.shape[0]):
         place = (i + 0.5) / gaps.shape[0] - 0.5
         for k in range(gaps.shape[1]):
@@ -81,8 +87,9 @@ def _sum_pull(
             total += _between(gaps[i, k] + likely_m, gap_m, likely)
             held = _between(gaps[i, k] + higher_m, gap_m, low)
             least += held
-            moment += place * held
-    return total, least, moment
+            across += place * held
+            along += ((k + 0.5) / gaps.shape[1] - 0.5) * held
+    return total, least, across, along
 
 
 @kernel()
@@ -108,37 +115,38 @@ def pole_shares(contact: Contact, magnet: Magnet, place: Placement, load: tuple[
     """Compute upper bounds of the poles' shares (P,) of the needed pull; 1 is all of it.
 
     Magnet and load are rigid, so a pole's share grows linearly with the load's offset from the middle of all
-    poles towards it. Across, where the poles stand in one row, a load that hangs beside the centre of pull
-    pries the face off about its edge; the safety factor may cover that, but no more. The offsets are upper
-    bounds by the sigmas of the load's centre.
+    poles towards it. Across, where the poles stand in one row, and along, where they stand side by side or
+    there is only one, a load that hangs beside the centre of pull pries the face off about its edge; the
+    safety factor may cover that, but no more. The offsets are upper bounds by the sigmas of the load's
+    centre.
     """
     away = load_centre(load) - (place.x_m, place.y_m)
     slack = UPPER * np.max([
         np.nan_to_num((bundle.sigma.along_m, bundle.sigma.lateral_m), nan=0.05) for bundle in load
     ], axis=0)  # fmt: skip
     offset = place.axes @ away
-    middle, slope, in_row = _levers(magnet.poles)
+    middle, slope, pried = _levers(magnet.poles)
     offset = offset - middle
     share = 1 / len(slope) + slope @ offset + np.abs(slope) @ slack
-    if in_row:
-        pulls = np.array([own.pull_across_m for own in contact.poles])
-        widths = np.array([pole.width_m for pole in magnet.poles])
-        beside = np.abs(offset[1] - pulls) + slack[1]
-        share = share * np.maximum((1 + 2 * beside / widths) / magnet.needed_factor, 1.0)
-    return np.asarray(share)
+    pulls = np.array([(own.pull_along_m, own.pull_across_m) for own in contact.poles])
+    sizes = np.array([(pole.length_m, pole.width_m) for pole in magnet.poles])
+    beside = pried * (np.abs(offset - pulls) + slack) / sizes
+    return np.asarray(share * np.maximum((1 + 2 * beside.max(axis=1)) / magnet.needed_factor, 1.0))
 
 
 @lru_cache(maxsize=64)
-def _levers(poles: tuple[Pole, ...]) -> tuple[Float64, Float64, bool]:
+def _levers(poles: tuple[Pole, ...]) -> tuple[Float64, Float64, Bool]:
     """Compute the poles' middle (2,), along and across, how each one's share (P, 2) grows with the load's
-    offset from it, and whether the poles stand in one row.
+    offset from it, and along which of both (2,) no other pole holds a face that a load pries off.
     """
     places = np.array([(pole.along_m, pole.across_m) for pole in poles])
     middle = places.mean(axis=0)
     arms = places - middle
-    spread = np.linalg.eigvalsh(arms.T @ arms) if len(arms) > 1 else np.zeros(2)
-    slope = arms @ np.linalg.pinv(arms.T @ arms, rcond=1e-6)
-    return frozen(middle), frozen(slope), bool(spread.min() < 1e-6)
+    spread, axes = np.linalg.eigh(arms.T @ arms)
+    slope = arms @ np.linalg.pinv(arms.T @ arms, rcond=SAME_PLACE)
+    in_row = spread[0] <= SAME_PLACE * max(spread[1], 1.0)
+    side_by_side = in_row and abs(axes[0, 0]) > abs(axes[1, 0])
+    return frozen(middle), frozen(slope), frozen(np.array([side_by_side or len(poles) == 1, in_row]))
 
 
 @dataclass(frozen=True)
