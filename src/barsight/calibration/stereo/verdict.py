@@ -187,4 +187,6 @@ def expect_usable(lines: Sequence[Line], path: Path) -> None:
     redo = [line for line in lines if line.verdict is Verdict.REDO]
     if redo:
         told = "; ".join(f"{line.name} {line.value}" for line in redo)
-        raise MeasurementError(f"{path}: redo the calibration, don't measure with it ({told}); see its report")
+        raise MeasurementError(
+            f"{path}: redo the calibration, don't measure with it ({told}); see its report"
+        )

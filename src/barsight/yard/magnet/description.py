@@ -13,7 +13,7 @@ import numpy as np
 from barsight.core.arrays import Float64
 from barsight.core.settings.file import read_settings
 from barsight.core.settings.values import expect_values
-from barsight.yard.magnet.pull import Pull, expect
+from barsight.yard.magnet.pull import MAX_GAP_M, Pull, expect
 
 MagnetType = Literal["electro", "permanent", "electro-permanent"]
 MIN_SAFETY_FACTOR = 3.0
@@ -56,6 +56,7 @@ class Beam:
 
     def __post_init__(self) -> None:
         expect(min(self.length_m, self.width_m) > 0, "the beam's length and width must be over 0")
+        expect(max(self.length_m, self.width_m) <= 40, "the beam can't be longer than 40 m")
         expect(self.above_faces_m >= 0, "the beam can't hang below the poles' faces")
 
 
@@ -93,6 +94,9 @@ class Limits:
         expect(angles, "limits pitch_deg and roll_deg lie between 0 and 45")
         lengths = min(self.offset_along_m, self.offset_across_m, self.overhang_m, self.gap_m)
         expect(lengths > 0, "limits offset_along_m, offset_across_m, overhang_m and gap_m must be over 0")
+        longest = max(self.offset_along_m, self.offset_across_m, self.overhang_m)
+        expect(longest <= 20, "limits offset_along_m, offset_across_m and overhang_m are in m, at most 20")
+        expect(self.gap_m <= MAX_GAP_M, f"limits gap_m is in m, at most {MAX_GAP_M:g}")
         expect(0 <= self.contact_share < 1, "limits contact_share lies between 0 and 1")
 
 

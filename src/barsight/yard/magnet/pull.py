@@ -14,6 +14,10 @@ from barsight.core.errors import ConfigError
 
 SATURATED_TESLA = 1.6
 """Flux density above which bars let little more through; the maximum if the file lists no plates."""
+MAX_GAP_M = 0.5
+"""Maximum air gap (m) of a lifting magnet; a larger one was given in another unit, and nothing would limit
+the gap.
+"""
 _MU0 = 4e-7 * math.pi
 _ACROSS = 201
 """Number of places across a face at which the pull on one round bar is summed."""
@@ -56,6 +60,7 @@ class Pull:
         same = len(self.gap_m) == len(self.kilopascal) >= 2
         expect(same, "pull gap_m and kilopascal must be lists of the same length, two or more")
         expect(self.gap_m[0] == 0 and _rises(self.gap_m), "pull gap_m must begin at 0 and rise")
+        expect(self.gap_m[-1] <= MAX_GAP_M, f"pull gap_m is in m, at most {MAX_GAP_M:g}")
         expect(_falls(self.kilopascal), "pull kilopascal must fall with the gap and end at 0")
         expect(0 < self.kilopascal[0] <= 4000, "pull kilopascal must lie between 0 and 4000 without a gap")
         ratios = (*self.round_ratio, self.grade_ratio, self.heat_ratio, self.duty_ratio)
