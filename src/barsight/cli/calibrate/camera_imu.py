@@ -59,7 +59,7 @@ def run(arguments: Sequence[str]) -> None:
     ) -> None:
         """Calibrate the mounting of the cameras on the IMU and the offset between their clocks.
 
-        The exit code is 5 if the verdict is to redo it; the files are written all the same.
+        The exit code is 5 if the verdict is redo; the files are written all the same.
 
         Args:
             recording: An EuRoC folder or bag taken while the rig was waved in front of the board, or a folder
@@ -100,7 +100,6 @@ def run(arguments: Sequence[str]) -> None:
         assessment = assess_camera_imu(calibration, halves)
         _write(calibration, assessment, out)
         _print(console, calibration, assessment, out)
-        expect_usable(assessment.lines, out)
 
     call(command, "calibrate camera-imu", arguments)
 
@@ -177,6 +176,7 @@ def _print(
     assessment: CameraImuAssessment,
     out: Path,
 ) -> None:
+    """Print the result and the verdict. Raises MeasurementError where it is to be redone."""
     sigma = calibration.sigma
     for camera, mount in enumerate(calibration.solution.state.mounts):
         own = sigma[7 * camera : 7 * camera + 7]
@@ -198,3 +198,4 @@ def _print(
     console.print(f"[{colour}]{assessment.verdict}[/{colour}]: {sentence}", highlight=False)
     for advice in (*calibration.notes, *assessment.advice):
         console.print(f"  {escape(advice)}", highlight=False)
+    expect_usable(assessment.lines, out)

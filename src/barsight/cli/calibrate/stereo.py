@@ -41,7 +41,7 @@ def run(arguments: Sequence[str]) -> None:
     ) -> None:
         """Calibrate two cameras from pictures of a board that both see.
 
-        The exit code is 5 if the verdict is to redo it; the files are written all the same.
+        The exit code is 5 if the verdict is redo; the files are written all the same.
 
         Args:
             pictures: Folder of pictures in pairs (folders left and right, or left01.png and right01.png), an
