@@ -37,6 +37,11 @@ def test_targets_place_the_world(tmp_path: Path, capsys: pytest.CaptureFixture[s
     [
         (HEADER + ROWS[0] + ROWS[1], 5, "2 pairs of points; 3 are the least"),
         (HEADER + ROWS[0] + ROWS[1] + "c,13,0,0,3,0,-8,,\n", 5, "lie on a line"),
+        (
+            HEADER + "a,0,0,0,6,0,0,,\nb,6,0,0,0,0,0,,\nc,6,5,0,0,5,0,,\nd,0,5,0,6,5,0,,\n",
+            5,
+            "turned upside down: names are mixed up",
+        ),
         (HEADER + ROWS[0] + ROWS[0], 3, "target a is there twice"),
         (HEADER + "a,1,2,x,0,0,0,,\n", 3, "line 2: a number is missing or is none"),
         (HEADER + "a,1,2\n", 3, "line 2: a number is missing"),

@@ -196,6 +196,10 @@ def _expect_usable(found: YardCalibration, source: Path) -> None:
         size = f"{scale:.4g} times as large as" if scale > 1 else f"only {scale:.4g} of"
         remedy = "give both in metres and each name its own place"
         raise MeasurementError(f"{source}: the yard's places are {size} the measured ones: {remedy}")
+    pose = found.alignment.target_from_source
+    if pose.source != "body" and pose.rotation[2, 2] <= 0:
+        remedy = "names are mixed up; z points up in both"
+        raise MeasurementError(f"{source}: the points fit only if the map is turned upside down: {remedy}")
     if found.turn_sigma_deg > MAX_UNSURE_DEG or found.place_sigma_m > MAX_UNSURE_M:
         raise MeasurementError(
             f"{source}: the points disagree by up to {off_m.max():.3g} m and tell the turn to "
