@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from barsight.yard.bundles.fitting.ends import middle_and_length_sigma
-from barsight.yard.types import ENDS, Bundle, Doubt, DoubtKind
+from barsight.yard.types import ENDS, Bundle, BundleSigma, Doubt, DoubtKind
 
 _SKEW, _ASIDE_RATIO, _LEVEL_M = 0.05, 0.3, 0.04
 """Maximum differences between two pieces of one bundle: sine of the skew, lateral distance between the axes
@@ -66,21 +66,6 @@ def _joined(whole: Bundle, piece: Bundle) -> Bundle | None:
     far = order[side]
     is_open, sigmas = list(whole.ends_open), list(whole.ends_sigma_m)
     is_open[side], sigmas[side] = piece.ends_open[far], piece.ends_sigma_m[far]
-    middle, length = middle_and_length_sigma((sigmas[0], sigmas[1]))
-    known = np.isfinite(piece.section_m2)
-    section = piece.section_m2 if known else whole.section_m2 * width**2
-    sigma = replace(
-        whole.sigma,
-        lateral_m=float(np.hypot(whole.sigma.lateral_m, aside)),
-        width_m=float(np.hypot(whole.sigma.width_m, piece.width_m - whole.width_m)),
-        top_z_m=float(np.hypot(whole.sigma.top_z_m, piece.top_z_m - whole.top_z_m)),
-        bar_diameter_m=float(
-            np.hypot(whole.sigma.bar_diameter_m, piece.bar_diameter_m - whole.bar_diameter_m)
-        ),
-        along_m=middle,
-        length_m=length,
-        section_m2=float(np.hypot(whole.sigma.section_m2, section - whole.section_m2)),
-    )
     # Straps on either piece hold both.
     kept, others = (
         tuple(
@@ -93,11 +78,33 @@ def _joined(whole: Bundle, piece: Bundle) -> Bundle | None:
     reasons = (*kept, *(_at_end(doubt, side) for doubt in added))
     return replace(
         whole, centre_m=ends.mean(axis=0), ends_m=ends, ends_open=(is_open[0], is_open[1]),
-        ends_sigma_m=(sigmas[0], sigmas[1]), length_m=float(np.linalg.norm(ends[1] - ends[0])), sigma=sigma,
+        ends_sigma_m=(sigmas[0], sigmas[1]), length_m=float(np.linalg.norm(ends[1] - ends[0])),
+        sigma=_joined_sigma(whole, piece, aside, (sigmas[0], sigmas[1])),
         bars=whole.bars if whole.bars == piece.bars else None,
         confidence=min(whole.confidence, piece.confidence), reasons=reasons,
         cover_doubts=tuple(dict.fromkeys(whole.cover_doubts + piece.cover_doubts)),
     )  # fmt: skip
+
+
+def _joined_sigma(whole: Bundle, piece: Bundle, aside_m: float, ends_m: tuple[float, float]) -> BundleSigma:
+    """Widen the sigma of a bundle by what a piece joined to it differs. aside_m: greatest distance of the
+    piece's ends from the axis. ends_m: sigmas of the ends of both together.
+    """
+    middle, length = middle_and_length_sigma(ends_m)
+    known = np.isfinite(piece.section_m2)
+    section = piece.section_m2 if known else whole.section_m2 * (piece.width_m / whole.width_m) ** 2
+    return replace(
+        whole.sigma,
+        lateral_m=float(np.hypot(whole.sigma.lateral_m, aside_m)),
+        width_m=float(np.hypot(whole.sigma.width_m, piece.width_m - whole.width_m)),
+        top_z_m=float(np.hypot(whole.sigma.top_z_m, piece.top_z_m - whole.top_z_m)),
+        bar_diameter_m=float(
+            np.hypot(whole.sigma.bar_diameter_m, piece.bar_diameter_m - whole.bar_diameter_m)
+        ),
+        along_m=middle,
+        length_m=length,
+        section_m2=float(np.hypot(whole.sigma.section_m2, section - whole.section_m2)),
+    )
 
 
 def _shows_gap(bundle: Bundle, end: int) -> bool:
