@@ -86,6 +86,21 @@ def test_a_pass_that_is_unsure_is_not_outvoted_by_surer_ones() -> None:
     assert any("x near the lift is uncertain" in s for s in reasons(Travel.joined(later), HERE))
 
 
+def test_pairs_that_record_at_once_are_read_back_and_a_disorder_is_not() -> None:
+    one = travel()
+    later = replace(one, stamp_ns=one.stamp_ns + 10**9, measured=one.stamp_ns < 0)
+    joined = Travel.joined([one, later])
+    content = joined.content()
+    again = Travel.read({"travel": content, "passes": [{}, {}]})
+    assert again is not None and np.array_equal(again.place_m, joined.place_m)
+    assert again.pass_number[:4].tolist() == [1, 1, 2, 1] and again.captured_ns == one.captured_ns
+    assert np.array_equal(again.place_m[again.pass_number == 2], later.place_m)
+    twice = {**content, "pass_number": [1] * len(joined.stamp_ns)}
+    assert Travel.read({"travel": twice, "passes": [{}, {}]}) is None
+    back = {**content, "stamp_ns": content["stamp_ns"][::-1]}
+    assert Travel.read({"travel": back, "passes": [{}, {}]}) is None
+
+
 def test_a_lift_under_refused_frames_is_forbidden_and_one_beside_them_is_not() -> None:
     one = travel(refused=tuple(range(13, 21)))
     assert reasons(one, HERE) == []

@@ -40,10 +40,11 @@ class Travel:
     place_m: (N, 2) x and y of the body. sigma_m: (N, 3) of the ground below it in x, y, z. off_m: (N,)
     distance between encoders and trajectory, NaN where there are no encoders, without what a constant latency
     explains. refused_m: (R, 2) where the refused frames must have been. reach_m: maximum distance from the
-    body at which a frame may see. stamp_ns: (N,) of the frames, rising. measured: (N,) whether a frame's
-    heights are in the map. sure_reach_m: distance from the body within which everything is in the picture.
-    eye_z_m: the body's median height; pixel_rad: angle of a pixel; both NaN in files of an earlier version.
-    pass_number: (N,) pass of each frame, from 1; empty where there is only one.
+    body at which a frame may see. stamp_ns: (N,) of the frames, rising; pairs that record at once may share
+    one. measured: (N,) whether a frame's heights are in the map. sure_reach_m: distance from the body within
+    which everything is in the picture. eye_z_m: the body's median height; pixel_rad: angle of a pixel; both
+    NaN in files of an earlier version. pass_number: (N,) pass of each frame, from 1; empty where there is
+    only one.
     """
 
     place_m: Float64
@@ -102,16 +103,20 @@ class Travel:
 
     @classmethod
     def joined(cls, parts: Sequence[Travel]) -> Travel:
-        """Join the passes of one yard, oldest first."""
-        place, sigma, off, refused, stamps, measured = (
-            np.concatenate([getattr(part, name) for part in parts])
-            for name in ("place_m", "sigma_m", "off_m", "refused_m", "stamp_ns", "measured")
+        """Join the passes of one yard, oldest first; frames of pairs that record at once are interleaved."""
+        stamps = np.concatenate([part.stamp_ns for part in parts])
+        order = np.argsort(stamps, kind="stable")
+        place, sigma, off, measured = (
+            np.concatenate([getattr(part, name) for part in parts])[order]
+            for name in ("place_m", "sigma_m", "off_m", "measured")
         )
+        refused = np.concatenate([part.refused_m for part in parts])
         reach_m, sure_reach_m = max(part.reach_m for part in parts), min(part.sure_reach_m for part in parts)
         eye_z_m, pixel_rad = max(part.eye_z_m for part in parts), max(part.pixel_rad for part in parts)
         numbers = np.repeat(np.arange(1, len(parts) + 1), [len(part.stamp_ns) for part in parts])
         return cls(
-            place, sigma, off, refused, reach_m, stamps, measured, sure_reach_m, eye_z_m, pixel_rad, numbers
+            place, sigma, off, refused, reach_m, stamps[order], measured, sure_reach_m, eye_z_m, pixel_rad,
+            numbers[order],
         )  # fmt: skip
 
     @classmethod
@@ -136,7 +141,7 @@ class Travel:
             and off.ndim == stamps.ndim == 1
             and numbers.shape == (stamps.shape if summary.get("passes") else (0,))
         )
-        if not whole or (np.diff(stamps) <= 0).any():
+        if not whole or not _rises(stamps, numbers):
             return None
         return cls(
             place, sigma, off, refused, reach_m, stamps, measured, sure_reach_m, eye_z_m, pixel_rad, numbers
@@ -145,6 +150,13 @@ class Travel:
     def content(self) -> dict[str, Any]:
         """Convert to the content of result.json; the writer handles NaN."""
         return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(self).items()}
+
+
+def _rises(stamps: Int64, numbers: Int64) -> bool:
+    """Check that stamps (N,) rise, and that only frames of different passes (N,) share one."""
+    steps = np.diff(stamps)
+    same_pass = np.diff(numbers) == 0 if len(numbers) else True
+    return not ((steps < 0) | ((steps == 0) & same_pass)).any()
 
 
 def _places_at(wanted: Int64, stamps: Int64, places: Float64) -> Float64:
