@@ -186,6 +186,15 @@ def test_what_cant_be() -> None:
         )
 
 
+def test_encoders_too_sparse_for_any_frame_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    recording, sightings, _ = simulated(0)
+    crane = recording.crane()
+    assert crane is not None
+    sparse = replace(crane, stamp_ns=crane.stamp_ns[::20], position_m=crane.position_m[::20])
+    with pytest.raises(MeasurementError, match=r"the encoders place no frame .*use: stereo,imu"):
+        fused(replace(recording, crane_samples=sparse), monkeypatch, sightings)
+
+
 def test_projection_and_triangulation_are_inverse() -> None:
     camera = Rectifier(ideal_rig()).camera
     points = np.array([[0.1, -0.2, 3.0], [1.0, 0.5, 7.0]])

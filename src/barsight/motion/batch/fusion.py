@@ -326,16 +326,23 @@ class BatchPoses:
 def _placed_frames(
     recording: Recording, crane: CraneSamples, sighted: Int64, shift: int
 ) -> tuple[Int64, list[RefusedFrame]]:
-    """List the stamps of all frames that encoders or pictures place, and the refused frames."""
-    known = set(sighted.tolist())
-    frames: list[int] = []
-    refused: list[RefusedFrame] = []
-    for stamp in recording.index.stamps_ns:
+    """List the stamps of all frames that encoders or pictures place, and the refused frames. Raises
+    MeasurementError where the pictures place some and the encoders none: nothing then ties them to the yard.
+    """
+    known, failed = set(sighted.tolist()), dict[int, Failed]()
+    stamps_ns = recording.index.stamps_ns
+    for stamp in stamps_ns:
         fit = fit_position(crane, stamp + shift, seconds_to_ns(0.35))
-        if isinstance(fit, Failed) and stamp not in known:
-            refused.append(RefusedFrame(stamp, fit.reason))
-        else:
-            frames.append(stamp)
+        if isinstance(fit, Failed):
+            failed[stamp] = fit
+    refused = [RefusedFrame(stamp, fit.reason) for stamp, fit in failed.items() if stamp not in known]
+    if known and len(failed) == len(stamps_ns):
+        reason = failed[stamps_ns[0]].reason
+        raise MeasurementError(
+            f"{recording.path}: the encoders place no frame ({reason}); give more readings on the pictures' "
+            "clock, or measure without them (use: stereo,imu)"
+        )
+    frames = [stamp for stamp in stamps_ns if stamp not in failed or stamp in known]
     return np.array(frames, np.int64), refused
 
 
