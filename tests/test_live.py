@@ -7,7 +7,8 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from types import SimpleNamespace
+from typing import Any, Literal, cast
 
 import numpy as np
 import pytest
@@ -350,6 +351,17 @@ def test_a_replay_gives_all_in_order_and_goes_on_where_it_was(whole: Path) -> No
     after = {"cam0": taken[2].stamp_ns, "cam1": taken[2].stamp_ns, "imu": int(given[0][-1]), "crane": 0}
     again = [p for p in source.packets(after) if isinstance(p, LivePicture)]
     assert [(p.camera, p.stamp_ns) for p in again] == [(p.camera, p.stamp_ns) for p in taken[4:]]
+
+
+def test_a_replay_that_begins_before_zero_loses_nothing(whole: Path) -> None:
+    recording = bs.open_recording(whole)
+    pictures = [replace(one, stamp_ns=k - 3) for k, one in enumerate(recording.stored_images())]
+    early = SimpleNamespace(
+        rig=recording.rig, imu=lambda: None, crane=lambda: None, stored_images=lambda: iter(pictures)
+    )
+    source = ReplaySource(cast(Any, early), ReplayClock(0, 0, 0.0), lambda: True)
+    packets = source.packets(dict.fromkeys(("cam0", "cam1", "imu", "crane"), 0))
+    assert [p.stamp_ns for p in packets if isinstance(p, LivePicture)] == [p.stamp_ns for p in pictures]
 
 
 def test_a_resumed_replay_loses_what_was_due_meanwhile_and_no_more(whole: Path) -> None:

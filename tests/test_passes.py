@@ -185,6 +185,17 @@ def test_of_passes_of_one_time_the_one_that_hangs_differently_is_named() -> None
         in_order(cast(Any, [first, second]), bs.MeasureSettings())
 
 
+def test_passes_before_the_clock_began_are_told_apart() -> None:
+    passes = [
+        SimpleNamespace(
+            path=Path("pass"), index=SimpleNamespace(stamps_ns=(first, first + 5)), rig="one",
+            crane=lambda: SimpleNamespace(crane_to_body_m=1.0, yard_from_body_nominal=0.0),
+        )
+        for first in (-30, -20, -10, 0)
+    ]  # fmt: skip
+    assert in_order(cast(Any, passes[::-1]), bs.MeasureSettings()) == tuple(passes)
+
+
 def test_noise_and_edges_are_no_change() -> None:
     rng, one = np.random.default_rng(5), PlaceHistory((0.0, 0.0), (160, 120), 0.05)
     z = np.zeros((160, 120))

@@ -21,6 +21,9 @@ USUAL_PERCENT = 95
 AHEAD_NS = NS_PER_S // 5
 """Lead in ns of readings over pictures at full speed: more than any pose waits for."""
 
+BEFORE_ALL_NS = -(1 << 63)
+"""Stamp before all others: those of a recording may begin at 0 or below it."""
+
 
 @dataclass(frozen=True)
 class ReplayClock:
@@ -72,11 +75,12 @@ class ReplaySource:
 
     def packets(self, after: dict[str, int]) -> Iterator[LivePicture | LostPicture | Readings]:
         """Yield packets when they are due; see `Source.packets`."""
+        resumed_ns = self._clock.stamp_now_ns() if any(after.values()) else None
+        after = {sensor: last_ns or BEFORE_ALL_NS for sensor, last_ns in after.items()}
         given = {
             sensor: int(np.searchsorted(stamps, after[sensor], side="right"))
             for sensor, (stamps, _) in self._readings.items()
         }
-        resumed_ns = self._clock.stamp_now_ns() if any(after.values()) else None
         for stored in self._recording.stored_images():
             if stored.stamp_ns <= after[f"cam{stored.camera}"]:
                 continue

@@ -136,7 +136,7 @@ def in_order(recordings: Sequence[Recording], settings: MeasureSettings) -> tupl
 
 def _at_once(ordered: Sequence[Recording]) -> list[list[Recording]]:
     """Group recordings made at the same time; two pairs of cameras on one body make one each."""
-    groups, end_ns = list[list[Recording]](), -1
+    groups, end_ns = list[list[Recording]](), ordered[0].index.stamps_ns[-1]
     for one in ordered:
         if groups and one.index.stamps_ns[0] <= end_ns:
             groups[-1].append(one)
