@@ -94,6 +94,9 @@ def test_stamps_out_of_order_are_named() -> None:
         expect_increasing(np.array([2, 5, 3, 4, 4]), path)
     with pytest.raises(InputError, match="line 2: stamp 7 is the same as the one before"):
         expect_increasing(np.array([7, 7]), path, first_line=1)
+    expect_increasing(np.array([-(2**62) - 5, 2**62 + 5]), path)
+    with pytest.raises(InputError, match="goes back in time"):
+        expect_increasing(np.array([2**63 - 1, -(2**63)]), path)
 
 
 def test_interpolation_loses_no_nanosecond() -> None:

@@ -55,13 +55,17 @@ def _stamp(text: str) -> Decimal:
     return stamp
 
 
+def rows_not_later(stamps_ns: Int64) -> Int64:
+    """Find the rows k whose successor k + 1 isn't later; compared, as a difference may exceed 64 bits."""
+    return np.flatnonzero(stamps_ns[1:] <= stamps_ns[:-1])
+
+
 def expect_increasing(stamps_ns: Int64, path: Path, first_line: int = 2) -> None:
     """Raise `InputError` naming the file's line where stamps repeat or go back."""
-    steps = np.diff(stamps_ns)
-    bad = np.flatnonzero(steps <= 0)
+    bad = rows_not_later(stamps_ns)
     if bad.size:
         k = int(bad[0]) + 1
-        what = "is the same as the one before" if steps[k - 1] == 0 else "goes back in time"
+        what = "is the same as the one before" if stamps_ns[k] == stamps_ns[k - 1] else "goes back in time"
         raise InputError(
             path,
             f"line {first_line + k}: stamp {int(stamps_ns[k])} {what} ({bad.size} such lines)",

@@ -15,6 +15,7 @@ from barsight.core.arrays import Int64
 from barsight.core.errors import InputError
 from barsight.core.records.pairs import RefusedFrame, StereoFrame
 from barsight.core.records.sensor_samples import CraneSamples, ImuSamples, LaserProfile
+from barsight.core.stamps import rows_not_later
 from barsight.recording.base import FrameIndex, Recording
 
 Samples = TypeVar("Samples", ImuSamples, CraneSamples)
@@ -84,7 +85,7 @@ class PacketRecording:
 
     def _expect_later(self, stamps_ns: Sequence[int] | Int64, last_ns: int | None) -> None:
         late = last_ns is not None and stamps_ns[0] <= last_ns
-        if late or (np.diff(stamps_ns) <= 0).any():
+        if late or rows_not_later(np.asarray(stamps_ns)).size:
             raise InputError(
                 self.path, f"a packet of {stamps_ns[0]} ns comes late", "push packets in time's order"
             )

@@ -24,6 +24,7 @@ from barsight.core.pose import Pose
 from barsight.core.reading.bounded_reading import in_range
 from barsight.core.records.pairs import RefusedFrame, StereoFrame
 from barsight.core.records.sensor_samples import CraneSamples, ImuSamples, LaserProfile
+from barsight.core.stamps import rows_not_later
 from barsight.recording.base import FrameIndex, RecordingSettings
 from barsight.recording.formats.bag_file import BagFile, RawMessage
 from barsight.recording.formats.bag_images import file_of, gray_of
@@ -249,9 +250,9 @@ class BagRecording:
             ) from None
 
     def _expect_increasing(self, topic: str, stamps: Int64) -> None:
-        bad = np.flatnonzero(np.diff(stamps) <= 0)
+        bad = rows_not_later(stamps)
         if bad.size:
-            what = "is there twice" if np.diff(stamps)[bad[0]] == 0 else "goes back in time"
+            what = "is there twice" if stamps[bad[0]] == stamps[bad[0] + 1] else "goes back in time"
             if stamps[bad[0]] == stamps[bad[0] + 1] == 0:
                 what = "carries no time (header.stamp)"
             raise InputError(

@@ -12,7 +12,7 @@ import numpy as np
 from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import InputError
 from barsight.core.reading.bounded_reading import MAX_LINES, MAX_PICTURES, expect_lines, in_range
-from barsight.core.stamps import expect_increasing
+from barsight.core.stamps import expect_increasing, rows_not_later
 from barsight.recording.own_files import expect_inner_name
 
 
@@ -44,7 +44,7 @@ class Table:
 
     def expect_increasing(self) -> None:
         """Raise `InputError` naming the line at which stamps repeat or go back."""
-        bad = np.flatnonzero(np.diff(self.first) <= 0)
+        bad = rows_not_later(self.first)
         if bad.size:
             row = int(bad[0]) + 1
             expect_increasing(self.first, self.path, self.line(row) - row)
@@ -99,7 +99,7 @@ def read_image_list(path: Path) -> tuple[Int64, tuple[str, ...]]:
     if not stamps:
         raise InputError(path, "has no rows", "the camera recorded nothing; record again or copy it again")
     stamp_ns = np.array(stamps, dtype=np.int64)
-    bad = np.flatnonzero(np.diff(stamp_ns) <= 0)
+    bad = rows_not_later(stamp_ns)
     if bad.size:
         row = int(bad[0]) + 1
         expect_increasing(stamp_ns, path, lines[row] - row)

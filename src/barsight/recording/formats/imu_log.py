@@ -14,7 +14,7 @@ from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import InputError
 from barsight.core.reading.bounded_reading import in_range, read_lines
 from barsight.core.records.sensor_samples import ImuSamples
-from barsight.core.stamps import NS_PER_S
+from barsight.core.stamps import NS_PER_S, rows_not_later
 from barsight.recording.formats.bag_file import IMU_TYPE, BagFile
 
 GRAVITY_MPS2 = 9.80665
@@ -217,7 +217,7 @@ def _bag_rows(path: Path) -> tuple[str, Int64, Float64]:
 
 
 def _expect_rising(path: Path, stamp_ns: Int64) -> None:
-    back = np.flatnonzero(np.diff(stamp_ns) <= 0)
+    back = rows_not_later(stamp_ns)
     if stamp_ns.size < 2:
         raise InputError(path, "holds no samples", f"give {FORM}")
     if back.size:
