@@ -15,6 +15,7 @@ import pytest
 
 import barsight as bs
 from barsight.cli.main import run
+from barsight.core.reading.sealed_json import write_sealed
 from barsight.core.records.pairs import RefusedFrame, StereoFrame
 from barsight.core.records.sensor_samples import CraneSamples
 from barsight.live.capture import Capture
@@ -207,9 +208,16 @@ def test_keyframes_come_back_and_torn_ones_are_refused(tmp_path: Path) -> None:
     kept = Keyframes((1, 2), Mode("blind", ("why",), False))
     write_keyframes(kept, tmp_path / "keyframes.json")
     assert read_keyframes(tmp_path / "keyframes.json") == kept
-    (tmp_path / "keyframes.json").write_text('{"keyframes_ns": [1]}')
+    path = tmp_path / "keyframes.json"
+    path.write_text(path.read_text().replace('"lifts": false', '"lifts": true'))
+    with pytest.raises(bs.BarsightError, match="was changed"):
+        read_keyframes(path)
+    path.write_text('{"keyframes_ns": [1]}')
+    with pytest.raises(bs.BarsightError, match="no schema_version"):
+        read_keyframes(path)
+    write_sealed({"schema_version": 2, "keyframes_ns": [1]}, path)
     with pytest.raises(bs.BarsightError, match="is not a list of keyframes"):
-        read_keyframes(tmp_path / "keyframes.json")
+        read_keyframes(path)
 
 
 def test_the_ring_gives_whole_pairs_only(ring: PairRing) -> None:

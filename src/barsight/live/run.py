@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import os
 import shutil
@@ -22,6 +21,7 @@ from barsight.core.json_values import write_json
 from barsight.core.memory import trim_heap
 from barsight.core.notices import Notice
 from barsight.core.parallel import in_background
+from barsight.core.reading.sealed_json import read_sealed, write_sealed
 from barsight.core.stamps import NS_PER_S
 from barsight.core.timing import ProgressCallback
 from barsight.live.latency import latencies
@@ -47,6 +47,7 @@ from barsight.yard.magnet.description import load_magnet
 from barsight.yard_frame import in_yard
 
 MAX_SPEED = 1000.0
+KEYFRAMES_VERSION = 2
 LATEST = ("pose.json", LIVE_MAP)
 """Files that hold the latest value during the run."""
 
@@ -254,7 +255,7 @@ def handled_signals(told: Mapping[signal.Signals, str], take: Callable[[str], ob
 def write_keyframes(keyframes: Keyframes, target: Path) -> None:
     """Write keyframes.json."""
     content = {
-        "schema_version": 1,
+        "schema_version": KEYFRAMES_VERSION,
         "keyframes_ns": list(keyframes.stamps_ns),
         "mode": {
             "name": keyframes.mode.name,
@@ -262,22 +263,22 @@ def write_keyframes(keyframes: Keyframes, target: Path) -> None:
             "lifts": keyframes.mode.lifts,
         },
     }
-    write_json(target, content)
+    write_sealed(content, target)
 
 
 def read_keyframes(path: Path) -> Keyframes:
-    """Read keyframes.json. Raises InputError if the file isn't one."""
+    """Read keyframes.json, whose mode decides on lifts. Raises InputError if the file isn't one or was
+    changed.
+    """
     remedy = "give keyframes.json of a folder that barsight live wrote"
+    content = read_sealed(path, KEYFRAMES_VERSION, remedy)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
         mode = content["mode"]
         return Keyframes(
             tuple(map(int, content["keyframes_ns"])),
-            Mode(mode["name"], tuple(mode["reasons"]), bool(mode["lifts"])),
+            Mode(mode["name"], tuple(mode["reasons"]), mode["lifts"] is True),
         )
-    except FileNotFoundError as error:
-        raise InputError(path, "no such file", remedy) from error
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise InputError(
             path, f"is not a list of keyframes ({type(error).__name__}: {error})", remedy
         ) from error
