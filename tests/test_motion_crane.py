@@ -10,7 +10,12 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import ConfigError, Failed, MeasurementError
 from barsight.core.records.sensor_samples import CraneSamples, ImuSamples
 from barsight.inertial.model import GRAVITY_MPS2, ImuBias
-from barsight.motion.crane.encoder_trajectory import CraneSettings, EncoderOdometry, fit_position
+from barsight.motion.crane.encoder_trajectory import (
+    CraneSettings,
+    EncoderOdometry,
+    fit_position,
+    reestimate_noise,
+)
 from barsight.motion.crane.known_motion import ImuWay, way_around
 from barsight.motion.crane.robust_parabola import ROUNDS, fit_parabola
 from barsight.motion.crane.sway import sway_at
@@ -44,6 +49,16 @@ def test_a_parabola_is_met_exactly() -> None:
         position, covariance = fit.position_m, fit.covariance
         np.testing.assert_allclose(position, place((stamp - START_NS) / 1e9), atol=1e-10)
         assert 0 < covariance[0, 0] < STD_M**2
+
+
+@pytest.mark.parametrize("rate_hz", [20, 1000])
+def test_rounding_of_a_standing_crane_doesnt_average_out(rate_hz: int) -> None:
+    truth, step_m = np.array([3.1234, 1.2345, 5.0003]), 0.005
+    stamps = START_NS + np.arange(10 * rate_hz, dtype=np.int64) * (10**9 // rate_hz)
+    read = np.tile(np.round(truth / step_m) * step_m, (len(stamps), 1))
+    crane = CraneSamples(stamps, read, MOUNT, NOMINAL, step_m / 12**0.5)
+    fit = fit_position(reestimate_noise(crane), START_NS + 5 * 10**9, WINDOW_NS)
+    assert (np.abs(fit.position_m - truth) < 1.8 * np.sqrt(np.diag(fit.covariance))).all()
 
 
 @pytest.mark.parametrize("count", [5, 8, 15])
@@ -121,8 +136,9 @@ def test_without_an_imu_sigma_holds_what_a_parabola_smears() -> None:
     crane, _, _ = oscillating(3.0)
     crane = replace(crane, position_std_m=2e-4)
     fit = fit_position(crane, START_NS + 1_040_000_000, WINDOW_NS)
-    still = fit_position(replace(crane, position_m=crane.position_m * 0), START_NS + 1_040_000_000, WINDOW_NS)
-    assert fit.covariance[0, 0] ** 0.5 > 5 * still.covariance[0, 0] ** 0.5
+    even = (crane.stamp_ns - START_NS)[:, None] / 1e9 * [0.3, 0.1, 0.05]
+    steady = fit_position(replace(crane, position_m=even), START_NS + 1_040_000_000, WINDOW_NS)
+    assert fit.covariance[0, 0] ** 0.5 > 5 * steady.covariance[0, 0] ** 0.5
     assert 1e-3 > fit.covariance[0, 0] ** 0.5 > 4e-4
 
 

@@ -28,6 +28,9 @@ MIN_FOR_NOISE = 100
 NINE_TENTHS = 0.623
 """Mean square of the smallest nine tenths of normally distributed residuals, relative to that of all."""
 
+MIN_ALIKE_RATIO = 0.9
+"""Smallest share of equal readings on an axis that stands; the rest may be outliers."""
+
 
 @dataclass(frozen=True)
 class CraneSettings:
@@ -167,7 +170,8 @@ def fit_position(
     else:
         place, velocity = place + way.place_at(stamp)[0], velocity + way.speed_at(stamp)[0]
         bend = bend + way.acceleration_at(stamp)[0]
-    return FittedPosition(place, velocity, bend, np.eye(3) * variance)
+    hidden = _hidden_m2(crane.position_m[first:last], crane.position_std_m)
+    return FittedPosition(place, velocity, bend, np.diag(variance + hidden))
 
 
 def _misfit_m2(off_m: Float64, fitted: int, sigma_m: float) -> float:
@@ -179,11 +183,20 @@ def _misfit_m2(off_m: Float64, fitted: int, sigma_m: float) -> float:
     return float(max(0.0, seen - (1 + 2 * (2 / free) ** 0.5) * sigma_m**2))
 
 
+def _hidden_m2(position_m: Float64, sigma_m: float) -> Float64:
+    """Return the variance (3,) that readings (N, 3) hide where they are alike: an encoder that stands rounds
+    each of them by the same amount, which doesn't average out.
+    """
+    alike = (position_m == np.median(position_m, axis=0)).mean(axis=0)
+    return np.where(alike >= MIN_ALIKE_RATIO, sigma_m**2, 0.0)
+
+
 def reestimate_noise(crane: CraneSamples) -> CraneSamples:
     """Re-estimate the readings' sigma from themselves, within a factor of two of the stated one.
 
     Uses fourth differences, which suppress any smooth motion, and their median, which is robust to outliers.
-    (Each outlier is in five of them, so the largest ones are removed before the median.)
+    (Each outlier is in five of them, so the largest ones are removed before the median.) A median of zero
+    shows rounding, not noise.
     """
     if len(crane.stamp_ns) < MIN_FOR_NOISE:
         return crane
@@ -192,6 +205,8 @@ def reestimate_noise(crane: CraneSamples) -> CraneSamples:
     for _ in range(3):
         spread = mad_sigma(kept)
         kept = fourth[fourth <= 4 * spread]
+    if spread == 0:
+        return crane
     seen = spread / 70**0.5
     stated = crane.position_std_m
     return replace(crane, position_std_m=float(np.clip(seen, stated / 2, stated * 2)))
