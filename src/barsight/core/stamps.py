@@ -12,6 +12,8 @@ from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import InputError
 
 NS_PER_S = 1_000_000_000
+BEFORE_ALL_NS = -(2**63)
+"""A stamp before all others: a clock may count from any moment, so stamps may be 0 or negative."""
 
 
 def seconds_to_ns(seconds: float) -> int:

@@ -11,7 +11,7 @@ import numpy as np
 
 from barsight.core.arrays import Float64, Int64
 from barsight.core.records.sensor_samples import CraneSamples
-from barsight.core.stamps import NS_PER_S, seconds_to_ns
+from barsight.core.stamps import BEFORE_ALL_NS, NS_PER_S, seconds_to_ns
 from barsight.live.settings import LiveSettings
 from barsight.motion.batch.fault_detection import frozen_now
 
@@ -38,8 +38,6 @@ STAMP_SIGMA_S = 0.02
 """Standard deviation (s) of stamps while a device's clock is being estimated anew."""
 HELD_NS, HELD_READINGS = 5 * NS_PER_S, 100
 """Window in which faults are searched: its length in ns, and its minimum number of readings."""
-BEFORE_ALL_NS = -(2**63)
-"""A stamp before all others: a clock may count from any moment, so stamps may be 0 or negative."""
 LOOK_NS = NS_PER_S // 10
 """Interval in ns between searches for faults, by the readings' stamps."""
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.core.arrays import Float64, Int64
-from barsight.core.stamps import NS_PER_S
+from barsight.core.stamps import BEFORE_ALL_NS, NS_PER_S
 from barsight.recording.image_decoding import TornImageError
 from barsight.recording.pairing import decode_for
 from barsight.recording.stored_images import StoredImage, StoredPictures
@@ -20,9 +20,6 @@ BATCH_NS = 10_000_000
 USUAL_PERCENT = 95
 AHEAD_NS = NS_PER_S // 5
 """Lead in ns of readings over pictures at full speed: more than any pose waits for."""
-
-BEFORE_ALL_NS = -(1 << 63)
-"""Stamp before all others: those of a recording may begin at 0 or below it."""
 
 
 @dataclass(frozen=True)
