@@ -346,23 +346,6 @@ def _reading_of(z_m: Float64, width_m: float, *, pack_only: bool = False) -> Rea
     return cast(Reading, reading)
 
 
-def test_an_outline_ends_where_the_floor_is_seen_within_it() -> None:
-    """A pack 0.16 m wide is read as 0.24 m wide. Dunnage 0.12 m high stands beside it: under its axis, but
-    over that of the outline, 0.06 m.
-    """
-    u = 0.01 * np.arange(25) - 0.12
-    z = np.where(np.abs(u) < 0.085, 0.24, 0.0) + np.zeros((200, 1))
-    z[95:105, u > 0.085] = 0.12
-    reading = _reading_of(z, 0.24)
-    reading.found.fit.values[OUTLINE_Z] = 0.06
-    assert measure_laid(reading) == (pytest.approx(0.12), True)
-    seen = SeenSection(0.16, 0.0, sides_seen=True, sides_free=True)
-    assert measure_laid(reading, seen) == (0.0, False)
-    assert seen.within(0.24) == pytest.approx((-0.08, 0.08))
-    assert replace(seen, hidden_m=(0.0, 0.05)).within(0.24) == pytest.approx((-0.08, 0.12))
-    assert replace(seen, sides_free=False).within(0.24) is None
-
-
 @pytest.mark.parametrize(
     ("sunk_from_m", "own_m", "top_m", "laid_m"),
     [(0.085, 0.0, 0.1, 0.0), (0.085, 0.0, 0.2, 0.2), (0.085, 0.06, 0.1, 0.04), (0.0, 0.0, 0.1, 0.1)],

@@ -33,7 +33,7 @@ from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.floor import is_sunken
 from barsight.yard.bundles.irregular import widen_sigma
 from barsight.yard.bundles.layers import check_uncovered, find_layers, list_neighbours, list_overlaps
-from barsight.yard.bundles.pack_edges import DOUBTFUL, cut_at_floor
+from barsight.yard.bundles.pack_edges import DOUBTFUL
 from barsight.yard.bundles.reading import Reading
 from barsight.yard.bundles.section.seen_section import estimate_section, seen_section
 from barsight.yard.bundles.strapped_bundles import held_by_straps
@@ -127,7 +127,7 @@ def make_bundle(
         bar_axes=fit_bars(reading.found, settings),
         ends_sigma_m=(ends[0].sigma_m, ends[1].sigma_m),
         section_m2=section,
-        cover_doubts=list_cover_doubts(reading, seen, reasons),
+        cover_doubts=list_cover_doubts(reading, reasons),
         fit_sigma=_fit_sigma(own, ends),
     )
     doubtful = reading.other_packing is not None
@@ -135,7 +135,7 @@ def make_bundle(
     if reading.pack is not None and reading.pack.is_bounded:
         width_m = reading.pack.width_m
     irregular = widen_sigma(bundle.sigma, reading.found, width_m, bundle.length_m, is_one_of_two=doubtful)
-    return cut_at_floor(held_by_straps(bundle, irregular, reading, seen, floor_m), reading, seen)
+    return held_by_straps(bundle, irregular, reading, seen, floor_m)
 
 
 def map_sigma(yard: YardMap, bundle: Bundle) -> float:

@@ -162,12 +162,10 @@ def _shows_carrier(reading: Reading, width_m: float) -> bool:
     return bool((low & high).mean() > _CARRIED_RATIO)
 
 
-def list_cover_doubts(
-    reading: Reading, seen: SeenSection | None, reasons: tuple[Doubt, ...]
-) -> tuple[Doubt, ...]:
+def list_cover_doubts(reading: Reading, reasons: tuple[Doubt, ...]) -> tuple[Doubt, ...]:
     """List the objects that may hold the bundle down although no other bundle is known to lie on it."""
     out = [doubt for doubt in reasons if doubt.kind is DoubtKind.CROSSED]
-    laid, is_clear = measure_laid(reading, seen)
+    laid, is_clear = measure_laid(reading)
     if is_clear:
         said = f"something {1e3 * laid:.0f} mm high lies over a part of its width"
         out.append(Doubt(DoubtKind.OTHER, said))
@@ -179,7 +177,7 @@ def list_cover_doubts(
     return tuple(out)
 
 
-def measure_laid(reading: Reading, seen: SeenSection | None = None) -> tuple[float, bool]:
+def measure_laid(reading: Reading) -> tuple[float, bool]:
     """Measure the rise (m) of the highest object that lies over a part of a bundle's width, as a beam's end
     does, 0 where there is none. Also return whether any object rises by _LAID_M over the section even if
     the section is shifted sideways by a cell.
@@ -197,20 +195,13 @@ def measure_laid(reading: Reading, seen: SeenSection | None = None) -> tuple[flo
         return 0.0, False
     z = _straight_sections(reading, low, high)
     own = known_median(z)
-    beyond = np.zeros(own.shape[1], bool)
-    ends = None if seen is None or (pack is not None and pack.is_bounded) else seen.within(fit.width_m)
-    if ends is not None:
-        beside = low + grid.cell_m * np.arange(own.shape[1])
-        beyond = (beside < ends[0]) | (beside > ends[1])
-        low, high = ends
-        axis_z_m = float(np.nanmax(own[:, ~beyond])) - (high - low) / 2
-    sunken = (own < axis_z_m - _GULLY_RATIO * (high - low))[0] | beyond
+    sunken = (own < axis_z_m - _GULLY_RATIO * (high - low))[0]
     gully = np.logical_and.accumulate(sunken) | np.logical_and.accumulate(sunken[::-1])[::-1]
     rises = np.isfinite(z) & ~(gully & (z < axis_z_m)) & (z - own > _LAID_M)
     size = [max(round(side / grid.cell_m), 1) for side in _LAID_SIZE_M]
     square = np.ones(size, bool)
-    known = ndimage.uniform_filter(rises.astype(np.float64), size, mode="constant")
-    fits = ndimage.binary_erosion(rises | np.isnan(z), square) & (known > _MIN_SEEN_RATIO - 1e-6)
+    seen = ndimage.uniform_filter(rises.astype(np.float64), size, mode="constant")
+    fits = ndimage.binary_erosion(rises | np.isnan(z), square) & (seen > _MIN_SEEN_RATIO - 1e-6)
     laid = ndimage.binary_dilation(fits, square) & rises
     highest = ndimage.maximum_filter(np.where(np.isfinite(own), own, -np.inf), (1, 3))
     return float((z - own)[laid].max(initial=0.0)), bool((z - highest > _LAID_M)[laid].any())

@@ -6,9 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from barsight.yard.bundles.fitting.outline_fit import SLOPE_U
-from barsight.yard.bundles.reading import Reading
-from barsight.yard.bundles.section.seen_section import SeenSection
 from barsight.yard.types import Bundle, Doubt, DoubtKind
 
 DOUBTFUL = 0.4
@@ -20,25 +17,6 @@ other (m), maximum difference in height in mean widths.
 _NARROWEST_M = 0.04
 _SLIGHT_M = 0.015
 """Maximum depth (m) to which an outline may reach into a pack without being doubtful for it."""
-
-
-def cut_at_floor(bundle: Bundle, reading: Reading, seen: SeenSection | None) -> Bundle:
-    """Cut an outline where the surface falls to the floor on both sides within it, as it does if a circle is
-    fitted to a flat top. Bundles whose bars are counted or whose straps bound them keep their outline.
-    """
-    fit, pack = reading.found.fit, reading.pack
-    ends = None if seen is None else seen.within(fit.width_m)
-    if ends is None or bundle.bars is not None or (pack is not None and pack.is_bounded):
-        return bundle
-    width_m = ends[1] - ends[0]
-    aside = sum(ends) / 2 * np.array([np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad), 0.0])
-    if abs(bundle.yaw_rad - reading.found.grid.heading_rad + np.arctan(fit.values[SLOPE_U])) > 1.0:
-        aside = -aside
-    moved = aside + np.array([0.0, 0.0, bundle.top_z_m - width_m / 2 - bundle.centre_m[2]])
-    return replace(
-        bundle, centre_m=bundle.centre_m + moved, ends_m=bundle.ends_m + moved, width_m=width_m,
-        fit_sigma=None,
-    )  # fmt: skip
 
 
 def hold_off(bundles: list[Bundle], packs: list[bool]) -> list[Bundle]:

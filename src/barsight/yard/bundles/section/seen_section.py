@@ -78,7 +78,6 @@ class SeenSection:
     width_m: from side to side. misfit_m: RMS of the mean section over the outline of a full hexagon.
     sides_seen: both sides fall to the floor, or sink deep before a bundle of about its width begins.
     sides_free: both fall to the floor. hidden_m: length out of sight behind the low and the high side.
-    middle_m: place midway between the sides, beside the outline's axis.
     """
 
     width_m: float
@@ -86,16 +85,6 @@ class SeenSection:
     sides_seen: bool
     sides_free: bool
     hidden_m: tuple[float, float] = (0.0, 0.0)
-    middle_m: float = 0.0
-
-    def within(self, outline_m: float) -> tuple[float, float] | None:
-        """Return the places between which a bundle lies if it is seen to fall to the floor on both sides,
-        within an outline of width outline_m; None otherwise. What is out of sight may be the bundle's.
-        """
-        half = self.width_m / 2
-        low = max(self.middle_m - half - self.hidden_m[0], -outline_m / 2)
-        high = min(self.middle_m + half + self.hidden_m[1], outline_m / 2)
-        return (low, high) if self.sides_free and high - low < outline_m else None
 
 
 def seen_section(one: FittedOutline, others: list[FittedOutline], smoothing_m: float) -> SeenSection | None:
@@ -136,7 +125,6 @@ def seen_section(one: FittedOutline, others: list[FittedOutline], smoothing_m: f
             grid.cell_m * unseen_places(level[: ends[0][0]][::-1]),
             grid.cell_m * unseen_places(level[ends[1][0] + 1 :]),
         ),
-        middle_m=float(beside[ends[0][0]] + beside[ends[1][0]]) / 2,
     )
 
 
