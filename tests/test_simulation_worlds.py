@@ -25,7 +25,15 @@ from barsight.simulation.worlds.recording import cover, draw_world
 from barsight.simulation.worlds.settling import SKIN_M, BarPack, settle
 from barsight.simulation.worlds.solids import SolidYard, cylinder
 from barsight.simulation.worlds.surfaces import owners, scene_of
-from barsight.simulation.worlds.yards import KINDS, LOOSE, ORDERLY, DrawnBundle, draw_yard, kind_of
+from barsight.simulation.worlds.yards import (
+    KINDS,
+    LOOSE,
+    ORDERLY,
+    SPILLED,
+    DrawnBundle,
+    draw_yard,
+    kind_of,
+)
 
 GIVEN = SimulationSettings(
     length_m=1.6, frames=4, depth_views=0,
@@ -121,6 +129,24 @@ def test_orderly_yards_hold_whole_bundles_of_one_sort() -> None:
                 # Cut to 2 %, of which uneven ends take up to 0.13 m on the average.
                 assert one.length_m >= 0.97 * max(o.length_m for o in own) - 0.15
     assert kind_of(seed) != ORDERLY and draw_yard(5, 2.0, 2.4).kind == KINDS[5]
+
+
+def test_single_bars_lie_in_grooves_of_a_spilled_yards_highest_bundles() -> None:
+    laid = 0
+    for seed in range(4):
+        world = draw_yard(seed, 2.0, 2.4, kind=SPILLED)
+        strapped = [b for b in world.bundles if b.number < LOOSE]
+        for bar in (b for b in world.bundles if b.number >= LOOSE):
+            below = min(strapped, key=lambda b: float(np.hypot(*(b.centre_m - bar.centre_m)[[0, 2]])))
+            across = np.array([math.cos(below.yaw_rad), math.sin(below.yaw_rad)])
+            aside = float((bar.centre_m - below.centre_m)[:2] @ across)
+            up = float(bar.centre_m[2] - below.centre_m[2])
+            apart = np.sort(np.hypot(*(below.cross_m - (aside, up)).T))
+            touching = (bar.diameter_m + below.diameter_m) / 2
+            assert apart[:2] == pytest.approx(touching, abs=0.003)
+            assert up > below.cross_m[:, 1].max() and bar.length_m < below.length_m + 0.1
+            laid += 1
+    assert laid > 6
 
 
 def _expect_apart(bundles: list[DrawnBundle], y: float) -> None:

@@ -44,9 +44,9 @@ DRAWN_BY = (*DRAWS, "benchmarks/yard/drawn_worlds.py")
 class YardChoice:
     """Choice of the drawn yards and of how each becomes a map."""
 
-    kind: Literal["by-seed", "orderly"] = "by-seed"
+    kind: Literal["by-seed", "orderly", "spilled"] = "by-seed"
     """Kind of the yards. by-seed: seed modulo 10 selects the kind. orderly: whole bundles of one sort in even
-    layers.
+    layers. spilled: the same, with single bars that lie along on half of the highest bundles.
     """
     rendered: bool = False
     """Render and measure each yard, which takes a minute; otherwise noise is added to the exact map."""

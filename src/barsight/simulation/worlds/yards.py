@@ -1,4 +1,4 @@
-"""Draw yards more varied than any model of them: `draw_yard(seed)` makes one of KINDS or an orderly one.
+"""Draw yards more varied than any model of them: `draw_yard(seed)` makes one of KINDS or of NAMED_KINDS.
 
 Piles (`piles`) are lined up along X; other objects of a yard stand and lie around them. No code of the
 simulated stock or of the yard's stages is used.
@@ -11,17 +11,21 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+from scipy.signal import argrelmin
 
 from barsight.core.arrays import Float64
 from barsight.simulation.worlds.packing import strap, tag
 from barsight.simulation.worlds.piles import DIAMETERS_M, Lying, Manner, Pile, Upright, pile_up
+from barsight.simulation.worlds.settling import BarPack
 from barsight.simulation.worlds.solids import Solid, SolidYard, box, cylinder, turn_about_z
 
 KINDS = (
     "layered", "beams", "walls", "along-x", "nested", "askew", "stanchions", "unseen", "loose", "mixed",
 )  # fmt: skip
-ORDERLY = "orderly"
-"""Kind of yard that is drawn only if named, not by a seed: layers of identical full-hexagon bundles."""
+ORDERLY, SPILLED = NAMED_KINDS = ("orderly", "spilled")
+"""Kinds of yards that are drawn only if named, not by a seed: layers of identical full-hexagon bundles; the
+same with single bars that lie along on the highest ones.
+"""
 LOOSE = 1000
 """Number of the first bar that belongs to no bundle."""
 SEGMENT_M = 1.2
@@ -33,6 +37,9 @@ MAX_SIDE_M = 3.4
 STRAIGHT_M = 0.0005
 MIN_BAR_M = 1.5
 ON_STRAP_M = 0.0013
+SPILLED_RATIO = 0.5
+"""Share of the highest bundles on which a single bar lies along in a spilled yard."""
+GROOVE_STEP_M = 0.0005
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +64,7 @@ class DrawnBundle:
 
 @dataclass(frozen=True, eq=False)
 class DrawnYard:
-    """A yard of one of KINDS or ORDERLY, from x = 0 and centred on y = 0. size_m: along X and Y."""
+    """A yard of one of KINDS or NAMED_KINDS, from x = 0 and centred on y = 0. size_m: along X and Y."""
 
     seed: int
     kind: str
@@ -106,7 +113,10 @@ def draw_yard(
         room = length_m - x
         span = min(across, MAX_SIDE_M) if abs(yaw) > 1 else min(across, room)
         pile = pile_up(manner, upright, span, length, rng)
-        _lay_upon(pile, 0.7 if kind == "beams" else 0.12, rng)
+        if kind == SPILLED:
+            _spill_upon(pile, rng)
+        else:
+            _lay_upon(pile, 0.7 if kind == "beams" else 0.12, rng)
         placed, laid = _placed(pile, section, (len(bundles), LOOSE + len(bundles)), yaw, rng)
         bounds = np.array([s.bounds for s in placed])
         low, high = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
@@ -127,7 +137,7 @@ def _sort(kind: str, section: int, rng: np.random.Generator) -> tuple[Manner, Up
     upright: Upright = "wedges"
     if kind == "nested":
         manner = "nested"
-    if kind == ORDERLY:
+    if kind in NAMED_KINDS:
         manner = "orderly"
     if kind == "loose" and section % 2 == 0:
         return "loose", "stanchions" if rng.random() < 0.5 else "wedges"
@@ -264,6 +274,28 @@ def _lay_upon(pile: Pile, share: float, rng: np.random.Generator) -> None:
             size = np.array([reach, float(rng.uniform(0.05, 0.12)), thick])
             pile.others.append(box("beam", at, size, yaw))
         taken |= {id(o) for o in near}
+
+
+def _spill_upon(pile: Pile, rng: np.random.Generator) -> None:
+    """Lay single bars along on bundles of the highest layer, each in a groove between two bars below it."""
+    top = max(one.layer for one in pile.lying)
+    for one in [one for one in pile.lying if one.layer == top]:
+        if rng.random() > SPILLED_RATIO:
+            continue
+        radius = float(rng.choice(DIAMETERS_M)) / 2
+        aside, up = one.pack.cross.T
+        x = np.arange(aside.min(), aside.max(), GROOVE_STEP_M)
+        room = (one.pack.radius + radius) ** 2 - (x[:, None] - aside) ** 2
+        z = np.where(room > 0, up + np.sqrt(np.maximum(room, 0)), -np.inf).max(axis=1)
+        (grooves,) = argrelmin(z)
+        if not grooves.size:
+            continue
+        groove = int(rng.choice(grooves))
+        length = float(rng.choice([rng.uniform(0.9, 1.0), rng.uniform(0.3, 0.9)], p=[0.7, 0.3])) * one.length
+        turn, along = turn_about_z(one.yaw), float(rng.uniform(-0.5, 0.5)) * (one.length - length)
+        at = turn[:, 0] * (x[groove] - aside.mean()) + turn[:, 1] * along
+        cross = np.array([[aside.mean() + at[0], z[groove] + ON_STRAP_M]])
+        pile.lying.append(Lying(BarPack(cross, radius), top + 1, length, one.y + float(at[1]), one.yaw))
 
 
 def _stand_about(end_x: float, bar_length: float, rng: np.random.Generator) -> list[Solid]:
