@@ -534,6 +534,22 @@ def test_a_bar_along_a_bundle_five_times_as_wide_lies_on_it() -> None:
     assert nearest(found, laid).on_top is False and nearest(found, bar).on_top
 
 
+@pytest.mark.parametrize(("bar_m", "is_told"), [(0.04, True), (0.05, True), (None, False)])
+def test_a_bar_that_lies_along_on_a_bundle_covers_it(bar_m: float | None, *, is_told: bool) -> None:
+    """It lies in the groove between two of four bars of 32 mm. Neither width nor top tells."""
+    below = Laid(0.0, 0.0, 0.2, 0.0, 0.032, 37, roll_deg=0.0)
+    stock = [below]
+    if bar_m is not None:
+        rise = np.sqrt(((bar_m + 0.032) / 2) ** 2 - 0.016**2)
+        axis_z_m = below.z_m + below.axes_m[:, 1].max() + rise
+        stock.append(Laid(0.0, 0.0, axis_z_m, 0.0, bar_m, 1))
+    heights = draw(stock, x_m=(-0.6, 0.6), sigma_m=0.002)
+    (found,) = find_bundles(heights, SETTINGS)
+    said = [doubt.sentence for doubt in found.cover_doubts]
+    assert any("lies along on it" in sentence for sentence in said) is is_told
+    assert bool(said) is is_told
+
+
 def test_a_bundle_of_the_next_row_is_no_neighbour_at_a_flank() -> None:
     laid = Laid(0.7, -1.7, 0.1355, 0.0)
     (alone,) = find_bundles(draw([laid], y_m=(-3.7, 3.7)), SETTINGS)

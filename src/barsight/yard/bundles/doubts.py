@@ -30,6 +30,10 @@ to one object. Dunnage comes in twos or more. Both in m.
 """
 _LAID_M, _LAID_SIZE_M = 0.02, (0.04, 0.03)
 """Minimum rise of an object that lies over a part of a bundle's width, and its size along and across (m)."""
+_ALONG_M = 0.012
+"""Minimum rise of a bundle's own section over its outline's top from which something lies along on it. On
+drawn yards 98 % of uncovered bundles rise by less than 8 mm.
+"""
 _MIN_SEEN_RATIO = 0.75
 """Minimum share of such an object's places that is measured: matching loses places along its edges."""
 _MAX_BOW_CELLS, _BOW_COST_M, _BOW_STEP = 8, 2e-4, 4
@@ -172,6 +176,9 @@ def list_cover_doubts(reading: Reading, reasons: tuple[Doubt, ...]) -> tuple[Dou
     elif laid > 0:
         said = f"something {1e3 * laid:.0f} mm high beside it may lie over its flank"
         out.append(Doubt(DoubtKind.HIDDEN_FLANK, said))
+    if (along := measure_along(reading)) > _ALONG_M:
+        said = f"something {1e3 * along:.0f} mm over its outline lies along on it"
+        out.append(Doubt(DoubtKind.OTHER, said))
     if reading.flanks is not None and reading.flanks.cover_doubt:
         out.append(reading.flanks.cover_doubt)
     return tuple(out)
@@ -187,15 +194,13 @@ def measure_laid(reading: Reading) -> tuple[float, bool]:
     axis, where a gully shows at the rim, lies beside the bundle, as dunnage does. A steep flank that is off
     by a cell rises as much; an object on a bundle rests on its crest and rises over the shifted section too.
     """
-    grid, fit, pack = reading.found.grid, reading.found.fit, reading.pack
-    low, high, axis_z_m = -fit.width_m / 2, fit.width_m / 2, float(fit.values[Z])
-    if pack is not None and pack.is_bounded:
-        low, high, axis_z_m = pack.low_m, pack.high_m, axis_z_m + pack.top_m - pack.width_m / 2
-    if fit.last - fit.first < 2 * _BEFORE_END_M / grid.cell_m + 1:
+    grid = reading.found.grid
+    sections = _straight_sections(reading)
+    if sections is None:
         return 0.0, False
-    z = _straight_sections(reading, low, high)
+    z, axis_z_m, width_m = sections
     own = known_median(z)
-    sunken = (own < axis_z_m - _GULLY_RATIO * (high - low))[0]
+    sunken = (own < axis_z_m - _GULLY_RATIO * width_m)[0]
     gully = np.logical_and.accumulate(sunken) | np.logical_and.accumulate(sunken[::-1])[::-1]
     rises = np.isfinite(z) & ~(gully & (z < axis_z_m)) & (z - own > _LAID_M)
     size = [max(round(side / grid.cell_m), 1) for side in _LAID_SIZE_M]
@@ -207,14 +212,34 @@ def measure_laid(reading: Reading) -> tuple[float, bool]:
     return float((z - own)[laid].max(initial=0.0)), bool((z - highest > _LAID_M)[laid].any())
 
 
-def _straight_sections(reading: Reading, low_m: float, high_m: float) -> Float64:
-    """Look up the heights (R, C) of a bundle's rows at the places low_m to high_m across, less the rise along
-    its axis; NaN where unknown. The rows of a bowed bundle are shifted sideways into line.
+def measure_along(reading: Reading) -> float:
+    """Measure the rise (m) of a bundle's own section, the median along it, over its outline's top: a bar that
+    lies along on it rises so all the way. Negative where it is lower, 0 where it isn't known.
+    """
+    sections = _straight_sections(reading)
+    if sections is None:
+        return 0.0
+    z, axis_z_m, width_m = sections
+    own = known_median(z)[0]
+    cells = max(round(_LAID_SIZE_M[1] / reading.found.grid.cell_m), 1)
+    ridge = ndimage.minimum_filter1d(np.where(np.isfinite(own), own, -np.inf), cells)
+    return float(ridge.max()) - axis_z_m - width_m / 2 if np.isfinite(ridge).any() else 0.0
+
+
+def _straight_sections(reading: Reading) -> tuple[Float64, float, float] | None:
+    """Look up the heights (R, C) of a bundle's rows from flank to flank, less the rise along its axis, NaN
+    where unknown; and the height of its axis and its width. None where it is too short. The rows of a bowed
+    bundle are shifted sideways into line.
 
     The bow is the parabola b (x^2 - 1/3), x from -1 to 1 along the bundle, that brings all rows closest to
     their median section: the fitted axis is the mean of such a bundle.
     """
-    grid, fit = reading.found.grid, reading.found.fit
+    grid, fit, pack = reading.found.grid, reading.found.fit, reading.pack
+    if fit.last - fit.first < 2 * _BEFORE_END_M / grid.cell_m + 1:
+        return None
+    low_m, high_m, axis_z_m = -fit.width_m / 2, fit.width_m / 2, float(fit.values[Z])
+    if pack is not None and pack.is_bounded:
+        low_m, high_m, axis_z_m = pack.low_m, pack.high_m, axis_z_m + pack.top_m - pack.width_m / 2
     rim = round(_BEFORE_END_M / grid.cell_m)
     rows = np.arange(fit.first + rim, fit.last + 1 - rim)
     beside = np.arange(low_m, high_m + grid.cell_m / 2, grid.cell_m)
@@ -226,7 +251,7 @@ def _straight_sections(reading: Reading, low_m: float, high_m: float) -> Float64
         cost = float(np.nanmean(misfit)) + _BOW_COST_M * abs(bow) if np.isfinite(misfit).any() else np.inf
         if cost < least:
             best, least = bow, cost
-    return _sections(reading, rows, beside + best * parabola)
+    return _sections(reading, rows, beside + best * parabola), axis_z_m, high_m - low_m
 
 
 def _sections(reading: Reading, rows: Int64, beside: Float64) -> Float64:
