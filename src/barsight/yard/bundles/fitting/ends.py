@@ -21,11 +21,13 @@ _RAGGED_M = 0.2
 _SOME, _MAX_VALUE = 0.3, 0.6
 _DEEP_RATIO = 0.5
 """Minimum depth of the surface under the outline, in widths, from which the bundle has ended."""
-_GROWTH_CELLS = 1.5
-"""Distance, in cells, by which the map extends a bundle beyond its true end."""
-_SEEN_SIGMA_M, _SEEN_SIGMAS = 0.006, 1.0
-"""Standard deviation of an end's place where all bars end flush: a constant part (m), and a multiple of the
-heights' sigma, which rises with the size of the pixels.
+_GROWTH_M = 0.015
+"""Distance (m) by which the map extends a bundle beyond its true end. The matching window, not the size of
+the cells, determines it.
+"""
+_SEEN_SIGMA_M, _SEEN_CELLS, _SEEN_SIGMAS = 0.0053, 12**-0.5, 1.0
+"""Standard deviation of an end's place where all bars end flush: a constant part (m), the rounding to whole
+cells, and a multiple of the heights' sigma, which rises with the size of the pixels.
 """
 _UNEVEN_SIGMAS, _RAGGED_RATIO = 2.0, 0.35
 """Parts of an end's sigma: factor on the sigma that follows from the spread of the visible bars' ends, since
@@ -84,9 +86,9 @@ def find_end(grid: AlignedMap, fit: Fit, step: int, settings: BundleSettings) ->
             lower += 1
             if lower * cell >= _PROOF_M:
                 spread = ragged * cell
-                end = v + step * (spread / 4 - _GROWTH_CELLS * cell)
+                end = v + step * (spread / 4 - _GROWTH_M)
                 uneven = _unevenness(grid, fit, row, step, settings)
-                flush = math.hypot(_SEEN_SIGMA_M, _SEEN_SIGMAS * fit.sigma_m)
+                flush = math.hypot(_SEEN_SIGMA_M, _SEEN_CELLS * cell, _SEEN_SIGMAS * fit.sigma_m)
                 sigma = math.hypot(flush, _RAGGED_RATIO * spread, _UNEVEN_SIGMAS * uneven)
                 return End(end, sigma, is_open=False, flush_sigma_m=flush)
     return _open_end(v, "the map doesn't show what lies beyond", lower)

@@ -65,9 +65,11 @@ _MAX_DEVIATIONS = 4.0
 """Maximum deviations from the prior's mean: a floor further above cuts off nothing, further below no more."""
 _BULGE_RATIO = 0.4
 """Standard deviation of the bulge of bars behind a flank, as a fraction of the unseen length there."""
-_SEEN_WIDTH_SIGMA_M, _OUTLINE_RATIO = 0.012, 0.5
-"""Errors of the seen width: a constant standard deviation (m), and a fraction of its difference from the
-outline's width.
+_GROWTH_M = 0.01
+"""Width (m) that the map adds to a bundle: the matching window, not the size of the cells, determines it."""
+_SEEN_WIDTH_SIGMA_M, _SEEN_WIDTH_CELLS, _OUTLINE_RATIO = 0.0113, 6**-0.5, 0.5
+"""Errors of the seen width: a constant standard deviation (m), the rounding of both sides to whole cells, and
+a fraction of its difference from the outline's width.
 """
 
 
@@ -75,8 +77,8 @@ outline's width.
 class SeenSection:
     """The section of a bundle that is seen.
 
-    width_m: from side to side. misfit_m: RMS of the mean section over the outline of a full hexagon.
-    sides_seen: both sides fall to the floor, or sink deep before a bundle of about its width begins.
+    width_m: from side to side, with its sigma. misfit_m: RMS of the mean section over the outline of a full
+    hexagon. sides_seen: both sides fall to the floor, or sink deep before a bundle of about its width begins.
     sides_free: both fall to the floor. hidden_m: length out of sight behind the low and the high side.
     """
 
@@ -85,6 +87,7 @@ class SeenSection:
     sides_seen: bool
     sides_free: bool
     hidden_m: tuple[float, float] = (0.0, 0.0)
+    width_sigma_m: float = 0.012
 
 
 def seen_section(one: FittedOutline, others: list[FittedOutline], smoothing_m: float) -> SeenSection | None:
@@ -117,7 +120,8 @@ def seen_section(one: FittedOutline, others: list[FittedOutline], smoothing_m: f
     misfit = np.sort(np.abs(misfit[np.isfinite(misfit)]))
     misfit = misfit[: round(_GULLIES_APART * misfit.size)]
     return SeenSection(
-        width_m=grid.cell_m * (len(own) - 1),
+        width_m=grid.cell_m * len(own) - _GROWTH_M,
+        width_sigma_m=math.hypot(_SEEN_WIDTH_SIGMA_M, _SEEN_WIDTH_CELLS * grid.cell_m),
         misfit_m=float(np.sqrt(np.mean(misfit**2))) if misfit.size else np.inf,
         sides_seen=all(seen for _, seen, _ in ends),
         sides_free=all(free for _, _, free in ends),
@@ -177,6 +181,9 @@ def estimate_section(
 ) -> tuple[float, float]:
     """Estimate the steel section of a bundle whose bars can't be counted, and its sigma (m2); NaN where its
     sides weren't seen, or where the visible part isn't the outline's section.
+
+    What looks like one bar may be one: the section's upper bound is then no less than that of a solid bar as
+    wide as the map shows it.
     """
     if seen is None or not seen.sides_seen:
         return np.nan, np.nan
@@ -185,8 +192,12 @@ def estimate_section(
     fill = _FILL_RATIO if fit.rings else _BAR_FILL_RATIO
     off_m = _OUTLINE_RATIO * (seen.width_m - fit.width_m)
     bulge_m = bulge_sigma(seen.hidden_m, seen.width_m, is_along_baseline=is_along_baseline)
-    sigma_m = math.hypot(_SEEN_WIDTH_SIGMA_M, off_m, bulge_m)
-    return section_of_pack(seen.width_m, sigma_m, over_floor(top_m, floor_m), fill)
+    sigma_m = math.hypot(seen.width_sigma_m, off_m, bulge_m)
+    section, sigma = section_of_pack(seen.width_m, sigma_m, over_floor(top_m, floor_m), fill)
+    if fit.rings:
+        return section, sigma
+    solid = math.pi / 4 * max(fit.width_m, seen.width_m + _GROWTH_M) ** 2
+    return section, max(sigma, (solid - section) / UPPER)
 
 
 def section_of_pack(
