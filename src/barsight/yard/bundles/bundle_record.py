@@ -31,7 +31,7 @@ from barsight.yard.bundles.fitting.outline_fit import (
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.floor import is_sunken
-from barsight.yard.bundles.irregular import widen_sigma
+from barsight.yard.bundles.irregular import widen_sigma, widen_unseen
 from barsight.yard.bundles.layers import check_uncovered, find_layers, list_neighbours, list_overlaps
 from barsight.yard.bundles.pack_edges import DOUBTFUL
 from barsight.yard.bundles.reading import Reading
@@ -135,7 +135,8 @@ def make_bundle(
     if reading.pack is not None and reading.pack.is_bounded:
         width_m = reading.pack.width_m
     irregular = widen_sigma(bundle.sigma, reading.found, width_m, bundle.length_m, is_one_of_two=doubtful)
-    return held_by_straps(bundle, irregular, reading, seen, floor_m)
+    held = held_by_straps(bundle, irregular, reading, seen, floor_m)
+    return widen_unseen(held, reading.flanks, settings.max_width_m)
 
 
 def map_sigma(yard: YardMap, bundle: Bundle) -> float:

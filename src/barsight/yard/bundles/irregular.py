@@ -1,4 +1,6 @@
-"""Widen the sigma of an outline that may not be the bundle's: irregular bundles aren't hexagons."""
+"""Widen the sigma of an outline that may not be the bundle's: irregular bundles aren't hexagons, and others
+are measured in part.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,9 @@ from dataclasses import replace
 import numpy as np
 
 from barsight.yard.bundles.fitting.outline_fit import DIAMETER, FittedOutline
-from barsight.yard.types import BundleSigma
+from barsight.yard.bundles.section.flanks import Flanks
+from barsight.yard.lift_settings import UPPER
+from barsight.yard.types import Bundle, BundleSigma, Doubt, DoubtKind
 
 _WIDTH_RATIOS, _WIDTH_SIGMAS = (0.03, 0.12), (1.5, 2.0)
 """Errors of the width, in widths and in sigmas of a height; each where the pictures show the packing, and
@@ -23,6 +27,24 @@ DIAMETER_RATIOS = 0.06, 0.45, 0.6
 """Errors of a diameter, as fractions of it: where bars show their shape, where they are too thin for that,
 and where another packing fits as well or many bars may look like one.
 """
+
+
+def widen_unseen(bundle: Bundle, flanks: Flanks | None, max_width_m: float) -> Bundle:
+    """Widen the sigma of a bundle that may go on, up to the maximum width of one, beside a flank where
+    nothing was measured, as at the map's end. Its section isn't known.
+    """
+    if flanks is None or not flanks.unbounded:
+        return bundle
+    said = f"nothing was measured beside its {' and '.join(flanks.unbounded)} flank: it may be wider"
+    wider_m = max(max_width_m - bundle.width_m, 0.0) / UPPER
+    sigma = replace(
+        bundle.sigma,
+        width_m=float(np.hypot(bundle.sigma.width_m, wider_m)),
+        lateral_m=float(np.hypot(bundle.sigma.lateral_m, wider_m / 2)),
+        section_m2=np.nan,
+    )
+    reasons = (*bundle.reasons, Doubt(DoubtKind.MAY_GO_ON, said))
+    return replace(bundle, bars=None, section_m2=np.nan, sigma=sigma, reasons=reasons)
 
 
 def widen_sigma(

@@ -17,8 +17,11 @@ _FLANK_RATIOS = 0.3, 0.5, 0.55
 """Distances from a bundle's middle, in widths: where it begins to fall off, its edge, and how far a map may
 extend the flank over the edge.
 """
-_BEYOND_M = 0.15
-"""Maximum distance (m) beyond a bundle's edge of a neighbour that may lie over it."""
+_SIDES = "low", "high"
+_BESIDE_M, _BEYOND_M = 0.05, 0.15
+"""Minimum distance (m) beyond a bundle's edge of a place that shows what lies beside it; maximum distance of
+a neighbour that may lie over it.
+"""
 _FLAT_RATIO, _SHALLOW_RATIO, _SURE_RATIO, _HIGHER_M = 0.1, 0.18, 0.3, 0.03
 """Thresholds on a flank's fall, in widths, and on a neighbour's rise over the crest (m).
 
@@ -34,7 +37,8 @@ class Flanks:
 
     falls_m: from the crest to the lowest place of each flank, inf where it falls to the floor or out of
     sight, 0 where something higher hides all of it. rises_m: from the crest to the highest place beside each
-    flank, -inf where nothing is seen. are_flat: neither flank falls off before its edge, as with a plate, a
+    flank, -inf where only floor is seen, NaN where nothing was measured, as beyond the map's end: then the
+    fall is that of what was measured. are_flat: neither flank falls off before its edge, as with a plate, a
     cart or a wall. ended: the sides on which straps show where the bundle ends, however little it falls
     there.
     """
@@ -55,13 +59,21 @@ class Flanks:
         """Return the same doubt for a flank that isn't seen with certainty."""
         return self._doubt(_SURE_RATIO)
 
+    @property
+    def unbounded(self) -> tuple[str, ...]:
+        """Name the flanks beside which nothing was measured, so that the bundle may be wider."""
+        return tuple(name for name, rise in zip(_SIDES, self.rises_m, strict=True) if np.isnan(rise))
+
     def _doubt(self, shallow_ratio: float) -> Doubt | None:
-        sides = list(zip(("low", "high"), self.falls_m, self.rises_m, self.ended, strict=True))
+        sides = list(zip(_SIDES, self.falls_m, self.rises_m, self.ended, strict=True))
         for name, fall, rise, ended in sides:
             if fall < _FLAT_RATIO * self.width_m and not (ended and rise <= _HIGHER_M):
                 said = f"its {name} flank was not seen: something may lie over it"
                 return Doubt(DoubtKind.UNSEEN_FLANK, said)
         for name, fall, rise, _ in sides:
+            if fall < shallow_ratio * self.width_m and np.isnan(rise):
+                said = f"its {name} flank was not seen: nothing was measured beside it"
+                return Doubt(DoubtKind.UNSEEN_FLANK, said)
             if fall < shallow_ratio * self.width_m and _HIGHER_M < rise < self.width_m:
                 said = f"what stands {1e3 * rise:.0f} mm higher beside it may lie over its {name} flank"
                 return Doubt(DoubtKind.HIDDEN_FLANK, said)
@@ -90,13 +102,16 @@ def seen_flanks(one: FittedOutline, low_m: float, high_m: float) -> Flanks | Non
 def _flank(outwards: Float64, level: Float64, crest: float, width: float) -> tuple[float, float, float]:
     """Measure one side from the crest (m): the fall before its edge; the fall including what a map extends
     over it, inf where that goes to the floor or out of sight, 0 where something higher hides the whole flank;
-    and the rise of what lies beyond.
+    and the rise of what lies beyond, NaN where nothing was measured there.
     """
     first, edge, last = (ratio * width for ratio in _FLANK_RATIOS)
     inner = level[(outwards > first) & (outwards < edge)]
     own = level[(outwards > first) & (outwards < last)]
     beyond = level[(outwards >= edge) & (outwards < edge + _BEYOND_M)]
     before = crest - inner[np.isfinite(inner)].min(initial=crest)
+    if np.isnan(level[(outwards >= edge + _BESIDE_M) & (outwards < edge + _BEYOND_M)]).all():
+        measured = ~np.isnan(level)
+        return float(before), float(crest - level[measured][outwards[measured].argmax()]), np.nan
     rise = beyond[np.isfinite(beyond)].max(initial=-np.inf) - crest
     seen = own[~np.isnan(own)]
     lowest = seen.min() if seen.size else crest if own.size and rise > _HIGHER_M else -np.inf
