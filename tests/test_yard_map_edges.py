@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from barsight.core.records.heights import HeightSource
+from barsight.yard.bundles.bundle_record import describe_bundles
+from barsight.yard.bundles.collinear_pieces import join_pieces
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.lifting.targets import plan_lifts
-from barsight.yard.types import DoubtKind, HeightMap
+from barsight.yard.sections import split_map
+from barsight.yard.types import ENDS, Doubt, DoubtKind, HeightMap
 from barsight.yard.weight import STEEL_KG_PER_M3, bundle_mass
-from lift_yards import MAGNET, laid, map_of
+from lift_yards import MAGNET, laid, map_of, record
 from lift_yards import SETTINGS as LIFTS
 from yard_maps import Laid
 
@@ -21,6 +27,15 @@ def cut(heights: HeightMap, x_m: float) -> HeightMap:
     """The same map, ended at an x."""
     end = round((x_m - heights.x0_m) / heights.cell_m)
     return heights.part(slice(0, heights.shape[0]), slice(0, end))
+
+
+def unseen(heights: HeightMap, y_m: float, length_m: float) -> HeightMap:
+    """The same map without the rows of a length about a y."""
+    hidden = np.abs(heights.y_m - y_m) < length_m / 2
+    hidden = np.repeat(hidden[:, None], heights.shape[1], axis=1)
+    unknown, z_m = heights.source.copy(), np.where(hidden, np.float32(np.nan), heights.z_m)
+    unknown[hidden] = HeightSource.UNKNOWN
+    return replace(heights, z_m=z_m, source=unknown)
 
 
 def mass_of(one: Laid) -> float:
@@ -51,3 +66,35 @@ def test_a_bundle_whose_flanks_are_seen_is_free_beside_the_maps_end() -> None:
         (told,) = find_bundles(cut(map_of([one]), one.width_m / 2 + beyond_m), SETTINGS)
         assert told.is_free and told.sigma.width_m < 0.05
         assert bundle_mass(told).upper_kg > mass_of(one)
+
+
+@pytest.mark.parametrize(("gap_m", "unknown_m"), [(0.02, 0.06), (0.1, 0.1), (0.05, 0.3), (0.5, 0.55)])
+def test_a_gap_may_hide_in_what_the_map_does_not_show(gap_m: float, unknown_m: float) -> None:
+    """Two bundles end to end were told as one of 6.3 m, free and certain, and a lift of both was offered."""
+    one = replace(laid(0.0, 0.165), length_m=6.5, y_m=-0.25)
+    behind = replace(one, length_m=0.7, y_m=3.0 + 0.35 + gap_m)
+    place_m = 3.0 + gap_m / 2
+    heights = unseen(map_of([one, behind], y_m=(-4.0, 4.6)), place_m, unknown_m)
+    (told,) = find_bundles(heights, SETTINGS)
+    assert told.length_m > 7.0 and told.confidence < 0.5
+    assert any(doubt.kind is DoubtKind.GAP for doubt in told.reasons)
+    assert not plan_lifts(heights, (told,), MAGNET, LIFTS, ()).offered
+    (whole,) = find_bundles(map_of([replace(one, length_m=7.2, y_m=0.1)]), SETTINGS)
+    assert whole.confidence > 0.9
+
+
+@pytest.mark.parametrize(
+    ("why", "is_free"),
+    [("end is open: the map doesn't show what lies beyond", True), (DoubtKind.COVERED_END.value, False)],
+)
+def test_pieces_joined_over_what_was_not_seen_may_be_two_bundles(why: str, *, is_free: bool) -> None:
+    pieces = [
+        record(
+            replace(laid(0.0), y_m=y_m, length_m=3.0), ends_open=(y_m > 0, y_m < 0),
+            reasons=(Doubt.read(f"the {ENDS[y_m < 0]} {why}"),),
+        )
+        for y_m in (-1.7, 1.7)
+    ]  # fmt: skip
+    (whole,) = describe_bundles(join_pieces(pieces), 0.0, split_map(map_of([laid(0.0)])))
+    assert whole.length_m > 6.0 and not any(whole.ends_open)
+    assert whole.is_free is is_free and (whole.confidence < 0.5) is is_free

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from barsight.yard.bundles.doubts import list_hidden_gaps
 from barsight.yard.bundles.fitting.ends import middle_and_length_sigma
 from barsight.yard.types import ENDS, Bundle, BundleSigma, Doubt, DoubtKind
 
@@ -59,7 +60,7 @@ def _joined(whole: Bundle, piece: Bundle) -> Bundle | None:
         and abs(np.log(width)) < _ALIKE_LOG
     ):
         return None
-    if _shows_gap(whole, side) or _shows_gap(piece, order[1 - side]):
+    if _has(whole, DoubtKind.GAP, side) or _has(piece, DoubtKind.GAP, order[1 - side]):
         return None
     end = whole.ends_m[side] + (away[side, 0] - own) * whole.direction / np.cos(whole.pitch_rad)
     ends = np.array([whole.ends_m[0], end] if side else [end, whole.ends_m[1]])
@@ -75,7 +76,9 @@ def _joined(whole: Bundle, piece: Bundle) -> Bundle | None:
     )
     kept = tuple(doubt for doubt in kept if doubt.end != side)
     added = (doubt for doubt in others if doubt.end in (None, far) and doubt not in kept)
-    reasons = (*kept, *(_at_end(doubt, side) for doubt in added))
+    covered = any(_has(one, DoubtKind.COVERED_END, end) for one, end in ((whole, side), (piece, 1 - far)))
+    between = _list_between(float(gap), covered=covered)
+    reasons = (*kept, *(_at_end(doubt, side) for doubt in added), *between)
     return replace(
         whole, centre_m=ends.mean(axis=0), ends_m=ends, ends_open=(is_open[0], is_open[1]),
         ends_sigma_m=(sigmas[0], sigmas[1]), length_m=float(np.linalg.norm(ends[1] - ends[0])),
@@ -107,8 +110,16 @@ def _joined_sigma(whole: Bundle, piece: Bundle, aside_m: float, ends_m: tuple[fl
     )
 
 
-def _shows_gap(bundle: Bundle, end: int) -> bool:
-    return any(doubt.kind is DoubtKind.GAP and doubt.end == end for doubt in bundle.reasons)
+def _has(bundle: Bundle, kind: DoubtKind, end: int) -> bool:
+    return any(doubt.kind is kind and doubt.end == end for doubt in bundle.reasons)
+
+
+def _list_between(gap_m: float, *, covered: bool) -> list[Doubt]:
+    """List the doubts about what lies between two pieces: what covers it, or a gap that isn't seen."""
+    if covered:
+        said = f"something between two pieces, {gap_m:.2f} m apart, {DoubtKind.COVERS_PART.value}"
+        return [Doubt(DoubtKind.COVERS_PART, said)]
+    return list_hidden_gaps(gap_m)
 
 
 def _at_end(doubt: Doubt, end: int) -> Doubt:

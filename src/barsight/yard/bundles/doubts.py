@@ -8,7 +8,7 @@ from scipy import ndimage
 from barsight.core.arrays import Bool, Float64, Int64, UInt8
 from barsight.core.linalg.robust import known_median
 from barsight.yard.bundles.crossing_bundles import rise_over
-from barsight.yard.bundles.fitting.ends import End, gap_rows
+from barsight.yard.bundles.fitting.ends import End, gap_rows, lost_rows
 from barsight.yard.bundles.fitting.outline import BARS_OF_RINGS, bundle_width
 from barsight.yard.bundles.fitting.outline_fit import ABOVE, AGREES, BELOW, DIAMETER, SLOPE_U, SLOPE_Z, U, Z
 from barsight.yard.bundles.fitting.settings import BundleSettings
@@ -52,6 +52,10 @@ _CARRIER_M, _CARRIED_RATIO = 0.15, 0.03
 """Maximum distance (m) of a carrier from both flanks; minimum share of the length over which it shows."""
 _BEFORE_END_M = 0.05
 """Margin (m) at each end within which rows aren't used: bars end unevenly."""
+_STUB_M, _HIDES_M, _MIN_LOST_M = 0.3, 0.05, 0.015
+"""Lengths (m) along a bundle: that of what is too short to be another one at its end; maximum distance from
+what lies across it of the rows that this hides; minimum of a gap between two bundles.
+"""
 _SURE_KNOWN = 0.7
 """Minimum share of a bundle's length that must have been measured; below it, the bundle gets a doubt."""
 
@@ -88,17 +92,17 @@ def list_doubts(
         out.append(Doubt(DoubtKind.OTHER, f"only {100 * known:.0f} % of its length was measured"))
     crossed = _runs(rows == ABOVE)
     cell = reading.found.grid.cell_m
-    narrow = _places(
-        [run for run in crossed if cell < (run[1] - run[0]) * cell <= _NARROW_M], reading, settings
-    )
-    wide = [b - a for a, b in crossed if (b - a) * cell > _NARROW_M]
+    slim = [run for run in crossed if cell < (run[1] - run[0]) * cell <= _NARROW_M]
+    narrow = _places(slim, reading, settings)
+    long = [run for run in crossed if (run[1] - run[0]) * cell > _NARROW_M]
     if narrow == 1:
         out.append(Doubt(DoubtKind.LIES_ACROSS, "something narrow lies across it at one place"))
     elif narrow:
         said = f"something narrow crosses over it at {narrow} places, such as dunnage"
         out.append(Doubt(DoubtKind.CROSSED, said))
     out += [
-        Doubt(DoubtKind.COVERS_PART, f"something {n * cell:.2f} m long covers a part of it") for n in wide
+        Doubt(DoubtKind.COVERS_PART, f"something {(b - a) * cell:.2f} m long covers a part of it")
+        for a, b in long
     ]
     sunken = (rows == BELOW).sum() * cell
     if sunken > 0.1:
@@ -110,9 +114,7 @@ def list_doubts(
         if end.shows_gap:
             said = f"the {name} end is open: behind it shows {DoubtKind.GAP.value}"
             out.append(Doubt(DoubtKind.GAP, said, number))
-    if deep := gap_rows(reading.found.grid, reading.found.fit, settings):
-        said = f"{DoubtKind.GAP.value}, {deep * cell:.2f} m long, parts it: two bundles may lie end to end"
-        out.append(Doubt(DoubtKind.GAP, said))
+    out += _list_gaps(reading, long + (slim if narrow else []), settings)
     if reading.rival is not None and reading.rival_weight > 0.9 * reading.weight:
         gap = abs(reading.rival.fit.width_m - reading.found.fit.width_m)
         if gap > 0.15 * reading.found.fit.width_m:
@@ -122,6 +124,37 @@ def list_doubts(
     if reading.flanks is not None and reading.flanks.doubt:
         out.append(reading.flanks.doubt)
     return tuple(out)
+
+
+def _list_gaps(reading: Reading, across: list[tuple[int, int]], settings: BundleSettings) -> list[Doubt]:
+    """List the doubts that two bundles may lie end to end: a gap that is seen, or rows in which the surface
+    isn't seen to go on. across: rows of what lies across the bundle, which hides the rows beside it.
+    """
+    grid, fit = reading.found.grid, reading.found.fit
+    if deep := gap_rows(grid, fit, settings):
+        length_m = deep * grid.cell_m
+        said = f"{DoubtKind.GAP.value}, {length_m:.2f} m long, parts it: two bundles may lie end to end"
+        return [Doubt(DoubtKind.GAP, said)]
+    lost = lost_rows(grid, fit, settings)
+    stub, beside = (round(reach / grid.cell_m) for reach in (_STUB_M, _HIDES_M))
+    lost[:stub] = lost[max(len(lost) - stub, 0) :] = False
+    longest = grid.cell_m * max(
+        (
+            end - first
+            for first, end in _runs(lost)
+            if not any(first <= b + beside and end >= a - beside for a, b in across)
+        ),
+        default=0,
+    )
+    return list_hidden_gaps(longest)
+
+
+def list_hidden_gaps(lost_m: float) -> list[Doubt]:
+    """List the doubt that a gap may hide in a length along a bundle that the map doesn't show."""
+    if lost_m < _MIN_LOST_M:
+        return []
+    said = f"may hide in {lost_m:.2f} m that the map doesn't show: two bundles may lie end to end"
+    return [Doubt(DoubtKind.GAP, f"{DoubtKind.GAP.value} {said}")]
 
 
 def _places(runs: list[tuple[int, int]], reading: Reading, settings: BundleSettings) -> int:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from barsight.core.arrays import Float64, Int64
+from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.linalg.robust import nan_medians
 from barsight.yard.bundles.fitting.bars import visible_bars
 from barsight.yard.bundles.fitting.outline import STEP_M, make_outline
@@ -104,6 +104,17 @@ def gap_rows(grid: AlignedMap, fit: Fit, settings: BundleSettings) -> int:
     over = _over(grid, fit, np.arange(fit.first, fit.last + 1), settings)
     over = over[np.isfinite(over).mean(axis=1) >= _MAX_VALUE]
     return int((nan_medians(over.T) <= -_DEEP_RATIO * fit.width_m).sum()) if len(over) else 0
+
+
+def lost_rows(grid: AlignedMap, fit: Fit, settings: BundleSettings) -> Bool:
+    """Mark the rows between a bundle's ends (rows,) in which its surface isn't seen to go on: too little of
+    the width is known, or what is known lies deep.
+    """
+    over = _over(grid, fit, np.arange(fit.first, fit.last + 1), settings)
+    known = np.isfinite(over).mean(axis=1)
+    lost = known < _SOME
+    lost[known > 0] |= nan_medians(over[known > 0].T) <= -_DEEP_RATIO * fit.width_m
+    return np.asarray(lost, np.bool_)
 
 
 def middle_and_length_sigma(ends_sigma_m: tuple[float, float]) -> tuple[float, float]:
