@@ -60,9 +60,18 @@ def test_a_bundle_that_the_maps_end_cuts_lengthwise_may_be_wider(
     assert not any(told.id in lift.bundles for lift in plan.offered)
 
 
+def test_floor_behind_a_wide_unknown_strip_is_no_flank() -> None:
+    one = laid(0.0, 0.165)
+    heights = map_of([one])
+    heights.source[:, (heights.x_m > 0.0) & (heights.x_m < 0.2)] = HeightSource.UNKNOWN
+    (told,) = find_bundles(heights, SETTINGS)
+    assert not told.is_free and np.isnan(bundle_mass(told).kg)
+    assert abs(told.width_m - one.width_m) < 1.96 * told.sigma.width_m
+
+
 def test_a_bundle_whose_flanks_are_seen_is_free_beside_the_maps_end() -> None:
     one = laid(0.0, 0.165)
-    for beyond_m in (0.06, 0.2):
+    for beyond_m in (0.03, 0.06, 0.2):
         (told,) = find_bundles(cut(map_of([one]), one.width_m / 2 + beyond_m), SETTINGS)
         assert told.is_free and told.sigma.width_m < 0.05
         assert bundle_mass(told).upper_kg > mass_of(one)

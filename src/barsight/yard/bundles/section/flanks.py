@@ -36,9 +36,9 @@ class Flanks:
     """Flanks on the low and the high side.
 
     falls_m: from the crest to the lowest place of each flank, inf where it falls to the floor or out of
-    sight, 0 where something higher hides all of it. rises_m: from the crest to the highest place beside each
-    flank, -inf where only floor is seen, NaN where nothing was measured, as beyond the map's end: then the
-    fall is that of what was measured. are_flat: neither flank falls off before its edge, as with a plate, a
+    sight, 0 where something higher hides all of it or nothing was measured beside it. rises_m: from the crest
+    to the highest place beside each flank, -inf where only floor is seen, NaN where nothing was measured, as
+    beyond the map's end. are_flat: neither flank falls off before its edge, as with a plate, a
     cart or a wall. ended: the sides on which straps show where the bundle ends, however little it falls
     there.
     """
@@ -71,9 +71,6 @@ class Flanks:
                 said = f"its {name} flank was not seen: something may lie over it"
                 return Doubt(DoubtKind.UNSEEN_FLANK, said)
         for name, fall, rise, _ in sides:
-            if fall < shallow_ratio * self.width_m and np.isnan(rise):
-                said = f"its {name} flank was not seen: nothing was measured beside it"
-                return Doubt(DoubtKind.UNSEEN_FLANK, said)
             if fall < shallow_ratio * self.width_m and _HIGHER_M < rise < self.width_m:
                 said = f"what stands {1e3 * rise:.0f} mm higher beside it may lie over its {name} flank"
                 return Doubt(DoubtKind.HIDDEN_FLANK, said)
@@ -101,17 +98,18 @@ def seen_flanks(one: FittedOutline, low_m: float, high_m: float) -> Flanks | Non
 
 def _flank(outwards: Float64, level: Float64, crest: float, width: float) -> tuple[float, float, float]:
     """Measure one side from the crest (m): the fall before its edge; the fall including what a map extends
-    over it, inf where that goes to the floor or out of sight, 0 where something higher hides the whole flank;
-    and the rise of what lies beyond, NaN where nothing was measured there.
+    over it, inf where that goes to the floor or out of sight, 0 where something higher hides the whole flank
+    or nothing was measured beside it; and the rise of what lies beyond, NaN where nothing was measured.
     """
     first, edge, last = (ratio * width for ratio in _FLANK_RATIOS)
     inner = level[(outwards > first) & (outwards < edge)]
     own = level[(outwards > first) & (outwards < last)]
     beyond = level[(outwards >= edge) & (outwards < edge + _BEYOND_M)]
     before = crest - inner[np.isfinite(inner)].min(initial=crest)
-    if np.isnan(level[(outwards >= edge + _BESIDE_M) & (outwards < edge + _BEYOND_M)]).all():
-        measured = ~np.isnan(level)
-        return float(before), float(crest - level[measured][outwards[measured].argmax()]), np.nan
+    measured = ~np.isnan(level) & (outwards < edge + _BEYOND_M)
+    furthest = int(np.flatnonzero(measured)[outwards[measured].argmax()])
+    if outwards[furthest] < edge + _BESIDE_M and crest - level[furthest] < width:
+        return float(before), 0.0, np.nan
     rise = beyond[np.isfinite(beyond)].max(initial=-np.inf) - crest
     seen = own[~np.isnan(own)]
     lowest = seen.min() if seen.size else crest if own.size and rise > _HIGHER_M else -np.inf
