@@ -181,7 +181,8 @@ def test_the_loads_top_does_not_stand_above_leaning_faces(
     """A map cuts crests off: the faces may lie lower than the fitted top, and lean down from there."""
     bundle, place = record(laid(0.3)), Placement(0.3, 0.0, 0.0)
     heights = np.full(len(MAGNET.poles), bundle.top_z_m - down_m)
-    contact = Contact(bundle.top_z_m - down_m, heights, 0.0, np.radians(roll_deg), 0.0, 0.004, 0.0005, ())
+    lean_rad, sigmas_m = np.radians(roll_deg), (0.004, 0.0005)
+    contact = Contact(bundle.top_z_m - down_m, heights, 0.0, lean_rad, 0.0, *sigmas_m, 0.0035, ())
     narrow = replace(MAGNET, tolerance=Tolerance(0.02, 0.02, 0.2))
     (check,) = leaning_checks(place, narrow, contact, (bundle,))
     half_m = MAGNET.pole_table[0, 3] / 2 + 0.02

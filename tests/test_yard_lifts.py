@@ -32,7 +32,13 @@ from barsight.yard.lifting.validity import disturbed_checks, validity
 from barsight.yard.magnet.contact import rest_magnet
 from barsight.yard.magnet.description import Beam, Magnet, Pole, Tolerance
 from barsight.yard.magnet.footprint import BundleTable, Placement, count_gripped
-from barsight.yard.magnet.holding import hold_load, pole_shares, share_checks, weakest_pole
+from barsight.yard.magnet.holding import (
+    hold_load,
+    pole_shares,
+    pried_ratio,
+    share_checks,
+    weakest_pole,
+)
 from barsight.yard.magnet.resting_plane import rest_plane
 from barsight.yard.types import Doubt, DoubtKind
 from barsight.yard.vetoes import VETOES, Veto
@@ -250,34 +256,65 @@ def test_the_weakest_pole_is_named() -> None:
     # 0.28 m off the middle along the bars: arms of 2.1 and 0.7 m, sum of squares 9.8 m2.
     lift = judged([laid(0.3)], place=Placement(0.3, 0.28, 0.0))
     assert lift.contact is not None
-    shares = pole_shares(lift.contact, MAGNET, lift.place, (record(laid(0.3)),))
+    shares = pole_shares(MAGNET, lift.place, (record(laid(0.3)),))
     slack = 1.645 * SIGMA.along_m
     assert shares[0] == pytest.approx(0.25 + 2.1 / 9.8 * (0.28 + slack), abs=0.002)
     assert shares[3] == pytest.approx(0.25 - 2.1 / 9.8 * (0.28 - slack), abs=0.002)
-    checks = share_checks(weakest_pole(lift.contact, 120e3, MAGNET, lift.place, (record(laid(0.3)),)))
+    weakest = weakest_pole(lift.contact, 120e3, MAGNET, lift.place, (record(laid(0.3)),))
+    checks = share_checks(weakest, math.inf)
+    checks = [one for one in checks if one.result != "passed"]
     assert [(one.code, one.result) for one in checks] == [("weak-pull", "failed")]
     assert "pole 1's pull" in checks[0].reason
+
+
+def held(magnet: Magnet, off_m: tuple[float, float] = (0.0, 0.0), wide_m: float = 1.0) -> tuple[float, float]:
+    """The moment of the pull over that of a load `off_m` (across, along) from the magnet, with a pull of
+    three times its weight, and the largest share of a pole. wide_m: of the steel, level all along.
+    """
+    heights = map_of([], sigma_m=0.0)
+    heights.z_m[:, np.abs(heights.x_m - 0.5) < wide_m / 2] = 0.3
+    place, one = Placement(0.5, 0.0, 0.0), record(laid(0.5 + off_m[0], y_m=off_m[1]))
+    contact = rest_magnet(heights, place, magnet, 0.003)
+    assert contact is not None
+    contact = hold_load(contact, magnet, (one,), 0.0)
+    needed_n = contact.pull_low_n / 3 * magnet.needed_factor
+    return pried_ratio(contact, needed_n, magnet, place, (one,)), pole_shares(magnet, place, (one,)).max()
 
 
 @pytest.mark.parametrize("across", [(0.0,), (-0.06, 0.06)])
 def test_a_load_beyond_the_end_of_the_only_face_along_pries_it_off(across: tuple[float, ...]) -> None:
     magnet = weak(poles=tuple(Pole(0.0, u, 0.5, 0.1) for u in across))
-    lift = judged([laid(0.3)], place=Placement(0.3, 0.28, 0.0), magnet=magnet)
-    assert lift.contact is not None
-    shares = pole_shares(lift.contact, magnet, lift.place, (record(laid(0.3)),))
-    # Moments about the face's far edge, which the safety factor of 2 covers in part.
-    pried = (1 + 2 * (0.28 + 1.645 * SIGMA.along_m) / 0.5) / 2
-    assert shares.max() >= pried / len(across) > 1.1 / len(across)
+    expected = 3 * 0.25 / (0.25 + 0.6 + 1.645 * SIGMA.along_m)
+    assert held(magnet, (0.0, 0.6))[0] == pytest.approx(expected, rel=0.02)
 
 
-def test_poles_off_their_row_by_a_millimetre_are_pried_off_across_as_in_one_row() -> None:
-    for off in (0.0, 0.0012):
-        poles = tuple(replace(pole, across_m=off if k % 2 else -off) for k, pole in enumerate(MAGNET.poles))
-        magnet = weak(poles=poles)
-        lift = judged([laid(0.3)], magnet=magnet)
-        assert lift.contact is not None
-        shares = pole_shares(lift.contact, magnet, lift.place, (record(laid(0.37)),))
-        assert shares.max() > 1.2 * (0.25 + 2.1 / 9.8 * 1.645 * SIGMA.along_m)
+@pytest.mark.parametrize("off_mm", [0.0, 1.2, 3.0, 5.0, 10.0])
+def test_poles_a_little_off_their_row_hold_a_load_as_those_in_one_row_do(off_mm: float) -> None:
+    off_m = off_mm / 1e3
+    magnet = weak(
+        poles=tuple(replace(pole, across_m=off_m if k % 2 else -off_m) for k, pole in enumerate(MAGNET.poles))
+    )
+    ratio, share = held(magnet, (0.03, 0.0))
+    slack = 1.645 * SIGMA.lateral_m
+    row = 3 * 0.05 / (0.05 + 0.03 + slack)
+    assert ratio == pytest.approx(row, rel=0.01 + off_m / 0.05)
+    # Faces 0.1 m wide: the lever 1.2 times as long as the offset, over a twelfth of their width squared.
+    along = 2.1 / 9.8 * 1.645 * SIGMA.along_m
+    across = 1.2 * off_m * (0.03 + slack) / (4 * 0.1**2 / 12)
+    assert share == pytest.approx(0.25 + along + across, abs=0.005)
+    assert held(magnet, (0.15, 0.0))[0] < 1
+
+
+def test_a_row_of_poles_askew_under_its_beam_is_a_row() -> None:
+    straight = held(weak(poles=(Pole(-1.0, 0.0, 0.9, 0.1), Pole(1.0, 0.0, 0.9, 0.1))), (0.03, 0.0))
+    askew = held(weak(poles=(Pole(-1.0, -0.1, 0.9, 0.1), Pole(1.0, 0.1, 0.9, 0.1))), (0.03, 0.0))
+    assert askew[1] == pytest.approx(straight[1], abs=0.02)
+
+
+def test_a_load_turns_about_the_steel_that_the_faces_touch_not_about_their_edges() -> None:
+    # The face is 100 mm wide; under its middle five cells of the map are level, 40 mm from first to last.
+    expected = 3 * 0.02 / (0.02 + 0.03 + 1.645 * SIGMA.lateral_m)
+    assert held(MAGNET, (0.03, 0.0), wide_m=0.05)[0] == pytest.approx(expected, rel=0.1)
 
 
 def test_too_heavy_for_magnet_or_crane() -> None:

@@ -51,6 +51,7 @@ from barsight.yard.magnet.footprint import (
 from barsight.yard.magnet.holding import (
     WeakestPole,
     hold_load,
+    pried_ratio,
     share_checks,
     weakest_bundle,
     weakest_pole,
@@ -156,6 +157,7 @@ def assess_placement(
     needed = mass.upper_kg * NEWTON_PER_KG * magnet.needed_factor
     contact = hold_load(contact, magnet, load, settings.strap_m)
     weakest = weakest_pole(contact, needed, magnet, place, load)
+    pried = pried_ratio(contact, needed, magnet, place, load)
     worst = weakest_bundle(contact, magnet, place, load, settings.strap_m)
     away = np.array([place.x_m, place.y_m]) - load_centre(load)
     offset = float(away @ place.along), float(away @ place.across)
@@ -167,7 +169,7 @@ def assess_placement(
         *disturbed_checks(yard.events, place, magnet, load, valid, settings),
         *count_checks(place, yard.heights, magnet, near, contact, held, settings),
         *face_checks(contact, needed, magnet, load, settings),
-        *share_checks(weakest, worst),
+        *share_checks(weakest, pried, worst),
         *clearance_checks(place, yard.heights, magnet, contact, load),
         *resting_checks(place, magnet, contact, load),
         *leaning_checks(place, magnet, contact, load),
@@ -189,14 +191,13 @@ def assess_placement(
         reason = f"elsewhere within the crane's tolerance: {end}"
         what = "size of the box in which all checks pass, relative to the crane's tolerance"
         checks.append(check_min("narrow-tolerance", what, scale, SCALES[0], "", reason))
-    least = float(np.min([scale if search else math.inf, worst]))
     return Lift(
         place, tuple(b.id for b in load), len(load), held.probability,
         tuple(b.id for b in load) if len(load) > settings.bundles else (),
         contact, mass, needed, *offset, overhang[0] + UPPER * overhang[1],
         _scaled(magnet.tolerance, scale),
-        _safety(contact, weakest, needed, mass, magnet, least), tuple(checks), valid,
-        target_covariance(
+        _safety(contact, weakest, needed, mass, magnet, (scale if search else math.inf, pried, worst)),
+        tuple(checks), valid, target_covariance(
             place, load, contact.gap_sigma_m, _map_sigma(yard.heights, place, magnet), yard.travel,
             magnet.offset,
         ),
@@ -222,19 +223,20 @@ def _unseen_lift(place: Placement) -> Lift:
 
 
 def _safety(
-    contact: Contact, weakest: WeakestPole | None, needed_n: float, mass: Mass, magnet: Magnet, scale: float
-) -> float:
+    contact: Contact, weakest: WeakestPole | None, needed_n: float, mass: Mass, magnet: Magnet,
+    others: tuple[float, ...],
+) -> float:  # fmt: skip
     """Compute a lift's safety: the minimum of pull over needed pull, weakest pole's pull over its share,
-    capacity over load, and `scale`: that of the tolerance over the crane's, or of the worst bundle's pull.
+    capacity over load, and `others`: tolerance over the crane's, what the load pries off, the worst bundle.
     """
     capacity_kg = min(magnet.capacity_kg, magnet.crane_capacity_kg - magnet.own_mass_kg)
     ratios = (
         contact.pull_low_n / needed_n if needed_n > 0 else 0.0,
         weakest.ratio if weakest else 0.0,
         capacity_kg / mass.upper_kg if mass.upper_kg > 0 else 0.0,
-        scale,
+        *others,
     )
-    return float(np.nan_to_num(min(ratios)))
+    return float(np.nan_to_num(np.min(ratios)))
 
 
 def nearby_bundles(table: BundleTable, place: Placement, magnet: Magnet) -> BundleTable:
@@ -334,6 +336,7 @@ def _change(
             unknown_check(contact, settings), *face_checks(contact, needed_n, magnet, load, settings),
             *share_checks(
                 weakest_pole(contact, needed_n, magnet, moved, load),
+                pried_ratio(contact, needed_n, magnet, moved, load),
                 weakest_bundle(contact, magnet, moved, load, settings.strap_m),
             ),
             *resting_checks(moved, magnet, contact, load),

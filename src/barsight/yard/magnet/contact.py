@@ -65,9 +65,9 @@ class Contact:
 
     pitch_rad: slope along the beam; roll_rad: slope across. rests_off_m: how far from the middle the faces
     rest where the suspension stops their lean, otherwise 0. sigma_m: of the plane's height, including the
-    error that the whole map shares; gap_sigma_m: of the height over the steel. pull_n, pull_low_n: the pull,
-    and its lower bound (95 %). widest_gap_m: the largest of the poles' smallest gaps. contact_share: of all
-    faces; unknown_share: the worst pole's.
+    error that the whole map shares; gap_sigma_m: of the height over the steel. touch_gap_m: maximum gap at
+    which a place of a face touches. pull_n, pull_low_n: the pull, and its lower bound (95 %). widest_gap_m:
+    the largest of the poles' smallest gaps. contact_share: of all faces; unknown_share: the worst pole's.
     """
 
     centre_z_m: float
@@ -77,6 +77,7 @@ class Contact:
     rests_off_m: float
     sigma_m: float
     gap_sigma_m: float
+    touch_gap_m: float
     poles: tuple[PoleContact, ...]
 
     @property
@@ -119,7 +120,8 @@ def rest_magnet(heights: HeightMap, place: Placement, magnet: Magnet, contact_ga
     most = np.tan(np.radians(magnet.limits.roll_deg))
     u, v, z = (np.ascontiguousarray(points[seen, k]) for k in (U, V, Z))
     height, roll, pitch, rests_off = rest_faces(u, v, z, noise, most)
-    table, gaps = _gaps(points, height, roll, pitch, contact_gap_m + noise, poles)
+    touch_gap = contact_gap_m + noise
+    table, gaps = _gaps(points, height, roll, pitch, touch_gap, poles)
     shared = float(np.median(points[seen, SIGMA]))
     faces = height + roll * poles[:, 1] + pitch * poles[:, 0]
     found, first = [], 0
@@ -140,6 +142,7 @@ def rest_magnet(heights: HeightMap, place: Placement, magnet: Magnet, contact_ga
         rests_off,
         math.hypot(noise, shared),
         noise,
+        touch_gap,
         tuple(found),
     )
 

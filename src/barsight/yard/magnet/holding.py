@@ -8,10 +8,12 @@ that smoothing has cut off, on a strap, and with the noise added.
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
+import cv2
 import numpy as np
 
 from barsight.core.arrays import Bool, Float64, frozen, kernel
@@ -30,9 +32,6 @@ MAX_CUT_RATIO = 0.12
 
 MIN_DIAMETER_RATIO = 0.1
 """Minimum lower bound of a diameter, as a fraction: some twenty thin bars have been read as one thick bar."""
-
-SAME_PLACE = 1e-6
-"""Spread of the poles' centres in a direction, relative to the other one's, below which it is no lever."""
 
 
 def hold_load(contact: Contact, magnet: Magnet, load: tuple[Bundle, ...], strap_m: float) -> Contact:
@@ -111,42 +110,87 @@ def min_diameter_m(bundle: Bundle) -> float:
     return float(np.fmax(diameter - UPPER * bundle.sigma.bar_diameter_m, MIN_DIAMETER_RATIO * diameter))
 
 
-def pole_shares(contact: Contact, magnet: Magnet, place: Placement, load: tuple[Bundle, ...]) -> Float64:
+def pole_shares(magnet: Magnet, place: Placement, load: tuple[Bundle, ...]) -> Float64:
     """Compute upper bounds of the poles' shares (P,) of the needed pull; 1 is all of it.
 
     Magnet and load are rigid, so a pole's share grows linearly with the load's offset from the middle of all
-    poles towards it. Across, where the poles stand in one row, and along, where they stand side by side or
-    there is only one, a load that hangs beside the centre of pull pries the face off about its edge; the
-    safety factor may cover that, but no more. The offsets are upper bounds by the sigmas of the load's
-    centre.
+    poles towards it. The offset is an upper bound by the sigmas of the load's centre.
     """
-    away = load_centre(load) - (place.x_m, place.y_m)
-    slack = UPPER * np.max([
-        np.nan_to_num((bundle.sigma.along_m, bundle.sigma.lateral_m), nan=0.05) for bundle in load
-    ], axis=0)  # fmt: skip
-    offset = place.axes @ away
-    middle, slope, pried = _levers(magnet.poles)
-    offset = offset - middle
-    share = 1 / len(slope) + slope @ offset + np.abs(slope) @ slack
-    pulls = np.array([(own.pull_along_m, own.pull_across_m) for own in contact.poles])
-    sizes = np.array([(pole.length_m, pole.width_m) for pole in magnet.poles])
-    beside = pried * (np.abs(offset - pulls) + slack) / sizes
-    return np.asarray(share * np.maximum((1 + 2 * beside.max(axis=1)) / magnet.needed_factor, 1.0))
+    away, slack = _off_centre(place, load)
+    middle, slope = _levers(magnet.poles)
+    return np.asarray(1 / len(slope) + slope @ (away - middle) + np.abs(slope) @ slack)
+
+
+def _off_centre(place: Placement, load: tuple[Bundle, ...]) -> tuple[Float64, Float64]:
+    """Compute the load's centre of mass (2,) from the magnet's, along and across, and the error's bound."""
+    sigmas = [(bundle.sigma.along_m, bundle.sigma.lateral_m) for bundle in load]
+    away = place.axes @ (load_centre(load) - (place.x_m, place.y_m))
+    return away, UPPER * np.nan_to_num(sigmas, nan=0.05).max(axis=0)
 
 
 @lru_cache(maxsize=64)
-def _levers(poles: tuple[Pole, ...]) -> tuple[Float64, Float64, Bool]:
-    """Compute the poles' middle (2,), along and across, how each one's share (P, 2) grows with the load's
-    offset from it, and along which of both (2,) no other pole holds a face that a load pries off.
+def _levers(poles: tuple[Pole, ...]) -> tuple[Float64, Float64]:
+    """Compute the poles' middle (2,), along and across, and how each one's share (P, 2) grows with the load's
+    offset from it.
+
+    Where the poles stand closer to one line than their faces are wide, the faces themselves are the longer
+    lever: they carry most of the moment by pressing on one side, which `pried_ratio` judges.
     """
     places = np.array([(pole.along_m, pole.across_m) for pole in poles])
+    faces = np.array([(pole.length_m, pole.width_m) for pole in poles])
     middle = places.mean(axis=0)
     arms = places - middle
     spread, axes = np.linalg.eigh(arms.T @ arms)
-    slope = arms @ np.linalg.pinv(arms.T @ arms, rcond=SAME_PLACE)
-    in_row = spread[0] <= SAME_PLACE * max(spread[1], 1.0)
-    side_by_side = in_row and abs(axes[0, 0]) > abs(axes[1, 0])
-    return frozen(middle), frozen(slope), frozen(np.array([side_by_side or len(poles) == 1, in_row]))
+    spread = np.maximum(spread, (faces**2).sum(axis=0) / 12 @ axes**2)
+    return frozen(middle), frozen(arms @ axes / spread @ axes.T)
+
+
+def pried_ratio(
+    contact: Contact, needed_n: float, magnet: Magnet, place: Placement, load: tuple[Bundle, ...]
+) -> float:
+    """Compute the moment of the pull over that of the load, each about the edge of what the faces touch, for
+    the worst edge; infinite where the load pries the faces off no edge.
+
+    Magnet and load are rigid: a load that hangs beside the pull turns about the outermost steel on the other
+    side that the faces touch. The safety factor may be used up for this, but no more.
+    """
+    weight_n = needed_n / magnet.needed_factor
+    if contact.contact_share == 0 or not weight_n > 0:
+        return 0.0
+    touched = _touched(contact, magnet)
+    away, slack = _off_centre(place, load)
+    pulls = np.array([own.pull_low_n for own in contact.poles])
+    at = np.array([
+        (pole.along_m + own.pull_along_m, pole.across_m + own.pull_across_m)
+        for own, pole in zip(contact.poles, magnet.poles, strict=True)
+    ])  # fmt: skip
+    edges = np.roll(touched, -1, axis=0) - touched
+    inwards = np.column_stack([-edges[:, 1], edges[:, 0]])
+    inwards *= np.sign((inwards * (touched.mean(axis=0) - touched)).sum(axis=1))[:, None]
+    held = ((inwards[:, None] * (at - touched[:, None])).sum(axis=2) * pulls).sum(axis=1)
+    turning = (inwards * (away - touched)).sum(axis=1) + np.abs(inwards) @ slack
+    prying = turning > 0
+    return float(np.min(held[prying] / (weight_n * turning[prying]), initial=math.inf))
+
+
+def _touched(contact: Contact, magnet: Magnet) -> Float64:
+    """Return the corners (N, 2), along and across, in order, of the area between all places where the faces
+    touch; none where they touch nothing.
+    """
+    corners = list[tuple[float, float]]()
+    for own, pole in zip(contact.poles, magnet.poles, strict=True):
+        touches = own.gap_map_m <= contact.touch_gap_m
+        if touches.any():
+            columns, parts = (np.flatnonzero(touches.any(axis=axis)) for axis in (1, 0))
+            v, u = (
+                middle + size * (np.array([cells[0], cells[-1] + 1]) / count - 0.5)
+                for middle, size, cells, count in (
+                    (pole.along_m, pole.length_m, parts, touches.shape[1]),
+                    (pole.across_m, pole.width_m, columns, touches.shape[0]),
+                )
+            )
+            corners += itertools.product(v, u)
+    return np.asarray(cv2.convexHull(np.array(corners, np.float32)).reshape(-1, 2), np.float64)
 
 
 @dataclass(frozen=True)
@@ -169,7 +213,7 @@ def weakest_pole(
     """Find the pole with the smallest ratio of pull to share; None where no load, or no weight, is known."""
     if not load or not needed_n > 0:
         return None
-    shares = np.maximum(pole_shares(contact, magnet, place, load), 1e-3) * needed_n
+    shares = np.maximum(pole_shares(magnet, place, load), 1e-3) * needed_n
     pulls = np.array([own.pull_low_n for own in contact.poles])
     worst = int(np.argmin(pulls / shares))
     return WeakestPole(worst + 1, float(pulls[worst]), float(shares[worst]))
@@ -211,9 +255,9 @@ def _over(bundle: Bundle, pole: Pole, place: Placement, own: PoleContact) -> Boo
     return np.asarray((np.abs(at @ axes.across) <= half[0]) & (np.abs(at @ axes.along) <= half[1]))
 
 
-def share_checks(weakest: WeakestPole | None, worst_bundle: float = math.inf) -> list[Check]:
-    """Check that the weakest pole carries its share, and each of several bundles
-    is held (`weakest_bundle`).
+def share_checks(weakest: WeakestPole | None, pried: float, worst_bundle: float = math.inf) -> list[Check]:
+    """Check that the weakest pole carries its share, that the load pries off no face (`pried_ratio`), and
+    that each of several bundles is held (`weakest_bundle`).
     """
     if weakest is None:
         return []
@@ -223,7 +267,12 @@ def share_checks(weakest: WeakestPole | None, worst_bundle: float = math.inf) ->
             "weak-pull", "lower bound of the worst pole's pull, relative to its share", weakest.ratio, 1.0,
             "", f"the lower bound of pole {weakest.number}'s pull is {pull:.1f} kN; its share of the "
             f"load needs {share:.1f} kN",
-        )
+        ),
+        check_min(
+            "weak-pull", "moment of the pull about the edge of what the faces touch, relative to the load's",
+            pried, 1.0, "", "the load hangs so far beside the pull that it may pry the faces off: the moment "
+            f"of the pull about the edge of what they touch is {pried:.2f} of the load's",
+        ),
     ]  # fmt: skip
     if worst_bundle < math.inf or math.isnan(worst_bundle):
         what = "lower bound of the pull on the worst bundle, relative to what it needs"
