@@ -15,7 +15,7 @@ from barsight.yard.magnet.description import Tolerance
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.types import HeightMap
 from barsight.yard.vetoes import vetoes_of
-from lift_yards import MAGNET, SIGMA, codes, judged, laid, map_of, record
+from lift_yards import MAGNET, SETTINGS, SIGMA, codes, judged, laid, map_of, record
 
 TOP_M = laid(0.3).top_z_m
 
@@ -170,6 +170,19 @@ def test_faces_must_rest_on_the_load_itself() -> None:
     assert found(heights) == {"obstructed"}
     unsure = record(laid(0.3), sigma=replace(SIGMA, top_z_m=float("nan")))
     assert "obstructed" in codes(judged([laid(0.3)], (unsure,), Placement(0.3, 0.0, 0.0), heights=heights))
+
+
+@pytest.mark.parametrize(("x_m", "y_m", "over_m", "passes"), [
+    (0.48, 1.5, 0.2, True), (0.48, 1.5, 0.3, False), (0.6, 1.5, 2.0, True), (0.3, 3.2, 2.0, True),
+    (0.3, 2.6, 2.0, False), (0.36, 2.5, 0.06, False),
+])  # fmt: skip
+def test_no_stanchion_that_the_map_does_not_show_stands_in_the_magnet(
+    x_m: float, y_m: float, over_m: float, *, passes: bool
+) -> None:
+    """The beam is 0.3 m wide, 5.4 m long and 0.35 m over the faces, which reach to 0.05 and 2.55 m."""
+    settings = replace(SETTINGS, stanchions=((x_m, y_m, TOP_M + over_m),))
+    lift = judged([laid(0.3)], settings=settings)
+    assert codes(lift) == (set() if passes else {"obstructed"}), lift.vetoes
 
 
 @pytest.mark.parametrize(("roll_deg", "down_m", "passes"), [

@@ -128,6 +128,13 @@ def test_no_load_travels_over_what_was_not_seen_or_below_what_may_stand_there() 
     assert isinstance(order, LiftOrder) and order.steps[0].travel_z_m == pytest.approx(2.2)
 
 
+def test_no_load_travels_below_a_stanchion_that_the_map_does_not_show() -> None:
+    heights, bundles = pile()
+    settings = replace(SETTINGS, stanchions=((0.1, LENGTH_M / 2 + 0.3, 3.0), (4.0, 0.0, 5.0)))
+    order = order_lifts(5, heights, bundles, plan_lifts(heights, bundles, MAGNET, settings, ()))
+    assert isinstance(order, LiftOrder) and order.steps[0].travel_z_m == pytest.approx(3.5)
+
+
 def test_a_magnet_that_is_longer_than_its_load_travels_over_what_stands_too() -> None:
     """The load of 4 m and its swing end at 2.5 m, the beam of 5.4 m that holds it may come to 3.5 m."""
     stock = [laid(0.3, length_m=4.0)]

@@ -170,7 +170,7 @@ def assess_placement(
         *count_checks(place, yard.heights, magnet, near, contact, held, settings),
         *face_checks(contact, needed, magnet, load, settings),
         *share_checks(weakest, pried, worst),
-        *clearance_checks(place, yard.heights, magnet, contact, load),
+        *clearance_checks(place, yard.heights, magnet, contact, load, settings.stanchions),
         *resting_checks(place, magnet, contact, load),
         *leaning_checks(place, magnet, contact, load),
         *load_checks(load, mass, offset, overhang, magnet, settings),
@@ -302,7 +302,7 @@ def _tolerance(
         if changed:
             return found, changed
         wider = replace(magnet, tolerance=box)
-        clear = clearance_checks(place, yard.heights, wider, contact, load)
+        clear = clearance_checks(place, yard.heights, wider, contact, load, settings.stanchions)
         for veto in vetoes_of([*label_checks(place, yard.heights, wider, FacePlane.of(contact)), *clear]):
             return found, veto.reason
         found = scale

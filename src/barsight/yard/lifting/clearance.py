@@ -20,6 +20,7 @@ from barsight.yard.lifting.unseen import wide_parts
 from barsight.yard.magnet.contact import Contact
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
+from barsight.yard.magnet.stanchions import stanchion_checks
 from barsight.yard.map_lookup import cell_spans, highest_seen
 from barsight.yard.types import Bundle, HeightMap
 from barsight.yard.vetoes import Check, check_max
@@ -82,9 +83,10 @@ class Obstacle:
 
 
 def clearance_checks(
-    place: Placement, heights: HeightMap, magnet: Magnet, contact: Contact, load: tuple[Bundle, ...]
-) -> list[Check]:
-    """Check that nothing, seen or unseen, rises above the faces' plane under the magnet or beside it.
+    place: Placement, heights: HeightMap, magnet: Magnet, contact: Contact, load: tuple[Bundle, ...],
+    stanchions: tuple[tuple[float, float, float], ...],
+) -> list[Check]:  # fmt: skip
+    """Check that nothing, seen, unseen or stated, rises above the faces' plane under the magnet or beside it.
 
     The limits include the sigma of the plane in height and that of a cell in place.
     """
@@ -107,7 +109,8 @@ def clearance_checks(
         if find_obstacle(place, heights, magnet, faces, load, careful=False) is None:
             reason += "; the value is within its sigma of the limit"
         checks.append(Check(code, what, obstacle.value_mm, sigma, obstacle.bound_mm, "mm", "failed", reason))
-    return checks
+    plane = np.array([faces.centre_z_m, math.tan(faces.pitch_rad), math.tan(faces.roll_rad)])
+    return checks + stanchion_checks(place, _region(place, heights, magnet, 0.0).parts, plane, stanchions)
 
 
 def find_obstacle(

@@ -114,8 +114,8 @@ def sound_ground(
     events: tuple[YardEvent, ...] = (), travel: Travel | None = None, now_ns: int = 0,
 ) -> Ground:  # fmt: skip
     """Bar the ground that shouldn't be loaded: leaning bundles, bundles over an edge, doubtful ones, and
-    no-lift areas. Nothing is known any more within reach of an event in the yard, or where the last sight is
-    too old at now_ns.
+    no-lift areas. Stanchions stand as high as the settings say, even where the map doesn't show them. Nothing
+    is known any more within reach of an event in the yard, or where the last sight is too old at now_ns.
     """
     footings = {footing.bundle: footing for footing in standing}
     for bundle in bundles:
@@ -126,6 +126,8 @@ def sound_ground(
             ground = ground.barring(ground.inside(own, own.x_m, own.y_m, own.yaw_rad, SHADOW_M))
     for x_min, y_min, x_max, y_max in settings.no_lift_areas:
         ground = ground.barring(ground.within(x_min, y_min, x_max, y_max))
+    for x, y, z in settings.stanchions:
+        ground = ground.with_load(ground.within(x, y, x, y), z)
     for event in events:
         yaw_rad, reach_m = math.radians(event.yaw_deg), settings.disturbed_reach_m
         ground = ground.forgetting(ground.inside(event, event.x_m, event.y_m, yaw_rad, reach_m))
