@@ -37,7 +37,7 @@ VETOES = {
     "gap": "A pole is too far above the steel, too little of the faces touches it, a label is between "
     "them, or the height of the steel is too uncertain.",
     "weak-pull": "The lower bound of the pull, in all or at one pole, is less than the load times the "
-    "safety factor needs.",
+    "safety factor needs, or the load hangs so far beside it that it may pry the faces off.",
     "mass-unknown": "The mass can't be determined from what was seen.",
     "overweight": "The upper bound of the load's mass is more than the magnet or the crane may carry.",
     "off-centre": "The magnet's centre is too far from the load's centre of mass.",

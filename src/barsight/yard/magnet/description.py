@@ -20,6 +20,10 @@ MIN_SAFETY_FACTOR = 3.0
 """Minimum safety factor of permanent, electro-permanent and unknown types of magnet [EN 13155]."""
 MIN_SAFETY_FACTOR_BACKED = 2.0
 """Minimum safety factor of an electromagnet that a battery backs up when the mains fail [EN 13155]."""
+MAX_REACH_RATIO = 2.0
+"""Maximum air gap with a pull, in widths of the widest face: the field ends there; a larger one is in cm."""
+MIN_OWN_RATIO = 0.005
+"""Minimum mass of a magnet, as a fraction of what it may carry; with less, the mass is in tonnes."""
 MAX_OFFSET_M = 0.2
 """Maximum offset (m): a larger one isn't how the magnet hangs, but a wrong lever arm of the rig."""
 _EXAMPLE = resources.files("barsight.yard.magnet").joinpath("example_magnet.toml")
@@ -162,7 +166,17 @@ class Magnet:
         for one, other in combinations(self.poles, 2):
             apart = one.is_beside(other)
             expect(apart, f"two poles, at along_m {one.along_m:g} and {other.along_m:g}, lie over each other")
+        widest = max(min(pole.length_m, pole.width_m) for pole in self.poles)
+        expect(
+            self.reach_m <= MAX_REACH_RATIO * widest,
+            f"pull gap_m goes to {self.reach_m:g}, further than a face {widest:g} wide pulls: give gaps in m",
+        )
         expect(min(self.own_mass_kg, self.capacity_kg) > 0, "own_mass_kg and capacity_kg must be over 0")
+        expect(
+            self.own_mass_kg >= MIN_OWN_RATIO * self.capacity_kg,
+            f"own_mass_kg {self.own_mass_kg:g} is too little for a magnet that carries {self.capacity_kg:g}: "
+            "give masses in kg",
+        )
         expect(
             self.crane_capacity_kg > self.own_mass_kg,
             f"crane_capacity_kg {self.crane_capacity_kg:g} leaves nothing beside own_mass_kg "

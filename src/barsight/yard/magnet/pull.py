@@ -67,6 +67,8 @@ class Pull:
         expect(all(0 < ratio <= 1 for ratio in ratios), "pull's ratios must be over 0, at most 1")
         same = len(self.round_diameter_m) == len(self.round_ratio)
         expect(same, "pull round_diameter_m and round_ratio must be lists of the same length")
+        grows = all(b >= a for a, b in pairwise(self.round_ratio))
+        expect(grows, "pull round_ratio can't fall as round_diameter_m rises")
         within = all(0.005 <= diameter <= 1 for diameter in self.round_diameter_m)
         expect(within and _rises(self.round_diameter_m), "pull round_diameter_m must rise from 0.005 to 1")
         self._check_plates()
