@@ -317,6 +317,20 @@ def test_a_load_turns_about_the_steel_that_the_faces_touch_not_about_their_edges
     assert held(MAGNET, (0.03, 0.0), wide_m=0.05)[0] == pytest.approx(expected, rel=0.1)
 
 
+@pytest.mark.parametrize(("width_m", "passes"), [(0.22, False), (0.4, True)])
+def test_of_two_bundles_none_turns_about_its_inner_bars(width_m: float, *, passes: bool) -> None:
+    """A narrow face between them pulls each with its factor, but only on the bars beside its neighbour."""
+    pull = replace(MAGNET.pull, round_diameter_m=(), round_ratio=(), grade_ratio=1.0)
+    magnet = weak(
+        poles=tuple(replace(pole, width_m=width_m) for pole in MAGNET.poles), pull=pull, capacity_kg=2e4,
+        crane_capacity_kg=3e4, tolerance=Tolerance(0.005, 0.03, 0.1), beam=replace(MAGNET.beam, width_m=0.45),
+    )  # fmt: skip
+    place = Placement(0.4425, 0.0, 0.0)
+    lift = judged([laid(0.3), laid(0.585)], None, place, magnet, LiftSettings(bundles=2))
+    assert lift.count == 2 and codes(lift) == (set() if passes else {"weak-pull"})
+    assert all("one of the bundles" in veto.reason for veto in lift.vetoes)
+
+
 def test_too_heavy_for_magnet_or_crane() -> None:
     assert codes(judged([laid(0.3)], magnet=weak(capacity_kg=2000.0))) == {"overweight"}
     assert codes(judged([laid(0.3)], magnet=weak(crane_capacity_kg=4000.0))) == {"overweight"}

@@ -155,9 +155,9 @@ def pried_ratio(
     side that the faces touch. The safety factor may be used up for this, but no more.
     """
     weight_n = needed_n / magnet.needed_factor
-    if contact.contact_share == 0 or not weight_n > 0:
-        return 0.0
     touched = _touched(contact, magnet)
+    if not touched.size or not weight_n > 0:
+        return 0.0
     away, slack = _off_centre(place, load)
     pulls = np.array([own.pull_low_n for own in contact.poles])
     at = np.array([
@@ -190,7 +190,8 @@ def _touched(contact: Contact, magnet: Magnet) -> Float64:
                 )
             )
             corners += itertools.product(v, u)
-    return np.asarray(cv2.convexHull(np.array(corners, np.float32)).reshape(-1, 2), np.float64)
+    hull = cv2.convexHull(np.array(corners, np.float32)) if corners else np.empty(0)
+    return np.asarray(hull.reshape(-1, 2), np.float64)
 
 
 @dataclass(frozen=True)
@@ -223,9 +224,10 @@ def weakest_bundle(
     contact: Contact, magnet: Magnet, place: Placement, load: tuple[Bundle, ...], strap_m: float
 ) -> float:
     """Compute for each of several bundles the ratio of the pull's lower bound to what its weight needs, and
-    return the minimum; infinite where one or none is taken, NaN where a weight isn't known.
+    how it pries itself off (`pried_ratio`); return the minimum. Infinite where one or none is taken, NaN
+    where a weight isn't known.
 
-    Only the cells of a face that certainly lie over a bundle's outline pull it.
+    Only the cells of a face that certainly lie over a bundle's outline pull and touch it.
     """
     if len(load) < 2:
         return math.inf
@@ -237,7 +239,9 @@ def weakest_bundle(
         )
         held = hold_load(replace(contact, poles=poles), magnet, (bundle,), strap_m)
         needed_n = bundle_mass(bundle).upper_kg * NEWTON_PER_KG * magnet.needed_factor
-        ratios.append(held.pull_low_n / needed_n if needed_n > 0 else math.nan)
+        if not needed_n > 0:
+            return math.nan
+        ratios += [held.pull_low_n / needed_n, pried_ratio(held, needed_n, magnet, place, (bundle,))]
     return float(np.min(ratios))
 
 
@@ -270,12 +274,15 @@ def share_checks(weakest: WeakestPole | None, pried: float, worst_bundle: float 
         ),
         check_min(
             "weak-pull", "moment of the pull about the edge of what the faces touch, relative to the load's",
-            pried, 1.0, "", "the load hangs so far beside the pull that it may pry the faces off: the moment "
-            f"of the pull about the edge of what they touch is {pried:.2f} of the load's",
+            pried, 1.0, "", "the load may pry the faces off: the moment of the pull about the edge of what "
+            f"they touch is {pried:.2f} of the load's",
         ),
     ]  # fmt: skip
     if worst_bundle < math.inf or math.isnan(worst_bundle):
-        what = "lower bound of the pull on the worst bundle, relative to what it needs"
-        reason = f"the lower bound of the pull on one of the bundles is {worst_bundle:.2f} of what it needs"
+        what = "lower bound of the pull on the worst bundle, in all or about an edge, relative to its need"
+        reason = (
+            "the lower bound of the pull on one of the bundles, in all or about the edge of what the faces "
+            f"touch of it, is {worst_bundle:.2f} of what it needs"
+        )
         checks.append(check_min("weak-pull", what, worst_bundle, 1.0, "", reason))
     return checks
