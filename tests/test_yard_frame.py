@@ -95,9 +95,11 @@ def test_a_world_becomes_the_yard(tmp_path: Path) -> None:
 
 
 def test_units_that_differ_are_no_calibration(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    targets_file(tmp_path / "mm.csv", 1, scale=1000.0)
-    assert run(["calibrate", "yard", str(tmp_path / "mm.csv"), "-o", str(tmp_path / "yard.yaml")]) == 5
-    assert "times as large as the measured ones" in capsys.readouterr().err
+    for scale, code, said in ((1000.0, 3, "give metres"), (3.28, 5, "times as large as the measured ones")):
+        targets_file(tmp_path / "units.csv", 1, scale=scale)
+        words = ["calibrate", "yard", str(tmp_path / "units.csv"), "-o", str(tmp_path / "yard.yaml")]
+        assert run(words) == code
+        assert said in capsys.readouterr().err
     assert not (tmp_path / "yard.yaml").exists()
 
 

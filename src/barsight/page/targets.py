@@ -21,7 +21,7 @@ from barsight.core.reading.geotiff import open_geotiff
 from barsight.core.records.heights import HeightSource
 from barsight.page.layers import MAX_PIXELS
 from barsight.page.survey_files import expect_map, survey_folder
-from barsight.registration.surveyed_targets import Targets, read_places, write_targets
+from barsight.registration.surveyed_targets import SAME_M, Targets, read_places, write_targets
 from barsight.registration.yard import calibrate_yard
 from barsight.result_folder import read_heights
 from barsight.yard.lifting.travel_accuracy import Travel
@@ -52,8 +52,6 @@ JUMP_M = 0.02
 """Minimum threshold in metres, beside twice sigma, above which a height belongs to another face."""
 MIN_SHARE, MIN_LEVEL = 0.3, 0.8
 """Minimum share of the cells around a pick that are measured, and of these that are on one face."""
-SAME_M = 0.02
-"""Minimum distance in metres between two targets; closer picks are of the same target."""
 MIN_TARGETS = 3
 LISTED = Path("list of places")
 
@@ -284,7 +282,7 @@ def _fitted(targets: Targets, frame: str) -> tuple[dict[str, Any] | None, Float6
     content = {
         "turn_sigma_deg": found.turn_sigma_deg, "place_sigma_m": found.place_sigma_m,
         "scale": found.alignment.scale, "scale_sigma": found.alignment.scale_sigma,
-        "doubts": list(found.doubts),
+        "doubts": [*found.contradictions, *found.doubts],
     }  # fmt: skip
     return content, found.off_m
 

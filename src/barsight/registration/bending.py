@@ -124,7 +124,6 @@ def calibrate_bent_yard(
     # The frame's turn is about the source's origin, as in `align_rigid`.
     joint = np.linalg.inv(normal)
     joint[6:][~fitted] = joint[:, 6:][:, ~fitted] = 0.0
-    joint *= rigid.inflation
     return _joined(rigid, bend, values, joint, at, slopes, covariance_m2)
 
 

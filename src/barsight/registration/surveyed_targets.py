@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from barsight.calibration.boards.ring_detection import ring_codes
 from barsight.core.arrays import Bool, Float64, Int64
@@ -20,6 +21,10 @@ YARD = ("yard_x", "yard_y", "yard_z")
 PLACE = ("x", "y", "z")
 TAGS = 587
 """Number of tags in the family 36h11."""
+SAME_M = 0.02
+"""Minimum distance in metres between two targets; closer ones are the same target."""
+MAX_APART_M = 2000.0
+"""Maximum distance of a yard's targets along an axis in metres; larger ones are in other units."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +63,8 @@ def read_targets(path: Path) -> Targets:
     """
     names, table = _read_table(path, "name", (*YARD, *PLACE))
     _expect_once(path, "target", names)
+    for places, how in ((table[:, :3], "surveyed"), (table[:, 3:6], "measured")):
+        _expect_apart(path, names, places, how)
     return Targets(names, table[:, :3], table[:, 3:6], table[:, 6], table[:, 7] == 1)
 
 
@@ -77,6 +84,7 @@ def read_tags(path: Path) -> SurveyedTags:
     if strange is not None:
         raise InputError(path, f"{strange!r} is no {family}", f"give the number on it, 0 to {count - 1}")
     _expect_once(path, kind, tuple(map(str, numbers)))
+    _expect_apart(path, names, table[:, :3], "surveyed")
     found = np.array(numbers, np.int64), table[:, :3], table[:, 3], table[:, 4] == 1
     return SurveyedTags(*found, are_rings)
 
@@ -89,6 +97,7 @@ def read_places(path: Path, text: str | None = None) -> tuple[tuple[str, ...], S
     """
     names, table = _read_table(path, "name", YARD, text)
     _expect_once(path, "target", names)
+    _expect_apart(path, names, table[:, :3], "surveyed")
     numbers = np.arange(len(names), dtype=np.int64)
     return names, SurveyedTags(numbers, table[:, :3], table[:, 3], table[:, 4] == 1, width_m=table[:, 5])
 
@@ -154,6 +163,8 @@ def _read_table(
         raise InputError(path, f"has no column {missing[0]}", remedy)
     numbers = []
     for n, row in enumerate(rows, start=2):
+        if None in row:
+            raise InputError(path, f"line {n} has more fields than the header", "write numbers with a point")
         try:
             values = [float(row[name]) for name in columns]
             values += [float(row.get("sigma_m") or "nan"), float(row.get("check") or 0)]
@@ -173,3 +184,16 @@ def _expect_once(path: Path, kind: str, names: tuple[str, ...]) -> None:
     twice = next((name for name, count in Counter(names).items() if count > 1), None)
     if twice is not None:
         raise InputError(path, f"{kind} {twice} is there twice", f"give each {kind} once")
+
+
+def _expect_apart(path: Path, names: tuple[str, ...], places_m: Float64, how: str) -> None:
+    """Raise InputError if two names stand for one target, which would count twice, or no yard is so large."""
+    if not len(names):
+        return
+    wide_m = float(np.ptp(places_m, axis=0).max())
+    if wide_m > MAX_APART_M:
+        raise InputError(path, f"has targets that are {how} {wide_m:.0f} m apart", "give metres")
+    near = KDTree(places_m).query_pairs(SAME_M, output_type="ndarray")
+    if len(near):
+        one, other = (names[k] for k in min(map(tuple, near)))
+        raise InputError(path, f"{one} and {other} are {how} at one place", "give each target once")

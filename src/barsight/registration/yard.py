@@ -5,34 +5,35 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtrc
 
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import Failed
+from barsight.registration.agreement import find_agreement
 from barsight.registration.rigid import Alignment, align_rigid, design_rows
 
-DOUBTFUL = 0.001
-"""Probability of the residuals under the stated sigmas below which these are too small, or a point is
-wrong.
-"""
+STRANGE = 0.01
+"""Probability under the stated sigmas below which residuals that don't contradict them are doubtful."""
+MAX_OFF = 4.0
+"""Largest distance of a check from where the frame puts it, in sigmas of a coordinate."""
 
 
 @dataclass(frozen=True, eq=False)
 class YardCalibration:
-    """alignment: yard_from_<frame>, its covariance scaled by `inflation` where the residuals require it.
+    """alignment: yard_from_<frame>, of the points that agree.
 
-    names: (N,) of the points; yard_m: (N, 3) their positions; checks: (N,) those that took no part. off_m:
-    (N, 3) yard minus moved point; sigma_m: (N,) expected RMS of its coordinates (1 sigma). doubts: sentences.
+    names: (N,) of the points; yard_m: (N, 3) their positions; checks: (N,) those that took no part, or that
+    the others contradict. off_m: (N, 3) yard minus moved point; sigma_m: (N,) expected RMS of its coordinates
+    (1 sigma). doubts: sentences; contradictions: sentences that forbid the use.
     """
 
     alignment: Alignment
-    inflation: float
     names: tuple[str, ...]
     yard_m: Float64
     checks: Bool
     off_m: Float64
     sigma_m: Float64
     doubts: tuple[str, ...]
+    contradictions: tuple[str, ...]
 
     @property
     def turn_sigma_deg(self) -> float:
@@ -51,44 +52,76 @@ def calibrate_yard(
 ) -> YardCalibration | Failed:  # fmt: skip
     """Estimate `yard_from_<frame>` from points measured in `frame` (N, 3) and known in the yard (N, 3), m.
 
-    covariance_m2: as in `align_rigid`, yard axes; None estimates one sigma from the residuals. checks: (N,)
-    points that are only compared. Failed `few-points`, `collinear`.
+    covariance_m2: as in `align_rigid`, yard axes; None estimates one sigma from the residuals. Where each
+    point has its own, points that the others contradict become checks. checks: (N,) points that are only
+    compared. Failed `few-points`, `collinear`.
     """
-    used = ~checks
-    covariance = covariance_m2
-    if covariance is not None:
-        covariance = covariance[np.ix_(used, used)] if covariance.ndim == 2 else covariance[used]
-    found = align_rigid(measured[used], yard[used], ("yard", frame), covariance)
+    found = _aligned(measured, yard, covariance_m2, ~checks, frame)
     if isinstance(found, Failed):
         return found
-    doubts: list[str] = []
-    inflation = 1.0
-    free = found.degrees_of_freedom
-    if covariance is not None and free > 0 and chdtrc(free, found.chi2) < DOUBTFUL:
-        inflation = found.chi2 / free
-        doubts.append(
-            f"the points disagree {(found.chi2 / free) ** 0.5:.1f} times as much as their sigmas say: "
-            "a target is mistaken or moved; the stated sigma grows by that"
-        )
-    scaled = Alignment(
-        found.target_from_source, inflation * found.covariance, found.residuals_m, found.scale,
-        inflation**0.5 * found.scale_sigma, found.sigma_m, found.chi2,
-    )  # fmt: skip
-    if abs(scaled.scale - 1) > 3 * scaled.scale_sigma:
-        doubts.append(
-            f"the measured points are {100 * (1 / scaled.scale - 1):+.3f} ± {100 * scaled.scale_sigma:.3f} % "
-            "too large: baseline or survey has a wrong metre (the scale is not corrected)"
-        )
-    off = yard - scaled.target_from_source.apply(measured)
-    design = design_rows(measured @ scaled.target_from_source.rotation.T)
-    own = np.full(len(measured), scaled.sigma_m**2) if covariance_m2 is None else covariance_m2
-    sigma = predicted_sigma(design, scaled.covariance, own, checks)
+    contradictions, rivals, doubts = list[str](), dict[int, str](), list[str]()
+    if covariance_m2 is not None and covariance_m2.ndim == 3:
+        judged = _judged(names, measured, yard, covariance_m2, ~checks, found)
+        contradictions, rivals, doubts = judged
+    if rivals:
+        checks = checks | np.isin(np.arange(len(names)), list(rivals))
+        found = _aligned(measured, yard, covariance_m2, ~checks, frame)
+        assert not isinstance(found, Failed)
+    off = yard - found.target_from_source.apply(measured)
+    design = design_rows(measured @ found.target_from_source.rotation.T)
+    own = np.full(len(measured), found.sigma_m**2) if covariance_m2 is None else covariance_m2
+    sigma = predicted_sigma(design, found.covariance, own, checks)
     length = np.linalg.norm(off, axis=1)
-    doubts += [
-        f"check {names[k]} is {1e3 * length[k]:.1f} mm off, its sigma is {1e3 * sigma[k]:.1f} mm"
-        for k in np.flatnonzero(checks & (length > 4 * sigma))
+    contradictions += [
+        f"{names[k]} is {1e3 * length[k]:.1f} mm off, its sigma is {1e3 * sigma[k]:.1f} mm{rivals.get(k, '')}"
+        for k in np.flatnonzero(checks).tolist()
+        if length[k] > MAX_OFF * sigma[k] or k in rivals
     ]
-    return YardCalibration(scaled, inflation, names, yard, checks, off, sigma, tuple(doubts))
+    doubts += _wrong_metre(found)
+    return YardCalibration(found, names, yard, checks, off, sigma, tuple(doubts), tuple(contradictions))
+
+
+def _aligned(
+    measured: Float64, yard: Float64, covariance_m2: Float64 | None, used: Bool, frame: str
+) -> Alignment | Failed:
+    if covariance_m2 is not None:
+        covariance_m2 = covariance_m2[np.ix_(used, used)] if covariance_m2.ndim == 2 else covariance_m2[used]
+    return align_rigid(measured[used], yard[used], ("yard", frame), covariance_m2)
+
+
+def _judged(
+    names: tuple[str, ...], measured: Float64, yard: Float64, covariance_m2: Float64, used: Bool,
+    found: Alignment,
+) -> tuple[list[str], dict[int, str], list[str]]:  # fmt: skip
+    """Judge the used points by their sigmas. Returns contradictions; mistaken points, each with those that
+    may be mistaken in its place; and doubts.
+    """
+    at = np.flatnonzero(used)
+    chosen = measured[at], yard[at], covariance_m2[at]
+    agreement = find_agreement(*chosen)
+    if agreement.is_whole and not agreement.left_out:
+        if agreement.chance >= STRANGE:
+            return [], {}, []
+        chance, worst = f"chance {100 * agreement.chance:.2g} %", names[at[agreement.worst]]
+        return [], {}, [f"the points are off more than their sigmas say ({chance}), {worst} most"]
+    scaled = find_agreement(found.scale * chosen[0], *chosen[1:])
+    if scaled.is_whole and not scaled.left_out and (told := _wrong_metre(found)):
+        mistaken = " or ".join(names[at[k]] for k in agreement.left_out)
+        return [told[0] + (f", or {mistaken} is mistaken" if mistaken else "")], {}, []
+    if not agreement.is_whole:
+        much = f"the points disagree {agreement.disagreement:.1f} times as much as their sigmas say"
+        return [f"{much}, and leaving out a few doesn't help"], {}, []
+    others = ("".join(f" (or {names[at[j]]} is)" for j in one) for one in agreement.rivals)
+    return [], dict(zip(at[list(agreement.left_out)].tolist(), others, strict=True)), []
+
+
+def _wrong_metre(found: Alignment) -> tuple[str, ...]:
+    if abs(found.scale - 1) <= 3 * found.scale_sigma:
+        return ()
+    return (
+        f"the measured points are {100 * (1 / found.scale - 1):+.3f} ± {100 * found.scale_sigma:.3f} % "
+        "too large: baseline or survey has a wrong metre (the scale is not corrected)",
+    )
 
 
 def predicted_sigma(design: Float64, covariance: Float64, own_m2: Float64, checks: Bool) -> Float64:

@@ -200,6 +200,9 @@ def _expect_usable(found: YardCalibration, source: Path) -> None:
     if pose.source != "body" and pose.rotation[2, 2] <= 0:
         remedy = "names are mixed up; z points up in both"
         raise MeasurementError(f"{source}: the points fit only if the map is turned upside down: {remedy}")
+    if found.contradictions:
+        remedy = "survey and measure again or leave out, or give the sigma that is true (--sigma-m, sigma_m)"
+        raise MeasurementError(f"{source}: {'; '.join(found.contradictions)}: {remedy}")
     if found.turn_sigma_deg > MAX_UNSURE_DEG or found.place_sigma_m > MAX_UNSURE_M:
         raise MeasurementError(
             f"{source}: the points disagree by up to {off_m.max():.3g} m and tell the turn to "
