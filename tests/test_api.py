@@ -146,6 +146,12 @@ def test_a_disparity_of_two_arrays() -> None:
     inner = found.disparity_px[10:-10, 60:-20]
     assert np.isfinite(inner).mean() > 0.9
     assert abs(float(np.nanmedian(inner)) - 12) < 0.1
+    wide = scene.astype(np.uint16) * 257
+    same: Any = np.dstack([scene] * 3)[:, 12:212], wide[:, :200]
+    again = bs.disparity(same[1], same[0], range_px=(0, 32), method="sgbm")
+    np.testing.assert_array_equal(again.disparity_px, found.disparity_px)
+    with pytest.raises(bs.BarsightError, match="float64 pixels; 8 or 16 bits are needed; give uint8"):
+        bs.disparity(scene / 255, same[0])
 
 
 def test_without_xarray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,8 +18,9 @@ from barsight.core.errors import CalibrationError, ConfigError, InputError, Outp
 from barsight.core.files import atomic_directory, atomic_path, atomic_paths, changed_folder
 from barsight.core.printing import printable
 from barsight.core.reading.bounded_reading import read_arrays, read_json, read_text, read_toml
+from barsight.core.records.gray_levels import TornImageError
 from barsight.core.stamps import parse_seconds
-from barsight.recording.image_decoding import TornImageError, decode_gray
+from barsight.recording.image_decoding import decode_gray
 from barsight.recording.open import open_recording
 from barsight.yard.magnet.description import example_magnet, load_magnet
 from recording_samples import write_euroc

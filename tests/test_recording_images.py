@@ -1,13 +1,17 @@
 """Torn pictures are refused at any cut; colours and depths become gray as documented."""
 
+import io
 import struct
 import zlib
 
 import cv2
 import numpy as np
 import pytest
+import tifffile
+from PIL import Image
 
-from barsight.recording.image_decoding import PNG_SIGNATURE, TornImageError, check_png, decode_gray, to_gray
+from barsight.core.records.gray_levels import TornImageError, to_gray
+from barsight.recording.image_decoding import PNG_SIGNATURE, check_png, decode_gray
 from recording_samples import picture, png
 
 
@@ -81,10 +85,29 @@ def test_sixteen_bits_become_eight_by_a_fixed_scale() -> None:
     np.testing.assert_array_equal(to_gray(picture(0).astype(np.uint16) * 257), picture(0))
 
 
-def test_twelve_bits_in_sixteen_are_refused_and_black_is_not() -> None:
+@pytest.mark.parametrize("bits", [8, 10, 12, 14])
+def test_fewer_bits_in_sixteen_are_refused_and_black_is_not(bits: int) -> None:
     with pytest.raises(TornImageError, match="full 16 bits"):
-        to_gray(np.full((4, 4), 4095, np.uint16))
+        to_gray(np.full((4, 4), 2**bits - 1, np.uint16))
     assert not to_gray(np.zeros((4, 4), np.uint16)).any()
+
+
+def test_kinds_that_would_be_misread_are_refused_by_name() -> None:
+    image = picture(0)
+    white = io.BytesIO()
+    tifffile.imwrite(white, 65535 - image.astype(np.uint16) * 257, photometric="miniswhite")
+    eight = io.BytesIO()
+    tifffile.imwrite(eight, 255 - image, photometric="miniswhite")
+    np.testing.assert_array_equal(decode_gray(eight.getvalue()), image)
+    cmyk = io.BytesIO()
+    Image.fromarray(image).convert("CMYK").save(cmyk, "JPEG")
+    height, width = image.shape
+    twelve = b"P5 # a camera's\n%d %d\n4095\n" % (width, height) + (image.astype(">u2") * 16).tobytes()
+    plain = b"P5\n%d %d\n255\n" % (width, height) + image.tobytes()
+    np.testing.assert_array_equal(decode_gray(plain), image)
+    for data, said in ((white.getvalue(), "MINISWHITE"), (cmyk.getvalue(), "CMYK"), (twelve, "up to 4095")):
+        with pytest.raises(TornImageError, match=said):
+            decode_gray(data)
 
 
 def test_other_pixels_are_refused() -> None:

@@ -13,10 +13,11 @@ import barsight as bs
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import InputError
 from barsight.core.records.pairs import StereoFrame
-from barsight.core.records.sensor_samples import CraneSamples
+from barsight.core.records.sensor_samples import CraneSamples, ImuSamples
 from barsight.mapping.view import Matcher
 from barsight.motion.frontend.tracking import Tracker
 from barsight.pipeline import lift_choice
+from barsight.recording.packets import PacketRecording
 from test_yard_frame import calibrated
 
 SETTINGS: dict[str, Any] = {"stereo": {"method": "sgbm"}, "map": {"cell_m": 0.05}}
@@ -153,3 +154,55 @@ def test_a_session_refuses_what_it_could_only_miss_at_the_end(whole: Path, tmp_p
     for given, settings, named, line in refused:
         with pytest.raises(bs.BarsightError, match=re.escape(line)):
             bs.Session(given, *settings, **named)
+
+
+def packed(recording: Any, tmp_path: Path) -> tuple[PacketRecording, StereoFrame, ImuSamples, CraneSamples]:
+    frame = next(one for one in recording.frames() if isinstance(one, StereoFrame))
+    imu, crane = recording.imu(), recording.crane()
+    assert imu is not None and crane is not None
+    return PacketRecording(recording.rig, tmp_path), frame, imu, crane
+
+
+def test_pictures_of_other_kinds_become_the_readers_gray(whole: Path, tmp_path: Path) -> None:
+    recording, frame, _, _ = packed(bs.open_recording(whole), tmp_path)
+    wide, colour = frame.left.astype(np.uint16) * 257, np.dstack([frame.right] * 3)
+    same = bs.StereoFrame(np.int64(frame.stamp_ns), wide, colour)  # type: ignore[arg-type]
+    recording.add(same)
+    (stored,) = recording.frames()
+    assert isinstance(stored, StereoFrame)
+    np.testing.assert_array_equal(stored.left, frame.left)
+    np.testing.assert_array_equal(stored.right, frame.right)
+    refused: list[tuple[Any, Any, str]] = [
+        (5, frame.left.astype(np.uint16) * 16, "a 16-bit picture whose brightest value"),
+        (5, frame.left / 255, "float64 pixels; 8 or 16 bits are needed; give uint8"),
+        (5, np.dstack([frame.left] * 2), "2 channels"),
+        (5, None, r"shape \(\)"),
+        (5.0, frame.left, "stamp 5.0 is no integer of 64 bits; give nanoseconds"),
+        (2**70, frame.left, "no integer of 64 bits"),
+    ]
+    for stamp, picture, said in refused:
+        with pytest.raises(InputError, match=said):
+            bs.StereoFrame(stamp, picture, frame.right)
+
+
+def test_packets_that_are_no_measurements_are_refused(whole: Path, tmp_path: Path) -> None:
+    recording, frame, imu, crane = packed(bs.open_recording(whole), tmp_path)
+    late = replace(crane, stamp_ns=crane.stamp_ns + 10**12)
+    refused: list[tuple[Any, str]] = [
+        (frame.left, "a ndarray is no packet; give one of StereoFrame"),
+        ((frame.left, frame.right), "a tuple is no packet"),
+        (replace(imu, stamp_ns=imu.stamp_ns / 1e9), "stamps of ImuSamples are float64; give ns"),
+        (replace(imu, gyro_radps=imu.gyro_radps[1:]), "gyro_radps of ImuSamples has the shape"),
+        (replace(imu, accel_mps2=imu.accel_mps2 / 9.81), "probably in g"),
+        (replace(crane, position_m=crane.position_m[:, :2]), "position_m of CraneSamples has the shape"),
+        (replace(crane, position_std_m=0.0), "the latter positive"),
+        (replace(crane, yard_from_body_nominal=np.ones((3, 3))), "the crane's mounting can't be"),
+        (replace(late, crane_to_body_m=crane.crane_to_body_m + 1), "another mounting or sigma"),
+        (bs.LaserProfile(0, np.arange(3.0), np.zeros(2), np.zeros(3), 0.01), "y_m of LaserProfile"),
+    ]
+    for packet, said in refused:
+        with pytest.raises(bs.BarsightError, match=said):
+            recording.add(packet)
+        if said.startswith("the crane's"):
+            recording.add(crane)
+    assert recording.imu() is None

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from barsight.core.errors import BarsightError
     from barsight.core.records.disparity import Disparity
     from barsight.core.records.heights import Contour
+    from barsight.core.records.pairs import StereoFrame
+    from barsight.core.records.sensor_samples import CraneSamples, ImuSamples, LaserProfile
     from barsight.measure_settings import MeasureSettings
     from barsight.reconstruction.live_map import Snapshot
     from barsight.result import Lifts, LiftTarget, Yard
@@ -28,8 +30,9 @@ if TYPE_CHECKING:
     __version__: str
 
 __all__ = [
-    "BarsightError", "Bundle", "CameraPath", "Contour", "Disparity", "HeightMap", "LiftTarget", "Lifts",
-    "MeasureSettings", "Session", "Snapshot", "StereoCalibration", "StereoRig", "Yard", "__version__",
+    "BarsightError", "Bundle", "CameraPath", "Contour", "CraneSamples", "Disparity", "HeightMap",
+    "ImuSamples", "LaserProfile", "LiftTarget", "Lifts", "MeasureSettings", "Session", "Snapshot",
+    "StereoCalibration", "StereoFrame", "StereoRig", "Yard", "__version__",
     "calibrate_stereo", "disparity", "load", "measure", "open_recording", "packets",
 ]  # fmt: skip
 
@@ -40,6 +43,8 @@ _HOMES = {
     "barsight.core.errors": ("BarsightError",),
     "barsight.core.records.disparity": ("Disparity",),
     "barsight.core.records.heights": ("Contour",),
+    "barsight.core.records.pairs": ("StereoFrame",),
+    "barsight.core.records.sensor_samples": ("CraneSamples", "ImuSamples", "LaserProfile"),
     "barsight.reconstruction.live_map": ("Snapshot",),
     "barsight.measure_settings": ("MeasureSettings",),
     "barsight.result": ("LiftTarget", "Lifts", "Yard"),

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from barsight.core.arrays import Float64, Int64
+from barsight.core.records.gray_levels import TornImageError
 from barsight.core.stamps import BEFORE_ALL_NS, NS_PER_S
-from barsight.recording.image_decoding import TornImageError
 from barsight.recording.pairing import decode_for
 from barsight.recording.stored_images import StoredImage, StoredPictures
 from barsight.sensors.source import LivePicture, LostPicture, Readings

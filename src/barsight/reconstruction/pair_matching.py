@@ -14,9 +14,10 @@ from barsight.core.arrays import UInt8
 from barsight.core.errors import CalibrationError, ConfigError, Failed, InputError, MeasurementError
 from barsight.core.reading.bounded_reading import read_bytes
 from barsight.core.records.disparity import Disparity, DisparityRange
-from barsight.core.records.pairs import RectifiedPair, StereoFrame
+from barsight.core.records.gray_levels import TornImageError, split_colour
+from barsight.core.records.pairs import PICTURE_REMEDY, RectifiedPair, StereoFrame
 from barsight.mapping.view import disparity_range
-from barsight.recording.image_decoding import MAX_PICTURE_BYTES, TornImageError, decode_with_colour
+from barsight.recording.image_decoding import MAX_PICTURE_BYTES, decode_with_colour
 from barsight.stereo.image_pair import pair_from_images
 from barsight.stereo.search_range import check_matchable
 from barsight.stereo.settings import MethodName, StereoSettings, make_method
@@ -107,14 +108,13 @@ def _with_colours(pair: RectifiedPair, rectifier: Rectifier, left: UInt8, right:
 
 
 def _read(path: Picture) -> tuple[UInt8, UInt8 | None]:
-    if not isinstance(path, Path):
-        if path.dtype != np.uint8 or path.ndim != 2:
-            raise InputError("picture", "is no (H, W) array of uint8", "give gray levels, or a file")
-        return path, None
     try:
+        if not isinstance(path, Path):
+            return split_colour(np.asarray(path))
         return decode_with_colour(read_bytes(path, MAX_PICTURE_BYTES, "check the name"))
     except TornImageError as error:
-        raise InputError(path, str(error), "give another picture") from error
+        remedy = "give another picture" if isinstance(path, Path) else PICTURE_REMEDY
+        raise InputError(_name(path), str(error), remedy) from error
 
 
 def _expect_inside(candidates: DisparityRange, pair: RectifiedPair) -> None:

@@ -1,13 +1,13 @@
 """Decode stored pictures to (H, W) uint8 gray, refusing damaged ones.
 
 OpenCV fills the missing rows of a truncated PNG or JPEG with gray and reports it on stderr only, so a picture
-is checked before it is decoded: a PNG chunk by chunk with its checksums, a JPEG by its end marker.
-Colour becomes gray with the weights 0.299 R + 0.587 G + 0.114 B [ITU-R BT.601]; 16 bits become 8 by the same
-fixed scale for every frame (65535 -> 255), so that brightness stays comparable along a recording.
+is checked before it is decoded: a PNG chunk by chunk with its checksums, a JPEG by its end marker. Kinds that
+OpenCV decodes to wrong values are refused.
 """
 
 from __future__ import annotations
 
+import re
 import struct
 import zlib
 from io import BytesIO
@@ -17,10 +17,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from tifffile import TiffFile
+from tifffile import PHOTOMETRIC, TiffFile
 
 from barsight.calibration.geometry.camera import MAX_PIXELS
 from barsight.core.arrays import UInt8
+from barsight.core.records.gray_levels import TornImageError, split_colour, to_gray
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_KINDS = {
@@ -33,12 +34,10 @@ JPEG_SIGNATURE = b"\xff\xd8\xff"
 
 
 MAX_PICTURE_BYTES = 1 << 28
-_NARROWED = ((np.arange(1 << 16) + 128) // 257).astype(np.uint8)
-"""Lookup table from 16-bit to 8-bit values."""
-
-
-class TornImageError(ValueError):
-    """A picture that can't be used; the text gives the reason, without the file's name."""
+_MISREAD = ("CMYK", "SEPARATED", "LAB", "CIELAB", "ICCLAB", "ITULAB", "CFA", "LINEAR_RAW", "LOGL", "LOGLUV")
+"""Kinds of pixels, as Pillow and tifffile name them, whose gray values OpenCV gets wrong or can't know."""
+_PNM_HEADER = re.compile(rb"P[2356](?:\s+(?:#[^\n]*\n\s*)*\d+){2}\s+(?:#[^\n]*\n\s*)*(\d{1,9})\s")
+"""Header of a PNM up to its largest value, which OpenCV ignores."""
 
 
 def decode_gray(data: bytes, size: tuple[int, int] | None = None, max_pixels: int = MAX_PIXELS) -> UInt8:
@@ -52,11 +51,7 @@ def decode_gray(data: bytes, size: tuple[int, int] | None = None, max_pixels: in
 
 def decode_with_colour(data: bytes) -> tuple[UInt8, UInt8 | None]:
     """Decode to gray and to (H, W, 3) uint8 BGR, None if the picture contains only gray values."""
-    image = _eight_bits(_decoded(data))
-    if image.ndim != 3 or image.shape[2] not in (3, 4):
-        return to_gray(image), None
-    colour = np.ascontiguousarray(image[:, :, :3])
-    return to_gray(image), colour if (colour != colour[:, :, :1]).any() else None
+    return split_colour(_decoded(data))
 
 
 def expect_size(found: tuple[int, int], size: tuple[int, int]) -> None:
@@ -75,11 +70,18 @@ def _header_size(data: bytes) -> tuple[int, int]:
         if data.startswith((b"II", b"MM")):
             with TiffFile(BytesIO(data)) as file:
                 page = file.pages.first
-                return page.imagewidth, page.imagelength
-        with Image.open(BytesIO(data), formats=("JPEG", "BMP", "PPM", "WEBP")) as picture:
-            return picture.size
+                kind, bits = PHOTOMETRIC(page.photometric).name, page.bitspersample
+                size = page.imagewidth, page.imagelength
+        else:
+            with Image.open(BytesIO(data), formats=("JPEG", "BMP", "PPM", "WEBP")) as picture:
+                kind, bits, size = picture.mode, 8, picture.size
     except Exception:  # Pillow and tifffile raise many types for a damaged header
         raise TornImageError("is not a readable picture") from None
+    if kind in _MISREAD or (kind == "MINISWHITE" and bits != 8):
+        raise TornImageError(f"has pixels of the kind {kind}; gray or RGB is read")
+    if (most := _PNM_HEADER.match(data)) and int(most[1]) not in (255, 65535):
+        raise TornImageError(f"has gray levels up to {int(most[1])}; up to 255 or 65535 are read")
+    return size
 
 
 def _decoded(data: bytes, size: tuple[int, int] | None = None, max_pixels: int = MAX_PIXELS) -> NDArray[Any]:
@@ -97,40 +99,6 @@ def _decoded(data: bytes, size: tuple[int, int] | None = None, max_pixels: int =
     if image is None or image.shape[:2] != (height, width):
         raise TornImageError("is not a readable picture")
     return np.asarray(image)
-
-
-def to_gray(image: NDArray[np.uint8] | NDArray[np.uint16]) -> UInt8:
-    """Convert (H, W), (H, W, 3) BGR or (H, W, 4) BGRA, 8 or 16 bits, to (H, W) uint8.
-
-    Raises `TornImageError` for other kinds, and for 16-bit pictures that use only the lowest 12 bits, which
-    would be almost black.
-    """
-    image = _eight_bits(image)
-    if image.ndim == 3:
-        if image.shape[2] == 1:
-            image = image[:, :, 0]
-        elif image.shape[2] in (3, 4):
-            code = cv2.COLOR_BGR2GRAY if image.shape[2] == 3 else cv2.COLOR_BGRA2GRAY
-            image = cv2.cvtColor(image, code)
-        else:
-            raise TornImageError(f"has {image.shape[2]} channels; 1, 3 or 4 are needed")
-    return np.ascontiguousarray(image, dtype=np.uint8)
-
-
-def _eight_bits(image: NDArray[Any]) -> UInt8:
-    if image.dtype == np.uint16:
-        brightest = int(image.max(initial=0))
-        if 0 < brightest < 4096:
-            raise TornImageError(
-                f"is a 16-bit picture whose brightest value is {brightest}: scale it to the full 16 bits"
-            )
-        narrow = np.empty(image.shape, np.uint8)
-        for row, wide in zip(narrow, image, strict=True):
-            row[:] = _NARROWED[wide]
-        return narrow
-    if image.dtype != np.uint8:
-        raise TornImageError(f"has {image.dtype} pixels; 8 or 16 bits are needed")
-    return np.asarray(image, dtype=np.uint8)
 
 
 def check_png(data: bytes) -> tuple[int, int]:

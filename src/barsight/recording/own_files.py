@@ -9,7 +9,8 @@ from pathlib import Path, PurePosixPath
 from barsight.core.errors import InputError
 from barsight.core.files import lies_within
 from barsight.core.reading.bounded_reading import MAX_TABLE_BYTES, open_regular, read_bytes
-from barsight.recording.image_decoding import MAX_PICTURE_BYTES, TornImageError
+from barsight.core.records.gray_levels import TornImageError
+from barsight.recording.image_decoding import MAX_PICTURE_BYTES
 
 MAX_NAME_BYTES = 1000
 """Maximum length of a file's path below the recording; systems allow 4096 with all folders above."""

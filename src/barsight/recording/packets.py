@@ -5,20 +5,23 @@ from __future__ import annotations
 from collections.abc import Container, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar, get_args
 
 import numpy as np
 
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import Int64
-from barsight.core.errors import InputError
+from barsight.core.errors import ConfigError, InputError
+from barsight.core.pose import Pose
 from barsight.core.records.pairs import RefusedFrame, StereoFrame
 from barsight.core.records.sensor_samples import CraneSamples, ImuSamples, LaserProfile
 from barsight.core.stamps import rows_not_later
 from barsight.recording.base import FrameIndex, Recording
+from barsight.recording.sensor_samples import expect_si
 
 Samples = TypeVar("Samples", ImuSamples, CraneSamples)
+Checked = TypeVar("Checked", ImuSamples, CraneSamples, LaserProfile)
 Packet = StereoFrame | RefusedFrame | ImuSamples | CraneSamples | LaserProfile
 """A pair, or samples received since the last packet of their kind, or a reference profile."""
 
@@ -39,8 +42,9 @@ def packets(recording: Recording) -> Iterator[Packet]:
 class PacketRecording:
     """A `Recording` of the packets received so far; `folder` stores the pictures' pixels.
 
-    Raises InputError for a packet that is older than the last of its kind, or whose samples aren't finite or
-    not in time order. A packet without samples has no effect.
+    Raises InputError for a packet that is older than the last of its kind, whose arrays aren't finite,
+    complete and in time order, or whose mounting differs from that before; ConfigError for what is no packet.
+    A packet without samples has no effect.
     """
 
     path, format = Path("session"), "packets"
@@ -59,8 +63,12 @@ class PacketRecording:
 
     def add(self, packet: Packet) -> None:
         """Add a packet."""
+        kinds: tuple[type, ...] = get_args(Packet)
+        if not isinstance(packet, kinds):
+            names = ", ".join(kind.__name__ for kind in kinds)
+            raise ConfigError(f"a {type(packet).__name__} is no packet; give one of {names}")
         if isinstance(packet, LaserProfile):
-            self._laser.append(packet)
+            self._laser.append(self._checked(packet))
         elif isinstance(packet, ImuSamples):
             self._add_samples(packet, self._imu)
         elif isinstance(packet, CraneSamples):
@@ -77,11 +85,54 @@ class PacketRecording:
     def _add_samples(self, packet: Samples, series: _Grown[Samples]) -> None:
         if not len(packet.stamp_ns):
             return
+        packet = self._checked(packet)
         self._expect_later(packet.stamp_ns, series.last_ns)
-        if not all(np.isfinite(getattr(packet, name)).all() for name in _ARRAYS[type(packet)]):
-            problem = f"a packet of {packet.stamp_ns[0]} ns holds NaN or infinite values"
-            raise InputError(self.path, problem, "leave such samples out")
+        if isinstance(packet, ImuSamples):
+            expect_si(self.path, packet.accel_mps2)
+        else:
+            self._expect_mounting(packet)
         series.add(packet)
+
+    def _checked(self, packet: Checked) -> Checked:
+        """Return a packet with its arrays as NumPy's. Raises InputError unless they are complete."""
+        kind: type = type(packet)
+        arrays = dict[str, Any]()
+        count: int | None = None
+        columns: tuple[int, ...]
+        for name, columns in _COLUMNS[kind].items():
+            values = np.asarray(getattr(packet, name))
+            count = len(values) if count is None and values.ndim else count
+            if values.shape != (count, *columns):
+                problem = f"{name} of {kind.__name__} has the shape {values.shape}"
+                raise InputError(self.path, problem, f"give {(count, *columns)}, a row per sample")
+            if name == "stamp_ns" and values.dtype.kind not in "iu":
+                raise InputError(
+                    self.path, f"stamps of {kind.__name__} are {values.dtype}", "give ns, integers"
+                )
+            if values.dtype.kind not in "iuf" or not np.isfinite(values).all():
+                problem = f"{name} of {kind.__name__} holds what is no finite number"
+                raise InputError(self.path, problem, "leave such samples out")
+            arrays[name] = values
+        return replace(packet, **arrays)
+
+    def _expect_mounting(self, packet: CraneSamples) -> None:
+        """Raise InputError for a mounting that can't be, or isn't that of the packets before."""
+        mounting = [np.asarray(getattr(packet, name), np.float64) for name in _MOUNTING]
+        first = self._crane.first
+        if first is not None and not all(
+            np.array_equal(one, getattr(first, name)) for one, name in zip(mounting, _MOUNTING, strict=True)
+        ):
+            problem = "CraneSamples have another mounting or sigma than those before"
+            raise InputError(self.path, problem, "begin another session after the rig was moved")
+        body_m, turn, std_m = mounting
+        try:
+            Pose("yard", "body", turn, body_m)
+        except ValueError as error:
+            raise InputError(self.path, f"the crane's mounting can't be: {error}") from None
+        if not (np.isfinite(body_m).all() and 0 < std_m < np.inf):
+            raise InputError(
+                self.path, "crane_to_body_m and position_std_m must be finite, the latter positive"
+            )
 
     def _expect_later(self, stamps_ns: Sequence[int] | Int64, last_ns: int | None) -> None:
         late = last_ns is not None and stamps_ns[0] <= last_ns
@@ -136,24 +187,27 @@ class PacketRecording:
         return self._folder / f"pair_{stamp_ns}.npz"
 
 
-_ARRAYS = {
-    ImuSamples: ("stamp_ns", "gyro_radps", "accel_mps2"),
-    CraneSamples: ("stamp_ns", "position_m"),
-}  # fmt: skip
+_COLUMNS: dict[type, dict[str, tuple[int, ...]]] = {
+    ImuSamples: {"stamp_ns": (), "gyro_radps": (3,), "accel_mps2": (3,)},
+    CraneSamples: {"stamp_ns": (), "position_m": (3,)},
+    LaserProfile: {"x_m": (), "y_m": (), "z_m": ()},
+}
+"""Arrays of a packet, and the shape of a sample in each."""
+_MOUNTING = ("crane_to_body_m", "yard_from_body_nominal", "position_std_m")
 
 
 class _Grown(Generic[Samples]):
     """Growing samples; the cost of adding does not depend on their number."""
 
     def __init__(self) -> None:
-        self._first: Samples | None = None
+        self.first: Samples | None = None
         self._arrays: dict[str, Any] = {}
         self._count = 0
 
     def add(self, part: Samples) -> None:
-        if self._first is None:
-            self._first = part
-            self._arrays = {name: getattr(part, name).copy() for name in _ARRAYS[type(part)]}
+        if self.first is None:
+            self.first = part
+            self._arrays = {name: getattr(part, name).copy() for name in _COLUMNS[type(part)]}
             self._count = len(part.stamp_ns)
             return
         end = self._count + len(part.stamp_ns)
@@ -171,9 +225,9 @@ class _Grown(Generic[Samples]):
     @property
     def samples(self) -> Samples | None:
         count = self._count  # read once: another thread may be adding
-        if self._first is None:
+        if self.first is None:
             return None
-        return replace(self._first, **{name: array[:count] for name, array in self._arrays.items()})
+        return replace(self.first, **{name: array[:count] for name, array in self._arrays.items()})
 
 
 def _between(
@@ -186,5 +240,5 @@ def _between(
             first = 0 if after_ns is None else int(np.searchsorted(stamps, after_ns, side="right"))
             end = stamps.size if last_ns is None else int(np.searchsorted(stamps, last_ns, side="right"))
             if end > first:
-                names = _ARRAYS[type(samples)]
+                names = _COLUMNS[type(samples)]
                 yield replace(samples, **{name: getattr(samples, name)[first:end] for name in names})

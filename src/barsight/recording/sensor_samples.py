@@ -24,6 +24,12 @@ def make_imu(path: Path, stamp_ns: Int64, gyro: Float64, accel: Float64, body_fr
     rotation = body_from_imu.rotation
     if not np.array_equal(rotation, np.eye(3)):
         gyro, accel = gyro @ rotation.T, accel @ rotation.T
+    expect_si(path, accel)
+    return ImuSamples(stamp_ns, gyro, accel)
+
+
+def expect_si(path: Path, accel: Float64) -> None:
+    """Raise `InputError` if accelerations (N, 3) look like multiples of g."""
     median = float(np.median(np.linalg.norm(accel, axis=1)))
     if 0.8 < median < 1.25:
         raise InputError(
@@ -31,7 +37,6 @@ def make_imu(path: Path, stamp_ns: Int64, gyro: Float64, accel: Float64, body_fr
             f"the accelerations' median is {median:.2f} m/s^2, so they are probably in g",
             "multiply them by 9.80665 so that they are in m/s^2",
         )
-    return ImuSamples(stamp_ns, gyro, accel)
 
 
 def make_crane(document: Document, stamp_ns: Int64, position_m: Float64) -> CraneSamples:

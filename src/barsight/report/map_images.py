@@ -14,8 +14,9 @@ from barsight.core.arrays import Float32, Float64, UInt8
 from barsight.core.errors import InputError
 from barsight.core.reading.bounded_reading import read_bytes
 from barsight.core.reading.geotiff import HEIGHT_BANDS, REMEDY, GeoTiff, open_geotiff
+from barsight.core.records.gray_levels import TornImageError
 from barsight.core.records.heights import HeightSource
-from barsight.recording.image_decoding import MAX_PICTURE_BYTES, TornImageError, decode_with_colour
+from barsight.recording.image_decoding import MAX_PICTURE_BYTES, decode_with_colour
 
 LONGEST_PX = 2400
 MAX_PIXELS = 3_000_000

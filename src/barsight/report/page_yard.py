@@ -13,7 +13,8 @@ from barsight.core.arrays import Float64, UInt8
 from barsight.core.errors import InputError
 from barsight.core.reading.bounded_reading import read_bytes
 from barsight.core.reading.geotiff import REMEDY
-from barsight.recording.image_decoding import MAX_PICTURE_BYTES, TornImageError, decode_gray
+from barsight.core.records.gray_levels import TornImageError
+from barsight.recording.image_decoding import MAX_PICTURE_BYTES, decode_gray
 from barsight.report.map_images import Raster, paint_height, robust_range
 from barsight.report.page_maps import LARGE_TEXT, Drawing, Key, MapFigure, Shape, draw_map
 from barsight.yard.inventory.bundle_file import read_bundles

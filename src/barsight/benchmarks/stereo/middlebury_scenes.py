@@ -11,8 +11,9 @@ import numpy as np
 from barsight.core.arrays import Bool, Float32, UInt8
 from barsight.core.errors import InputError
 from barsight.core.records.disparity import DisparityRange
+from barsight.core.records.gray_levels import TornImageError
 from barsight.core.records.pairs import RectifiedPair
-from barsight.recording.image_decoding import TornImageError, decode_with_colour
+from barsight.recording.image_decoding import decode_with_colour
 from barsight.stereo.disparity_files import read_disparity
 from barsight.stereo.image_pair import pair_from_images
 

@@ -2,22 +2,42 @@
 
 from __future__ import annotations
 
+import operator
 from dataclasses import dataclass
 
+import numpy as np
+
 from barsight.core.arrays import Bool, Float64, Int64, UInt8, expect_shape
+from barsight.core.errors import InputError
+from barsight.core.records.gray_levels import TornImageError, to_gray
+
+PICTURE_REMEDY = "give uint8, as (image >> 4).astype(np.uint8) of 12 bits"
 
 
 @dataclass(frozen=True, eq=False)
 class StereoFrame:
-    """One raw pair. left, right: (H, W) uint8, cam0 and cam1. stamp_ns: cam0's clock."""
+    """One raw pair. left, right: (H, W) uint8, cam0 and cam1; others are converted as `to_gray` does.
+    stamp_ns: cam0's clock. Raises InputError for what can't be a pair.
+    """
 
     stamp_ns: int
     left: UInt8
     right: UInt8
 
     def __post_init__(self) -> None:
-        expect_shape("left", self.left, (None, None))
-        expect_shape("right", self.right, (None, None))
+        try:
+            object.__setattr__(self, "stamp_ns", operator.index(self.stamp_ns))
+            np.int64(self.stamp_ns)
+        except (TypeError, OverflowError):
+            problem = f"its stamp {self.stamp_ns!r} is no integer of 64 bits"
+            raise InputError("pair", problem, "give nanoseconds") from None
+        for name in ("left", "right"):
+            try:
+                object.__setattr__(self, name, to_gray(np.asarray(getattr(self, name))))
+            except TornImageError as error:
+                raise InputError(
+                    f"{name} picture of {self.stamp_ns} ns", str(error), PICTURE_REMEDY
+                ) from error
 
 
 @dataclass(frozen=True, eq=False)

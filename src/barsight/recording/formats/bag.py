@@ -22,6 +22,7 @@ from barsight.core.arrays import Float64, Int64, UInt8
 from barsight.core.errors import InputError
 from barsight.core.pose import Pose
 from barsight.core.reading.bounded_reading import in_range
+from barsight.core.records.gray_levels import TornImageError
 from barsight.core.records.pairs import RefusedFrame, StereoFrame
 from barsight.core.records.sensor_samples import CraneSamples, ImuSamples, LaserProfile
 from barsight.core.stamps import rows_not_later
@@ -31,7 +32,6 @@ from barsight.recording.formats.bag_images import file_of, gray_of
 from barsight.recording.formats.bag_laser import laser_rows
 from barsight.recording.formats.bag_setup import choose_topics, find_calibration
 from barsight.recording.formats.segments import SEGMENTS, SegmentFile
-from barsight.recording.image_decoding import TornImageError
 from barsight.recording.own_files import expect_own_files, file_digests
 from barsight.recording.pairing import PairedStamps, pair_cameras
 from barsight.recording.sensor_samples import laser_std, make_crane, make_imu, make_laser

@@ -9,15 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from barsight.core.arrays import UInt8
+from barsight.core.records.gray_levels import TornImageError, to_gray
 from barsight.recording.formats.bag_file import COMPRESSED_TYPE
-from barsight.recording.image_decoding import (
-    JPEG_SIGNATURE,
-    PNG_SIGNATURE,
-    TornImageError,
-    decode_gray,
-    expect_size,
-    to_gray,
-)
+from barsight.recording.image_decoding import JPEG_SIGNATURE, PNG_SIGNATURE, decode_gray, expect_size
 
 # encoding: (dtype, channels, conversion to BGR or gray, None if no conversion is needed)
 ENCODINGS: dict[str, tuple[type[np.generic], int, int | None]] = {

@@ -6,8 +6,8 @@ from collections.abc import Container, Iterator, Sequence
 from pathlib import Path
 
 from barsight.calibration.geometry.rig import StereoRig
+from barsight.core.records.gray_levels import TornImageError
 from barsight.core.records.pairs import RefusedFrame, StereoFrame
-from barsight.recording.image_decoding import TornImageError
 from barsight.recording.own_files import read_picture
 from barsight.recording.pairing import PairedAtOpening, decode_for
 from barsight.recording.stored_images import StoredImage, merge_cameras

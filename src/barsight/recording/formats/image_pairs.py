@@ -9,7 +9,8 @@ from pathlib import Path
 from barsight.core.arrays import UInt8
 from barsight.core.errors import InputError
 from barsight.core.reading.bounded_reading import read_bytes
-from barsight.recording.image_decoding import MAX_PICTURE_BYTES, TornImageError, decode_gray
+from barsight.core.records.gray_levels import TornImageError
+from barsight.recording.image_decoding import MAX_PICTURE_BYTES, decode_gray
 
 SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm"}
 FOLDERS = (

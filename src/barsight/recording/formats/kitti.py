@@ -26,11 +26,12 @@ from barsight.core.reading.bounded_reading import (
     read_lines,
     read_text,
 )
+from barsight.core.records.gray_levels import TornImageError
 from barsight.core.records.sensor_samples import CraneSamples, ImuSamples, LaserProfile
 from barsight.core.stamps import NS_PER_S, expect_increasing, seconds_in_ns
 from barsight.recording.base import RecordingSettings
 from barsight.recording.formats.image_folders import PictureFiles
-from barsight.recording.image_decoding import TornImageError, decode_gray
+from barsight.recording.image_decoding import decode_gray
 from barsight.recording.own_files import expect_own_files, file_digests, read_picture
 from barsight.recording.pairing import pair_cameras
 
