@@ -13,6 +13,7 @@ from barsight.acceptance.certificate import certificate_content, write_certifica
 from barsight.acceptance.quantities import judge_all
 from barsight.artefacts.plan import TouchDown
 from barsight.cli.main import run
+from barsight.core.errors import ConfigError
 from barsight.plant.state import offered_lift
 from barsight.store.confirmation import OpenLift
 from barsight.store.lift_records import find_gap, find_outlines
@@ -33,12 +34,16 @@ OFFSET = MagnetOffset(*HANGS_M.tolist(), 0.001, 0.002, 0.0015, "cal", "yard")
 
 
 def certificate(
-    folder: Path, rng: np.random.Generator, count: int = 6, offset: MagnetOffset | None = None
-) -> Path:
-    """A certificate with touch-downs that scatter by 2 mm, on spheres that are seen exactly."""
+    folder: Path, rng: np.random.Generator, count: int = 6, offset: MagnetOffset | None = None,
+    stray_m: float = 0.0,
+) -> Path:  # fmt: skip
+    """A certificate with touch-downs that scatter by 2 mm, on spheres that are seen exactly. stray_m: added
+    to the third's x.
+    """
     plan = replace(planned(), dummy_bundle=())
     tops = [np.array([s.x_m, s.y_m, s.z_m + s.diameter_m / 2]) for s in plan.sphere]
     read = [tops[k % len(tops)] - HANGS_M + rng.normal(0, 0.002, 3) for k in range(count)]
+    read[2:3] = [place + np.array([stray_m, 0, 0]) for place in read[2:3]]
     touched = tuple(
         TouchDown(f"touch {k}", plan.sphere[k % len(tops)].name, *place.tolist(), sigma_m=0.001)
         for k, place in enumerate(read)
@@ -155,12 +160,20 @@ def test_later_touch_downs_are_judged_with_the_offset(tmp_path: Path) -> None:
         assert other["uncertainty"]["sigma"] == pytest.approx(np.hypot(1.0, 1e3 * OFFSET.sigma_m[axis]))
 
 
-@pytest.mark.parametrize("what", ["few", "with an offset", "failed", "twice"])
+def test_a_touch_down_listed_under_two_names_counts_once() -> None:
+    plan = planned()
+    one = TouchDown("touch", plan.sphere[0].name, 1.0, 2.0, 3.0)
+    with pytest.raises(ConfigError, match="has the readings of another touch-down"):
+        replace(plan, touch_down=(one, replace(one, name="again")))
+
+
+@pytest.mark.parametrize("what", ["few", "with an offset", "failed", "twice", "stray"])
 def test_what_carries_no_offset_is_refused(
     what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rng = np.random.default_rng(8)
-    path = certificate(tmp_path, rng, 2 if what == "few" else 6, OFFSET if what == "with an offset" else None)
+    offset, stray_m = (OFFSET if what == "with an offset" else None), (0.04 if what == "stray" else 0.0)
+    path = certificate(tmp_path, rng, 2 if what == "few" else 6, offset, stray_m)
     if what == "failed":
         plan = replace(planned(), dummy_bundle=(), touch_down=())
         seen = observed(plan, off_by(baseline=0.02), rng)
@@ -173,6 +186,6 @@ def test_what_carries_no_offset_is_refused(
     else:
         code = calibrated(tmp_path, path)
     said = {"few": "3 are the least", "with an offset": "accept without --magnet", "failed": "isn't accepted",
-            "twice": "has an [offset] already"}  # fmt: skip
+            "twice": "has an [offset] already", "stray": "touch 2 lies"}  # fmt: skip
     assert code == 3 and said[what] in capsys.readouterr().err.replace("\n", " ")
     assert not (tmp_path / "again.toml").exists()

@@ -20,6 +20,7 @@ from barsight.core.arrays import Float64
 from barsight.core.errors import ConfigError, InputError, MeasurementError
 from barsight.core.pose import Pose, skew
 from barsight.core.reading.bounded_reading import in_range
+from barsight.registration.agreement import DOUBTFUL
 from barsight.registration.yard_file import YardFrame, read_yard_file
 from barsight.result_folder import open_folder, read_heights
 from barsight.yard.inventory.bundle_file import read_bundles
@@ -251,7 +252,7 @@ def _magnet_source(certificate: Path | None, assumed: list[str]) -> list[ErrorSo
     touches = {} if certificate is None else _touch_errors_m(certificate)
     sources = []
     for axis in "xyz":
-        errors = touches.get(axis, [])
+        errors = list(touches.get(axis, {}).values())
         if errors:
             mean = np.array([[float(np.mean(np.square(errors)))]])
             by = f"{len(errors)} touch-downs of {Path(str(certificate)).name}"
@@ -289,7 +290,7 @@ def touched_offset(certificate: Path) -> MagnetOffset:
         ids = str(content["calibration_id"]), str(content["yard_frame_id"])
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(certificate, f"is damaged ({type(error).__name__}: {error})", OTHER) from error
-    errors_m = [_mean_touch_m(certificate, axis, touches.get(axis, []), own_m) for axis in "xyz"]
+    errors_m = [_mean_touch_m(certificate, axis, touches.get(axis, {}), own_m) for axis in "xyz"]
     (x, x_sigma), (y, y_sigma), (z, z_sigma) = errors_m
     max_m = max(abs(x), abs(y), abs(z))
     if max_m > MAX_OFFSET_M:
@@ -314,29 +315,39 @@ def _expect_sound(certificate: Path, content: dict[str, Any]) -> None:
         raise InputError(certificate, f"its rig isn't accepted ({wrong[0]})", "mend the rig, then touch down")
 
 
-def _mean_touch_m(certificate: Path, axis: str, errors_m: list[float], own_m: float) -> tuple[float, float]:
+def _mean_touch_m(
+    certificate: Path, axis: str, errors_m: dict[str, float], own_m: float
+) -> tuple[float, float]:
     """Average the errors along one axis; also return the sigma of the mean. own_m: sigma of one reading."""
-    errors = np.array(errors_m)
+    errors = np.array(list(errors_m.values()))
     if len(errors) < MIN_TOUCHES:
         problem = f"has {len(errors)} touch-downs that tell {axis}, {MIN_TOUCHES} are the least"
         raise InputError(certificate, problem, "touch spheres or dummy bundles; a plate tells z only")
     if np.ptp(errors) > MAX_APART_M:
         problem = f"its touch-downs lie {1e3 * np.ptp(errors):.0f} mm apart along {axis}"
         raise InputError(certificate, problem, "touch down again, the magnet at rest")
+    far = int(np.abs(errors - np.median(errors)).argmax())
+    others = np.delete(errors, far)
+    off, scatter = abs(errors[far] - others.mean()), max(float(others.std(ddof=1)), own_m, 1e-5)
+    ratio = off / scatter / (1 + 1 / len(others)) ** 0.5
+    if len(errors) * 2 * student.sf(ratio, len(others) - 1) < DOUBTFUL:  # Grubbs' test
+        problem = f"{list(errors_m)[far]} lies {1e3 * off:.0f} mm from the other touch-downs along {axis}"
+        raise InputError(certificate, f"{problem}, which scatter by {1e3 * scatter:.1f} mm", "make it again")
     few = float(student.ppf((1 + COVERAGE) / 2, len(errors) - 1)) / 2
     sigma = few * max(float(errors.std(ddof=1)), own_m, 1e-5) / len(errors) ** 0.5
     return float(errors.mean()), sigma
 
 
-def _touch_errors_m(certificate: Path) -> dict[str, list[float]]:
-    """Read the errors (m) of the touch-downs by axis."""
-    found: dict[str, list[float]] = {}
+def _touch_errors_m(certificate: Path) -> dict[str, dict[str, float]]:
+    """Read the errors (m) of the touch-downs by axis and name."""
+    found: dict[str, dict[str, float]] = {}
     try:
         for row in read_certificate(certificate)["quantities"]:
             if row["group"] == "touch_mm" and row["error"] is not None:
-                found.setdefault(row["name"][-1:], []).append(1e-3 * float(row["error"]))
-    except (KeyError, TypeError, ValueError) as error:
+                name, _, axis = row["name"].rpartition(": ")
+                found.setdefault(axis, {})[name] = 1e-3 * float(row["error"])
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(certificate, f"is damaged ({type(error).__name__}: {error})", OTHER) from error
-    if not in_range([error for errors in found.values() for error in errors]).all():
+    if not in_range([error for errors in found.values() for error in errors.values()]).all():
         raise InputError(certificate, "has an impossible error", OTHER)
     return found

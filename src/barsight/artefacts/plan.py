@@ -241,6 +241,11 @@ class AcceptancePlan:
             self._expect_known(step.name, (step.lower, step.upper), self.plate)
         for touch in self.touch_down:
             self._expect_known(touch.name, (touch.on,), self.artefacts)
+        read = {(one.on, one.x_m, one.y_m, one.z_m): one.name for one in self.touch_down}
+        again = next((one for one in self.touch_down if one.name not in read.values()), None)
+        if again is not None:
+            problem = f"{again.name} has the readings of another touch-down on {again.on}"
+            raise ConfigError(f"plan: {problem}; list each touch-down once")
 
     def kinds(
         self,
