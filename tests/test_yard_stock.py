@@ -119,6 +119,11 @@ def test_csv_and_json_say_the_same(tmp_path: Path) -> None:
         ("name,x_m,y_m\nA,1,2\nA,3,2\n", "lists 'A' 2 times"),
         ("name,x_m,y_m,width_m\nA,1,2,-3\n", "width_m can't be '-3'"),
         ("name,x_m,y_m\nA,nan,2\n", "x_m can't be 'nan'"),
+        ("name,x_m,y_m\nA,1e300,2\n", "x_m can't be '1e300'"),
+        ("name,x_m,y_m\nB,1,2\nA,1,5,2,3\n", "bundle 2 has more fields than the header"),
+        ("name,x_m,y_m,x_m\nA,1,2,3\n", "has the column x_m twice"),
+        ("name,x_m,y_m,bars\nA,1,2,6.7\n", "bars can't be '6.7'"),
+        ("name;x_m;y_m\nA;1,5;2,3\n", "commas between, decimals with a point"),
     ],
 )
 def test_a_wrong_list_is_refused_in_one_line(tmp_path: Path, text: str, says: str) -> None:
@@ -127,6 +132,13 @@ def test_a_wrong_list_is_refused_in_one_line(tmp_path: Path, text: str, says: st
     with pytest.raises(InputError) as caught:
         read_stock(path)
     assert says in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_spreadsheets_list_is_read(tmp_path: Path) -> None:
+    """Byte order mark, capitals and spaces in the header, rows of nothing but commas."""
+    path = tmp_path / "stock.csv"
+    path.write_text("\ufeffName, X_m,y_m ,Bars\nA,1,2,7\n,,,\n", encoding="utf-8")
+    assert read_stock(path) == (ListedBundle("A", 1.0, 2.0, bars=7),)
 
 
 def test_a_missing_or_torn_list_is_refused(tmp_path: Path) -> None:
@@ -138,6 +150,10 @@ def test_a_missing_or_torn_list_is_refused(tmp_path: Path) -> None:
     (tmp_path / "number.json").write_text("3", encoding="utf-8")
     with pytest.raises(InputError, match="not a list of bundles"):
         read_stock(tmp_path / "number.json")
+    for text, says in (('"A", "x_m": true', "x_m can't be"), ('["A"], "x_m": 1', "has no name")):
+        (tmp_path / "kinds.json").write_text(f'[{{"name": {text}, "y_m": 2}}]', encoding="utf-8")
+        with pytest.raises(InputError, match=says):
+            read_stock(tmp_path / "kinds.json")
 
 
 def test_the_file_fits_its_schema_and_comes_back_whole(bundles: tuple[Bundle, ...], tmp_path: Path) -> None:

@@ -14,14 +14,15 @@ from scipy.optimize import linear_sum_assignment
 
 from barsight.core.arrays import Float64
 from barsight.core.errors import InputError
-from barsight.core.reading.bounded_reading import MAX_ENTRIES, read_json, read_lines
+from barsight.core.reading.bounded_reading import MAX_ENTRIES, in_range, read_json, read_lines
 from barsight.yard.stability.stability import turn_between
 from barsight.yard.types import Bundle
 
 _NEEDED = ("name", "x_m", "y_m")
 _OPTIONAL = ("top_z_m", "yaw_deg", "length_m", "width_m", "bar_diameter_m", "bars")
 _REMEDY = (
-    f"give a CSV with the columns {', '.join(_NEEDED)} (and any of {', '.join(_OPTIONAL)}), or JSON objects"
+    f"give a CSV with the columns {', '.join(_NEEDED)} (and any of {', '.join(_OPTIONAL)}), commas between, "
+    "decimals with a point, or JSON objects"
 )
 MAX_LISTED = 10_000
 """Maximum number of listed bundles: each one is compared with each bundle of the map."""
@@ -118,10 +119,17 @@ def stock_text(listed: tuple[ListedBundle, ...]) -> str:
 
 def _csv_rows(path: Path) -> list[dict[str, Any]]:
     reader = csv.DictReader(read_lines(path, MAX_ENTRIES, _REMEDY))
-    missing = [name for name in _NEEDED if name not in (reader.fieldnames or ())]
-    if missing:
-        raise InputError(path, f"has no column {missing[0]}", _REMEDY)
-    return [dict(row) for row in reader]
+    header = [name.strip().lower() for name in reader.fieldnames or ()]
+    for name in (*_NEEDED, *_OPTIONAL):
+        if header.count(name) > 1 or (name in _NEEDED and name not in header):
+            problem = f"has the column {name} twice" if name in header else f"has no column {name}"
+            raise InputError(path, problem, _REMEDY)
+    reader.fieldnames = header
+    rows = list[dict[str, Any]](reader)
+    long = next((number for number, row in enumerate(rows, start=1) if None in row), None)
+    if long is not None:
+        raise InputError(path, f"bundle {long} has more fields than the header", _REMEDY)
+    return [row for row in rows if any(row.values())]
 
 
 def _json_rows(path: Path) -> list[dict[str, Any]]:
@@ -146,10 +154,12 @@ def _expected(path: Path, number: int, row: dict[str, Any]) -> ListedBundle:
         except (TypeError, ValueError, OverflowError):
             value = float("nan")
         positive = key in ("length_m", "width_m", "bar_diameter_m", "bars")
-        if not np.isfinite(value) or (positive and value <= 0):
+        is_wrong = isinstance(text, bool) or (key == "bars" and value % 1 != 0)
+        if is_wrong or not in_range(value) or (positive and value <= 0):
             raise InputError(path, f"bundle {number}: {key} can't be {str(text)[:40]!r}", _REMEDY)
         figures[key] = value
-    name = str(row.get("name") or "").strip()
+    given = row.get("name")
+    name = str(given).strip() if isinstance(given, str | int) else ""
     if not name:
         raise InputError(path, f"bundle {number} has no name", _REMEDY)
     bars = figures.pop("bars")
