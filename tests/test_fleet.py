@@ -43,6 +43,7 @@ from barsight.fleet.versions import FleetTask, arguments, publish_version
 from barsight.fleet.window import RunWindow
 from barsight.measure_settings import MeasureSettings
 from barsight.store.audit import AuditChain, entry, verify_chain
+from barsight.store.confirmation import open_lifts
 from barsight.store.history import present_yard
 from barsight.store.opening import open_store
 from barsight.store.promotion import counts, promoted_version
@@ -263,16 +264,17 @@ def test_a_promoted_version_hides_the_other_survey_of_its_recording(tmp_path: Pa
             assert promoted_version(connection) == "" and isinstance(verify_chain(connection), AuditChain)
 
 
-def test_promoted_surveys_share_the_names_of_their_bundles(tmp_path: Path) -> None:
+def test_promoted_surveys_share_the_names_of_their_bundles_and_offer_nothing(tmp_path: Path) -> None:
     results = open_objects(str(tmp_path / "r"), create=True)
     tasks = [FleetTask(key * 32, key, (), VERSION, key, "archive") for key in "ab"]
     for task, stock, age_s in zip(tasks, (FIRST, SECOND), (3600.0, 60.0), strict=True):
-        survey(tmp_path / "surveys" / task.key, stock, age_s, with_lifts=False)
+        survey(tmp_path / "surveys" / task.key, stock, age_s)
         results.write(f"results/{task.key}/result.json", b"{}")
     with open_store(f"sqlite:///{tmp_path}/s.db", create=True) as store:
         assert promote(store, results, VERSION, tasks, tmp_path / "surveys", "ann", no_progress) == 2
         with store.reading() as connection:
             assert len(present_yard(connection)) == len(SECOND)
+            assert open_lifts(connection) == ()
 
 
 @pytest.mark.parametrize("now", [b"other", b"longer than it was", b""])

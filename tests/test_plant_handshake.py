@@ -22,9 +22,10 @@ from barsight.plant.handshake import LiftClaim
 from barsight.plant.settings import LiveSource
 from barsight.plant.state import PlantState
 from barsight.plant.steps import LiftReport, LiftSteps
-from barsight.store.audit import Entry
-from barsight.store.confirmation import begin_lift, confirm_lift, open_lifts
+from barsight.store.audit import Entry, entry
+from barsight.store.confirmation import begin_lift, confirm_lift, newest_survey, open_lifts
 from barsight.store.lift_records import add_lifts
+from barsight.store.tables import FLEET_SURVEYS, PROMOTIONS, SURVEYS
 from handshake_plant import Plant, make_template
 
 CRANES = integers(0, 1)
@@ -238,6 +239,38 @@ def test_a_map_begun_before_an_unrecorded_lift_was_told_offers_nothing(plant: Pl
     assert offered(plant).lift is None
     plant.survey(begun_s=20.1)
     assert offered(plant).lift is not None
+
+
+def promote_newest(plant: Plant) -> None:
+    """Switch to a fleet's version that measured the newest survey's recording anew."""
+    with entry(plant.store, "ann", "promote", plant.now_ns) as opened:
+        old = newest_survey(opened.connection)
+        assert old is not None
+        columns = {name: value for name, value in old._mapping.items() if name != "id"}
+        opened.add(SURVEYS, **columns | {"map_id": "anew", "heights": b""})
+        opened.add(FLEET_SURVEYS, version="v", map_id="anew", is_own=True)
+        opened.add(PROMOTIONS, version="v", who="ann", at_ns=opened.at_ns)
+
+
+def test_a_lift_stays_begun_if_its_recording_is_measured_anew_and_promoted(plant: Plant) -> None:
+    claim = claimed(plant)
+    plant.now_s = 10.0
+    plant.steps.executing(claim.token)
+    promote_newest(plant)
+    assert offered(plant).reasons[0].startswith(f"unfinished: lift {claim.lift_id} has begun")
+    plant.survey(begun_s=9.0, offset_m=100.0)
+    state = offered(plant)
+    assert not state.is_valid and state.lift is not None and state.lift.lift_id == claim.lift_id
+    assert ranks_offered(plant) == [2, 3, 4, 5, 6]
+    assert plant.steps.executed(claim.token, DID) == "unweighed"
+
+
+def test_a_claim_ends_if_its_recording_is_measured_anew_and_promoted(plant: Plant) -> None:
+    claim = claimed(plant)
+    promote_newest(plant)
+    assert isinstance(plant.steps.executing(claim.token), Failed)
+    assert isinstance(plant.steps.executed(claim.token, DID), Failed)
+    assert [one.code for one in offered(plant).alarms] == ["lift-unrecorded"]
 
 
 @pytest.mark.parametrize("end", ["executed", "failed"])

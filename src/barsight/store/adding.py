@@ -144,7 +144,7 @@ def add_survey(
         settle_lifts(opened, changes | absences, read.from_ns, is_newest=is_newest)
         is_valid = _note_equipment(opened, read, survey_id, (rig, crane))
         if read.lifts is not None:
-            is_sound = is_valid and not _note_looking_back(opened, read, survey_id)
+            is_sound = is_valid and not _note_looking_back(opened, read, survey_id, version)
             add_lifts(opened, survey_id, read.lifts, ids, is_newest=is_newest and is_sound)
             if is_newest:
                 end_disturbed(opened, read.from_ns)
@@ -294,11 +294,12 @@ def _note_equipment(
     return not reason
 
 
-def _note_looking_back(opened: Entry, read: MeasuredSurvey, survey_id: int) -> bool:
-    """Return True, and forbid the lifts, if a measured yard's lifts were judged as of its last frame: their
-    age was not compared with a clock. A simulated yard's clock continues from that frame.
+def _note_looking_back(opened: Entry, read: MeasuredSurvey, survey_id: int, version: str | None) -> bool:
+    """Return True, and forbid the lifts, if they were judged as of the last frame, as those of a fleet's
+    version are: their age was not compared with a clock. A simulated yard's clock continues from that frame.
     """
-    if read.lifts is None or not read.lifts["looks_back"] or read.identity.is_simulated:
+    looks_back = read.lifts is not None and read.lifts["looks_back"] and not read.identity.is_simulated
+    if version is None and not looks_back:
         return False
     reason = "its lifts were judged at the time of the last frame, for review only, never for a crane"
     opened.add(SURVEY_VETOES, survey_id=survey_id, code="map-too-old", reason=reason)

@@ -77,7 +77,10 @@ def yard_clock_ns(connection: Connection, now_ns: int | None = None) -> int:
 
 
 def open_lifts(connection: Connection) -> tuple[OpenLift, ...]:
-    """List the offered, claimed or executing lifts in the order of their ids."""
+    """List the offered, claimed or executing lifts in the order of their ids.
+
+    Those of surveys that don't count are among them: whatever a fleet promotes, a crane may hold their load.
+    """
     return _lifts(connection, _open_query())
 
 
@@ -100,7 +103,7 @@ def _lift_query(which: ColumnElement[bool]) -> Select[Any]:
             LIFT_STATES,
             (LIFT_STATES.c.lift_id == LIFTS.c.id) & (LIFT_STATES.c.step == newest.c.step),
         )
-        .where(which, counts())
+        .where(which)
         .order_by(LIFTS.c.id)
     )
 
