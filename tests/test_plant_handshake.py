@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -16,6 +17,7 @@ from hypothesis.strategies import booleans, integers, sampled_from
 
 pytest.importorskip("sqlalchemy")
 
+from barsight.core import wall_clock
 from barsight.core.errors import Failed, InputError
 from barsight.plant.feed import read_state
 from barsight.plant.handshake import LiftClaim
@@ -23,10 +25,10 @@ from barsight.plant.settings import LiveSource
 from barsight.plant.state import PlantState
 from barsight.plant.steps import LiftReport, LiftSteps
 from barsight.store.audit import Entry, entry
-from barsight.store.confirmation import begin_lift, confirm_lift, newest_survey, open_lifts
+from barsight.store.confirmation import begin_lift, confirm_lift, expire_stale, newest_survey, open_lifts
 from barsight.store.lift_records import add_lifts
 from barsight.store.tables import FLEET_SURVEYS, PROMOTIONS, SURVEYS
-from handshake_plant import Plant, make_template
+from handshake_plant import LIFTS, Plant, make_template
 
 CRANES = integers(0, 1)
 FAULTS = sampled_from(["", "", "", "before", "after", "locked"])
@@ -239,6 +241,28 @@ def test_a_map_begun_before_an_unrecorded_lift_was_told_offers_nothing(plant: Pl
     assert offered(plant).lift is None
     plant.survey(begun_s=20.1)
     assert offered(plant).lift is not None
+
+
+def test_a_clock_that_is_set_back_makes_no_offer_last_longer(
+    plant: Plant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def set_to(ahead_s: float) -> int:
+        clock = SimpleNamespace(time_ns=lambda: round((10_000 + ahead_s) * 1e9), monotonic_ns=lambda: 0)
+        monkeypatch.setattr(wall_clock, "time", clock)
+        return expire_stale(plant.store, "test")
+
+    set_to(0.0)
+    plant.survey()
+    claim = claimed(plant)
+    assert [set_to(at_s) for at_s in (-0.9, 3600.0, 3599.1)] == [0, 0, 0]
+    assert set_to(3590.0) == LIFTS and offered(plant).lift is None
+    assert isinstance(plant.steps.executing(claim.token), Failed)
+    plant.survey()
+    claim = claimed(plant)
+    assert plant.steps.executing(claim.token) == claim.token
+    set_to(-3600.0)
+    assert plant.states_of(claim.lift_id)[-1] == "executing"
+    assert plant.steps.executed(claim.token, DID) == "unweighed"
 
 
 def promote_newest(plant: Plant) -> None:

@@ -270,15 +270,19 @@ def forbid(store: Store, code: str, reason: str, who: str) -> None:
 
 
 def expire_stale(store: Store, who: str) -> int:
-    """End offers and confirmations with an outdated map or an invalid calibration; return their number."""
+    """End offers and confirmations with an outdated map or an invalid calibration, and all if this computer's
+    clock was set back; return their number.
+    """
+    set_back_s, stale = store.clock.look(), {}
     with store.reading() as connection:
         clock_ns = yard_clock_ns(connection)
-        if not _stale(connection, clock_ns):
-            return 0
-    with entry(store, who, "lifts expired", clock_ns) as opened:
-        stale = _stale(opened.connection, clock_ns)
-        for lift_id, reason in stale.items():
-            step_lift(opened, lift_id, "expired", reason)
+        is_due = bool(_stale(connection, clock_ns, set_back_s))
+    if is_due:
+        with entry(store, who, "lifts expired", clock_ns) as opened:
+            stale = _stale(opened.connection, clock_ns, set_back_s)
+            for lift_id, reason in stale.items():
+                step_lift(opened, lift_id, "expired", reason)
+    store.clock.settle()
     return len(stale)
 
 
@@ -318,8 +322,8 @@ def _change(store: Store, lift_id: int, who: str, what: str, step: Callable[[Ent
         step(opened, found[lift_id])
 
 
-def _stale(connection: Connection, clock_ns: int) -> dict[int, str]:
-    """Return why offers and confirmations are no longer valid, by id."""
+def _stale(connection: Connection, clock_ns: int, set_back_s: float = 0.0) -> dict[int, str]:
+    """Return why offers and confirmations are no longer valid, by id. set_back_s: `WallClock.set_back_s`."""
     newest = newest_survey(connection)
     reasons = {}
     reason = "" if newest is None else why_invalid(connection, newest.calibration_id, clock_ns)
@@ -329,6 +333,9 @@ def _stale(connection: Connection, clock_ns: int) -> dict[int, str]:
             continue
         if newest is not None and lift.survey_id != newest.id:
             reasons[lift.lift_id] = "expired: a newer map came"
+        elif set_back_s:
+            back = f"this computer's clock was set back by {set_back_s:.0f} s: the age can't be told"
+            reasons[lift.lift_id] = f"expired: map-too-old: {back}"
         elif until_ns is None or until_ns < clock_ns:
             reasons[lift.lift_id] = "expired: map-too-old: it was valid for a limited time"
         elif is_ahead(lift.record.get("valid_from_ns"), clock_ns):

@@ -5,13 +5,14 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from barsight.core.errors import ConfigError, InputError, OutputError
 from barsight.core.extras import extra
 from barsight.core.files import atomic_path
+from barsight.core.wall_clock import WallClock
 from barsight.store.tables import METADATA
 
 with extra("store"):
@@ -34,10 +35,13 @@ _LOCK = 0x62617273
 
 @dataclass(frozen=True)
 class Store:
-    """An open store. engine: the SQLAlchemy engine. name: its URL without the password."""
+    """An open store. engine: the SQLAlchemy engine. name: its URL without the password. clock: by which the
+    ages of its lifts are told.
+    """
 
     engine: Engine
     name: str
+    clock: WallClock = field(default_factory=WallClock)
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
