@@ -204,6 +204,23 @@ def test_a_folder_that_is_not_empty_is_refused(
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 
+def test_an_ended_run_does_not_say_that_lifts_stand(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A second Ctrl-C, for one; state.json is all that programs of others know."""
+
+    def interrupted(self: Supervisor) -> None:
+        self.state.phase, self.state.mode = "measuring", Mode("full", (), True)
+        self._write(health=False)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Supervisor, "run", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        replay(whole, tmp_path / "out", SETTINGS, LiveSettings(), tell=lambda _: None)
+    state = json.loads((tmp_path / "out" / "state.json").read_text())
+    assert state["phase"] == "failed" and not state["lifts"]["may_stand"]
+
+
 def test_keyframes_come_back_and_torn_ones_are_refused(tmp_path: Path) -> None:
     kept = Keyframes((1, 2), Mode("blind", ("why",), False))
     write_keyframes(kept, tmp_path / "keyframes.json")

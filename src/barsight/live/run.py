@@ -136,6 +136,12 @@ class LiveRun:
                 if given is not None:
                     supervisor.state.mode = given.mode
                 return _finish(supervisor, link, board, self._recording, self._asked, request, advance)
+        except BaseException:
+            if supervisor is not None:
+                supervisor.end_map(at_once=True)
+                shutil.rmtree(folder, ignore_errors=True)  # leaves space for the state on a full disk
+                supervisor.fail()
+            raise
         finally:
             if supervisor is not None:
                 supervisor.end_map(at_once=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import signal
@@ -84,7 +85,8 @@ def run_process(role: str, link: Link) -> None:
     try:
         PROCESSES[role](link)
     except Exception as error:
-        reason.write_text(f"{type(error).__name__}: {error}", encoding="utf-8")
+        with contextlib.suppress(OSError):  # the disk may be full, of which the command tells
+            reason.write_text(f"{type(error).__name__}: {error}", encoding="utf-8")
         if not isinstance(error, BarsightError):
             traceback.print_exc()
         sys.exit(1)
@@ -135,6 +137,12 @@ class Supervisor:
         """Request the end of the run. An interruption counts even if it is already ending: no run follows."""
         if not self.stop_because or because == INTERRUPTED:
             self.stop_because = because
+
+    def fail(self) -> None:
+        """Report, if it can be written, that the run ended without a result."""
+        self.state.phase = "failed"
+        with contextlib.suppress(BarsightError):
+            write_state(self.state, self._board, self._out)
 
     def final_mode(self) -> Mode:
         """Judge the mode at the last picture, independently of the processes' pace."""
