@@ -143,6 +143,29 @@ def test_the_yards_clock_goes_on_while_nothing_changes(
     assert abs(later["clock_ns"] - first["clock_ns"] - later_ns) < 2 * NS_PER_S
 
 
+@pytest.mark.parametrize(
+    ("method", "path", "content", "wanted"),
+    [
+        ("GET", f"/api/yard?at_ns={2**63}", "", "query.at_ns: "),
+        ("GET", f"/api/stock.csv?at_ns=-{2**70}", "", "query.at_ns: "),
+        ("GET", "/api/bundles/B\u00b2", "", "there is no bundle B"),
+        ("POST", f"/api/lifts/{2**31}/taken", "", "path.lift_id: "),
+        ("POST", f"/api/alarms/{2**70}/clear", "{}", "path.alarm_id: "),
+        ("POST", "/api/lifts/1/confirm", '{"map_id": "\\ud800"}', "body.map_id: "),
+        ("POST", "/api/session", '{"name": "ann", "password": "\\ud800"}', "body.password: "),
+        ("POST", "/api/vetoes", '{"code": "\\ud800", "reason": "x"}', "body.code: "),
+        ("POST", "/api/alarms", '{"code": "a", "reason": "x\\u0000"}', "body.reason: "),
+    ],
+)
+def test_what_no_store_can_hold_is_refused_in_one_line(
+    local: httpx.Client, method: str, path: str, content: str, wanted: str
+) -> None:
+    answer = local.request(
+        method, path, content=content.encode(), headers={"Content-Type": "application/json"}
+    )
+    assert answer.status_code in (404, 422) and answer.json()["problem"].startswith(wanted)
+
+
 def test_how_far_an_open_end_may_lie_is_told_by_bars_alike() -> None:
     bar = {"bar_diameter_m": 0.05, "width_m": 0.3, "length_m": 6.0, "ends_open": [False, False]}
     cut = bar | {"length_m": 5.2, "ends_open": [False, True]}
@@ -375,6 +398,7 @@ def test_other_pages_and_names_are_refused(local: httpx.Client) -> None:
     assert local.get("/api/state", headers={"Origin": "https://evil.example"}).status_code == 403
     assert local.get("/api/state", headers={"Origin": "null"}).status_code == 403
     assert local.get("/api/state", headers={"Origin": f"http://localhost:{port}"}).status_code == 200
+    assert local.get("/api/surveys/a%00/files/result.json").status_code == 403
     lift = offered(local)[0]
     body = {"map_id": lift["map_id"]}
     wrong = {"X-Barsight-Token": "guessed"}

@@ -16,16 +16,24 @@ pytest.importorskip("sqlalchemy")
 
 from sqlalchemy import func, select
 
+from barsight.core.errors import Failed
 from barsight.plant.feed import StateFeed
 from barsight.plant.serving import TelegramServer
 from barsight.plant.settings import PlantSettings, StoreSource, TelegramSettings
-from barsight.plant.steps import LiftSteps
+from barsight.plant.steps import LiftReport, LiftSteps
 from barsight.store.opening import Store, open_store
 from barsight.store.tables import AUDIT
 from opcua_servers import PASSWORD, node_package, opcua_plant
 from plant_commands import IN, yard_store
 
 AT_ONCE = 20
+
+
+def test_a_number_beyond_the_store_s_ids_names_no_lift(store: Store) -> None:
+    """PostgreSQL fails on it: it would end all links."""
+    steps, report = LiftSteps(store, PlantSettings()), LiftReport(True, False, None)
+    for told in (steps.executed(1, report, 2**32 - 1), steps.failed(1, "no", 2**31)):
+        assert isinstance(told, Failed) and told.code == "token"
 
 
 def senseless(draw: random.Random) -> bytes:

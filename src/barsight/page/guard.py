@@ -61,6 +61,8 @@ class Guard:
             return "this server is not called that"
         if not set(given(b"origin")) <= self._origins:
             return "another page's request is refused"
+        if "\0" in scope["path"]:
+            return "no name has the character NUL"  # which PostgreSQL doesn't take
         lengths = given(b"content-length")
         if lengths and not (lengths[0].isdigit() and int(lengths[0]) <= MAX_BODY_BYTES):
             return "the request is too long"

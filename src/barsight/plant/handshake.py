@@ -11,7 +11,7 @@ from barsight.core.extras import extra
 from barsight.plant.state import OfferedLift
 from barsight.store.confirmation import LateReportError, begin_lift, confirm_lift, end_lift, take_lift
 from barsight.store.opening import Store
-from barsight.store.tables import LIFT_STATES, LIFTS
+from barsight.store.tables import LIFT_STATES, LIFTS, MAX_ID
 
 with extra("store"):
     from sqlalchemy import Row, select
@@ -52,6 +52,8 @@ def claim_lift(store: Store, lift: OfferedLift, who: str) -> LiftClaim | Failed:
 
 def claim_of(store: Store, lift_id: int) -> LiftClaim | None:
     """Find the claim of a lift, whatever state followed it; a lift is claimed only once."""
+    if lift_id > MAX_ID:
+        return None
     with store.reading() as connection:
         query = select(LIFT_STATES).where(LIFT_STATES.c.lift_id == lift_id, LIFT_STATES.c.state == "claimed")
         row = connection.execute(query).first()

@@ -23,6 +23,8 @@ with extra("store"):
     )  # fmt: skip
 
 METADATA = MetaData()
+MAX_ID = 2**31 - 1
+"""Largest id; a query for a larger one is an error in PostgreSQL."""
 
 
 def _figures(*names: str) -> list[Column[float]]:

@@ -22,6 +22,7 @@ with extra("page"):
     import asyncio
 
     from fastapi import FastAPI, Request
+    from fastapi.exceptions import RequestValidationError
     from fastapi.responses import JSONResponse, Response
 
 STATIC = files("barsight.page") / "static"
@@ -71,6 +72,13 @@ def _add_errors(app: FastAPI) -> None:
             if error.wait_s:
                 headers["Retry-After"] = str(int(error.wait_s) + 1)
         return JSONResponse({"problem": str(error)}, status, headers)
+
+    @app.exception_handler(RequestValidationError)
+    async def tell_form(_: Request, error: RequestValidationError) -> JSONResponse:
+        """Name the wrong value without repeating it."""
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        return JSONResponse({"problem": ascii(f"{place}: {first['msg']}")[1:-1]}, 422)
 
 
 def _add_page(app: FastAPI) -> None:

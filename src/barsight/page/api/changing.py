@@ -16,6 +16,7 @@ from barsight.page.api.forms import (
     DecisionForm,
     EndForm,
     NoteForm,
+    Number,
     VetoForm,
 )
 from barsight.page.watch import StoreWatch
@@ -40,17 +41,17 @@ def add_lifts(app: FastAPI, watch: StoreWatch, access: Access) -> None:
         return {"revision": watch.published.revision}
 
     @app.post("/api/lifts/{lift_id}/confirm")
-    def confirm(lift_id: int, form: ConfirmForm, caller: Caller = operate) -> dict[str, int]:
+    def confirm(lift_id: Number, form: ConfirmForm, caller: Caller = operate) -> dict[str, int]:
         who = signature(caller, form.name)
         watch.judge()
         return done(lambda: confirm_lift(watch.store, lift_id, form.map_id, who))
 
     @app.post("/api/lifts/{lift_id}/taken")
-    def taken(lift_id: int, caller: Caller = execute) -> dict[str, int]:
+    def taken(lift_id: Number, caller: Caller = execute) -> dict[str, int]:
         return done(lambda: take_lift(watch.store, lift_id, signature(caller)))
 
     @app.post("/api/lifts/{lift_id}/end")
-    def end(lift_id: int, form: EndForm, caller: Caller = execute) -> dict[str, int]:
+    def end(lift_id: Number, form: EndForm, caller: Caller = execute) -> dict[str, int]:
         return done(lambda: end_lift(watch.store, lift_id, form.state, signature(caller), form.note))
 
     @app.post("/api/vetoes")
@@ -85,14 +86,14 @@ def add_alarms(app: FastAPI, watch: StoreWatch, access: Access) -> None:
         )
 
     @app.post("/api/alarms/{alarm_id}/acknowledge")
-    def acknowledge(alarm_id: int, form: NoteForm, caller: Caller = operate) -> dict[str, int]:
+    def acknowledge(alarm_id: Number, form: NoteForm, caller: Caller = operate) -> dict[str, int]:
         return change(
             signature(caller), f"alarm {alarm_id} acknowledged",
             lambda opened: acknowledge_alarm(opened, alarm_id, form.note or None),
         )  # fmt: skip
 
     @app.post("/api/alarms/{alarm_id}/clear")
-    def clear(alarm_id: int, form: NoteForm, caller: Caller = report) -> dict[str, int]:
+    def clear(alarm_id: Number, form: NoteForm, caller: Caller = report) -> dict[str, int]:
         return change(
             signature(caller), f"alarm {alarm_id} cleared",
             lambda opened: step_alarm(opened, alarm_id, "cleared", form.note or None),

@@ -9,7 +9,7 @@ from barsight.core.extras import extra
 from barsight.core.json_values import json_value
 from barsight.page.access import Access, AccessError, Caller
 from barsight.page.api.callers import need
-from barsight.page.api.forms import TargetsForm
+from barsight.page.api.forms import Stamp, TargetsForm
 from barsight.page.documents import bundle_history, bundle_records
 from barsight.page.layers import Kind, PaintedLayers, find_layers
 from barsight.page.model import survey_model
@@ -67,7 +67,7 @@ def add_reading(app: FastAPI, watch: StoreWatch, access: Access) -> None:
         return json_value(found)
 
     @app.get("/api/yard")
-    def yard(at_ns: int, _: Caller = reader) -> Any:
+    def yard(at_ns: Stamp, _: Caller = reader) -> Any:
         with watch.store.reading() as connection:
             layers = [one.content() for one in find_layers(connection, at_ns)]
             return json_value(
@@ -75,14 +75,14 @@ def add_reading(app: FastAPI, watch: StoreWatch, access: Access) -> None:
             )
 
     @app.get("/api/stock.csv")
-    def stock_list(_: Caller = reader, at_ns: int | None = None) -> Response:
+    def stock_list(_: Caller = reader, at_ns: Stamp | None = None) -> Response:
         with watch.store.reading() as connection:
             text = stock_text(listed_bundles(present_yard(connection, at_ns)))
         headers = {"content-disposition": "attachment; filename=stock.csv"}
         return Response(text, media_type="text/csv", headers=headers)
 
     @app.get("/api/compare")
-    def compare(before_ns: int, after_ns: int, _: Caller = reader) -> Any:
+    def compare(before_ns: Stamp, after_ns: Stamp, _: Caller = reader) -> Any:
         with watch.store.reading() as connection:
             return json_value({"changes": yard_changes(connection, before_ns, after_ns)})
 
@@ -93,7 +93,7 @@ def add_files(app: FastAPI, watch: StoreWatch, access: Access) -> None:
     reader = need(access, "read")
 
     @app.get("/api/layers/{map_id}.png")
-    def layer(map_id: str, _: Caller = reader, kind: Kind = "photo", at_ns: int | None = None) -> Response:
+    def layer(map_id: str, _: Caller = reader, kind: Kind = "photo", at_ns: Stamp | None = None) -> Response:
         layers = watch.published.layers
         if at_ns is not None:
             with watch.store.reading() as connection:
@@ -158,4 +158,6 @@ def add_targets(app: FastAPI, watch: StoreWatch, access: Access) -> None:
 
 def identity_number(name: str) -> int:
     """Read a bundle's number from its name; 0, which no bundle has, for an invalid name."""
-    return int(name[1:]) if name[:1] == "B" and name[1:].isdigit() and len(name) < 10 else 0
+    return (
+        int(name[1:]) if name[:1] == "B" and name[1:].isdigit() and name.isascii() and len(name) < 10 else 0
+    )

@@ -14,8 +14,7 @@ async function call(method, path, body) {
   const content = await answer.json().catch(() => ({}));
   if (!answer.ok) {
     if (answer.status === 401) session.isKnown = false;
-    const detail = Array.isArray(content.detail) ? content.detail.map((one) => one.msg).join("; ") : content.detail;
-    throw new Refused(answer.status, content.problem || detail || answer.statusText);
+    throw new Refused(answer.status, content.problem || content.detail || answer.statusText);
   }
   return content;
 }
