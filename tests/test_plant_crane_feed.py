@@ -15,13 +15,12 @@ from barsight.core.errors import Failed
 from barsight.plant import feed as feed_module
 from barsight.plant.crane_names import is_crane
 from barsight.plant.feed import StateFeed
-from barsight.plant.handshake import LiftClaim
+from barsight.plant.handshake import LiftClaim, expire_claims
 from barsight.plant.partner import PlcPartner
 from barsight.plant.settings import LiveSource, PlantCrane, PlantSettings, StoreSource
 from barsight.plant.steps import LiftSteps
 from barsight.plant.telegram import out_values, unpack
 from barsight.store import confirmation
-from barsight.store.confirmation import expire_claims
 from barsight.store.opening import Store, open_store
 from barsight.store.states import lift_state
 from plant_commands import IN, yard_store

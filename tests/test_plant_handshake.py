@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
@@ -263,6 +264,24 @@ def test_a_clock_that_is_set_back_makes_no_offer_last_longer(
     set_to(-3600.0)
     assert plant.states_of(claim.lift_id)[-1] == "executing"
     assert plant.steps.executed(claim.token, DID) == "unweighed"
+
+
+def test_a_lift_is_not_offered_again_by_a_backup_from_before_it(plant: Plant, tmp_path: Path) -> None:
+    path = tmp_path / "plant" / "yard.db"
+    backup = shutil.copy(path, tmp_path / "backup.db")
+    claim = claimed(plant)
+    assert plant.steps.executing(claim.token) == claim.token
+    assert plant.steps.executed(claim.token, DID) == "unweighed"
+    assert expire_stale(plant.store, "test") == 0
+    shutil.copyfile(backup, path)
+    assert isinstance(plant.steps.claim("crane", claim.lift_id), Failed)
+    expire_stale(plant.store, "test")
+    state = offered(plant)
+    assert state.lift is None and [one.code for one in state.alarms] == ["lift-unrecorded"]
+    plant.survey(begun_s=plant.now_s - 1.0)
+    assert offered(plant).lift is None, "a map that was begun before offers nothing"
+    plant.survey(begun_s=plant.now_s + 1.0)
+    assert offered(plant).lift is not None
 
 
 def promote_newest(plant: Plant) -> None:

@@ -12,11 +12,12 @@ from typing import Protocol
 from barsight.core.errors import BarsightError
 from barsight.core.reading.live_run import CranePose
 from barsight.plant.crane_names import is_crane
+from barsight.plant.handshake import expire_claims
 from barsight.plant.link_settings import MAX_AGE_S
 from barsight.plant.live_folder import with_live_run
 from barsight.plant.settings import PlantSettings
 from barsight.plant.state import PlantState, PlcReading, state_of_store
-from barsight.store.confirmation import expire_claims, expire_stale
+from barsight.store.confirmation import expire_stale
 from barsight.store.opening import Store
 
 READ_EVERY_S = 0.1

@@ -4,17 +4,28 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from barsight.core.errors import BarsightError, Failed, InputError
 from barsight.core.extras import extra
 from barsight.plant.state import OfferedLift
-from barsight.store.confirmation import LateReportError, begin_lift, confirm_lift, end_lift, take_lift
+from barsight.store.audit import entry
+from barsight.store.confirmation import (
+    LateReportError,
+    begin_lift,
+    confirm_lift,
+    end_lift,
+    open_lifts,
+    take_lift,
+    yard_clock_ns,
+)  # fmt: skip
 from barsight.store.opening import Store
+from barsight.store.states import step_lift
 from barsight.store.tables import LIFT_STATES, LIFTS, MAX_ID
 
 with extra("store"):
-    from sqlalchemy import Row, select
+    from sqlalchemy import Connection, Row, select
 
 LOAD_SIGMAS = 3.0
 """Largest difference between the weighed load and the predicted mass, in standard deviations of that mass;
@@ -127,3 +138,25 @@ def report_failed(store: Store, claim: LiftClaim, note: str) -> str | Failed:
             raise
         return Failed("refused", str(error))
     return "failed"
+
+
+def expire_claims(store: Store, who: str, claim_s: float, is_of: Callable[[str], bool]) -> int:
+    """End overdue claims by those for whose names `is_of` returns True; return their number."""
+    with store.reading() as connection:
+        clock_ns = yard_clock_ns(connection)
+        before_ns = clock_ns - round(claim_s * 1e9)
+        if not _overdue(connection, before_ns, is_of):
+            return 0
+    with entry(store, who, "claims expired", clock_ns) as opened:
+        overdue = _overdue(opened.connection, before_ns, is_of)
+        for lift_id in overdue:
+            step_lift(opened, lift_id, "expired", f"it was claimed and not begun within {claim_s:g} s")
+    return len(overdue)
+
+
+def _overdue(connection: Connection, before_ns: int, is_of: Callable[[str], bool]) -> list[int]:
+    claimed = [lift.lift_id for lift in open_lifts(connection) if lift.state == "claimed"]
+    rows = connection.execute(
+        select(LIFT_STATES).where(LIFT_STATES.c.lift_id.in_(claimed), LIFT_STATES.c.state == "claimed")
+    ).all()
+    return [row.lift_id for row in rows if row.at_ns < before_ns and is_of(row.who)]

@@ -80,6 +80,18 @@ def _append(opened: Entry, what: str) -> None:
     opened.connection.execute(insert(AUDIT).values(**row, digest=_digest(row)))
 
 
+def newest_entry(connection: Connection) -> tuple[int, str]:
+    """Return id and digest of the newest row of the log, (0, "") if there is none."""
+    row = connection.execute(select(AUDIT.c.id, AUDIT.c.digest).order_by(AUDIT.c.id.desc()).limit(1)).first()
+    return (0, "") if row is None else (int(row.id), str(row.digest))
+
+
+def has_entry(connection: Connection, seen: tuple[int, str]) -> bool:
+    """Check that the log still has a row, given by id and digest; (0, "") it always has."""
+    digest = connection.execute(select(AUDIT.c.digest).where(AUDIT.c.id == seen[0])).scalar()
+    return seen == (0, "") or digest == seen[1]
+
+
 def verify_chain(connection: Connection) -> AuditChain | Failed:
     """Verify the log from its first row: each digest, the link to the row before, and the rows it covers.
 

@@ -12,7 +12,7 @@ from typing import Any
 from barsight.core.arrays import Float64
 from barsight.core.errors import ConfigError, InputError
 from barsight.core.extras import extra
-from barsight.store.audit import Entry, entry
+from barsight.store.audit import Entry, entry, has_entry, newest_entry
 from barsight.store.calibrations import why_invalid
 from barsight.store.lift_records import find_gap, find_outlines
 from barsight.store.opening import Store
@@ -271,8 +271,9 @@ def forbid(store: Store, code: str, reason: str, who: str) -> None:
 
 def expire_stale(store: Store, who: str) -> int:
     """End offers and confirmations with an outdated map or an invalid calibration, and all if this computer's
-    clock was set back; return their number.
+    clock or the store was set back; return their number, without those that end with the store's state.
     """
+    _end_lost(store, who)
     set_back_s, stale = store.clock.look(), {}
     with store.reading() as connection:
         clock_ns = yard_clock_ns(connection)
@@ -286,26 +287,20 @@ def expire_stale(store: Store, who: str) -> int:
     return len(stale)
 
 
-def expire_claims(store: Store, who: str, claim_s: float, is_of: Callable[[str], bool]) -> int:
-    """End overdue claims by those for whose names `is_of` returns True; return their number."""
+def _end_lost(store: Store, who: str) -> None:
+    """End all offers, and raise an alarm, if the log lacks a row that this process has seen: a backup, or a
+    server that lagged behind, took the store's place, and lifts that were made since are offered again.
+    """
+    seen = store.log.newest  # before the transaction, which then must have it
     with store.reading() as connection:
+        newest, is_whole = newest_entry(connection), has_entry(connection, seen)
         clock_ns = yard_clock_ns(connection)
-        before_ns = clock_ns - round(claim_s * 1e9)
-        if not _overdue(connection, before_ns, is_of):
-            return 0
-    with entry(store, who, "claims expired", clock_ns) as opened:
-        overdue = _overdue(opened.connection, before_ns, is_of)
-        for lift_id in overdue:
-            step_lift(opened, lift_id, "expired", f"it was claimed and not begun within {claim_s:g} s")
-    return len(overdue)
-
-
-def _overdue(connection: Connection, before_ns: int, is_of: Callable[[str], bool]) -> list[int]:
-    claimed = [lift.lift_id for lift in open_lifts(connection) if lift.state == "claimed"]
-    rows = connection.execute(
-        select(LIFT_STATES).where(LIFT_STATES.c.lift_id.in_(claimed), LIFT_STATES.c.state == "claimed")
-    ).all()
-    return [row.lift_id for row in rows if row.at_ns < before_ns and is_of(row.who)]
+    if not is_whole:
+        with entry(store, who, "store set back", clock_ns) as opened:
+            lost = f"the store was set back, row {seen[0]} of its log is gone: survey before the next lift"
+            raise_alarm(opened, "lift-unrecorded", lost)
+            _end_offers(opened, "disturbed: the store was set back, which lifts were made isn't known")
+    store.log.newest = newest
 
 
 def _change(store: Store, lift_id: int, who: str, what: str, step: Callable[[Entry, OpenLift], None]) -> None:

@@ -33,15 +33,23 @@ _LOCK = 0x62617273
 """PostgreSQL advisory lock that writers of a store take."""
 
 
+@dataclass
+class SeenLog:
+    """Newest row of the audit log that this process has seen: its id, 0 for none, and its digest."""
+
+    newest: tuple[int, str] = (0, "")
+
+
 @dataclass(frozen=True)
 class Store:
-    """An open store. engine: the SQLAlchemy engine. name: its URL without the password. clock: by which the
-    ages of its lifts are told.
+    """An open store. engine: the SQLAlchemy engine. name: its URL without the password. clock, log: by which
+    this process notices that the computer's clock, or the store itself, was set back.
     """
 
     engine: Engine
     name: str
     clock: WallClock = field(default_factory=WallClock)
+    log: SeenLog = field(default_factory=SeenLog)
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
