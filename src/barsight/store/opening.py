@@ -147,6 +147,8 @@ _UNWRITTEN = ("SQLITE_FULL", "SQLITE_IOERR", "SQLITE_READONLY", _READ_ONLY, "425
 without the right.
 """
 _TOO_IDLE = "25P03"
+_MOVED = "SQLITE_READONLY_DBMOVED"
+"""Code of SQLite's if another file took the place of the one that is open."""
 
 
 @contextmanager
@@ -168,8 +170,8 @@ def _translated_errors(name: str, writer: Engine | None = None) -> Iterator[None
             raise
         problem = str(error.orig).strip().splitlines()[0]
         if is_unwritten:
-            if writer is not None and code == _READ_ONLY:
-                writer.dispose()  # kept connections would stay read-only when the server no longer is
+            if writer is not None and code in (_READ_ONLY, _MOVED):
+                writer.dispose()  # kept connections would stay with what the server, or the file, was before
             raise OutputError(f"{name}: {problem}; free some space, or see that it may be written") from error
         raise InputError(
             name, problem, "see that the database is there, is a store and may be written"
