@@ -8,6 +8,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -21,7 +22,9 @@ from barsight.page.live import LiveFolder
 from barsight.page.watch import StoreWatch
 from barsight.plant.state import state_of_store
 from barsight.store import confirmation, opening
+from barsight.store.adding import add_survey, read_survey
 from barsight.store.audit import Entry, entry
+from barsight.store.confirmation import open_lifts
 from barsight.store.opening import Store, open_store
 from barsight.store.states import (
     acknowledge_alarm,
@@ -32,6 +35,7 @@ from barsight.store.states import (
     step_lift,
 )  # fmt: skip
 from barsight.store.tables import ALARMS, BUNDLES, LIFT_BUNDLES, LIFTS
+from page_yards import SECOND, survey
 
 
 def wait_for(holds: Callable[[], bool], timeout_s: float = 10.0) -> None:
@@ -89,6 +93,24 @@ def test_what_an_earlier_server_left_ends_though_the_first_look_failed(
         watch.judge(with_chain=True)
         with store.reading() as connection:
             assert [alarm_state(connection, one) for one in left] == ["returned"] * 2
+
+
+def test_a_store_that_was_changed_by_hand_offers_nothing(url: str, tmp_path: Path) -> None:
+    with open_store(url) as store:
+        watch = StoreWatch(store)
+        watch.judge(with_chain=True)
+        with closing(sqlite3.connect(url.removeprefix("sqlite:///"))) as hand, hand:
+            hand.execute("DROP TRIGGER lifts_no_update")
+            hand.execute("UPDATE lifts SET record = replace(record, '\"count\": 1', '\"count\": 2')")
+        with store.reading() as connection:
+            assert open_lifts(connection)
+        watch.judge(with_chain=True)
+        with store.reading() as connection:
+            assert open_lifts(connection) == ()
+        add_survey(store, read_survey(survey(tmp_path / "next", SECOND, 0.0)), "ann")
+        watch.judge()
+        with store.reading() as connection:
+            assert open_lifts(connection) == ()
 
 
 def test_alarms_alike_end_together(url: str) -> None:

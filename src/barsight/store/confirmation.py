@@ -17,7 +17,7 @@ from barsight.store.calibrations import why_invalid
 from barsight.store.lift_records import find_gap, find_outlines
 from barsight.store.opening import Store
 from barsight.store.promotion import counts
-from barsight.store.states import has_alarm, last_raised_ns, lift_state, raise_alarm, step_lift
+from barsight.store.states import has_alarm, has_standing, last_raised_ns, lift_state, raise_alarm, step_lift
 from barsight.store.tables import LIFT_STATES, LIFTS, SURVEY_VETOES, SURVEYS
 from barsight.yard.lifting.validity import is_ahead
 from barsight.yard.vetoes import VETOES
@@ -322,12 +322,15 @@ def _stale(connection: Connection, clock_ns: int, set_back_s: float = 0.0) -> di
     newest = newest_survey(connection)
     reasons = {}
     reason = "" if newest is None else why_invalid(connection, newest.calibration_id, clock_ns)
+    is_broken = has_standing(connection, "store-broken")
     for lift in open_lifts(connection):
         until_ns = lift.record["valid_until_ns"]
         if lift.state == "executing":
             continue
         if newest is not None and lift.survey_id != newest.id:
             reasons[lift.lift_id] = "expired: a newer map came"
+        elif is_broken:
+            reasons[lift.lift_id] = "expired: store-broken: rows of the store were changed outside Barsight"
         elif set_back_s:
             back = f"this computer's clock was set back by {set_back_s:.0f} s: the age can't be told"
             reasons[lift.lift_id] = f"expired: map-too-old: {back}"

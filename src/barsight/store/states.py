@@ -125,6 +125,11 @@ def standing_alarms(connection: Connection) -> list[tuple[str, str, str]]:
     return [(row.code, row.reason, row.state) for row in connection.execute(_standing_query()).all()]
 
 
+def has_standing(connection: Connection, code: str) -> bool:
+    """Check whether an alarm with this code stands whose cause hasn't ended."""
+    return any(one == code and state != "returned" for one, _, state in standing_alarms(connection))
+
+
 @cache
 def _standing_query() -> Select[Any]:
     last = select(ALARM_STATES.c.alarm_id, func.max(ALARM_STATES.c.step).label("step"))
