@@ -146,6 +146,18 @@ def together(*calls: Callable[[], object]) -> list[object]:
     return results
 
 
+def test_a_survey_stays_where_it_is_when_a_link_to_it_moves_on(store: Store, tmp_path: Path) -> None:
+    folders = [write_folder(tmp_path / name, shift_m=shift_m) for name, shift_m in (("a", 0.0), ("b", 0.01))]
+    for folder in folders:
+        latest = tmp_path / "latest"
+        latest.unlink(missing_ok=True)
+        latest.symlink_to(folder.name)
+        add_survey(store, read_survey(latest), "ann")
+    with store.reading() as connection:
+        kept = connection.execute(select(SURVEYS.c.folder).order_by(SURVEYS.c.id)).scalars().all()
+    assert kept == [str(folder.resolve()) for folder in folders]
+
+
 def test_two_writers_at_once(store_url: str, tmp_path: Path) -> None:
     yard = CraneYard(0)
     for k in range(2):

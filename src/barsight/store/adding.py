@@ -160,6 +160,7 @@ def read_survey(folder: Path) -> MeasuredSurvey:
     Raises InputError for a folder that was changed or has no bundles or times, MeasurementError if its map
     has no place in the yard.
     """
+    folder = folder.resolve()  # a link such as `latest` leads elsewhere later
     summary, identity = open_folder(folder, cloud=True)
     path = folder / "bundles.json"
     if identity is None or not path.is_file():
@@ -184,7 +185,7 @@ def read_survey(folder: Path) -> MeasuredSurvey:
         if unknown_events(lifts, kept_events(folder)):
             raise InputError(chosen, "was chosen before the newest of events.csv", lift_file.REMEDY)
     return MeasuredSurvey(
-        folder.absolute(), identity, identity.captured_from_ns, identity.captured_to_ns,
+        folder, identity, identity.captured_from_ns, identity.captured_to_ns,
         str((summary.get("software") or {}).get("version")), {**summary["files"], **own}, records, found,
         read_heights(folder), lifts, recordings_of(summary),
     )  # fmt: skip
