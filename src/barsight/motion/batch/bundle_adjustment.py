@@ -15,6 +15,7 @@ from barsight.core.pose import Pose, skew
 from barsight.core.records.trajectory import RigDrift
 from barsight.inertial.model import ImuBias
 from barsight.motion.batch.apparent_motion import solve_with_slides
+from barsight.motion.batch.encoder_scale import doubtful_scales
 from barsight.motion.batch.rig_drift_search import optimise_with_drift
 from barsight.motion.problem.encoder_factors import (
     EncoderState,
@@ -25,7 +26,12 @@ from barsight.motion.problem.encoder_factors import (
     with_known_way,
     with_unevenness,
 )
-from barsight.motion.problem.gauss_newton import GraphState, optimise_graph, sighting_residuals
+from barsight.motion.problem.gauss_newton import (
+    GraphState,
+    linearise_graph,
+    optimise_graph,
+    sighting_residuals,
+)
 from barsight.motion.problem.gtsam_factors import build_graph, initial_values
 from barsight.motion.problem.marginals import Marginals, marginals
 from barsight.motion.problem.normal_equations import System
@@ -60,8 +66,9 @@ class Estimate:
     velocity_mps: (M, 3), None without IMU. biases: (M,). pixel_sigma_px: the sightings' noise as the
     residuals show it; used: (N,) sightings kept. drift: of the rig, None where no picture was used or the
     calibration is taken as exact. encoders: None without them. placed: P encoder positions; encoder_off_m,
-    encoder_sigma_m: (P, 3) residual and sigma of each; encoder_used: (P,) those that agree. inertial,
-    pictures, imu: of the nodes, stamped by the nodes' clock; points: (M,) sightings used at each.
+    encoder_sigma_m: (P, 3) residual and sigma of each; encoder_used: (P,) those that agree.
+    scaled: axes whose encoder's scale was estimated. inertial, pictures, imu: of the nodes, stamped by the
+    nodes' clock; points: (M,) sightings used at each.
     """
 
     poses: tuple[Pose, ...]
@@ -77,6 +84,7 @@ class Estimate:
     encoder_off_m: Float64
     encoder_sigma_m: Float64
     encoder_used: Bool
+    scaled: tuple[int, ...]
     inertial: InertialStates | None
     pictures: NormalisedResiduals | None
     imu: NormalisedResiduals | None
@@ -91,9 +99,10 @@ def solve_batch(problem: Problem, frames: Int64) -> Estimate:
     accelerations and the unevenness that it shows, sightings beyond 3.5 sigma are removed and all sigmas are
     scaled to the residuals. Then the drift is estimated again and weighed against its prior, and encoder
     positions beyond 5 sigma are removed. (Removing sightings before the drift is known would take the very
-    ones that show it best.) Raises LinAlgError where the measurements leave an unknown undetermined.
+    ones that show it best.) Where an encoder's scale is doubtful, everything is estimated once more with
+    that scale as an unknown. Raises LinAlgError where the measurements leave an unknown undetermined.
     """
-    problem = replace(problem, asked=frames)
+    given = problem = replace(problem, asked=frames)
     used = np.ones(0 if problem.sightings is None else len(problem.sightings.node), np.bool_)
     if problem.sightings is not None:
         used = well_observed(problem.sightings, used)
@@ -119,6 +128,12 @@ def solve_batch(problem: Problem, frames: Int64) -> Estimate:
         chosen = tuple(place for place, kept in zip(everywhere.placed, agreed, strict=True) if kept)
         problem = replace(problem, placed=chosen)
         state, system = optimise_graph(problem, build_graph(problem), state, used)
+    if seeks_drift and problem.has_latency:
+        del system  # two are never held
+        doubtful = doubtful_scales(problem, state, used)
+        if doubtful:
+            return solve_batch(replace(given, scaled=(*problem.scaled, *doubtful)), frames)
+        system = linearise_graph(problem, build_graph(problem), state, used)
     return _estimate(frames, everywhere, problem, state, system, used, drift)
 
 
@@ -139,6 +154,8 @@ def _estimate(
     velocity, biases = _inertial(state, problem)
     sigma = float(np.median(problem.sightings.sigma_px)) if problem.sightings else 0.0
     pictures, points = normalised_reprojection(problem, state, used)
+    by_drift, shared = found.drift_jacobian_of_encoders, _covariance(drift)
+    unknown = np.sqrt(found.encoder_sigmas**2 + np.einsum("si,ij,sj->s", by_drift, shared, by_drift))
     return Estimate(
         poses,
         covariances(found, shown, drift),
@@ -148,11 +165,12 @@ def _estimate(
         sigma,
         drift and with_matching_bias(drift, problem),
         used,
-        encoder_state(state.values, problem.jumps, found.encoder_sigmas) if problem.has_latency else None,
+        encoder_state(state.values, problem, unknown) if problem.has_latency else None,
         everywhere.placed,
         encoder_residuals(state.values, everywhere),
         encoder_sigmas(everywhere),
         encoder_inliers(state.values, everywhere),
+        problem.scaled,
         inertial_states(problem, state, everything),
         pictures,
         normalised_imu(problem, state),
@@ -160,11 +178,15 @@ def _estimate(
     )
 
 
+def _covariance(drift: RigDrift | None) -> Float64:
+    return np.zeros((2, 2)) if drift is None else drift.covariance
+
+
 def covariances(found: Marginals, poses: tuple[Pose, ...], drift: RigDrift | None) -> Float64:
     """Compute pose covariances (F, 6, 6) in the reference's axes, including the uncertainty of the rig's
     drift.
     """
-    shared = np.zeros((2, 2)) if drift is None else drift.covariance
+    shared = _covariance(drift)
     result = np.zeros((len(poses), 6, 6))
     for k, pose in enumerate(poses):
         rotation = np.zeros((6, 6))
@@ -180,7 +202,7 @@ def relative_covariances(
     """Compute covariances (P, 6, 6) of the later pose relative to the earlier one, as rotation then
     translation of a small motion applied after it, in its own axes. Errors common to both cancel.
     """
-    shared = np.zeros((2, 2)) if drift is None else drift.covariance
+    shared = _covariance(drift)
     result = np.empty((len(pairs), 6, 6))
     for p, (old, new) in enumerate(pairs.tolist()):
         moved = poses[new].inverse() @ poses[old]

@@ -264,6 +264,7 @@ class BatchPoses:
             encoder_positions,
             encoder_warnings,
             jump_sentences,
+            scale_sentences,
         )
         from barsight.motion.problem.problem import (
             AttitudePrior,
@@ -309,10 +310,11 @@ class BatchPoses:
         )
         begin_ns = 0 if inputs.crane is None else int(inputs.crane.stamp_ns[0])
         sure, maybe = jump_sentences(jumps, begin_ns, estimate.encoders)
-        warnings += maybe
+        wrong, doubtful = scale_sentences(estimate.scaled, estimate.encoders)
+        warnings += (*doubtful, *maybe)
         in_sigmas = estimate.encoder_off_m / estimate.encoder_sigma_m
         encoders = normalised_encoders(nodes.stamp_ns, estimate.placed, in_sigmas)
-        return estimate, warnings, sure, encoders
+        return estimate, warnings, (*wrong, *sure), encoders
 
     def _attitude_sigmas_deg(self, chosen: list[int], still: Container[int]) -> dict[int, float]:
         """Choose the sigma (degrees) of the nominal attitude at the chosen nodes: larger under way, since

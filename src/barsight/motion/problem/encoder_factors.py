@@ -52,19 +52,26 @@ MAX_UNEVEN_M = 0.006
 """Largest residual that counts towards the unevenness: a larger one is a fault, and is clipped."""
 NOTED_LATENCY_SIGMAS = 5.0
 NOTED_LATENCY_S = 0.005
+PLAY_M = 0.002
+"""Standard deviation of an encoder's play and of rails, which pass for scale over a short travel."""
+SURE_SCALE_SIGMAS = 4.7
+"""Significance from which a scale is wrong, as that of a jump; one that is less significant may be wrong."""
 AXES = ("bridge", "trolley", "hoist")
 
 
 @dataclass(frozen=True)
 class EncoderState:
     """latency_s and its sigma: zero and the prior's where nothing shows it. jump_m, jump_sigma_m: (J,) size
-    of each jump and its sigma.
+    of each jump and its sigma. excess, excess_sigma: (S,) by how much each encoder whose scale is an unknown
+    travels too far, as a ratio.
     """
 
     latency_s: float
     latency_sigma_s: float
     jump_m: Float64
     jump_sigma_m: Float64
+    excess: Float64
+    excess_sigma: Float64
 
 
 def encoder_position(
@@ -172,11 +179,23 @@ def encoder_sigmas(problem: Problem, min_m: float = MIN_SIGMA_M) -> Float64:
     return np.hypot(own[:, None], problem.uneven_m * np.sqrt(problem.alike)[:, None])
 
 
-def encoder_state(values: Any, jumps: Sequence[EncoderJump], sigmas: Float64) -> EncoderState:
-    """Extract the encoders' estimated latency and jumps. sigmas: (S,) of these unknowns."""
-    found = encoder_unknowns_of(values)
-    sizes = np.array([jump.size_m for jump in jumps], np.float64)
-    return EncoderState(float(found[0]), float(sigmas[0]), sizes + found[1:], sigmas[1:])
+def travel_m(problem: Problem) -> Float64:
+    """Return the extent (3,) of the encoders' positions, at least `PLAY_M`."""
+    place = np.array([p.position_m for p in problem.placed]).reshape(-1, 3)
+    extent: Float64 = np.maximum(np.ptp(place, axis=0), PLAY_M) if len(place) else np.full(3, PLAY_M)
+    return extent
+
+
+def encoder_state(values: Any, problem: Problem, sigmas: Float64) -> EncoderState:
+    """Extract the encoders' estimated latency, jumps and scales. sigmas: (S,) of these unknowns."""
+    found, end = encoder_unknowns_of(values), 1 + len(problem.jumps)
+    sizes = np.array([jump.size_m for jump in problem.jumps], np.float64)
+    share = found[end:]  # of the readings' travel
+    play = PLAY_M / travel_m(problem)[list(problem.scaled)]
+    return EncoderState(
+        float(found[0]), float(sigmas[0]), sizes + found[1:end], sigmas[1:end], share / (1 - share),
+        np.hypot(sigmas[end:], play) / (1 - share) ** 2,
+    )  # fmt: skip
 
 
 def jump_sentences(
@@ -199,6 +218,26 @@ def jump_sentences(
                 sure.append(f"{encoder} goes on {at}, after the freeze, off by {size}")
             case "maybe":
                 maybe.append(f"{encoder} may jump {at}, by {size}: sigma holds it")
+    return tuple(sure), tuple(maybe)
+
+
+def scale_sentences(
+    scaled: Sequence[int], state: EncoderState | None
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Describe the scales, of the encoders `scaled`, that are certainly or possibly wrong."""
+    sure, maybe = [], []
+    for k, axis in enumerate(scaled if state is not None else ()):
+        assert state is not None
+        excess, sigma = 100 * state.excess[k], 100 * state.excess_sigma[k]
+        size = f"{abs(excess):.2f} % too {'far' if excess > 0 else 'short'} (1 sigma {sigma:.2f} %)"
+        encoder = f"the {AXES[axis]}'s encoder"
+        if abs(excess) > SURE_SCALE_SIGMAS * sigma:
+            sure.append(
+                f"{encoder} travels {size} by cameras and IMU: a wrong scale; "
+                "this was taken off (check its wheel and gear, else the cameras' baseline)"
+            )
+        else:
+            maybe.append(f"{encoder} may travel {size} by cameras and IMU: sigma holds it")
     return tuple(sure), tuple(maybe)
 
 
@@ -238,7 +277,8 @@ def encoder_warnings(
 
 def _readings(problem: Problem, unknowns: Float64) -> tuple[Float64, Float64]:
     """Extrapolate the encoders' positions (P, 3) by the latency along their parabolas, less the estimated
-    excess of the jumps; also return the derivatives (P, 3, S) by these unknowns.
+    excess of the jumps and of the travel since the first; also return the derivatives (P, 3, S) by these
+    unknowns.
     """
     placed, latency_s = problem.placed, float(unknowns[0])
     place = np.array([p.position_m for p in placed])
@@ -248,6 +288,8 @@ def _readings(problem: Problem, unknowns: Float64) -> tuple[Float64, Float64]:
     stamps = problem.stamp_ns[_nodes(placed)]
     for k, jump in enumerate(problem.jumps, start=1):
         derivative[:, jump.axis, k] = -jump.share(stamps)
+    for k, axis in enumerate(problem.scaled, start=1 + len(problem.jumps)):
+        derivative[:, axis, k] = place[:1, axis] - place[:, axis]
     reading = place + (velocity + derivative[..., 0]) / 2 * latency_s + derivative[..., 1:] @ unknowns[1:]
     return reading, derivative
 

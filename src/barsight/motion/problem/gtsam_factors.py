@@ -19,6 +19,8 @@ from barsight.motion.problem.problem import Problem, encoder_unknowns_of
 WIDTHS = {"x": 6, "v": 3, "b": 6}
 OFFSETS = {"x": 0, "v": 6, "b": 9}
 """Offsets of a node's unknowns: pose, with an IMU velocity and biases."""
+ENCODER_SCALE_SIGMA = 0.1
+"""Prior standard deviation of an encoder's scale, where it is an unknown."""
 
 
 def build_graph(problem: Problem, first: int = 0, end: int | None = None) -> Any:
@@ -99,7 +101,9 @@ def _add_priors(graph: Any, problem: Problem, nodes: range) -> None:
             sigmas = gtsam.noiseModel.Gaussian.Covariance(whole)
         graph.add(gtsam.PriorFactorPose3(X(0), _gtsam_pose(problem.start[0]), sigmas))
     if problem.has_latency and begins:
-        sigmas = _sigmas(problem.encoder_latency_sigma_s, *(jump.sigma_m for jump in problem.jumps))
+        scales = [ENCODER_SCALE_SIGMA] * len(problem.scaled)
+        jumps = (jump.sigma_m for jump in problem.jumps)
+        sigmas = _sigmas(problem.encoder_latency_sigma_s, *jumps, *scales)
         graph.add(gtsam.PriorFactorVector(E(0), np.zeros(problem.encoder_unknowns), sigmas))
     for attitude in problem.attitudes:
         if attitude.node not in nodes:

@@ -17,8 +17,9 @@ NO_PAIRS = np.empty((0, 2), np.int64)
 @dataclass(frozen=True, eq=False)
 class Marginals:
     """Marginal covariances of the system's K nodes. poses: (K, 6, 6) in GTSAM's order and body axes, with the
-    rig's drift taken as known. encoder_sigmas: (S,) of the encoders' unknowns. drift_jacobian_of_pose: (K, 6,
-    2) derivatives of the poses by the drift. nodes: (K, n, n) of all of a node's unknowns, with the whole
+    rig's drift taken as known. encoder_sigmas: (S,) of the encoders' unknowns, likewise.
+    drift_jacobian_of_pose: (K, 6, 2) derivatives of the poses by the drift; drift_jacobian_of_encoders: (S,
+    2) those of the encoders' unknowns. nodes: (K, n, n) of all of a node's unknowns, with the whole
     border taken as known. cross: (P, 6, 6) of pairs of poses, as `poses`; NaN for pairs too far apart for the
     band.
     """
@@ -26,6 +27,7 @@ class Marginals:
     poses: Float64
     encoder_sigmas: Float64
     drift_jacobian_of_pose: Float64
+    drift_jacobian_of_encoders: Float64
     nodes: Float64
     cross: Float64
 
@@ -42,15 +44,16 @@ def marginals(system: System, pairs: Int64 = NO_PAIRS) -> Marginals:
     cross = cross[:, :6, :6]
     poses = nodes[:, :6, :6]
     by_border = -_to_border(system)[layout.poses].reshape(count, 6, -1)
-    drift_jacobian_of_pose, encoders = by_border[:, :, -2:], np.empty(0)
+    drift_jacobian_of_pose, encoders, by_drift = by_border[:, :, -2:], np.empty(0), np.empty((0, 2))
     if len(own) > 2:
         variance = np.linalg.inv(own[:-2, :-2])
         encoders = np.sqrt(np.diag(variance)[: system.encoder_unknowns])
+        by_drift = -(variance @ own[:-2, -2:])[: system.encoder_unknowns]
         to_border = by_border[:, :, :-2]
         poses = poses + to_border @ variance @ to_border.transpose(0, 2, 1)
         drift_jacobian_of_pose = drift_jacobian_of_pose - to_border @ variance @ own[:-2, -2:]
         cross = cross + to_border[pairs[:, 0]] @ variance @ to_border[pairs[:, 1]].transpose(0, 2, 1)
-    return Marginals(poses, encoders, drift_jacobian_of_pose, nodes, cross)
+    return Marginals(poses, encoders, drift_jacobian_of_pose, by_drift, nodes, cross)
 
 
 @one_blas_thread()

@@ -184,8 +184,8 @@ def inertial_of(values: Any, nodes: Int64) -> Float64:
 
 
 def encoder_unknowns_of(values: Any) -> Float64:
-    """Extract the encoders' unknowns (S,) from GTSAM's values: their latency, s, and the excess of each jump
-    over its stated size, m; (0,) without encoders.
+    """Extract the encoders' unknowns (S,) from GTSAM's values: their latency, s, the excess of each jump
+    over its stated size, m, and relative scales; (0,) without encoders.
     """
     return np.asarray(values.atVector(E(0))) if values.exists(E(0)) else np.empty(0)
 
@@ -232,6 +232,8 @@ class Problem:
     """Whether the encoders' latency is an unknown."""
     jumps: tuple[EncoderJump, ...] = ()
     """Jumps of the encoders, each of which is an unknown."""
+    scaled: tuple[int, ...] = ()
+    """Axes whose encoder's scale is an unknown (`encoder_scale`)."""
     has_imu: bool = False
     """Whether velocities and biases are unknowns."""
     uneven_m: Float64 = field(default_factory=lambda: np.full(3, FIRST_UNEVEN_M))
@@ -276,8 +278,8 @@ class Problem:
 
     @property
     def encoder_unknowns(self) -> int:
-        """Count the encoders' unknowns: latency and jumps."""
-        return 1 + len(self.jumps) if self.has_latency else 0
+        """Count the encoders' unknowns: latency, jumps and scales."""
+        return 1 + len(self.jumps) + len(self.scaled) if self.has_latency else 0
 
     @property
     def border(self) -> int:

@@ -49,17 +49,31 @@ def combine_with_prior(theta: Float64, covariance: Float64, problem: Problem) ->
     assert seen is not None
     focal, baseline = seen.camera.focal_px, seen.camera.baseline_m
     disparity = seen.stereo[:, 0] - seen.stereo[:, 2] + seen.camera.doffs_px
-    yaw_prior = SERVICE_RAD if problem.has_latency else problem.offset_prior_px / focal
-    prior = np.array([yaw_prior, problem.scale_prior]) ** 2
+    prior, floor = drift_prior(problem), drift_floor(problem)
+    if not problem.has_latency:
+        floor[0, 0] += prior[0] ** 2
+    yaw, scale, combined = _weighed(np.eye(2), theta, covariance + floor, prior)
+    range_m = focal * baseline / float(np.median(disparity))
+    return RigDrift(yaw, scale, combined, prior, baseline, range_m, bool(problem.has_latency))
+
+
+def drift_prior(problem: Problem) -> Float64:
+    """Return the prior standard deviations (2,) of yaw (rad) and scale."""
+    seen = problem.sightings
+    assert seen is not None
+    yaw = SERVICE_RAD if problem.has_latency else problem.offset_prior_px / seen.camera.focal_px
+    return np.array([yaw, problem.scale_prior])
+
+
+def drift_floor(problem: Problem) -> Float64:
+    """Compute the covariance (2, 2) of yaw and scale that matching biases add to what sightings show."""
+    seen = problem.sightings
+    assert seen is not None
+    disparity = seen.stereo[:, 0] - seen.stereo[:, 2] + seen.camera.doffs_px
     everywhere_px, near_px = MATCHING_BIAS_PX, MATCHING_BIAS_PX
     if problem.pieces is not None:
         everywhere_px, near_px = COMMON_BIAS_PX, 0.0
-    floor = _floor(disparity, focal, everywhere_px, near_px)
-    if not problem.has_latency:
-        floor[0, 0] += prior[0]
-    yaw, scale, combined = _weighed(np.eye(2), theta, covariance + floor, np.sqrt(prior))
-    range_m = focal * baseline / float(np.median(disparity))
-    return RigDrift(yaw, scale, combined, np.sqrt(prior), baseline, range_m, bool(problem.has_latency))
+    return _floor(disparity, seen.camera.focal_px, everywhere_px, near_px)
 
 
 def with_matching_bias(drift: RigDrift, problem: Problem) -> RigDrift:
