@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -40,6 +41,12 @@ class EncoderJump:
         return np.where(stamp_ns >= self.stamp_ns, 1.0, 0.0)
 
 
+READINGS_PER_SIDE, MAX_REACH_NS = 3.1, 800_000_000
+"""Minimum half-width of a window for a fit, in intervals of the readings, and its maximum, ns: over longer
+ones a crane's travel is no parabola. So at least four readings a second are needed.
+"""
+
+
 @dataclass(frozen=True, eq=False)
 class CraneSamples:
     """Positions of the crane's reference point by the encoders.
@@ -56,6 +63,16 @@ class CraneSamples:
     yard_from_body_nominal: Float64
     position_std_m: float
     jumps: tuple[EncoderJump, ...] = ()
+
+    @cached_property
+    def interval_ns(self) -> int:
+        """Return the median interval of the readings, 0 where there are fewer than two."""
+        return int(np.median(np.diff(self.stamp_ns))) if len(self.stamp_ns) > 1 else 0
+
+    def reach_ns(self, half_ns: int) -> int:
+        """Return the half-width of a window that is wide enough for slow encoders too, if any is."""
+        wide_ns = round(READINGS_PER_SIDE * self.interval_ns)
+        return max(half_ns, wide_ns) if wide_ns <= MAX_REACH_NS else half_ns
 
 
 @dataclass(frozen=True, eq=False)

@@ -54,6 +54,11 @@ SENSORS = ("stereo", "imu", "crane")
 PLACE_SPACING_S = 0.4
 
 
+def place_spacing_ns(crane: CraneSamples) -> int:
+    """Return the interval of encoder positions: each reading counts for one of them."""
+    return max(seconds_to_ns(PLACE_SPACING_S), 2 * crane.reach_ns(0))
+
+
 @dataclass(frozen=True)
 class FusionSettings:
     """The estimate from all sensors together."""
@@ -284,7 +289,7 @@ class BatchPoses:
         placed: tuple[EncoderPosition, ...] = ()
         attitudes: list[AttitudePrior] = []
         if inputs.crane is not None:
-            chosen = _apart(nodes.stamp_ns, seconds_to_ns(PLACE_SPACING_S))
+            chosen = _apart(nodes.stamp_ns, place_spacing_ns(inputs.crane))
             placed = encoder_positions(inputs.crane, inputs.imu, nodes.stamp_ns, chosen)
             nominal = inputs.crane.yard_from_body_nominal
             sigmas = self._attitude_sigmas_deg(chosen, ties.still)

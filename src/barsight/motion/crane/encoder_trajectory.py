@@ -12,7 +12,7 @@ from barsight.core.arrays import Float64, Int64
 from barsight.core.errors import Failed, MeasurementError
 from barsight.core.linalg.robust import mad_sigma
 from barsight.core.pose import Pose
-from barsight.core.records.sensor_samples import CraneSamples
+from barsight.core.records.sensor_samples import MAX_REACH_NS, READINGS_PER_SIDE, CraneSamples
 from barsight.core.records.trajectory import PosedFrame, Trajectory
 from barsight.core.settings.values import NOT_NEGATIVE, POSITIVE, expect_ranges
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
@@ -87,7 +87,7 @@ class EncoderPoses(ImmediatePoses):
         assert crane is not None
         at_ns = stamp + self._recording.rig.timeshift_cam_imu_ns
         attitude, attitude_std_deg = crane.yard_from_body_nominal, settings.attitude_std_deg
-        half, way = seconds_to_ns(settings.window_s), None
+        half, way = crane.reach_ns(seconds_to_ns(settings.window_s)), None
         if imu is not None:
             way = way_around(imu, at_ns, half, attitude, ImuBias.none(), 2)
         fit = fit_position(crane, at_ns, half, way)
@@ -131,13 +131,15 @@ def fit_position(
 ) -> FittedPosition | Failed:
     """Fit the crane point at `stamp_ns` to the readings around it.
 
-    Fits a parabola to the readings within the window (a line to fewer than six) by least squares with Cauchy
-    weights, so that isolated outliers have no pull however far off they are. A crane that oscillates follows
-    no parabola. So the travel measured by the IMU, where known, is subtracted from the readings, which are
-    `late_ns` late, before the fit and added again after it, and only what the IMU leaves open is fitted (a
-    line where the acceleration is known too: its middle has 4/9 of a parabola's variance). Failed
-    `no-encoder` where the readings don't enclose the stamp; readings beyond a jump don't count.
+    Fits a parabola to the readings within the window (a line to fewer than six), which is wider where they
+    are slow, by least squares with Cauchy weights, so that isolated outliers have no pull however far off
+    they are. A crane that oscillates follows no parabola. So the travel measured by the IMU, where known, is
+    subtracted from the readings, which are `late_ns` late, before the fit and added again after it, and only
+    what the IMU leaves open is fitted (a line where the acceleration is known too: its middle has 4/9 of a
+    parabola's variance). Failed `no-encoder` where the readings don't enclose the stamp; readings beyond a
+    jump don't count.
     """
+    window_ns = crane.reach_ns(window_ns)
     begin_ns, end_ns = stamp_ns - window_ns, stamp_ns + window_ns
     for jump in crane.jumps:
         if jump.stamp_ns <= stamp_ns:
@@ -148,9 +150,11 @@ def fit_position(
     stamps: Int64 = crane.stamp_ns[first:last]
     if stamps.size < 4 or stamps[0] > stamp_ns or stamps[-1] < stamp_ns:
         away = np.abs(crane.stamp_ns - stamp_ns).min(initial=np.iinfo(np.int64).max) / NS_PER_S
-        return Failed(
-            "no-encoder", f"{stamps.size} encoder readings around the frame (the nearest {away:.2f} s away)"
-        )
+        reason = f"{stamps.size} encoder readings around the frame (the nearest {away:.2f} s away)"
+        if READINGS_PER_SIDE * crane.interval_ns > MAX_REACH_NS:
+            apart_s = crane.interval_ns / NS_PER_S
+            reason += f"; they come {apart_s:.2f} s apart: give at least four a second"
+        return Failed("no-encoder", reason)
     time = (stamps - stamp_ns) / window_ns
     window_s = window_ns / NS_PER_S
     degree = min(2 if stamps.size >= 6 else 1, 2 if way is None else way.open_degree)

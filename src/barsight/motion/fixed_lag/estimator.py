@@ -60,8 +60,6 @@ class FixedLagFusion(TrajectoryEstimator):
 class FixedLagPoses(ImmediatePoses):
     """`PoseEstimator` over a window of the last frames."""
 
-    delay_ns = FixedLagFusion.delay_ns
-
     def __init__(self, estimator: FixedLagFusion, recording: Recording, rectifier: Rectifier) -> None:
         from barsight.motion.fixed_lag.smoother import FixedLagEstimator
 
@@ -71,6 +69,7 @@ class FixedLagPoses(ImmediatePoses):
         self._noise = recording.imu_noise() or ORDINARY_NOISE
         self.reads_pictures = "stereo" in self._use
         readings = self._readings()
+        self.delay_ns = readings.delay_ns
         if readings.crane is None and not self.reads_pictures:
             raise MeasurementError(f"{recording.path}: no crane encoders; estimate with use: stereo")
         self._level = None if readings.crane is not None else align_with_gravity(recording)
@@ -82,7 +81,8 @@ class FixedLagPoses(ImmediatePoses):
 
     def place(self, seen: FrameInput) -> PosedFrame | RefusedFrame:
         """Track the frame and estimate its pose."""
-        self._estimator.readings = self._readings()
+        self._estimator.readings = readings = self._readings()
+        self.delay_ns = readings.delay_ns
         pair = pictures_of(seen)
         if isinstance(pair, Failed):
             return self._estimator.take(RefusedFrame(seen.stamp_ns, pair.reason))

@@ -8,10 +8,15 @@ import numpy as np
 
 from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.core.records.sensor_samples import CraneSamples, ImuSamples
+from barsight.core.stamps import seconds_to_ns
 from barsight.inertial.model import without_saturation
 
 SENSOR_DELAY_S = 0.06
 """Delay, s, after a frame's stamp until which readings are awaited before the frame is computed."""
+SLOW_S, SLOW_DELAY_S = 0.12, 0.27
+"""Interval, s, from which encoders are slow, and the delay for them, in which one reads at least once."""
+NEWEST = 100
+"""Number of the newest readings that tell the encoders' interval."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,6 +26,16 @@ class SensorBuffer:
     crane: CraneSamples | None
     imu: ImuSamples | None
     noise: ImuNoise
+
+    @property
+    def delay_ns(self) -> int:
+        """Return the delay after a frame's stamp until which readings are awaited."""
+        crane = self.crane
+        if crane is None:
+            return seconds_to_ns(SENSOR_DELAY_S)
+        newest = replace(crane, stamp_ns=crane.stamp_ns[-NEWEST:], position_m=crane.position_m[-NEWEST:])
+        is_slow = newest.interval_ns > seconds_to_ns(SLOW_S)
+        return seconds_to_ns(SLOW_DELAY_S if is_slow else SENSOR_DELAY_S)
 
     def between(self, first_ns: int, last_ns: int) -> SensorBuffer:
         """Select the readings between two stamps, without those at the limit of the IMU range."""

@@ -20,11 +20,11 @@ from barsight.core.stamps import seconds_to_ns
 from barsight.features.guided_matching import PredictedMotion
 from barsight.inertial.preintegration import Preintegrated
 from barsight.motion.batch.fault_detection import freeze_sentences
-from barsight.motion.batch.fusion import PLACE_SPACING_S, FusionSettings
+from barsight.motion.batch.fusion import PLACE_SPACING_S, FusionSettings, place_spacing_ns
 from barsight.motion.crane.encoder_trajectory import CraneSettings, fit_position, reestimate_noise
 from barsight.motion.crane.known_motion import way_around
 from barsight.motion.fixed_lag.encoder_watch import EncoderWatch, with_jumps, with_sums
-from barsight.motion.fixed_lag.sensor_buffer import SENSOR_DELAY_S, SensorBuffer
+from barsight.motion.fixed_lag.sensor_buffer import SensorBuffer
 from barsight.motion.fixed_lag.sliding_window import Window, add_frame, add_nodes
 from barsight.motion.fixed_lag.window_update import marginalise, solve_window
 from barsight.motion.frontend.chains import UNTIED, imu_bridges
@@ -190,7 +190,7 @@ class FixedLagEstimator:
         return now if now.crane is None else replace(now, crane=self.watch.usable(now.crane))
 
     def _come(self, stamp_ns: int) -> SensorBuffer:
-        last = stamp_ns + self._shift_ns + seconds_to_ns(SENSOR_DELAY_S)
+        last = stamp_ns + self._shift_ns + self.readings.delay_ns
         begin = last if self.window is None else int(self.window.problem.stamp_ns[0])
         return self.readings.between(begin - seconds_to_ns(LOOK_BACK_S), last)
 
@@ -199,8 +199,10 @@ class FixedLagEstimator:
         nodes = make_nodes(np.array([stamp]), None if now.crane is None else now.imu)
         if now.crane is None:
             assert sighting is not None
-        elif isinstance(fit_position(now.crane, stamp, seconds_to_ns(0.35)), Failed):
-            return Failed("no-encoder", "the encoders don't cover the first frame")
+        else:
+            fit = fit_position(now.crane, stamp, seconds_to_ns(0.35))
+            if isinstance(fit, Failed):
+                return Failed(fit.code, f"the encoders don't cover the first frame: {fit.reason}")
         sightings = () if sighting is None else (sighting,)
         start = initial_poses(nodes, now.crane, sightings, self._shift_ns, self._rectifier, self._level)
         known = (stamp, stamp) if now.crane is None else (int(now.crane.stamp_ns[0]), stamp)
@@ -306,18 +308,19 @@ class FixedLagEstimator:
             return window
         crane, placed, problem = reestimate_noise(now.crane), list(window.problem.placed), window.problem
         placed_ns = window.placed_ns
-        complete, last = stamp + seconds_to_ns(SENSOR_DELAY_S - FIT_S), len(problem.start) - 1
+        half, spacing = crane.reach_ns(seconds_to_ns(FIT_S)), 0.97 * place_spacing_ns(crane)
+        complete, last = stamp + self.readings.delay_ns - half, len(problem.start) - 1
         by_imu = last > 0 and problem.preintegrated[-1] is not None
         loose = not by_imu and (sighting is None or sighting.motion is None)
         for k, node_ns in enumerate(problem.stamp_ns.tolist()):
             at_once = loose and k == last
-            near = placed_ns is not None and node_ns - placed_ns < 0.97 * seconds_to_ns(PLACE_SPACING_S)
+            near = placed_ns is not None and node_ns - placed_ns < spacing
             if not at_once and (near or node_ns > complete):
                 continue
-            half, way = seconds_to_ns(self._crane.window_s if at_once else FIT_S), None
+            wide, way = seconds_to_ns(self._crane.window_s) if at_once else half, None
             if now.imu is not None and not at_once:
                 way = way_around(now.imu, node_ns, half, window.pose(k).rotation, window.bias, 2)
-            found = encoder_position(crane, k, node_ns, half, way)
+            found = encoder_position(crane, k, node_ns, wide, way)
             if not isinstance(found, Failed):
                 placed.append(found)
                 placed_ns = node_ns

@@ -89,7 +89,7 @@ def encoder_positions(
     crane: CraneSamples, imu: ImuSamples | None, stamp_ns: Int64, nodes: Sequence[int]
 ) -> tuple[EncoderPosition, ...]:
     """Interpolate the body's position at some nodes of stamps (M,), with the attitude taken as nominal."""
-    found, half = [], seconds_to_ns(WINDOW_S)
+    found, half = [], crane.reach_ns(seconds_to_ns(WINDOW_S))
     for k in nodes:
         stamp, nominal, none = int(stamp_ns[k]), crane.yard_from_body_nominal, ImuBias.none()
         way = None if imu is None else way_around(imu, stamp, half, nominal, none, 2)
@@ -102,10 +102,10 @@ def with_known_way(problem: Problem, values: Any) -> Problem:
     latency: they become 1.5 times as precise.
     """
     crane, imu = problem.crane, problem.imu
-    if crane is None or imu is None or not problem.has_imu:
+    if crane is None or imu is None or not problem.has_imu or not problem.placed:
         return problem
     late_ns, found = seconds_to_ns(float(encoder_unknowns_of(values)[0])), []
-    half = seconds_to_ns(WINDOW_S) + abs(late_ns)
+    half = crane.reach_ns(seconds_to_ns(WINDOW_S)) + abs(late_ns)
     for place in problem.placed:
         k, stamp = place.node, int(problem.stamp_ns[place.node])
         bias = values.atConstantBias(B(k))
