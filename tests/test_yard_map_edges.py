@@ -92,6 +92,20 @@ def test_a_gap_may_hide_in_what_the_map_does_not_show(gap_m: float, unknown_m: f
     assert whole.confidence > 0.9
 
 
+@pytest.mark.parametrize(("size_m", "is_free"), [(0.08, True), (0.12, False), (0.6, False)])
+def test_something_may_lie_where_half_of_the_width_was_not_seen(size_m: float, *, is_free: bool) -> None:
+    """The place lies beyond the magnet: such a lift was offered, whatever lay there."""
+    one = laid(0.0, 0.165, length_m=7.4)
+    heights = map_of([one], y_m=(-4.5, 4.5))
+    along, across = np.abs(heights.y_m - 2.95) < size_m / 2, np.abs(heights.x_m - 0.1) < 0.1
+    heights.source[along[:, None] & across] = HeightSource.UNKNOWN
+    (told,) = find_bundles(heights, SETTINGS)
+    assert told.is_free is is_free and told.confidence > 0.9
+    plan = plan_lifts(heights, (told,), MAGNET, LIFTS, ())
+    assert len(plan.offered) == is_free
+    assert all("covered" in {veto.code for veto in lift.vetoes} for lift in plan.refused)
+
+
 @pytest.mark.parametrize(
     ("why", "is_free"),
     [("end is open: the map doesn't show what lies beyond", True), (DoubtKind.COVERED_END.value, False)],

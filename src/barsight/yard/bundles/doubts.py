@@ -34,6 +34,10 @@ _ALONG_M = 0.012
 """Minimum rise of a bundle's own section over its outline's top from which something lies along on it. On
 drawn yards 98 % of uncovered bundles rise by less than 8 mm.
 """
+_UNSEEN_M, _CREST_RATIO = 0.1, 0.4
+"""Minimum size (m) of an unseen place over a bundle that may hide what lies there; maximum distance of such
+places from the middle, in widths: matching loses the steep flanks beyond.
+"""
 _MIN_SEEN_RATIO = 0.75
 """Minimum share of such an object's places that is measured: matching loses places along its edges."""
 _MAX_BOW_CELLS, _BOW_COST_M, _BOW_STEP = 8, 2e-4, 4
@@ -214,7 +218,27 @@ def list_cover_doubts(reading: Reading, reasons: tuple[Doubt, ...]) -> tuple[Dou
         out.append(Doubt(DoubtKind.OTHER, said))
     if reading.flanks is not None and reading.flanks.cover_doubt:
         out.append(reading.flanks.cover_doubt)
+    if unseen := _unseen_length(reading):
+        said = f"over {unseen:.2f} m a part of its width was not seen: something may lie there"
+        out.append(Doubt(DoubtKind.OTHER, said))
     return tuple(out)
+
+
+def _unseen_length(reading: Reading) -> float:
+    """Measure the length (m) of a bundle over which unseen places can hide something that lies there."""
+    grid, fit, (low, high) = reading.found.grid, reading.found.fit, _bounds(reading)
+    rim, inset = round(_BEFORE_END_M / grid.cell_m), (0.5 - _CREST_RATIO) * (high - low)
+    rows = np.arange(fit.first + rim, fit.last + 1 - rim)
+    unseen = np.isnan(_sections(reading, rows, np.arange(low + inset, high - inset, grid.cell_m)))
+    side = round(_UNSEEN_M / grid.cell_m)
+    wide = ndimage.binary_opening(unseen, np.ones((side, min(side, unseen.shape[1])), bool))
+    return float(grid.cell_m * wide.any(axis=1).sum())
+
+
+def _bounds(reading: Reading) -> tuple[float, float]:
+    """Return the flanks (m) beside the axis: those of the pack where its bounds are known."""
+    half, pack = reading.found.fit.width_m / 2, reading.pack
+    return (-half, half) if pack is None or not pack.is_bounded else (pack.low_m, pack.high_m)
 
 
 def measure_laid(reading: Reading) -> tuple[float, bool]:
@@ -270,9 +294,9 @@ def _straight_sections(reading: Reading) -> tuple[Float64, float, float] | None:
     grid, fit, pack = reading.found.grid, reading.found.fit, reading.pack
     if fit.last - fit.first < 2 * _BEFORE_END_M / grid.cell_m + 1:
         return None
-    low_m, high_m, axis_z_m = -fit.width_m / 2, fit.width_m / 2, float(fit.values[Z])
+    (low_m, high_m), axis_z_m = _bounds(reading), float(fit.values[Z])
     if pack is not None and pack.is_bounded:
-        low_m, high_m, axis_z_m = pack.low_m, pack.high_m, axis_z_m + pack.top_m - pack.width_m / 2
+        axis_z_m += pack.top_m - pack.width_m / 2
     rim = round(_BEFORE_END_M / grid.cell_m)
     rows = np.arange(fit.first + rim, fit.last + 1 - rim)
     beside = np.arange(low_m, high_m + grid.cell_m / 2, grid.cell_m)
