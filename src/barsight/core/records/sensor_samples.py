@@ -55,6 +55,7 @@ class CraneSamples:
     crane_to_body_m: (3,) the body's origin minus the crane point, yard axes.
     yard_from_body_nominal: (3, 3) attitude of the body as mounted. position_std_m: sigma of one reading.
     jumps: found in the readings and subtracted from them, in order of time; no fit may span one.
+    late_ns: delay that was taken off the stamps.
     """
 
     stamp_ns: Int64
@@ -63,6 +64,7 @@ class CraneSamples:
     yard_from_body_nominal: Float64
     position_std_m: float
     jumps: tuple[EncoderJump, ...] = ()
+    late_ns: int = 0
 
     @cached_property
     def interval_ns(self) -> int:

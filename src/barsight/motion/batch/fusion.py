@@ -21,6 +21,7 @@ from barsight.inertial.model import ORDINARY_NOISE, saturation_sentences, withou
 from barsight.motion.batch.detail import joint_sentences, jumps_alone, select_detail, untied_pictures
 from barsight.motion.batch.fault_detection import check_crane, frames_off
 from barsight.motion.batch.sensor_agreement import refuse_contradictions
+from barsight.motion.crane.encoder_delay import without_delay
 from barsight.motion.crane.encoder_trajectory import (
     CraneSettings,
     EncoderOdometry,
@@ -126,9 +127,9 @@ class BatchPoses:
         self._imu, self._spoiled = recording.imu() if "imu" in use else None, 0
         if self._imu is not None:
             self._imu, self._spoiled = without_saturation(self._imu)
-        self._crane = None
-        if self._stated is not None:
-            self._crane = check_crane(reestimate_noise(self._stated), KnownMotion(None, self._imu)).samples
+        self._crane, self._timed = None, self._stated and without_delay(self._stated, self._imu)
+        if self._timed is not None:
+            self._crane = check_crane(reestimate_noise(self._timed), KnownMotion(None, self._imu)).samples
         if self._crane is None and not self.reads_pictures:
             raise MeasurementError(f"{recording.path}: no crane encoders; measure with use: stereo")
         self._tracker = Tracker(self._predictor(), settings.front_end)
@@ -212,10 +213,10 @@ class BatchPoses:
         self._refuse_wrong_sensors(sightings)
         level = None if crane else align_with_gravity(recording)
         warnings = level.warnings if level else ()
-        if self._stated is not None:
+        if self._timed is not None:
             shift = recording.rig.timeshift_cam_imu_ns
             known = known_motion(sightings, self._imu, self._rectifier, shift)
-            checked = check_crane(reestimate_noise(self._stated), known)
+            checked = check_crane(reestimate_noise(self._timed), known)
             crane, doubts = checked.samples, checked.warnings
         warnings += saturation_sentences(self._spoiled)
         if self.reads_pictures:

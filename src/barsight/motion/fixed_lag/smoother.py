@@ -23,6 +23,7 @@ from barsight.motion.batch.fault_detection import freeze_sentences
 from barsight.motion.batch.fusion import PLACE_SPACING_S, FusionSettings, place_spacing_ns
 from barsight.motion.crane.encoder_trajectory import CraneSettings, fit_position, reestimate_noise
 from barsight.motion.crane.known_motion import way_around
+from barsight.motion.fixed_lag.delay_watch import DelayWatch
 from barsight.motion.fixed_lag.encoder_watch import EncoderWatch, with_jumps, with_sums
 from barsight.motion.fixed_lag.sensor_buffer import SensorBuffer
 from barsight.motion.fixed_lag.sliding_window import Window, add_frame, add_nodes
@@ -66,6 +67,7 @@ class FixedLagEstimator:
         self.window: Window | None = None
         self.motions: list[Sighting] = []
         self.watch = EncoderWatch()
+        self.delay = DelayWatch()
         self._failed = False
 
     def predict(self, old_ns: int, new_ns: int) -> PredictedMotion | None:
@@ -152,6 +154,8 @@ class FixedLagEstimator:
     def _check_encoders(self, stamp_ns: int) -> None:
         """Look for faults in the encoders' newest readings; positions taken beyond a new jump are removed."""
         now = self._come(stamp_ns)
+        if self.delay.check(now):  # the window holds what late readings said
+            self.window, self.watch, now = None, EncoderWatch(), self._come(stamp_ns)
         if now.crane is None or not len(now.crane.stamp_ns):
             return
         sums = self.watch.put_together(int(now.crane.stamp_ns[0]))
@@ -180,7 +184,8 @@ class FixedLagEstimator:
             return (), ()
         begin_ns = int(crane.stamp_ns[0])
         sure, maybe = jump_sentences(sorted(self.watch.told, key=lambda jump: jump.stamp_ns), begin_ns, None)
-        return (*freeze_sentences(self.watch.frozen, begin_ns), *sure), maybe
+        late = self.delay.sentences(begin_ns)
+        return (*late, *freeze_sentences(self.watch.frozen, begin_ns), *sure), maybe
 
     def _now(self, stamp_ns: int) -> SensorBuffer:
         """Select the readings that have arrived when the frame at a stamp is computed, from before the first
@@ -190,9 +195,10 @@ class FixedLagEstimator:
         return now if now.crane is None else replace(now, crane=self.watch.usable(now.crane))
 
     def _come(self, stamp_ns: int) -> SensorBuffer:
-        last = stamp_ns + self._shift_ns + self.readings.delay_ns
+        last = stamp_ns + self._shift_ns + self.readings.delay_ns + self.delay.late_ns
         begin = last if self.window is None else int(self.window.problem.stamp_ns[0])
-        return self.readings.between(begin - seconds_to_ns(LOOK_BACK_S), last)
+        come = self.readings.between(begin - seconds_to_ns(LOOK_BACK_S), last)
+        return come if come.crane is None else replace(come, crane=self.delay.without(come.crane))
 
     def _begun(self, stamp: int, sighting: Sighting | None, now: SensorBuffer) -> Window | Failed:
         # Without encoders the first frame is the origin; a node before it would take that role.

@@ -190,10 +190,11 @@ def encoder_state(values: Any, problem: Problem, sigmas: Float64) -> EncoderStat
     """Extract the encoders' estimated latency, jumps and scales. sigmas: (S,) of these unknowns."""
     found, end = encoder_unknowns_of(values), 1 + len(problem.jumps)
     sizes = np.array([jump.size_m for jump in problem.jumps], np.float64)
+    taken_s = 0.0 if problem.crane is None else problem.crane.late_ns / NS_PER_S
     share = found[end:]  # of the readings' travel
     play = PLAY_M / travel_m(problem)[list(problem.scaled)]
     return EncoderState(
-        float(found[0]), float(sigmas[0]), sizes + found[1:end], sigmas[1:end], share / (1 - share),
+        taken_s + float(found[0]), float(sigmas[0]), sizes + found[1:end], sigmas[1:end], share / (1 - share),
         np.hypot(sigmas[end:], play) / (1 - share) ** 2,
     )  # fmt: skip
 

@@ -1,0 +1,83 @@
+"""Estimate by how much the encoders' stamps are late, from the IMU's motion alone.
+
+The estimate has the latency as an unknown, but follows it only as far as its readings' parabolas hold, and a
+delay of 0.1 s of a crane that oscillates looks like jumps. So a long delay is taken off beforehand: the one
+with which the readings of a few seconds differ least from the travel by the IMU, up to the cubic that gravity
+and biases leave open.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from barsight.core.arrays import Float64
+from barsight.core.records.sensor_samples import CraneSamples, ImuSamples
+from barsight.core.stamps import NS_PER_S, seconds_to_ns
+from barsight.motion.crane.known_motion import KnownMotion
+
+LATE_S = np.arange(-30, 31) * 0.02
+"""Delays that are tried, s."""
+PART_S, MAX_PARTS = 4.0, 15
+"""Duration, s, of a part of the readings, and the maximum number of parts."""
+MIN_READINGS = 15
+MIN_LATE_S = 0.07
+"""Delays below this one are left to the estimate."""
+WILD_M = 0.02
+"""Distance from which a reading counts as wild, and no more than this."""
+CLEARLY_WORSE, MAX_LEFT_M = 1.3, 0.005
+"""Minimum ratio of the mean square of the readings as stamped to that after the delay, and maximum RMS after
+it: no more is left of 1000 parts of drawn cranes, with jumps and freezes, that aren't late (1.21).
+"""
+
+
+class DelaySearch:
+    """Mean squares of the readings against the IMU for each delay tried, over all parts so far."""
+
+    def __init__(self) -> None:
+        self._squares: Float64 = np.zeros(len(LATE_S))
+        self._count = 0
+
+    def add(self, crane: CraneSamples, imu: ImuSamples, begin_ns: int) -> bool:
+        """Add the readings of the part that begins at a stamp; return whether they told anything."""
+        spare, end_ns = seconds_to_ns(float(LATE_S[-1])), begin_ns + seconds_to_ns(PART_S)
+        first, end = np.searchsorted(crane.stamp_ns, (begin_ns, end_ns))
+        way = KnownMotion(None, imu).by_imu(crane, begin_ns - spare, end_ns + spare)
+        if end - first < MIN_READINGS or way is None:
+            return False
+        stamps, place = crane.stamp_ns[first:end], crane.position_m[first:end]
+        time = (stamps - begin_ns) / NS_PER_S / PART_S * 2 - 1
+        basis, _ = np.linalg.qr(np.polynomial.polynomial.polyvander(time, 3))
+        for k, late_s in enumerate(LATE_S.tolist()):
+            off = place - way.place_at(stamps - seconds_to_ns(late_s))
+            off -= basis @ (basis.T @ off)
+            self._squares[k] += float((np.minimum(np.abs(off), WILD_M) ** 2).mean())
+        self._count += 1
+        return True
+
+    @property
+    def late_s(self) -> float:
+        """Return the delay, s, if one explains the readings clearly better than none; else 0."""
+        if not self._count:
+            return 0.0
+        mean = self._squares / self._count
+        best, none = int(mean.argmin()), float(mean[len(LATE_S) // 2])
+        late_s = float(LATE_S[best])
+        clear = 0 < best < len(LATE_S) - 1 and mean[best] < min(none / CLEARLY_WORSE, MAX_LEFT_M**2)
+        return late_s if clear and abs(late_s) > MIN_LATE_S else 0.0
+
+
+def without_delay(crane: CraneSamples, imu: ImuSamples | None) -> CraneSamples:
+    """Take off a long delay of the readings, where the IMU shows one."""
+    if imu is None or not len(crane.stamp_ns):
+        return crane
+    search, parts = DelaySearch(), np.arange(crane.stamp_ns[0], crane.stamp_ns[-1], seconds_to_ns(PART_S))
+    for begin in parts[:: -(-len(parts) // MAX_PARTS)].tolist():
+        search.add(crane, imu, begin)
+    return shifted_back(crane, seconds_to_ns(search.late_s))
+
+
+def shifted_back(crane: CraneSamples, late_ns: int) -> CraneSamples:
+    """Stamp the readings earlier by a delay."""
+    return replace(crane, stamp_ns=crane.stamp_ns - late_ns, late_ns=late_ns) if late_ns else crane

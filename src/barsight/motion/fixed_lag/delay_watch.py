@@ -1,0 +1,48 @@
+"""Watch the encoders' delay while the crane travels, to find a long one as soon as it shows."""
+
+from __future__ import annotations
+
+from barsight.core.records.sensor_samples import CraneSamples
+from barsight.core.stamps import NS_PER_S, seconds_to_ns
+from barsight.motion.crane.encoder_delay import LATE_S, PART_S, DelaySearch, shifted_back
+from barsight.motion.fixed_lag.sensor_buffer import SensorBuffer
+
+STEP_S = 2.0
+"""Interval, s, between the beginnings of the parts that are examined."""
+
+
+class DelayWatch:
+    """Delay of the encoders' stamps so far. late_ns: 0 until one is found; from then on it is taken off."""
+
+    def __init__(self) -> None:
+        self.late_ns = 0
+        self._search = DelaySearch()
+        self._next_ns, self._found_ns = 0, 0
+
+    def check(self, now: SensorBuffer) -> bool:
+        """Examine the readings that have come; return whether they show a delay that wasn't known before."""
+        crane, imu = now.crane, now.imu
+        if self.late_ns or crane is None or imu is None or not len(imu.stamp_ns):
+            return False
+        spare, part = seconds_to_ns(float(LATE_S[-1])), seconds_to_ns(PART_S)
+        last_ns = min(int(crane.stamp_ns[-1]), int(imu.stamp_ns[-1]) - spare)
+        begin = max(self._next_ns, int(crane.stamp_ns[0]), int(imu.stamp_ns[0]) + spare)
+        while begin + part <= last_ns:
+            self._search.add(crane, imu, begin)
+            begin = self._next_ns = begin + seconds_to_ns(STEP_S)
+        self.late_ns, self._found_ns = seconds_to_ns(self._search.late_s), last_ns
+        return self.late_ns != 0
+
+    def without(self, crane: CraneSamples) -> CraneSamples:
+        """Take the delay off the stamps."""
+        return shifted_back(crane, self.late_ns)
+
+    def sentences(self, begin_ns: int) -> tuple[str, ...]:
+        """Describe the delay, with times in seconds since `begin_ns`."""
+        if not self.late_ns:
+            return ()
+        late_ms, found_s = round(1e3 * self.late_ns / NS_PER_S), (self._found_ns - begin_ns) / NS_PER_S
+        return (
+            f"the encoders are {late_ms} ms late, which showed at {found_s:.1f} s; it is taken off from then "
+            "on, and poses before are off by it (correct the encoders' stamps)",
+        )

@@ -1,0 +1,83 @@
+"""Encoders with late stamps: the delay is found by the IMU and taken off; live, it is named as a doubt."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from barsight.calibration.geometry.rectification import Rectifier
+from barsight.core.records.trajectory import Trajectory
+from barsight.evaluation.trajectory_error import Drift, trajectory_drift
+from barsight.motion.batch import fusion
+from barsight.motion.crane.encoder_delay import without_delay
+from barsight.motion.fixed_lag import estimator as live
+from barsight.recording.formats.ground_truth import GroundTruth
+from drawn_cranes import drawn_crane, drawn_senses
+from motion_recordings import MemoryRecording, tell_sightings
+from spoiled_recording import late
+from test_motion_live import ESTIMATORS
+
+
+def drawn(name: str, seed: int, late_s: float, patch: pytest.MonkeyPatch) -> tuple[Trajectory, Drift]:
+    """A drawn crane that oscillates, its encoders stamped `late_s` late, by all sensors."""
+    crane = drawn_crane(seed)
+    senses = drawn_senses(crane, seed, points=600)
+    seen = senses.sightings[:40]
+    tell_sightings(patch, {"fused": fusion, "live": live}[name], seen)
+    recording = MemoryRecording(
+        senses.rig, stamps_ns=tuple(one.stamp_ns for one in seen), imu_samples=senses.imu,
+        crane_samples=late(crane.readings, late_s),
+    )  # fmt: skip
+    found = ESTIMATORS[name]("stereo,imu,crane")(recording, Rectifier(senses.rig), lambda: None)
+    drift = trajectory_drift(found, GroundTruth(np.array(recording.stamps_ns), senses.poses[:40]), 0)
+    assert drift is not None
+    return found, drift
+
+
+@pytest.mark.parametrize("seed", [20000, 20001])
+def test_late_encoders_of_a_crane_that_oscillates_are_put_right(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They seemed to jump 80 to 180 times, and places were 40 to 60 mm off."""
+    found, drift = drawn("fused", seed, 0.2, monkeypatch)
+    assert not found.doubts and "the encoders are " in " ".join(found.warnings)
+    assert drift.reference_rmse_mm < 2 and drift.nees_position < 3
+
+
+@pytest.mark.parametrize("seed", [20000, 20009])
+def test_live_says_that_encoders_are_late(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    found, _ = drawn("live", seed, 0.2, monkeypatch)
+    (told,) = found.doubts
+    assert "the encoders are 200 ms late" in told
+    late_on = found.frames[len(found.frames) // 2 :]
+    crane = drawn_crane(seed)
+    off = [f.reference_from_body.translation - crane.path(f.stamp_ns / 1e9 - 1) for f in late_on]
+    assert np.linalg.norm(off, axis=1).max() < 0.02
+
+
+def test_live_takes_what_is_not_late_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    for late_s in (0.0, 0.04):
+        found, drift = drawn("live", 20003, late_s, monkeypatch)
+        assert not found.doubts and drift.nees_position < 2
+
+
+@pytest.mark.parametrize(("fault", "least"), [({}, 0.9), ({"jump_m": 0.1}, 0.4), ({"frozen_s": 1.0}, 0.0)])
+def test_a_delay_is_found_and_none_invented(fault: dict[str, float], least: float) -> None:
+    """What else is wrong hides a delay; it makes none."""
+    found = []
+    for seed in range(20020, 20032):
+        crane = drawn_crane(seed, **fault)
+        imu = drawn_senses(crane, seed).imu
+        assert without_delay(crane.readings, imu).late_ns == 0
+        taken_s = [without_delay(late(crane.readings, s), imu).late_ns / 1e9 for s in (-0.2, 0.2)]
+        found += [abs(taken_s[0] + 0.2) < 0.03, abs(taken_s[1] - 0.2) < 0.03]
+    assert sum(found) >= least * len(found)
+
+
+def test_without_an_imu_nothing_is_told() -> None:
+    readings = drawn_crane(20000).readings
+    assert without_delay(readings, None) is readings
+    none = replace(readings, stamp_ns=readings.stamp_ns[:0], position_m=readings.position_m[:0])
+    assert without_delay(none, drawn_senses(drawn_crane(20000), 20000).imu) is none
