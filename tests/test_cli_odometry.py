@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from barsight.cli.main import run
+from contradicting_inputs import swapped_pictures
 
 PITCH_M = 0.09
 """A bar of the development yard."""
@@ -46,6 +47,18 @@ def test_what_is_written(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     assert run(["odometry", str(whole), "-o", str(out), "--use=stereo"]) == 0
     data = json.loads((out / "odometry.json").read_text())
     assert data["reference"] == "world" and "velocity_mps" not in data["frames"][0]
+
+
+@pytest.mark.parametrize("estimator", ["fused", "live", "odometry"])
+def test_swapped_pictures_are_named(
+    recording: Path, estimator: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They were blamed on too little texture; the encoders placed all frames."""
+    swapped_pictures(recording / "mav0")
+    assert run(["odometry", str(recording), "--estimator", estimator]) != 0
+    told = capsys.readouterr()
+    assert "left and right images are swapped" in told.err and "placed" not in told.out
+    assert run(["odometry", str(recording), "--use", "imu", "crane"]) == 0
 
 
 def test_a_measured_folder_is_left_alone(

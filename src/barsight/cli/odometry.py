@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -20,12 +21,14 @@ from barsight.core.files import atomic_directory, lies_within
 from barsight.core.records.trajectory import Trajectory
 from barsight.evaluation.board_poses import board_poses, gyro_only_rmse_deg
 from barsight.evaluation.trajectory_error import Drift, frame_errors, trajectory_drift
+from barsight.mapping.recording_probe import probe_recording
 from barsight.motion.frontend.matching_example import matching_example
 from barsight.motion.settings import MotionSettings, make_estimator
 from barsight.recording.base import Recording, RecordingSettings
 from barsight.recording.formats.board_corners import CornerRecording
 from barsight.recording.formats.ground_truth import truth_of
 from barsight.recording.open import open_recording
+from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.recording.sensor_selection import SelectedSensors
 from barsight.report.files.tables import write_relative, write_trajectory
 from barsight.report.odometry_page import OdometryResult, write_odometry_page
@@ -61,6 +64,7 @@ def run(arguments: Sequence[str]) -> None:
             settings = replace(settings, fusion=replace(settings.fusion, use=",".join(use)))
             if settings.estimator == "paper":  # it has no `use` setting
                 source = SelectedSensors(source, use)
+        _refuse_swapped(source, rectifier, settings)
         trajectory = make_estimator(settings)(source, rectifier, lambda: None)
         if not trajectory.frames:
             why = trajectory.refused[0].reason if trajectory.refused else "it has no frames"
@@ -99,6 +103,15 @@ def _expect_own_folder(out: Path, recording: Path) -> None:
         raise OutputError(f"{out}: holds what barsight measure wrote; name another folder")
     if out.exists() and not out.is_dir():
         raise OutputError(f"{out}: is a file; name a folder")
+
+
+def _refuse_swapped(source: Recording, rectifier: Rectifier, settings: MotionSettings) -> None:
+    """Raise InputError where left and right are swapped; other faults of pictures are the estimate's."""
+    if settings.estimator == "crane" or "stereo" not in settings.fusion.sensors:
+        return
+    if source.index.stamps_ns and not isinstance(source, CornerRecording):
+        with suppress(MeasurementError):
+            probe_recording(RectifiedPairs(source, rectifier))
 
 
 def _summary(trajectory: Trajectory) -> list[str]:
