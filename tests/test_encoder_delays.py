@@ -65,7 +65,7 @@ def test_live_takes_what_is_not_late_as_it_is(monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.parametrize(("fault", "least"), [({}, 0.9), ({"jump_m": 0.1}, 0.4), ({"frozen_s": 1.0}, 0.0)])
 def test_a_delay_is_found_and_none_invented(fault: dict[str, float], least: float) -> None:
-    """What else is wrong hides a delay; it makes none."""
+    """Other faults may hide a delay, but they make none."""
     found = []
     for seed in range(20020, 20032):
         crane = drawn_crane(seed, **fault)
