@@ -1,6 +1,7 @@
 """Several passes over one yard: how they are tied, what changed between them, one map and one result."""
 
 import json
+import shutil
 from dataclasses import fields, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -464,6 +465,24 @@ def test_passes_lie_together_as_well_as_their_sigmas_say(passes: tuple[Path, Pat
 
 
 @pytest.mark.slow
+def test_a_pass_whose_encoders_lost_their_reference_contradicts_and_is_moved_back(
+    passes: tuple[Path, Path], tmp_path: Path
+) -> None:
+    """The bridge reads half a metre too much; the bars' pattern alone would fit anywhere."""
+    off = tmp_path / "pass_2"
+    shutil.copytree(passes[1], off)
+    path = off / "mav0/crane0/data.csv"
+    header, *lines = path.read_text().splitlines()
+    rows = [line.split(",") for line in lines]
+    moved = [f"{stamp},{float(x) + 0.5:.6f},{y},{z}" for stamp, x, y, z in rows]
+    path.write_text("\n".join([header, *moved]) + "\n")
+    yard = bs.measure([passes[0], off], at="end", **COARSE)
+    (tie,) = yard.summary["passes"][1]["ties"]
+    assert tie["contradicts"] and tie["shift_m"][0] == pytest.approx(-0.5, abs=0.01)
+    assert "passes-contradict" in [one["code"] for one in yard.summary["warnings"]]
+    assert "trajectory-degraded" in [one["code"] for one in yard.summary["vetoes"]]
+
+
 def test_passes_whose_trolley_travels_meanwhile_lie_together(tmp_path: Path) -> None:
     """The way back is driven obliquely too: the trolley goes 0.8 m within each pass."""
     oblique = replace(PASSES, seed=720021, motion=replace(PASSES.motion, trolley_m=0.8))

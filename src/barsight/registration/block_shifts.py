@@ -73,15 +73,16 @@ class BlockShifts:
 
 
 def block_shifts(
-    first: MatchedMap, second: MatchedMap, origin_m: tuple[float, float], cell_m: float
-) -> BlockShifts:
+    first: MatchedMap, second: MatchedMap, origin_m: tuple[float, float], cell_m: float,
+    begin_m: Float64 | None = None,
+) -> BlockShifts:  # fmt: skip
     """Measure the shifts of all blocks by least squares over heights and pictures (Lucas-Kanade).
 
-    first, second: on one grid, whose first cell's centre is origin_m (x, y). Bars alone don't show the shift
-    along themselves; straps, ends, rust and mill scale do. Cells whose heights differ by more than GATE_M are
-    left out. Slow changes of the brightness are removed.
+    first, second: on one grid, whose first cell's centre is origin_m (x, y). begin_m: (3,) start value. Bars
+    alone don't show the shift along themselves; straps, ends, rust and mill scale do. Cells whose heights
+    differ by more than GATE_M are left out. Slow changes of the brightness are removed.
     """
-    total, found = np.zeros(3), BlockShifts.none()
+    total, found = np.zeros(3) if begin_m is None else begin_m, BlockShifts.none()
     for _ in range(_TURNS):
         found = _measured(first, second.moved(total, cell_m), origin_m, cell_m)
         if not len(found.place_m):
@@ -107,13 +108,14 @@ def _middle(found: BlockShifts) -> Float64:
 def _measured(
     first: MatchedMap, second: MatchedMap, origin_m: tuple[float, float], cell_m: float
 ) -> BlockShifts:
-    known = np.isfinite(first.z_m) & np.isfinite(second.z_m)
-    known &= np.abs(first.z_m - second.z_m) <= GATE_M
-    known = cv2.erode(known.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    heights = [np.where(known, one.z_m, 0).astype(np.float32) for one in (first, second)]
+    both = np.isfinite(first.z_m) & np.isfinite(second.z_m)
+    both &= np.abs(first.z_m - second.z_m) <= GATE_M
+    known = _inner(both)  # where the slopes are those of known cells
+    heights = [np.where(both, one.z_m, 0).astype(np.float32) for one in (first, second)]
     variance = np.nan_to_num(first.sigma_m**2 + second.sigma_m**2, nan=1.0) + 1e-8
-    pictured = known & np.isfinite(first.gray) & np.isfinite(second.gray)
+    pictured = both & np.isfinite(first.gray) & np.isfinite(second.gray)
     pictures = [_contrast(one.gray, pictured) for one in (first, second)]
+    pictured = _inner(pictured)
     noise = pictures[0] - pictures[1]
     spread = float(1.4826 * np.median(np.abs(noise[pictured]))) if pictured.any() else 1.0
     normal = np.zeros((3, 3, *known.shape), np.float32)
@@ -130,6 +132,12 @@ def _measured(
             for j in range(3):
                 normal[i, j] += weight * jacobian[i] * jacobian[j]
     return _solved(known, heights[0], normal, wanted, origin_m, cell_m)
+
+
+def _inner(known: Bool) -> Bool:
+    """Find the cells whose neighbours are known as well."""
+    inner: Bool = cv2.erode(known.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    return inner
 
 
 def _solved(

@@ -19,6 +19,7 @@ from barsight.mapping.surface.surface import Layers, Surface, write_tile
 from barsight.mapping.surface.tile_figures import TileFigures, gather_surface, tile_figures
 from barsight.mapping.tiles import TILE_CELLS
 from barsight.registration.block_shifts import BLOCK_CELLS, BlockShifts, MatchedMap, block_shifts
+from barsight.registration.gross_shift import CoarsePair, find_gross_shift
 from barsight.registration.pass_ties import PassCorrection
 
 EDGE_M = 0.03
@@ -53,14 +54,21 @@ class JoinedSurface:
 
 
 def measure_overlaps(surfaces: Sequence[Surface]) -> dict[tuple[int, int], BlockShifts]:
-    """Match all pairs of surfaces where both have heights; keys are (first, second)."""
+    """Match all pairs of surfaces where both have heights, also where one lies grossly shifted; keys are
+    (first, second).
+    """
     found = {}
     for first, second in combinations(range(len(surfaces)), 2):
-        blocks = BlockShifts.none()
-        for column, row, columns, rows in _shared(surfaces[first], surfaces[second]):
-            one, other = (_seen(surfaces[k].window(column, row, columns, rows)) for k in (first, second))
-            cell_m = surfaces[first].cell_m
-            blocks += block_shifts(one, other, (column * cell_m, row * cell_m), cell_m)
+        blocks, cell_m = BlockShifts.none(), surfaces[first].cell_m
+        parts = list(_shared(surfaces[first], surfaces[second]))
+        coarse = []
+        for part in parts:
+            one, other = (_seen(surfaces[k].window(*part)) for k in (first, second))
+            coarse.append(CoarsePair.of(one, other, cell_m))
+        begin_m = find_gross_shift(coarse, cell_m)
+        for part in parts:
+            one, other = (_seen(surfaces[k].window(*part)) for k in (first, second))
+            blocks += block_shifts(one, other, (part[0] * cell_m, part[1] * cell_m), cell_m, begin_m)
         if len(blocks.place_m):
             found[first, second] = blocks
     return found
