@@ -74,6 +74,7 @@ def picked(way: Way, frame: StereoFrame, rng: np.random.Generator) -> dict[int, 
     [
         ("tag,stamp_ns,u,v\n", "doesn't begin with name,stamp_ns,u,v"),
         (PICKS + "a,1,2,\n", "line 2: a number is missing or is none"),
+        (PICKS + "a,1,2,5,3,5\n", "line 2 has more fields than the header; write numbers with a point"),
         (PICKS + "b,1,2,3\n", "line 2: target b isn't listed; list its surveyed place too"),
         (PICKS + "a,1,2,3\na,1,2,3\n", "line 3: a is picked twice at 1; pick it once"),
         (PICKS + "a,17,2,3\n", "there is no pair with a pose at 17; the nearest is at"),

@@ -116,6 +116,8 @@ def read_picks(path: Path, names: tuple[str, ...]) -> dict[int, dict[int, Float6
     picks: dict[int, dict[int, Float64]] = {}
     for n, line in enumerate(lines, start=2):
         fields = [field.strip() for field in line.split(",")]
+        if len(fields) > len(header):
+            raise InputError(path, f"line {n} has more fields than the header", "write numbers with a point")
         try:
             stamp_ns, pixel = int(fields[1]), np.array([float(fields[2]), float(fields[3])])
         except (ValueError, IndexError):
