@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from barsight.core.errors import InputError, OutputError
-from barsight.core.files import atomic_directory, atomic_path
+from barsight.core.files import atomic_directory, atomic_path, atomic_paths
 
 FAILURES = [RuntimeError("bug"), KeyboardInterrupt(), OSError(errno.ENOSPC, "No space left on device")]
 
@@ -78,6 +78,28 @@ def test_a_folder_appears_whole(tmp_path: Path) -> None:
     mask = os.umask(0)
     os.umask(mask)
     assert out.stat().st_mode & 0o777 == 0o777 & ~mask
+
+
+def test_a_full_disk_names_the_file_that_was_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not the temporary one, also where a page is written into a folder that isn't there yet."""
+
+    def full(self: Path, data: str) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self))
+
+    monkeypatch.setattr(Path, "write_text", full)
+
+    def write(target: Path) -> None:
+        with atomic_path(target) as path:
+            path.write_text("x")
+
+    with pytest.raises(OutputError) as caught, atomic_directory(tmp_path / "out") as folder:
+        write(folder / "page.html")
+    assert str(caught.value).startswith(f"{tmp_path / 'out' / 'page.html'}: the disk is full")
+    with pytest.raises(OutputError) as caught, atomic_paths(tmp_path / "a.yaml", tmp_path / "a.html") as two:
+        write(two[1])
+    assert str(caught.value).startswith(f"{tmp_path / 'a.html'}: the disk is full")
 
 
 def test_an_empty_folder_is_filled_a_full_one_kept(tmp_path: Path) -> None:

@@ -66,7 +66,7 @@ def _prepared(*targets: Path) -> Iterator[tuple[Path, ...]]:
         for target in targets:
             if target.exists() and not target.is_file() and not target.is_dir():
                 raise OutputError(f"{target}: is not a regular file but a pipe or a device; name a file")
-        with _staging(first.absolute()) as folder:
+        with _staging(first.absolute()) as folder, _shown(folder, first.absolute().parent):
             temporary = tuple(folder / target.name for target in targets)
             yield temporary
             for made, target in zip(reversed(temporary), reversed(targets), strict=True):
@@ -92,7 +92,7 @@ def atomic_directory(target: Path, *, replace: bool = False, owned: tuple[str, .
         made = [folder for folder in target.parents if not folder.exists()]
         target.parent.mkdir(parents=True, exist_ok=True)
     try:
-        with translated_os_errors(target), _staging(target) as staging:
+        with translated_os_errors(target), _staging(target) as staging, _shown(staging, target):
             yield staging
             if not replace:
                 # Another run may have written there in the meantime.
@@ -140,6 +140,18 @@ def changed_folder(target: Path) -> Iterator[Path]:
         for name in shown:
             if (staging / name).is_symlink():
                 (staging / name).unlink()
+
+
+@contextlib.contextmanager
+def _shown(staging: Path, folder: Path) -> Iterator[None]:
+    """Name the file that the user asked for where one in the temporary folder couldn't be written."""
+    try:
+        yield
+    except OutputError as error:
+        text = str(error)
+        if str(staging) not in text:
+            raise
+        raise OutputError(text.replace(str(staging), str(folder))) from error
 
 
 @contextlib.contextmanager
