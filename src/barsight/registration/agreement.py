@@ -13,6 +13,8 @@ from barsight.registration.rigid import MIN_POINTS, Alignment, align_rigid, desi
 
 DOUBTFUL = 0.001
 """Probability under the stated covariances below which points contradict one another."""
+MAX_LEFT_OUT = 20
+"""Maximum number of points that are left out; where more would have to be, the list as a whole is wrong."""
 RIVAL_CHI2 = -2 * np.log(DOUBTFUL)
 """Largest difference in chi2 between two points either of which may be the mistaken one."""
 
@@ -41,7 +43,7 @@ def find_agreement(source: Float64, target: Float64, covariance_m2: Float64) -> 
 
     source, target (N, 3): matched points; covariance_m2 (N, 3, 3): of each pair's difference, target axes.
     Tested are chi2 of all residuals and, for each point, the part of it that goes when that is left out. Less
-    than half of the points are left out, and three or more stay.
+    than half of the points are left out, at most MAX_LEFT_OUT, and three or more stay.
     """
     count = len(source)
     kept, out, rivals = np.ones(count, np.bool_), list[int](), list[tuple[int, ...]]()
@@ -58,7 +60,7 @@ def find_agreement(source: Float64, target: Float64, covariance_m2: Float64) -> 
         first = first or (chance, worst, float(np.sqrt(found.chi2 / free)))
         if chance >= DOUBTFUL:
             return PointAgreement(kept, tuple(out), tuple(rivals), True, *first)
-        if here.size <= max(MIN_POINTS, count // 2 + 1):
+        if here.size <= max(MIN_POINTS, count // 2 + 1, count - MAX_LEFT_OUT):
             break
         near: Int64 = here[gone > gone[worst] - RIVAL_CHI2]
         rivals.append(tuple(int(k) for k in near if k != here[worst]))

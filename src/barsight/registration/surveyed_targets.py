@@ -195,7 +195,9 @@ def _expect_apart(path: Path, names: tuple[str, ...], places_m: Float64, how: st
     wide_m = float(np.ptp(places_m, axis=0).max())
     if wide_m > MAX_APART_M:
         raise InputError(path, f"has targets that are {how} {wide_m:.0f} m apart", "give metres")
-    near = KDTree(places_m).query_pairs(SAME_M, output_type="ndarray")
-    if len(near):
-        one, other = (names[k] for k in min(map(tuple, near)))
-        raise InputError(path, f"{one} and {other} are {how} at one place", "give each target once")
+    found = KDTree(places_m).query(places_m, k=2)
+    away_m, nearest = np.asarray(found[0])[:, 1], np.asarray(found[1])
+    if away_m.min() < SAME_M:
+        k = int(np.argmax(away_m < SAME_M))
+        other = names[next(int(n) for n in nearest[k] if n != k)]
+        raise InputError(path, f"{names[k]} and {other} are {how} at one place", "give each target once")

@@ -61,6 +61,9 @@ def run(arguments: Sequence[str]) -> None:
     ) -> None:
         """Register the measurement's frame in the yard, from surveyed targets or tags, or from crane moves.
 
+        The exit code is 5, and nothing is written, where targets contradict their sigmas; the mistaken ones
+        are named.
+
         Args:
             source: A .csv of targets (name,yard_x,yard_y,yard_z,x,y,z in m; optionally sigma_m, and check = 1
                 for targets set apart), a recording that shows tags, or one in which bridge and trolley move.
