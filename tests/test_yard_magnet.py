@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -118,8 +120,13 @@ def test_a_magnet_file_that_is_not_there_is_one_line(
 
 
 @pytest.mark.parametrize(
-    "change", [{"bundles": 0}, {"max_age_s": 0.0}, {"min_confidence": 2.0}, {"max_lean_deg": 0.0}]
-)
-def test_impossible_lift_settings_are_refused(change: dict[str, float]) -> None:
+    "change",
+    [
+        {"bundles": 0}, {"max_age_s": 0.0}, {"min_confidence": 2.0}, {"max_lean_deg": 0.0},
+        {"stanchions": ((math.nan, 0.0, 1.0),)}, {"stanchions": ((0.0, 0.0, -1.0),)},
+        {"no_lift_areas": ((-math.inf, 0.0, 1.0, 1.0),)}, {"no_lift_areas": ((0.0, 0.0, 0.0, 1.0),)},
+    ],
+)  # fmt: skip
+def test_impossible_lift_settings_are_refused(change: dict[str, Any]) -> None:
     with pytest.raises(ConfigError):
-        LiftSettings(**change)  # type: ignore[arg-type]
+        LiftSettings(**change)

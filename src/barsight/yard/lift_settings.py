@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from barsight.core.errors import ConfigError
@@ -71,8 +72,12 @@ class LiftSettings:
             swing_m=POSITIVE, dunnage_m=(0, 0.5), max_turn_deg=(0, 180), max_stack_m=(OVER_0, 50),
             max_lean_deg=(OVER_0, 45),
         )  # fmt: skip
+        for stanchion in self.stanchions:
+            if not (all(map(math.isfinite, stanchion)) and stanchion[2] > 0):
+                told = ", ".join(f"{value:g}" for value in stanchion)
+                raise ConfigError(f"lift.stanchions: give x, y and a height over 0, not {told}")
         for area in self.no_lift_areas:
-            if not (area[0] < area[2] and area[1] < area[3]):
+            if not (all(map(math.isfinite, area)) and area[0] < area[2] and area[1] < area[3]):
                 told = ", ".join(f"{value:g}" for value in area)
                 raise ConfigError(f"lift.no_lift_areas: give x_min, y_min, x_max, y_max, not {told}")
 
