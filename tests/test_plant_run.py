@@ -17,7 +17,7 @@ pytest.importorskip("sqlalchemy")
 
 from barsight.cli.main import run
 from opcua_servers import free_port
-from plant_commands import LinkedPlc, plant_run, read_out, write_config
+from plant_commands import IN, LinkedPlc, plant_run, read_out, write_config
 
 
 def valid_telegrams_left(plc: LinkedPlc) -> int:
@@ -75,6 +75,19 @@ def test_a_plc_whose_life_counter_stands_gets_no_lift(tmp_path: Path) -> None:
         assert [one["status"] & 1 for one in told[4:]] == [0] * 4  # 300 ms are three telegrams
         assert {one["lift_id"] for one in told[4:]} == {0}
         plc.until_valid()
+
+
+def test_of_two_plcs_at_one_address_the_later_gets_nothing_while_the_first_is_alive(tmp_path: Path) -> None:
+    """It could report the first one's lift as failed while the load hangs."""
+    config = write_config(tmp_path, telegram={"port": (port := free_port())})
+    with plant_run(config), LinkedPlc(port) as first, LinkedPlc(port) as second:
+        first.until_valid()
+        claim = (first.life + 1, 0, 0, 0, 0, 0, 0, 1, 1, 1, 0, 0)
+        second.link.sendall(IN.pack(0xB51B, 1, *claim))
+        told = [(first.turn(), second.turn()) for _ in range(8)]
+        assert all(mine["status"] & 1 for mine, _ in told)
+        assert {(other["status"] & 1, other["answer"], other["lift_id"]) for _, other in told} == {(0, 0, 0)}
+        second.until_valid()
 
 
 def test_what_is_not_configured_or_served_is_told_in_one_line(

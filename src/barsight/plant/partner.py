@@ -34,10 +34,15 @@ class PlcPartner:
         """Return how long the PLC's life counter has stood still or been missing, in seconds."""
         return time.monotonic() - self._alive_s
 
+    @property
+    def is_alive(self) -> bool:
+        """Check that the PLC's life counter moves."""
+        return self._life is not None and self.quiet_s <= self._silent_s
+
     def receive(self, found: dict[str, int], *, is_busy: bool = False) -> bool:
         """Accept a telegram; return True if it brings a new command, for which `execute` must be called.
 
-        is_busy: whether `execute` is still running; a command is then left to the telegrams that follow.
+        is_busy: whether no command can be executed now; it is then left to the telegrams that follow.
         """
         if found["life"] != self._life:
             self._life, self._alive_s = found["life"], time.monotonic()
@@ -57,11 +62,16 @@ class PlcPartner:
             bool(flags & _MAGNET_ON), bool(flags & _SLACK), bool(flags & _REACHED),
         )  # fmt: skip
 
-    def seen(self, state: PlantState) -> PlantState:
-        """Return the state that this PLC may act on; it is invalid if the PLC's life counter stands still."""
-        if self._life is not None and self.quiet_s <= self._silent_s:
+    def seen(self, state: PlantState, *, is_second: bool = False) -> PlantState:
+        """Return the state that this PLC may act on; it is invalid if the PLC's life counter stands still.
+
+        is_second: whether another PLC with the same name is alive; the state is invalid then too.
+        """
+        if self.is_alive and not is_second:
             return state
         reason = "partner-silent: the PLC's life counter stands still"
+        if is_second:
+            reason = "partner-twice: another connection from the same address is alive"
         return replace(state, is_valid=False, reasons=(*state.reasons, reason))
 
     def execute(self, found: dict[str, int]) -> None:

@@ -28,7 +28,8 @@ class TelegramServer:
 
     def __init__(self, feed: StateReader, steps: LiftSteps, settings: TelegramSettings) -> None:
         self._feed, self._steps, self._settings = feed, steps, settings
-        self._counter = self._partners = 0
+        self._counter = 0
+        self._partners: list[PlcPartner] = []
         self.refused = 0
 
     async def run(self, ready: Callable[[int], None]) -> None:
@@ -39,20 +40,22 @@ class TelegramServer:
             await server.serve_forever()
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        self._partners += 1
+        name = plc_name(writer.get_extra_info("peername")[0])  # the same after a reconnection
+        partner = PlcPartner(name, self._steps, self._settings.silent_s)
+        self._partners.append(partner)
         try:
-            if self._partners <= MAX_PARTNERS:
-                await self._exchange(reader, writer)
+            if len(self._partners) <= MAX_PARTNERS:
+                await self._exchange(reader, writer, partner)
         except asyncio.CancelledError:
             return  # the server is ending; asyncio's streams would log a cancelled task as an error
         finally:
-            self._partners -= 1
+            self._partners.remove(partner)
             writer.close()
 
-    async def _exchange(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _exchange(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, partner: PlcPartner
+    ) -> None:
         settings = self._settings
-        name = plc_name(writer.get_extra_info("peername")[0])  # the same after a reconnection
-        partner = PlcPartner(name, self._steps, settings.silent_s)
         writer.transport.set_write_buffer_limits(high=0)  # what isn't sent at once becomes outdated
         listening = asyncio.create_task(self._listen(reader, partner))
         due_s = time.monotonic()
@@ -60,7 +63,7 @@ class TelegramServer:
             while not listening.done() and partner.quiet_s < MAX_QUIET_S:
                 self._counter += 1
                 sent_s = time.monotonic()
-                state = partner.seen(self._feed.newest(self._counter))
+                state = partner.seen(self._feed.newest(self._counter), is_second=self._is_second(partner))
                 writer.write(pack("out", out_values(state, partner.answer), settings.byte_order))
                 await asyncio.wait_for(writer.drain(), settings.silent_s)
                 due_s = max(due_s + settings.cycle_s, time.monotonic() - settings.cycle_s)
@@ -77,6 +80,7 @@ class TelegramServer:
         """Receive telegrams; an invalid one ends the connection, since the telegram boundaries are lost.
 
         While a command is being executed, the following ones are ignored: a PLC repeats them until answered.
+        So are all of a second partner.
         """
         size = layout("in").size
         step: asyncio.Task[None] | None = None
@@ -87,9 +91,17 @@ class TelegramServer:
                     self.refused += 1
                     return
                 self._feed.take_reading(partner.reading(found))
-                if partner.receive(found, is_busy=step is not None and not step.done()):
+                is_busy = (step is not None and not step.done()) or self._is_second(partner)
+                if partner.receive(found, is_busy=is_busy):
                     step = asyncio.create_task(asyncio.to_thread(partner.execute, found))
                     step.add_done_callback(self._refresh)
+
+    def _is_second(self, partner: PlcPartner) -> bool:
+        """Check whether an earlier connection from the same address is alive: claims are by address, so that
+        two cranes behind one address would end each other's lifts.
+        """
+        before = self._partners[: self._partners.index(partner)]
+        return any(one.name == partner.name and one.is_alive for one in before)
 
     def _refresh(self, _: asyncio.Task[None]) -> None:
         """Have the state read at once after a step; the telegrams don't wait for it."""
