@@ -146,6 +146,15 @@ def together(*calls: Callable[[], object]) -> list[object]:
     return results
 
 
+def test_a_survey_from_the_future_is_refused(store: Store, tmp_path: Path) -> None:
+    """It would be the newest until its time comes, and no later survey would offer a lift."""
+    ahead = write_folder(tmp_path / "ahead", age_s=-3600.0, is_simulated=False)
+    with pytest.raises(InputError, match=r"is 3[56]\d\d s ahead of this computer's clock; set the clocks"):
+        add_survey(store, read_survey(ahead), "ann")
+    now = write_folder(tmp_path / "now", shift_m=0.01, is_simulated=False)
+    assert add_survey(store, read_survey(now), "ann").is_new
+
+
 def test_a_survey_stays_where_it_is_when_a_link_to_it_moves_on(store: Store, tmp_path: Path) -> None:
     folders = [write_folder(tmp_path / name, shift_m=shift_m) for name, shift_m in (("a", 0.0), ("b", 0.01))]
     for folder in folders:

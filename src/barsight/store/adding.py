@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 
 from barsight.core.errors import InputError, MeasurementError
 from barsight.core.extras import extra
+from barsight.core.stamps import NS_PER_S
 from barsight.result_folder import file_digest, open_folder, read_heights
 from barsight.store.audit import Entry, entry
 from barsight.store.calibrations import note_calibration, why_invalid
@@ -41,6 +43,7 @@ from barsight.yard.identity import MapIdentity, expect_same_frame
 from barsight.yard.inventory.bundle_file import bundle_of, bundles_content, read_match
 from barsight.yard.lifting import lift_file
 from barsight.yard.lifting.lift_file import read_lifts, unknown_events
+from barsight.yard.lifting.validity import is_ahead
 from barsight.yard.types import Bundle, YardMap
 
 with extra("store"):
@@ -192,7 +195,9 @@ def read_survey(folder: Path) -> MeasuredSurvey:
 
 
 def _expect_new(connection: Connection, read: MeasuredSurvey) -> bool:
-    """Check that the store has no such map. Raises InputError if simulated and real ones would mix."""
+    """Check that the store has no such map. Raises InputError if simulated and real ones would mix, or if
+    the frames are ahead of this computer's clock: such a survey would stay the newest until then.
+    """
     kinds = select(SURVEYS.c.is_simulated).limit(1)
     simulated = connection.execute(kinds).scalar()
     if simulated is not None and simulated != read.identity.is_simulated:
@@ -201,7 +206,12 @@ def _expect_new(connection: Connection, read: MeasuredSurvey) -> bool:
             read.path, f"{words[0]}, the store holds {words[1]} surveys", "keep it in a store of its own"
         )
     same = select(SURVEYS.c.id).where(SURVEYS.c.map_id == read.identity.map_id)
-    return connection.execute(same).first() is None
+    if connection.execute(same).first() is not None:
+        return False
+    if is_ahead(read.to_ns, now_ns := time.time_ns()) and not read.identity.is_simulated:
+        ahead = f"its last frame is {(read.to_ns - now_ns) / NS_PER_S:.0f} s ahead of this computer's clock"
+        raise InputError(read.path, ahead, "set the clocks and survey again")
+    return True
 
 
 def _expect_same_frame(connection: Connection, read: MeasuredSurvey) -> None:
