@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import shutil
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -28,9 +30,13 @@ from barsight.store.history import parse_time
 from barsight.store.opening import Store, open_store
 from barsight.store.recordings import list_recordings
 from barsight.store.tables import LIFT_STATES
+from barsight.yard.events import YardEvent, write_events
 from page_yards import SECOND, survey
 from result_folders import summary
 from yard_folders import lifts, write_folder
+
+EVENTS = "events.csv"
+PASS = ("magnet", 9.0, 9.0, 0.0, 1.0, 1.0)
 
 DAY_NS = 86400 * NS_PER_S
 
@@ -108,10 +114,10 @@ def test_lifts_of_a_calibration_that_is_not_valid_are_not_offered(store: Store, 
 def test_lifts_that_look_back_or_are_ahead_of_the_clock_are_not_offered(
     store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The frames' clock is an hour ahead, then this computer's is set an hour back."""
+    """The second yard's, after this computer's clock was set an hour back."""
     real = summary() | {"is_simulated": False}
     monkeypatch.setattr("page_yards.summary", lambda: real)
-    folder = survey(tmp_path / "ahead", SECOND, -3600.0, with_lifts=False)
+    folder = survey(tmp_path / "back", SECOND, 1.0, with_lifts=False)
     assert lifts(folder, "--at", "end") == 0
     assert json.loads((folder / "lifts.json").read_text())["lifts"]
     add_survey(store, read_survey(folder), "ann")
@@ -127,6 +133,34 @@ def test_lifts_that_look_back_or_are_ahead_of_the_clock_are_not_offered(
         back_ns = time.time_ns() - 3600 * NS_PER_S
         monkeypatch.setattr(confirmation, "yard_clock_ns", lambda _: back_ns)
         assert expire_stale(other, "ann") == offers
+
+
+@pytest.mark.parametrize(
+    ("change", "ended"),
+    [
+        (lambda folder: lifts(folder, "--lifted", "0"), 3),
+        (
+            lambda folder: write_events(
+                [YardEvent(time.time_ns(), "magnet", 9, 9, 0, 1, 1)], folder / EVENTS
+            ),
+            3,
+        ),
+        (lambda folder: (folder / EVENTS).write_text("torn"), 3),
+        (shutil.rmtree, 0),
+    ],
+)
+def test_what_is_told_in_a_survey_s_folder_ends_the_stored_offers(
+    store: Store, tmp_path: Path, change: Callable[[Path], object], ended: int
+) -> None:
+    folder = survey(tmp_path / "one", SECOND, 1.0)
+    add_survey(store, read_survey(folder), "ann")
+    assert expire_stale(store, "ann") == 0
+    change(folder)
+    assert expire_stale(store, "ann") == ended
+    add_survey(store, read_survey(survey(tmp_path / "two", SECOND, 0.0)), "ann")
+    assert expire_stale(store, "ann") == 0
+    with store.reading() as connection:
+        assert len(open_lifts(connection)) == 3
 
 
 def test_a_recording_is_kept_with_its_reason(

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 from barsight.core.arrays import Float64
@@ -14,7 +15,7 @@ from barsight.core.errors import ConfigError, InputError
 from barsight.core.extras import extra
 from barsight.store.audit import Entry, entry, has_entry, newest_entry
 from barsight.store.calibrations import why_invalid
-from barsight.store.lift_records import find_gap, find_outlines
+from barsight.store.lift_records import find_gap, find_outlines, why_outdated
 from barsight.store.opening import Store
 from barsight.store.promotion import counts
 from barsight.store.states import has_alarm, has_standing, last_raised_ns, lift_state, raise_alarm, step_lift
@@ -321,7 +322,8 @@ def _stale(connection: Connection, clock_ns: int, set_back_s: float = 0.0) -> di
     """Return why offers and confirmations are no longer valid, by id. set_back_s: `WallClock.set_back_s`."""
     newest = newest_survey(connection)
     reasons = {}
-    reason = "" if newest is None else why_invalid(connection, newest.calibration_id, clock_ns)
+    invalid = "" if newest is None else why_invalid(connection, newest.calibration_id, clock_ns)
+    outdated = "" if newest is None else why_outdated(Path(newest.folder), newest.files)
     is_broken = has_standing(connection, "store-broken")
     for lift in open_lifts(connection):
         until_ns = lift.record["valid_until_ns"]
@@ -338,6 +340,7 @@ def _stale(connection: Connection, clock_ns: int, set_back_s: float = 0.0) -> di
             reasons[lift.lift_id] = "expired: map-too-old: it was valid for a limited time"
         elif is_ahead(lift.record.get("valid_from_ns"), clock_ns):
             reasons[lift.lift_id] = "expired: map-from-the-future: the frames are ahead of this clock"
-        elif reason:
-            reasons[lift.lift_id] = f"expired: calibration-changed: {reason}"
+        elif invalid or outdated:
+            told = f"calibration-changed: {invalid}" if invalid else f"disturbed: {outdated}"
+            reasons[lift.lift_id] = f"expired: {told}"
     return reasons

@@ -1,23 +1,28 @@
-"""Store a survey's lifts and vetoes, settle the lifts that were offered or executed before it, and compute
-the outlines of what a lift may have moved.
+"""Store a survey's lifts and vetoes, settle the lifts that were offered or executed before it, notice when
+those in its folder are others, and compute the outlines of what a lift may have moved.
 """
 
 from __future__ import annotations
 
 import json
 import math
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from barsight.core.arrays import Float64
+from barsight.core.errors import InputError
 from barsight.core.extras import extra
+from barsight.result_folder import file_digest
 from barsight.store.audit import Entry
 from barsight.store.history import executed_lifts
 from barsight.store.states import step_lift
 from barsight.store.tables import LIFT_BUNDLES, LIFT_STATES, LIFTS, SIGHTINGS, SURVEY_VETOES
-from barsight.yard.events import corners, gap_between
+from barsight.yard.events import corners, gap_between, kept_events
 from barsight.yard.inventory.bundle_file import bundle_of
+from barsight.yard.lifting.lift_file import read_lifts, unknown_events
 from barsight.yard.lifting.load import laid_at
 
 with extra("store"):
@@ -106,6 +111,38 @@ def _claimed(opened: Entry) -> list[int]:
         .order_by(LIFT_STATES.c.lift_id)
     )
     return list(opened.connection.execute(claimed).scalars())
+
+
+def why_outdated(folder: Path, files: str) -> str:
+    """Return why the lifts that were stored with a survey aren't those of its folder any more, because lifts
+    or other events were told there since; empty if they are, or if the folder can't be seen from here.
+
+    files: of the survey's row.
+    """
+    digest = json.loads(files).get("lifts.json")
+    try:
+        if digest is None or not folder.is_dir():
+            return ""
+        stats = [
+            path.stat() if path.exists() else None for path in (folder / "lifts.json", folder / "events.csv")
+        ]
+    except OSError:
+        return ""
+    return _compare(folder, digest, tuple(one and (one.st_mtime_ns, one.st_size) for one in stats))
+
+
+@lru_cache(maxsize=4)
+def _compare(folder: Path, digest: str, stats: tuple[tuple[int, int] | None, ...]) -> str:
+    """Compare a folder's lifts with the stored ones. stats: of its files, for which the answer holds."""
+    chosen = folder / "lifts.json"
+    try:
+        if stats[0] is None or file_digest(chosen) != digest:
+            return f"{chosen} was written anew since, by what happened or for another magnet"
+        if stats[1] is not None and unknown_events(read_lifts(chosen), kept_events(folder)):
+            return f"{folder / 'events.csv'} has events since"
+    except InputError as error:
+        return str(error)
+    return ""
 
 
 def find_outlines(
