@@ -455,8 +455,12 @@ def test_people_log_in(url: str) -> None:
         assert client.post(path, json=body).status_code == 200
         steps = client.get("/api/lifts").json()["lifts"]
         assert "bob (operator)" in {step["who"] for one in steps for step in one["steps"]}
-        with open_store(url) as store, entry(store, "eve", "accounts") as opened:
-            accounts.withdraw(opened, "bob")
+        with client.stream("GET", "/api/events") as stream:
+            lines = stream.iter_lines()
+            assert next(lines) == "event: revision"
+            with open_store(url) as store, entry(store, "eve", "accounts") as opened:
+                accounts.withdraw(opened, "bob")
+            assert [line for line in lines if line.startswith("event")] == [], "it ends with the account"
         wait_for(lambda: client.get("/api/state").status_code == 401)
         answers = [
             client.post("/api/session", json={"name": "eve", "password": "wrong"}).status_code
@@ -493,6 +497,12 @@ def test_a_log_in_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     now[0] += 2.5 * 3600
     with pytest.raises(AccessError, match="ended"):
         access.caller(f"barsight_session={cookie}", "")
+    cookie, _ = access.log_in("eve", PASSWORD, "a")
+    now[0] += 1.5 * 3600
+    assert access.caller(f"barsight_session={cookie}", "", is_request=False).name == "eve"
+    now[0] += 3600
+    with pytest.raises(AccessError, match="ended"):
+        access.caller(f"barsight_session={cookie}", "", is_request=False)
     cookie, _ = access.log_in("eve", PASSWORD, "a")
     known["eve"] = accounts.Account("eve", "person", "viewer", "another")
     with pytest.raises(AccessError, match="log in"):

@@ -131,8 +131,11 @@ class Access:
         """End a log-in."""
         self._sessions.pop(token_digest(_cookie(cookies)), None)
 
-    def caller(self, cookies: str, authorization: str) -> Caller:
-        """Identify the caller. Raises AccessError (401) for an unknown one."""
+    def caller(self, cookies: str, authorization: str, *, is_request: bool = True) -> Caller:
+        """Identify the caller. Raises AccessError (401) for an unknown one.
+
+        is_request: whether to count it as a request, which a log-in needs now and then.
+        """
         accounts = self._accounts()
         if authorization:
             scheme, _, token = authorization.partition(" ")
@@ -155,7 +158,7 @@ class Access:
         if now_s - known.began_s > SESSION_S or now_s - known.seen_s > IDLE_S:
             self._sessions.pop(key, None)
             raise AccessError(401, "the log-in has ended; log in again")
-        known.seen_s = now_s
+        known.seen_s = now_s if is_request else known.seen_s
         return Caller(account.name, account.role, known.csrf)
 
 

@@ -6,7 +6,7 @@ import asyncio
 import json
 import threading
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass, field
 
 from barsight.core.errors import BarsightError
@@ -157,12 +157,14 @@ class StoreWatch:
         self._seen |= {code: {reason for other, reason in present if other == code} for code in judged}
         expire_stale(self.store, WHO)
 
-    async def events(self) -> AsyncIterator[bytes]:
+    async def events(self, may_read: Callable[[], bool]) -> AsyncIterator[bytes]:
         """Stream server-sent events: each new revision and crane position. A slow reader skips those in
         between.
+
+        may_read: whether the reader's log-in lasts; the stream ends with it.
         """
         sent, shown = -1, b""
-        while not self._stop.is_set():
+        while not self._stop.is_set() and may_read():
             changed = self._changed
             assert changed is not None
             if self.published.revision != sent:

@@ -17,7 +17,7 @@ def need(access: Access, right: Right) -> Any:
     """
 
     async def find(request: Request) -> Caller:
-        caller = access.caller(request.headers.get("cookie", ""), request.headers.get("authorization", ""))
+        caller = access.caller(*_credentials(request))
         if request.method not in ("GET", "HEAD"):
             expect_csrf(caller, request.headers.get("x-barsight-token", ""))
         if not caller.may(right):
@@ -25,6 +25,19 @@ def need(access: Access, right: Right) -> Any:
         return caller
 
     return Depends(find)
+
+
+def is_known(access: Access, request: Request) -> bool:
+    """Check whether the caller of a request that still lasts would be known now."""
+    try:
+        access.caller(*_credentials(request), is_request=False)
+    except AccessError:
+        return False
+    return True
+
+
+def _credentials(request: Request) -> tuple[str, str]:
+    return request.headers.get("cookie", ""), request.headers.get("authorization", "")
 
 
 def signature(caller: Caller, name: str = "") -> str:

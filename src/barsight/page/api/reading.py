@@ -8,7 +8,7 @@ from typing import Any
 from barsight.core.extras import extra
 from barsight.core.json_values import json_value
 from barsight.page.access import Access, AccessError, Caller
-from barsight.page.api.callers import need
+from barsight.page.api.callers import is_known, need
 from barsight.page.api.forms import Stamp, TargetsForm
 from barsight.page.documents import bundle_history, bundle_records
 from barsight.page.layers import Kind, PaintedLayers, find_layers
@@ -55,8 +55,10 @@ def add_reading(app: FastAPI, watch: StoreWatch, access: Access) -> None:
         add_document(name)
 
     @app.get("/api/events")
-    async def events(_: Caller = reader) -> StreamingResponse:
-        return StreamingResponse(watch.events(), media_type="text/event-stream")
+    async def events(request: Request, _: Caller = reader) -> StreamingResponse:
+        return StreamingResponse(
+            watch.events(lambda: is_known(access, request)), media_type="text/event-stream"
+        )
 
     @app.get("/api/bundles/{name}")
     def bundle(name: str, _: Caller = reader) -> Any:
