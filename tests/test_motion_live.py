@@ -228,6 +228,22 @@ def test_pictures_that_show_nothing_for_longer_than_the_window() -> None:
     assert np.linalg.norm(off) < 0.01
 
 
+@pytest.mark.parametrize("speed_mps", [0.0, 0.2])
+@pytest.mark.parametrize("gap_s", [10, 60])
+def test_no_pictures_for_a_minute(speed_mps: float, gap_s: int) -> None:
+    """The first frame after it was metres off, up to 60 sigma: the IMU alone had led there."""
+    recording, seen, truth = steady(speed_mps, 1, frames=20 + 2 * gap_s)
+    estimator = estimator_of(recording, "stereo,imu,crane", 8)
+    for k, sighting in enumerate(seen):
+        if 10 <= k < 10 + 2 * gap_s:
+            continue
+        frame = estimator.take(replace(sighting, motion=None) if k == 10 + 2 * gap_s else sighting)
+        assert isinstance(frame, PosedFrame)
+        off = frame.reference_from_body.translation - truth.poses[k].translation
+        assert off @ np.linalg.solve(frame.covariance[3:, 3:], off) < 25
+    assert np.linalg.norm(off) < 0.02
+
+
 def turned(seen: tuple, angle: float) -> tuple:
     """Every picture turned about the camera's axis, as points that slide alike look."""
     camera = Rectifier(ideal_rig(1280, 1024)).camera

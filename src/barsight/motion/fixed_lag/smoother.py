@@ -51,6 +51,10 @@ RECENT_FRAMES = 40
 """Number of the latest frames whose motions are compared with the encoders."""
 LOOK_BACK_S = 6.0
 """Duration, s, of the IMU and encoder readings kept from before the first node held."""
+MAX_BRIDGE_S = 15.0
+"""Longest time, s, without frames after which the window goes on where encoders could begin a new one: the
+IMU's place is off by metres after 40 s.
+"""
 FIT_S = PLACE_SPACING_S / 2 + 0.01
 
 
@@ -105,6 +109,8 @@ class FixedLagEstimator:
         covered = now.crane is not None and not isinstance(
             fit_position(now.crane, stamp, seconds_to_ns(self._crane.window_s)), Failed
         )
+        if covered and self._is_long_past(stamp):
+            self.window = None  # the IMU has gone too far astray for one step; encoders place a new one
         if sighting is None and not covered:
             assert isinstance(seen, RefusedFrame)
             return seen
@@ -130,6 +136,11 @@ class FixedLagEstimator:
         covariance = window.covariance
         self.window = marginalise(window, leaving) if leaving else window
         return PosedFrame(seen.stamp_ns, pose, covariance)
+
+    def _is_long_past(self, stamp: int) -> bool:
+        """Check whether the last node is too old for the IMU to lead from it to a stamp."""
+        window = self.window
+        return window is not None and stamp - int(window.problem.stamp_ns[-1]) > seconds_to_ns(MAX_BRIDGE_S)
 
     def _is_tied(self, sighting: Sighting, stamp: int, now: SensorBuffer) -> bool:
         """Check whether pictures or IMU tie a sighting to the window."""
