@@ -24,6 +24,8 @@ Samples = TypeVar("Samples", ImuSamples, CraneSamples)
 Checked = TypeVar("Checked", ImuSamples, CraneSamples, LaserProfile)
 Packet = StereoFrame | RefusedFrame | ImuSamples | CraneSamples | LaserProfile
 """A pair, or samples received since the last packet of their kind, or a reference profile."""
+MIN_JUDGED = 10
+"""Minimum number of samples whose median shows the unit of accelerations; a few may be a shock's."""
 
 
 def packets(recording: Recording) -> Iterator[Packet]:
@@ -87,10 +89,10 @@ class PacketRecording:
             return
         packet = self._checked(packet)
         self._expect_later(packet.stamp_ns, series.last_ns)
-        if isinstance(packet, ImuSamples):
-            expect_si(self.path, packet.accel_mps2)
-        else:
+        if isinstance(packet, CraneSamples):
             self._expect_mounting(packet)
+        elif len(packet.stamp_ns) >= MIN_JUDGED:
+            expect_si(self.path, packet.accel_mps2)
         series.add(packet)
 
     def _checked(self, packet: Checked) -> Checked:
@@ -110,7 +112,7 @@ class PacketRecording:
                     self.path, f"stamps of {kind.__name__} are {values.dtype}", "give ns, integers"
                 )
             if values.dtype.kind not in "iuf" or not np.isfinite(values).all():
-                problem = f"{name} of {kind.__name__} holds what is no finite number"
+                problem = f"{name} of {kind.__name__} holds NaN, infinite values or no numbers"
                 raise InputError(self.path, problem, "leave such samples out")
             arrays[name] = values
         return replace(packet, **arrays)
