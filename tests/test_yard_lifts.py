@@ -340,6 +340,21 @@ def test_mass_that_cannot_be_told() -> None:
     assert "mass-unknown" in codes(judged([laid(0.3)], (record(laid(0.3), bar_diameter_m=math.nan),)))
 
 
+@pytest.mark.parametrize("sigma_m", [0.002, 0.01])
+def test_the_gap_over_a_bundle_that_sags_is_known_whatever_the_maps_sigma(sigma_m: float) -> None:
+    """9 m of bars that hang 13 mm lower under the middle poles than at the outer poles' ends."""
+    heights = map_of([laid(0.3, length_m=9.0)], y_m=(-5.5, 5.5), sigma_m=0.001)
+    sag_m = (0.016 * (heights.y_m / 2.55) ** 2)[:, None]
+    heights.z_m[:] += np.where(heights.z_m > 0.03, sag_m, 0.0).astype(np.float32)
+    heights.sigma_m[:] = sigma_m
+    lift = judged([laid(0.3, length_m=9.0)], place=Placement(0.3, 0.0, 0.0), heights=heights)
+    assert lift.contact is not None
+    least = [pole.min_gap_m for pole in lift.contact.poles]
+    # The inner poles' outer ends are 1.15 m off the middle.
+    assert least == pytest.approx([0, 0.016 - 0.016 * (1.15 / 2.55) ** 2, 0.0128, 0], abs=0.003)
+    assert "gap" in codes(lift)
+
+
 def test_a_section_that_was_seen_stands_in_for_a_count() -> None:
     one = record(laid(0.3), bars=None, section_m2=0.04, sigma=replace(SIGMA, section_m2=0.008))
     mass = bundle_mass(one)

@@ -102,22 +102,23 @@ def test_a_departure_counts_by_how_far_it_is_from_straight() -> None:
 
 
 def test_a_straight_load_stays_and_what_departs_is_drawn_to_it() -> None:
-    """A section of five columns that slopes along; then a pole and a point of it are raised."""
+    """A section of five columns that slopes and sags along; then poles and a point of it are raised."""
     rng = np.random.default_rng(4)
-    pole, column, part = (a.ravel() for a in np.mgrid[:3, :5, :9])
+    pole, column, part = (a.ravel() for a in np.mgrid[:5, :5, :9])
     known = np.zeros((pole.size, COLUMNS))
-    known[:, V] = 1.5 * (pole - 1) + 0.1 * (part - 4)
+    known[:, V] = v = 1.5 * (pole - 2) + 0.1 * (part - 4)
     section = rng.normal(0.4, 0.02, 5)
-    known[:, Z] = section[column] + 0.01 * known[:, V]
     known[:, SIGMA], known[:, POLE] = 0.003, pole
-    straight = known[:, Z].copy()
-    np.testing.assert_allclose(_straight(known, column, 0.001), straight, atol=1e-12)
-    middle, point = pole == 1, 3 * 45 // 2
-    known[middle, Z] += 0.004
+    for sag in (0.0, -0.001, 0.001):
+        known[:, Z] = straight = section[column] + 0.01 * v + sag * v**2
+        np.testing.assert_allclose(_straight(known, column, 0.001), straight, atol=2e-5)
+    # Neither a slope nor a sag shares in these.
+    raised, point = 0.002 * np.array([-1, 2, 0, -2, 1])[pole], 5 * 45 // 2
+    known[:, Z] += raised
     known[point, Z] += 0.002
-    wanted = straight + np.where(middle, _likely(0.004, 0.003), 0.0)
+    wanted = straight + np.array([_likely(rise, 0.003) for rise in raised])
     wanted[point] += _likely(0.002, 0.001)
-    np.testing.assert_allclose(_straight(known, column, 0.001), wanted, atol=2e-5)
+    np.testing.assert_allclose(_straight(known, column, 0.001), wanted, atol=1e-4)
 
 
 def test_a_load_that_runs_askew_and_bends_under_the_beam_is_straight_all_the_same() -> None:

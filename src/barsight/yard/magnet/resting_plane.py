@@ -30,9 +30,10 @@ NEAR_LINE_M = 0.02
 """Distance (m) of a height from its line along the bars beyond which it has less weight in the load's slope;
 at twice this it has none.
 """
-ASKEW, BENT_PER_M = 0.005, 0.002
-"""Standard deviations of the angle between a load's axis and the beam (rad), and of its sideways bend (m from
-its middle, per metre along squared): with either, its section lies elsewhere under each pole.
+ASKEW, BENT_PER_M, SAG_PER_M = 0.005, 0.002, 0.002
+"""Standard deviations of the angle between a load's axis and the beam (rad), and of its bends sideways and
+downwards (m from its middle, per metre along squared). With the first two its section lies elsewhere under
+each pole; the last one is how bars sag between their supports, or hang down beyond them.
 """
 COLUMNS = 8
 U, V, Z, SCATTER, SEEN, ALL, SIGMA, POLE = range(COLUMNS)
@@ -91,7 +92,7 @@ def _columns(u: Float64) -> Int64:
 def _straight(known: Float64, column: Int64, noise: float) -> Float64:
     """Estimate the most likely heights (N,); column: (N,) number of the place across."""
     u, v, z, pole = known[:, U], known[:, V], known[:, Z], known[:, POLE]
-    path, steep, line, along = np.zeros(3), np.zeros(z.size), np.zeros(z.size), np.zeros(z.size)
+    path, steep, line, along = np.zeros(4), np.zeros(z.size), np.zeros(z.size), np.zeros(z.size)
     rest, near, sigma = np.empty(z.size), np.empty(z.size), known[:, SIGMA]
     for _ in range(4):
         for k in range(z.size):
@@ -104,6 +105,7 @@ def _straight(known: Float64, column: Int64, noise: float) -> Float64:
         path = _path(v, rest, steep, near, max(noise, 1e-3))
         for k in range(z.size):
             along[k] = path[0] * v[k] - steep[k] * (path[1] * v[k] + path[2] * v[k] ** 2)
+            along[k] += path[3] * v[k] ** 2
     apart, unsure, number = np.empty(z.size), np.empty(z.size), pole.astype(np.int64)
     for k in range(z.size):
         line[k] += along[k]
@@ -153,29 +155,30 @@ def _steepness(u: Float64, line: Float64) -> Float64:
 
 @kernel()
 def _path(v: Float64, rise: Float64, steep: Float64, weight: Float64, noise: float) -> Float64:
-    """Estimate how a load runs under the beam (3,): slope, sideways turn and sideways bend per metre.
+    """Estimate how a load runs under the beam (4,): slope, sideways turn, sideways bend and sag per metre.
 
     rise: (N,) heights over the section at places v (N,) along, m; steep: (N,) its slope across; weight: (N,).
-    noise: m. Linear least squares, with priors of ASKEW and BENT_PER_M on turn and bend.
+    noise: m. Linear least squares, with priors of ASKEW, BENT_PER_M and SAG_PER_M on turn, bend and sag.
     """
-    normal, right = np.zeros((3, 3)), np.zeros(3)
+    normal, right = np.zeros((4, 4)), np.zeros(4)
+    middle = (weight * v**2).sum() / max(weight.sum(), 1e-9)
     for k in range(v.size):
-        term = v[k], -steep[k] * v[k], -steep[k] * v[k] ** 2
-        for a in range(3):
+        term = v[k], -steep[k] * v[k], -steep[k] * v[k] ** 2, v[k] ** 2 - middle
+        for a in range(4):
             right[a] += weight[k] * term[a] * rise[k]
-            for b in range(3):
+            for b in range(4):
                 normal[a, b] += weight[k] * term[a] * term[b]
-    for a, sigma in ((0, 1.0), (1, ASKEW), (2, BENT_PER_M)):
+    for a, sigma in ((0, 1.0), (1, ASKEW), (2, BENT_PER_M), (3, SAG_PER_M)):
         normal[a, a] += (noise / sigma) ** 2
     # Gaussian elimination: LAPACK's solver would take half of this module's compile time.
-    for a in range(2):
-        for b in range(a + 1, 3):
+    for a in range(3):
+        for b in range(a + 1, 4):
             share = normal[b, a] / normal[a, a]
             right[b] -= share * right[a]
-            for c in range(a, 3):
+            for c in range(a, 4):
                 normal[b, c] -= share * normal[a, c]
-    for a in (2, 1, 0):
-        for c in range(a + 1, 3):
+    for a in (3, 2, 1, 0):
+        for c in range(a + 1, 4):
             right[a] -= normal[a, c] * right[c]
         right[a] /= normal[a, a]
     return right
