@@ -161,12 +161,16 @@ class StoreWatch:
         """Stream server-sent events: each new revision and crane position. A slow reader skips those in
         between.
 
-        may_read: whether the reader's log-in lasts; the stream ends with it.
+        may_read: whether the reader's log-in lasts; the stream ends with it, by an event after which the page
+        asks and reads that it must log in.
         """
         sent, shown = -1, b""
-        while not self._stop.is_set() and may_read():
+        while not self._stop.is_set():
             changed = self._changed
             assert changed is not None
+            if not may_read():
+                yield b"event: revision\ndata: 0\n\n"
+                return
             if self.published.revision != sent:
                 sent = self.published.revision
                 yield f"event: revision\nid: {sent}\ndata: {sent}\n\n".encode()
