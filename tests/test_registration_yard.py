@@ -111,6 +111,21 @@ def test_a_wrong_metre_and_a_check_that_is_off_are_said() -> None:
     assert "f is" in judged(measured, off, covariance, checks=1).contradictions[0]
 
 
+def test_many_honest_checks_whose_depth_is_less_sure_are_no_contradiction() -> None:
+    refused = 0
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        measured = rng.uniform((-2, -3, -8), (20, 3, -6.5), (28, 3))
+        noise = rng.normal(0, (0.001, 0.001, 0.006), (28, 3))
+        covariance = np.tile(np.diag([1e-6, 1e-6, 36e-6]), (28, 1, 1))
+        yard = TRUTH.apply(measured) + noise
+        apart = np.arange(28) >= 8
+        found = calibrate_yard(tuple(map(str, range(28))), measured, yard, covariance, apart, "world")
+        assert isinstance(found, YardCalibration)
+        refused += bool(found.contradictions)
+    assert refused <= 1
+
+
 def moved(seed: int, trolley_m: float, walk_m: float = 0.0) -> MovedYard | Failed:
     """A bridge of 12 m, then a trolley; odometry with noise and, where asked, errors that go together."""
     rng = np.random.default_rng(seed)

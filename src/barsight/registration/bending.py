@@ -11,7 +11,7 @@ from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import Failed
 from barsight.core.pose import skew
 from barsight.registration.rigid import align_rigid, design_rows
-from barsight.registration.yard import YardCalibration, calibrate_yard, predicted_sigma
+from barsight.registration.yard import YardCalibration, calibrate_yard, predicted_covariance
 
 BENDS = ("deflection_m", "skew_rad", "rail_m")
 ORDINARY = (0.02, 0.001, 0.01)
@@ -138,13 +138,13 @@ def _joined(
     bent = replace(bend, values=values, covariance=joint)
     turn = alignment.target_from_source.rotation
     design = np.concatenate([design_rows(at @ turn.T), turn @ slopes], axis=2)
-    sigma = predicted_sigma(design, joint, covariance_m2, rigid.checks)
+    spread = predicted_covariance(design, joint, covariance_m2, rigid.checks)
     untold = [
         f"the targets hardly tell {name}: let bridge and trolley travel further"
         for name, one, most, is_fitted in zip(BENDS, bent.sigma, ORDINARY, bend.fitted, strict=True)
         if is_fitted and one > UNTOLD * most
     ]
-    return replace(rigid, alignment=alignment, sigma_m=sigma, doubts=(*rigid.doubts, *untold)), bent
+    return replace(rigid, alignment=alignment, spread_m2=spread, doubts=(*rigid.doubts, *untold)), bent
 
 
 def bend_carry(bend: CraneBend, turn: Float64, place_m: Float64) -> Float64:

@@ -5,16 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import chdtrc
 
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import Failed
-from barsight.registration.agreement import find_agreement
+from barsight.registration.agreement import DOUBTFUL, find_agreement
 from barsight.registration.rigid import Alignment, align_rigid, design_rows
 
 STRANGE = 0.01
 """Probability under the stated sigmas below which residuals that don't contradict them are doubtful."""
-MAX_OFF = 4.0
-"""Largest distance of a check from where the frame puts it, in sigmas of a coordinate."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,8 +21,9 @@ class YardCalibration:
     """alignment: yard_from_<frame>, of the points that agree.
 
     names: (N,) of the points; yard_m: (N, 3) their positions; checks: (N,) those that took no part, or that
-    the others contradict. off_m: (N, 3) yard minus moved point; sigma_m: (N,) expected RMS of its coordinates
-    (1 sigma). doubts: sentences; contradictions: sentences that forbid the use.
+    the others contradict. off_m: (N, 3) yard minus moved point; spread_m2: (N, 3, 3) its expected covariance.
+    doubts: sentences. disagreement: sentences about all points that forbid the use; mistaken: by the number
+    of a point that the others contradict, those that may be mistaken in its place.
     """
 
     alignment: Alignment
@@ -31,9 +31,32 @@ class YardCalibration:
     yard_m: Float64
     checks: Bool
     off_m: Float64
-    sigma_m: Float64
+    spread_m2: Float64
     doubts: tuple[str, ...]
-    contradictions: tuple[str, ...]
+    disagreement: tuple[str, ...]
+    mistaken: dict[int, str]
+
+    @property
+    def sigma_m(self) -> Float64:
+        """Return the expected RMS (N,) of the coordinates of off_m."""
+        sigma: Float64 = np.sqrt(np.trace(self.spread_m2, axis1=1, axis2=2) / 3)
+        return sigma
+
+    @property
+    def contradictions(self) -> tuple[str, ...]:
+        """List what forbids the use: disagreement, mistaken points, and checks that are further off than all
+        of them together are by chance.
+        """
+        at = np.flatnonzero(self.checks)
+        off = self.off_m[at]
+        chi2 = np.einsum("ni,ni->n", off, np.linalg.solve(self.spread_m2[at], off[..., None])[..., 0])
+        wrong = at.size * chdtrc(3, chi2) < DOUBTFUL
+        return self.disagreement + tuple(
+            f"{self.names[k]} is {1e3 * np.linalg.norm(self.off_m[k]):.1f} mm off, its sigma is "
+            f"{1e3 * self.sigma_m[k]:.1f} mm{self.mistaken.get(k, '')}"
+            for k, is_wrong in zip(at.tolist(), wrong, strict=True)
+            if is_wrong or k in self.mistaken
+        )
 
     @property
     def turn_sigma_deg(self) -> float:
@@ -59,26 +82,21 @@ def calibrate_yard(
     found = _aligned(measured, yard, covariance_m2, ~checks, frame)
     if isinstance(found, Failed):
         return found
-    contradictions, rivals, doubts = list[str](), dict[int, str](), list[str]()
+    disagreement, mistaken, doubts = list[str](), dict[int, str](), list[str]()
     if covariance_m2 is not None and covariance_m2.ndim == 3:
-        judged = _judged(names, measured, yard, covariance_m2, ~checks, found)
-        contradictions, rivals, doubts = judged
-    if rivals:
-        checks = checks | np.isin(np.arange(len(names)), list(rivals))
+        disagreement, mistaken, doubts = _judged(names, measured, yard, covariance_m2, ~checks, found)
+    if mistaken:
+        checks = checks | np.isin(np.arange(len(names)), list(mistaken))
         found = _aligned(measured, yard, covariance_m2, ~checks, frame)
         assert not isinstance(found, Failed)
     off = yard - found.target_from_source.apply(measured)
     design = design_rows(measured @ found.target_from_source.rotation.T)
     own = np.full(len(measured), found.sigma_m**2) if covariance_m2 is None else covariance_m2
-    sigma = predicted_sigma(design, found.covariance, own, checks)
-    length = np.linalg.norm(off, axis=1)
-    contradictions += [
-        f"{names[k]} is {1e3 * length[k]:.1f} mm off, its sigma is {1e3 * sigma[k]:.1f} mm{rivals.get(k, '')}"
-        for k in np.flatnonzero(checks).tolist()
-        if length[k] > MAX_OFF * sigma[k] or k in rivals
-    ]
+    spread = predicted_covariance(design, found.covariance, own, checks)
     doubts += _wrong_metre(found)
-    return YardCalibration(found, names, yard, checks, off, sigma, tuple(doubts), tuple(contradictions))
+    return YardCalibration(
+        found, names, yard, checks, off, spread, tuple(doubts), tuple(disagreement), mistaken
+    )
 
 
 def _aligned(
@@ -93,7 +111,7 @@ def _judged(
     names: tuple[str, ...], measured: Float64, yard: Float64, covariance_m2: Float64, used: Bool,
     found: Alignment,
 ) -> tuple[list[str], dict[int, str], list[str]]:  # fmt: skip
-    """Judge the used points by their sigmas. Returns contradictions; mistaken points, each with those that
+    """Judge the used points by their sigmas. Returns disagreement; mistaken points, each with those that
     may be mistaken in its place; and doubts.
     """
     at = np.flatnonzero(used)
@@ -124,17 +142,14 @@ def _wrong_metre(found: Alignment) -> tuple[str, ...]:
     )
 
 
-def predicted_sigma(design: Float64, covariance: Float64, own_m2: Float64, checks: Bool) -> Float64:
-    """Predict the RMS (N,) over the axes of a point's own noise and, for checks, also of the fit's error
-    there.
+def predicted_covariance(design: Float64, covariance: Float64, own_m2: Float64, checks: Bool) -> Float64:
+    """Predict the covariance (N, 3, 3) of a point's own noise and, for checks, also of the fit's error there.
 
     design (N, 3, P): derivatives of the points by the fitted unknowns, covariance (P, P) of these. own_m2:
     variance (N,) of a coordinate, or covariance (N, N) of the points or (N, 3, 3) of the axes.
     """
-    if own_m2.ndim == 2:
-        own_m2 = np.diag(own_m2)
-    elif own_m2.ndim == 3:
-        own_m2 = np.trace(own_m2, axis1=1, axis2=2) / 3
-    placed = np.einsum("nij,jk,nik->n", design, covariance, design) / 3
-    sigma: Float64 = np.sqrt(own_m2 + np.where(checks, placed, 0.0))
-    return sigma
+    if own_m2.ndim < 3:
+        own_m2 = (np.diag(own_m2) if own_m2.ndim == 2 else own_m2)[:, None, None] * np.eye(3)
+    placed = np.einsum("nij,jk,nlk->nil", design, covariance, design)
+    predicted: Float64 = own_m2 + checks[:, None, None] * placed
+    return predicted
