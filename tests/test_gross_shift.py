@@ -64,6 +64,21 @@ def test_what_changed_is_no_shift(later: tuple[np.ndarray, np.ndarray]) -> None:
     assert not find_gross_shift([pair], CELL_M).any()
 
 
+def test_a_layer_laid_on_most_of_a_yard_is_no_shift_in_height() -> None:
+    """It lies as the one below does, with straps at the same places; beside it the floor stays."""
+    rng = np.random.default_rng(0)
+    bars = np.tile(np.cos(np.arange(COLUMNS) * np.pi / 2.5), (ROWS, 1))
+    bars[:, ::16] = -2
+    maps = []
+    for rise_m in (0.0, 0.25):
+        z, gray = 0.25 + rise_m + 0.02 * bars, 130 + 40 * bars + rng.normal(0, 10, bars.shape)
+        gray[[40, 41, 150, 151]] = 30
+        z[:15], z[-15:], gray[:15], gray[-15:] = 0, 0, 60, 60
+        z = z + cv2.GaussianBlur(rng.normal(0, 0.01, z.shape), (0, 0), 1.5)
+        maps.append(MatchedMap(*(one.astype(np.float32) for one in (z, np.full_like(z, 0.004), gray))))
+    assert not find_gross_shift([CoarsePair.of(*maps, CELL_M)], CELL_M).any()
+
+
 def test_nothing_in_common_is_no_shift() -> None:
     empty = np.full((ROWS, COLUMNS), np.nan, np.float32)
     nothing = MatchedMap(empty, empty, empty)

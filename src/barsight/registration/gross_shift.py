@@ -30,8 +30,10 @@ VOTER_M, MIN_VOTES, MIN_VOTERS_RATIO = 0.64, 0.7, 0.3
 """Size of the parts that vote between the shift and none; minimum share of votes for it, and minimum share of
 the parts that vote: fewer may show a bundle that was moved.
 """
-MIN_LEVEL_RATIO = 0.7
-"""Minimum share of the common cells within GATE_M of a common difference in height."""
+MIN_LEVEL_RATIO, MAX_STILL_RATIO = 0.7, 0.05
+"""Minimum share of the common cells within GATE_M of a common difference in height; maximum share of those
+that kept their height: floor beside a layer that was laid since does.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +82,8 @@ def find_gross_shift(pairs: Sequence[CoarsePair], cell_m: float) -> Float64:
         ])  # fmt: skip
         off = off[np.isfinite(off)]
         level = float(np.median(off)) if off.size else 0.0
-        if abs(level) > GATE_M and np.mean(np.abs(off - level) < GATE_M) >= MIN_LEVEL_RATIO:
+        still = np.mean(np.abs(off) < min(GATE_M, abs(level) / 2)) > MAX_STILL_RATIO
+        if abs(level) > GATE_M and np.mean(np.abs(off - level) < GATE_M) >= MIN_LEVEL_RATIO and not still:
             shift[2] = level
     return shift
 
