@@ -92,6 +92,19 @@ def test_fewer_bits_in_sixteen_are_refused_and_black_is_not(bits: int) -> None:
     assert not to_gray(np.zeros((4, 4), np.uint16)).any()
 
 
+def test_a_dark_picture_that_was_scaled_to_sixteen_bits_is_read() -> None:
+    """A whole night was refused, frame by frame, although its levels show that they were scaled."""
+    rng = np.random.default_rng(0)
+    night = np.clip(rng.normal(20, 8, (60, 80)), 0, 60).astype(np.uint8)
+    np.testing.assert_array_equal(to_gray(night.astype(np.uint16) * 257), night)
+    twelve = np.clip(rng.normal(320, 96, (60, 80)), 0, 1000).astype(np.uint16)
+    assert np.abs(to_gray(twelve << 4) - twelve / 16).max() < 1
+    fourteen = 16 * twelve // 4 + rng.integers(0, 4, twelve.shape).astype(np.uint16)
+    for raw in (twelve, fourteen, 4 * night.astype(np.uint16), 16 * night.astype(np.uint16)):
+        with pytest.raises(TornImageError, match="full 16 bits"):
+            to_gray(raw)
+
+
 def test_kinds_that_would_be_misread_are_refused_by_name() -> None:
     image = picture(0)
     white = io.BytesIO()

@@ -14,9 +14,13 @@ from numpy.typing import NDArray
 
 from barsight.core.arrays import UInt8
 
-MIN_BITS = 15
-"""Minimum number of bits that the brightest value of a 16-bit picture uses; fewer are those of a camera with
-10, 12 or 14 bits, unscaled.
+MIN_BRIGHTEST = 1 << 14
+"""Minimum of the brightest value of a 16-bit picture; a lower one is that of a camera with 10, 12 or 14 bits,
+unscaled, or of a dark picture.
+"""
+MIN_DARK, DARK_STEP, DARK_LEVELS = 1 << 12, 16, 8
+"""Minimum of the brightest value of a dark picture, minimum difference between its neighbouring levels, which
+one of 12 bits or fewer has when it is scaled to all 16, and minimum number of its levels.
 """
 _NARROWED = ((np.arange(1 << 16) + 128) // 257).astype(np.uint8)
 """Lookup table from 16-bit to 8-bit values."""
@@ -30,7 +34,7 @@ def to_gray(image: NDArray[Any]) -> UInt8:
     """Convert (H, W), (H, W, 3) BGR or (H, W, 4) BGRA, 8 or 16 bits, to (H, W) uint8.
 
     Raises `TornImageError` for other kinds, and for 16-bit pictures that use only the lower 14 bits or fewer,
-    which would be too dark.
+    unless their levels show that they were scaled: others would be too dark.
     """
     if image.ndim not in (2, 3):
         raise TornImageError(f"has the shape {image.shape}; (H, W) or (H, W, 3) is needed")
@@ -59,7 +63,7 @@ def eight_bits(image: NDArray[Any]) -> UInt8:
     """Convert 16 bits to 8. Raises `TornImageError` as `to_gray` does."""
     if image.dtype == np.uint16:
         brightest = int(image.max(initial=0))
-        if 0 < brightest < 1 << (MIN_BITS - 1):
+        if 0 < brightest < MIN_BRIGHTEST and not _is_dark(image, brightest):
             problem = f"is a 16-bit picture whose brightest value is {brightest}"
             raise TornImageError(f"{problem}: scale it to the full 16 bits, or to 8")
         narrow = np.empty(image.shape, np.uint8)
@@ -69,3 +73,13 @@ def eight_bits(image: NDArray[Any]) -> UInt8:
     if image.dtype != np.uint8:
         raise TornImageError(f"has {image.dtype} pixels; 8 or 16 bits are needed")
     return np.asarray(image, dtype=np.uint8)
+
+
+def _is_dark(image: NDArray[np.uint16], brightest: int) -> bool:
+    """Check whether a 16-bit picture without bright values was scaled to all 16 bits, so that it leaves
+    levels out.
+    """
+    if brightest < MIN_DARK:
+        return False
+    levels = np.flatnonzero(np.bincount(image.ravel()))
+    return levels.size >= DARK_LEVELS and int(np.diff(levels).min()) >= DARK_STEP
