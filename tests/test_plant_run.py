@@ -78,7 +78,7 @@ def test_a_plc_whose_life_counter_stands_gets_no_lift(tmp_path: Path) -> None:
 
 
 def test_of_two_plcs_at_one_address_the_later_gets_nothing_while_the_first_is_alive(tmp_path: Path) -> None:
-    """It could report the first one's lift as failed while the load hangs."""
+    """It could report the first one's lift as failed while the load hangs, also if that is silent a while."""
     config = write_config(tmp_path, telegram={"port": (port := free_port())})
     with plant_run(config), LinkedPlc(port) as first, LinkedPlc(port) as second:
         first.until_valid()
@@ -86,8 +86,19 @@ def test_of_two_plcs_at_one_address_the_later_gets_nothing_while_the_first_is_al
         second.link.sendall(IN.pack(0xB51B, 1, *claim))
         told = [(first.turn(), second.turn()) for _ in range(8)]
         assert all(mine["status"] & 1 for mine, _ in told)
+        told += [(first.turn(), second.turn())] + [(told[0][0], second.turn()) for _ in range(8)]
         assert {(other["status"] & 1, other["answer"], other["lift_id"]) for _, other in told} == {(0, 0, 0)}
+        first.until_valid()
+        first.link.close()
         second.until_valid()
+
+
+def test_a_plc_that_comes_again_is_served_while_its_old_connection_stands(tmp_path: Path) -> None:
+    config = write_config(tmp_path, telegram={"port": (port := free_port())})
+    with plant_run(config), LinkedPlc(port) as cut_off:
+        cut_off.until_valid()
+        with LinkedPlc(port) as again:
+            again.until_valid()
 
 
 def test_what_is_not_configured_or_served_is_told_in_one_line(

@@ -137,3 +137,22 @@ def test_telegrams_that_waited_for_a_late_plc_are_told_by_the_echo(plant: Plant)
     )
     assert all(fresh[5:20]) and all(fresh[-5:])
     assert not one.wrong
+
+
+def test_readings_of_a_second_plc_at_one_address_are_not_the_cranes(
+    plant: Plant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bridges_m = list[float]()
+    monkeypatch.setattr(StateFeed, "take_reading", lambda _, reading: bridges_m.append(reading.bridge_m))
+    with (
+        served(plant.store, plant.settings, TelegramSettings(port=0, cycle_s=0.02)) as one,
+        socket.create_connection(("127.0.0.1", one.port), timeout=5) as first,
+        socket.create_connection(("127.0.0.1", one.port), timeout=5) as second,
+    ):
+        for life in range(1, 20):
+            first.sendall(telegram(life))
+            first.recv(98, socket.MSG_WAITALL)
+            if life > 3:
+                second.sendall(IN.pack(0xB51B, 1, life, 0, 0, 10_000, *[0] * 8))
+                second.recv(98, socket.MSG_WAITALL)
+    assert len(bridges_m) > 10 and set(bridges_m) == {0.0}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import replace
 
@@ -21,7 +22,7 @@ class PlcPartner:
         self.name, self._steps, self._silent_s = name, steps, silent_s
         self._answer: dict[str, int] = {}
         self._life: int | None = None
-        self._alive_s = time.monotonic()
+        self._alive_s, self._began_s = time.monotonic(), math.inf
         self._number: int | None = None
 
     @property
@@ -39,6 +40,15 @@ class PlcPartner:
         """Check that the PLC's life counter moves."""
         return self._life is not None and self.quiet_s <= self._silent_s
 
+    def is_second_to(self, other: PlcPartner) -> bool:
+        """Check whether this is another PLC with the same name as one that began before and is alive.
+
+        If the other has been heard since this one began, it isn't the same PLC, reconnected: then it may also
+        be silent for a while.
+        """
+        is_later = other.name == self.name and other._began_s < self._began_s
+        return is_later and (other.is_alive or other._alive_s > self._began_s)
+
     def receive(self, found: dict[str, int], *, is_busy: bool = False) -> bool:
         """Accept a telegram; return True if it brings a new command, for which `execute` must be called.
 
@@ -46,6 +56,7 @@ class PlcPartner:
         """
         if found["life"] != self._life:
             self._life, self._alive_s = found["life"], time.monotonic()
+            self._began_s = min(self._began_s, self._alive_s)
         if is_busy:
             return False
         is_new = found["command"] != NOTHING and found["command_number"] != self._number

@@ -80,7 +80,7 @@ class TelegramServer:
         """Receive telegrams; an invalid one ends the connection, since the telegram boundaries are lost.
 
         While a command is being executed, the following ones are ignored: a PLC repeats them until answered.
-        So are all of a second partner.
+        All that a second partner sends is ignored.
         """
         size = layout("in").size
         step: asyncio.Task[None] | None = None
@@ -90,18 +90,19 @@ class TelegramServer:
                 if isinstance(found, Failed):
                     self.refused += 1
                     return
-                self._feed.take_reading(partner.reading(found))
-                is_busy = (step is not None and not step.done()) or self._is_second(partner)
+                is_second = self._is_second(partner)
+                if not is_second:
+                    self._feed.take_reading(partner.reading(found))
+                is_busy = (step is not None and not step.done()) or is_second
                 if partner.receive(found, is_busy=is_busy):
                     step = asyncio.create_task(asyncio.to_thread(partner.execute, found))
                     step.add_done_callback(self._refresh)
 
     def _is_second(self, partner: PlcPartner) -> bool:
-        """Check whether an earlier connection from the same address is alive: claims are by address, so that
-        two cranes behind one address would end each other's lifts.
+        """Check whether another PLC at the same address is served: claims are by address, so that two cranes
+        behind one address would end each other's lifts.
         """
-        before = self._partners[: self._partners.index(partner)]
-        return any(one.name == partner.name and one.is_alive for one in before)
+        return any(partner.is_second_to(one) for one in self._partners)
 
     def _refresh(self, _: asyncio.Task[None]) -> None:
         """Have the state read at once after a step; the telegrams don't wait for it."""
