@@ -10,9 +10,12 @@ import pytest
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.records.trajectory import Trajectory
 from barsight.evaluation.trajectory_error import Drift, trajectory_drift
+from barsight.inertial.model import ORDINARY_NOISE
 from barsight.motion.batch import fusion
 from barsight.motion.crane.encoder_delay import without_delay
 from barsight.motion.fixed_lag import estimator as live
+from barsight.motion.fixed_lag.delay_watch import DelayWatch
+from barsight.motion.fixed_lag.sensor_buffer import SensorBuffer
 from barsight.recording.formats.ground_truth import GroundTruth
 from drawn_cranes import drawn_crane, drawn_senses
 from motion_recordings import MemoryRecording, tell_sightings
@@ -46,11 +49,12 @@ def test_late_encoders_of_a_crane_that_oscillates_are_put_right(
     assert drift.reference_rmse_mm < 2 and drift.nees_position < 3
 
 
-@pytest.mark.parametrize("seed", [20000, 20009])
-def test_live_says_that_encoders_are_late(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    found, _ = drawn("live", seed, 0.2, monkeypatch)
+@pytest.mark.parametrize(("seed", "late_s"), [(20000, 0.2), (20009, 0.2), (20003, -0.2)])
+def test_live_says_that_encoders_are_late(seed: int, late_s: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With those that are early, most frames were refused."""
+    found, _ = drawn("live", seed, late_s, monkeypatch)
     (told,) = found.doubts
-    assert "the encoders are 200 ms late" in told
+    assert f"the encoders are 200 ms {'late' if late_s > 0 else 'early'}" in told and not found.refused
     late_on = found.frames[len(found.frames) // 2 :]
     crane = drawn_crane(seed)
     off = [f.reference_from_body.translation - crane.path(f.stamp_ns / 1e9 - 1) for f in late_on]
@@ -79,5 +83,15 @@ def test_a_delay_is_found_and_none_invented(fault: dict[str, float], least: floa
 def test_without_an_imu_nothing_is_told() -> None:
     readings = drawn_crane(20000).readings
     assert without_delay(readings, None) is readings
-    none = replace(readings, stamp_ns=readings.stamp_ns[:0], position_m=readings.position_m[:0])
-    assert without_delay(none, drawn_senses(drawn_crane(20000), 20000).imu) is none
+    for count in (0, 1):
+        few = replace(readings, stamp_ns=readings.stamp_ns[:count], position_m=readings.position_m[:count])
+        assert without_delay(few, drawn_senses(drawn_crane(20000), 20000).imu) is few
+
+
+def test_live_goes_on_where_encoders_have_not_begun_or_have_ended() -> None:
+    """The frame ended the whole run."""
+    crane = drawn_crane(20000)
+    watch, stamps = DelayWatch(), crane.readings.stamp_ns
+    buffer = SensorBuffer(crane.readings, drawn_senses(crane, 20000).imu, ORDINARY_NOISE)
+    for begin_ns, end_ns in ((0, stamps[0]), (stamps[-1] + 1, stamps[-1] + 10**9)):
+        assert not watch.check(buffer.between(int(begin_ns), int(end_ns)))

@@ -70,7 +70,7 @@ class DelaySearch:
 
 def without_delay(crane: CraneSamples, imu: ImuSamples | None) -> CraneSamples:
     """Take off a long delay of the readings, where the IMU shows one."""
-    if imu is None or not len(crane.stamp_ns):
+    if imu is None or len(crane.stamp_ns) < MIN_READINGS:
         return crane
     search, parts = DelaySearch(), np.arange(crane.stamp_ns[0], crane.stamp_ns[-1], seconds_to_ns(PART_S))
     for begin in parts[:: -(-len(parts) // MAX_PARTS)].tolist():

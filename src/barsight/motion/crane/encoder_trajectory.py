@@ -149,8 +149,9 @@ def fit_position(
     first, last = np.searchsorted(crane.stamp_ns, (begin_ns, end_ns))
     stamps: Int64 = crane.stamp_ns[first:last]
     if stamps.size < 4 or stamps[0] > stamp_ns or stamps[-1] < stamp_ns:
-        away = np.abs(crane.stamp_ns - stamp_ns).min(initial=np.iinfo(np.int64).max) / NS_PER_S
-        reason = f"{stamps.size} encoder readings around the frame (the nearest {away:.2f} s away)"
+        reason = f"{stamps.size} encoder readings around the frame"
+        if len(crane.stamp_ns):
+            reason += f" (the nearest {np.abs(crane.stamp_ns - stamp_ns).min() / NS_PER_S:.2f} s away)"
         if READINGS_PER_SIDE * crane.interval_ns > MAX_REACH_NS:
             apart_s = crane.interval_ns / NS_PER_S
             reason += f"; they come {apart_s:.2f} s apart: give at least four a second"

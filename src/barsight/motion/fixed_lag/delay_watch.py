@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from barsight.core.records.sensor_samples import CraneSamples
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
-from barsight.motion.crane.encoder_delay import LATE_S, PART_S, DelaySearch, shifted_back
+from barsight.motion.crane.encoder_delay import LATE_S, PART_S, DelaySearch
 from barsight.motion.fixed_lag.sensor_buffer import SensorBuffer
 
 STEP_S = 2.0
@@ -22,7 +21,7 @@ class DelayWatch:
     def check(self, now: SensorBuffer) -> bool:
         """Examine the readings that have come; return whether they show a delay that wasn't known before."""
         crane, imu = now.crane, now.imu
-        if self.late_ns or crane is None or imu is None or not len(imu.stamp_ns):
+        if self.late_ns or not (crane and len(crane.stamp_ns) and imu and len(imu.stamp_ns)):
             return False
         spare, part = seconds_to_ns(float(LATE_S[-1])), seconds_to_ns(PART_S)
         last_ns = min(int(crane.stamp_ns[-1]), int(imu.stamp_ns[-1]) - spare)
@@ -33,16 +32,13 @@ class DelayWatch:
         self.late_ns, self._found_ns = seconds_to_ns(self._search.late_s), last_ns
         return self.late_ns != 0
 
-    def without(self, crane: CraneSamples) -> CraneSamples:
-        """Take the delay off the stamps."""
-        return shifted_back(crane, self.late_ns)
-
     def sentences(self, begin_ns: int) -> tuple[str, ...]:
         """Describe the delay, with times in seconds since `begin_ns`."""
         if not self.late_ns:
             return ()
-        late_ms, found_s = round(1e3 * self.late_ns / NS_PER_S), (self._found_ns - begin_ns) / NS_PER_S
+        off_ms, found_s = round(1e3 * self.late_ns / NS_PER_S), (self._found_ns - begin_ns) / NS_PER_S
+        off = f"{abs(off_ms)} ms {'late' if off_ms > 0 else 'early'}"
         return (
-            f"the encoders are {late_ms} ms late, which showed at {found_s:.1f} s; it is taken off from then "
-            "on, and poses before are off by it (correct the encoders' stamps)",
+            f"the encoders are {off}, which showed at {found_s:.1f} s; it is taken off from then on, and "
+            "poses before are off by it (correct the encoders' stamps)",
         )

@@ -82,7 +82,7 @@ class FixedLagPoses(ImmediatePoses):
     def place(self, seen: FrameInput) -> PosedFrame | RefusedFrame:
         """Track the frame and estimate its pose."""
         self._estimator.readings = readings = self._readings()
-        self.delay_ns = readings.delay_ns + self._estimator.delay.late_ns
+        self.delay_ns = readings.delay_ns + max(0, self._estimator.delay.late_ns)
         pair = pictures_of(seen)
         if isinstance(pair, Failed):
             return self._estimator.take(RefusedFrame(seen.stamp_ns, pair.reason))

@@ -10,6 +10,7 @@ from barsight.calibration.geometry.imu_noise import ImuNoise
 from barsight.core.records.sensor_samples import CraneSamples, ImuSamples
 from barsight.core.stamps import seconds_to_ns
 from barsight.inertial.model import without_saturation
+from barsight.motion.crane.encoder_delay import shifted_back
 
 SENSOR_DELAY_S = 0.06
 """Delay, s, after a frame's stamp until which readings are awaited before the frame is computed."""
@@ -37,14 +38,18 @@ class SensorBuffer:
         is_slow = newest.interval_ns > seconds_to_ns(SLOW_S)
         return seconds_to_ns(SLOW_DELAY_S if is_slow else SENSOR_DELAY_S)
 
-    def between(self, first_ns: int, last_ns: int) -> SensorBuffer:
-        """Select the readings between two stamps, without those at the limit of the IMU range."""
+    def between(self, first_ns: int, last_ns: int, late_ns: int = 0) -> SensorBuffer:
+        """Select the readings between two stamps, without those at the limit of the IMU range.
+
+        late_ns: delay of the encoders' stamps, which is taken off.
+        """
         crane, imu = self.crane, self.imu
         if crane is not None:
-            part = slice(*np.searchsorted(crane.stamp_ns, (first_ns, last_ns)))
-            crane = replace(crane, stamp_ns=crane.stamp_ns[part], position_m=crane.position_m[part])
+            part = slice(*np.searchsorted(crane.stamp_ns, (first_ns + late_ns, last_ns + late_ns)))
+            near = replace(crane, stamp_ns=crane.stamp_ns[part], position_m=crane.position_m[part])
+            crane = shifted_back(near, late_ns)
         if imu is not None:
             part = slice(*np.searchsorted(imu.stamp_ns, (first_ns, last_ns)))
-            near = ImuSamples(imu.stamp_ns[part], imu.gyro_radps[part], imu.accel_mps2[part])
-            imu, _ = without_saturation(near)
+            imu = ImuSamples(imu.stamp_ns[part], imu.gyro_radps[part], imu.accel_mps2[part])
+            imu, _ = without_saturation(imu)
         return SensorBuffer(crane, imu, self.noise)

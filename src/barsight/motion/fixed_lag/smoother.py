@@ -206,10 +206,9 @@ class FixedLagEstimator:
         return now if now.crane is None else replace(now, crane=self.watch.usable(now.crane))
 
     def _come(self, stamp_ns: int) -> SensorBuffer:
-        last = stamp_ns + self._shift_ns + self.readings.delay_ns + self.delay.late_ns
+        last = stamp_ns + self._shift_ns + self.readings.delay_ns
         begin = last if self.window is None else int(self.window.problem.stamp_ns[0])
-        come = self.readings.between(begin - seconds_to_ns(LOOK_BACK_S), last)
-        return come if come.crane is None else replace(come, crane=self.delay.without(come.crane))
+        return self.readings.between(begin - seconds_to_ns(LOOK_BACK_S), last, self.delay.late_ns)
 
     def _begun(self, stamp: int, sighting: Sighting | None, now: SensorBuffer) -> Window | Failed:
         # Without encoders the first frame is the origin; a node before it would take that role.
