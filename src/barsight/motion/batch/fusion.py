@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from barsight.calibration.geometry.rectification import Rectifier
-from barsight.core.arrays import Int64
 from barsight.core.errors import ConfigError, Failed, InputError, MeasurementError
 from barsight.core.motion_detail import NormalisedResiduals
 from barsight.core.records.pairs import NamedPoints, RefusedFrame
@@ -29,6 +28,7 @@ from barsight.motion.crane.encoder_trajectory import (
     reestimate_noise,
 )
 from barsight.motion.crane.known_motion import KnownMotion
+from barsight.motion.crane.places import indices_apart, place_spacing_ns, placed_frames
 from barsight.motion.estimator import FrameInput, TrajectoryEstimator
 from barsight.motion.frame_to_frame.visual_odometry import StereoOdometry
 from barsight.motion.frontend.board_corners import PointTracker, split_tracks
@@ -52,12 +52,6 @@ if TYPE_CHECKING:
     from barsight.motion.batch.bundle_adjustment import Estimate
 
 SENSORS = ("stereo", "imu", "crane")
-PLACE_SPACING_S = 0.4
-
-
-def place_spacing_ns(crane: CraneSamples) -> int:
-    """Return the interval of encoder positions: each reading counts for one of them."""
-    return max(seconds_to_ns(PLACE_SPACING_S), 2 * crane.reach_ns(0))
 
 
 @dataclass(frozen=True)
@@ -168,7 +162,7 @@ class BatchPoses:
         frames = np.array([s.stamp_ns for s in inputs.sightings], np.int64)
         refused = list(inputs.refused)
         if inputs.crane is not None:
-            frames, gone = _placed_frames(recording, inputs.crane, frames, shift)
+            frames, gone = placed_frames(recording, inputs.crane, frames, shift)
             left = set(frames.tolist())
             refused = gone + [r for r in refused if r.stamp_ns not in left]
             refused = list({r.stamp_ns: r for r in refused}.values())
@@ -290,7 +284,7 @@ class BatchPoses:
         placed: tuple[EncoderPosition, ...] = ()
         attitudes: list[AttitudePrior] = []
         if inputs.crane is not None:
-            chosen = _apart(nodes.stamp_ns, place_spacing_ns(inputs.crane))
+            chosen = indices_apart(nodes.stamp_ns, place_spacing_ns(inputs.crane))
             placed = encoder_positions(inputs.crane, inputs.imu, nodes.stamp_ns, chosen)
             nominal = inputs.crane.yard_from_body_nominal
             sigmas = self._attitude_sigmas_deg(chosen, ties.still)
@@ -329,35 +323,3 @@ class BatchPoses:
         moving, standing = self._crane_settings.attitude_std_deg * 1.6, [k for k in chosen if k in still]
         at_rest = self._crane_settings.sway_std_deg * len(standing) ** 0.5
         return {k: at_rest if k in standing else moving for k in chosen}
-
-
-def _placed_frames(
-    recording: Recording, crane: CraneSamples, sighted: Int64, shift: int
-) -> tuple[Int64, list[RefusedFrame]]:
-    """List the stamps of all frames that encoders or pictures place, and the refused frames. Raises
-    MeasurementError where the pictures place some and the encoders none: nothing then ties them to the yard.
-    """
-    known, failed = set(sighted.tolist()), dict[int, Failed]()
-    stamps_ns = recording.index.stamps_ns
-    for stamp in stamps_ns:
-        fit = fit_position(crane, stamp + shift, seconds_to_ns(0.35))
-        if isinstance(fit, Failed):
-            failed[stamp] = fit
-    refused = [RefusedFrame(stamp, fit.reason) for stamp, fit in failed.items() if stamp not in known]
-    if known and len(failed) == len(stamps_ns):
-        reason = failed[stamps_ns[0]].reason
-        raise MeasurementError(
-            f"{recording.path}: the encoders place no frame ({reason}); give more readings on the pictures' "
-            "clock, or measure without them (use: stereo,imu)"
-        )
-    frames = [stamp for stamp in stamps_ns if stamp not in failed or stamp in known]
-    return np.array(frames, np.int64), refused
-
-
-def _apart(stamp_ns: Int64, min_ns: int) -> list[int]:
-    """Select indices of stamps at least about `min_ns` apart, starting with the first."""
-    chosen = [0]
-    for k in range(1, len(stamp_ns)):
-        if stamp_ns[k] - stamp_ns[chosen[-1]] >= 0.97 * min_ns:
-            chosen.append(k)
-    return chosen

@@ -20,9 +20,10 @@ from barsight.core.stamps import seconds_to_ns
 from barsight.features.guided_matching import PredictedMotion
 from barsight.inertial.preintegration import Preintegrated
 from barsight.motion.batch.fault_detection import freeze_sentences
-from barsight.motion.batch.fusion import PLACE_SPACING_S, FusionSettings, place_spacing_ns
+from barsight.motion.batch.fusion import FusionSettings
 from barsight.motion.crane.encoder_trajectory import CraneSettings, fit_position, reestimate_noise
 from barsight.motion.crane.known_motion import way_around
+from barsight.motion.crane.places import PLACE_SPACING_S, place_spacing_ns
 from barsight.motion.fixed_lag.delay_watch import DelayWatch
 from barsight.motion.fixed_lag.encoder_watch import EncoderWatch, with_jumps, with_sums
 from barsight.motion.fixed_lag.sensor_buffer import SensorBuffer
