@@ -185,6 +185,18 @@ def test_pictures_of_other_kinds_become_the_readers_gray(whole: Path, tmp_path: 
             bs.StereoFrame(stamp, picture, frame.right)
 
 
+def test_whole_numbers_in_a_first_packet_dont_cut_the_later_ones(whole: Path, tmp_path: Path) -> None:
+    """Stamps of 32 bits wrapped, and 9.81 became 9."""
+    recording, _, imu, _ = packed(bs.open_recording(whole), tmp_path)
+    level = np.array([[0, 0, 10]])
+    recording.add(replace(imu, stamp_ns=np.array([0], np.int32), gyro_radps=0 * level, accel_mps2=level))
+    recording.add(imu)
+    kept = recording.imu()
+    assert kept is not None
+    np.testing.assert_array_equal(kept.stamp_ns[1:], imu.stamp_ns)
+    np.testing.assert_array_equal(kept.accel_mps2[1:], imu.accel_mps2)
+
+
 def test_packets_that_are_no_measurements_are_refused(whole: Path, tmp_path: Path) -> None:
     recording, frame, imu, crane = packed(bs.open_recording(whole), tmp_path)
     late = replace(crane, stamp_ns=crane.stamp_ns + 10**12)
@@ -192,6 +204,7 @@ def test_packets_that_are_no_measurements_are_refused(whole: Path, tmp_path: Pat
         (frame.left, "a ndarray is no packet; give one of StereoFrame"),
         ((frame.left, frame.right), "a tuple is no packet"),
         (replace(imu, stamp_ns=imu.stamp_ns / 1e9), "stamps of ImuSamples are float64; give ns"),
+        (replace(imu, stamp_ns=5), "stamp_ns of ImuSamples has the shape"),  # type: ignore[arg-type]
         (replace(imu, gyro_radps=imu.gyro_radps[1:]), "gyro_radps of ImuSamples has the shape"),
         (replace(imu, accel_mps2=imu.accel_mps2 / 9.81), "probably in g"),
         (replace(crane, position_m=crane.position_m[:, :2]), "position_m of CraneSamples has the shape"),

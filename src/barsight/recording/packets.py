@@ -85,7 +85,7 @@ class PacketRecording:
             self._stamps_ns.append(packet.stamp_ns)
 
     def _add_samples(self, packet: Samples, series: _Grown[Samples]) -> None:
-        if not len(packet.stamp_ns):
+        if not np.size(packet.stamp_ns):
             return
         packet = self._checked(packet)
         self._expect_later(packet.stamp_ns, series.last_ns)
@@ -96,7 +96,9 @@ class PacketRecording:
         series.add(packet)
 
     def _checked(self, packet: Checked) -> Checked:
-        """Return a packet with its arrays as NumPy's. Raises InputError unless they are complete."""
+        """Return a packet with its arrays as NumPy's: stamps int64, the others float64. Raises InputError
+        unless they are complete.
+        """
         kind: type = type(packet)
         arrays = dict[str, Any]()
         count: int | None = None
@@ -114,7 +116,8 @@ class PacketRecording:
             if values.dtype.kind not in "iuf" or not np.isfinite(values).all():
                 problem = f"{name} of {kind.__name__} holds NaN, infinite values or no numbers"
                 raise InputError(self.path, problem, "leave such samples out")
-            arrays[name] = values
+            # Later packets are written into an array of the first one's type.
+            arrays[name] = values.astype(np.int64 if name == "stamp_ns" else np.float64, copy=False)
         return replace(packet, **arrays)
 
     def _expect_mounting(self, packet: CraneSamples) -> None:
