@@ -133,8 +133,8 @@ def _levers(poles: tuple[Pole, ...]) -> tuple[Float64, Float64]:
     """Compute the poles' middle (2,), along and across, and how each one's share (P, 2) grows with the load's
     offset from it.
 
-    Where the poles stand closer to one line than their faces are wide, the faces themselves are the longer
-    lever: they carry most of the moment by pressing on one side, which `pried_ratio` judges.
+    Where the poles stand closer to one line than 0.3 of their faces' width, the faces themselves are the
+    longer lever: they carry most of the moment by pressing on one side, which `pried_ratio` judges.
     """
     places = np.array([(pole.along_m, pole.across_m) for pole in poles])
     faces = np.array([(pole.length_m, pole.width_m) for pole in poles])
