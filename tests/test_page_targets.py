@@ -20,7 +20,7 @@ from barsight.page.api.serve import ServeOptions, serving
 from barsight.page.targets import Pick, place_pick
 from barsight.registration.rigid import design_rows
 from barsight.registration.surveyed_targets import read_targets
-from barsight.registration.yard import predicted_sigma
+from barsight.registration.yard import predicted_covariance
 from barsight.registration.yard_file import read_yard_file
 from barsight.store.accounts import add_person
 from barsight.store.audit import entry
@@ -302,5 +302,6 @@ def test_rendered_columns_place_the_yard(tmp_path: Path) -> None:
     assert frame.doubts == ()
     off_m = np.linalg.norm(frame.yard_from.apply(np.array(at)) - true, axis=1)
     design = design_rows(np.array(at) @ frame.yard_from.rotation.T)
-    sigma_m = predicted_sigma(design, frame.covariance, np.zeros(6), np.ones(6, bool))
+    spread_m2 = predicted_covariance(design, frame.covariance, np.zeros(6), np.ones(6, bool))
+    sigma_m = np.sqrt(np.trace(spread_m2, axis1=1, axis2=2) / 3)
     assert off_m.max() < 0.02 and (off_m < 2 * 3**0.5 * sigma_m).all()
