@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from barsight.calibration.geometry.rectification import Rectifier
-from barsight.core.errors import MeasurementError
+from barsight.core.errors import Failed, MeasurementError
 from barsight.core.records.trajectory import Trajectory
 from barsight.evaluation.trajectory_error import Drift, trajectory_drift
 from barsight.motion.batch import fusion
-from barsight.motion.crane.encoder_trajectory import CraneSettings, EncoderOdometry
+from barsight.motion.crane.encoder_trajectory import CraneSettings, EncoderOdometry, fit_position
 from barsight.motion.fixed_lag import estimator as live
 from barsight.recording.formats.ground_truth import GroundTruth
 from drawn_cranes import drawn_crane, drawn_senses
@@ -66,3 +66,15 @@ def test_encoders_that_are_too_slow_are_refused_by_name(name: str, monkeypatch: 
     monkeypatch.setattr("test_slow_encoders.trajectory_drift", lambda *_: "none")
     found, _ = drawn(name, "stereo,imu,crane", 20003, 2.0, monkeypatch)
     assert not found.frames and all(words in frame.reason for frame in found.refused) and crane.fault is None
+
+
+@pytest.mark.parametrize(
+    ("count", "words"),
+    [(0, "0 encoder readings around the frame"), (2, "2 encoder readings around"), (9, "on one side of the")],
+)
+def test_why_readings_place_no_frame(count: int, words: str) -> None:
+    read = drawn_crane(20003).readings
+    read = replace(read, stamp_ns=read.stamp_ns[:count], position_m=read.position_m[:count])
+    after_ns = int(read.stamp_ns[-1]) + 1 if count else 0
+    found = fit_position(read, after_ns, 350_000_000)
+    assert isinstance(found, Failed) and words in found.reason and len(found.reason) < 80

@@ -149,7 +149,8 @@ def fit_position(
     first, last = np.searchsorted(crane.stamp_ns, (begin_ns, end_ns))
     stamps: Int64 = crane.stamp_ns[first:last]
     if stamps.size < 4 or stamps[0] > stamp_ns or stamps[-1] < stamp_ns:
-        reason = f"{stamps.size} encoder readings around the frame"
+        where = "on one side of" if stamps.size >= 4 else "around"
+        reason = f"{stamps.size} encoder readings {where} the frame"
         if len(crane.stamp_ns):
             reason += f" (the nearest {np.abs(crane.stamp_ns - stamp_ns).min() / NS_PER_S:.2f} s away)"
         if READINGS_PER_SIDE * crane.interval_ns > MAX_REACH_NS:
