@@ -22,7 +22,7 @@ from barsight.motion.problem.gtsam_factors import build_graph
 from barsight.motion.problem.problem import Problem, encoder_unknowns_of
 from barsight.motion.problem.rig_drift import drift_floor, drift_prior
 
-MAYBE_SIGMAS = 3.3
+MAYBE_SIGMAS = 4.5
 """Significance from which a scale may be wrong, so that it becomes an unknown."""
 MIN_WAY_M = 0.5
 """Minimum travel on an axis for its scale to be told."""
