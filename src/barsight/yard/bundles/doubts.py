@@ -60,6 +60,7 @@ _STUB_M, _HIDES_M, _MIN_LOST_M = 0.3, 0.05, 0.015
 """Lengths (m) along a bundle: that of what is too short to be another one at its end; maximum distance from
 what lies across it of the rows that this hides; minimum of a gap between two bundles.
 """
+StraightSections = tuple[Float64, float, float, float]
 _SURE_KNOWN = 0.7
 """Minimum share of a bundle's length that must have been measured; below it, the bundle gets a doubt."""
 
@@ -206,14 +207,15 @@ def _shows_carrier(reading: Reading, width_m: float) -> bool:
 def list_cover_doubts(reading: Reading, reasons: tuple[Doubt, ...]) -> tuple[Doubt, ...]:
     """List the objects that may hold the bundle down although no other bundle is known to lie on it."""
     out = [doubt for doubt in reasons if doubt.kind is DoubtKind.CROSSED]
-    laid, is_clear = measure_laid(reading)
+    sections = straight_sections(reading)
+    laid, is_clear = measure_laid(sections)
     if is_clear:
         said = f"something {1e3 * laid:.0f} mm high lies over a part of its width"
         out.append(Doubt(DoubtKind.OTHER, said))
     elif laid > 0:
         said = f"something {1e3 * laid:.0f} mm high beside it may lie over its flank"
         out.append(Doubt(DoubtKind.HIDDEN_FLANK, said))
-    if (along := measure_along(reading)) > _ALONG_M:
+    if (along := measure_along(sections)) > _ALONG_M:
         said = f"something {1e3 * along:.0f} mm over its outline lies along on it"
         out.append(Doubt(DoubtKind.OTHER, said))
     if reading.flanks is not None and reading.flanks.cover_doubt:
@@ -241,7 +243,7 @@ def _bounds(reading: Reading) -> tuple[float, float]:
     return (-half, half) if pack is None or not pack.is_bounded else (pack.low_m, pack.high_m)
 
 
-def measure_laid(reading: Reading) -> tuple[float, bool]:
+def measure_laid(sections: StraightSections | None) -> tuple[float, bool]:
     """Measure the rise (m) of the highest object that lies over a part of a bundle's width, as a beam's end
     does, 0 where there is none. Also return whether any object rises by _LAID_M over the section even if
     the section is shifted sideways by a cell.
@@ -251,16 +253,14 @@ def measure_laid(reading: Reading) -> tuple[float, bool]:
     axis, where a gully shows at the rim, lies beside the bundle, as dunnage does. A steep flank that is off
     by a cell rises as much; an object on a bundle rests on its crest and rises over the shifted section too.
     """
-    grid = reading.found.grid
-    sections = _straight_sections(reading)
     if sections is None:
         return 0.0, False
-    z, axis_z_m, width_m = sections
+    z, axis_z_m, width_m, cell_m = sections
     own = known_median(z)
     sunken = (own < axis_z_m - _GULLY_RATIO * width_m)[0]
     gully = np.logical_and.accumulate(sunken) | np.logical_and.accumulate(sunken[::-1])[::-1]
     rises = np.isfinite(z) & ~(gully & (z < axis_z_m)) & (z - own > _LAID_M)
-    size = [max(round(side / grid.cell_m), 1) for side in _LAID_SIZE_M]
+    size = [max(round(side / cell_m), 1) for side in _LAID_SIZE_M]
     square = np.ones(size, bool)
     seen = ndimage.uniform_filter(rises.astype(np.float64), size, mode="constant")
     fits = ndimage.binary_erosion(rises | np.isnan(z), square) & (seen > _MIN_SEEN_RATIO - 1e-6)
@@ -269,24 +269,23 @@ def measure_laid(reading: Reading) -> tuple[float, bool]:
     return float((z - own)[laid].max(initial=0.0)), bool((z - highest > _LAID_M)[laid].any())
 
 
-def measure_along(reading: Reading) -> float:
+def measure_along(sections: StraightSections | None) -> float:
     """Measure the rise (m) of a bundle's own section, the median along it, over its outline's top: a bar that
     lies along on it rises so all the way. Negative where it is lower, 0 where it isn't known.
     """
-    sections = _straight_sections(reading)
     if sections is None:
         return 0.0
-    z, axis_z_m, width_m = sections
+    z, axis_z_m, width_m, cell_m = sections
     own = known_median(z)[0]
-    cells = max(round(_LAID_SIZE_M[1] / reading.found.grid.cell_m), 1)
+    cells = max(round(_LAID_SIZE_M[1] / cell_m), 1)
     ridge = ndimage.minimum_filter1d(np.where(np.isfinite(own), own, -np.inf), cells)
     return float(ridge.max()) - axis_z_m - width_m / 2 if np.isfinite(ridge).any() else 0.0
 
 
-def _straight_sections(reading: Reading) -> tuple[Float64, float, float] | None:
+def straight_sections(reading: Reading) -> StraightSections | None:
     """Look up the heights (R, C) of a bundle's rows from flank to flank, less the rise along its axis, NaN
-    where unknown; and the height of its axis and its width. None where it is too short. The rows of a bowed
-    bundle are shifted sideways into line.
+    where unknown; the height of its axis, its width and the cells' size. None where it is too short. The rows
+    of a bowed bundle are shifted sideways into line.
 
     The bow is the parabola b (x^2 - 1/3), x from -1 to 1 along the bundle, that brings all rows closest to
     their median section: the fitted axis is the mean of such a bundle.
@@ -308,7 +307,7 @@ def _straight_sections(reading: Reading) -> tuple[Float64, float, float] | None:
         cost = float(np.nanmean(misfit)) + _BOW_COST_M * abs(bow) if np.isfinite(misfit).any() else np.inf
         if cost < least:
             best, least = bow, cost
-    return _sections(reading, rows, beside + best * parabola), axis_z_m, high_m - low_m
+    return _sections(reading, rows, beside + best * parabola), axis_z_m, high_m - low_m, grid.cell_m
 
 
 def _sections(reading: Reading, rows: Int64, beside: Float64) -> Float64:
