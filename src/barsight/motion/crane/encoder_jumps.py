@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from barsight.core.arrays import Float64
 from barsight.core.linalg.dense import one_blas_thread
 from barsight.core.linalg.robust import mad_sigma
 from barsight.core.records.sensor_samples import CraneSamples, EncoderJump
@@ -23,6 +24,12 @@ from barsight.motion.crane.jump_window import (
     JumpWindow,
 )
 from barsight.motion.crane.known_motion import KnownMotion
+from barsight.motion.crane.springs import find_springs, with_springs
+
+MIN_FOR_NOISE = 20
+"""Minimum number of readings from which their noise is estimated."""
+FAST_RATIO = 0.5
+"""Speed, as a ratio of the fastest axis's, from which stamps that jitter show in the readings."""
 
 
 @one_blas_thread()
@@ -45,6 +52,8 @@ def find_jumps(
     around = {m: JumpWindow.around(series, sigma_m, m, known) for m in middles.tolist()}
     windows = {m: window for m, window in around.items() if window is not None and window.beyond.size}
     jumps = [[jump for jump in crane.jumps if jump.axis == axis] for axis in range(3)]
+    springs = find_springs(list(windows.values()), jumps)
+    windows = {m: with_springs(window, springs) for m, window in windows.items()}
     steps = {(m, axis): windows[m].largest_step(axis, jumps[axis]) for m in windows for axis in range(3)}
     found: list[EncoderJump] = []
     while candidates := [step for step in steps.values() if step is not None]:
@@ -135,22 +144,42 @@ def _thinned(crane: CraneSamples) -> CraneSamples:
     return replace(crane, stamp_ns=stamps, position_m=place)
 
 
-def _noise_m(crane: CraneSamples, series: CraneSamples) -> float:
-    """Estimate the sigma of one of the series' readings: the stated one, or the observed one if that is
-    larger.
+def _noise_m(crane: CraneSamples, series: CraneSamples) -> Float64:
+    """Estimate the sigma (n, 3) of the series' readings, m: noise s, and stamps that jitter by j at speed v,
+
+        sigma^2 = s^2 + j^2 v^2
+
+    s is the stated noise, or that of the slower readings where it is larger; j explains what the faster ones
+    add to it.
     """
-    together = len(crane.stamp_ns) / len(series.stamp_ns)
+    together = len(crane.stamp_ns) / max(len(series.stamp_ns), 1)
     stated = crane.position_std_m * (1.0 if together < 1.5 else (np.pi / 2 / together) ** 0.5)
-    return max(stated, _seen_sigma_m(series))
+    if len(series.stamp_ns) < MIN_FOR_NOISE:
+        return np.full((len(series.stamp_ns), 3), stated)
+    off, speed = _scatter_m(series), np.abs(_speed_mps(series))
+    inner = speed[2:-2]
+    fast = inner > FAST_RATIO * np.percentile(inner, 95, axis=0).max()
+    slow = [off[~fast[:, k], k] for k in range(3)]
+    noise = max([stated, *(float(mad_sigma(part, axis=0)) for part in slow if len(part) >= MIN_FOR_NOISE)])
+    if np.count_nonzero(fast) < MIN_FOR_NOISE:
+        return np.full((len(series.stamp_ns), 3), noise)
+    jitter_s = np.sqrt(max(0.0, float(mad_sigma(off[fast], axis=0)) ** 2 - noise**2)) / np.median(inner[fast])
+    return np.asarray(np.hypot(noise, jitter_s * speed))
 
 
-def _seen_sigma_m(crane: CraneSamples) -> float:
-    """Estimate a reading's noise on the noisiest axis from its median distance to the cubic through the two
-    readings on either side.
+def _speed_mps(crane: CraneSamples) -> Float64:
+    """Compute the speed (n, 3) at the readings as their slope over five of them."""
+    at = np.arange(len(crane.stamp_ns))
+    old, new = np.maximum(at - 2, 0), np.minimum(at + 2, len(at) - 1)
+    seconds = (crane.stamp_ns[new] - crane.stamp_ns[old]) / NS_PER_S
+    return np.asarray((crane.position_m[new] - crane.position_m[old]) / seconds[:, None])
+
+
+def _scatter_m(crane: CraneSamples) -> Float64:
+    """Compute the distance (n - 4, 3) of each reading to the cubic through the two readings on either side,
+    scaled to the noise of one reading.
     """
     time = (crane.stamp_ns - crane.stamp_ns[:1]) / NS_PER_S
-    if len(time) < 9:
-        return 0.0
     around = np.arange(2, len(time) - 2)[:, None] + np.array([-2, -1, 1, 2])
     unit = (time[around] - time[2:-2, None]) / float(np.median(np.diff(time)))
     weights = np.ones_like(unit)  # of Lagrange interpolation at the reading's own time
@@ -159,5 +188,4 @@ def _seen_sigma_m(crane: CraneSamples) -> float:
             if i != j:
                 weights[:, i] *= -unit[:, j] / (unit[:, i] - unit[:, j])
     off = crane.position_m[2:-2] - np.einsum("kn,knj->kj", weights, crane.position_m[around])
-    scale = np.sqrt(1 + (weights**2).sum(axis=1))
-    return float(mad_sigma(off / scale[:, None], axis=0).max())
+    return np.asarray(off / np.sqrt(1 + (weights**2).sum(axis=1))[:, None])

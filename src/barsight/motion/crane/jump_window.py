@@ -81,10 +81,10 @@ class FoundStep:
 class JumpWindow:
     """N readings and then M steps of the pictures as rows.
 
-    values: (N + M, 3) m; variance: (N + M,) of each row's noise; open: (3, N + M, N + M) covariance of
-    everything else, per axis. steps: (N + M, S) columns of the steps that are tested; beyond: (S,) the first
-    reading beyond each. stamp_ns: (N,), whose first reading is the series' `first`; by_imu: whether the IMU
-    measures the travel.
+    values: (N + M, 3) m; variance: (3, N + M) of the rows' noise per axis; open: (3, N + M, N + M) covariance
+    of everything else. steps: (N + M, S) columns of the steps that are tested; beyond: (S,) the first reading
+    beyond each. stamp_ns: (N,), whose first reading is the series' `first`; by_imu: whether the IMU measures
+    the travel.
     """
 
     values: Float64
@@ -98,9 +98,17 @@ class JumpWindow:
 
     @classmethod
     def around(
-        cls, series: CraneSamples, sigma_m: float, middle_ns: int, known: KnownMotion, half_s: float = HALF_S
+        cls,
+        series: CraneSamples,
+        sigma_m: Float64,
+        middle_ns: int,
+        known: KnownMotion,
+        half_s: float = HALF_S,
     ) -> JumpWindow | None:
-        """Gather the measurements around a stamp; None where they are too few for any step."""
+        """Gather the measurements around a stamp; None where they are too few for any step.
+
+        sigma_m: (n, 3) of the series' readings.
+        """
         first, end = np.searchsorted(series.stamp_ns, known.span(middle_ns, seconds_to_ns(half_s)))
         stamps, place = series.stamp_ns[first:end], series.position_m[first:end]
         count = len(stamps)
@@ -111,13 +119,13 @@ class JumpWindow:
         begin_ns, last_ns = int(stamps[0]), int(stamps[-1])
         imu = known.by_imu(series, begin_ns, last_ns)
         seen = None if known.steps is None else known.steps.chosen(begin_ns, last_ns)
-        values, speed, variance = place - place[:1], np.zeros_like(place), np.full(count, sigma_m**2)
+        values, speed, variance = place - place[:1], np.zeros_like(place), sigma_m[first:end].T ** 2
         way, ends = np.empty((0, 3)), np.empty(0, np.int64)
         if seen is not None and len(seen.old_ns):
             way = seen.way_m @ series.yard_from_body_nominal.T
             ends, speed = np.concatenate([seen.old_ns, seen.new_ns]), _seen_speed(seen, way, stamps)
             askew = (ASKEW_RAD * np.linalg.norm(way, axis=1)) ** 2
-            variance = np.concatenate([variance, seen.sigma_m**2 + askew])
+            variance = np.hstack([variance, np.tile(seen.sigma_m**2 + askew, (3, 1))])
         time = (np.concatenate([stamps, ends]) - begin_ns) / NS_PER_S
         rows = block_diag(np.eye(count), _differences(len(way)))
         if imu is not None:
@@ -139,14 +147,14 @@ class JumpWindow:
         """Find the most significant step on one axis besides the given jumps; None where there is none."""
         values, open_m2 = self.values[:, axis], self.open[axis]
         if jumps:
-            open_m2 = open_m2 + self._jumped(jumps)
+            open_m2 = open_m2 + self.jumped(jumps)
         none = np.zeros(len(values))
-        plain = self._weighted(values, open_m2, none, np.ones(len(none)))
+        plain = self._weighted(axis, open_m2, none, np.ones(len(none)))
         if np.abs(plain.sigmas).max() < MAYBE_SIGMAS and plain.worst < CAUCHY_SIGMAS + 1:
             return None
-        without = self._robust(values, open_m2, none)
+        without = self._robust(axis, open_m2, none)
         tried = {int(np.abs(fit.sigmas).argmax()) for fit in (plain, without)}
-        fits = [(self._robust(values, open_m2, self.steps[:, k]), k) for k in tried]
+        fits = [(self._robust(axis, open_m2, self.steps[:, k]), k) for k in tried]
         fit, k = min(fits, key=lambda one: one[0].cost)
         sigmas = float(np.sqrt(max(0.0, 2 * (without.cost - fit.cost)))) / (1 if self.by_imu else BLIND_RATIO)
         if sigmas < MAYBE_SIGMAS or abs(fit.size_m) < MIN_JUMP_M:
@@ -158,10 +166,15 @@ class JumpWindow:
         """Fit a step at a stamp; return its size and sigma, m."""
         step = np.zeros(len(self.values))
         step[: len(self.stamp_ns)] = self.stamp_ns >= stamp_ns
-        fit = self._robust(self.values[:, axis], self.open[axis], step)
+        fit = self._robust(axis, self.open[axis], step)
         return fit.size_m, fit.sigma_m
 
-    def _jumped(self, jumps: Sequence[EncoderJump]) -> Float64:
+    def weights(self, axis: int, open_m2: Float64) -> Float64:
+        """Compute the Cauchy weights (N + M,) of the rows, without a step, under the covariance `open_m2`."""
+        off = self._robust(axis, open_m2, np.zeros(len(self.values))).off
+        return 1 / (1 + off**2 / CAUCHY_SIGMAS**2)
+
+    def jumped(self, jumps: Sequence[EncoderJump]) -> Float64:
         """Compute the covariance (N + M, N + M) of the jumps' unknown sizes and of readings next to them."""
         stamps, near = self.stamp_ns, seconds_to_ns(1.3 / MAX_RATE_HZ)
         columns, unsure = np.zeros((len(self.values), len(jumps))), np.zeros(len(self.values))
@@ -171,18 +184,19 @@ class JumpWindow:
             unsure[: len(stamps)][np.abs(stamps - jump.stamp_ns) < near] = WIDE_M**2
         return np.asarray(columns @ columns.T + np.diag(unsure))
 
-    def _robust(self, values: Float64, open_m2: Float64, step: Float64) -> _Fit:
-        weight = np.ones(len(values))
+    def _robust(self, axis: int, open_m2: Float64, step: Float64) -> _Fit:
+        weight = np.ones(len(step))
         for _ in range(ROUNDS):
-            fit, before = self._weighted(values, open_m2, step, weight), weight
+            fit, before = self._weighted(axis, open_m2, step, weight), weight
             weight = 1 / (1 + fit.off**2 / CAUCHY_SIGMAS**2)
             if np.abs(weight - before).max() < MIN_CHANGE:
                 break
         return fit
 
-    def _weighted(self, values: Float64, open_m2: Float64, step: Float64, weight: Float64) -> _Fit:
+    def _weighted(self, axis: int, open_m2: Float64, step: Float64, weight: Float64) -> _Fit:
         """Fit with given weights; if step (N + M,) is all zeros, no step is fitted."""
-        noise = self.variance / weight
+        values, variance = self.values[:, axis], self.variance[axis]
+        noise = variance / weight
         factor = cholesky(open_m2 + np.diag(noise))
         right = solve_lower(factor, np.column_stack([values, step, self.steps]))
         own, mine = right[:, 0], right[:, 1]
@@ -193,7 +207,7 @@ class JumpWindow:
             own = own - size * mine
         each = (right[:, 2:] * own[:, None]).sum(axis=0) / np.sqrt((right[:, 2:] ** 2).sum(axis=0))
         pull = solve_lower(factor, own, transposed=True)
-        off = noise * pull / np.sqrt(self.variance)
+        off = noise * pull / np.sqrt(variance)
         cost = CAUCHY_SIGMAS**2 / 2 * float(np.log1p((off / CAUCHY_SIGMAS) ** 2).sum())
         cost += float(pull @ open_m2 @ pull) / 2
         way = values - size * step - noise * pull
