@@ -68,6 +68,11 @@ class FacePlane:
         """Take the plane from a contact."""
         return cls(contact.centre_z_m, contact.pitch_rad, contact.roll_rad, contact.gap_sigma_m)
 
+    @property
+    def table(self) -> Float64:
+        """Return (3,) the height (m) at the magnet's centre, and the slopes along and across."""
+        return np.array([self.centre_z_m, math.tan(self.pitch_rad), math.tan(self.roll_rad)])
+
 
 @dataclass(frozen=True, eq=False)
 class Obstacle:
@@ -90,9 +95,8 @@ def clearance_checks(
 
     The limits include the sigma of the plane in height and that of a cell in place.
     """
-    faces = FacePlane.of(contact)
+    faces, sigma = FacePlane.of(contact), 1e3 * contact.gap_sigma_m
     obstacle = find_obstacle(place, heights, magnet, faces, load)
-    sigma = 1e3 * contact.gap_sigma_m
     checks = []
     for code, what, bound_mm in (
         ("obstructed", "highest object above the plane of the faces, under or beside the magnet",
@@ -101,16 +105,18 @@ def clearance_checks(
          f"proven free; beside the load the limit is {1e3 * MAX_HOLE_BESIDE_M:.0f} mm", 1e3 * MAX_HOLE_M),
     ):  # fmt: skip
         if obstacle is None or obstacle.code != code:
-            unknown = obstacle is not None and code == "unknown-under-footprint"
-            if not unknown:
-                checks.append(Check(code, what, None, sigma, bound_mm, "mm", "passed", ""))
+            checks.append(Check(code, what, None, sigma, bound_mm, "mm", "passed", ""))
             continue
         reason = obstacle.reason
         if find_obstacle(place, heights, magnet, faces, load, careful=False) is None:
             reason += "; the value is within its sigma of the limit"
         checks.append(Check(code, what, obstacle.value_mm, sigma, obstacle.bound_mm, "mm", "failed", reason))
-    plane = np.array([faces.centre_z_m, math.tan(faces.pitch_rad), math.tan(faces.roll_rad)])
-    return checks + stanchion_checks(place, _region(place, heights, magnet, 0.0).parts, plane, stanchions)
+        # Behind an object no unseen place is searched for.
+        break
+    if stanchions:
+        parts = _region(place, heights, magnet, 0.0).parts
+        checks += stanchion_checks(place, parts, faces.table, stanchions)
+    return checks
 
 
 def find_obstacle(
@@ -123,10 +129,7 @@ def find_obstacle(
     beam passes over objects. careful: an object also obstructs if a limit lies within its sigma.
     """
     region = _region(place, heights, magnet, EDGE_SIGMA_M if careful else 0.0)
-    plane = np.array([
-        faces.centre_z_m, math.tan(faces.pitch_rad), math.tan(faces.roll_rad),
-        faces.sigma_m if careful else 0.0,
-    ])  # fmt: skip
+    plane = np.append(faces.table, faces.sigma_m if careful else 0.0)
     rise, most, blocked = _look(
         heights.z_m, heights.source, _NO_BOUNDS if heights.free_m is None else heights.free_m,
         np.array([heights.x0_m, heights.y0_m, heights.cell_m]), region.x_m, region.y_m, region.frame, plane,
