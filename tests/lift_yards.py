@@ -9,7 +9,8 @@ import numpy as np
 
 from barsight.yard.identity import MapIdentity
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.assessment import Lift, LiftScene, assess_placement
+from barsight.yard.lifting.assessment import assess_placement
+from barsight.yard.lifting.lift import Lift, LiftScene
 from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.magnet.description import Magnet, load_magnet
 from barsight.yard.magnet.footprint import BundleTable, Placement

@@ -19,11 +19,11 @@ from barsight.yard.lifting.clearance import (
     FacePlane,
     find_obstacle,
 )
-from barsight.yard.lifting.unseen import wide_parts
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.magnet.holding import _sum_pull
 from barsight.yard.map_lookup import interpolate_height
 from barsight.yard.types import HeightMap
+from barsight.yard.unseen import wide_parts
 from lift_yards import MAGNET, Laid, laid, map_of, record
 
 FACES = FacePlane(0.2, 0.01, -0.02, 0.002)

@@ -23,7 +23,7 @@ from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.inventory.bundle_file import read_bundles
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.assessment import LiftScene
+from barsight.yard.lifting.lift import LiftScene
 from barsight.yard.lifting.targets import map_vetoes
 from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.magnet.footprint import BundleTable

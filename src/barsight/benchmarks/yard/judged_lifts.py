@@ -23,7 +23,8 @@ from barsight.benchmarks.provenance import Provenance, provenance
 from barsight.benchmarks.yard.drawn_worlds import MappedWorld
 from barsight.simulation.worlds.yards import DrawnYard
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.assessment import Lift, assess_placement
+from barsight.yard.lifting.assessment import assess_placement
+from barsight.yard.lifting.lift import Lift
 from barsight.yard.lifting.targets import plan_lifts
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement

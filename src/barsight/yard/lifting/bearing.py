@@ -13,12 +13,12 @@ from barsight.core.arrays import Bool, Float32, Float64
 from barsight.core.records.heights import HeightSource
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.load import Load, axes_of
-from barsight.yard.lifting.unseen import wide_parts
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.resting_plane import rest_plane
 from barsight.yard.map_lookup import nearest_cells
 from barsight.yard.sections import part_about
 from barsight.yard.types import YardMap
+from barsight.yard.unseen import wide_parts
 
 STEP_M = 0.02
 SMOOTH_M, NARROW_M = 0.05, 0.03

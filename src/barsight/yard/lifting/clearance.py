@@ -16,13 +16,13 @@ import numpy as np
 from barsight.core.arrays import Bool, Float32, Float64, UInt8, kernel
 from barsight.yard.lift_settings import UPPER
 from barsight.yard.lifting.load import tops_at
-from barsight.yard.lifting.unseen import wide_parts
 from barsight.yard.magnet.contact import Contact
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.magnet.stanchions import stanchion_checks
 from barsight.yard.map_lookup import cell_spans, highest_seen
 from barsight.yard.types import Bundle, HeightMap
+from barsight.yard.unseen import wide_parts
 from barsight.yard.vetoes import Check, check_max
 
 STEP_M = 0.01

@@ -12,9 +12,9 @@ from barsight.core.arrays import Bool, Float32, Float64, Int64
 from barsight.core.records.heights import HeightSource
 from barsight.yard.events import YardEvent
 from barsight.yard.lifting.load import Load, axes_of
-from barsight.yard.lifting.unseen import wide_parts
 from barsight.yard.sections import patches
 from barsight.yard.types import HeightMap, YardMap
+from barsight.yard.unseen import wide_parts
 
 COARSE_M = 0.05
 MIN_KNOWN = 0.5

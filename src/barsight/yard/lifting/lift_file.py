@@ -17,8 +17,8 @@ from barsight.core.reading.sealed_json import read_sealed, write_sealed
 from barsight.yard.events import YardEvent
 from barsight.yard.identity import MapIdentity
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.assessment import Lift
 from barsight.yard.lifting.bearing import magnet_reach
+from barsight.yard.lifting.lift import Lift
 from barsight.yard.lifting.load import Load, laid_at
 from barsight.yard.lifting.order import LiftOrder
 from barsight.yard.lifting.targets import RULE, LiftPlan

@@ -15,8 +15,9 @@ from barsight.core.parallel import ordered_map
 from barsight.core.stamps import seconds_to_ns
 from barsight.yard.events import YardEvent, events_since
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.assessment import Lift, LiftScene, assess_placement
+from barsight.yard.lifting.assessment import assess_placement
 from barsight.yard.lifting.ground import Ground
+from barsight.yard.lifting.lift import Lift, LiftScene
 from barsight.yard.lifting.load import Load, axes_of, laid_at
 from barsight.yard.lifting.set_down import SetDown, find_set_down, sound_ground
 from barsight.yard.lifting.travel_accuracy import Travel
