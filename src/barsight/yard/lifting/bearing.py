@@ -37,13 +37,14 @@ MAX_SPAN_RATIO = 0.65
 """Maximum distance, in lengths, between successive supports."""
 MAX_ALONG_DEG, MAX_ACROSS_DEG = 2.0, 3.0
 MAX_HOLE_M, HOLE_DEPTH_M = 0.14, 0.15
-"""Minimum width and depth (m) of a hole: narrower gullies between bars are bridged by dunnage, and shallow
-ones don't matter.
+"""Maximum width (m) of a gully between bars, which dunnage bridges, and maximum depth (m) of a hollow that
+doesn't matter: what is wider and deeper is a hole.
 """
 _HOLE_STEPS = round(MAX_HOLE_M / STEP_M) | 1
 MAX_UNSEEN_CELLS = 3
-"""Minimum width, in steps, of an unseen place that may hide an obstacle."""
+"""Width, in steps, of an unseen place from which on it may hide an obstacle."""
 UNSEEN_REACH_CELLS = 9
+"""Side, in cells, of the square about an unseen cell whose highest one is taken for it."""
 MAX_RISE_M = 0.03
 """Maximum rise (m) over the underside of something beside the load that doesn't touch it."""
 MAX_THIN_RISE_M, MIN_THIN_CELLS = 0.1, 6

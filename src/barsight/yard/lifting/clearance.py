@@ -29,12 +29,12 @@ STEP_M = 0.01
 STRAY_FIELD_M = 0.03
 """Distance (m) from a face or the beam within which the stray field attracts steel."""
 MAX_RISE_M = 0.012
-"""Minimum height (m) above the faces' plane of a patch that obstructs, by medians over squares of 50 mm."""
+"""Maximum rise (m) over the faces' plane of a patch that is no obstacle, by medians over squares of 50 mm."""
 MAX_TOP_RISE_M = 0.014
 """Maximum height (m) of the load's own fitted top above the plane where the plane is lowest: a map cuts off
 crests of thick bars by some 6 mm."""
 MAX_NARROW_RISE_M = 0.020
-"""Minimum height (m) of a patch that is too narrow for those, by medians over squares of 30 mm."""
+"""The same of a patch that is too narrow for those, by medians over squares of 30 mm."""
 MAX_THIN_RISE_M, MIN_THIN_CELLS = 0.05, 8
 """The same for thin objects such as plates on edge, and the minimum number of connected cells."""
 BEAM_CLEAR_M = 0.1
@@ -44,7 +44,7 @@ MIN_PATCH_CELLS = 4
 EDGE_SIGMA_M = 0.003
 """Standard deviation (m) of an object's edge as it shows in cells of STEP_M."""
 MAX_HOLE_M = 0.06
-"""Minimum width (m) of an unseen place over the load that may hide an obstacle."""
+"""Width (m) of an unseen place over the load from which on it may hide an obstacle."""
 MAX_HOLE_BESIDE_M = 0.04
 """The same beside the load: around a post, wrong matches make its edge look free."""
 FLANK_M = 0.03

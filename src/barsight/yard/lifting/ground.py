@@ -17,11 +17,13 @@ from barsight.yard.types import HeightMap, YardMap
 from barsight.yard.unseen import wide_parts
 
 COARSE_M = 0.05
+"""Side (m) of a coarse cell."""
 MIN_KNOWN = 0.5
 """Minimum share of a coarse cell that must have been seen."""
 MAX_HOLE_CELLS = 2
-"""Minimum width, in coarse cells, of an unseen place that may hide an obstacle."""
+"""Width, in coarse cells, of an unseen place from which on it may hide an obstacle."""
 _PATCH_CELLS = 256
+"""Side, in coarse cells, of the squares in which a map is read."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,11 +31,12 @@ from barsight.yard.types import Bundle
 
 REACH_M = 30.0
 """Maximum distance (m) along X and Y from the load at which places are searched for."""
-MAX_TRIED = 16
-APART_M = 0.15
+MAX_TRIED, APART_M = 16, 0.15
+"""Maximum number of places per heading that are assessed exactly, and their minimum spacing (m)."""
 SHADOW_M = 0.3
 """Distance (m) around a load within which things were partly hidden by it, and may move when it goes."""
 SMALL_TURNS_DEG = (0.0, 2.5, -2.5, 5.0, -5.0)
+"""Turns of the load that are tried, the smallest first."""
 
 
 @dataclass(frozen=True)
@@ -148,9 +149,8 @@ def _candidates(
     """Propose places (x, y) that no coarse cell rules out: the lowest first, and among these the nearest."""
     top, shut, low = ground.turned(yaw_rad)
     cell, margin = ground.cell_m, settings.set_down_clear_m
-    size = tuple(
-        int((side + 2 * margin) / cell) | 1 for side in (load.width_m, load.length_m)
-    )  # odd, no wider than the clear outline by more than a cell
+    # Odd, and no more than a cell wider than the clear outline.
+    size = tuple(int((side + 2 * margin) / cell) | 1 for side in (load.width_m, load.length_m))
     if size[0] > top.shape[1] or size[1] > top.shape[0]:
         return
     # A gully between two cells that carry may be up to three cells wide.

@@ -33,13 +33,17 @@ from barsight.yard.vetoes import Veto, check_true, vetoes_of
 from barsight.yard.weight import load_centre
 
 ACROSS_M = (0.0, 0.015, -0.015, 0.03, -0.03)
+"""Offsets (m) of the magnet across the load's centre that are tried first."""
 BETWEEN_M = (0.0075, -0.0075, 0.0225, -0.0225)
 """Offsets (m) across that are tried where some of those hold, but not within the crane's tolerance."""
 ALONG_M = (0.1, -0.1, 0.25, -0.25)
+"""Offsets (m) along that are tried where none across is free of vetoes."""
 ANYWHERE = frozenset({"covered", "bundle-doubtful", "end-open", "mass-unknown", "overweight", "thin-bar"})
 """Vetoes of the load itself, which another place of the magnet can't change."""
-SAME_TOP_M = 0.03
-SAME_YAW_RAD = np.radians(2.0)
+SAME_TOP_M, SAME_YAW_RAD = 0.03, np.radians(2.0)
+"""Maximum differences of the tops (m) and the yaws of two bundles that are lifted together."""
+SAME_LIFT_GAP_M = 0.1
+"""Maximum gap (m) between two bundles that are lifted together."""
 RULE = (
     "Lifts are sorted by their safety: the smallest of pull over needed pull, the worst pole's pull over its "
     "share, capacity over load, and tolerance over the crane's tolerance. Of equal ones the higher bundle "
@@ -234,9 +238,10 @@ def _groups(bundles: tuple[Bundle, ...], count: int) -> Iterator[tuple[Bundle, .
             if away <= 0 or len(group) == count:
                 continue
             level = abs(other.top_z_m - last.top_z_m) < SAME_TOP_M
+            reach = (other.width_m + last.width_m) / 2 + SAME_LIFT_GAP_M
             between = away - float((last.centre_m - first.centre_m)[:2] @ across)
             shift = abs(float((other.centre_m - first.centre_m)[:2] @ first.direction[:2]))
-            if level and between < (other.width_m + last.width_m) / 2 + 0.1 and shift < first.length_m / 2:
+            if level and between < reach and shift < first.length_m / 2:
                 group.append(other)
         if len(group) == count:
             yield tuple(group)
@@ -254,16 +259,16 @@ def _best(group: tuple[Bundle, ...], yard: LiftScene, magnet: Magnet, settings: 
     if set(quick[0].bundles) == {bundle.id for bundle in group} and _forbidden_anywhere(quick):
         return quick[0]
     quick += tried((0.0, across) for across in ACROSS_M if 0 < abs(across) < limit)
-    quick.sort(key=_worst_first)
+    quick.sort(key=_best_first)
     sound = _sound(quick, yard, magnet, settings)
     if _forbidden_anywhere(quick) or (sound is not None and not sound.vetoes):
         return sound or quick[0]
     middle = _offset_across(group, quick[0].place)
     between = [across for across in BETWEEN_M if sound is not None and abs(across) < limit]
     beside = [(along, across) for along in ALONG_M for across in dict.fromkeys((0.0, middle))]
-    more = sorted(tried([*((0.0, across) for across in between), *beside]), key=_worst_first)
+    more = sorted(tried([*((0.0, across) for across in between), *beside]), key=_best_first)
     found = [one for one in (sound, _sound(more, yard, magnet, settings)) if one is not None]
-    return min(found or [*quick, *more], key=_worst_first)
+    return min(found or [*quick, *more], key=_best_first)
 
 
 def _forbidden_anywhere(lifts: list[Lift]) -> bool:
@@ -282,10 +287,11 @@ def _sound(quick: list[Lift], yard: LiftScene, magnet: Magnet, settings: LiftSet
             whole.append(assess_placement(lift.place, yard, magnet, settings))
             if not whole[-1].vetoes:
                 return whole[-1]
-    return min(whole, key=_worst_first, default=None)
+    return min(whole, key=_best_first, default=None)
 
 
-def _worst_first(lift: Lift) -> tuple[int, float]:
+def _best_first(lift: Lift) -> tuple[int, float]:
+    """Return the key that sorts lifts: the fewest vetoes first, then the safest."""
     return len(lift.vetoes), -lift.safety
 
 

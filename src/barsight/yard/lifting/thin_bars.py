@@ -26,6 +26,7 @@ BELOW_M = 0.3
 a slope of a half where it projects.
 """
 WAY_STEP_M, UNSEEN_STEP_M = 0.02, 0.1
+"""Spacing (m) of a line's places that are checked, and of the lines that may cross an unseen neighbour."""
 
 
 def thin_bar_checks(

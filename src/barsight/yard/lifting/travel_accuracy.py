@@ -30,6 +30,7 @@ ALONGSIDE_M = 1.0
 SURE_SIGMAS = 3.0
 """Number of the trajectory's sigmas beyond which encoders count as disagreeing with it."""
 MOVING_MPS = 0.05
+"""Minimum speed (m/s) from which a latency of the encoders shows."""
 CODE = "trajectory-degraded"
 
 
