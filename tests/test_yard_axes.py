@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from barsight.core.arrays import Float64
+from barsight.yard.axes import turn_between
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.lift_settings import LiftSettings
@@ -16,7 +17,7 @@ from barsight.yard.lifting.targets import plan_lifts
 from barsight.yard.magnet.description import Tolerance
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.stability.pile_sides import pile_sides
-from barsight.yard.stability.stability import footings, turn_between
+from barsight.yard.stability.stability import footings
 from barsight.yard.types import Bundle, HeightMap
 from lift_yards import MAGNET, SETTINGS, codes, judged, laid, map_of, record
 from yard_maps import Laid

@@ -179,7 +179,7 @@ def draw_place(heights: Any, record: dict[str, Any], magnet: Magnet, bundles: tu
         cv2.putText(picture, str(bundle.id), middle, cv2.FONT_HERSHEY_SIMPLEX, 0.6, BGR["bundle"], 2)
     centre = np.array([place.x_m, place.y_m])
     outline(corners((place.x_m, place.y_m), place.yaw_rad, magnet.beam.width_m, magnet.beam.length_m), "beam")
-    more_v, more_u = 2 * magnet.tolerance.along(place.axes)
+    more_v, more_u = 2 * magnet.tolerance.along(place.beam_axes)
     for pole in magnet.poles:
         at = centre + pole.along_m * place.along + pole.across_m * place.across
         size = pole.width_m, pole.length_m

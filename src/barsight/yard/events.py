@@ -14,6 +14,7 @@ from barsight.core.arrays import Float64
 from barsight.core.errors import InputError
 from barsight.core.files import atomic_path
 from barsight.core.reading.bounded_reading import MAX_ENTRIES, read_lines
+from barsight.yard.axes import axes_of
 from barsight.yard.types import Bundle
 
 KINDS = ("lift", "set-down", "magnet")
@@ -107,10 +108,8 @@ def events_since(events: tuple[YardEvent, ...], captured_ns: tuple[int, int] | N
 
 def corners(centre: tuple[float, float], yaw_rad: float, width_m: float, length_m: float) -> Float64:
     """Compute the corners (4, 2) of a rectangle whose length runs along yaw."""
-    across = width_m / 2 * np.array([math.cos(yaw_rad), math.sin(yaw_rad)])
-    along = length_m / 2 * np.array([-math.sin(yaw_rad), math.cos(yaw_rad)])
     turns = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
-    return np.asarray(np.array(centre) + turns[:, :1] * across + turns[:, 1:] * along)
+    return np.asarray(centre + turns * (width_m / 2, length_m / 2) @ axes_of(yaw_rad))
 
 
 def gap_between(one: Float64, other: Float64) -> float:

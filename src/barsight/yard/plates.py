@@ -54,9 +54,9 @@ def find_plates(bundle: Bundle, heights: YardMap, size_m: tuple[float, float]) -
     """
     across = np.arange(-bundle.width_m / 2 - ASIDE_M, bundle.width_m / 2 + ASIDE_M, STEP_M)
     along = np.arange(-bundle.length_m / 2, bundle.length_m / 2 + STEP_M / 2, STEP_M)
-    c, s = np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad)
-    x = bundle.centre_m[0] + c * across - s * along[:, None]
-    y = bundle.centre_m[1] + s * across + c * along[:, None]
+    x, y = (
+        bundle.centre_m[k] + bundle.axes[0, k] * across + bundle.axes[1, k] * along[:, None] for k in (0, 1)
+    )
     part = part_about(heights, x.ravel(), y.ravel())
     if part.gray is None or not part.gray.any():
         return []

@@ -203,11 +203,11 @@ def _strip(heights: HeightMap, bundle: Bundle) -> tuple[Float64, Float32]:
     NaN if unseen.
     """
     assert heights.tops is not None
-    axis = np.array([-math.sin(bundle.yaw_rad), math.cos(bundle.yaw_rad)])
+    across, axis = bundle.axes
     half_v, half_u = round(bundle.length_m / 2 / STEP_M), round((bundle.width_m / 2 + REACH_M) / STEP_M)
     along, beside = (STEP_M * np.arange(-half, half + 1.0) for half in (half_v, half_u))
-    x = bundle.centre_m[0] + along[:, None] * axis[0] + beside * axis[1]
-    y = bundle.centre_m[1] + along[:, None] * axis[1] - beside * axis[0]
+    x = bundle.centre_m[0] + along[:, None] * axis[0] + beside * across[0]
+    y = bundle.centre_m[1] + along[:, None] * axis[1] + beside * across[1]
     return along, np.log(sample_levels(heights, heights.tops, x, y) + _DARK)
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from barsight.core.arrays import Float32, Float64, UInt8
 from barsight.core.extras import extra
+from barsight.yard.axes import axes_of
 
 ENDS = "low-y", "high-y"
 """Names of a bundle's ends."""
@@ -271,6 +272,11 @@ class Bundle:
     def bottom_z_m(self) -> float:
         """Return the height of the underside: a hexagon reaches as far below its axis as above it."""
         return float(2 * self.centre_m[2] - self.top_z_m)
+
+    @property
+    def axes(self) -> Float64:
+        """Return unit vectors (2, 2) in plan view: across the axis and along it."""
+        return axes_of(self.yaw_rad)
 
     @property
     def direction(self) -> Float64:

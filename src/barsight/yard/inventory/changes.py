@@ -10,6 +10,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from barsight.core.arrays import Float64
+from barsight.yard.axes import turn_between
 from barsight.yard.map_lookup import lookup_heights
 from barsight.yard.sections import part_about
 from barsight.yard.types import Bundle, YardMap
@@ -98,12 +99,9 @@ def displacement(before: Bundle, after: Bundle) -> tuple[float, float, float, fl
     """Compute the displacement across, along, up (at the top; m) and in yaw (rad), in the
     old bundle's axes.
     """
-    away = after.centre_m[:2] - before.centre_m[:2]
-    cos, sin = math.cos(before.yaw_rad), math.sin(before.yaw_rad)
-    turned = (after.yaw_rad - before.yaw_rad + math.pi / 2) % math.pi - math.pi / 2
-    along = float(away @ (-sin, cos))
-    across = float(away @ (cos, sin)) + along * math.tan(turned) / 2
-    return across, along, after.top_z_m - before.top_z_m, turned
+    across, along = (before.axes @ (after.centre_m - before.centre_m)[:2]).tolist()
+    turned = turn_between(before.yaw_rad, after.yaw_rad)
+    return across + along * math.tan(turned) / 2, along, after.top_z_m - before.top_z_m, turned
 
 
 def displacement_along(before: Bundle, after: Bundle) -> tuple[float, float]:
@@ -113,13 +111,12 @@ def displacement_along(before: Bundle, after: Bundle) -> tuple[float, float]:
     along = displacement(before, after)[1]
     if not (any(before.ends_open) or any(after.ends_open)):
         return along, math.hypot(before.sigma.along_m, after.sigma.along_m)
-    axis = np.array([-math.sin(before.yaw_rad), math.cos(before.yaw_rad)])
     # Along X, a small turn swaps which end is the low one.
     swapped = math.cos(after.yaw_rad - before.yaw_rad) < 0
     for end, then in ((0, int(swapped)), (1, int(not swapped))):
         if not (before.ends_open[end] or after.ends_open[then]):
             away = after.ends_m[then, :2] - before.ends_m[end, :2]
-            return float(away @ axis), math.hypot(_end_sigma(before, end), _end_sigma(after, then))
+            return float(before.axes[1] @ away), math.hypot(_end_sigma(before, end), _end_sigma(after, then))
     return 0.0, 0.0
 
 
@@ -175,7 +172,6 @@ def heights_over(bundle: Bundle, heights: YardMap) -> Float64:
     u = np.linspace(-0.4, 0.4, 5) * bundle.width_m
     v = np.linspace(-0.45, 0.45, 40) * bundle.length_m
     vv, uu = np.meshgrid(v, u, indexing="ij")
-    cos, sin = math.cos(bundle.yaw_rad), math.sin(bundle.yaw_rad)
-    x: Float64 = bundle.centre_m[0] + uu * cos - vv * sin
-    y: Float64 = bundle.centre_m[1] + uu * sin + vv * cos
+    across, along = bundle.axes
+    x, y = (bundle.centre_m[k] + uu * across[k] + vv * along[k] for k in (0, 1))
     return lookup_heights(part_about(heights, x, y), x, y)

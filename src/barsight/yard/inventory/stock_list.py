@@ -15,7 +15,7 @@ from scipy.optimize import linear_sum_assignment
 from barsight.core.arrays import Float64
 from barsight.core.errors import InputError
 from barsight.core.reading.bounded_reading import MAX_ENTRIES, in_range, read_json, read_lines
-from barsight.yard.stability.stability import turn_between
+from barsight.yard.axes import turn_between
 from barsight.yard.types import Bundle
 
 _NEEDED = ("name", "x_m", "y_m")
@@ -240,8 +240,8 @@ def _shift(one: ListedBundle, bundle: Bundle) -> tuple[float, float, float]:
 
 
 def _across_along(shift: tuple[float, float, float], bundle: Bundle) -> tuple[float, float]:
-    c, s = np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad)
-    return float(c * shift[0] + s * shift[1]), float(-s * shift[0] + c * shift[1])
+    across, along = (bundle.axes @ shift[:2]).tolist()
+    return across, along
 
 
 def _distance(one: ListedBundle, bundle: Bundle) -> float:

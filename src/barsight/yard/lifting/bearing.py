@@ -11,8 +11,9 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64
 from barsight.core.records.heights import HeightSource
+from barsight.yard.axes import axes_of
 from barsight.yard.lift_settings import LiftSettings
-from barsight.yard.lifting.load import Load, axes_of
+from barsight.yard.lifting.load import Load
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.resting_plane import rest_plane
 from barsight.yard.map_lookup import nearest_cells

@@ -202,9 +202,8 @@ def _over(load: tuple[Bundle, ...], region: Region, margin_m: float = 0.0) -> Bo
     over = np.full(region.under.shape, not load)
     for bundle in load:
         dx, dy = region.x_m - bundle.centre_m[0], region.y_m[:, None] - bundle.centre_m[1]
-        sin, cos = math.sin(bundle.yaw_rad), math.cos(bundle.yaw_rad)
-        inside = np.abs(cos * dx + sin * dy) <= bundle.width_m / 2 + margin_m
-        over |= inside & (np.abs(cos * dy - sin * dx) <= bundle.length_m / 2 + margin_m)
+        beside, beyond = (np.abs(axis[0] * dx + axis[1] * dy) for axis in bundle.axes)
+        over |= (beside <= bundle.width_m / 2 + margin_m) & (beyond <= bundle.length_m / 2 + margin_m)
     return over
 
 
@@ -248,7 +247,7 @@ def leaning_checks(
 
 def _tops(place: Placement, magnet: Magnet, load: tuple[Bundle, ...]) -> Float64:
     """Compute the heights (bundles, poles) of the load's tops at the poles."""
-    return tops_at(load, magnet.pole_table[:, :2] @ place.axes + (place.x_m, place.y_m))
+    return tops_at(load, magnet.pole_table[:, :2] @ place.beam_axes + (place.x_m, place.y_m))
 
 
 def _obstructed(rise: Float32, spare: Float32, region: Region) -> Obstacle | None:

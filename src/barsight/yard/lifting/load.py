@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from barsight.core.arrays import Float64
+from barsight.yard.axes import axes_of
 from barsight.yard.lift_settings import UPPER, LiftSettings
 from barsight.yard.magnet.description import Tolerance
 from barsight.yard.magnet.holding import min_diameter_m
@@ -113,15 +114,9 @@ def reached_areas(
     return [area for area in settings.no_lift_areas if reaches_area(middle_m, yaw_rad, grown, area)]
 
 
-def axes_of(yaw_rad: float) -> Float64:
-    """Return unit vectors (2, 2): across an axis and along it."""
-    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
-    return np.array([[cos, sin], [-sin, cos]])
-
-
 def tops_at(bundles: tuple[Bundle, ...], places_m: Float64) -> Float64:
     """Compute the heights (bundles, N) of bundles' tops at places (N, 2) in plan view along them."""
-    along = [(places_m - bundle.centre_m[:2]) @ axes_of(bundle.yaw_rad)[1] for bundle in bundles]
+    along = [(places_m - bundle.centre_m[:2]) @ bundle.axes[1] for bundle in bundles]
     return np.array([
         bundle.top_z_m + away * math.tan(bundle.pitch_rad)
         for bundle, away in zip(bundles, along, strict=True)

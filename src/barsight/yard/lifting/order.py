@@ -13,11 +13,12 @@ import numpy as np
 
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
+from barsight.yard.axes import axes_of
 from barsight.yard.events import events_since
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.bearing import magnet_reach
 from barsight.yard.lifting.ground import Ground
-from barsight.yard.lifting.load import Load, axes_of
+from barsight.yard.lifting.load import Load
 from barsight.yard.lifting.set_down import SHADOW_M, SetDown, find_set_down, sound_ground
 from barsight.yard.lifting.targets import LiftPlan, ended_with_floor, put_down
 from barsight.yard.magnet.description import Magnet

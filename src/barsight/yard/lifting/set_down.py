@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Float64
+from barsight.yard.axes import axes_of
 from barsight.yard.events import YardEvent
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.bearing import (
@@ -22,7 +23,7 @@ from barsight.yard.lifting.bearing import (
     placing_slack,
 )
 from barsight.yard.lifting.ground import Ground
-from barsight.yard.lifting.load import Load, axes_of, reached_areas
+from barsight.yard.lifting.load import Load, reached_areas
 from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.lifting.validity import old_cells
 from barsight.yard.magnet.description import Magnet

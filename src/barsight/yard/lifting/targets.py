@@ -13,12 +13,13 @@ import numpy as np
 from barsight.core.notices import FORBIDS
 from barsight.core.parallel import ordered_map
 from barsight.core.stamps import seconds_to_ns
+from barsight.yard.axes import axes_of, high_side, turn_between
 from barsight.yard.events import YardEvent, events_since
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.assessment import assess_placement
 from barsight.yard.lifting.ground import Ground
 from barsight.yard.lifting.lift import Lift, LiftScene
-from barsight.yard.lifting.load import Load, axes_of, laid_at
+from barsight.yard.lifting.load import Load, laid_at
 from barsight.yard.lifting.set_down import SetDown, find_set_down, sound_ground
 from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.lifting.validity import age_checks, validity
@@ -27,7 +28,7 @@ from barsight.yard.magnet.footprint import BundleTable, Placement
 from barsight.yard.sections import part_about, split_map
 from barsight.yard.stability.blockers import Blocked, find_blocked
 from barsight.yard.stability.pile_sides import PileSide, pile_sides
-from barsight.yard.stability.stability import Footing, footings, high_side, mean_yaw, turn_between
+from barsight.yard.stability.stability import Footing, footings, mean_yaw
 from barsight.yard.types import Bundle, YardMap
 from barsight.yard.vetoes import Veto, check_true, vetoes_of
 from barsight.yard.weight import load_centre

@@ -126,32 +126,27 @@ def may_reach(bundle: Bundle, place: Placement, magnet: Magnet, faces_z_m: float
     highest_m = bundle.top_z_m + bundle.length_m / 2 * abs(math.tan(bundle.pitch_rad))
     if highest_m < faces_z_m - BELOW_M:
         return False
-    along, across = _axes(bundle)
+    across, along = bundle.axes
     wide = bundle.width_m / 2 + BEYOND_M
     long = bundle.length_m / 2 + MAX_SLOPE * wide
     away = bundle.centre_m[:2] - (place.x_m, place.y_m)
-    spread = np.abs(place.axes @ along) * long + np.abs(place.axes @ across) * wide
-    return bool((np.abs(place.axes @ away) <= _under_m(place, magnet) + spread).all())
+    beam = place.beam_axes
+    spread = np.abs(beam @ along) * long + np.abs(beam @ across) * wide
+    return bool((np.abs(beam @ away) <= _under_m(place, magnet) + spread).all())
 
 
 def _under_m(place: Placement, magnet: Magnet) -> Float64:
     """Compute half the length and half the width (2,) of the area under the magnet, including the crane's
     tolerance and the stray field.
     """
-    slack = magnet.tolerance.along(place.axes)
+    slack = magnet.tolerance.along(place.beam_axes)
     half = np.array([magnet.size_m[1], magnet.size_m[0]]) / 2 + slack + STRAY_FIELD_M
     return np.asarray(half + math.radians(magnet.tolerance.yaw_deg) * half[::-1])
 
 
-def _axes(bundle: Bundle) -> tuple[Float64, Float64]:
-    """Return a bundle's unit vectors along and across, yard axes."""
-    along = np.array([-math.sin(bundle.yaw_rad), math.cos(bundle.yaw_rad)])
-    return along, np.array([along[1], -along[0]])
-
-
 def _beyond_flanks(bundle: Bundle, line: ThinLine) -> Float64:
     """Return places (N, 2) on a line across a bundle, up to BEYOND_M beyond either flank, in yard axes."""
-    along, across = _axes(bundle)
+    across, along = bundle.axes
     askew = math.radians(line.askew_deg)
     way = math.cos(askew) * across + math.sin(askew) * along
     reach = (bundle.width_m / 2 + BEYOND_M) / math.cos(askew)

@@ -11,11 +11,11 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
+from barsight.yard.axes import axes_of
 from barsight.yard.events import YardEvent, corners, gap_between
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.clearance import STRAY_FIELD_M
 from barsight.yard.lifting.ground import Ground
-from barsight.yard.lifting.load import axes_of
 from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from barsight.core.arrays import Bool, Float64, Int64, kernel
+from barsight.yard.axes import axes_of
 from barsight.yard.magnet.description import Magnet, Tolerance
 from barsight.yard.types import Bundle
 
@@ -45,22 +46,22 @@ class Placement:
     @property
     def along(self) -> Float64:
         """Return the unit vector (2,) along the beam."""
-        return np.array([-np.sin(self.yaw_rad), np.cos(self.yaw_rad)])
+        return np.asarray(axes_of(self.yaw_rad)[1])
 
     @property
     def across(self) -> Float64:
         """Return the unit vector (2,) across the beam."""
-        return np.array([np.cos(self.yaw_rad), np.sin(self.yaw_rad)])
+        return np.asarray(axes_of(self.yaw_rad)[0])
 
     @property
-    def axes(self) -> Float64:
+    def beam_axes(self) -> Float64:
         """Return the rows (2, 2) `along` and `across`."""
         return np.stack([self.along, self.across])
 
     @property
     def frame(self) -> Float64:
-        """Return the rows (3, 2): the place, then `axes`."""
-        return np.vstack([(self.x_m, self.y_m), self.axes])
+        """Return the rows (3, 2): the place, then `beam_axes`."""
+        return np.vstack([(self.x_m, self.y_m), self.beam_axes])
 
 
 class Rectangles(NamedTuple):

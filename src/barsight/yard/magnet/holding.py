@@ -124,7 +124,7 @@ def pole_shares(magnet: Magnet, place: Placement, load: tuple[Bundle, ...]) -> F
 def _off_centre(place: Placement, load: tuple[Bundle, ...]) -> tuple[Float64, Float64]:
     """Compute the load's centre of mass (2,) from the magnet's, along and across, and the error's bound."""
     sigmas = [(bundle.sigma.along_m, bundle.sigma.lateral_m) for bundle in load]
-    away = place.axes @ (load_centre(load) - (place.x_m, place.y_m))
+    away = place.beam_axes @ (load_centre(load) - (place.x_m, place.y_m))
     return away, UPPER * np.nan_to_num(sigmas, nan=0.05).max(axis=0)
 
 
@@ -252,11 +252,11 @@ def _over(bundle: Bundle, pole: Pole, place: Placement, own: PoleContact) -> Boo
     v = pole.along_m + pole.length_m * ((np.arange(shape[1]) + 0.5) / shape[1] - 0.5)
     at = np.array([place.x_m, place.y_m]) - bundle.centre_m[:2]
     at = at + u[:, None, None] * place.across + v[None, :, None] * place.along
-    sigma, axes = bundle.sigma, Placement(0.0, 0.0, bundle.yaw_rad)
+    sigma, (across, along) = bundle.sigma, bundle.axes
     sigmas = np.array([(sigma.lateral_m, sigma.width_m / 2), (sigma.along_m, sigma.length_m / 2)])
     half = np.array([bundle.width_m, bundle.length_m]) / 2
     half = half - UPPER * np.hypot(*np.nan_to_num(sigmas, nan=0.05).T)
-    return np.asarray((np.abs(at @ axes.across) <= half[0]) & (np.abs(at @ axes.along) <= half[1]))
+    return np.asarray((np.abs(at @ across) <= half[0]) & (np.abs(at @ along) <= half[1]))
 
 
 def share_checks(weakest: WeakestPole | None, pried: float, worst_bundle: float = math.inf) -> list[Check]:

@@ -35,7 +35,7 @@ def reached_strips(
     they fall from. face_z_m: (P,) height of each pole's face.
     """
     poles = magnet.pole_table
-    more = tolerance.along(place.axes)
+    more = tolerance.along(place.beam_axes)
     turned = math.radians(tolerance.yaw_deg)
     wide, long = ((np.abs(poles[:, k]) + poles[:, m] / 2).max() for k, m in ((1, 3), (0, 2)))
     grown = poles.copy()

@@ -21,7 +21,7 @@ def stanchion_checks(
     """
     checks = []
     for x, y, z in stanchions:
-        v, u = place.axes @ (x - place.x_m, y - place.y_m)
+        v, u = place.beam_axes @ (x - place.x_m, y - place.y_m)
         over = z - float(plane @ (1, v, u))
         under = (np.abs(parts[:, 0] - v) <= parts[:, 2]) & (np.abs(parts[:, 1] - u) <= parts[:, 3])
         if under.any():

@@ -50,11 +50,7 @@ def lies_on(upper: Bundle, lower: Bundle) -> bool:
     if upper.bottom_z_m - lower.bottom_z_m <= HIGHER_RATIO * width:
         return False
     away = (upper.centre_m - lower.centre_m)[:2]
-    both = [
-        (np.array([[np.cos(b.yaw_rad), np.sin(b.yaw_rad)], [-np.sin(b.yaw_rad), np.cos(b.yaw_rad)]]),
-         np.array([b.width_m, b.length_m]) / 2)
-        for b in (upper, lower)
-    ]  # fmt: skip
+    both = [(bundle.axes, np.array([bundle.width_m, bundle.length_m]) / 2) for bundle in (upper, lower)]
     for axis in (*both[0][0], *both[1][0]):
         reach = sum(float(np.abs(own @ axis) @ half) for own, half in both)
         if abs(float(away @ axis)) >= reach - MEETS_RATIO * width:

@@ -14,13 +14,12 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from barsight.core.arrays import Float64
+from barsight.yard.axes import high_side, turn_between
 from barsight.yard.stability.stability import (
     MIN_LEDGE_M,
     STEP_M,
     Footing,
     gaps_between,
-    high_side,
-    turn_between,
 )
 from barsight.yard.types import Bundle
 

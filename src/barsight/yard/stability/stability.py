@@ -14,6 +14,7 @@ import numpy as np
 
 from barsight.core.arrays import Float64
 from barsight.core.parallel import ordered_map
+from barsight.yard.axes import high_side, turn_between
 from barsight.yard.lift_settings import UPPER, LiftSettings
 from barsight.yard.map_lookup import lookup_heights
 from barsight.yard.types import Bundle, HeightMap
@@ -70,18 +71,6 @@ class Footing:
     freeboard_m: float
 
 
-def high_side(yaw_rad: float) -> Float64:
-    """Return the unit vector (2,) across an axis, towards high x, or high y if the axis is closer to X."""
-    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
-    turned = cos < 0 if abs(cos) > abs(sin) else sin < 0
-    return np.array([-cos, -sin] if turned else [cos, sin])
-
-
-def turn_between(yaw_rad: float, other_rad: float) -> float:
-    """Compute the angle in [-pi/2, pi/2) from one axis to another; an axis has no direction."""
-    return (other_rad - yaw_rad + math.pi / 2) % math.pi - math.pi / 2
-
-
 def mean_yaw(bundles: tuple[Bundle, ...]) -> float:
     """Average the bundles' yaws as axes, relative to the first one's."""
     first = bundles[0].yaw_rad
@@ -125,10 +114,8 @@ def _profile(heights: HeightMap, bundle: Bundle, sign: int) -> Float64:
     """Compute the seen cells' median height and their share (N, 2), from the edge outwards every STEP_M."""
     out = bundle.width_m / 2 + np.arange(0, LOOK_M, STEP_M)
     along = np.linspace(-0.45, 0.45, STATIONS) * bundle.length_m
-    cos, sin = np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad)
-    side = sign * high_side(bundle.yaw_rad)
-    x = bundle.centre_m[0] + out[:, None] * side[0] - along[None] * sin
-    y = bundle.centre_m[1] + out[:, None] * side[1] + along[None] * cos
+    side, axis = sign * high_side(bundle.yaw_rad), bundle.axes[1]
+    x, y = (bundle.centre_m[k] + out[:, None] * side[k] + along[None] * axis[k] for k in (0, 1))
     z = lookup_heights(heights, x, y) - along[None] * np.tan(bundle.pitch_rad)
     known = np.isfinite(z)
     filled = np.where(known, z, np.inf)
@@ -160,11 +147,9 @@ def _side(profile: Float64, bundle: Bundle) -> Side:
 
 def _distance(bundle: Bundle, x: float, y: float) -> float:
     """Compute the distance (m) in plan view from a place to the bundle's outline."""
-    away = np.array([x, y]) - bundle.centre_m[:2]
-    cos, sin = np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad)
-    beside = abs(away @ (cos, sin)) - bundle.width_m / 2
-    beyond = abs(away @ (-sin, cos)) - bundle.length_m / 2
-    return math.hypot(max(float(beside), 0.0), max(float(beyond), 0.0))
+    away = np.abs(bundle.axes @ ((x, y) - bundle.centre_m[:2]))
+    beyond = away - (bundle.width_m / 2, bundle.length_m / 2)
+    return float(np.linalg.norm(np.maximum(beyond, 0)))
 
 
 def footing_checks(
@@ -297,7 +282,5 @@ def _beside(one: Bundle, other: Bundle) -> bool:
 
 def gaps_between(one: Bundle, other: Bundle) -> tuple[float, float]:
     """Compute the gaps (m) between two outlines, across and along the first one; negative is an overlap."""
-    away = other.centre_m[:2] - one.centre_m[:2]
-    cos, sin = np.cos(one.yaw_rad), np.sin(one.yaw_rad)
-    beside = abs(away @ (cos, sin)) - (one.width_m + other.width_m) / 2
-    return float(beside), float(abs(away @ (-sin, cos)) - (one.length_m + other.length_m) / 2)
+    beside, beyond = np.abs(one.axes @ (other.centre_m - one.centre_m)[:2]).tolist()
+    return beside - (one.width_m + other.width_m) / 2, beyond - (one.length_m + other.length_m) / 2
