@@ -18,7 +18,7 @@ from barsight.plant.state import offered_lift
 from barsight.store.confirmation import OpenLift
 from barsight.store.lift_records import find_gap, find_outlines
 from barsight.store.opening import Store
-from barsight.yard.events import corners
+from barsight.yard.axes import corners
 from barsight.yard.lifting.lift_file import lifts_content, read_lifts, write_lifts
 from barsight.yard.lifting.load import Load
 from barsight.yard.lifting.targets import offset_vetoes, plan_lifts, put_down

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from barsight.core.stamps import NS_PER_S
-from barsight.yard.events import YardEvent, corners, gap_between
+from barsight.yard.axes import corners, gap_between
+from barsight.yard.events import YardEvent
 from barsight.yard.lifting.targets import plan_lifts
 from barsight.yard.lifting.travel_accuracy import target_covariance
 from barsight.yard.magnet.contact import rest_magnet

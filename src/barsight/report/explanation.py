@@ -19,7 +19,8 @@ from barsight.core.errors import ConfigError
 from barsight.core.files import atomic_path
 from barsight.report.page import environment, format_number, resource
 from barsight.result_folder import changed_inputs, open_folder, read_heights
-from barsight.yard.events import corners, kept_events
+from barsight.yard.axes import corners
+from barsight.yard.events import kept_events
 from barsight.yard.inventory.bundle_file import read_bundles
 from barsight.yard.lifting.clearance import FacePlane, find_obstacle
 from barsight.yard.lifting.lift_file import forbidden_since, read_lifts
@@ -173,18 +174,17 @@ def draw_place(heights: Any, record: dict[str, Any], magnet: Magnet, bundles: tu
         cv2.polylines(picture, [points], True, BGR[kind], thickness, cv2.LINE_AA)
 
     for bundle in bundles:
-        x, y = bundle.centre_m[:2]
-        outline(corners((x, y), bundle.yaw_rad, bundle.width_m, bundle.length_m), "bundle")
+        outline(bundle.corners_m, "bundle")
         middle = np.round(pixels(bundle.centre_m[None, :2]))[0].astype(int).tolist()
         cv2.putText(picture, str(bundle.id), middle, cv2.FONT_HERSHEY_SIMPLEX, 0.6, BGR["bundle"], 2)
     centre = np.array([place.x_m, place.y_m])
-    outline(corners((place.x_m, place.y_m), place.yaw_rad, magnet.beam.width_m, magnet.beam.length_m), "beam")
+    outline(corners(centre, place.yaw_rad, magnet.beam.width_m, magnet.beam.length_m), "beam")
     more_v, more_u = 2 * magnet.tolerance.along(place.beam_axes)
     for pole in magnet.poles:
         at = centre + pole.along_m * place.along + pole.across_m * place.across
         size = pole.width_m, pole.length_m
-        outline(corners((at[0], at[1]), place.yaw_rad, size[0] + more_u, size[1] + more_v), "tolerance", 1)
-        outline(corners((at[0], at[1]), place.yaw_rad, *size), "face")
+        outline(corners(at, place.yaw_rad, size[0] + more_u, size[1] + more_v), "tolerance", 1)
+        outline(corners(at, place.yaw_rad, *size), "face")
     return picture
 
 

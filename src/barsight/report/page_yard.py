@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from barsight.core.arrays import Float64, UInt8
+from barsight.core.arrays import UInt8
 from barsight.core.errors import InputError
 from barsight.core.reading.bounded_reading import read_bytes
 from barsight.core.reading.geotiff import REMEDY
@@ -17,6 +18,7 @@ from barsight.core.records.gray_levels import TornImageError
 from barsight.recording.image_decoding import MAX_PICTURE_BYTES, decode_gray
 from barsight.report.map_images import Raster, paint_height, robust_range
 from barsight.report.page_maps import LARGE_TEXT, Drawing, Key, MapFigure, Shape, draw_map
+from barsight.yard.axes import axes_of, corners
 from barsight.yard.inventory.bundle_file import read_bundles
 from barsight.yard.lifting.lift_file import read_lifts
 from barsight.yard.types import Bundle
@@ -104,13 +106,13 @@ def bundle_shapes(bundles: tuple[Bundle, ...]) -> tuple[Shape, ...]:
     shapes = []
     for bundle in bundles:
         colour = FREE_RGB if bundle.is_free else COVERED_RGB
-        corners = rectangle(bundle.centre_m[:2], bundle.yaw_rad, bundle.width_m, bundle.length_m)
+        outline = bundle.corners_m.tolist()
         low, high = bundle.ends_m[:, :2].tolist()
         for a, b, dashed in (
-            (corners[0], corners[1], bundle.ends_open[0]), (corners[1], corners[2], False),
-            (corners[2], corners[3], bundle.ends_open[1]), (corners[3], corners[0], False),
+            (outline[0], outline[1], bundle.ends_open[0]), (outline[1], outline[2], False),
+            (outline[2], outline[3], bundle.ends_open[1]), (outline[3], outline[0], False),
         ):  # fmt: skip
-            shapes.append(Shape((a, b), colour, 1.6, dashed))
+            shapes.append(Shape((tuple(a), tuple(b)), colour, 1.6, dashed))
         shapes.append(Shape((tuple(low), tuple(high)), colour, 0.8, False, str(bundle.id)))
     return tuple(shapes)
 
@@ -120,32 +122,12 @@ def lift_shapes(lifts: dict[str, Any]) -> tuple[Shape, ...]:
     shapes = []
     for lift in lifts["lifts"]:
         label = f"#{lift['rank']}"
-        for corners in pole_corners(lift["target"], lifts["magnet"]["poles"]):
-            shapes.append(Shape((*corners, corners[0]), LIFT_RGB, 2.2, False, label))
+        target = lift["target"]
+        yaw_rad = math.radians(target["yaw_deg"])
+        across, along = axes_of(yaw_rad)
+        for pole in lifts["magnet"]["poles"]:
+            centre = (target["x_m"], target["y_m"]) + pole["across_m"] * across + pole["along_m"] * along
+            points = tuple(map(tuple, corners(centre, yaw_rad, pole["width_m"], pole["length_m"]).tolist()))
+            shapes.append(Shape((*points, points[0]), LIFT_RGB, 2.2, False, label))
             label = ""
     return tuple(shapes)
-
-
-def pole_corners(
-    target: dict[str, float], poles: list[dict[str, float]]
-) -> list[tuple[tuple[float, float], ...]]:
-    """Compute the four corners of each pole, yard axes, m."""
-    yaw = np.radians(target["yaw_deg"])
-    across, along = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
-    found = []
-    for pole in poles:
-        centre = np.array([target["x_m"], target["y_m"]])
-        centre = centre + pole["across_m"] * across + pole["along_m"] * along
-        found.append(rectangle(centre, float(yaw), pole["width_m"], pole["length_m"]))
-    return found
-
-
-def rectangle(
-    centre: Float64, yaw_rad: float, width: float, length: float
-) -> tuple[tuple[float, float], ...]:
-    """Compute the corners: of the low-y end from the low to the high side, then of the high-y end back."""
-    across = width / 2 * np.array([np.cos(yaw_rad), np.sin(yaw_rad)])
-    along = length / 2 * np.array([-np.sin(yaw_rad), np.cos(yaw_rad)])
-    corners = (centre - along - across, centre - along + across, centre + along + across,
-               centre + along - across)  # fmt: skip
-    return tuple((float(x), float(y)) for x, y in corners)

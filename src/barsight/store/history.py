@@ -19,6 +19,7 @@ from barsight.core.stamps import NS_PER_S
 from barsight.store.matching import has_moved
 from barsight.store.promotion import counts
 from barsight.store.tables import ABSENCES, LIFT_BUNDLES, LIFT_STATES, LIFTS, SIGHTINGS, SURVEYS
+from barsight.yard.axes import turn_between
 from barsight.yard.inventory.bundle_file import bundle_of
 from barsight.yard.types import Bundle
 
@@ -256,7 +257,7 @@ class ExecutedLift:
         if self.set_down is None:
             return None
         to = self.set_down
-        yaw_rad = (math.radians(to["yaw_deg"]) + math.pi / 2) % math.pi - math.pi / 2
+        yaw_rad = turn_between(0.0, math.radians(to["yaw_deg"]))
         up_m = to["z_m"] - bundle.bottom_z_m
         centre = np.array([to["x_m"], to["y_m"], bundle.centre_m[2] + up_m])
         return replace(bundle, centre_m=centre, yaw_rad=yaw_rad, pitch_rad=0.0, top_z_m=bundle.top_z_m + up_m)

@@ -20,7 +20,8 @@ from barsight.store.audit import Entry
 from barsight.store.history import executed_lifts
 from barsight.store.states import step_lift
 from barsight.store.tables import LIFT_BUNDLES, LIFT_STATES, LIFTS, SIGHTINGS, SURVEY_VETOES
-from barsight.yard.events import corners, gap_between, kept_events
+from barsight.yard.axes import corners, gap_between
+from barsight.yard.events import kept_events
 from barsight.yard.inventory.bundle_file import bundle_of
 from barsight.yard.lifting.lift_file import read_lifts, unknown_events
 from barsight.yard.lifting.load import laid_at
@@ -164,10 +165,7 @@ def find_outlines(
     if record["set_down"] and bundles:
         place = record["set_down"]
         lying.append(laid_at(tuple(bundles), place["x_m"], place["y_m"], math.radians(place["yaw_deg"])))
-    for bundle in lying:
-        at = float(bundle.centre_m[0]), float(bundle.centre_m[1])
-        outlines.append(corners(at, bundle.yaw_rad, bundle.width_m, bundle.length_m))
-    return outlines
+    return outlines + [bundle.corners_m for bundle in lying]
 
 
 def _magnet_down(record: dict[str, Any]) -> dict[str, float] | None:

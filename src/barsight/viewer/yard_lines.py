@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from barsight.core.arrays import Float32, Float64
+from barsight.yard.axes import axes_of
 from barsight.yard.inventory.bundle_file import read_bundles
 from barsight.yard.lifting.lift_file import read_lifts
 from barsight.yard.types import Bundle
@@ -37,7 +39,7 @@ def bundle_box(bundle: Bundle) -> Float64:
     height.
     """
     along = bundle.direction
-    across = np.array([np.cos(bundle.yaw_rad), np.sin(bundle.yaw_rad), 0.0])
+    across = np.append(bundle.axes[0], 0.0)
     up = np.cross(across, along)
     middle = bundle.centre_m + up * (bundle.top_z_m - bundle.centre_m[2] - bundle.width_m / 2)
     half = bundle.width_m / 2
@@ -47,10 +49,8 @@ def bundle_box(bundle: Bundle) -> Float64:
 def pole_boxes(lift: dict[str, Any], poles: list[dict[str, float]]) -> Float64:
     """Compute edges (12 * P, 2, 3) of the poles at their places."""
     target = lift["target"]
-    yaw, pitch = np.radians(target["yaw_deg"]), np.radians(lift["pitch_deg"])
-    roll = np.radians(lift["roll_deg"])
-    across = np.array([np.cos(yaw), np.sin(yaw), np.tan(roll)])
-    along = np.array([-np.sin(yaw), np.cos(yaw), np.tan(pitch)])
+    rises = np.tan(np.radians([lift["roll_deg"], lift["pitch_deg"]]))
+    across, along = np.column_stack([axes_of(math.radians(target["yaw_deg"])), rises])
     up = np.array([0.0, 0.0, POLE_HEIGHT_M / 2])
     origin = np.array([target["x_m"], target["y_m"], target["z_m"]]) + up
     boxes = [

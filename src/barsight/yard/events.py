@@ -8,13 +8,11 @@ from collections.abc import Iterable
 from dataclasses import asdict, astuple, dataclass, fields
 from pathlib import Path
 
-import numpy as np
-
 from barsight.core.arrays import Float64
 from barsight.core.errors import InputError
 from barsight.core.files import atomic_path
 from barsight.core.reading.bounded_reading import MAX_ENTRIES, read_lines
-from barsight.yard.axes import axes_of
+from barsight.yard.axes import corners
 from barsight.yard.types import Bundle
 
 KINDS = ("lift", "set-down", "magnet")
@@ -104,22 +102,3 @@ def merged(first: Iterable[YardEvent], more: Iterable[YardEvent]) -> tuple[YardE
 def events_since(events: tuple[YardEvent, ...], captured_ns: tuple[int, int] | None) -> tuple[YardEvent, ...]:
     """Select events that a map may not show: those after its first frame, or all if that is unknown."""
     return tuple(event for event in events if captured_ns is None or event.stamp_ns > captured_ns[0])
-
-
-def corners(centre: tuple[float, float], yaw_rad: float, width_m: float, length_m: float) -> Float64:
-    """Compute the corners (4, 2) of a rectangle whose length runs along yaw."""
-    turns = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
-    return np.asarray(centre + turns * (width_m / 2, length_m / 2) @ axes_of(yaw_rad))
-
-
-def gap_between(one: Float64, other: Float64) -> float:
-    """Compute a lower bound (m) of two rectangles' distance by separating axes; 0 where they overlap."""
-    widest = 0.0
-    for corner in (one, other):
-        for side in (corner[1] - corner[0], corner[2] - corner[1]):
-            length = float(np.linalg.norm(side))
-            if length == 0:
-                continue
-            a, b = one @ side / length, other @ side / length
-            widest = max(widest, float(a.min() - b.max()), float(b.min() - a.max()))
-    return widest

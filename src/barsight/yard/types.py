@@ -14,7 +14,7 @@ import numpy as np
 
 from barsight.core.arrays import Float32, Float64, UInt8
 from barsight.core.extras import extra
-from barsight.yard.axes import axes_of
+from barsight.yard.axes import axes_of, corners
 
 ENDS = "low-y", "high-y"
 """Names of a bundle's ends."""
@@ -277,6 +277,11 @@ class Bundle:
     def axes(self) -> Float64:
         """Return unit vectors (2, 2) in plan view: across the axis and along it."""
         return axes_of(self.yaw_rad)
+
+    @property
+    def corners_m(self) -> Float64:
+        """Compute the corners (4, 2) of the outline in plan view, as `axes.corners` does."""
+        return corners(self.centre_m[:2], self.yaw_rad, self.width_m, self.length_m)
 
     @property
     def direction(self) -> Float64:

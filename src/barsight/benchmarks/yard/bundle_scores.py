@@ -15,6 +15,7 @@ from barsight.benchmarks.provenance import Provenance, provenance
 from barsight.core.arrays import Float64
 from barsight.core.errors import InputError
 from barsight.simulation.worlds.solids import STEEL_KG_PER_M3
+from barsight.yard.axes import axes_of, turn_between
 from barsight.yard.types import Bundle
 from barsight.yard.weight import bundle_mass
 
@@ -204,33 +205,26 @@ def reliability(scores: BundleErrors) -> str:
     return f"confidence {'; '.join(out) or '-'}"
 
 
-def _axes(true: TrueBundle) -> tuple[Float64, Float64]:
-    c, s = np.cos(true.yaw_rad), np.sin(true.yaw_rad)
-    return np.array([c, s, 0.0]), np.array([-s, c, 0.0])
-
-
 def _offset(found: Bundle, true: TrueBundle) -> tuple[float, float]:
     """Compute the detected centre's offset from the true one, across and along the true axis, m."""
-    across, along = _axes(true)
-    step = found.centre_m - true.centre_m
-    return float(step @ across), float(step @ along)
+    across, along = (axes_of(true.yaw_rad) @ (found.centre_m - true.centre_m)[:2]).tolist()
+    return across, along
 
 
 def _inside(found: Bundle, true: TrueBundle) -> bool:
     across, along = _offset(found, true)
-    turned = abs((found.yaw_rad - true.yaw_rad + np.pi / 2) % np.pi - np.pi / 2)
+    turned = abs(turn_between(true.yaw_rad, found.yaw_rad))
     level = abs(found.top_z_m - true.top_z_m) < true.width_m / 2
     return abs(across) < true.width_m / 2 and abs(along) < true.length_m / 2 and turned < 0.2 and level
 
 
 def _errors(found: Bundle, true: TrueBundle) -> dict[str, tuple[float, float]]:
     sigma, mass = found.sigma, bundle_mass(found)
-    along = _axes(true)[1]
-    turned = (found.yaw_rad - true.yaw_rad + np.pi / 2) % np.pi - np.pi / 2
+    along = axes_of(true.yaw_rad)[1]
     flip = 1 if np.cos(found.yaw_rad - true.yaw_rad) > 0 else -1
     out = {
         "lateral": (_offset(found, true)[0], sigma.lateral_m),
-        "yaw": (float(turned), sigma.yaw_rad),
+        "yaw": (turn_between(true.yaw_rad, found.yaw_rad), sigma.yaw_rad),
         "top": (found.top_z_m - true.top_z_m, sigma.top_z_m),
         "width": (found.width_m - true.width_m, sigma.width_m),
         "diameter": (found.bar_diameter_m - true.bar_diameter_m, sigma.bar_diameter_m),
@@ -238,7 +232,7 @@ def _errors(found: Bundle, true: TrueBundle) -> dict[str, tuple[float, float]]:
     }
     for k, name in enumerate(("low end", "high end")):
         side = (-1, 1)[k] * flip
-        error = float((found.ends_m[k] - true.centre_m) @ along) - side * true.length_m / 2
+        error = float((found.ends_m[k] - true.centre_m)[:2] @ along) - side * true.length_m / 2
         out[name] = (
             (float("nan"), float("nan")) if found.ends_open[k] else (side * error, found.ends_sigma_m[k])
         )

@@ -11,8 +11,8 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
-from barsight.yard.axes import axes_of
-from barsight.yard.events import YardEvent, corners, gap_between
+from barsight.yard.axes import axes_of, corners, gap_between
+from barsight.yard.events import YardEvent
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.clearance import STRAY_FIELD_M
 from barsight.yard.lifting.ground import Ground
@@ -178,9 +178,7 @@ def disturbed_checks(
     began: heights from before and after it are fused.
     """
     outlines = [corners((place.x_m, place.y_m), place.yaw_rad, *magnet.size_m)]
-    for bundle in load:
-        x, y = bundle.centre_m[:2]
-        outlines.append(corners((x, y), bundle.yaw_rad, bundle.width_m, bundle.length_m))
+    outlines += [bundle.corners_m for bundle in load]
     since = [event for event in events if seen is None or event.stamp_ns > seen.begun_ns]
     checks = []
     for event in since:
