@@ -6,6 +6,7 @@ All in the yard frame, m and rad. Yaw is the axis's angle from +Y about Z, count
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any, Protocol
@@ -18,6 +19,17 @@ from barsight.yard.axes import axes_of, corners
 
 ENDS = "low-y", "high-y"
 """Names of a bundle's ends."""
+
+
+UNKNOWN_SIGMA_M, UNKNOWN_SIGMA_RAD = 0.05, 0.005
+"""Standard deviations of a length or place (m) and of a yaw (rad) whose own aren't known: with them hardly
+anything is certain.
+"""
+
+
+def known_sigma(sigma_m: float) -> float:
+    """Return a standard deviation (m), or UNKNOWN_SIGMA_M where it isn't known."""
+    return sigma_m if math.isfinite(sigma_m) else UNKNOWN_SIGMA_M
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,13 +9,11 @@ import numpy as np
 
 from barsight.core.arrays import Float64
 from barsight.yard.lift_settings import UPPER
-from barsight.yard.types import Bundle
+from barsight.yard.types import Bundle, known_sigma
 
 STEEL_KG_PER_M3 = 7850.0
 COUNT_SIGMA_RATIO = 0.08
 """Standard deviation of the cross-section of counted bars that their outline leaves, as a fraction."""
-UNKNOWN_LENGTH_SIGMA_M = 0.05
-"""Standard deviation (m) of a length whose own isn't known, as in the load's outline and overhang."""
 
 
 @dataclass(frozen=True)
@@ -54,9 +52,7 @@ def bundle_mass(bundle: Bundle) -> Mass:
     if not (section > 0 and bundle.length_m > 0):
         return Mass(math.nan, math.nan)
     kg = section * bundle.length_m * STEEL_KG_PER_M3
-    known = math.isfinite(bundle.sigma.length_m)
-    longer = (bundle.sigma.length_m if known else UNKNOWN_LENGTH_SIGMA_M) / bundle.length_m
-    return Mass(kg, kg * math.hypot(sigma / section, longer))
+    return Mass(kg, kg * math.hypot(sigma / section, known_sigma(bundle.sigma.length_m) / bundle.length_m))
 
 
 def load_centre(bundles: tuple[Bundle, ...]) -> Float64:

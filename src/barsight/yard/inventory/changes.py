@@ -13,7 +13,7 @@ from barsight.core.arrays import Float64
 from barsight.yard.axes import turn_between
 from barsight.yard.map_lookup import lookup_heights
 from barsight.yard.sections import part_about
-from barsight.yard.types import Bundle, YardMap
+from barsight.yard.types import UNKNOWN_SIGMA_M, UNKNOWN_SIGMA_RAD, Bundle, YardMap
 from barsight.yard.weight import Mass, bundle_mass
 
 Kind = Literal["same", "moved", "settled", "taken", "added", "not-seen"]
@@ -21,8 +21,6 @@ MAX_MOVE_M = 0.5
 SAME_WIDTH = 0.15
 SIGNIFICANT = 2.576
 """Number of sigmas that chance exceeds in one case out of a hundred."""
-UNKNOWN_SIGMA_M, UNKNOWN_SIGMA_RAD = 0.05, 0.005
-"""Sigmas of a place (m) and a yaw (rad) whose own aren't known: the same as for a lift's count."""
 MIN_KNOWN = 0.5
 _NO_PAIR = 1e6
 

@@ -57,7 +57,7 @@ from barsight.yard.magnet.partings import without_parted
 from barsight.yard.magnet.reach import reached_strips
 from barsight.yard.map_lookup import nearest_cells
 from barsight.yard.stability.stability import footing_checks
-from barsight.yard.types import Bundle, HeightMap
+from barsight.yard.types import Bundle, HeightMap, known_sigma
 from barsight.yard.vetoes import check_min, check_true, vetoes_of
 from barsight.yard.weight import Mass, bundle_mass, load_centre
 
@@ -201,7 +201,7 @@ def _overhang(place: Placement, load: tuple[Bundle, ...], magnet: Magnet) -> tup
     last = max(pole.along_m + pole.length_m / 2 for pole in magnet.poles)
     beyond = []
     for bundle in load:
-        sigma = float(np.nan_to_num(bundle.sigma.length_m, nan=0.05)) / 2
+        sigma = known_sigma(bundle.sigma.length_m) / 2
         ends = (bundle.ends_m[:, :2] - (place.x_m, place.y_m)) @ place.along
         beyond += [(max(end - last, first - end), sigma) for end in ends.tolist()]
     return max(beyond, key=lambda way: way[0] + UPPER * way[1], default=(math.nan, math.nan))

@@ -16,7 +16,7 @@ from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import BEYOND_OPEN_END_M, BundleTable, Grip, Placement
 from barsight.yard.magnet.holding import min_diameter_m
 from barsight.yard.map_lookup import interpolate_height
-from barsight.yard.types import ENDS, Bundle, HeightMap
+from barsight.yard.types import ENDS, Bundle, HeightMap, known_sigma
 from barsight.yard.vetoes import Check, check_max, check_min, check_true
 from barsight.yard.weight import Mass
 
@@ -114,7 +114,7 @@ def area_checks(
     outlines = [(np.array([place.x_m, place.y_m]), place.yaw_rad, magnet.size_m)]
     for bundle in load:
         one, own = Load.of((bundle,)), bundle.sigma
-        wide, long = (2 * UPPER * _known(part) for part in (own.lateral_m, own.along_m))
+        wide, long = (2 * UPPER * known_sigma(part) for part in (own.lateral_m, own.along_m))
         size = one.width_m + wide, one.length_m + long
         outlines.append((np.array([one.x_m, one.y_m]), one.yaw_rad, size))
     reached = [area for one in outlines for area in reached_areas(*one, magnet.tolerance, settings)]
@@ -212,8 +212,8 @@ def load_checks(
             )  # fmt: skip
     limits = magnet.limits
     for name, offset, most, sigma in (
-        ("along", offset_m[0], limits.offset_along_m, max(_known(b.sigma.along_m) for b in load)),
-        ("across", offset_m[1], limits.offset_across_m, max(_known(b.sigma.lateral_m) for b in load)),
+        ("along", offset_m[0], limits.offset_along_m, max(known_sigma(b.sigma.along_m) for b in load)),
+        ("across", offset_m[1], limits.offset_across_m, max(known_sigma(b.sigma.lateral_m) for b in load)),
     ):
         reason = (
             f"the magnet's centre is {1e3 * abs(offset):.0f} mm {name} the bars from the load's centre; "
@@ -254,10 +254,6 @@ def _bundle_checks(bundle: Bundle, settings: LiftSettings) -> list[Check]:
             f"the {ends} end of bundle {bundle.id} was not seen, so its length, mass and balance are unknown",
         ),
     ]  # fmt: skip
-
-
-def _known(sigma: float) -> float:
-    return sigma if math.isfinite(sigma) else 0.05
 
 
 def _shown_ratio(load: tuple[Bundle, ...]) -> float:

@@ -13,10 +13,8 @@ from barsight.yard.lift_settings import UPPER, LiftSettings
 from barsight.yard.magnet.description import Tolerance
 from barsight.yard.magnet.holding import min_diameter_m
 from barsight.yard.stability.stability import mean_yaw
-from barsight.yard.types import Bundle
+from barsight.yard.types import Bundle, known_sigma
 from barsight.yard.weight import load_centre
-
-UNKNOWN_SIGMA_M = 0.05
 
 
 @dataclass(frozen=True)
@@ -48,7 +46,7 @@ class Load:
         low, high = np.full(2, np.inf), np.full(2, -np.inf)
         for b in bundles:
             half = [
-                size / 2 + UPPER * (sigma if math.isfinite(sigma) else UNKNOWN_SIGMA_M) / 2
+                size / 2 + UPPER * known_sigma(sigma) / 2
                 for size, sigma in ((b.width_m, b.sigma.width_m), (b.length_m, b.sigma.length_m))
             ]
             low = np.minimum(low, axes @ b.centre_m[:2] - half)

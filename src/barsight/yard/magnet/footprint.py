@@ -16,10 +16,12 @@ import numpy as np
 from barsight.core.arrays import Bool, Float64, Int64, kernel
 from barsight.yard.axes import axes_of
 from barsight.yard.magnet.description import Magnet, Tolerance
-from barsight.yard.types import Bundle
+from barsight.yard.types import UNKNOWN_SIGMA_M, UNKNOWN_SIGMA_RAD, Bundle
 
 BEYOND_OPEN_END_M = 20.0
+"""Maximum length (m) of a bundle beyond an end that wasn't seen."""
 MIN_SIGMA_M = 0.001
+"""Minimum standard deviation (m) of an overlap."""
 HEIGHT_SIGMA_M = 0.005
 """Standard deviation (m), besides its own sigma, of a bundle's top line as its height under a pole."""
 SURELY = 3.0
@@ -91,7 +93,7 @@ class BundleTable:
 
     @classmethod
     def of(cls, bundles: tuple[Bundle, ...]) -> BundleTable:
-        """Build from bundles. An unknown sigma counts as 50 mm or 5 mrad, with which nothing is certain."""
+        """Build from bundles. An unknown sigma counts as UNKNOWN_SIGMA_M or UNKNOWN_SIGMA_RAD."""
         yaw = np.array([b.yaw_rad for b in bundles])
         sigma = np.array(
             [
@@ -105,7 +107,7 @@ class BundleTable:
                 for b in bundles
             ]
         ).reshape(-1, 5)
-        unknown = np.broadcast_to((0.05, 0.05, 0.005, 0.05, 0.05), sigma.shape)
+        m, rad = UNKNOWN_SIGMA_M, UNKNOWN_SIGMA_RAD
         sigma_top = np.array([b.sigma.top_z_m for b in bundles])
         rectangles = Rectangles(
             np.array([b.centre_m[:2] for b in bundles]).reshape(-1, 2),
@@ -113,8 +115,8 @@ class BundleTable:
             np.array([(b.width_m / 2, b.length_m / 2) for b in bundles]).reshape(-1, 2),
             np.array([b.top_z_m for b in bundles]),
             np.tan([b.pitch_rad for b in bundles]),
-            np.where(np.isfinite(sigma), sigma, unknown),
-            np.where(np.isfinite(sigma_top), np.minimum(sigma_top, MAX_TOP_SIGMA_M), 0.05),
+            np.where(np.isfinite(sigma), sigma, (m, m, rad, m, m)),
+            np.where(np.isfinite(sigma_top), np.minimum(sigma_top, MAX_TOP_SIGMA_M), m),
             np.array([b.ends_open for b in bundles], dtype=np.bool_).reshape(-1, 2),
         )
         return cls(bundles, rectangles)

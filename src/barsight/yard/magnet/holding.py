@@ -21,7 +21,7 @@ from barsight.yard.lift_settings import UPPER
 from barsight.yard.magnet.contact import NEWTON_PER_KG, Contact, PoleContact
 from barsight.yard.magnet.description import Magnet, Pole
 from barsight.yard.magnet.footprint import Placement
-from barsight.yard.types import Bundle
+from barsight.yard.types import UNKNOWN_SIGMA_M, Bundle
 from barsight.yard.vetoes import Check, check_min
 from barsight.yard.weight import bundle_mass, load_centre
 
@@ -125,7 +125,7 @@ def _off_centre(place: Placement, load: tuple[Bundle, ...]) -> tuple[Float64, Fl
     """Compute the load's centre of mass (2,) from the magnet's, along and across, and the error's bound."""
     sigmas = [(bundle.sigma.along_m, bundle.sigma.lateral_m) for bundle in load]
     away = place.beam_axes @ (load_centre(load) - (place.x_m, place.y_m))
-    return away, UPPER * np.nan_to_num(sigmas, nan=0.05).max(axis=0)
+    return away, UPPER * np.nan_to_num(sigmas, nan=UNKNOWN_SIGMA_M).max(axis=0)
 
 
 @lru_cache(maxsize=64)
@@ -255,7 +255,7 @@ def _over(bundle: Bundle, pole: Pole, place: Placement, own: PoleContact) -> Boo
     sigma, (across, along) = bundle.sigma, bundle.axes
     sigmas = np.array([(sigma.lateral_m, sigma.width_m / 2), (sigma.along_m, sigma.length_m / 2)])
     half = np.array([bundle.width_m, bundle.length_m]) / 2
-    half = half - UPPER * np.hypot(*np.nan_to_num(sigmas, nan=0.05).T)
+    half = half - UPPER * np.hypot(*np.nan_to_num(sigmas, nan=UNKNOWN_SIGMA_M).T)
     return np.asarray((np.abs(at @ across) <= half[0]) & (np.abs(at @ along) <= half[1]))
 
 

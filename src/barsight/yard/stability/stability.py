@@ -17,7 +17,7 @@ from barsight.core.parallel import ordered_map
 from barsight.yard.axes import high_side, turn_between
 from barsight.yard.lift_settings import UPPER, LiftSettings
 from barsight.yard.map_lookup import lookup_heights
-from barsight.yard.types import Bundle, HeightMap
+from barsight.yard.types import Bundle, HeightMap, known_sigma
 from barsight.yard.vetoes import Check, check_max, check_min, check_true
 
 STEP_M = 0.01
@@ -172,7 +172,7 @@ def footing_checks(
             check_max(
                 "overhanging", "overhang beyond the edge of what carries it", mm * over, mm * limit,
                 "mm", f"it extends {mm * over:.0f} mm beyond what carries it; the limit is "
-                f"{mm * limit:.0f} mm", sigma=mm * _sure(target.sigma.width_m / 2) if over else 0.0,
+                f"{mm * limit:.0f} mm", sigma=mm * known_sigma(target.sigma.width_m / 2) if over else 0.0,
                 sigmas=UPPER,
             )
         )  # fmt: skip
@@ -191,7 +191,7 @@ def footing_checks(
                 mm * own.freeboard_m, mm * settings.min_freeboard_m, "mm",
                 f"the stanchion beside it is {mm * own.freeboard_m:.0f} "
                 f"mm above its top; {mm * settings.min_freeboard_m:.0f} mm are needed",
-                sigma=mm * _sure(target.sigma.top_z_m),
+                sigma=mm * known_sigma(target.sigma.top_z_m),
             )
         )  # fmt: skip
     return [*checks, *_neighbour_checks(target, bundles, by_id, settings)]
@@ -232,7 +232,9 @@ def _column_checks(target: Bundle, own: Footing) -> list[Check]:
     if math.isnan(own.sides[0].sheer_m + own.sides[1].sheer_m):
         return []
     most, mm = MAX_COLUMN_RATIO * target.width_m + DUNNAGE_M, 1e3
-    sigma = math.hypot(MAX_COLUMN_RATIO * _sure(target.sigma.width_m), _sure(target.sigma.top_z_m))
+    sigma = math.hypot(
+        MAX_COLUMN_RATIO * known_sigma(target.sigma.width_m), known_sigma(target.sigma.top_z_m)
+    )
     return [
         check_max(
             "unstable-side", "vertical drop on both its sides", mm * sheer, mm * most, "mm",
@@ -268,10 +270,6 @@ def rests_against(other: Bundle, target: Bundle) -> bool:
     reach = (other.width_m + target.width_m) / 2 + TOUCH_M
     apart = math.hypot(sideways, float(other.centre_m[2] - target.centre_m[2]))
     return raised > RAISED_RATIO * min(other.width_m, target.width_m) and apart < reach
-
-
-def _sure(sigma: float) -> float:
-    return sigma if math.isfinite(sigma) else 0.05
 
 
 def _beside(one: Bundle, other: Bundle) -> bool:
