@@ -12,7 +12,7 @@ from scipy.optimize import linear_sum_assignment
 from barsight.core.arrays import Bool, Float64
 from barsight.yard.inventory.changes import (
     MIN_KNOWN,
-    SAME_WIDTH,
+    SAME_WIDTH_RATIO,
     displacement,
     displacement_along,
     heights_over,
@@ -157,7 +157,7 @@ def _is_same_kind(known: KnownBundle, found: FoundBundle) -> bool:
 
 def _agree(before: float, sigma_before: float, after: float, sigma_after: float) -> bool:
     sigma = math.hypot(_known(sigma_before), _known(sigma_after))
-    return not abs(after - before) > max(SAME_WIDTH * before, SIGMAS * sigma)
+    return not abs(after - before) > max(SAME_WIDTH_RATIO * before, SIGMAS * sigma)
 
 
 def _is_same_length(before: Bundle, after: Bundle) -> bool:

@@ -13,8 +13,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from barsight.core.arrays import Float32, Float64, UInt8
+from barsight.core.arrays import Bool, Float32, Float64, UInt8
 from barsight.core.extras import extra
+from barsight.core.records.heights import HeightSource
 from barsight.yard.axes import axes_of, corners
 
 ENDS = "low-y", "high-y"
@@ -72,6 +73,11 @@ class HeightMap:
     def y_m(self) -> Float64:
         """Return the y of the cells' centres (rows,)."""
         return np.asarray(self.y0_m + self.cell_m * np.arange(self.shape[0]), np.float64)
+
+    @property
+    def is_seen(self) -> Bool:
+        """Mark the cells (rows, columns) that were seen; filled ones weren't."""
+        return (self.source != HeightSource.UNKNOWN) & (self.source != HeightSource.FILLED)
 
     def to_xarray(self) -> Any:
         """Return the map as an xarray.Dataset with coordinates `y` and `x` and units as attributes.

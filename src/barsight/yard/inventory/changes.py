@@ -17,11 +17,12 @@ from barsight.yard.types import UNKNOWN_SIGMA_M, UNKNOWN_SIGMA_RAD, Bundle, Yard
 from barsight.yard.weight import Mass, bundle_mass
 
 Kind = Literal["same", "moved", "settled", "taken", "added", "not-seen"]
-MAX_MOVE_M = 0.5
-SAME_WIDTH = 0.15
+MAX_MOVE_M, SAME_WIDTH_RATIO = 0.5, 0.15
+"""Maximum distance (m) between an old and a new bundle that may be one, and of their widths, as a share."""
 SIGNIFICANT = 2.576
 """Number of sigmas that chance exceeds in one case out of a hundred."""
 MIN_KNOWN = 0.5
+"""Minimum share of a bundle's place that a map must have seen to tell that the bundle isn't there."""
 _NO_PAIR = 1e6
 
 
@@ -84,7 +85,7 @@ def _match(old: tuple[Bundle, ...], new: tuple[Bundle, ...]) -> dict[int, int]:
     for i, before in enumerate(old):
         for j, after in enumerate(new):
             across, along, up, _ = displacement(before, after)
-            same = abs(after.width_m - before.width_m) < SAME_WIDTH * before.width_m
+            same = abs(after.width_m - before.width_m) < SAME_WIDTH_RATIO * before.width_m
             open_end = any(before.ends_open) or any(after.ends_open)
             way = math.hypot(across, 0.0 if open_end else along, 2 * up)
             if same and way < MAX_MOVE_M and abs(along) < before.length_m / 2:

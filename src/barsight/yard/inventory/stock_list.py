@@ -27,9 +27,11 @@ _REMEDY = (
 MAX_LISTED = 10_000
 """Maximum number of listed bundles: each one is compared with each bundle of the map."""
 _REACH_M = 1.0
-_MOVED_M = 0.05
-_TURNED_DEG = 5.0
-_SIGMAS = 3.0
+"""Maximum distance (m) between a listed bundle and the one found."""
+_MOVED_M, _TURNED_DEG, _DIFFERENT_RATIO, _SIGMAS = 0.05, 5.0, 0.1, 3.0
+"""Minimum distance (m), angle and share of a size by which a bundle differs from the list, and the same in
+sigmas.
+"""
 
 
 @dataclass(frozen=True)
@@ -278,7 +280,7 @@ def _disagreements(one: ListedBundle, bundle: Bundle) -> tuple[str, ...]:
     ):
         if listed is None or not np.isfinite(spread):
             continue
-        if abs(found - listed) > max(_SIGMAS * spread, 0.1 * listed):
+        if abs(found - listed) > max(_SIGMAS * spread, _DIFFERENT_RATIO * listed):
             out.append(f"{name} {1e3 * found:.0f} mm instead of {1e3 * listed:.0f} mm")
     if one.yaw_deg is not None:
         listed_rad = np.radians(one.yaw_deg)

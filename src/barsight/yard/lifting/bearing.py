@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64
-from barsight.core.records.heights import HeightSource
 from barsight.yard.axes import axes_of
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.load import Load
@@ -133,7 +132,7 @@ def _surroundings(
     x, y = (place[k] + v[:, None] * along[k] + u[None] * across[k] for k in (0, 1))
     part = part_about(yard, x, y)
     column, row, inside = nearest_cells(part, x, y)
-    seen = (part.source != HeightSource.UNKNOWN) & (part.source != HeightSource.FILLED)
+    seen = part.is_seen
     lowest = np.where(seen, part.z_m, np.float32(-1e3))
     nearby = cv2.dilate(lowest, np.ones((UNSEEN_REACH_CELLS,) * 2, np.uint8))
     filled = np.where(seen, part.z_m, nearby).astype(np.float32)

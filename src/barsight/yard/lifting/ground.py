@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64, Int64
-from barsight.core.records.heights import HeightSource
 from barsight.yard.axes import axes_of
 from barsight.yard.events import YardEvent
 from barsight.yard.lifting.load import Load
@@ -167,7 +166,7 @@ class Ground:
 def _coarse(heights: HeightMap, step: int) -> tuple[Float32, Float32]:
     """Compute the maximum height that may occur in each block of step x step, and the share that was seen."""
     rows, columns = (n // step for n in heights.z_m.shape)
-    seen = (heights.source != HeightSource.UNKNOWN) & (heights.source != HeightSource.FILLED)
+    seen = heights.is_seen
     cut = np.s_[: rows * step, : columns * step]
     blocks = rows, step, columns, step
     share = seen[cut].reshape(blocks).mean(axis=(1, 3)).astype(np.float32)

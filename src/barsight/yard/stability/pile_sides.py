@@ -23,8 +23,8 @@ from barsight.yard.stability.stability import (
 )
 from barsight.yard.types import Bundle
 
-NEAR_M = 0.3
-PARALLEL_RAD = np.radians(5.0)
+NEAR_M, PARALLEL_RAD = 0.3, np.radians(5.0)
+"""Maximum gap (m) and angle between two bundles of one pile."""
 
 
 @dataclass(frozen=True)

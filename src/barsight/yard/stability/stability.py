@@ -20,18 +20,28 @@ from barsight.yard.map_lookup import lookup_heights
 from barsight.yard.types import Bundle, HeightMap, known_sigma
 from barsight.yard.vetoes import Check, check_max, check_min, check_true
 
-STEP_M = 0.01
-LOOK_M = 1.5
+STEP_M, LOOK_M = 0.01, 1.5
+"""Spacing (m) of the places beside a bundle that are looked at, and how far (m) they reach from its edge."""
 STATIONS = 40
+"""Number of such rows of places along a bundle."""
 DUNNAGE_M = 0.3
 """Maximum thickness (m) of the dunnage between two layers."""
 MIN_LEDGE_M = 0.03
-MIN_KNOWN = 0.3
+"""Minimum width (m) of a ledge, and minimum difference of the ledges on both sides, that counts."""
+MIN_KNOWN, MIN_PLACES = 0.3, 10
+"""Minimum share of a place's stations that must have been seen, and minimum number of such places."""
+FREE_RATIO = 1.2
+"""Minimum drop beside a bundle, in its widths, that reaches below its support."""
+LEVEL_M = 0.05
+"""Height (m) over the lowest place beside a bundle, or over the floor, that counts as level with it."""
 SHEER_M = 0.15
+"""Distance (m) from a bundle's edge within which its side is called sheer."""
 MAX_COLUMN_RATIO = 2.5
 """Maximum height of two bundles, one on the other, in widths."""
 BESIDE_M = 0.3
+"""Maximum gap (m) between a bundle and one that may slide onto it."""
 TOUCH_M = 0.02
+"""Maximum gap (m) between bundles that touch."""
 RAISED_RATIO = 0.25
 """Minimum height, in widths, of a neighbour's underside above that of the bundle it rests against."""
 
@@ -107,7 +117,7 @@ def _footing(heights: HeightMap, bundle: Bundle, settings: LiftSettings) -> Foot
 
 def _is_free(side: Side, bundle: Bundle) -> bool:
     """Check whether the surface beside the bundle falls below the bundle's support."""
-    return side.drop_m > 1.2 * bundle.width_m
+    return side.drop_m > FREE_RATIO * bundle.width_m
 
 
 def _profile(heights: HeightMap, bundle: Bundle, sign: int) -> Float64:
@@ -128,17 +138,17 @@ def _profile(heights: HeightMap, bundle: Bundle, sign: int) -> Float64:
 def _side(profile: Float64, bundle: Bundle) -> Side:
     z, known = profile[:, 0], profile[:, 1] >= MIN_KNOWN
     share = float(profile[:, 1].mean())
-    if known.sum() < 10:
+    if known.sum() < MIN_PLACES:
         return Side(math.nan, math.nan, math.nan, math.nan, share)
     # The bundle's own shoulder and its neighbour's may show in the first centimetres.
     z = np.where(known, z, np.nan)
     lowest = float(np.nanmin(z))
     drop = bundle.top_z_m - lowest
-    run = float(np.flatnonzero(np.nan_to_num(z, nan=np.inf) <= lowest + 0.05)[0]) * STEP_M
+    run = float(np.flatnonzero(np.nan_to_num(z, nan=np.inf) <= lowest + LEVEL_M)[0]) * STEP_M
     slope = math.degrees(math.atan2(drop, run))
     base = bundle.top_z_m - bundle.width_m
     floor_of_layer = base - DUNNAGE_M / 2 - 0.5 * bundle.width_m
-    shows = np.flatnonzero(~(np.nan_to_num(z, nan=-np.inf) > max(floor_of_layer, 0.05)))
+    shows = np.flatnonzero(~(np.nan_to_num(z, nan=-np.inf) > max(floor_of_layer, LEVEL_M)))
     ledge = float(shows[0] if shows.size else len(z)) * STEP_M
     near = z[: round(SHEER_M / STEP_M) + 1]
     sheer = bundle.top_z_m - float(np.nanmin(near)) if np.isfinite(near).any() else math.nan
