@@ -13,8 +13,9 @@ from barsight.core.records.sensor_samples import LaserProfile
 from barsight.mapping.agreement_intervals import agreement_intervals
 
 JUMP_M = 0.03
-_FURTHEST_M = 0.06
-_FEWEST_SHARED = 50
+"""Minimum height difference (m) of neighbours that are on two surfaces: a step, not a slope."""
+_FURTHEST_M, _FEWEST_SHARED = 0.06, 50
+"""Maximum shift (m) of a profile along x, and minimum number of points that are compared at a shift."""
 
 
 def profile_difference(contour: Contour, laser: LaserProfile) -> Float64:

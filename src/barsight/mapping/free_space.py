@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from barsight.core.arrays import Bool, Float32, Float64, Int32, UInt8, kernel
 from barsight.mapping.observation import CellObservations
 from barsight.mapping.spilled_tiles import TileKey
+from barsight.mapping.tiles import TILE_CELLS, covering_tiles, tile_overlap, tile_places
 
-TILE = 256
 OVER_END_M = 0.02
 """Margin added to the height of a line of sight when it lowers a cell's bound."""
 MARGIN_M = 0.5
@@ -43,8 +43,8 @@ _DIAGONAL_CELLS = math.sqrt(2.0)
 class FreeSpace:
     """Upper bounds (m) of the height of anything in each cell, from the two views with the lowest bounds.
 
-    cell_m: side of the map's cells. tiles: (2, TILE, TILE) each, the lowest bound and the second lowest;
-    2 MiB per 5 m square at cells of 10 mm.
+    cell_m: side of the map's cells. tiles: (2, TILE_CELLS, TILE_CELLS) each, the lowest bound and the second
+    lowest; 2 MiB per 5 m square at cells of 10 mm.
     """
 
     cell_m: float
@@ -83,9 +83,8 @@ class FreeSpace:
 
     def forget(self, forgotten: Callable[[NDArray[Any], NDArray[Any]], Bool]) -> None:
         """Discard bounds. forgotten: marks the places, by x and y (m) of a grid."""
-        cells = np.arange(TILE) * self.cell_m
         for key in sorted(self.tiles):
-            self.tiles[key][:, forgotten(*(cells + at * TILE * self.cell_m for at in key))] = UNPROVEN
+            self.tiles[key][:, forgotten(*tile_places(key, self.cell_m))] = UNPROVEN
 
     def join(
         self, newer: FreeSpace, rise_m: float, forgotten: Callable[[NDArray[Any], NDArray[Any]], Bool]
@@ -93,11 +92,9 @@ class FreeSpace:
         """Merge the bounds of a newer pass, raised by rise_m. forgotten: marks the places, by x and y (m)
         of a grid, that have changed since, where only the newer pass's bounds remain valid.
         """
-        cells = np.arange(TILE) * self.cell_m
         for key in sorted({*self.tiles, *newer.tiles}):
-            x, y = (cells + at * TILE * self.cell_m for at in key)
-            mine = self.tiles.setdefault(key, np.full((2, TILE, TILE), UNPROVEN))
-            mine[:, forgotten(x, y)] = UNPROVEN
+            mine = self.tiles.setdefault(key, np.full((2, TILE_CELLS, TILE_CELLS), UNPROVEN))
+            mine[:, forgotten(*tile_places(key, self.cell_m))] = UNPROVEN
             if key in newer.tiles:
                 np.minimum(mine, newer.tiles[key] + np.float32(rise_m), out=mine)
 
@@ -106,7 +103,7 @@ class FreeSpace:
         new = bound[theirs]
         if not np.isfinite(new).any():
             return
-        tile = self.tiles.setdefault(key, np.full((2, TILE, TILE), UNPROVEN))
+        tile = self.tiles.setdefault(key, np.full((2, TILE_CELLS, TILE_CELLS), UNPROVEN))
         first, second = tile[0][ours], tile[1][ours]
         tile[1][ours] = np.minimum(second, np.maximum(first, new))
         tile[0][ours] = np.minimum(first, new)
@@ -130,29 +127,6 @@ def level_heights(
     level = np.full(shape, NO_END)
     _mark_level(cells.x, cells.y, cells.z_m, corner, highest, lowest, level)
     return level, holes
-
-
-def covering_tiles(column: int, row: int, shape: tuple[int, int]) -> list[TileKey]:
-    """List the tiles that cover an array (rows, columns) whose first cell is (column, row)."""
-    return [
-        (i, j)
-        for i in range(column // TILE, (column + shape[1] - 1) // TILE + 1)
-        for j in range(row // TILE, (row + shape[0] - 1) // TILE + 1)
-    ]
-
-
-def tile_overlap(
-    key: TileKey, column: int, row: int, shape: tuple[int, ...]
-) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-    """Return the cells shared by the tile and an array whose first cell is (column, row), as slices [y, x]
-    of each.
-    """
-    ours, theirs = [], []
-    for tile, first, size in ((key[1], row, shape[0]), (key[0], column, shape[1])):
-        low, high = max(tile * TILE, first), min((tile + 1) * TILE, first + size)
-        ours.append(slice(low - tile * TILE, high - tile * TILE))
-        theirs.append(slice(low - first, high - first))
-    return (ours[0], ours[1]), (theirs[0], theirs[1])
 
 
 @kernel()

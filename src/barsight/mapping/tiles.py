@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from barsight.core.arrays import Float32
+from barsight.core.arrays import Float32, Float64
 from barsight.mapping.spilled_tiles import SpilledTiles, TileKey
 
 TILE_CELLS = 256
+"""Side of a tile, in cells."""
 SLOTS = 4
 """Maximum number of heights stored per cell."""
 FIELDS = 7
@@ -68,3 +69,32 @@ class TileStore:
 def tiles_around(key: TileKey) -> list[TileKey]:
     """Return a tile and its eight neighbours, itself in the middle."""
     return [(key[0] + i, key[1] + j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+
+
+def covering_tiles(column: int, row: int, shape: tuple[int, int]) -> list[TileKey]:
+    """List the tiles that cover an array (rows, columns) whose first cell is (column, row)."""
+    return [
+        (i, j)
+        for i in range(column // TILE_CELLS, (column + shape[1] - 1) // TILE_CELLS + 1)
+        for j in range(row // TILE_CELLS, (row + shape[0] - 1) // TILE_CELLS + 1)
+    ]
+
+
+def tile_overlap(
+    key: TileKey, column: int, row: int, shape: tuple[int, ...]
+) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+    """Return the cells shared by the tile and an array whose first cell is (column, row), as slices [y, x]
+    of each.
+    """
+    ours, theirs = [], []
+    for tile, first, size in ((key[1], row, shape[0]), (key[0], column, shape[1])):
+        low, high = max(tile * TILE_CELLS, first), min((tile + 1) * TILE_CELLS, first + size)
+        ours.append(slice(low - tile * TILE_CELLS, high - tile * TILE_CELLS))
+        theirs.append(slice(low - first, high - first))
+    return (ours[0], ours[1]), (theirs[0], theirs[1])
+
+
+def tile_places(key: TileKey, cell_m: float) -> tuple[Float64, Float64]:
+    """Compute x and y (TILE_CELLS,) of the centres of a tile's columns and rows, m."""
+    x_m, y_m = (cell_m * (TILE_CELLS * at + np.arange(TILE_CELLS)) for at in key)
+    return x_m, y_m

@@ -15,12 +15,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from barsight.core.arrays import Bool, Float32, Float64, Int32, UInt8, UInt16, kernel
+from barsight.core.arrays import Bool, Float32, Float64, UInt8, UInt16
 from barsight.core.pose import Pose
 from barsight.core.records.pairs import RectifiedPair
-from barsight.mapping.free_space import TILE, covering_tiles, tile_overlap
+from barsight.mapping.free_space import NO_END, UNPROVEN, bound_heights
 from barsight.mapping.observation import CellObservations
 from barsight.mapping.spilled_tiles import TileKey
+from barsight.mapping.tiles import TILE_CELLS, covering_tiles, tile_overlap, tile_places
 
 COARSE_CELLS = 5
 """Side, in cells of the map, of the coarse cells in which the height of the tops is computed."""
@@ -36,8 +37,8 @@ MAX_VIEWS = 250
 class TopPhoto:
     """Sums of gray levels and the number of views in them, per cell of the map.
 
-    cell_m: side of the cells. tiles: (2, TILE, TILE) each, sums and numbers of views; 1 MiB per 5 m square at
-    cells of 10 mm.
+    cell_m: side of the cells. tiles: (2, TILE_CELLS, TILE_CELLS) each, sums and numbers of views; 1 MiB per
+    5 m square at cells of 10 mm.
     """
 
     cell_m: float
@@ -100,9 +101,8 @@ class TopPhoto:
 
     def join(self, newer: TopPhoto, forgotten: Callable[[NDArray[Any], NDArray[Any]], Bool]) -> None:
         """Add a newer pass's pictures. forgotten: see `FreeSpace.join`."""
-        cells = np.arange(TILE) * self.cell_m
         for key, (sums, views) in self.tiles.items():
-            gone = forgotten(*(cells + at * TILE * self.cell_m for at in key))
+            gone = forgotten(*tile_places(key, self.cell_m))
             sums[gone], views[gone] = 0, 0
         for key, added in newer.tiles.items():
             if key not in self.tiles:
@@ -116,7 +116,7 @@ class TopPhoto:
         ours, theirs = tile_overlap(key, column, row, count.shape)
         if not count[theirs].any():
             return
-        sums, views = self.tiles.setdefault(key, np.zeros((2, TILE, TILE), np.uint16))
+        sums, views = self.tiles.setdefault(key, np.zeros((2, TILE_CELLS, TILE_CELLS), np.uint16))
         open_ = views[ours] < MAX_VIEWS
         sums[ours] += np.where(open_, total[theirs], np.uint16(0))
         views[ours] += np.where(open_, count[theirs], np.uint8(0))
@@ -128,10 +128,11 @@ def _tops(cells: CellObservations, column: int, row: int, cell_m: float) -> tupl
     """
     shape = tuple(-(-(int(at.max()) + 1 - first) // COARSE_CELLS)
                   for at, first in ((cells.y, row), (cells.x, column)))  # fmt: skip
-    lowest = np.float32(cells.z_m.min())
-    heights = np.full(tuple(COARSE_CELLS * n for n in shape), lowest, np.float32)
-    seen = np.zeros(heights.shape, np.uint8)
-    _note_highest(cells.x, cells.y, cells.z_m, column, row, heights, seen)
+    size = tuple(COARSE_CELLS * n for n in shape)
+    highest, lowest = np.full(size, NO_END), np.full(size, UNPROVEN)
+    bound_heights(cells.x, cells.y, cells.z_m, (column, row), highest, lowest)
+    seen = (highest > NO_END).astype(np.uint8)
+    heights = np.maximum(highest, cells.z_m.min())
     # The median keeps a single wrong match from raising the tops.
     smooth = cv2.medianBlur(heights, 3).reshape(shape[0], COARSE_CELLS, shape[1], COARSE_CELLS)
     span = round(SPAN_M / (COARSE_CELLS * cell_m)) | 1
@@ -139,20 +140,6 @@ def _tops(cells: CellObservations, column: int, row: int, cell_m: float) -> tupl
     wide = round(SPAN_M / cell_m) | 1
     held = cv2.morphologyEx(seen, cv2.MORPH_CLOSE, np.ones((wide, wide), np.uint8)) > 0
     return np.asarray(cv2.blur(tops, (3, 3)) + np.float32(OVER_TOPS_M), np.float32), held
-
-
-@kernel()
-def _note_highest(
-    x: Int32, y: Int32, z: Float32, column: int, row: int, heights: Float32, seen: UInt8
-) -> None:
-    """Raise heights (H, W) to the highest z (N,) of each cell x, y (N,), and mark the cell in seen (H, W);
-    both arrays start at (column, row).
-    """
-    first_column, first_row = np.int32(column), np.int32(row)
-    for k in range(z.size):
-        i, j = np.uint32(y[k] - first_row), np.uint32(x[k] - first_column)
-        heights[i, j] = max(heights[i, j], z[k])
-        seen[i, j] = 1
 
 
 def _finer(at: Float64, coarse: Float32, size: tuple[int, ...]) -> Float32:

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64
+from barsight.core.linalg.robust import mad_sigma
 
 BLOCK_CELLS = 64
 MIN_KNOWN_RATIO = 0.3
@@ -117,7 +118,7 @@ def _measured(
     pictures = [_contrast(one.gray, pictured) for one in (first, second)]
     pictured = _inner(pictured)
     noise = pictures[0] - pictures[1]
-    spread = float(1.4826 * np.median(np.abs(noise[pictured]))) if pictured.any() else 1.0
+    spread = mad_sigma(noise[pictured]) if pictured.any() else 1.0
     normal = np.zeros((3, 3, *known.shape), np.float32)
     wanted = np.zeros((3, *known.shape), np.float32)
     for pair, weight, lifts in (

@@ -13,6 +13,7 @@ from barsight.calibration.boards.ring_detection import find_rings
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Float64, UInt8
 from barsight.core.errors import Failed
+from barsight.core.linalg.robust import mad_sigma
 from barsight.core.pose import skew
 from barsight.core.records.pairs import RectifiedCamera, RefusedFrame, StereoFrame
 from barsight.core.records.trajectory import PosedFrame
@@ -95,8 +96,8 @@ class SeenTags:
         """Estimate the noise of a middle in one picture from the row differences between the pictures."""
         if self.known_px is not None:
             return self.known_px
-        rows = [abs(one.rows_px) for seen in self.sightings.values() for one in seen]
-        return max(MIN_SIGMA_PX, 1.4826 * float(np.median(rows)) / 2**0.5) if rows else MIN_SIGMA_PX
+        rows_px = np.array([one.rows_px for seen in self.sightings.values() for one in seen])
+        return max(MIN_SIGMA_PX, mad_sigma(rows_px) / 2**0.5) if rows_px.size else MIN_SIGMA_PX
 
     def moved(self, posed: dict[int, PosedFrame]) -> SeenTags:
         """Place the sightings by other poses of the same pairs; those without a pose are left out."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -72,8 +72,7 @@ def finished_layers(
     if reach > 0:
         fill_gaps(around, reach)
     inner = slice(_HALO, _HALO + TILE_CELLS)
-    layers = Layers(*(getattr(around, field.name)[inner, inner] for field in fields(Layers)))
-    return layers, blur[inner, inner]
+    return around.part(inner, inner), blur[inner, inner]
 
 
 def _within(direction: Int8, margin: int) -> Int8:

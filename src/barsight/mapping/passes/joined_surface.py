@@ -17,7 +17,7 @@ from barsight.mapping.passes.changes import PLACE_M, PlaceHistory
 from barsight.mapping.spilled_tiles import TileKey
 from barsight.mapping.surface.surface import Layers, Surface, write_tile
 from barsight.mapping.surface.tile_figures import TileFigures, gather_surface, tile_figures
-from barsight.mapping.tiles import TILE_CELLS
+from barsight.mapping.tiles import TILE_CELLS, covering_tiles, tile_places
 from barsight.registration.block_shifts import BLOCK_CELLS, BlockShifts, MatchedMap, block_shifts
 from barsight.registration.gross_shift import CoarsePair, find_gross_shift
 from barsight.registration.pass_ties import PassCorrection
@@ -115,9 +115,7 @@ def join_surfaces(passes: Sequence[PassSurface], folder: Path) -> JoinedSurface:
 def _join_tile(
     passes: Sequence[PassSurface], key: TileKey, history: PlaceHistory, folder: Path
 ) -> TileFigures:
-    cell_m = passes[0].surface.cell_m
-    x_m, y_m = (cell_m * (TILE_CELLS * at + np.arange(TILE_CELLS)) for at in key)
-    last = history.last_change(x_m, y_m)
+    last = history.last_change(*tile_places(key, passes[0].surface.cell_m))
     layers, parts = Layers.unknown(TILE_CELLS, TILE_CELLS), []
     times = np.full(last.shape, -1)
     for number, one in enumerate(passes):
@@ -212,12 +210,7 @@ def _coarse(one: PassSurface, low: Float64, shape: tuple[int, int], cells: int) 
         for left in range(0, shape[1], step):
             rows, columns = min(step, shape[0] - first), min(step, shape[1] - left)
             column, row = int(low[0]) + left * cells, int(low[1]) + first * cells
-            keys = {
-                (at_x // TILE_CELLS, at_y // TILE_CELLS)
-                for at_x in (column, column + columns * cells - 1)
-                for at_y in (row, row + rows * cells - 1)
-            }
-            if not keys & occupied:
+            if occupied.isdisjoint(covering_tiles(column, row, (rows * cells, columns * cells))):
                 continue
             layers = moved_window(one, column, row, columns * cells, rows * cells)
             seen = layers.source == HeightSource.VISION

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import Float32, Float64
+from barsight.core.linalg.robust import mad_sigma
 from barsight.core.records.heights import HeightSource
 from barsight.mapping.passes.changes import BundleMove
 from barsight.mapping.passes.joined_surface import PassSurface, moved_window
@@ -116,7 +117,7 @@ def picture_along(one: PassSurface, bundle: SeenBundle) -> Float32 | None:
         for part in (np.where(known, gray, 0), known)
     )
     fast = gray - smooth / np.maximum(held, 1e-3)
-    bound = _MAX_CONTRAST * 1.4826 * float(np.median(np.abs(fast[known])))
+    bound = _MAX_CONTRAST * mad_sigma(fast[known])
     return np.asarray(np.clip(fast, -bound, bound), np.float32)
 
 

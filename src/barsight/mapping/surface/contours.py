@@ -11,11 +11,13 @@ from scipy.ndimage import median_filter
 from barsight.core.arrays import Float64, UInt8
 from barsight.core.records.heights import Contour, HeightSource
 from barsight.core.records.sensor_samples import LaserProfile
+from barsight.mapping.agreement import JUMP_M
 from barsight.mapping.surface.surface import Surface
 
 SPACING_M = 0.01
+"""Spacing (m) of a contour's samples along X."""
 SAME_Y_M = 0.001
-_JUMP_M = 0.03
+"""Maximum distance (m) along Y of a requested contour from a laser profile for them to be compared."""
 _FILTER_SAMPLES = 5
 
 
@@ -104,7 +106,7 @@ def _blend(z: Float64, sigma: Float64, source: UInt8, weights: Float64) -> tuple
     nearest = np.argmax(weights, axis=0)[None, :]
     z_nearest = np.take_along_axis(z, nearest, axis=0)
     source_nearest = np.take_along_axis(source, nearest, axis=0)
-    joined = (source == source_nearest) & (np.abs(z - z_nearest) <= _JUMP_M)
+    joined = (source == source_nearest) & (np.abs(z - z_nearest) <= JUMP_M)
     w = np.where(joined, weights, 0.0)
     with np.errstate(invalid="ignore"):
         w /= w.sum(axis=0)

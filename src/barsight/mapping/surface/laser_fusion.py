@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy as np
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.records.heights import HeightSource
 from barsight.core.records.sensor_samples import LaserProfile
+from barsight.mapping.agreement import JUMP_M
 from barsight.mapping.settings import MapSettings
 from barsight.mapping.spilled_tiles import TileKey
 from barsight.mapping.surface.cloud import cloud_file
@@ -24,7 +25,7 @@ CARRIED_M = 0.12
 far along a bar.
 """
 _REACH = 2
-_EDGE_M = 0.03
+"""Number of cells along x within which an edge of the map may explain a laser's height."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +90,7 @@ def _at_cells(laser: LaserProfile, cell_m: float, settings: MapSettings) -> _Poi
     step = laser.z_m[after] - laser.z_m[before]
     nearest = np.where(share > 0.5, after, before)
     near = np.abs(laser.x_m[nearest] - x) <= 0.25 * cell_m
-    even = (gap <= 2 * cell_m) & (np.abs(step) <= _EDGE_M)
+    even = (gap <= 2 * cell_m) & (np.abs(step) <= JUMP_M)
     z = np.where(even, laser.z_m[before] + share * step, laser.z_m[nearest])
     y = np.where(even, (1 - share) * laser.y_m[before] + share * laser.y_m[after], laser.y_m[nearest])
     kept = even | near
@@ -108,7 +109,7 @@ def _fused_tile(
     rows, columns = TILE_CELLS + 2 * carry, TILE_CELLS + 2 * _REACH
     around = surface.window(first, row, columns, rows)
     share, shift, gain = np.zeros((3, rows, columns))
-    fused = Layers(*(getattr(around, field.name).copy() for field in fields(Layers)))
+    fused = around.part(slice(None), slice(None))
     for one in points:
         i, j = one.row - row, one.column - first
         here = (i >= 0) & (i < rows) & (j >= _REACH) & (j < columns - _REACH)
@@ -125,8 +126,7 @@ def _fused_tile(
     beside = (share > 0) & (fused.source == HeightSource.VISION)
     fused.z_m[beside] += (share * gain * shift)[beside].astype(np.float32)
     fused.sigma_m[beside] *= np.sqrt(1 - share**2 * gain)[beside].astype(np.float32)
-    cut = slice(carry, carry + TILE_CELLS), slice(_REACH, _REACH + TILE_CELLS)
-    return Layers(*(np.ascontiguousarray(getattr(fused, field.name)[cut]) for field in fields(Layers)))
+    return fused.part(slice(carry, carry + TILE_CELLS), slice(_REACH, _REACH + TILE_CELLS))
 
 
 def _fuse_points(

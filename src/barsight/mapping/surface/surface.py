@@ -15,7 +15,7 @@ from barsight.mapping.fusion import height_sigma
 from barsight.mapping.spilled_tiles import TileKey
 from barsight.mapping.surface.cloud import CloudPart, read_part
 from barsight.mapping.surface.hole_filling import bridge_gaps
-from barsight.mapping.tiles import FIELDS, GRAY, TILE_CELLS, VIEWS, Z
+from barsight.mapping.tiles import FIELDS, GRAY, VIEWS, Z, covering_tiles, tile_overlap
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +37,10 @@ class Layers:
         nan = np.full((rows, columns), np.nan, np.float32)
         none = np.zeros((rows, columns), np.float32)
         return cls(nan, nan.copy(), none, none.astype(np.uint8), nan.copy())
+
+    def part(self, rows: slice, columns: slice) -> Layers:
+        """Copy a rectangle, by cells from start to stop."""
+        return Layers(*(getattr(self, field.name)[rows, columns].copy() for field in fields(Layers)))
 
 
 def gray_levels(intensity: Float32) -> UInt8:
@@ -69,11 +73,9 @@ class Surface:
     def window(self, column: int, row: int, columns: int, rows: int) -> Layers:
         """Read the rectangle that starts at cell (column, row); it is unknown where there is no tile."""
         layers = Layers.unknown(rows, columns)
-        for tile_row in range(row // TILE_CELLS, (row + rows - 1) // TILE_CELLS + 1):
-            for tile_column in range(column // TILE_CELLS, (column + columns - 1) // TILE_CELLS + 1):
-                if (tile_column, tile_row) in self.tiles:
-                    tile = read_tile(self.folder, (tile_column, tile_row))
-                    paste(tile, (tile_column, tile_row), layers, column, row)
+        for key in covering_tiles(column, row, (rows, columns)):
+            if key in self.tiles:
+                paste(read_tile(self.folder, key), key, layers, column, row)
         return layers
 
     def cloud(self) -> Iterator[CloudPart]:
@@ -145,15 +147,6 @@ def read_tile(folder: Path, key: TileKey) -> Layers:
 
 def paste(tile: Layers, key: TileKey, into: Layers, column: int, row: int) -> None:
     """Copy the part of the tile that overlaps the rectangle whose first cell is (column, row)."""
-    rows, columns = into.z_m.shape
-    left, top = key[0] * TILE_CELLS - column, key[1] * TILE_CELLS - row
-    target = (
-        slice(max(top, 0), min(top + TILE_CELLS, rows)),
-        slice(max(left, 0), min(left + TILE_CELLS, columns)),
-    )
-    source = (
-        slice(target[0].start - top, target[0].stop - top),
-        slice(target[1].start - left, target[1].stop - left),
-    )
+    ours, theirs = tile_overlap(key, column, row, into.z_m.shape)
     for field in fields(Layers):
-        getattr(into, field.name)[target] = getattr(tile, field.name)[source]
+        getattr(into, field.name)[theirs] = getattr(tile, field.name)[ours]
