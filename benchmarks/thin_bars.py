@@ -96,8 +96,7 @@ def crossings(world: DrawnYard, bundle: Bundle) -> list[tuple[float, float, floa
 def score(world: DrawnYard, out: Path, found: dict[float, list[bool]], alarms: list[float]) -> None:
     """Score a measured yard's uncovered bundles of 2 m and more: whether each bar that covers 0.9 of one's
     width is found, by diameter; the strongest line on each that nothing lies on."""
-    yard = read_heights(out)
-    heights = yard.part(slice(0, yard.shape[0]), slice(0, yard.shape[1]))
+    heights = read_heights(out).whole()
     for bundle in read_bundles(out / "bundles.json"):
         strengths = line_strengths(heights, bundle)
         if bundle.length_m < 2 or bundle.on_top is False or strengths is None:

@@ -69,7 +69,7 @@ def stick(image: np.ndarray, label: np.ndarray, corners_px: np.ndarray) -> np.nd
 def labelled(recording: Path, out: Path, text: str, size_m: float) -> np.ndarray:
     """Stick a label over the middle of the map in all pictures, by the measured poses; its place."""
     parted, rig, path = read_heights(out), open_recording(recording).rig, read_path(out)
-    heights = parted.part(slice(0, parted.shape[0]), slice(0, parted.shape[1]))
+    heights = parted.whole()
     assert path is not None
     x, y = path.position_m[:, 0].mean(), float(np.mean(heights.y_m))
     column, row = np.abs(heights.x_m - x).argmin(), np.abs(heights.y_m - y).argmin()

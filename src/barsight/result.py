@@ -89,9 +89,7 @@ class Yard:
     @cached_property
     def height_map(self) -> HeightMap:
         """Return the whole map."""
-        heights = read_heights(self.folder)
-        rows, columns = heights.shape
-        return heights.part(slice(0, rows), slice(0, columns))
+        return read_heights(self.folder).whole()
 
     @cached_property
     def contours(self) -> tuple[Contour, ...]:

@@ -256,7 +256,7 @@ def read_path(folder: Path) -> CameraPath | None:
 def read_cloud(path: Path, max_points: int | None = None) -> Cloud:
     """Read at most `max_points` evenly drawn points of cloud.ply (all, if None) from disk.
 
-    Raises InputError if the file is missing, damaged or empty or has other properties than formats.md says.
+    Raises InputError if the file is missing, damaged or empty or lacks one of PROPERTIES.
     """
     if not path.is_file():
         raise InputError(path, "no such file", REMEDY)

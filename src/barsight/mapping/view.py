@@ -92,7 +92,7 @@ class Matcher:
         if isinstance(candidates, Failed):
             return candidates
         width = pair.camera.width
-        if candidates.lowest_px >= width or candidates.highest_px <= -width or candidates.count > width:
+        if not candidates.fits(width):
             asked = f"{candidates.lowest_px}:{candidates.highest_px}"
             return Failed("wide-range", f"the disparity range {asked} doesn't fit a picture {width} px wide")
         with self.watch("stereo", 1):

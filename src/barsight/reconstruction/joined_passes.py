@@ -28,6 +28,7 @@ from barsight.reconstruction.tracked_recording import TrackedRecording
 from barsight.recording.base import Recording
 from barsight.registration.pass_ties import PairTie, PassCorrection, PassPrior, PassTies, tie_passes
 from barsight.yard.types import Bundle, Doubt, DoubtKind
+from barsight.yard_frame import mounting_id
 
 MIN_SIGMA = np.array([2e-4, 2e-4, 2e-4, 0.002, 0.002, 0.002])
 """Minimum sigma of a pass's rotation (rad) and shift (m), due to springs and rails that no encoder
@@ -147,12 +148,12 @@ def _at_once(ordered: Sequence[Recording]) -> list[list[Recording]]:
 
 
 def _hung(recording: Recording) -> str:
-    """Return a digest of how the body is mounted on the crane. Raises InputError without encoders."""
+    """Return the id of the body's mounting on the crane. Raises InputError without encoders."""
     crane = recording.crane()
     if crane is None:
         problem = "it has no crane encoders, which place several passes in one yard"
         raise InputError(recording.path, problem, "measure it by itself")
-    return json_digest(json_value({"lever": crane.crane_to_body_m, "attitude": crane.yard_from_body_nominal}))
+    return mounting_id(crane)
 
 
 def join_passes(

@@ -48,10 +48,7 @@ class Snapshot:
     @cached_property
     def height_map(self) -> HeightMap | None:
         """Return the whole map."""
-        if self.surface is None:
-            return None
-        rows, columns = self.surface.shape
-        return surface_map(self.surface).part(slice(0, rows), slice(0, columns))
+        return None if self.surface is None else surface_map(self.surface).whole()
 
 
 class PairPlacer:

@@ -13,7 +13,7 @@ from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.arrays import UInt8
 from barsight.core.errors import CalibrationError, ConfigError, Failed, InputError, MeasurementError
 from barsight.core.reading.bounded_reading import read_bytes
-from barsight.core.records.disparity import Disparity, DisparityRange
+from barsight.core.records.disparity import Disparity
 from barsight.core.records.gray_levels import TornImageError, split_colour
 from barsight.core.records.pairs import PICTURE_REMEDY, RectifiedPair, StereoFrame
 from barsight.mapping.view import disparity_range
@@ -49,7 +49,9 @@ def match_pictures(
         if candidates.code not in _REMEDIES:
             raise MeasurementError(f"{_name(left)}: {candidates.reason}")
         raise InputError(_name(left), candidates.reason, _REMEDIES[candidates.code])
-    _expect_inside(candidates, pair)
+    if not candidates.fits(pair.camera.width):
+        span = f"{candidates.lowest_px}:{candidates.highest_px}"
+        raise ConfigError(f"the range {span} doesn't fit a picture {pair.camera.width} px wide")
     disparity = make_method(settings)(pair, candidates)
     if disparity.coverage == 0:
         span = f"no pixel has a match from {candidates.lowest_px} to {candidates.highest_px} px"
@@ -115,12 +117,3 @@ def _read(path: Picture) -> tuple[UInt8, UInt8 | None]:
     except TornImageError as error:
         remedy = "give another picture" if isinstance(path, Path) else PICTURE_REMEDY
         raise InputError(_name(path), str(error), remedy) from error
-
-
-def _expect_inside(candidates: DisparityRange, pair: RectifiedPair) -> None:
-    """Raise ConfigError where no candidate is possible, or there are more than the picture's width."""
-    width = pair.camera.width
-    if candidates.lowest_px >= width or candidates.highest_px <= -width or candidates.count > width:
-        raise ConfigError(
-            f"the range {candidates.lowest_px}:{candidates.highest_px} doesn't fit a picture {width} px wide"
-        )

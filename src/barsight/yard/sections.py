@@ -53,6 +53,10 @@ class PartedMap:
             slice(rows.start - below, rows.stop - below), slice(columns.start - left, columns.stop - left)
         )
 
+    def whole(self) -> HeightMap:
+        """Read the whole map."""
+        return self.part(slice(0, self.shape[0]), slice(0, self.shape[1]))
+
 
 def surface_map(
     surface: Surface, free: FreeSpace | None = None, tops: TopPhoto | None = None,

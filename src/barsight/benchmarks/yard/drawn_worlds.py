@@ -84,9 +84,7 @@ def measured_world(out: Path, settings: LiftSettings) -> MappedWorld:
     now_ns = captured[1] if captured else 0
     warnings = [(str(w["code"]), str(w["message"])) for w in summary["warnings"]]
     vetoes = map_vetoes(warnings, summary["reference"], now_ns, now_ns, settings, has_magnet=True)
-    whole = read_heights(out)
-    rows, columns = whole.shape
-    heights = whole.part(slice(0, rows), slice(0, columns))
+    heights = read_heights(out).whole()
     return map_world(heights, read_bundles(out / "bundles.json"), vetoes, travel, now_ns, settings)
 
 

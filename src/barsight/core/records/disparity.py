@@ -25,6 +25,10 @@ class DisparityRange:
         """Return the number of whole candidates."""
         return self.highest_px - self.lowest_px
 
+    def fits(self, width: int) -> bool:
+        """Check that pictures of this width (px) can have such disparities, and as many."""
+        return self.lowest_px < width and self.highest_px > -width and self.count <= width
+
 
 @dataclass(frozen=True, eq=False)
 class Disparity:

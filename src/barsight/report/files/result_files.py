@@ -1,4 +1,4 @@
-"""Write the result files of formats.md, each completely or not at all."""
+"""Write the result files (docs/reference/results.md), each completely or not at all."""
 
 from __future__ import annotations
 
