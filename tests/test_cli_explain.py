@@ -71,6 +71,15 @@ def test_the_block_is_marked_where_it_stands(folder: Path) -> None:
     assert offered is not None and not (offered == BGR["offending"]).all(axis=-1).any()
 
 
+def test_what_passes_the_check_is_not_marked(tmp_path: Path) -> None:
+    """The check takes the height over the steel; the whole map's error moves plane and block alike."""
+    made = write_folder(tmp_path / "out", block_m=0.011)
+    assert lifts(made) == 0
+    told = explain(made, "bundle:1")
+    assert {check["result"] for check in told.checks if check["code"] == "obstructed"} == {"passed"}
+    assert told.picture is not None and not (told.picture == BGR["offending"]).all(axis=-1).any()
+
+
 @pytest.mark.parametrize(
     ("which", "says"),
     [("9", "no lift of rank 9"), ("bundle:99", "no lift of bundle 99"), ("first", "names no lift")],

@@ -151,10 +151,11 @@ def draw_place(heights: Any, record: dict[str, Any], magnet: Magnet, bundles: tu
     long = max(magnet.half_span_m, magnet.beam.length_m / 2) + BEYOND_M
     wide = max(magnet.beam.width_m / 2, *(abs(p.across_m) + p.width_m / 2 for p in magnet.poles)) + BEYOND_M
     part = _part(heights, place, math.hypot(long, wide))
+    # The first check of obstacles states the sigma that they are judged with.
+    sigma_mm = next(check["sigma"] for check in record["checks"] if check["code"] == "obstructed")
     faces = FacePlane(
-        target["z_m"], math.radians(record["pitch_deg"]), math.radians(record["roll_deg"]),
-        record["contact_sigma_m"],
-    )  # fmt: skip
+        target["z_m"], math.radians(record["pitch_deg"]), math.radians(record["roll_deg"]), sigma_mm / 1e3
+    )
     picture = _paint(part, place, faces, long, wide)
 
     def pixels(xy_m: Float64) -> Float64:
