@@ -15,12 +15,14 @@ from barsight.core.errors import BarsightError
 from barsight.store.accounts import Account, Role, is_password, token_digest
 
 COOKIE = "barsight_session"
-SESSION_S = 12 * 3600.0
-IDLE_S = 2 * 3600.0
+SESSION_S, IDLE_S = 12 * 3600.0, 2 * 3600.0
+"""Time after which a log-in ends, and the same without a request."""
 MAX_SESSIONS = 200
-FREE_TRIES = 5
-MAX_WAIT_S = 300.0
+"""Maximum number of log-ins; the oldest one gives way."""
+FREE_TRIES, MAX_WAIT_S = 5, 300.0
+"""Number of failed log-ins from which on a wait follows, and the longest wait."""
 MAX_THROTTLED = 10_000
+"""Maximum number of names and clients whose failures are remembered."""
 LOCAL = "local"
 """Name of the user at this computer if the store has no accounts."""
 

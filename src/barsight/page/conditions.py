@@ -27,7 +27,6 @@ from barsight.store.tables import (
     LIFT_BUNDLES,
     LIFT_STATES,
     SIGHTINGS,
-    SURVEY_VETOES,
     SURVEYS,
 )  # fmt: skip
 
@@ -162,12 +161,3 @@ def _changes(
             active[row.code, row.reason].append(row.id)
     gone = [one for one in active if one not in present and one[1] in seen.get(one[0], {one[1]})]
     return sorted(present - set(active)), [number for one in gone for number in active[one]]
-
-
-def has_veto(connection: Connection, survey_id: int, code: str) -> bool:
-    """Check whether a map as a whole has a veto."""
-    query = select(SURVEY_VETOES.c.id).where(
-        SURVEY_VETOES.c.survey_id == survey_id, SURVEY_VETOES.c.code == code,
-        SURVEY_VETOES.c.bundle_id.is_(None),
-    )  # fmt: skip
-    return connection.execute(query).first() is not None

@@ -40,9 +40,8 @@ with extra("store"):
 
 LIKE_RATIO = 0.15
 """Largest relative difference of bar diameter and width between bundles of the same kind."""
-MAX_LIFTS = 500
-MAX_ALARMS = 500
-MAX_RECORDINGS = 500
+MAX_LIFTS = MAX_ALARMS = MAX_RECORDINGS = 500
+"""Maximum numbers of past ones that the page lists."""
 _FIGURES = (
     "axis_centre_m", "yaw_deg", "pitch_deg", "length_m", "ends_m", "ends_open", "width_m", "top_z_m",
     "bar_diameter_m", "bars", "section_m2", "mass_kg", "layer", "on_top", "confidence", "known_share",

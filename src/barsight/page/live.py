@@ -14,7 +14,9 @@ from barsight.core.json_values import json_value
 from barsight.core.reading.live_run import read_crane_pose, read_live_state, running_folder
 
 STOPPED_S = 10.0
+"""Age of health.json from which on the run counts as stopped."""
 HISTORY = 720
+"""Number of health.json's states that are kept for the trends."""
 _FOR_LIFTS = ("full", "no-imu")
 
 

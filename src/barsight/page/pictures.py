@@ -17,8 +17,8 @@ from barsight.store.tables import SIGHTINGS, SURVEYS
 with extra("store"):
     from sqlalchemy import Connection, select
 
-MARGIN_M = 0.3
-PIXEL_M = 0.005
+MARGIN_M, PIXEL_M = 0.3, 0.005
+"""Margin shown around a bundle, and size of a pixel, m."""
 MAX_LONG = 1600
 """Maximum picture length along a bundle in pixels."""
 

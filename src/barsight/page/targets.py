@@ -18,7 +18,6 @@ from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import ConfigError, Failed, InputError
 from barsight.core.extras import extra
 from barsight.core.reading.geotiff import open_geotiff
-from barsight.core.records.heights import HeightSource
 from barsight.page.layers import MAX_PIXELS
 from barsight.page.survey_files import expect_map, survey_folder
 from barsight.registration.surveyed_targets import SAME_M, Targets, read_places, write_targets
@@ -181,7 +180,7 @@ def place_pick(heights: YardMap, travel: Travel | None, pick: Pick) -> PickedPla
     part = _around(heights, pick)
     cell_m, corner = part.cell_m, (part.x0_m, part.y0_m)
     pixel = (np.array([pick.x_m, pick.y_m]) - corner) / cell_m
-    is_measured = np.isfinite(part.z_m) & np.isin(part.source, (HeightSource.VISION, HeightSource.LASER))
+    is_measured = np.isfinite(part.z_m) & part.is_seen
     found: Found = "hand"
     reach, off_m = LEVEL_M / cell_m, 0.0
     if pick.width_m is not None and not pick.is_exact:

@@ -17,7 +17,6 @@ from barsight.page.conditions import (
     WHO,
     find_chain_condition,
     find_conditions,
-    has_veto,
     settle_alarms,
 )  # fmt: skip
 from barsight.page.documents import (
@@ -32,17 +31,17 @@ from barsight.page.documents import (
 from barsight.page.layers import SurveyLayer, find_layers, newest_at
 from barsight.page.live import LiveFolder, LiveHealth
 from barsight.store.accounts import Account, list_accounts
-from barsight.store.confirmation import expire_stale, forbid, newest_survey
+from barsight.store.confirmation import expire_stale, forbid, map_vetoes, newest_survey
 from barsight.store.opening import Store
 from barsight.store.tables import AUDIT
 
 with extra("store"):
     from sqlalchemy import func, select
 
-LOOK_S = 0.2
-JUDGE_S = 2.0
-VERIFY_S = 600.0
+LOOK_S, JUDGE_S, VERIFY_S = 0.2, 2.0, 600.0
+"""Intervals at which the store is looked at, its alarms are settled, and its audit log is verified."""
 HEARTBEAT_S = 10.0
+"""Interval at which a quiet event stream sends a comment, so that nothing between closes it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,8 +148,8 @@ class StoreWatch:
                 present |= find_chain_condition(connection)
             newest = newest_survey(connection)
             changed = [reason for code, reason in present if code == "calibration-changed"]
-            is_told = newest is not None and has_veto(connection, newest.id, "calibration-changed")
-        if changed and not is_told:
+            vetoes = [] if newest is None else map_vetoes(connection, newest.id)
+        if changed and not any(veto["code"] == "calibration-changed" for veto in vetoes):
             forbid(self.store, "calibration-changed", changed[0], WHO)
         # What another server sees may not be seen from here: after the start only what was seen here ends.
         settle_alarms(self.store, present, judged, self._seen)

@@ -65,9 +65,7 @@ def withdraw(opened: Entry, name: str) -> None:
     accounts = list_accounts(opened.connection)
     if name not in accounts:
         raise ConfigError(f"there is no account {name!r}")
-    engineers = [one.name for one in accounts.values() if one.kind == "person" and one.role == "engineer"]
-    if engineers == [name]:
-        raise ConfigError(f"{name} is the last engineer; add another one first")
+    _expect_engineer_beside(accounts, name)
     opened.add(
         ACCOUNTS, name=name, kind=accounts[name].kind, role=NO_ROLE, secret="", at_ns=opened.at_ns,
         who=opened.who,
@@ -96,7 +94,13 @@ def _add(opened: Entry, name: str, kind: str, role: str, secret: str) -> None:
         raise ConfigError(f"{name} is a {known[name].kind} already; withdraw it first")
     if not known and (kind, role) != ("person", "engineer"):
         raise ConfigError("the first account is a person with the role engineer, who may add others")
-    last = [one.name for one in known.values() if one.kind == "person" and one.role == "engineer"]
-    if last == [name] and role != "engineer":
-        raise ConfigError(f"{name} is the last engineer; add another one first")
+    if role != "engineer":
+        _expect_engineer_beside(known, name)
     opened.add(ACCOUNTS, name=name, kind=kind, role=role, secret=secret, at_ns=opened.at_ns, who=opened.who)
+
+
+def _expect_engineer_beside(accounts: dict[str, Account], name: str) -> None:
+    """Raise ConfigError if no other person would be left to add accounts."""
+    engineers = [one.name for one in accounts.values() if one.kind == "person" and one.role == "engineer"]
+    if engineers == [name]:
+        raise ConfigError(f"{name} is the last engineer; add another one first")

@@ -7,11 +7,12 @@ import zlib
 
 import numpy as np
 
-from barsight.core.arrays import Float32
 from barsight.yard.types import HeightMap, YardMap
 
 CELL_M = 0.1
+"""Approximate side (m) of a coarse cell."""
 _STRIPE = 256
+"""Number of the map's rows that are read at once."""
 _UNKNOWN = np.iinfo(np.int16).min
 
 
@@ -20,19 +21,15 @@ def pack(heights: YardMap) -> bytes:
     step = max(1, round(CELL_M / heights.cell_m))
     rows, columns = heights.shape
     stripe = step * max(1, _STRIPE // step)
-    parts = [
-        _seen(heights.part(slice(first, min(first + stripe, rows)), slice(0, columns)))[::step, ::step]
+    parts = (
+        heights.part(slice(first, min(first + stripe, rows)), slice(0, columns))
         for first in range(0, rows, stripe)
-    ]
-    z = np.concatenate(parts)
+    )
+    nan = np.float32(np.nan)
+    z = np.concatenate([np.where(part.is_seen, part.z_m, nan)[::step, ::step] for part in parts])
     mm = np.where(np.isfinite(z), np.clip(np.round(1e3 * z), -32000, 32000), _UNKNOWN).astype("<i2")
     head = json.dumps([heights.x0_m, heights.y0_m, step * heights.cell_m, *mm.shape])
     return zlib.compress(head.encode() + b"\n" + mm.tobytes())
-
-
-def _seen(part: HeightMap) -> Float32:
-    """Return a part's heights (rows, columns), NaN for cells that no sensor saw."""
-    return np.where((part.source == 1) | (part.source == 2), part.z_m, np.float32(np.nan))
 
 
 def unpack(packed: bytes) -> HeightMap:

@@ -18,13 +18,21 @@ from barsight.store.calibrations import why_invalid
 from barsight.store.lift_records import find_gap, find_outlines, why_outdated
 from barsight.store.opening import Store
 from barsight.store.promotion import counts
-from barsight.store.states import has_alarm, has_standing, last_raised_ns, lift_state, raise_alarm, step_lift
+from barsight.store.states import (
+    has_alarm,
+    has_standing,
+    last_raised_ns,
+    lift_state,
+    newest_steps,
+    raise_alarm,
+    step_lift,
+)
 from barsight.store.tables import LIFT_STATES, LIFTS, SURVEY_VETOES, SURVEYS
 from barsight.yard.lifting.validity import is_ahead
 from barsight.yard.vetoes import VETOES
 
 with extra("store"):
-    from sqlalchemy import ColumnElement, Connection, Row, Select, func, select
+    from sqlalchemy import ColumnElement, Connection, Row, Select, select
 
 OPEN = ("offered", "claimed", "executing")
 
@@ -92,10 +100,7 @@ def _open_query() -> Select[Any]:
 
 def _lift_query(which: ColumnElement[bool]) -> Select[Any]:
     """Build the query for lifts by a condition on their last state, in the order of their ids."""
-    last = select(LIFT_STATES.c.lift_id, func.max(LIFT_STATES.c.step).label("step")).group_by(
-        LIFT_STATES.c.lift_id
-    )
-    newest = last.subquery()
+    newest = newest_steps(LIFT_STATES, "lift")
     return (
         select(LIFTS, SURVEYS.c.map_id, SURVEYS.c.calibration_id, LIFT_STATES.c.state)
         .join(SURVEYS, SURVEYS.c.id == LIFTS.c.survey_id)

@@ -18,6 +18,7 @@ from barsight.core.extras import extra
 from barsight.core.stamps import NS_PER_S
 from barsight.store.matching import has_moved
 from barsight.store.promotion import counts
+from barsight.store.states import newest_steps
 from barsight.store.tables import ABSENCES, LIFT_BUNDLES, LIFT_STATES, LIFTS, SIGHTINGS, SURVEYS
 from barsight.yard.axes import turn_between
 from barsight.yard.inventory.bundle_file import bundle_of
@@ -244,7 +245,7 @@ def _first_of_each(
 
 @dataclass(frozen=True)
 class ExecutedLift:
-    """A lift that took a bundle. target, set_down: their JSON in lifts.json. state: `executed` or later."""
+    """A lift that took a bundle. set_down: its JSON in lifts.json. state: `executed` or later."""
 
     lift_id: int
     bundle_id: int
@@ -265,11 +266,7 @@ class ExecutedLift:
 
 def executed_lifts(connection: Connection) -> tuple[ExecutedLift, ...]:
     """List the lifts that took a single bundle, each with its last state, in the order of their ids."""
-    newest = (
-        select(LIFT_STATES.c.lift_id, func.max(LIFT_STATES.c.step).label("step"))
-        .group_by(LIFT_STATES.c.lift_id)
-        .subquery()
-    )
+    newest = newest_steps(LIFT_STATES, "lift")
     done = LIFT_STATES.alias("done")
     last = LIFT_STATES.alias("last")
     alone = (

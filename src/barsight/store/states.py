@@ -11,7 +11,7 @@ from barsight.store.audit import Entry
 from barsight.store.tables import ALARM_STATES, ALARMS, LIFT_STATES, RECORDING_STATES
 
 with extra("store"):
-    from sqlalchemy import Connection, Select, Table, func, select
+    from sqlalchemy import Connection, Select, Subquery, Table, func, select
 
 LIFT_STEPS: dict[str | None, tuple[str, ...]] = {
     None: ("offered",),
@@ -132,8 +132,7 @@ def has_standing(connection: Connection, code: str) -> bool:
 
 @cache
 def _standing_query() -> Select[Any]:
-    last = select(ALARM_STATES.c.alarm_id, func.max(ALARM_STATES.c.step).label("step"))
-    newest = last.group_by(ALARM_STATES.c.alarm_id).subquery()
+    newest = newest_steps(ALARM_STATES, "alarm")
     return (
         select(ALARMS.c.id, ALARMS.c.code, ALARMS.c.reason, ALARM_STATES.c.state)
         .join(ALARM_STATES, ALARM_STATES.c.alarm_id == ALARMS.c.id)
@@ -141,6 +140,12 @@ def _standing_query() -> Select[Any]:
         .where(ALARM_STATES.c.state != "cleared")
         .order_by(ALARMS.c.id.desc())
     )
+
+
+def newest_steps(table: Table, owner: str) -> Subquery:
+    """Build the query for the number of each owner's last step."""
+    key = table.c[f"{owner}_id"]
+    return select(key, func.max(table.c.step).label("step")).group_by(key).subquery()
 
 
 def _last(connection: Connection, table: Table, owner: str, number: int) -> tuple[int, str | None]:

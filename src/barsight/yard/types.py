@@ -77,7 +77,7 @@ class HeightMap:
     @property
     def is_seen(self) -> Bool:
         """Mark the cells (rows, columns) that were seen; filled ones weren't."""
-        return (self.source != HeightSource.UNKNOWN) & (self.source != HeightSource.FILLED)
+        return HeightSource.measured(self.source)
 
     def to_xarray(self) -> Any:
         """Return the map as an xarray.Dataset with coordinates `y` and `x` and units as attributes.

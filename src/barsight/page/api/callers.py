@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from barsight.core.extras import extra
-from barsight.page.access import Access, AccessError, Caller, Right, expect_csrf
+from barsight.page.access import LOCAL, Access, AccessError, Caller, Right, expect_csrf
 
 with extra("page"):
     from fastapi import Depends, Request
@@ -42,6 +42,6 @@ def _credentials(request: Request) -> tuple[str, str]:
 
 def signature(caller: Caller, name: str = "") -> str:
     """Name the caller for the audit log; a caller without an account gives a name."""
-    if caller.csrf is not None and caller.name == "local" and name.strip():
+    if caller.csrf is not None and caller.name == LOCAL and name.strip():
         return f"{name.strip()} (no account)"
     return f"{caller.name} ({caller.role})"
