@@ -400,7 +400,7 @@ def test_a_changed_document_is_not_compared(tmp_path: Path) -> None:
     note = {"measured_s": 1.0, "whole_s": 1.0, "peak_bytes": 1, "files": {}}
     for key in ("a", "b"):
         for path in (tmp_path / "out").iterdir():
-            results.upload(path, f"files/{key}/t/{path.name}")
+            results.write(f"files/{key}/t/{path.name}", path)
         assert publish(results, HeldRecording(key, 1, "t"), note)
     same = compare_recording(results, "one", "a", "b")
     assert same is not None and len(same.changes) == 12 and not any(one.sigma == 0 for one in same.changes)

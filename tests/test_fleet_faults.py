@@ -324,7 +324,7 @@ def test_azure_keeps_the_promises_that_a_run_rests_on(
         here = open_objects(str(make_archive(tmp_path / "a", {"r": "good", "s": "good", "bad": "poison"})))
         archive, results = (open_objects(f"az://yard/{name}") for name in ("archive", "results"))
         for one in here.list():
-            archive.upload(tmp_path / "a" / one.path, one.path)
+            archive.write(one.path, tmp_path / "a" / one.path)
         with ThreadPoolExecutor(8) as pool:
             put = [pool.submit(results.write_new, "x/y", bytes([k])) for k in range(8)]
         assert sum(one.result() for one in put) == 1 and len(results.read("x/y") or b"") == 1

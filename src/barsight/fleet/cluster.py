@@ -23,8 +23,6 @@ them as well.
 """
 AHEAD = 4
 """Number of tasks queued at the scheduler for each worker, however many are planned."""
-
-
 LOOK_S = 0.5
 """Interval in seconds at which new workers and an opened window are noticed."""
 

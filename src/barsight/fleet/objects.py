@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
@@ -52,19 +53,19 @@ class Objects:
 
     def list(self, prefix: str = "") -> Iterator[StoredObject]:
         """List all objects under a prefix that ends with a slash."""
-        with _told(self.url):
+        with _translated_errors(self.url):
             for part in obstore.list(self.store, prefix.rstrip("/") or None):
                 yield from map(_listed, part)
 
     def list_folder(self, prefix: str) -> Iterator[StoredObject]:
         """List the objects directly in a folder."""
-        with _told(self.url):
+        with _translated_errors(self.url):
             for one in obstore.list_with_delimiter(self.store, prefix or None)["objects"]:
                 yield _listed(one)
 
     def read(self, path: str) -> bytes | None:
         """Read a small object; None if there is none. Raises InputError above MAX_DOCUMENT_BYTES."""
-        with _told(f"{self.url}/{path}"):
+        with _translated_errors(f"{self.url}/{path}"):
             try:
                 found = self._get(path)
             except FileNotFoundError:
@@ -89,9 +90,9 @@ class Objects:
             expect_schema(content, schema, f"{self.url}/{path}", REMEDY)
         return content
 
-    def write(self, path: str, data: bytes) -> None:
-        """Write an object, replacing any existing one. Raises OutputError if this fails."""
-        with _told(f"{self.url}/{path}", writes=True):
+    def write(self, path: str, data: bytes | Path) -> None:
+        """Write an object, replacing any existing one. data: or a file. Raises OutputError if this fails."""
+        with _translated_errors(f"{self.url}/{path}", writes=True):
             obstore.put(self.store, path, data)
 
     def write_new(self, path: str, data: bytes) -> bool:
@@ -100,7 +101,7 @@ class Objects:
         data: must identify its writer: a put whose answer was lost is retried and finds itself. Raises
         OutputError if this fails.
         """
-        with _told(f"{self.url}/{path}", writes=True):
+        with _translated_errors(f"{self.url}/{path}", writes=True):
             try:
                 obstore.put(self.store, path, data, mode="create")
             except AlreadyExistsError:
@@ -109,7 +110,7 @@ class Objects:
 
     def remove(self, path: str) -> None:
         """Remove an object, if it still exists."""
-        with _told(f"{self.url}/{path}"):
+        with _translated_errors(f"{self.url}/{path}"):
             try:
                 obstore.delete(self.store, path)
             except FileNotFoundError:
@@ -117,7 +118,7 @@ class Objects:
 
     def chunks(self, path: str) -> Iterator[bytes]:
         """Read a large object in parts. Raises InputError if there is none."""
-        with _told(f"{self.url}/{path}"):
+        with _translated_errors(f"{self.url}/{path}"):
             try:
                 found = self._get(path)
             except FileNotFoundError:
@@ -131,11 +132,6 @@ class Objects:
         if isinstance(self.store, LocalStore) and file.exists():
             open_regular(file).close()
         return obstore.get(self.store, path)
-
-    def upload(self, file: Path, path: str) -> None:
-        """Write a file as an object. Raises OutputError if this fails."""
-        with _told(f"{self.url}/{path}", writes=True):
-            obstore.put(self.store, path, file)
 
 
 def open_objects(url: str, *, create: bool = False) -> Objects:
@@ -169,27 +165,22 @@ def _is_plain(endpoint: str) -> bool:
     return endpoint.startswith("http://")
 
 
-class _told:  # noqa: N801
+@contextmanager
+def _translated_errors(name: str, *, writes: bool = False) -> Iterator[None]:
     """Turn the error of a server or disk into one line: InputError, or OutputError if it `writes`."""
-
-    def __init__(self, name: str, *, writes: bool = False) -> None:
-        self.name, self.writes = name, writes
-
-    def __enter__(self) -> None:
-        """Begin."""
-
-    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
-        """Translate."""
-        if kind is not None and kind.__name__ == "PanicException":  # obstore can't start a thread
+    try:
+        yield
+    except BaseException as error:
+        if type(error).__name__ == "PanicException":  # obstore can't start a thread
             raise MemoryError from error
-        if isinstance(error, BaseError) or (isinstance(error, OSError) and error.errno is None):
-            problem = _first_line(error)
-            if self.writes:
-                message = f"{self.name}: can't be written ({problem}); free some space or set its keys"
-                raise OutputError(message) from error
-            raise UnreachableError(
-                self.name, f"can't be reached ({problem})", "see that it is there and its keys are set"
-            ) from error
+        if not isinstance(error, BaseError) and not (isinstance(error, OSError) and error.errno is None):
+            raise
+        problem = _first_line(error)
+        if writes:
+            message = f"{name}: can't be written ({problem}); free some space or set its keys"
+            raise OutputError(message) from error
+        remedy = "see that it is there and its keys are set"
+        raise UnreachableError(name, f"can't be reached ({problem})", remedy) from error
 
 
 def _first_line(error: BaseException) -> str:

@@ -138,7 +138,7 @@ def _upload(out: Path, target: str, results: Objects) -> dict[str, dict[str, obj
         name = path.relative_to(out).as_posix()
         with path.open("rb") as stream:
             digest = hashlib.file_digest(stream, "sha256").hexdigest()
-        results.upload(path, f"{target}/{name}")
+        results.write(f"{target}/{name}", path)
         files[name] = {"bytes": path.stat().st_size, "sha256": digest}
     return files
 

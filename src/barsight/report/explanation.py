@@ -27,10 +27,12 @@ from barsight.yard.lifting.lift_file import forbidden_since, read_lifts
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.map_lookup import lookup_heights
+from barsight.yard.sections import part_about
 from barsight.yard.types import Bundle, HeightMap, YardMap
 from barsight.yard.vetoes import Veto
 
 PIXELS_PER_M = 180.0
+"""Scale of the picture."""
 BEYOND_M = 0.5
 """Margin in metres shown around the magnet."""
 LOW_M, HIGH_M = -0.3, 0.1
@@ -116,7 +118,7 @@ def _find(lifts: dict[str, Any], which: str, folder: Path) -> dict[str, Any]:
 
 def format_check(check: dict[str, Any]) -> tuple[str, str]:
     """Format a check's value with sigma, and its bound."""
-    unit = {"deg": "°", "s": "s"}.get(check["unit"], check["unit"])
+    unit = "°" if check["unit"] == "deg" else check["unit"]
     decimals = {"mm": 1, "N": 0, "kg": 0, "s": 0, "": 3, "deg": 2}.get(check["unit"], 2)
     if float(check["value"] or 0).is_integer() and float(check["bound"] or 0).is_integer():
         decimals = 0
@@ -142,7 +144,9 @@ def write_explanation(told: Explanation, target: Path) -> None:
         path.write_text(page, encoding="utf-8")
 
 
-def draw_place(heights: Any, record: dict[str, Any], magnet: Magnet, bundles: tuple[Bundle, ...]) -> UInt8:
+def draw_place(
+    heights: YardMap, record: dict[str, Any], magnet: Magnet, bundles: tuple[Bundle, ...]
+) -> UInt8:
     """Draw the heights around a lift (H, W, 3), with the beam from left to right, faces, tolerance, bundles
     and the offending cells.
     """
@@ -150,7 +154,8 @@ def draw_place(heights: Any, record: dict[str, Any], magnet: Magnet, bundles: tu
     place = Placement(target["x_m"], target["y_m"], math.radians(target["yaw_deg"]))
     long = max(magnet.half_span_m, magnet.beam.length_m / 2) + BEYOND_M
     wide = max(magnet.beam.width_m / 2, *(abs(p.across_m) + p.width_m / 2 for p in magnet.poles)) + BEYOND_M
-    part = _part(heights, place, math.hypot(long, wide))
+    reach = math.hypot(long, wide) * np.array([-1, 1])
+    part = part_about(heights, place.x_m + reach, place.y_m + reach)
     # The first check of obstacles states the sigma that they are judged with.
     sigma_mm = next(check["sigma"] for check in record["checks"] if check["code"] == "obstructed")
     faces = FacePlane(
@@ -187,18 +192,6 @@ def draw_place(heights: Any, record: dict[str, Any], magnet: Magnet, bundles: tu
         outline(corners(at, place.yaw_rad, size[0] + more_u, size[1] + more_v), "tolerance", 1)
         outline(corners(at, place.yaw_rad, *size), "face")
     return picture
-
-
-def _part(heights: YardMap, place: Placement, reach_m: float) -> HeightMap:
-    """Cut out the map around a place."""
-    cuts = []
-    for centre, first, count in (
-        (place.y_m, heights.y0_m, heights.shape[0]), (place.x_m, heights.x0_m, heights.shape[1]),
-    ):  # fmt: skip
-        low = math.floor((centre - reach_m - first) / heights.cell_m)
-        high = math.ceil((centre + reach_m - first) / heights.cell_m) + 1
-        cuts.append(slice(min(max(low, 0), count - 1), max(min(high, count), 1)))
-    return heights.part(*cuts)
 
 
 def _paint(heights: HeightMap, place: Placement, faces: FacePlane, long: float, wide: float) -> UInt8:

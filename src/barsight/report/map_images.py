@@ -18,8 +18,8 @@ from barsight.core.records.gray_levels import TornImageError
 from barsight.core.records.heights import HeightSource
 from barsight.recording.image_decoding import MAX_PICTURE_BYTES, decode_with_colour
 
-LONGEST_PX = 2400
-MAX_PIXELS = 3_000_000
+LONGEST_PX, MAX_PIXELS = 2400, 3_000_000
+"""Maximum length of a strip's longer side, and maximum size of a map's picture, in pixels."""
 MAX_STRIPS = 12
 FOLD_ASPECT = 7.0
 """Ratio of length to width above which a map is folded into strips below each other."""

@@ -12,8 +12,9 @@ from barsight.report.map_images import data_uri
 from barsight.report.plots import Picture
 
 LONGEST_PX = 1280
-ZOOM = 4
-CROP_PX = (200, 320)
+"""Maximum length of a picture's longer side."""
+ZOOM, CROP_PX = 4, (200, 320)
+"""Magnification of the enlarged picture, and the part that it shows: height and width."""
 GREEN, RED, ORANGE, BLUE = (57, 211, 83), (255, 90, 79), (242, 177, 52), (96, 190, 255)
 SHIFT = 4
 """Number of fractional bits of OpenCV's drawing coordinates: 16ths of a pixel."""

@@ -23,8 +23,8 @@ from barsight.report.map_images import (
     robust_range,
 )
 
-WIDTH = 1000.0
-TALLEST = 680.0
+WIDTH, TALLEST = 1000.0, 680.0
+"""Width of a drawing and maximum height of its map, in drawing units."""
 LARGE_TEXT, SMALL_MAP_TEXT = 13.0, 32.0
 """Font sizes in drawing units; the three smaller maps are shown at a third of the size."""
 

@@ -12,8 +12,8 @@ from barsight.core.stamps import NS_PER_S
 from barsight.report.plots import MAX_POINTS, SERIES, Plot, Trace, json_numbers
 from barsight.result_folder import CameraPath
 
-MIN_SPAN_MM = 20.0
-MIN_SPAN_DEG = 0.2
+MIN_SPAN_MM, MIN_SPAN_DEG = 20.0, 0.2
+"""Minimum range of an axis, so that a plot doesn't magnify noise."""
 
 
 def path_plots(path: CameraPath, reference: str) -> tuple[Plot, ...]:

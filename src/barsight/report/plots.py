@@ -15,16 +15,17 @@ from barsight.core.records.heights import Contour, HeightSource
 from barsight.core.records.sensor_samples import LaserProfile
 from barsight.mapping.agreement import profile_difference
 
-MAX_POINTS = 20_000
-MAX_SCATTER = 3_000
+MAX_POINTS, MAX_SCATTER = 20_000, 3_000
+"""Maximum numbers of samples that a line and a cloud of markers show."""
 BAND_SIGMAS = 1.96
+"""Half width of a contour's band, in sigmas: 95 %."""
 SERIES = ("--series-0", "--series-1", "--series-2", "--series-3", "--series-4", "--series-5")
 Trace = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture for the page: `name` is its id, `uri` its data, `alt` its description."""
+    """A picture for the page: `name` is its id, `uri` its data, `caption` explains it."""
 
     name: str
     title: str

@@ -18,9 +18,9 @@ SOURCE_RGB = {
     HeightSource.LASER: ("laser", (90, 170, 60)),
     HeightSource.FILLED: ("filled", (230, 120, 30)),
 }
-
-
+"""Name and colour of each source."""
 _PATCH_CELLS = 2048
+"""Side, in cells, of the squares in which a map is read."""
 
 
 @dataclass(frozen=True, eq=False)
