@@ -3,37 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-import tifffile
 
-import barsight
 from barsight.core.arrays import UInt8
 from barsight.core.files import atomic_path
 from barsight.mapping.passes.changes import PlaceHistory
 from barsight.mapping.surface.surface import Surface, gray_levels
 from barsight.mapping.top_photo import TopPhoto
+from barsight.report.files.geotiff import write_geotiff
 
 NO_DATA = 0
 _COLUMNS = 1024
-
-
-def georeference(surface: Surface, frame_id: str) -> list[tuple[int, str, int, Any, bool]]:
-    """Make the georeferencing tags of a raster: a user-defined projected system (32767) that cites the frame,
-    pixels as areas, m.
-    """
-    cell, citation = surface.cell_m, f"{frame_id}|"
-    left, top = (surface.columns[0] - 0.5) * cell, (surface.rows[1] - 0.5) * cell
-    cited = (1026, 34737, len(citation), 0)
-    keys = (1, 1, 0, 5, 1024, 0, 1, 1, 1025, 0, 1, 1, *cited, 3072, 0, 1, 32767, 3076, 0, 1, 9001)
-    return [
-        (33550, "d", 3, (cell, cell, 0.0), True),
-        (33922, "d", 6, (0.0, 0.0, 0.0, left, top, 0.0), True),
-        (34735, "H", len(keys), keys, True),
-        (34737, "s", 0, citation, True),
-    ]
+"""Number of the map's columns that are read at once."""
 
 
 def orthophoto(surface: Surface) -> UInt8:
@@ -72,14 +55,4 @@ def write_passes(surface: Surface, history: PlaceHistory, target: Path, frame_id
 
 
 def _write_gray(surface: Surface, picture: UInt8, target: Path, frame_id: str) -> None:
-    with atomic_path(target) as path:
-        tifffile.imwrite(
-            path,
-            picture,
-            photometric="minisblack",
-            tile=(256, 256),
-            compression="zlib",
-            metadata=None,
-            software=f"barsight {barsight.__version__}",
-            extratags=[*georeference(surface, frame_id), (42113, "s", 0, str(NO_DATA), True)],
-        )
+    write_geotiff(surface, picture, target, frame_id, str(NO_DATA))
