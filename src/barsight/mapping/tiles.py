@@ -96,5 +96,5 @@ def tile_overlap(
 
 def tile_places(key: TileKey, cell_m: float) -> tuple[Float64, Float64]:
     """Compute x and y (TILE_CELLS,) of the centres of a tile's columns and rows, m."""
-    x_m, y_m = (cell_m * (TILE_CELLS * at + np.arange(TILE_CELLS)) for at in key)
+    x_m, y_m = (cell_m * (TILE_CELLS * at + np.arange(TILE_CELLS, dtype=np.float64)) for at in key)
     return x_m, y_m

@@ -35,7 +35,8 @@ def corners(centre: ArrayLike, yaw_rad: float, width_m: float, length_m: float) 
     its high-y end back. centre: x and y. yaw_rad: of its length, from +Y about Z.
     """
     turns = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
-    return np.asarray(centre + turns * (width_m / 2, length_m / 2) @ axes_of(yaw_rad))
+    corner: Float64 = np.asarray(centre) + turns * (width_m / 2, length_m / 2) @ axes_of(yaw_rad)
+    return corner
 
 
 def gap_between(one: Float64, other: Float64) -> float:
