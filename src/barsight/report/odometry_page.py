@@ -16,15 +16,18 @@ from barsight.core.json_values import json_value
 from barsight.core.motion_detail import NormalisedResiduals
 from barsight.core.records.trajectory import Trajectory
 from barsight.core.stamps import NS_PER_S
-from barsight.evaluation.trajectory_error import Drift, FrameErrors
+from barsight.evaluation.trajectory_error import Drift, FrameErrors, rms
 from barsight.motion.frontend.matching_example import MatchingExample
 from barsight.report.match_images import draw_matches
 from barsight.report.page import KeyFigure, format_number, write_summary_page
 from barsight.report.page_trajectory import path_plots
-from barsight.report.plots import SERIES, Plot, Trace, json_numbers, keep_extremes
+from barsight.report.plots import SERIES, Plot, Trace, keep_extremes, line_trace, time_plot
 from barsight.result_folder import CameraPath
 
 MAX_POINTS = 6000
+"""Maximum number of samples of a line, of which the page has many."""
+MAX_MARKED = 60
+"""Maximum number of samples that are marked each."""
 AXES = "xyz"
 
 
@@ -108,9 +111,7 @@ def odometry_summary(result: OdometryResult) -> dict[str, Any]:
 def _figures(result: OdometryResult) -> list[KeyFigure]:
     trajectory, drift = result.trajectory, result.drift
     sigma = _sigmas(trajectory)
-    turn, place = (
-        float(np.sqrt((sigma[:, part] ** 2).sum(axis=1).mean())) for part in (slice(3), slice(3, 6))
-    )
+    turn, place = rms(sigma[:, :3]), rms(sigma[:, 3:])
     figures = [
         KeyFigure(
             "Frames", f"{len(trajectory.frames)} of {result.frames}", f"{len(trajectory.refused)} refused"
@@ -164,7 +165,7 @@ def _states(result: OdometryResult) -> list[Plot]:
                 edge |= {"mode": "lines", "line": {**edge["line"], "dash": "dot", "width": 0.8}}
                 traces.append({**edge, "showlegend": False, "hoverinfo": "skip"})
         where = "reference axes" if name == "velocity" else "the IMU's axes"
-        plots.append(_over_time(name, title, traces, f"In {where}; dotted: ± 2 sigma."))
+        plots.append(time_plot(name, title, traces, f"In {where}; dotted: ± 2 sigma."))
     return plots
 
 
@@ -197,13 +198,13 @@ def _innovations(part: NormalisedResiduals, trajectory: Trajectory) -> Plot:
         "Each frame's turn and way since the one before, as pictures find it, minus what gyro and encoders "
         "predicted, over the sigma of both; in the left camera's axes. Dashed: 3 sigma."
     )
-    return _over_time("innovations-step", "sigma", traces, caption)
+    return time_plot("innovations-step", "sigma", traces, caption)
 
 
 def _sensor(name: str, part: NormalisedResiduals, caption: str, trajectory: Trajectory) -> Plot:
     time = _seconds(part.stamp_ns, trajectory)
     traces = [_line(label, time, part.values[:, k], k) for k, label in enumerate(part.names)]
-    return _over_time(
+    return time_plot(
         f"in-sigma-{name}", "sigma", traces, f"{caption} Measured minus estimated, over the stated sigma."
     )
 
@@ -218,7 +219,7 @@ def _sigma(result: OdometryResult) -> list[Plot]:
     ):  # fmt: skip
         traces = [_line(AXES[k], time, sigma[:, part][:, k] * scale, k) for k in range(3)]
         plots.append(
-            _over_time(f"sigma-{name}", f"sigma / {title}", traces, f"One sigma of each frame's {name}.")
+            time_plot(f"sigma-{name}", f"sigma / {title}", traces, f"One sigma of each frame's {name}.")
         )
     errors = result.errors
     if errors is not None:
@@ -229,7 +230,7 @@ def _sigma(result: OdometryResult) -> list[Plot]:
         ):  # fmt: skip
             traces = [_line(AXES[k], at, values[:, k] * scale, k) for k in range(3)]
             caption = f"Estimate minus truth {over}: {name}."
-            plots.append(_over_time(f"error-{name}", f"error / {title}", traces, caption))
+            plots.append(time_plot(f"error-{name}", f"error / {title}", traces, caption))
     return plots
 
 
@@ -253,20 +254,12 @@ def _seconds(stamp_ns: Int64, trajectory: Trajectory) -> Float64:
     return result
 
 
-def _over_time(name: str, title: str, traces: list[Trace], caption: str) -> Plot:
-    layout = {"xaxis": {"title": {"text": "time / s"}}, "yaxis": {"title": {"text": title}}}
-    return Plot(name, traces, layout, 300, caption)
-
-
 def _line(name: str, x: Float64, y: Float64, colour: int) -> Trace:
+    """Make a line of at most MAX_POINTS samples, which are marked where they are few."""
     kept = keep_extremes(y, MAX_POINTS)
     return {
-        "type": "scatter",
-        "mode": "lines+markers" if x.size <= 60 else "lines",
-        "name": name,
-        "x": json_numbers(x[kept], 3),
-        "y": json_numbers(y[kept], 5),
-        "line": {"color": SERIES[colour], "width": 1.4},
+        **line_trace(name, x[kept], y[kept], SERIES[colour], 1.4, (3, 5)),
+        "mode": "lines+markers" if x.size <= MAX_MARKED else "lines",
         "marker": {"color": SERIES[colour], "size": 4},
     }
 

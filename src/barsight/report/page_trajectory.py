@@ -9,11 +9,13 @@ from scipy.spatial.transform import Rotation
 
 from barsight.core.arrays import Float64
 from barsight.core.stamps import NS_PER_S
-from barsight.report.plots import MAX_POINTS, SERIES, Plot, Trace, json_numbers
+from barsight.report.plots import MAX_POINTS, SERIES, Plot, Trace, json_numbers, line_trace
 from barsight.result_folder import CameraPath
 
 MIN_SPAN_MM, MIN_SPAN_DEG = 20.0, 0.2
 """Minimum range of an axis, so that a plot doesn't magnify noise."""
+MAX_MARKED = 400
+"""Maximum number of poses that are marked each."""
 
 
 def path_plots(path: CameraPath, reference: str) -> tuple[Plot, ...]:
@@ -28,15 +30,10 @@ def path_plots(path: CameraPath, reference: str) -> tuple[Plot, ...]:
 
 def _from_above(path: CameraPath, reference: str, note: str) -> Plot:
     x, y, _ = path.position_m.T
-    dots = path.stamp_ns.size <= 400
     traces: list[Trace] = [
         {
-            "type": "scatter",
-            "mode": "lines+markers" if dots else "lines",
-            "name": "body",
-            "x": json_numbers(x, 4),
-            "y": json_numbers(y, 4),
-            "line": {"color": "--series-0", "width": 1.6},
+            **line_trace("body", x, y, "--series-0", 1.6, (4, 4)),
+            "mode": "lines+markers" if path.stamp_ns.size <= MAX_MARKED else "lines",
             "marker": {"color": "--series-0", "size": 5},
         },
         _mark("start", x[0], y[0], "--series-2"),

@@ -95,7 +95,7 @@ def contour_plot(compared: ComparedContour) -> Plot:
     source = contour.source[kept]
     seen = np.where(HeightSource.measured(source), z, np.nan)
     name = "vision and laser" if (source == HeightSource.LASER).any() else "vision"
-    traces = [_band(x, seen, BAND_SIGMAS * sigma), _line(name, x, seen, "--series-0", 1.4)]
+    traces = [_band(x, seen, BAND_SIGMAS * sigma), line_trace(name, x, seen, "--series-0", 1.4)]
     filled = source == HeightSource.FILLED
     if filled.any():
         traces.append(_markers("filled", x[filled], z[filled], "--filled", 5))
@@ -109,10 +109,10 @@ def contour_plot(compared: ComparedContour) -> Plot:
     if laser is None:
         return Plot(f"contour-{contour.profile}", traces, layout, 340, caption)
     of_laser = keep_extremes(laser.z_m, MAX_POINTS)
-    traces.append(_line("laser", laser.x_m[of_laser], laser.z_m[of_laser] * 1e3, "--laser", 1.2))
+    traces.append(line_trace("laser", laser.x_m[of_laser], laser.z_m[of_laser] * 1e3, "--laser", 1.2))
     error = compared.error_m * 1e3
     of_error = keep_extremes(error, MAX_POINTS)
-    shown = _line("vision − laser", laser.x_m[of_error], error[of_error], "--series-1", 1.2)
+    shown = line_trace("vision − laser", laser.x_m[of_error], error[of_error], "--series-1", 1.2)
     traces.append({**shown, "yaxis": "y2"})
     known = np.abs(error[np.isfinite(error)])
     reach = max(20.0, _reach(known))
@@ -145,7 +145,9 @@ def histogram_plot(compared: tuple[ComparedContour, ...]) -> Plot | None:
     traces = []
     for order, (profile, error) in enumerate(errors.items()):
         share = 100 * np.histogram(error, edges)[0] / max(error.size, 1)
-        trace = _line(f"profile {profile}", edges[:-1] + bin_mm / 2, share, SERIES[order % len(SERIES)], 1.6)
+        trace = line_trace(
+            f"profile {profile}", edges[:-1] + bin_mm / 2, share, SERIES[order % len(SERIES)], 1.6
+        )
         trace["line"]["shape"] = "hvh"
         traces.append(trace)
     outside = int((together > reach).sum())
@@ -220,15 +222,24 @@ def _band(x: Float64, z: Float64, half: Float64) -> Trace:
     }
 
 
-def _line(name: str, x: Float64, y: Float64, colour: str, width: float) -> Trace:
+def line_trace(
+    name: str, x: Float64, y: Float64, colour: str, width: float, decimals: tuple[int, int] = (4, 2)
+) -> Trace:
+    """Make a line. decimals: of x and y."""
     return {
         "type": "scatter",
         "mode": "lines",
         "name": name,
-        "x": json_numbers(x, 4),
-        "y": json_numbers(y, 2),
+        "x": json_numbers(x, decimals[0]),
+        "y": json_numbers(y, decimals[1]),
         "line": {"color": colour, "width": width},
     }
+
+
+def time_plot(name: str, title: str, traces: list[Trace], caption: str) -> Plot:
+    """Plot traces over time in seconds. title: of the other axis."""
+    layout = {"xaxis": {"title": {"text": "time / s"}}, "yaxis": {"title": {"text": title}}}
+    return Plot(name, traces, layout, 300, caption)
 
 
 def _markers(name: str, x: Float64, y: Float64, colour: str, size: float) -> Trace:

@@ -14,9 +14,10 @@ from barsight.calibration.camera_imu.verdict import CameraImuAssessment
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
 from barsight.report.page import KeyFigure, format_number, write_summary_page
-from barsight.report.plots import SERIES, Plot, json_numbers, keep_extremes
+from barsight.report.plots import SERIES, Plot, Trace, keep_extremes, line_trace, time_plot
 
 MAX_POINTS = 6000
+"""Maximum number of samples of a line, of which the page has many."""
 SENSORS = ("pictures", "gyro", "accel")
 
 
@@ -120,7 +121,9 @@ def camera_imu_plots(calibration: CameraImuCalibration) -> list[Plot]:
         each = np.bincount(sightings.frame, square, frames) / np.bincount(sightings.frame, minlength=frames)
         traces.append(_line(f"cam{camera}", sightings.stamp_s, np.sqrt(each) / calibration.corner_px, camera))
     plots = [
-        _over_time("corners", traces, "Each picture's corners, root mean square over one corner's noise.")
+        time_plot(
+            "corners", "sigma", traces, "Each picture's corners, root mean square over one corner's noise."
+        )
     ]
     for name, own, spread in (("gyro", slice(0, 3), 1), ("accel", slice(3, 6), 2)):
         freed = np.sqrt(1 - calibration.spreads[spread].absorbed)
@@ -130,7 +133,7 @@ def camera_imu_plots(calibration: CameraImuCalibration) -> list[Plot]:
             f"{name}: measured minus predicted, over the sigma used and the share that the spline takes up. "
             f"Scatter {calibration.spreads[spread].factor:.2f} sigma."
         )
-        plots.append(_over_time(name, traces, caption))
+        plots.append(time_plot(name, "sigma", traces, caption))
     traces = []
     for order, (name, spread) in enumerate((("gyro", 1), ("accel", 2))):
         own_spread = calibration.spreads[spread]
@@ -144,17 +147,10 @@ def camera_imu_plots(calibration: CameraImuCalibration) -> list[Plot]:
     return plots
 
 
-def _over_time(name: str, traces: list[dict[str, Any]], caption: str) -> Plot:
-    layout = {"xaxis": {"title": {"text": "time / s"}}, "yaxis": {"title": {"text": "sigma"}}}
-    return Plot(name, traces, layout, 300, caption)
-
-
-def _line(name: str, x: Float64, y: Float64, colour: int) -> dict[str, Any]:
+def _line(name: str, x: Float64, y: Float64, colour: int) -> Trace:
+    """Make a line of at most MAX_POINTS samples."""
     kept = keep_extremes(y, MAX_POINTS)
-    return {
-        "type": "scatter", "mode": "lines", "name": name, "x": json_numbers(x[kept], 3),
-        "y": json_numbers(y[kept], 3), "line": {"color": SERIES[colour], "width": 1.0},
-    }  # fmt: skip
+    return line_trace(name, x[kept], y[kept], SERIES[colour], 1.0, (3, 3))
 
 
 def _figures(summary: dict[str, Any]) -> list[KeyFigure]:

@@ -16,7 +16,7 @@ from barsight.core.arrays import Float64
 from barsight.core.errors import Failed
 from barsight.core.json_values import json_value
 from barsight.report.page import KeyFigure, format_number, write_summary_page
-from barsight.report.plots import Plot, json_numbers
+from barsight.report.plots import Plot, Trace, json_numbers, line_trace
 
 SCHEMA = 1
 HEAT = [[0.0, "#f7fbff"], [0.35, "#6baed6"], [0.7, "#2171b5"], [1.0, "#08306b"]]
@@ -233,8 +233,5 @@ def _depth_plot(assessment: Assessment) -> Plot:
     return Plot("depth", traces, layout, 320, caption)
 
 
-def _line(name: str, x: Float64, y: Float64, colour: str) -> dict[str, Any]:
-    return {
-        "type": "scatter", "mode": "lines", "name": name, "x": json_numbers(x, 3), "y": json_numbers(y, 4),
-        "line": {"color": colour, "width": 1.4},
-    }  # fmt: skip
+def _line(name: str, x: Float64, y: Float64, colour: str) -> Trace:
+    return line_trace(name, x, y, colour, 1.4, (3, 4))
