@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar, cast
 
 import cv2
 import numpy as np
 
 from barsight.core.arrays import Bool, Float32, Float64
 from barsight.core.linalg.robust import mad_sigma
+
+Floats = TypeVar("Floats", Float32, Float64)
 
 BLOCK_CELLS = 64
 MIN_KNOWN_RATIO = 0.3
@@ -174,10 +177,12 @@ def _sums(values: Float32) -> Float64:
 
 def _contrast(gray: Float32, known: Bool) -> Float32:
     """Smooth a picture a little and subtract its slow part, using known cells only."""
-    weight = known.astype(np.float32)
-    filled = np.where(known, gray, 0).astype(np.float32)
-    smooth = []
-    for sigma in (_FINE_CELLS, _COARSE_CELLS):
-        total = cv2.GaussianBlur(weight, (0, 0), sigma)
-        smooth.append(cv2.GaussianBlur(filled, (0, 0), sigma) / np.maximum(total, 1e-3))
-    return np.where(known, smooth[0] - smooth[1], 0).astype(np.float32)
+    fine, coarse = (smooth_known(gray, known, cells) for cells in (_FINE_CELLS, _COARSE_CELLS))
+    return np.where(known, fine - coarse, 0).astype(np.float32)
+
+
+def smooth_known(values: Floats, known: Bool, sigma_cells: float) -> Floats:
+    """Smooth a map (H, W) by a Gaussian mean of its known cells."""
+    total = cv2.GaussianBlur(known.astype(values.dtype), (0, 0), sigma_cells)
+    smooth = cv2.GaussianBlur(np.where(known, values, values.dtype.type(0)), (0, 0), sigma_cells)
+    return cast(Floats, smooth / np.maximum(total, 1e-3))

@@ -7,12 +7,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from scipy import fft
 
 from barsight.core.arrays import Bool, Float64
-from barsight.registration.block_shifts import GATE_M, MatchedMap
+from barsight.registration.block_shifts import GATE_M, MatchedMap, smooth_known
 
 COARSE_M = 0.04
 """Size of the cells that are compared."""
@@ -99,12 +98,10 @@ def _reduced(values: np.ndarray, step: int) -> Float64:
     return mean
 
 
-def _contrast(values: Float64, sigma: float) -> tuple[Float64, Bool]:
+def _contrast(values: Float64, sigma_cells: float) -> tuple[Float64, Bool]:
     """Subtract the slow part of the known cells; returns 0 elsewhere, and which are known."""
     known = np.isfinite(values)
-    filled, weight = np.where(known, values, 0.0), known.astype(np.float64)
-    slow = cv2.GaussianBlur(filled, (0, 0), sigma) / np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma), 1e-3)
-    return np.where(known, filled - slow, 0.0), known
+    return np.where(known, values - smooth_known(values, known, sigma_cells), 0.0), known
 
 
 def _features(one: CoarsePair, coarse_m: float) -> list[tuple[tuple[Float64, Bool], tuple[Float64, Bool]]]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from barsight.core.arrays import Float64
+from barsight.core.linalg.robust import CHI2_3_MEDIAN
 from barsight.core.pose import skew
 from barsight.registration.block_shifts import BlockShifts
 
@@ -28,8 +29,6 @@ FEW_INFLATION, MIN_INFLATION = 10.0, 1e-3
 """Factor on the stated variance where blocks are too few to show it, and the minimum of the estimated
 factor.
 """
-CHI2_MEDIAN = 2.366
-"""Median of chi2 with three degrees of freedom."""
 NOTHING = 1e-3
 """Information (1 / m^2) that is assumed for directions which a block doesn't show."""
 _ROUNDS = 15
@@ -164,7 +163,7 @@ def _scaled(first: int, second: int, blocks: BlockShifts) -> _Overlap:
     for _ in range(_ROUNDS):
         squares = np.einsum("ki,kij,kj->k", off, blocks.information, off)
         if count >= MIN_BLOCKS:
-            inflation = max(float(np.median(squares)) / CHI2_MEDIAN, MIN_INFLATION)
+            inflation = max(float(np.median(squares)) / CHI2_3_MEDIAN, MIN_INFLATION)
         weight = 1 / (1 + squares / (9 * inflation))
         fitted = np.linalg.lstsq(np.sqrt(weight)[:, None] * plane, np.sqrt(weight)[:, None] * blocks.shift_m,
                                  rcond=None)[0]  # fmt: skip

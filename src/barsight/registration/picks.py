@@ -17,9 +17,11 @@ from barsight.registration.tags import SeenTags, TagSighting, sighting_at
 HALF_PX = 10
 """Half-width of the patch around a pick that is searched for in the right picture."""
 ROWS_PX = 2
+"""Number of rows above and below a pick's own that are searched."""
 PICKED_PX, MATCHED_PX = 0.7, 0.15
 """Standard deviation of a pick by hand, and of matching it in the right picture."""
 MIN_DISPARITY_PX = 1.0
+"""Minimum disparity; with less, the matching error is a large part of it."""
 MIN_ALIKE, MAX_RIVAL = 0.75, 0.95
 """Minimum correlation of a patch at the match, and maximum correlation elsewhere as a ratio to it."""
 

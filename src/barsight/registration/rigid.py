@@ -162,7 +162,7 @@ def _covariance(rotated: Float64, spread: Float64) -> Float64:
     """Compute the covariance (J^T S^-1 J)^-1 (6, 6) of least squares with a covariance S, (N, 3, 3) or (N,
     N).
 
-    turned: (N, 3) points from the source's origin, target axes.
+    rotated: (N, 3) points from the source's origin, target axes.
     """
     centre = rotated.mean(axis=0)
     design = design_rows(rotated - centre)

@@ -13,13 +13,14 @@ from barsight.calibration.boards.ring_detection import find_rings
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Float64, UInt8
 from barsight.core.errors import Failed
-from barsight.core.linalg.robust import mad_sigma
+from barsight.core.linalg.robust import CHI2_3_MEDIAN, mad_sigma
 from barsight.core.pose import skew
 from barsight.core.records.pairs import RectifiedCamera, RefusedFrame, StereoFrame
 from barsight.core.records.trajectory import PosedFrame
 from barsight.registration.rigid import Alignment, align_rigid
 
 MIN_PAIRS = 2
+"""Minimum number of pairs that must show a tag."""
 MAX_ROWS_PX = 2.0
 """Maximum difference between the rows of a tag's corners in the two pictures: beyond it they are two tags, or
 the rig is misaligned.
@@ -28,12 +29,12 @@ MIN_SIGMA_PX = 0.03
 """Lower bound of the noise of a tag's middle in one picture."""
 MAX_CHI2 = 16.3
 """Maximum chi2 of a pair's three coordinates, exceeded by one in a thousand."""
-MEDIAN_CHI2 = 2.37
 MAX_APART_M = 0.1
 """Maximum distance of a pair's position from the tag's; if two or more pairs exceed it, they saw another
 tag.
 """
 OTHER_FAMILIES = ("25h9", "36h10", "16h5")
+"""Families whose tags are reported where the yard's own aren't found."""
 MIRRORED_RATIO = 0.2
 """Ratio of misfits below which the mirrored positions are the right ones."""
 
@@ -238,7 +239,7 @@ def _combined(number: int, name: str, seen: list[TagSighting], sigma_px: float) 
         off = places - middle
         chi2 = np.einsum("ki,kij,kj->k", off, weights, off)
         near = np.linalg.norm(off, axis=1) <= MAX_APART_M
-        kept = near & (chi2 <= MAX_CHI2 * max(1.0, float(np.median(chi2)) / MEDIAN_CHI2))
+        kept = near & (chi2 <= MAX_CHI2 * max(1.0, float(np.median(chi2)) / CHI2_3_MEDIAN))
         if (~near).sum() >= 2 or kept.sum() < MIN_PAIRS:
             apart = float(np.linalg.norm(np.ptp(places, axis=0)))
             reason = f"{name} is seen at places {apart:.2f} m apart: it is there twice, or was moved"

@@ -43,6 +43,11 @@ class YardCalibration:
         return sigma
 
     @property
+    def rms_m(self) -> float:
+        """Return the RMS distance between the points that agree and their yard positions."""
+        return float(np.sqrt((self.off_m[~self.checks] ** 2).sum(axis=1).mean()))
+
+    @property
     def contradictions(self) -> tuple[str, ...]:
         """List what forbids the use: disagreement, mistaken points, and checks that are further off than all
         of them together are by chance.

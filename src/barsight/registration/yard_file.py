@@ -71,7 +71,7 @@ def write_yard_file(
         "scale": found.alignment.scale,
         "scale_sigma": found.alignment.scale_sigma,
         "points": int((~found.checks).sum()),
-        "rms_m": float(np.sqrt((found.off_m[~found.checks] ** 2).sum(axis=1).mean())),
+        "rms_m": found.rms_m,
         "targets_m": found.yard_m[~found.checks].tolist(),
         "doubts": list(found.doubts),
         **{name: value for name, value in owners.items() if value is not None},

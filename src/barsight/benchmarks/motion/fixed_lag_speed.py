@@ -18,6 +18,7 @@ from barsight.core.memory import peak_memory_mib, resident_bytes
 from barsight.core.pose import Pose
 from barsight.core.records.sensor_samples import CraneSamples, ImuSamples
 from barsight.core.records.trajectory import PosedFrame
+from barsight.evaluation.trajectory_error import rms
 from barsight.features.guided_matching import project_stereo
 from barsight.inertial.model import ORDINARY_NOISE
 from barsight.motion.batch.fusion import FusionSettings
@@ -93,7 +94,7 @@ def bench_live(keyframes: int = 1000, held: int = 8, seed: int = 1) -> LiveSpeed
         keyframes, float(np.mean(seen)), tuple(tenths[:, 0].tolist()), tuple(tenths[:, 1].tolist()),
         tuple((held_mib - held_mib[0]).tolist()),
         peak_memory_mib(),
-        float(1e3 * np.sqrt((off**2).sum(axis=1).mean())), float(nees.mean()),
+        1e3 * rms(off), float(nees.mean()),
     )  # fmt: skip
 
 

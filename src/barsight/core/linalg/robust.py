@@ -10,6 +10,8 @@ from scipy import ndimage
 
 SIGMA_PER_MAD = 1.4826
 """Ratio of the sigma of normal errors to their median absolute deviation."""
+CHI2_3_MEDIAN = 2.366
+"""Median of chi2 with three degrees of freedom."""
 
 
 @overload

@@ -19,7 +19,6 @@ MAX_ROWS = 200
 
 def write_yard_report(found: YardCalibration, verdict: str, source: str, html: Path, data: Path) -> None:
     """Write the page to `html` and its numbers to `data`, each completely or not at all."""
-    rms = float(np.sqrt((found.off_m[~found.checks] ** 2).sum(axis=1).mean()))
     summary: dict[str, Any] = {
         "schema": 1,
         "software": {"name": "barsight", "version": barsight.__version__},
@@ -29,7 +28,7 @@ def write_yard_report(found: YardCalibration, verdict: str, source: str, html: P
         "checks": int(found.checks.sum()),
         "turn_sigma_deg": found.turn_sigma_deg,
         "place_sigma_mm": 1e3 * found.place_sigma_m,
-        "rms_mm": 1e3 * rms,
+        "rms_mm": 1e3 * found.rms_m,
         "scale": found.alignment.scale,
         "scale_sigma": found.alignment.scale_sigma,
         "doubts": list(found.doubts),
@@ -47,7 +46,7 @@ def write_yard_report(found: YardCalibration, verdict: str, source: str, html: P
         KeyFigure(
             "Placed to", f"± {format_number(1e3 * found.place_sigma_m, 1, 'mm')}", "one sigma, worst axis"
         ),
-        KeyFigure("Points off", format_number(1e3 * rms, 1, "mm"), "RMS of their distances"),
+        KeyFigure("Points off", format_number(1e3 * found.rms_m, 1, "mm"), "RMS of their distances"),
         KeyFigure(
             "Scale",
             format_number(found.alignment.scale, 5),
