@@ -35,7 +35,6 @@ from barsight.stereo.baselines.region_voting import region_vote
 from barsight.stereo.baselines.winner_takes_all import Winners, sweep
 from barsight.stereo.noise import image_noise
 
-_SUPPORT_RADIUS_PX = 4
 _MEDIAN_RADIUS_PX = 9
 _MEDIAN_SIGMA_PX = 9.0
 _MEDIAN_SIGMA_GRAY = 14.7
@@ -111,7 +110,7 @@ class Census:
             _MEDIAN_SIGMA_PX,
             _MEDIAN_SIGMA_GRAY,
         )
-        return assemble_disparity(pair, winners, chosen, matched, _SUPPORT_RADIUS_PX, settings.output)
+        return assemble_disparity(pair, winners, chosen, matched, settings.output)
 
 
 def census_winners(

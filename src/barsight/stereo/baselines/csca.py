@@ -49,7 +49,6 @@ from barsight.stereo.baselines.spanning_tree import spanning_tree, tree_filter
 from barsight.stereo.baselines.winner_takes_all import Winners, sweep
 
 _FEWEST_CANDIDATES = 5
-_SUPPORT_RADIUS_PX = 4
 
 
 @dataclass(frozen=True)
@@ -110,7 +109,7 @@ class Csca:
             settings.median_sigma_px,
             settings.median_sigma_gray,
         )
-        return assemble_disparity(pair, winners, chosen, matched, _SUPPORT_RADIUS_PX, settings.output)
+        return assemble_disparity(pair, winners, chosen, matched, settings.output)
 
 
 def scale_weights(scales: int, regulariser: float) -> Float64:

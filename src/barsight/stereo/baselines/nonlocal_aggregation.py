@@ -30,7 +30,6 @@ from barsight.stereo.baselines.postprocessing import (
 from barsight.stereo.baselines.spanning_tree import SpanningTree, spanning_tree, tree_filter
 from barsight.stereo.baselines.winner_takes_all import Winners, sweep
 
-_SUPPORT_RADIUS_PX = 4
 _MEDIAN_PX = 5
 
 
@@ -77,7 +76,7 @@ class Nonlocal:
         chosen = _median(refine_nonlocal(smooth, matched, tree, candidates, settings.sigma * 255 / 2))
         # A pixel is as certain as a match only where refinement kept the value that both images agreed on.
         matched &= chosen == smooth
-        return assemble_disparity(pair, winners, chosen, matched, _SUPPORT_RADIUS_PX, settings.output)
+        return assemble_disparity(pair, winners, chosen, matched, settings.output)
 
 
 def tree_winners(

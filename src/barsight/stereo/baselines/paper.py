@@ -23,8 +23,8 @@ from barsight.stereo.baselines.census import Census, CensusSettings
 from barsight.stereo.baselines.postprocessing import OutputSettings, is_matchable, no_match, with_sigma
 from barsight.stereo.sgbm import Sgbm, SgbmSettings
 
-_SUPPORT_RADIUS_PX = 4
 _SETTLED_RATIO = 0.95
+"""Share of pixels that have settled when the loop ends."""
 _NARROWEST_PX = 16  # OpenCV rounds the number of candidates up to a multiple of this.
 
 
@@ -76,7 +76,7 @@ class Paper:
         initial = start(pair, candidates)
         values = iterate_bilateral(pair, initial.disparity_px, candidates, settings)
         matched = np.isfinite(initial.disparity_px)
-        return with_sigma(pair, values, matched, _SUPPORT_RADIUS_PX, settings.output)
+        return with_sigma(pair, values, matched, settings.output)
 
 
 def iterate_bilateral(

@@ -14,6 +14,9 @@ from barsight.stereo.baselines.winner_takes_all import Winners, subpixel_winners
 from barsight.stereo.noise import has_texture, noise_sigma
 
 _MIN_RELIABLE = 0.01
+"""Minimum share of pixels whose match holds in both images; with fewer, the pair has no match at all."""
+_SUPPORT_RADIUS_PX = 4
+"""Radius of the window that is taken as a match's support for the noise bound, whatever the method."""
 
 
 @dataclass(frozen=True)
@@ -41,28 +44,27 @@ def assemble_disparity(
     winners: Winners,
     chosen_px: Int32,
     matched: Bool,
-    radius_px: int,
     settings: OutputSettings,
 ) -> Disparity:
     """Assemble the disparity. chosen_px: (H, W) whole disparities after post-processing. matched: where left
     and right agree.
 
     Matched pixels that kept their winner get the parabola's disparity; the rest stays whole or NaN. sigma
-    combines the noise bound over a window of radius_px with the settings' constant.
+    combines the noise bound over the support with the settings' constant.
     """
     matched = matched & hits_valid_pixel(chosen_px, pair)
     if matched.sum() < _MIN_RELIABLE * matched.size:
         return no_match(pair)
     kept = matched & (chosen_px == winners.candidate_px)
     disparity = np.where(kept, subpixel_winners(winners), chosen_px.astype(np.float32))
-    return with_sigma(pair, disparity.astype(np.float32), matched, radius_px, settings)
+    return with_sigma(pair, disparity.astype(np.float32), matched, settings)
 
 
 def with_sigma(
-    pair: RectifiedPair, disparity_px: Float32, matched: Bool, radius_px: int, settings: OutputSettings
+    pair: RectifiedPair, disparity_px: Float32, matched: Bool, settings: OutputSettings
 ) -> Disparity:
-    """Combine the noise bound over a window of radius_px with the settings' constants."""
-    sigma = np.hypot(noise_sigma(pair.left, radius_px), np.float32(settings.subpixel_sigma_px))
+    """Combine the noise bound over the support with the settings' constants."""
+    sigma = np.hypot(noise_sigma(pair.left, _SUPPORT_RADIUS_PX), np.float32(settings.subpixel_sigma_px))
     sigma = np.where(matched, sigma, np.float32(settings.filled_sigma_px)).astype(np.float32)
     known = pair.left_valid & ~np.isnan(disparity_px)
     if not settings.fill:

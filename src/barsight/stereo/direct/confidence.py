@@ -20,22 +20,31 @@ from barsight.stereo.direct.kernels.box_sums import mirror_index, window_means
 from barsight.stereo.direct.kernels.cubic_spline import interpolated_value, row_coefficients, value_and_slope
 
 _BLUR_PX = 0.7
-_WINDOW_PX = 21
-_EVERY_PX = 10
-_STRIPES = 4
-_STRIPE_ROWS = 81
+"""Blur of the pictures whose vertical shift is measured, one sigma."""
+_WINDOW_PX, _EVERY_PX = 21, 10
+"""Side of the windows in which shifts are solved, and the distance between windows."""
+_STRIPES, _STRIPE_ROWS = 4, 81
+"""Number and height of the stripes that are measured of a large picture."""
 _OUTLIER_GRAY = np.float32(8)
-_MIN_SLOPE_POWER = 4.0
-_MIN_INDEPENDENCE = 0.05
-_LARGEST_VARIANCE_PX2 = 0.1
-_FEWEST_WINDOWS = 30
+"""Residual at which a pixel's weight is halved, gray levels."""
+_MIN_SLOPE_POWER, _MIN_INDEPENDENCE = 4.0, 0.05
+"""Minimum mean square slope along the columns in a window, (gray levels / px)^2; minimum determinant of its
+equations relative to their diagonal, below which the two shifts can't be told apart.
+"""
+_MAX_VARIANCE_PX2, _MIN_WINDOWS = 0.1, 30
+"""Maximum noise variance of a shift that is used, and minimum number of such shifts."""
 _NOISE_RATIO = 4.5
+"""Factor on the shifts' median noise variance, which is subtracted from their scatter."""
 _BEND_PX = 3
+"""Distance to the neighbours from whose mean a bend is measured."""
 _START_WINDOW_PX = 9
+"""Side of the window over which start and refinement are compared."""
 _EDGE_REACH_PX = 3.0
+"""Distance from a depth edge at which the risk has fallen to 1 / e."""
 _FAR_PX = 1e4
-_OTHER_SIDE_PX = 4
-_UNSURE_SIDE_PX = 2.5
+"""Disparity beyond any real one, in place of unknown ones."""
+_OTHER_SIDE_PX, _UNSURE_SIDE_PX = 4, 2.5
+"""Distance within which the other side of a depth edge is searched, and within which a pixel may be on it."""
 _BAND_ROWS = 64
 _NAN = np.float32(np.nan)
 
@@ -53,7 +62,7 @@ def vertical_error_px(left: UInt8, right: UInt8, disparity: Float32, matched: Bo
         stripes = [slice(first, first + _STRIPE_ROWS) for first in firsts]
     found = [_vertical_shifts(left[rows], right[rows], disparity[rows], usable[rows]) for rows in stripes]
     shift, variance = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    if shift.size < _FEWEST_WINDOWS:
+    if shift.size < _MIN_WINDOWS:
         return 0.0
     spread = mad_sigma(shift)
     return float(np.sqrt(max(spread * spread - _NOISE_RATIO * float(np.median(variance)), 0.0)))
@@ -255,7 +264,7 @@ def _vertical_shifts(
     told[[0, -1]] = False
     xx, xy, yy, xr, yr, power, determinant = (a[told] for a in (xx, xy, yy, xr, yr, power, determinant))
     variance = power * np.square(xx / determinant) / np.float32(_WINDOW_PX * _WINDOW_PX)
-    sure = variance < _LARGEST_VARIANCE_PX2
+    sure = variance < _MAX_VARIANCE_PX2
     shift = (xx * yr - xy * xr) / determinant
     return np.asarray(shift[sure], dtype=np.float32), np.asarray(variance[sure], dtype=np.float32)
 

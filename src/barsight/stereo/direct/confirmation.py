@@ -22,9 +22,11 @@ from barsight.stereo.direct.semiglobal.cost import (
 )
 
 _SAME_PX = np.float32(1.0)
+"""Difference from which a prediction and the pair's own match are in dispute."""
 _CONSISTENT_PX = 2.0
-_COST_WINDOW_PX = 7
-EDGE_WINDOW_PX = 9
+"""Maximum difference between a prediction and the right picture's match, if there is no other."""
+_COST_WINDOW_PX, EDGE_WINDOW_PX = 7, 9
+"""Side of the windows over which costs are summed, and in which depth edges are detected."""
 _BAND_ROWS = 64
 _NAN = np.float32(np.nan)
 _FAR = -1e6

@@ -7,8 +7,8 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float32, kernel
 
-_STEPS = 16
-_NONE = -32768
+_STEPS, _NONE = 16, -32768
+"""Number of steps per pixel in which disparities are searched for islands, and their value where unknown."""
 
 
 def is_consistent(left_px: Float32, right_px: Float32, tolerance_px: float) -> Bool:

@@ -16,12 +16,15 @@ from barsight.stereo.direct.kernels.vectors import FLOAT, FLOAT_LANES, Vectors, 
 
 _RADIUS_PX = 5
 _SIDE_PX = 2 * _RADIUS_PX + 1
-_UNKNOWN = 1e30
-_GRAY = 10.0
-_DISTANCE_PX = 4.0
+"""Side of the median's window."""
+_UNKNOWN, _FAR = 1e30, 1e4
+"""Values in place of unknown disparities: for the median, and beyond any real one."""
+_GRAY, _DISTANCE_PX = 10.0, 4.0
+"""Difference in gray levels at which a weight falls to 1 / e, and sigma of the weights over distance."""
 _BESIDE_PX = 3
-_FAR = 1e4
+"""Distance from a jump within which pixels are sharpened, along rows and columns."""
 _EXACT_PX = 0.02
+"""Length of the interval to which a median is narrowed down."""
 _BAND_ROWS = 32
 
 

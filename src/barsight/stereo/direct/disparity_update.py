@@ -18,13 +18,15 @@ from barsight.stereo.direct.kernels.box_sums import (
 from barsight.stereo.direct.support_regions import MARGIN
 
 _SLACK = np.float32(0.5)
-_BLEND_REACH_PX = 4
-_SAG_REACH_PX = 5
+"""Share of the short fit's variance by which the supports may differ before the short one counts."""
+_BLEND_REACH_PX, _SAG_REACH_PX = 4, 5
+"""Half side of the windows over which the supports' difference and the curvature are averaged."""
 _SPREAD_ACROSS_PX2 = np.float32(3)
 """Mean square distance across the axis over which the supports average: their own width and the axis'
 error.
 """
-_LONGEST_STEP_PX = np.float32(1.5)
+_MAX_STEP_PX = np.float32(1.5)
+"""Maximum change of a disparity in one step."""
 _SUPPORT = np.float32(0.5 * 1.87)
 """Factor of a fit's variance: the sum of squared weights over their sum for a Gaussian support in the
 plane, times the loss due to the outlier weights, measured on rendered planes. Noise in the slopes adds in
@@ -194,7 +196,7 @@ def _settle(
         here = disparity[y + MARGIN, MARGIN : MARGIN + width]
         for x in range(width):
             off = wanted[x] - half * sag[x] - here[x]
-            ahead[x] = min(max(off, -_LONGEST_STEP_PX), _LONGEST_STEP_PX)
+            ahead[x] = min(max(off, -_MAX_STEP_PX), _MAX_STEP_PX)
         for x in range(width):
             here[x] += ahead[x]
         for x in range(width):

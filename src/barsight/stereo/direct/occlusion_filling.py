@@ -16,20 +16,27 @@ import numpy as np
 from barsight.core.arrays import Float32, Float64, Int32, UInt8, kernel
 from barsight.core.parallel import parallel_bands
 
-_RAYS = 16
-_REACH_PX = 200
-_PLANE_RADIUS_PX = 15
-_EVERY_PX = 3
+_RAYS, _REACH_PX = 16, 200
+"""Number of rays from a hole's pixel, and their length along the row or the column."""
+_PLANE_RADIUS_PX, _EVERY_PX = 15, 3
+"""Half side of the window to which a plane is fitted, and the step between its pixels."""
 _SLOPE_HOLD = 20.0 / _EVERY_PX**2
+"""Weight of the assumption that a plane has no slope, px^2."""
 _SAME_SURFACE_PX = 1.0
+"""Maximum distance from a plane of the pixels to which it is fitted."""
 _SLOPE_LENGTH_PX = 50.0
+"""Distance over which an extrapolated plane's slope fades out."""
 _GRAY = 12.0
+"""Difference in gray levels at which a candidate's weight falls to 1 / e."""
 _HIDDEN_QUANTILE = 0.3
+"""Quantile of the candidates that is taken where one picture may hide what the other sees."""
 _SEEN_RATIO = 0.03
+"""Factor on the weight of a candidate that lies in front of what the right picture sees there."""
 _SPREAD_RATIO = 2.0
+"""Ratio of a guess's sigma to the candidates' spread."""
 _BAND_ROWS = 32
-_SAMPLED_EVERY_PX = 8
-_MIDDLE_PERCENT = (45, 55)
+_SAMPLED_EVERY_PX, _MIDDLE_PERCENT = 8, (45, 55)
+"""Step between sampled pixels, and the percentiles of the sample between which all values are sorted."""
 
 
 def fill_occlusions_by_planes(

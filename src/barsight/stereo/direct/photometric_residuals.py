@@ -24,8 +24,11 @@ from barsight.stereo.direct.kernels.box_sums import (
 from barsight.stereo.direct.support_regions import MARGIN
 
 _CONTRAST_FLOOR = np.float32(4)
+"""Variance added to both pictures' contrast, gray levels^2."""
 _BLOCK_PX = 3
+"""Side of the blocks over which pulls are summed to estimate their noise."""
 _MAX_UNDAMPED = np.float32(3)
+"""Maximum gain of a step."""
 
 
 def photometric_residual(

@@ -30,6 +30,7 @@ from barsight.stereo.direct.depth_edges import sharpen_edges
 from barsight.stereo.direct.kernels.pyramid import double_disparity, halve
 from barsight.stereo.direct.occlusion_filling import fill_occlusions_by_planes, fill_row_holes
 from barsight.stereo.direct.refinement import (
+    MIN_HALVED_PX,
     RefinedDisparity,
     RefinementSettings,
     refine_at_half_size,
@@ -47,10 +48,13 @@ from barsight.stereo.masking import mask_values
 
 _NAN = np.float32(np.nan)
 _FAST_HALF_SIZE_STEPS = 2
+"""Number of refinement steps that the preset `fast` runs at half size."""
 _JUMP_PX = 1.0
-_FURTHEST_FROM_START_PX = 2.0
+"""Minimum difference between neighbours at a depth edge."""
+_MAX_MOVED_PX = 2.0
+"""Maximum distance between a match and its start; beyond it, the match is dropped."""
 _MIN_CONTRAST_GRAY = 0.5
-_MIN_HALVED_PX = 128
+"""Minimum standard deviation of a picture's gray levels; with less, nothing is matched."""
 _FAR_STEP_PX, _MAX_FAR_RATIO = 0.3, 0.15
 """Length of a refinement step, and maximum share of pixels that step further, above which a prediction is
 rejected as a whole.
@@ -179,7 +183,7 @@ class _Matching:
         if min(_contrast(pair.left), _contrast(pair.right)) < _MIN_CONTRAST_GRAY:
             nothing = np.full(pair.left.shape, _NAN, dtype=np.float32)
             return Disparity(nothing, nothing.copy())
-        if predicted is not None and min(pair.left.shape) >= _MIN_HALVED_PX:
+        if predicted is not None and min(pair.left.shape) >= MIN_HALVED_PX:
             return self._confirm(pair, candidates, predicted)
         settings, refinement = self.settings, self.settings.refinement
         if settings.preset == "fast":
@@ -247,7 +251,7 @@ class _Matching:
             np.float32(settings.model_sigma_px**2 + (settings.vertical_error_ratio * vertical_px) ** 2),
             np.float32(settings.edge_error_ratio**2),
             np.float32(settings.start_error_ratio),
-            np.float32(_FURTHEST_FROM_START_PX),
+            np.float32(_MAX_MOVED_PX),
             np.float32(np.inf if settings.fill_occlusions else settings.max_sigma_px),
         )
         bend, disagreement = disparity_bend(found, settings.max_edge_px), start_disagreement(start_px, found)
@@ -255,7 +259,7 @@ class _Matching:
 
     def _start(self, pair: RectifiedPair, candidates: DisparityRange) -> _Start:
         settings = self.settings
-        if settings.preset == "fast" and min(pair.left.shape) >= _MIN_HALVED_PX:
+        if settings.preset == "fast" and min(pair.left.shape) >= MIN_HALVED_PX:
             return self._start_at_half_size(pair, candidates)
         found = match_semiglobal(
             pair.left, pair.right, candidates.lowest_px, candidates.count, settings.semiglobal

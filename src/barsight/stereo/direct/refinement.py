@@ -52,26 +52,28 @@ from barsight.stereo.noise import image_noise
 
 Image = UInt8 | Float32
 
-_BLUR_PX = 0.5
-_FIRST_BLUR_PX = 0.7
-_LONG_STEP_PX = 5
-_SHORT_STEP_PX = 3
-_HALF_STEP_PX = 3
+_BLUR_PX, _FIRST_BLUR_PX = 0.5, 0.7
+"""Blur of the pictures in the last step and in the first, one sigma."""
+_LONG_STEP_PX, _SHORT_STEP_PX, _HALF_STEP_PX = 5, 3, 3
+"""Sampling step along the axis of the long support, the short one, and the long one at half size."""
 _HALF_ACROSS = 0.75
+"""Ratio of the long support's width at half size, in half-size pixels, to that at full size."""
 _HALF_HOLD = 4
 """Weight of the hold at half size relative to full size, where a pixel stands for four."""
 _LONGEST_HALF_STEP_PX = 0.4
 """Maximum step at half size, in half-size pixels; longer ones move pixels beside depth edges to the other
 side.
 """
-_MIN_HALVED_PX = 128
+MIN_HALVED_PX = 128
+"""Minimum length of a picture's shorter side for work at half size."""
 _ALIKE_BLUR_PX = 1.5
+"""Blur of the gray values at whose differences supports end, one sigma."""
 _LAST_SAME_SURFACE = 0.5
 """Share of same_surface_px at which supports end in the last step: the start's steps of whole pixels are
 gone by then, while dunnage of 40 mm is half a pixel high.
 """
-_HOLD = 0.1
-_HOLD_UNMATCHED = 0.02
+_HOLD, _HOLD_UNMATCHED = 0.1, 0.02
+"""Weight of the hold, which keeps a pixel where it is, and the share of it that an unmatched pixel has."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +145,7 @@ def refine_disparity(
     halves_rows: whether half size halves the rows too.
     """
     halved = max(min(settings.half_size_steps, settings.steps - 1), 0)
-    if min(left.shape) < _MIN_HALVED_PX:
+    if min(left.shape) < MIN_HALVED_PX:
         halved = 0
     if halved:
         start = refine_at_half_size(left, right, start, matched, settings, halves_rows, halved)
