@@ -12,12 +12,13 @@ from barsight.core.errors import InputError
 from barsight.core.json_values import json_digest
 from barsight.core.reading.bounded_reading import MAX_TABLE_BYTES
 from barsight.fleet.objects import Objects, StoredObject
+from barsight.recording.formats.bag_file import BAG_KINDS
 from barsight.recording.formats.segments import PATTERN
 from barsight.recording.own_files import leads_outside
 
 SURVEY = "survey.json"
 """File that combines the recordings in its folder into one survey: its list `passes` names them."""
-_BAGS = (".bag", ".mcap", ".db3")
+_BAGS = tuple(BAG_KINDS)
 _INSIDE = {"mav0", "cam0", "cam1", "image_0", "image_1"}
 _PICTURES = (".png", ".jpg", ".pgm", ".tif")
 _UNREAD = {"truth", "alarms"}

@@ -8,14 +8,13 @@ from barsight.calibration.boards.detection_files import has_detections
 from barsight.core.errors import InputError
 from barsight.recording.base import RecordingSettings
 from barsight.recording.formats.bag import BagRecording
-from barsight.recording.formats.bag_file import BagFile
+from barsight.recording.formats.bag_file import BAG_KINDS, BagFile
 from barsight.recording.formats.board_corners import CornerRecording
 from barsight.recording.formats.euroc import EurocRecording
 from barsight.recording.formats.kitti import KittiRecording, is_kitti
 from barsight.recording.formats.segments import SEGMENTS, segments_of
 from barsight.recording.stored_images import StoredPictures
 
-BAG_KINDS = {".bag": "ros1", ".mcap": "ros2-mcap", ".db3": "ros2-sqlite3"}
 KNOWN = (
     "an EuRoC folder (holding mav0), a KITTI odometry sequence (calib.txt, image_0, image_1), a ROS 1 .bag, "
     "a ROS 2 bag folder (metadata.yaml), a folder of live's segments, a .mcap, a .db3 or a board's corners "

@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 
+from barsight.calibration.files.yaml_document import read_document
 from barsight.core.errors import InputError
 from barsight.core.files import lies_within
 from barsight.core.reading.bounded_reading import MAX_TABLE_BYTES, open_regular, read_bytes
@@ -42,6 +43,12 @@ def expect_own_files(root: Path, names: Iterable[str]) -> None:
             raise InputError(
                 root / name, "is a link out of the recording", "copy the file into the recording"
             )
+
+
+def states_simulated(folder: Path) -> bool:
+    """Check whether the `body.yaml` of a recording's folder states that it is simulated."""
+    path = folder / "body.yaml"
+    return path.is_file() and read_document(path).values.get("is_simulated") is True
 
 
 def read_picture(path: Path, root: Path) -> bytes:

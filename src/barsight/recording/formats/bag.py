@@ -27,12 +27,12 @@ from barsight.core.records.pairs import RefusedFrame, StereoFrame
 from barsight.core.records.sensor_samples import CraneSamples, ImuSamples, LaserProfile
 from barsight.core.stamps import rows_not_later
 from barsight.recording.base import FrameIndex, RecordingSettings
-from barsight.recording.formats.bag_file import BagFile, RawMessage
+from barsight.recording.formats.bag_file import BAG_KINDS, BagFile, RawMessage
 from barsight.recording.formats.bag_images import file_of, gray_of
 from barsight.recording.formats.bag_laser import laser_rows
 from barsight.recording.formats.bag_setup import choose_topics, find_calibration
 from barsight.recording.formats.segments import SEGMENTS, SegmentFile
-from barsight.recording.own_files import expect_own_files, file_digests
+from barsight.recording.own_files import expect_own_files, file_digests, states_simulated
 from barsight.recording.pairing import PairedStamps, pair_cameras
 from barsight.recording.sensor_samples import laser_std, make_crane, make_imu, make_laser
 from barsight.recording.stored_images import StoredImage
@@ -83,8 +83,7 @@ class BagRecording:
     @cached_property
     def is_simulated(self) -> bool:
         """Return `is_simulated` of a `body.yaml` in the bag's folder; False if it isn't stated."""
-        path = self._folder / "body.yaml"
-        return path.is_file() and read_document(path).values.get("is_simulated") is True
+        return states_simulated(self._folder)
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -219,9 +218,7 @@ class BagRecording:
 
     def _bag_files(self) -> list[Path]:
         files = sorted(self.path.iterdir()) if self.path.is_dir() else [self.path]
-        return [
-            file for file in files if file.suffix in (".bag", ".mcap", ".db3") or file.name == "metadata.yaml"
-        ]
+        return [file for file in files if file.suffix in BAG_KINDS or file.name == "metadata.yaml"]
 
     def _pictures(self) -> Iterator[RawMessage]:
         return self._bag.messages((self._topics.cam0, self._topics.cam1))

@@ -21,6 +21,8 @@ from barsight.core.stamps import NS_PER_S
 from barsight.recording.formats.bag_reader import BagReader
 from barsight.recording.own_files import expect_inner_name, leads_outside
 
+BAG_KINDS = {".bag": "ros1", ".mcap": "ros2-mcap", ".db3": "ros2-sqlite3"}
+"""Formats of bag files by their suffix."""
 IMAGE_TYPE = "sensor_msgs/msg/Image"
 COMPRESSED_TYPE = "sensor_msgs/msg/CompressedImage"
 IMU_TYPE = "sensor_msgs/msg/Imu"

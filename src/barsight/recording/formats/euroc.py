@@ -15,7 +15,7 @@ from barsight.core.records.sensor_samples import CraneSamples, ImuSamples, Laser
 from barsight.recording.base import RecordingSettings
 from barsight.recording.formats.euroc_tables import Table, read_image_list, read_table
 from barsight.recording.formats.image_folders import PictureFiles
-from barsight.recording.own_files import expect_own_files, file_digests
+from barsight.recording.own_files import expect_own_files, file_digests, states_simulated
 from barsight.recording.pairing import pair_cameras
 from barsight.recording.sensor_samples import laser_std, make_crane, make_imu, make_laser
 
@@ -63,8 +63,7 @@ class EurocRecording(PictureFiles):
     @cached_property
     def is_simulated(self) -> bool:
         """Return `is_simulated` of `body.yaml`; False if it isn't stated."""
-        path = self._root / "body.yaml"
-        return path.is_file() and read_document(path).values.get("is_simulated") is True
+        return states_simulated(self._root)
 
     @cached_property
     def _imu(self) -> ImuSamples | None:

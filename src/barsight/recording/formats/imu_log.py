@@ -15,7 +15,7 @@ from barsight.core.errors import InputError
 from barsight.core.reading.bounded_reading import in_range, read_lines
 from barsight.core.records.sensor_samples import ImuSamples
 from barsight.core.stamps import NS_PER_S, rows_not_later
-from barsight.recording.formats.bag_file import IMU_TYPE, BagFile
+from barsight.recording.formats.bag_file import BAG_KINDS, IMU_TYPE, BagFile
 
 GRAVITY_MPS2 = 9.80665
 COLUMNS = 7
@@ -23,7 +23,6 @@ MAX_SAMPLES = 2_000_000
 """Maximum number of samples of a log: three hours at 200 Hz."""
 FORM = "seven columns: time, three of the gyroscope, three of the accelerometer (or these two exchanged)"
 NAMES_FORM = "more than seven columns need a header that names gyro and accel"
-BAGS = (".bag", ".mcap", ".db3")
 NAMED = {
     "gyro": re.compile(r"gyr|angular|omega|^w_|^w[xyz]\b|^g[xyz]\b", re.IGNORECASE),
     "accel": re.compile(r"acc|^a_|^a[xyz]\b", re.IGNORECASE),
@@ -79,7 +78,7 @@ def read_imu_log(
 
     Stamps may have any epoch, also start-up; their unit is given by `TimeUnit`.
     """
-    is_bag = path.suffix in BAGS or (path / "metadata.yaml").is_file()
+    is_bag = path.suffix in BAG_KINDS or (path / "metadata.yaml").is_file()
     file = path if is_bag else _file(path)
     header, stamp_ns, values = _bag_rows(path) if is_bag else _rows(file, time_unit)
     norms = [float(np.median(np.linalg.norm(values[:, k : k + 3], axis=1))) for k in (0, 3)]
