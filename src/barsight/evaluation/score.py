@@ -8,6 +8,7 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import InputError
+from barsight.core.linalg.robust import SIGMAS_95
 from barsight.core.reading.bounded_reading import read_arrays
 from barsight.core.reading.geotiff import HEIGHT_BANDS, open_geotiff
 from barsight.core.records.heights import HeightSource
@@ -106,7 +107,7 @@ def _figures(error_m: Float64, sigma_m: Float64, claimed: Bool | None) -> Figure
         "mae_mm": size.mean(),
         "p95_mm": np.percentile(size, 95),
         "max_mm": size.max(),
-        "within_95_pct": 100 * np.mean(size <= 1.96e3 * sigma_m[known]),
+        "within_95_pct": 100 * np.mean(size <= SIGMAS_95 * 1e3 * sigma_m[known]),
     }
     if claimed is not None and claimed.size:
         figures["coverage_pct"] = 100 * claimed.mean()

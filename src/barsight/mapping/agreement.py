@@ -8,6 +8,7 @@ import numpy as np
 
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import Failed
+from barsight.core.linalg.robust import SIGMAS_95
 from barsight.core.records.heights import Agreement, Contour, HeightSource
 from barsight.core.records.sensor_samples import LaserProfile
 from barsight.mapping.agreement_intervals import agreement_intervals
@@ -114,8 +115,8 @@ def compute_agreement(
         rmse_mm=float(np.sqrt((compared**2).mean())),
         p95_mm=float(np.percentile(size, 95)),
         max_mm=float(size.max()),
-        loa_low_mm=bias - 1.96 * spread,
-        loa_high_mm=bias + 1.96 * spread,
+        loa_low_mm=bias - SIGMAS_95 * spread,
+        loa_high_mm=bias + SIGMAS_95 * spread,
         x_shift_mm=1e3 * x_shift,
         z_shift_mm=1e3 * z_shift,
         time_shift_s=x_shift / speed_mps if speed_mps else float("nan"),

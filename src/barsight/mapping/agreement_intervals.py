@@ -10,10 +10,10 @@ import numpy as np
 from scipy.special import stdtrit
 
 from barsight.core.arrays import Bool, Float64
+from barsight.core.linalg.robust import SIGMAS_95
 
 FEWEST = 8
 """Minimum number of samples for which confidence intervals are computed."""
-Z_95 = 1.959964
 ROUNDS = 10
 MIN_ALONE = 1.5
 """So many independent samples any series has: of fewer, the spread about their mean says nothing."""
@@ -101,11 +101,11 @@ def agreement_intervals(
     laser = 0.0 if np.isnan(reference_sigma_m) else reference_sigma_m
     stated = 1e3 * np.hypot(sigma_m[used], laser)
     return AgreementIntervals(
-        count, alone, bias, bias - half, bias + half, bias - Z_95 * spread, bias + Z_95 * spread,
-        float(stdtrit(free, 0.975)) * spread * float(np.sqrt(1 / alone + Z_95**2 / (2 * free))),
+        count, alone, bias, bias - half, bias + half, bias - SIGMAS_95 * spread, bias + SIGMAS_95 * spread,
+        float(stdtrit(free, 0.975)) * spread * float(np.sqrt(1 / alone + SIGMAS_95**2 / (2 * free))),
         slope, slope - slope_half, slope + slope_half, abs(bias) + one_sided,
         float(np.sqrt(max(spread**2 - (1e3 * laser) ** 2, 0.0))),
-        100 * float(np.mean(np.abs(d) <= Z_95 * stated)),
+        100 * float(np.mean(np.abs(d) <= SIGMAS_95 * stated)),
     )  # fmt: skip
 
 

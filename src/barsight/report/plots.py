@@ -11,14 +11,13 @@ from typing import Any
 import numpy as np
 
 from barsight.core.arrays import Float64, Int64
+from barsight.core.linalg.robust import SIGMAS_95
 from barsight.core.records.heights import Contour, HeightSource
 from barsight.core.records.sensor_samples import LaserProfile
 from barsight.mapping.agreement import profile_difference
 
 MAX_POINTS, MAX_SCATTER = 20_000, 3_000
 """Maximum numbers of samples that a line and a cloud of markers show."""
-BAND_SIGMAS = 1.96
-"""Half width of a contour's band, in sigmas: 95 %."""
 SERIES = ("--series-0", "--series-1", "--series-2", "--series-3", "--series-4", "--series-5")
 Trace = dict[str, Any]
 
@@ -95,7 +94,7 @@ def contour_plot(compared: ComparedContour) -> Plot:
     source = contour.source[kept]
     seen = np.where(HeightSource.measured(source), z, np.nan)
     name = "vision and laser" if (source == HeightSource.LASER).any() else "vision"
-    traces = [_band(x, seen, BAND_SIGMAS * sigma), line_trace(name, x, seen, "--series-0", 1.4)]
+    traces = [_band(x, seen, SIGMAS_95 * sigma), line_trace(name, x, seen, "--series-0", 1.4)]
     filled = source == HeightSource.FILLED
     if filled.any():
         traces.append(_markers("filled", x[filled], z[filled], "--filled", 5))
@@ -103,7 +102,7 @@ def contour_plot(compared: ComparedContour) -> Plot:
         "xaxis": {"title": {"text": "x / m"}},
         "yaxis": {"title": {"text": "height / mm"}},
     }
-    caption = f"Profile {contour.profile}. The band is {name} ± {BAND_SIGMAS} sigma; unknown places are gaps."
+    caption = f"Profile {contour.profile}. The band is {name} ± {SIGMAS_95} sigma; unknown places are gaps."
     if kept.size < contour.x_m.size:
         caption += f" The plot shows the extremes of {contour.x_m.size} samples; contour.csv has them all."
     if laser is None:
@@ -187,7 +186,9 @@ def limits_plot(compared: tuple[ComparedContour, ...], agreement: list[dict[str,
         "yaxis": {"title": {"text": "vision − laser / mm"}, "zeroline": True},
         "shapes": shapes,
     }
-    caption = "Solid lines: bias; dashed lines: 95 % limits of agreement (bias ± 1.96 standard deviations)."
+    caption = (
+        f"Solid lines: bias; dashed lines: 95 % limits of agreement (bias ± {SIGMAS_95} standard deviations)."
+    )
     if decimated:
         caption += f" {MAX_SCATTER} samples of each profile, drawn at random."
     return Plot("limits", traces, layout, 340, caption)
@@ -212,7 +213,7 @@ def _band(x: Float64, z: Float64, half: Float64) -> Trace:
     return {
         "type": "scatter",
         "mode": "lines",
-        "name": f"± {BAND_SIGMAS} sigma",
+        "name": f"± {SIGMAS_95} sigma",
         "x": json_numbers(np.concatenate([*outline_x, np.empty(0)]), 4),
         "y": json_numbers(np.concatenate([*outline_z, np.empty(0)]), 1),
         "fill": "toself",

@@ -14,12 +14,12 @@ from rich.table import Table
 from barsight.benchmarks.provenance import Provenance, provenance
 from barsight.core.arrays import Float64
 from barsight.core.errors import InputError
+from barsight.core.linalg.robust import SIGMAS_95
 from barsight.simulation.worlds.solids import STEEL_KG_PER_M3
 from barsight.yard.axes import axes_of, turn_between
 from barsight.yard.types import Bundle
 from barsight.yard.weight import bundle_mass
 
-_INSIDE = 1.959964
 _COUNTS = ("free", "found", "claimed", "wrong", "said_count", "right_count")
 
 
@@ -158,7 +158,7 @@ def score_figures(scores: BundleErrors) -> dict[str, dict[str, float]]:
             "median": float(np.median(size) * unit),
             "p95": float(np.percentile(size, 95) * unit),
             "max": float(size.max() * unit),
-            "within_95_pct": float(100 * np.mean(size <= _INSIDE * sigma[known])),
+            "within_95_pct": float(100 * np.mean(size <= SIGMAS_95 * sigma[known])),
         }
     return out
 

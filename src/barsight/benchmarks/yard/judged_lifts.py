@@ -21,6 +21,7 @@ from barsight.benchmarks.lift_judge.judge import Judge, Target
 from barsight.benchmarks.lift_judge.magnet import JudgedMagnet
 from barsight.benchmarks.provenance import Provenance, provenance
 from barsight.benchmarks.yard.drawn_worlds import MappedWorld
+from barsight.core.linalg.robust import SIGMAS_95
 from barsight.simulation.worlds.yards import DrawnYard
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.assessment import assess_placement
@@ -29,7 +30,6 @@ from barsight.yard.lifting.targets import plan_lifts
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
 
-TWO_SIDED = 1.96
 SPREAD = (0.1, 0.012, math.radians(0.1))
 """Standard deviations, m, m, rad, of random placements from a bundle's centre: along, across, yaw."""
 
@@ -167,7 +167,7 @@ def bench_table(bench: JudgedBench) -> Table:
     reasons = Counter(reason.split(":")[0] for one in bad for reason in one.dangerous)
     low = [one.stated_pull_low_n <= one.true_pull_n for one in free]
     mass = [
-        abs(one.stated_mass_kg - one.true_mass_kg) <= TWO_SIDED * one.stated_sigma_kg
+        abs(one.stated_mass_kg - one.true_mass_kg) <= SIGMAS_95 * one.stated_sigma_kg
         for one in free if math.isfinite(one.stated_mass_kg)
     ]  # fmt: skip
     bad_yards, free_yards = (len({one.seed for one in part}) for part in (bad, free))

@@ -15,6 +15,7 @@ from rich.table import Table
 
 from barsight.benchmarks.provenance import Provenance
 from barsight.benchmarks.yard.bundle_scores import TrueBundle, read_true_bundles, score_bundles
+from barsight.core.linalg.robust import SIGMAS_95
 from barsight.core.pose import Pose
 from barsight.core.records.trajectory import PosedFrame, Trajectory
 from barsight.core.stamps import seconds_to_ns
@@ -25,7 +26,6 @@ from barsight.result_folder import read_summary
 from barsight.yard.inventory.bundle_file import read_bundles
 from barsight.yard.types import Bundle, DoubtKind
 
-TWO_SIDED = 1.959964
 UNSEEN = frozenset({
     DoubtKind.UNSEEN_FLANK, DoubtKind.HIDDEN_FLANK, DoubtKind.OVERLAP, DoubtKind.FAINT_LINE,
     DoubtKind.CROSSING_EDGE,
@@ -212,7 +212,7 @@ def _bundle_rows(kind: str, worlds: Sequence[WorldScore]) -> Iterable[WorldRow]:
         if not known.any():
             continue
         size = np.abs(errors[known]) * (np.degrees(1.0) if unit == "deg" else 1e3)
-        inside = np.abs(errors[known]) <= TWO_SIDED * sigmas[known]
+        inside = np.abs(errors[known]) <= SIGMAS_95 * sigmas[known]
         k = int(size.argmax())
         yield WorldRow(
             kind, f"bundles: {name}, {unit}", len(size), float(np.median(size)), float(size[k]),
@@ -286,7 +286,7 @@ def _poses(recording: Path, out: Path) -> dict[str, float]:
     sigmas = [sigma_of[stamp] for stamp in stamps]
     # One rigid motion: the mean rotation, and the mean shift that remains.
     aligned = error - error.mean(axis=0) - np.cross(turn.mean(axis=0), ground - ground.mean(axis=0))
-    inside = np.abs(error) <= TWO_SIDED * np.array(sigmas, np.float64)
+    inside = np.abs(error) <= SIGMAS_95 * np.array(sigmas, np.float64)
     return {
         "samples": float(error.size),
         "rmse_mm": 1e3 * rms(error),

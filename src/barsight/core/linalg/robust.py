@@ -10,6 +10,8 @@ from scipy import ndimage
 
 SIGMA_PER_MAD = 1.4826
 """Ratio of the sigma of normal errors to their median absolute deviation."""
+SIGMAS_95 = 1.96
+"""Half width of the interval that holds 95 % of normal errors, in sigmas."""
 CHI2_3_MEDIAN = 2.366
 """Median of chi2 with three degrees of freedom."""
 

@@ -10,11 +10,12 @@ import numpy as np
 import barsight
 from barsight.core.errors import Failed
 from barsight.core.json_values import json_value
+from barsight.core.linalg.robust import SIGMAS_95
 from barsight.core.records.trajectory import RigDrift
 from barsight.motion.rig_check.drift_check import RigCheck
 from barsight.motion.rig_check.epipolar_error import COLUMNS, ROWS, RowDrift
 from barsight.report.page import KeyFigure, format_number, write_summary_page
-from barsight.report.plots import BAND_SIGMAS, Plot, json_numbers
+from barsight.report.plots import Plot, json_numbers
 
 FARTHEST = 2.0
 """Largest range in the depth plot, as a multiple of the working range."""
@@ -85,7 +86,7 @@ def _rows_plot(rows: RowDrift, left: bool) -> Plot:
 def _depth_plot(drift: RigDrift, range_m: float) -> Plot:
     reach = np.linspace(0, FARTHEST * range_m, 60)
     cost = 1e3 * np.array([drift.depth_error_m(at) for at in reach])
-    band = BAND_SIGMAS * 1e3 * drift.yaw_sigma_rad * reach**2 / drift.baseline_m
+    band = SIGMAS_95 * 1e3 * drift.yaw_sigma_rad * reach**2 / drift.baseline_m
     x = json_numbers(np.concatenate([reach, reach[::-1]]), 3)
     y = json_numbers(np.concatenate([cost - band, (cost + band)[::-1]]), 3)
     traces: list[dict[str, Any]] = [
@@ -98,7 +99,7 @@ def _depth_plot(drift: RigDrift, range_m: float) -> Plot:
             "hoverinfo": "skip",
             "fillcolor": "--band",
             "line": {"width": 0},
-            "name": f"± {BAND_SIGMAS} sigma",
+            "name": f"± {SIGMAS_95} sigma",
         },
         {
             "type": "scatter",
