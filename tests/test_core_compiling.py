@@ -179,7 +179,7 @@ def only_the_last_few(monkeypatch: pytest.MonkeyPatch) -> list[Listed]:
     """Let few kernels be missing, those that compile fastest."""
     few = listed("measure")[-3:]
     monkeypatch.setattr(Listed, "missing", lambda self: self in few)
-    monkeypatch.setattr(ahead, "FEWEST_KERNELS", len(few))
+    monkeypatch.setattr(ahead, "MIN_KERNELS", len(few))
     monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", 2)
     return few
 

@@ -14,8 +14,9 @@ from barsight.calibration.boards.detection_files import read_detections
 from barsight.core.errors import ConfigError, Failed, InputError
 from barsight.core.parallel import ordered_map
 from barsight.core.records.pairs import RefusedFrame
+from barsight.recording.formats.bag_file import BAG_KINDS
 from barsight.recording.formats.image_pairs import ReadPair, find_pairs, read_pair_files
-from barsight.recording.open import BAG_KINDS, open_recording
+from barsight.recording.open import open_recording
 
 Size = tuple[int, int]
 

@@ -15,7 +15,7 @@ from barsight.mapping.agreement_intervals import agreement_intervals
 
 JUMP_M = 0.03
 """Minimum height difference (m) of neighbours that are on two surfaces: a step, not a slope."""
-_FURTHEST_M, _FEWEST_SHARED = 0.06, 50
+_FURTHEST_M, _MIN_SHARED = 0.06, 50
 """Maximum shift (m) of a profile along x, and minimum number of points that are compared at a shift."""
 
 
@@ -68,7 +68,7 @@ def profile_shift(contour: Contour, laser: LaserProfile) -> tuple[float, float]:
         for shift in centre + np.arange(-reach, reach + step / 2, step):
             error = profile_difference(contour, replace(laser, x_m=laser.x_m - shift))
             error = error[np.isfinite(error)]
-            if error.size < _FEWEST_SHARED:
+            if error.size < _MIN_SHARED:
                 continue
             above = -float(np.median(error))
             cost = float(np.median(np.abs(error + above)))

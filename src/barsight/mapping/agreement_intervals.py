@@ -12,7 +12,7 @@ from scipy.special import stdtrit
 from barsight.core.arrays import Bool, Float64
 from barsight.core.linalg.robust import SIGMAS_95
 
-FEWEST = 8
+MIN_SAMPLES = 8
 """Minimum number of samples for which confidence intervals are computed."""
 ROUNDS = 10
 MIN_ALONE = 1.5
@@ -56,7 +56,7 @@ def effective_samples(series: Float64) -> float:
     """
     known = np.isfinite(series)
     count = int(known.sum())
-    if count < FEWEST:
+    if count < MIN_SAMPLES:
         return float(count)
     centred = np.where(known, series - series[known].mean(), 0.0)
     if not centred.any():
@@ -90,7 +90,7 @@ def agreement_intervals(
     used = places & np.isfinite(difference_m)
     series = np.where(used, 1e3 * difference_m, np.nan)
     d, count = series[used], int(used.sum())
-    if count < FEWEST:
+    if count < MIN_SAMPLES:
         return AgreementIntervals(count, *[float("nan")] * 13)
     alone = effective_samples(series)
     bias, spread = float(d.mean()), float(d.std() / np.sqrt(1 - 1 / alone))

@@ -18,7 +18,7 @@ from barsight.core.records.gray_levels import TornImageError
 from barsight.core.records.heights import HeightSource
 from barsight.recording.image_decoding import MAX_PICTURE_BYTES, decode_with_colour
 
-LONGEST_PX, MAX_PIXELS = 2400, 3_000_000
+MAX_SIDE_PX, MAX_PIXELS = 2400, 3_000_000
 """Maximum length of a strip's longer side, and maximum size of a map's picture, in pixels."""
 MAX_STRIPS = 12
 FOLD_ASPECT = 7.0
@@ -110,7 +110,7 @@ def _reduce(file: GeoTiff) -> Raster:
 def _choose_step(width: int, height: int) -> int:
     strip = -(-width // strip_count(width, height))
     longest = max(strip, height)
-    return max(1, -(-longest // LONGEST_PX), int(np.ceil(np.sqrt(width * height / MAX_PIXELS))))
+    return max(1, -(-longest // MAX_SIDE_PX), int(np.ceil(np.sqrt(width * height / MAX_PIXELS))))
 
 
 def _pool(values: NDArray[np.generic], into: NDArray[np.generic], row: int, column: int, step: int) -> None:

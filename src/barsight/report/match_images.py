@@ -11,7 +11,7 @@ from barsight.motion.frontend.matching_example import MatchingExample
 from barsight.report.map_images import data_uri
 from barsight.report.plots import Picture
 
-LONGEST_PX = 1280
+MAX_SIDE_PX = 1280
 """Maximum length of a picture's longer side."""
 ZOOM, CROP_PX = 4, (200, 320)
 """Magnification of the enlarged picture, and the part that it shows: height and width."""
@@ -22,7 +22,7 @@ SHIFT = 4
 
 def draw_matches(example: MatchingExample) -> tuple[Picture, ...]:
     """Draw features, raw and filtered matches, guided matches in full and enlarged."""
-    scale = min(1.0, LONGEST_PX / max(example.old.shape))
+    scale = min(1.0, MAX_SIDE_PX / max(example.old.shape))
     wrong = ~example.filtered
     agreed, lost = example.agreed, ~example.agreed & np.isfinite(example.found).all(axis=1)
     source = "encoders and gyro" if example.by_sensors else "the pictures themselves"

@@ -23,7 +23,7 @@ from barsight.report.map_images import (
     robust_range,
 )
 
-WIDTH, TALLEST = 1000.0, 680.0
+WIDTH, MAX_HEIGHT = 1000.0, 680.0
 """Width of a drawing and maximum height of its map, in drawing units."""
 LARGE_TEXT, SMALL_MAP_TEXT = 13.0, 32.0
 """Font sizes in drawing units; the three smaller maps are shown at a third of the size."""
@@ -179,7 +179,7 @@ def draw_map(
     strips = cut_strips(picture, raster, lossless=lossless)
     widest = max(strip.x_max_m - strip.x_min_m for strip in strips)
     tall = raster.z_m.shape[0] * raster.cell_m
-    scale = min((WIDTH - 5.6 * text) / widest, TALLEST / tall)
+    scale = min((WIDTH - 5.6 * text) / widest, MAX_HEIGHT / tall)
     return tuple(_drawing(strip, scale, levels, text) for strip in strips)
 
 

@@ -81,7 +81,7 @@ def build_scene(stock: Stock, settings: SimulationSettings, rng: np.random.Gener
     for beam in stock.beams:
         boxes.append(_beam_shape(beam))
         box_materials.append(plain_material(rng.uniform(0.3, 0.42), 0.0, rng))
-    shape = np.array([np.resize(np.append(s, np.zeros(15 - len(s))), 15) for s in cylinders + boxes])
+    shape = np.array([np.pad(row, (0, 15 - len(row))) for row in cylinders + boxes])
     material = np.array(cylinder_materials + box_materials, dtype=np.float32)
     primitives = Primitives(shape.reshape(-1, 15), material.reshape(-1, 10), len(cylinders))
     thickest = max(kind.diameter_m for kind in settings.kinds)

@@ -12,7 +12,7 @@ from barsight.core.records.pairs import RectifiedPair
 
 _VISIBLE_STEP = 4
 _MIN_RATIO = 1e-3
-_FEWEST_ROWS = 3
+_MIN_ROWS = 3
 _MAX_BEND_GRAY = 8 * 255
 
 
@@ -21,7 +21,7 @@ def has_texture(pair: RectifiedPair) -> bool:
     the pixel two columns away: black, burnt-out and uniformly gray images have no texture, nor have images
     of fewer than 3 rows.
     """
-    if pair.left.shape[0] < _FEWEST_ROWS:
+    if pair.left.shape[0] < _MIN_ROWS:
         return False
     return _is_textured(pair.left, pair.left_valid) and _is_textured(pair.right, pair.right_valid)
 
@@ -56,7 +56,7 @@ def _median_bend(image: UInt8 | Float32) -> float:
     """Compute the median of the sizes of second differences along rows and columns, at every third of both;
     those of whole gray levels are counted, not sorted.
     """
-    if image.dtype != np.uint8 or min(image.shape) < _FEWEST_ROWS:
+    if image.dtype != np.uint8 or min(image.shape) < _MIN_ROWS:
         return float(np.median(np.abs(_bends(_bends(image).T))))
     sizes = np.zeros(_MAX_BEND_GRAY + 1, dtype=np.int64)
     _count_bends(cast(UInt8, image), sizes)

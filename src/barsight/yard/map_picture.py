@@ -9,7 +9,8 @@ import numpy as np
 
 from barsight.core.arrays import Float32, Float64
 
-_WIDEST_PX = 900
+_MAX_SIDE_PX = 900
+"""Maximum length of the picture's longer side."""
 
 
 def picture_html(x_m: Float64, y_m: Float64, z_m: Float32) -> str:
@@ -23,7 +24,7 @@ def picture_html(x_m: Float64, y_m: Float64, z_m: Float32) -> str:
     levels = np.where(known, (z_m - low) / max(high - low, 1e-6) * 255, 0).clip(0, 255)
     colours = cv2.applyColorMap(levels.astype(np.uint8), cv2.COLORMAP_VIRIDIS)
     colours[~known] = 255
-    scale = min(1.0, _WIDEST_PX / max(z_m.shape))
+    scale = min(1.0, _MAX_SIDE_PX / max(z_m.shape))
     small = cv2.resize(colours[::-1], None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     data = b64encode(cv2.imencode(".png", small)[1].tobytes()).decode()
     return (

@@ -22,7 +22,7 @@ from barsight.core.records.pairs import RectifiedCamera, RectifiedPair
 _MIN_REACH_PX = 4.0
 _REACH_RADII = 0.4
 _INSIDE_RATIO = 0.7
-_FEWEST_PIXELS = 200
+_MIN_PIXELS = 200
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +136,7 @@ def _distance(
     front = rays @ towards
     aside = np.sqrt((length**2 - front**2).clip(0, None)) / length
     inner = aside < _INSIDE_RATIO * sine
-    if inner.sum() < _FEWEST_PIXELS:
+    if inner.sum() < _MIN_PIXELS:
         return None
     shift = disparity.disparity_px[rows, columns][inner] + camera.doffs_px
     sigma = disparity.sigma_px[rows, columns][inner] / shift

@@ -23,11 +23,11 @@ from barsight.core.records.disparity import Disparity
 from barsight.core.records.pairs import RectifiedCamera
 
 _ROUNDS = 3
-_FEWEST_PIXELS = 200
+_MIN_PIXELS = 200
 _REACH_RADII = 2.0
 _CLEAR_RADII = 1.6
 _CAUCHY_SIGMAS = 2.4
-_LARGEST_PRODUCT = 1e100
+_MAX_PRODUCT = 1e100
 
 
 class BarPixels(NamedTuple):
@@ -73,7 +73,7 @@ def fit_bar(disparity: Disparity, camera: RectifiedCamera, guess: BarGuess) -> B
     if floor is None:
         return Failed("no-floor", "too few pixels of the floor have a disparity")
     rows, columns = np.nonzero(near & known)
-    if rows.size < _FEWEST_PIXELS:
+    if rows.size < _MIN_PIXELS:
         return Failed("no-bar", f"only {rows.size} pixels near the bar have a disparity")
     rays = np.column_stack([(columns - camera.cx_px), (rows - camera.cy_px)]) / camera.focal_px
     behind = floor[0] * columns + floor[1] * rows + floor[2]
@@ -111,7 +111,7 @@ def _beside_the_axis(camera: RectifiedCamera, guess: BarGuess) -> Float64:
 def _fit_floor(disparity: Disparity, where: Bool) -> Float64 | None:
     """Fit the floor's disparity (3,), a * column + b * row + c, robustly; None for too few pixels."""
     rows, columns = np.nonzero(where)
-    if rows.size < _FEWEST_PIXELS:
+    if rows.size < _MIN_PIXELS:
         return None
     design = np.column_stack([columns, rows, np.ones(rows.size)]).astype(np.float64)
     values = disparity.disparity_px[rows, columns].astype(np.float64)
@@ -194,7 +194,7 @@ def _cauchy(centre: Float64, axis: Float64, radius: float, pixels: BarPixels, we
         away = _residual(centre, axis, radius, pixels, index) * weight[index]
         product *= 1 + away * away
         # One logarithm for many factors, because logarithms dominate the run time.
-        if product > _LARGEST_PRODUCT:
+        if product > _MAX_PRODUCT:
             total += math.log(product)
             product = 1.0
     return float((total + math.log(product)) / len(weight))

@@ -21,7 +21,7 @@ from barsight.core.errors import Failed
 _STRETCH_PX = 16
 _LENS_SIGMA_PX = 0.45
 _FINE_PX = 0.02
-_FEWEST_STRETCHES = 6
+_MIN_STRETCHES = 6
 _PARTS = 5
 
 
@@ -49,7 +49,7 @@ def find_outline(image: UInt8, line: Float64, radius_px: float, search: OutlineS
     image.
     """
     stretches = _stretches(image, line, radius_px, search)
-    if len(stretches.place_px) < _FEWEST_STRETCHES:
+    if len(stretches.place_px) < _MIN_STRETCHES:
         return Failed(
             "no-outline", f"only {len(stretches.place_px)} stretches of an outline lie in the image"
         )

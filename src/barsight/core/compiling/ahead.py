@@ -16,7 +16,7 @@ MAX_PROCESSES = 4
 """Maximum number of compiling processes. Each takes half a gigabyte, and the more there are, the more of them
 compile the same functions.
 """
-FEWEST_KERNELS = 8
+MIN_KERNELS = 8
 """Minimum number of kernels for which starting processes pays."""
 _PLACE_BYTES = 4
 
@@ -31,7 +31,7 @@ def compile_ahead(advance: Callable[[str, int, int], None], *groups: str) -> Non
     if cores < 2 or numba.config.DISABLE_JIT or not sys.executable:
         return
     missing = [place for place, one in enumerate(listed(*groups)) if one.missing()]
-    if len(missing) < FEWEST_KERNELS:
+    if len(missing) < MIN_KERNELS:
         return
     read_place, write_place = os.pipe()
     read_done, write_done = os.pipe()

@@ -17,7 +17,8 @@ REACH_CELLS = 15
 """Distance, in cells, up to which a cell's bars depend on its surroundings: twice the widest pitch, or the
 corner of a stripe window.
 """
-_WIDEST_CELLS, _WIDEST_PX = 7.0, 10.0
+_MAX_PITCH_CELLS, _MAX_PITCH_PX = 7.0, 10.0
+"""Maximum distance between bars whose profile is drawn, in cells and in pixels."""
 _BLUR_PX = 1.5
 """Blur of the heights across the bar by matching's support, 1 sigma."""
 _PLACE_RATIO, _LINE_RATIO, _UNSEEN_RATIO, _SHOWN_MARGIN = 0.05, 0.25, 0.15, 0.6
@@ -109,14 +110,14 @@ def _draw(
             ways = np.cos(turn), -np.sin(turn), step_m
             shown = np.exp(-2 * (np.pi * _BLUR_PX * pixel_cells[i, j] / pitch) ** 2)
             hidden[i, j] = _ROUND * (1 - shown) * pitch * cell_m
-            if pitch > _WIDEST_CELLS:
+            if pitch > _MAX_PITCH_CELLS:
                 continue
             rise_m, off_m = _line(z, i, j, ways, pitch, _UNSEEN_RATIO * pitch * cell_m)
             if off_m > 0:
                 hidden[i, j] = np.hypot(hidden[i, j], (1 - shown) * off_m / 2)
             if (
                 not draws
-                or pitch > _WIDEST_PX * pixel_cells[i, j]
+                or pitch > _MAX_PITCH_PX * pixel_cells[i, j]
                 or not off_m <= _LINE_RATIO * pitch * cell_m
             ):
                 continue

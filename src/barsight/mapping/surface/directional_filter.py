@@ -19,7 +19,8 @@ from barsight.mapping.surface.bar_directions import (
 
 VOTE_CELLS = 9
 _STEP_M = 0.03
-_WIDEST_CELLS = np.float32(1.5)
+_MAX_BLUR_CELLS = np.float32(1.5)
+"""Maximum blur that is undone in full."""
 _BLUR_CELLS, _BLUR_RATIO, _VALLEY_RATIO = 11, 2.0, 4.5
 _VALLEY_CELLS = 6
 _RAMP_PX, _RAMP_RATIO, _RIM_PX, _RIM_RATIO = 3.0, 0.5, 1.0, 0.5
@@ -89,11 +90,11 @@ def deblur_across(z: Float32, direction: Int8, blur_cells: Float32) -> Float32:
 
     direction: (H, W) the bar's own, of `smooth_along_bars`, which also returned the heights z. A cell stays
     as it is where a neighbour is missing or more than 30 mm higher or lower, which is a step and not a
-    curvature. A blur wider than `_WIDEST_CELLS` is undone only in part, since the noise would grow more than
-    the bars gain.
+    curvature. A blur above `_MAX_BLUR_CELLS` is undone only in part, since the noise would grow more than the
+    bars gain.
     """
     rows, columns = np.rint(_across()).astype(np.int64)
-    return _sharpened(z, direction, np.minimum(blur_cells, _WIDEST_CELLS) ** 2, rows, columns)
+    return _sharpened(z, direction, np.minimum(blur_cells, _MAX_BLUR_CELLS) ** 2, rows, columns)
 
 
 def valley_mask(z: Float32, direction: Int8) -> Bool:

@@ -24,10 +24,14 @@ MIN_ALIKE_RATIO = 0.7
 """Minimum share of a profile's points that lie on the map's surface, there or within two samples along x."""
 MAX_SLOPE = 2.0
 """Maximum slope of places used to fit the offset."""
-_STRETCH_POINTS, _FEWEST, _FEWEST_STRETCHES = 50, 100, 3
+_STRETCH_POINTS, _MIN_SAMPLES, _MIN_STRETCHES = 50, 100, 3
+"""Number of points of a stretch; minimum numbers of measured points and of stretches for an offset."""
 _SHORT_POINTS, _CAP_M = 25, 0.03
+"""Number of points of a stretch whose mean difference is compared; maximum difference that counts."""
 _REACH = 2
+"""Number of samples along x by which a point may lie off the map's surface."""
 _ROUNDS, _TUKEY = 15, 4.685
+"""Rounds of the robust fit; deviation in sigmas from which a point has no weight."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +85,7 @@ def check_laser(contour: Contour, laser: LaserProfile, settings: MapSettings) ->
     """
     known = np.isfinite(profile_difference(contour, laser))
     samples = int(known.sum())
-    offset = _offset(contour, laser, settings) if samples >= _FEWEST else None
+    offset = _offset(contour, laser, settings) if samples >= _MIN_SAMPLES else None
     if offset is None:
         reason = f"vision has {samples} of its {known.size} points, too few on smooth places to tell"
         return LaserCheck(laser.profile, samples, None, reason)
@@ -105,7 +109,7 @@ def _sideways(contour: Contour, laser: LaserProfile, off_m: float) -> str:
     for move in (off_m, -off_m):
         gain = _costs(contour, replace(laser, x_m=laser.x_m + move)) - _costs(contour, laser)
         gain = gain[np.isfinite(gain)]
-        if gain.size < _FEWEST_STRETCHES or not gain.any():
+        if gain.size < _MIN_STRETCHES or not gain.any():
             better, worse = 1.0, 1.0
         else:
             better, worse = (float(wilcoxon(gain, alternative=side).pvalue) for side in ("less", "greater"))
@@ -142,7 +146,7 @@ def _offset(contour: Contour, laser: LaserProfile, settings: MapSettings) -> Las
     used = np.isfinite(above) & smooth_places(laser.z_m) & (np.abs(slope) <= MAX_SLOPE)
     stretch = (np.arange(above.size) // _STRETCH_POINTS)[used]
     numbers = np.unique(stretch)
-    if numbers.size < _FEWEST_STRETCHES:
+    if numbers.size < _MIN_STRETCHES:
         return None
     design, above = np.stack([-slope[used], np.ones(used.sum())], axis=1), above[used]
     fit = _robust_fit(design, above)

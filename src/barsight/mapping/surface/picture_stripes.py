@@ -16,7 +16,7 @@ STEP_CELLS = 1.4
 _ACROSS_CELLS, _ALONG_CELLS, _TAPER_CELLS = 6, 6, 1.5
 _PITCHES = np.float32(2.4) * np.float32(1.06) ** np.arange(24, dtype=np.float32)
 _MIN_EXPLAINED, _MIN_CONTRAST, _MIN_SPREAD = 0.6, 0.12, 0.06
-_FEWEST_CELLS, _MIN_INDEPENDENCE = 2.5, 0.04
+_MIN_CELLS, _MIN_INDEPENDENCE = 2.5, 0.04
 
 
 class Stripes(NamedTuple):
@@ -97,7 +97,7 @@ def _fit_stripes(
             if d < 0:
                 continue
             total = _read_across(z, gray, i, j, d, step_m, window, along, level, weight)
-            if total < _FEWEST_CELLS:
+            if total < _MIN_CELLS:
                 continue
             mean, power = np.float32(0), np.float32(0)
             for k in range(count):

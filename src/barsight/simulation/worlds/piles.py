@@ -23,7 +23,7 @@ BARS = (3, 200)
 BEAMS_M = (0.05, 0.09, 0.14)
 BOW = 0.002
 """Standard deviation of the bow relative to the length, if there is room for it."""
-SHORTEST, SHORTEST_ORDERLY = 0.8, 0.98
+MIN_LENGTH_RATIO, MIN_ORDERLY_LENGTH_RATIO = 0.8, 0.98
 """Minimum length of a bundle relative to the pile's bar length: in general, and in an orderly pile."""
 RINGS = (1, 2, 3, 4)
 """Possible numbers of rings of the full hexagons in an orderly pile."""
@@ -160,7 +160,7 @@ def _layers(
         if not hanging:
             return
         settled = settle(hanging, [one.pack for one in pile.lying], [*sides, *boxes])
-        shortest = SHORTEST_ORDERLY if is_orderly else SHORTEST
+        shortest = MIN_ORDERLY_LENGTH_RATIO if is_orderly else MIN_LENGTH_RATIO
         laid = [_laid(pack, layer, length, rng, shortest) for pack in settled]
         pile.lying += _slackened(laid, reach, rng)
         extents = np.array([pack.extent for pack in settled])
@@ -168,7 +168,7 @@ def _layers(
 
 
 def _laid(
-    pack: BarPack, layer: int, length: float, rng: np.random.Generator, shortest: float = SHORTEST
+    pack: BarPack, layer: int, length: float, rng: np.random.Generator, shortest: float = MIN_LENGTH_RATIO
 ) -> Lying:
     own = float(rng.uniform(shortest, 1.0)) * length
     uneven = float(rng.choice([0.005, 0.02, 0.2], p=[0.3, 0.55, 0.15]))
@@ -222,7 +222,7 @@ def _bear(
     low, high = reach[0] - 0.09, reach[1] + 0.09
     wedge = (0.06, max(0.05, 0.6 * height))
     for share in np.linspace(-0.35, 0.35, int(rng.choice([2, 3, 4]))):
-        y = float(share) * length * SHORTEST + float(rng.normal(0, 0.04))
+        y = float(share) * length * MIN_LENGTH_RATIO + float(rng.normal(0, 0.04))
         over = float(rng.uniform(0, 0.2)) if pile.upright == "wedges" else -0.09
         ends = (low - over, high + over)
         wide = float(rng.uniform(0.8, 1.4)) * height

@@ -48,7 +48,7 @@ from barsight.stereo.baselines.postprocessing import (
 from barsight.stereo.baselines.spanning_tree import spanning_tree, tree_filter
 from barsight.stereo.baselines.winner_takes_all import Winners, sweep
 
-_FEWEST_CANDIDATES = 5
+_MIN_CANDIDATES = 5
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ def _pyramid(pair: RectifiedPair, candidates: DisparityRange, scales: int) -> li
     while len(pyramid) < scales:
         held = pyramid[-1].candidates
         coarser = DisparityRange(held.lowest_px // 2, held.highest_px // 2 + 1)
-        if coarser.count < _FEWEST_CANDIDATES or min(images.left.shape) < 2:
+        if coarser.count < _MIN_CANDIDATES or min(images.left.shape) < 2:
             break
         masks = [np.ascontiguousarray(mask[::2, ::2]) for mask in (images.left_valid, images.right_valid)]
         images = cost_images(cv2.pyrDown(images.left), cv2.pyrDown(images.right), *masks)

@@ -25,7 +25,7 @@ from barsight.stereo.sgbm import Sgbm, SgbmSettings
 
 _SETTLED_RATIO = 0.95
 """Share of pixels that have settled when the loop ends."""
-_NARROWEST_PX = 16  # OpenCV rounds the number of candidates up to a multiple of this.
+_MIN_WIDTH_PX = 16  # OpenCV rounds the number of candidates up to a multiple of this.
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Paper:
     def __call__(self, pair: RectifiedPair, candidates: DisparityRange) -> Disparity:
         """Match; see `StereoMethod`. Without `output.fill`, pixels without an initial disparity are NaN."""
         settings = self.settings
-        too_narrow = pair.left.shape[1] + min(candidates.lowest_px, 0) <= _NARROWEST_PX
+        too_narrow = pair.left.shape[1] + min(candidates.lowest_px, 0) <= _MIN_WIDTH_PX
         if too_narrow or not is_matchable(pair, candidates):
             return no_match(pair)
         start: Sgbm | Census = Sgbm(settings.sgbm) if settings.initial == "sgbm" else Census(settings.census)

@@ -60,7 +60,7 @@ _HALF_ACROSS = 0.75
 """Ratio of the long support's width at half size, in half-size pixels, to that at full size."""
 _HALF_HOLD = 4
 """Weight of the hold at half size relative to full size, where a pixel stands for four."""
-_LONGEST_HALF_STEP_PX = 0.4
+_MAX_HALF_STEP_PX = 0.4
 """Maximum step at half size, in half-size pixels; longer ones move pixels beside depth edges to the other
 side.
 """
@@ -185,7 +185,7 @@ def refine_at_half_size(
     for _ in range(steps):
         work.pulls(small_left, small_right, _BLUR_PX, slope_noise, is_last=False)
         fitted, _ = work.planes([SupportShape(half.along_px, half.across_px, _HALF_STEP_PX)])[0]
-        step = np.clip(fitted - now, -_LONGEST_HALF_STEP_PX, _LONGEST_HALF_STEP_PX)
+        step = np.clip(fitted - now, -_MAX_HALF_STEP_PX, _MAX_HALF_STEP_PX)
         now += step
         moved += step
     return upsample_update(started, moved, start, settings.same_surface_px)
