@@ -136,9 +136,9 @@ def compared(
 @pytest.mark.parametrize("phi", [0.0, 0.8])
 def test_the_bias_lies_in_its_interval_though_neighbours_repeat_each_other(phi: float) -> None:
     drawn = [compared(np.random.default_rng((7, k)), phi, 1.0) for k in range(200)]
-    held = np.mean([a.bias_low_mm <= 1.0 <= a.bias_high_mm for a in drawn])
+    held = np.mean([a.smooth_bias_low_mm <= 1.0 <= a.smooth_bias_high_mm for a in drawn])
     assert 0.90 <= held <= 0.985
-    independent = drawn[0].samples * (1 - phi) / (1 + phi)
+    independent = drawn[0].smooth_samples * (1 - phi) / (1 + phi)
     assert np.median([a.effective_samples for a in drawn]) == pytest.approx(independent, rel=0.15)
 
 
@@ -149,7 +149,7 @@ def test_few_independent_samples_are_not_told_to_be_more() -> None:
     ones = np.ones(200)
     found = [agreement_intervals(row, ones, 2e-3 * ones, np.nan, ones > 0) for row in rows]
     assert np.median([one.effective_samples for one in found]) < 9
-    assert np.mean([one.bias_low_mm < 0 < one.bias_high_mm for one in found]) > 0.86
+    assert np.mean([one.smooth_bias_low_mm < 0 < one.smooth_bias_high_mm for one in found]) > 0.86
 
 
 def test_a_bias_that_grows_with_height_is_found() -> None:
@@ -169,7 +169,7 @@ def test_means_are_called_equivalent_wrongly_in_one_case_of_twenty() -> None:
 def test_the_lasers_sigma_is_taken_off_and_counted_in() -> None:
     """Differences of 2 mm, a laser of 1 mm, vision stated to 2 mm."""
     drawn = [compared(np.random.default_rng((10, k)), 0.0, 0.0) for k in range(20)]
-    assert np.mean([a.other_sd_mm for a in drawn]) == pytest.approx(np.sqrt(3), rel=0.03)
+    assert np.mean([a.vision_sd_mm for a in drawn]) == pytest.approx(np.sqrt(3), rel=0.03)
     inside = 100 * (2 * norm.cdf(1.96 * np.sqrt(5) / 2) - 1)
     assert np.mean([a.within_95_pct for a in drawn]) == pytest.approx(inside, abs=0.7)
 

@@ -99,7 +99,7 @@ def compute_agreement(
     size = np.abs(compared)
     level = smooth_places(laser.z_m)
     smooth = np.abs(error[np.isfinite(error) & level]) * 1e3
-    sure = agreement_intervals(
+    intervals = agreement_intervals(
         error, laser.z_m, _at_laser(contour, contour.sigma_m, laser), laser.range_std_m, level
     )
     x_shift, z_shift = profile_shift(contour, laser)
@@ -120,18 +120,5 @@ def compute_agreement(
         x_shift_mm=1e3 * x_shift,
         z_shift_mm=1e3 * z_shift,
         time_shift_s=x_shift / speed_mps if speed_mps else float("nan"),
-        smooth_samples=sure.samples,
-        effective_samples=sure.effective_samples,
-        smooth_bias_mm=sure.bias_mm,
-        smooth_bias_low_mm=sure.bias_low_mm,
-        smooth_bias_high_mm=sure.bias_high_mm,
-        smooth_loa_low_mm=sure.loa_low_mm,
-        smooth_loa_high_mm=sure.loa_high_mm,
-        smooth_loa_half_mm=sure.loa_half_mm,
-        slope_mm_per_m=sure.slope_mm_per_m,
-        slope_low_mm_per_m=sure.slope_low_mm_per_m,
-        slope_high_mm_per_m=sure.slope_high_mm_per_m,
-        equivalence_mm=sure.equivalence_mm,
-        vision_sd_mm=sure.other_sd_mm,
-        within_95_pct=sure.within_95_pct,
+        **vars(intervals),
     )

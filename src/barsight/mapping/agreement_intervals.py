@@ -1,5 +1,5 @@
-"""Estimate the confidence intervals of an agreement: samples along a profile are autocorrelated, so fewer
-of them count as independent.
+"""Estimate the confidence intervals of an agreement at smooth places: samples along a profile are
+autocorrelated, so fewer of them count as independent.
 """
 
 from __future__ import annotations
@@ -22,28 +22,28 @@ MIN_ALONE = 1.5
 @dataclass(frozen=True)
 class AgreementIntervals:
     """95 % confidence intervals of a bias (mm), its limits of agreement and its slope over height (mm/m); NaN
-    where there are too few samples.
+    where there are too few samples. Named as in `Agreement`.
 
     effective_samples: number of independent samples that would estimate the mean equally well [Bayley 1946].
-    loa_low, loa_high: limits of agreement, each uncertain by ± loa_half [Bland 1999]. equivalence_mm: the
-    smallest margin for which two one-sided tests at 5 % find the means equivalent [Schuirmann 1987].
-    other_sd_mm: standard deviation that the reference's own sigma doesn't explain. within_95_pct: percentage
-    of differences inside the 95 % interval that both sigmas predict.
+    smooth_loa_low, smooth_loa_high: limits of agreement, each uncertain by ± smooth_loa_half [Bland 1999].
+    equivalence_mm: the smallest margin for which two one-sided tests at 5 % find the means equivalent
+    [Schuirmann 1987]. vision_sd_mm: standard deviation that the reference's own sigma doesn't explain.
+    within_95_pct: percentage of differences inside the 95 % interval that both sigmas predict.
     """
 
-    samples: int
+    smooth_samples: int
     effective_samples: float
-    bias_mm: float
-    bias_low_mm: float
-    bias_high_mm: float
-    loa_low_mm: float
-    loa_high_mm: float
-    loa_half_mm: float
+    smooth_bias_mm: float
+    smooth_bias_low_mm: float
+    smooth_bias_high_mm: float
+    smooth_loa_low_mm: float
+    smooth_loa_high_mm: float
+    smooth_loa_half_mm: float
     slope_mm_per_m: float
     slope_low_mm_per_m: float
     slope_high_mm_per_m: float
     equivalence_mm: float
-    other_sd_mm: float
+    vision_sd_mm: float
     within_95_pct: float
 
 

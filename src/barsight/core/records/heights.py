@@ -50,12 +50,8 @@ class Agreement:
     x_shift_mm, z_shift_mm: how far the laser's profile lies along x and above where it fits best (NaN where
     too little is in common); time_shift_s: the delay of its clock that explains x_shift at the travel's
     speed. They are reported only: no other figure is corrected by them.
-    The last ones are of smooth places, with intervals of 95 % that know how neighbours repeat each other:
-    effective_samples, as many as there are independent ones; smooth_bias and its low and high; the limits of
-    agreement there, each known to ± smooth_loa_half; slope, the bias that grows with height, mm per m;
-    equivalence, the least margin for which two one-sided tests of 5 % call both means equivalent; vision_sd,
-    the spread that the laser's own sigma doesn't explain; within_95_pct, the share of differences inside what
-    both sigmas state. NaN under eight samples.
+    From smooth_samples on: of smooth places, with 95 % intervals that account for autocorrelation, see
+    `AgreementIntervals`. NaN under eight samples.
     """
 
     profile: int
