@@ -11,7 +11,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from barsight.core.errors import InputError, OutputError
+from barsight.core.errors import MEASURE_AGAIN, InputError, OutputError
 from barsight.core.files import atomic_directory
 from barsight.core.records.heights import Contour
 from barsight.report.files.result_files import RESULT_FILES
@@ -101,7 +101,7 @@ class Yard:
         """Return the body's poses. Raises InputError if the folder has none."""
         path = read_path(self.folder)
         if path is None:
-            raise InputError(self.folder, "has no trajectory.tum", "measure the recording again")
+            raise InputError(self.folder, "has no trajectory.tum", MEASURE_AGAIN)
         return path
 
     @cached_property

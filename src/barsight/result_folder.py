@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from barsight.core.arrays import Float32, Float64, Int64, rows_by_number
-from barsight.core.errors import InputError
+from barsight.core.errors import MEASURE_AGAIN, InputError
 from barsight.core.json_values import json_digest
 from barsight.core.reading.bounded_reading import (
     MAX_PICTURES,
@@ -23,7 +23,7 @@ from barsight.core.reading.bounded_reading import (
     read_json,
     read_lines,
 )
-from barsight.core.reading.geotiff import HEIGHT_BANDS, REMEDY, open_geotiff
+from barsight.core.reading.geotiff import HEIGHT_BANDS, open_geotiff
 from barsight.core.reading.json_schema import expect_schema, package_schema
 from barsight.core.reading.ply import read_vertices
 from barsight.core.reading.sealed_json import SEAL
@@ -79,8 +79,8 @@ def read_summary(folder: Path) -> dict[str, Any]:
         raise InputError(folder, "no such folder", remedy)
     if not path.is_file():
         raise InputError(folder, "has no result.json", remedy)
-    summary = read_json(path, REMEDY)
-    expect_schema(summary, package_schema("barsight.yard", "result"), path, REMEDY)
+    summary = read_json(path, MEASURE_AGAIN)
+    expect_schema(summary, package_schema("barsight.yard", "result"), path, MEASURE_AGAIN)
     found: dict[str, Any] = summary
     return found
 
@@ -123,11 +123,11 @@ def open_folder(
     bundles, chosen = folder / "bundles.json", folder / "lifts.json"
     if "map_id" not in summary:
         if bundles.is_file() or chosen.is_file():
-            raise InputError(path, "has no map_id: an earlier version wrote it", REMEDY)
+            raise InputError(path, "has no map_id: an earlier version wrote it", MEASURE_AGAIN)
         return summary, None
     identity = identify_map(summary)
     if identity.map_id != summary["map_id"]:
-        raise InputError(path, "was changed after it was written", REMEDY)
+        raise InputError(path, "was changed after it was written", MEASURE_AGAIN)
     for name in SEALED:
         file, digest = folder / name, (summary.get("files") or {}).get(name)
         if not file.is_file() or (name == "cloud.ply" and not cloud):
@@ -135,13 +135,13 @@ def open_folder(
         if digest is None and name == PHOTO:
             continue
         if digest is None:
-            raise InputError(path, f"has no digest of {name}: an earlier version wrote it", REMEDY)
+            raise InputError(path, f"has no digest of {name}: an earlier version wrote it", MEASURE_AGAIN)
         _expect_form(file)
         if file_digest(file) != digest:
-            raise InputError(file, "is not the one that result.json was written with", REMEDY)
+            raise InputError(file, "is not the one that result.json was written with", MEASURE_AGAIN)
     if bundles.is_file():
         found = bundle_file.bundles_content(bundles)
-        identity.expect(bundles, found, REMEDY)
+        identity.expect(bundles, found, MEASURE_AGAIN)
         if lifts and chosen.is_file():
             content = read_lifts(chosen)
             identity.expect(chosen, content, lift_file.REMEDY)
@@ -153,7 +153,7 @@ def open_folder(
 def _expect_form(file: Path) -> None:
     """Refuse, by its header, a file that would take long to digest and is no map, cloud or table."""
     if file.name in TABLES:
-        expect_lines(file, remedy=REMEDY)
+        expect_lines(file, remedy=MEASURE_AGAIN)
     elif file.suffix == ".tif":
         with open_geotiff(file, HEIGHT_BANDS if file.name == "height.tif" else 1):
             pass
@@ -199,7 +199,7 @@ def read_heights(folder: Path) -> PartedMap:
     names = ("height.tif", "ortho.tif", "free.tif", "tops.tif", "passes.tif")
     path, photo, free, tops, passes = (folder / name for name in names)
     if not path.is_file():
-        raise InputError(folder, "has no height.tif", REMEDY)
+        raise InputError(folder, "has no height.tif", MEASURE_AGAIN)
     with open_geotiff(path, HEIGHT_BANDS) as file:
         size, cell_m = file.size, file.cell_m
         x0_m, y0_m = file.left_m + cell_m / 2, file.top_m - (size[0] - 0.5) * cell_m
@@ -207,7 +207,7 @@ def read_heights(folder: Path) -> PartedMap:
         if other.is_file():
             with open_geotiff(other) as file:
                 if file.size != size or file.page.dtype != dtype:
-                    raise InputError(other, "doesn't fit height.tif", REMEDY)
+                    raise InputError(other, "doesn't fit height.tif", MEASURE_AGAIN)
 
     def layer(path: Path, rows: slice, columns: slice) -> NDArray[Any] | None:
         if not path.is_file():
@@ -233,7 +233,7 @@ def read_path(folder: Path) -> CameraPath | None:
         return None
     stamps: list[int] = []
     numbers: list[list[float]] = []
-    for count, line in enumerate(read_lines(path, MAX_PICTURES, REMEDY), start=1):
+    for count, line in enumerate(read_lines(path, MAX_PICTURES, MEASURE_AGAIN), start=1):
         fields = line.split()
         if not fields or fields[0].startswith("#"):
             continue
@@ -241,15 +241,15 @@ def read_path(folder: Path) -> CameraPath | None:
             stamps.append(parse_seconds(fields[0]))
             numbers.append([float(field) for field in fields[1:]])
         except ValueError as error:
-            raise InputError(path, f"line {count} is not TUM ({error})", REMEDY) from error
+            raise InputError(path, f"line {count} is not TUM ({error})", MEASURE_AGAIN) from error
         if len(numbers[-1]) != 7:
-            raise InputError(path, f"line {count} has {len(fields)} numbers instead of 8", REMEDY)
+            raise InputError(path, f"line {count} has {len(fields)} numbers instead of 8", MEASURE_AGAIN)
     table = np.array(numbers, dtype=np.float64).reshape(-1, 7)
     far = ~in_range(table).all(axis=1)
     loose = ~(np.abs(np.linalg.norm(table[:, 3:], axis=1) - 1) <= 0.01)
     for wrong, says in ((far, "its numbers are out of range"), (loose, "its quaternion has not length 1")):
         if wrong.any():
-            raise InputError(path, f"pose {int(np.argmax(wrong)) + 1}: {says}", REMEDY)
+            raise InputError(path, f"pose {int(np.argmax(wrong)) + 1}: {says}", MEASURE_AGAIN)
     return CameraPath(np.array(stamps, dtype=np.int64), table[:, :3], table[:, 3:])
 
 
@@ -259,16 +259,16 @@ def read_cloud(path: Path, max_points: int | None = None) -> Cloud:
     Raises InputError if the file is missing, damaged or empty or lacks one of PROPERTIES.
     """
     if not path.is_file():
-        raise InputError(path, "no such file", REMEDY)
+        raise InputError(path, "no such file", MEASURE_AGAIN)
     try:
         data = read_vertices(path)
     except (ValueError, OSError) as error:
-        raise InputError(path, f"is damaged ({error})", REMEDY) from error
+        raise InputError(path, f"is damaged ({error})", MEASURE_AGAIN) from error
     missing = [name for name in PROPERTIES if name not in (data.dtype.names or ())]
     if missing:
-        raise InputError(path, f"has no property {missing[0]}", REMEDY)
+        raise InputError(path, f"has no property {missing[0]}", MEASURE_AGAIN)
     if data.size == 0:
-        raise InputError(path, "has no points", REMEDY)
+        raise InputError(path, "has no points", MEASURE_AGAIN)
     count = int(data.size) if max_points is None else min(int(data.size), max_points)
     drawn = data[np.arange(count) * data.size // count]
     column = {name: np.asarray(drawn[name], dtype=np.float32) for name in PROPERTIES}
@@ -308,7 +308,7 @@ def read_laser(folder: Path) -> tuple[LaserProfile, ...]:
 def _by_profile(path: Path, table: Float64) -> dict[int, Float64]:
     found = rows_by_number(table[:, 0])
     if len(found) > MAX_PROFILES:
-        raise InputError(path, f"holds {len(found)} profiles, at most {MAX_PROFILES} are read", REMEDY)
+        raise InputError(path, f"holds {len(found)} profiles, at most {MAX_PROFILES} are read", MEASURE_AGAIN)
     return {number: table[rows] for number, rows in found.items()}
 
 
@@ -319,16 +319,16 @@ def _read_table(path: Path, known: int, *columns: int) -> Float64:
     """
     if not path.is_file():
         return np.empty((0, columns[0]))
-    lines = read_lines(path, remedy=REMEDY)[1:]
+    lines = read_lines(path, remedy=MEASURE_AGAIN)[1:]
     if not lines:
         return np.empty((0, columns[0]))
     filled = (re.sub(",(?=,|$)", ",nan", line) for line in lines)
     try:
         table = np.loadtxt(filled, dtype=np.float64, delimiter=",", ndmin=2)
     except ValueError as error:
-        raise InputError(path, f"is damaged ({str(error).split(';')[0]})", REMEDY) from error
+        raise InputError(path, f"is damaged ({str(error).split(';')[0]})", MEASURE_AGAIN) from error
     if table.shape[1] not in columns:
-        raise InputError(path, f"has {table.shape[1]} columns instead of {columns[-1]}", REMEDY)
+        raise InputError(path, f"has {table.shape[1]} columns instead of {columns[-1]}", MEASURE_AGAIN)
     if (~in_range(table) & ~np.isnan(table)).any() or np.isnan(table[:, :known]).any():
-        raise InputError(path, "holds a number out of range", REMEDY)
+        raise InputError(path, "holds a number out of range", MEASURE_AGAIN)
     return table

@@ -9,6 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+MEASURE_AGAIN = "measure the recording again"
+"""Remedy for a measured folder that is incomplete or damaged."""
+
 
 class BarsightError(Exception):
     """Something that the user can put right; its text is one line."""

@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from barsight.calibration.boards.ring_detection import nearest_disc
 from barsight.core.arrays import Bool, Float64
-from barsight.core.errors import ConfigError, Failed, InputError
+from barsight.core.errors import MEASURE_AGAIN, ConfigError, Failed, InputError
 from barsight.core.extras import extra
 from barsight.core.reading.geotiff import open_geotiff
 from barsight.page.layers import MAX_PIXELS
@@ -290,6 +290,6 @@ def _fitted(targets: Targets, frame: str) -> tuple[dict[str, Any] | None, Float6
 def _opened(folder: Path, map_id: str) -> _PickedSurvey:
     summary, owners = expect_map(folder, map_id), measured_owners(folder)
     if not (folder / "ortho.tif").is_file():
-        raise InputError(folder, "has no ortho.tif", "measure the recording again")
+        raise InputError(folder, "has no ortho.tif", MEASURE_AGAIN)
     frame = "world" if owners["mounting_id"] is None else "encoders"
     return _PickedSurvey(folder, frame, read_heights(folder), Travel.read(summary))

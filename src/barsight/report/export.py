@@ -12,10 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from barsight.core.errors import BarsightError, ConfigError, InputError, OutputError
+from barsight.core.errors import MEASURE_AGAIN, BarsightError, ConfigError, InputError, OutputError
 from barsight.core.extras import extra
 from barsight.core.files import atomic_path
-from barsight.core.reading.geotiff import REMEDY
 from barsight.result_folder import Cloud, open_folder, read_cloud
 
 _LAS_STEP_M = 1e-4
@@ -48,7 +47,9 @@ def export(folder: Path, target: Path) -> int:
         try:
             _WRITERS[kind](cloud, path, frame_id)
         except (OverflowError, ValueError) as error:
-            raise InputError(folder / "cloud.ply", f"doesn't fit a {kind} file ({error})", REMEDY) from error
+            raise InputError(
+                folder / "cloud.ply", f"doesn't fit a {kind} file ({error})", MEASURE_AGAIN
+            ) from error
         except (OSError, BarsightError):
             raise
         except Exception as error:  # errors of the libraries, if the system refuses to write

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from barsight.core.arrays import Float32, Float64, UInt8
-from barsight.core.errors import InputError
+from barsight.core.errors import MEASURE_AGAIN, InputError
 from barsight.core.reading.bounded_reading import read_bytes
-from barsight.core.reading.geotiff import HEIGHT_BANDS, REMEDY, GeoTiff, open_geotiff
+from barsight.core.reading.geotiff import HEIGHT_BANDS, GeoTiff, open_geotiff
 from barsight.core.records.gray_levels import TornImageError
 from barsight.core.records.heights import HeightSource
 from barsight.recording.image_decoding import MAX_PICTURE_BYTES, decode_with_colour
@@ -241,9 +241,9 @@ def preview_uri(path: Path) -> str:
     if not path.is_file():
         return ""
     try:
-        gray, colour = decode_with_colour(read_bytes(path, MAX_PICTURE_BYTES, REMEDY))
+        gray, colour = decode_with_colour(read_bytes(path, MAX_PICTURE_BYTES, MEASURE_AGAIN))
     except TornImageError as error:
-        raise InputError(path, str(error), REMEDY) from None
+        raise InputError(path, str(error), MEASURE_AGAIN) from None
     picture = np.dstack([gray, gray, gray]) if colour is None else colour
     opaque = np.full(picture.shape[:2], 255, np.uint8)
     return data_uri(np.dstack([picture[..., ::-1], opaque]).astype(np.uint8), lossless=False)

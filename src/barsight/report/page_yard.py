@@ -11,9 +11,8 @@ import cv2
 import numpy as np
 
 from barsight.core.arrays import UInt8
-from barsight.core.errors import InputError
+from barsight.core.errors import MEASURE_AGAIN, InputError
 from barsight.core.reading.bounded_reading import read_bytes
-from barsight.core.reading.geotiff import REMEDY
 from barsight.core.records.gray_levels import TornImageError
 from barsight.recording.image_decoding import MAX_PICTURE_BYTES, decode_gray
 from barsight.report.map_images import Raster, paint_height, robust_range
@@ -78,9 +77,11 @@ def _orthophoto(path: Path, raster: Raster) -> UInt8:
     """Resample the orthophoto (H, W, 4) to the raster's size, transparent where nothing was seen."""
     step, (rows, columns) = raster.step, raster.z_m.shape
     try:
-        gray = decode_gray(read_bytes(path, MAX_PICTURE_BYTES, REMEDY), max_pixels=rows * columns * step**2)
+        gray = decode_gray(
+            read_bytes(path, MAX_PICTURE_BYTES, MEASURE_AGAIN), max_pixels=rows * columns * step**2
+        )
     except TornImageError as error:
-        raise InputError(path, str(error), REMEDY) from None
+        raise InputError(path, str(error), MEASURE_AGAIN) from None
     whole = np.zeros((rows * step, columns * step), np.uint8)
     whole[: gray.shape[0], : gray.shape[1]] = gray[: rows * step, : columns * step]
     small = cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA)

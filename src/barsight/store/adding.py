@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from barsight.core.errors import InputError, MeasurementError
+from barsight.core.errors import MEASURE_AGAIN, InputError, MeasurementError
 from barsight.core.extras import extra
 from barsight.core.stamps import NS_PER_S
 from barsight.result_folder import file_digest, open_folder, read_heights
@@ -49,7 +49,6 @@ from barsight.yard.types import Bundle, YardMap
 with extra("store"):
     from sqlalchemy import Connection, select
 
-REMEDY = "measure the recording again"
 REASONS: dict[Finding, str] = {
     "gone": "its place was seen, and it is empty or something else lies there",
     "covered": "something lies over its place",
@@ -167,13 +166,13 @@ def read_survey(folder: Path) -> MeasuredSurvey:
     summary, identity = open_folder(folder, cloud=True)
     path = folder / "bundles.json"
     if identity is None or not path.is_file():
-        raise InputError(folder, "has no bundles.json", REMEDY)
+        raise InputError(folder, "has no bundles.json", MEASURE_AGAIN)
     if summary.get("reference") != "yard":
         raise MeasurementError(
             f"{folder}: is in the {summary.get('reference')} frame; only maps with a crane's place are kept"
         )
     if identity.captured_from_ns is None or identity.captured_to_ns is None:
-        raise InputError(folder / "result.json", "has no captured_from_ns and captured_to_ns", REMEDY)
+        raise InputError(folder / "result.json", "has no captured_from_ns and captured_to_ns", MEASURE_AGAIN)
     content = bundles_content(path)
     records = tuple({k: v for k, v in one.items() if k != "bar_axes"} for one in content["bundles"])
     match = read_match(path)

@@ -17,10 +17,9 @@ from rich.table import Table
 
 from barsight.cli.arguments import call, config_path, load_settings
 from barsight.cli.safe_console import SafeConsole
-from barsight.core.errors import ConfigError, Failed, InputError
+from barsight.core.errors import MEASURE_AGAIN, ConfigError, Failed, InputError
 from barsight.core.files import changed_folder
 from barsight.core.parallel import in_background
-from barsight.core.reading.geotiff import REMEDY
 from barsight.report.page import draw_pictures, write_report
 from barsight.result_folder import (
     PHOTO,
@@ -139,9 +138,9 @@ def _open(out: Path) -> _MeasuredFolder:
     summary, identity = open_folder(out, lifts=False)
     bundles = read_bundles(out / "bundles.json")
     if identity is None:
-        raise InputError(out / "result.json", "has no map_id: an earlier version wrote it", REMEDY)
+        raise InputError(out / "result.json", "has no map_id: an earlier version wrote it", MEASURE_AGAIN)
     if PHOTO in summary["files"] and not (out / PHOTO).is_file():
-        raise InputError(out / PHOTO, "is missing: nothing else shows labels under a face", REMEDY)
+        raise InputError(out / PHOTO, "is missing: nothing else shows labels under a face", MEASURE_AGAIN)
     stock = read_match(out / "bundles.json")
     listed = {} if stock is None else contradicted_bundles(stock)
     return _MeasuredFolder(summary, identity, read_heights(out), bundles, Travel.read(summary), listed)

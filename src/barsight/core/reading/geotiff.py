@@ -15,12 +15,11 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from barsight.core.errors import InputError
+from barsight.core.errors import MEASURE_AGAIN, InputError
 from barsight.core.reading.bounded_reading import open_regular
 
 HEIGHT_BANDS = 4
 """Bands of height.tif: z, sigma, views, source."""
-REMEDY = "measure the recording again"
 MAX_CELLS = 1 << 28
 """Maximum number of cells of a map: 26,000 m^2 at 10 mm. A small file may claim any number."""
 _MAX_SLACK_BYTES = 1 << 26
@@ -89,7 +88,7 @@ def open_geotiff(path: Path, bands: int = 1) -> Iterator[GeoTiff]:
     Raises InputError for anything else, and where the file proves damaged while it is open.
     """
     try:
-        with open_regular(path, REMEDY) as stream, tifffile.TiffFile(stream) as file:
+        with open_regular(path, MEASURE_AGAIN) as stream, tifffile.TiffFile(stream) as file:
             page = file.pages.first
             assert isinstance(page, tifffile.TiffPage) and page.dtype is not None
             planar = (
@@ -97,20 +96,24 @@ def open_geotiff(path: Path, bands: int = 1) -> Iterator[GeoTiff]:
             )
             if not planar or not page.is_tiled or min(page.shape) < 1:
                 raise InputError(
-                    path, f"has the shape {page.shape}, not {bands} planar bands in tiles", REMEDY
+                    path, f"has the shape {page.shape}, not {bands} planar bands in tiles", MEASURE_AGAIN
                 )
             if math.prod(page.shape) > MAX_CELLS * bands:
                 raise InputError(
-                    path, f"has {math.prod(page.shape) // bands} cells, at most {MAX_CELLS} are read", REMEDY
+                    path,
+                    f"has {math.prod(page.shape) // bands} cells, at most {MAX_CELLS} are read",
+                    MEASURE_AGAIN,
                 )
             size = path.stat().st_size
             most = 2 * math.prod(page.shape) * page.dtype.itemsize + _MAX_SLACK_BYTES
             if size > most:
-                raise InputError(path, f"has {size} bytes, its cells take {most} at most", REMEDY)
+                raise InputError(path, f"has {size} bytes, its cells take {most} at most", MEASURE_AGAIN)
             cell_m = float(page.tags["ModelPixelScaleTag"].value[0])
             left_m, top_m = (float(v) for v in page.tags["ModelTiepointTag"].value[3:5])
             if not (0 < cell_m < 1e3 and abs(left_m) < 1e6 and abs(top_m) < 1e6):
-                raise InputError(path, "is nowhere on earth: its cells or its corner are impossible", REMEDY)
+                raise InputError(
+                    path, "is nowhere on earth: its cells or its corner are impossible", MEASURE_AGAIN
+                )
             yield GeoTiff(page, cell_m, left_m, top_m)
     except _TORN as error:
-        raise InputError(path, f"is damaged ({error})", REMEDY) from error
+        raise InputError(path, f"is damaged ({error})", MEASURE_AGAIN) from error

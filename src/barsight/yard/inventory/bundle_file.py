@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from barsight.core.arrays import Float64
-from barsight.core.errors import InputError
+from barsight.core.errors import MEASURE_AGAIN, InputError
 from barsight.core.json_values import DIGITS, json_value
 from barsight.core.reading.bounded_reading import MAX_MAGNITUDE
 from barsight.core.reading.json_schema import expect_schema, package_schema
@@ -21,7 +21,6 @@ from barsight.yard.types import Bar, Bundle, BundleLabel, BundleSigma, Doubt, Fi
 from barsight.yard.weight import bundle_mass, bundle_section
 
 SCHEMA_VERSION = 2
-REMEDY = "measure the recording again"
 
 
 def write_bundles(
@@ -41,8 +40,8 @@ def write_bundles(
 
 def bundles_content(path: Path) -> dict[str, Any]:
     """Read the content of bundles.json. Raises InputError as `read_bundles` does."""
-    content = read_sealed(path, SCHEMA_VERSION, REMEDY)
-    expect_schema(content, package_schema("barsight.yard", "bundles"), path, REMEDY)
+    content = read_sealed(path, SCHEMA_VERSION, MEASURE_AGAIN)
+    expect_schema(content, package_schema("barsight.yard", "bundles"), path, MEASURE_AGAIN)
     return content
 
 
@@ -54,7 +53,7 @@ def read_bundles(path: Path) -> tuple[Bundle, ...]:
     try:
         return tuple(bundle_of(record) for record in content["bundles"])
     except (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError) as error:
-        raise InputError(path, f"is damaged ({type(error).__name__}: {error})", REMEDY) from error
+        raise InputError(path, f"is damaged ({type(error).__name__}: {error})", MEASURE_AGAIN) from error
 
 
 def read_match(path: Path) -> StockMatch | None:
@@ -69,7 +68,7 @@ def read_match(path: Path) -> StockMatch | None:
         )
         return StockMatch(matched, *(tuple(stock[name]) for name in ("moved", "missing", "hidden", "extra")))
     except (KeyError, TypeError) as error:
-        raise InputError(path, f"is damaged ({type(error).__name__}: {error})", REMEDY) from error
+        raise InputError(path, f"is damaged ({type(error).__name__}: {error})", MEASURE_AGAIN) from error
 
 
 def _record(bundle: Bundle) -> dict[str, Any]:
