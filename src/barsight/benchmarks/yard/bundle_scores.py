@@ -129,12 +129,7 @@ def join_scores(parts: list[BundleErrors]) -> BundleErrors:
     return BundleErrors(
         errors=stack([p.errors for p in parts]),
         sigmas=stack([p.sigmas for p in parts]),
-        free=sum(p.free for p in parts),
-        found=sum(p.found for p in parts),
-        claimed=sum(p.claimed for p in parts),
-        wrong=sum(p.wrong for p in parts),
-        said_count=sum(p.said_count for p in parts),
-        right_count=sum(p.right_count for p in parts),
+        **{name: sum(getattr(part, name) for part in parts) for name in _COUNTS},
         confidence=np.concatenate([p.confidence for p in parts]),
         is_right=np.concatenate([p.is_right for p in parts]),
     )

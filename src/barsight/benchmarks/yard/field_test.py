@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from barsight.benchmarks.provenance import Provenance
 from barsight.benchmarks.yard.run_cost import RunCost
 from barsight.evaluation.score import Figures, score_folder
 from barsight.recording.base import Recording
+from barsight.result_folder import read_summary
 
 VARIANTS: dict[str, tuple[str, ...]] = {
     "paper": ("--stereo.method", "paper", "--motion.estimator", "paper", "--map.contours", "paper"),
@@ -74,7 +74,7 @@ def laser_error_mm(recording: Recording, folder: Path) -> tuple[float, float]:
 
 def yard_row(method: str, flags: tuple[str, ...], recording: Path, out: Path, cost: RunCost) -> YardRow:
     """Score a measured folder."""
-    content = json.loads((out / "result.json").read_text(encoding="utf-8"))
+    content = read_summary(out)
     figures = score_folder(recording, out)
     agreed = content["agreement"]
     return YardRow(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -16,6 +15,7 @@ from rich.table import Table
 
 from barsight.core.compiling.ahead import compile_ahead
 from barsight.core.errors import MeasurementError
+from barsight.result_folder import read_summary
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ def measure_apart(recording: Path, out: Path, flags: tuple[str, ...]) -> RunCost
     if done.returncode != 0:
         lines = done.stderr.strip().splitlines()
         raise MeasurementError(f"{' '.join(flags) or 'default'}: {lines[-1] if lines else done.returncode}")
-    content = json.loads((out / "result.json").read_text(encoding="utf-8"))
+    content = read_summary(out)
     stage_s = {stage["name"]: stage["seconds"] for stage in content["stages"]}
     return RunCost(wall_s, cpu_s, content["peak_memory_mib"], stage_s)
 

@@ -95,14 +95,14 @@ class WorldBench:
 
 def score_world(recording: Path, out: Path | None, looked_at: str, refused: str) -> WorldScore:
     """Score the folder that a world was measured into; out: None if measuring was refused."""
-    truth = json.loads((recording / "truth" / "world.json").read_text(encoding="utf-8"))
+    truth = _truth(recording, "world.json")
     names = tuple(name for name, holds in truth["conditions"].items() if holds)
     known = (truth["seed"], truth["kind"], names, looked_at, refused)
     if out is None:
         return WorldScore(*known, {}, {}, {}, {}, {})
     maps = {name: dict(figures) for name, figures in score_folder(recording, out).items()}
     true = read_true_bundles(recording)
-    loose = [bool(row.get("is_loose")) for row in _rows(recording)]
+    loose = [bool(row.get("is_loose")) for row in _truth(recording, "bundles.json")]
     shown = _shown(recording, true)
     bundles = tuple(t for t, alone, seen in zip(true, loose, shown, strict=True) if seen and not alone)
     bars = tuple(t for t, alone, seen in zip(true, loose, shown, strict=True) if seen and alone)
@@ -199,15 +199,9 @@ def _over_worlds(
 
 def _bundle_rows(kind: str, worlds: Sequence[WorldScore]) -> Iterable[WorldRow]:
     for name, unit in BUNDLE_ROWS.items():
-        errors = np.concatenate(
-            [np.array(w.errors.get(name, []), np.float64) for w in worlds] or [np.empty(0)]
-        )
-        sigmas = np.concatenate(
-            [np.array(w.sigmas.get(name, []), np.float64) for w in worlds] or [np.empty(0)]
-        )
-        seeds = np.concatenate(
-            [np.full(len(w.errors.get(name, [])), w.seed) for w in worlds] or [np.empty(0)]
-        )
+        errors = np.array([v for w in worlds for v in w.errors.get(name, ())], np.float64)
+        sigmas = np.array([v for w in worlds for v in w.sigmas.get(name, ())], np.float64)
+        seeds = [w.seed for w in worlds for _ in w.errors.get(name, ())]
         known = np.isfinite(errors)
         if not known.any():
             continue
@@ -216,7 +210,7 @@ def _bundle_rows(kind: str, worlds: Sequence[WorldScore]) -> Iterable[WorldRow]:
         k = int(size.argmax())
         yield WorldRow(
             kind, f"bundles: {name}, {unit}", len(size), float(np.median(size)), float(size[k]),
-            int(seeds[known][k]), 100 * float(inside.mean()),
+            seeds[np.flatnonzero(known)[k]], 100 * float(inside.mean()),
         )  # fmt: skip
     for name, part, whole in (
         ("free bundles found, %", "found", "free"),
@@ -234,9 +228,8 @@ def _bundle_rows(kind: str, worlds: Sequence[WorldScore]) -> Iterable[WorldRow]:
             yield WorldRow(kind, name, count, float(np.median([v for v, _ in shares])), bad, seed, math.nan)
 
 
-def _rows(recording: Path) -> list[dict[str, Any]]:
-    text = (recording / "truth" / "bundles.json").read_text(encoding="utf-8")
-    return list(json.loads(text))
+def _truth(recording: Path, name: str) -> Any:
+    return json.loads((recording / "truth" / name).read_text(encoding="utf-8"))
 
 
 def _shown(recording: Path, true: tuple[TrueBundle, ...]) -> list[bool]:
@@ -265,7 +258,7 @@ def _poses(recording: Path, out: Path) -> dict[str, float]:
         PosedFrame(int(stamp), pose, np.zeros((6, 6)))
         for stamp, pose in zip(path.stamp_ns, path.poses, strict=True)
     )
-    rig = json.loads((recording / "truth" / "rig.json").read_text(encoding="utf-8"))
+    rig = _truth(recording, "rig.json")
     shift = seconds_to_ns(rig["time_offset_s"])
     found = frame_errors(
         Trajectory("yard", frames, (), ()), read_ground_truth(recording, reference="yard"), shift

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from barsight.benchmarks.yard.run_cost import RunCost, cost_table, measure_apart
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError
 from barsight.core.json_values import write_json
+from barsight.result_folder import read_summary
 
 
 @dataclass(frozen=True)
@@ -63,5 +63,5 @@ def bench_length(
 
 def _row(recording: Path, out: Path) -> LengthRow:
     cost = measure_apart(recording, out, ())
-    content = json.loads((out / "result.json").read_text(encoding="utf-8"))
+    content = read_summary(out)
     return LengthRow(content["trajectory"]["length_m"], content["frames"]["used"], cost)
