@@ -114,8 +114,7 @@ def clearance_checks(
         # Behind an object no unseen place is searched for.
         break
     if stanchions:
-        parts = _region(place, heights, magnet, 0.0).parts
-        checks += stanchion_checks(place, parts, faces.table, stanchions)
+        checks += stanchion_checks(place, _region(place, heights, magnet, 0.0).parts, faces.table, stanchions)
     return checks
 
 
@@ -196,9 +195,7 @@ def _filled(rise: Float32, max_rise: Float32) -> Float32:
 
 
 def _over(load: tuple[Bundle, ...], region: Region, margin_m: float = 0.0) -> Bool:
-    """Mark the cells (V, U) over the load's outline and a margin; all cells where no load is known, in which
-    case no lift is offered.
-    """
+    """Mark the cells (V, U) over the load's outline and a margin; all cells where no load is known."""
     over = np.full(region.under.shape, not load)
     for bundle in load:
         dx, dy = region.x_m - bundle.centre_m[0], region.y_m[:, None] - bundle.centre_m[1]

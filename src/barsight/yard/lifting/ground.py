@@ -22,6 +22,8 @@ MIN_KNOWN = 0.5
 """Minimum share of a coarse cell that must have been seen."""
 MAX_HOLE_CELLS = 2
 """Width, in coarse cells, of an unseen place from which on it may hide an obstacle."""
+SHADOW_M = 0.3
+"""Distance (m) around a load within which things were partly hidden by it, and may move when it goes."""
 _PATCH_CELLS = 256
 """Side, in coarse cells, of the squares in which a map is read."""
 
@@ -117,6 +119,10 @@ class Ground:
     def barring(self, cells: Bool) -> Ground:
         """Return a copy in which nothing may be put down on these cells."""
         return replace(self, barred=self.barred | cells)
+
+    def apart_from(self, load: Load) -> Ground:
+        """Return a copy in which nothing may be put down where a load lies and in its shadow."""
+        return self.barring(self.inside(load, load.x_m, load.y_m, load.yaw_rad, SHADOW_M))
 
     def forgetting(self, cells: Bool) -> Ground:
         """Return a copy in which nothing is known of these cells."""

@@ -17,9 +17,9 @@ from barsight.yard.axes import axes_of
 from barsight.yard.events import events_since
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.bearing import magnet_reach
-from barsight.yard.lifting.ground import Ground
+from barsight.yard.lifting.ground import SHADOW_M, Ground
 from barsight.yard.lifting.load import Load
-from barsight.yard.lifting.set_down import SHADOW_M, SetDown, find_set_down, sound_ground
+from barsight.yard.lifting.set_down import SetDown, find_set_down, sound_ground
 from barsight.yard.lifting.targets import LiftPlan, ended_with_floor, put_down
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.types import Bundle, YardMap
@@ -66,8 +66,7 @@ def order_lifts(
         Ground.of(yard), bundles, plan.footings, plan.settings, since, plan.travel, plan.judged_at_ns
     )
     for bundle in queue:
-        own = Load.of((bundle,))
-        ground = ground.barring(ground.inside(own, own.x_m, own.y_m, own.yaw_rad, SHADOW_M))
+        ground = ground.apart_from(Load.of((bundle,)))
     steps = list[LiftStep]()
     for bundle in queue:
         load = Load.of((bundle,))

@@ -34,8 +34,6 @@ REACH_M = 30.0
 """Maximum distance (m) along X and Y from the load at which places are searched for."""
 MAX_TRIED, APART_M = 16, 0.15
 """Maximum number of places per heading that are assessed exactly, and their minimum spacing (m)."""
-SHADOW_M = 0.3
-"""Distance (m) around a load within which things were partly hidden by it, and may move when it goes."""
 SMALL_TURNS_DEG = (0.0, 2.5, -2.5, 5.0, -5.0)
 """Turns of the load that are tried, the smallest first."""
 
@@ -72,7 +70,7 @@ def find_set_down(ground: Ground, load: Load, magnet: Magnet, settings: LiftSett
     if load.rolls:
         return None
     ground = ground.about(load.x_m, load.y_m, REACH_M)
-    free = ground.barring(ground.inside(load, load.x_m, load.y_m, load.yaw_rad, SHADOW_M))
+    free = ground.apart_from(load)
     for turn in _turns(settings.max_turn_deg):
         yaw = load.yaw_rad + math.radians(turn)
         yaw -= math.pi * math.ceil(yaw / math.pi - 0.5)
@@ -124,8 +122,7 @@ def sound_ground(
         footing = footings[bundle.id]
         leans = footing.overhang_side and footing.overhang_m > 0
         if leans or bundle.confidence < settings.min_confidence:
-            own = Load.of((bundle,))
-            ground = ground.barring(ground.inside(own, own.x_m, own.y_m, own.yaw_rad, SHADOW_M))
+            ground = ground.apart_from(Load.of((bundle,)))
     for x_min, y_min, x_max, y_max in settings.no_lift_areas:
         ground = ground.barring(ground.within(x_min, y_min, x_max, y_max))
     for x, y, z in settings.stanchions:
