@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from barsight.acceptance.acceptance import Acceptance, accept
-from barsight.acceptance.budget import BudgetedLoad, ErrorSource, budget
+from barsight.acceptance.budgets.budget import BudgetedLoad, ErrorSource, budget
+from barsight.acceptance.budgets.error_sources import SHAPE, fit_sources
 from barsight.acceptance.causes import name_causes
-from barsight.acceptance.error_sources import SHAPE, fit_sources
 from barsight.acceptance.layout import Area, lay_out
 from barsight.acceptance.pictures import check_pictures
 from barsight.artefacts.plan import AcceptancePlan

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from acceptance_faults import CAMERA, ORDINARY, wrong_rig
 
-from barsight.acceptance.error_sources import SHAPE
+from barsight.acceptance.budgets.error_sources import SHAPE
 from barsight.artefacts.plan import AcceptancePlan, DummyBundle
 from barsight.calibration.files.rig_file import write_rig_file
 from barsight.cli.main import run

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from barsight.acceptance import error_sources
-from barsight.acceptance.budget import ERRORS, FIGURES, BudgetedLoad, ErrorSource, budget
-from barsight.acceptance.error_sources import SHAPE, fit_sources, measured_load
+from barsight.acceptance.budgets import error_sources
+from barsight.acceptance.budgets.budget import ERRORS, FIGURES, BudgetedLoad, ErrorSource, budget
+from barsight.acceptance.budgets.error_sources import SHAPE, fit_sources, measured_load
 from barsight.acceptance.observation import ViewGeometry
 from barsight.cli.main import run
 from barsight.core.arrays import Float64

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import tifffile
 
-from barsight.acceptance.error_sources import measured_load
+from barsight.acceptance.budgets.error_sources import measured_load
 from barsight.acceptance.watch import WatchedSurvey, WatchRecord, read_watch, with_survey, write_watch
 from barsight.cli.main import run
 from barsight.core.errors import InputError

@@ -10,8 +10,8 @@ import tyro
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from barsight.acceptance.budget import BudgetedFigure, budget
-from barsight.acceptance.error_sources import MeasuredLoad, measured_load
+from barsight.acceptance.budgets.budget import BudgetedFigure, budget
+from barsight.acceptance.budgets.error_sources import MeasuredLoad, measured_load
 from barsight.cli.arguments import call
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from barsight.acceptance.error_sources import touched_offset
+from barsight.acceptance.budgets.touch_downs import touched_offset
 from barsight.cli.arguments import call
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import InputError

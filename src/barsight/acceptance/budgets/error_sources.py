@@ -8,24 +8,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import t as student
 
-from barsight.acceptance.budget import BudgetedLoad, ErrorSource
-from barsight.acceptance.certificate import REMEDY as OTHER
+from barsight.acceptance.budgets.budget import BudgetedLoad, ErrorSource
+from barsight.acceptance.budgets.touch_downs import touch_errors_m
 from barsight.acceptance.certificate import read_certificate
 from barsight.acceptance.observation import ViewGeometry, view_geometry
-from barsight.acceptance.uncertainty import COVERAGE
 from barsight.acceptance.yard_area import measured_rig
 from barsight.core.arrays import Float64
 from barsight.core.errors import ConfigError, InputError, MeasurementError
 from barsight.core.pose import Pose, skew
-from barsight.core.reading.bounded_reading import in_range
-from barsight.registration.agreement import DOUBTFUL
 from barsight.registration.yard_file import YardFrame, read_yard_file
 from barsight.result_folder import open_folder, read_heights
 from barsight.yard.inventory.bundle_file import read_bundles
 from barsight.yard.lifting.travel_accuracy import Travel
-from barsight.yard.magnet.description import MAX_OFFSET_M, MagnetOffset
+from barsight.yard.magnet.description import MagnetOffset
 from barsight.yard.types import Bundle, YardMap
 from barsight.yard.weight import bundle_mass
 from barsight.yard_frame import shared_covariance
@@ -37,9 +33,6 @@ SHAPE = "shape of the bundle"
 """Name of the error source for how far a bundle's shape may differ from its fitted outline. A dummy
 bundle's shape is known, so this source is left out for it.
 """
-MIN_TOUCHES = 3
-MAX_APART_M = 0.1
-"""Maximum spread (m) along one axis of touch-downs made by one magnet at rest."""
 EXPANSION_PER_K = 23e-6
 """Thermal expansion (1/K) of the aluminium bar that carries the cameras."""
 
@@ -249,7 +242,7 @@ def _frame_source(frame: YardFrame | None, shared: Float64, assumed: list[str]) 
 
 def _magnet_source(certificate: Path | None, assumed: list[str]) -> list[ErrorSource]:
     """Convert uncorrected touch-down errors to uncertainty, as their mean squares about 0."""
-    touches = {} if certificate is None else _touch_errors_m(certificate)
+    touches = {} if certificate is None else touch_errors_m(certificate)
     sources = []
     for axis in "xyz":
         errors = list(touches.get(axis, {}).values())
@@ -272,82 +265,3 @@ def _offset_sources(offset: MagnetOffset) -> list[ErrorSource]:
         ErrorSource("camera to magnet", (f"magnet_{axis}",), np.array([[sigma**2]]), "calibrate magnet")
         for axis, sigma in zip("xyz", offset.sigma_m, strict=True)
     ]
-
-
-def touched_offset(certificate: Path) -> MagnetOffset:
-    """Average the touch-downs of a certificate into the magnet's offset from where the crane's readings place
-    it.
-
-    The sigma of a mean is the larger of the scatter and the sigma of one reading, over the root of their
-    number, widened so that two sigma cover 95.45 % by Student's t. Raises InputError where the certificate is
-    unsuitable.
-    """
-    content, touches = read_certificate(certificate), _touch_errors_m(certificate)
-    try:
-        _expect_sound(certificate, content)
-        rows = [row for row in content["quantities"] if row["group"] == "touch_mm"]
-        own_m = 1e-3 * max((float(row["uncertainty"]["sigma"]) for row in rows), default=0.0)
-        ids = str(content["calibration_id"]), str(content["yard_frame_id"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(certificate, f"is damaged ({type(error).__name__}: {error})", OTHER) from error
-    errors_m = [_mean_touch_m(certificate, axis, touches.get(axis, {}), own_m) for axis in "xyz"]
-    (x, x_sigma), (y, y_sigma), (z, z_sigma) = errors_m
-    max_m = max(abs(x), abs(y), abs(z))
-    if max_m > MAX_OFFSET_M:
-        problem = f"the magnet hangs {1e3 * max_m:.0f} mm off: that is the rig's lever arm"
-        raise InputError(certificate, problem, "correct p_crane_body in crane0/sensor.yaml and accept again")
-    return MagnetOffset(x, y, z, x_sigma, y_sigma, z_sigma, *ids)
-
-
-def _expect_sound(certificate: Path, content: dict[str, Any]) -> None:
-    """Raise InputError where the rig wasn't accepted (touch-downs aside) or an offset was already
-    subtracted.
-    """
-    if content.get("magnet_offset") is not None:
-        raise InputError(certificate, "was made with a magnet's offset", "accept without --magnet first")
-    wrong = [str(one["name"]) for one in content["causes"]]
-    wrong += [
-        str(row["name"])
-        for row in content["quantities"]
-        if row["group"] != "touch_mm" and row["decision"] != "passed"
-    ]
-    if wrong:
-        raise InputError(certificate, f"its rig isn't accepted ({wrong[0]})", "mend the rig, then touch down")
-
-
-def _mean_touch_m(
-    certificate: Path, axis: str, errors_m: dict[str, float], own_m: float
-) -> tuple[float, float]:
-    """Average the errors along one axis; also return the sigma of the mean. own_m: sigma of one reading."""
-    errors = np.array(list(errors_m.values()))
-    if len(errors) < MIN_TOUCHES:
-        problem = f"has {len(errors)} touch-downs that tell {axis}, {MIN_TOUCHES} are the least"
-        raise InputError(certificate, problem, "touch spheres or dummy bundles; a plate tells z only")
-    if np.ptp(errors) > MAX_APART_M:
-        problem = f"its touch-downs lie {1e3 * np.ptp(errors):.0f} mm apart along {axis}"
-        raise InputError(certificate, problem, "touch down again, the magnet at rest")
-    far = int(np.abs(errors - np.median(errors)).argmax())
-    others = np.delete(errors, far)
-    off, scatter = abs(errors[far] - others.mean()), max(float(others.std(ddof=1)), own_m, 1e-5)
-    ratio = off / scatter / (1 + 1 / len(others)) ** 0.5
-    if len(errors) * 2 * student.sf(ratio, len(others) - 1) < DOUBTFUL:  # Grubbs' test
-        problem = f"{list(errors_m)[far]} lies {1e3 * off:.0f} mm from the other touch-downs along {axis}"
-        raise InputError(certificate, f"{problem}, which scatter by {1e3 * scatter:.1f} mm", "make it again")
-    few = float(student.ppf((1 + COVERAGE) / 2, len(errors) - 1)) / 2
-    sigma = few * max(float(errors.std(ddof=1)), own_m, 1e-5) / len(errors) ** 0.5
-    return float(errors.mean()), sigma
-
-
-def _touch_errors_m(certificate: Path) -> dict[str, dict[str, float]]:
-    """Read the errors (m) of the touch-downs by axis and name."""
-    found: dict[str, dict[str, float]] = {}
-    try:
-        for row in read_certificate(certificate)["quantities"]:
-            if row["group"] == "touch_mm" and row["error"] is not None:
-                name, _, axis = row["name"].rpartition(": ")
-                found.setdefault(axis, {})[name] = 1e-3 * float(row["error"])
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(certificate, f"is damaged ({type(error).__name__}: {error})", OTHER) from error
-    if not in_range([error for errors in found.values() for error in errors.values()]).all():
-        raise InputError(certificate, "has an impossible error", OTHER)
-    return found

@@ -1,0 +1,1 @@
+"""Budget the uncertainty of lifts: error sources, touch-downs of the magnet, and their propagation."""
