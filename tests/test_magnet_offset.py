@@ -3,17 +3,20 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import jsonschema
 import numpy as np
 import pytest
 
 from barsight.acceptance.acceptance import Acceptance
+from barsight.acceptance.budgets.touch_downs import touched_offset
 from barsight.acceptance.certificate import certificate_content, write_certificate
 from barsight.acceptance.quantities import judge_all
 from barsight.artefacts.plan import TouchDown
 from barsight.cli.main import run
-from barsight.core.errors import ConfigError
+from barsight.core.errors import ConfigError, Failed
+from barsight.motion.rig_check.drift_check import CheckLine, DriftState, RigCheck
 from barsight.plant.state import offered_lift
 from barsight.store.confirmation import OpenLift
 from barsight.store.lift_records import find_gap, find_outlines
@@ -35,27 +38,35 @@ OFFSET = MagnetOffset(*HANGS_M.tolist(), 0.001, 0.002, 0.0015, "cal", "yard")
 
 def certificate(
     folder: Path, rng: np.random.Generator, count: int = 6, offset: MagnetOffset | None = None,
-    stray_m: float = 0.0,
+    stray_m: float = 0.0, artefacts: int = 5, recordings: int = 1, map_m: float = 0.0, apart_m: float = 0.0,
+    rig: tuple[RigCheck, ...] = (),
 ) -> Path:  # fmt: skip
-    """A certificate with touch-downs that scatter by 2 mm, on spheres that are seen exactly. stray_m: added
-    to the third's x.
+    """A certificate with touch-downs that scatter by 2 mm, on spheres that recordings see `map_m` off.
+    stray_m: added to the third's x. apart_m: added to every other one's.
     """
     plan = replace(planned(), dummy_bundle=())
-    tops = [np.array([s.x_m, s.y_m, s.z_m + s.diameter_m / 2]) for s in plan.sphere]
-    read = [tops[k % len(tops)] - HANGS_M + rng.normal(0, 0.002, 3) for k in range(count)]
+    tops = [np.array([s.x_m, s.y_m, s.z_m + s.diameter_m / 2]) for s in plan.sphere[:artefacts]]
+    read = [tops[k % artefacts] - HANGS_M + rng.normal(0, 0.002, 3) for k in range(count)]
     read[2:3] = [place + np.array([stray_m, 0, 0]) for place in read[2:3]]
+    read[::2] = [place + np.array([apart_m, 0, 0]) for place in read[::2]]
     touched = tuple(
-        TouchDown(f"touch {k}", plan.sphere[k % len(tops)].name, *place.tolist(), sigma_m=0.001)
+        TouchDown(f"touch {k}", plan.sphere[k % artefacts].name, *place.tolist(), sigma_m=0.001)
         for k, place in enumerate(read)
     )
     plan = replace(plan, touch_down=touched)
-    seen = observed(plan, off_by(), rng)
-    spheres = {
-        s.name: replace(seen.spheres[s.name], centre_m=np.array([s.x_m, s.y_m, s.z_m]))  # type: ignore[type-var]
-        for s in plan.sphere
-    }
-    seen = replace(seen, spheres=spheres)
-    found = Acceptance(plan, (seen,), judge_all(plan, [seen], offset), (), (CLEAN,), (), {"rec": {}}, offset)
+    views = []
+    for _ in range(recordings):
+        seen = observed(plan, off_by(), rng)
+        spheres = {
+            s.name: replace(
+                seen.spheres[s.name],  # type: ignore[type-var]
+                centre_m=np.array([s.x_m, s.y_m, s.z_m]) + rng.normal(0, map_m, 3),
+            )
+            for s in plan.sphere
+        }
+        views.append(replace(seen, spheres=spheres))
+    judged = tuple(q for q in judge_all(plan, views, offset) if q.group != "repeat_mm")
+    found = Acceptance(plan, tuple(views), judged, rig, (CLEAN,), (), {"rec": {}}, offset)
     write_certificate(certificate_content(found, "N. N."), folder / "cert", None, pdf=False)
     return folder / "cert.json"
 
@@ -66,19 +77,27 @@ def calibrated(folder: Path, path: Path) -> int:
     return run([*line, "-o", str(folder / "hung.toml")])
 
 
-def test_the_mean_of_touch_downs_lies_within_its_sigma(tmp_path: Path) -> None:
-    """Forty commissionings of six touch-downs: errors over sigma, three axes each."""
+@pytest.mark.parametrize(("recordings", "count", "map_m"), [(1, 6, 0.0), (3, 6, 0.0014), (1, 20, 0.0014)])
+def test_the_mean_of_touch_downs_lies_within_its_sigma(
+    recordings: int, count: int, map_m: float, tmp_path: Path
+) -> None:
+    """Forty commissionings: errors over sigma, three axes each. What one artefact is seen off is in all its
+    touch-downs, and the worst of several recordings is further off than their mean.
+    """
     off = []
     for seed in range(40):
-        folder = tmp_path / str(seed)
-        folder.mkdir()
-        assert calibrated(folder, certificate(folder, np.random.default_rng((24, seed)))) == 0
-        found = load_magnet(folder / "hung.toml").offset
-        assert found is not None and (found.calibration_id, found.yard_frame_id) == ("cal", "yard")
+        rng = np.random.default_rng((24, seed))
+        found = touched_offset(certificate(tmp_path, rng, count, recordings=recordings, map_m=map_m))
         off.append((np.array(found.place_m) - HANGS_M) / found.sigma_m)
-    inside = np.mean(np.abs(off) < 2)
-    assert 0.9 < inside <= 0.995, "95.45 % by Student's t"
+    assert np.mean(np.abs(off) < 2) > 0.94, "95.45 % by Student's t"
     assert 0.5 < np.std(off) < 1.1
+
+
+def test_a_magnets_file_gets_the_offset_of_its_rig(tmp_path: Path) -> None:
+    assert calibrated(tmp_path, certificate(tmp_path, np.random.default_rng(24))) == 0
+    found = load_magnet(tmp_path / "hung.toml").offset
+    assert found is not None and (found.calibration_id, found.yard_frame_id) == ("cal", "yard")
+    assert np.all(np.abs(np.array(found.place_m) - HANGS_M) < 3 * np.array(found.sigma_m))
 
 
 def test_an_offset_is_taken_off_what_the_crane_gets(tmp_path: Path) -> None:
@@ -167,25 +186,41 @@ def test_a_touch_down_listed_under_two_names_counts_once() -> None:
         replace(plan, touch_down=(one, replace(one, name="again")))
 
 
-@pytest.mark.parametrize("what", ["few", "with an offset", "failed", "twice", "stray"])
+DRIFTED = RigCheck(
+    (CheckLine("yaw", 0.1, 0.001, "deg", 35.0, DriftState.RECALIBRATE, ""),),
+    Failed("few-rows", ""), Failed("no-crane", ""), 7.0, np.ones(4),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("made", "said"),
+    [
+        ({"count": 2}, "3 are the least"),
+        ({"artefacts": 2}, "are on 2 artefacts, 3 are the least"),
+        ({"offset": OFFSET}, "accept without --magnet"),
+        ({"stray_m": 0.04}, "touch 2 lies"),
+        ({"count": 12, "apart_m": 0.02}, "lie in two groups"),
+        ({"rig": (DRIFTED,)}, "isn't accepted (the crane's travel: recalibrate)"),
+    ],
+)
 def test_what_carries_no_offset_is_refused(
-    what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    made: dict[str, Any], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert calibrated(tmp_path, certificate(tmp_path, np.random.default_rng(8), **made)) == 3
+    assert said in capsys.readouterr().err.replace("\n", " ") and not (tmp_path / "hung.toml").exists()
+
+
+def test_a_failed_rig_and_a_file_with_an_offset_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rng = np.random.default_rng(8)
-    offset, stray_m = (OFFSET if what == "with an offset" else None), (0.04 if what == "stray" else 0.0)
-    path = certificate(tmp_path, rng, 2 if what == "few" else 6, offset, stray_m)
-    if what == "failed":
-        plan = replace(planned(), dummy_bundle=(), touch_down=())
-        seen = observed(plan, off_by(baseline=0.02), rng)
-        found = Acceptance(plan, (seen,), judge_all(plan, [seen]), (), (CLEAN,), (), {"rec": {}})
-        write_certificate(certificate_content(found, ""), path, None, pdf=False)
-    if what == "twice":
-        assert calibrated(tmp_path, path) == 0
-        line = ["calibrate", "magnet", str(path), "--magnet", str(tmp_path / "hung.toml")]
-        code = run([*line, "-o", str(tmp_path / "again.toml")])
-    else:
-        code = calibrated(tmp_path, path)
-    said = {"few": "3 are the least", "with an offset": "accept without --magnet", "failed": "isn't accepted",
-            "twice": "has an [offset] already", "stray": "touch 2 lies"}  # fmt: skip
-    assert code == 3 and said[what] in capsys.readouterr().err.replace("\n", " ")
-    assert not (tmp_path / "again.toml").exists()
+    path = certificate(tmp_path, rng)
+    assert calibrated(tmp_path, path) == 0
+    line = ["calibrate", "magnet", str(path), "--magnet", str(tmp_path / "hung.toml")]
+    assert run([*line, "-o", str(tmp_path / "again.toml")]) == 3 and not (tmp_path / "again.toml").exists()
+    assert "has an [offset] already" in capsys.readouterr().err.replace("\n", " ")
+    plan = replace(planned(), dummy_bundle=(), touch_down=())
+    seen = observed(plan, off_by(baseline=0.02), rng)
+    found = Acceptance(plan, (seen,), judge_all(plan, [seen]), (), (CLEAN,), (), {"rec": {}})
+    write_certificate(certificate_content(found, ""), path, None, pdf=False)
+    assert calibrated(tmp_path, path) == 3 and "isn't accepted" in capsys.readouterr().err.replace("\n", " ")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,23 +12,30 @@ from scipy.stats import t as student
 from barsight.acceptance.certificate import REMEDY as OTHER
 from barsight.acceptance.certificate import read_certificate
 from barsight.acceptance.uncertainty import COVERAGE
+from barsight.core.arrays import Float64
 from barsight.core.errors import InputError
 from barsight.core.reading.bounded_reading import in_range
+from barsight.motion.rig_check.drift_check import BAD_STATES
 from barsight.registration.agreement import DOUBTFUL
 from barsight.yard.magnet.description import MAX_OFFSET_M, MagnetOffset
 
-MIN_TOUCHES = 3
+MIN_ARTEFACTS = 3
+"""Minimum number of artefacts that are touched: each is seen with an error that all its touch-downs share."""
 MAX_APART_M = 0.1
 """Maximum spread (m) along one axis of touch-downs made by one magnet at rest."""
+MIN_PARTED, DRAWS = 10.0, 20_000
+"""Ratio up to which two groups are parted by chance, however many touch-downs there are, and number of drawn
+samples by which the chance of a larger one is found.
+"""
 
 
 def touched_offset(certificate: Path) -> MagnetOffset:
     """Average the touch-downs of a certificate into the magnet's offset from where the crane's readings place
     it.
 
-    The sigma of a mean is the larger of the scatter and the sigma of one reading, over the root of their
-    number, widened so that two sigma cover 95.45 % by Student's t. Raises InputError where the certificate is
-    unsuitable.
+    The mean is that of the artefacts' means. Its sigma is the largest of the artefacts' scatter and the
+    scatter of all, each over the root of its number, and of what the sigma of a reading leaves, widened so
+    that two sigma cover 95.45 % by Student's t. Raises InputError where the certificate is unsuitable.
     """
     content, touches = read_certificate(certificate), touch_errors_m(certificate)
     try:
@@ -35,9 +43,10 @@ def touched_offset(certificate: Path) -> MagnetOffset:
         rows = [row for row in content["quantities"] if row["group"] == "touch_mm"]
         own_m = 1e-3 * max((float(row["uncertainty"]["sigma"]) for row in rows), default=0.0)
         ids = str(content["calibration_id"]), str(content["yard_frame_id"])
+        touched = {str(one["name"]): str(one["on"]) for one in content["plan"]["touch_down"]}
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(certificate, f"is damaged ({type(error).__name__}: {error})", OTHER) from error
-    errors_m = [_mean_touch_m(certificate, axis, touches.get(axis, {}), own_m) for axis in "xyz"]
+    errors_m = [_mean_touch_m(certificate, axis, touches.get(axis, {}), touched, own_m) for axis in "xyz"]
     (x, x_sigma), (y, y_sigma), (z, z_sigma) = errors_m
     max_m = max(abs(x), abs(y), abs(z))
     if max_m > MAX_OFFSET_M:
@@ -53,6 +62,7 @@ def _expect_sound(certificate: Path, content: dict[str, Any]) -> None:
     if content.get("magnet_offset") is not None:
         raise InputError(certificate, "was made with a magnet's offset", "accept without --magnet first")
     wrong = [str(one["name"]) for one in content["causes"]]
+    wrong += [f"the crane's travel: {one['state']}" for one in content["rig"] if one["state"] in BAD_STATES]
     wrong += [
         str(row["name"])
         for row in content["quantities"]
@@ -63,13 +73,29 @@ def _expect_sound(certificate: Path, content: dict[str, Any]) -> None:
 
 
 def _mean_touch_m(
-    certificate: Path, axis: str, errors_m: dict[str, float], own_m: float
+    certificate: Path, axis: str, errors_m: Mapping[str, float], touched: Mapping[str, str], own_m: float
 ) -> tuple[float, float]:
-    """Average the errors along one axis; also return the sigma of the mean. own_m: sigma of one reading."""
+    """Average the errors along one axis; also return the sigma of the mean. touched: the artefact of each
+    touch-down by name. own_m: sigma of one reading.
+    """
+    by_artefact: dict[str, list[float]] = {}
+    for name, error in errors_m.items():
+        by_artefact.setdefault(touched.get(name, name), []).append(error)
+    if len(by_artefact) < MIN_ARTEFACTS:
+        problem = f"its touch-downs that tell {axis} are on {len(by_artefact)} artefacts, {MIN_ARTEFACTS} are"
+        remedy = "touch several spheres or dummy bundles; a plate tells z only"
+        raise InputError(certificate, f"{problem} the least", remedy)
     errors = np.array(list(errors_m.values()))
-    if len(errors) < MIN_TOUCHES:
-        problem = f"has {len(errors)} touch-downs that tell {axis}, {MIN_TOUCHES} are the least"
-        raise InputError(certificate, problem, "touch spheres or dummy bundles; a plate tells z only")
+    _expect_alike(certificate, axis, list(errors_m), errors, own_m)
+    means = np.array([np.mean(one) for one in by_artefact.values()])
+    of_readings = own_m * sum(1 / len(one) for one in by_artefact.values()) ** 0.5 / len(means)
+    scatter = max(means.std(ddof=1) / len(means) ** 0.5, errors.std(ddof=1) / len(errors) ** 0.5)
+    few = float(student.ppf((1 + COVERAGE) / 2, len(means) - 1)) / 2
+    return float(means.mean()), few * max(float(scatter), of_readings, 1e-5)
+
+
+def _expect_alike(certificate: Path, axis: str, names: list[str], errors: Float64, own_m: float) -> None:
+    """Raise InputError where one touch-down lies far from the others, or they lie in two groups."""
     if np.ptp(errors) > MAX_APART_M:
         problem = f"its touch-downs lie {1e3 * np.ptp(errors):.0f} mm apart along {axis}"
         raise InputError(certificate, problem, "touch down again, the magnet at rest")
@@ -78,21 +104,49 @@ def _mean_touch_m(
     off, scatter = abs(errors[far] - others.mean()), max(float(others.std(ddof=1)), own_m, 1e-5)
     ratio = off / scatter / (1 + 1 / len(others)) ** 0.5
     if len(errors) * 2 * student.sf(ratio, len(others) - 1) < DOUBTFUL:  # Grubbs' test
-        problem = f"{list(errors_m)[far]} lies {1e3 * off:.0f} mm from the other touch-downs along {axis}"
+        problem = f"{names[far]} lies {1e3 * off:.0f} mm from the other touch-downs along {axis}"
         raise InputError(certificate, f"{problem}, which scatter by {1e3 * scatter:.1f} mm", "make it again")
-    few = float(student.ppf((1 + COVERAGE) / 2, len(errors) - 1)) / 2
-    sigma = few * max(float(errors.std(ddof=1)), own_m, 1e-5) / len(errors) ** 0.5
-    return float(errors.mean()), sigma
+    if len(errors) < 4:
+        return
+    parting, lower, gap = (one[0] for one in _parted(errors[None], max(own_m, 1e-5)))
+    if parting < MIN_PARTED:
+        return
+    drawn = np.random.default_rng(0).normal(0, 1, (DRAWS, len(errors)))
+    if np.mean(_parted(drawn, 0.0)[0] >= parting) < DOUBTFUL:
+        below = ", ".join(names[k] for k in np.argsort(errors)[: int(lower)])
+        problem = f"its touch-downs lie in two groups {1e3 * gap:.0f} mm apart along {axis}"
+        remedy = "find out what changed (the magnet turned, a reading slipped) and touch down again"
+        raise InputError(certificate, f"{problem} (the lower one: {below})", remedy)
+
+
+def _parted(samples: Float64, min_scatter: float) -> tuple[Float64, Float64, Float64]:
+    """Part samples (S, N) into the two groups, of two values or more each, whose means differ most in units
+    of the scatter within them, at least `min_scatter`. Returns that ratio, the number of values in the lower
+    group and the difference of the means, (S,) each.
+    """
+    ordered = np.sort(samples, axis=1)
+    count = ordered.shape[1]
+    lower = np.arange(2, count - 1)
+    sums, squares = np.cumsum(ordered, axis=1), np.cumsum(ordered**2, axis=1)
+    below = sums[:, 1 : count - 2]
+    above = sums[:, -1:] - below
+    within = squares[:, -1:] - below**2 / lower - above**2 / (count - lower)
+    gap = above / (count - lower) - below / lower
+    scatter = np.sqrt(within.clip(0) / (count - 2)).clip(max(min_scatter, 1e-9))
+    ratio = gap / (scatter * np.sqrt(1 / lower + 1 / (count - lower)))
+    best = ratio.argmax(axis=1)
+    rows = np.arange(len(samples))
+    return ratio[rows, best], lower[best].astype(np.float64), gap[rows, best]
 
 
 def touch_errors_m(certificate: Path) -> dict[str, dict[str, float]]:
-    """Read the errors (m) of the touch-downs by axis and name."""
+    """Read the errors (m) of the touch-downs by axis and name, each the mean over the recordings."""
     found: dict[str, dict[str, float]] = {}
     try:
         for row in read_certificate(certificate)["quantities"]:
             if row["group"] == "touch_mm" and row["error"] is not None:
                 name, _, axis = row["name"].rpartition(": ")
-                found.setdefault(axis, {})[name] = 1e-3 * float(row["error"])
+                found.setdefault(axis, {})[name] = 1e-3 * float(np.mean(row["errors"]))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(certificate, f"is damaged ({type(error).__name__}: {error})", OTHER) from error
     if not in_range([error for errors in found.values() for error in errors.values()]).all():

@@ -31,7 +31,7 @@ def run(arguments: Sequence[str]) -> None:
         it, each lift gives the readings at which the magnet's centre is over the target (crane_target).
 
         Args:
-            certificate: Certificate from barsight accept with at least three touch-downs on spheres or dummy
+            certificate: Certificate from barsight accept with touch-downs on at least three spheres or dummy
                 bundles.
             magnet: TOML file of the magnet, without an [offset].
             out: The .toml file to write.
