@@ -73,17 +73,27 @@ def test_a_store_holds_one_yard_frame_unless_told(store: Store, tmp_path: Path) 
     assert add_survey(store, new, "ann", same_yard=True).is_new
 
 
-def test_a_certificate_of_another_frame_budgets_nothing(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("changed", "reason"),
+    [
+        ({"yard_frame_id": "beef"}, r"another yard frame \(beef; the folder has f00d\)"),
+        ({"magnet_offset": {"x_m": 0.012}}, "was made with a magnet's offset"),
+    ],
+)
+def test_a_certificate_of_another_frame_or_of_a_corrected_magnet_budgets_nothing(
+    changed: dict[str, object], reason: str, tmp_path: Path
+) -> None:
+    """With an offset its touch-downs say what that left over, not how the magnet hangs."""
     folder = write_folder(tmp_path / "out")
     told = {
         "schema_version": 1,
         "calibration_id": "ca1b",
-        "yard_frame_id": "beef",
+        "yard_frame_id": "f00d",
         "quantities": [],
         "plan": {},
     }
-    write_sealed(told, tmp_path / "certificate.json")
-    with pytest.raises(InputError, match=r"another yard frame \(beef; the folder has f00d\)"):
+    write_sealed(told | changed, tmp_path / "certificate.json")
+    with pytest.raises(InputError, match=reason):
         measured_load(folder, None, tmp_path / "certificate.json", 5.0)
 
 

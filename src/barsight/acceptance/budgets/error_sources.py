@@ -70,7 +70,10 @@ def measured_load(
     if summary["reference"] != "yard":
         raise InputError(folder, "isn't in the yard's frame", "measure with encoders, or with --yard")
     if certificate is not None:
-        _expect_own(certificate, read_certificate(certificate), summary)
+        told = read_certificate(certificate)
+        _expect_own(certificate, told, summary)
+        if offset is None and told.get("magnet_offset") is not None:
+            raise InputError(certificate, "was made with a magnet's offset", "give --magnet with that offset")
     if offset is not None:
         _expect_own(folder / "result.json", summary, asdict(offset), "the magnet's offset")
     bundle = _chosen(folder, number)
