@@ -392,6 +392,9 @@ def test_a_certificate_is_signed_and_a_changed_one_refused(tmp_path: Path) -> No
     for name in ("cert.json", "cert.html", "cert.pdf"):
         signature = (tmp_path / f"{name}.sig").read_bytes()
         key.public_key().verify(signature, (tmp_path / name).read_bytes())
+    write_certificate(content, tmp_path / "cert", None, pdf=False)
+    left = {"key.pem", "cert.json", "cert.html"}  # an earlier PDF, or its signature, would say something else
+    assert {path.name for path in tmp_path.iterdir()} == left
     text = (tmp_path / "cert.json").read_text()
     (tmp_path / "cert.json").write_text(text.replace('"passed": false', '"passed": true'))
     with pytest.raises(InputError, match="was changed after it was written"):

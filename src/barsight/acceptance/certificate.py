@@ -86,24 +86,28 @@ def certificate_files(out: Path) -> tuple[Path, ...]:
 
 
 def write_certificate(content: dict[str, Any], out: Path, key: Path | None, pdf: bool) -> str:
-    """Write JSON, page and, where `pdf` is set, the PDF, all or none; return the content's digest.
+    """Write JSON, page and, where `pdf` is set, the PDF, all or none; return the content's digest. An earlier
+    certificate's PDF and signatures don't stay beside them.
 
     key: Ed25519 private key (PEM) that signs each file; the signature is written next to it as NAME.sig.
     """
     files = certificate_files(out)
-    files = files if pdf else files[:2]
+    written = files if pdf else files[:2]
+    signatures = tuple(file.with_name(f"{file.name}.sig") for file in files)
+    made = written if key is None else (*written, *signatures[: len(written)])
     digest = json_digest(content)
     page = environment().get_template("certificate_page.html.jinja").render(
         c=content, digest=digest, signed=key is not None, css=resource("page.css"), bar=error_bar
     )  # fmt: skip
-    with atomic_paths(*files) as paths:
+    with atomic_paths(*made) as paths:
         write_sealed(content, paths[0])
         paths[1].write_text(page, encoding="utf-8", errors="replace")
         if pdf:
             write_pdf(content, digest, key is not None, paths[2])
-    if key is not None:
-        for file in files:
-            sign_file(file, key)
+        for path in paths[: len(written)] if key is not None else ():
+            sign_file(path, key)
+        for stale in {*files, *signatures} - {*made}:
+            stale.unlink(missing_ok=True)
     return digest
 
 
