@@ -11,6 +11,7 @@ from barsight.acceptance.watch import (
     WatchedFigure,
     WatchedSurvey,
     WatchRecord,
+    beyond_limits,
     control_charts,
     feature_figures,
     read_watch,
@@ -18,11 +19,13 @@ from barsight.acceptance.watch import (
     with_survey,
     write_watch,
 )
+from barsight.cli.acceptance import verify
 from barsight.cli.main import run
 from barsight.core.errors import Failed, InputError
+from barsight.motion.rig_check.drift_check import RigCheck
 from barsight.registration.surveyed_targets import SurveyedTags
 from barsight.registration.tags import PlacedTag
-from test_acceptance import observed, planned
+from test_acceptance import CLEAN, observed, planned
 
 SIGMAS = {"yaw / deg": 0.0018, "baseline / %": 0.05, "pitch / deg": 0.0014, "sharpness of cam0 / log": 0.15}
 
@@ -87,6 +90,36 @@ def test_what_is_normal_is_learned_first() -> None:
     drawn = [survey(k, rng, yaw_deg=0.05 * (k == 7)) for k in range(8)]
     assert all(np.isnan(one.mean) for one in control_charts(drawn[:7]))
     assert first_alarm(drawn) is None
+
+
+def test_a_stray_survey_among_those_that_are_learned_hides_no_later_jump() -> None:
+    told = 0
+    for seed in range(40):
+        rng = np.random.default_rng((41, seed))
+        shifts = [0.03 * (k == 5) + 0.01 * (k >= 10) for k in range(13)]
+        alarm = first_alarm([survey(k, rng, yaw_deg=shift) for k, shift in enumerate(shifts)])
+        told += alarm is not None and alarm > 10
+    assert told >= 38
+
+
+def test_a_figure_that_is_no_longer_seen_has_no_value() -> None:
+    rng = np.random.default_rng(42)
+    drawn = [survey(k, rng) for k in range(12)]
+    last = replace(drawn[-1], figures=drawn[-1].figures[1:])
+    yaw, baseline, *_ = control_charts([*drawn[:-1], last])
+    assert np.isnan(yaw.value) and np.isfinite(yaw.mean) and baseline.value == last.figures[0].value
+
+
+def test_a_rig_that_moved_before_its_first_survey_is_beyond_the_plans_limits() -> None:
+    plan = planned()
+    for moved, said in (
+        ((0, 0, 0), []), ((0, 0, 0.02), ["height of plates"]), ((-0.02, 0, 0), ["place of spheres along x"]),
+    ):  # fmt: skip
+        off = np.array(moved)
+        seen = observed(plan, lambda place, off=off: place + off, np.random.default_rng(43))
+        figures = feature_figures(plan, seen)
+        assert not isinstance(figures, Failed)
+        assert [one.partition(" is ")[0] for one in beyond_limits(plan, figures)] == said
 
 
 def test_fixed_features_watch_mounting_and_yard_frame() -> None:
@@ -179,6 +212,17 @@ def test_bad_input(
     monkeypatch.chdir(tmp_path)
     assert run(["verify", *arguments]) == code
     assert reason in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
+def test_a_survey_that_shows_nothing_of_the_rig_is_not_verified(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    blind = RigCheck((), Failed("few-rows", "too few matches"), Failed("no-crane", ""), 7.0, np.ones(4))
+    for name, found in (("open_recording", None), ("in_yard", None), ("look_at_rig", (blind, CLEAN))):
+        monkeypatch.setattr(verify, name, lambda *_, found=found: found)
+    assert run(["verify", str(tmp_path), "--record", str(tmp_path / "watch.json")]) == 5
+    assert "shows nothing of the rig (too few matches" in capsys.readouterr().err.replace("\n", " ")
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow

@@ -6,20 +6,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from math import isfinite
+from math import inf, isfinite
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import t as student
 
 from barsight.acceptance.observation import Observation
 from barsight.acceptance.pictures import PictureHealth
 from barsight.artefacts.plan import AcceptancePlan
+from barsight.core.arrays import Float64
 from barsight.core.errors import Failed, InputError
 from barsight.core.json_values import json_value
 from barsight.core.reading.json_schema import expect_schema, list_schema, record_schema
 from barsight.core.reading.sealed_json import read_sealed, write_sealed
 from barsight.motion.rig_check.drift_check import RigCheck
+from barsight.registration.agreement import DOUBTFUL
 from barsight.registration.surveyed_targets import SurveyedTags
 from barsight.registration.tags import PlacedTag
 
@@ -105,9 +108,9 @@ class WatchRecord:
 class ControlChart:
     """A figure's control chart.
 
-    value: the latest. mean, sigma: the normal ones, NaN while they are being learned. cusum: larger of both
-    sums. alarmed_at: number of the survey since the approval (from 1) that first raised an alarm, None for no
-    alarm.
+    value: of the latest survey, NaN if it doesn't show the figure. mean, sigma: the normal ones, NaN while
+    they are being learned. cusum: larger of both sums. alarmed_at: number of the survey since the approval
+    (from 1) that first raised an alarm, None for no alarm.
     """
 
     name: str
@@ -187,6 +190,19 @@ def feature_figures(plan: AcceptancePlan, seen: Observation) -> tuple[WatchedFig
     return tuple(figures)
 
 
+def beyond_limits(plan: AcceptancePlan, figures: Sequence[WatchedFigure]) -> list[str]:
+    """List the fixed features that lie further off in the mean than the plan permits: what is normal is
+    learned, so that a rig that moved before its first survey raises no alarm by the charts.
+    """
+    limits = {"height of plates": plan.limits.height_mm, "place of spheres": plan.limits.position_mm}
+    return [
+        f"{figure.name.partition(' / ')[0]} is {figure.value:+.1f} mm off, the plan permits {limit:g}"
+        for figure in figures
+        for start, limit in limits.items()
+        if figure.name.startswith(start) and abs(figure.value) > limit
+    ]
+
+
 def tag_figures(
     listed: SurveyedTags, placed: Sequence[PlacedTag | Failed]
 ) -> tuple[WatchedFigure, ...] | Failed:
@@ -220,12 +236,12 @@ def _chart(name: str, surveys: Sequence[WatchedSurvey]) -> ControlChart:
         for figure in survey.figures
         if figure.name == name
     ]
-    learned = np.array([figure.value for _, figure in rows[:LEARNED]])
-    if len(learned) < LEARNED:
-        return ControlChart(name, rows[-1][1].value, np.nan, np.nan, 0.0, None)
-    mean = float(learned.mean())
-    scatter = float(learned.std(ddof=1))
-    spread = (1 + 1 / LEARNED) ** 0.5  # the learned mean is uncertain too
+    value = rows[-1][1].value if rows[-1][0] == len(surveys) else np.nan
+    if len(rows) < LEARNED:
+        return ControlChart(name, value, np.nan, np.nan, 0.0, None)
+    learned = _without_stray([figure for _, figure in rows[:LEARNED]])
+    mean, scatter = float(learned.mean()), float(learned.std(ddof=1))
+    spread = (1 + 1 / len(learned)) ** 0.5  # the learned mean is uncertain too
     up = down = 0.0
     alarmed, sigma = None, np.nan
     for number, figure in rows[LEARNED:]:
@@ -234,7 +250,20 @@ def _chart(name: str, surveys: Sequence[WatchedSurvey]) -> ControlChart:
         up, down = max(up + off - SLACK, 0.0), max(down - off - SLACK, 0.0)
         if max(up, down) > ALARM and alarmed is None:
             alarmed = number
-    return ControlChart(name, rows[-1][1].value, mean, sigma, max(up, down), alarmed)
+    return ControlChart(name, value, mean, sigma, max(up, down), alarmed)
+
+
+def _without_stray(figures: Sequence[WatchedFigure]) -> Float64:
+    """Return the values without one that lies far from the others by their stated sigma or, where they
+    scatter more, by Grubbs' test; it would widen what is normal so far that no jump raised an alarm.
+    """
+    values = np.array([figure.value for figure in figures])
+    far = int(np.abs(values - np.median(values)).argmax())
+    others = np.delete(values, far)
+    scatter, sigma = float(others.std(ddof=1)), figures[far].sigma
+    sigma, free = (scatter, len(others) - 1) if scatter > DOUBTED * sigma else (sigma, inf)
+    ratio = abs(values[far] - others.mean()) / sigma / (1 + 1 / len(others)) ** 0.5
+    return others if len(values) * 2 * student.sf(ratio, free) < DOUBTFUL else values
 
 
 def read_watch(path: Path) -> WatchRecord:

@@ -19,6 +19,7 @@ from barsight.acceptance.watch import (
     Approval,
     ControlChart,
     WatchedSurvey,
+    beyond_limits,
     control_charts,
     feature_figures,
     picture_figures,
@@ -83,7 +84,7 @@ def run(arguments: Sequence[str]) -> None:
         features = None if plan is None else read_plan(plan)
         settings = MeasureSettings(yard=yard, recording=RecordingSettings(rig=rig))
         listed = None if tags is None else read_tags(tags)
-        survey, check, dirty = _look(recording, settings, features, listed)
+        survey, check, own = _look(recording, settings, features, listed)
         if approve:
             now = datetime.now(UTC).isoformat(timespec="seconds")
             given = Approval(approve, why, now, survey.calibration_id, len(known.surveys))
@@ -92,7 +93,7 @@ def run(arguments: Sequence[str]) -> None:
         write_watch(known, record)
         charts = control_charts(known.since_approval)
         _print(charts, check, len(known.since_approval))
-        problems = _problems(charts, check) + dirty
+        problems = _problems(charts, check) + own
         if problems:
             raise MeasurementError(f"{recording}: {'; '.join(problems)}")
 
@@ -102,10 +103,16 @@ def run(arguments: Sequence[str]) -> None:
 def _look(
     path: Path, settings: MeasureSettings, plan: AcceptancePlan | None, listed: SurveyedTags | None
 ) -> tuple[WatchedSurvey, RigCheck, list[str]]:
-    """Compute a survey's figures; also return the rig's check and messages about dirty lenses."""
+    """Compute a survey's figures; also return the rig's check and messages about dirty lenses and about
+    features that lie beyond the plan's limits.
+    """
     source = in_yard(open_recording(path, settings.recording), settings.yard)
     check, health = look_at_rig(source, settings.recording.rig)
-    figures = rig_figures(check) + picture_figures(health)
+    figures, beyond = rig_figures(check), list[str]()
+    if not figures:
+        why = "; ".join(one.reason for one in (check.rows, check.drift) if isinstance(one, Failed))
+        raise MeasurementError(f"{path}: shows nothing of the rig ({why}); travel over more of the yard")
+    figures += picture_figures(health)
     if plan is not None:
         console = SafeConsole(stderr=True)
         with tempfile.TemporaryDirectory(prefix="barsight.") as scratch, stages(console) as advance:
@@ -116,7 +123,7 @@ def _look(
             raise MeasurementError(
                 f"{path}: none of the plan's plates, or spheres, was found: {fixed.reason}"
             )
-        figures += fixed
+        figures, beyond = figures + fixed, beyond_limits(plan, fixed)
     if listed is not None:
         placed = tag_figures(listed, place_in_yard(source, listed, SafeConsole(stderr=True)))
         if isinstance(placed, Failed):
@@ -126,7 +133,7 @@ def _look(
     spoiled = [] if isinstance(health, Failed) else [one for one in health if one.dirt_pct > limit]
     ids = recording_id(source.digests()), calibration_id(source.rig)
     survey = WatchedSurvey(str(path), *ids, figures, placing_id(source))
-    return survey, check, [f"dirty lens of {one.camera}" for one in spoiled]
+    return survey, check, [f"dirty lens of {one.camera}" for one in spoiled] + beyond
 
 
 def _problems(charts: Sequence[ControlChart], check: RigCheck) -> list[str]:
@@ -146,7 +153,8 @@ def _print(charts: Sequence[ControlChart], check: RigCheck, surveys: int) -> Non
     for head in ("figure", "now", "normal", "sigma", f"sum (alarm over {ALARM:g})", ""):
         table.add_column(head, justify="left" if head in ("figure", "") else "right")
     for one in charts:
-        state = "learning" if one.mean != one.mean else "good" if one.alarmed_at is None else "alarm"
+        state = "learning" if one.mean != one.mean else "not seen" if one.value != one.value else "good"
+        state = state if one.alarmed_at is None else "alarm"
         cells = [f"{number:.4g}" for number in (one.value, one.mean, one.sigma, one.cusum)]
         table.add_row(one.name, *(["-" if cell == "nan" else cell for cell in cells]), state)
     console = SafeConsole()
