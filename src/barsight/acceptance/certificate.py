@@ -104,8 +104,9 @@ def write_certificate(content: dict[str, Any], out: Path, key: Path | None, pdf:
         paths[1].write_text(page, encoding="utf-8", errors="replace")
         if pdf:
             write_pdf(content, digest, key is not None, paths[2])
-        for path in paths[: len(written)] if key is not None else ():
-            sign_file(path, key)
+        if key is not None:
+            for path in paths[: len(written)]:
+                sign_file(path, key)
         for stale in {*files, *signatures} - {*made}:
             stale.unlink(missing_ok=True)
     return digest
