@@ -13,7 +13,7 @@ from barsight.calibration.geometry.rig import StereoRig
 from barsight.cli.main import run
 from barsight.core.pose import Pose
 from barsight.labels.attachment import PlacedCode, contradictions, merge_codes
-from barsight.labels.bundle_labels import bundle_label, unread_label
+from barsight.labels.bundle_labels import ILLEGIBLE, bundle_label, unread_label
 from barsight.labels.code_reading import read_codes
 from barsight.labels.placing import pose_at
 from barsight.recording.open import open_recording
@@ -29,7 +29,7 @@ from barsight.simulation.textures import label_codes, label_text, surface_tile
 from barsight.simulation.truth import label_rows
 from barsight.yard.inventory.stock_list import ListedBundle, contradicted_bundles, match_stock
 from barsight.yard.plates import find_plates
-from barsight.yard.types import BundleLabel, HeightMap
+from barsight.yard.types import Bundle, BundleLabel, HeightMap
 from cli_runs import FAST
 from lift_yards import laid, map_of, record
 
@@ -208,6 +208,39 @@ def measured_bundles(recording: Path, out: Path, *flags: str) -> dict[str, Any]:
     assert run(["measure", str(recording), "-o", str(out), *how, *flags]) == 0
     content: dict[str, Any] = json.loads((out / "bundles.json").read_text())
     return content
+
+
+def on_top(bundle: Bundle, text: str, aside_m: float = 0.0, along_m: float = 0.0) -> list[PlacedCode]:
+    place = np.array([bundle.centre_m[0] + aside_m, bundle.centre_m[1] + along_m, bundle.top_z_m])
+    return [PlacedCode(text, "QRCode", place, (k, 0)) for k in range(3)]
+
+
+def test_a_label_on_the_border_of_two_bundles_is_surely_on_neither() -> None:
+    """The neighbour is 4 mm higher; the label's place is known to some mm."""
+    first = record(laid(0.0), 1)
+    aside = np.array([first.width_m, 0, 0])
+    second = replace(first, id=2, centre_m=first.centre_m + aside, top_z_m=first.top_z_m + 0.004)
+    for inside_m, sure in ((0.01, False), (0.05, True)):
+        codes = on_top(first, "B-17", first.width_m / 2 - inside_m)
+        (label,) = merge_codes(codes, (first, second))
+        assert (label.bundle, label.is_sure) == (1, sure)
+        assert sure or "on the border of bundle 2" in label.doubts[0]
+    over = replace(second, centre_m=first.centre_m)  # it lies across: the label is on the upper one
+    (label,) = merge_codes(on_top(over, "B-17"), (first, over))
+    assert (label.bundle, label.is_sure) == (2, True)
+
+
+def test_one_text_on_two_bundles_is_no_label_and_at_both_ends_of_one_it_is() -> None:
+    first = record(laid(0.0), 1)
+    second = replace(first, id=2, centre_m=first.centre_m + np.array([1.0, 0, 0]))
+    twins = merge_codes(on_top(first, "B-17") + on_top(second, "B-17"), (first, second))
+    assert [bundle_label(one, twins) for one in (first, second)] == [ILLEGIBLE, ILLEGIBLE]
+    ends = merge_codes(on_top(first, "B-17", 0, -1) + on_top(first, "B-17", 0, 1), (first, second))
+    read = bundle_label(first, ends)
+    assert read is not None and read.text == "B-17"
+    listed = (ListedBundle("B-17", *first.centre_m[:2].tolist()),)
+    assert contradictions(ends, (first, second), listed) == ()
+    assert "'B-17' lies at two places" in contradictions(twins, (first, second), listed)[0]
 
 
 @pytest.mark.slow

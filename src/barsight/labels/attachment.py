@@ -37,8 +37,9 @@ class PlacedCode:
 @dataclass(frozen=True, eq=False)
 class Label:
     """A label. place_m: (3,) median position over its pictures. pictures: number that read this text;
-    agreement_ratio: their share of all that read anything there. is_sure: read by enough pictures and
-    contradicted by none. bundle: id of its bundle, None if it is on no known one. doubts: sentences.
+    agreement_ratio: their share of all that read anything there. is_sure: read by enough pictures,
+    contradicted by none, and clear of other bundles' borders. bundle: id of its bundle, None if it is on no
+    known one. doubts: sentences.
     """
 
     text: str
@@ -85,24 +86,33 @@ def _label(
     needed = MIN_NUMBER_PICTURES if group[0].kind == NUMBER else MIN_PICTURES
     if pictures < needed:
         doubts.append(f"read in {pictures} picture{'s' * (pictures > 1)}, {needed} are needed")
-    bundle = _bundle_at(place, bundles)
+    bundle, beside = _bundle_at(place, bundles)
+    if beside:
+        doubts.append(f"it lies on the border of {', '.join(f'bundle {one.id}' for one in beside)}")
     return Label(
         group[0].text, group[0].kind, place, pictures, pictures / (pictures + others), not doubts,
         None if bundle is None else bundle.id, tuple(doubts),
     )  # fmt: skip
 
 
-def _bundle_at(place_m: Float64, bundles: Sequence[Bundle]) -> Bundle | None:
-    """Find the bundle whose top carries a position, within BESIDE_M and BELOW_TOP_M; the highest of
-    several.
+def _bundle_at(place_m: Float64, bundles: Sequence[Bundle]) -> tuple[Bundle | None, list[Bundle]]:
+    """Find the bundle whose top carries a position, within BESIDE_M and BELOW_TOP_M; the highest of several
+    if it lies well inside, otherwise the one inside which it lies furthest, with the others that may carry
+    it.
     """
     found = []
     for bundle in bundles:
         across, along = _across_along(bundle, place_m)
-        beside = across <= bundle.width_m / 2 + BESIDE_M and along <= bundle.length_m / 2 + BESIDE_M
-        if beside and abs(place_m[2] - bundle.top_z_m) <= BELOW_TOP_M:
-            found.append(bundle)
-    return max(found, key=lambda bundle: bundle.top_z_m, default=None)
+        inside_m = min(bundle.width_m / 2 - across, bundle.length_m / 2 - along)
+        if inside_m >= -BESIDE_M and abs(place_m[2] - bundle.top_z_m) <= BELOW_TOP_M:
+            found.append((bundle, inside_m))
+    if not found:
+        return None, []
+    best, inside_m = max(found, key=lambda one: one[0].top_z_m)
+    if inside_m >= BESIDE_M:
+        return best, []
+    best, _ = max(found, key=lambda one: one[1])
+    return best, [bundle for bundle, _ in found if bundle is not best]
 
 
 def _across_along(bundle: Bundle, place_m: Float64) -> tuple[float, float]:
@@ -127,7 +137,7 @@ def contradictions(
         if one is None:
             found.append(f"label {label.text!r} is not in the list")
             continue
-        if label.text in seen:
+        if label.text in seen and (label.bundle is None or label.bundle != seen[label.text].bundle):
             found.append(f"label {label.text!r} lies at two places")
         seen[label.text] = label
         if label.bundle is not None and not _listed_there(one, by_id[label.bundle]):

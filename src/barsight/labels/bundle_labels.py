@@ -43,8 +43,9 @@ def label_bundles(
 ) -> tuple[Bundle, ...]:  # fmt: skip
     """Read the labels in the pairs that have a pose, and assign each bundle its own.
 
-    poses: reference_from_body by stamp. A bundle gets a label if exactly one text is read on it, and surely.
-    If something is read but isn't sure, or only a plate of a label's size is seen, the label is illegible.
+    poses: reference_from_body by stamp. A bundle gets a label if exactly one text is read on it, surely, and
+    on no other bundle. If something is read but isn't sure, or only a plate of a label's size is seen, the
+    label is illegible.
     Raises ConfigError without the extra `labels`.
     """
     labels = merge_codes(read_texts(pairs, poses, heights, bundles, settings), bundles)
@@ -138,11 +139,12 @@ def _on_the_map(heights: YardMap, origin: Float64, direction: Float64) -> Float6
     return first_surface(part_about(heights, ends[:, 0], ends[:, 1]), origin, direction)
 
 
-def bundle_label(bundle: Bundle, labels: Iterable[Label]) -> BundleLabel | None:
+def bundle_label(bundle: Bundle, labels: Sequence[Label]) -> BundleLabel | None:
     """Choose a bundle's label from all that were read; see `label_bundles`."""
     here = [label for label in labels if label.bundle == bundle.id]
     sure = {label.text for label in here if label.is_sure}
-    if len(sure) == 1 and all(label.text in sure for label in here):
+    elsewhere = {label.text for label in labels if label.is_sure and label.bundle not in (bundle.id, None)}
+    if len(sure) == 1 and all(label.text in sure for label in here) and not sure & elsewhere:
         best = max(here, key=lambda label: label.pictures)
         read = round(best.pictures / best.agreement_ratio)
         return BundleLabel(best.text, best.kind, best.pictures, (best.pictures + 1) / (read + 2))
