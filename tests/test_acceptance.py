@@ -266,6 +266,23 @@ def test_repeats_are_judged_by_their_upper_bound() -> None:
     assert not any(q.group == "repeat_mm" for q in judge_all(plan, [observed(plan, off_by(), rng)]))
 
 
+def test_the_bound_of_the_repeatability_holds_where_whole_recordings_are_shifted() -> None:
+    """A crane that is 2 mm off (1 sigma) shifts all artefacts of a recording alike: few degrees of freedom,
+    however many artefacts there are.
+    """
+    plan = replace(planned(), dummy_bundle=())
+
+    def repeated(recordings: int, rng: np.random.Generator) -> tuple[float, float]:
+        shifts = rng.normal(0, 0.002, (recordings, 3))
+        seen = [observed(plan, lambda place, off=off: place + off, rng) for off in shifts]
+        (repeat,) = (q for q in judge_all(plan, seen) if q.group == "repeat_mm")
+        return repeat.error, repeat.error + repeat.uncertainty.expanded
+
+    truth = repeated(150, np.random.default_rng(8))[0]
+    held = [truth <= repeated(3, np.random.default_rng((9, seed)))[1] for seed in range(60)]
+    assert np.mean(held) > 0.9, "95 %"
+
+
 def test_a_recording_given_twice_proves_no_repeatability(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

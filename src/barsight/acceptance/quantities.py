@@ -28,6 +28,8 @@ from barsight.yard.magnet.description import MagnetOffset
 from barsight.yard.types import Bundle
 from barsight.yard.weight import bundle_mass
 
+AXES = {"height": "z", "x": "x", "y": "y", "z": "z", "lift across": "x", "lift z": "z"}
+"""Axis along which a quantity, by the end of its name, is a place; a dummy bundle lies across X."""
 REPEATED = ("height_mm", "position_mm", "length_mm", "step_mm", "lift_mm")
 """Groups of lengths whose repeatability over the recordings is judged."""
 
@@ -193,17 +195,14 @@ class _Judge:
         """Judge twice the pooled standard deviation over the recordings; U extends to its upper 95 %
         bound.
         """
-        rows = [np.array(q.errors) for q in judged if q.group in REPEATED]
-        rows = [row[np.isfinite(row)] for row in rows]
-        free = sum(row.size - 1 for row in rows if row.size > 1)
-        if free < 1:
+        rows = [q for q in judged if q.group in REPEATED and np.isfinite(q.errors).all()]
+        if len(self._seen) < 2 or not rows:
             return
-        scatter = np.sqrt(sum(float(row.var(ddof=1)) * (row.size - 1) for row in rows if row.size > 1) / free)
-        upper = float(2 * scatter * (np.sqrt(free / chi2.ppf(0.05, free)) - 1))
-        part = UncertaintyPart("few repeats", upper / 2, "chi-square", float(free), "this test")
-        yield self._judged(
-            "repeatability, 2 s", "repeat_mm", [2 * float(scatter)], [part], "", expanded=upper
-        )  # fmt: skip
+        off = np.array([q.errors for q in rows])
+        scatter, free = float(np.sqrt(off.var(axis=1, ddof=1).mean())), _repeat_freedom(rows)
+        upper = 2 * scatter * (np.sqrt(free / chi2.ppf(0.05, free)) - 1)
+        part = UncertaintyPart("few repeats", upper / 2, "chi-square", free, "this test")
+        yield self._judged("repeatability, 2 s", "repeat_mm", [2 * scatter], [part], "", expanded=upper)
 
     def _judged(
         self, name: str, group: str, errors: Sequence[float], parts: Sequence[UncertaintyPart], reason: str,
@@ -237,6 +236,25 @@ class _Judge:
     @property
     def _expansion(self) -> float:
         return self._plan.conditions.expansion
+
+
+def _repeat_freedom(rows: Sequence[JudgedQuantity]) -> float:
+    """Estimate the degrees of freedom of a scatter over recordings [Welch 1947]. A recording shifts all
+    places alike along an axis, which counts once; distances follow from the places and don't count where
+    there are any.
+    """
+    axes = [AXES.get(q.name.rpartition(": ")[2], "") if q.group != "step_mm" else "" for q in rows]
+    if not any(axes):
+        axes = [q.name for q in rows]
+    squares, squared = 0.0, 0.0
+    for axis in {*axes} - {""}:
+        off = np.array([q.errors for q, own in zip(rows, axes, strict=True) if own == axis])
+        off = off - off.mean(axis=1, keepdims=True)
+        common, count = len(off) * float((off.mean(axis=0) ** 2).sum()), off.shape[1] - 1
+        rest = float((off**2).sum()) - common
+        squares += common + rest
+        squared += common**2 / count + (rest**2 / count / (len(off) - 1) if len(off) > 1 else 0.0)
+    return squares**2 / squared if squared > 0 else float(len(rows[0].errors) - 1)
 
 
 def _why(found: Sequence[object]) -> str:
