@@ -197,6 +197,7 @@ DRIFTED = RigCheck(
     [
         ({"count": 2}, "3 are the least"),
         ({"artefacts": 2}, "are on 2 artefacts, 3 are the least"),
+        ({"artefacts": 3}, "its touch-downs span 0.8 m of 2.7 m along x"),
         ({"offset": OFFSET}, "accept without --magnet"),
         ({"stray_m": 0.04}, "touch 2 lies"),
         ({"count": 12, "apart_m": 0.02}, "lie in two groups"),

@@ -21,6 +21,10 @@ from barsight.yard.magnet.description import MAX_OFFSET_M, MagnetOffset
 
 MIN_ARTEFACTS = 3
 """Minimum number of artefacts that are touched: each is seen with an error that all its touch-downs share."""
+MIN_SPAN_RATIO = 0.5
+"""Minimum ratio, along X and Y, of the span of the touched artefacts to that of all: beyond it a yard frame
+that is turned against the crane's axes makes another offset.
+"""
 MAX_APART_M = 0.1
 """Maximum spread (m) along one axis of touch-downs made by one magnet at rest."""
 MIN_PARTED, DRAWS = 10.0, 20_000
@@ -44,6 +48,7 @@ def touched_offset(certificate: Path) -> MagnetOffset:
         own_m = 1e-3 * max((float(row["uncertainty"]["sigma"]) for row in rows), default=0.0)
         ids = str(content["calibration_id"]), str(content["yard_frame_id"])
         touched = {str(one["name"]): str(one["on"]) for one in content["plan"]["touch_down"]}
+        _expect_spread(certificate, content["plan"], set(touched.values()))
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(certificate, f"is damaged ({type(error).__name__}: {error})", OTHER) from error
     errors_m = [_mean_touch_m(certificate, axis, touches.get(axis, {}), touched, own_m) for axis in "xyz"]
@@ -70,6 +75,22 @@ def _expect_sound(certificate: Path, content: dict[str, Any]) -> None:
     ]
     if wrong:
         raise InputError(certificate, f"its rig isn't accepted ({wrong[0]})", "mend the rig, then touch down")
+
+
+def _expect_spread(certificate: Path, plan: dict[str, Any], touched: set[str]) -> None:
+    """Raise InputError where the artefacts that tell x and y were touched at one side of the yard only."""
+    told = {str(one["name"]) for kind in ("sphere", "dummy_bundle") for one in plan[kind]} & touched
+    for axis in "xy":
+        places = {
+            str(one["name"]): float(one[f"{axis}_m"])
+            for kind in ("plate", "sphere", "dummy_bundle")
+            for one in plan[kind]
+        }
+        whole_m = max(places.values()) - min(places.values())
+        own = [places[name] for name in told]
+        if len(told) >= MIN_ARTEFACTS and max(own) - min(own) < MIN_SPAN_RATIO * whole_m:
+            problem = f"its touch-downs span {max(own) - min(own):.1f} m of {whole_m:.1f} m along {axis}"
+            raise InputError(certificate, problem, "touch artefacts at both ends of the yard too")
 
 
 def _mean_touch_m(
