@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import chi2
 from scipy.stats import t as student
 
 from barsight.acceptance.certificate import REMEDY as OTHER
@@ -17,7 +18,7 @@ from barsight.core.errors import InputError
 from barsight.core.reading.bounded_reading import in_range
 from barsight.motion.rig_check.drift_check import BAD_STATES
 from barsight.registration.agreement import DOUBTFUL
-from barsight.yard.magnet.description import MAX_OFFSET_M, MagnetOffset
+from barsight.yard.magnet.description import MAX_OFFSET_M, MagnetOffset, Tolerance
 
 MIN_ARTEFACTS = 3
 """Minimum number of artefacts that are touched: each is seen with an error that all its touch-downs share."""
@@ -33,13 +34,14 @@ samples by which the chance of a larger one is found.
 """
 
 
-def touched_offset(certificate: Path) -> MagnetOffset:
+def touched_offset(certificate: Path, tolerance: Tolerance) -> MagnetOffset:
     """Average the touch-downs of a certificate into the magnet's offset from where the crane's readings place
     it.
 
     The mean is that of the artefacts' means. Its sigma is the largest of the artefacts' scatter and the
     scatter of all, each over the root of its number, and of what the sigma of a reading leaves, widened so
-    that two sigma cover 95.45 % by Student's t. Raises InputError where the certificate is unsuitable.
+    that two sigma cover 95.45 % by Student's t. Raises InputError where the certificate is unsuitable, or the
+    crane doesn't keep the magnet's tolerance.
     """
     content, touches = read_certificate(certificate), touch_errors_m(certificate)
     try:
@@ -52,6 +54,7 @@ def touched_offset(certificate: Path) -> MagnetOffset:
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(certificate, f"is damaged ({type(error).__name__}: {error})", OTHER) from error
     errors_m = [_mean_touch_m(certificate, axis, touches.get(axis, {}), touched, own_m) for axis in "xyz"]
+    _expect_kept(certificate, touches, tolerance)
     (x, x_sigma), (y, y_sigma), (z, z_sigma) = errors_m
     max_m = max(abs(x), abs(y), abs(z))
     if max_m > MAX_OFFSET_M:
@@ -91,6 +94,21 @@ def _expect_spread(certificate: Path, plan: dict[str, Any], touched: set[str]) -
         if len(told) >= MIN_ARTEFACTS and max(own) - min(own) < MIN_SPAN_RATIO * whole_m:
             problem = f"its touch-downs span {max(own) - min(own):.1f} m of {whole_m:.1f} m along {axis}"
             raise InputError(certificate, problem, "touch artefacts at both ends of the yard too")
+
+
+def _expect_kept(certificate: Path, touches: Mapping[str, Mapping[str, float]], tolerance: Tolerance) -> None:
+    """Raise InputError where two sigmas of the touch-downs' scatter, by its lower 95 % bound, are more than
+    the accuracy with which the crane is said to set the magnet down.
+    """
+    for axis, stated_m in (("x", tolerance.x_m), ("y", tolerance.y_m)):
+        errors = np.array(list(touches.get(axis, {}).values()))
+        if len(errors) < 2:
+            continue
+        scatter_m = float(errors.std(ddof=1))
+        if 2 * scatter_m / (chi2.ppf(0.95, len(errors) - 1) / (len(errors) - 1)) ** 0.5 > stated_m:
+            problem = f"its touch-downs scatter by {1e3 * scatter_m:.0f} mm (1 sigma) along {axis}"
+            remedy = f"find out why, or state a larger tolerance than {axis}_m = {stated_m:g}"
+            raise InputError(certificate, f"{problem}, more than the magnet's tolerance holds", remedy)
 
 
 def _mean_touch_m(

@@ -37,9 +37,10 @@ def run(arguments: Sequence[str]) -> None:
             out: The .toml file to write.
         """
         expect_output(out, ".toml")
-        if load_magnet(magnet).offset is not None:
+        described = load_magnet(magnet)
+        if described.offset is not None:
             raise InputError(magnet, "has an [offset] already", "give the file without it")
-        offset = asdict(touched_offset(certificate))
+        offset = asdict(touched_offset(certificate, described.tolerance))
         lines = [f"{name} = {_value(value)}" for name, value in offset.items()]
         with atomic_path(out) as path:
             text = magnet.read_text("utf-8").rstrip("\n")
