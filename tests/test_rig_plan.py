@@ -115,6 +115,11 @@ def over_planned(path: Path) -> list[float]:
     [
         (("--range", "8", "--width", "12", "--sigma", "0.001"), 5, "needs a baseline of 5.15 m"),
         (("--range", "20", "--width", "12", "--bar-diameter", "0.01"), 5, "take a camera of more pixels"),
+        (
+            ("--range", "5", "--width", "3", "--stack", "4", "--bar-diameter", "0.02", "--camera", "1.3MP"),
+            5,
+            "12 mm needs f/12 to be sharp from 1 to 5 m",
+        ),
         (("--range", "8", "--width", "12", "--stack", "7"), 2, "less than a fifth of the range"),
         (("--range", "-8", "--width", "12"), 2, "--range must lie in 0.5...60 m, not -8"),
         (("--range", "8", "--width", "12", "--bar-diameter", "9"), 2, "--bar-diameter must lie in 0.005"),

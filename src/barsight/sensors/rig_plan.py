@@ -208,7 +208,12 @@ def _with_baseline(wish: Wish, camera: CatalogueCamera, focal_mm: float, passes:
         )
     exposure_us = 1e6 * MAX_BLUR_PX / (f * (wish.speed_mps / near + TURN_RADPS))
     needed = (focal_mm * 1e-3) ** 2 * wish.stack_m / (2 * wish.range_m * near * camera.pixel_um * 1e-6)
-    f_number = next((stop for stop in STOPS if stop >= needed), STOPS[-1])
+    f_number = next((stop for stop in STOPS if stop >= needed), None)
+    if f_number is None:
+        raise MeasurementError(
+            f"{focal_mm:g} mm needs f/{needed:.0f} to be sharp from {near:g} to {wish.range_m:g} m, lenses "
+            f"close to f/{STOPS[-1]:g}; hang it higher, lower the piles or take a camera of larger pixels"
+        )
     common_m = camera.width_px * near / f - baseline_m
     rate_hz = math.ceil(max(MIN_VIEWS * wish.speed_mps / common_m, MIN_RATE_HZ))
     if rate_hz > camera.max_rate_hz:
