@@ -96,20 +96,44 @@ def name_causes(
     rows = [row for view in seen for row in _artefact_rows(plan, view)]
     rows += [row for check in checks if not isinstance(check, Failed) for row in _travel_rows(check)]
     causes += _ratio_causes(checks)
-    found = _best_cause(rows)
+    found = _best_cause(_over_recordings(rows))
     return tuple([*causes, found] if found is not None else causes)
 
 
 @dataclass(frozen=True, eq=False)
 class _Row:
-    """An error, its sigma, and its derivatives with respect to the UNKNOWNS. artefact: name, empty for
-    travel.
+    """An error and its derivatives with respect to the UNKNOWNS. noise: sigma that each recording draws anew;
+    shared: that of the survey or calibration, the same in all. artefact: name, empty for travel. what: name
+    of the error, empty where each recording shows another one.
     """
 
     artefact: str
+    what: str
     error: float
-    sigma: float
+    noise: float
+    shared: float
     answer: Float64
+
+    @property
+    def sigma(self) -> float:
+        """Return the sigma of the error."""
+        return float(np.hypot(self.noise, self.shared))
+
+
+def _over_recordings(rows: Sequence[_Row]) -> list[_Row]:
+    """Average each error over the recordings, which leaves the part of its sigma that they share."""
+    groups: dict[tuple[str, str], list[_Row]] = {}
+    for number, row in enumerate(rows):
+        groups.setdefault((row.artefact, row.what or str(number)), []).append(row)
+    return [
+        replace(
+            group[0],
+            error=float(np.mean([row.error for row in group])),
+            noise=float(np.linalg.norm([row.noise for row in group])) / len(group),
+            answer=np.mean([row.answer for row in group], axis=0),
+        )
+        for group in groups.values()
+    ]
 
 
 def _best_cause(rows: Sequence[_Row]) -> Cause | None:
@@ -170,8 +194,8 @@ def _artefact_rows(plan: AcceptancePlan, view: Observation) -> Iterator[_Row]:
         if not isinstance(found, Failed):
             place = np.array([plate.x_m, plate.y_m, plate.z_m])
             noise = np.hypot(1e-3 * PLATE_MM, PLATE_PX * view.view.px_m(plate.z_m))
-            error, sigma_m = found.z_m - plate.z_m, float(np.hypot(noise, plate.sigma_m))
-            yield _Row(plate.name, error, sigma_m, _moves(view.view, place)[2])
+            error, answer = found.z_m - plate.z_m, _moves(view.view, place)[2]
+            yield _Row(plate.name, "z", error, float(noise), plate.sigma_m, answer)
     for sphere in plan.sphere:
         seen = view.spheres[sphere.name]
         if isinstance(seen, Failed) or sphere.place_sigma_m is None:
@@ -180,9 +204,9 @@ def _artefact_rows(plan: AcceptancePlan, view: Observation) -> Iterator[_Row]:
         noise = np.hypot(1e-3 * PLACE_MM, PLACE_PX * (view.view.camera_m[2] - place[2]) / view.view.focal_px)
         noises = [noise, noise, np.hypot(1e-3 * SPHERE_MM, SPHERE_PX * view.view.px_m(place[2]))]
         for k, answer in enumerate(_moves(view.view, place)):
-            sigma_m = float(np.hypot(noises[k], sphere.place_sigma_m))
             answer[-1] = -1.0 if k == 2 else 0.0
-            yield _Row(sphere.name, float(seen.centre_m[k] - place[k]), sigma_m, answer)
+            error = float(seen.centre_m[k] - place[k])
+            yield _Row(sphere.name, "xyz"[k], error, float(noises[k]), sphere.place_sigma_m, answer)
     known = {s.name: s for s in plan.sphere}
     for bar in plan.sphere_bar:
         ends = [known[name] for name in bar.spheres]
@@ -195,7 +219,7 @@ def _artefact_rows(plan: AcceptancePlan, view: Observation) -> Iterator[_Row]:
         direction = (second - first) / np.linalg.norm(second - first)
         answer = direction @ (_moves(view.view, second) - _moves(view.view, first))
         error = float(np.linalg.norm(b.centre_m - a.centre_m)) - bar.length_m * plan.conditions.expansion
-        yield _Row(bar.name, error, float(np.hypot(2e-3 * PLACE_MM, bar.sigma_m)), answer)
+        yield _Row(bar.name, "length", error, 2e-3 * PLACE_MM, bar.sigma_m, answer)
 
 
 def _moves(view: ViewGeometry, place: Float64) -> Float64:
@@ -227,14 +251,17 @@ def _travel_rows(check: RigCheck) -> Iterator[_Row]:
     if not isinstance(rows, Failed):
         answer = np.zeros(len(UNKNOWNS))
         answer[0] = 1.0
-        yield _Row("", float(rows.values[3]), float(check.row_sigmas[3]), answer)
+        noise, sigma = float(rows.sigmas[3]), float(check.row_sigmas[3])
+        yield _Row(
+            "", "yaw by rows", float(rows.values[3]), noise, max(sigma**2 - noise**2, 0.0) ** 0.5, answer
+        )
     if isinstance(drift, Failed):
         return
     for row, seen, variance in zip(*drift.by_travel(), strict=True):
         answer = np.zeros(len(UNKNOWNS))
         # A baseline longer than calibrated means a calibrated one that is too short: flip its sign.
         answer[:2] = row * (1, -1)
-        yield _Row("", float(seen), float(variance**0.5), answer)
+        yield _Row("", "", float(seen), float(variance**0.5), 0.0, answer)
 
 
 def _ratio_causes(checks: Sequence[RigCheck | Failed]) -> Iterator[Cause]:
