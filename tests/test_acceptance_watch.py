@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from barsight.acceptance.watch import (
     control_charts,
     feature_figures,
     read_watch,
+    rig_figures,
     tag_figures,
     with_survey,
     write_watch,
@@ -23,6 +25,7 @@ from barsight.cli.acceptance import verify
 from barsight.cli.main import run
 from barsight.core.errors import Failed, InputError
 from barsight.motion.rig_check.drift_check import RigCheck
+from barsight.motion.rig_check.epipolar_error import RowDrift
 from barsight.registration.surveyed_targets import SurveyedTags
 from barsight.registration.tags import PlacedTag
 from test_acceptance import CLEAN, observed, planned
@@ -100,6 +103,28 @@ def test_a_stray_survey_among_those_that_are_learned_hides_no_later_jump() -> No
         alarm = first_alarm([survey(k, rng, yaw_deg=shift) for k, shift in enumerate(shifts)])
         told += alarm is not None and alarm > 10
     assert told >= 38
+
+
+def test_travel_of_unequal_length_is_no_drift_of_the_yaw() -> None:
+    """A calibration that is a little wrong shifts the yaw by rows only, the same in every survey."""
+
+    def seen(rng: np.random.Generator, shift_deg: float, jump_deg: float) -> RigCheck:
+        by_rows, by_travel = 0.0014, float(rng.choice([0.0015, 0.015]))
+        yaw = np.radians([shift_deg + jump_deg + rng.normal(0, by_rows), jump_deg + rng.normal(0, by_travel)])
+        covariance = np.diag(np.radians([0.001, 0.001, 0.001, by_rows]) ** 2)
+        nothing = np.zeros(1)
+        rows = RowDrift(np.append(np.zeros(3), yaw[0]), covariance, 0.0, 0.1, 900, 10, nothing, nothing)
+        travel = SimpleNamespace(yaw_rad=yaw[1], yaw_sigma_rad=np.radians(by_travel))
+        return RigCheck((), rows, travel, 7.0, np.radians([*[1e-3] * 3, 0.0078]))  # type: ignore[arg-type]
+
+    for jump_deg in (0.0, 0.01):
+        alarms = []
+        for seed in range(20):
+            rng = np.random.default_rng((44, seed))
+            checks = [seen(rng, 0.0078, jump_deg * (k >= 17)) for k in range(20)]
+            drawn = [WatchedSurvey("r", str(k), "cal", rig_figures(one)) for k, one in enumerate(checks)]
+            alarms.append(first_alarm(drawn))
+        assert alarms == [None] * 20 if jump_deg == 0 else all(a is not None and a > 17 for a in alarms)
 
 
 def test_a_figure_that_is_no_longer_seen_has_no_value() -> None:

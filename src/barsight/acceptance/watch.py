@@ -16,7 +16,6 @@ from scipy.stats import t as student
 from barsight.acceptance.observation import Observation
 from barsight.acceptance.pictures import PictureHealth
 from barsight.artefacts.plan import AcceptancePlan
-from barsight.core.arrays import Float64
 from barsight.core.errors import Failed, InputError
 from barsight.core.json_values import json_value
 from barsight.core.reading.json_schema import expect_schema, list_schema, record_schema
@@ -122,9 +121,11 @@ class ControlChart:
 
 
 def rig_figures(check: RigCheck) -> tuple[WatchedFigure, ...]:
-    """Extract the rig's figures from rows and travel: baseline, pitch, roll, focal ratio, and the weighted
-    mean of the yaw from both. The calibration's uncertainty is the same in all surveys, so sigmas cover noise
-    only.
+    """Extract the rig's figures from rows and travel: baseline, pitch, roll, focal ratio, and the yaw by each
+    of both. The calibration's uncertainty is the same in all surveys, so sigmas cover noise only.
+
+    It shifts the yaw by rows against that by travel, which therefore aren't averaged: their weights change
+    with the travel.
     """
     noise = {} if isinstance(check.rows, Failed) else dict(
         zip(("pitch", "roll", "focal ratio"), check.rows.sigmas / check.row_sigmas, strict=False)
@@ -134,16 +135,12 @@ def rig_figures(check: RigCheck) -> tuple[WatchedFigure, ...]:
         for line in check.lines
         if isfinite(line.value) and isfinite(line.sigma) and not line.name.startswith("yaw")
     ]
-    estimates = []
     if not isinstance(check.rows, Failed):
-        estimates.append((float(check.rows.values[3]), float(check.rows.sigmas[3])))
+        yaw, sigma = np.degrees([check.rows.values[3], check.rows.sigmas[3]]).tolist()
+        figures.append(WatchedFigure("yaw by rows / deg", yaw, sigma))
     if not isinstance(check.drift, Failed):
-        estimates.append((check.drift.yaw_rad, check.drift.yaw_sigma_rad))
-    if estimates:
-        values, sigmas = np.degrees(np.array(estimates).T)
-        weight = sigmas**-2.0
-        yaw = float((weight * values).sum() / weight.sum())
-        figures.append(WatchedFigure("yaw / deg", yaw, float(weight.sum() ** -0.5)))
+        yaw, sigma = np.degrees([check.drift.yaw_rad, check.drift.yaw_sigma_rad]).tolist()
+        figures.append(WatchedFigure("yaw by travel / deg", yaw, sigma))
     return tuple(figures)
 
 
@@ -239,31 +236,52 @@ def _chart(name: str, surveys: Sequence[WatchedSurvey]) -> ControlChart:
     value = rows[-1][1].value if rows[-1][0] == len(surveys) else np.nan
     if len(rows) < LEARNED:
         return ControlChart(name, value, np.nan, np.nan, 0.0, None)
-    learned = _without_stray([figure for _, figure in rows[:LEARNED]])
-    mean, scatter = float(learned.mean()), float(learned.std(ddof=1))
-    spread = (1 + 1 / len(learned)) ** 0.5  # the learned mean is uncertain too
+    normal = _Normal.without_stray([figure for _, figure in rows[:LEARNED]])
     up = down = 0.0
     alarmed, sigma = None, np.nan
     for number, figure in rows[LEARNED:]:
-        sigma = scatter if scatter > DOUBTED * figure.sigma else figure.sigma
-        off = (figure.value - mean) / (spread * sigma)
+        sigma, off = normal.ratio * figure.sigma, normal.deviation(figure)
         up, down = max(up + off - SLACK, 0.0), max(down - off - SLACK, 0.0)
         if max(up, down) > ALARM and alarmed is None:
             alarmed = number
-    return ControlChart(name, value, mean, sigma, max(up, down), alarmed)
+    return ControlChart(name, value, normal.mean, sigma, max(up, down), alarmed)
 
 
-def _without_stray(figures: Sequence[WatchedFigure]) -> Float64:
-    """Return the values without one that lies far from the others by their stated sigma or, where they
-    scatter more, by Grubbs' test; it would widen what is normal so far that no jump raised an alarm.
+@dataclass(frozen=True)
+class _Normal:
+    """The normal value of a figure: weighted mean of some surveys and its stated sigma. ratio: of their
+    scatter to their stated sigmas where it is over DOUBTED, otherwise 1. count: number of surveys.
     """
-    values = np.array([figure.value for figure in figures])
-    far = int(np.abs(values - np.median(values)).argmax())
-    others = np.delete(values, far)
-    scatter, sigma = float(others.std(ddof=1)), figures[far].sigma
-    sigma, free = (scatter, len(others) - 1) if scatter > DOUBTED * sigma else (sigma, inf)
-    ratio = abs(values[far] - others.mean()) / sigma / (1 + 1 / len(others)) ** 0.5
-    return others if len(values) * 2 * student.sf(ratio, free) < DOUBTFUL else values
+
+    mean: float
+    sigma: float
+    ratio: float
+    count: int
+
+    @classmethod
+    def of(cls, figures: Sequence[WatchedFigure]) -> _Normal:
+        """Learn it from surveys."""
+        values = np.array([figure.value for figure in figures])
+        weights = np.array([figure.sigma for figure in figures]) ** -2.0
+        mean = float(weights @ values / weights.sum())
+        ratio = float(weights @ (values - mean) ** 2 / (len(values) - 1)) ** 0.5
+        return cls(mean, float(weights.sum() ** -0.5), ratio if ratio > DOUBTED else 1.0, len(values))
+
+    @classmethod
+    def without_stray(cls, figures: Sequence[WatchedFigure]) -> _Normal:
+        """Learn it without one that lies far from the others by their stated sigmas or, where they scatter
+        more, by Grubbs' test; it would widen what is normal so far that no jump raised an alarm.
+        """
+        middle = np.median([figure.value for figure in figures])
+        far = max(figures, key=lambda figure: abs(figure.value - middle) / figure.sigma)
+        others = cls.of([figure for figure in figures if figure is not far])
+        free = others.count - 1 if others.ratio > 1 else inf
+        chance = len(figures) * 2 * student.sf(abs(others.deviation(far)), free)
+        return others if chance < DOUBTFUL else cls.of(figures)
+
+    def deviation(self, figure: WatchedFigure) -> float:
+        """Compute a figure's deviation in sigmas of its own and of the mean."""
+        return (figure.value - self.mean) / (self.ratio * float(np.hypot(figure.sigma, self.sigma)))
 
 
 def read_watch(path: Path) -> WatchRecord:
