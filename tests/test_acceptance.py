@@ -41,6 +41,7 @@ from barsight.simulation.rays import cast_rays
 from barsight.simulation.settings.recording import SimulationSettings
 from barsight.simulation.worlds.artefacts import lay_artefacts
 from barsight.yard.types import HeightMap
+from lift_yards import laid, record
 
 AREA = Area((0.2, 3.8), (-1.35, 1.35), 4.5, 625.0, 0.5)
 SPHERE = Sphere("ball", 1.03, 0.51, 0.4, 0.3, place_sigma_m=0.0005)
@@ -328,6 +329,20 @@ def test_a_touch_down_is_held_against_what_was_touched() -> None:
     assert judged["touch 1: y"].error == pytest.approx(-4, abs=5)
     assert judged["touch 2: z"].error == pytest.approx(20, abs=4)
     assert judged["touch 2: z"].decision is Decision.FAILED and "touch 2: x" not in judged
+
+
+def test_a_touch_down_on_a_dummy_with_an_open_end_tells_its_height_only() -> None:
+    """Its middle isn't seen: the touch-down would be as far off as half of what is missing."""
+    plan = planned()
+    (dummy,) = plan.dummy_bundle
+    place = np.array([dummy.x_m, dummy.y_m - 0.06, 0.2])
+    short = replace(record(laid(0.0)), centre_m=place, top_z_m=dummy.top_z_m)
+    touched = (TouchDown("touch", dummy.name, dummy.x_m, dummy.y_m, dummy.top_z_m),)
+    seen = observed(plan, off_by(), np.random.default_rng(7))
+    for ends_open, axes in (((False, True), "z"), ((False, False), "xyz")):
+        view = replace(seen, bundles={dummy.name: replace(short, ends_open=ends_open)})
+        judged = judge_all(replace(plan, touch_down=touched), [view])
+        assert [q.name for q in judged if q.group == "touch_mm"] == [f"touch: {axis}" for axis in axes]
 
 
 def pictures(faults: FaultSettings, seed: int) -> list[StereoFrame]:

@@ -176,7 +176,7 @@ class _Judge:
         for k, axis in enumerate("xyz"):
             errors = [o[k] for o in off]
             if all(np.isnan(errors)) and not all(isinstance(top, Failed) for top in tops):
-                continue  # a plate only shows its height
+                continue  # only its height is seen
             yield self._judged(f"{one.name}: {axis}", "touch_mm", errors, parts[k], _why(tops))
 
     def laser(self) -> Iterator[JudgedQuantity]:
@@ -277,15 +277,18 @@ def _bundle_errors(bundle: Bundle, dummy: DummyBundle) -> Float64:
 
 
 def _top(view: Observation, name: str, artefacts: Sequence[Artefact]) -> Float64 | Failed:
-    """Find the point (3,) m at which a magnet touches an artefact; NaN for a plate's x and y, which aren't
-    seen.
+    """Find the point (3,) m at which a magnet touches an artefact; NaN for the x and y of a plate, or of a
+    bundle with an open end, whose middle isn't seen.
     """
     if name in view.plates:
         plate = view.plates[name]
         return plate if isinstance(plate, Failed) else np.array([nan, nan, plate.z_m])
     if name in view.bundles:
         bundle = view.bundles[name]
-        return bundle if isinstance(bundle, Failed) else np.array([*bundle.centre_m[:2], bundle.top_z_m])
+        if isinstance(bundle, Failed):
+            return bundle
+        middle = (nan, nan) if any(bundle.ends_open) else bundle.centre_m[:2]
+        return np.array([*middle, bundle.top_z_m])
     sphere = view.spheres[name]
     if isinstance(sphere, Failed):
         return sphere
