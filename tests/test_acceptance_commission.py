@@ -1,5 +1,6 @@
 """The guided way: steps are done once, again where something changed, and end in a certificate."""
 
+import json
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -126,6 +127,19 @@ def test_a_new_folder_says_what_to_bring(tmp_path: Path, capsys: pytest.CaptureF
     settings.write_text(settings.read_text().replace("range_m = 7.0", "range_m = -7.0"))
     assert run(["commission", str(tmp_path / "crane")]) == 2
     assert "range_m must be positive" in capsys.readouterr().err
+
+
+def test_a_rig_file_whose_report_says_redo_is_not_brought_along(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As where the pictures of a calibration that failed are taken away."""
+    begin(tmp_path / "crane")
+    (tmp_path / "crane" / "rig.yaml").write_text("cameras: []")
+    report = tmp_path / "crane" / "rig.json"
+    for verdict, reason in (("redo", "rig.json: says redo of rig.yaml"), ("usable", "next: a recording of")):
+        report.write_text(json.dumps({"verdict": verdict}))
+        assert run(["commission", str(tmp_path / "crane")]) == 5
+        assert reason in capsys.readouterr().err.replace("\n", " ")
 
 
 def tags_between(plan: AcceptancePlan) -> str:

@@ -17,6 +17,7 @@ from barsight.acceptance.commissioning import (
     read_done,
     walk,
 )
+from barsight.calibration.stereo.verdict import Verdict
 from barsight.cli import measure
 from barsight.cli.acceptance import accept
 from barsight.cli.arguments import call
@@ -87,7 +88,7 @@ def guided_steps(folder: Path, settings: CommissionSettings) -> tuple[GuidedStep
         bring = "targets as surveyed and as measured in measured/, as targets.csv"
         steps.insert(3, GuidedStep("yard frame", ("targets.csv", "measured"), way.framed, bring, way.targets))
     if (folder / "rig.yaml").exists() and not (folder / "board").exists():
-        steps[0] = GuidedStep("cameras", rig, (), "", lambda: "rig.yaml was brought along")
+        steps[0] = GuidedStep("cameras", rig, (), "", way.brought)
     return tuple(steps)
 
 
@@ -117,6 +118,15 @@ class _Way:
         words = ["--board", self.settings.board, "--range-m", str(self.settings.range_m)]
         stereo.run([self._at("board"), *words, "-o", self._at("rig.yaml")])
         return str(read_json(self.folder / "rig.json", REMEDY)["verdict"])
+
+    def brought(self) -> str:
+        """Take a rig file from elsewhere, unless the report beside it says redo."""
+        report = self.folder / "rig.json"
+        told = read_json(report, REMEDY) if report.exists() else None
+        if isinstance(told, dict) and told.get("verdict") == Verdict.REDO:
+            remedy = "bring new pictures into board/, or another rig.yaml with its own rig.json"
+            raise MeasurementError(f"{report}: says redo of rig.yaml; {remedy}")
+        return "rig.yaml was brought along"
 
     def travel(self) -> str:
         check.run([self._at("survey"), *self._rig, "-o", self._at("check.json")])
