@@ -21,6 +21,7 @@ from barsight.acceptance.watch import (
     with_survey,
     write_watch,
 )
+from barsight.artefacts.plan import ErrorLimits
 from barsight.cli.acceptance import verify
 from barsight.cli.main import run
 from barsight.core.errors import Failed, InputError
@@ -135,7 +136,7 @@ def test_a_figure_that_is_no_longer_seen_has_no_value() -> None:
     assert np.isnan(yaw.value) and np.isfinite(yaw.mean) and baseline.value == last.figures[0].value
 
 
-def test_a_rig_that_moved_before_its_first_survey_is_beyond_the_plans_limits() -> None:
+def test_a_rig_that_moved_before_its_first_survey_is_beyond_the_limits() -> None:
     plan = planned()
     for moved, said in (
         ((0, 0, 0), []), ((0, 0, 0.02), ["height of plates"]), ((-0.02, 0, 0), ["place of spheres along x"]),
@@ -144,7 +145,12 @@ def test_a_rig_that_moved_before_its_first_survey_is_beyond_the_plans_limits() -
         seen = observed(plan, lambda place, off=off: place + off, np.random.default_rng(43))
         figures = feature_figures(plan, seen)
         assert not isinstance(figures, Failed)
-        assert [one.partition(" is ")[0] for one in beyond_limits(plan, figures)] == said
+        assert [one.partition(" is ")[0] for one in beyond_limits(plan.limits, figures)] == said
+    tags = [
+        WatchedFigure(f"place of tags along {axis} / mm", 8.0, sigma)
+        for axis, sigma in (("x", 2.0), ("z", 1.0))
+    ]
+    assert beyond_limits(ErrorLimits(), tags) == ["place of tags along z is +8.0 mm off, the limit is 5"]
 
 
 def test_fixed_features_watch_mounting_and_yard_frame() -> None:

@@ -15,7 +15,7 @@ from scipy.stats import t as student
 
 from barsight.acceptance.observation import Observation
 from barsight.acceptance.pictures import PictureHealth
-from barsight.artefacts.plan import AcceptancePlan
+from barsight.artefacts.plan import AcceptancePlan, ErrorLimits
 from barsight.core.errors import Failed, InputError
 from barsight.core.json_values import json_value
 from barsight.core.reading.json_schema import expect_schema, list_schema, record_schema
@@ -53,6 +53,8 @@ _SCHEMA = record_schema(
     schema_version={"const": SCHEMA_VERSION}, content_sha256=_TEXT, surveys=list_schema(_SURVEY),
     approvals=list_schema(_APPROVAL),
 )  # fmt: skip
+TAGS = "place of tags along"
+"""Name of the tags' figures, without the axis."""
 SHARPNESS_SIGMA = 0.15
 """Standard deviation of the logarithm of a picture's sharpness, which varies between yards."""
 
@@ -187,17 +189,18 @@ def feature_figures(plan: AcceptancePlan, seen: Observation) -> tuple[WatchedFig
     return tuple(figures)
 
 
-def beyond_limits(plan: AcceptancePlan, figures: Sequence[WatchedFigure]) -> list[str]:
-    """List the fixed features that lie further off in the mean than the plan permits: what is normal is
+def beyond_limits(limits: ErrorLimits, figures: Sequence[WatchedFigure]) -> list[str]:
+    """List the fixed features whose mean error is beyond its limit by over two sigmas: what is normal is
     learned, so that a rig that moved before its first survey raises no alarm by the charts.
     """
-    limits = {"height of plates": plan.limits.height_mm, "place of spheres": plan.limits.position_mm}
-    return [
-        f"{figure.name.partition(' / ')[0]} is {figure.value:+.1f} mm off, the plan permits {limit:g}"
-        for figure in figures
-        for start, limit in limits.items()
-        if figure.name.startswith(start) and abs(figure.value) > limit
-    ]
+    found = []
+    for figure in figures:
+        name = figure.name.partition(" / ")[0]
+        limit = limits.height_mm if name in ("height of plates", f"{TAGS} z") else limits.position_mm
+        is_fixed = name.startswith(("height of plates", "place of spheres", TAGS))
+        if is_fixed and abs(figure.value) - 2 * figure.sigma > limit:
+            found.append(f"{name} is {figure.value:+.1f} mm off, the limit is {limit:g}")
+    return found
 
 
 def tag_figures(
@@ -215,7 +218,7 @@ def tag_figures(
         return Failed("not-found", "; ".join(one.reason for one in placed if isinstance(one, Failed)))
     off, variance = (np.mean(part, axis=0) for part in zip(*found, strict=True))
     return tuple(
-        WatchedFigure(f"place of tags along {axis} / mm", float(off[k]), float(variance[k] ** 0.5))
+        WatchedFigure(f"{TAGS} {axis} / mm", float(off[k]), float(variance[k] ** 0.5))
         for k, axis in enumerate("xyz")
     )
 

@@ -104,11 +104,11 @@ def _look(
     path: Path, settings: MeasureSettings, plan: AcceptancePlan | None, listed: SurveyedTags | None
 ) -> tuple[WatchedSurvey, RigCheck, list[str]]:
     """Compute a survey's figures; also return the rig's check and messages about dirty lenses and about
-    features that lie beyond the plan's limits.
+    features that lie beyond their limits.
     """
     source = in_yard(open_recording(path, settings.recording), settings.yard)
     check, health = look_at_rig(source, settings.recording.rig)
-    figures, beyond = rig_figures(check), list[str]()
+    figures = rig_figures(check)
     if not figures:
         why = "; ".join(one.reason for one in (check.rows, check.drift) if isinstance(one, Failed))
         raise MeasurementError(f"{path}: shows nothing of the rig ({why}); travel over more of the yard")
@@ -123,16 +123,17 @@ def _look(
             raise MeasurementError(
                 f"{path}: none of the plan's plates, or spheres, was found: {fixed.reason}"
             )
-        figures, beyond = figures + fixed, beyond_limits(plan, fixed)
+        figures += fixed
     if listed is not None:
         placed = tag_figures(listed, place_in_yard(source, listed, SafeConsole(stderr=True)))
         if isinstance(placed, Failed):
             raise MeasurementError(f"{path}: none of the listed tags was placed: {placed.reason}")
         figures += placed
-    limit = (ErrorLimits() if plan is None else plan.limits).dirt_pct
-    spoiled = [] if isinstance(health, Failed) else [one for one in health if one.dirt_pct > limit]
+    limits = ErrorLimits() if plan is None else plan.limits
+    spoiled = [] if isinstance(health, Failed) else [one for one in health if one.dirt_pct > limits.dirt_pct]
     ids = recording_id(source.digests()), calibration_id(source.rig)
     survey = WatchedSurvey(str(path), *ids, figures, placing_id(source))
+    beyond = beyond_limits(limits, figures)
     return survey, check, [f"dirty lens of {one.camera}" for one in spoiled] + beyond
 
 
