@@ -9,13 +9,17 @@ import cv2
 import numpy as np
 import pytest
 
+from barsight.calibration.files.rig_file import write_rig_file
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.cli.main import run
+from barsight.core.errors import InputError
 from barsight.core.pose import Pose
 from barsight.labels.attachment import PlacedCode, contradictions, merge_codes
 from barsight.labels.bundle_labels import ILLEGIBLE, bundle_label, unread_label
 from barsight.labels.code_reading import read_codes
 from barsight.labels.placing import pose_at
+from barsight.labels.reading import _expect_own
+from barsight.motion.rig_check.self_calibration import turn_right_camera
 from barsight.recording.open import open_recording
 from barsight.result_folder import read_heights, read_path
 from barsight.simulation.lighting import bake, hall_lamps
@@ -164,16 +168,24 @@ def test_other_texts_at_the_place_and_single_pictures_are_doubted() -> None:
     assert "1 picture" in labels["C"].doubts[0]
 
 
-def test_another_recording_is_refused(
+def test_another_recording_or_rig_is_refused(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
     assert run(["measure", str(recording), "-o", str(out), *FAST]) == 0
+    turned = turn_right_camera(open_recording(recording).rig, np.array([0.0, 0.001, 0.0]))
+    write_rig_file(tmp_path / "rig.yaml", turned)
+    assert run(["labels", str(recording), str(out), "--rig", str(tmp_path / "rig.yaml")]) == 3
+    assert "was measured with another rig" in capsys.readouterr().err.replace("\n", " ")
+    result = json.loads((out / "result.json").read_text())
     rig = recording / "mav0" / "cam0" / "sensor.yaml"
     rig.write_text(rig.read_text() + "\n# another\n")
-    capsys.readouterr()
-    assert run(["labels", str(recording), str(out)]) != 0
-    assert "is not the result of" in capsys.readouterr().err
+    said = result | {"passes": [{"inputs": result["hashes"]["inputs"]}]}
+    for content in (result, said):
+        with pytest.raises(InputError, match="is not the result of"):
+            _expect_own(open_recording(recording), out, content)
+    assert run(["labels", str(recording), str(out)]) == 3
+    assert "is not the result of" in capsys.readouterr().err.replace("\n", " ")
     assert not (out / "labels.json").exists()
 
 

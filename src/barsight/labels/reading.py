@@ -20,6 +20,7 @@ from barsight.result_folder import open_folder, read_heights, read_path
 from barsight.yard.inventory.bundle_file import read_bundles
 from barsight.yard.inventory.stock_list import ListedBundle
 from barsight.yard.label_settings import LabelSettings
+from barsight.yard_frame import calibration_id
 
 SCHEMA_VERSION = 1
 FILE = "labels.json"
@@ -45,13 +46,10 @@ def read_labels(
     """Read the labels in a recording's pictures and locate them on the map in `folder`.
 
     count: called after each pair, twice if plain numbers are read. Raises InputError where the folder is not
-    of this recording or has no trajectory, ConfigError without the extra `labels`.
+    of this recording and rig or has no trajectory, ConfigError without the extra `labels`.
     """
     said, _ = open_folder(folder)
-    own, whole = recording.digests(), said["hashes"]["inputs"]
-    if not said.get("passes") and any(own[name] != whole[name] for name in own.keys() & whole.keys()):
-        remedy = "name the recording that it was measured from"
-        raise InputError(folder, f"is not the result of {recording.path}", remedy)
+    _expect_own(recording, folder, said)
     path = read_path(folder)
     if path is None:
         raise InputError(folder, "has no trajectory.tum", "measure the recording again")
@@ -66,6 +64,21 @@ def read_labels(
     return ReadLabels(
         said["map_id"], 2 * len(poses), labels, illegible, contradictions(labels, bundles, listed)
     )
+
+
+def _expect_own(recording: Recording, folder: Path, said: dict[str, Any]) -> None:
+    """Raise InputError where a folder wasn't measured from a recording, or with another rig."""
+    own, passes = recording.digests(), said.get("passes") or ()
+    for inputs in [one["inputs"] for one in passes] or [said["hashes"]["inputs"]]:
+        shared = own.keys() & inputs.keys()
+        has_data = any(Path(name).suffix not in (".yaml", ".yml") for name in shared)
+        if has_data and all(own[name] == inputs[name] for name in shared):
+            break
+    else:
+        remedy = "name the recording that it was measured from"
+        raise InputError(folder, f"is not the result of {recording.path}", remedy)
+    if not passes and calibration_id(recording.rig) != said["calibration_id"]:
+        raise InputError(folder, "was measured with another rig", "name its rig file: --rig RIG")
 
 
 def write_labels(found: ReadLabels, folder: Path) -> Path:
