@@ -239,7 +239,7 @@ def _chart(name: str, surveys: Sequence[WatchedSurvey]) -> ControlChart:
     value = rows[-1][1].value if rows[-1][0] == len(surveys) else np.nan
     if len(rows) < LEARNED:
         return ControlChart(name, value, np.nan, np.nan, 0.0, None)
-    normal = _Normal.without_stray([figure for _, figure in rows[:LEARNED]])
+    normal = _LearnedValue.without_stray([figure for _, figure in rows[:LEARNED]])
     up = down = 0.0
     alarmed, sigma = None, np.nan
     for number, figure in rows[LEARNED:]:
@@ -251,7 +251,7 @@ def _chart(name: str, surveys: Sequence[WatchedSurvey]) -> ControlChart:
 
 
 @dataclass(frozen=True)
-class _Normal:
+class _LearnedValue:
     """The normal value of a figure: weighted mean of some surveys and its stated sigma. ratio: of their
     scatter to their stated sigmas where it is over DOUBTED, otherwise 1. count: number of surveys.
     """
@@ -262,7 +262,7 @@ class _Normal:
     count: int
 
     @classmethod
-    def of(cls, figures: Sequence[WatchedFigure]) -> _Normal:
+    def of(cls, figures: Sequence[WatchedFigure]) -> _LearnedValue:
         """Learn it from surveys."""
         values = np.array([figure.value for figure in figures])
         weights = np.array([figure.sigma for figure in figures]) ** -2.0
@@ -271,7 +271,7 @@ class _Normal:
         return cls(mean, float(weights.sum() ** -0.5), ratio if ratio > DOUBTED else 1.0, len(values))
 
     @classmethod
-    def without_stray(cls, figures: Sequence[WatchedFigure]) -> _Normal:
+    def without_stray(cls, figures: Sequence[WatchedFigure]) -> _LearnedValue:
         """Learn it without one that lies far from the others by their stated sigmas or, where they scatter
         more, by Grubbs' test; it would widen what is normal so far that no jump raised an alarm.
         """
