@@ -1,7 +1,9 @@
 """Acceptance: fits of artefacts, decisions, causes by real triangulation, pictures, certificates."""
 
+import base64
 import dataclasses
 import math
+import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -446,6 +448,18 @@ def test_a_certificate_is_signed_and_a_changed_one_refused(tmp_path: Path) -> No
     (tmp_path / "cert.json").write_text(text.replace('"passed": false', '"passed": true'))
     with pytest.raises(InputError, match="was changed after it was written"):
         read_certificate(tmp_path / "cert.json")
+
+
+def test_letters_that_a_pdf_lacks_are_spelled_and_said(tmp_path: Path) -> None:
+    """They were black squares: nobody could read who signed."""
+    for signer, shown in (
+        ("Łukasz Żółty, Бrno", b"Lukasz Z\\363lty, ?rno"),
+        ("Jörg Groß", b"J\\366rg Gro\\337"),
+    ):
+        write_certificate(accepted() | {"signer": signer}, tmp_path / "cert", None, pdf=True)
+        streams = (tmp_path / "cert.pdf").read_bytes().split(b"stream\n")[1::2]
+        pages = b"".join(zlib.decompress(base64.a85decode(one.partition(b"~>")[0])) for one in streams)
+        assert shown in pages and (b"Letters that this PDF lacks" in pages) == ("?" in str(shown))
 
 
 def test_a_wrong_key_is_refused_before_anything_is_measured(

@@ -5,11 +5,19 @@ from __future__ import annotations
 from html import escape
 from pathlib import Path
 from typing import Any
+from unicodedata import normalize
 
 from barsight.core.extras import extra
 from barsight.report.page import format_number
 
 HEADS = ("quantity", "error", "U", "k", "limit", "unit", "decision")
+
+
+PLAIN = str.maketrans("ŁłĐđŦŧĦħı−\u202f", "LlDdTtHhi- ")
+"""Letters that no accent can be taken off, and signs, and what the PDF shows of them."""
+SPELLED = (
+    "Letters that this PDF lacks are shown without their accents or as ?; the page and the JSON have them."
+)
 
 
 def write_pdf(content: dict[str, Any], digest: str, signed: bool, target: Path) -> None:
@@ -22,9 +30,11 @@ def write_pdf(content: dict[str, Any], digest: str, signed: bool, target: Path) 
     styles = getSampleStyleSheet()
 
     def text(words: str, style: str = "BodyText") -> Any:
-        return Paragraph(escape(words), styles[style])
+        return Paragraph(escape(_spelled(words)), styles[style])
 
     rows = [HEADS, *(_row(one) for one in content["quantities"])]
+    said = [headline(content), *facts(content), *findings(content), *(cell for row in rows for cell in row)]
+    lacks = any(_spelled(words) != words for words in said)
     look = [
         ("FONTSIZE", (0, 0), (-1, -1), 8), ("GRID", (0, 0), (-1, -1), 0.25, colors.grey),
         ("BACKGROUND", (0, 0), (-1, 0), colors.whitesmoke), ("ALIGN", (1, 0), (4, -1), "RIGHT"),
@@ -38,7 +48,7 @@ def write_pdf(content: dict[str, Any], digest: str, signed: bool, target: Path) 
         text(headline(content), "Heading2"),
         *(text(line) for line in facts(content)),
         Spacer(1, 8),
-        Table(rows, repeatRows=1, style=TableStyle(look)),
+        Table([[*map(_spelled, row)] for row in rows], repeatRows=1, style=TableStyle(look)),
         Spacer(1, 8),
         *(text(line) for line in findings(content)),
         text("Decision rule", "Heading3"),
@@ -46,6 +56,7 @@ def write_pdf(content: dict[str, Any], digest: str, signed: bool, target: Path) 
         text("Signature", "Heading3"),
         text(f"Digest of the content (SHA-256): {digest}"),
         text("Signed with Ed25519: the signature lies beside as .sig." if signed else "Not signed."),
+        *([text(SPELLED)] if lacks else []),
     ]  # fmt: skip
     SimpleDocTemplate(str(target), pagesize=A4, title="Acceptance certificate", invariant=1).build(parts)
 
@@ -93,4 +104,13 @@ def _row(one: dict[str, Any]) -> tuple[str, ...]:
 
 def _plain(value: Any, decimals: int) -> str:
     """Format a value with characters that the PDF's built-in fonts have."""
-    return format_number(value, decimals).replace("−", "-").replace("\u202f", " ").replace("–", "-")
+    return format_number(value, decimals).translate(PLAIN)
+
+
+def _spelled(words: str) -> str:
+    """Spell a text with characters that the PDF's built-in fonts have; others become ?."""
+    shown = []
+    for letter in words.translate(PLAIN):
+        plain = letter if letter.encode("cp1252", "ignore") else normalize("NFKD", letter)[:1]
+        shown.append(plain.encode("cp1252", "replace").decode("cp1252"))
+    return "".join(shown)
