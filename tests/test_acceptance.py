@@ -493,6 +493,17 @@ def test_a_plan_stands_on_free_floor_only() -> None:
     assert isinstance(lay_out(area, "full", full), Failed)
 
 
+@pytest.mark.parametrize("above_floor_m", [4.5, 7.0, 10.0, 14.0])
+def test_bare_floor_passes_for_no_plate(above_floor_m: float) -> None:
+    plan = lay_out(Area((0.0, 20.0), (-4.0, 4.0), above_floor_m, 1250.0, 0.5), "high")
+    assert isinstance(plan, AcceptancePlan)
+    floor = height_map(lambda x, y: 0 * x)
+    for plate in plan.plate:
+        found = fit_plate(floor, replace(plate, x_m=1.0, y_m=0.75), plan.conditions.search_m)
+        if not isinstance(found, Failed):
+            assert decide(1e3 * (found.z_m - plate.z_m), 1.0, plan.limits.height_mm) is Decision.FAILED
+
+
 def test_a_plan_is_simulated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "plan.toml").write_text(plan_text(planned()))
     line = ["simulate", str(tmp_path / "rec"), "--artefacts", str(tmp_path / "plan.toml"), "--length", "4"]

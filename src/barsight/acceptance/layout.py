@@ -87,7 +87,9 @@ def lay_out(area: Area, yard: str, floor: YardMap | None = None) -> AcceptancePl
         if spot is None:
             return Failed("no-floor", f"no free floor for {name}: {2 * reach:.1f} m across are wanted")
         places[name] = np.round(spot, 2)
-    tops = {name: round(max(up * area.above_floor_m, 0.02), 2) for name, _, _, up in PLATES}
+    limits = _limits(area)
+    lowest = max(2e-3 * limits.height_mm, 0.02)  # bare floor at a plate's place must not pass for it
+    tops = {name: round(max(up * area.above_floor_m, lowest), 2) for name, _, _, up in PLATES}
     plates = tuple(_plate(name, places[name], tops[name], side) for name, *_ in PLATES)
     spheres = tuple(
         _monument(name, places[name], up * area.above_floor_m + wide / 2, wide) for name, _, _, up in SPHERES
@@ -98,7 +100,7 @@ def lay_out(area: Area, yard: str, floor: YardMap | None = None) -> AcceptancePl
             HeightStep(f"step {k}", "plate 1", name, round(tops[name] - tops["plate 1"], 3))
             for k, name in enumerate((n for n in tops if tops[n] > tops["plate 1"]), 1)
         ),
-        (_dummy(places[DUMMY[0]], area.ground_px_m),), (), _limits(area),
+        (_dummy(places[DUMMY[0]], area.ground_px_m),), (), limits,
     )  # fmt: skip
 
 
