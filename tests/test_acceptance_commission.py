@@ -159,6 +159,28 @@ def tags_between(plan: AcceptancePlan) -> str:
     return "\n".join(["tag,yard_x,yard_y,yard_z,sigma_m,check", *rows, ""])
 
 
+def test_an_edited_page_of_the_certificate_is_made_again(tmp_path: Path) -> None:
+    """Its JSON alone was watched: a page that somebody had changed stayed."""
+    step = next(one for one in guided_steps(tmp_path, CommissionSettings()) if one.name == "acceptance")
+    made: list[str] = []
+
+    def do() -> str:
+        made.append("again")
+        for name in step.makes:
+            (tmp_path / name).write_text("FAILED")
+        return "failed"
+
+    guided = (replace(step, takes=(), do=do),)
+    for edited in ("certificate.html", "certificate.pdf"):
+        walk(tmp_path, guided)
+        count = len(made)
+        walk(tmp_path, guided)
+        assert len(made) == count
+        (tmp_path / edited).write_text("PASSED")
+    walk(tmp_path, guided)
+    assert len(made) == 3 and (tmp_path / "certificate.pdf").read_text() == "FAILED"
+
+
 def test_tags_place_the_yard_before_it_is_measured(tmp_path: Path) -> None:
     made = CommissionSettings(use_tags=True, girder_y_m=(-8.0, 8.0), magnet="magnet.toml")
     listed = guided_steps(tmp_path, made)

@@ -31,6 +31,7 @@ from barsight.recording.base import RecordingSettings
 from barsight.yard.magnet.description import load_magnet
 
 REMEDY = "do this step again"
+CERTIFICATE = ("certificate.json", "certificate.html", "certificate.pdf")
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -75,7 +76,7 @@ def guided_steps(folder: Path, settings: CommissionSettings) -> tuple[GuidedStep
         GuidedStep("empty yard", (*rig, "survey", *way.placed), ("measured",), "", way.empty_yard),
         GuidedStep("plan", ("measured",), ("plan_drawn.toml",), "", way.plan, (settings.yard,)),
         GuidedStep(
-            "acceptance", ("plan.toml", "artefacts", *rig, *way.framed, *way.magnet), ("certificate.json",),
+            "acceptance", ("plan.toml", "artefacts", *rig, *way.framed, *way.magnet), CERTIFICATE,
             "plan_drawn.toml with the measured values as plan.toml, recordings of the artefacts into "
             "artefacts/, each in a folder of its own", way.acceptance, (settings.signer, settings.key),
         ),
