@@ -303,7 +303,7 @@ def test_a_wide_tolerance_pairs_no_neighbours(
     assert (board["capture", "paired"], board["capture", "unpaired_cam1"]) == (7, 1)
 
 
-HEARD = SensorActivity((10**9, 10**9), 30_000_000, {"imu": 10**9, "crane": 10**9})
+HEARD = SensorActivity((10**9, 10**9), 10**9, 30_000_000, {"imu": 10**9, "crane": 10**9})
 
 
 @pytest.mark.parametrize(
@@ -317,6 +317,9 @@ HEARD = SensorActivity((10**9, 10**9), 30_000_000, {"imu": 10**9, "crane": 10**9
         (replace(HEARD, cameras_ns=(10**9, 10**8)), 0.05, {}, "encoders-only", False, "cam1: silent"),
         (replace(HEARD, cameras_ns=(0, 10**9)), 0.05, {}, "encoders-only", False, "cam0: no picture yet"),
         (HEARD, 1.0, {}, "blind", False, "cam0: silent"),
+        (replace(HEARD, pair_ns=3 * 10**8), 0, {}, "encoders-only", False, "cam1: no pair for 0.70 s"),
+        (replace(HEARD, pair_ns=5 * 10**8), 0, {}, "full", True, None),
+        (replace(HEARD, pair_ns=0), 0, {}, "encoders-only", False, "cam1: no pair yet"),
         (HEARD, 0, {"capture": "killed"}, "blind", False, "capture is down: killed"),
         (replace(HEARD, jumped_m=0.5), 0, {}, "no-encoders", False, "jumped by 500 mm"),
         (replace(HEARD, clock_step_s=-40.0), 0, {}, "full", False, "stepped by -40.0 s"),

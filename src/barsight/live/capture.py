@@ -102,6 +102,7 @@ class Capture:
             if self._speed == 0:
                 self._wait_for_reader()
             self._ring.write(frame, exposed_ns if self._speed else time.monotonic_ns())
+            board["capture", "last_pair_ns"] = frame.stamp_ns
             board.add("capture", "paired")
         self._count_lost()
 

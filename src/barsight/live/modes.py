@@ -25,6 +25,10 @@ MODES: dict[ModeName, str] = {
 }
 FOR_LIFTS = ("full", "no-imu")
 MIN_CAMERA_SILENCE_S = 0.3
+PAIR_SILENCES = 2
+"""Time without a pair after which the cameras are out, in terms of a camera's own bound: a counter that began
+anew costs two pairs.
+"""
 MAX_CLOCK_STEP_S = 1.0
 JUMP_SIGMAS, MIN_JUMP_M, MAX_CHANGE_MPS2 = 8.0, 0.03, 1.0
 """Thresholds of a jump: sigmas of a reading, least distance (m), and largest acceleration (m/s²) assumed when
@@ -46,13 +50,14 @@ LOOK_NS = NS_PER_S // 10
 class SensorActivity:
     """Last activity of each sensor: stamps on the cameras' clock, 0 for never.
 
-    cameras_ns: of cam0 and cam1. interval_ns: longest interval between pictures. readings_ns: of `imu` and
-    `crane`, if the recording has them. frozen: whether the encoders repeat one reading although the crane
-    must be moving. jumped_m: by how much (m) they have jumped, otherwise 0. clock_step_s: of the system's
-    clock.
+    cameras_ns: of cam0 and cam1. pair_ns: of the last pair that their pictures formed. interval_ns: longest
+    interval between pictures. readings_ns: of `imu` and `crane`, if the recording has them. frozen: whether
+    the encoders repeat one reading although the crane must be moving. jumped_m: by how much (m) they have
+    jumped, otherwise 0. clock_step_s: of the system's clock.
     """
 
     cameras_ns: tuple[int, int]
+    pair_ns: int
     interval_ns: int
     readings_ns: dict[str, int]
     frozen: bool = False
@@ -99,7 +104,7 @@ def judge_mode(
 
 
 def _silent_cameras(heard: SensorActivity, now_ns: int, settings: LiveSettings) -> list[str]:
-    """List the cameras that have provided no picture for too long."""
+    """List the cameras that have provided no picture for too long, or both if their pictures don't pair."""
     silences = []
     bound_s = max(MIN_CAMERA_SILENCE_S, settings.camera_silence_intervals * heard.interval_ns / NS_PER_S)
     for camera, last_ns in enumerate(heard.cameras_ns):
@@ -107,6 +112,9 @@ def _silent_cameras(heard: SensorActivity, now_ns: int, settings: LiveSettings) 
             silences.append(f"cam{camera}: no picture yet")
         elif now_ns - last_ns > seconds_to_ns(bound_s):
             silences.append(_silence(f"cam{camera}", now_ns - last_ns, bound_s))
+    if not silences and now_ns - heard.pair_ns > seconds_to_ns(PAIR_SILENCES * bound_s):
+        since = f"for {(now_ns - heard.pair_ns) / NS_PER_S:.2f} s" if heard.pair_ns else "yet"
+        silences.append(f"cam0 and cam1: no pair {since}, their stamps or exposure counters contradict")
     return silences
 
 

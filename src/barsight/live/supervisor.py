@@ -274,6 +274,7 @@ class Supervisor:
         board, frozen, jumped_m, step_s = self._board, False, 0.0, 0.0
         # Pictures first: readings that arrive meanwhile must not look late in comparison.
         last_ns = board["capture", "last_cam0_ns"], board["capture", "last_cam1_ns"]
+        pair_ns, interval_ns = board["capture", "last_pair_ns"], board["capture", "interval_ns"]
         readings: dict[str, int] = {}
         for sensor in sorted(self._sensors):
             stamps, _ = self._link.readings(sensor).last(1)
@@ -282,7 +283,7 @@ class Supervisor:
             frozen, jumped_m = self._faults.take(*self._encoders.read())
         if self._link.source.crane is not None:
             step_s = (time.time_ns() - time.monotonic_ns() - self._link.source.epoch_ns) / NS_PER_S
-        return SensorActivity(last_ns, board["capture", "interval_ns"], readings, frozen, jumped_m, step_s)
+        return SensorActivity(last_ns, pair_ns, interval_ns, readings, frozen, jumped_m, step_s)
 
     def _write(self, health: bool) -> None:
         write_state(self.state, self._board, self._out)

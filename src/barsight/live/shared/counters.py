@@ -14,7 +14,8 @@ ROWS: dict[str, tuple[str, ...]] = {
     "capture": (
         "ready", "ended", "pictures_cam0", "pictures_cam1", "paired", "unpaired_cam0", "unpaired_cam1",
         "torn", "capture_down", "incomplete", "missed", "backpressure", "late", "clock", "trigger", "skew_ns",
-        "max_skew_ns", "last_cam0_ns", "last_cam1_ns", "interval_ns", "first_ns", "beat_ns",
+        "max_skew_ns", "last_cam0_ns", "last_cam1_ns", "last_pair_ns", "interval_ns", "first_ns",
+        "beat_ns",
     ),
     "track": (
         "ready", "done", "taken", "tracked", "not_placed", "newer_pair", "kept", "kept_passed", "beat_ns",
