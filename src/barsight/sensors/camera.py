@@ -157,6 +157,13 @@ class CameraDriver(ABC):
         if pixels != "Mono8":
             raise InputError(self.name, f"the camera {self.serial} gives {pixels}", "set it to Mono8")
 
+    def _no_clock(self) -> InputError:
+        """Return the error about a camera without a clock."""
+        return InputError(
+            self.name, f"the camera {self.serial} gives no stamps of exposure",
+            "use one with a clock: when a picture arrives doesn't tell when it was exposed",
+        )  # fmt: skip
+
     def _connect(self) -> None:
         found = self.find(self._settings)
         if self.serial not in found:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from barsight.core.extras import extra
+from barsight.core.stamps import NS_PER_S
 from barsight.sensors.camera import WAIT_MS, Blocks, CameraDriver, RawLoss, RawPicture
 from barsight.sensors.settings import CamerasSettings
 
@@ -19,6 +20,8 @@ SILENT_S = 2.0
 """Time in seconds without data after which a camera that can't be controlled either is reconnected."""
 STOPPED_S = 0.1
 """Time in seconds that a camera needs to end its stream."""
+TICKS, TICKS_REGISTER = "GevTimestampTickFrequency", 0x093C
+"""Feature and bootstrap register (8 bytes) with the ticks per second of a camera's clock."""
 SERIALS = ("DeviceSerialNumber", "DeviceID")
 PTP_STATES = {"PtpStatus": "PtpDataSetLatch", "GevIEEE1588Status": "GevIEEE1588DataSetLatch"}
 """Features with the PTP state, by the newer and the older name, and the command that latches each."""
@@ -50,6 +53,7 @@ class GigeCamera(CameraDriver):
             camera.acquisition_stop()
             time.sleep(STOPPED_S)
         self._expect(camera.get_integer("Width"), camera.get_integer("Height"), camera.get("PixelFormat"))
+        self._tick_hz = self._find_ticks()
         if self._settings.exposure_us is not None:
             camera.set_exposure_time(self._settings.exposure_us)
         if self._settings.trigger == "free":
@@ -57,6 +61,16 @@ class GigeCamera(CameraDriver):
         else:
             camera.enable_trigger("FrameStart", self._settings.trigger)
         self.ptp = self._read_ptp()
+
+    def _find_ticks(self) -> int:
+        """Return the ticks per second of the camera's clock. Raises InputError if it has no clock."""
+        try:
+            ticks: int = self._camera.get_integer(TICKS)
+        except vg.GenicamError:
+            ticks = int.from_bytes(self._camera.read_register(TICKS_REGISTER, 8), "big")
+        if ticks <= 0:
+            raise self._no_clock()
+        return ticks
 
     def _read_ptp(self) -> str:
         for state, latch in PTP_STATES.items():
@@ -96,7 +110,8 @@ class GigeCamera(CameraDriver):
                     stats = stream.stats()
                     counters = {cause: getattr(stats, name) for name, cause in CAUSES.items()}
                     yield from blocks.losses(gap, counters)
-                yield RawPicture(int(frame.ts_dev or 0), arrival_ns, blocks.trigger, frame.to_numpy())
+                device_ns = (frame.ts_dev or 0) * NS_PER_S // self._tick_hz
+                yield RawPicture(device_ns, arrival_ns, blocks.trigger, frame.to_numpy())
 
 
 def _serial(camera: Any) -> str:

@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from barsight.core.errors import InputError
 from barsight.core.extras import extra
 from barsight.core.stamps import NS_PER_S
 from barsight.sensors.camera import WAIT_MS, Blocks, CameraDriver, RawLoss, RawPicture
@@ -92,10 +91,7 @@ class PylonCamera(CameraDriver):
             return int(ticks.Value)
         if genicam.IsImplemented(self._nodes.GetNode(STAMPS_NS)):
             return NS_PER_S
-        raise InputError(
-            self.name, f"the camera {self.serial} gives no stamps of exposure",
-            "use one with a clock: when a picture arrives doesn't tell when it was exposed",
-        )  # fmt: skip
+        raise self._no_clock()
 
     @property
     def _nodes(self) -> Any:
