@@ -76,6 +76,21 @@ def test_a_clock_that_is_set_back_a_little_settles_anew_too(back_s: float) -> No
     assert np.abs(off_s[: 20 * 30]).max() < 0.005 and np.abs(off_s[20 * 35 :]).max() < 0.005
 
 
+def test_a_camera_that_was_set_back_a_little_while_it_was_away_has_no_wrong_stamp() -> None:
+    """cam0 of 10 Hz is lost for a second; meanwhile its clock is set back by 20 ms."""
+    source = CraneSource((), {}, 10.0, 0, lambda: True)  # type: ignore[arg-type]
+    found: list[tuple[int, int]] = []
+    for k in [*range(60), *range(70, 130)]:
+        true_ns, trigger = k * SECOND // 10, k + 1 if k < 60 else k - 69
+        device_ns = true_ns + 50 * SECOND - (20_000_000 if k >= 60 else 0)
+        for packet in source._picture("cam0", RawPicture(device_ns, true_ns + 1_000_000, trigger, DARK)):
+            assert isinstance(packet, LostPicture) and packet.cause == "clock"
+        found += [(stamp_ns, true_ns) for stamp_ns, *_ in source._held]
+        source._held.clear()
+    assert max(abs(stamp_ns - true_ns) for stamp_ns, true_ns in found) < 2_000_000
+    assert len(found) > 95
+
+
 @pytest.mark.parametrize(("rate_hz", "back_s"), [(5, 0.6), (10, 0.3), (200, 0.02)])
 def test_no_stamp_is_wrong_once_a_clock_was_set_back_by_over_two_intervals(
     rate_hz: int, back_s: float

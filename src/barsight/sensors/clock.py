@@ -44,9 +44,10 @@ class DeviceClock:
 
     def __init__(self) -> None:
         self.jumps = 0
-        self._begin()
+        self.begin_anew()
 
-    def _begin(self) -> None:
+    def begin_anew(self) -> None:
+        """Forget all stamps so far: the device may have restarted."""
         self._minima: deque[tuple[int, int]] = deque(maxlen=BUCKETS)
         self._delays: deque[int] = deque(maxlen=RECENT)
         self._origin: tuple[int, int] | None = None
@@ -59,7 +60,7 @@ class DeviceClock:
         """Add a stamp and its arrival time (monotonic); return whether the clock is settled."""
         if self._origin is not None and self._has_jumped(device_ns, arrival_ns):
             self.jumps += 1
-            self._begin()
+            self.begin_anew()
         elif self._late:
             return True
         if self._origin is None:

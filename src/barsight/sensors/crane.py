@@ -31,10 +31,14 @@ Item = tuple[str, RawPicture | RawLoss | RawReading]
 
 @dataclass
 class _Stream:
-    """A sensor's clock, the last stamp delivered, and losses. dropped: readings that found the queue full."""
+    """A sensor's clock, the last stamp delivered, a camera's last trigger number, and losses.
+
+    dropped: readings that found the queue full.
+    """
 
     clock: DeviceClock = field(default_factory=DeviceClock)
     last_ns: int = 0
+    trigger: int = 0
     lost: int = 0
     dropped: int = 0
 
@@ -148,6 +152,9 @@ class CraneSource:
         if isinstance(item, RawLoss):
             yield LostPicture(camera, 0, item.cause, item.count)
             return
+        if item.trigger <= stream.trigger:  # connected anew: it may have been set meanwhile
+            stream.clock.begin_anew()
+        stream.trigger = item.trigger
         if not stream.clock.add(item.device_ns, item.arrival_ns):
             yield LostPicture(camera, 0, "clock")
             return
