@@ -24,9 +24,9 @@ from barsight.live.link import GrowingRecording, Link, LiveInput
 from barsight.live.modes import FreezeWatch, JumpWatch, Mode, SensorActivity, judge_mode
 from barsight.live.run import Keyframes, read_keyframes, replay, write_keyframes
 from barsight.live.settings import LiveSettings
-from barsight.live.shared.counters import Counters
+from barsight.live.shared.counters import OFF, Counters
 from barsight.live.shared.logs import NumberLog, ReadingLog
-from barsight.live.shared.ring import PairRing
+from barsight.live.shared.ring import CapturedPair, PairRing
 from barsight.live.source import ReplayClock, ReplaySource
 from barsight.live.state import prometheus
 from barsight.live.supervisor import Supervisor
@@ -36,7 +36,7 @@ from barsight.mapping.surface.surface import read_tile
 from barsight.reconstruction import map_building
 from barsight.recording.formats.ground_truth import read_ground_truth
 from barsight.sensors.pairing import PairFormer
-from barsight.sensors.source import LivePicture, LostPicture, Readings
+from barsight.sensors.source import LivePicture, LostPicture, Readings, SensorSigns
 from barsight.yard.magnet.description import example_magnet
 from cli_runs import FAST
 from test_cli_resume import counting_matches
@@ -324,6 +324,12 @@ HEARD = SensorActivity((10**9, 10**9), 10**9, 30_000_000, {"imu": 10**9, "crane"
         (replace(HEARD, jumped_m=0.5), 0, {}, "no-encoders", False, "jumped by 500 mm"),
         (replace(HEARD, clock_step_s=-40.0), 0, {}, "full", False, "stepped by -40.0 s"),
         (replace(HEARD, clock_step_s=0.4), 0, {}, "full", True, None),
+        (replace(HEARD, off_m=(0.2, 0.0, -0.1)), 0, {}, "full", False, "224 mm off by cameras and IMU"),
+        (replace(HEARD, off_m=(0.03, 0.0, 0.02)), 0, {}, "full", True, None),
+        (replace(HEARD, restarted=True), 0, {}, "full", False, "their zero may have changed"),
+        (replace(HEARD, troubles={"cam0": "has 1x1"}), 0, {}, "full", True, None),
+        (replace(HEARD, troubles={"cam0": "has 1x1"}), 1.0, {}, "blind", False, "(bound 0.30 s): has 1x1"),
+        (replace(HEARD, troubles={"pictures": "black"}), 0, {}, "encoders-only", False, "cam1: black"),
         (HEARD, 0, {"track": "x"}, "encoders-only", False, "track is down"),
         (HEARD, 0, {"map": "x"}, "full", False, "map is down"),
     ],
@@ -520,3 +526,52 @@ def test_tracking_begun_anew_beats_as_it_follows_all_keyframes(
     monkeypatch.setattr(tracking, "_placed", placed)
     tracking.follow_again()
     assert len(beats) == 3 and all(beats)
+
+
+def test_pictures_in_which_nothing_can_be_matched_are_reported_until_they_can(
+    whole: Path, board: Counters, ring: PairRing, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both lenses are covered for four pairs."""
+    link = Link(LiveInput(whole), SETTINGS.chosen(), LiveSettings(), tmp_path, tmp_path, "", board.name, None)
+    recording = bs.open_recording(whole)
+    seen = next(one for one in recording.frames() if isinstance(one, StereoFrame))
+    black = np.zeros_like(seen.left)
+    tracking = Tracking(link, GrowingRecording(recording, [], link), board, ring)
+    tracking.follow_again()
+    monkeypatch.setattr(tracking, "_wait_for_readings", lambda stamp_ns: None)
+    monkeypatch.setattr(tracking, "_placed", lambda pair: RefusedFrame(pair.stamp_ns, "dark"))
+    told = []
+    for k in range(6):
+        pair = StereoFrame(seen.stamp_ns + k, *((black, black) if k < 4 else (seen.left, seen.right)))
+        tracking.take(CapturedPair(k + 1, 0, pair), range(0))
+        told.append(link.told("pictures"))
+    assert told[:2] == told[4:] == ["", ""]
+    assert all("the left image is black all over" in one for one in told[2:4])
+
+
+def test_what_the_encoders_are_off_by_outlives_tracking_and_counts_once(
+    whole: Path, board: Counters, ring: PairRing, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A jump of 0.3 m; a restarted process may find it again in the keyframes that it follows, or not."""
+    link = Link(LiveInput(whole), SETTINGS.chosen(), LiveSettings(), tmp_path, tmp_path, "", board.name, None)
+    recording = GrowingRecording(bs.open_recording(whole), [], link)
+    for found_again_um, found_um in ((0, 300_000), (300_000, 300_000), (0, 0)):
+        tracking = Tracking(link, recording, board, ring)
+        sizes = iter((found_again_um, found_um))
+        monkeypatch.setattr(
+            tracking, "_encoders_um", lambda sizes=sizes: dict(zip(OFF, (next(sizes), 0, 0), strict=True))
+        )
+        tracking.follow_again()
+        tracking._tell_encoders()
+        assert [board["track", name] for name in OFF] == [300_000, 0, 0]
+
+
+def test_why_a_camera_is_not_connected_reaches_the_run(
+    whole: Path, board: Counters, ring: PairRing, tmp_path: Path
+) -> None:
+    link = Link(LiveInput(whole), SETTINGS.chosen(), LiveSettings(), tmp_path, tmp_path, "", board.name, None)
+    capture = Capture(link, board, ring)
+    for why in ("gives 640x480,\nthe calibration is for 1280x1024", ""):
+        signs = SensorSigns({"cam1_connects": 1}, {"cam0": "", "cam1": why})
+        capture.run(SimpleNamespace(packets=lambda after, signs=signs: iter([signs])))  # type: ignore[arg-type]
+        assert (link.told("cam0"), link.told("cam1")) == ("", " ".join(why.split()))

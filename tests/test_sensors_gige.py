@@ -57,6 +57,26 @@ def test_stamps_are_ns_whatever_the_cameras_tick_is(ticks: int, has_feature: boo
     assert np.abs(np.diff(stamps) - PERIOD_S * 1e9).max() < 100
 
 
+def test_a_camera_tells_why_it_is_not_connected_until_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is away, then comes back with another size, then as it was."""
+    from barsight.sensors.gige import GigeCamera
+
+    monkeypatch.setattr("barsight.sensors.camera.AGAIN_S", 0.0)
+    camera, told = GigeCamera(1, SETTINGS, (6, 4)), []
+    found: Iterator[dict[str, Any]] = iter([{}, {"R": (8, 4)}, {"R": (6, 4)}])
+
+    def control(size: tuple[int, int]) -> None:
+        told.append(camera.trouble)
+        camera._expect(*size, "Mono8")
+
+    monkeypatch.setattr(camera, "find", lambda settings: next(found))
+    monkeypatch.setattr(camera, "_control", control)
+    monkeypatch.setattr(camera, "_stream", lambda may_go_on: iter([camera.trouble]))
+    told.append(str(next(camera.pictures(lambda: True))))
+    assert told[0] == "does not answer" and told[2] == ""
+    assert told[1].startswith("the camera R gives 8x4, the calibration is for 6x4; name the calibration")
+
+
 def test_a_camera_without_a_clock_is_refused() -> None:
     from barsight.sensors.gige import GigeCamera
 

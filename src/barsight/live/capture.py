@@ -73,6 +73,7 @@ class Capture:
         self._pairs = PairFormer(tolerance_ns)
         self._lost = [board["capture", f"unpaired_cam{camera}"] for camera in (0, 1)]
         self._contradicted = board["capture", "trigger"]
+        self._tell = link.tell
 
     def run(self, source: Source) -> None:
         """Process packets until there are no more."""
@@ -88,6 +89,8 @@ class Capture:
             elif isinstance(packet, SensorSigns):
                 for name, value in packet.values.items():
                     self._board["sensors", name] = value
+                for name, why in packet.troubles.items():
+                    self._tell(name, why)
             else:
                 self._take(packet)
         self._pairs.end()
@@ -99,10 +102,10 @@ class Capture:
         board["capture", f"last_{camera}_ns"] = picture.stamp_ns
         board.add("capture", f"pictures_{camera}")
         for frame, exposed_ns in self._pairs.push(picture):
+            board["capture", "last_pair_ns"] = frame.stamp_ns
             if self._speed == 0:
                 self._wait_for_reader()
             self._ring.write(frame, exposed_ns if self._speed else time.monotonic_ns())
-            board["capture", "last_pair_ns"] = frame.stamp_ns
             board.add("capture", "paired")
         self._count_lost()
 

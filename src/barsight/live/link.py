@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Container, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -83,6 +84,23 @@ class Link:
     def readings(self, sensor: str) -> ReadingLog:
         """Open the log of `imu` or `crane`."""
         return ReadingLog(self.folder / f"{sensor}.log", {"imu": 6, "crane": 3}[sensor])
+
+    def tell(self, name: str, why: str) -> None:
+        """Write why a process ended, a camera isn't connected or `pictures` can't be matched; "" if none of
+        it is so. The disk may be full, of which the command tells.
+        """
+        with contextlib.suppress(OSError):
+            self._reason(name).write_text(why, encoding="utf-8")
+
+    def told(self, name: str) -> str:
+        """Read what was told last, on one line; "" if nothing was."""
+        try:
+            return " ".join(self._reason(name).read_text(encoding="utf-8").split())
+        except OSError:
+            return ""
+
+    def _reason(self, name: str) -> Path:
+        return self.folder / f"{name}.reason"
 
     def states(self) -> ReadingLog:
         """Open the log of the states from which poses are propagated (IMU clock)."""

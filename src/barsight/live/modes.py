@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Literal
 
@@ -35,6 +35,8 @@ JUMP_SIGMAS, MIN_JUMP_M, MAX_CHANGE_MPS2 = 8.0, 0.03, 1.0
 a reading is predicted from the crane's speed.
 """
 SPEED_READINGS = 6
+MAX_OFF_M = 0.05
+"""Threshold (m) of encoders that are off by cameras and IMU: a jump there and back leaves up to this."""
 JUMP_HELD_S = 1.0
 """Time in seconds for which encoders stay excluded after they came back from a jump."""
 AFTER_FREEZE_S = 0.3
@@ -53,7 +55,10 @@ class SensorActivity:
     cameras_ns: of cam0 and cam1. pair_ns: of the last pair that their pictures formed. interval_ns: longest
     interval between pictures. readings_ns: of `imu` and `crane`, if the recording has them. frozen: whether
     the encoders repeat one reading although the crane must be moving. jumped_m: by how much (m) they have
-    jumped, otherwise 0. clock_step_s: of the system's clock.
+    jumped, otherwise 0. off_m: by how much each is off by cameras and IMU, which also see a jump that came
+    while they were silent. restarted: whether their sender has restarted during the run. clock_step_s: of the
+    system's clock. troubles: why `cam0` or `cam1` isn't connected, and why nothing in the last `pictures` can
+    be matched, "" if neither is so.
     """
 
     cameras_ns: tuple[int, int]
@@ -62,7 +67,10 @@ class SensorActivity:
     readings_ns: dict[str, int]
     frozen: bool = False
     jumped_m: float = 0.0
+    off_m: tuple[float, ...] = (0.0, 0.0, 0.0)
+    restarted: bool = False
     clock_step_s: float = 0.0
+    troubles: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -98,21 +106,37 @@ def judge_mode(
     else:
         name = "no-imu" if imu else "full"
     reasons += [*silent, *(why for why in (imu, crane) if why)]
-    if is_stepped := abs(heard.clock_step_s) > MAX_CLOCK_STEP_S:
-        reasons.append(f"the system's clock was stepped by {heard.clock_step_s:.1f} s: ages can't be told")
-    return Mode(name, tuple(reasons), name in FOR_LIFTS and not down and not is_stepped)
+    doubts = _doubts(heard)
+    return Mode(name, (*reasons, *doubts), name in FOR_LIFTS and not down and not doubts)
+
+
+def _doubts(heard: SensorActivity) -> list[str]:
+    """List what revokes lifts whatever the mode: ages or the encoders' zero can't be told."""
+    doubts = []
+    if abs(heard.clock_step_s) > MAX_CLOCK_STEP_S:
+        doubts.append(f"the system's clock was stepped by {heard.clock_step_s:.1f} s: ages can't be told")
+    if (off_m := float(np.linalg.norm(heard.off_m))) > MAX_OFF_M:
+        doubts.append(f"the encoders are {1e3 * off_m:.0f} mm off by cameras and IMU, survey again")
+    if heard.restarted:
+        doubts.append("the encoders' sender began anew, their zero may have changed: survey again")
+    return doubts
 
 
 def _silent_cameras(heard: SensorActivity, now_ns: int, settings: LiveSettings) -> list[str]:
-    """List the cameras that have provided no picture for too long, or both if their pictures don't pair."""
+    """List the cameras that have provided no picture for too long, or both if theirs form no pairs or show
+    nothing.
+    """
     silences = []
     bound_s = max(MIN_CAMERA_SILENCE_S, settings.camera_silence_intervals * heard.interval_ns / NS_PER_S)
     for camera, last_ns in enumerate(heard.cameras_ns):
         if not last_ns:
             silences.append(f"cam{camera}: no picture yet")
         elif now_ns - last_ns > seconds_to_ns(bound_s):
-            silences.append(_silence(f"cam{camera}", now_ns - last_ns, bound_s))
-    if not silences and now_ns - heard.pair_ns > seconds_to_ns(PAIR_SILENCES * bound_s):
+            why = heard.troubles.get(f"cam{camera}", "")
+            silences.append(_silence(f"cam{camera}", now_ns - last_ns, bound_s) + (why and f": {why}"))
+    if why := heard.troubles.get("pictures", ""):
+        silences.append(f"cam0 and cam1: {why}")
+    elif not silences and now_ns - heard.pair_ns > seconds_to_ns(PAIR_SILENCES * bound_s):
         since = f"for {(now_ns - heard.pair_ns) / NS_PER_S:.2f} s" if heard.pair_ns else "yet"
         silences.append(f"cam0 and cam1: no pair {since}, their stamps or exposure counters contradict")
     return silences

@@ -20,10 +20,17 @@ from barsight.core.stamps import NS_PER_S
 from barsight.live.capture import capture
 from barsight.live.link import Link
 from barsight.live.mapper import build_live_map
-from barsight.live.modes import FOR_LIFTS, EncoderFaults, FreezeWatch, Mode, SensorActivity, judge_mode
+from barsight.live.modes import (
+    FOR_LIFTS,
+    EncoderFaults,
+    FreezeWatch,
+    Mode,
+    SensorActivity,
+    judge_mode,
+)
 from barsight.live.pose_output import output_poses
 from barsight.live.record import record
-from barsight.live.shared.counters import DRAIN, Counters
+from barsight.live.shared.counters import DRAIN, OFF, Counters
 from barsight.live.source import ReplayClock
 from barsight.live.state import ProcessState, RunState, write_health, write_state
 from barsight.live.survey import INTERRUPTED, SurveyWatch
@@ -80,13 +87,11 @@ def run_process(role: str, link: Link) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     end_with_parent()
-    reason = link.folder / f"{role}.reason"
-    reason.unlink(missing_ok=True)
+    link.tell(role, "")
     try:
         PROCESSES[role](link)
     except Exception as error:
-        with contextlib.suppress(OSError):  # the disk may be full, of which the command tells
-            reason.write_text(f"{type(error).__name__}: {error}", encoding="utf-8")
+        link.tell(role, f"{type(error).__name__}: {error}")
         if not isinstance(error, BarsightError):
             traceback.print_exc()
         sys.exit(1)
@@ -110,6 +115,7 @@ class Supervisor:
         self._crane = recording.crane() if "crane" in self._sensors else None
         self._encoders = link.readings("crane")
         self._faults = None if self._crane is None else EncoderFaults(self._crane)
+        self._restarted = False
         self._survey: SurveyWatch | None = None
         if link.source.crane is not None:
             self._survey = SurveyWatch(link.source.crane.survey, is_alone=not link.source.surveys)
@@ -220,11 +226,11 @@ class Supervisor:
     def _why(self, role: str) -> str:
         if role in self._hung:
             return self._hung.pop(role)
-        code, reason = self._running[role].exitcode or 0, self._link.folder / f"{role}.reason"
+        code, reason = self._running[role].exitcode or 0, self._link.told(role)
         if code < 0:
             return f"was ended by {signal.Signals(-code).name}"
-        if reason.is_file():
-            return f"ended by {' '.join(reason.read_text(encoding='utf-8').split())}"
+        if reason:
+            return f"ended by {reason}"
         return f"ended with code {code}"
 
     def _judge(self) -> None:
@@ -281,9 +287,14 @@ class Supervisor:
             readings[sensor] = int(stamps[-1]) - self._shift_ns if len(stamps) else 0
         if self._faults is not None:
             frozen, jumped_m = self._faults.take(*self._encoders.read())
+            self._restarted |= board["sensors", "crane_restarts"] > 0  # a capture begun anew counts from 0
         if self._link.source.crane is not None:
             step_s = (time.time_ns() - time.monotonic_ns() - self._link.source.epoch_ns) / NS_PER_S
-        return SensorActivity(last_ns, pair_ns, interval_ns, readings, frozen, jumped_m, step_s)
+        troubles = {name: self._link.told(name) for name in ("cam0", "cam1", "pictures")}
+        return SensorActivity(
+            last_ns, pair_ns, interval_ns, readings, frozen, jumped_m,
+            tuple(board["track", name] / 1e6 for name in OFF), self._restarted, step_s, troubles,
+        )  # fmt: skip
 
     def _write(self, health: bool) -> None:
         write_state(self.state, self._board, self._out)

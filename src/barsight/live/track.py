@@ -17,16 +17,19 @@ from barsight.core.records.pairs import RectifiedPair, RefusedFrame, StereoFrame
 from barsight.core.records.trajectory import PosedFrame
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.live.link import GrowingRecording, Link
-from barsight.live.shared.counters import Counters
+from barsight.live.shared.counters import OFF, Counters
 from barsight.live.shared.ring import CapturedPair, PairRing
 from barsight.motion.fixed_lag.estimator import FixedLagPoses
 from barsight.motion.settings import make_estimator
 from barsight.reconstruction.live_map import PairPlacer
 from barsight.recording.rectified_pairs import RectifiedPairs
+from barsight.stereo.search_range import check_matchable
 
 POLL_S = 0.002
 GRACE_S = 0.3
 """Longest time in seconds that a frame waits for the readings of a sensor that has gone silent."""
+UNMATCHABLE_PAIRS = 3
+"""Number of pairs in succession that are reported if nothing in them can be matched, as by covered lenses."""
 AGAIN_FRAMES = 10
 """Number of last keyframes that a restarted process tracks first: more than the window holds."""
 
@@ -72,6 +75,8 @@ class Tracking:
         self._placer: PairPlacer | None = None
         self._last_kept: Float64 | None = None
         self._last_kept_ns, self._still = 0, 0
+        self._off_um: list[int] = []
+        self._unmatchable, self._told = 0, ""
 
     def follow_again(self) -> None:
         """Track the last keyframes again after a restart; without encoders, all of them."""
@@ -85,6 +90,7 @@ class Tracking:
             self._last_kept_ns = seen.stamp_ns
             if isinstance(posed, PosedFrame):
                 self._last_kept = posed.reference_from_body.translation
+        self._off_um = [self._board["track", name] - um for name, um in self._encoders_um().items()]
 
     def end(self) -> None:
         """Save the trajectory, if it consists of exactly the pairs kept."""
@@ -103,12 +109,14 @@ class Tracking:
         if isinstance(rectified, Failed):
             posed: PosedFrame | RefusedFrame = RefusedFrame(stamp, rectified.reason)
         else:
+            self._tell_pictures(check_matchable(rectified))
             self._wait_for_readings(stamp)
             posed = self._placed(rectified)
         has_pose = isinstance(posed, PosedFrame)
         self._board.add("track", "tracked" if has_pose else "not_placed")
         if isinstance(posed, PosedFrame):
             self._tell_state()
+            self._tell_encoders()
         done_ns = time.monotonic_ns()
         for number in passed:
             self._keep_passed(self._ring.read(number))
@@ -125,6 +133,24 @@ class Tracking:
         state = poses.navigation if isinstance(poses, FixedLagPoses) else None
         if state is not None:
             self._states.append(np.array([state.stamp_ns]), state.row[None])
+
+    def _tell_encoders(self) -> None:
+        """Report how far the encoders are off by cameras and IMU, also since before a restart."""
+        for before_um, (name, um) in zip(self._off_um, self._encoders_um().items(), strict=True):
+            self._board["track", name] = before_um + um
+
+    def _encoders_um(self) -> dict[str, int]:
+        poses = None if self._placer is None else self._placer.poses
+        off_m = poses.encoders_off_m if isinstance(poses, FixedLagPoses) else np.zeros(3)
+        return {name: round(1e6 * off) for name, off in zip(OFF, off_m.tolist(), strict=True)}
+
+    def _tell_pictures(self, nothing: Failed | None) -> None:
+        """Report why nothing can be matched, once that holds for several pairs in succession."""
+        self._unmatchable = 0 if nothing is None else self._unmatchable + 1
+        why = nothing.reason if nothing is not None and self._unmatchable >= UNMATCHABLE_PAIRS else ""
+        if why != self._told:
+            self._told = why
+            self._link.tell("pictures", why)
 
     def _keep_passed(self, pair: CapturedPair | None) -> None:
         """Keep a skipped pair if it is far enough from the last one kept."""

@@ -80,8 +80,9 @@ class Blocks:
 class CameraDriver(ABC):
     """A camera with a given serial number, connected when pictures are requested and reconnected when lost.
 
-    size: width and height of the calibration. connects: how often it was connected. ptp: the PTP state that
-    it reports of its clock, "" if it is not connected or reports none.
+    size: width and height of the calibration. connects: how often it was connected. trouble: why it isn't
+    connected, "" if it is. ptp: the PTP state that it reports of its clock, "" if it is not connected or
+    reports none.
     """
 
     errors: ClassVar[type[Exception]]
@@ -91,7 +92,7 @@ class CameraDriver(ABC):
         self.name, self.serial = f"cam{number}", settings.serials[number]
         self._settings, self._size = settings, size
         self._camera: Any = None
-        self.connects, self.ptp = 0, ""
+        self.connects, self.trouble, self.ptp = 0, "", ""
 
     @staticmethod
     @abstractmethod
@@ -138,8 +139,8 @@ class CameraDriver(ABC):
                 if self._camera is None:
                     self._connect()
                 yield from self._stream(may_go_on)
-            except (self.errors, InputError):
-                pass
+            except (self.errors, InputError) as error:
+                self.trouble = " ".join(str(error).split()).removeprefix(f"{self.name}: ")[:300]
             if may_go_on():
                 self._drop()
                 time.sleep(AGAIN_S)
@@ -169,7 +170,7 @@ class CameraDriver(ABC):
         if self.serial not in found:
             raise InputError(self.name, "does not answer")
         self.open(found[self.serial])
-        self.connects += 1
+        self.connects, self.trouble = self.connects + 1, ""
 
     def _drop(self) -> None:
         try:

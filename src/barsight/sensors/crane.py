@@ -84,7 +84,8 @@ class CraneSource:
                 yield from self._next()
                 if time.monotonic() >= signs_at:
                     signs_at = time.monotonic() + SIGNS_EVERY_S
-                    yield SensorSigns(self._signs())
+                    troubles = {camera.name: camera.trouble for camera in self._cameras}
+                    yield SensorSigns(self._signs(), troubles)
             yield from self._ordered(until_ns=None)
         finally:
             self._going = False

@@ -44,9 +44,12 @@ class Readings:
 
 @dataclass(frozen=True)
 class SensorSigns:
-    """Health data of the sensors. values: by the counter names of the row `sensors`."""
+    """Health data of the sensors. values: by the counter names of the row `sensors`. troubles: of `cam0` and
+    `cam1`, why it isn't connected, "" if it is.
+    """
 
     values: Mapping[str, int]
+    troubles: Mapping[str, str]
 
 
 Packet = LivePicture | LostPicture | Readings | SensorSigns

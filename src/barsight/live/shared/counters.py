@@ -9,6 +9,8 @@ import numpy as np
 
 from barsight.core.arrays import Int64
 
+OFF = ("bridge_off_um", "trolley_off_um", "hoist_off_um")
+"""Counters of `track`: by how much each encoder has jumped by now."""
 ROWS: dict[str, tuple[str, ...]] = {
     "supervisor": ("began_ns", "stop", "alarms"),
     "capture": (
@@ -19,6 +21,7 @@ ROWS: dict[str, tuple[str, ...]] = {
     ),
     "track": (
         "ready", "done", "taken", "tracked", "not_placed", "newer_pair", "kept", "kept_passed", "beat_ns",
+        *OFF,
     ),
     "pose": ("ready", "written", "beat_ns"),
     "sensors": (

@@ -46,6 +46,11 @@ class EncoderWatch:
         """Return the stamps of the first and last reading of each freeze."""
         return [(first, last) for first, last, _ in self._frozen]
 
+    @property
+    def off_m(self) -> Float64:
+        """Return by how much each encoder is off since the beginning, (3,): the sum of its jumps."""
+        return np.array([sum(jump.size_m for jump in self.told if jump.axis == axis) for axis in range(3)])
+
     def check(self, crane: CraneSamples, known: KnownMotion) -> None:
         """Look for faults in the newest readings. crane: the readings as they came."""
         if not len(crane.stamp_ns):

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from barsight.calibration.geometry.rectification import Rectifier
+from barsight.core.arrays import Float64
 from barsight.core.errors import Failed, MeasurementError
 from barsight.core.records.pairs import RefusedFrame
 from barsight.core.records.trajectory import PosedFrame, Trajectory
@@ -94,6 +95,11 @@ class FixedLagPoses(ImmediatePoses):
         """Return the latest estimated state; None before the first."""
         window = self._estimator.window
         return None if window is None or window.newest is None else window.navigation
+
+    @property
+    def encoders_off_m(self) -> Float64:
+        """Return by how much each encoder is off by now, (3,)."""
+        return self._estimator.watch.off_m
 
     def finish(self) -> Trajectory:
         """Return all poses. Raises InputError where the pictures contradict a sensor."""
