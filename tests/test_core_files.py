@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from barsight.core.errors import InputError, OutputError
-from barsight.core.files import atomic_directory, atomic_path, atomic_paths
+from barsight.core.files import atomic_directory, atomic_path, atomic_paths, held_folder
 
 FAILURES = [RuntimeError("bug"), KeyboardInterrupt(), OSError(errno.ENOSPC, "No space left on device")]
 
@@ -179,3 +179,15 @@ def test_a_refusal_names_the_side_that_it_is_about(tmp_path: Path, inside: str) 
         raise PermissionError(errno.EACCES, "Permission denied", str(tmp_path / inside))
     with pytest.raises(InputError, match=r"data.csv: no permission to read"), atomic_directory(target):
         raise PermissionError(errno.EACCES, "Permission denied", str(tmp_path / "recording" / "data.csv"))
+
+
+def test_a_folder_is_held_for_one_process_and_is_gone_if_nothing_came_into_it(tmp_path: Path) -> None:
+    out = tmp_path / "new" / "out"
+    with held_folder(out), pytest.raises(OutputError, match="another run is writing there"), held_folder(out):
+        pass
+    assert list(tmp_path.iterdir()) == []
+    with held_folder(out):
+        (out / "kept").touch()
+    with held_folder(out), pytest.raises(OutputError, match="is a file"), held_folder(out / "kept"):
+        pass
+    assert [path.name for path in out.iterdir()] == ["kept"]

@@ -87,8 +87,8 @@ def atomic_directory(target: Path, *, replace: bool = False, owned: tuple[str, .
     with translated_os_errors(target):
         if not replace:
             expect_empty(target, can_overwrite=bool(owned))
-        elif target.exists() and not target.is_dir():
-            raise OutputError(f"{target}: is a file; name a folder")
+        else:
+            _expect_no_file(target)
         made = [folder for folder in target.parents if not folder.exists()]
         target.parent.mkdir(parents=True, exist_ok=True)
     try:
@@ -209,6 +209,36 @@ def _taken(staging: Path) -> int | None:
 
 
 @contextlib.contextmanager
+def held_folder(folder: Path) -> Iterator[None]:
+    """Hold a folder for this process alone; one that isn't there is made, and removed if it stays empty.
+
+    A killed process holds nothing. Raises OutputError if another process holds it.
+    """
+    import fcntl
+
+    _expect_no_file(folder)
+    made = [one for one in (folder, *folder.parents) if not one.exists()]
+    with contextlib.ExitStack() as stack:
+        for one in reversed(made):
+            stack.callback(_remove_if_empty, one)
+        with translated_os_errors(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+            stack.callback(os.close, held)
+            try:
+                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                told = "another run is writing there; name another folder, or end that run"
+                raise OutputError(f"{folder}: {told}") from error
+        yield
+
+
+def _remove_if_empty(folder: Path) -> None:
+    with contextlib.suppress(OSError):
+        folder.rmdir()
+
+
+@contextlib.contextmanager
 def translated_os_errors(target: Path) -> Iterator[None]:
     """Translate refusals by the operating system (full disk, no permission) into one `OutputError` line.
 
@@ -268,11 +298,15 @@ def expect_empty(target: Path, *, can_overwrite: bool = False) -> None:
 
     can_overwrite: the caller has an option to overwrite, which the message names.
     """
-    if target.exists() and not target.is_dir():
-        raise OutputError(f"{target}: is a file; name a folder")
+    _expect_no_file(target)
     if target.is_dir() and any(target.iterdir()):
         remedy = "or overwrite it (--overwrite)" if can_overwrite else "or remove it"
         raise OutputError(f"{target}: exists and is not empty; name another folder {remedy}")
+
+
+def _expect_no_file(target: Path) -> None:
+    if target.exists() and not target.is_dir():
+        raise OutputError(f"{target}: is a file; name a folder")
 
 
 def _replace(source: Path, target: Path) -> None:

@@ -15,6 +15,7 @@ from barsight.cli.measure import print_outcome
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError
+from barsight.core.files import held_folder
 from barsight.core.printing import printed_aside
 from barsight.live.crane.run import measure_crane, measure_surveys, replay_surveys
 from barsight.live.run import replay as replay_recording
@@ -67,7 +68,7 @@ def run(arguments: Sequence[str]) -> None:
             raise ConfigError("--keyframes is for one replay, without --surveys")
         if replay is None and (speed != 1 or at != "now" or keyframes is not None):
             raise ConfigError("--speed, --at and --keyframes are for --replay; a crane has its own pace")
-        with printed_aside(console.print_line) as tell, stages(console) as advance:
+        with printed_aside(console.print_line) as tell, stages(console) as advance, held_folder(out):
             common: dict[str, Any] = {"magnet": magnet, "tell": tell, "advance": advance}
             if replay is not None:
                 run_replay = replay_surveys if surveys else partial(replay_recording, keyframes=keyframes)
