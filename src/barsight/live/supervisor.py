@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
@@ -97,6 +97,16 @@ def run_process(role: str, link: Link) -> None:
         sys.exit(1)
 
 
+@contextlib.contextmanager
+def _signals_blocked() -> Iterator[None]:
+    """Block Ctrl-C and SIGTERM, which a terminal sends to all processes, also for the server of processes."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 class Supervisor:
     """Runs the processes of a run. tell: receives each line of the log."""
 
@@ -163,7 +173,8 @@ class Supervisor:
             target=run_process, args=(role, self._link), name=f"barsight {role}", daemon=True
         )
         self._board.beat(role)
-        process.start()
+        with _signals_blocked():
+            process.start()
         self._running[role] = process
         self.state.processes[role].pid = process.pid or 0
 
