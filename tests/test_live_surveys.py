@@ -16,7 +16,7 @@ import pytest
 import barsight as bs
 from barsight.core.settings.values import build_settings
 from barsight.live.crane import run as crane_run
-from barsight.live.crane.run import _drop_standing, _keep, replay_surveys
+from barsight.live.crane.run import _drop_standing, _keep, _tidy, replay_surveys
 from barsight.live.drift import DAY_NS, HEAD, NAMES, drift_figures, note_drift
 from barsight.live.link import Link, LiveInput
 from barsight.live.run import _stopped_by_signals, ended_afterwards
@@ -210,6 +210,56 @@ def test_no_process_outlives_a_command_that_was_killed_at_once(tmp_path: Path) -
     while held.is_dir() and (held / "stat").read_text().rpartition(")")[2].split()[0] != "Z":
         assert time.monotonic() < give_up
         time.sleep(0.05)
+
+
+STARTER = """
+import multiprocessing, signal, time
+from barsight.live.shared.counters import Counters
+from barsight.live.supervisor import _signals_blocked
+if __name__ == "__main__":
+    got = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: got.append(_[0]))
+    board, context = Counters(), multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["barsight.live.supervisor"])
+    process = context.Process(target=time.sleep, args=(0.1,))
+    print("now", flush=True)
+    with _signals_blocked():
+        process.start()
+    process.join()
+    board.remove()
+    print(process.exitcode, sorted(got), flush=True)
+"""
+
+
+def test_signals_to_all_processes_while_the_first_one_starts_end_none_of_them(tmp_path: Path) -> None:
+    """Ctrl-C in a terminal: the server of processes had printed a traceback, and the command another."""
+    script = tmp_path / "starter.py"
+    script.write_text(STARTER, encoding="utf-8")
+    with subprocess.Popen(
+        [sys.executable, script],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as command:
+        assert command.stdout is not None and command.stderr is not None
+        assert command.stdout.readline() == "now\n"
+        for number in (signal.SIGINT, signal.SIGTERM):
+            time.sleep(0.4)
+            os.killpg(command.pid, number)
+        assert command.stdout.readline() == "0 [2, 15]\n"
+        assert command.stderr.read() == ""
+
+
+def test_what_a_killed_run_was_working_on_is_removed_but_not_its_recording(tmp_path: Path) -> None:
+    killed = tmp_path / "20261130T122950"
+    for name in (".live", "recording"):
+        (killed / name).mkdir(parents=True)
+        (killed / name / "data").touch()
+    _tidy(tmp_path)
+    assert [path.name for path in killed.iterdir()] == ["recording"]
+    _tidy(tmp_path / "none yet")
 
 
 def test_the_oldest_surveys_go_but_for_protected_ones(tmp_path: Path) -> None:

@@ -48,6 +48,8 @@ from barsight.yard_frame import in_yard
 
 MAX_SPEED = 1000.0
 KEYFRAMES_VERSION = 2
+WORK = ".live"
+"""Folder of a run's intermediate data, in its output folder while it lasts."""
 LATEST = ("pose.json", LIVE_MAP)
 """Files that hold the latest value during the run."""
 
@@ -111,7 +113,7 @@ class LiveRun:
         Returns an empty result if the crane only stood.
         """
         compile_ahead(advance, "measure")
-        folder = self._out.absolute() / ".live"
+        folder = self._out.absolute() / WORK
         with translated_os_errors(self._out):
             folder.mkdir(parents=True, exist_ok=True)
         camera = self._recording.rig.cam0

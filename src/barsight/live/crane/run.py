@@ -16,7 +16,7 @@ from barsight.core.timing import ProgressCallback
 from barsight.live.crane.preflight import prove_sensors
 from barsight.live.drift import DRIFT_FILE, note_drift
 from barsight.live.link import LiveInput
-from barsight.live.run import LiveRun, begin_replay, handled_signals
+from barsight.live.run import WORK, LiveRun, begin_replay, handled_signals
 from barsight.live.settings import CraneConfig, LiveSettings
 from barsight.live.survey import INTERRUPTED, STOOD
 from barsight.measure_folder import ignore_progress
@@ -74,6 +74,7 @@ def measure_surveys(
         raise ConfigError("crane.toml has no [encoders], by which surveys begin and end")
     request = LiftRequest(None if magnet is None else load_magnet(magnet), surveys=out)
     proved, ended, is_first = False, "", True
+    _tidy(out)
     while ended != INTERRUPTED:
         folder = out / datetime.now(UTC).strftime(STAMP)
         recording = _recorded(crane, folder, folder.name)
@@ -116,6 +117,7 @@ def replay_surveys(
     """
     request = LiftRequest(None if magnet is None else load_magnet(magnet), judged_at)
     ended, is_first = "", True
+    _tidy(out)
     while ended != INTERRUPTED:
         folder = out / datetime.now(UTC).strftime(STAMP)
         run = begin_replay(path, folder, settings, live, speed, tell)
@@ -174,16 +176,26 @@ def _point(link: Path, name: str) -> None:
         fresh.replace(link)
 
 
+def _tidy(out: Path) -> None:
+    """Remove what killed runs left of their work; their recordings stay."""
+    for path in _surveys(out):
+        shutil.rmtree(path / WORK, ignore_errors=True)
+
+
 def _keep(out: Path, count: int, newest: str) -> None:
     """Remove the oldest survey folders beyond `count`, except the last one measured.
 
     newest: name of the folder just written.
     """
-    surveys = [
-        path for path in out.iterdir()
-        if path.is_dir() and not path.is_symlink() and len(path.name) == 15 and path.name[8] == "T"
-    ]  # fmt: skip
-    for path in oldest_first(surveys, newest)[:-count]:
+    for path in oldest_first(_surveys(out), newest)[:-count]:
         is_latest = (out / LATEST).exists() and path.samefile(out / LATEST)
         if not is_latest and not (path / PROTECTED).exists():
             shutil.rmtree(path, ignore_errors=True)
+
+
+def _surveys(out: Path) -> list[Path]:
+    """List the survey folders in `out`."""
+    return [
+        path for path in (out.iterdir() if out.is_dir() else ())
+        if path.is_dir() and not path.is_symlink() and len(path.name) == 15 and path.name[8] == "T"
+    ]  # fmt: skip
