@@ -278,7 +278,18 @@ position_std_m = 0.002
         ("[0.4, 0.0, -1.5]", "[400, 0, -1500]", "encoders.p_crane_body_m must lie in -30...30"),
         ("p_crane_body_m", "p_crane_body_mm", "did you mean p_crane_body_m"),
         ("exposure_us = 800", "exposure_us = 0.0008", "cameras.exposure_us must lie in 5...200000"),
+        ("exposure_us = 800", "exposure_us = 40000", "over the interval between pictures, 33333"),
         ('"B2"', '"A1"', "names A1 twice"),
+        (
+            "[encoders]",
+            "[imu]\nport = 5602\nrate_hz = 200\n[encoders]",
+            "imu and encoders are both at UDP port",
+        ),
+        (
+            "[encoders]\nport = 5602",
+            '[imu]\ndevice = "a"\nbaud = 460800\nrate_hz = 200\n[encoders]\ndevice = "a"\nbaud = 921600',
+            "imu and encoders are both at a;",
+        ),
         ("0, -1, 0, 0", "0, 1, 0, 0", "encoders.R_yard_body"),
         ("position_std_m = 0.002", "position_std_m = 2", "encoders.position_std_m must lie in"),
         ("port = 5602", "port = 99999", "encoders.port must lie in 1...65535"),

@@ -57,6 +57,13 @@ def test_stamps_are_ns_whatever_the_cameras_tick_is(ticks: int, has_feature: boo
     assert np.abs(np.diff(stamps) - PERIOD_S * 1e9).max() < 100
 
 
+def test_an_interface_that_is_not_there_is_named() -> None:
+    from barsight.sensors.gige import GigeCamera
+
+    with pytest.raises(InputError, match=r"cameras: can't be searched: iface 'nosuch0'.*cameras\.interface"):
+        GigeCamera.find(CamerasSettings(("L", "R"), 30.0, interface="nosuch0"))
+
+
 def test_a_camera_tells_why_it_is_not_connected_until_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     """It is away, then comes back with another size, then as it was."""
     from barsight.sensors.gige import GigeCamera

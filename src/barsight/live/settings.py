@@ -130,6 +130,11 @@ class CraneConfig:
     measure: MeasureSettings = field(default_factory=MeasureSettings)
     live: LiveSettings = LiveSettings()
 
+    def __post_init__(self) -> None:
+        ways = [sensor.way.partition(" at ")[0] for sensor in self.sensors().values()]
+        if len(set(ways)) < len(ways):
+            raise ConfigError(f"imu and encoders are both at {ways[0]}; give each its own port or device")
+
     def sensors(self) -> dict[str, ImuSettings | EncodersSettings]:
         """Return the settings of `imu` and `crane`, if there are any."""
         have = {"imu": self.imu, "crane": self.encoders}

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from barsight.core.errors import InputError
 from barsight.core.extras import extra
 from barsight.core.stamps import NS_PER_S
 from barsight.sensors.camera import WAIT_MS, Blocks, CameraDriver, RawLoss, RawPicture
@@ -38,7 +39,14 @@ class GigeCamera(CameraDriver):
     def find(settings: CamerasSettings) -> dict[str, Any]:
         """Find all cameras on the network by serial number, without taking control of any."""
         found: dict[str, Any] = {}
-        for device in vg.discover(timeout_ms=SEARCH_MS, iface=settings.interface):
+        try:
+            devices = vg.discover(timeout_ms=SEARCH_MS, iface=settings.interface)
+        except vg.GenicamError as error:
+            raise InputError(
+                "cameras", f"can't be searched: {' '.join(str(error).split())[:200]}",
+                "name one of these in cameras.interface, or leave it out to search all",
+            ) from error  # fmt: skip
+        for device in devices:
             try:
                 with vg.connect_gige(device, iface=settings.interface, monitor=True) as camera:
                     found[_serial(camera)] = device

@@ -52,6 +52,12 @@ class CamerasSettings:
         expect_ranges(
             self, "cameras.", rate_hz=(0.5, 200), exposure_us=(5, 200_000), packet_size_bytes=(500, 16000)
         )
+        interval_us = 1e6 / self.rate_hz
+        if self.exposure_us is not None and self.exposure_us >= interval_us:
+            raise ConfigError(
+                f"cameras.exposure_us is {self.exposure_us:g}, over the interval between pictures, "
+                f"{interval_us:.0f}; give microseconds, or a lower cameras.rate_hz"
+            )
         if self.serials[0] == self.serials[1]:
             raise ConfigError(f"cameras.serials names {self.serials[0]} twice; give cam0's and cam1's")
 
