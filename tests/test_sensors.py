@@ -134,7 +134,7 @@ def test_datagrams_are_read_and_what_is_lost_or_torn_counts() -> None:
     place = (1.5, -2.0, 8.0)
     whole = [pack("crane", number, 100 + number, place) for number in (7, 8, 8, 11)]
     sent = [whole[0] + whole[1], whole[2], b"BSC1", pack("imu", 1, 5, (0.0,) * 6), whole[3]]
-    sent += [struct.pack("<4sIq3d", b"BSC1", 12, 112, *place[:2], float("nan"))]
+    sent += [struct.pack("<4sIq3d", b"BSC1", 12, 112, *place[:2], wrong) for wrong in (float("nan"), 1e30)]
     for data in sent:
         out.sendto(data, ("127.0.0.1", port))
     give_up = time.monotonic() + 0.5
@@ -142,7 +142,7 @@ def test_datagrams_are_read_and_what_is_lost_or_torn_counts() -> None:
     assert [(one.device_ns, one.values, one.lost) for one in found] == [
         (107, place, 0), (108, place, 0), (111, place, 2),
     ]  # fmt: skip
-    assert receiver.torn == 3 and found[0].arrival_ns == 42
+    assert receiver.torn == 4 and found[0].arrival_ns == 42
     assert (receiver.sequence.overtaken, receiver.sequence.restarts) == (1, 0)
     with pytest.raises(bs.BarsightError, match=rf"crane: UDP port {port} can't be opened"):
         ReadingReceiver("crane", settings)
@@ -193,6 +193,24 @@ def test_readings_that_are_overtaken_or_doubled_begin_nothing_anew(rate_hz: int)
             missing += found
     assert (np.diff(taken) > 0).all() and len(taken) + missing == taken[-1] - taken[0] + 1
     assert sequence.restarts == 0 and sequence.overtaken == len(sent) - len(taken) > 0
+
+
+class Broken:
+    """A camera whose driver fails in a way that nobody foresaw."""
+
+    name, trouble, ptp, connects = "cam0", "", "", 1
+
+    def pictures(self, may_go_on: Any) -> Any:
+        yield RawPicture(1, 1, 1, DARK)
+        raise ValueError("not foreseen")
+
+
+def test_a_sensor_whose_thread_fails_ends_the_capture_with_its_error() -> None:
+    """Else the sensor would be silent for the rest of the run; the process begins anew."""
+    give_up = time.monotonic() + 5.0
+    source = CraneSource((Broken(), Broken()), {}, 30.0, 0, lambda: time.monotonic() < give_up)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="not foreseen"):
+        list(source.packets({"cam0": 0, "cam1": 0}))
 
 
 def test_readings_wait_while_all_is_held_up_and_pictures_that_find_no_room_count(

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -63,17 +64,24 @@ class CraneSource:
         self._room = threading.Semaphore(RAW_PICTURES)
         self._held: list[tuple[int, int, int, LivePicture]] = []
         self._overflow = self._device_ns = 0
+        self._failed: Exception | None = None
 
     def packets(self, after: dict[str, int]) -> Iterator[Packet]:
         """Yield packets as they arrive, pictures in time order; see `Source.packets`."""
         for name, stream in self._streams.items():
             stream.last_ns = after[name]
         threads = [
-            threading.Thread(target=self._take_pictures, args=(f"cam{k}", camera), daemon=True)
+            threading.Thread(
+                target=self._take, args=(f"cam{k}", partial(camera.pictures, self._is_going)), daemon=True
+            )
             for k, camera in enumerate(self._cameras)
         ]
         threads += [
-            threading.Thread(target=self._take_readings, args=(name, one), daemon=True)
+            threading.Thread(
+                target=self._take,
+                args=(name, partial(one.readings, self._is_going, time.monotonic_ns)),
+                daemon=True,
+            )
             for name, one in self._receivers.items()
         ]
         for thread in threads:
@@ -82,6 +90,8 @@ class CraneSource:
         try:
             while self._ask():
                 yield from self._next()
+                if self._failed is not None:
+                    raise self._failed
                 if time.monotonic() >= signs_at:
                     signs_at = time.monotonic() + SIGNS_EVERY_S
                     troubles = {camera.name: camera.trouble for camera in self._cameras}
@@ -94,13 +104,16 @@ class CraneSource:
             for receiver in self._receivers.values():
                 receiver.close()
 
-    def _take_pictures(self, name: str, camera: CameraDriver) -> None:
-        for item in camera.pictures(lambda: self._going):
-            self._put(name, item)
+    def _take(self, name: str, items: Callable[[], Iterator[RawPicture | RawLoss | RawReading]]) -> None:
+        """Take what a sensor gives; an error that its driver doesn't expect ends the source."""
+        try:
+            for item in items():
+                self._put(name, item)
+        except Exception as error:
+            self._failed = error
 
-    def _take_readings(self, name: str, receiver: ReadingReceiver) -> None:
-        for item in receiver.readings(lambda: self._going, time.monotonic_ns):
-            self._put(name, item)
+    def _is_going(self) -> bool:
+        return self._going
 
     def _put(self, name: str, item: RawPicture | RawLoss | RawReading) -> None:
         if isinstance(item, RawPicture) and not self._room.acquire(blocking=False):

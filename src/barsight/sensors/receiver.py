@@ -7,9 +7,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
-
 from barsight.core.errors import ConfigError
+from barsight.core.reading.bounded_reading import in_range
 from barsight.core.stamps import NS_PER_S
 from barsight.sensors.forms import FORMS
 from barsight.sensors.settings import ReadingsSettings
@@ -151,7 +150,7 @@ class ReadingReceiver:
 
     def _parsed(self, data: bytes, arrival_ns: int) -> Iterator[RawReading]:
         for mark, number, stamp, *values in self._form.iter_unpack(data):
-            if mark != self._mark or not np.isfinite(values).all():
+            if mark != self._mark or not in_range(values).all():  # no recording may hold it
                 self.torn += 1
                 continue
             lost = self.sequence.lost_before(number, stamp, arrival_ns)
