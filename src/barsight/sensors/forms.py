@@ -11,6 +11,8 @@ from __future__ import annotations
 import struct
 
 FORMS = {"imu": (b"BSI1", struct.Struct("<4sIq6d")), "crane": (b"BSC1", struct.Struct("<4sIq3d"))}
+LIMITS = {"imu": (1e4, 1e4, 1e4, 1e5, 1e5, 1e5), "crane": (1e7, 1e7, 1e7)}
+"""Largest magnitudes of values; beyond them a reading is garbage, not one in another unit."""
 CRC_BYTES = 4
 
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
 from barsight.core.errors import ConfigError
-from barsight.core.reading.bounded_reading import in_range
 from barsight.core.stamps import NS_PER_S
-from barsight.sensors.forms import FORMS
+from barsight.sensors.forms import FORMS, LIMITS
 from barsight.sensors.settings import ReadingsSettings
 
 MAX_BYTES = 65536
@@ -120,7 +119,7 @@ class ReadingReceiver:
 
     def __init__(self, sensor: str, settings: ReadingsSettings) -> None:
         """Open the channel. Raises ConfigError if a UDP port is taken; a serial device may appear later."""
-        self._mark, self._form = FORMS[sensor]
+        (self._mark, self._form), self._limits = FORMS[sensor], LIMITS[sensor]
         self.torn = 0
         self._way: Way
         if settings.port is not None:
@@ -150,9 +149,13 @@ class ReadingReceiver:
 
     def _parsed(self, data: bytes, arrival_ns: int) -> Iterator[RawReading]:
         for mark, number, stamp, *values in self._form.iter_unpack(data):
-            if mark != self._mark or not in_range(values).all():  # no recording may hold it
+            if mark != self._mark or not self._are_sane(values):
                 self.torn += 1
                 continue
             lost = self.sequence.lost_before(number, stamp, arrival_ns)
             if lost is not None:
                 yield RawReading(stamp, arrival_ns, tuple(values), lost)
+
+    def _are_sane(self, values: Iterable[float]) -> bool:
+        """Check that no value is NaN or beyond its limit."""
+        return all(abs(value) <= limit for value, limit in zip(values, self._limits, strict=True))
