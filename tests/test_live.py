@@ -329,6 +329,7 @@ HEARD = SensorActivity((10**9, 10**9), 10**9, 30_000_000, {"imu": 10**9, "crane"
         (replace(HEARD, restarted=True), 0, {}, "full", False, "their zero may have changed"),
         (replace(HEARD, troubles={"cam0": "has 1x1"}), 0, {}, "full", True, None),
         (replace(HEARD, troubles={"cam0": "has 1x1"}), 1.0, {}, "blind", False, "(bound 0.30 s): has 1x1"),
+        (replace(HEARD, troubles={"imu_clock": "it drifts"}), 0, {}, "full", False, "imu: it drifts"),
         (replace(HEARD, troubles={"pictures": "black"}), 0, {}, "encoders-only", False, "cam1: black"),
         (HEARD, 0, {"track": "x"}, "encoders-only", False, "track is down"),
         (HEARD, 0, {"map": "x"}, "full", False, "map is down"),

@@ -49,6 +49,19 @@ def test_a_clock_is_mapped_by_its_least_delays(seed: int) -> None:
     assert abs(clock.drift_ppb - 60_000) < 3_000 and 50e6 < clock.jitter_ns < 300e6
 
 
+@pytest.mark.parametrize(("ppm", "is_wild"), [(150, False), (-150, False), (-300, True), (500, True)])
+def test_a_clock_that_drifts_too_fast_to_be_followed_is_told(ppm: float, is_wild: bool) -> None:
+    """One of -300 ppm had stamps 12 ms late, and nothing told so; a busy host is no such clock."""
+    rng, clock, told = np.random.default_rng(0), DeviceClock(), []
+    for k in range(20 * 180):
+        true_ns = k * SECOND // 20
+        late_ns = 1e6 + rng.exponential(1e6) + (rng.uniform(0, 8e7) if 30 < true_ns / SECOND < 90 else 0.0)
+        clock.add(round(true_ns * (1 + ppm * 1e-6)), round(true_ns + late_ns))
+        told.append(clock.is_wild)
+    assert any(told[20 * 30 : 20 * 60]) is False
+    assert all(told[20 * 100 :]) if is_wild else not any(told)
+
+
 def test_a_clock_that_jumps_settles_anew() -> None:
     for jump_ns in (-20 * SECOND, 20 * SECOND):
         clock = DeviceClock()

@@ -86,8 +86,8 @@ class Link:
         return ReadingLog(self.folder / f"{sensor}.log", {"imu": 6, "crane": 3}[sensor])
 
     def tell(self, name: str, why: str) -> None:
-        """Write why a process ended, a camera isn't connected or `pictures` can't be matched; "" if none of
-        it is so. The disk may be full, of which the command tells.
+        """Write why a process ended, or one of `modes.TROUBLES`; "" once it is over. The disk may be full, of
+        which the command tells.
         """
         with contextlib.suppress(OSError):
             self._reason(name).write_text(why, encoding="utf-8")

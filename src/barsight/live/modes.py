@@ -23,6 +23,11 @@ MODES: dict[ModeName, str] = {
     "encoders-only": "Encoders without pairs of pictures: no new map, no lift.",
     "blind": "Neither pictures nor encoders: nothing is known, no lift.",
 }
+SENSORS = ("cam0", "cam1", "imu", "crane")
+TROUBLES = ("cam0", "cam1", "pictures", *(f"{name}_clock" for name in SENSORS))
+"""Names of troubles: why a camera isn't connected, why nothing in the last pictures can be matched, and why a
+sensor's clock can't be followed.
+"""
 FOR_LIFTS = ("full", "no-imu")
 MIN_CAMERA_SILENCE_S = 0.3
 PAIR_SILENCES = 2
@@ -57,8 +62,7 @@ class SensorActivity:
     the encoders repeat one reading although the crane must be moving. jumped_m: by how much (m) they have
     jumped, otherwise 0. off_m: by how much each is off by cameras and IMU, which also see a jump that came
     while they were silent. restarted: whether their sender has restarted during the run. clock_step_s: of the
-    system's clock. troubles: why `cam0` or `cam1` isn't connected, and why nothing in the last `pictures` can
-    be matched, "" if neither is so.
+    system's clock. troubles: by name, "" or missing if there is none (see TROUBLES).
     """
 
     cameras_ns: tuple[int, int]
@@ -111,7 +115,7 @@ def judge_mode(
 
 
 def _doubts(heard: SensorActivity) -> list[str]:
-    """List what revokes lifts whatever the mode: ages or the encoders' zero can't be told."""
+    """List what revokes lifts whatever the mode: ages, stamps or the encoders' zero can't be told."""
     doubts = []
     if abs(heard.clock_step_s) > MAX_CLOCK_STEP_S:
         doubts.append(f"the system's clock was stepped by {heard.clock_step_s:.1f} s: ages can't be told")
@@ -119,6 +123,7 @@ def _doubts(heard: SensorActivity) -> list[str]:
         doubts.append(f"the encoders are {1e3 * off_m:.0f} mm off by cameras and IMU, survey again")
     if heard.restarted:
         doubts.append("the encoders' sender began anew, their zero may have changed: survey again")
+    doubts += [f"{name}: {why}" for name in SENSORS if (why := heard.troubles.get(f"{name}_clock", ""))]
     return doubts
 
 

@@ -22,6 +22,7 @@ from barsight.live.link import Link
 from barsight.live.mapper import build_live_map
 from barsight.live.modes import (
     FOR_LIFTS,
+    TROUBLES,
     EncoderFaults,
     FreezeWatch,
     Mode,
@@ -301,7 +302,7 @@ class Supervisor:
             self._restarted |= board["sensors", "crane_restarts"] > 0  # a capture begun anew counts from 0
         if self._link.source.crane is not None:
             step_s = (time.time_ns() - time.monotonic_ns() - self._link.source.epoch_ns) / NS_PER_S
-        troubles = {name: self._link.told(name) for name in ("cam0", "cam1", "pictures")}
+        troubles = {name: self._link.told(name) for name in TROUBLES}
         return SensorActivity(
             last_ns, pair_ns, interval_ns, readings, frozen, jumped_m,
             tuple(board["track", name] / 1e6 for name in OFF), self._restarted, step_s, troubles,

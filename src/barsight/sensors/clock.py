@@ -17,6 +17,8 @@ drift.
 """
 MAX_DRIFT = 2e-4
 """Largest drift. Quartz clocks agree within 1e-4: a steeper line results from a few late stamps."""
+WILD_AFTER_NS = 60 * NS_PER_S
+"""Time span of stamps over which a steeper line is the clock's own, not that of a few late stamps."""
 EARLY_NS = 50_000_000
 """A clock has jumped if a stamp seems to arrive this much (ns) before it was made."""
 LATE_NS, LATE_COUNT = NS_PER_S, 5
@@ -40,6 +42,8 @@ class DeviceClock:
     the line below all points (s, a - s) and closest to them in their middle gives offset and drift: it is an
     edge of the lower convex hull [Zhang, Liu, Xia 2002]. The smallest delay itself stays in the offset: it is
     constant, and the calibration of the camera against the IMU includes it.
+
+    is_wild: whether it drifts by over `MAX_DRIFT`, as a clock does while it is slewed: stamps are wrong then.
     """
 
     def __init__(self) -> None:
@@ -55,6 +59,7 @@ class DeviceClock:
         self._behind, self._behind_ns = 0, 0
         self._newest_ns, self._older = 0, 0
         self._offset_ns, self._drift = 0.0, 0.0
+        self.is_wild = False
 
     def add(self, device_ns: int, arrival_ns: int) -> bool:
         """Add a stamp and its arrival time (monotonic); return whether the clock is settled."""
@@ -126,6 +131,7 @@ class DeviceClock:
         points = list(self._minima)
         if points[-1][0] - points[0][0] < DRIFT_AFTER_NS:
             self._drift, self._offset_ns = 0.0, float(min(apart for _, apart in points))
+            self.is_wild = False
             return
         hull: list[tuple[int, int]] = []
         for point in points:
@@ -135,7 +141,9 @@ class DeviceClock:
         middle = sum(since for since, _ in points) / len(points)
         right = next(k for k in range(1, len(hull)) if hull[k][0] >= middle or k == len(hull) - 1)
         (x0, y0), (x1, y1) = hull[right - 1], hull[right]
-        self._drift = float(np.clip((y1 - y0) / (x1 - x0), -MAX_DRIFT, MAX_DRIFT))
+        slope = (y1 - y0) / (x1 - x0)
+        self.is_wild = abs(slope) > MAX_DRIFT and points[-1][0] - points[0][0] >= WILD_AFTER_NS
+        self._drift = float(np.clip(slope, -MAX_DRIFT, MAX_DRIFT))
         self._offset_ns = min(apart - self._drift * since for since, apart in points)
 
 

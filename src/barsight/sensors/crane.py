@@ -14,7 +14,7 @@ import numpy as np
 
 from barsight.core.stamps import NS_PER_S
 from barsight.sensors.camera import PTP_ROLES, CameraDriver, RawLoss, RawPicture, are_one_clock
-from barsight.sensors.clock import DeviceClock
+from barsight.sensors.clock import MAX_DRIFT, DeviceClock
 from barsight.sensors.receiver import RawReading, ReadingReceiver
 from barsight.sensors.source import LivePicture, LostPicture, Packet, Readings, SensorSigns
 
@@ -94,8 +94,7 @@ class CraneSource:
                     raise self._failed
                 if time.monotonic() >= signs_at:
                     signs_at = time.monotonic() + SIGNS_EVERY_S
-                    troubles = {camera.name: camera.trouble for camera in self._cameras}
-                    yield SensorSigns(self._signs(), troubles)
+                    yield SensorSigns(self._signs(), self._troubles())
             yield from self._ordered(until_ns=None)
         finally:
             self._going = False
@@ -202,6 +201,13 @@ class CraneSource:
                 return
             heapq.heappop(self._held)
             yield picture
+
+    def _troubles(self) -> dict[str, str]:
+        troubles = {camera.name: camera.trouble for camera in self._cameras}
+        wild = f"its clock drifts by over {1e6 * MAX_DRIFT:.0f} ppm, its stamps are wrong"
+        for name, stream in self._streams.items():
+            troubles[f"{name}_clock"] = wild if stream.clock.is_wild else ""
+        return troubles
 
     def _signs(self) -> dict[str, int]:
         signs: dict[str, int] = {}

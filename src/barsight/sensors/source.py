@@ -44,8 +44,8 @@ class Readings:
 
 @dataclass(frozen=True)
 class SensorSigns:
-    """Health data of the sensors. values: by the counter names of the row `sensors`. troubles: of `cam0` and
-    `cam1`, why it isn't connected, "" if it is.
+    """Health data of the sensors. values: by the counter names of the row `sensors`. troubles: why `cam0` or
+    `cam1` isn't connected and why a sensor's clock (`imu_clock`) can't be followed, "" if neither is so.
     """
 
     values: Mapping[str, int]
