@@ -22,7 +22,7 @@ from barsight.plant.settings import PlantSettings
 from barsight.plant.steps import LiftSteps
 from barsight.plant.telegram import IN_MAGIC, out_values, pack, unpack
 from barsight.store import confirmation
-from barsight.store.adding import end_disturbed
+from barsight.store.adding import end_disturbed, end_touched
 from barsight.store.audit import entry
 from barsight.store.lift_records import add_lifts, settle_lifts
 from barsight.store.opening import Store, open_store
@@ -236,6 +236,7 @@ class Plant:
             settle_lifts(opened, {}, from_ns, is_newest=True)
             add_lifts(opened, survey_id, content, ids, is_newest=True)
             end_disturbed(opened, from_ns)
+            end_touched(opened, from_ns)
             for lift_id in opened.rows["lifts"]:
                 self.ends_s[lift_id] = self.now_s + VALID_S
 
@@ -285,9 +286,10 @@ class Plant:
             return True
         found = wire.up.popleft()
         try:
+            wire.partner.watch(wire.partner.reading(found))
             if wire.partner.receive(found):
                 self.store.fault[:] = [fault] if fault else []
-                wire.partner.execute(found)
+                wire.partner.execute()
         except Killed:
             self.start_server()
             return False

@@ -74,7 +74,7 @@ APART = {
 MAX_MODULES = 15
 ROOT = Path(barsight.__file__).parent
 OPTIONAL = {
-    "viser": 1, "plotly": 1, "rosbags": 3, "pymunk": 1, "alembic": 7, "viva_genicam": 1, "fastapi": 5,
+    "viser": 1, "plotly": 1, "rosbags": 3, "pymunk": 1, "alembic": 8, "viva_genicam": 1, "fastapi": 5,
     "pypylon": 1, "mitsuba": 1, "drjit": 1, "uvicorn": 1, "zxingcpp": 1, "obstore": 1, "distributed": 1,
     "dask": 1,
     "asyncua": 1, "aiomqtt": 1, "snap7": 1, "reportlab": 1, "tesserocr": 1,

@@ -52,6 +52,8 @@ EXTRAS = {
         "store/migrations/versions/v0003_fleet.py",
         "store/migrations/versions/v0004_places.py",
         "store/migrations/versions/v0005_equipment.py",
+        "store/migrations/versions/v0006_touches.py",
+        "store/touches.py",
         "fleet/records.py",
         "fleet/promoting.py",
         "plant/handshake.py",

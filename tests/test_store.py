@@ -239,8 +239,8 @@ NEXT = """
 import sqlalchemy as sa
 from alembic import op
 
-revision = "0006"
-down_revision = "0005"
+revision = "0007"
+down_revision = "0006"
 
 
 def upgrade():
@@ -252,7 +252,7 @@ def upgrade():
 def next_version(folder: Path, monkeypatch: pytest.MonkeyPatch, more: str = "pass") -> None:
     """As if a later version of the package with one more migration were installed."""
     shutil.copytree(opening.MIGRATIONS, folder, ignore=shutil.ignore_patterns("__pycache__"))
-    (folder / "versions" / "v0006_next.py").write_text(NEXT.format(more=more), encoding="utf-8")
+    (folder / "versions" / "v0007_next.py").write_text(NEXT.format(more=more), encoding="utf-8")
     monkeypatch.setattr(opening, "MIGRATIONS", folder)
 
 
@@ -274,7 +274,7 @@ def test_an_earlier_schema_is_brought_up_to_date_after_a_backup(
     assert run(["store", "verify", store_url]) == 3
     assert "newer version" in capsys.readouterr().err
     if store_url.startswith("sqlite"):
-        backup = tmp_path / "yard.db.schema-0005.backup"
+        backup = tmp_path / "yard.db.schema-0006.backup"
         with open_store(f"sqlite:///{backup}") as store:
             assert checked(store) == before
 

@@ -15,9 +15,9 @@ from barsight.core.errors import InputError
 from barsight.core.extras import extra
 from barsight.core.reading.geotiff import open_geotiff
 from barsight.report.map_images import hillshade
-from barsight.store.coarse_map import unpack
 from barsight.store.promotion import counts
 from barsight.store.tables import SURVEYS
+from barsight.yard.inventory.coarse_map import unpack
 from barsight.yard.map_lookup import nearest_cells
 from barsight.yard.types import HeightMap
 

@@ -23,6 +23,7 @@ from barsight.store.confirmation import (
 from barsight.store.opening import Store
 from barsight.store.states import step_lift
 from barsight.store.tables import LIFT_STATES, LIFTS, MAX_ID
+from barsight.store.touches import note_beside, was_at_target
 
 with extra("store"):
     from sqlalchemy import Connection, Row, select
@@ -103,7 +104,8 @@ def begin_claimed(store: Store, claim: LiftClaim) -> LiftClaim | Failed:
 def report_executed(store: Store, claim: LiftClaim, load_kg: float | None) -> str | Failed:
     """Report a claimed lift as executed: `confirmed`, `contradicted` by the load cell, or `unweighed`.
 
-    A contradiction raises the alarm `load-contradicts`; the next survey shows what was really moved. A
+    A contradiction raises the alarm `load-contradicts`; the next survey shows what was really moved. A lift
+    that the crane's own readings place beside its target is recorded as failed and the report refused. A
     repeated report gets the same answer and changes nothing. A lift that has already ended in another way
     can't be recorded: this raises the alarm `lift-unrecorded` and withdraws all offers. Raises BarsightError
     if the store can't be written; the report must then be repeated.
@@ -119,8 +121,17 @@ def report_executed(store: Store, claim: LiftClaim, load_kg: float | None) -> st
             verdict, alarm = "contradicted", ("load-contradicts", f"lift {claim.lift_id}: {weighed}")
     if "executed" in states_of(store, claim.lift_id):
         return verdict
+    beside = note_beside(store, claim.lift_id, claim.who)
+    if beside is not None:
+        failed = report_failed(store, claim, f"it was reported as executed; {beside}")
+        return failed if isinstance(failed, Failed) else Failed("beside", beside)
+    with store.reading() as connection:
+        is_known = was_at_target(connection, claim.lift_id)
+    place = (
+        "at its target, by the crane's readings" if is_known else "where isn't known: no position was sent"
+    )
     try:
-        take_lift(store, claim.lift_id, claim.who, alarm)
+        take_lift(store, claim.lift_id, claim.who, alarm, place)
     except LateReportError as error:
         return Failed("refused", str(error))
     return verdict

@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from dataclasses import replace
 
 from barsight.core.errors import BarsightError, Failed
 from barsight.plant.state import PlantState, PlcReading
 from barsight.plant.steps import LiftReport, LiftSteps
+from barsight.store.touches import Touch
 
 DONE, REFUSED, CONTRADICTED = 1, 2, 3
 NOTHING, CLAIM, EXECUTING, EXECUTED = 0, 1, 2, 3
+DOWN_M = 0.1
+"""Height in metres above that of contact up to which the magnet of a lift that has begun counts as down."""
+MAX_PLACE_M = 10_000.0
+"""Readings in metres from which on they are no place in a yard."""
 _MAGNET_ON, _WEIGHED, _SLACK, _REACHED = 1, 2, 4, 8
 
 
@@ -24,6 +30,11 @@ class PlcPartner:
         self._life: int | None = None
         self._alive_s, self._began_s = time.monotonic(), math.inf
         self._number: int | None = None
+        self._command: dict[str, int] | None = None
+        self._touches: deque[Touch] = deque()
+        self._last: PlcReading | None = None
+        self._begun: int | None = None
+        self._contact_m: float | None = None
 
     @property
     def answer(self) -> dict[str, int]:
@@ -50,7 +61,7 @@ class PlcPartner:
         return is_later and (other.is_alive or other._alive_s > self._began_s)
 
     def receive(self, found: dict[str, int], *, is_busy: bool = False) -> bool:
-        """Accept a telegram; return True if it brings a new command, for which `execute` must be called.
+        """Accept a telegram; return True if `execute` must be called, for a new command or for touches.
 
         is_busy: whether no command can be executed now; it is then left to the telegrams that follow.
         """
@@ -62,7 +73,32 @@ class PlcPartner:
         is_new = found["command"] != NOTHING and found["command_number"] != self._number
         if is_new or found["command"] == NOTHING:
             self._number = found["command_number"]
-        return is_new
+        self._command = found if is_new else None
+        return is_new or bool(self._touches)
+
+    def watch(self, reading: PlcReading) -> None:
+        """Find in the PLC's readings, one after another, where its magnet touches something.
+
+        Without a position (all zeros, or no place of a yard) nothing is known, nor from the first reading.
+        While a lift has begun, the magnet is down up to `DOWN_M` above the height of contact; otherwise
+        whenever it is turned on.
+        """
+        last, self._last = self._last, reading
+        place_m = (reading.bridge_m, reading.trolley_m, reading.hoist_m)
+        if last is None or not 0 < max(map(abs, place_m)) < MAX_PLACE_M:
+            return
+        contact_m = self._contact_m
+        down_m = math.inf if contact_m is None else contact_m + DOWN_M
+        was, now = ((one.is_magnet_on, one.hoist_m <= down_m, one.is_rope_slack) for one in (last, reading))
+        kinds = {
+            "release": was[0] and not now[0],
+            "grip": all(now[:2]) and not all(was[:2]),
+            "contact": not was[0] and not now[0] and (
+                (now[2] and not was[2]) or (contact_m is not None and now[1] and not was[1])
+            ),
+        }  # fmt: skip
+        for kind in (name for name, is_told in kinds.items() if is_told):
+            self._touches.append(Touch(kind, *place_m))
 
     def reading(self, found: dict[str, int]) -> PlcReading:
         """Form the PLC's reading of the crane from a telegram."""
@@ -78,6 +114,9 @@ class PlcPartner:
 
         is_second: whether another PLC with the same name is alive; the state is invalid then too.
         """
+        lift = state.lift
+        is_own = lift is not None and lift.lift_id == self._begun
+        self._contact_m = lift.hoist_height_m if lift is not None and is_own else None
         if self.is_alive and not is_second:
             return state
         reason = "partner-silent: the PLC's life counter stands still"
@@ -85,17 +124,22 @@ class PlcPartner:
             reason = "partner-twice: another connection from the same address is alive"
         return replace(state, is_valid=False, reasons=(*state.reasons, reason))
 
-    def execute(self, found: dict[str, int]) -> None:
-        """Execute a command on the store; `answer` holds the outcome.
+    def execute(self) -> None:
+        """Note the touches, then execute the command on the store; `answer` holds its outcome.
 
         If the store can't be reached there is no answer: the command is tried again with the next telegram.
         """
+        command = self._command
         try:
-            answer, token = self._step(found)
+            while self._touches:
+                self._steps.touched(self.name, self._touches.popleft())
+            if command is None:
+                return
+            answer, token = self._step(command)
         except BarsightError:
             self._number = None
             return
-        self._answer = {"answer_number": found["command_number"], "answer": answer, "token": token}
+        self._answer = {"answer_number": command["command_number"], "answer": answer, "token": token}
 
     def _step(self, found: dict[str, int]) -> tuple[int, int]:
         lift = (found["lift_id"], found["checksum"])
@@ -106,6 +150,7 @@ class PlcPartner:
         answer: str | int | Failed
         if found["command"] == EXECUTING:
             answer = self._steps.executing(token, *lift)
+            self._begun = None if isinstance(answer, Failed) else found["lift_id"]
         elif found["command"] == EXECUTED:
             load_kg = found["load"] / 10 if flags & _WEIGHED else None
             report = LiftReport(bool(flags & _REACHED), bool(flags & _SLACK), load_kg)

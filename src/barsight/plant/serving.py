@@ -92,10 +92,12 @@ class TelegramServer:
                     return
                 is_second = self._is_second(partner)
                 if not is_second:
-                    self._feed.take_reading(partner.reading(found))
+                    reading = partner.reading(found)
+                    self._feed.take_reading(reading)
+                    partner.watch(reading)
                 is_busy = (step is not None and not step.done()) or is_second
                 if partner.receive(found, is_busy=is_busy):
-                    step = asyncio.create_task(asyncio.to_thread(partner.execute, found))
+                    step = asyncio.create_task(asyncio.to_thread(partner.execute))
                     step.add_done_callback(self._refresh)
 
     def _is_second(self, partner: PlcPartner) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -21,6 +22,7 @@ from barsight.plant.handshake import (
 from barsight.plant.settings import PlantSettings
 from barsight.plant.state import OfferedLift
 from barsight.store.opening import Store
+from barsight.store.touches import Touch, note_touch
 
 
 @dataclass(frozen=True)
@@ -38,16 +40,27 @@ class LiftSteps:
     def __init__(self, store: Store, settings: PlantSettings) -> None:
         self._store, self._settings = store, settings
         self._turn = threading.Lock()
+        self._touches: deque[tuple[str, Touch]] = deque()
+
+    def touched(self, who: str, touch: Touch) -> None:
+        """Note where a crane's magnet touched something; see `note_touch`. If the store can't be written, it
+        is noted before the next step.
+        """
+        with self._turn:
+            self._touches.append((who, touch))
+            self._note_touches()
 
     def claim(self, who: str, lift_id: int, checksum: int | None = None) -> LiftClaim | Failed:
         """Claim the offered lift. checksum: first four bytes of its SHA-256, if known."""
         with self._turn:
+            self._note_touches()
             lift = self._valid_lift(lift_id, checksum)
             return lift if isinstance(lift, Failed) else claim_lift(self._store, lift, who)
 
     def executing(self, token: int, lift_id: int | None = None, checksum: int | None = None) -> int | Failed:
         """Begin the claimed lift, once, while the state is valid; return its token."""
         with self._turn:
+            self._note_touches()
             lift = self._valid_lift(lift_id, checksum)
             claim = lift if isinstance(lift, Failed) else self._claimed(token, lift.lift_id)
             begun = claim if isinstance(claim, Failed) else begin_claimed(self._store, claim)
@@ -56,6 +69,7 @@ class LiftSteps:
     def executed(self, token: int, report: LiftReport, lift_id: int | None = None) -> str | Failed:
         """Record an executed lift: `confirmed`, `contradicted` or `unweighed`; see `report_executed`."""
         with self._turn:
+            self._note_touches()
             claim = self._claimed(token, lift_id)
             if isinstance(claim, Failed):
                 return claim
@@ -66,8 +80,14 @@ class LiftSteps:
     def failed(self, token: int, note: str, lift_id: int | None = None) -> str | Failed:
         """Record a failed lift."""
         with self._turn:
+            self._note_touches()
             claim = self._claimed(token, lift_id)
             return claim if isinstance(claim, Failed) else report_failed(self._store, claim, note)
+
+    def _note_touches(self) -> None:
+        while self._touches:
+            note_touch(self._store, *self._touches[0])
+            self._touches.popleft()
 
     def _valid_lift(self, lift_id: int | None, checksum: int | None) -> OfferedLift | Failed:
         state = read_state(self._store, self._settings)

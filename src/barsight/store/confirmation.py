@@ -148,7 +148,9 @@ def begin_lift(store: Store, lift_id: int, who: str) -> None:
     _change(store, lift_id, who, "lift begun", step)
 
 
-def take_lift(store: Store, lift_id: int, who: str, alarm: tuple[str, str] | None = None) -> None:
+def take_lift(
+    store: Store, lift_id: int, who: str, alarm: tuple[str, str] | None = None, note: str | None = None
+) -> None:
     """Report a confirmed lift as executed; this ends nearby offers and confirmations.
 
     alarm: code and reason of an alarm to raise with it. Raises InputError if the lift can't be recorded; if
@@ -156,8 +158,8 @@ def take_lift(store: Store, lift_id: int, who: str, alarm: tuple[str, str] | Non
     """
 
     def step(opened: Entry, lift: OpenLift) -> None:
-        step_lift(opened, lift_id, "executed")
-        _end_beside(opened, lift)
+        step_lift(opened, lift_id, "executed", note)
+        end_beside(opened, lift)
         if alarm is not None:
             raise_alarm(opened, *alarm)
 
@@ -211,7 +213,7 @@ def end_lift(store: Store, lift_id: int, state: str, who: str, note: str, tells_
             step_lift(opened, lift_id, "executing")
         step_lift(opened, lift_id, state, note)
         if is_assumed or lift.state == "executing":
-            _end_beside(opened, lift)
+            end_beside(opened, lift)
 
     try:
         _change(store, lift_id, who, f"lift {state}", step)
@@ -236,7 +238,7 @@ def end_disturbed(opened: Entry, since_ns: int) -> None:
     failed = select(LIFT_STATES.c.lift_id).where(*late, begun)
     query = _lift_query(LIFTS.c.id.in_(moving) | LIFTS.c.id.in_(failed))
     for lift in _lifts(opened.connection, query):
-        _end_beside(opened, lift)
+        end_beside(opened, lift)
 
 
 def _end_offers(opened: Entry, reason: str) -> None:
@@ -245,7 +247,7 @@ def _end_offers(opened: Entry, reason: str) -> None:
             step_lift(opened, lift.lift_id, "expired", reason)
 
 
-def _end_beside(opened: Entry, lift: OpenLift) -> None:
+def end_beside(opened: Entry, lift: OpenLift) -> None:
     """End offers and confirmations within reach of anything that a lift may have moved."""
 
     def outlines(one: OpenLift) -> list[Float64]:

@@ -30,7 +30,7 @@ ALARM_STEPS: dict[str | None, tuple[str, ...]] = {
 """States that may follow each state of an alarm. `returned`: the cause has ended without an acknowledgement;
 acknowledging the alarm then clears it (ISA-18.2).
 """
-MISMATCHES = ("store-broken", "load-contradicts", "lift-unrecorded", "lift-failed")
+MISMATCHES = ("store-broken", "load-contradicts", "lift-beside", "lift-unrecorded", "lift-failed")
 """Codes of alarms after which the store may no longer match the yard."""
 PRIORITIES = dict.fromkeys(MISMATCHES, 1) | {"calibration-changed": 1, "bundle-moved": 3, "survey-files": 3}
 """Priorities of alarms by code for page and plant, 1 is the highest; all others have 2."""

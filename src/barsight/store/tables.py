@@ -88,6 +88,14 @@ LIFT_STATES = Table(
     UniqueConstraint("lift_id", "step"),
 )  # fmt: skip
 
+TOUCHES = Table(
+    "touches", METADATA, _key(), _of("lifts", is_optional=True), *_texts("kind"),
+    *_figures("x_m", "y_m", "z_m"), *_stamps("at_ns"), *_texts("who"),
+)  # fmt: skip
+"""Places by the crane's readings where its magnet touched something; see `touches`. lift_id: of the lift that
+it belongs to.
+"""
+
 SURVEY_VETOES = Table(
     "vetoes", METADATA, _key(), _of("surveys"), _of("bundles", is_optional=True), *_texts("code", "reason"),
 )  # fmt: skip

@@ -42,9 +42,11 @@ async def serve_s7(
         wrong = now
         if isinstance(found, Failed):
             return
-        feed.take_reading(partner.reading(found))
+        reading = partner.reading(found)
+        feed.take_reading(reading)
+        partner.watch(reading)
         if partner.receive(found):
-            partner.execute(found)
+            partner.execute()
             feed.refresh()
 
     thread = asyncio.create_task(asyncio.to_thread(run_s7, settings, layout("in").size, outputs, take, stop))

@@ -1,0 +1,332 @@
+"""A crane's own readings tell of a lift where its magnet came down, took a load and put it down."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+pytest.importorskip("sqlalchemy")
+
+from barsight.core.errors import Failed
+from barsight.plant.feed import read_state
+from barsight.plant.link_settings import S7Settings
+from barsight.plant.links.s7_link import serve_s7
+from barsight.plant.partner import PlcPartner
+from barsight.plant.serving import TelegramServer
+from barsight.plant.settings import TelegramSettings
+from barsight.plant.state import PlantState
+from barsight.plant.telegram import IN_MAGIC, pack, unpack
+from barsight.store import confirmation
+from barsight.store.tables import LIFT_STATES
+from barsight.store.touches import Touch
+from handshake_plant import CLAIM, DONE, EXECUTED, EXECUTING, REFUSED, Plant, make_template
+
+FIRST, SECOND = (109.0, 0.0), (118.0, 0.0)
+"""Targets of the first two lifts; their tolerance is 10 mm."""
+FREE = (50.0, 40.0)
+ON, SLACK, REACHED = 1, 4, 8
+HIGH, DOWN = 6.0, 0.5
+
+
+@pytest.fixture
+def plant(tmp_path: Path) -> Iterator[Plant]:
+    one = Plant(make_template(tmp_path), tmp_path / "plant")
+    yield one
+    one.close()
+
+
+class Driver:
+    """A crane's PLC that follows its lift's handshake and sends where its magnet is."""
+
+    def __init__(self, plant: Plant, name: str = "plc a") -> None:
+        self.plant, self.name = plant, name
+        self.connect()
+        self.life = self.number = 0
+        self.at, self.flags, self.z_m = FREE, 0, HIGH
+        self.lift = {"lift_id": 0, "checksum": 0, "token": 0}
+
+    def connect(self) -> None:
+        self.partner = PlcPartner(self.name, self.plant.steps, 0.3)
+
+    def turn(self, command: int = 0) -> int:
+        """Exchange telegrams once; return the answer to the command."""
+        self.plant.now_s += 0.1
+        self.life, self.number = self.life + 1, self.number + bool(command)
+        state = self.partner.seen(read_state(self.plant.store, self.plant.settings))
+        if command == CLAIM:
+            assert state.is_valid and state.lift is not None
+            self.lift |= {"lift_id": state.lift.lift_id, "checksum": int(state.lift.sha256[:8], 16)}
+        values = {
+            "magic": IN_MAGIC, "version": 1, "life": self.life, "flags": self.flags | REACHED,
+            "bridge": round(1e4 * self.at[0]), "trolley": round(1e4 * self.at[1]),
+            "hoist": round(1e4 * self.z_m), "command": command, "command_number": self.number, **self.lift,
+        }  # fmt: skip
+        found = unpack("in", pack("in", values))
+        assert not isinstance(found, Failed)
+        self.partner.watch(self.partner.reading(found))
+        if self.partner.receive(found):
+            self.partner.execute()
+        self.lift["token"] = self.partner.answer.get("token") or self.lift["token"]
+        return self.partner.answer.get("answer", 0) if command else 0
+
+    def go(self, at: tuple[float, float], z_m: float = HIGH, flags: int | None = None) -> None:
+        self.at, self.z_m = at, z_m
+        self.flags = self.flags if flags is None else flags
+        self.turn()
+
+    def begin(self) -> int:
+        assert (self.turn(), self.turn(CLAIM), self.turn(EXECUTING)) == (0, DONE, DONE)
+        self.turn()
+        return self.lift["lift_id"]
+
+    def take(self, at: tuple[float, float]) -> None:
+        """Travel there, lower, take the load and raise it."""
+        self.go(at)
+        self.go(at, DOWN, SLACK)
+        self.go(at, DOWN, SLACK | ON)
+        self.go(at, HIGH, ON)
+
+    def put(self, at: tuple[float, float]) -> None:
+        self.go(at)
+        self.go(at, DOWN, SLACK | ON)
+        self.go(at, DOWN, SLACK)
+        self.go(at, HIGH, 0)
+
+
+def offers(plant: Plant) -> list[int]:
+    with plant.store.reading() as connection:
+        lifts, newest = confirmation.open_lifts(connection), confirmation.newest_survey(connection)
+    assert newest is not None
+    offered = (one for one in lifts if one.survey_id == newest.id and one.state == "offered")
+    return [one.record["rank"] for one in offered]
+
+
+def alarms(plant: Plant) -> list[tuple[str, int, str]]:
+    state = read_state(plant.store, plant.settings)
+    return [(one.code, one.priority, one.text) for one in state.alarms]
+
+
+def note_of(plant: Plant, lift_id: int) -> str:
+    with plant.store.reading() as connection:
+        rows = connection.execute(LIFT_STATES.select().where(LIFT_STATES.c.lift_id == lift_id)).all()
+    return str(rows[-1].note)
+
+
+def test_a_crane_that_takes_a_load_beside_its_target_has_not_made_the_lift(plant: Plant) -> None:
+    """The place where it was and the planned one offer nothing, by a map begun before either."""
+    crane = Driver(plant)
+    lift_id = crane.begin()
+    crane.take(SECOND)
+    ((code, priority, text),) = alarms(plant)
+    assert (code, priority) == ("lift-beside", 1) and "x 118.000" in text and "9000 mm beside" in text
+    assert plant.states_of(lift_id)[-1] == "executing" and offers(plant) == [3, 4, 5, 6]
+    crane.put(FREE)
+    assert [crane.turn(EXECUTED), crane.turn(EXECUTED)] == [REFUSED] * 2, "again, the same"
+    assert plant.states_of(lift_id) == ["offered", "claimed", "executing", "failed"]
+    assert [one[0] for one in alarms(plant)] == ["lift-beside"]
+    plant.survey(begun_s=0.0, offset_m=100.0)
+    assert offers(plant) == [3, 4, 5, 6]
+    plant.survey(offset_m=100.0)
+    assert offers(plant) == [1, 2, 3, 4, 5, 6]
+
+
+@pytest.mark.parametrize("off_m", [0.0, 0.0100, 0.0102])
+def test_the_lifts_tolerance_is_what_may_be_beside(plant: Plant, off_m: float) -> None:
+    crane = Driver(plant)
+    lift_id = crane.begin()
+    crane.take((FIRST[0], FIRST[1] - off_m))
+    crane.put(FREE)
+    is_made = off_m <= 0.01
+    assert crane.turn(EXECUTED) == (DONE if is_made else REFUSED)
+    assert [one[0] for one in alarms(plant)] == ([] if is_made else ["lift-beside"])
+    assert not is_made or note_of(plant, lift_id).startswith("at its target")
+    assert offers(plant) == [2, 3, 4, 5, 6]
+
+
+def test_a_position_that_is_not_sent_is_unknown(plant: Plant) -> None:
+    """All zeros: the lift is taken as made, as its crane says, and the store says what isn't known."""
+    crane = Driver(plant)
+    lift_id = crane.begin()
+    for flags in (SLACK, SLACK | ON, ON, 0):
+        crane.go((0.0, 0.0), 0.0, flags)
+    assert crane.turn(EXECUTED) == DONE and alarms(plant) == []
+    assert "no position was sent" in note_of(plant, lift_id)
+
+
+def lower_only(crane: Driver) -> None:
+    """The PLC sends neither magnet nor rope."""
+    crane.go(SECOND)
+    crane.go(SECOND, DOWN)
+    crane.go(SECOND)
+
+
+def slack_only(crane: Driver) -> None:
+    crane.go(SECOND, HIGH, SLACK)
+    crane.go(SECOND, HIGH, 0)
+
+
+def on_before_lowering(crane: Driver) -> None:
+    crane.go(FREE, HIGH, ON)
+    crane.go(SECOND, HIGH, ON)
+    crane.go(SECOND, DOWN, ON)
+    crane.go(SECOND, HIGH, ON)
+
+
+def after_a_vain_try(crane: Driver) -> None:
+    """Nothing stuck at the target, so it was tried beside."""
+    crane.take(FIRST)
+    crane.put(FIRST)
+    crane.take(SECOND)
+
+
+@pytest.mark.parametrize("way", [lower_only, slack_only, on_before_lowering, after_a_vain_try])
+def test_whatever_tells_that_the_magnet_came_down_beside(plant: Plant, way: Callable[[Driver], None]) -> None:
+    crane = Driver(plant)
+    crane.begin()
+    way(crane)
+    assert 2 not in offers(plant)
+    assert crane.turn(EXECUTED) == REFUSED and [one[0] for one in alarms(plant)] == ["lift-beside"]
+
+
+def on_early(crane: Driver) -> None:
+    crane.go(FREE, HIGH, ON)
+    crane.take(FIRST)
+    crane.put(FREE)
+
+
+def falters_at_set_down(crane: Driver) -> None:
+    """The magnet is reversed to let go, and the rope was slack for a moment on the way."""
+    crane.go((80.0, 30.0), HIGH, SLACK)
+    crane.take(FIRST)
+    for _ in range(3):
+        crane.put(FREE)
+        crane.go(FREE, DOWN, SLACK | ON)
+    crane.go(FREE, HIGH, 0)
+
+
+def connects_anew(crane: Driver) -> None:
+    crane.take(FIRST)
+    crane.connect()
+    crane.put(FREE)
+    crane.go(FREE, DOWN, SLACK | ON)
+    crane.go(FREE, HIGH, 0)
+
+
+@pytest.mark.parametrize("way", [on_early, falters_at_set_down, connects_anew])
+def test_what_is_no_lift_beside(plant: Plant, way: Callable[[Driver], None]) -> None:
+    crane = Driver(plant)
+    crane.begin()
+    way(crane)
+    assert crane.turn(EXECUTED) == DONE and alarms(plant) == []
+    assert offers(plant) == [2, 3, 4, 5, 6]
+
+
+def test_a_load_that_is_put_down_beside_an_offer_ends_it(plant: Plant) -> None:
+    """Also after the lift was reported, as a PLC may do while the load still hangs."""
+    crane = Driver(plant)
+    crane.begin()
+    crane.take(FIRST)
+    assert crane.turn(EXECUTED) == DONE and offers(plant) == [2, 3, 4, 5, 6]
+    crane.put((127.9, 0.5))
+    assert offers(plant) == [2, 4, 5, 6] and alarms(plant) == []
+
+
+def test_a_magnet_that_takes_something_without_a_lift_ends_the_offers_there(plant: Plant) -> None:
+    """A person did it, or a program that ignores the handshake; another crane's lift stays."""
+    other = Driver(plant, "plc b")
+    lift_id = other.begin()
+    crane = Driver(plant)
+    crane.turn()
+    crane.take(SECOND)
+    assert offers(plant) == [3, 4, 5, 6] and alarms(plant) == []
+    other.take(FIRST)
+    assert other.turn(EXECUTED) == DONE and note_of(plant, lift_id).startswith("at its target")
+
+
+def test_a_lift_that_a_person_confirmed_and_makes_by_hand_stays_theirs(plant: Plant) -> None:
+    lift = read_state(plant.store, plant.settings).lift
+    assert lift is not None
+    confirmation.confirm_lift(plant.store, lift.lift_id, lift.map_id, "ann")
+    crane = Driver(plant)
+    crane.turn()
+    crane.take(FIRST)
+    crane.put(FREE)
+    confirmation.take_lift(plant.store, lift.lift_id, "ann")
+    assert alarms(plant) == [] and offers(plant) == [2, 3, 4, 5, 6]
+
+
+def test_a_touch_that_the_store_could_not_take_is_noted_before_the_next_step(plant: Plant) -> None:
+    crane = Driver(plant)
+    crane.begin()
+    crane.go(SECOND)
+    plant.store.fault[:] = ["locked"]
+    crane.go(SECOND, DOWN, ON)
+    assert alarms(plant) == []
+    crane.go(SECOND, HIGH, ON)
+    assert crane.turn(EXECUTED) == REFUSED and [one[0] for one in alarms(plant)] == ["lift-beside"]
+
+
+def telegrams() -> list[bytes]:
+    """A magnet that is turned on at x 118 m and off at 50 m."""
+    steps = ((118.0, 0), (118.0, ON), (50.0, ON), (50.0, 0))
+    values = [
+        {"magic": IN_MAGIC, "version": 1, "life": k, "flags": flags, "bridge": round(1e4 * x_m)}
+        for k, (x_m, flags) in enumerate(steps, start=1)
+    ]
+    return [pack("in", one) for one in values]
+
+
+TOUCHED = [Touch("grip", 118.0, 0.0, 0.0), Touch("release", 50.0, 0.0, 0.0)]
+
+
+class Seen:
+    """State and steps for a link, that keep what it tells."""
+
+    def __init__(self) -> None:
+        self.touches: list[Touch] = []
+        state = PlantState("idle", False, (), 1, 0, "none")
+        self.feed = SimpleNamespace(newest=lambda _: state, refresh=lambda: None, take_reading=lambda _: None)
+
+    def touched(self, who: str, touch: Touch) -> None:
+        self.touches.append(touch)
+
+
+def test_the_telegram_tells_touches() -> None:
+    seen = Seen()
+    settings = TelegramSettings(port=0, cycle_s=0.02)
+
+    async def talk() -> None:
+        port = asyncio.get_running_loop().create_future()
+        server = TelegramServer(seen.feed, seen, settings)  # type: ignore[arg-type]
+        running = asyncio.create_task(server.run(port.set_result))
+        reader, writer = await asyncio.open_connection("127.0.0.1", await port)
+        for one in telegrams():
+            writer.write(one)
+        end_s = time.monotonic() + 20
+        while len(seen.touches) < len(TOUCHED) and time.monotonic() < end_s:
+            writer.write(telegrams()[-1])
+            await asyncio.wait_for(reader.readexactly(98), 5)
+        writer.close()
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+
+    asyncio.run(talk())
+    assert seen.touches == TOUCHED
+
+
+def test_s7_tells_touches(monkeypatch: pytest.MonkeyPatch) -> None:
+    s7 = pytest.importorskip("barsight.plant.s7")
+    seen = Seen()
+
+    def run(*arguments: Callable[[object], None]) -> None:
+        for one in telegrams():
+            arguments[3](s7.S7Exchange(one, 0.0, 0.0))
+
+    monkeypatch.setattr(s7, "run_s7", run)
+    asyncio.run(serve_s7(S7Settings(), seen.feed, seen, lambda _: None))  # type: ignore[arg-type]
+    assert seen.touches == TOUCHED
