@@ -217,7 +217,13 @@ def connects_anew(crane: Driver) -> None:
     crane.go(FREE, HIGH, 0)
 
 
-@pytest.mark.parametrize("way", [on_early, falters_at_set_down, connects_anew])
+def is_not_heard_for_a_while(crane: Driver) -> None:
+    crane.plant.now_s += 5
+    crane.go(FIRST, HIGH, ON)
+    crane.put(FREE)
+
+
+@pytest.mark.parametrize("way", [on_early, falters_at_set_down, connects_anew, is_not_heard_for_a_while])
 def test_what_is_no_lift_beside(plant: Plant, way: Callable[[Driver], None]) -> None:
     crane = Driver(plant)
     crane.begin()

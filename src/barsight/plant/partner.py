@@ -16,6 +16,8 @@ DONE, REFUSED, CONTRADICTED = 1, 2, 3
 NOTHING, CLAIM, EXECUTING, EXECUTED = 0, 1, 2, 3
 DOWN_M = 0.1
 """Height in metres above that of contact up to which the magnet of a lift that has begun counts as down."""
+MAX_GAP_S = 1.0
+"""Longest time in seconds between readings of which the later one tells what happened since the earlier."""
 MAX_PLACE_M = 10_000.0
 """Readings in metres from which on they are no place in a yard."""
 _MAGNET_ON, _WEIGHED, _SLACK, _REACHED = 1, 2, 4, 8
@@ -33,6 +35,7 @@ class PlcPartner:
         self._command: dict[str, int] | None = None
         self._touches: deque[Touch] = deque()
         self._last: PlcReading | None = None
+        self._last_s = 0.0
         self._begun: int | None = None
         self._contact_m: float | None = None
 
@@ -79,11 +82,15 @@ class PlcPartner:
     def watch(self, reading: PlcReading) -> None:
         """Find in the PLC's readings, one after another, where its magnet touches something.
 
-        Without a position (all zeros, or no place of a yard) nothing is known, nor from the first reading.
-        While a lift has begun, the magnet is down up to `DOWN_M` above the height of contact; otherwise
-        whenever it is turned on.
+        Without a position (all zeros, or no place of a yard) nothing is known, nor from the first reading,
+        nor of what happened before one that came `MAX_GAP_S` late: the load may hang by then. While a lift
+        has begun, the magnet is down up to `DOWN_M` above the height of contact; otherwise whenever it is
+        turned on.
         """
-        last, self._last = self._last, reading
+        last, last_s = self._last, self._last_s
+        self._last, self._last_s = reading, time.monotonic()
+        if self._last_s - last_s > MAX_GAP_S:
+            last = self._begun = self._contact_m = None
         place_m = (reading.bridge_m, reading.trolley_m, reading.hoist_m)
         if last is None or not 0 < max(map(abs, place_m)) < MAX_PLACE_M:
             return
