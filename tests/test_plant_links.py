@@ -352,9 +352,19 @@ def test_a_run_that_ended_stays_so_though_the_clock_is_set_back(ago_s: float, tm
 def test_changes_are_told_once() -> None:
     alarm = PlantAlarm("live-stopped", 2, "no word", True, False)
     raised = replace(QUIET, alarms=(alarm,), is_valid=False, reasons=("why",), map_id="m")
-    assert changes_between(None, QUIET) == [] == changes_between(raised, raised)
+    assert changes_between(QUIET, QUIET) == [] == changes_between(raised, raised)
     assert [one["event"] for one in changes_between(QUIET, raised)] == ["validity", "survey", "alarm-raised"]
     assert [one["event"] for one in changes_between(raised, QUIET)] == ["validity", "alarm-ended"]
+
+
+def test_what_stands_is_told_at_the_start_as_it_may_have_changed_while_nobody_told() -> None:
+    """Who holds an offer that was told before learns that there is none."""
+    alarm = PlantAlarm("live-stopped", 2, "no word", True, False)
+    told = changes_between(
+        None, replace(QUIET, alarms=(alarm,), is_valid=False, reasons=("why",), map_id="m")
+    )
+    assert [one["event"] for one in told] == ["started", "validity", "survey", "lift", "alarm-raised"]
+    assert (told[1]["is_valid"], told[3]["is"]) == (False, None)
 
 
 def test_each_alarm_is_told_though_others_of_its_code_stand() -> None:

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from barsight.core.errors import ConfigError
+from barsight.core.errors import ConfigError, InputError
 from barsight.plant.link_settings import WebhookSettings
-from barsight.plant.webhooks import Webhook
+from barsight.plant.webhooks import Webhook, post, read_secret
 from opcua_servers import free_port
 from plant_commands import Hooks
 
@@ -41,11 +41,34 @@ def test_changes_come_in_order_signed_and_again_until_taken(hooks: Hooks, tmp_pa
         until(lambda: len(hooks.posts) == 5)
     finally:
         hook.stop()
-    assert [(one["id"], one["number"]) for one in hooks.posts] == [(1, 0), (1, 0), (1, 0), (2, 1), (3, 2)]
+    first = hooks.posts[0]["id"]
+    assert [(one["id"] - first, one["number"]) for one in hooks.posts] == [
+        (0, 0), (0, 0), (0, 0), (1, 1), (2, 2)
+    ]  # fmt: skip
     for one in hooks.posts:
         assert (
             one["signature"] == "sha256=" + hmac.new(b"sixteen bars", one["raw"], hashlib.sha256).hexdigest()
         )
+
+
+def test_no_id_of_an_earlier_process_comes_again(hooks: Hooks) -> None:
+    """A receiver that drops what comes twice would else drop the first changes after each start."""
+    for number in range(2):
+        hook = Webhook(hooks.url, WebhookSettings((hooks.url,)))
+        try:
+            hook.tell({"event": "lift"})
+            until(lambda number=number: len(hooks.posts) == number + 1)  # type: ignore[misc]
+        finally:
+            hook.stop()
+    assert hooks.posts[1]["id"] > hooks.posts[0]["id"] and hooks.posts[1]["id"] < 2**53
+
+
+def test_an_empty_secret_signs_nothing(hooks: Hooks, tmp_path: Path) -> None:
+    (tmp_path / "secret").write_text("\n")
+    with pytest.raises(InputError, match="its first line is empty"):
+        read_secret(tmp_path / "secret")
+    problem, is_final = post(hooks.url, WebhookSettings((hooks.url,), tmp_path / "secret"), {})
+    assert problem is not None and not is_final and hooks.posts == []
 
 
 def test_an_address_that_is_away_costs_bounded_memory(hooks: Hooks) -> None:

@@ -7,12 +7,14 @@ import hmac
 import http.client
 import json
 import threading
+import time
 import urllib.error
 import urllib.request
 from collections import deque
+from pathlib import Path
 from typing import Any
 
-from barsight.core.errors import BarsightError
+from barsight.core.errors import BarsightError, InputError
 from barsight.core.json_values import json_value
 from barsight.core.reading.bounded_reading import read_text
 from barsight.plant.link_settings import WebhookSettings
@@ -29,7 +31,8 @@ class _NoRedirect(urllib.request.HTTPRedirectHandler):
 class Webhook:
     """One address, with the changes queued for it and the thread that posts them.
 
-    A change is posted until the address answers with 2xx, so it may arrive twice, with the same `id`. A
+    A change is posted until the address answers with 2xx, so it may arrive twice, with the same `id`. Ids
+    rise from the time in ms at which this began, so that none of an earlier process comes again. A
     change answered with 4xx other than 408 and 429 is dropped, as it would be refused again. `lost` is the
     number of changes dropped before a post.
     """
@@ -39,7 +42,7 @@ class Webhook:
         self._settings = settings
         self._waiting: deque[tuple[int, dict[str, Any]]] = deque()
         self._lock = threading.Lock()
-        self._numbers = 0
+        self._numbers = time.time_ns() // 1_000_000
         self._lost = 0
         self._problem: str | None = None
         self._changed, self._stop = threading.Event(), threading.Event()
@@ -97,6 +100,14 @@ class Webhook:
             wait_s = min(2 * wait_s, self._settings.max_retry_s)
 
 
+def read_secret(path: Path) -> bytes:
+    """Read the secret, the first line of a file. Raises InputError if there is none: anybody could sign."""
+    secret = read_text(path, remedy="give the file with the secret").partition("\n")[0].rstrip("\r")
+    if not secret.strip():
+        raise InputError(path, "its first line is empty", "write the secret into it")
+    return secret.encode()
+
+
 def post(url: str, settings: WebhookSettings, body: dict[str, Any]) -> tuple[str | None, bool]:
     """Post a body once; return the problem (None if accepted) and whether a retry would be pointless."""
     content = json.dumps(json_value(body), allow_nan=False).encode()
@@ -104,7 +115,7 @@ def post(url: str, settings: WebhookSettings, body: dict[str, Any]) -> tuple[str
     opener = urllib.request.build_opener(_NoRedirect)
     try:
         if settings.secret_file is not None:
-            secret = (read_text(settings.secret_file).splitlines() or [""])[0].encode()
+            secret = read_secret(settings.secret_file)
             headers[SIGNATURE] = "sha256=" + hmac.new(secret, content, hashlib.sha256).hexdigest()
         request = urllib.request.Request(url, content, headers, method="POST")
         with opener.open(request, timeout=settings.timeout_s):

@@ -11,16 +11,22 @@ from barsight.plant.state import MAX_ALARMS, MAX_CODES, PlantAlarm, PlantState
 
 
 def changes_between(old: PlantState | None, new: PlantState) -> list[dict[str, Any]]:
-    """List the events: `validity`, `survey`, `lift`, `alarm-raised`, `alarm-ended`. old: None at first."""
-    if old is None:
-        return []
+    """List the events: `validity`, `survey`, `lift`, `alarm-raised`, `alarm-ended`.
+
+    old: None at first: after `started` all that stands is then told, and whether anything is offered, as a
+    receiver may hold what was told before this process began.
+    """
     events: list[dict[str, Any]] = []
-    if old.is_valid != new.is_valid:
+    is_first = old is None
+    if old is None:
+        events.append({"event": "started"})
+        old = PlantState("idle", False, (), 0, 0, "none")
+    if is_first or old.is_valid != new.is_valid:
         events.append({"event": "validity", "is_valid": new.is_valid, "reasons": list(new.reasons)})
     if new.map_id is not None and old.map_id != new.map_id:
         events.append({"event": "survey", "map_id": new.map_id})
     before, after = _lift(old), _lift(new)
-    if before != after:
+    if is_first or before != after:
         events.append({"event": "lift", "was": before, "is": after})
     for alarm in (Counter(_alarms(new)) - Counter(_alarms(old))).elements():
         text = {"code": alarm.code, "text": alarm.text, "priority": alarm.priority}

@@ -8,7 +8,6 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Any
 
 from barsight.core.errors import OutputError
-from barsight.core.reading.bounded_reading import read_text
 from barsight.plant.feed import READ_EVERY_S, StateFeed
 from barsight.plant.link_settings import MqttSettings, WebhookSettings
 from barsight.plant.links.changes import changes_between
@@ -18,7 +17,7 @@ from barsight.plant.links.telegram_process import serve_telegram
 from barsight.plant.settings import PlantSettings
 from barsight.plant.state import PlantState
 from barsight.plant.steps import LiftSteps
-from barsight.plant.webhooks import Webhook
+from barsight.plant.webhooks import Webhook, read_secret
 from barsight.store.opening import Store
 
 Say = Callable[[str], None]
@@ -78,7 +77,7 @@ async def _followed(feed: StateFeed) -> AsyncIterator[tuple[PlantState, list[dic
 
 async def _serve_webhooks(settings: WebhookSettings, feed: StateFeed, say: Say) -> None:
     if settings.secret_file is not None:
-        read_text(settings.secret_file, remedy="give the file with the secret")
+        read_secret(settings.secret_file)
     hooks = [Webhook(url, settings) for url in settings.urls]
     reported: dict[str, str | None] = {hook.url: None for hook in hooks}
     for hook in hooks:
