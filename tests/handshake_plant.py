@@ -22,11 +22,11 @@ from barsight.plant.settings import PlantSettings
 from barsight.plant.steps import LiftSteps
 from barsight.plant.telegram import IN_MAGIC, out_values, pack, unpack
 from barsight.store import confirmation
-from barsight.store.adding import end_disturbed, end_touched
 from barsight.store.audit import entry
 from barsight.store.lift_records import add_lifts, settle_lifts
 from barsight.store.opening import Store, open_store
 from barsight.store.tables import BUNDLES, SURVEYS
+from barsight.store.touches import end_disturbed
 
 FIRST_NS = 1_790_000_000 * 10**9
 STAY_S = 0.3
@@ -236,7 +236,6 @@ class Plant:
             settle_lifts(opened, {}, from_ns, is_newest=True)
             add_lifts(opened, survey_id, content, ids, is_newest=True)
             end_disturbed(opened, from_ns)
-            end_touched(opened, from_ns)
             for lift_id in opened.rows["lifts"]:
                 self.ends_s[lift_id] = self.now_s + VALID_S
 

@@ -358,7 +358,7 @@ def test_changes_are_told_once() -> None:
 
 
 def test_what_stands_is_told_at_the_start_as_it_may_have_changed_while_nobody_told() -> None:
-    """Who holds an offer that was told before learns that there is none."""
+    """A receiver that holds an offer from before learns that there is none."""
     alarm = PlantAlarm("live-stopped", 2, "no word", True, False)
     told = changes_between(
         None, replace(QUIET, alarms=(alarm,), is_valid=False, reasons=("why",), map_id="m")

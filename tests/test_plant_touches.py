@@ -266,6 +266,17 @@ def test_a_lift_that_a_person_confirmed_and_makes_by_hand_stays_theirs(plant: Pl
     assert alarms(plant) == [] and offers(plant) == [2, 3, 4, 5, 6]
 
 
+def test_nobody_else_reports_a_lift_beside_as_executed(plant: Plant) -> None:
+    """An operator ends it on the page, for a PLC that is away."""
+    crane = Driver(plant)
+    lift_id = crane.begin()
+    crane.take(SECOND)
+    for _ in range(2):
+        with pytest.raises(confirmation.BesideError, match="9000 mm beside the target"):
+            confirmation.take_lift(plant.store, lift_id, "ann")
+    assert plant.states_of(lift_id)[-1] == "failed" and [one[0] for one in alarms(plant)] == ["lift-beside"]
+
+
 def test_a_touch_that_the_store_could_not_take_is_noted_before_the_next_step(plant: Plant) -> None:
     crane = Driver(plant)
     crane.begin()

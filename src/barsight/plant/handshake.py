@@ -12,6 +12,7 @@ from barsight.core.extras import extra
 from barsight.plant.state import OfferedLift
 from barsight.store.audit import entry
 from barsight.store.confirmation import (
+    BesideError,
     LateReportError,
     begin_lift,
     confirm_lift,
@@ -20,10 +21,10 @@ from barsight.store.confirmation import (
     take_lift,
     yard_clock_ns,
 )  # fmt: skip
+from barsight.store.lift_records import was_at_target
 from barsight.store.opening import Store
 from barsight.store.states import step_lift
 from barsight.store.tables import LIFT_STATES, LIFTS, MAX_ID
-from barsight.store.touches import note_beside, was_at_target
 
 with extra("store"):
     from sqlalchemy import Connection, Row, select
@@ -121,10 +122,6 @@ def report_executed(store: Store, claim: LiftClaim, load_kg: float | None) -> st
             verdict, alarm = "contradicted", ("load-contradicts", f"lift {claim.lift_id}: {weighed}")
     if "executed" in states_of(store, claim.lift_id):
         return verdict
-    beside = note_beside(store, claim.lift_id, claim.who)
-    if beside is not None:
-        failed = report_failed(store, claim, f"it was reported as executed; {beside}")
-        return failed if isinstance(failed, Failed) else Failed("beside", beside)
     with store.reading() as connection:
         is_known = was_at_target(connection, claim.lift_id)
     place = (
@@ -132,6 +129,8 @@ def report_executed(store: Store, claim: LiftClaim, load_kg: float | None) -> st
     )
     try:
         take_lift(store, claim.lift_id, claim.who, alarm, place)
+    except BesideError as error:
+        return Failed("beside", str(error))
     except LateReportError as error:
         return Failed("refused", str(error))
     return verdict

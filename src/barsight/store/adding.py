@@ -15,7 +15,7 @@ from barsight.core.stamps import NS_PER_S
 from barsight.result_folder import file_digest, open_folder, read_heights
 from barsight.store.audit import Entry, entry
 from barsight.store.calibrations import note_calibration, why_invalid
-from barsight.store.confirmation import end_disturbed, yard_clock_ns
+from barsight.store.confirmation import yard_clock_ns
 from barsight.store.history import (
     BundleSighting,
     executed_lifts,
@@ -37,7 +37,7 @@ from barsight.store.matching import (
 from barsight.store.opening import Store
 from barsight.store.recordings import FoundRecording, note_recordings, recordings_of
 from barsight.store.tables import ABSENCES, BUNDLES, SIGHTINGS, SURVEY_VETOES, SURVEYS
-from barsight.store.touches import end_touched
+from barsight.store.touches import end_disturbed
 from barsight.yard.events import kept_events
 from barsight.yard.identity import MapIdentity, expect_same_frame
 from barsight.yard.inventory.bundle_file import bundle_of, bundles_content, read_match
@@ -151,7 +151,6 @@ def add_survey(
             add_lifts(opened, survey_id, read.lifts, ids, is_newest=is_newest and is_sound)
             if is_newest:
                 end_disturbed(opened, read.from_ns)
-                end_touched(opened, read.from_ns)
     named = {identity_name(number): change for number, change in changes.items()}
     return AddedSurvey(
         read.identity.map_id, True, named, {identity_name(n): kind for n, kind in absences.items()}

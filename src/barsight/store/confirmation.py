@@ -15,13 +15,12 @@ from barsight.core.errors import ConfigError, InputError
 from barsight.core.extras import extra
 from barsight.store.audit import Entry, entry, has_entry, newest_entry
 from barsight.store.calibrations import why_invalid
-from barsight.store.lift_records import find_gap, find_outlines, why_outdated
+from barsight.store.lift_records import find_beside, find_gap, find_outlines, raise_beside, why_outdated
 from barsight.store.opening import Store
 from barsight.store.promotion import counts
 from barsight.store.states import (
     has_alarm,
     has_standing,
-    last_raised_ns,
     lift_state,
     newest_steps,
     raise_alarm,
@@ -39,6 +38,10 @@ OPEN = ("offered", "claimed", "executing")
 
 class LateReportError(InputError):
     """A lift was reported after it had ended: it can't be recorded, but the alarm is."""
+
+
+class BesideError(InputError):
+    """A lift was reported as executed that was made beside its target; it is recorded as failed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +94,11 @@ def open_lifts(connection: Connection) -> tuple[OpenLift, ...]:
     Those of surveys that don't count are among them: whatever a fleet promotes, a crane may hold their load.
     """
     return _lifts(connection, _open_query())
+
+
+def find_lifts(connection: Connection, which: ColumnElement[bool]) -> tuple[OpenLift, ...]:
+    """Find lifts by a condition on LIFTS and their last state, in the order of their ids."""
+    return _lifts(connection, _lift_query(which))
 
 
 @cache
@@ -153,21 +161,32 @@ def take_lift(
 ) -> None:
     """Report a confirmed lift as executed; this ends nearby offers and confirmations.
 
-    alarm: code and reason of an alarm to raise with it. Raises InputError if the lift can't be recorded; if
-    it had been confirmed and has ended, an alarm is raised and all offers end (LateReportError).
+    A lift that the crane's readings place beside its target is recorded as failed, with the alarm
+    `lift-beside` (BesideError). alarm: code and reason of one to raise with it. Raises InputError if the lift
+    can't be recorded; if it was confirmed and has ended, an alarm is raised and all end (LateReportError).
     """
+    with store.reading() as connection:
+        beside = find_beside(connection, lift_id, is_reported=True)
+        is_known = beside is not None and lift_state(connection, lift_id) == "failed"
 
     def step(opened: Entry, lift: OpenLift) -> None:
-        step_lift(opened, lift_id, "executed", note)
+        if beside is None:
+            step_lift(opened, lift_id, "executed", note)
+        else:
+            step_lift(opened, lift_id, "failed", f"it was reported as executed; {beside}")
+            raise_beside(opened, lift_id, beside)
         end_beside(opened, lift)
         if alarm is not None:
             raise_alarm(opened, *alarm)
 
     try:
-        _change(store, lift_id, who, "lift executed", step)
+        if not is_known:
+            _change(store, lift_id, who, "lift executed", step)
     except InputError:
         _note_unrecorded(store, lift_id, who, "executed")
         raise
+    if beside is not None:
+        raise BesideError(f"lift {lift_id}", beside, "it is recorded as failed")
 
 
 def _note_unrecorded(store: Store, lift_id: int, who: str, reported: str) -> None:
@@ -190,7 +209,7 @@ def _note_unrecorded(store: Store, lift_id: int, who: str, reported: str) -> Non
         alarm = f"lift {lift_id} {did} and is {state}, unrecorded: survey before the next lift"
         if not has_alarm(opened.connection, "lift-unrecorded", alarm):
             raise_alarm(opened, "lift-unrecorded", alarm)
-            _end_offers(opened, f"disturbed: lift {lift_id} {did} and isn't recorded")
+            end_offers(opened, f"disturbed: lift {lift_id} {did} and isn't recorded")
     raise LateReportError(
         f"lift {lift_id}", f"is {state}, it can't be recorded", "survey before the next lift"
     )
@@ -223,25 +242,8 @@ def end_lift(store: Store, lift_id: int, state: str, who: str, note: str, tells_
         raise
 
 
-def end_disturbed(opened: Entry, since_ns: int) -> None:
-    """End offers near lifts that moved something after `since_ns`, the beginning of a map being added; all
-    after a lift that isn't recorded, as its place is unknown.
-    """
-    unrecorded_ns = last_raised_ns(opened.connection, "lift-unrecorded")
-    if unrecorded_ns is not None and unrecorded_ns >= since_ns:
-        _end_offers(opened, "disturbed: a lift that isn't recorded was reported after this map was begun")
-    moving = select(LIFT_STATES.c.lift_id).where(
-        LIFT_STATES.c.state.in_(("executing", "executed")), LIFT_STATES.c.at_ns >= since_ns
-    )
-    begun = LIFT_STATES.c.lift_id.in_(select(LIFT_STATES.c.lift_id).where(LIFT_STATES.c.state == "executing"))
-    late = LIFT_STATES.c.state == "failed", LIFT_STATES.c.at_ns >= since_ns
-    failed = select(LIFT_STATES.c.lift_id).where(*late, begun)
-    query = _lift_query(LIFTS.c.id.in_(moving) | LIFTS.c.id.in_(failed))
-    for lift in _lifts(opened.connection, query):
-        end_beside(opened, lift)
-
-
-def _end_offers(opened: Entry, reason: str) -> None:
+def end_offers(opened: Entry, reason: str) -> None:
+    """End all offers and confirmations; a lift that has begun stays open until it is reported."""
     for lift in open_lifts(opened.connection):
         if lift.state != "executing":
             step_lift(opened, lift.lift_id, "expired", reason)
@@ -274,7 +276,7 @@ def forbid(store: Store, code: str, reason: str, who: str) -> None:
         if newest is None:
             raise ConfigError("there is no survey to forbid lifts of")
         opened.add(SURVEY_VETOES, survey_id=newest.id, code=code, reason=reason)
-        _end_offers(opened, f"{code}: {reason}")
+        end_offers(opened, f"{code}: {reason}")
 
 
 def expire_stale(store: Store, who: str) -> int:
@@ -307,7 +309,7 @@ def _end_lost(store: Store, who: str) -> None:
         with entry(store, who, "store set back", clock_ns) as opened:
             lost = f"the store was set back, row {seen[0]} of its log is gone: survey before the next lift"
             raise_alarm(opened, "lift-unrecorded", lost)
-            _end_offers(opened, "disturbed: the store was set back, which lifts were made isn't known")
+            end_offers(opened, "disturbed: the store was set back, which lifts were made isn't known")
     store.log.newest = newest
 
 

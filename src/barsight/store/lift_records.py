@@ -1,11 +1,13 @@
 """Store a survey's lifts and vetoes, settle the lifts that were offered or executed before it, notice when
-those in its folder are others, and compute the outlines of what a lift may have moved.
+those in its folder are others, compute the outlines of what a lift may have moved, and find where a crane
+made it.
 """
 
 from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -18,8 +20,8 @@ from barsight.core.extras import extra
 from barsight.result_folder import file_digest
 from barsight.store.audit import Entry
 from barsight.store.history import executed_lifts
-from barsight.store.states import step_lift
-from barsight.store.tables import LIFT_BUNDLES, LIFT_STATES, LIFTS, SIGHTINGS, SURVEY_VETOES
+from barsight.store.states import has_alarm, raise_alarm, step_lift
+from barsight.store.tables import LIFT_BUNDLES, LIFT_STATES, LIFTS, SIGHTINGS, SURVEY_VETOES, TOUCHES
 from barsight.yard.axes import corners, gap_between
 from barsight.yard.events import kept_events
 from barsight.yard.inventory.bundle_file import bundle_of
@@ -27,7 +29,13 @@ from barsight.yard.lifting.lift_file import read_lifts, unknown_events
 from barsight.yard.lifting.load import laid_at
 
 with extra("store"):
-    from sqlalchemy import Connection, select
+    from sqlalchemy import Connection, Row, select
+
+
+BESIDE = "lift-beside"
+"""Code of the alarm after a magnet came down beside the target of its lift."""
+ROUNDING_M = 1e-4
+"""What a target and a reading may differ by, beyond the tolerance, as telegrams round both."""
 
 
 def add_lifts(
@@ -184,3 +192,83 @@ def _magnet_down(record: dict[str, Any]) -> dict[str, float] | None:
 def find_gap(first: list[Float64], second: list[Float64]) -> float:
     """Find the smallest gap between outlines of two lifts."""
     return float(np.min([gap_between(one, other) for one in first for other in second], initial=math.inf))
+
+
+def find_beside(connection: Connection, lift_id: int, *, is_reported: bool) -> str | None:
+    """Return where a lift's load was taken if it wasn't at its target, else None.
+
+    The magnet must be there whenever it takes something, until it has put a load down elsewhere. is_reported:
+    the lift is over, so that it must also have come down there, if it came down anywhere. None also if a load
+    was put down that nobody saw taken.
+    """
+    rows = _touches_of(connection, lift_id)
+    if not rows:
+        return None
+    record = lift_record(connection, lift_id)
+    is_holding, elsewhere = False, None
+    for row in rows:
+        is_there = is_at(record, row.x_m, row.y_m)
+        if row.kind == "release" and not is_there:
+            return None
+        if row.kind == "release":
+            is_holding = False  # nothing was taken away
+        elif row.kind == "grip" and not is_there and not is_holding:
+            return _words(record, row)
+        elif is_there:
+            is_holding, is_reported = is_holding or row.kind == "grip", False
+        else:
+            elsewhere = row
+    return _words(record, elsewhere) if is_reported and elsewhere is not None else None
+
+
+def was_at_target(connection: Connection, lift_id: int) -> bool:
+    """Check whether a crane's readings tell that a lift's load was taken at its target."""
+    record = lift_record(connection, lift_id)
+    return any(
+        row.kind != "release" and is_at(record, row.x_m, row.y_m) for row in _touches_of(connection, lift_id)
+    )
+
+
+def is_at(record: dict[str, Any], x_m: float, y_m: float, place: str = "target") -> bool:
+    """Check whether a crane's readings lie within the tolerance of a lift's target, or of its set-down."""
+    if record[place] is None:
+        return False
+    off_m, tolerance = off_target(record, x_m, y_m, place), record["tolerance"]
+    return all(abs(off_m[k]) <= tolerance[name] + ROUNDING_M for k, name in enumerate(("x_m", "y_m")))
+
+
+def off_target(record: dict[str, Any], x_m: float, y_m: float, place: str = "target") -> tuple[float, float]:
+    """Compute how far a crane's readings (m) are from those at a lift's target or set-down."""
+    # Records of an earlier version have no offset between the crane's readings and its magnet.
+    wanted = record.get(f"crane_{place}") or record[place]
+    return x_m - wanted["x_m"], y_m - wanted["y_m"]
+
+
+def _words(record: dict[str, Any], row: Row[Any]) -> str:
+    off_m = math.hypot(*off_target(record, row.x_m, row.y_m))
+    what = "took a load" if row.kind == "grip" else "came down"
+    return (
+        f"by the crane's readings the magnet {what} at x {row.x_m:.3f}, y {row.y_m:.3f} m, "
+        f"{1e3 * off_m:.0f} mm beside the target: see what was moved, and survey before the next lift"
+    )
+
+
+def raise_beside(opened: Entry, lift_id: int, beside: str) -> None:
+    """Raise the alarm `lift-beside`, once for a lift and place."""
+    reason = f"lift {lift_id}: {beside}"
+    if not has_alarm(opened.connection, BESIDE, reason):
+        raise_alarm(opened, BESIDE, reason)
+
+
+def lift_record(connection: Connection, lift_id: int) -> dict[str, Any]:
+    """Read a lift's record."""
+    found: dict[str, Any] = json.loads(
+        connection.execute(select(LIFTS.c.record).where(LIFTS.c.id == lift_id)).scalar_one()
+    )
+    return found
+
+
+def _touches_of(connection: Connection, lift_id: int) -> Sequence[Row[Any]]:
+    return connection.execute(
+        select(TOUCHES).where(TOUCHES.c.lift_id == lift_id).order_by(TOUCHES.c.id)
+    ).all()

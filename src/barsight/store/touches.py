@@ -7,28 +7,37 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 from barsight.core.arrays import Float64
 from barsight.core.extras import extra
 from barsight.store.audit import Entry, entry
-from barsight.store.confirmation import OpenLift, end_beside, open_lifts, yard_clock_ns
-from barsight.store.lift_records import find_gap, find_outlines
+from barsight.store.confirmation import (
+    OpenLift,
+    end_beside,
+    end_offers,
+    find_lifts,
+    open_lifts,
+    yard_clock_ns,
+)  # fmt: skip
+from barsight.store.lift_records import (
+    find_beside,
+    find_gap,
+    find_outlines,
+    is_at,
+    lift_record,
+    off_target,
+    raise_beside,
+)  # fmt: skip
 from barsight.store.opening import Store
-from barsight.store.states import has_alarm, raise_alarm, step_lift
+from barsight.store.states import last_raised_ns, step_lift
 from barsight.store.tables import LIFT_STATES, LIFTS, SIGHTINGS, TOUCHES
 from barsight.yard.events import corners
 from barsight.yard.inventory.bundle_file import bundle_of
 
 with extra("store"):
     from sqlalchemy import Connection, Row, Select, select
-
-BESIDE = "lift-beside"
-"""Code of the alarm after a magnet came down beside the target of its lift."""
-ROUNDING_M = 1e-4
-"""What a target and a reading may differ by, beyond the tolerance, as telegrams round both."""
 
 
 @dataclass(frozen=True)
@@ -62,100 +71,26 @@ def note_touch(store: Store, who: str, touch: Touch) -> None:
             if lift.lift_id == lift_id and lift.state == "executing":
                 beside = find_beside(opened.connection, lift_id, is_reported=False)
                 if beside is not None:
-                    _raise_beside(opened, beside)
+                    raise_beside(opened, lift.lift_id, beside)
                     end_beside(opened, lift)
 
 
-def end_touched(opened: Entry, since_ns: int) -> None:
-    """End offers near the places that were touched after `since_ns`, the beginning of a map being added."""
+def end_disturbed(opened: Entry, since_ns: int) -> None:
+    """End offers near lifts and touches that moved something after `since_ns`, the beginning of a map being
+    added; all after a lift that isn't recorded, as its place is unknown.
+    """
+    unrecorded_ns = last_raised_ns(opened.connection, "lift-unrecorded")
+    if unrecorded_ns is not None and unrecorded_ns >= since_ns:
+        end_offers(opened, "disturbed: a lift that isn't recorded was reported after this map was begun")
+    moving = select(LIFT_STATES.c.lift_id).where(
+        LIFT_STATES.c.state.in_(("executing", "executed")), LIFT_STATES.c.at_ns >= since_ns
+    )
+    begun = LIFT_STATES.c.lift_id.in_(select(LIFT_STATES.c.lift_id).where(LIFT_STATES.c.state == "executing"))
+    late = LIFT_STATES.c.state == "failed", LIFT_STATES.c.at_ns >= since_ns
+    failed = select(LIFT_STATES.c.lift_id).where(*late, begun)
+    for lift in find_lifts(opened.connection, LIFTS.c.id.in_(moving) | LIFTS.c.id.in_(failed)):
+        end_beside(opened, lift)
     _end_within_reach(opened, select(TOUCHES).where(TOUCHES.c.at_ns >= since_ns))
-
-
-def note_beside(store: Store, lift_id: int, who: str) -> str | None:
-    """Return why a lift that is reported as executed wasn't made at its place, None if nothing says so; the
-    alarm is raised, unless it was.
-    """
-    with store.reading() as connection:
-        beside = find_beside(connection, lift_id, is_reported=True)
-        clock_ns = yard_clock_ns(connection)
-        is_raised = beside is None or has_alarm(connection, BESIDE, beside)
-    if beside is not None and not is_raised:
-        with entry(store, who, f"lift beside {lift_id}", clock_ns) as opened:
-            _raise_beside(opened, beside)
-    return beside
-
-
-def find_beside(connection: Connection, lift_id: int, *, is_reported: bool) -> str | None:
-    """Return where a lift's load was taken if it wasn't at its target, else None.
-
-    The magnet must be there whenever it takes something, until it has put a load down elsewhere. is_reported:
-    the lift is over, so that it must also have come down there, if it came down anywhere. None also if a load
-    was put down that nobody saw taken.
-    """
-    record = _record(connection, lift_id)
-    is_holding, elsewhere = False, None
-    for row in _touches_of(connection, lift_id):
-        is_there = is_at(record, row.x_m, row.y_m)
-        if row.kind == "release" and not is_there:
-            return None
-        if row.kind == "release":
-            is_holding = False  # nothing was taken away
-        elif row.kind == "grip" and not is_there and not is_holding:
-            return _words(lift_id, record, row)
-        elif is_there:
-            is_holding, is_reported = is_holding or row.kind == "grip", False
-        else:
-            elsewhere = row
-    return _words(lift_id, record, elsewhere) if is_reported and elsewhere is not None else None
-
-
-def was_at_target(connection: Connection, lift_id: int) -> bool:
-    """Check whether a crane's readings tell that a lift's load was taken at its target."""
-    record = _record(connection, lift_id)
-    return any(
-        row.kind != "release" and is_at(record, row.x_m, row.y_m) for row in _touches_of(connection, lift_id)
-    )
-
-
-def is_at(record: dict[str, Any], x_m: float, y_m: float, place: str = "target") -> bool:
-    """Check whether a crane's readings lie within the tolerance of a lift's target, or of its set-down."""
-    if record[place] is None:
-        return False
-    off_m, tolerance = _off(record, x_m, y_m, place), record["tolerance"]
-    return all(abs(off_m[k]) <= tolerance[name] + ROUNDING_M for k, name in enumerate(("x_m", "y_m")))
-
-
-def _off(record: dict[str, Any], x_m: float, y_m: float, place: str = "target") -> tuple[float, float]:
-    # Records of an earlier version have no offset between the crane's readings and its magnet.
-    wanted = record.get(f"crane_{place}") or record[place]
-    return x_m - wanted["x_m"], y_m - wanted["y_m"]
-
-
-def _words(lift_id: int, record: dict[str, Any], row: Row[Any]) -> str:
-    off_m = math.hypot(*_off(record, row.x_m, row.y_m))
-    what = "took a load" if row.kind == "grip" else "came down"
-    return (
-        f"lift {lift_id}: by the crane's readings the magnet {what} at x {row.x_m:.3f}, y {row.y_m:.3f} m, "
-        f"{1e3 * off_m:.0f} mm beside the target: see what was moved, and survey before the next lift"
-    )
-
-
-def _raise_beside(opened: Entry, reason: str) -> None:
-    if not has_alarm(opened.connection, BESIDE, reason):
-        raise_alarm(opened, BESIDE, reason)
-
-
-def _record(connection: Connection, lift_id: int) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(
-        connection.execute(select(LIFTS.c.record).where(LIFTS.c.id == lift_id)).scalar_one()
-    )
-    return found
-
-
-def _touches_of(connection: Connection, lift_id: int) -> Iterable[Row[Any]]:
-    return connection.execute(
-        select(TOUCHES).where(TOUCHES.c.lift_id == lift_id).order_by(TOUCHES.c.id)
-    ).all()
 
 
 def _lift_of(connection: Connection, who: str, touch: Touch) -> int | None:
@@ -201,7 +136,7 @@ def _is_as_planned(connection: Connection, row: Row[Any]) -> bool:
     begun = LIFT_STATES.c.lift_id == row.lift_id, LIFT_STATES.c.state == "executing"
     if row.lift_id is None or connection.execute(select(LIFT_STATES.c.id).where(*begun)).first() is None:
         return False
-    record = _record(connection, row.lift_id)
+    record = lift_record(connection, row.lift_id)
     return is_at(record, row.x_m, row.y_m) or (
         row.kind == "release" and is_at(record, row.x_m, row.y_m, "set_down")
     )
@@ -224,7 +159,7 @@ def _moved(connection: Connection, row: Row[Any], other: OpenLift) -> list[Float
     ]
 
     def square(place: Row[Any], side_m: float) -> Float64:
-        off_m = _off(other.record, place.x_m, place.y_m)
+        off_m = off_target(other.record, place.x_m, place.y_m)
         target = other.record["target"]
         return corners((target["x_m"] + off_m[0], target["y_m"] + off_m[1]), 0.0, side_m, side_m)
 
