@@ -56,6 +56,9 @@ def test_encoders_load_and_clock_of_the_plc_are_in_the_state(tmp_path: Path) -> 
             None,
             (0.002,) * 3,
         )
+        feed.take_reading(replace(state.plc, bridge_m=0.0, trolley_m=0.0, hoist_m=0.0))
+        feed.refresh()
+        assert feed.newest(1).plc is not None and feed.newest(1).pose is None  # no position was sent
         with_live = StateFeed(store, replace(settings, live=LiveSource(tmp_path)))
         with_live.take_reading(state.plc)
         with_live.refresh()

@@ -155,7 +155,7 @@ def test_a_position_that_is_not_sent_is_unknown(plant: Plant) -> None:
     for flags in (SLACK, SLACK | ON, ON, 0):
         crane.go((0.0, 0.0), 0.0, flags)
     assert crane.turn(EXECUTED) == DONE and alarms(plant) == []
-    assert "no position was sent" in note_of(plant, lift_id)
+    assert note_of(plant, lift_id) == "no reading of the crane told where"
 
 
 def lower_only(crane: Driver) -> None:
@@ -223,7 +223,39 @@ def is_not_heard_for_a_while(crane: Driver) -> None:
     crane.put(FREE)
 
 
-@pytest.mark.parametrize("way", [on_early, falters_at_set_down, connects_anew, is_not_heard_for_a_while])
+def loses_its_encoders_for_a_moment(crane: Driver) -> None:
+    crane.go(FIRST)
+    crane.go((0.0, 0.0), 0.0, ON)
+    crane.go(FIRST, HIGH, ON)
+    crane.put(FREE)
+
+
+def finds_the_load_higher(crane: Driver, flags: int = SLACK) -> None:
+    """The magnet touches 0.2 m above the height that was told, and lays the load down lower."""
+    for at, z_m in ((FIRST, DOWN + 0.2), (FREE, DOWN)):
+        crane.go(at)
+        crane.go(at, z_m, crane.flags | flags)
+        crane.go(at, z_m, flags | (ON if at == FIRST else 0))
+        crane.go(at, HIGH, crane.flags & ON)
+
+
+def finds_it_higher_and_tells_no_rope(crane: Driver) -> None:
+    finds_the_load_higher(crane, 0)
+
+
+def finds_it_higher_and_is_on_early(crane: Driver) -> None:
+    crane.go(FREE, HIGH, ON)
+    finds_the_load_higher(crane)
+
+
+@pytest.mark.parametrize(
+    "way",
+    [
+        on_early, falters_at_set_down, connects_anew, is_not_heard_for_a_while,
+        loses_its_encoders_for_a_moment, finds_the_load_higher,
+        finds_it_higher_and_tells_no_rope, finds_it_higher_and_is_on_early,
+    ],
+)  # fmt: skip
 def test_what_is_no_lift_beside(plant: Plant, way: Callable[[Driver], None]) -> None:
     crane = Driver(plant)
     crane.begin()

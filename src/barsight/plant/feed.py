@@ -90,9 +90,8 @@ class StateFeed:
         if known is None or time.monotonic() - known[0] > PLC_SILENT_S:
             return state
         plc, pose = known[1], state.pose
-        if pose is None and crane is not None and self._settings.live is None:
-            sigma_m = (crane.position_std_m,) * 3
-            pose = CranePose(plc.bridge_m, plc.trolley_m, plc.hoist_m, None, sigma_m, plc.stamp_ns)
+        if pose is None and crane is not None and plc.place_m is not None and self._settings.live is None:
+            pose = CranePose(*plc.place_m, None, (crane.position_std_m,) * 3, plc.stamp_ns)
         return replace(state, plc=plc, pose=pose)
 
     def _follow(self) -> None:

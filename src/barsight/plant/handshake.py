@@ -124,9 +124,7 @@ def report_executed(store: Store, claim: LiftClaim, load_kg: float | None) -> st
         return verdict
     with store.reading() as connection:
         is_known = was_at_target(connection, claim.lift_id)
-    place = (
-        "at its target, by the crane's readings" if is_known else "where isn't known: no position was sent"
-    )
+    place = "at its target, by the crane's readings" if is_known else "no reading of the crane told where"
     try:
         take_lift(store, claim.lift_id, claim.who, alarm, place)
     except BesideError as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from barsight.core.errors import BarsightError, Failed
 from barsight.plant.state import PlantState, PlcReading
@@ -18,9 +18,24 @@ DOWN_M = 0.1
 """Height in metres above that of contact up to which the magnet of a lift that has begun counts as down."""
 MAX_GAP_S = 1.0
 """Longest time in seconds between readings of which the later one tells what happened since the earlier."""
-MAX_PLACE_M = 10_000.0
-"""Readings in metres from which on they are no place in a yard."""
 _MAGNET_ON, _WEIGHED, _SLACK, _REACHED = 1, 2, 4, 8
+
+
+@dataclass(frozen=True)
+class _Magnet:
+    """State of the magnet by a reading. is_low: it is no higher than where it counts as down."""
+
+    is_on: bool
+    is_low: bool
+    is_slack: bool
+
+    @classmethod
+    def of(cls, reading: PlcReading, down_m: float) -> _Magnet:
+        return cls(reading.is_magnet_on, reading.hoist_m <= down_m, reading.is_rope_slack)
+
+    @property
+    def grips(self) -> bool:
+        return self.is_on and (self.is_low or self.is_slack)
 
 
 class PlcPartner:
@@ -82,30 +97,31 @@ class PlcPartner:
     def watch(self, reading: PlcReading) -> None:
         """Find in the PLC's readings, one after another, where its magnet touches something.
 
-        Without a position (all zeros, or no place of a yard) nothing is known, nor from the first reading,
-        nor of what happened before one that came `MAX_GAP_S` late: the load may hang by then. While a lift
-        has begun, the magnet is down up to `DOWN_M` above the height of contact; otherwise whenever it is
-        turned on.
+        Without a position nothing is known, nor from the first reading, nor of what happened before one that
+        came `MAX_GAP_S` late: the load may hang by then. The magnet is down if the rope is slack; while a
+        lift has begun also up to `DOWN_M` above the height of contact, otherwise whenever it is turned on.
         """
         last, last_s = self._last, self._last_s
-        self._last, self._last_s = reading, time.monotonic()
-        if self._last_s - last_s > MAX_GAP_S:
+        self._last_s = time.monotonic()
+        self._last = None if reading.place_m is None else reading
+        if self._last is None or self._last_s - last_s > MAX_GAP_S:
             last = self._begun = self._contact_m = None
-        place_m = (reading.bridge_m, reading.trolley_m, reading.hoist_m)
-        if last is None or not 0 < max(map(abs, place_m)) < MAX_PLACE_M:
+        if last is None or reading.place_m is None:
             return
         contact_m = self._contact_m
         down_m = math.inf if contact_m is None else contact_m + DOWN_M
-        was, now = ((one.is_magnet_on, one.hoist_m <= down_m, one.is_rope_slack) for one in (last, reading))
+        was, now = (_Magnet.of(one, down_m) for one in (last, reading))
+        lowered = contact_m is not None and now.is_low and not was.is_low
         kinds = {
-            "release": was[0] and not now[0],
-            "grip": all(now[:2]) and not all(was[:2]),
-            "contact": not was[0] and not now[0] and (
-                (now[2] and not was[2]) or (contact_m is not None and now[1] and not was[1])
+            "release": was.is_on and not now.is_on,
+            "on": now.is_on and not was.is_on and not now.grips,
+            "grip": now.grips and not was.grips,
+            "contact": not (was.is_on or now.is_on) and (
+                lowered or (now.is_slack and not was.is_slack)
             ),
         }  # fmt: skip
         for kind in (name for name, is_told in kinds.items() if is_told):
-            self._touches.append(Touch(kind, *place_m))
+            self._touches.append(Touch(kind, *reading.place_m))
 
     def reading(self, found: dict[str, int]) -> PlcReading:
         """Form the PLC's reading of the crane from a telegram."""

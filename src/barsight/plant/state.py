@@ -19,6 +19,8 @@ MAX_ALARMS = 20
 """Maximum number of alarms in the state: urgent ones, then active ones, then the newest. One of each further
 code is added, up to `MAX_CODES`.
 """
+MAX_PLACE_M = 10_000.0
+"""Readings of a crane in metres from which on they are no place in a yard."""
 MAX_CODES = 20
 """Maximum number of alarms that are added so that each code is told."""
 YAW_SENSE = "of the beam from +Y of the yard frame, counter-clockwise seen from above"
@@ -41,6 +43,12 @@ class PlcReading:
     is_magnet_on: bool
     is_rope_slack: bool
     is_position_reached: bool
+
+    @property
+    def place_m(self) -> tuple[float, float, float] | None:
+        """Return bridge, trolley and hoist; None if they aren't known: all zeros, or no place of a yard."""
+        place_m = (self.bridge_m, self.trolley_m, self.hoist_m)
+        return place_m if 0 < max(map(abs, place_m)) < MAX_PLACE_M else None
 
 
 @dataclass(frozen=True)

@@ -215,8 +215,8 @@ def find_beside(connection: Connection, lift_id: int, *, is_reported: bool) -> s
         elif row.kind == "grip" and not is_there and not is_holding:
             return _words(record, row)
         elif is_there:
-            is_holding, is_reported = is_holding or row.kind == "grip", False
-        else:
+            is_holding, is_reported = is_holding or row.kind != "contact", False
+        elif row.kind != "on":
             elsewhere = row
     return _words(record, elsewhere) if is_reported and elsewhere is not None else None
 

@@ -42,8 +42,9 @@ with extra("store"):
 
 @dataclass(frozen=True)
 class Touch:
-    """A place that a crane read. kind: `grip` (the magnet is down and on), `release` (it was turned off), or
-    `contact` (it came down without being on).
+    """A place that a crane read. kind: `grip` (the magnet is down and on), `release` (it was turned off),
+    `contact` (it came down without being on), or `on` (it was turned on higher than where a lift takes its
+    load: what lies there is higher than was told, or it was turned on early).
     """
 
     kind: str
@@ -116,7 +117,7 @@ def _end_within_reach(opened: Entry, query: Select[Any]) -> None:
     """End offers and confirmations near touches, without those of the lift that a touch belongs to."""
     connection = opened.connection
     for row in connection.execute(query.order_by(TOUCHES.c.id)).all():
-        if _is_as_planned(connection, row):
+        if row.kind == "on" or _is_as_planned(connection, row):
             continue
         moved: dict[int, list[Float64]] = {}
         for other in open_lifts(connection):
