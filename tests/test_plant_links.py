@@ -416,6 +416,20 @@ def test_the_state_holds_a_limited_number_of_codes_and_those_beyond_have_not_end
     assert [(one["event"], one["code"]) for one in changes_between(full, more)] == [("alarm-raised", "new")]
 
 
+def test_a_step_whose_client_was_told_that_nobody_answers_begins_nothing() -> None:
+    """The process was held up; what a crane did is recorded all the same."""
+    pytest.importorskip("asyncua")
+    from barsight.plant.opcua.process import OpcUaProcess
+
+    process, taken = OpcUaProcess.__new__(OpcUaProcess), list[str]()
+    process._handshake = lambda step, *_: taken.append(step) or step  # type: ignore[func-returns-value]
+    now_s = time.monotonic()
+    for until_s in (now_s - 0.1, now_s + 60):
+        for step in ("claim", "executing", "executed", "failed"):
+            process._answer_one((step, "crane", {}), until_s)
+    assert taken == ["executed", "failed", "claim", "executing", "executed", "failed"]
+
+
 def test_another_alarm_of_a_code_is_raised_though_the_first_was_acknowledged() -> None:
     pytest.importorskip("asyncua")
     from barsight.plant.opcua.alarms import Conditions

@@ -25,6 +25,9 @@ from barsight.plant.opcua.surveys import Told
 Handshake = Callable[[str, str, Mapping[str, Any]], "str | Failed"]
 """Callable that takes a step of the handshake: its name, the caller and the arguments; returns the token."""
 
+BEGINNINGS = ("claim", "executing")
+"""Steps that a client takes before it lifts; the others tell what it did."""
+
 
 class OpcUaProcess:
     """The server's process, and the thread that answers its requests."""
@@ -82,15 +85,17 @@ class OpcUaProcess:
         while not self._stop.is_set():
             try:
                 if self._here.poll(0.1):
-                    number, question = self._here.recv()
+                    number, question, until_s = self._here.recv()
                     self._is_serving = True
-                    self._here.send((number, self._answer_one(question)))
+                    self._here.send((number, self._answer_one(question, until_s)))
             except (EOFError, OSError):
                 return
 
-    def _answer_one(self, question: tuple[str, str, Mapping[str, Any]] | None) -> Any:
+    def _answer_one(self, question: tuple[str, str, Mapping[str, Any]] | None, until_s: float) -> Any:
+        """Answer a request. One that the server's process has given up begins no lift any more."""
         if question is not None:
-            return self._handshake(*question)
+            is_late = question[0] in BEGINNINGS and time.monotonic() > until_s
+            return None if is_late else self._handshake(*question)
         known = self._told
         return known[1] if known is not None and time.monotonic() - known[0] <= self._max_age_s else None
 
@@ -130,7 +135,7 @@ class _AskedPlant:
         self._asked += 1
         end = time.monotonic() + timeout_s
         try:
-            self._connection.send((self._asked, question))
+            self._connection.send((self._asked, question, end))
             while (left := end - time.monotonic()) > 0 and self._connection.poll(left):
                 number, answer = self._connection.recv()
                 if number == self._asked:
