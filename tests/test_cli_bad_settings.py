@@ -76,7 +76,7 @@ def test_unknown_command(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ("group", "line"),
     [
-        ("bench", "barsight: bench needs a benchmark: stereo | "),
+        ("bench", "barsight: bench needs a benchmark: stereo, "),
         ("calibrate", "barsight: calibrate needs a kind: board, stereo, "),
     ],
 )
@@ -85,7 +85,26 @@ def test_a_group_alone_asks_for_the_rest(group: str, line: str, capsys: pytest.C
     told = capsys.readouterr()
     assert told.err.startswith(line) and told.err.count("\n") == 1 and not told.out
     assert run([group, "--help"]) == 0
-    assert capsys.readouterr().out.startswith(f"usage: barsight {group} ")
+    told = capsys.readouterr()
+    assert told.out.startswith(f"usage: barsight {group} KIND ...") and "  stereo " in told.out
+
+
+@pytest.mark.parametrize(
+    ("words", "usage"),
+    [
+        (("store", "keep"), "URL RECORDING WHY"),
+        (("yard",), "[URL]"),
+        (("measure",), "RECORDING [...]"),
+        (("bench", "length"), "RECORDING"),
+    ],
+)
+def test_help_names_positional_arguments(
+    words: tuple[str, ...], usage: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        run([*words, "--help"])
+    told = capsys.readouterr().out
+    assert usage in told.split("\n\n")[0] and "(default: )" not in told.partition(" options ")[0]
 
 
 def test_result_says_what_was_used(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:

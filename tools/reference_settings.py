@@ -9,6 +9,7 @@ import textwrap
 import types
 from collections.abc import Iterator
 from dataclasses import dataclass
+from enum import StrEnum
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, cast, get_args, get_origin, get_type_hints
@@ -118,6 +119,8 @@ def type_text(kind: Any) -> str:
         return type_text(inner[0])
     if origin is Literal:
         return ", ".join(f"`{value}`" for value in inner)
+    if inspect.isclass(kind) and issubclass(kind, StrEnum):
+        return ", ".join(f"`{member.value}`" for member in kind)
     if origin in (Union, types.UnionType):
         return " or ".join(type_text(part) for part in inner if part is not type(None))
     if origin is tuple and inner[-1] is Ellipsis:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import functools
 import importlib
+import inspect
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise, takewhile
 from pathlib import Path
-from typing import TypeVar
+from typing import Annotated, Any, TypeVar, cast, get_args, get_origin, get_type_hints
 
 import tyro
 
@@ -21,16 +22,34 @@ from barsight.core.settings.renamed import refuse_old_flags
 Settings = TypeVar("Settings")
 LISTS = ("--use", "--lifted", "--fetch")
 """Flags whose values may be separated by commas."""
+_POSITIONAL = cast(Any, tyro.conf.Positional[int]).__metadata__[0]
 
 
 def call(command: Callable[..., None], name: str, arguments: Sequence[str]) -> None:
     """Parse `arguments` according to the function's signature and call it; wrong usage exits with code 2."""
     refuse_old_flags(arguments)
     listed = _listed(arguments)
+    _name_positional(command)
     shown = [printable(argument) for argument in listed]
     if shown != listed:  # tyro prints rejected arguments unescaped
         tyro.cli(_only_parsed(command), prog=f"barsight {name}", args=shown, compact_help=False)
     tyro.cli(command, prog=f"barsight {name}", args=listed, compact_help=False)
+
+
+def _name_positional(command: Callable[..., None]) -> None:
+    """Give positional arguments their own names in usage and help: RECORDING, not PATH."""
+    hints = get_type_hints(command, include_extras=True)
+    for name, parameter in inspect.signature(command).parameters.items():
+        hint, word = hints[name], name.upper()
+        if _POSITIONAL not in getattr(hint, "__metadata__", ()):
+            continue
+        if get_origin(get_args(hint)[0]) is tuple:  # one or more
+            shown = tyro.conf.arg(metavar=f"{word[:-1]} [...]", help_behavior_hint="(required)")
+        else:
+            needed = parameter.default is parameter.empty
+            shown = tyro.conf.arg(metavar=word if needed else f"[{word}]")
+        hints[name] = Annotated[hint, shown]
+    command.__annotations__.update(hints)
 
 
 def _only_parsed(command: Callable[..., None]) -> Callable[..., None]:
@@ -54,14 +73,21 @@ def pass_on(name: str, noun: str, kinds: Mapping[str, str], arguments: Sequence[
     if not arguments:
         raise ConfigError(f"{name} needs a kind: {', '.join(kinds)}; --help says what each does")
     if arguments[0] in ("-h", "--help"):
-        width = max(map(len, kinds)) + 1
-        lines = "\n".join(f"  {kind:<{width}}{summary}" for kind, summary in kinds.items())
-        sys.stdout.write(f"usage: barsight {name} KIND ...\n\nkinds:\n{lines}\n\n")
+        print_kinds(name, kinds)
         return
     kind, rest = arguments[0], arguments[1:]
     if kind not in kinds:
         raise ConfigError(f"there is no {noun} {kind!r}; known are {', '.join(kinds)}")
     importlib.import_module(f"barsight.cli.{name}.{kind.replace('-', '_')}").run(rest)
+
+
+def print_kinds(name: str, kinds: Mapping[str, str]) -> None:
+    """Print the help of a command that has kinds, each with its summary."""
+    width = max(map(len, kinds)) + 1
+    lines = "\n".join(f"  {kind:<{width}}{summary}" for kind, summary in kinds.items())
+    sys.stdout.write(
+        f"usage: barsight {name} KIND ...\n\nkinds:\n{lines}\n\nbarsight {name} KIND --help explains one.\n"
+    )
 
 
 def _listed(arguments: Sequence[str]) -> list[str]:

@@ -24,9 +24,7 @@ def run(arguments: Sequence[str]) -> None:
     default = load_settings(config_path(arguments), MeasureSettings)
 
     def command(
-        recordings: tyro.conf.Positional[
-            Annotated[tuple[Path, ...], tyro.conf.arg(metavar="RECORDING [RECORDING ...]")]
-        ],
+        recordings: tyro.conf.Positional[tuple[Path, ...]],
         out: Annotated[Path, tyro.conf.arg(aliases=("-o",))],
         settings: Annotated[MeasureSettings, tyro.conf.arg(name="")] = default,
         config: Path | None = None,

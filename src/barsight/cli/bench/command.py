@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from inspect import getdoc
 from pathlib import Path
 from typing import Annotated
 
@@ -15,7 +16,7 @@ from barsight.benchmarks.stereo.speed import bench_speed, speed_table, time_chai
 from barsight.benchmarks.stereo.steps import write_steps
 from barsight.benchmarks.stereo.subpixel import bench_subpixel, subpixel_table
 from barsight.benchmarks.stereo.target_size import bench_target_size, target_size_table
-from barsight.cli.arguments import call
+from barsight.cli.arguments import call, print_kinds
 from barsight.cli.bench import matching
 from barsight.cli.bench.bundles import bench_found_bundles
 from barsight.cli.bench.length import bench_length
@@ -55,11 +56,11 @@ def run(arguments: Sequence[str]) -> None:
         "live-step": bench_step,
         "length": bench_length,
     }
-    names = " | ".join(benches)
+    names = ", ".join(benches)
     if not arguments:
-        raise ConfigError(f"bench needs a benchmark: {names}")
+        raise ConfigError(f"bench needs a benchmark: {names}; --help says what each does")
     if arguments[0] in ("-h", "--help"):
-        SafeConsole().print(f"usage: barsight bench {names} ...", markup=False)
+        print_kinds("bench", {name: (getdoc(bench) or "").split("\n")[0] for name, bench in benches.items()})
         return
     if arguments[0] not in benches:
         raise ConfigError(f"there is no benchmark {arguments[0]!r}; choose {names}")

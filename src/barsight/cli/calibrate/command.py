@@ -7,14 +7,14 @@ from collections.abc import Sequence
 from barsight.cli.arguments import pass_on
 
 KINDS = {
-    "board": "Draw a board to print in its true size, or how to hold it before the cameras",
-    "stereo": "Calibrate two cameras from pictures of a board: rig.yaml and a report that judges it",
-    "camera-imu": "Where the cameras sit on the IMU and the clocks' offset, from a recording with a board",
-    "check": "Has the rig drifted? Ordinary crane travel shows it, with sigma and cost in mm",
-    "export": "Write a rig in another format: ours, Kalibr, OpenCV, EuRoC",
-    "yard": "Where the world lies in the yard, from surveyed targets or crane moves in two axes",
-    "magnet": "How the magnet hangs off the crane's readings, from the touch-downs of a certificate",
-    "imu-noise": "Noise densities and random walks of an IMU from a log at rest: imu.yaml",
+    "board": "Draw a calibration board to print at true size, or how to hold it in front of the cameras",
+    "stereo": "Calibrate two cameras from pictures of a board: rig file, and a report with a verdict",
+    "camera-imu": "Calibrate the cameras' mounting on the IMU, and the clocks' offset, from a recording",
+    "check": "Check if the rig has drifted, from ordinary crane travel",
+    "export": "Write a rig in another format: Barsight's, Kalibr's, OpenCV's, EuRoC's",
+    "yard": "Register the measurement's frame in the yard, from surveyed targets, tags or crane moves",
+    "magnet": "Find the magnet's offset from the crane's readings, from a certificate's touch-downs",
+    "imu-noise": "Fit the noise model of an IMU from a log at rest: imu.yaml",
 }
 
 

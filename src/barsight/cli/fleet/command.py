@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from barsight.cli.arguments import pass_on
 
 KINDS = {
-    "plan": "Find an archive's recordings, and tell what is to be done and how long it takes",
-    "run": "Measure what is planned, on this machine's cores or a Dask cluster",
-    "status": "Count what is done, under way, left, and parked with its reason",
-    "compare": "Compare two versions over the archive: what moved beyond its sigma",
-    "promote": "Switch what the page and the plant see to a version, or back",
+    "plan": "Find an archive's recordings and plan their measurement",
+    "run": "Measure the planned recordings, on this machine's cores or a Dask cluster",
+    "status": "Count what is done, under way, left and parked",
+    "compare": "Compare two versions over the archive",
+    "promote": "Switch the page and the plant to a version, or back",
 }
 
 

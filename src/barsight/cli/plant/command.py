@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from barsight.cli.arguments import pass_on
 
 KINDS = {
-    "run": "Serve the state by telegram, OPC UA, MQTT, S7 and webhooks; Ctrl-C ends it",
+    "run": "Serve the plant's state by telegram, OPC UA, MQTT, S7 and webhooks until Ctrl-C",
     "user": "Add a user of the OPC UA server, or change role and password",
-    "check": "Check each link from the other side, and write a protocol; exit code 5 where one does not hold",
-    "scl": "Write the telegram's types as a source for TIA Portal",
+    "check": "Check each link from its other side, and write a protocol",
+    "scl": "Write the telegram's types as a source file for TIA Portal",
 }
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
 
 import tyro
 from rich.console import Console
@@ -21,7 +20,7 @@ def run(arguments: Sequence[str]) -> None:
 
     def command(
         url: tyro.conf.Positional[str],
-        out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")],
+        out: tyro.conf.Positional[Path],
         by: str | None = None,
         migrate: bool = False,
         same_yard: bool = False,

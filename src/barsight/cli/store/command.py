@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from barsight.cli.arguments import pass_on
 
 KINDS = {
-    "add": "Add a measured folder: its bundles get names that they keep",
-    "approve": "Approve a calibration for a time; the rig's older ones end",
-    "keep": "Say why a recording is not to be deleted",
-    "list": "List the surveys, calibrations and recordings, and the bundles of the present yard",
-    "user": "Add or withdraw who may log in to the page",
-    "verify": "Check the audit chain and the rows that it covers; exit code 5 where they don't hold",
+    "add": "Add a measured folder; its bundles get permanent names",
+    "approve": "Approve a calibration of a rig for a period",
+    "keep": "Protect a recording from deletion, with a reason",
+    "list": "List surveys, calibrations and recordings, and the bundles currently in the yard",
+    "user": "Add a person who may log in to the page, or withdraw the account",
+    "verify": "Verify the audit chain and the rows that it covers",
 }
 
 

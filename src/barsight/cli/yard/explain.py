@@ -23,7 +23,7 @@ def run(arguments: Sequence[str]) -> None:
     """Parse the arguments, print the explanation and write its page."""
 
     def command(
-        folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")],
+        folder: tyro.conf.Positional[Path],
         lift: tyro.conf.Positional[str],
         out: Annotated[Path | None, tyro.conf.arg(aliases=("-o",))] = None,
     ) -> None:
