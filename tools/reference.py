@@ -11,6 +11,7 @@ import dataclasses
 import importlib
 import inspect
 import io
+import json
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -21,7 +22,7 @@ import tyro
 
 import barsight
 from barsight.cli import main
-from reference_codes import codes_page
+from reference_codes import alarms_table, codes_page
 from reference_schemas import schemas_page
 from reference_settings import CRANE, MAGNET, PLANT, Use, settings_page, shown, type_text, walk
 
@@ -145,11 +146,13 @@ def settings_uses(all_commands: list[Command]) -> dict[type, list[tuple[str, str
 def pages() -> dict[str, str]:
     """The text of each page by its file name."""
     all_commands = list(commands())
+    words = json.loads((PACKAGE / "page" / "static" / "words.json").read_text(encoding="utf-8"))
+    alarms = alarms_table(words, find("alarm_priority"))
     return {
         "commands.md": commands_page(all_commands),
         "settings.md": HEAD + settings_page(settings_uses(all_commands)),
         "codes.md": HEAD
-        + codes_page(find("BarsightError"), find("VETOES"), find("WARNINGS"), main.INTERRUPTED),
+        + codes_page(find("BarsightError"), find("VETOES"), find("WARNINGS"), main.INTERRUPTED, alarms),
         "telegram.md": HEAD + find("telegram_page")(),
         "schemas.md": HEAD + schemas_page(PACKAGE),
     }

@@ -20,14 +20,15 @@ class BarsightError(Exception):
 
 
 class ConfigError(BarsightError):
-    """A setting that is out of its range, misspelt or contradicts another."""
+    """A setting that is out of its range, misspelt or contradicts another; or a wrong command line."""
 
     exit_code = 2
 
 
 class InputError(BarsightError):
-    """An input that is missing, damaged or wrong. `path` names it, `problem` says what is wrong, `remedy`
-    what to do.
+    """An input that is missing, damaged or wrong.
+
+    `path` names it, `problem` says what is wrong, `remedy` what to do.
     """
 
     exit_code = 3
@@ -48,13 +49,13 @@ class CalibrationError(InputError):
 
 
 class OutputError(BarsightError):
-    """An output that could not be written whole; nothing of it is left."""
+    """An output that could not be written completely; nothing of it is left."""
 
     exit_code = 4
 
 
 class MeasurementError(BarsightError):
-    """The inputs are readable but don't carry what the measurement needs."""
+    """The inputs are readable but don't hold what is needed, or a check isn't passed: a verdict, an alarm."""
 
     exit_code = 5
 
