@@ -16,17 +16,34 @@ def schemas_page(package: Path) -> str:
         lines.append(f"\n## {path.name.replace('.schema', '')}\n\n{schema.get('description', '')}\n\n")
         lines.append(f"The schema is `{path.relative_to(package.parent)}`.\n\n")
         lines.append("| property | type | meaning |\n|---|---|---|\n")
-        lines += [f"| `{name}` | {kind} | {about} |\n" for name, kind, about in _rows(schema, schema, "")]
+        rows = _rows(schema, schema, "", {})
+        lines += [f"| `{name}` | {kind} | {about} |\n" for name, kind, about in rows]
     return "".join(lines)
 
 
-def _rows(node: dict[str, Any], root: dict[str, Any], prefix: str) -> Iterator[tuple[str, str, str]]:
+def _rows(
+    node: dict[str, Any], root: dict[str, Any], prefix: str, seen: dict[str, str]
+) -> Iterator[tuple[str, str, str]]:
+    """seen: the property that first had each definition; a later one refers to it."""
     for name, stated in node.get("properties", {}).items():
         part, dotted = _resolved(stated, root), f"{prefix}{name}"
-        yield dotted, _type(part, root), part.get("description", "").replace("|", "\\|")
-        yield from _rows(part, root, f"{dotted}.")
-        if isinstance(part.get("items"), dict):
-            yield from _rows(_resolved(part["items"], root), root, f"{dotted}[].")
+        items: dict[str, Any] = part["items"] if isinstance(part.get("items"), dict) else {}
+        shared = _reference(items) or _reference(stated)
+        first = seen.setdefault(shared, dotted) if shared else dotted
+        like = "" if first == dotted else f"as `{first}`"
+        about = part.get("description", "").replace("|", "\\|")
+        choices = stated.get("oneOf", stated.get("anyOf", []))
+        null = " or null" * any(one.get("type") == "null" for one in choices)
+        yield dotted, _type(part, root) + null, "; ".join(filter(None, (about, like)))
+        if not like:
+            yield from _rows(part, root, f"{dotted}.", seen)
+            yield from _rows(_resolved(items, root), root, f"{dotted}[].", seen)
+
+
+def _reference(node: dict[str, Any]) -> str | None:
+    """The definition that a node or one of its choices names."""
+    found = [one["$ref"] for one in (node, *node.get("anyOf", []), *node.get("oneOf", [])) if "$ref" in one]
+    return found[0] if found else None
 
 
 def _resolved(node: dict[str, Any], root: dict[str, Any]) -> dict[str, Any]:
