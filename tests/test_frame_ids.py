@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import tifffile
 
@@ -46,9 +47,11 @@ def test_every_file_names_the_frame_of_result_json(
     path, (contour, *_) = read_path(out), read_contours(out)
     assert path is not None and len(path.stamp_ns) == 4 and len(contour.z_m) > 20
     assert len(read_vertices(out / "cloud.ply")) > 100
-    for kind in ("pcd", "csv"):
-        export(out, out / f"points.{kind}")
-        assert named(out, f"points.{kind}") == result["frame_id"]
+    export(out, out / "points.pcd")
+    assert named(out, "points.pcd") == result["frame_id"]
+    export(out, out / "points.csv")  # whose readers take the names from its first line
+    points = np.genfromtxt(out / "points.csv", delimiter=",", names=True)
+    assert points.dtype.names == ("x_m", "y_m", "z_m", "intensity", "sigma_m", "views")
 
 
 def moved(folder: Path, frame: str) -> Path:

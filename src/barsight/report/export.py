@@ -1,7 +1,8 @@
 """Export a measured cloud or map to other programs' formats, chosen by the file name.
 
-All keep metres and the reference frame, which LAS (system identifier), PCD and CSV (a comment) and E57 (the
-scan's name) also state. LAS and PCD store sigma and view count in fields of their own; E57 can't store them.
+All keep metres and the reference frame, which LAS (system identifier), PCD (a comment) and E57 (the scan's
+name) also state; a comment in a CSV breaks its readers. LAS, PCD and CSV store sigma and view count in fields
+of their own; E57 can't store them.
 """
 
 from __future__ import annotations
@@ -102,9 +103,9 @@ def _write_e57(cloud: Cloud, path: Path, frame_id: str) -> None:
         raise
 
 
-def _write_csv(cloud: Cloud, path: Path, frame_id: str) -> None:
+def _write_csv(cloud: Cloud, path: Path) -> None:
     columns = np.column_stack([cloud.xyz_m, cloud.intensity, cloud.sigma_m, cloud.views])
-    head = f"# frame {frame_id}\n" * bool(frame_id) + "x_m,y_m,z_m,intensity,sigma_m,views"
+    head = "x_m,y_m,z_m,intensity,sigma_m,views"
     np.savetxt(path, columns, "%.4f,%.4f,%.5f,%d,%.5f,%d", header=head, comments="")
 
 
@@ -113,5 +114,5 @@ _WRITERS: dict[str, Callable[[Cloud, Path, str], None]] = {
     ".laz": lambda cloud, path, frame_id: _write_las(cloud, path, frame_id, compress=True),
     ".pcd": _write_pcd,
     ".e57": _write_e57,
-    ".csv": _write_csv,
+    ".csv": lambda cloud, path, _: _write_csv(cloud, path),
 }
