@@ -157,7 +157,7 @@ def test_a_torn_folder_is_one_line(
 def test_two_folders_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     old, new = write_folder(tmp_path / "old"), write_folder(tmp_path / "new", shift_m=-0.08)
     assert run(["compare", str(old), str(new), "--json", str(tmp_path / "c.json")]) == 0
-    assert "1 of 2 bundles lie where they lay" in capsys.readouterr().out
+    assert "unchanged: 1 of 2 bundles" in capsys.readouterr().out
     changes = json.loads((tmp_path / "c.json").read_text())["changes"]
     assert [c["kind"] for c in changes] == ["moved", "same"]
     assert changes[0]["across_mm"] == pytest.approx(-80) and changes[0]["significant"]

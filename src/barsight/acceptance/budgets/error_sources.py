@@ -139,7 +139,7 @@ def _rig_source(summary: dict[str, Any], path: Path, focal_px: float, assumed: l
     if stated is not None:
         by = "the rig file's covariance, and the travel"
         return ErrorSource(name, ("yaw", "baseline", "focal"), covariance, by)
-    assumed.append("no rig file with a covariance was used: baseline and focal length are taken as right")
+    assumed.append("no rig file with a covariance was used: baseline and focal length count as exact")
     return ErrorSource(name, ("yaw",), covariance, "stereo.calibration_sigma_px")
 
 
@@ -237,7 +237,7 @@ def _yard_frame(summary: dict[str, Any]) -> YardFrame | None:
 
 def _frame_source(frame: YardFrame | None, shared: Float64, assumed: list[str]) -> list[ErrorSource]:
     if frame is None:
-        assumed.append("no yard file was used: how the rig hangs is taken as the recording says it")
+        assumed.append("no yard file was used: the mounting that the recording states counts as exact")
         return []
     names = ("turn_x", "turn_y", "turn_z", "move_x", "move_y", "move_z")
     return [ErrorSource("yard frame", names, shared, f"calibrate yard, {frame.path.name}")]
@@ -256,7 +256,7 @@ def _magnet_source(certificate: Path | None, assumed: list[str]) -> list[ErrorSo
                 ErrorSource("camera to magnet", (f"magnet_{axis}",), mean, by, "t", float(len(errors)))
             )
     if len(sources) < 3:
-        assumed.append("no touch-downs along all axes: the magnet is taken to hang where the crane says")
+        assumed.append("no touch-downs along all axes: the crane's readings count as the magnet's place")
     return sources
 
 

@@ -71,7 +71,7 @@ def _write(found: MeasuredLoad, figures: Sequence[BudgetedFigure], out: Path) ->
 def _print(found: MeasuredLoad, figures: Sequence[BudgetedFigure]) -> None:
     table = Table(box=SIMPLE_HEAD, title=f"Bundle {found.bundle}: standard uncertainties, and U (k x sigma)")
     for head in ("figure", "part", "sigma", "", "distribution", "dof", "measured by"):
-        table.add_column(head)
+        table.add_column(head, overflow="fold")
     for one in figures:
         for part in one.parts:
             free = f"{part.degrees_of_freedom:.0f}"

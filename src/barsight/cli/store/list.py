@@ -60,15 +60,18 @@ def run(arguments: Sequence[str]) -> None:
 def _calibration_table(calibrations: tuple[KnownCalibration, ...], clock_ns: int) -> Table:
     table = Table(title="Calibrations", box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     for head in ("crane", "rig", "calibration", "valid from", "until", "approved by", "now"):
-        table.add_column(head, no_wrap=head != "approved by")
+        table.add_column(head, no_wrap=head not in ("valid from", "until", "approved by"), overflow="fold")
     for one in calibrations:
         named = one.crane, one.rig, one.digest
         if not one.times:
             table.add_row(*named, "-", "-", "-", "never approved")
         for time_ in one.times:
-            until = "-" if time_.until_ns is None else time_text(time_.until_ns)
+            since, until = (
+                "-" if ns is None else time_text(ns).replace("T", " ")  # which may be broken into two lines
+                for ns in (time_.from_ns, time_.until_ns)
+            )
             status = "valid" if time_.holds(clock_ns) else "to come" if clock_ns < time_.from_ns else "ended"
-            table.add_row(*named, time_text(time_.from_ns), until, time_.approved_by, status)
+            table.add_row(*named, since, until, time_.approved_by, status)
     return table
 
 

@@ -29,7 +29,7 @@ def run(arguments: Sequence[str]) -> None:
             chain = verify_chain(connection)
         if isinstance(chain, Failed):
             raise MeasurementError(f"{store.name}: {chain.reason}")
-        message = f"{chain.entries} rows of the audit log hold; the last digest is {chain.digest}"
+        message = f"the audit log is valid: {chain.entries} rows; the last digest is {chain.digest}"
         SafeConsole().print(message, highlight=False, soft_wrap=True)
 
     call(command, "store verify", arguments)

@@ -83,7 +83,7 @@ def _print(changes: tuple[Change, ...], console: Console) -> None:
             )  # fmt: skip
         console.print(table)
     same = len(changes) - len(shown)
-    console.print(f"{same} of {len(changes)} bundles lie where they lay", highlight=False)
+    console.print(f"unchanged: {same} of {len(changes)} bundles", highlight=False)
 
 
 def _name(number: int | None) -> str:
