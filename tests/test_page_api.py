@@ -630,7 +630,7 @@ def test_places_are_shown_by_the_newest_survey_that_saw_them(url: str, tmp_path:
     [
         (["--host", "0.0.0.0"], "--public-url"),
         (["--host", "0.0.0.0", "--public-url", "http://yard"], "is not https"),
-        (["--host", "0.0.0.0", "--public-url", "https://yard"], "no accounts"),
+        (["--host", "0.0.0.0", "--public-url", "https://yard"], "unencrypted"),
         (["--public-url", "https://yard"], "no accounts"),
         (["--certificate", "no.pem"], "go together"),
         (["--port", "99999"], "does not exist"),

@@ -57,12 +57,17 @@ class ServeOptions:
             raise InputError(self.live, "is a file", "name the folder that barsight live writes")
         if not self.is_loopback and self.public_url is None:
             raise ConfigError(
-                f"--host {self.host} is reached from other computers: say with --public-url "
-                "https://NAME:PORT what browsers call it"
+                f"--host {self.host} is reached from other computers: give its URL in browsers, --public-url "
+                "https://NAME:PORT"
             )
         if self.public_url is not None and urlsplit(self.public_url).scheme != "https":
             raise ConfigError(
                 f"--public-url {self.public_url} is not https: give --certificate and --key, or a proxy"
+            )
+        if not self.is_loopback and self.certificate is None:
+            raise ConfigError(
+                f"--host {self.host} would send passwords unencrypted: give --certificate and --key, or "
+                "leave --host out and let a proxy on this computer encrypt"
             )
 
     @property
