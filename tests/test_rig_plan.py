@@ -114,20 +114,20 @@ def over_planned(path: Path) -> list[float]:
     ("flags", "code", "words"),
     [
         (("--range", "8", "--width", "12", "--sigma", "0.001"), 5, "needs a baseline of 5.15 m"),
-        (("--range", "20", "--width", "12", "--bar-diameter", "0.01"), 5, "take a camera of more pixels"),
+        (("--range", "20", "--width", "12", "--bar-diameter", "0.01"), 5, "take a camera with more pixels"),
         (
             ("--range", "5", "--width", "3", "--stack", "4", "--bar-diameter", "0.02", "--camera", "1.3MP"),
             5,
             "12 mm needs f/12 to be sharp from 1 to 5 m",
         ),
-        (("--range", "8", "--width", "12", "--stack", "7"), 2, "less than a fifth of the range"),
+        (("--range", "8", "--width", "12", "--stack", "7"), 2, "mount the cameras higher"),
         (("--range", "-8", "--width", "12"), 2, "--range must lie in 0.5...60 m, not -8"),
         (("--range", "8", "--width", "12", "--bar-diameter", "9"), 2, "--bar-diameter must lie in 0.005"),
         (("--range", "8", "--width", "12", "--speed", "nan"), 2, "--speed must lie in 0.01...5 m/s, not nan"),
         (
             ("--range", "3", "--stack", "1.5", "--width", "2", "--speed", "5", "--camera", "12MP"),
             5,
-            "go slower",
+            "drive slower",
         ),
     ],
 )
@@ -139,7 +139,7 @@ def test_what_does_not_fit_is_one_line(
     assert words in told.err and told.err.count("\n") == 1 and told.out == ""
 
 
-def test_sums_and_parts_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
+def test_figures_and_parts_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["plan", "--range", "8", "--width", "12"]) == 0
     told = capsys.readouterr().out
     assert "0.55 m" in told and "6 mm, C mount" in told and "5 Hz" in told

@@ -41,17 +41,17 @@ def run(arguments: Sequence[str]) -> None:
         """
         wish = Wish(range, width, stack, bar_diameter, sigma, speed)
         plan, console = plan_rig(wish, CAMERAS[camera]), SafeConsole()
-        sums = Table(title="Sums", box=SIMPLE_HEAD)
-        for head in ("figure", "value", "by"):
-            sums.add_column(head)
-        for row in plan.sums():
-            sums.add_row(*row)
+        figures = Table(title="Figures", box=SIMPLE_HEAD)
+        for head in ("figure", "value", "formula"):
+            figures.add_column(head)
+        for row in plan.figures():
+            figures.add_row(*row)
         parts = Table(title="Parts", box=SIMPLE_HEAD)
-        for head in ("part", "what it must do"):
+        for head in ("part", "requirements"):
             parts.add_column(head)
         for part in plan.parts():
             parts.add_row(*part)
-        console.print(sums)
+        console.print(figures)
         console.print(parts)
 
     call(command, "plan", arguments)

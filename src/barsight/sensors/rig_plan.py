@@ -78,7 +78,8 @@ class Wish:
             expect(low <= value <= high, f"--{flag} must lie in {low:g}...{high:g} {unit}, not {value:g}")
         if self.stack_m > 0.8 * self.range_m:
             raise ConfigError(
-                f"the stack of {self.stack_m:g} m leaves less than a fifth of the range of {self.range_m:g} m"
+                f"--stack {self.stack_m:g} m is more than four fifths of --range {self.range_m:g} m: mount "
+                "the cameras higher"
             )
 
     @property
@@ -124,28 +125,32 @@ class RigPlan:
         """Return the data rate of both cameras, Mbit/s: 2 W H rate 8 bits, plus headers."""
         return LINK_RATIO * 2 * self.camera.width_px * self.camera.height_px * self.rate_hz * 8e-6
 
-    def sums(self) -> tuple[tuple[str, str, str], ...]:
+    def figures(self) -> tuple[tuple[str, str, str], ...]:
         """List the calculated figures: name, value, formula."""
         wish, f, near = self.wish, self.focal_px, self.wish.near_m
         far_mm, near_mm = (1e3 * depth_sigma_m(z, f, self.baseline_m) for z in (wish.range_m, near))
         max_px, min_px = (f * self.baseline_m / z for z in (near, wish.range_m))
         overlap = 100 * (1 - wish.speed_mps / self.rate_hz / self.common_m)
         blur = f"{MAX_BLUR_PX:g} px / (f (v / z + {TURN_RADPS:g} rad/s))"
-        floor = f"Z / f, bar / {MIN_BAR_PX:g} at most"
+        floor = f"Z / f; at most bar / {MIN_BAR_PX:g}"
         match = f"Z^2 sigma_d / (f B), sigma_d = {DISPARITY_SIGMA_PX:g} px"
         return (
             ("focal length", f"{self.focal_mm:g} mm, {f:.0f} px", "f = H z / lane, z to the highest pile"),
             ("pixel on the floor", f"{1e3 * wish.range_m / f:.1f} mm", floor),
-            ("lanes", f"{self.passes}, {self.lane_m:.1f} m each", "H z / f, with 10 % in common"),
+            (
+                "lanes",
+                f"{self.passes}, {self.lane_m:.1f} m each",
+                f"H z / f; neighbours share {100 * LANE_OVERLAP_RATIO:.0f} %",
+            ),
             ("baseline", f"{self.baseline_m:.2f} m", "B = Z^2 sigma_d / (f sigma_Z)"),
             ("disparities", f"{min_px:.0f} to {max_px:.0f} px", "f B / Z"),
             ("sigma of a depth", f"{far_mm:.1f} mm on the floor, {near_mm:.1f} mm on top", match),
             ("exposure", f"{self.exposure_us:.0f} us at most", blur),
-            ("aperture", f"f/{self.f_number:g} or more", "f^2 (Z - z) / (2 Z z pixel), sharp from z to Z"),
-            ("rate", f"{self.rate_hz:g} Hz", f"{MIN_VIEWS} v / common view, {MIN_RATE_HZ:g} Hz at least"),
+            ("aperture", f"f/{self.f_number:g} or more", "f^2 (Z - z) / (2 Z z pixel); sharp from z to Z"),
+            ("rate", f"{self.rate_hz:g} Hz", f"{MIN_VIEWS} v / common view; at least {MIN_RATE_HZ:g} Hz"),
             ("overlap", f"{overlap:.0f} %", "1 - v / (rate (W z / f - B))"),
             ("data", f"{self.data_mbps:.0f} Mbit/s", f"{LINK_RATIO:g} x 2 W H rate x 8 bits"),
-            ("disk", f"{self.disk_gib():.1f} GiB per 35 m", "W H 16 bytes each 0.1 m, until measured"),
+            ("disk", f"{self.disk_gib():.1f} GiB per 35 m", "W H 16 bytes every 0.1 m, until measured"),
         )
 
     def disk_gib(self) -> float:
@@ -158,16 +163,26 @@ class RigPlan:
         camera, links = self.camera, 1 if self.data_mbps < 900 else 2
         size = f"{camera.width_px}x{camera.height_px}, {camera.pixel_um:g} um, mono, global shutter"
         return (
-            ("2 cameras", f"{size}, GigE Vision, {self.rate_hz:g} Hz by a hardware trigger, blocks counted"),
+            (
+                "2 cameras",
+                f"{size}, GigE Vision, {self.rate_hz:g} Hz by a hardware trigger, a block number that counts "
+                "exposures",
+            ),
             (
                 "2 lenses",
                 f"{self.focal_mm:g} mm, C mount, focus and iris locked by screws, f/{self.f_number:g}",
             ),
-            ("beam", f"stiff, of one metal, {self.baseline_m:.2f} m between the lenses, along the travel"),
-            ("light", f"floods: gray levels around 120 at {self.exposure_us:.0f} us and the f-number"),
+            (
+                "beam",
+                f"one stiff piece of metal, {self.baseline_m:.2f} m between the lenses, along the travel",
+            ),
+            (
+                "light",
+                f"floodlights: gray levels around 120 at {self.exposure_us:.0f} us and f/{self.f_number:g}",
+            ),
             ("trigger", "one signal to both cameras"),
-            ("IMU", "200 Hz or more, on the beam, its noise and place calibrated"),
-            ("encoders", "bridge, trolley and hoist, 20 Hz or more, stamped when they were read"),
+            ("IMU", "200 Hz or more, on the beam; noise and mounting calibrated"),
+            ("encoders", "bridge, trolley and hoist, 20 Hz or more, each reading with its time"),
             ("network", f"{links} x 1 Gbit/s for the cameras alone, jumbo frames (MTU 9000)"),
             ("computer", f"x86, 4 cores, 8 GiB, SSD with {2 * self.disk_gib():.0f} GiB free, Linux"),
         )
@@ -191,7 +206,7 @@ def plan_rig(wish: Wish, camera: CatalogueCamera) -> RigPlan:
             return _with_baseline(wish, camera, fitting[-1], passes)
     raise MeasurementError(
         f"no lens shows bars of {1e3 * wish.bar_m:.0f} mm with {MIN_BAR_PX:g} pixels from {wish.range_m:g} m "
-        f"in {MAX_PASSES} lanes; take a camera of more pixels or hang it lower"
+        f"in {MAX_PASSES} lanes; take a camera with more pixels or mount it lower"
     )
 
 
@@ -204,7 +219,7 @@ def _with_baseline(wish: Wish, camera: CatalogueCamera, focal_mm: float, passes:
         raise MeasurementError(
             f"a sigma of {1e3 * wish.sigma_m:g} mm needs a baseline of {baseline_m:.2f} m, the common view "
             f"allows {max_m:.2f} m; allow {1e3 * depth_sigma_m(wish.range_m, f, max_m):.1f} mm, take a "
-            "camera of more pixels or hang it lower"
+            "camera with more pixels or mount it lower"
         )
     exposure_us = 1e6 * MAX_BLUR_PX / (f * (wish.speed_mps / near + TURN_RADPS))
     needed = (focal_mm * 1e-3) ** 2 * wish.stack_m / (2 * wish.range_m * near * camera.pixel_um * 1e-6)
@@ -219,6 +234,6 @@ def _with_baseline(wish: Wish, camera: CatalogueCamera, focal_mm: float, passes:
     if rate_hz > camera.max_rate_hz:
         raise MeasurementError(
             f"at {wish.speed_mps:g} m/s {rate_hz} pictures a second are needed, the camera gives "
-            f"{camera.max_rate_hz:g}; take another, or go slower"
+            f"{camera.max_rate_hz:g}; take a faster one, or drive slower"
         )
     return RigPlan(wish, camera, focal_mm, passes, baseline_m, exposure_us, f_number, rate_hz)

@@ -13,7 +13,7 @@ class LabelSettings:
     """Settings for labels on bundles."""
 
     read: bool = False
-    """Read the labels' codes in the pictures (extra `labels`; takes a tenth of a second per picture), attach
+    """Read the labels' codes in the pictures (extra `labels`; takes 0.1 to 0.2 s per picture), attach
     them to the bundles and compare them with the stock list.
     """
     numbers: bool = False
