@@ -24,7 +24,17 @@ import barsight
 from barsight.cli import main
 from reference_codes import alarms_table, codes_page
 from reference_schemas import schemas_page
-from reference_settings import CRANE, MAGNET, PLANT, Use, settings_page, shown, type_text, walk
+from reference_settings import (
+    CRANE,
+    MAGNET,
+    PLANT,
+    Use,
+    own_defaults,
+    settings_page,
+    shown,
+    type_text,
+    walk,
+)
 
 PAGES = Path(__file__).parents[1] / "docs" / "reference"
 PACKAGE = Path(barsight.__file__).parent
@@ -150,7 +160,8 @@ def pages() -> dict[str, str]:
     alarms = alarms_table(words, find("alarm_priority"))
     return {
         "commands.md": commands_page(all_commands),
-        "settings.md": HEAD + settings_page(settings_uses(all_commands)),
+        "settings.md": HEAD
+        + settings_page(settings_uses(all_commands), own_defaults(find("MeasureSettings")())),
         "codes.md": HEAD
         + codes_page(find("BarsightError"), find("VETOES"), find("WARNINGS"), main.INTERRUPTED, alarms),
         "telegram.md": HEAD + find("telegram_page")(),

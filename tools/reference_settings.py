@@ -60,12 +60,26 @@ def walk(kind: Any, prefix: str) -> Iterator[tuple[type, str]]:
         yield from walk(part, prefix)
 
 
-def settings_page(uses: dict[type, list[tuple[str, str]]]) -> str:
-    """A section for each class: who takes it under which prefix, then a row a field."""
+def own_defaults(settings: Any, path: str = "") -> dict[tuple[type, str], list[str]]:
+    """Defaults that parts of `settings` have in place of their classes', such as "`9` in `map`"."""
+    found: dict[tuple[type, str], list[str]] = {}
+    for field in dataclasses.fields(settings):
+        value, dotted = getattr(settings, field.name), f"{path}.{field.name}".lstrip(".")
+        if dataclasses.is_dataclass(value):
+            for key, said in own_defaults(value, dotted).items():
+                found.setdefault(key, []).extend(said)
+        elif path and shown(value) != _default(field):
+            found.setdefault((type(settings), field.name), []).append(f"{shown(value)} in `{path}`")
+    return found
+
+
+def settings_page(uses: dict[type, list[tuple[str, str]]], own: dict[tuple[type, str], list[str]]) -> str:
+    """A section for each class: who takes it under which prefix, then a row a field. own: `own_defaults`."""
     lines = [
         "# Settings\n\nEvery setting is a flag (`--map.cell-m 0.02`) and a key of a TOML file "
-        "(`[map]`, `cell_m = 0.02`) for the commands that take `--config`. Flags go before the file. A "
-        "part's flags begin as its section says: `--map.*` means `--map.cell-m` and so on.\n"
+        "(`[map]`, `cell_m = 0.02`) for the commands that take `--config`. A flag overrides the file. A "
+        "part's flags begin as its section says: `--map.*` means `--map.cell-m` and so on. Where a part's "
+        "default differs, its keys in `measure` follow.\n"
     ]
     for kind, reached in uses.items():
         about = "" if (kind.__doc__ or "").startswith(f"{kind.__name__}(") else inspect.getdoc(kind) or ""
@@ -80,7 +94,8 @@ def settings_page(uses: dict[type, list[tuple[str, str]]]) -> str:
                     f"| `{field.name}` | {linked} | | {said.get(field.name) or _first_line(inner)} |\n"
                 )
                 continue
-            told = f"{type_text(hints[field.name])} | {_default(field)} | {said.get(field.name, '')}"
+            default = "; ".join([_default(field), *own.get((kind, field.name), ())])
+            told = f"{type_text(hints[field.name])} | {default} | {said.get(field.name, '')}"
             lines.append(f"| `{field.name}` | {told} |\n")
     return "".join(lines)
 
