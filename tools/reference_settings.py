@@ -78,8 +78,8 @@ def settings_page(uses: dict[type, list[tuple[str, str]]], own: dict[tuple[type,
     lines = [
         "# Settings\n\nEvery setting is a flag (`--map.cell-m 0.02`) and a key of a TOML file "
         "(`[map]`, `cell_m = 0.02`) for the commands that take `--config`. A flag overrides the file. A "
-        "part's flags begin as its section says: `--map.*` means `--map.cell-m` and so on. Where a part's "
-        "default differs, its keys in `measure` follow.\n"
+        "part's flags begin as its section says: `--map.*` means `--map.cell-m` and so on. Where a part has "
+        "a default of its own, the column *default* names the part.\n"
     ]
     for kind, reached in uses.items():
         about = "" if (kind.__doc__ or "").startswith(f"{kind.__name__}(") else inspect.getdoc(kind) or ""
