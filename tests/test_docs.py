@@ -1,5 +1,6 @@
 """The documents hold: blocks run, commands parse, links lead somewhere, and made pages are current."""
 
+import dataclasses
 import functools
 import importlib.util
 import itertools
@@ -16,8 +17,10 @@ import pytest
 import tyro
 
 from barsight.cli import main
+from barsight.core.records.heights import Agreement
 from barsight.core.settings.file import read_settings
 from barsight.plant.settings import LINKS, read_plant
+from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.magnet.description import Magnet, example_magnet
 from cli_runs import FAST
 
@@ -191,6 +194,12 @@ def test_warnings_are_those_of_the_table(reference: ModuleType) -> None:
     source = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "src").rglob("*.py"))
     raised = set(re.findall(r'Notice\(\s*"([a-z-]+)"', source)) | {"no-overlap"}
     assert raised == set(reference.find("WARNINGS"))
+
+
+@pytest.mark.parametrize("record", [Agreement, Travel], ids=["agreement", "travel"])
+def test_figures_of_result_json_are_described(record: type) -> None:
+    text = (ROOT / "docs" / "reference" / "results.md").read_text(encoding="utf-8")
+    assert [field.name for field in dataclasses.fields(record) if f"`{field.name}`" not in text] == []
 
 
 def test_readme_leads_to_every_command() -> None:
