@@ -67,12 +67,16 @@ def _write_las(cloud: Cloud, path: Path, frame_id: str, *, compress: bool) -> No
         [laspy.ExtraBytesParams("sigma_z", "float32"), laspy.ExtraBytesParams("views", "uint16")]
     )
     header.system_identifier = frame_id or "OTHER"
+    header.global_encoding.wkt = (
+        True  # as LAS requires of this point format, with a reference system or without
+    )
     header.scales = np.full(3, _LAS_STEP_M)
     header.offsets = np.floor(cloud.xyz_m.min(axis=0)).astype(np.float64)
     las = laspy.LasData(header)
     las.x, las.y, las.z = cloud.xyz_m.T.astype(np.float64)
     # LAS requires the full range of 16 bits.
     las.intensity = (cloud.intensity * 257).astype(np.uint16)
+    las.return_number = las.number_of_returns = np.ones(len(las), np.uint8)  # filters drop return 0
     las.sigma_z = cloud.sigma_m
     las.views = cloud.views.astype(np.uint16)
     with path.open("wb") as file:
