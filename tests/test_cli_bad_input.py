@@ -273,7 +273,7 @@ def test_a_disk_that_fills_up_under_numpy(
         raise OSError("4096 requested and 0 written")
 
     monkeypatch.setattr("numpy.save", full)
-    refused(recording, capsys, "could not be written whole", "out")
+    refused(recording, capsys, "could not be written completely", "out")
 
 
 def test_folders_made_for_a_run_that_failed_are_gone(

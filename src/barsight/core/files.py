@@ -266,9 +266,7 @@ def translated_os_errors(target: Path) -> Iterator[None]:
         }.get(error.errno or 0)
         if error.errno is None and "written" in str(error):
             # NumPy's writer says how many items it wrote and drops the system's reason.
-            advice = (
-                "the disk is full or a limit is reached: a file could not be written whole; free some space"
-            )
+            advice = "the disk or a quota is full: a file could not be written completely; free some space"
         if advice is None and _is_temporary(error.filename, target):
             advice = f"nothing can be written there ({error.strerror}); name another folder"
         if advice is None:

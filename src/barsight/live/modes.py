@@ -118,7 +118,7 @@ def _doubts(heard: SensorActivity) -> list[str]:
     """List what revokes lifts whatever the mode: ages, stamps or the encoders' zero can't be told."""
     doubts = []
     if abs(heard.clock_step_s) > MAX_CLOCK_STEP_S:
-        doubts.append(f"the system's clock was stepped by {heard.clock_step_s:.1f} s: ages can't be told")
+        doubts.append(f"the system's clock was stepped by {heard.clock_step_s:.1f} s: ages aren't known")
     if (off_m := float(np.linalg.norm(heard.off_m))) > MAX_OFF_M:
         doubts.append(f"the encoders are {1e3 * off_m:.0f} mm off by cameras and IMU, survey again")
     if heard.restarted:

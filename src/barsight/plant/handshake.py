@@ -118,7 +118,7 @@ def report_executed(store: Store, claim: LiftClaim, load_kg: float | None) -> st
     if load_kg is not None:
         verdict = "confirmed"
         if abs(load_kg - record["mass_kg"]) > LOAD_SIGMAS * record["mass_sigma_kg"]:
-            weighed = f"{load_kg:.0f} kg were weighed, {record['mass_kg']:.0f} kg were told"
+            weighed = f"{load_kg:.0f} kg were weighed, {record['mass_kg']:.0f} kg were stated"
             verdict, alarm = "contradicted", ("load-contradicts", f"lift {claim.lift_id}: {weighed}")
     if "executed" in states_of(store, claim.lift_id):
         return verdict

@@ -129,7 +129,7 @@ def in_order(recordings: Sequence[Recording], settings: MeasureSettings) -> tupl
             raise InputError(group[twin].path, problem, "name each pass once")
         odd = [one for one in group if _hung(one) != hung]
         if odd or (known and known.isdisjoint(pairs)):
-            problem = f"its cameras, or how they hang from the crane, differ from those of {ordered[0].path}"
+            problem = f"its cameras, or their mounting on the crane, differ from those of {ordered[0].path}"
             raise InputError((odd or group)[0].path, problem, "measure passes of one rig and crane together")
         known.update(pairs)
     return tuple(ordered)

@@ -91,7 +91,7 @@ def _pair(left: Picture, right: Picture, rig: Path | StereoRig | None, method: M
         rows, columns = _MIN_SIZE
         size = f"{pair.camera.width}x{pair.camera.height}"
         raise InputError(
-            _name(left), f"is {size}: {columns}x{rows} at least can be matched", "give whole pictures"
+            _name(left), f"is {size}: it must be at least {columns}x{rows}", "give whole pictures"
         )
     offset = vertical_offset(pair.left, pair.right)
     if not isinstance(offset, Failed) and offset > MAX_OFFSET_PX:

@@ -55,7 +55,9 @@ def export(folder: Path, target: Path) -> int:
             raise
         except Exception as error:  # errors of the libraries, if the system refuses to write
             reason = str(error).strip().partition("\n")[0][:200]
-            raise OutputError(f"{target}: could not be written whole ({reason}); free some space") from error
+            raise OutputError(
+                f"{target}: could not be written completely ({reason}); free some space"
+            ) from error
     return cloud.total
 
 

@@ -53,7 +53,7 @@ with extra("store"):
 REASONS: dict[Finding, str] = {
     "gone": "its place was seen, and it is empty or something else lies there",
     "covered": "something lies over its place",
-    "not-found": "something as high lies at its place, but no such bundle was told",
+    "not-found": "something as high lies at its place, but no such bundle was detected",
 }
 
 

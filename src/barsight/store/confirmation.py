@@ -343,7 +343,7 @@ def _stale(connection: Connection, clock_ns: int, set_back_s: float = 0.0) -> di
         elif is_broken:
             reasons[lift.lift_id] = "expired: store-broken: rows of the store were changed outside Barsight"
         elif set_back_s:
-            back = f"this computer's clock was set back by {set_back_s:.0f} s: the age can't be told"
+            back = f"this computer's clock was set back by {set_back_s:.0f} s: ages aren't known"
             reasons[lift.lift_id] = f"expired: map-too-old: {back}"
         elif until_ns is None or until_ns < clock_ns:
             reasons[lift.lift_id] = "expired: map-too-old: it was valid for a limited time"

@@ -113,7 +113,7 @@ def release_recording(opened: Entry, name: str, why: str) -> str:
     number, key = _find(opened.connection, name)
     if recording_state(opened.connection, number) != "kept":
         raise ConfigError(
-            f"{key}: isn't kept, so nothing can be released; barsight store list tells which are"
+            f"{key}: isn't kept, so there is nothing to release; barsight store list shows which are kept"
         )
     step_recording(opened, number, "released", why or None)
     (Path(key) / PROTECTED).unlink(missing_ok=True)
@@ -146,5 +146,5 @@ def _find(connection: Connection, name: str) -> tuple[int, str]:
     ]
     if len(found) != 1:
         problem = "names several recordings" if found else "is no recording that the store knows"
-        raise ConfigError(f"{name}: {problem}; barsight store list tells them")
+        raise ConfigError(f"{name}: {problem}; barsight store list shows them")
     return found[0].id, found[0].key

@@ -122,7 +122,7 @@ def _mean_touch_m(
         by_artefact.setdefault(touched.get(name, name), []).append(error)
     if len(by_artefact) < MIN_ARTEFACTS:
         problem = f"its touch-downs that tell {axis} are on {len(by_artefact)} artefacts, {MIN_ARTEFACTS} are"
-        remedy = "touch several spheres or dummy bundles; a plate tells z only"
+        remedy = "touch several spheres or dummy bundles; a plate shows z only"
         raise InputError(certificate, f"{problem} the least", remedy)
     errors = np.array(list(errors_m.values()))
     _expect_alike(certificate, axis, list(errors_m), errors, own_m)

@@ -75,7 +75,7 @@ def run(arguments: Sequence[str]) -> None:
         if left_out:
             raise InputError(
                 archive, f"{len(left_out)} recordings are left out of the plan, the others are in it",
-                "mend those above and plan again",
+                "repair those named above and plan again",
             )  # fmt: skip
 
     call(command, "fleet plan", arguments)

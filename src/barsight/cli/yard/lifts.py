@@ -234,7 +234,7 @@ def _offset(magnet: Magnet) -> str:
         return "the magnet's offset is not calibrated, so its tolerance must cover it (calibrate magnet)"
     figures = zip("xyz", magnet.offset.place_m, magnet.offset.sigma_m, strict=True)
     offsets = ", ".join(f"{axis} {1e3 * off:+.1f} ± {1e3 * sigma:.1f}" for axis, off, sigma in figures)
-    return f"the magnet hangs off the crane's readings by {offsets} mm; crane_target has that taken off"
+    return f"the magnet is off the crane's readings by {offsets} mm; crane_target is corrected for this"
 
 
 def print_lifts(plan: LiftPlan, console: Console) -> None:

@@ -122,7 +122,7 @@ def serving(url: str, options: ServeOptions) -> Iterator[str]:
             try:
                 while not server.started:
                     if not thread.is_alive():
-                        raise OutputError("the server did not start; its reason stands above")
+                        raise OutputError("the server did not start; the lines above say why")
                     time.sleep(0.01)
                 yield f"{'https' if options.certificate else 'http'}://{_shown(options.host)}:{port}"
             finally:
