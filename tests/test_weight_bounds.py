@@ -43,3 +43,15 @@ def test_a_mass_does_not_fall_with_the_size_of_the_cells(
     true_m2 = one.bars * np.pi / 4 * one.diameter_m**2
     assert section_m2 - UPPER * sigma_m2 < true_m2 < 1.005 * (section_m2 + UPPER * sigma_m2)
     assert one.length_m - 0.06 < told.length_m < one.length_m + 0.02
+
+
+@pytest.mark.parametrize(("diameter_m", "yaw_deg", "seed"), [(0.08, 1.3, 1), (0.12, 0.4, 0)])
+def test_one_bar_that_was_read_as_many_thin_ones_may_be_solid(
+    diameter_m: float, yaw_deg: float, seed: int
+) -> None:
+    """A pack of thin bars as wide has 16 % less steel; at most as much was stated."""
+    one = laid(0.0, diameter_m / 2 + 0.05, diameter_m=diameter_m, bars=1, yaw_deg=yaw_deg)
+    (told,) = find_bundles(map_of([one], seed=seed), BundleSettings())
+    section_m2, sigma_m2 = bundle_section(told)
+    assert told.bar_diameter_m < 0.03
+    assert np.pi / 4 * diameter_m**2 < section_m2 + UPPER * sigma_m2

@@ -101,8 +101,9 @@ def make_bundle(
     reasons = doubt + list_wall_doubts(reading, seen, top_z, floor_m)
     reasons += list_doubts(reading, rows, ends, settings)
     section, section_sigma = estimate_section(
-        seen, fit, top_z, floor_m, is_along_baseline=reading.is_along_baseline
-    )
+        seen, fit, top_z, floor_m, is_along_baseline=reading.is_along_baseline,
+        shows_bars=reading.found.shades is not None,
+    )  # fmt: skip
     own = _sigma(reading.found, ends, top, settings)
     bundle = Bundle(
         id=0,

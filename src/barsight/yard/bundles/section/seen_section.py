@@ -71,6 +71,8 @@ _SEEN_WIDTH_SIGMA_M, _SEEN_WIDTH_CELLS, _OUTLINE_RATIO = 0.0113, 6**-0.5, 0.5
 """Errors of the seen width: a constant standard deviation (m), the rounding of both sides to whole cells, and
 a fraction of its difference from the outline's width.
 """
+_FINE_SIGMA_M = 0.012
+"""Standard deviation (m) of the seen width with cells of 10 mm, which a map's growth outweighs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,9 +104,8 @@ def seen_section(one: FittedOutline, others: list[FittedOutline], smoothing_m: f
     middle = int(crest[0] + np.argmax(np.nan_to_num(level[crest[0] : crest[1] + 1], nan=-np.inf)))
     deep_m = _GULLY_RATIO * float(fit.values[DIAMETER])
     others_begin = _is_neighbour(one, beside, others)
-    resolved = fit.rings > 0 and fit.values[DIAMETER] > _PARTED_DIAMETER_M
     parted_m = np.inf
-    if resolved:
+    if is_resolved(fit):
         parted_m = max(_PARTED_RATIO * fit.width_m, _PARTED_BARS * float(fit.values[DIAMETER]))
     lowest_m = float(level[middle]) - MAX_HEIGHT_RATIO * (_MAX_PIECE_RATIO * fit.width_m + _WIDER_M)
     limits = deep_m, parted_m, lowest_m, round(_HIDDEN_M / grid.cell_m)
@@ -178,12 +179,13 @@ def estimate_section(
     floor_m: float | None,
     *,
     is_along_baseline: bool = False,
+    shows_bars: bool = False,
 ) -> tuple[float, float]:
     """Estimate the steel section of a bundle whose bars can't be counted, and its sigma (m2); NaN where its
     sides weren't seen, or where the visible part isn't the outline's section.
 
-    What looks like one bar may be one: the section's upper bound is then no less than that of a solid bar as
-    wide as the map shows it.
+    What looks like one bar, or like bars too thin to show, may be one bar: the section's upper bound is then
+    no less than that of a solid bar as wide as the map may show it, unless the photo shows the bars.
     """
     if seen is None or not seen.sides_seen:
         return np.nan, np.nan
@@ -194,10 +196,16 @@ def estimate_section(
     bulge_m = bulge_sigma(seen.hidden_m, seen.width_m, is_along_baseline=is_along_baseline)
     sigma_m = math.hypot(seen.width_sigma_m, off_m, bulge_m)
     section, sigma = section_of_pack(seen.width_m, sigma_m, over_floor(top_m, floor_m), fill)
-    if fit.rings:
+    if shows_bars or is_resolved(fit):
         return section, sigma
-    solid = math.pi / 4 * max(fit.width_m, seen.width_m + _GROWTH_M) ** 2
+    rounded_m = UPPER * (seen.width_sigma_m - _FINE_SIGMA_M)
+    solid = math.pi / 4 * (max(fit.width_m, seen.width_m + _GROWTH_M) + rounded_m) ** 2
     return section, max(sigma, (solid - section) / UPPER)
+
+
+def is_resolved(fit: Fit) -> bool:
+    """Check whether an outline has several bars, thick enough for the map to show their shape."""
+    return fit.rings > 0 and bool(fit.values[DIAMETER] > _PARTED_DIAMETER_M)
 
 
 def section_of_pack(
