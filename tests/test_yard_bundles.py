@@ -17,7 +17,7 @@ from barsight.yard.bundles import detection
 from barsight.yard.bundles.bundle_kinds import listed_diameter
 from barsight.yard.bundles.collinear_pieces import join_pieces
 from barsight.yard.bundles.detection import _on, find_bundles
-from barsight.yard.bundles.doubts import measure_laid, straight_sections
+from barsight.yard.bundles.doubts import straighten
 from barsight.yard.bundles.fitting.ends import middle_and_length_sigma
 from barsight.yard.bundles.fitting.outline import TRIANGLE, bundle_width
 from barsight.yard.bundles.fitting.outline_fit import AGREES, Fit, FittedOutline, compare_halves
@@ -28,6 +28,7 @@ from barsight.yard.bundles.headings import find_headings
 from barsight.yard.bundles.layers import list_overlaps
 from barsight.yard.bundles.reading import Reading
 from barsight.yard.bundles.section.flanks import Flanks
+from barsight.yard.bundles.section.laid_objects import measure_laid
 from barsight.yard.bundles.section.seen_section import (
     SeenSection,
     _edge,
@@ -361,7 +362,7 @@ def test_dunnage_that_shows_in_a_gully_lies_beside_the_bundle(
     sunken = (u > sunk_from_m) & (u < sunk_from_m + 0.045)
     z = np.where(sunken, own_m, 0.24) + np.zeros((200, 1))
     z[(np.abs(v) < 0.05)[:, None] & sunken[None]] = top_m
-    laid = measure_laid(straight_sections(_reading_of(z, 0.24, pack_only=pack_only)))
+    laid = measure_laid(straighten(_reading_of(z, 0.24, pack_only=pack_only)))
     assert laid == (pytest.approx(laid_m), laid_m > 0)
 
 
@@ -372,7 +373,7 @@ def test_a_bow_is_not_another_thing(aside_m: float, over_m: float) -> None:
     bow = aside_m * v[:, None] ** 2
     z = 0.24 - 2.5 * np.maximum(np.abs(np.round(u - bow, 2)) - 0.06, 0.0)
     z[80:90, 10:18] += over_m
-    laid, is_clear = measure_laid(straight_sections(_reading_of(z, 0.24)))
+    laid, is_clear = measure_laid(straighten(_reading_of(z, 0.24)))
     assert laid < over_m + 0.026 and is_clear is (over_m > 0)
 
 
@@ -383,11 +384,11 @@ def test_a_bar_beside_a_flank_is_not_taken_for_a_bow(length: int) -> None:
     z = np.tile(0.24 - np.maximum(np.abs(u) - 0.06, 0.0), (200, 1))
     z[80 : 80 + length] = 0.24 - np.maximum(np.abs(u) - 0.1, 0.0)
     z[:, u < -0.06] = np.nan
-    assert measure_laid(straight_sections(_reading_of(z, 0.24))) == (pytest.approx(0.04), True)
+    assert measure_laid(straighten(_reading_of(z, 0.24))) == (pytest.approx(0.04), True)
 
 
 def test_nothing_is_known_to_lie_on_a_bundle_without_rows() -> None:
-    assert measure_laid(straight_sections(_reading_of(np.full((10, 25), 0.24), 0.24))) == (0.0, False)
+    assert measure_laid(straighten(_reading_of(np.full((10, 25), 0.24), 0.24))) == (0.0, False)
 
 
 def test_a_flank_that_ends_early_is_not_clearly_another_thing() -> None:
@@ -395,7 +396,7 @@ def test_a_flank_that_ends_early_is_not_clearly_another_thing() -> None:
     u = 0.01 * np.arange(25) - 0.12
     z = np.tile(0.24 - 2.5 * np.maximum(np.abs(u) - 0.06, 0.0), (200, 1))
     z[80:86] = 0.24 - 2.5 * np.maximum(np.abs(u) - 0.07, 0.0)
-    assert measure_laid(straight_sections(_reading_of(z, 0.24))) == (pytest.approx(0.025), False)
+    assert measure_laid(straighten(_reading_of(z, 0.24))) == (pytest.approx(0.025), False)
 
 
 @pytest.mark.parametrize(("lost", "is_found"), [(0, True), (2, True), (6, False)])
@@ -407,7 +408,7 @@ def test_what_lies_on_a_bundle_is_found_though_matching_loses_its_edge(lost: int
     z[80:86, 20:] += 0.06
     for row in range(80, 86):
         z[row, 20 + row % 2 : 20 + lost] = np.nan
-    assert (measure_laid(straight_sections(_reading_of(z, 0.24)))[0] > 0) is is_found
+    assert (measure_laid(straighten(_reading_of(z, 0.24)))[0] > 0) is is_found
 
 
 def test_outlines_that_overlap_leave_open_which_bundle_lies_over_the_other() -> None:
@@ -532,22 +533,6 @@ def test_a_bar_along_a_bundle_five_times_as_wide_lies_on_it() -> None:
     bar = Laid(0.7, 0.0, laid.top_z_m + 0.033, 0.0, bars=1, length_m=2.0)
     found = find_bundles(draw([laid, bar]), SETTINGS)
     assert nearest(found, laid).on_top is False and nearest(found, bar).on_top
-
-
-@pytest.mark.parametrize(("bar_m", "is_told"), [(0.04, True), (0.05, True), (None, False)])
-def test_a_bar_that_lies_along_on_a_bundle_covers_it(bar_m: float | None, *, is_told: bool) -> None:
-    """It lies in the groove between two of four bars of 32 mm. Neither width nor top tells."""
-    below = Laid(0.0, 0.0, 0.2, 0.0, 0.032, 37, roll_deg=0.0)
-    stock = [below]
-    if bar_m is not None:
-        rise = np.sqrt(((bar_m + 0.032) / 2) ** 2 - 0.016**2)
-        axis_z_m = below.z_m + below.axes_m[:, 1].max() + rise
-        stock.append(Laid(0.0, 0.0, axis_z_m, 0.0, bar_m, 1))
-    heights = draw(stock, x_m=(-0.6, 0.6), sigma_m=0.002)
-    (found,) = find_bundles(heights, SETTINGS)
-    said = [doubt.sentence for doubt in found.cover_doubts]
-    assert any("lies along on it" in sentence for sentence in said) is is_told
-    assert bool(said) is is_told
 
 
 def test_a_bundle_of_the_next_row_is_no_neighbour_at_a_flank() -> None:

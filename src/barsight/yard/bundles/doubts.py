@@ -5,14 +5,20 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from barsight.core.arrays import Bool, Float64, Int64, UInt8
-from barsight.core.linalg.robust import known_median
+from barsight.core.arrays import Bool, UInt8
 from barsight.yard.bundles.crossing_bundles import rise_over
 from barsight.yard.bundles.fitting.ends import End, gap_rows, lost_rows
 from barsight.yard.bundles.fitting.outline import BARS_OF_RINGS, bundle_width
-from barsight.yard.bundles.fitting.outline_fit import ABOVE, AGREES, BELOW, DIAMETER, SLOPE_U, SLOPE_Z, U, Z
+from barsight.yard.bundles.fitting.outline_fit import ABOVE, AGREES, BELOW, DIAMETER, SLOPE_U, U, Z
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.reading import Reading
+from barsight.yard.bundles.section.laid_objects import (
+    StraightSections,
+    look_up,
+    measure_along,
+    measure_laid,
+    straight_sections,
+)
 from barsight.yard.bundles.section.seen_section import (
     MAX_HEIGHT_RATIO,
     SeenSection,
@@ -28,27 +34,14 @@ _LIES_M, _ONE_PLACE_M = 0.02, 0.3
 """Minimum rise over a bundle of an object that lies across it; maximum gap between runs of rows that belong
 to one object. Dunnage comes in twos or more. Both in m.
 """
-_LAID_M, _LAID_SIZE_M = 0.02, (0.04, 0.03)
-"""Minimum rise of an object that lies over a part of a bundle's width, and its size along and across (m)."""
-_ALONG_M = 0.012
-"""Minimum rise of a bundle's own section over its outline's top from which something lies along on it. On
-drawn yards 98 % of uncovered bundles rise by less than 8 mm.
+_ALONG_M, _BARE_M = 0.012, 0.004
+"""Minimum rises (m) from which something lies along on a bundle: over the fitted outline's top or over other
+parts of the bundle, by which no free bundle of measured yards rises by more than 10 mm; and of a crest that
+no strap crosses.
 """
 _UNSEEN_M, _CREST_RATIO = 0.1, 0.4
 """Minimum size (m) of an unseen place over a bundle that may hide what lies there; maximum distance of such
 places from the middle, in widths: matching loses the steep flanks beyond.
-"""
-_MIN_SEEN_RATIO = 0.75
-"""Minimum share of such an object's places that is measured: matching loses places along its edges."""
-_MAX_BOW_CELLS, _BOW_COST_M, _BOW_STEP = 8, 2e-4, 4
-"""Range of a bundle's bow, in cells between its middle and its ends; cost of each, m of mean misfit; step of
-the rows by which it is found.
-"""
-_MAX_MISFIT_M = 0.03
-"""Misfit (m) from which a place tells nothing of the shift: something lies there."""
-_GULLY_RATIO = 0.3
-"""Minimum depth, in widths, of the surface at a bundle's rim under its axis from which it isn't the bundle's.
-The rim of an upright triangle of bars lies 0.22 under its axis, that of one turned by 25 degrees 0.24.
 """
 _MAX_DUNNAGE_M = 0.15
 """Maximum height (m) of the dunnage under a bundle."""
@@ -60,7 +53,6 @@ _STUB_M, _HIDES_M, _MIN_LOST_M = 0.3, 0.05, 0.015
 """Lengths (m) along a bundle: that of what is too short to be another one at its end; maximum distance from
 what lies across it of the rows that this hides; minimum of a gap between two bundles.
 """
-StraightSections = tuple[Float64, float, float, float]
 _SURE_KNOWN = 0.7
 """Minimum share of a bundle's length that must have been measured; below it, the bundle gets a doubt."""
 
@@ -207,7 +199,7 @@ def _shows_carrier(reading: Reading, width_m: float) -> bool:
 def list_cover_doubts(reading: Reading, reasons: tuple[Doubt, ...]) -> tuple[Doubt, ...]:
     """List the objects that may hold the bundle down although no other bundle is known to lie on it."""
     out = [doubt for doubt in reasons if doubt.kind is DoubtKind.CROSSED]
-    sections = straight_sections(reading)
+    sections = straighten(reading)
     laid, is_clear = measure_laid(sections)
     if is_clear:
         said = f"something {1e3 * laid:.0f} mm high lies over a part of its width"
@@ -216,8 +208,10 @@ def list_cover_doubts(reading: Reading, reasons: tuple[Doubt, ...]) -> tuple[Dou
         said = f"something {1e3 * laid:.0f} mm high beside it may lie over its flank"
         out.append(Doubt(DoubtKind.HIDDEN_FLANK, said))
     if (along := measure_along(sections)) > _ALONG_M:
-        said = f"something {1e3 * along:.0f} mm over its outline lies along on it"
+        said = f"something {1e3 * along:.0f} mm over its outline, or over its other parts, lies along on it"
         out.append(Doubt(DoubtKind.OTHER, said))
+    if reading.pack is not None and reading.pack.bare_m > _BARE_M:
+        out.append(Doubt(DoubtKind.OTHER, "no strap crosses its crest: something lies along on its straps"))
     if reading.flanks is not None and reading.flanks.cover_doubt:
         out.append(reading.flanks.cover_doubt)
     if unseen := _unseen_length(reading):
@@ -231,95 +225,27 @@ def _unseen_length(reading: Reading) -> float:
     grid, fit, (low, high) = reading.found.grid, reading.found.fit, _bounds(reading)
     rim, inset = round(_BEFORE_END_M / grid.cell_m), (0.5 - _CREST_RATIO) * (high - low)
     rows = np.arange(fit.first + rim, fit.last + 1 - rim)
-    unseen = np.isnan(_sections(reading, rows, np.arange(low + inset, high - inset, grid.cell_m)))
+    unseen = np.isnan(look_up(grid, fit, rows, np.arange(low + inset, high - inset, grid.cell_m)))
     side = round(_UNSEEN_M / grid.cell_m)
     wide = ndimage.binary_opening(unseen, np.ones((side, min(side, unseen.shape[1])), bool))
     return float(grid.cell_m * wide.any(axis=1).sum())
+
+
+def straighten(reading: Reading) -> StraightSections | None:
+    """Straighten the sections of a bundle between its flanks; None where it is too short."""
+    grid, fit, pack = reading.found.grid, reading.found.fit, reading.pack
+    axis_z_m = float(fit.values[Z])
+    if pack is not None and pack.is_bounded:
+        axis_z_m += pack.top_m - pack.width_m / 2
+    rim = round(_BEFORE_END_M / grid.cell_m)
+    rows = np.arange(fit.first + rim, fit.last + 1 - rim)
+    return straight_sections(grid, fit, rows, _bounds(reading), axis_z_m) if rows.size > 1 else None
 
 
 def _bounds(reading: Reading) -> tuple[float, float]:
     """Return the flanks (m) beside the axis: those of the pack where its bounds are known."""
     half, pack = reading.found.fit.width_m / 2, reading.pack
     return (-half, half) if pack is None or not pack.is_bounded else (pack.low_m, pack.high_m)
-
-
-def measure_laid(sections: StraightSections | None) -> tuple[float, bool]:
-    """Measure the rise (m) of the highest object that lies over a part of a bundle's width, as a beam's end
-    does, 0 where there is none. Also return whether any object rises by _LAID_M over the section even if
-    the section is shifted sideways by a cell.
-
-    Rises are measured over the bundle's own section: the median along it at each place across. An object is a
-    patch that everywhere holds a rectangle of _LAID_SIZE_M and rises by _LAID_M. An object no higher than the
-    axis, where a gully shows at the rim, lies beside the bundle, as dunnage does. A steep flank that is off
-    by a cell rises as much; an object on a bundle rests on its crest and rises over the shifted section too.
-    """
-    if sections is None:
-        return 0.0, False
-    z, axis_z_m, width_m, cell_m = sections
-    own = known_median(z)
-    sunken = (own < axis_z_m - _GULLY_RATIO * width_m)[0]
-    gully = np.logical_and.accumulate(sunken) | np.logical_and.accumulate(sunken[::-1])[::-1]
-    rises = np.isfinite(z) & ~(gully & (z < axis_z_m)) & (z - own > _LAID_M)
-    size = [max(round(side / cell_m), 1) for side in _LAID_SIZE_M]
-    square = np.ones(size, bool)
-    seen = ndimage.uniform_filter(rises.astype(np.float64), size, mode="constant")
-    fits = ndimage.binary_erosion(rises | np.isnan(z), square) & (seen > _MIN_SEEN_RATIO - 1e-6)
-    laid = ndimage.binary_dilation(fits, square) & rises
-    highest = ndimage.maximum_filter(np.where(np.isfinite(own), own, -np.inf), (1, 3))
-    return float((z - own)[laid].max(initial=0.0)), bool((z - highest > _LAID_M)[laid].any())
-
-
-def measure_along(sections: StraightSections | None) -> float:
-    """Measure the rise (m) of a bundle's own section, the median along it, over its outline's top: a bar that
-    lies along on it rises so all the way. Negative where it is lower, 0 where it isn't known.
-    """
-    if sections is None:
-        return 0.0
-    z, axis_z_m, width_m, cell_m = sections
-    own = known_median(z)[0]
-    cells = max(round(_LAID_SIZE_M[1] / cell_m), 1)
-    ridge = ndimage.minimum_filter1d(np.where(np.isfinite(own), own, -np.inf), cells)
-    return float(ridge.max()) - axis_z_m - width_m / 2 if np.isfinite(ridge).any() else 0.0
-
-
-def straight_sections(reading: Reading) -> StraightSections | None:
-    """Look up the heights (R, C) of a bundle's rows from flank to flank, less the rise along its axis, NaN
-    where unknown; the height of its axis, its width and the cells' size. None where it is too short. The rows
-    of a bowed bundle are shifted sideways into line.
-
-    The bow is the parabola b (x^2 - 1/3), x from -1 to 1 along the bundle, that brings all rows closest to
-    their median section: the fitted axis is the mean of such a bundle.
-    """
-    grid, fit, pack = reading.found.grid, reading.found.fit, reading.pack
-    if fit.last - fit.first < 2 * _BEFORE_END_M / grid.cell_m + 1:
-        return None
-    (low_m, high_m), axis_z_m = _bounds(reading), float(fit.values[Z])
-    if pack is not None and pack.is_bounded:
-        axis_z_m += pack.top_m - pack.width_m / 2
-    rim = round(_BEFORE_END_M / grid.cell_m)
-    rows = np.arange(fit.first + rim, fit.last + 1 - rim)
-    beside = np.arange(low_m, high_m + grid.cell_m / 2, grid.cell_m)
-    parabola = grid.cell_m * (np.linspace(-1, 1, len(rows)) ** 2 - 1 / 3)[:, None]
-    best, least = 0, np.inf
-    for bow in sorted(range(-_MAX_BOW_CELLS, _MAX_BOW_CELLS + 1), key=abs):
-        z = _sections(reading, rows[::_BOW_STEP], beside + bow * parabola[::_BOW_STEP])
-        misfit = np.minimum(np.abs(z - known_median(z)), _MAX_MISFIT_M)
-        cost = float(np.nanmean(misfit)) + _BOW_COST_M * abs(bow) if np.isfinite(misfit).any() else np.inf
-        if cost < least:
-            best, least = bow, cost
-    return _sections(reading, rows, beside + best * parabola), axis_z_m, high_m - low_m, grid.cell_m
-
-
-def _sections(reading: Reading, rows: Int64, beside: Float64) -> Float64:
-    """Look up the heights (R, C) of a bundle's rows at places beside its axis, (C,) or (R, C), less the rise
-    along it; NaN where unknown.
-    """
-    grid, fit = reading.found.grid, reading.found.fit
-    along = grid.v0_m + grid.cell_m * rows[:, None] - fit.v_m
-    column = np.rint((fit.values[U] + fit.values[SLOPE_U] * along + beside - grid.u0_m) / grid.cell_m)
-    inside = (column >= 0) & (column < grid.z_m.shape[1])
-    z = grid.z_m[rows[:, None], np.where(inside, column, 0).astype(np.int64)]
-    return np.where(inside, z - fit.values[SLOPE_Z] * along, np.nan)
 
 
 def rate_confidence(reading: Reading, rows: UInt8) -> float:

@@ -21,7 +21,7 @@ from barsight.yard.bundles.section.pack_sides import (
 )
 from barsight.yard.bundles.section.seen_section import agreeing_rows, mean_section
 from barsight.yard.bundles.section.strap_lines import FLOOR_M
-from barsight.yard.bundles.section.straps import MIN_ROWS, REACH_M, StrapSpan, strap_spans
+from barsight.yard.bundles.section.straps import MIN_ROWS, REACH_M, StrapSpan, bare_rise, strap_spans
 from barsight.yard.lift_settings import UPPER
 from barsight.yard.types import HeightMap
 
@@ -46,7 +46,7 @@ class Pack:
     span: width of the straps themselves; others_m: where other bundles' straps begin on either side, infinite
     where there are none. top_m: highest place over the axis; sides: the low and the high one. diameter_m: of
     its bars by the dark lines along it, NaN where these aren't seen. hidden_m: length out of sight behind the
-    low and the high flank, where bars may bulge.
+    low and the high flank, where bars may bulge. bare_m: rise of a crest that no strap crosses.
     """
 
     low_m: float
@@ -57,6 +57,7 @@ class Pack:
     sides: tuple[PackSide, PackSide]
     diameter_m: float = math.nan
     hidden_m: tuple[float, float] = (0.0, 0.0)
+    bare_m: float = 0.0
 
     @property
     def sides_seen(self) -> bool:
@@ -92,8 +93,11 @@ def strapped_pack(height_map: HeightMap, grid: AlignedMap, fit: Fit) -> Pack | N
     own = spans[number]
     thick = bar_diameter(height_map, grid, fit, own.low_m, own.high_m)
     pack = find_pack(spans, number, beside, level, thick * (1 + UPPER * SAME_DIAMETER_RATIO))
-    if pack is None or not pack.is_bounded:
-        return pack and replace(pack, diameter_m=thick)
+    if pack is None:
+        return None
+    pack = replace(pack, bare_m=bare_rise(height_map, grid, fit, own, level))
+    if not pack.is_bounded:
+        return replace(pack, diameter_m=thick)
     pack = replace(pack, diameter_m=bar_diameter(height_map, grid, fit, pack.low_m, pack.high_m))
     # Straps hold several bars: where no dark line shows, the visible one may be the top one of several.
     one_bar = fit.rings == 0 and math.isnan(pack.diameter_m)

@@ -43,7 +43,7 @@ def line_contrast(gray: Float32, cell_m: float) -> Float64:
 
     Lines may be off by a cell from bar to bar.
     """
-    beyond = np.minimum(np.abs(_level_along(gray, cell_m)), _CLIPPED) - _NOISE
+    beyond = np.minimum(np.abs(level_along(gray, cell_m)), _CLIPPED) - _NOISE
     lines: Float64 = ndimage.maximum_filter1d(ndimage.uniform_filter1d(beyond, 3, axis=0), 3, axis=0)
     return lines
 
@@ -56,7 +56,7 @@ def faint_lines(gray: Float32, stock: Bool, cell_m: float) -> tuple[Float64, Flo
     On rough or rusty bars a strap is fainter than the bar's own spots, but it is darker or brighter at the
     same place on all bars. stock: where bars lie.
     """
-    level = np.clip(_level_along(gray, cell_m), -_SPOT, _SPOT)
+    level = np.clip(level_along(gray, cell_m), -_SPOT, _SPOT)
     level = ndimage.uniform_filter1d(np.where(stock, level, 0.0), 3, axis=0)
     pool = round(_POOL_M / cell_m) | 1
     scatter = mad_sigma(ndimage.uniform_filter1d(level, pool, axis=1), axis=0)
@@ -70,7 +70,7 @@ def pooled_contrast(level: Float64, variance: Float64, cell_m: float) -> Float64
     return np.asarray(np.abs(mean) / np.sqrt(variance / pool), np.float64)
 
 
-def _level_along(gray: Float32, cell_m: float) -> Float64:
+def level_along(gray: Float32, cell_m: float) -> Float64:
     """Compute the log gray levels (rows, places) minus their running median along the bar, divided by the
     bar's own scatter; NaN counts as the bar's median.
     """

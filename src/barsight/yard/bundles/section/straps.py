@@ -13,12 +13,14 @@ import numpy as np
 from scipy import ndimage
 
 from barsight.core.arrays import Bool, Float32, Float64, Int64, kernel
+from barsight.core.linalg.robust import known_median
 from barsight.yard.bundles.fitting.outline_fit import ABOVE, BELOW, MIXED, SLOPE_U, Fit, U
 from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 from barsight.yard.bundles.section.strap_lines import (
     faint_lines,
     find_cliffs,
     find_gullies,
+    level_along,
     line_contrast,
     pooled_contrast,
     split_columns,
@@ -53,6 +55,15 @@ _SHOWN_RATIO = 0.9
 """Minimum share of a bundle in the photo for missing straps to count as evidence."""
 APART_M = 0.3
 """Minimum spacing (m) of two straps: lines closer together along the bars are one strap."""
+
+_BARE, _SHOWN, _STRAP, _SURE_STRAPS = 0.35, 0.5, 1.0, 3
+"""Maximum contrast of a strap, in its median over its bundle, where it isn't seen, and minimum one where it
+is; minimum median in units of the noise, and number of straps that reach it.
+"""
+_INSIDE_M, _BESIDE_M = 0.02, 0.04
+"""Minimum distance (m) from the straps' ends of a crest without straps, and maximum distance (m) beside it
+within which they show again.
+"""
 
 
 @dataclass(frozen=True)
@@ -138,6 +149,52 @@ def _span(
     along = tuple(_row_at_ends(own, row, cell_m) for row in np.sort(rows).tolist())
     spread = float(np.median(np.abs(ends - (low, high)), axis=0).max())
     return StrapSpan(float(across[0]), float(across[1]), along, cell_m * spread)
+
+
+def bare_rise(height_map: HeightMap, grid: AlignedMap, fit: Fit, span: StrapSpan, level_m: Float64) -> float:
+    """Measure the rise (m) of the highest crest that straps don't cross, though they show on both sides of
+    it, over the surface there: a bar that lies along on them. 0 where there is none.
+
+    level_m: mean heights over the axis, at the places within REACH_M.
+    """
+    shown, own = _shown_shares(height_map, grid, fit, span)
+    height = np.where(np.isfinite(level_m), level_m, np.nan)[own]
+    inside, beside = (round(reach / grid.cell_m) for reach in (_INSIDE_M, _BESIDE_M))
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], shown < _BARE, [False]]).astype(int)))
+    highest = 0.0
+    for first, end in edges.reshape(-1, 2):
+        if first < inside or end > own.size - inside:
+            continue
+        low, high = height[max(first - beside, 0) : first], height[end : end + beside]
+        low = low[shown[max(first - beside, 0) : first] > _SHOWN][-1:]
+        high = high[shown[end : end + beside] > _SHOWN][:1]
+        if low.size and high.size:
+            rise = float(np.nan_to_num(height[first:end], nan=-np.inf).max() - max(low[0], high[0]))
+            highest = max(highest, rise)
+    return highest
+
+
+def _shown_shares(
+    height_map: HeightMap, grid: AlignedMap, fit: Fit, span: StrapSpan
+) -> tuple[Float64, Int64]:
+    """Compute how clearly straps show at each place that they span (N,), the median over the straps of their
+    contrast in their own medians; 0 where there are too few. Also return the places' indices.
+    """
+    beside, gray, _, stock = _around(height_map, grid, fit)
+    own = np.flatnonzero((beside >= span.low_m) & (beside <= span.high_m))
+    level = ndimage.uniform_filter1d(level_along(gray, grid.cell_m), 3, axis=0)
+    level[~stock] = np.nan
+    shares = []
+    for low, high in span.rows_m:
+        rows = np.rint(np.linspace(low, high, own.size) / grid.cell_m).astype(np.int64)
+        lines = np.array([level[(rows + k).clip(0, len(level) - 1), own] for k in (-1, 0, 1)])
+        middles = np.nan_to_num(known_median(lines.T)[0])
+        best = int(np.abs(middles).argmax())
+        if abs(middles[best]) > _STRAP:
+            shares.append(lines[best] / middles[best])
+    if len(shares) < _SURE_STRAPS:
+        return np.zeros(own.size), own
+    return known_median(np.array(shares))[0], own
 
 
 def is_photographed(height_map: HeightMap, grid: AlignedMap, fit: Fit) -> bool:

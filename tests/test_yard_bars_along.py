@@ -1,0 +1,70 @@
+"""Bars that lie along on a bundle, in maps drawn from known geometry."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from barsight.yard.bundles.detection import find_bundles
+from barsight.yard.bundles.fitting.settings import BundleSettings
+from barsight.yard.bundles.section.laid_objects import StraightSections, measure_along
+from barsight.yard.types import Bundle
+from yard_maps import Laid, draw, photographed
+
+SETTINGS = BundleSettings()
+BELOW = Laid(0.0, 0.0, 0.2, 0.0, 0.032, 37, roll_deg=0.0)
+
+
+def in_groove(bar_m: float, length_m: float = 3.0, y_m: float = 0.0) -> Laid:
+    """A bar in the groove between the two middle ones of the topmost four."""
+    rise = np.sqrt(((bar_m + BELOW.diameter_m) / 2) ** 2 - (BELOW.diameter_m / 2) ** 2)
+    axis_z_m = BELOW.z_m + BELOW.axes_m[:, 1].max() + rise
+    return Laid(0.0, y_m, axis_z_m, 0.0, bar_m, 1, length_m=length_m)
+
+
+def said(bundle: Bundle) -> list[str]:
+    return [doubt.sentence for doubt in bundle.cover_doubts]
+
+
+@pytest.mark.parametrize(("bar_m", "is_told"), [(0.04, True), (0.05, True), (None, False)])
+def test_a_bar_that_lies_along_on_a_bundle_covers_it(bar_m: float | None, *, is_told: bool) -> None:
+    """Neither width nor top tells."""
+    stock = [BELOW] if bar_m is None else [BELOW, in_groove(bar_m)]
+    (found,) = find_bundles(draw(stock, x_m=(-0.6, 0.6), sigma_m=0.002), SETTINGS)
+    assert any("lies along on it" in sentence for sentence in said(found)) is is_told
+    assert bool(said(found)) is is_told
+
+
+@pytest.mark.parametrize("part", [0.3, 0.5, 0.7])
+def test_a_bar_along_on_a_part_of_a_bundle_is_higher_than_the_rest(part: float) -> None:
+    """It rises by 15 to 20 mm. Half as long as the bundle, it is in the median along it."""
+    bar = in_groove(0.025, 3 * part, 1.5 * (1 - part))
+    found = find_bundles(draw([BELOW, bar], x_m=(-0.6, 0.6), sigma_m=0.002), SETTINGS)
+    (below,) = [one for one in found if one.width_m > 0.15]
+    assert any("lies along on it" in sentence for sentence in said(below)) and not below.is_free
+
+
+def test_a_ridge_over_the_fitted_outline_lies_along_whatever_the_straps_bound() -> None:
+    """A pack's top, which straps bound, holds the bar."""
+    beside = 0.01 * np.arange(25) - 0.12
+    z = np.tile(np.where(np.abs(beside) < 0.025, 0.27, 0.24), (200, 1))
+    assert measure_along(StraightSections(z, 0.15, 0.24, 0.24, 0.01)) == pytest.approx(0.03)
+    assert measure_along(StraightSections(z, 0.15, 0.27, 0.24, 0.01)) == 0.0
+
+
+@pytest.mark.parametrize("is_bare", [True, False])
+def test_no_strap_crosses_a_bar_that_lies_along(*, is_bare: bool) -> None:
+    """The bar is as long as the bundle, and no higher than a map's smoothing leaves open."""
+    bar = in_groove(0.032)
+    heights = photographed(draw([BELOW, bar], x_m=(-0.6, 0.6), sigma_m=0.002), [BELOW, bar])
+    assert heights.gray is not None
+    x = heights.x0_m + heights.cell_m * np.arange(heights.z_m.shape[1])
+    y = heights.y0_m + heights.cell_m * np.arange(heights.z_m.shape[0])
+    on_bar = np.abs(x) < bar.diameter_m / 2 + heights.cell_m / 2
+    for at in (-1.2, -0.4, 0.4, 1.2):
+        strap = (np.abs(y - at) < 0.02)[:, None] & ~(is_bare & on_bar)
+        heights = replace(heights, gray=np.where(strap, 10, heights.gray).astype(np.uint8))
+    found = min(find_bundles(heights, SETTINGS), key=lambda one: abs(one.centre_m[0]))
+    assert any("no strap crosses" in sentence for sentence in said(found)) is is_bare
