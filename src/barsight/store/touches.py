@@ -33,7 +33,7 @@ from barsight.store.lift_records import (
 from barsight.store.opening import Store
 from barsight.store.states import last_raised_ns, step_lift
 from barsight.store.tables import LIFT_STATES, LIFTS, SIGHTINGS, TOUCHES
-from barsight.yard.events import corners
+from barsight.yard.axes import corners
 from barsight.yard.inventory.bundle_file import bundle_of
 
 with extra("store"):
