@@ -450,6 +450,14 @@ def test_a_certificate_is_signed_and_a_changed_one_refused(tmp_path: Path) -> No
         read_certificate(tmp_path / "cert.json")
 
 
+def test_a_folder_to_keep_results_in_is_new(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "plan.toml").write_text(plan_text(planned()))
+    line = ["accept", str(tmp_path / "plan.toml"), "nowhere", "-o", str(tmp_path / "cert"), "--keep"]
+    for keep, reason in ((tmp_path, "not an empty folder"), (tmp_path / "plan.toml" / "new", "is a file")):
+        assert run([*line, str(keep)]) == 4
+        assert reason in capsys.readouterr().err.replace("\n", " ")
+
+
 def test_letters_that_a_pdf_lacks_are_spelled_and_said(tmp_path: Path) -> None:
     """They were black squares: nobody could read who signed."""
     for signer, shown in (

@@ -26,8 +26,8 @@ from barsight.artefacts.plan import plan_text, read_plan
 from barsight.cli.arguments import call
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
-from barsight.core.errors import ConfigError, Failed, InputError, MeasurementError
-from barsight.core.files import atomic_path, expect_output
+from barsight.core.errors import ConfigError, Failed, InputError, MeasurementError, OutputError
+from barsight.core.files import atomic_path, expect_output, translated_os_errors
 from barsight.measure_settings import MeasureSettings
 from barsight.recording.base import RecordingSettings
 from barsight.report.signing import sign_file
@@ -102,6 +102,8 @@ def run_acceptance(
     wanted = read_plan(files[0])
     page = certificate_files(out)[1]
     expect_output(page, ".html")
+    if keep is not None and keep.exists() and (not keep.is_dir() or any(keep.iterdir())):
+        raise OutputError(f"{keep}: exists and is not an empty folder; name a new one (--keep)")
     has_pdf = find_spec("reportlab") is not None
     with tempfile.TemporaryDirectory(prefix="barsight.") as scratch:
         if key is not None:  # report a wrong key before measuring, not after
@@ -109,7 +111,8 @@ def run_acceptance(
             probe.touch()
             sign_file(probe, key)
         work = Path(scratch) if keep is None else keep
-        work.mkdir(parents=True, exist_ok=True)
+        with translated_os_errors(work):
+            work.mkdir(parents=True, exist_ok=True)
         with stages(console) as advance:
             found = accept(wanted, files[1:], settings, work, advance, offset)
     write_certificate(certificate_content(found, signer, steps), out, key, has_pdf)
