@@ -62,8 +62,9 @@ def run(arguments: Sequence[str]) -> None:
 
         Control charts (CUSUM) monitor yaw, baseline, pitch, roll, focal ratio, the pictures' sharpness
         and, with a plan or tags, fixed features. The first eight surveys establish what is normal. The
-        exit code is 5 if a chart raises an alarm, the rig has drifted, or a lens is dirty; an alarm
-        persists until a calibration is approved.
+        exit code is 5 if a chart raises an alarm, the rig has drifted, fixed features are beyond their
+        limits, a lens is dirty, or the survey shows nothing of the rig; an alarm of a chart persists until a
+        calibration is approved.
 
         Args:
             recording: An ordinary survey with travel.
