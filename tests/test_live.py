@@ -576,3 +576,19 @@ def test_why_a_camera_is_not_connected_reaches_the_run(
         signs = SensorSigns({"cam1_connects": 1}, {"cam0": "", "cam1": why})
         capture.run(SimpleNamespace(packets=lambda after, signs=signs: iter([signs])))  # type: ignore[arg-type]
         assert (link.told("cam0"), link.told("cam1")) == ("", " ".join(why.split()))
+
+
+def test_a_process_that_lives_but_does_not_go_on_counts_as_down_before_it_is_ended(
+    whole: Path, board: Counters, tmp_path: Path
+) -> None:
+    """Tracking that hung for 25 s was told nowhere, and lifts stood."""
+    link = Link(LiveInput(whole), SETTINGS.chosen(), LiveSettings(), tmp_path, tmp_path, "", board.name, None)
+    supervisor = Supervisor(link, board, lambda _: None)
+    for role, one in supervisor.state.processes.items():
+        one.state = "running"
+        board.beat(role)
+    assert supervisor._down() == {}
+    board["track", "beat_ns"] -= 6 * 10**9
+    assert supervisor._down() == {"track": "has not gone on for 6 s"}
+    supervisor.state.processes["track"].state = "done"
+    assert supervisor._down() == {}

@@ -182,7 +182,7 @@ def test_the_first_signal_waits_until_a_survey_is_measured(tmp_path: Path) -> No
 
 HOLDER = """
 import multiprocessing, time
-from barsight.live.supervisor import end_with_parent
+from barsight.live.shared.processes import end_with_parent
 
 def hold():
     end_with_parent()
@@ -215,7 +215,7 @@ def test_no_process_outlives_a_command_that_was_killed_at_once(tmp_path: Path) -
 STARTER = """
 import multiprocessing, signal, time
 from barsight.live.shared.counters import Counters
-from barsight.live.supervisor import _signals_blocked
+from barsight.live.shared.processes import signals_blocked
 if __name__ == "__main__":
     got = []
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -224,7 +224,7 @@ if __name__ == "__main__":
     context.set_forkserver_preload(["barsight.live.supervisor"])
     process = context.Process(target=time.sleep, args=(0.1,))
     print("now", flush=True)
-    with _signals_blocked():
+    with signals_blocked():
         process.start()
     process.join()
     board.remove()

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import multiprocessing
-import os
 import signal
 import sys
-import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
@@ -32,6 +30,7 @@ from barsight.live.modes import (
 from barsight.live.pose_output import output_poses
 from barsight.live.record import record
 from barsight.live.shared.counters import DRAIN, OFF, Counters
+from barsight.live.shared.processes import end_with_parent, signals_blocked
 from barsight.live.source import ReplayClock
 from barsight.live.state import ProcessState, RunState, write_health, write_state
 from barsight.live.survey import INTERRUPTED, SurveyWatch
@@ -46,6 +45,8 @@ MAX_RESTARTS, RESTARTS_WITHIN_S = 5, 30.0
 """Maximum number of restarts of a process, and the time in seconds within which they count; more end the
 run.
 """
+STALLED_S = 5.0
+"""Time in seconds without a heartbeat after which a process counts as down, before it is ended."""
 START_S = 120.0
 """Longest time in seconds that processes may take to start on a busy machine."""
 FINISH_S = 60.0
@@ -68,21 +69,6 @@ SIGNS = {
 """Counters whose changes are logged, each with its line."""
 
 
-def end_with_parent() -> None:
-    """End this process when its parent is gone: a killed parent can't stop its processes, and cameras and
-    ports would stay occupied.
-    """
-    parent = multiprocessing.parent_process()
-    if parent is None:
-        return
-
-    def end(sentinel: int = parent.sentinel) -> None:
-        wait([sentinel])
-        os._exit(1)
-
-    threading.Thread(target=end, daemon=True).start()
-
-
 def run_process(role: str, link: Link) -> None:
     """Run one process of the run. Ctrl-C is left to its parent, with which it dies."""
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -96,16 +82,6 @@ def run_process(role: str, link: Link) -> None:
         if not isinstance(error, BarsightError):
             traceback.print_exc()
         sys.exit(1)
-
-
-@contextlib.contextmanager
-def _signals_blocked() -> Iterator[None]:
-    """Block Ctrl-C and SIGTERM, which a terminal sends to all processes, also for the server of processes."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 class Supervisor:
@@ -174,7 +150,7 @@ class Supervisor:
             target=run_process, args=(role, self._link), name=f"barsight {role}", daemon=True
         )
         self._board.beat(role)
-        with _signals_blocked():
+        with signals_blocked():
             process.start()
         self._running[role] = process
         self.state.processes[role].pid = process.pid or 0
@@ -229,11 +205,13 @@ class Supervisor:
 
     def _end_if_hung(self, role: str, process: BaseProcess) -> None:
         """End a process that is alive but hangs; while it is starting, `START_S` applies."""
-        silent_s = (time.monotonic_ns() - self._board[role, "beat_ns"]) / NS_PER_S
         bound_s = self._link.live.hang_s if self._board[role, "ready"] else START_S
-        if silent_s > bound_s:
+        if self._silent_s(role) > bound_s:
             self._hung[role] = f"did not go on for {bound_s:g} s"
             process.kill()
+
+    def _silent_s(self, role: str) -> float:
+        return (time.monotonic_ns() - self._board[role, "beat_ns"]) / NS_PER_S
 
     def _why(self, role: str) -> str:
         if role in self._hung:
@@ -252,12 +230,7 @@ class Supervisor:
         heard = self._heard()
         if now_ns is None or self._board["capture", "ended"]:
             now_ns = max(heard.cameras_ns)
-        down = {
-            role: one.reason
-            for role, one in self.state.processes.items()
-            if one.state not in ("running", "done") and role != "record"
-        }
-        mode = judge_mode(heard, now_ns, self._link.live, down)
+        mode = judge_mode(heard, now_ns, self._link.live, self._down())
         if self._board["record", "paused"]:
             mode = replace(mode, reasons=(*mode.reasons, "recording is stopped, the disk is too full"))
         self.state.now_ns = now_ns
@@ -272,6 +245,18 @@ class Supervisor:
         self._watch_survey(now_ns)
         self._watch_sensors()
         self._write(health=time.monotonic() >= self._health_at)
+
+    def _down(self) -> dict[str, str]:
+        """Return which processes don't work, with reasons; lifts don't depend on the recorder."""
+        down = {}
+        for role, one in self.state.processes.items():
+            silent_s = self._silent_s(role)
+            if one.state == "running" and silent_s > STALLED_S:
+                down[role] = f"has not gone on for {silent_s:.0f} s"
+            elif one.state not in ("running", "done"):
+                down[role] = one.reason
+        down.pop("record", None)
+        return down
 
     def _watch_survey(self, now_ns: int) -> None:
         """Stop when the survey is over; encoders that can't be trusted don't end one."""
@@ -325,8 +310,7 @@ class Supervisor:
         """Wait until everything kept is in the map, if the map process can finish it; `at_once` ends it."""
         process = self._running.get("map")
         while process is not None and process.is_alive():
-            silent_s = (time.monotonic_ns() - self._board["map", "beat_ns"]) / NS_PER_S
-            if at_once or silent_s > max(self._link.live.hang_s, FINISH_S):
+            if at_once or self._silent_s("map") > max(self._link.live.hang_s, FINISH_S):
                 process.kill()
             process.join(BEAT_S)
         if process is not None:
