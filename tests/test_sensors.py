@@ -14,6 +14,7 @@ import pytest
 
 import barsight as bs
 from barsight.cli.main import run as cli
+from barsight.core.files import held_folder
 from barsight.live.crane.check import check_machine
 from barsight.live.crane.preflight import expect_plausible, held
 from barsight.live.settings import read_crane
@@ -272,6 +273,16 @@ def test_the_oldest_unprotected_segments_go_first(tmp_path: Path) -> None:
     assert len(list((tmp_path / "20260101").iterdir())) == 4 and (tmp_path / "notes").is_dir()
     more = 0
     assert keeper.tidy() == 0 and not keeper.is_full
+
+
+def test_what_another_run_is_recording_stays(tmp_path: Path) -> None:
+    """Two cranes, one folder of recordings: the run that began later deleted the other's."""
+    for day in ("20260101", "20260102", "20260103"):
+        (tmp_path / day).mkdir()
+        (tmp_path / day / "segment_000000.mcap").touch()
+    with held_folder(tmp_path / "20260101"):
+        assert Retention(tmp_path / "20260103", 0.85, 0.95, lambda _: 0.9).tidy() == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["20260101", "20260103"]
 
 
 def test_recordings_dated_ahead_go_first(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from barsight.core.errors import BarsightError, ConfigError
-from barsight.core.files import expect_empty, translated_os_errors
+from barsight.core.files import expect_empty, held_folder, translated_os_errors
 from barsight.core.timing import ProgressCallback
 from barsight.live.crane.preflight import prove_sensors
 from barsight.live.drift import DRIFT_FILE, note_drift
@@ -55,7 +55,9 @@ def measure_crane(
     request = LiftRequest(None if magnet is None else load_magnet(magnet))
     expect_empty(out)
     recording = _recorded(crane, out, datetime.now(UTC).strftime(STAMP))
-    return _begin(crane, out, recording, settings, live, tell).measure(None, request, advance)
+    run = _begin(crane, out, recording, settings, live, tell)
+    with held_folder(recording):  # from other runs' retention
+        return run.measure(None, request, advance)
 
 
 @handled_signals(_NO_SURVEY_RUNS, lambda _: None)
@@ -89,7 +91,8 @@ def measure_surveys(
         is_first, proved = False, True
         _point(out / RUNNING, folder.name)
         try:
-            run.measure(None, request, advance)
+            with held_folder(recording):
+                run.measure(None, request, advance)
             ended = run.stop_because
             if ended == STOOD:
                 _drop_standing(folder, recording)

@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+from barsight.core.files import is_held
 from barsight.recording.formats.segments import PATTERN
 
 PROTECTED = "PROTECTED"
@@ -59,10 +60,15 @@ class Retention:
         return deleted
 
     def _deletable(self) -> list[Path]:
-        """List the segments of the other recordings, the oldest first."""
+        """List the segments of the other recordings, the oldest first, but not of one that a run writes or
+        measures.
+        """
         return [
             path
             for folder in oldest_first(self._current.parent.iterdir(), self._current.name)
-            if folder.is_dir() and folder != self._current and not (folder / PROTECTED).exists()
+            if folder.is_dir()
+            and folder != self._current
+            and not (folder / PROTECTED).exists()
+            and not is_held(folder)
             for path in sorted(folder.glob(PATTERN))
         ]
