@@ -31,7 +31,7 @@ from barsight.plant.feed import StateFeed
 from barsight.plant.link_settings import MqttSettings, OpcUaSettings, S7Settings, WebhookSettings
 from barsight.plant.links import opcua_link
 from barsight.plant.links.changes import changes_between
-from barsight.plant.links.running import _serve_mqtt, _serve_webhooks, serve_plant
+from barsight.plant.links.running import _followed, _serve_mqtt, _serve_webhooks, serve_plant
 from barsight.plant.links.s7_link import serve_s7
 from barsight.plant.links.telegram_process import serve_telegram
 from barsight.plant.live_folder import with_live_run
@@ -365,6 +365,21 @@ def test_what_stands_is_told_at_the_start_as_it_may_have_changed_while_nobody_to
     )
     assert [one["event"] for one in told] == ["started", "validity", "survey", "lift", "alarm-raised"]
     assert (told[1]["is_valid"], told[3]["is"]) == (False, None)
+
+
+def test_no_id_of_an_earlier_process_comes_again() -> None:
+    """A receiver that drops what comes twice would else drop the first changes after each start."""
+    feed = SimpleNamespace(newest=lambda _: QUIET)
+
+    async def ids() -> list[int]:
+        async for _, changes in _followed(feed):  # type: ignore[arg-type]
+            return [one["id"] for one in changes]
+        return []
+
+    first = asyncio.run(ids())
+    time.sleep(0.02)
+    both = [*first, *asyncio.run(ids())]
+    assert len(both) > 2 and both == sorted(set(both)) and both[-1] < 2**53
 
 
 def test_each_alarm_is_told_though_others_of_its_code_stand() -> None:

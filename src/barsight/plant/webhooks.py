@@ -7,7 +7,6 @@ import hmac
 import http.client
 import json
 import threading
-import time
 import urllib.error
 import urllib.request
 from collections import deque
@@ -31,8 +30,7 @@ class _NoRedirect(urllib.request.HTTPRedirectHandler):
 class Webhook:
     """One address, with the changes queued for it and the thread that posts them.
 
-    A change is posted until the address answers with 2xx, so it may arrive twice, with the same `id`. Ids
-    rise from the time in ms at which this began, so that none of an earlier process comes again. A
+    A change is posted until the address answers with 2xx, so it may arrive twice. A
     change answered with 4xx other than 408 and 429 is dropped, as it would be refused again. `lost` is the
     number of changes dropped before a post.
     """
@@ -40,9 +38,8 @@ class Webhook:
     def __init__(self, url: str, settings: WebhookSettings) -> None:
         self.url = url
         self._settings = settings
-        self._waiting: deque[tuple[int, dict[str, Any]]] = deque()
+        self._waiting: deque[dict[str, Any]] = deque()
         self._lock = threading.Lock()
-        self._numbers = time.time_ns() // 1_000_000
         self._lost = 0
         self._problem: str | None = None
         self._changed, self._stop = threading.Event(), threading.Event()
@@ -62,11 +59,10 @@ class Webhook:
     def tell(self, change: dict[str, Any]) -> None:
         """Queue a change; if the queue is full, the oldest is dropped."""
         with self._lock:
-            self._numbers += 1
             if len(self._waiting) >= self._settings.max_waiting:
                 self._waiting.popleft()
                 self._lost += 1
-            self._waiting.append((self._numbers, change))
+            self._waiting.append(change)
         self._changed.set()
 
     def stop(self) -> None:
@@ -86,7 +82,7 @@ class Webhook:
             if first is None:
                 self._changed.wait()
                 continue
-            problem, is_final = post(self.url, self._settings, {"id": first[0], "lost": lost, **first[1]})
+            problem, is_final = post(self.url, self._settings, {"lost": lost, **first})
             self._problem = problem
             if problem is None or is_final:
                 wait_s = FIRST_RETRY_S

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Any
 
@@ -66,11 +67,16 @@ async def _watch(feed: StateFeed) -> None:
 
 
 async def _followed(feed: StateFeed) -> AsyncIterator[tuple[PlantState, list[dict[str, Any]]]]:
-    """Yield the newest state repeatedly, with the changes since the previous one."""
+    """Yield the newest state repeatedly, with the changes since the previous one.
+
+    A change may arrive twice: its `id` tells. Ids rise from the time in ms at which this began, so that none
+    of an earlier process comes again.
+    """
     last: PlantState | None = None
+    ids = itertools.count(time.time_ns() // 1_000_000)
     for counter in itertools.count(1):
         state = feed.newest(counter)
-        yield state, changes_between(last, state)
+        yield state, [{"id": next(ids), **change} for change in changes_between(last, state)]
         last = state
         await asyncio.sleep(READ_EVERY_S)
 
