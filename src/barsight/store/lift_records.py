@@ -249,7 +249,7 @@ def _words(record: dict[str, Any], row: Row[Any]) -> str:
     what = "took a load" if row.kind == "grip" else "came down"
     return (
         f"by the crane's readings the magnet {what} at x {row.x_m:.3f}, y {row.y_m:.3f} m, "
-        f"{1e3 * off_m:.0f} mm beside the target: see what was moved, and survey before the next lift"
+        f"{1e3 * off_m:.0f} mm beside the target: see what was moved; the offers near have ended"
     )
 
 
