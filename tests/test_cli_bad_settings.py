@@ -1,6 +1,7 @@
 """Settings that can't be, in files and flags: one line, an exit code, and nothing left behind."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -105,6 +106,15 @@ def test_help_names_positional_arguments(
         run([*words, "--help"])
     told = capsys.readouterr().out
     assert usage in told.split("\n\n")[0] and "(default: )" not in told.partition(" options ")[0]
+
+
+def test_descriptions_in_help_flow(capsys: pytest.CaptureFixture[str]) -> None:
+    """They kept the source's line breaks inside the terminal's own."""
+    with pytest.raises(SystemExit):
+        run(["measure", "--help"])
+    said = " ".join(capsys.readouterr().out.replace("│", "").split("\n"))
+    first = re.search(r"The recording; or several.*?changed\.", said)
+    assert first is not None and all(len(gap) < 20 for gap in re.findall(r" {2,}", first[0]))
 
 
 def test_result_says_what_was_used(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:

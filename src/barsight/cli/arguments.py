@@ -29,15 +29,18 @@ def call(command: Callable[..., None], name: str, arguments: Sequence[str]) -> N
     """Parse `arguments` according to the function's signature and call it; wrong usage exits with code 2."""
     refuse_old_flags(arguments)
     listed = _listed(arguments)
-    _name_positional(command)
+    _prepare_help(command)
     shown = [printable(argument) for argument in listed]
     if shown != listed:  # tyro prints rejected arguments unescaped
         tyro.cli(_only_parsed(command), prog=f"barsight {name}", args=shown, compact_help=False)
     tyro.cli(command, prog=f"barsight {name}", args=listed, compact_help=False)
 
 
-def _name_positional(command: Callable[..., None]) -> None:
-    """Give positional arguments their own names in usage and help: RECORDING, not PATH."""
+def _prepare_help(command: Callable[..., None]) -> None:
+    """Give positional arguments their own names in usage and help, RECORDING instead of PATH, and let each
+    argument's description flow as one paragraph.
+    """
+    command.__doc__ = re.sub(r"\n {8,}(?=\S)", " ", inspect.getdoc(command) or "")
     hints = get_type_hints(command, include_extras=True)
     for name, parameter in inspect.signature(command).parameters.items():
         hint, word = hints[name], name.upper()
