@@ -97,7 +97,7 @@ def test_misspelt_settings_and_missing_recordings_say_so(tmp_path: Path) -> None
         ({"preset": "quick"}, "preset is 'quick'; choose best or fast"),
         ({"self_calibrate": "pitch"}, "self_calibrate is 'pitch'; choose none or yaw"),
         ({"use": ("stereo", "radar")}, "use is 'radar'; choose stereo, imu or crane"),
-        ({"use": ("imu",)}, "stereo can't be left out of use: it is what measures"),
+        ({"use": ("imu",)}, "use must contain stereo: the map is made from the pictures"),
         ({"use": "stereo"}, "use is 'stereo'; give a list"),
         ({"map": 3}, "map is 3; give its fields by name"),
         ({"map": {"cel_m": 0.05}}, "there is no setting map.cel_m; did you mean cell_m?"),

@@ -48,7 +48,7 @@ class MeasureSettings:
     def __post_init__(self) -> None:
         expect_values(self)
         if "stereo" not in self.use:
-            raise ConfigError("stereo can't be left out of use: it is what measures")
+            raise ConfigError("use must contain stereo: the map is made from the pictures")
 
     def chosen(self) -> MeasureSettings:
         """Apply the preset to the settings."""
