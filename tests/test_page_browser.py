@@ -340,7 +340,7 @@ def test_the_crane_goes_over_the_yard_as_the_live_run_tells(
             sheet.page.wait_for_selector("#crane >> text=without IMU")
             live_folder(live, position_m=[400.0, 1.0, 8.0])
             wait_for(lambda: "never seen" in sheet.page.inner_text("#age"))
-        sheet.page.wait_for_selector("#crane >> text=no word", timeout=5000)  # it writes no more
+        sheet.page.wait_for_selector("#crane >> text=no data", timeout=5000)  # it writes no more
         assert sheet.page.evaluate("barsightYard.crane") is None
         assert "Age of the newest map" in sheet.page.inner_text("#age")
         assert sheet.errors == []
