@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from barsight.calibration.geometry.rectification import Rectifier
-from barsight.core.errors import Failed
+from barsight.core.errors import Failed, InputError, MeasurementError
 from barsight.core.records.pairs import RefusedFrame
 from barsight.core.records.sensor_samples import CraneSamples, EncoderJump, ImuSamples
 from barsight.evaluation.trajectory_error import trajectory_drift
@@ -25,6 +25,7 @@ from barsight.motion.fixed_lag.estimator import FixedLagFusion, FixedLagSettings
 from barsight.motion.fixed_lag.sensor_buffer import SensorBuffer
 from barsight.motion.frontend.seen_steps import known_motion
 from barsight.motion.frontend.sightings import Sighting
+from barsight.motion.settings import MotionSettings, make_estimator
 from barsight.recording.formats.ground_truth import GroundTruth, read_ground_truth
 from barsight.recording.open import open_recording
 from drawn_cranes import DrawnCrane, drawn_crane, drawn_senses
@@ -215,6 +216,34 @@ def test_poses_of_drawn_cranes_with_a_fault(monkeypatch: pytest.MonkeyPatch) -> 
         told = f"{ratio:.2f} times as far off as clean (worst {worst:.2f}), sigma {wider:.2f} times as wide"
         print(f"{fault}: {told}, NEES {found[:, 1].mean():.1f}", flush=True)
         assert ratio < 1.3 and found[:, 1].mean() < 1.1 * clean[:, 1].mean() and wider > 0.98
+
+
+@pytest.mark.parametrize(("sensor", "fault"), [(s, f) for s in ("crane", "imu") for f in ("doubled", "nan")])
+@pytest.mark.parametrize("name", ["fused", "live", "crane"])
+def test_readings_of_no_order_or_no_number_are_refused(name: str, sensor: str, fault: str) -> None:
+    """They ended in tracebacks, each in another room."""
+    recording, _, _ = steady(0.4, 0)
+    values = {key: np.array(value) for key, value in vars(getattr(recording, f"{sensor}_samples")).items()
+              if isinstance(value, np.ndarray) and len(value) > 50}  # fmt: skip
+    stamps, (key, first) = values["stamp_ns"], list(values.items())[1]
+    if fault == "doubled":
+        stamps[10] = stamps[9]
+    else:
+        first[10] = np.nan
+    spoiled = {f"{sensor}_samples": replace(getattr(recording, f"{sensor}_samples"), stamp_ns=stamps,
+                                            **{key: first})}  # fmt: skip
+    estimator = make_estimator(MotionSettings(estimator=name))
+    with pytest.raises(InputError, match=r"later than|aren't numbers"):
+        estimator.begin(replace(recording, **spoiled), Rectifier(recording.rig))
+
+
+def test_encoders_without_a_reading_place_no_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    recording, seen, _ = steady(0.4, 0)
+    tell_sightings(monkeypatch, fusion, seen)
+    none = replace(recording.crane_samples, stamp_ns=np.empty(0, np.int64), position_m=np.empty((0, 3)))
+    recording = replace(recording, crane_samples=none)
+    with pytest.raises(MeasurementError, match="the encoders place no frame"):
+        BatchFusion(FusionSettings(), CraneSettings())(recording, Rectifier(recording.rig), lambda: None)
 
 
 def test_the_noise_is_what_the_readings_show() -> None:

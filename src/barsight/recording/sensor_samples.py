@@ -12,6 +12,7 @@ from barsight.core.errors import InputError
 from barsight.core.pose import Pose
 from barsight.core.reading.bounded_reading import MAX_PROFILES
 from barsight.core.records.sensor_samples import CraneSamples, ImuSamples, LaserProfile
+from barsight.core.stamps import rows_not_later
 
 
 def make_imu(path: Path, stamp_ns: Int64, gyro: Float64, accel: Float64, body_from_imu: Pose) -> ImuSamples:
@@ -37,6 +38,24 @@ def expect_si(path: Path, accel: Float64) -> None:
             f"the accelerations' median is {median:.2f} m/s^2, so they are probably in g",
             "multiply them by 9.80665 so that they are in m/s^2",
         )
+
+
+def expect_usable(path: Path, crane: CraneSamples | None, imu: ImuSamples | None) -> None:
+    """Raise `InputError` where readings that no file's reader has checked aren't in order of time or finite.
+
+    Readings may be missing: there may be none at all.
+    """
+    given = [] if crane is None else [("the encoders'", crane.stamp_ns, crane.position_m)]
+    if imu is not None:
+        given.append(("the IMU's", imu.stamp_ns, np.hstack([imu.gyro_radps, imu.accel_mps2])))
+    for whose, stamps, values in given:
+        late = len(rows_not_later(stamps))
+        if late:
+            problem = f"{late} of {whose} {len(stamps)} stamps aren't later than the one before"
+            raise InputError(path, problem, "sort the readings by time and drop doubled ones")
+        wrong = int((~np.isfinite(values)).any(axis=1).sum())
+        if wrong:
+            raise InputError(path, f"{wrong} of {whose} {len(stamps)} readings aren't numbers", "drop them")
 
 
 def make_crane(document: Document, stamp_ns: Int64, position_m: Float64) -> CraneSamples:

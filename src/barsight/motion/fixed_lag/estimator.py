@@ -26,6 +26,7 @@ from barsight.motion.frontend.chains import UNTIED, untied_sentence
 from barsight.motion.frontend.tracking import Tracker
 from barsight.motion.gravity import align_with_gravity
 from barsight.recording.base import Recording
+from barsight.recording.sensor_samples import expect_usable
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,7 @@ class FixedLagPoses(ImmediatePoses):
         self._noise = recording.imu_noise() or ORDINARY_NOISE
         self.reads_pictures = "stereo" in self._use
         readings = self._readings()
+        expect_usable(recording.path, readings.crane, readings.imu)
         self.delay_ns = readings.delay_ns
         if readings.crane is None and not self.reads_pictures:
             raise MeasurementError(f"{recording.path}: no crane encoders; estimate with use: stereo")
