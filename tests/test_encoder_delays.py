@@ -67,9 +67,9 @@ def test_live_takes_what_is_not_late_as_it_is(monkeypatch: pytest.MonkeyPatch) -
         assert not found.doubts and drift.nees_position < 2
 
 
-@pytest.mark.parametrize(("fault", "least"), [({}, 0.9), ({"jump_m": 0.1}, 0.4), ({"frozen_s": 1.0}, 0.0)])
-def test_a_delay_is_found_and_none_invented(fault: dict[str, float], least: float) -> None:
-    """Other faults may hide a delay, but they make none."""
+@pytest.mark.parametrize("fault", [{}, {"jump_m": 0.1}, {"frozen_s": 1.0}])
+def test_a_delay_is_found_and_none_invented(fault: dict[str, float]) -> None:
+    """Other faults neither make a delay nor hide it: with a freeze, 2 of 24 were found."""
     found = []
     for seed in range(20020, 20032):
         crane = drawn_crane(seed, **fault)
@@ -77,7 +77,7 @@ def test_a_delay_is_found_and_none_invented(fault: dict[str, float], least: floa
         assert without_delay(crane.readings, imu).late_ns == 0
         taken_s = [without_delay(late(crane.readings, s), imu).late_ns / 1e9 for s in (-0.2, 0.2)]
         found += [abs(taken_s[0] + 0.2) < 0.03, abs(taken_s[1] - 0.2) < 0.03]
-    assert sum(found) >= least * len(found)
+    assert sum(found) >= 0.9 * len(found)
 
 
 def test_without_an_imu_nothing_is_told() -> None:

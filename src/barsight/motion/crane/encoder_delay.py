@@ -40,7 +40,9 @@ class DelaySearch:
         self._count = 0
 
     def add(self, crane: CraneSamples, imu: ImuSamples, begin_ns: int) -> bool:
-        """Add the readings of the part that begins at a stamp; return whether they told anything."""
+        """Add the readings of the part that begins at a stamp; return whether they told anything. Those that no
+        delay explains, as they froze or jumped, don't.
+        """
         spare, end_ns = seconds_to_ns(float(LATE_S[-1])), begin_ns + seconds_to_ns(PART_S)
         first, end = np.searchsorted(crane.stamp_ns, (begin_ns, end_ns))
         way = KnownMotion(None, imu).by_imu(crane, begin_ns - spare, end_ns + spare)
@@ -49,10 +51,14 @@ class DelaySearch:
         stamps, place = crane.stamp_ns[first:end], crane.position_m[first:end]
         time = (stamps - begin_ns) / NS_PER_S / PART_S * 2 - 1
         basis, _ = np.linalg.qr(np.polynomial.polynomial.polyvander(time, 3))
+        squares = np.empty(len(LATE_S))
         for k, late_s in enumerate(LATE_S.tolist()):
             off = place - way.place_at(stamps - seconds_to_ns(late_s))
             off -= basis @ (basis.T @ off)
-            self._squares[k] += float((np.minimum(np.abs(off), WILD_M) ** 2).mean())
+            squares[k] = (np.minimum(np.abs(off), WILD_M) ** 2).mean()
+        if squares.min() > MAX_LEFT_M**2:
+            return False
+        self._squares += squares
         self._count += 1
         return True
 
