@@ -55,6 +55,14 @@ def test_five_readings_a_second_place_a_crane(
     assert drift.reference_rmse_mm < most_mm and drift.nees_position < 3
 
 
+@pytest.mark.parametrize("rate_hz", [8.0, 10.0])
+def test_live_waits_for_a_reading_beyond_the_frame(rate_hz: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first frames were refused: it waited for 0.06 s, and the readings come 0.1 s apart."""
+    for seed in (20005, 20006, 20014, 20019):
+        found, _ = drawn("live", "stereo,imu,crane", seed, rate_hz, monkeypatch)
+        assert len(found.refused) <= 1 and not found.doubts  # one reading in twenty may be lost
+
+
 @pytest.mark.parametrize("name", ROOMS)
 def test_encoders_that_are_too_slow_are_refused_by_name(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     words = "apart: give at least four a second"

@@ -14,8 +14,10 @@ from barsight.motion.crane.encoder_delay import shifted_back
 
 SENSOR_DELAY_S = 0.06
 """Delay, s, after a frame's stamp until which readings are awaited before the frame is computed."""
-SLOW_S, SLOW_DELAY_S = 0.12, 0.27
-"""Interval, s, from which encoders are slow, and the delay for them, in which one reads at least once."""
+SLOW_S, SLOW_RATIO, SLOW_DELAY_S = 0.055, 1.35, 0.27
+"""Interval, s, from which encoders are slow; delay for them, in which one reads at least once, in intervals,
+and its maximum, s.
+"""
 NEWEST = 100
 """Number of the newest readings that tell the encoders' interval."""
 
@@ -35,8 +37,9 @@ class SensorBuffer:
         if crane is None:
             return seconds_to_ns(SENSOR_DELAY_S)
         newest = replace(crane, stamp_ns=crane.stamp_ns[-NEWEST:], position_m=crane.position_m[-NEWEST:])
-        is_slow = newest.interval_ns > seconds_to_ns(SLOW_S)
-        return seconds_to_ns(SLOW_DELAY_S if is_slow else SENSOR_DELAY_S)
+        if newest.interval_ns <= seconds_to_ns(SLOW_S):
+            return seconds_to_ns(SENSOR_DELAY_S)
+        return min(round(SLOW_RATIO * newest.interval_ns), seconds_to_ns(SLOW_DELAY_S))
 
     def between(self, first_ns: int, last_ns: int, late_ns: int = 0) -> SensorBuffer:
         """Select the readings between two stamps, without those at the limit of the IMU range.
