@@ -221,7 +221,9 @@ def seen_from(count: int, seed: int, with_crane: bool, wrong_px: float) -> tuple
         v, a = np.array([0.8, 0, 0]), np.array([0.3, 0.1, 0])
         places[2] += 0.01 * (wrong_px > 0)  # beyond Huber's length
         placed = tuple(EncoderPosition(k, place, v * (k % 3 - 1), a, 0.002) for k, place in enumerate(places))
-        attitudes = tuple(AttitudePrior(k, poses[k].rotation, np.full(3, 0.003)) for k in range(count))
+        attitudes = tuple(
+            AttitudePrior(k, poses[k].rotation, np.full(3, 0.003), k % 2 == 0) for k in range(count)
+        )
     problem = Problem(
         tuple(poses), stamps, not with_crane, seen, (None,) * (count - 1), placed, attitudes, (),
         ImuBias.none(), has_latency=with_crane, jumps=jumps, uneven_m=UNEVEN_M,
@@ -236,14 +238,30 @@ def encoder_error(
     trolley have a share (2,), and its derivatives."""
 
     def error(factor: Any, values: gtsam.Values, jacobians: list[np.ndarray] | None) -> np.ndarray:
-        pose, (latency, *jumped) = values.atPose3(factor.keys()[0]), values.atVector(factor.keys()[1])
+        pose, (latency, *jumped) = values.atPose3(factor.keys()[0]), values.atVector(factor.keys()[1])[:3]
         by_jumps = np.diag([*share, 1.0])[:, :2]
         if jacobians is not None:
             jacobians[0] = np.hstack([np.zeros((3, 3)), pose.rotation().matrix()])
             speed = place.velocity_mps + place.acceleration_mps2 * latency
-            jacobians[1] = np.column_stack([-speed, by_jumps])
+            jacobians[1] = np.column_stack([-speed, by_jumps, np.zeros((3, 3))])
         way = place.velocity_mps * latency + place.acceleration_mps2 * latency**2 / 2
         return pose.translation() - place.position_m - way + by_jumps @ jumped
+
+    return error
+
+
+def attitude_error(
+    attitude: AttitudePrior,
+) -> Callable[[Any, gtsam.Values, list[np.ndarray] | None], np.ndarray]:
+    """The body's turn from its nominal attitude, under way less the mounting's error, and derivatives."""
+
+    def error(factor: Any, values: gtsam.Values, jacobians: list[np.ndarray] | None) -> np.ndarray:
+        pose, mounting = values.atPose3(factor.keys()[0]), values.atVector(factor.keys()[1])[-3:]
+        if jacobians is not None:
+            jacobians[0] = np.eye(3, 6)
+            jacobians[1] = np.hstack([np.zeros((3, 3)), -attitude.sways * np.eye(3)])
+        turn = gtsam.Rot3.Logmap(gtsam.Rot3(attitude.rotation).between(pose.rotation()))
+        return np.asarray(turn - attitude.sways * mounting)
 
     return error
 
@@ -264,6 +282,9 @@ def by_gtsam(problem: Problem, used: np.ndarray) -> tuple[gtsam.Values, gtsam.Ma
         model = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Diagonal.Sigmas(sigma))
         share = np.array([float(place.node >= 5), float(place.node >= 3)])
         graph.add(gtsam.CustomFactor(model, [X(place.node), E(0)], encoder_error(place, share)))
+    for attitude in problem.attitudes:
+        model = gtsam.noiseModel.Diagonal.Sigmas(attitude.sigma_rad)
+        graph.add(gtsam.CustomFactor(model, [X(attitude.node), E(0)], attitude_error(attitude)))
     for k in np.flatnonzero(used):
         model = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Isotropic.Sigma(3, seen.sigma_px[k]))
         u, v, right = seen.stereo[k]

@@ -15,15 +15,18 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import E
 
-from barsight.core.arrays import Bool
-from barsight.motion.problem.encoder_factors import PLAY_M, travel_m
+from barsight.core.arrays import Bool, Float64
+from barsight.motion.problem.encoder_factors import PLAY_M, SURE_SCALE_SIGMAS, travel_m
 from barsight.motion.problem.gauss_newton import GraphState, linearise_graph
 from barsight.motion.problem.gtsam_factors import build_graph
 from barsight.motion.problem.problem import Problem, encoder_unknowns_of
 from barsight.motion.problem.rig_drift import drift_floor, drift_prior
+from barsight.motion.problem.travel import Scales
 
 MAYBE_SIGMAS = 4.5
 """Significance from which a scale may be wrong, so that it becomes an unknown."""
+WIDER_SIGMAS = 2.0
+"""Significance from which a scale that isn't an unknown yet counts in the sigma of what is known by then."""
 MIN_WAY_M = 0.5
 """Minimum travel on an axis for its scale to be told."""
 
@@ -32,28 +35,57 @@ def doubtful_scales(problem: Problem, state: GraphState, used: Bool) -> tuple[in
     """Find the axes whose encoder contradicts cameras and IMU in scale, at the optimum; those whose scale is
     an unknown already aren't asked.
     """
-    way = travel_m(problem)
-    axes = [axis for axis in np.flatnonzero(way > MIN_WAY_M).tolist() if axis not in problem.scaled]
+    moved = np.flatnonzero(travel_m(problem) > MIN_WAY_M).tolist()
+    axes = tuple(axis for axis in moved if axis not in problem.scaled)
     if not axes or not used.any():
         return ()
     known, count = encoder_unknowns_of(state.values), len(axes)
+    begin = problem.scale_places.stop
     values = gtsam.Values(state.values)
     values.erase(E(0))
-    values.insert(E(0), np.append(known, np.zeros(count)))
+    values.insert(E(0), np.insert(known, begin, np.zeros(count)))
     tried, state = replace(problem, scaled=(*problem.scaled, *axes)), replace(state, values=values)
     system = linearise_graph(tried, build_graph(tried), state, used)
     own, slope = system.schur(system.forward)
     size = len(own)
-    at = np.r_[len(known) : len(known) + count, size - 2 : size]
+    at = np.r_[begin : begin + count, size - 2 : size]
     covariance = np.linalg.inv(own)[np.ix_(at, at)].astype(np.float64)
-    best = -np.linalg.solve(own, slope)[at]
+    best = -np.linalg.solve(own, slope)[at].astype(np.float64)
     best[count:] += state.drift
-    covariance[count:, count:] += drift_floor(problem)
-    prior = np.zeros_like(covariance)
-    prior[[count, count + 1], [count, count + 1]] = drift_prior(problem) ** -2.0
+    return doubtful_axes(problem, axes, weigh_scales(problem, best, covariance))
+
+
+def weigh_scales(problem: Problem, best: Float64, covariance: Float64) -> Scales:
+    """Weigh scales and the rig's drift (S + 2,), as the equations alone would have them, against the drift's
+    prior: the scales.
+    """
+    covariance, prior = covariance.copy(), np.zeros_like(covariance)
+    covariance[-2:, -2:] += drift_floor(problem)
+    prior[[-2, -1], [-2, -1]] = drift_prior(problem) ** -2.0
     information = np.linalg.inv(covariance)
-    combined = np.linalg.inv(information + prior)
-    excess = (combined @ information @ best)[:count]
-    sigma = np.sqrt(np.diag(combined)[:count] + (PLAY_M / way[axes]) ** 2)
-    off = np.abs(excess) / sigma
-    return tuple(axis for axis, sigmas in zip(axes, off, strict=True) if sigmas > MAYBE_SIGMAS)
+    combined = np.linalg.inv(information + prior).astype(np.float64)
+    return Scales((combined @ information @ best)[:-2], combined[:-2, :-2])
+
+
+def doubtful_axes(problem: Problem, axes: tuple[int, ...], scales: Scales | None) -> tuple[int, ...]:
+    """Select the axes whose encoder may have a wrong scale: none, unless one of them contradicts cameras and
+    IMU; then also those that could be wrong in its stead, since a turned camera shows on all axes alike.
+    """
+    if scales is None or not axes:
+        return ()
+    _, sigmas = scales_alone(problem, axes, scales)
+    if sigmas.max() <= MAYBE_SIGMAS:
+        return ()
+    near = (sigmas > 0) & (sigmas.max() ** 2 - sigmas**2 < SURE_SCALE_SIGMAS**2)
+    return tuple(np.array(axes, np.int64)[near].tolist())
+
+
+def scales_alone(problem: Problem, axes: tuple[int, ...], scales: Scales) -> tuple[Float64, Float64]:
+    """Estimate the scale (S,) of each axis with the others taken as right, and its significance (S,) in
+    sigma: 0 where the encoder travelled too little.
+    """
+    way = travel_m(problem)[list(axes)]
+    information = np.linalg.inv(scales.covariance + np.diag((PLAY_M / way) ** 2))
+    own = np.diag(information)
+    value: Float64 = information @ scales.value / own
+    return value, np.where(way > MIN_WAY_M, np.abs(value) * np.sqrt(own), 0.0)

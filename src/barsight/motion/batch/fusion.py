@@ -47,9 +47,11 @@ from barsight.motion.gravity import GravityAlignment, align_with_gravity
 from barsight.motion.problem.nodes import Nodes, constrain_by_imu, initial_poses, make_nodes
 from barsight.recording.base import Recording
 from barsight.recording.formats.board_corners import CornerRecording
+from barsight.recording.sensor_samples import expect_usable
 
 if TYPE_CHECKING:
     from barsight.motion.batch.bundle_adjustment import Estimate
+    from barsight.motion.problem.problem import AttitudePrior
 
 SENSORS = ("stereo", "imu", "crane")
 
@@ -119,6 +121,7 @@ class BatchPoses:
         self.reads_pictures = "stereo" in use
         self._stated = recording.crane() if "crane" in use else None
         self._imu, self._spoiled = recording.imu() if "imu" in use else None, 0
+        expect_usable(recording.path, self._stated, self._imu)
         if self._imu is not None:
             self._imu, self._spoiled = without_saturation(self._imu)
         self._crane, self._timed = None, self._stated and without_delay(self._stated, self._imu)
@@ -266,12 +269,7 @@ class BatchPoses:
             jump_sentences,
             scale_sentences,
         )
-        from barsight.motion.problem.problem import (
-            AttitudePrior,
-            EncoderPosition,
-            Problem,
-            StereoObservations,
-        )
+        from barsight.motion.problem.problem import EncoderPosition, Problem, StereoObservations
         from barsight.motion.problem.residuals import normalised_encoders
 
         start = initial_poses(nodes, inputs.crane, inputs.sightings, shift, rectifier, inputs.level)
@@ -286,9 +284,7 @@ class BatchPoses:
         if inputs.crane is not None:
             chosen = indices_apart(nodes.stamp_ns, place_spacing_ns(inputs.crane))
             placed = encoder_positions(inputs.crane, inputs.imu, nodes.stamp_ns, chosen)
-            nominal = inputs.crane.yard_from_body_nominal
-            sigmas = self._attitude_sigmas_deg(chosen, ties.still)
-            attitudes = [AttitudePrior(k, nominal, np.full(3, np.deg2rad(s))) for k, s in sigmas.items()]
+            attitudes = self._attitudes(chosen, ties.still, inputs.crane.yard_from_body_nominal)
         jumps = inputs.crane.jumps if inputs.crane is not None and placed else ()
         seen = None
         if inputs.sightings:
@@ -302,6 +298,7 @@ class BatchPoses:
             tuple(attitudes), ties.still, ties.bias,
             offset_prior_px=self._settings.offset_prior_px, scale_prior=self._settings.scale_sigma,
             crane=inputs.crane, imu=inputs.imu, has_latency=bool(placed), jumps=jumps,
+            mounting_sigma_rad=self._crane_settings.mounting_sigma_rad,
             has_imu=any(part is not None for part in ties.preintegrated),
         )  # fmt: skip
         estimate = solve_batch(problem, nodes.frame)
@@ -310,16 +307,21 @@ class BatchPoses:
         )
         begin_ns = 0 if inputs.crane is None else int(inputs.crane.stamp_ns[0])
         sure, maybe = jump_sentences(jumps, begin_ns, estimate.encoders)
-        wrong, doubtful = scale_sentences(estimate.scaled, estimate.encoders)
+        wrong, doubtful = scale_sentences(
+            estimate.scaled, estimate.encoders.excess if estimate.encoders else None
+        )
         warnings += (*doubtful, *maybe)
         in_sigmas = estimate.encoder_off_m / estimate.encoder_sigma_m
         encoders = normalised_encoders(nodes.stamp_ns, estimate.placed, in_sigmas)
         return estimate, warnings, (*wrong, *sure), encoders
 
-    def _attitude_sigmas_deg(self, chosen: list[int], still: Container[int]) -> dict[int, float]:
-        """Choose the sigma (degrees) of the nominal attitude at the chosen nodes: larger under way, since
-        sway reverses within about a second and closer nodes aren't independent; at rest for one shared error.
+    def _attitudes(self, chosen: list[int], still: Container[int], nominal: Float64) -> list[AttitudePrior]:
+        """Make the nominal attitude's priors at the chosen nodes: looser under way, since sway reverses
+        within about a second and closer nodes aren't independent; at rest for one shared error.
         """
+        from barsight.motion.problem.problem import AttitudePrior
+
         moving, standing = self._crane_settings.attitude_std_deg * 1.6, [k for k in chosen if k in still]
         at_rest = self._crane_settings.sway_std_deg * len(standing) ** 0.5
-        return {k: at_rest if k in standing else moving for k in chosen}
+        sigma = {k: np.deg2rad(at_rest if k in standing else moving) for k in chosen}
+        return [AttitudePrior(k, nominal, np.full(3, sigma[k]), k not in standing) for k in chosen]

@@ -22,12 +22,15 @@ from barsight.motion.crane.robust_parabola import fit_parabola
 from barsight.motion.crane.sway import sway_at
 from barsight.motion.estimator import FrameInput, ImmediatePoses, TrajectoryEstimator
 from barsight.recording.base import Recording
+from barsight.recording.sensor_samples import expect_usable
 
 CAUCHY_SIGMAS = 3.0
 MIN_FOR_NOISE = 100
 NINE_TENTHS = 0.623
 """Mean square of the smallest nine tenths of normally distributed residuals, relative to that of all."""
 
+MOUNTING_RATIO = 2 / 3
+"""Ratio of the sigma of the mounting's and girder's own error to `CraneSettings.attitude_std_deg`."""
 MIN_ALIKE_RATIO = 0.9
 """Smallest share of equal readings on an axis that stands; the rest may be outliers."""
 
@@ -49,6 +52,11 @@ class CraneSettings:
     sway_std_deg: float = 0.02
     """Standard deviation of the attitude (degrees, each axis) where the gyro measures the sway."""
 
+    @property
+    def mounting_sigma_rad(self) -> float:
+        """Return the standard deviation of the part of the attitude's error that doesn't change."""
+        return float(np.deg2rad(MOUNTING_RATIO * self.attitude_std_deg))
+
     def __post_init__(self) -> None:
         expect_ranges(
             self, "motion.crane.", window_s=POSITIVE, sway_window_s=POSITIVE, attitude_std_deg=NOT_NEGATIVE,
@@ -64,8 +72,10 @@ class EncoderOdometry(TrajectoryEstimator):
 
     def begin(self, recording: Recording, rectifier: Rectifier) -> EncoderPoses:
         """Begin. Raises MeasurementError where the recording has no encoders."""
-        if recording.crane() is None:
+        crane = recording.crane()
+        if crane is None:
             raise MeasurementError(f"{recording.path}: no crane encoders; measure without them (use: stereo)")
+        expect_usable(recording.path, crane, recording.imu())
         return EncoderPoses(self.settings, recording)
 
 

@@ -105,10 +105,10 @@ def with_jumps(window: Window, jumps: tuple[EncoderJump, ...]) -> Window:
     added = tuple(jump for jump in jumps if jump not in problem.jumps)
     if not added or not problem.has_latency:
         return window
-    values, prior, old = gtsam.Values(window.state.values), problem.prior, problem.encoder_unknowns
+    values, prior, old = gtsam.Values(window.state.values), problem.prior, 1 + len(problem.jumps)
     known = encoder_unknowns_of(values)
     values.erase(E(0))
-    values.insert(E(0), np.append(known, np.zeros(len(added))))
+    values.insert(E(0), np.insert(known, old, np.zeros(len(added))))
     if prior is not None:
         prior = _widened(prior, old, np.array([jump.sigma_m for jump in added]))
     problem = replace(problem, jumps=(*problem.jumps, *added), prior=prior)
@@ -129,7 +129,7 @@ def with_sums(window: Window, sums: dict[EncoderJump, tuple[EncoderJump, ...]]) 
         known = encoder_unknowns_of(values)
         known[1 + at[0]] = known[1:][at].sum()
         values.erase(E(0))
-        values.insert(E(0), known[np.r_[0, 1 + kept]])
+        values.insert(E(0), known[np.r_[0, 1 + kept, 1 + len(problem.jumps) : len(known)]])
         prior = problem.prior
         if prior is not None:
             prior = sum_unknowns(prior, 1 + np.array(at))
@@ -160,7 +160,7 @@ def sum_unknowns(prior: MarginalPrior, at: Int64) -> MarginalPrior:
 
 
 def _widened(prior: MarginalPrior, old: int, sigmas_m: Float64) -> MarginalPrior:
-    """Add unknowns with these sigmas to a prior, after the `old` unknowns of the encoders in its border."""
+    """Add unknowns with these sigmas to a prior, after the first `old` unknowns in its border."""
     at = len(prior.matrix) - len(prior.border) + old
     where, none = np.full(len(sigmas_m), at), np.zeros(len(sigmas_m))
     matrix = np.insert(np.insert(prior.matrix, where, 0.0, axis=0), where, 0.0, axis=1)

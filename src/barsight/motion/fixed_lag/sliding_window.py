@@ -25,6 +25,7 @@ from barsight.motion.frontend.sightings import Sighting
 from barsight.motion.problem.gauss_newton import GraphState
 from barsight.motion.problem.problem import MIN_SIGMA_PX, Problem, StereoObservations
 from barsight.motion.problem.stereo_factors import initial_points
+from barsight.motion.problem.travel import Scales
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +38,7 @@ class Window:
     held. noise: factor on the stated sigmas of the sightings, from their residuals. newest: covariance of the
     last node; drift_covariance: (2, 2) of the rig's drift. seen_ns, placed_ns: stamps of the last node with a
     picture and of the last one with an encoder position; stood: whether the prior of the attitude at rest has
-    been added.
+    been added. scales: of the encoders, as `WindowSolution`.
     """
 
     problem: Problem
@@ -52,6 +53,7 @@ class Window:
     seen_ns: int | None = None
     placed_ns: int | None = None
     stood: bool = False
+    scales: Scales | None = None
 
     def pose(self, node: int) -> Pose:
         """Return reference_from_body of a node."""

@@ -16,14 +16,13 @@ from barsight.core.errors import Failed
 from barsight.core.pose import Pose
 from barsight.core.records.pairs import RefusedFrame
 from barsight.core.records.trajectory import PosedFrame
-from barsight.core.stamps import seconds_to_ns
+from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.features.guided_matching import PredictedMotion
 from barsight.inertial.preintegration import Preintegrated
 from barsight.motion.batch.fault_detection import freeze_sentences
 from barsight.motion.batch.fusion import FusionSettings
 from barsight.motion.crane.encoder_trajectory import CraneSettings, fit_position, reestimate_noise
-from barsight.motion.crane.known_motion import way_around
-from barsight.motion.crane.places import PLACE_SPACING_S, place_spacing_ns
+from barsight.motion.fixed_lag.crane_ties import FIT_S, with_attitudes, with_encoder_positions
 from barsight.motion.fixed_lag.delay_watch import DelayWatch
 from barsight.motion.fixed_lag.encoder_watch import EncoderWatch, with_jumps, with_sums
 from barsight.motion.fixed_lag.sensor_buffer import SensorBuffer
@@ -34,7 +33,11 @@ from barsight.motion.frontend.motion_prediction import CranePredictor, predict_b
 from barsight.motion.frontend.seen_steps import known_motion
 from barsight.motion.frontend.sightings import Sighting
 from barsight.motion.gravity import GravityAlignment
-from barsight.motion.problem.encoder_factors import encoder_position, jump_sentences
+from barsight.motion.problem.encoder_factors import (
+    jump_sentences,
+    scale_excess,
+    scale_sentences,
+)
 from barsight.motion.problem.gauss_newton import GraphState
 from barsight.motion.problem.gtsam_factors import initial_values
 from barsight.motion.problem.nodes import (
@@ -46,7 +49,7 @@ from barsight.motion.problem.nodes import (
     preintegrate_between,
     subdivide,
 )
-from barsight.motion.problem.problem import AttitudePrior, Problem
+from barsight.motion.problem.problem import Problem
 
 RECENT_FRAMES = 40
 """Number of the latest frames whose motions are compared with the encoders."""
@@ -56,7 +59,7 @@ MAX_BRIDGE_S = 15.0
 """Longest time, s, without frames after which the window goes on where encoders could begin a new one: the
 IMU's place is off by metres after 40 s.
 """
-FIT_S = PLACE_SPACING_S / 2 + 0.01
+AXES = (0, 1, 2)
 
 
 class FixedLagEstimator:
@@ -74,6 +77,8 @@ class FixedLagEstimator:
         self.watch = EncoderWatch()
         self.delay = DelayWatch()
         self._failed = False
+        self._left: Window | None = None
+        self._scaled_ns: int | None = None
 
     def predict(self, old_ns: int, new_ns: int) -> PredictedMotion | None:
         """Predict the motion as a `Predictor` does: by the IMU from the last estimate, else by encoders; None
@@ -111,7 +116,7 @@ class FixedLagEstimator:
             fit_position(now.crane, stamp, seconds_to_ns(self._crane.window_s)), Failed
         )
         if covered and self._is_long_past(stamp):
-            self.window = None  # the IMU has gone too far astray for one step; encoders place a new one
+            self._leave_window()  # the IMU has gone too far astray for one step; encoders place a new one
         if sighting is None and not covered:
             assert isinstance(seen, RefusedFrame)
             return seen
@@ -124,19 +129,25 @@ class FixedLagEstimator:
             return RefusedFrame(seen.stamp_ns, window.reason)
         rectifier = self._rectifier
         window = add_frame(window, sighting, rectifier.camera, rectifier.body_from_rect0, self._held)
-        window = self._bound(window, sighting, now, stamp)
+        window = with_encoder_positions(window, sighting, now, self._crane, stamp + self.readings.delay_ns)
         try:
             window, leaving = solve_window(window, self._held)
         except np.linalg.LinAlgError:
             if self._failed and now.crane is not None:
-                self.window = None  # the window may be the cause, and encoders can place a new one
+                self._leave_window()  # it may be the cause, and encoders can place a new one
             self._failed = True
             return RefusedFrame(seen.stamp_ns, "the sensors together have no solution here")
         self._failed = False
         pose = window.pose(len(window.problem.start) - 1)
         covariance = window.covariance
         self.window = marginalise(window, leaving) if leaving else window
+        if self._scaled_ns is None and len(window.problem.held) < len(window.problem.scaled):
+            self._scaled_ns = stamp
         return PosedFrame(seen.stamp_ns, pose, covariance)
+
+    def _leave_window(self) -> None:
+        """Leave the window; what it knows of the encoders' scales stays."""
+        self._left, self.window = self.window or self._left, None
 
     def _is_long_past(self, stamp: int) -> bool:
         """Check whether the last node is too old for the IMU to lead from it to a stamp."""
@@ -167,7 +178,8 @@ class FixedLagEstimator:
         """Look for faults in the encoders' newest readings; positions taken beyond a new jump are removed."""
         now = self._come(stamp_ns)
         if self.delay.check(now):  # the window holds what late readings said
-            self.window, self.watch, now = None, EncoderWatch(), self._come(stamp_ns)
+            self.window = self._left = None
+            self.watch, now = EncoderWatch(), self._come(stamp_ns)
         if now.crane is None or not len(now.crane.stamp_ns):
             return
         sums = self.watch.put_together(int(now.crane.stamp_ns[0]))
@@ -196,8 +208,19 @@ class FixedLagEstimator:
             return (), ()
         begin_ns = int(crane.stamp_ns[0])
         sure, maybe = jump_sentences(sorted(self.watch.told, key=lambda jump: jump.stamp_ns), begin_ns, None)
-        late = self.delay.sentences(begin_ns)
-        return (*late, *freeze_sentences(self.watch.frozen, begin_ns), *sure), maybe
+        late, frozen = self.delay.sentences(begin_ns), freeze_sentences(self.watch.frozen, begin_ns)
+        return (*late, *frozen, *self._scale_sentences(begin_ns), *sure), maybe
+
+    def _scale_sentences(self, begin_ns: int) -> tuple[str, ...]:
+        """Describe the scales that are no longer taken as right: whichever is wrong, poses before are off."""
+        window = self.window or self._left
+        if window is None or window.scales is None or self._scaled_ns is None:
+            return ()
+        problem, excess = window.problem, scale_excess(window.problem, window.scales)
+        at = [k for k, axis in enumerate(problem.scaled) if axis not in problem.held]
+        since = f" from {(self._scaled_ns - begin_ns) / NS_PER_S:.1f} s on; poses before may be off by it"
+        sure, maybe = scale_sentences([problem.scaled[k] for k in at], excess.chosen(at), since)
+        return sure + maybe
 
     def _now(self, stamp_ns: int) -> SensorBuffer:
         """Select the readings that have arrived when the frame at a stamp is computed, from before the first
@@ -229,10 +252,16 @@ class FixedLagEstimator:
             start, nodes.stamp_ns, now.crane is None, None, ties.preintegrated, (), (), ties.still, ties.bias,
             offset_prior_px=settings.offset_prior_px, scale_prior=settings.scale_sigma,
             has_latency=now.crane is not None, has_imu=now.imu is not None, jumps=self.watch.jumps,
+            mounting_sigma_rad=self._crane.mounting_sigma_rad, scaled=AXES if now.crane else (),
+            held=AXES if now.crane else (),
         )  # fmt: skip
+        left, scales = self._left, None
+        if left is not None and left.problem.has_latency and now.crane is not None:
+            scales, old = left.scales, left.problem
+            problem = replace(problem, held=old.held, known_scales=scales, travelled=old.travelled)
         state = GraphState(initial_values(problem), np.empty((0, 4)), np.zeros(2))
-        window = Window(problem, state, np.empty(0, np.int64))
-        return self._with_attitudes(window, 0, now)
+        window = Window(problem, state, np.empty(0, np.int64), scales=scales)
+        return with_attitudes(window, 0, now.crane, self._crane)
 
     def _grown(self, stamp: int, sighting: Sighting | None, now: SensorBuffer) -> Window | Failed:
         window = self.window
@@ -251,7 +280,7 @@ class FixedLagEstimator:
             quiet = is_imu_quiet(grew.problem.stamp_ns[first:], now.imu, now.noise)
             still = (*grew.problem.still, *(first + int(k) for k in np.flatnonzero(quiet)))
             grew = replace(grew, problem=replace(grew.problem, still=still))
-        return self._with_attitudes(grew, first, now)
+        return with_attitudes(grew, first, now.crane, self._crane)
 
     def _started(
         self, window: Window, stamps: list[int], parts: tuple[Preintegrated | None, ...],
@@ -299,46 +328,3 @@ class FixedLagEstimator:
         if sighting is None or sighting.motion is None or window.seen_ns != last_ns:
             return False
         return float(np.linalg.norm(sighting.motion.translation)) < MAX_STILL_M
-
-    def _with_attitudes(self, window: Window, first: int, now: SensorBuffer) -> Window:
-        """Add priors of the nominal attitude at the nodes from `first` on: loose ones under way, and a single
-        one at rest, since there the error is the same each time.
-        """
-        if now.crane is None:
-            return window
-        crane, problem, stood, added = self._crane, window.problem, window.stood, []
-        for k in range(first, len(problem.start)):
-            sigma = crane.attitude_std_deg * 1.6
-            if k in problem.still:
-                if stood:
-                    continue
-                sigma, stood = crane.sway_std_deg, True
-            added.append(AttitudePrior(k, now.crane.yard_from_body_nominal, np.full(3, np.deg2rad(sigma))))
-        extended = replace(problem, attitudes=problem.attitudes + tuple(added))
-        return replace(window, problem=extended, stood=stood)
-
-    def _bound(self, window: Window, sighting: Sighting | None, now: SensorBuffer, stamp: int) -> Window:
-        """Add the encoder positions, 0.4 s apart, of the nodes for whose fit all readings have arrived; at
-        once where nothing else ties the last node to the one before.
-        """
-        if now.crane is None:
-            return window
-        crane, placed, problem = reestimate_noise(now.crane), list(window.problem.placed), window.problem
-        placed_ns = window.placed_ns
-        half, spacing = crane.reach_ns(seconds_to_ns(FIT_S)), 0.97 * place_spacing_ns(crane)
-        complete, last = stamp + self.readings.delay_ns - half, len(problem.start) - 1
-        by_imu = last > 0 and problem.preintegrated[-1] is not None
-        loose = not by_imu and (sighting is None or sighting.motion is None)
-        for k, node_ns in enumerate(problem.stamp_ns.tolist()):
-            at_once = loose and k == last
-            near = placed_ns is not None and node_ns - placed_ns < spacing
-            if not at_once and (near or node_ns > complete):
-                continue
-            wide, way = seconds_to_ns(self._crane.window_s) if at_once else half, None
-            if now.imu is not None and not at_once:
-                way = way_around(now.imu, node_ns, half, window.pose(k).rotation, window.bias, 2)
-            found = encoder_position(crane, k, node_ns, wide, way)
-            if not isinstance(found, Failed):
-                placed.append(found)
-                placed_ns = node_ns
-        return replace(window, problem=replace(problem, placed=tuple(placed)), placed_ns=placed_ns)

@@ -1,8 +1,11 @@
 """Form and solve the window's normal equations, which are dense.
 
 Order of the unknowns: node by node those of the frames held (pose, with an IMU velocity and biases; nodes
-between frames are eliminated first, `gaps`), then the border: with encoders their latency, their jumps and
-the slide that all points in view share (`Window.slide`), then the rig's drift.
+between frames are eliminated first, `gaps`), then the border: with encoders their unknowns and the slide that
+all points in view share (`Window.slide`), then the rig's drift.
+
+The encoders' scales are held at zero at first, like the rest of a Schmidt filter's [Schmidt 1966] states that
+are only considered: what shows them is kept, so that one that becomes doubtful is known at once.
 """
 
 from __future__ import annotations
@@ -11,9 +14,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from barsight.core.arrays import Bool, Float64
+from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.linalg import dense, skyline
 from barsight.core.pose import Pose, skew
+from barsight.motion.batch.encoder_scale import WIDER_SIGMAS, scales_alone, weigh_scales
 from barsight.motion.linear.chain_elimination import (
     Chain,
     EliminatedNodes,
@@ -27,6 +31,7 @@ from barsight.motion.linear.schur_complement import (
     eliminate_points,
     scatter_reduced,
 )
+from barsight.motion.problem.attitude_factors import add_attitudes
 from barsight.motion.problem.encoder_factors import add_encoders
 from barsight.motion.problem.gauss_newton import (
     GraphState,
@@ -37,7 +42,8 @@ from barsight.motion.problem.gauss_newton import (
 )
 from barsight.motion.problem.gtsam_factors import build_graph, linearise_chain
 from barsight.motion.problem.problem import Problem, encoder_unknowns_of
-from barsight.motion.problem.rig_drift import LOOSE, combine_with_prior
+from barsight.motion.problem.rig_drift import LOOSE, combine_with_prior, drift_prior
+from barsight.motion.problem.travel import Scales
 
 SLIDE_SIGMA_RAD = 2.5e-4
 """Standard deviation of the slide common to all points in view: 1 to 4e-4 over stacks, nothing on floors
@@ -74,13 +80,16 @@ class NewestNode:
 
 @dataclass(frozen=True, eq=False)
 class WindowSolution:
-    """state, slide: after the `step` (n,). drift_covariance: (2, 2), None where the rig is taken as exact."""
+    """state, slide: after the `step` (n,). drift_covariance: (2, 2), None where the rig is taken as exact.
+    scales: of `Problem.scaled`, those held as they would be if they weren't; None where nothing shows them.
+    """
 
     state: GraphState
     slide: float
     step: Float64
     newest: NewestNode
     drift_covariance: Float64 | None
+    scales: Scales | None
 
 
 def border_of(problem: Problem, state: GraphState, slide: float) -> Float64:
@@ -131,6 +140,9 @@ def _chain(problem: Problem, state: GraphState, first: int, end: int, last: int)
     chain = linearise_chain(build_graph(problem, first, end), state.values, size, len(problem.start))
     placed = tuple(place for place in problem.placed if first <= place.node < end)
     add_encoders(chain, replace(problem, placed=placed), state.poses, encoder_unknowns_of(state.values))
+    attitudes = tuple(one for one in problem.attitudes if first <= one.node < end)
+    own = replace(problem, attitudes=attitudes)
+    add_attitudes(chain, own, state.poses, encoder_unknowns_of(state.values))
     return chain.at(slice(first, last + 1))
 
 
@@ -183,25 +195,71 @@ def solve_step(
     """Solve for the full step. Raises LinAlgError where the measurements leave an unknown undetermined."""
     size, matrix = problem.width, equations.matrix.copy()
     matrix[[-2, -1], [-2, -1]] += 1 / np.array(LOOSE) ** 2
-    factor = dense.cholesky(matrix)
-    forward = dense.solve_lower(factor, equations.gradient)
+    begin = len(problem.retained) * size
+    held = begin + _held_places(problem)
+    order = np.append(np.delete(np.arange(len(matrix)), held), held)
+    whole = dense.cholesky(matrix[np.ix_(order, order)])
+    pulled = dense.solve_lower(whole, equations.gradient[order])
+    free = len(order) - len(held)
+    factor, forward = whole[:free, :free], pulled[:free]
     covariance, by_drift = None, np.zeros(2)
-    if problem.offset_prior_px > 0 and used.any():
+    weighs_drift = problem.offset_prior_px > 0 and bool(used.any())
+    if weighs_drift:
         own = factor[-2:, -2:]
         best = state.drift - dense.solve_lower(own, forward[-2:], transposed=True)
         drift = combine_with_prior(best, np.linalg.inv(own @ own.T).astype(np.float64), problem)
         by_drift, covariance = np.array([drift.yaw_rad, drift.scale]) - state.drift, drift.covariance
     left = -forward[:-2] - by_drift @ factor[-2:, :-2]
-    step = np.concatenate([dense.solve_lower(factor[:-2, :-2], left, transposed=True), by_drift])
-    tail = len(matrix) - len(problem.retained) * size + size
-    own = factor[-tail:, -tail:]
+    step = np.zeros(len(order))
+    step[order[:free]] = np.append(dense.solve_lower(factor[:-2, :-2], left, transposed=True), by_drift)
+    own = factor[begin - size :, begin - size :]
     information = own @ own.T
-    inverse = np.linalg.inv(information[:-2, :-2])[:size].astype(np.float64)
-    newest = NewestNode(inverse[:, :size], -inverse @ information[:-2, -2:])
+    inverse = np.linalg.inv(information[:-2, :-2]).astype(np.float64)
+    jacobian = -inverse @ information[:-2, -2:]
+    newest = NewestNode(inverse[:size, :size], jacobian[:size])
     slid = float(step[-3]) if problem.has_latency else 0.0
-    return WindowSolution(
-        _stepped(problem, state, used, step, equations.gaps), slide + slid, step, newest, covariance
-    )
+    stepped = _stepped(problem, state, used, step, equations.gaps)
+    scales = None
+    if weighs_drift and problem.scaled and covariance is not None:
+        spread = (inverse + jacobian @ covariance @ jacobian.T)[size:, size:]
+        scales = _scales(problem, encoder_unknowns_of(stepped.values), spread)
+        if len(held):
+            own = whole[free - 2 :, free - 2 :]
+            best = -dense.solve_lower(own, pulled[free - 2 :], transposed=True)
+            best[:2] += state.drift
+            scales = _with_held(problem, scales, best, np.linalg.inv(own @ own.T).astype(np.float64))
+            newest = _widened(problem, newest, scales, whole[begin - size :, begin - size :])
+    return WindowSolution(stepped, slide + slid, step, newest, covariance, scales)
+
+
+def _held_places(problem: Problem) -> Int64:
+    """Return the places in the border of the scales that are held."""
+    if not problem.has_latency:
+        return np.empty(0, np.int64)
+    places: Int64 = problem.scale_places.start + np.flatnonzero(np.isin(problem.scaled, problem.held))
+    return places
+
+
+def _scales(problem: Problem, unknowns: Float64, covariance: Float64) -> Scales:
+    """Read the scales that aren't held from the encoders' unknowns (S,). covariance: of the border without
+    those held.
+    """
+    free = np.flatnonzero(~np.isin(problem.scaled, problem.held))
+    spread, at = np.zeros((len(problem.scaled),) * 2), problem.scale_places.start + np.arange(len(free))
+    spread[np.ix_(free, free)] = covariance[np.ix_(at, at)]
+    return Scales(unknowns[problem.scale_places], spread)
+
+
+def _with_held(problem: Problem, scales: Scales, best: Float64, covariance: Float64) -> Scales:
+    """Add the scales that are held. best, covariance: (2 + H,) of the rig's drift and of these, as the
+    equations alone would have them.
+    """
+    held = np.flatnonzero(np.isin(problem.scaled, problem.held))
+    last = np.roll(np.arange(len(best)), -2)
+    found = weigh_scales(problem, best[last], covariance[np.ix_(last, last)])
+    value, spread = scales.value.copy(), scales.covariance.copy()
+    value[held], spread[np.ix_(held, held)] = found.value, found.covariance
+    return Scales(value, spread)
 
 
 def _stepped(
@@ -216,6 +274,24 @@ def _stepped(
         pictures = pictures + step[-3] * slide_twist(problem.sightings.body_from_rect0)
     border = np.concatenate([encoders, step[-2:]])
     return retract(problem, state, used, by_node, np.empty(0), border, pictures)
+
+
+def _widened(problem: Problem, newest: NewestNode, scales: Scales, factor: Float64) -> NewestNode:
+    """Add to the last node's covariance what scales that are held may do to it. factor: of the last node, the
+    border, and the scales that are held.
+    """
+    value, sigmas = scales_alone(
+        problem, problem.held, scales.chosen(np.flatnonzero(np.isin(problem.scaled, problem.held)))
+    )
+    off = np.where(sigmas > WIDER_SIGMAS, value, 0.0)
+    if not off.any():
+        return newest
+    information = factor @ factor.T
+    free = len(information) - len(off)
+    own = information[:free, :free]
+    own[[-2, -1], [-2, -1]] += drift_prior(problem) ** -2.0
+    moved = -np.linalg.solve(own, information[:free, free:])[: len(newest.covariance)] * off
+    return replace(newest, covariance=newest.covariance + moved @ moved.T)
 
 
 def marginal_prior(left: DenseEquations, step: Float64, count: int) -> tuple[Float64, Float64]:

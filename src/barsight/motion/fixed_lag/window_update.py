@@ -17,6 +17,7 @@ from barsight.core.arrays import Bool, Float64
 from barsight.core.linalg import dense
 from barsight.core.pose import Pose
 from barsight.motion.batch.bundle_adjustment import MIN_AGREEING, robust_noise
+from barsight.motion.batch.encoder_scale import doubtful_axes
 from barsight.motion.fixed_lag.sliding_window import Window
 from barsight.motion.fixed_lag.window_equations import (
     DenseEquations,
@@ -95,6 +96,11 @@ def solve_window(window: Window, held: int) -> tuple[Window, MarginalisedPart | 
         equations = left = equations + assemble_equations(problem, state, used & goes, 0, count)
     equations = equations + assemble_equations(problem, state, used & ~goes, count, len(problem.start))
     found = solve_step(problem, state, window.slide, used, equations)
+    at = [problem.scaled.index(axis) for axis in problem.held]
+    doubtful = doubtful_axes(problem, problem.held, found.scales and found.scales.chosen(at))
+    if doubtful:
+        problem = replace(problem, held=tuple(axis for axis in problem.held if axis not in doubtful))
+        found = solve_step(problem, state, window.slide, used, equations)
     if count:
         leaving = MarginalisedPart(count, ended, left, found.step)
     fits = encoder_inliers(found.state.values, problem)
@@ -105,7 +111,8 @@ def solve_window(window: Window, held: int) -> tuple[Window, MarginalisedPart | 
         mounting = _about_axis(stated.body_from_rect0, found.slide - window.slide)
         stated = replace(stated, body_from_rect0=mounting)
     result = replace(
-        window, problem=replace(window.problem, placed=kept, sightings=stated), state=found.state,
+        window, problem=replace(window.problem, placed=kept, sightings=stated, held=problem.held),
+        state=found.state, scales=found.scales or window.scales,
         slide=found.slide, noise=noise, drift_covariance=found.drift_covariance, newest=found.newest,
     )  # fmt: skip
     return result, leaving

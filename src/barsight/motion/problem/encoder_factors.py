@@ -37,6 +37,7 @@ from barsight.motion.problem.problem import (
     poses_of,
 )
 from barsight.motion.problem.rig_drift import HUBER_SIGMAS
+from barsight.motion.problem.travel import Scales
 
 FARTHEST_SIGMAS = 5.0
 WINDOW_S = 0.21
@@ -62,16 +63,15 @@ AXES = ("bridge", "trolley", "hoist")
 @dataclass(frozen=True)
 class EncoderState:
     """latency_s and its sigma: zero and the prior's where nothing shows it. jump_m, jump_sigma_m: (J,) size
-    of each jump and its sigma. excess, excess_sigma: (S,) by how much each encoder whose scale is an unknown
-    travels too far, as a ratio.
+    of each jump and its sigma. excess: (S,) by how much each encoder whose scale is an unknown travels too
+    far.
     """
 
     latency_s: float
     latency_sigma_s: float
     jump_m: Float64
     jump_sigma_m: Float64
-    excess: Float64
-    excess_sigma: Float64
+    excess: Scales
 
 
 def encoder_position(
@@ -181,9 +181,8 @@ def encoder_sigmas(problem: Problem, min_m: float = MIN_SIGMA_M) -> Float64:
 
 def travel_m(problem: Problem) -> Float64:
     """Return the extent (3,) of the encoders' positions, at least `PLAY_M`."""
-    place = np.array([p.position_m for p in problem.placed]).reshape(-1, 3)
-    extent: Float64 = np.maximum(np.ptp(place, axis=0), PLAY_M) if len(place) else np.full(3, PLAY_M)
-    return extent
+    travel = problem.travel
+    return np.full(3, PLAY_M) if travel is None else np.maximum(travel.high_m - travel.low_m, PLAY_M)
 
 
 def encoder_state(values: Any, problem: Problem, sigmas: Float64) -> EncoderState:
@@ -191,12 +190,20 @@ def encoder_state(values: Any, problem: Problem, sigmas: Float64) -> EncoderStat
     found, end = encoder_unknowns_of(values), 1 + len(problem.jumps)
     sizes = np.array([jump.size_m for jump in problem.jumps], np.float64)
     taken_s = 0.0 if problem.crane is None else problem.crane.late_ns / NS_PER_S
-    share = found[end:]  # of the readings' travel
-    play = PLAY_M / travel_m(problem)[list(problem.scaled)]
+    at = problem.scale_places
     return EncoderState(
-        taken_s + float(found[0]), float(sigmas[0]), sizes + found[1:end], sigmas[1:end], share / (1 - share),
-        np.hypot(sigmas[end:], play) / (1 - share) ** 2,
+        taken_s + float(found[0]), float(sigmas[0]), sizes + found[1:end], sigmas[1:end],
+        scale_excess(problem, Scales(found[at], np.diag(sigmas[at] ** 2))),
     )  # fmt: skip
+
+
+def scale_excess(problem: Problem, scales: Scales) -> Scales:
+    """Convert scales, which are shares of the readings' travel, to shares of the true one; their sigmas then
+    hold an encoder's play.
+    """
+    play, share = PLAY_M / travel_m(problem)[list(problem.scaled)], scales.value
+    by_share = np.diag((1 - share) ** -2.0)
+    return Scales(share / (1 - share), by_share @ (scales.covariance + np.diag(play**2)) @ by_share)
 
 
 def jump_sentences(
@@ -223,22 +230,24 @@ def jump_sentences(
 
 
 def scale_sentences(
-    scaled: Sequence[int], state: EncoderState | None
+    scaled: Sequence[int], found: Scales | None, since: str = ""
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Describe the scales, of the encoders `scaled`, that are certainly or possibly wrong."""
+    """Describe the scales, of the encoders `scaled`, that are certainly or possibly wrong. found: (S,), as
+    from `scale_excess`; since: from when on they were taken off.
+    """
     sure, maybe = [], []
-    for k, axis in enumerate(scaled if state is not None else ()):
-        assert state is not None
-        excess, sigma = 100 * state.excess[k], 100 * state.excess_sigma[k]
+    for k, axis in enumerate(scaled if found is not None else ()):
+        assert found is not None
+        excess, sigma = 100 * found.value[k], 100 * found.sigma[k]
         size = f"{abs(excess):.2f} % too {'far' if excess > 0 else 'short'} (1 sigma {sigma:.2f} %)"
         encoder = f"the {AXES[axis]}'s encoder"
         if abs(excess) > SURE_SCALE_SIGMAS * sigma:
             sure.append(
                 f"{encoder} travels {size} by cameras and IMU: a wrong scale; "
-                "this was taken off (check its wheel and gear, else the cameras' baseline)"
+                f"this was taken off{since} (check its wheel and gear, else the cameras' baseline)"
             )
         else:
-            maybe.append(f"{encoder} may travel {size} by cameras and IMU: sigma holds it")
+            maybe.append(f"{encoder} may travel {size} by cameras and IMU: sigma holds it{since}")
     return tuple(sure), tuple(maybe)
 
 
@@ -289,8 +298,9 @@ def _readings(problem: Problem, unknowns: Float64) -> tuple[Float64, Float64]:
     stamps = problem.stamp_ns[_nodes(placed)]
     for k, jump in enumerate(problem.jumps, start=1):
         derivative[:, jump.axis, k] = -jump.share(stamps)
+    assert problem.travel is not None
     for k, axis in enumerate(problem.scaled, start=1 + len(problem.jumps)):
-        derivative[:, axis, k] = place[:1, axis] - place[:, axis]
+        derivative[:, axis, k] = problem.travel.first_m[axis] - place[:, axis]
     reading = place + (velocity + derivative[..., 0]) / 2 * latency_s + derivative[..., 1:] @ unknowns[1:]
     return reading, derivative
 

@@ -27,6 +27,7 @@ from barsight.motion.linear.schur_complement import (
     eliminate_points,
     scatter_reduced,
 )
+from barsight.motion.problem.attitude_factors import add_attitudes, attitudes_cost
 from barsight.motion.problem.encoder_factors import add_encoders, encoders_cost
 from barsight.motion.problem.gtsam_factors import linearise_chain
 from barsight.motion.problem.normal_equations import System
@@ -127,9 +128,9 @@ def optimise_graph(
 ) -> tuple[GraphState, System]:
     """Find the state that fits best, and its system, by Levenberg-Marquardt.
 
-    graph: GTSAM's factors of everything but sightings and encoders. The rig's drift is kept fixed. min_gain:
-    relative decrease of the cost from which a step is followed by another. Raises LinAlgError where the
-    measurements leave an unknown undetermined.
+    graph: GTSAM's factors of everything but sightings, encoders and attitudes. The rig's drift is kept fixed.
+    min_gain: relative decrease of the cost from which a step is followed by another. Raises LinAlgError where
+    the measurements leave an unknown undetermined.
     """
     found = minimise(_PoseIterate(problem, graph, used, state), Options(max_steps, min_gain, 0.0, 1e-5, 1e6))
     if found.termination is Termination.SINGULAR:
@@ -145,6 +146,7 @@ def linearise_graph(problem: Problem, graph: Any, state: GraphState, used: Bool)
     corner, corner_gradient = np.zeros((border, border)), np.zeros(border)
     whole = linearise_chain(graph, state.values, layout.size, len(problem.start))
     add_encoders(whole, problem, state.poses, encoder_unknowns_of(state.values))
+    add_attitudes(whole, problem, state.poses, encoder_unknowns_of(state.values))
     chain, gaps = eliminate_nodes(whole, problem.retained)
     add_chain(chain, layout.node, rows)
     gradient[layout.nodes] = chain.gradient.ravel()
@@ -221,6 +223,7 @@ def retract(
 
 def cost_of(problem: Problem, graph: Any, state: GraphState, used: Bool) -> float:
     cost = float(graph.error(state.values)) + encoders_cost(state.values, problem)
+    cost += attitudes_cost(state.values, problem)
     if problem.pieces is not None:
         cost += problem.pieces.cost(state.pieces)
     if problem.sightings is None:

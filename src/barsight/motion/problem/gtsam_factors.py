@@ -1,6 +1,6 @@
-"""Build GTSAM's factors of everything but sightings and encoders, and linearise them: preintegrated IMU
-between neighbouring nodes; priors on attitude, biases, the encoders' unknowns and, where the body stands
-still, velocity.
+"""Build GTSAM's factors of everything but sightings, encoders and attitudes, and linearise them:
+preintegrated IMU between neighbouring nodes; priors on biases, the encoders' unknowns and, where the body
+stands still, velocity.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from gtsam.symbol_shorthand import B, E, V, X
 from barsight.core.arrays import Float64, Int64
 from barsight.core.pose import Pose
 from barsight.motion.linear.chain_elimination import Chain, add_products
+from barsight.motion.problem.attitude_factors import MIN_SIGMA_RAD
 from barsight.motion.problem.problem import Problem, encoder_unknowns_of
 
 WIDTHS = {"x": 6, "v": 3, "b": 6}
@@ -24,8 +25,8 @@ ENCODER_SCALE_SIGMA = 0.1
 
 
 def build_graph(problem: Problem, first: int = 0, end: int | None = None) -> Any:
-    """Build the graph, without sightings and encoders, of the factors of nodes first...end - 1 (None: all)
-    and, by the IMU, of each with the next.
+    """Build the graph, without sightings, encoders and attitudes, of the factors of nodes first...end - 1
+    (None: all) and, by the IMU, of each with the next.
     """
     graph = gtsam.NonlinearFactorGraph()
     nodes = range(first, len(problem.start) if end is None else end)
@@ -48,8 +49,17 @@ def initial_values(problem: Problem) -> Any:
             values.insert(V(k), velocity[k])
             values.insert(B(k), bias)
     if problem.has_latency:
-        values.insert(E(0), np.zeros(problem.encoder_unknowns))
+        values.insert(E(0), _encoder_start(problem))
     return values
+
+
+def _encoder_start(problem: Problem) -> Float64:
+    """Begin with no latency, the jumps as stated and, where a scale is known, with it."""
+    start = np.zeros(problem.encoder_unknowns)
+    if problem.known_scales is not None:
+        free = ~np.isin(problem.scaled, problem.held)
+        start[problem.scale_places] = np.where(free, problem.known_scales.value, 0.0)
+    return start
 
 
 def linearise_chain(graph: Any, values: Any, width: int, nodes: int) -> Chain:
@@ -101,15 +111,16 @@ def _add_priors(graph: Any, problem: Problem, nodes: range) -> None:
             sigmas = gtsam.noiseModel.Gaussian.Covariance(whole)
         graph.add(gtsam.PriorFactorPose3(X(0), _gtsam_pose(problem.start[0]), sigmas))
     if problem.has_latency and begins:
+        known, at = problem.known_scales, problem.scale_places
         scales = [ENCODER_SCALE_SIGMA] * len(problem.scaled)
         jumps = (jump.sigma_m for jump in problem.jumps)
-        sigmas = _sigmas(problem.encoder_latency_sigma_s, *jumps, *scales)
-        graph.add(gtsam.PriorFactorVector(E(0), np.zeros(problem.encoder_unknowns), sigmas))
-    for attitude in problem.attitudes:
-        if attitude.node not in nodes:
-            continue
-        rotation = gtsam.Rot3(attitude.rotation)
-        graph.add(gtsam.PoseRotationPrior3D(X(attitude.node), rotation, _sigmas(*attitude.sigma_rad)))
+        mounting = [max(problem.mounting_sigma_rad, MIN_SIGMA_RAD)] * 3
+        sigmas = np.array([problem.encoder_latency_sigma_s, *jumps, *scales, *mounting])
+        mean, covariance = np.zeros(len(sigmas)), np.diag(sigmas**2)
+        if known is not None:
+            mean[at], covariance[at, at] = known.value, known.covariance
+        noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
+        graph.add(gtsam.PriorFactorVector(E(0), mean, noise))
 
 
 def _add_imu(graph: Any, problem: Problem, nodes: range) -> None:

@@ -20,6 +20,7 @@ from barsight.inertial.model import ImuBias
 from barsight.inertial.preintegration import Preintegrated
 from barsight.motion.frontend.sightings import Sighting
 from barsight.motion.linear.ordering import Ordering, order_unknowns
+from barsight.motion.problem.travel import EncoderTravel, Scales
 
 FIRST_UNEVEN_M = 0.0005
 ALIKE_M = 0.5
@@ -91,11 +92,14 @@ class EncoderPosition:
 
 @dataclass(frozen=True, eq=False)
 class AttitudePrior:
-    """Prior on a node's attitude, reference_from_body (3, 3); sigma_rad (3,) in body axes."""
+    """Prior on a node's attitude, reference_from_body (3, 3); sigma_rad (3,) in body axes. sways: whether it
+    is about the mounting, whose error is an unknown (`attitude_factors`).
+    """
 
     node: int
     rotation: Float64
     sigma_rad: Float64
+    sways: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +189,7 @@ def inertial_of(values: Any, nodes: Int64) -> Float64:
 
 def encoder_unknowns_of(values: Any) -> Float64:
     """Extract the encoders' unknowns (S,) from GTSAM's values: their latency, s, the excess of each jump
-    over its stated size, m, and relative scales; (0,) without encoders.
+    over its stated size, m, relative scales, and the mounting's error, rad; (0,) without encoders.
     """
     return np.asarray(values.atVector(E(0))) if values.exists(E(0)) else np.empty(0)
 
@@ -234,6 +238,14 @@ class Problem:
     """Jumps of the encoders, each of which is an unknown."""
     scaled: tuple[int, ...] = ()
     """Axes whose encoder's scale is an unknown (`encoder_scale`)."""
+    held: tuple[int, ...] = ()
+    """Those of them whose scale is taken as right, though what shows it is kept."""
+    known_scales: Scales | None = None
+    """Prior of the scales; None: they may be anything."""
+    travelled: EncoderTravel | None = None
+    """Encoders' travel before and within `placed`; None: that of `placed`."""
+    mounting_sigma_rad: float = float(np.deg2rad(0.1))
+    """Prior standard deviation of the mounting's error about each axis."""
     has_imu: bool = False
     """Whether velocities and biases are unknowns."""
     uneven_m: Float64 = field(default_factory=lambda: np.full(3, FIRST_UNEVEN_M))
@@ -248,6 +260,17 @@ class Problem:
         if not len(place):
             return np.empty(0, np.int64)
         return np.asarray(KDTree(place).query_ball_point(place, ALIKE_M, return_length=True), np.int64)
+
+    @cached_property
+    def travel(self) -> EncoderTravel | None:
+        """Return the encoders' travel; None without any position."""
+        return self.travelled or EncoderTravel.of([place.position_m for place in self.placed])
+
+    @property
+    def scale_places(self) -> slice:
+        """Return the places of the scales among the encoders' unknowns."""
+        begin = 1 + len(self.jumps)
+        return slice(begin, begin + len(self.scaled))
 
     @cached_property
     def retained(self) -> Int64:
@@ -278,8 +301,8 @@ class Problem:
 
     @property
     def encoder_unknowns(self) -> int:
-        """Count the encoders' unknowns: latency, jumps and scales."""
-        return 1 + len(self.jumps) + len(self.scaled) if self.has_latency else 0
+        """Count the encoders' unknowns: latency, jumps, scales and the mounting's error."""
+        return 1 + len(self.jumps) + len(self.scaled) + 3 if self.has_latency else 0
 
     @property
     def border(self) -> int:
