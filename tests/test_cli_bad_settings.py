@@ -93,7 +93,7 @@ def test_a_group_alone_asks_for_the_rest(group: str, line: str, capsys: pytest.C
 @pytest.mark.parametrize(
     ("words", "usage"),
     [
-        (("store", "keep"), "URL RECORDING WHY"),
+        (("store", "keep"), "URL RECORDING WHY [--release | --no-release] [--by STR]"),
         (("yard",), "[URL]"),
         (("measure",), "RECORDING [...]"),
         (("bench", "length"), "RECORDING"),

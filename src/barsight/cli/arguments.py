@@ -23,6 +23,7 @@ Settings = TypeVar("Settings")
 LISTS = ("--use", "--lifted", "--fetch")
 """Flags whose values may be separated by commas."""
 _POSITIONAL = cast(Any, tyro.conf.Positional[int]).__metadata__[0]
+_WORDS = {Path: "PATH", str: "STR", int: "INT", float: "FLOAT"}
 
 
 def call(command: Callable[..., None], name: str, arguments: Sequence[str]) -> None:
@@ -37,16 +38,20 @@ def call(command: Callable[..., None], name: str, arguments: Sequence[str]) -> N
 
 
 def _prepare_help(command: Callable[..., None]) -> None:
-    """Give positional arguments their own names in usage and help, RECORDING instead of PATH, and let each
-    argument's description flow as one paragraph.
+    """Give positional arguments their own names in usage and help, RECORDING instead of PATH, others that may
+    be left out one word, PATH instead of {None}|PATH, and let each description flow as one paragraph.
     """
     command.__doc__ = re.sub(r"\n {8,}(?=\S)", " ", inspect.getdoc(command) or "")
     hints = get_type_hints(command, include_extras=True)
     for name, parameter in inspect.signature(command).parameters.items():
         hint, word = hints[name], name.upper()
-        if _POSITIONAL not in getattr(hint, "__metadata__", ()):
+        kind, *marks = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+        if _POSITIONAL not in marks:
+            inner = [one for one in get_args(kind) if one in _WORDS]
+            if type(None) in get_args(kind) and len(inner) == 1:
+                hints[name] = Annotated[hint, tyro.conf.arg(metavar=_WORDS[inner[0]])]
             continue
-        if get_origin(get_args(hint)[0]) is tuple:  # one or more
+        if get_origin(kind) is tuple:  # one or more
             shown = tyro.conf.arg(metavar=f"{word[:-1]} [...]", help_behavior_hint="(required)")
         else:
             needed = parameter.default is parameter.empty
