@@ -52,8 +52,9 @@ def test_late_encoders_of_a_crane_that_oscillates_are_put_right(
 @pytest.mark.parametrize(("seed", "late_s"), [(20000, 0.2), (20009, 0.2), (20003, -0.2)])
 def test_live_says_that_encoders_are_late(seed: int, late_s: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """With those that are early, most frames were refused."""
-    found, _ = drawn("live", seed, late_s, monkeypatch)
+    found, drift = drawn("live", seed, late_s, monkeypatch)
     (told,) = found.doubts
+    assert drift.nees_position < 2  # those from before are wide: it was 15 to 90
     assert f"the encoders are 200 ms {'late' if late_s > 0 else 'early'}" in told and not found.refused
     late_on = found.frames[len(found.frames) // 2 :]
     crane = drawn_crane(seed)

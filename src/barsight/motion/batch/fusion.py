@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from barsight.calibration.geometry.rectification import Rectifier
+from barsight.core.arrays import Float64
 from barsight.core.errors import ConfigError, Failed, InputError, MeasurementError
 from barsight.core.motion_detail import NormalisedResiduals
 from barsight.core.records.pairs import NamedPoints, RefusedFrame

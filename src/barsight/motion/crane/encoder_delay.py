@@ -40,8 +40,8 @@ class DelaySearch:
         self._count = 0
 
     def add(self, crane: CraneSamples, imu: ImuSamples, begin_ns: int) -> bool:
-        """Add the readings of the part that begins at a stamp; return whether they told anything. Those that no
-        delay explains, as they froze or jumped, don't.
+        """Add the readings of the part that begins at a stamp; return whether they told anything. Those that
+        no delay explains, as they froze or jumped, don't.
         """
         spare, end_ns = seconds_to_ns(float(LATE_S[-1])), begin_ns + seconds_to_ns(PART_S)
         first, end = np.searchsorted(crane.stamp_ns, (begin_ns, end_ns))

@@ -11,12 +11,14 @@ STEP_S = 2.0
 
 
 class DelayWatch:
-    """Delay of the encoders' stamps so far. late_ns: 0 until one is found; from then on it is taken off."""
+    """Delay of the encoders' stamps so far. late_ns: 0 until one is found, at `found_ns`; from then on it is
+    taken off.
+    """
 
     def __init__(self) -> None:
         self.late_ns = 0
         self._search = DelaySearch()
-        self._next_ns, self._found_ns = 0, 0
+        self._next_ns, self.found_ns = 0, 0
 
     def check(self, now: SensorBuffer) -> bool:
         """Examine the readings that have come; return whether they show a delay that wasn't known before."""
@@ -29,14 +31,15 @@ class DelayWatch:
         while begin + part <= last_ns:
             self._search.add(crane, imu, begin)
             begin = self._next_ns = begin + seconds_to_ns(STEP_S)
-        self.late_ns, self._found_ns = seconds_to_ns(self._search.late_s), last_ns
+        self.late_ns = seconds_to_ns(self._search.late_s)
+        self.found_ns = max(int(crane.stamp_ns[-1]), int(imu.stamp_ns[-1]))
         return self.late_ns != 0
 
     def sentences(self, begin_ns: int) -> tuple[str, ...]:
         """Describe the delay, with times in seconds since `begin_ns`."""
         if not self.late_ns:
             return ()
-        off_ms, found_s = round(1e3 * self.late_ns / NS_PER_S), (self._found_ns - begin_ns) / NS_PER_S
+        off_ms, found_s = round(1e3 * self.late_ns / NS_PER_S), (self.found_ns - begin_ns) / NS_PER_S
         off = f"{abs(off_ms)} ms {'late' if off_ms > 0 else 'early'}"
         return (
             f"the encoders are {off}, which showed at {found_s:.1f} s; it is taken off from then on, and "

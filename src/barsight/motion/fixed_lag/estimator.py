@@ -120,8 +120,8 @@ class FixedLagPoses(ImmediatePoses):
         if untied := sum(frame.reason == UNTIED for frame in self.refused):
             doubts += (untied_sentence(untied),)
         return Trajectory(
-            "world" if readings.crane is None else "yard", tuple(self.placed), tuple(self.refused), sensors,
-            warnings, doubts=doubts,
+            "world" if readings.crane is None else "yard", self._estimator.told_later(self.placed),
+            tuple(self.refused), sensors, warnings, doubts=doubts,
         )  # fmt: skip
 
     def _readings(self) -> SensorBuffer:

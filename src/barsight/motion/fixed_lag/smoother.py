@@ -6,6 +6,7 @@ as the readings after the node are there.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -25,6 +26,7 @@ from barsight.motion.crane.encoder_trajectory import CraneSettings, fit_position
 from barsight.motion.fixed_lag.crane_ties import FIT_S, with_attitudes, with_encoder_positions
 from barsight.motion.fixed_lag.delay_watch import DelayWatch
 from barsight.motion.fixed_lag.encoder_watch import EncoderWatch, with_jumps, with_sums
+from barsight.motion.fixed_lag.known_later import way_of_delay, widened
 from barsight.motion.fixed_lag.sensor_buffer import SensorBuffer
 from barsight.motion.fixed_lag.sliding_window import Window, add_frame, add_nodes
 from barsight.motion.fixed_lag.window_update import marginalise, solve_window
@@ -221,6 +223,21 @@ class FixedLagEstimator:
         since = f" from {(self._scaled_ns - begin_ns) / NS_PER_S:.1f} s on; poses before may be off by it"
         sure, maybe = scale_sentences([problem.scaled[k] for k in at], excess.chosen(at), since)
         return sure + maybe
+
+    def told_later(self, frames: Sequence[PosedFrame]) -> tuple[PosedFrame, ...]:
+        """Widen the poses from before a delay or a wrong scale of the encoders was known."""
+        crane, window = self.readings.crane, self.window or self._left
+        stamps = np.array([frame.stamp_ns for frame in frames], np.int64) + self._shift_ns
+        if crane is None or not len(stamps):
+            return tuple(frames)
+        found = widened(frames, way_of_delay(crane, stamps, self.delay.late_ns, self.delay.found_ns))
+        if window is None or window.scales is None or self._scaled_ns is None:
+            return found
+        problem, place = window.problem, np.array([f.reference_from_body.translation for f in frames])
+        assert problem.travel is not None
+        share = np.where(np.isin(problem.scaled, problem.held), 0.0, window.scales.value)
+        off = share * (place - problem.travel.first_m)
+        return widened(found, np.where((stamps < self._scaled_ns)[:, None], off, 0.0))
 
     def _now(self, stamp_ns: int) -> SensorBuffer:
         """Select the readings that have arrived when the frame at a stamp is computed, from before the first
