@@ -99,3 +99,14 @@ def test_scales_of_forty_drawn_cranes(monkeypatch: pytest.MonkeyPatch) -> None:
         print(f"{percent} %: {sure} sure, {maybe} possible of {len(found)}, NEES {nees:.2f} (median)")
         assert sure <= 0 if percent == 0 else sure > 0.5 * len(found)
         assert maybe <= 2 or percent > 0
+
+
+@pytest.mark.slow
+def test_live_scales_of_drawn_cranes(monkeypatch: pytest.MonkeyPatch) -> None:
+    for percent in (0.0, 0.5, 2.0):
+        found = [drawn(seed, monkeypatch, (1 + percent / 100, 1.0), "live") for seed in range(20140, 20152)]
+        told = sum("encoder" in " ".join(trajectory.doubts) for trajectory, _ in found)
+        nees = np.array([[drift.nees_position, drift.nees_attitude] for _, drift in found])
+        print(f"{percent} %: told in {told} of {len(found)}, NEES mean {nees.mean(axis=0)}")
+        assert told == 0 if percent == 0 else told >= 0.3 * len(found)
+        assert np.median(nees) < 3
