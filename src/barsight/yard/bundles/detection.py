@@ -42,7 +42,6 @@ from barsight.yard.bundles.headings import find_headings
 from barsight.yard.bundles.layers import same_place
 from barsight.yard.bundles.reading import Reading
 from barsight.yard.bundles.section.packs import strapped_pack
-from barsight.yard.bundles.section.straps import is_photographed
 from barsight.yard.bundles.set_packing import choose_readings, overlaps, strongest_rivals, without_slivers
 from barsight.yard.bundles.strapped_bundles import without_pieces
 from barsight.yard.sections import split_map
@@ -186,10 +185,7 @@ def _settled(
     packs = ordered_map(
         lambda reading: strapped_pack(height_map, reading.found.grid, reading.found.fit), readings
     )
-    seen = []
-    for reading, pack in zip(readings, packs, strict=True):
-        has_photo = pack is not None or is_photographed(height_map, reading.found.grid, reading.found.fit)
-        seen.append(replace(reading, pack=pack, has_photo=has_photo).with_flanks())
+    seen = [replace(one, pack=pack).with_flanks() for one, pack in zip(readings, packs, strict=True)]
     return [one for one in seen if one.pack is not None or not one.is_flat]
 
 

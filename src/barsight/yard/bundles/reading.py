@@ -20,9 +20,9 @@ class Reading:
     """A chosen outline with its weight (cells explained) and the strongest rival reading of its place.
 
     other_packing: rings of another packing that explains the bundles of this kind as well, if there is one.
-    pack: the bars that straps hold together there, None where no straps are seen; has_photo: whether straps
-    would show. is_along_baseline: whether the line from camera to camera runs roughly along its bars. flanks:
-    of the pack where its bounds are known, otherwise of the outline; None where too little of them is seen.
+    pack: the bars that straps hold together there, None where no straps are seen. is_along_baseline: whether
+    the line from camera to camera runs roughly along its bars. flanks: of the pack where its bounds are
+    known, otherwise of the outline; None where too little of them is seen.
     """
 
     found: FittedOutline
@@ -31,7 +31,6 @@ class Reading:
     rival_weight: float
     other_packing: int | None
     pack: Pack | None = None
-    has_photo: bool = False
     is_along_baseline: bool = False
     flanks: Flanks | None = None
 

@@ -73,13 +73,15 @@ def held_by_straps(
 
 
 def _without_straps(bundle: Bundle, irregular: BundleSigma, reading: Reading) -> Bundle:
-    """Add the doubt to several bars that can't be counted that no straps show where they should."""
+    """Add the doubt to several bars that can't be counted that no straps were seen, whether or not a photo
+    would show them.
+    """
     if bundle.bars is not None:
         return bundle
     bundle = replace(bundle, sigma=irregular)
-    if not reading.has_photo or reading.found.fit.rings == 0:
+    if reading.found.fit.rings == 0:
         return bundle
-    said = "the photo shows no straps that hold it: its bars may lie loose, or be some of a wider bundle's"
+    said = "no straps that hold it were seen: its bars may lie loose, or be some of a wider bundle's"
     return replace(bundle, reasons=(*bundle.reasons, Doubt(DoubtKind.NO_STRAPS, said)))
 
 

@@ -51,8 +51,6 @@ MIN_STRAPS, MIN_ROWS = 2, 20
 """Minimum number of straps that hold a bundle, and of rows of the map for its mean section."""
 _LINE_M, _END_M = 0.05, 0.08
 """Half the length (m) along the bars over which a strap's place is averaged; width (m) of either end."""
-_SHOWN_RATIO = 0.9
-"""Minimum share of a bundle in the photo for missing straps to count as evidence."""
 APART_M = 0.3
 """Minimum spacing (m) of two straps: lines closer together along the bars are one strap."""
 
@@ -195,14 +193,6 @@ def _shown_shares(
     if len(shares) < _SURE_STRAPS:
         return np.zeros(own.size), own
     return known_median(np.array(shares))[0], own
-
-
-def is_photographed(height_map: HeightMap, grid: AlignedMap, fit: Fit) -> bool:
-    """Check whether the orthophoto covers nearly all of a bundle's middle, where straps would show."""
-    if height_map.gray is None:
-        return False
-    beside, gray, _, _ = _around(height_map, grid, fit)
-    return bool(np.isfinite(gray[:, np.abs(beside) < fit.width_m / 4]).mean() > _SHOWN_RATIO)
 
 
 def _around(height_map: HeightMap, grid: AlignedMap, fit: Fit) -> tuple[Float64, Float32, Float32, Bool]:
