@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import yard_maps
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.bundles.section.laid_objects import StraightSections, measure_along
@@ -68,3 +69,19 @@ def test_no_strap_crosses_a_bar_that_lies_along(*, is_bare: bool) -> None:
         heights = replace(heights, gray=np.where(strap, 10, heights.gray).astype(np.uint8))
     found = min(find_bundles(heights, SETTINGS), key=lambda one: abs(one.centre_m[0]))
     assert any("no strap crosses" in sentence for sentence in said(found)) is is_bare
+
+
+@pytest.mark.parametrize(("yaw_deg", "roll_deg"), [(0.4, 0.0), (1.3, 25.0)])
+@pytest.mark.parametrize("beam_m", [0.0, 0.08])
+def test_flanks_in_coarse_cells_are_nothing_that_lies_there(
+    yaw_deg: float, roll_deg: float, beam_m: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A flank off by one of 25 mm was as wide as an object must be. A beam's end on it is found."""
+    monkeypatch.setattr(yard_maps, "CELL_M", 0.025)
+    laid = Laid(0.0, 0.0, 0.2, yaw_deg, length_m=5.0, roll_deg=roll_deg)
+    heights = draw([laid], (-1.0, 1.0), (-3.0, 3.0), 0.002)
+    x = heights.x0_m + heights.cell_m * np.arange(heights.z_m.shape[1])
+    y = heights.y0_m + heights.cell_m * np.arange(heights.z_m.shape[0])
+    heights.z_m[(np.abs(y - 0.6) < beam_m / 2)[:, None] & (x > 0.03) & (x < 0.3)] = 0.4
+    found = min(find_bundles(heights, SETTINGS), key=lambda one: abs(one.centre_m[0]))
+    assert bool(said(found)) is (beam_m > 0)

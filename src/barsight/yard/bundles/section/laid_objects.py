@@ -14,6 +14,8 @@ from barsight.yard.bundles.fitting.rotated_map import AlignedMap
 
 _LAID_M, _LAID_SIZE_M = 0.02, (0.04, 0.03)
 """Minimum rise of an object that lies over a part of a bundle's width, and its size along and across (m)."""
+_LAID_CELLS = 2
+"""Minimum size of such an object in cells: a steep flank is often off by one."""
 _MIN_SEEN_RATIO = 0.75
 """Minimum share of such an object's places that is measured: matching loses places along its edges."""
 _MAX_BOW_CELLS, _BOW_COST_M, _BOW_STEP = 8, 2e-4, 4
@@ -106,7 +108,7 @@ def measure_laid(sections: StraightSections | None) -> tuple[float, bool]:
     sunken = (own < sections.axis_z_m - _GULLY_RATIO * sections.width_m)[0]
     gully = np.logical_and.accumulate(sunken) | np.logical_and.accumulate(sunken[::-1])[::-1]
     rises = np.isfinite(z) & ~(gully & (z < sections.axis_z_m)) & (z - own > _LAID_M)
-    size = [max(round(side / sections.cell_m), 1) for side in _LAID_SIZE_M]
+    size = [max(round(side / sections.cell_m), _LAID_CELLS) for side in _LAID_SIZE_M]
     square = np.ones(size, bool)
     seen = ndimage.uniform_filter(rises.astype(np.float64), size, mode="constant")
     fits = ndimage.binary_erosion(rises | np.isnan(z), square) & (seen > _MIN_SEEN_RATIO - 1e-6)
