@@ -257,7 +257,7 @@ class BatchPoses:
                 "against gyro and encoders",
                 "repair the stamps, or use the pictures alone (use: stereo)",
             )
-        refuse_contradictions(path, sightings, self._imu, self._stated, self._rectifier, shift)
+        refuse_contradictions(path, sightings, self._imu, self._timed, self._rectifier, shift)
 
     def _solve(
         self, recording: Recording, rectifier: Rectifier, inputs: _Inputs, nodes: Nodes, shift: int

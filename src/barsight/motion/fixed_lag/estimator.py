@@ -18,6 +18,7 @@ from barsight.core.stamps import seconds_to_ns
 from barsight.inertial.model import ORDINARY_NOISE, saturation_sentences, without_saturation
 from barsight.motion.batch.fusion import FusionSettings
 from barsight.motion.batch.sensor_agreement import refuse_contradictions
+from barsight.motion.crane.encoder_delay import shifted_back
 from barsight.motion.crane.encoder_trajectory import CraneSettings
 from barsight.motion.estimator import FrameInput, ImmediatePoses, TrajectoryEstimator, pictures_of
 from barsight.motion.fixed_lag.propagation import NavigationState
@@ -107,8 +108,9 @@ class FixedLagPoses(ImmediatePoses):
         """Return all poses. Raises InputError where the pictures contradict a sensor."""
         readings = self._estimator.readings
         imu, spoiled = (None, 0) if readings.imu is None else without_saturation(readings.imu)
+        crane = readings.crane and shifted_back(readings.crane, self._estimator.delay.late_ns)
         refuse_contradictions(
-            self._recording.path, self._estimator.motions, imu, readings.crane, self._rectifier,
+            self._recording.path, self._estimator.motions, imu, crane, self._rectifier,
             self._recording.rig.timeshift_cam_imu_ns,
         )  # fmt: skip
         names = {"crane": readings.crane, "imu": readings.imu, "stereo": self.reads_pictures or None}

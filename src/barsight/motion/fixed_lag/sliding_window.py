@@ -85,11 +85,10 @@ class Window:
         rotation = np.kron(np.eye(2), self.pose(len(self.problem.start) - 1).rotation)
         shared = np.zeros((2, 2)) if self.drift_covariance is None else self.drift_covariance
         drift_jacobian_of_pose = self.newest.drift_jacobian_of_pose[:6]
-        result: Float64 = (
-            rotation
-            @ (self.newest.covariance[:6, :6] + drift_jacobian_of_pose @ shared @ drift_jacobian_of_pose.T)
-            @ rotation.T
-        )
+        known = self.newest.covariance[:6, :6] + drift_jacobian_of_pose @ shared @ drift_jacobian_of_pose.T
+        if self.newest.by_scales is not None:
+            known = known + self.newest.by_scales @ self.newest.by_scales.T
+        result: Float64 = rotation @ known @ rotation.T
         return result
 
     @property

@@ -71,11 +71,13 @@ class DenseEquations:
 @dataclass(frozen=True, eq=False)
 class NewestNode:
     """The last node's covariance (n, n), of pose (body axes), velocity (reference) and biases (accelerometer,
-    gyro), with the rig's drift taken as known; drift_jacobian_of_pose (n, 2) of these by the drift.
+    gyro), with the rig's drift taken as known; drift_jacobian_of_pose (n, 2) of these by the drift. by_scales: (6, H)
+    shifts of the pose by what scales that are held may be off; encoders that go on show nothing of these.
     """
 
     covariance: Float64
     drift_jacobian_of_pose: Float64
+    by_scales: Float64 | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,7 +279,7 @@ def _stepped(
 
 
 def _widened(problem: Problem, newest: NewestNode, scales: Scales, factor: Float64) -> NewestNode:
-    """Add to the last node's covariance what scales that are held may do to it. factor: of the last node, the
+    """Add to the last node by how much scales that are held may be shifting it. factor: of the last node, the
     border, and the scales that are held.
     """
     value, sigmas = scales_alone(
@@ -291,7 +293,7 @@ def _widened(problem: Problem, newest: NewestNode, scales: Scales, factor: Float
     own = information[:free, :free]
     own[[-2, -1], [-2, -1]] += drift_prior(problem) ** -2.0
     moved = -np.linalg.solve(own, information[:free, free:])[: len(newest.covariance)] * off
-    return replace(newest, covariance=newest.covariance + moved @ moved.T)
+    return replace(newest, by_scales=moved[:6])
 
 
 def marginal_prior(left: DenseEquations, step: Float64, count: int) -> tuple[Float64, Float64]:
