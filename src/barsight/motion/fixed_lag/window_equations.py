@@ -71,8 +71,9 @@ class DenseEquations:
 @dataclass(frozen=True, eq=False)
 class NewestNode:
     """The last node's covariance (n, n), of pose (body axes), velocity (reference) and biases (accelerometer,
-    gyro), with the rig's drift taken as known; drift_jacobian_of_pose (n, 2) of these by the drift. by_scales: (6, H)
-    shifts of the pose by what scales that are held may be off; encoders that go on show nothing of these.
+    gyro), with the rig's drift taken as known; drift_jacobian_of_pose (n, 2) of these by the drift.
+    by_scales: (6, H) shifts of the pose by what scales that are held may be off; encoders that go on show
+    nothing of these.
     """
 
     covariance: Float64
@@ -293,7 +294,7 @@ def _widened(problem: Problem, newest: NewestNode, scales: Scales, factor: Float
     own = information[:free, :free]
     own[[-2, -1], [-2, -1]] += drift_prior(problem) ** -2.0
     moved = -np.linalg.solve(own, information[:free, free:])[: len(newest.covariance)] * off
-    return replace(newest, by_scales=moved[:6])
+    return replace(newest, by_scales=moved[:6].astype(np.float64))
 
 
 def marginal_prior(left: DenseEquations, step: Float64, count: int) -> tuple[Float64, Float64]:
