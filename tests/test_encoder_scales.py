@@ -57,7 +57,7 @@ def test_a_wrong_scale_is_named_and_taken_off(
 
 def test_a_scale_that_may_be_wrong_is_in_sigma(monkeypatch: pytest.MonkeyPatch) -> None:
     """0.4 to 0.5 % over a few metres is at the limit of what can be told."""
-    for seed in (20002, 20008, 20010):
+    for seed in (20000, 20002, 20008, 20010):
         found, drift = drawn(seed, monkeypatch, (1.0045, 1.0))
         assert "encoder" in " ".join((*found.doubts, *found.warnings)) and drift.nees_position < 8
 

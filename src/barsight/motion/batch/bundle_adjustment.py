@@ -15,7 +15,7 @@ from barsight.core.pose import Pose, skew
 from barsight.core.records.trajectory import RigDrift
 from barsight.inertial.model import ImuBias
 from barsight.motion.batch.apparent_motion import solve_with_slides
-from barsight.motion.batch.encoder_scale import doubtful_scales
+from barsight.motion.batch.encoder_scale import doubtful_axes, scales_if_unknown, suspected_scales
 from barsight.motion.batch.rig_drift_search import optimise_with_drift
 from barsight.motion.problem.encoder_factors import (
     EncoderState,
@@ -45,6 +45,7 @@ from barsight.motion.problem.stereo_factors import (
     temporal_inflation,
     well_observed,
 )
+from barsight.motion.problem.travel import Scales
 
 FARTHEST_OUTLIER_SIGMAS = 3.5
 MAX_ROUNDS = 3
@@ -67,7 +68,8 @@ class Estimate:
     residuals show it; used: (N,) sightings kept. drift: of the rig, None where no picture was used or the
     calibration is taken as exact. encoders: None without them. placed: P encoder positions; encoder_off_m,
     encoder_sigma_m: (P, 3) residual and sigma of each; encoder_used: (P,) those that agree.
-    scaled: axes whose encoder's scale was estimated. inertial, pictures, imu: of the nodes, stamped by the
+    scaled: axes whose encoder's scale was estimated; suspected: axes and scales of those that were taken as
+    right but may be wrong, which widens `covariance`. inertial, pictures, imu: of the nodes, stamped by the
     nodes' clock; points: (M,) sightings used at each.
     """
 
@@ -89,6 +91,7 @@ class Estimate:
     pictures: NormalisedResiduals | None
     imu: NormalisedResiduals | None
     points: Int64
+    suspected: tuple[tuple[int, ...], Scales] = ((), Scales(np.empty(0), np.empty((0, 0))))
 
 
 def solve_batch(problem: Problem, frames: Int64) -> Estimate:
@@ -100,7 +103,8 @@ def solve_batch(problem: Problem, frames: Int64) -> Estimate:
     scaled to the residuals. Then the drift is estimated again and weighed against its prior, and encoder
     positions beyond 5 sigma are removed. (Removing sightings before the drift is known would take the very
     ones that show it best.) Where an encoder's scale is doubtful, everything is estimated once more with
-    that scale as an unknown. Raises LinAlgError where the measurements leave an unknown undetermined.
+    that scale as an unknown; where it is suspected, it widens the poses. Raises LinAlgError where the
+    measurements leave an unknown undetermined.
     """
     given = problem = replace(problem, asked=frames)
     used = np.ones(0 if problem.sightings is None else len(problem.sightings.node), np.bool_)
@@ -130,10 +134,13 @@ def solve_batch(problem: Problem, frames: Int64) -> Estimate:
         state, system = optimise_graph(problem, build_graph(problem), state, used)
     if seeks_drift and problem.has_latency:
         del system  # two are never held
-        doubtful = doubtful_scales(problem, state, used)
-        if doubtful:
+        tried = scales_if_unknown(problem, state, used)
+        if tried and (doubtful := doubtful_axes(problem, *tried)):
             return solve_batch(replace(given, scaled=(*problem.scaled, *doubtful)), frames)
         system = linearise_graph(problem, build_graph(problem), state, used)
+        estimate = _estimate(frames, everywhere, problem, state, system, used, drift)
+        suspected = suspected_scales(problem, *tried) if tried else estimate.suspected
+        return _widened(replace(estimate, suspected=suspected), problem, frames)
     return _estimate(frames, everywhere, problem, state, system, used, drift)
 
 
@@ -180,6 +187,18 @@ def _estimate(
 
 def _covariance(drift: RigDrift | None) -> Float64:
     return np.zeros((2, 2)) if drift is None else drift.covariance
+
+
+def _widened(estimate: Estimate, problem: Problem, frames: Int64) -> Estimate:
+    """Add to the frames' positions by how much scales that are only suspected may shift them."""
+    (axes, scales), covariance = estimate.suspected, estimate.covariance.copy()
+    if not axes or problem.travel is None:
+        return estimate
+    place = np.array([estimate.poses[k].translation for k in frames])
+    shift = np.zeros_like(place)
+    shift[:, list(axes)] = scales.value * (place - problem.travel.first_m)[:, list(axes)]
+    covariance[:, 3:, 3:] += shift[:, :, None] * shift[:, None, :]
+    return replace(estimate, covariance=covariance)
 
 
 def covariances(found: Marginals, poses: tuple[Pose, ...], drift: RigDrift | None) -> Float64:

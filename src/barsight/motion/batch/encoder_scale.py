@@ -25,20 +25,22 @@ from barsight.motion.problem.travel import Scales
 
 MAYBE_SIGMAS = 4.5
 """Significance from which a scale may be wrong, so that it becomes an unknown."""
+SUSPECTED_SIGMAS = 3.3
+"""Significance from which a scale that isn't an unknown counts in the sigma of a whole recording's poses."""
 WIDER_SIGMAS = 2.0
 """Significance from which a scale that isn't an unknown yet counts in the sigma of what is known by then."""
 MIN_WAY_M = 0.5
 """Minimum travel on an axis for its scale to be told."""
 
 
-def doubtful_scales(problem: Problem, state: GraphState, used: Bool) -> tuple[int, ...]:
-    """Find the axes whose encoder contradicts cameras and IMU in scale, at the optimum; those whose scale is
-    an unknown already aren't asked.
-    """
+def scales_if_unknown(
+    problem: Problem, state: GraphState, used: Bool
+) -> tuple[tuple[int, ...], Scales] | None:
+    """Estimate, at the optimum, the scales that aren't unknowns: their axes, and their values as unknowns."""
     moved = np.flatnonzero(travel_m(problem) > MIN_WAY_M).tolist()
     axes = tuple(axis for axis in moved if axis not in problem.scaled)
     if not axes or not used.any():
-        return ()
+        return None
     known, count = encoder_unknowns_of(state.values), len(axes)
     begin = problem.scale_places.stop
     values = gtsam.Values(state.values)
@@ -52,7 +54,17 @@ def doubtful_scales(problem: Problem, state: GraphState, used: Bool) -> tuple[in
     covariance = np.linalg.inv(own)[np.ix_(at, at)].astype(np.float64)
     best = -np.linalg.solve(own, slope)[at].astype(np.float64)
     best[count:] += state.drift
-    return doubtful_axes(problem, axes, weigh_scales(problem, best, covariance))
+    return axes, weigh_scales(problem, best, covariance)
+
+
+def suspected_scales(
+    problem: Problem, axes: tuple[int, ...], scales: Scales
+) -> tuple[tuple[int, ...], Scales]:
+    """Select the axes whose scale is taken as right but may be wrong, with its value and sigma on each."""
+    value, sigmas = scales_alone(problem, axes, scales)
+    at = np.flatnonzero(sigmas > SUSPECTED_SIGMAS)
+    sigma = np.abs(value[at]) / sigmas[at]
+    return tuple(np.array(axes, np.int64)[at].tolist()), Scales(value[at], np.diag(sigma**2))
 
 
 def weigh_scales(problem: Problem, best: Float64, covariance: Float64) -> Scales:

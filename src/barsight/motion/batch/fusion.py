@@ -311,7 +311,7 @@ class BatchPoses:
         wrong, doubtful = scale_sentences(
             estimate.scaled, estimate.encoders.excess if estimate.encoders else None
         )
-        warnings += (*doubtful, *maybe)
+        warnings += (*doubtful, *scale_sentences(*estimate.suspected)[1], *maybe)
         in_sigmas = estimate.encoder_off_m / estimate.encoder_sigma_m
         encoders = normalised_encoders(nodes.stamp_ns, estimate.placed, in_sigmas)
         return estimate, warnings, (*wrong, *sure), encoders
