@@ -63,6 +63,28 @@ def test_a_clock_that_drifts_too_fast_to_be_followed_is_told(ppm: float, is_wild
     assert all(told[20 * 100 :]) if is_wild else not any(told)
 
 
+@pytest.mark.parametrize("ppm", [-1500, -20_000])
+def test_a_clock_so_slow_that_it_jumps_again_and_again_is_told(ppm: float) -> None:
+    """At -1500 ppm it counted as jumped every 40 s, so that 60 s never passed: 54 ms late, untold."""
+    rng, clock, told = np.random.default_rng(0), DeviceClock(), []
+    for k in range(20 * 300):
+        true_ns = k * SECOND // 20
+        slow_s = min(k / 20, 150.0)  # then it is right again
+        device_ns = round(true_ns + slow_s * SECOND * ppm * 1e-6)
+        clock.add(device_ns, round(true_ns + 1e6 + rng.exponential(1e6)))
+        told.append(clock.is_wild)
+    assert clock.jumps > 2 and all(told[20 * 45 : 20 * 150]) and not told[-1]
+
+
+def test_a_clock_that_is_set_twice_is_not_one_that_drifts() -> None:
+    clock = DeviceClock()
+    for k in range(20 * 90):
+        set_s = 0.0 if k < 300 else -0.4 if k < 900 else 0.3
+        clock.add(round((k / 20 + set_s) * SECOND), round((k / 20 + 0.001) * SECOND))
+        assert not clock.is_wild
+    assert clock.jumps == 2
+
+
 def test_a_clock_that_jumps_settles_anew() -> None:
     for jump_ns in (-20 * SECOND, 20 * SECOND):
         clock = DeviceClock()

@@ -18,7 +18,9 @@ drift.
 MAX_DRIFT = 2e-4
 """Largest drift. Quartz clocks agree within 1e-4: a steeper line results from a few late stamps."""
 WILD_AFTER_NS = 60 * NS_PER_S
-"""Time span of stamps over which a steeper line is the clock's own, not that of a few late stamps."""
+"""Time span of stamps over which a steeper line is the clock's own, not that of a few late stamps; and time
+within which a clock that fell behind twice wasn't set, but drifts.
+"""
 EARLY_NS = 50_000_000
 """A clock has jumped if a stamp seems to arrive this much (ns) before it was made."""
 LATE_NS, LATE_COUNT = NS_PER_S, 5
@@ -44,10 +46,12 @@ class DeviceClock:
     constant, and the calibration of the camera against the IMU includes it.
 
     is_wild: whether it drifts by over `MAX_DRIFT`, as a clock does while it is slewed: stamps are wrong then.
+    One that is so slow that it counts as jumped stays wild until that is over.
     """
 
     def __init__(self) -> None:
-        self.jumps = 0
+        self.jumps, self.is_wild = 0, False
+        self._fell_behind_ns: int | None = None
         self.begin_anew()
 
     def begin_anew(self) -> None:
@@ -58,12 +62,15 @@ class DeviceClock:
         self._count, self._late, self._bucket = 0, 0, -1
         self._behind, self._behind_ns = 0, 0
         self._newest_ns, self._older = 0, 0
-        self._offset_ns, self._drift = 0.0, 0.0
-        self.is_wild = False
+        self._offset_ns, self._drift, self._steep = 0.0, 0.0, False
 
     def add(self, device_ns: int, arrival_ns: int) -> bool:
         """Add a stamp and its arrival time (monotonic); return whether the clock is settled."""
         if self._origin is not None and self._has_jumped(device_ns, arrival_ns):
+            if self._behind >= LATE_COUNT:  # all stamps were late, as those of a clock that is slow are
+                again = self._fell_behind_ns is not None and arrival_ns - self._fell_behind_ns < WILD_AFTER_NS
+                self.is_wild |= self._steep or again
+                self._fell_behind_ns = arrival_ns
             self.jumps += 1
             self.begin_anew()
         elif self._late:
@@ -131,7 +138,6 @@ class DeviceClock:
         points = list(self._minima)
         if points[-1][0] - points[0][0] < DRIFT_AFTER_NS:
             self._drift, self._offset_ns = 0.0, float(min(apart for _, apart in points))
-            self.is_wild = False
             return
         hull: list[tuple[int, int]] = []
         for point in points:
@@ -142,7 +148,9 @@ class DeviceClock:
         right = next(k for k in range(1, len(hull)) if hull[k][0] >= middle or k == len(hull) - 1)
         (x0, y0), (x1, y1) = hull[right - 1], hull[right]
         slope = (y1 - y0) / (x1 - x0)
-        self.is_wild = abs(slope) > MAX_DRIFT and points[-1][0] - points[0][0] >= WILD_AFTER_NS
+        self._steep = abs(slope) > MAX_DRIFT
+        if points[-1][0] - points[0][0] >= WILD_AFTER_NS:
+            self.is_wild = self._steep
         self._drift = float(np.clip(slope, -MAX_DRIFT, MAX_DRIFT))
         self._offset_ns = min(apart - self._drift * since for since, apart in points)
 
