@@ -532,22 +532,47 @@ def test_tracking_begun_anew_beats_as_it_follows_all_keyframes(
 def test_pictures_in_which_nothing_can_be_matched_are_reported_until_they_can(
     whole: Path, board: Counters, ring: PairRing, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Both lenses are covered for four pairs."""
+    """Both lenses are covered for four pairs; tracking that then begins anew tells that they are free."""
     link = Link(LiveInput(whole), SETTINGS.chosen(), LiveSettings(), tmp_path, tmp_path, "", board.name, None)
     recording = bs.open_recording(whole)
     seen = next(one for one in recording.frames() if isinstance(one, StereoFrame))
     black = np.zeros_like(seen.left)
-    tracking = Tracking(link, GrowingRecording(recording, [], link), board, ring)
-    tracking.follow_again()
-    monkeypatch.setattr(tracking, "_wait_for_readings", lambda stamp_ns: None)
-    monkeypatch.setattr(tracking, "_placed", lambda pair: RefusedFrame(pair.stamp_ns, "dark"))
-    told = []
+    monkeypatch.setattr(Tracking, "_wait_for_readings", lambda self, stamp_ns: None)
+    monkeypatch.setattr(Tracking, "_placed", lambda self, pair: RefusedFrame(pair.stamp_ns, "dark"))
+
+    def begun() -> Tracking:
+        tracking = Tracking(link, GrowingRecording(recording, [], link), board, ring)
+        tracking.follow_again()
+        return tracking
+
+    tracking, told = begun(), []
     for k in range(6):
+        if k == 4:
+            tracking = begun()
         pair = StereoFrame(seen.stamp_ns + k, *((black, black) if k < 4 else (seen.left, seen.right)))
         tracking.take(CapturedPair(k + 1, 0, pair), range(0))
         told.append(link.told("pictures"))
     assert told[:2] == told[4:] == ["", ""]
     assert all("the left image is black all over" in one for one in told[2:4])
+
+
+def test_a_trouble_that_changes_is_never_read_as_over(
+    whole: Path, board: Counters, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file is empty while it is written: whoever read it then said that lifts are valid."""
+    link = Link(LiveInput(whole), SETTINGS.chosen(), LiveSettings(), tmp_path, tmp_path, "", board.name, None)
+    link.tell("imu_clock", "it drifts by 300 ppm")
+    found, write = [], Path.write_text
+
+    def slowly(self: Path, text: str, **how: Any) -> int:
+        write(self, "", **how)
+        found.append(link.told("imu_clock"))
+        return write(self, text, **how)
+
+    monkeypatch.setattr(Path, "write_text", slowly)
+    for why in ("it drifts by 300 ppm", "it drifts by 500 ppm", ""):
+        link.tell("imu_clock", why)
+    assert found == ["it drifts by 300 ppm", "it drifts by 500 ppm"] and link.told("imu_clock") == ""
 
 
 def test_what_the_encoders_are_off_by_outlives_tracking_and_counts_once(

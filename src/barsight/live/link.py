@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
+from barsight.core.errors import OutputError
+from barsight.core.files import atomic_path
 from barsight.core.records.pairs import RefusedFrame, StereoFrame
 from barsight.core.records.sensor_samples import CraneSamples, ImuSamples
 from barsight.live.settings import CraneConfig, LiveSettings
@@ -87,10 +89,11 @@ class Link:
 
     def tell(self, name: str, why: str) -> None:
         """Write why a process ended, or one of `modes.TROUBLES`; "" once it is over. The disk may be full, of
-        which the command tells.
+        which the command tells. A reader never finds a trouble that lasts to be over.
         """
-        with contextlib.suppress(OSError):
-            self._reason(name).write_text(why, encoding="utf-8")
+        if " ".join(why.split()) != self.told(name):
+            with contextlib.suppress(OSError, OutputError), atomic_path(self._reason(name)) as path:
+                path.write_text(why, encoding="utf-8")
 
     def told(self, name: str) -> str:
         """Read what was told last, on one line; "" if nothing was."""

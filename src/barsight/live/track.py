@@ -76,7 +76,7 @@ class Tracking:
         self._last_kept: Float64 | None = None
         self._last_kept_ns, self._still = 0, 0
         self._off_um: list[int] = []
-        self._unmatchable, self._told = 0, ""
+        self._unmatchable = 0
 
     def follow_again(self) -> None:
         """Track the last keyframes again after a restart; without encoders, all of them."""
@@ -148,9 +148,7 @@ class Tracking:
         """Report why nothing can be matched, once that holds for several pairs in succession."""
         self._unmatchable = 0 if nothing is None else self._unmatchable + 1
         why = nothing.reason if nothing is not None and self._unmatchable >= UNMATCHABLE_PAIRS else ""
-        if why != self._told:
-            self._told = why
-            self._link.tell("pictures", why)
+        self._link.tell("pictures", why)
 
     def _keep_passed(self, pair: CapturedPair | None) -> None:
         """Keep a skipped pair if it is far enough from the last one kept."""
