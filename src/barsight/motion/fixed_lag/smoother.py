@@ -180,7 +180,7 @@ class FixedLagEstimator:
         """Look for faults in the encoders' newest readings; positions taken beyond a new jump are removed."""
         now = self._come(stamp_ns)
         if self.delay.check(now):  # the window holds what late readings said
-            self.window = self._left = None
+            self.window = self._left = self._scaled_ns = None
             self.watch, now = EncoderWatch(), self._come(stamp_ns)
         if now.crane is None or not len(now.crane.stamp_ns):
             return
