@@ -52,9 +52,19 @@ def find_jumps(
     around = {m: JumpWindow.around(series, sigma_m, m, known) for m in middles.tolist()}
     windows = {m: window for m, window in around.items() if window is not None and window.beyond.size}
     jumps = [[jump for jump in crane.jumps if jump.axis == axis] for axis in range(3)]
-    springs = find_springs(list(windows.values()), jumps)
-    windows = {m: with_springs(window, springs) for m, window in windows.items()}
     steps = {(m, axis): windows[m].largest_step(axis, jumps[axis]) for m in windows for axis in range(3)}
+    if not any(steps.values()):
+        return ()
+    springs = find_springs(list(windows.values()), jumps)
+    sprung = {m: with_springs(window, springs) for m, window in windows.items()}
+
+    def largest_step(m: int, axis: int, step: FoundStep | None) -> FoundStep | None:
+        """Find the largest step beside the oscillations. They only explain `step`, found without them: one
+        that isn't there without them is what is left of a wild reading that was taken for an oscillation.
+        """
+        return step and sprung[m].largest_step(axis, jumps[axis])
+
+    steps = {(m, axis): largest_step(m, axis, step) for (m, axis), step in steps.items()}
     found: list[EncoderJump] = []
     while candidates := [step for step in steps.values() if step is not None]:
         best = max(candidates, key=lambda step: step.sigmas)
@@ -66,7 +76,7 @@ def find_jumps(
         jumps[axis].append(found[-1])
         for m in windows:
             if abs(m - stamp) < seconds_to_ns(HALF_S) + stride:
-                steps[m, axis] = windows[m].largest_step(axis, jumps[axis])
+                steps[m, axis] = largest_step(m, axis, windows[m].largest_step(axis, jumps[axis]))
     return tuple(found)
 
 
