@@ -33,11 +33,13 @@ it: no more is left of 1000 parts of drawn cranes, with jumps and freezes, that 
 
 
 class DelaySearch:
-    """Mean squares of the readings against the IMU for each delay tried, over all parts so far."""
+    """Mean squares of the readings against the IMU for each delay tried, and without it, over all parts so
+    far.
+    """
 
     def __init__(self) -> None:
         self._squares: Float64 = np.zeros(len(LATE_S))
-        self._count = 0
+        self._alone, self._count = 0.0, 0
 
     def add(self, crane: CraneSamples, imu: ImuSamples, begin_ns: int) -> bool:
         """Add the readings of the part that begins at a stamp; return whether they told anything. Those that
@@ -51,26 +53,31 @@ class DelaySearch:
         stamps, place = crane.stamp_ns[first:end], crane.position_m[first:end]
         time = (stamps - begin_ns) / NS_PER_S / PART_S * 2 - 1
         basis, _ = np.linalg.qr(np.polynomial.polynomial.polyvander(time, 3))
-        squares = np.empty(len(LATE_S))
-        for k, late_s in enumerate(LATE_S.tolist()):
-            off = place - way.place_at(stamps - seconds_to_ns(late_s))
-            off -= basis @ (basis.T @ off)
-            squares[k] = (np.minimum(np.abs(off), WILD_M) ** 2).mean()
+
+        def mean_square(off: Float64) -> float:
+            off = off - basis @ (basis.T @ off)
+            return float((np.minimum(np.abs(off), WILD_M) ** 2).mean())
+
+        ways = [way.place_at(stamps - seconds_to_ns(late_s)) for late_s in LATE_S.tolist()]
+        squares = np.array([mean_square(place - way_m) for way_m in ways])
         if squares.min() > MAX_LEFT_M**2:
             return False
         self._squares += squares
+        self._alone += mean_square(place)
         self._count += 1
         return True
 
     @property
     def late_s(self) -> float:
-        """Return the delay, s, if one explains the readings clearly better than none; else 0."""
+        """Return the delay, s, if one explains the readings clearly better than none, and than no motion of
+        the IMU at all, as where the crane stands; else 0.
+        """
         if not self._count:
             return 0.0
         mean = self._squares / self._count
-        best, none = int(mean.argmin()), float(mean[len(LATE_S) // 2])
-        late_s = float(LATE_S[best])
-        clear = 0 < best < len(LATE_S) - 1 and mean[best] < min(none / CLEARLY_WORSE, MAX_LEFT_M**2)
+        best, late_s = int(mean.argmin()), float(LATE_S[mean.argmin()])
+        others = min(float(mean[len(LATE_S) // 2]), self._alone / self._count)
+        clear = 0 < best < len(LATE_S) - 1 and mean[best] < min(others / CLEARLY_WORSE, MAX_LEFT_M**2)
         return late_s if clear and abs(late_s) > MIN_LATE_S else 0.0
 
 
