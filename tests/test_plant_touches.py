@@ -15,6 +15,7 @@ pytest.importorskip("sqlalchemy")
 from barsight.core.errors import Failed
 from barsight.plant.feed import read_state
 from barsight.plant.link_settings import S7Settings
+from barsight.plant.links.running import _watch
 from barsight.plant.links.s7_link import serve_s7
 from barsight.plant.partner import PlcPartner
 from barsight.plant.serving import TelegramServer
@@ -320,6 +321,37 @@ def test_a_touch_that_the_store_could_not_take_is_noted_before_the_next_step(pla
     assert crane.turn(EXECUTED) == REFUSED and [one[0] for one in alarms(plant)] == ["lift-beside"]
 
 
+def test_a_touch_that_the_store_could_not_take_lets_no_answered_command_count_again(plant: Plant) -> None:
+    """The PLC leaves its command until the next one; the lift that it began was refused in mid-air."""
+    crane = Driver(plant)
+    crane.begin()
+    plant.store.fault[:] = ["locked"]
+    crane.at, crane.z_m, crane.flags = FIRST, DOWN, ON
+    for _ in range(2):
+        crane.number -= 1
+        assert crane.turn(EXECUTING) == DONE
+
+
+def test_a_touch_that_the_store_could_not_take_is_noted_without_another_step(plant: Plant) -> None:
+    """Nobody claims anything, and the page offers what it ends."""
+    crane = Driver(plant)
+    crane.turn()
+    crane.go(SECOND)
+    plant.store.fault[:] = ["locked"]
+    crane.go(SECOND, DOWN, SLACK)
+
+    async def watch() -> None:
+        feed = SimpleNamespace(is_alive=True)
+        watching = asyncio.create_task(_watch(feed, plant.steps))  # type: ignore[arg-type]
+        await asyncio.sleep(0.3)
+        watching.cancel()
+        await asyncio.gather(watching, return_exceptions=True)
+
+    assert 2 in offers(plant)
+    asyncio.run(watch())
+    assert offers(plant) == [1, 3, 4, 5, 6]
+
+
 def telegrams() -> list[bytes]:
     """A magnet that is turned on at x 118 m and off at 50 m."""
     steps = ((118.0, 0), (118.0, ON), (50.0, ON), (50.0, 0))
@@ -361,6 +393,36 @@ def test_the_telegram_tells_touches() -> None:
             writer.write(telegrams()[-1])
             await asyncio.wait_for(reader.readexactly(98), 5)
         writer.close()
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+
+    asyncio.run(talk())
+    assert seen.touches == TOUCHED
+
+
+def test_touches_at_the_end_of_a_connection_are_told() -> None:
+    """They came while the store took a command, and no telegram followed."""
+
+    class Slow(Seen):
+        def claim(self, *_: object) -> Failed:
+            time.sleep(0.5)
+            return Failed("invalid", "no lift is offered")
+
+    seen = Slow()
+    claim = {"magic": IN_MAGIC, "version": 1, "life": 9, "command": CLAIM, "command_number": 1, "bridge": 1}
+
+    async def talk() -> None:
+        port = asyncio.get_running_loop().create_future()
+        server = TelegramServer(seen.feed, seen, TelegramSettings(port=0))  # type: ignore[arg-type]
+        running = asyncio.create_task(server.run(port.set_result))
+        _, writer = await asyncio.open_connection("127.0.0.1", await port)
+        for part in (pack("in", claim), b"".join(telegrams())):
+            writer.write(part)
+            await asyncio.sleep(0.1)
+        writer.close()
+        end_s = time.monotonic() + 5
+        while len(seen.touches) < len(TOUCHED) and time.monotonic() < end_s:
+            await asyncio.sleep(0.02)
         running.cancel()
         await asyncio.gather(running, return_exceptions=True)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
 from collections import deque
 from dataclasses import dataclass, replace
@@ -49,6 +50,7 @@ class PlcPartner:
         self._number: int | None = None
         self._command: dict[str, int] | None = None
         self._touches: deque[Touch] = deque()
+        self._noting = threading.Lock()
         self._last: PlcReading | None = None
         self._last_s = 0.0
         self._begun: int | None = None
@@ -150,19 +152,26 @@ class PlcPartner:
     def execute(self) -> None:
         """Note the touches, then execute the command on the store; `answer` holds its outcome.
 
-        If the store can't be reached there is no answer: the command is tried again with the next telegram.
+        If the store can't be reached there is no answer: the command is tried again with the next telegram. A
+        command that was answered before isn't.
         """
         command = self._command
         try:
-            while self._touches:
-                self._steps.touched(self.name, self._touches.popleft())
+            self.note_touches()
             if command is None:
                 return
             answer, token = self._step(command)
         except BarsightError:
-            self._number = None
+            if command is not None:
+                self._number = None
             return
         self._answer = {"answer_number": command["command_number"], "answer": answer, "token": token}
+
+    def note_touches(self) -> None:
+        """Hand the touches over. Raises BarsightError if one can't be noted yet; `LiftSteps` keeps it."""
+        with self._noting:
+            while self._touches:
+                self._steps.touched(self.name, self._touches.popleft())
 
     def _step(self, found: dict[str, int]) -> tuple[int, int]:
         lift = (found["lift_id"], found["checksum"])

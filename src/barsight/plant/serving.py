@@ -7,7 +7,7 @@ import contextlib
 import time
 from collections.abc import Callable
 
-from barsight.core.errors import Failed
+from barsight.core.errors import BarsightError, Failed
 from barsight.plant.crane_names import plc_name
 from barsight.plant.feed import StateReader
 from barsight.plant.partner import PlcPartner
@@ -46,6 +46,8 @@ class TelegramServer:
         try:
             if len(self._partners) <= MAX_PARTNERS:
                 await self._exchange(reader, writer, partner)
+                with contextlib.suppress(BarsightError):
+                    await asyncio.to_thread(partner.note_touches)  # those that came during the last step
         except asyncio.CancelledError:
             return  # the server is ending; asyncio's streams would log a cancelled task as an error
         finally:

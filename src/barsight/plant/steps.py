@@ -44,10 +44,15 @@ class LiftSteps:
 
     def touched(self, who: str, touch: Touch) -> None:
         """Note where a crane's magnet touched something; see `note_touch`. If the store can't be written, it
-        is noted before the next step.
+        is noted before the next step, or by `note_touches`.
         """
         with self._turn:
             self._touches.append((who, touch))
+            self._note_touches()
+
+    def note_touches(self) -> None:
+        """Note the touches that the store couldn't take. Raises BarsightError if it still can't."""
+        with self._turn:
             self._note_touches()
 
     def claim(self, who: str, lift_id: int, checksum: int | None = None) -> LiftClaim | Failed:

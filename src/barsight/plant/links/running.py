@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import itertools
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Any
 
-from barsight.core.errors import OutputError
+from barsight.core.errors import BarsightError, OutputError
 from barsight.plant.feed import READ_EVERY_S, StateFeed
 from barsight.plant.link_settings import MqttSettings, WebhookSettings
 from barsight.plant.links.changes import changes_between
@@ -29,8 +30,9 @@ async def serve_plant(store: Store, settings: PlantSettings, say: Say) -> None:
 
     Raises OutputError if a link can't be served, or if the state is no longer being read.
     """
+    steps = LiftSteps(store, settings)
     with StateFeed(store, settings) as feed:
-        links = {"state": _watch(feed), **_links(store, settings, feed, say)}
+        links = {"state": _watch(feed, steps), **_links(store, settings, feed, steps, say)}
         tasks = [asyncio.create_task(_named(name, link), name=name) for name, link in links.items()]
         try:
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -42,8 +44,9 @@ async def serve_plant(store: Store, settings: PlantSettings, say: Say) -> None:
             await asyncio.gather(*tasks, return_exceptions=True)
 
 
-def _links(store: Store, settings: PlantSettings, feed: StateFeed, say: Say) -> dict[str, Awaitable[None]]:
-    steps = LiftSteps(store, settings)
+def _links(
+    store: Store, settings: PlantSettings, feed: StateFeed, steps: LiftSteps, say: Say
+) -> dict[str, Awaitable[None]]:
     links: dict[str, Awaitable[None]] = {}
     if settings.telegram is not None:
         at = f"telegram at {settings.telegram.host}:{settings.telegram.port}"
@@ -59,9 +62,14 @@ def _links(store: Store, settings: PlantSettings, feed: StateFeed, say: Say) -> 
     return links
 
 
-async def _watch(feed: StateFeed) -> None:
-    """Raise OutputError if the state is no longer being read: no link would ever offer a lift again."""
+async def _watch(feed: StateFeed, steps: LiftSteps) -> None:
+    """Raise OutputError if the state is no longer being read: no link would ever offer a lift again.
+
+    Touches that the store couldn't take are noted meanwhile: the offers near them stand until then.
+    """
     while feed.is_alive:
+        with contextlib.suppress(BarsightError):
+            await asyncio.to_thread(steps.note_touches)
         await asyncio.sleep(1.0)
     raise OutputError("the state is read no more; the lines above say why")
 
