@@ -47,6 +47,20 @@ def test_a_bar_along_on_a_part_of_a_bundle_is_higher_than_the_rest(part: float) 
     assert any("lies along on it" in sentence for sentence in said(below)) and not below.is_free
 
 
+@pytest.mark.parametrize("bar_m", [None, 0.03])
+def test_a_bundle_that_sags_between_its_timbers_has_no_bar_on_it(bar_m: float | None) -> None:
+    """Its ends and its middle lie 18 mm higher. A bar on one of them is told nevertheless."""
+    below = replace(BELOW, length_m=6.0)
+    bars = [] if bar_m is None else [in_groove(bar_m, 1.2, 2.2)]
+    heights = draw([below, *bars], x_m=(-0.6, 0.6), y_m=(-3.2, 3.2), sigma_m=0.002)
+    y = heights.y0_m + heights.cell_m * np.arange(heights.z_m.shape[0])
+    sag_m = 0.009 * (1 - np.cos(2 * np.pi * y / 3.0))[:, None]
+    heights.z_m[:] -= np.where(heights.z_m > 0.1, sag_m, 0).astype(np.float32)
+    found = max(find_bundles(heights, SETTINGS), key=lambda one: one.width_m)
+    assert any("lies along on it" in sentence for sentence in said(found)) is (bar_m is not None)
+    assert found.length_m > 5.8
+
+
 def test_a_ridge_over_the_fitted_outline_lies_along_whatever_the_straps_bound() -> None:
     """A pack's top, which straps bound, holds the bar."""
     beside = 0.01 * np.arange(25) - 0.12

@@ -69,9 +69,7 @@ def _write_las(cloud: Cloud, path: Path, frame_id: str, *, compress: bool) -> No
         [laspy.ExtraBytesParams("sigma_z", "float32"), laspy.ExtraBytesParams("views", "uint16")]
     )
     header.system_identifier = frame_id or "OTHER"
-    header.global_encoding.wkt = (
-        True  # as LAS requires of this point format, with a reference system or without
-    )
+    header.global_encoding.wkt = True  # as LAS requires of this point format, without a system too
     header.scales = np.full(3, _LAS_STEP_M)
     header.offsets = np.floor(cloud.xyz_m.min(axis=0)).astype(np.float64)
     las = laspy.LasData(header)

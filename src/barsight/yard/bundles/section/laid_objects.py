@@ -36,6 +36,8 @@ _LOWER_PCT, _MIN_PARTS, _MIN_PART_SEEN = 20, 3, 0.5
 """Percentile of the parts' heights that counts as the bundle's own; minimum number of parts; minimum share
 of a part's rows that is measured.
 """
+_SAG_PCT = 10
+"""Percentile of a part's rises across its width by which all of the part lies higher."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +131,10 @@ def measure_along(sections: StraightSections | None) -> float:
 
 
 def _rise_of_part(sections: StraightSections) -> float:
-    """Measure by how much (m) the highest part along a bundle rises over its lower parts; -inf if unknown."""
+    """Measure by how much (m) the highest part along a bundle rises over its lower parts; -inf if unknown.
+
+    What all of a part's width rises by is no bar on it: bundles of thin bars sag between their timbers.
+    """
     z, width = sections.z_m, sections.width_m
     beside = sections.cell_m * np.arange(z.shape[1]) - width / 2
     inner = np.abs(beside) < _INNER_RATIO * width - sections.cell_m / 2
@@ -144,7 +149,10 @@ def _rise_of_part(sections: StraightSections) -> float:
     known = np.isfinite(parts).sum(axis=0)
     at = np.maximum((known - 1) * _LOWER_PCT // 100, 0)
     lower = np.take_along_axis(np.sort(parts, axis=0), at[None], axis=0)
-    rise = np.where(np.isfinite(parts) & inner, parts - _shifted(lower), -np.inf)
+    raised = np.where(inner, parts - lower, np.nan).T
+    at = np.maximum(np.isfinite(raised).sum(axis=0) - 1, 0) * _SAG_PCT // 100
+    sag = np.take_along_axis(np.sort(raised, axis=0), at[None], axis=0).T
+    rise = np.where(np.isfinite(parts) & inner, parts - _shifted(lower) - np.fmax(sag, 0), -np.inf)
     cells = max(round(_PART_WIDTH_M / sections.cell_m), 1)
     return float(ndimage.minimum_filter(rise, (1, cells), mode="constant", cval=-np.inf).max())
 
