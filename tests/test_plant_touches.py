@@ -377,6 +377,15 @@ class Seen:
         self.touches.append(touch)
 
 
+class SlowClaim(Seen):
+    def claim(self, *_: object) -> Failed:
+        time.sleep(0.5)
+        return Failed("invalid", "no lift is offered")
+
+
+CLAIMING = {"magic": IN_MAGIC, "version": 1, "life": 9, "command": CLAIM, "command_number": 1, "bridge": 1}
+
+
 def test_the_telegram_tells_touches() -> None:
     seen = Seen()
     settings = TelegramSettings(port=0, cycle_s=0.02)
@@ -403,20 +412,14 @@ def test_the_telegram_tells_touches() -> None:
 def test_touches_at_the_end_of_a_connection_are_told() -> None:
     """They came while the store took a command, and no telegram followed."""
 
-    class Slow(Seen):
-        def claim(self, *_: object) -> Failed:
-            time.sleep(0.5)
-            return Failed("invalid", "no lift is offered")
-
-    seen = Slow()
-    claim = {"magic": IN_MAGIC, "version": 1, "life": 9, "command": CLAIM, "command_number": 1, "bridge": 1}
+    seen = SlowClaim()
 
     async def talk() -> None:
         port = asyncio.get_running_loop().create_future()
         server = TelegramServer(seen.feed, seen, TelegramSettings(port=0))  # type: ignore[arg-type]
         running = asyncio.create_task(server.run(port.set_result))
         _, writer = await asyncio.open_connection("127.0.0.1", await port)
-        for part in (pack("in", claim), b"".join(telegrams())):
+        for part in (pack("in", CLAIMING), b"".join(telegrams())):
             writer.write(part)
             await asyncio.sleep(0.1)
         writer.close()
@@ -430,14 +433,20 @@ def test_touches_at_the_end_of_a_connection_are_told() -> None:
     assert seen.touches == TOUCHED
 
 
-def test_s7_tells_touches(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("is_slow", [False, True])
+def test_s7_tells_touches(monkeypatch: pytest.MonkeyPatch, *, is_slow: bool) -> None:
+    """A slow step doesn't keep the PLC from being read: after a gap nothing is known of its magnet."""
     s7 = pytest.importorskip("barsight.plant.s7")
-    seen = Seen()
+    seen = SlowClaim() if is_slow else Seen()
+    claim = [pack("in", CLAIMING)] if is_slow else []
+    taken_s = []
 
     def run(*arguments: Callable[[object], None]) -> None:
-        for one in telegrams():
+        for one in [*claim, *telegrams()]:
+            began_s = time.monotonic()
             arguments[3](s7.S7Exchange(one, 0.0, 0.0))
+            taken_s.append(time.monotonic() - began_s)
 
     monkeypatch.setattr(s7, "run_s7", run)
     asyncio.run(serve_s7(S7Settings(), seen.feed, seen, lambda _: None))  # type: ignore[arg-type]
-    assert seen.touches == TOUCHED
+    assert seen.touches == TOUCHED and max(taken_s) < 0.3

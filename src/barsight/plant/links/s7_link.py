@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import threading
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 
-from barsight.core.errors import Failed
+from barsight.core.errors import BarsightError, Failed
 from barsight.plant.crane_names import plc_name
 from barsight.plant.feed import StateFeed
 from barsight.plant.link_settings import S7Settings
@@ -20,6 +22,8 @@ async def serve_s7(
 ) -> None:
     """Exchange until cancelled. say: called once when the PLC can't be reached or its data is no telegram,
     and once when it has recovered.
+
+    Steps are carried out by a thread of their own: the PLC is read, and life counts, while the store is slow.
     """
     from barsight.plant.s7 import S7Exchange, run_s7  # needs an extra; the other links don't
 
@@ -27,6 +31,8 @@ async def serve_s7(
     partner = PlcPartner(plc_name(f"{at} by S7"), steps, settings.silent_s)
     counter, stop = 0, threading.Event()
     wrong: str | None = None
+    worker = ThreadPoolExecutor(1, "S7 steps")
+    step: Future[None] | None = None
 
     def outputs() -> bytes:
         nonlocal counter
@@ -34,7 +40,7 @@ async def serve_s7(
         return pack("out", out_values(partner.seen(feed.newest(counter)), partner.answer))
 
     def take(exchanged: S7Exchange | Failed) -> None:
-        nonlocal wrong
+        nonlocal wrong, step
         found = exchanged if isinstance(exchanged, Failed) else unpack("in", exchanged.inputs)
         now = found.reason if isinstance(found, Failed) else ""
         if wrong is None or bool(now) != bool(wrong):
@@ -45,9 +51,15 @@ async def serve_s7(
         reading = partner.reading(found)
         feed.take_reading(reading)
         partner.watch(reading)
-        if partner.receive(found):
-            partner.execute()
-            feed.refresh()
+        is_busy = step is not None and not step.done()
+        if step is not None and not is_busy:
+            step.result()  # what isn't a refusal ends the link
+        if partner.receive(found, is_busy=is_busy):
+            step = worker.submit(carry_out)
+
+    def carry_out() -> None:
+        partner.execute()
+        feed.refresh()
 
     thread = asyncio.create_task(asyncio.to_thread(run_s7, settings, layout("in").size, outputs, take, stop))
     try:
@@ -55,3 +67,6 @@ async def serve_s7(
     finally:
         stop.set()
         await asyncio.gather(thread, return_exceptions=True)
+        await asyncio.to_thread(worker.shutdown)
+        with contextlib.suppress(BarsightError):
+            await asyncio.to_thread(partner.note_touches)
