@@ -13,6 +13,7 @@ import pytest
 pytest.importorskip("sqlalchemy")
 
 from barsight.core.errors import Failed
+from barsight.plant import serving
 from barsight.plant.feed import read_state
 from barsight.plant.link_settings import S7Settings
 from barsight.plant.links.running import _watch
@@ -21,6 +22,7 @@ from barsight.plant.partner import PlcPartner
 from barsight.plant.serving import TelegramServer
 from barsight.plant.settings import TelegramSettings
 from barsight.plant.state import PlantState
+from barsight.plant.steps import LiftSteps
 from barsight.plant.telegram import IN_MAGIC, pack, unpack
 from barsight.store import confirmation
 from barsight.store.tables import LIFT_STATES
@@ -46,13 +48,13 @@ class Driver:
 
     def __init__(self, plant: Plant, name: str = "plc a") -> None:
         self.plant, self.name = plant, name
-        self.connect()
+        self.partner = PlcPartner(name, plant.steps, 0.3)
         self.life = self.number = 0
         self.at, self.flags, self.z_m = FREE, 0, HIGH
         self.lift = {"lift_id": 0, "checksum": 0, "token": 0}
 
     def connect(self) -> None:
-        self.partner = PlcPartner(self.name, self.plant.steps, 0.3)
+        self.partner = PlcPartner(self.name, self.plant.steps, 0.3, self.partner.begun)
 
     def turn(self, command: int = 0) -> int:
         """Exchange telegrams once; return the answer to the command."""
@@ -218,6 +220,18 @@ def connects_anew(crane: Driver) -> None:
     crane.go(FREE, HIGH, 0)
 
 
+def connects_anew_and_is_on_early(crane: Driver) -> None:
+    crane.connect()
+    crane.go((80.0, 20.0))
+    on_early(crane)
+
+
+def is_not_heard_and_is_on_early(crane: Driver) -> None:
+    crane.plant.now_s += 5
+    crane.go((80.0, 20.0))
+    on_early(crane)
+
+
 def is_not_heard_for_a_while(crane: Driver) -> None:
     crane.plant.now_s += 5
     crane.go(FIRST, HIGH, ON)
@@ -253,6 +267,7 @@ def finds_it_higher_and_is_on_early(crane: Driver) -> None:
     "way",
     [
         on_early, falters_at_set_down, connects_anew, is_not_heard_for_a_while,
+        connects_anew_and_is_on_early, is_not_heard_and_is_on_early,
         loses_its_encoders_for_a_moment, finds_the_load_higher,
         finds_it_higher_and_tells_no_rope, finds_it_higher_and_is_on_early,
     ],
@@ -376,6 +391,9 @@ class Seen:
     def touched(self, who: str, touch: Touch) -> None:
         self.touches.append(touch)
 
+    def executing(self, token: int, *_: object) -> int:
+        return token
+
 
 class SlowClaim(Seen):
     def claim(self, *_: object) -> Failed:
@@ -431,6 +449,42 @@ def test_touches_at_the_end_of_a_connection_are_told() -> None:
 
     asyncio.run(talk())
     assert seen.touches == TOUCHED
+
+
+def test_a_plc_that_connects_anew_has_still_begun_its_lift(monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: list[int | None] = []
+
+    class Partner(PlcPartner):
+        def __init__(self, name: str, steps: LiftSteps, silent_s: float, lift_id: int | None = None) -> None:
+            super().__init__(name, steps, silent_s, lift_id)
+            begun.append(lift_id)
+
+    monkeypatch.setattr(serving, "PlcPartner", Partner)
+    seen = Seen()
+    told = {
+        "magic": IN_MAGIC,
+        "version": 1,
+        "life": 9,
+        "command": EXECUTING,
+        "command_number": 1,
+        "lift_id": 7,
+    }
+
+    async def talk() -> None:
+        port = asyncio.get_running_loop().create_future()
+        server = TelegramServer(seen.feed, seen, TelegramSettings(port=0))  # type: ignore[arg-type]
+        running = asyncio.create_task(server.run(port.set_result))
+        for _ in range(2):
+            _, writer = await asyncio.open_connection("127.0.0.1", await port)
+            writer.write(pack("in", told))
+            await asyncio.sleep(0.2)
+            writer.close()
+            await asyncio.sleep(0.3)
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+
+    asyncio.run(talk())
+    assert begun == [None, 7]
 
 
 @pytest.mark.parametrize("is_slow", [False, True])

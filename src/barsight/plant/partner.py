@@ -40,9 +40,9 @@ class _Magnet:
 
 
 class PlcPartner:
-    """A PLC that exchanges telegrams."""
+    """A PLC that exchanges telegrams. begun: the lift that it began last, also by an earlier connection."""
 
-    def __init__(self, name: str, steps: LiftSteps, silent_s: float) -> None:
+    def __init__(self, name: str, steps: LiftSteps, silent_s: float, begun: int | None = None) -> None:
         self.name, self._steps, self._silent_s = name, steps, silent_s
         self._answer: dict[str, int] = {}
         self._life: int | None = None
@@ -53,7 +53,7 @@ class PlcPartner:
         self._noting = threading.Lock()
         self._last: PlcReading | None = None
         self._last_s = 0.0
-        self._begun: int | None = None
+        self.begun = begun
         self._contact_m: float | None = None
 
     @property
@@ -100,14 +100,17 @@ class PlcPartner:
         """Find in the PLC's readings, one after another, where its magnet touches something.
 
         Without a position nothing is known, nor from the first reading, nor of what happened before one that
-        came `MAX_GAP_S` late: the load may hang by then. The magnet is down if the rope is slack; while a
-        lift has begun also up to `DOWN_M` above the height of contact, otherwise whenever it is turned on.
+        came `MAX_GAP_S` late: by then the load may hang, if the magnet is on. It is down if the rope is
+        slack; while a lift has begun also up to `DOWN_M` above the height of contact, otherwise whenever it
+        is turned on.
         """
         last, last_s = self._last, self._last_s
         self._last_s = time.monotonic()
         self._last = None if reading.place_m is None else reading
         if self._last is None or self._last_s - last_s > MAX_GAP_S:
-            last = self._begun = self._contact_m = None
+            last = None
+            if reading.is_magnet_on:
+                self.begun = self._contact_m = None
         if last is None or reading.place_m is None:
             return
         contact_m = self._contact_m
@@ -140,7 +143,7 @@ class PlcPartner:
         is_second: whether another PLC with the same name is alive; the state is invalid then too.
         """
         lift = state.lift
-        is_own = lift is not None and lift.lift_id == self._begun
+        is_own = lift is not None and lift.lift_id == self.begun
         self._contact_m = lift.hoist_height_m if lift is not None and is_own else None
         if self.is_alive and not is_second:
             return state
@@ -182,7 +185,7 @@ class PlcPartner:
         answer: str | int | Failed
         if found["command"] == EXECUTING:
             answer = self._steps.executing(token, *lift)
-            self._begun = None if isinstance(answer, Failed) else found["lift_id"]
+            self.begun = None if isinstance(answer, Failed) else found["lift_id"]
         elif found["command"] == EXECUTED:
             load_kg = found["load"] / 10 if flags & _WEIGHED else None
             report = LiftReport(bool(flags & _REACHED), bool(flags & _SLACK), load_kg)

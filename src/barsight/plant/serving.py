@@ -30,6 +30,7 @@ class TelegramServer:
         self._feed, self._steps, self._settings = feed, steps, settings
         self._counter = 0
         self._partners: list[PlcPartner] = []
+        self._begun: dict[str, int | None] = {}
         self.refused = 0
 
     async def run(self, ready: Callable[[int], None]) -> None:
@@ -41,7 +42,7 @@ class TelegramServer:
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         name = plc_name(writer.get_extra_info("peername")[0])  # the same after a reconnection
-        partner = PlcPartner(name, self._steps, self._settings.silent_s)
+        partner = PlcPartner(name, self._steps, self._settings.silent_s, self._begun.get(name))
         self._partners.append(partner)
         try:
             if len(self._partners) <= MAX_PARTNERS:
@@ -52,6 +53,7 @@ class TelegramServer:
             return  # the server is ending; asyncio's streams would log a cancelled task as an error
         finally:
             self._partners.remove(partner)
+            self._begun[name] = partner.begun
             writer.close()
 
     async def _exchange(
