@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 import yard_maps
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
+from barsight.yard.bundles.section import straps
 from barsight.yard.bundles.section.laid_objects import StraightSections, measure_along
 from barsight.yard.types import Bundle
 from yard_maps import Laid, draw, photographed
@@ -83,6 +85,27 @@ def test_no_strap_crosses_a_bar_that_lies_along(*, is_bare: bool) -> None:
         heights = replace(heights, gray=np.where(strap, 10, heights.gray).astype(np.uint8))
     found = min(find_bundles(heights, SETTINGS), key=lambda one: abs(one.centre_m[0]))
     assert any("no strap crosses" in sentence for sentence in said(found)) is is_bare
+
+
+NOISY = [
+    [-1.1, 0.0, -1.4, -1.6, 0.1, 1.5, 1.9, 1.4, 2.0, 1.0, 0.2, 1.5, 2.8, 1.0, 0.1, 0.3, 1.4, 1.1],
+    [3.1, 3.1, 3.6, 6.6, 8.5, 8.1, 6.4, 3.6, 0.5, 0.0, -0.2, 0.0, 0.0, 1.0, 1.1, -1.4, -3.2, -2.4],
+    [-0.1, -0.2, 2.0, 0.5, -0.2, 1.3, 2.4, 1.0, 0.2, 2.3, 2.1, -0.3, 0.2, 0.3, 0.3, 0.8, 3.9, 2.1, -0.5, 1.5],
+]  # fmt: skip
+CLEAR = [
+    [0.8, 0.5, 1.9, 1.4, 1.3, 1.3, 1.2, 0.6, 1.0, 1.0, 0.3, 0.0, 0.4, 0.7, 0.9, -0.8, 1.5, 0.9, 1.1],
+    [np.nan, 3.0, 3.8, 1.7, 1.3, 0.2, 0.2, -0.1, 1.0, 0.8, 0.0, -0.1, 0.3, 1.2, 1.1, 2.1, 2.3, np.nan],
+]
+
+
+@pytest.mark.parametrize("shown", [*NOISY, *CLEAR])
+def test_straps_that_hardly_show_tell_of_no_bar(shown: list[float], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Contrasts of free bundles of the shared yards, and of covered ones of drawn yards."""
+    shares = np.array(shown)
+    monkeypatch.setattr(straps, "_shown_shares", lambda *_: (shares, np.arange(shares.size)))
+    level_m = np.where(shares < 0.35, 0.01, 0.0)
+    rise_m = straps.bare_rise(None, SimpleNamespace(cell_m=0.01), None, None, level_m)  # type: ignore[arg-type]
+    assert rise_m == (0.01 if shown in CLEAR else 0.0)
 
 
 @pytest.mark.parametrize(("yaw_deg", "roll_deg"), [(0.4, 0.0), (1.3, 25.0)])

@@ -58,6 +58,11 @@ _BARE, _SHOWN, _STRAP, _SURE_STRAPS = 0.35, 0.5, 1.0, 3
 """Maximum contrast of a strap, in its median over its bundle, where it isn't seen, and minimum one where it
 is; minimum median in units of the noise, and number of straps that reach it.
 """
+_MAX_BARE, _MAX_OPPOSITE_RATIO = 2, 0.125
+"""Maximum number of stretches without straps, and maximum share of places with the opposite contrast: with
+more, what shows may be noise. Covered bundles of measured yards have up to 2 and 0.1, free ones whose
+straps hardly show 2 and 0.17, or 3.
+"""
 _INSIDE_M, _BESIDE_M = 0.02, 0.04
 """Minimum distance (m) from the straps' ends of a crest without straps, and maximum distance (m) beside it
 within which they show again.
@@ -159,6 +164,8 @@ def bare_rise(height_map: HeightMap, grid: AlignedMap, fit: Fit, span: StrapSpan
     height = np.where(np.isfinite(level_m), level_m, np.nan)[own]
     inside, beside = (round(reach / grid.cell_m) for reach in (_INSIDE_M, _BESIDE_M))
     edges = np.flatnonzero(np.diff(np.concatenate([[False], shown < _BARE, [False]]).astype(int)))
+    if edges.size > 2 * _MAX_BARE or (shown < -_BARE).mean() > _MAX_OPPOSITE_RATIO:
+        return 0.0
     highest = 0.0
     for first, end in edges.reshape(-1, 2):
         if first < inside or end > own.size - inside:
