@@ -127,7 +127,7 @@ def test_what_was_lifted_while_a_survey_ran_counts_for_it(
 
         def measure(self, _: object, request: LiftRequest, advance: object) -> None:
             write_events([lifted], before / "events.csv")
-            write_measured([recording], self.folder, settings, request, report=False)
+            write_measured([recording], self.folder, settings, request, overwrite=True, report=False)
 
     monkeypatch.setattr(crane_run, "_begin", lambda _, folder, *__, **___: Measuring(folder))
     monkeypatch.setattr(crane_run, "note_drift", lambda *_: "")
