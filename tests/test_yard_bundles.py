@@ -83,14 +83,6 @@ def test_two_touching_neighbours_and_one_apart_are_three_bundles() -> None:
     assert not any(any(b.ends_open) for b in bundles)
 
 
-@pytest.mark.parametrize("y_m", [-0.4, -0.2, 0.0, 0.2, 0.4])
-def test_a_bundle_of_the_minimum_length_is_found_wherever_it_lies(y_m: float) -> None:
-    """Cross-sections 1 m apart, counted from the end of the longer one, passed it by."""
-    stock = [Laid(0.8, 0.0, 0.1355, 0.0, length_m=4.0), Laid(0.0, y_m, 0.1355, 0.0, length_m=0.55)]
-    found = find_bundles(draw(stock, x_m=(-0.5, 1.3), y_m=(-2.5, 2.5), sigma_m=0.002), SETTINGS)
-    assert sorted(round(float(one.centre_m[0]), 1) for one in found) == [0.0, 0.8]
-
-
 def test_thin_bars_are_found_by_their_outline() -> None:
     laid = [Laid(0.2, 0.0, 0.2, 0.2, 0.02, 61, roll_deg=1), Laid(0.6, 0.0, 0.25, 0.0, 0.04, 37, roll_deg=-1)]
     bundles = find_bundles(draw(laid), SETTINGS)

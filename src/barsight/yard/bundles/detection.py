@@ -60,6 +60,8 @@ _LOWER_M = 0.005
 """Maximum distance (m) by which the top of a single bar is measured too low."""
 _RESOLVED_CELLS = 4.0
 _SLIVER_RATIO = 0.03
+_CROSSING_STEP_M = 0.4
+"""Spacing (m) of the cross-sections in which crossing bundles are sought: close enough to meet short ones."""
 _ALONG_COS = 0.87
 """Cosine of the maximum angle, 30 degrees, of bars along the baseline: single ones aren't matched."""
 _SEAM_M = 0.1
@@ -107,8 +109,9 @@ def _search(
     places = [_claims(one, settings) for one in found]
     chosen = choose_readings(_weights(found, floor), without_slivers(places, _SLIVER_RATIO))
     kept = [(found[k].grid, found[k].fit) for k in chosen]
+    close = replace(settings, slice_step_m=_CROSSING_STEP_M)
     for heading, part in crossing_pieces(height_map, kept, headings, settings):
-        across = _found(part, heading, floor, templates, settings)
+        across = _found(part, heading, floor, templates, close)
         found += [one for one in across if not is_beam(one.grid, one.fit, settings)]
     places += [_claims(one, settings) for one in found[len(places) :]]
     claims = without_slivers(places, _SLIVER_RATIO)

@@ -28,10 +28,8 @@ class BundleSettings:
     """Minimum width of a bundle of several bars."""
     max_width_m: float = 0.6
     """Maximum width of a bundle."""
-    slice_step_m: float = 0.4
-    """Distance between the cross-sections in which bundles are first searched for. Bundles that are shorter
-    may lie between two of them.
-    """
+    slice_step_m: float = 1.0
+    """Distance between the cross-sections in which bundles are first searched for."""
     slice_m: float = 0.2
     """Length along the bars over which one cross-section is averaged."""
     max_skew_deg: float = 4.0
