@@ -18,14 +18,7 @@ from barsight.store.calibrations import why_invalid
 from barsight.store.lift_records import find_beside, find_gap, find_outlines, raise_beside, why_outdated
 from barsight.store.opening import Store
 from barsight.store.promotion import counts
-from barsight.store.states import (
-    has_alarm,
-    has_standing,
-    lift_state,
-    newest_steps,
-    raise_alarm,
-    step_lift,
-)
+from barsight.store.states import has_alarm, has_standing, lift_state, newest_steps, raise_alarm, step_lift
 from barsight.store.tables import LIFT_STATES, LIFTS, SURVEY_VETOES, SURVEYS
 from barsight.yard.lifting.validity import is_ahead
 from barsight.yard.vetoes import VETOES

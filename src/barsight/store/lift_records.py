@@ -35,7 +35,7 @@ with extra("store"):
 BESIDE = "lift-beside"
 """Code of the alarm after a magnet came down beside the target of its lift."""
 ROUNDING_M = 1e-4
-"""What a target and a reading may differ by, beyond the tolerance, as telegrams round both."""
+"""Maximum difference (m) of a target and a reading beyond the tolerance, as telegrams round both."""
 
 
 def add_lifts(

@@ -195,8 +195,7 @@ def _widened(estimate: Estimate, problem: Problem, frames: Int64) -> Estimate:
     if not axes or problem.travel is None:
         return estimate
     place = np.array([estimate.poses[k].translation for k in frames])
-    shift = np.zeros_like(place)
-    shift[:, list(axes)] = scales.value * (place - problem.travel.first_m)[:, list(axes)]
+    shift = problem.travel.shifts(axes, scales.value, place)
     covariance[:, 3:, 3:] += shift[:, :, None] * shift[:, None, :]
     return replace(estimate, covariance=covariance)
 

@@ -236,7 +236,7 @@ class FixedLagEstimator:
         problem, place = window.problem, np.array([f.reference_from_body.translation for f in frames])
         assert problem.travel is not None
         share = np.where(np.isin(problem.scaled, problem.held), 0.0, window.scales.value)
-        off = share * (place - problem.travel.first_m)
+        off = problem.travel.shifts(problem.scaled, share, place)
         return widened(found, np.where((stamps < self._scaled_ns)[:, None], off, 0.0))
 
     def _now(self, stamp_ns: int) -> SensorBuffer:

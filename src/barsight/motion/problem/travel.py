@@ -27,6 +27,12 @@ class EncoderTravel:
             place = np.vstack([before.first_m, before.low_m, before.high_m, place])
         return cls(place[0], place.min(axis=0), place.max(axis=0)) if len(place) else None
 
+    def shifts(self, axes: Sequence[int], scales: Float64, place_m: Float64) -> Float64:
+        """Compute by how much (F, 3) encoders with these scales (S,) on some axes shift positions (F, 3)."""
+        shift = np.zeros_like(place_m)
+        shift[:, list(axes)] = scales * (place_m - self.first_m)[:, list(axes)]
+        return shift
+
 
 @dataclass(frozen=True, eq=False)
 class Scales:
