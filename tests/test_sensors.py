@@ -7,6 +7,7 @@ import threading
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -159,6 +160,39 @@ def test_pairs_need_stamp_and_trigger_to_agree() -> None:
             paired += [found.stamp_ns for found, _ in former.push(picture)]
     assert paired == [0, 10, 30, 60, 70] and former.contradicted == 6
     assert former.lost == [0, 0] and former.max_skew_ns == former.skew_ns == 1
+
+
+SET_PPM = 1e9
+"""The rate of a clock that is set at once."""
+
+
+@pytest.mark.parametrize(
+    ("ppm", "back_s"),
+    [(SET_PPM, 0.017), (SET_PPM, 0.033), (SET_PPM, 0.045), (SET_PPM, 0.066), (1000, 0.1), (5000, 0.035)],
+)
+def test_neighbours_are_never_paired_over_a_clock_that_is_set_or_slewed(ppm: float, back_s: float) -> None:
+    """cam1's, of 30 Hz, after 12 s: they were for 20 to 40 s, with heights 4 % off in mode full."""
+    cameras: Any = (SimpleNamespace(ptp=""),) * 2
+    source, former = CraneSource(cameras, {}, 30.0, 0, lambda: True), PairFormer(5_000_000)
+    rng = np.random.default_rng(0)
+    paired: list[tuple[int, int]] = []
+    for k in range(30 * 60):
+        off_s = min(ppm * max(k / 30 - 12, 0) / 1e6, back_s)
+        for camera in (0, 1):
+            at_ns, image = k * SECOND // 30, np.full((1, 2), k, np.int16).view(np.uint8)
+            device_ns = at_ns + (50 + camera) * SECOND - round(camera * off_s * SECOND)
+            arrival_ns = at_ns + 2_000_000 + round(rng.exponential(3e5))
+            list(source._picture(f"cam{camera}", RawPicture(device_ns, arrival_ns, k + 1, image)))
+        for picture in source._ordered(k * SECOND // 30 - SECOND // 10):
+            assert isinstance(picture, LivePicture)
+            paired += [
+                (int(one.left.view(np.int16)[0, 0]), int(one.right.view(np.int16)[0, 0]))
+                for one, _ in former.push(picture)
+            ]
+    lefts, rights = np.array(paired).T
+    assert (lefts == rights).all()
+    if ppm == SET_PPM:
+        assert source._streams["cam1"].clock.jumps == 1 and len(paired) > 30 * 57
 
 
 def test_datagrams_are_read_and_what_is_lost_or_torn_counts() -> None:

@@ -24,6 +24,10 @@ HOLD_INTERVALS = 3
 """Time in picture intervals that a picture waits for an older one of the other camera."""
 RAW_PICTURES, RAW_READINGS = 256, 1 << 16
 """Queue sizes for pictures and readings: as many readings as the fastest IMU provides in ten seconds."""
+BEHIND_COUNT = 2
+"""Successive pictures of a camera whose clock went on by too little after which it was set back: of one alone
+the stamp is wrong.
+"""
 ONE_CLOCK_NS = 5_000_000
 """Largest difference in ns between the smallest delays of two cameras on one network."""
 
@@ -32,14 +36,19 @@ Item = tuple[str, RawPicture | RawLoss | RawReading]
 
 @dataclass
 class _Stream:
-    """A sensor's clock, the last stamp delivered, a camera's last trigger number, and losses.
+    """A sensor's clock, the last stamp delivered, a camera's last picture, and losses.
 
-    dropped: readings that found the queue full.
+    trigger, device_ns: number and stamp of the last picture whose stamp was believed. exposure_ns: what its
+    clock went on for each exposure up to it. behind: pictures since, whose stamps were not. dropped: readings
+    that found the queue full.
     """
 
     clock: DeviceClock = field(default_factory=DeviceClock)
     last_ns: int = 0
     trigger: int = 0
+    device_ns: int = 0
+    exposure_ns: float = 0.0
+    behind: int = 0
     lost: int = 0
     dropped: int = 0
 
@@ -167,7 +176,13 @@ class CraneSource:
             return
         if item.trigger <= stream.trigger:  # connected anew: it may have been set meanwhile
             stream.clock.begin_anew()
-        stream.trigger = item.trigger
+        elif self._is_behind(stream, item):
+            if stream.behind < BEHIND_COUNT:
+                yield LostPicture(camera, 0, "late")
+                return
+            stream.clock.jumps += 1
+            stream.clock.begin_anew()
+        stream.trigger, stream.device_ns, stream.behind = item.trigger, item.device_ns, 0
         if not stream.clock.add(item.device_ns, item.arrival_ns):
             yield LostPicture(camera, 0, "clock")
             return
@@ -180,6 +195,18 @@ class CraneSource:
         stream.last_ns = stamp_ns
         picture = LivePicture(camera, stamp_ns, exposed_ns, item.image, item.trigger)
         heapq.heappush(self._held, (stamp_ns, camera, item.arrival_ns, picture))
+
+    def _is_behind(self, stream: _Stream, item: RawPicture) -> bool:
+        """Check whether a camera's clock went on by half an interval less than its exposures took.
+
+        Such a stamp is that of an earlier exposure of the other camera: neighbours would be paired.
+        """
+        exposures, went_on_ns = item.trigger - stream.trigger, item.device_ns - stream.device_ns
+        if went_on_ns < (exposures - 0.5) * min(stream.exposure_ns, self.interval_ns):
+            stream.behind += 1
+            return True
+        stream.exposure_ns = went_on_ns / exposures
+        return False
 
     def _are_one(self, device_ns: int) -> bool:
         """Check whether the cameras share one clock: they report so, and a stamp has the same age on both."""

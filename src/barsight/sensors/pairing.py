@@ -17,9 +17,11 @@ class PairFormer:
     """Pairs each picture with the other camera's picture nearest in time, at most `tolerance_ns` apart.
 
     If both carry a trigger number, the difference of the two numbers must stay constant: pictures for which
-    it changes are dropped, until `NEW_STEPS` in succession agree on another difference. lost: unpaired
-    pictures of cam0 and cam1. contradicted: pictures whose stamps and numbers contradict each other. skew_ns:
-    cam1's stamp minus cam0's in the last pair; max_skew_ns: its largest magnitude.
+    it changes are dropped, until `NEW_STEPS` in succession agree on another difference after a camera counted
+    anew, or missed an exposure that it didn't count. Without either, a clock ran away from the other one by
+    an interval, and the stamps are those of neighbours. lost: unpaired pictures of cam0 and cam1.
+    contradicted: pictures whose stamps and numbers contradict each other. skew_ns: cam1's stamp minus cam0's
+    in the last pair; max_skew_ns: its largest magnitude.
     """
 
     tolerance_ns: int
@@ -29,6 +31,9 @@ class PairFormer:
     max_skew_ns: int = 0
     _step: int | None = None
     _new_step: tuple[int, int] = (0, 0)
+    _may_change: bool = False
+    _last: list[tuple[int, int] | None] = field(default_factory=lambda: [None, None])
+    _exposure_ns: list[float] = field(default_factory=lambda: [0.0, 0.0])
     _waiting: tuple[deque[LivePicture], deque[LivePicture]] = field(
         default_factory=lambda: (deque(), deque())
     )
@@ -37,6 +42,7 @@ class PairFormer:
         """Add the next picture in time order; yield pairs that are certain, each with its exposure
         (monotonic, ns).
         """
+        self._count(picture)
         self._waiting[picture.camera].append(picture)
         lefts, rights = self._waiting
         while lefts and rights:
@@ -72,15 +78,28 @@ class PairFormer:
         if left.trigger is None or right.trigger is None:
             return True
         step = left.trigger - right.trigger
-        if self._step is None or step == self._step:
-            self._step, self._new_step = step, (0, 0)
-            return True
-        count = self._new_step[1] + 1 if self._new_step[0] == step else 1
-        self._new_step = step, count
-        if count < NEW_STEPS:
-            return False
-        self._step = step
+        if self._step is not None and step != self._step:
+            count = self._new_step[1] + 1 if self._new_step[0] == step else 1
+            self._new_step = step, count
+            if count < NEW_STEPS or not self._may_change:
+                return False
+        self._step, self._new_step, self._may_change = step, (0, 0), False
         return True
+
+    def _count(self, picture: LivePicture) -> None:
+        """Note whether a camera counted anew, or took half an interval more than it has exposures."""
+        camera, last = picture.camera, self._last[picture.camera]
+        if picture.trigger is None:
+            return
+        self._last[camera] = picture.trigger, picture.stamp_ns
+        if last is None:
+            return
+        exposures, took_ns = picture.trigger - last[0], picture.stamp_ns - last[1]
+        if exposures <= 0:
+            self._may_change = True
+            return
+        self._may_change |= took_ns > (exposures + 0.5) * self._exposure_ns[camera]
+        self._exposure_ns[camera] = took_ns / exposures
 
     def _drop(self, camera: int) -> None:
         self._waiting[camera].popleft()
