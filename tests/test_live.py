@@ -328,6 +328,10 @@ HEARD = SensorActivity((10**9, 10**9), 10**9, 30_000_000, {"imu": 10**9, "crane"
         (replace(HEARD, off_m=(0.03, 0.0, 0.02)), 0, {}, "full", True, None),
         (replace(HEARD, restarted=True), 0, {}, "full", False, "their zero may have changed"),
         (replace(HEARD, troubles={"cam0": "has 1x1"}), 0, {}, "full", True, None),
+        (
+            replace(HEARD, cameras_ns=(0, 10**9), troubles={"cam0": "has 1x1"}), 0.05, {}, "encoders-only",
+            False, "cam0: no picture yet: has 1x1",
+        ),
         (replace(HEARD, troubles={"cam0": "has 1x1"}), 1.0, {}, "blind", False, "(bound 0.30 s): has 1x1"),
         (replace(HEARD, troubles={"imu_clock": "it drifts"}), 0, {}, "full", False, "imu: it drifts"),
         (replace(HEARD, troubles={"pictures": "black"}), 0, {}, "encoders-only", False, "cam1: black"),
@@ -554,6 +558,33 @@ def test_pictures_in_which_nothing_can_be_matched_are_reported_until_they_can(
         told.append(link.told("pictures"))
     assert told[:2] == told[4:] == ["", ""]
     assert all("the left image is black all over" in one for one in told[2:4])
+
+
+@pytest.mark.parametrize("frozen", [(0,), (1,), (0, 1)])
+def test_a_camera_that_repeats_its_picture_while_the_crane_moves_is_reported(
+    frozen: tuple[int, ...], whole: Path, board: Counters, ring: PairRing, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """Three pairs of a crane that stands, four of one that moves by 40 mm from each to the next, then a new
+    picture; a picture may come again while the crane stands.
+    """
+    link = Link(LiveInput(whole), SETTINGS.chosen(), LiveSettings(), tmp_path, tmp_path, "", board.name, None)
+    recording = bs.open_recording(whole)
+    seen = [one for one in recording.frames() if isinstance(one, StereoFrame)]
+    monkeypatch.setattr(Tracking, "_wait_for_readings", lambda self, stamp_ns: None)
+    monkeypatch.setattr(Tracking, "_placed", lambda self, pair: RefusedFrame(pair.stamp_ns, "not tried"))
+    tracking, told = Tracking(link, GrowingRecording(recording, [], link), board, ring), []
+    for k in range(8):
+        link.readings("crane").append(np.array([k]), np.array([[0.04 * max(k - 2, 0), 1.0, 8.0]]))
+        images = [
+            getattr(seen[0], side) if k < 3 or (camera in frozen and k < 7) else getattr(seen[1], side) + k
+            for camera, side in enumerate(("left", "right"))
+        ]
+        tracking.take(CapturedPair(k + 1, 0, StereoFrame(k, *images)), range(0))
+        told.append(link.told("pictures"))
+    names = " and ".join(f"cam{camera}" for camera in frozen)
+    why = f"the same picture comes again and again from {names} while the crane moves"
+    assert told == [""] * 4 + [why] * 3 + [""]
 
 
 def test_a_trouble_that_changes_is_never_read_as_over(

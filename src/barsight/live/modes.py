@@ -25,8 +25,8 @@ MODES: dict[ModeName, str] = {
 }
 SENSORS = ("cam0", "cam1", "imu", "crane")
 TROUBLES = ("cam0", "cam1", "pictures", *(f"{name}_clock" for name in SENSORS))
-"""Names of troubles: why a camera isn't connected, why nothing in the last pictures can be matched, and why a
-sensor's clock can't be followed.
+"""Names of troubles: why a camera isn't connected, why the last pictures show nothing or nothing new, and why
+a sensor's clock can't be followed.
 """
 FOR_LIFTS = ("full", "no-imu")
 MIN_CAMERA_SILENCE_S = 0.3
@@ -129,15 +129,15 @@ def _doubts(heard: SensorActivity) -> list[str]:
 
 def _silent_cameras(heard: SensorActivity, now_ns: int, settings: LiveSettings) -> list[str]:
     """List the cameras that have provided no picture for too long, or both if theirs form no pairs or show
-    nothing.
+    nothing new.
     """
     silences = []
     bound_s = max(MIN_CAMERA_SILENCE_S, settings.camera_silence_intervals * heard.interval_ns / NS_PER_S)
     for camera, last_ns in enumerate(heard.cameras_ns):
+        why = heard.troubles.get(f"cam{camera}", "")
         if not last_ns:
-            silences.append(f"cam{camera}: no picture yet")
+            silences.append(f"cam{camera}: no picture yet" + (why and f": {why}"))
         elif now_ns - last_ns > seconds_to_ns(bound_s):
-            why = heard.troubles.get(f"cam{camera}", "")
             silences.append(_silence(f"cam{camera}", now_ns - last_ns, bound_s) + (why and f": {why}"))
     if why := heard.troubles.get("pictures", ""):
         silences.append(f"cam0 and cam1: {why}")

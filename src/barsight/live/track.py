@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from barsight.calibration.geometry.rectification import Rectifier
-from barsight.core.arrays import Float64
+from barsight.core.arrays import Float64, UInt8
 from barsight.core.compiling.ahead import load_kernels
 from barsight.core.errors import BarsightError, Failed, MeasurementError
 from barsight.core.files import atomic_path
@@ -30,6 +30,8 @@ GRACE_S = 0.3
 """Longest time in seconds that a frame waits for the readings of a sensor that has gone silent."""
 UNMATCHABLE_PAIRS = 3
 """Number of pairs in succession that are reported if nothing in them can be matched, as by covered lenses."""
+REPEATED_M = 0.05
+"""Distance in metres that the crane may travel, by the encoders, while a camera repeats one picture."""
 AGAIN_FRAMES = 10
 """Number of last keyframes that a restarted process tracks first: more than the window holds."""
 
@@ -61,6 +63,30 @@ def track(link: Link) -> None:
     board["track", "done"] = 1
 
 
+class RepeatWatch:
+    """Detects a camera that gives the same picture again and again while the crane travels."""
+
+    def __init__(self) -> None:
+        self._images: list[UInt8 | None] = [None, None]
+        self._since_m: list[Float64] = [np.zeros((0, 3))] * 2
+
+    def check(self, frame: StereoFrame, place_m: Float64) -> str:
+        """Examine the next pair; return which camera repeats its picture, "" if none does.
+
+        place_m: (1, 3) the encoders' newest reading; empty without one.
+        """
+        found = []
+        for camera, image in enumerate((frame.left, frame.right)):
+            before, since_m = self._images[camera], self._since_m[camera]
+            if before is None or not np.array_equal(image, before) or not len(since_m):
+                self._images[camera], self._since_m[camera] = image, place_m
+            elif len(place_m) and np.linalg.norm(place_m - since_m) > REPEATED_M:
+                found.append(f"cam{camera}")
+        if not found:
+            return ""
+        return f"the same picture comes again and again from {' and '.join(found)} while the crane moves"
+
+
 class Tracking:
     """Estimates each pair's pose from the data available when it arrives, and keeps the keyframes."""
 
@@ -77,6 +103,7 @@ class Tracking:
         self._last_kept_ns, self._still = 0, 0
         self._off_um: list[int] = []
         self._unmatchable = 0
+        self._repeats, self._encoders = RepeatWatch(), link.readings("crane")
 
     def follow_again(self) -> None:
         """Track the last keyframes again after a restart; without encoders, all of them."""
@@ -109,7 +136,7 @@ class Tracking:
         if isinstance(rectified, Failed):
             posed: PosedFrame | RefusedFrame = RefusedFrame(stamp, rectified.reason)
         else:
-            self._tell_pictures(check_matchable(rectified))
+            self._tell_pictures(check_matchable(rectified), pair.frame)
             self._wait_for_readings(stamp)
             posed = self._placed(rectified)
         has_pose = isinstance(posed, PosedFrame)
@@ -144,10 +171,14 @@ class Tracking:
         off_m = poses.encoders_off_m if isinstance(poses, FixedLagPoses) else np.zeros(3)
         return {name: round(1e6 * off) for name, off in zip(OFF, off_m.tolist(), strict=True)}
 
-    def _tell_pictures(self, nothing: Failed | None) -> None:
-        """Report why nothing can be matched, once that holds for several pairs in succession."""
+    def _tell_pictures(self, nothing: Failed | None, frame: StereoFrame) -> None:
+        """Report why nothing can be matched, once that holds for several pairs in succession, and which
+        camera repeats its picture.
+        """
         self._unmatchable = 0 if nothing is None else self._unmatchable + 1
-        why = nothing.reason if nothing is not None and self._unmatchable >= UNMATCHABLE_PAIRS else ""
+        why = self._repeats.check(frame, self._encoders.last(1)[1])
+        if nothing is not None and self._unmatchable >= UNMATCHABLE_PAIRS:
+            why = nothing.reason
         self._link.tell("pictures", why)
 
     def _keep_passed(self, pair: CapturedPair | None) -> None:
