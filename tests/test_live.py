@@ -560,6 +560,31 @@ def test_pictures_in_which_nothing_can_be_matched_are_reported_until_they_can(
     assert all("the left image is black all over" in one for one in told[2:4])
 
 
+def test_lenses_that_are_covered_but_for_the_sensors_noise_are_reported_until_they_are_free(
+    whole: Path, board: Counters, ring: PairRing, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No real picture is of one gray: mode full stood, with lifts, to the end of the run."""
+    link = Link(LiveInput(whole), SETTINGS.chosen(), LiveSettings(), tmp_path, tmp_path, "", board.name, None)
+    recording, rng = bs.open_recording(whole), np.random.default_rng(0)
+    seen = next(one for one in recording.frames() if isinstance(one, StereoFrame))
+    monkeypatch.setattr(Tracking, "_wait_for_readings", lambda self, stamp_ns: None)
+    crane, imu = recording.crane(), recording.imu()
+    assert crane is not None and imu is not None
+    link.readings("crane").append(crane.stamp_ns, crane.position_m)
+    link.readings("imu").append(imu.stamp_ns, np.hstack([imu.gyro_radps, imu.accel_mps2]))
+    growing = GrowingRecording(recording, [], link)
+    growing.grow()
+    tracking, told = Tracking(link, growing, board, ring), []
+    tracking.follow_again()
+    for k in range(14):
+        noise = np.rint(rng.normal(1.0, 0.9, (2, *seen.left.shape))).clip(0, 255).astype(np.uint8)
+        images = (seen.left, seen.right) if k < 2 or k > 11 else tuple(noise)
+        pair = StereoFrame(seen.stamp_ns + 10_000_000 * k, *images)
+        tracking.take(CapturedPair(k + 1, 0, pair), range(0))
+        told.append(bool(link.told("pictures")))
+    assert told == [False] * 9 + [True] * 3 + [False] * 2
+
+
 @pytest.mark.parametrize("frozen", [(0,), (1,), (0, 1)])
 def test_a_camera_that_repeats_its_picture_while_the_crane_moves_is_reported(
     frozen: tuple[int, ...], whole: Path, board: Counters, ring: PairRing, tmp_path: Path,

@@ -30,6 +30,8 @@ GRACE_S = 0.3
 """Longest time in seconds that a frame waits for the readings of a sensor that has gone silent."""
 UNMATCHABLE_PAIRS = 3
 """Number of pairs in succession that are reported if nothing in them can be matched, as by covered lenses."""
+UNTIED_PAIRS = 8
+"""Number of pairs in succession that are reported if their pictures don't follow from each other."""
 REPEATED_M = 0.05
 """Distance in metres that the crane may travel, by the encoders, while a camera repeats one picture."""
 AGAIN_FRAMES = 10
@@ -136,9 +138,9 @@ class Tracking:
         if isinstance(rectified, Failed):
             posed: PosedFrame | RefusedFrame = RefusedFrame(stamp, rectified.reason)
         else:
-            self._tell_pictures(check_matchable(rectified), pair.frame)
             self._wait_for_readings(stamp)
             posed = self._placed(rectified)
+            self._tell_pictures(check_matchable(rectified), pair.frame)
         has_pose = isinstance(posed, PosedFrame)
         self._board.add("track", "tracked" if has_pose else "not_placed")
         if isinstance(posed, PosedFrame):
@@ -172,13 +174,16 @@ class Tracking:
         return {name: round(1e6 * off) for name, off in zip(OFF, off_m.tolist(), strict=True)}
 
     def _tell_pictures(self, nothing: Failed | None, frame: StereoFrame) -> None:
-        """Report why nothing can be matched, once that holds for several pairs in succession, and which
-        camera repeats its picture.
+        """Report why nothing can be matched or followed, once that holds for several pairs in succession, and
+        which camera repeats its picture.
         """
         self._unmatchable = 0 if nothing is None else self._unmatchable + 1
+        poses = None if self._placer is None else self._placer.poses
         why = self._repeats.check(frame, self._encoders.last(1)[1])
         if nothing is not None and self._unmatchable >= UNMATCHABLE_PAIRS:
             why = nothing.reason
+        elif isinstance(poses, FixedLagPoses) and poses.untied >= UNTIED_PAIRS:
+            why = "the pictures no longer follow from each other: dark, covered or displaced?"
         self._link.tell("pictures", why)
 
     def _keep_passed(self, pair: CapturedPair | None) -> None:

@@ -24,6 +24,7 @@ from barsight.motion.estimator import FrameInput, ImmediatePoses, TrajectoryEsti
 from barsight.motion.fixed_lag.propagation import NavigationState
 from barsight.motion.fixed_lag.sensor_buffer import SENSOR_DELAY_S, SensorBuffer
 from barsight.motion.frontend.chains import UNTIED, untied_sentence
+from barsight.motion.frontend.sightings import Sighting
 from barsight.motion.frontend.tracking import Tracker
 from barsight.motion.gravity import align_with_gravity
 from barsight.recording.base import Recording
@@ -61,7 +62,9 @@ class FixedLagFusion(TrajectoryEstimator):
 
 
 class FixedLagPoses(ImmediatePoses):
-    """`PoseEstimator` over a window of the last frames."""
+    """`PoseEstimator` over a window of the last frames. untied: number of last frames whose pictures don't
+    follow from those before.
+    """
 
     def __init__(self, estimator: FixedLagFusion, recording: Recording, rectifier: Rectifier) -> None:
         from barsight.motion.fixed_lag.smoother import FixedLagEstimator
@@ -82,15 +85,20 @@ class FixedLagPoses(ImmediatePoses):
             recording.rig.timeshift_cam_imu_ns, readings, self._level,
         )  # fmt: skip
         self._tracker = Tracker(self._estimator.predict, settings.front_end)
+        self.untied = 0
 
     def place(self, seen: FrameInput) -> PosedFrame | RefusedFrame:
         """Track the frame and estimate its pose."""
         self._estimator.readings = readings = self._readings()
         self.delay_ns = readings.delay_ns + max(0, self._estimator.delay.late_ns)
         pair = pictures_of(seen)
+        tracked: Sighting | RefusedFrame
         if isinstance(pair, Failed):
-            return self._estimator.take(RefusedFrame(seen.stamp_ns, pair.reason))
-        tracked = self._tracker.push(pair)
+            tracked = RefusedFrame(seen.stamp_ns, pair.reason)
+        else:
+            tracked = self._tracker.push(pair)
+        is_tied = isinstance(tracked, Sighting) and (tracked.motion or tracked.again) is not None
+        self.untied = 0 if is_tied else self.untied + 1
         return self._estimator.take(tracked)
 
     @property
