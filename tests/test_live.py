@@ -327,6 +327,8 @@ HEARD = SensorActivity((10**9, 10**9), 10**9, 30_000_000, {"imu": 10**9, "crane"
         (replace(HEARD, off_m=(0.2, 0.0, -0.1)), 0, {}, "full", False, "224 mm off by cameras and IMU"),
         (replace(HEARD, off_m=(0.03, 0.0, 0.02)), 0, {}, "full", True, None),
         (replace(HEARD, restarted=True), 0, {}, "full", False, "their zero may have changed"),
+        (replace(HEARD, skew_ns=-4_900_000), 0, {}, "full", False, "cam1 is exposed 4.9 ms before cam0"),
+        (replace(HEARD, skew_ns=900_000), 0, {}, "full", True, None),
         (replace(HEARD, troubles={"cam0": "has 1x1"}), 0, {}, "full", True, None),
         (
             replace(HEARD, cameras_ns=(0, 10**9), troubles={"cam0": "has 1x1"}), 0.05, {}, "encoders-only",
@@ -511,6 +513,17 @@ def test_faults_of_encoders_show_at_every_rate_and_after_a_pause(
         out.append((now_s > begin_s, heard.frozen if fault == "frozen" else heard.jumped_m > 0.15))
     assert not any(is_out for is_late, is_out in out if not is_late)
     assert all([is_out for is_late, is_out in out if is_late][2:])
+
+
+def test_exposures_apart_count_only_by_one_clock(whole: Path, board: Counters, tmp_path: Path) -> None:
+    """Two clocks are told apart by the least delays of their pictures, which may differ by milliseconds."""
+    link = Link(LiveInput(whole), SETTINGS.chosen(), LiveSettings(), tmp_path, tmp_path, "", board.name, None)
+    supervisor, found = Supervisor(link, board, lambda line: None), []
+    board["capture", "skew_ns"] = 4_900_000
+    for is_one in (0, 1):
+        board["sensors", "one_clock"] = is_one
+        found.append(supervisor._heard().skew_ns)
+    assert found == [0, 4_900_000]
 
 
 def test_tracking_begun_anew_beats_as_it_follows_all_keyframes(

@@ -35,6 +35,10 @@ PAIR_SILENCES = 2
 anew costs two pairs.
 """
 MAX_CLOCK_STEP_S = 1.0
+MAX_SKEW_NS = 1_000_000
+"""Largest difference (ns) between the two exposures of a pair. At 0.6 m/s along a baseline of 0.5 m it moves
+heights by 10 mm at 8 m.
+"""
 JUMP_SIGMAS, MIN_JUMP_M, MAX_CHANGE_MPS2 = 8.0, 0.03, 1.0
 """Thresholds of a jump: sigmas of a reading, least distance (m), and largest acceleration (m/s²) assumed when
 a reading is predicted from the crane's speed.
@@ -62,7 +66,8 @@ class SensorActivity:
     the encoders repeat one reading although the crane must be moving. jumped_m: by how much (m) they have
     jumped, otherwise 0. off_m: by how much each is off by cameras and IMU, which also see a jump that came
     while they were silent. restarted: whether their sender has restarted during the run. clock_step_s: of the
-    system's clock. troubles: by name, "" or missing if there is none (see TROUBLES).
+    system's clock. skew_ns: by how much cam1 is exposed after cam0, 0 unless the cameras share one clock.
+    troubles: by name, "" or missing if there is none (see TROUBLES).
     """
 
     cameras_ns: tuple[int, int]
@@ -74,6 +79,7 @@ class SensorActivity:
     off_m: tuple[float, ...] = (0.0, 0.0, 0.0)
     restarted: bool = False
     clock_step_s: float = 0.0
+    skew_ns: int = 0
     troubles: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -123,6 +129,10 @@ def _doubts(heard: SensorActivity) -> list[str]:
         doubts.append(f"the encoders are {1e3 * off_m:.0f} mm off by cameras and IMU, survey again")
     if heard.restarted:
         doubts.append("the encoders' sender began anew, their zero may have changed: survey again")
+    if abs(heard.skew_ns) > MAX_SKEW_NS:
+        order = "after" if heard.skew_ns > 0 else "before"
+        skew = f"cam1 is exposed {abs(heard.skew_ns) / 1e6:.1f} ms {order} cam0, by their common clock"
+        doubts.append(f"{skew}: trigger both by one signal")
     doubts += [f"{name}: {why}" for name in SENSORS if (why := heard.troubles.get(f"{name}_clock", ""))]
     return doubts
 

@@ -287,10 +287,11 @@ class Supervisor:
             self._restarted |= board["sensors", "crane_restarts"] > 0  # a capture begun anew counts from 0
         if self._link.source.crane is not None:
             step_s = (time.time_ns() - time.monotonic_ns() - self._link.source.epoch_ns) / NS_PER_S
+        skew_ns = board["capture", "skew_ns"] if board["sensors", "one_clock"] else 0
         troubles = {name: self._link.told(name) for name in TROUBLES}
         return SensorActivity(
             last_ns, pair_ns, interval_ns, readings, frozen, jumped_m,
-            tuple(board["track", name] / 1e6 for name in OFF), self._restarted, step_s, troubles,
+            tuple(board["track", name] / 1e6 for name in OFF), self._restarted, step_s, skew_ns, troubles,
         )  # fmt: skip
 
     def _write(self, health: bool) -> None:

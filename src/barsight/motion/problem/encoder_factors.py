@@ -244,7 +244,7 @@ def scale_sentences(
         if abs(excess) > SURE_SCALE_SIGMAS * sigma:
             sure.append(
                 f"{encoder} travels {size} by cameras and IMU: a wrong scale; "
-                f"this was taken off{since} (check its wheel and gear, else the cameras' baseline)"
+                f"this was taken off{since} (check wheel and gear, else the cameras' baseline and trigger)"
             )
         else:
             maybe.append(f"{encoder} may travel {size} by cameras and IMU: sigma holds it{since}")

@@ -76,7 +76,7 @@ def self_calibrate(
     if correct:
         corrected = turn_right_camera(rig, np.array([0.0, drift.yaw_rad, 0.0]))
         return SelfCalibration(Rectifier(corrected), (f"the rig is self-calibrated: {seen}",), sigma_px)
-    warnings = (f"{seen}; calibrate anew",) if is_drifted(drift) else ()
+    warnings = (f"{seen}; calibrate anew, if both cameras expose at once",) if is_drifted(drift) else ()
     return SelfCalibration(rectifier, warnings, sigma_px)
 
 
