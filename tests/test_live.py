@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import shutil
 import threading
 import time
 from collections.abc import Iterator
@@ -15,6 +16,7 @@ import pytest
 
 import barsight as bs
 from barsight.cli.main import run
+from barsight.core.errors import OutputError
 from barsight.core.reading.sealed_json import write_sealed
 from barsight.core.records.pairs import RefusedFrame, StereoFrame
 from barsight.core.records.sensor_samples import CraneSamples
@@ -219,6 +221,22 @@ def test_an_ended_run_does_not_say_that_lifts_stand(
         replay(whole, tmp_path / "out", SETTINGS, LiveSettings(), tell=lambda _: None)
     state = json.loads((tmp_path / "out" / "state.json").read_text())
     assert state["phase"] == "failed" and not state["lifts"]["may_stand"]
+
+
+def test_a_folder_that_is_removed_during_the_run_is_named(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was said that the recording had no pair, for no reason."""
+
+    def cleared(self: Supervisor) -> None:
+        self.state.mode = Mode("full", (), True)
+        self._board.add("track", "kept", 3)
+        shutil.rmtree(tmp_path / "out" / ".live")
+
+    monkeypatch.setattr(Supervisor, "run", cleared)
+    with pytest.raises(OutputError, match=r"\.live: was removed during the run"):
+        replay(whole, tmp_path / "out", SETTINGS, LiveSettings(), tell=lambda _: None)
+    assert content(tmp_path / "out" / "state.json")["phase"] == "failed"
 
 
 def test_keyframes_come_back_and_torn_ones_are_refused(tmp_path: Path) -> None:

@@ -179,6 +179,8 @@ def _finish(
     write_state(state, board, out)
     lifts_s = None
     try:
+        if not kept and board["track", "kept"]:
+            raise OutputError(f"{link.folder}: was removed during the run; survey again, and leave it alone")
         if not kept:
             why = supervisor.stop_because or "; ".join(state.mode.reasons)
             raise MeasurementError(f"{link.source.recording}: no pair was kept; {why}")
