@@ -21,7 +21,8 @@ from barsight.plant.opcua.process import OpcUaProcess  # noqa: E402
 from barsight.plant.opcua.recipes import Recipes  # noqa: E402
 from barsight.plant.opcua.surveys import Told  # noqa: E402
 from opcua_plant import DrawnState  # noqa: E402
-from opcua_servers import free_port, opcua_plant  # noqa: E402
+from opcua_servers import PASSWORD, free_port, opcua_plant  # noqa: E402
+from plant_commands import plant_run, write_config  # noqa: E402
 
 pytestmark = pytest.mark.slow  # each server takes some ten seconds to start
 
@@ -138,3 +139,44 @@ async def _leave_behind(url: str, count: int) -> int:
         client.disconnect_socket()
     await asyncio.sleep(CLOSING_S)
     return made
+
+
+@pytest.mark.parametrize("tells_place", [True, False])
+def test_an_opc_ua_crane_that_lifts_beside_is_told_so_if_it_tells_where(
+    tmp_path: Path, *, tells_place: bool
+) -> None:
+    """asyncua's client makes the lift, through the server's process, on a store."""
+    pytest.importorskip("sqlalchemy")
+    from barsight.plant.opcua.security.access import add_user
+
+    add_user(tmp_path / "users.json", "crane", "operator", PASSWORD)
+    opcua = {"port": free_port(), "folder": "opcua", "users": "users.json", "allow_unsecured": True}
+    config = write_config(tmp_path, opcua=opcua)
+
+    async def lift() -> tuple[list[Any], str]:
+        client = asyncua.Client(f"opc.tcp://127.0.0.1:{opcua['port']}/barsight", timeout=20)
+        client.set_user("crane")
+        client.set_password(PASSWORD)
+        async with client:
+            node = client.get_node("ns=1;s=Handshake")
+
+            async def read(name: str) -> Any:
+                return await client.get_node(f"ns=1;s=State.{name}").read_value()
+
+            async with asyncio.timeout(20):
+                while not await read("is_valid"):
+                    await asyncio.sleep(0.1)
+            at = [await read(f"lift.{name}_m") for name in ("x", "y", "z")]
+            token, *_ = await node.call_method("1:claim", str(await read("lift.lift_id")))
+            assert (await node.call_method("1:executing", token))[1]
+            if tells_place:
+                told = await node.call_method("1:touched", "grip", at[0] + 9.0, at[1], at[2])
+                assert told == [True, ""]
+            answer = await node.call_method("1:executed", token, 0.0, False, True)
+            await asyncio.sleep(1.0)
+            return answer, str(await read("alarms"))
+
+    with plant_run(config):
+        answer, alarms = asyncio.run(lift())
+    assert answer[1] is not tells_place
+    assert ("9000 mm beside" in answer[2] and "lift-beside" in alarms) is tells_place

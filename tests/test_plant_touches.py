@@ -22,7 +22,7 @@ from barsight.plant.partner import PlcPartner
 from barsight.plant.serving import TelegramServer
 from barsight.plant.settings import TelegramSettings
 from barsight.plant.state import PlantState
-from barsight.plant.steps import LiftSteps
+from barsight.plant.steps import LiftSteps, take_named_step
 from barsight.plant.telegram import IN_MAGIC, pack, unpack
 from barsight.store import confirmation
 from barsight.store.tables import LIFT_STATES
@@ -278,6 +278,80 @@ def test_what_is_no_lift_beside(plant: Plant, way: Callable[[Driver], None]) -> 
     way(crane)
     assert crane.turn(EXECUTED) == DONE and alarms(plant) == []
     assert offers(plant) == [2, 3, 4, 5, 6]
+
+
+def holds_something_as_it_claims(crane: Driver) -> None:
+    crane.put(FREE)
+    crane.take(SECOND)
+
+
+@pytest.mark.parametrize(
+    "way", [lower_only, slack_only, lambda crane: crane.take(SECOND), holds_something_as_it_claims]
+)
+def test_a_lift_that_never_begins_is_not_made_beside_its_target(
+    plant: Plant, way: Callable[[Driver], None]
+) -> None:
+    """The PLC's program never sends `executing`."""
+    crane = Driver(plant)
+    crane.turn()
+    if way is holds_something_as_it_claims:
+        crane.take((80.0, 30.0))
+    assert crane.turn(CLAIM) == DONE
+    crane.turn()
+    way(crane)
+    assert 2 not in offers(plant)
+    assert [crane.turn(EXECUTED), crane.turn(EXECUTED)] == [REFUSED] * 2
+    assert plant.states_of(crane.lift["lift_id"]) == ["offered", "claimed", "failed"]
+    assert [one[0] for one in alarms(plant)] == ["lift-beside"] and offers(plant) == [3, 4, 5, 6]
+
+
+@pytest.mark.parametrize("before", ["nothing", "a load", "a place"])
+def test_a_lift_that_never_begins_is_made_at_its_target(plant: Plant, before: str) -> None:
+    """Also if the crane put another load down in between, or its magnet came down there for a moment."""
+    crane = Driver(plant)
+    crane.turn()
+    if before == "a load":
+        crane.take(FREE)
+    assert crane.turn(CLAIM) == DONE
+    if before == "a load":
+        crane.put((80.0, 30.0))
+    if before == "a place":
+        crane.go((80.0, 30.0), DOWN, SLACK)
+    crane.go(FREE, HIGH, 0)
+    crane.take(FIRST)
+    crane.put(FREE)
+    assert crane.turn(EXECUTED) == DONE and alarms(plant) == [] and offers(plant) == [2, 3, 4, 5, 6]
+    assert note_of(plant, crane.lift["lift_id"]).startswith("at its target")
+
+
+@pytest.mark.parametrize(("at", "begins"), [(FIRST, True), (SECOND, True), (SECOND, False), (None, True)])
+def test_an_opc_ua_crane_tells_where_its_magnet_was(
+    plant: Plant, at: tuple[float, float] | None, *, begins: bool
+) -> None:
+    def step(name: str, **arguments: object) -> str | Failed:
+        return take_named_step(plant.steps, name, "ann by OPC UA", arguments)
+
+    lift = read_state(plant.store, plant.settings).lift
+    assert lift is not None
+    token = step("claim", lift=str(lift.lift_id))
+    assert not begins or step("executing", token=token) == token
+    if at is not None:
+        assert step("touched", kind="grip", x_m=at[0], y_m=at[1], z_m=DOWN) == ""
+        assert [one[0] for one in alarms(plant)] == (["lift-beside"] if at == SECOND and begins else [])
+        assert step("touched", kind="release", x_m=FREE[0], y_m=FREE[1], z_m=DOWN) == ""
+    told = step("executed", token=token, mass_kg=0.0, slack_rope=False, position_reached=True)
+    assert isinstance(told, Failed) if at == SECOND else told == token
+    assert [one[0] for one in alarms(plant)] == (["lift-beside"] if at == SECOND else [])
+    note = "no reading of the crane told where" if at is None else "at its target"
+    assert at == SECOND or note_of(plant, lift.lift_id).startswith(note)
+
+
+@pytest.mark.parametrize("wrong", [{"kind": "grab"}, {"x_m": 118_000.0}, {"x_m": 0.0, "z_m": 0.0}])
+def test_an_opc_ua_crane_tells_no_place_that_cannot_be(plant: Plant, wrong: dict[str, object]) -> None:
+    touch = {"kind": "grip", "x_m": 118.0, "y_m": 0.0, "z_m": DOWN} | wrong
+    told = take_named_step(plant.steps, "touched", "ann by OPC UA", touch)
+    assert isinstance(told, Failed) and "grip, release, contact, on" in str(told)
+    assert offers(plant) == [1, 2, 3, 4, 5, 6]
 
 
 def test_a_load_that_is_put_down_beside_an_offer_ends_it(plant: Plant) -> None:

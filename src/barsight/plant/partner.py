@@ -54,6 +54,7 @@ class PlcPartner:
         self._last: PlcReading | None = None
         self._last_s = 0.0
         self.begun = begun
+        self._claimed: int | None = None
         self._contact_m: float | None = None
 
     @property
@@ -102,7 +103,7 @@ class PlcPartner:
         Without a position nothing is known, nor from the first reading, nor of what happened before one that
         came `MAX_GAP_S` late: by then the load may hang, if the magnet is on. It is down if the rope is
         slack; while a lift has begun also up to `DOWN_M` above the height of contact, otherwise whenever it
-        is turned on.
+        is turned on. While one is claimed, coming below that height tells that it came down.
         """
         last, last_s = self._last, self._last_s
         self._last_s = time.monotonic()
@@ -110,13 +111,13 @@ class PlcPartner:
         if self._last is None or self._last_s - last_s > MAX_GAP_S:
             last = None
             if reading.is_magnet_on:
-                self.begun = self._contact_m = None
+                self.begun = self._claimed = self._contact_m = None
         if last is None or reading.place_m is None:
             return
-        contact_m = self._contact_m
-        down_m = math.inf if contact_m is None else contact_m + DOWN_M
+        low_m = -math.inf if self._contact_m is None else self._contact_m + DOWN_M
+        down_m = math.inf if self.begun is None or self._contact_m is None else low_m
         was, now = (_Magnet.of(one, down_m) for one in (last, reading))
-        lowered = contact_m is not None and now.is_low and not was.is_low
+        lowered = last.hoist_m > low_m >= reading.hoist_m
         kinds = {
             "release": was.is_on and not now.is_on,
             "on": now.is_on and not was.is_on and not now.grips,
@@ -143,7 +144,7 @@ class PlcPartner:
         is_second: whether another PLC with the same name is alive; the state is invalid then too.
         """
         lift = state.lift
-        is_own = lift is not None and lift.lift_id == self.begun
+        is_own = lift is not None and lift.lift_id in (self.begun, self._claimed)
         self._contact_m = lift.hoist_height_m if lift is not None and is_own else None
         if self.is_alive and not is_second:
             return state
@@ -180,7 +181,10 @@ class PlcPartner:
         lift = (found["lift_id"], found["checksum"])
         if found["command"] == CLAIM:
             claim = self._steps.claim(self.name, *lift)
-            return (REFUSED, 0) if isinstance(claim, Failed) else (DONE, claim.token)
+            if isinstance(claim, Failed):
+                return REFUSED, 0
+            self._claimed, self.begun = claim.lift_id, self.begun if self.begun == claim.lift_id else None
+            return DONE, claim.token
         token, flags = found["token"], found["flags"]
         answer: str | int | Failed
         if found["command"] == EXECUTING:

@@ -46,9 +46,14 @@ class PlcReading:
 
     @property
     def place_m(self) -> tuple[float, float, float] | None:
-        """Return bridge, trolley and hoist; None if they aren't known: all zeros, or no place of a yard."""
+        """Return bridge, trolley and hoist; None if they aren't known."""
         place_m = (self.bridge_m, self.trolley_m, self.hoist_m)
-        return place_m if 0 < max(map(abs, place_m)) < MAX_PLACE_M else None
+        return place_m if is_place(*place_m) else None
+
+
+def is_place(*place_m: float) -> bool:
+    """Check whether a crane's readings are known: not all zeros, nor outside any yard."""
+    return 0 < max(map(abs, place_m)) < MAX_PLACE_M
 
 
 @dataclass(frozen=True)

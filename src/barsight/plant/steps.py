@@ -20,9 +20,9 @@ from barsight.plant.handshake import (
     report_failed,
 )
 from barsight.plant.settings import PlantSettings
-from barsight.plant.state import OfferedLift
+from barsight.plant.state import OfferedLift, is_place
 from barsight.store.opening import Store
-from barsight.store.touches import Touch, note_touch
+from barsight.store.touches import TOUCH_KINDS, Touch, note_touch
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,8 @@ class LiftSteps:
 
 
 def take_named_step(steps: LiftSteps, step: str, who: str, arguments: Mapping[str, Any]) -> str | Failed:
-    """Apply a step given by name, with the arguments of the OPC UA methods; return the token as text.
+    """Apply a step given by name, with the arguments of the OPC UA methods; return the token as text, or none
+    for `touched`.
 
     mass_kg: 0 or less if the load wasn't weighed.
     """
@@ -121,6 +122,13 @@ def take_named_step(steps: LiftSteps, step: str, who: str, arguments: Mapping[st
         if step == "claim":
             claim = steps.claim(who, _number(arguments["lift"]))
             return claim if isinstance(claim, Failed) else str(claim.token)
+        if step == "touched":
+            touch = Touch(*(arguments[name] for name in ("kind", "x_m", "y_m", "z_m")))
+            if touch.kind not in TOUCH_KINDS or not is_place(touch.x_m, touch.y_m, touch.z_m):
+                kinds = ", ".join(TOUCH_KINDS)
+                return Failed("no-touch", f"give a kind ({kinds}) and the readings in metres, not all 0")
+            steps.touched(who, touch)
+            return ""
         token = _number(arguments["token"])
         answer: str | int | Failed
         if step == "executing":

@@ -199,7 +199,7 @@ def find_beside(connection: Connection, lift_id: int, *, is_reported: bool) -> s
 
     The magnet must be there whenever it takes something, until it has put a load down elsewhere. is_reported:
     the lift is over, so that it must also have come down there, if it came down anywhere. None also if a load
-    was put down that nobody saw taken.
+    was put down that nobody saw taken. Of a lift that never begins this can be told only as it is reported.
     """
     rows = _touches_of(connection, lift_id)
     if not rows:
@@ -269,6 +269,22 @@ def lift_record(connection: Connection, lift_id: int) -> dict[str, Any]:
 
 
 def _touches_of(connection: Connection, lift_id: int) -> Sequence[Row[Any]]:
-    return connection.execute(
-        select(TOUCHES).where(TOUCHES.c.lift_id == lift_id).order_by(TOUCHES.c.id)
-    ).all()
+    """List the touches of a lift; of one that never began also those of its crane since the claim that belong
+    to no lift, without the end of what the crane held before.
+    """
+    which = TOUCHES.c.lift_id == lift_id
+    steps = {
+        row.state: row
+        for row in connection.execute(select(LIFT_STATES).where(LIFT_STATES.c.lift_id == lift_id)).all()
+    }
+    if "claimed" in steps and "executing" not in steps:
+        claim = steps["claimed"]
+        own = (TOUCHES.c.who == claim.who) & TOUCHES.c.lift_id.is_(None)
+        before = select(TOUCHES.c.kind).where(own, TOUCHES.c.at_ns < claim.at_ns)
+        newest = before.order_by(TOUCHES.c.id.desc()).limit(1)
+        held = connection.execute(newest).scalar() in ("grip", "on")
+        rows = connection.execute(
+            select(TOUCHES).where(which | (own & (TOUCHES.c.at_ns >= claim.at_ns))).order_by(TOUCHES.c.id)
+        ).all()
+        return rows[1:] if held and rows and rows[0].kind == "release" else rows
+    return connection.execute(select(TOUCHES).where(which).order_by(TOUCHES.c.id)).all()

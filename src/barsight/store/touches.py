@@ -40,6 +40,9 @@ with extra("store"):
     from sqlalchemy import Connection, Row, Select, select
 
 
+TOUCH_KINDS = ("grip", "release", "contact", "on")
+
+
 @dataclass(frozen=True)
 class Touch:
     """A place that a crane read. kind: `grip` (the magnet is down and on), `release` (it was turned off),

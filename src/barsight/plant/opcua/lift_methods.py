@@ -1,4 +1,6 @@
-"""Answer the handshake of a lift: Claim, Executing, Executed and Failed, for operators and above."""
+"""Answer the handshake of a lift: Claim, Executing, Executed and Failed, and where the magnet touches
+something, for operators and above.
+"""
 
 from __future__ import annotations
 
@@ -19,15 +21,21 @@ STEPS: dict[str, dict[str, ua.VariantType]] = {
         "slack_rope": ua.VariantType.Boolean, "position_reached": ua.VariantType.Boolean,
     },
     "failed": {"token": ua.VariantType.String, "reason": ua.VariantType.String},
+    "touched": {
+        "kind": ua.VariantType.String, "x_m": ua.VariantType.Double, "y_m": ua.VariantType.Double,
+        "z_m": ua.VariantType.Double,
+    },
 }  # fmt: skip
-"""Steps of the handshake with their arguments and types."""
+"""Steps of the handshake with their arguments and types. A crane need not call `touched`."""
 _KINDS = {
     ua.VariantType.String: str, ua.VariantType.Double: float, ua.VariantType.Boolean: bool,
 }  # fmt: skip
 
 
 class LiftMethods:
-    """The object `Handshake`: each method returns the token, whether the step was taken, and if not, why."""
+    """The object `Handshake`: each method returns the token, whether the step was taken, and if not, why;
+    `touched`, which needs no lift, returns no token.
+    """
 
     def __init__(self, server: Server, source: PlantSource) -> None:
         self._server = server
@@ -43,7 +51,7 @@ class LiftMethods:
         for step, arguments in STEPS.items():
             await node.add_method(
                 ua.NodeId(f"Handshake.{step}", index), ua.QualifiedName(step, index), self._taker(step),
-                [_argument(name, kind) for name, kind in arguments.items()], outputs,
+                [_argument(name, kind) for name, kind in arguments.items()], outputs[step == "touched" :],
             )  # fmt: skip
 
     def _taker(self, step: str) -> Any:
@@ -62,10 +70,11 @@ class LiftMethods:
             if answer is None:
                 return ua.StatusCode(ua.StatusCodes.BadNoCommunication)
             is_taken = not isinstance(answer, Failed)
-            return [
+            told = [
                 ua.Variant(answer if is_taken else "", ua.VariantType.String), ua.Variant(is_taken),
                 ua.Variant("" if is_taken else str(answer), ua.VariantType.String),
             ]  # fmt: skip
+            return told[step == "touched" :]
 
         return take
 
