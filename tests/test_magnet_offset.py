@@ -1,7 +1,9 @@
 """The magnet's offset by touch-downs: averaged, taken off the crane's target, bound to its rig."""
 
+import cmath
 import json
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -36,21 +38,31 @@ HANGS_M = np.array([0.012, -0.007, 0.004])
 OFFSET = MagnetOffset(*HANGS_M.tolist(), 0.001, 0.002, 0.0015, "cal", "yard")
 
 
+def turned(xy_m: tuple[float, float], yaw_deg: float) -> tuple[float, float]:
+    """A vector turned about Z, by complex numbers."""
+    vector = complex(*xy_m) * cmath.exp(1j * np.radians(yaw_deg))
+    return vector.real, vector.imag
+
+
 def certificate(
     folder: Path, rng: np.random.Generator, count: int = 6, offset: MagnetOffset | None = None,
     stray_m: float = 0.0, artefacts: int = 5, recordings: int = 1, map_m: float = 0.0,
-    scatter_m: float = 0.002, apart_m: float = 0.0,
+    scatter_m: float = 0.002, apart_m: float = 0.0, yaws_deg: Sequence[float] = (0.0,),
+    turns_m: tuple[float, float] = (0.0, 0.0),
 ) -> Path:  # fmt: skip
     """A certificate with touch-downs that scatter by `scatter_m`, on spheres that recordings see `map_m` off.
-    stray_m: added to the third's x. apart_m: added to every other one's.
+    stray_m: added to the third's x. apart_m: added to every other one's. yaws_deg: of the magnet, one for
+    each round of the artefacts. turns_m: what hangs off along x and y at yaw 0 and turns with it.
     """
     plan = replace(planned(), dummy_bundle=())
     tops = [np.array([s.x_m, s.y_m, s.z_m + s.diameter_m / 2]) for s in plan.sphere[:artefacts]]
-    read = [tops[k % artefacts] - HANGS_M + rng.normal(0, scatter_m, 3) for k in range(count)]
+    yaws = [yaws_deg[k // artefacts % len(yaws_deg)] for k in range(count)]
+    hangs = [HANGS_M + np.array([*turned(turns_m, yaw), 0.0]) for yaw in yaws]
+    read = [tops[k % artefacts] - hangs[k] + rng.normal(0, scatter_m, 3) for k in range(count)]
     read[2:3] = [place + np.array([stray_m, 0, 0]) for place in read[2:3]]
     read[::2] = [place + np.array([apart_m, 0, 0]) for place in read[::2]]
     touched = tuple(
-        TouchDown(f"touch {k}", plan.sphere[k % artefacts].name, *place.tolist(), sigma_m=0.001)
+        TouchDown(f"touch {k}", plan.sphere[k % artefacts].name, *place.tolist(), 0.001, yaws[k])
         for k, place in enumerate(read)
     )
     plan = replace(plan, touch_down=touched)
@@ -90,16 +102,76 @@ def test_the_mean_of_touch_downs_lies_within_its_sigma(
         found = touched_offset(
             certificate(tmp_path, rng, count, recordings=recordings, map_m=map_m), MAGNET.tolerance
         )
-        off.append((np.array(found.place_m) - HANGS_M) / found.sigma_m)
+        off.append((found.place_m(0.0) - HANGS_M) / found.sigma_m(0.0))
     assert np.mean(np.abs(off) < 2) > 0.94, "95.45 % by Student's t"
     assert 0.5 < np.std(off) < 1.1
+
+
+@pytest.mark.parametrize("yaws_deg", [(0.0, 90.0), (0.0, 45.0, 180.0), (10.0, -35.0)])
+def test_touch_downs_at_several_yaws_tell_what_turns_with_the_magnet(
+    yaws_deg: tuple[float, ...], tmp_path: Path
+) -> None:
+    """Thirty commissionings, each judged at the yaws of its touch-downs and at 120 degrees."""
+    near, far = [], []
+    for seed in range(30):
+        rng = np.random.default_rng((25, seed))
+        turns_m = (-0.02, 0.015)
+        made = certificate(tmp_path, rng, 15, map_m=0.0014, yaws_deg=yaws_deg, turns_m=turns_m)
+        found = touched_offset(made, MAGNET.tolerance)
+        assert found.turn_sigma_m is not None
+        for yaw_deg, off in (*((yaw, near) for yaw in yaws_deg), (120.0, far)):
+            true_m, yaw_rad = HANGS_M + np.array([*turned(turns_m, yaw_deg), 0.0]), np.radians(yaw_deg)
+            off.append((found.place_m(yaw_rad) - true_m) / found.sigma_m(yaw_rad))
+    for off in (near, far):
+        assert np.mean(np.abs(off) < 2) > 0.94 and 0.3 < np.std(off) < 1.1
+
+
+def test_an_offset_known_at_one_yaw_is_used_near_it_only(tmp_path: Path) -> None:
+    made = certificate(tmp_path, np.random.default_rng(24), yaws_deg=(-90.0,), turns_m=(0.01, 0.0))
+    found = touched_offset(made, MAGNET.tolerance)
+    assert found.turn_sigma_m is None and found.yaw_deg == pytest.approx(-90)
+    (own, near), tight = (found.sigma_m(np.radians(yaw)) for yaw in (-90, -85)), found.x_sigma_m
+    assert own[0] == pytest.approx(tight) and near[0] > own[0] + 1e-4 and near[2] == own[2]
+    bundle = record(laid(0.3))
+    for hung, codes in ((found, ["magnet-turned"]), (replace(found, yaw_deg=-8.0), [])):
+        plan = plan_lifts(map_of([laid(0.3)]), (bundle,), replace(MAGNET, offset=hung), SETTINGS, ())
+        assert [veto.code for lift in plan.refused for veto in lift.vetoes] == codes
+    assert "touch down at this yaw too" in plan_lifts(
+        map_of([laid(0.3)]), (bundle,), replace(MAGNET, offset=found), SETTINGS, ()
+    ).refused[0].vetoes[0].reason  # fmt: skip
+    assert "at yaw -90.0 deg, within 10 deg" in found.words
+
+
+def test_what_turns_with_the_magnet_is_turned_at_its_target_and_set_down(store: Store) -> None:
+    """A load that is lifted at yaw 0 and put down at 90 degrees, beside what the store then protects."""
+    turns = replace(OFFSET, along_m=0.03, across_m=-0.01, turn_sigma_m=0.001)
+    stock = [laid(0.3)]
+    plan = plan_lifts(map_of(stock), (record(stock[0]),), replace(MAGNET, offset=turns), SETTINGS, ())
+    (lift,) = plan.offered
+    over = Placement(3.0, 4.0, np.radians(90.0))
+    (row,) = lifts_content(replace(plan, offered=(replace(lift, magnet_down=over),)), "yard", GIVEN, "0")[
+        "lifts"
+    ]
+    off = [row["target"][axis] - row["crane_target"][axis] for axis in ("x_m", "y_m")]
+    assert off == pytest.approx([0.012 - 0.01, -0.007 + 0.03], abs=1e-6)
+    down = [row["crane_set_down"][axis] for axis in ("x_m", "y_m")]
+    assert down == pytest.approx([3 - 0.012 + 0.03, 4 + 0.007 + 0.01], abs=1e-6)
+    size = dict(zip(("width_m", "length_m"), MAGNET.size_m, strict=True))
+    with store.reading() as connection:
+        found = find_outlines(connection, 1, 1, row | {"beam": size, "offset": asdict(turns)})
+    assert np.abs(found[1] - corners((3.0, 4.0), over.yaw_rad, *MAGNET.size_m)).max() < 1e-6
 
 
 def test_a_magnets_file_gets_the_offset_of_its_rig(tmp_path: Path) -> None:
     assert calibrated(tmp_path, certificate(tmp_path, np.random.default_rng(24))) == 0
     found = load_magnet(tmp_path / "hung.toml").offset
     assert found is not None and (found.calibration_id, found.yard_frame_id) == ("cal", "yard")
-    assert np.all(np.abs(np.array(found.place_m) - HANGS_M) < 3 * np.array(found.sigma_m))
+    assert np.all(np.abs(found.place_m(0.0) - HANGS_M) < 3 * found.sigma_m(0.0))
+    turned = certificate(tmp_path, np.random.default_rng(24), 10, yaws_deg=(0.0, 90.0), turns_m=(0.02, 0.0))
+    assert calibrated(tmp_path, turned) == 0
+    found = load_magnet(tmp_path / "hung.toml").offset
+    assert found is not None and found.turn_sigma_m is not None
+    assert np.hypot(found.across_m - 0.02, found.along_m) < 4 * found.turn_sigma_m
 
 
 def test_an_offset_is_taken_off_what_the_crane_gets(tmp_path: Path) -> None:
@@ -119,7 +191,7 @@ def test_an_offset_is_taken_off_what_the_crane_gets(tmp_path: Path) -> None:
         assert moved == pytest.approx(HANGS_M, abs=1e-8)
         assert after["crane_target"]["yaw_deg"] == before["target"]["yaw_deg"]
         added = np.array(after["target_covariance"]) - np.array(before["target_covariance"])
-        wanted = np.diag([*np.square(OFFSET.sigma_m), 0])
+        wanted = np.diag([*np.square(OFFSET.sigma_m(0.0)), 0])
         assert added == pytest.approx(wanted, abs=1e-11)
         down, crane = before["crane_set_down"], after["crane_set_down"]
         assert [down[name] - crane[name] for name in names] == pytest.approx(HANGS_M, abs=1e-8)
@@ -178,7 +250,7 @@ def test_later_touch_downs_are_judged_with_the_offset(tmp_path: Path) -> None:
         axis = "xyz".index(row["name"][-1])
         other = rows[row["name"]]
         assert row["error"] - other["error"] == pytest.approx(1e3 * HANGS_M[axis])
-        assert other["uncertainty"]["sigma"] == pytest.approx(np.hypot(1.0, 1e3 * OFFSET.sigma_m[axis]))
+        assert other["uncertainty"]["sigma"] == pytest.approx(np.hypot(1.0, 1e3 * OFFSET.sigma_m(0.0)[axis]))
 
 
 def test_a_touch_down_listed_under_two_names_counts_once() -> None:
@@ -198,6 +270,7 @@ def test_a_touch_down_listed_under_two_names_counts_once() -> None:
         ({"scatter_m": 0.02}, "more than the magnet's tolerance holds"),
         ({"stray_m": 0.04}, "touch 2 lies"),
         ({"count": 12, "apart_m": 0.02}, "lie in two groups"),
+        ({"count": 6, "yaws_deg": (0.0, 90.0)}, "with the magnet turned on one artefact only"),
     ],
 )
 def test_what_carries_no_offset_is_refused(

@@ -165,11 +165,11 @@ class _Judge:
         tops = [_top(view, one.on, self._plan.artefacts) for view in self._seen]
         crane = np.array([one.x_m, one.y_m, one.z_m])
         if self._offset is not None:
-            crane = crane + self._offset.place_m
+            crane = crane + self._offset.place_m(np.radians(one.yaw_deg))
         off = [np.full(3, nan) if isinstance(top, Failed) else 1e3 * (top - crane) for top in tops]
         parts = [[self._own(one.sigma_m, "the crane's place at the touch-down")] for _ in range(3)]
         if self._offset is not None:
-            for row, sigma_m in zip(parts, self._offset.sigma_m, strict=True):
+            for row, sigma_m in zip(parts, self._offset.sigma_m(np.radians(one.yaw_deg)), strict=True):
                 row.append(
                     UncertaintyPart("offset of the magnet", 1e3 * sigma_m, measured_by="calibrate magnet")
                 )

@@ -126,6 +126,7 @@ class DummyBundle:
 class TouchDown:
     """A touch-down of the magnet on an artefact, over the centre of a plate or the middle of a dummy bundle's
     axis. x_m, y_m, z_m: centre of the magnet's faces according to the crane's own readings. sigma_m: of each.
+    yaw_deg: of the magnet's beam, from +Y, as for bundles.
 
     A sphere is touched at its highest point.
     """
@@ -136,9 +137,10 @@ class TouchDown:
     y_m: float
     z_m: float
     sigma_m: float = 0.002
+    yaw_deg: float = 0.0
 
     def __post_init__(self) -> None:
-        expect_ranges(self, "touch_down.", sigma_m=NOT_NEGATIVE)
+        expect_ranges(self, "touch_down.", sigma_m=NOT_NEGATIVE, yaw_deg=(-360, 360))
 
 
 @dataclass(frozen=True)
@@ -241,7 +243,7 @@ class AcceptancePlan:
             self._expect_known(step.name, (step.lower, step.upper), self.plate)
         for touch in self.touch_down:
             self._expect_known(touch.name, (touch.on,), self.artefacts)
-        read = {(one.on, one.x_m, one.y_m, one.z_m): one.name for one in self.touch_down}
+        read = {(one.on, one.x_m, one.y_m, one.z_m, one.yaw_deg): one.name for one in self.touch_down}
         again = next((one for one in self.touch_down if one.name not in read.values()), None)
         if again is not None:
             problem = f"{again.name} has the readings of another touch-down on {again.on}"

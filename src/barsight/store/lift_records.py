@@ -27,6 +27,7 @@ from barsight.yard.events import kept_events
 from barsight.yard.inventory.bundle_file import bundle_of
 from barsight.yard.lifting.lift_file import read_lifts, unknown_events
 from barsight.yard.lifting.load import laid_at
+from barsight.yard.magnet.description import MagnetOffset
 
 with extra("store"):
     from sqlalchemy import Connection, Row, select
@@ -59,6 +60,7 @@ def add_lifts(
         record = {key: value for key, value in lift.items() if key not in ("poles", "checks")}
         record |= {
             "beam": _outline(content.get("magnet") or {}),
+            "offset": (content.get("magnet") or {}).get("offset"),
             "disturbed_reach_m": content["settings"]["disturbed_reach_m"],
             "begins_fetch": None if fetch is None else lift["bundles"] == [fetch["steps"][0]["bundle"]],
         }
@@ -184,9 +186,11 @@ def _magnet_down(record: dict[str, Any]) -> dict[str, float] | None:
     crane = record.get("crane_set_down")
     if middle is None or crane is None:
         return middle
-    target, hung = record["target"], record["crane_target"]
-    off = {name: target[name] - hung[name] for name in ("x_m", "y_m")}
-    return {**crane, "x_m": crane["x_m"] + off["x_m"], "y_m": crane["y_m"] + off["y_m"]}
+    if record.get("offset") is not None:
+        off = MagnetOffset(**record["offset"]).place_m(math.radians(crane["yaw_deg"]))
+        return {**crane, "x_m": crane["x_m"] + float(off[0]), "y_m": crane["y_m"] + float(off[1])}
+    target, hung = record["target"], record["crane_target"]  # of an earlier version, or without an offset
+    return {**crane, **{name: crane[name] + target[name] - hung[name] for name in ("x_m", "y_m")}}
 
 
 def find_gap(first: list[Float64], second: list[Float64]) -> float:

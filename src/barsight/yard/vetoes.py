@@ -13,6 +13,7 @@ VETOES = {
     "disturbed": "A lift, a set-down or a magnet came near after the map's frames of the place began.",
     "map-from-the-future": "The last frame is ahead of this computer's clock, so its age is unknown.",
     "calibration-changed": "The calibration of map or magnet's offset changed since, or has expired.",
+    "magnet-turned": "The magnet's offset was found at another yaw, and turns with the magnet.",
     "calibration-drift": "The cameras' calibration no longer fits the pictures.",
     "trajectory-degraded": "The trajectory or the encoders are less accurate than the magnet needs.",
     "live-state": "The live run ended without a sensor that lifts need.",

@@ -21,7 +21,7 @@ from barsight.registration.yard_file import YardFrame, read_yard_file
 from barsight.result_folder import open_folder, read_heights
 from barsight.yard.inventory.bundle_file import read_bundles
 from barsight.yard.lifting.travel_accuracy import Travel
-from barsight.yard.magnet.description import MagnetOffset
+from barsight.yard.magnet.description import MAX_TURN_DEG, MagnetOffset
 from barsight.yard.types import Bundle, YardMap
 from barsight.yard.weight import bundle_mass
 from barsight.yard_frame import shared_covariance
@@ -99,7 +99,10 @@ def measured_load(
     below = np.append(seen_from[:2], bundle.top_z_m)
     shared = np.zeros((6, 6)) if frame is None else frame_covariance(frame, seen_from, below)
     sources += [*_frame_source(frame, shared, assumed), _travel_source(travel.sigma_m[near], shared)]
-    sources += _magnet_source(certificate, assumed) if offset is None else _offset_sources(offset)
+    if offset is None:
+        sources += _magnet_source(certificate, assumed)
+    else:
+        sources += _offset_sources(offset, bundle.yaw_rad, assumed)
     mass = bundle_mass(bundle)
     top = np.array([bundle.centre_m[0], bundle.centre_m[1], bundle.top_z_m])
     load = BudgetedLoad(top, bundle.yaw_rad, bundle.length_m, bundle.width_m, mass.kg)
@@ -260,11 +263,15 @@ def _magnet_source(certificate: Path | None, assumed: list[str]) -> list[ErrorSo
     return sources
 
 
-def _offset_sources(offset: MagnetOffset) -> list[ErrorSource]:
-    """Form the sources of a known offset from its sigma, which already allows for the number of
-    touch-downs.
+def _offset_sources(offset: MagnetOffset, yaw_rad: float, assumed: list[str]) -> list[ErrorSource]:
+    """Form the sources of a known offset from its sigma at a bundle's yaw, which already allows for the
+    number of touch-downs.
     """
+    if (turn_deg := offset.turn_deg(yaw_rad)) > MAX_TURN_DEG:
+        assumed.append(
+            f"the magnet's offset was found {turn_deg:.0f} deg from the bundle's yaw: no lift there"
+        )
     return [
         ErrorSource("camera to magnet", (f"magnet_{axis}",), np.array([[sigma**2]]), "calibrate magnet")
-        for axis, sigma in zip("xyz", offset.sigma_m, strict=True)
+        for axis, sigma in zip("xyz", offset.sigma_m(yaw_rad).tolist(), strict=True)
     ]

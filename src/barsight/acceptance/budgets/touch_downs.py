@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ from barsight.core.errors import InputError
 from barsight.core.reading.bounded_reading import in_range
 from barsight.motion.rig_check.drift_check import BAD_STATES
 from barsight.registration.agreement import DOUBTFUL
+from barsight.yard.axes import axes_of
 from barsight.yard.magnet.description import MAX_OFFSET_M, MagnetOffset, Tolerance
 
 MIN_ARTEFACTS = 3
@@ -28,6 +31,8 @@ that is turned against the crane's axes makes another offset.
 """
 MAX_APART_M = 0.1
 """Maximum spread (m) along one axis of touch-downs made by one magnet at rest."""
+MIN_TURN_DEG = 30.0
+"""Minimum angle (degrees) between touch-downs that tell which part of the offset turns with the magnet."""
 MIN_PARTED, DRAWS = 10.0, 20_000
 """Ratio up to which two groups are parted by chance, however many touch-downs there are, and number of drawn
 samples by which the chance of a larger one is found.
@@ -40,8 +45,9 @@ def touched_offset(certificate: Path, tolerance: Tolerance) -> MagnetOffset:
 
     The mean is that of the artefacts' means. Its sigma is the largest of the artefacts' scatter and the
     scatter of all, each over the root of its number, and of what the sigma of a reading leaves, widened so
-    that two sigma cover 95.45 % by Student's t. Raises InputError where the certificate is unsuitable, or the
-    crane doesn't keep the magnet's tolerance.
+    that two sigma cover 95.45 % by Student's t. Where the magnet was turned, the part of the offset that
+    turns is fitted first, and subtracted. Raises InputError where the certificate is unsuitable, or the crane
+    doesn't keep the magnet's tolerance.
     """
     content, touches = read_certificate(certificate), touch_errors_m(certificate)
     try:
@@ -49,18 +55,87 @@ def touched_offset(certificate: Path, tolerance: Tolerance) -> MagnetOffset:
         rows = [row for row in content["quantities"] if row["group"] == "touch_mm"]
         own_m = 1e-3 * max((float(row["uncertainty"]["sigma"]) for row in rows), default=0.0)
         ids = str(content["calibration_id"]), str(content["yard_frame_id"])
-        touched = {str(one["name"]): str(one["on"]) for one in content["plan"]["touch_down"]}
+        downs = {str(one["name"]): one for one in content["plan"]["touch_down"]}
+        touched = {name: str(one["on"]) for name, one in downs.items()}
+        yaws_rad = {name: math.radians(one.get("yaw_deg", 0.0)) for name, one in downs.items()}
         _expect_spread(certificate, content["plan"], set(touched.values()))
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(certificate, f"is damaged ({type(error).__name__}: {error})", OTHER) from error
+    turning = _turning_part(certificate, touches, touched, yaws_rad, own_m)
+    if turning is not None:
+        touches = _without(turning, touches, yaws_rad)
     errors_m = [_mean_touch_m(certificate, axis, touches.get(axis, {}), touched, own_m) for axis in "xyz"]
     _expect_kept(certificate, touches, tolerance)
     (x, x_sigma), (y, y_sigma), (z, z_sigma) = errors_m
-    max_m = max(abs(x), abs(y), abs(z))
+    max_m = max(map(abs, (x, y, z, *((turning.along_m, turning.across_m) if turning else ()))))
     if max_m > MAX_OFFSET_M:
         problem = f"the magnet hangs {1e3 * max_m:.0f} mm off: that is the rig's lever arm"
         raise InputError(certificate, problem, "correct p_crane_body in crane0/sensor.yaml and accept again")
-    return MagnetOffset(x, y, z, x_sigma, y_sigma, z_sigma, *ids)
+    middle = complex(np.mean([np.exp(1j * yaws_rad[name]) for name in touches["x"]]))
+    if turning is None:
+        yaw_deg = float(np.degrees(np.angle(middle)))
+        return MagnetOffset(x, y, z, x_sigma, y_sigma, z_sigma, *ids, yaw_deg)
+    shared = abs(middle) * turning.sigma_m  # what an error of the part that turns adds to the means
+    sigmas = (math.hypot(x_sigma, shared), math.hypot(y_sigma, shared), z_sigma)
+    return MagnetOffset(x, y, z, *sigmas, *ids, 0.0, turning.along_m, turning.across_m, turning.sigma_m)
+
+
+@dataclass(frozen=True)
+class _Turning:
+    """The part of an offset that turns with the magnet, in the beam's axes, with the sigma of each."""
+
+    along_m: float
+    across_m: float
+    sigma_m: float
+
+
+def _turning_part(
+    certificate: Path, errors_m: Mapping[str, Mapping[str, float]], touched: Mapping[str, str],
+    yaws_rad: Mapping[str, float], own_m: float,
+) -> _Turning | None:  # fmt: skip
+    """Fit the part of the offset that turns with the magnet; None where the magnet was hardly turned.
+
+    Its sigma is the larger of what leaving out one artefact after another shows, widened as the mean's, and
+    of what the sigma of a reading leaves. Raises InputError where it was turned on one artefact only.
+    """
+    names = sorted(errors_m.get("x", {}).keys() & errors_m.get("y", {}).keys())
+    if _span_deg([yaws_rad[name] for name in names]) < MIN_TURN_DEG:
+        return None
+
+    def fit(chosen: Sequence[str]) -> tuple[Float64, float]:
+        """Solve for across and along, and x and y; also return the former's sigma per unit of error."""
+        rows = np.concatenate([np.hstack([axes_of(yaws_rad[name]).T, np.eye(2)]) for name in chosen])
+        told = np.array([errors_m[axis][name] for name in chosen for axis in "xy"])
+        inverse = np.linalg.inv(rows.T @ rows)
+        return (inverse @ rows.T @ told)[:2], float(inverse[0, 0]) ** 0.5
+
+    artefacts = sorted({touched[name] for name in names})
+    left = [[name for name in names if touched[name] != one] for one in artefacts]
+    if any(_span_deg([yaws_rad[name] for name in rest]) < MIN_TURN_DEG for rest in left):
+        problem = "has touch-downs with the magnet turned on one artefact only"
+        raise InputError(certificate, problem, "touch several artefacts at each yaw")
+    (across, along), per_error = fit(names)
+    jackknife, count = np.array([fit(rest)[0] for rest in left]), len(artefacts)
+    scatter = ((count - 1) * np.square(jackknife - jackknife.mean(axis=0)).mean()) ** 0.5
+    few = float(student.ppf((1 + COVERAGE) / 2, count - 1)) / 2
+    return _Turning(float(along), float(across), few * max(float(scatter), own_m * per_error, 1e-5))
+
+
+def _span_deg(yaws_rad: Sequence[float]) -> float:
+    """Return the largest angle between any two yaws, in degrees; 0 for none."""
+    turns = np.exp(1j * np.array(yaws_rad))
+    return float(np.degrees(np.abs(np.angle(turns[:, None] * turns.conj())).max(initial=0.0)))
+
+
+def _without(
+    turning: _Turning, errors_m: Mapping[str, Mapping[str, float]], yaws_rad: Mapping[str, float]
+) -> dict[str, dict[str, float]]:
+    """Subtract the part of the offset that turns from the errors by axis and name."""
+    left = {axis: dict(rows) for axis, rows in errors_m.items()}
+    for k, axis in enumerate("xy"):
+        for name in left.get(axis, {}):
+            left[axis][name] -= float((turning.across_m, turning.along_m) @ axes_of(yaws_rad[name])[:, k])
+    return left
 
 
 def _expect_sound(certificate: Path, content: dict[str, Any]) -> None:

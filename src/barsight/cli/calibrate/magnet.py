@@ -28,7 +28,8 @@ def run(arguments: Sequence[str]) -> None:
         """Find the magnet's offset from where the crane's readings place it, from touch-downs.
 
         The magnet's file is written again with the mean of the touch-downs and its sigma as [offset]. With
-        it, each lift gives the readings at which the magnet's centre is over the target (crane_target).
+        it, each lift gives the readings at which the magnet's centre is over the target (crane_target). The
+        offset holds at the yaw of the touch-downs; at any yaw where they were made at several.
 
         Args:
             certificate: Certificate from barsight accept with touch-downs on at least three spheres or dummy
@@ -40,15 +41,12 @@ def run(arguments: Sequence[str]) -> None:
         described = load_magnet(magnet)
         if described.offset is not None:
             raise InputError(magnet, "has an [offset] already", "give the file without it")
-        offset = asdict(touched_offset(certificate, described.tolerance))
-        lines = [f"{name} = {_value(value)}" for name, value in offset.items()]
+        offset = touched_offset(certificate, described.tolerance)
+        lines = [f"{name} = {_value(value)}" for name, value in asdict(offset).items() if value is not None]
         with atomic_path(out) as path:
             text = magnet.read_text("utf-8").rstrip("\n")
             path.write_text("\n".join([text, "", "[offset]", *lines, ""]), encoding="utf-8")
-        console = SafeConsole()
-        for axis in "xyz":
-            off, sigma = 1e3 * offset[f"{axis}_m"], 1e3 * offset[f"{axis}_sigma_m"]
-            console.print(f"{axis}: {off:+.1f} ± {sigma:.1f} mm", highlight=False)
+        SafeConsole().print(f"offset: {offset.words}", highlight=False)
 
     call(command, "calibrate magnet", arguments)
 

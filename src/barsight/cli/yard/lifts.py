@@ -232,9 +232,9 @@ def _offset(magnet: Magnet) -> str:
     """Describe the magnet's offset from where the crane's readings place it."""
     if magnet.offset is None:
         return "the magnet's offset is not calibrated, so its tolerance must cover it (calibrate magnet)"
-    figures = zip("xyz", magnet.offset.place_m, magnet.offset.sigma_m, strict=True)
-    offsets = ", ".join(f"{axis} {1e3 * off:+.1f} ± {1e3 * sigma:.1f}" for axis, off, sigma in figures)
-    return f"the magnet is off the crane's readings by {offsets} mm; crane_target is corrected for this"
+    return (
+        f"the magnet is off the crane's readings by {magnet.offset.words}; crane_target is corrected for this"
+    )
 
 
 def print_lifts(plan: LiftPlan, console: Console) -> None:

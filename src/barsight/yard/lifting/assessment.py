@@ -33,7 +33,7 @@ from barsight.yard.lifting.thin_bars import (
     may_reach,
     thin_bar_checks,
 )
-from barsight.yard.lifting.travel_accuracy import target_covariance, travel_checks
+from barsight.yard.lifting.travel_accuracy import target_covariance, travel_checks, turn_checks
 from barsight.yard.lifting.validity import age_checks, disturbed_checks, validity
 from barsight.yard.magnet.contact import NEWTON_PER_KG, Contact, rest_magnet
 from barsight.yard.magnet.description import Magnet, Tolerance
@@ -87,6 +87,7 @@ def assess_placement(
     overhang = _overhang(place, load, magnet)
     checks = [
         *(travel_checks(yard.travel, place, magnet, settings) if yard.travel else ()),
+        *turn_checks(place, magnet),
         *(age_checks(valid.from_ns if valid else None, yard.now_ns, settings) if yard.travel else ()),
         *area_checks(place, magnet, load, settings),
         *disturbed_checks(yard.events, place, magnet, load, valid, settings),

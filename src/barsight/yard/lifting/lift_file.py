@@ -191,7 +191,7 @@ def _crane(
     """Return what the crane's readings must be for the magnet to be at a place; the place itself where no
     offset is known.
     """
-    off = (0.0, 0.0, 0.0) if offset is None else offset.place_m
+    off = np.zeros(3) if offset is None else offset.place_m(math.radians(yaw_deg))
     height = None if z_m is None else z_m - off[2]
     return {"x_m": x_m - off[0], "y_m": y_m - off[1], "z_m": height, "yaw_deg": yaw_deg}
 

@@ -26,7 +26,7 @@ from barsight.yard.lifting.ground import Ground
 from barsight.yard.lifting.load import Load, reached_areas
 from barsight.yard.lifting.travel_accuracy import Travel
 from barsight.yard.lifting.validity import old_cells
-from barsight.yard.magnet.description import Magnet
+from barsight.yard.magnet.description import MAX_TURN_DEG, Magnet
 from barsight.yard.stability.stability import Footing
 from barsight.yard.types import Bundle
 
@@ -65,7 +65,7 @@ class SetDown:
 
 def find_set_down(ground: Ground, load: Load, magnet: Magnet, settings: LiftSettings) -> SetDown | None:
     """Find the place with the smallest turn, among these the lowest, then the nearest. None where there is
-    none, or where the load would roll.
+    none, or where the load would roll. The magnet's offset must be known at its yaw there.
     """
     if load.rolls:
         return None
@@ -73,6 +73,8 @@ def find_set_down(ground: Ground, load: Load, magnet: Magnet, settings: LiftSett
     free = ground.apart_from(load)
     for turn in _turns(settings.max_turn_deg):
         yaw = load.yaw_rad + math.radians(turn)
+        if magnet.offset is not None and magnet.offset.turn_deg(yaw) > MAX_TURN_DEG:
+            continue
         yaw -= math.pi * math.ceil(yaw / math.pi - 0.5)
         for x, y in _candidates(free, load, yaw, settings):
             bearing = find_bearing(ground.yard, load, x, y, yaw, magnet, settings)

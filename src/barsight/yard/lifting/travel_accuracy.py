@@ -19,7 +19,7 @@ from barsight.core.records.sensor_samples import CraneSamples
 from barsight.core.records.trajectory import Trajectory
 from barsight.motion.crane.encoder_trajectory import fit_position
 from barsight.yard.lift_settings import UPPER, LiftSettings
-from barsight.yard.magnet.description import Magnet, MagnetOffset
+from barsight.yard.magnet.description import MAX_TURN_DEG, Magnet, MagnetOffset
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.types import Bundle
 from barsight.yard.vetoes import Check, check_max, check_true
@@ -197,7 +197,7 @@ def travel_checks(travel: Travel, place: Placement, magnet: Magnet, settings: Li
     reason = f"no frame was located within {travel.reach_m:.1f} m of the lift"
     checks = [check_true(CODE, "frames were located near the lift", bool(near.any()), reason)]
     if near.any():
-        checks += _sure_enough(_near_sigma(travel, near), magnet)
+        checks += _sure_enough(_near_sigma(travel, near), magnet, place.yaw_rad)
         refused = int((np.linalg.norm(travel.refused_m - here, axis=1) < travel.reach_m).sum())
         seen = refused + int(near.sum())
         reason = (
@@ -247,13 +247,27 @@ def _encoder_checks(travel: Travel, place: Placement, max_m: float) -> list[Chec
     ]  # fmt: skip
 
 
-def _sure_enough(sigma: Float64, magnet: Magnet) -> list[Check]:
+def turn_checks(place: Placement, magnet: Magnet) -> list[Check]:
+    """Check that the magnet's offset, if one is stated, is known at this lift's yaw."""
+    offset = magnet.offset
+    if offset is None:
+        return []
+    turn_deg = offset.turn_deg(place.yaw_rad)
+    reason = (
+        f"the magnet's offset was found at yaw {offset.yaw_deg:.1f} deg and turns with the magnet; this lift "
+        f"is {turn_deg:.1f} deg from it, the limit is {MAX_TURN_DEG:g} deg: touch down at this yaw too"
+    )
+    what = "angle to the yaw at which the magnet's offset was found"
+    return [check_max("magnet-turned", what, turn_deg, MAX_TURN_DEG, "deg", reason)]
+
+
+def _sure_enough(sigma: Float64, magnet: Magnet, yaw_rad: float) -> list[Check]:
     """Check that the 95 % bounds of the map's position and height are within the crane's tolerance and the
     gap, each combined with the error of the magnet's offset where that is known.
     """
     source = "trajectory"
     if magnet.offset is not None:
-        sigma, source = np.hypot(sigma, magnet.offset.sigma_m), "trajectory and touch-downs"
+        sigma, source = np.hypot(sigma, magnet.offset.sigma_m(yaw_rad)), "trajectory and touch-downs"
     return [
         check_max(
             CODE, f"uncertainty of {name} near the lift (95 %), by {source}", 1e3 * UPPER * float(one),
@@ -298,5 +312,5 @@ def target_covariance(
         shared = _near_sigma(travel, near) if near.any() else np.full(3, np.nan)
         found[:3, :3] += np.diag(shared**2)
     if offset is not None:
-        found[:3, :3] += np.diag(np.square(offset.sigma_m))
+        found[:3, :3] += np.diag(np.square(offset.sigma_m(place.yaw_rad)))
     return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from importlib import resources
 from itertools import combinations
@@ -13,6 +14,7 @@ import numpy as np
 from barsight.core.arrays import Float64
 from barsight.core.settings.file import read_settings
 from barsight.core.settings.values import expect_values
+from barsight.yard.axes import axes_of
 from barsight.yard.magnet.pull import MAX_GAP_M, Pull, expect
 
 MagnetType = Literal["electro", "permanent", "electro-permanent"]
@@ -26,6 +28,10 @@ MIN_OWN_RATIO = 0.005
 """Minimum mass of a magnet, as a fraction of what it may carry; with less, the mass is in tonnes."""
 MAX_OFFSET_M = 0.2
 """Maximum offset (m): a larger one isn't how the magnet hangs, but a wrong lever arm of the rig."""
+MAX_TURN_DEG = 10.0
+"""Maximum angle (degrees) of a lift's yaw to that of the touch-downs, where all of them have one."""
+UNKNOWN_TURN_M = 0.02
+"""Sigma (m) of the part of an offset that turns with the beam, where that part isn't known."""
 _EXAMPLE = resources.files("barsight.yard.magnet").joinpath("example_magnet.toml")
 
 
@@ -110,6 +116,10 @@ class MagnetOffset:
 
     Mean of touch-downs in yard axes, with the sigma of each mean. calibration_id, yard_frame_id: the rig and
     the frame in which they were made; an offset of another rig or frame forbids every lift.
+
+    along_m, across_m: the part that turns with the beam, in its own axes, in addition to x_m and y_m; known
+    where the magnet was turned between the touch-downs, with the sigma turn_sigma_m of each. Without that
+    sigma the touch-downs were made at yaw_deg, and the offset holds near it only.
     """
 
     x_m: float
@@ -120,21 +130,59 @@ class MagnetOffset:
     z_sigma_m: float
     calibration_id: str
     yard_frame_id: str
+    yaw_deg: float = 0.0
+    along_m: float = 0.0
+    across_m: float = 0.0
+    turn_sigma_m: float | None = None
 
     def __post_init__(self) -> None:
-        most = max(abs(value) for value in self.place_m)
-        expect(most <= MAX_OFFSET_M, f"offset x_m, y_m and z_m lie within {MAX_OFFSET_M:g} m")
-        expect(min(self.sigma_m) > 0 and max(self.sigma_m) <= 0.1, "offset's sigmas lie between 0 and 0.1 m")
+        most = max(abs(value) for value in (self.x_m, self.y_m, self.z_m, self.along_m, self.across_m))
+        names = "x_m, y_m, z_m, along_m and across_m"
+        expect(most <= MAX_OFFSET_M, f"offset {names} lie within {MAX_OFFSET_M:g} m")
+        sigmas = (self.x_sigma_m, self.y_sigma_m, self.z_sigma_m, self.turn_sigma_m)
+        stated = [sigma for sigma in sigmas if sigma is not None]
+        expect(min(stated) > 0 and max(stated) <= 0.1, "offset's sigmas lie between 0 and 0.1 m")
+        expect(abs(self.yaw_deg) <= 360, "offset yaw_deg lies between -360 and 360")
+        is_turned = self.turn_sigma_m is not None or (self.along_m, self.across_m) == (0, 0)
+        expect(is_turned, "offset along_m and across_m need turn_sigma_m")
 
     @property
-    def place_m(self) -> tuple[float, float, float]:
-        """Return the offset along x, y and z."""
-        return self.x_m, self.y_m, self.z_m
+    def words(self) -> str:
+        """Describe the offset with its sigmas in mm, and where it is known."""
+        rows = [
+            ("x", self.x_m, self.x_sigma_m),
+            ("y", self.y_m, self.y_sigma_m),
+            ("z", self.z_m, self.z_sigma_m),
+        ]
+        end = f"at yaw {self.yaw_deg:.1f} deg, within {MAX_TURN_DEG:g} deg of which it is used"
+        if self.turn_sigma_m is not None:
+            rows += [("along", self.along_m, self.turn_sigma_m), ("across", self.across_m, self.turn_sigma_m)]
+            end = "at any yaw, along and across turning with the beam"
+        return (
+            ", ".join(f"{name} {1e3 * m:+.1f} ± {1e3 * sigma:.1f}" for name, m, sigma in rows) + f" mm {end}"
+        )
 
-    @property
-    def sigma_m(self) -> tuple[float, float, float]:
-        """Return the offset's sigma along x, y and z."""
-        return self.x_sigma_m, self.y_sigma_m, self.z_sigma_m
+    def place_m(self, yaw_rad: float) -> Float64:
+        """Return the offset along x, y and z (3,) at the beam's yaw."""
+        turning = np.array([self.across_m, self.along_m]) @ axes_of(yaw_rad)
+        return np.array([self.x_m + turning[0], self.y_m + turning[1], self.z_m])
+
+    def sigma_m(self, yaw_rad: float) -> Float64:
+        """Return the offset's sigma along x, y and z (3,) at the beam's yaw.
+
+        Where the part that turns isn't known, it may be as large as the whole offset, or `UNKNOWN_TURN_M`.
+        """
+        turn_m = self.turn_sigma_m
+        if turn_m is None:
+            unknown_m = max(UNKNOWN_TURN_M, float(np.hypot(self.x_m, self.y_m)))
+            turn_m = 2 * abs(np.sin(np.radians(self.turn_deg(yaw_rad)) / 2)) * unknown_m
+        return np.hypot([self.x_sigma_m, self.y_sigma_m, self.z_sigma_m], [turn_m, turn_m, 0.0])
+
+    def turn_deg(self, yaw_rad: float) -> float:
+        """Return how far a yaw is from where the offset is known, in degrees."""
+        if self.turn_sigma_m is not None:
+            return 0.0
+        return abs((math.degrees(yaw_rad) - self.yaw_deg + 180) % 360 - 180)
 
 
 @dataclass(frozen=True)
