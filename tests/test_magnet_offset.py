@@ -11,14 +11,15 @@ import jsonschema
 import numpy as np
 import pytest
 
-from barsight.acceptance.acceptance import Acceptance
+from barsight.acceptance.acceptance import Acceptance, accept
 from barsight.acceptance.budgets.touch_downs import touched_offset
 from barsight.acceptance.certificate import certificate_content, write_certificate
 from barsight.acceptance.quantities import judge_all
 from barsight.artefacts.plan import TouchDown
 from barsight.cli.main import run
-from barsight.core.errors import ConfigError
+from barsight.core.errors import ConfigError, InputError
 from barsight.core.reading.sealed_json import write_sealed
+from barsight.measure_settings import MeasureSettings
 from barsight.plant.state import offered_lift
 from barsight.store.confirmation import OpenLift
 from barsight.store.lift_records import find_gap, find_outlines
@@ -251,6 +252,22 @@ def test_later_touch_downs_are_judged_with_the_offset(tmp_path: Path) -> None:
         other = rows[row["name"]]
         assert row["error"] - other["error"] == pytest.approx(1e3 * HANGS_M[axis])
         assert other["uncertainty"]["sigma"] == pytest.approx(np.hypot(1.0, 1e3 * OFFSET.sigma_m(0.0)[axis]))
+
+
+@pytest.mark.parametrize(
+    ("own", "said"), [(6, "touch 0, touch 1, touch 2 ..."), (1, "touch 0, which"), (0, "")]
+)
+def test_touch_downs_do_not_verify_their_own_mean(own: int, said: str, tmp_path: Path) -> None:
+    """By their readings, also in a plan that names them anew; before anything is measured."""
+    path = certificate(tmp_path, np.random.default_rng(24))
+    offset = touched_offset(path, MAGNET.tolerance)
+    downs = [TouchDown(**one) for one in json.loads(path.read_text())["plan"]["touch_down"]]
+    others = [replace(one, x_m=one.x_m + 0.001) for one in downs]
+    plan = replace(planned(), touch_down=(*downs[:own], *others[own:]))
+    with pytest.raises(ConfigError, match=said) if own else pytest.raises(InputError):
+        accept(plan, [tmp_path / "none"], MeasureSettings(), tmp_path, lambda *_: None, offset)
+    with pytest.raises(ConfigError, match="has no touch_down to verify"):
+        accept(replace(plan, touch_down=()), [], MeasureSettings(), tmp_path, lambda *_: None, offset)
 
 
 def test_a_touch_down_listed_under_two_names_counts_once() -> None:

@@ -15,7 +15,7 @@ from barsight.acceptance.pictures import FRAMES, PictureHealth, check_pictures
 from barsight.acceptance.quantities import Decision, JudgedQuantity, decide, judge_all
 from barsight.acceptance.uncertainty import combine
 from barsight.artefacts.plan import AcceptancePlan, ErrorLimits
-from barsight.core.errors import Failed, InputError
+from barsight.core.errors import ConfigError, Failed, InputError
 from barsight.core.records.pairs import StereoFrame
 from barsight.core.timing import ProgressCallback
 from barsight.measure_folder import measure_into
@@ -62,6 +62,7 @@ def accept(
     offset: of the magnet that touched down. Raises a BarsightError where a recording can't be measured at
     all.
     """
+    _expect_other_touches(plan, offset)
     seen, rig, pictures, inputs = [], [], [], dict[str, dict[str, str]]()
     for number, path in enumerate(recordings, 1):
         folder = work / f"measured_{number}"
@@ -114,6 +115,20 @@ def _expect_own_offset(offset: MagnetOffset | None, first: Observation) -> None:
     if (offset.calibration_id, offset.yard_frame_id) != (first.calibration_id, first.yard_frame_id):
         problem = "has another calibration or yard frame than the magnet's offset"
         raise InputError(first.recording, problem, "touch down with this one: accept without --magnet")
+
+
+def _expect_other_touches(plan: AcceptancePlan, offset: MagnetOffset | None) -> None:
+    """Raise ConfigError where the plan has no touch-down to verify the offset, or one that made it."""
+    if offset is None:
+        return
+    own = [one.name for one in plan.touch_down if one.digest in offset.touch_downs]
+    if own:
+        problem = f"the magnet's offset is the mean of {', '.join(own[:3])}{' ...' if own[3:] else ''}"
+        raise ConfigError(f"plan: {problem}, which can't verify it: touch down again, and list only those")
+    if not plan.touch_down:
+        raise ConfigError(
+            "plan: has no touch_down to verify the magnet's offset: add some, or give no magnet"
+        )
 
 
 def _some_frames(source: Recording) -> Iterator[StereoFrame]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections import Counter
 from collections.abc import Iterable
@@ -141,6 +142,12 @@ class TouchDown:
 
     def __post_init__(self) -> None:
         expect_ranges(self, "touch_down.", sigma_m=NOT_NEGATIVE, yaw_deg=(-360, 360))
+
+    @property
+    def digest(self) -> str:
+        """Form a digest of the crane's readings, by which this touch-down is known again in another plan."""
+        readings = (self.x_m, self.y_m, self.z_m, self.yaw_deg % 360)
+        return hashlib.sha256(" ".join(f"{value:.4f}" for value in readings).encode()).hexdigest()[:16]
 
 
 @dataclass(frozen=True)

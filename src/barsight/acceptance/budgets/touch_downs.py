@@ -15,6 +15,7 @@ from scipy.stats import t as student
 from barsight.acceptance.certificate import REMEDY as OTHER
 from barsight.acceptance.certificate import read_certificate
 from barsight.acceptance.uncertainty import COVERAGE
+from barsight.artefacts.plan import TouchDown
 from barsight.core.arrays import Float64
 from barsight.core.errors import InputError
 from barsight.core.reading.bounded_reading import in_range
@@ -55,9 +56,10 @@ def touched_offset(certificate: Path, tolerance: Tolerance) -> MagnetOffset:
         rows = [row for row in content["quantities"] if row["group"] == "touch_mm"]
         own_m = 1e-3 * max((float(row["uncertainty"]["sigma"]) for row in rows), default=0.0)
         ids = str(content["calibration_id"]), str(content["yard_frame_id"])
-        downs = {str(one["name"]): one for one in content["plan"]["touch_down"]}
-        touched = {name: str(one["on"]) for name, one in downs.items()}
-        yaws_rad = {name: math.radians(one.get("yaw_deg", 0.0)) for name, one in downs.items()}
+        downs = {str(one["name"]): TouchDown(**one) for one in content["plan"]["touch_down"]}
+        touched = {name: one.on for name, one in downs.items()}
+        yaws_rad = {name: math.radians(one.yaw_deg) for name, one in downs.items()}
+        digests = tuple(one.digest for one in downs.values())
         _expect_spread(certificate, content["plan"], set(touched.values()))
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(certificate, f"is damaged ({type(error).__name__}: {error})", OTHER) from error
@@ -74,10 +76,11 @@ def touched_offset(certificate: Path, tolerance: Tolerance) -> MagnetOffset:
     middle = complex(np.mean([np.exp(1j * yaws_rad[name]) for name in touches["x"]]))
     if turning is None:
         yaw_deg = float(np.degrees(np.angle(middle)))
-        return MagnetOffset(x, y, z, x_sigma, y_sigma, z_sigma, *ids, yaw_deg)
+        return MagnetOffset(x, y, z, x_sigma, y_sigma, z_sigma, *ids, yaw_deg, touch_downs=digests)
     shared = abs(middle) * turning.sigma_m  # what an error of the part that turns adds to the means
     sigmas = (math.hypot(x_sigma, shared), math.hypot(y_sigma, shared), z_sigma)
-    return MagnetOffset(x, y, z, *sigmas, *ids, 0.0, turning.along_m, turning.across_m, turning.sigma_m)
+    turns = (0.0, turning.along_m, turning.across_m, turning.sigma_m)
+    return MagnetOffset(x, y, z, *sigmas, *ids, *turns, digests)
 
 
 @dataclass(frozen=True)

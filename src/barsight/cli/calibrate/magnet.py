@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -52,4 +53,4 @@ def run(arguments: Sequence[str]) -> None:
 
 
 def _value(value: object) -> str:
-    return f"{value:.5f}" if isinstance(value, float) else f'"{value}"'
+    return f"{value:.5f}" if isinstance(value, float) else json.dumps(value)

@@ -120,6 +120,8 @@ class MagnetOffset:
     along_m, across_m: the part that turns with the beam, in its own axes, in addition to x_m and y_m; known
     where the magnet was turned between the touch-downs, with the sigma turn_sigma_m of each. Without that
     sigma the touch-downs were made at yaw_deg, and the offset holds near it only.
+
+    touch_downs: digest of each of them; they can't verify their own mean.
     """
 
     x_m: float
@@ -134,6 +136,7 @@ class MagnetOffset:
     along_m: float = 0.0
     across_m: float = 0.0
     turn_sigma_m: float | None = None
+    touch_downs: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         most = max(abs(value) for value in (self.x_m, self.y_m, self.z_m, self.along_m, self.across_m))
