@@ -2,6 +2,7 @@
 
 import base64
 import dataclasses
+import json
 import math
 import zlib
 from collections.abc import Callable
@@ -12,7 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
 from scipy.spatial.transform import Rotation
 
 from barsight.acceptance import acceptance
@@ -21,6 +22,7 @@ from barsight.acceptance.causes import name_causes
 from barsight.acceptance.certificate import (
     CommissioningStep,
     certificate_content,
+    certificate_files,
     read_certificate,
     write_certificate,
 )
@@ -34,9 +36,11 @@ from barsight.artefacts.plan import AcceptancePlan, Plate, Sphere, TouchDown, pl
 from barsight.cli.main import run
 from barsight.core.arrays import Float64
 from barsight.core.errors import Failed, InputError
+from barsight.core.reading.sealed_json import write_sealed
 from barsight.core.records.pairs import StereoFrame
 from barsight.measure_folder import ignore_progress
 from barsight.measure_settings import MeasureSettings
+from barsight.report.signing import signature_of
 from barsight.simulation.effects.faults import SpoiledLens
 from barsight.simulation.effects.settings import FaultSettings
 from barsight.simulation.rays import cast_rays
@@ -448,6 +452,72 @@ def test_a_certificate_is_signed_and_a_changed_one_refused(tmp_path: Path) -> No
     (tmp_path / "cert.json").write_text(text.replace('"passed": false', '"passed": true'))
     with pytest.raises(InputError, match="was changed after it was written"):
         read_certificate(tmp_path / "cert.json")
+
+
+def new_key(folder: Path, name: str) -> Path:
+    key = Ed25519PrivateKey.generate()
+    path, public = folder / f"{name}.pem", folder / f"{name}.public.pem"
+    path.write_bytes(key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
+    public.write_bytes(key.public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo))
+    return path
+
+
+def edit(path: Path) -> None:
+    """Change a word of a file; the digest inside a JSON is made anew."""
+    if path.suffix == ".json":
+        content = json.loads(path.read_text()) | {"passed": True}
+        del content["content_sha256"]
+        write_sealed(content, path)
+    else:
+        path.write_bytes(path.read_bytes().replace(b"o", b"0", 1))
+
+
+@pytest.mark.parametrize(
+    ("change", "code", "said"),
+    [
+        ("nothing", 0, "valid: cert.json, cert.html, cert.pdf"),
+        ("cert.json", 5, "changed: cert.json isn't what was signed"),
+        ("cert.html", 5, "changed: cert.html isn't what was signed"),
+        ("cert.pdf", 5, "changed: cert.pdf isn't what was signed"),
+        ("a byte of cert.json", 5, "changed: "),
+        ("signed anew", 5, "unknown key: no signature is by"),
+        ("another's page", 5, "cert.pdf was signed for another certificate"),
+        ("cert.html.sig", 5, "not signed: cert.html has no signature"),
+        ("a short signature", 5, "changed: cert.pdf"),
+        ("no certificate", 3, "is missing"),
+        ("no public key", 3, "is not a readable public key"),
+        ("only the page", 0, "whether these belong together isn't known"),
+    ],
+)
+def test_a_certificate_is_checked(
+    change: str, code: int, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own, other = new_key(tmp_path, "own"), new_key(tmp_path, "other")
+    content, files = accepted(()), certificate_files(tmp_path / "cert")
+    write_certificate(content | {"yard": "another"}, tmp_path / "cert", own, pdf=True)
+    others = [path.read_bytes() for path in (files[2], signature_of(files[2]))]
+    write_certificate(content, tmp_path / "cert", own, pdf=True)
+    if change in ("cert.json", "cert.html", "cert.pdf"):
+        edit(tmp_path / change)
+    elif change == "a byte of cert.json":
+        files[0].write_bytes(files[0].read_bytes().replace(b"false", b"true ", 1))
+    elif change == "signed anew":
+        write_certificate(content | {"passed": True}, tmp_path / "cert", other, pdf=True)
+    elif change == "another's page":
+        for path, read in zip((files[2], signature_of(files[2])), others, strict=True):
+            path.write_bytes(read)
+    elif change == "cert.html.sig":
+        (tmp_path / change).unlink()
+    elif change == "a short signature":
+        signature_of(files[2]).write_bytes(b"x")
+    elif change in ("no certificate", "only the page"):
+        for path in files[: 3 if change == "no certificate" else 2]:
+            path.unlink()
+    public = own if change == "no public key" else tmp_path / "own.public.pem"
+    assert run(["accept", "--check", str(tmp_path / "cert"), "--key", str(public)]) == code
+    told = capsys.readouterr()
+    assert said in (told.out + told.err).replace("\n", " ")
+    assert code or change == "only the page" or "it says: FAILED" in told.out
 
 
 def test_a_folder_to_keep_results_in_is_new(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,12 +11,13 @@ from typing import Any
 import barsight
 from barsight.acceptance.acceptance import Acceptance
 from barsight.acceptance.pdf import write_pdf
-from barsight.core.errors import Failed, InputError
+from barsight.core.errors import Failed, InputError, MeasurementError
 from barsight.core.files import atomic_paths
 from barsight.core.json_values import json_digest, json_value
-from barsight.core.reading.sealed_json import read_sealed, write_sealed
+from barsight.core.reading.bounded_reading import read_bytes
+from barsight.core.reading.sealed_json import SEAL, read_sealed, write_sealed
 from barsight.report.page import environment, resource
-from barsight.report.signing import sign_file
+from barsight.report.signing import MAX_SIGNED_BYTES, is_signed, sign_file, signature_of
 
 SCHEMA_VERSION = 1
 REMEDY = "take the certificate that barsight accept wrote"
@@ -93,7 +94,7 @@ def write_certificate(content: dict[str, Any], out: Path, key: Path | None, pdf:
     """
     files = certificate_files(out)
     written = files if pdf else files[:2]
-    signatures = tuple(file.with_name(f"{file.name}.sig") for file in files)
+    signatures = tuple(signature_of(file) for file in files)
     made = written if key is None else (*written, *signatures[: len(written)])
     digest = json_digest(content)
     page = environment().get_template("certificate_page.html.jinja").render(
@@ -118,6 +119,38 @@ def read_certificate(path: Path) -> dict[str, Any]:
     if "quantities" not in content or "plan" not in content:
         raise InputError(path, "is not a certificate", REMEDY)
     return content
+
+
+def check_certificate(path: Path, key: Path) -> tuple[tuple[Path, ...], dict[str, Any] | None]:
+    """Check that the files of a certificate are what was signed with a key, and belong together.
+
+    key: the signer's public key. Returns the files, and the JSON's content if the JSON is there. Raises
+    MeasurementError where one was changed, isn't signed, or was signed with another key; InputError where
+    there is no certificate.
+    """
+    files = tuple(file for file in certificate_files(path) if file.exists())
+    if not files or (path.suffix in (".json", ".html", ".pdf") and not path.exists()):
+        raise InputError(path, "is missing", REMEDY)
+    signed = {file: is_signed(file, key) for file in files}
+    content = None
+    if files[0].suffix == ".json":
+        try:
+            content = read_certificate(files[0])
+        except InputError as error:
+            raise MeasurementError(f"changed: {error}") from error
+    bad = [file.name for file, is_good in signed.items() if is_good is False]
+    if bad and True in signed.values():
+        raise MeasurementError(f"{path}: changed: {', '.join(bad)} isn't what was signed with {key}")
+    if bad:
+        raise MeasurementError(f"{path}: unknown key: no signature is by {key}, or all files were changed")
+    if None in signed.values():
+        unsigned = ", ".join(file.name for file, is_good in signed.items() if is_good is None)
+        raise MeasurementError(f"{path}: not signed: {unsigned} has no signature beside it (.sig)")
+    digest = b"" if content is None else str(content[SEAL]).encode()
+    for page in (file for file in files if file.suffix != ".json"):
+        if digest not in read_bytes(page, MAX_SIGNED_BYTES):
+            raise MeasurementError(f"{path}: changed: {page.name} was signed for another certificate")
+    return files, content
 
 
 def error_bar(row: dict[str, Any]) -> str:

@@ -58,7 +58,8 @@ def write_pdf(content: dict[str, Any], digest: str, signed: bool, target: Path) 
         text("Signed with Ed25519: the signature lies beside as .sig." if signed else "Not signed."),
         *([text(SPELLED)] if lacks else []),
     ]  # fmt: skip
-    SimpleDocTemplate(str(target), pagesize=A4, title="Acceptance certificate", invariant=1).build(parts)
+    page = {"pagesize": A4, "title": "Acceptance certificate", "subject": digest, "invariant": 1}
+    SimpleDocTemplate(str(target), **page).build(parts)
 
 
 def headline(content: dict[str, Any]) -> str:

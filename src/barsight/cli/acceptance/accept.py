@@ -1,4 +1,6 @@
-"""Run `barsight accept PLAN RECORDING... -o CERTIFICATE` and `barsight accept --plan OUT -o PLAN`."""
+"""Run `barsight accept PLAN RECORDING... -o CERTIFICATE`, `barsight accept --plan OUT -o PLAN` and
+`barsight accept --check CERTIFICATE --key PUBLIC`.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +8,7 @@ import tempfile
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.box import SIMPLE_HEAD
@@ -17,9 +19,11 @@ from barsight.acceptance.certificate import (
     CommissioningStep,
     certificate_content,
     certificate_files,
+    check_certificate,
     write_certificate,
 )
 from barsight.acceptance.layout import Area, lay_out
+from barsight.acceptance.pdf import headline
 from barsight.acceptance.quantities import Decision
 from barsight.acceptance.yard_area import measured_area
 from barsight.artefacts.plan import plan_text, read_plan
@@ -42,8 +46,9 @@ def run(arguments: Sequence[str]) -> None:
 
     def command(
         files: tyro.conf.Positional[tuple[Path, ...]],
-        out: Annotated[Path, tyro.conf.arg(aliases=("-o",))],
+        out: Annotated[Path | None, tyro.conf.arg(aliases=("-o",))] = None,
         plan: bool = False,
+        check: bool = False,
         yard: Path | None = None,
         rig: Path | None = None,
         magnet: Path | None = None,
@@ -60,21 +65,32 @@ def run(arguments: Sequence[str]) -> None:
 
         Args:
             files: PLAN.toml, then one or more recordings of the artefacts; several show the repeatability.
-                With --plan: a folder of results from barsight measure that shows the yard.
+                With --plan: a folder of results from barsight measure that shows the yard. With --check:
+                the certificate, by the name of any of its files.
             out: The certificate: .json, .html and, with the extra `acceptance`, .pdf are written under this
                 name. With --plan: the plan to write, PLAN.toml.
             plan: Make a plan for the yard instead, with artefacts on its free floor and limits based on the
                 pixel size.
+            check: Check that a certificate is as it was signed, with --key PUBLIC.pem. The exit code is 0 if
+                all its files are, whatever the certificate says, and 5 if one was changed or isn't signed,
+                or if another key signed it.
             yard: Yard file from barsight calibrate yard.
             rig: Rig file to use instead of the recordings' own calibration.
             magnet: TOML file of the magnet. Its offset from earlier touch-downs (barsight calibrate magnet)
                 is applied to the crane's readings; the touch-downs of this plan verify it.
             preset: Stereo preset, as in barsight measure.
             key: Ed25519 private key (PEM) that signs each file of the certificate; the signature is written
-                next to the file as NAME.sig.
+                next to the file as NAME.sig. With --check: the signer's public key.
             signer: Name of the person responsible for the certificate.
             keep: A new folder in which to keep the results of measuring each recording.
         """
+        if check:
+            if len(files) != 1 or key is None or plan or out is not None:
+                raise ConfigError("accept --check takes one certificate and --key PUBLIC.pem, nothing else")
+            print_checked(*check_certificate(files[0], key))
+            return
+        if out is None:
+            raise ConfigError("accept needs -o: the certificate to write, or with --plan the plan")
         if plan:
             if len(files) != 1:
                 raise ConfigError("accept --plan takes one folder that barsight measure wrote")
@@ -155,6 +171,17 @@ def print_acceptance(found: Acceptance) -> None:
     console.print(table)
     for one in found.causes:
         console.print(f"cause: {one.words}, {one.value:+.3g} ± {one.sigma:.2g} {one.unit}", highlight=False)
+
+
+def print_checked(files: tuple[Path, ...], content: dict[str, Any] | None) -> None:
+    """Print that the files of a certificate are valid, and what the certificate says."""
+    console, names = SafeConsole(), ", ".join(file.name for file in files)
+    console.print(f"valid: {names}: as signed with this key", highlight=False, markup=False)
+    if content is None:
+        console.print("the JSON isn't there: whether these belong together isn't known", markup=False)
+    else:
+        by = content["signer"] or "nobody named"
+        console.print_line(f"it says: {headline(content)}, issued {content['issued_at']} by {by}")
 
 
 def make_plan(measured: Path, out: Path, yard: str) -> None:
