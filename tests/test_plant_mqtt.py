@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import shutil
+import signal
 import subprocess
 import sys
 import textwrap
@@ -133,6 +134,69 @@ def test_the_last_will_tells_a_process_that_died(broker: Broker) -> None:
     assert asyncio.run(watch()) == ["true", "false"]
 
 
+@pytest.mark.parametrize(
+    ("how", "version", "left"),
+    [
+        ("KILL", "5", [False]),
+        ("KILL", "3.1.1", [False]),
+        pytest.param("STOP", "5", [], marks=pytest.mark.slow),
+        ("leave", "5", [False]),
+    ],
+)
+def test_a_state_does_not_stay_valid_without_its_process(
+    how: str, version: str, left: list[bool], broker: Broker
+) -> None:
+    """For whoever subscribes 1.6 s after it was killed, hung or ended; a hung one's last will comes later."""
+    program = textwrap.dedent(f"""
+        import asyncio, sys
+        from barsight.plant.link_settings import MqttSettings
+        from barsight.plant.mqtt import OFFLINE, MqttPublisher
+        from dataclasses import replace
+        async def main():
+            publisher = MqttPublisher(MqttSettings(port={broker.port}, version="{version}"))
+            running = asyncio.create_task(publisher.run())
+            for _ in range(600):
+                publisher.show(replace(OFFLINE, is_valid=True))
+                await asyncio.sleep(0.05)
+                if publisher.counts.states == 5:
+                    print("up", flush=True)
+                if {how == "leave"} and publisher.counts.states > 30:
+                    break
+            running.cancel()
+            await asyncio.gather(running, return_exceptions=True)
+        asyncio.run(main())
+    """)
+
+    async def retained(wait_s: float) -> list[bool]:
+        found = []
+        async with aiomqtt.Client("127.0.0.1", broker.port) as client:
+            await client.subscribe("barsight/crane/state", qos=1)
+            try:
+                async with asyncio.timeout(wait_s):
+                    async for message in client.messages:
+                        found.append(json.loads(bytes(message.payload).decode())["is_valid"])  # noqa: PERF401
+            except TimeoutError:
+                return found
+        return found
+
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        assert True in asyncio.run(retained(0.5))
+        try:
+            if how == "leave":
+                process.wait(20)
+            else:
+                process.send_signal(getattr(signal, f"SIG{how}"))
+            time.sleep(1.6)
+            assert asyncio.run(retained(0.3)) == left
+            if how == "STOP":
+                ended = '"is_valid": false'
+                asyncio.run(broker.until("barsight/crane/state", lambda text: ended in text, 20))
+        finally:
+            process.kill()
+
+
 def test_a_broker_that_is_away_costs_bounded_memory_and_the_newest_survives(broker: Broker) -> None:
     settings = MqttSettings(port=broker.port, max_waiting=10, max_retry_s=0.2, state_every_s=0.02)
     publisher = MqttPublisher(settings)
@@ -224,6 +288,7 @@ def test_a_newer_state_does_not_wait_for_the_events(monkeypatch: pytest.MonkeyPa
     async def body() -> float:
         publisher = MqttPublisher(MqttSettings(state_every_s=0.02))
         monkeypatch.setattr(publisher, "_client", SlowClient)
+        monkeypatch.setattr(publisher, "_presence", SlowClient)
         for number in range(100):
             publisher.tell({"number": number})
         running = asyncio.create_task(publisher.run())

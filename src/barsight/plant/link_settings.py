@@ -7,7 +7,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from barsight.core.errors import ConfigError
-from barsight.core.settings.values import expect_ranges, expect_values
+from barsight.core.settings.values import expect_choice, expect_ranges, expect_values
 
 MAX_AGE_S = 0.3
 """Maximum age of a state in seconds, counted from when it was read from the store; an older one is marked
@@ -97,6 +97,10 @@ class MqttSettings:
     """Host name or address of the broker."""
     port: int = 1883
     """TCP port of the broker; usually 8883 with TLS."""
+    version: str = "5"
+    """Version of MQTT: `5`, by which a state that isn't renewed ends after a second, or `3.1.1`, by which the
+    last will alone ends it.
+    """
     prefix: str = "barsight/crane"
     """Prefix of all topics."""
     user: str | None = None
@@ -124,6 +128,7 @@ class MqttSettings:
             self, "mqtt.", port=(1, 65535), keepalive_s=(1, 3600), max_waiting=(1, 100000),
             max_retry_s=(0.1, 600), state_every_s=(0.01, MAX_AGE_S),
         )  # fmt: skip
+        expect_choice("mqtt.version", self.version, ("5", "3.1.1"))
         if not self.prefix or set("#+\0") & set(self.prefix) or self.prefix.startswith("$"):
             raise ConfigError(
                 f"mqtt.prefix: {self.prefix!r} is not a topic; leave out #, + and a $ at the front"

@@ -1,7 +1,8 @@
-"""Publish the plant state to an MQTT broker: plain JSON, retained, with a last will.
+"""Publish the plant state to an MQTT broker: plain JSON, retained, with last wills.
 
-Topics below the prefix: `online` (retained; `true`, or `false` by the last will), `state` (retained, the
-newest snapshot), `events` (not retained, in order). While the broker is unreachable, only the newest state
+Topics below the prefix: `online` (retained; `true`, or `false` by the last will), `state` (retained for
+`STATE_LASTS_S`, the newest snapshot, or `OFFLINE` by the last will), `events` (not retained, in order). A
+connection has one last will, so that there are two. While the broker is unreachable, only the newest state
 and at most `max_waiting` events are kept; the oldest are dropped, and the next event that gets through
 carries their number (`lost`).
 """
@@ -10,6 +11,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import ssl
 import time
 from collections import deque
@@ -23,10 +25,17 @@ from barsight.core.extras import extra
 from barsight.core.json_values import json_value
 from barsight.core.reading.bounded_reading import read_text
 from barsight.plant.link_settings import MqttSettings
+from barsight.plant.state import PlantState
 
 with extra("mqtt"):
     import aiomqtt
+    from paho.mqtt.packettypes import PacketTypes
+    from paho.mqtt.properties import Properties
 
+OFFLINE = PlantState("idle", False, ("offline: Barsight's connection to the broker ended",), 0, 0, "none")
+"""State that the broker shows once Barsight is gone."""
+STATE_LASTS_S = 1
+"""Time in seconds after which the broker drops a state that isn't renewed (MQTT 5)."""
 MqttError = aiomqtt.MqttError
 """Raised if the broker can't be reached or refuses the connection."""
 
@@ -46,7 +55,9 @@ class MqttPublisher:
 
     def __init__(self, settings: MqttSettings) -> None:
         self._settings = settings
-        self._client = mqtt_clients(settings, "online")
+        self._client = mqtt_clients(settings, "state", state_json(OFFLINE))
+        self._presence = mqtt_clients(settings, "online", "false")
+        self._present_s = -math.inf
         self._state: str | None = None
         self._events: deque[dict[str, Any]] = deque()
         self._lost = 0
@@ -93,20 +104,19 @@ class MqttPublisher:
         while True:
             began = time.monotonic()
             try:
-                async with self._client() as client:
+                async with self._client() as client, self._presence() as presence:
                     self._connections += 1
-                    self._problem = None
-                    await client.publish(self._topic("online"), "true", qos=1, retain=True)
+                    self._problem, self._present_s = None, -math.inf
                     latest = self._state = self._state or latest
                     self._changed.set()
                     try:
                         while True:
+                            await self._tell_presence(presence)
                             latest = await self._publish(client) or latest
                     finally:
                         if _is_cancelled():
-                            await client.publish(
-                                self._topic("online"), "false", qos=1, retain=True, timeout=1
-                            )
+                            for topic, text in (("online", "false"), ("state", state_json(OFFLINE))):
+                                await client.publish(self._topic(topic), text, qos=1, retain=True, timeout=1)
             except (aiomqtt.MqttError, OSError) as error:
                 self._problem = str(error).strip() or type(error).__name__
             if _is_cancelled():  # a lost broker's error on the way out has replaced the cancellation
@@ -114,6 +124,12 @@ class MqttPublisher:
             wait_s = 0.1 if time.monotonic() - began > self._settings.max_retry_s else wait_s
             await asyncio.sleep(wait_s)
             wait_s = min(2 * wait_s, self._settings.max_retry_s)
+
+    async def _tell_presence(self, presence: aiomqtt.Client) -> None:
+        """Publish, now and then, that Barsight is there; a connection that was lost is noticed by this."""
+        if time.monotonic() - self._present_s >= self._settings.keepalive_s:
+            self._present_s = time.monotonic()
+            await presence.publish(self._topic("online"), "true", qos=1, retain=True)
 
     async def _publish(self, client: aiomqtt.Client) -> str | None:
         """Publish what is waiting; return the state that was sent."""
@@ -126,7 +142,9 @@ class MqttPublisher:
         began_s = time.monotonic()
         try:
             if state is not None:
-                await client.publish(self._topic("state"), state, qos=0, retain=True)
+                await client.publish(
+                    self._topic("state"), state, qos=0, retain=True, properties=self._lasting()
+                )
                 self._states_sent += 1
             while self._events:
                 if self._has_newer(began_s):
@@ -153,23 +171,35 @@ class MqttPublisher:
         event = {**self._events[0], "lost": self._unsaid}
         return json.dumps(json_value(event), allow_nan=False)
 
+    def _lasting(self) -> Properties | None:
+        """Form the properties with which a state expires; None by a version that has none."""
+        if self._settings.version != "5":
+            return None
+        properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
+        properties.MessageExpiryInterval = STATE_LASTS_S
+        return properties
+
     def _topic(self, name: str) -> str:
         return f"{self._settings.prefix}/{name}"
 
 
-def mqtt_clients(one: MqttSettings, will: str | None = None) -> Callable[[], aiomqtt.Client]:
+def mqtt_clients(
+    one: MqttSettings, will: str | None = None, text: str = "false"
+) -> Callable[[], aiomqtt.Client]:
     """Read password and authority, and return a factory of clients for the broker.
 
-    will: topic below the prefix on which the broker publishes `false` if a client is lost. Raises InputError.
+    will: topic below the prefix on which the broker publishes `text` if a client is lost. Raises InputError.
     """
     password = None if one.password_file is None else read_text(one.password_file).partition("\n")[0]
     context = None if one.authority is None else _context(one.authority)
-    last = aiomqtt.Will(f"{one.prefix}/{will}", "false", qos=1, retain=True) if will else None
+    last = aiomqtt.Will(f"{one.prefix}/{will}", text, qos=1, retain=True) if will else None
+    version = aiomqtt.ProtocolVersion.V5 if one.version == "5" else aiomqtt.ProtocolVersion.V311
 
     def client() -> aiomqtt.Client:
         return aiomqtt.Client(
             one.host, one.port, username=one.user, password=password, keepalive=one.keepalive_s, will=last,
-            timeout=5, tls_context=context, max_queued_outgoing_messages=20, max_inflight_messages=20,
+            timeout=5, tls_context=context, protocol=version, max_queued_outgoing_messages=20,
+            max_inflight_messages=20,
         )  # fmt: skip
 
     return client
