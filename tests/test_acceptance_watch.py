@@ -69,6 +69,25 @@ def late_alarms(runs: int, seed: int, sigma_deg: float = 0.0018) -> int:
     return late
 
 
+def test_sigmas_that_are_stated_too_small_raise_few_alarms_and_hide_no_jump() -> None:
+    """Healthy surveys that scatter by one and a half to two and a half of the stated sigmas, then a jump."""
+    for ratio in (1.5, 2.0, 2.5):
+        alarms = jumps = 0
+        for seed in range(100):
+            rng = np.random.default_rng((46, seed))
+            values = 3.0 + rng.normal(0, ratio, 60)
+            alarms += first_alarm(with_values(values)) is not None
+            values[25:] += 5 * ratio
+            alarm = first_alarm(with_values(values[:28]))
+            jumps += alarm is None
+        assert alarms <= 13 and jumps == 0
+
+
+def with_values(values: np.ndarray) -> list[WatchedSurvey]:
+    figures = (WatchedFigure("yaw / deg", float(value), 1.0) for value in values)
+    return [WatchedSurvey(f"rec{k}", f"id{k}", "cal", (figure,)) for k, figure in enumerate(figures)]
+
+
 def test_healthy_surveys_are_quiet_and_a_jump_is_told_within_three() -> None:
     assert false_alarms(4, 1000, 31) == 0
     assert late_alarms(100, 32) <= 1
