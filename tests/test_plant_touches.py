@@ -421,6 +421,23 @@ def test_a_touch_that_the_store_could_not_take_lets_no_answered_command_count_ag
         assert crane.turn(EXECUTING) == DONE
 
 
+@pytest.mark.parametrize("pauses", [False, True])
+def test_an_answer_counts_for_its_own_command_only(plant: Plant, *, pauses: bool) -> None:
+    """The PLC never raises its number, or changes the command in another cycle than the number: it must not
+    take the answer to its claim for that to `executing`, as the lift has not begun.
+    """
+    crane = Driver(plant)
+    crane.turn()
+    assert crane.turn(CLAIM) == DONE
+    if pauses:
+        crane.turn()
+    crane.number -= 1
+    assert crane.turn(EXECUTING) == 0
+    assert plant.states_of(crane.lift["lift_id"])[-1] == "claimed"
+    assert crane.turn(EXECUTING) == DONE
+    assert plant.states_of(crane.lift["lift_id"])[-1] == "executing"
+
+
 def test_a_touch_that_the_store_could_not_take_is_noted_without_another_step(plant: Plant) -> None:
     """Nobody claims anything, and the page offers what it ends."""
     crane = Driver(plant)

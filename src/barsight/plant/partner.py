@@ -45,6 +45,7 @@ class PlcPartner:
     def __init__(self, name: str, steps: LiftSteps, silent_s: float, begun: int | None = None) -> None:
         self.name, self._steps, self._silent_s = name, steps, silent_s
         self._answer: dict[str, int] = {}
+        self._answered, self._heard = (NOTHING, 0), (0, NOTHING, 0)
         self._life: int | None = None
         self._alive_s, self._began_s = time.monotonic(), math.inf
         self._number: int | None = None
@@ -59,8 +60,13 @@ class PlcPartner:
 
     @property
     def answer(self) -> dict[str, int]:
-        """Form the fields of the next telegram that answer the PLC: its life counter and its last command."""
-        return {"life_echo": self._life or 0, **self._answer}
+        """Form the fields of the next telegram that answer the PLC: its life counter and its last command.
+
+        Another command under the number of an answered one has no answer, or it would take that one's.
+        """
+        number, *asked = self._heard
+        is_same = number != self._answer.get("answer_number") or tuple(asked) == self._answered
+        return {"life_echo": self._life or 0, **(self._answer if is_same or asked[0] == NOTHING else {})}
 
     @property
     def quiet_s(self) -> float:
@@ -89,6 +95,7 @@ class PlcPartner:
         if found["life"] != self._life:
             self._life, self._alive_s = found["life"], time.monotonic()
             self._began_s = min(self._began_s, self._alive_s)
+        self._heard = found["command_number"], found["command"], found["lift_id"]
         if is_busy:
             return False
         is_new = found["command"] != NOTHING and found["command_number"] != self._number
@@ -169,6 +176,7 @@ class PlcPartner:
             if command is not None:
                 self._number = None
             return
+        self._answered = command["command"], command["lift_id"]
         self._answer = {"answer_number": command["command_number"], "answer": answer, "token": token}
 
     def note_touches(self) -> None:
