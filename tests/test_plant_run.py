@@ -6,6 +6,7 @@ import contextlib
 import os
 import signal
 import socket
+import struct
 import subprocess
 import time
 from pathlib import Path
@@ -99,6 +100,28 @@ def test_a_plc_that_comes_again_is_served_while_its_old_connection_stands(tmp_pa
         cut_off.until_valid()
         with LinkedPlc(port) as again:
             again.until_valid()
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (struct.pack("<HHHHqiiiIHHIII", 0xB51B, 1, 1, *[0] * 11), "bytes are in the other order than big"),
+        (IN.pack(0xB51B, 1, 1, 0x1F, *[0] * 10), "flags 0x1f"),
+        (IN.pack(0xB51B, 1, 1, 0, 0, 0x42DA0000, *[0] * 8), "its position, 112158 m, is in no yard"),
+    ],
+    ids=["byte order", "flags", "float"],
+)
+def test_what_is_wrong_with_telegrams_is_told(tmp_path: Path, content: bytes, said: str) -> None:
+    """The other byte order, a bit too many, a float: the PLC sees no more than its connection close."""
+    port = free_port()
+    with plant_run(write_config(tmp_path, telegram={"port": port})) as process:
+        for _ in range(3):
+            with LinkedPlc(port) as plc:
+                plc.link.sendall(content)
+                plc.link.recv(98)
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        assert line.startswith("plc 127.0.0.1: ") and said in line
 
 
 def test_what_is_not_configured_or_served_is_told_in_one_line(

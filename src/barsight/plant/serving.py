@@ -19,6 +19,8 @@ MIN_GAP_RATIO = 0.8
 """Shortest gap between a late telegram and the next, as a share of the cycle."""
 MAX_PARTNERS = 32
 """Maximum number of connections at a time; any further one is closed."""
+MAX_TOLD = 100
+"""Maximum number of PLCs of whose telegrams it is told what is wrong."""
 MAX_QUIET_S = 10.0
 """Time in seconds after which a connection is closed if the partner's life counter stands still."""
 
@@ -26,8 +28,13 @@ MAX_QUIET_S = 10.0
 class TelegramServer:
     """Serve the newest state while `run` runs. refused: number of invalid telegrams received."""
 
-    def __init__(self, feed: StateReader, steps: LiftSteps, settings: TelegramSettings) -> None:
+    def __init__(
+        self, feed: StateReader, steps: LiftSteps, settings: TelegramSettings,
+        say: Callable[[str], None] | None = None,
+    ) -> None:  # fmt: skip
+        """say: called with what is wrong with a PLC's telegrams, once until something else is."""
         self._feed, self._steps, self._settings = feed, steps, settings
+        self._say, self._said = say, dict[str, str]()
         self._counter = 0
         self._partners: list[PlcPartner] = []
         self._begun: dict[str, int | None] = {}
@@ -93,16 +100,24 @@ class TelegramServer:
                 found = unpack("in", await reader.readexactly(size), self._settings.byte_order)
                 if isinstance(found, Failed):
                     self.refused += 1
+                    self._tell(partner.name, f"connection closed, what came is no telegram: {found.reason}")
                     return
                 is_second = self._is_second(partner)
                 if not is_second:
                     reading = partner.reading(found)
                     self._feed.take_reading(reading)
+                    if reading.problem:
+                        self._tell(partner.name, f"where its magnet is isn't known: {reading.problem}")
                     partner.watch(reading)
                 is_busy = (step is not None and not step.done()) or is_second
                 if partner.receive(found, is_busy=is_busy):
                     step = asyncio.create_task(asyncio.to_thread(partner.execute))
                     step.add_done_callback(self._refresh)
+
+    def _tell(self, name: str, text: str) -> None:
+        if self._say is not None and self._said.get(name) != text and len(self._said) < MAX_TOLD:
+            self._said[name] = text
+            self._say(f"{name}: {text}")
 
     def _is_second(self, partner: PlcPartner) -> bool:
         """Check whether another PLC at the same address is served: claims are by address, so that two cranes

@@ -50,6 +50,14 @@ class PlcReading:
         place_m = (self.bridge_m, self.trolley_m, self.hoist_m)
         return place_m if is_place(*place_m) else None
 
+    @property
+    def problem(self) -> str:
+        """Return why the position can't be right, as of a float or swapped words; empty if it may be."""
+        far_m = max((self.bridge_m, self.trolley_m, self.hoist_m), key=abs)
+        if abs(far_m) < MAX_PLACE_M:
+            return ""
+        return f"its position, {far_m:.0f} m, is in no yard: send whole numbers of 0.1 mm, in the byte order"
+
 
 def is_place(*place_m: float) -> bool:
     """Check whether a crane's readings are known: not all zeros, nor outside any yard."""

@@ -59,7 +59,10 @@ def unpack(side: str, content: bytes, byte_order: str = "big") -> dict[str, int]
     if len(content) != form.size:
         return Failed("telegram-length", f"{len(content)} bytes came, {form.size} are a telegram")
     found = dict(zip((name for name, _, _ in table_of(side)), form.unpack(content), strict=True))
-    if (found["magic"], found["version"]) != (OUT_MAGIC if side == "out" else IN_MAGIC, VERSION):
+    magic = OUT_MAGIC if side == "out" else IN_MAGIC
+    if found["magic"] == int.from_bytes(magic.to_bytes(2, "little")):
+        return Failed("telegram-kind", f"its bytes are in the other order than {byte_order} (byte_order)")
+    if (found["magic"], found["version"]) != (magic, VERSION):
         return Failed("telegram-kind", f"magic {found['magic']:#06x}, version {found['version']}")
     if side == "in" and (found["command"] > 4 or found["flags"] > 15):
         return Failed("telegram-value", f"command {found['command']}, flags {found['flags']:#x}")

@@ -26,6 +26,6 @@ def run(arguments: Sequence[str]) -> None:
         """
         settings, console = read_plant(config), SafeConsole()
         with open_store(settings.store.url) as store:
-            asyncio.run(serve_plant(store, settings, lambda line: console.print(line, highlight=False)))
+            asyncio.run(serve_plant(store, settings, console.print_line))
 
     call(command, "plant run", arguments)

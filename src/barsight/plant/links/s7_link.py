@@ -42,7 +42,7 @@ async def serve_s7(
     def take(exchanged: S7Exchange | Failed) -> None:
         nonlocal wrong, step
         found = exchanged if isinstance(exchanged, Failed) else unpack("in", exchanged.inputs)
-        now = found.reason if isinstance(found, Failed) else ""
+        now = found.reason if isinstance(found, Failed) else partner.reading(found).problem
         if wrong is None or bool(now) != bool(wrong):
             say(f"S7 with {at}: {now or 'exchanging'}")
         wrong = now

@@ -45,7 +45,9 @@ async def serve_telegram(
     calls_there.close()
     stop, at = threading.Event(), f"telegram at {settings.host}"
     threads = [
-        threading.Thread(target=_send_states, args=(states, feed, stop), name="telegram states", daemon=True),
+        threading.Thread(
+            target=_send_states, args=(states, feed, stop, say), name="telegram states", daemon=True
+        ),
         threading.Thread(target=_answer_calls, args=(calls, feed, steps), name="telegram calls", daemon=True),
     ]
     try:
@@ -78,12 +80,18 @@ def _begun(calls: Connection) -> int | str:
     return "its process didn't start"
 
 
-def _send_states(states: Connection, feed: StateFeed, stop: threading.Event) -> None:
+def _send_states(
+    states: Connection, feed: StateFeed, stop: threading.Event, say: Callable[[str], None]
+) -> None:
     with contextlib.suppress(EOFError, OSError):
         while not stop.wait(SEND_EVERY_S):
             states.send(feed.read())
             while states.poll():
-                feed.take_reading(states.recv())
+                came = states.recv()
+                if isinstance(came, str):
+                    say(came)
+                else:
+                    feed.take_reading(came)
 
 
 def _answer_calls(calls: Connection, feed: StateFeed, steps: LiftSteps) -> None:
@@ -123,8 +131,15 @@ class _SentFeed:
 
     def take_reading(self, reading: PlcReading) -> None:
         """Pass a PLC's reading of the crane on to the parent."""
+        self._pass_on(reading)
+
+    def say(self, text: str) -> None:
+        """Have the parent say a line."""
+        self._pass_on(text)
+
+    def _pass_on(self, what: PlcReading | str) -> None:
         with contextlib.suppress(OSError):
-            self._states.send(reading)
+            self._states.send(what)
 
     def _receive(self) -> None:
         try:
@@ -156,7 +171,8 @@ class _Calls:
 def _serve(settings: TelegramSettings, states: Connection, calls: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C and ends this process
     asked = _Calls(calls)
-    server = TelegramServer(_SentFeed(states, asked), cast(LiftSteps, asked), settings)
+    feed = _SentFeed(states, asked)
+    server = TelegramServer(feed, cast(LiftSteps, asked), settings, feed.say)
     try:
         asyncio.run(server.run(calls.send))
     except OSError as error:
