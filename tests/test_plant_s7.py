@@ -58,6 +58,24 @@ def test_an_exchange_reads_inputs_and_writes_outputs(plc: DrawnPlc) -> None:
     assert bytes(plc.blocks[101]) == outputs
 
 
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"read_start": 10}, "32 bytes from 10 on of data block 100 can't be read"),
+        ({"write_start": 10}, "400 bytes from 10 on of data block 101 can't be written"),
+        ({"write_db": 7}, "400 bytes from 0 on of data block 7 can't be written"),
+        ({"port": 1}, ": no connection: "),
+    ],
+)
+def test_a_data_block_that_is_too_short_or_absent_is_named(
+    plc: DrawnPlc, settings: dict[str, int], said: str
+) -> None:
+    link = S7Link(S7Settings(**{"port": plc.port, **settings}), INPUT_BYTES)
+    exchanged = link.exchange(lambda: bytes(OUTPUT_BYTES))
+    link.close()
+    assert isinstance(exchanged, Failed) and said in exchanged.reason
+
+
 def test_what_is_written_is_as_it_is_then(plc: DrawnPlc, monkeypatch: pytest.MonkeyPatch) -> None:
     """The state ages while the PLC takes half a second for what it is asked for before."""
     read, began_s, asked_s = snap7.Client.db_read, time.monotonic(), []

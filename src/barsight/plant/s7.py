@@ -50,12 +50,19 @@ class S7Link:
         Returns Failed if the PLC can't be reached; an error raised by `outputs` passes through.
         """
         one, write_s = self._settings, 0.0
-        read = self._tried(lambda client: client.db_read(one.read_db, one.read_start, self._input_bytes))
+        what = f"{self._input_bytes} bytes from {one.read_start} on of data block {one.read_db} can't be read"
+        read = self._tried(
+            what, lambda client: client.db_read(one.read_db, one.read_start, self._input_bytes)
+        )
         if isinstance(read, Failed):
             return read
         if outputs is not None:
             content = bytearray(outputs())
-            written = self._tried(lambda client: client.db_write(one.write_db, one.write_start, content))
+            size, start = len(content), one.write_start
+            what = f"{size} bytes from {start} on of data block {one.write_db} can't be written"
+            written = self._tried(
+                what, lambda client: client.db_write(one.write_db, one.write_start, content)
+            )
             if isinstance(written, Failed):
                 return written
             write_s = written[1]
@@ -64,16 +71,16 @@ class S7Link:
             return Failed("s7-short", f"the PLC gave {len(inputs)} bytes of {self._input_bytes}")
         return S7Exchange(inputs, read[1], write_s)
 
-    def _tried(self, act: Callable[[snap7.Client], Any]) -> tuple[Any, float] | Failed:
-        """Ask the PLC for something; return the answer and the time that it took."""
-        settings = self._settings
+    def _tried(self, what: str, act: Callable[[snap7.Client], Any]) -> tuple[Any, float] | Failed:
+        """Ask the PLC for something; return the answer and the time that it took. what: said if it fails."""
+        settings, doing = self._settings, "no connection"
         try:
-            client = self._connected()
+            client, doing = self._connected(), what
             began_s = time.monotonic()
             return act(client), time.monotonic() - began_s
         except (S7Error, RuntimeError, OSError, ValueError) as error:
             self.close()
-            reason = f"the PLC at {settings.host}:{settings.port} can't be read and written: {error}"
+            reason = f"the PLC at {settings.host}:{settings.port}: {doing}: {error}"
             return Failed("s7-exchange", " ".join(reason.split()))
 
     def close(self) -> None:
