@@ -27,7 +27,7 @@ from barsight.plant.telegram import IN_MAGIC, pack, unpack
 from barsight.store import confirmation
 from barsight.store.tables import LIFT_STATES
 from barsight.store.touches import Touch
-from handshake_plant import CLAIM, DONE, EXECUTED, EXECUTING, REFUSED, Plant, make_template
+from handshake_plant import CLAIM, DONE, EXECUTED, EXECUTING, FAILED, REFUSED, Plant, make_template
 
 FIRST, SECOND = (109.0, 0.0), (118.0, 0.0)
 """Targets of the first two lifts; their tolerance is 10 mm."""
@@ -194,6 +194,52 @@ def test_whatever_tells_that_the_magnet_came_down_beside(plant: Plant, way: Call
     way(crane)
     assert 2 not in offers(plant)
     assert crane.turn(EXECUTED) == REFUSED and [one[0] for one in alarms(plant)] == ["lift-beside"]
+
+
+def stays_away(crane: Driver) -> None:
+    for _ in range(3):
+        crane.go(FREE, 0.0)
+
+
+def stops_beside(crane: Driver) -> None:
+    """The PLC sends neither magnet nor rope, nor the hoist."""
+    for at in (FREE, (FIRST[0] + 0.5, FIRST[1]), FREE):
+        crane.go(at, 0.0)
+
+
+@pytest.mark.parametrize("begins", [True, False])
+@pytest.mark.parametrize("way", [stays_away, stops_beside])
+def test_a_crane_that_was_never_at_its_target_has_not_lifted(
+    plant: Plant, way: Callable[[Driver], None], *, begins: bool
+) -> None:
+    crane = Driver(plant)
+    crane.z_m = 0.0
+    crane.turn()
+    assert crane.turn(CLAIM) == DONE
+    assert not begins or crane.turn(EXECUTING) == DONE
+    way(crane)
+    assert crane.turn(EXECUTED) == REFUSED
+    assert plant.states_of(crane.lift["lift_id"])[-1] == ("executing" if begins else "claimed")
+    assert crane.turn(FAILED) == DONE
+
+
+@pytest.mark.parametrize("lost", [None, "position", "telegrams", "connection"])
+def test_a_crane_that_was_at_its_target_has_lifted_whatever_was_lost(plant: Plant, lost: str | None) -> None:
+    """Neither magnet nor rope are sent, nor the hoist."""
+    crane = Driver(plant)
+    crane.z_m = 0.0
+    crane.begin()
+    if lost == "telegrams":
+        plant.now_s += 5
+    elif lost == "connection":
+        crane.connect()
+        crane.turn()
+        crane.turn(CLAIM)
+    crane.go((0.0, 0.0) if lost == "position" else FREE, 0.0)
+    if lost is None:
+        crane.go(FIRST, 0.0)
+    crane.go(FREE, 0.0)
+    assert crane.turn(EXECUTED) == DONE and alarms(plant) == []
 
 
 def on_early(crane: Driver) -> None:

@@ -9,7 +9,7 @@ from collections import deque
 from dataclasses import dataclass, replace
 
 from barsight.core.errors import BarsightError, Failed
-from barsight.plant.state import PlantState, PlcReading
+from barsight.plant.state import OfferedLift, PlantState, PlcReading
 from barsight.plant.steps import LiftReport, LiftSteps
 from barsight.store.touches import Touch
 
@@ -56,6 +56,8 @@ class PlcPartner:
         self._last_s = 0.0
         self.begun = begun
         self._claimed: int | None = None
+        self._shown: OfferedLift | None = None
+        self._away_from: OfferedLift | None = None
         self._contact_m: float | None = None
 
     @property
@@ -110,17 +112,21 @@ class PlcPartner:
         Without a position nothing is known, nor from the first reading, nor of what happened before one that
         came `MAX_GAP_S` late: by then the load may hang, if the magnet is on. It is down if the rope is
         slack; while a lift has begun also up to `DOWN_M` above the height of contact, otherwise whenever it
-        is turned on. While one is claimed, coming below that height tells that it came down.
+        is turned on. While one is claimed, coming below that height tells that it came down. A crane whose
+        position was known since it claimed a lift, and never at the target, hasn't made it.
         """
         last, last_s = self._last, self._last_s
         self._last_s = time.monotonic()
         self._last = None if reading.place_m is None else reading
         if self._last is None or self._last_s - last_s > MAX_GAP_S:
             last = None
+            self._away_from = None
             if reading.is_magnet_on:
                 self.begun = self._claimed = self._contact_m = None
         if last is None or reading.place_m is None:
             return
+        if self._away_from is not None and self._away_from.is_at(*reading.place_m[:2]):
+            self._away_from = None
         low_m = -math.inf if self._contact_m is None else self._contact_m + DOWN_M
         down_m = math.inf if self.begun is None or self._contact_m is None else low_m
         was, now = (_Magnet.of(one, down_m) for one in (last, reading))
@@ -135,6 +141,7 @@ class PlcPartner:
         }  # fmt: skip
         for kind in (name for name, is_told in kinds.items() if is_told):
             self._touches.append(Touch(kind, *reading.place_m))
+            self._away_from = None  # the store judges by the touches
 
     def reading(self, found: dict[str, int]) -> PlcReading:
         """Form the PLC's reading of the crane from a telegram."""
@@ -152,6 +159,7 @@ class PlcPartner:
         """
         lift = state.lift
         is_own = lift is not None and lift.lift_id in (self.begun, self._claimed)
+        self._shown = lift
         self._contact_m = lift.hoist_height_m if lift is not None and is_own else None
         if self.is_alive and not is_second:
             return state
@@ -191,6 +199,8 @@ class PlcPartner:
             claim = self._steps.claim(self.name, *lift)
             if isinstance(claim, Failed):
                 return REFUSED, 0
+            if self._shown is not None and self._shown.handshake == "offered":
+                self._away_from = self._shown if self._shown.lift_id == claim.lift_id else None
             self._claimed, self.begun = claim.lift_id, self.begun if self.begun == claim.lift_id else None
             return DONE, claim.token
         token, flags = found["token"], found["flags"]
@@ -200,7 +210,9 @@ class PlcPartner:
             self.begun = None if isinstance(answer, Failed) else found["lift_id"]
         elif found["command"] == EXECUTED:
             load_kg = found["load"] / 10 if flags & _WEIGHED else None
-            report = LiftReport(bool(flags & _REACHED), bool(flags & _SLACK), load_kg)
+            is_away = self._away_from is not None and self._away_from.lift_id == found["lift_id"]
+            is_reached = bool(flags & _REACHED) and not is_away
+            report = LiftReport(is_reached, bool(flags & _SLACK), load_kg)
             answer = self._steps.executed(token, report, found["lift_id"])
         else:
             answer = self._steps.failed(token, f"the PLC says so, flags {flags}", found["lift_id"])

@@ -11,6 +11,7 @@ from typing import Any
 from barsight.core.json_values import json_value
 from barsight.core.reading.live_run import CranePose
 from barsight.store.confirmation import OPEN, OpenLift, map_vetoes, newest_survey, open_lifts, yard_clock_ns
+from barsight.store.lift_records import ROUNDING_M
 from barsight.store.opening import Store
 from barsight.store.states import alarm_priority, standing_alarms
 from barsight.yard.lifting.validity import is_ahead
@@ -96,6 +97,11 @@ class OfferedLift:
     map_id: str
     handshake: str
     sha256: str = ""
+
+    def is_at(self, x_m: float, y_m: float) -> bool:
+        """Check whether a crane's readings lie within the tolerance of the target."""
+        x_off, y_off = abs(x_m - self.x_m), abs(y_m - self.y_m)
+        return x_off <= self.tolerance_x_m + ROUNDING_M and y_off <= self.tolerance_y_m + ROUNDING_M
 
     def digest(self) -> str:
         """Form the checksum: SHA-256 of the fields' JSON without `handshake` and `sha256`."""
