@@ -258,7 +258,7 @@ def test_later_touch_downs_are_judged_with_the_offset(tmp_path: Path) -> None:
     ("own", "said"), [(6, "touch 0, touch 1, touch 2 ..."), (1, "touch 0, which"), (0, "")]
 )
 def test_touch_downs_do_not_verify_their_own_mean(own: int, said: str, tmp_path: Path) -> None:
-    """By their readings, also in a plan that names them anew; before anything is measured."""
+    """They are known by their readings, whatever a plan calls them, and before anything is measured."""
     path = certificate(tmp_path, np.random.default_rng(24))
     offset = touched_offset(path, MAGNET.tolerance)
     downs = [TouchDown(**one) for one in json.loads(path.read_text())["plan"]["touch_down"]]

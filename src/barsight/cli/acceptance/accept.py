@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -41,6 +42,26 @@ from barsight.yard.magnet.description import MagnetOffset, load_magnet
 COLOURS = {Decision.PASSED: "green", Decision.FAILED: "red"}
 
 
+@dataclass(frozen=True)
+class CertificateSignature:
+    """The signature of a certificate, to be made or to be checked."""
+
+    key: Path | None = None
+    """Ed25519 private key (PEM) that signs each file of the certificate; the signature is written next to the
+    file as NAME.sig. With --check: the signer's public key.
+    """
+    signer: str = ""
+    """Name of the person responsible for the certificate."""
+    check: bool = False
+    """Check that a certificate is as it was signed, with --key PUBLIC.pem. The exit code is 0 if all its
+    files are, whatever the certificate says, and 5 if one was changed or isn't signed, or if another key
+    signed it.
+    """
+
+
+UNSIGNED = CertificateSignature()
+
+
 def run(arguments: Sequence[str]) -> None:
     """Parse the arguments, run the acceptance and print it."""
 
@@ -48,14 +69,12 @@ def run(arguments: Sequence[str]) -> None:
         files: tyro.conf.Positional[tuple[Path, ...]],
         out: Annotated[Path | None, tyro.conf.arg(aliases=("-o",))] = None,
         plan: bool = False,
-        check: bool = False,
         yard: Path | None = None,
         rig: Path | None = None,
         magnet: Path | None = None,
         preset: Literal["best", "fast"] = "best",
-        key: Path | None = None,
-        signer: str = "",
         keep: Path | None = None,
+        signature: Annotated[CertificateSignature, tyro.conf.arg(name="")] = UNSIGNED,
     ) -> None:
         """Accept a rig with artefacts in the yard, in the manner of VDI/VDE 2634-3 and ISO 10360-13.
 
@@ -71,23 +90,18 @@ def run(arguments: Sequence[str]) -> None:
                 name. With --plan: the plan to write, PLAN.toml.
             plan: Make a plan for the yard instead, with artefacts on its free floor and limits based on the
                 pixel size.
-            check: Check that a certificate is as it was signed, with --key PUBLIC.pem. The exit code is 0 if
-                all its files are, whatever the certificate says, and 5 if one was changed or isn't signed,
-                or if another key signed it.
             yard: Yard file from barsight calibrate yard.
             rig: Rig file to use instead of the recordings' own calibration.
             magnet: TOML file of the magnet. Its offset from earlier touch-downs (barsight calibrate magnet)
                 is applied to the crane's readings; the touch-downs of this plan verify it.
             preset: Stereo preset, as in barsight measure.
-            key: Ed25519 private key (PEM) that signs each file of the certificate; the signature is written
-                next to the file as NAME.sig. With --check: the signer's public key.
-            signer: Name of the person responsible for the certificate.
             keep: A new folder in which to keep the results of measuring each recording.
+            signature: Who signs it, or whether it is as it was signed.
         """
-        if check:
-            if len(files) != 1 or key is None or plan or out is not None:
+        if signature.check:
+            if len(files) != 1 or signature.key is None or plan or out is not None:
                 raise ConfigError("accept --check takes one certificate and --key PUBLIC.pem, nothing else")
-            print_checked(*check_certificate(files[0], key))
+            print_checked(*check_certificate(files[0], signature.key))
             return
         if out is None:
             raise ConfigError("accept needs -o: the certificate to write, or with --plan the plan")
@@ -99,8 +113,8 @@ def run(arguments: Sequence[str]) -> None:
         if len(files) < 2:
             raise ConfigError("accept needs PLAN.toml and at least one recording; --plan makes a plan")
         settings = MeasureSettings(preset=preset, yard=yard, recording=RecordingSettings(rig=rig))
-        offset = _offset(magnet)
-        found = run_acceptance(files, out, settings, key, signer, keep, offset=offset)
+        by = signature.key, signature.signer
+        found = run_acceptance(files, out, settings, *by, keep, offset=_offset(magnet))
         if not found.is_passed:
             raise MeasurementError(f"{files[0]}: not accepted: {why_refused(found)}")
 

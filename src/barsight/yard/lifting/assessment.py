@@ -33,7 +33,7 @@ from barsight.yard.lifting.thin_bars import (
     may_reach,
     thin_bar_checks,
 )
-from barsight.yard.lifting.travel_accuracy import target_covariance, travel_checks, turn_checks
+from barsight.yard.lifting.travel_accuracy import crane_checks, target_covariance
 from barsight.yard.lifting.validity import age_checks, disturbed_checks, validity
 from barsight.yard.magnet.contact import NEWTON_PER_KG, Contact, rest_magnet
 from barsight.yard.magnet.description import Magnet, Tolerance
@@ -86,8 +86,7 @@ def assess_placement(
     offset = float(away @ place.along), float(away @ place.across)
     overhang = _overhang(place, load, magnet)
     checks = [
-        *(travel_checks(yard.travel, place, magnet, settings) if yard.travel else ()),
-        *turn_checks(place, magnet),
+        *crane_checks(yard.travel, place, magnet, settings),
         *(age_checks(valid.from_ns if valid else None, yard.now_ns, settings) if yard.travel else ()),
         *area_checks(place, magnet, load, settings),
         *disturbed_checks(yard.events, place, magnet, load, valid, settings),

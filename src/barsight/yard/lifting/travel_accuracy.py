@@ -190,6 +190,16 @@ def _disagreement(
     return size
 
 
+def crane_checks(
+    travel: Travel | None, place: Placement, magnet: Magnet, settings: LiftSettings
+) -> list[Check]:
+    """Check that the crane can set the magnet down on the place: by the travel, if it is known, and by the
+    magnet's offset.
+    """
+    checks = [] if travel is None else travel_checks(travel, place, magnet, settings)
+    return checks + _turn_checks(place, magnet)
+
+
 def travel_checks(travel: Travel, place: Placement, magnet: Magnet, settings: LiftSettings) -> list[Check]:
     """Check that the map's position and height are accurate enough for this lift."""
     here = np.array([place.x_m, place.y_m])
@@ -247,7 +257,7 @@ def _encoder_checks(travel: Travel, place: Placement, max_m: float) -> list[Chec
     ]  # fmt: skip
 
 
-def turn_checks(place: Placement, magnet: Magnet) -> list[Check]:
+def _turn_checks(place: Placement, magnet: Magnet) -> list[Check]:
     """Check that the magnet's offset, if one is stated, is known at this lift's yaw."""
     offset = magnet.offset
     if offset is None:
