@@ -90,7 +90,7 @@ def test_what_an_earlier_server_left_ends_though_the_first_look_failed(
         with store.writing(), pytest.raises(InputError, match="locked"):
             watch.judge()
         watch.judge()
-        watch.judge(with_chain=True)
+        watch.verify()
         with store.reading() as connection:
             assert [alarm_state(connection, one) for one in left] == ["returned"] * 2
 
@@ -98,13 +98,13 @@ def test_what_an_earlier_server_left_ends_though_the_first_look_failed(
 def test_a_store_that_was_changed_by_hand_offers_nothing(url: str, tmp_path: Path) -> None:
     with open_store(url) as store:
         watch = StoreWatch(store)
-        watch.judge(with_chain=True)
+        watch.verify()
         with closing(sqlite3.connect(url.removeprefix("sqlite:///"))) as hand, hand:
             hand.execute("DROP TRIGGER lifts_no_update")
             hand.execute("UPDATE lifts SET record = replace(record, '\"count\": 1', '\"count\": 2')")
         with store.reading() as connection:
             assert open_lifts(connection)
-        watch.judge(with_chain=True)
+        watch.verify()
         with store.reading() as connection:
             assert open_lifts(connection) == ()
         add_survey(store, read_survey(survey(tmp_path / "next", SECOND, 0.0)), "ann")

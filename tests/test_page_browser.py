@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import json
 import shutil
-import sqlite3
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from barsight.page import watch as watching
 from barsight.page.api.serve import ServeOptions, serving
 from barsight.store.accounts import add_person
 from barsight.store.audit import entry
@@ -93,26 +92,29 @@ def test_a_bundles_age_goes_on_while_nothing_changes(browser: object, address: s
     context.close()
 
 
-def test_readings_of_the_crane_are_shown_where_they_are_not_the_place(browser: object, url: str) -> None:
+def test_readings_of_the_crane_are_shown_where_they_are_not_the_place(browser: object, address: str) -> None:
     """The magnet of one lift hangs 0.2 m off the readings; the other lifts' readings are their places."""
-    with closing(sqlite3.connect(url.removeprefix("sqlite:///"))) as connection:
-        connection.execute("DROP TRIGGER lifts_no_update")
-        number, told = connection.execute("SELECT id, record FROM lifts ORDER BY id").fetchone()
-        record = json.loads(told)
-        record["target"]["x_m"], record["crane_target"]["x_m"] = 3.0, 2.8
-        connection.execute("UPDATE lifts SET record = ? WHERE id = ?", (json.dumps(record), number))
-        connection.commit()
-    with serving(url, ServeOptions(port=0)) as address:
-        sheet = Sheet(browser, address)
-        sheet.open("lifts")
-        panels = {
-            one.get_attribute("id"): one.inner_text() for one in sheet.page.query_selector_all(".lifts > *")
-        }
-        told = panels.pop(f"lift-{number}")
-        assert "X 3.00" in told and "Target, crane's readings" in told and "X 2.80" in told
-        assert panels and not any("Target, crane's" in other for other in panels.values())
-        assert not sheet.errors
-        sheet.context.close()
+    sheet = Sheet(browser, address)
+    number = sheet.page.evaluate("fetch('/api/lifts').then((answer) => answer.json())")["lifts"][0]["id"]
+
+    def move(route: object) -> None:
+        answer = route.fetch()
+        content = answer.json()
+        moved = content["lifts"][0]
+        moved["target"]["x_m"], moved["crane_target"]["x_m"] = 3.0, 2.8
+        route.fulfill(response=answer, json=content)
+
+    sheet.page.route("**/api/lifts", move)
+    sheet.page.reload()
+    sheet.open("lifts")
+    panels = {
+        one.get_attribute("id"): one.inner_text() for one in sheet.page.query_selector_all(".lifts > *")
+    }
+    told = panels.pop(f"lift-{number}")
+    assert "X 3.00" in told and "Target, crane's readings" in told and "X 2.80" in told
+    assert panels and not any("Target, crane's" in other for other in panels.values())
+    assert not sheet.errors
+    sheet.context.close()
 
 
 @pytest.mark.parametrize("reported", ["taken", "failed"])
@@ -433,14 +435,9 @@ def test_two_browsers_agree_within_a_second(browser: object, address: str) -> No
     assert one.errors == two.errors == []
 
 
-def test_a_stale_offer_cannot_be_confirmed(browser: object, address: str) -> None:
-    """The dialog stands open while a veto comes: its confirmation is refused, and the page says so."""
-    sheet = Sheet(browser, address)
-    sheet.open("lifts")
-    page = sheet.page
-    page.click("[id^=confirm-] >> nth=0")
-    page.fill("#ask-name", "Ann")
-    told = page.evaluate(
+def forbid_lifts(page: object) -> int:
+    """Forbid all lifts by the API, beside the page; return the answer's status."""
+    return page.evaluate(
         """async () => {
           const token = (await (await fetch("/api/session")).json()).token;
           const headers = {"X-Barsight-Token": token, "Content-Type": "application/json"};
@@ -448,14 +445,48 @@ def test_a_stale_offer_cannot_be_confirmed(browser: object, address: str) -> Non
           return (await fetch("/api/vetoes", {method: "POST", headers, body})).status;
         }"""
     )
-    assert told == 200
-    page.click("#ask-yes")
-    page.wait_for_selector("#told >> text=expired")
+
+
+def test_a_stale_offer_cannot_be_confirmed(browser: object, address: str) -> None:
+    """The dialog stands open while a veto comes: it is left, and the page says so."""
+    sheet = Sheet(browser, address)
+    sheet.open("lifts")
+    page = sheet.page
+    page.click("[id^=confirm-] >> nth=0")
+    page.fill("#ask-name", "Ann")
+    assert forbid_lifts(page) == 200
+    page.wait_for_selector("dialog", state="detached")
+    page.wait_for_selector("#told >> text=has changed")
     lifts = page.evaluate("fetch('/api/lifts').then((answer) => answer.json())")["lifts"]
     assert {one["state"] for one in lifts} == {"expired"}
-    page.keyboard.press("Escape")
     sheet.open("bundle")
     assert page.inner_text("#screen tbody").count("disturbed") == 5, "it forbids the whole map"
+
+
+def test_a_page_that_hears_nothing_offers_nothing(
+    browser: object, address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The network or the store falls silent without an error: no screen shows an offer until a beat comes."""
+    sheet = Sheet(browser, address, wait="#side >> text=offered")
+    page = sheet.page
+    page.clock.install()
+    offered = "[...document.querySelectorAll('#screen [id^=confirm-], #screen [id^=pick-]')].length"
+    sheet.open("lifts")
+    page.click("[id^=confirm-] >> nth=0")
+    monkeypatch.setattr(watching, "FRESH_S", -1.0)
+    page.clock.fast_forward(11_000)
+    page.wait_for_selector("#server >> text=no lift is offered")
+    page.wait_for_selector("dialog", state="detached")
+    wait_for(lambda: page.evaluate(offered) == 0)
+    sheet.open("yard")
+    page.wait_for_selector("#side >> text=No connection to the server")
+    assert page.evaluate(offered) == 0 and page.evaluate("barsightYard.data.lifts.length") == 0
+    page.evaluate("location.hash = 'bundle/B1'")
+    page.wait_for_selector("#screen >> text=No connection to the server")
+    assert page.evaluate(offered) == 0
+    monkeypatch.setattr(watching, "FRESH_S", 10.0)
+    page.wait_for_selector("#confirm-1")
+    assert "connected" in page.inner_text("#server") and not sheet.errors
 
 
 def test_a_server_that_ends_and_comes_back(browser: object, url: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import threading
 import time
@@ -15,6 +16,7 @@ from barsight.core.json_values import json_value
 from barsight.page.conditions import (
     ALARM_CODES,
     WHO,
+    Condition,
     find_chain_condition,
     find_conditions,
     settle_alarms,
@@ -40,8 +42,10 @@ with extra("store"):
 
 LOOK_S, JUDGE_S, VERIFY_S = 0.2, 2.0, 600.0
 """Intervals at which the store is looked at, its alarms are settled, and its audit log is verified."""
-HEARTBEAT_S = 10.0
-"""Interval at which a quiet event stream sends a comment, so that nothing between closes it."""
+BEAT_S, FRESH_S = 2.0, 10.0
+"""Interval of an event stream's beats, and maximum age of the last judgement for one to be sent: a page that
+hears none shows no offer.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,17 +87,23 @@ class StoreWatch:
         self._stop = threading.Event()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._changed: asyncio.Event | None = None
-        self._thread = threading.Thread(target=self._run, name="store watch", daemon=True)
+        self._judged_s = float("-inf")
+        self._threads = [
+            threading.Thread(target=self._run, name="store watch", daemon=True),
+            threading.Thread(target=self._run_chain, name="audit watch", daemon=True),
+        ]
 
     def start(self, loop: asyncio.AbstractEventLoop) -> None:
         """Start watching; clients that wait for events do so in this loop."""
         self._loop, self._changed = loop, asyncio.Event()
-        self._thread.start()
+        for thread in self._threads:
+            thread.start()
 
     def stop(self) -> None:
         """Stop watching, and end all event streams."""
         self._stop.set()
-        self._thread.join(10.0)
+        for thread in self._threads:
+            thread.join(10.0)
         if self._changed is not None:
             self._changed.set()
 
@@ -133,37 +143,46 @@ class StoreWatch:
             self.crane = crane
             self._wake()
 
-    def judge(self, *, with_chain: bool = False) -> None:
+    def judge(self) -> None:
         """Settle alarms, and end offers that have expired or whose calibration was changed."""
         with self._judging:
-            self._judge(with_chain=with_chain)
+            self._judge()
+        self.refresh()
+        self._judged_s = time.monotonic()
+
+    def verify(self) -> None:
+        """Verify the audit log and settle its alarm; in a long log it takes longer than offers may wait."""
+        with self.store.reading() as connection:
+            present = find_chain_condition(connection)
+        with self._judging:
+            self._settle(present, {"store-broken"})
         self.refresh()
 
-    def _judge(self, *, with_chain: bool) -> None:
+    def _judge(self) -> None:
         self.health = None if self.live is None else self.live.look()
-        judged = {code for code in ALARM_CODES if code != "store-broken" or with_chain}
         with self.store.reading() as connection:
             present = find_conditions(connection, self.health)
-            if with_chain:
-                present |= find_chain_condition(connection)
             newest = newest_survey(connection)
             changed = [reason for code, reason in present if code == "calibration-changed"]
             vetoes = [] if newest is None else map_vetoes(connection, newest.id)
         if changed and not any(veto["code"] == "calibration-changed" for veto in vetoes):
             forbid(self.store, "calibration-changed", changed[0], WHO)
+        self._settle(present, set(ALARM_CODES) - {"store-broken"})
+
+    def _settle(self, present: set[Condition], judged: set[str]) -> None:
         # What another server sees may not be seen from here: after the start only what was seen here ends.
         settle_alarms(self.store, present, judged, self._seen)
         self._seen |= {code: {reason for other, reason in present if other == code} for code in judged}
         expire_stale(self.store, WHO)
 
     async def events(self, may_read: Callable[[], bool]) -> AsyncIterator[bytes]:
-        """Stream server-sent events: each new revision and crane position. A slow reader skips those in
-        between.
+        """Stream server-sent events: new revisions and crane positions, and beats while offers are judged. A
+        slow reader skips those in between.
 
         may_read: whether the reader's log-in lasts; the stream ends with it, by an event after which the page
         asks and reads that it must log in.
         """
-        sent, shown = -1, b""
+        sent, shown, beat_s = -1, b"", float("-inf")
         while not self._stop.is_set():
             changed = self._changed
             assert changed is not None
@@ -174,14 +193,17 @@ class StoreWatch:
                 sent = self.published.revision
                 yield f"event: revision\nid: {sent}\ndata: {sent}\n\n".encode()
                 continue
+            now_s = time.monotonic()
+            if now_s - beat_s >= BEAT_S:
+                beat_s = now_s
+                is_fresh = now_s - self._judged_s <= FRESH_S
+                yield b"event: beat\ndata: fresh\n\n" if is_fresh else b": still there\n\n"
             if self.crane != shown:
                 shown = self.crane
                 yield b"event: crane\ndata: " + shown + b"\n\n"
                 continue
-            try:
-                await asyncio.wait_for(changed.wait(), HEARTBEAT_S)
-            except TimeoutError:
-                yield b": still there\n\n"
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(changed.wait(), BEAT_S)
 
     def _wake(self) -> None:
         if self._loop is not None and not self._loop.is_closed():
@@ -193,15 +215,14 @@ class StoreWatch:
             changed.set()
 
     def _run(self) -> None:
-        judged_s = verified_s = float("-inf")
+        judged_s = float("-inf")
         while not self._stop.is_set():
             try:
                 self.look_at_crane()
                 now_s = time.monotonic()
                 if now_s - judged_s >= JUDGE_S:
-                    with_chain = now_s - verified_s >= VERIFY_S
-                    self.judge(with_chain=with_chain)
-                    judged_s, verified_s = now_s, now_s if with_chain else verified_s
+                    self.judge()
+                    judged_s = now_s
                 self.refresh()
                 self.problem = None
             except (BarsightError, OSError) as error:  # a database or a disk may be back later
@@ -209,3 +230,11 @@ class StoreWatch:
             except Exception as error:  # a watch that has ended would show an old yard
                 self.problem = f"{type(error).__name__}: {error}"
             self._stop.wait(LOOK_S)
+
+    def _run_chain(self) -> None:
+        wait_s = VERIFY_S
+        while not self._stop.wait(wait_s):
+            wait_s = JUDGE_S
+            with contextlib.suppress(Exception):  # the other thread meets it too, and tells of it
+                self.verify()
+                wait_s = VERIFY_S

@@ -40,7 +40,8 @@ def build_app(watch: StoreWatch, hosts: frozenset[str], origins: frozenset[str],
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        await asyncio.to_thread(watch.judge, with_chain=True)
+        await asyncio.to_thread(watch.verify)
+        await asyncio.to_thread(watch.judge)
         watch.start(asyncio.get_running_loop())
         yield
         await asyncio.to_thread(watch.stop)

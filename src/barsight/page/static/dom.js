@@ -71,7 +71,8 @@ export function tell(text) {
 }
 
 // Ask in a dialog; returns the form's values, or null where it was left. fields: [name, label, options].
-export function ask(title, text, fields, accept) {
+// lift: the one that is asked about; the dialog is left where its state changes.
+export function ask(title, text, fields, accept, lift = null) {
   return new Promise((resolve) => {
     const inputs = fields.map(([name, label, options = {}]) => [
       h("label", { htmlFor: `ask-${name}` }, label),
@@ -83,7 +84,7 @@ export function ask(title, text, fields, accept) {
       h("h1", { id: "ask-title" }, title), text && h("div", {}, text), inputs,
       h("div", { className: "buttons" }, h("button", { className: "main", id: "ask-yes" }, accept),
         h("button", { type: "button", onclick: () => dialog.close("") }, t("cancel"))));
-    const dialog = h("dialog", { "aria-labelledby": "ask-title", onclose: () => {
+    const dialog = h("dialog", { "aria-labelledby": "ask-title", "data-lift": lift && `${lift.id} ${lift.state}`, onclose: () => {
       const values = Object.fromEntries(new FormData(form));
       dialog.remove();
       resolve(dialog.returnValue === "yes" ? values : null);

@@ -1,6 +1,6 @@
 // The page: header, screens by the address's hash, the stream of revisions.
 import { ageText, h, languageName, LANGUAGES, loadWords, setLanguage, show, t, tell } from "./dom.js";
-import { enter, forget, listen, live, logIn, read, session } from "./api.js";
+import { awayText, enter, forget, hear, isThere, listen, live, logIn, read, session } from "./api.js";
 import { clockNow, showCrane, yardScreen } from "./yard.js";
 import { adminScreen, alarmScreen, alarmText, bundleScreen, healthScreen, liftScreen, mark, priority, stockScreen, surveyScreen } from "./screens.js";
 import { targetScreen } from "./targets.js";
@@ -11,11 +11,12 @@ const modelScreen = async (...given) => (await import("./model.js")).modelScreen
 
 const SCREENS = { yard: yardScreen, model: modelScreen, bundle: bundleScreen, lifts: liftScreen, stock: stockScreen, alarms: alarmScreen, timeline: timelineScreen, surveys: surveyScreen, targets: targetScreen, health: healthScreen, admin: adminScreen };
 const place = document.getElementById("screen");
-let isThere = true;
+let wasThere = true;
 let drawn = 0;
 let drawnAt = 0;
 const AGED_MS = 60000; // ages stand on these screens, which nothing else may draw anew for hours
 const AGING = ["yard", "bundle"];
+const OFFERING = ["yard", "bundle", "lifts"];
 
 const where = () => {
   const [name, argument] = location.hash.slice(1).split("/");
@@ -38,15 +39,26 @@ async function draw() {
   } catch (error) {
     if (error.status === 401) logInScreen();
     else if (error.status === 404) show(place, h("section", {}, error.message));
-    else tell(isThere ? error.message : t("server.away"));
+    else if (mine === drawn && !isThere() && OFFERING.includes(name)) show(place, h("section", {}, h("h1", {}, t("veto.no-connection")), h("p", {}, error.message)));
+    else tell(error.message);
   }
+}
+
+// A dialog on a lift that has changed since is left: what it asks is no longer so.
+async function leaveDialog() {
+  const dialog = document.querySelector("dialog[data-lift]");
+  if (!dialog) return;
+  const { lifts } = await read("lifts");
+  if (lifts.some((one) => dialog.dataset.lift === `${one.id} ${one.state}`)) return;
+  dialog.close("");
+  tell(t("told.changed"));
 }
 
 function header(state, name) {
   const fact = (word, value, props = {}) => h("div", { className: "fact", ...props }, h("span", {}, t(word)), h("strong", {}, value));
   const top = state.top_alarm;
   show(document.getElementById("header"),
-    fact("header.server", isThere ? t("server.there") : t("server.away"), { id: "server" }),
+    fact("header.server", serverText(), { id: "server" }),
     fact(...mapAge(state), { id: "age" }),
     live.crane && fact("crane", craneText(), { id: "crane", title: live.crane.reasons.join("; ") }),
     fact("header.map", state.survey ? state.survey.map_id : "–"),
@@ -110,20 +122,38 @@ function logInScreen() {
 
 let isListening = false;
 function start() {
+  if (!isListening) hear();
   forget();
   draw();
   if (isListening) return;
   isListening = true;
-  listen(() => { forget(); draw(); }, (there) => { if (there !== isThere) { isThere = there; document.body.dataset.there = there; forget(); if (there) enter().catch(() => {}).then(draw); else mark_away(); } }, craneMoved);
+  listen(() => { forget(); changed(); }, look, craneMoved);
+  setInterval(look, 1000);
 }
 
-function mark_away() {
-  const place_ = document.querySelector("#server strong");
-  if (place_) place_.textContent = t("server.away");
+function changed() {
+  draw();
+  leaveDialog().catch(() => {});
+}
+
+const serverText = () => (isThere() ? t("server.there") : awayText());
+
+// Whether the server is there, by the last beat: while it isn't, no screen shows an offer.
+function look() {
+  const there = isThere();
+  const text = document.querySelector("#server strong");
+  if (text) text.textContent = serverText();
+  if (there === wasThere) return;
+  wasThere = there;
+  document.body.dataset.there = there;
+  if (there) {
+    forget();
+    enter().catch(() => {}).then(changed);
+  } else if (OFFERING.includes(where()[0])) changed();
 }
 
 setInterval(async () => {
-  if (!session.isKnown || !isThere) return;
+  if (!session.isKnown || !isThere()) return;
   await showAge();
   const name = where()[0];
   if (name === "health" || (AGING.includes(name) && performance.now() - drawnAt > AGED_MS)) draw();

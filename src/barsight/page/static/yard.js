@@ -1,6 +1,6 @@
 // Screen: the yard from above.
 import { OPEN_LIFTS, ask, h, metres, figure, show, t, ageText, tell, row, table } from "./dom.js";
-import { change, live, may, read, session } from "./api.js";
+import { change, live, may, read, session, since_ms } from "./api.js";
 import { YardCanvas } from "./canvas.js";
 import { whyNot } from "./why.js";
 
@@ -58,10 +58,7 @@ export function showCrane() {
 }
 
 // The yard's clock goes on between two documents.
-export function clockNow(state) {
-  state.read_ms ??= performance.now();
-  return state.clock_ns + (performance.now() - state.read_ms) * 1e6;
-}
+export const clockNow = (state) => state.clock_ns + since_ms(state.read) * 1e6;
 
 function sideOf(known) {
   const { bundles, lifts, state } = known;
@@ -136,17 +133,17 @@ export function liftButtons(lift, clock_ns = Infinity) {
   const which = `${lift.bundles.join(", ")} · ${t("map")} ${lift.map_id}`;
   const late = lift.state === "expired" && h("p", {}, t("lift.late.text"));
   const ended = async (state, title) => {
-    const given = await ask(t(title), [h("p", {}, which), late], [["note", t("reason")]], t("accept"));
+    const given = await ask(t(title), [h("p", {}, which), late], [["note", t("reason")]], t("accept"), lift);
     if (given) act("end", { state, note: given.note }, `told.${state}`);
   };
   const taken = async () => {
-    if (!late || await ask(t("lift.taken"), [h("p", {}, which), late], [], t("accept"))) act("taken", {}, "told.taken");
+    if (!late || await ask(t("lift.taken"), [h("p", {}, which), late], [], t("accept"), lift)) act("taken", {}, "told.taken");
   };
   const confirm = async () => {
     const fields = session.name === "local" ? [["name", t("your.name")]] : [];
     const text = [h("p", {}, t("lift.confirm.text", lift.rank, lift.bundles.join(", "))), h("dl", {}, h("dt", {}, t("map")), h("dd", {}, lift.map_id), h("dt", {}, t("calibration")), h("dd", {}, lift.calibration_id),
       h("dt", {}, t("role")), h("dd", {}, `${session.name} · ${t(`role.${session.role}`)}`))];
-    const given = await ask(t("lift.confirm"), text, fields, t("lift.confirm"));
+    const given = await ask(t("lift.confirm"), text, fields, t("lift.confirm"), lift);
     if (given) act("confirm", { map_id: lift.map_id, name: given.name || "" }, "told.confirmed");
   };
   const button = (id, word, onclick, className, right) => h("button", { id: `${id}-${lift.id}`, onclick, className, disabled: !may(right) }, t(word));
