@@ -1,6 +1,7 @@
 """The Python API: a recording measured as in a notebook."""
 
 import gc
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -15,11 +16,12 @@ from barsight.core.records.pairs import StereoFrame
 from barsight.core.settings.values import build_settings
 from barsight.mapping.settings import MapSettings
 from barsight.reconstruction.map_building import nothing_seen
+from barsight.result_folder import seal_map
 from barsight.yard.events import YardEvent, kept_events, write_events
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.lift_file import read_lifts
 from cli_runs import FAST
-from result_folders import write_folder
+from result_folders import summary, write_folder
 
 NOTEBOOK: dict[str, Any] = {"stereo": {"method": "sgbm"}, "map": {"cell_m": 0.05}}
 
@@ -59,7 +61,8 @@ def test_a_notebook_measures_looks_and_saves(
     with pytest.raises(bs.BarsightError, match="not empty"):
         yard.save(saved)
     np.testing.assert_array_equal(bs.load(saved).height_map.z_m, heights.z_m)
-    assert all(len(repr(one)) < 130 for one in (yard, yard.lifts, heights, contour))
+    assert all(len(repr(one)) < 130 for one in (yard, yard.lifts, heights, contour, yard.trajectory))
+    assert all(len(repr(one)) < 130 for one in (*yard.bundles, *yard.lifts.refused))
     folder = yard.folder
     del yard, heights
     gc.collect()
@@ -79,6 +82,22 @@ def test_what_was_reported_in_a_folder_outlives_a_measurement_into_it(whole: Pat
     assert kept_events(out) == (since,) and len(read_lifts(out / "lifts.json")["events"]) == 1
     yard.save(out, overwrite=True)
     assert kept_events(out) == (since,)
+
+
+def test_a_folder_that_was_measured_anew_is_loaded_again(tmp_path: Path) -> None:
+    """What was read before and what is read now would be of two maps."""
+    out = write_folder(tmp_path / "result")
+    yard = bs.load(out)
+    assert yard.trajectory.stamp_ns.size == 12
+    content = summary() | {"captured_from_ns": 1, "captured_to_ns": 2}
+    seal_map(content, out)
+    (out / "result.json").write_text(json.dumps(content), encoding="utf-8")
+    with pytest.raises(bs.BarsightError, match="measured anew"):
+        _ = yard.height_map
+    with pytest.raises(bs.BarsightError, match="measured anew"):
+        yard.save(tmp_path / "saved")
+    assert not (tmp_path / "saved").exists()
+    assert bs.load(out).height_map.z_m.size
 
 
 def test_misspelt_settings_and_missing_recordings_say_so(tmp_path: Path) -> None:

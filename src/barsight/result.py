@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from barsight.core.errors import MEASURE_AGAIN, InputError, OutputError
 from barsight.core.files import atomic_directory
@@ -23,11 +23,14 @@ from barsight.result_folder import (
     read_contours,
     read_heights,
     read_path,
+    read_summary,
 )
 from barsight.yard.events import YardEvent, events_since, kept_events, merged, write_events
 from barsight.yard.inventory.bundle_file import read_bundles
 from barsight.yard.lifting.lift_file import forbidden_since, read_lifts
 from barsight.yard.types import Bundle, HeightMap
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -49,7 +52,13 @@ class LiftTarget:
     mass_sigma_kg: float | None
     valid_until_ns: int | None
     vetoes: tuple[tuple[str, str], ...]
-    record: dict[str, Any] = field(repr=False)
+    record: dict[str, Any]
+
+    def __repr__(self) -> str:
+        rank = "refused" if self.rank is None else f"rank {self.rank}"
+        told = ", ".join(code for code, _ in self.vetoes)
+        place = f"({self.x_m:.2f}, {self.y_m:.2f}) m"
+        return f"<LiftTarget {rank}: bundles {self.bundles} at {place}{told and f'; vetoes {told}'}>"
 
 
 @dataclass(frozen=True)
@@ -89,17 +98,17 @@ class Yard:
     @cached_property
     def height_map(self) -> HeightMap:
         """Return the whole map."""
-        return read_heights(self.folder).whole()
+        return self._read(lambda folder: read_heights(folder).whole())
 
     @cached_property
     def contours(self) -> tuple[Contour, ...]:
         """Return the heights along X, one contour for each profile."""
-        return read_contours(self.folder)
+        return self._read(read_contours)
 
     @cached_property
     def trajectory(self) -> CameraPath:
         """Return the body's poses. Raises InputError if the folder has none."""
-        path = read_path(self.folder)
+        path = self._read(read_path)
         if path is None:
             raise InputError(self.folder, "has no trajectory.tum", MEASURE_AGAIN)
         return path
@@ -107,16 +116,27 @@ class Yard:
     @cached_property
     def bundles(self) -> tuple[Bundle, ...]:
         """Return the bundles found."""
-        return read_bundles(self.folder / "bundles.json")
+        return self._read(lambda folder: read_bundles(folder / "bundles.json"))
 
     @cached_property
     def _chosen(self) -> dict[str, Any]:
-        return read_lifts(self.folder / "lifts.json")
+        return self._read(lambda folder: read_lifts(folder / "lifts.json"))
+
+    def _read(self, read: Callable[[Path], T]) -> T:
+        content = read(self.folder)
+        self._expect_unchanged()
+        return content
+
+    def _expect_unchanged(self) -> None:
+        """Raise InputError if the folder was measured anew since it was loaded."""
+        if read_summary(self.folder).get("map_id") != self.summary.get("map_id"):
+            raise InputError(self.folder, "was measured anew since it was loaded", "load it again")
 
     @property
     def lifts(self) -> Lifts:
         """Return the lifts as currently valid: those too old, or disturbed since, are refused."""
         content = self._chosen
+        self._expect_unchanged()
         offered, refused = (tuple(map(_target, content[name])) for name in ("lifts", "refused"))
         vetoes = _vetoes(content)
         if changed := changed_inputs(self.summary):
@@ -155,6 +175,7 @@ class Yard:
             for name in RESULT_FILES:
                 if (self.folder / name).is_file():
                     shutil.copyfile(self.folder / name, staging / name)
+            self._expect_unchanged()
             from_ns = self.summary.get("captured_from_ns")
             later = events_since(kept_events(target), None if from_ns is None else (from_ns, from_ns))
             if told := merged(self._events, later):

@@ -59,6 +59,9 @@ class CameraPath:
     position_m: Float64
     quaternion_xyzw: Float64
 
+    def __repr__(self) -> str:
+        return f"<CameraPath: {self.stamp_ns.size} poses>"
+
 
 @dataclass(frozen=True, eq=False)
 class Cloud:

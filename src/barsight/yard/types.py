@@ -276,6 +276,10 @@ class Bundle:
     fit_sigma: FitSigma | None = None
     map_sigma_z_m: float = float("nan")
 
+    def __repr__(self) -> str:
+        size = f"{self.length_m:.2f} m x {self.width_m:.2f} m"
+        return f"<Bundle {self.id}: {size} at ({self.centre_m[0]:.2f}, {self.centre_m[1]:.2f}) m>"
+
     @property
     def is_free(self) -> bool:
         """Check that nothing lies on the bundle, with certainty."""
