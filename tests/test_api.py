@@ -85,7 +85,7 @@ def test_what_was_reported_in_a_folder_outlives_a_measurement_into_it(whole: Pat
 
 
 def test_a_folder_that_was_measured_anew_is_loaded_again(tmp_path: Path) -> None:
-    """What was read before and what is read now would be of two maps."""
+    """Two reads would be of two maps."""
     out = write_folder(tmp_path / "result")
     yard = bs.load(out)
     assert yard.trajectory.stamp_ns.size == 12
