@@ -17,7 +17,7 @@ from barsight.core.records.heights import HeightSource
 from barsight.result_folder import read_cloud, read_heights
 from barsight.viewer.cloud import SOURCE_RGB, colour_layer, seen_layer, surface_layer
 from barsight.viewer.view import line_segments, serving, view
-from result_folders import surface_m, write_folder
+from result_folders import bands, surface_m, write_folder, write_height
 
 
 @pytest.fixture(scope="module")
@@ -103,6 +103,15 @@ def test_mistakes_are_one_line(tmp_path: Path) -> None:
     cloud.unlink()
     with pytest.raises(InputError, match="no such file"):
         view(folder, 0, False)
+
+
+def test_a_map_without_heights_is_shown_by_its_cloud(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "out")
+    unknown = bands()
+    unknown[:2], unknown[2:] = np.nan, 0
+    write_height(folder / "height.tif", unknown)
+    with serving(folder, 0) as url:
+        assert get(url)[0] == 200
 
 
 def test_a_missing_extra_is_named(

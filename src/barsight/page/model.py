@@ -40,6 +40,8 @@ def survey_model(connection: Connection, map_id: str, by: str) -> bytes:
 def _packed(folder: Path, map_id: str, by: str) -> bytes:
     expect_map(folder, map_id)
     layer = surface_layer(read_heights(folder), MAX_POINTS)
+    if not layer.total:
+        raise AccessError(404, f"no height of map {map_id} is known")
     coloured, lines = colour_layer(layer, by), yard_lines(folder)
     head = {
         "points": len(layer.xyz_m), "total": layer.total, "caption": coloured.caption,

@@ -72,6 +72,7 @@ def serving(out_dir: Path, port: int, max_points: int = MAX_POINTS) -> Iterator[
         "surface": surface_layer(read_heights(out_dir), max_points),
         "everything seen": seen_layer(cloud),
     }
+    layers = {name: layer for name, layer in layers.items() if layer.total}  # a map may know no height
     _expect_free(port)
     with _quiet(), _own_pages_only():
         server = viser.ViserServer(host=HOST, port=port, label="barsight", verbose=False)
