@@ -216,6 +216,28 @@ def test_the_yard_by_mouse_and_on_paper(browser: object, address: str) -> None:
     assert sheet.errors == []
 
 
+def test_a_wall_and_a_glove(browser: object, address: str) -> None:
+    """A wall screen shows all larger and picks where it is clicked; a finger has 44 px for each aim."""
+    wall = browser.new_page(locale="en", viewport={"width": 3840, "height": 2160})
+    wall.goto(address)
+    wall.wait_for_selector("#side >> text=offered")
+    wait_for(lambda: wall.evaluate("barsightYard.width > 0"))
+    box, width = wall.locator("#yard").bounding_box(), wall.evaluate("barsightYard.width")
+    assert box["width"] > 1.5 * width and wall.evaluate("document.querySelector('#yard').width") > 1.5 * width
+    x, y = (box["width"] / width * each for each in wall.evaluate("barsightYard.place(0.3, 2.0)"))
+    wall.mouse.click(box["x"] + x, box["y"] + y)
+    wall.wait_for_selector("#side >> text=Ends in")
+    tablet = browser.new_page(
+        locale="de", viewport={"width": 1024, "height": 768}, has_touch=True, is_mobile=True
+    )
+    tablet.goto(f"{address}/#lifts")
+    tablet.wait_for_selector("#confirm-1")
+    aims = tablet.query_selector_all("button, nav a, select")
+    assert min(one.bounding_box()["height"] for one in aims) >= 44
+    wall.close()
+    tablet.close()
+
+
 PIXELS = """() => {
   const canvas = document.querySelector("canvas");
   const copy = document.createElement("canvas");

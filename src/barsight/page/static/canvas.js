@@ -1,9 +1,13 @@
 // The yard from above on a canvas: surveys' pictures faded by age, bundles, lifts, vetoes; pan, zoom, pick.
 import { shortWhy, isForbidden } from "./why.js";
-import { OPEN_LIFTS, t } from "./dom.js";
+import { OPEN_LIFTS, pixelRatio, pointOf, t } from "./dom.js";
 
 const SELECT = "#1d4f91";
 const INK = "#26292b";
+const CLAIMED = "#1d4f91a0";
+const OFFERED = "#f2f2f2a0";
+const NARROW_PX = 12; // an outline alone looks as a filled one
+const RANK_PX = 13;
 const PATH_ITEMS = 20;
 const AROUND = 0.25; // share of the view that is drawn beyond each of its edges while it is moved
 const WORDS_PX = 40; // room below the yard for the words of its lowest bundles
@@ -101,7 +105,7 @@ export class YardCanvas {
   }
 
   paint() {
-    const ratio = window.devicePixelRatio || 1;
+    const ratio = pixelRatio(this.canvas);
     this.width = this.canvas.clientWidth;
     this.height = this.canvas.clientHeight;
     if (this.canvas.width !== Math.round(this.width * ratio)) this.canvas.width = Math.round(this.width * ratio);
@@ -306,31 +310,42 @@ export class YardCanvas {
     return this.pattern;
   }
 
+  // Ranks where they find room, the safest first; a dot where they don't. An offer is hollow, a confirmed lift full.
   paintLifts(c) {
     const items = new Map(this.items.map((item) => [item.bundle.identity, item]));
-    for (const lift of this.data.lifts) {
+    const open = this.data.lifts.filter((lift) => OPEN_LIFTS.includes(lift.state) && items.has(lift.bundles[0]));
+    const ranked = (this.ranked = []);
+    c.strokeStyle = SELECT;
+    for (const lift of open.sort((a, b) => a.rank - b.rank)) {
       const item = items.get(lift.bundles[0]);
-      if (!item || !OPEN_LIFTS.includes(lift.state)) continue;
-      c.strokeStyle = SELECT;
-      c.lineWidth = 3.5;
+      const isOffered = lift.state === "offered";
+      const wide = item.bundle.width_m * this.view.scale;
+      c.lineWidth = Math.min(3.5, Math.max(1, wide / 5));
+      c.fillStyle = isOffered ? OFFERED : CLAIMED;
       c.beginPath(); this.path(c, item);
-      if (lift.state !== "offered") { c.fillStyle = "#1d4f9166"; c.fill(); }
+      if (!isOffered || wide < NARROW_PX) c.fill();
       c.stroke();
       const [px, py] = this.place(lift.target.x_m, lift.target.y_m);
-      c.fillStyle = lift.state !== "offered" ? SELECT : "#f2f2f2";
-      c.lineWidth = 2.5;
-      c.beginPath(); c.arc(px, py, 13, 0, 7); c.fill(); c.stroke();
-      c.fillStyle = lift.state !== "offered" ? "#fff" : "#16191b";
-      c.font = "bold 14px sans-serif";
-      c.textAlign = "center"; c.textBaseline = "middle";
-      c.fillText(String(lift.rank), px, py + 1);
+      const hasRoom = ranked.every((other) => Math.hypot(other.px - px, other.py - py) > 2 * RANK_PX + 2);
+      if (hasRoom) ranked.push({ px, py, isOffered, rank: lift.rank });
+      c.fillStyle = isOffered ? "#f2f2f2" : SELECT;
+      c.beginPath(); c.arc(px, py, 2.5, 0, 7); c.fill(); c.stroke();
+    }
+    c.lineWidth = 2.5;
+    c.font = "bold 14px sans-serif";
+    c.textAlign = "center"; c.textBaseline = "middle";
+    for (const { px, py, isOffered, rank } of ranked) {
+      c.fillStyle = isOffered ? "#f2f2f2" : SELECT;
+      c.beginPath(); c.arc(px, py, RANK_PX, 0, 7); c.fill(); c.stroke();
+      c.fillStyle = isOffered ? "#16191b" : "#fff";
+      c.fillText(String(rank), px, py + 1);
     }
   }
 
   // Names and words where they find room: over each bundle's lower end, first come.
   paintWords(c, seen) {
     if (this.view.scale < 9) return;
-    const taken = [];
+    const taken = this.ranked.map(({ px, py }) => [px - RANK_PX, py - RANK_PX, px + RANK_PX, py + RANK_PX]);
     c.textBaseline = "top";
     c.textAlign = "center";
     const clear = (box) => taken.every((o) => box[2] < o[0] || box[0] > o[2] || box[3] < o[1] || box[1] > o[3]);
@@ -355,7 +370,7 @@ export class YardCanvas {
         lines.slice(0, count).forEach((line, k) => c.fillText(line, px, box[1] + 16 * k + 1));
         break;
       }
-      if (taken.length > 400) break;
+      if (taken.length > 400 + this.ranked.length) break;
     }
   }
 
@@ -390,21 +405,27 @@ export class YardCanvas {
     this.onPick(under.length ? under[0].bundle.identity : null);
   }
 
+  // One finger or the mouse moves and picks, two fingers zoom about their middle.
   listen() {
-    let from = null;
+    const down = new Map();
     let moved = false;
-    this.canvas.addEventListener("pointerdown", (e) => { from = [e.offsetX, e.offsetY]; moved = false; this.canvas.setPointerCapture(e.pointerId); });
+    const spread = () => { const [[ax, ay], [bx, by]] = down.values(); return { apart: Math.hypot(ax - bx, ay - by), x: (ax + bx) / 2, y: (ay + by) / 2 }; };
+    this.canvas.addEventListener("pointerdown", (e) => { moved = down.size > 0; down.set(e.pointerId, pointOf(e)); this.canvas.setPointerCapture(e.pointerId); });
     this.canvas.addEventListener("pointermove", (e) => {
+      const from = down.get(e.pointerId);
       if (!from) return;
-      const [dx, dy] = [e.offsetX - from[0], e.offsetY - from[1]];
-      if (!moved && Math.hypot(dx, dy) < 4) return;
+      const to = pointOf(e);
+      const [dx, dy] = [to[0] - from[0], to[1] - from[1]];
+      if (!moved && Math.hypot(dx, dy) < (e.pointerType === "mouse" ? 4 : 10)) return;
       moved = true;
-      this.pan(dx, dy);
-      from = [e.offsetX, e.offsetY];
+      const before = down.size === 2 && spread();
+      down.set(e.pointerId, to);
+      if (before) { const { apart, x, y } = spread(); this.zoom(apart / Math.max(before.apart, 1), x, y); }
+      else if (down.size === 1) this.pan(dx, dy);
     });
-    this.canvas.addEventListener("pointerup", (e) => { if (from && !moved) this.pick(e.offsetX, e.offsetY); from = null; });
-    this.canvas.addEventListener("pointercancel", () => { from = null; });
-    this.canvas.addEventListener("wheel", (e) => { e.preventDefault(); this.zoom(Math.exp(-e.deltaY / 400), e.offsetX, e.offsetY); }, { passive: false });
+    this.canvas.addEventListener("pointerup", (e) => { if (down.delete(e.pointerId) && !moved) this.pick(...pointOf(e)); });
+    this.canvas.addEventListener("pointercancel", (e) => { down.delete(e.pointerId); });
+    this.canvas.addEventListener("wheel", (e) => { e.preventDefault(); this.zoom(Math.exp(-e.deltaY / 400), ...pointOf(e)); }, { passive: false });
     this.canvas.addEventListener("keydown", (e) => this.key(e));
   }
 

@@ -45,6 +45,16 @@ export function show(place, ...children) {
   if (focused) document.getElementById(focused)?.focus({ preventScroll: true });
 }
 
+// Pixels of the screen for each of a canvas's; a wall screen shows everything larger.
+export const pixelRatio = (canvas) => (window.devicePixelRatio || 1) * (canvas.currentCSSZoom || 1);
+
+// Where on a canvas a pointer is, in the canvas's pixels.
+export function pointOf(event) {
+  const canvas = event.currentTarget;
+  const box = canvas.getBoundingClientRect();
+  return [event.clientX - box.left, event.clientY - box.top].map((px) => (px * canvas.clientWidth) / box.width);
+}
+
 export const OPEN_LIFTS = ["offered", "claimed", "executing"];
 export const metres = (value, digits = 2) => (value === null || value === undefined ? "–" : `${value.toFixed(digits)} m`);
 export const figure = (value, sigma, factor, unit, digits = 0) => {

@@ -14,8 +14,7 @@ const place = document.getElementById("screen");
 let wasThere = true;
 let drawn = 0;
 let drawnAt = 0;
-const AGED_MS = 60000; // ages stand on these screens, which nothing else may draw anew for hours
-const AGING = ["yard", "bundle"];
+const AGED_MS = 60000; // ages stand on the screens with offers, which nothing else may draw anew for hours
 const OFFERING = ["yard", "bundle", "lifts"];
 
 const where = () => {
@@ -156,7 +155,7 @@ setInterval(async () => {
   if (!session.isKnown || !isThere()) return;
   await showAge();
   const name = where()[0];
-  if (name === "health" || (AGING.includes(name) && performance.now() - drawnAt > AGED_MS)) draw();
+  if (name === "health" || (OFFERING.includes(name) && performance.now() - drawnAt > AGED_MS)) draw();
 }, 5000);
 window.addEventListener("hashchange", () => draw().then(() => place.focus()));
 await loadWords();

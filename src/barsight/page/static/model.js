@@ -1,5 +1,5 @@
 // Screen: a survey's surface in 3D with bundles and offered lifts, drawn by WebGL.
-import { h, show, t, timeText, tell } from "./dom.js";
+import { h, pixelRatio, pointOf, show, t, timeText, tell } from "./dom.js";
 import { read } from "./api.js";
 
 const FIELD = (50 * Math.PI) / 180;
@@ -148,7 +148,7 @@ class Model {
 
   paint() {
     const { gl, canvas, program } = this;
-    const ratio = window.devicePixelRatio || 1;
+    const ratio = pixelRatio(canvas);
     const [width, height] = [Math.round(canvas.clientWidth * ratio), Math.round(canvas.clientHeight * ratio)];
     if (!width || !height) return;
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
@@ -197,11 +197,12 @@ class Model {
   listen() {
     const { canvas } = this;
     let from = null;
-    canvas.addEventListener("pointerdown", (e) => { from = [e.offsetX, e.offsetY]; canvas.setPointerCapture(e.pointerId); });
+    canvas.addEventListener("pointerdown", (e) => { from = pointOf(e); canvas.setPointerCapture(e.pointerId); });
     canvas.addEventListener("pointermove", (e) => {
       if (!from || !this.looks) return;
-      (e.shiftKey || e.buttons === 2 ? this.move : this.turn).call(this, e.offsetX - from[0], e.offsetY - from[1]);
-      from = [e.offsetX, e.offsetY];
+      const to = pointOf(e);
+      (e.shiftKey || e.buttons === 2 ? this.move : this.turn).call(this, to[0] - from[0], to[1] - from[1]);
+      from = to;
     });
     for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, () => { from = null; });
     canvas.addEventListener("contextmenu", (e) => e.preventDefault());

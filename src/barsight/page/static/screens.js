@@ -27,7 +27,7 @@ export async function bundleScreen(place, name) {
     h("div", { className: "two" },
       h("section", {}, h("h1", {}, name), bundle ? figures(bundle, clockNow(state)) : h("p", {}, t("bundle.gone")),
         h("h2", {}, t("stock.entry")), h("p", {}, bundle?.stock_name || t("stock.none"))),
-      h("div", {}, bundle && h("section", {}, h("h1", {}, lift ? t("lift") : t("why.not")), lift ? liftPanel(lift) : whyNot(bundle, state.map_vetoes)),
+      h("div", {}, bundle && h("section", {}, h("h1", {}, lift ? t("lift") : t("why.not")), lift ? liftPanel(lift, clockNow(state)) : whyNot(bundle, state.map_vetoes)),
         h("section", { id: "pictures" }, h("h1", {}, t("pictures")), pictures))),
     h("section", {}, h("h1", {}, t("history")), table([t("time"), t("what"), "#X m", "#Y m", `#${t("top")} m`, t("map")], [...told.history].reverse().map((one) => row([
       h("td", {}, timeText(one.at_ns)), h("td", {}, t(`change.${one.what}`), one.reason && h("div", { className: "quiet small" }, one.reason)), one.x_m?.toFixed(3) ?? "–", one.y_m?.toFixed(3) ?? "–", one.top_z_m?.toFixed(3) ?? "–",
@@ -42,7 +42,7 @@ export async function liftScreen(place) {
   const open = lifts.filter((one) => OPEN_LIFTS.includes(one.state)).sort((a, b) => a.rank - b.rank);
   const closed = lifts.filter((one) => !open.includes(one));
   show(place,
-    h("section", {}, h("h1", {}, t("lifts.open")), open.length ? h("div", { className: "lifts" }, open.map((one) => h("div", { className: "panel", id: `lift-${one.id}` }, h("h2", {}, `${one.rank} · ${one.bundles.join(", ")}`), liftPanel(one)))) : h("p", {}, t("lifts.none"))),
+    h("section", {}, h("h1", {}, t("lifts.open")), open.length ? h("div", { className: "lifts" }, open.map((one) => h("div", { className: "panel", id: `lift-${one.id}` }, h("h2", {}, `${one.rank} · ${one.bundles.join(", ")}`), liftPanel(one, clockNow(state))))) : h("p", {}, t("lifts.none"))),
     h("section", {}, h("h1", {}, t("lifts.closed")), table([t("lift"), t("bundle"), t("state"), t("time"), t("who"), t("note"), t("to.do")], closed.map((one) => {
       const step = one.steps[one.steps.length - 1];
       return row([h("td", {}, String(one.id)), h("td", {}, one.bundles.map((name) => h("a", { href: `#bundle/${name}` }, name))), h("td", {}, t(`lift.${one.state}`)), h("td", {}, timeText(step.at_ns)), h("td", {}, step.who), h("td", {}, step.note || ""), h("td", {}, liftButtons(one, clockNow(state)))]);

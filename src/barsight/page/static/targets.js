@@ -1,5 +1,5 @@
 // Screen: surveyed targets picked on a survey's photo, saved as the list that `barsight calibrate yard` takes.
-import { ask, h, row, show, t, table, tell, timeText } from "./dom.js";
+import { ask, h, pixelRatio, pointOf, row, show, t, table, tell, timeText } from "./dom.js";
 import { change, get, may, read } from "./api.js";
 import { YardCanvas } from "./canvas.js";
 
@@ -169,7 +169,7 @@ class PhotoCanvas extends YardCanvas {
     super(canvas, () => {});
     Object.assign(this, { loupe, onPlace, onNudge, targets: [], looked: null, isExact: false });
     canvas.addEventListener("pointerdown", (e) => { this.isExact = e.shiftKey; });
-    canvas.addEventListener("pointermove", (e) => { if (this.view) this.look(this.at(e.offsetX, e.offsetY)); });
+    canvas.addEventListener("pointermove", (e) => { if (this.view) this.look(this.at(...pointOf(e))); });
   }
 
   open(grid) {
@@ -260,7 +260,7 @@ class PhotoCanvas extends YardCanvas {
   drawLoupe() {
     if (!this.looked || !this.loupe.isConnected) return;
     const { view, width, height, loupe } = this;
-    const ratio = window.devicePixelRatio || 1;
+    const ratio = pixelRatio(loupe);
     Object.assign(loupe, { width: Math.round(loupe.clientWidth * ratio), height: Math.round(loupe.clientHeight * ratio) });
     const c = loupe.getContext("2d");
     c.setTransform(ratio, 0, 0, ratio, 0, 0);

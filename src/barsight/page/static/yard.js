@@ -82,7 +82,7 @@ function bundlePanel(bundle, { lifts, state }) {
   const lift = bundle.lift && lifts.find((one) => one.id === bundle.lift.id);
   return [
     h("h1", {}, `${bundle.identity}${bundle.stock_name ? ` · ${bundle.stock_name}` : ""}`),
-    lift && liftPanel(lift), figures(bundle, clockNow(state)),
+    lift && liftPanel(lift, clockNow(state)), figures(bundle, clockNow(state)),
     !bundle.lift && [h("h2", {}, t("why.not")), whyNot(bundle, state.map_vetoes)],
     h("p", {}, h("a", { href: `#bundle/${bundle.identity}`, id: "to-bundle" }, t("bundle.more"))),
   ];
@@ -109,7 +109,8 @@ const at = (place) => `X ${place.x_m.toFixed(2)}  Y ${place.y_m.toFixed(2)}  Z $
 // What the crane's own display must say there, where that differs: the magnet hangs off its readings, or the load off the magnet's middle.
 const readings = (word, place, crane) => crane && at(crane) !== at(place) && [t(word), at(crane)];
 
-export function liftPanel(lift) {
+// clock_ns: the yard's.
+export function liftPanel(lift, clock_ns) {
   const pull = lift.pull_low_n === null ? t("unknown") : `${(lift.pull_low_n / 1000).toFixed(0)} / ${(lift.pull_needed_n / 1000).toFixed(0)} kN`;
   const to = lift.set_down;
   return [
@@ -117,9 +118,9 @@ export function liftPanel(lift) {
       ["expired", "failed"].includes(lift.state) && h("li", { className: "at" }, t(`lift.${lift.state}`))),
     h("dl", {}, [
       [t("lift.target"), at(lift.target)], readings("lift.readings", lift.target, lift.crane_target),
-      [t("lift.takes"), t("lift.sure", lift.count, (100 * lift.count_probability).toFixed(2))],
+      [t("lift.takes"), t("lift.sure", lift.count, Math.min(100 * lift.count_probability, 99.99).toFixed(2))],
       [t("mass"), figure(lift.mass_kg, lift.mass_sigma_kg, 1, "kg")], [t("lift.pull"), pull],
-      [t("lift.setdown"), to ? at(to) : "–"], to && readings("lift.setdown.readings", to, lift.crane_set_down), [t("map"), lift.map_id],
+      [t("lift.setdown"), to ? at(to) : "–"], to && readings("lift.setdown.readings", to, lift.crane_set_down), lift.state !== "executing" && lift.valid_until_ns !== null && [t("lift.until"), ageText(lift.valid_until_ns - clock_ns)], [t("map"), lift.map_id],
     ].filter(Boolean).map(([name, value]) => [h("dt", {}, name), h("dd", {}, value)])),
     liftButtons(lift),
   ];
