@@ -66,6 +66,16 @@ def test_odd_things_are_noted(tmp_path: Path) -> None:
     assert "crane0 does not span the pictures: 0.00 s missing at the start, 0.20 s at the end" in notes
 
 
+def test_pictures_that_are_not_there_are_noted(tmp_path: Path) -> None:
+    write_euroc(tmp_path, 8)
+    before = describe_recording(open_recording(tmp_path)).notes
+    lost = sorted((tmp_path / "mav0" / "cam1" / "data").iterdir())[5]
+    lost.unlink()
+    note, *others = describe_recording(open_recording(tmp_path)).notes
+    assert tuple(others) == before
+    assert "refused: 1, first" in note and note.endswith(f"cam1/data/{lost.name}")
+
+
 def test_a_crane_in_millimetres_is_noted(tmp_path: Path) -> None:
     write_euroc(tmp_path)
     rows = [f"{stamp},35000.0,120.0,8500.0" for stamp in stamps(3)]

@@ -14,6 +14,7 @@ from barsight.core.arrays import Int64
 from barsight.core.records.pairs import RefusedFrame
 from barsight.core.records.sensor_samples import CraneSamples, LaserProfile
 from barsight.core.stamps import NS_PER_S
+from barsight.recording.formats.image_folders import PictureFiles
 from barsight.recording.plausibility import clock_faults, doubts
 from barsight.recording.stored_images import StoredPictures
 
@@ -104,7 +105,13 @@ def describe_recording(recording: StoredPictures) -> RecordingInfo:
         streams.append(stream_info("crane0", crane.stamp_ns))
     first = next(iter(recording.frames()), None)
     messages = (doubt.message for doubt in doubts(recording))
-    notes = (*recording.notes, *clock_faults(recording), *messages, *_time_notes(streams))
+    notes = (
+        *_absent(recording),
+        *recording.notes,
+        *clock_faults(recording),
+        *messages,
+        *_time_notes(streams),
+    )
     return RecordingInfo(
         path=recording.path,
         format=recording.format,
@@ -116,8 +123,15 @@ def describe_recording(recording: StoredPictures) -> RecordingInfo:
         calibration=_calibration(recording.rig),
         crane=_crane(crane) if crane is not None else None,
         laser=_laser(laser),
-        notes=tuple(dict.fromkeys(notes)),
+        notes=tuple(dict.fromkeys((*notes, *_time_notes(streams)))),
     )
+
+
+def _absent(recording: StoredPictures) -> tuple[str, ...]:
+    absent = recording.absent() if isinstance(recording, PictureFiles) else ()
+    if not absent:
+        return ()
+    return (f"pictures that are not there, their pairs are refused: {len(absent)}, first {absent[0]}",)
 
 
 def stream_info(name: str, stamp_ns: Int64) -> StreamInfo:

@@ -33,6 +33,12 @@ class PictureFiles(PairedAtOpening):
             if wanted is None or stamp in wanted:
                 yield self._read_pair(stamp, self._left[left], self._right[right])
 
+    def absent(self) -> tuple[Path, ...]:
+        """List the named pictures that are not there, relative to the root; their pairs will be refused."""
+        return tuple(
+            path.relative_to(self._root) for path in (*self._left, *self._right) if not path.is_file()
+        )
+
     def stored_images(self) -> Iterator[StoredImage]:
         """Yield the stored bytes of every readable picture, both cameras in time order."""
         for camera, stamp, path in merge_cameras(self._pairs, self._left, self._right):
