@@ -55,7 +55,13 @@ def test_ablation_leaves_out_one_part_at_a_time(
 def test_mistakes_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["bench", "everything"]) == 2
     assert capsys.readouterr().err.count("\n") == 1
-    for flags in (["stereo-speed", "--repeats", "0"], ["length", str(tmp_path), "--times", "1"]):
+    for flags in (
+        ["stereo-speed", "--repeats", "0"], ["length", str(tmp_path), "--times", "1"],
+        ["stereo", str(tmp_path), "--repeats", "0"], ["front-end", str(tmp_path), "--repeats", "0"],
+        ["subpixel", "--scenes", "0"], ["target-size", "--poses", "0"],
+        ["ablation", str(tmp_path), "--scenes", "0"],
+        ["features", str(tmp_path), "--count", "0"], ["matching", str(tmp_path), "--count", "0"],
+    ):  # fmt: skip
         assert run(["bench", *flags]) == 2
         assert capsys.readouterr().err.count("\n") == 1
     assert run(["bench", "stereo", str(tmp_path)]) == 3

@@ -23,6 +23,7 @@ from barsight.cli.bench.length import bench_length
 from barsight.cli.bench.lifts import bench_lift_targets
 from barsight.cli.bench.live import bench_live_estimate, bench_step
 from barsight.cli.bench.renderers import bench_renderers
+from barsight.cli.bench.seeds import expect_counts
 from barsight.cli.bench.worlds import bench_worlds
 from barsight.cli.bench.yard import bench_yard
 from barsight.cli.safe_console import SafeConsole
@@ -81,6 +82,7 @@ def _stereo(
         repeats: Runs per method and scene; times are given as medians and ranges.
         save: JSON file for all figures, with commit and machine.
     """
+    expect_counts(repeats=repeats)
     bench = bench_stereo(data, _made(methods), repeats)
     console = SafeConsole()
     console.print(scene_table(bench))
@@ -107,8 +109,7 @@ def _stereo_speed(
         repeats: Number of rounds; every method runs once in each round.
         save: JSON file for all figures, with commit and machine.
     """
-    if repeats < 1:
-        raise ConfigError(f"--repeats {repeats}: one round at least")
+    expect_counts(repeats=repeats)
     made = _made(methods)
     if "barsight" in methods:
         for name, settings in {
@@ -142,6 +143,7 @@ def _ablation(data: tyro.conf.Positional[Path], scenes: int = 2, save: Json = No
         scenes: Number of rendered scenes of each kind.
         save: JSON file for all figures of the folder of scenes, with commit and machine.
     """
+    expect_counts(scenes=scenes)
     variants = without_one_part()
     bench = bench_stereo(data, variants, repeats=1)
     console = SafeConsole()
@@ -162,6 +164,7 @@ def _subpixel(
         scenes: Number of rendered scenes of each kind.
         save: JSON file for all figures, with commit and machine.
     """
+    expect_counts(scenes=scenes)
     bench = bench_subpixel(_made(methods), data, scenes)
     SafeConsole().print(subpixel_table(bench))
     if save is not None:
@@ -176,6 +179,7 @@ def _target_size(methods: tuple[MethodName, ...] = METHODS, poses: int = 10, sav
         poses: Number of poses at each range.
         save: JSON file for all figures, with commit and machine.
     """
+    expect_counts(poses=poses)
     bench = bench_target_size(_made(methods), poses)
     SafeConsole().print(target_size_table(bench))
     if save is not None:

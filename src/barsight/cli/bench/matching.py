@@ -11,6 +11,7 @@ import tyro
 
 from barsight.benchmarks.motion.frontend_speed import bench_front_end, front_end_table
 from barsight.benchmarks.motion.matching import bench_features, bench_matching, feature_table, match_table
+from barsight.cli.bench.seeds import expect_counts
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.json_values import write_json
 from barsight.features.detectors import DETECTORS, DetectorName
@@ -34,6 +35,7 @@ def features(
         repeats: Runs per detector; times are given as medians and ranges.
         save: JSON file for all figures, with commit and machine.
     """
+    expect_counts(count=count, repeats=repeats)
     bench = bench_features(recordings, detectors, count, repeats)
     SafeConsole().print(feature_table(bench))
     if save is not None:
@@ -54,6 +56,7 @@ def matching(
         count: Number of features requested.
         save: JSON file for all figures, with commit and machine.
     """
+    expect_counts(count=count)
     bench = bench_matching(recordings, detectors, count)
     SafeConsole().print(match_table(bench))
     if save is not None:
@@ -70,6 +73,7 @@ def front_end(
         repeats: Runs after a first one that compiles; times are given as medians and ranges.
         save: JSON file for all figures, with commit and machine.
     """
+    expect_counts(repeats=repeats)
     bench = bench_front_end(recordings, repeats)
     SafeConsole().print(front_end_table(bench))
     if save is not None:

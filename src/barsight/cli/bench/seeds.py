@@ -1,4 +1,4 @@
-"""Parse the seeds of a benchmark and run it over them, on this machine or on the workers of a Dask
+"""Check the counts and seeds of a benchmark, and run it over them, on this machine or on the workers of a Dask
 cluster.
 """
 
@@ -15,6 +15,13 @@ from barsight.core.extras import extra
 T = TypeVar("T")
 TRIES = 3
 """Number of times that a seed is given to workers before it is abandoned."""
+
+
+def expect_counts(**counts: int) -> None:
+    """Raise ConfigError for a count below 1, by its flag."""
+    for name, count in counts.items():
+        if count < 1:
+            raise ConfigError(f"--{name} {count}: must be 1 or more")
 
 
 def parse_seeds(seeds: str, bench: str) -> range:
