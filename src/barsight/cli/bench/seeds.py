@@ -1,5 +1,5 @@
-"""Check the counts and seeds of a benchmark, and run it over them, on this machine or on the workers of a Dask
-cluster.
+"""Check the counts and seeds of a benchmark, and run it over them, on this machine or on the workers of a
+Dask cluster.
 """
 
 from __future__ import annotations
