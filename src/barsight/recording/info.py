@@ -14,9 +14,8 @@ from barsight.core.arrays import Int64
 from barsight.core.records.pairs import RefusedFrame
 from barsight.core.records.sensor_samples import CraneSamples, LaserProfile
 from barsight.core.stamps import NS_PER_S
-from barsight.recording.formats.image_folders import PictureFiles
 from barsight.recording.plausibility import clock_faults, doubts
-from barsight.recording.stored_images import StoredPictures
+from barsight.recording.stored_images import NamedPictures, StoredPictures
 
 GAP_FACTOR = 1.5
 
@@ -128,7 +127,7 @@ def describe_recording(recording: StoredPictures) -> RecordingInfo:
 
 
 def _absent(recording: StoredPictures) -> tuple[str, ...]:
-    absent = recording.absent() if isinstance(recording, PictureFiles) else ()
+    absent = recording.absent() if isinstance(recording, NamedPictures) else ()
     if not absent:
         return ()
     return (f"pictures that are not there, their pairs are refused: {len(absent)}, first {absent[0]}",)

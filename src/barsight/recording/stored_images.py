@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from pathlib import Path
+from typing import Protocol, TypeVar, runtime_checkable
 
 from barsight.recording.base import Recording
 from barsight.recording.pairing import PairedStamps
@@ -32,6 +33,15 @@ class StoredPictures(Recording, Protocol):
 
     def stored_images(self) -> Iterator[StoredImage]:
         """Yield every picture's bytes as stored, both cameras in time order."""
+        ...
+
+
+@runtime_checkable
+class NamedPictures(Protocol):
+    """Protocol of a recording whose pictures are files that a list names."""
+
+    def absent(self) -> tuple[Path, ...]:
+        """List the named pictures that are not there, relative to the root; their pairs will be refused."""
         ...
 
 

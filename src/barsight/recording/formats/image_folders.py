@@ -34,7 +34,7 @@ class PictureFiles(PairedAtOpening):
                 yield self._read_pair(stamp, self._left[left], self._right[right])
 
     def absent(self) -> tuple[Path, ...]:
-        """List the named pictures that are not there, relative to the root; their pairs will be refused."""
+        """List the pictures that are not there; see `NamedPictures.absent`."""
         return tuple(
             path.relative_to(self._root) for path in (*self._left, *self._right) if not path.is_file()
         )
