@@ -25,15 +25,7 @@ from barsight.store.history import (
     next_sightings,
 )  # fmt: skip
 from barsight.store.lift_records import add_lifts, settle_lifts
-from barsight.store.matching import (
-    Finding,
-    FoundBundle,
-    KnownBundle,
-    has_moved,
-    look_at,
-    match_by_place,
-    match_carried,
-)  # fmt: skip
+from barsight.store.matching import FoundBundle, KnownBundle, match_by_place, match_carried
 from barsight.store.opening import Store
 from barsight.store.recordings import FoundRecording, note_recordings, recordings_of
 from barsight.store.tables import ABSENCES, BUNDLES, SIGHTINGS, SURVEY_VETOES, SURVEYS
@@ -41,7 +33,9 @@ from barsight.store.touches import end_disturbed
 from barsight.yard.events import kept_events
 from barsight.yard.identity import MapIdentity, expect_same_frame
 from barsight.yard.inventory.bundle_file import bundle_of, bundles_content, read_match
+from barsight.yard.inventory.changes import Finding, look_at
 from barsight.yard.inventory.coarse_map import pack, unpack
+from barsight.yard.inventory.matching import moved_bundles
 from barsight.yard.lifting import lift_file
 from barsight.yard.lifting.lift_file import read_lifts, unknown_events
 from barsight.yard.lifting.validity import is_ahead
@@ -125,10 +119,10 @@ def add_survey(
         laid = [j for j, finding in shown.items() if j not in partner and finding != "covered"]
         carried = match_carried(known, read.found, matched, laid)
         partner |= {j: i for i, j in carried.items()}
-        findings = {
-            j: "moved" if j in carried.values() else _change(before.get(j), one.bundle, shown.get(j))
-            for j, one in enumerate(read.found)
-        }
+        moved = moved_bundles(list(before.values()), [read.found[j].bundle for j in before])
+        findings = {j: "added" if finding == "gone" else "found" for j, finding in shown.items()}
+        findings |= {j: "moved" if is_moved else "same" for j, is_moved in zip(before, moved, strict=True)}
+        findings |= dict.fromkeys(carried.values(), "moved")
         survey_id = _add_row(opened, read, heights)
         changes: dict[int, str] = {}
         ids: dict[int, int] = {}
@@ -280,13 +274,6 @@ def _known(
         if seen is not None:
             last[number] = seen.bundle
     return tuple(known), last
-
-
-def _change(before: Bundle | None, found: Bundle, shown: Finding | None) -> str:
-    """Classify a bundle's change, or the origin of a new one. shown: the earlier finding at its place."""
-    if before is not None:
-        return "moved" if has_moved(before, found) else "same"
-    return "added" if shown == "gone" else "found"
 
 
 def _note_equipment(

@@ -16,12 +16,12 @@ import numpy as np
 from barsight.core.errors import ConfigError
 from barsight.core.extras import extra
 from barsight.core.stamps import NS_PER_S
-from barsight.store.matching import has_moved
 from barsight.store.promotion import counts
 from barsight.store.states import newest_steps
 from barsight.store.tables import ABSENCES, LIFT_BUNDLES, LIFT_STATES, LIFTS, SIGHTINGS, SURVEYS
 from barsight.yard.axes import turn_between
 from barsight.yard.inventory.bundle_file import bundle_of
+from barsight.yard.inventory.matching import moved_bundles
 from barsight.yard.types import Bundle
 
 with extra("store"):
@@ -184,12 +184,14 @@ def yard_changes(connection: Connection, before_ns: int, after_ns: int) -> list[
     """List the changes between two times: `came`, `went`, `moved`; unchanged bundles are left out."""
     before = {one.sighting.bundle_id: one.sighting for one in present_yard(connection, before_ns)}
     after = {one.sighting.bundle_id: one.sighting for one in present_yard(connection, after_ns)}
+    both = sorted(before.keys() & after.keys())
+    moved = moved_bundles([before[n].bundle for n in both], [after[n].bundle for n in both])
     changes = []
-    for number in sorted({*before, *after}):
+    for number in sorted(
+        {*before, *after} - {n for n, is_moved in zip(both, moved, strict=True) if not is_moved}
+    ):
         old, new = before.get(number), after.get(number)
         kind = "went" if new is None else "came" if old is None else "moved"
-        if old is not None and new is not None and not has_moved(old.bundle, new.bundle):
-            continue
         changes.append(
             {
                 "identity": identity_name(number), "what": kind,

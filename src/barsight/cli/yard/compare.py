@@ -19,7 +19,7 @@ from barsight.core.json_values import write_json
 from barsight.result_folder import open_folder, read_heights
 from barsight.yard.identity import expect_same_frame
 from barsight.yard.inventory.bundle_file import read_bundles
-from barsight.yard.inventory.changes import Change, compare_yards
+from barsight.yard.inventory.changes import YardChanges, compare_yards
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -52,23 +52,24 @@ def run(arguments: Sequence[str]) -> None:
                 )
         if not same_yard:
             expect_same_frame(new, frames[1], frames[0], str(old))
-        changes = compare_yards(
+        compared = compare_yards(
             read_bundles(old / "bundles.json"), read_heights(old),
             read_bundles(new / "bundles.json"), read_heights(new),
         )  # fmt: skip
         if json is not None:
-            _write(changes, json)
-        _print(changes, SafeConsole())
+            _write(compared, json)
+        _print(compared, SafeConsole())
 
     call(command, "compare", arguments)
 
 
-def _write(changes: tuple[Change, ...], target: Path) -> None:
-    rows = [asdict(change) | {"significant": change.significant} for change in changes]
-    write_json(target, {"changes": rows})
+def _write(compared: YardChanges, target: Path) -> None:
+    rows = [asdict(change) | {"significant": change.significant} for change in compared.changes]
+    write_json(target, {"changes": rows, "shift_mm": 1e3 * compared.shift_m})
 
 
-def _print(changes: tuple[Change, ...], console: Console) -> None:
+def _print(compared: YardChanges, console: Console) -> None:
+    changes = compared.changes
     shown = [change for change in changes if change.kind != "same"]
     if shown:
         table = Table(box=SIMPLE_HEAD, title="Changes")
@@ -82,6 +83,9 @@ def _print(changes: tuple[Change, ...], console: Console) -> None:
                 _figure(change.yaw_deg, yaw, 2), _figure(change.kg, change.sigma_kg, 0),
             )  # fmt: skip
         console.print(table)
+    x, y, z = 1e3 * compared.shift_m
+    shift = f"shift of the whole yard, taken out of all: {x:+.0f}, {y:+.0f}, {z:+.0f} mm in x, y, z"
+    console.print(shift, highlight=False)
     same = len(changes) - len(shown)
     console.print(f"unchanged: {same} of {len(changes)} bundles", highlight=False)
 

@@ -16,13 +16,14 @@ from barsight.core.reading.sealed_json import SEAL
 from barsight.fleet.ledger import REMEDY, result_note
 from barsight.fleet.objects import Objects
 from barsight.fleet.versions import FleetTask, places
+from barsight.yard.inventory.bundle_file import bundle_of
+from barsight.yard.inventory.matching import Places, match_bundles
+from barsight.yard.types import Bundle
 
 FIGURES = ("x_m", "y_m", "top_z_m", "yaw_deg", "length_m", "width_m")
 """Quantities of a bundle that are compared."""
 _UNREAD = (KeyError, TypeError, ValueError, AttributeError, OverflowError)
 """Exceptions that a damaged document raises."""
-MAX_APART_M = 0.5
-"""Largest distance in metres between two bundles that count as the same one."""
 
 
 @dataclass(frozen=True)
@@ -99,8 +100,11 @@ def compare_recording(results: Objects, name: str, before: str, after: str) -> R
     if len(notes) < len(found):
         return None
     folders = [f"files/{note['key']}/{note['token']}" for note in notes]
-    bundles = [_bundles(results, folder) for folder in folders]
-    pairs = _partners(*bundles)
+    read = [_bundles(results, folder) for folder in folders]
+    bundles = [{bundle.id: figures for bundle, figures in one} for one in read]
+    old, new = (Places.of([bundle for bundle, _ in one]) for one in read)
+    matched = match_bundles(old, new, sizes_agree=False)
+    pairs = {read[0][i][0].id: read[1][j][0].id for i, j in matched.items()}
     changes = tuple(
         _change(name, i, figure, bundles[0][i], bundles[1][j]) for i, j in pairs.items() for figure in FIGURES
     )
@@ -118,11 +122,11 @@ def compare_recording(results: Objects, name: str, before: str, after: str) -> R
     )  # fmt: skip
 
 
-def _bundles(results: Objects, folder: str) -> dict[int, dict[str, float]]:
-    """Read a result's bundles: each quantity, and its sigma as `figure sigma`."""
+def _bundles(results: Objects, folder: str) -> list[tuple[Bundle, dict[str, float]]]:
+    """Read a result's bundles, each with its quantities, and the sigma of each as `figure sigma`."""
     content = _document(results, f"{folder}/bundles.json")
     try:
-        return {int(one["id"]): _figures(one) for one in content["bundles"]}
+        return [(bundle_of(one), _figures(one)) for one in content["bundles"]]
     except _UNREAD as error:
         raise _torn(results, f"{folder}/bundles.json", error) from error
 
@@ -161,20 +165,6 @@ def _document(results: Objects, path: str) -> dict[str, Any]:
 
 def _torn(results: Objects, path: str, error: Exception) -> InputError:
     return InputError(f"{results.url}/{path}", f"is damaged ({type(error).__name__}: {error})", REMEDY)
-
-
-def _partners(before: dict[int, dict[str, float]], after: dict[int, dict[str, float]]) -> dict[int, int]:
-    """Pair the bundles of two results, the nearest first, by centre and top."""
-    apart = sorted(
-        (math.dist(*([one[name] for name in FIGURES[:3]] for one in (a, b))), i, j)
-        for i, a in before.items()
-        for j, b in after.items()
-    )
-    pairs: dict[int, int] = {}
-    for distance, i, j in apart:
-        if distance <= MAX_APART_M and i not in pairs and j not in pairs.values():
-            pairs[i] = j
-    return pairs
 
 
 def _change(

@@ -7,32 +7,37 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
-from barsight.core.arrays import Float64
-from barsight.yard.axes import turn_between
+from barsight.core.arrays import Bool, Float64
+from barsight.yard.inventory.matching import (
+    MOVE_SIGMAS,
+    SAME_PLACE_SIGMAS,
+    Places,
+    common_shift,
+    displace,
+    find_candidates,
+    match_candidates,
+)
 from barsight.yard.map_lookup import lookup_heights
 from barsight.yard.sections import part_about
-from barsight.yard.types import UNKNOWN_SIGMA_M, UNKNOWN_SIGMA_RAD, Bundle, YardMap
+from barsight.yard.types import Bundle, YardMap
 from barsight.yard.weight import Mass, bundle_mass
 
-Kind = Literal["same", "moved", "settled", "taken", "added", "not-seen"]
-MAX_MOVE_M, SAME_WIDTH_RATIO = 0.5, 0.15
-"""Maximum distance (m) between an old and a new bundle that may be one, and of their widths, as a share."""
-SIGNIFICANT = 2.576
-"""Number of sigmas that chance exceeds in one case out of a hundred."""
+Finding = Literal["gone", "covered", "not-found", "unseen"]
+Kind = Literal["same", "moved", "settled", "taken", "added", "covered", "not-found", "not-seen"]
+MAX_MOVE_M = 0.5
+"""Maximum distance (m) across or along by which a bundle may have moved and still be the same."""
 MIN_KNOWN = 0.5
 """Minimum share of a bundle's place that a map must have seen to tell that the bundle isn't there."""
-_NO_PAIR = 1e6
 
 
 @dataclass(frozen=True)
 class Change:
     """The change of one bundle. old, new: its ids, None where it isn't present.
 
-    across_mm, along_mm, up_mm, yaw_deg: new minus old, in the old bundle's axes; sigmas: of these four, from
-    both measurements. z: the largest ratio of across, up and yaw to its sigma (also of along where both ends
-    were seen). kg, sigma_kg: mass that was taken (negative) or added; NaN where unknown.
+    across_mm, along_mm, up_mm, yaw_deg: new minus old beyond the shift of the whole yard, in the old bundle's
+    axes; sigmas: of these four, from both measurements. z: the largest ratio of these to their sigmas. kg,
+    sigma_kg: mass that was taken (negative) or added; NaN where unknown.
     """
 
     kind: Kind
@@ -50,110 +55,68 @@ class Change:
     @property
     def significant(self) -> bool:
         """Check whether chance alone causes such a change in less than one case out of a hundred."""
-        return self.kind in ("taken", "added") or self.z > SIGNIFICANT
+        return self.kind in ("taken", "added") or self.z > MOVE_SIGMAS
+
+
+@dataclass(frozen=True, eq=False)
+class YardChanges:
+    """The changes of the bundles: in the old ones' order, then the others. shift_m: (3,) by which the new
+    yard as a whole lies off the old one, as an error of its frame does.
+    """
+
+    changes: tuple[Change, ...]
+    shift_m: Float64
 
 
 def compare_yards(
     old: tuple[Bundle, ...], old_heights: YardMap, new: tuple[Bundle, ...], new_heights: YardMap
-) -> tuple[Change, ...]:
-    """Match the bundles of two maps of one yard and list the changes: in the old ones' order, then the added.
+) -> YardChanges:
+    """Match the bundles of two maps of one yard and list the changes.
 
-    A bundle that is gone is `taken` only where the new map saw its place, and a new one `added` only where
-    the old map did; otherwise it is `not-seen`.
+    A bundle is `taken` only where the new map shows its place empty or another one there, and `added` only
+    where the old map does. Otherwise, the other map has not seen its place (`not-seen`), shows something
+    higher there (`covered`), or something as high, without such a bundle (`not-found`).
     """
-    pairs = _match(old, new)
+    before, after = Places.of(old), Places.of(new)
+    found = find_candidates(before, after, MAX_MOVE_M)
+    pairs = match_candidates(found)
+    kept, partners = before.take(list(pairs)), after.take(list(pairs.values()))
+    shift_m = common_shift(kept, partners)
+    moves = displace(kept, partners, shift_m)
+    changed = {
+        i: _change(old[i], new[j], *figures)
+        for (i, j), *figures in zip(pairs.items(), moves.values, moves.sigmas, moves.ratios, strict=True)
+    }
+    replaced = found.in_place & ~found.agree
+    gone, came = set(found.before[replaced].tolist()), set(found.after[replaced].tolist())
+    told: dict[Finding, Kind] = {"unseen": "not-seen", "covered": "covered", "not-found": "not-found"}
     changes = []
-    for k, before in enumerate(old):
-        if k in pairs:
-            changes.append(_change(before, new[pairs[k]]))
-        else:
-            seen = _seen(before, new_heights)
-            changes.append(_alone("taken" if seen else "not-seen", before.id, None, bundle_mass(before), -1))
+    for i, one in enumerate(old):
+        if i not in pairs:
+            kind = "taken" if i in gone else told.get(look_at(one, new_heights), "taken")
+            changed[i] = _alone(kind, one.id, None, bundle_mass(one), -1)
+        changes.append(changed[i])
     matched = set(pairs.values())
-    for k, after in enumerate(new):
-        if k not in matched:
-            seen = _seen(after, old_heights)
-            changes.append(_alone("added" if seen else "not-seen", None, after.id, bundle_mass(after), 1))
-    return tuple(changes)
+    for j, one in enumerate(new):
+        if j not in matched:
+            kind = "added" if j in came else told.get(look_at(one, old_heights), "added")
+            changes.append(_alone(kind, None, one.id, bundle_mass(one), 1))
+    return YardChanges(tuple(changes), shift_m)
 
 
-def _match(old: tuple[Bundle, ...], new: tuple[Bundle, ...]) -> dict[int, int]:
-    """Match indices in `new` to those in `old`: smallest total distance, none longer than MAX_MOVE_M."""
-    if not old or not new:
-        return {}
-    cost = np.full((len(old), len(new)), _NO_PAIR)
-    for i, before in enumerate(old):
-        for j, after in enumerate(new):
-            across, along, up, _ = displacement(before, after)
-            same = abs(after.width_m - before.width_m) < SAME_WIDTH_RATIO * before.width_m
-            open_end = any(before.ends_open) or any(after.ends_open)
-            way = math.hypot(across, 0.0 if open_end else along, 2 * up)
-            if same and way < MAX_MOVE_M and abs(along) < before.length_m / 2:
-                cost[i, j] = way
-    rows, columns = linear_sum_assignment(cost)
-    return {int(i): int(j) for i, j in zip(rows, columns, strict=True) if cost[i, j] < _NO_PAIR}
-
-
-def displacement(before: Bundle, after: Bundle) -> tuple[float, float, float, float]:
-    """Compute the displacement across, along, up (at the top; m) and in yaw (rad), in the
-    old bundle's axes.
-    """
-    across, along = (before.axes @ (after.centre_m - before.centre_m)[:2]).tolist()
-    turned = turn_between(before.yaw_rad, after.yaw_rad)
-    return across + along * math.tan(turned) / 2, along, after.top_z_m - before.top_z_m, turned
-
-
-def displacement_along(before: Bundle, after: Bundle) -> tuple[float, float]:
-    """Compute the displacement along the old bundle's axis and its sigma (m): that of the middle where all
-    ends were seen, otherwise that of an end that was seen both times; 0 where there is none.
-    """
-    along = displacement(before, after)[1]
-    if not (any(before.ends_open) or any(after.ends_open)):
-        return along, math.hypot(before.sigma.along_m, after.sigma.along_m)
-    # Along X, a small turn swaps which end is the low one.
-    swapped = math.cos(after.yaw_rad - before.yaw_rad) < 0
-    for end, then in ((0, int(swapped)), (1, int(not swapped))):
-        if not (before.ends_open[end] or after.ends_open[then]):
-            away = after.ends_m[then, :2] - before.ends_m[end, :2]
-            return float(before.axes[1] @ away), math.hypot(_end_sigma(before, end), _end_sigma(after, then))
-    return 0.0, 0.0
-
-
-def _end_sigma(bundle: Bundle, end: int) -> float:
-    own = bundle.ends_sigma_m[end]
-    if math.isfinite(own):
-        return own
-    parts = (bundle.sigma.along_m, bundle.sigma.length_m / 2)
-    return math.hypot(*(part for part in parts if math.isfinite(part)))
-
-
-def _change(before: Bundle, after: Bundle) -> Change:
-    across, _, up, turned = displacement(before, after)
-    along, sigma_along = displacement_along(before, after)
-    a, b = before.sigma, after.sigma
-    sigmas = (
-        math.hypot(a.lateral_m, b.lateral_m), sigma_along,
-        math.hypot(a.top_z_m, b.top_z_m), math.hypot(a.yaw_rad, b.yaw_rad),
-    )  # fmt: skip
-    turn = _ratio(turned, sigmas[3], UNKNOWN_SIGMA_RAD)
-    ratios = (_ratio(across, sigmas[0]), _ratio(along, sigmas[1]), turn)
-    lifted = _ratio(up, sigmas[2])
+def _change(before: Bundle, after: Bundle, values: Float64, sigmas: Float64, ratios: Float64) -> Change:
+    """Describe a matched bundle's displacement across, along and up and in yaw, (4,) each."""
+    across, along, lifted, turn = ratios.tolist()
     kind: Kind = "same"
-    if max(ratios) > SIGNIFICANT or (lifted > SIGNIFICANT and up > 0):
+    if max(across, along, turn) > MOVE_SIGMAS or (lifted > MOVE_SIGMAS and values[2] > 0):
         kind = "moved"
-    elif lifted > SIGNIFICANT:
+    elif lifted > MOVE_SIGMAS:
         kind = "settled"
-    millimetres = (1e3 * sigmas[0], 1e3 * sigmas[1], 1e3 * sigmas[2], math.degrees(sigmas[3]))
-    return Change(
-        kind, before.id, after.id, 1e3 * across, 1e3 * along, 1e3 * up, math.degrees(turned), millimetres,
-        max(*ratios, lifted), 0.0, 0.0,
-    )  # fmt: skip
-
-
-def _ratio(value: float, sigma: float, unknown: float = UNKNOWN_SIGMA_M) -> float:
-    """Compute the ratio of a value to its sigma; an unknown sigma counts as `unknown`."""
-    sigma = unknown if math.isnan(sigma) else sigma
-    return abs(value) / sigma if sigma > 0 else 0.0
+    units = np.array([1e3, 1e3, 1e3, math.degrees(1)])
+    across_mm, along_mm, up_mm, yaw_deg = (units * values).tolist()
+    a, b, c, d = (units * sigmas).tolist()
+    z = float(ratios.max())
+    return Change(kind, before.id, after.id, across_mm, along_mm, up_mm, yaw_deg, (a, b, c, d), z, 0.0, 0.0)
 
 
 def _alone(kind: Kind, old: int | None, new: int | None, mass: Mass, sign: int) -> Change:
@@ -174,3 +137,20 @@ def heights_over(bundle: Bundle, heights: YardMap) -> Float64:
     across, along = bundle.axes
     x, y = (bundle.centre_m[k] + uu * across[k] + vv * along[k] for k in (0, 1))
     return lookup_heights(part_about(heights, x, y), x, y)
+
+
+def look_at(bundle: Bundle, heights: YardMap) -> Finding:
+    """Compare a map with a bundle at its place: the map is lower, higher, level or unknown there.
+
+    Lower over most of its length means `gone`, higher `covered`, level `not-found`: something is there.
+    """
+    z = heights_over(bundle, heights)[:, 1:4]
+    known: Bool = np.isfinite(z)
+    if known.mean() < MIN_KNOWN:
+        return "unseen"
+    along: Float64 = np.linspace(-0.45, 0.45, len(z)) * bundle.length_m
+    above = z - (bundle.top_z_m + along * math.tan(bundle.pitch_rad))[:, None]
+    margin = max(0.3 * bundle.width_m, SAME_PLACE_SIGMAS * np.nan_to_num(bundle.sigma.top_z_m))
+    if (above[known] < -margin).mean() > 0.5:
+        return "gone"
+    return "covered" if (above[known] > margin).mean() > 0.5 else "not-found"

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections import Counter
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from barsight.core.arrays import Float64
 from barsight.core.errors import InputError
 from barsight.core.reading.bounded_reading import MAX_ENTRIES, in_range, read_json, read_lines
 from barsight.yard.axes import turn_between
+from barsight.yard.inventory.matching import MOVE_SIGMAS, MOVED_M, Places, displace, match_bundles
 from barsight.yard.types import Bundle
 
 _NEEDED = ("name", "x_m", "y_m")
@@ -25,13 +26,13 @@ _REMEDY = (
     "decimals with a point, or JSON objects"
 )
 MAX_LISTED = 10_000
-"""Maximum number of listed bundles: each one is compared with each bundle of the map."""
+"""Maximum number of listed bundles."""
 _REACH_M = 1.0
 """Maximum distance (m) between a listed bundle and the one found."""
-_MOVED_M, _TURNED_DEG, _DIFFERENT_RATIO, _SIGMAS = 0.05, 5.0, 0.1, 3.0
-"""Minimum distance (m), angle and share of a size by which a bundle differs from the list, and the same in
-sigmas.
-"""
+_LIST_SIGMAS = 0.05, 0.17, 0.05, math.radians(5.0)
+"""Standard deviations of a listed place across, along and up (m) and of its yaw."""
+_TURNED_DEG, _DIFFERENT_RATIO = 5.0, 0.1
+"""Minimum angle and share of a size by which a bundle differs from the list, beside MOVE_SIGMAS."""
 
 
 @dataclass(frozen=True)
@@ -169,24 +170,25 @@ def _expected(path: Path, number: int, row: dict[str, Any]) -> ListedBundle:
 
 
 def match_stock(listed: tuple[ListedBundle, ...], bundles: tuple[Bundle, ...]) -> StockMatch:
-    """Pair listed and found bundles, each once, so that the total distance is smallest and none exceeds 1 m.
+    """Match listed and found bundles, each at most once, by place and size; none is over 1 m off across.
 
-    A bundle has moved if the distance exceeds both 50 mm and three of the found place's sigmas.
+    A bundle has moved if it is off by more than MOVED_M and than chance at SIGNIFICANCE; along the axis only
+    where both ends, and so its middle, were seen.
     """
-    cost = np.array([[_distance(one, bundle) for bundle in bundles] for one in listed])
-    cost = cost.reshape(len(listed), len(bundles))
-    pairs = zip(*linear_sum_assignment(np.minimum(cost, 2 * _REACH_M)), strict=True)
-    partner = {int(i): int(k) for i, k in pairs if cost[i, k] <= _REACH_M}
+    found, places = Places.of(bundles), _places(listed)
+    pairs = match_bundles(found, places, _REACH_M, sizes_agree=False)
+    partner = {i: k for k, i in sorted(pairs.items(), key=lambda pair: pair[1])}
+    exact = replace(places, sigmas=np.zeros_like(places.sigmas), sizes=np.full_like(places.sizes, np.nan))
+    moves = displace(found.take(list(partner.values())), exact.take(list(partner)))
     matched, moved = [], []
     names = {one.name for one in listed}
-    for i, k in partner.items():
-        shift = _shift(listed[i], bundles[k])
+    for (i, k), is_moved in zip(partner.items(), moves.moved(MOVED_M, math.inf), strict=True):
         differs = (*_disagreements(listed[i], bundles[k]), *_other_label(listed[i], bundles[k], names))
-        matched.append(MatchedEntry(listed[i].name, bundles[k].id, shift, differs))
-        if _has_moved(shift, bundles[k]):
+        matched.append(MatchedEntry(listed[i].name, bundles[k].id, _shift(listed[i], bundles[k]), differs))
+        if is_moved:
             moved.append(listed[i].name)
     absent = [one for i, one in enumerate(listed) if i not in partner]
-    hidden = tuple(one.name for one in absent if _is_covered(one, bundles))
+    hidden = tuple(one.name for one in absent if _is_covered(one, found))
     taken = set(partner.values())
     return StockMatch(
         matched=tuple(matched),
@@ -241,33 +243,21 @@ def _shift(one: ListedBundle, bundle: Bundle) -> tuple[float, float, float]:
     return float(bundle.centre_m[0] - one.x_m), float(bundle.centre_m[1] - one.y_m), float(rise)
 
 
-def _across_along(shift: tuple[float, float, float], bundle: Bundle) -> tuple[float, float]:
-    across, along = (bundle.axes @ shift[:2]).tolist()
-    return across, along
+def _places(listed: tuple[ListedBundle, ...]) -> Places:
+    """Collect the listed places, as rough as lists are."""
 
+    def table(*names: str) -> Float64:
+        rows = [[getattr(one, name) for name in names] for one in listed]
+        return np.array(rows, np.float64).reshape(-1, len(names))
 
-def _distance(one: ListedBundle, bundle: Bundle) -> float:
-    """Compute a weighted distance: across and up count fully; 1 m along the axis counts as 0.3 m across.
-
-    A bundle that lies half its width higher or lower than listed is another one.
-    """
-    shift = _shift(one, bundle)
-    if abs(shift[2]) > bundle.width_m / 2:
-        return float(2 * _REACH_M)
-    across, along = _across_along(shift, bundle)
-    if any(bundle.ends_open) and abs(along) < bundle.length_m / 2:
-        along = 0.0
-    return float(np.linalg.norm([across, 0.3 * along, shift[2]]))
-
-
-def _has_moved(shift: tuple[float, float, float], bundle: Bundle) -> bool:
-    """Check whether a bundle has moved; along the axis only where both ends, and so its middle, were seen."""
-    across, along = _across_along(shift, bundle)
-    sigma = bundle.sigma
-    moves: Float64 = np.abs([across, shift[2], 0.0 if any(bundle.ends_open) else along])
-    along_sigma = sigma.along_m if np.isfinite(sigma.along_m) else 0.0
-    limits = [max(_MOVED_M, _SIGMAS * s) for s in (sigma.lateral_m, sigma.top_z_m, along_sigma)]
-    return bool((moves > limits).any())
+    shape = len(listed), 4
+    section = np.full((len(listed), 1), np.nan)
+    return Places(
+        table("x_m", "y_m", "top_z_m"), np.radians(table("yaw_deg")[:, 0]),
+        np.hstack([table("length_m", "width_m", "bar_diameter_m"), section]),
+        np.broadcast_to(_LIST_SIGMAS, shape), np.full(shape, np.nan),
+        np.zeros((len(listed), 2), np.bool_), np.full((len(listed), 2), np.nan),
+    )  # fmt: skip
 
 
 def _disagreements(one: ListedBundle, bundle: Bundle) -> tuple[str, ...]:
@@ -280,12 +270,12 @@ def _disagreements(one: ListedBundle, bundle: Bundle) -> tuple[str, ...]:
     ):
         if listed is None or not np.isfinite(spread):
             continue
-        if abs(found - listed) > max(_SIGMAS * spread, _DIFFERENT_RATIO * listed):
+        if abs(found - listed) > max(MOVE_SIGMAS * spread, _DIFFERENT_RATIO * listed):
             out.append(f"{name} {1e3 * found:.0f} mm instead of {1e3 * listed:.0f} mm")
     if one.yaw_deg is not None:
         listed_rad = np.radians(one.yaw_deg)
         turn_deg = abs(np.degrees(turn_between(listed_rad, bundle.yaw_rad)))
-        if not turn_deg <= max(_SIGMAS * np.degrees(np.nan_to_num(sigma.yaw_rad)), _TURNED_DEG):
+        if not turn_deg <= max(MOVE_SIGMAS * np.degrees(np.nan_to_num(sigma.yaw_rad)), _TURNED_DEG):
             out.append(f"it lies turned by {turn_deg:.0f} deg")
     if one.bars is not None and bundle.bars not in (None, one.bars):
         out.append(f"{bundle.bars} bars instead of {one.bars}")
@@ -300,12 +290,9 @@ def _other_label(one: ListedBundle, bundle: Bundle, names: set[str]) -> tuple[st
     return (f"its label reads {bundle.label.text!r}, {known}",)
 
 
-def _is_covered(one: ListedBundle, bundles: tuple[Bundle, ...]) -> bool:
+def _is_covered(one: ListedBundle, found: Places) -> bool:
     """Check whether a found bundle lies over the listed place, above the listed top if there is one."""
-    for bundle in bundles:
-        shift = _shift(one, bundle)
-        across, along = _across_along(shift, bundle)
-        over = abs(across) < bundle.width_m / 2 and abs(along) < bundle.length_m / 2
-        if over and (one.top_z_m is None or bundle.top_z_m > one.top_z_m):
-            return True
-    return False
+    (length, width), top = found.sizes[:, :2].T, found.top_m
+    across, along = found.across_along(np.array([one.x_m, one.y_m]) - top[:, :2])
+    over = (np.abs(across) < width / 2) & (np.abs(along) < length / 2)
+    return bool((over & (one.top_z_m is None or top[:, 2] > one.top_z_m)).any())
