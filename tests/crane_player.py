@@ -20,8 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
-from barsight.sensors.forms import pack
 from crane_network import PORTS
+from reading_forms import pack
 
 MAX_WAITING = 3000
 """Bytes that wait to be read: a line that nobody reads holds nothing, a terminal would for long."""

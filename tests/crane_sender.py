@@ -10,7 +10,7 @@ import time
 
 import numpy as np
 
-from barsight.sensors.forms import pack
+from reading_forms import pack
 
 OFF_NS = 3_000_000_000
 

@@ -80,6 +80,27 @@ def test_what_passes_the_check_is_not_marked(tmp_path: Path) -> None:
     assert told.picture is not None and not (told.picture == BGR["offending"]).all(axis=-1).any()
 
 
+def test_stanchions_and_no_lift_areas_are_drawn_where_they_are(tmp_path: Path) -> None:
+    made = write_folder(tmp_path / "out")
+    assert lifts(made) == 0
+    target = explain(made, "bundle:0").record["target"]
+    assert target["yaw_deg"] == pytest.approx(0, abs=1)
+    x_m, y_m = target["x_m"], target["y_m"]
+    settings = tmp_path / "yard.toml"
+    settings.write_text(
+        f"stanchions = [[{x_m}, {y_m + 1.0}, 0.1]]\n"
+        f"no_lift_areas = [[{x_m - 0.3}, {y_m + 0.5}, {x_m + 5}, {y_m + 9}]]\n"
+    )
+    assert lifts(made, "--config", str(settings)) == 0
+    picture = explain(made, "bundle:0").picture
+    assert picture is not None
+    middle = np.array(picture.shape[:2]) / 2
+    marked = np.argwhere((picture == BGR["stanchion"]).all(axis=-1)) - middle
+    assert np.abs(marked.mean(axis=0) / PIXELS_PER_M) == pytest.approx([0.0, 1.0], abs=0.02)
+    lines = (np.argwhere((picture == BGR["no-lift"]).all(axis=-1)) - middle) / PIXELS_PER_M
+    assert np.abs(lines).min(axis=0) == pytest.approx([0.0, 0.5], abs=0.03)
+
+
 @pytest.mark.parametrize(
     ("which", "says"),
     [("9", "no lift of rank 9"), ("bundle:99", "no lift of bundle 99"), ("first", "names no lift")],

@@ -145,7 +145,7 @@ def history() -> PlaceHistory:
 
 def test_a_change_is_told_once_with_place_and_height() -> None:
     (change,) = history().changes
-    assert change.pass_number == 1 and change.rise_m == pytest.approx(-0.3)
+    assert change.pass_index == 1 and change.rise_m == pytest.approx(-0.3)
     assert change.low_m == (2.0, 4.5) and change.high_m == (3.0, 6.5)
     assert change.area_m2 == pytest.approx(2.0)
 
@@ -159,7 +159,7 @@ def test_two_pairs_of_one_time_see_no_change_but_both_see_what_changed_before() 
     left[100:120, 5:20] = 0.5  # what the other pair, which saw it at the same time, hasn't
     for number, (z, since) in enumerate(((old, 0), (left, 1), (np.zeros((160, 120), np.float32), 1))):
         one.add(number, z, sigma, since)
-    rises = [(change.pass_number, round(change.rise_m, 2)) for change in one.changes]
+    rises = [(change.pass_index, round(change.rise_m, 2)) for change in one.changes]
     assert rises == [(1, 0.5), (1, -0.3)]
     assert set(np.unique(one.changed_by)) == {-1, 1} and one.seen_by.max() == 2
 

@@ -24,11 +24,11 @@ from barsight.sensors import crane as crane_module
 from barsight.sensors.camera import RawPicture
 from barsight.sensors.clock import DeviceClock
 from barsight.sensors.crane import CraneSource
-from barsight.sensors.forms import pack
 from barsight.sensors.pairing import PairFormer
 from barsight.sensors.receiver import RawReading, ReadingReceiver, Sequence
 from barsight.sensors.settings import ReadingsSettings
 from barsight.sensors.source import LivePicture, LostPicture, Readings
+from reading_forms import pack
 
 SECOND = 10**9
 DARK = np.zeros((4, 6), np.uint8)

@@ -14,9 +14,9 @@ import pytest
 import barsight as bs
 from barsight.live.crane import preflight
 from barsight.live.settings import CraneConfig, read_crane
-from barsight.sensors.forms import pack
 from barsight.sensors.receiver import RawReading, ReadingReceiver
 from barsight.sensors.settings import ReadingsSettings
+from reading_forms import pack
 
 RATE_HZ, FIRST = 200, 10_000
 VALUES = (0.001, -0.002, 0.003, 0.1, 0.2, -9.8)

@@ -130,8 +130,8 @@ def _records(mapped: MappedYard, travels: Sequence[Travel]) -> tuple[PassRecord,
             one.way.trajectory.length_m, travel.captured_ns, int(one.way.trajectory.stamp_ns[0]),
             int(one.way.trajectory.stamp_ns[-1]), len(one.built.placed), one.probed.frames_total,
             correction, tuple(pair for pair in ties.pairs if pair.second == number),
-            tuple(change for change in mapped.joined.history.changes if change.pass_number == number),
-            tuple(move for move in mapped.joined.history.moves if move.pass_number == number),
+            tuple(change for change in mapped.joined.history.changes if change.pass_index == number),
+            tuple(move for move in mapped.joined.history.moves if move.pass_index == number),
         )
         for number, (one, travel, correction) in enumerate(
             zip(mapped.passes, travels, ties.corrections, strict=True)

@@ -246,14 +246,14 @@ def _changed(change: HeightChange) -> str:
     (x0, y0), (x1, y1) = change.low_m, change.high_m
     way = "higher" if change.rise_m > 0 else "lower"
     return (
-        f"before pass {change.pass_number + 1} {change.area_m2:.2f} m² between x {x0:.2f} and {x1:.2f} m, "
+        f"before pass {change.pass_index + 1} {change.area_m2:.2f} m² between x {x0:.2f} and {x1:.2f} m, "
         f"y {y0:.2f} and {y1:.2f} m became {1e3 * abs(change.rise_m):.0f} mm {way}"
     )
 
 
 def _moved_along(move: BundleMove) -> str:
     x, y = move.ends_m[:, :2].mean(axis=0)
-    what = f"before pass {move.pass_number + 1} the bundle around x {x:.2f}, y {y:.2f} m"
+    what = f"before pass {move.pass_index + 1} the bundle around x {x:.2f}, y {y:.2f} m"
     if move.along_m is None:
         return f"{what} was exchanged: its picture is another one's"
     way = move.ends_m[1] - move.ends_m[0] if move.along_m > 0 else move.ends_m[0] - move.ends_m[1]

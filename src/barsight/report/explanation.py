@@ -22,6 +22,7 @@ from barsight.result_folder import changed_inputs, open_folder, read_heights
 from barsight.yard.axes import corners
 from barsight.yard.events import kept_events
 from barsight.yard.inventory.bundle_file import read_bundles
+from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.clearance import FacePlane, find_obstacle
 from barsight.yard.lifting.lift_file import forbidden_since, read_lifts
 from barsight.yard.magnet.description import Magnet
@@ -39,7 +40,7 @@ LOW_M, HIGH_M = -0.3, 0.1
 """Range in metres of the colour scale, relative to the faces' plane."""
 BGR = {
     "face": (180, 47, 255), "beam": (255, 255, 255), "tolerance": (0, 215, 255), "bundle": (83, 211, 57),
-    "offending": (30, 30, 230),
+    "offending": (30, 30, 230), "no-lift": (0, 128, 255), "stanchion": (255, 255, 0),
 }  # fmt: skip
 UNSEEN_BGR, HATCH_BGR = (225, 225, 225), (150, 150, 150)
 
@@ -91,7 +92,9 @@ def explain(folder: Path, which: str) -> Explanation:
             state = f"was offered at rank {rank}, and is forbidden now: {', '.join(v.code for v in since)}"
     picture = None
     if record["target"]["z_m"] is not None:
-        picture = draw_place(read_heights(folder), record, cattrs.structure(lifts["magnet"], Magnet), bundles)
+        magnet = cattrs.structure(lifts["magnet"], Magnet)
+        settings = cattrs.structure(lifts["settings"], LiftSettings)
+        picture = draw_place(read_heights(folder), record, magnet, bundles, settings)
     title = f"The lift of bundle {ids} {state}"
     simulated = bool(summary.get("is_simulated"))
     return Explanation(title, record, tuple(lifts["vetoes"]), picture, simulated, since)
@@ -145,10 +148,11 @@ def write_explanation(told: Explanation, target: Path) -> None:
 
 
 def draw_place(
-    heights: YardMap, record: dict[str, Any], magnet: Magnet, bundles: tuple[Bundle, ...]
-) -> UInt8:
-    """Draw the heights around a lift (H, W, 3), with the beam from left to right, faces, tolerance, bundles
-    and the offending cells.
+    heights: YardMap, record: dict[str, Any], magnet: Magnet, bundles: tuple[Bundle, ...],
+    settings: LiftSettings,
+) -> UInt8:  # fmt: skip
+    """Draw the heights around a lift (H, W, 3), with the beam from left to right, faces, tolerance, bundles,
+    the offending cells, and the stanchions and no-lift areas of the settings.
     """
     target = record["target"]
     place = Placement(target["x_m"], target["y_m"], math.radians(target["yaw_deg"]))
@@ -183,6 +187,11 @@ def draw_place(
         outline(bundle.corners_m, "bundle")
         middle = np.round(pixels(bundle.centre_m[None, :2]))[0].astype(int).tolist()
         cv2.putText(picture, str(bundle.id), middle, cv2.FONT_HERSHEY_SIMPLEX, 0.6, BGR["bundle"], 2)
+    for low_x, low_y, high_x, high_y in settings.no_lift_areas:
+        outline(np.array([(low_x, low_y), (high_x, low_y), (high_x, high_y), (low_x, high_y)]), "no-lift", 3)
+    for x, y, _ in settings.stanchions:
+        at = np.round(pixels(np.array([[x, y]]))).astype(int)[0].tolist()
+        cv2.drawMarker(picture, at, BGR["stanchion"], cv2.MARKER_DIAMOND, 16, 3)
     centre = np.array([place.x_m, place.y_m])
     outline(corners(centre, place.yaw_rad, magnet.beam.width_m, magnet.beam.length_m), "beam")
     more_v, more_u = 2 * magnet.tolerance.along(place.beam_axes)

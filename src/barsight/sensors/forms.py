@@ -1,4 +1,4 @@
-"""Pack readings of IMU and encoders in the format of their senders.
+"""Define the format of the readings that IMU and encoders send.
 
 A reading is little-endian: four bytes of kind (`BSI1` for the IMU, `BSC1` for the crane), a sequence number
 (uint32), the stamp of the measurement on the sender's clock (int64, ns), and float64 values: gyro x, y, z
@@ -14,9 +14,3 @@ FORMS = {"imu": (b"BSI1", struct.Struct("<4sIq6d")), "crane": (b"BSC1", struct.S
 LIMITS = {"imu": (1e4, 1e4, 1e4, 1e5, 1e5, 1e5), "crane": (1e7, 1e7, 1e7)}
 """Largest magnitudes of values; beyond them a reading is garbage, not one in another unit."""
 CRC_BYTES = 4
-
-
-def pack(sensor: str, number: int, stamp_ns: int, values: tuple[float, ...]) -> bytes:
-    """Pack a reading as a sender does."""
-    mark, form = FORMS[sensor]
-    return form.pack(mark, number % (1 << 32), stamp_ns, *values)

@@ -31,12 +31,12 @@ MARGIN_M = 0.15
 
 @dataclass(frozen=True)
 class HeightChange:
-    """A change of height. pass_number: pass that first saw it (of passes recorded at the same time, the
+    """A change of height. pass_index: pass that first saw it (of passes recorded at the same time, the
     first), from 0. low_m, high_m: corners of its bounding rectangle, x and y. area_m2: area of the places
     that changed. rise_m: median change of height, negative where something was removed.
     """
 
-    pass_number: int
+    pass_index: int
     low_m: tuple[float, float]
     high_m: tuple[float, float]
     area_m2: float
@@ -47,11 +47,11 @@ class HeightChange:
 class BundleMove:
     """A bundle found at the same height as before that was exchanged or moved along its axis.
 
-    pass_number: as in `HeightChange`. ends_m: (2, 3) ends of its axis in the joined map, the low-y end first.
+    pass_index: as in `HeightChange`. ends_m: (2, 3) ends of its axis in the joined map, the low-y end first.
     along_m: distance moved towards its high-y end, None if it is another bundle.
     """
 
-    pass_number: int
+    pass_index: int
     ends_m: Float64
     width_m: float
     along_m: float | None
@@ -62,7 +62,7 @@ class PlaceHistory:
 
     low_m: (x, y), the corner of the first place. shape: (rows, columns). place_m: side of a place. Memory: 10
     bytes per place. seen_by: number of the newest pass that saw the place, -1 for none; changed_by:
-    pass_number of its last change, -1 for none. changes, moves: all that were found.
+    pass_index of its last change, -1 for none. changes, moves: all that were found.
     """
 
     def __init__(self, low_m: tuple[float, float], shape: tuple[int, int], place_m: float) -> None:
@@ -102,7 +102,7 @@ class PlaceHistory:
         the heights have already shown.
         """
         x_m, y_m = np.linspace(move.ends_m[0, :2], move.ends_m[1, :2], AXIS_PLACES).T
-        if move.along_m is None and (self._look_up(self.changed_by, x_m, y_m) >= move.pass_number).any():
+        if move.along_m is None and (self._look_up(self.changed_by, x_m, y_m) >= move.pass_index).any():
             return
         self.moves.append(move)
         ends = move.ends_m[:, :2]
@@ -114,7 +114,7 @@ class PlaceHistory:
         reach_m = length_m / 2 + abs(move.along_m or 0.0) + MARGIN_M
         inside = np.abs(away @ along) <= reach_m
         inside &= np.abs(away @ np.array([along[1], -along[0]])) <= move.width_m / 2 + MARGIN_M
-        self.changed_by[inside] = np.maximum(self.changed_by[inside], move.pass_number)
+        self.changed_by[inside] = np.maximum(self.changed_by[inside], move.pass_index)
 
     def _change(self, number: int, box: tuple[slice, slice], inside: Bool, rise: Float32) -> HeightChange:
         (left, bottom), (right, top) = (

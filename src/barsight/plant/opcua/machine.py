@@ -7,7 +7,6 @@ Numbers are those of the specification's NodeSet.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
 from barsight.core.errors import Failed
 
@@ -15,11 +14,6 @@ MAIN_STATES = {"Preoperational": 1, "Halted": 2, "Error": 3, "Operational": 4}
 AUTOMATIC_STATES = {"Initialized": 5, "Ready": 6, "SingleExecution": 7, "ContinuousExecution": 8}
 """State names and their StateNumbers."""
 EXECUTING = ("SingleExecution", "ContinuousExecution")
-
-Method = Literal[
-    "Halt", "Reset", "SelectModeAutomatic", "PrepareRecipe", "UnprepareRecipe", "PrepareProduct",
-    "UnprepareProduct", "StartSingleJob", "StartContinuous", "Stop", "Abort",
-]  # fmt: skip
 
 _MAIN: dict[str, dict[str, str]] = {
     "Halt": {"Preoperational": "Halted", "Operational": "Halted", "Error": "Halted"},
