@@ -9,10 +9,10 @@ from scipy.stats import norm
 from scipy.stats import t as student
 
 from barsight.core.errors import Failed
-from barsight.core.records.heights import Agreement, Contour, HeightSource
+from barsight.core.records.heights import Agreement, AgreementIntervals, Contour, HeightSource
 from barsight.core.records.sensor_samples import LaserProfile
 from barsight.mapping.agreement import compute_agreement, profile_difference, smooth_places
-from barsight.mapping.agreement_intervals import AgreementIntervals, agreement_intervals
+from barsight.mapping.agreement_intervals import agreement_intervals
 from barsight.report.files.tables import write_laser_csv
 from barsight.result_folder import read_laser
 

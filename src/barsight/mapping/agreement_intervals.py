@@ -4,47 +4,18 @@ autocorrelated, so fewer of them count as independent.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.special import stdtrit
 
 from barsight.core.arrays import Bool, Float64
 from barsight.core.linalg.robust import SIGMAS_95
+from barsight.core.records.heights import AgreementIntervals
 
 MIN_SAMPLES = 8
 """Minimum number of samples for which confidence intervals are computed."""
 ROUNDS = 10
 MIN_ALONE = 1.5
 """So many independent samples any series has: of fewer, the spread about their mean says nothing."""
-
-
-@dataclass(frozen=True)
-class AgreementIntervals:
-    """95 % confidence intervals of a bias (mm), its limits of agreement and its slope over height (mm/m); NaN
-    where there are too few samples. Named as in `Agreement`.
-
-    effective_samples: number of independent samples that would estimate the mean equally well [Bayley 1946].
-    smooth_loa_low, smooth_loa_high: limits of agreement, each uncertain by ± smooth_loa_half [Bland 1999].
-    equivalence_mm: the smallest margin for which two one-sided tests at 5 % find the means equivalent
-    [Schuirmann 1987]. vision_sd_mm: standard deviation that the reference's own sigma doesn't explain.
-    within_95_pct: percentage of differences inside the 95 % interval that both sigmas predict.
-    """
-
-    smooth_samples: int
-    effective_samples: float
-    smooth_bias_mm: float
-    smooth_bias_low_mm: float
-    smooth_bias_high_mm: float
-    smooth_loa_low_mm: float
-    smooth_loa_high_mm: float
-    smooth_loa_half_mm: float
-    slope_mm_per_m: float
-    slope_low_mm_per_m: float
-    slope_high_mm_per_m: float
-    equivalence_mm: float
-    vision_sd_mm: float
-    within_95_pct: float
 
 
 def effective_samples(series: Float64) -> float:

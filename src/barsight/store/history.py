@@ -16,6 +16,7 @@ import numpy as np
 from barsight.core.errors import ConfigError
 from barsight.core.extras import extra
 from barsight.core.stamps import NS_PER_S
+from barsight.store.audit import IDS_PER_QUERY
 from barsight.store.promotion import counts
 from barsight.store.states import newest_steps
 from barsight.store.tables import ABSENCES, LIFT_BUNDLES, LIFT_STATES, LIFTS, SIGHTINGS, SURVEYS
@@ -25,7 +26,7 @@ from barsight.yard.inventory.matching import moved_bundles
 from barsight.yard.types import Bundle
 
 with extra("store"):
-    from sqlalchemy import Connection, Row, Select, and_, func, select, true
+    from sqlalchemy import Connection, Row, Table, and_, func, select, true, tuple_
     from sqlalchemy.sql.elements import ColumnElement
 
 
@@ -158,8 +159,7 @@ def newest_absences(
 ) -> dict[int, Absence]:
     """Find each bundle's newest absence from a survey up to a time. version: as if it were promoted."""
     condition = true() if until_ns is None else SURVEYS.c.captured_to_ns <= until_ns
-    chosen = select(ABSENCES, SURVEYS.c.captured_to_ns).join(SURVEYS).where(condition, counts(version))
-    rows = _first_of_each(connection, chosen, ABSENCES.c.bundle_id, is_newest=True)
+    rows = _first_of_each(connection, ABSENCES, and_(condition, counts(version)), is_newest=True)
     return {r.bundle_id: Absence(r.bundle_id, r.captured_to_ns, r.kind, r.reason) for r in rows}
 
 
@@ -224,8 +224,7 @@ def yard_records(present: tuple[PresentBundle, ...], now_ns: int) -> list[dict[s
 def _sightings(
     connection: Connection, condition: ColumnElement[bool], *, is_newest: bool
 ) -> dict[int, BundleSighting]:
-    chosen = select(SIGHTINGS, SURVEYS.c.map_id, SURVEYS.c.captured_to_ns).join(SURVEYS).where(condition)
-    rows = _first_of_each(connection, chosen, SIGHTINGS.c.bundle_id, is_newest=is_newest)
+    rows = _first_of_each(connection, SIGHTINGS, condition, is_newest=is_newest)
     return {
         r.bundle_id: BundleSighting(
             r.bundle_id, r.survey_id, r.map_id, r.captured_to_ns, r.change, r.stock_name, json.loads(r.record)
@@ -235,14 +234,31 @@ def _sightings(
 
 
 def _first_of_each(
-    connection: Connection, chosen: Select[Any], key: ColumnElement[int], *, is_newest: bool
+    connection: Connection, table: Table, condition: ColumnElement[bool], *, is_newest: bool
 ) -> Iterable[Row[Any]]:
-    """Keep the newest row of each key by its survey's time, or the oldest."""
-    times = (SURVEYS.c.captured_to_ns, SURVEYS.c.id)
-    order = [time.desc() if is_newest else time.asc() for time in times]
-    place = func.row_number().over(partition_by=key, order_by=order).label("place")
-    inner = chosen.add_columns(place).subquery()
-    return connection.execute(select(inner).where(inner.c.place == 1)).all()
+    """Find the newest row of each bundle by its survey's time, or the oldest.
+
+    Only the index of surveys and bundles is scanned: all rows with their records are many times as much.
+    """
+    surveys: dict[int, list[int]] = {}
+    chosen = select(SURVEYS.c.id, SURVEYS.c.captured_to_ns).where(condition)
+    for survey_id, captured_ns in connection.execute(chosen).all():
+        surveys.setdefault(captured_ns, []).append(survey_id)
+    times = chosen.subquery()
+    of_bundle = (func.max if is_newest else func.min)(times.c.captured_to_ns)
+    number = table.c.bundle_id + 0  # else SQLite follows the bundles' own index, from row to row
+    joined = times.join(table, table.c.survey_id == times.c.id)
+    newest = select(number, of_bundle).select_from(joined).group_by(number)
+    keys = [(one, bundle) for bundle, at in connection.execute(newest).all() for one in surveys[at]]
+    rows: dict[int, Row[Any]] = {}
+    for first in range(0, len(keys), IDS_PER_QUERY):
+        key = tuple_(table.c.survey_id, table.c.bundle_id).in_(keys[first : first + IDS_PER_QUERY])
+        found = select(table, SURVEYS.c.map_id, SURVEYS.c.captured_to_ns).join(SURVEYS).where(key)
+        for row in connection.execute(found).all():
+            known = rows.get(row.bundle_id)
+            if known is None or (row.survey_id > known.survey_id) is is_newest:
+                rows[row.bundle_id] = row
+    return rows.values()
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,35 @@ class Contour:
 
 
 @dataclass(frozen=True)
-class Agreement:
+class AgreementIntervals:
+    """95 % confidence intervals of a bias (mm), its limits of agreement and its slope over height (mm/m); NaN
+    where there are too few samples. Named as in `Agreement`.
+
+    effective_samples: number of independent samples that would estimate the mean equally well [Bayley 1946].
+    smooth_loa_low, smooth_loa_high: limits of agreement, each uncertain by ± smooth_loa_half [Bland 1999].
+    equivalence_mm: the smallest margin for which two one-sided tests at 5 % find the means equivalent
+    [Schuirmann 1987]. vision_sd_mm: standard deviation that the reference's own sigma doesn't explain.
+    within_95_pct: percentage of differences inside the 95 % interval that both sigmas predict.
+    """
+
+    smooth_samples: int
+    effective_samples: float
+    smooth_bias_mm: float
+    smooth_bias_low_mm: float
+    smooth_bias_high_mm: float
+    smooth_loa_low_mm: float
+    smooth_loa_high_mm: float
+    smooth_loa_half_mm: float
+    slope_mm_per_m: float
+    slope_low_mm_per_m: float
+    slope_high_mm_per_m: float
+    equivalence_mm: float
+    vision_sd_mm: float
+    within_95_pct: float
+
+
+@dataclass(frozen=True)
+class Agreement(AgreementIntervals):
     """Agreement of a contour with a reference profile; all in mm but for the coverage.
 
     samples: compared points. coverage_pct: share of the reference's points that vision measured.
@@ -50,8 +78,6 @@ class Agreement:
     x_shift_mm, z_shift_mm: how far the laser's profile lies along x and above where it fits best (NaN where
     too little is in common); time_shift_s: the delay of its clock that explains x_shift at the travel's
     speed. They are reported only: no other figure is corrected by them.
-    From smooth_samples on: of smooth places, with 95 % intervals that account for autocorrelation, see
-    `AgreementIntervals`. NaN under eight samples.
     """
 
     profile: int
@@ -70,17 +96,3 @@ class Agreement:
     x_shift_mm: float
     z_shift_mm: float
     time_shift_s: float
-    smooth_samples: int
-    effective_samples: float
-    smooth_bias_mm: float
-    smooth_bias_low_mm: float
-    smooth_bias_high_mm: float
-    smooth_loa_low_mm: float
-    smooth_loa_high_mm: float
-    smooth_loa_half_mm: float
-    slope_mm_per_m: float
-    slope_low_mm_per_m: float
-    slope_high_mm_per_m: float
-    equivalence_mm: float
-    vision_sd_mm: float
-    within_95_pct: float
