@@ -13,6 +13,7 @@ import uuid
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import psycopg
 import pytest
 from alembic.autogenerate import compare_metadata
@@ -26,10 +27,20 @@ from barsight.core.errors import ConfigError, Failed, InputError, OutputError
 from barsight.store.adding import AddedSurvey, add_survey, read_survey
 from barsight.store.audit import AuditChain, entry, verify_chain
 from barsight.store.calibrations import approve_calibration, note_calibration
-from barsight.store.history import parse_time
+from barsight.store.history import newest_absences, newest_sightings, next_sightings, parse_time
 from barsight.store.opening import Store, open_store
 from barsight.store.states import LIFT_STEPS, alarm_state, raise_alarm, step_alarm, step_lift
-from barsight.store.tables import ALARMS, AUDIT, LIFTS, METADATA, SURVEY_VETOES, SURVEYS
+from barsight.store.tables import (
+    ABSENCES,
+    ALARMS,
+    AUDIT,
+    BUNDLES,
+    LIFTS,
+    METADATA,
+    SIGHTINGS,
+    SURVEY_VETOES,
+    SURVEYS,
+)
 from store_servers import add_database
 from store_yards import CraneYard
 from yard_folders import lifts, write_folder
@@ -472,3 +483,37 @@ def test_the_audit_log_and_the_tables_have_their_names(store: Store) -> None:
         (row,) = connection.execute(select(AUDIT)).all()
         assert connection.execute(select(ALARMS.c.id)).scalars().all() == [number]
     assert (row.who, row.what) == ("ann", "alarm")
+
+
+def test_the_newest_and_the_first_sightings_are_those_of_a_plain_search(store: Store) -> None:
+    """Surveys in any order of time, several at one time."""
+    rng, rows, looked = np.random.default_rng(2), [], []
+    with entry(store, "ann", "surveys") as opened:
+        bundles = []
+        for number in range(30):
+            at_ns = int(rng.integers(1, 15))
+            survey_id = opened.add(
+                SURVEYS, map_id=f"m{number}", captured_from_ns=0, captured_to_ns=at_ns, added_ns=0,
+                calibration_id="", is_simulated=True, software_version="", folder="", files="", heights=b"",
+            )  # fmt: skip
+            bundles = bundles or [opened.add(BUNDLES, survey_id=survey_id) for _ in range(20)]
+            for k, bundle_id in enumerate(rng.permutation(bundles)[:8].tolist()):
+                figures = dict.fromkeys(("x_m", "y_m", "top_z_m", "yaw_deg", "length_m", "width_m"), 0.0)
+                seen = {"survey_id": survey_id, "bundle_id": bundle_id}
+                if k < 6:
+                    opened.add(SIGHTINGS, **seen, number=k, change="same", **figures, record="{}")
+                    rows.append((bundle_id, at_ns, survey_id))
+                else:
+                    opened.add(ABSENCES, **seen, kind="gone", reason=str(survey_id))
+                    looked.append((bundle_id, at_ns, survey_id))
+    with store.reading() as connection:
+        for limit in range(16):
+            newest = {bundle: survey for bundle, at, survey in sorted(rows) if at <= limit}
+            found = newest_sightings(connection, limit)
+            assert {number: one.survey_id for number, one in found.items()} == newest
+            oldest = {bundle: survey for bundle, at, survey in sorted(rows)[::-1] if at > limit}
+            found = next_sightings(connection, limit)
+            assert {number: one.survey_id for number, one in found.items()} == oldest
+            absent = {bundle: str(survey) for bundle, at, survey in sorted(looked) if at <= limit}
+            found_absent = newest_absences(connection, limit)
+            assert {number: one.reason for number, one in found_absent.items()} == absent
