@@ -136,6 +136,10 @@ def heights_over(bundle: Bundle, heights: YardMap) -> Float64:
     vv, uu = np.meshgrid(v, u, indexing="ij")
     across, along = bundle.axes
     x, y = (bundle.centre_m[k] + uu * across[k] + vv * along[k] for k in (0, 1))
+    rows, columns = (heights.cell_m * size for size in heights.shape)
+    for at, first, length in ((x, heights.x0_m, columns), (y, heights.y0_m, rows)):
+        if at.max() < first - heights.cell_m or at.min() > first + length:
+            return np.full(x.shape, np.nan)  # nothing to read
     return lookup_heights(part_about(heights, x, y), x, y)
 
 
