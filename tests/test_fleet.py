@@ -277,6 +277,24 @@ def test_promoted_surveys_share_the_names_of_their_bundles_and_offer_nothing(tmp
             assert open_lifts(connection) == ()
 
 
+def test_a_survey_that_another_promotion_copies_meanwhile_is_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    results, task = (
+        open_objects(str(tmp_path / "r"), create=True),
+        FleetTask("a" * 32, "a", (), VERSION, "a", ""),
+    )
+    results.write(f"results/{task.key}/result.json", b"{}")
+
+    def late(*_: object) -> None:
+        survey(tmp_path / "surveys" / task.key, FIRST, 60.0)
+        raise OutputError("exists and is not empty")
+
+    monkeypatch.setattr("barsight.fleet.promoting._fetch", late)
+    with open_store(f"sqlite:///{tmp_path}/s.db", create=True) as store:
+        assert promote(store, results, VERSION, [task], tmp_path / "surveys", "ann", no_progress) == 1
+
+
 @pytest.mark.parametrize("now", [b"other", b"longer than it was", b""])
 def test_only_what_was_published_is_promoted(tmp_path: Path, now: bytes) -> None:
     results = open_objects(str(tmp_path / "r"), create=True)

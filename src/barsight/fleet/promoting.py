@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from barsight.core.errors import ConfigError, InputError, MeasurementError
+from barsight.core.errors import ConfigError, InputError, MeasurementError, OutputError
 from barsight.core.extras import extra
 from barsight.core.files import atomic_directory
 from barsight.fleet.ledger import REMEDY, published_keys, result_note
@@ -50,7 +50,11 @@ def promote(
     for number, task in enumerate(chosen):
         out = folder / task.key[:32]
         if not out.is_dir():
-            _fetch(results, task.key, out)
+            try:
+                _fetch(results, task.key, out)
+            except OutputError:
+                if not out.is_dir():  # else another promotion has copied it in the meantime
+                    raise
         surveys.append(replace(read_survey(out), recordings=(found_recording(task),)))
         advance(number + 1, len(chosen))
     for survey in sorted(surveys, key=lambda one: one.to_ns):
