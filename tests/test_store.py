@@ -18,16 +18,18 @@ import psycopg
 import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
-from sqlalchemy import func, select, text
+from sqlalchemy import event, func, select, text
 from sqlalchemy.exc import DBAPIError
 
 import barsight.store.opening as opening
 from barsight.cli.main import run
 from barsight.core.errors import ConfigError, Failed, InputError, OutputError
+from barsight.page.documents import survey_records
 from barsight.store.adding import AddedSurvey, add_survey, read_survey
 from barsight.store.audit import AuditChain, entry, verify_chain
 from barsight.store.calibrations import approve_calibration, note_calibration
-from barsight.store.history import newest_absences, newest_sightings, next_sightings, parse_time
+from barsight.store.confirmation import newest_survey
+from barsight.store.history import list_surveys, newest_absences, newest_sightings, next_sightings, parse_time
 from barsight.store.opening import Store, open_store
 from barsight.store.states import LIFT_STEPS, alarm_state, raise_alarm, step_alarm, step_lift
 from barsight.store.tables import (
@@ -517,3 +519,13 @@ def test_the_newest_and_the_first_sightings_are_those_of_a_plain_search(store: S
             absent = {bundle: str(survey) for bundle, at, survey in sorted(looked) if at <= limit}
             found_absent = newest_absences(connection, limit)
             assert {number: one.reason for number, one in found_absent.items()} == absent
+
+
+def test_lists_of_surveys_leave_their_heights_where_they_are(store: Store) -> None:
+    """With 5000 surveys of a large yard they are gigabytes."""
+    asked: list[str] = []
+    event.listen(store.engine, "before_cursor_execute", lambda *given: asked.append(given[2]))
+    with store.reading() as connection:
+        assert list_surveys(connection) == () and survey_records(connection) == []
+        assert newest_survey(connection) is None
+    assert len(asked) > 5 and not [query for query in asked if "heights" in query]

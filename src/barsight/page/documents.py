@@ -30,6 +30,7 @@ from barsight.store.tables import (
     LIFTS,
     SIGHTINGS,
     STOCK_DECISIONS,
+    SURVEY_FACTS,
     SURVEY_VETOES,
     SURVEYS,
 )  # fmt: skip
@@ -224,7 +225,7 @@ def _urgency(alarm: dict[str, Any]) -> tuple[int, int, int]:
 
 def survey_records(connection: Connection) -> list[dict[str, Any]]:
     """List the surveys, the newest first, with the findings and files of each."""
-    files = {row.map_id: row for row in connection.execute(select(SURVEYS)).all()}
+    files = {row.map_id: row for row in connection.execute(select(*SURVEY_FACTS)).all()}
     records = []
     for survey in reversed(list_surveys(connection)):
         row = files[survey.map_id]

@@ -10,7 +10,7 @@ from barsight.core.errors import InputError
 from barsight.core.extras import extra
 from barsight.page.access import AccessError
 from barsight.result_folder import file_digest, open_folder
-from barsight.store.tables import SURVEYS
+from barsight.store.tables import SURVEY_FACTS, SURVEYS
 
 with extra("store"):
     from sqlalchemy import Connection, select
@@ -37,7 +37,7 @@ def expect_map(folder: Path, map_id: str) -> dict[str, Any]:
 
 def find_file(connection: Connection, map_id: str, name: str) -> Path:
     """Return a file's path after a check of its digest. Raises InputError if it is missing or changed."""
-    row = connection.execute(select(SURVEYS).where(SURVEYS.c.map_id == map_id)).first()
+    row = connection.execute(select(*SURVEY_FACTS).where(SURVEYS.c.map_id == map_id)).first()
     if row is None:
         raise InputError(map_id, "there is no such survey")
     digests = json.loads(row.files)

@@ -19,7 +19,7 @@ from barsight.store.lift_records import find_beside, find_gap, find_outlines, ra
 from barsight.store.opening import Store
 from barsight.store.promotion import counts
 from barsight.store.states import has_alarm, has_standing, lift_state, newest_steps, raise_alarm, step_lift
-from barsight.store.tables import LIFT_STATES, LIFTS, SURVEY_VETOES, SURVEYS
+from barsight.store.tables import LIFT_STATES, LIFTS, SURVEY_FACTS, SURVEY_VETOES, SURVEYS
 from barsight.yard.lifting.validity import is_ahead
 from barsight.yard.vetoes import VETOES
 
@@ -57,8 +57,7 @@ def newest_survey(connection: Connection) -> Row[Any] | None:
 @cache
 def _newest_query() -> Select[Any]:
     order = (SURVEYS.c.captured_to_ns.desc(), SURVEYS.c.id.desc())
-    columns = (column for column in SURVEYS.c if column.name != "heights")
-    return select(*columns).where(counts()).order_by(*order).limit(1)
+    return select(*SURVEY_FACTS).where(counts()).order_by(*order).limit(1)
 
 
 def map_vetoes(connection: Connection, survey_id: int) -> list[dict[str, str]]:

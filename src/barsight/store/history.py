@@ -19,7 +19,7 @@ from barsight.core.stamps import NS_PER_S
 from barsight.store.audit import IDS_PER_QUERY
 from barsight.store.promotion import counts
 from barsight.store.states import newest_steps
-from barsight.store.tables import ABSENCES, LIFT_BUNDLES, LIFT_STATES, LIFTS, SIGHTINGS, SURVEYS
+from barsight.store.tables import ABSENCES, LIFT_BUNDLES, LIFT_STATES, LIFTS, SIGHTINGS, SURVEY_FACTS, SURVEYS
 from barsight.yard.axes import turn_between
 from barsight.yard.inventory.bundle_file import bundle_of
 from barsight.yard.inventory.matching import moved_bundles
@@ -95,7 +95,7 @@ def list_surveys(connection: Connection) -> tuple[SurveyRow, ...]:
         grouped = select(table.c.survey_id, kind, func.count()).group_by(table.c.survey_id, kind)
         for survey_id, name, count in connection.execute(grouped).all():
             counts.setdefault(survey_id, Counter())[name] += count
-    rows = connection.execute(select(SURVEYS).order_by(SURVEYS.c.captured_to_ns, SURVEYS.c.id)).all()
+    rows = connection.execute(select(*SURVEY_FACTS).order_by(SURVEYS.c.captured_to_ns, SURVEYS.c.id)).all()
     return tuple(
         SurveyRow(
             r.map_id, r.captured_from_ns, r.captured_to_ns, r.is_simulated, r.folder,

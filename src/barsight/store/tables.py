@@ -55,6 +55,8 @@ SURVEYS = Table(
     *_texts("software_version", "folder", "files"), Column("heights", LargeBinary, nullable=False),
 )  # fmt: skip
 """Measured folders. files: JSON with SHA-256 of each file. heights: from `coarse_map.pack`."""
+SURVEY_FACTS = tuple(column for column in SURVEYS.c if column.name != "heights")
+"""Columns of a survey but for its heights, which fill the memory where many surveys are read."""
 
 BUNDLES = Table("bundles", METADATA, _key(), _of("surveys"))
 """Identities: one row for each bundle that was ever in the yard, with the survey that named it."""
