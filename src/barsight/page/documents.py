@@ -35,12 +35,11 @@ from barsight.store.tables import (
     SURVEYS,
 )  # fmt: skip
 from barsight.yard.inventory.bundle_file import read_match
+from barsight.yard.inventory.matching import SAME_SIZE_RATIO
 
 with extra("store"):
     from sqlalchemy import Connection, Row, func, or_, select
 
-LIKE_RATIO = 0.15
-"""Largest relative difference of bar diameter and width between bundles of the same kind."""
 MAX_LIFTS = MAX_ALARMS = MAX_RECORDINGS = 500
 """Maximum numbers of past ones that the page lists."""
 _FIGURES = (
@@ -103,7 +102,7 @@ def unseen_lengths(records: list[dict[str, Any]]) -> list[float | None]:
     unseen_m: list[float | None] = []
     for record in records:
         size = np.array([record["bar_diameter_m"] or np.nan, record["width_m"]])
-        alike = (np.abs(whole[:, :2] - size) <= LIKE_RATIO * size).all(axis=1)
+        alike = (np.abs(whole[:, :2] - size) <= SAME_SIZE_RATIO * size).all(axis=1)
         alike &= whole[:, 2] > record["length_m"]
         is_known = any(record["ends_open"]) and bool(alike.any())
         unseen_m.append(float(np.median(whole[alike, 2])) - record["length_m"] if is_known else None)
