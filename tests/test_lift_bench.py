@@ -103,26 +103,43 @@ def test_what_is_kept_is_done_again_for_other_sources_magnets_and_sizes(
         done.append(name)
         made.mkdir()
 
-    monkeypatch.setattr(lifts, "render_world", lambda _, out, full_size: make("rendered", out))
-    monkeypatch.setattr(lifts, "measure_into", lambda _, out, *a, **b: make("measured", out))
+    def render(_: object, out: Path, *, full_size: bool, trolley_y_m: tuple[float, ...]) -> None:
+        make("rendered", out)
+        for number in range(len(trolley_y_m)):
+            (out / f"pass_{number + 1}").mkdir()
+
+    def measure(paths: Path | list[Path], out: Path, *_: object, **__: object) -> None:
+        make("measured" if isinstance(paths, Path) else f"measured {[path.name for path in paths]}", out)
+
+    monkeypatch.setattr(lifts, "render_world", render)
+    monkeypatch.setattr(lifts, "measure_into", measure)
     monkeypatch.setattr(lifts, "measured_world", lambda *_: noisy_world(draw_yard(4, 3, 1), LiftSettings()))
     monkeypatch.setattr(lifts, "judge_yard", lambda *_: ())
     short = tmp_path / "short.toml"
     short.write_text(example_magnet().replace("2.1", "1.6"), encoding="utf-8")
 
-    def run(magnet: Path | None = None, *, full_size: bool = False) -> list[str]:
+    def run(magnet: Path | None = None, *trolley_y_m: float, full_size: bool = False) -> list[str]:
         done.clear()
-        choice = lifts.YardChoice(rendered=True, full_size=full_size)
+        choice = lifts.YardChoice(rendered=True, full_size=full_size, trolley_y_m=trolley_y_m)
         bench_lift_targets("4:5", choice, 0, keep=tmp_path / "kept", magnet=magnet)
         return done.copy()
 
     both = ["rendered", "measured"]
     assert run() == both and run() == []
     assert run(full_size=True) == both and run(short) == both and run(short) == []
+    assert run(short, -1.5, 1.8) == ["rendered", "measured ['pass_1', 'pass_2']"]
+    assert run(short, -1.5, 1.8) == [] and len(run(short, -1.5, 1.9)) == 2
+    assert run(short) == both
     monkeypatch.setattr(world_runs, "sources_digest", lambda _, names: str("yard" in names))
     assert run(short) == both
     monkeypatch.setattr(world_runs, "sources_digest", lambda _, names: "new" if "yard" in names else "False")
     assert run(short) == ["measured"]
+
+
+def test_passes_need_pictures_and_places_on_the_yard() -> None:
+    for rendered, trolley_y_m in ((False, (0.0,)), (True, (0.0, 99.0))):
+        with pytest.raises(ConfigError, match=r"trolley.y.m"):
+            lifts.YardChoice(rendered=rendered, trolley_y_m=trolley_y_m)
 
 
 def test_a_hundred_placements_on_one_yard_are_not_a_hundred_yards() -> None:

@@ -12,9 +12,11 @@ from barsight.benchmarks.lift_judge.envelopes import Envelope, envelope
 from barsight.benchmarks.lift_judge.magnet import JudgedMagnet
 from barsight.core.records.heights import HeightSource
 from barsight.result_folder import read_heights, read_summary
+from barsight.simulation.passes import simulate_passes
 from barsight.simulation.scene import Scene
 from barsight.simulation.settings.recording import SimulationSettings
 from barsight.simulation.settings.rig import CameraSettings
+from barsight.simulation.settings.travel import PassesSettings
 from barsight.simulation.simulate import LaidYard, simulate
 from barsight.simulation.worlds.conditions import ASIDE_M
 from barsight.simulation.worlds.surfaces import draw_finishes, scene_of
@@ -62,10 +64,15 @@ def recording_settings(world: DrawnYard, *, full_size: bool = False) -> Simulati
     )
 
 
-def render_world(world: DrawnYard, recording: Path, *, full_size: bool = False) -> None:
-    """Render a recording of a world."""
-    settings = recording_settings(world, full_size=full_size)
-    simulate(recording, settings, laid=LaidYard(drawn_scene(world), {}))
+def render_world(
+    world: DrawnYard, recording: Path, *, full_size: bool = False, trolley_y_m: tuple[float, ...] = ()
+) -> None:
+    """Render a recording of a world, or one of each pass (pass_1, pass_2) at these trolley positions."""
+    settings, laid = recording_settings(world, full_size=full_size), LaidYard(drawn_scene(world), {})
+    if trolley_y_m:
+        simulate_passes(recording, replace(settings, passes=PassesSettings(trolley_y_m)), laid=laid)
+    else:
+        simulate(recording, settings, laid=laid)
 
 
 @dataclass(frozen=True, eq=False)

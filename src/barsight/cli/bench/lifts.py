@@ -32,6 +32,7 @@ from barsight.core.errors import ConfigError, MeasurementError
 from barsight.core.json_values import write_json
 from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings
+from barsight.simulation.settings.travel import PassesSettings
 from barsight.simulation.worlds.yards import DrawnYard
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.magnet.description import Magnet, example_magnet, load_magnet
@@ -54,6 +55,13 @@ class YardChoice:
     """Render pictures of 1280x1024 instead of 640x512, which halves the pixel size on the surface but takes
     four times as long.
     """
+    trolley_y_m: tuple[float, ...] = ()
+    """Record each rendered yard in several passes, with the trolley at these positions; one by default."""
+
+    def __post_init__(self) -> None:
+        if self.trolley_y_m and not self.rendered:
+            raise ConfigError("bench lifts: trolley-y-m needs --rendered: the exact map has no passes")
+        PassesSettings(self.trolley_y_m)
 
 
 def bench_lift_targets(
@@ -102,7 +110,7 @@ def bench_lift_targets(
         judged = read_magnet(described_at)
         given = _Given(
             (keep or Path(scratch)).absolute(), load_magnet(described_at), judged, placements,
-            danger_placements, choice, WorldKeys.of((judged.half_span_m, choice.full_size), DRAWN_BY),
+            danger_placements, choice, _keys(judged, choice),
         )  # fmt: skip
         for seed, lifts in over_seeds(_judge_seed, numbers, given, workers, scheduler):
             found[seed] = lifts
@@ -132,6 +140,12 @@ class _Given:
     keys: WorldKeys
 
 
+def _keys(magnet: JudgedMagnet, choice: YardChoice) -> WorldKeys:
+    """Compute the keys of the kept results; without passes those that were kept before stay valid."""
+    passes = (choice.trolley_y_m,) if choice.trolley_y_m else ()
+    return WorldKeys.of((magnet.half_span_m, choice.full_size, *passes), DRAWN_BY)
+
+
 def _bench(found: dict[int, tuple[JudgedLift, ...]]) -> JudgedBench:
     return JudgedBench.of(len(found), [lift for seed in sorted(found) for lift in found[seed]])
 
@@ -152,10 +166,11 @@ def _measured(world: DrawnYard, folder: Path, settings: LiftSettings, given: _Gi
     """Render and measure the yard where its folder doesn't keep it. Raises MeasurementError where it can't be
     measured.
     """
-    full_size = given.choice.full_size
+    full_size, trolley_y_m = given.choice.full_size, given.choice.trolley_y_m
     note = keep_measured(
         folder, read_note(folder, "lifts"), given.keys,
-        lambda recording: render_world(world, recording, full_size=full_size), _measure,
+        lambda recording: render_world(world, recording, full_size=full_size, trolley_y_m=trolley_y_m),
+        _measure,
     )  # fmt: skip
     if note["refused"]:
         raise MeasurementError(f"bench lifts: seed {world.seed} can't be measured: {note['refused']}")
@@ -163,4 +178,5 @@ def _measured(world: DrawnYard, folder: Path, settings: LiftSettings, given: _Gi
 
 
 def _measure(recording: Path, out: Path) -> None:
-    measure_into(recording, out, MeasureSettings(), report=False, judged_at="end")
+    passes = sorted(recording.glob("pass_*")) or recording
+    measure_into(passes, out, MeasureSettings(), report=False, judged_at="end")
