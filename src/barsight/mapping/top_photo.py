@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from barsight.core.arrays import Bool, Float32, Float64, UInt8, UInt16
 from barsight.core.pose import Pose
-from barsight.core.records.pairs import RectifiedPair
+from barsight.core.records.pairs import RectifiedCamera, RectifiedPair
 from barsight.mapping.free_space import NO_END, UNPROVEN, bound_heights
 from barsight.mapping.observation import CellObservations
 from barsight.mapping.spilled_tiles import TileKey
@@ -29,6 +29,8 @@ SPAN_M = 0.35
 """Maximum width of the gaps that the tops' height bridges, as a bar laid across them would."""
 OVER_TOPS_M = 0.01
 """Height added to the tops: about that of a thin bar's middle above what carries it."""
+BESIDE_M = 0.5
+"""Distance within which a top that a picture's border cuts off hides lower things beyond the border."""
 MAX_VIEWS = 250
 """Maximum number of views added up per cell, so that the sum of gray levels fits into 16 bits."""
 
@@ -59,20 +61,21 @@ class TopPhoto:
             column * self.cell_m + offset + step * np.arange(columns),
             row * self.cell_m + offset + step * np.arange(rows),
         )
-        seen = reference_from_rect0.inverse().apply(np.stack([x, y, tops], axis=-1).reshape(-1, 3))
-        camera, depth = pair.camera, np.maximum(seen[:, 2], 1e-3)
-        left_x = camera.focal_px * seen[:, 0] / depth + camera.cx_px
-        right_x = left_x - camera.focal_px * camera.baseline_m / depth + camera.doffs_px
+        camera, rect0_from_reference = pair.camera, reference_from_rect0.inverse()
+        at = _pixels(camera, rect0_from_reference, x, y, tops)
+        # A top beside the border that the picture cuts off hides what seems to be seen beneath it.
+        under = _pixels(camera, rect0_from_reference, x, y, _highest_beside(tops, step))
         fine = tuple(COARSE_CELLS * n for n in reversed(tops.shape))
-        at_y = _finer(camera.focal_px * seen[:, 1] / depth + camera.cy_px, tops, fine)
+        at_y = _finer(at[2], fine)
         total, count = np.zeros(fine[::-1], np.uint16), np.zeros(fine[::-1], np.uint8)
-        for picture, valid, at in (
-            (pair.left, pair.left_valid, left_x), (pair.right, pair.right_valid, right_x)
+        for picture, valid, at_x, under_x in (
+            (pair.left, pair.left_valid, at[0], under[0]), (pair.right, pair.right_valid, at[1], under[1])
         ):  # fmt: skip
-            places = _finer(at, tops, fine), at_y
+            places, known = (_finer(at_x, fine), at_y), valid.astype(np.uint8)
             gray = cv2.remap(picture, *places, cv2.INTER_LINEAR, borderValue=0)
-            inside = cv2.remap(valid.astype(np.uint8), *places, cv2.INTER_NEAREST, borderValue=0) > 0
-            inside &= held
+            inside = cv2.remap(known, *places, cv2.INTER_NEAREST, borderValue=0) > 0
+            whole = cv2.remap(known, under_x, under[2], cv2.INTER_NEAREST, borderValue=0)
+            inside &= held & (cv2.resize(whole, fine, interpolation=cv2.INTER_NEAREST) > 0)
             total += np.where(inside, gray, 0).astype(np.uint16)
             count += inside.astype(np.uint8)
         for key in covering_tiles(column, row, count.shape):
@@ -133,18 +136,39 @@ def _tops(cells: CellObservations, column: int, row: int, cell_m: float) -> tupl
     bound_heights(cells.x, cells.y, cells.z_m, (column, row), highest, lowest)
     seen = (highest > NO_END).astype(np.uint8)
     heights = np.maximum(highest, cells.z_m.min())
+    coarse = shape[0], COARSE_CELLS, shape[1], COARSE_CELLS
     # The median keeps a single wrong match from raising the tops.
-    smooth = cv2.medianBlur(heights, 3).reshape(shape[0], COARSE_CELLS, shape[1], COARSE_CELLS)
-    span = round(SPAN_M / (COARSE_CELLS * cell_m)) | 1
-    tops = cv2.morphologyEx(smooth.max(axis=1).max(axis=2), cv2.MORPH_CLOSE, np.ones((span, span), np.uint8))
+    smooth = cv2.medianBlur(heights, 3).reshape(coarse).max(axis=(1, 3))
+    span = np.ones((round(SPAN_M / (COARSE_CELLS * cell_m)) | 1,) * 2, np.uint8)
+    tops = cv2.morphologyEx(smooth, cv2.MORPH_CLOSE, span)
+    # Beyond the border of what was seen there is no height that may lower the tops beside it.
+    enough = (2 * seen.reshape(coarse).sum(axis=(1, 3)) >= COARSE_CELLS**2).astype(np.uint8)
+    known = cv2.morphologyEx(enough, cv2.MORPH_CLOSE, span).astype(np.float32)
+    weight = cv2.blur(known, (3, 3))
+    around = cv2.blur(tops * known, (3, 3)) / np.maximum(weight, np.float32(1e-6))
+    tops = np.where(weight > 0, around, tops)
     wide = round(SPAN_M / cell_m) | 1
     held = cv2.morphologyEx(seen, cv2.MORPH_CLOSE, np.ones((wide, wide), np.uint8)) > 0
-    return np.asarray(cv2.blur(tops, (3, 3)) + np.float32(OVER_TOPS_M), np.float32), held
+    return np.asarray(tops + np.float32(OVER_TOPS_M), np.float32), held
 
 
-def _finer(at: Float64, coarse: Float32, size: tuple[int, ...]) -> Float32:
+def _highest_beside(tops: Float32, step_m: float) -> Float32:
+    """Return the highest of the tops (R, C) within BESIDE_M, in coarse cells of step_m."""
+    return np.asarray(cv2.dilate(tops, np.ones((2 * round(BESIDE_M / step_m) + 1,) * 2, np.uint8)))
+
+
+def _pixels(
+    camera: RectifiedCamera, rect0_from_reference: Pose, x: Float64, y: Float64, z: Float32
+) -> tuple[Float32, Float32, Float32]:
+    """Project places, by x, y and z (R, C) each, to columns in the left and the right picture, and rows."""
+    seen = rect0_from_reference.apply(np.stack([x, y, z], axis=-1).reshape(-1, 3)).reshape(*z.shape, 3)
+    depth = np.maximum(seen[..., 2], 1e-3)
+    left = camera.focal_px * seen[..., 0] / depth + camera.cx_px
+    right = left - camera.focal_px * camera.baseline_m / depth + camera.doffs_px
+    down = camera.focal_px * seen[..., 1] / depth + camera.cy_px
+    return left.astype(np.float32), right.astype(np.float32), down.astype(np.float32)
+
+
+def _finer(at: Float32, size: tuple[int, ...]) -> Float32:
     """Interpolate pixel coordinates of coarse cells to the map's own cells, size = (width, height)."""
-    return np.asarray(
-        cv2.resize(at.reshape(coarse.shape).astype(np.float32), size, interpolation=cv2.INTER_LINEAR),
-        np.float32,
-    )
+    return np.asarray(cv2.resize(at, size, interpolation=cv2.INTER_LINEAR), np.float32)
