@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -15,11 +15,13 @@ from barsight.core.stamps import seconds_to_ns
 from barsight.measure_settings import MeasureSettings
 from barsight.measurement import BuiltMap, Measurement, PassRecord, StageTime
 from barsight.pipeline.bundle_search import find_yard_bundles
+from barsight.pipeline.further_passes import find_unseen
 from barsight.pipeline.mapped_yard import MappedYard
 from barsight.pipeline.notices import stage_notices, stock_notices
 from barsight.reconstruction.joined_passes import MappedPass
 from barsight.reconstruction.probed_recording import ProbedRecording
 from barsight.reconstruction.tracked_recording import TrackedRecording
+from barsight.yard.cameras import Cameras
 from barsight.yard.events import YardEvent, events_since
 from barsight.yard.inventory.stock_list import StockMatch, contradicted_bundles, match_stock
 from barsight.yard.lifting.targets import LiftPlan, map_vetoes, offset_vetoes, plan_lifts
@@ -148,7 +150,9 @@ def _travel(
     camera = way.rectifier.camera
     range_m = probed.first.range_m
     trajectory = with_shared(way.trajectory, frame_of(source))
-    return Travel.of(trajectory, source.crane(), shift_ns, window_ns, range_m, camera, built.stamps_ns)
+    travel = Travel.of(trajectory, source.crane(), shift_ns, window_ns, range_m, camera, built.stamps_ns)
+    middle = trajectory.frames[len(trajectory.frames) // 2].reference_from_body
+    return replace(travel, cameras=Cameras.of(middle, way.rectifier.body_from_rect0, camera))
 
 
 def _lifts(
@@ -167,7 +171,7 @@ def _lifts(
         own = calibration_id(source.rig), yard_frame_id(source, trajectory)
         forbidden += offset_vetoes(request.magnet, *own)
     listed = {} if stock is None else contradicted_bundles(stock)
-    return plan_lifts(
+    plan = plan_lifts(
         heights,
         bundles,
         request.magnet or load_magnet(None),
@@ -178,3 +182,4 @@ def _lifts(
         events_since(request.events, travel.captured_ns),
         listed,
     )
+    return replace(plan, unseen=find_unseen(plan, heights, bundles))

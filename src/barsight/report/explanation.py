@@ -24,7 +24,7 @@ from barsight.yard.events import kept_events
 from barsight.yard.inventory.bundle_file import read_bundles
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.clearance import FacePlane, find_obstacle
-from barsight.yard.lifting.lift_file import forbidden_since, read_lifts
+from barsight.yard.lifting.lift_file import forbidden_since, read_lifts, read_unseen
 from barsight.yard.magnet.description import Magnet
 from barsight.yard.magnet.footprint import Placement
 from barsight.yard.map_lookup import lookup_heights
@@ -50,7 +50,8 @@ class Explanation:
     """A lift of lifts.json with the findings of its checks.
 
     title: in words. picture: (H, W, 3) BGR, None if nothing was known under the magnet. map_vetoes: what
-    forbids every lift of the map; since: what has forbidden this lift since it was offered.
+    forbids every lift of the map; since: what has forbidden this lift since it was offered. unseen: what
+    would show what was not seen of a refused lift, empty if nothing is known that would.
     """
 
     title: str
@@ -59,6 +60,7 @@ class Explanation:
     picture: UInt8 | None
     is_simulated: bool
     since: tuple[Veto, ...] = ()
+    unseen: str = ""
 
     @property
     def checks(self) -> list[dict[str, Any]]:
@@ -97,7 +99,9 @@ def explain(folder: Path, which: str) -> Explanation:
         picture = draw_place(read_heights(folder), record, magnet, bundles, settings)
     title = f"The lift of bundle {ids} {state}"
     simulated = bool(summary.get("is_simulated"))
-    return Explanation(title, record, tuple(lifts["vetoes"]), picture, simulated, since)
+    places = read_unseen(lifts) if rank is None else None
+    unseen = places.sentence_for(record["bundles"]) if places else ""
+    return Explanation(title, record, tuple(lifts["vetoes"]), picture, simulated, since, unseen)
 
 
 def _find(lifts: dict[str, Any], which: str, folder: Path) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from barsight.report.map_images import Raster, paint_height, robust_range
 from barsight.report.page_maps import LARGE_TEXT, Drawing, Key, MapFigure, Shape, draw_map
 from barsight.yard.axes import axes_of, corners
 from barsight.yard.inventory.bundle_file import read_bundles
-from barsight.yard.lifting.lift_file import read_lifts
+from barsight.yard.lifting.lift_file import read_lifts, read_unseen
 from barsight.yard.types import Bundle
 
 FREE_RGB, COVERED_RGB, LIFT_RGB = "#39d353", "#f2b134", "#ff2fb3"
@@ -27,11 +27,14 @@ FREE_RGB, COVERED_RGB, LIFT_RGB = "#39d353", "#f2b134", "#ff2fb3"
 
 @dataclass(frozen=True)
 class YardPart:
-    """Part of the page on bundles and lifts. lifts: content of lifts.json, None if there is none."""
+    """Part of the page on bundles and lifts. lifts: content of lifts.json, None if there is none. unseen:
+    sentences on what would show what was not seen of the refused ones.
+    """
 
     figures: tuple[MapFigure, ...]
     bundles: tuple[Bundle, ...]
     lifts: dict[str, Any] | None
+    unseen: tuple[str, ...]
 
 
 def yard_pictures(out_dir: Path, raster: Raster) -> tuple[MapFigure, ...]:
@@ -70,7 +73,8 @@ def yard_part(out_dir: Path, pictures: tuple[MapFigure, ...]) -> YardPart | None
         replace(figure, drawings=tuple(_with(drawing, shapes) for drawing in figure.drawings))
         for figure in pictures
     )
-    return YardPart(figures, bundles, lifts)
+    unseen = read_unseen(lifts) if lifts else None
+    return YardPart(figures, bundles, lifts, unseen.sentences if unseen else ())
 
 
 def _orthophoto(path: Path, raster: Raster) -> UInt8:

@@ -59,3 +59,5 @@ def _print(explanation: Explanation, console: Console) -> None:
         colour = COLOUR[check["result"]]
         table.add_row(f"[{colour}]{check['result']}[/{colour}]", escape(what), figure, bound, check["code"])
     console.print(table)
+    if explanation.unseen:
+        console.print(explanation.unseen, highlight=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -20,6 +20,7 @@ from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import MEASURE_AGAIN, ConfigError, Failed, InputError
 from barsight.core.files import changed_folder
 from barsight.core.parallel import in_background
+from barsight.pipeline.further_passes import find_unseen
 from barsight.report.page import draw_pictures, write_report
 from barsight.result_folder import (
     PHOTO,
@@ -95,6 +96,7 @@ def run(arguments: Sequence[str]) -> None:
                 )  # fmt: skip
                 order = _first_order(out, folder, plan, fetch) if fetch else None
                 happened = _recorded(out, happened)
+            plan = replace(plan, unseen=find_unseen(plan, folder.heights, folder.bundles))
             plan = plan if order is None else begin_order(order, plan, folder.bundles, folder.heights)
         console = SafeConsole(stderr=True)
         digest, sequence = bundles_digest(out), next_sequence(out / "lifts.json", folder.identity)
@@ -270,3 +272,5 @@ def print_lifts(plan: LiftPlan, console: Console) -> None:
     if reasons:
         listed = ", ".join(f"{code} {count}" for code, count in reasons.most_common())
         console.print(f"refused: {len(plan.refused)} ({listed})", highlight=False)
+    for sentence in plan.unseen.sentences if plan.unseen else ():
+        console.print(sentence, highlight=False)

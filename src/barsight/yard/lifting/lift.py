@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -47,6 +48,72 @@ class LiftScene:
         """Return the line across a load that most exceeds its limit; None where a bundle isn't seen."""
         lines = [found[0] for bundle in load if (found := self.thin_lines(bundle)) is not None]
         return max(lines, key=lambda line: line.excess_ratio) if lines and len(lines) == len(load) else None
+
+
+@dataclass(frozen=True)
+class FurtherPass:
+    """A pass that would show what was not seen of refused lifts: the cameras' body at y_m, which is shift_m
+    from where the pass with the most frames had it.
+
+    bundles: of these lifts. only_unseen: those of them whose lift nothing else is known to forbid.
+    """
+
+    y_m: float
+    shift_m: float
+    bundles: tuple[int, ...]
+    only_unseen: tuple[int, ...]
+
+    @property
+    def where(self) -> str:
+        """Describe the pass."""
+        way = f"{abs(self.shift_m):.1f} m towards {'+' if self.shift_m > 0 else '-'}y"
+        return f"A pass with the cameras at y {self.y_m:.1f} m (the trolley {way})"
+
+    @property
+    def sentence(self) -> str:
+        """Describe the pass and what it would show."""
+        rest = len(self.only_unseen)
+        also = f"; nothing else is known to forbid {rest} of them" if rest else ""
+        return f"{self.where} would show what was not seen of {_refused(self.bundles)}{also}."
+
+
+@dataclass(frozen=True)
+class UnseenPlaces:
+    """Places that were not seen, for which lifts are refused. passes: those that would show them, the best
+    first. in_sight: bundles of lifts of which some lie in the pictures but couldn't be measured, so that no
+    pass is proposed.
+    """
+
+    passes: tuple[FurtherPass, ...]
+    in_sight: tuple[int, ...]
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """Describe the passes, and what none of them would show."""
+        said = [one.sentence for one in self.passes]
+        if self.in_sight:
+            said.append(f"What was not seen of {_refused(self.in_sight)} {_IN_SIGHT}.")
+        return tuple(said)
+
+    def sentence_for(self, bundles: Collection[int]) -> str:
+        """Describe what would show what was not seen of the lift of these bundles; empty if nothing is known
+        that would.
+        """
+        for one in self.passes:
+            if set(bundles) & set(one.bundles):
+                return f"{one.where} would show what was not seen."
+        return f"What was not seen {_IN_SIGHT}." if set(bundles) & set(self.in_sight) else ""
+
+
+_IN_SIGHT = (
+    "lies in the pictures, at least in part, but too dark or too bare to be measured: a pass elsewhere is "
+    "not likely to show it"
+)
+
+
+def _refused(bundles: tuple[int, ...]) -> str:
+    ids = ", ".join(str(number) for number in bundles)
+    return f"{len(bundles)} refused bundle{'s' if len(bundles) > 1 else ''} ({ids})"
 
 
 @dataclass(frozen=True, eq=False)

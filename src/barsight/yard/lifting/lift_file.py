@@ -18,7 +18,7 @@ from barsight.yard.events import YardEvent
 from barsight.yard.identity import MapIdentity
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.bearing import magnet_reach
-from barsight.yard.lifting.lift import Lift
+from barsight.yard.lifting.lift import Lift, UnseenPlaces
 from barsight.yard.lifting.load import Load, laid_at
 from barsight.yard.lifting.order import LiftOrder
 from barsight.yard.lifting.targets import RULE, LiftPlan
@@ -50,6 +50,12 @@ def read_lifts(path: Path) -> dict[str, Any]:
     content = read_sealed(path, SCHEMA_VERSION, REMEDY)
     expect_schema(content, package_schema("barsight.yard", "lifts"), path, REMEDY)
     return content
+
+
+def read_unseen(content: dict[str, Any]) -> UnseenPlaces | None:
+    """Read what was not seen of refused lifts from the content of lifts.json; None if it doesn't tell."""
+    unseen = content.get("unseen")
+    return None if unseen is None else cattrs.structure(unseen, UnseenPlaces)
 
 
 def forbidden_since(
@@ -124,6 +130,7 @@ def lifts_content(
             "sides": [asdict(side) for side in plan.sides],
             "blocked": [asdict(each) for each in plan.blocked],
             "fetch": asdict(order) if order else None,
+            "unseen": asdict(plan.unseen) if plan.unseen else None,
         },
         DIGITS,
     )

@@ -18,7 +18,7 @@ from barsight.yard.events import YardEvent, events_since
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.assessment import assess_placement
 from barsight.yard.lifting.ground import Ground
-from barsight.yard.lifting.lift import Lift, LiftScene
+from barsight.yard.lifting.lift import Lift, LiftScene, UnseenPlaces
 from barsight.yard.lifting.load import Load, laid_at
 from barsight.yard.lifting.set_down import SetDown, find_set_down, sound_ground
 from barsight.yard.lifting.travel_accuracy import Travel
@@ -60,7 +60,8 @@ class LiftPlan:
     vetoes: those of the whole map; with any of them nothing is offered. footings: how each bundle stands.
     sides: of the piles. blocked: what must be moved before each bundle. judged_at_ns: time of the assessment
     on the frames' clock; captured_ns: stamps of the first and last frame, None where the map was given.
-    events: in the yard since it was measured. travel: of the map's frames.
+    events: in the yard since it was measured. travel: of the map's frames. unseen: what was not seen of the
+    refused lifts, None where that wasn't looked for.
     """
 
     magnet: Magnet
@@ -75,6 +76,7 @@ class LiftPlan:
     captured_ns: tuple[int, int] | None
     events: tuple[YardEvent, ...] = ()
     travel: Travel | None = None
+    unseen: UnseenPlaces | None = None
 
     @property
     def looks_back(self) -> bool:

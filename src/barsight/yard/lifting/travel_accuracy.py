@@ -18,6 +18,7 @@ from barsight.core.records.pairs import RectifiedCamera
 from barsight.core.records.sensor_samples import CraneSamples
 from barsight.core.records.trajectory import Trajectory
 from barsight.motion.crane.encoder_trajectory import fit_position
+from barsight.yard.cameras import Cameras
 from barsight.yard.lift_settings import UPPER, LiftSettings
 from barsight.yard.magnet.description import MAX_TURN_DEG, Magnet, MagnetOffset
 from barsight.yard.magnet.footprint import Placement
@@ -45,7 +46,7 @@ class Travel:
     one. measured: (N,) whether a frame's heights are in the map. sure_reach_m: distance from the body within
     which everything is in the picture. eye_z_m: the body's median height; pixel_rad: angle of a pixel; both
     NaN in files of an earlier version. pass_number: (N,) pass of each frame, from 1; empty where there is
-    only one.
+    only one. cameras: None in files of an earlier version, and where those of passes differ.
     """
 
     place_m: Float64
@@ -59,6 +60,7 @@ class Travel:
     eye_z_m: float = float("nan")
     pixel_rad: float = float("nan")
     pass_number: Int64 = field(default_factory=lambda: np.zeros(0, np.int64))
+    cameras: Cameras | None = None
 
     @property
     def captured_ns(self) -> tuple[int, int] | None:
@@ -115,9 +117,12 @@ class Travel:
         reach_m, sure_reach_m = max(part.reach_m for part in parts), min(part.sure_reach_m for part in parts)
         eye_z_m, pixel_rad = max(part.eye_z_m for part in parts), max(part.pixel_rad for part in parts)
         numbers = np.repeat(np.arange(1, len(parts) + 1), [len(part.stamp_ns) for part in parts])
+        cameras = parts[0].cameras
+        if cameras is not None and not all(cameras.is_like(part.cameras) for part in parts):
+            cameras = None
         return cls(
             place, sigma, off, refused, reach_m, stamps[order], measured, sure_reach_m, eye_z_m, pixel_rad,
-            numbers[order],
+            numbers[order], cameras,
         )  # fmt: skip
 
     @classmethod
@@ -135,6 +140,7 @@ class Travel:
             reach_m, sure_reach_m = float(content["reach_m"]), float(content["sure_reach_m"])
             eye_z_m, pixel_rad = (float(content.get(k, np.nan)) for k in ("eye_z_m", "pixel_rad"))
             numbers = np.array(content.get("pass_number", []), dtype=np.int64)
+            cameras = Cameras.read(content.get("cameras"))
         except (KeyError, TypeError, ValueError, OverflowError):
             return None
         whole = (
@@ -145,12 +151,14 @@ class Travel:
         if not whole or not _rises(stamps, numbers):
             return None
         return cls(
-            place, sigma, off, refused, reach_m, stamps, measured, sure_reach_m, eye_z_m, pixel_rad, numbers
+            place, sigma, off, refused, reach_m, stamps, measured, sure_reach_m, eye_z_m, pixel_rad, numbers,
+            cameras,
         )  # fmt: skip
 
     def content(self) -> dict[str, Any]:
         """Convert to the content of result.json; the writer handles NaN."""
-        return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(self).items()}
+        content = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(self).items()}
+        return content | {"cameras": None if self.cameras is None else self.cameras.content()}
 
 
 def _rises(stamps: Int64, numbers: Int64) -> bool:
