@@ -43,6 +43,13 @@ class PlacedCamera:
         ray = np.array([*(pixel - np.array(self.principal_px)) / self.focal_px, 1.0])
         return self.map_from_rect.translation, self.map_from_rect.rotation @ ray
 
+    @property
+    def projection(self) -> Float64:
+        """Compute the matrix (3, 4) that projects homogeneous positions in the map to homogeneous pixels."""
+        into, (cx, cy) = self.map_from_rect.inverse(), self.principal_px
+        inner = np.array([[self.focal_px, 0.0, cx], [0.0, self.focal_px, cy], [0.0, 0.0, 1.0]])
+        return np.asarray(inner @ np.hstack([into.rotation, into.translation[:, None]]), np.float64)
+
     def project(self, places_m: Float64) -> tuple[Float64, Float64]:
         """Project positions (..., 3) to pixels (..., 2), NaN behind the camera, and depth (...), m."""
         seen = self.map_from_rect.inverse().apply(places_m.reshape(-1, 3)).reshape(places_m.shape)

@@ -76,6 +76,16 @@ class FreeSpace:
                 out[theirs] = tile[1][ours]
         return out
 
+    def lower(self, column: int, row: int, bound: Float32) -> None:
+        """Lower the bounds of the cells from column and row on to `bound` (rows, columns), where that is
+        lower.
+        """
+        for key in covering_tiles(column, row, bound.shape):
+            if key in self.tiles:
+                ours, theirs = tile_overlap(key, column, row, bound.shape)
+                tile = self.tiles[key]
+                tile[(slice(None), *ours)] = np.minimum(tile[(slice(None), *ours)], bound[theirs])
+
     def rise(self, rise_m: float) -> None:
         """Move all bounds up."""
         for key in self.tiles:

@@ -14,7 +14,7 @@ from barsight.core.notices import Notice
 from barsight.core.stamps import seconds_to_ns
 from barsight.measure_settings import MeasureSettings
 from barsight.measurement import BuiltMap, Measurement, PassRecord, StageTime
-from barsight.pipeline.bundle_search import find_yard_bundles
+from barsight.pipeline.bundle_search import carve_gullies, find_yard_bundles
 from barsight.pipeline.further_passes import find_unseen
 from barsight.pipeline.mapped_yard import MappedYard
 from barsight.pipeline.notices import stage_notices, stock_notices
@@ -56,6 +56,8 @@ def find_lifts(mapped: MappedYard, request: LiftRequest) -> Measurement:
     watch, profiles = mapped.watch, mapped.profiles
     heights = surface_map(mapped.surface, mapped.free, mapped.tops, mapped.history)
     bundles = find_yard_bundles(mapped, heights)
+    carve_gullies(mapped, heights, bundles)
+    heights = surface_map(mapped.surface, mapped.free, mapped.tops, mapped.history)
     listed = mapped.stock if trajectory.reference == "yard" else None
     stock = None if listed is None else match_stock(listed, bundles)
     warnings = [*stage_notices(mapped), *stock_notices(mapped.stock, stock), *request.notices]
