@@ -27,7 +27,8 @@ from barsight.benchmarks.yard.drawn_worlds import (
     measured_world,
     noisy_world,
 )
-from barsight.benchmarks.yard.judged_lifts import draw_beside, over_bundle
+from barsight.benchmarks.yard.judged_lifts import draw_beside
+from barsight.benchmarks.yard.liftable_bundles import over_bundle
 from barsight.cli.bench.seeds import parse_seeds
 from barsight.simulation.worlds.recording import cover, is_uncovered
 from barsight.simulation.worlds.surfaces import owners

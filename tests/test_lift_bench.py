@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from barsight.benchmarks.lift_judge.envelopes import envelope
+from barsight.benchmarks.lift_judge.judge import Judge, Target
 from barsight.benchmarks.lift_judge.magnet import magnet_of, read_magnet
 from barsight.benchmarks.provenance import provenance
 from barsight.benchmarks.yard import world_runs
@@ -20,6 +21,7 @@ from barsight.benchmarks.yard.judged_lifts import (
     judge_yard,
     upper_bound,
 )
+from barsight.benchmarks.yard.liftable_bundles import liftable_bundles
 from barsight.cli.bench import lifts
 from barsight.cli.bench.lifts import bench_lift_targets
 from barsight.cli.main import run
@@ -55,8 +57,15 @@ def test_the_bench_tells_what_was_judged(tmp_path: Path) -> None:
     assert len(judged) >= 4 and all(not one.vetoes for one in judged if one.offered)
     for one in judged:
         assert np.isnan(one.true_mass_kg) or min(abs(one.true_mass_kg - kg) for kg in masses) < 1e-6
-    table = bench_table(JudgedBench.of(1, judged))
-    assert table.row_count == 10
+    offered = {one.load for one in judged if one.offered}
+    bundles = tuple(liftable_bundles(world, magnet, offered))
+    assert bundles and {one.bundle for one in bundles} <= set(world.free)
+    for one in bundles:
+        target = Target(one.x_m, one.y_m, np.radians(one.yaw_deg), magnet.tolerance)
+        verdict = Judge(world.yard, magnet).judge(target)
+        assert verdict.is_fine and verdict.load == (one.bundle,) and one.offered == (verdict.load in offered)
+    table = bench_table(JudgedBench.of(1, judged, bundles))
+    assert table.row_count == 11
 
 
 def test_placements_for_danger_say_nothing_of_what_is_refused(tmp_path: Path) -> None:
@@ -115,6 +124,7 @@ def test_what_is_kept_is_done_again_for_other_sources_magnets_and_sizes(
     monkeypatch.setattr(lifts, "measure_into", measure)
     monkeypatch.setattr(lifts, "measured_world", lambda *_: noisy_world(draw_yard(4, 3, 1), LiftSettings()))
     monkeypatch.setattr(lifts, "judge_yard", lambda *_: ())
+    monkeypatch.setattr(lifts, "liftable_bundles", lambda *_: ())
     short = tmp_path / "short.toml"
     short.write_text(example_magnet().replace("2.1", "1.6"), encoding="utf-8")
 
@@ -144,14 +154,14 @@ def test_passes_need_pictures_and_places_on_the_yard() -> None:
 
 def test_a_hundred_placements_on_one_yard_are_not_a_hundred_yards() -> None:
     """A tenth of the yards hold a danger in half of their placements: the bound holds in 95 %."""
-    one = JudgedLift(0, "", False, 0, 0, 0, (), (), (), 1, 1, 1, 1, 1)
+    one = JudgedLift(0, "", False, 0, 0, 0, (), (), (), 1, 1, 1, 1, 1, (0,))
     rng, held, made = np.random.default_rng(5), 0, provenance()
     for _ in range(100):
         lifts = [
             replace(one, seed=seed, dangerous=("over",) * (is_bad and k % 2))
             for seed, is_bad in enumerate((rng.random(16) < 0.1).tolist()) for k in range(10)
         ]  # fmt: skip
-        told = str(list(bench_table(JudgedBench(16, tuple(lifts), made)).columns[1].cells)[1])
+        told = str(list(bench_table(JudgedBench(16, tuple(lifts), (), made)).columns[1].cells)[1])
         assert "of 16 yards" in told
         held += float(told.split("bound ")[1].split(" %")[0]) >= 5.0
     assert held >= 95
@@ -165,8 +175,8 @@ def test_a_danger_without_a_veto_fails_the_bench(
     offered: bool, vetoes: tuple[str, ...], dangerous: tuple[str, ...], code: int,
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
-    one = JudgedLift(0, "", offered, 0, 0, 0, vetoes, dangerous, (), 1, 1, 1, 1, 1)
-    monkeypatch.setattr(lifts, "over_seeds", lambda *_: [(0, (one,))])
+    one = JudgedLift(0, "", offered, 0, 0, 0, vetoes, dangerous, (), 1, 1, 1, 1, 1, (0,))
+    monkeypatch.setattr(lifts, "over_seeds", lambda *_: [(0, ((one,), ()))])
     assert run(["bench", "lifts", "--seeds", "0:1"]) == code
     assert ("dangerous placements without a veto: 1" in capsys.readouterr().err) == (code != 0)
 

@@ -21,6 +21,7 @@ from barsight.benchmarks.lift_judge.judge import Judge, Target
 from barsight.benchmarks.lift_judge.magnet import JudgedMagnet
 from barsight.benchmarks.provenance import Provenance, provenance
 from barsight.benchmarks.yard.drawn_worlds import MappedWorld
+from barsight.benchmarks.yard.liftable_bundles import LiftableBundle, over_bundle, shifted
 from barsight.core.linalg.robust import SIGMAS_95
 from barsight.simulation.worlds.yards import DrawnYard
 from barsight.yard.lift_settings import LiftSettings
@@ -36,7 +37,8 @@ SPREAD = (0.1, 0.012, math.radians(0.1))
 
 @dataclass(frozen=True)
 class JudgedLift:
-    """One placement and its verdict. offered: it is one of the plan's lifts; vetoes: the planner's codes.
+    """One placement and its verdict. offered: it is one of the plan's lifts; vetoes: the planner's codes;
+    load: the bundles that lie under the faces.
 
     dangerous: the judge's reasons; for a vetoed placement that is dangerous at the target itself, only those
     found there. stated_*: values stated by the planner; true_*: values by the judge, NaN if there is no load.
@@ -57,6 +59,7 @@ class JudgedLift:
     stated_pull_low_n: float
     true_mass_kg: float
     true_pull_n: float
+    load: tuple[int, ...]
     for_danger: bool = False
 
     @property
@@ -67,16 +70,19 @@ class JudgedLift:
 
 @dataclass(frozen=True)
 class JudgedBench:
-    """All judged placements, and the number of yards that they come from."""
+    """All judged placements, the bundles that could be lifted, and the number of yards of both."""
 
     yards: int
     lifts: tuple[JudgedLift, ...]
+    bundles: tuple[LiftableBundle, ...]
     provenance: Provenance
 
     @classmethod
-    def of(cls, yards: int, lifts: Sequence[JudgedLift]) -> JudgedBench:
-        """Record the judged placements, with commit and machine."""
-        return cls(yards, tuple(lifts), provenance())
+    def of(
+        cls, yards: int, lifts: Sequence[JudgedLift], bundles: Sequence[LiftableBundle] = ()
+    ) -> JudgedBench:
+        """Record the judged placements and the bundles, with commit and machine."""
+        return cls(yards, tuple(lifts), tuple(bundles), provenance())
 
     @property
     def unvetoed(self) -> tuple[JudgedLift, ...]:
@@ -115,18 +121,10 @@ def judge_yard(
             yield replace(_judged(world, lift, judge, judged, offered=False), for_danger=more)
 
 
-def over_bundle(world: DrawnYard, bundle: int) -> Placement:
-    """Place the magnet over a bundle's centre of mass, along its bars."""
-    _, centre = world.yard.load(bundle)
-    along = world.yard.bars(bundle)[0].axes[0]
-    return Placement(float(centre[0]), float(centre[1]), math.atan2(-along[0], along[1]))
-
-
 def draw_beside(middle: Placement, rng: np.random.Generator) -> Placement:
     """Draw a placement around the given one, with the standard deviations SPREAD."""
-    along, across, turn = rng.normal(0, SPREAD)
-    x, y = (middle.x_m, middle.y_m) + along * middle.along + across * middle.across
-    return Placement(float(x), float(y), middle.yaw_rad + float(turn))
+    along, across, turn = (float(one) for one in rng.normal(0, SPREAD))
+    return replace(shifted(middle, along, across), yaw_rad=middle.yaw_rad + turn)
 
 
 def _judged(world: DrawnYard, lift: Lift, judge: Judge, magnet: JudgedMagnet, *, offered: bool) -> JudgedLift:
@@ -148,7 +146,7 @@ def _judged(world: DrawnYard, lift: Lift, judge: Judge, magnet: JudgedMagnet, *,
         world.seed, world.kind, offered, place.x_m, place.y_m, place.yaw_deg,
         tuple(sorted({veto.code for veto in lift.vetoes})), verdict.dangerous, verdict.unclear,
         lift.mass.kg, lift.mass.sigma_kg, contact.pull_low_n if contact else math.nan,
-        verdict.mass_kg, verdict.pull_n,
+        verdict.mass_kg, verdict.pull_n, verdict.load,
     )  # fmt: skip
 
 
@@ -182,6 +180,8 @@ def bench_table(bench: JudgedBench) -> Table:
         ("truly fine", f"{len(fine)}"),
         ("of these vetoed", _share(len(refused), len(fine))),
         ("why those were vetoed", _counts(codes)),
+        ("bundles with a fine placement, offered",
+         _share(sum(one.offered for one in bench.bundles), len(bench.bundles))),
         ("lower bound of the pull holds", _share(sum(low), len(low))),
         ("mass in its 95 % interval", _share(sum(mass), len(mass))),
     ):  # fmt: skip

@@ -24,6 +24,7 @@ from barsight.benchmarks.yard.judged_lifts import (
     dangerous_table,
     judge_yard,
 )
+from barsight.benchmarks.yard.liftable_bundles import LiftableBundle, liftable_bundles
 from barsight.benchmarks.yard.world_runs import DRAWS, WorldKeys, keep_measured, read_note
 from barsight.cli.bench.seeds import over_seeds, parse_seeds
 from barsight.cli.progress import stages
@@ -102,7 +103,7 @@ def bench_lift_targets(
             raise ConfigError(f"bench lifts: {name} must be 0 or more, not {count}")
     if scheduler is not None and keep is None:
         raise ConfigError("bench lifts: with --scheduler the workers share a folder: name it with --keep")
-    found: dict[int, tuple[JudgedLift, ...]] = {}
+    found: dict[int, _JudgedYard] = {}
     with tempfile.TemporaryDirectory() as scratch, stages(SafeConsole(stderr=True)) as advance:
         described_at = magnet or Path(scratch) / "magnet.toml"
         if magnet is None:
@@ -112,8 +113,8 @@ def bench_lift_targets(
             (keep or Path(scratch)).absolute(), load_magnet(described_at), judged, placements,
             danger_placements, choice, _keys(judged, choice),
         )  # fmt: skip
-        for seed, lifts in over_seeds(_judge_seed, numbers, given, workers, scheduler):
-            found[seed] = lifts
+        for seed, yard in over_seeds(_judge_seed, numbers, given, workers, scheduler):
+            found[seed] = yard
             advance("yards", len(found), len(numbers))
             if save is not None:
                 write_json(save, _bench(found))
@@ -146,11 +147,16 @@ def _keys(magnet: JudgedMagnet, choice: YardChoice) -> WorldKeys:
     return WorldKeys.of((magnet.half_span_m, choice.full_size, *passes), DRAWN_BY)
 
 
-def _bench(found: dict[int, tuple[JudgedLift, ...]]) -> JudgedBench:
-    return JudgedBench.of(len(found), [lift for seed in sorted(found) for lift in found[seed]])
+_JudgedYard = tuple[tuple[JudgedLift, ...], tuple[LiftableBundle, ...]]
 
 
-def _judge_seed(seed: int, given: _Given) -> tuple[JudgedLift, ...]:
+def _bench(found: dict[int, _JudgedYard]) -> JudgedBench:
+    yards = [yard for _, yard in sorted(found.items())]
+    lifts = [lift for lifts, _ in yards for lift in lifts]
+    return JudgedBench.of(len(yards), lifts, [bundle for _, bundles in yards for bundle in bundles])
+
+
+def _judge_seed(seed: int, given: _Given) -> _JudgedYard:
     kind = None if given.choice.kind == "by-seed" else given.choice.kind
     settings, folder = LiftSettings(), given.keep / f"{kind or 'seed'}_{seed}"
     world = judged_yard(seed, given.judged, kind)
@@ -159,7 +165,9 @@ def _judge_seed(seed: int, given: _Given) -> tuple[JudgedLift, ...]:
     else:
         mapped = noisy_world(world, settings)
     counts = given.placements, given.danger_placements
-    return tuple(judge_yard(world, mapped, given.magnet, given.judged, settings, *counts))
+    lifts = tuple(judge_yard(world, mapped, given.magnet, given.judged, settings, *counts))
+    offered = {lift.load for lift in lifts if lift.offered}
+    return lifts, tuple(liftable_bundles(world, given.judged, offered))
 
 
 def _measured(world: DrawnYard, folder: Path, settings: LiftSettings, given: _Given) -> MappedWorld:
