@@ -24,6 +24,9 @@ from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
 from barsight.yard.events import YardEvent
 from barsight.yard.lift_settings import LiftSettings
+from barsight.yard.lifting import targets
+from barsight.yard.lifting.assessment import assess_placement
+from barsight.yard.lifting.lift import Lift
 from barsight.yard.lifting.lift_file import lifts_content, read_lifts, write_lifts
 from barsight.yard.lifting.load import reaches_area
 from barsight.yard.lifting.targets import map_vetoes, plan_lifts
@@ -659,6 +662,37 @@ def test_an_empty_yard_and_one_without_a_free_bundle_offer_nothing() -> None:
     stock = [laid(0.3)]
     plan = plan_lifts(map_of(stock), (record(stock[0], on_top=False),), MAGNET, SETTINGS, ())
     assert plan.offered == plan.refused == ()
+
+
+def test_a_place_between_those_that_fail_for_different_reasons_is_found() -> None:
+    """Posts and unseen places beside the load leave it free only from -0.21 to -0.14 m along."""
+    one = laid(0.3, diameter_m=0.04)
+    heights = bare(map_of([one]))
+    # Nothing rises into the beam.
+    heights = replace(heights, free_m=np.full(heights.shape, one.top_z_m + 0.1, np.float32))
+    x = heights.x0_m + heights.cell_m * np.arange(heights.shape[1])
+    y = heights.y0_m + heights.cell_m * np.arange(heights.shape[0])
+    posts = np.ix_(np.abs(y + 0.3) <= 0.03, np.abs(np.abs(x - 0.3) - 0.08) <= 0.013)
+    heights.z_m[posts] = one.top_z_m + 0.15
+    unseen = np.ix_(np.abs(y - 1.345) <= 0.03, np.abs(np.abs(x - 0.3) - 0.1) <= 0.033)
+    heights.source[unseen] = HeightSource.UNKNOWN
+    heights.z_m[unseen] = np.nan
+    (lift,) = plan_lifts(heights, (record(one),), MAGNET, SETTINGS, ()).offered
+    assert lift.offset_along_m == pytest.approx(-0.175)
+
+
+def test_a_load_that_stands_badly_is_assessed_at_its_middle_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No other place of the magnet changes how the pile carries it."""
+    asked = list[Placement]()
+
+    def assess(place: Placement, *args: Any, **named: Any) -> Lift:
+        asked.append(place)
+        return assess_placement(place, *args, **named)
+
+    monkeypatch.setattr(targets, "assess_placement", assess)
+    stock, bundles = stack(0.15)
+    plan = plan_lifts(map_of(stock), bundles, MAGNET, SETTINGS, ())
+    assert "no-support" in codes(plan.refused[0]) and len(asked) == len(plan.refused) == 1
 
 
 def test_two_bundles_at_once_where_they_are_asked_for() -> None:

@@ -39,7 +39,12 @@ BETWEEN_M = (0.0075, -0.0075, 0.0225, -0.0225)
 """Offsets (m) across that are tried where some of those hold, but not within the crane's tolerance."""
 ALONG_M = (0.1, -0.1, 0.25, -0.25)
 """Offsets (m) along that are tried where none across is free of vetoes."""
-ANYWHERE = frozenset({"covered", "bundle-doubtful", "end-open", "mass-unknown", "overweight", "thin-bar"})
+BETWEEN_ALONG_M = (0.175, -0.175, 0.05, -0.05)
+"""Offsets (m) along that are tried where those have vetoes too, but no veto in common."""
+ANYWHERE = frozenset({
+    "covered", "bundle-doubtful", "end-open", "mass-unknown", "overweight", "thin-bar",
+    "overhanging", "unstable-side", "no-support", "over-stanchion",
+})  # fmt: skip
 """Vetoes of the load itself, which another place of the magnet can't change."""
 SAME_TOP_M, SAME_YAW_RAD = 0.03, np.radians(2.0)
 """Maximum differences of the tops (m) and the yaws of two bundles that are lifted together."""
@@ -267,16 +272,27 @@ def _best(group: tuple[Bundle, ...], yard: LiftScene, magnet: Magnet, settings: 
     if _forbidden_anywhere(quick) or (sound is not None and not sound.vetoes):
         return sound or quick[0]
     middle = _offset_across(group, quick[0].place)
-    between = [across for across in BETWEEN_M if sound is not None and abs(across) < limit]
-    beside = [(along, across) for along in ALONG_M for across in dict.fromkeys((0.0, middle))]
-    more = sorted(tried([*((0.0, across) for across in between), *beside]), key=_best_first)
-    found = [one for one in (sound, _sound(more, yard, magnet, settings)) if one is not None]
-    return min(found or [*quick, *more], key=_best_first)
+    found = [] if sound is None else [sound]
+    between = [(0.0, across) for across in BETWEEN_M if sound is not None and abs(across) < limit]
+    for lengths, others in ((ALONG_M, between), (BETWEEN_ALONG_M, [])):
+        beside = [(along, across) for along in lengths for across in dict.fromkeys((0.0, middle))]
+        more = sorted(tried([*others, *beside]), key=_best_first)
+        quick += more
+        best = _sound(more, yard, magnet, settings)
+        found += [] if best is None else [best]
+        if (best is not None and not best.vetoes) or _shared_codes(quick):
+            break
+    return min(found or quick, key=_best_first)
 
 
 def _forbidden_anywhere(lifts: list[Lift]) -> bool:
     """Check whether all lifts have the same veto of the load itself."""
-    return bool(ANYWHERE.intersection(*({veto.code for veto in lift.vetoes} for lift in lifts)))
+    return bool(ANYWHERE & _shared_codes(lifts))
+
+
+def _shared_codes(lifts: list[Lift]) -> set[str]:
+    """Return the codes of the vetoes that all lifts have."""
+    return set.intersection(*({veto.code for veto in lift.vetoes} for lift in lifts))
 
 
 def _sound(quick: list[Lift], yard: LiftScene, magnet: Magnet, settings: LiftSettings) -> Lift | None:
