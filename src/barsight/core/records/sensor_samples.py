@@ -24,8 +24,9 @@ class ImuSamples:
 class EncoderJump:
     """A jump in one encoder's readings, from `stamp_ns` on. axis: 0 bridge, 1 trolley, 2 hoist.
 
-    size_m, sigma_m: the estimated jump and its sigma. kind: certain, possible, or suspected because the
-    readings stood still before.
+    size_m: the estimated jump. sigma_m: its sigma where it is estimated anew, from readings on both sides of
+    it; found_sigma_m: its sigma as found. kind: certain, possible, or suspected because the readings stood
+    still before.
     """
 
     stamp_ns: int
@@ -33,6 +34,12 @@ class EncoderJump:
     size_m: float
     sigma_m: float
     kind: Literal["sure", "maybe", "freeze"] = "sure"
+    found_sigma_m: float = float("inf")
+
+    @property
+    def known_sigma_m(self) -> float:
+        """Return the jump's sigma where it is estimated no more."""
+        return min(self.sigma_m, self.found_sigma_m)
 
     def share(self, stamp_ns: Int64) -> Float64:
         """Return (N,) the factor of the jump's size in readings at these stamps: 0 before it, 1 from it

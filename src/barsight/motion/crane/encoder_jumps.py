@@ -28,6 +28,8 @@ from barsight.motion.crane.springs import find_springs, with_springs
 
 MIN_FOR_NOISE = 20
 """Minimum number of readings from which their noise is estimated."""
+REACH_S = 0.5
+"""Maximum distance, s, of a jump from the step by which it was found."""
 FAST_RATIO = 0.5
 """Speed, as a ratio of the fastest axis's, from which stamps that jitter show in the readings."""
 
@@ -68,9 +70,13 @@ def find_jumps(
     found: list[EncoderJump] = []
     while candidates := [step for step in steps.values() if step is not None]:
         best = max(candidates, key=lambda step: step.sigmas)
-        stamp, axis = _exact_stamp(crane, series, best), best.axis
+        middle, axis = int(series.stamp_ns[best.reading]), best.axis
+        around_it = JumpWindow.around(series, sigma_m, middle, known, reach_s=REACH_S)
+        if around_it is not None:  # a large jump just outside a window's steps seems to be at one of them
+            best = with_springs(around_it, springs).largest_step(axis, jumps[axis]) or best
+        stamp = _exact_stamp(crane, series, best)
         if best.sigmas > SURE_SIGMAS:
-            found.append(EncoderJump(stamp, axis, best.size_m, WIDE_M))
+            found.append(EncoderJump(stamp, axis, best.size_m, WIDE_M, found_sigma_m=best.sigma_m))
         else:
             found.append(EncoderJump(stamp, axis, 0.0, abs(best.size_m), "maybe"))
         jumps[axis].append(found[-1])

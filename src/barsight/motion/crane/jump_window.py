@@ -37,8 +37,8 @@ SURE_SIGMAS, MAYBE_SIGMAS = 4.7, 4.0
 tie between the readings on its two sides.
 """
 BLIND_RATIO = 1.7
-"""Factor on both thresholds where no IMU measures the travel: what a crane may do isn't quite normally
-distributed, and three outliers in a row look like a step.
+"""Factor on both thresholds and on a jump's sigma where no IMU measures the travel: what a crane may do isn't
+quite normally distributed, and three outliers in a row look like a step.
 """
 MIN_JUMP_M = 0.004
 WIDE_M = 10.0
@@ -65,14 +65,15 @@ SCALE, ASKEW_RAD = 2e-3, 2.6e-3
 @dataclass(frozen=True, eq=False)
 class FoundStep:
     """Step found on an axis. reading: the first of the series' readings beyond it; sigmas: its significance
-    (without an IMU reduced by `BLIND_RATIO`); way_m: (n,) the travel less the values that the step was fitted
-    to, at the window's readings, which begin at `first`.
+    (without an IMU reduced by `BLIND_RATIO`); size_m, sigma_m: the step itself; way_m: (n,) the travel less
+    the values that the step was fitted to, at the window's readings, which begin at `first`.
     """
 
     axis: int
     reading: int
     sigmas: float
     size_m: float
+    sigma_m: float
     first: int
     way_m: Float64
 
@@ -104,15 +105,16 @@ class JumpWindow:
         middle_ns: int,
         known: KnownMotion,
         half_s: float = HALF_S,
+        reach_s: float = STRIDE_S / 2,
     ) -> JumpWindow | None:
         """Gather the measurements around a stamp; None where they are too few for any step.
 
-        sigma_m: (n, 3) of the series' readings.
+        sigma_m: (n, 3) of the series' readings; reach_s: maximum distance of the steps from the stamp, s.
         """
         first, end = np.searchsorted(series.stamp_ns, known.span(middle_ns, seconds_to_ns(half_s)))
         stamps, place = series.stamp_ns[first:end], series.position_m[first:end]
         count = len(stamps)
-        beyond = np.flatnonzero(np.abs(stamps - middle_ns) <= seconds_to_ns(STRIDE_S / 2))
+        beyond = np.flatnonzero(np.abs(stamps - middle_ns) <= seconds_to_ns(reach_s))
         beyond = beyond[(beyond >= MIN_SIDE) & (beyond <= count - MIN_SIDE)]
         if count < 2 * MIN_SIDE:
             return None
@@ -156,11 +158,13 @@ class JumpWindow:
         tried = {int(np.abs(fit.sigmas).argmax()) for fit in (plain, without)}
         fits = [(self._robust(axis, open_m2, self.steps[:, k]), k) for k in tried]
         fit, k = min(fits, key=lambda one: one[0].cost)
-        sigmas = float(np.sqrt(max(0.0, 2 * (without.cost - fit.cost)))) / (1 if self.by_imu else BLIND_RATIO)
+        wider = 1 if self.by_imu else BLIND_RATIO
+        sigmas = float(np.sqrt(max(0.0, 2 * (without.cost - fit.cost)))) / wider
         if sigmas < MAYBE_SIGMAS or abs(fit.size_m) < MIN_JUMP_M:
             return None
         way = (fit.way_m - values)[: len(self.stamp_ns)]
-        return FoundStep(axis, self.first + int(self.beyond[k]), sigmas, fit.size_m, self.first, way)
+        reading = self.first + int(self.beyond[k])
+        return FoundStep(axis, reading, sigmas, fit.size_m, wider * fit.sigma_m, self.first, way)
 
     def step_at(self, axis: int, stamp_ns: int) -> tuple[float, float]:
         """Fit a step at a stamp; return its size and sigma, m."""

@@ -17,7 +17,7 @@ from gtsam.symbol_shorthand import E
 from barsight.core.arrays import Float64, Int64
 from barsight.core.linalg import dense
 from barsight.core.records.sensor_samples import CraneSamples, EncoderJump
-from barsight.core.stamps import seconds_to_ns
+from barsight.core.stamps import BEFORE_ALL_NS, seconds_to_ns
 from barsight.motion.batch.fault_detection import Stretch, frozen_stretches, merge_stretches, without_frozen
 from barsight.motion.crane.encoder_jumps import find_jumps, take_off_jumps
 from barsight.motion.crane.known_motion import KnownMotion
@@ -25,9 +25,10 @@ from barsight.motion.fixed_lag.sliding_window import Window
 from barsight.motion.problem.problem import MarginalPrior, encoder_unknowns_of
 
 NEWEST_S = 2.5
-"""Duration, s, of the newest readings in which jumps are sought: a jump shows more clearly as readings
-follow.
+"""Duration, s, of the readings in which jumps are sought again: a jump shows more clearly as readings follow.
 """
+MAX_SEARCHED_S = 600.0
+"""Maximum duration, s, of the readings in which jumps are sought at once, which takes 10 ms a second."""
 
 
 class EncoderWatch:
@@ -40,6 +41,7 @@ class EncoderWatch:
         self.jumps: tuple[EncoderJump, ...] = ()
         self.told: list[EncoderJump] = []
         self._frozen: list[Stretch] = []
+        self._searched_ns = BEFORE_ALL_NS
 
     @property
     def frozen(self) -> list[tuple[int, int]]:
@@ -52,7 +54,9 @@ class EncoderWatch:
         return np.array([sum(jump.size_m for jump in self.told if jump.axis == axis) for axis in range(3)])
 
     def check(self, crane: CraneSamples, known: KnownMotion) -> None:
-        """Look for faults in the newest readings. crane: the readings as they came."""
+        """Look for faults in the readings since the last look, however long ago that was, and in those of
+        `NEWEST_S` before it. crane: the readings as they came.
+        """
         if not len(crane.stamp_ns):
             return
         stamps, place = crane.stamp_ns, crane.position_m
@@ -68,8 +72,10 @@ class EncoderWatch:
         usable, after = without_frozen(crane, self._frozen_since(int(stamps[0])))
         reported = {jump.stamp_ns for jump in self.jumps}
         self._add([jump for jump in after if jump.stamp_ns not in reported])
-        newest_ns = int(stamps[-1]) - seconds_to_ns(NEWEST_S)
-        self._add(find_jumps(replace(usable, jumps=self.jumps), known, newest_ns))
+        since_ns = min(self._searched_ns, int(stamps[-1])) - seconds_to_ns(NEWEST_S)
+        self._searched_ns = int(stamps[-1])
+        since_ns = max(since_ns, int(stamps[-1]) - seconds_to_ns(MAX_SEARCHED_S))
+        self._add(find_jumps(replace(usable, jumps=self.jumps), known, since_ns))
 
     def put_together(self, begin_ns: int) -> dict[EncoderJump, tuple[EncoderJump, ...]]:
         """Replace the jumps of each encoder that lie before all readings held, from `begin_ns` on, by their
@@ -80,11 +86,21 @@ class EncoderWatch:
             past = tuple(jump for jump in self.jumps if jump.axis == axis and jump.stamp_ns <= begin_ns)
             if len(past) > 1:
                 size, sigma = sum(jump.size_m for jump in past), math.hypot(*(jump.sigma_m for jump in past))
-                found[EncoderJump(past[-1].stamp_ns, axis, size, sigma)] = past
+                known = math.hypot(*(jump.known_sigma_m for jump in past))
+                found[EncoderJump(past[-1].stamp_ns, axis, size, sigma, found_sigma_m=known)] = past
         gone = {jump for past in found.values() for jump in past}
         left = (*found, *(jump for jump in self.jumps if jump not in gone))
         self.jumps = tuple(sorted(left, key=lambda jump: jump.stamp_ns))
         return found
+
+    def settle(self, begin_ns: int) -> None:
+        """Take the jumps before a stamp as known as they were found, as a window that begins then has no
+        readings from before them.
+        """
+        self.jumps = tuple(
+            replace(jump, sigma_m=jump.known_sigma_m) if jump.stamp_ns <= begin_ns else jump
+            for jump in self.jumps
+        )
 
     def usable(self, crane: CraneSamples) -> CraneSamples:
         """Return the readings without the frozen ones and with the jumps subtracted."""

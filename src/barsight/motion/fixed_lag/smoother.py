@@ -25,7 +25,7 @@ from barsight.motion.batch.fusion import FusionSettings
 from barsight.motion.crane.encoder_trajectory import CraneSettings, fit_position, reestimate_noise
 from barsight.motion.fixed_lag.crane_ties import FIT_S, with_attitudes, with_encoder_positions
 from barsight.motion.fixed_lag.delay_watch import DelayWatch
-from barsight.motion.fixed_lag.encoder_watch import EncoderWatch, with_jumps, with_sums
+from barsight.motion.fixed_lag.encoder_watch import MAX_SEARCHED_S, EncoderWatch, with_jumps, with_sums
 from barsight.motion.fixed_lag.known_later import way_of_delay, widened
 from barsight.motion.fixed_lag.sensor_buffer import SensorBuffer
 from barsight.motion.fixed_lag.sliding_window import Window, add_frame, add_nodes
@@ -181,7 +181,7 @@ class FixedLagEstimator:
         now = self._come(stamp_ns)
         if self.delay.check(now):  # the window holds what late readings said
             self.window = self._left = self._scaled_ns = None
-            self.watch, now = EncoderWatch(), self._come(stamp_ns)
+            self.watch, now = EncoderWatch(), self._come(stamp_ns, MAX_SEARCHED_S)
         if now.crane is None or not len(now.crane.stamp_ns):
             return
         sums = self.watch.put_together(int(now.crane.stamp_ns[0]))
@@ -246,10 +246,10 @@ class FixedLagEstimator:
         now = self._come(stamp_ns)
         return now if now.crane is None else replace(now, crane=self.watch.usable(now.crane))
 
-    def _come(self, stamp_ns: int) -> SensorBuffer:
+    def _come(self, stamp_ns: int, look_back_s: float = LOOK_BACK_S) -> SensorBuffer:
         last = stamp_ns + self._shift_ns + self.readings.delay_ns
         begin = last if self.window is None else int(self.window.problem.stamp_ns[0])
-        return self.readings.between(begin - seconds_to_ns(LOOK_BACK_S), last, self.delay.late_ns)
+        return self.readings.between(begin - seconds_to_ns(look_back_s), last, self.delay.late_ns)
 
     def _begun(self, stamp: int, sighting: Sighting | None, now: SensorBuffer) -> Window | Failed:
         # Without encoders the first frame is the origin; a node before it would take that role.
@@ -265,6 +265,7 @@ class FixedLagEstimator:
         known = (stamp, stamp) if now.crane is None else (int(now.crane.stamp_ns[0]), stamp)
         ties = constrain_by_imu(nodes, start, known, now.imu, now.noise)
         settings = self._settings
+        self.watch.settle(stamp)
         problem = Problem(
             start, nodes.stamp_ns, now.crane is None, None, ties.preintegrated, (), (), ties.still, ties.bias,
             offset_prior_px=settings.offset_prior_px, scale_prior=settings.scale_sigma,
