@@ -81,6 +81,16 @@ def test_live_names_a_wrong_scale_and_goes_on_without_it(
     assert drift.nees_position < 10
 
 
+@pytest.mark.parametrize("seed", [20141, 20143, 20148])
+def test_live_holds_a_scale_in_sigma_that_it_cannot_tell(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It counted from 2 sigma on, and not in what was placed before: NEES was 19, 42 and 43."""
+    found, drift = drawn(seed, monkeypatch, (1.005, 1.0), "live")
+    assert not found.doubts and drift.nees_position < 3
+    clean, drift = drawn(seed, monkeypatch, (1.0, 1.0), "live")
+    sigma_m = np.median([np.sqrt(np.trace(frame.covariance[3:, 3:])) for frame in clean.frames])
+    assert not (clean.doubts or clean.warnings) and drift.nees_position < 2 and sigma_m < 0.006
+
+
 @pytest.mark.parametrize("seed", [20002, 20011, 20019])
 def test_a_rig_that_hangs_askew_is_in_sigma(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each node's nominal attitude counted anew: NEES of the attitude was 8 to 13 live."""

@@ -45,7 +45,7 @@ from barsight.motion.problem.stereo_factors import (
     temporal_inflation,
     well_observed,
 )
-from barsight.motion.problem.travel import Scales
+from barsight.motion.problem.travel import Scales, widen_positions
 
 FARTHEST_OUTLIER_SIGMAS = 3.5
 MAX_ROUNDS = 3
@@ -191,13 +191,12 @@ def _covariance(drift: RigDrift | None) -> Float64:
 
 def _widened(estimate: Estimate, problem: Problem, frames: Int64) -> Estimate:
     """Add to the frames' positions by how much scales that are only suspected may shift them."""
-    (axes, scales), covariance = estimate.suspected, estimate.covariance.copy()
+    axes, scales = estimate.suspected
     if not axes or problem.travel is None:
         return estimate
     place = np.array([estimate.poses[k].translation for k in frames])
     shift = problem.travel.shifts(axes, scales.value, place)
-    covariance[:, 3:, 3:] += shift[:, :, None] * shift[:, None, :]
-    return replace(estimate, covariance=covariance)
+    return replace(estimate, covariance=widen_positions(estimate.covariance, shift))
 
 
 def covariances(found: Marginals, poses: tuple[Pose, ...], drift: RigDrift | None) -> Float64:

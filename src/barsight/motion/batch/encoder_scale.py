@@ -27,8 +27,10 @@ MAYBE_SIGMAS = 4.5
 """Significance from which a scale may be wrong, so that it becomes an unknown."""
 SUSPECTED_SIGMAS = 3.3
 """Significance from which a scale that isn't an unknown counts in the sigma of a whole recording's poses."""
-WIDER_SIGMAS = 2.0
-"""Significance from which a scale that isn't an unknown yet counts in the sigma of what is known by then."""
+WIDER_SIGMAS = 1.0
+"""Significance from which a scale that isn't an unknown yet counts in the sigma of what is known by then; it
+counts in full where it is one sigma more.
+"""
 MIN_WAY_M = 0.5
 """Minimum travel on an axis for its scale to be told."""
 
@@ -90,6 +92,14 @@ def doubtful_axes(problem: Problem, axes: tuple[int, ...], scales: Scales | None
         return ()
     near = (sigmas > 0) & (sigmas.max() ** 2 - sigmas**2 < SURE_SCALE_SIGMAS**2)
     return tuple(np.array(axes, np.int64)[near].tolist())
+
+
+def possible_scales(problem: Problem, axes: tuple[int, ...], scales: Scales) -> Float64:
+    """Weigh how wrong the scales (S,) of some axes may be that are taken as right: the more significant, the
+    nearer to the value that cameras and IMU show.
+    """
+    value, sigmas = scales_alone(problem, axes, scales)
+    return value * np.clip(sigmas - WIDER_SIGMAS, 0.0, 1.0)
 
 
 def scales_alone(problem: Problem, axes: tuple[int, ...], scales: Scales) -> tuple[Float64, Float64]:

@@ -17,7 +17,7 @@ from barsight.core.errors import Failed
 from barsight.core.pose import Pose
 from barsight.core.records.pairs import RefusedFrame
 from barsight.core.records.trajectory import PosedFrame
-from barsight.core.stamps import NS_PER_S, seconds_to_ns
+from barsight.core.stamps import seconds_to_ns
 from barsight.features.guided_matching import PredictedMotion
 from barsight.inertial.preintegration import Preintegrated
 from barsight.motion.batch.fault_detection import freeze_sentences
@@ -26,7 +26,12 @@ from barsight.motion.crane.encoder_trajectory import CraneSettings, fit_position
 from barsight.motion.fixed_lag.crane_ties import FIT_S, with_attitudes, with_encoder_positions
 from barsight.motion.fixed_lag.delay_watch import DelayWatch
 from barsight.motion.fixed_lag.encoder_watch import MAX_SEARCHED_S, EncoderWatch, with_jumps, with_sums
-from barsight.motion.fixed_lag.known_later import way_of_delay, widened
+from barsight.motion.fixed_lag.known_later import (
+    live_scale_sentences,
+    way_of_delay,
+    widened,
+    widened_by_scales,
+)
 from barsight.motion.fixed_lag.sensor_buffer import SensorBuffer
 from barsight.motion.fixed_lag.sliding_window import Window, add_frame, add_nodes
 from barsight.motion.fixed_lag.window_update import marginalise, solve_window
@@ -35,11 +40,7 @@ from barsight.motion.frontend.motion_prediction import CranePredictor, predict_b
 from barsight.motion.frontend.seen_steps import known_motion
 from barsight.motion.frontend.sightings import Sighting
 from barsight.motion.gravity import GravityAlignment
-from barsight.motion.problem.encoder_factors import (
-    jump_sentences,
-    scale_excess,
-    scale_sentences,
-)
+from barsight.motion.problem.encoder_factors import jump_sentences
 from barsight.motion.problem.gauss_newton import GraphState
 from barsight.motion.problem.gtsam_factors import initial_values
 from barsight.motion.problem.nodes import (
@@ -211,33 +212,17 @@ class FixedLagEstimator:
         begin_ns = int(crane.stamp_ns[0])
         sure, maybe = jump_sentences(sorted(self.watch.told, key=lambda jump: jump.stamp_ns), begin_ns, None)
         late, frozen = self.delay.sentences(begin_ns), freeze_sentences(self.watch.frozen, begin_ns)
-        return (*late, *frozen, *self._scale_sentences(begin_ns), *sure), maybe
-
-    def _scale_sentences(self, begin_ns: int) -> tuple[str, ...]:
-        """Describe the scales that are no longer taken as right: whichever is wrong, poses before are off."""
-        window = self.window or self._left
-        if window is None or window.scales is None or self._scaled_ns is None:
-            return ()
-        problem, excess = window.problem, scale_excess(window.problem, window.scales)
-        at = [k for k, axis in enumerate(problem.scaled) if axis not in problem.held]
-        since = f" from {(self._scaled_ns - begin_ns) / NS_PER_S:.1f} s on; poses before may be off by it"
-        sure, maybe = scale_sentences([problem.scaled[k] for k in at], excess.chosen(at), since)
-        return sure + maybe
+        wrong, suspected = live_scale_sentences(self.window or self._left, self._scaled_ns, begin_ns)
+        return (*late, *frozen, *wrong, *sure), (*suspected, *maybe)
 
     def told_later(self, frames: Sequence[PosedFrame]) -> tuple[PosedFrame, ...]:
-        """Widen the poses from before a delay or a wrong scale of the encoders was known."""
+        """Widen the poses from before a delay or a wrong scale of the encoders was known or suspected."""
         crane, window = self.readings.crane, self.window or self._left
         stamps = np.array([frame.stamp_ns for frame in frames], np.int64) + self._shift_ns
         if crane is None or not len(stamps):
             return tuple(frames)
         found = widened(frames, way_of_delay(crane, stamps, self.delay.late_ns, self.delay.found_ns))
-        if window is None or window.scales is None or self._scaled_ns is None:
-            return found
-        problem, place = window.problem, np.array([f.reference_from_body.translation for f in frames])
-        assert problem.travel is not None
-        share = np.where(np.isin(problem.scaled, problem.held), 0.0, window.scales.value)
-        off = problem.travel.shifts(problem.scaled, share, place)
-        return widened(found, np.where((stamps < self._scaled_ns)[:, None], off, 0.0))
+        return widened_by_scales(found, stamps, window, self._scaled_ns)
 
     def _now(self, stamp_ns: int) -> SensorBuffer:
         """Select the readings that have arrived when the frame at a stamp is computed, from before the first

@@ -17,7 +17,7 @@ import numpy as np
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.linalg import dense, skyline
 from barsight.core.pose import Pose, skew
-from barsight.motion.batch.encoder_scale import WIDER_SIGMAS, scales_alone, weigh_scales
+from barsight.motion.batch.encoder_scale import possible_scales, weigh_scales
 from barsight.motion.linear.chain_elimination import (
     Chain,
     EliminatedNodes,
@@ -283,10 +283,8 @@ def _widened(problem: Problem, newest: NewestNode, scales: Scales, factor: Float
     """Add to the last node by how much scales that are held may be shifting it. factor: of the last node, the
     border, and the scales that are held.
     """
-    value, sigmas = scales_alone(
-        problem, problem.held, scales.chosen(np.flatnonzero(np.isin(problem.scaled, problem.held)))
-    )
-    off = np.where(sigmas > WIDER_SIGMAS, value, 0.0)
+    at = np.flatnonzero(np.isin(problem.scaled, problem.held))
+    off = possible_scales(problem, problem.held, scales.chosen(at))
     if not off.any():
         return newest
     information = factor @ factor.T

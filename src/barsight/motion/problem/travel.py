@@ -49,3 +49,12 @@ class Scales:
     def chosen(self, at: Any) -> Scales:
         """Select some of the scales."""
         return Scales(self.value[at], self.covariance[np.ix_(at, at)])
+
+
+def widen_positions(covariance: Float64, shift_m: Float64) -> Float64:
+    """Add the squares of shifts (..., 3), each as one error along its direction, to the positions' part of
+    pose covariances (..., 6, 6).
+    """
+    wider = covariance.copy()
+    wider[..., 3:, 3:] += shift_m[..., :, None] * shift_m[..., None, :]
+    return wider
