@@ -53,6 +53,11 @@ READINGS_PER_SIDE, MAX_REACH_NS = 3.1, 800_000_000
 ones a crane's travel is no parabola. So at least four readings a second are needed.
 """
 
+MIN_CHANGES, SAME_M, MULTIPLE_RATIO = 5, 1e-6, 0.006
+"""Minimum number of changes of an encoder's readings that show its resolution; the largest change that is
+rounding; and how far a change may be from a multiple of it.
+"""
+
 
 @dataclass(frozen=True, eq=False)
 class CraneSamples:
@@ -77,6 +82,25 @@ class CraneSamples:
     def interval_ns(self) -> int:
         """Return the median interval of the readings, 0 where there are fewer than two."""
         return int(np.median(np.diff(self.stamp_ns))) if len(self.stamp_ns) > 1 else 0
+
+    @cached_property
+    def resolution_m(self) -> float:
+        """Return the coarsest step of which all an encoder's changes are multiples; 0 where readings are too
+        few or too fine to show it. (Readings at one speed change by one step, too, but none of them is equal
+        to the last.)
+        """
+        coarsest = 0.0
+        for axis in self.position_m.T:
+            steps = np.abs(np.diff(axis))
+            changed = np.flatnonzero(steps > SAME_M)
+            if len(changed) < MIN_CHANGES:
+                continue
+            finest = float(steps[changed].min())
+            multiple = steps[changed] / finest
+            others = np.count_nonzero(multiple > 1.5) + np.diff(changed).sum() - len(changed) + 1
+            if np.abs(multiple - multiple.round()).max() < MULTIPLE_RATIO and 2 * others >= len(changed):
+                coarsest = max(coarsest, finest)
+        return coarsest
 
     def reach_ns(self, half_ns: int) -> int:
         """Return the half-width of a window that is wide enough for slow encoders too, if any is."""

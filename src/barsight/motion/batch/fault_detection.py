@@ -29,6 +29,7 @@ MIN_HELD_M, HELD_SIGMAS = 0.01, 8.0
 """Minimum distance, in m and in sigma of a reading (the larger counts), that a crane must have travelled
 during equal readings for these to be frozen.
 """
+SPEED_SIGMAS = 3.0
 MAX_BRAKING_MPS2, MAX_ALONE_MPS2 = 1.0, (1.0, 4.0, 4.0)
 """Maximum braking of the crane as a whole, and of bridge, trolley and hoist alone, whose brakes differ."""
 STOP_WINDOW_S = 0.1
@@ -84,7 +85,7 @@ def freeze_sentences(parts: Sequence[tuple[int, int]], begin_ns: int) -> tuple[s
 
 def min_way_m(crane: CraneSamples) -> float:
     """Return the minimum travel (m) from which encoders that stand still count as frozen."""
-    return max(MIN_HELD_M, HELD_SIGMAS * crane.position_std_m)
+    return max(MIN_HELD_M, HELD_SIGMAS * max(crane.position_std_m, crane.resolution_m / 12**0.5))
 
 
 def without_frozen(
@@ -249,15 +250,15 @@ def _frozen(position_m: Float64, axes: tuple[int, ...], time: Float64, min_m: fl
         # Two of the three may be wild.
         away = float(np.linalg.norm(after - place[last], axis=1).min()) if len(after) == 3 else 0.0
         away -= braking * float(time[min(last + 2, len(time) - 1)] - time[last]) ** 2 / 2
-        speed = _speed_before(place, time, int(first))
+        speed = _speed_before(place, time, int(first), min_m / HELD_SIGMAS)
         braked = min(float(time[last] - time[first]), speed / braking)
         if max(away, (speed - braking * braked / 2) * braked) > min_m:
             found.append((int(first), int(last)))
     return found
 
 
-def _speed_before(place: Float64, time: Float64, first: int) -> float:
-    """Extrapolate the speed (m/s) at a reading from the readings before it.
+def _speed_before(place: Float64, time: Float64, first: int, sigma_m: float) -> float:
+    """Extrapolate the speed (m/s) at a reading from the readings before it, less what their sigma may add.
 
     It continues the medians of the earlier and the later rates over half a window, since a braking crane is
     slower than it was, and is at most that of the last steps.
@@ -275,4 +276,5 @@ def _speed_before(place: Float64, time: Float64, first: int) -> float:
     # The third, since two may be wild.
     last = np.array([min(first - 1, near), min(first - 3, near)])
     steps = np.linalg.norm(place[first] - place[last], axis=1) / (time[first] - time[last])
-    return min(speed, float(steps.min()))
+    unsure = SPEED_SIGMAS * sigma_m / float(np.median(time[new] - time[old]))
+    return max(0.0, min(speed, float(steps.min())) - unsure)

@@ -33,6 +33,10 @@ MIN_WAY_M = 0.1
 """Steps that are shorter than this by both pictures and encoders show neither scale nor direction."""
 MAX_WAY_RATIO, MAX_ANGLE_DEG = 1.15, 5.0
 """Maximum ratio between the encoders' and the pictures' travel, and maximum angle between the two."""
+MAX_FAST_S = 0.06
+"""Maximum interval, s, of readings five of which a crane travels nearly straight."""
+READING_SIGMAS = 2.0
+"""Distance, in sigma of a reading, by which the readings may leave a step's direction."""
 TURNS_SIGMAS, MAX_TURN_RATIO, MIN_ALIKE = 4.0, 5.0, 0.7
 """Minimum size of a turn, in sigma, for it to be seen; maximum ratio between the gyro's and the pictures'
 turns; minimum cosine between them.
@@ -63,7 +67,8 @@ def refuse_contradictions(
 
 
 def _check_encoders(path: Path, steps: SeenSteps, crane: CraneSamples) -> None:
-    place = median_filter(crane.position_m, size=(5, 1), mode="nearest")  # against single outliers
+    fast = crane.interval_ns <= seconds_to_ns(MAX_FAST_S)
+    place = median_filter(crane.position_m, size=(5 if fast else 3, 1), mode="nearest")  # against outliers
     for first, last, _ in frozen_stretches(crane):  # reported by itself: no wrong unit or axis
         place[first : last + 1] = np.nan
     seen_m = np.linalg.norm(steps.way_m, axis=1)
@@ -80,10 +85,11 @@ def _check_encoders(path: Path, steps: SeenSteps, crane: CraneSamples) -> None:
         long = np.maximum(read_m, seen_m) > MIN_WAY_M
         if long.sum() < MIN_STEPS:
             return None
-        cosine = (travel * steps.way_m).sum(axis=1)[long] / np.maximum(read_m * seen_m, 1e-12)[long]
+        product = np.maximum(read_m * seen_m, 1e-12)[long]
+        angle = np.arccos(np.clip((travel * steps.way_m).sum(axis=1)[long] / product, -1, 1))
+        angle -= np.arctan2(READING_SIGMAS * crane.position_std_m, read_m[long])
         ratio = float(np.median(read_m[long] / np.maximum(seen_m[long], 1e-6)))
-        least = float(np.percentile(cosine, 25))  # diagonal steps hide exchanged axes
-        return ratio, float(np.degrees(np.arccos(np.clip(least, -1, 1))))
+        return ratio, float(np.degrees(np.percentile(angle, 75)))  # diagonal steps hide exchanged axes
 
     found = compared(0.0)
     if found is None:

@@ -208,12 +208,15 @@ def _hidden_m2(position_m: Float64, sigma_m: float) -> Float64:
 
 
 def reestimate_noise(crane: CraneSamples) -> CraneSamples:
-    """Re-estimate the readings' sigma from themselves, within a factor of two of the stated one.
+    """Re-estimate the readings' sigma from themselves, within a factor of two of the stated one, but no finer
+    than their resolution.
 
     Uses fourth differences, which suppress any smooth motion, and their median, which is robust to outliers.
     (Each outlier is in five of them, so the largest ones are removed before the median.) A median of zero
     shows rounding, not noise.
     """
+    rounding = crane.resolution_m / 12**0.5
+    crane = replace(crane, position_std_m=max(crane.position_std_m, rounding))
     if len(crane.stamp_ns) < MIN_FOR_NOISE:
         return crane
     fourth = np.abs(np.diff(crane.position_m, n=4, axis=0))
@@ -225,4 +228,4 @@ def reestimate_noise(crane: CraneSamples) -> CraneSamples:
         return crane
     seen = spread / 70**0.5
     stated = crane.position_std_m
-    return replace(crane, position_std_m=float(np.clip(seen, stated / 2, stated * 2)))
+    return replace(crane, position_std_m=max(rounding, float(np.clip(seen, stated / 2, stated * 2))))
