@@ -14,7 +14,9 @@ from barsight.core.errors import InputError
 from barsight.core.records.sensor_samples import CraneSamples
 from barsight.motion.batch.fault_detection import frozen_stretches
 from barsight.motion.batch.sensor_agreement import refuse_contradictions
+from barsight.motion.crane.encoder_jumps import find_jumps
 from barsight.motion.crane.encoder_trajectory import reestimate_noise
+from barsight.motion.crane.known_motion import KnownMotion
 from drawn_cranes import drawn_crane, drawn_senses
 
 
@@ -41,6 +43,16 @@ def test_coarse_encoders_froze_nothing(stated: bool) -> None:
         assert whole.resolution_m == pytest.approx(0.02)
         assert reestimate_noise(whole).position_std_m >= 0.0057
         assert frozen_stretches(whole) == []
+
+
+@pytest.mark.parametrize("seed", [20004, 20014])
+def test_less_than_a_count_is_no_jump(seed: int) -> None:
+    """Of counts of 10 mm, oscillating cranes were told to jump by 5 to 8 mm; two counts are found."""
+    imu = drawn_senses(drawn_crane(seed), seed).imu
+    for jump_m in (0.0, 0.02):
+        read = reestimate_noise(coarse(drawn_crane(seed, jump_m=jump_m).readings, 0.01))
+        jumps = find_jumps(read, KnownMotion(None, imu))
+        assert [jump.kind for jump in jumps] == (["sure"] if jump_m else [])
 
 
 def test_noise_shows_no_resolution() -> None:

@@ -28,6 +28,8 @@ from barsight.motion.crane.springs import find_springs, with_springs
 
 MIN_FOR_NOISE = 20
 """Minimum number of readings from which their noise is estimated."""
+MIN_COUNTS = 0.8
+"""Minimum size of a jump in steps of its encoder's resolution, since counts are lost as a whole."""
 REACH_S = 0.5
 """Maximum distance, s, of a jump from the step by which it was found."""
 FAST_RATIO = 0.5
@@ -59,12 +61,14 @@ def find_jumps(
         return ()
     springs = find_springs(list(windows.values()), jumps)
     sprung = {m: with_springs(window, springs) for m, window in windows.items()}
+    least_m = MIN_COUNTS * crane.resolution_m
 
     def largest_step(m: int, axis: int, step: FoundStep | None) -> FoundStep | None:
         """Find the largest step beside the oscillations. They only explain `step`, found without them: one
         that isn't there without them is what is left of a wild reading that was taken for an oscillation.
         """
-        return step and sprung[m].largest_step(axis, jumps[axis])
+        found = step and sprung[m].largest_step(axis, jumps[axis])
+        return found if found is not None and abs(found.size_m) > least_m else None
 
     steps = {(m, axis): largest_step(m, axis, step) for (m, axis), step in steps.items()}
     found: list[EncoderJump] = []
