@@ -47,7 +47,7 @@ def test_coarse_encoders_froze_nothing(stated: bool) -> None:
 
 @pytest.mark.parametrize("seed", [20004, 20014])
 def test_less_than_a_count_is_no_jump(seed: int) -> None:
-    """Of counts of 10 mm, oscillating cranes were told to jump by 5 to 8 mm; two counts are found."""
+    """Oscillating cranes with counts of 10 mm were told to jump by 5 to 8 mm; two counts are found."""
     imu = drawn_senses(drawn_crane(seed), seed).imu
     for jump_m in (0.0, 0.02):
         read = reestimate_noise(coarse(drawn_crane(seed, jump_m=jump_m).readings, 0.01))
