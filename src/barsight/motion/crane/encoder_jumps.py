@@ -61,14 +61,14 @@ def find_jumps(
         return ()
     springs = find_springs(list(windows.values()), jumps)
     sprung = {m: with_springs(window, springs) for m, window in windows.items()}
-    least_m = MIN_COUNTS * crane.resolution_m
+    min_jump_m = MIN_COUNTS * crane.resolution_m
 
     def largest_step(m: int, axis: int, step: FoundStep | None) -> FoundStep | None:
         """Find the largest step beside the oscillations. They only explain `step`, found without them: one
         that isn't there without them is what is left of a wild reading that was taken for an oscillation.
         """
         found = step and sprung[m].largest_step(axis, jumps[axis])
-        return found if found is not None and abs(found.size_m) > least_m else None
+        return found if found is not None and abs(found.size_m) > min_jump_m else None
 
     steps = {(m, axis): largest_step(m, axis, step) for (m, axis), step in steps.items()}
     found: list[EncoderJump] = []
