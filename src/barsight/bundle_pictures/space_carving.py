@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from scipy import ndimage
 
 from barsight.bundle_pictures.samples import PlacedFrames, bundle_axes, is_placed
 from barsight.core.arrays import Bool, Float32, Float64, UInt8, kernel
@@ -99,7 +100,7 @@ def carve_beside(
         own = (slice(rows.start - top, rows.stop - top), slice(columns.start - left, columns.stop - left))
         low = _depths(part, highest)
         wanted = np.zeros(part.shape, bool)
-        # A cell more on each side: a cell's neighbours must be free too.
+        # With the cells around the patch, so that no proven place ends at its border.
         wanted[max(own[0].start - 1, 0) : own[0].stop + 1, max(own[1].start - 1, 0) : own[1].stop + 1] = True
         wanted &= np.isnan(part.z_m) & (low < part.free_m) & np.isfinite(part.free_m)
         if wanted[own].any():
@@ -130,12 +131,12 @@ def _carved(
     views = _views(pairs, frames, places)
     if views is None:
         return np.full(part.shape, np.inf, np.float32)
-    bound = np.where(np.isnan(part.z_m), free, np.float32(-np.inf))
+    bound = np.full(part.shape, np.inf, np.float32)
     heights = CellGrid(part.x0_m, part.y0_m, part.cell_m, np.asarray(part.z_m, np.float32))
     bound[rows, columns] = carve_cells(places, low[rows, columns], views, heights)
-    # A place is as free as the least free one beside it.
-    highest = np.asarray(cv2.dilate(bound, np.ones((3, 3), np.uint8)), np.float32)
-    return np.where(wanted & (highest < free), highest, np.float32(np.inf))
+    bound[~(bound < free)] = np.inf
+    # Single cells are dropped: most that are proven wrongly are single ones at the edges of things.
+    return np.asarray(ndimage.grey_closing(bound, (2, 2), mode="constant", cval=np.inf), np.float32)
 
 
 def _views(pairs: RectifiedPairs, frames: PlacedFrames, places: Float64) -> CarvingViews | None:

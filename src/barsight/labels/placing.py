@@ -47,8 +47,8 @@ class PlacedCamera:
     def projection(self) -> Float64:
         """Compute the matrix (3, 4) that projects homogeneous positions in the map to homogeneous pixels."""
         into, (cx, cy) = self.map_from_rect.inverse(), self.principal_px
-        inner = np.array([[self.focal_px, 0.0, cx], [0.0, self.focal_px, cy], [0.0, 0.0, 1.0]])
-        return np.asarray(inner @ np.hstack([into.rotation, into.translation[:, None]]), np.float64)
+        right, down, depth = np.column_stack([into.rotation, into.translation])
+        return np.stack([self.focal_px * right + cx * depth, self.focal_px * down + cy * depth, depth])
 
     def project(self, places_m: Float64) -> tuple[Float64, Float64]:
         """Project positions (..., 3) to pixels (..., 2), NaN behind the camera, and depth (...), m."""
