@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import math
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -392,7 +394,10 @@ def test_an_opc_ua_crane_tells_where_its_magnet_was(
     assert at == SECOND or note_of(plant, lift.lift_id).startswith(note)
 
 
-@pytest.mark.parametrize("wrong", [{"kind": "grab"}, {"x_m": 118_000.0}, {"x_m": 0.0, "z_m": 0.0}])
+@pytest.mark.parametrize(
+    "wrong",
+    [{"kind": "grab"}, {"x_m": 118_000.0}, {"x_m": 0.0, "z_m": 0.0}, {"x_m": math.nan}, {"y_m": math.nan}],
+)
 def test_an_opc_ua_crane_tells_no_place_that_cannot_be(plant: Plant, wrong: dict[str, object]) -> None:
     touch = {"kind": "grip", "x_m": 118.0, "y_m": 0.0, "z_m": DOWN} | wrong
     told = take_named_step(plant.steps, "touched", "ann by OPC UA", touch)
@@ -586,6 +591,29 @@ def test_touches_at_the_end_of_a_connection_are_told() -> None:
 
     asyncio.run(talk())
     assert seen.touches == TOUCHED
+
+
+def test_a_crane_that_moves_by_floats_is_told_of_once() -> None:
+    """Each telegram has another impossible position: ten lines a second hid all others."""
+    seen, said = Seen(), list[str]()
+    floats = [0x42DA0000 + 5000 * number for number in range(20)]
+    moving = [pack("in", CLAIMING | {"command": 0, "life": n, "bridge": at}) for n, at in enumerate(floats)]
+
+    async def talk() -> None:
+        port = asyncio.get_running_loop().create_future()
+        server = TelegramServer(seen.feed, seen, TelegramSettings(port=0), said.append)  # type: ignore[arg-type]
+        running = asyncio.create_task(server.run(port.set_result))
+        reader, writer = await asyncio.open_connection("127.0.0.1", await port)
+        writer.write(b"".join(moving) + bytes(len(moving[0])))
+        with contextlib.suppress(OSError):
+            while await asyncio.wait_for(reader.read(98), 5):
+                pass
+        writer.close()
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+
+    asyncio.run(talk())
+    assert len(said) == 2 and "112158 m, is in no yard" in said[0] and "magic 0x0000" in said[1]
 
 
 def test_a_plc_that_connects_anew_has_still_begun_its_lift(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -100,24 +100,25 @@ class TelegramServer:
                 found = unpack("in", await reader.readexactly(size), self._settings.byte_order)
                 if isinstance(found, Failed):
                     self.refused += 1
-                    self._tell(partner.name, f"connection closed, what came is no telegram: {found.reason}")
+                    self._tell(partner.name, "connection closed, what came is no telegram", found.reason)
                     return
                 is_second = self._is_second(partner)
                 if not is_second:
                     reading = partner.reading(found)
                     self._feed.take_reading(reading)
                     if reading.problem:
-                        self._tell(partner.name, f"where its magnet is isn't known: {reading.problem}")
+                        self._tell(partner.name, "where its magnet is isn't known", reading.problem)
                     partner.watch(reading)
                 is_busy = (step is not None and not step.done()) or is_second
                 if partner.receive(found, is_busy=is_busy):
                     step = asyncio.create_task(asyncio.to_thread(partner.execute))
                     step.add_done_callback(self._refresh)
 
-    def _tell(self, name: str, text: str) -> None:
-        if self._say is not None and self._said.get(name) != text and len(self._said) < MAX_TOLD:
-            self._said[name] = text
-            self._say(f"{name}: {text}")
+    def _tell(self, name: str, what: str, why: str) -> None:
+        is_listed = name in self._said or len(self._said) < MAX_TOLD
+        if self._say is not None and self._said.get(name) != what and is_listed:
+            self._said[name] = what  # not why: its figures change from telegram to telegram
+            self._say(f"{name}: {what}: {why}")
 
     def _is_second(self, partner: PlcPartner) -> bool:
         """Check whether another PLC at the same address is served: claims are by address, so that two cranes

@@ -62,7 +62,7 @@ class PlcReading:
 
 def is_place(*place_m: float) -> bool:
     """Check whether a crane's readings are known: not all zeros, nor outside any yard."""
-    return 0 < max(map(abs, place_m)) < MAX_PLACE_M
+    return any(place_m) and all(abs(value) < MAX_PLACE_M for value in place_m)
 
 
 @dataclass(frozen=True)
