@@ -95,15 +95,15 @@ def test_what_errs_as_stated_is_rarely_called_a_change() -> None:
         return record(drawn, number, top_z_m=one.top_z_m + rng.normal(0, SIGMA.top_z_m))
 
     kinds = [compared([measured(0)], [measured(1)])[0].kind for _ in range(100)]
-    assert kinds.count("same") >= 97
+    assert kinds.count("same") >= 99
 
 
 @pytest.mark.parametrize("unknown", ["lateral_m", "along_m", "top_z_m", "yaw_rad"])
 def test_a_bundle_whose_sigma_is_not_known_may_have_moved(unknown: str) -> None:
-    """It went 0.3 m aside or along, rose by 0.16 m or turned by 2 deg."""
+    """It went 0.3 m aside or along, rose by 0.19 m or turned by 2 deg."""
     before = record(laid(0.3))
     moves = {"lateral_m": (0.3, 0.0, 0.2, 0.0), "along_m": (0.0, 0.3, 0.2, 0.0),
-             "top_z_m": (0.0, 0.0, 0.36, 0.0), "yaw_rad": (0.0, 0.0, 0.2, 2.0)}  # fmt: skip
+             "top_z_m": (0.0, 0.0, 0.39, 0.0), "yaw_rad": (0.0, 0.0, 0.2, 2.0)}  # fmt: skip
     x, y, z, yaw = moves[unknown]
     after = record(laid(0.3 + x, z=z, y_m=y, yaw_deg=yaw), sigma=replace(SIGMA, **{unknown: math.nan}))
     (change,) = compared([before], [after])

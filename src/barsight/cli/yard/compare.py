@@ -32,7 +32,7 @@ def run(arguments: Sequence[str]) -> None:
         """Report the changes between two measured yards: moved, settled, taken, added, in mm and kg.
 
         A change counts as significant if, by the sigmas of both, its probability by chance is less than
-        one in a hundred.
+        one in a thousand.
 
         Args:
             old: The earlier folder of results from barsight measure.

@@ -54,7 +54,7 @@ class Change:
 
     @property
     def significant(self) -> bool:
-        """Check whether chance alone causes such a change in less than one case out of a hundred."""
+        """Check whether chance alone causes such a change in less than one case out of a thousand."""
         return self.kind in ("taken", "added") or self.z > MOVE_SIGMAS
 
 

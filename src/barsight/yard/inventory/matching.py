@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.yard.types import UNKNOWN_SIGMA_M, UNKNOWN_SIGMA_RAD, Bundle
 
-SIGNIFICANCE = 0.01
+SIGNIFICANCE = 0.001
 """Probability by which chance alone lets a bundle that lies still count as moved."""
 MOVE_SIGMAS = NormalDist().inv_cdf(1 - SIGNIFICANCE / 8)
 """The same as a bound on each of four two-sided figures (Bonferroni)."""
