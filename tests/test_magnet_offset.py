@@ -143,6 +143,21 @@ def test_an_offset_known_at_one_yaw_is_used_near_it_only(tmp_path: Path) -> None
     assert "at yaw -90.0 deg, within 10 deg" in found.words
 
 
+@pytest.mark.parametrize("yaw_deg", [-0.5, 3.0])
+def test_a_beam_lies_along_a_bundle_in_the_direction_of_its_touch_downs(yaw_deg: float) -> None:
+    """Bundles have no direction: one along X is found at 89 or at -89 degrees, as it happens."""
+    lies, magnet = laid(0.3, yaw_deg=yaw_deg), replace(MAGNET, offset=replace(OFFSET, yaw_deg=yaw_deg))
+    other = replace(MAGNET, offset=replace(OFFSET, yaw_deg=yaw_deg + 180))
+    (near,), (far,) = (
+        plan_lifts(map_of([lies]), (record(lies),), one, SETTINGS, ()).offered for one in (magnet, other)
+    )
+    for one, turned in ((near.place, far.place), (near.magnet_down, far.magnet_down)):
+        assert one is not None and turned is not None
+        assert (turned.x_m, turned.y_m) == pytest.approx((one.x_m, one.y_m))
+        assert abs(turned.yaw_deg - one.yaw_deg) == pytest.approx(180) and abs(turned.yaw_deg) <= 180
+    assert far.safety == pytest.approx(near.safety)
+
+
 def test_what_turns_with_the_magnet_is_turned_at_its_target_and_set_down(store: Store) -> None:
     """A load that is lifted at yaw 0 and put down at 90 degrees, beside what the store then protects."""
     turns = replace(OFFSET, along_m=0.03, across_m=-0.01, turn_sigma_m=0.001)

@@ -102,7 +102,7 @@ def measured_load(
     if offset is None:
         sources += _magnet_source(certificate, assumed)
     else:
-        sources += _offset_sources(offset, bundle.yaw_rad, assumed)
+        sources += _offset_sources(offset, offset.beam_yaw(bundle.yaw_rad), assumed)
     mass = bundle_mass(bundle)
     top = np.array([bundle.centre_m[0], bundle.centre_m[1], bundle.top_z_m])
     load = BudgetedLoad(top, bundle.yaw_rad, bundle.length_m, bundle.width_m, mass.kg)

@@ -70,10 +70,10 @@ def find_set_down(ground: Ground, load: Load, magnet: Magnet, settings: LiftSett
     if load.rolls:
         return None
     ground = ground.about(load.x_m, load.y_m, REACH_M)
-    free = ground.apart_from(load)
+    free, offset = ground.apart_from(load), magnet.offset
     for turn in _turns(settings.max_turn_deg):
         yaw = load.yaw_rad + math.radians(turn)
-        if magnet.offset is not None and magnet.offset.turn_deg(yaw) > MAX_TURN_DEG:
+        if offset is not None and offset.turn_deg(offset.beam_yaw(yaw)) > MAX_TURN_DEG:
             continue
         yaw -= math.pi * math.ceil(yaw / math.pi - 0.5)
         for x, y in _candidates(free, load, yaw, settings):

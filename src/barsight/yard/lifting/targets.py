@@ -259,7 +259,7 @@ def _best(group: tuple[Bundle, ...], yard: LiftScene, magnet: Magnet, settings: 
     """Choose the placement with the fewest vetoes, then the safest; the middle if the load is vetoed."""
 
     def tried(offsets: Iterable[tuple[float, float]]) -> list[Lift]:
-        places = (_place(group, along, across) for along, across in offsets)
+        places = (_place(group, magnet, along, across) for along, across in offsets)
         return [assess_placement(place, yard, magnet, settings, search=False) for place in places]
 
     limit = magnet.limits.offset_across_m
@@ -319,9 +319,10 @@ def _offset_across(group: tuple[Bundle, ...], place: Placement) -> float:
     return float((np.array([place.x_m, place.y_m]) - centre) @ place.across)
 
 
-def _place(group: tuple[Bundle, ...], along: float, across: float) -> Placement:
+def _place(group: tuple[Bundle, ...], magnet: Magnet, along: float, across: float) -> Placement:
     centre = load_centre(group)
     yaw = mean_yaw(group)
+    yaw = yaw if magnet.offset is None else magnet.offset.beam_yaw(yaw)
     place = Placement(float(centre[0]), float(centre[1]), yaw)
     moved = centre + along * place.along + across * place.across
     return Placement(float(moved[0]), float(moved[1]), yaw)

@@ -187,6 +187,11 @@ class MagnetOffset:
             return 0.0
         return abs((math.degrees(yaw_rad) - self.yaw_deg + 180) % 360 - 180)
 
+    def beam_yaw(self, yaw_rad: float) -> float:
+        """Return the beam's yaw along an axis: of the two, the nearer to where the offset is known."""
+        is_near = self.turn_deg(yaw_rad) <= 90
+        return yaw_rad if is_near else yaw_rad - math.copysign(math.pi, yaw_rad)
+
 
 @dataclass(frozen=True)
 class Magnet:
