@@ -511,6 +511,19 @@ def test_a_page_that_hears_nothing_offers_nothing(
     assert "connected" in page.inner_text("#server") and not sheet.errors
 
 
+def test_an_answer_that_is_cut_off_is_none(browser: object, address: str) -> None:
+    """On a slow network the time for an answer may end amid its content: it counted as an empty one."""
+    sheet = Sheet(browser, address, wait="#side >> text=offered")
+    cut = {"status": 200, "content_type": "application/json", "body": '{"lifts": ['}
+    sheet.page.route("**/api/lifts", lambda route: route.fulfill(**cut))
+    sheet.page.reload()
+    sheet.page.wait_for_selector("#told >> text=No answer from the server")
+    sheet.page.unroute("**/api/lifts")
+    sheet.open("lifts")
+    sheet.page.wait_for_selector("#confirm-1")
+    assert not sheet.errors
+
+
 def test_a_server_that_ends_and_comes_back(browser: object, url: str) -> None:
     with serving(url, ServeOptions(port=0)) as address:
         sheet = Sheet(browser, address)

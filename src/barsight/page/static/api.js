@@ -26,9 +26,9 @@ async function call(method, path, body) {
   if (body !== undefined) headers["Content-Type"] = "application/json";
   if (method !== "GET" && session.token) headers["X-Barsight-Token"] = session.token;
   if (!isThere() && path !== "/api/session") throw new Refused(0, awayText());
-  const answer = await fetch(path, { method, headers, body: body === undefined ? undefined : JSON.stringify(body), signal: AbortSignal.timeout(ANSWER_MS) })
-    .catch(() => { throw new Refused(0, t("server.unanswered")); });
-  const content = await answer.json().catch(() => ({}));
+  const unanswered = () => { throw new Refused(0, t("server.unanswered")); };
+  const answer = await fetch(path, { method, headers, body: body === undefined ? undefined : JSON.stringify(body), signal: AbortSignal.timeout(ANSWER_MS) }).catch(unanswered);
+  const content = await answer.json().catch(() => (answer.ok ? unanswered() : {}));
   if (!answer.ok) {
     if (answer.status === 401) session.isKnown = false;
     throw new Refused(answer.status, content.problem || content.detail || answer.statusText);
