@@ -197,6 +197,29 @@ def test_a_state_does_not_stay_valid_without_its_process(
             process.kill()
 
 
+def test_a_broker_that_knows_only_the_older_version_is_told_with_the_remedy() -> None:
+    """It refuses the connection as MQTT 3.1.1 says, as Mosquitto before 1.6."""
+
+    async def told() -> str:
+        async def refuse(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            await reader.read(200)
+            writer.write(bytes([0x20, 2, 0, 1]))
+            writer.close()
+
+        old = await asyncio.start_server(refuse, "127.0.0.1", 0)
+        publisher = MqttPublisher(MqttSettings(port=old.sockets[0].getsockname()[1]))
+        running = asyncio.create_task(publisher.run())
+        async with asyncio.timeout(10):
+            while publisher.problem is None:
+                await asyncio.sleep(0.02)
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+        old.close()
+        return publisher.problem
+
+    assert 'Unsupported protocol version 5: set mqtt.version = "3.1.1"' in asyncio.run(told())
+
+
 def test_a_broker_that_is_away_costs_bounded_memory_and_the_newest_survives(broker: Broker) -> None:
     settings = MqttSettings(port=broker.port, max_waiting=10, max_retry_s=0.2, state_every_s=0.02)
     publisher = MqttPublisher(settings)

@@ -118,7 +118,7 @@ class MqttPublisher:
                             for topic, text in (("online", "false"), ("state", state_json(OFFLINE))):
                                 await client.publish(self._topic(topic), text, qos=1, retain=True, timeout=1)
             except (aiomqtt.MqttError, OSError) as error:
-                self._problem = str(error).strip() or type(error).__name__
+                self._problem = mqtt_problem(error, self._settings)
             if _is_cancelled():  # a lost broker's error on the way out has replaced the cancellation
                 raise asyncio.CancelledError
             wait_s = 0.1 if time.monotonic() - began > self._settings.max_retry_s else wait_s
@@ -181,6 +181,14 @@ class MqttPublisher:
 
     def _topic(self, name: str) -> str:
         return f"{self._settings.prefix}/{name}"
+
+
+def mqtt_problem(error: Exception, settings: MqttSettings) -> str:
+    """Describe why a broker can't be used, with the remedy where it doesn't know the version."""
+    problem = str(error).strip() or type(error).__name__
+    other = "3.1.1" if settings.version == "5" else "5"
+    remedy = f' {settings.version}: set mqtt.version = "{other}"'
+    return problem + remedy if problem.lower().endswith("protocol version") else problem
 
 
 def mqtt_clients(

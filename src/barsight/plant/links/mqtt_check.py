@@ -12,7 +12,7 @@ import time
 from barsight.core.errors import Failed
 from barsight.plant.link_settings import MqttSettings
 from barsight.plant.links.link_check import LinkCheck
-from barsight.plant.mqtt import MqttError, mqtt_clients
+from barsight.plant.mqtt import MqttError, mqtt_clients, mqtt_problem
 
 STATES = 20
 WAIT_S = 5.0
@@ -25,7 +25,7 @@ def check_mqtt(settings: MqttSettings) -> LinkCheck | Failed:
     except TimeoutError:
         return Failed("mqtt-silent", f"{settings.host}:{settings.port}: no state came within {WAIT_S:g} s")
     except (MqttError, OSError) as error:
-        return Failed("mqtt-link", f"{settings.host}:{settings.port}: {error}")
+        return Failed("mqtt-link", f"{settings.host}:{settings.port}: {mqtt_problem(error, settings)}")
 
 
 async def _read(settings: MqttSettings) -> LinkCheck:
