@@ -36,7 +36,7 @@ from yard_folders import schema
 
 HANGS_M = np.array([0.012, -0.007, 0.004])
 """Seen minus read."""
-OFFSET = MagnetOffset(*HANGS_M.tolist(), 0.001, 0.002, 0.0015, "cal", "yard")
+OFFSET = MagnetOffset(*HANGS_M.tolist(), 0.001, 0.002, 0.0015, "cal", "yard", 0.0)
 
 
 def turned(xy_m: tuple[float, float], yaw_deg: float) -> tuple[float, float]:
@@ -183,6 +183,10 @@ def test_a_magnets_file_gets_the_offset_of_its_rig(tmp_path: Path) -> None:
     found = load_magnet(tmp_path / "hung.toml").offset
     assert found is not None and (found.calibration_id, found.yard_frame_id) == ("cal", "yard")
     assert np.all(np.abs(found.place_m(0.0) - HANGS_M) < 3 * found.sigma_m(0.0))
+    text = (tmp_path / "hung.toml").read_text()
+    (tmp_path / "old.toml").write_text(text.replace("yaw_deg = 0.00000\n", ""))
+    with pytest.raises(ConfigError, match=r"offset\.yaw_deg is missing"):
+        load_magnet(tmp_path / "old.toml")
     turned = certificate(tmp_path, np.random.default_rng(24), 10, yaws_deg=(0.0, 90.0), turns_m=(0.02, 0.0))
     assert calibrated(tmp_path, turned) == 0
     found = load_magnet(tmp_path / "hung.toml").offset

@@ -132,7 +132,7 @@ class MagnetOffset:
     z_sigma_m: float
     calibration_id: str
     yard_frame_id: str
-    yaw_deg: float = 0.0
+    yaw_deg: float
     along_m: float = 0.0
     across_m: float = 0.0
     turn_sigma_m: float | None = None
