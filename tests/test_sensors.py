@@ -195,6 +195,21 @@ def test_neighbours_are_never_paired_over_a_clock_that_is_set_or_slewed(ppm: flo
         assert source._streams["cam1"].clock.jumps == 1 and len(paired) > 30 * 57
 
 
+@pytest.mark.parametrize("first_hz", [30, 5])
+def test_a_camera_that_is_faster_than_stated_is_followed(first_hz: int) -> None:
+    """One of 30 Hz, stated as 10 Hz, lost every second picture, and its clock began anew with each other one:
+    no pair ever formed.
+    """
+    cameras: Any = (SimpleNamespace(ptp=""),) * 2
+    source, at_ns, image = CraneSource(cameras, {}, 10.0, 0, lambda: True), 0, np.zeros((1, 2), np.uint8)
+    for k in range(30 * 8):
+        at_ns += SECOND // (first_hz if k < 30 else 30)
+        picture = RawPicture(50 * SECOND + at_ns, at_ns + 2_000_000, k + 1, image)
+        lost = list(source._picture("cam0", picture))
+        assert not lost or k < 30 + 2 + 31
+    assert source._streams["cam0"].clock.jumps == (first_hz == 5)
+
+
 def test_datagrams_are_read_and_what_is_lost_or_torn_counts() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
         one.bind(("127.0.0.1", 0))

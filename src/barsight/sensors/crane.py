@@ -39,8 +39,8 @@ class _Stream:
     """A sensor's clock, the last stamp delivered, a camera's last picture, and losses.
 
     trigger, device_ns: number and stamp of the last picture whose stamp was believed. exposure_ns: what its
-    clock went on for each exposure up to it. behind: pictures since, whose stamps were not. dropped: readings
-    that found the queue full.
+    clock went on for each exposure up to it, 0 until two are known. behind: pictures since, whose stamps were
+    not. dropped: readings that found the queue full.
     """
 
     clock: DeviceClock = field(default_factory=DeviceClock)
@@ -51,6 +51,11 @@ class _Stream:
     behind: int = 0
     lost: int = 0
     dropped: int = 0
+
+    def begin_anew(self) -> None:
+        """Forget clock and picture rate so far."""
+        self.clock.begin_anew()
+        self.exposure_ns = 0.0
 
 
 class CraneSource:
@@ -175,13 +180,13 @@ class CraneSource:
             yield LostPicture(camera, 0, item.cause, item.count)
             return
         if item.trigger <= stream.trigger:  # connected anew: it may have been set meanwhile
-            stream.clock.begin_anew()
-        elif self._is_behind(stream, item):
+            stream.begin_anew()
+        elif stream.trigger and self._is_behind(stream, item):
             if stream.behind < BEHIND_COUNT:
                 yield LostPicture(camera, 0, "late")
                 return
             stream.clock.jumps += 1
-            stream.clock.begin_anew()
+            stream.begin_anew()
         stream.trigger, stream.device_ns, stream.behind = item.trigger, item.device_ns, 0
         if not stream.clock.add(item.device_ns, item.arrival_ns):
             yield LostPicture(camera, 0, "clock")
