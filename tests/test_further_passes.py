@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from barsight.core.arrays import Float64, Int64
 from barsight.core.pose import Pose
 from barsight.core.records.pairs import RectifiedCamera
 from barsight.pipeline.further_passes import BEYOND_M, STEP_M, find_unseen
@@ -88,6 +89,28 @@ def test_no_pass_is_proposed_for_what_the_pictures_show_without_a_height() -> No
     assert find_unseen(plan, heights, (bundle,)) == UnseenPlaces((), (0,))
     far = find_unseen(planned(heights, bundle, travel(-3.5)), heights, (bundle,))
     assert far is not None and far.passes[0].bundles == (0,) and far.in_sight == ()
+
+
+def test_only_views_near_a_lift_are_followed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All of a yard's were, for each lift: 5.7 s for 8 lifts and 4400 frames, now 0.1 s."""
+    one, way, followed = laid(0.3), travel(-1.0), []
+    heights = bare(map_of([one]))
+    heights.z_m[heights.y_m > -1.0 + REACH * EYE_M] = np.nan
+    bundle, count_views = record(one, ends_open=(False, True)), Cameras.count_views
+
+    def counted(self: Cameras, body_m: Float64, about: HeightMap, places_m: Float64) -> Int64:
+        followed.append(len(body_m))
+        return count_views(self, body_m, about, places_m)
+
+    monkeypatch.setattr(Cameras, "count_views", counted)
+    plan = planned(heights, bundle, way)
+    further = np.column_stack([np.linspace(20.0, 900.0, 2000), np.full(2000, -1.0)])
+    more = sure_travel(np.concatenate([way.place_m, further]), np.arange(1, 2006) * 10**9)
+    far = replace(plan, travel=replace(more, cameras=cameras()))
+    assert (
+        find_unseen(far, heights, (bundle,)) == find_unseen(plan, heights, (bundle,)) != UnseenPlaces((), ())
+    )
+    assert set(followed) == {5}
 
 
 def test_the_cameras_are_read_as_they_were_written() -> None:

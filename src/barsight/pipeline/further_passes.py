@@ -74,14 +74,15 @@ def find_unseen(plan: LiftPlan, yard: YardMap, bundles: tuple[Bundle, ...]) -> U
         if not parts:
             continue
         about = _about(yard, np.concatenate([part[0] for part in parts]), MARGIN_M)
-        counts = [_count_views(travel.cameras, body_m, about, part) for part in parts]
+        near_m, longest_near_m = (_near(one, parts, travel.reach_m + MARGIN_M) for one in (body_m, longest_m))
+        counts = [_count_views(travel.cameras, near_m, about, part) for part in parts]
         if min((count < SEEN_VIEWS).mean() for count in counts) < HIDDEN_RATIO:
             in_sight += lift.bundles
             continue
         middle_y_m = float(np.concatenate(parts, axis=1)[0, :, 1].mean())
         shown = np.zeros(shifts_m.size, np.bool_)
         for k in np.flatnonzero(np.abs(base_y_m + shifts_m - middle_y_m) < REACH_M):
-            there = longest_m + shifts_m[k] * ACROSS
+            there = longest_near_m + shifts_m[k] * ACROSS
             counts = [_count_views(travel.cameras, there, about, part) for part in parts]
             shown[k] = min((count >= SHOWN_VIEWS).mean() for count in counts) >= SHOWN_RATIO
         hidden.append(_Unseen(lift, shown))
@@ -134,6 +135,13 @@ def _measured_places(travel: Travel) -> Float64:
     """Return the body's places (F, 3) at the measured frames."""
     places = travel.place_m[travel.measured]
     return np.column_stack([places, np.full(len(places), travel.eye_z_m)])
+
+
+def _near(body_m: Float64, parts: Sequence[Float64], reach_m: float) -> Float64:
+    """Select the body's places (F, 3) from which the parts (2, N, 3) may be in the pictures, by x."""
+    x = np.concatenate(parts, axis=1)[0, :, 0]
+    near: Float64 = body_m[(body_m[:, 0] > x.min() - reach_m) & (body_m[:, 0] < x.max() + reach_m)]
+    return near
 
 
 def _about(yard: YardMap, places: Float64, margin_m: float) -> HeightMap:
