@@ -96,6 +96,14 @@ def test_a_changed_or_foreign_file_is_refused_by_name(
         assert len(bs.load(folder).lifts) == 2
 
 
+def test_a_loaded_yard_offers_what_was_chosen_last(folder: Path) -> None:
+    """What it had read first stayed on offer, though lifts were chosen again there with a no-lift area."""
+    yard = bs.load(folder)
+    assert len(yard.lifts) == 2
+    assert lifts(folder, "--no-lift-areas", "-9", "-9", "9", "9") == 0
+    assert len(yard.lifts) == 0 and len(yard.lifts.refused) == 2
+
+
 def test_a_folder_of_an_earlier_version_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     result = content(folder / "result.json")
     del result["map_id"]

@@ -118,10 +118,6 @@ class Yard:
         """Return the bundles found."""
         return self._read(lambda folder: read_bundles(folder / "bundles.json"))
 
-    @cached_property
-    def _chosen(self) -> dict[str, Any]:
-        return self._read(lambda folder: read_lifts(folder / "lifts.json"))
-
     def _read(self, read: Callable[[Path], T]) -> T:
         content = read(self.folder)
         self._expect_unchanged()
@@ -134,9 +130,8 @@ class Yard:
 
     @property
     def lifts(self) -> Lifts:
-        """Return the lifts as currently valid: those too old, or disturbed since, are refused."""
-        content = self._chosen
-        self._expect_unchanged()
+        """Return the lifts as currently valid: as last chosen, those too old or disturbed since refused."""
+        content = self._read(lambda folder: read_lifts(folder / "lifts.json"))
         offered, refused = (tuple(map(_target, content[name])) for name in ("lifts", "refused"))
         vetoes = _vetoes(content)
         if changed := changed_inputs(self.summary):
