@@ -288,6 +288,22 @@ def test_logs_skip_what_a_killed_writer_left(tmp_path: Path) -> None:
     assert reader.last(2)[0].tolist() == [BEGIN_NS + 1, BEGIN_NS + 2]
 
 
+def test_a_log_that_grows_while_it_is_read_gives_no_more_rows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of one row asked for, two came: places of a frozen camera's crane that couldn't be subtracted."""
+    log = ReadingLog(tmp_path / "crane.log", 1)
+    log.append(np.array([1, 2]), np.zeros((2, 1)))
+    rows = log._rows
+
+    def grown(first: int) -> np.ndarray:
+        log.append(np.array([3]), np.zeros((1, 1)))
+        return rows(first)
+
+    monkeypatch.setattr(log, "_rows", grown)
+    assert log.last(1)[1].shape == (1, 1) and log.last(0)[0].size == 0
+
+
 def test_pairs_form_by_stamp_and_each_lone_picture_counts() -> None:
     """cam0 at 0, 10, 30, 41 and cam1 at 1, 20, 30, 40, tolerance 2."""
     former = PairFormer(2)

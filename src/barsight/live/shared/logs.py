@@ -41,7 +41,7 @@ class ReadingLog:
     def last(self, count: int) -> tuple[Int64, Float64]:
         """Return the last `count` rows, or as many as there are."""
         size = self._path.stat().st_size // self._row if self._path.exists() else 0
-        rows = self._rows(max(size - count, 0))
+        rows = self._rows(max(size - count, 0))[:count]  # it may have grown since
         return rows[:, 0].copy().view(np.int64), rows[:, 1:].copy()
 
     def _rows(self, first: int) -> Float64:
