@@ -195,6 +195,25 @@ def test_neighbours_are_never_paired_over_a_clock_that_is_set_or_slewed(ppm: flo
         assert source._streams["cam1"].clock.jumps == 1 and len(paired) > 30 * 57
 
 
+def test_a_camera_that_counted_an_exposure_too_many_is_paired_again() -> None:
+    """cam1 of 10 Hz, at 8 s, as by a disturbed trigger line: no pair formed from then on."""
+    cameras: Any = (SimpleNamespace(ptp=""),) * 2
+    source, former = CraneSource(cameras, {}, 10.0, 0, lambda: True), PairFormer(5_000_000)
+    paired: list[int] = []
+    for k in range(150):
+        at_ns, image = k * SECOND // 10, np.full((1, 2), k, np.uint8)
+        for camera in (0, 1):
+            count = k + 1 + (camera == 1 and k >= 80)
+            picture = RawPicture(at_ns + (50 + camera) * SECOND, at_ns + 2_000_000, count, image)
+            list(source._picture(f"cam{camera}", picture))
+        for one in source._ordered(at_ns - SECOND // 10):
+            assert isinstance(one, LivePicture)
+            for pair, _ in former.push(one):
+                assert (pair.left == pair.right).all()
+                paired.append(int(pair.left[0, 0]))
+    assert sum(k >= 80 for k in paired) > 50
+
+
 @pytest.mark.parametrize("first_hz", [30, 5])
 def test_a_camera_that_is_faster_than_stated_is_followed(first_hz: int) -> None:
     """One of 30 Hz, stated as 10 Hz, lost every second picture, and its clock began anew with each other one:

@@ -18,8 +18,9 @@ class PairFormer:
 
     If both carry a trigger number, the difference of the two numbers must stay constant: pictures for which
     it changes are dropped, until `NEW_STEPS` in succession agree on another difference after a camera counted
-    anew, or missed an exposure that it didn't count. Without either, a clock ran away from the other one by
-    an interval, and the stamps are those of neighbours. lost: unpaired pictures of cam0 and cam1.
+    anew, missed an exposure that it didn't count, or counted one that it didn't take. Without these, a clock
+    ran away from the other one by an interval, and the stamps are those of neighbours. lost: unpaired
+    pictures of cam0 and cam1.
     contradicted: pictures whose stamps and numbers contradict each other. skew_ns: cam1's stamp minus cam0's
     in the last pair; max_skew_ns: its largest magnitude.
     """
@@ -87,7 +88,9 @@ class PairFormer:
         return True
 
     def _count(self, picture: LivePicture) -> None:
-        """Note whether a camera counted anew, or took half an interval more than it has exposures."""
+        """Note whether a camera counted anew, took half an interval more than it has exposures, or whole ones
+        less.
+        """
         camera, last = picture.camera, self._last[picture.camera]
         if picture.trigger is None:
             return
@@ -98,7 +101,10 @@ class PairFormer:
         if exposures <= 0:
             self._may_change = True
             return
-        self._may_change |= took_ns > (exposures + 0.5) * self._exposure_ns[camera]
+        exposure_ns = self._exposure_ns[camera]
+        more_ns = took_ns - exposures * exposure_ns
+        is_whole = abs(more_ns - round(more_ns / max(exposure_ns, 1)) * exposure_ns) < self.tolerance_ns
+        self._may_change |= more_ns > exposure_ns / 2 or (more_ns < -exposure_ns / 2 and is_whole)
         self._exposure_ns[camera] = took_ns / exposures
 
     def _drop(self, camera: int) -> None:
