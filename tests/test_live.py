@@ -291,7 +291,7 @@ def test_logs_skip_what_a_killed_writer_left(tmp_path: Path) -> None:
 def test_a_log_that_grows_while_it_is_read_gives_no_more_rows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of one row asked for, two came: places of a frozen camera's crane that couldn't be subtracted."""
+    """Two rows came for one that was asked for, so that two places couldn't be subtracted."""
     log = ReadingLog(tmp_path / "crane.log", 1)
     log.append(np.array([1, 2]), np.zeros((2, 1)))
     rows = log._rows

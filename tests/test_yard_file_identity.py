@@ -97,7 +97,7 @@ def test_a_changed_or_foreign_file_is_refused_by_name(
 
 
 def test_a_loaded_yard_offers_what_was_chosen_last(folder: Path) -> None:
-    """What it had read first stayed on offer, though lifts were chosen again there with a no-lift area."""
+    """Those read first stayed on offer, though lifts were chosen again there with a no-lift area."""
     yard = bs.load(folder)
     assert len(yard.lifts) == 2
     assert lifts(folder, "--no-lift-areas", "-9", "-9", "9", "9") == 0
