@@ -3,7 +3,8 @@
 Matching finds nothing in a dark gully between two bundles, so that nothing bounds what stands there. But
 something as high as the bundles would show the same brightness to all views. Where some views show the
 dark of the gully and others a flank, at each height from the known bound down to the bundle's top, nothing
-that high stands there.
+that high stands there. Something dark and glossy, whose highlight only some views show, may be taken for a
+gully: so this is off unless `map.carve_gullies` is set.
 """
 
 from __future__ import annotations
@@ -197,7 +198,7 @@ def carve_cells(places: Float64, low: Float32, views: CarvingViews, heights: Cel
 
 @kernel()
 def _spread(values: Float32) -> float:
-    """Compute the ratio of the value that OUTER_RATIO exceed to the one that OUTER_RATIO are under."""
+    """Compute the ratio of the values (V,) that OUTER_RATIO of them exceed and fall short of."""
     ordered = np.sort(values)
     outer = int(ordered.size * OUTER_RATIO)
     return float(ordered[ordered.size - 1 - outer] / ordered[outer])
@@ -225,7 +226,7 @@ def _brightness(views: CarvingViews, v: int, x: float, y: float, z: float) -> tu
 
 @kernel()
 def _is_hidden(heights: CellGrid, eye: Float64, x: float, y: float, z: float) -> bool:
-    """Check whether the map blocks the line of sight from a place to an eye."""
+    """Check whether the map blocks the line of sight from a place to an eye (3,)."""
     cell = heights.cell_m
     far = max(np.sqrt((eye[0] - x) ** 2 + (eye[1] - y) ** 2), 1e-6)
     step_x, step_y, rise = (eye[0] - x) / far * cell, (eye[1] - y) / far * cell, (eye[2] - z) / far * cell

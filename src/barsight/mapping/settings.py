@@ -59,6 +59,11 @@ class MapSettings:
     """Maximum distance of an unknown cell from seen cells on opposite sides for it to be filled; filled
     cells are flagged.
     """
+    carve_gullies: bool = False
+    """Whether space carving may prove unseen gullies beside bundles free: at no height does the place look
+    alike to all views. It assumes that nothing dark and glossy lies there: a highlight that comes and goes
+    looks the same.
+    """
     max_sigma_m: float = 0.5
     """Maximum sigma of a point's depth; less certain points are left out."""
     resident_tiles: int = 64

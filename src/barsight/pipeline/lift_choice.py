@@ -56,8 +56,9 @@ def find_lifts(mapped: MappedYard, request: LiftRequest) -> Measurement:
     watch, profiles = mapped.watch, mapped.profiles
     heights = surface_map(mapped.surface, mapped.free, mapped.tops, mapped.history)
     bundles = find_yard_bundles(mapped, heights)
-    carve_gullies(mapped, heights, bundles)
-    heights = surface_map(mapped.surface, mapped.free, mapped.tops, mapped.history)
+    if settings.map.carve_gullies:
+        carve_gullies(mapped, heights, bundles)
+        heights = surface_map(mapped.surface, mapped.free, mapped.tops, mapped.history)
     listed = mapped.stock if trajectory.reference == "yard" else None
     stock = None if listed is None else match_stock(listed, bundles)
     warnings = [*stage_notices(mapped), *stock_notices(mapped.stock, stock), *request.notices]

@@ -175,7 +175,7 @@ class MqttPublisher:
         """Form the properties with which a state expires; None by a version that has none."""
         if self._settings.version != "5":
             return None
-        properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
+        properties = Properties(PacketTypes.PUBLISH)
         properties.MessageExpiryInterval = STATE_LASTS_S
         return properties
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -31,6 +32,7 @@ from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError, MeasurementError
 from barsight.core.json_values import write_json
+from barsight.mapping.settings import MapSettings
 from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings
 from barsight.simulation.settings.travel import PassesSettings
@@ -58,11 +60,15 @@ class YardChoice:
     """
     trolley_y_m: tuple[float, ...] = ()
     """Record each rendered yard in several passes, with the trolley at these positions; one by default."""
+    carve_gullies: bool = False
+    """Measure rendered yards with map.carve_gullies."""
 
     def __post_init__(self) -> None:
         if self.trolley_y_m and not self.rendered:
             raise ConfigError("bench lifts: trolley-y-m needs --rendered: the exact map has no passes")
         PassesSettings(self.trolley_y_m)
+        if self.carve_gullies and not self.rendered:
+            raise ConfigError("bench lifts: carve-gullies needs --rendered: it asks the pictures")
 
 
 def bench_lift_targets(
@@ -142,9 +148,10 @@ class _Given:
 
 
 def _keys(magnet: JudgedMagnet, choice: YardChoice) -> WorldKeys:
-    """Compute the keys of the kept results; without passes those that were kept before stay valid."""
+    """Compute the keys of the kept results; without choices of today those kept before stay valid."""
     passes = (choice.trolley_y_m,) if choice.trolley_y_m else ()
-    return WorldKeys.of((magnet.half_span_m, choice.full_size, *passes), DRAWN_BY)
+    carved = ("carved",) if choice.carve_gullies else ()
+    return WorldKeys.of((magnet.half_span_m, choice.full_size, *passes, *carved), DRAWN_BY)
 
 
 _JudgedYard = tuple[tuple[JudgedLift, ...], tuple[LiftableBundle, ...]]
@@ -178,13 +185,13 @@ def _measured(world: DrawnYard, folder: Path, settings: LiftSettings, given: _Gi
     note = keep_measured(
         folder, read_note(folder, "lifts"), given.keys,
         lambda recording: render_world(world, recording, full_size=full_size, trolley_y_m=trolley_y_m),
-        _measure,
+        partial(_measure, MapSettings(carve_gullies=given.choice.carve_gullies)),
     )  # fmt: skip
     if note["refused"]:
         raise MeasurementError(f"bench lifts: seed {world.seed} can't be measured: {note['refused']}")
     return measured_world(folder / "measured", settings)
 
 
-def _measure(recording: Path, out: Path) -> None:
+def _measure(mapped: MapSettings, recording: Path, out: Path) -> None:
     passes = sorted(recording.glob("pass_*")) or recording
-    measure_into(passes, out, MeasureSettings(), report=False, judged_at="end")
+    measure_into(passes, out, MeasureSettings(map=mapped), report=False, judged_at="end")
