@@ -179,9 +179,11 @@ def test_how_far_an_open_end_may_lie_is_told_by_bars_alike() -> None:
 def read_events(client: httpx.Client, kind: str, act: Callable[[], object]) -> list[str]:
     """Read events of a kind: the first one, and the one that comes when `act` was called."""
     said: list[str] = []
+    end_s = time.monotonic() + 30
     with client.stream("GET", "/api/events", timeout=5) as answer:
         wanted = False
         for line in answer.iter_lines():
+            assert time.monotonic() < end_s, f"beats, but no second event of {kind}"
             if line.startswith("event:"):
                 wanted = line == f"event: {kind}"
             elif line.startswith("data:") and wanted:
