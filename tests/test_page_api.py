@@ -200,14 +200,21 @@ def test_crane_and_magnet_are_told_as_the_live_run_tells_them(url: str, tmp_path
     live = live_folder(tmp_path / "live" / "one", now_ns=10_000_000_000, crane_m=[2.4, 1.1, 7.0])
     (tmp_path / "live" / "current").symlink_to(live)
     options = ServeOptions(port=0, live=tmp_path / "live")
+    is_silent, old_s = threading.Event(), time.time() - 5
+
+    def run() -> None:
+        while not is_silent.wait(0.1):
+            os.utime(live / "state.json")
+        os.utime(live / "state.json", (old_s, old_s))
+
+    runs = threading.Thread(target=run)
+    runs.start()
     with serving(url, options) as address, httpx.Client(base_url=address) as client:
-        old_s = time.time() - 5
-
-        def beat() -> None:
-            os.utime(live / "state.json", (old_s, old_s))
-
-        os.utime(live / "state.json")
-        moving, silent = read_events(client, "crane", beat)
+        try:
+            moving, silent = read_events(client, "crane", is_silent.set)
+        finally:
+            is_silent.set()
+            runs.join()
         newest = client.get("/api/state").json()["survey"]["captured_to_ns"]
     place = {"body_m": [3.0, 1.0], "magnet_m": [2.4, 1.1], "map_seen_ns": newest}
     assert json.loads(moving) == {"mode": "full", "reasons": [], "place": place}
