@@ -146,8 +146,6 @@ def _views(pairs: RectifiedPairs, frames: PlacedFrames, places: Float64) -> Carv
     corners = np.stack(np.meshgrid(*ends.T), axis=-1).reshape(-1, 3)
     showing = [k for k in range(len(frames.stamps_ns)) if _may_show(frames, k, corners)]
     chosen = showing[:: math.ceil(len(showing) / _MAX_FRAMES)] if showing else []
-    if 2 * len(chosen) < MIN_VIEWS:
-        return None
     views = list[tuple[UInt8, UInt8, Float64, Float64]]()
     for pair in pairs({frames.stamps_ns[k] for k in chosen}):
         if isinstance(pair, RefusedFrame):
@@ -159,6 +157,8 @@ def _views(pairs: RectifiedPairs, frames: PlacedFrames, places: Float64) -> Carv
             around = cv2.blur(picture, (_AROUND_PX, _AROUND_PX))[::_STRIDE_PX, ::_STRIDE_PX]
             shown = np.where(valid, np.maximum(picture, 1), 0).astype(np.uint8)
             views.append((shown, around, camera.projection, camera.map_from_rect.translation))
+    if len(views) < MIN_VIEWS:
+        return None
     pictures, around, projections, eyes = (np.stack(layer) for layer in zip(*views, strict=True))
     return CarvingViews(pictures, around, projections, eyes)
 
