@@ -18,7 +18,7 @@ from barsight.simulation.settings.recording import SimulationSettings
 from barsight.simulation.settings.rig import CameraSettings
 from barsight.simulation.settings.travel import PassesSettings
 from barsight.simulation.simulate import LaidYard, simulate
-from barsight.simulation.worlds.conditions import ASIDE_M
+from barsight.simulation.worlds.conditions import draw_conditions
 from barsight.simulation.worlds.surfaces import draw_finishes, scene_of
 from barsight.simulation.worlds.yards import DrawnYard, draw_yard
 from barsight.yard.bundles.detection import find_bundles
@@ -56,12 +56,12 @@ def drawn_scene(world: DrawnYard) -> Scene:
 
 
 def recording_settings(world: DrawnYard, *, full_size: bool = False) -> SimulationSettings:
-    """Choose a short recording of a world, with small images or full-size ones: ten pairs for 3 m."""
+    """Draw the conditions of a world's short recording: light, texture, mounting, crane, sensors and image
+    faults. Images are small or full-size ones: ten pairs for 3 m.
+    """
     length, camera = world.size_m[0], CameraSettings() if full_size else SMALL
-    aside = ASIDE_M * (-1 if world.seed // 10 % 2 else 1) if world.hides else camera.trolley_y_m
-    return SimulationSettings(
-        length, round(3 + 2.3 * length), world.seed, depth_views=0, camera=replace(camera, trolley_y_m=aside)
-    )
+    given = SimulationSettings(length, round(3 + 2.3 * length), depth_views=0, camera=camera)
+    return draw_conditions(world.seed, given, hides=world.hides)
 
 
 def render_world(

@@ -53,7 +53,9 @@ class YardChoice:
     layers. spilled: the same, with single bars that lie along on half of the highest bundles.
     """
     rendered: bool = False
-    """Render and measure each yard, which takes a minute; otherwise noise is added to the exact map."""
+    """Record each yard under drawn light, crane and image faults and measure it, which takes a minute;
+    otherwise noise is added to the exact map.
+    """
     full_size: bool = False
     """Render pictures of 1280x1024 instead of 640x512, which halves the pixel size on the surface but takes
     four times as long.
