@@ -7,9 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from barsight.bundle_pictures import space_carving
-from barsight.bundle_pictures.space_carving import CarvingViews, CellGrid, carve_cells
+from barsight.bundle_pictures.space_carving import CarvingViews, carve_cells
 from barsight.core.pose import Pose
 from barsight.labels.placing import PlacedCamera
+from barsight.yard.map_lookup import CellGrid
 
 CELL_M, TOP_M, FOCAL_PX, EYE_M = 0.01, 0.4, 900.0, 8.0
 GULLY_M = 0.02
@@ -57,7 +58,7 @@ def carved(views: CarvingViews, heights: CellGrid | None = None) -> np.ndarray:
     x_m = np.arange(-0.01, 0.011, CELL_M)
     places = np.stack([x_m, np.zeros(x_m.size), np.full(x_m.size, BOUND_M)], axis=1)
     if heights is None:
-        heights = CellGrid(-2.0, -0.1, CELL_M, np.full((20, 400), np.nan, np.float32))
+        heights = CellGrid(-2.0, -0.1, CELL_M, np.full((20, 400), np.nan, np.float32), -np.inf)
     bound = carve_cells(places, np.full(x_m.size, TOP_M, np.float32), views, heights)
     assert (bound <= np.float32(BOUND_M)).all()
     return bound < TOP_M + 0.011
@@ -89,7 +90,7 @@ def test_views_that_the_map_blocks_do_not_count() -> None:
     assert carved(views).any()
     z = np.full((20, 400), np.nan, np.float32)
     z[:, 190:196] = TOP_M + 0.9
-    assert not carved(views, CellGrid(-2.0, -0.1, CELL_M, z)).any()
+    assert not carved(views, CellGrid(-2.0, -0.1, CELL_M, z, TOP_M + 0.9)).any()
 
 
 def test_few_views_prove_nothing() -> None:

@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from barsight.yard.map_lookup import cell_spans, highest_seen, lookup_heights, sample_levels
+from barsight.yard.map_lookup import (
+    CellGrid,
+    are_blocked,
+    cell_spans,
+    highest_seen,
+    lookup_heights,
+    sample_levels,
+)
 from test_yard_resting_plane import some_map, was_seen
 
 
@@ -59,3 +66,30 @@ def test_the_highest_seen_cell_of_a_span_counts() -> None:
         highest = z[max(low, 0) : top, left:right].max(initial=-np.inf)
         found = highest_seen(heights.z_m, heights.source, low, top, left, right)
         assert found == highest or (np.isnan(found) and highest == -np.inf)
+
+
+def plainly_blocked(grid: CellGrid, place: np.ndarray, eye: np.ndarray, over_m: float) -> bool:
+    """Look up all places of a line of sight at once."""
+    steps = max(int(np.ceil(np.hypot(*(eye - place)[:2]) / grid.cell_m)), 1)
+    line = place + np.arange(steps)[:, None] / steps * (eye - place)
+    column, row = (
+        np.floor((line[:, k] - first) / grid.cell_m + 0.5).astype(int)
+        for k, first in enumerate((grid.x0_m, grid.y0_m))
+    )
+    rows, columns = grid.z_m.shape
+    inside = (row >= 0) & (column >= 0) & (row < rows) & (column < columns)
+    return bool((grid.z_m[row[inside], column[inside]] > line[inside, 2] + over_m).any())
+
+
+@pytest.mark.parametrize("over_m", [0.0, 0.02])
+def test_a_line_of_sight_is_blocked_by_what_rises_over_it(over_m: float) -> None:
+    """From places in and beside the map, to eyes above, beside and straight over it."""
+    grid = CellGrid.of(some_map())
+    rng = np.random.default_rng(5)
+    places = rng.uniform((-0.4, -0.9, np.nanmin(grid.z_m)), (0.4, 0.9, grid.highest_m), (400, 3))
+    for eye in (np.array([1.5, -0.7, 0.6]), np.array([0.0, 0.0, 8.0]), places[7] + (0.0, 0.0, 5.0)):
+        found = are_blocked(grid, places, eye, over_m)
+        assert found.tolist() == [plainly_blocked(grid, place, eye, over_m) for place in places]
+        assert 0.05 < found.mean() < 0.95
+    nothing = grid._replace(z_m=np.full_like(grid.z_m, np.nan), highest_m=-np.inf)
+    assert not are_blocked(nothing, places, eye, over_m).any()

@@ -14,13 +14,14 @@ from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Float64, UInt8
 from barsight.core.pose import Pose
 from barsight.core.records.pairs import RefusedFrame
-from barsight.labels.placing import PlacedCamera, heights_at
+from barsight.labels.placing import PlacedCamera
 from barsight.recording.rectified_pairs import RectifiedPairs
+from barsight.yard.map_lookup import CellGrid, are_blocked
 from barsight.yard.types import Bundle, HeightMap
 
-_OVER_M, _MAX_RISE_M, _HIDDEN_RATIO = 0.05, 1.0, 0.05
-"""Step and maximum rise over which a line of sight is followed; share of a line's points that may be
-hidden.
+_FROM_M, _OVER_M, _HIDDEN_RATIO = 0.05, 0.025, 0.05
+"""Height over a bundle from which on lines of sight are followed, as single bars stand out of it; height over
+them from which on a surface hides a point; share of a line's points that may be hidden.
 """
 DARKEST = 8.0
 """Offset added to gray levels before their logarithm, so that noise in dark areas counts less."""
@@ -156,9 +157,7 @@ def _sample(
 
 
 def is_hidden(part: HeightMap, line_m: Float64, eye_m: Float64) -> bool:
-    """Check whether the map blocks the view from a camera to a line of points (N, 3)."""
-    rise = np.arange(_OVER_M, _MAX_RISE_M, _OVER_M)[:, None]
-    way = (eye_m - line_m)[:, :2] / np.maximum(eye_m[2] - line_m[:, 2:], _OVER_M)
-    there = line_m[:, :2] + rise[..., None] * way
-    blocked = heights_at(part, there) > line_m[:, 2] + rise + _OVER_M / 2
-    return bool(blocked.any(axis=0).mean() > _HIDDEN_RATIO)
+    """Check whether the map blocks the view from a camera (3,) to a line of points (N, 3)."""
+    way = (eye_m - line_m) / np.maximum(eye_m[2] - line_m[:, 2:], _FROM_M)
+    blocked = are_blocked(CellGrid.of(part), line_m + _FROM_M * way, eye_m, _OVER_M)
+    return bool(blocked.mean() > _HIDDEN_RATIO)

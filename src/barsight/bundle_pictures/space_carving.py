@@ -23,6 +23,7 @@ from barsight.core.arrays import Bool, Float32, Float64, UInt8, kernel
 from barsight.core.pose import Pose
 from barsight.core.records.pairs import RefusedFrame
 from barsight.recording.rectified_pairs import RectifiedPairs
+from barsight.yard.map_lookup import CellGrid, is_blocked
 from barsight.yard.sections import patches
 from barsight.yard.types import Bundle, HeightMap, YardMap
 
@@ -43,8 +44,6 @@ _PATCH_CELLS, _MARGIN_M = 512, 0.5
 """Side of the patches that are carved at a time, and the part of the map around one that may hide it."""
 _AROUND_PX, _STRIDE_PX = 151, 8
 """Window of the mean brightness, and the step between its samples."""
-_MAX_RISE_M = 1.0
-"""Rise over which a line of sight is followed to see whether the map blocks it."""
 _MAX_FRAMES = 32
 """Maximum number of frames for a patch; of more, every second, third or further one is used."""
 
@@ -69,15 +68,6 @@ class CarvingViews(NamedTuple):
     around: UInt8
     projections: Float64
     eyes: Float64
-
-
-class CellGrid(NamedTuple):
-    """Heights (rows, columns) of cells, and the place of the first one."""
-
-    x0_m: float
-    y0_m: float
-    cell_m: float
-    z_m: Float32
 
 
 def carve_beside(
@@ -133,8 +123,7 @@ def _carved(
     if views is None:
         return np.full(part.shape, np.inf, np.float32)
     bound = np.full(part.shape, np.inf, np.float32)
-    heights = CellGrid(part.x0_m, part.y0_m, part.cell_m, np.asarray(part.z_m, np.float32))
-    bound[rows, columns] = carve_cells(places, low[rows, columns], views, heights)
+    bound[rows, columns] = carve_cells(places, low[rows, columns], views, CellGrid.of(part))
     bound[~(bound < free)] = np.inf
     # Single cells are dropped: most that are proven wrongly are single ones at the edges of things.
     return np.asarray(ndimage.grey_closing(bound, (2, 2), mode="constant", cval=np.inf), np.float32)
@@ -173,7 +162,7 @@ def _may_show(frames: PlacedFrames, k: int, corners: Float64) -> bool:
 def carve_cells(places: Float64, low: Float32, views: CarvingViews, heights: CellGrid) -> Float32:
     """Lower the bounds of cells (N,) while no height is photo-consistent.
 
-    places: (N, 3) the cells at their known bounds. low: (N,) where to stop. heights: NaN where unknown.
+    places: (N, 3) the cells at their known bounds. low: (N,) where to stop. heights: that may hide them.
     """
     count = len(views.pictures)
     gray, relative = np.empty(count, np.float32), np.empty(count, np.float32)
@@ -185,7 +174,7 @@ def carve_cells(places: Float64, low: Float32, views: CarvingViews, heights: Cel
             seen = 0
             for v in range(count):
                 level, around = _brightness(views, v, x, y, z)
-                if level > 0 and not _is_hidden(heights, views.eyes[v], x, y, z):
+                if level > 0 and not is_blocked(heights, (x, y, z), views.eyes[v], 0.0):
                     gray[seen] = level + DARK
                     relative[seen] = gray[seen] / (around + DARK)
                     seen += 1
@@ -222,19 +211,3 @@ def _brightness(views: CarvingViews, v: int, x: float, y: float, z: float) -> tu
         return 0.0, 0.0
     level = (1 - b) * ((1 - a) * corners[0] + a * corners[1]) + b * ((1 - a) * corners[2] + a * corners[3])
     return level, float(around[i // _STRIDE_PX, j // _STRIDE_PX])
-
-
-@kernel()
-def _is_hidden(heights: CellGrid, eye: Float64, x: float, y: float, z: float) -> bool:
-    """Check whether the map blocks the line of sight from a place to an eye (3,)."""
-    cell = heights.cell_m
-    far = max(np.sqrt((eye[0] - x) ** 2 + (eye[1] - y) ** 2), 1e-6)
-    step_x, step_y, rise = (eye[0] - x) / far * cell, (eye[1] - y) / far * cell, (eye[2] - z) / far * cell
-    for k in range(1, int(_MAX_RISE_M / rise) + 2):
-        j = int((x + k * step_x - heights.x0_m) / cell + 0.5)
-        i = int((y + k * step_y - heights.y0_m) / cell + 0.5)
-        if not (0 <= i < heights.z_m.shape[0] and 0 <= j < heights.z_m.shape[1]):
-            return False
-        if heights.z_m[i, j] > z + k * rise:
-            return True
-    return False

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from barsight.core.arrays import Float32, Float64, Int64, kernel
+from barsight.core.arrays import Float64, Int64, kernel
 from barsight.core.pose import Pose
 from barsight.core.records.pairs import RectifiedCamera
+from barsight.yard.map_lookup import CellGrid, is_blocked
 from barsight.yard.types import HeightMap
 
 OVER_LINE_M = 0.02
@@ -67,36 +68,30 @@ class Cameras:
         """Count the views (N,) that show places (N, 3): both cameras have it in their picture, and no surface
         of the map is in the way. body_m: (F, 3) the body's places.
         """
-        z = np.where(np.isnan(heights.z_m), -np.float32(np.inf), heights.z_m)
-        at = np.array([heights.x0_m, heights.y0_m, heights.cell_m])
         eyes = np.ascontiguousarray(body_m[:, None] + self.eyes_m)
         axes, places = (np.ascontiguousarray(one, np.float64) for one in (self.axes, places_m))
-        return _count_views(z, at, places, eyes, axes, self.bounds)
+        return _count_views(CellGrid.of(heights), places, eyes, axes, self.bounds)
 
 
 @kernel()
-def _count_views(
-    z: Float32, at: Float64, places: Float64, eyes: Float64, axes: Float64, bounds: Float64
-) -> Int64:
-    """Count the views (N,) of places (N, 3); z: map (rows, columns), -inf where unknown; at: x and y of its
-    first cell, and the cells' size; eyes: (F, 2, 3); axes, bounds: see `Cameras`.
-    """
-    highest = z.max() if z.size else -np.inf
+def _count_views(grid: CellGrid, places: Float64, eyes: Float64, axes: Float64, bounds: Float64) -> Int64:
+    """Count the views (N,) of places (N, 3) from eyes (F, 2, 3). axes, bounds: see `Cameras`."""
     found = np.zeros(len(places), np.int64)
     for n in range(len(places)):
+        place = (places[n, 0], places[n, 1], places[n, 2])
         for f in range(len(eyes)):
             found[n] += (
-                _is_pictured(places[n], eyes[f, 0], axes, bounds[0])
-                and _is_pictured(places[n], eyes[f, 1], axes, bounds[1])
-                and not _is_blocked(z, at, highest, places[n], eyes[f, 0])
-                and not _is_blocked(z, at, highest, places[n], eyes[f, 1])
+                _is_pictured(place, eyes[f, 0], axes, bounds[0])
+                and _is_pictured(place, eyes[f, 1], axes, bounds[1])
+                and not is_blocked(grid, place, eyes[f, 0], OVER_LINE_M)
+                and not is_blocked(grid, place, eyes[f, 1], OVER_LINE_M)
             )
     return found
 
 
 @kernel()
-def _is_pictured(place: Float64, eye: Float64, axes: Float64, bounds: Float64) -> bool:
-    """Check whether a place (3,) lies in the picture of a camera at `eye` (3,)."""
+def _is_pictured(place: tuple[float, float, float], eye: Float64, axes: Float64, bounds: Float64) -> bool:
+    """Check whether a place lies in the picture of a camera at `eye` (3,). axes: (3, 3); bounds: (4,)."""
     x, y, z = place[0] - eye[0], place[1] - eye[1], place[2] - eye[2]
     right, down, depth = (
         axes[0, 0] * x + axes[0, 1] * y + axes[0, 2] * z,
@@ -107,20 +102,3 @@ def _is_pictured(place: Float64, eye: Float64, axes: Float64, bounds: Float64) -
         bounds[0] * depth <= right <= bounds[1] * depth and bounds[2] * depth <= down <= bounds[3] * depth
     )
     return bool(within and depth > 0)
-
-
-@kernel()
-def _is_blocked(z: Float32, at: Float64, highest: float, place: Float64, eye: Float64) -> bool:
-    """Check whether a surface of the map (rows, columns) rises over the line from a place to an eye (3,)."""
-    away = np.sqrt((eye[0] - place[0]) ** 2 + (eye[1] - place[1]) ** 2)
-    steps = int(np.ceil(away / at[2]))
-    for step in range(1, steps):
-        part = step / steps
-        level = place[2] + part * (eye[2] - place[2])
-        if level > highest:
-            return False
-        column = int(np.floor((place[0] + part * (eye[0] - place[0]) - at[0]) / at[2] + 0.5))
-        row = int(np.floor((place[1] + part * (eye[1] - place[1]) - at[1]) / at[2] + 0.5))
-        if 0 <= row < z.shape[0] and 0 <= column < z.shape[1] and z[row, column] > level + OVER_LINE_M:
-            return True
-    return False

@@ -1,8 +1,9 @@
-"""Look up the map's cells at given places in the yard."""
+"""Look up the map's cells at given places in the yard, and along lines of sight."""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -14,6 +15,24 @@ from barsight.yard.types import HeightMap
 SATURATED_LEVEL = 245.0
 """Gray level from which steel is saturated, so that neither white paper nor a bar shows on it."""
 _UNKNOWN, _FILLED = HeightSource.UNKNOWN, HeightSource.FILLED
+
+
+class CellGrid(NamedTuple):
+    """Heights (rows, columns) of cells, NaN where unknown, the place of the first cell, and the highest of
+    all heights, -inf where none is known.
+    """
+
+    x0_m: float
+    y0_m: float
+    cell_m: float
+    z_m: Float32
+    highest_m: float
+
+    @classmethod
+    def of(cls, heights: HeightMap) -> CellGrid:
+        """Take a map's cells."""
+        highest = float(np.fmax.reduce(heights.z_m, axis=None, initial=-np.inf))
+        return cls(heights.x0_m, heights.y0_m, heights.cell_m, heights.z_m, highest)
 
 
 def nearest_cells(heights: HeightMap, x: Float64, y: Float64) -> tuple[Int64, Int64, Bool]:
@@ -113,3 +132,34 @@ def interpolate_height(z: Float32, source: UInt8, column: float, row: float) -> 
             total += share_c * share_r * z[r, c]
             weight += share_c * share_r
     return total / weight if weight >= 0.5 else np.nan
+
+
+@kernel()
+def is_blocked(grid: CellGrid, place: tuple[float, float, float], eye: Float64, over_m: float) -> bool:
+    """Check whether a surface rises more than over_m above the line of sight from a place to an eye (3,): in
+    the place's own cell, and on in steps of at most a cell.
+    """
+    x, y, z = place
+    steps = max(int(np.ceil(np.sqrt((eye[0] - x) ** 2 + (eye[1] - y) ** 2) / grid.cell_m)), 1)
+    for step in range(steps):
+        part = step / steps
+        level = z + part * (eye[2] - z) + over_m
+        if level >= grid.highest_m:
+            return False
+        column = int(np.floor((x + part * (eye[0] - x) - grid.x0_m) / grid.cell_m + 0.5))
+        row = int(np.floor((y + part * (eye[1] - y) - grid.y0_m) / grid.cell_m + 0.5))
+        is_inside = 0 <= row < grid.z_m.shape[0] and 0 <= column < grid.z_m.shape[1]
+        if is_inside and grid.z_m[row, column] > level:
+            return True
+    return False
+
+
+@kernel()
+def are_blocked(grid: CellGrid, places: Float64, eye: Float64, over_m: float) -> Bool:
+    """Check for places (N, 3) whether a surface rises more than over_m above their lines of sight to an eye
+    (3,); (N,).
+    """
+    blocked = np.empty(len(places), np.bool_)
+    for n in range(len(places)):
+        blocked[n] = is_blocked(grid, (places[n, 0], places[n, 1], places[n, 2]), eye, over_m)
+    return blocked
