@@ -9,6 +9,7 @@ from barsight.yard.map_lookup import (
     are_blocked,
     cell_spans,
     highest_seen,
+    is_blocked,
     lookup_heights,
     sample_levels,
 )
@@ -91,5 +92,6 @@ def test_a_line_of_sight_is_blocked_by_what_rises_over_it(over_m: float) -> None
         found = are_blocked(grid, places, eye, over_m)
         assert found.tolist() == [plainly_blocked(grid, place, eye, over_m) for place in places]
         assert 0.05 < found.mean() < 0.95
+    assert is_blocked(grid, tuple(places[0]), eye, over_m) == plainly_blocked(grid, places[0], eye, over_m)
     nothing = grid._replace(z_m=np.full_like(grid.z_m, np.nan), highest_m=-np.inf)
     assert not are_blocked(nothing, places, eye, over_m).any()

@@ -158,6 +158,7 @@ def _sample(
 
 def is_hidden(part: HeightMap, line_m: Float64, eye_m: Float64) -> bool:
     """Check whether the map blocks the view from a camera (3,) to a line of points (N, 3)."""
-    way = (eye_m - line_m) / np.maximum(eye_m[2] - line_m[:, 2:], _FROM_M)
-    blocked = are_blocked(CellGrid.of(part), line_m + _FROM_M * way, eye_m, _OVER_M)
+    eye = np.array(eye_m)  # which may be read-only: to the kernel that is another type, compiled anew
+    way = (eye - line_m) / np.maximum(eye[2] - line_m[:, 2:], _FROM_M)
+    blocked = are_blocked(CellGrid.of(part), line_m + _FROM_M * way, eye, _OVER_M)
     return bool(blocked.mean() > _HIDDEN_RATIO)

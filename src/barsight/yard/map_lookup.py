@@ -31,8 +31,9 @@ class CellGrid(NamedTuple):
     @classmethod
     def of(cls, heights: HeightMap) -> CellGrid:
         """Take a map's cells."""
-        highest = float(np.fmax.reduce(heights.z_m, axis=None, initial=-np.inf))
-        return cls(heights.x0_m, heights.y0_m, heights.cell_m, heights.z_m, highest)
+        z = np.ascontiguousarray(heights.z_m, np.float32)
+        highest = float(np.fmax.reduce(z, axis=None, initial=-np.inf))
+        return cls(heights.x0_m, heights.y0_m, heights.cell_m, z, highest)
 
 
 def nearest_cells(heights: HeightMap, x: Float64, y: Float64) -> tuple[Int64, Int64, Bool]:
