@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from barsight.acceptance.commissioning import GuidedStep, begin, walk
-from barsight.acceptance.watch import Approval, WatchedFigure, WatchedSurvey, WatchRecord, write_watch
+from barsight.acceptance.watch.record import Approval, WatchedFigure, WatchedSurvey, WatchRecord, write_watch
 from barsight.calibration.files.euroc import read_rig
 from barsight.calibration.files.rig_file import write_rig_file
 from barsight.calibration.files.yaml_document import write_document

@@ -131,7 +131,8 @@ def _rig(name: str) -> Target:
 
 
 def _watch(folder: Path) -> int:
-    from barsight.acceptance.watch import control_charts, read_watch
+    from barsight.acceptance.watch.charts import control_charts
+    from barsight.acceptance.watch.record import read_watch
 
     control_charts(read_watch(folder / "watch.json").since_approval)
     return 0

@@ -12,7 +12,7 @@ import pytest
 from barsight.acceptance.certificate import read_certificate
 from barsight.acceptance.commissioning import SETTINGS, CommissionSettings, GuidedStep, begin, read_done, walk
 from barsight.acceptance.layout import Area, lay_out
-from barsight.acceptance.watch import read_watch
+from barsight.acceptance.watch.record import read_watch
 from barsight.artefacts.plan import AcceptancePlan, plan_text
 from barsight.calibration.files.rig_file import write_rig_file
 from barsight.cli.acceptance.commission import guided_steps

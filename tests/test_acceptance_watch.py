@@ -7,17 +7,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from barsight.acceptance.watch import (
+from barsight.acceptance.watch.charts import control_charts
+from barsight.acceptance.watch.figures import beyond_limits, feature_figures, rig_figures, tag_figures
+from barsight.acceptance.watch.record import (
     Approval,
     WatchedFigure,
     WatchedSurvey,
     WatchRecord,
-    beyond_limits,
-    control_charts,
-    feature_figures,
     read_watch,
-    rig_figures,
-    tag_figures,
     with_survey,
     write_watch,
 )

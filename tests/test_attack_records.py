@@ -9,7 +9,7 @@ from fuzz.mutators import reseal_folder
 from fuzz.seeds import measured_from, write_results
 
 from barsight.acceptance.commissioning import begin, read_done
-from barsight.acceptance.watch import read_watch
+from barsight.acceptance.watch.record import read_watch
 from barsight.cli.main import run
 from barsight.core.errors import InputError
 from barsight.core.reading.sealed_json import write_sealed

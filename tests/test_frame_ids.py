@@ -9,7 +9,7 @@ import pytest
 import tifffile
 
 from barsight.acceptance.budgets.error_sources import measured_load
-from barsight.acceptance.watch import WatchedSurvey, WatchRecord, read_watch, with_survey, write_watch
+from barsight.acceptance.watch.record import WatchedSurvey, WatchRecord, read_watch, with_survey, write_watch
 from barsight.cli.main import run
 from barsight.core.errors import InputError
 from barsight.core.reading.ply import read_vertices

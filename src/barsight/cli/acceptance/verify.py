@@ -14,21 +14,15 @@ from rich.table import Table
 
 from barsight.acceptance.acceptance import look_at_rig
 from barsight.acceptance.observation import observe
-from barsight.acceptance.watch import (
-    ALARM,
-    Approval,
-    ControlChart,
-    WatchedSurvey,
+from barsight.acceptance.watch.charts import ALARM, ControlChart, control_charts
+from barsight.acceptance.watch.figures import (
     beyond_limits,
-    control_charts,
     feature_figures,
     picture_figures,
-    read_watch,
     rig_figures,
     tag_figures,
-    with_survey,
-    write_watch,
 )
+from barsight.acceptance.watch.record import Approval, WatchedSurvey, read_watch, with_survey, write_watch
 from barsight.artefacts.plan import AcceptancePlan, ErrorLimits, read_plan
 from barsight.cli.arguments import call
 from barsight.cli.calibrate.yard_tags import place_in_yard
