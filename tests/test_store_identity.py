@@ -8,14 +8,17 @@ from pathlib import Path
 
 import pytest
 
+from barsight.store import adding
 from barsight.store.adding import AddedSurvey, add_survey, read_survey
 from barsight.store.audit import AuditChain, entry, verify_chain
 from barsight.store.history import ExecutedLift, list_surveys, newest_sightings, present_yard
 from barsight.store.lift_records import add_lifts
 from barsight.store.opening import Store, open_store
 from barsight.store.states import lift_state, step_lift
+from barsight.yard.inventory.coarse_map import unpack
+from barsight.yard.types import HeightMap
 from lift_yards import record
-from store_yards import START_NS, WHOLE, CraneYard, View
+from store_yards import PITCH_M, START_NS, WHOLE, CraneYard, View
 from yard_maps import Laid
 
 HOUR_NS = 3600 * 10**9
@@ -282,3 +285,24 @@ def test_what_was_not_seen_is_not_gone(store: Store, tmp_path: Path) -> None:
     with store.reading() as connection:
         (present,) = present_yard(connection)
     assert present.sighting.seen_ns < START_NS + 2 * HOUR_NS and present.doubt is None
+
+
+def test_a_place_that_no_survey_saw_is_looked_up_without_their_heights(
+    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All were unpacked: 0.5 s of a processor for 100 surveys of a yard of 100 m by 50 m, now 0.08 s."""
+    yard, unpacked = CraneYard(11), list[bytes]()
+    part = View(-9.0, PITCH_M * 8)
+
+    def counted(packed: bytes) -> HeightMap:
+        unpacked.append(packed)
+        return unpack(packed)
+
+    monkeypatch.setattr(adding, "unpack", counted)
+    for k in range(3):
+        yard.survey(tmp_path / str(k), part)
+        add_survey(store, read_survey(tmp_path / str(k)), "me")
+    unpacked.clear()
+    yard.survey(tmp_path / "whole")
+    added = add_survey(store, read_survey(tmp_path / "whole"), "me")
+    assert "found" in added.changes.values() and len(unpacked) <= 1

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import math
 import time
+import zlib
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from barsight.yard.inventory.changes import Change, YardChanges, compare_yards
+from barsight.yard.inventory.changes import Change, YardChanges, compare_yards, look_at
+from barsight.yard.inventory.coarse_map import pack, unpack, unpack_seen
 from barsight.yard.inventory.matching import Places, match_bundles, moved_bundles
 from barsight.yard.inventory.stock_list import ListedBundle, match_stock
-from barsight.yard.types import Bundle
+from barsight.yard.types import Bundle, HeightMap
 from lift_yards import SIGMA, laid, map_of, record
 
 STOCK = [laid(0.3), laid(0.65), laid(1.0)]
@@ -174,3 +177,24 @@ def test_ten_thousand_bundles_are_matched_in_seconds() -> None:
     pairs = match_bundles(places, after, 0.5)
     assert time.perf_counter() - began < 20
     assert len(pairs) == len(order) and all(order[j] == i for i, j in pairs.items())
+
+
+def test_a_packed_map_tells_which_places_it_saw_without_reading_their_heights() -> None:
+    rng = np.random.default_rng(6)
+    heights = map_of([laid(0.3)])
+    heights.z_m[rng.random(heights.shape) < 0.4] = np.nan
+    heights.source[np.isnan(heights.z_m)] = 0
+    packed = pack(heights)
+    whole, seen = unpack(packed), unpack_seen(packed)
+    findings = []
+    for x_m, y_m in rng.uniform((-1.5, -3.0), (1.5, 3.0), (100, 2)):
+        one = record(replace(laid(x_m), y_m=y_m))
+        findings.append(look_at(one, whole))
+        assert (look_at(one, seen) == "unseen") == (findings[-1] == "unseen")
+    assert 10 < findings.count("unseen") < 90
+    mm = np.where(np.isnan(whole.z_m), np.iinfo(np.int16).min, np.round(1e3 * whole.z_m)).astype("<i2")
+    head = json.dumps([whole.x0_m, whole.y0_m, whole.cell_m, *whole.shape])
+    earlier = zlib.compress(head.encode() + b"\n" + mm.tobytes())
+    for told in (unpack(earlier), unpack_seen(earlier)):
+        assert isinstance(told, HeightMap)
+        np.testing.assert_array_equal(told.z_m, whole.z_m)

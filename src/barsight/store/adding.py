@@ -34,7 +34,7 @@ from barsight.yard.events import kept_events
 from barsight.yard.identity import MapIdentity, expect_same_frame
 from barsight.yard.inventory.bundle_file import bundle_of, bundles_content, read_match
 from barsight.yard.inventory.changes import Finding, look_at
-from barsight.yard.inventory.coarse_map import pack, unpack
+from barsight.yard.inventory.coarse_map import pack, unpack, unpack_seen
 from barsight.yard.inventory.matching import moved_bundles
 from barsight.yard.lifting import lift_file
 from barsight.yard.lifting.lift_file import read_lifts, unknown_events
@@ -225,12 +225,15 @@ def _shown_before(connection: Connection, read: MeasuredSurvey, new: set[int]) -
         .order_by(SURVEYS.c.captured_to_ns.desc(), SURVEYS.c.id.desc())
     )
     for survey_id in connection.execute(earlier).scalars().all():
-        unseen = [j for j, finding in findings.items() if finding == "unseen"]
+        unseen = {j: read.found[j].bundle for j, finding in findings.items() if finding == "unseen"}
         if not unseen:
             break
-        packed = select(SURVEYS.c.heights).where(SURVEYS.c.id == survey_id)
-        heights = unpack(connection.execute(packed).scalar_one())
-        findings |= {j: look_at(read.found[j].bundle, heights) for j in unseen}
+        packed = connection.execute(select(SURVEYS.c.heights).where(SURVEYS.c.id == survey_id)).scalar_one()
+        area = unpack_seen(packed)
+        shown = {j: bundle for j, bundle in unseen.items() if look_at(bundle, area) != "unseen"}
+        if shown:
+            heights = unpack(packed)
+            findings |= {j: look_at(bundle, heights) for j, bundle in shown.items()}
     return findings
 
 

@@ -124,11 +124,6 @@ def _alone(kind: Kind, old: int | None, new: int | None, mass: Mass, sign: int) 
     return Change(kind, old, new, nan, nan, nan, nan, (nan,) * 4, nan, sign * mass.kg, mass.sigma_kg)
 
 
-def _seen(bundle: Bundle, heights: YardMap) -> bool:
-    """Check whether a map saw the place of a bundle found in the other map."""
-    return bool(np.isfinite(heights_over(bundle, heights)).mean() >= MIN_KNOWN)
-
-
 def heights_over(bundle: Bundle, heights: YardMap) -> Float64:
     """Look up a map's heights (40, 5) over a bundle's outline, along it and across; NaN where unseen."""
     u = np.linspace(-0.4, 0.4, 5) * bundle.width_m

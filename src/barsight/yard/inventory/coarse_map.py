@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import json
 import zlib
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from barsight.core.arrays import Bool
+from barsight.yard.sections import PartedMap
 from barsight.yard.types import HeightMap, YardMap
 
 CELL_M = 0.1
@@ -27,16 +31,44 @@ def pack(heights: YardMap) -> bytes:
     )
     nan = np.float32(np.nan)
     z = np.concatenate([np.where(part.is_seen, part.z_m, nan)[::step, ::step] for part in parts])
-    mm = np.where(np.isfinite(z), np.clip(np.round(1e3 * z), -32000, 32000), _UNKNOWN).astype("<i2")
+    known = np.isfinite(z)
+    mm = np.where(known, np.clip(np.round(1e3 * z), -32000, 32000), _UNKNOWN).astype("<i2")
     head = json.dumps([heights.x0_m, heights.y0_m, step * heights.cell_m, *mm.shape])
-    return zlib.compress(head.encode() + b"\n" + mm.tobytes())
+    seen = np.packbits(known, axis=1).tobytes()
+    return zlib.compress(head.encode() + b"\n" + seen) + zlib.compress(mm.tobytes())
 
 
 def unpack(packed: bytes) -> HeightMap:
     """Read the output of `pack`; sigma and views are not kept."""
-    head, _, body = zlib.decompress(packed).partition(b"\n")
-    x0_m, y0_m, cell_m, rows, columns = json.loads(head)
-    mm = np.frombuffer(body, "<i2").reshape(rows, columns)
-    known = mm != _UNKNOWN
+    (x0_m, y0_m, cell_m, *shape), seen, body = _parted(packed)
+    mm = np.frombuffer(zlib.decompress(body) if body else seen, "<i2").reshape(shape)
+    return _known_map(x0_m, y0_m, cell_m, mm != _UNKNOWN, mm)
+
+
+def unpack_seen(packed: bytes) -> YardMap:
+    """Read only which places were seen, 0 m high there: a small part of the time to read their heights."""
+    (x0_m, y0_m, cell_m, *shape), seen, body = _parted(packed)
+    if not body:
+        return unpack(packed)
+    bits = np.frombuffer(seen, np.uint8).reshape(shape[0], -1)
+
+    def read(rows: slice, columns: slice) -> HeightMap:
+        known = np.unpackbits(bits[rows], axis=1, count=shape[1])[:, columns].astype(np.bool_)
+        origin = x0_m + cell_m * columns.start, y0_m + cell_m * rows.start
+        return _known_map(*origin, cell_m, known, np.zeros(known.shape, np.int16))
+
+    return PartedMap(x0_m, y0_m, cell_m, (shape[0], shape[1]), read)
+
+
+def _parted(packed: bytes) -> tuple[list[Any], bytes, bytes]:
+    """Read place and size, and the bits of what was seen; return the heights still packed. Maps of earlier
+    versions have no bits: their heights are returned in place of these.
+    """
+    first = zlib.decompressobj()
+    head, _, seen = first.decompress(packed).partition(b"\n")
+    return json.loads(head), seen, first.unused_data
+
+
+def _known_map(x0_m: float, y0_m: float, cell_m: float, known: Bool, mm: NDArray[np.int16]) -> HeightMap:
     z = np.where(known, mm / np.float32(1e3), np.float32(np.nan)).astype(np.float32)
     return HeightMap(x0_m, y0_m, cell_m, z, np.full_like(z, np.nan), np.zeros_like(z), known.astype(np.uint8))
