@@ -13,6 +13,7 @@ import pytest
 
 from barsight.page import watch as watching
 from barsight.page.api.serve import ServeOptions, serving
+from barsight.report.page import write_report
 from barsight.store.accounts import add_person
 from barsight.store.audit import entry
 from barsight.store.confirmation import confirm_lift, end_lift, open_lifts
@@ -20,6 +21,7 @@ from barsight.store.opening import open_store
 from barsight.store.states import last_raised_ns
 from live_folders import beating, live_folder
 from opcua_servers import node_package
+from result_folders import write_folder
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -592,3 +594,16 @@ def test_the_catalogue_is_whole_in_three_languages(browser: object, address: str
             sheet.open(name)
             shown = sheet.page.inner_text("body")
             assert not [key for key in words if "." in key and key in shown.split()]
+
+
+def test_a_printed_report_shows_the_hashes_that_are_folded_on_a_screen(
+    browser: object, tmp_path: Path
+) -> None:
+    out = write_folder(tmp_path / "result")
+    write_report(out, out / "report.html")
+    page = browser.new_page()
+    page.goto((out / "report.html").as_uri())
+    for media, shown in (("screen", False), ("print", True)):
+        page.emulate_media(media=media)
+        digest = page.locator("#provenance code").first
+        assert digest.evaluate("one => one.checkVisibility({contentVisibilityAuto: true})") is shown
