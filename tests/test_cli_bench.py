@@ -67,6 +67,9 @@ def test_mistakes_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert run(["bench", "stereo", str(tmp_path)]) == 3
     text = capsys.readouterr().err
     assert text.count("\n") == 1 and str(tmp_path) in text
+    assert run(["bench", "lifts", "--magnet", str(tmp_path / "none.toml")]) == 3
+    text = capsys.readouterr().err
+    assert text.count("\n") == 1 and "none.toml: no such file; check the path" in text
 
 
 def test_the_live_estimate_is_timed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -116,10 +116,10 @@ def bench_lift_targets(
         described_at = magnet or Path(scratch) / "magnet.toml"
         if magnet is None:
             described_at.write_text(example_magnet(), encoding="utf-8")
-        judged = read_magnet(described_at)
+        described, judged = load_magnet(described_at), read_magnet(described_at)
         given = _Given(
-            (keep or Path(scratch)).absolute(), load_magnet(described_at), judged, placements,
-            danger_placements, choice, _keys(judged, choice),
+            (keep or Path(scratch)).absolute(), described, judged, placements, danger_placements, choice,
+            _keys(judged, choice),
         )  # fmt: skip
         for seed, yard in over_seeds(_judge_seed, numbers, given, workers, scheduler):
             found[seed] = yard
