@@ -4,6 +4,7 @@ import gc
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -133,6 +134,53 @@ def test_misspelt_settings_and_missing_recordings_say_so(tmp_path: Path) -> None
 def test_a_setting_that_cannot_be_is_named(whole: Path, settings: dict[str, Any], line: str) -> None:
     with pytest.raises(bs.BarsightError) as caught:
         bs.measure(whole, **settings)
+    assert str(caught.value).startswith(line)
+
+
+FLAT = np.zeros((40, 60), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("call", "line"),
+    [
+        (lambda: bs.disparity(FLAT, FLAT, range_px=(1,)), "range_px has 1 value; give 2"),
+        (lambda: bs.disparity(FLAT, FLAT, range_px=(0, 8, 9)), "range_px has 3 values; give 2"),
+        (lambda: bs.disparity(FLAT, FLAT, range_px=3), "range_px is 3; give a list"),
+        (lambda: bs.disparity(FLAT, FLAT, range_px=np.zeros((2, 2))), "range_px is array("),
+        (lambda: bs.disparity(FLAT, FLAT, range_px=(np.nan, 8)), "range_px is nan; give a whole number"),
+        (
+            lambda: bs.disparity(FLAT, FLAT, range_px=(0, 8), max_disparity_px=9),
+            "range_px and max_disparity_px are given; leave one of them out",
+        ),
+        (lambda: bs.disparity(FLAT, FLAT, rig=3), "rig is 3; give a path"),
+        (lambda: bs.disparity(None, FLAT), "left: has the shape (); "),
+        (lambda: bs.disparity(FLAT, np.zeros(0, np.uint8)), "right: has the shape (0,); "),
+        (lambda: bs.open_recording(None), "path is None; give a path"),
+        (lambda: bs.open_recording("a\0b"), "path is 'a\\x00b'; give a path without a NUL character"),
+        (lambda: bs.open_recording("x" * 300), "path has a file name of more than 255 bytes"),
+        (lambda: bs.load(np.zeros(3)), "folder is array("),
+        (lambda: bs.Yard(3), "folder is 3; give a path"),
+        (lambda: bs.measure(3), "recording is 3; give a path"),
+        (lambda: bs.measure(["none", None]), "recording is None; give a path"),
+        (lambda: bs.measure(b"none"), "recording is b'none'; give a path"),
+        (lambda: bs.measure("none", magnet=3), "magnet is 3; give a path"),
+        (lambda: list(bs.packets("none")), "recording is 'none'; give what open_recording(PATH) returns"),
+        (lambda: bs.calibrate_stereo("none", None), "board is None; give text in quotes"),
+        (lambda: bs.calibrate_stereo([], "checkerboard:9x6:0.025"), "pictures is []; give a path"),
+        (
+            lambda: bs.calibrate_stereo("none", "checkerboard:9x6:0.025", max_views=0),
+            "max_views is 0; give 6 or more",
+        ),
+        (
+            lambda: bs.calibrate_stereo("none", "checkerboard:9x6:0.025", lens=np.zeros(2)),
+            "lens is array([0., 0.]); choose radtan4, ",
+        ),
+    ],
+)  # fmt: skip
+def test_a_malformed_argument_is_named(call: Callable[[], Any], line: str) -> None:
+    """They ended in an IndexError, a TypeError or an AttributeError of what they reached."""
+    with pytest.raises(bs.BarsightError) as caught:
+        call()
     assert str(caught.value).startswith(line)
 
 

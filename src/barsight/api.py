@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import tempfile
 import weakref
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from barsight.board_views import views_from_pictures
+from barsight.board_views import MIN_VIEWS, views_from_pictures
 from barsight.calibration.boards.board import parse_board
 from barsight.calibration.geometry.projection import Lens
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.calibration.stereo.calibration import StereoCalibration
 from barsight.calibration.stereo.calibration import calibrate_stereo as solve_stereo
 from barsight.core.arrays import UInt8
+from barsight.core.errors import ConfigError
 from barsight.core.records.disparity import Disparity
-from barsight.core.settings.values import build_settings, expect_choice
+from barsight.core.settings.values import build_settings, checked_value, expect_choice
 from barsight.core.timing import ProgressCallback
 from barsight.measure_folder import ignore_progress, measure_into
 from barsight.measure_settings import MeasureSettings
@@ -31,7 +33,7 @@ from barsight.stereo.settings import StereoSettings
 
 def open_recording(path: Path | str) -> StoredPictures:
     """Return the recording at `path`: an EuRoC folder, a ROS bag or a KITTI sequence. Raises InputError."""
-    return open_path(Path(path))
+    return open_path(checked_value(path, Path, "path"))
 
 
 def measure(
@@ -54,8 +56,11 @@ def measure(
     Raises a BarsightError with a one-line text if nothing can be measured.
     """
     chosen = build_settings({"preset": preset, **settings}, MeasureSettings)
-    described = None if magnet is None else Path(magnet)
-    passes = [Path(recording)] if isinstance(recording, (str, Path)) else [Path(one) for one in recording]
+    described = checked_value(magnet, Path | None, "magnet")
+    given: Any = recording
+    is_one = isinstance(given, (str, bytes, os.PathLike)) or not isinstance(given, Iterable)
+    several = (given,) if is_one else tuple(given)
+    passes = list(checked_value(several, tuple[Path, ...], "recording"))
     out = Path(tempfile.mkdtemp(prefix="barsight."))
     try:
         measure_into(passes, out, chosen, advance=advance, magnet=described, judged_at=at, report=False)
@@ -69,7 +74,7 @@ def measure(
 
 def load(folder: Path | str) -> Yard:
     """Return the yard of a folder written by `barsight measure` or `Yard.save`. Raises InputError."""
-    return Yard(Path(folder))
+    return Yard(folder)
 
 
 def disparity(
@@ -86,10 +91,14 @@ def disparity(
     determined from the pictures if None. settings: fields of `StereoSettings`.
     """
     if range_px is not None:
-        settings |= {"min_disparity_px": range_px[0], "max_disparity_px": range_px[1]}
+        low, high = checked_value(range_px, tuple[int, int], "range_px")
+        if twice := settings.keys() & {"min_disparity_px", "max_disparity_px"}:
+            raise ConfigError(f"range_px and {min(twice)} are given; leave one of them out")
+        settings |= {"min_disparity_px": low, "max_disparity_px": high}
     chosen = build_settings(settings, StereoSettings)
     first, second = (Path(one) if isinstance(one, str) else one for one in (left, right))
-    return match_pictures(first, second, chosen, Path(rig) if isinstance(rig, str) else rig)[1]
+    by = rig if isinstance(rig, StereoRig) else checked_value(rig, Path | None, "rig")
+    return match_pictures(first, second, chosen, by)[1]
 
 
 def calibrate_stereo(
@@ -100,6 +109,8 @@ def calibrate_stereo(
     pictures, board, lens: as for `barsight calibrate stereo`.
     """
     expect_choice("lens", lens, tuple(one.value for one in Lens))
-    target, path = parse_board(board), Path(pictures)
+    target, path = parse_board(checked_value(board, str, "board")), checked_value(pictures, Path, "pictures")
+    if checked_value(max_views, int, "max_views") < MIN_VIEWS:
+        raise ConfigError(f"max_views is {max_views}; give {MIN_VIEWS} or more")
     views, sizes, left_out = views_from_pictures(path, target, max_views, ignore_progress)
     return solve_stereo(views, target, Lens(lens), sizes, path, left_out)

@@ -18,6 +18,9 @@ from barsight.recording.formats.bag_file import BAG_KINDS
 from barsight.recording.formats.image_pairs import ReadPair, find_pairs, read_pair_files
 from barsight.recording.open import open_recording
 
+MIN_VIEWS = 6
+"""Minimum of the maximum number of views of a board that a calibration is asked to use."""
+
 Size = tuple[int, int]
 
 

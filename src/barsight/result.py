@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 from barsight.core.errors import MEASURE_AGAIN, InputError, OutputError
 from barsight.core.files import atomic_directory
 from barsight.core.records.heights import Contour
+from barsight.core.settings.values import checked_value
 from barsight.report.files.result_files import RESULT_FILES
 from barsight.report.page import write_report
 from barsight.result_folder import (
@@ -91,9 +92,10 @@ class Yard:
     owner: object that `folder` belongs to; it lives as long as the yard.
     """
 
-    def __init__(self, folder: Path, owner: object = None) -> None:
-        self.folder, self._owner = folder, owner
-        self.summary, _ = open_folder(folder)
+    def __init__(self, folder: Path | str, owner: object = None) -> None:
+        self.folder: Path = checked_value(folder, Path, "folder")
+        self._owner = owner
+        self.summary, _ = open_folder(self.folder)
 
     @cached_property
     def height_map(self) -> HeightMap:
@@ -163,7 +165,7 @@ class Yard:
         Events that were reported there, and that the map may not show, are kept.
         Raises OutputError if `out` exists already and may not be overwritten.
         """
-        target = Path(out)
+        target: Path = checked_value(out, Path, "out")
         if target.resolve() == self.folder.resolve():
             raise OutputError(f"{target}: the yard was read from there; name another folder")
         with atomic_directory(target, replace=overwrite, owned=RESULT_FILES) as staging:

@@ -16,7 +16,7 @@ from barsight.calibration.geometry.rig import StereoRig
 from barsight.core.compiling.ahead import compile_ahead
 from barsight.core.errors import ConfigError, MeasurementError
 from barsight.core.records.pairs import RectifiedPair, RefusedFrame, StereoFrame
-from barsight.core.settings.values import build_settings
+from barsight.core.settings.values import build_settings, checked_value
 from barsight.core.stamps import NS_PER_S
 from barsight.core.timing import Stopwatch
 from barsight.measure_folder import ignore_progress, write_measured
@@ -59,13 +59,17 @@ class Session:
         if settings is not None and fields:
             raise ConfigError(f"settings are given twice; add {', '.join(fields)} to them")
         self._asked = build_settings(fields if settings is None else settings, MeasureSettings)
-        self._magnet = None if magnet is None else load_magnet(Path(magnet))
+        described = checked_value(magnet, Path | None, "magnet")
+        self._magnet = None if described is None else load_magnet(described)
+        if imu_noise is not None and not isinstance(imu_noise, ImuNoise):
+            raise ConfigError(f"imu_noise is {imu_noise!r}; give an ImuNoise, like a recording's imu_noise()")
         compile_ahead(ignore_progress, "measure")  # a moving crane doesn't wait for kernels
         self._settings = self._asked.chosen()
         self._folder = Path(tempfile.mkdtemp(prefix="barsight."))
         self._yard = self._folder / "yard"
         weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
-        self._rig, self._noise, self._is_simulated = rig, imu_noise, is_simulated
+        self._rig, self._noise = rig, imu_noise
+        self._is_simulated = checked_value(is_simulated, bool, "is_simulated")
         self._recordings: list[PacketRecording] = []
         self._begin_pass()
 

@@ -59,15 +59,16 @@ def match_pictures(
     return pair, disparity
 
 
-def _name(picture: Picture) -> Path:
-    return picture if isinstance(picture, Path) else Path("picture")
+def _name(picture: Picture, side: str = "left") -> Path:
+    """Name a picture by its file, or as the argument `side`."""
+    return picture if isinstance(picture, Path) else Path(side)
 
 
 def _pair(left: Picture, right: Picture, rig: Path | StereoRig | None, method: MethodName) -> RectifiedPair:
     """Load the rectified pair. Raises InputError where the pictures can't be read, differ in size, are too
     small or aren't rectified, and CalibrationError where the rig doesn't fit them.
     """
-    (left_gray, left_colour), (right_gray, right_colour) = _read(left), _read(right)
+    (left_gray, left_colour), (right_gray, right_colour) = _read(left, "left"), _read(right, "right")
     frame = StereoFrame(0, left_gray, right_gray)
     colours = None
     if method in _IN_COLOUR and left_colour is not None and right_colour is not None:
@@ -84,7 +85,9 @@ def _pair(left: Picture, right: Picture, rig: Path | StereoRig | None, method: M
         if frame.left.shape != frame.right.shape:
             sizes = " and ".join(f"{i.shape[1]}x{i.shape[0]}" for i in (frame.left, frame.right))
             raise InputError(
-                _name(right), f"the pictures' sizes differ ({sizes})", "give two pictures of one pair"
+                _name(right, "right"),
+                f"the pictures' sizes differ ({sizes})",
+                "give two pictures of one pair",
             )
         pair = pair_from_images(frame.left, frame.right, *(colours or ()))
     if any(side < least for side, least in zip(pair.left.shape, _MIN_SIZE, strict=True)):
@@ -109,11 +112,11 @@ def _with_colours(pair: RectifiedPair, rectifier: Rectifier, left: UInt8, right:
     return replace(pair, left_colour=left, right_colour=right)
 
 
-def _read(path: Picture) -> tuple[UInt8, UInt8 | None]:
+def _read(path: Picture, side: str) -> tuple[UInt8, UInt8 | None]:
     try:
         if not isinstance(path, Path):
             return split_colour(np.asarray(path))
         return decode_with_colour(read_bytes(path, MAX_PICTURE_BYTES, "check the name"))
     except TornImageError as error:
         remedy = "give another picture" if isinstance(path, Path) else PICTURE_REMEDY
-        raise InputError(_name(path), str(error), remedy) from error
+        raise InputError(_name(path, side), str(error), remedy) from error

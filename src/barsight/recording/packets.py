@@ -16,6 +16,7 @@ from barsight.core.errors import ConfigError, InputError
 from barsight.core.pose import Pose
 from barsight.core.records.pairs import RefusedFrame, StereoFrame
 from barsight.core.records.sensor_samples import CraneSamples, ImuSamples, LaserProfile
+from barsight.core.settings.values import checked_value
 from barsight.core.stamps import rows_not_later
 from barsight.recording.base import FrameIndex, Recording
 from barsight.recording.sensor_samples import expect_si
@@ -29,7 +30,11 @@ MIN_JUDGED = 10
 
 
 def packets(recording: Recording) -> Iterator[Packet]:
-    """Read a recording in time order: before each pair the samples up to it, then the rest."""
+    """Read a recording in time order: before each pair the samples up to it, then the rest. Raises
+    ConfigError for what is no recording.
+    """
+    if not hasattr(recording, "frames"):
+        raise ConfigError(f"recording is {recording!r}; give what open_recording(PATH) returns")
     yield from recording.laser()
     imu, crane, shift_ns = recording.imu(), recording.crane(), recording.rig.timeshift_cam_imu_ns
     last_ns: int | None = None
@@ -70,6 +75,10 @@ class PacketRecording:
             names = ", ".join(kind.__name__ for kind in kinds)
             raise ConfigError(f"a {type(packet).__name__} is no packet; give one of {names}")
         if isinstance(packet, LaserProfile):
+            if checked_value(packet.range_std_m, float, "range_std_m of LaserProfile") < 0:
+                raise InputError(
+                    self.path, f"range_std_m is {packet.range_std_m}", "give the laser's sigma, m"
+                )
             self._laser.append(self._checked(packet))
         elif isinstance(packet, ImuSamples):
             self._add_samples(packet, self._imu)

@@ -10,7 +10,7 @@ import tyro
 from rich.console import Console
 from rich.markup import escape
 
-from barsight.board_views import views_from_detections, views_from_pictures
+from barsight.board_views import MIN_VIEWS, views_from_detections, views_from_pictures
 from barsight.calibration.boards.board import parse_board
 from barsight.calibration.boards.detection_files import has_detections
 from barsight.calibration.files.rig_file import write_rig_file
@@ -82,8 +82,8 @@ def _expect(out: Path, range_m: float, max_views: int) -> None:
     expect_output(out, ".yaml", ".yml")
     if not 0.05 <= range_m <= 1000:
         raise ConfigError(f"--range-m {range_m:g} can't be; give the working distance in metres")
-    if max_views < 6:
-        raise ConfigError(f"--max-views {max_views} is too few; give 6 or more")
+    if max_views < MIN_VIEWS:
+        raise ConfigError(f"--max-views {max_views} is too few; give {MIN_VIEWS} or more")
 
 
 def _print(console: Console, calibration: StereoCalibration, out: Path, html: Path) -> None:

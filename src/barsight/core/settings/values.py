@@ -13,6 +13,8 @@ from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+import numpy as np
+
 from barsight.core.errors import ConfigError
 from barsight.core.settings.renamed import refuse_old_keys
 
@@ -36,8 +38,31 @@ def build_settings(content: Any, kind: type[Settings], name: str = "settings") -
         refuse_old_keys(content)
         built: Settings = _built(content, kind, "")
     else:
-        built = _checked(content, kind, name)
+        built = checked_value(content, kind, name)
     return built
+
+
+def checked_value(value: Any, kind: Any, name: str) -> Any:
+    """Convert a value to its type: mappings to records, lists to tuples, texts to paths. Raises ConfigError
+    that names it.
+    """
+    if get_origin(kind) in (Union, types.UnionType):
+        if value is None:
+            return None
+        (kind,) = (one for one in get_args(kind) if one is not types.NoneType)
+    if get_origin(kind) is Literal:
+        expect_choice(name, value, get_args(kind))
+        return value
+    if get_origin(kind) is tuple:
+        return _tuple(value, get_args(kind), name)
+    if is_dataclass(kind):
+        if isinstance(value, Mapping):
+            return _built(value, kind, f"{name}.")
+        if isinstance(value, kind):  # type: ignore[arg-type]
+            expect_values(value, f"{name}.")
+            return value
+        raise ConfigError(f"{name} is {value!r}; give its fields by name")
+    return _plain(value, kind, name)
 
 
 def expect_values(settings: Any, prefix: str = "") -> None:
@@ -49,12 +74,12 @@ def expect_values(settings: Any, prefix: str = "") -> None:
         value = getattr(settings, name)
         if isinstance(value, Mapping) and isinstance(kind, type):
             raise ConfigError(f"{prefix}{name} is {value!r}; give a {kind.__name__}")
-        _checked(value, kind, f"{prefix}{name}")
+        checked_value(value, kind, f"{prefix}{name}")
 
 
 def expect_choice(name: str, value: Any, choices: tuple[Any, ...]) -> None:
     """Raise ConfigError if a value isn't one of the choices."""
-    if value not in choices:
+    if not isinstance(value, tuple(map(type, choices))) or value not in choices:
         *most, last = map(str, choices)
         raise ConfigError(f"{name} is {value!r}; choose {', '.join(most)}{' or ' if most else ''}{last}")
 
@@ -99,38 +124,17 @@ def _built(content: Mapping[str, Any], kind: Any, prefix: str) -> Any:
     for field in fields(kind):
         if field.name not in content and field.default is field.default_factory is MISSING:
             raise ConfigError(f"{prefix}{field.name} is missing")
-    return kind(**{key: _checked(value, known[key], f"{prefix}{key}") for key, value in content.items()})
-
-
-def _checked(value: Any, kind: Any, name: str) -> Any:
-    """Convert a value to its type: mappings to records, lists to tuples, texts to paths."""
-    if get_origin(kind) in (Union, types.UnionType):
-        if value is None:
-            return None
-        (kind,) = (one for one in get_args(kind) if one is not types.NoneType)
-    if get_origin(kind) is Literal:
-        expect_choice(name, value, get_args(kind))
-        return value
-    if get_origin(kind) is tuple:
-        return _tuple(value, get_args(kind), name)
-    if is_dataclass(kind):
-        if isinstance(value, Mapping):
-            return _built(value, kind, f"{name}.")
-        if isinstance(value, kind):  # type: ignore[arg-type]
-            expect_values(value, f"{name}.")
-            return value
-        raise ConfigError(f"{name} is {value!r}; give its fields by name")
-    return _plain(value, kind, name)
+    return kind(**{key: checked_value(value, known[key], f"{prefix}{key}") for key, value in content.items()})
 
 
 def _tuple(value: Any, kinds: tuple[Any, ...], name: str) -> tuple[Any, ...]:
-    if not isinstance(value, (list, tuple)):
+    if not isinstance(value, (list, tuple)) and not (isinstance(value, np.ndarray) and value.ndim == 1):
         raise ConfigError(f"{name} is {value!r}; give a list")
     if kinds[-1] is Ellipsis:
         kinds = kinds[:1] * len(value)
     if len(value) != len(kinds):
-        raise ConfigError(f"{name} has {len(value)} values; give {len(kinds)}")
-    return tuple(_checked(one, kind, name) for one, kind in zip(value, kinds, strict=True))
+        raise ConfigError(f"{name} has {len(value)} value{'s' * (len(value) != 1)}; give {len(kinds)}")
+    return tuple(checked_value(one, kind, name) for one, kind in zip(value, kinds, strict=True))
 
 
 def _plain(value: Any, kind: Any, name: str) -> Any:
@@ -138,12 +142,14 @@ def _plain(value: Any, kind: Any, name: str) -> Any:
     accepted: Any
     accepted, wanted = {
         float: (Real, "a number"), int: (Integral, "a whole number"), bool: (bool, "true or false"),
-        str: (str, "text in quotes"), Path: ((str, Path), "a path"),
+        str: (str, "text in quotes"), Path: ((str, os.PathLike), "a path"),
     }[kind]  # fmt: skip
     if not isinstance(value, accepted) or (isinstance(value, bool) and kind is not bool):
         raise ConfigError(f"{name} is {value!r}; give {wanted}")
     if kind is int and abs(value) > MAX_VALUE:
         raise ConfigError(f"{name} is over the most, {MAX_VALUE}")
+    if kind is Path and "\0" in str(value):
+        raise ConfigError(f"{name} is {value!r}; give a path without a NUL character")
     if kind is Path and any(len(os.fsencode(part)) > MAX_NAME_BYTES for part in Path(value).parts):
         raise ConfigError(f"{name} has a file name of more than {MAX_NAME_BYTES} bytes")
     try:
