@@ -12,6 +12,7 @@ from barsight.core.pose import Pose
 from barsight.core.records.pairs import RectifiedCamera
 from barsight.core.stamps import NS_PER_S
 from barsight.result_folder import CameraPath
+from barsight.yard.map_lookup import nearest_cells
 from barsight.yard.types import HeightMap
 
 MAX_GAP_S = 1.0
@@ -115,13 +116,10 @@ def first_surface(heights: HeightMap, origin: Float64, direction: Float64) -> Fl
 
 
 def heights_at(heights: HeightMap, places: Float64) -> Float64:
-    """Look up the height (...) of the cell at each position (..., 2 or 3); NaN outside the map and where
-    unknown.
+    """Look up the height (...) of the cell at each position (..., 2 or 3), filled ones too; NaN outside the
+    map and where unknown.
     """
-    columns = np.round((places[..., 0] - heights.x0_m) / heights.cell_m).astype(np.int64)
-    rows = np.round((places[..., 1] - heights.y0_m) / heights.cell_m).astype(np.int64)
-    height, width = heights.z_m.shape
-    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-    z = np.full(columns.shape, np.nan)
-    z[inside] = heights.z_m[rows[inside], columns[inside]]
+    column, row, inside = nearest_cells(heights, places[..., 0], places[..., 1])
+    z = np.full(inside.shape, np.nan)
+    z[inside] = heights.z_m[row[inside], column[inside]]
     return z
