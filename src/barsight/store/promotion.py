@@ -8,14 +8,13 @@ from barsight.core.extras import extra
 from barsight.store.tables import FLEET_SURVEYS, PROMOTIONS, SURVEYS
 
 with extra("store"):
-    from sqlalchemy import Connection, and_, exists, literal, or_, select
+    from sqlalchemy import Connection, Select, and_, exists, literal, or_, select
     from sqlalchemy.sql.elements import ColumnElement
 
 
 def promoted_version(connection: Connection) -> str:
     """Return the version that page and plant use; empty if none was promoted."""
-    newest = select(PROMOTIONS.c.version).order_by(PROMOTIONS.c.id.desc()).limit(1)
-    return str(connection.execute(newest).scalar() or "")
+    return str(connection.execute(_newest_promotion()).scalar() or "")
 
 
 @cache
@@ -25,8 +24,7 @@ def counts(version: str | None = None) -> ColumnElement[bool]:
     A survey that was added only for a version counts while that version is promoted. Any other survey counts
     unless the promoted version has one of the same recording, identified by its first and last frame times.
     """
-    newest = select(PROMOTIONS.c.version).order_by(PROMOTIONS.c.id.desc()).limit(1).scalar_subquery()
-    promoted = newest if version is None else literal(version)
+    promoted = _newest_promotion().scalar_subquery() if version is None else literal(version)
     own, chosen, other, twin = (
         FLEET_SURVEYS.alias("own"), FLEET_SURVEYS.alias("chosen"), FLEET_SURVEYS.alias("other"),
         SURVEYS.alias("twin"),
@@ -39,3 +37,7 @@ def counts(version: str | None = None) -> ColumnElement[bool]:
         twin.c.captured_to_ns == SURVEYS.c.captured_to_ns,
     )  # fmt: skip
     return or_(is_chosen, and_(~is_own, ~has_twin))
+
+
+def _newest_promotion() -> Select[tuple[str]]:
+    return select(PROMOTIONS.c.version).order_by(PROMOTIONS.c.id.desc()).limit(1)
