@@ -37,9 +37,10 @@ BESIDE_M = (0.0, 0.1, 0.2, 0.35, 0.55)
 """Distances (m) beyond the middle, to either side, to which a line is followed."""
 BESIDE_RATIO = 1.5
 """Maximum weight, by length and relative to the middle, of the parts of a line beyond it."""
-DARK, BRIGHT = -2.0, 5.0
+MIN_CONTRAST, MAX_CONTRAST = -2.0, 5.0
 """Limits, in sigmas of a column, at which contrasts are clipped."""
 MIN_SIGMA_LOG = 0.05
+"""Minimum scatter of a column's log levels."""
 HIGHLIGHT_LOG, FADE_LOG = 0.3, 0.4
 """Log level over the load's median from which highlights have no weight, as a bar doesn't show on them; and
 the range below it over which their weight falls.
@@ -51,6 +52,7 @@ median, the load is lit more brightly there, as by the sun, and highlights are t
 BESIDE_END_M = 0.12
 """Distance (m) from an end within which rows aren't used, since objects before the end show there."""
 MIN_SEEN_RATIO = 0.8
+"""Minimum share of a load's cells that must be seen in the top photo."""
 MAX_SATURATED_RATIO, SATURATED_M = 0.65, 0.2
 """Maximum share of a load's cells that may be saturated, over a length (m) that is longer than a label."""
 APART_M = 0.1
@@ -219,7 +221,7 @@ def _contrast(level: Float32, middle: int, half: int) -> tuple[Float32, Float32]
     off = np.where(seen, filled - around, 0)
     off -= np.median(off, axis=0)
     sigma = np.maximum(mad_sigma(off, axis=0), MIN_SIGMA_LOG)
-    contrast = np.clip(off / sigma, DARK, BRIGHT)
+    contrast = np.clip(off / sigma, MIN_CONTRAST, MAX_CONTRAST)
     own = around[:, middle - half : middle + half + 1]
     lit = running_median(np.median(own, axis=1, keepdims=True), _odd_steps(LIT_M))
     base = np.maximum(np.median(own), lit)
