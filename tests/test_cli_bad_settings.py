@@ -166,4 +166,6 @@ def test_nothing_sure_enough(recording: Path, capsys: pytest.CaptureFixture[str]
 def test_a_simulation_of_no_number(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["simulate", str(tmp_path / "out"), "--camera.heading-deg", "nan"]) == 2
     assert "camera.heading_deg is nan" in capsys.readouterr().err
+    assert run(["simulate", str(tmp_path / "out"), "--camera.rig-seed", "-3"]) == 2
+    assert "camera.rig_seed must be at least 0, not -3" in capsys.readouterr().err
     assert not any(tmp_path.iterdir())

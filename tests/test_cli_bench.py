@@ -60,7 +60,8 @@ def test_mistakes_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
         ["stereo", str(tmp_path), "--repeats", "0"], ["front-end", str(tmp_path), "--repeats", "0"],
         ["subpixel", "--scenes", "0"], ["target-size", "--poses", "0"],
         ["ablation", str(tmp_path), "--scenes", "0"],
-        ["features", str(tmp_path), "--count", "0"], ["matching", str(tmp_path), "--count", "0"],
+        ["bundles", "--seed", "-1"], ["features", str(tmp_path), "--count", "0"],
+        ["matching", str(tmp_path), "--count", "0"],
     ):  # fmt: skip
         assert run(["bench", *flags]) == 2
         assert capsys.readouterr().err.count("\n") == 1

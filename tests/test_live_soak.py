@@ -222,6 +222,7 @@ def test_processes_of_others_are_neither_watched_nor_killed(tmp_path: Path) -> N
         (("{tmp}", "--", "--preset", "fast"), 2, "flags after -- are for --replay"),
         (("{tmp}",), 3, "no live run writes here"),
         (("{tmp}", "--hours", "-1"), 2, "--hours"),
+        (("{tmp}", "--seed", "-1"), 2, "--seed -1"),
         (("--replay", "{tmp}/nowhere"), 5, "nowhere"),
     ],
 )

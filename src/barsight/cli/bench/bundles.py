@@ -70,6 +70,8 @@ def bench_found_bundles(
         raise ConfigError("bench bundles: give both a recording and its measured folder, or neither")
     if yards < 1 or not 1 <= length_m <= 100:
         raise ConfigError("bench bundles: yards must be at least 1, length_m must lie between 1 and 100")
+    if seed < 0:
+        raise ConfigError(f"bench bundles: seed must be at least 0, not {seed}")
     seconds: tuple[float, ...] = ()
     console = SafeConsole()
     if recording is not None and out is not None:

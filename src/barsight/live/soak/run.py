@@ -44,6 +44,8 @@ class SoakPlan:
     def __post_init__(self) -> None:
         if not (self.hours > 0 and self.warm_up_h >= 0 and self.faults_after_h >= 0):
             raise ConfigError("--hours, --warm-up-h and --faults-after-h are hours from the soak's begin")
+        if self.seed < 0:
+            raise ConfigError(f"--seed {self.seed}: must be 0 or more")
 
 
 def soak_replays(

@@ -60,6 +60,7 @@ class CameraSettings:
             aside_m=(-20, 20),
             samples_per_side=(1, 4), vignetting=(0, UNDER_1), misalignment_deg=(0, 2), tilt_deg=(-30, 30),
             shot_noise_dn=NOT_NEGATIVE, read_noise_dn=NOT_NEGATIVE, psf_sigma_px=NOT_NEGATIVE,
+            rig_seed=NOT_NEGATIVE,
         )  # fmt: skip
         expect(self.focal_px > 0.3 * self.width_px, "camera.focal_px must be over 0.3 of the width")
 
