@@ -288,3 +288,46 @@ def test_a_process_of_one_thread_begins_no_other() -> None:
         "[1, 2, 3, 4] [0, 1, 2, 3] [1, 2, 3, 4] 7 [1, 3, 5, 7]", "the block runs", "torn 1",
     ]  # fmt: skip
     assert ended[0][1] == ended[1][1] and ended[1][2] != "torn 1"
+
+
+FORKED = """
+import os
+import time
+import weakref
+import numba
+import numpy as np
+from barsight.core.arrays import kernel
+from barsight.core.parallel import parallel_bands
+@kernel(parallel=True)
+def doubled(values):
+    out = np.empty_like(values)
+    for i in numba.prange(len(values)):
+        out[i] = 2 * values[i]
+    return out
+class Rows:
+    pass
+def is_freed():
+    rows = Rows()
+    parallel_bands(lambda first, end, rows=rows: None, 8, 2)
+    kept = weakref.ref(rows)
+    del rows
+    for _ in range(500):
+        if kept() is None:
+            return True
+        time.sleep(0.01)
+    return False
+values = np.arange(100.0)
+assert (doubled(values) == 2 * values).all() and is_freed()
+if child := os.fork():
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+else:
+    os._exit(int(not ((doubled(values) == 2 * values).all() and is_freed())))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
+def test_a_forked_process_works_and_keeps_nothing() -> None:
+    """`multiprocessing.Pool` forks notebooks: OpenMP ended such a worker, and each pair stayed in memory."""
+    environment = {**os.environ, "NUMBA_NUM_THREADS": "2"}
+    ended = subprocess.run([sys.executable, "-c", FORKED], env=environment, capture_output=True, text=True)
+    assert ended.stdout == "0\n", ended.stderr

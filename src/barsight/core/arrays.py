@@ -58,18 +58,30 @@ def kernel(*, parallel: bool = False, inline: bool = False, borrows: bool = Fals
         compiled: Any = numba.njit(**options)(function)
         with contextlib.suppress(RuntimeError):
             compiled._cache = KernelCache(function, options)
-        return cast(F, _in_turn(compiled) if parallel else compiled)
+        if not parallel:
+            return cast(F, compiled)
+        return cast(F, _in_turn(compiled, numba.njit(**(options | {"parallel": False}))(function)))
 
     return decorate
 
 
-def _in_turn(compiled: Any) -> Any:
+def _in_turn(compiled: Any, plain: Any) -> Any:
+    """Take all cores in turn; a fork of a process that took them takes one (GNU's OpenMP would end it)."""
+
     @functools.wraps(compiled)
     def call(*arguments: Any) -> Any:
+        if _first_process() != os.getpid():
+            return plain(*arguments)
         with _ALL_CORES:
             return compiled(*arguments)
 
     return call
+
+
+@functools.cache
+def _first_process() -> int:
+    """Return the process that was first to take all cores, of this one and those it was forked from."""
+    return os.getpid()
 
 
 def expect_shape(name: str, array: NDArray[Any], shape: tuple[int | None, ...]) -> None:

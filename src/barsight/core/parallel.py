@@ -4,6 +4,7 @@ thread is begun.
 
 from __future__ import annotations
 
+import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
@@ -225,3 +226,8 @@ def parallel_bands(work: Callable[[int, int], None], rows: int, band_rows: int) 
 @cache
 def _helpers() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max(numba.config.NUMBA_NUM_THREADS - 1, 1), thread_name_prefix="bands")
+
+
+if hasattr(os, "register_at_fork"):
+    # A fork has none of these threads: what is handed to them would be kept for good.
+    os.register_at_fork(after_in_child=_helpers.cache_clear)
