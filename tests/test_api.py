@@ -1,7 +1,9 @@
 """The Python API: a recording measured as in a notebook."""
 
+import copy
 import gc
 import json
+import pickle
 import subprocess
 import sys
 from collections.abc import Callable
@@ -64,8 +66,13 @@ def test_a_notebook_measures_looks_and_saves(
     np.testing.assert_array_equal(bs.load(saved).height_map.z_m, heights.z_m)
     assert all(len(repr(one)) < 130 for one in (yard, yard.lifts, heights, contour, yard.trajectory))
     assert all(len(repr(one)) < 130 for one in (*yard.bundles, *yard.lifts.refused))
-    folder = yard.folder
+    folder, copies = yard.folder, [copy.copy(yard), copy.deepcopy(yard)]
+    with pytest.raises(bs.BarsightError, match="can't be pickled; save the yard, and load"):
+        pickle.dumps(yard)
     del yard, heights
+    gc.collect()
+    assert [one.trajectory.stamp_ns.size for one in copies] == [4, 4]
+    copies.clear()
     gc.collect()
     assert not folder.exists()
     capsys.readouterr()
@@ -101,11 +108,23 @@ def test_a_folder_that_was_measured_anew_is_loaded_again(tmp_path: Path) -> None
     assert bs.load(out).height_map.z_m.size
 
 
+def test_a_loaded_yard_stays_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A notebook that changed its directory read another folder, or none."""
+    write_folder(tmp_path / "result")
+    monkeypatch.chdir(tmp_path)
+    yard = bs.load("result")
+    monkeypatch.chdir("/")
+    assert pickle.loads(pickle.dumps(yard)).trajectory.stamp_ns.size == 12
+
+
 def test_misspelt_settings_and_missing_recordings_say_so(tmp_path: Path) -> None:
     with pytest.raises(bs.BarsightError, match="no such file"):
         bs.open_recording(tmp_path / "none")
     with pytest.raises(bs.BarsightError, match=r"no result\.json"):
         bs.load(tmp_path)
+    packets: Any = bs.Session
+    with pytest.raises(bs.BarsightError, match=r"recording is <class .*; give a path, or a"):
+        bs.measure(packets)
     with pytest.raises(bs.BarsightError, match="lens is 'round'; choose radtan4, "):
         bs.calibrate_stereo(tmp_path, "checkerboard:9x6:0.025", lens="round")
 

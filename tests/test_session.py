@@ -165,7 +165,7 @@ def packed(recording: Any, tmp_path: Path) -> tuple[PacketRecording, StereoFrame
 
 def test_pictures_of_other_kinds_become_the_readers_gray(whole: Path, tmp_path: Path) -> None:
     recording, frame, _, _ = packed(bs.open_recording(whole), tmp_path)
-    wide, colour = frame.left.astype(np.uint16) * 257, np.dstack([frame.right] * 3)
+    wide, colour = (frame.left.astype(np.uint16) * 257).astype(">u2"), np.dstack([frame.right] * 3)
     same = bs.StereoFrame(np.int64(frame.stamp_ns), wide, colour)  # type: ignore[arg-type]
     recording.add(same)
     (stored,) = recording.frames()
@@ -176,6 +176,7 @@ def test_pictures_of_other_kinds_become_the_readers_gray(whole: Path, tmp_path: 
         (5, frame.left.astype(np.uint16) * 16, "a 16-bit picture whose brightest value"),
         (5, frame.left / 255, "float64 pixels; 8 or 16 bits are needed; give uint8"),
         (5, np.dstack([frame.left] * 2), "2 channels"),
+        (5, np.ma.masked_greater(frame.left, 200), "masked pixels"),
         (5, None, r"shape \(\)"),
         (5.0, frame.left, "stamp 5.0 is no integer of 64 bits; give nanoseconds"),
         (2**70, frame.left, "no integer of 64 bits"),

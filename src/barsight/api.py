@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
-import tempfile
-import weakref
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -27,7 +24,7 @@ from barsight.reconstruction.pair_matching import match_pictures
 from barsight.recording.open import open_recording as open_path
 from barsight.recording.packets import packets as packets
 from barsight.recording.stored_images import StoredPictures
-from barsight.result import Yard
+from barsight.result import TemporaryFolder, Yard
 from barsight.stereo.settings import StereoSettings
 
 
@@ -57,19 +54,24 @@ def measure(
     """
     chosen = build_settings({"preset": preset, **settings}, MeasureSettings)
     described = checked_value(magnet, Path | None, "magnet")
-    given: Any = recording
-    is_one = isinstance(given, (str, bytes, os.PathLike)) or not isinstance(given, Iterable)
-    several = (given,) if is_one else tuple(given)
-    passes = list(checked_value(several, tuple[Path, ...], "recording"))
-    out = Path(tempfile.mkdtemp(prefix="barsight."))
+    passes = _paths(recording)
+    temporary = TemporaryFolder()
+    out = temporary.path
     try:
         measure_into(passes, out, chosen, advance=advance, magnet=described, judged_at=at, report=False)
     except BaseException:
-        shutil.rmtree(out, ignore_errors=True)
+        temporary.delete()  # a notebook keeps the error, and what its frames hold
         raise
-    yard = Yard(out)
-    weakref.finalize(yard, shutil.rmtree, out, ignore_errors=True)
-    return yard
+    return Yard(out, temporary)
+
+
+def _paths(recording: Any) -> list[Path]:
+    """Return the paths of one or several passes. Raises ConfigError for anything else."""
+    is_one = isinstance(recording, (str, bytes, os.PathLike)) or not isinstance(recording, Iterable)
+    try:
+        return list(checked_value((recording,) if is_one else tuple(recording), tuple[Path, ...], "recording"))
+    except ConfigError as error:
+        raise ConfigError(f"{error}, or a list of paths, or push packets to a Session") from None
 
 
 def load(folder: Path | str) -> Yard:

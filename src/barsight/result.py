@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import shutil
+import tempfile
 import time
+import weakref
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 from barsight.core.errors import MEASURE_AGAIN, InputError, OutputError
 from barsight.core.files import atomic_directory
@@ -86,15 +88,32 @@ class Lifts:
         return f"<Lifts: {counts}{forbidden and f'; forbidden by {forbidden}'}>"
 
 
+class TemporaryFolder:
+    """A new folder that is deleted as soon as nothing holds this object. Copies of a yard hold the same one;
+    what is pickled can't.
+    """
+
+    def __init__(self) -> None:
+        self.path = Path(tempfile.mkdtemp(prefix="barsight."))
+        self.delete = weakref.finalize(self, shutil.rmtree, self.path, ignore_errors=True)
+
+    def __deepcopy__(self, memo: object) -> TemporaryFolder:
+        return self
+
+    def __reduce__(self) -> NoReturn:
+        remedy = "save the yard, and load the folder elsewhere (bs.load)"
+        raise OutputError(f"{self.path}: is temporary, so its yard can't be pickled; {remedy}")
+
+
 class Yard:
     """A measured yard; `folder` holds its files, which are read on demand.
 
-    owner: object that `folder` belongs to; it lives as long as the yard.
+    temporary: the temporary folder in which `folder` is; it lives as long as the yard and its copies.
     """
 
-    def __init__(self, folder: Path | str, owner: object = None) -> None:
-        self.folder: Path = checked_value(folder, Path, "folder")
-        self._owner = owner
+    def __init__(self, folder: Path | str, temporary: TemporaryFolder | None = None) -> None:
+        self.folder: Path = checked_value(folder, Path, "folder").absolute()
+        self._temporary = temporary
         self.summary, _ = open_folder(self.folder)
 
     @cached_property

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
-import weakref
 from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
@@ -29,7 +26,7 @@ from barsight.reconstruction.tracked_recording import matching
 from barsight.recording.packets import Packet, PacketRecording
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.recording.sensor_selection import SelectedSensors
-from barsight.result import Yard
+from barsight.result import TemporaryFolder, Yard
 from barsight.yard.magnet.description import load_magnet
 from barsight.yard_frame import expect_fits, in_yard
 
@@ -41,8 +38,9 @@ class Session:
     """Measures packets as they arrive: `snapshot` at any time, `next_pass` between passes, `finish` once.
 
     Each picture is rectified once and each pair matched once, for the snapshots and the end; both are on disk
-    (20 MB per pair of 1.3 megapixels), in a temporary folder that is deleted with the session. The estimator
-    `live` also places each pair once; with the batch estimators the poses of snapshots are provisional.
+    (20 MB per pair of 1.3 megapixels), in a temporary folder that is deleted with the session and its yard.
+    The estimator `live` also places each pair once; with the batch estimators the poses of snapshots are
+    provisional.
     """
 
     def __init__(
@@ -65,9 +63,9 @@ class Session:
             raise ConfigError(f"imu_noise is {imu_noise!r}; give an ImuNoise, like a recording's imu_noise()")
         compile_ahead(ignore_progress, "measure")  # a moving crane doesn't wait for kernels
         self._settings = self._asked.chosen()
-        self._folder = Path(tempfile.mkdtemp(prefix="barsight."))
+        self._temporary = TemporaryFolder()
+        self._folder = self._temporary.path
         self._yard = self._folder / "yard"
-        weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
         self._rig, self._noise = rig, imu_noise
         self._is_simulated = checked_value(is_simulated, bool, "is_simulated")
         self._recordings: list[PacketRecording] = []
@@ -137,7 +135,7 @@ class Session:
             self._recordings, self._yard, self._asked, LiftRequest(self._magnet),
             keep=kept.parent if several else kept, report=False,
         )  # fmt: skip
-        return Yard(self._yard, self)
+        return Yard(self._yard, self._temporary)
 
     def _end_pass(self) -> None:
         if is_final(self._settings):

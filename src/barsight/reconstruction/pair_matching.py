@@ -115,7 +115,7 @@ def _with_colours(pair: RectifiedPair, rectifier: Rectifier, left: UInt8, right:
 def _read(path: Picture, side: str) -> tuple[UInt8, UInt8 | None]:
     try:
         if not isinstance(path, Path):
-            return split_colour(np.asarray(path))
+            return split_colour(np.asanyarray(path))
         return decode_with_colour(read_bytes(path, MAX_PICTURE_BYTES, "check the name"))
     except TornImageError as error:
         remedy = "give another picture" if isinstance(path, Path) else PICTURE_REMEDY

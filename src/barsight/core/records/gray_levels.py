@@ -33,9 +33,12 @@ class TornImageError(ValueError):
 def to_gray(image: NDArray[Any]) -> UInt8:
     """Convert (H, W), (H, W, 3) BGR or (H, W, 4) BGRA, 8 or 16 bits, to (H, W) uint8.
 
-    Raises `TornImageError` for other kinds, and for 16-bit pictures that use only the lower 14 bits or fewer,
-    unless their levels show that they were scaled: others would be too dark.
+    Raises `TornImageError` for other kinds, for masked pixels, and for 16-bit pictures that use only the
+    lower 14 bits or fewer, unless their levels show that they were scaled: others would be too dark.
     """
+    if np.ma.is_masked(image):
+        raise TornImageError("has masked pixels, which would be matched: fill them")
+    image = np.asarray(image)
     if image.ndim not in (2, 3):
         raise TornImageError(f"has the shape {image.shape}; (H, W) or (H, W, 3) is needed")
     image = eight_bits(image)
@@ -61,7 +64,7 @@ def split_colour(image: NDArray[Any]) -> tuple[UInt8, UInt8 | None]:
 
 def eight_bits(image: NDArray[Any]) -> UInt8:
     """Convert 16 bits to 8. Raises `TornImageError` as `to_gray` does."""
-    if image.dtype == np.uint16:
+    if image.dtype.newbyteorder("=") == np.uint16:
         brightest = int(image.max(initial=0))
         if 0 < brightest < MIN_BRIGHTEST and not _is_dark(image, brightest):
             problem = f"is a 16-bit picture whose brightest value is {brightest}"

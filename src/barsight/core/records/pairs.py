@@ -33,7 +33,7 @@ class StereoFrame:
             raise InputError("pair", problem, "give nanoseconds") from None
         for name in ("left", "right"):
             try:
-                object.__setattr__(self, name, to_gray(np.asarray(getattr(self, name))))
+                object.__setattr__(self, name, to_gray(np.asanyarray(getattr(self, name))))
             except TornImageError as error:
                 raise InputError(
                     f"{name} picture of {self.stamp_ns} ns", str(error), PICTURE_REMEDY
