@@ -176,6 +176,18 @@ def test_blurred_picture_is_left_out() -> None:
     assert "blurred: its edges are 6.0 px wide" in removed[0].reason
 
 
+def test_repeated_pictures_add_no_certainty() -> None:
+    """Four copies of each halved all sigmas."""
+    views = simulated(8, count=6)
+    copies = [replace(view, name=f"{view.name} again") for view in views for _ in range(3)]
+    once, often = solved(views), solved([*views, *copies])
+    np.testing.assert_array_equal(often.covariance, once.covariance)
+    assert len(often.removed) == 18
+    assert often.removed[0].reason == "is the same picture as 00"
+    with pytest.raises(CalibrationError, match=r"only 1 views .* \(is the same picture as 00\)"):
+        solved([replace(views[0], name=f"{k:02d}") for k in range(9)])
+
+
 def test_too_few_views_are_refused_in_one_line() -> None:
     with pytest.raises(CalibrationError, match="only 2 views"):
         solved(simulated(1)[:2])

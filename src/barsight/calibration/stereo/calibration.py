@@ -1,8 +1,8 @@
 """Calibrate a stereo rig from views of a board: each camera alone, then both in one least-squares problem.
 
-Blurred pictures, outlying corners and misfitting views are removed in turn, each with a reason. The
-covariance is that of the least squares, widened where the residuals within a view are more correlated than
-independent corner noise would be (a warped board, cameras not triggered together).
+Repeated and blurred pictures, outlying corners and misfitting views are removed in turn, each with a reason.
+The covariance is that of the least squares, widened where the residuals within a view are more correlated
+than independent corner noise would be (a warped board, cameras not triggered together).
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from barsight.calibration.stereo.outlier_removal import (
     drop_blurred,
     drop_corners,
     drop_misfits,
+    drop_repeats,
     drop_small,
 )
 from barsight.core.arrays import Float64
@@ -122,8 +123,9 @@ def calibrate_stereo(
     parameter undetermined.
     """
     points, basis = board.points_m, shape_basis(board)
-    kept, small = drop_small(views)
-    removed = [*left_out, *small]
+    kept, repeated = drop_repeats(views)
+    kept, small = drop_small(kept)
+    removed = [*left_out, *repeated, *small]
     _expect_views(kept, source, removed)
     kept, blurred = drop_blurred(kept)
     removed += blurred

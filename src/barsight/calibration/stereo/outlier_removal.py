@@ -1,5 +1,5 @@
-"""Remove outliers from a stereo calibration: blurred pictures, views of another board, misdetected
-corners.
+"""Remove what misleads a stereo calibration: repeated and blurred pictures, views of another board,
+misdetected corners.
 """
 
 from __future__ import annotations
@@ -39,6 +39,19 @@ def drop_small(views: Sequence[BoardView]) -> tuple[list[BoardView], list[Remove
         if view.cam0 is not None or view.cam1 is not None:
             kept.append(view)
     return kept, removed
+
+
+def drop_repeats(views: Sequence[BoardView]) -> tuple[list[BoardView], list[Removed]]:
+    """Drop views whose corners are exactly those of an earlier one: counted again, their noise would seem to
+    be averaged.
+    """
+    first, removed = dict[tuple[bytes, ...], BoardView](), []
+    for view in views:
+        key = tuple(b"" if c is None else c.ids.tobytes() + c.pixels.tobytes() for c in view.cameras)
+        same = first.setdefault(key, view)
+        if same is not view:
+            removed.append(Removed(view.name, "both", f"is the same picture as {same.name}"))
+    return list(first.values()), removed
 
 
 def drop_blurred(views: Sequence[BoardView]) -> tuple[list[BoardView], list[Removed]]:
