@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from barsight.cli.main import run
+from barsight.recording.formats.ground_truth import EUROC_FOLDER
 from contradicting_inputs import swapped_pictures
 
 PITCH_M = 0.09
@@ -59,6 +60,17 @@ def test_swapped_pictures_are_named(
     told = capsys.readouterr()
     assert "left and right images are swapped" in told.err and "placed" not in told.out
     assert run(["odometry", str(recording), "--use", "imu", "crane"]) == 0
+
+
+def test_a_truth_that_cant_be_read_is_named_before_the_work(
+    recording: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An hour's estimate was lost at the end."""
+    monkeypatch.setattr("barsight.cli.odometry.make_estimator", lambda _: pytest.fail("estimated first"))
+    with (recording / "mav0" / EUROC_FOLDER / "data.csv").open("a", encoding="utf-8") as file:
+        file.write("1,0,0,0,1,0,0,0\n")
+    assert run(["odometry", str(recording)]) == 3
+    assert "goes back in time" in capsys.readouterr().err
 
 
 def test_a_measured_folder_is_left_alone(

@@ -7,9 +7,14 @@ import numpy as np
 import pytest
 
 from barsight.core.errors import InputError
+from barsight.core.pose import Pose
 from barsight.core.records.heights import Contour, HeightSource
+from barsight.core.records.trajectory import PosedFrame, Trajectory
+from barsight.core.stamps import NS_PER_S
 from barsight.evaluation.score import score_folder
+from barsight.evaluation.trajectory_error import frame_errors, trajectory_drift
 from barsight.mapping.settings import MapSettings
+from barsight.recording.formats.ground_truth import GroundTruth
 from barsight.report.files.height_rasters import write_height
 from barsight.report.files.tables import write_contours
 from mapping_views import block, fused, view
@@ -140,3 +145,24 @@ def test_missing_files_are_named(recording: Path, tmp_path: Path) -> None:
     out = written(tmp_path / "out")
     with pytest.raises(InputError, match=r"height.npz: no such file; give a simulated recording"):
         score_folder(out, out)
+
+
+def around_a_circle(stamp_ns: int, reference: str) -> Pose:
+    angle = 0.5 * stamp_ns / NS_PER_S
+    return Pose(reference, "body", np.eye(3), 3 * np.array([np.cos(angle), np.sin(angle), 0]))
+
+
+def test_frames_in_a_gap_of_the_truth_are_not_compared() -> None:
+    """A motion capture that sees nothing for four seconds made an exact odometry half a metre wrong."""
+    tracked = [k * NS_PER_S // 100 for k in range(1001) if not 300 < k < 700]
+    truth = GroundTruth(np.array(tracked), tuple(around_a_circle(stamp, "world") for stamp in tracked))
+    stamps = [k * NS_PER_S // 10 + 1000 for k in range(100)]
+    frames = tuple(PosedFrame(s, around_a_circle(s, "world"), 1e-6 * np.eye(6)) for s in stamps)
+    trajectory = Trajectory("world", frames, (), ("stereo",))
+    drift, errors = trajectory_drift(trajectory, truth, 0), frame_errors(trajectory, truth, 0)
+    assert drift is not None and errors is not None
+    assert drift.frames == errors.stamp_ns.size == 60
+    assert drift.aligned_rmse_mm < 0.1
+    sparse = replace(truth, stamp_ns=truth.stamp_ns[::100], poses=truth.poses[::100])
+    every = trajectory_drift(trajectory, sparse, 0)
+    assert every is not None and every.frames == 50

@@ -64,12 +64,12 @@ def run(arguments: Sequence[str]) -> None:
             settings = replace(settings, fusion=replace(settings.fusion, use=",".join(use)))
             if settings.estimator == "paper":  # it has no `use` setting
                 source = SelectedSensors(source, use)
+        truth = truth_of(source)  # an unreadable one is told before the work
         _refuse_swapped(source, rectifier, settings)
         trajectory = make_estimator(settings)(source, rectifier, lambda: None)
         if not trajectory.frames:
             why = trajectory.refused[0].reason if trajectory.refused else "it has no frames"
             raise MeasurementError(f"{recording}: no frame could be placed: {why}")
-        truth = truth_of(source)
         drift = (
             None if truth is None else trajectory_drift(trajectory, truth, source.rig.timeshift_cam_imu_ns)
         )

@@ -7,11 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from barsight.core.arrays import Float64, Int64
+from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.pose import nearest_rotation
 from barsight.core.records.trajectory import PosedFrame, Trajectory
 from barsight.core.stamps import NS_PER_S, interpolate_at
 from barsight.recording.formats.ground_truth import GroundTruth
+
+MAX_GAP_RATIO = 3.0
+"""Maximum interval of the truth, relative to its median, across which it is interpolated."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +78,7 @@ class _Met:
 def _met(trajectory: Trajectory, truth: GroundTruth, shift_ns: int) -> _Met | None:
     stamps = trajectory.stamp_ns + shift_ns
     inside = (stamps >= truth.stamp_ns[0]) & (stamps <= truth.stamp_ns[-1])
+    inside[inside] = _covered(stamps[inside], truth.stamp_ns)
     if inside.sum() < 3:
         return None
     frames = [frame for frame, kept in zip(trajectory.frames, inside, strict=True) if kept]
@@ -86,6 +90,17 @@ def _met(trajectory: Trajectory, truth: GroundTruth, shift_ns: int) -> _Met | No
     turns = Rotation.from_matrix(np.array([pose.rotation for pose in truth.poses]))
     true_turn = Slerp(seconds, turns)((stamps[inside] - truth.stamp_ns[0]) / NS_PER_S)
     return _Met(frames, place, turn, true_place, true_turn)
+
+
+def _covered(stamps_ns: Int64, truth_ns: Int64) -> Bool:
+    """Mark stamps (N,) within the truth that aren't in a gap of it, in which its tracker saw nothing."""
+    interval_ns = np.diff(truth_ns)
+    if not interval_ns.size:
+        return np.ones(stamps_ns.shape, np.bool_)
+    after = np.searchsorted(truth_ns, stamps_ns)
+    is_short = interval_ns[after - 1] <= MAX_GAP_RATIO * np.median(interval_ns)
+    covered: Bool = is_short | (truth_ns[after] == stamps_ns)
+    return covered
 
 
 def trajectory_drift(
