@@ -20,6 +20,7 @@ from barsight.core.errors import OutputError
 from barsight.core.reading.sealed_json import write_sealed
 from barsight.core.records.pairs import RefusedFrame, StereoFrame
 from barsight.core.records.sensor_samples import CraneSamples
+from barsight.live import run as live_run
 from barsight.live.capture import Capture
 from barsight.live.latency import counts, spread
 from barsight.live.link import GrowingRecording, Link, LiveInput
@@ -35,6 +36,7 @@ from barsight.live.supervisor import Supervisor
 from barsight.live.track import Tracking
 from barsight.mapping.fusion import fuse_view
 from barsight.mapping.surface.surface import read_tile
+from barsight.pipeline.lift_choice import LiftRequest
 from barsight.reconstruction import map_building
 from barsight.recording.formats.ground_truth import read_ground_truth
 from barsight.sensors.pairing import PairFormer
@@ -239,6 +241,36 @@ def test_a_folder_that_is_removed_during_the_run_is_named(
     with pytest.raises(OutputError, match=r"\.live: was removed during the run"):
         replay(whole, tmp_path / "out", SETTINGS, LiveSettings(), tell=lambda _: None)
     assert content(tmp_path / "out" / "state.json")["phase"] == "failed"
+
+
+@pytest.mark.parametrize(
+    ("after", "name", "told"),
+    [
+        ("", None, "the magnet's file was changed meanwhile: "),
+        (example_magnet().replace("example", "another"), "another", "was changed; it counts as it is now"),
+        (example_magnet(), "example", ""),
+    ],
+)
+def test_lifts_are_chosen_for_the_magnet_as_it_is_described_at_the_end(
+    after: str, name: str | None, told: str, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Lifts were chosen for the magnet that hung there as the service began, weeks ago."""
+    magnet = tmp_path / "magnet.toml"
+    magnet.write_text(example_magnet(), encoding="utf-8")
+
+    def exchanged(self: Supervisor) -> None:
+        self.state.mode = Mode("full", (), True)
+        magnet.write_text(after, encoding="utf-8")
+
+    given: list[LiftRequest] = []
+    monkeypatch.setattr(Supervisor, "run", exchanged)
+    monkeypatch.setattr(live_run, "_finish", lambda *all_: given.append(all_[5]) or {})
+    lines: list[str] = []
+    replay(whole, tmp_path / "out", SETTINGS, LiveSettings(), magnet=magnet, tell=lines.append)
+    (request,) = given
+    assert (request.magnet.name.split(":")[0] if request.magnet else None) == name
+    assert [notice.code for notice in request.notices] == ["live-state"] * (name is None)
+    assert len(lines) == bool(told) and all(told in line for line in lines)
 
 
 def test_keyframes_come_back_and_torn_ones_are_refused(tmp_path: Path) -> None:

@@ -27,7 +27,6 @@ from barsight.report.files.summary import summary
 from barsight.report.page import write_report
 from barsight.result_folder import seal_map
 from barsight.yard.events import events_beside, kept_events, merged
-from barsight.yard.magnet.description import load_magnet
 
 
 def ignore_progress(stage: str, done: int, total: int) -> None:
@@ -62,7 +61,7 @@ def measure_into(
         if lies_within(out, path):
             raise OutputError(f"{out}: lies in the recording itself; name a folder elsewhere")
     keep = out.absolute().with_name(f".{out.absolute().name}.resume") if resume else None
-    request = LiftRequest(None if magnet is None else load_magnet(magnet), judged_at)
+    request = LiftRequest.of(magnet, judged_at)
     content = write_measured(
         [open_recording(path, settings.recording) for path in chosen], out, settings, request,
         advance=advance, overwrite=overwrite, keep=keep, truth_of=truth_of, report=report,

@@ -12,7 +12,7 @@ WARNINGS = {
     "laser-frame": "Without crane positions the map isn't in the laser's frame, so they can't be compared.",
     "laser-askew": "A laser profile doesn't run along X of the yard, so it isn't compared or fused.",
     "laser-off": "A laser profile contradicts vision or can't be checked, and isn't fused into the map.",
-    "live-state": "The live run ended in a mode that forbids lifts; the message says why.",
+    "live-state": "The live run ended in a state that forbids lifts; the message says why.",
     "mounting-doubtful": "Gravity or the floor contradicts the stated mounting; no lift is offered.",
     "no-overlap": "A laser profile and the map share fewer than two points, so they can't be compared.",
     "one-view": "The map was made by a single frame, so no height is confirmed; no lift is offered.",

@@ -43,7 +43,6 @@ from barsight.recording.open import open_recording
 from barsight.recording.sensor_selection import SelectedSensors
 from barsight.report.page import write_report
 from barsight.yard.lifting.lift_file import read_lifts
-from barsight.yard.magnet.description import load_magnet
 from barsight.yard_frame import in_yard
 
 MAX_SPEED = 1000.0
@@ -74,7 +73,7 @@ def replay(
     BarsightError.
     """
     given = None if keyframes is None else read_keyframes(keyframes)
-    request = LiftRequest(None if magnet is None else load_magnet(magnet), judged_at)
+    request = LiftRequest.of(magnet, judged_at)
     return begin_replay(path, out, settings, live, speed, tell).measure(given, request, advance)
 
 
@@ -137,6 +136,9 @@ class LiveRun:
                     self._tell_all(f"ends early: {supervisor.stop_because}; what was kept is measured")
                 if given is not None:
                     supervisor.state.mode = given.mode
+                request, changed = request.read_again()
+                if changed:
+                    self._tell_all(changed)
                 return _finish(supervisor, link, board, self._recording, self._asked, request, advance)
         except BaseException:
             if supervisor is not None:
@@ -188,7 +190,8 @@ def _finish(
             recording, link = _recorded(link, kept, settings)
         write_keyframes(Keyframes(tuple(kept), state.mode), out / "keyframes.json")
         if not state.mode.lifts:
-            request = replace(request, notices=(Notice("live-state", _why_no_lifts(state.mode)),))
+            forbidden = Notice("live-state", _why_no_lifts(state.mode))
+            request = replace(request, notices=(*request.notices, forbidden))
         content = write_measured(
             [KeptRecording(recording, kept)], out, settings, request, advance=advance, overwrite=True,
             keep=link.checkpoints.parent, report=False,

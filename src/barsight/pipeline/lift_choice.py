@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+from barsight.core.errors import BarsightError
 from barsight.core.json_values import json_digest, json_value
 from barsight.core.memory import peak_memory_mib
 from barsight.core.notices import Notice
@@ -40,7 +41,7 @@ class LiftRequest:
     are forbidden (`no-magnet`). judged_at: time for which they are judged: now, or the recording's last
     frame, to look back. notices: warnings of the caller. events: reported before the yard was measured again;
     those that the new map may not show count. surveys: folder of the same yard's results, in which they are
-    reported too.
+    reported too. magnet_file: of the magnet.
     """
 
     magnet: Magnet | None = None
@@ -48,6 +49,29 @@ class LiftRequest:
     notices: tuple[Notice, ...] = ()
     events: tuple[YardEvent, ...] = ()
     surveys: Path | None = None
+    magnet_file: Path | None = None
+
+    @classmethod
+    def of(
+        cls, magnet: Path | None, judged_at: Literal["now", "end"] = "now", surveys: Path | None = None
+    ) -> LiftRequest:
+        """Request lifts for the magnet of a file; none is offered without one. Raises a BarsightError."""
+        loaded = None if magnet is None else load_magnet(magnet)
+        return cls(loaded, judged_at, surveys=surveys, magnet_file=magnet)
+
+    def read_again(self) -> tuple[LiftRequest, str]:
+        """Read the magnet's file again, which may have been changed since; return what to tell, "" if
+        nothing. Without a valid file any more, no lift is offered.
+        """
+        if self.magnet_file is None:
+            return self, ""
+        try:
+            magnet = load_magnet(self.magnet_file)
+        except BarsightError as error:
+            why = f"the magnet's file was changed meanwhile: {error}"
+            return replace(self, magnet=None, notices=(*self.notices, Notice("live-state", why))), why
+        told = "" if magnet == self.magnet else f"{self.magnet_file}: was changed; it counts as it is now"
+        return replace(self, magnet=magnet), told
 
 
 def find_lifts(mapped: MappedYard, request: LiftRequest) -> Measurement:

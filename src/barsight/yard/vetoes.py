@@ -16,7 +16,7 @@ VETOES = {
     "magnet-turned": "The magnet's offset was found at another yaw, and turns with the magnet.",
     "calibration-drift": "The cameras' calibration no longer fits the pictures.",
     "trajectory-degraded": "The trajectory or the encoders are less accurate than the magnet needs.",
-    "live-state": "The live run ended without a sensor that lifts need.",
+    "live-state": "The live run ended without something that lifts need.",
     "units-doubtful": "A sensor's readings have an impossible magnitude; the unit is probably wrong.",
     "mounting-doubtful": "Gravity or the floor contradicts the stated mounting of rig, IMU or encoders.",
     "stock-list": "The stock list and the measured bundle disagree.",

@@ -26,7 +26,6 @@ from barsight.recording.formats.segments import PATTERN
 from barsight.recording.open import open_recording
 from barsight.recording.writers.bag import write_descriptions
 from barsight.recording.writers.retention import PROTECTED, oldest_first
-from barsight.yard.magnet.description import load_magnet
 
 STAMP = "%Y%m%dT%H%M%S"
 AGAIN_S = 5.0
@@ -52,7 +51,7 @@ def measure_crane(
     All sensors are checked first; nothing is written if one of them isn't as crane.toml describes it.
     Raises a BarsightError.
     """
-    request = LiftRequest(None if magnet is None else load_magnet(magnet))
+    request = LiftRequest.of(magnet)
     expect_empty(out)
     recording = _recorded(crane, out, datetime.now(UTC).strftime(STAMP))
     run = _begin(crane, out, recording, settings, live, tell)
@@ -74,13 +73,13 @@ def measure_surveys(
     """
     if crane.encoders is None:
         raise ConfigError("crane.toml has no [encoders], by which surveys begin and end")
-    request = LiftRequest(None if magnet is None else load_magnet(magnet), surveys=out)
     proved, ended, is_first = False, "", True
     _tidy(out)
     while ended != INTERRUPTED:
         folder = out / datetime.now(UTC).strftime(STAMP)
         recording = _recorded(crane, folder, folder.name)
         try:
+            request = LiftRequest.of(magnet, surveys=out)
             run = _begin(crane, folder, recording, settings, live, tell, surveys=True, proved=proved)
         except BarsightError as error:
             if is_first:
@@ -118,11 +117,11 @@ def replay_surveys(
 
     The newest few folders are kept. Raises a BarsightError if the first run fails.
     """
-    request = LiftRequest(None if magnet is None else load_magnet(magnet), judged_at)
     ended, is_first = "", True
     _tidy(out)
     while ended != INTERRUPTED:
         folder = out / datetime.now(UTC).strftime(STAMP)
+        request = LiftRequest.of(magnet, judged_at)
         run = begin_replay(path, folder, settings, live, speed, tell)
         with translated_os_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
