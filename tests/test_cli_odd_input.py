@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from barsight.cli.main import run
-from cli_runs import FAST
+from cli_runs import FAST, pictures
 
 
 def measured(recording: Path, *flags: str) -> tuple[Path, dict]:
@@ -67,7 +67,29 @@ def test_unpaired_pictures_count_as_frames(recording: Path) -> None:
     keep_rows(recording, 3, "cam1")
     _, result = measured(recording)
     assert result["frames"]["total"] == 4 and result["frames"]["used"] == 3
-    assert "1 of 4 frames were refused" in [w["message"] for w in result["warnings"]]
+    (told,) = [w["message"] for w in result["warnings"] if w["code"] == "frames-refused"]
+    assert told.startswith("1 of 4 frames were refused; most often (1): ")
+
+
+@pytest.mark.parametrize(
+    ("cameras", "estimator"), [(("cam0", "cam1"), "fused"), (("cam1",), "fused"), (("cam0", "cam1"), "live")]
+)
+def test_pictures_of_a_frozen_camera_are_mapped_nowhere(
+    cameras: tuple[str, ...], estimator: str, recording: Path
+) -> None:
+    """They were mapped where the encoders were by then, and of half of the pictures the mounting was blamed
+    that the encoders contradicted.
+    """
+    for camera in cameras:
+        first, *later = pictures(recording, camera)
+        for path in later[:2]:
+            shutil.copy(first, path)
+    _, result = measured(recording, "--motion.estimator", estimator)
+    assert result["frames"]["used"] == 2
+    assert [frame["stage"] for frame in result["frames"]["refused"]] == ["trajectory"] * 2
+    (told,) = [w["message"] for w in result["warnings"] if w["code"] == "frames-refused"]
+    frozen = f"the same picture comes again and again from {' and '.join(cameras)} while the crane moves"
+    assert told == f"2 of 4 frames were refused; most often (2): {frozen}"
 
 
 def test_each_frame_is_used_refused_or_passed_over(

@@ -20,6 +20,7 @@ from barsight.live.link import GrowingRecording, Link
 from barsight.live.shared.counters import OFF, Counters
 from barsight.live.shared.ring import CapturedPair, PairRing
 from barsight.motion.fixed_lag.estimator import FixedLagPoses
+from barsight.motion.frontend.tracking import REPEATED_M, repeated_sentence
 from barsight.motion.settings import make_estimator
 from barsight.reconstruction.live_map import PairPlacer
 from barsight.recording.rectified_pairs import RectifiedPairs
@@ -32,8 +33,6 @@ UNMATCHABLE_PAIRS = 3
 """Number of pairs in succession that are reported if nothing in them can be matched, as by covered lenses."""
 UNTIED_PAIRS = 8
 """Number of pairs in succession that are reported if their pictures don't follow from each other."""
-REPEATED_M = 0.05
-"""Distance in metres that the crane may travel, by the encoders, while a camera repeats one picture."""
 AGAIN_FRAMES = 10
 """Number of last keyframes that a restarted process tracks first: more than the window holds."""
 
@@ -84,9 +83,7 @@ class RepeatWatch:
                 self._images[camera], self._since_m[camera] = image, place_m
             elif len(place_m) and np.linalg.norm(place_m - since_m) > REPEATED_M:
                 found.append(f"cam{camera}")
-        if not found:
-            return ""
-        return f"the same picture comes again and again from {' and '.join(found)} while the crane moves"
+        return repeated_sentence(found) if found else ""
 
 
 class Tracking:

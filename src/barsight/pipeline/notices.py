@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 
 import numpy as np
@@ -38,7 +39,9 @@ def stage_notices(mapped: MappedYard) -> list[Notice]:
             reason = "one frame made the map: no height is confirmed by another"
             warnings.append(Notice("one-view", reason))
         if one.built.refusals:
-            reason = f"{len(one.built.refusals)} of {one.probed.frames_total} frames were refused"
+            refused = Counter(refusal.frame.reason for refusal in one.built.refusals)
+            (most, count), total = refused.most_common(1)[0], one.probed.frames_total
+            reason = f"{refused.total()} of {total} frames were refused; most often ({count}): {most}"
             warnings.append(Notice("frames-refused", reason))
     return warnings
 

@@ -59,10 +59,14 @@ class NamedPoints:
 
 @dataclass(frozen=True)
 class RefusedFrame:
-    """A frame that can't be used, and why. The run goes on without it."""
+    """A frame that can't be used, and why. The run goes on without it.
+
+    is_stale: its pictures are older than its stamp, so that nothing may place them.
+    """
 
     stamp_ns: int
     reason: str
+    is_stale: bool = False
 
 
 @dataclass(frozen=True)

@@ -167,6 +167,7 @@ class BatchPoses:
         refused = list(inputs.refused)
         if inputs.crane is not None:
             frames, gone = placed_frames(recording, inputs.crane, frames, shift)
+            frames = frames[~np.isin(frames, [r.stamp_ns for r in refused if r.is_stale])]
             left = set(frames.tolist())
             refused = gone + [r for r in refused if r.stamp_ns not in left]
             refused = list({r.stamp_ns: r for r in refused}.values())

@@ -99,6 +99,8 @@ class FixedLagPoses(ImmediatePoses):
             tracked = self._tracker.push(pair)
         is_tied = isinstance(tracked, Sighting) and (tracked.motion or tracked.again) is not None
         self.untied = 0 if is_tied else self.untied + 1
+        if isinstance(tracked, RefusedFrame) and tracked.is_stale:
+            return tracked
         return self._estimator.take(tracked)
 
     @property

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,6 +25,11 @@ from barsight.stereo.search_range import coarse_disparity
 MIN_KNOWN = 200
 SPAN = 1.6
 """Factor by which new points may be nearer or further than the known ones."""
+
+REPEATED_M = 0.05
+"""Distance in metres that the crane may travel while a camera repeats one picture, to the last pixel."""
+REPEATED_SIGMAS = 5.0
+"""The same in sigma of the predicted travel."""
 
 MAX_LOST = 3
 """Maximum number of chain ends that are kept."""
@@ -71,6 +76,8 @@ class Tracker:
         """Track the next pair, or refuse it where it shows too little."""
         state, settings, patches = self._state, self._settings, patch_pair(pair)
         prediction = self._predictor(state.stamp_ns, pair.stamp_ns) if state else None
+        if state is not None and (repeated := _repeated(state, pair, prediction)):
+            return RefusedFrame(pair.stamp_ns, repeated_sentence(repeated), is_stale=True)
         result = _see(state, patches, prediction, settings)
         if isinstance(result, Failed) and state is not None:
             anew = _see(replace(state, tracks=None), patches, prediction, settings)
@@ -117,6 +124,23 @@ class Tracker:
                 again=SeenAgain(lost.state.stamp_ns, motion),
             )  # fmt: skip
         return sighting
+
+
+def repeated_sentence(cameras: Sequence[str]) -> str:
+    """Describe that these cameras repeat a picture."""
+    return f"the same picture comes again and again from {' and '.join(cameras)} while the crane moves"
+
+
+def _repeated(state: _State, pair: RectifiedPair, prediction: PredictedMotion | None) -> list[str]:
+    """List the cameras that repeat their last picture although the crane has moved."""
+    if prediction is None or state.tracks is None or state.tracks.last is None:
+        return []
+    sigma_m = float(np.sqrt(np.linalg.eigvalsh(prediction.covariance[3:, 3:])[-1]))
+    if np.linalg.norm(prediction.translation) < max(REPEATED_M, REPEATED_SIGMAS * sigma_m):
+        return []
+    last = state.tracks.last
+    both = (("cam0", pair.left, last.left), ("cam1", pair.right, last.right))
+    return [name for name, now, before in both if np.array_equal(now, before)]
 
 
 def _see(
