@@ -106,9 +106,8 @@ def estimate_trajectory(
         if rig is not None:
             corrected = settings.self_calibrate == "yaw"
             rig = residual_covariance(rig, trajectory.drift, corrected=corrected)
-        yield TrackedRecording(
-            trajectory, rectifier, stereo, rig, calibrated.warnings, poses, refusals, matched
-        )
+        moved = calibrated.warnings + trajectory.rig_moved
+        yield TrackedRecording(trajectory, rectifier, stereo, rig, moved, poses, refusals, matched)
 
 
 def select_keyframes(

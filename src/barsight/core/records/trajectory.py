@@ -79,7 +79,8 @@ class Trajectory:
 
     reference: `yard` or `world`. sensors: the ones used. warnings: sentences for the result. drift: of the
     rig, if the estimate observes it. detail: further figures of an estimate from all sensors. doubts:
-    sentences on what makes the whole trajectory doubtful, so that no lift may be chosen by it.
+    sentences on what makes the whole trajectory doubtful, so that no lift may be chosen by it. rig_moved: the
+    same on cameras that moved against each other.
     """
 
     reference: str
@@ -90,6 +91,7 @@ class Trajectory:
     drift: RigDrift | None = None
     detail: MotionDetail | None = None
     doubts: tuple[str, ...] = ()
+    rig_moved: tuple[str, ...] = ()
 
     @property
     def stamp_ns(self) -> Int64:

@@ -42,7 +42,7 @@ from barsight.motion.frontend.chains import (
 from barsight.motion.frontend.motion_prediction import CranePredictor
 from barsight.motion.frontend.seen_steps import known_motion
 from barsight.motion.frontend.settings import FrontEndSettings
-from barsight.motion.frontend.sightings import Sighting
+from barsight.motion.frontend.sightings import Sighting, moved_cameras
 from barsight.motion.frontend.tracking import Predictor, Tracker
 from barsight.motion.gravity import GravityAlignment, align_with_gravity
 from barsight.motion.problem.nodes import Nodes, constrain_by_imu, initial_poses, make_nodes
@@ -181,7 +181,8 @@ class BatchPoses:
             reason = f"the sensors together have no solution ({str(error).split('.')[0].strip()})"
             warnings = tuple(dict.fromkeys((*simple.warnings, *inputs.warnings)))
             doubts = inputs.doubts + jumps_alone(inputs.crane)
-            return replace(simple, warnings=warnings, doubts=(*doubts, f"{reason}: estimated one by one"))
+            doubts += (f"{reason}: estimated one by one",)
+            return replace(simple, warnings=warnings, doubts=doubts, rig_moved=self._rig_moved())
         placed = tuple(
             PosedFrame(int(stamp), estimate.poses[k], covariance)
             for stamp, k, covariance in zip(frames, nodes.frame, estimate.covariance, strict=True)
@@ -194,7 +195,12 @@ class BatchPoses:
             "world" if inputs.crane is None else "yard", placed, tuple(refused), sensors,
             inputs.warnings + seen, estimate.drift,
             select_detail(estimate, inputs.sightings, nodes, encoders, shift), inputs.doubts + doubts,
+            self._rig_moved(),
         )  # fmt: skip
+
+    def _rig_moved(self) -> tuple[str, ...]:
+        steps = [one.step for one in self._sightings if one.step is not None]
+        return moved_cameras(steps, self._recording.index.stamps_ns[0])
 
     def _simple(self, inputs: _Inputs) -> Trajectory:
         """Estimate without a graph: from the encoders alone or, without them, frame to frame."""

@@ -24,7 +24,7 @@ from barsight.motion.estimator import FrameInput, ImmediatePoses, TrajectoryEsti
 from barsight.motion.fixed_lag.propagation import NavigationState
 from barsight.motion.fixed_lag.sensor_buffer import SENSOR_DELAY_S, SensorBuffer
 from barsight.motion.frontend.chains import UNTIED, untied_sentence
-from barsight.motion.frontend.sightings import Sighting
+from barsight.motion.frontend.sightings import DisparityStep, Sighting, moved_cameras
 from barsight.motion.frontend.tracking import Tracker
 from barsight.motion.gravity import align_with_gravity
 from barsight.recording.base import Recording
@@ -86,6 +86,7 @@ class FixedLagPoses(ImmediatePoses):
         )  # fmt: skip
         self._tracker = Tracker(self._estimator.predict, settings.front_end)
         self.untied = 0
+        self._steps: list[DisparityStep] = []
 
     def place(self, seen: FrameInput) -> PosedFrame | RefusedFrame:
         """Track the frame and estimate its pose."""
@@ -101,6 +102,8 @@ class FixedLagPoses(ImmediatePoses):
         self.untied = 0 if is_tied else self.untied + 1
         if isinstance(tracked, RefusedFrame) and tracked.is_stale:
             return tracked
+        if isinstance(tracked, Sighting) and tracked.step is not None:
+            self._steps.append(tracked.step)
         return self._estimator.take(tracked)
 
     @property
@@ -134,6 +137,7 @@ class FixedLagPoses(ImmediatePoses):
         return Trajectory(
             "world" if readings.crane is None else "yard", self._estimator.told_later(self.placed),
             tuple(self.refused), sensors, warnings, doubts=doubts,
+            rig_moved=moved_cameras(self._steps, self._recording.index.stamps_ns[0]),
         )  # fmt: skip
 
     def _readings(self) -> SensorBuffer:

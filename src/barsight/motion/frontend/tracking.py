@@ -17,7 +17,7 @@ from barsight.features.tracks import Tracks, detect_corners, update_tracks
 from barsight.motion.frontend.motion_consensus import Consensus, motion_consensus, wide_consensus
 from barsight.motion.frontend.relative_pose import RelativePose, estimate_step
 from barsight.motion.frontend.settings import FrontEndSettings
-from barsight.motion.frontend.sightings import SeenAgain, Sighting, normalised_innovation
+from barsight.motion.frontend.sightings import SeenAgain, Sighting, disparity_step, normalised_innovation
 from barsight.motion.frontend.stereo_features import FeatureView, match_coarsely
 from barsight.motion.frontend.wide_steps import DescribedMotion, check_overlap, wide_motion, wide_view
 from barsight.stereo.search_range import coarse_disparity
@@ -151,7 +151,7 @@ def _see(
         kept = np.zeros(0, np.bool_)
         matches = GuidedMatches(np.empty((0, 3)), np.empty(0), kept, kept)
         tracks = Tracks(next_track=0 if state is None else state.next_track)
-        motion, innovation = None, None
+        motion, innovation, step = None, None, None
     else:
         tracks = state.tracks
         found = None if prediction is None else motion_consensus(tracks, pair, prediction, settings)
@@ -163,6 +163,8 @@ def _see(
                 return found
         kept, matches, motion = found
         innovation = None if prediction is None else normalised_innovation(prediction, motion)
+        old, new = tracks.stereo[kept], matches.stereo[kept]
+        step = disparity_step(pair.pair.stamp_ns, old, new, motion, pair.pair.camera)
     camera = pair.pair.camera
     if view is None:
         span = _span(matches.stereo[kept], camera)
@@ -175,8 +177,9 @@ def _see(
         return Failed("no-features", f"only {len(tracks.track)} points have a depth")
     ambiguous = int(matches.ambiguous.sum())
     sighting = Sighting(
-        pair.pair.stamp_ns, tracks.track, tracks.stereo, tracks.sigma_px, motion, ambiguous, innovation
-    )
+        pair.pair.stamp_ns, tracks.track, tracks.stereo, tracks.sigma_px, motion, ambiguous, innovation,
+        step=step,
+    )  # fmt: skip
     return _State(tracks, tracks.next_track, pair.pair.stamp_ns, view), sighting
 
 
