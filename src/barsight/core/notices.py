@@ -7,7 +7,7 @@ from dataclasses import dataclass
 WARNINGS = {
     "assumed": "The recording lacks something; the message names the assumption.",
     "calibration": "The rows of the rectified pictures don't match the calibration; no lift is offered.",
-    "calibration-drift": "Travel or pictures contradict the calibration (a moved camera?); no lift is offered.",
+    "calibration-drift": "Travel or pictures contradict the calibration; no lift is offered.",
     "frames-refused": "Frames were refused; `frames.refused` lists each one's stamp, stage and reason.",
     "laser-frame": "Without crane positions the map isn't in the laser's frame, so they can't be compared.",
     "laser-askew": "A laser profile doesn't run along X of the yard, so it isn't compared or fused.",
