@@ -227,20 +227,23 @@ def test_an_ended_run_does_not_say_that_lifts_stand(
     assert state["phase"] == "failed" and not state["lifts"]["may_stand"]
 
 
+@pytest.mark.parametrize("removed", [".live", "."])
 def test_a_folder_that_is_removed_during_the_run_is_named(
-    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    removed: str, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It was said that the recording had no pair, for no reason."""
+    """It was said that the recording had no pair, for no reason, or that there was no live.log."""
 
     def cleared(self: Supervisor) -> None:
         self.state.mode = Mode("full", (), True)
         self._board.add("track", "kept", 3)
-        shutil.rmtree(tmp_path / "out" / ".live")
+        shutil.rmtree(tmp_path / "out" / removed)
+        self._log("track ended")
 
     monkeypatch.setattr(Supervisor, "run", cleared)
     with pytest.raises(OutputError, match=r"\.live: was removed during the run"):
         replay(whole, tmp_path / "out", SETTINGS, LiveSettings(), tell=lambda _: None)
-    assert content(tmp_path / "out" / "state.json")["phase"] == "failed"
+    if removed == ".live":
+        assert content(tmp_path / "out" / "state.json")["phase"] == "failed"
 
 
 @pytest.mark.parametrize(

@@ -140,11 +140,15 @@ class LiveRun:
                 if changed:
                     self._tell_all(changed)
                 return _finish(supervisor, link, board, self._recording, self._asked, request, advance)
-        except BaseException:
-            if supervisor is not None:
-                supervisor.end_map(at_once=True)
-                shutil.rmtree(folder, ignore_errors=True)  # leaves space for the state on a full disk
-                supervisor.fail()
+        except BaseException as error:
+            if supervisor is None:
+                raise
+            supervisor.end_map(at_once=True)
+            was_removed = not folder.exists()
+            shutil.rmtree(folder, ignore_errors=True)  # leaves space for the state on a full disk
+            supervisor.fail()
+            if was_removed and isinstance(error, OSError):
+                raise _removed(folder) from error
             raise
         finally:
             if supervisor is not None:
@@ -182,7 +186,7 @@ def _finish(
     lifts_s = None
     try:
         if not kept and board["track", "kept"]:
-            raise OutputError(f"{link.folder}: was removed during the run; survey again, and leave it alone")
+            raise _removed(link.folder)
         if not kept:
             why = supervisor.stop_because or "; ".join(state.mode.reasons)
             raise MeasurementError(f"{link.source.recording}: no pair was kept; {why}")
@@ -205,6 +209,10 @@ def _finish(
         state.phase = "done" if lifts_s is not None else "failed"
         write_json(out / "latency.json", latencies(link, board, lifts_s))
         write_state(state, board, out)
+
+
+def _removed(folder: Path) -> OutputError:
+    return OutputError(f"{folder}: was removed during the run; survey again, and leave it alone")
 
 
 def _recorded(link: Link, kept: list[int], settings: MeasureSettings) -> tuple[Recording, Link]:

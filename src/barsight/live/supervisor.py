@@ -79,7 +79,7 @@ def run_process(role: str, link: Link) -> None:
         PROCESSES[role](link)
     except Exception as error:
         link.tell(role, f"{type(error).__name__}: {error}")
-        if not isinstance(error, BarsightError):
+        if not isinstance(error, BarsightError) and link.folder.exists():  # else the command tells of it
             traceback.print_exc()
         sys.exit(1)
 
@@ -134,7 +134,7 @@ class Supervisor:
     def fail(self) -> None:
         """Report, if it can be written, that the run ended without a result."""
         self.state.phase = "failed"
-        with contextlib.suppress(BarsightError):
+        with contextlib.suppress(BarsightError, OSError):
             write_state(self.state, self._board, self._out)
 
     def final_mode(self) -> Mode:
