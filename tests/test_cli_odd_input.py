@@ -4,6 +4,7 @@ import json
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -90,6 +91,16 @@ def test_pictures_of_a_frozen_camera_are_mapped_nowhere(
     (told,) = [w["message"] for w in result["warnings"] if w["code"] == "frames-refused"]
     frozen = f"the same picture comes again and again from {' and '.join(cameras)} while the crane moves"
     assert told == f"2 of 4 frames were refused; most often (2): {frozen}"
+
+
+def test_a_bayer_mosaic_taken_as_gray_is_named(recording: Path) -> None:
+    for path in pictures(recording, "cam1"):
+        picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        picture[::2, ::2] = picture[::2, ::2] * 0.7
+        cv2.imwrite(str(path), picture)
+    _, result = measured(recording)
+    (told,) = [w["message"] for w in result["warnings"] if "Bayer" in w["message"]]
+    assert told.startswith("the gray pictures of cam1 look like a Bayer mosaic: ")
 
 
 def test_each_frame_is_used_refused_or_passed_over(

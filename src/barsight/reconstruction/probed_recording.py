@@ -21,7 +21,7 @@ from barsight.mapping.recording_probe import (
 from barsight.measure_settings import MeasureSettings
 from barsight.reconstruction.checkpoint import checkpoint_folder, checkpoint_key, checkpointed
 from barsight.recording.base import Recording
-from barsight.recording.plausibility import clock_faults, doubts
+from barsight.recording.plausibility import clock_faults, doubts, mosaics
 from barsight.recording.rectified_pairs import RectifiedPairs
 from barsight.recording.sensor_selection import SelectedSensors
 from barsight.yard_frame import in_yard
@@ -30,8 +30,8 @@ from barsight.yard_frame import in_yard
 @dataclass(frozen=True, eq=False)
 class ProbedRecording:
     """Result of inspecting a recording. calibration_px: sigma of the disparity due to the calibration.
-    doubts: implausible samples. inputs: SHA-256 of the files. checkpoints: their folder, if any. watch:
-    times the stages.
+    doubts: implausible samples and pictures. inputs: SHA-256 of the files. checkpoints: their folder, if any.
+    watch: times the stages.
     """
 
     source: Recording
@@ -76,8 +76,8 @@ def inspect_recording(
         pairs = RectifiedPairs(source, Rectifier(source.rig), checkpoints or scratch, watch)
         first, cell_m, calibration_px = look_at(pairs, settings, checkpoints)
     return ProbedRecording(
-        source, pairs, first, cell_m, calibration_px, doubts(source), configuration, inputs, checkpoints,
-        watch,
+        source, pairs, first, cell_m, calibration_px, (*doubts(source), *mosaics(source)), configuration,
+        inputs, checkpoints, watch,
     )  # fmt: skip
 
 

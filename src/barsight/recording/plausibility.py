@@ -8,6 +8,7 @@ import numpy as np
 
 from barsight.core.arrays import Int64
 from barsight.core.notices import Notice
+from barsight.core.records.pairs import StereoFrame
 from barsight.core.records.sensor_samples import CraneSamples, ImuSamples
 from barsight.core.stamps import NS_PER_S
 from barsight.recording.base import Recording
@@ -21,6 +22,10 @@ MAX_SPEED_MPS, SPEED_WINDOW_S = 5.0, 0.5
 LARGE_YARD_M, LARGE_HOIST_M = 3000.0, 100.0
 LARGE_SHIFT_S = 0.5
 MAX_RATE_HZ = 20_000.0
+MAX_CELLS_RATIO = 0.05
+"""Largest difference in brightness between even and odd rows and columns, of the mean brightness: for a
+mosaic of gray it is that of the colours' sensitivities.
+"""
 MAX_MISSING_RATIO = 0.5
 """Largest share of the pictures' time that a sensor may be missing."""
 
@@ -52,6 +57,24 @@ def doubts(recording: Recording) -> tuple[Notice, ...]:
     for name, stamp_ns in _streams(recording):
         found += _span_doubts(name, stamp_ns, recording.index.stamps_ns)
     return tuple(found)
+
+
+def mosaics(recording: Recording) -> Iterator[Notice]:
+    """Yield a hint for each camera whose first picture is a Bayer mosaic taken as gray: its even and odd rows
+    and columns differ in brightness.
+    """
+    first = next((one for one in recording.frames() if isinstance(one, StereoFrame)), None)
+    if first is None:
+        return
+    for name, image in (("cam0", first.left), ("cam1", first.right)):
+        height, width = (size // 2 * 2 for size in image.shape)
+        cells = image[:height, :width].reshape(height // 2, 2, width // 2, 2).mean(axis=(0, 2))
+        if np.ptp(cells) > MAX_CELLS_RATIO * cells.mean():
+            yield Notice(
+                "assumed",
+                f"the gray pictures of {name} look like a Bayer mosaic: record gray or colour, or name the "
+                "Bayer encoding",
+            )
 
 
 def _streams(recording: Recording) -> Iterator[tuple[str, Int64]]:
