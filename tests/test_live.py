@@ -38,6 +38,7 @@ from barsight.mapping.fusion import fuse_view
 from barsight.mapping.surface.surface import read_tile
 from barsight.pipeline.lift_choice import LiftRequest
 from barsight.reconstruction import map_building
+from barsight.recording.awaited import AwaitedRecording
 from barsight.recording.formats.ground_truth import read_ground_truth
 from barsight.sensors.pairing import PairFormer
 from barsight.sensors.source import LivePicture, LostPicture, Readings, SensorSigns
@@ -274,6 +275,27 @@ def test_lifts_are_chosen_for_the_magnet_as_it_is_described_at_the_end(
     assert (request.magnet.name.split(":")[0] if request.magnet else None) == name
     assert [notice.code for notice in request.notices] == ["live-state"] * (name is None)
     assert len(lines) == bool(told) and all(told in line for line in lines)
+
+
+@pytest.mark.parametrize("is_changed", [False, True])
+def test_what_a_run_computed_does_not_count_for_another_yard_file(
+    is_changed: bool, whole: Path, tmp_path: Path
+) -> None:
+    """Poses in the frame before were named as those of the frame after."""
+    yard = calibrated(tmp_path, 3, "encoders")[0].path
+    opened = bs.open_recording(whole)
+    crane: Any = SimpleNamespace(
+        awaited=lambda at: AwaitedRecording(at, opened.rig, opened.imu(), opened.crane())
+    )
+    settings = replace(SETTINGS, yard=yard).chosen()
+    made = tmp_path / live_run._key(crane.awaited(whole), settings)[:32]
+    made.mkdir()
+    if is_changed:
+        shutil.copy(calibrated(tmp_path, 4, "encoders")[0].path, yard)
+    link = Link(LiveInput(whole, crane=crane), settings, LiveSettings(), tmp_path, made, "", "", None)
+    recording, after = live_run._recorded(link, [], settings)
+    assert (after.checkpoints == made) == is_changed
+    assert (after.checkpoints.name == live_run._key(recording, settings)[:32]) != is_changed
 
 
 def test_keyframes_come_back_and_torn_ones_are_refused(tmp_path: Path) -> None:

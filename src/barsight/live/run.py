@@ -216,7 +216,8 @@ def _removed(folder: Path) -> OutputError:
 
 
 def _recorded(link: Link, kept: list[int], settings: MeasureSettings) -> tuple[Recording, Link]:
-    """Open the recording of a run at a crane, with the results already computed on it.
+    """Open the recording of a run at a crane, with the results already computed on it, if they still count:
+    the yard file may have been changed during the run.
 
     If the recorder had to stop, the run's own logs replace the recording.
     """
@@ -225,6 +226,8 @@ def _recorded(link: Link, kept: list[int], settings: MeasureSettings) -> tuple[R
         growing = GrowingRecording(recording, kept, link)
         growing.grow()
         recording = growing
+    if link.checkpoints.name != _key(link.open_recording(), settings)[:32]:
+        return recording, link
     folder = link.checkpoints.with_name(_key(recording, settings)[:32])
     return recording, replace(link, checkpoints=link.checkpoints.rename(folder))
 

@@ -41,7 +41,8 @@ def stage_notices(mapped: MappedYard) -> list[Notice]:
         if one.built.refusals:
             refused = Counter(refusal.frame.reason for refusal in one.built.refusals)
             (most, count), total = refused.most_common(1)[0], one.probed.frames_total
-            reason = f"{refused.total()} of {total} frames were refused; most often ({count}): {most}"
+            why = f"{'first' if count == 1 else f'most often ({count})'}: {most}"
+            reason = f"{refused.total()} of {total} frames were refused; {why}"
             warnings.append(Notice("frames-refused", reason))
     return warnings
 
