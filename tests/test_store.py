@@ -12,6 +12,8 @@ import time
 import uuid
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import psycopg
@@ -29,9 +31,18 @@ from barsight.store.adding import AddedSurvey, add_survey, read_survey
 from barsight.store.audit import AuditChain, entry, verify_chain
 from barsight.store.calibrations import approve_calibration, note_calibration
 from barsight.store.confirmation import newest_survey
-from barsight.store.history import list_surveys, newest_absences, newest_sightings, next_sightings, parse_time
+from barsight.store.history import (
+    BundleSighting,
+    PresentBundle,
+    list_surveys,
+    newest_absences,
+    newest_sightings,
+    next_sightings,
+    parse_time,
+)
 from barsight.store.opening import Store, open_store
 from barsight.store.states import LIFT_STEPS, alarm_state, raise_alarm, step_alarm, step_lift
+from barsight.store.stock import listed_bundles
 from barsight.store.tables import (
     ABSENCES,
     ALARMS,
@@ -43,6 +54,7 @@ from barsight.store.tables import (
     SURVEY_VETOES,
     SURVEYS,
 )
+from lift_yards import laid, record
 from store_servers import add_database
 from store_yards import CraneYard
 from yard_folders import lifts, write_folder
@@ -529,3 +541,15 @@ def test_lists_of_surveys_leave_their_heights_where_they_are(store: Store) -> No
         assert list_surveys(connection) == () and survey_records(connection) == []
         assert newest_survey(connection) is None
     assert len(asked) > 5 and not [query for query in asked if "heights" in query]
+
+
+def test_each_bundle_of_a_written_list_has_a_name_of_its_own() -> None:
+    """A list may call a bundle as the store calls another one."""
+
+    def shown(identity: str, stock_name: str | None) -> PresentBundle:
+        sighting = SimpleNamespace(identity=identity, stock_name=stock_name, bundle=record(laid(0.3)))
+        return PresentBundle(cast(BundleSighting, sighting), None)
+
+    called = (("B1", "B2"), ("B2", None), ("B3", "B2"), ("B4", "B2 (2)"))
+    names = [one.name for one in listed_bundles(shown(*one) for one in called)]
+    assert names == ["B2", "B2 (2)", "B3", "B4"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +21,7 @@ from barsight.yard.inventory.stock_list import (
     list_contradiction,
     match_stock,
     read_stock,
+    stock_text,
     stock_warnings,
 )
 from barsight.yard.types import Bundle, Doubt, DoubtKind
@@ -139,6 +141,28 @@ def test_a_spreadsheets_list_is_read(tmp_path: Path) -> None:
     path = tmp_path / "stock.csv"
     path.write_text("\ufeffName, X_m,y_m ,Bars\nA,1,2,7\n,,,\n", encoding="utf-8")
     assert read_stock(path) == (ListedBundle("A", 1.0, 2.0, bars=7),)
+
+
+NAMES = ('Träger "40", Ø 8', "=1+1", "=cmd|' /C'!A0", "@SUM(A1)", "-a", "-12", "+49 7", "'=q", "'quote", "半")
+
+
+def test_a_written_list_comes_back_and_no_spreadsheet_calculates_it(tmp_path: Path) -> None:
+    """Without the mark a spreadsheet shows a name beyond ASCII garbled."""
+    listed = tuple(ListedBundle(name, float(k), 2.0) for k, name in enumerate(NAMES))
+    path = tmp_path / "stock.csv"
+    for some in (listed, listed[1:2]):
+        path.write_text(stock_text(some), encoding="utf-8")
+        assert read_stock(path) == some
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            names = [row["name"] for row in csv.DictReader(file)]
+        assert not any(name[0] in "=+@" or name == "-a" for name in names) and "'12" not in str(names)
+        assert path.read_bytes().startswith(b"\xef\xbb\xbf") is (some is listed)
+
+
+def test_a_name_on_two_lines_is_read_as_one(tmp_path: Path) -> None:
+    path = tmp_path / "stock.csv"
+    path.write_text('name,x_m,y_m\n"4711\nHall 2",1,2\n', encoding="utf-8")
+    assert [one.name for one in read_stock(path)] == ["4711 Hall 2"]
 
 
 def test_a_missing_or_torn_list_is_refused(tmp_path: Path) -> None:

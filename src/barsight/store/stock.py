@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from itertools import chain, count
 from typing import Literal
 
 from barsight.core.errors import InputError
@@ -29,7 +30,9 @@ def listed_bundles(present: Iterable[PresentBundle]) -> tuple[ListedBundle, ...]
     for shown in present:
         bundle = shown.sighting.bundle
         label = None if bundle.label is None else bundle.label.text
-        wanted = (shown.sighting.stock_name, label, shown.sighting.identity)
+        identity = shown.sighting.identity
+        more = (f"{identity} ({number})" for number in count(2))
+        wanted = chain((shown.sighting.stock_name, label, identity), more)
         name = next(each for each in wanted if each and each not in names)
         names.add(name)
         x_m, y_m, _ = (float(value) for value in bundle.centre_m)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import math
@@ -100,7 +101,11 @@ def read_stock(path: Path) -> tuple[ListedBundle, ...]:
 
 
 def stock_text(listed: tuple[ListedBundle, ...]) -> str:
-    """Format a list as CSV that `read_stock` reads; lengths to 0.1 mm, angles to 0.001 deg."""
+    """Format a list as CSV that `read_stock` reads; lengths to 0.1 mm, angles to 0.001 deg.
+
+    Spreadsheets open it safely: an apostrophe stands before a name that they would execute, and a byte order
+    mark before a list with letters beyond ASCII, which they would take for another encoding.
+    """
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     names = ("name", *_NEEDED[1:], *_OPTIONAL)
@@ -111,17 +116,26 @@ def stock_text(listed: tuple[ListedBundle, ...]) -> str:
         row = [figures[name] for name in names[1:]]
         finite = [value if value is not None and np.isfinite(value) else None for value in row]
         writer.writerow(
-            [one.name]
+            [f"'{one.name}" if _is_formula(one.name) else one.name]
             + [
                 "" if value is None else f"{value:.{digits.get(name, 4)}f}"
                 for name, value in zip(names[1:], finite, strict=True)
             ]
         )
-    return out.getvalue()
+    text = out.getvalue()
+    return text if text.isascii() else f"\ufeff{text}"
+
+
+def _is_formula(name: str) -> bool:
+    """Check whether a spreadsheet would calculate a name, apostrophes aside; a number stays as it is."""
+    with contextlib.suppress(ValueError):
+        float(name)
+        return False
+    return name.lstrip("'").startswith(("=", "+", "-", "@"))
 
 
 def _csv_rows(path: Path) -> list[dict[str, Any]]:
-    reader = csv.DictReader(read_lines(path, MAX_ENTRIES, _REMEDY))
+    reader = csv.DictReader(f"{line}\n" for line in read_lines(path, MAX_ENTRIES, _REMEDY))
     header = [name.strip().lower() for name in reader.fieldnames or ()]
     for name in (*_NEEDED, *_OPTIONAL):
         if header.count(name) > 1 or (name in _NEEDED and name not in header):
@@ -162,7 +176,9 @@ def _expected(path: Path, number: int, row: dict[str, Any]) -> ListedBundle:
             raise InputError(path, f"bundle {number}: {key} can't be {str(text)[:40]!r}", _REMEDY)
         figures[key] = value
     given = row.get("name")
-    name = str(given).strip() if isinstance(given, str | int) else ""
+    name = " ".join(str(given).splitlines()).strip() if isinstance(given, str | int) else ""
+    if name.startswith("'") and _is_formula(name):
+        name = name[1:]
     if not name:
         raise InputError(path, f"bundle {number} has no name", _REMEDY)
     bars = figures.pop("bars")
