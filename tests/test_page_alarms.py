@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from sqlalchemy import event, select
 
+from barsight.cli.main import run
 from barsight.core.errors import InputError
 from barsight.page import watch as watching
 from barsight.page.conditions import _lifted_since_seen, find_conditions, settle_alarms
@@ -36,6 +37,7 @@ from barsight.store.states import (
 )  # fmt: skip
 from barsight.store.tables import ALARMS, BUNDLES, LIFT_BUNDLES, LIFTS
 from page_yards import SECOND, survey
+from yard_folders import write_folder
 
 
 def wait_for(holds: Callable[[], bool], timeout_s: float = 10.0) -> None:
@@ -230,3 +232,25 @@ def test_only_bundles_asked_about_are_looked_up_among_the_lifted(url: str) -> No
             step_lift(opened, lift, state)
         gone, none = (select(BUNDLES.c.id).where(BUNDLES.c.id == number) for number in (4, 99))
         assert _lifted_since_seen(connection, newest.captured_to_ns, gone.union(none)) == {4}
+
+
+def test_a_clock_that_was_set_back_behind_the_newest_survey_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A survey made then counts as older and offers nothing: page, plant and `store add` say why."""
+    url = f"sqlite:///{tmp_path / 'yard.db'}"
+    first = write_folder(tmp_path / "first", is_simulated=False)
+    second = write_folder(tmp_path / "second", is_simulated=False, age_s=3600.0)
+    assert run(["store", "add", url, str(first)]) == 0 and "isn't the newest" not in capsys.readouterr().out
+    now_ns = time.time_ns
+    monkeypatch.setattr(time, "time_ns", lambda: now_ns() - 3000 * 10**9)
+    assert run(["store", "add", url, str(second)]) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "it isn't the newest, so nothing of it is offered: the newest survey's frames, until 20" in told
+    with open_store(url) as store:
+        state = state_of_store(store, 0)
+        assert state.reasons[0].startswith("map-from-the-future: ") and not state.is_valid
+        StoreWatch(store).judge()
+        assert raised(store)["map-from-the-future"] == 1
+        monkeypatch.setattr(time, "time_ns", now_ns)
+        assert not any("future" in reason for reason in state_of_store(store, 0).reasons)

@@ -16,7 +16,7 @@ from barsight.result_folder import changed_inputs, read_summary
 from barsight.store.audit import entry, verify_chain
 from barsight.store.calibrations import why_invalid
 from barsight.store.confirmation import newest_survey, yard_clock_ns
-from barsight.store.history import identity_name
+from barsight.store.history import identity_name, why_ahead
 from barsight.store.opening import Store
 from barsight.store.promotion import counts
 from barsight.store.states import alarm_state, raise_alarm, step_alarm
@@ -36,6 +36,7 @@ with extra("store"):
 ALARM_CODES = {
     "store-broken": "The audit log of the store doesn't hold: rows were changed outside Barsight.",
     "calibration-changed": "The newest map's calibration was changed since, or isn't valid any more.",
+    "map-from-the-future": "This computer's clock was set back: surveys count as older than the newest one.",
     "survey-files": "The newest survey's folder is gone or lacks files.",
     "lift-failed": "A lift was reported as done or failed, and its bundle still lies there.",
     "bundle-gone": "A bundle is gone that no lift has taken.",
@@ -55,8 +56,11 @@ def find_conditions(connection: Connection, live: LiveHealth | None) -> set[Cond
     newest = newest_survey(connection)
     if newest is not None:
         found |= _file_conditions(newest) | _yard_conditions(connection, newest)
-        reason = why_invalid(connection, newest.calibration_id, yard_clock_ns(connection))
+        clock_ns = yard_clock_ns(connection)
+        reason = why_invalid(connection, newest.calibration_id, clock_ns)
         found |= {("calibration-changed", reason)} if reason else set()
+        ahead = why_ahead(newest.captured_to_ns, clock_ns)
+        found |= {("map-from-the-future", ahead)} if ahead else set()
     if live is not None and live.problem is not None:
         found.add(live.problem)
     return found

@@ -11,6 +11,7 @@ from typing import Any
 from barsight.core.json_values import json_value
 from barsight.core.reading.live_run import CranePose
 from barsight.store.confirmation import OPEN, OpenLift, map_vetoes, newest_survey, open_lifts, yard_clock_ns
+from barsight.store.history import why_ahead
 from barsight.store.lift_records import ROUNDING_M
 from barsight.store.opening import Store
 from barsight.store.states import alarm_priority, standing_alarms
@@ -22,6 +23,8 @@ code is added, up to `MAX_CODES`.
 """
 MAX_PLACE_M = 10_000.0
 """Readings of a crane in metres from which on they are no place in a yard."""
+MIN_FLOAT = 1e-30
+"""Numbers up to which a reading in metres is no difference of rounding, but bytes in another order."""
 MAX_CODES = 20
 """Maximum number of alarms that are added so that each code is told."""
 YAW_SENSE = "of the beam from +Y of the yard frame, counter-clockwise seen from above"
@@ -61,8 +64,11 @@ class PlcReading:
 
 
 def is_place(*place_m: float) -> bool:
-    """Check whether a crane's readings are known: not all zeros, nor outside any yard."""
-    return any(place_m) and all(abs(value) < MAX_PLACE_M for value in place_m)
+    """Check whether a crane's readings are known: not all zeros, nor outside any yard, nor with a number that
+    only swapped bytes make so small.
+    """
+    sizes_m = [abs(value) for value in place_m]
+    return max(sizes_m) >= ROUNDING_M and all(one == 0 or MIN_FLOAT < one < MAX_PLACE_M for one in sizes_m)
 
 
 @dataclass(frozen=True)
@@ -171,6 +177,8 @@ def state_of_store(
     )
     lift = None if best is None else offered_lift(best, approach_height_m, magnet_steps_kg)
     reasons = _reasons(lift, survey.is_simulated and not allow_simulated, bool(magnet_steps_kg))
+    if ahead := why_ahead(survey.captured_to_ns, clock_ns):
+        reasons = (f"map-from-the-future: {ahead}", *reasons)
     if begun is not None and (vetoes or begun not in usable):
         old = "; ".join(one["reason"] for one in vetoes) or "its map is no longer the newest, or too old"
         reasons = (*reasons, f"unfinished: lift {begun.lift_id} has begun and isn't reported; {old}")

@@ -23,6 +23,7 @@ from barsight.store.tables import ABSENCES, LIFT_BUNDLES, LIFT_STATES, LIFTS, SI
 from barsight.yard.axes import turn_between
 from barsight.yard.inventory.bundle_file import bundle_of
 from barsight.yard.inventory.matching import moved_bundles
+from barsight.yard.lifting.validity import is_ahead
 from barsight.yard.types import Bundle
 
 with extra("store"):
@@ -134,6 +135,15 @@ def expect_time(stamp_ns: int) -> int:
 def time_text(stamp_ns: int) -> str:
     """Format a stamp in UTC, to the second."""
     return datetime.fromtimestamp(stamp_ns // NS_PER_S, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+def why_ahead(captured_to_ns: int, clock_ns: int) -> str:
+    """Return why surveys made now count as older than one with these frames; empty if they don't."""
+    if not is_ahead(captured_to_ns, clock_ns):
+        return ""
+    until = time_text(captured_to_ns)
+    ends = f"the newest survey's frames, until {until},"
+    return f"{ends} are ahead of this clock: surveys till then count as older"
 
 
 def newest_sightings(

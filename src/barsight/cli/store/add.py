@@ -12,6 +12,8 @@ from barsight.cli.arguments import call
 from barsight.cli.safe_console import SafeConsole
 from barsight.store.adding import AddedSurvey, add_survey, read_survey
 from barsight.store.audit import user_name
+from barsight.store.confirmation import newest_survey, yard_clock_ns
+from barsight.store.history import why_ahead
 from barsight.store.opening import DEFAULT_URL, open_store
 
 
@@ -45,7 +47,13 @@ def run(arguments: Sequence[str]) -> None:
         survey = read_survey(out)
         with open_store(url, create=True, migrate=migrate) as store:
             added = add_survey(store, survey, by or user_name(), same_yard=same_yard, rig=rig, crane=crane)
-        _print(added, SafeConsole())
+            with store.reading() as connection:
+                newest, clock_ns = newest_survey(connection), yard_clock_ns(connection)
+        console = SafeConsole()
+        _print(added, console)
+        if added.is_new and newest is not None and newest.map_id != added.map_id:
+            ahead = why_ahead(newest.captured_to_ns, clock_ns) or f"the newest is {newest.map_id}"
+            console.print(f"it isn't the newest, so nothing of it is offered: {ahead}", highlight=False)
 
     words = list(arguments)
     if len(words) == 1 and not words[0].startswith("-"):
