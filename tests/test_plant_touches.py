@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 pytest.importorskip("sqlalchemy")
@@ -23,7 +24,7 @@ from barsight.plant.links.s7_link import serve_s7
 from barsight.plant.partner import PlcPartner
 from barsight.plant.serving import TelegramServer
 from barsight.plant.settings import TelegramSettings
-from barsight.plant.state import PlantState
+from barsight.plant.state import PlantState, PlcReading
 from barsight.plant.steps import LiftSteps, take_named_step
 from barsight.plant.telegram import IN_MAGIC, pack, unpack
 from barsight.store import confirmation
@@ -80,9 +81,24 @@ class Driver:
         return self.partner.answer.get("answer", 0) if command else 0
 
     def go(self, at: tuple[float, float], z_m: float = HIGH, flags: int | None = None) -> None:
+        self.travel(at, z_m)
         self.at, self.z_m = at, z_m
         self.flags = self.flags if flags is None else flags
         self.turn()
+
+    def travel(self, at: tuple[float, float], z_m: float) -> None:
+        """Send the places on the way, unless the position is lost or found again."""
+        start, end = (*self.at, self.z_m), (*at, z_m)
+        if not any(start) or not any(end):
+            return
+        flags, names = (
+            {"flags": self.flags | REACHED, "clock_ns": 0, "load": 0},
+            ("bridge", "trolley", "hoist"),
+        )
+        for part in np.linspace(0, 1, math.ceil(math.dist(start, end)), endpoint=False)[1:]:
+            self.plant.now_s += 0.01
+            place = (round(1e4 * (a + (b - a) * part)) for a, b in zip(start, end, strict=True))
+            self.partner.watch(self.partner.reading(flags | dict(zip(names, place, strict=True))))
 
     def begin(self) -> int:
         assert (self.turn(), self.turn(CLAIM), self.turn(EXECUTING)) == (0, DONE, DONE)
@@ -396,13 +412,34 @@ def test_an_opc_ua_crane_tells_where_its_magnet_was(
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"kind": "grab"}, {"x_m": 118_000.0}, {"x_m": 0.0, "z_m": 0.0}, {"x_m": math.nan}, {"y_m": math.nan}],
-)
+    [
+        {"kind": "grab"}, {"x_m": 118_000.0}, {"x_m": 0.0, "z_m": 0.0}, {"x_m": math.nan}, {"y_m": math.nan},
+        {"x_m": 2.1e-317}, {"x_m": 1e-38, "z_m": 1e-5},
+    ],
+)  # fmt: skip
 def test_an_opc_ua_crane_tells_no_place_that_cannot_be(plant: Plant, wrong: dict[str, object]) -> None:
     touch = {"kind": "grip", "x_m": 118.0, "y_m": 0.0, "z_m": DOWN} | wrong
     told = take_named_step(plant.steps, "touched", "ann by OPC UA", touch)
     assert isinstance(told, Failed) and "grip, release, contact, on" in str(told)
     assert offers(plant) == [1, 2, 3, 4, 5, 6]
+
+
+@pytest.mark.parametrize("off_m", [-6.5536, 6.5536, 1.6, 500.0])
+def test_a_position_that_jumps_is_left_out_until_the_crane_is_back(plant: Plant, off_m: float) -> None:
+    """An encoder slips, or 16 bits are sent of 32: the load that was taken at the target counts."""
+    crane = Driver(plant)
+    crane.begin()
+    crane.go(FIRST)
+    for flags in (SLACK, SLACK | ON):
+        reading = PlcReading(
+            "plc a", 1, 0.0, FIRST[0] + off_m, FIRST[1], DOWN, None, bool(flags & ON), True, True
+        )
+        plant.now_s += 0.05
+        assert "jumped by" in crane.partner.watch(reading)
+    crane.go(FIRST, DOWN, SLACK | ON)
+    crane.go(FIRST, HIGH, ON)
+    crane.put(FREE)
+    assert crane.turn(EXECUTED) == DONE and alarms(plant) == [] and offers(plant) == [2, 3, 4, 5, 6]
 
 
 def test_a_load_that_is_put_down_beside_an_offer_ends_it(plant: Plant) -> None:
@@ -510,8 +547,8 @@ def test_a_touch_that_the_store_could_not_take_is_noted_without_another_step(pla
 
 
 def telegrams() -> list[bytes]:
-    """A magnet that is turned on at x 118 m and off at 50 m."""
-    steps = ((118.0, 0), (118.0, ON), (50.0, ON), (50.0, 0))
+    """A magnet that is turned on at x 118 m and off 0.8 m farther."""
+    steps = ((118.0, 0), (118.0, ON), (118.8, ON), (118.8, 0))
     values = [
         {"magic": IN_MAGIC, "version": 1, "life": k, "flags": flags, "bridge": round(1e4 * x_m)}
         for k, (x_m, flags) in enumerate(steps, start=1)
@@ -519,7 +556,7 @@ def telegrams() -> list[bytes]:
     return [pack("in", one) for one in values]
 
 
-TOUCHED = [Touch("grip", 118.0, 0.0, 0.0), Touch("release", 50.0, 0.0, 0.0)]
+TOUCHED = [Touch("grip", 118.0, 0.0, 0.0), Touch("release", 118.8, 0.0, 0.0)]
 
 
 class Seen:
@@ -543,7 +580,8 @@ class SlowClaim(Seen):
         return Failed("invalid", "no lift is offered")
 
 
-CLAIMING = {"magic": IN_MAGIC, "version": 1, "life": 9, "command": CLAIM, "command_number": 1, "bridge": 1}
+CLAIMING = {"magic": IN_MAGIC, "version": 1, "life": 9, "command": CLAIM, "command_number": 1}
+CLAIMING |= {"bridge": 1_180_000}
 
 
 def test_the_telegram_tells_touches() -> None:

@@ -19,6 +19,8 @@ DOWN_M = 0.1
 """Height in metres above that of contact up to which the magnet of a lift that has begun counts as down."""
 MAX_GAP_S = 1.0
 """Longest time in seconds between readings of which the later one tells what happened since the earlier."""
+MAX_SPEED_MPS, MAX_JUMP_M = 10.0, 1.0
+"""Speed and step between readings up to which a crane may have moved; readings may come in a bunch."""
 _MAGNET_ON, _WEIGHED, _SLACK, _REACHED = 1, 2, 4, 8
 
 
@@ -37,6 +39,16 @@ class _Magnet:
     @property
     def grips(self) -> bool:
         return self.is_on and (self.is_low or self.is_slack)
+
+
+def _jump(last: PlcReading | None, now: PlcReading, since_s: float) -> str:
+    """Return how a position jumped since the last reading; empty if a crane can have moved so."""
+    if last is None or last.place_m is None or now.place_m is None or since_s > MAX_GAP_S:
+        return ""
+    off_m = max(abs(one - other) for one, other in zip(now.place_m, last.place_m, strict=True))
+    if off_m <= MAX_JUMP_M + MAX_SPEED_MPS * since_s:
+        return ""
+    return f"its position jumped by {off_m:.2f} m within {since_s:.1f} s: it needs 32 bits and whole encoders"
 
 
 class PlcPartner:
@@ -106,16 +118,21 @@ class PlcPartner:
         self._command = found if is_new else None
         return is_new or bool(self._touches)
 
-    def watch(self, reading: PlcReading) -> None:
-        """Find in the PLC's readings, one after another, where its magnet touches something.
+    def watch(self, reading: PlcReading) -> str:
+        """Find in the PLC's readings, one after another, where its magnet touches something; return why this
+        one's position isn't believed, empty if it is.
 
         Without a position nothing is known, nor from the first reading, nor of what happened before one that
         came `MAX_GAP_S` late: by then the load may hang, if the magnet is on. It is down if the rope is
         slack; while a lift has begun also up to `DOWN_M` above the height of contact, otherwise whenever it
         is turned on. While one is claimed, coming below that height tells that it came down. A crane whose
-        position was known since it claimed a lift, and never at the target, hasn't made it.
+        position was known since it claimed a lift, and never at the target, hasn't made it. A reading that no
+        crane can have travelled to, as of an encoder's fault or of too few bits, is left out.
         """
         last, last_s = self._last, self._last_s
+        jump = _jump(last, reading, time.monotonic() - last_s)
+        if jump:
+            return jump
         self._last_s = time.monotonic()
         self._last = None if reading.place_m is None else reading
         if self._last is None or self._last_s - last_s > MAX_GAP_S:
@@ -124,7 +141,7 @@ class PlcPartner:
             if reading.is_magnet_on:
                 self.begun = self._claimed = self._contact_m = None
         if last is None or reading.place_m is None:
-            return
+            return reading.problem
         if self._away_from is not None and self._away_from.is_at(*reading.place_m[:2]):
             self._away_from = None
         low_m = -math.inf if self._contact_m is None else self._contact_m + DOWN_M
@@ -142,6 +159,7 @@ class PlcPartner:
         for kind in (name for name, is_told in kinds.items() if is_told):
             self._touches.append(Touch(kind, *reading.place_m))
             self._away_from = None  # the store judges by the touches
+        return ""
 
     def reading(self, found: dict[str, int]) -> PlcReading:
         """Form the PLC's reading of the crane from a telegram."""

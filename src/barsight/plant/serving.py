@@ -106,9 +106,8 @@ class TelegramServer:
                 if not is_second:
                     reading = partner.reading(found)
                     self._feed.take_reading(reading)
-                    if reading.problem:
-                        self._tell(partner.name, "where its magnet is isn't known", reading.problem)
-                    partner.watch(reading)
+                    if problem := partner.watch(reading):
+                        self._tell(partner.name, "where its magnet is isn't known", problem)
                 is_busy = (step is not None and not step.done()) or is_second
                 if partner.receive(found, is_busy=is_busy):
                     step = asyncio.create_task(asyncio.to_thread(partner.execute))

@@ -13,6 +13,7 @@ from barsight.plant.crane_names import plc_name
 from barsight.plant.feed import StateFeed
 from barsight.plant.link_settings import S7Settings
 from barsight.plant.partner import PlcPartner
+from barsight.plant.state import PlcReading
 from barsight.plant.steps import LiftSteps
 from barsight.plant.telegram import layout, out_values, pack, unpack
 
@@ -39,18 +40,19 @@ async def serve_s7(
         counter += 1
         return pack("out", out_values(partner.seen(feed.newest(counter)), partner.answer))
 
+    def watch(reading: PlcReading) -> str:
+        feed.take_reading(reading)
+        return partner.watch(reading)
+
     def take(exchanged: S7Exchange | Failed) -> None:
         nonlocal wrong, step
         found = exchanged if isinstance(exchanged, Failed) else unpack("in", exchanged.inputs)
-        now = found.reason if isinstance(found, Failed) else partner.reading(found).problem
+        now = found.reason if isinstance(found, Failed) else watch(partner.reading(found))
         if wrong is None or bool(now) != bool(wrong):
             say(f"S7 with {at}: {now or 'exchanging'}")
         wrong = now
         if isinstance(found, Failed):
             return
-        reading = partner.reading(found)
-        feed.take_reading(reading)
-        partner.watch(reading)
         is_busy = step is not None and not step.done()
         if step is not None and not is_busy:
             step.result()  # what isn't a refusal ends the link
