@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import shutil
 import sqlite3
 import threading
 import time
@@ -254,3 +255,32 @@ def test_a_clock_that_was_set_back_behind_the_newest_survey_is_told(
         assert raised(store)["map-from-the-future"] == 1
         monkeypatch.setattr(time, "time_ns", now_ns)
         assert not any("future" in reason for reason in state_of_store(store, 0).reasons)
+
+
+def test_a_backup_that_is_put_back_while_nothing_runs_offers_nothing(url: str, tmp_path: Path) -> None:
+    """A lift that was made since would be offered again; a store that is made anew is another one."""
+    path = Path(url.removeprefix("sqlite:///"))
+    backup = shutil.copy(path, tmp_path / "backup.db")
+
+    def judge() -> list[str]:
+        with open_store(url) as store:
+            StoreWatch(store).judge()
+            with store.reading() as connection:
+                return [one.state for one in open_lifts(connection)]
+
+    assert judge() == ["offered"] * 3
+    with open_store(url) as store:
+        lift = state_of_store(store, 0, allow_simulated=True).lift
+        assert lift is not None
+        confirmation.confirm_lift(store, lift.lift_id, lift.map_id, "ann")
+        confirmation.take_lift(store, lift.lift_id, "ann")
+    assert "offered" in judge()
+    shutil.copy(backup, path)
+    assert judge() == judge() == []
+    with open_store(url) as store:
+        assert raised(store)["lift-unrecorded"] == 1
+    path.unlink()
+    assert run(["store", "add", url, str(survey(tmp_path / "anew", SECOND, 1.0))]) == 0
+    assert judge() == ["offered"] * 3
+    path.with_name("yard.db.seen").write_text("no number")
+    assert judge() == ["offered"] * 3

@@ -302,7 +302,7 @@ def _end_lost(store: Store, who: str) -> None:
             lost = f"the store was set back, row {seen[0]} of its log is gone: survey before the next lift"
             raise_alarm(opened, "lift-unrecorded", lost)
             end_offers(opened, "disturbed: the store was set back, which lifts were made isn't known")
-    store.log.newest = newest
+    store.log.note(newest)
 
 
 def _change(store: Store, lift_id: int, who: str, what: str, step: Callable[[Entry, OpenLift], None]) -> None:

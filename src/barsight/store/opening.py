@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from barsight.core.errors import ConfigError, InputError, OutputError
 from barsight.core.extras import extra
 from barsight.core.files import atomic_path
 from barsight.core.wall_clock import WallClock
-from barsight.store.tables import METADATA
+from barsight.store.tables import MAX_ID, METADATA
 
 with extra("store"):
     from alembic import command
@@ -35,9 +35,29 @@ _LOCK = 0x62617273
 
 @dataclass
 class SeenLog:
-    """Newest row of the audit log that this process has seen: its id, 0 for none, and its digest."""
+    """Newest row of the audit log that was seen: its id, 0 for none, and its digest.
 
+    path: file that keeps it for the next process, beside a SQLite file that may be put back; None for
+    PostgreSQL.
+    """
+
+    path: Path | None = None
     newest: tuple[int, str] = (0, "")
+
+    def __post_init__(self) -> None:
+        if self.path is not None:
+            with suppress(OSError, ValueError):
+                number, digest = self.path.read_text(encoding="ascii").split()
+                self.newest = min(int(number), MAX_ID), digest
+
+    def note(self, newest: tuple[int, str]) -> None:
+        """Keep the newest row; where no file can be written, only for this process."""
+        if newest == self.newest:
+            return
+        self.newest = newest
+        if self.path is not None:
+            with suppress(OSError, OutputError), atomic_path(self.path) as path:
+                path.write_text(f"{newest[0]} {newest[1]}\n", encoding="ascii")
 
 
 @dataclass(frozen=True)
@@ -85,10 +105,11 @@ def open_store(url: str, *, create: bool = False, migrate: bool = False) -> Iter
     for an invalid URL, InputError for an unusable database.
     """
     parsed = _parse(url)
-    store = Store(_engine(parsed), parsed.render_as_string(hide_password=True))
+    log = SeenLog()
+    if parsed.get_backend_name() == "sqlite":
+        log = SeenLog(_seen_path(parsed, create=create))
+    store = Store(_engine(parsed), parsed.render_as_string(hide_password=True), log=log)
     try:
-        if parsed.get_backend_name() == "sqlite" and not create:
-            _expect_file(parsed)
         _bring_up_to_date(store, parsed, create=create, migrate=migrate)
         yield store
     finally:
@@ -108,10 +129,16 @@ def _parse(url: str) -> URL:
     return parsed
 
 
-def _expect_file(url: URL) -> None:
+def _seen_path(url: URL, *, create: bool) -> Path:
+    """Return the file of `SeenLog`, without an earlier store's. Raises InputError if there is no store."""
     path = Path(str(url.database))
+    seen = path.with_name(f"{path.name}.seen")
     if not path.is_file():
-        raise InputError(path, "there is no such store", "barsight store add makes one")
+        if not create:
+            raise InputError(path, "there is no such store", "barsight store add makes one")
+        with suppress(OSError):
+            seen.unlink()
+    return seen
 
 
 def _engine(url: URL) -> Engine:
