@@ -13,12 +13,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.errors import BarsightError, InputError
 from barsight.core.notices import FORBIDS, WARNINGS
 from barsight.core.records.sensor_samples import ImuSamples
 from barsight.measure_folder import measure_into
 from barsight.measure_settings import MeasureSettings
 from barsight.motion.batch.sensor_agreement import refuse_contradictions
+from barsight.motion.settings import MotionSettings, make_estimator
 from barsight.recording.open import open_recording
 from barsight.recording.plausibility import clock_faults, doubts
 from barsight.simulation.settings.recording import SimulationSettings
@@ -27,6 +29,7 @@ from barsight.yard.magnet.description import example_magnet
 from barsight.yard.vetoes import VETOES
 from contradicting_inputs import AGES, CONTRADICTIONS
 from drawn_steps import DrawnSteps, drawn_steps
+from simulated_ways import steady
 
 
 def refusal(steps: DrawnSteps) -> str:
@@ -86,6 +89,25 @@ def test_no_drawn_way_is_refused_and_what_is_wrong_is() -> None:
     for name in ("encoders in mm", "gyro in degrees/s", "crane clock 0.5 s late"):
         spoil, words = WRONG_STEPS[name]
         assert sum(words in told for told in judged(range(100, 106), spoil)) >= 5
+
+
+@pytest.mark.parametrize("seed", [20026, 20000])
+def test_a_trolley_that_counts_backwards_in_few_steps_is_refused(seed: int) -> None:
+    """It travelled 1.9 m while the bridge travelled 40: most steps' directions hid it."""
+    told = refusal(places(lambda place: place * [1, -1, 1])(drawn_steps(seed)))
+    assert "wrong mounting" in told and "sign" in told
+
+
+@pytest.mark.parametrize("name", ["fused", "live", "crane"])
+def test_an_accelerometer_in_g_is_refused_where_no_file_is_read(
+    name: Literal["fused", "live", "crane"],
+) -> None:
+    recording, *_ = steady(0.5, 0)
+    assert recording.imu_samples is not None
+    imu = replace(recording.imu_samples, accel_mps2=recording.imu_samples.accel_mps2 / 9.80665)
+    estimator = make_estimator(MotionSettings(name))
+    with pytest.raises(InputError, match="probably in g"):
+        estimator.begin(replace(recording, imu_samples=imu), Rectifier(recording.rig))
 
 
 @pytest.mark.parametrize("axes", [[0, 1, 2], [0]])

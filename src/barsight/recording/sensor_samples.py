@@ -41,7 +41,8 @@ def expect_si(path: Path, accel: Float64) -> None:
 
 
 def expect_usable(path: Path, crane: CraneSamples | None, imu: ImuSamples | None) -> None:
-    """Raise `InputError` where readings that no file's reader has checked aren't in order of time or finite.
+    """Raise `InputError` where readings that no file's reader has checked aren't in order of time or finite,
+    or in g.
 
     Readings may be missing: there may be none at all.
     """
@@ -56,6 +57,8 @@ def expect_usable(path: Path, crane: CraneSamples | None, imu: ImuSamples | None
         wrong = int((~np.isfinite(values)).any(axis=1).sum())
         if wrong:
             raise InputError(path, f"{wrong} of {whose} {len(stamps)} readings aren't numbers", "drop them")
+    if imu is not None and len(imu.stamp_ns):
+        expect_si(path, imu.accel_mps2)
 
 
 def make_crane(document: Document, stamp_ns: Int64, position_m: Float64) -> CraneSamples:

@@ -10,6 +10,9 @@ import numpy as np
 
 from barsight.core.arrays import Float64, Int64
 
+AXES = ("bridge", "trolley", "hoist")
+"""Names of the encoders, in the order of their readings."""
+
 
 @dataclass(frozen=True, eq=False)
 class ImuSamples:

@@ -15,7 +15,7 @@ from scipy.ndimage import median_filter
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.errors import InputError
-from barsight.core.records.sensor_samples import CraneSamples, ImuSamples
+from barsight.core.records.sensor_samples import AXES, CraneSamples, ImuSamples
 from barsight.core.stamps import interpolate_at, seconds_to_ns
 from barsight.motion.batch.fault_detection import (
     CLEARLY_BETTER,
@@ -35,6 +35,8 @@ MAX_WAY_RATIO, MAX_ANGLE_DEG = 1.15, 5.0
 """Maximum ratio between the encoders' and the pictures' travel, and maximum angle between the two."""
 MAX_FAST_S = 0.06
 """Maximum interval, s, of readings five of which a crane travels nearly straight."""
+SIGN_SIGMAS = 5.0
+"""Significance from which an encoder counts backwards."""
 READING_SIGMAS = 2.0
 """Distance, in sigma of a reading, by which the readings may leave a step's direction."""
 TURNS_SIGMAS, MAX_TURN_RATIO, MIN_ALIKE = 4.0, 5.0, 0.7
@@ -91,7 +93,7 @@ def _check_encoders(path: Path, steps: SeenSteps, crane: CraneSamples) -> None:
         ratio = float(np.median(read_m[long] / np.maximum(seen_m[long], 1e-6)))
         return ratio, float(np.degrees(np.percentile(angle, 75)))  # diagonal steps hide exchanged axes
 
-    found = compared(0.0)
+    found, late_s = compared(0.0), 0.0
     if found is None:
         return
     unlike = max(found[0], 1 / max(found[0], 1e-9)) > 2
@@ -118,6 +120,34 @@ def _check_encoders(path: Path, steps: SeenSteps, crane: CraneSamples) -> None:
             f"the encoders travel {angle_deg:.0f} degrees off the pictures' way: a wrong mounting",
             "check the encoders' axes and signs, R_yard_body and the cameras' T_BS",
         )
+    _check_signs(path, steps, crane, place, late_s)
+
+
+def _check_signs(path: Path, steps: SeenSteps, crane: CraneSamples, place: Float64, late_s: float) -> None:
+    """Raise InputError where an encoder counts backwards, even one that moves in few of the steps."""
+    seen, read = steps.way_m @ crane.yard_from_body_nominal.T, _between(steps, crane.stamp_ns, place, late_s)
+    read_all = np.isfinite(read).all(axis=1)
+    seen, read = seen[read_all], read[read_all]
+    if len(read) <= read.shape[1]:
+        return
+    way = np.nanmax(place, axis=0) - np.nanmin(place, axis=0)
+    for axis in np.flatnonzero(way > MIN_WAY_M).tolist():
+        gain, sigma = _gain(read, seen[:, axis], axis)
+        if gain < -SIGN_SIGMAS * sigma:
+            raise InputError(
+                path, f"the {AXES[axis]}'s encoder counts against the pictures' way: a wrong mounting",
+                "check its sign",
+            )  # fmt: skip
+
+
+def _gain(read: Float64, seen: Float64, axis: int) -> tuple[float, float]:
+    """Fit how far the pictures show (K,) travel per metre of one of the encoders (K, 3), besides what the
+    others' axes, slightly askew, add; also return its sigma.
+    """
+    inverse = np.linalg.pinv(read)
+    fitted = inverse @ seen
+    scatter = np.linalg.norm(seen - read @ fitted) / (len(seen) - len(fitted)) ** 0.5
+    return float(fitted[axis]), float(scatter * np.linalg.norm(inverse[axis]))
 
 
 def _check_gyro(path: Path, steps: SeenSteps, imu: ImuSamples) -> None:

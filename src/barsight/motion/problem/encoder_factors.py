@@ -23,7 +23,7 @@ from gtsam.symbol_shorthand import B, X
 
 from barsight.core.arrays import Bool, Float64, Int64
 from barsight.core.errors import Failed
-from barsight.core.records.sensor_samples import CraneSamples, EncoderJump, ImuSamples
+from barsight.core.records.sensor_samples import AXES, CraneSamples, EncoderJump, ImuSamples
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.inertial.model import ImuBias
 from barsight.motion.crane.encoder_trajectory import fit_position
@@ -57,7 +57,6 @@ PLAY_M = 0.002
 """Standard deviation of an encoder's play and of rails, which pass for scale over a short travel."""
 SURE_SCALE_SIGMAS = 4.7
 """Significance from which a scale is wrong, as that of a jump; one that is less significant may be wrong."""
-AXES = ("bridge", "trolley", "hoist")
 
 
 @dataclass(frozen=True)
