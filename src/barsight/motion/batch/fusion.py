@@ -21,7 +21,7 @@ from barsight.inertial.model import ORDINARY_NOISE, saturation_sentences, withou
 from barsight.motion.batch.detail import joint_sentences, jumps_alone, select_detail, untied_pictures
 from barsight.motion.batch.fault_detection import check_crane, frames_off
 from barsight.motion.batch.sensor_agreement import refuse_contradictions
-from barsight.motion.crane.encoder_delay import without_delay
+from barsight.motion.crane.encoder_delay import find_delay, shifted_back
 from barsight.motion.crane.encoder_trajectory import (
     CraneSettings,
     EncoderOdometry,
@@ -125,7 +125,9 @@ class BatchPoses:
         expect_usable(recording.path, self._stated, self._imu)
         if self._imu is not None:
             self._imu, self._spoiled = without_saturation(self._imu)
-        self._crane, self._timed = None, self._stated and without_delay(self._stated, self._imu)
+        self._delay = find_delay(self._stated, self._imu)
+        late_ns = seconds_to_ns(self._delay.late_s)
+        self._crane, self._timed = None, self._stated and shifted_back(self._stated, late_ns)
         if self._timed is not None:
             self._crane = check_crane(reestimate_noise(self._timed), KnownMotion(None, self._imu)).samples
         if self._crane is None and not self.reads_pictures:
@@ -222,7 +224,7 @@ class BatchPoses:
             shift = recording.rig.timeshift_cam_imu_ns
             known = known_motion(sightings, self._imu, self._rectifier, shift)
             checked = check_crane(reestimate_noise(self._timed), known)
-            crane, doubts = checked.samples, checked.warnings
+            crane, doubts = checked.samples, self._delay.doubts + checked.warnings
         warnings += saturation_sentences(self._spoiled)
         if self.reads_pictures:
             few, most = untied_pictures(sightings, refused)

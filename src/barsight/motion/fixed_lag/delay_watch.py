@@ -38,7 +38,7 @@ class DelayWatch:
     def sentences(self, begin_ns: int) -> tuple[str, ...]:
         """Describe the delay, with times in seconds since `begin_ns`."""
         if not self.late_ns:
-            return ()
+            return self._search.doubts
         off_ms, found_s = round(1e3 * self.late_ns / NS_PER_S), (self.found_ns - begin_ns) / NS_PER_S
         off = f"{abs(off_ms)} ms {'late' if off_ms > 0 else 'early'}"
         return (
