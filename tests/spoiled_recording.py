@@ -23,6 +23,7 @@ class SpoiledRecording:
     stamps: Callable[[list[int]], list[int]] = lambda stamps: stamps
     spoil_crane: Callable[[CraneSamples], CraneSamples] = lambda crane: crane
     spoil_imu: Callable[[ImuSamples], ImuSamples] = lambda imu: imu
+    spoil_pictures: Callable[[int, StereoFrame], StereoFrame] = lambda _, frame: frame
     _new: dict[int, int] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -37,9 +38,10 @@ class SpoiledRecording:
         return FrameIndex(tuple(self._new.values()), ())
 
     def frames(self, wanted: Container[int] | None = None) -> Iterator[StereoFrame | RefusedFrame]:
-        for frame in self.recording.frames():
+        for k, frame in enumerate(self.recording.frames()):
             stamp = self._new.get(frame.stamp_ns)
             if stamp is not None and (wanted is None or stamp in wanted):
+                frame = self.spoil_pictures(k, frame) if isinstance(frame, StereoFrame) else frame
                 yield replace(frame, stamp_ns=stamp)
 
     def imu(self) -> ImuSamples | None:

@@ -21,6 +21,7 @@ from barsight.features.guided_matching import (
 from barsight.motion.frame_to_frame.visual_odometry import StereoOdometry
 from barsight.motion.frontend.relative_pose import (
     RelativePose,
+    check_sides,
     refine_pose,
     rotate_covariance,
     transport_covariance,
@@ -37,6 +38,23 @@ YARD = RectifiedCamera(1250.0, 640.0, 512.0, 0.5, 0.0, 1280, 1024)
 STREET = RectifiedCamera(707.0, 602.0, 183.0, 0.537, 0.0, 1226, 370)
 HALL = RectifiedCamera(457.0, 363.0, 252.0, 0.11, 12.9, 752, 480)
 TURN, MOVE = np.array([0.01, 0.02, -0.005]), np.array([0.1, -0.02, 0.3])
+
+
+@pytest.mark.parametrize("camera", [YARD, STREET])
+def test_right_pictures_that_lie_aside_are_found(camera: RectifiedCamera) -> None:
+    """By a shift of the right camera, which changes far disparities less; a fifth of the points are wild."""
+    rng, rotation = np.random.default_rng(3), Rotation.from_rotvec(TURN).as_matrix()
+    for _ in range(40):
+        z, count = rng.uniform(6, 8, 200), 200
+        pixels = rng.uniform(30, np.array([camera.width, camera.height]) - 30, (count, 2))
+        points = np.column_stack([(pixels - [camera.cx_px, camera.cy_px]) / camera.focal_px, np.ones(count)])
+        points *= z[:, None]
+        noise = rng.normal(0, SETTINGS.pixel_sigma_px, (count, 3))
+        target = project_stereo(points @ rotation.T + MOVE, camera) + noise
+        target[:40] += rng.uniform(-30, 30, (40, 3))
+        late = target + np.array([0, 0, 1]) * (camera.focal_px * 0.02 / z)[:, None]
+        assert check_sides(points, target, rotation, MOVE, camera, SETTINGS) is None
+        assert isinstance(check_sides(points, late, rotation, MOVE, camera, SETTINGS), Failed)
 
 
 def refined(

@@ -16,6 +16,7 @@ from barsight.core.records.trajectory import PosedFrame, Trajectory
 from barsight.core.settings.values import expect_ranges
 from barsight.core.stamps import seconds_to_ns
 from barsight.inertial.model import ORDINARY_NOISE, saturation_sentences, without_saturation
+from barsight.motion.batch.detail import sides_sentence
 from barsight.motion.batch.fusion import FusionSettings
 from barsight.motion.batch.sensor_agreement import refuse_contradictions
 from barsight.motion.crane.encoder_delay import shifted_back
@@ -85,7 +86,7 @@ class FixedLagPoses(ImmediatePoses):
             recording.rig.timeshift_cam_imu_ns, readings, self._level,
         )  # fmt: skip
         self._tracker = Tracker(self._estimator.predict, settings.front_end)
-        self.untied = 0
+        self.untied = self._apart = 0
         self._steps: list[DisparityStep] = []
 
     def place(self, seen: FrameInput) -> PosedFrame | RefusedFrame:
@@ -98,6 +99,7 @@ class FixedLagPoses(ImmediatePoses):
             tracked = RefusedFrame(seen.stamp_ns, pair.reason)
         else:
             tracked = self._tracker.push(pair)
+        self._apart += isinstance(tracked, Sighting) and tracked.sides_apart
         is_tied = isinstance(tracked, Sighting) and (tracked.motion or tracked.again) is not None
         self.untied = 0 if is_tied else self.untied + 1
         if isinstance(tracked, RefusedFrame) and tracked.is_stale:
@@ -134,6 +136,8 @@ class FixedLagPoses(ImmediatePoses):
         warnings += saturation_sentences(spoiled)
         if untied := sum(frame.reason == UNTIED for frame in self.refused):
             doubts += (untied_sentence(untied),)
+        if self._apart:
+            doubts += (sides_sentence(self._apart),)
         return Trajectory(
             "world" if readings.crane is None else "yard", self._estimator.told_later(self.placed),
             tuple(self.refused), sensors, warnings, doubts=doubts,

@@ -15,7 +15,7 @@ from barsight.features.guided_matching import (
 from barsight.features.patch_alignment import PatchPair
 from barsight.features.self_similarity import texture_period_px
 from barsight.features.tracks import Tracks, match_tracks
-from barsight.motion.frontend.relative_pose import ransac, refine_pose
+from barsight.motion.frontend.relative_pose import check_sides, ransac, refine_pose
 from barsight.motion.frontend.settings import FrontEndSettings
 from barsight.motion.frontend.wide_steps import (
     MIN_WIDE_RATIO,
@@ -77,7 +77,8 @@ def motion_consensus(
     start = ransac(points, target[:, :2], camera, settings.rough)
     if isinstance(start, Failed):
         return start
-    step = refine_pose(points, target, *start, camera, settings.rough)
+    failed = check_sides(points, target, *start, camera, settings.rough)
+    step = failed or refine_pose(points, target, *start, camera, settings.rough)
     if isinstance(step, Failed):
         return step
     kept = np.zeros(len(tracks.track), np.bool_)

@@ -12,13 +12,21 @@ from scipy.spatial.transform import Rotation
 
 from barsight.core.arrays import Bool, Float64
 from barsight.core.errors import Failed
+from barsight.core.linalg.robust import mad_sigma
 from barsight.core.pose import skew
 from barsight.core.records.pairs import RectifiedCamera
-from barsight.features.guided_matching import match_across, triangulation_jacobian
+from barsight.features.guided_matching import match_across, project_stereo, triangulation_jacobian
 from barsight.features.matching import match_mutual
 from barsight.features.patch_alignment import align_patches
 from barsight.motion.frontend.relative_pose_kernel import MAX_SIGMAS, step_equations
 from barsight.motion.frontend.stereo_features import FeatureView, OdometrySettings
+
+SIDES_APART = "sides-apart"
+"""Code of a step whose left pictures agree on a motion that the right ones contradict."""
+MIN_AGREE_RATIO, MIN_ASIDE_PX, ASIDE_SPREADS = 0.5, 0.5, 3.0
+"""Minimum share of the points whose left pictures agree; minimum offset of the right ones, px (sound yards show
+0.03, from a car 0.18) and in sigma of a point.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +67,33 @@ def estimate_step(old: FeatureView, new: FeatureView, settings: OdometrySettings
     if isinstance(start, Failed):
         return start
     rotation, translation = start
-    return refine_pose(points, target, rotation, translation, camera, settings)
+    failed = check_sides(points, target, rotation, translation, camera, settings)
+    return failed or refine_pose(points, target, rotation, translation, camera, settings)
+
+
+def check_sides(
+    points: Float64,
+    target: Float64,
+    rotation: Float64,
+    translation: Float64,
+    camera: RectifiedCamera,
+    settings: OdometrySettings,
+) -> Failed | None:
+    """Check that a motion on which the left pictures agree fits the right ones too.
+
+    Cameras that expose at different times while they travel change every depth by the same share, and left
+    pictures alone don't show it: in one of the two pairs all right points lie aside by the same amount.
+    """
+    off = target - project_stereo(points @ rotation.T + translation, camera)
+    agree = np.linalg.norm(off[:, :2], axis=1) < settings.ransac_px
+    aside = (off[:, 2] - off[:, 0])[agree]
+    if agree.mean() < MIN_AGREE_RATIO:
+        return None
+    middle = float(np.median(aside))
+    spread = float(mad_sigma(aside - middle))
+    if abs(middle) < max(MIN_ASIDE_PX, ASIDE_SPREADS * spread):
+        return None
+    return Failed(SIDES_APART, f"the right picture's points lie {middle:.1f} px aside since the frame before")
 
 
 def ransac(

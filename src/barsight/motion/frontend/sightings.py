@@ -37,7 +37,7 @@ class Sighting:
     previous one. again: an earlier sighting that points named in both tie it to. ambiguous: number of points
     rejected because the prediction was too coarse to tell the bars apart. innovation: (6,) turn and way of
     `motion` minus the predicted ones in sigma, None without a prediction. step: of the disparities, None
-    where too few points show it.
+    where too few points show it. sides_apart: only the left picture follows from the one before.
     """
 
     stamp_ns: int
@@ -49,6 +49,7 @@ class Sighting:
     innovation: Float64 | None = None
     again: SeenAgain | None = None
     step: DisparityStep | None = None
+    sides_apart: bool = False
 
 
 @dataclass(frozen=True, eq=False)

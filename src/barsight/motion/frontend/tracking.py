@@ -15,7 +15,7 @@ from barsight.features.orb import describe_upright
 from barsight.features.patch_alignment import PatchPair, patch_pair
 from barsight.features.tracks import Tracks, detect_corners, update_tracks
 from barsight.motion.frontend.motion_consensus import Consensus, motion_consensus, wide_consensus
-from barsight.motion.frontend.relative_pose import RelativePose, estimate_step
+from barsight.motion.frontend.relative_pose import SIDES_APART, RelativePose, estimate_step
 from barsight.motion.frontend.settings import FrontEndSettings
 from barsight.motion.frontend.sightings import SeenAgain, Sighting, disparity_step, normalised_innovation
 from barsight.motion.frontend.stereo_features import FeatureView, match_coarsely
@@ -78,8 +78,9 @@ class Tracker:
         prediction = self._predictor(state.stamp_ns, pair.stamp_ns) if state else None
         if state is not None and (repeated := _repeated(state, pair, prediction)):
             return RefusedFrame(pair.stamp_ns, repeated_sentence(repeated), is_stale=True)
-        result = _see(state, patches, prediction, settings)
+        result, apart = _see(state, patches, prediction, settings), False
         if isinstance(result, Failed) and state is not None:
+            apart = result.code == SIDES_APART
             anew = _see(replace(state, tracks=None), patches, prediction, settings)
             if not isinstance(anew, Failed):
                 result = anew
@@ -88,6 +89,7 @@ class Tracker:
         if isinstance(result, Failed):
             return RefusedFrame(pair.stamp_ns, result.reason)
         self._state, sighting = result
+        sighting = replace(sighting, sides_apart=apart)
         return sighting if prediction is not None else self._tied(sighting, patches)
 
     def _lose(self, state: _State) -> None:
@@ -157,7 +159,7 @@ def _see(
         found = None if prediction is None else motion_consensus(tracks, pair, prediction, settings)
         if found is None or isinstance(found, Failed):
             found, view = _by_pictures(state, tracks, pair, settings)
-            if isinstance(found, Failed) and prediction is None:
+            if isinstance(found, Failed) and prediction is None and found.code != SIDES_APART:
                 found = _by_wide_step(tracks, pair, settings)
             if isinstance(found, Failed):
                 return found
