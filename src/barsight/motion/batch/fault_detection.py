@@ -202,11 +202,8 @@ def frozen_stretches(crane: CraneSamples) -> list[Stretch]:
     A crane that reverses gives equal readings too, above all with coarse encoders, but stays near them. One
     axis often stops while another travels on.
     """
-    time, min_m = (crane.stamp_ns - crane.stamp_ns[:1]) / NS_PER_S, min_way_m(crane)
     return merge_stretches(
-        (first, last, axes)
-        for axes in ((0, 1, 2), (0,), (1,), (2,))
-        for first, last in _frozen(crane.position_m, axes, time, min_m)
+        (first, last, axes) for axes in ((0, 1, 2), (0,), (1,), (2,)) for first, last in _frozen(crane, axes)
     )
 
 
@@ -224,21 +221,23 @@ def merge_stretches(stretches: Iterable[Stretch]) -> list[Stretch]:
 
 def frozen_now(crane: CraneSamples) -> Bool:
     """Check which encoders (3,) stand frozen at the last reading: each by itself, else all together."""
-    time, min_m = (crane.stamp_ns - crane.stamp_ns[:1]) / NS_PER_S, min_way_m(crane)
-    last = len(time) - 1
+    last = len(crane.stamp_ns) - 1
 
     def is_frozen(*axes: int) -> bool:
-        return any(end == last for _, end in _frozen(crane.position_m, axes, time, min_m))
+        return any(end == last for _, end in _frozen(crane, axes))
 
     each = np.array([is_frozen(axis) for axis in range(3)])
     return each if each.any() else np.full(3, is_frozen(0, 1, 2))
 
 
-def _frozen(position_m: Float64, axes: tuple[int, ...], time: Float64, min_m: float) -> list[tuple[int, int]]:
-    """Find stretches (first, last) of equal readings (N, 3) of encoders `axes` that must have moved by
-    `min_m`: all of them, or one.
+def _frozen(crane: CraneSamples, axes: tuple[int, ...]) -> list[tuple[int, int]]:
+    """Find stretches (first, last) of equal readings of encoders `axes` that must have moved: all of them, or
+    one.
     """
-    place = position_m[:, list(axes)]
+    time, min_m = (crane.stamp_ns - crane.stamp_ns[:1]) / NS_PER_S, min_way_m(crane)
+    # The difference of two rounded readings of each is off by up to a step.
+    unsure_m = max(SPEED_SIGMAS * min_m / HELD_SIGMAS, len(axes) ** 0.5 * crane.resolution_m)
+    place = crane.position_m[:, list(axes)]
     braking = MAX_ALONE_MPS2[axes[0]] if len(axes) == 1 else MAX_BRAKING_MPS2
     same = np.r_[False, (np.diff(place, axis=0) == 0).all(axis=1), False]
     edges = np.flatnonzero(np.diff(same.astype(int)))
@@ -250,15 +249,15 @@ def _frozen(position_m: Float64, axes: tuple[int, ...], time: Float64, min_m: fl
         # Two of the three may be wild.
         away = float(np.linalg.norm(after - place[last], axis=1).min()) if len(after) == 3 else 0.0
         away -= braking * float(time[min(last + 2, len(time) - 1)] - time[last]) ** 2 / 2
-        speed = _speed_before(place, time, int(first), min_m / HELD_SIGMAS)
+        speed = _speed_before(place, time, int(first), unsure_m)
         braked = min(float(time[last] - time[first]), speed / braking)
         if max(away, (speed - braking * braked / 2) * braked) > min_m:
             found.append((int(first), int(last)))
     return found
 
 
-def _speed_before(place: Float64, time: Float64, first: int, sigma_m: float) -> float:
-    """Extrapolate the speed (m/s) at a reading from the readings before it, less what their sigma may add.
+def _speed_before(place: Float64, time: Float64, first: int, unsure_m: float) -> float:
+    """Extrapolate the speed (m/s) at a reading from the readings before it, less what their error may add.
 
     It continues the medians of the earlier and the later rates over half a window, since a braking crane is
     slower than it was, and is at most that of the last steps.
@@ -276,5 +275,5 @@ def _speed_before(place: Float64, time: Float64, first: int, sigma_m: float) -> 
     # The third, since two may be wild.
     last = np.array([min(first - 1, near), min(first - 3, near)])
     steps = np.linalg.norm(place[first] - place[last], axis=1) / (time[first] - time[last])
-    unsure = SPEED_SIGMAS * sigma_m / float(np.median(time[new] - time[old]))
+    unsure = unsure_m / float(np.median(time[new] - time[old]))
     return max(0.0, min(speed, float(steps.min())) - unsure)
