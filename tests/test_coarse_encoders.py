@@ -46,7 +46,7 @@ def test_coarse_encoders_froze_nothing(stated: bool) -> None:
 
 
 def test_counts_of_100_mm_froze_nothing_and_a_freeze_is_found() -> None:
-    """The speed before 20 of 60 standstills of one count was taken as known to 3 sigma of a reading, though two
+    """The speed before 20 of 60 standstills of a count was taken as known to 3 sigma of a reading, though two
     of them may be a count off.
     """
     for seed in (20001, 20003, 20004, 20007, 20010, 20013):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,10 +15,12 @@ from barsight.core.records.trajectory import Trajectory
 from barsight.evaluation.trajectory_error import Drift, trajectory_drift
 from barsight.inertial.model import ORDINARY_NOISE
 from barsight.motion.batch import fusion
+from barsight.motion.batch.camera_offset import camera_doubts
 from barsight.motion.crane.encoder_delay import find_delay
 from barsight.motion.fixed_lag import estimator as live
 from barsight.motion.fixed_lag.delay_watch import DelayWatch
 from barsight.motion.fixed_lag.sensor_buffer import SensorBuffer
+from barsight.motion.frontend.sightings import Sighting
 from barsight.recording.formats.ground_truth import GroundTruth
 from drawn_cranes import drawn_crane, drawn_senses
 from motion_recordings import MemoryRecording, tell_sightings
@@ -28,14 +30,14 @@ from test_motion_live import ESTIMATORS
 
 def drawn(
     name: str, seed: int, late_s: float, patch: pytest.MonkeyPatch, factor: float = 1.0,
-    spoil: Callable[[CraneSamples], CraneSamples] = lambda crane: crane,
+    spoil: Callable[[CraneSamples], CraneSamples] = lambda crane: crane, cameras_late_s: float = 0.0,
 ) -> tuple[Trajectory, Drift]:  # fmt: skip
     """A drawn crane that oscillates, its encoders stamped `late_s` late and its bridge read `factor` times as
     far, by all sensors.
     """
     crane = drawn_crane(seed)
     senses = drawn_senses(crane, seed, points=600)
-    seen = senses.sightings[:40]
+    seen = cameras_late(senses.sightings[:40], cameras_late_s)
     tell_sightings(patch, {"fused": fusion, "live": live}[name], seen)
     read = crane.readings
     place = read.position_m[:1] + (read.position_m - read.position_m[:1]) * [factor, 1.0, 1.0]
@@ -145,6 +147,35 @@ def test_stamps_of_measurement_are_not_doubted(fault: dict[str, float]) -> None:
         imu = drawn_senses(crane, seed).imu
         assert not find_delay(late(crane.readings, 0.2), imu).doubts
         assert not find_delay(arrived(crane.readings, seed, 0.0, 0.02), imu).doubts
+
+
+def cameras_late(seen: Sequence[Sighting], late_s: float) -> tuple[Sighting, ...]:
+    return tuple(replace(one, stamp_ns=one.stamp_ns + round(1e9 * late_s)) for one in seen)
+
+
+@pytest.mark.parametrize("name", ["fused", "live"])
+def test_cameras_on_another_clock_are_doubted(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Live said nothing at 22 to 28 mm off, with an NEES of 5 to 7."""
+    found, _ = drawn(name, 20003, 0.0, monkeypatch, cameras_late_s=0.06)
+    (told,) = [doubt for doubt in found.doubts if "timeshift_cam_imu" in doubt]
+    late_ms = int(told.split(" ms late")[0].split()[-1])
+    assert 45 < late_ms < 75
+
+
+@pytest.mark.parametrize("crane_late_s", [0.0, 0.15])
+def test_cameras_are_doubted_where_they_are_late_alone(crane_late_s: float) -> None:
+    told: dict[float, int] = {0.0: 0, 0.06: 0, -0.1: 0}
+    for seed in range(20060, 20072):
+        crane = drawn_crane(seed)
+        senses = drawn_senses(crane, seed)
+        read, rectifier = late(crane.readings, crane_late_s), Rectifier(senses.rig)
+        search = find_delay(read, senses.imu)
+        for late_s in told:
+            seen = cameras_late(senses.sightings[:40], late_s)
+            told[late_s] += bool(camera_doubts(seen, rectifier, 0, read, search))
+            assert camera_doubts(seen[:5], rectifier, 0, read, search) == ()
+            assert camera_doubts(seen, rectifier, 0, read, find_delay(read, None)) == ()
+    assert told[0.0] == 0 and told[0.06] >= 8 and told[-0.1] >= 10
 
 
 def in_ns(seconds: Float64) -> Int64:

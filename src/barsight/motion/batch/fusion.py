@@ -18,6 +18,7 @@ from barsight.core.records.trajectory import PosedFrame, Trajectory
 from barsight.core.settings.values import NOT_NEGATIVE, OVER_0, expect_ranges
 from barsight.core.stamps import seconds_to_ns
 from barsight.inertial.model import ORDINARY_NOISE, saturation_sentences, without_saturation
+from barsight.motion.batch.camera_offset import camera_doubts
 from barsight.motion.batch.detail import joint_sentences, jumps_alone, select_detail, untied_pictures
 from barsight.motion.batch.fault_detection import check_crane, frames_off
 from barsight.motion.batch.sensor_agreement import refuse_contradictions
@@ -225,6 +226,7 @@ class BatchPoses:
             known = known_motion(sightings, self._imu, self._rectifier, shift)
             checked = check_crane(reestimate_noise(self._timed), known)
             crane, doubts = checked.samples, self._delay.doubts + checked.warnings
+            doubts += camera_doubts(sightings, self._rectifier, shift, self._stated, self._delay)
         warnings += saturation_sentences(self._spoiled)
         if self.reads_pictures:
             few, most = untied_pictures(sightings, refused)

@@ -8,7 +8,7 @@ and biases leave open.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from barsight.core.records.sensor_samples import CraneSamples, ImuSamples
 from barsight.core.stamps import NS_PER_S, seconds_to_ns
 from barsight.motion.crane.known_motion import KnownMotion
 
-LATE_S = np.arange(-30, 31) * 0.02
+LATE_S: Float64 = np.array(np.arange(-30, 31) * 0.02, np.float64)
 """Delays that are tried, s."""
 PART_S, MAX_PARTS = 4.0, 15
 """Duration, s, of a part of the readings, and the maximum number of parts."""
@@ -34,6 +34,34 @@ MAX_SCATTER_M, MAX_SCATTER_SIGMAS = 0.0075, 1.5
 """Maximum RMS, m and in sigma of a reading, that the best delay leaves in half of the parts or more. It
 leaves 4.2 mm or less with sound cranes; from 8.5 mm on places are up to 40 mm off.
 """
+
+
+INDEPENDENT_S = 0.1
+"""Interval, s, from which what a delay leaves in the readings is independent."""
+
+
+@dataclass(frozen=True)
+class FittedDelay:
+    """late_s: the delay that fits best; sigma_s: its sigma."""
+
+    late_s: float
+    sigma_s: float
+
+
+def fit_delay(late_s: Float64, squares: Float64, count: int) -> FittedDelay | None:
+    """Fit a parabola to the least of the mean squares (L,) of `count` residuals with evenly spaced delays
+    (L,); None where the least is at an end.
+    """
+    best = int(squares.argmin())
+    if not 0 < best < len(squares) - 1:
+        return None
+    before, least, after = squares[best - 1 : best + 2].tolist()
+    bend, slope, step = before - 2 * least + after, (after - before) / 2, float(late_s[1] - late_s[0])
+    if not bend > 0:
+        return None
+    least -= slope**2 / (2 * bend)
+    sigma = step * (2 * max(least, 0.0) / (bend * count)) ** 0.5
+    return FittedDelay(float(late_s[best]) - step * slope / bend, sigma)
 
 
 class DelaySearch:
@@ -86,6 +114,14 @@ class DelaySearch:
         others = min(float(mean[len(LATE_S) // 2]), self._alone / self._count)
         clear = 0 < best < len(LATE_S) - 1 and mean[best] < min(others / CLEARLY_WORSE, MAX_LEFT_M**2)
         return late_s if clear and abs(late_s) > MIN_LATE_S else 0.0
+
+    @property
+    def fitted(self) -> FittedDelay | None:
+        """Return the delay that fits best, of any size; None where none is clearly better than no motion."""
+        mean = self._squares / max(self._count, 1)
+        if not self._count or mean.min() > self._alone / self._count / CLEARLY_WORSE:
+            return None
+        return fit_delay(LATE_S, mean, round(self._count * PART_S / INDEPENDENT_S))
 
     @property
     def doubts(self) -> tuple[str, ...]:

@@ -12,12 +12,12 @@ STEP_S = 2.0
 
 class DelayWatch:
     """Delay of the encoders' stamps so far. late_ns: 0 until one is found, at `found_ns`; from then on it is
-    taken off.
+    taken off. search: what has been examined.
     """
 
     def __init__(self) -> None:
         self.late_ns = 0
-        self._search = DelaySearch()
+        self.search = DelaySearch()
         self._next_ns, self.found_ns = 0, 0
 
     def check(self, now: SensorBuffer) -> bool:
@@ -29,16 +29,16 @@ class DelayWatch:
         last_ns = min(int(crane.stamp_ns[-1]), int(imu.stamp_ns[-1]) - spare)
         begin = max(self._next_ns, int(crane.stamp_ns[0]), int(imu.stamp_ns[0]) + spare)
         while begin + part <= last_ns:
-            self._search.add(crane, imu, begin)
+            self.search.add(crane, imu, begin)
             begin = self._next_ns = begin + seconds_to_ns(STEP_S)
-        self.late_ns = seconds_to_ns(self._search.late_s)
+        self.late_ns = seconds_to_ns(self.search.late_s)
         self.found_ns = max(int(crane.stamp_ns[-1]), int(imu.stamp_ns[-1]))
         return self.late_ns != 0
 
     def sentences(self, begin_ns: int) -> tuple[str, ...]:
         """Describe the delay, with times in seconds since `begin_ns`."""
         if not self.late_ns:
-            return self._search.doubts
+            return self.search.doubts
         off_ms, found_s = round(1e3 * self.late_ns / NS_PER_S), (self.found_ns - begin_ns) / NS_PER_S
         off = f"{abs(off_ms)} ms {'late' if off_ms > 0 else 'early'}"
         return (

@@ -16,6 +16,7 @@ from barsight.core.records.trajectory import PosedFrame, Trajectory
 from barsight.core.settings.values import expect_ranges
 from barsight.core.stamps import seconds_to_ns
 from barsight.inertial.model import ORDINARY_NOISE, saturation_sentences, without_saturation
+from barsight.motion.batch.camera_offset import camera_doubts
 from barsight.motion.batch.detail import sides_sentence
 from barsight.motion.batch.fusion import FusionSettings
 from barsight.motion.batch.sensor_agreement import refuse_contradictions
@@ -131,6 +132,10 @@ class FixedLagPoses(ImmediatePoses):
         names = {"crane": readings.crane, "imu": readings.imu, "stereo": self.reads_pictures or None}
         sensors = tuple(name for name, used in names.items() if used is not None)
         doubts, warnings = self._estimator.encoder_faults()
+        doubts += camera_doubts(
+            self._estimator.motions, self._rectifier, self._recording.rig.timeshift_cam_imu_ns,
+            readings.crane, self._estimator.delay.search,
+        )  # fmt: skip
         if self._level is not None:
             warnings += self._level.warnings
         warnings += saturation_sentences(spoiled)

@@ -24,8 +24,8 @@ from barsight.motion.frontend.stereo_features import FeatureView, OdometrySettin
 SIDES_APART = "sides-apart"
 """Code of a step whose left pictures agree on a motion that the right ones contradict."""
 MIN_AGREE_RATIO, MIN_ASIDE_PX, ASIDE_SPREADS = 0.5, 0.5, 3.0
-"""Minimum share of the points whose left pictures agree; minimum offset of the right ones, px (sound yards show
-0.03, from a car 0.18) and in sigma of a point.
+"""Minimum share of the points whose left pictures agree; minimum offset of the right ones, px (sound yards
+show 0.03, from a car 0.18) and in sigma of a point.
 """
 
 
