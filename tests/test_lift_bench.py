@@ -28,9 +28,14 @@ from barsight.cli.main import run
 from barsight.core.errors import ConfigError
 from barsight.simulation.sensors import heights
 from barsight.simulation.simulate import LaidYard, World
-from barsight.simulation.worlds.yards import draw_yard
+from barsight.simulation.worlds.packing import tag
+from barsight.simulation.worlds.solids import SolidYard, cylinder
+from barsight.simulation.worlds.yards import DrawnYard, draw_yard
 from barsight.yard.lift_settings import LiftSettings
+from barsight.yard.lifting.clearance import FacePlane
+from barsight.yard.lifting.labels import find_label
 from barsight.yard.magnet.description import example_magnet, load_magnet
+from barsight.yard.magnet.footprint import Placement
 
 
 @pytest.mark.parametrize("seed", [5, 7])
@@ -66,6 +71,20 @@ def test_the_bench_tells_what_was_judged(tmp_path: Path) -> None:
         assert verdict.is_fine and verdict.load == (one.bundle,) and one.offered == (verdict.load in offered)
     table = bench_table(JudgedBench.of(1, judged, bundles))
     assert table.row_count == 11
+
+
+def test_a_label_that_would_hold_the_faces_off_shows_in_the_photo() -> None:
+    cross = np.array([(-0.09, 0.045), (0.0, 0.045), (0.09, 0.045)])
+    along = np.array([0.0, 1.0, 0.0])
+    bars = [cylinder("bar", np.array([x, 0.0, z]), along, 0.045, 5.7, 0) for x, z in cross]
+    label = tag(cross[1:2], 0.045, 0.7 * along, np.eye(3), 0)
+    found = []
+    for solids in (bars, [*bars, label]):
+        world = DrawnYard(0, "row", SolidYard(tuple(solids)), (), (0.4, 6.0))
+        height_map = noisy_world(world, LiftSettings()).scene.heights
+        place, plane = Placement(0.0, 0.0, 0.0), FacePlane(0.09, 0.0, 0.0, 0.002)
+        found.append(find_label(place, height_map, load_magnet(None), plane))
+    assert found[0] is None and found[1] == pytest.approx((0.7, 0.0), abs=0.05)
 
 
 def test_placements_for_danger_say_nothing_of_what_is_refused(tmp_path: Path) -> None:

@@ -10,16 +10,19 @@ from scipy import ndimage
 
 from barsight.benchmarks.lift_judge.envelopes import Envelope, envelope
 from barsight.benchmarks.lift_judge.magnet import JudgedMagnet
+from barsight.core.arrays import UInt8
 from barsight.core.records.heights import HeightSource
 from barsight.result_folder import read_heights, read_summary
 from barsight.simulation.passes import simulate_passes
+from barsight.simulation.render import FLOOR_ALBEDO
 from barsight.simulation.scene import Scene
 from barsight.simulation.settings.recording import SimulationSettings
 from barsight.simulation.settings.rig import CameraSettings
 from barsight.simulation.settings.travel import PassesSettings
 from barsight.simulation.simulate import LaidYard, simulate
 from barsight.simulation.worlds.conditions import draw_conditions
-from barsight.simulation.worlds.surfaces import draw_finishes, scene_of
+from barsight.simulation.worlds.solids import NOTHING
+from barsight.simulation.worlds.surfaces import ALBEDO, draw_finishes, scene_of
 from barsight.simulation.worlds.yards import DrawnYard, draw_yard
 from barsight.yard.bundles.detection import find_bundles
 from barsight.yard.bundles.fitting.settings import BundleSettings
@@ -42,6 +45,8 @@ OVER_MAGNET_M = 0.3
 CELL_M, MARGIN_M = 0.01, 0.6
 WHITE_M, ALIKE_M, ALIKE_CELLS = 0.001, 0.0015, 3.0
 """Noise of `noisy_world`: sigma of the white noise, m; sigma, m, and smoothing, cells, of the other."""
+WHITE_LEVEL = 300.0
+"""Gray level of an albedo of 1 in the photo of `noisy_world`."""
 
 
 def judged_yard(seed: int, magnet: JudgedMagnet, kind: str | None = None) -> DrawnYard:
@@ -103,7 +108,8 @@ def exact_heights(world: DrawnYard) -> Envelope:
 
 def noisy_world(world: DrawnYard, settings: LiftSettings) -> MappedWorld:
     """Add noise to the exact height of every cell and detect the bundles in the result. Every cell is
-    seen, nothing is smoothed, and no travel is known.
+    seen, nothing is smoothed, and no travel is known. Lifts are chosen with the yard's photo too: nothing
+    else shows labels.
     """
     rng = np.random.default_rng((31, world.seed))
     drawn = exact_heights(world)
@@ -113,7 +119,15 @@ def noisy_world(world: DrawnYard, settings: LiftSettings) -> MappedWorld:
     sigma = np.full_like(z, np.hypot(WHITE_M, ALIKE_M))
     vision = np.full(z.shape, HeightSource.VISION, np.uint8)
     heights = HeightMap(drawn.x0, drawn.y0, CELL_M, z, sigma, np.full_like(z, 6.0), vision)
-    return map_world(heights, find_bundles(heights, BundleSettings()), (), None, 0, settings)
+    bundles = find_bundles(heights, BundleSettings())
+    return map_world(replace(heights, gray=_photo(world, drawn)), bundles, (), None, 0, settings)
+
+
+def _photo(world: DrawnYard, drawn: Envelope) -> UInt8:
+    """Draw the photo (rows, columns) of a yard: each surface has the level of its kind's albedo."""
+    albedo = np.array([ALBEDO[solid.part] for solid in world.yard.solids])[drawn.top.T]
+    albedo[drawn.top.T == NOTHING] = FLOOR_ALBEDO
+    return np.asarray((WHITE_LEVEL * albedo).round(), np.uint8)
 
 
 def map_world(
