@@ -1,4 +1,4 @@
-"""Define array aliases, shape checks and the compile decorator that every kernel uses."""
+"""Define array aliases, shape checks, small sums, and the compile decorator that every kernel uses."""
 
 from __future__ import annotations
 
@@ -101,6 +101,11 @@ def rows_by_number(numbers: NDArray[Any]) -> dict[int, Int64]:
     order = np.argsort(numbers, kind="stable")
     found, first = np.unique(numbers[order], return_index=True)
     return {int(n): rows for n, rows in zip(found, np.split(order, first[1:]), strict=True)}
+
+
+def rms(vectors: Float64) -> float:
+    """Compute the root mean square of the lengths of vectors (N, K)."""
+    return float(np.sqrt((vectors**2).sum(axis=1).mean()))
 
 
 def frozen(array: NDArray[Any]) -> NDArray[Any]:

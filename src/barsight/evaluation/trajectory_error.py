@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from barsight.core.arrays import Bool, Float64, Int64
+from barsight.core.arrays import Bool, Float64, Int64, rms
 from barsight.core.pose import nearest_rotation
 from barsight.core.records.trajectory import PosedFrame, Trajectory
 from barsight.core.stamps import NS_PER_S, interpolate_at
@@ -140,11 +140,6 @@ def align_umeyama(place: Float64, target: Float64) -> Float64:
     centred, wanted = place - place.mean(axis=0), target - target.mean(axis=0)
     aligned: Float64 = centred @ nearest_rotation(wanted.T @ centred).T + target.mean(axis=0)
     return aligned
-
-
-def rms(vectors: Float64) -> float:
-    """Compute the root mean square of the lengths of vectors (N, 3)."""
-    return float(np.sqrt((vectors**2).sum(axis=1).mean()))
 
 
 def _nees(error: Float64, covariance: Float64) -> float:

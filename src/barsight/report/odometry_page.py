@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 import barsight
-from barsight.core.arrays import Float64, Int64
+from barsight.core.arrays import Float64, Int64, rms
 from barsight.core.errors import Failed
 from barsight.core.json_values import json_value
 from barsight.core.motion_detail import NormalisedResiduals
 from barsight.core.records.trajectory import Trajectory
 from barsight.core.stamps import NS_PER_S
-from barsight.evaluation.trajectory_error import Drift, FrameErrors, rms
+from barsight.evaluation.trajectory_error import Drift, FrameErrors
 from barsight.motion.frontend.matching_example import MatchingExample
 from barsight.report.match_images import draw_matches
 from barsight.report.page import KeyFigure, format_number, write_summary_page

@@ -12,13 +12,12 @@ from rich.table import Table
 from barsight.calibration.geometry.camera import Camera
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.calibration.geometry.rig import StereoRig
-from barsight.core.arrays import Bool, Float64, Int64
+from barsight.core.arrays import Bool, Float64, Int64, rms
 from barsight.core.errors import ConfigError
 from barsight.core.memory import peak_memory_mib, resident_bytes
 from barsight.core.pose import Pose
 from barsight.core.records.sensor_samples import CraneSamples, ImuSamples
 from barsight.core.records.trajectory import PosedFrame
-from barsight.evaluation.trajectory_error import rms
 from barsight.features.guided_matching import project_stereo
 from barsight.inertial.model import ORDINARY_NOISE
 from barsight.motion.batch.fusion import FusionSettings

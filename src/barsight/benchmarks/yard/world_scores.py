@@ -15,12 +15,13 @@ from rich.table import Table
 
 from barsight.benchmarks.provenance import Provenance
 from barsight.benchmarks.yard.bundle_scores import TrueBundle, read_true_bundles, score_bundles
+from barsight.core.arrays import rms
 from barsight.core.linalg.robust import SIGMAS_95
 from barsight.core.pose import Pose
 from barsight.core.records.trajectory import PosedFrame, Trajectory
 from barsight.core.stamps import seconds_to_ns
 from barsight.evaluation.score import score_folder
-from barsight.evaluation.trajectory_error import frame_errors, rms
+from barsight.evaluation.trajectory_error import frame_errors
 from barsight.recording.formats.ground_truth import read_ground_truth
 from barsight.result_folder import read_summary
 from barsight.yard.inventory.bundle_file import read_bundles

@@ -38,7 +38,7 @@ from barsight.calibration.stereo.outlier_removal import (
     drop_repeats,
     drop_small,
 )
-from barsight.core.arrays import Float64
+from barsight.core.arrays import Float64, rms
 from barsight.core.errors import CalibrationError, Failed
 from barsight.core.pose import Pose
 
@@ -156,11 +156,6 @@ def calibrate_stereo(
         _expect_views(kept, source, removed)
     removed += corner_notes(before, kept)
     return _finish(kept, board, lens, sizes, source, observed, solved, removed, (alone[0], alone[1]))
-
-
-def rms(residuals: Float64) -> float:
-    """Compute the RMS length of residuals (N, 2)."""
-    return float(np.sqrt((residuals**2).sum(axis=1).mean()))
 
 
 def parameter_names(lens: Lens) -> tuple[str, ...]:

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 import barsight
-from barsight.calibration.stereo.calibration import StereoCalibration, rms
+from barsight.calibration.stereo.calibration import StereoCalibration
 from barsight.calibration.stereo.outlier_removal import view_rms
 from barsight.calibration.stereo.projection_uncertainty import picture_grid
 from barsight.calibration.stereo.verdict import Assessment, tilts
-from barsight.core.arrays import Float64
+from barsight.core.arrays import Float64, rms
 from barsight.core.errors import Failed
 from barsight.core.json_values import json_value
 from barsight.report.page import KeyFigure, format_number, write_summary_page
