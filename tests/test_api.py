@@ -7,13 +7,14 @@ import pickle
 import subprocess
 import sys
 from collections.abc import Callable
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 import pytest
 
 import barsight as bs
+from barsight.calibration.files.rig_file import read_covariance
 from barsight.cli.main import run
 from barsight.core.records.pairs import StereoFrame
 from barsight.core.settings.values import build_settings
@@ -23,6 +24,7 @@ from barsight.result_folder import seal_map
 from barsight.yard.events import YardEvent, kept_events, write_events
 from barsight.yard.lift_settings import LiftSettings
 from barsight.yard.lifting.lift_file import read_lifts
+from calibration_views import BOARD, SIZE, simulated
 from cli_runs import FAST
 from result_folders import summary, write_folder
 
@@ -172,6 +174,7 @@ FLAT = np.zeros((40, 60), np.uint8)
             "range_px and max_disparity_px are given; leave one of them out",
         ),
         (lambda: bs.disparity(FLAT, FLAT, rig=3), "rig is 3; give a path"),
+        (lambda: bs.disparity(PurePosixPath("none.png"), FLAT), "none.png: no such file"),
         (lambda: bs.disparity(None, FLAT), "left: has the shape (); "),
         (lambda: bs.disparity(FLAT, np.zeros(0, np.uint8)), "right: has the shape (0,); "),
         (lambda: bs.open_recording(None), "path is None; give a path"),
@@ -240,6 +243,20 @@ def test_a_disparity_of_two_arrays() -> None:
         bs.disparity(scene / 255, same[0])
 
 
+def test_a_calibration_that_must_be_redone_says_so_and_is_saved_with_its_covariance(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The rig alone has no sigma: maps stated the default's, a quarter of it."""
+    found = simulated(1, count=4), (SIZE, SIZE), []
+    monkeypatch.setattr("barsight.api.views_from_pictures", lambda *_: found)
+    with pytest.warns(UserWarning, match=r"redo the calibration, don't measure with it: views .* 4 \(redo\)"):
+        calibration = bs.calibrate_stereo(tmp_path, str(BOARD))
+    calibration.save(tmp_path / "rig.yaml")
+    names, covariance = read_covariance(tmp_path / "rig.yaml") or ((), np.empty(0))
+    assert names == calibration.parameter_names
+    np.testing.assert_array_equal(covariance, calibration.covariance)
+
+
 def test_without_xarray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     one = np.zeros((2, 3), np.float32)
     heights = bs.HeightMap(1.0, 2.0, 0.5, one, one, one, one.astype(np.uint8))
@@ -263,6 +280,7 @@ for home, names in (
         delattr(home, name)
 from pathlib import Path
 import barsight as bs
+from barsight.calibration.files.rig_file import read_covariance
 from barsight.cli.main import main
 recording, result = sys.argv[1:]
 opened = bs.open_recording(recording)

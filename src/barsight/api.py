@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -13,6 +14,7 @@ from barsight.calibration.geometry.projection import Lens
 from barsight.calibration.geometry.rig import StereoRig
 from barsight.calibration.stereo.calibration import StereoCalibration
 from barsight.calibration.stereo.calibration import calibrate_stereo as solve_stereo
+from barsight.calibration.stereo.verdict import MAX_RANGE_M, MIN_RANGE_M, Verdict, assess, summary_sentence
 from barsight.core.arrays import UInt8
 from barsight.core.errors import ConfigError
 from barsight.core.records.disparity import Disparity
@@ -68,8 +70,9 @@ def measure(
 def _paths(recording: Any) -> list[Path]:
     """Return the paths of one or several passes. Raises ConfigError for anything else."""
     is_one = isinstance(recording, (str, bytes, os.PathLike)) or not isinstance(recording, Iterable)
+    passes = (recording,) if is_one else tuple(recording)
     try:
-        return list(checked_value((recording,) if is_one else tuple(recording), tuple[Path, ...], "recording"))
+        return list(checked_value(passes, tuple[Path, ...], "recording"))
     except ConfigError as error:
         raise ConfigError(f"{error}, or a list of paths, or push packets to a Session") from None
 
@@ -89,8 +92,8 @@ def disparity(
 ) -> Disparity:
     """Match two pictures: the left one's disparity and its sigma, px, NaN without a match.
 
-    left, right: files or (H, W) uint8, rectified unless a rig is given. range_px: first and last candidate;
-    determined from the pictures if None. settings: fields of `StereoSettings`.
+    left, right: files or (H, W) uint8, rectified unless a rig is given. range_px: first candidate, and the
+    end, which isn't one; determined from the pictures if None. settings: fields of `StereoSettings`.
     """
     if range_px is not None:
         low, high = checked_value(range_px, tuple[int, int], "range_px")
@@ -98,21 +101,30 @@ def disparity(
             raise ConfigError(f"range_px and {min(twice)} are given; leave one of them out")
         settings |= {"min_disparity_px": low, "max_disparity_px": high}
     chosen = build_settings(settings, StereoSettings)
-    first, second = (Path(one) if isinstance(one, str) else one for one in (left, right))
+    first, second = (Path(one) if isinstance(one, (str, os.PathLike)) else one for one in (left, right))
     by = rig if isinstance(rig, StereoRig) else checked_value(rig, Path | None, "rig")
     return match_pictures(first, second, chosen, by)[1]
 
 
 def calibrate_stereo(
-    pictures: Path | str, board: str, *, lens: str = Lens.RADTAN4.value, max_views: int = 150
-) -> StereoCalibration:
-    """Calibrate two cameras from pictures of a board seen by both; `.rig` is the input for measuring.
+    pictures: Path | str, board: str, *, lens: str = Lens.RADTAN4.value, range_m: float = 7.0,
+    max_views: int = 150,
+) -> StereoCalibration:  # fmt: skip
+    """Calibrate two cameras from pictures of a board seen by both; `.rig` is the input for measuring, and
+    `save` writes the file that also states its uncertainty.
 
-    pictures, board, lens: as for `barsight calibrate stereo`.
+    The arguments are those of `barsight calibrate stereo`. Warns if the verdict is redo.
     """
     expect_choice("lens", lens, tuple(one.value for one in Lens))
     target, path = parse_board(checked_value(board, str, "board")), checked_value(pictures, Path, "pictures")
     if checked_value(max_views, int, "max_views") < MIN_VIEWS:
         raise ConfigError(f"max_views is {max_views}; give {MIN_VIEWS} or more")
+    if not MIN_RANGE_M <= checked_value(range_m, float, "range_m") <= MAX_RANGE_M:
+        raise ConfigError(f"range_m is {range_m:g}; give the working distance in metres")
     views, sizes, left_out = views_from_pictures(path, target, max_views, ignore_progress)
-    return solve_stereo(views, target, Lens(lens), sizes, path, left_out)
+    calibration = solve_stereo(views, target, Lens(lens), sizes, path, left_out)
+    judged = assess(calibration, range_m)
+    if judged.verdict is Verdict.REDO:
+        why = summary_sentence(judged.lines)
+        warnings.warn(f"{path}: redo the calibration, don't measure with it: {why}", stacklevel=2)
+    return calibration

@@ -17,6 +17,7 @@ import numpy as np
 from barsight.calibration.boards.board import Board
 from barsight.calibration.boards.board_views import BoardView, Corners, Removed
 from barsight.calibration.boards.board_warp import BoardShape, board_shape, shape_basis
+from barsight.calibration.files.rig_file import write_rig_file
 from barsight.calibration.geometry.camera import Camera
 from barsight.calibration.geometry.projection import Lens
 from barsight.calibration.geometry.rig import StereoRig
@@ -86,6 +87,10 @@ class StereoCalibration:
         """Return the standard deviation of the baseline."""
         direction = self.state.translation_m / np.linalg.norm(self.state.translation_m)
         return float(np.sqrt(direction @ self.covariance[-3:, -3:] @ direction))
+
+    def save(self, path: Path | str) -> None:
+        """Write the rig file, which states the covariance too: a map's sigma then contains it."""
+        write_rig_file(Path(path), self.rig, rig_file_section(self))
 
 
 def rig_file_section(calibration: StereoCalibration) -> dict[str, object]:

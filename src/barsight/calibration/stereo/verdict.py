@@ -27,6 +27,8 @@ from barsight.core.errors import Failed, MeasurementError
 RANGES_M = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 10.0, 12.0)
 CROSS_RANGES_M = (2.0, 4.0, 7.0, 12.0)
 FEWEST_TILT_DEG = 25.0
+MIN_RANGE_M, MAX_RANGE_M = 0.05, 1000.0
+"""Range of working distances."""
 
 
 class Verdict(StrEnum):

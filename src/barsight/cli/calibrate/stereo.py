@@ -13,10 +13,16 @@ from rich.markup import escape
 from barsight.board_views import MIN_VIEWS, views_from_detections, views_from_pictures
 from barsight.calibration.boards.board import parse_board
 from barsight.calibration.boards.detection_files import has_detections
-from barsight.calibration.files.rig_file import write_rig_file
 from barsight.calibration.geometry.projection import Lens
-from barsight.calibration.stereo.calibration import StereoCalibration, calibrate_stereo, rig_file_section
-from barsight.calibration.stereo.verdict import Verdict, assess, expect_usable, summary_sentence
+from barsight.calibration.stereo.calibration import StereoCalibration, calibrate_stereo
+from barsight.calibration.stereo.verdict import (
+    MAX_RANGE_M,
+    MIN_RANGE_M,
+    Verdict,
+    assess,
+    expect_usable,
+    summary_sentence,
+)
 from barsight.cli.arguments import call
 from barsight.cli.progress import stages
 from barsight.cli.safe_console import SafeConsole
@@ -66,7 +72,7 @@ def run(arguments: Sequence[str]) -> None:
         assessment = assess(calibration, range_m)
         html, data = out.with_suffix(".html"), out.with_suffix(".json")
         with atomic_paths(out, html, data) as (path, *report):
-            write_rig_file(path, calibration.rig, rig_file_section(calibration))
+            calibration.save(path)
             write_calibration_report(calibration, assessment, *report)
         _print(console, calibration, out, html)
         colour = COLOURS[assessment.verdict]
@@ -80,7 +86,7 @@ def run(arguments: Sequence[str]) -> None:
 
 def _expect(out: Path, range_m: float, max_views: int) -> None:
     expect_output(out, ".yaml", ".yml")
-    if not 0.05 <= range_m <= 1000:
+    if not MIN_RANGE_M <= range_m <= MAX_RANGE_M:
         raise ConfigError(f"--range-m {range_m:g} can't be; give the working distance in metres")
     if max_views < MIN_VIEWS:
         raise ConfigError(f"--max-views {max_views} is too few; give {MIN_VIEWS} or more")
