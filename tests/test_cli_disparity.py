@@ -136,7 +136,10 @@ def test_what_is_refused(pair: tuple[Path, Path], tmp_path: Path, capsys: pytest
     refused([left, right, "-o", left], capsys, left, "is an input")
     refused([left, right, *out, "--preview", right], capsys, right, "is an input")
     assert (cv2.imread(right, cv2.IMREAD_GRAYSCALE) == picture).all()
-    assert not any(tmp_path.glob("d.*"))
+    refused([left, right, "-o", str(tmp_path / "d.png"), "--preview", str(tmp_path / "d.png")], capsys,
+            "is the disparity's file; name another")  # fmt: skip
+    refused([left, right, *out, "--preview", str(tmp_path / "none" / "p.png")], capsys, "there is no folder")
+    assert not any(tmp_path.glob("d*"))
 
 
 def test_pictures_that_do_not_belong_together_are_told(

@@ -14,6 +14,7 @@ from rich.markup import escape
 from barsight.cli.arguments import call
 from barsight.cli.safe_console import SafeConsole
 from barsight.core.errors import ConfigError, OutputError
+from barsight.core.files import atomic_paths
 from barsight.core.records.disparity import Disparity
 from barsight.measurement import Preview
 from barsight.reconstruction.pair_matching import match_pictures
@@ -59,17 +60,18 @@ def run(arguments: Sequence[str]) -> None:
         console = SafeConsole(stderr=True)
         if out.suffix.lower() not in SUFFIXES:
             raise OutputError(f"{out}: disparities are written as {', '.join(SUFFIXES)}")
-        _expect_no_input((out, preview), (left, right, rig))
+        _expect_own((out, preview), (left, right, rig))
         if range is not None:
             low, high = _parsed_range(range)
             settings = replace(settings, min_disparity_px=low, max_disparity_px=high)
         pair, disparity = match_pictures(left, right, settings, rig)
-        with_rig = None if rig is None else out.with_name(f"{out.stem}_calib.txt")
-        write_disparity(out, disparity)
-        if with_rig is not None:
-            write_calib(with_rig, pair.camera)
-        if preview is not None:
-            write_preview(Preview(pair.left, disparity.disparity_px), preview)
+        with_rig = () if rig is None else (out.with_name(f"{out.stem}_calib.txt"),)
+        with atomic_paths(out, *with_rig) as (path, *calib):
+            write_disparity(path, disparity)
+            for beside in calib:
+                write_calib(beside, pair.camera)
+            if preview is not None:
+                write_preview(Preview(pair.left, disparity.disparity_px), preview)
         console.print(_summary(out, disparity), soft_wrap=True, highlight=False)
         if settings.method == "barsight" and np.nanpercentile(disparity.sigma_px, 25) > _POOR_SIGMA_PX:
             console.print(_POOR, soft_wrap=True, highlight=False)
@@ -77,12 +79,15 @@ def run(arguments: Sequence[str]) -> None:
     call(command, "disparity", arguments)
 
 
-def _expect_no_input(outputs: tuple[Path | None, ...], inputs: tuple[Path | None, ...]) -> None:
-    """Raise OutputError for an output that is one of the inputs, which it would replace."""
-    read = {path.resolve() for path in inputs if path is not None}
+def _expect_own(outputs: tuple[Path, Path | None], inputs: tuple[Path | None, ...]) -> None:
+    """Raise OutputError for an output that is one of the inputs, or the other one, which it would replace."""
+    taken = {path.resolve(): "an input of this command" for path in inputs if path is not None}
     for path in outputs:
-        if path is not None and path.resolve() in read:
-            raise OutputError(f"{path}: is an input of this command; name another file")
+        if path is None:
+            continue
+        if (what := taken.get(path.resolve())) is not None:
+            raise OutputError(f"{path}: is {what}; name another file")
+        taken[path.resolve()] = "the disparity's file"
 
 
 def _summary(out: Path, disparity: Disparity) -> str:
