@@ -42,7 +42,7 @@ TURN, MOVE = np.array([0.01, 0.02, -0.005]), np.array([0.1, -0.02, 0.3])
 
 @pytest.mark.parametrize("camera", [YARD, STREET])
 def test_right_pictures_that_lie_aside_are_found(camera: RectifiedCamera) -> None:
-    """By a shift of the right camera, which changes far disparities less; a fifth of the points are wild."""
+    """A shift of the right camera changes far disparities less; a fifth of the points are wild."""
     rng, rotation = np.random.default_rng(3), Rotation.from_rotvec(TURN).as_matrix()
     for _ in range(40):
         z, count = rng.uniform(6, 8, 200), 200
