@@ -114,7 +114,7 @@ def moved_cameras(steps: Sequence[DisparityStep], begin_ns: int) -> tuple[str, .
     return (
         f"the cameras have moved against each other {at:.1f} s after the first frame: disparities change by "
         f"{worst.px:+.2f} px, which moves depths at {worst.range_m:.1f} m by {1e3 * worst.depth_m:+.0f} mm; "
-        "fasten them, calibrate anew and survey again",
+        "fasten them, calibrate anew and survey again; or trigger both by one signal, if they aren't",
     )
 
 
