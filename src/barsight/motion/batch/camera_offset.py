@@ -14,7 +14,7 @@ import numpy as np
 from barsight.calibration.geometry.rectification import Rectifier
 from barsight.core.arrays import Float64
 from barsight.core.records.sensor_samples import CraneSamples
-from barsight.core.stamps import interpolate_at, seconds_to_ns
+from barsight.core.stamps import NS_PER_S, interpolate_at, seconds_to_ns
 from barsight.motion.crane.encoder_delay import DelaySearch, FittedDelay, fit_delay
 from barsight.motion.crane.known_motion import SeenSteps
 from barsight.motion.frontend.seen_steps import seen_steps
@@ -33,8 +33,8 @@ def camera_doubts(
     sightings: Sequence[Sighting], rectifier: Rectifier, shift_ns: int, crane: CraneSamples | None,
     search: DelaySearch,
 ) -> tuple[str, ...]:  # fmt: skip
-    """Describe an offset of the cameras' stamps against encoders and IMU. crane: the readings as stamped, in
-    which `search` looked for a delay.
+    """Describe an offset of the cameras' stamps against encoders and IMU. crane: the readings in which
+    `search` looked for a delay, without their faults.
     """
     numbers = [k for k in range(1, len(sightings)) if sightings[k].motion is not None]
     if crane is None or len(crane.stamp_ns) < 2 or len(numbers) < MIN_STEPS:
@@ -43,7 +43,7 @@ def camera_doubts(
     by_imu = search.fitted
     if by_pictures is None or by_imu is None:
         return ()
-    offset_s = by_imu.late_s - by_pictures.late_s
+    offset_s = by_imu.late_s - by_pictures.late_s - crane.late_ns / NS_PER_S
     sigma_s = float(np.linalg.norm([by_imu.sigma_s, by_pictures.sigma_s, MIN_SIGMA_S]))
     if abs(offset_s) < max(MAX_OFFSET_S, OFFSET_SIGMAS * sigma_s):
         return ()

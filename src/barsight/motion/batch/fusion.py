@@ -226,7 +226,7 @@ class BatchPoses:
             known = known_motion(sightings, self._imu, self._rectifier, shift)
             checked = check_crane(reestimate_noise(self._timed), known)
             crane, doubts = checked.samples, self._delay.doubts + checked.warnings
-            doubts += camera_doubts(sightings, self._rectifier, shift, self._stated, self._delay)
+            doubts += camera_doubts(sightings, self._rectifier, shift, crane, self._delay)
         warnings += saturation_sentences(self._spoiled)
         if self.reads_pictures:
             few, most = untied_pictures(sightings, refused)

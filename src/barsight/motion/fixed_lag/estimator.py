@@ -134,7 +134,7 @@ class FixedLagPoses(ImmediatePoses):
         doubts, warnings = self._estimator.encoder_faults()
         doubts += camera_doubts(
             self._estimator.motions, self._rectifier, self._recording.rig.timeshift_cam_imu_ns,
-            readings.crane, self._estimator.delay.search,
+            crane and self._estimator.watch.usable(crane), self._estimator.delay.search,
         )  # fmt: skip
         if self._level is not None:
             warnings += self._level.warnings
