@@ -61,6 +61,15 @@ def test_late_encoders_of_a_crane_that_oscillates_are_put_right(
     assert drift.reference_rmse_mm < 2 and drift.nees_position < 3
 
 
+@pytest.mark.parametrize("late_s", [0.5, -0.5])
+def test_a_delay_that_no_encoder_has_is_a_wrong_clock(late_s: float) -> None:
+    """It was taken off without a word: what the crane tells of its lifts is off by it too."""
+    for seed in range(20020, 20024):
+        crane = drawn_crane(seed)
+        (told,) = find_delay(late(crane.readings, late_s), drawn_senses(crane, seed).imu).doubts
+        assert f"{'late' if late_s > 0 else 'early'} against the IMU: a wrong clock" in told
+
+
 @pytest.mark.parametrize(("seed", "late_s"), [(20000, 0.2), (20009, 0.2), (20003, -0.2)])
 def test_live_says_that_encoders_are_late(seed: int, late_s: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """With those that are early, most frames were refused."""

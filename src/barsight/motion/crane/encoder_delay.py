@@ -24,6 +24,8 @@ PART_S, MAX_PARTS = 4.0, 15
 MIN_READINGS = 15
 MIN_LATE_S = 0.07
 """Delays below this one are left to the estimate."""
+MAX_LATE_S = 0.25
+"""Delays above this one are a wrong clock, by which whatever else the crane tells is off too."""
 WILD_M = 0.02
 """Distance from which a reading counts as wild, and no more than this."""
 CLEARLY_WORSE, MAX_LEFT_M = 1.3, 0.005
@@ -125,7 +127,14 @@ class DelaySearch:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """Describe readings that no constant delay explains, as where stamps are times of arrival."""
+        """Describe a wrong clock, and readings that no constant delay explains, as where stamps are times of
+        arrival.
+        """
+        late_s = self.late_s
+        if abs(late_s) > MAX_LATE_S:
+            off = f"{abs(late_s):.2f} s {'late' if late_s > 0 else 'early'}"
+            told = f"the encoders' stamps are {off} against the IMU: a wrong clock (put all sensors on one clock)"
+            return (told,)
         if 2 * self._scattered <= self._tried:
             return ()
         return (
