@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 from sqlalchemy import event, select
 
+import page_yards
 from barsight.cli.main import run
 from barsight.core.errors import InputError
 from barsight.page import watch as watching
@@ -36,8 +37,9 @@ from barsight.store.states import (
     step_alarm,
     step_lift,
 )  # fmt: skip
-from barsight.store.tables import ALARMS, BUNDLES, LIFT_BUNDLES, LIFTS
+from barsight.store.tables import ALARMS, BUNDLES, LIFT_BUNDLES, LIFT_STATES, LIFTS
 from page_yards import SECOND, survey
+from result_folders import summary
 from yard_folders import write_folder
 
 
@@ -255,6 +257,26 @@ def test_a_clock_that_was_set_back_behind_the_newest_survey_is_told(
         assert raised(store)["map-from-the-future"] == 1
         monkeypatch.setattr(time, "time_ns", now_ns)
         assert not any("future" in reason for reason in state_of_store(store, 0).reasons)
+
+
+def test_nothing_is_offered_while_the_newest_frames_are_ahead_of_the_clock(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Lifts whose first frames the clock had passed were offered and confirmed beside that alarm."""
+    monkeypatch.setattr(page_yards, "summary", lambda: summary() | {"is_simulated": False})
+    read = read_survey(survey(tmp_path / "first", SECOND, 0.0))
+    url = f"sqlite:///{tmp_path / 'yard.db'}"
+    with open_store(url, create=True) as store:
+        add_survey(store, read, "me")
+    monkeypatch.setattr(time, "time_ns", lambda: read.to_ns - 3 * 10**9 // 2)
+    with open_store(url) as store:
+        assert state_of_store(store, 0).lift is None
+        StoreWatch(store).judge()
+        with store.reading() as connection:
+            assert not open_lifts(connection)
+            notes = connection.execute(select(LIFT_STATES.c.note).where(LIFT_STATES.c.state == "expired"))
+            assert all(note.startswith("expired: map-from-the-future") for note in notes.scalars())
+        assert raised(store)["map-from-the-future"] == 1
 
 
 def test_a_backup_that_is_put_back_while_nothing_runs_offers_nothing(url: str, tmp_path: Path) -> None:

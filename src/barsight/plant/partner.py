@@ -48,7 +48,8 @@ def _jump(last: PlcReading | None, now: PlcReading, since_s: float) -> str:
     off_m = max(abs(one - other) for one, other in zip(now.place_m, last.place_m, strict=True))
     if off_m <= MAX_JUMP_M + MAX_SPEED_MPS * since_s:
         return ""
-    return f"its position jumped by {off_m:.2f} m within {since_s:.1f} s: it needs 32 bits and whole encoders"
+    jumped = f"its position jumped by {off_m:.2f} m within {since_s:.1f} s"
+    return f"{jumped}: check the encoders, and that all 32 bits are sent"
 
 
 class PlcPartner:

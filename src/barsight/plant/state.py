@@ -15,7 +15,6 @@ from barsight.store.history import why_ahead
 from barsight.store.lift_records import ROUNDING_M
 from barsight.store.opening import Store
 from barsight.store.states import alarm_priority, standing_alarms
-from barsight.yard.lifting.validity import is_ahead
 
 MAX_ALARMS = 20
 """Maximum number of alarms in the state: urgent ones, then active ones, then the newest. One of each further
@@ -165,10 +164,10 @@ def state_of_store(
     if survey is None:
         empty = ("no-survey: the store holds no survey",)
         return PlantState("idle", False, empty, life_counter, clock_ns, "none", alarms=alarms)
+    ahead = why_ahead(survey.captured_to_ns, clock_ns)
     usable = [
         one for one in lifts
-        if one.survey_id == survey.id and (one.record["valid_until_ns"] or 0) > clock_ns
-        and not is_ahead(one.record.get("valid_from_ns"), clock_ns)
+        if one.survey_id == survey.id and (one.record["valid_until_ns"] or 0) > clock_ns and not ahead
         and (one.state != "offered" or one.record.get("begins_fetch") is not False)
     ]  # fmt: skip
     begun = next((one for one in lifts if one.state == "executing"), None)
@@ -177,7 +176,7 @@ def state_of_store(
     )
     lift = None if best is None else offered_lift(best, approach_height_m, magnet_steps_kg)
     reasons = _reasons(lift, survey.is_simulated and not allow_simulated, bool(magnet_steps_kg))
-    if ahead := why_ahead(survey.captured_to_ns, clock_ns):
+    if ahead:
         reasons = (f"map-from-the-future: {ahead}", *reasons)
     if begun is not None and (vetoes or begun not in usable):
         old = "; ".join(one["reason"] for one in vetoes) or "its map is no longer the newest, or too old"

@@ -339,7 +339,7 @@ def _stale(connection: Connection, clock_ns: int, set_back_s: float = 0.0) -> di
             reasons[lift.lift_id] = f"expired: map-too-old: {back}"
         elif until_ns is None or until_ns < clock_ns:
             reasons[lift.lift_id] = "expired: map-too-old: it was valid for a limited time"
-        elif is_ahead(lift.record.get("valid_from_ns"), clock_ns):
+        elif newest is not None and is_ahead(newest.captured_to_ns, clock_ns):
             reasons[lift.lift_id] = "expired: map-from-the-future: the frames are ahead of this clock"
         elif invalid or outdated:
             told = f"calibration-changed: {invalid}" if invalid else f"disturbed: {outdated}"
