@@ -718,6 +718,26 @@ def test_a_camera_that_repeats_its_picture_while_the_crane_moves_is_reported(
     assert told == [""] * 4 + [why] * 3 + [""]
 
 
+def test_pairs_without_a_pose_are_kept_unless_their_pictures_are_old(
+    whole: Path, board: Counters, ring: PairRing, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each pair of a frozen camera was kept while the crane travelled on: 20 MB a pair, and nothing is mapped
+    by it.
+    """
+    link = Link(LiveInput(whole), SETTINGS.chosen(), LiveSettings(), tmp_path, tmp_path, "", board.name, None)
+    recording = bs.open_recording(whole)
+    seen = next(one for one in recording.frames() if isinstance(one, StereoFrame))
+    monkeypatch.setattr(Tracking, "_wait_for_readings", lambda self, stamp_ns: None)
+    tracking, kept = Tracking(link, GrowingRecording(recording, [], link), board, ring), []
+    for k, is_stale in enumerate((False, True, True, False)):
+        refused = RefusedFrame(seen.stamp_ns + k, "no pose", is_stale)
+        monkeypatch.setattr(tracking, "_placed", lambda pair, refused=refused: refused)
+        frame = StereoFrame(seen.stamp_ns + k, seen.left, seen.right)
+        tracking.take(CapturedPair(k + 1, 0, frame), range(0))
+        kept.append(board["track", "kept"])
+    assert kept == [1, 1, 1, 2]
+
+
 def test_a_trouble_that_changes_is_never_read_as_over(
     whole: Path, board: Counters, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -210,11 +210,13 @@ class Tracking:
 
     def _is_keyframe(self, stamp_ns: int, posed: PosedFrame | RefusedFrame) -> bool:
         """Choose keyframes: pairs for which the body has moved far enough, the first few of a standing crane,
-        and those without a pose.
+        and those without a pose, unless their pictures are old.
         """
         if self._link.keyframes is not None:
             return stamp_ns in self._link.keyframes
-        if isinstance(posed, RefusedFrame) or self._last_kept is None:
+        if isinstance(posed, RefusedFrame):
+            return not posed.is_stale
+        if self._last_kept is None:
             return True
         way_m = np.linalg.norm(posed.reference_from_body.translation - self._last_kept)
         if way_m >= self._link.live.keyframe_way_m:
