@@ -93,6 +93,18 @@ def test_pictures_of_a_frozen_camera_are_mapped_nowhere(
     assert told == f"2 of 4 frames were refused; most often (2): {frozen}"
 
 
+def test_an_old_picture_is_mapped_nowhere_where_only_one_frame_is_left(recording: Path) -> None:
+    """The encoders placed it, since no graph is estimated then."""
+    keep_rows(recording, 2, "cam0", "cam1")
+    for camera in ("cam0", "cam1"):
+        first, second, *_ = pictures(recording, camera)
+        shutil.copy(first, second)
+    _, result = measured(recording)
+    assert result["frames"]["used"] == 1
+    (told,) = [w["message"] for w in result["warnings"] if w["code"] == "frames-refused"]
+    assert told.startswith("1 of 2 frames were refused; first: the same picture comes again and again")
+
+
 def test_a_bayer_mosaic_taken_as_gray_is_named(recording: Path) -> None:
     for path in pictures(recording, "cam1"):
         picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)

@@ -235,7 +235,7 @@ def test_cameras_that_expose_at_different_times_are_doubted(
         open_recording(data / "yard_dev"), kept=lambda k: k < 6, spoil_pictures=spoil
     )  # fmt: skip
     found = make_estimator(MotionSettings(name))(recording, Rectifier(recording.rig), lambda: None)
-    assert ["expose at the same time" in doubt for doubt in found.doubts] == [True] * bool(aside_px)
+    assert ["expose at the same time" in why for why in found.rig_moved] == [True] * bool(aside_px)
 
 
 @pytest.mark.parametrize(("sensor", "fault"), [(s, f) for s in ("crane", "imu") for f in ("doubled", "nan")])

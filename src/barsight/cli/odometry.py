@@ -122,7 +122,8 @@ def _summary(trajectory: Trajectory) -> list[str]:
         f"stated sigma: {1e3 * np.linalg.norm(sigma[3:]):.2f} mm, "
         f"{np.degrees(np.linalg.norm(sigma[:3])):.4f} deg",
     ]
-    lines += [f"warning: {warning}" for warning in (*trajectory.doubts, *trajectory.warnings)]
+    told = (*trajectory.rig_moved, *trajectory.doubts, *trajectory.warnings)
+    lines += [f"warning: {warning}" for warning in told]
     lines += [f"refused {frame.stamp_ns}: {frame.reason}" for frame in trajectory.refused]
     return lines
 

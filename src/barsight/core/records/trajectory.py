@@ -80,7 +80,7 @@ class Trajectory:
     reference: `yard` or `world`. sensors: the ones used. warnings: sentences for the result. drift: of the
     rig, if the estimate observes it. detail: further figures of an estimate from all sensors. doubts:
     sentences on what makes the whole trajectory doubtful, so that no lift may be chosen by it. rig_moved: the
-    same on cameras that moved against each other.
+    same on cameras that moved against each other, or don't expose at the same time.
     """
 
     reference: str

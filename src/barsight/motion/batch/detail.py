@@ -59,10 +59,11 @@ def untied_pictures(
     sightings: tuple[Sighting, ...], refused: tuple[RefusedFrame, ...]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Warn that pictures don't follow from each other, even where encoders place their frames: as warnings
-    for up to half of the frames, else as doubts. Right pictures that contradict the left ones are doubts.
+    for up to half of the frames, else as doubts. Right pictures that contradict the left ones explain it, and
+    are told as that (`sides_sentences`).
     """
-    if apart := sum(one.sides_apart for one in sightings):
-        return (), (sides_sentence(apart),)
+    if any(one.sides_apart for one in sightings):
+        return (), ()
     count = len(refused) + sum(one.motion is None and one.again is None for one in sightings[1:])
     if count == 0:
         return (), ()
@@ -72,14 +73,6 @@ def untied_pictures(
         return (problem,), ()
     return (), (
         f"{problem}: too little texture, too long a step, or left and right pictures of different times",
-    )
-
-
-def sides_sentence(count: int) -> str:
-    """Describe frames whose right pictures contradict the left ones."""
-    return (
-        f"the right pictures of {count} frames don't follow from those before as the left ones do: the depth "
-        "is wrong on one side of each (do both cameras expose at the same time?)"
     )
 
 

@@ -43,7 +43,7 @@ from barsight.motion.frontend.chains import (
 from barsight.motion.frontend.motion_prediction import CranePredictor
 from barsight.motion.frontend.seen_steps import known_motion
 from barsight.motion.frontend.settings import FrontEndSettings
-from barsight.motion.frontend.sightings import Sighting, moved_cameras
+from barsight.motion.frontend.sightings import Sighting, moved_cameras, sides_sentences
 from barsight.motion.frontend.tracking import Predictor, Tracker
 from barsight.motion.gravity import GravityAlignment, align_with_gravity
 from barsight.motion.problem.nodes import Nodes, constrain_by_imu, initial_poses, make_nodes
@@ -203,14 +203,20 @@ class BatchPoses:
 
     def _rig_moved(self) -> tuple[str, ...]:
         steps = [one.step for one in self._sightings if one.step is not None]
-        return moved_cameras(steps, self._recording.index.stamps_ns[0])
+        moved = moved_cameras(steps, self._recording.index.stamps_ns[0])
+        return moved + sides_sentences(sum(one.sides_apart for one in self._sightings))
 
     def _simple(self, inputs: _Inputs) -> Trajectory:
         """Estimate without a graph: from the encoders alone or, without them, frame to frame."""
         simple: TrajectoryEstimator = StereoOdometry(self._settings.front_end.rough)
         if inputs.crane is not None:
             simple = EncoderOdometry(self._crane_settings)
-        return simple(self._recording, self._rectifier, lambda: None)
+        found = simple(self._recording, self._rectifier, lambda: None)
+        stale = {one.stamp_ns: one for one in inputs.refused if one.is_stale}
+        return replace(
+            found, frames=tuple(frame for frame in found.frames if frame.stamp_ns not in stale),
+            refused=(*(one for one in found.refused if one.stamp_ns not in stale), *stale.values()),
+        )  # fmt: skip
 
     def _inputs(self) -> _Inputs:
         """Gather the tracked frames and the checked sensors. Raises InputError where they contradict."""

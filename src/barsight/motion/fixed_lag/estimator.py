@@ -17,7 +17,6 @@ from barsight.core.settings.values import expect_ranges
 from barsight.core.stamps import seconds_to_ns
 from barsight.inertial.model import ORDINARY_NOISE, saturation_sentences, without_saturation
 from barsight.motion.batch.camera_offset import camera_doubts
-from barsight.motion.batch.detail import sides_sentence
 from barsight.motion.batch.fusion import FusionSettings
 from barsight.motion.batch.sensor_agreement import refuse_contradictions
 from barsight.motion.crane.encoder_delay import shifted_back
@@ -26,7 +25,7 @@ from barsight.motion.estimator import FrameInput, ImmediatePoses, TrajectoryEsti
 from barsight.motion.fixed_lag.propagation import NavigationState
 from barsight.motion.fixed_lag.sensor_buffer import SENSOR_DELAY_S, SensorBuffer
 from barsight.motion.frontend.chains import UNTIED, untied_sentence
-from barsight.motion.frontend.sightings import DisparityStep, Sighting, moved_cameras
+from barsight.motion.frontend.sightings import DisparityStep, Sighting, moved_cameras, sides_sentences
 from barsight.motion.frontend.tracking import Tracker
 from barsight.motion.gravity import align_with_gravity
 from barsight.recording.base import Recording
@@ -141,12 +140,11 @@ class FixedLagPoses(ImmediatePoses):
         warnings += saturation_sentences(spoiled)
         if untied := sum(frame.reason == UNTIED for frame in self.refused):
             doubts += (untied_sentence(untied),)
-        if self._apart:
-            doubts += (sides_sentence(self._apart),)
+        moved = moved_cameras(self._steps, self._recording.index.stamps_ns[0])
         return Trajectory(
             "world" if readings.crane is None else "yard", self._estimator.told_later(self.placed),
             tuple(self.refused), sensors, warnings, doubts=doubts,
-            rig_moved=moved_cameras(self._steps, self._recording.index.stamps_ns[0]),
+            rig_moved=moved + sides_sentences(self._apart),
         )  # fmt: skip
 
     def _readings(self) -> SensorBuffer:

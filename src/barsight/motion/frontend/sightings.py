@@ -99,13 +99,14 @@ def disparity_step(
 
 def moved_cameras(steps: Sequence[DisparityStep], begin_ns: int) -> tuple[str, ...]:
     """Describe the largest step that shows that the cameras have moved against each other, if any does."""
-    sizes = [abs(step.px) for step in steps]
+    sizes = np.array([abs(step.px) for step in steps])
+
+    def is_unusual(k: int) -> bool:
+        return bool(sizes[k] > USUAL_STEPS * np.median(np.append(np.delete(sizes, k), 0.0)))
+
     found = [
         step for k, step in enumerate(steps)
-        if sizes[k] > max(
-            MIN_STEP_PX, STEP_SIGMAS * step.sigma_px,
-            USUAL_STEPS * float(np.median([0.0, *sizes[:k], *sizes[k + 1 :]])),
-        )
+        if sizes[k] > max(MIN_STEP_PX, STEP_SIGMAS * step.sigma_px) and is_unusual(k)
     ]  # fmt: skip
     if not found:
         return ()
@@ -115,6 +116,18 @@ def moved_cameras(steps: Sequence[DisparityStep], begin_ns: int) -> tuple[str, .
         f"the cameras have moved against each other {at:.1f} s after the first frame: disparities change by "
         f"{worst.px:+.2f} px, which moves depths at {worst.range_m:.1f} m by {1e3 * worst.depth_m:+.0f} mm; "
         "fasten them, calibrate anew and survey again; or trigger both by one signal, if they aren't",
+    )
+
+
+def sides_sentences(count: int) -> tuple[str, ...]:
+    """Describe `count` frames whose right pictures contradict the left ones, if there are any."""
+    if count == 0:
+        return ()
+    frames = "one frame doesn't" if count == 1 else f"{count} frames don't"
+    return (
+        f"the right picture of {frames} follow from the one before as the left one does, so the depth before "
+        "or after it is wrong: if a camera has moved, fasten it, calibrate anew and survey again; if they "
+        "don't expose at the same time, trigger both by one signal",
     )
 
 
