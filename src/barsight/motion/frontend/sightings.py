@@ -123,11 +123,10 @@ def sides_sentences(count: int) -> tuple[str, ...]:
     """Describe `count` frames whose right pictures contradict the left ones, if there are any."""
     if count == 0:
         return ()
-    frames = "one frame doesn't" if count == 1 else f"{count} frames don't"
     return (
-        f"the right picture of {frames} follow from the one before as the left one does, so the depth before "
-        "or after it is wrong: if a camera has moved, fasten it, calibrate anew and survey again; if they "
-        "don't expose at the same time, trigger both by one signal",
+        f"in {count} frame{'s' * (count > 1)} the right picture doesn't follow from the one before as the "
+        "left one does, so the depth before or after it is wrong: if a camera has moved, fasten it, "
+        "calibrate anew and survey again; if they don't expose at the same time, trigger both by one signal",
     )
 
 
