@@ -133,7 +133,7 @@ class DelaySearch:
         late_s = self.late_s
         if abs(late_s) > MAX_LATE_S:
             off = f"{abs(late_s):.2f} s {'late' if late_s > 0 else 'early'}"
-            told = f"the encoders' stamps are {off} against the IMU: a wrong clock (put all sensors on one clock)"
+            told = f"the encoders' stamps are {off} against the IMU: a wrong clock (put sensors on one clock)"
             return (told,)
         if 2 * self._scattered <= self._tried:
             return ()
