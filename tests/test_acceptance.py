@@ -408,7 +408,7 @@ def test_a_plan_is_read_as_it_was_written(tmp_path: Path) -> None:
         ('lower = "plate 1"', 'lower = "plate 9"', "names 'plate 9', which isn't among"),
         ("height_mm", "hieght_mm", "did you mean height_mm?"),
         ("diameter_m = 0.288", "diameter_m = 0.01", "diameter_m must lie in"),
-        ("size_m = [0.5, 0.5]", "size_m = [0.5]", "size_m has 1 values; give 2"),
+        ("size_m = [0.5, 0.5]", "size_m = [0.5]", "size_m has 1 value; give 2"),
     ],
 )
 def test_a_bad_plan_is_one_line(

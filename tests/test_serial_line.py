@@ -188,8 +188,9 @@ def serial(device: Path) -> str:
 
 def test_a_serial_line_is_proved_before_a_run(line: Line, whole: Path, tmp_path: Path) -> None:
     crane = described(tmp_path / "crane.toml", serial(line.link), whole)
-    line.send(framed(number) for number in range(2 * RATE_HZ))
-    heard = preflight.prove_sensor(crane, crane.described(tmp_path / "out"), "imu").imu_samples
+    rig = crane.described(tmp_path / "out")
+    line.send(framed(number) for number in range(10 * RATE_HZ))
+    heard = preflight.prove_sensor(crane, rig, "imu").imu_samples
     assert heard is not None and len(heard.stamp_ns) == RATE_HZ // 2
     assert np.allclose(heard.accel_mps2, VALUES[3:]) and heard.stamp_ns[0] >= stamp(0)
 

@@ -203,7 +203,7 @@ class BatchPoses:
 
     def _rig_moved(self) -> tuple[str, ...]:
         steps = [one.step for one in self._sightings if one.step is not None]
-        moved = moved_cameras(steps, self._recording.index.stamps_ns[0])
+        moved = moved_cameras(steps, self._recording.index.stamps_ns)
         return moved + sides_sentences(sum(one.sides_apart for one in self._sightings))
 
     def _simple(self, inputs: _Inputs) -> Trajectory:

@@ -140,7 +140,7 @@ class FixedLagPoses(ImmediatePoses):
         warnings += saturation_sentences(spoiled)
         if untied := sum(frame.reason == UNTIED for frame in self.refused):
             doubts += (untied_sentence(untied),)
-        moved = moved_cameras(self._steps, self._recording.index.stamps_ns[0])
+        moved = moved_cameras(self._steps, self._recording.index.stamps_ns)
         return Trajectory(
             "world" if readings.crane is None else "yard", self._estimator.told_later(self.placed),
             tuple(self.refused), sensors, warnings, doubts=doubts,

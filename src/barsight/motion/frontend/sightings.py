@@ -97,8 +97,10 @@ def disparity_step(
     return DisparityStep(stamp_ns, px, sigma_px, -px * range_m**2 / scale_px_m, range_m)
 
 
-def moved_cameras(steps: Sequence[DisparityStep], begin_ns: int) -> tuple[str, ...]:
-    """Describe the largest step that shows that the cameras have moved against each other, if any does."""
+def moved_cameras(steps: Sequence[DisparityStep], stamps_ns: Sequence[int]) -> tuple[str, ...]:
+    """Describe the largest step that shows that the cameras have moved against each other, if any does.
+    stamps_ns: of the recording's frames.
+    """
     sizes = np.array([abs(step.px) for step in steps])
 
     def is_unusual(k: int) -> bool:
@@ -111,7 +113,7 @@ def moved_cameras(steps: Sequence[DisparityStep], begin_ns: int) -> tuple[str, .
     if not found:
         return ()
     worst = max(found, key=lambda step: abs(step.px))
-    at = (worst.stamp_ns - begin_ns) / NS_PER_S
+    at = (worst.stamp_ns - stamps_ns[0]) / NS_PER_S
     return (
         f"the cameras have moved against each other {at:.1f} s after the first frame: disparities change by "
         f"{worst.px:+.2f} px, which moves depths at {worst.range_m:.1f} m by {1e3 * worst.depth_m:+.0f} mm; "
