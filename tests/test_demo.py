@@ -22,7 +22,6 @@ LONGER_M = 0.0375
 """Maximum length (m) by which single bars extend beyond their bundle."""
 
 
-@pytest.mark.slow
 def test_the_demo_ends_on_the_page_with_a_change_and_a_stock_list(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "barsight", "demo"]
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True) as demo:
