@@ -60,7 +60,7 @@ class MapSettings:
     cells are flagged.
     """
     carve_gullies: bool = False
-    """Whether space carving may prove unseen gullies beside bundles free: at no height does the place look
+    """Prove unseen gullies beside bundles free by space carving: at no height does the place look
     alike to all views. It assumes that nothing dark and glossy lies there: a highlight that comes and goes
     looks the same.
     """

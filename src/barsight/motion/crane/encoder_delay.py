@@ -36,8 +36,6 @@ MAX_SCATTER_M, MAX_SCATTER_SIGMAS = 0.0075, 1.5
 """Maximum RMS, m and in sigma of a reading, that the best delay leaves in half of the parts or more. It
 leaves 4.2 mm or less with sound cranes; from 8.5 mm on places are up to 40 mm off.
 """
-
-
 INDEPENDENT_S = 0.1
 """Interval, s, from which what a delay leaves in the readings is independent."""
 

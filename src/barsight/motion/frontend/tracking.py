@@ -74,10 +74,11 @@ class Tracker:
 
     def push(self, pair: RectifiedPair) -> Sighting | RefusedFrame:
         """Track the next pair, or refuse it where it shows too little."""
-        state, settings, patches = self._state, self._settings, patch_pair(pair)
+        state, settings = self._state, self._settings
         prediction = self._predictor(state.stamp_ns, pair.stamp_ns) if state else None
         if state is not None and (repeated := _repeated(state, pair, prediction)):
             return RefusedFrame(pair.stamp_ns, repeated_sentence(repeated), is_stale=True)
+        patches = patch_pair(pair)
         result, apart = _see(state, patches, prediction, settings), False
         if isinstance(result, Failed) and state is not None:
             apart = result.code == SIDES_APART
