@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from barsight.cli.main import run
 from barsight.core.records.pairs import RectifiedCamera
 from barsight.features.guided_matching import PredictedMotion, project_stereo, triangulate_stereo
-from barsight.motion.frontend.sightings import DisparityStep, disparity_step, moved_cameras
+from barsight.motion.frontend.sightings import DisparityStep, disparity_step, rig_moved
 from cli_runs import FAST, pictures
 
 CAMERA = RectifiedCamera(850.0, 480.0, 384.0, 0.5, 0.0, 960, 768)
@@ -38,21 +38,21 @@ def seen(rng: np.random.Generator, roll_rad: float = 0.0, more_px: float = 0.0) 
 def test_a_step_is_found_where_it_is_largest() -> None:
     rng = np.random.default_rng(0)
     steady = [seen(rng) for _ in range(200)]
-    assert moved_cameras(steady, (0,)) == ()
+    assert rig_moved(steady, 0, (0,)) == ()
     turned = seen(rng, more_px=0.74)  # 0.05 degrees
     assert abs(turned.px - 0.74) < 4 * turned.sigma_px < 0.15
-    (told,) = moved_cameras([*steady[:9], turned], (0,))
+    (told,) = rig_moved([*steady[:9], turned], 0, (0,))
     assert told.startswith("the cameras have moved against each other 2.5 s after the first frame")
     assert abs(turned.depth_m + 0.74 * turned.range_m**2 / 425) < 0.02
     rolled = seen(rng, roll_rad=np.radians(0.1))
-    assert moved_cameras([rolled], (0,)), "halves of the picture cancel each other"
+    assert rig_moved([rolled], 0, (0,)), "halves of the picture cancel each other"
 
 
 def test_few_points_and_usual_steps_show_nothing() -> None:
     none = np.zeros((20, 3))
     assert disparity_step(0, none, none, MOTION, CAMERA) is None
     rng = np.random.default_rng(1)
-    assert moved_cameras([seen(rng, more_px=px) for px in (0.1, -0.1, 0.12, -0.08, 0.24)], (0,)) == ()
+    assert rig_moved([seen(rng, more_px=px) for px in (0.1, -0.1, 0.12, -0.08, 0.24)], 0, (0,)) == ()
 
 
 def test_many_steps_are_judged_at_once() -> None:
@@ -60,7 +60,7 @@ def test_many_steps_are_judged_at_once() -> None:
     px = np.random.default_rng(2).normal(0, 0.01, 20_000)
     steps = [DisparityStep(k, one, 0.005, 0.0, 7.0) for k, one in enumerate(px.tolist())]
     begun = time.process_time()
-    assert moved_cameras(steps, (0,)) == ()
+    assert rig_moved(steps, 0, (0,)) == ()
     assert time.process_time() - begun < 2
 
 

@@ -60,7 +60,7 @@ def untied_pictures(
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Warn that pictures don't follow from each other, even where encoders place their frames: as warnings
     for up to half of the frames, else as doubts. Right pictures that contradict the left ones explain it, and
-    are told as that (`sides_sentences`).
+    are told as that (`rig_moved`).
     """
     if any(one.sides_apart for one in sightings):
         return (), ()

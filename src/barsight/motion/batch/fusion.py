@@ -43,7 +43,7 @@ from barsight.motion.frontend.chains import (
 from barsight.motion.frontend.motion_prediction import CranePredictor
 from barsight.motion.frontend.seen_steps import known_motion
 from barsight.motion.frontend.settings import FrontEndSettings
-from barsight.motion.frontend.sightings import Sighting, moved_cameras, sides_sentences
+from barsight.motion.frontend.sightings import Sighting, rig_moved
 from barsight.motion.frontend.tracking import Predictor, Tracker
 from barsight.motion.gravity import GravityAlignment, align_with_gravity
 from barsight.motion.problem.nodes import Nodes, constrain_by_imu, initial_poses, make_nodes
@@ -203,8 +203,8 @@ class BatchPoses:
 
     def _rig_moved(self) -> tuple[str, ...]:
         steps = [one.step for one in self._sightings if one.step is not None]
-        moved = moved_cameras(steps, self._recording.index.stamps_ns)
-        return moved + sides_sentences(sum(one.sides_apart for one in self._sightings))
+        apart = sum(one.sides_apart for one in self._sightings)
+        return rig_moved(steps, apart, self._recording.index.stamps_ns)
 
     def _simple(self, inputs: _Inputs) -> Trajectory:
         """Estimate without a graph: from the encoders alone or, without them, frame to frame."""

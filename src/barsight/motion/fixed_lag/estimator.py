@@ -25,7 +25,7 @@ from barsight.motion.estimator import FrameInput, ImmediatePoses, TrajectoryEsti
 from barsight.motion.fixed_lag.propagation import NavigationState
 from barsight.motion.fixed_lag.sensor_buffer import SENSOR_DELAY_S, SensorBuffer
 from barsight.motion.frontend.chains import UNTIED, untied_sentence
-from barsight.motion.frontend.sightings import DisparityStep, Sighting, moved_cameras, sides_sentences
+from barsight.motion.frontend.sightings import DisparityStep, Sighting, rig_moved
 from barsight.motion.frontend.tracking import Tracker
 from barsight.motion.gravity import align_with_gravity
 from barsight.recording.base import Recording
@@ -140,11 +140,10 @@ class FixedLagPoses(ImmediatePoses):
         warnings += saturation_sentences(spoiled)
         if untied := sum(frame.reason == UNTIED for frame in self.refused):
             doubts += (untied_sentence(untied),)
-        moved = moved_cameras(self._steps, self._recording.index.stamps_ns)
         return Trajectory(
             "world" if readings.crane is None else "yard", self._estimator.told_later(self.placed),
             tuple(self.refused), sensors, warnings, doubts=doubts,
-            rig_moved=moved + sides_sentences(self._apart),
+            rig_moved=rig_moved(self._steps, self._apart, self._recording.index.stamps_ns),
         )  # fmt: skip
 
     def _readings(self) -> SensorBuffer:

@@ -97,10 +97,16 @@ def disparity_step(
     return DisparityStep(stamp_ns, px, sigma_px, -px * range_m**2 / scale_px_m, range_m)
 
 
-def moved_cameras(steps: Sequence[DisparityStep], stamps_ns: Sequence[int]) -> tuple[str, ...]:
-    """Describe the largest step that shows that the cameras have moved against each other, if any does.
-    stamps_ns: of the recording's frames.
+def rig_moved(steps: Sequence[DisparityStep], sides_apart: int, stamps_ns: Sequence[int]) -> tuple[str, ...]:
+    """Describe what shows that the cameras have moved against each other, if anything does.
+
+    sides_apart: number of frames whose right pictures contradict the left ones. stamps_ns: of the
+    recording's frames.
     """
+    return _largest_step(steps, stamps_ns) + _sides_sentences(sides_apart)
+
+
+def _largest_step(steps: Sequence[DisparityStep], stamps_ns: Sequence[int]) -> tuple[str, ...]:
     sizes = np.array([abs(step.px) for step in steps])
 
     def is_unusual(k: int) -> bool:
@@ -121,8 +127,7 @@ def moved_cameras(steps: Sequence[DisparityStep], stamps_ns: Sequence[int]) -> t
     )
 
 
-def sides_sentences(count: int) -> tuple[str, ...]:
-    """Describe `count` frames whose right pictures contradict the left ones, if there are any."""
+def _sides_sentences(count: int) -> tuple[str, ...]:
     if count == 0:
         return ()
     return (
