@@ -55,6 +55,7 @@ from barsight.yard.magnet.holding import (
 )
 from barsight.yard.magnet.partings import without_parted
 from barsight.yard.magnet.reach import reached_strips
+from barsight.yard.magnet.seen_edges import seen_clearances
 from barsight.yard.map_lookup import nearest_cells
 from barsight.yard.stability.stability import footing_checks
 from barsight.yard.types import Bundle, HeightMap, known_sigma
@@ -134,6 +135,8 @@ def _grip(
     """Count the bundles that the poles take, bounded by how far each one reaches on the map."""
     reached = reached_strips(heights, place, magnet, tolerance, contact.z_m)
     held = count_gripped(place, magnet, tolerance, near, contact.z_m, reached)
+    clear = seen_clearances(held, heights, place, near, contact.z_m - magnet.reach_m, reached)
+    held = count_gripped(place, magnet, tolerance, near, contact.z_m, reached, clear)
     return without_parted(held, heights, place, near, reached)
 
 

@@ -26,6 +26,10 @@ HEIGHT_SIGMA_M = 0.005
 """Standard deviation (m), besides its own sigma, of a bundle's top line as its height under a pole."""
 SURELY = 3.0
 """Number of sigmas by which a place must lie within a bundle's ends to belong to it with certainty."""
+SEEN_EDGE_SIGMA_M = 0.006
+"""Standard deviation (m) of the place where a bundle's surface is seen to sink out of a pole's reach: in 99.9
+of 100 parts of a pole it lies at most 18 mm further out than told.
+"""
 MAX_TOP_SIGMA_M = 0.008
 """Upper bound (m) of a top's sigma: the faces rest on the same map, so what all places share of that sigma
 doesn't affect the heights between them.
@@ -137,20 +141,21 @@ class Grip:
 
 def count_gripped(
     place: Placement, magnet: Magnet, tolerance: Tolerance, table: BundleTable, face_z_m: Float64,
-    reached: Float64,
+    reached: Float64, clear_m: Float64 | None = None,
 ) -> Grip:  # fmt: skip
     """Count the bundles under the poles whose tops are within the magnet's reach.
 
     face_z_m: (P,) height of each pole's face. tolerance: of the crane's set-down; a hard bound. reached: (P,
     4) of `reach.reached_strips`: a bundle that lies entirely beside it isn't taken, even if its outline
-    extends under a face.
+    extends under a face. clear_m: (B, P) of `seen_edges.seen_clearances`, where these were looked for.
     """
     if not table.bundles:
         return Grip((), 1.0, np.empty(0))
     slack = np.array([tolerance.x_m, tolerance.y_m, np.radians(tolerance.yaw_deg)])
+    clear = np.full((len(table.bundles), len(reached)), -np.inf) if clear_m is None else clear_m
     flips, taken = _grip(
         place.x_m, place.y_m, place.yaw_rad, magnet.pole_table, reached, face_z_m - magnet.reach_m, slack,
-        table.rectangles,
+        clear, table.rectangles,
     )  # fmt: skip
     return Grip(tuple(np.flatnonzero(taken).tolist()), float(np.prod(1 - flips)), flips)
 
@@ -158,13 +163,13 @@ def count_gripped(
 @kernel()
 def _grip(
     x: float, y: float, yaw: float, poles: Float64, reached: Float64, reach_z: Float64, slack: Float64,
-    bundles: Rectangles,
+    clear: Float64, bundles: Rectangles,
 ) -> tuple[Float64, Bool]:  # fmt: skip
     """Compute the probability (B,) of a wrong count, and whether each bundle is taken.
 
     x, y, yaw: the magnet's place, m and rad. poles: (P, 4) along, across, length, width, m; reached: (P, 4)
     the same of what they may reach. reach_z: (P,) the lowest top that a pole takes, m. slack: (3,) bounds on
-    the crane's x, y (m) and yaw (rad).
+    the crane's x, y (m) and yaw (rad). clear: (B, P) as in `count_gripped`.
     """
     centre, along, half, top, slope, sigma, sigma_top, open_ends = bundles
     count = len(centre)
@@ -179,35 +184,36 @@ def _grip(
         for p in range(len(poles)):
             part, give = reached[p], none
             dx, dy = _away(x, y, cos, sin, part, centre[b])
-            depth, spread, loose = overlap(
-                dx, dy, cos, sin, part, along[b], half[b, 0], half[b, 1], sigma[b], give
-            )
+            far = dx * along[b, 0] + dy * along[b, 1]
+            depth, spread, loose = overlap(dx, dy, cos, sin, part, along[b], half[b], sigma[b], give, far)
             if depth > 0:
                 part, give = poles[p], slack
                 dx, dy = _away(x, y, cos, sin, part, centre[b])
-                depth, spread, loose = overlap(
-                    dx, dy, cos, sin, part, along[b], half[b, 0], half[b, 1], sigma[b], give
-                )
+                far = dx * along[b, 0] + dy * along[b, 1]
+                depth, spread, loose = overlap(dx, dy, cos, sin, part, along[b], half[b], sigma[b], give, far)
             miss = _below(-max(abs(depth) - loose, 0.0) / spread)
             if depth <= 0 and (open_ends[b, 0] or open_ends[b, 1]):
                 # An open end may lie anywhere under the pole.
                 longer = (open_ends[b, 0] + open_ends[b, 1]) * BEYOND_OPEN_END_M / 2
                 shift = (1.0 * open_ends[b, 1] - 1.0 * open_ends[b, 0]) * BEYOND_OPEN_END_M / 2
+                whole = np.array([half[b, 0], half[b, 1] + longer])
                 most, unsure, astray = overlap(
-                    dx - shift * along[b, 0], dy - shift * along[b, 1], cos, sin, part, along[b],
-                    half[b, 0], half[b, 1] + longer, sigma[b], give,
+                    dx - shift * along[b, 0], dy - shift * along[b, 1], cos, sin, part, along[b], whole,
+                    sigma[b], give, far,
                 )  # fmt: skip
                 miss = max(miss, 0.5 * _below((most + astray) / unsure))
-            if depth <= 0 and holder[p] >= 0 and abs(dx * along[b, 0] + dy * along[b, 1]) < half[b, 1]:
+            if depth <= 0 and holder[p] >= 0 and abs(far) < half[b, 1]:
                 # A strip that belongs to one bundle doesn't belong to another one beside it.
                 miss = min(miss, _below(-held[p, 0 if dx * cos + dy * sin > 0 else 1]))
-            over = top[b] + (dx * along[b, 0] + dy * along[b, 1]) * slope[b] - reach_z[p]
+            over = top[b] + far * slope[b] - reach_z[p]
+            if depth <= 0 or over > 0:
+                miss = min(miss, _below(-clear[b, p] / SEEN_EDGE_SIGMA_M))
             low = _below(-abs(over) / np.hypot(sigma_top[b], HEIGHT_SIGMA_M))
             under = (1 - miss if depth > 0 else miss) * (1 - low if over > 0 else low)
             if depth > 0 and over > 0:
                 taken[b] = True
                 kept = min(kept, 1 - under)
-            side = 1 if dx * along[b, 0] + dy * along[b, 1] > 0 else 0
+            side = 1 if far > 0 else 0
             added[side] = max(added[side], under)
         flips[b] = kept if taken[b] else min(added.sum(), 1.0)
     return flips, taken
@@ -262,18 +268,18 @@ def _below(z: float) -> float:
 
 @kernel()
 def overlap(
-    dx: float, dy: float, cos: float, sin: float, pole: Float64, along: Float64, half_width: float,
-    half_length: float, sigma: Float64, slack: Float64,
+    dx: float, dy: float, cos: float, sin: float, pole: Float64, along: Float64, half: Float64,
+    sigma: Float64, slack: Float64, far: float,
 ) -> tuple[float, float, float]:  # fmt: skip
     """Compute a pole's overlap with a bundle (negative is a distance), its sigma and the crane's slack, m.
 
     dx, dy: pole's centre minus bundle's. cos, sin: of the magnet's yaw. pole: (4,) along, across, length,
-    width, m. along: (2,) the bundle's unit vector; half_width, half_length, sigma (5,): its own, see
-    `Rectangles`. slack: (3,) on x, y (m) and yaw (rad). Of the four axes perpendicular to the rectangles'
-    sides, the one with the smallest overlap counts (separating axes).
+    width, m. along: (2,) the bundle's unit vector; half (2,), sigma (5,): its own, see `Rectangles`. slack:
+    (3,) on x, y (m) and yaw (rad). far: distance (m) along the bundle over which its yaw's error acts. Of the
+    four axes perpendicular to the rectangles' sides, the one with the smallest overlap counts (separating
+    axes).
     """
     best = (np.inf, 1.0, 0.0)
-    away = dx * along[0] + dy * along[1]
     for axis in range(4):
         if axis == 0:
             nx, ny = along[1], -along[0]
@@ -286,11 +292,11 @@ def overlap(
         side, end = abs(nx * along[1] - ny * along[0]), abs(nx * along[0] + ny * along[1])
         across, lengthwise = abs(nx * cos + ny * sin), abs(ny * cos - nx * sin)
         depth = (
-            side * half_width + end * half_length + across * pole[3] / 2 + lengthwise * pole[2] / 2
+            side * half[0] + end * half[1] + across * pole[3] / 2 + lengthwise * pole[2] / 2
             - abs(dx * nx + dy * ny)
         )  # fmt: skip
         if depth < best[0]:
-            variance = side**2 * (sigma[0] ** 2 + (away * sigma[2]) ** 2 + sigma[3] ** 2)
+            variance = side**2 * (sigma[0] ** 2 + (far * sigma[2]) ** 2 + sigma[3] ** 2)
             variance += end**2 * (sigma[1] ** 2 + sigma[4] ** 2) + MIN_SIGMA_M**2
             loose = slack[0] * abs(nx) + slack[1] * abs(ny)
             loose += slack[2] * across * (abs(pole[0]) + pole[2] / 2)

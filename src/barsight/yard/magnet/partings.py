@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 
 import numpy as np
@@ -10,7 +9,7 @@ import numpy as np
 from barsight.core.arrays import Bool, Float64
 from barsight.core.linalg.robust import nan_medians
 from barsight.yard.magnet.footprint import BundleTable, Grip, Placement
-from barsight.yard.magnet.reach import PART_M
+from barsight.yard.magnet.reach import ALONG_M, MAX_SKEW, parts_beside
 from barsight.yard.map_lookup import lookup_heights
 from barsight.yard.types import Bundle, HeightMap
 
@@ -18,11 +17,7 @@ _DEEP_M, _DEEP_RATIO = 0.1, 0.4
 """Minimum depth (m) of a gully that separates two bundles, and the same in widths of the wider one: in 3757
 simulated packs no gully is deeper than 86 mm or 0.39 of the width.
 """
-_STEP_M, _ALONG_M = 0.005, 0.02
-_PARALLEL = 0.05
-"""Maximum sine of the skew of two bundles between which a gully is sought."""
-_ROWS = 3
-"""Minimum number of rows of a pole's part that lie beside a bundle; with fewer, the bundle lies beyond it."""
+_STEP_M = 0.005
 _SEEN_RATIO = 0.5
 """Minimum share of a part along a pole that must have been seen for its median to count."""
 
@@ -46,32 +41,23 @@ def without_parted(
 
 
 def _parted(load: Bundle, other: Bundle, heights: HeightMap, place: Placement, reached: Float64) -> bool:
-    """Check that a gully runs between every pole's reach and another bundle, over its whole length."""
-    if any(abs(math.sin(bundle.yaw_rad - place.yaw_rad)) > _PARALLEL for bundle in (load, other)):
+    """Check that a gully runs between every pole's reach and another bundle, over its whole length.
+
+    One that lies beside no pole, such as behind the load, has no gully beside it.
+    """
+    if any(abs(math.sin(bundle.yaw_rad - place.yaw_rad)) > MAX_SKEW for bundle in (load, other)):
         return False
     deep = max(_DEEP_M, _DEEP_RATIO * max(load.width_m, other.width_m))
-    away = other.centre_m[:2] - (place.x_m, place.y_m)
-    middle, along = float(away @ place.across), float(away @ place.along)
-    half_m = math.inf if any(other.ends_open) else other.length_m / 2
-    turn = math.tan(other.yaw_rad - place.yaw_rad)
+    is_beside = False
     for pole in reached:
         if pole[2] == 0 or pole[3] == 0:
             continue
-        for part in _parts(pole):
-            v = part[np.abs(part - along) < half_m]
-            if v.size < _ROWS:
-                continue
-            beside = middle - turn * (float(v.mean()) - along)
+        for low, high, beside in parts_beside(other, place, pole):
+            is_beside = True
+            v = np.arange(low, high + ALONG_M / 2, ALONG_M)
             if not _gully(_profile(heights, place, v, pole[1], beside), pole[3] / 2, deep):
                 return False
-    return True
-
-
-def _parts(pole: Float64) -> list[Float64]:
-    """Divide a pole's reach along the beam into parts of about PART_M: places along."""
-    count = max(round(pole[2] / PART_M), 1)
-    ends = pole[0] + pole[2] * (np.arange(count + 1) / count - 0.5)
-    return [np.arange(low, high + _ALONG_M / 2, _ALONG_M) for low, high in itertools.pairwise(ends)]
+    return is_beside
 
 
 def _profile(heights: HeightMap, place: Placement, along_m: Float64, from_m: float, to_m: float) -> Float64:

@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
 
 from barsight.core.arrays import Bool, Float64
 from barsight.yard.magnet.description import Magnet, Tolerance
-from barsight.yard.magnet.footprint import Placement
+from barsight.yard.magnet.footprint import SURELY, Placement
 from barsight.yard.magnet.resting_plane import Z, profiles
-from barsight.yard.types import HeightMap
+from barsight.yard.types import Bundle, HeightMap, known_sigma
 
 DEEPER_M = 0.01
 """Depth (m) below a pole's reach at which steel may still be pulled, due to the errors of both heights."""
 PART_M = 0.25
 """Length (m) along the poles of the parts over which median heights are taken."""
+ALONG_M = 0.02
+"""Spacing (m) of the rows of a part."""
+MAX_SKEW = 0.05
+"""Maximum sine of the skew to the beam of a bundle beside whose surface is looked at."""
+_ROWS = 3
+"""Minimum number of rows of a part that lie beside a bundle; with fewer, the bundle lies beyond it."""
 LOOK_M = 0.05
 """Distance (m) beside a face over which falling flanks are followed."""
 FLANK_M, SHOULDER_M = 0.003, 0.004
@@ -91,3 +98,23 @@ def _flank(level: Float64, beyond: int) -> int:
     flank = (falls >= FLANK_M) & np.append(np.diff(falls) >= -SHOULDER_M, True)
     top = len(flank) - (len(flank) if flank.all() else int(np.argmin(flank[::-1])))
     return max(edge - 1 - top, 0)
+
+
+def parts_beside(bundle: Bundle, place: Placement, pole: Float64) -> list[tuple[float, float, float]]:
+    """List the parts, about PART_M long, of a pole's reach (4,) beside which a bundle may lie: from and to
+    along the beam, and the place of the bundle's middle across it.
+    """
+    away = bundle.centre_m[:2] - (place.x_m, place.y_m)
+    middle, along = float(away @ place.across), float(away @ place.along)
+    ends_m = math.hypot(known_sigma(bundle.sigma.along_m), known_sigma(bundle.sigma.length_m) / 2)
+    half_m = math.inf if any(bundle.ends_open) else bundle.length_m / 2 + SURELY * ends_m
+    turn = math.tan(bundle.yaw_rad - place.yaw_rad)
+    count = max(round(pole[2] / PART_M), 1)
+    ends = pole[0] + pole[2] * (np.arange(count + 1) / count - 0.5)
+    found = []
+    for low, high in itertools.pairwise(ends):
+        rows = np.arange(low, high + ALONG_M / 2, ALONG_M)
+        rows = rows[np.abs(rows - along) < half_m]
+        if rows.size >= _ROWS:
+            found.append((float(rows[0]), float(rows[-1]), middle - turn * (float(rows.mean()) - along)))
+    return found
