@@ -30,7 +30,7 @@ def hidden(heights: HeightMap, low_m: float, high_m: float) -> HeightMap:
 
 
 def clearances(heights: HeightMap, *bundles: Bundle) -> tuple[np.ndarray, np.ndarray]:
-    """What the poles reach, and by how much they miss each bundle but the first."""
+    """Reach of the poles, and by how much they miss each bundle but the first."""
     table, unsure = BundleTable.of(bundles), np.full(len(bundles), 0.1)
     strips = reached_strips(heights, OVER, MAGNET, MAGNET.tolerance, FACES)
     held = Grip((0,), 0.5, unsure)
